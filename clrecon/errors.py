@@ -1,0 +1,65 @@
+"""The errors that clrecon raises on purpose, each with the exit code of the command line.
+
+Every message is one line that says what is wrong, where, with which numbers, and what to do about it.
+Anything that is not a `ClreconError` and reaches a user is a fault of clrecon.
+"""
+
+from __future__ import annotations
+
+__all__ = [
+    "ClreconError",
+    "NoDicomError",
+    "NoSurfaceError",
+    "UsageError",
+    "RefusedInputError",
+    "DeviceError",
+    "OutputError",
+]
+
+
+class ClreconError(Exception):
+    """Base of all errors that clrecon raises on purpose.
+
+    Attributes
+    ----------
+    exit_code : int
+        What ``clrecon`` exits with when this error ends a command.
+    """
+
+    exit_code = 1
+
+
+class NoDicomError(ClreconError):
+    """The input holds no DICOM image that clrecon can use."""
+
+    exit_code = 2
+
+
+class NoSurfaceError(ClreconError):
+    """The iso value crosses no cell of the volume, or nothing is left of the surface."""
+
+    exit_code = 2
+
+
+class UsageError(ClreconError, ValueError):
+    """An argument is wrong: unknown name, impossible value, wrong shape."""
+
+    exit_code = 3
+
+
+class RefusedInputError(ClreconError):
+    """The input is corrupt, or its geometry cannot be trusted."""
+
+    exit_code = 4
+
+
+class DeviceError(ClreconError):
+    """No OpenCL device, a device that is not there, or a device that failed."""
+
+    exit_code = 5
+
+
+class OutputError(ClreconError):
+    """The output cannot be written; an older file of that name is intact."""
+
+    exit_code = 6

@@ -1,0 +1,27 @@
+"""Pure numpy: affines, patient frames and the `Volume` that carries them."""
+
+from clrecon.geometry.affine import (
+    apply_affine,
+    column_spacing,
+    compose_affine,
+    is_left_handed,
+    normal_matrix,
+    slice_normal,
+    tilt_degrees,
+)
+from clrecon.geometry.frames import SPACES, frame_from_lps
+from clrecon.geometry.volume import AIR_HU, Volume
+
+__all__ = [
+    "AIR_HU",
+    "SPACES",
+    "Volume",
+    "apply_affine",
+    "column_spacing",
+    "compose_affine",
+    "frame_from_lps",
+    "is_left_handed",
+    "normal_matrix",
+    "slice_normal",
+    "tilt_degrees",
+]

@@ -1,0 +1,122 @@
+"""The affine from voxel indices (i, j, k) to patient millimetres, and what can be read off it.
+
+An affine is always a 4x4 float64 array that maps column vectors (i, j, k, 1) to (x, y, z, 1) in LPS mm:
+its columns are the step from one column of a slice to the next, from one row to the next, from one slice to
+the next, and the centre of voxel (0, 0, 0).  The slice step is a full vector: with a tilted gantry it is not
+parallel to the slice normal, and the affine is then an exact shear.
+
+Source: DICOM PS3.3 C.7.6.2.1.1 (Image Position and Image Orientation), with the slice step added.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from clrecon.errors import UsageError
+
+__all__ = [
+    "apply_affine",
+    "checked_affine",
+    "column_spacing",
+    "compose_affine",
+    "is_left_handed",
+    "normal_matrix",
+    "slice_normal",
+    "tilt_degrees",
+]
+
+Float64Array = NDArray[np.float64]
+
+
+def compose_affine(i_step: ArrayLike, j_step: ArrayLike, k_step: ArrayLike, origin: ArrayLike) -> Float64Array:
+    """Build the affine from its three steps and the position of voxel (0, 0, 0).
+
+    Parameters
+    ----------
+    i_step, j_step, k_step, origin : array_like, shape (3,)
+        LPS mm.  `i_step` is the row cosines times PixelSpacing[1], `j_step` the column cosines times
+        PixelSpacing[0].
+
+    Returns
+    -------
+    ndarray, shape (4, 4), float64
+    """
+    affine = np.eye(4)
+    for column, vector in enumerate((i_step, j_step, k_step, origin)):
+        affine[:3, column] = vector
+    return affine
+
+
+def checked_affine(affine: ArrayLike) -> Float64Array:
+    """Return `affine` as a float64 copy after checking that it is one.
+
+    Raises
+    ------
+    UsageError
+        Not 4x4, not finite, last row not (0, 0, 0, 1), or singular.
+    """
+    checked = np.array(affine, dtype=np.float64)
+    if checked.shape != (4, 4):
+        raise UsageError(f"an affine is a 4x4 array, this one has shape {checked.shape}")
+    if not np.isfinite(checked).all():
+        raise UsageError("the affine holds NaN or infinite entries")
+    if not np.array_equal(checked[3], (0.0, 0.0, 0.0, 1.0)):
+        raise UsageError(f"the last row of an affine is (0, 0, 0, 1), this one has {checked[3].tolist()}")
+    lengths = np.linalg.norm(checked[:3, :3], axis=0)
+    if lengths.min() == 0.0 or abs(np.linalg.det(checked[:3, :3] / lengths)) < 1e-6:
+        raise UsageError("the affine is singular: its three steps do not span space")
+    return checked
+
+
+def apply_affine(affine: Float64Array, points: ArrayLike) -> Float64Array:
+    """Map points through an affine, in float64.
+
+    Parameters
+    ----------
+    affine : ndarray, shape (4, 4)
+    points : array_like, shape (n, 3)
+
+    Returns
+    -------
+    ndarray, shape (n, 3), float64
+
+    Raises
+    ------
+    UsageError
+        `points` is not (n, 3).
+    """
+    points = np.asarray(points, dtype=np.float64)
+    if points.ndim != 2 or points.shape[1] != 3:
+        raise UsageError(f"points have shape (n, 3), these have {points.shape}")
+    return points @ affine[:3, :3].T + affine[:3, 3]
+
+
+def column_spacing(affine: Float64Array) -> tuple[float, float, float]:
+    """Lengths (di, dj, dk) in mm of the three steps; dk is the length of the full slice step."""
+    di, dj, dk = np.linalg.norm(affine[:3, :3], axis=0)
+    return float(di), float(dj), float(dk)
+
+
+def slice_normal(affine: Float64Array) -> Float64Array:
+    """Unit normal of the slices, row direction x column direction."""
+    normal = np.cross(affine[:3, 0], affine[:3, 1])
+    return normal / np.linalg.norm(normal)
+
+
+def tilt_degrees(affine: Float64Array) -> float:
+    """Angle in degrees between the slice step and the line of the slice normal, 0 for a perpendicular stack."""
+    step, normal = affine[:3, 2], slice_normal(affine)
+    along = float(step @ normal)
+    across = float(np.linalg.norm(step - along * normal))
+    return float(np.degrees(np.arctan2(across, abs(along))))
+
+
+def is_left_handed(affine: Float64Array) -> bool:
+    """True when the three steps form a left-handed system: index space is then mirrored against the patient."""
+    return bool(np.linalg.det(affine[:3, :3]) < 0.0)
+
+
+def normal_matrix(affine: Float64Array) -> Float64Array:
+    """Inverse transpose of the 3x3 part: maps gradients per index step to gradients per mm."""
+    return np.linalg.inv(affine[:3, :3]).T

@@ -1,0 +1,140 @@
+"""The scalar field of a volume, as every surface operator sees it.
+
+What is inside, where between two samples the surface lies, and what is beyond the volume's border: stated once,
+for the device operators and their numpy twins alike.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clrecon.errors import NoSurfaceError, UsageError
+from clrecon.geometry.affine import normal_matrix
+from clrecon.geometry.volume import AIR_HU, Volume
+
+__all__ = ["IsoRule", "choose_iso_rule", "data_range", "slice_normal_matrices", "vertex_margin"]
+
+
+@dataclass(frozen=True)
+class IsoRule:
+    """How one iso value divides one volume.
+
+    Attributes
+    ----------
+    lowest_inside : int or float
+        A sample is inside when its value is >= this.  For integer voxels the lowest integer >= the iso value.
+    iso_level : float
+        Where the surface lies between two samples.  For integer voxels and an integer iso value k it is k - 0.5:
+        between the integers k - 1 and k, so that no vertex ever falls on a sample.
+    outside : float
+        The value beyond the border of a closed volume: the lowest value of the volume, but not below `AIR_HU`.
+    closed : bool
+        The volume is surrounded by `outside`; else the surface ends open at the border.
+    """
+
+    lowest_inside: int | float
+    iso_level: float
+    outside: float
+    closed: bool
+
+    @property
+    def border(self) -> int:
+        """Layers of outside around the volume: 1 when closed, else 0."""
+        return int(self.closed)
+
+
+def data_range(volume: Volume) -> tuple[float, float]:
+    """Lowest and highest value of the volume.
+
+    Raises
+    ------
+    NoSurfaceError
+        The volume holds NaN.
+    """
+    low, high = float(volume.voxels.min()), float(volume.voxels.max())
+    if math.isnan(low) or math.isnan(high):
+        raise NoSurfaceError("the volume holds NaN: it has no iso surface")
+    return low, high
+
+
+def _lowest_value(volume: Volume) -> float:
+    """Lowest value of the volume, or `AIR_HU` as soon as a slice reaches it: what is below does not matter."""
+    low = math.inf
+    for voxels in volume.voxels:
+        low = min(low, float(voxels.min()))
+        if low <= AIR_HU:
+            return float(AIR_HU)
+    return low
+
+
+def choose_iso_rule(volume: Volume, iso_value: float, closed: bool = True) -> IsoRule:
+    """Decide what is inside and where the surface lies.
+
+    Parameters
+    ----------
+    volume : Volume
+    iso_value : float
+        HU.  A sample is inside when its value is >= `iso_value`.
+    closed : bool
+        Surround the volume with outside.
+
+    Raises
+    ------
+    UsageError
+        `iso_value` is NaN or infinite.
+    NoSurfaceError
+        Float voxels that hold NaN or infinite values.
+    """
+    iso_value = float(iso_value)
+    if not math.isfinite(iso_value):
+        raise UsageError(f"the iso value is {iso_value}: give a finite number of HU")
+    dtype = volume.voxels.dtype
+    if dtype.kind == "f":
+        low, high = data_range(volume)
+        if not (math.isfinite(low) and math.isfinite(high)):
+            raise NoSurfaceError(f"the voxels run from {low} to {high}: infinite values have no iso surface")
+        iso_level = float(np.float32(iso_value))
+        lowest_inside: int | float = iso_level
+    else:
+        low = _lowest_value(volume)
+        lowest_inside = math.ceil(iso_value)
+        iso_level = iso_value - 0.5 if lowest_inside == iso_value else iso_value
+    outside = max(low, float(AIR_HU))
+    if outside >= iso_level:
+        # Everything is inside, or the iso value is below air: half a step of the nearest kind beyond the level.
+        outside = iso_level - 0.5
+    return IsoRule(lowest_inside, iso_level, outside, closed)
+
+
+def vertex_margin(volume: Volume, border: int) -> NDArray[np.float64]:
+    """Smallest distance of a vertex from a sample along i, j, k, in index steps.
+
+    Vertices are float32 millimetres: two that lie closer to one sample than a few units in the last place of
+    their coordinates could fall together, and a triangle between them would have no area.  Four units are kept.
+
+    Returns
+    -------
+    ndarray, shape (3,), float64
+        Typically 2e-4 of a step: four times the rounding of the coordinates themselves.
+    """
+    upper = np.array(volume.shape_ijk, dtype=np.float64) - 1.0 + border
+    corners = np.array([(i, j, k) for i in (-border, upper[0]) for j in (-border, upper[1]) for k in (-border, upper[2])])
+    largest = np.abs(volume.ijk_to_lps(corners)).max()
+    unit = float(np.spacing(np.float32(largest)))
+    steps = np.array(volume.spacing)
+    steps[2] = np.linalg.norm(np.diff(volume.slice_origins(border=1), axis=0), axis=1).min()
+    return np.minimum(4.0 * unit / steps, 0.25)
+
+
+def slice_normal_matrices(volume: Volume, border: int) -> NDArray[np.float64]:
+    """For each slice from ``-border`` to ``nk - 1 + border`` the matrix from gradients per step to gradients per mm.
+
+    Returns
+    -------
+    ndarray, shape (nk + 2 * border, 3, 3), float64
+    """
+    return np.broadcast_to(normal_matrix(volume.affine), (volume.shape_ijk[2] + 2 * border, 3, 3))

@@ -1,0 +1,34 @@
+"""Patient frames. Inside clrecon everything is LPS mm; RAS exists only at the border, under its own name.
+
+LPS: x to the patient's left, y to the posterior, z to the superior (DICOM).  RAS: x right, y anterior (NIfTI).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clrecon.errors import UsageError
+
+__all__ = ["SPACES", "frame_from_lps"]
+
+SPACES = ("lps", "ras")
+
+
+def frame_from_lps(space: str) -> NDArray[np.float64]:
+    """Return the 3x3 rotation from LPS mm to `space`.
+
+    Parameters
+    ----------
+    space : {"lps", "ras"}
+
+    Raises
+    ------
+    UsageError
+        Unknown space.
+    """
+    if space == "lps":
+        return np.eye(3)
+    if space == "ras":
+        return np.diag((-1.0, -1.0, 1.0))
+    raise UsageError(f"unknown space {space!r}: use one of {', '.join(SPACES)}")

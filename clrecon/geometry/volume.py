@@ -1,0 +1,115 @@
+"""`Volume`: voxels and the affine that places them in the patient."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from clrecon.errors import UsageError
+from clrecon.geometry.affine import Float64Array, apply_affine, checked_affine, column_spacing
+
+__all__ = ["AIR_HU", "DEVICE_DTYPES", "Volume"]
+
+AIR_HU = -1024
+"""HU given to voxels that hold no measurement (padding).  The floor of the 12-bit CT number scale: air is
+-1000 HU, and a floor below it stays outside of every surface of something that is denser than air."""
+
+DEVICE_DTYPES = tuple(np.dtype(name) for name in ("int8", "uint8", "int16", "uint16", "int32", "float32"))
+"""Voxel types that go to a device as they are; everything else is converted once, when a Volume is made."""
+
+
+def _device_ready(voxels: NDArray[Any]) -> NDArray[Any]:
+    """Return `voxels` C-contiguous in native byte order and in one of `DEVICE_DTYPES`, without loss of range."""
+    dtype = voxels.dtype.newbyteorder("=")
+    if dtype == np.bool_:
+        dtype = np.dtype(np.uint8)
+    elif dtype.kind == "f" and dtype != np.float32:
+        dtype = np.dtype(np.float32)
+    elif dtype.kind in "iu" and dtype not in DEVICE_DTYPES:
+        limits = np.iinfo(np.int32)
+        low, high = int(voxels.min()), int(voxels.max())
+        if low < limits.min or high > limits.max:
+            raise UsageError(f"voxels run from {low} to {high}: integers beyond 32 bits are not supported")
+        dtype = np.dtype(np.int32)
+    elif dtype not in DEVICE_DTYPES:
+        raise UsageError(f"voxels of type {voxels.dtype} are not supported: use integers or floats")
+    return np.ascontiguousarray(voxels, dtype=dtype)
+
+
+class Volume:
+    """Voxels in HU with the affine that places them in the patient.
+
+    Parameters
+    ----------
+    voxels : array_like, shape (nk, nj, ni)
+        One value a voxel, indexed ``voxels[k, j, i]``: i runs along a DICOM row (the column index), j over the
+        rows, k over the slices.  int8, uint8, int16, uint16, int32 and float32 are kept as they are (and not
+        copied when C-contiguous); bool becomes uint8, other floats float32, other integers int32.
+    affine : array_like, shape (4, 4)
+        Index (i, j, k) to LPS mm, see `clrecon.geometry.affine`.
+    report : dict, optional
+        What is known of the origin and the quality of this volume (the certificate of `read_volume`).
+
+    Raises
+    ------
+    UsageError
+        `voxels` is not three-dimensional, empty, or of a type that cannot be used; `affine` is not an affine.
+    """
+
+    def __init__(self, voxels: ArrayLike, affine: ArrayLike, report: dict[str, Any] | None = None):
+        array = np.asarray(voxels)
+        if array.ndim != 3:
+            raise UsageError(f"voxels have three axes (k, j, i), these have shape {array.shape}")
+        if array.size == 0:
+            raise UsageError(f"the volume is empty: its shape is {array.shape}")
+        self._voxels = _device_ready(array)
+        self._affine = checked_affine(affine)
+        self._affine.flags.writeable = False
+        self._inverse = np.linalg.inv(self._affine)
+        self.report: dict[str, Any] = {"warnings": []} if report is None else report
+
+    @property
+    def voxels(self) -> NDArray[Any]:
+        """The voxels, shape (nk, nj, ni)."""
+        return self._voxels
+
+    @property
+    def affine(self) -> Float64Array:
+        """4x4 float64, index (i, j, k) to LPS mm (read-only)."""
+        return self._affine
+
+    @property
+    def spacing(self) -> tuple[float, float, float]:
+        """(di, dj, dk) in mm: the lengths of the affine's three steps."""
+        return column_spacing(self._affine)
+
+    @property
+    def shape_ijk(self) -> tuple[int, int, int]:
+        """(ni, nj, nk), the reverse of ``voxels.shape``."""
+        nk, nj, ni = self._voxels.shape
+        return ni, nj, nk
+
+    def ijk_to_lps(self, points: ArrayLike) -> Float64Array:
+        """Map index coordinates (n, 3), fractions allowed, to LPS mm (n, 3), float64."""
+        return apply_affine(self._affine, points)
+
+    def lps_to_ijk(self, points: ArrayLike) -> Float64Array:
+        """Map LPS mm (n, 3) to index coordinates (n, 3), float64."""
+        return apply_affine(self._inverse, points)
+
+    def slice_origins(self, border: int = 0) -> Float64Array:
+        """Positions in LPS mm of voxel (0, 0, k) for k from ``-border`` to ``nk - 1 + border``.
+
+        Returns
+        -------
+        ndarray, shape (nk + 2 * border, 3), float64
+        """
+        k = np.arange(-border, self._voxels.shape[0] + border, dtype=np.float64)
+        return self._affine[:3, 3] + k[:, None] * self._affine[:3, 2]
+
+    def __repr__(self) -> str:
+        ni, nj, nk = self.shape_ijk
+        di, dj, dk = self.spacing
+        return f"Volume({ni} x {nj} x {nk} {self._voxels.dtype}, spacing {di:.4g} x {dj:.4g} x {dk:.4g} mm)"

@@ -1,0 +1,18 @@
+"""Kernel sources, programs and launches: between the drivers below and the operators above."""
+
+from clrecon.kernels.arrays import allocate, download, empty_output, upload
+from clrecon.kernels.launch import Stopwatch, launch
+from clrecon.kernels.program import load_program
+from clrecon.kernels.sources import kernel_files, read_kernel_source
+
+__all__ = [
+    "Stopwatch",
+    "allocate",
+    "download",
+    "empty_output",
+    "kernel_files",
+    "launch",
+    "load_program",
+    "read_kernel_source",
+    "upload",
+]

@@ -1,0 +1,75 @@
+"""Arrays on a device.  On a CPU device they are numpy's own memory and nothing is copied."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import DTypeLike, NDArray
+
+from clrecon.errors import DeviceError
+from clrecon.opencl import Device
+from clrecon.opencl.context import describe_error
+from clrecon.opencl.quirks import import_pyopencl
+
+__all__ = ["allocate", "download", "empty_output", "upload"]
+
+
+def _make_buffer(device: Device, flags: Any, size: int, host: NDArray[Any] | None = None) -> Any:
+    cl = import_pyopencl()
+    try:
+        if host is None:
+            return cl.Buffer(device.context, flags, size)
+        return cl.Buffer(device.context, flags, hostbuf=host)
+    except cl.Error as error:
+        raise DeviceError(f"{size:,} bytes cannot be had on {device.label}: {describe_error(error)}") from error
+
+
+def allocate(device: Device, size: int) -> Any:
+    """Return a buffer of `size` bytes (at least 4, since OpenCL has no empty buffers)."""
+    cl = import_pyopencl()
+    return _make_buffer(device, cl.mem_flags.READ_WRITE, max(size, 4))
+
+
+def upload(device: Device, array: NDArray[Any]) -> Any:
+    """Return a read-only buffer with the contents of `array`, which must stay unchanged as long as it is used."""
+    cl = import_pyopencl()
+    array = np.ascontiguousarray(array)
+    flags = cl.mem_flags.READ_ONLY
+    if device.shares_host_memory:
+        return _make_buffer(device, flags | cl.mem_flags.USE_HOST_PTR, array.nbytes, array)
+    return _make_buffer(device, flags | cl.mem_flags.COPY_HOST_PTR, array.nbytes, array)
+
+
+def empty_output(device: Device, shape: tuple[int, ...], dtype: DTypeLike) -> tuple[NDArray[Any], Any]:
+    """Return an uninitialised host array and a buffer for the device to write it; `download` fills the array."""
+    cl = import_pyopencl()
+    array: NDArray[Any] = np.empty(shape, dtype=dtype)
+    if device.shares_host_memory and array.nbytes:
+        return array, _make_buffer(device, cl.mem_flags.WRITE_ONLY | cl.mem_flags.USE_HOST_PTR, array.nbytes, array)
+    return array, allocate(device, array.nbytes)
+
+
+def download(device: Device, array: NDArray[Any], array_d: Any) -> NDArray[Any]:
+    """Wait for the device and return `array` with what it wrote to `array_d`.
+
+    Raises
+    ------
+    DeviceError
+        The device failed.
+    """
+    cl = import_pyopencl()
+    if not array.nbytes:
+        return array
+    try:
+        if array_d.flags & cl.mem_flags.USE_HOST_PTR:
+            # A map makes the host memory current; on CPU drivers it moves nothing.
+            mapped, _ = cl.enqueue_map_buffer(
+                device.queue, array_d, cl.map_flags.READ, 0, array.shape, array.dtype, is_blocking=True
+            )
+            mapped.base.release(device.queue)
+        else:
+            cl.enqueue_copy(device.queue, array, array_d, is_blocking=True)
+    except cl.Error as error:
+        raise DeviceError(f"reading from {device.label} failed: {describe_error(error)}") from error
+    return array

@@ -1,0 +1,115 @@
+"""Launch kernels with rounded-up sizes, and add up what they cost."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+from clrecon.errors import DeviceError
+from clrecon.opencl import Device
+from clrecon.opencl.context import describe_error
+from clrecon.opencl.quirks import import_pyopencl
+
+__all__ = ["Stopwatch", "launch"]
+
+
+class Stopwatch:
+    """Wall seconds by part (upload, build, kernels, download) and device seconds by kernel.
+
+    Drivers compile, or fetch from their cache, when a kernel is first launched.  The part "kernels" is therefore
+    what the device itself reports from start to end of each kernel, and the rest of the wall time of a
+    ``running`` block is counted as "build".
+    """
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = {"upload": 0.0, "build": 0.0, "kernels": 0.0, "download": 0.0}
+        self.by_kernel: dict[str, float] = {}
+        self._events: list[tuple[str, Any]] = []
+
+    @contextmanager
+    def timed(self, part: str) -> Iterator[None]:
+        """Add the wall time of the block to `part`."""
+        start = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.seconds[part] += time.perf_counter() - start
+
+    def record(self, kernel: str, event: Any) -> None:
+        """Keep the event of a launch until `settle`."""
+        self._events.append((kernel, event))
+
+    @contextmanager
+    def running(self, device: Device) -> Iterator[None]:
+        """Time a block that launches kernels, and wait for them at its end."""
+        start = time.perf_counter()
+        yield
+        finish(device)
+        wall = time.perf_counter() - start
+        busy = 0.0
+        for kernel, event in self._events:
+            spent = 1e-9 * (event.profile.end - event.profile.start)
+            self.by_kernel[kernel] = self.by_kernel.get(kernel, 0.0) + spent
+            busy += spent
+        self._events.clear()
+        self.seconds["kernels"] += min(busy, wall)
+        self.seconds["build"] += max(wall - busy, 0.0)
+
+
+def finish(device: Device) -> None:
+    """Wait until the queue is empty.
+
+    Raises
+    ------
+    DeviceError
+        A kernel failed.
+    """
+    cl = import_pyopencl()
+    try:
+        device.queue.finish()
+    except cl.Error as error:
+        raise DeviceError(f"device {device.label} failed: {describe_error(error)}") from error
+
+
+def launch(
+    device: Device,
+    kernel: Any,
+    items: int | tuple[int, ...],
+    group: int | tuple[int, ...],
+    *arguments: Any,
+    stopwatch: Stopwatch | None = None,
+) -> None:
+    """Enqueue `kernel` over at least `items` work-items.
+
+    Parameters
+    ----------
+    device : Device
+    kernel : pyopencl.Kernel
+    items, group : int or tuple of int
+        Work-items and work-group size, up to three axes; each axis is rounded up to whole groups, so kernels
+        check their bounds first.
+    *arguments
+        Buffers and numpy scalars, in the kernel's order.
+    stopwatch : Stopwatch, optional
+        Where the time goes.
+
+    Raises
+    ------
+    DeviceError
+        The driver refuses; the message names the kernel and the sizes.
+    """
+    cl = import_pyopencl()
+    items = (items,) if isinstance(items, int) else items
+    group = (group,) if isinstance(group, int) else group
+    rounded = tuple(-(-count // size) * size for count, size in zip(items, group, strict=True))
+    try:
+        event = kernel(device.queue, rounded, group, *arguments)
+    except cl.Error as error:
+        raise DeviceError(
+            f"kernel {kernel.function_name} ({rounded} items in groups of {group}) failed on {device.label}:"
+            f" {describe_error(error)}"
+        ) from error
+    if stopwatch is not None:
+        stopwatch.record(kernel.function_name, event)

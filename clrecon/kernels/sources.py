@@ -1,0 +1,60 @@
+"""The one place that knows where the kernel files are, and how their includes are resolved.
+
+Includes are inlined on the host, each file once, with ``#line`` marks: a compiler error then names the true file
+and line, no ``-I`` path with a space can break a driver, and the whole text is the key of every cache.
+"""
+
+from __future__ import annotations
+
+import re
+from functools import lru_cache
+from importlib import resources
+from importlib.resources.abc import Traversable
+from pathlib import Path
+
+__all__ = ["kernel_files", "kernel_root", "read_kernel_source"]
+
+_KNOWN_HEADER = "include/volume.h"
+_INCLUDE = re.compile(r'^\s*#\s*include\s+"([^"]+)"\s*$')
+
+
+@lru_cache(maxsize=1)
+def kernel_root() -> Traversable:
+    """Return the folder of the kernel files: the installed package, else ``cl/`` beside the sources."""
+    try:
+        root: Traversable = resources.files("clrecon.cl")
+    except ModuleNotFoundError:
+        root = Path(__file__).resolve().parents[2] / "cl"
+    if not root.joinpath(_KNOWN_HEADER).is_file():
+        raise AssertionError(f"clrecon is installed without its kernels: no {_KNOWN_HEADER}")
+    return root
+
+
+def kernel_files() -> list[str]:
+    """Return the names of all ``.cl`` files, relative to the kernel folder, with forward slashes."""
+    names = []
+    for theme in kernel_root().iterdir():
+        if theme.is_dir():
+            names.extend(f"{theme.name}/{file.name}" for file in theme.iterdir() if file.name.endswith(".cl"))
+    return sorted(names)
+
+
+def _inline(name: str, seen: set[str]) -> list[str]:
+    lines = [f'#line 1 "cl/{name}"']
+    for number, line in enumerate(kernel_root().joinpath(name).read_text(encoding="utf-8").splitlines(), start=1):
+        match = _INCLUDE.match(line)
+        if match is None:
+            lines.append(line)
+        elif match[1] not in seen:
+            seen.add(match[1])
+            lines.extend(_inline(match[1], seen))
+            lines.append(f'#line {number + 1} "cl/{name}"')
+        else:
+            lines.append("")
+    return lines
+
+
+@lru_cache(maxsize=None)
+def read_kernel_source(name: str) -> str:
+    """Return the text of kernel file `name` (such as ``"compaction/scan.cl"``) with its includes inlined."""
+    return "\n".join(_inline(name, {name})) + "\n"

@@ -1,0 +1,148 @@
+"""Find the OpenCL devices of the machine and choose one of them."""
+
+from __future__ import annotations
+
+import os
+import platform
+from functools import lru_cache
+from typing import Any
+
+from clrecon.errors import DeviceError
+from clrecon.opencl import quirks
+from clrecon.opencl.context import Device, describe_error
+
+__all__ = ["choose_device", "driver_advice", "list_devices", "list_platforms"]
+
+
+def driver_advice() -> str:
+    """One sentence on how to get an OpenCL driver on this system."""
+    system = platform.system()
+    if system == "Linux":
+        if platform.machine() == "x86_64":
+            return "install the CPU driver with `pip install 'pyopencl[pocl]'` or `apt install pocl-opencl-icd`"
+        return "install the CPU driver with `apt install pocl-opencl-icd`, or the GPU vendor's OpenCL package"
+    if system == "Windows":
+        return "install the GPU vendor's graphics driver, or the Intel CPU runtime with `pip install intel-opencl-rt`"
+    if system == "Darwin":
+        return "install PoCL with `conda install -c conda-forge pocl`, macOS before 15 brings OpenCL itself"
+    return "install the OpenCL driver (ICD) of your device"
+
+
+def _find_platforms() -> list[Any]:
+    """All pyopencl platforms; an empty list where there is no driver."""
+    try:
+        cl = quirks.import_pyopencl()
+    except ImportError as error:
+        raise DeviceError(f"pyopencl cannot be imported ({error}): reinstall clrecon") from error
+    try:
+        return list(cl.get_platforms())
+    except cl.Error:  # PLATFORM_NOT_FOUND_KHR: the loader is there, no driver is
+        return []
+
+
+@lru_cache(maxsize=1)
+def _discover() -> tuple[tuple[tuple[str, str, str], ...], tuple[Device, ...]]:
+    """((name, version, note) of each platform, all devices), found once a process."""
+    platforms: list[tuple[str, str, str]] = []
+    devices: list[Device] = []
+    for cl_platform in _find_platforms():
+        cl = quirks.import_pyopencl()
+        note = ""
+        try:
+            found = cl_platform.get_devices()
+        except cl.Error as error:  # DEVICE_NOT_FOUND is the normal answer of a driver without its hardware
+            found = []
+            if "DEVICE_NOT_FOUND" not in str(error):
+                note = describe_error(error)
+        devices.extend(Device(len(devices) + n, cl_platform, cl_device) for n, cl_device in enumerate(found))
+        platforms.append((cl_platform.name.strip(), cl_platform.version.strip(), note or f"{len(found)} devices"))
+    return tuple(platforms), tuple(devices)
+
+
+def list_platforms() -> list[dict[str, str]]:
+    """Name, version and a note of every OpenCL platform, also of those without a device."""
+    return [{"name": name, "version": version, "note": note} for name, version, note in _discover()[0]]
+
+
+def list_devices() -> list[Device]:
+    """Every OpenCL device of the machine, simulators included, in the order of the drivers.
+
+    Returns
+    -------
+    list of Device
+        Empty where no driver is installed.
+
+    Raises
+    ------
+    DeviceError
+        pyopencl itself cannot be imported.
+    """
+    return list(_discover()[1])
+
+
+def _list_for_message(devices: list[Device]) -> str:
+    return "; ".join(f"{device.index}: {device.label}" for device in devices)
+
+
+def _match(devices: list[Device], wanted: str) -> list[Device]:
+    """Devices that `wanted` names: by index, by type, or by a part of the platform's or device's name."""
+    if wanted.isdigit():
+        return [device for device in devices if device.index == int(wanted)]
+    wanted = wanted.lower()
+    of_type = [device for device in devices if device.type == wanted and not device.is_simulator]
+    if of_type:
+        return of_type
+    return [device for device in devices if wanted in f"{device.platform} {device.name}".lower()]
+
+
+def _named_by_pyopencl(cl: Any, devices: list[Device]) -> list[Device]:
+    """The device that PYOPENCL_CTX asks for, in pyopencl's own notation."""
+    try:
+        asked = cl.create_some_context(interactive=False).devices
+    except Exception as error:  # pyopencl raises RuntimeError, IndexError or its own errors here
+        raise DeviceError(f"PYOPENCL_CTX={os.environ['PYOPENCL_CTX']!r}: {describe_error(error)}") from error
+    return [device for device in devices if device.cl_device in asked]
+
+
+def choose_device(name: str | int | Device | None = None) -> Device:
+    """Choose the device to work on.
+
+    Parameters
+    ----------
+    name : str, int or Device, optional
+        Index as `list_devices` counts, "cpu" or "gpu", or a part of the name of a device or platform; of several
+        that match the best is taken.  None or "auto": what CLRECON_DEVICE says, else PYOPENCL_CTX, else the best
+        of all: GPUs before accelerators before CPUs before software rasterisers, then by memory.  A simulator is
+        used only when it is named.
+
+    Returns
+    -------
+    Device
+
+    Raises
+    ------
+    DeviceError
+        No driver, no device, or none of that name (the message lists what is there).
+    """
+    if isinstance(name, Device):
+        return name
+    devices = list_devices()
+    if not devices:
+        raise DeviceError(f"no OpenCL device found: {driver_advice()}")
+    wanted, source = ("", "") if name is None else (str(name).strip(), "device")
+    if wanted.lower() in ("", "auto"):
+        wanted, source = os.environ.get("CLRECON_DEVICE", "").strip(), "CLRECON_DEVICE"
+    if wanted.lower() not in ("", "auto"):
+        matches = _match(devices, wanted)
+        if not matches:
+            raise DeviceError(f"{source} {wanted!r} is not there; found {_list_for_message(devices)}")
+        return max(matches, key=lambda device: (not device.is_simulator, device.score))
+    if os.environ.get("PYOPENCL_CTX"):
+        matches = _named_by_pyopencl(quirks.import_pyopencl(), devices)
+    else:
+        matches = [device for device in devices if not device.is_simulator]
+    if not matches:
+        raise DeviceError(
+            f"only simulators found ({_list_for_message(devices)}): name one with --device, or {driver_advice()}"
+        )
+    return max(matches, key=lambda device: device.score)

@@ -1,0 +1,110 @@
+"""Exclusive scan and stream compaction: the two words that the other operators are written with."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from clrecon.kernels import Stopwatch, allocate, download, launch, load_program
+from clrecon.opencl import Device
+
+__all__ = ["Compacted", "Scanned", "compact", "exclusive_scan"]
+
+SCAN_GROUP = 64
+SCAN_BLOCK = SCAN_GROUP * 16
+"""Work-group size and elements a work-group of cl/compaction/scan.cl."""
+
+COMPACT_WORDS = 8
+"""Words a work-item of cl/compaction/compact.cl."""
+
+GROUP = 64
+
+
+@dataclass(frozen=True)
+class Scanned:
+    """Offsets on the device, (n,) uint32, and the exact total.  Offsets are modulo 2^32: check the total."""
+
+    offsets_d: Any
+    total: int
+
+
+@dataclass(frozen=True)
+class Compacted:
+    """Positions of the set bits on the device, (count,) uint32, ascending."""
+
+    positions_d: Any
+    count: int
+
+
+def exclusive_scan(device: Device, counts_d: Any, n: int, *, stopwatch: Stopwatch | None = None) -> Scanned:
+    """Sum of all counts before each element.
+
+    Parameters
+    ----------
+    device : Device
+    counts_d : buffer, (n,) uint32
+    n : int
+        Elements, at least 1.
+    stopwatch : Stopwatch, optional
+
+    Returns
+    -------
+    Scanned
+
+    Raises
+    ------
+    DeviceError
+        The device fails.
+    """
+    scan = load_program(device, "compaction/scan.cl")
+    blocks = -(-n // SCAN_BLOCK)
+    sums_d, block_offsets_d, total_d = (allocate(device, 4 * blocks), allocate(device, 4 * blocks), allocate(device, 8))
+    offsets_d = allocate(device, 4 * n)
+    size, items = np.uint32(n), blocks * SCAN_GROUP
+    launch(device, scan["sum_blocks"], items, SCAN_GROUP, counts_d, sums_d, size, stopwatch=stopwatch)
+    launch(
+        device, scan["scan_block_sums"], SCAN_GROUP, SCAN_GROUP,
+        sums_d, block_offsets_d, total_d, np.uint32(blocks), stopwatch=stopwatch,
+    )  # fmt: skip
+    launch(
+        device, scan["scan_blocks"], items, SCAN_GROUP, counts_d, block_offsets_d, offsets_d, size, stopwatch=stopwatch
+    )
+    total = download(device, np.empty(1, dtype=np.uint64), total_d)
+    return Scanned(offsets_d, int(total[0]))
+
+
+def compact(device: Device, mask_d: Any, words: int, *, stopwatch: Stopwatch | None = None) -> Compacted:
+    """Positions of the set bits of a bit mask.
+
+    Parameters
+    ----------
+    device : Device
+    mask_d : buffer, (words,) uint32
+        Bit b of word w is position ``32 * w + b``.
+    words : int
+        At least 1, at most 2^27, so that positions fit 32 bits.
+    stopwatch : Stopwatch, optional
+
+    Returns
+    -------
+    Compacted
+
+    Raises
+    ------
+    DeviceError
+        The device fails.
+    """
+    program = load_program(device, "compaction/compact.cl")
+    chunks = -(-words // COMPACT_WORDS)
+    counts_d = allocate(device, 4 * chunks)
+    size = np.uint32(words)
+    launch(device, program["count_set_bits"], chunks, GROUP, mask_d, counts_d, size, stopwatch=stopwatch)
+    scanned = exclusive_scan(device, counts_d, chunks, stopwatch=stopwatch)
+    positions_d = allocate(device, 4 * scanned.total)
+    launch(
+        device, program["list_set_bits"], chunks, GROUP,
+        mask_d, scanned.offsets_d, positions_d, size, stopwatch=stopwatch,
+    )  # fmt: skip
+    return Compacted(positions_d, scanned.total)

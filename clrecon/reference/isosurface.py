@@ -1,0 +1,111 @@
+"""Twin of `clrecon.operators.isosurface`: marching cubes in plain numpy, in float64."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clrecon.geometry import Volume, is_left_handed
+from clrecon.geometry.field import IsoRule, choose_iso_rule, slice_normal_matrices, vertex_margin
+from clrecon.reference.case_table import CORNERS, EDGES, case_table
+
+__all__ = ["extract_isosurface"]
+
+
+def _grid(volume: Volume, rule: IsoRule, layers: int) -> NDArray[np.float64]:
+    """The samples as float64, grown by `layers` of outside (closed) or of the border's own values (open)."""
+    values = volume.voxels.astype(np.float64)
+    if rule.closed:
+        return np.pad(values, layers, constant_values=rule.outside)
+    return np.pad(values, layers, mode="edge")
+
+
+def _gradients(volume: Volume, rule: IsoRule) -> NDArray[np.float64]:
+    """Gradient per index step (d/di, d/dj, d/dk) at every sample: central, one-sided at an open border."""
+    field = _grid(volume, rule, rule.border + 1)
+    parts = []
+    for axis in (2, 1, 0):
+        change = np.diff(field, axis=axis)
+        first = np.take(change, range(change.shape[axis] - 1), axis=axis)
+        second = np.take(change, range(1, change.shape[axis]), axis=axis)
+        weight = np.full(first.shape[axis], 0.5)
+        if not rule.closed:
+            weight[[0, -1]] = 1.0
+        shape = [1, 1, 1]
+        shape[axis] = -1
+        inner = [slice(1, -1)] * 3
+        inner[axis] = slice(None)
+        parts.append(((first + second) * weight.reshape(shape))[tuple(inner)])
+    return np.stack(parts, axis=-1)
+
+
+def _find_triangles(inside: NDArray[np.bool_], numbers: NDArray[np.int64]) -> NDArray[np.uint32]:
+    """Triangles of all cells, cell by cell; `numbers[k, j, i, axis]` is the vertex on the edge a sample owns."""
+    gk, gj, gi = inside.shape
+    cases = np.zeros((gk - 1, gj - 1, gi - 1), dtype=np.int64)
+    for corner, (x, y, z) in enumerate(CORNERS):
+        cases |= inside[z : gk - 1 + z, y : gj - 1 + y, x : gi - 1 + x].astype(np.int64) << corner
+    table = case_table()
+    triangles = []
+    for k, j, i in np.argwhere((cases != 0) & (cases != 255)):
+        for triangle in table[cases[k, j, i]]:
+            corners = (CORNERS[EDGES[edge][1]] for edge in triangle)
+            triangles.append(
+                [numbers[k + z, j + y, i + x, EDGES[edge][0]] for edge, (x, y, z) in zip(triangle, corners, strict=True)]
+            )
+    return np.array(triangles, dtype=np.uint32).reshape(-1, 3)
+
+
+def extract_isosurface(
+    volume: Volume, iso_value: float, *, closed: bool = True
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.uint32]]:
+    """Extract the iso surface of a small volume.
+
+    Parameters
+    ----------
+    volume : Volume
+    iso_value : float
+        HU.
+    closed : bool
+        Surround the volume with outside.
+
+    Returns
+    -------
+    vertices : ndarray, shape (n, 3), float64, LPS mm
+    normals : ndarray, shape (n, 3), float64, unit, towards lower values
+    triangles : ndarray, shape (m, 3), uint32, counter-clockwise as seen from lower values
+    """
+    rule = choose_iso_rule(volume, iso_value, closed)
+    field = _grid(volume, rule, rule.border)
+    inside = _grid(volume, rule, rule.border) >= rule.lowest_inside
+    if rule.closed:
+        inside[[0, -1]] = inside[:, [0, -1]] = inside[:, :, [0, -1]] = False
+    gradients = _gradients(volume, rule)
+
+    crossed = np.zeros((*inside.shape, 3), dtype=bool)
+    crossed[:, :, :-1, 0] = inside[:, :, :-1] != inside[:, :, 1:]
+    crossed[:, :-1, :, 1] = inside[:, :-1, :] != inside[:, 1:, :]
+    crossed[:-1, :, :, 2] = inside[:-1, :, :] != inside[1:, :, :]
+    numbers = (np.cumsum(crossed) - 1).reshape(crossed.shape)
+    triangles = _find_triangles(inside, numbers)
+
+    owner = np.argwhere(crossed)
+    k, j, i, axis = owner.T
+    step = np.eye(3, dtype=np.int64)[axis]
+    i1, j1, k1 = i + step[:, 0], j + step[:, 1], k + step[:, 2]
+    value, next_value = field[k, j, i], field[k1, j1, i1]
+    margin = vertex_margin(volume, rule.border)[axis]
+    t = np.clip((rule.iso_level - value) / (next_value - value), margin, 1.0 - margin)[:, None]
+
+    origins = volume.slice_origins(rule.border)
+    here = np.stack([i, j], axis=1) - rule.border
+    positions = origins[k] + (here + t * step[:, :2]) @ volume.affine[:3, :2].T + t * (origins[k1] - origins[k])
+
+    slope = (1.0 - t) * gradients[k, j, i] + t * gradients[k1, j1, i1]
+    flat = ~slope.any(axis=1)
+    slope[flat] = ((next_value - value)[:, None] * step)[flat]
+    normals = -np.einsum("nij,nj->ni", slice_normal_matrices(volume, rule.border)[k], slope)
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    if is_left_handed(volume.affine):
+        triangles = triangles[:, ::-1].copy()
+    return positions, normals, triangles
