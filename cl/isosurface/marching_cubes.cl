@@ -34,18 +34,20 @@ static inline uint pack_lanes(short16 lanes)
  *             ni nj nk   voxels
  *             border     layers of outside around the volume, 0 or 1
  *             words      words a row, ceil((ni + 2 border) / 32)
- * Launch      global = (words, gj, gk), local = any divisor the host chooses (it rounds up)
+ * Launch      global = gk * gj * words rounded up by the host, any local
  * Guarantees  every word of the mask is written; bits beyond the row are 0 */
 __kernel void classify_samples(
     __global const VOXEL *restrict voxels, __global uint *restrict mask, const VOXEL level,
     const int ni, const int nj, const int nk, const int border, const int words)
 {
-    const int w = get_global_id(0);
-    const int gj = get_global_size(1);
-    const int j = (int)get_global_id(1) - border;
-    const int k = (int)get_global_id(2) - border;
-    if (w >= words)
+    const uint gj = nj + 2 * border, gk = nk + 2 * border;
+    const size_t at = get_global_id(0);
+    if (at >= (size_t)gk * gj * words)
         return;
+    const int w = at % words;
+    const uint row_number = at / words;
+    const int j = (int)(row_number % gj) - border;
+    const int k = (int)(row_number / gj) - border;
     uint bits = 0;
     if (j >= 0 && j < nj && k >= 0 && k < nk) {
         const int first = 32 * w - border;
@@ -65,7 +67,7 @@ __kernel void classify_samples(
                 bits |= (uint)(row[first + b] >= level) << b;
         }
     }
-    mask[((size_t)get_global_id(2) * gj + get_global_id(1)) * words + w] = bits;
+    mask[at] = bits;
 }
 
 /* Parameters  mask             in   (gk, gj, words)

@@ -27,6 +27,7 @@ __all__ = [
 ]
 
 Float64Array = NDArray[np.float64]
+"""What every function here takes and gives."""
 
 
 def compose_affine(i_step: ArrayLike, j_step: ArrayLike, k_step: ArrayLike, origin: ArrayLike) -> Float64Array:
@@ -101,7 +102,7 @@ def column_spacing(affine: Float64Array) -> tuple[float, float, float]:
 def slice_normal(affine: Float64Array) -> Float64Array:
     """Unit normal of the slices, row direction x column direction."""
     normal = np.cross(affine[:3, 0], affine[:3, 1])
-    return normal / np.linalg.norm(normal)
+    return np.asarray(normal / np.linalg.norm(normal), dtype=np.float64)
 
 
 def tilt_degrees(affine: Float64Array) -> float:
@@ -119,4 +120,4 @@ def is_left_handed(affine: Float64Array) -> bool:
 
 def normal_matrix(affine: Float64Array) -> Float64Array:
     """Inverse transpose of the 3x3 part: maps gradients per index step to gradients per mm."""
-    return np.linalg.inv(affine[:3, :3]).T
+    return np.asarray(np.linalg.inv(affine[:3, :3]).T, dtype=np.float64)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -121,9 +122,8 @@ def vertex_margin(volume: Volume, border: int) -> NDArray[np.float64]:
     ndarray, shape (3,), float64
         Typically 2e-4 of a step: four times the rounding of the coordinates themselves.
     """
-    upper = np.array(volume.shape_ijk, dtype=np.float64) - 1.0 + border
-    corners = np.array([(i, j, k) for i in (-border, upper[0]) for j in (-border, upper[1]) for k in (-border, upper[2])])
-    largest = np.abs(volume.ijk_to_lps(corners)).max()
+    ends = [(-border, n - 1 + border) for n in volume.shape_ijk]
+    largest = np.abs(volume.ijk_to_lps(list(product(*ends)))).max()
     unit = float(np.spacing(np.float32(largest)))
     steps = np.array(volume.spacing)
     steps[2] = np.linalg.norm(np.diff(volume.slice_origins(border=1), axis=0), axis=1).min()

@@ -67,7 +67,7 @@ class Volume:
         self._voxels = _device_ready(array)
         self._affine = checked_affine(affine)
         self._affine.flags.writeable = False
-        self._inverse = np.linalg.inv(self._affine)
+        self._inverse = np.asarray(np.linalg.inv(self._affine), dtype=np.float64)
         self.report: dict[str, Any] = {"warnings": []} if report is None else report
 
     @property

@@ -20,7 +20,7 @@ class Stopwatch:
 
     Drivers compile, or fetch from their cache, when a kernel is first launched.  The part "kernels" is therefore
     what the device itself reports from start to end of each kernel, and the rest of the wall time of a
-    ``running`` block is counted as "build".
+    ``running`` block is counted as "build".  Where a driver's event times say nothing, all of it is "kernels".
     """
 
     def __init__(self) -> None:
@@ -54,6 +54,8 @@ class Stopwatch:
             self.by_kernel[kernel] = self.by_kernel.get(kernel, 0.0) + spent
             busy += spent
         self._events.clear()
+        if not device.has_event_times:
+            busy = wall
         self.seconds["kernels"] += min(busy, wall)
         self.seconds["build"] += max(wall - busy, 0.0)
 

@@ -59,4 +59,5 @@ def load_program(device: Device, name: str, variants: Mapping[str, str] | None =
             lines = [line.strip() for line in str(error).splitlines() if line.strip()]
             first = next((line for line in lines if "error" in line.lower() and "cl/" in line), lines[0])
             raise DeviceError(f"cl/{name} does not build on {device.label}: {first}") from error
-    return device.programs[key]
+    program: Program = device.programs[key]
+    return program

@@ -7,7 +7,7 @@ and line, no ``-I`` path with a space can break a driver, and the whole text is 
 from __future__ import annotations
 
 import re
-from functools import lru_cache
+from functools import cache
 from importlib import resources
 from importlib.resources.abc import Traversable
 from pathlib import Path
@@ -18,7 +18,7 @@ _KNOWN_HEADER = "include/volume.h"
 _INCLUDE = re.compile(r'^\s*#\s*include\s+"([^"]+)"\s*$')
 
 
-@lru_cache(maxsize=1)
+@cache
 def kernel_root() -> Traversable:
     """Return the folder of the kernel files: the installed package, else ``cl/`` beside the sources."""
     try:
@@ -32,7 +32,7 @@ def kernel_root() -> Traversable:
 
 def kernel_files() -> list[str]:
     """Return the names of all ``.cl`` files, relative to the kernel folder, with forward slashes."""
-    names = []
+    names: list[str] = []
     for theme in kernel_root().iterdir():
         if theme.is_dir():
             names.extend(f"{theme.name}/{file.name}" for file in theme.iterdir() if file.name.endswith(".cl"))
@@ -54,7 +54,7 @@ def _inline(name: str, seen: set[str]) -> list[str]:
     return lines
 
 
-@lru_cache(maxsize=None)
+@cache
 def read_kernel_source(name: str) -> str:
     """Return the text of kernel file `name` (such as ``"compaction/scan.cl"``) with its includes inlined."""
     return "\n".join(_inline(name, {name})) + "\n"

@@ -51,6 +51,7 @@ class Device:
         self.max_work_group_size: int = cl_device.max_work_group_size
         self.is_simulator: bool = quirks.is_simulator(self.platform)
         self.shares_host_memory: bool = quirks.shares_host_memory(self.platform, self.type)
+        self.has_event_times: bool = quirks.has_event_times(self.platform)
         self.programs: dict[tuple[str, tuple[str, ...]], Any] = {}
 
     @property

@@ -36,8 +36,8 @@ def check_budget(device: Device, buffers: Mapping[str, int]) -> int:
     for what, size in buffers.items():
         if size > device.max_allocation_bytes:
             raise DeviceError(
-                f"the {what} needs a buffer of {_mib(size)}, device {device.label} allows {_mib(device.max_allocation_bytes)}:"
-                " use a device with more memory or a smaller volume"
+                f"the {what} needs a buffer of {_mib(size)}, device {device.label} allows"
+                f" {_mib(device.max_allocation_bytes)}: use a device with more memory or a smaller volume"
             )
     total = sum(buffers.values())
     if total > device.memory_bytes:

@@ -3,15 +3,22 @@
 from __future__ import annotations
 
 import os
-from types import ModuleType
+from typing import Any
 
-__all__ = ["SIMULATOR_PLATFORMS", "import_pyopencl", "is_simulator", "is_software_gpu", "shares_host_memory"]
+__all__ = [
+    "SIMULATOR_PLATFORMS",
+    "has_event_times",
+    "import_pyopencl",
+    "is_simulator",
+    "is_software_gpu",
+    "shares_host_memory",
+]
 
 SIMULATOR_PLATFORMS = ("oclgrind",)
 """Simulators claim to be fast devices (Oclgrind: CPU, GPU and accelerator at once) and are 1000 times slower."""
 
 
-def import_pyopencl() -> ModuleType:
+def import_pyopencl() -> Any:
     """Import pyopencl once its environment is safe.
 
     pyopencl 2026.1 reads PYOPENCL_CACHE_FAILURE_FATAL without a default when its binary cache cannot be used
@@ -40,3 +47,8 @@ def shares_host_memory(platform_name: str, device_type: str) -> bool:
     buffers that they own, so both get buffers and copies like a GPU.
     """
     return device_type == "cpu" and not is_simulator(platform_name) and "rusticl" not in platform_name.lower()
+
+
+def has_event_times(platform_name: str) -> bool:
+    """False where profiling events say nothing: rusticl of Mesa 22 reports some nanoseconds for any kernel."""
+    return "rusticl" not in platform_name.lower()

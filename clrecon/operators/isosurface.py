@@ -95,7 +95,8 @@ def _refuse_level(volume: Volume, iso_value: float) -> NoSurfaceError:
     low, high = data_range(volume)
     where = "above" if iso_value > high else "below" if iso_value <= low else "within"
     return NoSurfaceError(
-        f"no surface at {iso_value:g} HU: the volume runs from {low:g} to {high:g} HU, the iso value lies {where} that range"
+        f"no surface at {iso_value:g} HU: the volume runs from {low:g} to {high:g} HU,"
+        f" the iso value lies {where} that range"
     )
 
 
@@ -136,7 +137,7 @@ def _classify(device: Device, grid: _SampleGrid, program: Any, voxels_d: Any, le
     ni, nj, nk = grid.volume.shape_ijk
     mask_d = allocate(device, 4 * grid.rows * grid.words)
     launch(
-        device, program["classify_samples"], (grid.words, *grid.shape[1:]), (1, 1, 1),
+        device, program["classify_samples"], grid.rows * grid.words, GROUP,
         voxels_d, mask_d, level,
         np.int32(ni), np.int32(nj), np.int32(nk), np.int32(grid.rule.border), np.int32(grid.words),
         stopwatch=stopwatch,

@@ -46,7 +46,7 @@ _EDGE_OF_CORNERS = {frozenset((low, high)): number for number, (_, low, high) in
 
 def _derive_faces() -> tuple[tuple[int, ...], ...]:
     """The corners of each face, counter-clockwise as seen from outside the cell."""
-    faces = []
+    faces: list[tuple[int, ...]] = []
     for axis in range(3):
         u, v = 1 << (axis + 1) % 3, 1 << (axis + 2) % 3
         faces.append((0, v, u | v, u))

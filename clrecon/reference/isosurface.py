@@ -49,10 +49,8 @@ def _find_triangles(inside: NDArray[np.bool_], numbers: NDArray[np.int64]) -> ND
     triangles = []
     for k, j, i in np.argwhere((cases != 0) & (cases != 255)):
         for triangle in table[cases[k, j, i]]:
-            corners = (CORNERS[EDGES[edge][1]] for edge in triangle)
-            triangles.append(
-                [numbers[k + z, j + y, i + x, EDGES[edge][0]] for edge, (x, y, z) in zip(triangle, corners, strict=True)]
-            )
+            owned = ((EDGES[edge][0], CORNERS[EDGES[edge][1]]) for edge in triangle)
+            triangles.append([numbers[k + z, j + y, i + x, axis] for axis, (x, y, z) in owned])
     return np.array(triangles, dtype=np.uint32).reshape(-1, 3)
 
 

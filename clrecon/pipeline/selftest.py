@@ -1,0 +1,103 @@
+"""Hold every operator against its numpy twin on the device that will be used, on small volumes."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clrecon.errors import DeviceError
+from clrecon.geometry import Volume
+from clrecon.kernels import download, upload
+from clrecon.opencl import Device
+from clrecon.operators.compaction import compact, exclusive_scan
+from clrecon.operators.isosurface import extract_isosurface
+from clrecon.reference import compaction as compaction_twin
+from clrecon.reference import isosurface as isosurface_twin
+
+__all__ = ["run_selftest"]
+
+VERTEX_TOLERANCE_VOXEL = 1e-4
+"""Device against twin: float32 against float64, in units of the smallest voxel edge."""
+
+OBLIQUE = np.array([[0.7, 0.1, 0.05, -250.0], [-0.1, 0.5, 0.2, -300.0], [0.0, 0.05, 2.5, -846.0], [0.0, 0.0, 0.0, 1.0]])
+"""Anisotropic, oblique and sheared, far from the origin."""
+
+
+def _random_integers(shape: tuple[int, ...], dtype: str, high: int) -> NDArray[Any]:
+    return np.random.default_rng(20).integers(0, high, shape).astype(dtype)
+
+
+def _check_scan(device: Device) -> str:
+    for n in (1, 63, 64, 65, 1023, 1024, 1025, 70_001):
+        counts = _random_integers((n,), "uint32", 9)
+        expected, total = compaction_twin.exclusive_scan(counts)
+        scanned = exclusive_scan(device, upload(device, counts), n)
+        offsets = download(device, np.empty(n, dtype=np.uint32), scanned.offsets_d)
+        if scanned.total != total or not np.array_equal(offsets, expected):
+            raise DeviceError(f"wrong sums of {n} elements")
+    return "8 sizes from 1 to 70,001 equal"
+
+
+def _check_compaction(device: Device) -> str:
+    for words in (1, 7, 8, 9, 513, 4001):
+        mask = _random_integers((words,), "uint32", 2**32) & _random_integers((words,), "uint32", 2**31)
+        expected = compaction_twin.compact(mask)
+        compacted = compact(device, upload(device, mask), words)
+        positions = download(device, np.empty(compacted.count, dtype=np.uint32), compacted.positions_d)
+        if not np.array_equal(positions, expected):
+            raise DeviceError(f"wrong positions in a mask of {words} words")
+    return "6 masks from 1 to 4,001 words equal"
+
+
+def _check_isosurface(device: Device) -> str:
+    worst = 0.0
+    cases = (
+        ((7, 9, 33), "int16", 3.0, True, OBLIQUE),
+        ((6, 5, 70), "uint8", 2.0, False, OBLIQUE @ np.diag((-1.0, 1.0, 1.0, 1.0))),
+        ((5, 6, 31), "float32", 2.5, True, np.diag((0.5, 0.7, 2.5, 1.0))),
+    )
+    for shape, dtype, iso_value, closed, affine in cases:
+        volume = Volume(_random_integers(shape, dtype, 6), affine)
+        vertices, _, triangles = isosurface_twin.extract_isosurface(volume, iso_value, closed=closed)
+        mesh = extract_isosurface(volume, iso_value, device, closed=closed)
+        if not np.array_equal(mesh.triangles, triangles):
+            raise DeviceError(f"wrong triangles for {dtype} voxels")
+        distance = float(np.abs(mesh.vertices - vertices).max()) / min(volume.spacing)
+        if not distance <= VERTEX_TOLERANCE_VOXEL:
+            raise DeviceError(f"vertices {distance:.2g} voxel off for {dtype} voxels, allowed {VERTEX_TOLERANCE_VOXEL:g}")
+        worst = max(worst, distance)
+    return f"3 volumes: triangles equal, vertices within {worst:.1e} voxel"
+
+
+CHECKS: tuple[tuple[str, Callable[[Device], str]], ...] = (
+    ("exclusive_scan", _check_scan),
+    ("compact", _check_compaction),
+    ("extract_isosurface", _check_isosurface),
+)
+
+
+def run_selftest(device: Device) -> Iterator[dict[str, Any]]:
+    """Check every operator on `device`, one result as soon as it is known.
+
+    Yields
+    ------
+    dict
+        ``operator`` (str), ``passed`` (bool), ``detail`` (str: what was compared, or what is wrong) and
+        ``seconds`` (float, kernel builds included).
+    """
+    for operator, check in CHECKS:
+        start = time.perf_counter()
+        try:
+            passed, detail = True, check(device)
+        except DeviceError as error:
+            passed, detail = False, str(error)
+        yield {
+            "operator": operator,
+            "passed": passed,
+            "detail": detail,
+            "seconds": round(time.perf_counter() - start, 3),
+        }

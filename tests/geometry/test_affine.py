@@ -1,0 +1,84 @@
+"""The affine: composed, applied, inverted, and what is read off it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from clrecon.errors import UsageError
+from clrecon.geometry import (
+    Volume,
+    apply_affine,
+    column_spacing,
+    compose_affine,
+    frame_from_lps,
+    is_left_handed,
+    normal_matrix,
+    slice_normal,
+    tilt_degrees,
+)
+from clrecon.geometry.affine import checked_affine
+
+ROW = np.array([0.8, 0.6, 0.0])
+COLUMN = np.array([-0.36, 0.48, 0.8])
+
+
+def test_compose_places_columns_rows_and_slices():
+    affine = compose_affine(ROW * 0.5, COLUMN * 0.7, (0.0, 0.3, 2.5), (-10.0, 20.0, 30.0))
+    mapped = apply_affine(affine, [(0, 0, 0), (2, 0, 0), (0, 2, 0), (0, 0, 2)])
+    assert np.allclose(mapped[0], (-10, 20, 30))
+    assert np.allclose(mapped[1] - mapped[0], ROW)
+    assert np.allclose(mapped[2] - mapped[0], COLUMN * 1.4)
+    assert np.allclose(mapped[3] - mapped[0], (0, 0.6, 5.0))
+    assert column_spacing(affine) == pytest.approx((0.5, 0.7, np.hypot(0.3, 2.5)))
+
+
+@pytest.mark.parametrize("tilt", [0.0, 1.0, 12.0, -20.0])
+def test_tilt_is_the_angle_between_step_and_normal(tilt):
+    angle = np.radians(tilt)
+    affine = compose_affine((0.5, 0, 0), (0, 0.7 * np.cos(angle), 0.7 * np.sin(angle)), (0, 0, 1.25), (1, 2, 3))
+    assert tilt_degrees(affine) == pytest.approx(abs(tilt), abs=1e-9)
+    assert np.allclose(slice_normal(affine), (0, -np.sin(angle), np.cos(angle)))
+
+
+def test_handedness_follows_the_determinant():
+    affine = compose_affine(ROW, COLUMN, np.cross(ROW, COLUMN), (0, 0, 0))
+    assert not is_left_handed(affine)
+    assert is_left_handed(affine @ np.diag((1.0, 1.0, -1.0, 1.0)))
+
+
+def test_normal_matrix_keeps_normals_perpendicular_under_shear():
+    affine = compose_affine((0.7, 0, 0), (0, 0.5, 0.1), (0.2, -0.4, 2.5), (0, 0, 0))
+    tangents = np.array([(1.0, 2.0, 0.0), (0.0, 1.0, -3.0)])
+    index_normal = np.cross(*tangents)
+    normal = normal_matrix(affine) @ index_normal
+    assert np.allclose(tangents @ affine[:3, :3].T @ normal, 0.0, atol=1e-12)
+
+
+def test_ras_negates_x_and_y_and_is_a_rotation():
+    rotation = frame_from_lps("ras")
+    assert np.array_equal(rotation @ (1.0, 2.0, 3.0), (-1.0, -2.0, 3.0))
+    assert np.linalg.det(rotation) == pytest.approx(1.0)
+    with pytest.raises(UsageError, match="mri"):
+        frame_from_lps("mri")
+
+
+@pytest.mark.parametrize(
+    ("affine", "says"),
+    [
+        (np.eye(3), "4x4"),
+        (np.diag((1.0, 1.0, np.nan, 1.0)), "NaN"),
+        (np.diag((1.0, 1.0, 0.0, 1.0)), "singular"),
+        (np.array([[1, 1, 0, 0], [1, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1.0]]), "singular"),
+        (np.eye(4) * 2.0, "last row"),
+    ],
+)
+def test_what_is_no_affine_is_refused(affine, says):
+    with pytest.raises(UsageError, match=says):
+        checked_affine(affine)
+
+
+def test_points_must_come_as_n_by_3():
+    volume = Volume(np.zeros((2, 3, 4), np.int16), np.eye(4))
+    with pytest.raises(UsageError, match=r"\(n, 3\)"):
+        volume.ijk_to_lps((1.0, 2.0, 3.0))

@@ -1,0 +1,82 @@
+"""`Volume`: axis order, types, and the way to millimetres and back."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from clrecon.errors import UsageError
+from clrecon.geometry import Volume
+from clrecon.geometry.volume import DEVICE_DTYPES
+
+OBLIQUE = np.array([[0.7, 0.1, 0.05, -250.0], [-0.1, 0.5, 0.2, -300.0], [0.0, 0.05, 2.5, -846.0], [0, 0, 0, 1.0]])
+
+
+def test_shape_is_reversed_between_subscripts_and_ijk():
+    volume = Volume(np.zeros((5, 6, 7), np.int16), OBLIQUE)
+    assert volume.voxels.shape == (5, 6, 7)
+    assert volume.shape_ijk == (7, 6, 5)
+    assert volume.spacing == pytest.approx(tuple(np.linalg.norm(OBLIQUE[:3, :3], axis=0)))
+
+
+def test_ijk_to_lps_and_back_in_float64():
+    volume = Volume(np.zeros((5, 6, 7), np.int16), OBLIQUE)
+    points = np.random.default_rng(3).uniform(-10, 500, (50, 3))
+    mapped = volume.ijk_to_lps(points)
+    assert mapped.dtype == np.float64
+    assert np.allclose(mapped[0], OBLIQUE[:3, :3] @ points[0] + OBLIQUE[:3, 3])
+    assert np.abs(volume.lps_to_ijk(mapped) - points).max() < 1e-9
+
+
+def test_slice_origins_follow_the_slice_step():
+    volume = Volume(np.zeros((3, 6, 7), np.int16), OBLIQUE)
+    origins = volume.slice_origins(border=1)
+    assert origins.shape == (5, 3)
+    assert np.allclose(origins, volume.ijk_to_lps([(0, 0, k) for k in (-1, 0, 1, 2, 3)]))
+
+
+@pytest.mark.parametrize("dtype", DEVICE_DTYPES)
+def test_device_types_are_kept_without_a_copy(dtype):
+    voxels = np.ones((2, 3, 4), dtype)
+    volume = Volume(voxels, np.eye(4))
+    assert volume.voxels.dtype == dtype
+    assert np.shares_memory(volume.voxels, voxels)
+
+
+@pytest.mark.parametrize(
+    ("given", "kept"),
+    [("bool", "uint8"), ("float64", "float32"), ("int64", "int32"), (">i2", "int16"), ("uint32", "int32")],
+)
+def test_other_types_are_converted_once(given, kept):
+    voxels = np.arange(24).reshape(2, 3, 4).astype(given)
+    volume = Volume(voxels, np.eye(4))
+    assert volume.voxels.dtype == np.dtype(kept)
+    assert np.array_equal(volume.voxels, voxels)
+
+
+def test_strided_voxels_are_made_contiguous():
+    voxels = np.arange(120, dtype=np.int16).reshape(4, 5, 6)[::-1, :, ::2]
+    volume = Volume(voxels, np.eye(4))
+    assert volume.voxels.flags.c_contiguous
+    assert np.array_equal(volume.voxels, voxels)
+
+
+@pytest.mark.parametrize(
+    ("voxels", "says"),
+    [
+        (np.zeros((3, 4)), "three axes"),
+        (np.zeros((0, 3, 4)), "empty"),
+        (np.zeros((2, 2, 2), complex), "complex"),
+        (np.full((2, 2, 2), 2**40), "32 bits"),
+    ],
+)
+def test_what_is_no_volume_is_refused(voxels, says):
+    with pytest.raises(UsageError, match=says):
+        Volume(voxels, np.eye(4))
+
+
+def test_the_affine_cannot_be_changed_behind_the_inverse():
+    volume = Volume(np.zeros((2, 3, 4), np.int16), np.eye(4))
+    with pytest.raises(ValueError, match="read-only"):
+        volume.affine[0, 0] = 2.0
+    assert volume.affine[0, 0] == 1.0

@@ -1,0 +1,64 @@
+"""Kernel files are found, their includes resolved, and each builds alone."""
+
+from __future__ import annotations
+
+import re
+
+import pytest
+
+from clrecon.errors import DeviceError
+from clrecon.kernels import kernel_files, load_program, read_kernel_source, sources
+
+
+def test_every_theme_is_found():
+    names = kernel_files()
+    assert {name.split("/")[0] for name in names} >= {"compaction", "isosurface"}
+    assert all(name.endswith(".cl") for name in names)
+
+
+@pytest.mark.parametrize("name", kernel_files())
+def test_includes_are_inlined_once_with_line_marks(name):
+    source = read_kernel_source(name)
+    assert not re.search(r"^\s*#\s*include", source, re.MULTILINE)
+    assert source.startswith(f'#line 1 "cl/{name}"')
+    marks = re.findall(r'#line 1 "(cl/[^"]+\.h)"', source)
+    assert len(marks) == len(set(marks))
+
+
+def test_line_marks_point_to_the_true_line():
+    name = "isosurface/marching_cubes.cl"
+    true = sources.kernel_root().joinpath(name).read_text().splitlines()
+    file, line, seen = "", 0, 0
+    for text in read_kernel_source(name).splitlines():
+        mark = re.match(r'#line (\d+) "cl/([^"]+)"', text)
+        if mark:
+            file, line = mark[2], int(mark[1])
+            continue
+        if file == name and text:
+            assert true[line - 1] == text
+            seen += 1
+        line += 1
+    assert seen > 100
+
+
+@pytest.mark.parametrize("name", kernel_files())
+def test_every_file_builds_alone(name, device):
+    kernels = load_program(device, name).kernel_names
+    declared = re.findall(r"^(?:void|__kernel void) (\w+)\(", read_kernel_source(name), re.MULTILINE)
+    assert kernels == sorted(declared)
+
+
+@pytest.mark.parametrize("voxel", ["char", "uchar", "short", "ushort", "int", "float"])
+def test_every_voxel_type_builds(voxel, device):
+    program = load_program(device, "isosurface/marching_cubes.cl", {"VOXEL": voxel})
+    assert "emit_vertices" in program.kernel_names
+
+
+def test_a_compiler_error_names_the_true_file_and_line(device, monkeypatch):
+    text = '#line 1 "cl/theme/file.cl"\n__kernel void broken(__global int *a)\n{\n    a[0] = missing_name;\n}\n'
+    monkeypatch.setattr("clrecon.kernels.program.read_kernel_source", lambda name: text)
+    with pytest.raises(DeviceError, match=r"theme/file.cl does not build on") as caught:
+        load_program(device, "theme/file.cl")
+    log = str(caught.value) + str(caught.value.__cause__)
+    assert "missing_name" in log
+    assert "theme/file.cl:3" in log

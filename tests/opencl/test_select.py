@@ -1,0 +1,98 @@
+"""Choosing a device: by name, by environment, by rank; never a simulator silently."""
+
+from __future__ import annotations
+
+import pytest
+
+from clrecon.errors import DeviceError
+from clrecon.opencl import check_budget, choose_device, list_devices, list_platforms, select
+
+
+class FakeDevice:
+    """What `choose_device` looks at."""
+
+    def __init__(self, index, name, platform, kind, memory=2**30, simulator=False, software=False):
+        self.index, self.name, self.platform, self.type = index, name, platform, kind
+        self.memory_bytes, self.is_simulator = memory, simulator
+        self.max_allocation_bytes = memory // 4
+        self.label = f"{name} ({platform})"
+        rank = 0 if software else {"gpu": 3, "accelerator": 2, "cpu": 1}.get(kind, 0)
+        self.score = (rank, memory, "1", -index)
+
+
+@pytest.fixture
+def machine(monkeypatch):
+    """A machine with a simulator in front, a CPU, two GPUs and a rasteriser."""
+    devices = [
+        FakeDevice(0, "Oclgrind Simulator", "Oclgrind", "gpu", 2**40, simulator=True),
+        FakeDevice(1, "pthread-Xeon", "Portable Computing Language", "cpu", 2**35),
+        FakeDevice(2, "Radeon", "AMD", "gpu", 2**33),
+        FakeDevice(3, "H200", "NVIDIA CUDA", "gpu", 2**37),
+        FakeDevice(4, "llvmpipe", "rusticl", "cpu", 2**36, software=True),
+    ]
+    monkeypatch.setattr(select, "list_devices", lambda: list(devices))
+    monkeypatch.delenv("CLRECON_DEVICE", raising=False)
+    monkeypatch.delenv("PYOPENCL_CTX", raising=False)
+    return devices
+
+
+def test_the_best_is_a_gpu_with_most_memory(machine):
+    assert choose_device().name == "H200"
+    assert choose_device("auto").name == "H200"
+
+
+@pytest.mark.parametrize(
+    ("wanted", "name"),
+    [("2", "Radeon"), (2, "Radeon"), ("radeon", "Radeon"), ("nvidia", "H200"), ("cpu", "pthread-Xeon"),
+     ("gpu", "H200"), ("llvmpipe", "llvmpipe"), ("oclgrind", "Oclgrind Simulator"), ("0", "Oclgrind Simulator")],
+)  # fmt: skip
+def test_a_device_is_found_by_index_type_or_part_of_its_name(machine, wanted, name):
+    assert choose_device(wanted).name == name
+
+
+def test_the_environment_names_a_device_and_the_argument_wins(machine, monkeypatch):
+    monkeypatch.setenv("CLRECON_DEVICE", "radeon")
+    assert choose_device().name == "Radeon"
+    assert choose_device("cpu").name == "pthread-Xeon"
+
+
+@pytest.mark.parametrize("wanted", ["9", "geforce"])
+def test_a_device_that_is_not_there_lists_what_is(machine, wanted, monkeypatch):
+    with pytest.raises(DeviceError, match=f"'{wanted}' is not there; found .*2: Radeon"):
+        choose_device(wanted)
+    monkeypatch.setenv("CLRECON_DEVICE", wanted)
+    with pytest.raises(DeviceError, match="CLRECON_DEVICE"):
+        choose_device()
+
+
+def test_a_simulator_is_never_chosen_silently(machine, monkeypatch):
+    monkeypatch.setattr(select, "list_devices", lambda: machine[:1])
+    with pytest.raises(DeviceError, match="only simulators"):
+        choose_device()
+    assert choose_device("oclgrind").is_simulator
+
+
+def test_no_device_says_how_to_get_a_driver(monkeypatch):
+    monkeypatch.setattr(select, "list_devices", lambda: [])
+    with pytest.raises(DeviceError, match="no OpenCL device found: install"):
+        choose_device()
+
+
+def test_the_budget_names_the_buffer_that_is_too_large(machine):
+    cpu = machine[1]
+    assert check_budget(cpu, {"volume": 2**20, "mesh": 2**21}) == 3 * 2**20
+    with pytest.raises(DeviceError, match=r"the volume needs a buffer of 8,193 MiB, .* allows 8,192 MiB"):
+        check_budget(cpu, {"volume": 2**33 + 2**20})
+    parts = {f"part {n}": 2**33 for n in range(5)}
+    with pytest.raises(DeviceError, match=r"needs 40,960 MiB .*part 0 8,192 MiB.* has 32,768 MiB"):
+        check_budget(cpu, parts)
+
+
+def test_devices_of_this_machine_describe_themselves(device):
+    devices = list_devices()
+    assert [d.index for d in devices] == list(range(len(devices)))
+    facts = device.describe()
+    assert facts["type"] in ("gpu", "accelerator", "cpu", "custom")
+    assert facts["memory_bytes"] >= facts["max_allocation_bytes"] > 0
+    assert device.platform in {platform["name"] for platform in list_platforms()}
+    assert choose_device(device.index) is device

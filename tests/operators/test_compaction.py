@@ -1,0 +1,46 @@
+"""Scan and compaction equal their twins at every awkward size."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from clrecon.kernels import download, upload
+from clrecon.operators.compaction import SCAN_BLOCK, SCAN_GROUP, compact, exclusive_scan
+from clrecon.reference import compaction as twin
+
+SIZES = [1, 2, 15, 16, 17, SCAN_GROUP - 1, SCAN_GROUP, SCAN_GROUP + 1, SCAN_BLOCK - 1, SCAN_BLOCK, SCAN_BLOCK + 1,
+         SCAN_BLOCK * SCAN_GROUP - 1, SCAN_BLOCK * SCAN_GROUP, SCAN_BLOCK * SCAN_GROUP + 1, 200_003]  # fmt: skip
+
+
+@pytest.mark.parametrize("n", SIZES)
+def test_scan_equals_its_twin(device, n):
+    counts = np.random.default_rng(n).integers(0, 50, n).astype(np.uint32)
+    scanned = exclusive_scan(device, upload(device, counts), n)
+    offsets, total = twin.exclusive_scan(counts)
+    assert scanned.total == total == int(counts.sum())
+    assert np.array_equal(download(device, np.empty(n, np.uint32), scanned.offsets_d), offsets)
+
+
+def test_a_total_beyond_32_bits_is_exact(device):
+    counts = np.full(5000, 2**21, np.uint32)  # a block still fits 32 bits
+    scanned = exclusive_scan(device, upload(device, counts), counts.size)
+    assert scanned.total == 5000 * 2**21 > 2**32
+
+
+def test_the_twin_is_what_it_says():
+    offsets, total = twin.exclusive_scan(np.array([3, 0, 2, 7], np.uint32))
+    assert offsets.tolist() == [0, 3, 3, 5]
+    assert total == 12
+    assert twin.compact(np.array([0b101, 0, 1 << 31], np.uint32)).tolist() == [0, 2, 95]
+
+
+@pytest.mark.parametrize("words", [1, 7, 8, 9, 63, 64, 65, 511, 512, 513, 40_001])
+@pytest.mark.parametrize("density", [0.0, 0.02, 0.5, 1.0])
+def test_compact_equals_its_twin(device, words, density):
+    bits = np.random.default_rng(words).random((words, 32)) < density
+    mask = np.packbits(bits, axis=1, bitorder="little").view("<u4").ravel().astype(np.uint32)
+    compacted = compact(device, upload(device, mask), words)
+    assert compacted.count == bits.sum()
+    positions = download(device, np.empty(compacted.count, np.uint32), compacted.positions_d)
+    assert np.array_equal(positions, twin.compact(mask))

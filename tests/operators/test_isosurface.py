@@ -1,0 +1,225 @@
+"""The isosurface operator against its twin, against topology, and against other programs."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import tolerances
+from scipy.spatial import cKDTree
+
+from clrecon.errors import DeviceError, NoSurfaceError, UsageError
+from clrecon.geometry import Volume, compose_affine
+from clrecon.operators import isosurface
+from clrecon.operators.isosurface import extract_isosurface
+from clrecon.reference import isosurface as twin
+
+OBLIQUE = np.array([[0.7, 0.1, 0.05, -250.0], [-0.1, 0.5, 0.2, -300.0], [0.0, 0.05, 2.5, -846.0], [0, 0, 0, 1.0]])
+MIRRORED = OBLIQUE @ np.diag((-1.0, 1.0, 1.0, 1.0))
+SHAPES = [(5, 7, 9), (4, 4, 30), (3, 5, 31), (3, 5, 32), (4, 3, 33), (2, 3, 63), (3, 2, 64), (2, 4, 65), (3, 3, 100)]
+
+
+def random_volume(shape, dtype="int16", high=6, affine=OBLIQUE, seed=0) -> Volume:
+    return Volume(np.random.default_rng(seed).integers(0, high, shape).astype(dtype), affine)
+
+
+def smooth_volume(shape=(23, 27, 45), affine=OBLIQUE, seed=1) -> Volume:
+    from scipy.ndimage import gaussian_filter
+
+    field = gaussian_filter(np.random.default_rng(seed).normal(size=shape), 2.0)
+    return Volume((field / field.std() * 300).astype(np.int16), affine)
+
+
+def assert_sound(mesh) -> None:
+    """Closed, manifold, outward, no zero-area face, every vertex used."""
+    quality = mesh.quality()
+    assert quality["closed"] and quality["manifold"]
+    assert quality["volume_ml"] > 0.0
+    assert quality["zero_area_faces"] == 0
+    assert quality["unused_vertices"] == 0
+
+
+@pytest.mark.parametrize("closed", [True, False])
+@pytest.mark.parametrize("shape", SHAPES)
+def test_device_equals_twin_at_word_borders(device, shape, closed):
+    volume = random_volume(shape)
+    vertices, normals, triangles = twin.extract_isosurface(volume, 3, closed=closed)
+    mesh = extract_isosurface(volume, 3, device, closed=closed)
+    assert np.array_equal(mesh.triangles, triangles)
+    assert np.abs(volume.lps_to_ijk(mesh.vertices) - volume.lps_to_ijk(vertices)).max() <= tolerances.TWIN_VERTEX_VOXEL
+    assert np.abs(mesh.normals - normals).max() <= tolerances.TWIN_NORMAL
+
+
+@pytest.mark.parametrize("dtype", ["int8", "uint8", "int16", "uint16", "int32", "float32"])
+@pytest.mark.parametrize("affine", [OBLIQUE, MIRRORED], ids=["right-handed", "left-handed"])
+def test_device_equals_twin_for_every_voxel_type(device, dtype, affine):
+    volume = random_volume((6, 7, 37), dtype, high=100, affine=affine)
+    for iso_value in (1, 40, 40.5, 99):
+        vertices, normals, triangles = twin.extract_isosurface(volume, iso_value)
+        mesh = extract_isosurface(volume, iso_value, device)
+        assert np.array_equal(mesh.triangles, triangles)
+        assert np.abs(mesh.vertices - vertices).max() <= tolerances.float32_unit(mesh.vertices)
+        assert np.abs(mesh.normals - normals).max() <= tolerances.TWIN_NORMAL
+
+
+@pytest.mark.parametrize("high", [2, 3, 6, 12])
+def test_random_integers_at_every_iso_value_are_sound(device, high):
+    for seed, shape in enumerate([(7, 9, 11), (5, 4, 35)]):
+        volume = random_volume(shape, high=high, seed=seed)
+        for iso_value in range(1, high):
+            assert_sound(extract_isosurface(volume, iso_value, device))
+
+
+@pytest.mark.parametrize("high", [4096, 65536])
+def test_steep_integers_far_from_the_origin_are_sound(device, high):
+    """Vertices next to a sample would fall together in float32 millimetres without the margin."""
+    affine = compose_affine((0.3, 0, 0), (0, 0.3, 0), (0, 0, 0.5), (-900, 900, 1800))
+    volume = random_volume((9, 11, 40), "uint16", high, affine)
+    for iso_value in (1, 2, high // 2, int(volume.voxels.max())):
+        assert_sound(extract_isosurface(volume, iso_value, device))
+
+
+def test_floats_that_equal_the_iso_value_are_sound(device):
+    assert_sound(extract_isosurface(random_volume((7, 8, 40), "float32", 4), 2.0, device))
+
+
+@pytest.mark.parametrize("shape", [(1, 1, 1), (1, 5, 7), (4, 1, 40), (3, 4, 1), (2, 2, 2), (9, 10, 33)])
+def test_a_volume_that_is_all_inside_is_a_closed_box(device, shape):
+    volume = Volume(np.full(shape, 700, np.int16), OBLIQUE)
+    mesh = extract_isosurface(volume, 300, device)
+    assert_sound(mesh)
+    assert mesh.quality()["euler_number"] == 2
+    low, high = volume.lps_to_ijk(mesh.vertices).min(axis=0), volume.lps_to_ijk(mesh.vertices).max(axis=0)
+    upper = np.array(volume.shape_ijk) - 1
+    assert (low > -1).all() and (low < 0).all() and (high > upper).all() and (high < upper + 1).all()
+
+
+def test_an_object_that_leaves_the_volume_is_closed_or_left_open(device):
+    voxels = np.zeros((9, 9, 9), np.int16)
+    voxels[:, 3:6, 3:6] = 100
+    closed = extract_isosurface(Volume(voxels, OBLIQUE), 50, device).quality()
+    opened = extract_isosurface(Volume(voxels, OBLIQUE), 50, device, closed=False).quality()
+    assert closed["closed"] and closed["boundary_edges"] == 0
+    assert not opened["closed"] and opened["boundary_edges"] > 0 and opened["nonmanifold_edges"] == 0
+
+
+def test_the_order_is_the_same_on_every_run(device):
+    volume = smooth_volume()
+    first, second = (extract_isosurface(volume, 100, device) for _ in range(2))
+    assert np.array_equal(first.triangles, second.triangles)
+    assert np.array_equal(first.vertices, second.vertices)
+    assert np.array_equal(first.normals, second.normals)
+
+
+def test_normals_look_the_way_the_faces_do(device):
+    for affine in (OBLIQUE, MIRRORED):
+        mesh = extract_isosurface(smooth_volume(affine=affine), 100, device)
+        corners = mesh.vertices.astype(np.float64)[mesh.triangles]
+        faces = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        along = np.einsum("ij,ij->i", faces, mesh.normals.astype(np.float64)[mesh.triangles].sum(axis=1))
+        assert (along > 0).mean() > 0.97
+        assert np.allclose(np.linalg.norm(mesh.normals, axis=1), 1.0, atol=1e-5)
+
+
+def test_flips_and_permutations_of_the_index_axes_give_the_same_surface(device):
+    volume = smooth_volume()
+    expected = extract_isosurface(volume, 100, device)
+    tree = cKDTree(expected.vertices)
+    for axes in [(0, 1, 2), (2, 1, 0), (1, 2, 0)]:
+        for flipped in [(), (0,), (1, 2)]:
+            voxels = np.flip(volume.voxels, flipped).transpose(axes)
+            ijk = np.eye(4)
+            for axis in flipped:  # array axis a is index axis 2 - a
+                ijk[2 - axis, 2 - axis], ijk[2 - axis, 3] = -1.0, volume.voxels.shape[axis] - 1.0
+            order = np.eye(4)[[*(2 - np.argsort(axes)[::-1]), 3]]
+            mesh = extract_isosurface(Volume(voxels, volume.affine @ ijk @ order), 100, device)
+            assert len(mesh.vertices) == len(expected.vertices)
+            assert tree.query(mesh.vertices)[0].max() <= tolerances.FRAME_MM
+            assert mesh.quality()["volume_ml"] == pytest.approx(expected.quality()["volume_ml"], rel=1e-3)
+
+
+def test_scikit_image_finds_the_same_points(device):
+    from skimage.measure import marching_cubes
+
+    volume = smooth_volume()
+    mesh = extract_isosurface(volume, 100, device)
+    padded = np.pad(volume.voxels, 1, constant_values=int(mesh.report["outside_hu"])).astype(np.float32)
+    points, faces, _, _ = marching_cubes(padded, 99.5, method="lorensen")
+    expected = volume.ijk_to_lps(points[:, ::-1] - 1.0)
+    assert len(mesh.vertices) == len(expected)
+    assert cKDTree(expected).query(mesh.vertices)[0].max() <= 5e-4
+    assert mesh.quality()["area_mm2"] == pytest.approx(_area(expected, faces), rel=2e-3)
+
+
+def test_flying_edges_finds_the_same_points_and_as_many_triangles(device):
+    pyvista = pytest.importorskip("pyvista")
+    volume = smooth_volume()
+    mesh = extract_isosurface(volume, 100, device, closed=False)
+    image = pyvista.ImageData(dimensions=volume.shape_ijk)
+    image["hu"] = volume.voxels.ravel()
+    contour = image.contour([99.5], method="flying_edges")
+    expected = volume.ijk_to_lps(contour.points)
+    assert len(mesh.vertices) == contour.n_points
+    assert len(mesh.triangles) == contour.n_cells
+    assert cKDTree(expected).query(mesh.vertices)[0].max() <= 5e-4
+
+
+def _area(points, faces) -> float:
+    a, b, c = (points[faces[:, corner]] for corner in range(3))
+    return float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2)
+
+
+@pytest.mark.parametrize(
+    ("iso_value", "closed", "where"),
+    [(6, True, "above"), (40_000, True, "above"), (1e9, False, "above"), (0, False, "below"), (-1e6, False, "below")],
+)
+def test_an_iso_value_outside_the_data_is_refused_with_the_range(device, iso_value, closed, where):
+    volume = random_volume((5, 6, 7))
+    with pytest.raises(NoSurfaceError, match=f"runs from 0 to 5 HU, the iso value lies {where}"):
+        extract_isosurface(volume, iso_value, device, closed=closed)
+
+
+def test_values_that_cannot_be_used_are_refused(device):
+    with pytest.raises(UsageError, match="finite"):
+        extract_isosurface(random_volume((3, 4, 5)), float("nan"), device)
+    with pytest.raises(NoSurfaceError, match="no cells"):
+        extract_isosurface(random_volume((1, 4, 5)), 3, device, closed=False)
+    with pytest.raises(UsageError, match="13,999 columns"):
+        extract_isosurface(Volume(np.zeros((1, 1, 13_999), np.int8), np.eye(4)), 1, device)
+
+
+def test_a_volume_over_the_budget_is_refused_before_anything_is_allocated(device, monkeypatch):
+    monkeypatch.setattr(device, "max_allocation_bytes", 1000)
+    monkeypatch.setattr(isosurface, "upload", lambda *_: pytest.fail("allocated"))
+    with pytest.raises(DeviceError, match="the volume needs a buffer"):
+        extract_isosurface(random_volume((9, 9, 9)), 3, device)
+
+
+def test_counts_over_32_bits_are_refused(device, monkeypatch):
+    true_scan = isosurface.exclusive_scan
+
+    def scan(*arguments, **options):
+        scanned = true_scan(*arguments, **options)
+        return type(scanned)(scanned.offsets_d, scanned.total + 2**32)
+
+    monkeypatch.setattr(isosurface, "exclusive_scan", scan)
+    with pytest.raises(DeviceError, match="more than 32 bits can number"):
+        extract_isosurface(random_volume((5, 6, 7)), 3, device)
+
+
+def test_the_report_says_how_the_mesh_was_made(device):
+    mesh = extract_isosurface(random_volume((5, 6, 7)), 3, device)
+    assert mesh.report["iso_value_hu"] == 3.0
+    assert mesh.report["iso_level_hu"] == 2.5
+    assert mesh.report["affine_ijk_to_lps_mm"] == OBLIQUE.tolist()
+    assert mesh.report["device"] == device.label
+    assert set(mesh.report["seconds"]) == {"upload", "build", "kernels", "download"}
+    assert mesh.report["kernel_seconds"].keys() >= {"classify_samples", "count_rows", "emit_vertices", "emit_triangles"}
+
+
+@pytest.mark.oclgrind
+def test_every_pass_on_a_small_volume(device):
+    """Small enough for a checking simulator: whole words, a word's rest, and rows shorter than a word."""
+    for shape in [(3, 4, 33), (2, 3, 5)]:
+        volume = random_volume(shape)
+        mesh = extract_isosurface(volume, 3, device)
+        assert np.array_equal(mesh.triangles, twin.extract_isosurface(volume, 3)[2])
