@@ -1,0 +1,6 @@
+"""DICOM in: a folder of classic single-frame CT images becomes a `clrecon.geometry.Volume` in HU and LPS mm."""
+
+from clrecon.dicom.reader import list_series, read_volume
+from clrecon.dicom.series import SeriesEntry, SeriesListing
+
+__all__ = ["SeriesEntry", "SeriesListing", "list_series", "read_volume"]

@@ -1,0 +1,112 @@
+"""The certificate: what is known of a volume's origin and geometry, as a dict without patient data."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from clrecon.dicom.gate import Stack
+from clrecon.dicom.header import SliceHeader
+from clrecon.dicom.pixels import PixelFacts
+from clrecon.dicom.scan import Scan
+from clrecon.dicom.series import Series
+from clrecon.dicom.text import hash_uid, join_names
+
+__all__ = ["certify", "collect_scan_warnings", "collect_series_warnings"]
+
+
+def collect_scan_warnings(scan: Scan) -> list[str]:
+    """Warnings about files that were passed over although they claim to be DICOM, or could not be looked at."""
+    warnings = []
+    if scan.corrupt:
+        plural = "s" * (len(scan.corrupt) > 1)
+        warnings.append(f"{len(scan.corrupt)} corrupt file{plural} skipped: {join_names(scan.corrupt)}")
+    for reason in ("not readable", "folder not readable", "link out of the folder"):
+        if scan.skipped[reason]:
+            warnings.append(f"{scan.skipped[reason]} skipped: {reason}")
+    return warnings
+
+
+def collect_series_warnings(series: Series) -> list[str]:
+    """Warnings about one series, from its headers and its geometry."""
+    if series.stack is None or series.kind == "other":
+        return []
+    headers = series.stack.slices
+    warnings = list(series.stack.warnings)
+    for text in dict.fromkeys(text for header in headers for text in header.warnings):
+        warnings.append(f"{text} ({_names(headers, lambda h, text=text: text in h.warnings)})")  # type: ignore[misc]
+    checks: tuple[tuple[Callable[[SliceHeader], bool], str], ...] = (
+        (
+            lambda h: not h.has_rescale,
+            "no RescaleSlope: slope 1, intercept {intercept} taken: maybe not HU",
+        ),
+        (lambda h: h.rescale_type not in ("", "HU"), "RescaleType is '{type}': the values are not HU"),
+        (lambda h: h.photometric == "MONOCHROME1", "MONOCHROME1: meant to be shown inverted; the values are kept"),
+        (lambda h: h.lossy, "lossy compression: the values are not those that were measured"),
+    )
+    for is_so, text in checks:
+        odd = next((header for header in headers if is_so(header)), None)
+        if odd is not None:
+            text = text.format(type=odd.rescale_type, intercept=f"{odd.intercept:g}")
+            warnings.append(f"{text} ({_names(headers, is_so)})")
+    return warnings
+
+
+def _names(headers: Sequence[SliceHeader], is_so: Callable[[SliceHeader], bool]) -> str:
+    names = [header.name for header in headers if is_so(header)]
+    return "all slices" if len(names) == len(headers) else join_names(names)
+
+
+def certify(
+    series: Series, stack: Stack, facts: PixelFacts, scan: Scan, affine: Any, warnings: Sequence[str]
+) -> dict[str, Any]:
+    """Build the report of a volume.
+
+    Parameters
+    ----------
+    series, stack : Series, Stack
+        What was read.
+    facts : PixelFacts
+    scan : Scan
+    affine : ndarray, shape (4, 4)
+    warnings : sequence of str
+
+    Returns
+    -------
+    dict
+        JSON types only.  Lengths in mm, angles in degrees; ``hu_range`` is that of the voxels as they are in the
+        volume, padding (at -1024) among them.
+    """
+    headers, first = stack.slices, stack.slices[0]
+    slopes, intercepts = [h.slope for h in headers], [h.intercept for h in headers]
+    thickness = sorted(h.slice_thickness_mm for h in headers if h.slice_thickness_mm is not None)
+    return {
+        "series": {
+            "number": series.number,
+            "uid_hash": hash_uid(series.identity.uid),
+            "description": series.identity.description,
+            "modality": series.identity.modality,
+        },
+        "slices": len(headers),
+        "shape_ijk": [first.columns, first.rows, len(headers)],
+        "spacing_mm": [float(length) for length in ((affine[:3, :3] ** 2).sum(axis=0) ** 0.5)],
+        "affine_ijk_to_lps_mm": affine.tolist(),
+        "tilt_deg": stack.tilt_deg,
+        "grid_residual_max_mm": stack.line.residual_max_mm,
+        "grid_residual_rms_mm": stack.line.residual_rms_mm,
+        "gap_mm": {"min": stack.line.gap_min_mm, "max": stack.line.gap_max_mm},
+        "uneven": stack.line.uneven,
+        "slice_thickness_mm": thickness[len(thickness) // 2] if thickness else None,
+        "padding_share": facts.padding_share,
+        "frame_of_reference_hash": hash_uid(first.frame_of_reference) if first.frame_of_reference else None,
+        "transfer_syntaxes": sorted({h.transfer_syntax for h in headers}),
+        "rescale": {
+            "slope": [min(slopes), max(slopes)],
+            "intercept": [min(intercepts), max(intercepts)],
+            "type": first.rescale_type or None,
+        },
+        "hu_range": [facts.hu_min, facts.hu_max],
+        "files": {"found": scan.files, "used": len(headers), "skipped": dict(scan.skipped)},
+        "warnings": list(warnings),
+        "problems": [],
+    }

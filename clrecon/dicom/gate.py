@@ -1,0 +1,321 @@
+"""The geometry gate: slices in, one affine with its residual out, or the reasons why there is none.
+
+The position of a slice is its ImagePositionPatient and nothing else.  Slices are sorted by the projection of the
+position on the normal n = X x Y (row direction x column direction), so index space is always right-handed.  The
+affine is the least-squares line through all positions: its slice step is a full vector, a tilted gantry is an exact
+shear, and the rounding of positions averages out.
+
+Source: DICOM PS3.3 C.7.6.2.1.1.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clrecon.dicom.header import SliceHeader
+from clrecon.dicom.text import join_names
+from clrecon.geometry import compose_affine, tilt_degrees
+
+__all__ = ["Stack", "measure_stack"]
+
+Float64Array = NDArray[np.float64]
+
+ORIENTATION_EXACT = 1e-4
+"""Deviation from unit length and right angle that is taken silently (rounding of the stored numbers)."""
+ORIENTATION_LIMIT = 1e-3
+"""Deviation up to which the directions are made orthonormal, with a warning; refused above."""
+ORIENTATION_SPREAD_RAD = 1e-4
+"""Angle by which the directions of single slices may differ from the mean: 0.03 mm over 300 mm."""
+POSITION_TOLERANCE_MM = 0.01
+POSITION_TOLERANCE_GAPS = 0.01
+"""A residual up to the larger of 0.01 mm and 1 % of the gap is rounding and no unevenness."""
+DUPLICATE_MM = 1e-3
+MISSING_RATIO = 1.5
+RUN_LENGTH = 3
+RUN_TOLERANCE = 0.05
+"""A gap over 1.5 times the usual one means missing slices, unless it is one of at least 3 gaps in a row that are
+equal within 5 %: a change of feed is a run, a hole is not."""
+TILT_REPORT_DEG = 0.05
+STATED_GAP_TOLERANCE = 0.01
+PIXEL_SPACING_TOLERANCE = 1e-5
+PLACES_SHOWN = 4
+
+
+@dataclass(frozen=True)
+class Line:
+    """Evenly spaced places fitted to the slices, and how far the slices are from them. None: there is one slice.
+
+    Attributes
+    ----------
+    step, origin : ndarray, shape (3,), float64
+        LPS mm, by least squares.
+    gap_min_mm, gap_max_mm, gap_median_mm : float
+        Along the normal; the median leaves duplicates out.
+    residual_max_mm, residual_rms_mm : float
+        Distance of the positions from their places.
+    tolerance_mm : float
+        Largest residual that is rounding.
+    worst_slice : int
+        Where the residual is largest.
+    uneven : bool
+        The residual is over the tolerance.
+    """
+
+    step: Float64Array | None = None
+    origin: Float64Array | None = None
+    gap_min_mm: float | None = None
+    gap_max_mm: float | None = None
+    gap_median_mm: float | None = None
+    residual_max_mm: float | None = None
+    residual_rms_mm: float | None = None
+    tolerance_mm: float | None = None
+    worst_slice: int = 0
+    uneven: bool | None = None
+
+
+@dataclass(frozen=True)
+class Stack:
+    """The measured geometry of one stack of slices.
+
+    Attributes
+    ----------
+    slices : tuple of SliceHeader
+        Sorted by ascending position along the normal.
+    positions_mm : ndarray, shape (n, 3), float64
+        LPS mm.
+    distances_mm : ndarray, shape (n,), float64
+        Positions along the normal.
+    affine : ndarray, shape (4, 4), float64, or None
+        Index (i, j, k) to LPS mm; None where there is a problem.
+    line : Line
+    tilt_deg : float or None
+        None where there is no affine.
+    problems, warnings : tuple of str
+        A stack with problems is refused.
+    """
+
+    slices: tuple[SliceHeader, ...]
+    positions_mm: Float64Array
+    distances_mm: Float64Array
+    affine: Float64Array | None
+    line: Line
+    tilt_deg: float | None
+    problems: tuple[str, ...]
+    warnings: tuple[str, ...]
+
+
+def measure_stack(headers: Sequence[SliceHeader]) -> Stack:
+    """Sort slices, find what is wrong with them, and fit the affine.
+
+    Parameters
+    ----------
+    headers : sequence of SliceHeader
+        At least one.
+
+    Returns
+    -------
+    Stack
+        Never raises for bad geometry: what is wrong stands in ``problems``.
+    """
+    problems = find_mixed_values(headers)
+    warnings: list[str] = []
+    row, column = _mean_directions(headers, problems, warnings)
+    normal = np.cross(row, column)
+    slices, positions, distances = sort_slices(headers, normal)
+    affine: Float64Array | None = None
+    line = Line()
+    if len(slices) == 1:
+        problems.append("a single slice cannot make a surface")
+    else:
+        line = measure_line(positions, distances)
+        faults = describe_duplicates(slices, distances) + describe_missing(slices, distances)
+        if line.uneven and not faults:
+            faults.append(_describe_unevenness(slices, distances, line))
+        problems += faults
+        if not problems:
+            assert line.step is not None and line.origin is not None
+            affine = compose_affine(row * slices[0].di_mm, column * slices[0].dj_mm, line.step, line.origin)
+        warnings += _compare_stated_gap(slices, line.gap_median_mm)
+    tilt = None if affine is None else tilt_degrees(affine)
+    if tilt is not None and tilt > TILT_REPORT_DEG:
+        warnings.append(f"gantry tilt {tilt:.2f} degrees: kept exactly, as a shear")
+    return Stack(slices, positions, distances, affine, line, tilt, tuple(problems), tuple(warnings))
+
+
+def measure_line(positions: Float64Array, distances: Float64Array) -> Line:
+    """Fit evenly spaced places to sorted positions (n, 3), n >= 2, and measure gaps and residuals."""
+    gaps = np.diff(distances)
+    real_gaps = gaps[gaps >= DUPLICATE_MM]
+    usual = float(np.median(real_gaps)) if real_gaps.size else 0.0
+    step, origin = fit_line(positions)
+    residuals = np.linalg.norm(positions - (origin + np.arange(len(positions))[:, None] * step), axis=1)
+    tolerance = max(POSITION_TOLERANCE_MM, POSITION_TOLERANCE_GAPS * usual)
+    return Line(
+        step=step,
+        origin=origin,
+        gap_min_mm=float(gaps.min()),
+        gap_max_mm=float(gaps.max()),
+        gap_median_mm=usual,
+        residual_max_mm=float(residuals.max()),
+        residual_rms_mm=float(np.sqrt(np.mean(residuals**2))),
+        tolerance_mm=tolerance,
+        worst_slice=int(residuals.argmax()),
+        uneven=bool(residuals.max() > tolerance),
+    )
+
+
+def _describe_unevenness(slices: Sequence[SliceHeader], distances: Float64Array, line: Line) -> str:
+    return (
+        f"slices are unevenly spaced: gaps {line.gap_min_mm:.3f} to {line.gap_max_mm:.3f} mm (usual "
+        f"{line.gap_median_mm:.3f} mm), up to {line.residual_max_mm:.3f} mm from even positions (allowed "
+        f"{line.tolerance_mm:.3f} mm), worst at {distances[line.worst_slice]:.2f} mm ({slices[line.worst_slice].name})"
+    )
+
+
+def sort_slices(
+    headers: Sequence[SliceHeader], normal: Float64Array
+) -> tuple[tuple[SliceHeader, ...], Float64Array, Float64Array]:
+    """Sort by projection on the normal; returns the slices, their positions (n, 3) and projections (n,) in mm."""
+    positions = np.array([header.position_mm for header in headers], dtype=np.float64)
+    distances = positions @ normal
+    order = sorted(range(len(headers)), key=lambda index: (distances[index], str(headers[index].file)))
+    return tuple(headers[index] for index in order), positions[order], distances[order]
+
+
+def fit_line(positions: Float64Array) -> tuple[Float64Array, Float64Array]:
+    """Least-squares step and origin (LPS mm) of positions (n, 3) that are numbered 0 to n - 1, n >= 2."""
+    k = np.arange(len(positions), dtype=np.float64)
+    centre, mean = k.mean(), positions.mean(axis=0)
+    step = (k - centre) @ (positions - mean) / np.sum((k - centre) ** 2)
+    return step, mean - centre * step
+
+
+def find_mixed_values(headers: Sequence[SliceHeader]) -> list[str]:
+    """Describe values that must be one and the same over a stack and are not, naming the odd slices."""
+    checks: tuple[tuple[str, Callable[[SliceHeader], object], Callable[[SliceHeader], str]], ...] = (
+        ("Columns x Rows", lambda h: (h.columns, h.rows), lambda h: f"{h.columns} x {h.rows}"),
+        (
+            "FrameOfReferenceUID",
+            lambda h: h.frame_of_reference,
+            lambda h: "another" if h.frame_of_reference else "no",
+        ),
+    )
+    found = []
+    for title, key, show in checks:
+        counts = Counter(key(header) for header in headers)
+        if len(counts) > 1:
+            usual = counts.most_common(1)[0][0]
+            odd = [header for header in headers if key(header) != usual]
+            found.append(f"{title} differ within the series: {show(odd[0])} in {join_names(h.name for h in odd)}")
+    di, dj = np.median([header.di_mm for header in headers]), np.median([header.dj_mm for header in headers])
+    allowed = PIXEL_SPACING_TOLERANCE * min(di, dj)
+    odd = [header for header in headers if max(abs(header.di_mm - di), abs(header.dj_mm - dj)) > allowed]
+    if odd:
+        found.append(
+            f"PixelSpacing differs within the series: {odd[0].dj_mm:g}\\{odd[0].di_mm:g} mm against "
+            f"{dj:g}\\{di:g} mm in {join_names(h.name for h in odd)}"
+        )
+    return found
+
+
+def _mean_directions(
+    headers: Sequence[SliceHeader], problems: list[str], warnings: list[str]
+) -> tuple[Float64Array, Float64Array]:
+    """Mean row and column directions, orthonormal; appends what is wrong with them."""
+    directions = np.array([(*h.row_cosines, *h.column_cosines) for h in headers], dtype=np.float64).reshape(-1, 2, 3)
+    mean = directions.mean(axis=0)
+    lengths = np.linalg.norm(directions, axis=2)
+    skew = np.abs(np.sum(directions[:, 0] * directions[:, 1], axis=1))
+    deviation = np.maximum(np.abs(lengths - 1.0).max(axis=1), skew)
+    worst = int(deviation.argmax())
+    if deviation[worst] > ORIENTATION_LIMIT:
+        problems.append(
+            f"{headers[worst].name}: ImageOrientationPatient (0020,0037) is off unit length or right angle "
+            f"by {deviation[worst]:.2g} (allowed {ORIENTATION_LIMIT:g})"
+        )
+        mean = np.eye(3)[:2]  # only to sort by; the stack is refused
+    elif deviation[worst] > ORIENTATION_EXACT:
+        warnings.append(
+            f"ImageOrientationPatient is off unit length or right angle by {deviation[worst]:.2g}: made orthonormal"
+        )
+    row, column = _orthonormalise(mean[0], mean[1])
+    if deviation[worst] <= ORIENTATION_LIMIT:
+        units = directions / lengths[:, :, None]
+        angles = 2.0 * np.arcsin(np.clip(np.linalg.norm(units - (row, column), axis=2).max(axis=1) / 2.0, 0.0, 1.0))
+        odd = int(angles.argmax())
+        # Skew that was taken out above is no difference between slices.
+        if angles[odd] > ORIENTATION_SPREAD_RAD + deviation[worst]:
+            problems.append(
+                f"ImageOrientationPatient differs within the series by {np.degrees(angles[odd]):.3f} degrees: "
+                f"{headers[odd].name}"
+            )
+    return row, column
+
+
+def _orthonormalise(row: Float64Array, column: Float64Array) -> tuple[Float64Array, Float64Array]:
+    """Nearest orthonormal pair: both directions move by the same angle. Left alone where already exact."""
+    row, column = row / np.linalg.norm(row), column / np.linalg.norm(column)
+    if abs(row @ column) > 1e-9:
+        bisector, across = row + column, row - column
+        bisector, across = bisector / np.linalg.norm(bisector), across / np.linalg.norm(across)
+        row, column = (bisector + across) / np.sqrt(2.0), (bisector - across) / np.sqrt(2.0)
+    return row, column
+
+
+def describe_duplicates(slices: Sequence[SliceHeader], distances: Float64Array) -> list[str]:
+    """Describe slices that share a position."""
+    pairs = [
+        f"{slices[k].name} and {slices[k + 1].name} at {distances[k]:.2f} mm"
+        for k in np.flatnonzero(np.diff(distances) < DUPLICATE_MM).tolist()
+    ]
+    if not pairs:
+        return []
+    return [f"{len(pairs)} duplicate slice{'s' * (len(pairs) > 1)}: {_join_places(pairs)}"]
+
+
+def describe_missing(slices: Sequence[SliceHeader], distances: Float64Array) -> list[str]:
+    """Describe holes in the stack, by the rule at `MISSING_RATIO`."""
+    keep = np.concatenate(([True], np.diff(distances) >= DUPLICATE_MM))
+    kept, places = distances[keep], np.flatnonzero(keep).tolist()
+    gaps = np.diff(kept)
+    if len(gaps) < 2:
+        return []
+    usual = float(np.median(gaps))
+    holes = []
+    for k in np.flatnonzero(gaps > MISSING_RATIO * usual).tolist():
+        if not _is_in_run(gaps, k):
+            missing = max(round(gaps[k] / usual) - 1, 1)
+            before, after = slices[places[k + 1] - 1], slices[places[k + 1]]
+            holes.append(
+                f"{missing} slice{'s' * (missing > 1)} missing between {kept[k]:.2f} and {kept[k + 1]:.2f} mm "
+                f"(gap {gaps[k]:.3f} mm, usual {usual:.3f} mm): {before.name}, {after.name}"
+            )
+    return [_join_places(holes)] if holes else []
+
+
+def _is_in_run(gaps: Float64Array, place: int) -> bool:
+    """True when a gap is one of at least `RUN_LENGTH` consecutive gaps that equal it within `RUN_TOLERANCE`."""
+    like = np.abs(gaps - gaps[place]) <= RUN_TOLERANCE * gaps[place]
+    first = last = place
+    while first > 0 and like[first - 1]:
+        first -= 1
+    while last < len(gaps) - 1 and like[last + 1]:
+        last += 1
+    return last - first + 1 >= RUN_LENGTH
+
+
+def _join_places(places: list[str]) -> str:
+    shown = "; ".join(places[:PLACES_SHOWN])
+    return shown if len(places) <= PLACES_SHOWN else f"{shown}; and {len(places) - PLACES_SHOWN} more"
+
+
+def _compare_stated_gap(slices: Sequence[SliceHeader], usual: float | None) -> list[str]:
+    stated = next((h.stated_gap_mm for h in slices if h.stated_gap_mm is not None), None)
+    if stated is None or not usual or abs(stated - usual) <= STATED_GAP_TOLERANCE * usual:
+        return []
+    return [f"SpacingBetweenSlices says {stated:g} mm, the positions say {usual:.4g} mm: the positions are used"]

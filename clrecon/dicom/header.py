@@ -1,0 +1,300 @@
+"""`SliceHeader`: the strict, validated model of one CT image between the parser and the geometry.
+
+No value of a file gets past this module unchecked: numbers are finite, in the right count and within a plausible
+range, or there is a problem that names the file and the tag.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from clrecon.dicom.codecs import describe_undecodable, is_encapsulated
+from clrecon.dicom.elements import CorruptFileError, read_elements
+from clrecon.dicom.text import escape_text
+from clrecon.dicom.values import WANTED_TAGS, ValueProblem, Values
+
+__all__ = ["OtherImage", "SeriesIdentity", "SliceHeader", "read_header"]
+
+CT_IMAGE_STORAGE = "1.2.840.10008.5.1.4.1.1.2"
+SECONDARY_CAPTURE = "1.2.840.10008.5.1.4.1.1.7"
+DICOMDIR_CLASS = "1.2.840.10008.1.3.10"
+
+PIXEL_SPACING_MM = (1e-3, 50.0)
+POSITION_LIMIT_MM = 1e6
+RESCALE_SLOPE = (1e-6, 1e6)
+RESCALE_INTERCEPT_LIMIT = 1e9
+
+
+@dataclass(frozen=True)
+class SeriesIdentity:
+    """What a file says of its series: UID, number (None where missing), description, modality."""
+
+    uid: str
+    number: int | None
+    description: str
+    modality: str
+
+
+@dataclass(frozen=True)
+class OtherImage:
+    """A DICOM object that cannot be a slice, and why.
+
+    Attributes
+    ----------
+    frames : int
+        Frames it holds, 1 for most.
+    kind : {"broken", "capture", "other"}
+        A CT image with a wrong header; a secondary capture; anything that is no CT.
+    problem : str
+        One line; names the file and the tag where there is one.
+    """
+
+    series: SeriesIdentity
+    file: Path
+    name: str
+    frames: int
+    kind: str
+    problem: str
+
+
+@dataclass(frozen=True)
+class SliceHeader:
+    """Everything that is known of one CT slice before its pixels are read. All values are validated.
+
+    Attributes
+    ----------
+    file, name : Path, str
+        Where it is; base name, escaped for messages.
+    localizer : bool
+        ImageType says LOCALIZER.
+    rows, columns : int
+    row_cosines, column_cosines : tuple of 3 float
+        ImageOrientationPatient as stored.
+    position_mm : tuple of 3 float
+        ImagePositionPatient, LPS mm, centre of the first voxel.
+    di_mm, dj_mm : float
+        Column spacing (PixelSpacing[1]) and row spacing (PixelSpacing[0]).
+    slice_thickness_mm, stated_gap_mm : float or None
+        SliceThickness and SpacingBetweenSlices; never used for geometry.
+    padding : tuple of (int, int) or None
+        Lowest and highest stored value that mean "no measurement".
+    slope, intercept : float
+        1 and 0 where the file has none, see `has_rescale`.
+    pixel_offset, pixel_length, inflate_from, file_bytes : int
+        See `DicomElements`.
+    warnings : tuple of str
+    """
+
+    series: SeriesIdentity
+    file: Path
+    name: str
+    localizer: bool
+    frame_of_reference: str
+    transfer_syntax: str
+    little_endian: bool
+    rows: int
+    columns: int
+    bits_allocated: int
+    bits_stored: int
+    high_bit: int
+    signed: bool
+    photometric: str
+    row_cosines: tuple[float, float, float]
+    column_cosines: tuple[float, float, float]
+    position_mm: tuple[float, float, float]
+    di_mm: float
+    dj_mm: float
+    slice_thickness_mm: float | None
+    stated_gap_mm: float | None
+    slope: float
+    intercept: float
+    has_rescale: bool
+    rescale_type: str
+    padding: tuple[int, int] | None
+    lossy: bool
+    pixel_offset: int
+    pixel_length: int
+    inflate_from: int
+    file_bytes: int
+    warnings: tuple[str, ...]
+
+    @property
+    def pixel_bytes(self) -> int:
+        """Bytes of the uncompressed pixels."""
+        return self.rows * self.columns * self.bits_allocated // 8
+
+
+def read_header(path: Path) -> SliceHeader | OtherImage | None:
+    """Read and validate the header of one file.
+
+    Returns
+    -------
+    SliceHeader, OtherImage or None
+        None for a DICOMDIR, which only lists what is on the disk anyway.
+
+    Raises
+    ------
+    NotDicomError, CorruptFileError, OSError
+        As `read_elements`; also corrupt is a CT image that ends before its pixel data.
+    """
+    elements = read_elements(path, WANTED_TAGS)
+    if elements.media_class == DICOMDIR_CLASS:
+        return None
+    values = Values(elements)
+    name = escape_text(path.name)
+    sop_class = values.word("SOPClassUID") or elements.media_class
+    modality = values.word("Modality") or ("CT" if sop_class == CT_IMAGE_STORAGE else "unknown")
+    series = SeriesIdentity(
+        values.word("SeriesInstanceUID"), values.whole_or_none("SeriesNumber"), values.description(), modality
+    )
+    frames = values.whole_or_none("NumberOfFrames")
+    kind = (
+        "other"
+        if modality != "CT"
+        else "capture"
+        if (sop_class + ".").startswith(SECONDARY_CAPTURE + ".")
+        else "broken"
+    )
+
+    def other(problem: str) -> OtherImage:
+        return OtherImage(series, path, name, max(frames or 1, 1), kind, problem)
+
+    if modality != "CT":
+        return other(f"modality {modality} is not CT")
+    if elements.pixel_tag is None:
+        raise CorruptFileError("ends before its pixel data")
+    if frames is not None and frames > 1:
+        return other(f"{name}: multi-frame image of {frames} frames: not supported yet")
+    if kind == "capture" and "ImagePositionPatient" not in values:
+        return other(f"{name}: secondary capture without ImagePositionPatient (0020,0032): no geometry")
+    try:
+        return _validate(values, series, path, name)
+    except ValueProblem as problem:
+        return other(f"{name}: {problem}")
+
+
+def _validate(values: Values, series: SeriesIdentity, path: Path, name: str) -> SliceHeader:
+    elements = values.elements
+    reason = describe_undecodable(elements.transfer_syntax)
+    if reason:
+        raise ValueProblem(reason)
+    if elements.pixel_tag != 0x7FE00010:
+        raise ValueProblem("Float Pixel Data (7FE0,0008): not supported yet")
+    samples, photometric = values.unsigned("SamplesPerPixel", 1), values.word("PhotometricInterpretation")
+    if samples != 1 or photometric not in ("MONOCHROME1", "MONOCHROME2"):
+        found = photometric or "nothing"
+        raise ValueProblem(
+            f"PhotometricInterpretation (0028,0004) is {escape_text(found)} with {samples} samples: "
+            "a CT slice is MONOCHROME2"
+        )
+    rows, columns = values.unsigned("Rows"), values.unsigned("Columns")
+    if rows == 0 or columns == 0:
+        raise ValueProblem(f"Rows (0028,0010) x Columns (0028,0011) is {rows} x {columns}")
+    allocated, stored, high_bit, signed = _validate_bits(values)
+    dj, di = values.decimals("PixelSpacing", 2)
+    low, high = PIXEL_SPACING_MM
+    if not (low <= di <= high and low <= dj <= high):
+        raise values.wrong("PixelSpacing", f"two numbers from {low:g} to {high:g} mm")
+    orientation = values.decimals("ImageOrientationPatient", 6)
+    if max(abs(v) for v in orientation) > 2.0:
+        raise values.wrong("ImageOrientationPatient", "two unit vectors")
+    position = values.decimals("ImagePositionPatient", 3)
+    if max(abs(v) for v in position) > POSITION_LIMIT_MM:
+        raise values.wrong("ImagePositionPatient", f"within {POSITION_LIMIT_MM:g} mm")
+
+    warnings = []
+    has_rescale = "RescaleSlope" in values
+    slope = values.decimals("RescaleSlope", 1)[0] if has_rescale else 1.0
+    intercept = values.decimals("RescaleIntercept", 1)[0] if "RescaleIntercept" in values else 0.0
+    if not RESCALE_SLOPE[0] <= abs(slope) <= RESCALE_SLOPE[1]:
+        raise values.wrong("RescaleSlope", "a finite number other than 0")
+    if abs(intercept) > RESCALE_INTERCEPT_LIMIT:
+        raise values.wrong("RescaleIntercept", f"within {RESCALE_INTERCEPT_LIMIT:g}")
+    if not series.uid:
+        warnings.append("no SeriesInstanceUID: the slices of one folder are taken as one series")
+    unused: dict[str, float | None] = {}
+    for keyword in ("SliceThickness", "SpacingBetweenSlices"):
+        try:
+            unused[keyword] = values.decimals(keyword, 1)[0] if keyword in values else None
+        except ValueProblem as problem:
+            unused[keyword] = None
+            warnings.append(f"{problem}; ignored, it plays no part in the geometry")
+    if elements.encoding_differs:
+        warnings.append("implicit and explicit VR are mixed up: parsed as found, not as the transfer syntax says")
+    image_type = values.text("ImageType").upper().split("\\")
+
+    header = SliceHeader(
+        series=series,
+        file=path,
+        name=name,
+        localizer="LOCALIZER" in (word.strip() for word in image_type),
+        frame_of_reference=values.word("FrameOfReferenceUID"),
+        transfer_syntax=elements.transfer_syntax,
+        little_endian=elements.little_endian,
+        rows=rows,
+        columns=columns,
+        bits_allocated=allocated,
+        bits_stored=stored,
+        high_bit=high_bit,
+        signed=signed,
+        photometric=photometric,
+        row_cosines=orientation[:3],  # type: ignore[arg-type]
+        column_cosines=orientation[3:],  # type: ignore[arg-type]
+        position_mm=position,  # type: ignore[arg-type]
+        di_mm=di,
+        dj_mm=dj,
+        slice_thickness_mm=unused["SliceThickness"],
+        stated_gap_mm=unused["SpacingBetweenSlices"],
+        slope=slope,
+        intercept=intercept,
+        has_rescale=has_rescale,
+        rescale_type=escape_text(values.word("RescaleType"), 16),
+        padding=values.padding(allocated, signed),
+        lossy=values.word("LossyImageCompression") == "01",
+        pixel_offset=elements.pixel_offset,
+        pixel_length=elements.pixel_length,
+        inflate_from=elements.inflate_from,
+        file_bytes=elements.file_bytes,
+        warnings=tuple(warnings),
+    )
+    _check_pixel_room(header, elements.pixel_vr)
+    return header
+
+
+def _validate_bits(values: Values) -> tuple[int, int, int, bool]:
+    allocated = values.unsigned("BitsAllocated")
+    if allocated not in (8, 16, 32):
+        raise values.wrong("BitsAllocated", "8, 16 or 32")
+    stored = values.unsigned("BitsStored")
+    if not 1 <= stored <= allocated:
+        raise values.wrong("BitsStored", f"1 to {allocated}")
+    high_bit = values.unsigned("HighBit", stored - 1)
+    if not stored - 1 <= high_bit < allocated:
+        raise values.wrong("HighBit", f"{stored - 1} to {allocated - 1}")
+    if is_encapsulated(values.elements.transfer_syntax) and high_bit != stored - 1:
+        raise values.wrong("HighBit", f"{stored - 1} in a compressed image")
+    representation = values.unsigned("PixelRepresentation")
+    if representation not in (0, 1):
+        raise values.wrong("PixelRepresentation", "0 or 1")
+    return allocated, stored, high_bit, representation == 1
+
+
+def _check_pixel_room(header: SliceHeader, pixel_vr: str) -> None:
+    """Refuse files that cannot hold their pixels, before anything is allocated for them."""
+    if is_encapsulated(header.transfer_syntax):
+        if header.pixel_length != -1:
+            raise ValueProblem("compressed transfer syntax, but Pixel Data (7FE0,0010) is not encapsulated")
+        return
+    if header.pixel_length == -1:
+        raise ValueProblem("Pixel Data (7FE0,0010) has no length, but the transfer syntax is uncompressed")
+    if not header.little_endian and header.bits_allocated == 8 and pixel_vr == "OW":
+        raise ValueProblem("8-bit pixels as big-endian words: not supported")
+    found = header.pixel_length
+    if header.inflate_from < 0:
+        found = min(found, max(header.file_bytes - header.pixel_offset, 0))
+    if found < header.pixel_bytes:
+        raise ValueProblem(
+            f"truncated: {header.pixel_bytes} bytes of pixels expected ({header.columns} x {header.rows} x "
+            f"{header.bits_allocated} bit), {found} found"
+        )

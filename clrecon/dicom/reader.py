@@ -1,0 +1,138 @@
+"""`read_volume` and `list_series`: the two doors of this package."""
+
+from __future__ import annotations
+
+import os
+import warnings as python_warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from clrecon.dicom.certificate import certify, collect_scan_warnings, collect_series_warnings
+from clrecon.dicom.pixels import read_voxels
+from clrecon.dicom.scan import Progress, Scan, scan_path
+from clrecon.dicom.series import Series, SeriesListing, choose_series, describe_series, group_series
+from clrecon.dicom.text import escape_text, join_names
+from clrecon.errors import NoDicomError, RefusedInputError, UsageError
+from clrecon.geometry import Volume
+
+__all__ = ["list_series", "read_volume"]
+
+
+def read_volume(
+    path: str | os.PathLike[str], series: int | str | None = None, *, progress: Progress | None = None
+) -> Volume:
+    """Read one CT series as a volume in HU and LPS mm.
+
+    Parameters
+    ----------
+    path : str or path-like
+        A folder, searched with its subfolders (any file names; DICOMDIR not needed), or one file.
+    series : int or str, optional
+        Number in the listing (from 1), SeriesInstanceUID, its hash, or description.  Default: the one CT series
+        with most slices; what was left is said in the warnings.
+    progress : callable, optional
+        Called as ``progress(stage, done, total)`` with stage "scan" or "read".
+
+    Returns
+    -------
+    Volume
+        ``voxels`` (nk, nj, ni) int16, int32 or float32 in HU, padding at -1024; ``affine`` index (i, j, k) to
+        LPS mm, slices by ascending position along the normal; ``report`` the certificate.
+
+    Raises
+    ------
+    NoDicomError
+        Nothing there, no DICOM, or no CT.
+    RefusedInputError
+        Corrupt files, or geometry or pixels that cannot be trusted; names files and figures.
+    UsageError
+        `series` names none or several.
+
+    Notes
+    -----
+    Source: DICOM PS3.3 C.7.6.2 (Image Plane), C.7.5.1 (padding), C.8.2.1 (CT image, rescale).
+    """
+    with _quiet_warnings():
+        scan, found = _scan_and_group(path, progress)
+        chosen = choose_series(found, series)
+        stack = chosen.stack
+        if chosen.problems or stack is None or stack.affine is None:
+            raise RefusedInputError(_describe_refusal(chosen, scan))
+        voxels, facts = read_voxels(stack.slices, progress)
+    warnings = [
+        *collect_series_warnings(chosen),
+        *collect_scan_warnings(scan),
+        *_describe_left(found, chosen),
+    ]
+    return Volume(voxels, stack.affine, certify(chosen, stack, facts, scan, stack.affine, warnings))
+
+
+def list_series(path: str | os.PathLike[str], *, progress: Progress | None = None) -> SeriesListing:
+    """List the series at a path, with the geometry of each and what is wrong with it.
+
+    Parameters
+    ----------
+    path, progress
+        As in `read_volume`.
+
+    Returns
+    -------
+    SeriesListing
+
+    Raises
+    ------
+    NoDicomError
+        Nothing there or no DICOM.
+    RefusedInputError
+        All DICOM files are corrupt.
+    """
+    with _quiet_warnings():
+        scan, found = _scan_and_group(path, progress)
+        entries = [describe_series(series, collect_series_warnings(series)) for series in found]
+    warnings = collect_scan_warnings(scan)
+    try:
+        chosen = choose_series(found)
+    except (NoDicomError, RefusedInputError) as error:
+        warnings.append(str(error))
+        return SeriesListing(entries, None, dict(scan.skipped), warnings)
+    return SeriesListing(entries, chosen.number, dict(scan.skipped), warnings + _describe_left(found, chosen))
+
+
+@contextmanager
+def _quiet_warnings() -> Iterator[None]:
+    """Keep the parser's Python warnings off standard error: what matters is in our own checks and report."""
+    with python_warnings.catch_warnings():
+        python_warnings.simplefilter("ignore")
+        yield
+
+
+def _scan_and_group(path: str | os.PathLike[str], progress: Progress | None) -> tuple[Scan, list[Series]]:
+    try:
+        folder = Path(path)
+    except TypeError as error:
+        raise UsageError(f"a path is a string or a path object, not {type(path).__name__}") from error
+    scan = scan_path(folder, progress)
+    if not scan.slices and not scan.others:
+        shown = escape_text(str(path), 256)
+        if scan.corrupt:
+            raise RefusedInputError(f"no readable DICOM file in {shown}, corrupt: {join_names(scan.corrupt)}")
+        reasons = ", ".join(f"{count} {reason}" for reason, count in sorted(scan.skipped.items()))
+        looked = f"{scan.files} file{'s' * (scan.files != 1)} looked at" + (f" ({reasons})" if reasons else "")
+        hint = "; a DICOMDIR only lists files: name the folder that holds them" if scan.skipped["DICOMDIR"] else ""
+        raise NoDicomError(f"no DICOM images in {shown}: {looked}{hint}")
+    return scan, group_series(scan)
+
+
+def _describe_refusal(series: Series, scan: Scan) -> str:
+    text = f"series {series.number} '{series.identity.description}': " + "; ".join(series.problems)
+    if scan.corrupt:
+        text += f" (corrupt and skipped: {join_names(scan.corrupt)})"
+    return text
+
+
+def _describe_left(found: list[Series], chosen: Series) -> list[str]:
+    left = [series for series in found if series is not chosen]
+    if not left:
+        return []
+    return [f"{len(left)} other series left: " + join_names([f"[{series.describe()}]" for series in left])]

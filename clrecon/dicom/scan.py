@@ -1,0 +1,134 @@
+"""Walk a folder, or take one file, and read the header of every DICOM file in it.
+
+Names, extensions and DICOMDIR files play no part.  Nothing but regular files inside the folder is opened: devices,
+pipes and links are skipped and counted (a link into the folder is met again at its own place; a link out of it is
+none of our business).
+"""
+
+from __future__ import annotations
+
+import os
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from clrecon.dicom.elements import CorruptFileError, NotDicomError
+from clrecon.dicom.header import OtherImage, SliceHeader, read_header
+from clrecon.dicom.text import escape_text
+from clrecon.errors import NoDicomError
+
+__all__ = ["Progress", "Scan", "scan_path"]
+
+Progress = Callable[[str, int, int], None]
+
+
+@dataclass
+class Scan:
+    """What is in a folder.
+
+    Attributes
+    ----------
+    slices : list of SliceHeader
+        Valid CT slices, in the order of their paths.
+    others : list of OtherImage
+        DICOM objects that are none.
+    skipped : Counter
+        Reason to number of files (or folders) that were passed over.
+    corrupt : list of str
+        One line for each file that says it is DICOM and is not readable as such: name and reason.
+    files : int
+        Regular files looked at.
+    """
+
+    slices: list[SliceHeader] = field(default_factory=list)
+    others: list[OtherImage] = field(default_factory=list)
+    skipped: Counter[str] = field(default_factory=Counter)
+    corrupt: list[str] = field(default_factory=list)
+    files: int = 0
+
+
+def scan_path(path: Path, progress: Progress | None = None) -> Scan:
+    """Read the headers of all DICOM files at `path`.
+
+    Parameters
+    ----------
+    path : Path
+        A folder, searched with its subfolders, or one file.
+    progress : callable, optional
+        Called as ``progress("scan", done, total)``.
+
+    Raises
+    ------
+    NoDicomError
+        `path` does not exist, cannot be read, or is neither a folder nor a regular file.
+    """
+    scan = Scan()
+    files = _list_files(path, scan)
+    scan.files = len(files)
+    for done, file in enumerate(files, start=1):
+        _take_file(file, scan)
+        if progress is not None:
+            progress("scan", done, len(files))
+    return scan
+
+
+def _take_file(file: Path, scan: Scan) -> None:
+    try:
+        header = read_header(file)
+    except NotDicomError:
+        scan.skipped["not DICOM"] += 1
+    except CorruptFileError as error:
+        scan.skipped["corrupt"] += 1
+        scan.corrupt.append(f"{escape_text(file.name)}: {error}")
+    except OSError:
+        scan.skipped["not readable"] += 1
+    else:
+        if header is None:
+            scan.skipped["DICOMDIR"] += 1
+        elif isinstance(header, SliceHeader):
+            scan.slices.append(header)
+        else:
+            scan.others.append(header)
+
+
+def _list_files(path: Path, scan: Scan) -> list[Path]:
+    """List the regular files at `path`, sorted, and count what was passed over."""
+    try:
+        if path.is_file():
+            return [path]
+        if not path.is_dir():
+            what = "is neither a folder nor a regular file" if os.path.lexists(path) else "does not exist"
+            raise NoDicomError(f"{path} {what}")
+        with os.scandir(path):
+            pass
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or str(error)
+        raise NoDicomError(f"{escape_text(str(path), 256)} cannot be read: {reason}") from error
+
+    root = os.path.realpath(path)
+    files: list[str] = []
+    folders = [str(path)]
+    while folders:
+        try:
+            with os.scandir(folders.pop()) as entries:
+                for entry in entries:
+                    _sort_entry(entry, root, files, folders, scan.skipped)
+        except OSError:
+            scan.skipped["folder not readable"] += 1
+    return [Path(file) for file in sorted(files)]
+
+
+def _sort_entry(
+    entry: os.DirEntry[str], root: str, files: list[str], folders: list[str], skipped: Counter[str]
+) -> None:
+    if entry.is_symlink():
+        target = os.path.realpath(entry.path)
+        inside = target == root or target.startswith(root.rstrip(os.sep) + os.sep)
+        skipped["link inside the folder" if inside else "link out of the folder"] += 1
+    elif entry.is_file(follow_symlinks=False):
+        files.append(entry.path)
+    elif entry.is_dir(follow_symlinks=False):
+        folders.append(entry.path)
+    else:
+        skipped["not a regular file"] += 1

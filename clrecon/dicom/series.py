@@ -1,0 +1,299 @@
+"""Slices to series: group, number, list, choose."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass, field
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from clrecon.dicom.gate import Stack, measure_stack
+from clrecon.dicom.header import OtherImage, SeriesIdentity, SliceHeader
+from clrecon.dicom.scan import Scan
+from clrecon.dicom.text import hash_uid, join_names
+from clrecon.errors import NoDicomError, RefusedInputError, UsageError
+from clrecon.geometry import column_spacing
+
+__all__ = ["Series", "SeriesEntry", "SeriesListing", "choose_series", "describe_series", "group_series"]
+
+SPLIT_ANGLE_RAD = np.radians(1.0)
+"""Slices of one SeriesInstanceUID whose directions differ by more are separate stacks (a localizer, another plane);
+below, they are one stack with a fault that the gate names."""
+PROBLEMS_SHOWN = 3
+
+
+@dataclass
+class Series:
+    """One stack of a series, or a series that cannot be one.
+
+    Attributes
+    ----------
+    kind : {"stack", "localizer", "capture", "other"}
+        Only stacks are ever chosen; "other" is no CT.
+    headers : list of SliceHeader
+        Valid slices, unsorted.
+    others : list of OtherImage
+        Its files that cannot be slices.
+    number : int
+        Place in the listing, from 1.
+    """
+
+    identity: SeriesIdentity
+    kind: str
+    headers: list[SliceHeader] = field(default_factory=list)
+    others: list[OtherImage] = field(default_factory=list)
+    number: int = 0
+
+    @property
+    def count(self) -> int:
+        """Slices, the frames of multi-frame images among them."""
+        return len(self.headers) + sum(image.frames for image in self.others)
+
+    @cached_property
+    def stack(self) -> Stack | None:
+        """The measured geometry; None without a valid slice."""
+        return measure_stack(self.headers) if self.headers else None
+
+    @cached_property
+    def problems(self) -> list[str]:
+        """Why this series is refused; empty where it is usable."""
+        if self.kind == "other":
+            return [f"modality {self.identity.modality} is not CT"]
+        texts = [image.problem for image in self.others]
+        problems = texts[:PROBLEMS_SHOWN]
+        if len(texts) > PROBLEMS_SHOWN:
+            problems.append(f"and {len(texts) - PROBLEMS_SHOWN} more files with a problem")
+        if self.kind == "localizer":
+            problems.append("localizer images, not a stack")
+        if self.stack is not None and not problems:  # bad files leave holes, which would only hide the cause
+            problems += self.stack.problems
+        return problems
+
+    def describe(self) -> str:
+        """One line for a message."""
+        kind = "" if self.kind in ("stack", "other") else f", {self.kind}"
+        plural = "s" * (self.count != 1)
+        title = f"{self.number}: {self.identity.modality} '{self.identity.description}'"
+        return f"{title}, {self.count} slice{plural}{kind}"
+
+
+@dataclass(frozen=True)
+class SeriesEntry:
+    """One line of a listing; `as_dict` is the documented machine-readable form.
+
+    Attributes
+    ----------
+    number : int
+        From 1, the value that ``series=`` takes.
+    uid_hash : str or None
+        First 16 hexadecimal digits of the SHA-256 of the SeriesInstanceUID, None where the files have none.
+    shape_ijk, spacing_mm, affine_ijk_to_lps_mm, tilt_deg : list, list, nested list, float; or None
+        None where the geometry is unknown or refused.
+    grid_residual_max_mm : float or None
+        Largest distance of a slice position from the affine.
+    gap_mm : dict
+        "min" and "max" distance of neighbouring slices along the normal, None where unknown.
+    """
+
+    number: int
+    uid_hash: str | None
+    description: str
+    modality: str
+    slices: int
+    shape_ijk: list[int] | None
+    spacing_mm: list[float] | None
+    affine_ijk_to_lps_mm: list[list[float]] | None
+    tilt_deg: float | None
+    grid_residual_max_mm: float | None
+    gap_mm: dict[str, float | None]
+    uneven: bool | None
+    warnings: list[str]
+    problems: list[str]
+
+    def as_dict(self) -> dict[str, Any]:
+        """The entry as a dict of JSON types."""
+        return asdict(self)
+
+
+@dataclass(frozen=True)
+class SeriesListing:
+    """What is at a path.
+
+    Attributes
+    ----------
+    series : list of SeriesEntry
+    chosen : int or None
+        Number of the series that `read_volume` takes when none is named; None where it would not choose.
+    skipped : dict of str to int
+        Reason to number of files passed over.
+    warnings : list of str
+    """
+
+    series: list[SeriesEntry]
+    chosen: int | None
+    skipped: dict[str, int]
+    warnings: list[str]
+
+
+def group_series(scan: Scan) -> list[Series]:
+    """Group what was scanned into numbered series.
+
+    One SeriesInstanceUID (where it was removed: one folder) gives one `Series`, or several where it mixes planes,
+    localizers or secondary captures with a stack.  Numbers follow (SeriesNumber, SeriesInstanceUID, larger part first)
+    and so do not depend on names.
+    """
+    slices: dict[str, list[SliceHeader]] = defaultdict(list)
+    others: dict[str, list[OtherImage]] = defaultdict(list)
+    for header in scan.slices:
+        slices[header.series.uid or str(header.file.parent)].append(header)
+    for image in scan.others:
+        others[image.series.uid or str(image.file.parent)].append(image)
+    found = []
+    for uid in {**slices, **others}:
+        parts = _split_slices(slices[uid])
+        for kind in ("capture", "other", "broken"):
+            images = [image for image in others[uid] if image.kind == kind]
+            if not images:
+                continue
+            stacks = [part for part in parts if part.kind == "stack"]
+            if kind == "broken" and stacks:
+                max(stacks, key=lambda part: len(part.headers)).others = images
+            else:
+                parts.append(Series(images[0].series, "stack" if kind == "broken" else kind, others=images))
+        parts.sort(key=lambda part: (part.kind != "stack", -part.count))
+        found += parts
+    found.sort(key=_listing_key)
+    for number, series in enumerate(found, start=1):
+        series.number = number
+    return found
+
+
+def _listing_key(series: Series) -> tuple[bool, int, str]:
+    number = series.identity.number
+    return number is None, number or 0, series.identity.uid
+
+
+def _split_slices(headers: Sequence[SliceHeader]) -> list[Series]:
+    """Part the slices of one SeriesInstanceUID by plane, localizers first."""
+    parts: list[tuple[np.ndarray, Series]] = []
+    known: dict[tuple[float, ...], Series] = {}
+    localizers = Series(headers[0].series, "localizer") if headers else None
+    for header in headers:
+        if header.localizer and localizers is not None:
+            localizers.headers.append(header)
+            continue
+        key = (*header.row_cosines, *header.column_cosines)
+        if key not in known:
+            directions = np.array(key).reshape(2, 3)
+            near = (part for first, part in parts if np.linalg.norm(first - directions, axis=1).max() < SPLIT_ANGLE_RAD)
+            part = next(near, None)
+            if part is None:
+                part = Series(header.series, "stack")
+                parts.append((directions, part))
+            known[key] = part
+        known[key].headers.append(header)
+    found = [part for _, part in parts]
+    if localizers is not None and localizers.headers:
+        found.append(localizers)
+    return found
+
+
+def describe_series(series: Series, warnings: Iterable[str] = ()) -> SeriesEntry:
+    """Make the listing entry of a series."""
+    stack = series.stack
+    affine = stack.affine if stack is not None and not series.problems else None
+    first = stack.slices[0] if stack is not None else None
+    return SeriesEntry(
+        number=series.number,
+        uid_hash=hash_uid(series.identity.uid),
+        description=series.identity.description,
+        modality=series.identity.modality,
+        slices=series.count,
+        shape_ijk=None if first is None else [first.columns, first.rows, len(series.headers)],
+        spacing_mm=None if affine is None else list(column_spacing(affine)),
+        affine_ijk_to_lps_mm=None if affine is None else affine.tolist(),
+        tilt_deg=None if stack is None or affine is None else stack.tilt_deg,
+        grid_residual_max_mm=None if stack is None else stack.line.residual_max_mm,
+        gap_mm={"min": stack.line.gap_min_mm if stack else None, "max": stack.line.gap_max_mm if stack else None},
+        uneven=None if stack is None else stack.line.uneven,
+        warnings=list(warnings),
+        problems=list(series.problems),
+    )
+
+
+def choose_series(found: Sequence[Series], wanted: int | str | None = None) -> Series:
+    """Choose the series to read.
+
+    Parameters
+    ----------
+    found : sequence of Series
+    wanted : int or str, optional
+        Number in the listing, SeriesInstanceUID, its hash, or the description (whole, or a part that only one
+        series has).  None takes the one CT stack with most slices.
+
+    Raises
+    ------
+    UsageError
+        `wanted` names none or several; lists what is there.
+    NoDicomError
+        There is no CT series, or the one named is none.
+    RefusedInputError
+        Several CT stacks have the same, largest number of slices; or there is no stack.
+    """
+    if wanted is None:
+        ct = [series for series in found if series.kind != "other"]
+        if not ct:
+            raise NoDicomError(_describe_modalities(found))
+        return _take_largest(ct)
+    matches = _match_series(found, wanted)
+    if len({series.identity for series in matches}) != 1:
+        count = "no series matches" if not matches else f"{len(matches)} series match"
+        raise UsageError(f"{count} series={wanted!r}; there are {_list_lines(found)}")
+    chosen = matches[0] if len(matches) == 1 else _take_largest(matches)
+    if chosen.kind == "other":
+        raise NoDicomError(f"series {chosen.number} is of modality {chosen.identity.modality}, not CT")
+    return chosen
+
+
+def _match_series(found: Sequence[Series], wanted: int | str) -> list[Series]:
+    text = str(wanted).strip()
+    by_id = [series for series in found if text in (series.identity.uid, hash_uid(series.identity.uid)) and text]
+    if by_id:
+        return by_id
+    if text.isascii() and text.isdigit():
+        return [series for series in found if series.number == int(text)]
+    folded = text.casefold()
+    exact = [series for series in found if series.identity.description.casefold() == folded]
+    return exact or [series for series in found if folded and folded in series.identity.description.casefold()]
+
+
+def _take_largest(candidates: Sequence[Series]) -> Series:
+    stacks = [series for series in candidates if series.kind == "stack"]
+    if not stacks:
+        if len(candidates) == 1:
+            return candidates[0]  # read_volume refuses it with its own problem
+        raise RefusedInputError(f"no CT stack among {_list_lines(candidates)}")
+    most = max(series.count for series in stacks)
+    largest = [series for series in stacks if series.count == most]
+    if len(largest) == 1:
+        return largest[0]
+    if most == 1:
+        raise RefusedInputError(f"a single slice cannot make a surface: {len(largest)} series of one slice each")
+    raise RefusedInputError(
+        f"{len(largest)} CT series have {most} slices each, choose one with --series: {_list_lines(largest)}"
+    )
+
+
+def _describe_modalities(found: Sequence[Series]) -> str:
+    counts: dict[str, int] = defaultdict(int)
+    for series in found:
+        counts[series.identity.modality] += 1
+    what = ", ".join(f"{count} series of modality {modality}" for modality, count in sorted(counts.items()))
+    return f"found {what}, no CT series"
+
+
+def _list_lines(found: Sequence[Series]) -> str:
+    return join_names([f"[{series.describe()}, hash {hash_uid(series.identity.uid)}]" for series in found])

@@ -1,0 +1,143 @@
+"""Typed and checked access to the raw values of one file.
+
+pydicom turns "1,5", "nan" or a wrong count of numbers into something without an error; here a decimal string is a
+finite number with a decimal point, in the count that is asked for, or a `ValueProblem` that names the tag.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from typing import Literal
+
+from clrecon.dicom.elements import DicomElements
+from clrecon.dicom.text import escape_text
+from clrecon.errors import RefusedInputError
+
+__all__ = ["WANTED_TAGS", "ValueProblem", "Values"]
+
+_TAGS = {
+    "SpecificCharacterSet": 0x00080005,
+    "ImageType": 0x00080008,
+    "SOPClassUID": 0x00080016,
+    "Modality": 0x00080060,
+    "SeriesDescription": 0x0008103E,
+    "SliceThickness": 0x00180050,
+    "SpacingBetweenSlices": 0x00180088,
+    "SeriesInstanceUID": 0x0020000E,
+    "SeriesNumber": 0x00200011,
+    "ImagePositionPatient": 0x00200032,
+    "ImageOrientationPatient": 0x00200037,
+    "FrameOfReferenceUID": 0x00200052,
+    "SamplesPerPixel": 0x00280002,
+    "PhotometricInterpretation": 0x00280004,
+    "NumberOfFrames": 0x00280008,
+    "Rows": 0x00280010,
+    "Columns": 0x00280011,
+    "PixelSpacing": 0x00280030,
+    "BitsAllocated": 0x00280100,
+    "BitsStored": 0x00280101,
+    "HighBit": 0x00280102,
+    "PixelRepresentation": 0x00280103,
+    "PixelPaddingValue": 0x00280120,
+    "PixelPaddingRangeLimit": 0x00280121,
+    "RescaleIntercept": 0x00281052,
+    "RescaleSlope": 0x00281053,
+    "RescaleType": 0x00281054,
+    "LossyImageCompression": 0x00282110,
+}
+WANTED_TAGS = tuple(_TAGS.values())
+_DECIMAL = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
+
+
+class ValueProblem(RefusedInputError):
+    """One value of a header is missing or wrong."""
+
+
+class Values:
+    """Typed access to raw elements; every accessor checks what it returns."""
+
+    def __init__(self, elements: DicomElements):
+        self.elements = elements
+        self.byte_order: Literal["little", "big"] = "little" if elements.little_endian else "big"
+
+    def __contains__(self, keyword: str) -> bool:
+        return bool(self.elements.values.get(_TAGS[keyword], b"").strip(b" \0"))
+
+    def wrong(self, keyword: str, expected: str) -> ValueProblem:
+        tag = _TAGS[keyword]
+        place = f"{keyword} ({tag >> 16:04X},{tag & 0xFFFF:04X})"
+        if keyword not in self and not self.elements.values.get(tag):
+            return ValueProblem(f"{place} is missing or empty, expected {expected}")
+        raw = self.elements.values[tag]
+        vr = self.elements.vrs.get(tag)
+        binary = vr in ("US", "SS", "UL") or (vr is None and keyword in _BINARY)
+        number = int.from_bytes(raw, self.byte_order)
+        shown = str(number) if binary else f"'{escape_text(raw.decode('latin-1').strip(chr(0) + ' '))}'"
+        return ValueProblem(f"{place} is {shown}, expected {expected}")
+
+    def text(self, keyword: str) -> str:
+        return self.elements.values.get(_TAGS[keyword], b"").decode("latin-1").strip(" \0")
+
+    def word(self, keyword: str) -> str:
+        return escape_text(self.text(keyword))
+
+    def decimals(self, keyword: str, count: int) -> tuple[float, ...]:
+        parts = [part.strip(" \0") for part in self.text(keyword).split("\\")]
+        expected = "a finite number" if count == 1 else f"{count} finite numbers"
+        if len(parts) != count or not all(_DECIMAL.fullmatch(part) for part in parts):
+            raise self.wrong(keyword, expected)
+        numbers = tuple(float(part) for part in parts)
+        if not all(math.isfinite(number) for number in numbers):
+            raise self.wrong(keyword, expected)
+        return numbers
+
+    def whole_or_none(self, keyword: str) -> int | None:
+        text = self.text(keyword)
+        return int(text) if re.fullmatch(r"[+-]?\d{1,12}", text) else None
+
+    def unsigned(self, keyword: str, default: int | None = None) -> int:
+        raw = self.elements.values.get(_TAGS[keyword], b"")
+        if not raw and default is not None:
+            return default
+        if len(raw) != (4 if self.elements.vrs.get(_TAGS[keyword]) == "UL" else 2):
+            raise self.wrong(keyword, "one unsigned number")
+        return int.from_bytes(raw, self.byte_order)
+
+    def padding(self, bits_allocated: int, signed: bool) -> tuple[int, int] | None:
+        """Range of stored padding values.
+
+        Writers give these with the VR of the other signedness too, so the bits are read again in the pixel
+        representation: US 63536 in signed 16-bit pixels is -2000.
+        """
+        bounds = []
+        for keyword in ("PixelPaddingValue", "PixelPaddingRangeLimit"):
+            raw = self.elements.values.get(_TAGS[keyword], b"")
+            if not raw:
+                break
+            if len(raw) not in (2, 4):
+                raise self.wrong(keyword, "one number")
+            bounds.append(int.from_bytes(raw, self.byte_order, signed=signed))
+            if bits_allocated == 8 and not signed:
+                bounds[-1] &= 0xFF
+        return (min(bounds), max(bounds)) if bounds else None
+
+    def description(self) -> str:
+        """SeriesDescription in its character set, one safe line."""
+        raw = self.elements.values.get(_TAGS["SeriesDescription"], b"").strip(b" \0")
+        charset = self.text("SpecificCharacterSet")
+        if raw.isascii() and b"\x1b" not in raw or not charset:
+            return escape_text(raw.decode("latin-1"))
+        from pydicom.charset import convert_encodings, decode_bytes
+
+        try:
+            decoded = decode_bytes(raw, convert_encodings(charset.split("\\")), set())
+        except (LookupError, ValueError, TypeError, AttributeError):
+            decoded = raw.decode("latin-1")  # a wrong character set spoils a label, not the image
+        return escape_text(decoded)
+
+
+_BINARY = (
+    "SamplesPerPixel Rows Columns BitsAllocated BitsStored HighBit PixelRepresentation "
+    "PixelPaddingValue PixelPaddingRangeLimit"
+).split()

@@ -1,0 +1,115 @@
+"""Cut and mutated files: nothing but a ClreconError gets out, in bounded time, and nothing is printed."""
+
+from __future__ import annotations
+
+import random
+import struct
+import warnings
+
+import numpy as np
+import pytest
+from dicom_series import Plan, make_dataset, save_dataset, write_series
+from pydicom.uid import DeflatedExplicitVRLittleEndian, ExplicitVRLittleEndian, ImplicitVRLittleEndian
+
+from clrecon.dicom import list_series, read_volume
+from clrecon.errors import ClreconError, RefusedInputError
+
+SYNTAXES = [ExplicitVRLittleEndian, ImplicitVRLittleEndian, DeflatedExplicitVRLittleEndian]
+PLAN = {"shape": (3, 3, 4), "name": "{}".format}
+
+
+def read_or_refuse(folder):
+    """Read; gives the volume or None where it is refused."""
+    try:
+        return read_volume(folder)
+    except ClreconError as error:
+        assert "\n" not in str(error) and str(error).isprintable()
+        return None
+
+
+@pytest.mark.fuzz
+@pytest.mark.parametrize("syntax", SYNTAXES)
+def test_a_file_cut_anywhere(tmp_path, syntax):
+    plan = write_series(tmp_path, Plan(syntax=syntax, **PLAN))
+    whole = (tmp_path / "1").read_bytes()
+    assert np.array_equal(read_volume(tmp_path).voxels, plan.hu())
+    for length in range(0, len(whole), 3):
+        (tmp_path / "1").write_bytes(whole[:length])
+        volume = read_or_refuse(tmp_path)
+        # What is left of a cut stack are slices 0 and 2, at twice the gap, and the report says why.
+        if volume is not None:
+            assert volume.voxels.shape[0] == 2 or np.array_equal(volume.voxels, plan.hu())
+            assert volume.voxels.shape[0] == 3 or volume.report["files"]["skipped"]
+
+
+@pytest.mark.fuzz
+@pytest.mark.parametrize("syntax", SYNTAXES)
+def test_a_file_with_wrong_bytes(tmp_path, syntax, capfd):
+    write_series(tmp_path, Plan(syntax=syntax, **PLAN))
+    whole = (tmp_path / "1").read_bytes()
+    dice = random.Random(20)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for _ in range(150):
+            data = bytearray(whole)
+            for _ in range(dice.choice((1, 1, 2, 8))):
+                data[dice.randrange(128, len(data))] = dice.choice((0, 1, 0xFF, 0x5C, dice.randrange(256)))
+            (tmp_path / "1").write_bytes(data)
+            volume = read_or_refuse(tmp_path)
+            assert volume is None or np.isfinite(volume.affine).all()
+            try:
+                list_series(tmp_path / "1")
+            except ClreconError:
+                pass
+    out, err = capfd.readouterr()
+    assert out == "" and err == ""
+
+
+@pytest.mark.parametrize("depth", [300, 5000])
+def test_deeply_nested_sequences(tmp_path, depth):
+    write_series(tmp_path, Plan(**PLAN))
+    whole = (tmp_path / "1").read_bytes()
+    start = whole.index(b"\x08\x00\x60\x00CS")  # before Modality
+    opening = struct.pack("<HH2sHL", 0x0008, 0x0051, b"SQ", 0, 0xFFFFFFFF) + struct.pack(
+        "<HHL", 0xFFFE, 0xE000, 0xFFFFFFFF
+    )
+    closing = struct.pack("<HHLHHL", 0xFFFE, 0xE00D, 0, 0xFFFE, 0xE0DD, 0)
+    (tmp_path / "1").write_bytes(whole[:start] + opening * depth + closing * depth + whole[start:])
+    for name in ("0", "2"):
+        (tmp_path / name).unlink()
+    with pytest.raises(RefusedInputError, match="1: sequences are nested too deep"):
+        read_volume(tmp_path)
+
+
+def test_implicit_elements_under_an_explicit_syntax(tmp_path):
+    plan = Plan(**PLAN)
+    for k in range(3):
+        ds = make_dataset(Plan(syntax=ImplicitVRLittleEndian, **PLAN), k)
+        save_dataset(ds, tmp_path / f"{k}")
+        data = (tmp_path / f"{k}").read_bytes()
+        old = b"1.2.840.10008.1.2\0"
+        assert data.count(b"\x12\0" + old) == 1
+        changed = data.replace(b"\x12\0" + old, b"\x14\0" + b"1.2.840.10008.1.2.1\0")
+        (tmp_path / f"{k}").write_bytes(changed)
+    volume = read_volume(tmp_path)
+    assert np.array_equal(volume.voxels, plan.hu())
+    assert "parsed as found" in volume.report["warnings"][0]
+
+
+def test_executable_preambles_are_read_as_dicom(tmp_path):
+    plan = write_series(tmp_path, Plan(**PLAN))
+    for file in tmp_path.iterdir():
+        data = file.read_bytes()
+        file.write_bytes(b"MZ" + b"\x90" * 126 + data[128:])
+    assert np.array_equal(read_volume(tmp_path).voxels, plan.hu())
+
+
+def test_unknown_transfer_syntax_is_named(tmp_path):
+    plan = Plan(**PLAN)
+    for k in range(3):
+        ds = make_dataset(plan, k)
+        save_dataset(ds, tmp_path / f"{k}")
+        data = (tmp_path / f"{k}").read_bytes()
+        (tmp_path / f"{k}").write_bytes(data.replace(b"1.2.840.10008.1.2.1\0", b"1.2.840.113619.5.9\0\0"))
+    with pytest.raises(RefusedInputError, match=r"transfer syntax 1\.2\.840\.113619\.5\.9 \(private or unknown\)"):
+        read_volume(tmp_path)

@@ -1,0 +1,277 @@
+"""What is found in a folder, how it is grouped, listed and chosen, and what is said of the rest."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import shutil
+
+import numpy as np
+import pydicom
+import pytest
+from dicom_series import ROOT, Plan, make_dataset, save_dataset, set_raw, set_values, write_series
+from pydicom.data import get_testdata_file
+from pydicom.uid import MRImageStorage, SecondaryCaptureImageStorage
+
+from clrecon.dicom import list_series, read_volume
+from clrecon.errors import NoDicomError, RefusedInputError, UsageError
+
+CONTRACT = (
+    "number uid_hash description modality slices shape_ijk spacing_mm affine_ijk_to_lps_mm tilt_deg "
+    "grid_residual_max_mm gap_mm uneven warnings problems"
+).split()
+
+
+@pytest.fixture
+def two_series(tmp_path):
+    """Series 2 of 7 slices and series 5 of 4, in files that do not tell."""
+    write_series(tmp_path, Plan(series=5, shape=(4, 5, 6), name="a{}".format))
+    write_series(tmp_path, Plan(series=2, name="sub/b{}".format))
+    return tmp_path
+
+
+def test_listing_is_the_contract(two_series):
+    listing = list_series(two_series)
+    entries = [entry.as_dict() for entry in listing.series]
+    assert [list(entry) for entry in entries] == [CONTRACT, CONTRACT]
+    assert listing.chosen == 1
+    assert json.loads(json.dumps(entries)) == entries
+    first = entries[0]
+    assert first["uid_hash"] == hashlib.sha256(f"{ROOT}.2".encode()).hexdigest()[:16]
+    assert (first["number"], first["description"], first["modality"], first["slices"]) == (1, "series 2", "CT", 7)
+    assert first["shape_ijk"] == [6, 5, 7]
+    assert first["spacing_mm"] == pytest.approx([0.5, 0.7, 1.25])
+    assert np.array(first["affine_ijk_to_lps_mm"])[:3, 3] == pytest.approx([-12.5, 31.25, -400.0])
+    assert first["tilt_deg"] == pytest.approx(0, abs=1e-6)
+    assert first["gap_mm"] == pytest.approx({"min": 1.25, "max": 1.25})
+    assert first["grid_residual_max_mm"] < 1e-9
+    assert (first["uneven"], first["warnings"], first["problems"]) == (False, [], [])
+    assert entries[1]["slices"] == 4 and entries[1]["number"] == 2
+
+
+def test_the_largest_series_is_taken_and_the_rest_said(two_series):
+    volume = read_volume(two_series)
+    assert volume.report["series"]["description"] == "series 2"
+    assert volume.report["warnings"] == ["1 other series left: [2: CT 'series 5', 4 slices]"]
+    assert volume.report["files"] == {"found": 11, "used": 7, "skipped": {}}
+    assert list_series(two_series).warnings == volume.report["warnings"]
+
+
+@pytest.mark.parametrize(
+    "wanted",
+    [2, "2", "series 5", "SERIES 5", "es 5", f"{ROOT}.5", hashlib.sha256(f"{ROOT}.5".encode()).hexdigest()[:16]],
+)
+def test_a_series_is_named_in_many_ways(two_series, wanted):
+    assert read_volume(two_series, wanted).report["series"]["number"] == 2
+
+
+@pytest.mark.parametrize(
+    ("wanted", "words"),
+    [(3, "no series matches series=3"), ("neck", "no series matches"), ("series", "2 series match"), ("", "no series")],
+)
+def test_unknown_or_vague_names_list_what_is_there(two_series, wanted, words):
+    with pytest.raises(UsageError) as caught:
+        read_volume(two_series, wanted)
+    assert words in str(caught.value)
+    assert "[1: CT 'series 2', 7 slices, hash " in str(caught.value)
+    assert "[2: CT 'series 5', 4 slices, hash " in str(caught.value)
+
+
+def test_two_series_of_equal_size_need_a_choice(tmp_path):
+    write_series(tmp_path, Plan(series=1))
+    write_series(tmp_path, Plan(series=2, name="x{}".format))
+    with pytest.raises(RefusedInputError, match=r"2 CT series have 7 slices each, choose one with --series: \[1: CT"):
+        read_volume(tmp_path)
+    listing = list_series(tmp_path)
+    assert listing.chosen is None
+    assert "choose one with --series" in listing.warnings[0]
+    assert read_volume(tmp_path, series=2).report["series"]["description"] == "series 2"
+
+
+def test_a_faulty_largest_series_is_not_passed_over(two_series):
+    file = two_series / "sub" / "b3"
+    ds = pydicom.dcmread(file)
+    set_raw("PixelSpacing", "0\\0")(ds, 3)
+    ds.save_as(file)
+    with pytest.raises(RefusedInputError, match=r"series 1 'series 2': b3: PixelSpacing"):
+        read_volume(two_series)
+    assert read_volume(two_series, 2).voxels.shape == (4, 5, 6)
+
+
+@pytest.mark.parametrize("by_type", [True, False], ids=["ImageType", "orientation"])
+def test_a_localizer_in_the_series_is_parted(tmp_path, by_type):
+    plan = write_series(tmp_path)
+    scout = make_dataset(Plan(angles=(90, 0, 0) if not by_type else (0, 0, 0), shape=(1, 9, 9)), 0)
+    if by_type:
+        scout.ImageType = ["ORIGINAL", "PRIMARY", "LOCALIZER"]
+    save_dataset(scout, tmp_path / "scout")
+    volume = read_volume(tmp_path)
+    assert np.array_equal(volume.voxels, plan.hu())
+    assert volume.spacing[2] == pytest.approx(1.25)
+    kind = ", localizer" if by_type else ""
+    assert volume.report["warnings"] == [f"1 other series left: [2: CT 'series 1', 1 slice{kind}]"]
+    assert read_volume(tmp_path, f"{ROOT}.1").report["slices"] == 7
+    assert len(list_series(tmp_path).series) == 2
+
+
+def test_a_secondary_capture_in_the_series_is_parted(tmp_path):
+    plan = write_series(tmp_path)
+    ds = make_dataset(plan, 0)
+    ds.SOPClassUID = ds.file_meta.MediaStorageSOPClassUID = SecondaryCaptureImageStorage
+    del ds.ImagePositionPatient
+    save_dataset(ds, tmp_path / "dose")
+    assert np.array_equal(read_volume(tmp_path).voxels, plan.hu())
+    entry = list_series(tmp_path).series[1]
+    assert "dose: secondary capture without ImagePositionPatient (0020,0032): no geometry" in entry.problems
+
+
+def test_other_modalities_are_listed_and_never_chosen(tmp_path):
+    change = set_values(Modality="MR", SOPClassUID=MRImageStorage)
+    write_series(tmp_path, change=change)
+    with pytest.raises(NoDicomError, match="found 1 series of modality MR, no CT series"):
+        read_volume(tmp_path)
+    listing = list_series(tmp_path)
+    assert (listing.chosen, listing.series[0].modality, listing.series[0].slices) == (None, "MR", 7)
+    assert listing.series[0].problems == ["modality MR is not CT"]
+    write_series(tmp_path, Plan(series=2, shape=(3, 5, 6), name="ct{}".format))
+    assert read_volume(tmp_path).report["series"]["modality"] == "CT"
+    with pytest.raises(NoDicomError, match="series 1 is of modality MR, not CT"):
+        read_volume(tmp_path, 1)
+
+
+def test_single_slices_never_win(tmp_path):
+    for number in (1, 2):
+        write_series(tmp_path, Plan(series=number, shape=(1, 5, 6), name=f"{number}-{{}}".format))
+    with pytest.raises(RefusedInputError, match="a single slice cannot make a surface: 2 series of one slice each"):
+        read_volume(tmp_path)
+    with pytest.raises(RefusedInputError, match="a single slice cannot make a surface"):
+        read_volume(tmp_path / "1-0")
+
+
+def test_files_without_series_uid_go_by_folder(tmp_path):
+    plan = write_series(tmp_path, change=set_values(SeriesInstanceUID=None))
+    volume = read_volume(tmp_path)
+    assert np.array_equal(volume.voxels, plan.hu())
+    assert volume.report["series"]["uid_hash"] is None
+    assert "no SeriesInstanceUID" in volume.report["warnings"][0]
+
+
+def test_hostile_descriptions_come_out_in_one_printable_line(tmp_path):
+    write_series(tmp_path, change=set_raw("SeriesDescription", "a\n\x1b[31m../\x00b" + "x" * 100))
+    text = read_volume(tmp_path).report["series"]["description"]
+    assert text.isprintable() and len(text) == 64
+    assert text.startswith("a\\n\\x1b[31m../\\x00bxx")
+
+
+def test_descriptions_keep_their_character_set(tmp_path):
+    write_series(tmp_path, change=set_values(SpecificCharacterSet="ISO_IR 192", SeriesDescription="Rücken 背骨"))
+    assert list_series(tmp_path).series[0].description == "Rücken 背骨"
+
+
+def test_no_patient_data_and_no_folder_in_the_report(tmp_path):
+    folder = tmp_path / "Doe^John"
+    write_series(folder, Plan(tilt_deg=3), set_values(RescaleType="US"))
+    (folder / "bad").write_bytes(bytes(128) + b"DICM" + b"\xff" * 50)
+    report = json.dumps(read_volume(folder).report)
+    assert "SECRET" not in report and "Doe" not in report and str(tmp_path) not in report
+    assert "bad: " in report
+
+
+# --- what else lies in a folder ---
+
+
+def test_nothing_there(tmp_path):
+    with pytest.raises(NoDicomError, match="does not exist"):
+        read_volume(tmp_path / "nowhere")
+    with pytest.raises(NoDicomError, match="no DICOM images in .*: 0 files looked at"):
+        read_volume(tmp_path)
+    (tmp_path / "empty").touch()
+    (tmp_path / "text.dcm").write_text("DICM " * 100)
+    (tmp_path / "picture.png").write_bytes(b"\x89PNG\r\n\x1a\n" + bytes(300))
+    with pytest.raises(NoDicomError, match=r"3 files looked at \(3 not DICOM\)"):
+        list_series(tmp_path)
+    with pytest.raises(NoDicomError, match=r"1 file looked at \(1 not DICOM\)"):
+        read_volume(tmp_path / "text.dcm")
+    with pytest.raises(UsageError, match="a path is a string or a path object, not int"):
+        read_volume(7)
+    with pytest.raises(NoDicomError):
+        read_volume("nul\0byte")
+
+
+def test_corrupt_files_among_good_ones_are_counted(tmp_path):
+    plan = write_series(tmp_path)
+    (tmp_path / "bad").write_bytes(bytes(128) + b"DICM" + b"\xff" * 50)
+    whole = (tmp_path / "slice002.dcm").read_bytes()
+    (tmp_path / "cut.dcm").write_bytes(whole[:600])
+    volume = read_volume(tmp_path)
+    assert np.array_equal(volume.voxels, plan.hu())
+    assert volume.report["files"] == {"found": 9, "used": 7, "skipped": {"corrupt": 2}}
+    assert volume.report["warnings"][0].startswith("2 corrupt files skipped: bad: ")
+    (tmp_path / "slice002.dcm").unlink()
+    with pytest.raises(
+        RefusedInputError, match=r"1 slice missing between .*\(corrupt and skipped: bad: .*, cut\.dcm: ends"
+    ):
+        read_volume(tmp_path)
+
+
+def test_corrupt_files_alone_are_refused(tmp_path):
+    (tmp_path / "bad").write_bytes(bytes(128) + b"DICM" + b"\xff" * 50)
+    with pytest.raises(RefusedInputError, match="no readable DICOM file in .*, corrupt: bad: "):
+        read_volume(tmp_path)
+
+
+def test_links_and_pipes_are_passed_over(tmp_path):
+    folder, outside = tmp_path / "in", tmp_path / "out"
+    plan = write_series(folder)
+    write_series(outside, Plan(series=3, shape=(9, 5, 6)))
+    os.symlink(outside, folder / "away")
+    os.symlink(outside / "slice000.dcm", folder / "file")
+    os.symlink(folder, folder / "loop")
+    os.symlink(folder / "slice000.dcm", folder / "twice")
+    os.mkfifo(folder / "pipe")
+    (folder / "x.dcm").mkdir()
+    volume = read_volume(folder)
+    assert np.array_equal(volume.voxels, plan.hu())
+    skipped = volume.report["files"]["skipped"]
+    assert skipped == {"link out of the folder": 2, "link inside the folder": 2, "not a regular file": 1}
+    assert "2 skipped: link out of the folder" in volume.report["warnings"]
+    with pytest.raises(NoDicomError, match="neither a folder nor a regular file"):
+        read_volume(folder / "pipe")
+    os.symlink(folder, tmp_path / "named")
+    assert read_volume(tmp_path / "named").report["slices"] == 7
+
+
+@pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() == 0, reason="root reads everything")
+def test_unreadable_files_are_counted(tmp_path):
+    write_series(tmp_path)
+    os.chmod(tmp_path / "slice006.dcm", 0)
+    assert read_volume(tmp_path).report["files"]["skipped"] == {"not readable": 1}
+
+
+def test_dicomdir_trees_of_pydicom(tmp_path):
+    source = get_testdata_file("DICOMDIR")
+    folder = tmp_path / "tree"
+    shutil.copytree(
+        os.path.dirname(source), folder, ignore=lambda where, names: [n for n in names if n == "DICOMDIR-nopatient"]
+    )
+    listing = list_series(folder)
+    assert listing.skipped["DICOMDIR"] >= 1
+    ct = [entry for entry in listing.series if entry.modality == "CT"]
+    assert [entry.slices for entry in ct] == [4, 2, 5]  # folders CT2, CT2N and CT5N
+    with pytest.raises(NoDicomError, match="a DICOMDIR only lists files"):
+        read_volume(folder / "DICOMDIR")
+
+
+def test_ct_small_of_pydicom():
+    with pytest.raises(RefusedInputError, match="a single slice cannot make a surface"):
+        read_volume(get_testdata_file("CT_small.dcm"))
+    entry = list_series(get_testdata_file("CT_small.dcm")).series[0]
+    assert entry.shape_ijk == [128, 128, 1]
+    assert entry.affine_ijk_to_lps_mm is None and entry.gap_mm == {"min": None, "max": None}
+
+
+def test_progress_counts_files_and_slices(two_series):
+    calls = []
+    read_volume(two_series, progress=lambda *call: calls.append(call))
+    assert calls == [("scan", n, 11) for n in range(1, 12)] + [("read", n, 7) for n in range(1, 8)]
