@@ -1,0 +1,47 @@
+"""Phantoms with a known truth: analytic bodies and a believable spine, as voxels or as a DICOM CT series.
+
+The names are loaded when first used, so that importing this package costs nothing.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from clrecon.phantom.build import make_phantom, write_phantom
+    from clrecon.phantom.sampling import add_noise, apply_point_spread, sample_distance, sample_occupancy
+    from clrecon.phantom.settings import KINDS, PhantomSettings, parse_size
+    from clrecon.phantom.shapes import Body, Box, Cylinder, HalfSpace, Sphere, Torus
+
+__all__ = [
+    "KINDS",
+    "Body",
+    "Box",
+    "Cylinder",
+    "HalfSpace",
+    "PhantomSettings",
+    "Sphere",
+    "Torus",
+    "add_noise",
+    "apply_point_spread",
+    "make_phantom",
+    "parse_size",
+    "sample_distance",
+    "sample_occupancy",
+    "write_phantom",
+]
+
+_MODULES = {
+    "build": ("make_phantom", "write_phantom"),
+    "sampling": ("add_noise", "apply_point_spread", "sample_distance", "sample_occupancy"),
+    "settings": ("KINDS", "PhantomSettings", "parse_size"),
+    "shapes": ("Body", "Box", "Cylinder", "HalfSpace", "Sphere", "Torus"),
+}
+
+
+def __getattr__(name: str) -> Any:
+    for module, names in _MODULES.items():
+        if name in names:
+            return getattr(importlib.import_module(f"clrecon.phantom.{module}"), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

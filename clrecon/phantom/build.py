@@ -1,0 +1,243 @@
+"""Make a phantom: voxels, affine and truth, in memory or as a DICOM series beside its truth.json."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import json
+import re
+import shutil
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clrecon.errors import OutputError, UsageError
+from clrecon.geometry import column_spacing, tilt_degrees
+from clrecon.phantom.anatomy import Anatomy
+from clrecon.phantom.bodies import choose_body
+from clrecon.phantom.dicom_series import RESCALE_INTERCEPT, write_series
+from clrecon.phantom.sampling import Progress, add_noise, apply_point_spread, sample_occupancy
+from clrecon.phantom.settings import CENTRE_LPS_MM, PhantomSettings, Placement, place_slices
+from clrecon.phantom.spine import draw_spine
+
+__all__ = ["SPINE_ISO_HU", "TRUTH_NAME", "make_phantom", "write_phantom"]
+
+TRUTH_NAME = "truth.json"
+
+SPINE_ISO_HU = 226.0
+"""Suggested iso value for the spine: above discs, organs and noise, below the blurred thin cortex."""
+
+_GENERATOR = "clrecon phantom"
+_OURS = re.compile(r"IM\d{4}\.dcm|truth\.json")
+
+
+def _version() -> str:
+    try:
+        return importlib.metadata.version("clrecon")
+    except importlib.metadata.PackageNotFoundError:
+        return "0+uninstalled"
+
+
+def _describe_spine(anatomy: Anatomy, affine: NDArray[np.float64], settings: PhantomSettings) -> dict[str, Any]:
+    """Where the parts are, LPS mm, and which of them lie in the volume."""
+    inverse = np.linalg.inv(affine)
+    extents = np.array(settings.shape_kji[::-1])
+
+    def inside(point: NDArray[np.float64]) -> bool:
+        ijk = inverse[:3, :3] @ point + inverse[:3, 3]
+        return bool(np.all((ijk > -0.5) & (ijk < extents - 0.5)))
+
+    centre = np.array(CENTRE_LPS_MM)
+    return {
+        "vertebrae": [
+            {
+                "name": vertebra.name,
+                "center_lps_mm": [float(value) for value in vertebra.center + centre],
+                "inside": inside(vertebra.center + centre),
+            }
+            for vertebra in anatomy.vertebrae
+        ],
+        "left_marker_lps_mm": [float(value) for value in anatomy.marker + centre],
+        "left_marker_radius_mm": anatomy.marker_radius,
+        "left_marker_inside": inside(anatomy.marker + centre),
+        "absent": anatomy.absent,
+    }
+
+
+def _make(
+    settings: PhantomSettings, placement: Placement, progress: Progress | None
+) -> tuple[NDArray[np.int16], dict[str, Any]]:
+    affine = placement.affine
+    surface: dict[str, Any] | None = None
+    spine: dict[str, Any] | None = None
+    half_maximum: float | None = None
+    if settings.kind == "spine":
+        field, anatomy = draw_spine(settings, affine, progress)
+        spine = _describe_spine(anatomy, affine, settings)
+    else:
+        body = choose_body(affine, settings)
+        field = sample_occupancy(body, affine, settings.shape_kji)
+        field *= np.float32(settings.inside_hu - settings.outside_hu)
+        field += np.float32(settings.outside_hu)
+        surface = body.describe()
+        half_maximum = (settings.inside_hu + settings.outside_hu) / 2.0
+    apply_point_spread(field, affine, settings.point_spread_mm, progress)
+    add_noise(field, settings.noise, settings.seed)
+    voxels = np.empty(field.shape, dtype=np.int16)
+    for k in range(len(field)):
+        voxels[k] = np.rint(np.clip(field[k], -32768, 32767 + RESCALE_INTERCEPT))
+    truth = {
+        "generator": _GENERATOR,
+        "version": _version(),
+        "kind": settings.kind,
+        "shape_ijk": list(settings.shape_kji[::-1]),
+        "affine_ijk_to_lps_mm": affine.tolist(),
+        "spacing_mm": list(column_spacing(affine)),
+        "slice_gap_along_normal_mm": float(placement.slice_thickness),
+        "tilt_deg": tilt_degrees(affine),
+        "iso_value_hu": SPINE_ISO_HU if half_maximum is None else half_maximum,
+        "half_maximum_hu": half_maximum,
+        "surface": surface,
+        "spine": spine,
+        "noise_hu": settings.noise,
+        "point_spread_mm": settings.point_spread_mm,
+        "seed": settings.seed,
+        "settings": settings.as_dict(),
+    }
+    return voxels, truth
+
+
+def make_phantom(
+    settings: PhantomSettings, progress: Progress | None = None
+) -> tuple[NDArray[np.int16], NDArray[np.float64], dict[str, Any]]:
+    """Make a phantom in memory.
+
+    Parameters
+    ----------
+    settings : PhantomSettings
+    progress : callable, optional
+        Called as ``progress(stage, done, total)``.
+
+    Returns
+    -------
+    voxels : ndarray, shape (nk, nj, ni), int16
+        HU.
+    affine : ndarray, shape (4, 4), float64
+        Index (i, j, k) to LPS mm, as the decimal strings of a written series give it.
+    truth : dict
+        Plain JSON types: ``kind, shape_ijk, affine_ijk_to_lps_mm, spacing_mm (di, dj, dk), tilt_deg,
+        iso_value_hu``, ``half_maximum_hu`` and ``surface`` (analytic shapes, else null), ``spine`` (centres of the
+        vertebrae, the marker on the patient's left and what is absent, else null), ``noise_hu, point_spread_mm,
+        seed, version, settings``.
+
+    Raises
+    ------
+    UsageError
+        The shape does not fit the volume.
+    """
+    placement = place_slices(settings)
+    voxels, truth = _make(settings, placement, progress)
+    return voxels, placement.affine, truth
+
+
+def _check_replaceable(folder: Path) -> None:
+    """Accept a folder that is absent, empty, or holds an earlier phantom and nothing else.
+
+    Raises
+    ------
+    UsageError
+        It holds something else, or is the current folder.
+    OutputError
+        It is a file, or the folder around it is missing.
+    """
+    if not folder.parent.is_dir():
+        raise OutputError(f"cannot write {folder.name}: the folder around it does not exist; make it first")
+    if not folder.exists():
+        return
+    if not folder.is_dir():
+        raise OutputError(f"cannot write {folder.name}: a file of that name exists; give a new folder")
+    if folder == Path.cwd():
+        raise UsageError("cannot write into the current folder: give a new or empty folder")
+    names = sorted(entry.name for entry in folder.iterdir())
+    if not names:
+        return
+    foreign = [name for name in names if not _OURS.fullmatch(name)]
+    if foreign or TRUTH_NAME not in names:
+        example = (foreign or names)[0]
+        raise UsageError(
+            f"{folder.name} holds {len(names)} files that are not a phantom ({example}): give a new or empty folder"
+        )
+    try:
+        generator = json.loads((folder / TRUTH_NAME).read_text(encoding="utf-8"))["generator"]
+    except (ValueError, KeyError, TypeError) as error:
+        raise UsageError(f"{folder.name}/{TRUTH_NAME} is not of a phantom: give a new or empty folder") from error
+    if generator != _GENERATOR:
+        raise UsageError(f"{folder.name}/{TRUTH_NAME} is not of a phantom: give a new or empty folder")
+
+
+def _put_in_place(finished: Path, folder: Path) -> None:
+    """Rename the finished folder over `folder`; an earlier phantom is put back when that fails.
+
+    When it succeeds the earlier phantom stays beside `finished`, in the temporary folder that the caller removes.
+    """
+    if not folder.exists():
+        finished.rename(folder)
+        return
+    earlier = finished.with_name(finished.name + "-earlier")
+    folder.rename(earlier)
+    try:
+        finished.rename(folder)
+    except OSError:
+        earlier.rename(folder)
+        raise
+
+
+def write_phantom(
+    out_folder: str | Path, settings: PhantomSettings, progress: Progress | None = None
+) -> dict[str, Any]:
+    """Write a phantom as a DICOM CT series with a truth.json.
+
+    The series is written into a temporary folder beside `out_folder`, read back, and then renamed: `out_folder` is
+    complete or untouched.
+
+    Parameters
+    ----------
+    out_folder : path
+        A new or empty folder, or one that holds an earlier phantom and nothing else (then replaced).
+    settings : PhantomSettings
+    progress : callable, optional
+        Called as ``progress(stage, done, total)``.
+
+    Returns
+    -------
+    dict
+        The truth, see `make_phantom`; the same as in truth.json.
+
+    Raises
+    ------
+    UsageError
+        `out_folder` holds other files, or the shape does not fit the volume.
+    OutputError
+        The files cannot be written.
+    """
+    folder = Path(out_folder).resolve()
+    try:
+        _check_replaceable(folder)
+        placement = place_slices(settings)
+        voxels, truth = _make(settings, placement, progress)
+        temporary = Path(tempfile.mkdtemp(prefix=".clrecon-", dir=folder.parent))
+        try:
+            finished = temporary / "series"
+            finished.mkdir()
+            write_series(finished, voxels, settings, placement, progress)
+            text = json.dumps(truth, indent=2) + "\n"
+            (finished / TRUTH_NAME).write_text(text, encoding="utf-8")
+            _put_in_place(finished, folder)
+        finally:
+            shutil.rmtree(temporary, ignore_errors=True)
+    except OSError as error:
+        reason = error.strerror or type(error).__name__
+        raise OutputError(f"the phantom cannot be written to {folder.name}: {reason}") from error
+    return truth

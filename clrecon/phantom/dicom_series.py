@@ -1,0 +1,136 @@
+"""Write a phantom as a DICOM CT series: one file a slice, fixed dates, UIDs derived from the settings.
+
+Source: DICOM PS3.3 A.3 (CT Image IOD), C.7.6.2 (Image Plane), C.8.2.1 (CT Image), PS3.10 chapter 7 (File Meta).
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clrecon.errors import OutputError
+from clrecon.phantom.sampling import Progress
+from clrecon.phantom.settings import PhantomSettings, Placement
+
+if TYPE_CHECKING:
+    from pydicom.dataset import FileDataset
+
+__all__ = ["RESCALE_INTERCEPT", "slice_file_name", "write_series"]
+
+RESCALE_INTERCEPT = -1024
+CT_IMAGE_STORAGE = "1.2.840.10008.5.1.4.1.1.2"
+_TRANSFER_SYNTAXES = {"explicit": "1.2.840.10008.1.2.1", "implicit": "1.2.840.10008.1.2"}
+# phantoms made twice must be equal byte for byte, so no clock
+_DATE, _TIME = "20200101", "120000"
+
+
+def slice_file_name(index: int) -> str:
+    """Name of the file of slice `index`, counted from 0."""
+    return f"IM{index + 1:04d}.dcm"
+
+
+def _make_uid(settings: PhantomSettings, *what: str) -> str:
+    from pydicom.uid import generate_uid
+
+    described = json.dumps(settings.as_dict(), sort_keys=True)
+    return str(generate_uid(entropy_srcs=["clrecon phantom", described, *what]))
+
+
+def _make_headers(settings: PhantomSettings, placement: Placement) -> Iterator[FileDataset]:
+    """Yield one dataset a slice, complete but for the pixels."""
+    from pydicom.dataset import FileDataset, FileMetaDataset
+    from pydicom.uid import PYDICOM_IMPLEMENTATION_UID, UID
+
+    study, series, frame = (_make_uid(settings, name) for name in ("study", "series", "frame of reference"))
+    columns, rows = settings.size
+    for k, position in enumerate(placement.positions):
+        instance = _make_uid(settings, "instance", str(k))
+        meta = FileMetaDataset()
+        meta.MediaStorageSOPClassUID = UID(CT_IMAGE_STORAGE)
+        meta.MediaStorageSOPInstanceUID = UID(instance)
+        meta.TransferSyntaxUID = UID(_TRANSFER_SYNTAXES[settings.transfer_syntax])
+        meta.ImplementationClassUID = PYDICOM_IMPLEMENTATION_UID
+        header = FileDataset(slice_file_name(k), {}, file_meta=meta, preamble=b"\0" * 128)
+        header.ImageType = ["ORIGINAL", "PRIMARY", "AXIAL"]
+        header.SOPClassUID, header.SOPInstanceUID = UID(CT_IMAGE_STORAGE), UID(instance)
+        header.StudyDate = header.SeriesDate = header.AcquisitionDate = header.ContentDate = _DATE
+        header.StudyTime = header.SeriesTime = header.AcquisitionTime = header.ContentTime = _TIME
+        header.AccessionNumber = header.ReferringPhysicianName = ""
+        header.Modality, header.Manufacturer = "CT", "clrecon"
+        header.StudyDescription, header.SeriesDescription = "clrecon phantom", f"phantom {settings.kind}"
+        header.PatientName, header.PatientID = "PHANTOM^CLRECON", "PHANTOM"
+        header.PatientBirthDate = header.PatientSex = ""
+        header.PatientPosition = "HFS"
+        header.KVP, header.SliceThickness = "120", placement.slice_thickness
+        if float(placement.tilt) != 0.0:
+            header.GantryDetectorTilt = placement.tilt
+        header.StudyInstanceUID, header.SeriesInstanceUID = UID(study), UID(series)
+        header.FrameOfReferenceUID, header.PositionReferenceIndicator = UID(frame), ""
+        header.StudyID, header.SeriesNumber, header.AcquisitionNumber = "1", "1", "1"
+        header.InstanceNumber = str(k + 1)
+        header.ImagePositionPatient, header.ImageOrientationPatient = position, placement.orientation
+        header.SamplesPerPixel, header.PhotometricInterpretation = 1, "MONOCHROME2"
+        header.Rows, header.Columns = rows, columns
+        header.PixelSpacing = placement.pixel_spacing
+        header.BitsAllocated, header.BitsStored, header.HighBit, header.PixelRepresentation = 16, 16, 15, 1
+        header.WindowCenter, header.WindowWidth = "300", "1500"
+        header.RescaleIntercept, header.RescaleSlope, header.RescaleType = str(RESCALE_INTERCEPT), "1", "HU"
+        yield header
+
+
+def _check_written(path: Path, header: Any, stored: NDArray[np.int16]) -> None:
+    """Read a file back and compare what places and fills it."""
+    from pydicom import dcmread
+
+    back = dcmread(path)
+    same = (
+        back.SOPInstanceUID == header.SOPInstanceUID
+        and [float(v) for v in back.ImagePositionPatient] == [float(v) for v in header.ImagePositionPatient]
+        and [float(v) for v in back.ImageOrientationPatient] == [float(v) for v in header.ImageOrientationPatient]
+        and [float(v) for v in back.PixelSpacing] == [float(v) for v in header.PixelSpacing]
+        and (back.Rows, back.Columns) == stored.shape
+        and back.PixelData[: stored.nbytes] == stored.astype("<i2").tobytes()
+    )
+    if not same:
+        raise OutputError(f"{path.name} does not read back as it was written: check the disk")
+
+
+def write_series(
+    folder: Path,
+    voxels: NDArray[np.int16],
+    settings: PhantomSettings,
+    placement: Placement,
+    progress: Progress | None = None,
+) -> None:
+    """Write one file a slice into an existing folder and read each back.
+
+    Parameters
+    ----------
+    folder : Path
+    voxels : ndarray, shape (nk, nj, ni), int16
+        HU, at most 32767 + `RESCALE_INTERCEPT`.
+    settings : PhantomSettings
+    placement : Placement
+    progress : callable, optional
+        Called as ``progress("write", done, slices)``.
+
+    Raises
+    ------
+    OutputError
+        A file does not read back as it was written.
+    OSError
+        A file cannot be written.
+    """
+    for k, header in enumerate(_make_headers(settings, placement)):
+        stored = voxels[k] - np.int16(RESCALE_INTERCEPT)
+        header.PixelData = stored.astype("<i2").tobytes()
+        path = folder / slice_file_name(k)
+        header.save_as(path, enforce_file_format=True)
+        _check_written(path, header, stored)
+        if progress is not None:
+            progress("write", k + 1, len(voxels))

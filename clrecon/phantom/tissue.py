@@ -1,0 +1,180 @@
+"""Soft tissue, lungs, vessels and couch of the spine phantom: what surrounds the bones, in HU."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from clrecon.phantom.anatomy import Anatomy
+from clrecon.phantom.fields import Field, capsule, coverage, ellipse, ellipsoid
+
+__all__ = ["draw_tissue"]
+
+AIR_HU = -1000.0
+SKIN_HU = 25.0
+FAT_HU = -105.0
+MUSCLE_HU = 54.0
+LUNG_HU = -860.0
+LIVER_HU = 62.0
+SPLEEN_HU = 52.0
+KIDNEY_HU = 36.0
+BLOOD_HU = 44.0
+CALCIUM_HU = 520.0
+BOWEL_HU = 22.0
+GAS_HU = -850.0
+FLUID_HU = 14.0
+CORD_HU = 38.0
+TABLE_SHELL_HU = 130.0
+TABLE_CORE_HU = -930.0
+
+
+def _blend(canvas: Field, share: Field, hu: float) -> None:
+    canvas += share * (np.float32(hu) - canvas)
+
+
+def _draw_couch(canvas: Field, anatomy: Anatomy, x: Field, y: Field, ramp: float) -> None:
+    """A curved carbon couch under the back: a thin shell round foam, endless along z."""
+    top = y - np.float32(anatomy.half_depth + 2.0)
+    bowed = top + np.float32(0.16 / anatomy.half_width) * x * x
+    shell = np.minimum(np.minimum(bowed, 32.0 - top), np.float32(0.95 * anatomy.half_width) - np.abs(x))
+    _blend(canvas, coverage(shell, ramp), TABLE_SHELL_HU)
+    _blend(canvas, coverage(shell - np.float32(1.6), ramp), TABLE_CORE_HU)
+
+
+def _draw_wall(canvas: Field, anatomy: Anatomy, x: Field, y: Field, ramp: float) -> Field:
+    """Skin, fat and muscle; returns the distance into the body cavity."""
+    skin = ellipse(x, y, anatomy.half_width, anatomy.half_depth)
+    _blend(canvas, coverage(skin, ramp), SKIN_HU)
+    _blend(canvas, coverage(skin - np.float32(1.8), ramp), FAT_HU)
+    # more fat on the flanks and the belly than over the ribs of the back
+    fat = np.float32(11.0) - np.float32(3.0) * np.clip(y / np.float32(anatomy.half_depth), -1.0, 1.0)
+    muscle = skin - fat
+    _blend(canvas, coverage(muscle, ramp), MUSCLE_HU)
+    return muscle - np.float32(13.0)
+
+
+def _draw_organs(
+    canvas: Field, anatomy: Anatomy, cavity: Field, x: Field, y: Field, z: Field, ramp: float, seed: int
+) -> Field:
+    """Abdominal organs in fat and, above the diaphragm, lungs; returns the distance into the lungs."""
+    wide, deep = anatomy.half_width - 28.0, anatomy.half_depth - 28.0
+    low = np.float32(anatomy.level_z("L1"))
+    _blend(canvas, coverage(cavity, ramp), FAT_HU + 8.0)
+    # domes: highest over the middle of each half of the chest
+    half = np.abs(x) - np.float32(0.5 * wide)
+    dome = low + np.float32(62.0) * np.maximum(
+        1.0 - (half / np.float32(0.62 * wide)) ** 2 - (y / np.float32(1.05 * deep)) ** 2, -0.2
+    )
+    above = (z - dome) * np.float32(0.75)
+    abdomen = np.minimum(cavity, -above)
+
+    lowest, highest = float(z.min()), float(z.max())
+
+    def organ(center: tuple[float, float, float], half_axes: tuple[float, float, float], hu: float) -> None:
+        if lowest > center[2] + half_axes[2] + 2.0 * ramp or highest < center[2] - half_axes[2] - 2.0 * ramp:
+            return
+        shape = ellipsoid(x - np.float32(center[0]), y - np.float32(center[1]), z - np.float32(center[2]), half_axes)
+        _blend(canvas, coverage(np.minimum(shape, abdomen), ramp), hu)
+
+    mid, kidney = anatomy.level_z("T12"), anatomy.level_z("L2")
+    generator = np.random.default_rng((seed, 13))
+    for n in range(9):
+        spot = (generator.uniform(-0.6, 0.7) * wide, generator.uniform(-0.75, -0.1) * deep, kidney - 22.0 * n + 25.0)
+        size = tuple(generator.uniform(14.0, 26.0, 3))
+        organ(spot, (size[0], size[1], size[2]), BOWEL_HU)
+        if n % 3 == 0:
+            organ((spot[0], spot[1] - 0.35 * size[1], spot[2]), (0.6 * size[0], 0.5 * size[1], 0.6 * size[2]), GAS_HU)
+    organ((-0.48 * wide, -0.10 * deep, mid - 8.0), (0.62 * wide, 0.80 * deep, 74.0), LIVER_HU)
+    organ((0.20 * wide, -0.45 * deep, mid), (0.34 * wide, 0.36 * deep, 34.0), BOWEL_HU + 8.0)
+    organ((0.70 * wide, 0.22 * deep, mid - 4.0), (0.24 * wide, 0.42 * deep, 44.0), SPLEEN_HU)
+    spine_y = anatomy.vertebrae[13].center[1]
+    for side in (1.0, -1.0):
+        # the right kidney lies lower, under the liver
+        organ((side * 56.0, spine_y + 8.0, kidney + 8.0 * side), (23.0, 19.0, 50.0), KIDNEY_HU)
+
+    mediastinum = ellipse(x - np.float32(6.0), y + np.float32(0.25 * deep), 0.34 * wide + 6.0, 0.85 * deep)
+    # heart and great vessels as one, in a rim of fat
+    _blend(canvas, coverage(np.minimum(np.minimum(mediastinum - np.float32(4.0), above), cavity), ramp), BLOOD_HU)
+    lung = np.minimum(np.minimum(cavity + np.float32(9.0), above), -mediastinum)
+    return lung
+
+
+_BAND = 24000
+"""Pixels drawn at once: temporaries that stay in the cache, and below the size at which memory is mapped anew."""
+
+
+def draw_tissue(anatomy: Anatomy, x: Field, y: Field, z: Field, ramp: float, seed: int) -> Field:
+    """Draw one slice without bone, in bands of rows.
+
+    Parameters
+    ----------
+    anatomy : Anatomy
+    x, y, z : ndarray, shape (nj, ni), float32
+        mm of the plan.
+    ramp : float
+        Width of an interface, mm.
+    seed : int
+
+    Returns
+    -------
+    ndarray, shape (nj, ni), float32
+        HU.
+    """
+    canvas = np.full(x.shape, AIR_HU, dtype=np.float32)
+    rows = max(1, _BAND // x.shape[1])
+    for start in range(0, x.shape[0], rows):
+        band = slice(start, start + rows)
+        _draw_band(canvas[band], anatomy, x[band], y[band], z[band], ramp, seed)
+    return canvas
+
+
+def _draw_band(canvas: Field, anatomy: Anatomy, x: Field, y: Field, z: Field, ramp: float, seed: int) -> None:
+    """Draw onto `canvas`, which holds air."""
+    _draw_couch(canvas, anatomy, x, y, ramp)
+    cavity = _draw_wall(canvas, anatomy, x, y, ramp)
+    lung = _draw_organs(canvas, anatomy, cavity, x, y, z, ramp, seed)
+
+    height = np.clip(z, *anatomy.curve_z) * np.float32(0.01)
+    spine_x, spine_y = (
+        np.asarray(np.polyval(curve.astype(np.float32), height), dtype=np.float32)
+        for curve in (anatomy.curve_x, anatomy.curve_y)
+    )
+    from_x, from_y = x - spine_x, y - spine_y
+    # muscle round the column, before the lungs so that these keep clear of it
+    column = ellipse(from_x, from_y - np.float32(34.0), 66.0, 37.0)
+    front = ellipse(from_x, from_y, 29.0, 27.0)
+    lung = np.minimum(lung, -np.maximum(column, front))
+    _blend(canvas, coverage(np.minimum(column, cavity + np.float32(13.0)), ramp), MUSCLE_HU)
+    _blend(canvas, coverage(lung, ramp), LUNG_HU)
+    # fat planes: under the skin between the muscle bellies, and beside the transverse processes
+    cleft = np.minimum(3.0 - np.abs(from_x), from_y - 56.0)
+    _blend(canvas, coverage(np.minimum(cleft, cavity + np.float32(13.0)), ramp), FAT_HU)
+    belly = np.abs(ellipse(np.abs(from_x) - np.float32(27.0), from_y - np.float32(42.0), 25.0, 17.0))
+    _blend(canvas, np.float32(0.6) * coverage(np.float32(0.7) - belly, ramp), FAT_HU)
+
+    top, bottom = anatomy.level_z("T12"), anatomy.level_z("L5")
+    lean = float(np.polyval(anatomy.curve_y, bottom / 100.0))
+    start = float(np.polyval(anatomy.curve_y, top / 100.0))
+    psoas = capsule(np.abs(from_x), y, z, (24.0, start + 6.0, top - 12.0), (44.0, lean - 6.0, bottom), 3.0, 21.0)
+    _blend(canvas, coverage(psoas, ramp), MUSCLE_HU + 4.0)
+    fat_round = ellipse(from_x - np.float32(2.0), from_y + np.float32(29.0), 34.0, 14.0)
+    _blend(canvas, coverage(np.minimum(fat_round, -lung), ramp), FAT_HU + 20.0)
+    aorta = ellipse(from_x - np.float32(13.0), from_y + np.float32(29.0), 10.0, 10.0)
+    # plaques: spots of the left and rear wall, here and there along the vessel
+    plaque = (
+        1.1
+        - np.abs(aorta - np.float32(1.0))
+        - np.float32(3.0)
+        * np.maximum(
+            0.84 - np.cos(z * np.float32(0.23) + np.float32(seed % 7)) * np.cos((from_x - from_y) * np.float32(0.25)),
+            0.0,
+        )
+    )
+    _blend(canvas, coverage(aorta, ramp), BLOOD_HU)
+    _blend(canvas, coverage(np.minimum(plaque, from_x - np.float32(13.0)), ramp), CALCIUM_HU)
+    _blend(canvas, coverage(ellipse(from_x + np.float32(16.0), from_y + np.float32(27.0), 12.5, 8.5), ramp), BLOOD_HU)
+
+    canal = ellipse(from_x, from_y - np.float32(24.3), 11.5, 8.3)
+    _blend(canvas, coverage(canal, ramp), FAT_HU + 40.0)
+    sac = ellipse(from_x, from_y - np.float32(24.0), 8.5, 6.6)
+    _blend(canvas, coverage(sac, ramp), FLUID_HU)
+    _blend(canvas, coverage(np.minimum(sac - np.float32(3.0), z - np.float32(anatomy.level_z("L1"))), ramp), CORD_HU)
