@@ -14,8 +14,11 @@ import time
 def main(folder: str, output: str, iso_value: float) -> None:
     start = time.perf_counter()
     import SimpleITK as sitk
-    import vtk
-    from vtk.util.numpy_support import numpy_to_vtk
+    from vtkmodules.util.numpy_support import numpy_to_vtk
+    from vtkmodules.vtkCommonCore import vtkSMPTools
+    from vtkmodules.vtkCommonDataModel import vtkImageData
+    from vtkmodules.vtkFiltersCore import vtkFlyingEdges3D
+    from vtkmodules.vtkIOGeometry import vtkSTLWriter
 
     imported = time.perf_counter()
     reader = sitk.ImageSeriesReader()
@@ -24,15 +27,15 @@ def main(folder: str, output: str, iso_value: float) -> None:
     voxels = sitk.GetArrayViewFromImage(image)
     read = time.perf_counter()
 
-    vtk.vtkSMPTools.SetBackend("STDThread")
-    vtk.vtkSMPTools.Initialize(2)
-    grid = vtk.vtkImageData()
+    vtkSMPTools.SetBackend("STDThread")
+    vtkSMPTools.Initialize(2)
+    grid = vtkImageData()
     grid.SetDimensions(*image.GetSize())
     grid.SetSpacing(*image.GetSpacing())
     grid.SetOrigin(*image.GetOrigin())
     grid.SetDirectionMatrix(*image.GetDirection())
     grid.GetPointData().SetScalars(numpy_to_vtk(voxels.ravel()))
-    contour = vtk.vtkFlyingEdges3D()
+    contour = vtkFlyingEdges3D()
     contour.SetInputData(grid)
     contour.SetValue(0, iso_value)
     contour.ComputeNormalsOn()
@@ -40,7 +43,7 @@ def main(folder: str, output: str, iso_value: float) -> None:
     contour.Update()
     contoured = time.perf_counter()
 
-    writer = vtk.vtkSTLWriter()
+    writer = vtkSTLWriter()
     writer.SetFileTypeToBinary()
     writer.SetFileName(output)
     writer.SetInputConnection(contour.GetOutputPort())

@@ -1,0 +1,125 @@
+"""What every command shares: its options, how numbers are shown, and how it ends."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import traceback
+from collections.abc import Callable, Sequence
+from typing import NoReturn
+
+from clrecon.cli.console import Console
+from clrecon.errors import ClreconError, OutputError, UsageError
+
+__all__ = ["EXIT_CODES", "INTERRUPTED", "Parser", "add_common", "add_device", "guard", "megabytes", "table"]
+
+INTERRUPTED = 130
+
+EXIT_CODES = """\
+exit codes: 0 done; 1 unexpected error; 2 no usable DICOM or no surface; 3 wrong usage;
+            4 corrupt or refused input; 5 no device or device failure; 6 output cannot be
+            written; 8 partly done; 130 interrupted"""
+
+
+class Parser(argparse.ArgumentParser):
+    """argparse with errors as `UsageError`: one line, exit code 3."""
+
+    def __init__(self, **options: object):
+        options.setdefault("formatter_class", argparse.RawDescriptionHelpFormatter)
+        super().__init__(allow_abbrev=False, **options)  # type: ignore[arg-type]
+
+    def error(self, message: str) -> NoReturn:
+        raise UsageError(f"{message} (see: {self.prog} --help)")
+
+
+def add_common(parser: argparse.ArgumentParser) -> None:
+    """Add --json, -q, -v and --debug."""
+    group = parser.add_argument_group("output")
+    group.add_argument("--json", action="store_true", help="print one JSON object on stdout and nothing else")
+    loudness = group.add_mutually_exclusive_group()
+    loudness.add_argument("-q", "--quiet", action="store_true", help="print errors only")
+    loudness.add_argument("-v", "--verbose", action="store_true", help="print more, and each stage on stderr")
+    group.add_argument("--debug", action="store_true", help="print the traceback of an error")
+
+
+def add_device(parser: argparse.ArgumentParser) -> None:
+    """Add --device."""
+    parser.add_argument(
+        "--device",
+        metavar="D",
+        help='OpenCL device: an index of "clrecon devices", "cpu", "gpu" or a part of its name'
+        " (default: CLRECON_DEVICE, else the best)",
+    )
+
+
+def guard(action: Callable[[], int], console: Console, debug: bool) -> int:
+    """Run `action` and turn whatever ends it into an exit code and at most one line on stderr.
+
+    Parameters
+    ----------
+    action : callable
+        Returns the exit code.
+    console : Console
+    debug : bool
+        Print the traceback too.
+
+    Returns
+    -------
+    int
+        The exit code.
+    """
+    try:
+        code = action()
+    except (Exception, KeyboardInterrupt) as error:
+        code = _report_error(error, console, debug)
+    try:
+        console.finish()
+    except OutputError as error:
+        console.error(str(error))
+        return error.exit_code
+    return code
+
+
+def _report_error(error: BaseException, console: Console, debug: bool) -> int:
+    if debug:
+        console.clear()
+        traceback.print_exception(type(error), error, error.__traceback__, file=sys.stderr)
+    if isinstance(error, KeyboardInterrupt):
+        console.error("interrupted")
+        return INTERRUPTED
+    if isinstance(error, ClreconError):
+        known = error
+    elif isinstance(error, MemoryError):
+        known = ClreconError("out of memory: free some, or use a smaller series")
+    else:
+        hint = "" if debug else "; run again with --debug for details, and please report it"
+        known = ClreconError(f"unexpected error ({type(error).__name__}: {str(error)[:300]}){hint}")
+    console.error(str(known))
+    try:
+        from clrecon.pipeline.report import error_as_dict
+
+        console.result(error_as_dict(known))
+    except OutputError:
+        pass  # the first error is the one to tell
+    return known.exit_code
+
+
+def table(rows: Sequence[Sequence[object]], right: Sequence[int] = ()) -> list[str]:
+    """Lay out rows of cells in columns; the columns numbered in `right` are aligned to the right."""
+    cells = [[str(cell) for cell in row] for row in rows]
+    widths = [max(len(cell) for cell in column) for column in zip(*cells, strict=True)]
+    return [
+        "  ".join(
+            cell.rjust(width) if n in right else cell.ljust(width)
+            for n, (cell, width) in enumerate(zip(row, widths, strict=True))
+        ).rstrip()
+        for row in cells
+    ]
+
+
+def megabytes(size: int) -> str:
+    """Bytes for people: ``12.3 MB`` (1 MB = 10^6 bytes)."""
+    for unit, factor in (("GB", 1e9), ("MB", 1e6), ("kB", 1e3)):
+        if size >= factor:
+            return f"{size / factor:.1f} {unit}"
+    return f"{size} bytes"

@@ -1,0 +1,182 @@
+"""What goes to the screen: results on stdout, all else on stderr."""
+
+from __future__ import annotations
+
+import os
+import sys
+import time
+from typing import Any
+
+from clrecon.errors import OutputError
+
+__all__ = ["Console", "printable"]
+
+_STAGES = {
+    "device": "choosing a device",
+    "scan": "looking through the files",
+    "read": "reading slices",
+    "build": "building kernels (takes seconds on the first run on this device), extracting the surface",
+    "select": "selecting components",
+    "write": "writing",
+    "measure": "measuring the mesh",
+    "draw": "drawing the phantom",
+    "blur": "blurring the phantom",
+    "selftest": "testing",
+}
+_HIDDEN = {*range(0x202A, 0x202F), *range(0x2066, 0x206A), 0x200E, 0x200F, 0x061C}
+_BAR_WIDTH = 24
+_REDRAW_SECONDS = 0.1
+
+
+def printable(text: object) -> str:
+    """Return `text` on one line, with control and direction characters as escapes.
+
+    Texts from DICOM files and file names can hold terminal sequences.
+    """
+    return "".join(
+        char if char.isprintable() and ord(char) not in _HIDDEN else char.encode("unicode_escape").decode("ascii")
+        for char in " ".join(str(text).splitlines())
+    )
+
+
+class Console:
+    """Writes for one command.
+
+    Parameters
+    ----------
+    as_json : bool
+        stdout gets one JSON object and nothing else.
+
+    Notes
+    -----
+    stdout: the result.  stderr: errors, warnings, progress; the moving line only where stderr is a terminal.
+    A reader that closes stdout early (``| head``) is no error.
+    """
+
+    def __init__(self, as_json: bool = False):
+        self.as_json, self.quiet, self.verbose = as_json, False, False
+        self.has_result = False
+        self._stdout_closed = sys.stdout is None
+        self._stage = ""
+        self._drawn = 0
+        self._last_draw = 0.0
+        self._start = time.perf_counter()
+        self._moving = _is_terminal(sys.stderr)
+
+    def set_loudness(self, quiet: bool, verbose: bool) -> None:
+        """`quiet`: errors only.  `verbose`: one plain line a stage on stderr instead of a moving one."""
+        self.quiet, self.verbose = quiet, verbose
+        self._moving = _is_terminal(sys.stderr) and not quiet and not verbose
+
+    def say(self, text: str = "") -> None:
+        """Print a line of the human result; nothing with ``--json`` or ``-q``."""
+        if not self.as_json and not self.quiet:
+            self._to_stdout(text)
+
+    def result(self, value: dict[str, Any]) -> None:
+        """Print the JSON object; nothing without ``--json``."""
+        if self.as_json and not self.has_result:
+            from clrecon.pipeline.report import to_json
+
+            self.has_result = True
+            self._to_stdout(to_json(value))
+
+    def warn(self, text: str, with_json: bool = False) -> None:
+        """Print a warning; with ``--json`` only where the object has no place for it (`with_json`)."""
+        if not self.quiet and (with_json or not self.as_json):
+            self._to_stderr(f"clrecon: warning: {printable(text)}")
+
+    def error(self, text: str) -> None:
+        """Print the one line that ends a command that failed."""
+        self._to_stderr(f"clrecon: error: {printable(text)}")
+
+    def progress(self, stage: str, done: int = 0, total: int = 0) -> None:
+        """Show what a job is doing, see `clrecon.pipeline.progress`."""
+        if self.verbose and stage != self._stage:
+            elapsed = time.perf_counter() - self._start
+            self._to_stderr(f"clrecon: {elapsed:6.2f} s  {_STAGES.get(stage, stage)}")
+        elif self._moving:
+            now = time.perf_counter()
+            if stage != self._stage or done == total or now - self._last_draw >= _REDRAW_SECONDS:
+                self._last_draw = now
+                self._draw(stage, done, total)
+        self._stage = stage
+
+    def clear(self) -> None:
+        """Remove the moving line."""
+        if self._drawn and sys.stderr is not None:
+            _write(sys.stderr, "\r" + " " * self._drawn + "\r")
+            self._drawn = 0
+
+    def finish(self) -> None:
+        """Remove the moving line and flush stdout, so that no failure is left for the end of the process.
+
+        Raises
+        ------
+        OutputError
+            stdout cannot take the result (a full disk).
+        """
+        self.clear()
+        self._guard_stdout(lambda: sys.stdout.flush())
+
+    def _draw(self, stage: str, done: int, total: int) -> None:
+        line = f"clrecon: {_STAGES.get(stage, printable(stage))}"
+        if total > 0:
+            filled = _BAR_WIDTH * min(done, total) // total
+            line += f" [{'#' * filled}{'.' * (_BAR_WIDTH - filled)}] {done}/{total}"
+        line = line[: max(20, _columns() - 1)]
+        if sys.stderr is not None:
+            _write(sys.stderr, "\r" + line + " " * max(0, self._drawn - len(line)))
+            self._drawn = len(line)
+
+    def _to_stderr(self, line: str) -> None:
+        self.clear()
+        if sys.stderr is not None:
+            _write(sys.stderr, line + "\n")
+
+    def _to_stdout(self, text: str) -> None:
+        self.clear()
+        self._guard_stdout(lambda: sys.stdout.write(text + "\n"))
+
+    def _guard_stdout(self, action: Any) -> None:
+        if self._stdout_closed:
+            return
+        try:
+            action()
+        except BrokenPipeError:
+            self._stdout_closed = True
+            _discard_stdout()
+        except OSError as error:
+            self._stdout_closed = True
+            _discard_stdout()
+            raise OutputError(f"cannot write to standard output: {error.strerror or error}") from error
+
+
+def _write(stream: Any, text: str) -> None:
+    try:
+        stream.write(text)
+        stream.flush()
+    except OSError:  # nobody can read it any more, and there is no other place to say so
+        pass
+
+
+def _discard_stdout() -> None:
+    """Point file descriptor 1 to nowhere: Python flushes stdout once more when it ends."""
+    try:
+        descriptor = sys.stdout.fileno()
+    except (OSError, ValueError):
+        return
+    null = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(null, descriptor)
+    os.close(null)
+
+
+def _is_terminal(stream: Any) -> bool:
+    return stream is not None and stream.isatty() and os.environ.get("TERM") != "dumb"
+
+
+def _columns() -> int:
+    try:
+        return os.get_terminal_size(2).columns
+    except OSError:
+        return 80

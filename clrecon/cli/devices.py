@@ -1,0 +1,49 @@
+"""``clrecon devices``: what OpenCL offers here."""
+
+from __future__ import annotations
+
+import argparse
+from typing import Any
+
+from clrecon.cli.common import add_device, megabytes, table
+from clrecon.cli.console import Console, printable
+
+__all__ = ["add_arguments", "run"]
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of the command."""
+    parser.epilog = (
+        "The device marked * is the one that would be used. Simulators (Oclgrind) are used only when they are named."
+    )
+    add_device(parser)
+
+
+def run(options: argparse.Namespace, console: Console) -> int:
+    """Run the command; returns the exit code."""
+    from clrecon.pipeline.devices import survey_devices
+
+    survey, problem = survey_devices(options.device)
+    console.result(survey)
+    for line in _describe_survey(survey):
+        console.say(line)
+    if problem is not None:
+        raise problem
+    return 0
+
+
+def _describe_survey(survey: dict[str, Any]) -> list[str]:
+    lines = []
+    for device in survey["devices"]:
+        mark = "*" if device["chosen"] else " "
+        kind = "simulator" if device["simulator"] else device["type"]
+        memory = f"{megabytes(device['memory_bytes'])}, largest buffer {megabytes(device['max_allocation_bytes'])}"
+        lines.append(f"{mark} {device['index']}  {kind:<11}  {printable(device['name'])}")
+        lines.append(f"{'':18}{device['compute_units']} compute units, {memory}")
+        driver = f"{device['platform']}, {device['version']}, driver {device['driver']}"
+        lines.append(f"{'':18}{printable(driver)}")
+    if survey["platforms"]:
+        lines += ["", "platforms:"]
+        rows = [(printable(p["name"]), printable(p["note"]), printable(p["version"])) for p in survey["platforms"]]
+        lines += [f"  {line}" for line in table(rows)]
+    return lines

@@ -1,0 +1,138 @@
+"""``clrecon mesh``: a CT series in, a calibrated mesh out."""
+
+from __future__ import annotations
+
+import argparse
+from typing import Any
+
+from clrecon.cli.common import add_device, megabytes
+from clrecon.cli.console import Console, printable
+from clrecon.pipeline.presets import DEFAULT_PRESET, PRESETS
+
+__all__ = ["add_arguments", "describe_mesh", "run"]
+
+_PARTS = ("read", "upload", "build", "kernels", "download", "write", "measure")
+
+
+def _epilog() -> str:
+    width = max(map(len, PRESETS))
+    lines = [f"  {p.name:<{width}}  {p.iso_value:>5g} HU  {p.description}" for p in PRESETS.values()]
+    return "\n".join(
+        (
+            "presets:",
+            *lines,
+            "",
+            "The mesh is in patient millimetres, by default in the DICOM frame (LPS: left, posterior, superior).",
+            "It is written as a whole or not at all, and an older file of that name stays until then.",
+            "Area, volume and components cost time and are measured with --report, --json or -v only.",
+            "",
+            "examples:",
+            "  clrecon mesh CT_FOLDER -o bone.stl",
+            "  clrecon mesh CT_FOLDER -o skull.glb --hu 300 --keep-largest 1 --report skull.json",
+        )
+    )
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of the command."""
+    parser.epilog = _epilog()
+    parser.add_argument("input", metavar="INPUT", help="DICOM folder (subfolders and any file names are fine) or file")
+    parser.add_argument(
+        "-o", "--output", metavar="OUT", required=True, help="mesh file: .stl .ply .obj .glb .vtp or .3mf"
+    )
+    level = parser.add_mutually_exclusive_group()
+    level.add_argument("--hu", type=float, metavar="N", help="iso value in HU; inside is N and above")
+    level.add_argument(
+        "--preset",
+        metavar="NAME",
+        help=f"iso value by tissue, one of: {', '.join(PRESETS)} (default: {DEFAULT_PRESET})",
+    )
+    parser.add_argument(
+        "--series",
+        metavar="S",
+        help='number or hash of the series, see "clrecon info" (default: the usable CT series with most slices)',
+    )
+    parser.add_argument("--space", default="lps", metavar="lps|ras", help="patient frame of the mesh (default: lps)")
+    parser.add_argument("--open", action="store_true", help="leave the surface open at the border of the volume")
+    parts = parser.add_mutually_exclusive_group()
+    parts.add_argument("--keep-largest", type=int, metavar="N", help="keep the N largest components only")
+    parts.add_argument("--min-volume", type=float, metavar="ML", help="keep components of at least ML millilitres only")
+    add_device(parser)
+    parser.add_argument("--report", metavar="FILE", help="write affine, counts, quality, device and times as JSON")
+
+
+def run(options: argparse.Namespace, console: Console) -> int:
+    """Run the command; returns the exit code."""
+    from clrecon.pipeline.mesh import make_mesh
+    from clrecon.pipeline.settings import MeshSettings
+
+    settings = MeshSettings(
+        iso_value=options.hu,
+        preset=options.preset,
+        series=options.series,
+        space=options.space.lower(),
+        closed=not options.open,
+        keep_largest=options.keep_largest,
+        min_volume_ml=options.min_volume,
+        device=options.device,
+    )
+    report = make_mesh(
+        options.input,
+        options.output,
+        settings,
+        report_path=options.report,
+        measure=bool(options.report or options.json or options.verbose),
+        progress=console.progress,
+    )
+    console.result(report)
+    for line in describe_mesh(report):
+        console.say(line)
+    size = megabytes(report["output"]["bytes"])
+    console.say(f"wrote    {printable(options.output)}, {size}, {report['space'].upper()} mm")
+    if options.report:
+        console.say(f"report   {printable(options.report)}")
+    for warning in report["warnings"]:
+        console.warn(warning)
+    return 0
+
+
+def describe_mesh(report: dict[str, Any]) -> list[str]:
+    """The report for people: what was read, what came out, on which device, in which time."""
+    reason = f"preset {report['preset']}" if report["preset"] else "as given"
+    border = "closed" if report["closed_at_border"] else "open"
+    return [
+        f"input    {_describe_volume(report['volume'])}",
+        f"surface  {report['iso_value_hu']:g} HU ({reason}), {border} at the border of the volume",
+        f"mesh     {report['vertices']:,} vertices, {report['triangles']:,} triangles",
+        *_describe_quality(report),
+        f"device   {printable(report['device'])}",
+        f"time     {_describe_times(report['seconds'])}",
+    ]
+
+
+def _describe_volume(volume: dict[str, Any]) -> str:
+    parts = []
+    if volume.get("shape_ijk"):
+        ni, nj, nk = volume["shape_ijk"]
+        parts.append(f"{nk} slices of {ni} x {nj}")
+    if volume.get("spacing_mm"):
+        di, dj, dk = volume["spacing_mm"]
+        parts.append(f"spacing {di:.4g} x {dj:.4g} x {dk:.4g} mm")
+    if volume.get("tilt_deg") and abs(volume["tilt_deg"]) >= 0.05:
+        parts.append(f"tilt {volume['tilt_deg']:.2f} degrees")
+    return ", ".join(parts)
+
+
+def _describe_quality(report: dict[str, Any]) -> list[str]:
+    if not report["quality"]:
+        return []
+    closed = "closed" if report["closed"] else "not closed"
+    manifold = "manifold" if report["manifold"] else "not manifold"
+    volume = "" if report["volume_ml"] is None else f", {report['volume_ml']:,.2f} ml"
+    parts = f"{report['components']:,} component{'s' * (report['components'] != 1)}"
+    return [f"         {parts}, {closed}, {manifold}, {report['area_mm2']:,.0f} mm2{volume}"]
+
+
+def _describe_times(seconds: dict[str, float]) -> str:
+    parts = ", ".join(f"{part} {seconds[part]:.2f}" for part in _PARTS if seconds.get(part, 0.0) >= 0.005)
+    return f"{seconds['total']:.2f} s ({parts})"

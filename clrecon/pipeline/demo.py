@@ -1,0 +1,138 @@
+"""The demonstration: phantom, mesh and report in one folder, and one surface whose size is known exactly."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from clrecon.errors import OutputError, UsageError
+from clrecon.pipeline.mesh import make_mesh
+from clrecon.pipeline.progress import Progress, Stopwatch
+from clrecon.pipeline.settings import MeshSettings
+
+if TYPE_CHECKING:
+    from clrecon.opencl import Device
+
+__all__ = ["DEMO_FILES", "DEMO_FOLDER", "make_demo"]
+
+DEMO_FOLDER = "clrecon-demo"
+DEMO_FILES = ("ct", "bone.stl", "report.json")
+
+_TILT_DEG, _OBLIQUE_DEG = 12.0, (10.0, -5.0, 30.0)
+
+
+def make_demo(
+    output: str | Path = DEMO_FOLDER, device: str | None = None, *, progress: Progress | None = None
+) -> dict[str, Any]:
+    """Write a phantom CT series, its bone mesh and the report; check a sphere of known volume.
+
+    Parameters
+    ----------
+    output : path
+        A new or empty folder, or one of an earlier demonstration, which is replaced.
+    device : str, optional
+        Name or index of an OpenCL device.
+    progress : callable, optional
+
+    Returns
+    -------
+    dict
+        ``folder``, ``files``, ``affine_error_mm`` (largest difference between the affine of the report and that of
+        the truth), ``check`` (see `check_sphere`), ``seconds`` and ``mesh`` (the report of the mesh).
+
+    Raises
+    ------
+    UsageError
+        The folder holds other things.
+    OutputError, DeviceError
+    """
+    from clrecon.opencl import choose_device
+    from clrecon.phantom import PhantomSettings, write_phantom
+
+    watch = Stopwatch()
+    folder = Path(output)
+    _prepare(folder)
+    chosen = choose_device(device)
+    settings = PhantomSettings(kind="spine", size=(256, 192), slices=110, spacing=(1.0, 1.0, 1.25))
+    truth = write_phantom(folder / "ct", settings, progress=progress)
+    watch.lap("phantom")
+    report = make_mesh(
+        folder / "ct",
+        folder / "bone.stl",
+        MeshSettings(device=str(chosen.index)),
+        report_path=folder / "report.json",
+        progress=progress,
+    )
+    watch.lap("mesh")
+    check = check_sphere(chosen)
+    watch.lap("check")
+    errors = [
+        abs(found - true)
+        for row, true_row in zip(report["affine_ijk_to_lps_mm"], truth["affine_ijk_to_lps_mm"], strict=True)
+        for found, true in zip(row, true_row, strict=True)
+    ]
+    seconds = {**watch.seconds, "total": watch.total()}
+    return {
+        "folder": str(output),
+        "files": list(DEMO_FILES),
+        "affine_error_mm": max(errors),
+        "check": check,
+        "seconds": {part: round(value, 4) for part, value in seconds.items()},
+        "mesh": report,
+    }
+
+
+def check_sphere(device: Device) -> dict[str, Any]:
+    """Mesh a sphere in anisotropic voxels, tilted gantry and oblique frame, and compare with geometry.
+
+    Returns
+    -------
+    dict
+        ``volume_ml``, ``true_volume_ml``, ``area_mm2``, ``true_area_mm2``, ``radius_error_max_mm`` (largest
+        distance of a vertex from the sphere), ``spacing_mm``, ``tilt_deg``.
+    """
+    import numpy as np
+
+    from clrecon.geometry import Volume
+    from clrecon.operators.isosurface import extract_isosurface
+    from clrecon.phantom import PhantomSettings, make_phantom
+
+    settings = PhantomSettings(
+        kind="sphere",
+        size=(72, 56),
+        slices=40,
+        spacing=(0.7, 0.5, 1.0),
+        tilt=_TILT_DEG,
+        oblique=_OBLIQUE_DEG,
+        noise=0.0,
+        point_spread_mm=0.0,
+    )
+    voxels, affine, truth = make_phantom(settings)
+    mesh = extract_isosurface(Volume(voxels, affine), truth["iso_value_hu"], device)
+    quality = mesh.quality()
+    surface = truth["surface"]
+    distance = np.linalg.norm(mesh.vertices - np.array(surface["center_lps_mm"]), axis=1)
+    return {
+        "volume_ml": quality["volume_ml"],
+        "true_volume_ml": surface["volume_ml"],
+        "area_mm2": quality["area_mm2"],
+        "true_area_mm2": surface["area_mm2"],
+        "radius_error_max_mm": float(np.abs(distance - surface["radius_mm"]).max()),
+        "spacing_mm": truth["spacing_mm"],
+        "tilt_deg": truth["tilt_deg"],
+    }
+
+
+def _prepare(folder: Path) -> None:
+    """Make the folder, or accept an empty one or that of an earlier demonstration."""
+    try:
+        folder.mkdir(exist_ok=True)
+        names = {entry.name for entry in folder.iterdir() if not entry.name.startswith(".clrecon-")}
+    except FileNotFoundError:
+        raise OutputError(f"cannot make {folder}: the folder around it does not exist; make it first") from None
+    except OSError as error:
+        raise OutputError(f"cannot make the folder {folder}: {error.strerror or error}") from error
+    foreign = sorted(names - set(DEMO_FILES))
+    if foreign or (names and not (folder / "ct" / "truth.json").is_file()):
+        example = (foreign or sorted(names))[0]
+        raise UsageError(f"{folder} holds something that is not of a demo ({example}): name a new or empty folder")

@@ -1,0 +1,82 @@
+"""What OpenCL offers on this machine, and whether the operators work on it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from clrecon.errors import DeviceError
+from clrecon.pipeline.progress import Progress, ignore_progress
+
+__all__ = ["run_device_selftest", "survey_devices"]
+
+
+def survey_devices(name: str | None = None) -> tuple[dict[str, Any], DeviceError | None]:
+    """List every OpenCL platform and device, and say which device would be used.
+
+    Parameters
+    ----------
+    name : str, optional
+        What a job would be told with ``--device``.
+
+    Returns
+    -------
+    survey : dict
+        ``{"platforms": [{"name", "version", "note"}], "devices": [{"index", "name", "platform", "type", "version",
+        "driver", "memory_bytes", "max_allocation_bytes", "compute_units", "simulator", "chosen", ...}],
+        "chosen": index or None}``.
+    problem : DeviceError or None
+        Why no device would be used.
+
+    Raises
+    ------
+    DeviceError
+        pyopencl itself cannot be imported.
+    """
+    from clrecon.opencl import choose_device, list_devices, list_platforms
+
+    devices = list_devices()
+    problem: DeviceError | None = None
+    chosen: int | None = None
+    try:
+        chosen = choose_device(name).index
+    except DeviceError as error:
+        problem = error
+    survey = {
+        "platforms": list_platforms(),
+        "devices": [{**device.describe(), "chosen": device.index == chosen} for device in devices],
+        "chosen": chosen,
+    }
+    return survey, problem
+
+
+def run_device_selftest(name: str | None = None, *, progress: Progress | None = None) -> dict[str, Any]:
+    """Run every operator against its twin on a small volume.
+
+    Parameters
+    ----------
+    name : str, optional
+        Device name or index.
+    progress : callable, optional
+
+    Returns
+    -------
+    dict
+        ``{"device": {...}, "passed": bool, "operators": [{"operator", "passed", "detail", "seconds"}]}``.
+
+    Raises
+    ------
+    DeviceError
+        No such device, or it fails outside of a test.
+    """
+    from clrecon.opencl import choose_device
+    from clrecon.pipeline.selftest import CHECKS, run_selftest
+
+    progress = progress or ignore_progress
+    device = choose_device(name)
+    results: list[dict[str, Any]] = []
+    progress("selftest", 0, len(CHECKS))
+    for result in run_selftest(device):
+        results.append(result)
+        progress("selftest", len(results), len(CHECKS))
+    passed = bool(results) and all(result["passed"] for result in results)
+    return {"device": device.describe(), "passed": passed, "operators": results}

@@ -1,0 +1,40 @@
+"""The job that writes a phantom series."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from clrecon.pipeline.progress import Progress
+
+__all__ = ["make_phantom"]
+
+
+def make_phantom(output: str | Path, *, progress: Progress | None = None, **settings: Any) -> dict[str, Any]:
+    """Write a phantom CT series with its truth.
+
+    Parameters
+    ----------
+    output : path
+        Folder for the DICOM files and ``truth.json``.
+    progress : callable, optional
+    **settings
+        Fields of `clrecon.phantom.PhantomSettings`; those that are None keep their default.  ``size`` may be a
+        text like ``"256x192"`` (columns x rows).
+
+    Returns
+    -------
+    dict
+        The truth, as in ``truth.json``.
+
+    Raises
+    ------
+    UsageError, OutputError
+        Impossible settings; the folder cannot be written.
+    """
+    from clrecon.phantom import PhantomSettings, parse_size, write_phantom
+
+    given = {name: value for name, value in settings.items() if value is not None}
+    if isinstance(given.get("size"), str):
+        given["size"] = parse_size(given["size"])
+    return write_phantom(output, PhantomSettings(**given), progress=progress)

@@ -1,0 +1,73 @@
+"""Iso values by tissue."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from clrecon.errors import UsageError
+
+__all__ = ["DEFAULT_PRESET", "PRESETS", "Preset", "find_preset"]
+
+
+@dataclass(frozen=True)
+class Preset:
+    """An iso value with its name and its reason.
+
+    Attributes
+    ----------
+    name : str
+    iso_value : float
+        HU.
+    description : str
+        What the surface shows, one line.
+    source : str
+        Where the value comes from.
+    """
+
+    name: str
+    iso_value: float
+    description: str
+    source: str
+
+
+DEFAULT_PRESET = "bone"
+
+_INVESALIUS = "InVesalius 3, lower bound of its preset"
+
+PRESETS: dict[str, Preset] = {
+    preset.name: preset
+    for preset in (
+        Preset(
+            "bone",
+            200.0,
+            "all bone: high enough to leave muscle and organs out, low enough to keep thin cortex whole",
+            "dicom2stl, tissue 'bone'; thin vertebral cortex in slices of 4 mm needs 150 to 200 HU",
+        ),
+        Preset("spongy-bone", 148.0, "cortical and spongy bone, with some contrast-filled vessels",
+               f"{_INVESALIUS} 'Spongial Bone (Adult)'"),
+        Preset("cortical-bone", 662.0, "dense bone only", f"{_INVESALIUS} 'Compact Bone (Adult)'"),
+        Preset("enamel", 1553.0, "teeth", f"{_INVESALIUS} 'Enamel (Adult)'"),
+        Preset("metal", 2500.0, "screws, rods and implants",
+               "above cortical bone (about 2000 HU), below the end of the 12-bit scale at 3071 HU"),
+        Preset("soft-tissue", -25.0, "muscle and organs without fat",
+               "half way between fat (about -100 HU) and muscle (about 50 HU)"),
+        Preset("skin", -500.0, "the outside of the body (and of the air inside of it)",
+               "half way between air (-1000 HU) and soft tissue (about 0 HU), where a blurred edge keeps its place"),
+    )
+}  # fmt: skip
+
+
+def find_preset(name: str) -> Preset:
+    """Return the preset called `name`.
+
+    Raises
+    ------
+    UsageError
+        There is none; the message lists what there is.
+    """
+    try:
+        return PRESETS[name]
+    except KeyError:
+        raise UsageError(
+            f"unknown preset {name!r}: use one of {', '.join(PRESETS)}, or give the iso value in HU"
+        ) from None

@@ -1,0 +1,99 @@
+"""Reports: strict JSON, written last.
+
+A report is the commit mark of a job: when it is there, everything that it speaks of is complete.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, BinaryIO
+
+from clrecon.errors import ClreconError
+
+__all__ = ["error_as_dict", "package_version", "peak_memory_bytes", "platform_name", "to_json", "write_report"]
+
+
+def to_json(value: Any, indent: int | None = 2) -> str:
+    """Return strict JSON (ASCII): numpy values become plain ones, NaN and infinities become null.
+
+    Raises
+    ------
+    TypeError
+        Something in `value` has no place in JSON.
+    """
+    return json.dumps(_plain(value), indent=indent, allow_nan=False)
+
+
+def _plain(value: Any) -> Any:
+    if value is None or isinstance(value, str | bool):
+        return value
+    if isinstance(value, int):
+        return int(value)
+    if isinstance(value, float):
+        return float(value) if math.isfinite(value) else None
+    if isinstance(value, Mapping):
+        return {str(key): _plain(entry) for key, entry in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(entry) for entry in value]
+    if hasattr(value, "tolist"):  # numpy scalars and arrays, without importing numpy
+        return _plain(value.tolist())
+    raise TypeError(f"{type(value).__name__} has no place in a report")
+
+
+def write_report(path: str | Path, report: Mapping[str, Any]) -> int:
+    """Write `report` as JSON in one step: the file holds all of it or is not touched.
+
+    Returns
+    -------
+    int
+        Bytes written.
+
+    Raises
+    ------
+    OutputError
+        The file cannot be written; an older one of that name is intact.
+    """
+    from clrecon.files import replace_file
+
+    content = (to_json(report) + "\n").encode("ascii")
+
+    def write(stream: BinaryIO) -> None:
+        stream.write(content)
+
+    return replace_file(path, write)
+
+
+def error_as_dict(error: ClreconError) -> dict[str, Any]:
+    """The JSON form of an error: ``{"error": {"kind", "exit_code", "message"}}``."""
+    return {"error": {"kind": type(error).__name__, "exit_code": error.exit_code, "message": str(error)}}
+
+
+def package_version() -> str:
+    """Version of clrecon, as ``clrecon.__version__`` (which stands above this layer)."""
+    from importlib.metadata import PackageNotFoundError, version
+
+    try:
+        return version("clrecon")
+    except PackageNotFoundError:  # a source folder that nobody has installed
+        return "0+uninstalled"
+
+
+def platform_name() -> str:
+    """Operating system, machine and Python, without the name of the computer."""
+    import platform
+
+    return f"{platform.system()} {platform.machine()}, Python {platform.python_version()}"
+
+
+def peak_memory_bytes() -> int | None:
+    """Largest resident memory of this process so far, None where the system does not tell."""
+    try:
+        import resource
+    except ImportError:  # Windows
+        return None
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return int(peak) if sys.platform == "darwin" else int(peak) * 1024

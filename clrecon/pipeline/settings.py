@@ -1,0 +1,79 @@
+"""What a job may be told, checked when it is said."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from clrecon.errors import UsageError
+from clrecon.pipeline.presets import DEFAULT_PRESET, find_preset
+
+__all__ = ["MeshSettings"]
+
+
+@dataclass(frozen=True)
+class MeshSettings:
+    """How a mesh is made from a CT series.
+
+    Parameters
+    ----------
+    iso_value : float, optional
+        HU; inside is ``>= iso_value``.
+    preset : str, optional
+        Name of an iso value, see `clrecon.pipeline.presets`.  Neither of both means the preset "bone".
+    series : str or int, optional
+        Which series of the input; None leaves the choice to `read_volume`.
+    space : {"lps", "ras"}
+        Patient frame of the written mesh.
+    closed : bool
+        Close the surface where it meets the border of the volume (outside is air).
+    keep_largest : int, optional
+        Keep only this many components, the largest by volume.
+    min_volume_ml : float, optional
+        Keep only components of at least this volume.
+    device : str, optional
+        Name or index of an OpenCL device; None leaves the choice to `choose_device`.
+
+    Raises
+    ------
+    UsageError
+        A value is impossible, or two exclude each other.
+    """
+
+    iso_value: float | None = None
+    preset: str | None = None
+    series: str | int | None = None
+    space: str = "lps"
+    closed: bool = True
+    keep_largest: int | None = None
+    min_volume_ml: float | None = None
+    device: str | None = None
+
+    def __post_init__(self) -> None:
+        if self.iso_value is not None and self.preset is not None:
+            raise UsageError("give either an iso value in HU or a preset, not both")
+        if self.iso_value is not None and not math.isfinite(self.iso_value):
+            raise UsageError(f"the iso value must be a finite number of HU, not {self.iso_value}")
+        if self.preset is not None:
+            find_preset(self.preset)
+        if self.keep_largest is not None and self.min_volume_ml is not None:
+            raise UsageError("give either the number of components to keep or their smallest volume, not both")
+        if self.keep_largest is not None and self.keep_largest < 1:
+            raise UsageError(f"the number of components to keep must be 1 or more, not {self.keep_largest}")
+        if self.min_volume_ml is not None and not (math.isfinite(self.min_volume_ml) and self.min_volume_ml > 0):
+            raise UsageError(f"the smallest volume to keep must be above 0 ml, not {self.min_volume_ml}")
+        from clrecon.geometry import frame_from_lps  # numpy: not wanted before a job starts
+
+        frame_from_lps(self.space)
+
+    @property
+    def level(self) -> float:
+        """The iso value in HU that is used."""
+        if self.iso_value is not None:
+            return self.iso_value
+        return find_preset(self.preset or DEFAULT_PRESET).iso_value
+
+    @property
+    def preset_used(self) -> str | None:
+        """Name of the preset behind `level`, None where the value was given."""
+        return None if self.iso_value is not None else (self.preset or DEFAULT_PRESET)

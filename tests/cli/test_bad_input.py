@@ -1,0 +1,237 @@
+"""Every wrong input: its exit code, one clear line, nothing on stdout and no output file."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from ct_files import sphere_voxels, write_series
+
+import clrecon.opencl
+from clrecon.cli.main import main
+
+PNG = bytes.fromhex("89504e470d0a1a0a0000000d49484452000000010000000108000000003a7e9b55")
+
+
+@pytest.fixture
+def no_device_needed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """These inputs are refused before a device computes anything: any machine will do."""
+    monkeypatch.setattr(clrecon.opencl, "choose_device", lambda name=None: object())
+
+
+@pytest.fixture
+def target(tmp_path: Path) -> Path:
+    folder = tmp_path / "out folder"
+    folder.mkdir()
+    return folder / "bone.stl"
+
+
+def check_refused(
+    arguments: list[str], code: int, words: str, target: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    found = main(arguments)
+    captured = capsys.readouterr()
+    assert found == code, captured.err
+    assert captured.out == ""
+    lines = captured.err.splitlines()
+    assert len(lines) == 1
+    assert lines[0].startswith("clrecon: error: ")
+    assert words in lines[0]
+    if target.parent.is_dir():
+        assert list(target.parent.iterdir()) == []
+
+
+def make_empty(folder: Path) -> None:
+    folder.mkdir()
+
+
+def make_text(folder: Path) -> None:
+    folder.mkdir()
+    (folder / "notes.txt").write_text("no image here\n" * 50)
+    (folder / "IM0001").write_text("x")
+
+
+def make_png(folder: Path) -> None:
+    folder.mkdir()
+    (folder / "picture.png").write_bytes(PNG)
+
+
+def make_truncated(folder: Path) -> None:
+    write_series(folder)
+    for path in folder.iterdir():
+        path.write_bytes(path.read_bytes()[:-700])
+
+
+def make_one_slice(folder: Path) -> None:
+    write_series(folder, sphere_voxels()[8:9])
+
+
+def make_two_equal(folder: Path) -> None:
+    write_series(folder, number=1)
+    write_series(folder, number=2)
+
+
+def make_mr(folder: Path) -> None:
+    write_series(folder, modality="MR")
+
+
+def make_nothing(folder: Path) -> None:
+    assert not folder.exists()
+
+
+@pytest.mark.parametrize(
+    ("make", "code", "words"),
+    [
+        (make_nothing, 2, "does not exist"),
+        (make_empty, 2, "no DICOM"),
+        (make_text, 2, "no DICOM"),
+        (make_png, 2, "no DICOM"),
+        (make_truncated, 4, "s1_0"),
+        (make_one_slice, 4, "slice"),
+        (make_two_equal, 4, "--series"),
+        (make_mr, 2, "MR"),
+    ],
+)
+@pytest.mark.usefixtures("no_device_needed")
+def test_mesh_refuses_input(
+    make: Any, code: int, words: str, tmp_path: Path, target: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / "ein ordner mit ä"
+    make(folder)
+    report = target.with_suffix(".json")
+    check_refused(["mesh", str(folder), "-o", str(target), "--report", str(report)], code, words, target, capsys)
+
+
+@pytest.mark.usefixtures("no_device_needed")
+def test_a_truncated_file_leaves_the_old_mesh(tmp_path: Path, target: Path) -> None:
+    make_truncated(tmp_path / "ct")
+    target.write_bytes(b"the old mesh")
+    assert main(["mesh", str(tmp_path / "ct"), "-o", str(target)]) == 4
+    assert target.read_bytes() == b"the old mesh"
+    assert list(target.parent.iterdir()) == [target]
+
+
+@pytest.mark.skipif(os.name != "posix" or os.geteuid() == 0, reason="the superuser may read everything")
+@pytest.mark.usefixtures("no_device_needed")
+def test_a_folder_without_permission(tmp_path: Path, target: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = write_series(tmp_path / "ct")
+    folder.chmod(0)
+    try:
+        check_refused(["mesh", str(folder), "-o", str(target)], 2, "cannot be read", target, capsys)
+    finally:
+        folder.chmod(0o700)
+
+
+def test_an_iso_value_above_all_voxels(
+    device: Any, tmp_path: Path, target: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = write_series(tmp_path / "ct")
+    arguments = ["mesh", str(folder), "-o", str(target), "--hu", "900", "--device", str(device.index)]
+    check_refused(arguments, 2, "-1000 to 700 HU", target, capsys)
+
+
+def test_a_constant_volume(device: Any, tmp_path: Path, target: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = write_series(tmp_path / "ct", np.full((4, 9, 7), -1000, np.int16))
+    check_refused(
+        ["mesh", str(folder), "-o", str(target), "--device", str(device.index)], 2, "-1000 to -1000 HU", target, capsys
+    )
+
+
+def test_an_unknown_device(device: Any, tmp_path: Path, target: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    arguments = ["mesh", str(tmp_path), "-o", str(target), "--device", "abacus"]
+    check_refused(arguments, 5, "'abacus' is not there; found ", target, capsys)
+
+
+@pytest.mark.parametrize(
+    ("output", "code", "words"),
+    [
+        ("missing/bone.stl", 6, "missing"),
+        (".", 3, "extension"),
+        ("bone", 3, "extension"),
+        ("bone.doc", 3, "doc"),
+        ("folder.stl", 6, "folder"),
+        ("a" * 300 + ".stl", 6, "too long"),
+    ],
+)
+def test_an_output_that_cannot_be_written_is_refused_before_all_work(
+    output: str, code: int, words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "folder.stl").mkdir()
+    before = sorted(tmp_path.iterdir())
+    assert main(["mesh", str(tmp_path / "no input"), "-o", str(tmp_path / output)]) == code
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert words in captured.err
+    assert len(captured.err.splitlines()) == 1
+    assert sorted(tmp_path.iterdir()) == before
+
+
+def test_a_report_in_a_missing_folder(tmp_path: Path, target: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    report = str(tmp_path / "nowhere" / "report.json")
+    check_refused(["mesh", str(tmp_path), "-o", str(target), "--report", report], 6, "nowhere", target, capsys)
+
+
+def test_report_and_mesh_are_two_files(tmp_path: Path, target: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    same = str(target)
+    check_refused(["mesh", str(tmp_path), "-o", same, "--report", same], 3, "same file", target, capsys)
+
+
+@pytest.mark.parametrize(
+    ("extra", "words"),
+    [
+        (["--hu", "nan"], "finite"),
+        (["--hu", "abc"], "invalid float"),
+        (["--hu", "300", "--preset", "skin"], "not allowed with"),
+        (["--preset", "bones"], "unknown preset 'bones': use one of bone, "),
+        (["--keep-largest", "0"], "1 or more"),
+        (["--min-volume", "-1"], "above 0 ml"),
+        (["--keep-largest", "2", "--min-volume", "1"], "not allowed with"),
+        (["--space", "mni"], "unknown space 'mni'"),
+        (["--colour"], "unrecognized arguments: --colour"),
+        (["-q", "-v"], "not allowed with"),
+    ],
+)
+def test_wrong_usage(
+    extra: list[str], words: str, tmp_path: Path, target: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    check_refused(["mesh", str(tmp_path), "-o", str(target), *extra], 3, words, target, capsys)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ([], "no command given"),
+        (["polish"], "invalid choice: 'polish'"),
+        (["mesh"], "required: INPUT, -o/--output (see: clrecon mesh --help)"),
+        (["--nonsense"], "unrecognized"),
+        (["phantom", "out", "--spacing", "1", "2"], "expected 3 arguments"),
+    ],
+)
+def test_wrong_commands(arguments: list[str], words: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(arguments) == 3
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert words in captured.err
+    assert len(captured.err.splitlines()) == 1
+
+
+@pytest.mark.parametrize(
+    ("make", "code", "words"),
+    [
+        (make_empty, 2, "no DICOM"),
+        (make_mr, 2, "MR"),
+        (make_one_slice, 4, "slice"),
+        (make_truncated, 4, "s1_0"),
+    ],
+)
+def test_info_refuses_input(
+    make: Any, code: int, words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    make(tmp_path / "in")
+    assert main(["info", str(tmp_path / "in")]) == code
+    last = capsys.readouterr().err.splitlines()[-1]
+    assert last.startswith("clrecon: error: ")
+    assert words in last

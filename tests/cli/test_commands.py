@@ -1,0 +1,306 @@
+"""The commands at work, in this process: results, JSON, reports."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import tolerances
+from ct_files import ORIGIN, PATIENT, RADIUS_MM, SPACING, write_series
+
+from clrecon.cli.main import COMMANDS, main
+
+CONTRACT = {
+    "affine_ijk_to_lps_mm", "iso_value_hu", "space", "vertices", "triangles", "closed", "manifold", "components",
+    "area_mm2", "volume_ml", "bounds_mm", "device", "driver", "version", "warnings", "seconds",
+}  # fmt: skip
+SECONDS = {"read", "upload", "build", "kernels", "download", "write", "total"}
+SERIES = {
+    "number", "uid_hash", "description", "modality", "slices", "shape_ijk", "spacing_mm", "affine_ijk_to_lps_mm",
+    "tilt_deg", "grid_residual_max_mm", "gap_mm", "uneven", "warnings", "problems",
+}  # fmt: skip
+TRUE_VOLUME_ML = 4.0 / 3.0 * math.pi * RADIUS_MM**3 / 1000.0
+
+
+def read_stl(path: Path) -> np.ndarray:
+    content = path.read_bytes()
+    count = int.from_bytes(content[80:84], "little")
+    assert len(content) == 84 + 50 * count
+    record = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
+    return np.frombuffer(content, record, offset=84)["corners"]
+
+
+@pytest.fixture(scope="session")
+def ct(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_series(tmp_path_factory.mktemp("cli") / "Scan von Größe 3")
+
+
+@pytest.mark.parametrize("space", ["lps", "ras"])
+def test_mesh_writes_the_sphere_where_it_is(
+    device: Any, space: str, ct: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    output, report_path = tmp_path / "Kugel ä.stl", tmp_path / "a report.json"
+    arguments = ["mesh", str(ct), "-o", str(output), "--report", str(report_path), "--hu", "-150", "--space", space]
+    assert main([*arguments, "--device", str(device.index)]) == 0
+    captured = capsys.readouterr()
+    assert captured.err == ""
+    assert "17 slices of 31 x 25, spacing 0.8 x 1.1 x 1.5 mm" in captured.out
+    assert "-150 HU (as given)" in captured.out
+    assert "Kugel ä.stl" in captured.out
+
+    report = json.loads(report_path.read_text())
+    assert CONTRACT <= set(report)
+    assert SECONDS <= set(report["seconds"])
+    assert report["seconds"]["total"] >= report["seconds"]["read"] > 0.0
+    expected = np.diag([*SPACING, 1.0])
+    expected[:3, 3] = ORIGIN
+    np.testing.assert_allclose(report["affine_ijk_to_lps_mm"], expected, atol=1e-9)
+    assert (report["closed"], report["manifold"], report["components"]) == (True, True, 1)
+    assert report["volume_ml"] == pytest.approx(TRUE_VOLUME_ML, rel=tolerances.CLI_SPHERE_VOLUME_SHARE)
+    assert (report["iso_value_hu"], report["preset"], report["space"]) == (-150.0, None, space)
+    assert report["output"] == {"format": "stl", "bytes": output.stat().st_size}
+
+    corners = read_stl(output)
+    assert len(corners) == report["triangles"]
+    bounds = [corners.reshape(-1, 3).min(axis=0), corners.reshape(-1, 3).max(axis=0)]
+    np.testing.assert_allclose(report["bounds_mm"], bounds, atol=1e-4)
+    signs = np.array([1, 1, 1]) if space == "lps" else np.array([-1, -1, 1])
+    centre = (np.array(ORIGIN) + np.array(SPACING) * np.array([15, 12, 8])) * signs
+    np.testing.assert_allclose(np.mean(bounds, axis=0), centre, atol=0.05)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["Kugel ä.stl", "a report.json"]
+
+
+def test_mesh_says_nothing_of_the_patient(
+    device: Any, ct: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    output, report = tmp_path / "a.ply", tmp_path / "a.json"
+    arguments = ["mesh", str(ct), "-o", str(output), "--report", str(report), "-v", "--device", str(device.index)]
+    assert main(arguments) == 0
+    captured = capsys.readouterr()
+    written = output.read_bytes() + report.read_bytes() + (captured.out + captured.err).encode()
+    for secret in (*PATIENT.split("^"), "4711", "19500102", "Scan von", "1.2.826.0.1"):
+        assert secret.encode() not in written
+
+
+def test_mesh_json_is_the_report(device: Any, ct: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    output = tmp_path / "a.glb"
+    assert main(["mesh", str(ct), "-o", str(output), "--json", "--device", str(device.index)]) == 0
+    captured = capsys.readouterr()
+    report = json.loads(captured.out)
+    assert CONTRACT <= set(report)
+    assert (report["preset"], report["iso_value_hu"], report["output"]["format"]) == ("bone", 200.0, "glb")
+    assert captured.err == ""
+
+
+def test_mesh_quiet_prints_nothing(device: Any, ct: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    output = tmp_path / "a.obj"
+    assert main(["mesh", str(ct), "-o", str(output), "-q", "--device", str(device.index)]) == 0
+    assert capsys.readouterr() == ("", "")
+    assert output.stat().st_size > 1000
+
+
+def test_mesh_without_report_measures_nothing(
+    device: Any, ct: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["mesh", str(ct), "-o", str(tmp_path / "a.stl"), "--device", str(device.index)]) == 0
+    assert "component" not in capsys.readouterr().out
+    assert main(["mesh", str(ct), "-o", str(tmp_path / "a.stl"), "-v", "--device", str(device.index)]) == 0
+    captured = capsys.readouterr()
+    assert "1 component, closed, manifold" in captured.out
+    assert "measuring the mesh" in captured.err
+
+
+def test_skin_warns_that_a_face_shows(
+    device: Any, ct: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert (
+        main(["mesh", str(ct), "-o", str(tmp_path / "a.stl"), "--preset", "skin", "--device", str(device.index)]) == 0
+    )
+    captured = capsys.readouterr()
+    assert "-500 HU (preset skin)" in captured.out
+    assert captured.err.startswith("clrecon: warning: a surface of the skin can show a face")
+
+
+def test_mesh_keeps_components_by_size(device: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    voxels = np.full((9, 20, 24), -1000, np.int16)
+    voxels[2:7, 2:12, 2:14] = 800
+    voxels[2:4, 15:18, 18:21] = 800
+    folder = write_series(tmp_path / "ct", voxels)
+    found = {}
+    for name, extra in {
+        "all": [], "largest": ["--keep-largest", "1"], "big": ["--min-volume", "0.1"],
+    }.items():  # fmt: skip
+        arguments = ["mesh", str(folder), "-o", str(tmp_path / "m.stl"), "--json", "--device", str(device.index)]
+        assert main([*arguments, *extra]) == 0
+        found[name] = json.loads(capsys.readouterr().out)
+    assert [found[name]["components"] for name in found] == [2, 1, 1]
+    assert found["largest"]["volume_ml"] == found["big"]["volume_ml"] < found["all"]["volume_ml"]
+    arguments = ["mesh", str(folder), "-o", str(tmp_path / "none.stl"), "--min-volume", "50"]
+    assert main([*arguments, "--device", str(device.index)]) == 2
+    assert "ml" in capsys.readouterr().err
+    assert not (tmp_path / "none.stl").exists()
+
+
+def test_open_leaves_the_border_open(device: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    voxels = np.full((5, 8, 9), -1000, np.int16)
+    voxels[:, 2:6, 3:6] = 600
+    folder = write_series(tmp_path / "ct", voxels)
+    arguments = ["mesh", str(folder), "-o", str(tmp_path / "m.stl"), "--json", "--device", str(device.index)]
+    closed = []
+    for extra in ([], ["--open"]):
+        assert main([*arguments, *extra]) == 0
+        report = json.loads(capsys.readouterr().out)
+        closed.append((report["closed"], report["volume_ml"] is None))
+    assert closed == [(True, False), (False, True)]
+
+
+def test_two_series_and_the_choice(device: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = write_series(tmp_path / "ct", number=1)
+    write_series(folder, np.full((6, 9, 9), -1000, np.int16), number=2)
+    assert main(["mesh", str(folder), "-o", str(tmp_path / "a.stl"), "--device", str(device.index)]) == 0
+    captured = capsys.readouterr()
+    assert "17 slices" in captured.out
+    assert captured.err.startswith("clrecon: warning: 1 other series left: [2: CT")
+    assert main(["mesh", str(folder), "-o", str(tmp_path / "a.stl"), "--series", "9"]) == 3
+    assert "no series matches" in capsys.readouterr().err
+
+
+def test_info_json_is_the_contract(ct: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["info", str(ct), "--json"]) == 0
+    captured = capsys.readouterr()
+    listing = json.loads(captured.out)
+    assert set(listing) == {"series", "chosen"}
+    assert listing["chosen"] == 1
+    (entry,) = listing["series"]
+    assert set(entry) == SERIES
+    assert (entry["slices"], entry["shape_ijk"], entry["modality"]) == (17, [31, 25, 17], "CT")
+    assert entry["spacing_mm"] == pytest.approx(SPACING)
+    assert set(entry["gap_mm"]) == {"min", "max"}
+    assert captured.err == ""
+
+
+def test_info_table_marks_the_choice(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = write_series(tmp_path / "ct", number=1)
+    write_series(folder, np.full((6, 9, 9), -1000, np.int16), number=2)
+    write_series(folder, np.full((3, 9, 9), 5, np.int16), number=3, modality="MR")
+    assert main(["info", str(folder)]) == 0
+    captured = capsys.readouterr()
+    rows = captured.out.splitlines()
+    assert rows[1].split()[:2] == ["*", "1"]
+    assert rows[2].split()[0] == "2"
+    assert "31 x 25" in rows[1] and "0.8 x 1.1 x 1.5" in rows[1]
+    assert "series 3: problem: modality MR is not CT" in rows
+
+
+def test_info_of_equal_series_names_the_way_out(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = write_series(tmp_path / "ct", number=1)
+    write_series(folder, number=2)
+    assert main(["info", str(folder), "--json"]) == 0
+    captured = capsys.readouterr()
+    assert json.loads(captured.out)["chosen"] is None
+    assert "choose one with --series" in captured.err
+    assert main(["info", str(folder), "--series", "2", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["chosen"] == 2
+    assert main(["info", str(folder), "--series", "7"]) == 3
+    assert "series '7' is not there" in capsys.readouterr().err
+
+
+def test_devices_lists_each(device: Any, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["devices", "--json", "--device", str(device.index)]) == 0
+    survey = json.loads(capsys.readouterr().out)
+    assert survey["chosen"] == device.index
+    entry = survey["devices"][device.index]
+    assert (entry["name"], entry["chosen"], entry["memory_bytes"]) == (device.name, True, device.memory_bytes)
+    assert sum(other["chosen"] for other in survey["devices"]) == 1
+    assert main(["devices", "--device", str(device.index)]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert any(line.startswith(f"* {device.index}  ") and device.name in line for line in lines)
+
+
+@pytest.mark.parametrize("command", ["devices", "selftest", "mesh"])
+def test_no_driver_says_how_to_get_one(
+    command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from clrecon.opencl import select
+
+    monkeypatch.setattr(select, "_discover", lambda: ((("Clover", "OpenCL 1.1", "0 devices"),), ()))
+    extra = [str(tmp_path), "-o", str(tmp_path / "a.stl")] if command == "mesh" else []
+    assert main([command, *extra]) == 5
+    captured = capsys.readouterr()
+    assert captured.err.startswith("clrecon: error: no OpenCL device found: install ")
+    assert len(captured.err.splitlines()) == 1
+    assert ("Clover  0 devices  OpenCL 1.1" in captured.out) == (command == "devices")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_selftest_passes(device: Any, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["selftest", "--json", "--device", str(device.index)]) == 0
+    outcome = json.loads(capsys.readouterr().out)
+    assert outcome["passed"] is True
+    assert "extract_isosurface" in [result["operator"] for result in outcome["operators"]]
+
+
+def test_selftest_that_fails_exits_5(
+    device: Any, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from clrecon.pipeline import selftest
+
+    wrong = [{"operator": "compact", "passed": False, "detail": "wrong positions", "seconds": 0.1}]
+    monkeypatch.setattr(selftest, "run_selftest", lambda chosen: iter(wrong))
+    assert main(["selftest", "--device", str(device.index)]) == 5
+    captured = capsys.readouterr()
+    assert "FAIL  compact" in captured.out
+    assert captured.err.startswith("clrecon: error: the self-test failed on ")
+
+
+def test_phantom_and_its_truth(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = tmp_path / "ph"
+    arguments = ["phantom", str(folder), "--kind", "sphere", "--size", "40x32", "--slices", "24", "--tilt", "-12"]
+    arguments += ["--spacing", "0.7", "0.5", "1.0", "--oblique", "10", "-5", "30", "--noise", "0", "--seed", "3"]
+    assert main([*arguments, "--json"]) == 0
+    truth = json.loads(capsys.readouterr().out)
+    assert truth["shape_ijk"] == [40, 32, 24]
+    assert truth == json.loads((folder / "truth.json").read_text())
+    assert main(["info", str(folder), "--json"]) == 0
+    (entry,) = json.loads(capsys.readouterr().out)["series"]
+    np.testing.assert_allclose(entry["affine_ijk_to_lps_mm"], truth["affine_ijk_to_lps_mm"], atol=1e-6)
+    assert entry["tilt_deg"] == pytest.approx(12.0, abs=1e-4)
+    assert main([*arguments, "--seed", "4"]) == 0
+    assert "sphere, 24 slices of 40 x 32" in capsys.readouterr().out
+
+
+def test_phantom_refuses_a_folder_with_other_files(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "thesis.txt").write_text("years of work")
+    assert main(["phantom", str(tmp_path), "--kind", "sphere"]) == 3
+    assert (tmp_path / "thesis.txt").read_text() == "years of work"
+    assert len(capsys.readouterr().err.splitlines()) == 1
+
+
+@pytest.mark.parametrize(
+    ("extra", "words"), [(["--kind", "cat"], "spine, sphere"), (["--size", "huge"], "huge"), (["--tilt", "80"], "80")]
+)
+def test_phantom_refuses_settings(
+    extra: list[str], words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["phantom", str(tmp_path / "ph"), *extra]) == 3
+    assert words in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("command", sorted(COMMANDS))
+def test_every_command_has_help_and_the_common_options(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([command, "--help"]) == 0
+    text = capsys.readouterr().out
+    for option in ("--json", "--quiet", "--verbose", "--debug", "exit codes: 0 done"):
+        assert option in text
+
+
+def test_version(capsys: pytest.CaptureFixture[str]) -> None:
+    import clrecon
+
+    assert main(["--version"]) == 0
+    assert capsys.readouterr().out == f"clrecon {clrecon.__version__}\n"

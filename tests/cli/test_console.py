@@ -1,0 +1,194 @@
+"""What goes to which stream, and how a command ends."""
+
+from __future__ import annotations
+
+import io
+import json
+import sys
+
+import pytest
+
+from clrecon.cli.common import guard, megabytes, table
+from clrecon.cli.console import Console, printable
+from clrecon.errors import DeviceError, NoDicomError
+
+
+class Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+class ClosedPipe(io.StringIO):
+    def write(self, text: str) -> int:
+        raise BrokenPipeError(32, "Broken pipe")
+
+    def flush(self) -> None:
+        raise BrokenPipeError(32, "Broken pipe")
+
+
+class FullDisk(ClosedPipe):
+    def write(self, text: str) -> int:
+        raise OSError(28, "No space left on device")
+
+    def flush(self) -> None:
+        pass
+
+
+def raising(error: BaseException):  # noqa: ANN201
+    def action() -> int:
+        raise error
+
+    return action
+
+
+@pytest.mark.parametrize(
+    ("text", "shown"),
+    [
+        ("LUNG 1.0", "LUNG 1.0"),
+        ("a\x1b[31mb", "a\\x1b[31mb"),
+        ("two\nlines", "two lines"),
+        ("gpj.\u202eexe", "gpj.\\u202eexe"),
+        ("Größe 3", "Größe 3"),
+        ("nul\0", "nul\\x00"),
+    ],
+)
+def test_texts_from_files_cannot_steer_the_terminal(text: str, shown: str) -> None:
+    assert printable(text) == shown
+
+
+@pytest.mark.parametrize(
+    ("error", "code", "line"),
+    [
+        (DeviceError("no driver"), 5, "clrecon: error: no driver"),
+        (NoDicomError("x\ny"), 2, "clrecon: error: x y"),
+        (KeyboardInterrupt(), 130, "clrecon: error: interrupted"),
+        (MemoryError(), 1, "clrecon: error: out of memory: free some, or use a smaller series"),
+        (
+            KeyError("thing"),
+            1,
+            "clrecon: error: unexpected error (KeyError: 'thing'); run again with --debug for details,"
+            " and please report it",
+        ),
+    ],
+)
+def test_an_error_is_one_line_and_a_code(
+    error: BaseException, code: int, line: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert guard(raising(error), Console(), debug=False) == code
+    captured = capsys.readouterr()
+    assert captured.err.splitlines() == [line]
+    assert captured.out == ""
+
+
+def test_debug_shows_the_traceback_and_keeps_the_code(capsys: pytest.CaptureFixture[str]) -> None:
+    assert guard(raising(DeviceError("no driver")), Console(), debug=True) == 5
+    lines = capsys.readouterr().err.splitlines()
+    assert lines[0] == "Traceback (most recent call last):"
+    assert lines[-1] == "clrecon: error: no driver"
+
+
+def test_an_error_is_an_object_with_json(capsys: pytest.CaptureFixture[str]) -> None:
+    assert guard(raising(DeviceError("no driver")), Console(as_json=True), debug=False) == 5
+    captured = capsys.readouterr()
+    assert json.loads(captured.out) == {"error": {"kind": "DeviceError", "exit_code": 5, "message": "no driver"}}
+    assert captured.err == "clrecon: error: no driver\n"
+
+
+def test_stdout_holds_one_object_at_most(capsys: pytest.CaptureFixture[str]) -> None:
+    console = Console(as_json=True)
+
+    def action() -> int:
+        console.say("for people")
+        console.warn("in the object already")
+        console.result({"nan": float("nan"), "one": 1})
+        raise DeviceError("late")
+
+    assert guard(action, console, debug=False) == 5
+    captured = capsys.readouterr()
+    assert json.loads(captured.out) == {"nan": None, "one": 1}
+    assert captured.err == "clrecon: error: late\n"
+
+
+def test_a_reader_that_leaves_is_no_error(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setattr(sys, "stdout", ClosedPipe())
+    console = Console()
+
+    def action() -> int:
+        console.say("one")
+        console.say("two")
+        return 0
+
+    assert guard(action, console, debug=False) == 0
+    assert capsys.readouterr().err == ""
+
+
+def test_a_full_disk_behind_stdout_is_an_error(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(sys, "stdout", FullDisk())
+    console = Console(as_json=True)
+
+    def action() -> int:
+        console.result({})
+        return 0
+
+    assert guard(action, console, debug=False) == 6
+    assert capsys.readouterr().err == "clrecon: error: cannot write to standard output: No space left on device\n"
+
+
+def test_no_stdout_at_all(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "stdout", None)
+    console = Console()
+    assert guard(lambda: console.say("nobody hears") or 0, console, debug=False) == 0
+
+
+def test_progress_is_silent_without_a_terminal(capsys: pytest.CaptureFixture[str]) -> None:
+    console = Console()
+    console.progress("read", 3, 10)
+    console.finish()
+    assert capsys.readouterr() == ("", "")
+
+
+def test_progress_moves_on_a_terminal_and_is_removed(monkeypatch: pytest.MonkeyPatch) -> None:
+    terminal = Terminal()
+    monkeypatch.setattr(sys, "stderr", terminal)
+    monkeypatch.setenv("TERM", "xterm")
+    console = Console()
+    console.progress("read", 5, 10)
+    assert "reading slices [############............] 5/10" in terminal.getvalue()
+    console.progress("build", 0, 0)
+    assert "building kernels (takes seconds on the first run" in terminal.getvalue()
+    console.finish()
+    assert terminal.getvalue().endswith(" \r")
+    assert "\n" not in terminal.getvalue()
+
+
+def test_quiet_shows_no_progress_on_a_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
+    terminal = Terminal()
+    monkeypatch.setattr(sys, "stderr", terminal)
+    console = Console()
+    console.set_loudness(quiet=True, verbose=False)
+    console.progress("read", 5, 10)
+    console.warn("hidden")
+    assert terminal.getvalue() == ""
+
+
+def test_verbose_prints_a_line_a_stage(capsys: pytest.CaptureFixture[str]) -> None:
+    console = Console()
+    console.set_loudness(quiet=False, verbose=True)
+    for done in range(4):
+        console.progress("read", done, 3)
+    console.progress("write")
+    lines = capsys.readouterr().err.splitlines()
+    assert [line.split("  ")[-1] for line in lines] == ["reading slices", "writing"]
+
+
+def test_table_aligns_columns() -> None:
+    assert table([("n", "name"), (12, "b"), (3, "long")], right=(0,)) == [" n  name", "12  b", " 3  long"]
+
+
+@pytest.mark.parametrize(
+    ("size", "shown"), [(12, "12 bytes"), (2500, "2.5 kB"), (7_340_000, "7.3 MB"), (4 * 10**9, "4.0 GB")]
+)
+def test_sizes_for_people(size: int, shown: str) -> None:
+    assert megabytes(size) == shown

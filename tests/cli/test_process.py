@@ -1,0 +1,106 @@
+"""The command line as a process of its own: streams, exit codes, start-up."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from ct_files import write_series
+
+COMMAND = [sys.executable, "-m", "clrecon.cli.main"]
+
+
+def run(*arguments: str, **options: object) -> subprocess.CompletedProcess[str]:
+    root = Path(__file__).resolve().parents[2]
+    environment = {**os.environ, "PYTHONPATH": str(root), **options.pop("environment", {})}  # type: ignore[dict-item]
+    return subprocess.run(
+        [*COMMAND, *arguments], env=environment, capture_output=True, text=True, timeout=120, **options
+    )  # type: ignore[call-overload]
+
+
+def test_help_goes_to_stdout_in_little_time() -> None:
+    start = time.perf_counter()
+    done = run("--help")
+    elapsed = time.perf_counter() - start
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "mesh      make a mesh from a CT series" in done.stdout
+    assert elapsed < 3.0  # 0.07 s on an idle machine; what is imported is what the guards look at
+
+
+def test_help_imports_neither_numpy_nor_a_driver() -> None:
+    done = run("mesh", "--help", environment={"PYTHONPROFILEIMPORTTIME": "1"})
+    imported = {line.rpartition("|")[2].strip().partition(".")[0] for line in done.stderr.splitlines()}
+    assert "argparse" in imported
+    assert imported & {"numpy", "pydicom", "pyopencl", "vtk", "vtkmodules", "pyvista", "skimage", "scipy"} == set()
+
+
+def test_an_error_is_one_line_on_stderr_and_the_exit_code(tmp_path: Path) -> None:
+    done = run("info", str(tmp_path / "nothing here"))
+    assert (done.returncode, done.stdout) == (2, "")
+    assert len(done.stderr.splitlines()) == 1
+    assert done.stderr.startswith("clrecon: error: ")
+
+
+@pytest.mark.skipif(os.name != "posix", reason="pipes and signals of POSIX")
+def test_a_reader_that_leaves_early(tmp_path: Path) -> None:
+    write_series(tmp_path / "ct")
+    reading, writing = os.pipe()
+    os.close(reading)
+    root = Path(__file__).resolve().parents[2]
+    process = subprocess.run(
+        [*COMMAND, "info", str(tmp_path / "ct")],
+        env={**os.environ, "PYTHONPATH": str(root)},
+        stdout=writing,
+        stderr=subprocess.PIPE,
+        timeout=60,
+    )
+    os.close(writing)
+    assert (process.returncode, process.stderr) == (0, b"")
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full here")
+def test_a_full_disk_behind_stdout(tmp_path: Path) -> None:
+    write_series(tmp_path / "ct")
+    root = Path(__file__).resolve().parents[2]
+    with open("/dev/full", "w") as full:
+        process = subprocess.run(
+            [*COMMAND, "info", str(tmp_path / "ct"), "--json"],
+            env={**os.environ, "PYTHONPATH": str(root)},
+            stdout=full,
+            stderr=subprocess.PIPE,
+            text=True,
+            timeout=60,
+        )
+    assert process.returncode == 6
+    assert process.stderr == "clrecon: error: cannot write to standard output: No space left on device\n"
+
+
+def test_a_plain_locale_shows_escapes(tmp_path: Path) -> None:
+    done = run("info", str(tmp_path / "größe"), environment={"PYTHONIOENCODING": "ascii", "PYTHONUTF8": "0"})
+    assert done.returncode == 2
+    assert "gr\\xf6\\xdfe" in done.stderr
+
+
+@pytest.mark.skipif(os.name != "posix", reason="pipes and signals of POSIX")
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_an_interrupt_leaves_nothing(number: signal.Signals, tmp_path: Path) -> None:
+    root = Path(__file__).resolve().parents[2]
+    process = subprocess.Popen(
+        [*COMMAND, "phantom", str(tmp_path / "ph"), "--slices", "300", "-v"],
+        env={**os.environ, "PYTHONPATH": str(root)},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    assert process.stderr is not None
+    assert "drawing the phantom" in process.stderr.readline()
+    process.send_signal(number)
+    output, errors = process.communicate(timeout=60)
+    assert (process.returncode, output) == (130, "")
+    assert errors == "clrecon: error: interrupted\n"
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,144 @@
+"""Fixtures for all tests: the real data, and every OpenCL device of the machine.
+
+Variables
+---------
+CLRECON_TEST_DATA
+    Folder of the real CT data, default ``../shared/data`` beside the project; tests over it skip where it is absent.
+CLRECON_TEST_DEVICE
+    Only the devices of this index or with this text in platform or name; naming one that is not there is an error.
+CLRECON_TEST_SIMULATORS=1
+    Simulators such as Oclgrind too.
+CLRECON_REQUIRE_DEVICE=1
+    No device is a failure, not a skip.
+CLRECON_REQUIRE_PLATFORMS
+    Comma list of texts; each must be found in platform, version or driver of a device of its own.
+CLRECON_REQUIRE_TESTS=1
+    A session in which no test has run fails.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+
+
+def is_set(variable: str) -> bool:
+    return os.environ.get(variable, "") not in ("", "0")
+
+
+def find_devices() -> tuple[list[Any], str]:
+    """Devices to test on, and why there are none."""
+    try:
+        from clrecon.errors import DeviceError
+        from clrecon.opencl import list_devices
+    except ImportError as error:
+        return [], f"the device layer cannot be imported: {error}"
+    try:
+        found = list_devices()
+    except DeviceError as error:
+        return [], str(error)
+    devices = [device for device in found if is_set("CLRECON_TEST_SIMULATORS") or not device.is_simulator]
+    wanted = os.environ.get("CLRECON_TEST_DEVICE", "").strip().lower()
+    if wanted:
+        devices = [
+            device
+            for device in devices
+            if wanted == str(device.index) or wanted in f"{device.platform} {device.name}".lower()
+        ]
+        if not devices:
+            there = "; ".join(f"{device.index}: {device.label}" for device in found) or "none"
+            raise pytest.UsageError(f"CLRECON_TEST_DEVICE={wanted!r} is not there; devices found: {there}")
+    return devices, "" if devices else "no OpenCL device found"
+
+
+def missing_platforms(wanted: str, devices: list[Any]) -> list[str]:
+    """Entries of the comma list `wanted` that find no device of their own."""
+    left = [f"{device.platform} {device.version} {device.driver}".lower() for device in devices]
+    missing = []
+    for entry in filter(None, (part.strip() for part in wanted.split(","))):
+        match = next((text for text in left if entry.lower() in text), None)
+        if match is None:
+            missing.append(entry)
+        else:
+            left.remove(match)
+    return missing
+
+
+def device_id(device: Any) -> str:
+    platform = "".join(letter if letter.isalnum() else "-" for letter in device.platform.lower())
+    return f"{device.index}-{platform}-{device.type}"
+
+
+class Devices:
+    """The devices of this session, found when the first test asks for one."""
+
+    found: tuple[list[Any], str] | None = None
+
+    @classmethod
+    def get(cls) -> tuple[list[Any], str]:
+        if cls.found is None:
+            devices, reason = find_devices()
+            missing = missing_platforms(os.environ.get("CLRECON_REQUIRE_PLATFORMS", ""), devices)
+            if missing and not os.environ.get("CLRECON_TEST_DEVICE", "").strip():
+                there = ", ".join(f"{device.platform} {device.driver}" for device in devices) or "none"
+                raise pytest.UsageError(f"CLRECON_REQUIRE_PLATFORMS: no device of {missing}; found {there}")
+            cls.found = devices, reason
+        return cls.found
+
+
+def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
+    if "device" in metafunc.fixturenames:
+        devices, reason = Devices.get()
+        parameters = devices or [pytest.param(reason, id="no-device")]
+        ids = [device_id(device) for device in devices] or None
+        metafunc.parametrize("device", parameters, ids=ids, indirect=True, scope="session")
+
+
+@pytest.fixture(scope="session")
+def device(request: pytest.FixtureRequest) -> Any:
+    """Every OpenCL device of the machine, one after the other."""
+    if isinstance(request.param, str):
+        if is_set("CLRECON_REQUIRE_DEVICE"):
+            pytest.fail(f"CLRECON_REQUIRE_DEVICE is set: {request.param}")
+        pytest.skip(request.param)
+    return request.param
+
+
+@pytest.fixture(scope="session")
+def real_data() -> Path:
+    """Folder of the real CT data; skips where it is absent."""
+    named = os.environ.get("CLRECON_TEST_DATA", "")
+    folder = Path(named) if named else ROOT.parent / "shared" / "data"
+    if not folder.is_dir():
+        if named:
+            pytest.fail(f"CLRECON_TEST_DATA={named!r} is not a folder")
+        pytest.skip("real CT data is absent (CLRECON_TEST_DATA names its folder)")
+    return folder
+
+
+@pytest.fixture(scope="session")
+def project_root() -> Path:
+    """The folder that holds setup.cfg."""
+    return ROOT
+
+
+class RanTests:
+    """How many tests have got as far as their own body."""
+
+    count = 0
+
+
+def pytest_runtest_logreport(report: pytest.TestReport) -> None:
+    if report.when == "call" and not report.skipped:
+        RanTests.count += 1
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_sessionfinish(session: pytest.Session, exitstatus: int) -> None:
+    if is_set("CLRECON_REQUIRE_TESTS") and RanTests.count == 0 and exitstatus == 0:
+        session.exitstatus = pytest.ExitCode.NO_TESTS_COLLECTED

@@ -1,0 +1,123 @@
+"""The jobs: order of work, what is left when a step fails, the demonstration."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+import tolerances
+
+from clrecon.errors import DeviceError, OutputError, UsageError
+from clrecon.phantom import PhantomSettings, write_phantom
+from clrecon.pipeline.demo import make_demo
+from clrecon.pipeline.devices import survey_devices
+from clrecon.pipeline.mesh import make_mesh
+from clrecon.pipeline.settings import MeshSettings
+
+
+@pytest.fixture(scope="module")
+def sphere(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]:
+    folder = tmp_path_factory.mktemp("jobs") / "ct"
+    settings = PhantomSettings(
+        kind="sphere",
+        size=(44, 60),
+        slices=31,
+        spacing=(0.5, 0.7, 1.0),
+        tilt=15.0,
+        oblique=(20.0, 5.0, -40.0),
+        noise=0.0,
+    )
+    return folder, write_phantom(folder, settings)
+
+
+def test_a_tilted_oblique_sphere_has_its_volume_and_place(
+    device: Any, sphere: tuple[Path, dict[str, Any]], tmp_path: Path
+) -> None:
+    folder, truth = sphere
+    stages: list[str] = []
+    report = make_mesh(
+        folder,
+        tmp_path / "sphere.stl",
+        MeshSettings(iso_value=truth["iso_value_hu"], device=str(device.index)),
+        measure=True,
+        progress=lambda stage, done, total: stages.append(stage),
+    )
+    assert report["volume_ml"] == pytest.approx(
+        truth["surface"]["volume_ml"], rel=tolerances.PHANTOM_SPHERE_VOLUME_SHARE
+    )
+    centre = [(low + high) / 2 for low, high in zip(*report["bounds_mm"], strict=True)]
+    assert centre == pytest.approx(truth["surface"]["center_lps_mm"], abs=0.1)
+    assert report["volume"]["tilt_deg"] == pytest.approx(15.0, abs=1e-3)
+    assert report["device"] == device.label
+    assert list(dict.fromkeys(stages)) == ["device", "scan", "read", "build", "write", "measure"]
+
+
+def test_parts_of_the_time_sum_to_the_total(device: Any, sphere: tuple[Path, dict[str, Any]], tmp_path: Path) -> None:
+    report = make_mesh(sphere[0], tmp_path / "a.ply", MeshSettings(preset="bone", device=str(device.index)))
+    seconds = dict(report["seconds"])
+    assert seconds.pop("total") == pytest.approx(sum(seconds.values()), abs=0.01)
+    assert (report["volume_ml"], report["quality"]) == (None, None)
+
+
+def test_outputs_then_device_then_input(sphere: tuple[Path, dict[str, Any]], tmp_path: Path) -> None:
+    nowhere = tmp_path / "nowhere"
+    bad_device = MeshSettings(device="abacus")
+    with pytest.raises(OutputError, match="nowhere"):
+        make_mesh(nowhere, nowhere / "a.stl", bad_device)
+    with pytest.raises(DeviceError, match="abacus|no OpenCL device"):
+        make_mesh(nowhere, tmp_path / "a.stl", bad_device)
+
+
+def test_a_failed_write_leaves_the_old_files(
+    device: Any, sphere: tuple[Path, dict[str, Any]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import clrecon.mesh
+
+    mesh, report = tmp_path / "a.stl", tmp_path / "a.json"
+    mesh.write_bytes(b"old mesh")
+    report.write_bytes(b"old report")
+
+    def fail(self: Any, path: Path, space: str = "lps") -> int:
+        raise OutputError("the disk is full")
+
+    monkeypatch.setattr(clrecon.mesh.Mesh, "save", fail)
+    with pytest.raises(OutputError, match="full"):
+        make_mesh(sphere[0], mesh, MeshSettings(device=str(device.index)), report_path=report)
+    assert (mesh.read_bytes(), report.read_bytes()) == (b"old mesh", b"old report")
+    assert sorted(tmp_path.iterdir()) == [report, mesh]
+
+
+def test_survey_says_why_no_device_is_used(device: Any) -> None:
+    survey, problem = survey_devices("abacus")
+    assert survey["chosen"] is None
+    assert len(survey["devices"]) > device.index
+    assert "abacus" in str(problem)
+
+
+def test_demo_writes_and_replaces(device: Any, tmp_path: Path) -> None:
+    folder = tmp_path / "demo"
+    first = make_demo(folder, str(device.index))
+    (folder / "report.json").write_text("{}")
+    second = make_demo(folder, str(device.index))
+    assert sorted(path.name for path in folder.iterdir()) == ["bone.stl", "ct", "report.json"]
+    report = json.loads((folder / "report.json").read_text())
+    assert report["triangles"] == first["mesh"]["triangles"] == second["mesh"]["triangles"] > 100_000
+    assert (report["closed"], report["manifold"]) == (True, True)
+    assert first["affine_error_mm"] < 1e-6
+    check = first["check"]
+    assert check["volume_ml"] == pytest.approx(check["true_volume_ml"], rel=tolerances.PHANTOM_SPHERE_VOLUME_SHARE)
+    assert check["radius_error_max_mm"] < 0.15 * max(check["spacing_mm"])
+
+
+def test_demo_refuses_a_folder_of_others(tmp_path: Path) -> None:
+    (tmp_path / "bone.stl").write_text("mine")
+    with pytest.raises(UsageError, match="not of a demo"):
+        make_demo(tmp_path)
+    (tmp_path / "thesis.txt").write_text("mine too")
+    with pytest.raises(UsageError, match="thesis"):
+        make_demo(tmp_path)
+    with pytest.raises(OutputError, match="does not exist"):
+        make_demo(tmp_path / "no" / "demo")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["bone.stl", "thesis.txt"]

@@ -1,0 +1,62 @@
+"""The main job on real CT: the affine that independent readers agree on, and the surface that VTK finds."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+import tolerances
+from scipy.spatial import cKDTree
+
+from clrecon.dicom import read_volume
+from clrecon.geometry import AIR_HU, Volume
+from clrecon.pipeline.mesh import make_mesh
+from clrecon.pipeline.settings import MeshSettings
+
+HU = 226
+
+# (folder, origin, spacing) as two independent readers have them
+SERIES = [
+    ("lumbar_4p25mm", (-250.0, -250.0, -846.25), (0.976562, 0.976562, 4.25)),
+    ("thoracic_0p8mm", (-169.399994, -165.0, -280.0), (0.644531, 0.644531, 0.8)),
+]
+
+
+def contour_with_vtk(volume: Volume) -> tuple[np.ndarray, np.ndarray]:
+    """Flying edges over the same voxels in one layer of air, mapped through the same affine."""
+    pyvista = pytest.importorskip("pyvista")
+    padded = np.pad(volume.voxels, 1, constant_values=AIR_HU)
+    image = pyvista.ImageData(dimensions=padded.shape[::-1], origin=(-1, -1, -1))
+    image["hu"] = padded.ravel()
+    contour = image.contour([HU - 0.5], method="flying_edges", compute_normals=False, compute_scalars=False)
+    return volume.ijk_to_lps(contour.points), contour.regular_faces
+
+
+def enclosed_ml(points: np.ndarray, faces: np.ndarray) -> float:
+    points = points - points.mean(axis=0)
+    a, b, c = (points[faces[:, corner]] for corner in range(3))
+    return float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6000.0)
+
+
+@pytest.mark.parametrize(("folder", "origin", "spacing"), SERIES, ids=[row[0] for row in SERIES])
+def test_real_series_mesh_like_vtk_in_the_true_place(real_data, device, tmp_path, folder, origin, spacing):
+    trimesh = pytest.importorskip("trimesh")
+    output, report_path = tmp_path / "bone.stl", tmp_path / "report.json"
+    make_mesh(real_data / folder, output, MeshSettings(iso_value=HU, device=device), report_path=report_path)
+    report = json.loads(report_path.read_text())
+    expected_affine = np.diag((*spacing, 1.0))
+    expected_affine[:3, 3] = origin
+    assert np.abs(np.array(report["affine_ijk_to_lps_mm"]) - expected_affine).max() < 1e-5
+    assert report["closed"] and report["manifold"]
+
+    volume = read_volume(real_data / folder)
+    points, faces = contour_with_vtk(volume)
+    written = trimesh.load_mesh(output, process=False)
+    vertices = np.unique(written.vertices, axis=0)
+    voxel = min(spacing)
+    both_ways = [cKDTree(points).query(vertices)[0], cKDTree(vertices).query(points)[0]]
+    for distances in both_ways:  # vertex to vertex: no less than to the surface
+        assert np.percentile(distances, 95) <= tolerances.VTK_SURFACE_HD95_VOXEL * voxel
+    assert report["triangles"] == len(faces)
+    assert report["volume_ml"] == pytest.approx(enclosed_ml(points, faces), rel=tolerances.VTK_VOLUME)

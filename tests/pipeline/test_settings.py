@@ -1,0 +1,54 @@
+"""Settings and presets: what is refused, and what an iso value is when nothing is said."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from clrecon.errors import UsageError
+from clrecon.pipeline.presets import DEFAULT_PRESET, PRESETS, find_preset
+from clrecon.pipeline.settings import MeshSettings
+
+
+def test_bone_is_the_default() -> None:
+    settings = MeshSettings()
+    assert (settings.level, settings.preset_used) == (200.0, "bone")
+    assert (settings.space, settings.closed, settings.device) == ("lps", True, None)
+
+
+def test_a_value_beats_the_default_preset() -> None:
+    settings = MeshSettings(iso_value=-0.0)
+    assert (settings.level, settings.preset_used) == (0.0, None)
+
+
+@pytest.mark.parametrize("name", sorted(PRESETS))
+def test_presets_are_whole_numbers_of_hu_in_the_range_of_ct(name: str) -> None:
+    preset = find_preset(name)
+    assert (preset.name, MeshSettings(preset=name).level) == (name, preset.iso_value)
+    assert preset.iso_value == int(preset.iso_value)
+    assert -1000 < preset.iso_value < 3071
+    assert preset.description and preset.source
+
+
+def test_the_default_preset_keeps_thin_cortex() -> None:
+    assert 150 <= PRESETS[DEFAULT_PRESET].iso_value <= 200
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        ({"iso_value": 3.0, "preset": "bone"}, "not both"),
+        ({"iso_value": math.nan}, "finite"),
+        ({"iso_value": -math.inf}, "finite"),
+        ({"preset": "Bone"}, "unknown preset 'Bone'"),
+        ({"space": "world"}, "unknown space 'world'"),
+        ({"keep_largest": 0}, "1 or more, not 0"),
+        ({"min_volume_ml": 0.0}, "above 0 ml"),
+        ({"min_volume_ml": math.nan}, "above 0 ml"),
+        ({"keep_largest": 1, "min_volume_ml": 1.0}, "not both"),
+    ],
+)
+def test_impossible_settings_are_refused(settings: dict, words: str) -> None:
+    with pytest.raises(UsageError, match=words):
+        MeshSettings(**settings)

@@ -1,0 +1,45 @@
+"""Every tolerance of the tests: name = value  # reason.  A bound is loosened here or nowhere."""
+
+from __future__ import annotations
+
+import numpy as np
+
+
+def float32_unit(points) -> float:
+    """One unit in the last place of the largest coordinate, in mm: what float32 vertices can hold."""
+    return float(np.spacing(np.float32(np.abs(points).max())))
+
+
+# --- operators ---
+TWIN_VERTEX_VOXEL = 1e-4  # device in float32 against twin in float64, index steps
+TWIN_NORMAL = 2e-5  # unit vectors in float32
+FRAME_MM = 1e-4  # one surface through differently ordered voxels
+SPHERE_DISTANCE_FIELD_VOXEL = 0.03  # sagitta of one edge at R = 5 voxels is 1/40 voxel
+SPHERE_PARTIAL_VOLUME_RMS_VOXEL = 0.05  # box-averaged edges bend: measured 0.04-0.05 for R >= 5 voxels
+SPHERE_PARTIAL_VOLUME_MAX_VOXEL = 0.15  # measured 0.11-0.14
+
+# --- dicom ---
+AFFINE_MM = 1e-6  # positions and directions are written with 9 decimals (6 where coordinates are 1e5 mm)
+ROUNDED_AFFINE_MM = 0.006  # positions rounded to 0.01 mm: half of it, and the fit averages most of that out
+
+# --- phantom ---
+PHANTOM_VOLUME_RATIO = 1e-3  # sum of partial volumes against analysis; the cell ramp leaves 0.03 % at R = 5 voxels
+PHANTOM_PLANE_SHARE = 0.03  # linear ramp against the exact share of a cell, 1 of 6 cells along an edge
+PHANTOM_DISTANCE_MM = 0.02  # brute force over surface points 0.5 mm apart: sagging chord of a curved surface
+PHANTOM_MESH_AREA_RATIO = 0.01  # marching cubes on partial volume cuts convex surfaces: R = 9 voxels
+PHANTOM_MESH_VOLUME_RATIO = 0.012  # marching cubes on partial volume: -0.9 % at R = 10 voxels (TRUST 2.1)
+PHANTOM_POSITION_MM = 1e-9  # decimal strings of 16 characters near 1000 mm
+PHANTOM_BLUR_HU = 1e-3  # float32 sums of 1000 HU against scipy
+
+# --- pipeline ---
+VTK_SURFACE_HD95_VOXEL = 0.05  # the bar; measured 1e-3: only the rounding of index coordinates differs
+VTK_VOLUME = 2e-3  # the bar; measured 1e-5
+
+# --- mesh ---
+MESH_VOLUME = 1e-6  # relative; float32 corners of a solid with exact corners, summed in float64
+MESH_UNIT_NORMAL = 1e-6  # float32 components; the text formats keep six decimals
+GLB_METRES = 1e-7  # relative; float32 coordinates through a float64 matrix, read back by another library
+
+# --- pipeline and command line ---
+PHANTOM_SPHERE_VOLUME_SHARE = 0.01  # sphere of about 12 mm in voxels of 0.5 x 0.7 x 1 mm: measured -0.34 %
+CLI_SPHERE_VOLUME_SHARE = 0.02  # sphere of 9 mm in voxels of 0.8 x 1.1 x 1.5 mm, its edge a ramp of 1 mm
