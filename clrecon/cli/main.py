@@ -86,7 +86,7 @@ def _dispatch(arguments: list[str], console: Console) -> int:
     except SystemExit as stop:  # --help
         return int(stop.code or 0)
     if options.version:
-        from clrecon.pipeline.report import package_version
+        from clrecon.version import package_version
 
         console.result({"version": package_version()})
         console.say(f"clrecon {package_version()}")

@@ -20,7 +20,7 @@ def collect_scan_warnings(scan: Scan) -> list[str]:
     warnings = []
     if scan.corrupt:
         plural = "s" * (len(scan.corrupt) > 1)
-        warnings.append(f"{len(scan.corrupt)} corrupt file{plural} skipped: {join_names(scan.corrupt)}")
+        warnings.append(f"{len(scan.corrupt)} corrupt file{plural} skipped: {join_names(map(str, scan.corrupt))}")
     for reason in ("not readable", "folder not readable", "link out of the folder"):
         if scan.skipped[reason]:
             warnings.append(f"{scan.skipped[reason]} skipped: {reason}")

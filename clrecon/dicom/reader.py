@@ -58,7 +58,7 @@ def read_volume(
         chosen = choose_series(found, series)
         stack = chosen.stack
         if chosen.problems or stack is None or stack.affine is None:
-            raise RefusedInputError(_describe_refusal(chosen, scan))
+            raise RefusedInputError(_describe_refusal(chosen))
         voxels, facts = read_voxels(stack.slices, progress)
     warnings = [
         *collect_series_warnings(chosen),
@@ -116,7 +116,7 @@ def _scan_and_group(path: str | os.PathLike[str], progress: Progress | None) -> 
     if not scan.slices and not scan.others:
         shown = escape_text(str(path), 256)
         if scan.corrupt:
-            raise RefusedInputError(f"no readable DICOM file in {shown}, corrupt: {join_names(scan.corrupt)}")
+            raise RefusedInputError(f"no readable DICOM file in {shown}, corrupt: {join_names(map(str, scan.corrupt))}")
         reasons = ", ".join(f"{count} {reason}" for reason, count in sorted(scan.skipped.items()))
         looked = f"{scan.files} file{'s' * (scan.files != 1)} looked at" + (f" ({reasons})" if reasons else "")
         hint = "; a DICOMDIR only lists files: name the folder that holds them" if scan.skipped["DICOMDIR"] else ""
@@ -124,15 +124,12 @@ def _scan_and_group(path: str | os.PathLike[str], progress: Progress | None) -> 
     return scan, group_series(scan)
 
 
-def _describe_refusal(series: Series, scan: Scan) -> str:
-    text = f"series {series.number} '{series.identity.description}': " + "; ".join(series.problems)
-    if scan.corrupt:
-        text += f" (corrupt and skipped: {join_names(scan.corrupt)})"
-    return text
+def _describe_refusal(series: Series) -> str:
+    return f"series {series.number} '{series.identity.description}': " + "; ".join(series.problems)
 
 
 def _describe_left(found: list[Series], chosen: Series) -> list[str]:
     left = [series for series in found if series is not chosen]
     if not left:
         return []
-    return [f"{len(left)} other series left: " + join_names([f"[{series.describe()}]" for series in left])]
+    return [f"{len(left)} other series left: " + join_names([f"[{series.describe_without_text()}]" for series in left])]

@@ -23,6 +23,17 @@ __all__ = ["Progress", "Scan", "scan_path"]
 Progress = Callable[[str, int, int], None]
 
 
+@dataclass(frozen=True)
+class CorruptFile:
+    """A file that says it is DICOM and is not readable as such."""
+
+    file: Path
+    reason: str
+
+    def __str__(self) -> str:
+        return f"{escape_text(self.file.name)}: {self.reason}"
+
+
 @dataclass
 class Scan:
     """What is in a folder.
@@ -35,8 +46,7 @@ class Scan:
         DICOM objects that are none.
     skipped : Counter
         Reason to number of files (or folders) that were passed over.
-    corrupt : list of str
-        One line for each file that says it is DICOM and is not readable as such: name and reason.
+    corrupt : list of CorruptFile
     files : int
         Regular files looked at.
     """
@@ -44,7 +54,7 @@ class Scan:
     slices: list[SliceHeader] = field(default_factory=list)
     others: list[OtherImage] = field(default_factory=list)
     skipped: Counter[str] = field(default_factory=Counter)
-    corrupt: list[str] = field(default_factory=list)
+    corrupt: list[CorruptFile] = field(default_factory=list)
     files: int = 0
 
 
@@ -80,7 +90,7 @@ def _take_file(file: Path, scan: Scan) -> None:
         scan.skipped["not DICOM"] += 1
     except CorruptFileError as error:
         scan.skipped["corrupt"] += 1
-        scan.corrupt.append(f"{escape_text(file.name)}: {error}")
+        scan.corrupt.append(CorruptFile(file, str(error)))
     except OSError:
         scan.skipped["not readable"] += 1
     else:

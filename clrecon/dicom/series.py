@@ -12,7 +12,7 @@ import numpy as np
 
 from clrecon.dicom.gate import Stack, measure_stack
 from clrecon.dicom.header import OtherImage, SeriesIdentity, SliceHeader
-from clrecon.dicom.scan import Scan
+from clrecon.dicom.scan import CorruptFile, Scan
 from clrecon.dicom.text import hash_uid, join_names
 from clrecon.errors import NoDicomError, RefusedInputError, UsageError
 from clrecon.geometry import column_spacing
@@ -37,6 +37,8 @@ class Series:
         Valid slices, unsorted.
     others : list of OtherImage
         Its files that cannot be slices.
+    corrupt : list of CorruptFile
+        Unreadable DICOM files in the folders of its slices: each may be one of its slices.
     number : int
         Place in the listing, from 1.
     """
@@ -45,6 +47,7 @@ class Series:
     kind: str
     headers: list[SliceHeader] = field(default_factory=list)
     others: list[OtherImage] = field(default_factory=list)
+    corrupt: list[CorruptFile] = field(default_factory=list)
     number: int = 0
 
     @property
@@ -68,16 +71,26 @@ class Series:
             problems.append(f"and {len(texts) - PROBLEMS_SHOWN} more files with a problem")
         if self.kind == "localizer":
             problems.append("localizer images, not a stack")
-        if self.stack is not None and not problems:  # bad files leave holes, which would only hide the cause
+        if self.corrupt:
+            problems.append(
+                "corrupt DICOM files beside its slices, which may belong to it (restore or remove them): "
+                + join_names(map(str, self.corrupt))
+            )
+        if self.kind == "stack" and self.stack is not None and not texts:  # bad files leave holes, which would only hide the cause
             problems += self.stack.problems
         return problems
 
     def describe(self) -> str:
-        """One line for a message."""
+        """One line for a message on the terminal."""
+        return f"{self.number}: {self.identity.modality} '{self.identity.description}', {self._describe_count()}"
+
+    def describe_without_text(self) -> str:
+        """One line for a report: without the description, since people type names into it."""
+        return f"{self.number}: {self.identity.modality} {hash_uid(self.identity.uid)}, {self._describe_count()}"
+
+    def _describe_count(self) -> str:
         kind = "" if self.kind in ("stack", "other") else f", {self.kind}"
-        plural = "s" * (self.count != 1)
-        title = f"{self.number}: {self.identity.modality} '{self.identity.description}'"
-        return f"{title}, {self.count} slice{plural}{kind}"
+        return f"{self.count} slice{'s' * (self.count != 1)}{kind}"
 
 
 @dataclass(frozen=True)
@@ -168,6 +181,9 @@ def group_series(scan: Scan) -> list[Series]:
     found.sort(key=_listing_key)
     for number, series in enumerate(found, start=1):
         series.number = number
+        if series.kind == "stack":
+            folders = {header.file.parent for header in series.headers}
+            series.corrupt = [corrupt for corrupt in scan.corrupt if corrupt.file.parent in folders]
     return found
 
 

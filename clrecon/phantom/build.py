@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.metadata
 import json
 import re
 import shutil
@@ -21,6 +20,7 @@ from clrecon.phantom.dicom_series import RESCALE_INTERCEPT, write_series
 from clrecon.phantom.sampling import Progress, add_noise, apply_point_spread, sample_occupancy
 from clrecon.phantom.settings import CENTRE_LPS_MM, PhantomSettings, Placement, place_slices
 from clrecon.phantom.spine import draw_spine
+from clrecon.version import package_version
 
 __all__ = ["SPINE_ISO_HU", "TRUTH_NAME", "make_phantom", "write_phantom"]
 
@@ -31,13 +31,6 @@ SPINE_ISO_HU = 226.0
 
 _GENERATOR = "clrecon phantom"
 _OURS = re.compile(r"IM\d{4}\.dcm|truth\.json")
-
-
-def _version() -> str:
-    try:
-        return importlib.metadata.version("clrecon")
-    except importlib.metadata.PackageNotFoundError:
-        return "0+uninstalled"
 
 
 def _describe_spine(anatomy: Anatomy, affine: NDArray[np.float64], settings: PhantomSettings) -> dict[str, Any]:
@@ -90,7 +83,7 @@ def _make(
         voxels[k] = np.rint(np.clip(field[k], -32768, 32767 + RESCALE_INTERCEPT))
     truth = {
         "generator": _GENERATOR,
-        "version": _version(),
+        "version": package_version(),
         "kind": settings.kind,
         "shape_ijk": list(settings.shape_kji[::-1]),
         "affine_ijk_to_lps_mm": affine.tolist(),

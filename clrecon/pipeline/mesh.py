@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING, Any
 from clrecon.errors import UsageError
 from clrecon.pipeline.presets import find_preset
 from clrecon.pipeline.progress import Progress, Stopwatch, ignore_progress
-from clrecon.pipeline.report import package_version, peak_memory_bytes, platform_name, write_report
+from clrecon.pipeline.report import peak_memory_bytes, platform_name, write_report
 from clrecon.pipeline.settings import MeshSettings
+from clrecon.version import package_version
 
 if TYPE_CHECKING:
     from clrecon.geometry import Volume

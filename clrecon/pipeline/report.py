@@ -14,7 +14,7 @@ from typing import Any, BinaryIO
 
 from clrecon.errors import ClreconError
 
-__all__ = ["error_as_dict", "package_version", "peak_memory_bytes", "platform_name", "to_json", "write_report"]
+__all__ = ["error_as_dict", "peak_memory_bytes", "platform_name", "to_json", "write_report"]
 
 
 def to_json(value: Any, indent: int | None = 2) -> str:
@@ -70,16 +70,6 @@ def write_report(path: str | Path, report: Mapping[str, Any]) -> int:
 def error_as_dict(error: ClreconError) -> dict[str, Any]:
     """The JSON form of an error: ``{"error": {"kind", "exit_code", "message"}}``."""
     return {"error": {"kind": type(error).__name__, "exit_code": error.exit_code, "message": str(error)}}
-
-
-def package_version() -> str:
-    """Version of clrecon, as ``clrecon.__version__`` (which stands above this layer)."""
-    from importlib.metadata import PackageNotFoundError, version
-
-    try:
-        return version("clrecon")
-    except PackageNotFoundError:  # a source folder that nobody has installed
-        return "0+uninstalled"
 
 
 def platform_name() -> str:

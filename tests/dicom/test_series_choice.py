@@ -23,6 +23,10 @@ CONTRACT = (
 ).split()
 
 
+def hash_of(series: int) -> str:
+    return hashlib.sha256(f"{ROOT}.{series}".encode()).hexdigest()[:16]
+
+
 @pytest.fixture
 def two_series(tmp_path):
     """Series 2 of 7 slices and series 5 of 4, in files that do not tell."""
@@ -38,7 +42,7 @@ def test_listing_is_the_contract(two_series):
     assert listing.chosen == 1
     assert json.loads(json.dumps(entries)) == entries
     first = entries[0]
-    assert first["uid_hash"] == hashlib.sha256(f"{ROOT}.2".encode()).hexdigest()[:16]
+    assert first["uid_hash"] == hash_of(2)
     assert (first["number"], first["description"], first["modality"], first["slices"]) == (1, "series 2", "CT", 7)
     assert first["shape_ijk"] == [6, 5, 7]
     assert first["spacing_mm"] == pytest.approx([0.5, 0.7, 1.25])
@@ -53,14 +57,14 @@ def test_listing_is_the_contract(two_series):
 def test_the_largest_series_is_taken_and_the_rest_said(two_series):
     volume = read_volume(two_series)
     assert volume.report["series"]["description"] == "series 2"
-    assert volume.report["warnings"] == ["1 other series left: [2: CT 'series 5', 4 slices]"]
+    assert volume.report["warnings"] == [f"1 other series left: [2: CT {hash_of(5)}, 4 slices]"]
     assert volume.report["files"] == {"found": 11, "used": 7, "skipped": {}}
     assert list_series(two_series).warnings == volume.report["warnings"]
 
 
 @pytest.mark.parametrize(
     "wanted",
-    [2, "2", "series 5", "SERIES 5", "es 5", f"{ROOT}.5", hashlib.sha256(f"{ROOT}.5".encode()).hexdigest()[:16]],
+    [2, "2", "series 5", "SERIES 5", "es 5", f"{ROOT}.5", hash_of(5)],
 )
 def test_a_series_is_named_in_many_ways(two_series, wanted):
     assert read_volume(two_series, wanted).report["series"]["number"] == 2
@@ -110,7 +114,7 @@ def test_a_localizer_in_the_series_is_parted(tmp_path, by_type):
     assert np.array_equal(volume.voxels, plan.hu())
     assert volume.spacing[2] == pytest.approx(1.25)
     kind = ", localizer" if by_type else ""
-    assert volume.report["warnings"] == [f"1 other series left: [2: CT 'series 1', 1 slice{kind}]"]
+    assert volume.report["warnings"] == [f"1 other series left: [2: CT {hash_of(1)}, 1 slice{kind}]"]
     assert read_volume(tmp_path, f"{ROOT}.1").report["slices"] == 7
     assert len(list_series(tmp_path).series) == 2
 
@@ -172,10 +176,9 @@ def test_descriptions_keep_their_character_set(tmp_path):
 def test_no_patient_data_and_no_folder_in_the_report(tmp_path):
     folder = tmp_path / "Doe^John"
     write_series(folder, Plan(tilt_deg=3), set_values(RescaleType="US"))
-    (folder / "bad").write_bytes(bytes(128) + b"DICM" + b"\xff" * 50)
     report = json.dumps(read_volume(folder).report)
     assert "SECRET" not in report and "Doe" not in report and str(tmp_path) not in report
-    assert "bad: " in report
+    assert "tilt 3.00 degrees" in report
 
 
 # --- what else lies in a folder ---
@@ -199,20 +202,24 @@ def test_nothing_there(tmp_path):
         read_volume("nul\0byte")
 
 
-def test_corrupt_files_among_good_ones_are_counted(tmp_path):
-    plan = write_series(tmp_path)
+def test_corrupt_files_in_another_folder_are_counted(tmp_path):
+    plan = write_series(tmp_path / "ct")
     (tmp_path / "bad").write_bytes(bytes(128) + b"DICM" + b"\xff" * 50)
-    whole = (tmp_path / "slice002.dcm").read_bytes()
-    (tmp_path / "cut.dcm").write_bytes(whole[:600])
     volume = read_volume(tmp_path)
     assert np.array_equal(volume.voxels, plan.hu())
-    assert volume.report["files"] == {"found": 9, "used": 7, "skipped": {"corrupt": 2}}
-    assert volume.report["warnings"][0].startswith("2 corrupt files skipped: bad: ")
-    (tmp_path / "slice002.dcm").unlink()
-    with pytest.raises(
-        RefusedInputError, match=r"1 slice missing between .*\(corrupt and skipped: bad: .*, cut\.dcm: ends"
-    ):
+    assert volume.report["files"] == {"found": 8, "used": 7, "skipped": {"corrupt": 1}}
+    assert volume.report["warnings"][0].startswith("1 corrupt file skipped: bad: ")
+
+
+@pytest.mark.parametrize("cut", ["slice000.dcm", "slice003.dcm", "slice006.dcm"])
+def test_a_cut_file_beside_the_slices_is_refused(tmp_path, cut):
+    """At an end of the stack it leaves no hole: the volume would be shorter and nobody would see it."""
+    write_series(tmp_path)
+    (tmp_path / cut).write_bytes((tmp_path / cut).read_bytes()[:600])
+    with pytest.raises(RefusedInputError, match=rf"may belong to it .*: {cut}: ends within"):
         read_volume(tmp_path)
+    listing = list_series(tmp_path)
+    assert listing.chosen == 1 and cut in listing.series[0].problems[0]
 
 
 def test_corrupt_files_alone_are_refused(tmp_path):

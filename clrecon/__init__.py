@@ -1,0 +1,124 @@
+"""CT DICOM in, calibrated bone mesh out, computed on any OpenCL device.
+
+>>> import clrecon
+>>> volume = clrecon.read_volume("CT_FOLDER")
+>>> mesh = clrecon.extract_isosurface(volume, 250)
+>>> mesh.save("bone.stl")
+
+The public names below are imported when they are first used: ``import clrecon`` alone needs no driver and loads
+neither pyopencl nor VTK.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from clrecon.dicom import list_series, read_volume
+    from clrecon.errors import (
+        ClreconError,
+        DeviceError,
+        NoDicomError,
+        NoSurfaceError,
+        OutputError,
+        RefusedInputError,
+        UsageError,
+    )
+    from clrecon.geometry import Volume
+    from clrecon.mesh import Mesh
+    from clrecon.opencl import Device
+    from clrecon.operators.isosurface import extract_isosurface
+
+    __version__: str
+
+__all__ = [
+    "ClreconError",
+    "DeviceError",
+    "Mesh",
+    "NoDicomError",
+    "NoSurfaceError",
+    "OutputError",
+    "RefusedInputError",
+    "UsageError",
+    "Volume",
+    "__version__",
+    "device",
+    "devices",
+    "extract_isosurface",
+    "list_series",
+    "read_volume",
+]
+
+_HOMES = {
+    "ClreconError": "clrecon.errors",
+    "DeviceError": "clrecon.errors",
+    "Mesh": "clrecon.mesh",
+    "NoDicomError": "clrecon.errors",
+    "NoSurfaceError": "clrecon.errors",
+    "OutputError": "clrecon.errors",
+    "RefusedInputError": "clrecon.errors",
+    "UsageError": "clrecon.errors",
+    "Volume": "clrecon.geometry",
+    "extract_isosurface": "clrecon.operators.isosurface",
+    "list_series": "clrecon.dicom",
+    "read_volume": "clrecon.dicom",
+}
+
+
+def devices() -> list[Device]:
+    """List every OpenCL device of the machine.
+
+    Returns
+    -------
+    list of clrecon.opencl.Device
+        With ``index, name, platform, type, version, driver, memory_bytes``; empty where there is no driver.
+
+    Raises
+    ------
+    DeviceError
+        pyopencl cannot be imported.
+    """
+    from clrecon.opencl import list_devices
+
+    return list_devices()
+
+
+def device(name: str | int | None = None) -> Device:
+    """Choose an OpenCL device.
+
+    Parameters
+    ----------
+    name : str or int, optional
+        Index, type or part of a name as ``clrecon devices`` shows them.  Without it: what CLRECON_DEVICE says,
+        else the best device of the machine.
+
+    Returns
+    -------
+    clrecon.opencl.Device
+
+    Raises
+    ------
+    DeviceError
+        No device, or none of that name; the message lists what is there.
+    """
+    from clrecon.opencl import choose_device
+
+    return choose_device(name)
+
+
+def __getattr__(name: str) -> Any:
+    if name == "__version__":
+        from clrecon.version import package_version
+
+        value: Any = package_version()
+    elif name in _HOMES:
+        value = getattr(import_module(_HOMES[name]), name)
+    else:
+        raise AttributeError(f"module 'clrecon' has no attribute {name!r}")
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

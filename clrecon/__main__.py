@@ -1,0 +1,5 @@
+"""``python -m clrecon``: the same as the console script."""
+
+from clrecon.cli.main import run
+
+run()

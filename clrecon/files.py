@@ -1,0 +1,249 @@
+"""Writing files so that a reader finds the whole new file or the whole old one, never a part.
+
+A file is written to a temporary one in the same folder (created exclusively, readable by the owner only, with a
+random name), flushed to the disk, checked, and only then renamed over the target.  Whatever goes wrong before the
+rename, `KeyboardInterrupt` included, removes the temporary file and leaves an older target as it was.  A process
+that is killed cannot clean up: what it left is removed by the next one that writes into the same folder.
+
+A target that is a symbolic link is followed: the file that it points to is replaced and the link stays.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import os
+import re
+import secrets
+import shutil
+import stat
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import BinaryIO
+
+from clrecon.errors import OutputError
+
+if sys.platform != "win32":
+    import fcntl
+
+__all__ = ["check_writable", "replace_file"]
+
+_TEMPORARY = re.compile(r"\.clrecon-[0-9a-f]{16}\.tmp")
+
+_ADVICE = {
+    errno.ENOSPC: "the disk is full: free some space or choose another folder",
+    errno.EDQUOT: "the disk quota is used up: free some space or choose another folder",
+    errno.EFBIG: "the file grew beyond the largest size that is allowed here",
+    errno.EROFS: "the file system is read-only: choose another folder",
+    errno.EACCES: "permission denied: choose another folder or change its permissions",
+    errno.EPERM: "the system does not permit it: choose another folder",
+    errno.ENAMETOOLONG: "the name is too long: choose a shorter one",
+    errno.ELOOP: "it is a symbolic link that leads back to itself",
+    errno.ENOENT: "the folder vanished while the file was written",
+}
+
+_KINDS: tuple[tuple[Callable[[int], bool], str], ...] = (
+    (stat.S_ISDIR, "a folder: name a file in it"),
+    (stat.S_ISFIFO, "a FIFO: only regular files are written"),
+    (stat.S_ISSOCK, "a socket: only regular files are written"),
+    (stat.S_ISBLK, "a block device: only regular files are written"),
+    (stat.S_ISCHR, "a character device: only regular files are written"),
+)
+
+
+def replace_file(
+    path: str | os.PathLike[str],
+    write: Callable[[BinaryIO], None],
+    verify: Callable[[Path], None] | None = None,
+    *,
+    expected_bytes: int = 0,
+) -> int:
+    """Write a file as a whole or not at all.
+
+    Parameters
+    ----------
+    path : str or path
+        The target.  A regular file of that name is replaced; its permissions are kept.  A new file gets the
+        permissions that the umask allows.
+    write : callable
+        Gets a binary stream, open for writing, and writes the contents.
+    verify : callable, optional
+        Gets the path of the finished temporary file and raises `OutputError` if it is not what it should be.
+    expected_bytes : int, optional
+        What the file is going to need; checked against the free space before anything is written.
+
+    Returns
+    -------
+    int
+        Size of the file in bytes.
+
+    Raises
+    ------
+    OutputError
+        The folder is missing or cannot be written to, the target is not a regular file or is write-protected, the
+        disk is full, or the check failed.  An older target is intact and no temporary file is left.
+    """
+    target = _checked_target(path)
+    with _system_errors(path):
+        _check_space(path, target.parent, expected_bytes)
+        _sweep(target.parent)
+        mode = _final_mode(target)
+        with _temporary_file(target.parent) as (temporary, stream):
+            write(stream)
+            stream.flush()
+            size = stream.tell()
+            os.fsync(stream.fileno())
+            found = os.fstat(stream.fileno()).st_size
+            if found != size:
+                raise OutputError(f"cannot write {_shown(path)}: {size} bytes written, {found} arrived on the disk")
+            if verify is not None:
+                verify(temporary)
+            if sys.platform == "win32":
+                stream.close()  # an open file cannot be renamed there
+            else:
+                os.fchmod(stream.fileno(), mode)
+            os.replace(temporary, target)
+    _sync_folder(target.parent)
+    return size
+
+
+def check_writable(path: str | os.PathLike[str], *, expected_bytes: int = 0) -> None:
+    """Raise `OutputError` if `replace_file` to this path is bound to fail: for a look before hours of work.
+
+    Creates an empty temporary file beside the target and removes it at once; the target is not touched.
+
+    Parameters
+    ----------
+    path : str or path
+    expected_bytes : int, optional
+        What the file is going to need, as far as it is known.
+    """
+    target = _checked_target(path)
+    with _system_errors(path):
+        _check_space(path, target.parent, expected_bytes)
+        with _temporary_file(target.parent):
+            pass
+
+
+def _shown(path: str | os.PathLike[str]) -> str:
+    """The path as it goes into a message: one line, nothing that steers a terminal."""
+    return "".join(c if c.isprintable() else repr(c)[1:-1] for c in os.fspath(path))
+
+
+@contextlib.contextmanager
+def _system_errors(path: str | os.PathLike[str]) -> Iterator[None]:
+    """Turn errors of the system into one line that names the target and what to do."""
+    try:
+        yield
+    except OSError as error:
+        reason = _ADVICE.get(error.errno or 0) or error.strerror or str(error) or type(error).__name__
+        raise OutputError(f"cannot write {_shown(path)}: {reason}") from error
+
+
+def _checked_target(path: str | os.PathLike[str]) -> Path:
+    """Resolve symbolic links and return the file to replace, after checking that it may be replaced."""
+    text = os.fspath(path)
+    if "\0" in text:
+        raise OutputError(f"cannot write {_shown(path)}: the name holds a null character")
+    with _system_errors(path):
+        if not text or text.endswith(tuple(filter(None, (os.sep, os.altsep)))):
+            raise OutputError(f"cannot write {_shown(path)!r}: this names a folder, name a file in it")
+        target = Path(os.path.realpath(text))
+        folder = target.parent
+        if not folder.exists():
+            raise OutputError(f"cannot write {_shown(path)}: the folder {_shown(folder)} does not exist, make it first")
+        if not folder.is_dir():
+            raise OutputError(f"cannot write {_shown(path)}: {_shown(folder)} is not a folder")
+        try:
+            mode = os.stat(target).st_mode
+        except FileNotFoundError:
+            return target
+        for is_kind, words in _KINDS:
+            if is_kind(mode):
+                raise OutputError(f"cannot write {_shown(path)}: it is {words}")
+        if not os.access(target, os.W_OK):
+            raise OutputError(f"cannot write {_shown(path)}: the file is there and write-protected")
+    return target
+
+
+def _check_space(path: str | os.PathLike[str], folder: Path, expected_bytes: int) -> None:
+    usage = shutil.disk_usage(folder)
+    # Some network file systems do not tell and report a size of 0.
+    if usage.total and expected_bytes > usage.free:
+        raise OutputError(
+            f"cannot write {_shown(path)}: it needs about {expected_bytes / 1e6:.1f} MB and "
+            f"{usage.free / 1e6:.1f} MB are free in {_shown(folder)}"
+        )
+
+
+def _final_mode(target: Path) -> int:
+    """Permissions for the finished file: those of the file that it replaces, else what the umask allows."""
+    try:
+        return stat.S_IMODE(os.stat(target).st_mode) & 0o777
+    except FileNotFoundError:
+        # The umask can only be read by setting it; a file that another thread makes meanwhile is the stricter.
+        umask = os.umask(0o077)
+        os.umask(umask)
+        return 0o666 & ~umask
+
+
+@contextlib.contextmanager
+def _temporary_file(folder: Path) -> Iterator[tuple[Path, BinaryIO]]:
+    """Create a file exclusively, for the owner only, and remove it in the end unless it was renamed."""
+    flags = os.O_RDWR | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0) | getattr(os, "O_NOFOLLOW", 0)
+    while True:
+        temporary = folder / f".clrecon-{secrets.token_hex(8)}.tmp"
+        try:
+            with os.fdopen(os.open(temporary, flags, 0o600), "wb") as stream:
+                if not _lock_new(stream):
+                    continue
+                yield temporary, stream
+                return
+        finally:
+            with contextlib.suppress(OSError):
+                temporary.unlink()
+
+
+def _lock_new(stream: BinaryIO) -> bool:
+    """Lock a file that was just created against `_sweep`; False when another process was about to sweep it."""
+    if sys.platform != "win32":
+        try:
+            fcntl.flock(stream.fileno(), fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return False
+        except OSError:
+            return True  # a file system without locks: nobody can lock, so nobody can sweep
+    return os.fstat(stream.fileno()).st_nlink > 0
+
+
+def _sweep(folder: Path) -> None:
+    """Remove temporary files of processes that are dead: those of our pattern that nobody holds a lock on."""
+    if sys.platform == "win32":
+        return
+    with os.scandir(folder) as entries:
+        names = [entry.name for entry in entries if _TEMPORARY.fullmatch(entry.name)]
+    for name in names:
+        temporary = folder / name
+        # Vanished meanwhile, someone else's, or locked by a living process: none of our business.
+        with contextlib.suppress(OSError):
+            descriptor = os.open(temporary, os.O_RDWR | os.O_NOFOLLOW | os.O_NONBLOCK)
+            try:
+                status = os.fstat(descriptor)
+                if stat.S_ISREG(status.st_mode) and status.st_uid == os.geteuid():
+                    fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                    temporary.unlink()
+            finally:
+                os.close(descriptor)
+
+
+def _sync_folder(folder: Path) -> None:
+    """Make the rename itself durable, where the system can; the file is whole either way."""
+    if sys.platform == "win32":
+        return
+    with contextlib.suppress(OSError):
+        descriptor = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)

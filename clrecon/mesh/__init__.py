@@ -1,0 +1,8 @@
+"""Surface meshes in patient millimetres: measure them, select their parts, write them to files."""
+
+from clrecon.mesh.components import select_components
+from clrecon.mesh.mesh import Mesh
+from clrecon.mesh.quality import measure_quality
+from clrecon.mesh.writers import FORMATS, check_format, write_mesh
+
+__all__ = ["FORMATS", "Mesh", "check_format", "measure_quality", "select_components", "write_mesh"]

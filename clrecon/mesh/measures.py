@@ -1,0 +1,59 @@
+"""Areas and volumes of triangles, in pieces that stay in the processor's cache."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["chunks", "cross_products", "local_origin"]
+
+CHUNK = 1 << 14
+"""Triangles a piece: 16384 of them take about 2 MB in float64; 32 times as many took 1.5 times as long."""
+
+
+def chunks(count: int, size: int = CHUNK) -> Iterator[slice]:
+    """Slices that cover ``range(count)`` in order."""
+    for start in range(0, count, size):
+        yield slice(start, min(start + size, count))
+
+
+def local_origin(vertices: NDArray[np.float32]) -> NDArray[np.float64]:
+    """Centre of the bounds, shape (3,), float64.
+
+    Patient coordinates can be far from zero; products of them would lose the digits that a volume needs.
+    """
+    if len(vertices) == 0:
+        return np.zeros(3)
+    return 0.5 * (vertices.min(axis=0).astype(np.float64) + vertices.max(axis=0))
+
+
+def cross_products(
+    vertices: NDArray[np.float32], triangles: NDArray[np.uint32], origin: NDArray[np.float64]
+) -> Iterator[tuple[slice, NDArray[np.float64], NDArray[np.float64]]]:
+    """Go through the triangles and give first corner and edge cross product, float64.
+
+    The cross product c of the edges from the first corner a is twice the area times the outward normal, and a . c is
+    six times the signed volume of the tetrahedron over the origin (divergence theorem).  Coordinates are float32, so
+    that differences and products are exact in float64: c is zero for triangles without area and only for those.
+
+    Yields
+    ------
+    where : slice
+        The triangles of this piece.
+    corner, cross : ndarray, shape (3, k), float64
+        One row each for x, y, z; `corner` is relative to `origin`, mm; `cross` is mm2.
+    """
+    columns = np.ascontiguousarray(vertices.T.astype(np.float64))
+    for where in chunks(len(triangles)):
+        a, b, c = triangles[where].T.astype(np.intp)
+        corner = columns[:, a]
+        p = columns[:, b] - corner
+        q = columns[:, c] - corner
+        cross = np.empty_like(p)
+        cross[0] = p[1] * q[2] - p[2] * q[1]
+        cross[1] = p[2] * q[0] - p[0] * q[2]
+        cross[2] = p[0] * q[1] - p[1] * q[0]
+        corner -= origin[:, None]
+        yield where, corner, cross

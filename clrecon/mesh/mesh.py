@@ -1,0 +1,207 @@
+"""`Mesh`: an indexed triangle surface in LPS mm."""
+
+from __future__ import annotations
+
+import os
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from clrecon.errors import UsageError
+from clrecon.geometry import frame_from_lps
+from clrecon.mesh.quality import measure_quality
+
+__all__ = ["Mesh"]
+
+_MOST_VERTICES = 2**32
+
+
+def _rows_of_three(values: ArrayLike, name: str) -> NDArray[Any]:
+    array = np.asarray(values)
+    if array.size == 0 and array.ndim < 2:
+        return array.reshape(0, 3)
+    if array.ndim != 2 or array.shape[1] != 3:
+        raise UsageError(f"{name} have shape (n, 3), these have {array.shape}")
+    return array
+
+
+def _as_float32(values: ArrayLike, name: str) -> NDArray[np.float32]:
+    array = _rows_of_three(values, name)
+    if array.dtype.kind not in "fiu":
+        raise UsageError(f"{name} are numbers, these are {array.dtype}")
+    return np.ascontiguousarray(array, dtype=np.float32)
+
+
+def _as_indices(values: ArrayLike) -> NDArray[np.uint32]:
+    array = _rows_of_three(values, "triangles")
+    if array.size and array.dtype.kind not in "iu":
+        raise UsageError(f"triangles hold indices of vertices (integers), these are {array.dtype}")
+    # Only other types can hold what uint32 cannot; those from a device are uint32 already and are not looked at.
+    if array.size and array.dtype != np.uint32:
+        low, high = int(array.min()), int(array.max())
+        if low < 0 or high >= _MOST_VERTICES:
+            raise UsageError(f"triangles hold indices from {low} to {high}: they must fit 32 bits without a sign")
+    return np.ascontiguousarray(array, dtype=np.uint32)
+
+
+class Mesh:
+    """An indexed triangle surface in the patient frame LPS, millimetres.
+
+    Parameters
+    ----------
+    vertices : array_like, shape (n, 3)
+        LPS mm; kept as float32, without a copy when they are C-contiguous float32.
+    triangles : array_like, shape (m, 3)
+        Indices of vertices, counter-clockwise when seen from outside; kept as uint32.
+    normals : array_like, shape (n, 3), optional
+        Unit vectors at the vertices that point outward, LPS; kept as float32.
+    report : dict, optional
+        What is known of the origin of this mesh, free of patient data: ``iso_value_hu``, ``affine_ijk_to_lps_mm``,
+        device, times.  The writers put the first two into the formats that have a place for them.
+
+    Raises
+    ------
+    UsageError
+        A shape or type that cannot be used, or as many normals as vertices are not given.  Whether every index
+        has a vertex is not looked at here but by `check`.
+    """
+
+    def __init__(
+        self,
+        vertices: ArrayLike,
+        triangles: ArrayLike,
+        normals: ArrayLike | None = None,
+        report: dict[str, Any] | None = None,
+    ):
+        self._vertices = _as_float32(vertices, "vertices")
+        self._triangles = _as_indices(triangles)
+        self._normals = None if normals is None else _as_float32(normals, "normals")
+        if len(self._vertices) > _MOST_VERTICES:
+            raise UsageError(f"a mesh has at most {_MOST_VERTICES} vertices, this one has {len(self._vertices)}")
+        if self._normals is not None and len(self._normals) != len(self._vertices):
+            raise UsageError(f"{len(self._normals)} normals for {len(self._vertices)} vertices: one a vertex is needed")
+        self.report: dict[str, Any] = {} if report is None else report
+
+    @property
+    def vertices(self) -> NDArray[np.float32]:
+        """Positions in LPS mm, shape (n, 3)."""
+        return self._vertices
+
+    @property
+    def triangles(self) -> NDArray[np.uint32]:
+        """Indices of vertices, shape (m, 3), counter-clockwise when seen from outside."""
+        return self._triangles
+
+    @property
+    def normals(self) -> NDArray[np.float32] | None:
+        """Outward unit vectors at the vertices, shape (n, 3), or None."""
+        return self._normals
+
+    @property
+    def vertex_count(self) -> int:
+        """Number of vertices, n."""
+        return len(self._vertices)
+
+    @property
+    def triangle_count(self) -> int:
+        """Number of triangles, m."""
+        return len(self._triangles)
+
+    def check(self) -> None:
+        """Look at every number: indices have a vertex, coordinates and normals are finite.
+
+        Raises
+        ------
+        UsageError
+            With the first number that is wrong.
+        """
+        if self.triangle_count and int(self._triangles.max()) >= self.vertex_count:
+            raise UsageError(
+                f"a triangle refers to vertex {int(self._triangles.max())}, the mesh has {self.vertex_count} vertices"
+            )
+        for name, values in (("vertex", self._vertices), ("normal", self._normals)):
+            if values is not None and not np.isfinite(values).all():
+                row = int(np.flatnonzero(~np.isfinite(values).all(axis=1))[0])
+                raise UsageError(f"{name} {row} is not finite: {values[row].tolist()}")
+
+    def in_space(self, space: str) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
+        """Return vertices and normals in another patient frame; the mesh itself is always LPS.
+
+        Parameters
+        ----------
+        space : {"lps", "ras"}
+            Going to RAS negates x and y: a half turn, so that the winding of the triangles stays.
+
+        Returns
+        -------
+        vertices : ndarray, shape (n, 3), float32, mm
+        normals : ndarray, shape (n, 3), float32, or None
+        """
+        signs = np.diag(frame_from_lps(space)).astype(np.float32)
+        if space == "lps":
+            return self._vertices, self._normals
+        # Adding 0 turns -0 into 0, which text formats would show.
+        vertices = self._vertices * signs + np.float32(0)
+        return vertices, None if self._normals is None else self._normals * signs + np.float32(0)
+
+    def quality(self) -> dict[str, Any]:
+        """Measure the mesh, see `clrecon.mesh.measure_quality` for the entries."""
+        return measure_quality(self._vertices, self._triangles)
+
+    def save(self, path: str | os.PathLike[str], space: str = "lps") -> int:
+        """Write the mesh to a file whose extension says the format.
+
+        STL (binary), PLY (binary), OBJ, GLB, VTP and 3MF.  The file is complete or not there at all, and an older
+        one of that name is replaced in one step.  It holds no patient data, date or path.
+
+        Parameters
+        ----------
+        path : str or path
+            ``.stl``, ``.ply``, ``.obj``, ``.glb``, ``.vtp`` or ``.3mf``, upper or lower case.
+        space : {"lps", "ras"}
+            Patient frame of the coordinates; the file says which it is.  Units are mm; GLB carries a node matrix
+            that takes them to the metres, Y up, of glTF.
+
+        Returns
+        -------
+        int
+            Size of the file in bytes.
+
+        Raises
+        ------
+        UsageError
+            Unknown extension or space, or the mesh fails `check`.
+        NoSurfaceError
+            The mesh has no triangle.
+        OutputError
+            The file cannot be written; an older one of that name is intact.
+        """
+        from clrecon.mesh.writers import write_mesh
+
+        return write_mesh(self, path, space)
+
+    def to_pyvista(self) -> Any:
+        """Return the mesh as ``pyvista.PolyData`` in LPS mm, sharing the memory of vertices and normals.
+
+        The normals are the active point normals, named ``Normals``; the field arrays ``SPACE`` and ``UNIT`` say
+        what the coordinates are.
+
+        Raises
+        ------
+        UsageError
+            The mesh fails `check`: VTK would crash on it.
+        """
+        import pyvista
+
+        from clrecon.mesh.vtk_bridge import make_polydata
+
+        self.check()
+        polydata = pyvista.wrap(make_polydata(self._vertices, self._triangles, self._normals))
+        polydata.field_data["SPACE"] = ["LPS"]
+        polydata.field_data["UNIT"] = ["mm"]
+        return polydata
+
+    def __repr__(self) -> str:
+        normals = "" if self._normals is None else ", with normals"
+        return f"Mesh({self.vertex_count} vertices, {self.triangle_count} triangles{normals}, LPS mm)"

@@ -1,0 +1,96 @@
+"""Is this surface fit to be printed, planned on and measured?  The figures behind the answer."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clrecon.errors import UsageError
+from clrecon.mesh.connectivity import count_duplicate_faces, count_split_vertices, find_edges, label_components
+from clrecon.mesh.measures import cross_products, local_origin
+
+__all__ = ["measure_quality"]
+
+
+def measure_quality(vertices: NDArray[np.float32], triangles: NDArray[np.uint32]) -> dict[str, Any]:
+    """Measure a triangle surface.
+
+    Parameters
+    ----------
+    vertices : ndarray, shape (n, 3), float32
+        Millimetres.
+    triangles : ndarray, shape (m, 3), uint32
+        Indices of vertices.
+
+    Returns
+    -------
+    dict
+        ``vertices``, ``triangles`` : int
+        ``closed`` : bool, there are triangles and every edge is in exactly two
+        ``manifold`` : bool, no edge in more than two faces, no two faces along an edge in one direction, the faces
+        around every vertex one fan, no face with a vertex twice
+        ``oriented`` : bool, no two faces run along an edge in the same direction
+        ``boundary_edges``, ``nonmanifold_edges`` : int, edges in one face, in more than two
+        ``nonmanifold_vertices`` : int, vertices whose faces fall apart into several fans
+        ``components`` : int, parts that share no vertex
+        ``euler_number`` : int, used vertices - edges + faces
+        ``genus`` : int or None, handles of all parts together; None if not closed and manifold
+        ``zero_area_faces``, ``duplicate_faces``, ``unused_vertices`` : int
+        ``area_mm2`` : float
+        ``volume_ml`` : float, enclosed volume, signed: cavities count negative, a surface turned inside out is
+        negative as a whole.  Means nothing unless ``closed``: it is then relative to the centre of the bounds
+        ``outward`` : bool, the volume is positive
+        ``bounds_mm`` : [[x, y, z], [x, y, z]], lowest and highest corner; None without vertices
+
+    Raises
+    ------
+    UsageError
+        A triangle refers to a vertex that is not there.
+    """
+    vertex_count, triangle_count = len(vertices), len(triangles)
+    if triangle_count and int(triangles.max()) >= vertex_count:
+        raise UsageError(f"a triangle refers to vertex {int(triangles.max())}, the mesh has {vertex_count} vertices")
+
+    edges = find_edges(triangles, vertex_count)
+    split_vertices = count_split_vertices(triangles, vertex_count, edges)
+    components, labels = label_components(triangles, vertex_count)
+    unused = int(np.count_nonzero(labels < 0))
+    loops = triangles.size - len(edges.half_edges)
+    euler_number = vertex_count - unused - edges.count + triangle_count
+    closed = triangle_count > 0 and edges.boundary == 0 and edges.nonmanifold == 0
+    manifold = triangle_count > 0 and edges.nonmanifold == 0 and edges.oriented and split_vertices == 0 and loops == 0
+    area, volume, zero_area = _area_and_volume(vertices, triangles)
+    return {
+        "vertices": vertex_count,
+        "triangles": triangle_count,
+        "closed": closed,
+        "manifold": manifold,
+        "oriented": edges.oriented,
+        "boundary_edges": edges.boundary,
+        "nonmanifold_edges": edges.nonmanifold,
+        "nonmanifold_vertices": split_vertices,
+        "components": components,
+        "euler_number": euler_number,
+        "genus": components - euler_number // 2 if closed and manifold else None,
+        "zero_area_faces": zero_area,
+        "duplicate_faces": count_duplicate_faces(triangles, vertex_count),
+        "unused_vertices": unused,
+        "area_mm2": area,
+        "volume_ml": volume / 1000.0,
+        "outward": volume > 0.0,
+        "bounds_mm": [vertices.min(axis=0).tolist(), vertices.max(axis=0).tolist()] if vertex_count else None,
+    }
+
+
+def _area_and_volume(vertices: NDArray[np.float32], triangles: NDArray[np.uint32]) -> tuple[float, float, int]:
+    """Area in mm2, signed volume in mm3, number of triangles without area."""
+    twice_area = six_volumes = 0.0
+    zero_area = 0
+    for _, corner, cross in cross_products(vertices, triangles, local_origin(vertices)):
+        squares = np.einsum("ij,ij->j", cross, cross)
+        twice_area += float(np.sqrt(squares).sum())
+        six_volumes += float(np.einsum("ij,ij->", corner, cross))
+        zero_area += int(np.count_nonzero(squares == 0.0))
+    return twice_area / 2.0, six_volumes / 6.0, zero_area

@@ -1,0 +1,105 @@
+"""Mesh files: one module a format, chosen by the extension of the file.
+
+A writer says how many bytes it is going to need, writes to a binary stream, and reads back what it wrote.  VTP is
+written by VTK; why the others are written here and not by a library stands in each module: headers, comments and
+matrices that say frame and unit, a full disk that must be noticed, time and memory.
+
+The same mesh gives the same bytes every time.  No file holds patient data, a date or a path.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, BinaryIO
+
+from clrecon.errors import NoSurfaceError, OutputError, UsageError
+from clrecon.files import replace_file
+from clrecon.mesh.writers import glb, obj, ply, stl, threemf, vtp
+from clrecon.mesh.writers.content import Content, describe_mesh
+
+if TYPE_CHECKING:
+    from clrecon.mesh.mesh import Mesh
+
+__all__ = ["FORMATS", "MeshFormat", "check_format", "write_mesh"]
+
+
+@dataclass(frozen=True)
+class MeshFormat:
+    """A file format.
+
+    Attributes
+    ----------
+    estimate : callable
+        About how many bytes the file is going to have; exact for STL, PLY and GLB, rather too few for the others.
+    write : callable
+        Writes the contents to a stream.
+    verify : callable
+        Reads the file back and raises `OutputError` unless sizes and counts are those of the contents.
+    most_bytes : int
+        Largest file that the format, or what reads it, can handle.
+    """
+
+    estimate: Callable[[Content], int]
+    write: Callable[[BinaryIO, Content], None]
+    verify: Callable[[Path, Content], None]
+    most_bytes: int
+
+
+# STL: the format could hold more, but many programs keep offsets in 32 bits.  GLB: its length field has 32 bits.
+_FOUR_GIB = 2**32 - 1
+_NO_LIMIT = 2**62
+
+FORMATS = {
+    ".stl": MeshFormat(stl.estimate, stl.write, stl.verify, _FOUR_GIB),
+    ".ply": MeshFormat(ply.estimate, ply.write, ply.verify, _NO_LIMIT),
+    ".obj": MeshFormat(obj.estimate, obj.write, obj.verify, _NO_LIMIT),
+    ".glb": MeshFormat(glb.estimate, glb.write, glb.verify, _FOUR_GIB),
+    ".vtp": MeshFormat(vtp.estimate, vtp.write, vtp.verify, _NO_LIMIT),
+    ".3mf": MeshFormat(threemf.estimate, threemf.write, threemf.verify, _NO_LIMIT),
+}
+
+
+def check_format(path: str | os.PathLike[str]) -> str:
+    """Return the extension of a mesh file in lower case, such as ``.stl``.
+
+    Raises
+    ------
+    UsageError
+        The extension is missing or stands for no format that is written.
+    """
+    extension = os.path.splitext(os.fspath(path))[1].lower()
+    if extension not in FORMATS:
+        found = f"the extension {extension!r}" if extension else "no extension"
+        raise UsageError(f"the name of the mesh file has {found}: use one of {', '.join(FORMATS)}")
+    return extension
+
+
+def write_mesh(mesh: Mesh, path: str | os.PathLike[str], space: str = "lps") -> int:
+    """Write a mesh to a file; what `Mesh.save` does.
+
+    Returns
+    -------
+    int
+        Size of the file in bytes.
+    """
+    extension = check_format(path)
+    chosen = FORMATS[extension]
+    mesh.check()
+    content = describe_mesh(mesh, space)
+    if mesh.triangle_count == 0:
+        raise NoSurfaceError(f"the surface is empty: no {extension[1:].upper()} file is written")
+    expected_bytes = chosen.estimate(content)
+    if expected_bytes > chosen.most_bytes:
+        raise OutputError(
+            f"{mesh.triangle_count} triangles make a {extension[1:].upper()} file of about "
+            f"{expected_bytes / 2**30:.1f} GiB, at most 4 GiB can be read: write PLY or VTP"
+        )
+    return replace_file(
+        path,
+        lambda stream: chosen.write(stream, content),
+        lambda temporary: chosen.verify(temporary, content),
+        expected_bytes=expected_bytes,
+    )

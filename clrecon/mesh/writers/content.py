@@ -1,0 +1,77 @@
+"""What a writer gets: a mesh in the frame in which it is written, and what may be said about it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clrecon.errors import OutputError
+from clrecon.geometry import frame_from_lps
+
+if TYPE_CHECKING:
+    from clrecon.mesh.mesh import Mesh
+
+__all__ = ["Content", "describe_mesh", "refuse_file"]
+
+
+@dataclass(frozen=True)
+class Content:
+    """A mesh as it goes into a file.
+
+    Attributes
+    ----------
+    vertices : ndarray, shape (n, 3), float32
+        mm in `space`.
+    triangles : ndarray, shape (m, 3), uint32
+    normals : ndarray, shape (n, 3), float32, or None
+    space : str
+        ``LPS`` or ``RAS``.
+    to_lps : ndarray, shape (3, 3), float64
+        Rotation from `space` to LPS.
+    iso_value_hu : float or None
+    affine : ndarray, shape (4, 4), float64, or None
+        Index (i, j, k) of the volume to LPS mm, whatever `space` is.
+    """
+
+    vertices: NDArray[np.float32]
+    triangles: NDArray[np.uint32]
+    normals: NDArray[np.float32] | None
+    space: str
+    to_lps: NDArray[np.float64]
+    iso_value_hu: float | None
+    affine: NDArray[np.float64] | None
+
+    @property
+    def remarks(self) -> list[str]:
+        """The facts for formats that have comments: space, unit and, when known, the iso value."""
+        remarks = [f"SPACE={self.space}", "UNIT=mm"]
+        if self.iso_value_hu is not None:
+            remarks.append(f"ISO_VALUE_HU={self.iso_value_hu:.9g}")
+        return remarks
+
+
+def describe_mesh(mesh: Mesh, space: str) -> Content:
+    """Turn a mesh into `space` and pick from its report what goes into files: nothing else ever does."""
+    vertices, normals = mesh.in_space(space)
+    iso_value = mesh.report.get("iso_value_hu")
+    affine = mesh.report.get("affine_ijk_to_lps_mm")
+    return Content(
+        vertices=vertices,
+        triangles=mesh.triangles,
+        normals=normals,
+        space=space.upper(),
+        to_lps=frame_from_lps(space).T,
+        iso_value_hu=None if iso_value is None else float(iso_value),
+        affine=None if affine is None else np.array(affine, dtype=np.float64).reshape(4, 4),
+    )
+
+
+def refuse_file(words: str, found: object, expected: object) -> OutputError:
+    """The error for a file that does not read back as it was written."""
+    return OutputError(
+        f"the file did not arrive on the disk as it was written: {found} {words}, {expected} expected; "
+        "an older file is intact, check the disk and try again"
+    )

@@ -1,0 +1,74 @@
+"""Binary little-endian PLY with the frame, the unit and the iso value in comments.
+
+Own code because vtkPLYWriter reports success on a full disk, and trimesh has no comments.
+Indices are declared ``int`` and not ``uint``, which is what every reader knows: at most 2**31 vertices.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+
+from clrecon.errors import OutputError
+from clrecon.mesh.measures import chunks
+from clrecon.mesh.writers.content import Content, refuse_file
+
+__all__ = ["estimate", "verify", "write"]
+
+_FACE = np.dtype([("count", "u1"), ("corners", "<i4", (3,))])
+_CHUNK = 1 << 14
+
+
+def _header(content: Content) -> bytes:
+    names = ["x", "y", "z"] if content.normals is None else ["x", "y", "z", "nx", "ny", "nz"]
+    lines = [
+        "ply",
+        "format binary_little_endian 1.0",
+        *(f"comment {remark}" for remark in content.remarks),
+        f"element vertex {len(content.vertices)}",
+        *(f"property float {name}" for name in names),
+        f"element face {len(content.triangles)}",
+        "property list uchar int vertex_indices",
+        "end_header",
+    ]
+    return ("\n".join(lines) + "\n").encode("ascii")
+
+
+def estimate(content: Content) -> int:
+    """Size of the file in bytes, exactly."""
+    row = 12 if content.normals is None else 24
+    return len(_header(content)) + row * len(content.vertices) + _FACE.itemsize * len(content.triangles)
+
+
+def write(stream: BinaryIO, content: Content) -> None:
+    """Write vertices (with normals, if there are any) and faces."""
+    if len(content.vertices) > 2**31:
+        raise OutputError(f"{len(content.vertices)} vertices are too many for a PLY file, at most {2**31}")
+    stream.write(_header(content))
+    columns = 3 if content.normals is None else 6
+    rows = np.empty((_CHUNK, columns), dtype="<f4")
+    for where in chunks(len(content.vertices), _CHUNK):
+        piece = rows[: where.stop - where.start]
+        piece[:, :3] = content.vertices[where]
+        if content.normals is not None:
+            piece[:, 3:] = content.normals[where]
+        stream.write(piece.data)
+    faces = np.empty(_CHUNK, dtype=_FACE)
+    faces["count"] = 3
+    for where in chunks(len(content.triangles), _CHUNK):
+        part = faces[: where.stop - where.start]
+        part["corners"] = content.triangles[where]
+        stream.write(part.view(np.uint8).data)
+
+
+def verify(path: Path, content: Content) -> None:
+    """Check header (with its counts) and size of a finished file."""
+    expected = _header(content)
+    with path.open("rb") as stream:
+        found = stream.read(len(expected))
+    if found != expected:
+        raise refuse_file("in the header", repr(found), repr(expected))
+    if path.stat().st_size != estimate(content):
+        raise refuse_file("bytes", path.stat().st_size, estimate(content))

@@ -1,0 +1,87 @@
+"""VTP, the XML PolyData of VTK, written by VTK: raw binary data after the XML, with 64-bit headers.
+
+VTK writes to a string and the string to our stream: left to itself it leaves a truncated file on a full disk.  The
+field arrays ``SPACE``, ``UNIT``, ``ISO_VALUE_HU`` and ``AFFINE_IJK_TO_LPS_MM`` (16 numbers, row by row) say what
+the coordinates are; 3D Slicer reads ``SPACE``.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any, BinaryIO
+
+from clrecon.errors import OutputError
+from clrecon.mesh.vtk_bridge import make_polydata
+from clrecon.mesh.writers.content import Content, refuse_file
+
+__all__ = ["estimate", "verify", "write"]
+
+_END = b"</VTKFile>"
+
+
+def estimate(content: Content) -> int:
+    """Size of the data in the file in bytes, without the XML: three indices and an offset a triangle."""
+    row = 12 if content.normals is None else 24
+    return row * len(content.vertices) + 16 * len(content.triangles)
+
+
+def write(stream: BinaryIO, content: Content) -> None:
+    """Write the surface with its field arrays."""
+    from vtkmodules.vtkIOXML import vtkXMLPolyDataWriter
+
+    polydata = make_polydata(content.vertices, content.triangles, content.normals)
+    for array in _field_arrays(content):
+        polydata.GetFieldData().AddArray(array)
+    writer = vtkXMLPolyDataWriter()
+    writer.SetInputData(polydata)
+    writer.SetDataModeToAppended()
+    writer.EncodeAppendedDataOff()
+    writer.SetCompressorTypeToNone()
+    writer.SetHeaderTypeToUInt64()
+    writer.SetByteOrderToLittleEndian()
+    writer.WriteToOutputStringOn()
+    if writer.Write() != 1:
+        raise OutputError(f"VTK could not write the surface, its error code is {writer.GetErrorCode()}")
+    text = writer.GetOutputString()
+    # VTK's Python gives str where the bytes happen to be UTF-8, bytes where they are not.
+    stream.write(text.encode("utf-8") if isinstance(text, str) else text)
+
+
+def _field_arrays(content: Content) -> list[Any]:
+    from vtkmodules.vtkCommonCore import vtkDoubleArray, vtkStringArray
+
+    arrays: list[Any] = []
+    for name, text in (("SPACE", content.space), ("UNIT", "mm")):
+        strings = vtkStringArray()
+        strings.SetName(name)
+        strings.InsertNextValue(text)
+        arrays.append(strings)
+    numbers: list[tuple[str, list[float]]] = []
+    if content.iso_value_hu is not None:
+        numbers.append(("ISO_VALUE_HU", [content.iso_value_hu]))
+    if content.affine is not None:
+        numbers.append(("AFFINE_IJK_TO_LPS_MM", content.affine.ravel().tolist()))
+    for name, values in numbers:
+        doubles = vtkDoubleArray()
+        doubles.SetName(name)
+        doubles.SetNumberOfComponents(len(values))
+        doubles.InsertNextTuple(values)
+        arrays.append(doubles)
+    return arrays
+
+
+def verify(path: Path, content: Content) -> None:
+    """Check the counts in the XML and the end of a finished file."""
+    with path.open("rb") as stream:
+        head = stream.read(8192).decode("latin-1")
+        stream.seek(max(path.stat().st_size - 64, 0))
+        end = stream.read()
+    for name, count in (("NumberOfPoints", len(content.vertices)), ("NumberOfPolys", len(content.triangles))):
+        match = re.search(rf'{name}="(\d+)"', head)
+        if match is None or int(match[1]) != count:
+            raise refuse_file(name, None if match is None else match[1], count)
+    if not end.rstrip().endswith(_END):
+        raise refuse_file("at the end", repr(end[-16:]), _END.decode())
+    if path.stat().st_size < estimate(content):
+        raise refuse_file("bytes", path.stat().st_size, f"more than {estimate(content)}")

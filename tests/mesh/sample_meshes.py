@@ -1,0 +1,101 @@
+"""Small meshes whose figures are known: vertices (n, 3) float64 and triangles (m, 3), outward."""
+
+from __future__ import annotations
+
+import numpy as np
+
+Arrays = tuple[np.ndarray, np.ndarray]
+
+CUBE_FACES = ((0, 2, 3, 1), (4, 5, 7, 6), (0, 1, 5, 4), (2, 6, 7, 3), (0, 4, 6, 2), (1, 3, 7, 5))
+"""Corner number: bits 0, 1, 2 are x, y, z; each face is counter-clockwise from outside."""
+
+
+def box(low=(0.0, 0.0, 0.0), size=(1.0, 1.0, 1.0)) -> Arrays:
+    corners = np.array([[c & 1, c >> 1 & 1, c >> 2] for c in range(8)], dtype=np.float64)
+    triangles = [[a, b, c] for a, b, c, d in CUBE_FACES] + [[a, c, d] for a, b, c, d in CUBE_FACES]
+    return np.array(low) + corners * np.array(size), np.array(triangles)
+
+
+def torus(rings: int = 15, sides: int = 8, major: float = 20.0, minor: float = 6.0) -> Arrays:
+    u, v = np.meshgrid(np.arange(rings), np.arange(sides), indexing="ij")
+    a, b = 2 * np.pi * u.ravel() / rings, 2 * np.pi * v.ravel() / sides
+    radius = major + minor * np.cos(b)
+    vertices = np.column_stack([radius * np.cos(a), radius * np.sin(a), minor * np.sin(b)])
+
+    def number(i, j):
+        return (i % rings * sides + j % sides).ravel()
+
+    one, two, three, four = number(u, v), number(u + 1, v), number(u + 1, v + 1), number(u, v + 1)
+    return vertices, np.concatenate([np.column_stack([one, two, three]), np.column_stack([one, three, four])])
+
+
+def torus_volume_ml(rings: int = 15, sides: int = 8, major: float = 20.0, minor: float = 6.0) -> float:
+    """Volume within the triangles of `torus`, from its cross sections: independent of the divergence theorem.
+
+    Between two neighbouring half planes lies the ruled solid whose quads are cut along one diagonal; summed over the
+    tetrahedra from the axis it is the sum over quads of determinants, here taken with numpy's general routine.
+    """
+    vertices, triangles = torus(rings, sides, major, minor)
+    return float(np.linalg.det(vertices[triangles]).sum() / 6000.0)
+
+
+def moebius(pieces: int = 11) -> Arrays:
+    angle = np.arange(pieces) * 2 * np.pi / pieces
+    vertices = [
+        [(10 + side * np.cos(a / 2)) * np.cos(a), (10 + side * np.cos(a / 2)) * np.sin(a), side * np.sin(a / 2)]
+        for a in angle
+        for side in (-2.0, 2.0)
+    ]
+    triangles = []
+    for piece in range(pieces):
+        a, b = 2 * piece, 2 * piece + 1
+        c, d = (2 * piece + 2, 2 * piece + 3) if piece < pieces - 1 else (1, 0)  # joined with a half turn
+        triangles += [[a, c, b], [b, c, d]]
+    return np.array(vertices), np.array(triangles)
+
+
+def join(*meshes: Arrays) -> Arrays:
+    """Several meshes as one, vertices not shared."""
+    vertices, triangles, count = [], [], 0
+    for points, faces in meshes:
+        vertices.append(points)
+        triangles.append(faces + count)
+        count += len(points)
+    return np.concatenate(vertices), np.concatenate(triangles)
+
+
+def weld(mesh: Arrays) -> Arrays:
+    """Vertices at one place become one."""
+    vertices, number = np.unique(mesh[0], axis=0, return_inverse=True)
+    return vertices, number.reshape(-1)[mesh[1]]
+
+
+def sphere(centre=(0.0, 0.0, 0.0), radius: float = 10.0, rounds: int = 2) -> Arrays:
+    """Octahedron, each triangle cut in four `rounds` times, corners pushed out to the sphere."""
+    vertices = np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]], dtype=np.float64)
+    upper = np.array([[0, 2, 4], [2, 1, 4], [1, 3, 4], [3, 0, 4]])
+    lower = np.array([[2, 0, 5], [1, 2, 5], [3, 1, 5], [0, 3, 5]])
+    triangles = np.concatenate([upper, lower])
+    for _ in range(rounds):
+        a, b, c = vertices[triangles].transpose(1, 0, 2)
+        ab, bc, ca = a + b, b + c, c + a
+        ab, bc, ca = (edge / np.linalg.norm(edge, axis=1, keepdims=True) for edge in (ab, bc, ca))
+        soup = np.stack([[a, ab, ca], [ab, b, bc], [ca, bc, c], [ab, bc, ca]]).transpose(0, 2, 1, 3).reshape(-1, 3)
+        vertices, number = np.unique(soup.round(12), axis=0, return_inverse=True)
+        vertices /= np.linalg.norm(vertices, axis=1, keepdims=True)
+        triangles = number.reshape(-1, 3)
+    return np.array(centre) + radius * vertices, triangles
+
+
+def ordered_soup(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+    """Triangles as corner coordinates, free of the order of vertices and triangles; the winding stays.
+
+    Every triangle begins with its smallest corner; shape (m, 9).
+    """
+    corners = np.asarray(vertices)[np.asarray(triangles)]
+    turned = []
+    for triangle in corners:
+        first = min(range(3), key=lambda corner: tuple(triangle[corner]))
+        turned.append(np.roll(triangle, -first, axis=0).ravel())
+    soup = np.array(turned).reshape(-1, 9)
+    return soup[np.lexsort(soup.T[::-1])]

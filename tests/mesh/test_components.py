@@ -1,0 +1,122 @@
+"""Choosing components by area rank and by enclosed volume."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import sample_meshes as samples
+
+from clrecon.errors import NoSurfaceError, UsageError
+from clrecon.mesh import Mesh, select_components
+
+pytestmark = pytest.mark.unit
+
+SMALL, LARGE, MIDDLE = 0, 1, 2
+
+
+def three_boxes() -> Mesh:
+    """1 mm3, 60 mm3 and 8 mm3, their vertices and faces interleaved; one vertex is not used."""
+    vertices, triangles = samples.join(
+        samples.box((500, 0, 0)), samples.box((-3, 2, 1), (3, 4, 5)), samples.box((9, 9, 9), (2, 2, 2))
+    )
+    order = np.arange(24).reshape(3, 8).T.ravel()  # new place -> old number
+    place = np.empty(24, dtype=int)
+    place[order] = np.arange(24)
+    faces = place[triangles].reshape(3, 12, 3).transpose(1, 0, 2).reshape(-1, 3)
+    shuffled = np.concatenate([vertices[order], [[0.0, 0.0, 0.0]]])
+    normals = np.arange(75, dtype=np.float32).reshape(25, 3)
+    return Mesh(shuffled, faces, normals, {"iso_value_hu": 250.0})
+
+
+def test_keep_largest_by_area():
+    mesh = three_boxes()
+    kept = select_components(mesh, keep_largest=1)
+    assert (kept.vertex_count, kept.triangle_count) == (8, 12)
+    rows = 3 * np.arange(8) + LARGE
+    np.testing.assert_array_equal(kept.vertices, mesh.vertices[rows])
+    np.testing.assert_array_equal(kept.normals, mesh.normals[rows])
+    np.testing.assert_array_equal(kept.triangles, (mesh.triangles[LARGE::3] - LARGE) // 3)
+    assert kept.report == {"iso_value_hu": 250.0, "components_found": 3, "components_kept": 1}
+    assert mesh.report == {"iso_value_hu": 250.0}
+    assert kept.quality()["volume_ml"] == pytest.approx(0.060)
+    assert kept.triangles.dtype == np.uint32
+
+
+def test_keep_two():
+    kept = select_components(three_boxes(), keep_largest=2)
+    assert kept.quality()["volume_ml"] == pytest.approx(0.068)
+    assert kept.report["components_kept"] == 2
+
+
+@pytest.mark.parametrize(("least", "volume"), [(0.0079, 0.068), (0.0081, 0.060), (0.0, 0.069)])
+def test_least_volume(least, volume):
+    kept = select_components(three_boxes(), min_volume_ml=least)
+    assert kept.quality()["volume_ml"] == pytest.approx(volume)
+
+
+def test_both_limits():
+    kept = select_components(three_boxes(), keep_largest=2, min_volume_ml=0.01)
+    assert kept.report["components_kept"] == 1
+    assert kept.quality()["volume_ml"] == pytest.approx(0.060)
+
+
+def test_nothing_to_drop_gives_the_mesh_itself():
+    mesh = three_boxes()
+    assert select_components(mesh, keep_largest=3) is mesh
+    assert mesh.report["components_found"] == mesh.report["components_kept"] == 3
+    assert select_components(mesh) is mesh
+
+
+def test_rank_is_by_area_not_volume():
+    flat = samples.box((0, 0, 0), (40, 40, 0.01))  # 3201.6 mm2, 16 mm3
+    cube = samples.box((100, 0, 0), (10, 10, 10))  # 600 mm2, 1000 mm3
+    kept = select_components(Mesh(*samples.join(cube, flat)), keep_largest=1)
+    assert kept.quality()["area_mm2"] == pytest.approx(3201.6, rel=1e-6)
+
+
+def test_equal_areas_keep_the_first():
+    kept = select_components(Mesh(*samples.join(samples.box((7, 0, 0)), samples.box())), keep_largest=1)
+    assert kept.vertices[:, 0].min() == 7.0
+
+
+def test_cavity_counts_without_its_sign():
+    vertices, triangles = samples.join(samples.box((0, 0, 0), (9, 9, 9)), samples.box((3, 3, 3), (3, 3, 3)))
+    triangles[12:] = triangles[12:, ::-1]
+    mesh = Mesh(vertices, triangles)
+    assert select_components(mesh, min_volume_ml=0.026) is mesh
+    filled = select_components(mesh, min_volume_ml=0.028)
+    assert filled.quality()["volume_ml"] == pytest.approx(0.729)
+
+
+def test_volume_of_an_open_component_does_not_depend_on_its_place():
+    vertices, triangles = samples.box((5000, -3000, 800), (10, 10, 10))
+    opened = (vertices, np.delete(triangles, 4, axis=0))
+    mesh = Mesh(*samples.join(opened, samples.box((0, 0, 0), (30, 30, 30))))
+    with pytest.raises(NoSurfaceError, match="largest has 27 ml"):
+        select_components(mesh, min_volume_ml=27.1)
+    # 1/12 of the faces is missing: the pyramid over it is not counted.
+    assert select_components(mesh, min_volume_ml=0.8).report["components_kept"] == 2
+    assert select_components(mesh, min_volume_ml=1.0).report["components_kept"] == 1
+
+
+def test_nothing_left():
+    with pytest.raises(NoSurfaceError, match="none of the 3 components encloses 1 ml: the largest has 0.06 ml"):
+        select_components(three_boxes(), min_volume_ml=1.0)
+    with pytest.raises(NoSurfaceError, match="surface is empty"):
+        select_components(Mesh([], []), keep_largest=1)
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        {"keep_largest": 0},
+        {"keep_largest": -2},
+        {"keep_largest": 1.5},
+        {"min_volume_ml": -1.0},
+        {"min_volume_ml": float("nan")},
+        {"min_volume_ml": float("inf")},
+    ],
+)
+def test_wrong_limits(arguments):
+    with pytest.raises(UsageError, match="keep_largest is a whole number|min_volume_ml is a volume"):
+        select_components(three_boxes(), **arguments)

@@ -1,0 +1,93 @@
+"""The Mesh itself: what it takes, keeps and refuses, and how VTK sees it."""
+
+from __future__ import annotations
+
+import gc
+
+import numpy as np
+import pytest
+import sample_meshes as samples
+
+from clrecon.errors import UsageError
+from clrecon.mesh import Mesh
+
+pytestmark = pytest.mark.unit
+
+
+def test_arrays_of_the_right_type_are_not_copied():
+    vertices = np.zeros((3, 3), np.float32)
+    triangles = np.array([[0, 1, 2]], np.uint32)
+    mesh = Mesh(vertices, triangles, vertices)
+    assert mesh.vertices is vertices and mesh.triangles is triangles and mesh.normals is vertices
+    assert (mesh.vertex_count, mesh.triangle_count, mesh.report) == (3, 1, {})
+
+
+def test_other_types_are_converted():
+    mesh = Mesh([[0, 0, 0], [1, 0, 0], [0, 2.5, 0]], np.array([[0, 1, 2]], np.int64)[:, ::-1])
+    assert (mesh.vertices.dtype, mesh.triangles.dtype) == (np.float32, np.uint32)
+    assert mesh.vertices[2, 1] == 2.5
+    assert mesh.triangles.tolist() == [[2, 1, 0]]
+    assert mesh.triangles.flags.c_contiguous
+    assert mesh.normals is None
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (([[0, 0]], []), r"vertices have shape \(n, 3\), these have \(1, 2\)"),
+        (([[0, 0, 0]], [[0, 0, 0, 0]]), r"triangles have shape \(n, 3\)"),
+        (([[0, 0, 0]], [[0.0, 0.0, 0.0]]), "integers"),
+        (([[0, 0, 0]], [[0, 0, -1]]), "from -1 to 0"),
+        (([[0, 0, 0]], [[0, 0, 2**32]]), "must fit 32 bits"),
+        (([["a", "b", "c"]], []), "vertices are numbers"),
+        (([[0, 0, 0]], [], [[0, 0, 1], [0, 0, 1]]), "2 normals for 1 vertices"),
+    ],
+)
+def test_wrong_arrays_are_refused(arguments, words):
+    with pytest.raises(UsageError, match=words):
+        Mesh(*arguments)
+
+
+def test_check_finds_what_the_constructor_does_not_look_at():
+    corners = np.eye(3)
+    with pytest.raises(UsageError, match="refers to vertex 7, the mesh has 3 vertices"):
+        Mesh(corners, [[0, 1, 7]]).check()
+    corners[1, 2] = np.nan
+    with pytest.raises(UsageError, match="vertex 1 is not finite"):
+        Mesh(corners, [[0, 1, 2]]).check()
+    with pytest.raises(UsageError, match="normal 1 is not finite"):
+        Mesh(np.eye(3), [[0, 1, 2]], corners).to_pyvista()
+
+
+def test_ras_is_a_half_turn():
+    vertices, triangles = samples.sphere((3, 0, -7))
+    mesh = Mesh(vertices, triangles, (vertices - (3, 0, -7)) / 10)
+    turned, normals = mesh.in_space("ras")
+    np.testing.assert_array_equal(turned, mesh.vertices * [-1, -1, 1])
+    np.testing.assert_array_equal(normals, mesh.normals * [-1, -1, 1])
+    assert not np.signbit(turned[turned == 0]).any()
+    assert Mesh(turned, triangles).quality()["volume_ml"] == pytest.approx(mesh.quality()["volume_ml"])
+    assert mesh.in_space("lps")[0] is mesh.vertices
+    with pytest.raises(UsageError, match="unknown space 'RAI'"):
+        mesh.in_space("RAI")
+
+
+def test_pyvista_sees_the_same_mesh_without_a_copy():
+    vertices, triangles = samples.torus()
+    mesh = Mesh(vertices, triangles, np.tile(np.float32([0, 0, 1]), (len(vertices), 1)))
+    polydata = mesh.to_pyvista()
+    assert np.shares_memory(np.asarray(polydata.points), mesh.vertices)
+    assert np.shares_memory(np.asarray(polydata.point_data["Normals"]), mesh.normals)
+    np.testing.assert_array_equal(polydata.regular_faces, triangles)
+    assert polydata.is_manifold and polydata.n_open_edges == 0
+    assert polydata.volume / 1000 == pytest.approx(mesh.quality()["volume_ml"], rel=1e-5)
+    assert polydata.point_data.active_normals_name == "Normals"
+    assert (list(polydata.field_data["SPACE"]), list(polydata.field_data["UNIT"])) == (["LPS"], ["mm"])
+    expected = mesh.vertices.copy()
+    del mesh, vertices
+    gc.collect()
+    np.testing.assert_array_equal(polydata.points, expected)
+
+
+def test_what_a_mesh_says_of_itself():
+    assert repr(Mesh(*samples.box())) == "Mesh(8 vertices, 12 triangles, LPS mm)"

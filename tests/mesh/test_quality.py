@@ -1,0 +1,197 @@
+"""Quality figures on meshes whose figures are known, each defect by itself."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import sample_meshes as samples
+import tolerances
+
+from clrecon.errors import UsageError
+from clrecon.mesh import Mesh, measure_quality
+
+pytestmark = pytest.mark.unit
+
+FAR = np.array([-1250.5, 3071.25, -846.25])
+
+
+def measure(arrays) -> dict:
+    return Mesh(*arrays).quality()
+
+
+def figures(quality: dict, *names: str) -> tuple:
+    return tuple(quality[name] for name in names)
+
+
+def test_box_far_from_the_origin():
+    quality = measure(samples.box(FAR, (2.0, 3.0, 5.5)))
+    assert quality == {
+        "vertices": 8,
+        "triangles": 12,
+        "closed": True,
+        "manifold": True,
+        "oriented": True,
+        "boundary_edges": 0,
+        "nonmanifold_edges": 0,
+        "nonmanifold_vertices": 0,
+        "components": 1,
+        "euler_number": 2,
+        "genus": 0,
+        "zero_area_faces": 0,
+        "duplicate_faces": 0,
+        "unused_vertices": 0,
+        "area_mm2": pytest.approx(67.0, rel=tolerances.MESH_VOLUME),
+        "volume_ml": pytest.approx(0.033, rel=tolerances.MESH_VOLUME),
+        "outward": True,
+        "bounds_mm": [FAR.tolist(), (FAR + (2.0, 3.0, 5.5)).tolist()],
+    }
+
+
+def test_torus_has_one_handle():
+    quality = measure(samples.torus())
+    assert figures(quality, "closed", "manifold", "euler_number", "genus", "components") == (True, True, 0, 1, 1)
+    assert quality["volume_ml"] == pytest.approx(samples.torus_volume_ml(), rel=tolerances.MESH_VOLUME)
+    # The triangles lie inside the torus (major 20, minor 6), less than a fifth of it is lost.
+    exact = 2 * np.pi**2 * 20.0 * 6.0**2 / 1000.0
+    assert 0.8 * exact < quality["volume_ml"] < exact
+
+
+def test_two_spheres_and_a_cavity():
+    vertices, triangles = samples.join(
+        samples.sphere((-30, 5, 2), 10), samples.sphere((40, 0, 0), 7), samples.sphere((-30, 5, 2), 4)
+    )
+    triangles[-128:] = triangles[-128:, ::-1]  # the wall of the cavity looks inward
+    quality = measure((vertices, triangles))
+    assert figures(quality, "closed", "manifold", "components", "euler_number", "genus") == (True, True, 3, 6, 0)
+    one = measure(samples.sphere(radius=1))["volume_ml"]
+    assert quality["volume_ml"] == pytest.approx(one * (10**3 + 7**3 - 4**3), rel=tolerances.MESH_VOLUME)
+    assert quality["area_mm2"] == pytest.approx(measure(samples.sphere(radius=1))["area_mm2"] * (100 + 49 + 16))
+
+
+def test_inside_out():
+    vertices, triangles = samples.box(FAR)
+    quality = measure((vertices, triangles[:, ::-1]))
+    assert figures(quality, "closed", "manifold", "oriented", "outward") == (True, True, True, False)
+    assert quality["volume_ml"] == pytest.approx(-0.001)
+
+
+def test_hole():
+    vertices, triangles = samples.sphere()
+    quality = measure((vertices, np.delete(triangles, 17, axis=0)))
+    assert figures(quality, "closed", "manifold", "boundary_edges", "euler_number", "genus") == (
+        False,
+        True,
+        3,
+        1,
+        None,
+    )
+
+
+def test_volume_of_an_open_surface_does_not_depend_on_its_place():
+    vertices, triangles = samples.box((0, 0, 0), (2, 2, 2))
+    opened = np.delete(triangles, 4, axis=0)
+    here, there = measure((vertices, opened)), measure((vertices + (4096, -8192, 512), opened))
+    assert there["volume_ml"] == here["volume_ml"] == pytest.approx(0.008 * 11 / 12)
+
+
+def test_flipped_face():
+    vertices, triangles = samples.torus()
+    triangles[40] = triangles[40, ::-1]
+    quality = measure((vertices, triangles))
+    assert figures(quality, "closed", "oriented", "manifold", "genus") == (True, False, False, None)
+    assert figures(quality, "nonmanifold_edges", "nonmanifold_vertices", "boundary_edges") == (0, 0, 0)
+
+
+def test_moebius_strip_cannot_be_oriented():
+    quality = measure(samples.moebius())
+    assert figures(quality, "oriented", "manifold", "closed", "euler_number") == (False, False, False, 0)
+    assert figures(quality, "nonmanifold_edges", "nonmanifold_vertices", "boundary_edges") == (0, 0, 22)
+
+
+def test_boxes_that_touch_in_a_corner():
+    quality = measure(samples.weld(samples.join(samples.box(), samples.box((1, 1, 1)))))
+    assert figures(quality, "closed", "oriented", "nonmanifold_edges", "nonmanifold_vertices") == (True, True, 0, 1)
+    assert figures(quality, "manifold", "components", "genus", "vertices") == (False, 1, None, 15)
+
+
+def test_open_fans_that_touch_in_a_corner():
+    vertices = [[0, 0, 0], [1, 0, 0], [0, 1, 0], [-1, 0, 0], [0, -1, 0]]
+    quality = measure((vertices, [[0, 1, 2], [0, 3, 4]]))
+    assert figures(quality, "nonmanifold_vertices", "manifold", "boundary_edges", "components") == (1, False, 6, 1)
+
+
+def test_boxes_that_share_an_edge():
+    quality = measure(samples.weld(samples.join(samples.box(), samples.box((1, 1, 0)))))
+    assert figures(quality, "nonmanifold_edges", "closed", "manifold", "boundary_edges") == (1, False, False, 0)
+    assert quality["genus"] is None
+
+
+def test_duplicate_faces_in_any_order():
+    vertices, triangles = samples.box()
+    more = np.concatenate([triangles, triangles[3:4, [1, 2, 0]], triangles[3:4, ::-1], triangles[7:8]])
+    quality = measure((vertices, more))
+    assert figures(quality, "duplicate_faces", "closed", "manifold", "oriented") == (3, False, False, False)
+
+
+def test_faces_without_area():
+    vertices, triangles = samples.box(FAR)
+    vertices = np.concatenate([vertices, vertices[:1] + [0.5, 0, 0], vertices[:1]])
+    quality = measure((vertices, np.concatenate([triangles, [[0, 8, 1], [0, 9, 1], [2, 2, 3]]])))
+    assert figures(quality, "zero_area_faces", "manifold", "unused_vertices") == (3, False, 0)
+
+
+def test_face_with_one_vertex_twice_is_not_manifold():
+    vertices, triangles = samples.box()
+    quality = measure((vertices, np.concatenate([np.delete(triangles, 0, axis=0), [[4, 4, 5]]])))
+    assert quality["manifold"] is False
+    assert quality["zero_area_faces"] == 1
+
+
+def test_unused_vertices_are_no_components():
+    vertices, triangles = samples.box()
+    quality = measure((np.concatenate([[[9.0, 9, 9]], vertices, [[8.0, 8, 8]]]), triangles + 1))
+    assert figures(quality, "unused_vertices", "components", "euler_number", "genus") == (2, 1, 2, 0)
+
+
+def test_empty_mesh():
+    quality = measure(([], []))
+    assert figures(quality, "vertices", "triangles", "closed", "manifold", "components") == (0, 0, False, False, 0)
+    assert figures(quality, "area_mm2", "volume_ml", "bounds_mm", "outward") == (0.0, 0.0, None, False)
+
+
+def test_order_of_vertices_and_faces_does_not_matter():
+    rng = np.random.default_rng(5)
+    vertices, triangles = samples.join(samples.torus(), samples.sphere((60, 3, 1)))
+    place = rng.permutation(len(vertices))
+    moved = np.empty_like(vertices)
+    moved[place] = vertices
+    turned = np.array([np.roll(row, rng.integers(3)) for row in place[triangles]])
+    one, other = measure((vertices, triangles)), measure((moved, rng.permutation(turned)))
+    assert other == {name: pytest.approx(value) if type(value) is float else value for name, value in one.items()}
+    assert one["genus"] == 1
+
+
+def test_large_mesh_crosses_the_pieces():
+    quality = measure(samples.torus(250, 131))
+    assert figures(quality, "triangles", "closed", "manifold", "genus") == (65500, True, True, 1)
+    assert quality["volume_ml"] == pytest.approx(samples.torus_volume_ml(250, 131), rel=tolerances.MESH_VOLUME)
+
+
+def test_wrong_index_is_refused():
+    with pytest.raises(UsageError, match="vertex 3, the mesh has 3 vertices"):
+        measure_quality(np.zeros((3, 3), np.float32), np.array([[0, 1, 3]], np.uint32))
+
+
+def test_more_vertices_than_keys_can_hold_are_refused():
+    from clrecon.mesh.connectivity import find_edges
+
+    with pytest.raises(UsageError, match="4000000000 vertices is too large"):
+        find_edges(np.zeros((0, 3), np.uint32), 4_000_000_000)
+
+
+def test_edge_keys_do_not_overflow_with_many_vertices():
+    from clrecon.mesh.connectivity import find_edges
+
+    last = 3_037_000_498
+    edges = find_edges(np.array([[0, last - 1, last], [last, last - 1, 1]], np.uint32), last + 1)
+    assert (edges.count, edges.boundary, edges.nonmanifold, edges.oriented) == (5, 4, 0, True)

@@ -1,0 +1,342 @@
+"""A file is replaced as a whole or not at all, whatever happens on the way."""
+
+from __future__ import annotations
+
+import errno
+import os
+import signal
+import socket
+import stat
+import subprocess
+import sys
+import textwrap
+import threading
+from pathlib import Path
+
+import pytest
+
+from clrecon import files
+from clrecon.errors import OutputError, UsageError
+from clrecon.files import check_writable, replace_file
+
+pytestmark = [
+    pytest.mark.unit,
+    pytest.mark.faults,
+    pytest.mark.skipif(sys.platform == "win32", reason="faults are made with POSIX means"),
+]
+
+
+def names(folder: Path) -> list[str]:
+    return sorted(entry.name for entry in folder.iterdir())
+
+
+def raise_in_the_middle(error: BaseException):
+    def write(stream) -> None:
+        stream.write(b"half")
+        raise error
+
+    return write
+
+
+@pytest.fixture
+def older(tmp_path) -> Path:
+    path = tmp_path / "bone.stl"
+    path.write_bytes(b"older")
+    return path
+
+
+def check_untouched(path: Path) -> None:
+    assert path.read_bytes() == b"older"
+    assert names(path.parent) == [path.name]
+
+
+def test_new_file(tmp_path):
+    seen = []
+
+    def verify(temporary: Path) -> None:
+        seen.append((temporary.parent, temporary.read_bytes(), stat.S_IMODE(temporary.stat().st_mode)))
+        assert temporary.name.startswith(".clrecon-")
+        assert not (tmp_path / "bone.stl").exists()
+
+    assert replace_file(tmp_path / "bone.stl", lambda stream: stream.write(b"12345"), verify) == 5
+    assert seen == [(tmp_path, b"12345", 0o600)]
+    assert (tmp_path / "bone.stl").read_bytes() == b"12345"
+    assert names(tmp_path) == ["bone.stl"]
+
+
+def test_older_file_is_replaced_in_one_step(older):
+    def write(stream) -> None:
+        stream.write(b"newer and longer")
+        stream.flush()
+        assert older.read_bytes() == b"older"
+
+    assert replace_file(str(older), write) == 16
+    assert older.read_bytes() == b"newer and longer"
+
+
+@pytest.mark.parametrize(("umask", "mode"), [(0o022, 0o644), (0o077, 0o600), (0o000, 0o666), (0o027, 0o640)])
+def test_new_file_has_the_mode_of_the_umask(tmp_path, umask, mode):
+    before = os.umask(umask)
+    try:
+        replace_file(tmp_path / "x", lambda stream: None)
+        assert os.umask(umask) == umask
+    finally:
+        os.umask(before)
+    assert stat.S_IMODE((tmp_path / "x").stat().st_mode) == mode
+
+
+def test_replaced_file_keeps_its_mode(older):
+    older.chmod(0o640)
+    replace_file(older, lambda stream: stream.write(b"newer"))
+    assert stat.S_IMODE(older.stat().st_mode) == 0o640
+
+
+@pytest.mark.parametrize(
+    ("code", "words"),
+    [
+        (errno.ENOSPC, "the disk is full"),
+        (errno.EDQUOT, "quota is used up"),
+        (errno.EROFS, "read-only"),
+        (errno.EPERM, "does not permit"),
+        (errno.EIO, os.strerror(errno.EIO)),
+    ],
+)
+def test_system_errors(older, code, words):
+    with pytest.raises(OutputError, match=words) as caught:
+        replace_file(older, raise_in_the_middle(OSError(code, os.strerror(code))))
+    assert "\n" not in str(caught.value) and str(older) in str(caught.value)
+    assert caught.value.exit_code == 6
+    check_untouched(older)
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt(), UsageError("no"), RuntimeError("no"), SystemExit(3)])
+def test_other_errors_pass_through(older, error):
+    with pytest.raises(type(error), match=f"^{error}$"):
+        replace_file(older, raise_in_the_middle(error))
+    check_untouched(older)
+
+
+def test_interrupt_while_verifying(older):
+    def verify(temporary: Path) -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt, match="^$"):
+        replace_file(older, lambda stream: stream.write(b"newer"), verify)
+    check_untouched(older)
+
+
+def test_failed_check(older):
+    def verify(temporary: Path) -> None:
+        raise OutputError("3 triangles, 4 expected")
+
+    with pytest.raises(OutputError, match="^3 triangles, 4 expected$"):
+        replace_file(older, lambda stream: stream.write(b"newer"), verify)
+    check_untouched(older)
+
+
+def test_bytes_that_are_lost_are_noticed(older):
+    def write(stream) -> None:
+        stream.write(b"12345678")
+        stream.flush()
+        os.truncate(stream.fileno(), 3)
+
+    with pytest.raises(OutputError, match="8 bytes written, 3 arrived"):
+        replace_file(older, write)
+    check_untouched(older)
+
+
+def test_limit_on_the_size_of_files(older):
+    """A real limit of the system, in a process of its own."""
+    code = f"""
+        import resource
+        from clrecon.errors import OutputError
+        from clrecon.files import replace_file
+        resource.setrlimit(resource.RLIMIT_FSIZE, (4096, 4096))
+        try:
+            replace_file({str(older)!r}, lambda stream: stream.write(bytes(100_000)))
+        except OutputError as error:
+            print(error)
+    """
+    run = subprocess.run([sys.executable, "-c", textwrap.dedent(code)], capture_output=True, text=True, timeout=60)
+    assert (run.returncode, run.stderr) == (0, "")
+    assert run.stdout == f"cannot write {older}: the file grew beyond the largest size that is allowed here\n"
+    check_untouched(older)
+
+
+def test_full_disk_is_foreseen(older):
+    calls = []
+    with pytest.raises(OutputError, match=r"needs about 1000000000.0 MB and [\d.]+ MB are free"):
+        replace_file(older, calls.append, expected_bytes=10**15)
+    with pytest.raises(OutputError, match="are free"):
+        check_writable(older, expected_bytes=10**15)
+    assert calls == []
+    check_untouched(older)
+
+
+@pytest.mark.parametrize("action", [check_writable, lambda path: replace_file(path, lambda stream: None)])
+class TestRefusedTargets:
+    def test_missing_folder(self, action, tmp_path):
+        with pytest.raises(OutputError, match="the folder .*no does not exist, make it first"):
+            action(tmp_path / "no" / "bone.stl")
+        assert names(tmp_path) == []
+
+    def test_parent_is_a_file(self, action, older):
+        with pytest.raises(OutputError, match="bone.stl is not a folder"):
+            action(older / "bone.stl")
+        check_untouched(older)
+
+    def test_folder(self, action, tmp_path):
+        with pytest.raises(OutputError, match="it is a folder"):
+            action(tmp_path)
+        with pytest.raises(OutputError, match="this names a folder"):
+            action(f"{tmp_path}/new/")
+        with pytest.raises(OutputError, match="this names a folder"):
+            action("")
+
+    def test_fifo(self, action, tmp_path):
+        os.mkfifo(tmp_path / "x.stl")
+        with pytest.raises(OutputError, match="it is a FIFO"):
+            action(tmp_path / "x.stl")
+        assert stat.S_ISFIFO((tmp_path / "x.stl").stat().st_mode)
+
+    def test_device(self, action):
+        with pytest.raises(OutputError, match="it is a character device"):
+            action("/dev/null")
+        assert stat.S_ISCHR(os.stat("/dev/null").st_mode)
+
+    def test_socket(self, action, tmp_path, monkeypatch):
+        monkeypatch.chdir(tmp_path)  # the name of a socket must be short
+        with socket.socket(socket.AF_UNIX) as server:
+            server.bind("s")
+            with pytest.raises(OutputError, match="it is a socket"):
+                action("s")
+
+    def test_name_too_long(self, action, tmp_path):
+        with pytest.raises(OutputError, match="the name is too long"):
+            action(tmp_path / ("x" * 300 + ".stl"))
+        assert names(tmp_path) == []
+
+    def test_link_loop(self, action, tmp_path):
+        (tmp_path / "a").symlink_to(tmp_path / "b")
+        (tmp_path / "b").symlink_to(tmp_path / "a")
+        with pytest.raises(OutputError, match="leads back to itself"):
+            action(tmp_path / "a")
+
+    def test_null_character(self, action, tmp_path):
+        with pytest.raises(OutputError, match="null character"):
+            action(f"{tmp_path}/a\0b")
+
+    def test_message_is_one_line(self, action, tmp_path):
+        with pytest.raises(OutputError, match="does not exist") as caught:
+            action(tmp_path / "no\nfolder\x1b[31m" / "x.stl")
+        assert str(caught.value).isprintable()
+
+    def test_no_permission(self, action, older, monkeypatch):
+        real = os.open
+
+        def refuse(path, flags, *rest, **more):
+            if flags & os.O_CREAT:
+                raise PermissionError(errno.EACCES, "Permission denied")
+            return real(path, flags, *rest, **more)
+
+        monkeypatch.setattr(os, "open", refuse)
+        with pytest.raises(OutputError, match="permission denied: choose another folder"):
+            action(older)
+        check_untouched(older)
+
+    def test_write_protected_file(self, action, older, monkeypatch):
+        monkeypatch.setattr(os, "access", lambda path, mode: False)  # root may write to everything
+        with pytest.raises(OutputError, match="write-protected"):
+            action(older)
+        check_untouched(older)
+
+
+def test_check_writable_leaves_nothing(older):
+    assert check_writable(older) is None
+    assert check_writable(older.parent / "new.stl") is None
+    check_untouched(older)
+
+
+def test_link_is_followed(tmp_path):
+    (tmp_path / "there").mkdir()
+    real, link, dangling = tmp_path / "there" / "real.stl", tmp_path / "link.stl", tmp_path / "dangling.stl"
+    real.write_bytes(b"older")
+    link.symlink_to(real)
+    dangling.symlink_to(tmp_path / "there" / "new.stl")
+    replace_file(link, lambda stream: stream.write(b"newer"))
+    replace_file(dangling, lambda stream: stream.write(b"new"))
+    assert link.is_symlink() and real.read_bytes() == b"newer"
+    assert dangling.is_symlink() and (tmp_path / "there" / "new.stl").read_bytes() == b"new"
+    assert names(tmp_path / "there") == ["new.stl", "real.stl"]
+
+
+@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGINT])
+def test_process_that_is_stopped(older, how):
+    """The older file stays; what a killed process leaves is removed by the next writer, and only that."""
+    code = f"""
+        import sys, time
+        from clrecon.files import replace_file
+        def write(stream):
+            stream.write(b"half")
+            stream.flush()
+            print("writing", flush=True)
+            time.sleep(60)
+        replace_file({str(older)!r}, write)
+    """
+    process = subprocess.Popen(
+        [sys.executable, "-c", textwrap.dedent(code)], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
+    )
+    assert process.stdout is not None
+    with process, process.stdout:
+        assert process.stdout.readline() == "writing\n"
+        temporary = [name for name in names(older.parent) if name.startswith(".clrecon-")]
+        assert len(temporary) == 1
+        # A living process keeps its file, although another one writes into the same folder.
+        replace_file(older.parent / "other.stl", lambda stream: stream.write(b"x"))
+        assert (older.parent / temporary[0]).read_bytes() == b"half"
+        process.send_signal(how)
+        process.wait(timeout=30)
+    assert older.read_bytes() == b"older"
+    assert (temporary[0] in names(older.parent)) == (how == signal.SIGKILL)
+    (older.parent / ".clrecon-notes").write_text("of the user")
+    replace_file(older.parent / "other.stl", lambda stream: stream.write(b"y"))
+    assert names(older.parent) == [".clrecon-notes", "bone.stl", "other.stl"]
+
+
+def test_many_writers_of_one_name(tmp_path):
+    """Whoever is last, the file is whole; nobody's temporary file is swept away."""
+    path = tmp_path / "bone.stl"
+    failures: list[BaseException] = []
+
+    def work(number: int) -> None:
+        try:
+            for _ in range(15):
+                replace_file(path, lambda stream: stream.write(bytes([number]) * 5000))
+        except BaseException as error:
+            failures.append(error)
+
+    threads = [threading.Thread(target=work, args=(number,)) for number in range(6)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert failures == []
+    content = path.read_bytes()
+    assert len(content) == 5000 and len(set(content)) == 1
+    assert names(tmp_path) == ["bone.stl"]
+
+
+def test_a_file_swept_before_it_was_locked_is_made_again(tmp_path, monkeypatch):
+    real, calls = files._lock_new, []
+
+    def lock(stream):
+        calls.append(stream)
+        if len(calls) == 1:
+            for entry in tmp_path.iterdir():
+                entry.unlink()
+        return real(stream)
+
+    monkeypatch.setattr(files, "_lock_new", lock)
+    assert replace_file(tmp_path / "x", lambda stream: stream.write(b"abc")) == 3
+    assert len(calls) == 2
+    assert (tmp_path / "x").read_bytes() == b"abc"
