@@ -2,10 +2,11 @@
 
 from clrecon.kernels.arrays import allocate, download, empty_output, upload
 from clrecon.kernels.launch import Stopwatch, launch
-from clrecon.kernels.program import load_program
+from clrecon.kernels.program import Program, load_program
 from clrecon.kernels.sources import kernel_files, read_kernel_source
 
 __all__ = [
+    "Program",
     "Stopwatch",
     "allocate",
     "download",

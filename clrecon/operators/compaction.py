@@ -10,7 +10,7 @@ import numpy as np
 from clrecon.kernels import Stopwatch, allocate, download, launch, load_program
 from clrecon.opencl import Device
 
-__all__ = ["Compacted", "Scanned", "compact", "exclusive_scan"]
+__all__ = ["Compacted", "Scanned", "compact", "exclusive_scan", "prepare_compaction"]
 
 SCAN_GROUP = 64
 SCAN_BLOCK = SCAN_GROUP * 16
@@ -36,6 +36,12 @@ class Compacted:
 
     positions_d: Any
     count: int
+
+
+def prepare_compaction(device: Device) -> None:
+    """Build the kernels of this module."""
+    load_program(device, "compaction/scan.cl")
+    load_program(device, "compaction/compact.cl")
 
 
 def exclusive_scan(device: Device, counts_d: Any, n: int, *, stopwatch: Stopwatch | None = None) -> Scanned:

@@ -7,17 +7,17 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import DTypeLike, NDArray
 
 from clrecon.errors import DeviceError, NoSurfaceError, UsageError
 from clrecon.geometry import Volume, is_left_handed
 from clrecon.geometry.field import IsoRule, choose_iso_rule, data_range, slice_normal_matrices, vertex_margin
-from clrecon.kernels import Stopwatch, allocate, download, empty_output, launch, load_program, upload
+from clrecon.kernels import Program, Stopwatch, allocate, download, empty_output, launch, load_program, upload
 from clrecon.mesh import Mesh
 from clrecon.opencl import Device, check_budget, choose_device
-from clrecon.operators.compaction import Compacted, compact, exclusive_scan
+from clrecon.operators.compaction import Compacted, compact, exclusive_scan, prepare_compaction
 
-__all__ = ["extract_isosurface"]
+__all__ = ["extract_isosurface", "prepare_isosurface"]
 
 Progress = Callable[[str, int, int], None]
 
@@ -208,6 +208,18 @@ def _emit(
     return positions, normals, triangles
 
 
+def prepare_isosurface(device: Device, dtype: DTypeLike = np.int16) -> Program:
+    """Build the kernels for volumes of `dtype`, so that a later `extract_isosurface` need not wait for them.
+
+    Raises
+    ------
+    DeviceError
+        The driver's compiler refuses.
+    """
+    prepare_compaction(device)
+    return load_program(device, "isosurface/marching_cubes.cl", {"VOXEL": VOXEL_TYPES[np.dtype(dtype).name]})
+
+
 def extract_isosurface(
     volume: Volume,
     iso_value: float,
@@ -268,8 +280,7 @@ def extract_isosurface(
     if progress is not None:
         progress("build", 0, 1)
     with stopwatch.timed("build"):
-        voxel = VOXEL_TYPES[volume.voxels.dtype.name]
-        program = load_program(device, "isosurface/marching_cubes.cl", {"VOXEL": voxel})
+        program = prepare_isosurface(device, volume.voxels.dtype)
     with stopwatch.timed("upload"):
         voxels_d = upload(device, volume.voxels)
     with stopwatch.running(device):

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from clrecon.errors import UsageError
+from clrecon.pipeline.opening import DeviceOpening
 from clrecon.pipeline.presets import find_preset
 from clrecon.pipeline.progress import Progress, Stopwatch, ignore_progress
 from clrecon.pipeline.report import peak_memory_bytes, platform_name, write_report
@@ -34,7 +35,8 @@ def make_mesh(
 ) -> dict[str, Any]:
     """Read a CT series, extract the surface at the iso value, write it.
 
-    Everything that can be refused without reading the input (names, folders, the device) is refused first.
+    Names and folders that can be refused without reading the input are refused first.  The device is opened and
+    its kernels are built while the input is read; a device that is not there ends the reading.
     The mesh is written to a temporary file and renamed; the report follows, as the commit mark.
 
     Parameters
@@ -69,15 +71,13 @@ def make_mesh(
     check_outputs(output, report_path)
 
     progress("device", 0, 0)
-    from clrecon.opencl import choose_device
+    with DeviceOpening(settings.device) as opening:
+        from clrecon.dicom import read_volume
 
-    device = choose_device(settings.device)
-    watch.lap("device")
-
-    from clrecon.dicom import read_volume
-
-    volume = read_volume(source, settings.series, progress=progress)
-    watch.lap("read")
+        volume = read_volume(source, settings.series, progress=opening.watched(progress))
+        watch.lap("read")
+        device = opening.wait()
+        watch.lap("device")
 
     from clrecon.operators.isosurface import extract_isosurface
 

@@ -68,7 +68,8 @@ def _check_isosurface(device: Device) -> str:
             raise DeviceError(f"wrong triangles for {dtype} voxels")
         distance = float(np.abs(mesh.vertices - vertices).max()) / min(volume.spacing)
         if not distance <= VERTEX_TOLERANCE_VOXEL:
-            raise DeviceError(f"vertices {distance:.2g} voxel off for {dtype} voxels, allowed {VERTEX_TOLERANCE_VOXEL:g}")
+            allowed = f"allowed {VERTEX_TOLERANCE_VOXEL:g}"
+            raise DeviceError(f"vertices {distance:.2g} voxel off for {dtype} voxels, {allowed}")
         worst = max(worst, distance)
     return f"3 volumes: triangles equal, vertices within {worst:.1e} voxel"
 

@@ -1,0 +1,184 @@
+"""Make a virtual environment for this project once, and find it again at no cost (shared by run.py and test.py).
+
+An environment is finished when its stamp is there and says word for word what was installed: the text of
+setup.cfg and pyproject.toml, the Python, the folder and the extras.  Anything else (a changed file, another
+Python, an interrupted installation) makes it anew.  clrecon itself is installed editable, so that a changed
+source file needs no new installation.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+__all__ = ["ROOT", "SetupError", "ensure_environment", "program_path"]
+
+ROOT = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))
+_STAMP = "clrecon-installed.txt"
+_LOG = "clrecon-install.log"
+
+
+class SetupError(Exception):
+    """The environment cannot be made; the message says what to do."""
+
+
+def program_path(folder: str, name: str) -> str:
+    """Path of program `name` in the environment `folder`."""
+    if os.name == "nt":
+        return os.path.join(folder, "Scripts", name + ".exe")
+    return os.path.join(folder, "bin", name)
+
+
+def _wanted_stamp(extras: str) -> str:
+    parts = [f"python {sys.version}", f"base {sys.base_prefix}", f"project {ROOT}", f"extras {extras}"]
+    for name in ("setup.cfg", "pyproject.toml"):
+        with open(os.path.join(ROOT, name), encoding="utf-8") as file:
+            parts.append(file.read())
+    return "\n".join(parts)
+
+
+def _is_finished(folder: str, stamp: str, program: str) -> bool:
+    try:
+        with open(os.path.join(folder, _STAMP), encoding="utf-8") as file:
+            # exists() follows links: false as well when the Python that the environment was made from is gone
+            return (
+                file.read() == stamp
+                and os.path.exists(program_path(folder, "python"))
+                and os.path.exists(program_path(folder, program))
+            )
+    except OSError:
+        return False
+
+
+def ensure_environment(name: str, extras: str = "", program: str = "clrecon") -> str:
+    """Return the folder of a finished environment, making it when it is not there.
+
+    Parameters
+    ----------
+    name : str
+        Folder in the project, such as ``.venv``.
+    extras : str
+        Extras of setup.cfg to install, such as ``test,dev``.
+    program : str
+        A program that the finished environment holds.
+
+    Raises
+    ------
+    SetupError
+        No venv module, no write permission, or pip failed.
+    """
+    folder = os.path.join(ROOT, name)
+    stamp = _wanted_stamp(extras)
+    if _is_finished(folder, stamp, program):
+        return folder
+    with _locked(folder + ".lock"):
+        if not _is_finished(folder, stamp, program):  # another start may have made it while this one waited
+            _make(folder, stamp, extras)
+    return folder
+
+
+@contextmanager
+def _locked(path: str) -> Iterator[None]:
+    """Hold the lock file `path`; the system lets go of it when its holder dies."""
+    try:
+        file = open(path, "a+b")  # noqa: SIM115 (closed below)
+    except OSError as error:
+        raise SetupError(f"the environment goes beside setup.cfg, but {ROOT} cannot be written: {error}") from error
+    try:
+        _wait_for_lock(file.fileno())
+        yield
+    finally:
+        file.close()
+
+
+def _wait_for_lock(descriptor: int) -> None:
+    import time
+
+    told = False
+    while True:
+        try:
+            if sys.platform == "win32":
+                import msvcrt
+
+                msvcrt.locking(descriptor, msvcrt.LK_NBLCK, 1)
+            else:
+                import fcntl
+
+                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            return
+        except OSError:
+            if not told:
+                _say("another start is installing clrecon, waiting for it")
+                told = True
+            time.sleep(0.2)
+
+
+def _say(text: str) -> None:
+    print(text, file=sys.stderr, flush=True)
+
+
+def _check_venv() -> None:
+    """Debian and its relatives split venv and ensurepip off Python."""
+    try:
+        import ensurepip  # noqa: F401
+        import venv  # noqa: F401
+    except ImportError as error:
+        version = f"{sys.version_info[0]}.{sys.version_info[1]}"
+        raise SetupError(
+            f"this Python ({sys.executable}) cannot make environments: its module {error.name} is missing.\n"
+            f"On Debian and Ubuntu: sudo apt install python3-venv   (or python{version}-venv), then start again.\n"
+            "Elsewhere install Python 3.10 or newer from python.org."
+        ) from error
+
+
+def _make(folder: str, stamp: str, extras: str) -> None:
+    import subprocess
+
+    _check_venv()
+    _say(f"making {os.path.basename(folder)} and installing clrecon (about a minute, once)")
+    try:
+        os.unlink(os.path.join(folder, _STAMP))
+    except FileNotFoundError:
+        pass
+    # -m venv in a process of its own: this one may itself run in an environment or without a writable home
+    made = subprocess.run([sys.executable, "-m", "venv", "--clear", folder], capture_output=True, text=True)
+    if made.returncode:
+        raise SetupError(f"python -m venv failed:\n{(made.stdout + made.stderr).strip()}")
+    target = f"{ROOT}[{extras}]" if extras else ROOT
+    command = [program_path(folder, "python"), "-m", "pip", "install", "--disable-pip-version-check", "--no-input"]
+    command += ["--progress-bar", "off", "--editable", target]
+    log = os.path.join(folder, _LOG)
+    code = _run_logged(command, log)
+    if code:
+        raise SetupError("\n".join(["pip failed:", *_last_words(log), f"(its whole output: {log})"]))
+    with open(os.path.join(folder, _STAMP + ".new"), "w", encoding="utf-8") as file:
+        file.write(stamp)
+    os.replace(os.path.join(folder, _STAMP + ".new"), os.path.join(folder, _STAMP))
+
+
+def _last_words(log: str) -> list[str]:
+    """The errors in pip's output, else its last lines; a list of all versions ever published is cut."""
+    with open(log, encoding="utf-8") as file:
+        lines = [line.rstrip()[:200] for line in file if line.strip()]
+    return [line for line in lines if "error:" in line.lower()][-8:] or lines[-8:]
+
+
+def _run_logged(command: list[str], log: str) -> int:
+    """Run `command` with its output in the file `log`; a terminal sees one line of what is going on."""
+    import subprocess
+
+    shows = sys.stderr.isatty()
+    with (
+        open(log, "w", encoding="utf-8") as file,
+        subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as process,
+    ):
+        assert process.stdout is not None
+        for line in process.stdout:
+            file.write(line)
+            if shows and line.strip():
+                print("\r\033[K  " + line.strip()[:76], end="", file=sys.stderr, flush=True)
+    if shows:
+        print("\r\033[K", end="", file=sys.stderr, flush=True)
+    return process.returncode

@@ -1,0 +1,154 @@
+"""What the guards share: the files of the project, and which layer may import what (the one table)."""
+
+from __future__ import annotations
+
+import ast
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[2]
+PACKAGE = ROOT / "clrecon"
+
+LEFT_OF: dict[str, frozenset[str]] = {}
+"""For each layer (a module or folder of clrecon/) the layers that it may import."""
+
+
+def _layer(name: str, *allowed: str) -> None:
+    LEFT_OF[name] = frozenset(allowed)
+
+
+_layer("__init__", "errors", "version", "geometry", "dicom", "mesh", "opencl", "operators")
+_layer("errors")
+_layer("version")
+_layer("files", "errors")
+_layer("geometry", "errors", "files")
+_layer("dicom", "errors", "files", "geometry")
+_layer("mesh", "errors", "version", "files", "geometry")
+_layer("reference", "errors", "files", "geometry")
+_layer("phantom", "errors", "version", "files", "geometry")
+_layer("opencl", "errors", "files")
+_layer("kernels", "errors", "files", "opencl")
+_layer("operators", "errors", "files", "geometry", "mesh", "opencl", "kernels")
+_layer("pipeline", *(set(LEFT_OF) - {"__init__"}))
+_layer("viewer", "errors", "files", "geometry", "mesh", "pipeline")
+_layer("cli", "errors", "version", "pipeline", "viewer")
+_layer("__main__", "cli")
+
+# Third-party packages: at module level (paid by whoever imports the layer), or only inside functions.
+AT_MODULE_LEVEL: dict[str, frozenset[str]] = {
+    "geometry": frozenset({"numpy"}),
+    "dicom": frozenset({"numpy", "pydicom"}),
+    "mesh": frozenset({"numpy"}),
+    "reference": frozenset({"numpy"}),
+    "phantom": frozenset({"numpy", "pydicom"}),
+    "opencl": frozenset({"numpy"}),
+    "kernels": frozenset({"numpy"}),
+    "operators": frozenset({"numpy"}),
+    "pipeline": frozenset({"numpy"}),
+    "viewer": frozenset({"numpy"}),
+}
+INSIDE_FUNCTIONS: dict[str, frozenset[str]] = {
+    "files": frozenset({"numpy"}),
+    "geometry": frozenset({"scipy"}),
+    "dicom": frozenset({"imagecodecs", "openjpeg", "rle", "jpeg_ls", "pylibjpeg"}),
+    "mesh": frozenset({"scipy", "pyvista", "vtk", "vtkmodules"}),
+    "reference": frozenset({"scipy"}),
+    "phantom": frozenset({"scipy"}),
+    "opencl": frozenset({"pyopencl"}),
+    "kernels": frozenset({"pyopencl"}),
+    "operators": frozenset({"pyopencl"}),
+    "pipeline": frozenset({"pyvista", "skimage"}),
+    "viewer": frozenset({"pyvista", "vtk", "vtkmodules"}),
+}
+
+
+def package_modules() -> dict[str, Path]:
+    """Dotted name -> file of every module of clrecon/."""
+    modules = {}
+    for path in sorted(PACKAGE.rglob("*.py")):
+        parts = path.relative_to(ROOT).with_suffix("").parts
+        modules[".".join(parts[:-1] if parts[-1] == "__init__" else parts)] = path
+    return modules
+
+
+def project_files(*suffixes: str) -> list[Path]:
+    """Files of the project (no environments, caches, build folders) whose name ends with one of `suffixes`."""
+    left_out = {"build", "dist", "clrecon-demo", "__pycache__"}
+    found: list[Path] = []
+    for top in sorted(ROOT.iterdir()):
+        if top.name in left_out or (top.name.startswith(".") and top.name != ".ci") or top.name.endswith(".egg-info"):
+            continue
+        candidates = [top] if top.is_file() else top.rglob("*")
+        found.extend(
+            path for path in candidates if path.is_file() and not left_out.intersection(path.relative_to(ROOT).parts)
+        )
+    return sorted(path for path in found if not suffixes or path.name.endswith(suffixes))
+
+
+def layer_of(module: str) -> str:
+    """``clrecon.mesh.writers.stl`` -> ``mesh``; ``clrecon`` -> ``__init__``."""
+    parts = module.split(".")
+    return parts[1] if len(parts) > 1 else "__init__"
+
+
+def _is_type_checking(test: ast.expr) -> bool:
+    return (isinstance(test, ast.Name) and test.id == "TYPE_CHECKING") or (
+        isinstance(test, ast.Attribute) and test.attr == "TYPE_CHECKING"
+    )
+
+
+def walk_imports(
+    node: ast.AST, module: str, is_package: bool, deferred: bool = False
+) -> Iterator[tuple[str, bool, int]]:
+    """Yield (imported module, is it deferred, line) of every import; annotations-only imports count as deferred."""
+    for child in ast.iter_child_nodes(node):
+        if isinstance(child, ast.Import):
+            for alias in child.names:
+                yield alias.name, deferred, child.lineno
+        elif isinstance(child, ast.ImportFrom):
+            yield from _imports_from(child, module, is_package, deferred)
+        elif isinstance(child, (ast.FunctionDef, ast.AsyncFunctionDef, ast.Lambda)):
+            yield from walk_imports(child, module, is_package, True)
+        elif isinstance(child, ast.If) and _is_type_checking(child.test):
+            yield from walk_imports(child, module, is_package, True)
+        else:
+            yield from walk_imports(child, module, is_package, deferred)
+
+
+def _imports_from(
+    node: ast.ImportFrom, module: str, is_package: bool, deferred: bool
+) -> Iterator[tuple[str, bool, int]]:
+    name = node.module or ""
+    if node.level:
+        parts = module.split(".")
+        base = parts[: len(parts) - node.level + (1 if is_package else 0)]
+        name = ".".join([*base, name] if name else base)
+    if name == "clrecon":  # from clrecon import geometry: the names are layers or public names
+        for alias in node.names:
+            layer = alias.name if alias.name in LEFT_OF else "__init__"
+            yield (f"clrecon.{layer}" if layer != "__init__" else "clrecon"), deferred, node.lineno
+    else:
+        yield name, deferred, node.lineno
+
+
+def find_layer_faults(source: str, module: str, is_package: bool = False) -> list[str]:
+    """Imports in `source` that the table does not allow, one line each."""
+    own = layer_of(module)
+    if own not in LEFT_OF:
+        return [f"{module}: layer {own!r} is not in the table of tests/guards/house.py"]
+    faults = []
+    for name, deferred, line in walk_imports(ast.parse(source), module, is_package):
+        top = name.split(".")[0]
+        if top == "clrecon":
+            other = layer_of(name)
+            if other != own and other not in LEFT_OF[own]:
+                faults.append(f"{module}:{line}: layer {own} may not import {name}")
+        elif top not in sys.stdlib_module_names:
+            allowed = AT_MODULE_LEVEL.get(own, frozenset())
+            if deferred:
+                allowed = allowed | INSIDE_FUNCTIONS.get(own, frozenset())
+            if top not in allowed:
+                where = "" if deferred else " at module level"
+                faults.append(f"{module}:{line}: layer {own} may not import {top}{where}")
+    return faults

@@ -1,0 +1,81 @@
+"""The rules of tests/conftest.py: which devices are asked for, and that a session without a test is no success."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+
+import conftest
+import pytest
+from house import ROOT
+
+POCL = SimpleNamespace(platform="Portable Computing Language", version="OpenCL 3.0 PoCL", driver="3.1")
+RUSTICL = SimpleNamespace(platform="rusticl", version="OpenCL 3.0", driver="22.3")
+
+
+@pytest.mark.parametrize(
+    ("wanted", "devices", "missing"),
+    [
+        ("", [], []),
+        ("rusticl, portable computing language", [POCL, RUSTICL], []),
+        ("Portable Computing Language, Portable Computing Language", [POCL, RUSTICL], ["Portable Computing Language"]),
+        ("Portable Computing Language, Portable Computing Language", [POCL, POCL], []),
+        ("Intel", [POCL], ["Intel"]),
+        ("3.1", [RUSTICL, POCL], []),
+    ],
+)
+def test_each_entry_needs_a_device_of_its_own(wanted: str, devices: list[SimpleNamespace], missing: list[str]) -> None:
+    assert conftest.missing_platforms(wanted, devices) == missing
+
+
+def run_pytest(tmp_path: Path, test: str, **variables: str) -> subprocess.CompletedProcess[str]:
+    """Run pytest on one file with a copy of the conftest, away from this project."""
+    (tmp_path / "conftest.py").write_text((ROOT / "tests" / "conftest.py").read_text())
+    (tmp_path / "test_one.py").write_text(test)
+    environment = {key: value for key, value in os.environ.items() if not key.startswith("CLRECON_")}
+    environment |= {"PYTHONPATH": str(ROOT), **variables}
+    command = [
+        sys.executable,
+        "-m",
+        "pytest",
+        "-q",
+        "-p",
+        "no:cacheprovider",
+        "--rootdir",
+        str(tmp_path),
+        str(tmp_path),
+    ]
+    return subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)
+
+
+NO_DRIVER = "import clrecon.opencl\nclrecon.opencl.list_devices = lambda: []\n"
+USES_DEVICE = "def test_it(device):\n    assert device.name\n"
+SKIPPED = "import pytest\ndef test_it():\n    pytest.skip('no')\n"
+
+
+@pytest.mark.parametrize(
+    ("test", "variables", "code"),
+    [
+        ("def test_it():\n    assert 1 + 1 == 2\n", {"CLRECON_REQUIRE_TESTS": "1"}, 0),
+        (SKIPPED, {}, 0),
+        (SKIPPED, {"CLRECON_REQUIRE_TESTS": "1"}, 5),
+        (NO_DRIVER + USES_DEVICE, {}, 0),
+        (NO_DRIVER + USES_DEVICE, {"CLRECON_REQUIRE_DEVICE": "1"}, 1),
+        (NO_DRIVER + USES_DEVICE, {"CLRECON_REQUIRE_PLATFORMS": "Intel"}, 2),
+        (USES_DEVICE, {"CLRECON_TEST_DEVICE": "no such device"}, 2),
+        ("def test_it(real_data):\n    assert real_data.is_dir()\n", {"CLRECON_TEST_DATA": "no-such-folder"}, 1),
+    ],
+)
+def test_exit_status_of_a_session(tmp_path: Path, test: str, variables: dict[str, str], code: int) -> None:
+    done = run_pytest(tmp_path, test, **variables)
+    assert done.returncode == code, done.stdout + done.stderr
+
+
+def test_required_platforms_are_there(device: object) -> None:
+    """Asks for the devices of this session, so that a platform that got lost shows in every run."""
+    wanted = os.environ.get("CLRECON_REQUIRE_PLATFORMS", "")
+    named = os.environ.get("CLRECON_TEST_DEVICE", "").strip()
+    assert named or conftest.missing_platforms(wanted, conftest.Devices.get()[0]) == []

@@ -1,0 +1,108 @@
+"""What README, CONTRIBUTING and the documents name is there, and their commands are understood."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from importlib import import_module
+from pathlib import Path
+
+import pytest
+from house import ROOT
+
+DOCUMENTS = ["README.md", "CONTRIBUTING.md", "CHANGELOG.md", "docs/contract.md"]
+LINK = re.compile(r"\[[^\]]*\]\(([^)#\s]+)[^)]*\)")
+QUOTED = re.compile(r"`((?:\.ci|cl|clrecon|docs|scripts|tests)/[\w./-]*|(?:setup\.cfg|\w+\.(?:md|toml)))`")
+COMMAND = re.compile(r"^ {4}(?:clrecon|python3 scripts/run\.py) +([^#\n]+)", re.MULTILINE)
+
+
+def find_missing_files(text: str, folder: Path) -> list[str]:
+    """Files that `text`, a document in `folder`, links to or names in code, and that are not there."""
+    links = [name for name in LINK.findall(text) if "://" not in name]
+    missing = [name for name in links if not (folder / name).exists()]
+    return missing + [name for name in QUOTED.findall(text) if not (ROOT / name).exists()]
+
+
+def find_commands(text: str) -> list[list[str]]:
+    """Arguments of every clrecon command in an indented block of `text`."""
+    return [shlex.split(arguments) for arguments in COMMAND.findall(text)]
+
+
+def parse_command(arguments: list[str]) -> None:
+    """Parse `arguments` as clrecon would.
+
+    Raises
+    ------
+    UsageError
+        They are not understood.
+    """
+    from clrecon.cli.common import Parser, add_common
+    from clrecon.cli.main import COMMANDS
+    from clrecon.errors import UsageError
+
+    if arguments == ["--help"]:
+        return
+    if arguments[0] not in COMMANDS:
+        raise UsageError(f"no command {arguments[0]}")
+    parser = Parser(prog=arguments[0])
+    import_module(COMMANDS[arguments[0]].module).add_arguments(parser)
+    add_common(parser)
+    parser.parse_args(arguments[1:])
+
+
+@pytest.mark.parametrize("name", DOCUMENTS)
+def test_every_named_file_is_there(name: str) -> None:
+    path = ROOT / name
+    assert find_missing_files(path.read_text(encoding="utf-8"), path.parent) == []
+
+
+def test_a_missing_file_is_found() -> None:
+    text = (
+        "See [this](docs/contract.md), [that](docs/contrakt.md), [home](https://x.org/a.md), `scripts/gone.py`, `--hu`."
+    )
+    assert find_missing_files(text, ROOT) == ["docs/contrakt.md", "scripts/gone.py"]
+
+
+def test_readme_commands_are_understood() -> None:
+    commands = find_commands((ROOT / "README.md").read_text(encoding="utf-8"))
+    assert {command[0] for command in commands} >= {"demo", "mesh", "info", "devices", "phantom", "selftest"}
+    for command in commands:
+        parse_command(command)
+
+
+@pytest.mark.parametrize("command", ["mesh A --hu 300", "mesh A -o b.stl --iso 3", "mash A", "info"])
+def test_a_wrong_command_is_found(command: str) -> None:
+    from clrecon.errors import UsageError
+
+    (arguments,) = find_commands(f"text\n\n    clrecon {command}   # why\n")
+    with pytest.raises(UsageError, match="required|unrecognized|no command"):
+        parse_command(arguments)
+
+
+def test_exit_codes_are_documented() -> None:
+    from clrecon import errors
+
+    codes = {getattr(errors, name).exit_code for name in errors.__all__}
+    rows = re.findall(r"^\| (\d+) \|", (ROOT / "README.md").read_text(encoding="utf-8"), re.MULTILINE)
+    assert codes <= {int(row) for row in rows}
+
+
+@pytest.mark.parametrize(
+    ("heading", "names"),
+    [
+        (
+            "clrecon info",
+            "series chosen number uid_hash description modality slices shape_ijk spacing_mm affine_ijk_to_lps_mm "
+            "tilt_deg grid_residual_max_mm gap_mm uneven warnings problems",
+        ),
+        (
+            "clrecon mesh",
+            "affine_ijk_to_lps_mm iso_value_hu space vertices triangles closed manifold components area_mm2 volume_ml "
+            "bounds_mm device driver version warnings seconds read upload build kernels download write total",
+        ),
+    ],
+)
+def test_the_contract_names_what_it_promises(heading: str, names: str) -> None:
+    text = (ROOT / "docs" / "contract.md").read_text(encoding="utf-8")
+    section = text.split(f"## {heading}")[1].split("\n## ")[0]
+    assert [name for name in names.split() if f"`{name}`" not in section] == []

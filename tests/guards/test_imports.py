@@ -1,0 +1,72 @@
+"""Importing clrecon, asking for help and reading files cost little and need no OpenCL driver."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import clrecon
+
+HEAVY = {"imagecodecs", "numpy", "pydicom", "pyopencl", "pyvista", "scipy", "skimage", "trimesh", "vtk", "vtkmodules"}
+LOADED = "import json, sys; print(json.dumps(sorted({name.partition('.')[0] for name in sys.modules})))"
+HELP = """
+import contextlib, io
+from clrecon.cli.main import main
+with contextlib.suppress(SystemExit), contextlib.redirect_stdout(io.StringIO()) as out:
+    main(["--help"])
+assert "mesh" in out.getvalue()
+"""
+NO_PYOPENCL = "import sys; sys.modules['pyopencl'] = None"
+
+
+def run_python(code: str, tmp_path: Path) -> subprocess.CompletedProcess[str]:
+    environment = {**os.environ, "OCL_ICD_VENDORS": str(tmp_path)}
+    return subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True)
+
+
+def loaded_after(code: str, tmp_path: Path) -> set[str]:
+    done = run_python(f"{code}\n{LOADED}", tmp_path)
+    assert done.returncode == 0, done.stderr
+    return set(json.loads(done.stdout.splitlines()[-1]))
+
+
+def test_import_loads_nothing_heavy(tmp_path: Path) -> None:
+    assert loaded_after("import clrecon", tmp_path) & HEAVY == set()
+
+
+def test_help_loads_nothing_heavy(tmp_path: Path) -> None:
+    assert loaded_after(HELP, tmp_path) & HEAVY == set()
+
+
+def test_a_heavy_import_would_be_seen(tmp_path: Path) -> None:
+    assert loaded_after("import clrecon; clrecon.Volume", tmp_path) & HEAVY == {"numpy"}
+
+
+def test_geometry_dicom_mesh_and_phantom_work_without_pyopencl(tmp_path: Path) -> None:
+    code = "import clrecon, clrecon.dicom, clrecon.mesh, clrecon.phantom, clrecon.reference\nprint(clrecon.Volume)"
+    done = run_python(f"{NO_PYOPENCL}\n{code}", tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "Volume" in done.stdout
+
+
+def test_a_device_without_pyopencl_is_a_clear_error(tmp_path: Path) -> None:
+    done = run_python(f"{NO_PYOPENCL}\nimport clrecon\nclrecon.devices()", tmp_path)
+    assert done.returncode == 1
+    assert "DeviceError: pyopencl cannot be imported" in done.stderr.splitlines()[-1]
+
+
+@pytest.mark.parametrize("name", clrecon.__all__)
+def test_every_public_name_is_there(name: str) -> None:
+    assert getattr(clrecon, name) is getattr(clrecon, name)
+    assert name in dir(clrecon)
+
+
+def test_an_unknown_name_is_an_attribute_error() -> None:
+    with pytest.raises(AttributeError, match="has no attribute 'read_volumes'"):
+        _ = clrecon.read_volumes
+    assert callable(clrecon.devices) and callable(clrecon.device)

@@ -1,0 +1,100 @@
+"""scripts/run.py makes its environment once, says what is wrong where it cannot, and then gets out of the way."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from house import ROOT
+
+posix_only = pytest.mark.skipif(os.name == "nt", reason="the stand-in program is a shell script")
+
+
+def copy_scripts(tmp_path: Path) -> Path:
+    project = tmp_path / "a project"
+    (project / "scripts").mkdir(parents=True)
+    for name in ("setup.cfg", "pyproject.toml", "scripts/run.py", "scripts/_environment.py"):
+        shutil.copy(ROOT / name, project / name)
+    return project
+
+
+def start(project: Path, *arguments: str, before: str = "") -> subprocess.CompletedProcess[str]:
+    """Run scripts/run.py, with the statements `before` executed first in the same process."""
+    script = str(project / "scripts" / "run.py")
+    code = f"import runpy, sys\n{before}\nsys.path.insert(0, {str(project / 'scripts')!r})\n"
+    code += f"sys.argv = [{script!r}, *{list(arguments)!r}]\nrunpy.run_path({script!r}, run_name='__main__')"
+    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+
+
+def finish_by_hand(project: Path) -> Path:
+    """Put a finished environment in place whose clrecon says what it is called with."""
+    code = "import _environment as e; print(e._wanted_stamp(''), end='')"
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=project / "scripts", capture_output=True, text=True, check=True
+    )
+    programs = project / ".venv" / "bin"
+    programs.mkdir(parents=True)
+    (programs / "python").symlink_to(sys.executable)
+    (programs / "clrecon").write_text('#!/bin/sh\necho "called with" "$@"\nexit 5\n')
+    (programs / "clrecon").chmod(0o755)
+    stamp = project / ".venv" / "clrecon-installed.txt"
+    stamp.write_text(done.stdout)
+    return stamp
+
+
+@posix_only
+def test_a_finished_environment_is_used_as_it_is(tmp_path: Path) -> None:
+    project = copy_scripts(tmp_path)
+    finish_by_hand(project)
+    done = start(project, "mesh", "A FOLDER", "-o", "x.stl")
+    assert (done.returncode, done.stdout, done.stderr) == (5, "called with mesh A FOLDER -o x.stl\n", "")
+    assert start(project).stdout == "called with --help\n"
+    assert not (project / ".venv.lock").exists()
+
+
+@posix_only
+@pytest.mark.parametrize("change", ["setup.cfg", "stamp cut", "no stamp", "program gone"])
+def test_anything_else_installs_again(tmp_path: Path, change: str) -> None:
+    project = copy_scripts(tmp_path)
+    stamp = finish_by_hand(project)
+    if change == "setup.cfg":
+        (project / change).write_text((project / change).read_text().replace("numpy >= 1.24", "numpy >= 1.25"))
+    elif change == "stamp cut":
+        stamp.write_text(stamp.read_text()[:-1])
+    elif change == "no stamp":
+        stamp.unlink()
+    else:
+        (project / ".venv" / "bin" / "clrecon").unlink()
+    done = start(project, before="sys.modules['ensurepip'] = None")  # stops the installation at its first step
+    assert done.returncode == 1
+    assert "called with" not in done.stdout
+
+
+def test_without_venv_it_says_what_to_install(tmp_path: Path) -> None:
+    done = start(copy_scripts(tmp_path), before="sys.modules['ensurepip'] = None")
+    assert done.returncode == 1
+    assert "sudo apt install python3-venv" in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+@pytest.mark.parametrize("name", ["run.py", "test.py"])
+def test_an_old_python_is_told_so(name: str) -> None:
+    script = ROOT / "scripts" / name
+    code = f"import runpy, sys\nsys.version_info = (3, 9, 2)\nrunpy.run_path({str(script)!r}, run_name='__main__')"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == 1
+    assert done.stderr.startswith("clrecon needs Python 3.10 or newer")
+    assert len(done.stderr.splitlines()) == 1
+
+
+@posix_only
+def test_a_project_that_cannot_be_written_is_told_so(tmp_path: Path) -> None:
+    project = copy_scripts(tmp_path)
+    (project / ".venv.lock").mkdir()  # for root as for others: not a file that can be opened
+    done = start(project)
+    assert done.returncode == 1
+    assert "cannot be written" in done.stderr and "Traceback" not in done.stderr

@@ -1,0 +1,119 @@
+"""The texts of the project: tests that assert, no machine paths, no unfinished marks, generated files up to date."""
+
+from __future__ import annotations
+
+import ast
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from house import ROOT, project_files
+
+TEXT_SUFFIXES = (".py", ".cl", ".h", ".md", ".cfg", ".toml", "run")
+FORBIDDEN = {
+    "a path of one machine": re.compile(r"(?<![\w.])/(?:home|root|Users|wor" + r"k|tmp/\w+)/"),
+    "an unfinished mark": re.compile(r"\b(?:TO" + r"DO|FIX" + r"ME|XX" + r"X|HA" + r"CK)\b"),
+}
+
+
+def find_forbidden(text: str) -> list[str]:
+    return [
+        f"{number}: {what}"
+        for number, line in enumerate(text.splitlines(), start=1)
+        for what, pattern in FORBIDDEN.items()
+        if pattern.search(line)
+    ]
+
+
+def _asserts_value(node: ast.AST) -> bool:
+    """An assert of something that can be false, a numpy or own assertion, or an expected error."""
+    if isinstance(node, ast.Assert):
+        return not isinstance(node.test, ast.Constant)
+    if isinstance(node, ast.Call):
+        function = node.func
+        name = function.attr if isinstance(function, ast.Attribute) else getattr(function, "id", "")
+        expects_error = name == "raises" and any(keyword.arg == "match" for keyword in node.keywords)
+        return name.startswith(("assert_", "check_")) or expects_error
+    return False
+
+
+def find_tests_without_assertion(source: str) -> list[str]:
+    return [
+        node.name
+        for node in ast.walk(ast.parse(source))
+        if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef))
+        and node.name.startswith("test_")
+        and not any(_asserts_value(child) for child in ast.walk(node))
+    ]
+
+
+def test_every_test_asserts_a_value() -> None:
+    files = [path for path in project_files(".py") if path.name.startswith("test_") and "tests" in path.parts]
+    assert len(files) >= 5
+    lazy = {path.name: names for path in files if (names := find_tests_without_assertion(path.read_text()))}
+    assert lazy == {}
+
+
+def test_test_files_have_names_of_their_own() -> None:
+    names = [path.name for path in project_files(".py") if path.is_relative_to(ROOT / "tests")]
+    assert sorted(names) == sorted(set(names))
+
+
+@pytest.mark.parametrize(
+    "body", ["pass", "assert True", "run()", "with pytest.raises(ValueError):\n        run()", "print(assert_all)"]
+)
+def test_a_test_without_assertion_is_found(body: str) -> None:
+    assert find_tests_without_assertion(f"def test_it():\n    {body}\n") == ["test_it"]
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        "assert run() == 3",
+        "np.testing.assert_allclose(a, b)",
+        "with pytest.raises(ValueError, match='no'):\n        run()",
+    ],
+)
+def test_a_test_with_assertion_is_accepted(body: str) -> None:
+    assert find_tests_without_assertion(f"def test_it():\n    {body}\n") == []
+
+
+def test_no_machine_paths_and_no_unfinished_marks() -> None:
+    files = project_files(*TEXT_SUFFIXES)
+    assert len(files) > 40
+    faults = [f"{path.name}:{fault}" for path in files for fault in find_forbidden(path.read_text(encoding="utf-8"))]
+    assert faults == []
+
+
+@pytest.mark.parametrize("line", ["x = 1  # TO" + "DO later", "open('/wor" + "k/main/a')", "see /ho" + "me/ann/x"])
+def test_a_forbidden_line_is_found(line: str) -> None:
+    assert len(find_forbidden(f"fine\n{line}\n")) == 1
+
+
+def test_files_are_short() -> None:
+    longest = {path.name: len(path.read_text().splitlines()) for path in project_files(".py", ".cl")}
+    assert {name: lines for name, lines in longest.items() if lines > 450} == {}
+
+
+def run_check(root: Path) -> subprocess.CompletedProcess[str]:
+    script = root / "scripts" / "derive_mc_tables.py"
+    return subprocess.run([sys.executable, str(script), "--check"], capture_output=True, text=True)
+
+
+def test_generated_files_are_up_to_date() -> None:
+    done = run_check(ROOT)
+    assert (done.returncode, done.stdout) == (0, "")
+
+
+def test_a_changed_generated_file_is_found(tmp_path: Path) -> None:
+    for name in ("scripts/derive_mc_tables.py", "cl/include/mc_tables.h"):
+        target = tmp_path / name
+        target.parent.mkdir(parents=True)
+        target.write_text((ROOT / name).read_text())
+    (tmp_path / "clrecon").symlink_to(ROOT / "clrecon")
+    assert run_check(tmp_path).returncode == 0
+    header = tmp_path / "cl" / "include" / "mc_tables.h"
+    header.write_text(header.read_text().replace("0x", "0X", 1))
+    assert run_check(tmp_path).returncode == 1
