@@ -76,7 +76,8 @@ class Series:
                 "corrupt DICOM files beside its slices, which may belong to it (restore or remove them): "
                 + join_names(map(str, self.corrupt))
             )
-        if self.kind == "stack" and self.stack is not None and not texts:  # bad files leave holes, which would only hide the cause
+        # Bad files leave holes, which would only hide the cause.
+        if self.kind == "stack" and self.stack is not None and not texts:
             problems += self.stack.problems
         return problems
 

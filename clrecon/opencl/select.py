@@ -55,7 +55,8 @@ def _discover() -> tuple[tuple[tuple[str, str, str], ...], tuple[Device, ...]]:
             if "DEVICE_NOT_FOUND" not in str(error):
                 note = describe_error(error)
         devices.extend(Device(len(devices) + n, cl_platform, cl_device) for n, cl_device in enumerate(found))
-        platforms.append((cl_platform.name.strip(), cl_platform.version.strip(), note or f"{len(found)} device{'s' * (len(found) != 1)}"))
+        count = f"{len(found)} device{'s' * (len(found) != 1)}"
+        platforms.append((cl_platform.name.strip(), cl_platform.version.strip(), note or count))
     return tuple(platforms), tuple(devices)
 
 

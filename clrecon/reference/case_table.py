@@ -103,9 +103,7 @@ def _fan(loop: list[int]) -> list[tuple[int, int, int]]:
 @lru_cache(maxsize=1)
 def case_table() -> tuple[tuple[tuple[int, int, int], ...], ...]:
     """Return for each of the 256 cases its triangles as triples of edge numbers."""
-    return tuple(
-        tuple(triangle for loop in case_loops(case) for triangle in _fan(loop)) for case in range(256)
-    )
+    return tuple(tuple(triangle for loop in case_loops(case) for triangle in _fan(loop)) for case in range(256))
 
 
 def pack_case_table() -> NDArray[np.uint64]:
