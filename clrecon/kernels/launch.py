@@ -78,8 +78,7 @@ def finish(device: Device) -> None:
 def launch(
     device: Device,
     kernel: Any,
-    items: int | tuple[int, ...],
-    group: int | tuple[int, ...],
+    items: int,
     *arguments: Any,
     stopwatch: Stopwatch | None = None,
 ) -> None:
@@ -89,9 +88,8 @@ def launch(
     ----------
     device : Device
     kernel : pyopencl.Kernel
-    items, group : int or tuple of int
-        Work-items and work-group size, up to three axes; each axis is rounded up to whole groups, so kernels
-        check their bounds first.
+    items : int
+        Work-items; rounded up to whole groups of `Device.group_size`, so kernels check their bounds first.
     *arguments
         Buffers and numpy scalars, in the kernel's order.
     stopwatch : Stopwatch, optional
@@ -103,14 +101,13 @@ def launch(
         The driver refuses; the message names the kernel and the sizes.
     """
     cl = import_pyopencl()
-    items = (items,) if isinstance(items, int) else items
-    group = (group,) if isinstance(group, int) else group
-    rounded = tuple(-(-count // size) * size for count, size in zip(items, group, strict=True))
+    group = device.group_size
+    rounded = -(-items // group) * group
     try:
-        event = kernel(device.queue, rounded, group, *arguments)
+        event = kernel(device.queue, (rounded,), (group,), *arguments)
     except cl.Error as error:
         raise DeviceError(
-            f"kernel {kernel.function_name} ({rounded} items in groups of {group}) failed on {device.label}:"
+            f"kernel {kernel.function_name} ({rounded:,} items in groups of {group}) failed on {device.label}:"
             f" {describe_error(error)}"
         ) from error
     if stopwatch is not None:

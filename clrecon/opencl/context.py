@@ -8,7 +8,10 @@ from typing import Any
 from clrecon.errors import DeviceError
 from clrecon.opencl import quirks
 
-__all__ = ["Device", "describe_error"]
+__all__ = ["GROUP_SIZE", "Device", "describe_error"]
+
+GROUP_SIZE = 64
+"""A whole wavefront of every GPU, and small enough to give a CPU's cores equal shares."""
 
 
 def describe_error(error: Exception) -> str:
@@ -61,6 +64,11 @@ class Device:
         if quirks.is_software_gpu(self.name):
             rank = 0
         return rank, self.memory_bytes, self.driver, -self.index
+
+    @property
+    def group_size(self) -> int:
+        """Work-group size of all launches: 64, or what the device allows where that is less (Apple's CPU: 1)."""
+        return min(GROUP_SIZE, self.max_work_group_size)
 
     @property
     def label(self) -> str:

@@ -7,19 +7,16 @@ from typing import Any
 
 import numpy as np
 
-from clrecon.kernels import Stopwatch, allocate, download, launch, load_program
+from clrecon.kernels import Program, Stopwatch, allocate, download, launch, load_program
 from clrecon.opencl import Device
 
 __all__ = ["Compacted", "Scanned", "compact", "exclusive_scan", "prepare_compaction"]
 
-SCAN_GROUP = 64
-SCAN_BLOCK = SCAN_GROUP * 16
-"""Work-group size and elements a work-group of cl/compaction/scan.cl."""
+SCAN_PER_ITEM = 16
+"""Elements a work-item of cl/compaction/scan.cl."""
 
 COMPACT_WORDS = 8
 """Words a work-item of cl/compaction/compact.cl."""
-
-GROUP = 64
 
 
 @dataclass(frozen=True)
@@ -40,8 +37,12 @@ class Compacted:
 
 def prepare_compaction(device: Device) -> None:
     """Build the kernels of this module."""
-    load_program(device, "compaction/scan.cl")
+    _load_scan(device)
     load_program(device, "compaction/compact.cl")
+
+
+def _load_scan(device: Device) -> Program:
+    return load_program(device, "compaction/scan.cl", {"SCAN_GROUP": str(device.group_size)})
 
 
 def exclusive_scan(device: Device, counts_d: Any, n: int, *, stopwatch: Stopwatch | None = None) -> Scanned:
@@ -64,19 +65,17 @@ def exclusive_scan(device: Device, counts_d: Any, n: int, *, stopwatch: Stopwatc
     DeviceError
         The device fails.
     """
-    scan = load_program(device, "compaction/scan.cl")
-    blocks = -(-n // SCAN_BLOCK)
+    scan = _load_scan(device)
+    blocks = -(-n // (SCAN_PER_ITEM * device.group_size))
     sums_d, block_offsets_d, total_d = (allocate(device, 4 * blocks), allocate(device, 4 * blocks), allocate(device, 8))
     offsets_d = allocate(device, 4 * n)
-    size, items = np.uint32(n), blocks * SCAN_GROUP
-    launch(device, scan["sum_blocks"], items, SCAN_GROUP, counts_d, sums_d, size, stopwatch=stopwatch)
+    size, items = np.uint32(n), blocks * device.group_size
+    launch(device, scan["sum_blocks"], items, counts_d, sums_d, size, stopwatch=stopwatch)
     launch(
-        device, scan["scan_block_sums"], SCAN_GROUP, SCAN_GROUP,
+        device, scan["scan_block_sums"], device.group_size,
         sums_d, block_offsets_d, total_d, np.uint32(blocks), stopwatch=stopwatch,
     )  # fmt: skip
-    launch(
-        device, scan["scan_blocks"], items, SCAN_GROUP, counts_d, block_offsets_d, offsets_d, size, stopwatch=stopwatch
-    )
+    launch(device, scan["scan_blocks"], items, counts_d, block_offsets_d, offsets_d, size, stopwatch=stopwatch)
     total = download(device, np.empty(1, dtype=np.uint64), total_d)
     return Scanned(offsets_d, int(total[0]))
 
@@ -106,11 +105,11 @@ def compact(device: Device, mask_d: Any, words: int, *, stopwatch: Stopwatch | N
     chunks = -(-words // COMPACT_WORDS)
     counts_d = allocate(device, 4 * chunks)
     size = np.uint32(words)
-    launch(device, program["count_set_bits"], chunks, GROUP, mask_d, counts_d, size, stopwatch=stopwatch)
+    launch(device, program["count_set_bits"], chunks, mask_d, counts_d, size, stopwatch=stopwatch)
     scanned = exclusive_scan(device, counts_d, chunks, stopwatch=stopwatch)
     positions_d = allocate(device, 4 * scanned.total)
     launch(
-        device, program["list_set_bits"], chunks, GROUP,
+        device, program["list_set_bits"], chunks,
         mask_d, scanned.offsets_d, positions_d, size, stopwatch=stopwatch,
     )  # fmt: skip
     return Compacted(positions_d, scanned.total)

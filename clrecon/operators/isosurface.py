@@ -28,8 +28,6 @@ VOXEL_TYPES = {
 LONGEST_ROW = 13_000
 """Samples a row: places in a row are 16-bit numbers, and a cell has at most 5 triangles."""
 
-GROUP = 64
-
 
 @dataclass(frozen=True)
 class _SampleGrid:
@@ -137,7 +135,7 @@ def _classify(device: Device, grid: _SampleGrid, program: Any, voxels_d: Any, le
     ni, nj, nk = grid.volume.shape_ijk
     mask_d = allocate(device, 4 * grid.rows * grid.words)
     launch(
-        device, program["classify_samples"], grid.rows * grid.words, GROUP,
+        device, program["classify_samples"], grid.rows * grid.words,
         voxels_d, mask_d, level,
         np.int32(ni), np.int32(nj), np.int32(nk), np.int32(grid.rule.border), np.int32(grid.words),
         stopwatch=stopwatch,
@@ -151,7 +149,7 @@ def _count(device: Device, grid: _SampleGrid, program: Any, mask_d: Any, stopwat
     word_vertices_d, word_triangles_d = allocate(device, 2 * rows * words), allocate(device, 2 * rows * words)
     flags_d = allocate(device, 4 * rows * grid.flag_words)
     launch(
-        device, program["count_rows"], rows, GROUP,
+        device, program["count_rows"], rows,
         mask_d, row_vertices_d, row_triangles_d, flags_d, word_vertices_d, word_triangles_d,
         *(np.uint32(n) for n in grid.shape), np.uint32(words), np.uint32(grid.flag_words),
         stopwatch=stopwatch,
@@ -187,7 +185,7 @@ def _emit(
     packing = (np.uint32(grid.words), np.uint32(grid.flag_words), active)
     with stopwatch.running(device):
         launch(
-            device, program["emit_vertices"], counts.words.count, GROUP,
+            device, program["emit_vertices"], counts.words.count,
             voxels_d, mask_d, counts.words.positions_d, counts.vertex_offsets_d, counts.word_vertices_d,
             frames_d, steps_d, positions_d, normals_d,
             np.float32(rule.iso_level), np.float32(rule.outside), _pad4(vertex_margin(volume, rule.border)),
@@ -195,7 +193,7 @@ def _emit(
             stopwatch=stopwatch,
         )  # fmt: skip
         launch(
-            device, program["emit_triangles"], counts.words.count, GROUP,
+            device, program["emit_triangles"], counts.words.count,
             mask_d, counts.words.positions_d, counts.vertex_offsets_d, counts.triangle_offsets_d,
             counts.word_vertices_d, counts.word_triangles_d, triangles_d,
             *(np.uint32(n) for n in grid.shape), *packing, np.int32(is_left_handed(volume.affine)),

@@ -35,8 +35,8 @@ def make_mesh(
 ) -> dict[str, Any]:
     """Read a CT series, extract the surface at the iso value, write it.
 
-    Names and folders that can be refused without reading the input are refused first.  The device is opened and
-    its kernels are built while the input is read; a device that is not there ends the reading.
+    Outputs that cannot be written are refused first, then a device that is not there, then the input.  The device
+    is opened and its kernels are built while the input is read.
     The mesh is written to a temporary file and renamed; the report follows, as the commit mark.
 
     Parameters
@@ -74,7 +74,7 @@ def make_mesh(
     with DeviceOpening(settings.device) as opening:
         from clrecon.dicom import read_volume
 
-        volume = read_volume(source, settings.series, progress=opening.watched(progress))
+        volume = read_volume(source, settings.series, progress=progress)
         watch.lap("read")
         device = opening.wait()
         watch.lap("device")

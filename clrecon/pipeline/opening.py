@@ -6,25 +6,29 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from types import TracebackType
 from typing import TYPE_CHECKING
 
-from clrecon.pipeline.progress import Progress
-
 if TYPE_CHECKING:
     from clrecon.opencl import Device
 
 __all__ = ["DeviceOpening"]
 
 
-def _open(name: str | int | Device | None) -> Device:
+def _choose(name: str | int | Device | None) -> Device:
     from clrecon.opencl import choose_device
+
+    return choose_device(name)
+
+
+def _prepare(chosen: Future[Device]) -> None:
     from clrecon.operators.isosurface import prepare_isosurface
 
-    device = choose_device(name)
-    prepare_isosurface(device)
-    return device
+    prepare_isosurface(chosen.result())
 
 
 class DeviceOpening:
-    """A device that is being opened beside other work.
+    """A device that is chosen, opened and given its kernels beside the work of a ``with`` block.
+
+    The order of errors does not depend on which side is faster: where the block fails and the device is not there
+    either, the device's error is raised.
 
     Parameters
     ----------
@@ -34,27 +38,20 @@ class DeviceOpening:
 
     def __init__(self, name: str | int | Device | None):
         self._pool = ThreadPoolExecutor(max_workers=1, thread_name_prefix="device")
-        self._future: Future[Device] = self._pool.submit(_open, name)
-
-    def watched(self, progress: Progress) -> Progress:
-        """Return `progress` as it is, but raising what the opening raised as soon as it is known."""
-
-        def report(stage: str, done: int, total: int) -> None:
-            if self._future.done():
-                self._future.result()
-            progress(stage, done, total)
-
-        return report
+        self._chosen = self._pool.submit(_choose, name)
+        self._prepared = self._pool.submit(_prepare, self._chosen)
 
     def wait(self) -> Device:
-        """Return the device.
+        """Return the device, ready to work.
 
         Raises
         ------
         DeviceError
-            There is none of that name, or it cannot be opened.
+            There is none of that name, it cannot be opened, or its compiler refuses.
         """
-        return self._future.result()
+        device = self._chosen.result()
+        self._prepared.result()
+        return device
 
     def __enter__(self) -> DeviceOpening:
         return self
@@ -62,4 +59,8 @@ class DeviceOpening:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
-        self._pool.shutdown(wait=True)
+        try:
+            if isinstance(error, Exception):
+                self._chosen.result()
+        finally:
+            self._pool.shutdown(wait=True, cancel_futures=True)

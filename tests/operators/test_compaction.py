@@ -6,11 +6,13 @@ import numpy as np
 import pytest
 
 from clrecon.kernels import download, upload
-from clrecon.operators.compaction import SCAN_BLOCK, SCAN_GROUP, compact, exclusive_scan
+from clrecon.opencl.context import GROUP_SIZE
+from clrecon.operators.compaction import SCAN_PER_ITEM, compact, exclusive_scan
 from clrecon.reference import compaction as twin
 
-SIZES = [1, 2, 15, 16, 17, SCAN_GROUP - 1, SCAN_GROUP, SCAN_GROUP + 1, SCAN_BLOCK - 1, SCAN_BLOCK, SCAN_BLOCK + 1,
-         SCAN_BLOCK * SCAN_GROUP - 1, SCAN_BLOCK * SCAN_GROUP, SCAN_BLOCK * SCAN_GROUP + 1, 200_003]  # fmt: skip
+BLOCK = GROUP_SIZE * SCAN_PER_ITEM
+BORDERS = (SCAN_PER_ITEM, GROUP_SIZE, BLOCK, BLOCK * GROUP_SIZE)
+SIZES = sorted({1, *(border + step for border in BORDERS for step in (-1, 0, 1)), 200_003})
 
 
 @pytest.mark.parametrize("n", SIZES)
@@ -20,6 +22,16 @@ def test_scan_equals_its_twin(device, n):
     offsets, total = twin.exclusive_scan(counts)
     assert scanned.total == total == int(counts.sum())
     assert np.array_equal(download(device, np.empty(n, np.uint32), scanned.offsets_d), offsets)
+
+
+@pytest.mark.parametrize("group", [1, 16])
+def test_devices_with_small_work_groups_get_the_same(device, group, monkeypatch):
+    monkeypatch.setattr(device, "max_work_group_size", group)
+    counts = np.random.default_rng(group).integers(0, 50, 5000).astype(np.uint32)
+    scanned = exclusive_scan(device, upload(device, counts), counts.size)
+    offsets, total = twin.exclusive_scan(counts)
+    assert scanned.total == total
+    assert np.array_equal(download(device, np.empty(counts.size, np.uint32), scanned.offsets_d), offsets)
 
 
 def test_a_total_beyond_32_bits_is_exact(device):
