@@ -27,7 +27,7 @@ from clrecon.errors import OutputError
 if sys.platform != "win32":
     import fcntl
 
-__all__ = ["check_writable", "replace_file"]
+__all__ = ["StagedFile", "check_writable", "replace_file", "stage_file"]
 
 _TEMPORARY = re.compile(r"\.clrecon-[0-9a-f]{16}\.tmp")
 
@@ -84,12 +84,59 @@ def replace_file(
         The folder is missing or cannot be written to, the target is not a regular file or is write-protected, the
         disk is full, or the check failed.  An older target is intact and no temporary file is left.
     """
+    with stage_file(path, write, verify, expected_bytes=expected_bytes) as staged:
+        staged.commit()
+    return staged.size
+
+
+class StagedFile:
+    """A finished file under a temporary name beside its target.
+
+    Attributes
+    ----------
+    size : int
+        Bytes.
+    """
+
+    def __init__(self, path: str | os.PathLike[str], temporary: Path, target: Path, stream: BinaryIO, size: int):
+        self._path, self._temporary, self._target, self._stream = path, temporary, target, stream
+        self.size = size
+
+    def commit(self) -> None:
+        """Rename the file over its target.
+
+        Raises
+        ------
+        OutputError
+            The system refuses; an older target is intact.
+        """
+        with _system_errors(self._path):
+            if sys.platform == "win32":
+                self._stream.close()  # an open file cannot be renamed there
+            os.replace(self._temporary, self._target)
+        _sync_folder(self._target.parent)
+
+
+@contextlib.contextmanager
+def stage_file(
+    path: str | os.PathLike[str],
+    write: Callable[[BinaryIO], None],
+    verify: Callable[[Path], None] | None = None,
+    *,
+    expected_bytes: int = 0,
+) -> Iterator[StagedFile]:
+    """Write a file under a temporary name; `StagedFile.commit` in the ``with`` block puts it in place.
+
+    For files that belong together: stage all of them, then commit one after the other.  What is not committed is
+    removed at the end of the block.  Parameters and errors as in `replace_file`.
+    """
     target = _checked_target(path)
-    with _system_errors(path):
-        _check_space(path, target.parent, expected_bytes)
-        _sweep(target.parent)
-        mode = _final_mode(target)
-        with _temporary_file(target.parent) as (temporary, stream):
+    with contextlib.ExitStack() as stack:
+        with _system_errors(path):
+            _check_space(path, target.parent, expected_bytes)
+            _sweep(target.parent)
+            mode = _final_mode(target)
+            temporary, stream = stack.enter_context(_temporary_file(target.parent))
             write(stream)
             stream.flush()
             size = stream.tell()
@@ -99,13 +146,10 @@ def replace_file(
                 raise OutputError(f"cannot write {_shown(path)}: {size} bytes written, {found} arrived on the disk")
             if verify is not None:
                 verify(temporary)
-            if sys.platform == "win32":
-                stream.close()  # an open file cannot be renamed there
-            else:
-                os.fchmod(stream.fileno(), mode)
-            os.replace(temporary, target)
-    _sync_folder(target.parent)
-    return size
+            if sys.platform != "win32":
+                with contextlib.suppress(PermissionError):  # some network file systems keep the mode to themselves
+                    os.fchmod(stream.fileno(), mode)
+        yield StagedFile(path, temporary, target, stream, size)
 
 
 def check_writable(path: str | os.PathLike[str], *, expected_bytes: int = 0) -> None:

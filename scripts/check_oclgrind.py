@@ -9,7 +9,8 @@ of an environment that has clrecon and its test extra (scripts/test.py does).
 
 --uninitialized also reports uninitialised values, with the compiler's optimiser off.  It is a help in a search and
 not part of the gate: up to version 21.10 Oclgrind stops there at LLVM's instruction "freeze" (which the optimiser
-makes of a quotient and its remainder), and takes halves of vectors (v.lo | v.hi) for uninitialised or crashes.
+makes of a quotient and its remainder), takes halves of vectors (v.lo | v.hi) for uninitialised or crashes, and after
+a buffer is freed takes the end of a larger one that follows it for uninitialised.
 """
 
 from __future__ import annotations

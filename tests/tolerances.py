@@ -12,6 +12,7 @@ def float32_unit(points) -> float:
 
 # --- operators ---
 TWIN_VERTEX_VOXEL = 1e-4  # device in float32 against twin in float64, index steps
+VERTEX_ROUNDING_UNITS = 0.6  # half a unit of the last rounding, and what is lost before it
 TWIN_NORMAL = 2e-5  # unit vectors in float32
 FRAME_MM = 1e-4  # one surface through differently ordered voxels
 SPHERE_DISTANCE_FIELD_VOXEL = 0.03  # sagitta of one edge at R = 5 voxels is 1/40 voxel

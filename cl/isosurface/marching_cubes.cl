@@ -137,6 +137,12 @@ static inline float3 gradient_at(
     return change * (closed ? (float3)(0.5f) : 0.5f + 0.5f * one_sided);
 }
 
+/* Largest absolute component. */
+static inline float largest_component(float3 v)
+{
+    return fmax(fabs(v.x), fmax(fabs(v.y), fabs(v.z)));
+}
+
 /* Sum of two floats and its exact rounding error (Knuth). */
 static inline float3 add_exactly(float3 a, float3 b, float3 *error)
 {
@@ -163,8 +169,9 @@ static inline float3 add_exactly(float3 a, float3 b, float3 *error)
  *                             last place of the position, so that no triangle collapses when it is rounded
  *             ni nj nk, border, words, flag_words, active   as above
  * Launch      global = active rounded up by the host, any local
- * Guarantees  every position and normal is written once.  Positions are right to one unit in the last place:
- *             products of a sample number (< 4096) and a step of 12 bits are exact, and sums keep their error */
+ * Guarantees  every position and normal is written once.  Positions are right to one unit in the last place of the
+ *             volume's largest coordinate (half a unit up to 4096 samples an axis, where products of a sample number
+ *             and a step of 12 bits are exact; sums keep their error) */
 __kernel void emit_vertices(
     __global const VOXEL *restrict voxels, __global const uint *restrict mask,
     __global const uint *restrict active_words, __global const uint *restrict row_offsets,
@@ -217,11 +224,13 @@ __kernel void emit_vertices(
             const float3 step = axis == 0 ? i_step : axis == 1 ? j_step : k_step;
             vstore3(base + (at_sample + t * step), vertex, positions);
 
+            /* Where the differences cancel, the edge itself says which way is down.  Scaled to a largest
+             * component of 1, so that no square over- or underflows. */
             float3 slope = gradient + t * (next_gradient - gradient);
-            if (dot(slope, slope) == 0.0f)
-                slope = (next - value) * (float3)(di, dj, dk);
-            const float3 up = (float3)(
-                dot(frame[3].xyz, slope), dot(frame[4].xyz, slope), dot(frame[5].xyz, slope));
+            const float steepest = largest_component(slope);
+            slope = steepest > 0.0f ? slope / steepest : (next > value ? 1.0f : -1.0f) * (float3)(di, dj, dk);
+            float3 up = (float3)(dot(frame[3].xyz, slope), dot(frame[4].xyz, slope), dot(frame[5].xyz, slope));
+            up /= largest_component(up);
             vstore3(-up / sqrt(dot(up, up)), vertex, normals);
             ++vertex;
         }

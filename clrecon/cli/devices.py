@@ -42,6 +42,8 @@ def _describe_survey(survey: dict[str, Any]) -> list[str]:
         lines.append(f"{'':18}{device['compute_units']} compute units, {memory}")
         driver = f"{device['platform']}, {device['version']}, driver {device['driver']}"
         lines.append(f"{'':18}{printable(driver)}")
+        if device["shortcoming"]:
+            lines.append(f"{'':18}cannot be used: {printable(device['shortcoming'])}")
     if survey["platforms"]:
         lines += ["", "platforms:"]
         rows = [(printable(p["name"]), printable(p["note"]), printable(p["version"])) for p in survey["platforms"]]

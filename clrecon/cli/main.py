@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import os
 import signal
@@ -73,8 +74,10 @@ def run() -> None:
         sys.modules.setdefault(name, None)  # type: ignore[arg-type]
     code = main()
     for stream in (sys.stdout, sys.stderr):
-        with contextlib.suppress(OSError, ValueError):  # closed by the reader; `main` has said what there is to say
+        # None where the process was started without it; closed by its reader; `main` has said what there is to say.
+        with contextlib.suppress(OSError, ValueError, AttributeError):
             stream.flush()
+    atexit._run_exitfuncs()
     # Every file is closed by now.  Freeing modules, drivers and voxels one by one takes the interpreter as long as
     # extracting the surface; the system does it at once.
     os._exit(code)

@@ -1,26 +1,38 @@
-"""The certificate: what is known of a volume's origin and geometry, as a dict without patient data."""
+"""The certificate: what is known of a volume's origin and geometry, as a dict without patient data.
+
+People put names into file names and series descriptions: warnings and reports hold neither, but counts and positions.
+"""
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Sequence
 from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from clrecon.dicom.gate import Stack
 from clrecon.dicom.header import SliceHeader
 from clrecon.dicom.pixels import PixelFacts
 from clrecon.dicom.scan import Scan
 from clrecon.dicom.series import Series
-from clrecon.dicom.text import hash_uid, join_names
+from clrecon.dicom.text import hash_uid
 
-__all__ = ["certify", "collect_scan_warnings", "collect_series_warnings"]
+__all__ = ["certify", "collect_scan_warnings", "collect_series_warnings", "collect_voxel_warnings"]
+
+CEILING_HU = 3071
+"""Highest HU of 12 stored bits with intercept -1024: metal and its surroundings are cut off there."""
+CEILING_VOXELS = 10
+"""As many voxels at the ceiling may be noise in dense bone."""
 
 
 def collect_scan_warnings(scan: Scan) -> list[str]:
     """Warnings about files that were passed over although they claim to be DICOM, or could not be looked at."""
     warnings = []
-    if scan.corrupt:
-        plural = "s" * (len(scan.corrupt) > 1)
-        warnings.append(f"{len(scan.corrupt)} corrupt file{plural} skipped: {join_names(map(str, scan.corrupt))}")
+    if scan.skipped["corrupt"]:
+        warnings.append(f"{scan.skipped['corrupt']} corrupt file{'s' * (scan.skipped['corrupt'] > 1)} skipped")
+    warnings += [f"{count} skipped: {reason}" for reason, count in Counter(s.reason for s in scan.suspects).items()]
     for reason in ("not readable", "folder not readable", "link out of the folder"):
         if scan.skipped[reason]:
             warnings.append(f"{scan.skipped[reason]} skipped: {reason}")
@@ -34,11 +46,15 @@ def collect_series_warnings(series: Series) -> list[str]:
     headers = series.stack.slices
     warnings = list(series.stack.warnings)
     for text in dict.fromkeys(text for header in headers for text in header.warnings):
-        warnings.append(f"{text} ({_names(headers, lambda h, text=text: text in h.warnings)})")  # type: ignore[misc]
+        warnings.append(f"{text} ({_place(series.stack, lambda h, text=text: text in h.warnings)})")  # type: ignore[misc]
     checks: tuple[tuple[Callable[[SliceHeader], bool], str], ...] = (
         (
-            lambda h: not h.has_rescale,
+            lambda h: not h.has_slope,
             "no RescaleSlope: slope 1, intercept {intercept} taken: maybe not HU",
+        ),
+        (
+            lambda h: h.has_slope and not h.has_intercept,
+            "no RescaleIntercept: slope {slope}, intercept 0 taken: maybe not HU",
         ),
         (lambda h: h.rescale_type not in ("", "HU"), "RescaleType is '{type}': the values are not HU"),
         (lambda h: h.photometric == "MONOCHROME1", "MONOCHROME1: meant to be shown inverted; the values are kept"),
@@ -47,14 +63,28 @@ def collect_series_warnings(series: Series) -> list[str]:
     for is_so, text in checks:
         odd = next((header for header in headers if is_so(header)), None)
         if odd is not None:
-            text = text.format(type=odd.rescale_type, intercept=f"{odd.intercept:g}")
-            warnings.append(f"{text} ({_names(headers, is_so)})")
+            text = text.format(type=odd.rescale_type, intercept=f"{odd.intercept:g}", slope=f"{odd.slope:g}")
+            warnings.append(f"{text} ({_place(series.stack, is_so)})")
     return warnings
 
 
-def _names(headers: Sequence[SliceHeader], is_so: Callable[[SliceHeader], bool]) -> str:
-    names = [header.name for header in headers if is_so(header)]
-    return "all slices" if len(names) == len(headers) else join_names(names)
+def _place(stack: Stack, is_so: Callable[[SliceHeader], bool]) -> str:
+    """Which slices, by count and position along the normal: their file names may hold the patient's."""
+    positions = [place for header, place in zip(stack.slices, stack.distances_mm, strict=True) if is_so(header)]
+    if len(positions) == len(stack.slices):
+        return "all slices"
+    first = "the first " * (len(positions) > 1)
+    return f"{len(positions)} of {len(stack.slices)} slices, {first}at {positions[0]:.2f} mm"
+
+
+def collect_voxel_warnings(voxels: NDArray[Any], facts: PixelFacts) -> list[str]:
+    """Warnings about the HU that were read."""
+    if facts.hu_max != CEILING_HU:
+        return []
+    count = int(np.count_nonzero(voxels == CEILING_HU))
+    if count <= CEILING_VOXELS:
+        return []
+    return [f"{count} voxels are at {CEILING_HU} HU, the ceiling of 12 bits: metal is saturated, its surface displaced"]
 
 
 def certify(
@@ -84,7 +114,6 @@ def certify(
         "series": {
             "number": series.number,
             "uid_hash": hash_uid(series.identity.uid),
-            "description": series.identity.description,
             "modality": series.identity.modality,
         },
         "slices": len(headers),

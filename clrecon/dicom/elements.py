@@ -35,7 +35,17 @@ _LONG_VRS = (b"OB", b"OW", b"OF", b"OD", b"OL", b"OV", b"UN")
 
 
 class NotDicomError(RefusedInputError):
-    """The file is no DICOM file: no "DICM" at byte 128."""
+    """The file is no DICOM file: no "DICM" at byte 128.
+
+    Attributes
+    ----------
+    start : bytes
+        The first bytes of the file; all of them where it is no longer than `PREFIX_BYTES`.
+    """
+
+    def __init__(self, message: str, start: bytes):
+        super().__init__(message)
+        self.start = start
 
 
 class CorruptFileError(RefusedInputError):
@@ -114,7 +124,7 @@ def read_elements(path: Path, wanted: tuple[int, ...]) -> DicomElements:
     """
     prefix, size = read_prefix(path)
     if not has_dicom_mark(prefix):
-        raise NotDicomError("no DICM mark at byte 128")
+        raise NotDicomError("no DICM mark at byte 128", prefix)
     if len(prefix) < size:
         try:
             elements = _parse(io.BytesIO(prefix), size, wanted)

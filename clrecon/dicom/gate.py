@@ -212,6 +212,11 @@ def find_mixed_values(headers: Sequence[SliceHeader]) -> list[str]:
             usual = counts.most_common(1)[0][0]
             odd = [header for header in headers if key(header) != usual]
             found.append(f"{title} differ within the series: {show(odd[0])} in {join_names(h.name for h in odd)}")
+    patients = Counter(header.patient_hash for header in headers if header.patient_hash is not None)
+    if len(patients) > 1:
+        usual = patients.most_common(1)[0][0]
+        odd = [header for header in headers if header.patient_hash not in (usual, None)]
+        found.append(f"PatientID differs within the series: another in {join_names(h.name for h in odd)}")
     di, dj = np.median([header.di_mm for header in headers]), np.median([header.dj_mm for header in headers])
     allowed = PIXEL_SPACING_TOLERANCE * min(di, dj)
     odd = [header for header in headers if max(abs(header.di_mm - di), abs(header.dj_mm - dj)) > allowed]

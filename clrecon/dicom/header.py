@@ -6,12 +6,13 @@ range, or there is a problem that names the file and the tag.
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from pathlib import Path
 
 from clrecon.dicom.codecs import describe_undecodable, is_encapsulated
 from clrecon.dicom.elements import CorruptFileError, read_elements
-from clrecon.dicom.text import escape_text
+from clrecon.dicom.text import escape_text, hash_uid
 from clrecon.dicom.values import WANTED_TAGS, ValueProblem, Values
 
 __all__ = ["OtherImage", "SeriesIdentity", "SliceHeader", "read_header"]
@@ -19,6 +20,9 @@ __all__ = ["OtherImage", "SeriesIdentity", "SliceHeader", "read_header"]
 CT_IMAGE_STORAGE = "1.2.840.10008.5.1.4.1.1.2"
 SECONDARY_CAPTURE = "1.2.840.10008.5.1.4.1.1.7"
 DICOMDIR_CLASS = "1.2.840.10008.1.3.10"
+
+DERIVED_WORDS = frozenset("MPR MIP MINIP MAXIP AIP PROJECTION REFORMATTED CPR CURVED VRT SSD".split())
+"""Words of ImageType that, beside DERIVED, mean computed images: other planes, projections, renderings."""
 
 PIXEL_SPACING_MM = (1e-3, 50.0)
 POSITION_LIMIT_MM = 1e6
@@ -45,7 +49,7 @@ class OtherImage:
     frames : int
         Frames it holds, 1 for most.
     kind : {"broken", "capture", "other"}
-        A CT image with a wrong header; a secondary capture; anything that is no CT.
+        A CT image with a wrong header or several frames; a secondary capture; anything that is no CT.
     problem : str
         One line; names the file and the tag where there is one.
     """
@@ -80,7 +84,9 @@ class SliceHeader:
     padding : tuple of (int, int) or None
         Lowest and highest stored value that mean "no measurement".
     slope, intercept : float
-        1 and 0 where the file has none, see `has_rescale`.
+        1 and 0 where the file has none, see `has_slope` and `has_intercept`.
+    patient_hash : str or None
+        Only to compare: it goes into no message and no report.
     pixel_offset, pixel_length, inflate_from, file_bytes : int
         See `DicomElements`.
     warnings : tuple of str
@@ -90,6 +96,7 @@ class SliceHeader:
     file: Path
     name: str
     localizer: bool
+    patient_hash: str | None
     frame_of_reference: str
     transfer_syntax: str
     little_endian: bool
@@ -109,7 +116,8 @@ class SliceHeader:
     stated_gap_mm: float | None
     slope: float
     intercept: float
-    has_rescale: bool
+    has_slope: bool
+    has_intercept: bool
     rescale_type: str
     padding: tuple[int, int] | None
     lossy: bool
@@ -144,7 +152,7 @@ def read_header(path: Path) -> SliceHeader | OtherImage | None:
     values = Values(elements)
     name = escape_text(path.name)
     sop_class = values.word("SOPClassUID") or elements.media_class
-    modality = values.word("Modality") or ("CT" if sop_class == CT_IMAGE_STORAGE else "unknown")
+    modality = values.word("Modality").strip().upper() or ("CT" if sop_class == CT_IMAGE_STORAGE else "unknown")
     series = SeriesIdentity(
         values.word("SeriesInstanceUID"), values.whole_or_none("SeriesNumber"), values.description(), modality
     )
@@ -166,8 +174,11 @@ def read_header(path: Path) -> SliceHeader | OtherImage | None:
         raise CorruptFileError("ends before its pixel data")
     if frames is not None and frames > 1:
         return other(f"{name}: multi-frame image of {frames} frames: not supported yet")
-    if kind == "capture" and "ImagePositionPatient" not in values:
-        return other(f"{name}: secondary capture without ImagePositionPatient (0020,0032): no geometry")
+    if kind == "capture":
+        why = "its pixels are a picture, not measured HU"
+        if "ImagePositionPatient" not in values:
+            why = "without ImagePositionPatient (0020,0032): no geometry"
+        return other(f"{name}: secondary capture (SOP class {sop_class}): {why}")
     try:
         return _validate(values, series, path, name)
     except ValueProblem as problem:
@@ -204,9 +215,9 @@ def _validate(values: Values, series: SeriesIdentity, path: Path, name: str) -> 
         raise values.wrong("ImagePositionPatient", f"within {POSITION_LIMIT_MM:g} mm")
 
     warnings = []
-    has_rescale = "RescaleSlope" in values
-    slope = values.decimals("RescaleSlope", 1)[0] if has_rescale else 1.0
-    intercept = values.decimals("RescaleIntercept", 1)[0] if "RescaleIntercept" in values else 0.0
+    has_slope, has_intercept = "RescaleSlope" in values, "RescaleIntercept" in values
+    slope = values.decimals("RescaleSlope", 1)[0] if has_slope else 1.0
+    intercept = values.decimals("RescaleIntercept", 1)[0] if has_intercept else 0.0
     if not RESCALE_SLOPE[0] <= abs(slope) <= RESCALE_SLOPE[1]:
         raise values.wrong("RescaleSlope", "a finite number other than 0")
     if abs(intercept) > RESCALE_INTERCEPT_LIMIT:
@@ -222,13 +233,17 @@ def _validate(values: Values, series: SeriesIdentity, path: Path, name: str) -> 
             warnings.append(f"{problem}; ignored, it plays no part in the geometry")
     if elements.encoding_differs:
         warnings.append("implicit and explicit VR are mixed up: parsed as found, not as the transfer syntax says")
-    image_type = values.text("ImageType").upper().split("\\")
+    image_type = [word.strip() for word in values.text("ImageType").upper().split("\\")]
+    derived = sorted(DERIVED_WORDS.intersection(re.split("[^A-Z]+", " ".join(image_type))))
+    if "DERIVED" in image_type and derived:
+        warnings.append(f"derived images (ImageType has DERIVED and {' '.join(derived)}): maybe not measured HU")
 
     header = SliceHeader(
         series=series,
         file=path,
         name=name,
-        localizer="LOCALIZER" in (word.strip() for word in image_type),
+        localizer="LOCALIZER" in image_type,
+        patient_hash=hash_uid(values.text("PatientID").strip()),
         frame_of_reference=values.word("FrameOfReferenceUID"),
         transfer_syntax=elements.transfer_syntax,
         little_endian=elements.little_endian,
@@ -248,7 +263,8 @@ def _validate(values: Values, series: SeriesIdentity, path: Path, name: str) -> 
         stated_gap_mm=unused["SpacingBetweenSlices"],
         slope=slope,
         intercept=intercept,
-        has_rescale=has_rescale,
+        has_slope=has_slope,
+        has_intercept=has_intercept,
         rescale_type=escape_text(values.word("RescaleType"), 16),
         padding=values.padding(allocated, signed),
         lossy=values.word("LossyImageCompression") == "01",

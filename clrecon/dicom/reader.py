@@ -8,10 +8,11 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from clrecon.dicom.certificate import certify, collect_scan_warnings, collect_series_warnings
+from clrecon.dicom.certificate import certify, collect_scan_warnings, collect_series_warnings, collect_voxel_warnings
+from clrecon.dicom.choice import choose_series, describe_left
 from clrecon.dicom.pixels import read_voxels
 from clrecon.dicom.scan import Progress, Scan, scan_path
-from clrecon.dicom.series import Series, SeriesListing, choose_series, describe_series, group_series
+from clrecon.dicom.series import Series, SeriesListing, describe_series, group_series
 from clrecon.dicom.text import escape_text, join_names
 from clrecon.errors import NoDicomError, RefusedInputError, UsageError
 from clrecon.geometry import Volume
@@ -30,7 +31,7 @@ def read_volume(
         A folder, searched with its subfolders (any file names; DICOMDIR not needed), or one file.
     series : int or str, optional
         Number in the listing (from 1), SeriesInstanceUID, its hash, or description.  Default: the one CT series
-        with most slices; what was left is said in the warnings.
+        with most slices, of several with as many the usable one; what was left is said in the warnings.
     progress : callable, optional
         Called as ``progress(stage, done, total)`` with stage "scan" or "read".
 
@@ -47,7 +48,7 @@ def read_volume(
     RefusedInputError
         Corrupt files, or geometry or pixels that cannot be trusted; names files and figures.
     UsageError
-        `series` names none or several.
+        `series` names none or several; `path` is empty or no path.
 
     Notes
     -----
@@ -62,8 +63,9 @@ def read_volume(
         voxels, facts = read_voxels(stack.slices, progress)
     warnings = [
         *collect_series_warnings(chosen),
+        *collect_voxel_warnings(voxels, facts),
         *collect_scan_warnings(scan),
-        *_describe_left(found, chosen),
+        *describe_left(found, chosen),
     ]
     return Volume(voxels, stack.affine, certify(chosen, stack, facts, scan, stack.affine, warnings))
 
@@ -86,6 +88,8 @@ def list_series(path: str | os.PathLike[str], *, progress: Progress | None = Non
         Nothing there or no DICOM.
     RefusedInputError
         All DICOM files are corrupt.
+    UsageError
+        `path` is empty or no path.
     """
     with _quiet_warnings():
         scan, found = _scan_and_group(path, progress)
@@ -96,7 +100,7 @@ def list_series(path: str | os.PathLike[str], *, progress: Progress | None = Non
     except (NoDicomError, RefusedInputError) as error:
         warnings.append(str(error))
         return SeriesListing(entries, None, dict(scan.skipped), warnings)
-    return SeriesListing(entries, chosen.number, dict(scan.skipped), warnings + _describe_left(found, chosen))
+    return SeriesListing(entries, chosen.number, dict(scan.skipped), warnings + describe_left(found, chosen))
 
 
 @contextmanager
@@ -110,12 +114,15 @@ def _quiet_warnings() -> Iterator[None]:
 def _scan_and_group(path: str | os.PathLike[str], progress: Progress | None) -> tuple[Scan, list[Series]]:
     try:
         folder = Path(path)
+        empty = not os.fspath(path).strip()  # Path("") is the current folder
     except TypeError as error:
         raise UsageError(f"a path is a string or a path object, not {type(path).__name__}") from error
+    if empty:
+        raise UsageError("the input path is empty")
     scan = scan_path(folder, progress)
     if not scan.slices and not scan.others:
         shown = escape_text(str(path), 256)
-        if scan.corrupt:
+        if scan.skipped["corrupt"]:
             raise RefusedInputError(f"no readable DICOM file in {shown}, corrupt: {join_names(map(str, scan.corrupt))}")
         reasons = ", ".join(f"{count} {reason}" for reason, count in sorted(scan.skipped.items()))
         looked = f"{scan.files} file{'s' * (scan.files != 1)} looked at" + (f" ({reasons})" if reasons else "")
@@ -125,11 +132,4 @@ def _scan_and_group(path: str | os.PathLike[str], progress: Progress | None) -> 
 
 
 def _describe_refusal(series: Series) -> str:
-    return f"series {series.number} '{series.identity.description}': " + "; ".join(series.problems)
-
-
-def _describe_left(found: list[Series], chosen: Series) -> list[str]:
-    left = [series for series in found if series is not chosen]
-    if not left:
-        return []
-    return [f"{len(left)} other series left: " + join_names([f"[{series.describe_without_text()}]" for series in left])]
+    return f"series {series.number}: " + "; ".join(series.problems)

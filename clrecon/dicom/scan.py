@@ -1,6 +1,7 @@
 """Walk a folder, or take one file, and read the header of every DICOM file in it.
 
-Names, extensions and DICOMDIR files play no part.  Nothing but regular files inside the folder is opened: devices,
+Names, extensions and DICOMDIR files play no part in what is read; an extension only makes a file that is no DICOM a
+suspect of being what is left of one.  Nothing but regular files inside the folder is opened: devices,
 pipes and links are skipped and counted (a link into the folder is met again at its own place; a link out of it is
 none of our business).
 """
@@ -13,19 +14,24 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from clrecon.dicom.elements import CorruptFileError, NotDicomError
+from clrecon.dicom.elements import META_START, CorruptFileError, NotDicomError
 from clrecon.dicom.header import OtherImage, SliceHeader, read_header
 from clrecon.dicom.text import escape_text
 from clrecon.errors import NoDicomError
 
-__all__ = ["Progress", "Scan", "scan_path"]
+__all__ = ["CorruptFile", "Progress", "Scan", "scan_path"]
 
 Progress = Callable[[str, int, int], None]
+
+DICOM_SUFFIXES = (".dcm", ".dic", ".dicom", ".ima")
+BLANK_START = bytes(128) + b"DICM"
+APPLE_DOUBLE = b"\x00\x05\x16\x07"
+"""Start of the "._NAME" files that macOS puts beside the files of a foreign disk."""
 
 
 @dataclass(frozen=True)
 class CorruptFile:
-    """A file that says it is DICOM and is not readable as such."""
+    """A file, or a folder, that may be or hold a DICOM image and is not readable as such."""
 
     file: Path
     reason: str
@@ -47,6 +53,9 @@ class Scan:
     skipped : Counter
         Reason to number of files (or folders) that were passed over.
     corrupt : list of CorruptFile
+        Files that say they are DICOM and cannot be parsed; files and folders that cannot be read at all.
+    suspects : list of CorruptFile
+        Files that are no DICOM by their content, but look like what is left of one.
     files : int
         Regular files looked at.
     """
@@ -55,6 +64,7 @@ class Scan:
     others: list[OtherImage] = field(default_factory=list)
     skipped: Counter[str] = field(default_factory=Counter)
     corrupt: list[CorruptFile] = field(default_factory=list)
+    suspects: list[CorruptFile] = field(default_factory=list)
     files: int = 0
 
 
@@ -86,13 +96,17 @@ def scan_path(path: Path, progress: Progress | None = None) -> Scan:
 def _take_file(file: Path, scan: Scan) -> None:
     try:
         header = read_header(file)
-    except NotDicomError:
+    except NotDicomError as error:
         scan.skipped["not DICOM"] += 1
+        reason = _suspect(file, error.start)
+        if reason:
+            scan.suspects.append(CorruptFile(file, reason))
     except CorruptFileError as error:
         scan.skipped["corrupt"] += 1
         scan.corrupt.append(CorruptFile(file, str(error)))
     except OSError:
         scan.skipped["not readable"] += 1
+        scan.corrupt.append(CorruptFile(file, "not readable"))
     else:
         if header is None:
             scan.skipped["DICOMDIR"] += 1
@@ -102,6 +116,15 @@ def _take_file(file: Path, scan: Scan) -> None:
             scan.others.append(header)
 
 
+def _suspect(file: Path, start: bytes) -> str:
+    """Say why a file without the mark of DICOM may be what is left of an image; empty where nothing says so."""
+    if file.name.startswith("._") and start.startswith(APPLE_DOUBLE):
+        return ""
+    if 0 < len(start) < META_START and BLANK_START.startswith(start):
+        return "cut within the preamble"
+    return "named like DICOM but is none" if file.suffix.lower() in DICOM_SUFFIXES else ""
+
+
 def _list_files(path: Path, scan: Scan) -> list[Path]:
     """List the regular files at `path`, sorted, and count what was passed over."""
     try:
@@ -109,7 +132,7 @@ def _list_files(path: Path, scan: Scan) -> list[Path]:
             return [path]
         if not path.is_dir():
             what = "is neither a folder nor a regular file" if os.path.lexists(path) else "does not exist"
-            raise NoDicomError(f"{path} {what}")
+            raise NoDicomError(f"{escape_text(str(path), 256)} {what}")
         with os.scandir(path):
             pass
     except (OSError, ValueError) as error:
@@ -120,12 +143,14 @@ def _list_files(path: Path, scan: Scan) -> list[Path]:
     files: list[str] = []
     folders = [str(path)]
     while folders:
+        folder = folders.pop()
         try:
-            with os.scandir(folders.pop()) as entries:
+            with os.scandir(folder) as entries:
                 for entry in entries:
                     _sort_entry(entry, root, files, folders, scan.skipped)
         except OSError:
             scan.skipped["folder not readable"] += 1
+            scan.corrupt.append(CorruptFile(Path(folder), "folder not readable"))
     return [Path(file) for file in sorted(files)]
 
 

@@ -1,4 +1,4 @@
-"""Slices to series: group, number, list, choose."""
+"""Slices to series: group, number, list."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,15 +15,16 @@ from clrecon.dicom.gate import Stack, measure_stack
 from clrecon.dicom.header import OtherImage, SeriesIdentity, SliceHeader
 from clrecon.dicom.scan import CorruptFile, Scan
 from clrecon.dicom.text import hash_uid, join_names
-from clrecon.errors import NoDicomError, RefusedInputError, UsageError
 from clrecon.geometry import column_spacing
 
-__all__ = ["Series", "SeriesEntry", "SeriesListing", "choose_series", "describe_series", "group_series"]
+__all__ = ["Series", "SeriesEntry", "SeriesListing", "describe_series", "group_series"]
 
 SPLIT_ANGLE_RAD = np.radians(1.0)
 """Slices of one SeriesInstanceUID whose directions differ by more are separate stacks (a localizer, another plane);
 below, they are one stack with a fault that the gate names."""
 PROBLEMS_SHOWN = 3
+SLICE_MODALITIES = ("MR", "NM", "PT")
+"""Other modalities whose files are slices: a corrupt file among them is one of theirs."""
 
 
 @dataclass
@@ -38,7 +40,7 @@ class Series:
     others : list of OtherImage
         Its files that cannot be slices.
     corrupt : list of CorruptFile
-        Unreadable DICOM files in the folders of its slices: each may be one of its slices.
+        Files and folders that cannot be read and may be, or hold, slices of it.
     number : int
         Place in the listing, from 1.
     """
@@ -54,6 +56,11 @@ class Series:
     def count(self) -> int:
         """Slices, the frames of multi-frame images among them."""
         return len(self.headers) + sum(image.frames for image in self.others)
+
+    @property
+    def single_frame_count(self) -> int:
+        """Slices, multi-frame images left out: those are not supported."""
+        return len(self.headers) + sum(image.frames == 1 for image in self.others)
 
     @cached_property
     def stack(self) -> Stack | None:
@@ -73,7 +80,7 @@ class Series:
             problems.append("localizer images, not a stack")
         if self.corrupt:
             problems.append(
-                "corrupt DICOM files beside its slices, which may belong to it (restore or remove them): "
+                "files or folders that are cut, corrupt or not readable may belong to it (restore or remove them): "
                 + join_names(map(str, self.corrupt))
             )
         # Bad files leave holes, which would only hide the cause.
@@ -86,7 +93,7 @@ class Series:
         return f"{self.number}: {self.identity.modality} '{self.identity.description}', {self._describe_count()}"
 
     def describe_without_text(self) -> str:
-        """One line for a report: without the description, since people type names into it."""
+        """One line for a warning: without the description, since people type names into it."""
         return f"{self.number}: {self.identity.modality} {hash_uid(self.identity.uid)}, {self._describe_count()}"
 
     def _describe_count(self) -> str:
@@ -162,9 +169,9 @@ def group_series(scan: Scan) -> list[Series]:
     slices: dict[str, list[SliceHeader]] = defaultdict(list)
     others: dict[str, list[OtherImage]] = defaultdict(list)
     for header in scan.slices:
-        slices[header.series.uid or str(header.file.parent)].append(header)
+        slices[_group_key(header)].append(header)
     for image in scan.others:
-        others[image.series.uid or str(image.file.parent)].append(image)
+        others[_group_key(image)].append(image)
     found = []
     for uid in {**slices, **others}:
         parts = _split_slices(slices[uid])
@@ -182,10 +189,42 @@ def group_series(scan: Scan) -> list[Series]:
     found.sort(key=_listing_key)
     for number, series in enumerate(found, start=1):
         series.number = number
-        if series.kind == "stack":
-            folders = {header.file.parent for header in series.headers}
-            series.corrupt = [corrupt for corrupt in scan.corrupt if corrupt.file.parent in folders]
+    if scan.corrupt or scan.suspects:
+        _blame_corrupt_files(found, scan)
     return found
+
+
+def _blame_corrupt_files(found: Sequence[Series], scan: Scan) -> None:
+    """Give every stack the unreadable files that may belong to it: a lost slice at its end would leave no hole.
+
+    A corrupt or unreadable file may belong to any stack, unless its folder holds slices of other series only.  A
+    suspect may belong to a stack with slices in its folder, or to one whose slices lie in several folders where its
+    own folder holds no slices at all.
+    """
+    holders: dict[Path, set[str]] = defaultdict(set)  # folder to the series, by UID, with slices in it
+    for series in found:
+        if series.kind == "capture" or series.kind == "other" and series.identity.modality not in SLICE_MODALITIES:
+            continue
+        images: list[SliceHeader | OtherImage] = [*series.headers, *series.others]
+        for image in images:
+            holders[image.file.parent].add(_group_key(image))
+    for series in found:
+        if series.kind != "stack":
+            continue
+        own = _group_key((series.headers or series.others)[0])
+        spread = sum(own in keys for keys in holders.values()) > 1
+        for corrupt in scan.corrupt:
+            keys = holders.get(corrupt.file.parent)
+            if keys is None or own in keys:
+                series.corrupt.append(corrupt)
+        for suspect in scan.suspects:
+            keys = holders.get(suspect.file.parent)
+            if own in keys if keys is not None else spread:
+                series.corrupt.append(suspect)
+
+
+def _group_key(image: SliceHeader | OtherImage) -> str:
+    return image.series.uid or str(image.file.parent)
 
 
 def _listing_key(series: Series) -> tuple[bool, int, str]:
@@ -239,78 +278,3 @@ def describe_series(series: Series, warnings: Iterable[str] = ()) -> SeriesEntry
         warnings=list(warnings),
         problems=list(series.problems),
     )
-
-
-def choose_series(found: Sequence[Series], wanted: int | str | None = None) -> Series:
-    """Choose the series to read.
-
-    Parameters
-    ----------
-    found : sequence of Series
-    wanted : int or str, optional
-        Number in the listing, SeriesInstanceUID, its hash, or the description (whole, or a part that only one
-        series has).  None takes the one CT stack with most slices.
-
-    Raises
-    ------
-    UsageError
-        `wanted` names none or several; lists what is there.
-    NoDicomError
-        There is no CT series, or the one named is none.
-    RefusedInputError
-        Several CT stacks have the same, largest number of slices; or there is no stack.
-    """
-    if wanted is None:
-        ct = [series for series in found if series.kind != "other"]
-        if not ct:
-            raise NoDicomError(_describe_modalities(found))
-        return _take_largest(ct)
-    matches = _match_series(found, wanted)
-    if len({series.identity for series in matches}) != 1:
-        count = "no series matches" if not matches else f"{len(matches)} series match"
-        raise UsageError(f"{count} series={wanted!r}; there are {_list_lines(found)}")
-    chosen = matches[0] if len(matches) == 1 else _take_largest(matches)
-    if chosen.kind == "other":
-        raise NoDicomError(f"series {chosen.number} is of modality {chosen.identity.modality}, not CT")
-    return chosen
-
-
-def _match_series(found: Sequence[Series], wanted: int | str) -> list[Series]:
-    text = str(wanted).strip()
-    by_id = [series for series in found if text in (series.identity.uid, hash_uid(series.identity.uid)) and text]
-    if by_id:
-        return by_id
-    if text.isascii() and text.isdigit():
-        return [series for series in found if series.number == int(text)]
-    folded = text.casefold()
-    exact = [series for series in found if series.identity.description.casefold() == folded]
-    return exact or [series for series in found if folded and folded in series.identity.description.casefold()]
-
-
-def _take_largest(candidates: Sequence[Series]) -> Series:
-    stacks = [series for series in candidates if series.kind == "stack"]
-    if not stacks:
-        if len(candidates) == 1:
-            return candidates[0]  # read_volume refuses it with its own problem
-        raise RefusedInputError(f"no CT stack among {_list_lines(candidates)}")
-    most = max(series.count for series in stacks)
-    largest = [series for series in stacks if series.count == most]
-    if len(largest) == 1:
-        return largest[0]
-    if most == 1:
-        raise RefusedInputError(f"a single slice cannot make a surface: {len(largest)} series of one slice each")
-    raise RefusedInputError(
-        f"{len(largest)} CT series have {most} slices each, choose one with --series: {_list_lines(largest)}"
-    )
-
-
-def _describe_modalities(found: Sequence[Series]) -> str:
-    counts: dict[str, int] = defaultdict(int)
-    for series in found:
-        counts[series.identity.modality] += 1
-    what = ", ".join(f"{count} series of modality {modality}" for modality, count in sorted(counts.items()))
-    return f"found {what}, no CT series"
-
-
-def _list_lines(found: Sequence[Series]) -> str:
-    return join_names([f"[{series.describe()}, hash {hash_uid(series.identity.uid)}]" for series in found])

@@ -22,6 +22,7 @@ _TAGS = {
     "SOPClassUID": 0x00080016,
     "Modality": 0x00080060,
     "SeriesDescription": 0x0008103E,
+    "PatientID": 0x00100020,
     "SliceThickness": 0x00180050,
     "SpacingBetweenSlices": 0x00180088,
     "SeriesInstanceUID": 0x0020000E,

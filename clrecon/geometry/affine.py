@@ -55,9 +55,14 @@ def checked_affine(affine: ArrayLike) -> Float64Array:
     Raises
     ------
     UsageError
-        Not 4x4, not finite, last row not (0, 0, 0, 1), or singular.
+        Not 4x4 numbers, not finite, last row not (0, 0, 0, 1), or singular.
     """
-    checked = np.array(affine, dtype=np.float64)
+    try:
+        if np.iscomplexobj(affine):
+            raise TypeError("complex numbers")
+        checked = np.array(affine, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise UsageError(f"an affine is a 4x4 array of numbers: {error}") from error
     if checked.shape != (4, 4):
         raise UsageError(f"an affine is a 4x4 array, this one has shape {checked.shape}")
     if not np.isfinite(checked).all():
@@ -87,7 +92,10 @@ def apply_affine(affine: Float64Array, points: ArrayLike) -> Float64Array:
     UsageError
         `points` is not (n, 3).
     """
-    points = np.asarray(points, dtype=np.float64)
+    try:
+        points = np.asarray(points, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise UsageError(f"points are an array of numbers of shape (n, 3): {error}") from error
     if points.ndim != 2 or points.shape[1] != 3:
         raise UsageError(f"points have shape (n, 3), these have {points.shape}")
     return points @ affine[:3, :3].T + affine[:3, 3]

@@ -17,6 +17,12 @@ from clrecon.errors import NoSurfaceError, UsageError
 from clrecon.geometry.affine import normal_matrix
 from clrecon.geometry.volume import AIR_HU, Volume
 
+LARGEST_INTEGER = 2**23
+"""Integer voxels are interpolated in float32, which holds halves of integers up to here."""
+
+LARGEST_FLOAT = 1e30
+"""Differences of float voxels up to here, and their squares after scaling, stay within float32."""
+
 __all__ = ["IsoRule", "choose_iso_rule", "data_range", "slice_normal_matrices", "vertex_margin"]
 
 
@@ -26,6 +32,8 @@ class IsoRule:
 
     Attributes
     ----------
+    iso_value : float
+        As asked for, HU.
     lowest_inside : int or float
         A sample is inside when its value is >= this.  For integer voxels the lowest integer >= the iso value.
     iso_level : float
@@ -37,6 +45,7 @@ class IsoRule:
         The volume is surrounded by `outside`; else the surface ends open at the border.
     """
 
+    iso_value: float
     lowest_inside: int | float
     iso_level: float
     outside: float
@@ -86,48 +95,83 @@ def choose_iso_rule(volume: Volume, iso_value: float, closed: bool = True) -> Is
     Raises
     ------
     UsageError
-        `iso_value` is NaN or infinite.
+        `iso_value` is no finite number, or values are too large to be interpolated in float32.
     NoSurfaceError
         Float voxels that hold NaN or infinite values.
     """
-    iso_value = float(iso_value)
-    if not math.isfinite(iso_value):
-        raise UsageError(f"the iso value is {iso_value}: give a finite number of HU")
+    iso_value = _checked_iso_value(iso_value)
     dtype = volume.voxels.dtype
     if dtype.kind == "f":
         low, high = data_range(volume)
         if not (math.isfinite(low) and math.isfinite(high)):
             raise NoSurfaceError(f"the voxels run from {low} to {high}: infinite values have no iso surface")
+        if max(-low, high) > LARGEST_FLOAT:
+            raise UsageError(f"the voxels run from {low:g} to {high:g}: beyond {LARGEST_FLOAT:g} is not supported")
         iso_level = float(np.float32(iso_value))
         lowest_inside: int | float = iso_level
     else:
         low = _lowest_value(volume)
+        if dtype == np.int32:
+            low, high = data_range(volume)
+            if max(-low, high) >= LARGEST_INTEGER:
+                raise UsageError(
+                    f"the voxels run from {low:.0f} to {high:.0f}: integers from {LARGEST_INTEGER} on cannot be"
+                    " interpolated exactly, rescale them or convert them to float32"
+                )
         lowest_inside = math.ceil(iso_value)
         iso_level = iso_value - 0.5 if lowest_inside == iso_value else iso_value
     outside = max(low, float(AIR_HU))
     if outside >= iso_level:
-        # Everything is inside, or the iso value is below air: half a step of the nearest kind beyond the level.
-        outside = iso_level - 0.5
-    return IsoRule(lowest_inside, iso_level, outside, closed)
+        # Everything is inside, or the iso value is below air: a value beyond the level that float32 tells from it.
+        outside = iso_level - max(0.5, abs(iso_level) * 2.0**-20)
+    return IsoRule(iso_value, lowest_inside, iso_level, outside, closed)
+
+
+def _checked_iso_value(iso_value: float) -> float:
+    try:
+        number = float(iso_value)
+    except (TypeError, ValueError) as error:
+        raise UsageError(f"the iso value is {iso_value!r}: give a number of HU") from error
+    if not math.isfinite(number):
+        raise UsageError(f"the iso value is {number}: give a finite number of HU")
+    if abs(number) > LARGEST_FLOAT:
+        raise UsageError(f"the iso value is {number:g}: beyond {LARGEST_FLOAT:g} is not supported")
+    return number
+
+
+LARGEST_MARGIN = 0.25
+"""Steps; beyond it a vertex could not say any more where on its edge it lies."""
 
 
 def vertex_margin(volume: Volume, border: int) -> NDArray[np.float64]:
     """Smallest distance of a vertex from a sample along i, j, k, in index steps.
 
     Vertices are float32 millimetres: two that lie closer to one sample than a few units in the last place of
-    their coordinates could fall together, and a triangle between them would have no area.  Four units are kept.
+    the volume's largest coordinate could fall together, and a triangle between them would have no area.  Four units
+    are kept; a vertex that belongs closer to a sample is moved by less than that.
 
     Returns
     -------
     ndarray, shape (3,), float64
-        Typically 2e-4 of a step: four times the rounding of the coordinates themselves.
+        Typically 2e-4 of a step: eight times the rounding of the coordinates themselves.
+
+    Raises
+    ------
+    UsageError
+        The volume lies so far from the origin that float32 cannot tell its voxels apart well.
     """
     ends = [(-border, n - 1 + border) for n in volume.shape_ijk]
     largest = np.abs(volume.ijk_to_lps(list(product(*ends)))).max()
     unit = float(np.spacing(np.float32(largest)))
     steps = np.array(volume.spacing)
     steps[2] = np.linalg.norm(np.diff(volume.slice_origins(border=1), axis=0), axis=1).min()
-    return np.minimum(4.0 * unit / steps, 0.25)
+    margin = 4.0 * unit / steps
+    if margin.max() > LARGEST_MARGIN:
+        raise UsageError(
+            f"the volume reaches {largest:.3g} mm from the origin with steps of {steps.min():.3g} mm:"
+            f" float32 vertices come in steps of {unit:.2g} mm there; shift its origin"
+        )
+    return margin
 
 
 def slice_normal_matrices(volume: Volume, border: int) -> NDArray[np.float64]:

@@ -21,14 +21,16 @@ def frame_from_lps(space: str) -> NDArray[np.float64]:
     Parameters
     ----------
     space : {"lps", "ras"}
+        Upper or lower case.
 
     Raises
     ------
     UsageError
         Unknown space.
     """
-    if space == "lps":
+    name = str(space).lower()
+    if name == "lps":
         return np.eye(3)
-    if space == "ras":
+    if name == "ras":
         return np.diag((-1.0, -1.0, 1.0))
     raise UsageError(f"unknown space {space!r}: use one of {', '.join(SPACES)}")

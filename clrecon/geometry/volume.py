@@ -21,12 +21,14 @@ DEVICE_DTYPES = tuple(np.dtype(name) for name in ("int8", "uint8", "int16", "uin
 
 
 def _device_ready(voxels: NDArray[Any]) -> NDArray[Any]:
-    """Return `voxels` C-contiguous in native byte order and in one of `DEVICE_DTYPES`, without loss of range."""
+    """Return `voxels` C-contiguous in native byte order and in one of `DEVICE_DTYPES`; refuse what goes beyond."""
     dtype = voxels.dtype.newbyteorder("=")
     if dtype == np.bool_:
         dtype = np.dtype(np.uint8)
     elif dtype.kind == "f" and dtype != np.float32:
         dtype = np.dtype(np.float32)
+        if np.abs(voxels).max() > np.finfo(np.float32).max and np.isfinite(voxels).all():
+            raise UsageError("the voxels go beyond the range of float32")
     elif dtype.kind in "iu" and dtype not in DEVICE_DTYPES:
         limits = np.iinfo(np.int32)
         low, high = int(voxels.min()), int(voxels.max())
@@ -36,6 +38,15 @@ def _device_ready(voxels: NDArray[Any]) -> NDArray[Any]:
     elif dtype not in DEVICE_DTYPES:
         raise UsageError(f"voxels of type {voxels.dtype} are not supported: use integers or floats")
     return np.ascontiguousarray(voxels, dtype=dtype)
+
+
+def _as_array(voxels: ArrayLike) -> NDArray[Any]:
+    if isinstance(voxels, np.ma.MaskedArray) and np.ma.is_masked(voxels):
+        raise UsageError("masked voxels: fill them first, for CT with voxels.filled(clrecon.geometry.AIR_HU)")
+    try:
+        return np.asarray(voxels)
+    except ValueError as error:
+        raise UsageError(f"voxels are no array of numbers: {error}") from error
 
 
 class Volume:
@@ -59,7 +70,7 @@ class Volume:
     """
 
     def __init__(self, voxels: ArrayLike, affine: ArrayLike, report: dict[str, Any] | None = None):
-        array = np.asarray(voxels)
+        array = _as_array(voxels)
         if array.ndim != 3:
             raise UsageError(f"voxels have three axes (k, j, i), these have shape {array.shape}")
         if array.size == 0:

@@ -1,7 +1,7 @@
 """Kernel sources, programs and launches: between the drivers below and the operators above."""
 
 from clrecon.kernels.arrays import allocate, download, empty_output, upload
-from clrecon.kernels.launch import Stopwatch, launch
+from clrecon.kernels.launching import Stopwatch, launch
 from clrecon.kernels.program import Program, load_program
 from clrecon.kernels.sources import kernel_files, read_kernel_source
 

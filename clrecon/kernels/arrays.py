@@ -15,6 +15,10 @@ from clrecon.opencl.quirks import import_pyopencl
 __all__ = ["allocate", "download", "empty_output", "upload"]
 
 
+SHARED_BYTES = 1 << 20
+"""Arrays below this are copied to the device even where it could use them in place."""
+
+
 def _make_buffer(device: Device, flags: Any, size: int, host: NDArray[Any] | None = None) -> Any:
     cl = import_pyopencl()
     try:
@@ -36,7 +40,8 @@ def upload(device: Device, array: NDArray[Any]) -> Any:
     cl = import_pyopencl()
     array = np.ascontiguousarray(array)
     flags = cl.mem_flags.READ_ONLY
-    if device.shares_host_memory:
+    # float4 and its like need addresses that numpy does not promise: small tables are copied.
+    if device.shares_host_memory and array.nbytes >= SHARED_BYTES:
         return _make_buffer(device, flags | cl.mem_flags.USE_HOST_PTR, array.nbytes, array)
     return _make_buffer(device, flags | cl.mem_flags.COPY_HOST_PTR, array.nbytes, array)
 
@@ -44,7 +49,10 @@ def upload(device: Device, array: NDArray[Any]) -> Any:
 def empty_output(device: Device, shape: tuple[int, ...], dtype: DTypeLike) -> tuple[NDArray[Any], Any]:
     """Return an uninitialised host array and a buffer for the device to write it; `download` fills the array."""
     cl = import_pyopencl()
-    array: NDArray[Any] = np.empty(shape, dtype=dtype)
+    try:
+        array: NDArray[Any] = np.empty(shape, dtype=dtype)
+    except MemoryError as error:
+        raise DeviceError(f"the result does not fit the memory of this computer: {error}") from error
     if device.shares_host_memory and array.nbytes:
         return array, _make_buffer(device, cl.mem_flags.WRITE_ONLY | cl.mem_flags.USE_HOST_PTR, array.nbytes, array)
     return array, allocate(device, array.nbytes)
@@ -71,5 +79,5 @@ def download(device: Device, array: NDArray[Any], array_d: Any) -> NDArray[Any]:
         else:
             cl.enqueue_copy(device.queue, array, array_d, is_blocking=True)
     except cl.Error as error:
-        raise DeviceError(f"reading from {device.label} failed: {describe_error(error)}") from error
+        raise device.fail("reading failed", error) from error
     return array

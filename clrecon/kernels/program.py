@@ -48,16 +48,27 @@ def load_program(device: Device, name: str, variants: Mapping[str, str] | None =
     """
     options = tuple(f"-D{macro}={value}" for macro, value in sorted((variants or {}).items()))
     key = (name, options)
-    if key not in device.programs:
-        cl = import_pyopencl()
-        try:
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # a compiler's chatter about code that builds
-                built = cl.Program(device.context, read_kernel_source(name)).build(["-cl-std=CL1.2", *options])
-            device.programs[key] = Program(name, built)
-        except (cl.Error, RuntimeError) as error:
-            lines = [line.strip() for line in str(error).splitlines() if line.strip()]
-            first = next((line for line in lines if "error" in line.lower() and "cl/" in line), lines[0])
-            raise DeviceError(f"cl/{name} does not build on {device.label}: {first}") from error
-    program: Program = device.programs[key]
-    return program
+    with device.lock:
+        if key not in device.programs:
+            device.programs[key] = _build(device, name, options)
+        program: Program = device.programs[key]
+        return program
+
+
+def _build(device: Device, name: str, options: tuple[str, ...]) -> Program:
+    cl = import_pyopencl()
+    context = device.context
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # a compiler's chatter about code that builds
+            return Program(name, cl.Program(context, read_kernel_source(name)).build(["-cl-std=CL1.2", *options]))
+    except (cl.Error, RuntimeError, OSError) as error:  # OSError: the driver's or pyopencl's cache
+        raise DeviceError(f"cl/{name} does not build on {device.label}: {_first_complaint(str(error))}") from error
+
+
+def _first_complaint(log: str) -> str:
+    """The first line of a build log that says what is wrong, with its place in our files if there is one."""
+    lines = [line.strip() for line in log.splitlines() if line.strip()]
+    complaints = [line for line in lines if "error:" in line.lower()]
+    placed = [line for line in complaints if ".cl:" in line or ".h:" in line]
+    return next(iter([*placed, *complaints, *lines]), "the driver does not say why")

@@ -3,6 +3,6 @@
 from clrecon.mesh.components import select_components
 from clrecon.mesh.mesh import Mesh
 from clrecon.mesh.quality import measure_quality
-from clrecon.mesh.writers import FORMATS, check_format, write_mesh
+from clrecon.mesh.writers import FORMATS, check_format, stage_mesh, write_mesh
 
-__all__ = ["FORMATS", "Mesh", "check_format", "measure_quality", "select_components", "write_mesh"]
+__all__ = ["FORMATS", "Mesh", "check_format", "measure_quality", "select_components", "stage_mesh", "write_mesh"]

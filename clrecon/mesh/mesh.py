@@ -139,7 +139,7 @@ class Mesh:
         normals : ndarray, shape (n, 3), float32, or None
         """
         signs = np.diag(frame_from_lps(space)).astype(np.float32)
-        if space == "lps":
+        if space.lower() == "lps":
             return self._vertices, self._normals
         # Adding 0 turns -0 into 0, which text formats would show.
         vertices = self._vertices * signs + np.float32(0)

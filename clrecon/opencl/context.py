@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from functools import cached_property
+import re
+import sys
+import threading
 from typing import Any
 
 from clrecon.errors import DeviceError
@@ -20,6 +22,25 @@ def describe_error(error: Exception) -> str:
     return text.splitlines()[0]
 
 
+def _version_numbers(text: str) -> tuple[int, ...]:
+    """The numbers of a version, so that 10 comes after 9."""
+    return tuple(int(number) for number in re.findall(r"[0-9]+", text))
+
+
+def _find_shortcoming(cl_device: Any) -> str:
+    """Why clrecon cannot work on a device, empty where it can."""
+    numbers = _version_numbers(cl_device.version)[:2]
+    if not cl_device.available:
+        return "it is not available"
+    if not cl_device.compiler_available:
+        return "it has no compiler"
+    if numbers < (1, 2):
+        return f"it has {cl_device.version.strip()}, OpenCL 1.2 is needed"
+    if bool(cl_device.endian_little) != (sys.byteorder == "little"):
+        return "its byte order is not that of this computer"
+    return ""
+
+
 class Device:
     """An OpenCL device; context and queue are made at first use.
 
@@ -34,6 +55,10 @@ class Device:
     compute_units : int
     is_simulator : bool
         A checking simulator such as Oclgrind: used only when it is named.
+    shortcoming : str
+        Why the device cannot be used; empty where it can.
+    lock : threading.RLock
+        Held while a kernel gets its arguments and is enqueued: kernels are shared between threads.
     """
 
     def __init__(self, index: int, cl_platform: Any, cl_device: Any):
@@ -55,15 +80,19 @@ class Device:
         self.is_simulator: bool = quirks.is_simulator(self.platform)
         self.shares_host_memory: bool = quirks.shares_host_memory(self.platform, self.type)
         self.has_event_times: bool = quirks.has_event_times(self.platform)
+        self.shortcoming: str = _find_shortcoming(cl_device)
+        self.lock = threading.RLock()
         self.programs: dict[tuple[str, tuple[str, ...]], Any] = {}
+        self._context: Any = None
+        self._queue: Any = None
 
     @property
-    def score(self) -> tuple[int, int, str, int]:
+    def score(self) -> tuple[int, int, tuple[int, ...], int]:
         """Sort key of the automatic choice: type, then memory, then driver version, then the order found."""
         rank = {"gpu": 3, "accelerator": 2, "cpu": 1}.get(self.type, 0)
         if quirks.is_software_gpu(self.name):
             rank = 0
-        return rank, self.memory_bytes, self.driver, -self.index
+        return rank, self.memory_bytes, _version_numbers(self.driver), -self.index
 
     @property
     def group_size(self) -> int:
@@ -75,7 +104,7 @@ class Device:
         """Platform and device name, for messages and reports."""
         return f"{self.name} ({self.platform})"
 
-    @cached_property
+    @property
     def context(self) -> Any:
         """The pyopencl context of this device alone.
 
@@ -85,19 +114,33 @@ class Device:
             The driver refuses.
         """
         cl = quirks.import_pyopencl()
-        try:
-            return cl.Context([self.cl_device])
-        except cl.Error as error:
-            raise DeviceError(f"device {self.label} cannot be opened: {describe_error(error)}") from error
+        with self.lock:
+            if self._context is None:
+                try:
+                    self._context = cl.Context([self.cl_device])
+                except cl.Error as error:
+                    raise DeviceError(f"device {self.label} cannot be opened: {describe_error(error)}") from error
+            return self._context
 
-    @cached_property
+    @property
     def queue(self) -> Any:
         """The in-order command queue, with profiling."""
         cl = quirks.import_pyopencl()
-        try:
-            return cl.CommandQueue(self.context, properties=cl.command_queue_properties.PROFILING_ENABLE)
-        except cl.Error as error:
-            raise DeviceError(f"device {self.label} gives no queue: {describe_error(error)}") from error
+        with self.lock:
+            if self._queue is None:
+                try:
+                    profiling = cl.command_queue_properties.PROFILING_ENABLE
+                    self._queue = cl.CommandQueue(self.context, properties=profiling)
+                except cl.Error as error:
+                    raise DeviceError(f"device {self.label} gives no queue: {describe_error(error)}") from error
+            return self._queue
+
+    def fail(self, what: str, error: Exception) -> DeviceError:
+        """Return the error for a failed call, and forget context and queue: a lost device needs fresh ones."""
+        with self.lock:
+            self._context = self._queue = None
+            self.programs.clear()
+        return DeviceError(f"{what} on {self.label}: {describe_error(error)}")
 
     def describe(self) -> dict[str, Any]:
         """Facts for ``clrecon devices --json`` and reports."""
@@ -113,6 +156,7 @@ class Device:
             "max_allocation_bytes": self.max_allocation_bytes,
             "compute_units": self.compute_units,
             "simulator": self.is_simulator,
+            "shortcoming": self.shortcoming,
         }
 
     def __repr__(self) -> str:

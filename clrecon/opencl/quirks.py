@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+import atexit
 import os
+import shutil
+import tempfile
+from functools import cache
+from pathlib import Path
 from typing import Any
 
 __all__ = [
     "SIMULATOR_PLATFORMS",
+    "cache_warnings",
     "has_event_times",
     "import_pyopencl",
     "is_simulator",
@@ -25,9 +31,41 @@ def import_pyopencl() -> Any:
     (read-only home, Oclgrind): the KeyError then hides the cause.
     """
     os.environ.setdefault("PYOPENCL_CACHE_FAILURE_FATAL", "")
+    cache_warnings()
     import pyopencl
 
     return pyopencl
+
+
+def _is_usable(folder: Path) -> bool:
+    """True when a file of some kilobytes can be written in `folder`, which is made where it is not there."""
+    try:
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder) as file:
+            file.write(bytes(1 << 16))
+    except OSError:
+        return False
+    return True
+
+
+@cache
+def cache_warnings() -> tuple[str, ...]:
+    """See to it that drivers can keep built kernels; what to tell the user when they cannot.
+
+    Without a folder to write to (no HOME, a read-only one, a full disk) PoCL shows no device at all and pyopencl
+    fails while it is imported.  They then get a folder of their own that ends with the process.
+    """
+    home = Path(os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache"))
+    pocl = os.environ.get("POCL_CACHE_DIR")
+    if _is_usable(home) and (pocl is None or _is_usable(Path(pocl))):
+        return ()
+    try:
+        folder = tempfile.mkdtemp(prefix="clrecon-")
+    except OSError:
+        return ("no folder for built kernels can be written: OpenCL drivers may show no device",)
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    os.environ.update(PYOPENCL_NO_CACHE="1", POCL_CACHE_DIR=folder, XDG_CACHE_HOME=folder)
+    return ("the cache folder cannot be written: kernels are built anew by every process",)
 
 
 def is_simulator(platform_name: str) -> bool:

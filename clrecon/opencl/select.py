@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import platform
+import re
 from functools import lru_cache
 from typing import Any
 
@@ -54,7 +55,11 @@ def _discover() -> tuple[tuple[tuple[str, str, str], ...], tuple[Device, ...]]:
             found = []
             if "DEVICE_NOT_FOUND" not in str(error):
                 note = describe_error(error)
-        devices.extend(Device(len(devices) + n, cl_platform, cl_device) for n, cl_device in enumerate(found))
+        for cl_device in found:
+            try:
+                devices.append(Device(len(devices), cl_platform, cl_device))
+            except cl.Error as error:  # one broken driver must not hide the others
+                note = f"a device does not answer: {describe_error(error)}"
         count = f"{len(found)} device{'s' * (len(found) != 1)}"
         platforms.append((cl_platform.name.strip(), cl_platform.version.strip(), note or count))
     return tuple(platforms), tuple(devices)
@@ -82,12 +87,15 @@ def list_devices() -> list[Device]:
 
 
 def _list_for_message(devices: list[Device]) -> str:
-    return "; ".join(f"{device.index}: {device.label}" for device in devices)
+    return "; ".join(
+        f"{device.index}: {device.label}" + (f", unusable: {device.shortcoming}" if device.shortcoming else "")
+        for device in devices
+    )
 
 
 def _match(devices: list[Device], wanted: str) -> list[Device]:
     """Devices that `wanted` names: by index, by type, or by a part of the platform's or device's name."""
-    if wanted.isdigit():
+    if re.fullmatch("[0-9]+", wanted):
         return [device for device in devices if device.index == int(wanted)]
     wanted = wanted.lower()
     of_type = [device for device in devices if device.type == wanted and not device.is_simulator]
@@ -129,7 +137,8 @@ def choose_device(name: str | int | Device | None = None) -> Device:
         return name
     devices = list_devices()
     if not devices:
-        raise DeviceError(f"no OpenCL device found: {driver_advice()}")
+        trouble = "".join(f" ({text})" for text in quirks.cache_warnings())
+        raise DeviceError(f"no OpenCL device found{trouble}: {driver_advice()}")
     wanted, source = ("", "") if name is None else (str(name).strip(), "device")
     if wanted.lower() in ("", "auto"):
         wanted, source = os.environ.get("CLRECON_DEVICE", "").strip(), "CLRECON_DEVICE"
@@ -137,13 +146,17 @@ def choose_device(name: str | int | Device | None = None) -> Device:
         matches = _match(devices, wanted)
         if not matches:
             raise DeviceError(f"{source} {wanted!r} is not there; found {_list_for_message(devices)}")
-        return max(matches, key=lambda device: (not device.is_simulator, device.score))
+        usable = [device for device in matches if not device.shortcoming]
+        if not usable:
+            raise DeviceError(f"device {matches[0].label} cannot be used: {matches[0].shortcoming}")
+        return max(usable, key=lambda device: (not device.is_simulator, device.score))
     if os.environ.get("PYOPENCL_CTX"):
         matches = _named_by_pyopencl(quirks.import_pyopencl(), devices)
     else:
-        matches = [device for device in devices if not device.is_simulator]
+        matches = [device for device in devices if not device.is_simulator and not device.shortcoming]
     if not matches:
         raise DeviceError(
-            f"only simulators found ({_list_for_message(devices)}): name one with --device, or {driver_advice()}"
+            f"no device to choose among {_list_for_message(devices)} (simulators must be named with --device):"
+            f" {driver_advice()}"
         )
     return max(matches, key=lambda device: device.score)

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from clrecon.errors import UsageError
 from clrecon.kernels import Program, Stopwatch, allocate, download, launch, load_program
 from clrecon.opencl import Device
 
@@ -14,6 +15,9 @@ __all__ = ["Compacted", "Scanned", "compact", "exclusive_scan", "prepare_compact
 
 SCAN_PER_ITEM = 16
 """Elements a work-item of cl/compaction/scan.cl."""
+
+LARGEST_SCAN = 2**31
+LARGEST_MASK = 2**27
 
 COMPACT_WORDS = 8
 """Words a work-item of cl/compaction/compact.cl."""
@@ -62,9 +66,13 @@ def exclusive_scan(device: Device, counts_d: Any, n: int, *, stopwatch: Stopwatc
 
     Raises
     ------
+    UsageError
+        `n` is out of range.
     DeviceError
         The device fails.
     """
+    if not 1 <= n <= LARGEST_SCAN:
+        raise UsageError(f"{n:,} elements: a scan takes 1 to {LARGEST_SCAN:,}")
     scan = _load_scan(device)
     blocks = -(-n // (SCAN_PER_ITEM * device.group_size))
     sums_d, block_offsets_d, total_d = (allocate(device, 4 * blocks), allocate(device, 4 * blocks), allocate(device, 8))
@@ -98,9 +106,13 @@ def compact(device: Device, mask_d: Any, words: int, *, stopwatch: Stopwatch | N
 
     Raises
     ------
+    UsageError
+        `words` is out of range.
     DeviceError
         The device fails.
     """
+    if not 1 <= words <= LARGEST_MASK:
+        raise UsageError(f"{words:,} words: a mask has 1 to {LARGEST_MASK:,}, so that positions fit 32 bits")
     program = load_program(device, "compaction/compact.cl")
     chunks = -(-words // COMPACT_WORDS)
     counts_d = allocate(device, 4 * chunks)

@@ -9,12 +9,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from clrecon.errors import DeviceError, NoSurfaceError, UsageError
+from clrecon.errors import ClreconError, DeviceError, NoSurfaceError, UsageError
 from clrecon.geometry import Volume, is_left_handed
 from clrecon.geometry.field import IsoRule, choose_iso_rule, data_range, slice_normal_matrices, vertex_margin
 from clrecon.kernels import Program, Stopwatch, allocate, download, empty_output, launch, load_program, upload
 from clrecon.mesh import Mesh
 from clrecon.opencl import Device, check_budget, choose_device
+from clrecon.opencl.quirks import cache_warnings
 from clrecon.operators.compaction import Compacted, compact, exclusive_scan, prepare_compaction
 
 __all__ = ["extract_isosurface", "prepare_isosurface"]
@@ -89,23 +90,28 @@ def _check_grid(grid: _SampleGrid) -> None:
         raise UsageError(f"the volume has {grid.rows:,} rows: more than 2^32 words of its mask are not supported")
 
 
-def _refuse_level(volume: Volume, iso_value: float) -> NoSurfaceError:
+def _refuse_level(device: Device, volume: Volume, rule: IsoRule) -> ClreconError:
     low, high = data_range(volume)
-    where = "above" if iso_value > high else "below" if iso_value <= low else "within"
+    if low < rule.lowest_inside <= high:
+        return DeviceError(
+            f"{device.label} found no surface at {rule.iso_value:g} HU although the volume runs from {low:g} to"
+            f" {high:g} HU: it computes wrongly, see `clrecon selftest` and try another device"
+        )
+    where = "above" if rule.lowest_inside > high else "at or below the lowest of"
     return NoSurfaceError(
-        f"no surface at {iso_value:g} HU: the volume runs from {low:g} to {high:g} HU,"
+        f"no surface at {rule.iso_value:g} HU: the volume runs from {low:g} to {high:g} HU,"
         f" the iso value lies {where} that range"
     )
 
 
-def _voxel_level(volume: Volume, rule: IsoRule, iso_value: float) -> Any:
+def _voxel_level(device: Device, volume: Volume, rule: IsoRule) -> Any:
     """The lowest inside value as a scalar of the voxels' own type."""
     dtype = volume.voxels.dtype
     if dtype.kind == "f":
         return np.float32(rule.lowest_inside)
     limits = np.iinfo(dtype)
     if rule.lowest_inside > limits.max:
-        raise _refuse_level(volume, iso_value)
+        raise _refuse_level(device, volume, rule)
     return dtype.type(max(rule.lowest_inside, limits.min))
 
 
@@ -131,7 +137,9 @@ def _slice_frames(volume: Volume, border: int) -> NDArray[np.float32]:
     return _pad4(np.concatenate([*parts, slice_normal_matrices(volume, border)], axis=1))
 
 
-def _classify(device: Device, grid: _SampleGrid, program: Any, voxels_d: Any, level: Any, stopwatch: Stopwatch) -> Any:
+def _classify(
+    device: Device, grid: _SampleGrid, program: Program, voxels_d: Any, level: Any, stopwatch: Stopwatch
+) -> Any:
     ni, nj, nk = grid.volume.shape_ijk
     mask_d = allocate(device, 4 * grid.rows * grid.words)
     launch(
@@ -143,7 +151,7 @@ def _classify(device: Device, grid: _SampleGrid, program: Any, voxels_d: Any, le
     return mask_d
 
 
-def _count(device: Device, grid: _SampleGrid, program: Any, mask_d: Any, stopwatch: Stopwatch) -> _Counts:
+def _count(device: Device, grid: _SampleGrid, program: Program, mask_d: Any, stopwatch: Stopwatch) -> _Counts:
     rows, words = grid.rows, grid.words
     row_vertices_d, row_triangles_d = allocate(device, 4 * rows), allocate(device, 4 * rows)
     word_vertices_d, word_triangles_d = allocate(device, 2 * rows * words), allocate(device, 2 * rows * words)
@@ -173,7 +181,14 @@ def _count(device: Device, grid: _SampleGrid, program: Any, mask_d: Any, stopwat
 
 
 def _emit(
-    device: Device, grid: _SampleGrid, program: Any, voxels_d: Any, mask_d: Any, counts: _Counts, stopwatch: Stopwatch
+    device: Device,
+    grid: _SampleGrid,
+    program: Program,
+    voxels_d: Any,
+    mask_d: Any,
+    counts: _Counts,
+    margin: NDArray[np.float32],
+    stopwatch: Stopwatch,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.uint32]]:
     volume, rule = grid.volume, grid.rule
     frames_d = upload(device, _slice_frames(volume, rule.border))
@@ -188,7 +203,7 @@ def _emit(
             device, program["emit_vertices"], counts.words.count,
             voxels_d, mask_d, counts.words.positions_d, counts.vertex_offsets_d, counts.word_vertices_d,
             frames_d, steps_d, positions_d, normals_d,
-            np.float32(rule.iso_level), np.float32(rule.outside), _pad4(vertex_margin(volume, rule.border)),
+            np.float32(rule.iso_level), np.float32(rule.outside), margin,
             *(np.int32(n) for n in volume.shape_ijk), np.int32(rule.border), *packing,
             stopwatch=stopwatch,
         )  # fmt: skip
@@ -231,7 +246,8 @@ def extract_isosurface(
     Marching cubes with a derived, face-consistent case table and vertices shared between cells.  A voxel is
     inside when its value is >= `iso_value`.  For integer voxels and an integer `iso_value` k the surface lies at
     k - 0.5, between the integers, so no face is degenerate.  Vertices are mapped through the volume's affine,
-    shear included, once; they are right to one unit in the last place of float32.
+    shear included, once; they are right to one unit in the last place that float32 has for the volume's largest
+    coordinate (6e-5 mm at 1 m), but kept four such units off voxel centres.
 
     Parameters
     ----------
@@ -258,19 +274,23 @@ def extract_isosurface(
     NoSurfaceError
         The iso value crosses nothing; the message gives the range of the data.
     UsageError
-        `iso_value` is not finite, or a row of the volume is too long.
+        `volume` or `iso_value` is not what it should be, values or coordinates are too large for float32, or a row
+        of the volume is too long.
     DeviceError
-        No device, not enough memory, more than 2^32 vertices or triangles, or the device fails.
+        No device, not enough memory, more than 2^32 vertices or triangles, or the device fails or computes wrongly.
 
     References
     ----------
     Lorensen and Cline 1987; Schroeder, Maynard and Geveci 2015.
     """
+    if not isinstance(volume, Volume):
+        raise UsageError(f"a surface needs a Volume, not {type(volume).__name__}: clrecon.Volume(voxels, affine)")
     device = choose_device(device)
     stopwatch = Stopwatch()
     grid = _SampleGrid(volume, choose_iso_rule(volume, iso_value, closed))
     _check_grid(grid)
-    level = _voxel_level(volume, grid.rule, iso_value)
+    margin = _pad4(vertex_margin(volume, grid.rule.border))
+    level = _voxel_level(device, volume, grid.rule)
     if min(grid.shape) < 2:
         raise NoSurfaceError(f"an open volume of {grid.shape} voxels has no cells: leave it closed")
     check_budget(device, {"volume": volume.voxels.nbytes, **grid.scratch()})
@@ -285,14 +305,14 @@ def extract_isosurface(
         mask_d = _classify(device, grid, program, voxels_d, level, stopwatch)
         counts = _count(device, grid, program, mask_d, stopwatch)
     if counts.triangles == 0:
-        raise _refuse_level(volume, iso_value)
+        raise _refuse_level(device, volume, grid.rule)
     output = {"vertices": 24 * counts.vertices, "triangles": 12 * counts.triangles}
     check_budget(device, {"volume": volume.voxels.nbytes, **grid.scratch(), **output})
-    positions, normals, triangles = _emit(device, grid, program, voxels_d, mask_d, counts, stopwatch)
+    positions, normals, triangles = _emit(device, grid, program, voxels_d, mask_d, counts, margin, stopwatch)
     if progress is not None:
         progress("build", 1, 1)
     report = {
-        "iso_value_hu": float(iso_value),
+        "iso_value_hu": grid.rule.iso_value,
         "iso_level_hu": grid.rule.iso_level,
         "closed_at_border": closed,
         "outside_hu": grid.rule.outside if closed else None,
@@ -301,5 +321,6 @@ def extract_isosurface(
         "driver": device.driver,
         "seconds": dict(stopwatch.seconds),
         "kernel_seconds": dict(stopwatch.by_kernel),
+        "warnings": list(cache_warnings()),
     }
     return Mesh(positions, triangles, normals, report)

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from clrecon.errors import UsageError
+from clrecon.errors import NoSurfaceError, UsageError
 from clrecon.pipeline.opening import DeviceOpening
 from clrecon.pipeline.presets import find_preset
 from clrecon.pipeline.progress import Progress, Stopwatch, ignore_progress
-from clrecon.pipeline.report import peak_memory_bytes, platform_name, write_report
+from clrecon.pipeline.report import peak_memory_bytes, platform_name, stage_report
 from clrecon.pipeline.settings import MeshSettings
 from clrecon.version import package_version
 
@@ -37,7 +38,7 @@ def make_mesh(
 
     Outputs that cannot be written are refused first, then a device that is not there, then the input.  The device
     is opened and its kernels are built while the input is read.
-    The mesh is written to a temporary file and renamed; the report follows, as the commit mark.
+    Mesh and report are written to temporary files, then renamed; the report comes last, as the commit mark.
 
     Parameters
     ----------
@@ -79,6 +80,7 @@ def make_mesh(
         device = opening.wait()
         watch.lap("device")
 
+    _check_level(volume, settings.level)
     from clrecon.operators.isosurface import extract_isosurface
 
     mesh = extract_isosurface(volume, settings.level, device, closed=settings.closed, progress=progress)
@@ -89,23 +91,36 @@ def make_mesh(
         mesh = select_components(mesh, keep_largest=settings.keep_largest, min_volume_ml=settings.min_volume_ml)
     watch.lap("surface")
 
-    progress("write", 0, 0)
-    size = mesh.save(output, space=settings.space)
-    watch.lap("write")
-
     quality: dict[str, Any] = {}
     if measure:
         progress("measure", 0, 0)
         quality = mesh.quality()
         watch.lap("measure")
 
-    report = describe(volume, mesh, quality, settings, device)
-    report["output"] = {"format": Path(output).suffix.lower().lstrip("."), "bytes": size}
-    report["seconds"] = _seconds(watch, mesh)
-    report["peak_memory_bytes"] = peak_memory_bytes()
-    if report_path is not None:
-        write_report(report_path, report)
+    from clrecon.mesh import stage_mesh
+
+    progress("write", 0, 0)
+    with ExitStack() as staged:  # both files are on the disk before either replaces an older one
+        mesh_file = staged.enter_context(stage_mesh(mesh, output, settings.space))
+        watch.lap("write")
+        report = describe(volume, mesh, quality, settings, device)
+        report["output"] = {"format": Path(output).suffix.lower().lstrip("."), "bytes": mesh_file.size}
+        report["seconds"] = _seconds(watch, mesh)
+        report["peak_memory_bytes"] = peak_memory_bytes()
+        report_file = None if report_path is None else staged.enter_context(stage_report(report_path, report))
+        mesh_file.commit()
+        if report_file is not None:
+            report_file.commit()
     return report
+
+
+def _check_level(volume: Volume, level: float) -> None:
+    """Refuse an iso value that has every voxel inside: the surface would be the box of the scan."""
+    low, high = volume.report["hu_range"]
+    if level <= low:
+        raise NoSurfaceError(
+            f"no surface at {level:g} HU: every voxel is inside, the volume runs from {low:g} to {high:g} HU"
+        )
 
 
 def check_outputs(output: str | Path, report_path: str | Path | None) -> None:
@@ -145,7 +160,7 @@ def describe(
     if len(mesh.vertices):
         corners = (frame @ mesh.vertices.min(axis=0), frame @ mesh.vertices.max(axis=0))
         bounds = [[float(pick(a, b)) for a, b in zip(*corners, strict=True)] for pick in (min, max)]
-    certificate = _without_free_text(volume.report)
+    certificate = dict(volume.report)
     warnings = [str(text) for text in certificate.pop("warnings", [])]
     warnings += [str(text) for text in (mesh.report or {}).get("warnings", [])]
     if settings.preset_used == "skin":
@@ -153,6 +168,8 @@ def describe(
     report: dict[str, Any] = {
         "affine_ijk_to_lps_mm": volume.affine.tolist(),
         "iso_value_hu": settings.level,
+        "iso_level_hu": (mesh.report or {}).get("iso_level_hu"),
+        "outside_hu": (mesh.report or {}).get("outside_hu"),
         "preset": settings.preset_used,
         "space": settings.space,
         "unit": "mm",
@@ -178,14 +195,6 @@ def describe(
     if settings.preset_used is not None:
         report["preset_reason"] = find_preset(settings.preset_used).source
     return report
-
-
-def _without_free_text(certificate: dict[str, Any]) -> dict[str, Any]:
-    """The certificate of a volume without the series description: people type names into it."""
-    kept = dict(certificate)
-    if isinstance(kept.get("series"), dict):
-        kept["series"] = {name: value for name, value in kept["series"].items() if name != "description"}
-    return kept
 
 
 def _seconds(watch: Stopwatch, mesh: Mesh) -> dict[str, float]:

@@ -9,12 +9,16 @@ import json
 import math
 import sys
 from collections.abc import Mapping
+from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import TYPE_CHECKING, Any, BinaryIO
 
 from clrecon.errors import ClreconError
 
-__all__ = ["error_as_dict", "peak_memory_bytes", "platform_name", "to_json", "write_report"]
+if TYPE_CHECKING:
+    from clrecon.files import StagedFile
+
+__all__ = ["error_as_dict", "peak_memory_bytes", "platform_name", "to_json", "stage_report"]
 
 
 def to_json(value: Any, indent: int | None = 2) -> str:
@@ -44,27 +48,22 @@ def _plain(value: Any) -> Any:
     raise TypeError(f"{type(value).__name__} has no place in a report")
 
 
-def write_report(path: str | Path, report: Mapping[str, Any]) -> int:
-    """Write `report` as JSON in one step: the file holds all of it or is not touched.
-
-    Returns
-    -------
-    int
-        Bytes written.
+def stage_report(path: str | Path, report: Mapping[str, Any]) -> AbstractContextManager[StagedFile]:
+    """Write `report` as JSON under a temporary name, to be committed after the files that it speaks of.
 
     Raises
     ------
     OutputError
         The file cannot be written; an older one of that name is intact.
     """
-    from clrecon.files import replace_file
+    from clrecon.files import stage_file
 
     content = (to_json(report) + "\n").encode("ascii")
 
     def write(stream: BinaryIO) -> None:
         stream.write(content)
 
-    return replace_file(path, write)
+    return stage_file(path, write)
 
 
 def error_as_dict(error: ClreconError) -> dict[str, Any]:

@@ -164,7 +164,7 @@ def test_a_slice_of_padding_alone(tmp_path):
         (set_values(PhotometricInterpretation="MONOCHROME1"), "MONOCHROME1: meant to be shown inverted"),
         (set_values(RescaleType="US"), "RescaleType is 'US': the values are not HU (all slices)"),
         (set_values(LossyImageCompression="01"), "lossy compression: the values are not those that were measured"),
-        (set_values(2, RescaleType="OD"), "RescaleType is 'OD': the values are not HU (slice002.dcm)"),
+        (set_values(2, RescaleType="OD"), "RescaleType is 'OD': the values are not HU (1 of 7 slices, at -397.50 mm)"),
     ],
 )
 def test_doubtful_values_are_kept_with_a_warning(tmp_path, change, words):

@@ -42,6 +42,47 @@ def test_outside_stays_outside_when_everything_is_inside(low, iso_value):
     assert rule.outside < rule.iso_level
 
 
+@pytest.mark.parametrize("order", [1, -1])
+def test_outside_is_found_wherever_the_lowest_value_lies(order):
+    voxels = np.arange(60, dtype=np.int16).reshape(3, 4, 5)[::order] - 7
+    assert choose_iso_rule(Volume(voxels, np.eye(4)), 20).outside == -7
+
+
+@pytest.mark.parametrize(("value", "dtype"), [(300, "int16"), (1e8, "float32"), (-1e8, "float32"), (1e-20, "float32")])
+def test_outside_differs_from_a_constant_volume_in_float32(value, dtype):
+    rule = choose_iso_rule(Volume(np.full((2, 2, 2), value, dtype), np.eye(4)), value)
+    assert np.float32(rule.outside) < np.float32(rule.iso_level) <= np.float32(value)
+    if dtype == "int16":
+        assert rule.outside == rule.iso_level - 0.5
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "dtype", "iso_value"),
+    [
+        (0, 2**23, "int32", 5),
+        (-(2**23), 0, "int32", -5),
+        (0, 1e31, "float32", 5),
+        (0, 1, "float32", 1e31),
+        (0, 9, "int16", -1e300),
+    ],
+)
+def test_values_beyond_float32_interpolation_are_refused(low, high, dtype, iso_value):
+    with pytest.raises(UsageError, match="supported|interpolated"):
+        choose_iso_rule(make_volume(low, high, dtype), iso_value)
+
+
+@pytest.mark.parametrize("bad", ["abc", None, [1, 2]])
+def test_an_iso_value_is_a_number(bad):
+    with pytest.raises(UsageError, match="give a number"):
+        choose_iso_rule(make_volume(0, 1), bad)
+
+
+def test_a_place_where_float32_is_too_coarse_is_refused():
+    volume = Volume(np.zeros((3, 4, 5), np.int16), np.diag((0.1, 0.1, 0.1, 1.0)) + np.eye(4, k=3) * 1e6)
+    with pytest.raises(UsageError, match=r"reaches 1e\+06 mm .* shift its origin"):
+        vertex_margin(volume, 1)
+
+
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
 def test_values_that_are_not_finite_are_refused(bad):
     with pytest.raises(UsageError, match="finite"):

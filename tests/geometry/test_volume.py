@@ -75,6 +75,21 @@ def test_what_is_no_volume_is_refused(voxels, says):
         Volume(voxels, np.eye(4))
 
 
+def test_masked_and_ragged_voxels_are_refused():
+    with pytest.raises(UsageError, match="masked"):
+        Volume(np.ma.masked_equal(np.arange(24).reshape(2, 3, 4), 5), np.eye(4))
+    with pytest.raises(UsageError, match="no array"):
+        Volume([[[1, 2], [3]]], np.eye(4))
+    with pytest.raises(UsageError, match="float32"):
+        Volume(np.full((2, 2, 2), 1e300), np.eye(4))
+
+
+@pytest.mark.parametrize("affine", ["x", [[1, 2], [3]], np.eye(4) * 1j, None])
+def test_an_affine_is_numbers(affine):
+    with pytest.raises(UsageError, match="affine"):
+        Volume(np.zeros((2, 2, 2), np.int16), affine)
+
+
 def test_the_affine_cannot_be_changed_behind_the_inverse():
     volume = Volume(np.zeros((2, 3, 4), np.int16), np.eye(4))
     with pytest.raises(ValueError, match="read-only"):

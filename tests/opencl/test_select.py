@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import sys
+from types import SimpleNamespace
+
 import pytest
 
 from clrecon.errors import DeviceError
 from clrecon.opencl import check_budget, choose_device, list_devices, list_platforms, select
+from clrecon.opencl.context import _find_shortcoming
 
 
 class FakeDevice:
@@ -16,6 +20,7 @@ class FakeDevice:
         self.memory_bytes, self.is_simulator = memory, simulator
         self.max_allocation_bytes = memory // 4
         self.label = f"{name} ({platform})"
+        self.shortcoming = ""
         rank = 0 if software else {"gpu": 3, "accelerator": 2, "cpu": 1}.get(kind, 0)
         self.score = (rank, memory, "1", -index)
 
@@ -43,7 +48,8 @@ def test_the_best_is_a_gpu_with_most_memory(machine):
 
 @pytest.mark.parametrize(
     ("wanted", "name"),
-    [("2", "Radeon"), (2, "Radeon"), ("radeon", "Radeon"), ("nvidia", "H200"), ("cpu", "pthread-Xeon"),
+    [("2", "Radeon"), (2, "Radeon"), (" 2 ", "Radeon"), ("radeon", "Radeon"),
+     ("nvidia", "H200"), ("cpu", "pthread-Xeon"),
      ("gpu", "H200"), ("llvmpipe", "llvmpipe"), ("oclgrind", "Oclgrind Simulator"), ("0", "Oclgrind Simulator")],
 )  # fmt: skip
 def test_a_device_is_found_by_index_type_or_part_of_its_name(machine, wanted, name):
@@ -56,7 +62,7 @@ def test_the_environment_names_a_device_and_the_argument_wins(machine, monkeypat
     assert choose_device("cpu").name == "pthread-Xeon"
 
 
-@pytest.mark.parametrize("wanted", ["9", "geforce"])
+@pytest.mark.parametrize("wanted", ["9", "geforce", "²"])
 def test_a_device_that_is_not_there_lists_what_is(machine, wanted, monkeypatch):
     with pytest.raises(DeviceError, match=f"'{wanted}' is not there; found .*2: Radeon"):
         choose_device(wanted)
@@ -67,9 +73,34 @@ def test_a_device_that_is_not_there_lists_what_is(machine, wanted, monkeypatch):
 
 def test_a_simulator_is_never_chosen_silently(machine, monkeypatch):
     monkeypatch.setattr(select, "list_devices", lambda: machine[:1])
-    with pytest.raises(DeviceError, match="only simulators"):
+    with pytest.raises(DeviceError, match="no device to choose among 0: Oclgrind .*simulators must be named"):
         choose_device()
     assert choose_device("oclgrind").is_simulator
+
+
+def test_a_device_that_cannot_work_is_passed_over(machine):
+    machine[3].shortcoming = "it has no compiler"
+    assert choose_device().name == "Radeon"
+    assert choose_device("gpu").name == "Radeon"
+    with pytest.raises(DeviceError, match="H200 .* cannot be used: it has no compiler"):
+        choose_device("h200")
+
+
+@pytest.mark.parametrize(
+    ("changed", "says"),
+    [({"available": False}, "not available"), ({"compiler_available": False}, "no compiler"),
+     ({"version": "OpenCL 1.1 x"}, "OpenCL 1.2 is needed"),
+     ({"endian_little": sys.byteorder != "little"}, "byte order")],
+)  # fmt: skip
+def test_shortcomings_are_named(changed, says):
+    good = {
+        "available": 1,
+        "compiler_available": 1,
+        "version": "OpenCL 3.0 x",
+        "endian_little": sys.byteorder == "little",
+    }
+    assert _find_shortcoming(SimpleNamespace(**good)) == ""
+    assert says in _find_shortcoming(SimpleNamespace(**{**good, **changed}))
 
 
 def test_no_device_says_how_to_get_a_driver(monkeypatch):

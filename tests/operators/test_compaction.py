@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from clrecon.errors import UsageError
 from clrecon.kernels import download, upload
 from clrecon.opencl.context import GROUP_SIZE
 from clrecon.operators.compaction import SCAN_PER_ITEM, compact, exclusive_scan
@@ -35,9 +36,31 @@ def test_devices_with_small_work_groups_get_the_same(device, group, monkeypatch)
 
 
 def test_a_total_beyond_32_bits_is_exact(device):
-    counts = np.full(5000, 2**21, np.uint32)  # a block still fits 32 bits
+    n = 70 * BLOCK + 3  # more blocks than a work-group has items
+    counts = np.full(n, 2**21 - 1, np.uint32)  # a block still fits 32 bits
+    scanned = exclusive_scan(device, upload(device, counts), n)
+    assert scanned.total == n * (2**21 - 1) > 2**32
+    offsets = download(device, np.empty(n, np.uint32), scanned.offsets_d)
+    assert np.array_equal(offsets, twin.exclusive_scan(counts)[0])
+
+
+@pytest.mark.oclgrind
+def test_more_blocks_than_a_group_has_items(device, monkeypatch):
+    """With groups of one wavefront this is a large scan; small groups make it one that a simulator can check."""
+    monkeypatch.setattr(device, "max_work_group_size", 4)
+    counts = np.random.default_rng(4).integers(0, 50, 4 * SCAN_PER_ITEM * 5 + 3).astype(np.uint32)
     scanned = exclusive_scan(device, upload(device, counts), counts.size)
-    assert scanned.total == 5000 * 2**21 > 2**32
+    offsets = download(device, np.empty(counts.size, np.uint32), scanned.offsets_d)
+    assert np.array_equal(offsets, twin.exclusive_scan(counts)[0])
+
+
+def test_sizes_that_do_not_fit_are_refused(device):
+    with pytest.raises(UsageError, match="0 elements"):
+        exclusive_scan(device, None, 0)
+    with pytest.raises(UsageError, match="a scan takes"):
+        exclusive_scan(device, None, 2**32)
+    with pytest.raises(UsageError, match="positions fit 32 bits"):
+        compact(device, None, 2**27 + 1)
 
 
 def test_the_twin_is_what_it_says():

@@ -11,11 +11,14 @@ from clrecon.errors import DeviceError, NoSurfaceError, UsageError
 from clrecon.geometry import Volume, compose_affine
 from clrecon.operators import isosurface
 from clrecon.operators.isosurface import extract_isosurface
+from clrecon.pipeline.selftest import run_selftest
 from clrecon.reference import isosurface as twin
 
 OBLIQUE = np.array([[0.7, 0.1, 0.05, -250.0], [-0.1, 0.5, 0.2, -300.0], [0.0, 0.05, 2.5, -846.0], [0, 0, 0, 1.0]])
 MIRRORED = OBLIQUE @ np.diag((-1.0, 1.0, 1.0, 1.0))
-SHAPES = [(5, 7, 9), (4, 4, 30), (3, 5, 31), (3, 5, 32), (4, 3, 33), (2, 3, 63), (3, 2, 64), (2, 4, 65), (3, 3, 100)]
+SHAPES = [(5, 7, 9), (4, 4, 30), (3, 5, 31), (3, 5, 32), (4, 3, 33), (2, 3, 63), (3, 2, 64), (2, 4, 65), (3, 3, 100),
+          (2, 3, 1023), (2, 2, 1024), (2, 3, 1030), (3, 2, 2100)]  # fmt: skip
+"""(nk, nj, ni) on both sides of a mask word (32 samples) and of a word of flags (1024 samples)."""
 
 
 def random_volume(shape, dtype="int16", high=6, affine=OBLIQUE, seed=0) -> Volume:
@@ -59,6 +62,35 @@ def test_device_equals_twin_for_every_voxel_type(device, dtype, affine):
         assert np.array_equal(mesh.triangles, triangles)
         assert np.abs(mesh.vertices - vertices).max() <= tolerances.float32_unit(mesh.vertices)
         assert np.abs(mesh.normals - normals).max() <= tolerances.TWIN_NORMAL
+
+
+@pytest.mark.parametrize("shape", [(2, 700, 40), (2, 3, 1000)])
+def test_vertices_are_rounded_once(device, shape):
+    """Far from the origin and after many steps, a vertex is the float32 next to the true one, or its neighbour."""
+    volume = random_volume(shape)
+    vertices = twin.extract_isosurface(volume, 3)[0]
+    error = np.abs(extract_isosurface(volume, 3, device).vertices - vertices).max()
+    assert error <= tolerances.VERTEX_ROUNDING_UNITS * tolerances.float32_unit(vertices)
+
+
+def test_checkerboards_have_the_normals_of_their_edges(device):
+    """Central differences cancel there: the edge itself says which way is down."""
+    k, j, i = np.indices((5, 6, 34))
+    for voxels in ((i + j + k) % 2, i % 2, k % 2):
+        volume = Volume(voxels.astype(np.int16), OBLIQUE)
+        mesh = extract_isosurface(volume, 1, device)
+        assert np.allclose(np.linalg.norm(mesh.normals, axis=1), 1.0, atol=1e-5)
+        assert np.abs(mesh.normals - twin.extract_isosurface(volume, 1)[1]).max() <= tolerances.TWIN_NORMAL
+
+
+@pytest.mark.parametrize("scale", [1e-20, 1e-6, 1e6, 1e29])
+def test_the_scale_of_float_values_does_not_matter(device, scale):
+    voxels = smooth_volume((9, 10, 40)).voxels.astype(np.float32)
+    expected = extract_isosurface(Volume(voxels, OBLIQUE), 100.0, device, closed=False)
+    mesh = extract_isosurface(Volume(voxels / 1000 * np.float32(scale), OBLIQUE), 0.1 * scale, device, closed=False)
+    assert np.array_equal(mesh.triangles, expected.triangles)
+    assert np.abs(mesh.normals - expected.normals).max() < 1e-3
+    assert np.abs(mesh.vertices - expected.vertices).max() < 1e-3
 
 
 @pytest.mark.parametrize("high", [2, 3, 6, 12])
@@ -170,8 +202,9 @@ def _area(points, faces) -> float:
 
 @pytest.mark.parametrize(
     ("iso_value", "closed", "where"),
-    [(6, True, "above"), (40_000, True, "above"), (1e9, False, "above"), (0, False, "below"), (-1e6, False, "below")],
-)
+    [(6, True, "above"), (40_000, True, "above"), (1e9, False, "above"), (0, False, "at or below the lowest of"),
+     (-1e6, False, "at or below the lowest of")],
+)  # fmt: skip
 def test_an_iso_value_outside_the_data_is_refused_with_the_range(device, iso_value, closed, where):
     volume = random_volume((5, 6, 7))
     with pytest.raises(NoSurfaceError, match=f"runs from 0 to 5 HU, the iso value lies {where}"):
@@ -185,6 +218,40 @@ def test_values_that_cannot_be_used_are_refused(device):
         extract_isosurface(random_volume((1, 4, 5)), 3, device, closed=False)
     with pytest.raises(UsageError, match="13,999 columns"):
         extract_isosurface(Volume(np.zeros((1, 1, 13_999), np.int8), np.eye(4)), 1, device)
+
+
+def test_only_volumes_have_surfaces(device):
+    with pytest.raises(UsageError, match=r"needs a Volume, not ndarray: clrecon.Volume\(voxels, affine\)"):
+        extract_isosurface(np.zeros((3, 4, 5)), 1, device)
+
+
+def test_a_device_that_finds_nothing_is_not_believed(device, monkeypatch):
+    """A surface that must be there and is not is the device's fault, not the iso value's."""
+    monkeypatch.setattr(isosurface, "_classify", lambda device, grid, *_: isosurface.upload(
+        device, np.zeros(grid.rows * grid.words, np.uint32)))  # fmt: skip
+    with pytest.raises(DeviceError, match="it computes wrongly"):
+        extract_isosurface(random_volume((5, 6, 7)), 3, device)
+    outcomes = {result["operator"]: result["passed"] for result in run_selftest(device)}
+    assert outcomes == {"exclusive_scan": True, "compact": True, "extract_isosurface": False}
+
+
+def test_the_mesh_counts_for_the_budget_too(device, monkeypatch):
+    volume = random_volume((9, 9, 9))
+    grid = isosurface._SampleGrid(volume, isosurface.choose_iso_rule(volume, 3))
+    before_emitting = volume.voxels.nbytes + sum(grid.scratch().values())
+    monkeypatch.setattr(device, "memory_bytes", before_emitting + 100)
+    with pytest.raises(DeviceError, match="triangles"):
+        extract_isosurface(volume, 3, device)
+
+
+def test_too_many_rows_for_the_flags_are_refused():
+    class Endless:
+        shape_ijk = (40, 2**16, 2**16)
+
+    volume = random_volume((2, 2, 2))
+    grid = isosurface._SampleGrid(Endless(), isosurface.choose_iso_rule(volume, 3))
+    with pytest.raises(UsageError, match="rows"):
+        isosurface._check_grid(grid)
 
 
 def test_a_volume_over_the_budget_is_refused_before_anything_is_allocated(device, monkeypatch):

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 import tolerances
 
-from clrecon.errors import DeviceError, OutputError, UsageError
+from clrecon.errors import DeviceError, NoSurfaceError, OutputError, UsageError
 from clrecon.phantom import PhantomSettings, write_phantom
 from clrecon.pipeline.demo import make_demo
 from clrecon.pipeline.devices import survey_devices
@@ -51,7 +51,7 @@ def test_a_tilted_oblique_sphere_has_its_volume_and_place(
     assert centre == pytest.approx(truth["surface"]["center_lps_mm"], abs=0.1)
     assert report["volume"]["tilt_deg"] == pytest.approx(15.0, abs=1e-3)
     assert report["device"] == device.label
-    assert list(dict.fromkeys(stages)) == ["device", "scan", "read", "build", "write", "measure"]
+    assert list(dict.fromkeys(stages)) == ["device", "scan", "read", "build", "measure", "write"]
 
 
 def test_parts_of_the_time_sum_to_the_total(device: Any, sphere: tuple[Path, dict[str, Any]], tmp_path: Path) -> None:
@@ -70,23 +70,32 @@ def test_outputs_then_device_then_input(sphere: tuple[Path, dict[str, Any]], tmp
         make_mesh(nowhere, tmp_path / "a.stl", bad_device)
 
 
-def test_a_failed_write_leaves_the_old_files(
-    device: Any, sphere: tuple[Path, dict[str, Any]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("fails", ["clrecon.mesh.stage_mesh", "clrecon.pipeline.mesh.stage_report"])
+def test_a_failed_write_leaves_both_old_files(
+    fails: str, device: Any, sphere: tuple[Path, dict[str, Any]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    import clrecon.mesh
-
     mesh, report = tmp_path / "a.stl", tmp_path / "a.json"
     mesh.write_bytes(b"old mesh")
     report.write_bytes(b"old report")
 
-    def fail(self: Any, path: Path, space: str = "lps") -> int:
+    def fail(*_: Any) -> Any:
         raise OutputError("the disk is full")
 
-    monkeypatch.setattr(clrecon.mesh.Mesh, "save", fail)
+    monkeypatch.setattr(fails, fail)
     with pytest.raises(OutputError, match="full"):
         make_mesh(sphere[0], mesh, MeshSettings(device=str(device.index)), report_path=report)
     assert (mesh.read_bytes(), report.read_bytes()) == (b"old mesh", b"old report")
     assert sorted(tmp_path.iterdir()) == [report, mesh]
+
+
+@pytest.mark.parametrize("level", [-5000.0, -1000.0])
+def test_a_level_with_everything_inside_is_refused(
+    level: float, device: Any, sphere: tuple[Path, dict[str, Any]], tmp_path: Path
+) -> None:
+    settings = MeshSettings(iso_value=level, device=str(device.index))
+    with pytest.raises(NoSurfaceError, match=r"every voxel is inside, the volume runs from -1000 to 1000 HU"):
+        make_mesh(sphere[0], tmp_path / "box.stl", settings)
+    assert not list(tmp_path.iterdir())
 
 
 def test_survey_says_why_no_device_is_used(device: Any) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from clrecon.errors import OutputError, RefusedInputError
-from clrecon.pipeline.report import error_as_dict, peak_memory_bytes, platform_name, to_json, write_report
+from clrecon.pipeline.report import error_as_dict, peak_memory_bytes, platform_name, stage_report, to_json
 
 
 def test_numpy_becomes_plain_and_nan_becomes_null() -> None:
@@ -38,14 +38,18 @@ def test_what_json_cannot_hold_is_an_error() -> None:
 
 def test_a_report_that_fails_leaves_the_old_one(tmp_path: Path) -> None:
     path = tmp_path / "report.json"
-    size = write_report(path, {"a": 1})
-    assert size == path.stat().st_size
+    with stage_report(path, {"a": 1}) as staged:
+        assert not path.exists()
+        staged.commit()
+    assert staged.size == path.stat().st_size
     with pytest.raises(TypeError, match="object has no place"):
-        write_report(path, {"a": object()})
+        stage_report(path, {"a": object()})
+    with stage_report(path, {"a": 2}):
+        pass  # never committed
     assert json.loads(path.read_text()) == {"a": 1}
     assert list(tmp_path.iterdir()) == [path]
     with pytest.raises(OutputError, match="nowhere"):
-        write_report(tmp_path / "nowhere" / "report.json", {})
+        stage_report(tmp_path / "nowhere" / "report.json", {}).__enter__()
 
 
 def test_errors_as_json() -> None:

@@ -11,19 +11,20 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO
 
 from clrecon.errors import NoSurfaceError, OutputError, UsageError
-from clrecon.files import replace_file
+from clrecon.files import StagedFile, stage_file
 from clrecon.mesh.writers import glb, obj, ply, stl, threemf, vtp
 from clrecon.mesh.writers.content import Content, describe_mesh
 
 if TYPE_CHECKING:
     from clrecon.mesh.mesh import Mesh
 
-__all__ = ["FORMATS", "MeshFormat", "check_format", "write_mesh"]
+__all__ = ["FORMATS", "MeshFormat", "check_format", "stage_mesh", "write_mesh"]
 
 
 @dataclass(frozen=True)
@@ -70,7 +71,10 @@ def check_format(path: str | os.PathLike[str]) -> str:
     UsageError
         The extension is missing or stands for no format that is written.
     """
-    extension = os.path.splitext(os.fspath(path))[1].lower()
+    try:
+        extension = os.path.splitext(os.fspath(path))[1].lower()
+    except TypeError as error:
+        raise UsageError(f"a mesh file is named by a string or a path, not {type(path).__name__}") from error
     if extension not in FORMATS:
         found = f"the extension {extension!r}" if extension else "no extension"
         raise UsageError(f"the name of the mesh file has {found}: use one of {', '.join(FORMATS)}")
@@ -85,6 +89,13 @@ def write_mesh(mesh: Mesh, path: str | os.PathLike[str], space: str = "lps") -> 
     int
         Size of the file in bytes.
     """
+    with stage_mesh(mesh, path, space) as staged:
+        staged.commit()
+    return staged.size
+
+
+def stage_mesh(mesh: Mesh, path: str | os.PathLike[str], space: str = "lps") -> AbstractContextManager[StagedFile]:
+    """Write a mesh under a temporary name, to be committed with other files; see `clrecon.files.stage_file`."""
     extension = check_format(path)
     chosen = FORMATS[extension]
     mesh.check()
@@ -97,7 +108,7 @@ def write_mesh(mesh: Mesh, path: str | os.PathLike[str], space: str = "lps") -> 
             f"{mesh.triangle_count} triangles make a {extension[1:].upper()} file of about "
             f"{expected_bytes / 2**30:.1f} GiB, at most 4 GiB can be read: write PLY or VTP"
         )
-    return replace_file(
+    return stage_file(
         path,
         lambda stream: chosen.write(stream, content),
         lambda temporary: chosen.verify(temporary, content),

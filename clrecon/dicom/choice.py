@@ -1,0 +1,111 @@
+"""Which of the series found is read: the one that is named, or the one usable CT stack with most slices."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Sequence
+
+from clrecon.dicom.series import Series
+from clrecon.dicom.text import hash_uid, join_names
+from clrecon.errors import NoDicomError, RefusedInputError, UsageError
+
+__all__ = ["choose_series", "describe_left"]
+
+
+def choose_series(found: Sequence[Series], wanted: int | str | None = None) -> Series:
+    """Choose the series to read.
+
+    Parameters
+    ----------
+    found : sequence of Series
+    wanted : int or str, optional
+        Number in the listing, SeriesInstanceUID, its hash, or the description (whole, or a part that only one
+        series has).  None takes the one CT stack with most slices; of several with as many, the one that is
+        usable.
+
+    Raises
+    ------
+    UsageError
+        `wanted` names none or several; lists what is there.
+    NoDicomError
+        There is no CT series, or the one named is none.
+    RefusedInputError
+        Several usable CT stacks, or only unusable ones, have the same, largest number of slices; or there is no
+        stack.
+    """
+    if wanted is None:
+        ct = [series for series in found if series.kind != "other"]
+        if not ct:
+            raise NoDicomError(_describe_modalities(found))
+        return _take_largest(ct)
+    matches = _match_series(found, wanted)
+    if len({series.identity for series in matches}) != 1:
+        count = "no series matches" if not matches else f"{len(matches)} series match"
+        raise UsageError(f"{count} series={wanted!r}; there are {_list_lines(found)}")
+    chosen = matches[0] if len(matches) == 1 else _take_largest(matches)
+    if chosen.kind == "other":
+        raise NoDicomError(f"series {chosen.number} is of modality {chosen.identity.modality}, not CT")
+    return chosen
+
+
+def _match_series(found: Sequence[Series], wanted: int | str) -> list[Series]:
+    text = str(wanted).strip()
+    by_id = [series for series in found if text in (series.identity.uid, hash_uid(series.identity.uid)) and text]
+    if by_id:
+        return by_id
+    if text.isascii() and text.isdigit():
+        return [series for series in found if series.number == int(text)]
+    folded = text.casefold()
+    exact = [series for series in found if series.identity.description.casefold() == folded]
+    return exact or [series for series in found if folded and folded in series.identity.description.casefold()]
+
+
+def _take_largest(candidates: Sequence[Series]) -> Series:
+    stacks = [series for series in candidates if series.kind == "stack"]
+    if not stacks:
+        if len(candidates) == 1:
+            return candidates[0]  # read_volume refuses it with its own problem
+        raise RefusedInputError(f"no CT stack among {_list_lines(candidates)}")
+    counts = [series.count for series in stacks]
+    single_frame = [series.single_frame_count for series in stacks]
+    if counts != single_frame and any(not series.problems for series in stacks):
+        counts = single_frame  # multi-frame images neither win nor tie against a stack that can be read
+    most = max(counts)
+    largest = [series for series, count in zip(stacks, counts, strict=True) if count == most]
+    if len(largest) == 1:
+        return largest[0]  # a fault does not pass it over: read_volume refuses it
+    usable = [series for series in largest if not series.problems]
+    if len(usable) == 1:
+        return usable[0]
+    if most == 1:
+        raise RefusedInputError(f"a single slice cannot make a surface: {len(largest)} series of one slice each")
+    if not usable:
+        reasons = join_names(f"[series {series.number}: {series.problems[0]}]" for series in largest)
+        raise RefusedInputError(f"{len(largest)} CT series have {most} slices each and none can be used: {reasons}")
+    raise RefusedInputError(
+        f"{len(usable)} CT series have {most} slices each, choose one with --series: {_list_lines(usable)}"
+    )
+
+
+def describe_left(found: Sequence[Series], chosen: Series) -> list[str]:
+    """Warn of the series that were not chosen, and which of the larger ones cannot be used."""
+    left = [series for series in found if series is not chosen]
+    if not left:
+        return []
+    lines = []
+    for series in left:
+        unusable = series.kind == "stack" and series.count >= chosen.count and series.problems
+        lines.append(f"[{series.describe_without_text()}{', cannot be used' if unusable else ''}]")
+    return [f"{len(left)} other series left: {join_names(lines)}"]
+
+
+def _describe_modalities(found: Sequence[Series]) -> str:
+    counts: dict[str, int] = defaultdict(int)
+    for series in found:
+        counts[series.identity.modality] += 1
+    what = ", ".join(f"{count} series of modality {modality}" for modality, count in sorted(counts.items()))
+    return f"found {what}, no CT series"
+
+
+def _list_lines(found: Sequence[Series]) -> str:
+    return join_names([f"[{series.describe()}, hash {hash_uid(series.identity.uid)}]" for series in found])

@@ -1,0 +1,97 @@
+"""Headers that make a series doubtful: a warning where it can be read, a refusal where it cannot."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from dicom_series import Plan, set_raw, set_values, write_series
+from pydicom.uid import SecondaryCaptureImageStorage
+
+from clrecon.dicom import list_series, read_volume
+from clrecon.errors import RefusedInputError
+
+
+@pytest.mark.parametrize(
+    ("change", "shift", "words"),
+    [
+        (set_values(RescaleIntercept=None), 1024, "no RescaleIntercept: slope 1, intercept 0 taken: maybe not HU"),
+        (set_values(RescaleSlope=None), 0, "no RescaleSlope: slope 1, intercept -1024 taken: maybe not HU"),
+    ],
+    ids=["intercept", "slope"],
+)
+def test_half_a_rescale_is_doubtful(tmp_path, change, shift, words):
+    plan = write_series(tmp_path, change=change)
+    volume = read_volume(tmp_path)
+    assert np.array_equal(volume.voxels, plan.hu() + shift)
+    assert volume.report["warnings"] == [f"{words} (all slices)"]
+
+
+@pytest.mark.parametrize("ending", ["", ".1", ".2", ".3", ".4"])
+def test_a_secondary_capture_with_a_position_is_refused(tmp_path, ending):
+    sop_class = SecondaryCaptureImageStorage + ending
+    write_series(tmp_path, change=set_values(SOPClassUID=sop_class))
+    with pytest.raises(RefusedInputError) as caught:
+        read_volume(tmp_path)
+    reason = f"slice000.dcm: secondary capture (SOP class {sop_class}): its pixels are a picture, not measured HU"
+    assert reason in str(caught.value)
+    assert list_series(tmp_path).series[0].problems[0] == reason
+    plan = write_series(tmp_path, Plan(series=2, shape=(3, 5, 6), name="ct{}".format))
+    assert np.array_equal(read_volume(tmp_path).voxels, plan.hu())
+
+
+@pytest.mark.parametrize(
+    ("image_type", "word"),
+    [
+        ("DERIVED\\SECONDARY\\MPR", "MPR"),
+        ("DERIVED\\PRIMARY\\AXIAL\\CT_SOM5 MIP", "MIP"),
+        ("derived\\SECONDARY\\PROJECTION IMAGE", "PROJECTION"),
+        ("DERIVED\\SECONDARY\\REFORMATTED\\AVERAGE", "REFORMATTED"),
+        ("DERIVED\\SECONDARY\\AXIAL", None),
+        ("ORIGINAL\\PRIMARY\\AXIAL\\MPR", None),
+    ],
+)
+def test_derived_images_are_told(tmp_path, image_type, word):
+    plan = write_series(tmp_path, change=set_raw("ImageType", image_type))
+    volume = read_volume(tmp_path)
+    assert np.array_equal(volume.voxels, plan.hu())
+    said = f"derived images (ImageType has DERIVED and {word}): maybe not measured HU (all slices)"
+    assert volume.report["warnings"] == ([said] if word else [])
+
+
+def test_slices_of_two_patients_are_refused_without_their_ids(tmp_path):
+    write_series(tmp_path, change=set_values(only=4, PatientID="OTHERSECRET"))
+    with pytest.raises(RefusedInputError, match=r"PatientID differs within the series: another in slice004\.dcm"):
+        read_volume(tmp_path)
+    listing = list_series(tmp_path)
+    assert "PatientID differs within the series" in listing.series[0].problems[0]
+    assert "SECRET" not in json.dumps([entry.as_dict() for entry in listing.series])
+
+
+@pytest.mark.parametrize("patient", ["", " SECRETID "], ids=["missing", "with spaces"])
+def test_the_same_patient_written_otherwise_is_one(tmp_path, patient):
+    plan = write_series(tmp_path, change=set_raw("PatientID", patient, only=4))
+    assert np.array_equal(read_volume(tmp_path).voxels, plan.hu())
+
+
+@pytest.mark.parametrize(("count", "top", "told"), [(3, 3071, True), (1, 3071, False), (3, 3072, False)])
+def test_saturated_metal_is_told(tmp_path, count, top, told):
+    def saturate(ds, k):
+        stored = np.frombuffer(ds.PixelData, np.int16).copy()
+        stored[:count] = top + 1024
+        ds.PixelData = stored.tobytes()
+
+    write_series(tmp_path, change=saturate)
+    report = read_volume(tmp_path).report
+    assert report["hu_range"][1] == top
+    said = "21 voxels are at 3071 HU, the ceiling of 12 bits: metal is saturated, its surface displaced"
+    assert report["warnings"] == ([said] if told else [])
+
+
+@pytest.mark.parametrize("modality", ["ct", " Ct "])
+def test_modality_in_other_letters_is_ct(tmp_path, modality):
+    plan = write_series(tmp_path, change=set_raw("Modality", modality))
+    volume = read_volume(tmp_path)
+    assert np.array_equal(volume.voxels, plan.hu())
+    assert volume.report["series"]["modality"] == "CT"
