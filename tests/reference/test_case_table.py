@@ -103,3 +103,48 @@ def test_corners_and_edges_are_numbered_as_documented():
     assert [axis for axis, _, _ in EDGES] == [0] * 4 + [1] * 4 + [2] * 4
     assert EDGES[5] == (1, 1, 3)
     assert EDGES[11] == (2, 3, 7)
+
+
+def volume_inside(case: int) -> float:
+    """Volume of the inside part of the cell, with the surface through the middles of the edges."""
+    triangles = MIDDLES[np.array(case_table()[case], dtype=int).reshape(-1, 3)]
+    volume = np.linalg.det(triangles).sum() / 6
+    for axis in range(3):
+        inside = [c for c in range(8) if c >> axis & 1 and case >> c & 1]
+        diagonal = len(inside) == 2 and (inside[0] ^ inside[1]).bit_count() == 2
+        volume += (1 / 4 if diagonal else (0, 1 / 8, 1 / 2, 7 / 8, 1)[len(inside)]) / 3
+    return volume
+
+
+def has_diagonal_face(case: int) -> bool:
+    states = [[case >> c & 1 for c in sorted(face)] for face in FACES]
+    return any(state in ([1, 0, 0, 1], [0, 1, 1, 0]) for state in states)
+
+
+def test_the_first_cases_have_the_volumes_of_elementary_geometry():
+    assert volume_inside(0) == 0 and volume_inside(255) == pytest.approx(1)
+    assert volume_inside(1) == pytest.approx(1 / 48)
+    assert volume_inside(3) == pytest.approx(1 / 8)
+    assert volume_inside(15) == pytest.approx(1 / 2)
+
+
+@pytest.mark.parametrize("case", range(128))
+def test_a_case_and_its_complement_err_to_opposite_sides(case):
+    """Else every surface would enclose too much or too little: 0.1 % on bone, 0.5 % on thin parts."""
+    if not has_diagonal_face(case):  # there the inside corners are kept apart, in the complement the others
+        assert volume_inside(case) + volume_inside(255 - case) == pytest.approx(1)
+
+
+def test_volumes_are_as_near_to_the_trilinear_field_as_fans_allow():
+    n = 24
+    places = (np.arange(n) + 0.5) / n
+    z, y, x = np.meshgrid(places, places, places, indexing="ij")
+    errors = []
+    for case in range(256):
+        field = sum(
+            ((x if cx else 1 - x) * (y if cy else 1 - y) * (z if cz else 1 - z))
+            for c, (cx, cy, cz) in enumerate(CORNERS)
+            if case >> c & 1
+        )
+        errors.append(volume_inside(case) - np.mean(np.sign(field - 0.5) / 2 + 0.5))
+    assert np.abs(errors).mean() < 0.08  # 0.096 with the first fan that is possible
