@@ -21,7 +21,8 @@ from clrecon.mesh.writers.content import Content, refuse_file
 __all__ = ["estimate", "verify", "write"]
 
 _HEAD = 84
-_FACET = np.dtype([("floats", "V48"), ("attribute", "<u2")])
+_FACET_BYTES = 50
+"""Normal, three corners and two unused bytes."""
 _CHUNK = 1 << 14
 """Facets a piece: what a piece needs stays in the processor's cache."""
 _AHEAD = 4
@@ -34,42 +35,38 @@ def _header(content: Content) -> bytes:
 
 def estimate(content: Content) -> int:
     """Size of the file in bytes, exactly."""
-    return _HEAD + _FACET.itemsize * len(content.triangles)
+    return _HEAD + _FACET_BYTES * len(content.triangles)
 
 
 def write(stream: BinaryIO, content: Content) -> None:
     """Write facets with unit normals from their corners; the normal of a facet without area is zero."""
     stream.write(_header(content) + struct.pack("<I", len(content.triangles)))
-    starts = range(0, len(content.triangles), _CHUNK)
+    coordinates = [np.ascontiguousarray(content.vertices[:, axis]) for axis in range(3)]
     with ThreadPoolExecutor(max_workers=2) as pool:  # numpy works outside the interpreter's lock
-        waiting: deque[Future[NDArray[np.uint8]]] = deque()
-        for start in starts:
-            waiting.append(pool.submit(_pack_facets, content, start))
+        waiting: deque[Future[bytearray]] = deque()
+        for start in range(0, len(content.triangles), _CHUNK):
+            waiting.append(pool.submit(_pack_facets, coordinates, content.triangles[start : start + _CHUNK]))
             if len(waiting) > _AHEAD:
-                stream.write(waiting.popleft().result().data)
+                stream.write(waiting.popleft().result())
         while waiting:
-            stream.write(waiting.popleft().result().data)
+            stream.write(waiting.popleft().result())
 
 
-def _pack_facets(content: Content, start: int) -> NDArray[np.uint8]:
-    """The bytes of one piece of facets."""
-    triangles = content.triangles[start : start + _CHUNK]
-    count = len(triangles)
-    piece = np.empty((count, 4, 3), dtype="<f4")  # normal, then three corners
-    piece[:, 1:] = content.vertices.take(triangles, axis=0)
-    p = piece[:, 2] - piece[:, 1]
-    q = piece[:, 3] - piece[:, 1]
-    normal = piece[:, 0]
-    normal[:, 0] = p[:, 1] * q[:, 2] - p[:, 2] * q[:, 1]
-    normal[:, 1] = p[:, 2] * q[:, 0] - p[:, 0] * q[:, 2]
-    normal[:, 2] = p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0]
-    length = np.sqrt(np.einsum("ij,ij->i", normal, normal))
+def _pack_facets(coordinates: list[NDArray[np.float32]], triangles: NDArray[np.uint32]) -> bytearray:
+    """The bytes of one piece of facets.  All arithmetic is on whole columns: twice as fast as on rows of three."""
+    a, b, c = (
+        [axis.take(corner) for axis in coordinates] for corner in np.ascontiguousarray(triangles.T)
+    )  # corners, each as x, y, z
+    p = [b[axis] - a[axis] for axis in range(3)]
+    q = [c[axis] - a[axis] for axis in range(3)]
+    normal = [p[axis - 2] * q[axis - 1] - p[axis - 1] * q[axis - 2] for axis in range(3)]
+    length = np.sqrt(normal[0] * normal[0] + normal[1] * normal[1] + normal[2] * normal[2])
     length[length == 0.0] = 1.0
-    normal /= length[:, None]
-    normal += np.float32(0)  # no -0
-    facets = np.zeros(count, dtype=_FACET)
-    facets["floats"] = piece.reshape(count, 12).view("V48")[:, 0]
-    return facets.view(np.uint8)
+    zero = np.float32(0)
+    packed = bytearray(_FACET_BYTES * len(triangles))
+    for place, column in enumerate([*(part / length + zero for part in normal), *a, *b, *c]):  # + 0: no -0
+        np.ndarray(len(triangles), "<f4", packed, 4 * place, (_FACET_BYTES,))[:] = column
+    return packed
 
 
 def verify(path: Path, content: Content) -> None:
