@@ -233,6 +233,23 @@ def prepare_isosurface(device: Device, dtype: DTypeLike = np.int16) -> Program:
     return load_program(device, "isosurface/marching_cubes.cl", {"VOXEL": VOXEL_TYPES[np.dtype(dtype).name]})
 
 
+def _describe(device: Device, grid: _SampleGrid, stopwatch: Stopwatch) -> dict[str, Any]:
+    """The report of a mesh: how it was made, free of patient data."""
+    rule = grid.rule
+    return {
+        "iso_value_hu": rule.iso_value,
+        "iso_level_hu": rule.iso_level,
+        "closed_at_border": rule.closed,
+        "outside_hu": rule.outside if rule.closed else None,
+        "affine_ijk_to_lps_mm": grid.volume.affine.tolist(),
+        "device": device.label,
+        "driver": device.driver,
+        "seconds": dict(stopwatch.seconds),
+        "kernel_seconds": dict(stopwatch.by_kernel),
+        "warnings": list(cache_warnings()),
+    }
+
+
 def extract_isosurface(
     volume: Volume,
     iso_value: float,
@@ -311,16 +328,4 @@ def extract_isosurface(
     positions, normals, triangles = _emit(device, grid, program, voxels_d, mask_d, counts, margin, stopwatch)
     if progress is not None:
         progress("build", 1, 1)
-    report = {
-        "iso_value_hu": grid.rule.iso_value,
-        "iso_level_hu": grid.rule.iso_level,
-        "closed_at_border": closed,
-        "outside_hu": grid.rule.outside if closed else None,
-        "affine_ijk_to_lps_mm": volume.affine.tolist(),
-        "device": device.label,
-        "driver": device.driver,
-        "seconds": dict(stopwatch.seconds),
-        "kernel_seconds": dict(stopwatch.by_kernel),
-        "warnings": list(cache_warnings()),
-    }
-    return Mesh(positions, triangles, normals, report)
+    return Mesh(positions, triangles, normals, _describe(device, grid, stopwatch))
