@@ -38,11 +38,11 @@ def import_pyopencl() -> Any:
 
 
 def _is_usable(folder: Path) -> bool:
-    """True when a file of some kilobytes can be written in `folder`, which is made where it is not there."""
+    """True when a file of 4 KiB can be written in `folder`, which is made where it is not there."""
     try:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder) as file:
-            file.write(bytes(1 << 16))
+            file.write(bytes(1 << 12))
     except OSError:
         return False
     return True
