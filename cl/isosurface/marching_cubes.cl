@@ -137,12 +137,6 @@ static inline float3 gradient_at(
     return change * (closed ? (float3)(0.5f) : 0.5f + 0.5f * one_sided);
 }
 
-/* Largest absolute component. */
-static inline float largest_component(float3 v)
-{
-    return fmax(fabs(v.x), fmax(fabs(v.y), fabs(v.z)));
-}
-
 /* Sum of two floats and its exact rounding error (Knuth). */
 static inline float3 add_exactly(float3 a, float3 b, float3 *error)
 {
@@ -165,6 +159,7 @@ static inline float3 add_exactly(float3 a, float3 b, float3 *error)
  *             normals         out  (vertices, 3) unit, towards lower values
  *             iso_level       where on an edge the surface lies
  *             outside         value beyond the border of a closed volume
+ *             value_scale     power of two that takes the values to 1 or below: squares neither over- nor underflow
  *             margin          smallest distance of a vertex from a sample along x, y, z, in steps: some units in the
  *                             last place of the position, so that no triangle collapses when it is rounded
  *             ni nj nk, border, words, flag_words, active   as above
@@ -178,7 +173,7 @@ __kernel void emit_vertices(
     __global const ushort *restrict word_vertices,
     __global const float4 *restrict slice_frames, __global const float4 *restrict steps,
     __global float *restrict positions, __global float *restrict normals,
-    const float iso_level, const float outside, const float4 margin,
+    const float iso_level, const float outside, const float value_scale, const float4 margin,
     const int ni, const int nj, const int nk, const int border, const uint words, const uint flag_words,
     const uint active)
 {
@@ -201,6 +196,7 @@ __kernel void emit_vertices(
     float3 base = add_exactly(frame[0].xyz, row_j * steps[2].xyz, &base_rest);
     base = add_exactly(base, word_i * steps[0].xyz, &base_rest);
 
+    const size_t row_stride = ni, slice_stride = (size_t)ni * (size_t)nj;
     const int vj = (int)j - border, vk = (int)k - border;
     const int row_is_inner = vj >= 1 && vj < nj - 2 && vk >= 1 && vk < nk - 2;
     size_t vertex = row_offsets[row] + word_vertices[(size_t)row * words + w];
@@ -209,14 +205,17 @@ __kernel void emit_vertices(
         const int vi = (int)(32 * w + b) - border;
         const int inner = row_is_inner && vi >= 1 && vi < ni - 2;
         const float3 at_sample = base_rest + (float)b * i_step;
-        const float value = sample_voxel(voxels, vi, vj, vk, ni, nj, nk, 1, outside);
+        const size_t here = inner ? voxel_index(vi, vj, vk, ni, nj) : 0;
+        const float value = inner ? convert_float(voxels[here]) : sample_voxel(voxels, vi, vj, vk, ni, nj, nk, 1, outside);
         const float3 gradient = gradient_at(voxels, vi, vj, vk, ni, nj, nk, border, outside, inner);
         for (int axis = 0; axis < 3; ++axis) {
             const ulong crossed = axis == 0 ? edges.x : axis == 1 ? edges.y : edges.z;
             if (!(crossed >> b & 1))
                 continue;
             const int di = axis == 0, dj = axis == 1, dk = axis == 2;
-            const float next = sample_voxel(voxels, vi + di, vj + dj, vk + dk, ni, nj, nk, 1, outside);
+            const size_t stride = axis == 0 ? 1 : axis == 1 ? row_stride : slice_stride;
+            const float next = inner ? convert_float(voxels[here + stride])
+                                     : sample_voxel(voxels, vi + di, vj + dj, vk + dk, ni, nj, nk, 1, outside);
             const float3 next_gradient
                 = gradient_at(voxels, vi + di, vj + dj, vk + dk, ni, nj, nk, border, outside, inner);
             const float keep = axis == 0 ? margin.x : axis == 1 ? margin.y : margin.z;
@@ -224,13 +223,12 @@ __kernel void emit_vertices(
             const float3 step = axis == 0 ? i_step : axis == 1 ? j_step : k_step;
             vstore3(base + (at_sample + t * step), vertex, positions);
 
-            /* Where the differences cancel, the edge itself says which way is down.  Scaled to a largest
-             * component of 1, so that no square over- or underflows. */
-            float3 slope = gradient + t * (next_gradient - gradient);
-            const float steepest = largest_component(slope);
-            slope = steepest > 0.0f ? slope / steepest : (next > value ? 1.0f : -1.0f) * (float3)(di, dj, dk);
-            float3 up = (float3)(dot(frame[3].xyz, slope), dot(frame[4].xyz, slope), dot(frame[5].xyz, slope));
-            up /= largest_component(up);
+            /* Where the differences cancel, the edge itself says which way is down. */
+            float3 slope = value_scale * (gradient + t * (next_gradient - gradient));
+            if (dot(slope, slope) == 0.0f)
+                slope = (next > value ? 1.0f : -1.0f) * (float3)(di, dj, dk);
+            const float3 up = (float3)(
+                dot(frame[3].xyz, slope), dot(frame[4].xyz, slope), dot(frame[5].xyz, slope));
             vstore3(-up / sqrt(dot(up, up)), vertex, normals);
             ++vertex;
         }

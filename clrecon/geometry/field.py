@@ -43,6 +43,8 @@ class IsoRule:
         The value beyond the border of a closed volume: the lowest value of the volume, but not below `AIR_HU`.
     closed : bool
         The volume is surrounded by `outside`; else the surface ends open at the border.
+    value_scale : float
+        Power of two that takes the values of float voxels to 1 or below; 1 for integers, which need none.
     """
 
     iso_value: float
@@ -50,6 +52,7 @@ class IsoRule:
     iso_level: float
     outside: float
     closed: bool
+    value_scale: float = 1.0
 
     @property
     def border(self) -> int:
@@ -101,12 +104,14 @@ def choose_iso_rule(volume: Volume, iso_value: float, closed: bool = True) -> Is
     """
     iso_value = _checked_iso_value(iso_value)
     dtype = volume.voxels.dtype
+    value_scale = 1.0
     if dtype.kind == "f":
         low, high = data_range(volume)
         if not (math.isfinite(low) and math.isfinite(high)):
             raise NoSurfaceError(f"the voxels run from {low} to {high}: infinite values have no iso surface")
         if max(-low, high) > LARGEST_FLOAT:
             raise UsageError(f"the voxels run from {low:g} to {high:g}: beyond {LARGEST_FLOAT:g} is not supported")
+        value_scale = _power_of_two_over(max(-low, high, abs(iso_value)))
         iso_level = float(np.float32(iso_value))
         lowest_inside: int | float = iso_level
     else:
@@ -124,7 +129,13 @@ def choose_iso_rule(volume: Volume, iso_value: float, closed: bool = True) -> Is
     if outside >= iso_level:
         # Everything is inside, or the iso value is below air: a value beyond the level that float32 tells from it.
         outside = iso_level - max(0.5, abs(iso_level) * 2.0**-20)
-    return IsoRule(iso_value, lowest_inside, iso_level, outside, closed)
+    return IsoRule(iso_value, lowest_inside, iso_level, outside, closed, value_scale)
+
+
+def _power_of_two_over(largest: float) -> float:
+    """A power of two that takes `largest` to 1 or below, as far as float32 has one."""
+    _, exponent = math.frexp(largest)
+    return 2.0 ** min(max(-exponent, -126), 126)
 
 
 def _checked_iso_value(iso_value: float) -> float:

@@ -203,7 +203,7 @@ def _emit(
             device, program["emit_vertices"], counts.words.count,
             voxels_d, mask_d, counts.words.positions_d, counts.vertex_offsets_d, counts.word_vertices_d,
             frames_d, steps_d, positions_d, normals_d,
-            np.float32(rule.iso_level), np.float32(rule.outside), margin,
+            np.float32(rule.iso_level), np.float32(rule.outside), np.float32(rule.value_scale), margin,
             *(np.int32(n) for n in volume.shape_ijk), np.int32(rule.border), *packing,
             stopwatch=stopwatch,
         )  # fmt: skip
