@@ -8,9 +8,6 @@
 #define VOXEL short
 #endif
 
-#define CLRECON_PASTE_(a, b) a##b
-#define CLRECON_PASTE(a, b) CLRECON_PASTE_(a, b)
-
 /* Linear index of voxel (i, j, k) of a volume of ni columns and nj rows a slice: i runs fastest. */
 static inline size_t voxel_index(int i, int j, int k, int ni, int nj)
 {

@@ -28,46 +28,53 @@ static inline uint pack_lanes(short16 lanes)
     return by2.x | by2.y;
 }
 
+/* The word of 32 samples that starts at voxel `first` of a row; `first` may lie before it, samples may lie beyond. */
+static inline uint classify_word(__global const VOXEL *row, int first, int ni, VOXEL level)
+{
+    if (ni < 32) {
+        uint bits = 0;
+        for (int b = max(0, -first); b < min(32, ni - first); ++b)
+            bits |= (uint)(row[first + b] >= level) << b;
+        return bits;
+    }
+    /* 32 voxels that lie in the row, shifted to where the word has them. */
+    const int begin = clamp(first, 0, ni - 32);
+    const uint low = pack_lanes(convert_short16(vload16(0, row + begin) >= level));
+    const uint high = pack_lanes(convert_short16(vload16(0, row + begin + 16) >= level));
+    const uint bits = low | high << 16;
+    if (first < begin)
+        return bits << (begin - first);
+    return first - begin < 32 ? bits >> (first - begin) : 0;
+}
+
 /* Parameters  voxels     in   (nk, nj, ni)
  *             mask       out  (gk, gj, words) bit set where voxel >= level
  *             level      lowest inside value
  *             ni nj nk   voxels
  *             border     layers of outside around the volume, 0 or 1
  *             words      words a row, ceil((ni + 2 border) / 32)
- * Launch      global = gk * gj * words rounded up by the host, any local
+ * Launch      global = gj * gk rounded up by the host, any local: one item a row, so that dividing for j and k
+ *             costs little
  * Guarantees  every word of the mask is written; bits beyond the row are 0 */
 __kernel void classify_samples(
     __global const VOXEL *restrict voxels, __global uint *restrict mask, const VOXEL level,
     const int ni, const int nj, const int nk, const int border, const int words)
 {
     const uint gj = nj + 2 * border, gk = nk + 2 * border;
-    const size_t at = get_global_id(0);
-    if (at >= (size_t)gk * gj * words)
+    const uint row = get_global_id(0);
+    if (row >= gj * gk)
         return;
-    const int w = at % words;
-    const uint row_number = at / words;
-    const int j = (int)(row_number % gj) - border;
-    const int k = (int)(row_number / gj) - border;
-    uint bits = 0;
-    if (j >= 0 && j < nj && k >= 0 && k < nk) {
-        const int first = 32 * w - border;
-        __global const VOXEL *row = voxels + voxel_index(0, j, k, ni, nj);
-        if (ni >= 32) {
-            /* 32 voxels that lie in the row, shifted to where the word has them. */
-            const int begin = clamp(first, 0, ni - 32);
-            const uint low = pack_lanes(convert_short16(CLRECON_PASTE(vload, 16)(0, row + begin) >= level));
-            const uint high = pack_lanes(convert_short16(CLRECON_PASTE(vload, 16)(0, row + begin + 16) >= level));
-            bits = low | high << 16;
-            if (first < begin)
-                bits <<= begin - first;
-            else if (first > begin)
-                bits = first - begin < 32 ? bits >> (first - begin) : 0;
-        } else {
-            for (int b = max(0, -first); b < min(32, ni - first); ++b)
-                bits |= (uint)(row[first + b] >= level) << b;
-        }
+    __global uint *row_mask = mask + (size_t)row * words;
+    const int j = (int)(row % gj) - border;
+    const int k = (int)(row / gj) - border;
+    if (j < 0 || j >= nj || k < 0 || k >= nk) {
+        for (int w = 0; w < words; ++w)
+            row_mask[w] = 0;
+        return;
     }
-    mask[at] = bits;
+    __global const VOXEL *row_voxels = voxels + voxel_index(0, j, k, ni, nj);
+    for (int w = 0; w < words; ++w)
+        row_mask[w] = classify_word(row_voxels, 32 * w - border, ni, level);
 }
 
 /* Parameters  mask             in   (gk, gj, words)

@@ -143,7 +143,7 @@ def _classify(
     ni, nj, nk = grid.volume.shape_ijk
     mask_d = allocate(device, 4 * grid.rows * grid.words)
     launch(
-        device, program["classify_samples"], grid.rows * grid.words,
+        device, program["classify_samples"], grid.rows,
         voxels_d, mask_d, level,
         np.int32(ni), np.int32(nj), np.int32(nk), np.int32(grid.rule.border), np.int32(grid.words),
         stopwatch=stopwatch,
