@@ -203,25 +203,10 @@ def _validate(values: Values, series: SeriesIdentity, path: Path, name: str) -> 
     if rows == 0 or columns == 0:
         raise ValueProblem(f"Rows (0028,0010) x Columns (0028,0011) is {rows} x {columns}")
     allocated, stored, high_bit, signed = _validate_bits(values)
-    dj, di = values.decimals("PixelSpacing", 2)
-    low, high = PIXEL_SPACING_MM
-    if not (low <= di <= high and low <= dj <= high):
-        raise values.wrong("PixelSpacing", f"two numbers from {low:g} to {high:g} mm")
-    orientation = values.decimals("ImageOrientationPatient", 6)
-    if max(abs(v) for v in orientation) > 2.0:
-        raise values.wrong("ImageOrientationPatient", "two unit vectors")
-    position = values.decimals("ImagePositionPatient", 3)
-    if max(abs(v) for v in position) > POSITION_LIMIT_MM:
-        raise values.wrong("ImagePositionPatient", f"within {POSITION_LIMIT_MM:g} mm")
+    (dj, di), orientation, position = _validate_geometry(values)
+    slope, intercept = _validate_rescale(values)
 
     warnings = []
-    has_slope, has_intercept = "RescaleSlope" in values, "RescaleIntercept" in values
-    slope = values.decimals("RescaleSlope", 1)[0] if has_slope else 1.0
-    intercept = values.decimals("RescaleIntercept", 1)[0] if has_intercept else 0.0
-    if not RESCALE_SLOPE[0] <= abs(slope) <= RESCALE_SLOPE[1]:
-        raise values.wrong("RescaleSlope", "a finite number other than 0")
-    if abs(intercept) > RESCALE_INTERCEPT_LIMIT:
-        raise values.wrong("RescaleIntercept", f"within {RESCALE_INTERCEPT_LIMIT:g}")
     if not series.uid:
         warnings.append("no SeriesInstanceUID: the slices of one folder are taken as one series")
     unused: dict[str, float | None] = {}
@@ -263,8 +248,8 @@ def _validate(values: Values, series: SeriesIdentity, path: Path, name: str) -> 
         stated_gap_mm=unused["SpacingBetweenSlices"],
         slope=slope,
         intercept=intercept,
-        has_slope=has_slope,
-        has_intercept=has_intercept,
+        has_slope="RescaleSlope" in values,
+        has_intercept="RescaleIntercept" in values,
         rescale_type=escape_text(values.word("RescaleType"), 16),
         padding=values.padding(allocated, signed),
         lossy=values.word("LossyImageCompression") == "01",
@@ -276,6 +261,32 @@ def _validate(values: Values, series: SeriesIdentity, path: Path, name: str) -> 
     )
     _check_pixel_room(header, elements.pixel_vr)
     return header
+
+
+def _validate_geometry(values: Values) -> tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...]]:
+    """PixelSpacing (row, column), ImageOrientationPatient and ImagePositionPatient, within sane limits."""
+    spacing = values.decimals("PixelSpacing", 2)
+    low, high = PIXEL_SPACING_MM
+    if not all(low <= length <= high for length in spacing):
+        raise values.wrong("PixelSpacing", f"two numbers from {low:g} to {high:g} mm")
+    orientation = values.decimals("ImageOrientationPatient", 6)
+    if max(abs(v) for v in orientation) > 2.0:
+        raise values.wrong("ImageOrientationPatient", "two unit vectors")
+    position = values.decimals("ImagePositionPatient", 3)
+    if max(abs(v) for v in position) > POSITION_LIMIT_MM:
+        raise values.wrong("ImagePositionPatient", f"within {POSITION_LIMIT_MM:g} mm")
+    return spacing, orientation, position
+
+
+def _validate_rescale(values: Values) -> tuple[float, float]:
+    """RescaleSlope and RescaleIntercept; 1 and 0 where they are missing, which the certificate warns of."""
+    slope = values.decimals("RescaleSlope", 1)[0] if "RescaleSlope" in values else 1.0
+    intercept = values.decimals("RescaleIntercept", 1)[0] if "RescaleIntercept" in values else 0.0
+    if not RESCALE_SLOPE[0] <= abs(slope) <= RESCALE_SLOPE[1]:
+        raise values.wrong("RescaleSlope", "a finite number other than 0")
+    if abs(intercept) > RESCALE_INTERCEPT_LIMIT:
+        raise values.wrong("RescaleIntercept", f"within {RESCALE_INTERCEPT_LIMIT:g}")
+    return slope, intercept
 
 
 def _validate_bits(values: Values) -> tuple[int, int, int, bool]:

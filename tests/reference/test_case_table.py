@@ -135,16 +135,14 @@ def test_a_case_and_its_complement_err_to_opposite_sides(case):
         assert volume_inside(case) + volume_inside(255 - case) == pytest.approx(1)
 
 
-def test_volumes_are_as_near_to_the_trilinear_field_as_fans_allow():
-    n = 24
-    places = (np.arange(n) + 0.5) / n
-    z, y, x = np.meshgrid(places, places, places, indexing="ij")
-    errors = []
-    for case in range(256):
-        field = sum(
-            ((x if cx else 1 - x) * (y if cy else 1 - y) * (z if cz else 1 - z))
-            for c, (cx, cy, cz) in enumerate(CORNERS)
-            if case >> c & 1
-        )
-        errors.append(volume_inside(case) - np.mean(np.sign(field - 0.5) / 2 + 0.5))
-    assert np.abs(errors).mean() < 0.08  # 0.096 with the first fan that is possible
+def test_every_case_encloses_the_volume_that_it_has_in_vtk():
+    """A third opinion on the choice of fans; the first fan that is possible differs in 72 cases."""
+    pyvista = pytest.importorskip("pyvista")
+    image = pyvista.ImageData(dimensions=(2, 2, 2))
+    for case in range(1, 255):
+        image["inside"] = np.array([case >> c & 1 for c in range(8)], dtype=np.float32)
+        contour = image.contour([0.5], method="flying_edges", compute_normals=False, compute_scalars=False)
+        enclosed = np.linalg.det(contour.points.astype(np.float64)[contour.regular_faces]).sum() / 6
+        triangles = MIDDLES[np.array(case_table()[case], dtype=int).reshape(-1, 3)]
+        assert np.linalg.det(triangles).sum() / 6 == pytest.approx(enclosed, abs=1e-6), case
+        assert len(triangles) == contour.n_cells, case
