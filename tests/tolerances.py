@@ -34,7 +34,7 @@ PHANTOM_BLUR_HU = 1e-3  # float32 sums of 1000 HU against scipy
 
 # --- pipeline ---
 VTK_SURFACE_HD95_VOXEL = 0.05  # the bar; measured 3e-5: only rounding differs
-VTK_VOLUME = 2e-3  # the bar; measured 5e-5 at 226 HU, 8e-4 at most from 200 to 700 HU: loops are cut into other triangles
+VTK_VOLUME = 2e-3  # the bar; measured 5e-5 at 226 HU, at most 8e-4 from 200 to 700 HU: other fans of the same loops
 
 # --- mesh ---
 MESH_VOLUME = 1e-6  # relative; float32 corners of a solid with exact corners, summed in float64
