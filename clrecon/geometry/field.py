@@ -20,6 +20,9 @@ from clrecon.geometry.volume import AIR_HU, Volume
 LARGEST_INTEGER = 2**23
 """Integer voxels are interpolated in float32, which holds halves of integers up to here."""
 
+LOWEST_OUTSIDE = -(2**30)
+"""Differences between integer voxels and what is outside of them stay within 32 bits."""
+
 LARGEST_FLOAT = 1e30
 """Differences of float voxels up to here, and their squares after scaling, stay within float32."""
 
@@ -68,19 +71,24 @@ def data_range(volume: Volume) -> tuple[float, float]:
     NoSurfaceError
         The volume holds NaN.
     """
-    low, high = float(volume.voxels.min()), float(volume.voxels.max())
-    if math.isnan(low) or math.isnan(high):
-        raise NoSurfaceError("the volume holds NaN: it has no iso surface")
+    low, high = math.inf, -math.inf
+    for k, voxels in enumerate(volume.voxels):
+        lowest, highest = float(voxels.min()), float(voxels.max())
+        if math.isnan(lowest):  # numpy's min and max are NaN where one value is
+            raise NoSurfaceError(f"slice {k} of the volume holds NaN: it has no iso surface")
+        low, high = min(low, lowest), max(high, highest)
+        volume.release_slices(k, k + 1)
     return low, high
 
 
 def _lowest_value(volume: Volume) -> float:
     """Lowest value of the volume, or `AIR_HU` as soon as a slice reaches it: what is below does not matter."""
     low = math.inf
-    for voxels in volume.voxels:
+    for k, voxels in enumerate(volume.voxels):
         low = min(low, float(voxels.min()))
         if low <= AIR_HU:
             return float(AIR_HU)
+        volume.release_slices(k, k + 1)
     return low
 
 
@@ -115,7 +123,7 @@ def choose_iso_rule(volume: Volume, iso_value: float, closed: bool = True) -> Is
         iso_level = float(np.float32(iso_value))
         lowest_inside: int | float = iso_level
     else:
-        low = _lowest_value(volume)
+        low = _lowest_value(volume) if closed else float(AIR_HU)
         if dtype == np.int32:
             low, high = data_range(volume)
             if max(-low, high) >= LARGEST_INTEGER:
@@ -127,8 +135,11 @@ def choose_iso_rule(volume: Volume, iso_value: float, closed: bool = True) -> Is
         iso_level = iso_value - 0.5 if lowest_inside == iso_value else iso_value
     outside = max(low, float(AIR_HU))
     if outside >= iso_level:
-        # Everything is inside, or the iso value is below air: a value beyond the level that float32 tells from it.
-        outside = iso_level - max(0.5, abs(iso_level) * 2.0**-20)
+        # Everything is inside, or the iso value is below air: a value beyond the level, of the voxels' own kind.
+        if dtype.kind == "f":
+            outside = iso_level - max(0.5, abs(iso_level) * 2.0**-20)
+        else:
+            outside = float(max(lowest_inside - 1, LOWEST_OUTSIDE))
     return IsoRule(iso_value, lowest_inside, iso_level, outside, closed, value_scale)
 
 

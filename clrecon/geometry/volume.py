@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from clrecon.errors import UsageError
 from clrecon.geometry.affine import Float64Array, apply_affine, checked_affine, column_spacing
+from clrecon.geometry.mapping import find_mapping
 
 __all__ = ["AIR_HU", "DEVICE_DTYPES", "Volume"]
 
@@ -76,6 +77,7 @@ class Volume:
         if array.size == 0:
             raise UsageError(f"the volume is empty: its shape is {array.shape}")
         self._voxels = _device_ready(array)
+        self._mapping = find_mapping(self._voxels)
         self._affine = checked_affine(affine)
         self._affine.flags.writeable = False
         self._inverse = np.asarray(np.linalg.inv(self._affine), dtype=np.float64)
@@ -119,6 +121,14 @@ class Volume:
         """
         k = np.arange(-border, self._voxels.shape[0] + border, dtype=np.float64)
         return self._affine[:3, 3] + k[:, None] * self._affine[:3, 2]
+
+    def release_slices(self, first: int, end: int) -> None:
+        """Say that slices ``first`` to ``end - 1`` are not needed soon: those of a memory-mapped file leave memory.
+
+        Without effect on other volumes, and on none on what the voxels are: they are read again when they are used.
+        """
+        if self._mapping is not None:
+            self._mapping.release(self._voxels[first:end])
 
     def __repr__(self) -> str:
         ni, nj, nk = self.shape_ijk
