@@ -2,6 +2,7 @@
 
 from clrecon.kernels.arrays import allocate, download, empty_output, upload
 from clrecon.kernels.launching import Stopwatch, launch
+from clrecon.kernels.pages import result_pages
 from clrecon.kernels.program import Program, load_program
 from clrecon.kernels.sources import kernel_files, read_kernel_source
 
@@ -15,5 +16,6 @@ __all__ = [
     "launch",
     "load_program",
     "read_kernel_source",
+    "result_pages",
     "upload",
 ]

@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from clrecon.errors import DeviceError
+from clrecon.errors import DeviceError, DeviceMemoryError
+from clrecon.kernels.pages import result_pages
 from clrecon.opencl import Device
 from clrecon.opencl.context import describe_error
 from clrecon.opencl.quirks import import_pyopencl
@@ -26,12 +27,14 @@ def _make_buffer(device: Device, flags: Any, size: int, host: NDArray[Any] | Non
             return cl.Buffer(device.context, flags, size)
         return cl.Buffer(device.context, flags, hostbuf=host)
     except cl.Error as error:
-        raise DeviceError(f"{size:,} bytes cannot be had on {device.label}: {describe_error(error)}") from error
+        raise DeviceMemoryError(f"{size:,} bytes cannot be had on {device.label}: {describe_error(error)}") from error
 
 
 def allocate(device: Device, size: int) -> Any:
     """Return a buffer of `size` bytes (at least 4, since OpenCL has no empty buffers)."""
     cl = import_pyopencl()
+    if device.shares_host_memory and size >= SHARED_BYTES:
+        return empty_output(device, (size,), np.uint8)[1]  # pages that an earlier call has used
     return _make_buffer(device, cl.mem_flags.READ_WRITE, max(size, 4))
 
 
@@ -50,16 +53,16 @@ def empty_output(device: Device, shape: tuple[int, ...], dtype: DTypeLike) -> tu
     """Return an uninitialised host array and a buffer for the device to write it; `download` fills the array."""
     cl = import_pyopencl()
     try:
-        array: NDArray[Any] = np.empty(shape, dtype=dtype)
+        array = result_pages.empty(shape, dtype)
     except MemoryError as error:
         raise DeviceError(f"the result does not fit the memory of this computer: {error}") from error
     if device.shares_host_memory and array.nbytes:
-        return array, _make_buffer(device, cl.mem_flags.WRITE_ONLY | cl.mem_flags.USE_HOST_PTR, array.nbytes, array)
+        return array, _make_buffer(device, cl.mem_flags.READ_WRITE | cl.mem_flags.USE_HOST_PTR, array.nbytes, array)
     return array, allocate(device, array.nbytes)
 
 
-def download(device: Device, array: NDArray[Any], array_d: Any) -> NDArray[Any]:
-    """Wait for the device and return `array` with what it wrote to `array_d`.
+def download(device: Device, array: NDArray[Any], array_d: Any, offset: int = 0) -> NDArray[Any]:
+    """Wait for the device and return `array` with what it wrote to `array_d` from byte `offset` on.
 
     Raises
     ------
@@ -73,11 +76,13 @@ def download(device: Device, array: NDArray[Any], array_d: Any) -> NDArray[Any]:
         if array_d.flags & cl.mem_flags.USE_HOST_PTR:
             # A map makes the host memory current; on CPU drivers it moves nothing.
             mapped, _ = cl.enqueue_map_buffer(
-                device.queue, array_d, cl.map_flags.READ, 0, array.shape, array.dtype, is_blocking=True
+                device.queue, array_d, cl.map_flags.READ, offset, array.shape, array.dtype, is_blocking=True
             )
+            if mapped.ctypes.data != array.ctypes.data:
+                array[...] = mapped
             mapped.base.release(device.queue)
         else:
-            cl.enqueue_copy(device.queue, array, array_d, is_blocking=True)
+            cl.enqueue_copy(device.queue, array, array_d, src_offset=offset, is_blocking=True)
     except cl.Error as error:
         raise device.fail("reading failed", error) from error
     return array
