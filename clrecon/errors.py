@@ -13,6 +13,7 @@ __all__ = [
     "UsageError",
     "RefusedInputError",
     "DeviceError",
+    "DeviceMemoryError",
     "OutputError",
 ]
 
@@ -57,6 +58,10 @@ class DeviceError(ClreconError):
     """No OpenCL device, a device that is not there, or a device that failed."""
 
     exit_code = 5
+
+
+class DeviceMemoryError(DeviceError):
+    """The device has no room for something: less at a time may go through."""
 
 
 class OutputError(ClreconError):

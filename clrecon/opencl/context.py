@@ -7,7 +7,7 @@ import sys
 import threading
 from typing import Any
 
-from clrecon.errors import DeviceError
+from clrecon.errors import DeviceError, DeviceMemoryError
 from clrecon.opencl import quirks
 
 __all__ = ["GROUP_SIZE", "Device", "describe_error"]
@@ -57,6 +57,8 @@ class Device:
         A checking simulator such as Oclgrind: used only when it is named.
     shortcoming : str
         Why the device cannot be used; empty where it can.
+    kernel_variants : dict of str to str
+        ``-D`` definitions for kernels that are written for vectors, see `quirks.kernel_variants`.
     lock : threading.RLock
         Held while a kernel gets its arguments and is enqueued: kernels are shared between threads.
     """
@@ -80,6 +82,7 @@ class Device:
         self.is_simulator: bool = quirks.is_simulator(self.platform)
         self.shares_host_memory: bool = quirks.shares_host_memory(self.platform, self.type)
         self.has_event_times: bool = quirks.has_event_times(self.platform)
+        self.kernel_variants: dict[str, str] = quirks.kernel_variants(self.platform, self.type)
         self.shortcoming: str = _find_shortcoming(cl_device)
         self.lock = threading.RLock()
         self.programs: dict[tuple[str, tuple[str, ...]], Any] = {}
@@ -140,7 +143,8 @@ class Device:
         with self.lock:
             self._context = self._queue = None
             self.programs.clear()
-        return DeviceError(f"{what} on {self.label}: {describe_error(error)}")
+        kind = DeviceMemoryError if isinstance(error, quirks.import_pyopencl().MemoryError) else DeviceError
+        return kind(f"{what} on {self.label}: {describe_error(error)}")
 
     def describe(self) -> dict[str, Any]:
         """Facts for ``clrecon devices --json`` and reports."""

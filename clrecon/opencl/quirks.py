@@ -17,6 +17,7 @@ __all__ = [
     "import_pyopencl",
     "is_simulator",
     "is_software_gpu",
+    "kernel_variants",
     "shares_host_memory",
 ]
 
@@ -24,6 +25,7 @@ SIMULATOR_PLATFORMS = ("oclgrind",)
 """Simulators claim to be fast devices (Oclgrind: CPU, GPU and accelerator at once) and are 1000 times slower."""
 
 
+@cache
 def import_pyopencl() -> Any:
     """Import pyopencl once its environment is safe.
 
@@ -90,3 +92,18 @@ def shares_host_memory(platform_name: str, device_type: str) -> bool:
 def has_event_times(platform_name: str) -> bool:
     """False where profiling events say nothing: rusticl of Mesa 22 reports some nanoseconds for any kernel."""
     return "rusticl" not in platform_name.lower()
+
+
+def kernel_variants(platform_name: str, device_type: str) -> dict[str, str]:
+    """Definitions for kernels with code of their own for CPUs, whose compilers do not make vectors of work-items.
+
+    LANES is the length of their vectors: 8 is one AVX register, and half of one with AVX-512 or two of NEON cost
+    little.  WORDS_PER_ITEM is how many neighbouring words of a mask a work-item takes, so that its vectors are full.
+    OpenCL's prefetch() does nothing in PoCL; the builtin of its compiler, clang, does.
+    """
+    if device_type != "cpu" or is_simulator(platform_name):
+        return {"LANES": "1", "WORDS_PER_ITEM": "1"}
+    variants = {"LANES": "8", "WORDS_PER_ITEM": "8"}
+    if "portable computing language" in platform_name.lower():
+        variants["HAS_BUILTIN_PREFETCH"] = "1"
+    return variants
