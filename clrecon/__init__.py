@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from clrecon.geometry import Volume
     from clrecon.mesh import Mesh
     from clrecon.opencl import Device
-    from clrecon.operators.isosurface import extract_isosurface
+    from clrecon.operators.isosurface import SurfaceExtractor, extract_isosurface, extract_isosurfaces
 
     __version__: str
 
@@ -40,12 +40,14 @@ __all__ = [
     "NoSurfaceError",
     "OutputError",
     "RefusedInputError",
+    "SurfaceExtractor",
     "UsageError",
     "Volume",
     "__version__",
     "device",
     "devices",
     "extract_isosurface",
+    "extract_isosurfaces",
     "list_series",
     "read_volume",
 ]
@@ -58,9 +60,11 @@ _HOMES = {
     "NoSurfaceError": "clrecon.errors",
     "OutputError": "clrecon.errors",
     "RefusedInputError": "clrecon.errors",
+    "SurfaceExtractor": "clrecon.operators.isosurface",
     "UsageError": "clrecon.errors",
     "Volume": "clrecon.geometry",
     "extract_isosurface": "clrecon.operators.isosurface",
+    "extract_isosurfaces": "clrecon.operators.isosurface",
     "list_series": "clrecon.dicom",
     "read_volume": "clrecon.dicom",
 }

@@ -10,12 +10,21 @@
  *   3. emit_vertices      positions and normals of the vertices of each word with work
  *   4. emit_triangles     vertex numbers of the triangles of each word with work
  *
+ * The sample grid is the volume, with one layer of outside around it when the surface is closed.  The passes work on
+ * a slab of it: whole slices, with those beyond it that its vertices and their numbers depend on.  A mesh is the same
+ * in one slab or in many.
+ *
  * A sample owns the edges towards i + 1, j + 1 and k + 1.  Vertices are numbered by row, then by owner along the
  * row, then by axis: the number of any edge's vertex follows from three popcounts, so vertices are computed once
  * and shared without a hash, an atomic or an index array, and the order never depends on the device. */
 #include "include/volume.h"
 #include "include/mc_tables.h"
 #include "isosurface/mask_rows.h"
+#include "isosurface/vertex_group.h"
+
+#ifndef WORDS_PER_ITEM
+#define WORDS_PER_ITEM 1
+#endif
 
 /* Bits of 16 comparison results (-1 or 0 each): bit n is lane n. */
 static inline uint pack_lanes(short16 lanes)
@@ -26,6 +35,16 @@ static inline uint pack_lanes(short16 lanes)
     const ushort4 by4 = by8.lo | by8.hi;
     const ushort2 by2 = by4.lo | by4.hi;
     return by2.x | by2.y;
+}
+
+/* Inside bits of 16 voxels.  Wider types are compared 8 at a time: vectors of 64 bytes go wrong in PoCL 3.0 on
+ * processors without registers of that size, where kernel and library disagree on how they are passed. */
+static inline uint classify_lanes(__global const VOXEL *voxels, VOXEL level)
+{
+    if (sizeof(VOXEL) <= 2)
+        return pack_lanes(convert_short16(vload16(0, voxels) >= level));
+    return pack_lanes(
+        (short16)(convert_short8(vload8(0, voxels) >= level), convert_short8(vload8(1, voxels) >= level)));
 }
 
 /* The word of 32 samples that starts at voxel `first` of a row; `first` may lie before it, samples may lie beyond. */
@@ -39,52 +58,56 @@ static inline uint classify_word(__global const VOXEL *row, int first, int ni, V
     }
     /* 32 voxels that lie in the row, shifted to where the word has them. */
     const int begin = clamp(first, 0, ni - 32);
-    const uint low = pack_lanes(convert_short16(vload16(0, row + begin) >= level));
-    const uint high = pack_lanes(convert_short16(vload16(0, row + begin + 16) >= level));
-    const uint bits = low | high << 16;
+    const uint bits = classify_lanes(row + begin, level) | classify_lanes(row + begin + 16, level) << 16;
     if (first < begin)
         return bits << (begin - first);
     return first - begin < 32 ? bits >> (first - begin) : 0;
 }
 
-/* Parameters  voxels     in   (nk, nj, ni)
+/* Parameters  voxels     in   slices of the volume from first_slice on
  *             mask       out  (gk, gj, words) bit set where voxel >= level
  *             level      lowest inside value
- *             ni nj nk   voxels
+ *             ni nj nk   voxels of the whole volume
  *             border     layers of outside around the volume, 0 or 1
+ *             first_slice          slice of the volume that `voxels` begins with
+ *             first_sample_slice   slice of the sample grid that the mask begins with
+ *             gk         slices of the mask
  *             words      words a row, ceil((ni + 2 border) / 32)
  * Launch      global = gj * gk rounded up by the host, any local: one item a row, so that dividing for j and k
  *             costs little
  * Guarantees  every word of the mask is written; bits beyond the row are 0 */
 __kernel void classify_samples(
     __global const VOXEL *restrict voxels, __global uint *restrict mask, const VOXEL level,
-    const int ni, const int nj, const int nk, const int border, const int words)
+    const int ni, const int nj, const int nk, const int border, const int first_slice, const int first_sample_slice,
+    const uint gk, const int words)
 {
-    const uint gj = nj + 2 * border, gk = nk + 2 * border;
+    const uint gj = nj + 2 * border;
     const uint row = get_global_id(0);
     if (row >= gj * gk)
         return;
     __global uint *row_mask = mask + (size_t)row * words;
     const int j = (int)(row % gj) - border;
-    const int k = (int)(row / gj) - border;
+    const int k = (int)(row / gj) + first_sample_slice - border;
     if (j < 0 || j >= nj || k < 0 || k >= nk) {
         for (int w = 0; w < words; ++w)
             row_mask[w] = 0;
         return;
     }
-    __global const VOXEL *row_voxels = voxels + voxel_index(0, j, k, ni, nj);
+    __global const VOXEL *row_voxels = voxels + voxel_index(0, j, k - first_slice, ni, nj);
     for (int w = 0; w < words; ++w)
         row_mask[w] = classify_word(row_voxels, 32 * w - border, ni, level);
 }
 
 /* Parameters  mask             in   (gk, gj, words)
- *             row_vertices     out  (gk, gj) vertices owned by each row
- *             row_triangles    out  (gk, gj) triangles of the cells of each row
- *             words_with_work  out  (gk, gj, flag_words) bit w of a row: word w owns a vertex or has an active cell
- *             word_vertices    out  (gk, gj, words) vertices of the row before each word
- *             word_triangles   out  (gk, gj, words) triangles of the row before each word
- *             gi gj gk         samples; words a row; flag_words = ceil(words / 32)
- * Launch      global = gj * gk rounded up by the host, any local
+ *             row_vertices     out  (rows_to_count,) vertices owned by each row
+ *             row_triangles    out  (rows_to_count,) triangles of the cells of each row
+ *             words_with_work  out  (rows_to_count, flag_words) bit w of a row: word w owns a vertex or has an active cell
+ *             word_vertices    out  (rows_to_count, words) vertices of the row before each word
+ *             word_triangles   out  (rows_to_count, words) triangles of the row before each word
+ *             gi gj gk         samples; words a row; flag_words = ceil(words / 32), rounded up to a
+ *                              power of two
+ *             rows_to_count    rows that are counted, the first ones of the mask
+ * Launch      global = rows_to_count rounded up by the host, any local
  * Assumes     5 (gi + 1) < 65536, so that places in a row fit 16 bits
  * Guarantees  every output is written */
 __kernel void count_rows(
@@ -92,68 +115,54 @@ __kernel void count_rows(
     __global uint *restrict row_vertices, __global uint *restrict row_triangles,
     __global uint *restrict words_with_work,
     __global ushort *restrict word_vertices, __global ushort *restrict word_triangles,
-    const uint gi, const uint gj, const uint gk, const uint words, const uint flag_words)
+    const uint gi, const uint gj, const uint gk, const uint words, const uint flag_words, const uint rows_to_count)
 {
     const uint row = get_global_id(0);
-    if (row >= gj * gk)
+    if (row >= rows_to_count)
         return;
     const uint j = row % gj;
     const uint k = row / gj;
-    const int has_cells = j + 1 < gj && k + 1 < gk;
+    const int has_y = j + 1 < gj, has_z = k + 1 < gk;
+    /* Rows (y, z) around the row of cells; where the grid ends, rows beyond are the last one: no edge is crossed. */
+    __global const uint *y0z0 = mask + (size_t)row * words;
+    __global const uint *y1z0 = has_y ? y0z0 + words : y0z0;
+    __global const uint *y0z1 = has_z ? y0z0 + (size_t)gj * words : y0z0;
+    __global const uint *y1z1 = has_y && has_z ? y0z1 + words : y0z0;
+    cell_rows rows = {y0z0[0], y1z0[0], y0z1[0], y1z1[0]};
     uint vertices = 0, triangles = 0, flags = 0;
     for (uint w = 0; w < words; ++w) {
         word_vertices[(size_t)row * words + w] = (ushort)vertices;
         word_triangles[(size_t)row * words + w] = (ushort)triangles;
-        const crossed_edges edges = find_crossed_edges(mask, j, k, w, gi, gj, gk, words);
-        const uint own = count_vertices_before(edges, 32);
-        uint active = 0;
-        if (has_cells) {
-            const cell_rows rows = load_cell_rows(mask, j, k, w, gj, words);
-            active = find_active_cells(rows, w, gi);
-            for (uint rest = active; rest != 0; rest &= rest - 1)
-                triangles += (uint)MC_TRIANGLES[cell_case(rows, lowest_bit(rest))] & 15;
+        const uint next = w + 1 < words ? w + 1 : w;
+        const cell_rows next_rows = {y0z0[next], y1z0[next], y0z1[next], y1z1[next]};
+        rows.y0z0 |= next_rows.y0z0 << 32;
+        rows.y1z0 |= next_rows.y1z0 << 32;
+        rows.y0z1 |= next_rows.y0z1 << 32;
+        rows.y1z1 |= next_rows.y1z1 << 32;
+        const uint active = find_active_cells(rows, w, gi);
+        const uint y = (uint)(rows.y0z0 ^ rows.y1z0), z = (uint)(rows.y0z0 ^ rows.y0z1);
+        if ((active | y | z) != 0) {
+            const uint x = (uint)((rows.y0z0 ^ rows.y0z0 >> 1) & samples_with_next(w, gi));
+            vertices += popcount(x) + popcount(y) + popcount(z);
+            if (has_y && has_z) {
+                for (uint rest = active; rest != 0; rest &= rest - 1)
+                    triangles += (uint)MC_TRIANGLES[cell_case(rows, lowest_bit(rest))] & 15;
+            }
+            flags |= 1u << (w & 31);
         }
-        vertices += own;
-        flags |= (uint)(own != 0 || active != 0) << (w & 31);
         if ((w & 31) == 31 || w + 1 == words) {
             words_with_work[(size_t)row * flag_words + (w >> 5)] = flags;
             flags = 0;
         }
+        rows = next_rows;
     }
+    for (uint f = (words + 31) / 32; f < flag_words; ++f)
+        words_with_work[(size_t)row * flag_words + f] = 0;
     row_vertices[row] = vertices;
     row_triangles[row] = triangles;
 }
 
-/* Gradient of the field per index step at sample (i, j, k) of the volume: central differences, one-sided at the
- * border of an open volume.  `inner` says that all six neighbours lie in the volume. */
-static inline float3 gradient_at(
-    __global const VOXEL *voxels, int i, int j, int k, int ni, int nj, int nk, int closed, float outside, int inner)
-{
-    if (inner) {
-        __global const VOXEL *at = voxels + voxel_index(i, j, k, ni, nj);
-        const size_t plane = (size_t)ni * (size_t)nj;
-        return 0.5f * (float3)(convert_float(at[1]) - convert_float(*(at - 1)),
-            convert_float(at[ni]) - convert_float(*(at - ni)),
-            convert_float(at[plane]) - convert_float(*(at - plane)));
-    }
-#define SAMPLE(di, dj, dk) sample_voxel(voxels, i + di, j + dj, k + dk, ni, nj, nk, closed, outside)
-    const float3 change = (float3)(SAMPLE(1, 0, 0) - SAMPLE(-1, 0, 0), SAMPLE(0, 1, 0) - SAMPLE(0, -1, 0),
-        SAMPLE(0, 0, 1) - SAMPLE(0, 0, -1));
-#undef SAMPLE
-    const float3 one_sided = (float3)(i == 0 || i == ni - 1, j == 0 || j == nj - 1, k == 0 || k == nk - 1);
-    return change * (closed ? (float3)(0.5f) : 0.5f + 0.5f * one_sided);
-}
-
-/* Sum of two floats and its exact rounding error (Knuth). */
-static inline float3 add_exactly(float3 a, float3 b, float3 *error)
-{
-    const float3 sum = a + b;
-    const float3 part = sum - a;
-    *error += (a - (sum - part)) + (b - part);
-    return sum;
-}
-
-/* Parameters  voxels          in   (nk, nj, ni)
+/* Parameters  voxels          in   slices of the volume from first_slice on
  *             mask            in   (gk, gj, words)
  *             active_words    in   (active,) numbers of the words with work: bits of words_with_work
  *             row_offsets     in   (gk, gj) vertices before each row
@@ -169,8 +178,13 @@ static inline float3 add_exactly(float3 a, float3 b, float3 *error)
  *             value_scale     power of two that takes the values to 1 or below: squares neither over- nor underflow
  *             margin          smallest distance of a vertex from a sample along x, y, z, in steps: some units in the
  *                             last place of the position, so that no triangle collapses when it is rounded
- *             ni nj nk, border, words, flag_words, active   as above
- * Launch      global = active rounded up by the host, any local
+ *             ni nj nk, border   of the whole volume
+ *             first_slice     slice of the volume that `voxels` begins with
+ *             first_sample_slice   slice of the sample grid that the mask begins with
+ *             gk, words       as above
+ *             row_shift       a word's number is its row times 2^row_shift, plus its place in the row
+ *             active          number of words with work
+ * Launch      global = ceil(active / WORDS_PER_ITEM) rounded up by the host, any local
  * Guarantees  every position and normal is written once.  Positions are right to one unit in the last place of the
  *             volume's largest coordinate (half a unit up to 4096 samples an axis, where products of a sample number
  *             and a step of 12 bits are exact; sums keep their error) */
@@ -180,66 +194,119 @@ __kernel void emit_vertices(
     __global const ushort *restrict word_vertices,
     __global const float4 *restrict slice_frames, __global const float4 *restrict steps,
     __global float *restrict positions, __global float *restrict normals,
-    const float iso_level, const float outside, const float value_scale, const float4 margin,
-    const int ni, const int nj, const int nk, const int border, const uint words, const uint flag_words,
-    const uint active)
+    const float iso_level, const VALUE outside, const float value_scale, const float4 margin,
+    const int ni, const int nj, const int nk, const int border, const int first_slice, const int first_sample_slice,
+    const uint gk, const uint words, const uint row_shift, const uint active)
 {
-    if (get_global_id(0) >= active)
+    const uint begin = get_global_id(0) * WORDS_PER_ITEM;
+    if (begin >= active)
         return;
-    const uint gi = ni + 2 * border, gj = nj + 2 * border, gk = nk + 2 * border;
-    const uint flag = active_words[get_global_id(0)];
-    const uint row = flag / (32 * flag_words);
-    const uint w = flag % (32 * flag_words);
-    const uint j = row % gj, k = row / gj;
-    const crossed_edges edges = find_crossed_edges(mask, j, k, w, gi, gj, gk, words);
+    const uint end = min(begin + WORDS_PER_ITEM, active);
+    const volume_part volume = {voxels, ni, nj, nk, first_slice, border, outside};
+    const uint gi = ni + 2 * border, gj = nj + 2 * border;
+    slice_frame frame;
+    frame.i_step = steps[0].xyz;
+    frame.i_rest = steps[1].xyz;
+    frame.j_step = steps[2].xyz;
+    frame.j_rest = steps[3].xyz;
+    frame.margin = margin.xyz;
+    frame.iso_level = iso_level;
+    frame.value_scale = value_scale;
 
-    __global const float4 *frame = slice_frames + 6 * (size_t)k;
-    const float3 k_step = frame[2].xyz;
-    const float3 i_step = steps[0].xyz + steps[1].xyz;
-    const float3 j_step = steps[2].xyz + steps[3].xyz;
-    /* Position of the word's first sample, and what rounding left of it. */
-    const float word_i = (float)((int)(32 * w) - border), row_j = (float)((int)j - border);
-    float3 base_rest = frame[1].xyz + word_i * steps[1].xyz + row_j * steps[3].xyz;
-    float3 base = add_exactly(frame[0].xyz, row_j * steps[2].xyz, &base_rest);
-    base = add_exactly(base, word_i * steps[0].xyz, &base_rest);
+    /* First touches of the volume wait for memory: ask for all that the item will need before it needs any of it. */
+    for (uint n = begin; n < end; ++n) {
+        const uint row = active_words[n] >> row_shift, w = active_words[n] & ((1u << row_shift) - 1);
+        prefetch_around(&volume, (int)(32 * w) - border, (int)(row % gj) - border,
+            (int)(row / gj) + first_sample_slice - border);
+    }
 
-    const size_t row_stride = ni, slice_stride = (size_t)ni * (size_t)nj;
-    const int vj = (int)j - border, vk = (int)k - border;
-    const int row_is_inner = vj >= 1 && vj < nj - 2 && vk >= 1 && vk < nk - 2;
-    size_t vertex = row_offsets[row] + word_vertices[(size_t)row * words + w];
-    for (uint rest = (uint)(edges.x | edges.y | edges.z); rest != 0; rest &= rest - 1) {
-        const uint b = lowest_bit(rest);
-        const int vi = (int)(32 * w + b) - border;
-        const int inner = row_is_inner && vi >= 1 && vi < ni - 2;
-        const float3 at_sample = base_rest + (float)b * i_step;
-        const size_t here = inner ? voxel_index(vi, vj, vk, ni, nj) : 0;
-        const float value = inner ? convert_float(voxels[here]) : sample_voxel(voxels, vi, vj, vk, ni, nj, nk, 1, outside);
-        const float3 gradient = gradient_at(voxels, vi, vj, vk, ni, nj, nk, border, outside, inner);
-        for (int axis = 0; axis < 3; ++axis) {
-            const ulong crossed = axis == 0 ? edges.x : axis == 1 ? edges.y : edges.z;
-            if (!(crossed >> b & 1))
-                continue;
-            const int di = axis == 0, dj = axis == 1, dk = axis == 2;
-            const size_t stride = axis == 0 ? 1 : axis == 1 ? row_stride : slice_stride;
-            const float next = inner ? convert_float(voxels[here + stride])
-                                     : sample_voxel(voxels, vi + di, vj + dj, vk + dk, ni, nj, nk, 1, outside);
-            const float3 next_gradient
-                = gradient_at(voxels, vi + di, vj + dj, vk + dk, ni, nj, nk, border, outside, inner);
-            const float keep = axis == 0 ? margin.x : axis == 1 ? margin.y : margin.z;
-            const float t = clamp((iso_level - value) / (next - value), keep, 1.0f - keep);
-            const float3 step = axis == 0 ? i_step : axis == 1 ? j_step : k_step;
-            vstore3(base + (at_sample + t * step), vertex, positions);
-
-            /* Where the differences cancel, the edge itself says which way is down. */
-            float3 slope = value_scale * (gradient + t * (next_gradient - gradient));
-            if (dot(slope, slope) == 0.0f)
-                slope = (next > value ? 1.0f : -1.0f) * (float3)(di, dj, dk);
-            const float3 up = (float3)(
-                dot(frame[3].xyz, slope), dot(frame[4].xyz, slope), dot(frame[5].xyz, slope));
-            vstore3(-up / sqrt(dot(up, up)), vertex, normals);
-            ++vertex;
+    vertex_group group;
+    uint gathered = 0;
+    uint slice_begin = 0, slice_end = 0; /* rows of the slice that `frame` describes */
+    uint k = 0;
+    size_t written = 0;
+    for (uint n = begin; n < end; ++n) {
+        const uint row = active_words[n] >> row_shift, w = active_words[n] & ((1u << row_shift) - 1);
+        if (row >= slice_end) {
+            if (gathered != 0)
+                write_vertices(&group, &frame, gathered, positions + 3 * written, normals + 3 * written);
+            gathered = 0;
+            written = row_offsets[row] + word_vertices[(size_t)row * words + w];
+            k = row / gj;
+            slice_begin = k * gj;
+            slice_end = slice_begin + gj;
+            load_slice_frame(&frame, slice_frames + 6 * (size_t)k);
+        }
+        const uint j = row - slice_begin;
+        crossed_edges edges;
+        find_crossed_edges(&edges, mask, j, k, w, gi, gj, gk, words);
+        const uint x = (uint)edges.x, y = (uint)edges.y, z = (uint)edges.z;
+        /* Without branches: whether an axis has its vertex is as good as random, and wrong guesses cost more. */
+        ushort crossed[96]; /* 4 * sample + axis */
+        uint count = 0;
+        for (uint owners = x | y | z; owners != 0; owners &= owners - 1) {
+            const uint b = lowest_bit(owners);
+            crossed[count] = (ushort)(4 * b);
+            count += x >> b & 1;
+            crossed[count] = (ushort)(4 * b + 1);
+            count += y >> b & 1;
+            crossed[count] = (ushort)(4 * b + 2);
+            count += z >> b & 1;
+        }
+        const int vi = (int)(32 * w) - border, vj = (int)j - border, vk = (int)k + first_sample_slice - border;
+        const int row_is_inner = vj >= 1 && vj < nj - 2 && vk >= 1 && vk < nk - 2;
+        for (uint m = 0; m < count; ++m) {
+            const int i = vi + (crossed[m] >> 2);
+            const int inner = row_is_inner && i >= 1 && i < ni - 2;
+            gather_vertex(&group, gathered++, &volume, i, vj, vk, crossed[m] & 3, inner);
+            if (gathered == LANES) {
+                write_vertices(&group, &frame, LANES, positions + 3 * written, normals + 3 * written);
+                written += LANES;
+                gathered = 0;
+            }
         }
     }
+    if (gathered != 0)
+        write_vertices(&group, &frame, gathered, positions + 3 * written, normals + 3 * written);
+}
+
+#if LANES > 1
+#define TRIANGLES_WAITING 64
+
+/* Write triangles that wait in private memory. */
+static inline void flush_triangles(const uint *waiting, uint count, __global uint *out)
+{
+    uint n = 0;
+    for (; n + 8 <= 3 * count; n += 8)
+        vstore8(vload8(0, waiting + n), 0, out + n);
+    for (; n < 3 * count; ++n)
+        out[n] = waiting[n];
+}
+#endif
+
+/* The crossed edges owned by one row of samples, as emit_triangles numbers them. */
+typedef struct {
+    ulong xy; /* low 32 bits: along x, high: along y */
+    uint z;
+    ulong x_window, y_window; /* samples 0..32 of the word */
+    uint first; /* number of the first vertex of the word */
+} numbered_edges;
+
+static inline void number_edges(
+    numbered_edges *edges, ulong own, ulong next_y, ulong next_z, ulong with_next, uint first)
+{
+    edges->x_window = (own ^ own >> 1) & with_next;
+    edges->y_window = own ^ next_y;
+    edges->xy = (edges->x_window & 0xffffffffUL) | edges->y_window << 32;
+    edges->z = (uint)(own ^ next_z);
+    edges->first = first;
+}
+
+/* Number of the first vertex of the owners from sample b on. */
+static inline uint number_at(const numbered_edges *edges, uint b)
+{
+    const uint before = (1u << b) - 1;
+    return edges->first + (uint)popcount(edges->xy & (before | (ulong)before << 32)) + popcount(edges->z & before);
 }
 
 /* Parameters  mask              in   (gk, gj, words)
@@ -249,68 +316,113 @@ __kernel void emit_vertices(
  *             word_vertices     in   (gk, gj, words)
  *             word_triangles    in   (gk, gj, words)
  *             triangles         out  (triangles, 3) vertex numbers, counter-clockwise as seen from lower values
- *             gi gj gk, words, flag_words, active   as above
+ *             first_vertex      number of the vertex that vertex_offsets calls 0
+ *             gi gj gk, words, row_shift, active   as above
  *             mirrored          1 when index space is left-handed in mm: the winding is turned round
- * Launch      global = active rounded up by the host, any local
+ * Launch      global = ceil(active / WORDS_PER_ITEM) rounded up by the host, any local
  * Guarantees  every triangle is written once, cell by cell along the rows */
 __kernel void emit_triangles(
     __global const uint *restrict mask, __global const uint *restrict active_words,
     __global const uint *restrict vertex_offsets, __global const uint *restrict triangle_offsets,
     __global const ushort *restrict word_vertices, __global const ushort *restrict word_triangles,
-    __global uint *restrict triangles,
-    const uint gi, const uint gj, const uint gk, const uint words, const uint flag_words, const uint active,
+    __global uint *restrict triangles, const uint first_vertex,
+    const uint gi, const uint gj, const uint gk, const uint words, const uint row_shift, const uint active,
     const int mirrored)
 {
-    if (get_global_id(0) >= active)
+    const uint begin = get_global_id(0) * WORDS_PER_ITEM;
+    if (begin >= active)
         return;
-    const uint flag = active_words[get_global_id(0)];
-    const uint row = flag / (32 * flag_words);
-    const uint w = flag % (32 * flag_words);
-    const uint j = row % gj, k = row / gj;
-    if (j + 1 >= gj || k + 1 >= gk)
-        return;
-    const cell_rows rows = load_cell_rows(mask, j, k, w, gj, words);
-    uint rest = find_active_cells(rows, w, gi);
-    if (rest == 0)
-        return;
-
-    /* Rows of samples around the row of cells, numbered by y + 2 z. */
-    crossed_edges edges[4];
-    uint first[4];
-    for (uint around = 0; around < 4; ++around) {
-        const uint rj = j + (around & 1), rk = k + (around >> 1);
-        const uint r = row_index(rj, rk, gj);
-        edges[around] = find_crossed_edges(mask, rj, rk, w, gi, gj, gk, words);
-        first[around] = vertex_offsets[r] + word_vertices[(size_t)r * words + w];
-    }
-
-    size_t triangle = (size_t)triangle_offsets[row] + word_triangles[(size_t)row * words + w];
-    for (; rest != 0; rest &= rest - 1) {
-        const uint b = lowest_bit(rest);
-        /* Vertex numbers of the cell's 12 edges; those of edges that are not crossed are never looked up. */
-        uint numbers[12];
-        for (uint around = 0; around < 4; ++around) {
-            const crossed_edges e = edges[around];
-            const uint here = first[around] + count_vertices_before(e, b);
-            const uint x = e.x >> b & 1, y = e.y >> b & 1, z = e.z >> b & 1;
-            const uint next = here + x + y + z;
-            const uint next_x = e.x >> (b + 1) & 1, next_y = e.y >> (b + 1) & 1;
-            numbers[around] = here;
-            if ((around & 1) == 0) { /* y = 0: owns y edges, which are numbered by x + 2 z */
-                numbers[4 + around] = here + x;
-                numbers[5 + around] = next + next_x;
-            }
-            if (around < 2) { /* z = 0: owns z edges, which are numbered by x + 2 y */
-                numbers[8 + 2 * around] = here + x + y;
-                numbers[9 + 2 * around] = next + next_x + next_y;
-            }
+    const uint end = min(begin + WORDS_PER_ITEM, active);
+    /* Where in a packed triangle its first and its last corner stand. */
+    const uint first_shift = mirrored ? 8 : 0, last_shift = mirrored ? 0 : 8;
+#if LANES > 1
+    uint waiting[3 * TRIANGLES_WAITING];
+    uint waits = 0;
+#endif
+    const uint first_row = active_words[begin] >> row_shift;
+    size_t triangle = (size_t)triangle_offsets[first_row]
+        + word_triangles[(size_t)first_row * words + (active_words[begin] & ((1u << row_shift) - 1))];
+    uint slice_begin = 0, slice_end = 0, k = 0;
+    for (uint n = begin; n < end; ++n) {
+        const uint row = active_words[n] >> row_shift, w = active_words[n] & ((1u << row_shift) - 1);
+        if (row >= slice_end) {
+            k = row / gj;
+            slice_begin = k * gj;
+            slice_end = slice_begin + gj;
         }
-        ulong packed = MC_TRIANGLES[cell_case(rows, b)];
-        const uint count = (uint)packed & 15;
-        packed >>= 4;
-        for (uint n = 0; n < count; ++n, packed >>= 12) {
-            const uint a = numbers[packed & 15], c = numbers[packed >> 8 & 15];
-            vstore3((uint3)(mirrored ? c : a, numbers[packed >> 4 & 15], mirrored ? a : c), triangle++, triangles);
+        const uint j = row - slice_begin;
+        if (j + 1 >= gj || k + 1 >= gk)
+            continue;
+        /* Rows (y, z) around the row of cells, and those beyond, from which it has the edges of its far side. */
+        cell_rows rows;
+        load_cell_rows(&rows, mask, j, k, w, gj, words);
+        uint rest = find_active_cells(rows, w, gi);
+        const ulong y2z0 = j + 2 < gj ? load_window(mask, row + 2, w, words) : rows.y1z0;
+        const ulong y2z1 = j + 2 < gj ? load_window(mask, row + gj + 2, w, words) : rows.y1z1;
+        const ulong y0z2 = k + 2 < gk ? load_window(mask, row + 2 * gj, w, words) : rows.y0z1;
+        const ulong y1z2 = k + 2 < gk ? load_window(mask, row + 2 * gj + 1, w, words) : rows.y1z1;
+        const ulong with_next = samples_with_next(w, gi);
+#define FIRST(r) (first_vertex + vertex_offsets[r] + word_vertices[(size_t)(r) * words + w])
+        numbered_edges e0, e1, e2, e3;
+        number_edges(&e0, rows.y0z0, rows.y1z0, rows.y0z1, with_next, FIRST(row));
+        number_edges(&e1, rows.y1z0, y2z0, rows.y1z1, with_next, FIRST(row + 1));
+        number_edges(&e2, rows.y0z1, rows.y1z1, y0z2, with_next, FIRST(row + gj));
+        number_edges(&e3, rows.y1z1, y2z1, y1z2, with_next, FIRST(row + gj + 1));
+#undef FIRST
+        for (; rest != 0; rest &= rest - 1) {
+            const uint b = lowest_bit(rest);
+            /* Vertex numbers of the cell's 12 edges; those of edges that are not crossed are never looked up. */
+            uint numbers[16];
+#define BIT(window, at) ((uint)((window) >> (at)) & 1)
+            const uint at0 = number_at(&e0, b), at1 = number_at(&e1, b), at2 = number_at(&e2, b);
+            const uint x0 = BIT(e0.x_window, b), x1 = BIT(e1.x_window, b), x2 = BIT(e2.x_window, b);
+            const uint y0 = BIT(e0.y_window, b), y1 = BIT(e1.y_window, b), y2 = BIT(e2.y_window, b);
+            const uint after0 = at0 + x0 + y0 + (e0.z >> b & 1) + BIT(e0.x_window, b + 1);
+            const uint after1 = at1 + x1 + y1 + (e1.z >> b & 1) + BIT(e1.x_window, b + 1);
+            const uint after2 = at2 + x2 + y2 + (e2.z >> b & 1) + BIT(e2.x_window, b + 1);
+            numbers[0] = at0;
+            numbers[1] = at1;
+            numbers[2] = at2;
+            numbers[3] = number_at(&e3, b);
+            numbers[4] = at0 + x0;
+            numbers[5] = after0;
+            numbers[6] = at2 + x2;
+            numbers[7] = after2;
+            numbers[8] = at0 + x0 + y0;
+            numbers[9] = after0 + BIT(e0.y_window, b + 1);
+            numbers[10] = at1 + x1 + y1;
+            numbers[11] = after1 + BIT(e1.y_window, b + 1);
+#undef BIT
+            const ulong packed = MC_TRIANGLES[cell_case(rows, b)];
+            const uint count = (uint)packed & 15;
+#if LANES > 1
+            /* Two triangles whether they count or not, the rest where there are more: wrong guesses cost more. */
+            __private uint *out = waiting + 3 * waits;
+#define PUT(n) \
+            out[3 * n] = numbers[packed >> (4 + 12 * n + first_shift) & 15]; \
+            out[3 * n + 1] = numbers[packed >> (8 + 12 * n) & 15]; \
+            out[3 * n + 2] = numbers[packed >> (4 + 12 * n + last_shift) & 15];
+            PUT(0) PUT(1)
+            if (count > 2) {
+                PUT(2) PUT(3) PUT(4)
+            }
+#undef PUT
+            waits += count;
+            if (waits > TRIANGLES_WAITING - 5) {
+                flush_triangles(waiting, waits, triangles + 3 * triangle);
+                triangle += waits;
+                waits = 0;
+            }
+#else
+            for (uint n = 0; n < count; ++n) {
+                const uint corners = (uint)(packed >> (4 + 12 * n));
+                vstore3((uint3)(numbers[corners >> first_shift & 15], numbers[corners >> 4 & 15],
+                    numbers[corners >> last_shift & 15]), triangle++, triangles);
+            }
+#endif
         }
     }
+#if LANES > 1
+    flush_triangles(waiting, waits, triangles + 3 * triangle);
+#endif
 }

@@ -41,23 +41,14 @@ typedef struct {
     ulong x, y, z;
 } crossed_edges;
 
-static inline crossed_edges find_crossed_edges(
-    __global const uint *mask, uint j, uint k, uint w, uint gi, uint gj, uint gk, uint words)
+static inline void find_crossed_edges(
+    crossed_edges *edges, __global const uint *mask, uint j, uint k, uint w, uint gi, uint gj, uint gk, uint words)
 {
     const uint row = row_index(j, k, gj);
     const ulong own = load_window(mask, row, w, words);
-    crossed_edges edges;
-    edges.x = (own ^ own >> 1) & samples_with_next(w, gi);
-    edges.y = j + 1 < gj ? own ^ load_window(mask, row + 1, w, words) : 0;
-    edges.z = k + 1 < gk ? own ^ load_window(mask, row + gj, w, words) : 0;
-    return edges;
-}
-
-/* Number of vertices owned by the samples before sample b of a window. */
-static inline uint count_vertices_before(crossed_edges edges, uint b)
-{
-    const ulong before = low_bits(b);
-    return (uint)(popcount(edges.x & before) + popcount(edges.y & before) + popcount(edges.z & before));
+    edges->x = (own ^ own >> 1) & samples_with_next(w, gi);
+    edges->y = j + 1 < gj ? own ^ load_window(mask, row + 1, w, words) : 0;
+    edges->z = k + 1 < gk ? own ^ load_window(mask, row + gj, w, words) : 0;
 }
 
 /* The four rows of windows around a row of cells: bit b of them are the corners of cell b at x = 0,
@@ -66,15 +57,14 @@ typedef struct {
     ulong y0z0, y1z0, y0z1, y1z1;
 } cell_rows;
 
-static inline cell_rows load_cell_rows(__global const uint *mask, uint j, uint k, uint w, uint gj, uint words)
+static inline void load_cell_rows(
+    cell_rows *rows, __global const uint *mask, uint j, uint k, uint w, uint gj, uint words)
 {
     const uint row = row_index(j, k, gj);
-    cell_rows rows;
-    rows.y0z0 = load_window(mask, row, w, words);
-    rows.y1z0 = load_window(mask, row + 1, w, words);
-    rows.y0z1 = load_window(mask, row + gj, w, words);
-    rows.y1z1 = load_window(mask, row + gj + 1, w, words);
-    return rows;
+    rows->y0z0 = load_window(mask, row, w, words);
+    rows->y1z0 = load_window(mask, row + 1, w, words);
+    rows->y0z1 = load_window(mask, row + gj, w, words);
+    rows->y1z1 = load_window(mask, row + gj + 1, w, words);
 }
 
 /* Cells of the word (bits 0..31) whose corners are neither all inside nor all outside. */

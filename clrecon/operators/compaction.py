@@ -30,6 +30,13 @@ class Scanned:
     offsets_d: Any
     total: int
 
+    def before(self, device: Device, place: int, n: int) -> int:
+        """Sum of the counts before element `place` of `n`; exact where the total is below 2^32."""
+        if place == n:
+            return self.total
+        value = np.empty(1, dtype=np.uint32)
+        return int(download(device, value, self.offsets_d, 4 * place)[0])
+
 
 @dataclass(frozen=True)
 class Compacted:

@@ -1,93 +1,31 @@
-"""Extract iso surfaces: the host side of cl/isosurface/marching_cubes.cl."""
+"""Extract iso surfaces: one volume, any size, any number of iso values."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from types import TracebackType
 from typing import Any
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from clrecon.errors import ClreconError, DeviceError, NoSurfaceError, UsageError
-from clrecon.geometry import Volume, is_left_handed
-from clrecon.geometry.field import IsoRule, choose_iso_rule, data_range, slice_normal_matrices, vertex_margin
-from clrecon.kernels import Program, Stopwatch, allocate, download, empty_output, launch, load_program, upload
+from clrecon.errors import ClreconError, DeviceError, DeviceMemoryError, NoSurfaceError, UsageError
+from clrecon.geometry import Volume
+from clrecon.geometry.field import IsoRule, choose_iso_rule, data_range
+from clrecon.kernels import Program, Stopwatch, result_pages, upload
 from clrecon.mesh import Mesh
-from clrecon.opencl import Device, check_budget, choose_device
+from clrecon.opencl import Device, choose_device, describe_shortage, memory_limits
 from clrecon.opencl.quirks import cache_warnings
-from clrecon.operators.compaction import Compacted, compact, exclusive_scan, prepare_compaction
+from clrecon.operators import marching_cubes
+from clrecon.operators.marching_cubes import Counted, Placement
+from clrecon.operators.slabs import SampleGrid, Slab, plan_slabs
 
-__all__ = ["extract_isosurface", "prepare_isosurface"]
+__all__ = ["SurfaceExtractor", "extract_isosurface", "extract_isosurfaces", "prepare_isosurface"]
 
 Progress = Callable[[str, int, int], None]
 
-VOXEL_TYPES = {
-    "int8": "char", "uint8": "uchar", "int16": "short", "uint16": "ushort", "int32": "int", "float32": "float",
-}  # fmt: skip
-
-LONGEST_ROW = 13_000
-"""Samples a row: places in a row are 16-bit numbers, and a cell has at most 5 triangles."""
-
-
-@dataclass(frozen=True)
-class _SampleGrid:
-    """The samples of a volume with its border, and how the inside mask packs them."""
-
-    volume: Volume
-    rule: IsoRule
-
-    @property
-    def shape(self) -> tuple[int, int, int]:
-        """(gi, gj, gk) samples."""
-        gi, gj, gk = (n + 2 * self.rule.border for n in self.volume.shape_ijk)
-        return gi, gj, gk
-
-    @property
-    def rows(self) -> int:
-        """Rows along i."""
-        return self.shape[1] * self.shape[2]
-
-    @property
-    def words(self) -> int:
-        """32-bit words of the mask a row."""
-        return -(-self.shape[0] // 32)
-
-    @property
-    def flag_words(self) -> int:
-        """32-bit words a row of one flag a word."""
-        return -(-self.words // 32)
-
-    def scratch(self) -> dict[str, int]:
-        """Bytes of every buffer between the volume and the mesh, by what it is."""
-        return {
-            "inside mask": 4 * self.rows * self.words,
-            "word counts": 4 * self.rows * self.words,
-            "row counts": 16 * self.rows,
-            "word flags": 4 * self.rows * self.flag_words,
-            "active words": 4 * self.rows * self.words,
-        }
-
-
-@dataclass(frozen=True)
-class _Counts:
-    """What `_count` leaves on the device, and the totals."""
-
-    words: Compacted
-    vertex_offsets_d: Any
-    triangle_offsets_d: Any
-    word_vertices_d: Any
-    word_triangles_d: Any
-    vertices: int
-    triangles: int
-
-
-def _check_grid(grid: _SampleGrid) -> None:
-    gi, gj, gk = grid.shape
-    if gi > LONGEST_ROW:
-        raise UsageError(f"the volume has {gi - 2 * grid.rule.border:,} columns, {LONGEST_ROW - 2:,} are supported")
-    if grid.rows * grid.flag_words * 32 >= 2**32:
-        raise UsageError(f"the volume has {grid.rows:,} rows: more than 2^32 words of its mask are not supported")
+Part = tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.uint32]]
+"""Positions, normals and triangles of one slab."""
 
 
 def _refuse_level(device: Device, volume: Volume, rule: IsoRule) -> ClreconError:
@@ -115,110 +53,231 @@ def _voxel_level(device: Device, volume: Volume, rule: IsoRule) -> Any:
     return dtype.type(max(rule.lowest_inside, limits.min))
 
 
-def _pad4(rows: NDArray[np.float64]) -> NDArray[np.float32]:
-    """Rows of three as rows of four float32, for float4."""
-    padded = np.zeros((*rows.shape[:-1], 4), dtype=np.float32)
-    padded[..., :3] = rows
-    return padded
+def _join(parts: list[Part]) -> Part:
+    """The parts of all slabs behind each other; each is freed as soon as it is copied."""
+    if len(parts) == 1:
+        return parts[0]
+    joined: list[NDArray[Any]] = []
+    for which in range(3):
+        rows = sum(len(part[which]) for part in parts)
+        joined.append(result_pages.empty((rows, 3), parts[0][which].dtype))
+    filled = [0, 0, 0]
+    while parts:
+        for which, array in enumerate(parts.pop(0)):
+            joined[which][filled[which] : filled[which] + len(array)] = array
+            filled[which] += len(array)
+    return joined[0], joined[1], joined[2]
 
 
-def _split(values: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Split into a part of 12 significant bits and the rest: 12-bit parts times whole numbers < 4096 are exact."""
-    mantissa, exponent = np.frexp(values)
-    head = np.ldexp(np.round(np.ldexp(mantissa, 12)), exponent - 12)
-    return head, values - head
+class SurfaceExtractor:
+    """A volume on a device, from which surfaces are extracted at one iso value after the other.
+
+    The volume is uploaded once, where it fits the device as a whole; a larger one goes through slab by slab each time,
+    and gives the same mesh bit for bit.  Use it as a context manager, or `close` it.
+
+    Parameters
+    ----------
+    volume : Volume
+        Its voxels must not change as long as the extractor is open.
+    device : Device, str or int, optional
+        See `clrecon.device`; None is the best of the machine.
+    memory : int, optional
+        Bytes that may be taken on the device for the volume, what is computed from it, and the mesh; None is all that
+        the device has.  The finished mesh lies in the computer's memory and does not count.
+
+    Raises
+    ------
+    UsageError
+        `volume` is no Volume, `memory` no number of bytes, or a row of the volume is too long.
+    DeviceError
+        There is no such device.
+    """
+
+    def __init__(self, volume: Volume, device: Device | str | int | None = None, *, memory: int | None = None):
+        if not isinstance(volume, Volume):
+            raise UsageError(f"a surface needs a Volume, not {type(volume).__name__}: clrecon.Volume(voxels, affine)")
+        if memory is not None and (isinstance(memory, bool) or not isinstance(memory, int) or memory < 1):
+            raise UsageError(f"memory is a whole number of bytes, not {memory!r}")
+        ni = volume.shape_ijk[0]
+        if ni + 2 > marching_cubes.LONGEST_ROW:
+            raise UsageError(f"the volume has {ni:,} columns, {marching_cubes.LONGEST_ROW - 2:,} are supported")
+        self.volume = volume
+        self.device = choose_device(device)
+        self.memory = memory
+        self._resident_d: Any = None
+        self._slices: dict[int, int] = {}
+        self._placements: dict[int, Placement] = {}
+
+    def __enter__(self) -> SurfaceExtractor:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Free the volume on the device."""
+        self._resident_d = None
+
+    def forecast(self, *, closed: bool = True) -> dict[str, int]:
+        """What an extraction will take, before anything is computed.
+
+        Returns
+        -------
+        dict
+            ``slabs``, ``slices_a_slab``; ``volume_bytes`` and ``scratch_bytes`` of the largest slab on the device, the
+            latter at most: it grows with the surface.  The mesh comes on top: 24 bytes a vertex, 12 a triangle.
+
+        Raises
+        ------
+        DeviceError
+            Not even a slab of one slice fits.
+        """
+        grid = SampleGrid(self.volume, IsoRule(0.0, 0, 0.0, 0.0, closed))
+        slices = self._plan(grid)
+        slab = Slab(grid, 0, slices)
+        return {
+            "slabs": -(-grid.shape[2] // slices),
+            "slices_a_slab": slices,
+            "volume_bytes": slab.volume_bytes(),
+            "scratch_bytes": sum(slab.scratch().values()),
+        }
+
+    def extract(self, iso_value: float, *, closed: bool = True, progress: Progress | None = None) -> Mesh:
+        """Extract the surface at one iso value, see `extract_isosurface`."""
+        stopwatch = Stopwatch()
+        grid = SampleGrid(self.volume, choose_iso_rule(self.volume, iso_value, closed))
+        if min(grid.shape) < 2:
+            raise NoSurfaceError(f"an open volume of {grid.shape} voxels has no cells: leave it closed")
+        run = _Run(self, grid, stopwatch, _voxel_level(self.device, self.volume, grid.rule), self._placement(grid))
+        if progress is not None:
+            progress("build", 0, 1)
+        with stopwatch.timed("build"):
+            prepare_isosurface(self.device, self.volume.voxels.dtype)
+        if progress is not None:
+            progress("build", 1, 1)
+        positions, normals, triangles = run.all_slabs(self._plan(grid), progress)
+        return Mesh(positions, triangles, normals, run.describe(len(positions), len(triangles)))
+
+    def _plan(self, grid: SampleGrid) -> int:
+        border = grid.rule.border
+        if border not in self._slices:
+            self._slices[border] = plan_slabs(grid, self.device, self.memory)
+        return self._slices[border]
+
+    def _placement(self, grid: SampleGrid) -> Placement:
+        border = grid.rule.border
+        if border not in self._placements:
+            self._placements[border] = Placement.of(self.volume, border)
+        return self._placements[border]
+
+    def _upload(self, slab: Slab) -> Any:
+        """The slices of the volume that the slab reads; all of them stay on the device once they are there."""
+        if self._resident_d is not None:
+            return self._resident_d
+        first, end = slab.voxel_slices
+        voxels_d = upload(self.device, self.volume.voxels[first:end])
+        if slab.slices == slab.grid.shape[2]:
+            self._resident_d = voxels_d
+        return voxels_d
+
+    def _use_smaller_slabs(self, border: int, slices: int) -> None:
+        """Remember that slabs of more slices do not go through."""
+        self._resident_d = None
+        self._slices[border] = slices
 
 
-def _slice_frames(volume: Volume, border: int) -> NDArray[np.float32]:
-    """Table of emit_vertices: six float4 for each slice of the sample grid."""
-    origins = volume.slice_origins(border + 1)[1:]
-    head, rest = origins[:-1].astype(np.float32), origins[:-1] - origins[:-1].astype(np.float32)
-    parts = [head.astype(np.float64)[:, None], rest[:, None], np.diff(origins, axis=0)[:, None]]
-    return _pad4(np.concatenate([*parts, slice_normal_matrices(volume, border)], axis=1))
+class _Run:
+    """One extraction: from slab to slab, with fewer slices a slab when the device has no room for more."""
 
+    def __init__(
+        self, extractor: SurfaceExtractor, grid: SampleGrid, stopwatch: Stopwatch, level: Any, placement: Placement
+    ):
+        self.extractor = extractor
+        self.device = extractor.device
+        self.grid = grid
+        self.stopwatch = stopwatch
+        self.level = level
+        self.placement = placement
+        self.slabs = 0
+        self.largest = {"volume": 0, "scratch": 0, "output": 0}
+        self.warnings: list[str] = []
 
-def _classify(
-    device: Device, grid: _SampleGrid, program: Program, voxels_d: Any, level: Any, stopwatch: Stopwatch
-) -> Any:
-    ni, nj, nk = grid.volume.shape_ijk
-    mask_d = allocate(device, 4 * grid.rows * grid.words)
-    launch(
-        device, program["classify_samples"], grid.rows,
-        voxels_d, mask_d, level,
-        np.int32(ni), np.int32(nj), np.int32(nk), np.int32(grid.rule.border), np.int32(grid.words),
-        stopwatch=stopwatch,
-    )  # fmt: skip
-    return mask_d
+    def all_slabs(self, slices: int, progress: Progress | None) -> Part:
+        """Go through the grid, `slices` at a time."""
+        gk = self.grid.shape[2]
+        parts: list[Part] = []
+        first = vertices = triangles = 0
+        while first < gk:
+            slab = Slab(self.grid, first, min(first + slices, gk))
+            try:
+                part = self._one_slab(slab, vertices)
+            except DeviceMemoryError as error:
+                if slab.slices == 1:
+                    raise
+                slices = -(-slab.slices // 2)
+                self.extractor._use_smaller_slabs(self.grid.rule.border, slices)
+                self.warnings.append(f"{error}: continued with slabs of {slices} slices")
+                continue
+            parts.append(part)
+            vertices, triangles = vertices + len(part[0]), triangles + len(part[2])
+            if max(vertices, triangles) >= 2**32:
+                raise marching_cubes.too_many(vertices, triangles)
+            self.slabs += 1
+            first = slab.end
+            if progress is not None and (first < gk or self.slabs > 1):
+                progress("slabs", first, gk)
+        if triangles == 0:
+            raise _refuse_level(self.device, self.grid.volume, self.grid.rule)
+        try:
+            return _join(parts)
+        except MemoryError as error:
+            raise DeviceError(f"the mesh does not fit the memory of this computer: {error}") from error
 
-
-def _count(device: Device, grid: _SampleGrid, program: Program, mask_d: Any, stopwatch: Stopwatch) -> _Counts:
-    rows, words = grid.rows, grid.words
-    row_vertices_d, row_triangles_d = allocate(device, 4 * rows), allocate(device, 4 * rows)
-    word_vertices_d, word_triangles_d = allocate(device, 2 * rows * words), allocate(device, 2 * rows * words)
-    flags_d = allocate(device, 4 * rows * grid.flag_words)
-    launch(
-        device, program["count_rows"], rows,
-        mask_d, row_vertices_d, row_triangles_d, flags_d, word_vertices_d, word_triangles_d,
-        *(np.uint32(n) for n in grid.shape), np.uint32(words), np.uint32(grid.flag_words),
-        stopwatch=stopwatch,
-    )  # fmt: skip
-    vertices = exclusive_scan(device, row_vertices_d, rows, stopwatch=stopwatch)
-    triangles = exclusive_scan(device, row_triangles_d, rows, stopwatch=stopwatch)
-    if vertices.total >= 2**32 or triangles.total >= 2**32:
-        raise DeviceError(
-            f"the surface has {vertices.total:,} vertices and {triangles.total:,} triangles:"
-            " more than 32 bits can number; choose another iso value or a part of the volume"
+    def _one_slab(self, slab: Slab, first_vertex: int) -> Part:
+        device, stopwatch = self.device, self.stopwatch
+        program = prepare_isosurface(device, self.grid.volume.voxels.dtype)
+        with stopwatch.timed("upload"):
+            voxels_d = self.extractor._upload(slab)
+        with stopwatch.running(device):
+            mask_d = marching_cubes.classify(device, slab, program, voxels_d, self.level, stopwatch)
+            counted = marching_cubes.count(device, slab, program, mask_d, stopwatch)
+        self._check_output(slab, counted)
+        part = marching_cubes.emit(
+            device, slab, program, voxels_d, mask_d, counted, self.placement, first_vertex, stopwatch
         )
-    return _Counts(
-        words=compact(device, flags_d, rows * grid.flag_words, stopwatch=stopwatch),
-        vertex_offsets_d=vertices.offsets_d,
-        triangle_offsets_d=triangles.offsets_d,
-        word_vertices_d=word_vertices_d,
-        word_triangles_d=word_triangles_d,
-        vertices=vertices.total,
-        triangles=triangles.total,
-    )
+        self.grid.volume.release_slices(*slab.voxel_slices)
+        return part
 
+    def _check_output(self, slab: Slab, counted: Counted) -> None:
+        """Refuse a slab whose mesh does not fit beside the rest; note what the slab takes."""
+        needs = slab.needs(counted.output())
+        needs["active words"] = 4 * counted.words.count
+        shortage = describe_shortage(memory_limits(self.device, self.extractor.memory), needs)
+        if shortage:
+            raise DeviceMemoryError(shortage)
+        output, volume = sum(counted.output().values()), needs["volume"]
+        for what, size in (("volume", volume), ("output", output), ("scratch", sum(needs.values()) - volume - output)):
+            self.largest[what] = max(self.largest[what], size)
 
-def _emit(
-    device: Device,
-    grid: _SampleGrid,
-    program: Program,
-    voxels_d: Any,
-    mask_d: Any,
-    counts: _Counts,
-    margin: NDArray[np.float32],
-    stopwatch: Stopwatch,
-) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.uint32]]:
-    volume, rule = grid.volume, grid.rule
-    frames_d = upload(device, _slice_frames(volume, rule.border))
-    steps_d = upload(device, _pad4(np.stack([part for step in (0, 1) for part in _split(volume.affine[:3, step])])))
-    positions, positions_d = empty_output(device, (counts.vertices, 3), np.float32)
-    normals, normals_d = empty_output(device, (counts.vertices, 3), np.float32)
-    triangles, triangles_d = empty_output(device, (counts.triangles, 3), np.uint32)
-    active = np.uint32(counts.words.count)
-    packing = (np.uint32(grid.words), np.uint32(grid.flag_words), active)
-    with stopwatch.running(device):
-        launch(
-            device, program["emit_vertices"], counts.words.count,
-            voxels_d, mask_d, counts.words.positions_d, counts.vertex_offsets_d, counts.word_vertices_d,
-            frames_d, steps_d, positions_d, normals_d,
-            np.float32(rule.iso_level), np.float32(rule.outside), np.float32(rule.value_scale), margin,
-            *(np.int32(n) for n in volume.shape_ijk), np.int32(rule.border), *packing,
-            stopwatch=stopwatch,
-        )  # fmt: skip
-        launch(
-            device, program["emit_triangles"], counts.words.count,
-            mask_d, counts.words.positions_d, counts.vertex_offsets_d, counts.triangle_offsets_d,
-            counts.word_vertices_d, counts.word_triangles_d, triangles_d,
-            *(np.uint32(n) for n in grid.shape), *packing, np.int32(is_left_handed(volume.affine)),
-            stopwatch=stopwatch,
-        )  # fmt: skip
-    with stopwatch.timed("download"):
-        download(device, positions, positions_d)
-        download(device, normals, normals_d)
-        download(device, triangles, triangles_d)
-    return positions, normals, triangles
+    def describe(self, vertices: int, triangles: int) -> dict[str, Any]:
+        """The report of a mesh: how it was made, free of patient data."""
+        rule = self.grid.rule
+        return {
+            "iso_value_hu": rule.iso_value,
+            "iso_level_hu": rule.iso_level,
+            "closed_at_border": rule.closed,
+            "outside_hu": rule.outside if rule.closed else None,
+            "affine_ijk_to_lps_mm": self.grid.volume.affine.tolist(),
+            "device": self.device.label,
+            "driver": self.device.driver,
+            "slabs": self.slabs,
+            "device_bytes": dict(self.largest),
+            "seconds": dict(self.stopwatch.seconds),
+            "kernel_seconds": dict(self.stopwatch.by_kernel),
+            "warnings": [*cache_warnings(), *self.warnings],
+        }
 
 
 def prepare_isosurface(device: Device, dtype: DTypeLike = np.int16) -> Program:
@@ -229,25 +288,7 @@ def prepare_isosurface(device: Device, dtype: DTypeLike = np.int16) -> Program:
     DeviceError
         The driver's compiler refuses.
     """
-    prepare_compaction(device)
-    return load_program(device, "isosurface/marching_cubes.cl", {"VOXEL": VOXEL_TYPES[np.dtype(dtype).name]})
-
-
-def _describe(device: Device, grid: _SampleGrid, stopwatch: Stopwatch) -> dict[str, Any]:
-    """The report of a mesh: how it was made, free of patient data."""
-    rule = grid.rule
-    return {
-        "iso_value_hu": rule.iso_value,
-        "iso_level_hu": rule.iso_level,
-        "closed_at_border": rule.closed,
-        "outside_hu": rule.outside if rule.closed else None,
-        "affine_ijk_to_lps_mm": grid.volume.affine.tolist(),
-        "device": device.label,
-        "driver": device.driver,
-        "seconds": dict(stopwatch.seconds),
-        "kernel_seconds": dict(stopwatch.by_kernel),
-        "warnings": list(cache_warnings()),
-    }
+    return marching_cubes.prepare_marching_cubes(device, dtype)
 
 
 def extract_isosurface(
@@ -256,6 +297,7 @@ def extract_isosurface(
     device: Device | str | int | None = None,
     *,
     closed: bool = True,
+    memory: int | None = None,
     progress: Progress | None = None,
 ) -> Mesh:
     """Extract the iso surface of a volume, as a closed manifold mesh in LPS mm.
@@ -266,9 +308,13 @@ def extract_isosurface(
     shear included, once; they are right to one unit in the last place that float32 has for the volume's largest
     coordinate (6e-5 mm at 1 m), but kept four such units off voxel centres.
 
+    A volume of any size goes through: what does not fit the device is worked on slab by slab.  The mesh is the same
+    bit for bit.
+
     Parameters
     ----------
     volume : Volume
+        Its voxels may be a memory-mapped file larger than the memory of the computer.
     iso_value : float
         HU.
     device : Device, str or int, optional
@@ -277,14 +323,18 @@ def extract_isosurface(
         True: the volume is surrounded by air, and the surface is closed where an object leaves the volume.
         Beyond the border the field has the volume's lowest value, but not less than -1024 HU.
         False: the surface ends open at the outermost voxel centres.
+    memory : int, optional
+        Bytes that may be taken on the device, see `SurfaceExtractor`; None is all that it has.
     progress : callable, optional
-        Called as ``progress("build", done, total)`` around the building of the kernels.
+        Called as ``progress("build", done, total)`` around the building of the kernels, and as
+        ``progress("slabs", slices done, all slices)`` where there are several.
 
     Returns
     -------
     Mesh
         Triangles are counter-clockwise and normals point as seen from lower values; `Mesh.report` holds the iso
-        value, the affine, the device and the seconds {upload, build, kernels, download}.
+        value, the affine, the device, the number of slabs, ``device_bytes`` {volume, scratch, output} of the
+        largest, and the seconds {upload, build, kernels, download}.
 
     Raises
     ------
@@ -294,38 +344,39 @@ def extract_isosurface(
         `volume` or `iso_value` is not what it should be, values or coordinates are too large for float32, or a row
         of the volume is too long.
     DeviceError
-        No device, not enough memory, more than 2^32 vertices or triangles, or the device fails or computes wrongly.
+        No device, not even one slice fits its memory, 2^32 vertices or triangles or more, or the device fails or
+        computes wrongly.
 
     References
     ----------
     Lorensen and Cline 1987; Schroeder, Maynard and Geveci 2015.
     """
-    if not isinstance(volume, Volume):
-        raise UsageError(f"a surface needs a Volume, not {type(volume).__name__}: clrecon.Volume(voxels, affine)")
-    device = choose_device(device)
-    stopwatch = Stopwatch()
-    grid = _SampleGrid(volume, choose_iso_rule(volume, iso_value, closed))
-    _check_grid(grid)
-    margin = _pad4(vertex_margin(volume, grid.rule.border))
-    level = _voxel_level(device, volume, grid.rule)
-    if min(grid.shape) < 2:
-        raise NoSurfaceError(f"an open volume of {grid.shape} voxels has no cells: leave it closed")
-    check_budget(device, {"volume": volume.voxels.nbytes, **grid.scratch()})
+    with SurfaceExtractor(volume, device, memory=memory) as extractor:
+        return extractor.extract(iso_value, closed=closed, progress=progress)
 
-    if progress is not None:
-        progress("build", 0, 1)
-    with stopwatch.timed("build"):
-        program = prepare_isosurface(device, volume.voxels.dtype)
-    with stopwatch.timed("upload"):
-        voxels_d = upload(device, volume.voxels)
-    with stopwatch.running(device):
-        mask_d = _classify(device, grid, program, voxels_d, level, stopwatch)
-        counts = _count(device, grid, program, mask_d, stopwatch)
-    if counts.triangles == 0:
-        raise _refuse_level(device, volume, grid.rule)
-    output = {"vertices": 24 * counts.vertices, "triangles": 12 * counts.triangles}
-    check_budget(device, {"volume": volume.voxels.nbytes, **grid.scratch(), **output})
-    positions, normals, triangles = _emit(device, grid, program, voxels_d, mask_d, counts, margin, stopwatch)
-    if progress is not None:
-        progress("build", 1, 1)
-    return Mesh(positions, triangles, normals, _describe(device, grid, stopwatch))
+
+def extract_isosurfaces(
+    volume: Volume,
+    iso_values: Sequence[float],
+    device: Device | str | int | None = None,
+    *,
+    closed: bool = True,
+    memory: int | None = None,
+    progress: Progress | None = None,
+) -> list[Mesh]:
+    """Extract the surfaces of a volume at several iso values, which is uploaded once.
+
+    Parameters
+    ----------
+    iso_values : sequence of float
+        HU, at least one.
+
+    Returns
+    -------
+    list of Mesh
+        In the order of `iso_values`; for all else see `extract_isosurface`.
+    """
+    if len(iso_values) == 0:
+        raise UsageError("no iso value is given")
+    with SurfaceExtractor(volume, device, memory=memory) as extractor:
+        return [extractor.extract(iso_value, closed=closed, progress=progress) for iso_value in iso_values]

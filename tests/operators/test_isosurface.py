@@ -9,8 +9,8 @@ from scipy.spatial import cKDTree
 
 from clrecon.errors import DeviceError, NoSurfaceError, UsageError
 from clrecon.geometry import Volume, compose_affine
-from clrecon.operators import isosurface
-from clrecon.operators.isosurface import extract_isosurface
+from clrecon.operators import isosurface, marching_cubes
+from clrecon.operators.isosurface import SurfaceExtractor, extract_isosurface, extract_isosurfaces
 from clrecon.pipeline.selftest import run_selftest
 from clrecon.reference import isosurface as twin
 
@@ -229,50 +229,35 @@ def test_only_volumes_have_surfaces(device):
 
 def test_a_device_that_finds_nothing_is_not_believed(device, monkeypatch):
     """A surface that must be there and is not is the device's fault, not the iso value's."""
-    monkeypatch.setattr(isosurface, "_classify", lambda device, grid, *_: isosurface.upload(
-        device, np.zeros(grid.rows * grid.words, np.uint32)))  # fmt: skip
+    monkeypatch.setattr(marching_cubes, "classify", lambda device, slab, *_: marching_cubes.upload(
+        device, np.zeros(slab.mask_rows * slab.grid.words, np.uint32)))  # fmt: skip
     with pytest.raises(DeviceError, match="it computes wrongly"):
         extract_isosurface(random_volume((5, 6, 7)), 3, device)
     outcomes = {result["operator"]: result["passed"] for result in run_selftest(device)}
     assert outcomes == {"exclusive_scan": True, "compact": True, "extract_isosurface": False}
 
 
-def test_the_mesh_counts_for_the_budget_too(device, monkeypatch):
-    volume = random_volume((9, 9, 9))
-    grid = isosurface._SampleGrid(volume, isosurface.choose_iso_rule(volume, 3))
-    before_emitting = volume.voxels.nbytes + sum(grid.scratch().values())
-    monkeypatch.setattr(device, "memory_bytes", before_emitting + 100)
-    with pytest.raises(DeviceError, match="triangles"):
-        extract_isosurface(volume, 3, device)
+def test_several_iso_values_are_as_each_alone(device):
+    volume = smooth_volume()
+    meshes = extract_isosurfaces(volume, [100, -50.5, 100], device)
+    for mesh, iso_value in zip(meshes, [100, -50.5, 100], strict=True):
+        alone = extract_isosurface(volume, iso_value, device)
+        assert mesh.report["iso_value_hu"] == iso_value
+        assert np.array_equal(mesh.vertices, alone.vertices)
+        assert np.array_equal(mesh.normals, alone.normals)
+        assert np.array_equal(mesh.triangles, alone.triangles)
+    with pytest.raises(UsageError, match="no iso value"):
+        extract_isosurfaces(volume, [], device)
 
 
-def test_too_many_rows_for_the_flags_are_refused():
-    class Endless:
-        shape_ijk = (40, 2**16, 2**16)
-
-    volume = random_volume((2, 2, 2))
-    grid = isosurface._SampleGrid(Endless(), isosurface.choose_iso_rule(volume, 3))
-    with pytest.raises(UsageError, match="rows"):
-        isosurface._check_grid(grid)
-
-
-def test_a_volume_over_the_budget_is_refused_before_anything_is_allocated(device, monkeypatch):
-    monkeypatch.setattr(device, "max_allocation_bytes", 1000)
-    monkeypatch.setattr(isosurface, "upload", lambda *_: pytest.fail("allocated"))
-    with pytest.raises(DeviceError, match="the volume needs a buffer"):
-        extract_isosurface(random_volume((9, 9, 9)), 3, device)
-
-
-def test_counts_over_32_bits_are_refused(device, monkeypatch):
-    true_scan = isosurface.exclusive_scan
-
-    def scan(*arguments, **options):
-        scanned = true_scan(*arguments, **options)
-        return type(scanned)(scanned.offsets_d, scanned.total + 2**32)
-
-    monkeypatch.setattr(isosurface, "exclusive_scan", scan)
-    with pytest.raises(DeviceError, match="more than 32 bits can number"):
-        extract_isosurface(random_volume((5, 6, 7)), 3, device)
+def test_the_volume_is_uploaded_once(device, monkeypatch):
+    uploads = []
+    true_upload = isosurface.upload
+    monkeypatch.setattr(isosurface, "upload", lambda *arguments: uploads.append(1) or true_upload(*arguments))
+    with SurfaceExtractor(smooth_volume(), device) as extractor:
+        for iso_value in (50, 100, 150):
+            extractor.extract(iso_value)
+    assert len(uploads) == 1
 
 
 def test_the_report_says_how_the_mesh_was_made(device):
@@ -281,6 +266,8 @@ def test_the_report_says_how_the_mesh_was_made(device):
     assert mesh.report["iso_level_hu"] == 2.5
     assert mesh.report["affine_ijk_to_lps_mm"] == OBLIQUE.tolist()
     assert mesh.report["device"] == device.label
+    assert mesh.report["slabs"] == 1
+    assert mesh.report["device_bytes"]["output"] == 24 * len(mesh.vertices) + 12 * len(mesh.triangles)
     assert set(mesh.report["seconds"]) == {"upload", "build", "kernels", "download"}
     assert mesh.report["kernel_seconds"].keys() >= {"classify_samples", "count_rows", "emit_vertices", "emit_triangles"}
 

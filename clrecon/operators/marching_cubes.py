@@ -1,0 +1,226 @@
+"""The passes of cl/isosurface/marching_cubes.cl on one slab of a volume."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import DTypeLike, NDArray
+
+from clrecon.errors import DeviceError
+from clrecon.geometry import Volume, is_left_handed
+from clrecon.geometry.field import slice_normal_matrices, vertex_margin
+from clrecon.kernels import Program, Stopwatch, allocate, download, empty_output, launch, load_program, upload
+from clrecon.opencl import Device
+from clrecon.operators.compaction import Compacted, compact, exclusive_scan, prepare_compaction
+from clrecon.operators.slabs import Slab
+
+__all__ = ["Counted", "Placement", "classify", "count", "emit", "prepare_marching_cubes"]
+
+VOXEL_TYPES = {
+    "int8": "char", "uint8": "uchar", "int16": "short", "uint16": "ushort", "int32": "int", "float32": "float",
+}  # fmt: skip
+
+LONGEST_ROW = 13_000
+"""Samples a row: places in a row are 16-bit numbers, and a cell has at most 5 triangles."""
+
+
+@dataclass(frozen=True)
+class Counted:
+    """What `count` leaves on the device of one slab, and the totals of the slab's own rows."""
+
+    words: Compacted
+    vertex_offsets_d: Any
+    triangle_offsets_d: Any
+    word_vertices_d: Any
+    word_triangles_d: Any
+    vertices: int
+    triangles: int
+
+    def output(self) -> dict[str, int]:
+        """Bytes of the slab's mesh."""
+        return {"vertices": 24 * self.vertices, "triangles": 12 * self.triangles}
+
+
+def prepare_marching_cubes(device: Device, dtype: DTypeLike) -> Program:
+    """Build the kernels for volumes of `dtype`.
+
+    Raises
+    ------
+    DeviceError
+        The driver's compiler refuses.
+    """
+    prepare_compaction(device)
+    dtype = np.dtype(dtype)
+    variants = {"VOXEL": VOXEL_TYPES[dtype.name], "VALUE": "float" if dtype.kind == "f" else "int"}
+    return load_program(device, "isosurface/marching_cubes.cl", {**variants, **device.kernel_variants})
+
+
+def _pad4(rows: NDArray[np.float64]) -> NDArray[np.float32]:
+    """Rows of three as rows of four float32, for float4."""
+    padded = np.zeros((*rows.shape[:-1], 4), dtype=np.float32)
+    padded[..., :3] = rows
+    return padded
+
+
+def _split(values: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Split into a part of 12 significant bits and the rest: 12-bit parts times whole numbers < 4096 are exact."""
+    mantissa, exponent = np.frexp(values)
+    head = np.ldexp(np.round(np.ldexp(mantissa, 12)), exponent - 12)
+    return head, values - head
+
+
+@dataclass(frozen=True)
+class Placement:
+    """Where the samples of a grid are in mm, as emit_vertices takes it.
+
+    Attributes
+    ----------
+    slice_frames : ndarray, shape (gk, 6, 4), float32
+    steps : ndarray, shape (4, 4), float32
+    margin : ndarray, shape (4,), float32
+    """
+
+    slice_frames: NDArray[np.float32]
+    steps: NDArray[np.float32]
+    margin: NDArray[np.float32]
+
+    @classmethod
+    def of(cls, volume: Volume, border: int) -> Placement:
+        """Compose the tables for a volume with `border` layers of outside.
+
+        Raises
+        ------
+        UsageError
+            The volume lies too far from the origin for float32.
+        """
+        origins = volume.slice_origins(border + 1)[1:]
+        head, rest = origins[:-1].astype(np.float32), origins[:-1] - origins[:-1].astype(np.float32)
+        parts = [head.astype(np.float64)[:, None], rest[:, None], np.diff(origins, axis=0)[:, None]]
+        frames = _pad4(np.concatenate([*parts, slice_normal_matrices(volume, border)], axis=1))
+        steps = _pad4(np.stack([part for step in (0, 1) for part in _split(volume.affine[:3, step])]))
+        return cls(frames, steps, _pad4(vertex_margin(volume, border)))
+
+
+def _volume_scalars(slab: Slab) -> tuple[Any, ...]:
+    """ni, nj, nk, border, first_slice, first_sample_slice: how every pass is told where the slab lies."""
+    shape, border = slab.grid.volume.shape_ijk, slab.grid.rule.border
+    return tuple(np.int32(n) for n in (*shape, border, slab.voxel_slices[0], slab.first))
+
+
+def classify(device: Device, slab: Slab, program: Program, voxels_d: Any, level: Any, stopwatch: Stopwatch) -> Any:
+    """Pass 1: return the inside mask of the slab.
+
+    Parameters
+    ----------
+    voxels_d : buffer
+        The slices ``slab.voxel_slices`` of the volume.
+    level : scalar of the voxels' type
+        Lowest inside value.
+    """
+    mask_d = allocate(device, 4 * slab.mask_rows * slab.grid.words)
+    launch(
+        device, program["classify_samples"], slab.mask_rows,
+        voxels_d, mask_d, level, *_volume_scalars(slab), np.uint32(slab.mask_slices), np.int32(slab.grid.words),
+        stopwatch=stopwatch,
+    )  # fmt: skip
+    return mask_d
+
+
+def count(device: Device, slab: Slab, program: Program, mask_d: Any, stopwatch: Stopwatch) -> Counted:
+    """Pass 2 and the scans: how many vertices and triangles, and where each word's own begin.
+
+    Raises
+    ------
+    DeviceError
+        The slab has more vertices or triangles than 32 bits can number, or the device fails.
+    """
+    grid, rows = slab.grid, slab.counted_rows
+    gi, gj, _ = grid.shape
+    row_vertices_d, row_triangles_d = allocate(device, 4 * rows), allocate(device, 4 * rows)
+    word_vertices_d, word_triangles_d = (allocate(device, 2 * rows * grid.words) for _ in range(2))
+    flags_d = allocate(device, 4 * rows * grid.flag_words)
+    launch(
+        device, program["count_rows"], rows,
+        mask_d, row_vertices_d, row_triangles_d, flags_d, word_vertices_d, word_triangles_d,
+        np.uint32(gi), np.uint32(gj), np.uint32(slab.mask_slices), np.uint32(grid.words), np.uint32(grid.flag_words),
+        np.uint32(rows), stopwatch=stopwatch,
+    )  # fmt: skip
+    vertices = exclusive_scan(device, row_vertices_d, rows, stopwatch=stopwatch)
+    triangles = exclusive_scan(device, row_triangles_d, rows, stopwatch=stopwatch)
+    if vertices.total >= 2**32 or triangles.total >= 2**32:
+        raise too_many(vertices.total, triangles.total)
+    words = compact(device, flags_d, slab.rows * grid.flag_words, stopwatch=stopwatch)
+    return Counted(
+        words=words,
+        vertex_offsets_d=vertices.offsets_d,
+        triangle_offsets_d=triangles.offsets_d,
+        word_vertices_d=word_vertices_d,
+        word_triangles_d=word_triangles_d,
+        vertices=vertices.before(device, slab.rows, rows),
+        triangles=triangles.before(device, slab.rows, rows),
+    )
+
+
+def too_many(vertices: int, triangles: int) -> DeviceError:
+    """The error for a surface whose vertices or triangles 32 bits cannot number."""
+    return DeviceError(
+        f"the surface has {vertices:,} vertices and {triangles:,} triangles:"
+        " more than 32 bits can number; choose another iso value or a part of the volume"
+    )
+
+
+def emit(
+    device: Device,
+    slab: Slab,
+    program: Program,
+    voxels_d: Any,
+    mask_d: Any,
+    counted: Counted,
+    placement: Placement,
+    first_vertex: int,
+    stopwatch: Stopwatch,
+) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.uint32]]:
+    """Passes 3 and 4: positions, normals and triangles of the slab.
+
+    Parameters
+    ----------
+    first_vertex : int
+        Vertices of all slabs before.
+    """
+    grid = slab.grid
+    volume, rule = grid.volume, grid.rule
+    frames_d = upload(device, placement.slice_frames[slab.first : slab.end])
+    steps_d = upload(device, placement.steps)
+    positions, positions_d = empty_output(device, (counted.vertices, 3), np.float32)
+    normals, normals_d = empty_output(device, (counted.vertices, 3), np.float32)
+    triangles, triangles_d = empty_output(device, (counted.triangles, 3), np.uint32)
+    active = counted.words.count
+    packing = (np.uint32(grid.words), np.uint32(grid.row_shift), np.uint32(active))
+    items = -(-active // int(device.kernel_variants["WORDS_PER_ITEM"]))
+    value = np.float32 if volume.voxels.dtype.kind == "f" else np.int32
+    gi, gj, _ = grid.shape
+    with stopwatch.running(device):
+        if counted.vertices:
+            launch(
+                device, program["emit_vertices"], items,
+                voxels_d, mask_d, counted.words.positions_d, counted.vertex_offsets_d, counted.word_vertices_d,
+                frames_d, steps_d, positions_d, normals_d,
+                np.float32(rule.iso_level), value(rule.outside), np.float32(rule.value_scale), placement.margin,
+                *_volume_scalars(slab), np.uint32(slab.mask_slices), *packing,
+                stopwatch=stopwatch,
+            )  # fmt: skip
+        if counted.triangles:
+            launch(
+                device, program["emit_triangles"], items,
+                mask_d, counted.words.positions_d, counted.vertex_offsets_d, counted.triangle_offsets_d,
+                counted.word_vertices_d, counted.word_triangles_d, triangles_d, np.uint32(first_vertex),
+                np.uint32(gi), np.uint32(gj), np.uint32(slab.mask_slices), *packing,
+                np.int32(is_left_handed(volume.affine)),
+                stopwatch=stopwatch,
+            )  # fmt: skip
+    with stopwatch.timed("download"):
+        for array, array_d in ((positions, positions_d), (normals, normals_d), (triangles, triangles_d)):
+            download(device, array, array_d)
+    return positions, normals, triangles

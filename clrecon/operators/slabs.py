@@ -1,0 +1,163 @@
+"""Slabs of the sample grid: which slices a part of a surface needs, and how many fit a device."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+
+from clrecon.errors import DeviceError
+from clrecon.geometry import Volume
+from clrecon.geometry.field import IsoRule
+from clrecon.opencl import Device, describe_shortage, memory_limits
+
+__all__ = ["SampleGrid", "Slab", "plan_slabs"]
+
+
+@dataclass(frozen=True)
+class SampleGrid:
+    """The samples of a volume with its border, and how the inside mask packs them.
+
+    Attributes
+    ----------
+    volume : Volume
+    rule : IsoRule
+    """
+
+    volume: Volume
+    rule: IsoRule
+
+    @cached_property
+    def shape(self) -> tuple[int, int, int]:
+        """(gi, gj, gk) samples."""
+        gi, gj, gk = (n + 2 * self.rule.border for n in self.volume.shape_ijk)
+        return gi, gj, gk
+
+    @property
+    def words(self) -> int:
+        """32-bit words of the mask a row."""
+        return -(-self.shape[0] // 32)
+
+    @property
+    def row_shift(self) -> int:
+        """A word's number is its row times 2^row_shift, plus its place in the row: a multiple of 32 words a row."""
+        return max(5, (self.words - 1).bit_length())
+
+    @property
+    def flag_words(self) -> int:
+        """32-bit words a row of one flag a word."""
+        return 1 << (self.row_shift - 5)
+
+
+@dataclass(frozen=True)
+class Slab:
+    """Slices `first` to ``end - 1`` of a sample grid, with those around them that their part of a surface needs.
+
+    The slab's rows own vertices on edges towards the slice `end`, whose vertices its triangles refer to and whose
+    owners look one slice further; gradients look one slice further at both ends.
+    """
+
+    grid: SampleGrid
+    first: int
+    end: int
+
+    @property
+    def slices(self) -> int:
+        """Slices whose vertices and cells belong to the slab."""
+        return self.end - self.first
+
+    @property
+    def mask_slices(self) -> int:
+        """Slices that are classified."""
+        return min(self.end + 2, self.grid.shape[2]) - self.first
+
+    @property
+    def rows(self) -> int:
+        """Rows whose vertices and cells belong to the slab."""
+        return self.slices * self.grid.shape[1]
+
+    @property
+    def mask_rows(self) -> int:
+        """Rows that are classified."""
+        return self.mask_slices * self.grid.shape[1]
+
+    @property
+    def counted_rows(self) -> int:
+        """Rows whose vertices are counted: one slice more than the slab's own."""
+        return (min(self.end + 1, self.grid.shape[2]) - self.first) * self.grid.shape[1]
+
+    @property
+    def voxel_slices(self) -> tuple[int, int]:
+        """First and end of the slices of the volume that the slab reads."""
+        border, nk = self.grid.rule.border, self.grid.volume.shape_ijk[2]
+        return max(self.first - border - 1, 0), min(self.end - border + 2, nk)
+
+    def scratch(self) -> dict[str, int]:
+        """Bytes of every buffer between the volume and the mesh, by what it is; at most."""
+        counted_words = self.counted_rows * self.grid.words
+        return {
+            "inside mask": 4 * self.mask_rows * self.grid.words,
+            "word counts": 4 * counted_words,
+            "row counts": 16 * self.counted_rows,
+            "word flags": 4 * self.counted_rows * self.grid.flag_words,
+            "active words": 4 * self.rows * self.grid.words,
+        }
+
+    def volume_bytes(self) -> int:
+        """Bytes of the slices of the volume that the slab reads."""
+        first, end = self.voxel_slices
+        ni, nj, _ = self.grid.volume.shape_ijk
+        return (end - first) * ni * nj * int(self.grid.volume.voxels.dtype.itemsize)
+
+    def needs(self, output: Mapping[str, int] | None = None) -> dict[str, int]:
+        """Bytes of every buffer that lives at the same time."""
+        return {"volume": self.volume_bytes(), **self.scratch(), **(output or {})}
+
+
+OUTPUT_SHARE = 8
+"""Where slabs are needed, an eighth of the memory is kept free for the mesh: bone takes less, noise more (a slab whose
+mesh does not fit is halved)."""
+
+MOST_WORDS = 2**32
+"""Words of a slab are numbered in 32 bits, of which the place in the row takes `SampleGrid.row_shift`."""
+
+
+def plan_slabs(grid: SampleGrid, device: Device, memory: int | None = None) -> int:
+    """Slices a slab: all of them where the whole grid fits the device, else as many as fit.
+
+    Parameters
+    ----------
+    grid : SampleGrid
+    device : Device
+    memory : int, optional
+        Bytes that may be taken on the device; None is all of its memory.
+
+    Raises
+    ------
+    DeviceError
+        Not even one slice with its neighbours fits; the message has what it needs and what there is.
+    """
+    gk = grid.shape[2]
+    limits = memory_limits(device, memory)
+
+    def fits(slices: int, share: int) -> bool:
+        # A slab in the middle of the grid: no other of as many slices needs more.
+        first = max(0, min(2, gk - slices))
+        slab = Slab(grid, first, first + slices)
+        needs = slab.needs({"mesh": min(limits.total_bytes // share, limits.buffer_bytes)} if share else None)
+        return (slab.mask_rows << grid.row_shift) < MOST_WORDS and not describe_shortage(limits, needs)
+
+    if fits(gk, 0):
+        return gk
+    if not fits(1, OUTPUT_SHARE):
+        first = max(0, min(2, gk - 1))
+        needs = Slab(grid, first, first + 1).needs()
+        raise DeviceError(
+            f"one slice with its neighbours needs {sum(needs.values()):,} bytes, and room for its mesh:"
+            f" {limits.describe()}; give more memory or use another device"
+        )
+    low, high = 1, gk  # fits, does not
+    while high - low > 1:
+        middle = (low + high) // 2
+        low, high = (middle, high) if fits(middle, OUTPUT_SHARE) else (low, middle)
+    return low

@@ -1,0 +1,197 @@
+"""Volumes that do not fit: in slabs, with the same mesh bit for bit, or refused with the numbers."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from test_isosurface import MIRRORED, OBLIQUE, random_volume, smooth_volume
+
+from clrecon.errors import DeviceError, DeviceMemoryError, UsageError
+from clrecon.geometry import Volume
+from clrecon.geometry.field import choose_iso_rule
+from clrecon.operators import isosurface, marching_cubes
+from clrecon.operators.isosurface import SurfaceExtractor, extract_isosurface
+from clrecon.operators.slabs import SampleGrid, Slab, plan_slabs
+
+
+def extract_in_slabs(volume, iso_value, device, slices, closed=True):
+    extractor = SurfaceExtractor(volume, device)
+    extractor._use_smaller_slabs(int(closed), slices)
+    return extractor.extract(iso_value, closed=closed)
+
+
+def assert_same(mesh, expected) -> None:
+    assert np.array_equal(mesh.triangles, expected.triangles)
+    assert np.array_equal(mesh.vertices, expected.vertices)
+    assert np.array_equal(mesh.normals, expected.normals)
+
+
+@pytest.mark.parametrize("closed", [True, False])
+@pytest.mark.parametrize("dtype", ["int16", "uint8", "float32"])
+@pytest.mark.parametrize("shape", [(9, 7, 40), (2, 3, 70), (20, 9, 33)])
+def test_slabs_of_any_thickness_give_the_same_mesh(device, shape, dtype, closed):
+    volume = random_volume(shape, dtype, affine=MIRRORED if dtype == "uint8" else OBLIQUE)
+    expected = extract_isosurface(volume, 3, device, closed=closed)
+    for slices in (1, 2, 3, 5):
+        mesh = extract_in_slabs(volume, 3, device, slices, closed)
+        assert mesh.report["slabs"] == -(-(shape[0] + 2 * closed) // slices)
+        assert_same(mesh, expected)
+
+
+def test_a_single_slice_goes_through_in_slabs_of_one(device):
+    volume = random_volume((1, 6, 40))
+    assert_same(extract_in_slabs(volume, 3, device, 1), extract_isosurface(volume, 3, device))
+
+
+def test_empty_slabs_in_between_do_no_harm(device):
+    voxels = np.zeros((30, 8, 40), np.int16)
+    voxels[3:6, 2:5, 5:9] = voxels[20:24, 3:6, 20:36] = 100
+    volume = Volume(voxels, OBLIQUE)
+    assert_same(extract_in_slabs(volume, 50, device, 4), extract_isosurface(volume, 50, device))
+
+
+def test_a_budget_makes_slabs(device):
+    volume = smooth_volume((40, 60, 70))
+    expected = extract_isosurface(volume, 100, device)
+    memory = volume.voxels.nbytes // 2
+    mesh = extract_isosurface(volume, 100, device, memory=memory)
+    assert mesh.report["slabs"] > 2
+    assert sum(mesh.report["device_bytes"].values()) <= memory
+    assert_same(mesh, expected)
+
+
+def test_the_limits_of_the_device_make_slabs(device, monkeypatch):
+    volume = smooth_volume((40, 60, 70))
+    expected = extract_isosurface(volume, 100, device)
+    monkeypatch.setattr(device, "max_allocation_bytes", volume.voxels.nbytes // 3)
+    mesh = extract_isosurface(volume, 100, device)
+    assert mesh.report["slabs"] >= 3
+    assert_same(mesh, expected)
+
+
+def test_the_forecast_is_what_then_happens(device):
+    k, j, i = np.indices((40, 60, 70))
+    volume = Volume((1000 - 100 * np.hypot(np.hypot(k - 20, j - 30), i - 35)).astype(np.int16), OBLIQUE)
+    with SurfaceExtractor(volume, device, memory=volume.voxels.nbytes // 2) as extractor:
+        forecast = extractor.forecast()
+        mesh = extractor.extract(100)
+    assert forecast["slabs"] > 1
+    assert forecast["slabs"] == mesh.report["slabs"]
+    taken = mesh.report["device_bytes"]
+    assert forecast["volume_bytes"] <= taken["volume"]  # the first slab has no neighbour before it
+    assert taken["scratch"] <= 1.3 * forecast["scratch_bytes"]  # one slice more of the mask
+
+
+def test_a_budget_for_less_than_a_slice_is_refused_before_anything_is_allocated(device, monkeypatch):
+    monkeypatch.setattr(isosurface, "upload", lambda *_: pytest.fail("allocated"))
+    with pytest.raises(DeviceError, match=r"one slice with its neighbours needs [0-9,]+ bytes.*10,000 bytes are allow"):
+        extract_isosurface(smooth_volume((40, 60, 70)), 100, device, memory=10_000)
+
+
+@pytest.mark.parametrize("memory", [0, -1, 1.5, "2", True])
+def test_a_budget_is_a_number_of_bytes(device, memory):
+    with pytest.raises(UsageError, match="whole number of bytes"):
+        extract_isosurface(smooth_volume(), 100, device, memory=memory)
+
+
+def test_a_mesh_over_the_budget_halves_the_slab(device):
+    """A noisy volume: what is planned for does not hold the mesh of so many slices."""
+    volume = random_volume((24, 40, 64), high=2)
+    grid = SampleGrid(volume, choose_iso_rule(volume, 1))
+    memory = 4 * sum(Slab(grid, 0, 24).needs().values())
+    mesh = extract_isosurface(volume, 1, device, memory=memory)
+    assert mesh.report["slabs"] > 1
+    assert any("continued with slabs of" in warning for warning in mesh.report["warnings"])
+    assert_same(mesh, extract_isosurface(volume, 1, device))
+
+
+@pytest.mark.parametrize("fails", [1, 2, 5])
+def test_memory_that_runs_out_late_halves_the_slab(device, monkeypatch, fails):
+    """The driver says at the n-th allocation that there is no more: smaller slabs, a warning, the same mesh."""
+    volume = smooth_volume((24, 30, 40))
+    expected = extract_isosurface(volume, 100, device)
+    true_allocate, calls = marching_cubes.allocate, []
+
+    def allocate(*arguments):
+        calls.append(1)
+        if len(calls) == fails:
+            raise DeviceMemoryError("no room for 1 byte")
+        return true_allocate(*arguments)
+
+    monkeypatch.setattr(marching_cubes, "allocate", allocate)
+    mesh = extract_isosurface(volume, 100, device)
+    assert mesh.report["slabs"] == 2
+    assert mesh.report["warnings"][-1] == "no room for 1 byte: continued with slabs of 13 slices"
+    assert_same(mesh, expected)
+
+
+def test_memory_that_never_suffices_is_an_error_in_the_end(device, monkeypatch):
+    def allocate(*_):
+        raise DeviceMemoryError("no room for 1 byte")
+
+    monkeypatch.setattr(marching_cubes, "allocate", allocate)
+    with pytest.raises(DeviceError, match="no room for 1 byte"):
+        extract_isosurface(smooth_volume((9, 10, 11)), 100, device)
+
+
+def test_counts_over_32_bits_are_refused(device, monkeypatch):
+    true_scan = marching_cubes.exclusive_scan
+
+    def scan(*arguments, **options):
+        scanned = true_scan(*arguments, **options)
+        return type(scanned)(scanned.offsets_d, scanned.total + 2**32)
+
+    monkeypatch.setattr(marching_cubes, "exclusive_scan", scan)
+    with pytest.raises(DeviceError, match="more than 32 bits can number"):
+        extract_isosurface(random_volume((5, 6, 7)), 3, device)
+
+
+def test_vertices_of_all_slabs_together_must_fit_32_bits(device, monkeypatch):
+    """Each slab has few; the sum is refused, as soon as it is reached."""
+    true_emit = marching_cubes.emit
+
+    class Long:
+        def __init__(self, array):
+            self.array = array
+
+        def __len__(self):
+            return 2**31
+
+    def emit(*arguments):
+        return tuple(Long(array) for array in true_emit(*arguments))
+
+    monkeypatch.setattr(marching_cubes, "emit", emit)
+    with pytest.raises(DeviceError, match="4,294,967,296 vertices"):
+        extract_in_slabs(random_volume((9, 6, 7)), 3, device, 3)
+
+
+def test_too_many_words_for_32_bits_make_slabs_too():
+    class Tall:
+        shape_ijk = (40, 2**12, 2**16)
+        voxels = np.zeros((1, 1, 1), np.int16)
+
+    class Huge:
+        label, memory_bytes, max_allocation_bytes = "a large device", 2**45, 2**44
+
+    volume = random_volume((2, 2, 2))
+    grid = SampleGrid(Tall(), choose_iso_rule(volume, 3))
+    slices = plan_slabs(grid, Huge())
+    assert 1 < slices < 2**16
+    assert Slab(grid, 2, 2 + slices).mask_rows << grid.row_shift < 2**32
+    assert Slab(grid, 2, 3 + slices).mask_rows << grid.row_shift >= 2**32
+
+
+def test_a_mapped_file_goes_through_and_leaves_memory(device, tmp_path):
+    volume = smooth_volume((23, 64, 128))
+    np.save(tmp_path / "voxels.npy", volume.voxels)
+    mapped = Volume(np.load(tmp_path / "voxels.npy", mmap_mode="r"), volume.affine)
+    assert_same(extract_in_slabs(mapped, 100, device, 5), extract_isosurface(volume, 100, device))
+
+
+@pytest.mark.oclgrind
+def test_slabs_stay_within_their_buffers(device):
+    volume = random_volume((5, 4, 40))
+    for closed in (True, False):
+        expected = extract_isosurface(volume, 3, device, closed=closed)
+        for slices in (1, 2):
+            assert_same(extract_in_slabs(volume, 3, device, slices, closed), expected)
