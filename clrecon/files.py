@@ -27,9 +27,15 @@ from clrecon.errors import OutputError
 if sys.platform != "win32":
     import fcntl
 
-__all__ = ["StagedFile", "check_writable", "replace_file", "stage_file"]
+__all__ = ["StagedFile", "allow_open_files", "check_writable", "replace_file", "stage_file"]
+
+_FILES_OF_OTHERS = 200
+"""Open files that a job has beside those that it writes: libraries, drivers, their caches."""
 
 _TEMPORARY = re.compile(r"\.clrecon-[0-9a-f]{16}\.tmp")
+
+_own_names: set[str] = set()
+"""Temporary files that this process is writing: when it stages a thousand, looking at each every time would cost."""
 
 _ADVICE = {
     errno.ENOSPC: "the disk is full: free some space or choose another folder",
@@ -41,6 +47,7 @@ _ADVICE = {
     errno.ENAMETOOLONG: "the name is too long: choose a shorter one",
     errno.ELOOP: "it is a symbolic link that leads back to itself",
     errno.ENOENT: "the folder vanished while the file was written",
+    errno.EMFILE: "too many files are open at once: write fewer, or raise the limit (ulimit -n)",
 }
 
 _KINDS: tuple[tuple[Callable[[int], bool], str], ...] = (
@@ -152,6 +159,21 @@ def stage_file(
         yield StagedFile(path, temporary, target, stream, size)
 
 
+def allow_open_files(count: int) -> None:
+    """Raise the limit of open files of this process, as far as the system lets it, so that `count` can be staged."""
+    if sys.platform == "win32":  # 8192 there
+        return
+    import resource
+
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    wanted = count + _FILES_OF_OTHERS
+    if hard != resource.RLIM_INFINITY:
+        wanted = min(wanted, hard)
+    if soft != resource.RLIM_INFINITY and soft < wanted:
+        with contextlib.suppress(OSError, ValueError):  # what is too few shows when the file is opened
+            resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
+
+
 def check_writable(path: str | os.PathLike[str], *, expected_bytes: int = 0) -> None:
     """Raise `OutputError` if `replace_file` to this path is bound to fail: for a look before hours of work.
 
@@ -242,9 +264,11 @@ def _temporary_file(folder: Path) -> Iterator[tuple[Path, BinaryIO]]:
             with os.fdopen(os.open(temporary, flags, 0o600), "wb") as stream:
                 if not _lock_new(stream):
                     continue
+                _own_names.add(temporary.name)
                 yield temporary, stream
                 return
         finally:
+            _own_names.discard(temporary.name)
             with contextlib.suppress(OSError):
                 temporary.unlink()
 
@@ -266,7 +290,7 @@ def _sweep(folder: Path) -> None:
     if sys.platform == "win32":
         return
     with os.scandir(folder) as entries:
-        names = [entry.name for entry in entries if _TEMPORARY.fullmatch(entry.name)]
+        names = [entry.name for entry in entries if _TEMPORARY.fullmatch(entry.name) and entry.name not in _own_names]
     for name in names:
         temporary = folder / name
         # Vanished meanwhile, someone else's, or locked by a living process: none of our business.

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import argparse
+import re
 import sys
 import traceback
 from collections.abc import Callable, Sequence
-from typing import NoReturn
+from typing import Any, NoReturn
 
 from clrecon.cli.console import Console
 from clrecon.errors import ClreconError, OutputError, UsageError
@@ -14,6 +15,8 @@ from clrecon.errors import ClreconError, OutputError, UsageError
 __all__ = ["EXIT_CODES", "INTERRUPTED", "Parser", "add_common", "add_device", "guard", "megabytes", "table"]
 
 INTERRUPTED = 130
+
+_NEGATIVE_LIST = re.compile(r"-[0-9.]+(?:[eE][+-]?[0-9]+)?,")
 
 EXIT_CODES = """\
 exit codes: 0 done; 1 unexpected error; 2 no usable DICOM or no surface; 3 wrong usage;
@@ -28,8 +31,27 @@ class Parser(argparse.ArgumentParser):
         options.setdefault("formatter_class", argparse.RawDescriptionHelpFormatter)
         super().__init__(allow_abbrev=False, **options)  # type: ignore[arg-type]
 
+    def parse_known_args(self, args: Sequence[str] | None = None, namespace: Any = None) -> Any:  # type: ignore[override]
+        """As argparse does, but ``--seed -12,3,40`` is an option with its value, as ``--hu -12`` is."""
+        given = sys.argv[1:] if args is None else args
+        return super().parse_known_args(_join_negative_lists(given), namespace)
+
     def error(self, message: str) -> NoReturn:
         raise UsageError(f"{message} (see: {self.prog} --help)")
+
+
+def _join_negative_lists(arguments: Sequence[str]) -> list[str]:
+    """Write ``--option -1,2`` as ``--option=-1,2``: to argparse a list that begins with a minus is another option."""
+    joined: list[str] = []
+    for place, argument in enumerate(arguments):
+        if argument == "--":
+            return [*joined, *arguments[place:]]
+        previous = joined[-1] if joined else ""
+        if previous.startswith("--") and "=" not in previous and _NEGATIVE_LIST.match(argument):
+            joined[-1] = f"{previous}={argument}"
+        else:
+            joined.append(argument)
+    return joined
 
 
 def add_common(parser: argparse.ArgumentParser) -> None:

@@ -7,11 +7,13 @@ from typing import Any
 
 from clrecon.cli.common import add_device, megabytes
 from clrecon.cli.console import Console, printable
+from clrecon.cli.levels import LEVELS_HELP, parse_levels
 from clrecon.pipeline.presets import DEFAULT_PRESET, PRESETS
 
 __all__ = ["add_arguments", "describe_mesh", "run"]
 
-_PARTS = ("read", "upload", "build", "kernels", "download", "write", "measure")
+_PARTS = ("read", "upload", "build", "kernels", "download", "select", "write", "measure")
+_SHOWN_PARTS = 12
 
 
 def _epilog() -> str:
@@ -24,11 +26,13 @@ def _epilog() -> str:
             "",
             "The mesh is in patient millimetres, by default in the DICOM frame (LPS: left, posterior, superior).",
             "It is written as a whole or not at all, and an older file of that name stays until then.",
+            "Several meshes get names of their own: bone_200hu.stl, bone_001.stl, bone_200hu_001.stl.",
             "Area, volume and components cost time and are measured with --report, --json or -v only.",
             "",
             "examples:",
             "  clrecon mesh CT_FOLDER -o bone.stl",
             "  clrecon mesh CT_FOLDER -o skull.glb --hu 300 --keep-largest 1 --report skull.json",
+            "  clrecon mesh CT_FOLDER -o bone.stl --hu 200,350 --min-volume 1 --split",
         )
     )
 
@@ -41,7 +45,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "-o", "--output", metavar="OUT", required=True, help="mesh file: .stl .ply .obj .glb .vtp or .3mf"
     )
     level = parser.add_mutually_exclusive_group()
-    level.add_argument("--hu", type=float, metavar="N", help="iso value in HU; inside is N and above")
+    level.add_argument("--hu", type=parse_levels, metavar="N[,N...]", help=LEVELS_HELP)
     level.add_argument(
         "--preset",
         metavar="NAME",
@@ -54,9 +58,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--space", default="lps", metavar="lps|ras", help="patient frame of the mesh (default: lps)")
     parser.add_argument("--open", action="store_true", help="leave the surface open at the border of the volume")
-    parts = parser.add_mutually_exclusive_group()
-    parts.add_argument("--keep-largest", type=int, metavar="N", help="keep the N largest components only")
-    parts.add_argument("--min-volume", type=float, metavar="ML", help="keep components of at least ML millilitres only")
+    parser.add_argument("--keep-largest", type=int, metavar="N", help="keep the N largest components only")
+    parser.add_argument(
+        "--min-volume", type=float, metavar="ML", help="keep components of at least ML millilitres only"
+    )
+    parser.add_argument("--split", action="store_true", help="write one file a component, the largest first")
     add_device(parser)
     parser.add_argument("--report", metavar="FILE", help="write affine, counts, quality, device and times as JSON")
 
@@ -74,6 +80,7 @@ def run(options: argparse.Namespace, console: Console) -> int:
         closed=not options.open,
         keep_largest=options.keep_largest,
         min_volume_ml=options.min_volume,
+        split=options.split,
         device=options.device,
     )
     report = make_mesh(
@@ -87,8 +94,7 @@ def run(options: argparse.Namespace, console: Console) -> int:
     console.result(report)
     for line in describe_mesh(report):
         console.say(line)
-    size = megabytes(report["output"]["bytes"])
-    console.say(f"wrote    {printable(options.output)}, {size}, {report['space'].upper()} mm")
+    console.say(f"wrote    {_describe_files(options.output, report)}")
     if options.report:
         console.say(f"report   {printable(options.report)}")
     for warning in report["warnings"]:
@@ -100,11 +106,13 @@ def describe_mesh(report: dict[str, Any]) -> list[str]:
     """The report for people: what was read, what came out, on which device, in which time."""
     reason = f"preset {report['preset']}" if report["preset"] else "as given"
     border = "closed" if report["closed_at_border"] else "open"
+    levels = ", ".join(f"{level:g}" for level in dict.fromkeys(mesh["iso_value_hu"] for mesh in report["meshes"]))
     return [
         f"input    {_describe_volume(report['volume'])}",
-        f"surface  {report['iso_value_hu']:g} HU ({reason}), {border} at the border of the volume",
+        f"surface  {levels} HU ({reason}), {border} at the border of the volume",
         f"mesh     {report['vertices']:,} vertices, {report['triangles']:,} triangles",
         *_describe_quality(report),
+        *_describe_parts(report["meshes"]),
         f"device   {printable(report['device'])}",
         f"time     {_describe_times(report['seconds'])}",
     ]
@@ -123,8 +131,30 @@ def _describe_volume(volume: dict[str, Any]) -> str:
     return ", ".join(parts)
 
 
+def _describe_parts(meshes: list[dict[str, Any]]) -> list[str]:
+    """A line for each of several meshes, as long as they can be taken in at a glance."""
+    if len(meshes) == 1:
+        return []
+    lines = []
+    for mesh in meshes[:_SHOWN_PARTS]:
+        volume = "" if mesh["volume_ml"] is None else f", {mesh['volume_ml']:,.2f} ml"
+        lines.append(f"         {mesh['name']}: {mesh['triangles']:,} triangles{volume}")
+    if len(meshes) > _SHOWN_PARTS:
+        lines.append(f"         and {len(meshes) - _SHOWN_PARTS:,} more")
+    return lines
+
+
+def _describe_files(output: str, report: dict[str, Any]) -> str:
+    from clrecon.pipeline.outputs import name_outputs
+
+    paths = name_outputs(output, [mesh["name"] or "" for mesh in report["meshes"]])
+    names = [printable(str(path)) for path in (paths[0], paths[-1])]
+    files = {1: names[0], 2: " and ".join(names)}.get(len(paths), f"{names[0]} to {names[1]}, {len(paths):,} files")
+    return f"{files}, {megabytes(report['output']['bytes'])}, {report['space'].upper()} mm"
+
+
 def _describe_quality(report: dict[str, Any]) -> list[str]:
-    if not report["quality"]:
+    if report["components"] is None:
         return []
     closed = "closed" if report["closed"] else "not closed"
     manifold = "manifold" if report["manifold"] else "not manifold"

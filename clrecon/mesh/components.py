@@ -1,8 +1,9 @@
-"""Keep the large parts of a surface and drop the crumbs."""
+"""Keep the parts of a surface that matter, together or one by one, and drop the crumbs."""
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,10 +13,41 @@ from clrecon.mesh.connectivity import label_components
 from clrecon.mesh.measures import cross_products, local_origin
 from clrecon.mesh.mesh import Mesh
 
-__all__ = ["select_components"]
+__all__ = ["Labelled", "select_components", "split_components"]
+
+Labelled = tuple[int, NDArray[np.int64]]
+"""What `label_components` returns: the number of components, and that of each vertex."""
 
 
-def select_components(mesh: Mesh, keep_largest: int | None = None, min_volume_ml: float | None = None) -> Mesh:
+@dataclass(frozen=True)
+class _Chosen:
+    """Components of a mesh and which of them are kept.
+
+    Attributes
+    ----------
+    label_of_vertex, label_of_triangle : ndarray, int64
+        Number of the component; -1 for vertices that no triangle uses.
+    areas : ndarray, shape (count,), float64
+        mm2.
+    keep : ndarray, shape (count,), bool
+    facts : dict
+        What the report of the outcome says of it.
+    """
+
+    label_of_vertex: NDArray[np.int64]
+    label_of_triangle: NDArray[np.int64]
+    areas: NDArray[np.float64]
+    keep: NDArray[np.bool_]
+    facts: dict[str, object]
+
+
+def select_components(
+    mesh: Mesh,
+    keep_largest: int | None = None,
+    min_volume_ml: float | None = None,
+    *,
+    labelled: Labelled | None = None,
+) -> Mesh:
     """Keep the largest components of a surface.
 
     Components are ranked by area, not by volume: a part that is open at the border of the scan encloses nothing,
@@ -30,6 +62,8 @@ def select_components(mesh: Mesh, keep_largest: int | None = None, min_volume_ml
     min_volume_ml : float, optional
         Keep components that enclose at least so much, whatever the sign.  What an open component encloses is
         measured as if its rim were joined to the mean of its corners.
+    labelled : (int, ndarray), optional
+        What `label_components` returns for this mesh, where it is known already (a device finds it sooner).
 
     Returns
     -------
@@ -44,6 +78,74 @@ def select_components(mesh: Mesh, keep_largest: int | None = None, min_volume_ml
     NoSurfaceError
         The mesh is empty or no component is large enough; the message has the largest.
     """
+    chosen = _choose(mesh, keep_largest, min_volume_ml, labelled)
+    if chosen.keep.all():
+        mesh.report.update(chosen.facts)
+        return mesh
+    return _take(mesh, chosen.keep[chosen.label_of_triangle], {**mesh.report, **chosen.facts})
+
+
+def split_components(
+    mesh: Mesh,
+    keep_largest: int | None = None,
+    min_volume_ml: float | None = None,
+    *,
+    labelled: Labelled | None = None,
+    most: int | None = None,
+) -> list[Mesh]:
+    """Take a surface apart into its components.
+
+    Parameters
+    ----------
+    mesh, keep_largest, min_volume_ml, labelled
+        As in `select_components`; components that it would drop are left out.
+    most : int, optional
+        Refuse more components than this.
+
+    Returns
+    -------
+    list of Mesh
+        One a component, the largest area first (of equal ones the first).  Vertices and triangles keep their order,
+        normals and report come along.
+
+    Raises
+    ------
+    UsageError
+        As `select_components`, or there are more than `most` components.
+    NoSurfaceError
+        As `select_components`.
+    """
+    chosen = _choose(mesh, keep_largest, min_volume_ml, labelled)
+    kept = np.flatnonzero(chosen.keep)
+    if most is not None and len(kept) > most:
+        raise UsageError(
+            f"the surface has {len(kept):,} components, at most {most:,} are written one by one:"
+            " leave the small ones out (--min-volume ML, --keep-largest N)"
+        )
+    rank = np.full(len(chosen.keep) + 1, len(kept))  # the last entry is for unused vertices, whose label is -1
+    rank[kept[np.argsort(-chosen.areas[kept], kind="stable")]] = np.arange(len(kept))
+    vertex_order, vertex_ends = _group(rank[chosen.label_of_vertex], len(kept))
+    triangle_order, triangle_ends = _group(rank[chosen.label_of_triangle], len(kept))
+    number = np.empty(mesh.vertex_count, dtype=np.int64)
+    number[vertex_order] = np.arange(mesh.vertex_count)
+    parts = []
+    for part in range(len(kept)):
+        own = vertex_order[vertex_ends[part] : vertex_ends[part + 1]]
+        faces = mesh.triangles[triangle_order[triangle_ends[part] : triangle_ends[part + 1]]]
+        triangles = (number[faces] - vertex_ends[part]).astype(np.uint32)
+        normals = None if mesh.normals is None else mesh.normals[own]
+        parts.append(Mesh(mesh.vertices[own], triangles, normals, {**mesh.report, **chosen.facts}))
+    return parts
+
+
+def _group(ranks: NDArray[np.int64], count: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Stable order by rank, and where in it each rank from 0 to `count` begins."""
+    order = np.argsort(ranks, kind="stable")
+    return order, np.searchsorted(ranks[order], np.arange(count + 1))
+
+
+def _choose(mesh: Mesh, keep_largest: int | None, min_volume_ml: float | None, labelled: Labelled | None) -> _Chosen:
+    """Find the components and decide which are kept; parameters and errors as in `select_components`."""
     if keep_largest is not None and (isinstance(keep_largest, float) or keep_largest < 1):
         raise UsageError(f"keep_largest is a whole number from 1, not {keep_largest}")
     if min_volume_ml is not None and not (math.isfinite(min_volume_ml) and min_volume_ml >= 0):
@@ -52,7 +154,7 @@ def select_components(mesh: Mesh, keep_largest: int | None = None, min_volume_ml
     if mesh.triangle_count == 0:
         raise NoSurfaceError("the surface is empty: there is no component to keep")
 
-    count, labels = label_components(mesh.triangles, mesh.vertex_count)
+    count, labels = label_components(mesh.triangles, mesh.vertex_count) if labelled is None else labelled
     label_of_triangle = labels[mesh.triangles[:, 0]]
     areas, volumes = _measure_components(mesh, label_of_triangle, count)
     keep = np.ones(count, dtype=bool)
@@ -66,12 +168,8 @@ def select_components(mesh: Mesh, keep_largest: int | None = None, min_volume_ml
     if keep_largest is not None:
         ranked = np.argsort(-areas, kind="stable")
         keep[ranked[keep[ranked]][keep_largest:]] = False
-
-    found = {"components_found": count, "components_kept": int(np.count_nonzero(keep))}
-    if keep.all():
-        mesh.report.update(found)
-        return mesh
-    return _take(mesh, keep[label_of_triangle], {**mesh.report, **found})
+    facts: dict[str, object] = {"components_found": count, "components_kept": int(np.count_nonzero(keep))}
+    return _Chosen(labels, label_of_triangle, areas, keep, facts)
 
 
 def _measure_components(

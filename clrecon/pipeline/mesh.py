@@ -1,28 +1,23 @@
-"""The main job: a CT series in, a calibrated mesh out, with its report."""
+"""The main job: a CT series in, calibrated meshes out, with their report."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from clrecon.errors import NoSurfaceError, UsageError
+from clrecon.pipeline.description import describe_job, describe_part
 from clrecon.pipeline.opening import DeviceOpening
-from clrecon.pipeline.presets import find_preset
+from clrecon.pipeline.outputs import check_outputs, commit_all, name_outputs, stage_meshes
+from clrecon.pipeline.parts import extract_surfaces, first_names, plan_surfaces, select_parts
 from clrecon.pipeline.progress import Progress, Stopwatch, ignore_progress
-from clrecon.pipeline.report import peak_memory_bytes, platform_name, stage_report
+from clrecon.pipeline.report import peak_memory_bytes, stage_report
 from clrecon.pipeline.settings import MeshSettings
-from clrecon.version import package_version
-
-if TYPE_CHECKING:
-    from clrecon.geometry import Volume
-    from clrecon.mesh import Mesh
-    from clrecon.opencl import Device
 
 __all__ = ["make_mesh"]
 
 _DEVICE_PARTS = ("upload", "build", "kernels", "download")
-_SAID_ABOVE = ("vertices", "triangles", "closed", "manifold", "components", "area_mm2", "volume_ml", "bounds_mm")
 
 
 def make_mesh(
@@ -34,11 +29,14 @@ def make_mesh(
     measure: bool | None = None,
     progress: Progress | None = None,
 ) -> dict[str, Any]:
-    """Read a CT series, extract the surface at the iso value, write it.
+    """Read a CT series, extract its surfaces, select what is asked for, measure and write it.
+
+    One mesh is written to `output`.  Several, of several iso values or split into components, get a name between
+    stem and extension: ``bone_200hu.stl``, ``bone_001.stl``, ``bone_200hu_001.stl``.
 
     Outputs that cannot be written are refused first, then a device that is not there, then the input.  The device
     is opened and its kernels are built while the input is read.
-    Mesh and report are written to temporary files, then renamed; the report comes last, as the commit mark.
+    All files are written under temporary names, then renamed; the report comes last, as the commit mark.
 
     Parameters
     ----------
@@ -50,7 +48,7 @@ def make_mesh(
     report_path : path, optional
         Where the report goes as JSON.
     measure : bool, optional
-        Measure the mesh (area, volume, components, manifold or not).  It costs time; without it those entries of
+        Measure the meshes (area, volume, components, manifold or not).  It costs time; without it those entries of
         the report are None.  Default: when there is a `report_path`.
     progress : callable, optional
         ``progress(stage, done, total)``.
@@ -58,7 +56,7 @@ def make_mesh(
     Returns
     -------
     dict
-        The report, see `describe`; with ``output`` (format, bytes), ``seconds`` and ``peak_memory_bytes``.
+        The report, see `describe_job`; with ``seconds`` and ``peak_memory_bytes``.
 
     Raises
     ------
@@ -69,7 +67,8 @@ def make_mesh(
     progress = progress or ignore_progress
     measure = report_path is not None if measure is None else measure
     watch = Stopwatch()
-    check_outputs(output, report_path)
+    surfaces = plan_surfaces(settings.levels)
+    check_outputs(output, report_path, first_names(surfaces, settings.split))
 
     progress("device", 0, 0)
     with DeviceOpening(settings.device) as opening:
@@ -80,128 +79,49 @@ def make_mesh(
         device = opening.wait()
         watch.lap("device")
 
-    _check_level(volume, settings.level)
-    from clrecon.operators.isosurface import extract_isosurface
-
-    mesh = extract_isosurface(volume, settings.level, device, closed=settings.closed, progress=progress)
-    if settings.keep_largest is not None or settings.min_volume_ml is not None:
-        from clrecon.mesh import select_components
-
-        progress("select", 0, 0)
-        mesh = select_components(mesh, keep_largest=settings.keep_largest, min_volume_ml=settings.min_volume_ml)
+    extracted = extract_surfaces(volume, surfaces, device, settings, progress)
+    origins = [mesh.report for mesh in extracted]
     watch.lap("surface")
+    if settings.selects:
+        progress("select", 0, 0)
+    parts = [
+        part
+        for surface, mesh in zip(surfaces, extracted, strict=True)
+        for part in select_parts(surface, mesh, settings)
+    ]
+    del extracted
+    paths = name_outputs(output, [part.name for part in parts], report_path)
+    watch.lap("select")
 
-    quality: dict[str, Any] = {}
     if measure:
-        progress("measure", 0, 0)
-        quality = mesh.quality()
+        for place, part in enumerate(parts):
+            progress("measure", place, len(parts) if len(parts) > 1 else 0)
+            part.quality = part.mesh.quality()
         watch.lap("measure")
 
-    from clrecon.mesh import stage_mesh
-
     progress("write", 0, 0)
-    with ExitStack() as staged:  # both files are on the disk before either replaces an older one
-        mesh_file = staged.enter_context(stage_mesh(mesh, output, settings.space))
+    with ExitStack() as staged:  # all files are on the disk before any replaces an older one
+        files = stage_meshes(staged, [part.mesh for part in parts], paths, settings.space)
         watch.lap("write")
-        report = describe(volume, mesh, quality, settings, device)
-        report["output"] = {"format": Path(output).suffix.lower().lstrip("."), "bytes": mesh_file.size}
-        report["seconds"] = _seconds(watch, mesh)
+        meshes = [
+            describe_part(part, file, path, settings.space)
+            for part, file, path in zip(parts, files, paths, strict=True)
+        ]
+        report = describe_job(volume, parts, meshes, settings, device)
+        report["seconds"] = _seconds(watch, origins)
         report["peak_memory_bytes"] = peak_memory_bytes()
-        report_file = None if report_path is None else staged.enter_context(stage_report(report_path, report))
-        mesh_file.commit()
-        if report_file is not None:
-            report_file.commit()
+        if report_path is not None:
+            files.append(staged.enter_context(stage_report(report_path, report)))
+        commit_all(files)
     return report
 
 
-def _check_level(volume: Volume, level: float) -> None:
-    """Refuse an iso value that has every voxel inside: the surface would be the box of the scan."""
-    low, high = volume.report["hu_range"]
-    if level <= low:
-        raise NoSurfaceError(
-            f"no surface at {level:g} HU: every voxel is inside, the volume runs from {low:g} to {high:g} HU"
-        )
-
-
-def check_outputs(output: str | Path, report_path: str | Path | None) -> None:
-    """Refuse outputs that cannot be written, before any work is done.
-
-    Raises
-    ------
-    UsageError
-        Unknown extension, or both outputs are one file.
-    OutputError
-        A folder is missing or cannot be written, or a target is no regular file.
-    """
-    from clrecon.files import check_writable
-    from clrecon.mesh import check_format
-
-    check_format(output)
-    check_writable(output)
-    if report_path is not None:
-        if Path(report_path).resolve() == Path(output).resolve():
-            raise UsageError(f"the mesh and the report cannot be the same file: {output}")
-        check_writable(report_path)
-
-
-def describe(
-    volume: Volume, mesh: Mesh, quality: dict[str, Any], settings: MeshSettings, device: Device
-) -> dict[str, Any]:
-    """Compose the report of a mesh, all but output, times and memory.
-
-    Lengths are mm, areas mm2, volumes ml (1 ml = 1000 mm3).  ``bounds_mm`` is ``[[x, y, z], [x, y, z]]``, the
-    lowest and the highest corner in the patient frame ``space``, also for formats that store another frame
-    (GLB: metres, Y up).  ``affine_ijk_to_lps_mm`` is always LPS.
-    """
-    from clrecon.geometry import frame_from_lps
-
-    frame = frame_from_lps(settings.space)
-    bounds = None
-    if len(mesh.vertices):
-        corners = (frame @ mesh.vertices.min(axis=0), frame @ mesh.vertices.max(axis=0))
-        bounds = [[float(pick(a, b)) for a, b in zip(*corners, strict=True)] for pick in (min, max)]
-    certificate = dict(volume.report)
-    warnings = [str(text) for text in certificate.pop("warnings", [])]
-    warnings += [str(text) for text in (mesh.report or {}).get("warnings", [])]
-    if settings.preset_used == "skin":
-        warnings.append("a surface of the skin can show a face: treat the file as one that identifies the patient")
-    report: dict[str, Any] = {
-        "affine_ijk_to_lps_mm": volume.affine.tolist(),
-        "iso_value_hu": settings.level,
-        "iso_level_hu": (mesh.report or {}).get("iso_level_hu"),
-        "outside_hu": (mesh.report or {}).get("outside_hu"),
-        "preset": settings.preset_used,
-        "space": settings.space,
-        "unit": "mm",
-        "vertices": len(mesh.vertices),
-        "triangles": len(mesh.triangles),
-        "closed": quality.get("closed"),
-        "manifold": quality.get("manifold"),
-        "components": quality.get("components"),
-        "area_mm2": quality.get("area_mm2"),
-        "volume_ml": quality.get("volume_ml") if quality.get("closed") else None,
-        "bounds_mm": bounds,
-        "closed_at_border": settings.closed,
-        "keep_largest": settings.keep_largest,
-        "min_volume_ml": settings.min_volume_ml,
-        "device": device.label,
-        "driver": device.driver,
-        "version": package_version(),
-        "platform": platform_name(),
-        "warnings": list(dict.fromkeys(warnings)),
-        "volume": certificate,
-        "quality": {name: value for name, value in quality.items() if name not in _SAID_ABOVE} or None,
-    }
-    if settings.preset_used is not None:
-        report["preset_reason"] = find_preset(settings.preset_used).source
-    return report
-
-
-def _seconds(watch: Stopwatch, mesh: Mesh) -> dict[str, float]:
-    measured = (mesh.report or {}).get("seconds", {})
+def _seconds(watch: Stopwatch, origins: Sequence[dict[str, Any]]) -> dict[str, float]:
+    """Seconds by part of the job; `origins` are the reports of the surfaces."""
+    measured = [origin.get("seconds", {}) for origin in origins]
     seconds = {"device": watch.seconds.get("device", 0.0), "read": watch.seconds.get("read", 0.0)}
-    seconds.update({part: float(measured.get(part, 0.0)) for part in _DEVICE_PARTS})
-    seconds.update(write=watch.seconds.get("write", 0.0), measure=watch.seconds.get("measure", 0.0))
+    seconds.update({part: sum(float(own.get(part, 0.0)) for own in measured) for part in _DEVICE_PARTS})
+    seconds.update({part: watch.seconds.get(part, 0.0) for part in ("select", "measure", "write")})
     seconds["other"] = max(0.0, watch.total() - sum(seconds.values()))
     seconds["total"] = watch.total()
     return {part: round(value, 4) for part, value in seconds.items()}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from clrecon.errors import UsageError
@@ -17,8 +18,8 @@ class MeshSettings:
 
     Parameters
     ----------
-    iso_value : float, optional
-        HU; inside is ``>= iso_value``.
+    iso_value : float or sequence of float, optional
+        HU; inside is ``>= iso_value``.  Several make one mesh each.
     preset : str, optional
         Name of an iso value, see `clrecon.pipeline.presets`.  Neither of both means the preset "bone".
     series : str or int, optional
@@ -30,7 +31,9 @@ class MeshSettings:
     keep_largest : int, optional
         Keep only this many components, the largest by volume.
     min_volume_ml : float, optional
-        Keep only components of at least this volume.
+        Keep only components of at least this volume.  With `keep_largest`: of these the largest.
+    split : bool
+        One mesh a component, the largest first.
     device : str, optional
         Name or index of an OpenCL device; None leaves the choice to `choose_device`.
 
@@ -40,24 +43,22 @@ class MeshSettings:
         A value is impossible, or two exclude each other.
     """
 
-    iso_value: float | None = None
+    iso_value: float | Sequence[float] | None = None
     preset: str | None = None
     series: str | int | None = None
     space: str = "lps"
     closed: bool = True
     keep_largest: int | None = None
     min_volume_ml: float | None = None
+    split: bool = False
     device: str | None = None
 
     def __post_init__(self) -> None:
         if self.iso_value is not None and self.preset is not None:
             raise UsageError("give either an iso value in HU or a preset, not both")
-        if self.iso_value is not None and not math.isfinite(self.iso_value):
-            raise UsageError(f"the iso value must be a finite number of HU, not {self.iso_value}")
         if self.preset is not None:
             find_preset(self.preset)
-        if self.keep_largest is not None and self.min_volume_ml is not None:
-            raise UsageError("give either the number of components to keep or their smallest volume, not both")
+        self._check_levels()
         if self.keep_largest is not None and self.keep_largest < 1:
             raise UsageError(f"the number of components to keep must be 1 or more, not {self.keep_largest}")
         if self.min_volume_ml is not None and not (math.isfinite(self.min_volume_ml) and self.min_volume_ml > 0):
@@ -66,14 +67,30 @@ class MeshSettings:
 
         frame_from_lps(self.space)
 
+    def _check_levels(self) -> None:
+        if not self.levels:
+            raise UsageError("give at least one iso value in HU")
+        for place, value in enumerate(self.levels):
+            if not math.isfinite(value):
+                raise UsageError(f"the iso value must be a finite number of HU, not {value}")
+            if value in self.levels[:place]:
+                raise UsageError(f"the iso value {value:g} HU is given twice")
+
     @property
-    def level(self) -> float:
-        """The iso value in HU that is used."""
-        if self.iso_value is not None:
-            return self.iso_value
-        return find_preset(self.preset or DEFAULT_PRESET).iso_value
+    def levels(self) -> tuple[float, ...]:
+        """The iso values in HU that are used, one a surface."""
+        if self.iso_value is None:
+            return (find_preset(self.preset or DEFAULT_PRESET).iso_value,)
+        if isinstance(self.iso_value, Sequence):
+            return tuple(self.iso_value)
+        return (self.iso_value,)
 
     @property
     def preset_used(self) -> str | None:
-        """Name of the preset behind `level`, None where the value was given."""
+        """Name of the preset behind `levels`, None where the value was given."""
         return None if self.iso_value is not None else (self.preset or DEFAULT_PRESET)
+
+    @property
+    def selects(self) -> bool:
+        """Whether components are told apart."""
+        return self.split or self.keep_largest is not None or self.min_volume_ml is not None

@@ -145,6 +145,20 @@ def test_mesh_keeps_components_by_size(device: Any, tmp_path: Path, capsys: pyte
     assert not (tmp_path / "none.stl").exists()
 
 
+def test_several_meshes_are_shown_one_by_one(
+    device: Any, ct: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arguments = ["mesh", str(ct), "-o", str(tmp_path / "a.stl"), "--split", "-v", "--device", str(device.index)]
+    assert main([*arguments, "--hu", "-150,200.5"]) == 0
+    text = capsys.readouterr().out
+    assert "-150, 200.5 HU (as given)" in text
+    assert "2 components, closed, manifold" in text
+    assert "a_-150hu_001.stl and" in text
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a_-150hu_001.stl", "a_200.5hu_001.stl"]
+    triangles = [len(read_stl(path)) for path in sorted(tmp_path.iterdir())]
+    assert [f"hu_001: {count:,} triangles, " in text for count in triangles] == [True, True]
+
+
 def test_open_leaves_the_border_open(device: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     voxels = np.full((5, 8, 9), -1000, np.int16)
     voxels[:, 2:6, 3:6] = 600

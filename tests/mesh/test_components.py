@@ -7,7 +7,8 @@ import pytest
 import sample_meshes as samples
 
 from clrecon.errors import NoSurfaceError, UsageError
-from clrecon.mesh import Mesh, select_components
+from clrecon.mesh import Mesh, select_components, split_components
+from clrecon.mesh.connectivity import label_components
 
 pytestmark = pytest.mark.unit
 
@@ -120,3 +121,45 @@ def test_nothing_left():
 def test_wrong_limits(arguments):
     with pytest.raises(UsageError, match="keep_largest is a whole number|min_volume_ml is a volume"):
         select_components(three_boxes(), **arguments)
+
+
+def test_split_gives_each_component_as_it_is_alone():
+    mesh = three_boxes()
+    pieces = split_components(mesh)
+    assert [len(piece.triangles) for piece in pieces] == [12, 12, 12]
+    for place, piece in zip((LARGE, MIDDLE, SMALL), pieces, strict=True):
+        rows = 3 * np.arange(8) + place
+        np.testing.assert_array_equal(piece.vertices, mesh.vertices[rows])
+        np.testing.assert_array_equal(piece.normals, mesh.normals[rows])
+        np.testing.assert_array_equal(piece.triangles, (mesh.triangles[place::3] - place) // 3)
+        assert piece.report == {"iso_value_hu": 250.0, "components_found": 3, "components_kept": 3}
+        assert piece.triangles.dtype == np.uint32
+    assert mesh.report == {"iso_value_hu": 250.0}
+
+
+def test_split_leaves_out_what_is_not_kept():
+    pieces = split_components(three_boxes(), keep_largest=2, min_volume_ml=0.01)
+    assert [piece.report["components_kept"] for piece in pieces] == [1]
+    assert pieces[0].quality()["volume_ml"] == pytest.approx(0.060)
+    assert len(split_components(Mesh(*samples.box()))) == 1
+
+
+def test_split_of_equal_sizes_keeps_their_order():
+    places = (7.0, 0.0, 3.0)
+    pieces = split_components(Mesh(*samples.join(*(samples.box((x, 0, 0)) for x in places))))
+    assert [piece.vertices[:, 0].min() for piece in pieces] == list(places)
+
+
+def test_split_refuses_more_than_most():
+    assert len(split_components(three_boxes(), most=3)) == 3
+    with pytest.raises(UsageError, match="3 components, at most 2 are written one by one: leave the small ones out"):
+        split_components(three_boxes(), most=2)
+
+
+def test_labels_that_are_known_are_used():
+    mesh = three_boxes()
+    labelled = label_components(mesh.triangles, mesh.vertex_count)
+    kept = select_components(mesh, keep_largest=1, labelled=labelled)
+    np.testing.assert_array_equal(kept.vertices, select_components(mesh, keep_largest=1).vertices)
+    as_one = (1, np.zeros(mesh.vertex_count, dtype=np.int64))
+    assert select_components(mesh, keep_largest=1, labelled=as_one) is mesh

@@ -13,19 +13,31 @@ from clrecon.pipeline.settings import MeshSettings
 
 def test_bone_is_the_default() -> None:
     settings = MeshSettings()
-    assert (settings.level, settings.preset_used) == (200.0, "bone")
+    assert (settings.levels, settings.preset_used) == ((200.0,), "bone")
     assert (settings.space, settings.closed, settings.device) == ("lps", True, None)
 
 
 def test_a_value_beats_the_default_preset() -> None:
     settings = MeshSettings(iso_value=-0.0)
-    assert (settings.level, settings.preset_used) == (0.0, None)
+    assert (settings.levels, settings.preset_used) == ((0.0,), None)
+
+
+def test_several_iso_values_keep_their_order() -> None:
+    assert MeshSettings(iso_value=[350, 200.5]).levels == (350, 200.5)
+
+
+@pytest.mark.parametrize(
+    ("settings", "selects"),
+    [({}, False), ({"split": True}, True), ({"keep_largest": 1, "min_volume_ml": 1.0}, True)],
+)
+def test_components_are_told_apart_only_where_asked(settings: dict, selects: bool) -> None:
+    assert MeshSettings(**settings).selects is selects
 
 
 @pytest.mark.parametrize("name", sorted(PRESETS))
 def test_presets_are_whole_numbers_of_hu_in_the_range_of_ct(name: str) -> None:
     preset = find_preset(name)
-    assert (preset.name, MeshSettings(preset=name).level) == (name, preset.iso_value)
+    assert (preset.name, MeshSettings(preset=name).levels) == (name, (preset.iso_value,))
     assert preset.iso_value == int(preset.iso_value)
     assert -1000 < preset.iso_value < 3071
     assert preset.description and preset.source
@@ -46,7 +58,11 @@ def test_the_default_preset_keeps_thin_cortex() -> None:
         ({"keep_largest": 0}, "1 or more, not 0"),
         ({"min_volume_ml": 0.0}, "above 0 ml"),
         ({"min_volume_ml": math.nan}, "above 0 ml"),
-        ({"keep_largest": 1, "min_volume_ml": 1.0}, "not both"),
+        ({"iso_value": (200.0, math.nan)}, "finite"),
+        ({"iso_value": (200.0, 350.0, 200)}, "200 HU is given twice"),
+        ({"iso_value": (0.0, -0.0)}, "given twice"),
+        ({"iso_value": ()}, "at least one"),
+        ({"iso_value": (200.0, 350.0), "preset": "bone"}, "not both"),
     ],
 )
 def test_impossible_settings_are_refused(settings: dict, words: str) -> None:

@@ -1,0 +1,147 @@
+"""What the report of a mesh job says: of the whole job, and of each mesh."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterable, Sequence
+from typing import TYPE_CHECKING, Any
+
+from clrecon.pipeline.parts import Part
+from clrecon.pipeline.presets import find_preset
+from clrecon.pipeline.report import platform_name
+from clrecon.pipeline.settings import MeshSettings
+from clrecon.version import package_version
+
+if TYPE_CHECKING:
+    from clrecon.files import StagedFile
+    from clrecon.geometry import Volume
+    from clrecon.mesh import Mesh
+    from clrecon.opencl import Device
+
+__all__ = ["describe_job", "describe_part"]
+
+_SAID_ABOVE = ("vertices", "triangles", "closed", "manifold", "components", "area_mm2", "volume_ml", "bounds_mm")
+
+
+def describe_part(part: Part, file: StagedFile, output: str | os.PathLike[str], space: str) -> dict[str, Any]:
+    """One object of ``meshes``.
+
+    Lengths are mm, areas mm2, volumes ml (1 ml = 1000 mm3).  ``bounds_mm`` is ``[[x, y, z], [x, y, z]]``, the
+    lowest and the highest corner in the patient frame `space`, also for formats that store another frame
+    (GLB: metres, Y up).  What was not measured is None.
+    """
+    quality, origin = part.quality, part.mesh.report
+    return {
+        "name": part.name or None,
+        "label": part.surface.label,
+        "iso_value_hu": part.surface.iso_value,
+        "iso_level_hu": origin.get("iso_level_hu"),
+        "vertices": part.mesh.vertex_count,
+        "triangles": part.mesh.triangle_count,
+        "closed": quality.get("closed"),
+        "manifold": quality.get("manifold"),
+        "components": quality.get("components"),
+        "components_found": origin.get("components_found"),
+        "components_kept": origin.get("components_kept"),
+        "area_mm2": quality.get("area_mm2"),
+        "volume_ml": quality.get("volume_ml") if quality.get("closed") else None,
+        "bounds_mm": _bounds(part.mesh, space),
+        "output": {"format": os.path.splitext(output)[1].lower().lstrip("."), "bytes": file.size},
+        "quality": {name: value for name, value in quality.items() if name not in _SAID_ABOVE} or None,
+        **part.facts,
+    }
+
+
+def describe_job(
+    volume: Volume, parts: Sequence[Part], meshes: Sequence[dict[str, Any]], settings: MeshSettings, device: Device
+) -> dict[str, Any]:
+    """Compose the report of a job, all but times and memory.
+
+    Parameters
+    ----------
+    volume : Volume
+    parts : sequence of Part
+    meshes : sequence of dict
+        What `describe_part` says of each.
+    settings : MeshSettings
+    device : Device
+
+    Returns
+    -------
+    dict
+        With one mesh, its entries stand at the top too.  With several, sums do (components of one surface that are
+        written one by one were found together, and count once), ``bounds_mm`` is the box around all, ``closed``
+        and ``manifold`` hold where they hold for each, and what differs or cannot be summed is None.
+    """
+    certificate = dict(volume.report)
+    warnings = [str(text) for text in certificate.pop("warnings", [])]
+    for part in parts:
+        warnings += [str(text) for text in part.mesh.report.get("warnings", [])]
+    if settings.preset_used == "skin":
+        warnings.append("a surface of the skin can show a face: treat the file as one that identifies the patient")
+    of_surface = {part.surface: mesh for part, mesh in zip(parts, meshes, strict=True)}.values()
+    report: dict[str, Any] = {
+        "affine_ijk_to_lps_mm": volume.affine.tolist(),
+        "iso_value_hu": _common(mesh["iso_value_hu"] for mesh in meshes),
+        "iso_level_hu": _common(mesh["iso_level_hu"] for mesh in meshes),
+        "outside_hu": _common(part.mesh.report.get("outside_hu") for part in parts),
+        "preset": settings.preset_used,
+        "space": settings.space,
+        "unit": "mm",
+        "vertices": sum(mesh["vertices"] for mesh in meshes),
+        "triangles": sum(mesh["triangles"] for mesh in meshes),
+        "closed": _unless_unknown(all, (mesh["closed"] for mesh in meshes)),
+        "manifold": _unless_unknown(all, (mesh["manifold"] for mesh in meshes)),
+        "components": _unless_unknown(sum, (mesh["components"] for mesh in meshes)),
+        "components_found": _unless_unknown(sum, (mesh["components_found"] for mesh in of_surface)),
+        "components_kept": _unless_unknown(sum, (mesh["components_kept"] for mesh in of_surface)),
+        "area_mm2": _unless_unknown(sum, (mesh["area_mm2"] for mesh in meshes)),
+        "volume_ml": _unless_unknown(sum, (mesh["volume_ml"] for mesh in meshes)),
+        "bounds_mm": _unless_unknown(_around, (mesh["bounds_mm"] for mesh in meshes)),
+        "closed_at_border": settings.closed,
+        "keep_largest": settings.keep_largest,
+        "min_volume_ml": settings.min_volume_ml,
+        "split": settings.split,
+        "device": device.label,
+        "driver": device.driver,
+        "version": package_version(),
+        "platform": platform_name(),
+        "warnings": list(dict.fromkeys(warnings)),
+        "volume": certificate,
+        "quality": meshes[0]["quality"] if len(meshes) == 1 else None,
+        "meshes": list(meshes),
+        "output": {
+            "format": meshes[0]["output"]["format"],
+            "bytes": sum(mesh["output"]["bytes"] for mesh in meshes),
+        },
+    }
+    if settings.preset_used is not None:
+        report["preset_reason"] = find_preset(settings.preset_used).source
+    return report
+
+
+def _bounds(mesh: Mesh, space: str) -> list[list[float]] | None:
+    from clrecon.geometry import frame_from_lps
+
+    if mesh.vertex_count == 0:
+        return None
+    frame = frame_from_lps(space)
+    corners = (frame @ mesh.vertices.min(axis=0), frame @ mesh.vertices.max(axis=0))
+    return [[float(pick(a, b)) for a, b in zip(*corners, strict=True)] for pick in (min, max)]
+
+
+def _around(boxes: list[list[list[float]]]) -> list[list[float]]:
+    lows, highs = zip(*boxes, strict=True)
+    return [[min(axis) for axis in zip(*lows, strict=True)], [max(axis) for axis in zip(*highs, strict=True)]]
+
+
+def _common(values: Iterable[Any]) -> Any:
+    """The value that all have, None where they differ."""
+    found = list(values)
+    return found[0] if all(value == found[0] for value in found) else None
+
+
+def _unless_unknown(combine: Callable[[list[Any]], Any], values: Iterable[Any]) -> Any:
+    """`combine` of the values, None where one of them is."""
+    found = list(values)
+    return None if any(value is None for value in found) else combine(found)

@@ -1,0 +1,116 @@
+"""The files of a job: what they are called, and that none of them stands in the way of another."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from contextlib import ExitStack
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from clrecon.errors import OutputError, UsageError
+
+if TYPE_CHECKING:
+    from clrecon.files import StagedFile
+    from clrecon.mesh import Mesh
+
+__all__ = ["MOST_FILES", "check_outputs", "commit_all", "name_outputs", "stage_meshes"]
+
+MOST_FILES = 1000
+"""Meshes a job.  More are crumbs that nobody opens, and every one of them keeps a file open until all are written."""
+
+
+def name_outputs(output: str | Path, names: Sequence[str], report_path: str | Path | None = None) -> list[str | Path]:
+    """The files of several meshes: ``bone.stl`` and ``200hu`` make ``bone_200hu.stl``; an empty name changes nothing.
+
+    Parameters
+    ----------
+    output : path
+    names : sequence of str
+        One a mesh, see `clrecon.pipeline.parts.Part`.
+    report_path : path, optional
+
+    Returns
+    -------
+    list of path
+
+    Raises
+    ------
+    UsageError
+        There are too many, a name is no part of a file name, or two of the files, the report among them, are one.
+    """
+    if len(names) > MOST_FILES:
+        raise UsageError(
+            f"{len(names):,} meshes are more than {MOST_FILES:,} files:"
+            " leave small components out (--min-volume ML, --keep-largest N) or ask for fewer iso values"
+        )
+    stem, extension = os.path.splitext(os.fspath(output))
+    paths = [f"{stem}_{name}{extension}" if name else output for name in names]
+    owners: dict[str, str] = {}
+    if report_path is not None:
+        owners[_identity(report_path)] = "the report"
+    for name, path in zip(names, paths, strict=True):
+        if os.path.basename(name) != name or "\\" in name:
+            raise UsageError(f"{name!r} cannot be a part of the name of a file")
+        own = f"the mesh {name}" if name else "the mesh"
+        other = owners.setdefault(_identity(path), own)
+        if other is not own:
+            raise UsageError(f"{own} and {other} cannot be the same file: {path}")
+    return paths
+
+
+def _identity(path: str | Path) -> str:
+    """What two names of one file have in common, also where links lead there or upper case counts as lower case."""
+    return os.path.realpath(path).casefold()
+
+
+def check_outputs(output: str | Path, report_path: str | Path | None, names: Sequence[str] = ("",)) -> None:
+    """Refuse outputs that cannot be written, before any work is done.
+
+    Raises
+    ------
+    UsageError
+        Unknown extension, or two outputs are one file.
+    OutputError
+        A folder is missing or cannot be written, or a target is no regular file.
+    """
+    from clrecon.files import check_writable
+    from clrecon.mesh import check_format
+
+    check_format(output)
+    for path in name_outputs(output, names, report_path):
+        check_writable(path)
+    if report_path is not None:
+        check_writable(report_path)
+
+
+def stage_meshes(stack: ExitStack, meshes: Sequence[Mesh], paths: Sequence[str | Path], space: str) -> list[StagedFile]:
+    """Write all meshes under temporary names that `stack` removes unless they are committed.
+
+    Raises
+    ------
+    OutputError
+        One of them cannot be written; all older files are intact.
+    """
+    from clrecon.files import allow_open_files
+    from clrecon.mesh import stage_mesh
+
+    allow_open_files(len(meshes))
+    return [stack.enter_context(stage_mesh(mesh, path, space)) for mesh, path in zip(meshes, paths, strict=True)]
+
+
+def commit_all(files: Sequence[StagedFile]) -> None:
+    """Put staged files into their places, one after the other.
+
+    Raises
+    ------
+    OutputError
+        The system refuses one of them; the message says how many are in place already.
+    """
+    for done, file in enumerate(files):
+        try:
+            file.commit()
+        except OutputError as error:
+            if done == 0:
+                raise
+            raise OutputError(f"{error} ({done} of {len(files)} files of this job are in place already)") from error

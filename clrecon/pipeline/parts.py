@@ -1,0 +1,131 @@
+"""From a volume to the meshes of a job: surfaces, and the parts of them that become one file each."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+from clrecon.errors import NoSurfaceError
+from clrecon.pipeline.outputs import MOST_FILES
+from clrecon.pipeline.progress import Progress
+from clrecon.pipeline.settings import MeshSettings
+
+if TYPE_CHECKING:
+    from clrecon.geometry import Volume
+    from clrecon.mesh import Mesh
+    from clrecon.opencl import Device
+
+__all__ = ["Part", "Surface", "extract_surfaces", "first_names", "plan_surfaces", "select_parts"]
+
+
+@dataclass(frozen=True)
+class Surface:
+    """A surface that a job is to extract.
+
+    Attributes
+    ----------
+    name : str
+        What tells its files from those of the other surfaces, such as ``"200hu"``; empty where it is the only one.
+    iso_value : float
+        HU.
+    label : str or int or None
+        Of the label map that picks its cells, where there is one.
+    """
+
+    name: str
+    iso_value: float
+    label: str | int | None = None
+
+
+@dataclass
+class Part:
+    """A mesh that becomes a file of its own: a surface, or a component of one.
+
+    Attributes
+    ----------
+    surface : Surface
+    name : str
+        What stands between the stem of the output and its extension, such as ``"200hu_001"``; empty where the part
+        is the only one.
+    mesh : Mesh
+    quality : dict
+        What `Mesh.quality` says; empty where it was not measured.
+    facts : dict
+        More entries of its object in the report.
+    """
+
+    surface: Surface
+    name: str
+    mesh: Mesh
+    quality: dict[str, Any] = field(default_factory=dict)
+    facts: dict[str, Any] = field(default_factory=dict)
+
+
+def plan_surfaces(levels: Sequence[float]) -> list[Surface]:
+    """One surface an iso value (HU), in their order."""
+    if len(levels) == 1:
+        return [Surface("", levels[0])]
+    return [Surface(f"{_digits(level)}hu", level) for level in levels]
+
+
+def _digits(value: float) -> str:
+    """A number as it goes into a file name: all its digits, so that two numbers never look the same."""
+    text = repr(float(value) + 0.0)  # + 0.0: no "-0"
+    return text.removesuffix(".0")
+
+
+def extract_surfaces(
+    volume: Volume, surfaces: Sequence[Surface], device: Device, settings: MeshSettings, progress: Progress
+) -> list[Mesh]:
+    """Extract all surfaces, one mesh each.
+
+    Raises
+    ------
+    NoSurfaceError
+        One of the iso values crosses nothing, or has every voxel inside.
+    """
+    from clrecon.operators.isosurface import extract_isosurfaces
+
+    low, high = volume.report["hu_range"]
+    for surface in surfaces:
+        if surface.iso_value <= low:  # the surface would be the box of the scan
+            raise NoSurfaceError(
+                f"no surface at {surface.iso_value:g} HU: every voxel is inside,"
+                f" the volume runs from {low:g} to {high:g} HU"
+            )
+    levels = [surface.iso_value for surface in surfaces]
+    return extract_isosurfaces(volume, levels, device, closed=settings.closed, progress=progress)
+
+
+def select_parts(surface: Surface, mesh: Mesh, settings: MeshSettings) -> list[Part]:
+    """Keep the components that the settings ask for, together or one by one.
+
+    Raises
+    ------
+    NoSurfaceError
+        No component is large enough.
+    UsageError
+        More components are to be written one by one than anyone can want.
+    """
+    if not settings.selects:
+        return [Part(surface, surface.name, mesh)]
+    from clrecon.mesh import select_components, split_components
+
+    limits = (settings.keep_largest, settings.min_volume_ml)
+    try:
+        if not settings.split:
+            return [Part(surface, surface.name, select_components(mesh, *limits))]
+        pieces = split_components(mesh, *limits, most=MOST_FILES)
+    except NoSurfaceError as error:
+        raise NoSurfaceError(f"at {surface.iso_value:g} HU: {error}") from error
+    return [Part(surface, _name_piece(surface, place), piece) for place, piece in enumerate(pieces, start=1)]
+
+
+def first_names(surfaces: Sequence[Surface], split: bool) -> list[str]:
+    """Name of the first part of each surface: what is known of the outputs before anything is extracted."""
+    return [_name_piece(surface, 1) if split else surface.name for surface in surfaces]
+
+
+def _name_piece(surface: Surface, place: int) -> str:
+    return f"{surface.name}_{place:03d}" if surface.name else f"{place:03d}"

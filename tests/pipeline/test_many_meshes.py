@@ -1,0 +1,159 @@
+"""Several meshes in one job: iso values, components one by one, and what the report says of them."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from clrecon.errors import NoSurfaceError, OutputError, UsageError
+from clrecon.geometry import Volume
+from clrecon.pipeline import parts
+from clrecon.pipeline.mesh import make_mesh
+from clrecon.pipeline.settings import MeshSettings
+
+AFFINE = np.array([[0.5, 0.0, 0.0, -10.0], [0.0, 0.8, 0.0, 20.0], [0.0, 0.0, 2.0, -300.0], [0.0, 0.0, 0.0, 1.0]])
+SUMMED = ("vertices", "triangles", "components", "area_mm2", "volume_ml")
+
+
+@pytest.fixture
+def boxes(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A scan of three boxes: 800 HU large and middle, 300 HU small."""
+    voxels = np.full((12, 20, 30), -1000, np.int16)
+    voxels[2:10, 2:12, 2:14] = 800
+    voxels[2:6, 15:18, 18:24] = 800
+    voxels[8:10, 15:17, 4:6] = 300
+    report = {"hu_range": [-1000.0, 800.0], "warnings": ["the table is in the picture"]}
+    monkeypatch.setattr(
+        "clrecon.dicom.read_volume", lambda source, series, progress: Volume(voxels, AFFINE, dict(report))
+    )
+
+
+def run(tmp_path: Path, device: Any, **settings: Any) -> dict[str, Any]:
+    return make_mesh(
+        "scan",
+        tmp_path / "bone.ply",
+        MeshSettings(device=str(device.index), **settings),
+        report_path=tmp_path / "bone.json",
+    )
+
+
+@pytest.mark.usefixtures("boxes")
+def test_one_mesh_stands_at_the_top_and_in_the_list(device: Any, tmp_path: Path) -> None:
+    report = run(tmp_path, device, iso_value=200.0)
+    (mesh,) = report["meshes"]
+    assert (mesh["name"], mesh["label"]) == (None, None)
+    for name in (*SUMMED, "closed", "manifold", "bounds_mm", "iso_value_hu", "iso_level_hu", "quality"):
+        assert report[name] == mesh[name]
+        assert report[name] is not None
+    assert (report["components"], report["components_found"]) == (3, None)
+    assert report["output"] == mesh["output"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["bone.json", "bone.ply"]
+
+
+@pytest.mark.usefixtures("boxes")
+def test_several_iso_values_are_one_file_each(device: Any, tmp_path: Path) -> None:
+    alone = run(tmp_path, device, iso_value=500.0)
+    alone_file = (tmp_path / "bone.ply").read_bytes()
+    report = run(tmp_path, device, iso_value=(200.0, 500.0))
+    assert [mesh["name"] for mesh in report["meshes"]] == ["200hu", "500hu"]
+    assert [mesh["components"] for mesh in report["meshes"]] == [3, 2]
+    assert {**report["meshes"][1], "name": None} == alone["meshes"][0]
+    assert (tmp_path / "bone_500hu.ply").read_bytes() == alone_file
+    for name in SUMMED:
+        assert report[name] == pytest.approx(sum(mesh[name] for mesh in report["meshes"]))
+    assert (report["iso_value_hu"], report["iso_level_hu"], report["outside_hu"]) == (None, None, -1000.0)
+    assert (report["closed"], report["manifold"], report["quality"]) == (True, True, None)
+    assert report["warnings"] == ["the table is in the picture"]
+    size = sum((tmp_path / f"bone_{level}hu.ply").stat().st_size for level in (200, 500))
+    assert report["output"] == {"format": "ply", "bytes": size}
+    assert json.loads((tmp_path / "bone.json").read_text())["meshes"] == report["meshes"]
+
+
+@pytest.mark.usefixtures("boxes")
+def test_split_writes_the_components_by_descending_size(device: Any, tmp_path: Path) -> None:
+    whole = run(tmp_path, device, iso_value=200.0)
+    (tmp_path / "bone.ply").unlink()
+    report = run(tmp_path, device, iso_value=200.0, split=True)
+    assert sorted(path.name for path in tmp_path.iterdir()) == [
+        "bone.json", "bone_001.ply", "bone_002.ply", "bone_003.ply",
+    ]  # fmt: skip
+    assert [mesh["name"] for mesh in report["meshes"]] == ["001", "002", "003"]
+    areas = [mesh["area_mm2"] for mesh in report["meshes"]]
+    assert areas == sorted(areas, reverse=True)
+    for name in SUMMED:
+        assert report[name] == pytest.approx(whole[name])
+    assert report["bounds_mm"] == whole["bounds_mm"]
+    assert (report["iso_value_hu"], report["closed"], report["components_found"]) == (200.0, True, 3)
+    assert [mesh["components"] for mesh in report["meshes"]] == [1, 1, 1]
+
+
+@pytest.mark.usefixtures("boxes")
+def test_iso_values_limits_and_split_together(device: Any, tmp_path: Path) -> None:
+    report = run(tmp_path, device, iso_value=(200.0, 500.0), split=True, keep_largest=2, min_volume_ml=0.1)
+    assert [mesh["name"] for mesh in report["meshes"]] == ["200hu_001", "500hu_001"]
+    assert [mesh["components_found"] for mesh in report["meshes"]] == [3, 2]
+    assert (report["components_found"], report["components_kept"], report["components"]) == (5, 2, 2)
+    assert (report["keep_largest"], report["min_volume_ml"], report["split"]) == (2, 0.1, True)
+
+
+@pytest.mark.usefixtures("boxes")
+def test_bounds_and_files_follow_the_space(device: Any, tmp_path: Path) -> None:
+    lps = run(tmp_path, device, iso_value=(200.0, 500.0))["meshes"][1]["bounds_mm"]
+    ras = run(tmp_path, device, iso_value=(200.0, 500.0), space="ras")["meshes"][1]["bounds_mm"]
+    np.testing.assert_allclose(np.array(ras) * [-1, -1, 1], [[*lps[1][:2], lps[0][2]], [*lps[0][:2], lps[1][2]]])
+
+
+@pytest.mark.usefixtures("boxes")
+@pytest.mark.parametrize(
+    ("settings", "error", "words"),
+    [
+        ({"iso_value": (200.0, 900.0)}, NoSurfaceError, "900 HU"),
+        ({"iso_value": (200.0, -1000.0)}, NoSurfaceError, "-1000 HU: every voxel is inside"),
+        ({"iso_value": (200.0, 500.0), "min_volume_ml": 1000.0}, NoSurfaceError, "at 200 HU: none of the 3"),
+    ],
+)
+def test_one_surface_that_is_not_there_ends_the_job(
+    settings: dict[str, Any], error: type[Exception], words: str, device: Any, tmp_path: Path
+) -> None:
+    (tmp_path / "bone_200hu.ply").write_bytes(b"old")
+    with pytest.raises(error, match=words):
+        run(tmp_path, device, **settings)
+    assert [path.read_bytes() for path in tmp_path.iterdir()] == [b"old"]
+
+
+@pytest.mark.usefixtures("boxes")
+def test_too_many_components_are_refused_with_advice(
+    device: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(parts, "MOST_FILES", 2)
+    with pytest.raises(UsageError, match="3 components, at most 2 are written one by one: .*--min-volume"):
+        run(tmp_path, device, iso_value=200.0, split=True)
+    assert list(tmp_path.iterdir()) == []
+    assert len(run(tmp_path, device, iso_value=200.0, split=True, keep_largest=2)["meshes"]) == 2
+
+
+@pytest.mark.usefixtures("boxes")
+def test_no_old_file_is_replaced_unless_all_can_be(device: Any, tmp_path: Path) -> None:
+    (tmp_path / "bone_001.ply").write_bytes(b"old")
+    (tmp_path / "bone_003.ply").mkdir()
+    with pytest.raises(OutputError, match="bone_003.ply: it is a folder"):
+        run(tmp_path, device, iso_value=200.0, split=True)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["bone_001.ply", "bone_003.ply"]
+    assert (tmp_path / "bone_001.ply").read_bytes() == b"old"
+
+
+def test_surfaces_are_those_of_each_iso_value_alone(device: Any) -> None:
+    import clrecon
+
+    voxels = np.random.default_rng(5).integers(0, 9, (9, 10, 33)).astype(np.int16)
+    volume = Volume(voxels, AFFINE)
+    meshes = clrecon.extract_isosurfaces(volume, [6, 2, 3.5], device, closed=False)
+    for mesh, level in zip(meshes, (6, 2, 3.5), strict=True):
+        alone = clrecon.extract_isosurface(volume, level, device, closed=False)
+        assert mesh.report["iso_value_hu"] == level
+        np.testing.assert_array_equal(mesh.vertices, alone.vertices)
+        np.testing.assert_array_equal(mesh.triangles, alone.triangles)

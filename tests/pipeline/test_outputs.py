@@ -1,0 +1,110 @@
+"""Names of the files of a job; what stands in the way of what; all or nothing."""
+
+from __future__ import annotations
+
+import os
+from contextlib import ExitStack
+from pathlib import Path
+
+import pytest
+
+from clrecon.errors import OutputError, UsageError
+from clrecon.files import stage_file
+from clrecon.pipeline.outputs import MOST_FILES, check_outputs, commit_all, name_outputs
+from clrecon.pipeline.parts import first_names, plan_surfaces
+
+pytestmark = pytest.mark.unit
+
+
+def names_of(levels: list[float], split: bool = False) -> list[str]:
+    return [str(path) for path in name_outputs("a.b/bone.v2.stl", first_names(plan_surfaces(levels), split))]
+
+
+def test_one_mesh_has_the_name_that_was_given() -> None:
+    path = Path("x") / "bone.stl"
+    assert name_outputs(path, [""]) == [path]
+    assert names_of([226.5]) == ["a.b/bone.v2.stl"]
+
+
+def test_several_are_told_apart_before_the_extension() -> None:
+    assert names_of([200.0, 350]) == ["a.b/bone.v2_200hu.stl", "a.b/bone.v2_350hu.stl"]
+    assert names_of([200.0], split=True) == ["a.b/bone.v2_001.stl"]
+    assert names_of([-0.0, -150.5], split=True) == ["a.b/bone.v2_0hu_001.stl", "a.b/bone.v2_-150.5hu_001.stl"]
+
+
+def test_close_iso_values_keep_all_their_digits() -> None:
+    assert names_of([1234567.0, 1234568.0, 200.0000001]) == [
+        f"a.b/bone.v2_{digits}hu.stl" for digits in ("1234567", "1234568", "200.0000001")
+    ]
+
+
+def test_two_meshes_are_never_one_file(tmp_path: Path) -> None:
+    output = tmp_path / "bone.stl"
+    with pytest.raises(UsageError, match="the mesh T12 and the mesh T12 cannot be the same file"):
+        name_outputs(output, ["T12", "T12"])
+    with pytest.raises(UsageError, match="the mesh t12 and the mesh T12 cannot"):
+        name_outputs(output, ["T12", "t12"])
+    with pytest.raises(UsageError, match="the mesh T12 and the report cannot"):
+        name_outputs(output, ["L1", "T12"], tmp_path / "." / "bone_T12.stl")
+    (tmp_path / "bone_L1.stl").symlink_to(tmp_path / "bone_T12.stl")
+    with pytest.raises(UsageError, match="the mesh T12 and the mesh L1 cannot"):
+        check_outputs(output, None, ["L1", "T12"])
+
+
+@pytest.mark.parametrize("name", ["../T12", "a/b", "a\\b", "/tmp"])
+def test_a_name_stays_in_the_folder(name: str) -> None:
+    with pytest.raises(UsageError, match="cannot be a part of the name of a file"):
+        name_outputs("bone.stl", [name])
+
+
+def test_too_many_files_are_refused() -> None:
+    names = [f"{number}" for number in range(MOST_FILES + 1)]
+    assert len(name_outputs("bone.stl", names[1:])) == MOST_FILES
+    with pytest.raises(UsageError, match="1,001 meshes are more than 1,000 files"):
+        name_outputs("bone.stl", names)
+
+
+def test_each_file_is_looked_at_before_the_work(tmp_path: Path) -> None:
+    (tmp_path / "bone_350hu.stl").mkdir()
+    with pytest.raises(OutputError, match="bone_350hu.stl: it is a folder"):
+        check_outputs(tmp_path / "bone.stl", None, ["200hu", "350hu"])
+    (tmp_path / "bone.stl").mkdir()  # not a file of this job
+    check_outputs(tmp_path / "bone.stl", tmp_path / "r.json", ["200hu", "400hu"])
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["bone.stl", "bone_350hu.stl"]
+
+
+@pytest.mark.parametrize("blocked", [0, 2])
+def test_a_rename_that_fails_says_what_is_in_place(blocked: int, tmp_path: Path) -> None:
+    paths = [tmp_path / f"{number}.stl" for number in range(3)]
+    with ExitStack() as stack:
+        files = [stack.enter_context(stage_file(path, lambda stream: stream.write(b"new"))) for path in paths]
+        paths[blocked].mkdir()
+        with pytest.raises(OutputError, match=r"2.stl: .* \(2 of 3 files" if blocked else r"0.stl: [^(]*$"):
+            commit_all(files)
+    there = [path.name for path in tmp_path.iterdir() if path.is_file()]
+    assert sorted(there) == [path.name for path in paths[:blocked]]
+
+
+@pytest.mark.skipif(os.name != "posix", reason="the limit of open files is that of POSIX systems")
+def test_a_thousand_files_can_be_staged_at_once(tmp_path: Path) -> None:
+    import resource
+
+    from clrecon.files import allow_open_files
+
+    limits = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (200, limits[1]))
+    try:
+        allow_open_files(300)
+        with ExitStack() as stack:
+            files = [
+                stack.enter_context(stage_file(tmp_path / f"{number}", lambda stream: stream.write(b"x")))
+                for number in range(300)
+            ]
+            commit_all(files)
+        assert len(list(tmp_path.iterdir())) == 300
+        resource.setrlimit(resource.RLIMIT_NOFILE, (60, limits[1]))
+        with pytest.raises(OutputError, match="too many files are open at once"), ExitStack() as stack:
+            for number in range(100):
+                stack.enter_context(stage_file(tmp_path / f"{number}", lambda stream: stream.write(b"x")))
+    finally:
+        resource.setrlimit(resource.RLIMIT_NOFILE, limits)
