@@ -4,11 +4,13 @@
  * owned by samples, counting before writing); the packing of the inside test to one bit a sample is our own.
  *
  * Passes
- *   1. classify_samples   one bit a sample: inside or not
+ *   1. classify_samples   one bit a sample: inside or not; one state a row: outside, inside or mixed
  *   2. count_rows         per row: vertices, triangles and words with work; per word its place in the row
- *      (exclusive scans of the row counts and compaction of the words with work: cl/compaction)
- *   3. emit_vertices      positions and normals of the vertices of each word with work
- *   4. emit_triangles     vertex numbers of the triangles of each word with work
+ *      (exclusive scan of all row counts: cl/compaction/scan.cl)
+ *   3. total_counts       vertices, triangles and words with work of the slab
+ *   4. list_words         the words with work, in order
+ *   5. emit_vertices      positions and normals of the vertices of each word with work
+ *   6. emit_triangles     vertex numbers of the triangles of each word with work
  *
  * The sample grid is the volume, with one layer of outside around it when the surface is closed.  The passes work on
  * a slab of it: whole slices, with those beyond it that its vertices and their numbers depend on.  A mesh is the same
@@ -66,6 +68,7 @@ static inline uint classify_word(__global const VOXEL *row, int first, int ni, V
 
 /* Parameters  voxels     in   slices of the volume from first_slice on
  *             mask       out  (gk, gj, words) bit set where voxel >= level
+ *             row_states out  (gk, gj) ROW_OUTSIDE, ROW_INSIDE or ROW_MIXED
  *             level      lowest inside value
  *             ni nj nk   voxels of the whole volume
  *             border     layers of outside around the volume, 0 or 1
@@ -75,9 +78,10 @@ static inline uint classify_word(__global const VOXEL *row, int first, int ni, V
  *             words      words a row, ceil((ni + 2 border) / 32)
  * Launch      global = gj * gk rounded up by the host, any local: one item a row, so that dividing for j and k
  *             costs little
- * Guarantees  every word of the mask is written; bits beyond the row are 0 */
+ * Guarantees  every word of the mask and every state is written; bits beyond the row are 0 */
 __kernel void classify_samples(
-    __global const VOXEL *restrict voxels, __global uint *restrict mask, const VOXEL level,
+    __global const VOXEL *restrict voxels, __global uint *restrict mask, __global uchar *restrict row_states,
+    const VOXEL level,
     const int ni, const int nj, const int nk, const int border, const int first_slice, const int first_sample_slice,
     const uint gk, const int words)
 {
@@ -91,29 +95,35 @@ __kernel void classify_samples(
     if (j < 0 || j >= nj || k < 0 || k >= nk) {
         for (int w = 0; w < words; ++w)
             row_mask[w] = 0;
+        row_states[row] = ROW_OUTSIDE;
         return;
     }
     __global const VOXEL *row_voxels = voxels + voxel_index(0, j, k - first_slice, ni, nj);
-    for (int w = 0; w < words; ++w)
-        row_mask[w] = classify_word(row_voxels, 32 * w - border, ni, level);
+    uint any = 0, missing = 0;
+    for (int w = 0; w < words; ++w) {
+        const uint bits = classify_word(row_voxels, 32 * w - border, ni, level);
+        row_mask[w] = bits;
+        any |= bits;
+        missing |= ~bits & (uint)low_bits(min(32, ni + 2 * border - 32 * w));
+    }
+    row_states[row] = any == 0 ? ROW_OUTSIDE : missing == 0 ? ROW_INSIDE : ROW_MIXED;
 }
 
 /* Parameters  mask             in   (gk, gj, words)
- *             row_vertices     out  (rows_to_count,) vertices owned by each row
- *             row_triangles    out  (rows_to_count,) triangles of the cells of each row
- *             words_with_work  out  (rows_to_count, flag_words) bit w of a row: word w owns a vertex or has an active cell
+ *             row_states       in   (gk, gj)
+ *             row_counts       out  (3, rows_to_count) vertices owned by each row, triangles of its cells, words with
+ *                                   work: words that own a vertex or have an active cell
+ *             words_with_work  out  (rows_to_count, flag_words) bit w of a row: word w has work
  *             word_vertices    out  (rows_to_count, words) vertices of the row before each word
  *             word_triangles   out  (rows_to_count, words) triangles of the row before each word
- *             gi gj gk         samples; words a row; flag_words = ceil(words / 32), rounded up to a
- *                              power of two
+ *             gi gj gk         samples; words a row; flag_words = ceil(words / 32), rounded up to a power of two
  *             rows_to_count    rows that are counted, the first ones of the mask
  * Launch      global = rows_to_count rounded up by the host, any local
  * Assumes     5 (gi + 1) < 65536, so that places in a row fit 16 bits
- * Guarantees  every output is written */
+ * Guarantees  every output is written, but for the places in rows without work, which nothing asks for */
 __kernel void count_rows(
-    __global const uint *restrict mask,
-    __global uint *restrict row_vertices, __global uint *restrict row_triangles,
-    __global uint *restrict words_with_work,
+    __global const uint *restrict mask, __global const uchar *restrict row_states,
+    __global uint *restrict row_counts, __global uint *restrict words_with_work,
     __global ushort *restrict word_vertices, __global ushort *restrict word_triangles,
     const uint gi, const uint gj, const uint gk, const uint words, const uint flag_words, const uint rows_to_count)
 {
@@ -128,8 +138,17 @@ __kernel void count_rows(
     __global const uint *y1z0 = has_y ? y0z0 + words : y0z0;
     __global const uint *y0z1 = has_z ? y0z0 + (size_t)gj * words : y0z0;
     __global const uint *y1z1 = has_y && has_z ? y0z1 + words : y0z0;
+    const uint right = has_y ? row + 1 : row, above = has_z ? row + gj : row;
+    const uchar state = row_states[row];
+    if (state != ROW_MIXED && state == row_states[right] && state == row_states[above]
+        && state == row_states[has_z ? right + gj : right]) {
+        row_counts[row] = row_counts[rows_to_count + row] = row_counts[2 * (size_t)rows_to_count + row] = 0;
+        for (uint f = 0; f < flag_words; ++f)
+            words_with_work[(size_t)row * flag_words + f] = 0;
+        return;
+    }
     cell_rows rows = {y0z0[0], y1z0[0], y0z1[0], y1z1[0]};
-    uint vertices = 0, triangles = 0, flags = 0;
+    uint vertices = 0, triangles = 0, working = 0, flags = 0;
     for (uint w = 0; w < words; ++w) {
         word_vertices[(size_t)row * words + w] = (ushort)vertices;
         word_triangles[(size_t)row * words + w] = (ushort)triangles;
@@ -149,6 +168,7 @@ __kernel void count_rows(
                     triangles += (uint)MC_TRIANGLES[cell_case(rows, lowest_bit(rest))] & 15;
             }
             flags |= 1u << (w & 31);
+            ++working;
         }
         if ((w & 31) == 31 || w + 1 == words) {
             words_with_work[(size_t)row * flag_words + (w >> 5)] = flags;
@@ -158,14 +178,55 @@ __kernel void count_rows(
     }
     for (uint f = (words + 31) / 32; f < flag_words; ++f)
         words_with_work[(size_t)row * flag_words + f] = 0;
-    row_vertices[row] = vertices;
-    row_triangles[row] = triangles;
+    row_counts[row] = vertices;
+    row_counts[rows_to_count + row] = triangles;
+    row_counts[2 * (size_t)rows_to_count + row] = working;
+}
+
+/* Parameters  row_offsets  in   (3, rows_to_count) sum of all row counts before each
+ *             total        in   (1,) sum of all row counts
+ *             totals       out  (3,) vertices, triangles and words with work of the first `rows` rows
+ * Launch      one item
+ * Assumes     the sum of all row counts fits 32 bits */
+__kernel void total_counts(
+    __global const uint *restrict row_offsets, __global const ulong *restrict total, __global uint *restrict totals,
+    const uint rows, const uint rows_to_count)
+{
+    if (get_global_id(0) != 0)
+        return;
+    for (uint which = 0; which < 3; ++which) {
+        const size_t begin = (size_t)which * rows_to_count, end = begin + rows;
+        totals[which] = (end == 3 * (size_t)rows_to_count ? (uint)total[0] : row_offsets[end]) - row_offsets[begin];
+    }
+}
+
+/* Parameters  words_with_work  in   (rows_to_count, flag_words)
+ *             row_offsets      in   (3, rows_to_count)
+ *             active_words     out  (active,) numbers of the words with work, ascending: row times 2^row_shift, plus
+ *                                   the place in the row
+ *             rows             rows whose words are listed
+ * Launch      global = rows rounded up by the host, any local
+ * Guarantees  every number is written once */
+__kernel void list_words(
+    __global const uint *restrict words_with_work, __global const uint *restrict row_offsets,
+    __global uint *restrict active_words,
+    const uint rows, const uint rows_to_count, const uint flag_words, const uint row_shift)
+{
+    const uint row = get_global_id(0);
+    if (row >= rows)
+        return;
+    __global const uint *word_offsets = row_offsets + 2 * (size_t)rows_to_count;
+    uint place = word_offsets[row] - word_offsets[0];
+    for (uint f = 0; f < flag_words; ++f) {
+        for (uint flags = words_with_work[(size_t)row * flag_words + f]; flags != 0; flags &= flags - 1)
+            active_words[place++] = (row << row_shift) + 32 * f + lowest_bit(flags);
+    }
 }
 
 /* Parameters  voxels          in   slices of the volume from first_slice on
  *             mask            in   (gk, gj, words)
- *             active_words    in   (active,) numbers of the words with work: bits of words_with_work
- *             row_offsets     in   (gk, gj) vertices before each row
+ *             active_words    in   (active,)
+ *             row_offsets     in   (3, rows_to_count)
  *             word_vertices   in   (gk, gj, words)
  *             slice_frames    in   (gk, 6) float4: position of sample (0, 0, k) in mm (rounded to 12 bits, rest),
  *                                  step to slice k + 1, and the three rows of the matrix that maps gradients per
@@ -311,21 +372,21 @@ static inline uint number_at(const numbered_edges *edges, uint b)
 
 /* Parameters  mask              in   (gk, gj, words)
  *             active_words      in   (active,)
- *             vertex_offsets    in   (gk, gj) vertices before each row
- *             triangle_offsets  in   (gk, gj) triangles before each row
+ *             row_offsets       in   (3, rows_to_count)
  *             word_vertices     in   (gk, gj, words)
  *             word_triangles    in   (gk, gj, words)
  *             triangles         out  (triangles, 3) vertex numbers, counter-clockwise as seen from lower values
- *             first_vertex      number of the vertex that vertex_offsets calls 0
+ *             first_vertex      number of the slab's first vertex
+ *             rows_to_count     rows that were counted
  *             gi gj gk, words, row_shift, active   as above
  *             mirrored          1 when index space is left-handed in mm: the winding is turned round
  * Launch      global = ceil(active / WORDS_PER_ITEM) rounded up by the host, any local
  * Guarantees  every triangle is written once, cell by cell along the rows */
 __kernel void emit_triangles(
     __global const uint *restrict mask, __global const uint *restrict active_words,
-    __global const uint *restrict vertex_offsets, __global const uint *restrict triangle_offsets,
-    __global const ushort *restrict word_vertices, __global const ushort *restrict word_triangles,
-    __global uint *restrict triangles, const uint first_vertex,
+    __global const uint *restrict row_offsets, __global const ushort *restrict word_vertices,
+    __global const ushort *restrict word_triangles,
+    __global uint *restrict triangles, const uint first_vertex, const uint rows_to_count,
     const uint gi, const uint gj, const uint gk, const uint words, const uint row_shift, const uint active,
     const int mirrored)
 {
@@ -340,7 +401,8 @@ __kernel void emit_triangles(
     uint waits = 0;
 #endif
     const uint first_row = active_words[begin] >> row_shift;
-    size_t triangle = (size_t)triangle_offsets[first_row]
+    __global const uint *triangle_offsets = row_offsets + rows_to_count;
+    size_t triangle = (size_t)(triangle_offsets[first_row] - triangle_offsets[0])
         + word_triangles[(size_t)first_row * words + (active_words[begin] & ((1u << row_shift) - 1))];
     uint slice_begin = 0, slice_end = 0, k = 0;
     for (uint n = begin; n < end; ++n) {
@@ -362,7 +424,7 @@ __kernel void emit_triangles(
         const ulong y0z2 = k + 2 < gk ? load_window(mask, row + 2 * gj, w, words) : rows.y0z1;
         const ulong y1z2 = k + 2 < gk ? load_window(mask, row + 2 * gj + 1, w, words) : rows.y1z1;
         const ulong with_next = samples_with_next(w, gi);
-#define FIRST(r) (first_vertex + vertex_offsets[r] + word_vertices[(size_t)(r) * words + w])
+#define FIRST(r) (first_vertex + row_offsets[r] + word_vertices[(size_t)(r) * words + w])
         numbered_edges e0, e1, e2, e3;
         number_edges(&e0, rows.y0z0, rows.y1z0, rows.y0z1, with_next, FIRST(row));
         number_edges(&e1, rows.y1z0, y2z0, rows.y1z1, with_next, FIRST(row + 1));

@@ -11,7 +11,7 @@ from clrecon.errors import UsageError
 from clrecon.kernels import Program, Stopwatch, allocate, download, launch, load_program
 from clrecon.opencl import Device
 
-__all__ = ["Compacted", "Scanned", "compact", "exclusive_scan", "prepare_compaction"]
+__all__ = ["Compacted", "Scanned", "compact", "exclusive_scan", "prepare_scan"]
 
 SCAN_PER_ITEM = 16
 """Elements a work-item of cl/compaction/scan.cl."""
@@ -25,17 +25,14 @@ COMPACT_WORDS = 8
 
 @dataclass(frozen=True)
 class Scanned:
-    """Offsets on the device, (n,) uint32, and the exact total.  Offsets are modulo 2^32: check the total."""
+    """Offsets on the device, (n,) uint32, and the exact total.  Offsets are modulo 2^32: check the total.
+
+    ``total_d`` is the total on the device, (1,) uint64.
+    """
 
     offsets_d: Any
+    total_d: Any
     total: int
-
-    def before(self, device: Device, place: int, n: int) -> int:
-        """Sum of the counts before element `place` of `n`; exact where the total is below 2^32."""
-        if place == n:
-            return self.total
-        value = np.empty(1, dtype=np.uint32)
-        return int(download(device, value, self.offsets_d, 4 * place)[0])
 
 
 @dataclass(frozen=True)
@@ -46,10 +43,9 @@ class Compacted:
     count: int
 
 
-def prepare_compaction(device: Device) -> None:
-    """Build the kernels of this module."""
+def prepare_scan(device: Device) -> None:
+    """Build the kernels of `exclusive_scan`."""
     _load_scan(device)
-    load_program(device, "compaction/compact.cl")
 
 
 def _load_scan(device: Device) -> Program:
@@ -92,7 +88,7 @@ def exclusive_scan(device: Device, counts_d: Any, n: int, *, stopwatch: Stopwatc
     )  # fmt: skip
     launch(device, scan["scan_blocks"], items, counts_d, block_offsets_d, offsets_d, size, stopwatch=stopwatch)
     total = download(device, np.empty(1, dtype=np.uint64), total_d)
-    return Scanned(offsets_d, int(total[0]))
+    return Scanned(offsets_d, total_d, int(total[0]))
 
 
 def compact(device: Device, mask_d: Any, words: int, *, stopwatch: Stopwatch | None = None) -> Compacted:

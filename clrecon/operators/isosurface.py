@@ -241,11 +241,11 @@ class _Run:
         with stopwatch.timed("upload"):
             voxels_d = self.extractor._upload(slab)
         with stopwatch.running(device):
-            mask_d = marching_cubes.classify(device, slab, program, voxels_d, self.level, stopwatch)
-            counted = marching_cubes.count(device, slab, program, mask_d, stopwatch)
+            classified = marching_cubes.classify(device, slab, program, voxels_d, self.level, stopwatch)
+            counted = marching_cubes.count(device, slab, program, classified, stopwatch)
         self._check_output(slab, counted)
         part = marching_cubes.emit(
-            device, slab, program, voxels_d, mask_d, counted, self.placement, first_vertex, stopwatch
+            device, slab, program, voxels_d, classified, counted, self.placement, first_vertex, stopwatch
         )
         self.grid.volume.release_slices(*slab.voxel_slices)
         return part
@@ -253,7 +253,7 @@ class _Run:
     def _check_output(self, slab: Slab, counted: Counted) -> None:
         """Refuse a slab whose mesh does not fit beside the rest; note what the slab takes."""
         needs = slab.needs(counted.output())
-        needs["active words"] = 4 * counted.words.count
+        needs["active words"] = 4 * counted.active_words
         shortage = describe_shortage(memory_limits(self.device, self.extractor.memory), needs)
         if shortage:
             raise DeviceMemoryError(shortage)

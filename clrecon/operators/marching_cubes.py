@@ -8,15 +8,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from clrecon.errors import DeviceError
+from clrecon.errors import DeviceError, DeviceMemoryError
 from clrecon.geometry import Volume, is_left_handed
 from clrecon.geometry.field import slice_normal_matrices, vertex_margin
 from clrecon.kernels import Program, Stopwatch, allocate, download, empty_output, launch, load_program, upload
 from clrecon.opencl import Device
-from clrecon.operators.compaction import Compacted, compact, exclusive_scan, prepare_compaction
+from clrecon.operators.compaction import exclusive_scan, prepare_scan
 from clrecon.operators.slabs import Slab
 
-__all__ = ["Counted", "Placement", "classify", "count", "emit", "prepare_marching_cubes"]
+__all__ = ["Classified", "Counted", "Placement", "classify", "count", "emit", "prepare_marching_cubes"]
 
 VOXEL_TYPES = {
     "int8": "char", "uint8": "uchar", "int16": "short", "uint16": "ushort", "int32": "int", "float32": "float",
@@ -27,16 +27,24 @@ LONGEST_ROW = 13_000
 
 
 @dataclass(frozen=True)
+class Classified:
+    """What `classify` leaves on the device of one slab."""
+
+    mask_d: Any
+    row_states_d: Any
+
+
+@dataclass(frozen=True)
 class Counted:
     """What `count` leaves on the device of one slab, and the totals of the slab's own rows."""
 
-    words: Compacted
-    vertex_offsets_d: Any
-    triangle_offsets_d: Any
+    row_offsets_d: Any
     word_vertices_d: Any
     word_triangles_d: Any
+    active_words_d: Any
     vertices: int
     triangles: int
+    active_words: int
 
     def output(self) -> dict[str, int]:
         """Bytes of the slab's mesh."""
@@ -51,7 +59,7 @@ def prepare_marching_cubes(device: Device, dtype: DTypeLike) -> Program:
     DeviceError
         The driver's compiler refuses.
     """
-    prepare_compaction(device)
+    prepare_scan(device)
     dtype = np.dtype(dtype)
     variants = {"VOXEL": VOXEL_TYPES[dtype.name], "VALUE": "float" if dtype.kind == "f" else "int"}
     return load_program(device, "isosurface/marching_cubes.cl", {**variants, **device.kernel_variants})
@@ -109,8 +117,10 @@ def _volume_scalars(slab: Slab) -> tuple[Any, ...]:
     return tuple(np.int32(n) for n in (*shape, border, slab.voxel_slices[0], slab.first))
 
 
-def classify(device: Device, slab: Slab, program: Program, voxels_d: Any, level: Any, stopwatch: Stopwatch) -> Any:
-    """Pass 1: return the inside mask of the slab.
+def classify(
+    device: Device, slab: Slab, program: Program, voxels_d: Any, level: Any, stopwatch: Stopwatch
+) -> Classified:
+    """Pass 1: which samples of the slab are inside.
 
     Parameters
     ----------
@@ -120,47 +130,55 @@ def classify(device: Device, slab: Slab, program: Program, voxels_d: Any, level:
         Lowest inside value.
     """
     mask_d = allocate(device, 4 * slab.mask_rows * slab.grid.words)
+    row_states_d = allocate(device, slab.mask_rows)
     launch(
         device, program["classify_samples"], slab.mask_rows,
-        voxels_d, mask_d, level, *_volume_scalars(slab), np.uint32(slab.mask_slices), np.int32(slab.grid.words),
-        stopwatch=stopwatch,
+        voxels_d, mask_d, row_states_d, level, *_volume_scalars(slab), np.uint32(slab.mask_slices),
+        np.int32(slab.grid.words), stopwatch=stopwatch,
     )  # fmt: skip
-    return mask_d
+    return Classified(mask_d, row_states_d)
 
 
-def count(device: Device, slab: Slab, program: Program, mask_d: Any, stopwatch: Stopwatch) -> Counted:
-    """Pass 2 and the scans: how many vertices and triangles, and where each word's own begin.
+def count(device: Device, slab: Slab, program: Program, classified: Classified, stopwatch: Stopwatch) -> Counted:
+    """Passes 2 to 4: how many vertices and triangles, where those of each word begin, and which words have any.
 
     Raises
     ------
+    DeviceMemoryError
+        The slab has more than 32 bits can number.
     DeviceError
-        The slab has more vertices or triangles than 32 bits can number, or the device fails.
+        The device fails.
     """
     grid, rows = slab.grid, slab.counted_rows
     gi, gj, _ = grid.shape
-    row_vertices_d, row_triangles_d = allocate(device, 4 * rows), allocate(device, 4 * rows)
+    own_rows, counted_rows, flag_words = np.uint32(slab.rows), np.uint32(rows), np.uint32(grid.flag_words)
+    row_counts_d = allocate(device, 12 * rows)
     word_vertices_d, word_triangles_d = (allocate(device, 2 * rows * grid.words) for _ in range(2))
     flags_d = allocate(device, 4 * rows * grid.flag_words)
     launch(
         device, program["count_rows"], rows,
-        mask_d, row_vertices_d, row_triangles_d, flags_d, word_vertices_d, word_triangles_d,
-        np.uint32(gi), np.uint32(gj), np.uint32(slab.mask_slices), np.uint32(grid.words), np.uint32(grid.flag_words),
-        np.uint32(rows), stopwatch=stopwatch,
+        classified.mask_d, classified.row_states_d, row_counts_d, flags_d, word_vertices_d, word_triangles_d,
+        np.uint32(gi), np.uint32(gj), np.uint32(slab.mask_slices), np.uint32(grid.words), flag_words, counted_rows,
+        stopwatch=stopwatch,
     )  # fmt: skip
-    vertices = exclusive_scan(device, row_vertices_d, rows, stopwatch=stopwatch)
-    triangles = exclusive_scan(device, row_triangles_d, rows, stopwatch=stopwatch)
-    if vertices.total >= 2**32 or triangles.total >= 2**32:
-        raise too_many(vertices.total, triangles.total)
-    words = compact(device, flags_d, slab.rows * grid.flag_words, stopwatch=stopwatch)
-    return Counted(
-        words=words,
-        vertex_offsets_d=vertices.offsets_d,
-        triangle_offsets_d=triangles.offsets_d,
-        word_vertices_d=word_vertices_d,
-        word_triangles_d=word_triangles_d,
-        vertices=vertices.before(device, slab.rows, rows),
-        triangles=triangles.before(device, slab.rows, rows),
-    )
+    scanned = exclusive_scan(device, row_counts_d, 3 * rows, stopwatch=stopwatch)
+    if scanned.total >= 2**32:
+        raise DeviceMemoryError(
+            f"a slab of {slab.slices} slices has {scanned.total:,} vertices and triangles: more than 32 bits can number"
+        )
+    totals_d = allocate(device, 12)
+    launch(
+        device, program["total_counts"], 1,
+        scanned.offsets_d, scanned.total_d, totals_d, own_rows, counted_rows, stopwatch=stopwatch,
+    )  # fmt: skip
+    vertices, triangles, active = (int(n) for n in download(device, np.empty(3, np.uint32), totals_d))
+    active_words_d = allocate(device, 4 * active)
+    launch(
+        device, program["list_words"], slab.rows,
+        flags_d, scanned.offsets_d, active_words_d, own_rows, counted_rows, flag_words, np.uint32(grid.row_shift),
+        stopwatch=stopwatch,
+    )  # fmt: skip
+    return Counted(scanned.offsets_d, word_vertices_d, word_triangles_d, active_words_d, vertices, triangles, active)
 
 
 def too_many(vertices: int, triangles: int) -> DeviceError:
@@ -176,7 +194,7 @@ def emit(
     slab: Slab,
     program: Program,
     voxels_d: Any,
-    mask_d: Any,
+    classified: Classified,
     counted: Counted,
     placement: Placement,
     first_vertex: int,
@@ -196,7 +214,7 @@ def emit(
     positions, positions_d = empty_output(device, (counted.vertices, 3), np.float32)
     normals, normals_d = empty_output(device, (counted.vertices, 3), np.float32)
     triangles, triangles_d = empty_output(device, (counted.triangles, 3), np.uint32)
-    active = counted.words.count
+    active = counted.active_words
     packing = (np.uint32(grid.words), np.uint32(grid.row_shift), np.uint32(active))
     items = -(-active // int(device.kernel_variants["WORDS_PER_ITEM"]))
     value = np.float32 if volume.voxels.dtype.kind == "f" else np.int32
@@ -205,7 +223,7 @@ def emit(
         if counted.vertices:
             launch(
                 device, program["emit_vertices"], items,
-                voxels_d, mask_d, counted.words.positions_d, counted.vertex_offsets_d, counted.word_vertices_d,
+                voxels_d, classified.mask_d, counted.active_words_d, counted.row_offsets_d, counted.word_vertices_d,
                 frames_d, steps_d, positions_d, normals_d,
                 np.float32(rule.iso_level), value(rule.outside), np.float32(rule.value_scale), placement.margin,
                 *_volume_scalars(slab), np.uint32(slab.mask_slices), *packing,
@@ -214,8 +232,8 @@ def emit(
         if counted.triangles:
             launch(
                 device, program["emit_triangles"], items,
-                mask_d, counted.words.positions_d, counted.vertex_offsets_d, counted.triangle_offsets_d,
-                counted.word_vertices_d, counted.word_triangles_d, triangles_d, np.uint32(first_vertex),
+                classified.mask_d, counted.active_words_d, counted.row_offsets_d, counted.word_vertices_d,
+                counted.word_triangles_d, triangles_d, np.uint32(first_vertex), np.uint32(slab.counted_rows),
                 np.uint32(gi), np.uint32(gj), np.uint32(slab.mask_slices), *packing,
                 np.int32(is_left_handed(volume.affine)),
                 stopwatch=stopwatch,

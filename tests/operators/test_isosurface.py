@@ -229,8 +229,13 @@ def test_only_volumes_have_surfaces(device):
 
 def test_a_device_that_finds_nothing_is_not_believed(device, monkeypatch):
     """A surface that must be there and is not is the device's fault, not the iso value's."""
-    monkeypatch.setattr(marching_cubes, "classify", lambda device, slab, *_: marching_cubes.upload(
-        device, np.zeros(slab.mask_rows * slab.grid.words, np.uint32)))  # fmt: skip
+
+    def find_nothing(device, slab, *_):
+        mask = np.zeros(slab.mask_rows * slab.grid.words, np.uint32)
+        states = np.zeros(slab.mask_rows, np.uint8)
+        return marching_cubes.Classified(*(marching_cubes.upload(device, array) for array in (mask, states)))
+
+    monkeypatch.setattr(marching_cubes, "classify", find_nothing)
     with pytest.raises(DeviceError, match="it computes wrongly"):
         extract_isosurface(random_volume((5, 6, 7)), 3, device)
     outcomes = {result["operator"]: result["passed"] for result in run_selftest(device)}
