@@ -103,12 +103,20 @@ def by_plain_edges(volume: Volume) -> float:
     return float((np.median(edges.bone) + np.median(edges.tissue)) / 2.0)
 
 
+def by_preset(volume: Volume) -> float:
+    """The preset "bone", the same for every scan."""
+    from clrecon.pipeline.presets import PRESETS
+
+    return PRESETS["bone"].iso_value
+
+
 def by_auto(volume: Volume) -> float:
     """What clrecon does."""
     return choice.choose_iso_value(volume).iso_value
 
 
 METHODS: dict[str, Callable[[Volume], float]] = {
+    "preset bone": by_preset,
     "Otsu, three classes": by_otsu,
     "Kittler-Illingworth": by_minimum_error,
     "half of the histogram's modes": by_modes,
