@@ -41,6 +41,24 @@ SPINES: dict[str, tuple[dict[str, Any], dict[str, float]]] = {
     "1 mm, blur 1 mm": ({"point_spread_mm": 1.0, "noise": 10.0}, {}),
     "slices 4.25 mm": ({"slices": 40, "spacing": (1.0, 1.0, 4.25), "point_spread_mm": 0.7, "noise": 15.0}, {}),
     "1 mm, contrast medium": ({}, {"BLOOD_HU": 300.0, "KIDNEY_HU": 180.0}),
+    # made after the method was settled
+    "0.8 mm, slices 2 mm, tilt 12": (
+        {
+            "size": (320, 320),
+            "slices": 60,
+            "spacing": (0.8, 0.8, 2.0),
+            "tilt": 12.0,
+            "point_spread_mm": 0.6,
+            "noise": 25.0,
+            "seed": 5,
+        },
+        {"BLOOD_HU": 220.0, "LIVER_HU": 130.0, "KIDNEY_HU": 200.0},
+    ),
+    "0.7 mm, slices 3 mm": (
+        {"size": (360, 360), "slices": 50, "spacing": (0.7, 0.7, 3.0), "noise": 15.0, "seed": 7},
+        {},
+    ),
+    "1.5 mm": ({"size": (200, 200), "slices": 80, "spacing": (1.5, 1.5, 1.5), "seed": 8}, {}),
 }
 
 

@@ -12,6 +12,10 @@ if TYPE_CHECKING:
 
 __all__ = ["choose_level", "describe_level"]
 
+THICK_SLICES_MM = 2.5
+"""From here on thin walls across the slices lose so much that half way between the materials can be too high: with
+slices of 2 mm the level is as good as the best, with 3 mm it loses walls (docs/iso_value.md)."""
+
 
 def choose_level(volume: Volume, settings: MeshSettings) -> IsoChoice | None:
     """The iso value half way between two materials, measured or given; None where the settings name levels.
@@ -46,4 +50,9 @@ def describe_level(
                 f"{material} was given as {hu:g} HU, but the volume runs from {low:g} to {high:g} HU:"
                 " the level half way may not be that of this scan"
             )
+    if choice.method == "auto" and volume.spacing[2] > THICK_SLICES_MM:
+        warnings.append(
+            f"slices are {volume.spacing[2]:.3g} mm apart: walls thinner than that may be lost at"
+            f" {choice.iso_value:g} HU; compare with a lower iso value, such as --preset bone"
+        )
     return {"iso_value_reason": choice.reason, "iso_value_choice": choice.as_dict()}, warnings

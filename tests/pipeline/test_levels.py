@@ -77,6 +77,16 @@ def test_a_material_that_the_scan_does_not_hold_is_said() -> None:
     assert "bone was given as 1800 HU, but the volume runs from 40 to 1040 HU" in warning
 
 
+@pytest.mark.parametrize(("spacing", "expected"), [(2.0, 0), (3.0, 1)])
+def test_thick_slices_are_said(spacing: float, expected: int) -> None:
+    volume = ball()
+    thick = Volume(volume.voxels, np.diag((1.0, 1.0, spacing, 1.0)), volume.report)
+    settings = MeshSettings(half_way="auto")
+    warnings = describe_level(thick, settings, choose_level(thick, settings))[1]
+    assert len(warnings) == expected
+    assert all("slices are 3 mm apart" in warning and "540 HU" in warning for warning in warnings)
+
+
 def test_a_preset_says_its_reason() -> None:
     entries, warnings = describe_level(ball(), MeshSettings(preset="bone"), None)
     assert entries["iso_value_reason"].startswith("preset bone: ") and warnings == []
