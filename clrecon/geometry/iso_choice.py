@@ -171,6 +171,12 @@ def choose_iso_value(volume: Volume) -> IsoChoice:
     least = max(SEED_ABOVE_TISSUE_HU, LEAST_CONTRAST_SIGMAS * background.noise)
     if len(edges.bone) < FEWEST_EDGES or bone - tissue < least:
         raise NoSurfaceError(_no_bone(background, edges, histogram))
+    return _describe(background, edges, left_out, sampled)
+
+
+def _describe(background: Background, edges: BoneEdges, left_out: float, sampled: range) -> IsoChoice:
+    """The choice that the edges make, with its figures."""
+    bone, tissue = _median(edges.bone, edges.contrast), _median(edges.tissue, edges.contrast)
     iso_value = float(math.floor((bone + tissue) / 2.0 + 0.5))
     half = (edges.bone + edges.tissue) / 2.0
     spread = (_median(half, edges.contrast, 0.75) - _median(half, edges.contrast, 0.25)) / 2.0
@@ -195,7 +201,7 @@ def choose_iso_value(volume: Volume) -> IsoChoice:
         faint_share=round(float(np.mean(edges.bone < iso_value)), 4),
         contrast_medium_share=round(left_out, 4),
         slices=len(sampled),
-        slice_step=slice_step,
+        slice_step=sampled.step,
     )
 
 
