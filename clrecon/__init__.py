@@ -25,7 +25,7 @@ if TYPE_CHECKING:
         RefusedInputError,
         UsageError,
     )
-    from clrecon.geometry import Volume
+    from clrecon.geometry import Volume, choose_iso_value
     from clrecon.mesh import Mesh
     from clrecon.opencl import Device
     from clrecon.operators.isosurface import SurfaceExtractor, extract_isosurface, extract_isosurfaces
@@ -44,6 +44,7 @@ __all__ = [
     "UsageError",
     "Volume",
     "__version__",
+    "choose_iso_value",
     "device",
     "devices",
     "extract_isosurface",
@@ -63,6 +64,7 @@ _HOMES = {
     "SurfaceExtractor": "clrecon.operators.isosurface",
     "UsageError": "clrecon.errors",
     "Volume": "clrecon.geometry",
+    "choose_iso_value": "clrecon.geometry",
     "extract_isosurface": "clrecon.operators.isosurface",
     "extract_isosurfaces": "clrecon.operators.isosurface",
     "list_series": "clrecon.dicom",

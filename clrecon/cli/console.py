@@ -16,6 +16,7 @@ _STAGES = {
     "scan": "looking through the files",
     "read": "reading slices",
     "build": "building kernels (takes seconds on the first run on this device), extracting the surface",
+    "choose": "choosing the iso value",
     "select": "selecting components",
     "write": "writing",
     "measure": "measuring the mesh",

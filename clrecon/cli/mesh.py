@@ -7,12 +7,12 @@ from typing import Any
 
 from clrecon.cli.common import add_device, megabytes
 from clrecon.cli.console import Console, printable
-from clrecon.cli.levels import LEVELS_HELP, parse_levels
+from clrecon.cli.levels import LEVELS_HELP, parse_hu
 from clrecon.pipeline.presets import DEFAULT_PRESET, PRESETS
 
 __all__ = ["add_arguments", "describe_mesh", "run"]
 
-_PARTS = ("read", "upload", "build", "kernels", "download", "select", "write", "measure")
+_PARTS = ("read", "upload", "build", "kernels", "download", "choose", "select", "write", "measure")
 _SHOWN_PARTS = 12
 
 
@@ -32,6 +32,7 @@ def _epilog() -> str:
             "examples:",
             "  clrecon mesh CT_FOLDER -o bone.stl",
             "  clrecon mesh CT_FOLDER -o skull.glb --hu 300 --keep-largest 1 --report skull.json",
+            "  clrecon mesh CT_FOLDER -o bone.stl --hu auto",
             "  clrecon mesh CT_FOLDER -o bone.stl --hu 200,350 --min-volume 1 --split",
         )
     )
@@ -45,7 +46,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "-o", "--output", metavar="OUT", required=True, help="mesh file: .stl .ply .obj .glb .vtp or .3mf"
     )
     level = parser.add_mutually_exclusive_group()
-    level.add_argument("--hu", type=parse_levels, metavar="N[,N...]", help=LEVELS_HELP)
+    level.add_argument("--hu", type=parse_hu, default={}, metavar="N[,N...]|auto|half:B,T", help=LEVELS_HELP)
     level.add_argument(
         "--preset",
         metavar="NAME",
@@ -73,7 +74,7 @@ def run(options: argparse.Namespace, console: Console) -> int:
     from clrecon.pipeline.settings import MeshSettings
 
     settings = MeshSettings(
-        iso_value=options.hu,
+        **options.hu,
         preset=options.preset,
         series=options.series,
         space=options.space.lower(),
@@ -104,7 +105,7 @@ def run(options: argparse.Namespace, console: Console) -> int:
 
 def describe_mesh(report: dict[str, Any]) -> list[str]:
     """The report for people: what was read, what came out, on which device, in which time."""
-    reason = f"preset {report['preset']}" if report["preset"] else "as given"
+    reason = _describe_choice(report)
     border = "closed" if report["closed_at_border"] else "open"
     levels = ", ".join(f"{level:g}" for level in dict.fromkeys(mesh["iso_value_hu"] for mesh in report["meshes"]))
     return [
@@ -116,6 +117,17 @@ def describe_mesh(report: dict[str, Any]) -> list[str]:
         f"device   {printable(report['device'])}",
         f"time     {_describe_times(report['seconds'])}",
     ]
+
+
+def _describe_choice(report: dict[str, Any]) -> str:
+    """Why this iso value, in a few words."""
+    choice = report["iso_value_choice"]
+    if choice is None:
+        return f"preset {report['preset']}" if report["preset"] else "as given"
+    if choice["method"] != "auto":
+        return f"half way between tissue {choice['tissue_hu']:g} and bone {choice['bone_hu']:g} HU, as given"
+    below = "air" if choice["background"] == "air" else "tissue"
+    return f"auto: half way between {below} {choice['tissue_hu']:.0f} and bone {choice['bone_hu']:.0f} HU"
 
 
 def _describe_volume(volume: dict[str, Any]) -> str:

@@ -10,16 +10,20 @@ from clrecon.geometry.affine import (
     tilt_degrees,
 )
 from clrecon.geometry.frames import SPACES, frame_from_lps
+from clrecon.geometry.iso_choice import IsoChoice, choose_iso_value, half_iso_value
 from clrecon.geometry.volume import AIR_HU, Volume
 
 __all__ = [
     "AIR_HU",
+    "IsoChoice",
     "SPACES",
     "Volume",
     "apply_affine",
+    "choose_iso_value",
     "column_spacing",
     "compose_affine",
     "frame_from_lps",
+    "half_iso_value",
     "is_left_handed",
     "normal_matrix",
     "slice_normal",

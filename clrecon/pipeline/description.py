@@ -6,6 +6,7 @@ import os
 from collections.abc import Callable, Iterable, Sequence
 from typing import TYPE_CHECKING, Any
 
+from clrecon.pipeline.levels import describe_level
 from clrecon.pipeline.parts import Part
 from clrecon.pipeline.presets import find_preset
 from clrecon.pipeline.report import platform_name
@@ -14,7 +15,7 @@ from clrecon.version import package_version
 
 if TYPE_CHECKING:
     from clrecon.files import StagedFile
-    from clrecon.geometry import Volume
+    from clrecon.geometry import IsoChoice, Volume
     from clrecon.mesh import Mesh
     from clrecon.opencl import Device
 
@@ -53,7 +54,12 @@ def describe_part(part: Part, file: StagedFile, output: str | os.PathLike[str], 
 
 
 def describe_job(
-    volume: Volume, parts: Sequence[Part], meshes: Sequence[dict[str, Any]], settings: MeshSettings, device: Device
+    volume: Volume,
+    parts: Sequence[Part],
+    meshes: Sequence[dict[str, Any]],
+    settings: MeshSettings,
+    device: Device,
+    choice: IsoChoice | None = None,
 ) -> dict[str, Any]:
     """Compose the report of a job, all but times and memory.
 
@@ -65,6 +71,8 @@ def describe_job(
         What `describe_part` says of each.
     settings : MeshSettings
     device : Device
+    choice : IsoChoice, optional
+        Where the iso value came from when it was neither given nor a preset.
 
     Returns
     -------
@@ -77,6 +85,8 @@ def describe_job(
     warnings = [str(text) for text in certificate.pop("warnings", [])]
     for part in parts:
         warnings += [str(text) for text in part.mesh.report.get("warnings", [])]
+    level, level_warnings = describe_level(volume, settings, choice)
+    warnings += level_warnings
     if settings.preset_used == "skin":
         warnings.append("a surface of the skin can show a face: treat the file as one that identifies the patient")
     of_surface = {part.surface: mesh for part, mesh in zip(parts, meshes, strict=True)}.values()
@@ -85,6 +95,7 @@ def describe_job(
         "iso_value_hu": _common(mesh["iso_value_hu"] for mesh in meshes),
         "iso_level_hu": _common(mesh["iso_level_hu"] for mesh in meshes),
         "outside_hu": _common(part.mesh.report.get("outside_hu") for part in parts),
+        **level,
         "preset": settings.preset_used,
         "space": settings.space,
         "unit": "mm",

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from clrecon.pipeline.description import describe_job, describe_part
+from clrecon.pipeline.levels import choose_level
 from clrecon.pipeline.opening import DeviceOpening
 from clrecon.pipeline.outputs import check_outputs, commit_all, name_outputs, stage_meshes
 from clrecon.pipeline.parts import extract_surfaces, first_names, plan_surfaces, select_parts
@@ -79,6 +80,13 @@ def make_mesh(
         device = opening.wait()
         watch.lap("device")
 
+    if settings.half_way == "auto":
+        progress("choose", 0, 0)
+    choice = choose_level(volume, settings)
+    if choice is not None:
+        surfaces = plan_surfaces([choice.iso_value])
+    watch.lap("choose")
+
     extracted = extract_surfaces(volume, surfaces, device, settings, progress)
     origins = [mesh.report for mesh in extracted]
     watch.lap("surface")
@@ -107,7 +115,7 @@ def make_mesh(
             describe_part(part, file, path, settings.space)
             for part, file, path in zip(parts, files, paths, strict=True)
         ]
-        report = describe_job(volume, parts, meshes, settings, device)
+        report = describe_job(volume, parts, meshes, settings, device, choice)
         report["seconds"] = _seconds(watch, origins)
         report["peak_memory_bytes"] = peak_memory_bytes()
         if report_path is not None:
@@ -121,7 +129,7 @@ def _seconds(watch: Stopwatch, origins: Sequence[dict[str, Any]]) -> dict[str, f
     measured = [origin.get("seconds", {}) for origin in origins]
     seconds = {"device": watch.seconds.get("device", 0.0), "read": watch.seconds.get("read", 0.0)}
     seconds.update({part: sum(float(own.get(part, 0.0)) for own in measured) for part in _DEVICE_PARTS})
-    seconds.update({part: watch.seconds.get(part, 0.0) for part in ("select", "measure", "write")})
+    seconds.update({part: watch.seconds.get(part, 0.0) for part in ("choose", "select", "measure", "write")})
     seconds["other"] = max(0.0, watch.total() - sum(seconds.values()))
     seconds["total"] = watch.total()
     return {part: round(value, 4) for part, value in seconds.items()}

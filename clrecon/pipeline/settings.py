@@ -22,6 +22,8 @@ class MeshSettings:
         HU; inside is ``>= iso_value``.  Several make one mesh each.
     preset : str, optional
         Name of an iso value, see `clrecon.pipeline.presets`.  Neither of both means the preset "bone".
+    half_way : "auto" or (bone, tissue), optional
+        In place of an iso value: half way between the two materials, measured in the scan or given in HU.
     series : str or int, optional
         Which series of the input; None leaves the choice to `read_volume`.
     space : {"lps", "ras"}
@@ -45,6 +47,7 @@ class MeshSettings:
 
     iso_value: float | Sequence[float] | None = None
     preset: str | None = None
+    half_way: str | Sequence[float] | None = None
     series: str | int | None = None
     space: str = "lps"
     closed: bool = True
@@ -56,6 +59,7 @@ class MeshSettings:
     def __post_init__(self) -> None:
         if self.iso_value is not None and self.preset is not None:
             raise UsageError("give either an iso value in HU or a preset, not both")
+        self._check_half_way()
         if self.preset is not None:
             find_preset(self.preset)
         self._check_levels()
@@ -67,7 +71,24 @@ class MeshSettings:
 
         frame_from_lps(self.space)
 
+    def _check_half_way(self) -> None:
+        if self.half_way is None:
+            return
+        if self.iso_value is not None or self.preset is not None:
+            raise UsageError("give either an iso value, a preset or two materials, not more than one of them")
+        if isinstance(self.half_way, str):
+            if self.half_way != "auto":
+                raise UsageError(f"half way between what? {self.half_way!r} is neither auto nor two numbers of HU")
+            return
+        from clrecon.geometry import half_iso_value  # numpy: not wanted before a job starts
+
+        if len(self.half_way) != 2:
+            raise UsageError(f"half way needs two numbers of HU, bone and tissue, not {tuple(self.half_way)}")
+        half_iso_value(*self.half_way)
+
     def _check_levels(self) -> None:
+        if isinstance(self.half_way, str):
+            return
         if not self.levels:
             raise UsageError("give at least one iso value in HU")
         for place, value in enumerate(self.levels):
@@ -78,7 +99,13 @@ class MeshSettings:
 
     @property
     def levels(self) -> tuple[float, ...]:
-        """The iso values in HU that are used, one a surface."""
+        """The iso values in HU that are used, one a surface; NaN for the one that the scan has yet to give."""
+        if isinstance(self.half_way, str):
+            return (math.nan,)
+        if self.half_way is not None:
+            from clrecon.geometry import half_iso_value  # numpy: not wanted before a job starts
+
+            return (half_iso_value(*self.half_way).iso_value,)
         if self.iso_value is None:
             return (find_preset(self.preset or DEFAULT_PRESET).iso_value,)
         if isinstance(self.iso_value, Sequence):
@@ -87,8 +114,9 @@ class MeshSettings:
 
     @property
     def preset_used(self) -> str | None:
-        """Name of the preset behind `levels`, None where the value was given."""
-        return None if self.iso_value is not None else (self.preset or DEFAULT_PRESET)
+        """Name of the preset behind `levels`, None where the value was given or is half way."""
+        named = self.iso_value is not None or self.half_way is not None
+        return None if named else (self.preset or DEFAULT_PRESET)
 
     @property
     def selects(self) -> bool:

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from house import ROOT
 
-DOCUMENTS = ["README.md", "CONTRIBUTING.md", "CHANGELOG.md", "docs/contract.md"]
+DOCUMENTS = ["README.md", "CONTRIBUTING.md", "CHANGELOG.md", "docs/contract.md", "docs/iso_value.md"]
 LINK = re.compile(r"\[[^\]]*\]\(([^)#\s]+)[^)]*\)")
 QUOTED = re.compile(r"`((?:\.ci|cl|clrecon|docs|scripts|tests)/[\w./-]*|(?:setup\.cfg|\w+\.(?:md|toml)))`")
 COMMAND = re.compile(r"^ {4}(?:clrecon|python3 scripts/run\.py) +([^#\n]+)", re.MULTILINE)
@@ -97,7 +97,8 @@ def test_exit_codes_are_documented() -> None:
         ),
         (
             "clrecon mesh",
-            "affine_ijk_to_lps_mm iso_value_hu space vertices triangles closed manifold components area_mm2 volume_ml "
+            "affine_ijk_to_lps_mm iso_value_hu iso_value_reason iso_value_choice space "
+            "vertices triangles closed manifold components area_mm2 volume_ml "
             "bounds_mm device driver version warnings seconds read upload build kernels download write total",
         ),
     ],

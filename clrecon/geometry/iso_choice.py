@@ -1,0 +1,288 @@
+"""The iso value half way between bone and the tissue beside it, measured in the scan itself.
+
+A scanner blurs every edge, and of all levels only the one half way between the two plateaus leaves the edge where it
+is: 20 % of the step off it the surface moves by about half a voxel at a blur of 0.8 voxel.  Bone has no plateau of
+its own in the histogram of a body (marrow, thin cortex and contrast medium fill the same numbers), so the plateaus
+are read where they matter, at the edges:
+
+1. The histogram of evenly spread slices gives the soft-tissue mode and its noise.  Padding, air, table and fat lie
+   elsewhere and do not move it.
+2. Seeds are crossings of a value safely above that mode, along the rows and columns of those slices, where the edge
+   runs more across this axis than along it.
+3. From each seed a walk uphill to the first maximum gives the bone's plateau, one downhill the tissue's.  Edges that
+   start from air (table, lung, clothes), end in metal, or end in a flat and faint plateau (vessels and organs with
+   contrast medium) do not count.
+4. The medians of both plateaus, every edge weighted by its contrast, are "bone" and "tissue"; the iso value is half
+   way between them.
+
+Noise lifts a maximum as much as it lowers a minimum, which leaves the middle in place.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clrecon.errors import NoSurfaceError, UsageError
+from clrecon.geometry.bone_edges import Background, BoneEdges, leave_contrast_medium, measure_edges
+from clrecon.geometry.volume import AIR_HU, Volume
+
+__all__ = ["IsoChoice", "choose_iso_value", "half_iso_value"]
+
+Float64Array = NDArray[np.float64]
+
+SAMPLED_VOXELS = 8_400_000
+"""About so many voxels are looked at: 32 slices of 512 x 512."""
+FEWEST_SLICES = 8
+
+LOWEST_HU, HIGHEST_HU = AIR_HU + 1, 3071
+"""What the histogram counts: above the padding, up to the end of the 12-bit scale."""
+SMOOTHING_HU = 8.0
+SOFT_TISSUE_HU = (-30, 150)
+"""Where muscle, organs, blood and water have their mode."""
+FAT_HU = (-150, -31)
+"""Where fat has it, the background of what shows no other soft tissue."""
+AIR_MODE_HU = -700
+"""Modes below this are air."""
+
+SEED_ABOVE_TISSUE_HU = 100
+"""Bone begins so far above the soft-tissue mode at least: discs, clots and organs end below."""
+SEED_SIGMAS = 4.0
+WIDEST_MODE_HU = 150.0
+"""More noise than this hides the tissues; a ramp between two materials looks wider still."""
+SPECIMEN_SEED_HU = 150
+"""Where a specimen in air begins."""
+FAT_BELOW_TISSUE_HU = 250
+"""The low side of an edge is soft tissue or fat: not further below the mode than this."""
+
+FEWEST_EDGES = 64
+LEAST_CONTRAST_SIGMAS = 6.0
+
+_WAY_OUT = "give the iso value (--hu N) or the two materials (--hu half:BONE,TISSUE)"
+
+
+@dataclass(frozen=True)
+class IsoChoice:
+    """An iso value half way between two materials, with what speaks for it.
+
+    Attributes
+    ----------
+    iso_value : float
+        HU, half way between `bone_hu` and `tissue_hu`; a whole number where it was measured.
+    bone_hu, tissue_hu : float
+        The plateaus on both sides of the edge of bone, HU.
+    method : {"auto", "half"}
+        Measured, or given.
+    reason : str
+        One line for people.
+    background : {"soft tissue", "air"} or None
+        What the bone lies in; None where the materials were given, as for all that follows.
+    background_mode_hu, noise_hu : float or None
+        The mode of the background in the histogram and its width, HU.
+    edges : int or None
+        Edges measured.
+    spread_hu : float or None
+        Half the interquartile range of the half-way levels of single edges.
+    steepness_hu_per_voxel : float or None
+        Median of the steepest step of an edge along a row or column: `spread_hu` / this is what the spread means in
+        voxels, at most.
+    faint_share : float or None
+        Share of the edges whose bone stays below the iso value.  That bone, thin, poor in mineral or touched in
+        passing by a slice, is lost.
+    contrast_medium_share : float or None
+        Share of the contrast left out because it ends in a flat plateau below `CONTRAST_MEDIUM_HU`.
+    slices, slice_step : int or None
+        Slices looked at and the distance from one to the next.
+    """
+
+    iso_value: float
+    bone_hu: float
+    tissue_hu: float
+    method: str
+    reason: str
+    background: str | None = None
+    background_mode_hu: float | None = None
+    noise_hu: float | None = None
+    edges: int | None = None
+    spread_hu: float | None = None
+    steepness_hu_per_voxel: float | None = None
+    faint_share: float | None = None
+    contrast_medium_share: float | None = None
+    slices: int | None = None
+    slice_step: int | None = None
+
+    def as_dict(self) -> dict[str, Any]:
+        """All attributes but iso value and reason, for a report."""
+        return {name: value for name, value in dataclasses.asdict(self).items() if name not in ("iso_value", "reason")}
+
+
+def half_iso_value(bone_hu: float, tissue_hu: float) -> IsoChoice:
+    """Return the iso value half way between two materials that are known.
+
+    Raises
+    ------
+    UsageError
+        A number is not finite, or bone is not above tissue.
+    """
+    bone, tissue = float(bone_hu), float(tissue_hu)
+    if not (math.isfinite(bone) and math.isfinite(tissue)):
+        raise UsageError(f"bone and tissue must be finite numbers of HU, not {bone_hu} and {tissue_hu}")
+    if bone <= tissue:
+        raise UsageError(f"bone must be above tissue: {bone:g} HU is not above {tissue:g} HU")
+    reason = f"half way between tissue {tissue:g} and bone {bone:g} HU, as given"
+    return IsoChoice(tissue + (bone - tissue) / 2.0, bone, tissue, "half", reason)
+
+
+def choose_iso_value(volume: Volume) -> IsoChoice:
+    """Measure bone and the tissue beside it, and choose the iso value half way between them.
+
+    Bone in soft tissue, or, where the scan shows no soft tissue, a specimen in air.  Deterministic; looks at about
+    8 million voxels in evenly spread slices, one slice in memory at a time (a memory-mapped volume stays on the disk).
+    The measured errors, against other methods, are in ``docs/iso_value.md``.
+
+    Parameters
+    ----------
+    volume : Volume
+        Voxels in HU.
+
+    Returns
+    -------
+    IsoChoice
+
+    Raises
+    ------
+    NoSurfaceError
+        There are no two materials: neither soft tissue nor air has a mode, or no bone rises from it.
+    """
+    voxels = volume.voxels
+    count = max(FEWEST_SLICES, SAMPLED_VOXELS // (voxels.shape[1] * voxels.shape[2]))
+    slice_step = -(-voxels.shape[0] // count)
+    sampled = range((voxels.shape[0] - 1) % slice_step // 2, voxels.shape[0], slice_step)
+    histogram = _count_values(voxels, sampled)
+    background = _find_background(histogram)
+    edges = measure_edges(voxels, sampled, background)
+    edges, left_out = leave_contrast_medium(edges)
+    bone, tissue = _median(edges.bone, edges.contrast), _median(edges.tissue, edges.contrast)
+    least = max(SEED_ABOVE_TISSUE_HU, LEAST_CONTRAST_SIGMAS * background.noise)
+    if len(edges.bone) < FEWEST_EDGES or bone - tissue < least:
+        raise NoSurfaceError(_no_bone(background, edges, histogram))
+    return _describe(background, edges, left_out, sampled)
+
+
+def _describe(background: Background, edges: BoneEdges, left_out: float, sampled: range) -> IsoChoice:
+    """The choice that the edges make, with its figures."""
+    bone, tissue = _median(edges.bone, edges.contrast), _median(edges.tissue, edges.contrast)
+    iso_value = float(math.floor((bone + tissue) / 2.0 + 0.5))
+    half = (edges.bone + edges.tissue) / 2.0
+    spread = (_median(half, edges.contrast, 0.75) - _median(half, edges.contrast, 0.25)) / 2.0
+    steepness = _median(edges.step, edges.contrast)
+    reason = (
+        f"half way between {'air' if background.name == 'air' else 'tissue'} {tissue:.0f} and bone {bone:.0f} HU, "
+        f"medians of {len(half):,} edges in {len(sampled)} slices; single edges spread by {spread:.0f} HU, "
+        f"{spread / steepness:.2f} voxel"
+    )
+    return IsoChoice(
+        iso_value,
+        round(bone, 1),
+        round(tissue, 1),
+        "auto",
+        reason,
+        background=background.name,
+        background_mode_hu=background.mode,
+        noise_hu=round(background.noise, 1),
+        edges=len(half),
+        spread_hu=round(spread, 1),
+        steepness_hu_per_voxel=round(steepness, 1),
+        faint_share=round(float(np.mean(edges.bone < iso_value)), 4),
+        contrast_medium_share=round(left_out, 4),
+        slices=len(sampled),
+        slice_step=sampled.step,
+    )
+
+
+def _no_bone(background: Background, edges: BoneEdges, histogram: Float64Array) -> str:
+    above = histogram[background.seed - LOWEST_HU :].sum() / max(histogram.sum(), 1.0)
+    return (
+        f"no bone found to choose the iso value by: {background.name} has its mode at {background.mode:.0f} HU with a "
+        f"noise of {background.noise:.0f} HU, {above:.2%} of the voxels lie above {background.seed} HU and "
+        f"{len(edges.bone)} edges of bone rise from it; {_WAY_OUT}"
+    )
+
+
+def _count_values(voxels: NDArray[Any], sampled: range) -> Float64Array:
+    """Voxels of each whole HU from `LOWEST_HU` to `HIGHEST_HU`; what is below is padding, what is above counts last."""
+    low = LOWEST_HU - 1
+    counts = np.zeros(HIGHEST_HU - low + 1, dtype=np.int64)
+    for k in sampled:
+        values = np.asarray(voxels[k]).ravel()
+        if values.dtype.kind == "f":
+            if np.isnan(values).any():
+                raise NoSurfaceError(f"the volume holds NaN (slice {k}): it has no iso surface")
+            values = np.rint(np.clip(values, low, HIGHEST_HU))
+        counts += np.bincount(np.clip(values.astype(np.int32), low, HIGHEST_HU) - low, minlength=len(counts))
+    return counts[1:].astype(np.float64)
+
+
+def _smooth(histogram: Float64Array) -> Float64Array:
+    reach = int(4 * SMOOTHING_HU)
+    weights = np.exp(-0.5 * (np.arange(-reach, reach + 1) / SMOOTHING_HU) ** 2)
+    padded = np.pad(histogram, reach)
+    return np.convolve(padded, weights / weights.sum(), mode="valid")
+
+
+def _find_mode(smooth: Float64Array, low: int, high: int) -> tuple[float, float] | None:
+    """Highest local maximum of the smoothed histogram between two HU, and its width: mode and sigma in HU.
+
+    None where there is none that stands out twofold over what lies 250 to 500 HU below and 200 to 400 HU above, and is
+    no wider than `WIDEST_MODE_HU`: the ramp of an edge between air and bone runs through all values alike.  The width
+    is that of the upper side, where no fat is, at 61 % of the height, less the smoothing.
+    """
+    at = np.arange(max(low - LOWEST_HU, 1), min(high - LOWEST_HU, len(smooth) - 2) + 1)
+    peaks = at[(smooth[at] > smooth[at - 1]) & (smooth[at] >= smooth[at + 1])]
+    if not len(peaks):
+        return None
+    peak = int(peaks[np.argmax(smooth[peaks])])
+    height = smooth[peak]
+    beside = np.concatenate((smooth[max(peak - 500, 0) : max(peak - 250, 0)], smooth[peak + 200 : peak + 400]))
+    if height < 2.0 * beside.mean():
+        return None
+    above = smooth[peak:] < math.exp(-0.5) * height
+    width = float(np.argmax(above)) if above.any() else float(len(above))
+    width = math.sqrt(max(width**2 - SMOOTHING_HU**2, 1.0))
+    return (float(peak + LOWEST_HU), width) if width <= WIDEST_MODE_HU else None
+
+
+def _find_background(histogram: Float64Array) -> Background:
+    """Soft tissue, or the air round a specimen."""
+    smooth = _smooth(histogram)
+    tissue = _find_mode(smooth, *SOFT_TISSUE_HU) or _find_mode(smooth, *FAT_HU)
+    if tissue is not None:
+        mode, noise = tissue
+        seed = math.ceil(mode + max(SEED_ABOVE_TISSUE_HU, SEED_SIGMAS * noise))
+        return Background("soft tissue", mode, noise, seed, mode - FAT_BELOW_TISSUE_HU, mode + 2.0 * noise)
+    air = _find_mode(smooth, LOWEST_HU, AIR_MODE_HU)
+    if air is not None:
+        mode, noise = air
+        return Background("air", mode, noise, SPECIMEN_SEED_HU, -math.inf, mode + max(50.0, 2.0 * noise))
+    total = histogram.sum()
+    if not total:
+        raise NoSurfaceError(f"nothing but padding (up to {AIR_HU} HU) to choose the iso value by; {_WAY_OUT}")
+    raise NoSurfaceError(
+        f"no two materials to choose the iso value by: no mode between {FAT_HU[0]} and {SOFT_TISSUE_HU[1]} HU "
+        f"(soft tissue) nor below {AIR_MODE_HU} HU (air), most voxels are near "
+        f"{int(np.argmax(smooth)) + LOWEST_HU} HU; {_WAY_OUT}"
+    )
+
+
+def _median(values: NDArray[Any], weights: NDArray[Any], share: float = 0.5) -> float:
+    """Weighted quantile; 0 of nothing."""
+    if not len(values):
+        return 0.0
+    order = np.argsort(values, kind="stable")
+    summed = np.cumsum(weights[order], dtype=np.float64)
+    return float(values[order][min(np.searchsorted(summed, share * summed[-1]), len(values) - 1)])

@@ -1,0 +1,58 @@
+"""Which iso value a job uses where it was not given as a number, and what the report says about it."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from clrecon.pipeline.presets import find_preset
+from clrecon.pipeline.settings import MeshSettings
+
+if TYPE_CHECKING:
+    from clrecon.geometry import IsoChoice, Volume
+
+__all__ = ["choose_level", "describe_level"]
+
+THICK_SLICES_MM = 2.5
+"""From here on thin walls across the slices lose so much that half way between the materials can be too high: with
+slices of 2 mm the level is as good as the best, with 3 mm it loses walls (docs/iso_value.md)."""
+
+
+def choose_level(volume: Volume, settings: MeshSettings) -> IsoChoice | None:
+    """The iso value half way between two materials, measured or given; None where the settings name levels.
+
+    Raises
+    ------
+    NoSurfaceError
+        "auto" finds no two materials.
+    """
+    from clrecon.geometry import choose_iso_value, half_iso_value
+
+    if settings.half_way is None:
+        return None
+    if isinstance(settings.half_way, str):
+        return choose_iso_value(volume)
+    return half_iso_value(*settings.half_way)
+
+
+def describe_level(
+    volume: Volume, settings: MeshSettings, choice: IsoChoice | None
+) -> tuple[dict[str, Any], list[str]]:
+    """Entries of the report, and warnings."""
+    if choice is None:
+        preset = settings.preset_used
+        reason = "as given" if preset is None else f"preset {preset}: {find_preset(preset).source}"
+        return {"iso_value_reason": reason, "iso_value_choice": None}, []
+    warnings = []
+    low, high = volume.report["hu_range"]
+    for material, hu in (("bone", choice.bone_hu), ("tissue", choice.tissue_hu)):
+        if choice.method == "half" and not low <= hu <= high:
+            warnings.append(
+                f"{material} was given as {hu:g} HU, but the volume runs from {low:g} to {high:g} HU:"
+                " the level half way may not be that of this scan"
+            )
+    if choice.method == "auto" and volume.spacing[2] > THICK_SLICES_MM:
+        warnings.append(
+            f"slices are {volume.spacing[2]:.3g} mm apart: walls thinner than that may be lost at"
+            f" {choice.iso_value:g} HU; compare with a lower iso value, such as --preset bone"
+        )
+    return {"iso_value_reason": choice.reason, "iso_value_choice": choice.as_dict()}, warnings

@@ -1,0 +1,84 @@
+"""``--hu auto`` and ``--hu half:BONE,TISSUE``: what they make, say and refuse."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+from typing import Any
+
+import ct_files
+import pytest
+import tolerances
+
+from clrecon.cli.levels import parse_hu
+from clrecon.cli.main import main
+
+
+@pytest.fixture(scope="module")
+def ct(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A ball of 700 HU in water."""
+    voxels = ct_files.sphere_voxels((17, 31, 37))
+    inside = (voxels - ct_files.OUTSIDE_HU) / (ct_files.INSIDE_HU - ct_files.OUTSIDE_HU)
+    return ct_files.write_series(tmp_path_factory.mktemp("ct"), (inside * 700.0).round().astype("int16"))
+
+
+def run(ct: Path, device: Any, tmp_path: Path, *arguments: str) -> int:
+    return main(["mesh", str(ct), "-o", str(tmp_path / "b.stl"), "--device", str(device.index), *arguments])
+
+
+def test_auto_says_what_it_chose(ct: Path, device: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(ct, device, tmp_path, "--hu", "auto") == 0
+    shown = capsys.readouterr().out
+    (line,) = [line for line in shown.splitlines() if line.startswith("surface")]
+    level = float(line.split()[1])
+    assert abs(level - 350.0) <= tolerances.HALF_WAY_STEP_SHARE * 700.0
+    assert "HU (auto: half way between tissue 0 and bone 700 HU), closed" in line
+
+
+def test_half_takes_the_materials_given(
+    ct: Path, device: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(ct, device, tmp_path, "--hu", "half:700,-100", "--json") == 0
+    report = json.loads(capsys.readouterr().out)
+    assert (report["iso_value_hu"], report["iso_value_choice"]["method"]) == (300.0, "half")
+    assert "tissue was given as -100 HU, but the volume runs from 0 to 700 HU" in report["warnings"][0]
+    assert run(ct, device, tmp_path, "--hu", "half:700,0") == 0
+    assert "surface  350 HU (half way between tissue 0 and bone 700 HU, as given)" in capsys.readouterr().out
+
+
+def test_auto_without_bone_ends_with_2_and_the_modes(
+    device: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    water = ct_files.write_series(tmp_path / "water", ct_files.sphere_voxels() * 0 + 8)
+    assert run(water, device, tmp_path, "--hu", "auto") == 2
+    message = capsys.readouterr().err
+    assert "soft tissue has its mode at 8 HU" in message and "give the iso value (--hu N)" in message
+    assert not (tmp_path / "b.stl").exists()
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("half:1200", "does not name two materials"),
+        ("half:1200,40,3", "does not name two materials"),
+        ("half:bone,muscle", "'bone' in 'bone,muscle' is no number of HU"),
+        ("auto,300", "'auto' in 'auto,300' is no number of HU"),
+        ("Auto", "'Auto' is no number of HU"),
+    ],
+)
+def test_what_hu_does_not_understand(text: str, words: str) -> None:
+    with pytest.raises(argparse.ArgumentTypeError, match=words):
+        parse_hu(text)
+
+
+def test_what_hu_understands() -> None:
+    assert parse_hu("200,350.5") == {"iso_value": (200.0, 350.5)}
+    assert parse_hu("-150") == {"iso_value": (-150.0,)}
+    assert parse_hu("auto") == {"half_way": "auto"}
+    assert parse_hu("half:1200,-40") == {"half_way": (1200.0, -40.0)}
+
+
+def test_bone_below_tissue_is_wrong_usage(ct: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["mesh", str(ct), "-o", str(tmp_path / "b.stl"), "--hu", "half:40,1200"]) == 3
+    assert "40 HU is not above 1200 HU" in capsys.readouterr().err
