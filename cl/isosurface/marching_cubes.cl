@@ -4,7 +4,7 @@
  * owned by samples, counting before writing); the packing of the inside test to one bit a sample is our own.
  *
  * Passes
- *   1. classify_samples   one bit a sample: inside or not; one state a row: outside, inside or mixed
+ *   1. classify_samples   one bit a sample: inside or not; per row the words that hold any
  *   2. count_rows         per row: vertices, triangles and words with work; per word its place in the row
  *      (exclusive scan of all row counts: cl/compaction/scan.cl)
  *   3. total_counts       vertices, triangles and words with work of the slab
@@ -68,7 +68,8 @@ static inline uint classify_word(__global const VOXEL *row, int first, int ni, V
 
 /* Parameters  voxels     in   slices of the volume from first_slice on
  *             mask       out  (gk, gj, words) bit set where voxel >= level
- *             row_states out  (gk, gj) ROW_OUTSIDE, ROW_INSIDE or ROW_MIXED
+ *             row_extents  out  (gk, gj) first word of the row with a bit set, and the one after the last; 0, 0 in
+ *                          rows without any
  *             level      lowest inside value
  *             ni nj nk   voxels of the whole volume
  *             border     layers of outside around the volume, 0 or 1
@@ -78,9 +79,9 @@ static inline uint classify_word(__global const VOXEL *row, int first, int ni, V
  *             words      words a row, ceil((ni + 2 border) / 32)
  * Launch      global = gj * gk rounded up by the host, any local: one item a row, so that dividing for j and k
  *             costs little
- * Guarantees  every word of the mask and every state is written; bits beyond the row are 0 */
+ * Guarantees  every word of the mask and every extent is written; bits beyond the row are 0 */
 __kernel void classify_samples(
-    __global const VOXEL *restrict voxels, __global uint *restrict mask, __global uchar *restrict row_states,
+    __global const VOXEL *restrict voxels, __global uint *restrict mask, __global ushort2 *restrict row_extents,
     const VOXEL level,
     const int ni, const int nj, const int nk, const int border, const int first_slice, const int first_sample_slice,
     const uint gk, const int words)
@@ -95,22 +96,22 @@ __kernel void classify_samples(
     if (j < 0 || j >= nj || k < 0 || k >= nk) {
         for (int w = 0; w < words; ++w)
             row_mask[w] = 0;
-        row_states[row] = ROW_OUTSIDE;
+        row_extents[row] = (ushort2)(0, 0);
         return;
     }
     __global const VOXEL *row_voxels = voxels + voxel_index(0, j, k - first_slice, ni, nj);
-    uint any = 0, missing = 0;
+    int begin = words, end = 0;
     for (int w = 0; w < words; ++w) {
         const uint bits = classify_word(row_voxels, 32 * w - border, ni, level);
         row_mask[w] = bits;
-        any |= bits;
-        missing |= ~bits & (uint)low_bits(min(32, ni + 2 * border - 32 * w));
+        begin = min(begin, bits != 0 ? w : words);
+        end = bits != 0 ? w + 1 : end;
     }
-    row_states[row] = any == 0 ? ROW_OUTSIDE : missing == 0 ? ROW_INSIDE : ROW_MIXED;
+    row_extents[row] = (ushort2)((ushort)min(begin, end), (ushort)end);
 }
 
 /* Parameters  mask             in   (gk, gj, words)
- *             row_states       in   (gk, gj)
+ *             row_extents      in   (gk, gj)
  *             row_counts       out  (3, rows_to_count) vertices owned by each row, triangles of its cells, words with
  *                                   work: words that own a vertex or have an active cell
  *             words_with_work  out  (rows_to_count, flag_words) bit w of a row: word w has work
@@ -120,9 +121,9 @@ __kernel void classify_samples(
  *             rows_to_count    rows that are counted, the first ones of the mask
  * Launch      global = rows_to_count rounded up by the host, any local
  * Assumes     5 (gi + 1) < 65536, so that places in a row fit 16 bits
- * Guarantees  every output is written, but for the places in rows without work, which nothing asks for */
+ * Guarantees  every output is written, but for the places of words beyond the extents, which nothing asks for */
 __kernel void count_rows(
-    __global const uint *restrict mask, __global const uchar *restrict row_states,
+    __global const uint *restrict mask, __global const ushort2 *restrict row_extents,
     __global uint *restrict row_counts, __global uint *restrict words_with_work,
     __global ushort *restrict word_vertices, __global ushort *restrict word_triangles,
     const uint gi, const uint gj, const uint gk, const uint words, const uint flag_words, const uint rows_to_count)
@@ -138,18 +139,26 @@ __kernel void count_rows(
     __global const uint *y1z0 = has_y ? y0z0 + words : y0z0;
     __global const uint *y0z1 = has_z ? y0z0 + (size_t)gj * words : y0z0;
     __global const uint *y1z1 = has_y && has_z ? y0z1 + words : y0z0;
-    const uint right = has_y ? row + 1 : row, above = has_z ? row + gj : row;
-    const uchar state = row_states[row];
-    if (state != ROW_MIXED && state == row_states[right] && state == row_states[above]
-        && state == row_states[has_z ? right + gj : right]) {
+    /* Beyond the extents of the four rows everything is outside; the sample before may own an edge into them. */
+    const ushort2 extents[4] = {row_extents[row], row_extents[has_y ? row + 1 : row],
+        row_extents[has_z ? row + gj : row], row_extents[has_y && has_z ? row + gj + 1 : row]};
+    uint begin = words, end = 0;
+    for (uint around = 0; around < 4; ++around) {
+        if (extents[around].x < extents[around].y) {
+            begin = min(begin, (uint)extents[around].x);
+            end = max(end, (uint)extents[around].y);
+        }
+    }
+    begin -= begin != 0;
+    for (uint f = 0; f < flag_words; ++f)
+        words_with_work[(size_t)row * flag_words + f] = 0;
+    if (end == 0) {
         row_counts[row] = row_counts[rows_to_count + row] = row_counts[2 * (size_t)rows_to_count + row] = 0;
-        for (uint f = 0; f < flag_words; ++f)
-            words_with_work[(size_t)row * flag_words + f] = 0;
         return;
     }
-    cell_rows rows = {y0z0[0], y1z0[0], y0z1[0], y1z1[0]};
+    cell_rows rows = {y0z0[begin], y1z0[begin], y0z1[begin], y1z1[begin]};
     uint vertices = 0, triangles = 0, working = 0, flags = 0;
-    for (uint w = 0; w < words; ++w) {
+    for (uint w = begin; w < end; ++w) {
         word_vertices[(size_t)row * words + w] = (ushort)vertices;
         word_triangles[(size_t)row * words + w] = (ushort)triangles;
         const uint next = w + 1 < words ? w + 1 : w;
@@ -170,14 +179,12 @@ __kernel void count_rows(
             flags |= 1u << (w & 31);
             ++working;
         }
-        if ((w & 31) == 31 || w + 1 == words) {
+        if ((w & 31) == 31 || w + 1 == end) {
             words_with_work[(size_t)row * flag_words + (w >> 5)] = flags;
             flags = 0;
         }
         rows = next_rows;
     }
-    for (uint f = (words + 31) / 32; f < flag_words; ++f)
-        words_with_work[(size_t)row * flag_words + f] = 0;
     row_counts[row] = vertices;
     row_counts[rows_to_count + row] = triangles;
     row_counts[2 * (size_t)rows_to_count + row] = working;

@@ -9,11 +9,6 @@
 #ifndef CLRECON_MASK_ROWS_H
 #define CLRECON_MASK_ROWS_H
 
-/* What a row is as a whole. */
-#define ROW_OUTSIDE 0
-#define ROW_INSIDE 1
-#define ROW_MIXED 2
-
 /* Row number of (j, k). */
 static inline uint row_index(uint j, uint k, uint gj)
 {

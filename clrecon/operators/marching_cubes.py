@@ -31,7 +31,7 @@ class Classified:
     """What `classify` leaves on the device of one slab."""
 
     mask_d: Any
-    row_states_d: Any
+    row_extents_d: Any
 
 
 @dataclass(frozen=True)
@@ -130,13 +130,13 @@ def classify(
         Lowest inside value.
     """
     mask_d = allocate(device, 4 * slab.mask_rows * slab.grid.words)
-    row_states_d = allocate(device, slab.mask_rows)
+    row_extents_d = allocate(device, 4 * slab.mask_rows)
     launch(
         device, program["classify_samples"], slab.mask_rows,
-        voxels_d, mask_d, row_states_d, level, *_volume_scalars(slab), np.uint32(slab.mask_slices),
+        voxels_d, mask_d, row_extents_d, level, *_volume_scalars(slab), np.uint32(slab.mask_slices),
         np.int32(slab.grid.words), stopwatch=stopwatch,
     )  # fmt: skip
-    return Classified(mask_d, row_states_d)
+    return Classified(mask_d, row_extents_d)
 
 
 def count(device: Device, slab: Slab, program: Program, classified: Classified, stopwatch: Stopwatch) -> Counted:
@@ -157,7 +157,7 @@ def count(device: Device, slab: Slab, program: Program, classified: Classified, 
     flags_d = allocate(device, 4 * rows * grid.flag_words)
     launch(
         device, program["count_rows"], rows,
-        classified.mask_d, classified.row_states_d, row_counts_d, flags_d, word_vertices_d, word_triangles_d,
+        classified.mask_d, classified.row_extents_d, row_counts_d, flags_d, word_vertices_d, word_triangles_d,
         np.uint32(gi), np.uint32(gj), np.uint32(slab.mask_slices), np.uint32(grid.words), flag_words, counted_rows,
         stopwatch=stopwatch,
     )  # fmt: skip

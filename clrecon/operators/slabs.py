@@ -98,7 +98,7 @@ class Slab:
         return {
             "inside mask": 4 * self.mask_rows * self.grid.words,
             "word counts": 4 * counted_words,
-            "row states": self.mask_rows,
+            "row extents": 4 * self.mask_rows,
             "row counts": 24 * self.counted_rows,
             "word flags": 4 * self.counted_rows * self.grid.flag_words,
             "active words": 4 * self.rows * self.grid.words,

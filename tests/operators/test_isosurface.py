@@ -232,8 +232,8 @@ def test_a_device_that_finds_nothing_is_not_believed(device, monkeypatch):
 
     def find_nothing(device, slab, *_):
         mask = np.zeros(slab.mask_rows * slab.grid.words, np.uint32)
-        states = np.zeros(slab.mask_rows, np.uint8)
-        return marching_cubes.Classified(*(marching_cubes.upload(device, array) for array in (mask, states)))
+        extents = np.zeros(2 * slab.mask_rows, np.uint16)
+        return marching_cubes.Classified(*(marching_cubes.upload(device, array) for array in (mask, extents)))
 
     monkeypatch.setattr(marching_cubes, "classify", find_nothing)
     with pytest.raises(DeviceError, match="it computes wrongly"):
