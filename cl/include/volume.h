@@ -12,6 +12,10 @@
 #define VALUE int
 #endif
 
+#define CLRECON_JOIN(a, b) a##b
+#define CLRECON_VECTOR(type, n) CLRECON_JOIN(type, n)
+#define VOXEL8 CLRECON_VECTOR(VOXEL, 8)
+
 /* Linear index of voxel (i, j, k) of a volume of ni columns and nj rows a slice: i runs fastest. */
 static inline size_t voxel_index(int i, int j, int k, int ni, int nj)
 {

@@ -17,6 +17,7 @@ from clrecon.mesh import Mesh
 from clrecon.opencl import Device, choose_device, describe_shortage, memory_limits
 from clrecon.opencl.quirks import cache_warnings
 from clrecon.operators import marching_cubes
+from clrecon.operators.bricks import BrickRanges, BrickStates, compare_bricks, measure_bricks
 from clrecon.operators.marching_cubes import Counted, Placement
 from clrecon.operators.slabs import SampleGrid, Slab, plan_slabs
 
@@ -105,6 +106,8 @@ class SurfaceExtractor:
         self.device = choose_device(device)
         self.memory = memory
         self._resident_d: Any = None
+        self._bricks: BrickRanges | None = None
+        self._extractions = 0
         self._slices: dict[int, int] = {}
         self._placements: dict[int, Placement] = {}
 
@@ -118,7 +121,7 @@ class SurfaceExtractor:
 
     def close(self) -> None:
         """Free the volume on the device."""
-        self._resident_d = None
+        self._resident_d = self._bricks = None
 
     def forecast(self, *, closed: bool = True) -> dict[str, int]:
         """What an extraction will take, before anything is computed.
@@ -157,6 +160,7 @@ class SurfaceExtractor:
             prepare_isosurface(self.device, self.volume.voxels.dtype)
         if progress is not None:
             progress("build", 1, 1)
+        self._extractions += 1
         positions, normals, triangles = run.all_slabs(self._plan(grid), progress)
         return Mesh(positions, triangles, normals, run.describe(len(positions), len(triangles)))
 
@@ -182,9 +186,23 @@ class SurfaceExtractor:
             self._resident_d = voxels_d
         return voxels_d
 
+    def _compare_bricks(self, level: Any, stopwatch: Stopwatch) -> BrickStates | None:
+        """How the bricks of a resident volume compare with `level`; None before it pays to measure them.
+
+        Measuring takes as long as the first pass over the volume, so a single extraction does without.
+        """
+        if self._resident_d is None or self._extractions < 2:
+            return None
+        if self._bricks is None:
+            volume = self.volume
+            self._bricks = measure_bricks(
+                self.device, self._resident_d, volume.shape_ijk, volume.voxels.dtype, stopwatch=stopwatch
+            )
+        return compare_bricks(self.device, self._bricks, level, stopwatch=stopwatch)
+
     def _use_smaller_slabs(self, border: int, slices: int) -> None:
         """Remember that slabs of more slices do not go through."""
-        self._resident_d = None
+        self._resident_d = self._bricks = None
         self._slices[border] = slices
 
 
@@ -241,7 +259,8 @@ class _Run:
         with stopwatch.timed("upload"):
             voxels_d = self.extractor._upload(slab)
         with stopwatch.running(device):
-            classified = marching_cubes.classify(device, slab, program, voxels_d, self.level, stopwatch)
+            bricks = self.extractor._compare_bricks(self.level, stopwatch)
+            classified = marching_cubes.classify(device, slab, program, voxels_d, self.level, stopwatch, bricks)
             counted = marching_cubes.count(device, slab, program, classified, stopwatch)
         self._check_output(slab, counted)
         part = marching_cubes.emit(

@@ -13,14 +13,12 @@ from clrecon.geometry import Volume, is_left_handed
 from clrecon.geometry.field import slice_normal_matrices, vertex_margin
 from clrecon.kernels import Program, Stopwatch, allocate, download, empty_output, launch, load_program, upload
 from clrecon.opencl import Device
+from clrecon.operators.bricks import BrickStates
 from clrecon.operators.compaction import exclusive_scan, prepare_scan
 from clrecon.operators.slabs import Slab
+from clrecon.operators.voxel_types import voxel_variants
 
 __all__ = ["Classified", "Counted", "Placement", "classify", "count", "emit", "prepare_marching_cubes"]
-
-VOXEL_TYPES = {
-    "int8": "char", "uint8": "uchar", "int16": "short", "uint16": "ushort", "int32": "int", "float32": "float",
-}  # fmt: skip
 
 LONGEST_ROW = 13_000
 """Samples a row: places in a row are 16-bit numbers, and a cell has at most 5 triangles."""
@@ -60,9 +58,7 @@ def prepare_marching_cubes(device: Device, dtype: DTypeLike) -> Program:
         The driver's compiler refuses.
     """
     prepare_scan(device)
-    dtype = np.dtype(dtype)
-    variants = {"VOXEL": VOXEL_TYPES[dtype.name], "VALUE": "float" if dtype.kind == "f" else "int"}
-    return load_program(device, "isosurface/marching_cubes.cl", {**variants, **device.kernel_variants})
+    return load_program(device, "isosurface/marching_cubes.cl", {**voxel_variants(dtype), **device.kernel_variants})
 
 
 def _pad4(rows: NDArray[np.float64]) -> NDArray[np.float32]:
@@ -118,7 +114,13 @@ def _volume_scalars(slab: Slab) -> tuple[Any, ...]:
 
 
 def classify(
-    device: Device, slab: Slab, program: Program, voxels_d: Any, level: Any, stopwatch: Stopwatch
+    device: Device,
+    slab: Slab,
+    program: Program,
+    voxels_d: Any,
+    level: Any,
+    stopwatch: Stopwatch,
+    bricks: BrickStates | None = None,
 ) -> Classified:
     """Pass 1: which samples of the slab are inside.
 
@@ -128,9 +130,19 @@ def classify(
         The slices ``slab.voxel_slices`` of the volume.
     level : scalar of the voxels' type
         Lowest inside value.
+    bricks : BrickStates, optional
+        How the bricks of the volume compare with `level`, where the slab is all of it.
     """
     mask_d = allocate(device, 4 * slab.mask_rows * slab.grid.words)
     row_extents_d = allocate(device, 4 * slab.mask_rows)
+    if bricks is not None:
+        shape, border = slab.grid.volume.shape_ijk, slab.grid.rule.border
+        launch(
+            device, program["classify_bricks"], slab.mask_rows,
+            bricks.states_d, bricks.extents_d, voxels_d, mask_d, row_extents_d, level,
+            *(np.int32(n) for n in (*shape, border, slab.grid.words)), stopwatch=stopwatch,
+        )  # fmt: skip
+        return Classified(mask_d, row_extents_d)
     launch(
         device, program["classify_samples"], slab.mask_rows,
         voxels_d, mask_d, row_extents_d, level, *_volume_scalars(slab), np.uint32(slab.mask_slices),

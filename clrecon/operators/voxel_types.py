@@ -1,0 +1,18 @@
+"""How kernels are told the type of a volume's voxels."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import DTypeLike
+
+__all__ = ["voxel_variants"]
+
+_NAMES = {
+    "int8": "char", "uint8": "uchar", "int16": "short", "uint16": "ushort", "int32": "int", "float32": "float",
+}  # fmt: skip
+
+
+def voxel_variants(dtype: DTypeLike) -> dict[str, str]:
+    """``-D`` definitions of VOXEL and VALUE, see cl/include/volume.h."""
+    dtype = np.dtype(dtype)
+    return {"VOXEL": _NAMES[dtype.name], "VALUE": "float" if dtype.kind == "f" else "int"}

@@ -1,0 +1,64 @@
+"""Bricks: measured and compared as their twin does, and no surface depends on them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from test_isosurface import OBLIQUE, random_volume, smooth_volume
+
+from clrecon.geometry import Volume
+from clrecon.kernels import download, upload
+from clrecon.operators.bricks import compare_bricks, measure_bricks
+from clrecon.operators.isosurface import SurfaceExtractor, extract_isosurface
+from clrecon.reference import bricks as twin
+
+SHAPES = [(1, 1, 1), (3, 9, 7), (8, 8, 8), (9, 7, 8), (17, 16, 33), (8, 9, 100)]
+
+
+@pytest.mark.parametrize("dtype", ["int8", "uint8", "int16", "uint16", "int32", "float32"])
+@pytest.mark.parametrize("shape", SHAPES)
+def test_ranges_and_states_equal_those_of_the_twin(device, shape, dtype):
+    volume = random_volume(shape, dtype, high=100)
+    volume.voxels[:, :, shape[2] // 2 :] = 99  # all inside, and all outside of higher levels
+    measured = measure_bricks(device, upload(device, volume.voxels), volume.shape_ijk, volume.voxels.dtype)
+    expected = twin.measure_bricks(volume.voxels)
+    assert measured.shape == expected.shape[2::-1]
+    assert np.array_equal(download(device, np.empty_like(expected), measured.ranges_d), expected)
+    for level in (0, 50, 99, 100):
+        compared = compare_bricks(device, measured, volume.voxels.dtype.type(level))
+        states, extents = twin.compare_bricks(expected, level)
+        assert np.array_equal(download(device, np.empty_like(states), compared.states_d), states)
+        assert np.array_equal(download(device, np.empty_like(extents), compared.extents_d), extents)
+
+
+@pytest.mark.parametrize("closed", [True, False])
+@pytest.mark.parametrize("dtype", ["int16", "float32"])
+@pytest.mark.parametrize("shape", [(3, 9, 7), (9, 10, 33), (24, 17, 64), (5, 30, 100), (2, 3, 1030)])
+def test_the_surface_is_the_same_with_and_without(device, shape, dtype, closed):
+    """Blocks of equal values, so that there are bricks of all kinds at every place of a word."""
+    random = np.random.default_rng(3)
+    blocks = random.integers(0, 4, [-(-n // 6) for n in shape])
+    voxels = np.kron(blocks, np.ones((6, 6, 6)))[tuple(slice(n) for n in shape)].astype(dtype)
+    voxels[random.integers(0, 50, shape) == 0] = 2
+    volume = Volume(voxels, OBLIQUE)
+    with SurfaceExtractor(volume, device) as extractor:
+        for iso_value in (1, 2, 3, 1.5):
+            mesh = extractor.extract(iso_value, closed=closed)
+            expected = extract_isosurface(volume, iso_value, device, closed=closed)
+            assert np.array_equal(mesh.triangles, expected.triangles)
+            assert np.array_equal(mesh.vertices, expected.vertices)
+        assert "classify_bricks" in mesh.report["kernel_seconds"]
+
+
+def test_a_single_extraction_measures_no_bricks(device):
+    kernels = extract_isosurface(smooth_volume(), 100, device).report["kernel_seconds"]
+    assert "classify_samples" in kernels and "measure_bricks" not in kernels
+
+
+@pytest.mark.oclgrind
+def test_bricks_stay_within_their_buffers(device):
+    for shape in [(9, 10, 33), (3, 9, 7)]:
+        volume = random_volume(shape)
+        with SurfaceExtractor(volume, device) as extractor:
+            first, second = extractor.extract(3), extractor.extract(3)
+        assert np.array_equal(first.triangles, second.triangles)
