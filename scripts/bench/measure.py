@@ -7,15 +7,13 @@ import os
 import platform
 import subprocess
 import sys
-import threading
 import time
-import zlib
 from collections.abc import Callable, Sequence
 from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from clrecon.pipeline.machine import processor_name, usable_cores
+from clrecon.pipeline.machine import free_cores, processor_name, usable_cores
 from clrecon.pipeline.pairs import alternate, spread, summarise
 from clrecon.version import package_version
 
@@ -23,7 +21,6 @@ __all__ = [
     "Costs",
     "alternate",
     "describe_machine",
-    "free_cores",
     "medians",
     "run_program",
     "spread",
@@ -90,32 +87,6 @@ def medians(runs: Sequence[dict[str, float]]) -> dict[str, float]:
     """Median over runs of each named number."""
     names = dict.fromkeys(name for run in runs for name in run)
     return {name: spread([run[name] for run in runs if name in run])["median"] for name in names}
-
-
-def free_cores(seconds: float = 0.3) -> float:
-    """How many cores are really free now: what threads get done together against one alone.
-
-    Checksums of memory that fits the cache, so that bandwidth does not count.
-    """
-    block = bytes(1 << 18)
-
-    def work(done: list[int]) -> None:
-        end, count = time.perf_counter() + seconds, 0
-        while time.perf_counter() < end:
-            for _ in range(8):
-                zlib.crc32(block)  # lets other threads run
-            count += 1
-        done.append(count)
-
-    alone: list[int] = []
-    together: list[int] = []
-    work(alone)
-    threads = [threading.Thread(target=work, args=(together,)) for _ in range(usable_cores())]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    return sum(together) / max(alone[0], 1)
 
 
 def describe_machine() -> dict[str, Any]:

@@ -72,12 +72,12 @@ def choose_levels(voxels: NDArray[Any], points: int = POINTS, most: float = MOST
     falling = candidates[::-1]
     counts = np.array(estimate_triangles(voxels, list(falling)))
     # From sparse to dense: what the densest level so far has is passed on, so that counts only rise.
-    rising, first = np.unique(np.minimum(np.maximum.accumulate(counts), most), return_index=True)
+    rising, first = np.unique(np.maximum.accumulate(counts), return_index=True)
     levels = falling[first]
     some = rising > 0
     if not some.any():
         return [float(falling[-1])]
-    wanted = np.linspace(rising[some][0], rising[-1], points)
+    wanted = np.linspace(rising[some][0], min(rising[-1], most), points)
     return [float(round(level)) for level in np.interp(wanted, rising[some], levels[some])]
 
 
