@@ -61,16 +61,18 @@ class FlyingEdges:
 
         return str(vtkVersion.GetVTKVersion())
 
-    def run(self, level: float) -> PeerRun:
+    def run(self, level: float, keep: list[Any] | None = None) -> PeerRun:
         """Contour at `level` (HU, where the surface lies between two voxels) with a filter of its own.
 
-        The output is freed before this returns.
+        The output is freed before this returns, unless there is a list to `keep` it.
         """
         contour = self._make_filter(level)
         start = perf_counter()
         contour.Update()
         seconds = perf_counter() - start
         output = contour.GetOutput()
+        if keep is not None:
+            keep.append(output)
         return PeerRun(seconds, output.GetNumberOfPoints(), output.GetNumberOfCells())
 
     def _make_filter(self, level: float) -> Any:

@@ -146,8 +146,18 @@ def keep(result: dict[str, Any], folder: Path | None) -> None:
         side = result.get("sides", {}).get(name)
         times = f"  {seconds(side['clrecon_s']['median'])} : {seconds(side['peer_s']['median'])}" if side else ""
         print(f"  {name:<18}{ratio['median']:6.2f}  ({ratio['q1']:.2f} to {ratio['q3']:.2f}){times}", flush=True)
+    shares = result.get("kernel_percent_of_copy", {})
     for name, value in result.get("kernel_seconds", {}).items():
-        print(f"    {name:<28}{seconds(value):>10}")
+        share = f"{shares[name]:6.1f} % of copy bandwidth" if shares.get(name) else ""
+        print(f"    {name:<28}{seconds(value):>10}{share}")
+    for name, sides in result.get("resident_scratch_bytes_a_voxel", {}).items():
+        print(f"    scratch, {name:<19}{sides['median']:10.3f} bytes a voxel")
+    if result.get("scratch_bytes_a_voxel") is not None:
+        print(f"    scratch, as summed          {result['scratch_bytes_a_voxel']:10.3f} bytes a voxel")
+    for over, fits in result.get("fits", {}).items():
+        print(f"    linear over {over}: R2 {fits['clrecon']['r2']:.4f} (peer {fits['peer']['r2']:.4f})")
+    if result.get("stand_in"):
+        print("    stand-in: this version has no resident volume, each surface uploads it anew", flush=True)
     if folder is not None:
         write_json(result_path(folder, result), result)
 

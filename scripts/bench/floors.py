@@ -18,7 +18,14 @@ from numpy.typing import NDArray
 
 from clrecon.pipeline.machine import usable_cores
 
-__all__ = ["active_brick_share", "copy_bandwidth", "floor_bytes", "share_of_floor"]
+__all__ = [
+    "active_brick_share",
+    "copy_bandwidth",
+    "floor_bytes",
+    "kernel_bytes",
+    "share_of_floor",
+    "usable_bandwidth",
+]
 
 BRICK = 8
 _COPY_BYTES = 1 << 28
@@ -31,9 +38,25 @@ def floor_bytes(voxels: int, itemsize: int, vertices: int, triangles: int, is_cp
     return round(itemsize * voxels * read_share + transits * voxels / 8 * read_share + output)
 
 
-def share_of_floor(moved: int, bandwidth: dict[str, float], seconds: float) -> float:
-    """Per cent of the best measured bandwidth (bytes read and written a second) that a run achieves."""
-    return 100.0 * moved / max(bandwidth.values()) / seconds
+def kernel_bytes(voxels: int, itemsize: int, vertices: int, triangles: int) -> dict[str, int]:
+    """Bytes that the heavy kernels must move at least, each input read once, by kernel."""
+    mask = voxels // 8
+    return {
+        "classify_samples": itemsize * voxels + mask,
+        "count_rows": mask,
+        "emit_vertices": 24 * vertices,
+        "emit_triangles": 12 * triangles,
+    }
+
+
+def usable_bandwidth(bandwidth: dict[str, float], device: Any) -> float:
+    """The best measured copy on a CPU; on another device its own."""
+    return max(bandwidth.values()) if device.type == "cpu" else bandwidth["opencl"]
+
+
+def share_of_floor(moved: int, bandwidth: float, seconds: float) -> float | None:
+    """Per cent of a bandwidth (bytes read and written a second) that a run achieves; None without a time."""
+    return 100.0 * moved / bandwidth / seconds if seconds > 0 else None
 
 
 def active_brick_share(voxels: NDArray[Any], lowest_inside: float) -> float:

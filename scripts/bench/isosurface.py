@@ -5,10 +5,18 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from itertools import islice, repeat
 from typing import Any
 
-from floors import active_brick_share, copy_bandwidth, floor_bytes, share_of_floor
-from measure import Costs, alternate, medians, summarise
+from floors import (
+    active_brick_share,
+    copy_bandwidth,
+    floor_bytes,
+    kernel_bytes,
+    share_of_floor,
+    usable_bandwidth,
+)
+from measure import Costs, alternate, medians, spread, summarise
 from registry import Job, case
 
 __all__ = ["LEVEL_STEPS", "OwnSide", "PeerSide", "measure_cold", "measure_resident"]
@@ -18,8 +26,8 @@ LEVEL_STEPS = (0, 150, 40, 250, 80, 300, 20)
 value is ever asked for twice and nothing can be kept by value."""
 
 PAGES = (
-    "outputs of a call are freed before the next one; whether the C library then gives the same pages back or the"
-    " system maps new ones is in the page_faults of each side (about none: recycled)"
+    "all_threads, sequential: the outputs of a call are freed before the next one, so that clrecon, the C library or"
+    " the system may give the same pages again; fresh_pages: all outputs are kept; page_faults count what was new"
 )
 
 
@@ -29,13 +37,14 @@ class OwnSide:
     def __init__(self, extract: Callable[[float], Any]):
         self._extract = extract
         self.costs = Costs()
+        self.keep: list[Any] | None = None
         self.kernels: list[dict[str, float]] = []
         self.parts: list[dict[str, float]] = []
         self.counts: list[tuple[int, int]] = []
         self.device_bytes: dict[str, int] | None = None
 
     def run(self, hu: float) -> float:
-        """Seconds of one surface; the mesh is freed before this returns."""
+        """Seconds of one surface; the mesh is freed before this returns, unless there is a list to `keep` it."""
         start = time.perf_counter()
         mesh = self.costs.measure(lambda: self._extract(hu))
         seconds = time.perf_counter() - start
@@ -43,6 +52,8 @@ class OwnSide:
         self.parts.append(mesh.report.get("seconds", {}))
         self.device_bytes = mesh.report.get("device_bytes")
         self.counts.append((len(mesh.vertices), len(mesh.triangles)))
+        if self.keep is not None:
+            self.keep.append(mesh)
         return seconds
 
     def describe(self) -> dict[str, Any]:
@@ -64,12 +75,13 @@ class PeerSide:
         self._peer = FlyingEdges(volume, threads)
         self._volume = volume
         self.costs = Costs()
+        self.keep: list[Any] | None = None
         self.counts: list[tuple[int, int]] = []
 
     def run(self, hu: float) -> float:
-        """Seconds of one surface at the level where clrecon puts it; the output is freed before this returns."""
+        """Seconds of one surface at the level where clrecon puts it; the output is freed or kept as there."""
         level = level_of(self._volume, hu)
-        done = self.costs.measure(lambda: self._peer.run(level))
+        done = self.costs.measure(lambda: self._peer.run(level, self.keep))
         self.counts.append((done.vertices, done.triangles))
         return float(done.seconds)
 
@@ -88,47 +100,70 @@ def level_of(volume: Any, hu: float) -> float:
 
 
 def describe_surface(
-    job: Job, volume: Any, counts: tuple[int, int], seconds: float, read_share: float
+    job: Job, volume: Any, side: dict[str, Any], counts: tuple[int, int], seconds: float, read_share: float
 ) -> dict[str, Any]:
-    """Counts, rates and the share of the physical floor."""
+    """Counts, rates, time by kernel, and the shares of the physical floor."""
     bandwidth = copy_bandwidth(job.device)
-    vertices, triangles = counts
-    moved = floor_bytes(
-        volume.voxels.size, volume.voxels.itemsize, vertices, triangles, job.device.type == "cpu", read_share
-    )
+    best = usable_bandwidth(bandwidth, job.device)
+    shape = (volume.voxels.size, volume.voxels.itemsize, *counts)
+    moved = floor_bytes(*shape, job.device.type == "cpu", read_share)
+    kernels = side["clrecon"]["kernel_seconds"]
     return {
-        "vertices": vertices,
-        "triangles": triangles,
+        "vertices": counts[0],
+        "triangles": counts[1],
         "mvoxels_per_s": 1e-6 * volume.voxels.size / seconds,
-        "mtriangles_per_s": 1e-6 * triangles / seconds,
+        "mtriangles_per_s": 1e-6 * counts[1] / seconds,
+        "kernel_seconds": kernels,
+        "device_bytes": side["clrecon"]["device_bytes"],
         "copy_bytes_per_s": bandwidth,
         "floor_bytes": moved,
         "floor_read_share": read_share,
-        "percent_of_floor": share_of_floor(moved, bandwidth, seconds),
+        "percent_of_floor": share_of_floor(moved, best, seconds),
+        "kernels_percent_of_floor": share_of_floor(moved, best, sum(kernels.values())),
+        "kernel_percent_of_copy": {
+            name: share_of_floor(moved_by, best, kernels[name])
+            for name, moved_by in kernel_bytes(*shape).items()
+            if kernels.get(name)
+        },
         "pages": PAGES,
     }
 
 
-def compare_sides(job: Job, own: OwnSide, volume: Any, hus: Callable[[], Iterator[float]]) -> dict[str, Any]:
-    """Time clrecon against flying edges with all threads, then against the sequential default in fewer pairs."""
+def compare_sides(
+    job: Job, make_own: Callable[[], OwnSide], volume: Any, hus: Callable[[], Iterator[float]], *, fresh: bool
+) -> dict[str, Any]:
+    """Time clrecon against flying edges with all threads; then, in fewer pairs, against the sequential default, and
+    (`fresh`) with all threads again while every output is kept."""
+    variants = [("all_threads", job.peer_threads, job.pairs)]
+    if job.peer_threads > 1:
+        variants.append(("sequential", 1, min(job.pairs, 7)))
+    if fresh:
+        variants.append(("fresh_pages", job.peer_threads, min(job.pairs, 5)))
     figures: dict[str, Any] = {"ratios": {}, "sides": {}}
-    for name, threads, pairs in (("all_threads", job.peer_threads, job.pairs), ("sequential", 1, min(job.pairs, 7))):
-        if name == "sequential" and job.peer_threads == 1:
-            continue
-        peer = PeerSide(volume, threads)
-        mine, his = hus(), hus()
-        start = len(own.counts)
-        ours, theirs = alternate(lambda: own.run(next(mine)), lambda: peer.run(next(his)), pairs, limit_s=job.limit_s)  # noqa: B023
-        summary = summarise(ours, theirs)
+    for name, threads, pairs in variants:
+        own, peer = make_own(), PeerSide(volume, threads)
+        if name == "fresh_pages":
+            own.keep, peer.keep = [], []
+        summary, ours, theirs = _alternate_sides(own, peer, hus, pairs, job.limit_s)
         figures["ratios"][name] = summary["ratio"]
         figures["sides"][name] = {
             **summary,
+            "clrecon": own.describe(),
             "peer": peer.describe(),
-            "equal_counts": own.counts[start:] == peer.counts,
+            "equal_counts": own.counts == peer.counts,
+            "counts": own.counts,
             "ours": ours,
             "theirs": theirs,
         }
     return figures
+
+
+def _alternate_sides(
+    own: OwnSide, peer: PeerSide, hus: Callable[[], Iterator[float]], pairs: int, limit_s: float
+) -> tuple[dict[str, Any], list[float], list[float]]:
+    mine, his = hus(), hus()
+    ours, theirs = alternate(lambda: own.run(next(mine)), lambda: peer.run(next(his)), pairs, limit_s=limit_s)
+    return summarise(ours, theirs), ours, theirs
 
 
 @case("isosurface-cold", "host volume to host mesh, kernels built, against flying edges with all cores")
@@ -138,15 +173,13 @@ def measure_cold(job: Job) -> dict[str, Any]:
 
     volume = job.input.volume()
     prepare_isosurface(job.device, volume.voxels.dtype)
-    own = OwnSide(lambda hu: extract_isosurface(volume, hu, job.device, closed=False))
 
-    def same() -> Iterator[float]:
-        while True:
-            yield job.hu
+    def make_own() -> OwnSide:
+        return OwnSide(lambda hu: extract_isosurface(volume, hu, job.device, closed=False))
 
-    figures = compare_sides(job, own, volume, same)
-    seconds = figures["sides"]["all_threads"]["clrecon_s"]["median"]
-    return {**figures, **own.describe(), **describe_surface(job, volume, own.counts[-1], seconds, 1.0)}
+    figures = compare_sides(job, make_own, volume, lambda: repeat(job.hu), fresh=True)
+    side = figures["sides"]["all_threads"]
+    return {**figures, **describe_surface(job, volume, side, side["counts"][0], side["clrecon_s"]["median"], 1.0)}
 
 
 @contextmanager
@@ -180,19 +213,18 @@ def measure_resident(job: Job) -> dict[str, Any]:
     start = time.perf_counter()
     with open_extractor(volume, job.device) as (extract, is_stand_in):
         opened = time.perf_counter() - start
-        own = OwnSide(extract)
-        figures = compare_sides(job, own, volume, lambda: walk_levels(job.hu))
+        figures = compare_sides(job, lambda: OwnSide(extract), volume, lambda: walk_levels(job.hu), fresh=False)
     side = figures["sides"]["all_threads"]
-    asked = walk_levels(job.hu)
-    levels = [next(asked) for _ in own.counts[: side["pairs"] + 1]]
-    # The floor is that of the first iso value; its runs are those at the places 0, 7, 14 of the walk.
-    first = [seconds for hu, seconds in zip(levels[1:], side["ours"], strict=False) if hu - job.hu < 20]
-    seconds = medians([{"s": value} for value in first or side["ours"]])["s"]
+    levels = list(islice(walk_levels(job.hu), side["pairs"] + 1))
+    # The floor is that of the iso value itself; runs at it (and some HU above) are every seventh of the walk.
+    first = [
+        seconds for hu, seconds in zip(levels[1:], side["ours"], strict=True) if hu - job.hu < min(LEVEL_STEPS[1:])
+    ]
+    seconds = spread(first or side["ours"])["median"]
     share = active_brick_share(volume.voxels, job.hu)
     return {
         **figures,
-        **own.describe(),
-        **describe_surface(job, volume, own.counts[0], seconds, share),
+        **describe_surface(job, volume, side, side["counts"][0], seconds, share),
         "stand_in": is_stand_in,
         "open_seconds": opened,
         "levels_hu": levels,
