@@ -89,6 +89,9 @@ def _describe_device(entry: dict[str, Any]) -> list[str]:
         *((f"  {part}", _seconds(value), "") for part, value in entry["part_seconds"].items()),
         *((f"    {kernel}", _seconds(value), "") for kernel, value in entry["kernel_seconds"].items()),
     ]
+    if entry["resident_seconds"] is not None:
+        resident = entry["resident_seconds"]
+        rows.append(("new iso value", _seconds(resident["median"]), f"{_range(resident)}, volume on the device"))
     if peer is not None:
         threads = f"{peer['threads']} thread{'s' * (peer['threads'] != 1)}"
         rows.append(("flying edges", _seconds(peer["seconds"]["median"]), f"{_range(peer['seconds'])}, {threads}"))

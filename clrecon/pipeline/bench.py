@@ -8,7 +8,7 @@ from pathlib import Path
 from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
-from clrecon.errors import DeviceError, UsageError
+from clrecon.errors import DeviceError, NoSurfaceError, UsageError
 from clrecon.pipeline.machine import free_cores, processor_name, usable_cores
 from clrecon.pipeline.pairs import alternate, spread, summarise
 from clrecon.pipeline.presets import DEFAULT_PRESET, find_preset
@@ -220,6 +220,7 @@ def _measure_device(device: Device, volume: Volume, hu: float, runs: int) -> dic
         "warm_seconds": ours,
         "part_seconds": own.medians("seconds"),
         "kernel_seconds": own.medians("kernel_seconds"),
+        "resident_seconds": _time_resident(device, volume, hu, runs),
         "mvoxels_per_s": 1e-6 * volume.voxels.size / median,
         "mtriangles_per_s": 1e-6 * triangles / median,
         "peer": peer,
@@ -255,6 +256,28 @@ def _time_warm(own: _OwnRuns, volume: Volume, level: float, runs: int) -> tuple[
         "ratio": summary["ratio"],
     }
     return summary["clrecon_s"], peer
+
+
+def _time_resident(device: Device, volume: Volume, hu: float, runs: int) -> dict[str, float] | None:
+    """Spread of surfaces at iso values that are new to a volume on the device; None where no volume stays there."""
+    from clrecon.operators import isosurface
+
+    extractor_type = getattr(isosurface, "SurfaceExtractor", None)
+    if extractor_type is None:
+        return None
+    seconds = []
+    with extractor_type(volume, device) as extractor:
+        extractor.extract(hu, closed=False)
+        for number in range(runs):
+            # Whole HU up and down in turn, so that no value comes twice and all stay close to the one asked for.
+            step = (number // 2 + 1) * (1 if number % 2 == 0 else -1)
+            start = perf_counter()
+            try:
+                extractor.extract(hu + step, closed=False)
+            except NoSurfaceError:  # at the end of what the scan holds
+                continue
+            seconds.append(perf_counter() - start)
+    return spread(seconds) if seconds else None
 
 
 def _collect_warnings(result: dict[str, Any], volume: Volume) -> list[str]:

@@ -18,7 +18,7 @@ CONTRACT = {
 }  # fmt: skip
 OF_A_DEVICE = {
     "device", "error", "vertices", "triangles", "first_seconds", "warm_seconds", "part_seconds", "kernel_seconds",
-    "mvoxels_per_s", "mtriangles_per_s", "peer", "ratio",
+    "mvoxels_per_s", "mtriangles_per_s", "peer", "ratio", "resident_seconds",
 }  # fmt: skip
 
 

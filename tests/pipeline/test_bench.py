@@ -98,6 +98,38 @@ def test_unequal_surfaces_are_told(device: Any, ct: Path, monkeypatch: pytest.Mo
     assert any("flying edges 7: the times are not of the same work" in text for text in result["warnings"])
 
 
+class FakeExtractor:
+    """Has surfaces below 3 HU only."""
+
+    asked: list[float] = []
+
+    def __init__(self, volume: Any, device: Any):
+        self.asked.clear()
+
+    def __enter__(self) -> FakeExtractor:
+        return self
+
+    def __exit__(self, *_: Any) -> None:
+        pass
+
+    def extract(self, iso_value: float, *, closed: bool) -> None:
+        assert not closed
+        if iso_value >= 3:
+            raise NoSurfaceError("too high")
+        self.asked.append(iso_value)
+
+
+def test_no_iso_value_of_a_resident_volume_comes_twice(monkeypatch: pytest.MonkeyPatch) -> None:
+    from clrecon.operators import isosurface
+
+    monkeypatch.setattr(isosurface, "SurfaceExtractor", FakeExtractor, raising=False)
+    nothing: Any = None
+    found = bench._time_resident(nothing, nothing, 0.0, 7)
+    assert FakeExtractor.asked == [0.0, 1.0, -1.0, 2.0, -2.0, -3.0]  # 3 and 4 are beyond the scan
+    assert found is not None and found["min"] > 0
+    assert bench._time_resident(nothing, nothing, 0.0, 0) is None
+
+
 def test_all_devices_are_those_that_can_be_used(device: Any) -> None:
     chosen = bench._choose_devices(" ALL ")
     assert device in chosen or device.is_simulator
