@@ -130,6 +130,18 @@ def test_no_iso_value_of_a_resident_volume_comes_twice(monkeypatch: pytest.Monke
     assert bench._time_resident(nothing, nothing, 0.0, 0) is None
 
 
+def test_all_devices_leave_simulators_and_unusable_ones(device: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    from types import SimpleNamespace
+
+    from clrecon import opencl
+
+    simulator = SimpleNamespace(is_simulator=True, shortcoming="")
+    broken = SimpleNamespace(is_simulator=False, shortcoming="it has no compiler")
+    good = SimpleNamespace(is_simulator=False, shortcoming="")
+    monkeypatch.setattr(opencl, "list_devices", lambda: [simulator, broken, good])
+    assert bench._choose_devices("all") == [good]
+
+
 def test_all_devices_are_those_that_can_be_used(device: Any) -> None:
     chosen = bench._choose_devices(" ALL ")
     assert device in chosen or device.is_simulator

@@ -112,6 +112,8 @@ def test_plots_are_drawn(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> 
         blue = (pixels[..., 2] > 0.5) & (pixels[..., 0] < 0.4)
         red = (pixels[..., 0] > 0.6) & (pixels[..., 2] < 0.4)
         assert blue.sum() > 500 and red.sum() > 500  # clrecon and peer, or ratios on both sides of 1
+        if "scaling" in name:
+            assert 0.7 < blue.sum() / red.sum() < 1.4  # as many points and lines of both
 
 
 def test_nothing_to_plot_is_an_error(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
