@@ -219,7 +219,7 @@ def _measure_device(device: Device, volume: Volume, hu: float, runs: int) -> dic
         "first_seconds": {"open": opened, **first_parts, "total": opened + first},
         "warm_seconds": ours,
         "part_seconds": own.medians("seconds"),
-        "kernel_seconds": own.medians("kernel_seconds"),
+        "kernel_seconds": own.medians("kernel_seconds") if device.has_event_times else {},
         "resident_seconds": _time_resident(device, volume, hu, runs),
         "mvoxels_per_s": 1e-6 * volume.voxels.size / median,
         "mtriangles_per_s": 1e-6 * triangles / median,

@@ -107,7 +107,8 @@ def describe_surface(
     best = usable_bandwidth(bandwidth, job.device)
     shape = (volume.voxels.size, volume.voxels.itemsize, *counts)
     moved = floor_bytes(*shape, job.device.type == "cpu", read_share)
-    kernels = side["clrecon"]["kernel_seconds"]
+    # Some drivers' event times say nothing: no time by kernel then.
+    kernels = side["clrecon"]["kernel_seconds"] if job.device.has_event_times else {}
     return {
         "vertices": counts[0],
         "triangles": counts[1],

@@ -41,6 +41,8 @@ def test_every_stage_of_a_series_is_timed(device: Any, ct: Path, tmp_path: Path)
     assert lowest <= ratio["min"] <= ratio["max"] <= highest
     assert entry["mvoxels_per_s"] == pytest.approx(1e-6 * 48 * 40 * 24 / warm["median"])
     assert {"upload", "build", "kernels", "download"} <= set(entry["part_seconds"])
+    assert bool(entry["kernel_seconds"]) == device.has_event_times
+    assert sum(entry["kernel_seconds"].values()) <= 1.5 * entry["part_seconds"]["kernels"]
     assert entry["first_seconds"]["total"] >= entry["first_seconds"]["open"] > 0
     assert stages[0] == "device" and stages[-1] == "bench" and "read" in stages
 
