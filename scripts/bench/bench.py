@@ -27,7 +27,7 @@ from compare import compare_results, format_changes  # noqa: E402
 from inputs import parse_input  # noqa: E402
 from measure import describe_machine, write_json  # noqa: E402
 from registry import Case, Job, load_cases  # noqa: E402
-from results import SCHEMA, load_results, result_key, result_path  # noqa: E402
+from results import SCHEMA, load_results, pick, result_key, result_path  # noqa: E402
 from tables import format_results, markdown, seconds  # noqa: E402
 
 from clrecon.errors import ClreconError, UsageError  # noqa: E402
@@ -70,6 +70,11 @@ def make_parser() -> argparse.ArgumentParser:
     plot.add_argument("-o", "--output", type=Path, required=True, metavar="PNG")
     table = commands.add_parser("table", help="print a markdown table")
     table.add_argument("folder", type=Path)
+    for shown in (plot, table):
+        shown.add_argument("--case", nargs="+", action="extend", metavar="CASE", help="only these cases")
+        shown.add_argument(
+            "--ratio", nargs="+", action="extend", metavar="R", help="only these ratios (all_threads, ...)"
+        )
     return parser
 
 
@@ -166,7 +171,7 @@ def draw(options: argparse.Namespace) -> int:
     """Write the PNG files and name them."""
     from plots import plot_ratios, plot_scaling
 
-    results = load_results(options.folder)
+    results = pick(load_results(options.folder), options.case, options.ratio)
     bars = plot_ratios(results, options.output)
     print(f"{options.output}: {bars} ratios")
     for result in results.values():
@@ -202,7 +207,7 @@ def main(arguments: list[str] | None = None) -> int:
             return compare_folders(options)
         if options.command == "plot":
             return draw(options)
-        print(format_results(load_results(options.folder)))
+        print(format_results(pick(load_results(options.folder), options.case, options.ratio)))
         return 0
     except (ClreconError, FileNotFoundError, ValueError) as error:
         print(f"bench: error: {error}", file=sys.stderr)

@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-__all__ = ["SCHEMA", "Key", "device_name", "load_results", "result_key", "result_path"]
+__all__ = ["SCHEMA", "Key", "device_name", "load_results", "pick", "result_key", "result_path"]
 
 SCHEMA = 1
 
@@ -55,3 +55,15 @@ def load_results(folder: Path) -> dict[Key, dict[str, Any]]:
         else:
             print(f"{path.name}: no result of this form, passed over", file=sys.stderr)
     return results
+
+
+def pick(
+    results: dict[Key, dict[str, Any]], cases: list[str] | None = None, ratios: list[str] | None = None
+) -> dict[Key, dict[str, Any]]:
+    """The results of some cases with some of their ratios; None is all.  Results without a ratio left stay out."""
+    picked = {}
+    for key, result in results.items():
+        kept = {name: ratio for name, ratio in result["ratios"].items() if ratios is None or name in ratios}
+        if kept and (cases is None or key[0] in cases):
+            picked[key] = {**result, "ratios": kept}
+    return picked

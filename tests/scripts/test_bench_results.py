@@ -95,6 +95,28 @@ def test_the_table_has_one_row_a_ratio(tmp_path: Path, capsys: pytest.CaptureFix
     assert len({len(line) for line in lines}) == 1
 
 
+def test_the_table_shows_memory_and_lines_in_their_units() -> None:
+    scaling, memory = make_scaling_result(), make_result("memory")
+    scaling["ratios"] = {"over_sizes": spread_of(3.0)}
+    memory.update(ratios={"scratch": spread_of(3.0)}, sides={})
+    memory["resident_scratch_bytes_a_voxel"] = {"clrecon": spread_of(0.3), "peer": spread_of(0.9)}
+    made = {results.result_key(result): result for result in (scaling, memory)}
+    rows = tables.format_results(made).splitlines()
+    assert "| 0.30 B/voxel | 0.90 B/voxel | 3.00 " in rows[2]
+    assert "| R2 1.000     | R2 1.000     | 3.00 " in rows[3]
+
+
+def test_cases_and_ratios_can_be_picked(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    cold, job = make_result(), make_result("main-job")
+    cold["ratios"]["sequential"] = spread_of(4.0)
+    folder = keep(tmp_path / "a", cold, job)
+    assert bench.main(["table", str(folder), "--case", "isosurface-cold", "--ratio", "sequential"]) == 0
+    (row,) = capsys.readouterr().out.splitlines()[2:]
+    assert "sequential" in row and "4.00" in row
+    assert len(results.pick(results.load_results(folder))) == 2
+    assert results.pick(results.load_results(folder), None, ["nothing"]) == {}
+
+
 def test_seconds_are_short() -> None:
     assert [tables.seconds(value) for value in (2.345, 0.0345, 0.00034)] == ["2.35 s", "34.5 ms", "0.34 ms"]
 
