@@ -259,14 +259,11 @@ def _time_warm(own: _OwnRuns, volume: Volume, level: float, runs: int) -> tuple[
 
 
 def _time_resident(device: Device, volume: Volume, hu: float, runs: int) -> dict[str, float] | None:
-    """Spread of surfaces at iso values that are new to a volume on the device; None where no volume stays there."""
-    from clrecon.operators import isosurface
+    """Spread of surfaces at iso values that are new to a volume on the device; None where there is only one."""
+    from clrecon.operators.isosurface import SurfaceExtractor
 
-    extractor_type = getattr(isosurface, "SurfaceExtractor", None)
-    if extractor_type is None:
-        return None
     seconds = []
-    with extractor_type(volume, device) as extractor:
+    with SurfaceExtractor(volume, device) as extractor:
         extractor.extract(hu, closed=False)
         for number in range(runs):
             # Whole HU up and down in turn, so that no value comes twice and all stay close to the one asked for.

@@ -161,8 +161,6 @@ def keep(result: dict[str, Any], folder: Path | None) -> None:
         print(f"    scratch, as summed          {result['scratch_bytes_a_voxel']:10.3f} bytes a voxel")
     for over, fits in result.get("fits", {}).items():
         print(f"    linear over {over}: R2 {fits['clrecon']['r2']:.4f} (peer {fits['peer']['r2']:.4f})")
-    if result.get("stand_in"):
-        print("    stand-in: this version has no resident volume, each surface uploads it anew", flush=True)
     if folder is not None:
         write_json(result_path(folder, result), result)
 
