@@ -23,6 +23,7 @@ _STAGES = {
     "draw": "drawing the phantom",
     "blur": "blurring the phantom",
     "selftest": "testing",
+    "bench": "timing",
 }
 _HIDDEN = {*range(0x202A, 0x202F), *range(0x2066, 0x206A), 0x200E, 0x200F, 0x061C}
 _BAR_WIDTH = 24

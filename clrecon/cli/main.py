@@ -30,6 +30,7 @@ COMMANDS = {
     "devices": _Command("clrecon.cli.devices", "show the OpenCL devices and which one would be used"),
     "phantom": _Command("clrecon.cli.phantom", "write a made-up CT series with a known surface"),
     "selftest": _Command("clrecon.cli.selftest", "check that a device computes rightly"),
+    "bench": _Command("clrecon.cli.bench", "time every stage on this computer, beside VTK's flying edges"),
     "demo": _Command("clrecon.cli.demo", "phantom, mesh and report in one go: what clrecon does, in seconds"),
 }
 

@@ -1,61 +1,147 @@
-"""How benches measure: candidate and peer alternate, medians of pairs, and what the machine is."""
+"""How benches measure: processes, page faults, cores that were really had, the machine and its bandwidth."""
 
 from __future__ import annotations
 
 import json
 import os
 import platform
-import statistics
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Sequence
+from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-__all__ = ["alternate", "describe_machine", "run_program", "summarise", "write_json"]
+from clrecon.pipeline.machine import free_cores, processor_name, usable_cores
+from clrecon.pipeline.pairs import alternate, spread, summarise
+from clrecon.version import package_version
+
+__all__ = [
+    "Costs",
+    "alternate",
+    "describe_machine",
+    "medians",
+    "run_program",
+    "spread",
+    "summarise",
+    "write_json",
+]
+
+ROOT = Path(__file__).resolve().parents[2]
+_PACKAGES = ("numpy", "pyopencl", "vtk", "SimpleITK", "scipy", "connected-components-3d")
 
 
-def run_program(command: Sequence[str]) -> tuple[float, str]:
-    """Run a program to its end; wall seconds of the whole process and what it printed."""
+def run_program(command: Sequence[str], timeout_s: float = 600.0) -> tuple[float, str]:
+    """Run a program to its end; wall seconds of the whole process and what it printed.
+
+    Raises
+    ------
+    RuntimeError
+        It fails or takes longer than `timeout_s`.
+    """
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, (str(ROOT), os.environ.get("PYTHONPATH"))))}
     start = time.perf_counter()
-    done = subprocess.run(command, capture_output=True, text=True)
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, env=environment, timeout=timeout_s)
+    except subprocess.TimeoutExpired as error:
+        raise RuntimeError(f"{' '.join(command)} took more than {timeout_s:g} s") from error
     seconds = time.perf_counter() - start
     if done.returncode != 0:
-        sys.exit(f"{' '.join(command)} exited with {done.returncode}: {done.stderr.strip()}")
+        raise RuntimeError(f"{' '.join(command)} exited with {done.returncode}: {done.stderr.strip()[-2000:]}")
     return seconds, done.stdout
 
 
-def alternate(candidate: Callable[[], float], peer: Callable[[], float], pairs: int) -> tuple[list[float], list[float]]:
-    """Warm both up once, then time them in turn `pairs` times."""
-    candidate(), peer()
-    ours, theirs = [], []
-    for _ in range(pairs):
-        ours.append(candidate())
-        theirs.append(peer())
-    return ours, theirs
+class Costs:
+    """What runs of one side cost beside their seconds: page faults, and how many cores they really had."""
+
+    def __init__(self) -> None:
+        self.page_faults: list[int] = []
+        self.cores_used: list[float] = []
+
+    def measure(self, run: Callable[[], Any]) -> Any:
+        """Run, and keep what it cost."""
+        before, start = _usage(), time.perf_counter()
+        result = run()
+        wall, after = time.perf_counter() - start, _usage()
+        self.page_faults.append(int(after[0] - before[0]))
+        self.cores_used.append((after[1] - before[1]) / wall)
+        return result
+
+    def describe(self) -> dict[str, float]:
+        """Medians of a run."""
+        return {"page_faults": spread(self.page_faults)["median"], "cores_used": spread(self.cores_used)["median"]}
 
 
-def summarise(ours: list[float], theirs: list[float]) -> dict[str, Any]:
-    """Medians, spreads and the median of the ratios pair by pair (over 1: clrecon is faster)."""
-    ratios = [b / a for a, b in zip(ours, theirs, strict=True)]
-    return {
-        "pairs": len(ours),
-        "clrecon_s": {"median": statistics.median(ours), "min": min(ours), "max": max(ours)},
-        "peer_s": {"median": statistics.median(theirs), "min": min(theirs), "max": max(theirs)},
-        "ratio": {"median": statistics.median(ratios), "min": min(ratios), "max": max(ratios)},
-    }
+def _usage() -> tuple[int, float]:
+    """Page faults and processor seconds of this process so far (no faults where the system does not count)."""
+    try:
+        import resource
+    except ImportError:  # Windows
+        return 0, time.process_time()
+    usage = resource.getrusage(resource.RUSAGE_SELF)
+    return usage.ru_minflt + usage.ru_majflt, usage.ru_utime + usage.ru_stime
+
+
+def medians(runs: Sequence[dict[str, float]]) -> dict[str, float]:
+    """Median over runs of each named number."""
+    names = dict.fromkeys(name for run in runs for name in run)
+    return {name: spread([run[name] for run in runs if name in run])["median"] for name in names}
 
 
 def describe_machine() -> dict[str, Any]:
     """What a reader needs to place the figures."""
+    versions = {"clrecon": package_version()}
+    for name in _PACKAGES:
+        try:
+            versions[name] = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            continue
     return {
         "system": f"{platform.system()} {platform.machine()}",
-        "cores": os.cpu_count(),
+        "kernel": platform.release(),
+        "processor": processor_name(),
+        "cores": usable_cores(),
+        "free_cores": round(free_cores(), 2),
+        "load_average": list(os.getloadavg()) if hasattr(os, "getloadavg") else None,
+        "caches": _caches(),
         "python": platform.python_version(),
+        "packages": versions,
+        "revision": _revision(),
     }
+
+
+def _caches(folder: Path = Path("/sys/devices/system/cpu/cpu0/cache")) -> dict[str, str] | None:
+    """Size of each cache as the system says it; None where it does not."""
+    caches = {}
+    for entry in sorted(folder.glob("index*")):
+        try:
+            level, kind, size = ((entry / name).read_text().strip() for name in ("level", "type", "size"))
+        except OSError:
+            continue
+        caches[f"L{level} {kind.lower()}"] = size
+    return caches or None
+
+
+def _revision() -> str | None:
+    """Git revision of the measured code, with a + when files differ from it."""
+    try:
+        done = subprocess.run(
+            ["git", "describe", "--always", "--dirty=+", "--exclude=*"], cwd=ROOT, capture_output=True, text=True
+        )
+    except OSError:
+        return None
+    return done.stdout.strip() or None
 
 
 def write_json(path: Path, result: dict[str, Any]) -> None:
     """Keep a result, readable and stable under diff."""
-    path.write_text(json.dumps(result, indent=2, sort_keys=True) + "\n")
+    from clrecon.pipeline.report import to_json
+
+    plain = json.loads(to_json(result))
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps(plain, indent=2, sort_keys=True) + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    json.dump(describe_machine(), sys.stdout, indent=2)

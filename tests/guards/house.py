@@ -58,7 +58,7 @@ INSIDE_FUNCTIONS: dict[str, frozenset[str]] = {
     "opencl": frozenset({"pyopencl"}),
     "kernels": frozenset({"pyopencl"}),
     "operators": frozenset({"pyopencl"}),
-    "pipeline": frozenset({"pyvista", "skimage"}),
+    "pipeline": frozenset({"pyvista", "skimage", "vtkmodules"}),  # vtkmodules: flying edges, the peer of the bench
     "viewer": frozenset({"pyvista", "vtk", "vtkmodules"}),
 }
 

@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
-"""Peer of `clrecon mesh`: read with SimpleITK, contour with vtkFlyingEdges3D on two threads, write STL with VTK.
+"""Peer of `clrecon mesh`: read with SimpleITK, contour with vtkFlyingEdges3D on all threads, write STL with VTK.
 
-Usage: simpleitk_vtk.py CT_FOLDER OUTPUT.stl HU.  Prints its seconds by part as JSON.
+Usage: simpleitk_vtk.py CT_FOLDER OUTPUT.stl HU THREADS.  Prints its seconds by part as JSON.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import sys
 import time
 
 
-def main(folder: str, output: str, iso_value: float) -> None:
+def main(folder: str, output: str, iso_value: float, threads: int) -> None:
     start = time.perf_counter()
     import SimpleITK as sitk
     from vtkmodules.util.numpy_support import numpy_to_vtk
@@ -28,7 +28,7 @@ def main(folder: str, output: str, iso_value: float) -> None:
     read = time.perf_counter()
 
     vtkSMPTools.SetBackend("STDThread")
-    vtkSMPTools.Initialize(2)
+    vtkSMPTools.Initialize(threads)
     grid = vtkImageData()
     grid.SetDimensions(*image.GetSize())
     grid.SetSpacing(*image.GetSpacing())
@@ -60,4 +60,4 @@ def main(folder: str, output: str, iso_value: float) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1], sys.argv[2], float(sys.argv[3]))
+    main(sys.argv[1], sys.argv[2], float(sys.argv[3]), int(sys.argv[4]))

@@ -1,0 +1,113 @@
+"""``clrecon bench``: how fast it is here, stage by stage."""
+
+from __future__ import annotations
+
+import argparse
+from typing import Any
+
+from clrecon.cli.common import add_device, table
+from clrecon.cli.console import Console, printable
+
+__all__ = ["add_arguments", "run"]
+
+PARTLY_DONE = 8
+_RUNS = 7
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of the command."""
+    parser.epilog = (
+        "Times the stages from the scan to its surface, and VTK's flying edges (all cores, normals on) on the same\n"
+        'voxels at the same level, in turn. "--device all" takes every device one after the other. Ratios are medians\n'
+        "of pairs with their quartiles: above 1 clrecon is faster. The report holds no patient data.\n\n"
+        "examples:\n"
+        "  clrecon bench\n"
+        "  clrecon bench CT_FOLDER --hu 250 --device all --report bench.json"
+    )
+    parser.add_argument("input", metavar="INPUT", nargs="?", help="DICOM folder or file (default: a made-up spine)")
+    parser.add_argument("--hu", type=float, metavar="N", help="iso value in HU (default: the preset bone)")
+    parser.add_argument("--series", metavar="S", help='number or hash of the series, see "clrecon info"')
+    add_device(parser)
+    parser.add_argument("--runs", type=int, default=_RUNS, metavar="N", help=f"timed pairs (default: {_RUNS})")
+    parser.add_argument("--report", metavar="FILE", help="write the figures as JSON")
+
+
+def run(options: argparse.Namespace, console: Console) -> int:
+    """Run the command; returns the exit code."""
+    from clrecon.pipeline.bench import run_bench
+
+    result = run_bench(
+        options.input,
+        iso_value=options.hu,
+        device=options.device,
+        runs=options.runs,
+        series=options.series,
+        report_path=options.report,
+        progress=console.progress,
+    )
+    console.result(result)
+    for line in _describe(result):
+        console.say(line)
+    if options.report:
+        console.say(f"\nreport   {printable(options.report)}")
+    for warning in result["warnings"]:
+        console.warn(warning)
+    return PARTLY_DONE if any(entry["error"] for entry in result["devices"]) else 0
+
+
+def _describe(result: dict[str, Any]) -> list[str]:
+    given = result["input"]
+    ni, nj, nk = given["shape_ijk"]
+    spacing = " x ".join(f"{step:.4g}" for step in given["spacing_mm"])
+    name, read = ("phantom", "make") if given["kind"] == "phantom" else ("series", "read")
+    rate = 1e-6 * given["voxels"] / result["seconds"][read]
+    lines = [
+        f"input    {name}, {nk} slices of {ni} x {nj}, spacing {spacing} mm",
+        f"surface  {result['iso_value_hu']:g} HU, open at the border of the volume",
+        f"system   {printable(result['processor'])}, {result['cores']} cores ({result['free_cores']:.1f} free),"
+        f" {result['platform']}",
+        f"{read:<8} {_seconds(result['seconds'][read])} ({rate:,.0f} Mvoxel/s)",
+    ]
+    for entry in result["devices"]:
+        lines += ["", *_describe_device(entry)]
+    return lines
+
+
+def _describe_device(entry: dict[str, Any]) -> list[str]:
+    device = entry["device"]
+    name = printable(f"{device['name']} ({device['platform']}, driver {device['driver']})")
+    head = f"device {device['index']} {name}"
+    if entry["error"]:
+        return [head, f"  failed: {printable(entry['error'])}"]
+    first, warm, peer = entry["first_seconds"], entry["warm_seconds"], entry["peer"]
+    opening = ", ".join(
+        f"{part} {_seconds(first.get(part, 0.0))}" for part in ("open", "build", "upload", "kernels", "download")
+    )
+    rows = [
+        ("first surface", _seconds(first["total"]), opening),
+        ("later ones", _seconds(warm["median"]), _range(warm)),
+        *((f"  {part}", _seconds(value), "") for part, value in entry["part_seconds"].items()),
+        *((f"    {kernel}", _seconds(value), "") for kernel, value in entry["kernel_seconds"].items()),
+    ]
+    if entry["resident_seconds"] is not None:
+        resident = entry["resident_seconds"]
+        rows.append(("new iso value", _seconds(resident["median"]), f"{_range(resident)}, volume on the device"))
+    if peer is not None:
+        threads = f"{peer['threads']} thread{'s' * (peer['threads'] != 1)}"
+        rows.append(("flying edges", _seconds(peer["seconds"]["median"]), f"{_range(peer['seconds'])}, {threads}"))
+        rows.append(("ratio", f"{entry['ratio']['median']:.2f}", _ratio_range(entry["ratio"])))
+    rates = f"{entry['mvoxels_per_s']:,.0f} Mvoxel/s, {entry['mtriangles_per_s']:,.1f} Mtriangle/s"
+    counts = f"{entry['vertices']:,} vertices, {entry['triangles']:,} triangles"
+    return [head, *(f"  {line}" for line in table(rows, right=(1,))), f"  {counts}, {rates}"]
+
+
+def _seconds(value: float) -> str:
+    return f"{value:.2f} s" if value >= 1.0 else f"{1e3 * value:.2f} ms"
+
+
+def _range(spread: dict[str, float]) -> str:
+    return f"quartiles {_seconds(spread['q1'])} to {_seconds(spread['q3'])}"
+
+
+def _ratio_range(spread: dict[str, float]) -> str:
+    return f"quartiles {spread['q1']:.2f} to {spread['q3']:.2f}, above 1 clrecon is faster"

@@ -1,0 +1,86 @@
+"""Time two programs beside each other: in turn, pair by pair, so that a machine's moods meet both."""
+
+from __future__ import annotations
+
+import statistics
+from collections.abc import Callable, Sequence
+from time import perf_counter
+from typing import Any
+
+__all__ = ["FEWEST_PAIRS", "alternate", "spread", "summarise"]
+
+FEWEST_PAIRS = 3
+"""Pairs that are run whatever the time limit says: below it there is no spread."""
+
+
+def spread(values: Sequence[float]) -> dict[str, float]:
+    """Median, quartiles, smallest and largest of at least one value.
+
+    Returns
+    -------
+    dict
+        ``median, q1, q3, min, max``; quartiles are interpolated between the values (inclusive method).
+    """
+    if len(values) == 1:
+        q1 = median = q3 = float(values[0])
+    else:
+        q1, median, q3 = statistics.quantiles(values, n=4, method="inclusive")
+    return {"median": median, "q1": q1, "q3": q3, "min": float(min(values)), "max": float(max(values))}
+
+
+def alternate(
+    candidate: Callable[[], float],
+    peer: Callable[[], float],
+    pairs: int,
+    *,
+    warm: bool = True,
+    limit_s: float | None = None,
+    clock: Callable[[], float] = perf_counter,
+) -> tuple[list[float], list[float]]:
+    """Run two programs in turn; who is first changes with every pair, so that neither profits from its place.
+
+    Parameters
+    ----------
+    candidate, peer : callable
+        Run once and return the seconds that count.
+    pairs : int
+        Timed runs of each.
+    warm : bool
+        Run each once beforehand, untimed.
+    limit_s : float, optional
+        Start no further pair when so much time is gone, the warm-up included; `FEWEST_PAIRS` are always run.
+    clock : callable
+        What the limit is measured with, seconds.
+
+    Returns
+    -------
+    candidate_s, peer_s : list of float
+        Equally long.
+    """
+    start = clock()
+    if warm:
+        candidate(), peer()
+    ours: list[float] = []
+    theirs: list[float] = []
+    for number in range(pairs):
+        if limit_s is not None and number >= FEWEST_PAIRS and clock() - start > limit_s:
+            break
+        if number % 2:
+            theirs.append(peer())
+            ours.append(candidate())
+        else:
+            ours.append(candidate())
+            theirs.append(peer())
+    return ours, theirs
+
+
+def summarise(ours: Sequence[float], theirs: Sequence[float]) -> dict[str, Any]:
+    """Spreads of both sides and of the ratios pair by pair (over 1: clrecon is faster).
+
+    Returns
+    -------
+    dict
+        ``pairs`` (int), ``clrecon_s``, ``peer_s`` and ``ratio``, each as `spread` has it.
+    """
+    ratios = [theirs_s / ours_s for ours_s, theirs_s in zip(ours, theirs, strict=True)]
+    return {"pairs": len(ratios), "clrecon_s": spread(ours), "peer_s": spread(theirs), "ratio": spread(ratios)}

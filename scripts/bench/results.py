@@ -1,0 +1,69 @@
+"""Kept results: one JSON file a (case, input, device)."""
+
+from __future__ import annotations
+
+import json
+import re
+import sys
+from pathlib import Path
+from typing import Any
+
+__all__ = ["SCHEMA", "Key", "device_name", "load_results", "pick", "result_key", "result_path"]
+
+SCHEMA = 1
+
+Key = tuple[str, str, str]
+
+
+def device_name(device: dict[str, Any]) -> str:
+    """Short name of a device and its driver, fit for a file name: ``pocl-3.1-debian``."""
+    platform = str(device["platform"]).lower()
+    short = "pocl" if "portable computing" in platform else platform.split()[0] if platform.split() else "opencl"
+    parts = [short] if short == "pocl" and device["type"] == "cpu" else [short, str(device["name"]).lower()]
+    words = re.sub(r"\([^)]*\)", "", " ".join([*parts, str(device["driver"]).lower()]))
+    return re.sub(r"[^a-z0-9.]+", "-", words).strip("-")
+
+
+def result_key(result: dict[str, Any]) -> Key:
+    """(case, input, device): what makes two results comparable."""
+    return result["case"], result["input"]["name"], device_name(result["device"])
+
+
+def result_path(folder: Path, result: dict[str, Any]) -> Path:
+    """Where a result is kept."""
+    return folder / ("-".join(result_key(result)) + ".json")
+
+
+def load_results(folder: Path) -> dict[Key, dict[str, Any]]:
+    """All results of a folder by key; files of another form are named on stderr and passed over.
+
+    Raises
+    ------
+    FileNotFoundError
+        There is no such folder.
+    """
+    if not folder.is_dir():
+        raise FileNotFoundError(f"{folder} is not a folder of results")
+    results = {}
+    for path in sorted(folder.glob("*.json")):
+        try:
+            result = json.loads(path.read_text(encoding="utf-8"))
+        except ValueError:
+            result = None
+        if isinstance(result, dict) and result.get("schema") == SCHEMA:
+            results[result_key(result)] = result
+        else:
+            print(f"{path.name}: no result of this form, passed over", file=sys.stderr)
+    return results
+
+
+def pick(
+    results: dict[Key, dict[str, Any]], cases: list[str] | None = None, ratios: list[str] | None = None
+) -> dict[Key, dict[str, Any]]:
+    """The results of some cases with some of their ratios; None is all.  Results without a ratio left stay out."""
+    picked = {}
+    for key, result in results.items():
+        kept = {name: ratio for name, ratio in result["ratios"].items() if ratios is None or name in ratios}
+        if kept and (cases is None or key[0] in cases):
+            picked[key] = {**result, "ratios": kept}
+    return picked

@@ -1,0 +1,107 @@
+"""``clrecon bench``: table, JSON, report, exit codes."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from ct_files import PATIENT, write_series
+
+from clrecon.cli import bench as command
+from clrecon.cli.main import main
+
+CONTRACT = {
+    "input", "iso_value_hu", "iso_level_hu", "runs", "processor", "platform", "version", "cores", "free_cores",
+    "seconds", "devices", "warnings",
+}  # fmt: skip
+OF_A_DEVICE = {
+    "device", "error", "vertices", "triangles", "first_seconds", "warm_seconds", "part_seconds", "kernel_seconds",
+    "mvoxels_per_s", "mtriangles_per_s", "peer", "ratio", "resident_seconds",
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def ct(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_series(tmp_path_factory.mktemp("bench") / "Scan von Jane")
+
+
+def test_the_table_names_stages_kernels_and_the_peer(device: Any, ct: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["bench", str(ct), "--hu", "-150", "--runs", "2", "--device", str(device.index)]) == 0
+    out = capsys.readouterr().out
+    assert "17 slices of 31 x 25, spacing 0.8 x 1.1 x 1.5 mm" in out
+    assert "-150 HU, open at the border" in out
+    for words in (device.name, device.driver, "first surface", "later ones", "kernels", "flying edges", "ratio",
+                  "Mvoxel/s", "Mtriangle/s", "read"):  # fmt: skip
+        assert words in out
+
+
+def test_json_and_report_are_the_contract(
+    device: Any, ct: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    report = tmp_path / "b.json"
+    arguments = ["bench", str(ct), "--runs", "1", "--device", str(device.index), "--json", "--report", str(report)]
+    assert main(arguments) == 0
+    captured = capsys.readouterr()
+    result = json.loads(captured.out)
+    assert CONTRACT <= set(result) and result == json.loads(report.read_text())
+    assert OF_A_DEVICE <= set(result["devices"][0])
+    assert result["iso_value_hu"] == 200.0
+    written = captured.out + captured.err
+    for secret in (*PATIENT.split("^"), "4711", "19500102", "Scan von", "1.2.826.0.1"):
+        assert secret not in written
+
+
+def test_a_failed_device_is_partly_done(
+    device: Any, ct: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from clrecon.errors import DeviceError
+    from clrecon.pipeline import bench
+
+    real = bench._measure_device
+    seen: list[Any] = []
+
+    def fail_first(*arguments: Any) -> dict[str, Any]:
+        seen.append(arguments)
+        if len(seen) == 1:
+            raise DeviceError("it caught fire")
+        return real(*arguments)
+
+    monkeypatch.setattr(bench, "_measure_device", fail_first)
+    monkeypatch.setattr(bench, "_choose_devices", lambda name: [device, device])
+    assert main(["bench", str(ct), "--runs", "1", "--device", "all"]) == command.PARTLY_DONE
+    captured = capsys.readouterr()
+    assert "failed: it caught fire" in captured.out
+    assert "it caught fire" in captured.err and "flying edges" in captured.out
+
+
+@pytest.mark.parametrize(
+    ("extra", "code", "words"),
+    [
+        (["--runs", "0"], 3, "1 to 1000"),
+        (["--runs", "many"], 3, "invalid int value"),
+        (["--hu", "nan"], 3, "finite"),
+        (["--device", "abacus"], 5, "abacus"),
+        (["--report", "no/such/folder/b.json"], 6, "does not exist"),
+        (["--iso", "3"], 3, "unrecognized"),
+    ],
+)
+def test_wrong_arguments_are_one_line(
+    extra: list[str], code: int, words: str, ct: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["bench", str(ct), *extra]) == code
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert words in captured.err and len(captured.err.splitlines()) == 1
+
+
+def test_an_input_that_is_not_there(device: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    code = main(["bench", str(tmp_path / "gone"), "--device", str(device.index)])
+    assert code in (2, 3, 4) and "gone" in capsys.readouterr().err
+
+
+def test_the_default_of_the_command_is_that_of_the_job() -> None:
+    from clrecon.pipeline.bench import DEFAULT_RUNS
+
+    assert command._RUNS == DEFAULT_RUNS
