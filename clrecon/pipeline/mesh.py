@@ -95,7 +95,7 @@ def make_mesh(
     parts = [
         part
         for surface, mesh in zip(surfaces, extracted, strict=True)
-        for part in select_parts(surface, mesh, settings)
+        for part in select_parts(surface, mesh, settings, device)
     ]
     del extracted
     paths = name_outputs(output, [part.name for part in parts], report_path)

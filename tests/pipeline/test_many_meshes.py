@@ -101,6 +101,29 @@ def test_iso_values_limits_and_split_together(device: Any, tmp_path: Path) -> No
 
 
 @pytest.mark.usefixtures("boxes")
+@pytest.mark.parametrize(("space", "sign"), [("lps", 1.0), ("ras", -1.0)])
+def test_seeds_are_in_the_frame_of_the_mesh(space: str, sign: float, device: Any, tmp_path: Path) -> None:
+    middle = np.array([20.5 * 0.5 - 10, 16 * 0.8 + 20, 3.5 * 2 - 300])
+    seed = (middle * [sign, sign, 1]).tolist()
+    report = run(tmp_path, device, iso_value=(200.0, 500.0), seeds=[seed], space=space)
+    assert (report["components_found"], report["components_kept"]) == (5, 2)
+    assert report["seeds_mm"] == [seed]
+    for mesh in report["meshes"]:
+        low, high = np.array(mesh["bounds_mm"])
+        assert ((low < seed) & (seed < high)).all()
+        assert 0.8 < mesh["seed_distances_mm"][0] < 1.2  # a row of 0.8 mm to the last voxel, and a part of one
+
+
+@pytest.mark.usefixtures("boxes")
+def test_a_seed_off_the_surface_ends_the_job(device: Any, tmp_path: Path) -> None:
+    with pytest.raises(
+        UsageError, match=r"at 200 HU: the seed at LPS \(100, 20, -290\) mm lies .* mm from the nearest"
+    ):
+        run(tmp_path, device, iso_value=200.0, seeds=[(-100.0, -20.0, -290.0)], space="ras")
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.usefixtures("boxes")
 def test_bounds_and_files_follow_the_space(device: Any, tmp_path: Path) -> None:
     lps = run(tmp_path, device, iso_value=(200.0, 500.0))["meshes"][1]["bounds_mm"]
     ras = run(tmp_path, device, iso_value=(200.0, 500.0), space="ras")["meshes"][1]["bounds_mm"]
