@@ -72,7 +72,7 @@ def make_mesh(
     check_outputs(output, report_path, first_names(surfaces, settings.split))
 
     progress("device", 0, 0)
-    with DeviceOpening(settings.device) as opening:
+    with DeviceOpening(settings.device, components=settings.selects) as opening:
         from clrecon.dicom import read_volume
 
         volume = read_volume(source, settings.series, progress=progress)

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
-from clrecon.errors import NoSurfaceError, UsageError
+from clrecon.errors import DeviceMemoryError, NoSurfaceError, UsageError
 from clrecon.pipeline.outputs import MOST_FILES
 from clrecon.pipeline.progress import Progress
 from clrecon.pipeline.settings import MeshSettings
@@ -116,7 +116,11 @@ def select_parts(surface: Surface, mesh: Mesh, settings: MeshSettings, device: D
 
     limits = (settings.keep_largest, settings.min_volume_ml)
     seeds = [(frame_from_lps(settings.space).T @ seed).tolist() for seed in settings.seeds]
-    labelled = label_components(device, mesh.triangles, mesh.vertex_count)
+    labelled = None
+    try:
+        labelled = label_components(device, mesh.triangles, mesh.vertex_count)
+    except DeviceMemoryError as error:  # the outcome is the same, it only takes longer
+        mesh.report.setdefault("warnings", []).append(f"{error}: they were found without it")
     try:
         if not settings.split:
             return [Part(surface, surface.name, select_components(mesh, *limits, seeds=seeds, labelled=labelled))]

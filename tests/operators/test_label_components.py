@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import clrecon
-from clrecon.errors import DeviceError, UsageError
+from clrecon.errors import DeviceError, DeviceMemoryError, UsageError
 from clrecon.geometry import Volume
 from clrecon.mesh import connectivity
 from clrecon.operators import components
@@ -66,6 +66,21 @@ def test_a_fan_hooks_in_any_order(device, centre):
     check_equal(device, triangles, 1001)
 
 
+@pytest.mark.parametrize("basins", [5, 20, 200, 2000])
+def test_a_row_of_basins_is_a_chain_of_roots(device, basins):
+    """0 - n - 1 - n+1 - 2 ...: the first round leaves the roots 0, 1, 2 ..., each of which hooks to the one before."""
+    path = np.arange(2 * basins).reshape(2, basins).T.ravel().astype(np.uint32)
+    edges = np.column_stack([path[:-1], path[1:], path[1:]])
+    assert label_components(device, edges, 2 * basins)[0] == 1
+    check_equal(device, edges, 2 * basins)
+
+
+def test_a_device_that_never_ends_is_an_error(device, monkeypatch):
+    monkeypatch.setattr(components, "MOST_PASSES", 3)
+    with pytest.raises(DeviceError, match="has not found the components after 3 passes: it computes wrongly"):
+        label_components(device, strip(3001), 3001)
+
+
 def test_roots_are_the_smallest_vertices_and_unused_ones_are_none(device):
     triangles = np.array([[9, 4, 7], [3, 3, 3], [8, 1, 1], [5, 9, 9]], dtype=np.uint32)
     count, labels = label_components(device, triangles, 11)
@@ -104,10 +119,12 @@ def test_devices_with_small_work_groups_get_the_same(device, group, monkeypatch)
 
 @pytest.mark.oclgrind
 def test_several_rounds_under_a_simulator(device):
-    """A shuffled strip takes several rounds and passes, the rest is unused vertices and a component of one."""
+    """A shuffled strip takes several rounds, a row of basins several passes; unused vertices and one alone."""
     number = np.random.default_rng(6).permutation(70).astype(np.uint32)
-    triangles = np.concatenate([number[strip(60)], [[number[61]] * 3]]).astype(np.uint32)
-    check_equal(device, triangles, 70)
+    path = 70 + np.arange(40).reshape(2, 20).T.ravel()
+    edges = np.column_stack([path[:-1], path[1:], path[1:]])
+    triangles = np.concatenate([number[strip(60)], [[number[61]] * 3], edges]).astype(np.uint32)
+    check_equal(device, triangles, 112)
 
 
 def test_a_mesh_without_triangles(device):
@@ -128,8 +145,10 @@ def test_vertices_that_are_not_there_are_refused(device):
 def test_too_little_memory_is_said_before_it_is_taken(device, monkeypatch):
     monkeypatch.setattr(device, "memory_bytes", 16_000)
     monkeypatch.setattr(components, "allocate", lambda *_: pytest.fail("memory was taken"))
-    with pytest.raises(DeviceError, match="component offsets"):
+    with pytest.raises(DeviceMemoryError, match="component offsets"):
         label_components(device, soup(1000, 10), 1000)
+    with pytest.raises(DeviceMemoryError, match="15,000 bytes are allowed"):
+        label_components(device, soup(1000, 10), 1000, memory=15_000)
 
 
 def test_real_ct_equals_scipy(device, real_data):

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from clrecon.errors import NoSurfaceError, OutputError, UsageError
+from clrecon.errors import DeviceMemoryError, NoSurfaceError, OutputError, UsageError
 from clrecon.geometry import Volume
 from clrecon.pipeline import parts
 from clrecon.pipeline.mesh import make_mesh
@@ -121,6 +121,23 @@ def test_a_seed_off_the_surface_ends_the_job(device: Any, tmp_path: Path) -> Non
     ):
         run(tmp_path, device, iso_value=200.0, seeds=[(-100.0, -20.0, -290.0)], space="ras")
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.usefixtures("boxes")
+def test_components_that_do_not_fit_the_device_are_found_all_the_same(
+    device: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    on_device = run(tmp_path, device, iso_value=200.0, split=True)
+
+    def refuse(*_: Any) -> Any:
+        raise DeviceMemoryError("the components of the mesh cannot be found: too large")
+
+    monkeypatch.setattr("clrecon.operators.components.label_components", refuse)
+    report = run(tmp_path, device, iso_value=200.0, split=True)
+    assert report["meshes"] == on_device["meshes"]
+    assert report["warnings"][1:] == [
+        "the components of the mesh cannot be found: too large: they were found without it"
+    ]
 
 
 @pytest.mark.usefixtures("boxes")
