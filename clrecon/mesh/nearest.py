@@ -25,7 +25,7 @@ def find_nearest_triangle(
     vertices : ndarray, shape (n, 3), float32
         mm.
     triangles : ndarray, shape (m, 3), uint32
-        At least one.
+        At least one, every index below n.
     point : ndarray, shape (3,), float64
         mm.
 
@@ -42,7 +42,7 @@ def find_nearest_triangle(
     nearest_corner = np.inf
     for where in chunks(len(triangles)):
         a, b, c = triangles[where].T.astype(np.intp)
-        one, two, three = columns[:, a], columns[:, b], columns[:, c]
+        one, two, three = (np.take(columns, index, axis=1, mode="clip") for index in (a, b, c))
         low = np.minimum(np.minimum(one, two), three)
         high = np.maximum(np.maximum(one, two), three)
         gap = np.maximum(np.maximum(low, -high), 0.0)

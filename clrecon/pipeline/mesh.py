@@ -10,7 +10,7 @@ from typing import Any
 from clrecon.pipeline.description import describe_job, describe_part
 from clrecon.pipeline.levels import choose_level
 from clrecon.pipeline.opening import DeviceOpening
-from clrecon.pipeline.outputs import check_outputs, commit_all, name_outputs, stage_meshes
+from clrecon.pipeline.outputs import check_outputs, commit_all, count_leftovers, name_outputs, stage_meshes
 from clrecon.pipeline.parts import extract_surfaces, first_names, plan_surfaces, select_parts
 from clrecon.pipeline.progress import Progress, Stopwatch, ignore_progress
 from clrecon.pipeline.report import peak_memory_bytes, stage_report
@@ -116,6 +116,10 @@ def make_mesh(
             for part, file, path in zip(parts, files, paths, strict=True)
         ]
         report = describe_job(volume, parts, meshes, settings, device, choice)
+        if settings.split and (leftovers := count_leftovers(output, paths)):
+            report["warnings"].append(
+                f"{leftovers:,} more numbered files of this name lie beside the new ones, from an earlier run"
+            )
         report["seconds"] = _seconds(watch, origins)
         report["peak_memory_bytes"] = peak_memory_bytes()
         if report_path is not None:

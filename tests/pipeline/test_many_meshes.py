@@ -92,6 +92,20 @@ def test_split_writes_the_components_by_descending_size(device: Any, tmp_path: P
 
 
 @pytest.mark.usefixtures("boxes")
+def test_components_of_an_earlier_run_are_left_and_said(device: Any, tmp_path: Path) -> None:
+    for name in ("bone_002.ply", "bone_500hu_003.ply", "bone_1.ply", "bones_001.ply", "bone_001.stl"):
+        (tmp_path / name).write_bytes(b"other")
+    first = run(tmp_path, device, iso_value=200.0, split=True)
+    again = run(tmp_path, device, iso_value=200.0, split=True, keep_largest=1)
+    assert [report["warnings"][1:] for report in (first, again)] == [
+        ["1 more numbered files of this name lie beside the new ones, from an earlier run"],
+        ["3 more numbered files of this name lie beside the new ones, from an earlier run"],
+    ]
+    assert (tmp_path / "bone_500hu_003.ply").read_bytes() == b"other"
+    assert (tmp_path / "bone_003.ply").stat().st_size > 100
+
+
+@pytest.mark.usefixtures("boxes")
 def test_iso_values_limits_and_split_together(device: Any, tmp_path: Path) -> None:
     report = run(tmp_path, device, iso_value=(200.0, 500.0), split=True, keep_largest=2, min_volume_ml=0.1)
     assert [mesh["name"] for mesh in report["meshes"]] == ["200hu_001", "500hu_001"]
