@@ -31,7 +31,7 @@ class MeshSettings:
     closed : bool
         Close the surface where it meets the border of the volume (outside is air).
     keep_largest : int, optional
-        Keep only this many components, the largest by volume.
+        Keep only this many components, the largest by area.
     min_volume_ml : float, optional
         Keep only components of at least this volume.  With `keep_largest`: of these the largest.
     seeds : sequence of (x, y, z)
