@@ -1,7 +1,7 @@
 /* Connected components of a triangle mesh: union-find over the vertices, linked along the edges of the triangles.
  *
- * A vertex of an iso surface lies on one edge of the grid and belongs to the one or two sheets that cross it there, so
- * these are also the components of the active cells, but with separate sheets of one cell kept apart.
+ * A vertex of an iso surface lies on one edge of the grid and belongs to the one sheet that crosses it there, so this
+ * equals union-find over the active cells, but with separate sheets of one cell kept apart.
  *
  * Reference: Shiloach and Vishkin 1982, "An O(log n) parallel connectivity algorithm": rounds of hooking and pointer
  * jumping.  A root that has a smaller neighbour hooks to the smallest; one that has none, and that nobody hooks to, has
