@@ -45,8 +45,11 @@ VTK_VOLUME = 2e-3  # the bar; measured 5e-5 at 226 HU, at most 8e-4 from 200 to 
 # --- mesh ---
 MESH_VOLUME = 1e-6  # relative; float32 corners of a solid with exact corners, summed in float64
 MESH_UNIT_NORMAL = 1e-6  # float32 components; the text formats keep six decimals
+NEAREST_MM = 1e-12  # a distance of a few mm in float64
+NEAREST_SAMPLED_MM = 0.02  # 400 random points on each triangle of 0.6 mm, seen from inside or 4 mm away
 GLB_METRES = 1e-7  # relative; float32 coordinates through a float64 matrix, read back by another library
 
 # --- pipeline and command line ---
 PHANTOM_SPHERE_VOLUME_SHARE = 0.01  # sphere of about 12 mm in voxels of 0.5 x 0.7 x 1 mm: measured -0.34 %
 CLI_SPHERE_VOLUME_SHARE = 0.02  # sphere of 9 mm in voxels of 0.8 x 1.1 x 1.5 mm, its edge a ramp of 1 mm
+CLI_SPHERE_RADIUS_MM = 0.3  # sagitta of chords of 1.8 mm and the bent ramp; measured -0.26

@@ -8,6 +8,7 @@ from typing import Any
 from clrecon.cli.common import add_device, megabytes
 from clrecon.cli.console import Console, printable
 from clrecon.cli.levels import LEVELS_HELP, parse_hu
+from clrecon.cli.points import parse_point
 from clrecon.pipeline.presets import DEFAULT_PRESET, PRESETS
 
 __all__ = ["add_arguments", "describe_mesh", "run"]
@@ -63,6 +64,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--min-volume", type=float, metavar="ML", help="keep components of at least ML millilitres only"
     )
+    parser.add_argument(
+        "--seed",
+        type=parse_point,
+        metavar="X,Y,Z",
+        action="append",
+        default=[],
+        help="keep the component whose surface lies nearest to this point, in mm of the frame of --space;"
+        " repeat it for several",
+    )
     parser.add_argument("--split", action="store_true", help="write one file a component, the largest first")
     add_device(parser)
     parser.add_argument("--report", metavar="FILE", help="write affine, counts, quality, device and times as JSON")
@@ -81,6 +91,7 @@ def run(options: argparse.Namespace, console: Console) -> int:
         closed=not options.open,
         keep_largest=options.keep_largest,
         min_volume_ml=options.min_volume,
+        seeds=options.seed,
         split=options.split,
         device=options.device,
     )

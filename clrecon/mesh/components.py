@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,13 +11,19 @@ from numpy.typing import NDArray
 
 from clrecon.errors import NoSurfaceError, UsageError
 from clrecon.mesh.connectivity import label_components
-from clrecon.mesh.measures import cross_products, local_origin
+from clrecon.mesh.measures import CHUNK, cross_products, local_origin
 from clrecon.mesh.mesh import Mesh
+from clrecon.mesh.nearest import find_nearest_triangle
 
 __all__ = ["Labelled", "select_components", "split_components"]
 
 Labelled = tuple[int, NDArray[np.int64]]
 """What `label_components` returns: the number of components, and that of each vertex."""
+
+
+SEED_REACH_MM = 20.0
+"""Farther than this from any surface a seed is a mistake: the middle of a lumbar vertebral body (about 50 x 35 x 30 mm)
+lies 15 mm from its wall."""
 
 
 @dataclass(frozen=True)
@@ -46,22 +53,26 @@ def select_components(
     keep_largest: int | None = None,
     min_volume_ml: float | None = None,
     *,
+    seeds: Sequence[Sequence[float]] = (),
     labelled: Labelled | None = None,
 ) -> Mesh:
-    """Keep the largest components of a surface.
+    """Keep the largest components of a surface, or those at given points.
 
-    Components are ranked by area, not by volume: a part that is open at the border of the scan encloses nothing,
-    and the wall of a cavity has a negative volume.  The wall of a cavity is a component of its own; where it is
-    dropped, the cavity is filled.
+    Small components (`min_volume_ml`) are dropped first, then those that are nearest to no seed, then all but the
+    largest of the rest (`keep_largest`).  Components are ranked by area, not by volume: a part that is open at the
+    border of the scan encloses nothing, and the wall of a cavity has a negative volume.  The wall of a cavity is a
+    component of its own; where it is dropped, the cavity is filled.
 
     Parameters
     ----------
     mesh : Mesh
     keep_largest : int, optional
-        Keep so many components, those of largest area (of equal ones the first), of those that are large enough.
+        Keep so many components, those of largest area (of equal ones the first).
     min_volume_ml : float, optional
         Keep components that enclose at least so much, whatever the sign.  What an open component encloses is
         measured as if its rim were joined to the mean of its corners.
+    seeds : sequence of (x, y, z)
+        Keep the components whose surface lies nearest to one of these points, LPS mm.
     labelled : (int, ndarray), optional
         What `label_components` returns for this mesh, where it is known already (a device finds it sooner).
 
@@ -69,16 +80,18 @@ def select_components(
     -------
     Mesh
         Vertices and triangles keep their order, normals and report come along; the mesh itself when nothing is
-        dropped.  Its report has ``components_found`` and ``components_kept``.
+        dropped.  Its report has ``components_found`` and ``components_kept``, and with seeds
+        ``seed_distances_mm``: how far the surface lies from each.
 
     Raises
     ------
     UsageError
-        `keep_largest` below 1, or `min_volume_ml` negative or not a number.
+        `keep_largest` below 1, `min_volume_ml` negative or not a number, or a seed that is no point or farther than
+        20 mm from every component.
     NoSurfaceError
         The mesh is empty or no component is large enough; the message has the largest.
     """
-    chosen = _choose(mesh, keep_largest, min_volume_ml, labelled)
+    chosen = _choose(mesh, keep_largest, min_volume_ml, seeds, labelled)
     if chosen.keep.all():
         mesh.report.update(chosen.facts)
         return mesh
@@ -90,6 +103,7 @@ def split_components(
     keep_largest: int | None = None,
     min_volume_ml: float | None = None,
     *,
+    seeds: Sequence[Sequence[float]] = (),
     labelled: Labelled | None = None,
     most: int | None = None,
 ) -> list[Mesh]:
@@ -97,7 +111,7 @@ def split_components(
 
     Parameters
     ----------
-    mesh, keep_largest, min_volume_ml, labelled
+    mesh, keep_largest, min_volume_ml, seeds, labelled
         As in `select_components`; components that it would drop are left out.
     most : int, optional
         Refuse more components than this.
@@ -115,7 +129,7 @@ def split_components(
     NoSurfaceError
         As `select_components`.
     """
-    chosen = _choose(mesh, keep_largest, min_volume_ml, labelled)
+    chosen = _choose(mesh, keep_largest, min_volume_ml, seeds, labelled, rank=True)
     kept = np.flatnonzero(chosen.keep)
     if most is not None and len(kept) > most:
         raise UsageError(
@@ -144,8 +158,19 @@ def _group(ranks: NDArray[np.int64], count: int) -> tuple[NDArray[np.intp], NDAr
     return order, np.searchsorted(ranks[order], np.arange(count + 1))
 
 
-def _choose(mesh: Mesh, keep_largest: int | None, min_volume_ml: float | None, labelled: Labelled | None) -> _Chosen:
-    """Find the components and decide which are kept; parameters and errors as in `select_components`."""
+def _choose(
+    mesh: Mesh,
+    keep_largest: int | None,
+    min_volume_ml: float | None,
+    seeds: Sequence[Sequence[float]],
+    labelled: Labelled | None,
+    *,
+    rank: bool = False,
+) -> _Chosen:
+    """Find the components and decide which are kept; parameters and errors as in `select_components`.
+
+    Areas are measured where the decision or `rank` needs them, and are else zeros.
+    """
     if keep_largest is not None and (isinstance(keep_largest, float) or keep_largest < 1):
         raise UsageError(f"keep_largest is a whole number from 1, not {keep_largest}")
     if min_volume_ml is not None and not (math.isfinite(min_volume_ml) and min_volume_ml >= 0):
@@ -156,7 +181,9 @@ def _choose(mesh: Mesh, keep_largest: int | None, min_volume_ml: float | None, l
 
     count, labels = label_components(mesh.triangles, mesh.vertex_count) if labelled is None else labelled
     label_of_triangle = labels[mesh.triangles[:, 0]]
-    areas, volumes = _measure_components(mesh, label_of_triangle, count)
+    areas, volumes = _measure_components(
+        mesh, label_of_triangle, count, areas=rank or keep_largest is not None, volumes=min_volume_ml is not None
+    )
     keep = np.ones(count, dtype=bool)
     if min_volume_ml is not None:
         keep = volumes >= min_volume_ml
@@ -165,28 +192,61 @@ def _choose(mesh: Mesh, keep_largest: int | None, min_volume_ml: float | None, l
                 f"none of the {count} components encloses {min_volume_ml:g} ml: "
                 f"the largest has {volumes.max():.4g} ml, ask for less"
             )
+    facts: dict[str, object] = {}
+    if len(seeds):
+        keep, facts["seed_distances_mm"] = _find_at_seeds(mesh, label_of_triangle, keep, seeds)
     if keep_largest is not None:
         ranked = np.argsort(-areas, kind="stable")
         keep[ranked[keep[ranked]][keep_largest:]] = False
-    facts: dict[str, object] = {"components_found": count, "components_kept": int(np.count_nonzero(keep))}
+    facts.update(components_found=count, components_kept=int(np.count_nonzero(keep)))
     return _Chosen(labels, label_of_triangle, areas, keep, facts)
 
 
+def _find_at_seeds(
+    mesh: Mesh, label_of_triangle: NDArray[np.int64], keep: NDArray[np.bool_], seeds: Sequence[Sequence[float]]
+) -> tuple[NDArray[np.bool_], list[float]]:
+    """The components of `keep` that are nearest to a seed, and how far each seed lies from its own."""
+    rows = np.flatnonzero(keep[label_of_triangle])
+    triangles = mesh.triangles if len(rows) == mesh.triangle_count else mesh.triangles[rows]
+    found = np.zeros_like(keep)
+    distances = []
+    for seed in seeds:
+        point = np.asarray(seed, dtype=np.float64)
+        if point.shape != (3,) or not np.isfinite(point).all():
+            raise UsageError(f"a seed is a point of three numbers in mm, not {seed}")
+        row, distance = find_nearest_triangle(mesh.vertices, triangles, point)
+        if distance > SEED_REACH_MM:
+            place = ", ".join(f"{value:g}" for value in point)
+            raise UsageError(
+                f"the seed at LPS ({place}) mm lies {distance:.1f} mm from the nearest component, at most"
+                f" {SEED_REACH_MM:g} mm are allowed: check its coordinates and their frame, LPS or RAS"
+            )
+        found[label_of_triangle[rows[row]]] = True
+        distances.append(distance)
+    return found, distances
+
+
 def _measure_components(
-    mesh: Mesh, label_of_triangle: NDArray[np.int64], count: int
+    mesh: Mesh, label_of_triangle: NDArray[np.int64], count: int, *, areas: bool, volumes: bool
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Area in mm2 and enclosed volume in ml, without sign, of each component."""
+    """Area in mm2 and enclosed volume in ml, without sign, of each component; zeros where that is not wanted."""
     twice_area = np.zeros(count)
     six_volumes = np.zeros(count)
     cross_sum = np.zeros((3, count))
     corner_sum = np.zeros((3, count))
-    for where, corner, cross in cross_products(mesh.vertices, mesh.triangles, local_origin(mesh.vertices)):
+    if not areas and not volumes:
+        return twice_area, six_volumes
+    # Every piece adds to all components: where these are many, larger pieces keep that from taking the time.
+    size = max(CHUNK, count)
+    for where, corner, cross in cross_products(mesh.vertices, mesh.triangles, local_origin(mesh.vertices), size):
         label = label_of_triangle[where]
-        twice_area += np.bincount(label, np.sqrt(np.einsum("ij,ij->j", cross, cross)), count)
-        six_volumes += np.bincount(label, np.einsum("ij,ij->j", corner, cross), count)
-        for axis in range(3):
-            cross_sum[axis] += np.bincount(label, cross[axis], count)
-            corner_sum[axis] += np.bincount(label, corner[axis], count)
+        if areas:
+            twice_area += np.bincount(label, np.sqrt(np.einsum("ij,ij->j", cross, cross)), count)
+        if volumes:
+            six_volumes += np.bincount(label, np.einsum("ij,ij->j", corner, cross), count)
+            for axis in range(3):
+                cross_sum[axis] += np.bincount(label, cross[axis], count)
+                corner_sum[axis] += np.bincount(label, corner[axis], count)
     # From the common origin to one within each component: of no effect on closed ones, where the sum of the cross
     # products is zero.
     centre = corner_sum / np.bincount(label_of_triangle, minlength=count)

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["chunks", "cross_products", "local_origin"]
+__all__ = ["CHUNK", "chunks", "cross_products", "local_origin"]
 
 CHUNK = 1 << 14
 """Triangles a piece: 16384 of them take about 2 MB in float64; 32 times as many took 1.5 times as long."""
@@ -30,9 +30,9 @@ def local_origin(vertices: NDArray[np.float32]) -> NDArray[np.float64]:
 
 
 def cross_products(
-    vertices: NDArray[np.float32], triangles: NDArray[np.uint32], origin: NDArray[np.float64]
+    vertices: NDArray[np.float32], triangles: NDArray[np.uint32], origin: NDArray[np.float64], size: int = CHUNK
 ) -> Iterator[tuple[slice, NDArray[np.float64], NDArray[np.float64]]]:
-    """Go through the triangles and give first corner and edge cross product, float64.
+    """Go through the triangles, `size` at a time, and give first corner and edge cross product, float64.
 
     The cross product c of the edges from the first corner a is twice the area times the outward normal, and a . c is
     six times the signed volume of the tetrahedron over the origin (divergence theorem).  Coordinates are float32, so
@@ -46,11 +46,12 @@ def cross_products(
         One row each for x, y, z; `corner` is relative to `origin`, mm; `cross` is mm2.
     """
     columns = np.ascontiguousarray(vertices.T.astype(np.float64))
-    for where in chunks(len(triangles)):
+    for where in chunks(len(triangles), size):
         a, b, c = triangles[where].T.astype(np.intp)
-        corner = columns[:, a]
-        p = columns[:, b] - corner
-        q = columns[:, c] - corner
+        # "clip" is three times as fast as the check that numpy makes by default; callers have checked the indices.
+        corner, p, q = (np.take(columns, index, axis=1, mode="clip") for index in (a, b, c))
+        p -= corner
+        q -= corner
         cross = np.empty_like(p)
         cross[0] = p[1] * q[2] - p[2] * q[1]
         cross[1] = p[2] * q[0] - p[0] * q[2]

@@ -10,7 +10,7 @@ from typing import Any
 from clrecon.pipeline.description import describe_job, describe_part
 from clrecon.pipeline.levels import choose_level
 from clrecon.pipeline.opening import DeviceOpening
-from clrecon.pipeline.outputs import check_outputs, commit_all, name_outputs, stage_meshes
+from clrecon.pipeline.outputs import check_outputs, commit_all, count_leftovers, name_outputs, stage_meshes
 from clrecon.pipeline.parts import extract_surfaces, first_names, plan_surfaces, select_parts
 from clrecon.pipeline.progress import Progress, Stopwatch, ignore_progress
 from clrecon.pipeline.report import peak_memory_bytes, stage_report
@@ -72,7 +72,7 @@ def make_mesh(
     check_outputs(output, report_path, first_names(surfaces, settings.split))
 
     progress("device", 0, 0)
-    with DeviceOpening(settings.device) as opening:
+    with DeviceOpening(settings.device, components=settings.selects) as opening:
         from clrecon.dicom import read_volume
 
         volume = read_volume(source, settings.series, progress=progress)
@@ -95,7 +95,7 @@ def make_mesh(
     parts = [
         part
         for surface, mesh in zip(surfaces, extracted, strict=True)
-        for part in select_parts(surface, mesh, settings)
+        for part in select_parts(surface, mesh, settings, device)
     ]
     del extracted
     paths = name_outputs(output, [part.name for part in parts], report_path)
@@ -116,6 +116,10 @@ def make_mesh(
             for part, file, path in zip(parts, files, paths, strict=True)
         ]
         report = describe_job(volume, parts, meshes, settings, device, choice)
+        if settings.split and (leftovers := count_leftovers(output, paths)):
+            report["warnings"].append(
+                f"{leftovers:,} more numbered files of this name lie beside the new ones, from an earlier run"
+            )
         report["seconds"] = _seconds(watch, origins)
         report["peak_memory_bytes"] = peak_memory_bytes()
         if report_path is not None:

@@ -18,10 +18,13 @@ def _choose(name: str | int | Device | None) -> Device:
     return choose_device(name)
 
 
-def _prepare(chosen: Future[Device]) -> None:
+def _prepare(chosen: Future[Device], components: bool) -> None:
+    from clrecon.operators.components import prepare_components
     from clrecon.operators.isosurface import prepare_isosurface
 
     prepare_isosurface(chosen.result())
+    if components:
+        prepare_components(chosen.result())
 
 
 class DeviceOpening:
@@ -34,12 +37,14 @@ class DeviceOpening:
     ----------
     name : str, int, Device or None
         As `clrecon.device` takes it.
+    components : bool
+        Build the kernels that find components too.
     """
 
-    def __init__(self, name: str | int | Device | None):
+    def __init__(self, name: str | int | Device | None, components: bool = False):
         self._pool = ThreadPoolExecutor(max_workers=1, thread_name_prefix="device")
         self._chosen = self._pool.submit(_choose, name)
-        self._prepared = self._pool.submit(_prepare, self._chosen)
+        self._prepared = self._pool.submit(_prepare, self._chosen, components)
 
     def wait(self) -> Device:
         """Return the device, ready to work.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
@@ -14,7 +15,7 @@ if TYPE_CHECKING:
     from clrecon.files import StagedFile
     from clrecon.mesh import Mesh
 
-__all__ = ["MOST_FILES", "check_outputs", "commit_all", "name_outputs", "stage_meshes"]
+__all__ = ["MOST_FILES", "check_outputs", "commit_all", "count_leftovers", "name_outputs", "stage_meshes"]
 
 MOST_FILES = 1000
 """Meshes a job.  More are crumbs that nobody opens, and every one of them keeps a file open until all are written."""
@@ -57,6 +58,19 @@ def name_outputs(output: str | Path, names: Sequence[str], report_path: str | Pa
         if other is not own:
             raise UsageError(f"{own} and {other} cannot be the same file: {path}")
     return paths
+
+
+def count_leftovers(output: str | Path, paths: Sequence[str | Path]) -> int:
+    """Count the numbered files of `output` that are not among `paths`: components of an earlier run that had more.
+
+    They are not this job's to remove, but whoever takes all files of that name would take them for its own.
+    """
+    stem, extension = os.path.splitext(os.path.basename(output))
+    numbered = re.compile(rf"{re.escape(stem)}(?:_.+)?_[0-9]{{3,}}{re.escape(extension)}")
+    own = {_identity(path) for path in paths}
+    folder = os.path.dirname(output) or "."
+    with os.scandir(folder) as entries:
+        return sum(bool(numbered.fullmatch(entry.name)) and _identity(entry.path) not in own for entry in entries)
 
 
 def _identity(path: str | Path) -> str:

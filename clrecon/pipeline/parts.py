@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
-from clrecon.errors import NoSurfaceError
+from clrecon.errors import DeviceMemoryError, NoSurfaceError, UsageError
 from clrecon.pipeline.outputs import MOST_FILES
 from clrecon.pipeline.progress import Progress
 from clrecon.pipeline.settings import MeshSettings
@@ -98,7 +98,7 @@ def extract_surfaces(
     return extract_isosurfaces(volume, levels, device, closed=settings.closed, progress=progress)
 
 
-def select_parts(surface: Surface, mesh: Mesh, settings: MeshSettings) -> list[Part]:
+def select_parts(surface: Surface, mesh: Mesh, settings: MeshSettings, device: Device) -> list[Part]:
     """Keep the components that the settings ask for, together or one by one.
 
     Raises
@@ -106,19 +106,27 @@ def select_parts(surface: Surface, mesh: Mesh, settings: MeshSettings) -> list[P
     NoSurfaceError
         No component is large enough.
     UsageError
-        More components are to be written one by one than anyone can want.
+        A seed is near no component, or more components are to be written one by one than anyone can want.
     """
     if not settings.selects:
         return [Part(surface, surface.name, mesh)]
+    from clrecon.geometry import frame_from_lps
     from clrecon.mesh import select_components, split_components
+    from clrecon.operators.components import label_components
 
     limits = (settings.keep_largest, settings.min_volume_ml)
+    seeds = [(frame_from_lps(settings.space).T @ seed).tolist() for seed in settings.seeds]
+    labelled = None
+    try:
+        labelled = label_components(device, mesh.triangles, mesh.vertex_count)
+    except DeviceMemoryError as error:  # the outcome is the same, it only takes longer
+        mesh.report.setdefault("warnings", []).append(f"{error}: they were found without it")
     try:
         if not settings.split:
-            return [Part(surface, surface.name, select_components(mesh, *limits))]
-        pieces = split_components(mesh, *limits, most=MOST_FILES)
-    except NoSurfaceError as error:
-        raise NoSurfaceError(f"at {surface.iso_value:g} HU: {error}") from error
+            return [Part(surface, surface.name, select_components(mesh, *limits, seeds=seeds, labelled=labelled))]
+        pieces = split_components(mesh, *limits, seeds=seeds, labelled=labelled, most=MOST_FILES)
+    except (NoSurfaceError, UsageError) as error:
+        raise type(error)(f"at {surface.iso_value:g} HU: {error}") from error
     return [Part(surface, _name_piece(surface, place), piece) for place, piece in enumerate(pieces, start=1)]
 
 

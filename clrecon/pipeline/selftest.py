@@ -14,8 +14,10 @@ from clrecon.geometry import Volume
 from clrecon.kernels import download, upload
 from clrecon.opencl import Device
 from clrecon.operators.compaction import compact, exclusive_scan
+from clrecon.operators.components import label_components
 from clrecon.operators.isosurface import extract_isosurface
 from clrecon.reference import compaction as compaction_twin
+from clrecon.reference import components as components_twin
 from clrecon.reference import isosurface as isosurface_twin
 
 __all__ = ["run_selftest"]
@@ -53,6 +55,16 @@ def _check_compaction(device: Device) -> str:
     return "6 masks from 1 to 4,001 words equal"
 
 
+def _check_components(device: Device) -> str:
+    for vertices, triangles in ((64, 30), (5000, 1900), (5000, 9000)):
+        mesh = _random_integers((triangles, 3), "uint32", vertices)
+        count, labels = components_twin.label_components(mesh, vertices)
+        found, numbers = label_components(device, mesh, vertices)
+        if found != count or not np.array_equal(numbers, labels):
+            raise DeviceError(f"wrong components of {triangles} triangles: {found} of {count}")
+    return "3 meshes from 30 to 9,000 triangles equal"
+
+
 def _check_isosurface(device: Device) -> str:
     worst = 0.0
     cases = (
@@ -78,6 +90,7 @@ CHECKS: tuple[tuple[str, Callable[[Device], str]], ...] = (
     ("exclusive_scan", _check_scan),
     ("compact", _check_compaction),
     ("extract_isosurface", _check_isosurface),
+    ("label_components", _check_components),
 )
 
 

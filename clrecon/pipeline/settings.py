@@ -31,9 +31,11 @@ class MeshSettings:
     closed : bool
         Close the surface where it meets the border of the volume (outside is air).
     keep_largest : int, optional
-        Keep only this many components, the largest by volume.
+        Keep only this many components, the largest by area.
     min_volume_ml : float, optional
         Keep only components of at least this volume.  With `keep_largest`: of these the largest.
+    seeds : sequence of (x, y, z)
+        Keep only the components whose surface lies nearest to these points, in mm of the frame `space`.
     split : bool
         One mesh a component, the largest first.
     device : str, optional
@@ -53,6 +55,7 @@ class MeshSettings:
     closed: bool = True
     keep_largest: int | None = None
     min_volume_ml: float | None = None
+    seeds: Sequence[Sequence[float]] = ()
     split: bool = False
     device: str | None = None
 
@@ -67,6 +70,9 @@ class MeshSettings:
             raise UsageError(f"the number of components to keep must be 1 or more, not {self.keep_largest}")
         if self.min_volume_ml is not None and not (math.isfinite(self.min_volume_ml) and self.min_volume_ml > 0):
             raise UsageError(f"the smallest volume to keep must be above 0 ml, not {self.min_volume_ml}")
+        for seed in self.seeds:
+            if len(seed) != 3 or not all(map(math.isfinite, seed)):
+                raise UsageError(f"a seed is a point of three numbers in mm, not {tuple(seed)}")
         from clrecon.geometry import frame_from_lps  # numpy: not wanted before a job starts
 
         frame_from_lps(self.space)
@@ -121,4 +127,4 @@ class MeshSettings:
     @property
     def selects(self) -> bool:
         """Whether components are told apart."""
-        return self.split or self.keep_largest is not None or self.min_volume_ml is not None
+        return self.split or bool(self.seeds) or self.keep_largest is not None or self.min_volume_ml is not None

@@ -159,6 +159,38 @@ def test_several_meshes_are_shown_one_by_one(
     assert [f"hu_001: {count:,} triangles, " in text for count in triangles] == [True, True]
 
 
+@pytest.mark.parametrize("spaced", [True, False])
+def test_seeds_may_be_negative(
+    spaced: bool, device: Any, ct: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    centre = np.array(ORIGIN) + np.array(SPACING) * np.array([15, 12, 8])
+    seeds = [",".join(f"{value:.3f}" for value in centre + [0, 0, step]) for step in (0, RADIUS_MM)]
+    assert seeds[0].startswith("-")
+    extra = [word for seed in seeds for word in (["--seed", seed] if spaced else [f"--seed={seed}"])]
+    arguments = ["mesh", str(ct), *extra, "-o", str(tmp_path / "a.stl"), "--json", "--device", str(device.index)]
+    assert main([*arguments, "--hu", "-150"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert report["seeds_mm"] == [[float(value) for value in seed.split(",")] for seed in seeds]
+    inside, on = report["meshes"][0]["seed_distances_mm"]
+    assert (inside, on) == (
+        pytest.approx(RADIUS_MM, abs=tolerances.CLI_SPHERE_RADIUS_MM),
+        pytest.approx(0.0, abs=tolerances.CLI_SPHERE_RADIUS_MM),
+    )
+
+
+def test_lists_of_negative_numbers_are_values() -> None:
+    from clrecon.cli.common import Parser
+
+    parser = Parser()
+    parser.add_argument("--seed", action="append")
+    parser.add_argument("-q", action="store_true")
+    parser.add_argument("rest", nargs="*")
+    options = parser.parse_args(["--seed", "-1.5,2,3", "-q", "--seed=-1e3,.5,0", "--", "--seed", "-4,5"])
+    assert (options.seed, options.q) == (["-1.5,2,3", "-1e3,.5,0"], True)
+    assert options.rest == ["--seed", "-4,5"]
+    assert parser.parse_args(["--seed", "-.5,2"]).seed == ["-.5,2"]
+
+
 def test_open_leaves_the_border_open(device: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     voxels = np.full((5, 8, 9), -1000, np.int16)
     voxels[:, 2:6, 3:6] = 600

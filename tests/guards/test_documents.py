@@ -99,7 +99,9 @@ def test_exit_codes_are_documented() -> None:
             "clrecon mesh",
             "affine_ijk_to_lps_mm iso_value_hu iso_value_reason iso_value_choice space "
             "vertices triangles closed manifold components area_mm2 volume_ml "
-            "bounds_mm device driver version warnings seconds read upload build kernels download write total",
+            "bounds_mm device driver version warnings seconds read upload build kernels download write total "
+            "components_found components_kept keep_largest min_volume_ml seeds_mm split meshes output name label "
+            "seed_distances_mm quality",
         ),
     ],
 )

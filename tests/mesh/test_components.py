@@ -156,6 +156,56 @@ def test_split_refuses_more_than_most():
         split_components(three_boxes(), most=2)
 
 
+@pytest.mark.parametrize(
+    ("seeds", "kept", "distances"),
+    [
+        ([(0, 4, 3)], [LARGE], [0.0]),
+        ([(499, 0, 0)], [SMALL], [1.0]),
+        ([(499, 0, 0), (9, 9, 14), (500, 0, -2)], [SMALL, MIDDLE], [1.0, 3.0, 2.0]),
+    ],
+)
+def test_seeds_keep_the_nearest(seeds, kept, distances):
+    chosen = select_components(three_boxes(), seeds=seeds)
+    expected = np.concatenate([three_boxes().vertices[3 * np.arange(8) + place] for place in kept])
+    assert set(map(tuple, chosen.vertices)) == set(map(tuple, expected))
+    assert chosen.report["seed_distances_mm"] == pytest.approx(distances)
+    assert chosen.report["components_kept"] == len(kept)
+
+
+def test_small_ones_are_dropped_before_seeds_and_large_ones_ranked_after():
+    beside = [(8.5, 10, 10), (0, 5, 6)]  # next to the middle one; between both
+    mesh = three_boxes()
+    assert select_components(mesh, seeds=beside, min_volume_ml=0.01).quality()["volume_ml"] == pytest.approx(0.060)
+    assert select_components(mesh, seeds=beside[:1], keep_largest=1).quality()["volume_ml"] == pytest.approx(0.008)
+    assert select_components(mesh, seeds=beside, keep_largest=1).quality()["volume_ml"] == pytest.approx(0.060)
+    (piece,) = split_components(mesh, seeds=beside[:1])
+    assert piece.quality()["volume_ml"] == pytest.approx(0.008)
+
+
+def test_a_seed_far_from_everything_is_refused_with_its_distance():
+    with pytest.raises(UsageError, match=r"seed at LPS \(531, 0.5, 0.5\) mm lies 30.0 mm from the nearest component"):
+        select_components(three_boxes(), seeds=[(0, 4, 3), (531, 0.5, 0.5)])
+    assert select_components(three_boxes(), seeds=[(520.5, 0.5, 0.5)]).report["components_kept"] == 1
+
+
+@pytest.mark.parametrize("seed", [(1.0, 2.0), (1.0, 2.0, float("nan")), (1, 2, 3, 4)])
+def test_a_seed_is_a_point(seed):
+    with pytest.raises(UsageError, match="point of three numbers"):
+        select_components(three_boxes(), seeds=[seed])
+
+
+def test_many_components_are_measured_as_few():
+    """More components than triangles in a piece: the pieces grow with them."""
+    count = 20_000
+    vertices, triangles = samples.box()
+    places = np.arange(count) * 3.0
+    many = (vertices[None] + places[:, None, None] * [1, 0, 0]).reshape(-1, 3)
+    faces = (triangles[None] + 8 * np.arange(count)[:, None, None]).reshape(-1, 3)
+    many[8 * 777 : 8 * 778] = samples.box((places[777], 0, 0), (2, 2, 2))[0]
+    kept = select_components(Mesh(many, faces), keep_largest=1, min_volume_ml=0.002)
+    assert (kept.report["components_found"], kept.vertices[:, 0].min()) == (count, places[777])
+
+
 def test_labels_that_are_known_are_used():
     mesh = three_boxes()
     labelled = label_components(mesh.triangles, mesh.vertex_count)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from clrecon.errors import NoSurfaceError, OutputError, UsageError
+from clrecon.errors import DeviceMemoryError, NoSurfaceError, OutputError, UsageError
 from clrecon.geometry import Volume
 from clrecon.pipeline import parts
 from clrecon.pipeline.mesh import make_mesh
@@ -92,12 +92,66 @@ def test_split_writes_the_components_by_descending_size(device: Any, tmp_path: P
 
 
 @pytest.mark.usefixtures("boxes")
+def test_components_of_an_earlier_run_are_left_and_said(device: Any, tmp_path: Path) -> None:
+    for name in ("bone_002.ply", "bone_500hu_003.ply", "bone_1.ply", "bones_001.ply", "bone_001.stl"):
+        (tmp_path / name).write_bytes(b"other")
+    first = run(tmp_path, device, iso_value=200.0, split=True)
+    again = run(tmp_path, device, iso_value=200.0, split=True, keep_largest=1)
+    assert [report["warnings"][1:] for report in (first, again)] == [
+        ["1 more numbered files of this name lie beside the new ones, from an earlier run"],
+        ["3 more numbered files of this name lie beside the new ones, from an earlier run"],
+    ]
+    assert (tmp_path / "bone_500hu_003.ply").read_bytes() == b"other"
+    assert (tmp_path / "bone_003.ply").stat().st_size > 100
+
+
+@pytest.mark.usefixtures("boxes")
 def test_iso_values_limits_and_split_together(device: Any, tmp_path: Path) -> None:
     report = run(tmp_path, device, iso_value=(200.0, 500.0), split=True, keep_largest=2, min_volume_ml=0.1)
     assert [mesh["name"] for mesh in report["meshes"]] == ["200hu_001", "500hu_001"]
     assert [mesh["components_found"] for mesh in report["meshes"]] == [3, 2]
     assert (report["components_found"], report["components_kept"], report["components"]) == (5, 2, 2)
     assert (report["keep_largest"], report["min_volume_ml"], report["split"]) == (2, 0.1, True)
+
+
+@pytest.mark.usefixtures("boxes")
+@pytest.mark.parametrize(("space", "sign"), [("lps", 1.0), ("ras", -1.0)])
+def test_seeds_are_in_the_frame_of_the_mesh(space: str, sign: float, device: Any, tmp_path: Path) -> None:
+    middle = np.array([20.5 * 0.5 - 10, 16 * 0.8 + 20, 3.5 * 2 - 300])
+    seed = (middle * [sign, sign, 1]).tolist()
+    report = run(tmp_path, device, iso_value=(200.0, 500.0), seeds=[seed], space=space)
+    assert (report["components_found"], report["components_kept"]) == (5, 2)
+    assert report["seeds_mm"] == [seed]
+    for mesh in report["meshes"]:
+        low, high = np.array(mesh["bounds_mm"])
+        assert ((low < seed) & (seed < high)).all()
+        assert 0.8 < mesh["seed_distances_mm"][0] < 1.2  # a row of 0.8 mm to the last voxel, and a part of one
+
+
+@pytest.mark.usefixtures("boxes")
+def test_a_seed_off_the_surface_ends_the_job(device: Any, tmp_path: Path) -> None:
+    with pytest.raises(
+        UsageError, match=r"at 200 HU: the seed at LPS \(100, 20, -290\) mm lies .* mm from the nearest"
+    ):
+        run(tmp_path, device, iso_value=200.0, seeds=[(-100.0, -20.0, -290.0)], space="ras")
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.usefixtures("boxes")
+def test_components_that_do_not_fit_the_device_are_found_all_the_same(
+    device: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    on_device = run(tmp_path, device, iso_value=200.0, split=True)
+
+    def refuse(*_: Any) -> Any:
+        raise DeviceMemoryError("the components of the mesh cannot be found: too large")
+
+    monkeypatch.setattr("clrecon.operators.components.label_components", refuse)
+    report = run(tmp_path, device, iso_value=200.0, split=True)
+    assert report["meshes"] == on_device["meshes"]
+    assert report["warnings"][1:] == [
+        "the components of the mesh cannot be found: too large: they were found without it"
+    ]
 
 
 @pytest.mark.usefixtures("boxes")

@@ -28,7 +28,12 @@ def test_several_iso_values_keep_their_order() -> None:
 
 @pytest.mark.parametrize(
     ("settings", "selects"),
-    [({}, False), ({"split": True}, True), ({"keep_largest": 1, "min_volume_ml": 1.0}, True)],
+    [
+        ({}, False),
+        ({"split": True}, True),
+        ({"seeds": [(1, 2, 3)]}, True),
+        ({"keep_largest": 1, "min_volume_ml": 1.0}, True),
+    ],
 )
 def test_components_are_told_apart_only_where_asked(settings: dict, selects: bool) -> None:
     assert MeshSettings(**settings).selects is selects
@@ -54,6 +59,8 @@ def test_the_default_preset_keeps_thin_cortex() -> None:
         ({"iso_value": math.nan}, "finite"),
         ({"iso_value": -math.inf}, "finite"),
         ({"preset": "Bone"}, "unknown preset 'Bone'"),
+        ({"seeds": [(1.0, 2.0)]}, "point of three numbers"),
+        ({"seeds": [(1.0, 2.0, math.inf)]}, "point of three numbers"),
         ({"space": "world"}, "unknown space 'world'"),
         ({"keep_largest": 0}, "1 or more, not 0"),
         ({"min_volume_ml": 0.0}, "above 0 ml"),

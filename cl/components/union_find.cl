@@ -1,0 +1,242 @@
+/* Connected components of a triangle mesh: union-find over the vertices, linked along the edges of the triangles.
+ *
+ * A vertex of an iso surface lies on one edge of the grid and belongs to the one sheet that crosses it there, so this
+ * equals union-find over the active cells, but with separate sheets of one cell kept apart.
+ *
+ * Reference: Shiloach and Vishkin 1982, "An O(log n) parallel connectivity algorithm": rounds of hooking and pointer
+ * jumping.  A root that has a smaller neighbour hooks to the smallest; one that has none, and that nobody hooks to, has
+ * a smaller neighbour in the next round.  So two rounds halve the roots at least: 2 log2(n) rounds at most.
+ *
+ * Words: the label of a vertex is another vertex of its component with a smaller number, or itself, and then the vertex
+ * is a root.  A triangle is mixed when its corners have different roots.
+ *
+ * Passes
+ *   1. clear_labels, hook_corners   the first round, where every vertex is a root: no label need be read
+ *   2. jump_labels                  labels of labels, until every label is a root (until `flags` says so)
+ *   3. mark_mixed, mark_roots       what the other rounds are about, listed by compact.cl: a small part of the mesh
+ *   4. gather_roots; then hook_roots and jump_roots on these lists alone, until no root hooks to another; the labels
+ *      of all other vertices stay, and are roots of the first round; copy_roots brings both together
+ *   5. flag_roots, scan.cl, number_components
+ *
+ * No item waits for another, no array is read by one item while another writes it except by atomics, and a minimum
+ * does not depend on the order: the outcome is the same on every device.  The root of a component is its smallest
+ * vertex. */
+#define UNUSED 0xffffffffu
+
+#ifndef JUMPS
+#define JUMPS 8
+#endif
+
+/* Follow the labels from one, JUMPS times or until a root. */
+static inline uint follow_labels(
+    __global const uint *restrict labels, uint label, __global uint *flags, const uint pass)
+{
+    uint next = labels[label];
+    for (int jump = 0; jump < JUMPS && next != label; ++jump) {
+        label = next;
+        next = labels[label];
+    }
+    if (next != label)
+        flags[0] = pass;
+    return label;
+}
+
+/* Parameters  labels  out  (n,) UNUSED
+ *             flags   out  (2,) zeros; later the number of the last pass that had something to say
+ *             n       vertices
+ * Launch      global = n rounded up by the host, any local
+ * Guarantees  every label is written */
+__kernel void clear_labels(__global uint *restrict labels, __global uint *restrict flags, const uint n)
+{
+    const uint vertex = get_global_id(0);
+    if (vertex >= n)
+        return;
+    labels[vertex] = UNUSED;
+    if (vertex == 0)
+        flags[0] = flags[1] = 0;
+}
+
+/* Parameters  triangles  in      (m, 3) numbers of vertices, each below n
+ *             labels     in/out  (n,) cleared; then the smallest vertex in one triangle with each vertex
+ *             m          triangles
+ * Launch      global = m rounded up by the host, any local
+ * Guarantees  used vertices have a label not above their own number; the others stay UNUSED */
+__kernel void hook_corners(__global const uint *restrict triangles, __global uint *labels, const uint m)
+{
+    const uint triangle = get_global_id(0);
+    if (triangle >= m)
+        return;
+    const uint3 corner = vload3(triangle, triangles);
+    const uint least = min(corner.x, min(corner.y, corner.z));
+    atomic_min(labels + corner.x, least);
+    atomic_min(labels + corner.y, least);
+    atomic_min(labels + corner.z, least);
+}
+
+/* Parameters  labels  in   (n,) each not above the number of its vertex, or UNUSED
+ *             jumped  out  (n,) the label of the label ..., JUMPS times or until it is a root
+ *             flags   out  [0]: the pass where a label is not yet a root, else as it was
+ *             n       vertices
+ *             pass    counts from 1
+ * Launch      as clear_labels
+ * Guarantees  a chain of c links becomes one of at most ceil(c / (JUMPS + 1)); all who write the flag write the same */
+__kernel void jump_labels(
+    __global const uint *restrict labels, __global uint *restrict jumped, __global uint *flags, const uint n,
+    const uint pass)
+{
+    const uint vertex = get_global_id(0);
+    if (vertex >= n)
+        return;
+    const uint label = labels[vertex];
+    jumped[vertex] = label == UNUSED ? UNUSED : follow_labels(labels, label, flags, pass);
+}
+
+/* Parameters  triangles  in   (m, 3)
+ *             labels     in   (n,) all of them roots
+ *             mask       out  (words,) bit b of word w: triangle 32 w + b is mixed
+ *             m          triangles
+ * Launch      global = words = ceil(m / 32) rounded up by the host, any local
+ * Guarantees  every word is written */
+__kernel void mark_mixed(
+    __global const uint *restrict triangles, __global const uint *restrict labels, __global uint *restrict mask,
+    const uint m)
+{
+    const uint word = get_global_id(0);
+    if (word > (m - 1) / 32)
+        return;
+    const uint begin = 32 * word;
+    const uint count = min(32u, m - begin);
+    uint bits = 0;
+    for (uint bit = 0; bit < count; ++bit) {
+        const uint3 corner = vload3(begin + bit, triangles);
+        const uint root = labels[corner.x];
+        bits |= (uint)(root != labels[corner.y] || root != labels[corner.z]) << bit;
+    }
+    mask[word] = bits;
+}
+
+/* Parameters  labels  in   (n,) all of them roots
+ *             mask    out  (words,) bit b of word w: vertex 32 w + b is a root
+ *             n       vertices
+ * Launch      global = words = ceil(n / 32) rounded up by the host, any local
+ * Guarantees  every word is written */
+__kernel void mark_roots(__global const uint *restrict labels, __global uint *restrict mask, const uint n)
+{
+    const uint word = get_global_id(0);
+    if (word > (n - 1) / 32)
+        return;
+    const uint begin = 32 * word;
+    const uint count = min(32u, n - begin);
+    uint bits = 0;
+    for (uint bit = 0; bit < count; ++bit)
+        bits |= (uint)(labels[begin + bit] == begin + bit) << bit;
+    mask[word] = bits;
+}
+
+/* Parameters  triangles  in   (m, 3)
+ *             mixed      in   (count,) the mixed triangles
+ *             labels     in   (n,) all of them roots
+ *             corners    out  (count, 3) the roots of their corners
+ *             count      mixed triangles
+ * Launch      global = count rounded up by the host, any local
+ * Guarantees  every corner is written */
+__kernel void gather_roots(
+    __global const uint *restrict triangles, __global const uint *restrict mixed, __global const uint *restrict labels,
+    __global uint *restrict corners, const uint count)
+{
+    const uint place = get_global_id(0);
+    if (place >= count)
+        return;
+    const uint3 corner = vload3(mixed[place], triangles);
+    vstore3((uint3)(labels[corner.x], labels[corner.y], labels[corner.z]), place, corners);
+}
+
+/* Parameters  corners  in      (count, 3) roots of the first round, as gathered
+ *             labels   in      (n,) of these all roots
+ *             hooked   in/out  (n,) of these that are roots now as labels; then each the smallest in a triangle with it
+ *             flags    out     [1]: the round where a root was hooked, else as it was
+ *             count    mixed triangles
+ *             round    counts from 1
+ * Launch      as gather_roots
+ * Guarantees  all who write the flag write the same; without it every triangle lies in one component */
+__kernel void hook_roots(
+    __global const uint *restrict corners, __global const uint *restrict labels, __global uint *hooked,
+    __global uint *flags, const uint count, const uint round)
+{
+    const uint place = get_global_id(0);
+    if (place >= count)
+        return;
+    const uint3 corner = vload3(place, corners);
+    const uint a = labels[corner.x], b = labels[corner.y], c = labels[corner.z];
+    if (a == b && b == c)
+        return;
+    const uint least = min(a, min(b, c));
+    // The smallest root itself gains nothing, and in late rounds it is one address for all.
+    if (a != least)
+        atomic_min(hooked + a, least);
+    if (b != least)
+        atomic_min(hooked + b, least);
+    if (c != least)
+        atomic_min(hooked + c, least);
+    flags[1] = round;
+}
+
+/* As jump_labels, for the vertices of a list.
+ *
+ * Parameters  roots   in   (count,) the roots after the first round
+ *             labels  in   (n,)
+ *             jumped  out  (n,) of listed roots
+ *             flags   out  [0], as in jump_labels
+ *             count   listed roots
+ *             pass    counts from 1
+ * Launch      global = count rounded up by the host, any local */
+__kernel void jump_roots(
+    __global const uint *restrict roots, __global const uint *restrict labels, __global uint *restrict jumped,
+    __global uint *flags, const uint count, const uint pass)
+{
+    const uint place = get_global_id(0);
+    if (place < count)
+        jumped[roots[place]] = follow_labels(labels, labels[roots[place]], flags, pass);
+}
+
+/* Parameters  roots   in   (count,)
+ *             labels  in   (n,)
+ *             copy    out  (n,) of listed roots as labels
+ *             count   listed roots
+ * Launch      as jump_roots */
+__kernel void copy_roots(
+    __global const uint *restrict roots, __global const uint *restrict labels, __global uint *restrict copy,
+    const uint count)
+{
+    const uint place = get_global_id(0);
+    if (place < count)
+        copy[roots[place]] = labels[roots[place]];
+}
+
+/* Parameters  labels  in   (n,)
+ *             roots   out  (n,) 1 for roots, else 0
+ *             n       vertices
+ * Launch      as clear_labels */
+__kernel void flag_roots(__global const uint *restrict labels, __global uint *restrict roots, const uint n)
+{
+    const uint vertex = get_global_id(0);
+    if (vertex < n)
+        roots[vertex] = labels[vertex] == vertex;
+}
+
+/* Parameters  labels   in   (n,) the label of each label is a root
+ *             offsets  in   (n,) exclusive scan of the roots
+ *             numbers  out  (n,) components counted in the order of their roots; -1 for unused vertices
+ *             n        vertices
+ * Launch      as clear_labels
+ * Guarantees  every number is written */
+__kernel void number_components(
+    __global const uint *restrict labels, __global const uint *restrict offsets, __global int *restrict numbers,
+    const uint n)
+{
+    const uint vertex = get_global_id(0);
+    if (vertex >= n)
+        return;
+    const uint label = labels[vertex];
+    numbers[vertex] = label == UNUSED ? -1 : (int)offsets[labels[label]];
+}

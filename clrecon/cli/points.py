@@ -1,0 +1,24 @@
+"""Points on the command line."""
+
+from __future__ import annotations
+
+import argparse
+
+__all__ = ["parse_point"]
+
+
+def parse_point(text: str) -> tuple[float, ...]:
+    """Read ``X,Y,Z``, three numbers in mm.
+
+    Raises
+    ------
+    argparse.ArgumentTypeError
+        These are not three numbers.
+    """
+    try:
+        point = tuple(float(part) for part in text.split(","))
+    except ValueError:
+        point = ()
+    if len(point) != 3:
+        raise argparse.ArgumentTypeError(f"{text!r} is no point: three numbers in mm with commas, X,Y,Z")
+    return point

@@ -1,0 +1,73 @@
+"""The triangle of a surface that lies nearest to a point."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clrecon.mesh.measures import chunks
+
+__all__ = ["find_nearest_triangle"]
+
+Points = NDArray[np.float64]
+
+
+def find_nearest_triangle(
+    vertices: NDArray[np.float32], triangles: NDArray[np.uint32], point: NDArray[np.float64]
+) -> tuple[int, float]:
+    """Find the triangle that lies nearest to a point.
+
+    The box around a triangle is never farther than the triangle and its nearest corner never nearer: only triangles
+    whose box is nearer than the nearest corner of all are looked at exactly.
+
+    Parameters
+    ----------
+    vertices : ndarray, shape (n, 3), float32
+        mm.
+    triangles : ndarray, shape (m, 3), uint32
+        At least one, every index below n.
+    point : ndarray, shape (3,), float64
+        mm.
+
+    Returns
+    -------
+    triangle : int
+        Row of `triangles`; of several that are equally near the first.
+    distance : float
+        mm.
+    """
+    columns = np.ascontiguousarray(vertices.T.astype(np.float64)) - point[:, None]
+    corner_distance = np.einsum("ij,ij->j", columns, columns)
+    box_distance = np.empty(len(triangles))
+    nearest_corner = np.inf
+    for where in chunks(len(triangles)):
+        a, b, c = triangles[where].T.astype(np.intp)
+        one, two, three = (np.take(columns, index, axis=1, mode="clip") for index in (a, b, c))
+        low = np.minimum(np.minimum(one, two), three)
+        high = np.maximum(np.maximum(one, two), three)
+        gap = np.maximum(np.maximum(low, -high), 0.0)
+        box_distance[where] = np.einsum("ij,ij->j", gap, gap)
+        nearest_corner = min(nearest_corner, *(float(corner_distance[corner].min()) for corner in (a, b, c)))
+    near = np.flatnonzero(box_distance <= nearest_corner)
+    distances = _distances_from_origin(*(columns[:, triangles[near, corner]].T for corner in range(3)))
+    first = int(distances.argmin())
+    return int(near[first]), float(distances[first])
+
+
+def _distances_from_origin(a: Points, b: Points, c: Points) -> NDArray[np.float64]:
+    """Distance of the origin from each triangle (a, b, c), corners of shape (k, 3): its face, or one of its edges."""
+    edges = np.minimum(np.minimum(_distances_to_edge(a, b), _distances_to_edge(b, c)), _distances_to_edge(c, a))
+    normal = np.cross(b - a, c - a)
+    above = [np.einsum("ij,ij->i", normal, np.cross(p, q)) for p, q in ((a, b), (b, c), (c, a))]
+    length = np.linalg.norm(normal, axis=1)
+    inside = (np.minimum(np.minimum(*above[:2]), above[2]) >= 0.0) & (length > 0.0)
+    face = np.abs(np.einsum("ij,ij->i", normal, a)) / np.where(inside, length, 1.0)
+    return np.where(inside, face, edges)
+
+
+def _distances_to_edge(a: Points, b: Points) -> NDArray[np.float64]:
+    along = b - a
+    square = np.einsum("ij,ij->i", along, along)
+    share = np.clip(-np.einsum("ij,ij->i", a, along) / np.where(square > 0.0, square, 1.0), 0.0, 1.0)
+    distance: NDArray[np.float64] = np.linalg.norm(a + share[:, None] * along, axis=1)
+    return distance

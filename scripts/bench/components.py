@@ -1,0 +1,72 @@
+"""Connected components of the surface on the device, beside what scipy and cc3d find on the mesh and on the mask."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+from measure import alternate, summarise
+from registry import Job, case
+
+__all__ = ["measure_components"]
+
+
+@case("components", "components of the surface on the device, against scipy and cc3d")
+def measure_components(job: Job) -> dict[str, Any]:
+    """Mesh in host memory to a number for each vertex in host memory, upload and download included.
+
+    Peers: scipy.sparse.csgraph on the same mesh, with the same outcome; scipy.ndimage.label and cc3d on the mask of
+    the voxels inside (faces, and faces to corners), which find the solids and not their surfaces: a cavity is no
+    component of theirs.  They get the mask as a gift.
+    """
+    import cc3d
+    import numpy as np
+    from scipy import ndimage
+
+    from clrecon.kernels import Stopwatch
+    from clrecon.mesh import connectivity
+    from clrecon.operators.components import label_components
+    from clrecon.operators.isosurface import extract_isosurface
+
+    volume = job.input.volume()
+    mesh = extract_isosurface(volume, job.hu, job.device)
+    triangles, vertices = mesh.triangles, mesh.vertex_count
+    mask = volume.voxels >= job.hu
+    corners = ndimage.generate_binary_structure(3, 3)
+    peers: dict[str, Callable[[], Any]] = {
+        "csgraph": lambda: connectivity.label_components(triangles, vertices),
+        "ndimage_6": lambda: ndimage.label(mask)[::-1],
+        "ndimage_26": lambda: ndimage.label(mask, corners)[::-1],
+        "cc3d_6": lambda: cc3d.connected_components(mask, connectivity=6, return_N=True)[::-1],
+        "cc3d_26": lambda: cc3d.connected_components(mask, connectivity=26, return_N=True)[::-1],
+    }
+    components = {"clrecon": label_components(job.device, triangles, vertices)}
+    figures: dict[str, Any] = {"ratios": {}, "sides": {}}
+    for name, peer in peers.items():
+        components[name] = peer()
+        ours, theirs = alternate(
+            lambda: _seconds(lambda: label_components(job.device, triangles, vertices)),
+            lambda peer=peer: _seconds(peer),  # type: ignore[misc]
+            job.pairs,
+            limit_s=job.limit_s / len(peers),
+        )
+        figures["sides"][name] = summarise(ours, theirs)
+        figures["ratios"][name] = figures["sides"][name]["ratio"]
+    stopwatch = Stopwatch()
+    with stopwatch.running(job.device):
+        label_components(job.device, triangles, vertices, stopwatch=stopwatch)
+    return {
+        **figures,
+        "vertices": vertices,
+        "triangles": len(triangles),
+        "components": {name: int(found[0]) for name, found in components.items()},
+        "equal_to_csgraph": bool(np.array_equal(components["clrecon"][1], components["csgraph"][1])),
+        "kernel_seconds": dict(stopwatch.by_kernel),
+    }
+
+
+def _seconds(run: Callable[[], Any]) -> float:
+    start = time.perf_counter()
+    run()
+    return time.perf_counter() - start

@@ -1,0 +1,160 @@
+"""Components found on the device equal the twin's and scipy's, whatever the mesh and the device."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import clrecon
+from clrecon.errors import DeviceError, DeviceMemoryError, UsageError
+from clrecon.geometry import Volume
+from clrecon.mesh import connectivity
+from clrecon.operators import components
+from clrecon.operators.components import label_components
+from clrecon.reference import components as twin
+
+AFFINE = np.diag((0.5, 0.7, 2.5, 1.0))
+
+
+def soup(vertices: int, triangles: int, seed: int = 7) -> np.ndarray:
+    """Random triangles, some of them with one vertex two or three times."""
+    return np.random.default_rng(seed).integers(0, vertices, (triangles, 3)).astype(np.uint32)
+
+
+def strip(vertices: int) -> np.ndarray:
+    """A strip of triangles: its vertices are one path."""
+    return np.arange(vertices - 2, dtype=np.uint32)[:, None] + np.arange(3, dtype=np.uint32)
+
+
+def check_equal(device, triangles: np.ndarray, vertex_count: int, other=twin.label_components) -> None:
+    before = triangles.copy()
+    count, labels = label_components(device, triangles, vertex_count)
+    expected_count, expected = other(triangles, vertex_count)
+    assert count == expected_count
+    assert labels.dtype == np.int64
+    np.testing.assert_array_equal(labels, expected)
+    np.testing.assert_array_equal(triangles, before)
+
+
+@pytest.mark.parametrize("vertices", [1, 2, 31, 63, 64, 65, 1023, 1024, 1025])
+@pytest.mark.parametrize("share", [0.1, 0.35, 3.0])
+def test_random_triangles(device, vertices, share):
+    check_equal(device, soup(vertices, max(1, int(share * vertices))), vertices)
+
+
+@pytest.mark.parametrize("order", ["ascending", "descending", "shuffled"])
+def test_a_long_strip_is_one_component(device, order):
+    """Chains of labels are as long as they can be: several passes of jumps."""
+    n = 3001
+    number = {
+        "ascending": np.arange(n),
+        "descending": np.arange(n)[::-1],
+        "shuffled": np.random.default_rng(3).permutation(n),
+    }[order].astype(np.uint32)
+    triangles = number[strip(n)]
+    assert label_components(device, triangles, n)[0] == 1
+    check_equal(device, triangles, n)
+    check_equal(device, triangles[np.arange(n - 2) % 7 != 6], n)  # every seventh left out: still joined by the others
+    check_equal(device, triangles[np.arange(n - 2) % 7 < 4], n)  # pieces of six vertices, one between two unused
+
+
+@pytest.mark.parametrize("centre", [0, 500, 1000])
+def test_a_fan_hooks_in_any_order(device, centre):
+    rim = np.delete(np.arange(1001, dtype=np.uint32), centre)
+    triangles = np.column_stack([np.full(500, centre, np.uint32), rim[0::2], rim[1::2]])
+    assert label_components(device, triangles, 1001)[0] == 1
+    check_equal(device, triangles, 1001)
+
+
+@pytest.mark.parametrize("basins", [5, 20, 200, 2000])
+def test_a_row_of_basins_is_a_chain_of_roots(device, basins):
+    """0 - n - 1 - n+1 - 2 ...: the first round leaves the roots 0, 1, 2 ..., each of which hooks to the one before."""
+    path = np.arange(2 * basins).reshape(2, basins).T.ravel().astype(np.uint32)
+    edges = np.column_stack([path[:-1], path[1:], path[1:]])
+    assert label_components(device, edges, 2 * basins)[0] == 1
+    check_equal(device, edges, 2 * basins)
+
+
+def test_a_device_that_never_ends_is_an_error(device, monkeypatch):
+    monkeypatch.setattr(components, "MOST_PASSES", 3)
+    with pytest.raises(DeviceError, match="has not found the components after 3 passes: it computes wrongly"):
+        label_components(device, strip(3001), 3001)
+
+
+def test_roots_are_the_smallest_vertices_and_unused_ones_are_none(device):
+    triangles = np.array([[9, 4, 7], [3, 3, 3], [8, 1, 1], [5, 9, 9]], dtype=np.uint32)
+    count, labels = label_components(device, triangles, 11)
+    assert count == 3
+    assert labels.tolist() == [-1, 0, -1, 1, 2, 2, -1, 2, 0, 2, -1]
+
+
+def test_the_order_of_triangles_does_not_matter(device):
+    triangles = soup(400, 160)
+    shuffled = np.random.default_rng(1).permuted(np.random.default_rng(2).permutation(triangles), axis=1)
+    np.testing.assert_array_equal(
+        label_components(device, shuffled, 400)[1], label_components(device, triangles, 400)[1]
+    )
+
+
+@pytest.mark.parametrize("density", [0.03, 0.2, 0.5])
+def test_noisy_surfaces_equal_scipy(device, density):
+    voxels = (np.random.default_rng(11).random((20, 33, 40)) < density).astype(np.int16)
+    mesh = clrecon.extract_isosurface(Volume(voxels, AFFINE), 1, device)
+    check_equal(device, mesh.triangles, mesh.vertex_count, connectivity.label_components)
+
+
+def test_sheets_of_one_cell_stay_apart(device):
+    """Two voxels across the diagonal of a cell share its cells and no vertex: one component of cells, two surfaces."""
+    voxels = np.zeros((4, 4, 4), np.int16)
+    voxels[1, 1, 1] = voxels[2, 2, 2] = 10
+    mesh = clrecon.extract_isosurface(Volume(voxels, np.eye(4)), 5, device)
+    assert label_components(device, mesh.triangles, mesh.vertex_count)[0] == 2
+
+
+@pytest.mark.parametrize("group", [1, 16])
+def test_devices_with_small_work_groups_get_the_same(device, group, monkeypatch):
+    monkeypatch.setattr(device, "max_work_group_size", group)
+    check_equal(device, soup(500, 200), 500)
+
+
+@pytest.mark.oclgrind
+def test_several_rounds_under_a_simulator(device):
+    """A shuffled strip takes several rounds, a row of basins several passes; unused vertices and one alone."""
+    number = np.random.default_rng(6).permutation(70).astype(np.uint32)
+    path = 70 + np.arange(40).reshape(2, 20).T.ravel()
+    edges = np.column_stack([path[:-1], path[1:], path[1:]])
+    triangles = np.concatenate([number[strip(60)], [[number[61]] * 3], edges]).astype(np.uint32)
+    check_equal(device, triangles, 112)
+
+
+def test_a_mesh_without_triangles(device):
+    assert label_components(device, np.empty((0, 3), np.uint32), 0)[0] == 0
+    count, labels = label_components(device, [], 3)
+    assert (count, labels.tolist()) == (0, [-1, -1, -1])
+
+
+def test_vertices_that_are_not_there_are_refused(device):
+    with pytest.raises(UsageError, match="refers to vertex 5, the mesh has 5 vertices"):
+        label_components(device, np.array([[0, 1, 5]], np.uint32), 5)
+    with pytest.raises(UsageError, match="refers to vertex 0, the mesh has 0 vertices"):
+        label_components(device, np.zeros((1, 3), np.uint32), 0)
+    with pytest.raises(UsageError, match="components are found in up to"):
+        label_components(device, np.zeros((1, 3), np.uint32), 2**31 + 1)
+
+
+def test_too_little_memory_is_said_before_it_is_taken(device, monkeypatch):
+    monkeypatch.setattr(device, "memory_bytes", 16_000)
+    monkeypatch.setattr(components, "allocate", lambda *_: pytest.fail("memory was taken"))
+    with pytest.raises(DeviceMemoryError, match="component offsets"):
+        label_components(device, soup(1000, 10), 1000)
+    with pytest.raises(DeviceMemoryError, match="15,000 bytes are allowed"):
+        label_components(device, soup(1000, 10), 1000, memory=15_000)
+
+
+def test_real_ct_equals_scipy(device, real_data):
+    volume = clrecon.read_volume(real_data / "thoracic_0p8mm")
+    mesh = clrecon.extract_isosurface(volume, 226, device)
+    count, labels = label_components(device, mesh.triangles, mesh.vertex_count)
+    expected_count, expected = connectivity.label_components(mesh.triangles, mesh.vertex_count)
+    assert count == expected_count > 1000
+    np.testing.assert_array_equal(labels, expected)
