@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping
+from contextlib import suppress
 from typing import Any
 
 from clrecon.errors import DeviceError
+from clrecon.kernels.binaries import binary_key, read_binary, store_binary
 from clrecon.kernels.sources import read_kernel_source
 from clrecon.opencl import Device
 from clrecon.opencl.quirks import import_pyopencl
@@ -56,14 +58,48 @@ def load_program(device: Device, name: str, variants: Mapping[str, str] | None =
 
 
 def _build(device: Device, name: str, options: tuple[str, ...]) -> Program:
-    cl = import_pyopencl()
-    context = device.context
+    source = read_kernel_source(name)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # a compiler's chatter about code that builds
-            return Program(name, cl.Program(context, read_kernel_source(name)).build(["-cl-std=CL1.2", *options]))
-    except (cl.Error, RuntimeError, OSError) as error:  # OSError: the driver's or pyopencl's cache
+            built = _build_from_binary(device, source, options) if device.keeps_binaries else None
+            if built is None:
+                built = _build_from_source(device, source, options)
+            program = Program(name, built)
+    except (import_pyopencl().Error, RuntimeError, OSError) as error:  # OSError: the driver's or pyopencl's cache
         raise DeviceError(f"cl/{name} does not build on {device.label}: {_first_complaint(str(error))}") from error
+    if not program.kernel_names:
+        raise DeviceError(f"cl/{name} has no kernel on {device.label}: its cache is damaged, empty it")
+    return program
+
+
+_STANDARD = ("-cl-std=CL1.2",)
+
+
+def _key(device: Device, source: str, options: tuple[str, ...]) -> str:
+    driver = (device.platform, device.platform_version, device.driver, device.version, device.name)
+    return binary_key(*driver, *_STANDARD, *options, source)
+
+
+def _build_from_source(device: Device, source: str, options: tuple[str, ...]) -> Any:
+    cl = import_pyopencl()
+    built = cl.Program(device.context, source).build([*_STANDARD, *options])
+    if device.keeps_binaries:
+        with suppress(cl.Error):
+            store_binary(_key(device, source, options), built.binaries[0])
+    return built
+
+
+def _build_from_binary(device: Device, source: str, options: tuple[str, ...]) -> Any:
+    """The program from the binary that an earlier process kept; None where there is none or the driver refuses it."""
+    cl = import_pyopencl()
+    binary = read_binary(_key(device, source, options))
+    if binary is None:
+        return None
+    try:
+        return cl.Program(device.context, [device.cl_device], [binary]).build([*_STANDARD, *options])
+    except (cl.Error, RuntimeError):
+        return None
 
 
 def _first_complaint(log: str) -> str:

@@ -57,6 +57,8 @@ class Device:
         A checking simulator such as Oclgrind: used only when it is named.
     shortcoming : str
         Why the device cannot be used; empty where it can.
+    keeps_binaries : bool
+        Built programs are kept for the next process, see `clrecon.kernels.binaries`.
     kernel_variants : dict of str to str
         ``-D`` definitions for kernels that are written for vectors, see `quirks.kernel_variants`.
     lock : threading.RLock
@@ -82,6 +84,7 @@ class Device:
         self.is_simulator: bool = quirks.is_simulator(self.platform)
         self.shares_host_memory: bool = quirks.shares_host_memory(self.platform, self.type)
         self.has_event_times: bool = quirks.has_event_times(self.platform)
+        self.keeps_binaries: bool = quirks.is_slow_from_its_cache(self.platform)
         self.kernel_variants: dict[str, str] = quirks.kernel_variants(self.platform, self.type)
         self.shortcoming: str = _find_shortcoming(cl_device)
         self.lock = threading.RLock()

@@ -16,6 +16,7 @@ __all__ = [
     "has_event_times",
     "import_pyopencl",
     "is_simulator",
+    "is_slow_from_its_cache",
     "is_software_gpu",
     "kernel_variants",
     "shares_host_memory",
@@ -73,6 +74,11 @@ def cache_warnings() -> tuple[str, ...]:
 def is_simulator(platform_name: str) -> bool:
     """True for platforms that check or simulate and must never be chosen silently."""
     return any(name in platform_name.lower() for name in SIMULATOR_PLATFORMS)
+
+
+def is_slow_from_its_cache(platform_name: str) -> bool:
+    """True for PoCL: it preprocesses the whole source, builtins included, to find what it has built already."""
+    return "portable computing language" in platform_name.lower()
 
 
 def is_software_gpu(device_name: str) -> bool:

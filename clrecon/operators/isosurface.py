@@ -260,7 +260,7 @@ class _Run:
             voxels_d = self.extractor._upload(slab)
         with stopwatch.running(device):
             bricks = self.extractor._compare_bricks(self.level, stopwatch)
-            classified = marching_cubes.classify(device, slab, program, voxels_d, self.level, stopwatch, bricks)
+            classified = marching_cubes.classify(device, slab, voxels_d, self.level, stopwatch, bricks)
             counted = marching_cubes.count(device, slab, program, classified, stopwatch)
         self._check_output(slab, counted)
         part = marching_cubes.emit(

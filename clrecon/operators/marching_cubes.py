@@ -58,7 +58,12 @@ def prepare_marching_cubes(device: Device, dtype: DTypeLike) -> Program:
         The driver's compiler refuses.
     """
     prepare_scan(device)
+    _load_classify(device, dtype)
     return load_program(device, "isosurface/marching_cubes.cl", {**voxel_variants(dtype), **device.kernel_variants})
+
+
+def _load_classify(device: Device, dtype: DTypeLike) -> Program:
+    return load_program(device, "isosurface/classify.cl", voxel_variants(dtype))
 
 
 def _pad4(rows: NDArray[np.float64]) -> NDArray[np.float32]:
@@ -116,7 +121,6 @@ def _volume_scalars(slab: Slab) -> tuple[Any, ...]:
 def classify(
     device: Device,
     slab: Slab,
-    program: Program,
     voxels_d: Any,
     level: Any,
     stopwatch: Stopwatch,
@@ -133,6 +137,7 @@ def classify(
     bricks : BrickStates, optional
         How the bricks of the volume compare with `level`, where the slab is all of it.
     """
+    program = _load_classify(device, slab.grid.volume.voxels.dtype)
     mask_d = allocate(device, 4 * slab.mask_rows * slab.grid.words)
     row_extents_d = allocate(device, 4 * slab.mask_rows)
     if bricks is not None:

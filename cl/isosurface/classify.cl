@@ -1,0 +1,152 @@
+/* Which samples of a volume are inside, packed to one bit a sample: the first pass of every surface.
+ *
+ * References: the packing is our own; skipping bricks by their ranges follows Wilhelms and Van Gelder 1992.
+ *
+ * Passes (one of them)
+ *   classify_samples   from the voxels of a slab
+ *   classify_bricks    from the voxels of mixed bricks alone, where the bricks of the whole volume are measured */
+#include "bricks/bricks.h"
+#include "include/volume.h"
+#include "isosurface/mask_rows.h"
+
+/* Bits of 16 comparison results (-1 or 0 each): bit n is lane n. */
+static inline uint pack_lanes(short16 lanes)
+{
+    const ushort16 bits = as_ushort16(lanes)
+        & (ushort16)(1, 2, 4, 8, 16, 32, 64, 128, 256, 512, 1024, 2048, 4096, 8192, 16384, 32768);
+    const ushort8 by8 = bits.lo | bits.hi;
+    const ushort4 by4 = by8.lo | by8.hi;
+    const ushort2 by2 = by4.lo | by4.hi;
+    return by2.x | by2.y;
+}
+
+/* Inside bits of 16 voxels.  Wider types are compared 8 at a time: vectors of 64 bytes go wrong in PoCL 3.0 on
+ * processors without registers of that size, where kernel and library disagree on how they are passed. */
+static inline uint classify_lanes(__global const VOXEL *voxels, VOXEL level)
+{
+    if (sizeof(VOXEL) <= 2)
+        return pack_lanes(convert_short16(vload16(0, voxels) >= level));
+    return pack_lanes(
+        (short16)(convert_short8(vload8(0, voxels) >= level), convert_short8(vload8(1, voxels) >= level)));
+}
+
+/* The word of 32 samples that starts at voxel `first` of a row; `first` may lie before it, samples may lie beyond. */
+static inline uint classify_word(__global const VOXEL *row, int first, int ni, VOXEL level)
+{
+    if (ni < 32) {
+        uint bits = 0;
+        for (int b = max(0, -first); b < min(32, ni - first); ++b)
+            bits |= (uint)(row[first + b] >= level) << b;
+        return bits;
+    }
+    /* 32 voxels that lie in the row, shifted to where the word has them. */
+    const int begin = clamp(first, 0, ni - 32);
+    const uint bits = classify_lanes(row + begin, level) | classify_lanes(row + begin + 16, level) << 16;
+    if (first < begin)
+        return bits << (begin - first);
+    return first - begin < 32 ? bits >> (first - begin) : 0;
+}
+
+/* Parameters  voxels     in   slices of the volume from first_slice on
+ *             mask       out  (gk, gj, words) bit set where voxel >= level
+ *             row_extents  out  (gk, gj) first word of the row with a bit set, and the one after the last; 0, 0 in
+ *                          rows without any
+ *             level      lowest inside value
+ *             ni nj nk   voxels of the whole volume
+ *             border     layers of outside around the volume, 0 or 1
+ *             first_slice          slice of the volume that `voxels` begins with
+ *             first_sample_slice   slice of the sample grid that the mask begins with
+ *             gk         slices of the mask
+ *             words      words a row, ceil((ni + 2 border) / 32)
+ * Launch      global = gj * gk rounded up by the host, any local: one item a row, so that dividing for j and k
+ *             costs little
+ * Guarantees  every word of the mask and every extent is written; bits beyond the row are 0 */
+__kernel void classify_samples(
+    __global const VOXEL *restrict voxels, __global uint *restrict mask, __global ushort2 *restrict row_extents,
+    const VOXEL level,
+    const int ni, const int nj, const int nk, const int border, const int first_slice, const int first_sample_slice,
+    const uint gk, const int words)
+{
+    const uint gj = nj + 2 * border;
+    const uint row = get_global_id(0);
+    if (row >= gj * gk)
+        return;
+    __global uint *row_mask = mask + (size_t)row * words;
+    const int j = (int)(row % gj) - border;
+    const int k = (int)(row / gj) + first_sample_slice - border;
+    if (j < 0 || j >= nj || k < 0 || k >= nk) {
+        for (int w = 0; w < words; ++w)
+            row_mask[w] = 0;
+        row_extents[row] = (ushort2)(0, 0);
+        return;
+    }
+    __global const VOXEL *row_voxels = voxels + voxel_index(0, j, k - first_slice, ni, nj);
+    int begin = words, end = 0;
+    for (int w = 0; w < words; ++w) {
+        const uint bits = classify_word(row_voxels, 32 * w - border, ni, level);
+        row_mask[w] = bits;
+        begin = min(begin, bits != 0 ? w : words);
+        end = bits != 0 ? w + 1 : end;
+    }
+    row_extents[row] = (ushort2)((ushort)min(begin, end), (ushort)end);
+}
+
+/* What the bricks say of the word of samples first .. first + 31 of a row: BRICK_OUTSIDE, BRICK_INSIDE or
+ * BRICK_MIXED. */
+static inline uint state_of_word(__global const uchar *row_states, int first, int ni)
+{
+    const int begin = max(first, 0) / BRICK, end = (min(first + 32, ni) - 1) / BRICK;
+    const uint state = row_states[begin];
+    uint same = 1;
+    for (int b = begin + 1; b <= end; ++b)
+        same &= row_states[b] == state;
+    return same ? state : BRICK_MIXED;
+}
+
+/* classify_samples where the ranges of the volume's bricks are known: reads the voxels of mixed bricks alone.
+ *
+ * Parameters  brick_states   in   (bk, bj, bi) of the whole volume, see cl/bricks/ranges.cl
+ *             brick_extents  in   (bk, bj)
+ *             voxels         in   the whole volume
+ *             all others     as classify_samples */
+__kernel void classify_bricks(
+    __global const uchar *restrict brick_states, __global const ushort2 *restrict brick_extents,
+    __global const VOXEL *restrict voxels, __global uint *restrict mask, __global ushort2 *restrict row_extents,
+    const VOXEL level,
+    const int ni, const int nj, const int nk, const int border, const int words)
+{
+    const uint gj = nj + 2 * border, gk = nk + 2 * border;
+    const uint row = get_global_id(0);
+    if (row >= gj * gk)
+        return;
+    __global uint *row_mask = mask + (size_t)row * words;
+    const int j = (int)(row % gj) - border;
+    const int k = (int)(row / gj) - border;
+    int begin = 0, end = 0; /* words that may hold anything */
+    const int bi = (ni + BRICK - 1) / BRICK, bj = (nj + BRICK - 1) / BRICK;
+    const size_t brick_row = j < 0 || j >= nj || k < 0 || k >= nk ? 0 : (size_t)(k / BRICK) * bj + j / BRICK;
+    if (j >= 0 && j < nj && k >= 0 && k < nk && brick_extents[brick_row].y != 0) {
+        begin = (BRICK * brick_extents[brick_row].x + border) / 32;
+        end = min((BRICK * brick_extents[brick_row].y + border + 31) / 32, words);
+    }
+    for (int w = 0; w < begin; ++w)
+        row_mask[w] = 0;
+    for (int w = end; w < words; ++w)
+        row_mask[w] = 0;
+    __global const VOXEL *row_voxels = voxels + voxel_index(0, max(min(j, nj - 1), 0), max(min(k, nk - 1), 0), ni, nj);
+    __global const uchar *row_states = brick_states + brick_row * bi;
+    int first = words, last = 0;
+    for (int w = begin; w < end; ++w) {
+        const int sample = 32 * w - border;
+        const uint state = sample + 32 > 0 && sample < ni ? state_of_word(row_states, sample, ni) : BRICK_OUTSIDE;
+        uint bits = 0;
+        if (state == BRICK_MIXED)
+            bits = classify_word(row_voxels, sample, ni, level);
+        else if (state == BRICK_INSIDE)
+            bits = (uint)(low_bits(min(32, ni - sample)) & ~low_bits(max(0, -sample)));
+        row_mask[w] = bits;
+        first = min(first, bits != 0 ? w : words);
+        last = bits != 0 ? w + 1 : last;
+    }
+    row_extents[row] = (ushort2)((ushort)min(first, last), (ushort)last);
+}

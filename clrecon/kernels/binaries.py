@@ -1,0 +1,85 @@
+"""Built programs in the user's cache folder, for drivers that take long to find theirs.
+
+PoCL keeps what it has built, but reads the whole source through its compiler's preprocessor to look for it: 25 ms a
+program.  From the binary that it gives, the same program is there in 2 ms.
+
+A file is named by a hash of all that the binary depends on, and holds a hash of itself: one that was cut or changed is
+built anew.  Like the driver's own cache the folder is the user's alone, since what is in it will be run.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import tempfile
+from collections.abc import Sequence
+from contextlib import suppress
+from pathlib import Path
+
+__all__ = ["binary_key", "read_binary", "store_binary"]
+
+_MAGIC = b"clrecon kernels 1\n"
+_MOST_FILES = 64
+
+
+def binary_key(*parts: str) -> str:
+    """Hash of everything that a binary depends on: device, driver, options, source."""
+    digest = hashlib.sha256()
+    for part in parts:
+        digest.update(str(len(part)).encode() + b":" + part.encode())
+    return digest.hexdigest()
+
+
+def _folder() -> Path:
+    home = Path(os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache"))
+    return home / "clrecon" / "kernels"
+
+
+def _is_private(folder: Path) -> bool:
+    """True when nobody else can put a file there."""
+    if not hasattr(os, "getuid"):  # Windows: the profile folder is the user's own
+        return folder.is_dir()
+    try:
+        state = folder.stat()
+    except OSError:
+        return False
+    return state.st_uid == os.getuid() and not state.st_mode & 0o022
+
+
+def read_binary(key: str) -> bytes | None:
+    """Return the binary kept under `key`; None where there is none, or none that can be trusted."""
+    folder = _folder()
+    if not _is_private(folder):
+        return None
+    try:
+        content = (folder / key).read_bytes()
+    except OSError:
+        return None
+    head, binary = content[: len(_MAGIC) + 32], content[len(_MAGIC) + 32 :]
+    return binary if head == _MAGIC + hashlib.sha256(binary).digest() else None
+
+
+def store_binary(key: str, binary: bytes) -> None:
+    """Keep `binary` under `key`, as a whole or not at all; the oldest go when there are many.
+
+    A folder that cannot be written is no error: the program is there, and the next process builds it again.
+    """
+    folder = _folder()
+    with suppress(OSError):
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        if not _is_private(folder):
+            return
+        handle, name = tempfile.mkstemp(prefix=".new-", dir=folder)
+        try:
+            with os.fdopen(handle, "wb") as file:
+                file.write(_MAGIC + hashlib.sha256(binary).digest() + binary)
+            os.replace(name, folder / key)
+        except OSError:
+            os.unlink(name)
+            raise
+        _prune(sorted(folder.iterdir(), key=lambda path: path.stat().st_mtime))
+
+
+def _prune(files: Sequence[Path]) -> None:
+    for path in files[:-_MOST_FILES]:
+        path.unlink(missing_ok=True)
