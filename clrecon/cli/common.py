@@ -12,7 +12,17 @@ from typing import Any, NoReturn
 from clrecon.cli.console import Console
 from clrecon.errors import ClreconError, OutputError, UsageError
 
-__all__ = ["EXIT_CODES", "INTERRUPTED", "Parser", "add_common", "add_device", "guard", "megabytes", "table"]
+__all__ = [
+    "EXIT_CODES",
+    "INTERRUPTED",
+    "Parser",
+    "add_common",
+    "add_device",
+    "add_memory",
+    "guard",
+    "megabytes",
+    "table",
+]
 
 INTERRUPTED = 130
 
@@ -72,6 +82,34 @@ def add_device(parser: argparse.ArgumentParser) -> None:
         help='OpenCL device: an index of "clrecon devices", "cpu", "gpu" or a part of its name'
         " (default: CLRECON_DEVICE, else the best)",
     )
+
+
+def add_memory(parser: argparse.ArgumentParser) -> None:
+    """Add --memory."""
+    parser.add_argument(
+        "--memory",
+        type=parse_size,
+        metavar="SIZE",
+        help="memory that may be taken on the device, such as 500MB or 2GiB (default: all of it);"
+        " what does not fit goes through in slabs, with the same result",
+    )
+
+
+_SIZE = re.compile(r"([0-9]+(?:\.[0-9]*)?) *([kmgt]?)(i?)b?", re.IGNORECASE)
+
+
+def parse_size(text: str) -> int:
+    """Read an amount of memory: a number with B, kB, MB, GB (powers of 1000), KiB, MiB or GiB (of 1024).
+
+    Raises
+    ------
+    argparse.ArgumentTypeError
+        It is none.
+    """
+    match = _SIZE.fullmatch(text.strip())
+    if match is None or (match[3] and not match[2]):
+        raise argparse.ArgumentTypeError(f"{text!r} is no amount of memory: write it as 500MB or 2GiB")
+    return int(float(match[1]) * (1024 if match[3] else 1000) ** " kmgt".index(match[2].lower() or " "))
 
 
 def guard(action: Callable[[], int], console: Console, debug: bool) -> int:

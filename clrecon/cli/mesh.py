@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
-from clrecon.cli.common import add_device, megabytes
+from clrecon.cli.common import add_device, add_memory, megabytes
 from clrecon.cli.console import Console, printable
 from clrecon.cli.levels import LEVELS_HELP, parse_hu
 from clrecon.cli.points import parse_point
@@ -75,6 +75,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--split", action="store_true", help="write one file a component, the largest first")
     add_device(parser)
+    add_memory(parser)
     parser.add_argument("--report", metavar="FILE", help="write affine, counts, quality, device and times as JSON")
 
 
@@ -94,6 +95,7 @@ def run(options: argparse.Namespace, console: Console) -> int:
         seeds=options.seed,
         split=options.split,
         device=options.device,
+        memory=options.memory,
     )
     report = make_mesh(
         options.input,
@@ -125,9 +127,16 @@ def describe_mesh(report: dict[str, Any]) -> list[str]:
         f"mesh     {report['vertices']:,} vertices, {report['triangles']:,} triangles",
         *_describe_quality(report),
         *_describe_parts(report["meshes"]),
-        f"device   {printable(report['device'])}",
+        f"device   {printable(report['device'])}{_describe_slabs(report)}",
         f"time     {_describe_times(report['seconds'])}",
     ]
+
+
+def _describe_slabs(report: dict[str, Any]) -> str:
+    """In how many slabs, where the volume did not fit as a whole."""
+    if report["slabs"] == 1:
+        return ""
+    return f", {report['slabs']} slabs of at most {megabytes(sum(report['device_bytes'].values()))}"
 
 
 def _describe_choice(report: dict[str, Any]) -> str:

@@ -117,6 +117,9 @@ def describe_job(
         "split": settings.split,
         "device": device.label,
         "driver": device.driver,
+        "memory_allowed_bytes": settings.memory,
+        "slabs": max((part.mesh.report.get("slabs", 1) for part in parts), default=1),
+        "device_bytes": _largest(part.mesh.report.get("device_bytes", {}) for part in parts),
         "version": package_version(),
         "platform": platform_name(),
         "warnings": list(dict.fromkeys(warnings)),
@@ -131,6 +134,14 @@ def describe_job(
     if settings.preset_used is not None:
         report["preset_reason"] = find_preset(settings.preset_used).source
     return report
+
+
+def _largest(taken: Iterable[dict[str, int]]) -> dict[str, int]:
+    """Of several surfaces, the most that one took, by what it is."""
+    largest: dict[str, int] = {}
+    for own in taken:
+        largest.update({what: max(size, largest.get(what, 0)) for what, size in own.items()})
+    return largest
 
 
 def _bounds(mesh: Mesh, space: str) -> list[list[float]] | None:

@@ -95,7 +95,9 @@ def extract_surfaces(
                 f" the volume runs from {low:g} to {high:g} HU"
             )
     levels = [surface.iso_value for surface in surfaces]
-    return extract_isosurfaces(volume, levels, device, closed=settings.closed, progress=progress)
+    return extract_isosurfaces(
+        volume, levels, device, closed=settings.closed, memory=settings.memory, progress=progress
+    )
 
 
 def select_parts(surface: Surface, mesh: Mesh, settings: MeshSettings, device: Device) -> list[Part]:
@@ -118,7 +120,7 @@ def select_parts(surface: Surface, mesh: Mesh, settings: MeshSettings, device: D
     seeds = [(frame_from_lps(settings.space).T @ seed).tolist() for seed in settings.seeds]
     labelled = None
     try:
-        labelled = label_components(device, mesh.triangles, mesh.vertex_count)
+        labelled = label_components(device, mesh.triangles, mesh.vertex_count, memory=settings.memory)
     except DeviceMemoryError as error:  # the outcome is the same, it only takes longer
         mesh.report.setdefault("warnings", []).append(f"{error}: they were found without it")
     try:

@@ -40,6 +40,8 @@ class MeshSettings:
         One mesh a component, the largest first.
     device : str, optional
         Name or index of an OpenCL device; None leaves the choice to `choose_device`.
+    memory : int, optional
+        Bytes that may be taken on the device; None is all that it has.  What does not fit goes through in slabs.
 
     Raises
     ------
@@ -58,6 +60,7 @@ class MeshSettings:
     seeds: Sequence[Sequence[float]] = ()
     split: bool = False
     device: str | None = None
+    memory: int | None = None
 
     def __post_init__(self) -> None:
         if self.iso_value is not None and self.preset is not None:
@@ -70,6 +73,8 @@ class MeshSettings:
             raise UsageError(f"the number of components to keep must be 1 or more, not {self.keep_largest}")
         if self.min_volume_ml is not None and not (math.isfinite(self.min_volume_ml) and self.min_volume_ml > 0):
             raise UsageError(f"the smallest volume to keep must be above 0 ml, not {self.min_volume_ml}")
+        if self.memory is not None and self.memory < 1:
+            raise UsageError(f"the memory that may be taken must be above 0 bytes, not {self.memory}")
         for seed in self.seeds:
             if len(seed) != 3 or not all(map(math.isfinite, seed)):
                 raise UsageError(f"a seed is a point of three numbers in mm, not {tuple(seed)}")

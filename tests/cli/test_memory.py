@@ -1,0 +1,55 @@
+"""``--memory``: amounts as people write them, slabs where they are needed, the same file."""
+
+from __future__ import annotations
+
+import argparse
+import json
+
+import pytest
+
+from clrecon.cli.common import parse_size
+from clrecon.cli.main import main
+
+
+@pytest.mark.parametrize(
+    ("text", "size"),
+    [("1000", 1000), ("512B", 512), ("1.5kB", 1500), ("500MB", 500_000_000), ("2GiB", 2 * 2**30), ("2g", 2 * 10**9),
+     ("64 MiB", 64 * 2**20), ("1TB", 10**12)],
+)  # fmt: skip
+def test_amounts_are_read(text, size):
+    assert parse_size(text) == size
+
+
+@pytest.mark.parametrize("text", ["", "much", "-5MB", "5XB", "5iB", "MB", "1e9", "5MB5"])
+def test_what_is_no_amount_is_refused(text):
+    with pytest.raises(argparse.ArgumentTypeError, match="500MB or 2GiB"):
+        parse_size(text)
+
+
+@pytest.fixture(scope="module")
+def ct_folder(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("memory") / "ct"
+    assert main(["phantom", str(folder), "--kind", "sphere", "--size", "64", "--slices", "40", "-q"]) == 0
+    return folder
+
+
+def test_a_small_budget_gives_the_same_file_in_slabs(ct_folder, tmp_path, capsys):
+    assert main(["mesh", str(ct_folder), "-o", str(tmp_path / "whole.stl"), "--json"]) == 0
+    whole = json.loads(capsys.readouterr().out)
+    arguments = ["mesh", str(ct_folder), "-o", str(tmp_path / "slabs.stl"), "--memory", "200kB"]
+    assert main([*arguments, "--json"]) == 0
+    slabs = json.loads(capsys.readouterr().out)
+    assert (tmp_path / "whole.stl").read_bytes() == (tmp_path / "slabs.stl").read_bytes()
+    assert whole["slabs"] == 1 and whole["memory_allowed_bytes"] is None
+    assert slabs["slabs"] > 1 and slabs["memory_allowed_bytes"] == 200_000
+    assert sum(slabs["device_bytes"].values()) <= 200_000
+    assert main(arguments) == 0
+    assert f"{slabs['slabs']} slabs of at most" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(("memory", "code", "message"), [
+    ("5kB", 5, "5,000 bytes are allowed"), ("0", 3, "above 0 bytes"), ("lots", 3, "no amount of memory")])  # fmt: skip
+def test_a_budget_that_is_none_or_too_small(ct_folder, tmp_path, capsys, memory, code, message):
+    assert main(["mesh", str(ct_folder), "-o", str(tmp_path / "x.stl"), "--memory", memory]) == code
+    assert message in capsys.readouterr().err
+    assert not (tmp_path / "x.stl").exists()
