@@ -143,7 +143,7 @@ def test_components_that_do_not_fit_the_device_are_found_all_the_same(
 ) -> None:
     on_device = run(tmp_path, device, iso_value=200.0, split=True)
 
-    def refuse(*_: Any) -> Any:
+    def refuse(*_: Any, **__: Any) -> Any:
         raise DeviceMemoryError("the components of the mesh cannot be found: too large")
 
     monkeypatch.setattr("clrecon.operators.components.label_components", refuse)
