@@ -4,7 +4,7 @@
  *
  * Passes
  *   1. measure_bricks    once a volume
- *   2. compare_bricks    once an iso value: which bricks are all inside, all outside, mixed */
+ *   2. compare_bricks    once an iso value: which words of samples are all inside, all outside, mixed */
 #include "bricks/bricks.h"
 #include "include/volume.h"
 
@@ -52,27 +52,36 @@ __kernel void measure_bricks(
 }
 
 /* Parameters  ranges   in   (bk, bj, bi, 2)
- *             states   out  (bk, bj, bi) BRICK_OUTSIDE, BRICK_INSIDE or BRICK_MIXED
- *             extents  out  (bk, bj) first brick of the row that is not all outside, and the one after the last; 0, 0
- *                           where there is none
+ *             states   out  (bk, bj, words) of each word of 32 samples, for all rows of these bricks: BRICK_OUTSIDE,
+ *                           BRICK_INSIDE or BRICK_MIXED.  Samples beyond the volume do not count
+ *             extents  out  (bk, bj) first word that is not all outside, and the one after the last; 0, 0 where there is
+ *                           none
  *             level    lowest inside value
- *             bi       bricks a row;  rows = bj * bk
+ *             ni       voxels a row;  border: word w begins at voxel 32 w - border;  words: words a row
+ *             rows     bj * bk
  * Launch      global = rows rounded up by the host, any local
  * Guarantees  every state and extent is written */
 __kernel void compare_bricks(
     __global const VOXEL *restrict ranges, __global uchar *restrict states, __global ushort2 *restrict extents,
-    const VOXEL level, const uint bi, const uint rows)
+    const VOXEL level, const int ni, const int border, const uint words, const uint rows)
 {
     const uint row = get_global_id(0);
     if (row >= rows)
         return;
-    uint begin = bi, end = 0;
-    for (uint b = 0; b < bi; ++b) {
-        const size_t brick = (size_t)row * bi + b;
-        const int inside = ranges[2 * brick] >= level, outside = !(ranges[2 * brick + 1] >= level);
-        states[brick] = outside ? BRICK_OUTSIDE : inside ? BRICK_INSIDE : BRICK_MIXED;
-        begin = min(begin, outside ? bi : b);
-        end = outside ? end : b + 1;
+    const int bi = (ni + BRICK - 1) / BRICK;
+    __global const VOXEL *row_ranges = ranges + 2 * (size_t)row * bi;
+    uint begin = words, end = 0;
+    for (uint w = 0; w < words; ++w) {
+        const int first = 32 * (int)w - border;
+        const int last_brick = (min(first + 32, ni) - 1) / BRICK;
+        int all_inside = 1, all_outside = 1;
+        for (int b = max(first, 0) / BRICK; first < ni && b <= last_brick; ++b) {
+            all_inside &= row_ranges[2 * b] >= level;
+            all_outside &= !(row_ranges[2 * b + 1] >= level);
+        }
+        states[(size_t)row * words + w] = all_outside ? BRICK_OUTSIDE : all_inside ? BRICK_INSIDE : BRICK_MIXED;
+        begin = min(begin, all_outside ? words : w);
+        end = all_outside ? end : w + 1;
     }
     extents[row] = (ushort2)((ushort)min(begin, end), (ushort)end);
 }

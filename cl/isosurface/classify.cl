@@ -91,26 +91,14 @@ __kernel void classify_samples(
     row_extents[row] = (ushort2)((ushort)min(begin, end), (ushort)end);
 }
 
-/* What the bricks say of the word of samples first .. first + 31 of a row: BRICK_OUTSIDE, BRICK_INSIDE or
- * BRICK_MIXED. */
-static inline uint state_of_word(__global const uchar *row_states, int first, int ni)
-{
-    const int begin = max(first, 0) / BRICK, end = (min(first + 32, ni) - 1) / BRICK;
-    const uint state = row_states[begin];
-    uint same = 1;
-    for (int b = begin + 1; b <= end; ++b)
-        same &= row_states[b] == state;
-    return same ? state : BRICK_MIXED;
-}
-
-/* classify_samples where the ranges of the volume's bricks are known: reads the voxels of mixed bricks alone.
+/* classify_samples where the ranges of the volume's bricks are known: reads the voxels of mixed words alone.
  *
- * Parameters  brick_states   in   (bk, bj, bi) of the whole volume, see cl/bricks/ranges.cl
- *             brick_extents  in   (bk, bj)
- *             voxels         in   the whole volume
- *             all others     as classify_samples */
+ * Parameters  word_states   in   (bk, bj, words) of the whole volume, see cl/bricks/ranges.cl
+ *             word_extents  in   (bk, bj)
+ *             voxels        in   the whole volume
+ *             all others    as classify_samples */
 __kernel void classify_bricks(
-    __global const uchar *restrict brick_states, __global const ushort2 *restrict brick_extents,
+    __global const uchar *restrict word_states, __global const ushort2 *restrict word_extents,
     __global const VOXEL *restrict voxels, __global uint *restrict mask, __global ushort2 *restrict row_extents,
     const VOXEL level,
     const int ni, const int nj, const int nk, const int border, const int words)
@@ -122,31 +110,26 @@ __kernel void classify_bricks(
     __global uint *row_mask = mask + (size_t)row * words;
     const int j = (int)(row % gj) - border;
     const int k = (int)(row / gj) - border;
-    int begin = 0, end = 0; /* words that may hold anything */
-    const int bi = (ni + BRICK - 1) / BRICK, bj = (nj + BRICK - 1) / BRICK;
-    const size_t brick_row = j < 0 || j >= nj || k < 0 || k >= nk ? 0 : (size_t)(k / BRICK) * bj + j / BRICK;
-    if (j >= 0 && j < nj && k >= 0 && k < nk && brick_extents[brick_row].y != 0) {
-        begin = (BRICK * brick_extents[brick_row].x + border) / 32;
-        end = min((BRICK * brick_extents[brick_row].y + border + 31) / 32, words);
-    }
-    for (int w = 0; w < begin; ++w)
+    const int in_volume = j >= 0 && j < nj && k >= 0 && k < nk;
+    const size_t brick_row = in_volume ? (size_t)(k / BRICK) * ((nj + BRICK - 1) / BRICK) + j / BRICK : 0;
+    const ushort2 extent = in_volume ? word_extents[brick_row] : (ushort2)(0, 0);
+    for (int w = 0; w < extent.x; ++w)
         row_mask[w] = 0;
-    for (int w = end; w < words; ++w)
+    for (int w = extent.y; w < words; ++w)
         row_mask[w] = 0;
-    __global const VOXEL *row_voxels = voxels + voxel_index(0, max(min(j, nj - 1), 0), max(min(k, nk - 1), 0), ni, nj);
-    __global const uchar *row_states = brick_states + brick_row * bi;
-    int first = words, last = 0;
-    for (int w = begin; w < end; ++w) {
-        const int sample = 32 * w - border;
-        const uint state = sample + 32 > 0 && sample < ni ? state_of_word(row_states, sample, ni) : BRICK_OUTSIDE;
+    __global const VOXEL *row_voxels = voxels + (in_volume ? voxel_index(0, j, k, ni, nj) : 0);
+    __global const uchar *row_states = word_states + brick_row * words;
+    int begin = words, end = 0;
+    for (int w = extent.x; w < extent.y; ++w) {
+        const int first = 32 * w - border;
         uint bits = 0;
-        if (state == BRICK_MIXED)
-            bits = classify_word(row_voxels, sample, ni, level);
-        else if (state == BRICK_INSIDE)
-            bits = (uint)(low_bits(min(32, ni - sample)) & ~low_bits(max(0, -sample)));
+        if (row_states[w] == BRICK_MIXED)
+            bits = classify_word(row_voxels, first, ni, level);
+        else if (row_states[w] == BRICK_INSIDE)
+            bits = (uint)(low_bits(min(32, ni - first)) & ~low_bits(max(0, -first)));
         row_mask[w] = bits;
-        first = min(first, bits != 0 ? w : words);
-        last = bits != 0 ? w + 1 : last;
+        begin = min(begin, bits != 0 ? w : words);
+        end = bits != 0 ? w + 1 : end;
     }
-    row_extents[row] = (ushort2)((ushort)min(first, last), (ushort)last);
+    row_extents[row] = (ushort2)((ushort)min(begin, end), (ushort)end);
 }

@@ -35,7 +35,13 @@ class BrickRanges:
 
 @dataclass(frozen=True)
 class BrickStates:
-    """How the bricks compare with an iso value: states (bk, bj, bi) uint8, extents (bk, bj, 2) uint16."""
+    """How words of 32 samples compare with an iso value, for all rows of voxels of a row of bricks.
+
+    Attributes
+    ----------
+    states_d : buffer, (bk, bj, words) uint8
+    extents_d : buffer, (bk, bj, 2) uint16
+    """
 
     states_d: Any
     extents_d: Any
@@ -85,9 +91,15 @@ def measure_bricks(
 
 
 def compare_bricks(
-    device: Device, ranges: BrickRanges, level: Any, *, stopwatch: Stopwatch | None = None
+    device: Device,
+    ranges: BrickRanges,
+    level: Any,
+    ni: int,
+    border: int,
+    *,
+    stopwatch: Stopwatch | None = None,
 ) -> BrickStates:
-    """Say of each brick whether its voxels are all outside (0), all inside (1) or mixed (2).
+    """Say of each word of 32 samples what its bricks say: all outside (0), all inside (1) or mixed (2).
 
     Parameters
     ----------
@@ -95,18 +107,24 @@ def compare_bricks(
     ranges : BrickRanges
     level : scalar of the voxels' type
         Lowest inside value.
+    ni : int
+        Voxels a row.
+    border : int
+        Word w begins at voxel ``32 * w - border``, and there are samples up to ``ni - 1 + border``.  Those beyond the
+        volume do not count.
     stopwatch : Stopwatch, optional
 
     Returns
     -------
     BrickStates
-        With the extent of each row of bricks: the first that is not all outside, and the one after the last.
+        With the extent of each row of bricks: the first word that is not all outside, and the one after the last.
     """
-    bi, bj, bk = ranges.shape
-    states_d, extents_d = allocate(device, bi * bj * bk), allocate(device, 4 * bj * bk)
+    _, bj, bk = ranges.shape
+    words = -(-(ni + 2 * border) // 32)
+    states_d, extents_d = allocate(device, words * bj * bk), allocate(device, 4 * bj * bk)
     launch(
         device, prepare_bricks(device, ranges.dtype)["compare_bricks"], bj * bk,
-        ranges.ranges_d, states_d, extents_d, level, np.uint32(bi), np.uint32(bj * bk),
-        stopwatch=stopwatch,
+        ranges.ranges_d, states_d, extents_d, level, np.int32(ni), np.int32(border), np.uint32(words),
+        np.uint32(bj * bk), stopwatch=stopwatch,
     )  # fmt: skip
     return BrickStates(states_d, extents_d)

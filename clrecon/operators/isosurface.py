@@ -186,7 +186,7 @@ class SurfaceExtractor:
             self._resident_d = voxels_d
         return voxels_d
 
-    def _compare_bricks(self, level: Any, stopwatch: Stopwatch) -> BrickStates | None:
+    def _compare_bricks(self, level: Any, border: int, stopwatch: Stopwatch) -> BrickStates | None:
         """How the bricks of a resident volume compare with `level`; None before it pays to measure them.
 
         Measuring takes as long as the first pass over the volume, so a single extraction does without.
@@ -198,7 +198,7 @@ class SurfaceExtractor:
             self._bricks = measure_bricks(
                 self.device, self._resident_d, volume.shape_ijk, volume.voxels.dtype, stopwatch=stopwatch
             )
-        return compare_bricks(self.device, self._bricks, level, stopwatch=stopwatch)
+        return compare_bricks(self.device, self._bricks, level, self.volume.shape_ijk[0], border, stopwatch=stopwatch)
 
     def _use_smaller_slabs(self, border: int, slices: int) -> None:
         """Remember that slabs of more slices do not go through."""
@@ -259,7 +259,7 @@ class _Run:
         with stopwatch.timed("upload"):
             voxels_d = self.extractor._upload(slab)
         with stopwatch.running(device):
-            bricks = self.extractor._compare_bricks(self.level, stopwatch)
+            bricks = self.extractor._compare_bricks(self.level, self.grid.rule.border, stopwatch)
             classified = marching_cubes.classify(device, slab, voxels_d, self.level, stopwatch, bricks)
             counted = marching_cubes.count(device, slab, program, classified, stopwatch)
         self._check_output(slab, counted)

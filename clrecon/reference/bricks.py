@@ -31,13 +31,20 @@ def measure_bricks(voxels: NDArray[Any], brick: int = 8) -> NDArray[Any]:
     return ranges
 
 
-def compare_bricks(ranges: NDArray[Any], level: float) -> tuple[NDArray[np.uint8], NDArray[np.uint16]]:
-    """State of each brick and extent of each row of bricks, as the device operator gives them."""
-    outside, inside = ranges[..., 1] < level, ranges[..., 0] >= level
-    states = np.where(outside, 0, np.where(inside, 1, 2)).astype(np.uint8)
-    extents = np.zeros((*states.shape[:2], 2), np.uint16)
-    for row in np.ndindex(*states.shape[:2]):
-        used = np.flatnonzero(states[row])
+def compare_bricks(
+    ranges: NDArray[Any], level: float, ni: int, border: int, brick: int = 8
+) -> tuple[NDArray[np.uint8], NDArray[np.uint16]]:
+    """State of each word of samples and extent of each row of bricks, as the device operator gives them."""
+    words = -(-(ni + 2 * border) // 32)
+    states = np.zeros((*ranges.shape[:2], words), np.uint8)
+    extents = np.zeros((*ranges.shape[:2], 2), np.uint16)
+    for k, j in np.ndindex(*ranges.shape[:2]):
+        for word in range(words):
+            first, end = max(32 * word - border, 0), min(32 * word - border + 32, ni)
+            if first < end:
+                low, high = ranges[k, j, first // brick : (end - 1) // brick + 1].T
+                states[k, j, word] = 0 if high.max() < level else 1 if low.min() >= level else 2
+        used = np.flatnonzero(states[k, j])
         if len(used):
-            extents[row] = used[0], used[-1] + 1
+            extents[k, j] = used[0], used[-1] + 1
     return states, extents

@@ -25,10 +25,11 @@ def test_ranges_and_states_equal_those_of_the_twin(device, shape, dtype):
     assert measured.shape == expected.shape[2::-1]
     assert np.array_equal(download(device, np.empty_like(expected), measured.ranges_d), expected)
     for level in (0, 50, 99, 100):
-        compared = compare_bricks(device, measured, volume.voxels.dtype.type(level))
-        states, extents = twin.compare_bricks(expected, level)
-        assert np.array_equal(download(device, np.empty_like(states), compared.states_d), states)
-        assert np.array_equal(download(device, np.empty_like(extents), compared.extents_d), extents)
+        for border in (0, 1):
+            compared = compare_bricks(device, measured, volume.voxels.dtype.type(level), shape[2], border)
+            states, extents = twin.compare_bricks(expected, level, shape[2], border)
+            assert np.array_equal(download(device, np.empty_like(states), compared.states_d), states)
+            assert np.array_equal(download(device, np.empty_like(extents), compared.extents_d), extents)
 
 
 @pytest.mark.parametrize("closed", [True, False])
