@@ -85,14 +85,13 @@ void scan_block_sums(
 
 /* Parameters  counts         in   (n,)
  *             block_offsets  in   (blocks,)
- *             offsets        out  (n,) sum of all counts before each element, modulo 2^32
+ *             offsets        out  (n,) sum of all counts before each element, modulo 2^32; may be `counts` itself
  *             n              elements
  * Launch      as sum_blocks
  * Guarantees  every offset is written */
 __kernel __attribute__((reqd_work_group_size(SCAN_GROUP, 1, 1)))
 void scan_blocks(
-    __global const uint *restrict counts, __global const uint *restrict block_offsets, __global uint *restrict offsets,
-    const uint n)
+    __global const uint *counts, __global const uint *restrict block_offsets, __global uint *offsets, const uint n)
 {
     __local uint partial[SCAN_GROUP];
     const uint item = get_local_id(0);
@@ -114,7 +113,8 @@ void scan_blocks(
     barrier(CLK_LOCAL_MEM_FENCE);
     uint offset = partial[item];
     for (uint index = begin; index < end; ++index) {
+        const uint count = counts[index];
         offsets[index] = offset;
-        offset += counts[index];
+        offset += count;
     }
 }

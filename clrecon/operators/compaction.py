@@ -52,7 +52,9 @@ def _load_scan(device: Device) -> Program:
     return load_program(device, "compaction/scan.cl", {"SCAN_GROUP": str(device.group_size)})
 
 
-def exclusive_scan(device: Device, counts_d: Any, n: int, *, stopwatch: Stopwatch | None = None) -> Scanned:
+def exclusive_scan(
+    device: Device, counts_d: Any, n: int, *, in_place: bool = False, stopwatch: Stopwatch | None = None
+) -> Scanned:
     """Sum of all counts before each element.
 
     Parameters
@@ -61,6 +63,8 @@ def exclusive_scan(device: Device, counts_d: Any, n: int, *, stopwatch: Stopwatc
     counts_d : buffer, (n,) uint32
     n : int
         Elements, at least 1.
+    in_place : bool
+        The offsets take the place of the counts: no memory of their own.
     stopwatch : Stopwatch, optional
 
     Returns
@@ -79,7 +83,7 @@ def exclusive_scan(device: Device, counts_d: Any, n: int, *, stopwatch: Stopwatc
     scan = _load_scan(device)
     blocks = -(-n // (SCAN_PER_ITEM * device.group_size))
     sums_d, block_offsets_d, total_d = (allocate(device, 4 * blocks), allocate(device, 4 * blocks), allocate(device, 8))
-    offsets_d = allocate(device, 4 * n)
+    offsets_d = counts_d if in_place else allocate(device, 4 * n)
     size, items = np.uint32(n), blocks * device.group_size
     launch(device, scan["sum_blocks"], items, counts_d, sums_d, size, stopwatch=stopwatch)
     launch(

@@ -178,7 +178,7 @@ def count(device: Device, slab: Slab, program: Program, classified: Classified, 
         np.uint32(gi), np.uint32(gj), np.uint32(slab.mask_slices), np.uint32(grid.words), flag_words, counted_rows,
         stopwatch=stopwatch,
     )  # fmt: skip
-    scanned = exclusive_scan(device, row_counts_d, 3 * rows, stopwatch=stopwatch)
+    scanned = exclusive_scan(device, row_counts_d, 3 * rows, in_place=True, stopwatch=stopwatch)
     if scanned.total >= 2**32:
         raise DeviceMemoryError(
             f"a slab of {slab.slices} slices has {scanned.total:,} vertices and triangles: more than 32 bits can number"

@@ -99,7 +99,7 @@ class Slab:
             "inside mask": 4 * self.mask_rows * self.grid.words,
             "word counts": 4 * counted_words,
             "row extents": 4 * self.mask_rows,
-            "row counts": 24 * self.counted_rows,
+            "row counts": 12 * self.counted_rows,
             "word flags": 4 * self.counted_rows * self.grid.flag_words,
             "active words": 4 * self.rows * self.grid.words,
         }

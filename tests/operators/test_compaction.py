@@ -25,6 +25,16 @@ def test_scan_equals_its_twin(device, n):
     assert np.array_equal(download(device, np.empty(n, np.uint32), scanned.offsets_d), offsets)
 
 
+@pytest.mark.parametrize("n", [1, BLOCK - 1, BLOCK + 1, 20_003])
+def test_a_scan_may_take_the_place_of_its_counts(device, n):
+    counts = np.random.default_rng(n).integers(0, 5, n).astype(np.uint32)
+    scanned = exclusive_scan(device, upload(device, counts), n)  # writable, and counts as good as any
+    again = exclusive_scan(device, scanned.offsets_d, n, in_place=True)
+    assert again.offsets_d is scanned.offsets_d
+    expected = twin.exclusive_scan(twin.exclusive_scan(counts)[0])[0]
+    assert np.array_equal(download(device, np.empty(n, np.uint32), again.offsets_d), expected)
+
+
 @pytest.mark.parametrize("group", [1, 16])
 def test_devices_with_small_work_groups_get_the_same(device, group, monkeypatch):
     monkeypatch.setattr(device, "max_work_group_size", group)
