@@ -15,7 +15,7 @@ from clrecon.mesh.connectivity import (
     label_components,
     opposite_half_edges,
 )
-from clrecon.mesh.distances import distances_near
+from clrecon.mesh.distances import NearDistance
 from clrecon.mesh.intersections import find_self_intersections
 from clrecon.mesh.measures import cross_products
 
@@ -47,7 +47,7 @@ class Clusters:
         self._names, self._places = names, places
         self._components = label_components(triangles, len(vertices))
         self._seen: IntArray = np.full(triangles.shape, -1)
-        self._vertex_tree: Any = None
+        self._before: tuple[Any, NearDistance] | None = None
 
     @classmethod
     def from_collapses(
@@ -202,19 +202,20 @@ class Clusters:
         has_moved = self._has_moved()
         moved = np.flatnonzero(has_moved if all_vertices else has_moved & touched[self._names])
         gone_into = self._names[moved]
-        left_behind = distances_near(self._vertices[moved], gone_into, self._places, self.faces(), bound) > bound
+        left_behind = NearDistance(self._places, self.faces())(self._vertices[moved], gone_into, bound) > bound
 
         faces = named[changed & self._is_face(named) & has_moved[named].any(axis=1)]
         standing = np.unique(gone_into[touched[gone_into]])
         points = np.concatenate([self._places[standing], self._places[faces].mean(axis=1)])
-        nearest = self._tree().query(points, workers=-1)[1]
-        away = distances_near(points, nearest, self._vertices, self._triangles, bound) > bound
+        away = self._distances_from_before(points, bound) > bound
         off_place, off_face = standing[away[: len(standing)]], faces[away[len(standing) :]]
         return np.unique(np.concatenate([gone_into[left_behind], off_place, off_face.reshape(-1)]))
 
-    def _tree(self) -> Any:
+    def _distances_from_before(self, points: Float64Array, bound: float) -> Float64Array:
         from scipy.spatial import cKDTree
 
-        if self._vertex_tree is None:
-            self._vertex_tree = cKDTree(self._vertices, balanced_tree=False, compact_nodes=False)
-        return self._vertex_tree
+        if self._before is None:
+            tree = cKDTree(self._vertices, balanced_tree=False, compact_nodes=False)
+            self._before = tree, NearDistance(self._vertices, self._triangles)
+        tree, distance = self._before
+        return distance(points, tree.query(points, workers=-1)[1], bound)

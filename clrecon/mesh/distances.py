@@ -12,7 +12,7 @@ from clrecon.mesh.connectivity import order_by_number
 from clrecon.mesh.measures import chunks, cross_product, cross_products, local_origin
 from clrecon.mesh.mesh import Mesh
 
-__all__ = ["SAMPLES", "SurfaceDistance", "compare_meshes", "distances_near", "sample_surface", "summarise_distances"]
+__all__ = ["SAMPLES", "NearDistance", "SurfaceDistance", "compare_meshes", "sample_surface", "summarise_distances"]
 
 SAMPLES = 50_000
 """Points a side: the 95th percentile then stands on the 2500 largest distances."""
@@ -95,50 +95,54 @@ class SurfaceDistance:
         return np.sqrt(squares)
 
 
-def distances_near(
-    points: Points,
-    near: NDArray[np.integer],
-    vertices: NDArray[np.floating],
-    triangles: NDArray[np.uint32],
-    limit: float,
-) -> NDArray[np.float64]:
+class NearDistance:
     """Distances from points to a surface where a vertex of it is known to be near each point.
 
-    Where the foot of a perpendicular lies within a triangle around that vertex and its length is within `limit`,
-    that length is the answer: never less than the distance to the surface.  Only for the other points all triangles
-    are searched, and the answer is exact.
+    Where the foot of a perpendicular lies within a triangle around that vertex and its length is within a limit, that
+    length is the answer: never less than the distance to the surface.  Only for the other points all triangles are
+    searched, and the answer is exact.
 
     Parameters
     ----------
-    points : ndarray, shape (k, 3), float64, mm
-    near : ndarray, shape (k,), int
-        A vertex near each point.
     vertices : ndarray, shape (n, 3), mm
     triangles : ndarray, shape (m, 3), uint32
-    limit : float
-        mm.
-
-    Returns
-    -------
-    ndarray, shape (k,), float64, mm
     """
-    corners = triangles.reshape(-1)
-    face_of = order_by_number(corners, len(vertices)) // 3
-    begin = np.concatenate([[0], np.cumsum(np.bincount(corners, minlength=len(vertices)))])
-    columns = np.ascontiguousarray(vertices.T, dtype=np.float64)
-    found = np.full(len(points), np.inf)
-    for where in chunks(len(points), _PIECE):
-        count = begin[near[where] + 1] - begin[near[where]]
-        start = np.concatenate([[0], np.cumsum(count)[:-1]])
-        pair = np.repeat(np.arange(len(count)), count)
-        face = face_of[np.arange(len(pair)) - start[pair] + begin[near[where]][pair]]
-        length = _perpendicular(points[where].T.take(pair, axis=1), columns, triangles[face])
-        some = count > 0
-        found[where][some] = np.minimum.reduceat(length, start[some]) if some.any() else np.inf
-    rest = np.flatnonzero(~(found <= limit))
-    if len(rest):
-        found[rest] = SurfaceDistance(vertices, triangles)(points[rest])
-    return found
+
+    def __init__(self, vertices: NDArray[np.floating], triangles: NDArray[np.uint32]):
+        self._vertices, self._triangles = vertices, triangles
+        corners = triangles.reshape(-1)
+        self._face_of = order_by_number(corners, len(vertices)) // 3
+        self._begin = np.concatenate([[0], np.cumsum(np.bincount(corners, minlength=len(vertices)))])
+        self._columns = np.ascontiguousarray(vertices.T, dtype=np.float64)
+        self._exact: SurfaceDistance | None = None
+
+    def __call__(self, points: Points, near: NDArray[np.integer], limit: float) -> NDArray[np.float64]:
+        """Distances in mm, shape (k,).
+
+        Parameters
+        ----------
+        points : ndarray, shape (k, 3), float64, mm
+        near : ndarray, shape (k,), int
+            A vertex near each point.
+        limit : float
+            mm.
+        """
+        found = np.full(len(points), np.inf)
+        for where in chunks(len(points), _PIECE):
+            first = self._begin[near[where]]
+            count = self._begin[near[where] + 1] - first
+            start = np.concatenate([[0], np.cumsum(count)[:-1]])
+            pair = np.repeat(np.arange(len(count)), count)
+            face = self._face_of[np.arange(len(pair)) - start[pair] + first[pair]]
+            length = _perpendicular(points[where].T.take(pair, axis=1), self._columns, self._triangles[face])
+            some = count > 0
+            if some.any():
+                found[where][some] = np.minimum.reduceat(length, start[some])
+        rest = np.flatnonzero(~(found <= limit))
+        if len(rest):
+            self._exact = self._exact or SurfaceDistance(self._vertices, self._triangles)
+            found[rest] = self._exact(points[rest])
+        return found
 
 
 def _perpendicular(points: Points, columns: Points, faces: NDArray[np.uint32]) -> NDArray[np.float64]:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from clrecon.errors import NoSurfaceError, UsageError
 from clrecon.mesh.clusters import Clusters
 from clrecon.mesh.connectivity import find_edges
-from clrecon.mesh.distances import distances_near
+from clrecon.mesh.distances import NearDistance
 from clrecon.mesh.measures import cross_products, local_origin
 from clrecon.mesh.mesh import Mesh
 from clrecon.mesh.normals import vertex_normals
@@ -129,10 +129,11 @@ def _hold_back(
     length = np.sqrt(np.einsum("na,na->n", step, step))
     looked_at = np.flatnonzero(length > bound)
     is_held = np.zeros(len(before), dtype=bool)
+    from_before = NearDistance(before, triangles)
     for _ in range(_ROUNDS):
         after = before + step
-        far = distances_near(after[looked_at], looked_at, before, triangles, bound) > bound
-        far |= distances_near(before[looked_at], looked_at, after, triangles, bound) > bound
+        far = from_before(after[looked_at], looked_at, bound) > bound
+        far |= NearDistance(after, triangles)(before[looked_at], looked_at, bound) > bound
         held = looked_at[far]
         if len(held) == 0:
             break
@@ -214,14 +215,7 @@ def decimate_mesh(mesh: Mesh, fraction: float, max_deviation_mm: float | None = 
     origin = local_origin(mesh.vertices)
     clusters = _collapse(mesh.vertices - origin, mesh.triangles, fraction, bound)
     collapsed = clusters.collapsed_count
-    whole = True
-    for _ in range(_ROUNDS):
-        if clusters.undo(clusters.find_faults(origin)):
-            continue
-        undone = clusters.undo(clusters.find_far(bound, all_vertices=whole))
-        if whole and not undone and not clusters.undo(clusters.find_crossing(origin)):
-            break
-        whole = not undone
+    _mend(clusters, origin, bound)
     vertices, triangles = clusters.surface(origin)
     said = {
         "fraction": fraction,
@@ -231,6 +225,22 @@ def decimate_mesh(mesh: Mesh, fraction: float, max_deviation_mm: float | None = 
         "vertices_taken_back": collapsed - clusters.collapsed_count,
     }
     return Mesh(vertices, triangles, vertex_normals(vertices, triangles), _carry_on(mesh, "decimate", said))
+
+
+def _mend(clusters: Clusters, origin: NDArray[np.float64], bound: float) -> None:
+    """Undo clusters until the surface is sound and within the bound; what is cheap and changes most comes first."""
+    whole, uncut = True, False
+    for _ in range(_ROUNDS):
+        if clusters.undo(clusters.find_faults(origin)):
+            uncut = False
+        elif clusters.undo(clusters.find_far(bound, all_vertices=whole)):
+            whole = uncut = False
+        elif not uncut and clusters.undo(clusters.find_crossing(origin)):
+            whole = False
+        elif whole:
+            break
+        else:
+            whole = uncut = True
 
 
 def _collapse(vertices: NDArray[np.float64], triangles: NDArray[np.uint32], fraction: float, bound: float) -> Clusters:

@@ -9,7 +9,7 @@ import tolerances
 
 from clrecon.errors import NoSurfaceError, UsageError
 from clrecon.mesh import Mesh
-from clrecon.mesh.distances import SurfaceDistance, compare_meshes, distances_near, sample_surface
+from clrecon.mesh.distances import NearDistance, SurfaceDistance, compare_meshes, sample_surface
 
 pytestmark = pytest.mark.unit
 
@@ -68,7 +68,7 @@ def test_distance_to_one_triangle(point, distance):
     points = np.array([point]) + FAR
     assert SurfaceDistance(vertices + FAR, triangles)(points) == pytest.approx([distance], abs=1e-9)
     for vertex in range(3):
-        near = distances_near(points, np.array([vertex]), vertices + FAR, triangles, 0.5)
+        near = NearDistance(vertices + FAR, triangles)(points, np.array([vertex]), 0.5)
         assert near == pytest.approx([distance], abs=1e-9)
 
 
@@ -79,7 +79,7 @@ def test_distances_near_a_vertex_are_exact_or_within_the_limit():
     near = rng.integers(0, len(vertices), 500)
     points = vertices[near] + rng.normal(scale=1.5, size=(500, 3))
     exact = SurfaceDistance(vertices, triangles)(points)
-    found = distances_near(points, near, vertices, triangles, 0.8)
+    found = NearDistance(vertices, triangles)(points, near, 0.8)
     assert (found >= exact - 1e-9).all()
     assert ((found <= 0.8) | (np.abs(found - exact) < 1e-9)).all()
     assert (found > 0.8).sum() > 50 < (found < 0.8).sum()
