@@ -137,12 +137,11 @@ class Clusters:
         faces = self.faces()
         size = len(self._vertices)
         edges = find_edges(faces, size)
-        wrong = edges.uses > 2
-        if not edges.oriented:
+        faults = []
+        if not edges.oriented:  # as is every mesh with three faces at an edge
             upward = (faces.reshape(-1) < faces[:, (1, 2, 0)].reshape(-1))[edges.half_edges]
             ups = np.add.reduceat(upward, edges.first, dtype=np.int64)
-            wrong |= (ups > 1) | (edges.uses - ups > 1)
-        faults = list(edges.ends[:, wrong])
+            faults += list(edges.ends[:, (ups > 1) | (edges.uses - ups > 1)])
         opposite = opposite_half_edges(faces, edges)
         if opposite is not None:
             faults.append(faces[find_faces_back_to_back(opposite)].reshape(-1))
