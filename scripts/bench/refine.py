@@ -2,41 +2,42 @@
 
 from __future__ import annotations
 
-import statistics
 import time
 from collections.abc import Callable
 from typing import Any
 
 from measure import alternate, summarise
+from registry import Job, case
 
-__all__ = ["compare_refinement"]
+__all__ = ["measure_refinement"]
+
+SHARE = 0.9
+"""Of the triangles that are to go."""
 
 
-def compare_refinement(mesh: Any, pairs: int, share: float = 0.9) -> dict[str, Any]:
+@case("refine", "smoothing, decimation and quality of the surface, against VTK's filters, which have no bound")
+def measure_refinement(job: Job) -> dict[str, Any]:
     """Time `smooth_mesh`, `decimate_mesh` and `Mesh.quality` on one surface beside their peers.
 
     The peers are vtkWindowedSincPolyDataFilter (the same filter without a bound), vtkQuadricDecimation to the share
     of triangles that clrecon reaches, and vtkFeatureEdges with vtkPolyDataConnectivityFilter and vtkMassProperties.
-
-    Parameters
-    ----------
-    mesh : clrecon.Mesh
-        With ``affine_ijk_to_lps_mm`` in its report.
-    pairs : int
-    share : float
-        Of the triangles that are to go.
     """
     import clrecon
 
-    small = clrecon.decimate_mesh(mesh, share)
+    mesh = clrecon.extract_isosurface(job.input.volume(), job.hu, job.device)
+    small = clrecon.decimate_mesh(mesh, SHARE)
     reached = small.report["refinement"]["decimate"]["reached"]
     peer_small = _decimate(mesh, reached)
+    times = {
+        "smooth": _in_turns(lambda: clrecon.smooth_mesh(mesh), lambda: _smooth(mesh), job),
+        "decimate": _in_turns(lambda: clrecon.decimate_mesh(mesh, SHARE), lambda: _decimate(mesh, reached), job),
+        "quality": _in_turns(mesh.quality, lambda: _measure(mesh), job),
+    }
     return {
+        "ratios": {name: found["ratio"] for name, found in times.items()},
         "triangles": mesh.triangle_count,
-        "smooth": _in_turns(lambda: clrecon.smooth_mesh(mesh), lambda: _smooth(mesh), pairs),
-        "decimate": _in_turns(lambda: clrecon.decimate_mesh(mesh, share), lambda: _decimate(mesh, reached), pairs),
-        "quality": _in_turns(mesh.quality, lambda: _measure(mesh), pairs),
-        "compare_s": _median(lambda: clrecon.compare_meshes(small, mesh), pairs),
+        **times,
+        "compare_s": _seconds(lambda: clrecon.compare_meshes(small, mesh)),
         "results": {
             "clrecon": {"reached": reached, **_judge(small, mesh)},
             "peer": {"reached": 1.0 - peer_small.triangle_count / mesh.triangle_count, **_judge(peer_small, mesh)},
@@ -58,12 +59,9 @@ def _seconds(run: Callable[[], object]) -> float:
     return time.perf_counter() - start
 
 
-def _median(run: Callable[[], object], runs: int) -> float:
-    return statistics.median(_seconds(run) for _ in range(runs))
-
-
-def _in_turns(own: Callable[[], object], peer: Callable[[], object], pairs: int) -> dict[str, Any]:
-    return summarise(*alternate(lambda: _seconds(own), lambda: _seconds(peer), pairs))
+def _in_turns(own: Callable[[], object], peer: Callable[[], object], job: Job) -> dict[str, Any]:
+    sides = alternate(lambda: _seconds(own), lambda: _seconds(peer), job.pairs, limit_s=job.limit_s)
+    return summarise(*sides)
 
 
 def _smooth(mesh: Any) -> None:
