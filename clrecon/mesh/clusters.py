@@ -21,6 +21,9 @@ from clrecon.mesh.measures import cross_products
 
 __all__ = ["Clusters"]
 
+_FEW = 0.05
+"""Share of faces up to which it pays to look for what lies around them."""
+
 Float64Array = NDArray[np.float64]
 IntArray = NDArray[np.integer]
 
@@ -47,6 +50,7 @@ class Clusters:
         self._names, self._places = names, places
         self._components = label_components(triangles, len(vertices))
         self._seen: IntArray = np.full(triangles.shape, -1)
+        self._seen_uncut: IntArray = np.full(triangles.shape, -1)
         self._before: tuple[Any, NearDistance] | None = None
 
     @classmethod
@@ -175,9 +179,31 @@ class Clusters:
         return [faces[where][~cross.any(axis=0)].reshape(-1) for where, _, cross in pieces]
 
     def find_crossing(self, origin: Float64Array) -> IntArray:
-        """Names of clusters at faces that cut each other once coordinates are rounded to float32."""
-        faces = self.faces()
-        return np.unique(faces[find_self_intersections((self._places + origin).astype(np.float32), faces)])
+        """Names of clusters at faces that cut each other once coordinates are rounded to float32.
+
+        Only faces that have changed since the last call are looked at, with what lies around them.
+        """
+        named = self._names[self._triangles]
+        is_face = self._is_face(named)
+        faces = named[is_face].astype(np.uint32)
+        changed = (named != self._seen_uncut).any(axis=1)[is_face]
+        self._seen_uncut = named
+        rounded = (self._places + origin).astype(np.float32)
+        faces = faces[self._beside(faces, changed)]
+        return np.unique(faces[find_self_intersections(rounded, faces)])
+
+    def _beside(self, faces: NDArray[np.uint32], changed: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Faces that can touch one of those that have changed."""
+        if np.count_nonzero(changed) > _FEW * len(faces):
+            return np.ones(len(faces), dtype=bool)
+        if not changed.any():
+            return changed
+        from scipy.spatial import cKDTree
+
+        corners = self._places[faces]
+        centres = corners.mean(axis=1)
+        reach = 2.0 * float(np.linalg.norm(corners - centres[:, None], axis=2).max())
+        return np.isfinite(cKDTree(centres[changed]).query(centres, distance_upper_bound=reach, workers=-1)[0])
 
     def find_far(self, bound: float, all_vertices: bool) -> IntArray:
         """Names of clusters where the surface has moved too far.

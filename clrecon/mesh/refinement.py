@@ -38,7 +38,8 @@ _ERROR_OVER_BOUND = 16.0
 dozens of them: at 4 a quarter of the bound is used, at 16 half of it (95 % of the surface), beyond more places have
 to be taken back than are won."""
 
-_ROUNDS = 30
+_ROUNDS = 200
+"""At most; each undoes something, on CT about 30 are needed."""
 
 
 def default_deviation(mesh: Mesh) -> float:
