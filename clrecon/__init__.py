@@ -27,6 +27,8 @@ if TYPE_CHECKING:
     )
     from clrecon.geometry import Volume, choose_iso_value
     from clrecon.mesh import Mesh
+    from clrecon.mesh.distances import compare_meshes
+    from clrecon.mesh.refinement import decimate_mesh, smooth_mesh
     from clrecon.opencl import Device
     from clrecon.operators.isosurface import SurfaceExtractor, extract_isosurface, extract_isosurfaces
 
@@ -45,12 +47,15 @@ __all__ = [
     "Volume",
     "__version__",
     "choose_iso_value",
+    "compare_meshes",
+    "decimate_mesh",
     "device",
     "devices",
     "extract_isosurface",
     "extract_isosurfaces",
     "list_series",
     "read_volume",
+    "smooth_mesh",
 ]
 
 _HOMES = {
@@ -65,10 +70,13 @@ _HOMES = {
     "UsageError": "clrecon.errors",
     "Volume": "clrecon.geometry",
     "choose_iso_value": "clrecon.geometry",
+    "compare_meshes": "clrecon.mesh.distances",
+    "decimate_mesh": "clrecon.mesh.refinement",
     "extract_isosurface": "clrecon.operators.isosurface",
     "extract_isosurfaces": "clrecon.operators.isosurface",
     "list_series": "clrecon.dicom",
     "read_volume": "clrecon.dicom",
+    "smooth_mesh": "clrecon.mesh.refinement",
 }
 
 

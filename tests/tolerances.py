@@ -49,6 +49,20 @@ NEAREST_MM = 1e-12  # a distance of a few mm in float64
 NEAREST_SAMPLED_MM = 0.02  # 400 random points on each triangle of 0.6 mm, seen from inside or 4 mm away
 GLB_METRES = 1e-7  # relative; float32 coordinates through a float64 matrix, read back by another library
 
+# --- smoothing, decimation, distances ---
+SPHERE_SAGITTA_MM = 0.004  # triangles of 0.49 mm on a sphere of 10 mm sag 0.003 mm
+SMOOTHED_NOISE_SHARE = 0.5  # white noise through a filter that passes a tenth of the band; measured 0.33 to 0.42
+SMOOTHED_RADIUS_MM = 0.01  # noise of 0.1 mm on 20 mm; a Laplacian of as many steps loses 0.2 mm
+SMOOTHED_VOLUME = 2e-3  # the gate is 5e-3
+DECIMATED_VOLUME = 2e-3  # triangles of 3 mm on a sphere of 20 mm lie on both sides of it
+TRILINEAR = 1e-9  # float64 against scipy and analysis
+ISO_VERTEX_VOXEL = 1e-4  # vertices of the twin: held off the samples by up to 2e-4 of a step, rounded nowhere
+DEVICE_ISO_VERTEX_VOXEL = (
+    5e-4  # float32 millimetres 1 m from the origin are 6e-5 mm; held off samples by 2e-4 of a step
+)
+REFINED_TORUS_VOLUME = 0.03  # partial volume takes 1.2 % off so thin a torus, the gate on refinement 0.5 %
+ISO_SPHERE_SAGITTA_MM = 0.025  # between samples 0.7, 0.5 and 0.9 mm apart a sphere of 8 mm sags sum(h^2) / 8 R
+
 # --- pipeline and command line ---
 PHANTOM_SPHERE_VOLUME_SHARE = 0.01  # sphere of about 12 mm in voxels of 0.5 x 0.7 x 1 mm: measured -0.34 %
 CLI_SPHERE_VOLUME_SHARE = 0.02  # sphere of 9 mm in voxels of 0.8 x 1.1 x 1.5 mm, its edge a ramp of 1 mm

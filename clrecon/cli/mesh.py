@@ -9,11 +9,12 @@ from clrecon.cli.common import add_device, add_memory, megabytes
 from clrecon.cli.console import Console, printable
 from clrecon.cli.levels import LEVELS_HELP, parse_hu
 from clrecon.cli.points import parse_point
+from clrecon.cli.refinement import add_refinement, describe_refinement, finish_with_gates, refinement_settings
 from clrecon.pipeline.presets import DEFAULT_PRESET, PRESETS
 
 __all__ = ["add_arguments", "describe_mesh", "run"]
 
-_PARTS = ("read", "upload", "build", "kernels", "download", "choose", "select", "write", "measure")
+_PARTS = ("read", "upload", "build", "kernels", "download", "choose", "select", "refine", "write", "measure")
 _SHOWN_PARTS = 12
 
 
@@ -74,6 +75,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         " repeat it for several",
     )
     parser.add_argument("--split", action="store_true", help="write one file a component, the largest first")
+    add_refinement(parser)
     add_device(parser)
     add_memory(parser)
     parser.add_argument("--report", metavar="FILE", help="write affine, counts, quality, device and times as JSON")
@@ -96,6 +98,7 @@ def run(options: argparse.Namespace, console: Console) -> int:
         split=options.split,
         device=options.device,
         memory=options.memory,
+        **refinement_settings(options),
     )
     report = make_mesh(
         options.input,
@@ -111,9 +114,7 @@ def run(options: argparse.Namespace, console: Console) -> int:
     console.say(f"wrote    {_describe_files(options.output, report)}")
     if options.report:
         console.say(f"report   {printable(options.report)}")
-    for warning in report["warnings"]:
-        console.warn(warning)
-    return 0
+    return finish_with_gates(report, console, options.strict)
 
 
 def describe_mesh(report: dict[str, Any]) -> list[str]:
@@ -127,6 +128,7 @@ def describe_mesh(report: dict[str, Any]) -> list[str]:
         f"mesh     {report['vertices']:,} vertices, {report['triangles']:,} triangles",
         *_describe_quality(report),
         *_describe_parts(report["meshes"]),
+        *describe_refinement(report["meshes"]),
         f"device   {printable(report['device'])}{_describe_slabs(report)}",
         f"time     {_describe_times(report['seconds'])}",
     ]

@@ -1,4 +1,8 @@
-"""Surface meshes in patient millimetres: measure them, select their parts, write them to files."""
+"""Surface meshes in patient millimetres: measure them, select their parts, write them to files.
+
+Smoothing and decimation (`clrecon.mesh.refinement`), distances (`clrecon.mesh.distances`) and gates
+(`clrecon.mesh.gates`) are imported by those who use them.
+"""
 
 from clrecon.mesh.components import select_components, split_components
 from clrecon.mesh.mesh import Mesh

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["CHUNK", "chunks", "cross_products", "local_origin"]
+__all__ = ["CHUNK", "chunks", "corner_edges", "cross_product", "cross_products", "local_origin"]
 
 CHUNK = 1 << 14
 """Triangles a piece: 16384 of them take about 2 MB in float64; 32 times as many took 1.5 times as long."""
@@ -29,21 +29,19 @@ def local_origin(vertices: NDArray[np.float32]) -> NDArray[np.float64]:
     return 0.5 * (vertices.min(axis=0).astype(np.float64) + vertices.max(axis=0))
 
 
-def cross_products(
+def corner_edges(
     vertices: NDArray[np.float32], triangles: NDArray[np.uint32], origin: NDArray[np.float64], size: int = CHUNK
-) -> Iterator[tuple[slice, NDArray[np.float64], NDArray[np.float64]]]:
-    """Go through the triangles, `size` at a time, and give first corner and edge cross product, float64.
+) -> Iterator[tuple[slice, NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]]:
+    """Go through the triangles, `size` at a time, and give first corner and the two edges from it, float64.
 
-    The cross product c of the edges from the first corner a is twice the area times the outward normal, and a . c is
-    six times the signed volume of the tetrahedron over the origin (divergence theorem).  Coordinates are float32, so
-    that differences and products are exact in float64: c is zero for triangles without area and only for those.
+    Coordinates are float32, so that differences and their products are exact in float64.
 
     Yields
     ------
     where : slice
         The triangles of this piece.
-    corner, cross : ndarray, shape (3, k), float64
-        One row each for x, y, z; `corner` is relative to `origin`, mm; `cross` is mm2.
+    corner, p, q : ndarray, shape (3, k), float64
+        One row each for x, y, z, mm; `corner` is relative to `origin`, `p` runs to the second corner, `q` to the third.
     """
     columns = np.ascontiguousarray(vertices.T.astype(np.float64))
     for where in chunks(len(triangles), size):
@@ -52,9 +50,34 @@ def cross_products(
         corner, p, q = (np.take(columns, index, axis=1, mode="clip") for index in (a, b, c))
         p -= corner
         q -= corner
-        cross = np.empty_like(p)
-        cross[0] = p[1] * q[2] - p[2] * q[1]
-        cross[1] = p[2] * q[0] - p[0] * q[2]
-        cross[2] = p[0] * q[1] - p[1] * q[0]
         corner -= origin[:, None]
-        yield where, corner, cross
+        yield where, corner, p, q
+
+
+def cross_product(p: NDArray[np.float64], q: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Cross product of vectors in columns, shape (3, k)."""
+    cross = np.empty_like(p)
+    cross[0] = p[1] * q[2] - p[2] * q[1]
+    cross[1] = p[2] * q[0] - p[0] * q[2]
+    cross[2] = p[0] * q[1] - p[1] * q[0]
+    return cross
+
+
+def cross_products(
+    vertices: NDArray[np.float32], triangles: NDArray[np.uint32], origin: NDArray[np.float64], size: int = CHUNK
+) -> Iterator[tuple[slice, NDArray[np.float64], NDArray[np.float64]]]:
+    """Go through the triangles, `size` at a time, and give first corner and edge cross product, float64.
+
+    The cross product c of the edges from the first corner a is twice the area times the outward normal, and a . c is
+    six times the signed volume of the tetrahedron over the origin (divergence theorem).  c is zero for triangles
+    without area and only for those.
+
+    Yields
+    ------
+    where : slice
+        The triangles of this piece.
+    corner, cross : ndarray, shape (3, k), float64
+        One row each for x, y, z; `corner` is relative to `origin`, mm; `cross` is mm2.
+    """
+    for where, corner, p, q in corner_edges(vertices, triangles, origin, size):
+        yield where, corner, cross_product(p, q)

@@ -8,8 +8,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.errors import UsageError
-from clrecon.mesh.connectivity import count_duplicate_faces, count_split_vertices, find_edges, label_components
-from clrecon.mesh.measures import cross_products, local_origin
+from clrecon.mesh.connectivity import (
+    count_duplicate_faces,
+    find_edges,
+    find_split_vertices,
+    label_components,
+    opposite_half_edges,
+)
+from clrecon.mesh.measures import corner_edges, cross_product, local_origin
 
 __all__ = ["measure_quality"]
 
@@ -38,6 +44,7 @@ def measure_quality(vertices: NDArray[np.float32], triangles: NDArray[np.uint32]
         ``euler_number`` : int, used vertices - edges + faces
         ``genus`` : int or None, handles of all parts together; None if not closed and manifold
         ``zero_area_faces``, ``duplicate_faces``, ``unused_vertices`` : int
+        ``shortest_edge_mm`` : float or None, None without edges
         ``area_mm2`` : float
         ``volume_ml`` : float, enclosed volume, signed: cavities count negative, a surface turned inside out is
         negative as a whole.  Means nothing unless ``closed``: it is then relative to the centre of the bounds
@@ -54,14 +61,15 @@ def measure_quality(vertices: NDArray[np.float32], triangles: NDArray[np.uint32]
         raise UsageError(f"a triangle refers to vertex {int(triangles.max())}, the mesh has {vertex_count} vertices")
 
     edges = find_edges(triangles, vertex_count)
-    split_vertices = count_split_vertices(triangles, vertex_count, edges)
-    components, labels = label_components(triangles, vertex_count)
+    opposite = opposite_half_edges(triangles, edges)
+    split_vertices = len(find_split_vertices(triangles, vertex_count, edges, opposite))
+    components, labels = label_components(triangles, vertex_count, edges)
     unused = int(np.count_nonzero(labels < 0))
     loops = triangles.size - len(edges.half_edges)
     euler_number = vertex_count - unused - edges.count + triangle_count
     closed = triangle_count > 0 and edges.boundary == 0 and edges.nonmanifold == 0
     manifold = triangle_count > 0 and edges.nonmanifold == 0 and edges.oriented and split_vertices == 0 and loops == 0
-    area, volume, zero_area = _area_and_volume(vertices, triangles)
+    area, volume, zero_area, shortest = _measure_triangles(vertices, triangles)
     return {
         "vertices": vertex_count,
         "triangles": triangle_count,
@@ -75,8 +83,9 @@ def measure_quality(vertices: NDArray[np.float32], triangles: NDArray[np.uint32]
         "euler_number": euler_number,
         "genus": components - euler_number // 2 if closed and manifold else None,
         "zero_area_faces": zero_area,
-        "duplicate_faces": count_duplicate_faces(triangles, vertex_count),
+        "duplicate_faces": count_duplicate_faces(triangles, vertex_count, opposite),
         "unused_vertices": unused,
+        "shortest_edge_mm": shortest,
         "area_mm2": area,
         "volume_ml": volume / 1000.0,
         "outward": volume > 0.0,
@@ -84,13 +93,19 @@ def measure_quality(vertices: NDArray[np.float32], triangles: NDArray[np.uint32]
     }
 
 
-def _area_and_volume(vertices: NDArray[np.float32], triangles: NDArray[np.uint32]) -> tuple[float, float, int]:
-    """Area in mm2, signed volume in mm3, number of triangles without area."""
+def _measure_triangles(
+    vertices: NDArray[np.float32], triangles: NDArray[np.uint32]
+) -> tuple[float, float, int, float | None]:
+    """Area in mm2, signed volume in mm3, number of triangles without area, shortest edge in mm."""
     twice_area = six_volumes = 0.0
     zero_area = 0
-    for _, corner, cross in cross_products(vertices, triangles, local_origin(vertices)):
+    shortest = np.inf
+    for _, corner, p, q in corner_edges(vertices, triangles, local_origin(vertices)):
+        cross = cross_product(p, q)
         squares = np.einsum("ij,ij->j", cross, cross)
         twice_area += float(np.sqrt(squares).sum())
         six_volumes += float(np.einsum("ij,ij->", corner, cross))
         zero_area += int(np.count_nonzero(squares == 0.0))
-    return twice_area / 2.0, six_volumes / 6.0, zero_area
+        for edge in (p, q, q - p):
+            shortest = min(shortest, float(np.einsum("ij,ij->j", edge, edge).min()))
+    return twice_area / 2.0, six_volumes / 6.0, zero_area, float(np.sqrt(shortest)) if len(triangles) else None

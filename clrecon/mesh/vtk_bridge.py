@@ -11,7 +11,7 @@ __all__ = ["make_polydata"]
 
 
 def make_polydata(
-    vertices: NDArray[np.float32], triangles: NDArray[np.uint32], normals: NDArray[np.float32] | None
+    vertices: NDArray[np.floating], triangles: NDArray[np.uint32], normals: NDArray[np.float32] | None
 ) -> Any:
     """Build a ``vtkPolyData`` that shares the memory of the arrays.
 
@@ -20,7 +20,8 @@ def make_polydata(
 
     Parameters
     ----------
-    vertices, normals : ndarray, shape (n, 3), float32, C-contiguous
+    vertices : ndarray, shape (n, 3), float32 or float64, C-contiguous
+    normals : ndarray, shape (n, 3), float32, C-contiguous
     triangles : ndarray, shape (m, 3), uint32, C-contiguous, every index below n
     """
     from vtkmodules.util.numpy_support import numpy_to_vtk

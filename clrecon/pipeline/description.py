@@ -124,7 +124,7 @@ def describe_job(
         "platform": platform_name(),
         "warnings": list(dict.fromkeys(warnings)),
         "volume": certificate,
-        "quality": meshes[0]["quality"] if len(meshes) == 1 else None,
+        **{name: meshes[0][name] if len(meshes) == 1 else None for name in ("quality", "iso_distance", "refinement")},
         "meshes": list(meshes),
         "output": {
             "format": meshes[0]["output"]["format"],

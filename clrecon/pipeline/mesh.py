@@ -13,6 +13,7 @@ from clrecon.pipeline.opening import DeviceOpening
 from clrecon.pipeline.outputs import check_outputs, commit_all, count_leftovers, name_outputs, stage_meshes
 from clrecon.pipeline.parts import extract_surfaces, first_names, plan_surfaces, select_parts
 from clrecon.pipeline.progress import Progress, Stopwatch, ignore_progress
+from clrecon.pipeline.refinement import judge_parts, refine_surface, warn_of_gates
 from clrecon.pipeline.report import peak_memory_bytes, stage_report
 from clrecon.pipeline.settings import MeshSettings
 
@@ -101,11 +102,17 @@ def make_mesh(
     paths = name_outputs(output, [part.name for part in parts], report_path)
     watch.lap("select")
 
-    if measure:
+    if settings.refines:
+        for part in parts:
+            part.mesh = refine_surface(part.mesh, settings, progress)
+        watch.lap("refine")
+
+    if measure or settings.strict:
         for place, part in enumerate(parts):
             progress("measure", place, len(parts) if len(parts) > 1 else 0)
             part.quality = part.mesh.quality()
-        watch.lap("measure")
+    gates = judge_parts(parts, volume, settings)
+    watch.lap("measure")
 
     progress("write", 0, 0)
     with ExitStack() as staged:  # all files are on the disk before any replaces an older one
@@ -120,6 +127,8 @@ def make_mesh(
             report["warnings"].append(
                 f"{leftovers:,} more numbered files of this name lie beside the new ones, from an earlier run"
             )
+        report["gates"] = gates
+        report["warnings"] += warn_of_gates(gates)
         report["seconds"] = _seconds(watch, origins)
         report["peak_memory_bytes"] = peak_memory_bytes()
         if report_path is not None:
@@ -133,7 +142,7 @@ def _seconds(watch: Stopwatch, origins: Sequence[dict[str, Any]]) -> dict[str, f
     measured = [origin.get("seconds", {}) for origin in origins]
     seconds = {"device": watch.seconds.get("device", 0.0), "read": watch.seconds.get("read", 0.0)}
     seconds.update({part: sum(float(own.get(part, 0.0)) for own in measured) for part in _DEVICE_PARTS})
-    seconds.update({part: watch.seconds.get(part, 0.0) for part in ("choose", "select", "measure", "write")})
+    seconds.update({part: watch.seconds.get(part, 0.0) for part in ("choose", "select", "refine", "measure", "write")})
     seconds["other"] = max(0.0, watch.total() - sum(seconds.values()))
     seconds["total"] = watch.total()
     return {part: round(value, 4) for part, value in seconds.items()}

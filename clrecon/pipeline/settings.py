@@ -42,6 +42,14 @@ class MeshSettings:
         Name or index of an OpenCL device; None leaves the choice to `choose_device`.
     memory : int, optional
         Bytes that may be taken on the device; None is all that it has.  What does not fit goes through in slabs.
+    smooth : int, optional
+        Iterations of smoothing, see `clrecon.mesh.smooth_mesh`; None: none.
+    decimate : float, optional
+        Share of the triangles to take away, see `clrecon.mesh.decimate_mesh`; None: none.
+    max_deviation_mm : float, optional
+        Bound of each of both, mm; None: a quarter of the shortest voxel step.
+    strict : bool
+        Measure whatever a gate needs, triangles that cut each other too.
 
     Raises
     ------
@@ -61,6 +69,10 @@ class MeshSettings:
     split: bool = False
     device: str | None = None
     memory: int | None = None
+    smooth: int | None = None
+    decimate: float | None = None
+    max_deviation_mm: float | None = None
+    strict: bool = False
 
     def __post_init__(self) -> None:
         if self.iso_value is not None and self.preset is not None:
@@ -78,6 +90,7 @@ class MeshSettings:
         for seed in self.seeds:
             if len(seed) != 3 or not all(map(math.isfinite, seed)):
                 raise UsageError(f"a seed is a point of three numbers in mm, not {tuple(seed)}")
+        self._check_refinement()
         from clrecon.geometry import frame_from_lps  # numpy: not wanted before a job starts
 
         frame_from_lps(self.space)
@@ -108,6 +121,18 @@ class MeshSettings:
             if value in self.levels[:place]:
                 raise UsageError(f"the iso value {value:g} HU is given twice")
 
+    def _check_refinement(self) -> None:
+        if self.smooth is not None and not 1 <= self.smooth <= 1000:
+            raise UsageError(f"smoothing takes from 1 to 1000 iterations, not {self.smooth}")
+        if self.decimate is not None and not 0.0 < self.decimate < 1.0:
+            raise UsageError(f"the share of triangles to take away lies between 0 and 1, {self.decimate:g} does not")
+        if self.max_deviation_mm is None:
+            return
+        if not self.refines:
+            raise UsageError("a largest deviation bounds smoothing and decimation: ask for one of them too")
+        if not (math.isfinite(self.max_deviation_mm) and self.max_deviation_mm > 0.0):
+            raise UsageError(f"the largest deviation is a length in mm above 0, not {self.max_deviation_mm:g}")
+
     @property
     def levels(self) -> tuple[float, ...]:
         """The iso values in HU that are used, one a surface; NaN for the one that the scan has yet to give."""
@@ -122,6 +147,11 @@ class MeshSettings:
         if isinstance(self.iso_value, Sequence):
             return tuple(self.iso_value)
         return (self.iso_value,)
+
+    @property
+    def refines(self) -> bool:
+        """The surface is smoothed or decimated."""
+        return self.smooth is not None or self.decimate is not None
 
     @property
     def preset_used(self) -> str | None:

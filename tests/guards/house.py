@@ -52,7 +52,7 @@ INSIDE_FUNCTIONS: dict[str, frozenset[str]] = {
     "files": frozenset({"numpy"}),
     "geometry": frozenset({"scipy"}),
     "dicom": frozenset({"imagecodecs", "openjpeg", "rle", "jpeg_ls", "pylibjpeg"}),
-    "mesh": frozenset({"scipy", "pyvista", "vtk", "vtkmodules"}),
+    "mesh": frozenset({"scipy", "pyvista", "vtk", "vtkmodules", "fast_simplification"}),
     "reference": frozenset({"scipy"}),
     "phantom": frozenset({"scipy"}),
     "opencl": frozenset({"pyopencl"}),

@@ -9,6 +9,13 @@ import tolerances
 
 from clrecon.errors import UsageError
 from clrecon.mesh import Mesh, measure_quality
+from clrecon.mesh.connectivity import (
+    count_duplicate_faces,
+    find_edges,
+    find_split_vertices,
+    opposite_half_edges,
+    order_by_number,
+)
 
 pytestmark = pytest.mark.unit
 
@@ -40,6 +47,7 @@ def test_box_far_from_the_origin():
         "zero_area_faces": 0,
         "duplicate_faces": 0,
         "unused_vertices": 0,
+        "shortest_edge_mm": 2.0,
         "area_mm2": pytest.approx(67.0, rel=tolerances.MESH_VOLUME),
         "volume_ml": pytest.approx(0.033, rel=tolerances.MESH_VOLUME),
         "outward": True,
@@ -182,16 +190,55 @@ def test_wrong_index_is_refused():
         measure_quality(np.zeros((3, 3), np.float32), np.array([[0, 1, 3]], np.uint32))
 
 
-def test_more_vertices_than_keys_can_hold_are_refused():
-    from clrecon.mesh.connectivity import find_edges
+def test_shortest_edge():
+    vertices, triangles = samples.box((0, 0, 0), (2.0, 3.0, 5.5))
+    for low, high in triangles[7, [[0, 1], [1, 2], [2, 0]]]:
+        near = vertices.copy()
+        near[high] = near[low] + (near[high] - near[low]) / 64
+        expected = min(
+            np.linalg.norm(near[a] - near[b]) for a, b, _ in np.concatenate([triangles, triangles[:, [1, 2, 0]]])
+        )
+        assert measure((near, triangles))["shortest_edge_mm"] == pytest.approx(expected, rel=tolerances.MESH_VOLUME)
+    assert measure(([], []))["shortest_edge_mm"] is None
 
-    with pytest.raises(UsageError, match="4000000000 vertices is too large"):
-        find_edges(np.zeros((0, 3), np.uint32), 4_000_000_000)
+
+@pytest.mark.parametrize("size", [1, 40, 100_000])
+def test_order_by_number_is_a_stable_sort(size):
+    numbers = np.random.default_rng(size).integers(0, size, 300)
+    np.testing.assert_array_equal(order_by_number(numbers, size), np.argsort(numbers, kind="stable"))
 
 
-def test_edge_keys_do_not_overflow_with_many_vertices():
-    from clrecon.mesh.connectivity import find_edges
+def test_going_round_the_vertices_finds_what_joining_the_corners_finds():
+    """Spheres glued in vertices at random: both ways of looking for split vertices, faces around them in any order."""
+    rng = np.random.default_rng(11)
+    vertices, triangles = samples.join(*[samples.sphere(rounds=1)] * 6)
+    place = np.arange(len(vertices))
+    for ball, (one, other) in enumerate(rng.integers(0, len(vertices) // 6, (5, 2)) + [0, len(vertices) // 6]):
+        place[place == place[ball * len(vertices) // 6 + one]] = place[ball * len(vertices) // 6 + other]
+    glued = rng.permutation(place[triangles]).astype(np.uint32)
+    edges = find_edges(glued, len(vertices))
+    opposite = opposite_half_edges(glued, edges)
+    assert opposite is not None
+    found = find_split_vertices(glued, len(vertices), edges, opposite)
+    np.testing.assert_array_equal(found, find_split_vertices(glued, len(vertices), edges))
+    assert 3 <= len(found) <= 5
+    assert count_duplicate_faces(glued, len(vertices), opposite) == count_duplicate_faces(glued, len(vertices)) == 0
 
-    last = 3_037_000_498
+
+def test_a_vertex_with_many_faces():
+    top = np.column_stack([np.cos(np.arange(200) * np.pi / 100), np.sin(np.arange(200) * np.pi / 100), np.zeros(200)])
+    ring, after = np.arange(200) + 2, (np.arange(200) + 1) % 200 + 2
+    cone = [[0, a, b] for a, b in zip(ring, after, strict=True)] + [[1, b, a] for a, b in zip(ring, after, strict=True)]
+    quality = measure((np.concatenate([[[0, 0, 1], [0, 0, -1]], top]), cone))
+    assert figures(quality, "closed", "manifold", "genus", "outward") == (True, True, 0, True)
+
+
+def test_two_triangles_back_to_back():
+    quality = measure(([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2], [2, 1, 0]]))
+    assert figures(quality, "duplicate_faces", "closed", "oriented", "volume_ml") == (1, True, True, 0.0)
+
+
+def test_edges_between_the_highest_vertex_numbers():
+    last = 2**32 - 2
     edges = find_edges(np.array([[0, last - 1, last], [last, last - 1, 1]], np.uint32), last + 1)
     assert (edges.count, edges.boundary, edges.nonmanifold, edges.oriented) == (5, 4, 0, True)

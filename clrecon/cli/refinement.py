@@ -1,0 +1,93 @@
+"""Options of smoothing, decimation and gates, and what is said of them."""
+
+from __future__ import annotations
+
+import argparse
+from typing import Any
+
+from clrecon.cli.console import Console
+
+__all__ = ["GATE_FAILED", "add_refinement", "describe_refinement", "finish_with_gates", "refinement_settings"]
+
+GATE_FAILED = 8
+"""Exit code: everything is written, and ``--strict`` was asked for."""
+
+_ITERATIONS = 20
+
+
+def add_refinement(parser: argparse.ArgumentParser) -> None:
+    """Add --smooth, --decimate, --max-deviation and --strict."""
+    parser.add_argument(
+        "--smooth",
+        type=int,
+        nargs="?",
+        const=_ITERATIONS,
+        metavar="N",
+        help=f"smooth with N iterations of a windowed sinc filter (default: {_ITERATIONS})",
+    )
+    parser.add_argument(
+        "--decimate",
+        type=float,
+        metavar="SHARE",
+        help="take away this share of the triangles, such as 0.9, or as much as the largest deviation lets",
+    )
+    parser.add_argument(
+        "--max-deviation",
+        type=float,
+        metavar="MM",
+        help="smoothing and decimation each move no vertex further (default: a quarter of the shortest voxel step)",
+    )
+    parser.add_argument(
+        "--strict",
+        action="store_true",
+        help=f"exit with {GATE_FAILED} when a mesh fails a gate: closed, manifold, no cuts, close to the scan ...",
+    )
+
+
+def refinement_settings(options: argparse.Namespace) -> dict[str, Any]:
+    """The fields of `MeshSettings` that these options set."""
+    return {
+        "smooth": options.smooth,
+        "decimate": options.decimate,
+        "max_deviation_mm": options.max_deviation,
+        "strict": options.strict,
+    }
+
+
+def describe_refinement(meshes: list[dict[str, Any]]) -> list[str]:
+    """What smoothing and decimation have changed: of one mesh, or the worst of several."""
+    found = [mesh["refinement"] for mesh in meshes if mesh["refinement"]]
+    if not found:
+        return []
+    worst = max(found, key=lambda each: each["deviation"]["hd95_mm"] / each["voxel_mm"])
+    parts = []
+    if "smooth" in worst:
+        parts.append(f"smoothed ({worst['smooth']['iterations']} iterations)")
+    if "decimate" in worst:
+        asked = worst["decimate"]["fraction"]
+        parts.append(f"{100 * worst['decimate']['reached']:.1f} % of {100 * asked:g} % of the triangles taken away")
+    deviation, voxel = worst["deviation"], worst["voxel_mm"]
+    if deviation["volume_change_percent"] is not None:
+        parts.append(f"volume {deviation['volume_change_percent']:+.2f} %")
+    which = "refined " if len(found) == 1 else "refined (worst mesh)"
+    lengths = ", ".join(
+        f"{name} {deviation[key]:.3f} mm ({deviation[key] / voxel:.2f} voxel)"
+        for name, key in (("mean", "assd_mm"), ("95 % within", "hd95_mm"), ("largest", "max_mm"))
+    )
+    return [f"{which} {', '.join(parts)}", f"         from the surface before: {lengths}"]
+
+
+def finish_with_gates(report: dict[str, Any], console: Console, strict: bool) -> int:
+    """Print the warnings of a report; returns the exit code.
+
+    With `strict` the gates that failed are errors: they are printed with ``--quiet`` and ``--json`` too.
+    """
+    from clrecon.pipeline.refinement import warn_of_gates
+
+    failed = warn_of_gates(report["gates"]) if strict else []
+    for warning in report["warnings"]:
+        if warning not in failed:
+            console.warn(warning)
+    for line in failed:
+        console.error(line)
+    return GATE_FAILED if failed else 0

@@ -1,0 +1,103 @@
+"""Smoothing and decimation of one surface of a job, and the gates that it is held against."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+from clrecon.pipeline.parts import Part
+from clrecon.pipeline.progress import Progress, ignore_progress
+from clrecon.pipeline.settings import MeshSettings
+
+if TYPE_CHECKING:
+    from clrecon.geometry import Volume
+    from clrecon.mesh import Mesh
+
+__all__ = ["judge_parts", "refine_surface", "warn_of_gates"]
+
+
+def refine_surface(mesh: Mesh, settings: MeshSettings, progress: Progress = ignore_progress) -> Mesh:
+    """Smooth and decimate as the settings say; the mesh itself where they say neither.
+
+    Returns
+    -------
+    Mesh
+        Its report has ``refinement``: ``smooth``, ``decimate`` (see `clrecon.mesh.refinement`) and ``deviation``,
+        which is `clrecon.mesh.compare_meshes` with the surface before, and ``voxel_mm``.
+    """
+    if not settings.refines:
+        return mesh
+    from clrecon.mesh.distances import compare_meshes
+    from clrecon.mesh.refinement import BOUND_VOXEL, decimate_mesh, default_deviation, smooth_mesh
+
+    raw = mesh
+    if settings.smooth is not None:
+        progress("smooth", 0, 0)
+        mesh = smooth_mesh(mesh, settings.smooth, settings.max_deviation_mm)
+    if settings.decimate is not None:
+        progress("decimate", 0, 0)
+        mesh = decimate_mesh(mesh, settings.decimate, settings.max_deviation_mm)
+    progress("compare", 0, 0)
+    mesh.report["refinement"] |= {
+        "deviation": compare_meshes(mesh, raw),
+        "voxel_mm": default_deviation(raw) / BOUND_VOXEL,
+    }
+    return mesh
+
+
+def judge_parts(parts: Sequence[Part], volume: Volume, settings: MeshSettings) -> list[dict[str, Any]]:
+    """Hold the parts of a job against the gates; what was found goes into the `facts` of each.
+
+    Parameters
+    ----------
+    parts : sequence of Part
+        As they are written, with what `Mesh.quality` says of them.  Where a part was not measured only the gates of a
+        refinement count.
+    volume : Volume
+        They were made from this.
+    settings : MeshSettings
+        With `strict`, triangles that cut each other are looked for, which takes longer than all else.
+
+    Returns
+    -------
+    list of dict
+        All gates, see `clrecon.mesh.gates.judge_mesh`, each with ``mesh``, the name of its part or None.
+    """
+    if not (settings.refines or any(part.quality for part in parts)):
+        for part in parts:
+            part.facts |= {"iso_distance": None, "refinement": None}
+        return []
+    from clrecon.mesh.gates import judge_mesh
+    from clrecon.mesh.intersections import count_self_intersections
+    from clrecon.mesh.iso_distance import measure_iso_distance, rule_of_report
+
+    gates = []
+    for part in parts:
+        mesh, refinement = part.mesh, part.mesh.report.get("refinement")
+        iso_distance = None
+        if part.quality:
+            rule = None if part.surface.label is not None else rule_of_report(mesh.report)
+            iso_distance = None if rule is None else measure_iso_distance(mesh, volume, rule)
+            part.quality["self_intersections"] = (
+                count_self_intersections(mesh.vertices, mesh.triangles) if settings.strict else None
+            )
+        found = judge_mesh(
+            part.quality,
+            closed=settings.closed,
+            outward=not settings.split,
+            iso_distance=iso_distance,
+            deviation=refinement and refinement["deviation"],
+            voxel_mm=refinement and refinement["voxel_mm"],
+        )
+        part.facts |= {"iso_distance": iso_distance, "refinement": refinement}
+        gates += [{"mesh": part.name or None, **gate} for gate in found]
+    return gates
+
+
+def warn_of_gates(gates: Sequence[dict[str, Any]]) -> list[str]:
+    """One line for each gate that failed, with the name of its mesh where there are several."""
+    if not gates:
+        return []
+    from clrecon.mesh.gates import failed_gates
+
+    return [f"{gate['mesh']}: {line}" if gate["mesh"] else line for gate in gates for line in failed_gates([gate])]

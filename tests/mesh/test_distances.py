@@ -1,0 +1,106 @@
+"""Distances between surfaces whose distance is known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import sample_meshes as samples
+import tolerances
+
+from clrecon.errors import NoSurfaceError, UsageError
+from clrecon.mesh import Mesh
+from clrecon.mesh.distances import NearDistance, SurfaceDistance, compare_meshes, sample_surface
+
+pytestmark = pytest.mark.unit
+
+FAR = np.array([-1250.5, 3071.25, -846.25])
+TRIANGLE = (np.array([[0.0, 0, 0], [4, 0, 0], [0, 4, 0]]), np.array([[0, 1, 2]], np.uint32))
+
+
+def rectangle(height: float, size=(30.0, 20.0)) -> samples.Arrays:
+    corners = np.array([[0, 0, height], [size[0], 0, height], [*size, height], [0, size[1], height]], dtype=float)
+    return corners, np.array([[0, 1, 2], [0, 2, 3]])
+
+
+def test_parallel_planes():
+    one, other = (Mesh(rectangle(height)[0] + FAR, rectangle(0)[1]) for height in (0.0, 1.25))
+    found = compare_meshes(one, other, samples=1000)
+    for side in ("to_reference_mm", "from_reference_mm"):
+        assert found[side] == pytest.approx(dict.fromkeys(("mean", "rms", "p95", "max"), 1.25))
+    assert (found["hd95_mm"], found["assd_mm"], found["max_mm"]) == pytest.approx((1.25, 1.25, 1.25))
+
+
+def test_concentric_spheres():
+    inner, outer = (Mesh(*samples.sphere(FAR, radius, 5)) for radius in (10.0, 10.5))
+    found = compare_meshes(outer, inner, samples=5000)
+    for name in ("hd95_mm", "assd_mm", "max_mm"):
+        assert found[name] == pytest.approx(0.5, abs=tolerances.SPHERE_SAGITTA_MM)
+    assert found["volume_change_percent"] == pytest.approx(100 * (1.05**3 - 1), rel=1e-5)
+    assert found["samples"] == 5000
+
+
+def test_hd95_takes_the_worse_side_and_assd_both():
+    plane = Mesh(*rectangle(0.0))
+    half = Mesh(*rectangle(0.0, (15.0, 20.0)))
+    found = compare_meshes(half, plane, samples=20_000)
+    assert found["to_reference_mm"]["max"] == 0.0
+    # Beyond the edge at x = 15 the distance grows to 15: 95 % of all points of 30 mm end at 13.5.
+    assert found["hd95_mm"] == pytest.approx(13.5, abs=0.01)
+    assert found["assd_mm"] == pytest.approx(0.5 * 15.0 / 4.0, abs=0.01)
+
+
+def test_an_open_surface_without_volume_has_no_change():
+    assert compare_meshes(Mesh(*rectangle(0.0)), Mesh(*rectangle(0.0)), 10)["volume_change_percent"] is None
+
+
+@pytest.mark.parametrize(
+    ("point", "distance"),
+    [
+        ((1.0, 1.0, 3.0), 3.0),  # over the face
+        ((2.0, -5.0, 0.0), 5.0),  # beside an edge
+        ((-3.0, -4.0, 0.0), 5.0),  # at a corner
+        ((4.0, 4.0, 0.0), np.sqrt(8.0)),  # beside the long edge
+        ((2.0, 2.0, 0.0), 0.0),  # on it
+    ],
+)
+def test_distance_to_one_triangle(point, distance):
+    vertices, triangles = TRIANGLE
+    points = np.array([point]) + FAR
+    assert SurfaceDistance(vertices + FAR, triangles)(points) == pytest.approx([distance], abs=1e-9)
+    for vertex in range(3):
+        near = NearDistance(vertices + FAR, triangles)(points, np.array([vertex]), 0.5)
+        assert near == pytest.approx([distance], abs=1e-9)
+
+
+def test_distances_near_a_vertex_are_exact_or_within_the_limit():
+    vertices, triangles = samples.torus(40, 24)
+    triangles = triangles.astype(np.uint32)
+    rng = np.random.default_rng(3)
+    near = rng.integers(0, len(vertices), 500)
+    points = vertices[near] + rng.normal(scale=1.5, size=(500, 3))
+    exact = SurfaceDistance(vertices, triangles)(points)
+    found = NearDistance(vertices, triangles)(points, near, 0.8)
+    assert (found >= exact - 1e-9).all()
+    assert ((found <= 0.8) | (np.abs(found - exact) < 1e-9)).all()
+    assert (found > 0.8).sum() > 50 < (found < 0.8).sum()
+
+
+def test_samples_cover_the_area_evenly():
+    vertices = np.array([[0.0, 0, 0], [3, 0, 0], [0, 1, 0], [10, 0, 0], [19, 0, 0], [10, 1, 0], [0, 0, 0]])
+    triangles = np.array([[0, 1, 2], [3, 4, 5], [0, 6, 6]], np.uint32)
+    points = sample_surface(vertices, triangles, 4000)
+    on_second = points[:, 0] >= 10.0
+    assert on_second.sum() == 3000  # areas 1.5 and 4.5
+    np.testing.assert_allclose(points[on_second].mean(axis=0), [13.0, 1 / 3, 0.0], atol=0.02)
+    assert (points[on_second][:, 1] <= 1 - (points[on_second][:, 0] - 10) / 9 + 1e-12).all()
+    np.testing.assert_array_equal(points, sample_surface(vertices, triangles, 4000))
+
+
+def test_nothing_to_measure_is_refused():
+    plane = Mesh(*rectangle(0.0))
+    with pytest.raises(NoSurfaceError, match="without area"):
+        compare_meshes(plane, Mesh([], []))
+    with pytest.raises(NoSurfaceError, match="without area"):
+        compare_meshes(Mesh([[0, 0, 0], [1, 1, 1]], [[0, 1, 1]]), plane)
+    with pytest.raises(UsageError, match="at least 1 sample, not 0"):
+        compare_meshes(plane, plane, samples=0)

@@ -1,0 +1,98 @@
+"""Gates: each fault fails its own gate and no other."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import sample_meshes as samples
+
+from clrecon.mesh import Mesh
+from clrecon.mesh.distances import compare_meshes
+from clrecon.mesh.gates import failed_gates, judge_mesh
+
+pytestmark = pytest.mark.unit
+
+NAMES = {"closed", "manifold", "oriented", "outward", "zero_area_faces", "duplicate_faces", "self_intersections"}
+
+
+def failed(gates: list[dict]) -> set[str]:
+    return {gate["name"] for gate in gates if gate["ok"] is False}
+
+
+def of(arrays: samples.Arrays, closed: bool = True) -> list[dict]:
+    return judge_mesh(Mesh(*arrays).quality(), closed=closed)
+
+
+def test_a_good_mesh_fails_none():
+    gates = of(samples.torus())
+    assert {gate["name"] for gate in gates} == NAMES
+    assert failed(gates) == set()
+    assert failed_gates(gates) == []
+    assert all(set(gate) == {"name", "measured", "bound", "unit", "ok", "text"} for gate in gates)
+    assert [gate["measured"] for gate in gates if gate["ok"] is None] == [None]  # self-intersections
+
+
+def test_a_hole():
+    vertices, triangles = samples.sphere()
+    gates = of((vertices, np.delete(triangles, 17, axis=0)))
+    assert failed(gates) == {"closed"}
+    assert failed_gates(gates) == ["gate closed failed: edges with one triangle only: 3, none allowed"]
+    assert failed(of((vertices, np.delete(triangles, 17, axis=0)), closed=False)) == set()
+
+
+def test_an_open_surface_has_no_gate_on_what_it_encloses():
+    vertices, triangles = samples.sphere()
+    gates = of((vertices, triangles[1:, ::-1]), closed=False)
+    assert failed(gates) == set()
+    assert not {"closed", "outward"} & {gate["name"] for gate in gates}
+
+
+def test_inside_out():
+    vertices, triangles = samples.torus()
+    inside_out = Mesh(vertices, triangles[:, ::-1]).quality()
+    assert failed(judge_mesh(inside_out)) == {"outward"}
+    assert failed(judge_mesh(inside_out, outward=False)) == set()
+
+
+def test_a_flipped_face():
+    vertices, triangles = samples.torus()
+    triangles[40] = triangles[40, ::-1]
+    assert failed(of((vertices, triangles))) == {"manifold", "oriented"}
+
+
+def test_a_shared_corner():
+    assert failed(of(samples.weld(samples.join(samples.box(), samples.box((1, 1, 1)))))) == {"manifold"}
+
+
+def test_faces_without_area_and_doubled():
+    vertices, triangles = samples.box()
+    flat = np.concatenate([vertices, vertices[:1]])
+    assert failed(of((flat, np.concatenate([triangles, [[0, 8, 1], [8, 0, 1]]])))) >= {"zero_area_faces"}
+    assert failed(of((vertices, np.concatenate([triangles, triangles[:1]])))) >= {"duplicate_faces"}
+
+
+@pytest.mark.parametrize(
+    ("radius", "expected"),
+    [
+        (10.004, set()),
+        (10.012, set()),
+        (9.98, {"volume_change"}),  # 0.6 % of volume
+        (10.15, {"volume_change", "deviation_mean"}),
+        (10.3, {"volume_change", "deviation_mean", "deviation_p95"}),
+    ],
+)
+def test_a_deviation_in_voxels(radius, expected):
+    one, other = (Mesh(*samples.sphere(radius=r, rounds=4)) for r in (radius, 10.0))
+    gates = judge_mesh(deviation=compare_meshes(one, other, 2000), voxel_mm=1.0)
+    assert len(gates) == 3
+    assert failed(gates) == expected
+    twice = judge_mesh(deviation=compare_meshes(one, other, 2000), voxel_mm=2.0, closed=False)
+    assert failed(twice) == ({"deviation_mean"} if radius == 10.3 else set())
+
+
+def test_vertices_off_the_iso_surface():
+    def at(p95: float, mean: float) -> set[str]:
+        return failed(judge_mesh(iso_distance={"vertices_voxel": {"p95": p95, "mean": mean}}))
+
+    assert (at(0.25, 0.1), at(0.26, 0.1), at(0.25, 0.11)) == (set(), {"iso_distance_p95"}, {"iso_distance_mean"})
+    assert judge_mesh(iso_distance={"vertices_voxel": None}) == []

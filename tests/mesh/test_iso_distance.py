@@ -1,0 +1,145 @@
+"""Distance to the trilinear iso surface, where analysis knows it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import tolerances
+from scipy.ndimage import map_coordinates
+
+from clrecon.geometry import Volume, compose_affine
+from clrecon.geometry.field import choose_iso_rule
+from clrecon.mesh import Mesh
+from clrecon.mesh.iso_distance import (
+    distances_to_iso_surface,
+    measure_iso_distance,
+    rule_of_report,
+    smallest_voxel_mm,
+    trilinear_field,
+)
+from clrecon.reference.isosurface import extract_isosurface
+
+pytestmark = pytest.mark.unit
+
+SHEARED = compose_affine((0.0, 0.7, 0.1), (0.5, 0.0, -0.05), (0.3, 0.2, 2.5), (-250.0, 130.5, -846.25))
+SHAPE_IJK = (11, 9, 7)
+
+
+def centres(shape_ijk=SHAPE_IJK) -> np.ndarray:
+    k, j, i = np.meshgrid(*(np.arange(n) for n in shape_ijk[::-1]), indexing="ij")
+    return np.column_stack([i.ravel(), j.ravel(), k.ravel()])
+
+
+def volume_of(field, affine=SHEARED, shape_ijk=SHAPE_IJK, dtype=np.float32) -> Volume:
+    empty = Volume(np.zeros(shape_ijk[::-1], dtype), affine)
+    return Volume(field(empty.ijk_to_lps(centres(shape_ijk))).reshape(shape_ijk[::-1]).astype(dtype), affine)
+
+
+def noise_volume(dtype=np.int16) -> Volume:
+    return Volume(np.random.default_rng(4).integers(-900, 900, SHAPE_IJK[::-1]).astype(dtype), SHEARED)
+
+
+def test_field_and_gradient_as_scipy_and_differences_have_them():
+    volume = noise_volume()
+    rule = choose_iso_rule(volume, 100, closed=True)
+    ijk = np.random.default_rng(5).uniform(-1, SHAPE_IJK, (400, 3))
+    padded = np.pad(volume.voxels.astype(float), 1, constant_values=rule.outside)
+    value, gradient = trilinear_field(volume, rule, ijk)
+    expected = map_coordinates(padded, ijk.T[::-1] + 1, order=1)
+    np.testing.assert_allclose(value, expected, rtol=0, atol=tolerances.TRILINEAR * 1000)
+    inner = ijk[(np.abs(ijk - np.round(ijk)) > 1e-3).all(axis=1)]
+    for axis in range(3):
+        step = 1e-4 * np.eye(3)[axis]
+        change = trilinear_field(volume, rule, inner + step)[0] - trilinear_field(volume, rule, inner - step)[0]
+        found = trilinear_field(volume, rule, inner)[1][:, axis]
+        np.testing.assert_allclose(found, change / 2e-4, rtol=0, atol=1e-4)
+
+
+def test_an_open_volume_ends_at_its_border():
+    volume = noise_volume()
+    rule = choose_iso_rule(volume, 100, closed=False)
+    beyond, border = np.array([[-0.5, 3.0, 9.0], [4.2, 8.9, 2.0]]), np.array([[0.0, 3.0, 6.0], [4.2, 8.0, 2.0]])
+    np.testing.assert_array_equal(trilinear_field(volume, rule, beyond)[0], trilinear_field(volume, rule, border)[0])
+
+
+@pytest.mark.parametrize("normal", [(1.0, 0.0, 0.0), (0.3, -0.5, 0.8), (-0.2, 0.9, 0.1)])
+def test_a_plane_through_sheared_voxels(normal):
+    """A linear field is trilinear itself: distances are exact, along the normal in mm and not in index space."""
+    normal = np.array(normal) / np.linalg.norm(normal)
+    middle = (SHEARED @ [5, 4, 3, 1])[:3]
+    volume = volume_of(lambda points: 40.0 * (points - middle) @ normal)
+    rule = choose_iso_rule(volume, 0.0, closed=False)
+    rng = np.random.default_rng(6)
+    across = rng.uniform(-0.6, 0.6, (50, 3)) @ (np.eye(3) - np.outer(normal, normal))
+    offset = rng.uniform(-0.3, 0.3, 50)
+    found = distances_to_iso_surface(volume, rule, middle + across + offset[:, None] * normal)
+    np.testing.assert_allclose(found, np.abs(offset), atol=1e-4)  # voxels are float32
+
+
+def test_points_off_a_sphere():
+    affine = np.diag([0.7, 0.5, 0.9, 1.0])
+    shape, radius = (40, 55, 32), 8.0
+    centre = (affine @ [19.3, 27.4, 15.6, 1])[:3]
+    volume = volume_of(lambda points: radius - np.linalg.norm(points - centre, axis=1), affine, shape)
+    directions = np.random.default_rng(7).normal(size=(300, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    offset = np.linspace(-0.5, 0.5, 300)
+    points = centre + directions * (radius + offset)[:, None]
+    found = distances_to_iso_surface(volume, choose_iso_rule(volume, 0.0), points)
+    np.testing.assert_allclose(found, np.abs(offset), atol=tolerances.ISO_SPHERE_SAGITTA_MM)
+
+
+def test_the_border_cell_of_a_closed_volume():
+    volume = Volume(np.full((4, 4, 4), 1000, np.int16), np.diag([2.0, 1.0, 1.0, 1.0]))
+    rule = choose_iso_rule(volume, 0, closed=True)
+    surface = -2.0 * (1000 + 0.5) / (1000 - rule.outside)  # in x, half a unit below the integer
+    points = np.array([[surface + 0.1, 1.5, 1.5], [surface, 1.2, 2.0]])
+    np.testing.assert_allclose(distances_to_iso_surface(volume, rule, points), [0.1, 0.0], atol=1e-9)
+
+
+def test_a_flat_field_has_no_surface_nearby():
+    volume = Volume(np.zeros((4, 4, 4), np.int16), np.eye(4))
+    rule = choose_iso_rule(volume, 500, closed=False)
+    assert np.isnan(distances_to_iso_surface(volume, rule, np.array([[1.5, 1.5, 1.5]]))).all()
+    mesh = Mesh([[1, 1, 1], [2, 1, 1], [1, 2, 1]], [[0, 1, 2]])
+    found = measure_iso_distance(mesh, volume, rule)
+    assert (found["not_found"], found["vertices_mm"], found["centres_voxel"]) == (4, None, None)
+
+
+@pytest.mark.parametrize("closed", [True, False])
+@pytest.mark.parametrize("iso_value", [100, 33.25])
+def test_vertices_of_an_extracted_surface_lie_on_it(iso_value, closed):
+    volume = noise_volume()
+    vertices, _, triangles = extract_isosurface(volume, iso_value, closed=closed)
+    found = measure_iso_distance(Mesh(vertices, triangles), volume, choose_iso_rule(volume, iso_value, closed))
+    assert found["vertices_voxel"]["max"] < tolerances.ISO_VERTEX_VOXEL
+    assert found["centres_voxel"]["p95"] > 0.01  # flat triangles on noise
+    assert found["vertices_mm"]["max"] == pytest.approx(found["vertices_voxel"]["max"] * smallest_voxel_mm(volume))
+    assert smallest_voxel_mm(volume) == pytest.approx(np.hypot(0.5, 0.05))
+
+
+def test_a_level_half_a_unit_off_is_found():
+    volume = noise_volume()
+    vertices, _, triangles = extract_isosurface(volume, 100)
+    mesh = Mesh(vertices, triangles)
+    assert measure_iso_distance(mesh, volume, choose_iso_rule(volume, 101))["vertices_voxel"]["mean"] > 1e-4
+
+
+def test_only_so_many_samples():
+    volume = noise_volume()
+    vertices, _, triangles = extract_isosurface(volume, 100)
+    found = measure_iso_distance(Mesh(vertices, triangles), volume, choose_iso_rule(volume, 100), samples=100)
+    assert 50 < found["samples"]["vertices"] <= 100
+    assert 50 < found["samples"]["centres"] <= 100
+
+
+def test_the_rule_is_read_from_the_report_of_a_mesh():
+    closed = {"iso_value_hu": 226.0, "iso_level_hu": 225.5, "closed_at_border": True, "outside_hu": -1024.0}
+    rule = rule_of_report(closed)
+    assert rule is not None
+    assert (rule.iso_level, rule.outside, rule.border) == (225.5, -1024.0, 1)
+    opened = rule_of_report({**closed, "closed_at_border": False, "outside_hu": None})
+    assert opened is not None
+    assert (opened.closed, opened.border) == (False, 0)
+    assert rule_of_report({}) is None
+    assert rule_of_report({**closed, "outside_hu": None}) is None

@@ -1,0 +1,131 @@
+"""Smoothing: noise goes, shape and volume stay, nothing moves beyond the bound."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import sample_meshes as samples
+import tolerances
+
+from clrecon.errors import NoSurfaceError, UsageError
+from clrecon.mesh import Mesh
+from clrecon.mesh.distances import SurfaceDistance
+from clrecon.mesh.normals import vertex_normals
+from clrecon.mesh.refinement import smooth_mesh
+
+pytestmark = pytest.mark.unit
+
+CENTRE = np.array([-150.25, 1071.5, -846.0])
+RADIUS = 20.0
+
+
+def noisy_sphere(noise: float, seed: int = 1) -> Mesh:
+    vertices, triangles = samples.sphere((0, 0, 0), 1.0, 5)
+    lengths = RADIUS + np.random.default_rng(seed).normal(scale=noise, size=len(vertices))
+    return Mesh(CENTRE + vertices * lengths[:, None], triangles, None, {"iso_value_hu": 300.0})
+
+
+def plane(noise: float, size: int = 30) -> Mesh:
+    x, y = (grid.ravel() for grid in np.meshgrid(np.arange(size), np.arange(size)))
+    z = np.random.default_rng(2).normal(scale=noise, size=size * size)
+    corner = (x + size * y)[(x < size - 1) & (y < size - 1)]
+    lower = np.column_stack([corner, corner + 1, corner + size + 1])
+    upper = np.column_stack([corner, corner + size + 1, corner + size])
+    return Mesh(np.column_stack([x, y, z]), np.concatenate([lower, upper]))
+
+
+def radial_error(mesh: Mesh) -> np.ndarray:
+    return np.linalg.norm(mesh.vertices - CENTRE, axis=1) - RADIUS
+
+
+def test_noise_on_a_sphere_goes_and_the_radius_stays():
+    rough = noisy_sphere(0.1)
+    smooth = smooth_mesh(rough, max_deviation_mm=0.5)
+    assert np.std(radial_error(smooth)) < tolerances.SMOOTHED_NOISE_SHARE * 0.1
+    assert abs(radial_error(smooth).mean()) < tolerances.SMOOTHED_RADIUS_MM
+    quality = smooth.quality()
+    assert (quality["closed"], quality["manifold"], quality["zero_area_faces"]) == (True, True, 0)
+    assert quality["volume_ml"] == pytest.approx(4 / 3 * np.pi * 8.0, rel=tolerances.SMOOTHED_VOLUME)
+    np.testing.assert_array_equal(smooth.triangles, rough.triangles)
+    outward = (smooth.vertices - CENTRE) / np.linalg.norm(smooth.vertices - CENTRE, axis=1, keepdims=True)
+    assert np.einsum("na,na->n", smooth.normals, outward).min() > 0.99
+    assert smooth.report["iso_value_hu"] == 300.0
+    assert smooth.report["refinement"]["smooth"]["iterations"] == 20
+
+
+def test_more_iterations_smooth_more():
+    rough = noisy_sphere(0.1)
+    few, many = (np.std(radial_error(smooth_mesh(rough, n, 1.0))) for n in (5, 20))
+    assert many < few < 0.1
+
+
+@pytest.mark.parametrize("bound", [0.02, 0.1])
+def test_no_vertex_of_either_surface_is_further_than_the_bound(bound):
+    rough = noisy_sphere(0.2)
+    free, smooth = smooth_mesh(rough, 20, 10.0), smooth_mesh(rough, 20, bound)
+    assert SurfaceDistance(rough.vertices, rough.triangles)(free.vertices.astype(float)).max() > 3 * bound
+    assert free.report["refinement"]["smooth"]["vertices_held_back"] == 0
+    assert smooth.report["refinement"]["smooth"]["vertices_held_back"] > 100
+    for one, other in ((rough, smooth), (smooth, rough)):
+        distance = SurfaceDistance(other.vertices, other.triangles)(one.vertices.astype(float))
+        assert distance.max() <= bound + tolerances.float32_unit(rough.vertices)
+
+
+def test_a_plane_becomes_flat_and_keeps_its_border():
+    rough = plane(0.1)
+    smooth = smooth_mesh(rough, 40, 1.0)
+    border = np.isin(rough.vertices[:, :2], (0.0, 29.0)).any(axis=1)
+    np.testing.assert_array_equal(smooth.vertices[border], rough.vertices[border])
+    inner = ((rough.vertices[:, :2] > 6) & (rough.vertices[:, :2] < 23)).all(axis=1)
+    assert np.std(smooth.vertices[inner, 2]) < tolerances.SMOOTHED_NOISE_SHARE * np.std(rough.vertices[inner, 2])
+    even = smooth_mesh(plane(0.0), 20, 1.0)
+    assert np.abs(even.vertices[:, 2]).max() == 0.0
+
+
+def test_a_torus_keeps_its_volume():
+    torus = Mesh(*samples.torus(120, 48))
+    before, after = torus.quality(), smooth_mesh(torus, 20, 1.0).quality()
+    assert after["volume_ml"] == pytest.approx(before["volume_ml"], rel=tolerances.SMOOTHED_VOLUME)
+    assert after["genus"] == 1
+
+
+def test_faces_that_would_lose_their_area_stay():
+    vertices, triangles = samples.box((1000, 0, 0), (2.0**-12, 2.0**-12, 2.0**-12))  # a few units of float32
+    smooth = smooth_mesh(Mesh(vertices, triangles), 100, 1.0)
+    assert smooth.quality()["zero_area_faces"] == 0
+
+
+def test_the_default_bound_is_a_quarter_of_the_shortest_step():
+    rough = noisy_sphere(0.1)
+    with pytest.raises(UsageError, match="give max_deviation_mm"):
+        smooth_mesh(rough)
+    rough.report["affine_ijk_to_lps_mm"] = np.diag([0.5, 0.4, 2.0, 1.0]).tolist()
+    assert smooth_mesh(rough).report["refinement"]["smooth"]["max_deviation_mm"] == pytest.approx(0.1)
+
+
+@pytest.mark.parametrize("iterations", [0, -1, 1001, 20.0])
+def test_impossible_iterations(iterations):
+    with pytest.raises(UsageError, match="from 1 to 1000 iterations"):
+        smooth_mesh(noisy_sphere(0.1), iterations, 1.0)
+
+
+@pytest.mark.parametrize("bound", [0.0, -1.0, float("nan"), float("inf")])
+def test_impossible_bounds(bound):
+    with pytest.raises(UsageError, match="a length in mm above 0"):
+        smooth_mesh(noisy_sphere(0.1), 20, bound)
+
+
+def test_an_empty_surface_is_refused():
+    with pytest.raises(NoSurfaceError, match="nothing to refine"):
+        smooth_mesh(Mesh([], []), 20, 1.0)
+
+
+def test_normals_do_not_depend_on_the_diagonals():
+    vertices, triangles = samples.box()
+    normals = vertex_normals(vertices.astype(np.float32), triangles.astype(np.uint32))
+    np.testing.assert_allclose(normals, (vertices * 2 - 1) / np.sqrt(3), atol=tolerances.MESH_UNIT_NORMAL)
+
+
+def test_a_vertex_without_faces_has_a_unit_normal():
+    normals = vertex_normals(np.zeros((4, 3), np.float32), np.array([[0, 1, 2]], np.uint32))
+    np.testing.assert_array_equal(normals, [[0, 0, 1]] * 4)
