@@ -242,6 +242,20 @@ def test_a_device_that_finds_nothing_is_not_believed(device, monkeypatch):
     assert outcomes == {"exclusive_scan": True, "compact": True, "extract_isosurface": False}
 
 
+@pytest.mark.parametrize("lanes", ["1", "8"])
+@pytest.mark.parametrize("words", ["1", "3", "8"])
+def test_every_variant_of_the_kernels_gives_the_same_mesh(device, lanes, words, monkeypatch):
+    """What runs on GPUs is tested where there is none."""
+    volume = smooth_volume((23, 27, 75), affine=MIRRORED)
+    vertices, normals, triangles = twin.extract_isosurface(volume, 100)
+    variants = {**device.kernel_variants, "LANES": lanes, "WORDS_PER_ITEM": words}
+    monkeypatch.setattr(device, "kernel_variants", variants)
+    mesh = extract_isosurface(volume, 100, device)
+    assert np.array_equal(mesh.triangles, triangles)
+    assert np.abs(mesh.vertices - vertices).max() <= tolerances.float32_unit(mesh.vertices)
+    assert np.abs(mesh.normals - normals).max() <= tolerances.TWIN_NORMAL
+
+
 def test_several_iso_values_are_as_each_alone(device):
     volume = smooth_volume()
     meshes = extract_isosurfaces(volume, [100, -50.5, 100], device)
