@@ -242,8 +242,7 @@ def test_a_device_that_finds_nothing_is_not_believed(device, monkeypatch):
     assert outcomes == {"exclusive_scan": True, "compact": True, "extract_isosurface": False}
 
 
-@pytest.mark.parametrize("lanes", ["1", "8"])
-@pytest.mark.parametrize("words", ["1", "3", "8"])
+@pytest.mark.parametrize(("lanes", "words"), [("1", "1"), ("8", "3")])
 def test_every_variant_of_the_kernels_gives_the_same_mesh(device, lanes, words, monkeypatch):
     """What runs on GPUs is tested where there is none."""
     volume = smooth_volume((23, 27, 75), affine=MIRRORED)
