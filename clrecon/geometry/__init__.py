@@ -9,7 +9,7 @@ from clrecon.geometry.affine import (
     slice_normal,
     tilt_degrees,
 )
-from clrecon.geometry.frames import SPACES, frame_from_lps
+from clrecon.geometry.frames import SPACES, frame_from_lps, lps_affine_from_ras
 from clrecon.geometry.iso_choice import IsoChoice, choose_iso_value, half_iso_value
 from clrecon.geometry.volume import AIR_HU, Volume
 
@@ -25,6 +25,7 @@ __all__ = [
     "frame_from_lps",
     "half_iso_value",
     "is_left_handed",
+    "lps_affine_from_ras",
     "normal_matrix",
     "slice_normal",
     "tilt_degrees",

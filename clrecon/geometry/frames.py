@@ -6,11 +6,11 @@ LPS: x to the patient's left, y to the posterior, z to the superior (DICOM).  RA
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from clrecon.errors import UsageError
 
-__all__ = ["SPACES", "frame_from_lps"]
+__all__ = ["SPACES", "frame_from_lps", "lps_affine_from_ras"]
 
 SPACES = ("lps", "ras")
 
@@ -34,3 +34,18 @@ def frame_from_lps(space: str) -> NDArray[np.float64]:
     if name == "ras":
         return np.diag((-1.0, -1.0, 1.0))
     raise UsageError(f"unknown space {space!r}: use one of {', '.join(SPACES)}")
+
+
+def lps_affine_from_ras(affine: ArrayLike) -> NDArray[np.float64]:
+    """Turn an affine to RAS mm (NIfTI, FreeSurfer) into one to LPS mm; its own inverse.
+
+    Parameters
+    ----------
+    affine : array_like, shape (4, 4)
+        Index (i, j, k) to RAS mm.
+
+    Returns
+    -------
+    ndarray, shape (4, 4), float64
+    """
+    return np.asarray(np.diag((-1.0, -1.0, 1.0, 1.0)) @ np.asarray(affine, dtype=np.float64), dtype=np.float64)

@@ -9,10 +9,13 @@ from clrecon.geometry import Volume, is_left_handed
 from clrecon.geometry.field import IsoRule, choose_iso_rule, slice_normal_matrices, vertex_margin
 from clrecon.reference.case_table import CORNERS, EDGES, case_table
 
-__all__ = ["extract_isosurface"]
+__all__ = ["Surface", "extract_inside", "extract_isosurface", "sample_grid"]
+
+Surface = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.uint32]]
+"""Vertices (n, 3) and normals (n, 3), LPS mm, and triangles (m, 3)."""
 
 
-def _grid(volume: Volume, rule: IsoRule, layers: int) -> NDArray[np.float64]:
+def sample_grid(volume: Volume, rule: IsoRule, layers: int) -> NDArray[np.float64]:
     """The samples as float64, grown by `layers` of outside (closed) or of the border's own values (open)."""
     values = volume.voxels.astype(np.float64)
     if rule.closed:
@@ -20,9 +23,11 @@ def _grid(volume: Volume, rule: IsoRule, layers: int) -> NDArray[np.float64]:
     return np.pad(values, layers, mode="edge")
 
 
-def _gradients(volume: Volume, rule: IsoRule) -> NDArray[np.float64]:
-    """Gradient per index step (d/di, d/dj, d/dk) at every sample: central, one-sided at an open border."""
-    field = _grid(volume, rule, rule.border + 1)
+def _gradients(field: NDArray[np.float64], rule: IsoRule) -> NDArray[np.float64]:
+    """Gradient per index step (d/di, d/dj, d/dk) at every sample: central, one-sided at an open border.
+
+    `field` has one more layer on every side than the result.
+    """
     parts = []
     for axis in (2, 1, 0):
         change = np.diff(field, axis=axis)
@@ -54,9 +59,7 @@ def _find_triangles(inside: NDArray[np.bool_], numbers: NDArray[np.int64]) -> ND
     return np.array(triangles, dtype=np.uint32).reshape(-1, 3)
 
 
-def extract_isosurface(
-    volume: Volume, iso_value: float, *, closed: bool = True
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.uint32]]:
+def extract_isosurface(volume: Volume, iso_value: float, *, closed: bool = True) -> Surface:
     """Extract the iso surface of a small volume.
 
     Parameters
@@ -74,11 +77,34 @@ def extract_isosurface(
     triangles : ndarray, shape (m, 3), uint32, counter-clockwise as seen from lower values
     """
     rule = choose_iso_rule(volume, iso_value, closed)
-    field = _grid(volume, rule, rule.border)
-    inside = _grid(volume, rule, rule.border) >= rule.lowest_inside
+    inside = sample_grid(volume, rule, rule.border) >= rule.lowest_inside
     if rule.closed:
         inside[[0, -1]] = inside[:, [0, -1]] = inside[:, :, [0, -1]] = False
-    gradients = _gradients(volume, rule)
+    return extract_inside(volume, rule, inside)
+
+
+def extract_inside(
+    volume: Volume, rule: IsoRule, inside: NDArray[np.bool_], hu_places: NDArray[np.bool_] | None = None
+) -> Surface:
+    """Extract the surface between the samples that are inside and the others.
+
+    Parameters
+    ----------
+    volume : Volume
+    rule : IsoRule
+    inside : ndarray, shape (gk, gj, gi), bool
+        On the sample grid: the volume and its border.
+    hu_places : ndarray, shape (gk, gj, gi), bool, optional
+        Between two samples that have it the vertex lies where HU cross the iso level; elsewhere half way, with the
+        normal of the inside.  None: HU place every vertex.
+
+    Returns
+    -------
+    vertices, normals, triangles
+        As `extract_isosurface`.
+    """
+    field = sample_grid(volume, rule, rule.border)
+    gradients = _gradients(sample_grid(volume, rule, rule.border + 1), rule)
 
     crossed = np.zeros((*inside.shape, 3), dtype=bool)
     crossed[:, :, :-1, 0] = inside[:, :, :-1] != inside[:, :, 1:]
@@ -93,15 +119,24 @@ def extract_isosurface(
     i1, j1, k1 = i + step[:, 0], j + step[:, 1], k + step[:, 2]
     value, next_value = field[k, j, i], field[k1, j1, i1]
     margin = vertex_margin(volume, rule.border)[axis]
-    t = np.clip((rule.iso_level - value) / (next_value - value), margin, 1.0 - margin)[:, None]
+    half_way = np.zeros(len(owner), dtype=bool)
+    if hu_places is not None:
+        half_way = ~(hu_places[k, j, i] & hu_places[k1, j1, i1])
+    change = np.where(half_way, 1.0, next_value - value)
+    t = np.where(half_way, 0.5, np.clip((rule.iso_level - value) / change, margin, 1.0 - margin))[:, None]
 
     origins = volume.slice_origins(rule.border)
     here = np.stack([i, j], axis=1) - rule.border
     positions = origins[k] + (here + t * step[:, :2]) @ volume.affine[:3, :2].T + t * (origins[k1] - origins[k])
 
     slope = (1.0 - t) * gradients[k, j, i] + t * gradients[k1, j1, i1]
+    if half_way.any():
+        around = np.pad(inside.astype(np.float64), 1, mode="constant" if rule.closed else "edge")
+        gradients = _gradients(around, rule)
+        slope[half_way] = (gradients[k, j, i] + gradients[k1, j1, i1])[half_way]
     flat = ~slope.any(axis=1)
-    slope[flat] = ((next_value - value)[:, None] * step)[flat]
+    rise = np.where(inside[k1, j1, i1], 1.0, -1.0)
+    slope[flat] = (rise[:, None] * step)[flat]
     normals = -np.einsum("nij,nj->ni", slice_normal_matrices(volume, rule.border)[k], slope)
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     if is_left_handed(volume.affine):

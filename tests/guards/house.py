@@ -18,18 +18,19 @@ def _layer(name: str, *allowed: str) -> None:
     LEFT_OF[name] = frozenset(allowed)
 
 
-_layer("__init__", "errors", "version", "geometry", "dicom", "mesh", "opencl", "operators")
+_layer("__init__", "errors", "version", "geometry", "dicom", "labels", "mesh", "opencl", "operators")
 _layer("errors")
 _layer("version")
 _layer("files", "errors")
 _layer("geometry", "errors", "files")
 _layer("dicom", "errors", "files", "geometry")
 _layer("mesh", "errors", "version", "files", "geometry")
-_layer("reference", "errors", "files", "geometry")
+_layer("labels", "errors", "files", "geometry", "dicom")
+_layer("reference", "errors", "files", "geometry", "labels")
 _layer("phantom", "errors", "version", "files", "geometry")
 _layer("opencl", "errors", "files")
 _layer("kernels", "errors", "files", "opencl")
-_layer("operators", "errors", "files", "geometry", "mesh", "opencl", "kernels")
+_layer("operators", "errors", "files", "geometry", "labels", "mesh", "opencl", "kernels")
 _layer("pipeline", *(set(LEFT_OF) - {"__init__"}))
 _layer("viewer", "errors", "files", "geometry", "mesh", "pipeline")
 _layer("cli", "errors", "version", "pipeline", "viewer")
@@ -39,6 +40,7 @@ _layer("__main__", "cli")
 AT_MODULE_LEVEL: dict[str, frozenset[str]] = {
     "geometry": frozenset({"numpy"}),
     "dicom": frozenset({"numpy", "pydicom"}),
+    "labels": frozenset({"numpy"}),
     "mesh": frozenset({"numpy"}),
     "reference": frozenset({"numpy"}),
     "phantom": frozenset({"numpy", "pydicom"}),
@@ -52,6 +54,7 @@ INSIDE_FUNCTIONS: dict[str, frozenset[str]] = {
     "files": frozenset({"numpy"}),
     "geometry": frozenset({"scipy"}),
     "dicom": frozenset({"imagecodecs", "openjpeg", "rle", "jpeg_ls", "pylibjpeg"}),
+    "labels": frozenset({"nibabel", "nrrd", "pydicom", "scipy"}),
     "mesh": frozenset({"scipy", "pyvista", "vtk", "vtkmodules", "fast_simplification"}),
     "reference": frozenset({"scipy"}),
     "phantom": frozenset({"scipy"}),

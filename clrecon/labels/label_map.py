@@ -1,0 +1,142 @@
+"""`LabelMap`: one whole number a voxel, the affine that places it, and what the numbers are called."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from clrecon.errors import UsageError
+from clrecon.geometry import column_spacing
+from clrecon.geometry.affine import Float64Array, checked_affine
+from clrecon.labels.names import check_name, find_number
+
+__all__ = ["LARGEST_NUMBER", "LabelMap"]
+
+LARGEST_NUMBER = 65_535
+"""Label numbers go to a device as 16 bits."""
+
+
+class LabelMap:
+    """Whole numbers that say to which structure a voxel belongs; 0 is none.
+
+    Parameters
+    ----------
+    voxels : array_like, shape (nk, nj, ni)
+        Whole numbers from 0 to 65,535, indexed ``voxels[k, j, i]``.
+    affine : array_like, shape (4, 4)
+        Index (i, j, k) to LPS mm, as that of a `Volume`; of another grid than the volume's where need be.
+    names : mapping of int to str, optional
+        What the numbers are called; a number without a name is called ``label_N``.
+    frame_of_reference_hash : str, optional
+        Of the frame of reference that the file names (DICOM SEG), as in the report of a volume.
+    warnings : sequence of str, optional
+        What was doubtful in the file.
+
+    Raises
+    ------
+    UsageError
+        Not three axes, empty, no whole numbers, numbers out of range; no affine; a name that is no text.
+    """
+
+    def __init__(
+        self,
+        voxels: ArrayLike,
+        affine: ArrayLike,
+        names: Mapping[int, str] | None = None,
+        *,
+        frame_of_reference_hash: str | None = None,
+        warnings: Sequence[str] = (),
+    ):
+        self._voxels = _checked_voxels(voxels)
+        self._affine = checked_affine(affine)
+        self._affine.flags.writeable = False
+        self._names = {int(number): check_name(name) for number, name in (names or {}).items()}
+        self.frame_of_reference_hash = frame_of_reference_hash
+        self.warnings = tuple(warnings)
+
+    @property
+    def voxels(self) -> NDArray[Any]:
+        """The numbers, shape (nk, nj, ni), uint8 or uint16."""
+        return self._voxels
+
+    @property
+    def affine(self) -> Float64Array:
+        """4x4 float64, index (i, j, k) to LPS mm (read-only)."""
+        return self._affine
+
+    @property
+    def spacing(self) -> tuple[float, float, float]:
+        """(di, dj, dk) in mm."""
+        return column_spacing(self._affine)
+
+    @property
+    def shape_ijk(self) -> tuple[int, int, int]:
+        """(ni, nj, nk), the reverse of ``voxels.shape``."""
+        nk, nj, ni = self._voxels.shape
+        return ni, nj, nk
+
+    @cached_property
+    def counts(self) -> dict[int, int]:
+        """How many voxels each number has, of the numbers that are there (0 is none of them)."""
+        total = np.zeros(int(self._voxels.max()) + 1, dtype=np.int64)
+        for plane in self._voxels:
+            counted = np.bincount(plane.ravel())
+            total[: len(counted)] += counted
+        return {int(number): int(total[number]) for number in np.flatnonzero(total) if number}
+
+    @property
+    def numbers(self) -> tuple[int, ...]:
+        """The numbers that are there, ascending, without 0."""
+        return tuple(self.counts)
+
+    @property
+    def names(self) -> dict[int, str]:
+        """Number to name: of every number that is there, and of every one that the file names."""
+        return {number: self.name(number) for number in sorted({*self.counts, *self._names} - {0})}
+
+    def name(self, number: int) -> str:
+        """What `number` is called, ``label_N`` where the file does not say."""
+        return self._names.get(number) or f"label_{number}"
+
+    def find(self, label: str | int) -> int:
+        """The number of a label.
+
+        Parameters
+        ----------
+        label : str or int
+            Number; or name, in upper or lower case; or one part of a name: ``T12`` finds ``vertebrae_T12``.
+
+        Raises
+        ------
+        UsageError
+            None or several are called so, or no voxel has it; the message lists what is there.
+        """
+        return find_number(label, self.names, self.counts)
+
+    def __repr__(self) -> str:
+        ni, nj, nk = self.shape_ijk
+        di, dj, dk = self.spacing
+        return f"LabelMap({ni} x {nj} x {nk}, spacing {di:.4g} x {dj:.4g} x {dk:.4g} mm, {len(self.numbers)} labels)"
+
+
+def _checked_voxels(voxels: ArrayLike) -> NDArray[Any]:
+    try:
+        array = np.asarray(voxels)
+    except ValueError as error:
+        raise UsageError(f"labels are an array of whole numbers: {error}") from error
+    if array.ndim != 3:
+        raise UsageError(f"labels have three axes (k, j, i), these have shape {array.shape}")
+    if array.size == 0:
+        raise UsageError(f"the label map is empty: its shape is {array.shape}")
+    if array.dtype == np.bool_:
+        array = array.astype(np.uint8)
+    if array.dtype.kind not in "iu":
+        raise UsageError(f"labels are whole numbers, these are {array.dtype}: convert them first")
+    low, high = int(array.min()), int(array.max())
+    if low < 0 or high > LARGEST_NUMBER:
+        raise UsageError(f"labels run from 0 to {LARGEST_NUMBER:,}, these from {low:,} to {high:,}")
+    return np.ascontiguousarray(array, dtype=np.uint8 if array.dtype.itemsize == 1 else np.uint16)

@@ -1,0 +1,85 @@
+"""Names of labels: found again however they are written, and made safe for file names.
+
+Names come from files that strangers wrote: in messages they are escaped, in file names they are letters and digits.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Collection, Mapping
+
+from clrecon.dicom.text import escape_text
+from clrecon.errors import UsageError
+
+__all__ = ["check_name", "find_number", "label_suffix", "list_labels"]
+
+SUFFIX_LENGTH = 40
+LABELS_LISTED = 60
+
+
+def check_name(name: str) -> str:
+    """A name in one printable line of limited length.
+
+    Raises
+    ------
+    UsageError
+        It is no text.
+    """
+    if not isinstance(name, str):
+        raise UsageError(f"the name of a label is text, not {type(name).__name__}")
+    return escape_text(name.strip())
+
+
+def list_labels(names: Mapping[int, str], numbers: Collection[int]) -> str:
+    """``27 vertebrae_L5, 28 vertebrae_L4``: the labels that are there, for a message."""
+    shown = [f"{number} {names[number]}" for number in sorted(numbers)][:LABELS_LISTED]
+    more = len(numbers) - len(shown)
+    return (", ".join(shown) or "none") + (f" and {more} more" if more > 0 else "")
+
+
+def _parts(name: str) -> list[str]:
+    return [part for part in re.split(r"[^a-z0-9]+", name.casefold()) if part]
+
+
+def find_number(label: str | int, names: Mapping[int, str], present: Collection[int]) -> int:
+    """The number of `label`: its number, else its name, else the one name that has it as a part.
+
+    Parameters
+    ----------
+    label : str or int
+    names : mapping of int to str
+    present : collection of int
+        Numbers that voxels have.
+
+    Raises
+    ------
+    UsageError
+        None or several are called so, or no voxel has it; the message lists what is there.
+    """
+    text = str(label).strip()
+    wanted = text.casefold()
+    named = [number for number, name in names.items() if name.casefold() == wanted]
+    if not named and re.fullmatch(r"[0-9]{1,9}", text):
+        named = [int(text)]
+    if not named:
+        parts = _parts(text)
+        named = [number for number, name in names.items() if len(parts) == 1 and parts[0] in _parts(name)]
+    named = [number for number in named if number in present] or named
+    if len(named) > 1:
+        raise UsageError(
+            f"'{escape_text(text)}' names several labels: {list_labels(names, named)};"
+            " give the number or the whole name"
+        )
+    if not named or named[0] not in present:
+        what = "is not in the label map" if not named or named[0] not in names else "has no voxel in the label map"
+        raise UsageError(f"label '{escape_text(text)}' {what}; there are: {list_labels(names, present)}")
+    return named[0]
+
+
+def label_suffix(name: str) -> str:
+    """A name as part of a file name: letters, digits, dot, hyphen and underscore, at most 40.
+
+    Dots and hyphens at either end are taken off; a name without any letter or digit gives ``label``.
+    """
+    safe = re.sub(r"[^A-Za-z0-9._-]+", "_", name)[:SUFFIX_LENGTH].strip("._-")
+    return safe or "label"

@@ -1,0 +1,101 @@
+"""Segments that are stored one by one become one map: where two of them claim a voxel, it is said or settled."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clrecon.errors import RefusedInputError, UsageError
+from clrecon.geometry.affine import Float64Array
+from clrecon.labels.label_map import LARGEST_NUMBER, LabelMap
+from clrecon.labels.names import check_name, find_number
+
+__all__ = ["Painter", "check_wanted"]
+
+
+class Painter:
+    """Writes segments into one map.
+
+    Without `only` no two segments may overlap.  With it those that are wanted may not overlap each other; of the
+    others they take what they share, and among the others the lowest number does.
+
+    Parameters
+    ----------
+    file : str
+        Name of the file, for messages.
+    voxels : ndarray, shape (nk, nj, ni), uint16
+        Zeros, to be written.
+    names : mapping of int to str
+        The segments.
+    only : tuple of str or int, optional
+        Labels that are wanted.
+
+    Raises
+    ------
+    UsageError
+        A wanted label is not there.
+    RefusedInputError
+        Numbers that are no label numbers.
+    """
+
+    def __init__(self, file: str, voxels: NDArray[Any], names: Mapping[int, str], only: tuple[str | int, ...] | None):
+        wrong = [number for number in names if not 0 < number <= LARGEST_NUMBER]
+        if wrong:
+            raise RefusedInputError(f"{file} numbers a segment {wrong[0]}: 1 to {LARGEST_NUMBER:,} are possible")
+        self._file, self._voxels = file, voxels
+        self._names = {number: check_name(name) for number, name in names.items()}
+        shown = {number: name or f"label_{number}" for number, name in self._names.items()}
+        self._wanted = sorted(names if only is None else {find_number(label, shown, names) for label in only})
+        others = sorted(set(names) - set(self._wanted), reverse=True)
+        self.order = [*others, *self._wanted]
+        """Numbers in the order in which they have to be painted."""
+        self._is_wanted = np.zeros(LARGEST_NUMBER + 1, dtype=bool)
+        self._is_wanted[self._wanted] = True
+        self._shared: dict[tuple[int, int], int] = {}
+
+    def paint(self, k: int, number: int, mask: NDArray[np.bool_]) -> None:
+        """Give the voxels of slice `k` where `mask` (nj, ni) is true to `number`."""
+        plane = self._voxels[k]
+        if self._is_wanted[number]:
+            before = plane[mask]
+            before = before[self._is_wanted[before] & (before != number)]
+            for other, count in zip(*np.unique(before, return_counts=True), strict=True):
+                pair = (int(other), number)
+                self._shared[pair] = self._shared.get(pair, 0) + int(count)
+        plane[mask] = number
+
+    def finish(self, affine: Float64Array, **options: Any) -> LabelMap:
+        """The map.
+
+        Raises
+        ------
+        RefusedInputError
+            Segments overlap that may not.
+        """
+        if self._shared:
+            (a, b), count = max(self._shared.items(), key=lambda item: item[1])
+            raise RefusedInputError(
+                f"segments of {self._file} overlap: {a} {self._names[a]} and {b} {self._names[b]} share {count:,}"
+                f" voxels{f', and {len(self._shared) - 1} more pairs' if len(self._shared) > 1 else ''};"
+                " choose labels that do not overlap with --label, one run each"
+            )
+        return LabelMap(self._voxels, affine, self._names, **options)
+
+
+def check_wanted(only: str | int | Iterable[str | int] | None) -> tuple[str | int, ...] | None:
+    """`only` as a tuple, None where nothing is said.
+
+    Raises
+    ------
+    UsageError
+        A label that is neither number nor text.
+    """
+    if only is None:
+        return None
+    wanted = (only,) if isinstance(only, str | int) else tuple(only)
+    if not all(isinstance(label, str | int) for label in wanted):
+        raise UsageError("labels are chosen by number or name")
+    return wanted

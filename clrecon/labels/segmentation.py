@@ -1,0 +1,211 @@
+"""DICOM SEG (Segmentation and Label Map Segmentation): every frame is placed by its own position.
+
+Source: DICOM PS3.3 A.51 and C.8.20 (Segmentation), C.7.6.16 (multi-frame functional groups), PS3.5 8.1.1 (one-bit
+pixels are packed without a gap between frames, lowest bit first).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clrecon.dicom.text import escape_text, hash_uid
+from clrecon.errors import ClreconError, RefusedInputError
+from clrecon.labels.frames import FrameStack, place_frames
+from clrecon.labels.label_map import LabelMap
+from clrecon.labels.overlap import Painter
+from clrecon.labels.stream import check_size, empty_labels, show_name
+
+__all__ = ["is_dicom", "read_segmentation"]
+
+SEGMENTATION_CLASSES = ("1.2.840.10008.5.1.4.1.1.66.4", "1.2.840.10008.5.1.4.1.1.66.7")
+IMPLICIT_LITTLE, EXPLICIT_LITTLE = "1.2.840.10008.1.2", "1.2.840.10008.1.2.1"
+RLE_LOSSLESS = "1.2.840.10008.1.2.5"
+MOST_FRAMES = 1_000_000
+
+
+@dataclass(frozen=True)
+class _Layout:
+    """What the header of a SEG says of its frames."""
+
+    kind: str
+    rows: int
+    columns: int
+    frames: int
+    bits: int
+
+
+def is_dicom(start: bytes) -> bool:
+    """True when the first 132 bytes of a file are those of DICOM."""
+    return start[128:132] == b"DICM"
+
+
+def read_segmentation(path: Path, only: tuple[str | int, ...] | None = None) -> LabelMap:
+    """Read a DICOM SEG of binary segments or of a label map.
+
+    Parameters
+    ----------
+    path : Path
+    only : tuple of str or int, optional
+        The segments that are wanted: others may overlap.
+
+    Raises
+    ------
+    UsageError
+        A wanted segment is not there.
+    RefusedInputError
+        No SEG, fractional segments, frames that form no even stack, segments that overlap, corrupt, or compressed
+        with anything but RLE.
+    """
+    name = show_name(path)
+    dataset = _parse(path, name)
+    try:
+        layout = _read_layout(dataset, name, path.stat().st_size)
+        segments = {int(s.SegmentNumber): str(s.get("SegmentLabel", "")) for s in dataset.SegmentSequence}
+        groups = list(dataset.PerFrameFunctionalGroupsSequence)
+        if len(groups) != layout.frames:
+            raise RefusedInputError(f"{name} is corrupt: {layout.frames} frames and {len(groups)} descriptions of them")
+        shared = (list(dataset.get("SharedFunctionalGroupsSequence") or []) or [None])[0]
+        stack = place_frames(shared, groups, name)
+        frame_of_reference = str(dataset.get("FrameOfReferenceUID", ""))
+        numbers = None if layout.kind == "LABELMAP" else [_segment_of(group, shared) for group in groups]
+        pixels = _FramePixels(dataset, layout, name)
+    except ClreconError:
+        raise
+    except Exception as error:  # pydicom raises whatever a corrupt value leads to
+        raise RefusedInputError(f"{name} is no usable DICOM SEG: {_first_line(error)}") from error
+    frame_hash = hash_uid(frame_of_reference)
+    voxels = empty_labels(name, (stack.slices, layout.rows, layout.columns))
+    if numbers is None:
+        for frame, k in enumerate(stack.places):
+            voxels[k] = pixels.read(frame)
+        return LabelMap(voxels, stack.affine, segments, frame_of_reference_hash=frame_hash)
+    return _paint(pixels, numbers, stack, Painter(name, voxels, segments, only)).finish(
+        stack.affine, frame_of_reference_hash=frame_hash
+    )
+
+
+def _first_line(error: Exception) -> str:
+    return escape_text((str(error).splitlines() or [""])[0] or type(error).__name__, 200)
+
+
+def _parse(path: Path, name: str) -> Any:
+    from pydicom import dcmread
+    from pydicom.filereader import read_file_meta_info
+
+    try:
+        meta = read_file_meta_info(path)
+        syntax = str(meta.get("TransferSyntaxUID", ""))
+        if syntax not in (IMPLICIT_LITTLE, EXPLICIT_LITTLE, RLE_LOSSLESS):
+            raise RefusedInputError(
+                f"{name} is stored with transfer syntax {escape_text(syntax)}: of DICOM SEG uncompressed little endian"
+                " and RLE are read, convert it"
+            )
+        dataset = dcmread(path)
+        sop_class = str(dataset.get("SOPClassUID", ""))
+    except ClreconError:
+        raise
+    except Exception as error:
+        raise RefusedInputError(f"{name} is a corrupt DICOM file: {_first_line(error)}") from error
+    if sop_class not in SEGMENTATION_CLASSES:
+        raise RefusedInputError(
+            f"{name} is DICOM but no segmentation (class {escape_text(sop_class)}): a SEG object holds labels"
+        )
+    return dataset
+
+
+def _read_layout(dataset: Any, name: str, file_bytes: int) -> _Layout:
+    kind = str(dataset.get("SegmentationType", "")).upper()
+    if kind not in ("BINARY", "LABELMAP"):
+        raise RefusedInputError(
+            f"{name} holds segments of type {escape_text(kind) or 'unknown'}: binary ones and label maps are read,"
+            " fractional ones do not say which voxels they mean"
+        )
+    layout = _Layout(
+        kind, int(dataset.Rows), int(dataset.Columns), int(dataset.get("NumberOfFrames", 1)), int(dataset.BitsAllocated)
+    )
+    if layout.bits not in ((1, 8) if kind == "BINARY" else (8, 16)) or not 0 < layout.frames <= MOST_FRAMES:
+        raise RefusedInputError(f"{name} is corrupt: {layout.frames} frames of {layout.bits} bits a pixel")
+    compressed = dataset.file_meta.TransferSyntaxUID == RLE_LOSSLESS
+    # RLE writes two bytes for up to 128 and at least a header of 64 bytes a frame: never more than 64 to 1.
+    held = file_bytes * (8 if layout.bits == 1 else 1) * (64 if compressed else 1)
+    shape = (layout.columns, layout.rows, layout.frames)
+    check_size(name, shape, max(1, layout.bits // 8), held, compressed=False)
+    return layout
+
+
+def _segment_of(group: Any, shared: Any) -> int:
+    for owner in (group, shared):
+        if owner is not None and owner.get("SegmentIdentificationSequence"):
+            return int(owner.SegmentIdentificationSequence[0].ReferencedSegmentNumber)
+    raise ValueError("a frame does not say to which segment it belongs")
+
+
+class _FramePixels:
+    """The pixels of one frame after the other."""
+
+    def __init__(self, dataset: Any, layout: _Layout, name: str):
+        self._layout, self._name = layout, name
+        self._items = layout.rows * layout.columns
+        self._data = bytes(dataset.PixelData)
+        self._fragments: list[bytes] | None = None
+        if dataset.file_meta.TransferSyntaxUID == RLE_LOSSLESS:
+            from pydicom.encaps import generate_frames
+
+            self._fragments = list(generate_frames(self._data, number_of_frames=layout.frames))
+            if layout.bits == 1 or len(self._fragments) != layout.frames:
+                raise ValueError(f"{len(self._fragments)} compressed frames of {layout.bits} bits")
+        elif len(self._data) * 8 < layout.frames * self._items * layout.bits:
+            raise RefusedInputError(
+                f"{name} is cut: {layout.frames} frames of {layout.columns} x {layout.rows} do not fit"
+                f" {len(self._data):,} bytes"
+            )
+
+    def read(self, frame: int) -> NDArray[Any]:
+        """Frame `frame`, counted from 0, shape (rows, columns), uint8 or uint16."""
+        layout = self._layout
+        if self._fragments is not None:
+            plane = self._decode(self._fragments[frame])
+        elif layout.bits == 1:
+            first = frame * self._items
+            packed = np.frombuffer(self._data, np.uint8)[first // 8 : -(-(first + self._items) // 8)]
+            plane = np.unpackbits(packed, bitorder="little")[first % 8 : first % 8 + self._items]
+        else:
+            plane = np.frombuffer(
+                self._data, f"<u{layout.bits // 8}", self._items, frame * self._items * layout.bits // 8
+            )
+        return plane.reshape(layout.rows, layout.columns)
+
+    def _decode(self, fragment: bytes) -> NDArray[Any]:
+        from pydicom.pixels.decoders.rle import _rle_decode_frame
+
+        layout = self._layout
+        try:
+            planes = _rle_decode_frame(fragment, layout.rows, layout.columns, 1, layout.bits, "<")
+            return np.frombuffer(bytes(planes), f"<u{layout.bits // 8}", self._items)
+        except Exception as error:
+            raise RefusedInputError(f"{self._name} has a corrupt RLE frame: {_first_line(error)}") from error
+
+
+def _paint(pixels: _FramePixels, numbers: list[int], stack: FrameStack, painter: Painter) -> Painter:
+    order = {number: place for place, number in enumerate(painter.order)}
+    for frame, k in _frames_in_order(numbers, stack, order, pixels):
+        painter.paint(k, numbers[frame], pixels.read(frame).astype(bool))
+    return painter
+
+
+def _frames_in_order(
+    numbers: list[int], stack: FrameStack, order: dict[int, int], pixels: _FramePixels
+) -> Iterator[tuple[int, int]]:
+    unknown = sorted(set(numbers) - set(order))
+    if unknown:
+        raise RefusedInputError(
+            f"{pixels._name} is corrupt: a frame belongs to segment {unknown[0]}, which it does not list"
+        )
+    for frame in sorted(range(len(numbers)), key=lambda n: order[numbers[n]]):
+        yield frame, stack.places[frame]
