@@ -29,6 +29,9 @@ SPHERE_PARTIAL_VOLUME_MAX_VOXEL = 0.15  # measured 0.103
 AFFINE_MM = 1e-6  # positions and directions are written with 9 decimals (6 where coordinates are 1e5 mm)
 ROUNDED_AFFINE_MM = 0.006  # positions rounded to 0.01 mm: half of it, and the fit averages most of that out
 
+# --- labels ---
+NIFTI_AFFINE_MM = 1e-5  # sform entries and quaternions are float32: coordinates of some 100 mm
+
 # --- phantom ---
 PHANTOM_VOLUME_RATIO = 1e-3  # sum of partial volumes against analysis; the cell ramp leaves 0.03 % at R = 5 voxels
 PHANTOM_PLANE_SHARE = 0.03  # linear ramp against the exact share of a cell, 1 of 6 cells along an edge

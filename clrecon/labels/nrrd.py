@@ -222,7 +222,10 @@ def nrrd_affine(header: dict[str, Any], name: str) -> Float64Array:
         )
     signs = np.array(LPS_FROM_SPACE[space])
     try:
-        steps: NDArray[np.float64] = np.asarray(header["space directions"], dtype=np.float64)[-3:]
+        directions: NDArray[np.float64] = np.asarray(header["space directions"], dtype=np.float64)
+        if len(directions) != header["dimension"]:
+            raise ValueError(f"{len(directions)} directions for {header['dimension']} axes")
+        steps = directions[-3:]
         origin = np.asarray(header["space origin"], dtype=np.float64)
         return checked_affine(compose_affine(steps[0] * signs, steps[1] * signs, steps[2] * signs, origin * signs))
     except (KeyError, IndexError, TypeError, ValueError, UsageError) as error:

@@ -6,6 +6,7 @@ pixels are packed without a gap between frames, lowest bit first).
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -62,7 +63,12 @@ def read_segmentation(path: Path, only: tuple[str | int, ...] | None = None) -> 
         No SEG, fractional segments, frames that form no even stack, segments that overlap, corrupt, or compressed
         with anything but RLE.
     """
-    name = show_name(path)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # pydicom's quote the file unescaped
+        return _read(path, show_name(path), only)
+
+
+def _read(path: Path, name: str, only: tuple[str | int, ...] | None) -> LabelMap:
     dataset = _parse(path, name)
     try:
         layout = _read_layout(dataset, name, path.stat().st_size)

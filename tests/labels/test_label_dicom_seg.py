@@ -1,0 +1,197 @@
+"""DICOM SEG: frames at their own positions, names, overlaps, written by highdicom or by hand."""
+
+from __future__ import annotations
+
+import dicom_series
+import numpy as np
+import pydicom
+import pytest
+from label_files import write_seg
+from pydicom.uid import DeflatedExplicitVRLittleEndian, RLELossless
+
+from clrecon.dicom import read_volume
+from clrecon.errors import RefusedInputError, UsageError
+from clrecon.labels import read_labels, resample_labels
+
+pytest.importorskip("highdicom")
+
+PLAN = dicom_series.Plan(shape=(7, 6, 9), angles=(10, -20, 35), gap=1.25)
+
+
+def ct_slices(plan=PLAN):
+    """The slices as highdicom wants them."""
+    slices = []
+    for k in range(plan.shape[0]):
+        ds = dicom_series.make_dataset(plan, k)
+        ds.StudyInstanceUID = dicom_series.ROOT + ".7"
+        for keyword in ("PatientBirthDate", "PatientSex", "StudyDate", "StudyTime", "StudyID", "AccessionNumber",
+                        "ReferringPhysicianName", "SeriesDate", "SeriesTime"):  # fmt: skip
+            setattr(ds, keyword, "")
+        slices.append(ds)
+    return slices
+
+
+def masks(overlap=False, shape=PLAN.shape):
+    first, second = np.zeros(shape, bool), np.zeros(shape, bool)
+    first[1:3, 1:4, 2:7] = True
+    second[2 if overlap else 3 : 6, 2:5, 3:8] = True
+    return [("T12", first), ("L1 body", second)]
+
+
+def ct_volume(tmp_path, plan=PLAN):
+    dicom_series.write_series(tmp_path / "ct", plan)
+    return read_volume(tmp_path / "ct")
+
+
+@pytest.mark.parametrize(
+    ("kind", "syntax"), [("BINARY", None), ("LABELMAP", None), ("LABELMAP", RLELossless)], ids=["bits", "map", "rle"]
+)
+@pytest.mark.parametrize("leave_out_empty", [True, False])
+def test_segments_lie_on_their_ct(tmp_path, kind, syntax, leave_out_empty):
+    segments = masks()
+    path = write_seg(
+        tmp_path / "a.dcm", segments, ct_slices(), kind=kind, leave_out_empty=leave_out_empty, syntax=syntax
+    )
+    labels = read_labels(path)
+    assert labels.names == {1: "T12", 2: "L1 body"}
+    taken = resample_labels(labels, ct_volume(tmp_path))
+    assert taken.exact
+    for number, (_, mask) in enumerate(segments, start=1):
+        assert np.array_equal(taken.voxels == number, mask)
+
+
+def test_holes_between_frames_are_slices_without_labels(tmp_path):
+    """No two frames are neighbours: their distance is not that of the slices."""
+    mask = np.zeros(PLAN.shape, bool)
+    mask[1::2, 2:4, 2:5] = True
+    path = write_seg(tmp_path / "a.dcm", [("odd", mask)], ct_slices())
+    taken = resample_labels(read_labels(path), ct_volume(tmp_path))
+    assert pydicom.dcmread(path).NumberOfFrames == 3
+    assert np.array_equal(taken.voxels == 1, mask)
+
+
+def test_the_frames_of_a_tilted_gantry_form_a_sheared_stack(tmp_path):
+    plan = dicom_series.Plan(shape=(7, 6, 9), tilt_deg=15.0)
+    path = write_seg(tmp_path / "a.dcm", masks(), ct_slices(plan))
+    taken = resample_labels(read_labels(path), ct_volume(tmp_path, plan))
+    assert taken.exact and np.array_equal(taken.voxels == 2, masks()[1][1])
+
+
+def test_overlapping_segments_are_refused_unless_one_is_chosen(tmp_path):
+    path = write_seg(tmp_path / "a.dcm", masks(overlap=True), ct_slices())
+    with pytest.raises(RefusedInputError, match=r"1 T12 and 2 L1 body share 8 voxels; choose labels .* --label"):
+        read_labels(path)
+    first, second = (int(mask.sum()) for _, mask in masks(overlap=True))
+    assert read_labels(path, ["t12"]).counts == {1: first, 2: second - 8}
+    assert read_labels(path, [2]).counts == {1: first - 8, 2: second}
+    with pytest.raises(UsageError, match="label 'L9' is not in the label map; there are: 1 T12, 2 L1 body"):
+        read_labels(path, ["L9"])
+
+
+def test_labels_of_another_frame_of_reference_are_refused(tmp_path):
+    labels = read_labels(write_seg(tmp_path / "a.dcm", masks(), ct_slices()))
+    volume = ct_volume(tmp_path)
+    assert labels.frame_of_reference_hash == volume.report["frame_of_reference_hash"]
+    volume.report["frame_of_reference_hash"] = "0" * 16
+    with pytest.raises(RefusedInputError, match="belongs to frame of reference"):
+        resample_labels(labels, volume)
+
+
+def spoil(path, **values):
+    ds = pydicom.dcmread(path)
+    for keyword, value in values.items():
+        if value is None:
+            delattr(ds, keyword)
+        else:
+            setattr(ds, keyword, value)
+    ds.save_as(path)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"SegmentationType": "FRACTIONAL"}, "fractional ones do not say which voxels"),
+        ({"Rows": 60_000}, "cannot come from a file of"),
+        ({"NumberOfFrames": 2_000_000}, "is corrupt: 2000000 frames"),
+        ({"NumberOfFrames": 4}, "4 frames and 5 descriptions"),
+        ({"BitsAllocated": 32}, "frames of 32 bits a pixel"),
+        ({"PixelData": b"\0\0"}, "is cut: 5 frames of 9 x 6"),
+        ({"PixelData": None}, "is no usable DICOM SEG"),
+        ({"SegmentSequence": None}, "is no usable DICOM SEG"),
+        ({"SOPClassUID": "1.2.840.10008.5.1.4.1.1.2"}, "is DICOM but no segmentation"),
+    ],
+)
+def test_what_is_no_sound_segmentation_is_refused(tmp_path, values, message):
+    path = spoil(write_seg(tmp_path / "a.dcm", masks(), ct_slices()), **values)
+    with pytest.raises(RefusedInputError, match=message):
+        read_labels(path)
+
+
+def move(path, change):
+    ds = pydicom.dcmread(path)
+    change(ds.SharedFunctionalGroupsSequence[0], ds.PerFrameFunctionalGroupsSequence)
+    ds.save_as(path)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda s, f: setattr(f[2].PlanePositionSequence[0], "ImagePositionPatient", [0, 0, 0]), "do not lie evenly"),
+        (lambda s, f: setattr(f[2].PlanePositionSequence[0], "ImagePositionPatient", []), "no usable DICOM SEG"),
+        (lambda s, f: setattr(f[2], "PlanePositionSequence", []), "no usable DICOM SEG: no PlanePositionSequence"),
+        (lambda s, f: setattr(s.PlaneOrientationSequence[0], "ImageOrientationPatient", [0] * 6), "cannot be placed"),
+        (lambda s, f: setattr(s.PixelMeasuresSequence[0], "PixelSpacing", [0, 1]), "cannot be placed"),
+        (lambda s, f: setattr(f[1].SegmentIdentificationSequence[0], "ReferencedSegmentNumber", 9), "segment 9, which"),
+    ],
+)
+def test_frames_without_a_sound_place_are_refused(tmp_path, change, message):
+    path = move(write_seg(tmp_path / "a.dcm", masks(), ct_slices()), change)
+    with pytest.raises(RefusedInputError, match=message):
+        read_labels(path)
+
+
+def test_deflated_files_are_refused_before_they_are_inflated(tmp_path):
+    path = write_seg(tmp_path / "a.dcm", masks(), ct_slices())
+    ds = pydicom.dcmread(path)
+    ds.file_meta.TransferSyntaxUID = DeflatedExplicitVRLittleEndian
+    ds.save_as(path)
+    with pytest.raises(RefusedInputError, match="transfer syntax 1.2.840.10008.1.2.1.99"):
+        read_labels(path)
+
+
+@pytest.mark.fuzz
+def test_cut_anywhere_it_is_refused(tmp_path):
+    content = write_seg(tmp_path / "a.dcm", masks(), ct_slices()).read_bytes()
+    for length in range(0, len(content) - 2, 53):
+        (tmp_path / "b.dcm").write_bytes(content[:length])
+        with pytest.raises(RefusedInputError, match="."):
+            read_labels(tmp_path / "b.dcm")
+
+
+@pytest.mark.fuzz
+def test_damaged_anywhere_it_is_read_or_refused(tmp_path):
+    content = write_seg(tmp_path / "a.dcm", masks(), ct_slices(), kind="LABELMAP", syntax=RLELossless).read_bytes()
+    random = np.random.default_rng(3)
+    refused = 0
+    for _ in range(150):
+        damaged = np.frombuffer(content, np.uint8).copy()
+        damaged[random.integers(132, len(content), 4)] = random.integers(0, 256, 4)
+        (tmp_path / "b.dcm").write_bytes(damaged.tobytes())
+        try:
+            read_labels(tmp_path / "b.dcm")
+        except (RefusedInputError, UsageError):
+            refused += 1
+    assert 20 < refused < 150
+
+
+def test_real_segmentation_and_nrrd_agree(real_data):
+    folder = real_data / "seg_and_labels"
+    volume = read_volume(folder / "ct-3slice")
+    seg, nrrd = (resample_labels(read_labels(folder / name), volume) for name in ("liver.dcm", "liver_seg.nrrd"))
+    assert seg.exact and nrrd.exact and seg.voxels.any()
+    assert np.array_equal(seg.voxels, nrrd.voxels)
+    with pytest.raises(RefusedInputError, match="1 GREEN and 2 ORANGE share 3,017 voxels, and 2 more pairs"):
+        read_labels(folder / "partial_overlaps.dcm")
+    assert read_labels(folder / "partial_overlaps.dcm", ["green"]).find("GREEN") == 1

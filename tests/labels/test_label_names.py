@@ -1,0 +1,110 @@
+"""Labels found by what people call them, and names that are safe in file names."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from label_files import OBLIQUE, make_labels
+
+from clrecon.errors import RefusedInputError, UsageError
+from clrecon.labels import LabelMap, label_suffix, read_labels
+
+NAMES = {2: "vertebrae_T12", 5: "vertebrae_T1", 7: "rib left 12", 8: "rib left 11", 9: "absent"}
+
+
+def label_map(names=NAMES):
+    return LabelMap(make_labels(numbers=(0, 2, 5, 7, 8, 11)), OBLIQUE, names)
+
+
+@pytest.mark.parametrize(
+    ("label", "number"),
+    [
+        ("T12", 2),
+        ("t1", 5),
+        ("vertebrae_t12", 2),
+        (" 7 ", 7),
+        (11, 11),
+        ("label_11", 11),
+        ("RIB LEFT 11", 8),
+        ("12", 7),
+    ],
+)
+def test_labels_are_found_by_number_name_and_part_of_a_name(label, number):
+    if label == "12":
+        with pytest.raises(UsageError, match="label '12' is not in the label map"):
+            label_map().find(label)  # a number is a number, not a part of a name
+        return
+    assert label_map().find(label) == number
+
+
+@pytest.mark.parametrize(
+    ("label", "message"),
+    [
+        ("rib", "'rib' names several labels: 7 rib left 12, 8 rib left 11; give the number"),
+        ("L5", "label 'L5' is not in the label map; there are: 2 vertebrae_T12, 5 vertebrae_T1, 7 rib left 12"),
+        ("absent", "label 'absent' has no voxel in the label map; there are"),
+        (99, "label '99' is not in the label map"),
+        ("a\nb\x1b", r"label 'a\\nb\\x1b' is not"),
+        ("", "label '' is not"),
+    ],
+)
+def test_an_unknown_label_lists_what_is_there(label, message):
+    with pytest.raises(UsageError, match=message):
+        label_map().find(label)
+
+
+@pytest.mark.parametrize(
+    ("name", "suffix"),
+    [
+        ("vertebrae_T12", "vertebrae_T12"),
+        ("L1 body", "L1_body"),
+        ("../../etc/passwd", "etc_passwd"),
+        ("..", "label"),
+        ("", "label"),
+        ("-rf", "rf"),
+        ("a\0b\nc\x1b[31m", "a_b_c_31m"),
+        ("Wirbelkörper", "Wirbelk_rper"),
+        ("\u202egnp.exe", "gnp.exe"),
+        ("x" * 300, "x" * 40),
+        ("C:\\NUL", "C_NUL"),
+    ],
+)
+def test_suffixes_are_safe_in_file_names(name, suffix):
+    assert label_suffix(name) == suffix
+
+
+@pytest.mark.parametrize(
+    ("voxels", "message"),
+    [
+        (np.zeros((3, 4)), "three axes"),
+        (np.zeros((0, 3, 4), int), "is empty"),
+        (np.zeros((2, 3, 4)), "whole numbers, these are float64"),
+        (np.full((2, 3, 4), -1), "these from -1"),
+        (np.full((2, 3, 4), 65_536), "these from 65,536"),
+        ([[1], [2, 3]], "array of whole numbers"),
+    ],
+)
+def test_what_is_no_label_map_is_refused(voxels, message):
+    with pytest.raises(UsageError, match=message):
+        LabelMap(voxels, np.eye(4))
+
+
+def test_a_mask_is_a_label_map():
+    labels = LabelMap(np.eye(3, dtype=bool)[None], np.eye(4))
+    assert labels.numbers == (1,) and labels.counts == {1: 3} and labels.name(1) == "label_1"
+    assert repr(labels) == "LabelMap(3 x 3 x 1, spacing 1 x 1 x 1 mm, 1 labels)"
+
+
+def test_files_that_are_no_label_maps_are_refused(tmp_path):
+    (tmp_path / "a.nii").write_text("hello")
+    with pytest.raises(RefusedInputError, match="is no label map that can be read: NIfTI, NRRD and DICOM SEG are"):
+        read_labels(tmp_path / "a.nii")
+    (tmp_path / "b.gz").write_bytes(b"\x1f\x8b nonsense")
+    with pytest.raises(RefusedInputError, match="is no label map"):
+        read_labels(tmp_path / "b.gz")
+    with pytest.raises(UsageError, match="there is no label map"):
+        read_labels(tmp_path / "c.nii")
+    with pytest.raises(UsageError, match="is a folder"):
+        read_labels(tmp_path)
+    with pytest.raises(UsageError, match="by number or name"):
+        read_labels(tmp_path / "a.nii", [2.5])

@@ -1,0 +1,136 @@
+"""NRRD label maps and 3D Slicer segmentations: frames, names, layers, and what is refused."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from label_files import OBLIQUE, make_labels, write_nrrd
+
+from clrecon.errors import RefusedInputError, UsageError
+from clrecon.labels import read_labels
+
+pytest.importorskip("nrrd")
+SPACES = ["left-posterior-superior", "right-anterior-superior", "left-anterior-superior"]
+
+
+def edit(path, *replacements):
+    """Replace text in the header of a raw NRRD file."""
+    header, gap, data = path.read_bytes().partition(b"\n\n")
+    for old, new in replacements:
+        assert old in header
+        header = header.replace(old, new)
+    path.write_bytes(header + gap + data)
+    return path
+
+
+def segment(n, name, value, layer=None):
+    fields = {f"Segment{n}_Name": name, f"Segment{n}_LabelValue": str(value), f"Segment{n}_ID": f"id{n}"}
+    return fields if layer is None else {**fields, f"Segment{n}_Layer": str(layer)}
+
+
+@pytest.mark.parametrize("space", SPACES)
+@pytest.mark.parametrize("encoding", ["raw", "gzip"])
+def test_every_frame_becomes_lps(tmp_path, space, encoding):
+    voxels = make_labels()
+    labels = read_labels(write_nrrd(tmp_path / "a.nrrd", voxels.astype(np.int16), space=space, encoding=encoding))
+    assert np.array_equal(labels.voxels, voxels)
+    assert np.allclose(labels.affine, OBLIQUE, atol=1e-12)
+
+
+@pytest.mark.parametrize("dtype", ["<i1", "<u1", "<u2", ">i2", "<i4", "<i8", "<f4", ">f8"])
+def test_whole_numbers_of_every_type_are_read(tmp_path, dtype):
+    voxels = make_labels()
+    assert np.array_equal(read_labels(write_nrrd(tmp_path / "a.nrrd", voxels.astype(dtype))).voxels, voxels)
+
+
+def test_simpleitk_agrees_on_the_place(tmp_path):
+    sitk = pytest.importorskip("SimpleITK")
+    rigid = OBLIQUE.copy()
+    rigid[:3, :3] = np.linalg.qr(OBLIQUE[:3, :3])[0] @ np.diag((0.7, 0.5, 2.5))
+    path = write_nrrd(tmp_path / "a.nrrd", make_labels(), rigid, space="right-anterior-superior")
+    image = sitk.ReadImage(str(path))
+    here = read_labels(path).affine @ (1, 2, 3, 1)
+    assert np.allclose(here[:3], image.TransformIndexToPhysicalPoint((1, 2, 3)), atol=1e-9)
+
+
+def test_slicer_names_are_read(tmp_path):
+    fields = {**segment(0, "L1 vertebra", 2), **segment(1, "bad\x1b[31m", 5)}
+    labels = read_labels(write_nrrd(tmp_path / "a.seg.nrrd", make_labels(), **fields))
+    assert labels.names[2] == "L1 vertebra" and labels.find("l1 VERTEBRA") == 2 and labels.find("L1") == 2
+    assert "\x1b" not in labels.names[5] and labels.names[5].startswith("bad")
+
+
+def layered(overlap: bool):
+    """Three segments in two layers; the first two overlap in one voxel or not at all."""
+    voxels = np.zeros((3, 4, 5, 2), np.uint8)
+    voxels[0, 0, :3, 0] = 1
+    voxels[0, 0, 2 if overlap else 3, 1] = 1
+    voxels[2, 3, 4, 1] = 2
+    return voxels, {**segment(0, "one", 1, 0), **segment(1, "two", 1, 1), **segment(2, "three", 2, 1)}
+
+
+def test_layers_become_one_map(tmp_path):
+    voxels, fields = layered(False)
+    labels = read_labels(write_nrrd(tmp_path / "a.seg.nrrd", voxels, **fields))
+    assert labels.counts == {1: 3, 2: 1, 3: 1} and labels.names == {1: "one", 2: "two", 3: "three"}
+    assert labels.voxels[0, 0, 3] == 2 and labels.voxels[2, 3, 4] == 3
+    assert np.allclose(labels.affine, OBLIQUE, atol=1e-12)
+
+
+def test_layers_that_overlap_are_refused_unless_one_is_chosen(tmp_path):
+    voxels, fields = layered(True)
+    path = write_nrrd(tmp_path / "a.seg.nrrd", voxels, **fields)
+    with pytest.raises(RefusedInputError, match="1 one and 2 two share 1 voxels"):
+        read_labels(path)
+    assert read_labels(path, ["one"]).counts == {1: 3, 3: 1}
+    assert read_labels(path, ["two", 3]).counts == {1: 2, 2: 1, 3: 1}
+    with pytest.raises(UsageError, match="label 'four' is not in the label map; there are: 1 one, 2 two, 3 three"):
+        read_labels(path, ["four"])
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        (b"space: left-posterior-superior", b"space: scanner-xyz", "space 'scanner-xyz'"),
+        (b"space: left-posterior-superior\n", b"", "does not say where it lies"),
+        (b"sizes: 7 6 4", b"sizes: 7 6 4000", "cannot come from a file of"),
+        (b"sizes: 7 6 4", b"sizes: 70000 60000 40000", "at most 4,294,967,296"),
+        (b"sizes: 7 6 4", b"sizes: 7 6 -4", "at least 1 an axis"),
+        (b"sizes: 7 6 4", b"sizes: 7 6 x", "corrupt NRRD header"),
+        (b"dimension: 3", b"dimension: 2", "has 3 axes"),
+        (b"type: uint8", b"type: block", "is not a label map: its voxels are 'block'"),
+        (b"encoding: raw", b"encoding: hex", "is stored as 'hex'"),
+        (b"encoding: raw", b"encoding: raw\ndata file: /etc/passwd", "says 'data file'"),
+        (b"encoding: raw", b"encoding: raw\nbyte skip: -1", "says 'byte skip'"),
+        (b"encoding: raw", b"encoding: gzip", "cut or corrupt in slice 1 of 4"),
+        (b"space origin: (", b"space origin: (1e999,", "cannot be placed|corrupt NRRD"),
+        (b"space directions: (", b"space directions: none (", "cannot be placed|corrupt NRRD"),
+    ],
+)
+def test_hostile_headers_are_refused(tmp_path, old, new, message):
+    path = edit(write_nrrd(tmp_path / "a.nrrd", make_labels(), encoding="raw"), (old, new))
+    with pytest.raises(RefusedInputError, match=message):
+        read_labels(path)
+
+
+def test_a_header_without_end_is_refused(tmp_path):
+    (tmp_path / "a.nrrd").write_bytes(b"NRRD0004\n" + b"# x\n" * 400_000)
+    with pytest.raises(RefusedInputError, match="does not end within"):
+        read_labels(tmp_path / "a.nrrd")
+
+
+@pytest.mark.fuzz
+@pytest.mark.parametrize("encoding", ["raw", "gzip"])
+def test_cut_anywhere_it_is_refused(tmp_path, encoding):
+    content = write_nrrd(tmp_path / "a.nrrd", make_labels((9, 20, 20)), encoding=encoding).read_bytes()
+    for length in {*range(0, len(content), 37), len(content) - 1}:
+        (tmp_path / "b.nrrd").write_bytes(content[:length])
+        with pytest.raises(RefusedInputError, match="."):
+            read_labels(tmp_path / "b.nrrd")
+
+
+def test_without_pynrrd_the_extra_is_named(tmp_path, monkeypatch):
+    path = write_nrrd(tmp_path / "a.nrrd", make_labels())
+    monkeypatch.setitem(__import__("sys").modules, "nrrd", None)
+    with pytest.raises(UsageError, match=r"needs the package pynrrd: pip install 'clrecon\[labels\]'"):
+        read_labels(path)
