@@ -32,6 +32,8 @@ ROUNDED_AFFINE_MM = 0.006  # positions rounded to 0.01 mm: half of it, and the f
 # --- labels ---
 NIFTI_AFFINE_MM = 1e-5  # sform entries and quaternions are float32: coordinates of some 100 mm
 
+LABEL_SPHERE_VOLUME = 0.015  # chords of a partial-volume sphere of 9.4 voxels lose 1 %; measured 0.9 %, with a leak 1.1
+
 # --- phantom ---
 PHANTOM_VOLUME_RATIO = 1e-3  # sum of partial volumes against analysis; the cell ramp leaves 0.03 % at R = 5 voxels
 PHANTOM_PLANE_SHARE = 0.03  # linear ramp against the exact share of a cell, 1 of 6 cells along an edge
