@@ -26,17 +26,20 @@ if TYPE_CHECKING:
         UsageError,
     )
     from clrecon.geometry import Volume, choose_iso_value
+    from clrecon.labels import LabelMap, read_labels
     from clrecon.mesh import Mesh
     from clrecon.mesh.distances import compare_meshes
     from clrecon.mesh.refinement import decimate_mesh, smooth_mesh
     from clrecon.opencl import Device
     from clrecon.operators.isosurface import SurfaceExtractor, extract_isosurface, extract_isosurfaces
+    from clrecon.operators.labels import extract_labels
 
     __version__: str
 
 __all__ = [
     "ClreconError",
     "DeviceError",
+    "LabelMap",
     "Mesh",
     "NoDicomError",
     "NoSurfaceError",
@@ -53,7 +56,9 @@ __all__ = [
     "devices",
     "extract_isosurface",
     "extract_isosurfaces",
+    "extract_labels",
     "list_series",
+    "read_labels",
     "read_volume",
     "smooth_mesh",
 ]
@@ -61,6 +66,7 @@ __all__ = [
 _HOMES = {
     "ClreconError": "clrecon.errors",
     "DeviceError": "clrecon.errors",
+    "LabelMap": "clrecon.labels",
     "Mesh": "clrecon.mesh",
     "NoDicomError": "clrecon.errors",
     "NoSurfaceError": "clrecon.errors",
@@ -74,7 +80,9 @@ _HOMES = {
     "decimate_mesh": "clrecon.mesh.refinement",
     "extract_isosurface": "clrecon.operators.isosurface",
     "extract_isosurfaces": "clrecon.operators.isosurface",
+    "extract_labels": "clrecon.operators.labels",
     "list_series": "clrecon.dicom",
+    "read_labels": "clrecon.labels",
     "read_volume": "clrecon.dicom",
     "smooth_mesh": "clrecon.mesh.refinement",
 }

@@ -23,6 +23,9 @@
 #include "include/mc_tables.h"
 #include "isosurface/mask_rows.h"
 #include "isosurface/vertex_group.h"
+#ifdef LABELS
+#include "isosurface/label_border.h"
+#endif
 
 #ifndef WORDS_PER_ITEM
 #define WORDS_PER_ITEM 1
@@ -170,6 +173,8 @@ __kernel void list_words(
  *             gk, words       as above
  *             row_shift       a word's number is its row times 2^row_shift, plus its place in the row
  *             active          number of words with work
+ *             inside, label   in   with -D LABELS: the label that each sample is inside of, slices as those of `voxels`,
+ *                             and the label whose surface it is; see label_border.h
  * Launch      global = ceil(active / WORDS_PER_ITEM) rounded up by the host, any local
  * Guarantees  every position and normal is written once.  Positions are right to one unit in the last place of the
  *             volume's largest coordinate (half a unit up to 4096 samples an axis, where products of a sample number
@@ -182,13 +187,20 @@ __kernel void emit_vertices(
     __global float *restrict positions, __global float *restrict normals,
     const float iso_level, const VALUE outside, const float value_scale, const float4 margin,
     const int ni, const int nj, const int nk, const int border, const int first_slice, const int first_sample_slice,
-    const uint gk, const uint words, const uint row_shift, const uint active)
+    const uint gk, const uint words, const uint row_shift, const uint active
+#ifdef LABELS
+    , __global const ushort *restrict inside, const uint label
+#endif
+    )
 {
     const uint begin = get_global_id(0) * WORDS_PER_ITEM;
     if (begin >= active)
         return;
     const uint end = min(begin + WORDS_PER_ITEM, active);
     const volume_part volume = {voxels, ni, nj, nk, first_slice, border, outside};
+#ifdef LABELS
+    const label_part labels = {inside, label};
+#endif
     const uint gi = ni + 2 * border, gj = nj + 2 * border;
     slice_frame frame;
     frame.i_step = steps[0].xyz;
@@ -244,7 +256,11 @@ __kernel void emit_vertices(
         for (uint m = 0; m < count; ++m) {
             const int i = vi + (crossed[m] >> 2);
             const int inner = row_is_inner && i >= 1 && i < ni - 2;
-            gather_vertex(&group, gathered++, &volume, i, vj, vk, crossed[m] & 3, inner);
+            gather_vertex(&group, gathered, &volume, i, vj, vk, crossed[m] & 3, inner);
+#ifdef LABELS
+            gather_border(&group, gathered, &volume, &labels, iso_level, i, vj, vk, crossed[m] & 3);
+#endif
+            ++gathered;
             if (gathered == LANES) {
                 write_vertices(&group, &frame, LANES, positions + 3 * written, normals + 3 * written);
                 written += LANES;

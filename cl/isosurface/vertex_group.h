@@ -15,6 +15,9 @@ typedef struct {
     VALUE value[LANES], next_value[LANES];
     VALUE gradient_i[LANES], gradient_j[LANES], gradient_k[LANES];
     VALUE next_gradient_i[LANES], next_gradient_j[LANES], next_gradient_k[LANES];
+#ifdef LABELS
+    int half_way[LANES]; /* not placed by HU, see label_border.h */
+#endif
 } vertex_group;
 
 /* What the vertices of one slice have in common. */
@@ -162,7 +165,13 @@ static inline void write_vertices(
     const floats next_value = to_floats(load_lanes(group->next_value));
     const floats keep = choose(
         along_k, (floats)(frame->margin.z), choose(along_j, (floats)(frame->margin.y), (floats)(frame->margin.x)));
-    const floats t = clamp((frame->iso_level - value) / (next_value - value), keep, 1.0f - keep);
+    floats t = clamp((frame->iso_level - value) / (next_value - value), keep, 1.0f - keep);
+    floats value_scale = (floats)(frame->value_scale);
+#ifdef LABELS
+    const ints half_way = load_lanes(group->half_way) != 0;
+    t = choose(half_way, (floats)(0.5f), t);
+    value_scale = choose(half_way, (floats)(1.0f), value_scale);
+#endif
 
     const floats i = to_floats(load_lanes(group->i)), j = to_floats(load_lanes(group->j));
 #define PLACE(c) place_vertices(i, j, t, along_j, along_k, frame->origin.c, frame->origin_rest.c, \
@@ -170,7 +179,7 @@ static inline void write_vertices(
     store_triples(PLACE(x), PLACE(y), PLACE(z), count, positions);
 #undef PLACE
 
-#define SLOPE(c) (frame->value_scale * (to_floats(load_lanes(group->gradient_##c)) + t \
+#define SLOPE(c) (value_scale * (to_floats(load_lanes(group->gradient_##c)) + t \
         * (to_floats(load_lanes(group->next_gradient_##c)) - to_floats(load_lanes(group->gradient_##c)))))
     floats slope_i = SLOPE(i), slope_j = SLOPE(j), slope_k = SLOPE(k);
 #undef SLOPE

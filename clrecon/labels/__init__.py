@@ -1,8 +1,8 @@
 """Label maps: which voxel belongs to which structure, read from NIfTI, NRRD and DICOM SEG."""
 
 from clrecon.labels.label_map import LabelMap
-from clrecon.labels.names import label_suffix
+from clrecon.labels.names import file_suffixes, label_suffix
 from clrecon.labels.reader import read_labels
 from clrecon.labels.resample import ResampledLabels, resample_labels
 
-__all__ = ["LabelMap", "ResampledLabels", "label_suffix", "read_labels", "resample_labels"]
+__all__ = ["LabelMap", "ResampledLabels", "file_suffixes", "label_suffix", "read_labels", "resample_labels"]

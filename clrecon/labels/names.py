@@ -6,12 +6,13 @@ Names come from files that strangers wrote: in messages they are escaped, in fil
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Collection, Mapping
 
 from clrecon.dicom.text import escape_text
 from clrecon.errors import UsageError
 
-__all__ = ["check_name", "find_number", "label_suffix", "list_labels"]
+__all__ = ["check_name", "file_suffixes", "find_number", "label_suffix", "list_labels"]
 
 SUFFIX_LENGTH = 40
 LABELS_LISTED = 60
@@ -83,3 +84,13 @@ def label_suffix(name: str) -> str:
     """
     safe = re.sub(r"[^A-Za-z0-9._-]+", "_", name)[:SUFFIX_LENGTH].strip("._-")
     return safe or "label"
+
+
+def file_suffixes(names: Mapping[int, str]) -> dict[int, str]:
+    """`label_suffix` of each name; where two would be one file, also on systems that ignore case, with the number."""
+    suffixes = {number: label_suffix(name) for number, name in names.items()}
+    found = Counter(suffix.casefold() for suffix in suffixes.values())
+    unique = {n: s if found[s.casefold()] == 1 else f"{s}_{n}" for n, s in suffixes.items()}
+    if len({suffix.casefold() for suffix in unique.values()}) < len(unique):  # a name that looks like such a pair
+        return {number: f"label_{number}" for number in names}
+    return unique

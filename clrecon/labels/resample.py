@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -110,6 +111,9 @@ def _take_nearest(labels: LabelMap, volume: Volume) -> tuple[NDArray[np.uint16],
 def _shares_inside(labels: LabelMap, volume: Volume) -> dict[int, float]:
     """For each label the share of its voxels whose centres lie inside the volume's outermost voxels."""
     upper = np.array(volume.shape_ijk) - 0.5
+    corners = volume.lps_to_ijk(apply_affine(labels.affine, _corners(labels)))
+    if (corners >= -0.5).all() and (corners <= upper).all():
+        return dict.fromkeys(labels.counts, 1.0)
     inside = np.zeros(max(labels.numbers, default=0) + 1, dtype=np.int64)
     for k, plane in enumerate(labels.voxels):
         j, i = np.nonzero(plane)
@@ -134,10 +138,13 @@ def _check_overlap(labels: LabelMap, volume: Volume, shares: dict[int, float]) -
     )
 
 
+def _corners(grid: LabelMap | Volume) -> list[tuple[int, ...]]:
+    """Index coordinates of the eight outermost voxels."""
+    return list(product(*((0, n - 1) for n in grid.shape_ijk)))
+
+
 def _extent(grid: LabelMap | Volume) -> str:
     """``x -250..249, y ..., z ... mm``: the corners' range."""
-    corners = [[i, j, k] for i in (0, grid.shape_ijk[0] - 1) for j in (0, grid.shape_ijk[1] - 1)
-               for k in (0, grid.shape_ijk[2] - 1)]  # fmt: skip
-    points = apply_affine(grid.affine, corners)
+    points = apply_affine(grid.affine, _corners(grid))
     low, high = points.min(axis=0), points.max(axis=0)
     return ", ".join(f"{axis} {a:.0f} to {b:.0f}" for axis, a, b in zip("xyz", low, high, strict=True)) + " mm"

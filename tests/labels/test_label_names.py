@@ -7,7 +7,7 @@ import pytest
 from label_files import OBLIQUE, make_labels
 
 from clrecon.errors import RefusedInputError, UsageError
-from clrecon.labels import LabelMap, label_suffix, read_labels
+from clrecon.labels import LabelMap, file_suffixes, label_suffix, read_labels
 
 NAMES = {2: "vertebrae_T12", 5: "vertebrae_T1", 7: "rib left 12", 8: "rib left 11", 9: "absent"}
 
@@ -71,6 +71,18 @@ def test_an_unknown_label_lists_what_is_there(label, message):
 )
 def test_suffixes_are_safe_in_file_names(name, suffix):
     assert label_suffix(name) == suffix
+
+
+@pytest.mark.parametrize(
+    ("names", "suffixes"),
+    [
+        ({1: "T12", 2: "L1"}, {1: "T12", 2: "L1"}),
+        ({1: "rib a", 2: "rib/a", 3: "RIB_A"}, {1: "rib_a_1", 2: "rib_a_2", 3: "RIB_A_3"}),
+        ({1: "..", 2: "!!", 3: "label_1"}, {1: "label_1", 2: "label_2", 3: "label_3"}),
+    ],
+)
+def test_no_two_labels_get_one_file(names, suffixes):
+    assert file_suffixes(names) == suffixes
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,207 @@
+"""Surfaces of labels on every device: equal to the twin, closed, sharing borders, no worse than the plain surface."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import tolerances
+
+from clrecon.errors import NoSurfaceError, RefusedInputError, UsageError
+from clrecon.geometry import Volume
+from clrecon.labels import LabelMap, resample_labels
+from clrecon.labels.growth import near_offsets
+from clrecon.operators import labels as operator
+from clrecon.operators.isosurface import extract_isosurface
+from clrecon.operators.labels import extract_labels
+from clrecon.reference import labels as twin
+
+OBLIQUE = np.array([[0.7, 0.1, 0.05, -250.0], [-0.1, 0.5, 0.2, -300.0], [0.0, 0.05, 2.5, -846.0], [0, 0, 0, 1.0]])
+MIRRORED = OBLIQUE @ np.diag((-1.0, 1.0, 1.0, 1.0))
+SHAPES = [(5, 7, 9), (6, 5, 31), (5, 6, 33), (9, 4, 64), (4, 5, 100), (3, 4, 1030)]
+
+
+def random_volume(shape, dtype="int16", affine=OBLIQUE, seed=0, high=6) -> Volume:
+    return Volume(np.random.default_rng(seed).integers(0, high, shape).astype(dtype), affine)
+
+
+def random_labels(shape, seed=1, numbers=(0, 0, 3, 7, 300)) -> np.ndarray:
+    """Blocks of labels, and single voxels of others."""
+    random = np.random.default_rng(seed)
+    coarse = random.choice(np.array(numbers, np.uint16), [-(-n // 3) for n in shape])
+    labels = coarse.repeat(3, 0).repeat(3, 1).repeat(3, 2)[: shape[0], : shape[1], : shape[2]]
+    odd = random.random(shape) < 0.1
+    return np.where(odd, random.choice(np.array(numbers, np.uint16), shape), labels)
+
+
+def assert_equals_twin(mesh, volume, inside, number, iso_value, closed=True):
+    vertices, normals, triangles = twin.extract_label(volume, inside, number, iso_value, closed=closed)
+    assert np.array_equal(mesh.triangles, triangles)
+    assert np.abs(volume.lps_to_ijk(mesh.vertices) - volume.lps_to_ijk(vertices)).max() <= tolerances.TWIN_VERTEX_VOXEL
+    assert np.abs(mesh.normals - normals).max() <= tolerances.TWIN_NORMAL
+
+
+@pytest.mark.parametrize("closed", [True, False])
+@pytest.mark.parametrize("solid", [False, True])
+@pytest.mark.parametrize("shape", SHAPES)
+def test_device_equals_twin(device, shape, solid, closed):
+    volume, labels = random_volume(shape), random_labels(shape)
+    numbers = (3, 7, 300)
+    inside = twin.find_solid(volume, labels, 3, grow_mm=1.2, closed=closed, solid=numbers if solid else ())
+    meshes = extract_labels(volume, LabelMap(labels, OBLIQUE), 3, device, grow_mm=1.2, closed=closed, solid=solid)
+    assert tuple(meshes) == numbers
+    for number, mesh in meshes.items():
+        assert_equals_twin(mesh, volume, inside, number, 3, closed)
+
+
+@pytest.mark.parametrize("dtype", ["int8", "uint8", "int16", "uint16", "int32", "float32"])
+def test_device_equals_twin_for_every_voxel_type(device, dtype):
+    shape = (6, 7, 37)
+    volume, labels = random_volume(shape, dtype, MIRRORED, high=100), random_labels(shape)
+    for iso_value in (40, 40.3):
+        inside = twin.find_solid(volume, labels, iso_value)
+        for number, mesh in extract_labels(volume, LabelMap(labels, MIRRORED), iso_value, device).items():
+            assert_equals_twin(mesh, volume, inside, number, iso_value)
+
+
+@pytest.mark.parametrize("grow_mm", [0.0, 0.6, 2.7, 5.3])
+def test_growth_is_that_of_the_twin_to_the_last_sample(device, grow_mm):
+    """The buffer of the device is looked at itself: sizes on both sides of a work-group, ties of distance."""
+    for shape in [(5, 7, 9), (4, 4, 4), (5, 5, 5), (1, 1, 63), (3, 1, 65)]:
+        for affine in (OBLIQUE, np.eye(4)):
+            volume, labels = random_volume(shape, affine=affine), random_labels(shape, numbers=(0, 0, 0, 0, 2, 9))
+            offsets, shells = near_offsets(affine, grow_mm)
+            whole = {1: tuple(slice(0, n) for n in shape)}
+            own, _ = operator.prepare_labels(device)
+            rule = operator.choose_iso_rule(volume, 3)
+            part = operator._find_inside(
+                device, rule, volume, labels, whole, (offsets, shells), own, False, operator.Stopwatch()
+            )
+            assert np.array_equal(part.inside, twin.find_solid(volume, labels, 3, grow_mm=grow_mm))
+
+
+def test_labels_are_closed_manifold_and_share_their_border(device):
+    shape = (12, 13, 40)
+    volume, labels = random_volume(shape, high=9), random_labels(shape)
+    meshes = extract_labels(volume, LabelMap(labels, OBLIQUE), 2.3, device)
+    points = {}
+    for number, mesh in meshes.items():
+        quality = mesh.quality()
+        assert quality["closed"] and quality["manifold"] and quality["volume_ml"] > 0
+        assert quality["zero_area_faces"] == 0 and quality["unused_vertices"] == 0
+        points[number] = {row.tobytes() for row in mesh.vertices}
+        assert len(points[number]) == len(mesh.vertices)
+    inside = twin.find_solid(volume, labels, 2.3)
+    for one, other in ((3, 7), (3, 300), (7, 300)):
+        borders = 0
+        for axis in range(3):
+            a, b = np.moveaxis(inside, axis, 0)[1:], np.moveaxis(inside, axis, 0)[:-1]
+            borders += int(((a == one) & (b == other) | (a == other) & (b == one)).sum())
+        assert len(points[one] & points[other]) == borders > 0
+
+
+def test_one_label_alone_is_the_same_as_among_others(device):
+    shape = (20, 9, 40)
+    volume, labels = random_volume(shape), np.zeros(shape, np.uint16)
+    labels[2:6], labels[6:13, 2:], labels[15:] = 3, 7, 9
+    together = extract_labels(volume, LabelMap(labels, OBLIQUE), 3, device)
+    for number in (7, 9):
+        alone = extract_labels(volume, LabelMap(labels, OBLIQUE), 3, device, numbers=[number])[number]
+        assert np.array_equal(alone.vertices, together[number].vertices)
+        assert np.array_equal(alone.normals, together[number].normals)
+        assert np.array_equal(alone.triangles, together[number].triangles)
+
+
+def test_a_label_of_everything_is_the_plain_surface(device):
+    for closed in (True, False):
+        volume = random_volume((9, 8, 45))
+        labels = LabelMap(np.ones(volume.voxels.shape, np.uint8), OBLIQUE)
+        plain = extract_isosurface(volume, 3, device, closed=closed)
+        mesh = extract_labels(volume, labels, 3, device, closed=closed)[1]
+        assert np.array_equal(mesh.vertices, plain.vertices)
+        assert np.array_equal(mesh.normals, plain.normals)
+        assert np.array_equal(mesh.triangles, plain.triangles)
+        assert mesh.report["vertices_by_hu_share"] == 1.0
+
+
+def test_labels_on_another_grid_are_the_same_where_it_covers_the_volume(device):
+    volume, labels = random_volume((6, 7, 33)), random_labels((6, 7, 33))
+    turned = OBLIQUE @ np.array([[0, 0, 1, 0], [0, -1, 0, 6], [1, 0, 0, 0], [0, 0, 0, 1.0]])
+    expected = extract_labels(volume, LabelMap(labels, OBLIQUE), 3, device)
+    meshes = extract_labels(volume, LabelMap(labels[:, ::-1].transpose(2, 1, 0), turned), 3, device)
+    assert all(np.array_equal(meshes[n].vertices, expected[n].vertices) for n in expected)
+
+
+def test_the_report_says_what_was_done(device):
+    volume, labels = random_volume((5, 7, 9)), random_labels((5, 7, 9))
+    label_map = LabelMap(labels, OBLIQUE, {3: "vertebrae_T12"}, warnings=["doubtful"])
+    mesh = extract_labels(volume, label_map, 3, device, numbers=["T12"])[3]
+    assert mesh.report["label"] == 3 and mesh.report["label_name"] == "vertebrae_T12"
+    assert mesh.report["label_inside_share"] == 1.0 and mesh.report["solid"] is False
+    assert mesh.report["grow_mm"] == pytest.approx(1.5 * max(volume.spacing[:2]))
+    assert 0.1 < mesh.report["vertices_by_hu_share"] < 0.9
+    assert "doubtful" in mesh.report["warnings"]
+    assert set(mesh.report["seconds"]) == {"upload", "build", "kernels", "download"}
+
+
+def test_a_label_that_leaves_the_volume_is_said(device):
+    volume = random_volume((5, 7, 9))
+    shifted = OBLIQUE.copy()
+    shifted[:, 3] = OBLIQUE @ (0, 0, 3, 1)
+    mesh = extract_labels(volume, LabelMap(np.full((5, 7, 9), 2), shifted), 3, device)[2]
+    assert "60 % of label 2 lie outside the CT" in mesh.report["warnings"][-1]
+    assert mesh.quality()["closed"]
+
+
+def test_labels_without_a_surface_are_refused_or_left_out(device):
+    volume, labels = random_volume((5, 7, 9)), np.zeros((5, 7, 9), np.uint8)
+    labels[0], labels[3:] = 2, 5
+    volume.voxels[:3] = 1
+    label_map = LabelMap(labels, OBLIQUE, {2: "liver"})
+    assert tuple(extract_labels(volume, label_map, 3, device)) == (5,)
+    with pytest.raises(NoSurfaceError, match="no surface of label 2 liver at 3 HU: its voxels run from 1 to 1 HU"):
+        extract_labels(volume, label_map, 3, device, numbers=[5, 2])
+    with pytest.raises(NoSurfaceError, match="no label has a voxel of 6 HU or more"):
+        extract_labels(volume, label_map, 6, device)
+    with pytest.raises(UsageError, match="label '9' is not in the label map; there are: 2 liver, 5 label_5"):
+        extract_labels(volume, label_map, 3, device, numbers=[9])
+    with pytest.raises(UsageError, match="at least one label"):
+        extract_labels(volume, label_map, 3, device, numbers=[])
+    far = OBLIQUE.copy()
+    far[0, 3] += 1000
+    with pytest.raises(RefusedInputError, match="0 % of the labels"):
+        extract_labels(volume, LabelMap(labels, far), 3, device)
+
+
+def test_a_label_outside_the_volume_is_refused_when_asked_for(device):
+    volume, labels = random_volume((5, 7, 9)), np.zeros((10, 7, 9), np.uint8)
+    labels[:5], labels[8:] = 2, 4
+    label_map = LabelMap(labels, OBLIQUE)
+    assert tuple(extract_labels(volume, label_map, 3, device)) == (2,)
+    with pytest.raises(NoSurfaceError, match="label 4 label_4 has no voxel in the CT: it lies outside"):
+        extract_labels(volume, label_map, 3, device, numbers=[4])
+
+
+@pytest.mark.oclgrind
+def test_every_pass_on_a_small_volume(device):
+    volume, labels = random_volume((4, 4, 33)), random_labels((4, 4, 33))
+    inside = twin.find_solid(volume, labels, 3, grow_mm=1.2)
+    for number, mesh in extract_labels(volume, LabelMap(labels, OBLIQUE), 3, device, grow_mm=1.2).items():
+        assert np.array_equal(mesh.triangles, twin.extract_label(volume, inside, number, 3)[2])
+
+
+def test_a_real_vertebra_is_sound(device, real_data):
+    from clrecon.dicom import read_volume
+    from clrecon.labels import read_labels
+
+    folder = real_data / "thoracolumbar_labels"
+    volume, labels = read_volume(folder / "ct_2mm_jpeg2000"), read_labels(folder / "ct_2mm_labels.nii.gz")
+    hollow, full = (
+        extract_labels(volume, labels, 226, device, numbers=["T12", "T11"], solid=solid) for solid in (False, True)
+    )
+    for mesh in (*hollow.values(), *full.values()):
+        assert mesh.quality()["closed"] and mesh.quality()["manifold"]
+    mask_ml = np.count_nonzero(resample_labels(labels, volume).voxels == 32) * np.prod(volume.spacing) / 1000
+    assert full[32].quality()["volume_ml"] == pytest.approx(mask_ml, rel=tolerances.REAL_SOLID_VOLUME)
+    assert hollow[32].quality()["volume_ml"] < 0.6 * mask_ml
+    shared = {row.tobytes() for row in full[32].vertices} & {row.tobytes() for row in full[33].vertices}
+    assert len(shared) > 100
