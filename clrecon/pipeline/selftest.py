@@ -12,13 +12,16 @@ from numpy.typing import NDArray
 from clrecon.errors import ClreconError, DeviceError
 from clrecon.geometry import Volume
 from clrecon.kernels import download, upload
+from clrecon.labels import LabelMap
 from clrecon.opencl import Device
 from clrecon.operators.compaction import compact, exclusive_scan
 from clrecon.operators.components import label_components
 from clrecon.operators.isosurface import extract_isosurface
+from clrecon.operators.labels import extract_labels
 from clrecon.reference import compaction as compaction_twin
 from clrecon.reference import components as components_twin
 from clrecon.reference import isosurface as isosurface_twin
+from clrecon.reference import labels as label_twin
 
 __all__ = ["run_selftest"]
 
@@ -86,11 +89,30 @@ def _check_isosurface(device: Device) -> str:
     return f"3 volumes: triangles equal, vertices within {worst:.1e} voxel"
 
 
+def _check_labels(device: Device) -> str:
+    worst = 0.0
+    for closed, solid in ((True, False), (False, True)):
+        volume = Volume(_random_integers((7, 8, 37), "int16", 6), OBLIQUE)
+        blocks = _random_integers((3, 3, 13), "uint16", 4).repeat(3, 0).repeat(3, 1).repeat(3, 2)[:7, :8, :37]
+        numbers = (1, 2, 3)
+        inside = label_twin.find_solid(volume, blocks, 3.0, closed=closed, solid=numbers if solid else ())
+        meshes = extract_labels(volume, LabelMap(blocks, OBLIQUE), 3.0, device, closed=closed, solid=solid)
+        for number in numbers:
+            vertices, _, triangles = label_twin.extract_label(volume, inside, number, 3.0, closed=closed)
+            if number not in meshes or not np.array_equal(meshes[number].triangles, triangles):
+                raise DeviceError(f"wrong triangles of label {number}")
+            worst = max(worst, float(np.abs(meshes[number].vertices - vertices).max()) / min(volume.spacing))
+    if not worst <= VERTEX_TOLERANCE_VOXEL:
+        raise DeviceError(f"vertices of labels {worst:.2g} voxel off, allowed {VERTEX_TOLERANCE_VOXEL:g}")
+    return f"6 labels: triangles equal, vertices within {worst:.1e} voxel"
+
+
 CHECKS: tuple[tuple[str, Callable[[Device], str]], ...] = (
     ("exclusive_scan", _check_scan),
     ("compact", _check_compaction),
     ("extract_isosurface", _check_isosurface),
     ("label_components", _check_components),
+    ("extract_labels", _check_labels),
 )
 
 

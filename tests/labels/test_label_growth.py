@@ -203,3 +203,12 @@ def test_a_solid_label_that_leaves_the_volume_is_solid_up_to_its_end(closed):
     inside = find_solid(half, labels, 275, closed=closed, solid=(1,))
     assert inside[12, 12, 12] == 1
     assert np.count_nonzero(inside) >= 0.99 * np.count_nonzero(labels)
+
+
+@pytest.mark.parametrize(("closed", "filled"), [(True, 0), (False, 125)])
+def test_a_hole_at_the_end_of_the_volume_is_open_where_outside_is_beyond(closed, filled):
+    volume, share = sphere_volume(9.4, 25, low=-50, high=600, hollow=6.9, core=0)
+    labels = (share[:13] >= 0.5).astype(np.uint16)
+    labels[8:13, 10:15, 10:15] = 0
+    inside = find_solid(Volume(volume.voxels[:13], volume.affine), labels, 275, closed=closed, solid=(1,))
+    assert np.count_nonzero(inside[8:13, 10:15, 10:15]) == filled

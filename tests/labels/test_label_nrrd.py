@@ -84,6 +84,7 @@ def test_layers_that_overlap_are_refused_unless_one_is_chosen(tmp_path):
         read_labels(path)
     assert read_labels(path, ["one"]).counts == {1: 3, 3: 1}
     assert read_labels(path, ["two", 3]).counts == {1: 2, 2: 1, 3: 1}
+    assert read_labels(path, [3]).counts == {1: 3, 3: 1}  # among those not wanted the lowest number
     with pytest.raises(UsageError, match="label 'four' is not in the label map; there are: 1 one, 2 two, 3 three"):
         read_labels(path, ["four"])
 

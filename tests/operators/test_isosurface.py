@@ -239,7 +239,7 @@ def test_a_device_that_finds_nothing_is_not_believed(device, monkeypatch):
     with pytest.raises(DeviceError, match="it computes wrongly"):
         extract_isosurface(random_volume((5, 6, 7)), 3, device)
     outcomes = {result["operator"]: result["passed"] for result in run_selftest(device)}
-    assert outcomes == {"exclusive_scan": True, "compact": True, "extract_isosurface": False}
+    assert [operator for operator, passed in outcomes.items() if not passed] == ["extract_isosurface"]
 
 
 @pytest.mark.parametrize(("lanes", "words"), [("1", "1"), ("8", "3")])
