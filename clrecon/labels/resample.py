@@ -65,6 +65,8 @@ def resample_labels(labels: LabelMap, volume: Volume) -> ResampledLabels:
     """
     if not isinstance(labels, LabelMap) or not isinstance(volume, Volume):
         raise UsageError("a label map is brought to a volume: resample_labels(LabelMap, Volume)")
+    if not labels.numbers:
+        raise RefusedInputError("the label map is empty: no voxel has a label")
     _check_frame_of_reference(labels, volume)
     shares = _shares_inside(labels, volume)
     _check_overlap(labels, volume, shares)

@@ -21,7 +21,15 @@ from clrecon.operators.bricks import BrickRanges, BrickStates, compare_bricks, m
 from clrecon.operators.marching_cubes import Counted, Placement
 from clrecon.operators.slabs import SampleGrid, Slab, plan_slabs
 
-__all__ = ["SurfaceExtractor", "extract_isosurface", "extract_isosurfaces", "prepare_isosurface"]
+__all__ = [
+    "Part",
+    "Progress",
+    "SurfaceExtractor",
+    "extract_isosurface",
+    "extract_isosurfaces",
+    "prepare_isosurface",
+    "voxel_level",
+]
 
 Progress = Callable[[str, int, int], None]
 
@@ -43,7 +51,7 @@ def _refuse_level(device: Device, volume: Volume, rule: IsoRule) -> ClreconError
     )
 
 
-def _voxel_level(device: Device, volume: Volume, rule: IsoRule) -> Any:
+def voxel_level(device: Device, volume: Volume, rule: IsoRule) -> Any:
     """The lowest inside value as a scalar of the voxels' own type."""
     dtype = volume.voxels.dtype
     if dtype.kind == "f":
@@ -153,7 +161,7 @@ class SurfaceExtractor:
         grid = SampleGrid(self.volume, choose_iso_rule(self.volume, iso_value, closed))
         if min(grid.shape) < 2:
             raise NoSurfaceError(f"an open volume of {grid.shape} voxels has no cells: leave it closed")
-        run = _Run(self, grid, stopwatch, _voxel_level(self.device, self.volume, grid.rule), self._placement(grid))
+        run = _Run(self, grid, stopwatch, voxel_level(self.device, self.volume, grid.rule), self._placement(grid))
         if progress is not None:
             progress("build", 0, 1)
         with stopwatch.timed("build"):

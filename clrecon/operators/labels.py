@@ -10,71 +10,68 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import DTypeLike, NDArray
 
 from clrecon.errors import NoSurfaceError, UsageError
-from clrecon.geometry import Volume, is_left_handed
-from clrecon.geometry.field import IsoRule, choose_iso_rule, vertex_margin
-from clrecon.kernels import Stopwatch, allocate, download, empty_output, launch, load_program, upload
+from clrecon.geometry import Volume
+from clrecon.geometry.field import IsoRule, choose_iso_rule
+from clrecon.kernels import Program, Stopwatch, allocate, download, launch, load_program, upload
 from clrecon.labels import LabelMap, ResampledLabels, resample_labels
 from clrecon.labels.growth import checked_growth, near_offsets
 from clrecon.labels.solid import Box, fill_solid, find_boxes
 from clrecon.mesh import Mesh
-from clrecon.opencl import Device, check_budget, choose_device
-from clrecon.operators import isosurface as plain
-from clrecon.operators.compaction import prepare_compaction
+from clrecon.opencl import Device, check_budget, choose_device, describe_shortage, memory_limits
+from clrecon.opencl.quirks import cache_warnings
+from clrecon.operators import marching_cubes
+from clrecon.operators.isosurface import Part, Progress, voxel_level
+from clrecon.operators.marching_cubes import Placement
+from clrecon.operators.slabs import SampleGrid, Slab
 
 __all__ = ["extract_labels", "prepare_labels"]
-
-Surface = tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.uint32]]
 
 SPARE_SLICES = 2
 """Beyond the label's box: the far end of a crossed edge, and what its gradient needs."""
 
 
 @dataclass(frozen=True)
-class _Part:
-    """The slices of a volume that a device holds, and what is inside of which label in them."""
+class _Growth:
+    """How far labels grow: offsets to the samples around, nearest first, and which of them are equally near."""
 
-    volume: Volume
-    rule: IsoRule
+    mm: float
+    offsets: NDArray[np.int32]
+    shells: NDArray[np.int32]
+
+    @property
+    def reach(self) -> tuple[int, int, int]:
+        """Samples along i, j, k."""
+        i, j, k = np.abs(self.offsets).max(axis=0, initial=0)
+        return int(i), int(j), int(k)
+
+
+@dataclass(frozen=True)
+class _Held:
+    """The slices of a volume that the device holds, and what is inside of which label in them."""
+
     first: int
-    last: int
+    end: int
     voxels_d: Any
     inside_d: Any
     inside: NDArray[np.uint16]
 
-    @property
-    def bytes(self) -> int:
-        """What the device holds."""
-        held = slice(self.first, self.last)
-        return self.volume.voxels[held].nbytes + self.inside[held].nbytes
-
 
 @dataclass(frozen=True)
-class _Window:
-    """The slices of the sample grid that hold one label and a layer around it, and how its mask packs them."""
+class _Window(Slab):
+    """The slices of the sample grid that hold one label and a layer around it, of what the device holds."""
 
-    first: int
-    shape: tuple[int, int, int]
-
-    @property
-    def rows(self) -> int:
-        """Rows along i."""
-        return self.shape[1] * self.shape[2]
+    held: tuple[int, int] = (0, 0)
 
     @property
-    def words(self) -> int:
-        """32-bit words of the mask a row."""
-        return -(-self.shape[0] // 32)
-
-    @property
-    def flag_words(self) -> int:
-        """32-bit words a row of one flag a word."""
-        return -(-self.words // 32)
+    def voxel_slices(self) -> tuple[int, int]:
+        """First and end of the slices of the volume that the device holds."""
+        return self.held
 
 
-def prepare_labels(device: Device, dtype: Any = np.int16) -> tuple[Any, Any]:
+def prepare_labels(device: Device, dtype: DTypeLike = np.int16) -> tuple[Program, Program]:
     """Build the kernels for volumes of `dtype`: those that find what is inside, and those of the surface.
 
     Raises
@@ -82,15 +79,8 @@ def prepare_labels(device: Device, dtype: Any = np.int16) -> tuple[Any, Any]:
     DeviceError
         The driver's compiler refuses.
     """
-    prepare_compaction(device)
-    variants = {
-        "VOXEL": plain.VOXEL_TYPES[np.dtype(dtype).name],
-        "VALUE": "float" if np.dtype(dtype).kind == "f" else "int",
-    }
-    if device.type == "cpu":
-        variants.update(LANES="8", WORDS_PER_ITEM="8")
-    own = load_program(device, "labels/own_samples.cl", variants)
-    return own, load_program(device, "isosurface/marching_cubes.cl", {**variants, "LABELS": "1"})
+    own = load_program(device, "labels/own_samples.cl", marching_cubes.kernel_variants(device, dtype))
+    return own, marching_cubes.prepare_marching_cubes(device, dtype, labels=True)
 
 
 def _choose_numbers(labels: LabelMap, numbers: Sequence[int | str] | None) -> tuple[int, ...]:
@@ -102,136 +92,132 @@ def _choose_numbers(labels: LabelMap, numbers: Sequence[int | str] | None) -> tu
     return chosen
 
 
-def _find_inside(
-    device: Device,
-    rule: IsoRule,
-    volume: Volume,
-    labels: NDArray[np.uint16],
-    boxes: dict[int, Box],
-    growth: tuple[NDArray[np.int32], NDArray[np.int32]],
-    program: Any,
-    solid: bool,
-    stopwatch: Stopwatch,
-) -> _Part:
-    """Upload the slices that the labels need, once, and find what is inside of which label."""
-    offsets, shells = growth
-    spare = SPARE_SLICES + int(np.abs(offsets[:, 2]).max(initial=0))  # labels that are not asked for grow too
-    first = max(0, min((box[0].start for box in boxes.values()), default=0) - spare)
-    last = min(volume.voxels.shape[0], max((box[0].stop for box in boxes.values()), default=1) + spare)
-    inside = np.zeros(volume.voxels.shape, dtype=np.uint16)
-    part = inside[first:last]
-    check_budget(device, {"volume": volume.voxels[first:last].nbytes, "labels": part.nbytes, "inside": part.nbytes})
-    level = plain._voxel_level(device, volume, rule)
-    near = np.concatenate([offsets, shells[:, None]], axis=1).astype(np.int32)
-    with stopwatch.timed("upload"):
-        voxels_d = upload(device, volume.voxels[first:last])
-        labels_d = upload(device, labels[first:last])
-        near_d = upload(device, near if len(near) else np.zeros((1, 4), np.int32))
-    inside_d = allocate(device, part.nbytes)
-    with stopwatch.running(device):
-        launch(
-            device, program["own_samples"], part.size, voxels_d, labels_d, near_d, inside_d, level,
-            *(np.int32(n) for n in part.shape[::-1]), np.int32(len(near)),
-            stopwatch=stopwatch,
-        )  # fmt: skip
-    with stopwatch.timed("download"):
-        download(device, part, inside_d)
-    if solid:
-        for number, box in boxes.items():
-            fill_solid(inside, labels, number, box, offsets, rule.closed)
+class _Run:
+    """One extraction: what is common to its labels."""
+
+    def __init__(
+        self, volume: Volume, taken: ResampledLabels, rule: IsoRule, growth: _Growth, device: Device, solid: bool
+    ):
+        self.volume = volume
+        self.labels = taken.voxels
+        self.rule = rule
+        self.growth = growth
+        self.device = device
+        self.solid = solid
+        self.stopwatch = Stopwatch()
+        self.grid = SampleGrid(volume, rule)
+        self.level = voxel_level(device, volume, rule)
+        self.placement = Placement.of(volume, rule.border)
+        with self.stopwatch.timed("build"):
+            self.own, self.surface = prepare_labels(device, volume.voxels.dtype)
+
+    def slices_for(self, boxes: dict[int, Box]) -> tuple[int, int]:
+        """First and end of the slices of the volume that these labels need."""
+        spare = SPARE_SLICES + self.growth.reach[2]  # labels that are not asked for grow too
+        first = max(0, min(box[0].start for box in boxes.values()) - spare)
+        return first, min(self.volume.shape_ijk[2], max(box[0].stop for box in boxes.values()) + spare)
+
+    def needs(self, first: int, end: int) -> dict[str, int]:
+        """Bytes on the device while what is inside is found in these slices."""
+        samples = self.volume.voxels[first:end].size
+        return {"volume": samples * self.volume.voxels.itemsize, "labels": 2 * samples, "inside": 2 * samples}
+
+    def group(self, boxes: dict[int, Box], memory: int | None) -> list[dict[int, Box]]:
+        """All labels at once where their slices fit the device, else one by one: the meshes are the same."""
+        room = memory_limits(self.device, memory)
+        needs = self.needs(*self.slices_for(boxes))
+        scratch = max(sum(self.window(box, (0, 0)).scratch().values()) for box in boxes.values())
+        if not describe_shortage(room, {**needs, "scratch": min(scratch, room.buffer_bytes)}):
+            return [boxes]
+        return [{number: box} for number, box in boxes.items()]
+
+    def find_inside(self, boxes: dict[int, Box], memory: int | None) -> _Held:
+        """Upload the slices that the labels need, and find what is inside of which label."""
+        device, stopwatch = self.device, self.stopwatch
+        first, end = self.slices_for(boxes)
+        check_budget(device, self.needs(first, end), memory)
+        inside = np.zeros(self.labels.shape, dtype=np.uint16)
+        part = inside[first:end]
+        offsets = self.growth.offsets
+        near = np.concatenate([offsets, self.growth.shells[:, None]], axis=1).astype(np.int32)
         with stopwatch.timed("upload"):
-            inside_d = upload(device, part)
-    return _Part(volume, rule, first, last, voxels_d, inside_d, inside)
+            voxels_d = upload(device, self.volume.voxels[first:end])
+            labels_d = upload(device, self.labels[first:end])
+            near_d = upload(device, near if len(near) else np.zeros((1, 4), np.int32))
+        inside_d = allocate(device, part.nbytes)
+        with stopwatch.running(device):
+            launch(
+                device, self.own["own_samples"], part.size, voxels_d, labels_d, near_d, inside_d, self.level,
+                *(np.int32(n) for n in part.shape[::-1]), np.int32(len(near)),
+                stopwatch=stopwatch,
+            )  # fmt: skip
+        with stopwatch.timed("download"):
+            download(device, part, inside_d)
+        if self.solid:
+            for number, box in boxes.items():
+                fill_solid(inside, self.labels, number, box, offsets, self.rule.closed)
+            with stopwatch.timed("upload"):
+                inside_d = upload(device, part)
+        return _Held(first, end, voxels_d, inside_d, inside)
 
+    def window(self, box: Box, held: tuple[int, int]) -> _Window:
+        """The slices of the sample grid around a label's box."""
+        return _Window(self.grid, box[0].start, box[0].stop + 2 * self.rule.border, held)
 
-def _extract_one(
-    device: Device, part: _Part, number: int, box: Box, own: Any, surface: Any, stopwatch: Stopwatch
-) -> Surface | None:
-    """Positions, normals and triangles of one label, None where nothing is inside of it."""
-    volume, rule = part.volume, part.rule
-    gi, gj, _ = (n + 2 * rule.border for n in volume.shape_ijk)
-    window = _Window(box[0].start, (gi, gj, box[0].stop - box[0].start + 2 * rule.border))
-    held = {"volume": part.bytes, "inside mask": 14 * window.rows * window.words, "row counts": 20 * window.rows}
-    check_budget(device, held)
-    mask_d = allocate(device, 4 * window.rows * window.words)
-    with stopwatch.running(device):
-        launch(
-            device, own["classify_label"], window.rows * window.words, part.inside_d, mask_d, np.uint32(number),
-            *_place(part, window), np.uint32(window.words),
-            stopwatch=stopwatch,
+    def extract_one(self, held: _Held, number: int, box: Box, memory: int | None) -> Part | None:
+        """Positions, normals and triangles of one label, None where nothing is inside of it."""
+        device, stopwatch = self.device, self.stopwatch
+        window = self.window(box, (held.first, held.end))
+        words = window.mask_rows * self.grid.words
+        needs = {**self.needs(held.first, held.end), **window.scratch()}
+        check_budget(device, needs, memory)
+        mask_d = allocate(device, 4 * words)
+        with stopwatch.running(device):
+            launch(
+                device, self.own["classify_label"], words, held.inside_d, mask_d, np.uint32(number),
+                *marching_cubes.volume_scalars(window), np.uint32(window.mask_slices), np.uint32(self.grid.words),
+                stopwatch=stopwatch,
+            )  # fmt: skip
+            counted = marching_cubes.count(device, window, self.surface, mask_d, stopwatch)
+        if counted.triangles == 0:
+            return None
+        check_budget(device, {**needs, **counted.output()}, memory)
+        return marching_cubes.emit(
+            device, window, self.surface, held.voxels_d, mask_d, counted, self.placement, 0, stopwatch,
+            (held.inside_d, np.uint32(number)),
         )  # fmt: skip
-        counts = plain._count(device, window, surface, mask_d, stopwatch)  # type: ignore[arg-type]
-    if counts.triangles == 0:
-        return None
-    check_budget(device, {**held, "vertices": 24 * counts.vertices, "triangles": 12 * counts.triangles})
-    return _emit(device, part, window, surface, mask_d, counts, number, stopwatch)
 
+    def share_by_hu(self, held: _Held, number: int, box: Box) -> float:
+        """Share of the vertices of a label that HU place; the others lie half way, on a border of the mask."""
+        inside = np.pad(held.inside[box], self.rule.border)
+        dense = np.pad(self.volume.voxels[box] >= self.rule.lowest_inside, self.rule.border)
+        own = inside == number
+        placing = np.where(own, dense, (inside == 0) & ~dense)
+        placed = crossed = 0
+        for axis in range(3):
+            edges = np.diff(own, axis=axis)
+            crossed += int(np.count_nonzero(edges))
+            both = [np.moveaxis(placing, axis, 0)[cut] for cut in (slice(None, -1), slice(1, None))]
+            placed += int(np.count_nonzero(np.moveaxis(edges, axis, 0) & both[0] & both[1]))
+        return placed / max(crossed, 1)
 
-def _place(part: _Part, window: _Window) -> tuple[Any, ...]:
-    """Sizes of the volume, where buffer and mask begin, and slices of the mask, as the kernels take them."""
-    sizes = tuple(np.int32(n) for n in part.volume.shape_ijk)
-    places = (np.int32(part.rule.border), np.int32(part.first), np.int32(window.first), np.uint32(window.shape[2]))
-    return *sizes, *places
-
-
-def _emit(
-    device: Device,
-    part: _Part,
-    window: _Window,
-    program: Any,
-    mask_d: Any,
-    counts: Any,
-    number: int,
-    stopwatch: Stopwatch,
-) -> Surface:
-    volume, rule = part.volume, part.rule
-    frames = plain._slice_frames(volume, rule.border)[window.first : window.first + window.shape[2]]
-    steps = plain._pad4(np.stack([half for step in (0, 1) for half in plain._split(volume.affine[:3, step])]))
-    frames_d, steps_d = upload(device, frames), upload(device, steps)
-    positions, positions_d = empty_output(device, (counts.vertices, 3), np.float32)
-    normals, normals_d = empty_output(device, (counts.vertices, 3), np.float32)
-    triangles, triangles_d = empty_output(device, (counts.triangles, 3), np.uint32)
-    active = counts.words.count
-    items = -(-active // (8 if device.type == "cpu" else 1))
-    packing = (np.uint32(window.words), np.uint32(window.flag_words), np.uint32(active))
-    outside = (np.float32 if volume.voxels.dtype.kind == "f" else np.int32)(rule.outside)
-    with stopwatch.running(device):
-        launch(
-            device, program["emit_vertices"], items,
-            part.voxels_d, mask_d, counts.words.positions_d, counts.vertex_offsets_d, counts.word_vertices_d,
-            frames_d, steps_d, positions_d, normals_d,
-            np.float32(rule.iso_level), outside, np.float32(rule.value_scale),
-            plain._pad4(vertex_margin(volume, rule.border)),
-            *_place(part, window), *packing, part.inside_d, np.uint32(number),
-            stopwatch=stopwatch,
-        )  # fmt: skip
-        launch(
-            device, program["emit_triangles"], items,
-            mask_d, counts.words.positions_d, counts.vertex_offsets_d, counts.triangle_offsets_d,
-            counts.word_vertices_d, counts.word_triangles_d, triangles_d, np.uint32(0),
-            *(np.uint32(n) for n in window.shape), *packing, np.int32(is_left_handed(volume.affine)),
-            stopwatch=stopwatch,
-        )  # fmt: skip
-    with stopwatch.timed("download"):
-        for array, array_d in ((positions, positions_d), (normals, normals_d), (triangles, triangles_d)):
-            download(device, array, array_d)
-    return positions, normals, triangles
-
-
-def _share_by_hu(part: _Part, number: int, box: Box) -> float:
-    """Share of the vertices of a label that HU place; the others lie half way, on a border of the mask."""
-    inside = np.pad(part.inside[box], part.rule.border)
-    dense = np.pad(part.volume.voxels[box] >= part.rule.lowest_inside, part.rule.border)
-    placing = np.where(inside == number, dense, (inside == 0) & ~dense)
-    own = inside == number
-    placed = crossed = 0
-    for axis in range(3):
-        here, there = (np.moveaxis(own, axis, 0)[cut] for cut in (slice(None, -1), slice(1, None)))
-        edges = here != there
-        crossed += int(np.count_nonzero(edges))
-        near, far = (np.moveaxis(placing, axis, 0)[cut] for cut in (slice(None, -1), slice(1, None)))
-        placed += int(np.count_nonzero(edges & near & far))
-    return placed / max(crossed, 1)
+    def describe(self) -> dict[str, Any]:
+        """What the reports of all labels have in common."""
+        rule = self.rule
+        return {
+            "iso_value_hu": rule.iso_value,
+            "iso_level_hu": rule.iso_level,
+            "closed_at_border": rule.closed,
+            "outside_hu": rule.outside if rule.closed else None,
+            "affine_ijk_to_lps_mm": self.volume.affine.tolist(),
+            "device": self.device.label,
+            "driver": self.device.driver,
+            "grow_mm": self.growth.mm,
+            "solid": self.solid,
+            "seconds": dict(self.stopwatch.seconds),
+            "kernel_seconds": dict(self.stopwatch.by_kernel),
+            "warnings": list(cache_warnings()),
+        }
 
 
 def _refuse_label(volume: Volume, taken: ResampledLabels, label: str, number: int, rule: IsoRule) -> NoSurfaceError:
@@ -255,7 +241,8 @@ def extract_labels(
     grow_mm: float | None = None,
     closed: bool = True,
     solid: bool = False,
-    progress: plain.Progress | None = None,
+    memory: int | None = None,
+    progress: Progress | None = None,
 ) -> dict[int, Mesh]:
     """Extract the iso surface of a volume label by label: the label picks the cells, HU place the vertices.
 
@@ -282,6 +269,9 @@ def extract_labels(
         As `extract_isosurface`.
     solid : bool
         Fill what is less dense within a label, see `clrecon.labels.solid`.
+    memory : int, optional
+        Bytes that may be taken on the device; None is all that it has.  Where the slices of all labels do not fit
+        together, the labels go through one by one; the meshes are the same.
     progress : callable, optional
         Called as ``progress("labels", done, total)``.
 
@@ -306,42 +296,40 @@ def extract_labels(
     taken = resample_labels(labels, volume)
     chosen = _choose_numbers(labels, numbers)
     rule = choose_iso_rule(volume, iso_value, closed)
+    if volume.shape_ijk[0] + 2 > marching_cubes.LONGEST_ROW:
+        raise UsageError(
+            f"the volume has {volume.shape_ijk[0]:,} columns, {marching_cubes.LONGEST_ROW - 2:,} are supported"
+        )
     grow_mm = checked_growth(volume, grow_mm)
-    offsets, shells = near_offsets(volume.affine, grow_mm)
-    reach = np.abs(offsets).max(axis=0, initial=0)
-    device = choose_device(device)
-    plain._check_grid(plain._SampleGrid(volume, rule))
-    boxes = find_boxes(taken.voxels, chosen, (int(reach[0]), int(reach[1]), int(reach[2])))
+    growth = _Growth(grow_mm, *near_offsets(volume.affine, grow_mm))
+    boxes = find_boxes(taken.voxels, chosen, growth.reach)
     names = {number: f"{number} {labels.name(number)}" for number in chosen}
-    for number in chosen:
-        if number not in boxes and numbers is not None:
-            raise _refuse_label(volume, taken, names[number], number, rule)
-    stopwatch = Stopwatch()
-    with stopwatch.timed("build"):
-        own, surface = prepare_labels(device, volume.voxels.dtype)
-    part = _find_inside(device, rule, volume, taken.voxels, boxes, (offsets, shells), own, solid, stopwatch)
+    missing = [number for number in chosen if number not in boxes]
+    if missing and numbers is not None:
+        raise _refuse_label(volume, taken, names[missing[0]], missing[0], rule)
+    run = _Run(volume, taken, rule, growth, choose_device(device), solid)
     meshes: dict[int, Mesh] = {}
-    for done, number in enumerate(boxes):
-        if progress is not None:
-            progress("labels", done, len(boxes))
-        extracted = _extract_one(device, part, number, boxes[number], own, surface, stopwatch)
-        if extracted is None:
-            if numbers is not None:
-                raise _refuse_label(volume, taken, names[number], number, rule)
-            continue
-        positions, normals, triangles = extracted
-        report = {
-            **plain._describe(device, plain._SampleGrid(volume, rule), stopwatch),
-            "label": number,
-            "label_name": labels.name(number),
-            "label_inside_share": taken.inside[number],
-            "vertices_by_hu_share": _share_by_hu(part, number, boxes[number]),
-            "grow_mm": grow_mm,
-            "solid": solid,
-        }
-        report["warnings"] += _warn(taken, report)
-        meshes[number] = Mesh(positions, triangles, normals, report)
-        stopwatch = Stopwatch()
+    for group in run.group(boxes, memory) if boxes else []:
+        held = run.find_inside(group, memory)
+        for number, box in group.items():
+            if progress is not None:
+                progress("labels", len(meshes), len(boxes))
+            part = run.extract_one(held, number, box, memory)
+            if part is None:
+                if numbers is not None:
+                    raise _refuse_label(volume, taken, names[number], number, rule)
+                continue
+            report = {
+                **run.describe(),
+                "label": number,
+                "label_name": labels.name(number),
+                "label_inside_share": taken.inside[number],
+                "vertices_by_hu_share": run.share_by_hu(held, number, box),
+            }
+            report["warnings"] += _warn(taken, report)
+            positions, normals, triangles = part
+            meshes[number] = Mesh(positions, triangles, normals, report)
+            run.stopwatch = Stopwatch()  # what is common to all labels counts for the first
     if not meshes:
         raise NoSurfaceError(f"no label has a voxel of {rule.iso_value:g} HU or more in the CT")
     return meshes

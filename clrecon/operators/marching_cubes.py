@@ -18,7 +18,16 @@ from clrecon.operators.compaction import exclusive_scan, prepare_scan
 from clrecon.operators.slabs import Slab
 from clrecon.operators.voxel_types import voxel_variants
 
-__all__ = ["Classified", "Counted", "Placement", "classify", "count", "emit", "prepare_marching_cubes"]
+__all__ = [
+    "Classified",
+    "Counted",
+    "Placement",
+    "classify",
+    "count",
+    "emit",
+    "prepare_marching_cubes",
+    "volume_scalars",
+]
 
 LONGEST_ROW = 13_000
 """Samples a row: places in a row are 16-bit numbers, and a cell has at most 5 triangles."""
@@ -49,8 +58,8 @@ class Counted:
         return {"vertices": 24 * self.vertices, "triangles": 12 * self.triangles}
 
 
-def prepare_marching_cubes(device: Device, dtype: DTypeLike) -> Program:
-    """Build the kernels for volumes of `dtype`.
+def prepare_marching_cubes(device: Device, dtype: DTypeLike, *, labels: bool = False) -> Program:
+    """Build the kernels for volumes of `dtype`; with `labels` those whose emit_vertices takes labels.
 
     Raises
     ------
@@ -58,8 +67,10 @@ def prepare_marching_cubes(device: Device, dtype: DTypeLike) -> Program:
         The driver's compiler refuses.
     """
     prepare_scan(device)
-    _load_classify(device, dtype)
-    return load_program(device, "isosurface/marching_cubes.cl", {**voxel_variants(dtype), **device.kernel_variants})
+    if not labels:
+        _load_classify(device, dtype)
+    variants = {**voxel_variants(dtype), **device.kernel_variants}
+    return load_program(device, "isosurface/marching_cubes.cl", {**variants, "LABELS": "1"} if labels else variants)
 
 
 def _load_classify(device: Device, dtype: DTypeLike) -> Program:
@@ -112,7 +123,7 @@ class Placement:
         return cls(frames, steps, _pad4(vertex_margin(volume, border)))
 
 
-def _volume_scalars(slab: Slab) -> tuple[Any, ...]:
+def volume_scalars(slab: Slab) -> tuple[Any, ...]:
     """ni, nj, nk, border, first_slice, first_sample_slice: how every pass is told where the slab lies."""
     shape, border = slab.grid.volume.shape_ijk, slab.grid.rule.border
     return tuple(np.int32(n) for n in (*shape, border, slab.voxel_slices[0], slab.first))
@@ -150,7 +161,7 @@ def classify(
         return Classified(mask_d, row_extents_d)
     launch(
         device, program["classify_samples"], slab.mask_rows,
-        voxels_d, mask_d, row_extents_d, level, *_volume_scalars(slab), np.uint32(slab.mask_slices),
+        voxels_d, mask_d, row_extents_d, level, *volume_scalars(slab), np.uint32(slab.mask_slices),
         np.int32(slab.grid.words), stopwatch=stopwatch,
     )  # fmt: skip
     return Classified(mask_d, row_extents_d)
@@ -216,6 +227,7 @@ def emit(
     placement: Placement,
     first_vertex: int,
     stopwatch: Stopwatch,
+    label_arguments: tuple[Any, ...] = (),
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.uint32]]:
     """Passes 3 and 4: positions, normals and triangles of the slab.
 
@@ -223,6 +235,8 @@ def emit(
     ----------
     first_vertex : int
         Vertices of all slabs before.
+    label_arguments : tuple
+        What emit_vertices takes more in a program that was built with labels.
     """
     grid = slab.grid
     volume, rule = grid.volume, grid.rule
@@ -243,7 +257,7 @@ def emit(
                 voxels_d, classified.mask_d, counted.active_words_d, counted.row_offsets_d, counted.word_vertices_d,
                 frames_d, steps_d, positions_d, normals_d,
                 np.float32(rule.iso_level), value(rule.outside), np.float32(rule.value_scale), placement.margin,
-                *_volume_scalars(slab), np.uint32(slab.mask_slices), *packing,
+                *volume_scalars(slab), np.uint32(slab.mask_slices), *packing, *label_arguments,
                 stopwatch=stopwatch,
             )  # fmt: skip
         if counted.triangles:

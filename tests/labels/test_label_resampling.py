@@ -96,6 +96,11 @@ def test_labels_of_another_place_are_refused_with_the_numbers():
         resample_labels(LabelMap(VOXELS, far), VOLUME)
 
 
+def test_an_empty_map_is_refused():
+    with pytest.raises(RefusedInputError, match="the label map is empty"):
+        resample_labels(LabelMap(np.zeros((2, 2, 2), np.uint8), OBLIQUE), VOLUME)
+
+
 def test_only_label_maps_and_volumes():
     with pytest.raises(UsageError, match="LabelMap, Volume"):
         resample_labels(VOXELS, VOLUME)

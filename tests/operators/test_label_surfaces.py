@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 import tolerances
 
-from clrecon.errors import NoSurfaceError, RefusedInputError, UsageError
+from clrecon.errors import DeviceError, NoSurfaceError, RefusedInputError, UsageError
 from clrecon.geometry import Volume
+from clrecon.geometry.field import choose_iso_rule
 from clrecon.labels import LabelMap, resample_labels
 from clrecon.labels.growth import near_offsets
 from clrecon.operators import labels as operator
@@ -69,14 +70,12 @@ def test_growth_is_that_of_the_twin_to_the_last_sample(device, grow_mm):
     for shape in [(5, 7, 9), (4, 4, 4), (5, 5, 5), (1, 1, 63), (3, 1, 65)]:
         for affine in (OBLIQUE, np.eye(4)):
             volume, labels = random_volume(shape, affine=affine), random_labels(shape, numbers=(0, 0, 0, 0, 2, 9))
-            offsets, shells = near_offsets(affine, grow_mm)
-            whole = {1: tuple(slice(0, n) for n in shape)}
-            own, _ = operator.prepare_labels(device)
-            rule = operator.choose_iso_rule(volume, 3)
-            part = operator._find_inside(
-                device, rule, volume, labels, whole, (offsets, shells), own, False, operator.Stopwatch()
-            )
-            assert np.array_equal(part.inside, twin.find_solid(volume, labels, 3, grow_mm=grow_mm))
+            growth = operator._Growth(grow_mm, *near_offsets(affine, grow_mm))
+            rule = choose_iso_rule(volume, 3)
+            taken = resample_labels(LabelMap(labels, affine), volume)
+            run = operator._Run(volume, taken, rule, growth, device, False)
+            held = run.find_inside({1: tuple(slice(0, n) for n in shape)}, None)
+            assert np.array_equal(held.inside, twin.find_solid(volume, labels, 3, grow_mm=grow_mm))
 
 
 def test_labels_are_closed_manifold_and_share_their_border(device):
@@ -121,6 +120,24 @@ def test_a_label_of_everything_is_the_plain_surface(device):
         assert np.array_equal(mesh.normals, plain.normals)
         assert np.array_equal(mesh.triangles, plain.triangles)
         assert mesh.report["vertices_by_hu_share"] == 1.0
+
+
+def test_labels_that_do_not_fit_together_go_through_one_by_one(device, monkeypatch):
+    shape = (60, 40, 40)
+    volume, labels = random_volume(shape), np.zeros(shape, np.uint16)
+    labels[:6], labels[28:31], labels[55:] = 3, 7, 9
+    expected = extract_labels(volume, LabelMap(labels, OBLIQUE), 3, device, solid=True)
+    uploads = []
+    true_upload = operator.upload
+    monkeypatch.setattr(operator, "upload", lambda d, a: uploads.append(a.shape) or true_upload(d, a))
+    meshes = extract_labels(volume, LabelMap(labels, OBLIQUE), 3, device, solid=True, memory=500_000)
+    assert sum(len(shape) == 3 and shape[1:] == (40, 40) for shape in uploads) == 9  # three for each label
+    for number, mesh in meshes.items():
+        assert np.array_equal(mesh.vertices, expected[number].vertices)
+        assert np.array_equal(mesh.normals, expected[number].normals)
+        assert np.array_equal(mesh.triangles, expected[number].triangles)
+    with pytest.raises(DeviceError, match="are allowed on"):
+        extract_labels(volume, LabelMap(labels, OBLIQUE), 3, device, memory=50_000)
 
 
 def test_labels_on_another_grid_are_the_same_where_it_covers_the_volume(device):
