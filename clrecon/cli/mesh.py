@@ -7,6 +7,7 @@ from typing import Any
 
 from clrecon.cli.common import add_device, add_memory, megabytes
 from clrecon.cli.console import Console, printable
+from clrecon.cli.labels import add_label_arguments, describe_labels
 from clrecon.cli.levels import LEVELS_HELP, parse_hu
 from clrecon.cli.points import parse_point
 from clrecon.cli.refinement import add_refinement, describe_refinement, finish_with_gates, refinement_settings
@@ -36,6 +37,7 @@ def _epilog() -> str:
             "  clrecon mesh CT_FOLDER -o skull.glb --hu 300 --keep-largest 1 --report skull.json",
             "  clrecon mesh CT_FOLDER -o bone.stl --hu auto",
             "  clrecon mesh CT_FOLDER -o bone.stl --hu 200,350 --min-volume 1 --split",
+            "  clrecon mesh CT_FOLDER -o bone.stl --labels spine.nii.gz --label T12 --label L1",
         )
     )
 
@@ -75,6 +77,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         " repeat it for several",
     )
     parser.add_argument("--split", action="store_true", help="write one file a component, the largest first")
+    add_label_arguments(parser)
     add_refinement(parser)
     add_device(parser)
     add_memory(parser)
@@ -83,6 +86,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace, console: Console) -> int:
     """Run the command; returns the exit code."""
+    from clrecon.pipeline.labels import choose_labels
     from clrecon.pipeline.mesh import make_mesh
     from clrecon.pipeline.settings import MeshSettings
 
@@ -96,6 +100,7 @@ def run(options: argparse.Namespace, console: Console) -> int:
         min_volume_ml=options.min_volume,
         seeds=options.seed,
         split=options.split,
+        labels=choose_labels(options.labels, options.label, options.grow, options.solid),
         device=options.device,
         memory=options.memory,
         **refinement_settings(options),
@@ -127,6 +132,7 @@ def describe_mesh(report: dict[str, Any]) -> list[str]:
         f"surface  {levels} HU ({reason}), {border} at the border of the volume",
         f"mesh     {report['vertices']:,} vertices, {report['triangles']:,} triangles",
         *_describe_quality(report),
+        *describe_labels(report["meshes"]),
         *_describe_parts(report["meshes"]),
         *describe_refinement(report["meshes"]),
         f"device   {printable(report['device'])}{_describe_slabs(report)}",

@@ -339,5 +339,7 @@ def _warn(taken: ResampledLabels, report: dict[str, Any]) -> list[str]:
     warnings = list(taken.warnings)
     if report["label_inside_share"] < 1.0:
         share = 100.0 * (1.0 - report["label_inside_share"])
-        warnings.append(f"{share:.3g} % of label {report['label']} lie outside the CT: its surface ends there")
+        warnings.append(
+            f"{share:.3g} % of label {report['label']} lie outside the CT: its surface ends where the CT does"
+        )
     return warnings

@@ -6,6 +6,7 @@ import os
 from collections.abc import Callable, Iterable, Sequence
 from typing import TYPE_CHECKING, Any
 
+from clrecon.pipeline.labels import describe_label
 from clrecon.pipeline.levels import describe_level
 from clrecon.pipeline.parts import Part
 from clrecon.pipeline.presets import find_preset
@@ -50,6 +51,7 @@ def describe_part(part: Part, file: StagedFile, output: str | os.PathLike[str], 
         "bounds_mm": _bounds(part.mesh, space),
         "output": {"format": os.path.splitext(output)[1].lower().lstrip("."), "bytes": file.size},
         "quality": {name: value for name, value in quality.items() if name not in _SAID_ABOVE} or None,
+        **describe_label(origin),
         **part.facts,
     }
 

@@ -8,10 +8,11 @@ from pathlib import Path
 from typing import Any
 
 from clrecon.pipeline.description import describe_job, describe_part
+from clrecon.pipeline.labels import extract_label_surfaces, open_labels
 from clrecon.pipeline.levels import choose_level
 from clrecon.pipeline.opening import DeviceOpening
 from clrecon.pipeline.outputs import check_outputs, commit_all, count_leftovers, name_outputs, stage_meshes
-from clrecon.pipeline.parts import extract_surfaces, first_names, plan_surfaces, select_parts
+from clrecon.pipeline.parts import check_levels, extract_surfaces, first_names, plan_surfaces, select_parts
 from clrecon.pipeline.progress import Progress, Stopwatch, ignore_progress
 from clrecon.pipeline.refinement import judge_parts, refine_surface, warn_of_gates
 from clrecon.pipeline.report import peak_memory_bytes, stage_report
@@ -34,7 +35,7 @@ def make_mesh(
     """Read a CT series, extract its surfaces, select what is asked for, measure and write it.
 
     One mesh is written to `output`.  Several, of several iso values or split into components, get a name between
-    stem and extension: ``bone_200hu.stl``, ``bone_001.stl``, ``bone_200hu_001.stl``.
+    stem and extension: ``bone_200hu.stl``, ``bone_001.stl``, ``bone_200hu_001.stl``, ``bone_T12.stl``.
 
     Outputs that cannot be written are refused first, then a device that is not there, then the input.  The device
     is opened and its kernels are built while the input is read.
@@ -76,6 +77,7 @@ def make_mesh(
     with DeviceOpening(settings.device, components=settings.selects) as opening:
         from clrecon.dicom import read_volume
 
+        labels = open_labels(settings.labels)
         volume = read_volume(source, settings.series, progress=progress)
         watch.lap("read")
         device = opening.wait()
@@ -88,7 +90,13 @@ def make_mesh(
         surfaces = plan_surfaces([choice.iso_value])
     watch.lap("choose")
 
-    extracted = extract_surfaces(volume, surfaces, device, settings, progress)
+    check_levels(volume, surfaces)
+    if labels is not None and settings.labels is not None:
+        surfaces, extracted = extract_label_surfaces(
+            volume, surfaces, labels, settings.labels, device, settings.closed, progress
+        )
+    else:
+        extracted = extract_surfaces(volume, surfaces, device, settings, progress)
     origins = [mesh.report for mesh in extracted]
     watch.lap("surface")
     if settings.selects:

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from clrecon.mesh import Mesh
     from clrecon.opencl import Device
 
-__all__ = ["Part", "Surface", "extract_surfaces", "first_names", "plan_surfaces", "select_parts"]
+__all__ = ["Part", "Surface", "check_levels", "extract_surfaces", "first_names", "plan_surfaces", "select_parts"]
 
 
 @dataclass(frozen=True)
@@ -75,6 +75,23 @@ def _digits(value: float) -> str:
     return text.removesuffix(".0")
 
 
+def check_levels(volume: Volume, surfaces: Sequence[Surface]) -> None:
+    """Refuse iso values that have every voxel inside.
+
+    Raises
+    ------
+    NoSurfaceError
+        One of them has.
+    """
+    low, high = volume.report["hu_range"]
+    for surface in surfaces:
+        if surface.iso_value <= low:  # the surface would be the box of the scan
+            raise NoSurfaceError(
+                f"no surface at {surface.iso_value:g} HU: every voxel is inside,"
+                f" the volume runs from {low:g} to {high:g} HU"
+            )
+
+
 def extract_surfaces(
     volume: Volume, surfaces: Sequence[Surface], device: Device, settings: MeshSettings, progress: Progress
 ) -> list[Mesh]:
@@ -83,17 +100,10 @@ def extract_surfaces(
     Raises
     ------
     NoSurfaceError
-        One of the iso values crosses nothing, or has every voxel inside.
+        One of the iso values crosses nothing.
     """
     from clrecon.operators.isosurface import extract_isosurfaces
 
-    low, high = volume.report["hu_range"]
-    for surface in surfaces:
-        if surface.iso_value <= low:  # the surface would be the box of the scan
-            raise NoSurfaceError(
-                f"no surface at {surface.iso_value:g} HU: every voxel is inside,"
-                f" the volume runs from {low:g} to {high:g} HU"
-            )
     levels = [surface.iso_value for surface in surfaces]
     return extract_isosurfaces(
         volume, levels, device, closed=settings.closed, memory=settings.memory, progress=progress

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from clrecon.errors import UsageError
+from clrecon.pipeline.labels import LabelChoice
 from clrecon.pipeline.presets import DEFAULT_PRESET, find_preset
 
 __all__ = ["MeshSettings"]
@@ -38,6 +39,8 @@ class MeshSettings:
         Keep only the components whose surface lies nearest to these points, in mm of the frame `space`.
     split : bool
         One mesh a component, the largest first.
+    labels : LabelChoice, optional
+        A label map: one mesh a label, see `clrecon.pipeline.labels`.
     device : str, optional
         Name or index of an OpenCL device; None leaves the choice to `choose_device`.
     memory : int, optional
@@ -67,6 +70,7 @@ class MeshSettings:
     min_volume_ml: float | None = None
     seeds: Sequence[Sequence[float]] = ()
     split: bool = False
+    labels: LabelChoice | None = None
     device: str | None = None
     memory: int | None = None
     smooth: int | None = None

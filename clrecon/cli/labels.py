@@ -1,0 +1,40 @@
+"""The options of ``clrecon mesh`` for label maps, and what it says of their surfaces."""
+
+from __future__ import annotations
+
+import argparse
+from typing import Any
+
+__all__ = ["add_label_arguments", "describe_labels"]
+
+
+def add_label_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options for label maps."""
+    group = parser.add_argument_group("labels", "one mesh a label: the label picks the cells, HU place the vertices")
+    group.add_argument("--labels", metavar="FILE", help="label map: NIfTI, NRRD (.seg.nrrd too) or DICOM SEG")
+    group.add_argument(
+        "--label", metavar="NAME|N", action="append", help="this label only; may be given again (default: all)"
+    )
+    group.add_argument("--solid", action="store_true", help="fill what is less dense within a label: marrow")
+    group.add_argument(
+        "--grow",
+        type=float,
+        metavar="MM",
+        help="dense voxels this near to a label are its own (default: 1.5 times the pixel spacing)",
+    )
+
+
+def describe_labels(meshes: list[dict[str, Any]]) -> list[str]:
+    """A line about the surfaces of labels, none where there are none."""
+    labels = [mesh for mesh in meshes if mesh["label"] is not None]
+    if not labels:
+        return []
+    shares = [100.0 * mesh["vertices_by_hu_share"] for mesh in labels]
+    low, high = min(shares), max(shares)
+    share = f"{low:.0f}" if round(low) == round(high) else f"{low:.0f} to {high:.0f}"
+    count = len({mesh["label_number"] for mesh in labels})
+    kind = ", solid" if labels[0]["solid"] else ""
+    return [
+        f"labels   {count} label{'s' * (count > 1)}{kind}, grown by {labels[0]['grow_mm']:.3g} mm;"
+        f" HU place {share} % of the vertices"
+    ]

@@ -1,0 +1,125 @@
+"""``clrecon mesh --labels``: files, their names, the report, and what is said of what cannot be."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import tolerances
+from ct_files import ORIGIN, PATIENT, RADIUS_MM, SPACING, sphere_voxels, write_series
+from label_files import write_nifti
+
+from clrecon.cli.main import main
+
+pytest.importorskip("nibabel")
+AFFINE = np.diag([*SPACING, 1.0])
+AFFINE[:3, 3] = ORIGIN
+NAMES = (
+    b'<LabelTable><Label Key="1"><![CDATA[left half]]></Label><Label Key="2"><![CDATA[../RIGHT half]]></Label>'
+    b'<Label Key="3"><![CDATA[Doe^Jane\x1b[31m]]></Label></LabelTable>'
+)
+SPHERE_ML = 4.0 / 3.0 * np.pi * RADIUS_MM**3 / 1000.0
+
+
+@pytest.fixture(scope="module")
+def ct(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_series(tmp_path_factory.mktemp("ct") / "scan")
+
+
+@pytest.fixture(scope="module")
+def labels(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two halves of the sphere, and a label in the air."""
+    voxels = np.zeros(sphere_voxels().shape, np.uint8)
+    dense = sphere_voxels() >= 0
+    voxels[:, :, :15] = dense[:, :, :15]
+    voxels[:, :, 15:] = 2 * dense[:, :, 15:]
+    voxels[:2, :2, :2] = 3
+    return Path(write_nifti(tmp_path_factory.mktemp("labels") / "a.nii.gz", voxels, AFFINE, extension=NAMES))
+
+
+def run(*arguments: object, device: Any = None) -> int:
+    chosen = [] if device is None else ["--device", device.index]
+    return main([str(argument) for argument in ("mesh", *arguments, *chosen)])
+
+
+def test_each_label_gets_a_file_of_its_name(
+    device: Any, ct: Path, labels: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    options = ("--labels", labels, "--hu", -150, "--report", tmp_path / "r.json")
+    assert run(ct, "-o", tmp_path / "bone.stl", *options, device=device) == 0
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["bone_RIGHT_half.stl", "bone_left_half.stl", "r.json"]
+    captured = capsys.readouterr()
+    assert "labels   2 labels, grown by 1.65 mm; HU place" in captured.out
+    assert "1 label has no voxel of -150 HU or more in the CT and no mesh: 3 Doe_Jane_x1b_31m" in captured.err
+    report = json.loads((tmp_path / "r.json").read_text())
+    assert [(mesh["name"], mesh["label"], mesh["label_number"]) for mesh in report["meshes"]] == [
+        ("left_half", "left_half", 1), ("RIGHT_half", "RIGHT_half", 2),
+    ]  # fmt: skip
+    assert report["closed"] and report["manifold"]
+    assert report["volume_ml"] == pytest.approx(SPHERE_ML, rel=tolerances.CLI_SPHERE_VOLUME_SHARE)
+    for mesh in report["meshes"]:
+        assert mesh["label_inside_share"] == 1.0 and 0.5 < mesh["vertices_by_hu_share"] < 1.0
+        assert mesh["grow_mm"] == pytest.approx(1.65) and mesh["solid"] is False
+    assert PATIENT not in (tmp_path / "r.json").read_text()
+
+
+def test_one_label_is_the_output_itself(device: Any, ct: Path, labels: Path, tmp_path: Path) -> None:
+    for label in ("left half", "1", "LEFT"):
+        options = ("--labels", labels, "--label", label, "--solid", "--grow", "0.9", "--hu", -150)
+        assert run(ct, "-o", tmp_path / "one.stl", *options, device=device) == 0
+    assert [path.name for path in tmp_path.iterdir()] == ["one.stl"]
+
+
+def test_labels_and_iso_values_together(device: Any, ct: Path, labels: Path, tmp_path: Path) -> None:
+    options = ("--labels", labels, "--label", 2, "--label", 1, "--hu", "-150,300")
+    assert run(ct, "-o", tmp_path / "b.ply", *options, device=device) == 0
+    assert sorted(path.name for path in tmp_path.iterdir()) == [
+        "b_RIGHT_half_-150hu.ply", "b_RIGHT_half_300hu.ply", "b_left_half_-150hu.ply", "b_left_half_300hu.ply",
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("options", "code", "words"),
+    [
+        (["--label", "T12"], 3, "label 'T12' is not in the label map; there are: 1 left half, 2 ../RIGHT half, 3 Doe"),
+        (["--label", "half"], 3, "'half' names several labels"),
+        (["--label", "3"], 2, "no surface of label 3 Doe^Jane\\x1b[31m at -150 HU: its voxels run from -1000 to -1000"),
+        (["--grow", "-1"], 3, "labels grow by 0 mm or more"),
+        (["--hu", "-1000"], 2, "every voxel is inside"),
+    ],
+)
+def test_what_cannot_be_is_said_in_one_line(
+    options: list[str], code: int, words: str, device: Any, ct: Path, labels: Path, tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    level = [] if "--hu" in options else ["--hu", "-150"]
+    assert run(ct, "-o", tmp_path / "b.stl", "--labels", labels, *level, *options, device=device) == code
+    error = capsys.readouterr().err
+    assert words in error and error.count("\n") == 1 and "\x1b" not in error
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("options", [["--solid"], ["--label", "1"], ["--grow", "1"]])
+def test_label_options_without_labels_are_refused(
+    options: list[str], ct: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(ct, "-o", tmp_path / "b.stl", *options) == 3
+    assert f"{options[0]} says how labels become meshes" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("content", "code", "words"),
+    [(None, 3, "there is no label map"), (b"", 4, "is no label map"), (b"\x1f\x8b\x08\0", 4, "is no label map")],
+)
+def test_a_label_map_that_cannot_be_read_ends_the_job(
+    content: bytes | None, code: int, words: str, device: Any, ct: Path, tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    if content is not None:
+        (tmp_path / "a.nii.gz").write_bytes(content)
+    assert run(ct, "-o", tmp_path / "b.stl", "--labels", tmp_path / "a.nii.gz", device=device) == code
+    assert words in capsys.readouterr().err
+    assert not (tmp_path / "b.stl").exists()
