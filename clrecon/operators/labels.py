@@ -24,7 +24,7 @@ from clrecon.opencl import Device, check_budget, choose_device, describe_shortag
 from clrecon.opencl.quirks import cache_warnings
 from clrecon.operators import marching_cubes
 from clrecon.operators.isosurface import Part, Progress, voxel_level
-from clrecon.operators.marching_cubes import Placement
+from clrecon.operators.marching_cubes import Classified, Placement
 from clrecon.operators.slabs import SampleGrid, Slab
 
 __all__ = ["extract_labels", "prepare_labels"]
@@ -168,22 +168,23 @@ class _Run:
         """Positions, normals and triangles of one label, None where nothing is inside of it."""
         device, stopwatch = self.device, self.stopwatch
         window = self.window(box, (held.first, held.end))
-        words = window.mask_rows * self.grid.words
         needs = {**self.needs(held.first, held.end), **window.scratch()}
         check_budget(device, needs, memory)
-        mask_d = allocate(device, 4 * words)
+        mask_d = allocate(device, 4 * window.mask_rows * self.grid.words)
+        classified = Classified(mask_d, allocate(device, window.mask_rows))
         with stopwatch.running(device):
             launch(
-                device, self.own["classify_label"], words, held.inside_d, mask_d, np.uint32(number),
-                *marching_cubes.volume_scalars(window), np.uint32(window.mask_slices), np.uint32(self.grid.words),
+                device, self.own["classify_label"], window.mask_rows,
+                held.inside_d, mask_d, classified.row_states_d, np.uint32(number),
+                *marching_cubes.volume_scalars(window), np.uint32(window.mask_slices), np.int32(self.grid.words),
                 stopwatch=stopwatch,
             )  # fmt: skip
-            counted = marching_cubes.count(device, window, self.surface, mask_d, stopwatch)
+            counted = marching_cubes.count(device, window, self.surface, classified, stopwatch)
         if counted.triangles == 0:
             return None
         check_budget(device, {**needs, **counted.output()}, memory)
         return marching_cubes.emit(
-            device, window, self.surface, held.voxels_d, mask_d, counted, self.placement, 0, stopwatch,
+            device, window, self.surface, held.voxels_d, classified, counted, self.placement, 0, stopwatch,
             (held.inside_d, np.uint32(number)),
         )  # fmt: skip
 
