@@ -32,8 +32,8 @@ ROUNDED_AFFINE_MM = 0.006  # positions rounded to 0.01 mm: half of it, and the f
 # --- labels ---
 NIFTI_AFFINE_MM = 1e-5  # sform entries and quaternions are float32: coordinates of some 100 mm
 
-REAL_SOLID_VOLUME = 0.06  # a vertebra at 2 mm against its mask: the mask is drawn by a network; measured -3.5 %
-LABEL_SPHERE_VOLUME = 0.015  # chords of a partial-volume sphere of 9.4 voxels lose 1 %; measured 0.9 %, with a leak 1.1
+REAL_SOLID_VOLUME = 0.05  # a vertebra at 2 mm and 200 HU against its mask, which a network drew; measured -1.2 %
+LABEL_SPHERE_VOLUME = 0.015  # chords of a partial-volume sphere of 9.4 voxels lose 1 %; measured 0.9 %
 
 # --- phantom ---
 PHANTOM_VOLUME_RATIO = 1e-3  # sum of partial volumes against analysis; the cell ramp leaves 0.03 % at R = 5 voxels

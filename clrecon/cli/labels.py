@@ -20,7 +20,7 @@ def add_label_arguments(parser: argparse.ArgumentParser) -> None:
         "--grow",
         type=float,
         metavar="MM",
-        help="dense voxels this near to a label are its own (default: 1.5 times the pixel spacing)",
+        help="dense voxels this near to a label are its own (default: one voxel each way)",
     )
 
 
@@ -33,8 +33,7 @@ def describe_labels(meshes: list[dict[str, Any]]) -> list[str]:
     low, high = min(shares), max(shares)
     share = f"{low:.0f}" if round(low) == round(high) else f"{low:.0f} to {high:.0f}"
     count = len({mesh["label_number"] for mesh in labels})
+    grow_mm = labels[0]["grow_mm"]
+    growth = "one voxel" if grow_mm is None else f"{grow_mm:.3g} mm"
     kind = ", solid" if labels[0]["solid"] else ""
-    return [
-        f"labels   {count} label{'s' * (count > 1)}{kind}, grown by {labels[0]['grow_mm']:.3g} mm;"
-        f" HU place {share} % of the vertices"
-    ]
+    return [f"labels   {count} label{'s' * (count > 1)}{kind}, grown by {growth}; HU place {share} % of the vertices"]

@@ -1,8 +1,9 @@
-"""Which samples lie within some millimetres of a sample, nearest first: how labels grow, on host and device alike."""
+"""Which samples lie around a sample, nearest first: how labels grow, on host and device alike."""
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -11,26 +12,57 @@ from numpy.typing import NDArray
 from clrecon.errors import UsageError
 from clrecon.geometry import Volume
 
-__all__ = ["GROW_STEPS", "checked_growth", "near_offsets"]
-
-GROW_STEPS = 1.5
-"""Default growth in the largest in-plane spacing: all eight neighbours in the slice."""
+__all__ = ["Growth"]
 
 MOST_OFFSETS = 5000
 SAME_DISTANCE = 1e-6
 """Relative; offsets whose lengths differ by rounding alone are equally near."""
 
 
-def checked_growth(volume: Volume, grow_mm: float | None) -> float:
-    """The growth in mm, the default where None is given.
+@dataclass(frozen=True)
+class Growth:
+    """How far labels grow.
 
-    Raises
-    ------
-    UsageError
-        It is no number, negative, or so large that whole bones would be swallowed.
+    Attributes
+    ----------
+    grow_mm : float or None
+        None: one voxel each way.
+    offsets : ndarray, shape (n, 3), int32
+        (di, dj, dk) to the samples around, without (0, 0, 0), nearest in mm first, shear included.
+    shells : ndarray, shape (n,), int32
+        From 0; equal for offsets of equal length.
     """
-    if grow_mm is None:
-        return GROW_STEPS * max(volume.spacing[:2])
+
+    grow_mm: float | None
+    offsets: NDArray[np.int32]
+    shells: NDArray[np.int32]
+
+    @classmethod
+    def of(cls, volume: Volume, grow_mm: float | None) -> Growth:
+        """The growth by `grow_mm` on the grid of a volume.
+
+        Raises
+        ------
+        UsageError
+            `grow_mm` is no number, negative, or so large that whole bones would be swallowed.
+        """
+        steps = volume.affine[:3, :3]
+        if grow_mm is None:
+            return cls(None, *_sort(_offsets_within((1, 1, 1)), steps))
+        limit = _checked(grow_mm, volume)
+        reach = np.floor(limit * np.linalg.norm(np.linalg.inv(steps), axis=1) + 1e-9).astype(int)
+        offsets = _offsets_within(tuple(reach))
+        near = np.linalg.norm(offsets @ steps.T, axis=1) <= limit * (1.0 + SAME_DISTANCE)
+        return cls(limit, *_sort(offsets[near], steps))
+
+    @property
+    def reach(self) -> tuple[int, int, int]:
+        """Samples along i, j, k."""
+        i, j, k = np.abs(self.offsets).max(axis=0, initial=0)
+        return int(i), int(j), int(k)
+
+
+def _checked(grow_mm: float, volume: Volume) -> float:
     try:
         number = float(grow_mm)
     except (TypeError, ValueError) as error:
@@ -46,28 +78,19 @@ def checked_growth(volume: Volume, grow_mm: float | None) -> float:
     return number
 
 
-def near_offsets(affine: NDArray[np.float64], grow_mm: float) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-    """Offsets between samples that are at most `grow_mm` apart, shear included, nearest first.
-
-    Returns
-    -------
-    offsets : ndarray, shape (n, 3), int32
-        (di, dj, dk), without (0, 0, 0).
-    shells : ndarray, shape (n,), int32
-        From 0; equal for offsets of equal length.
-    """
-    steps = affine[:3, :3]
-    reach = np.floor(grow_mm * np.linalg.norm(np.linalg.inv(steps), axis=1) + 1e-9).astype(int)
+def _offsets_within(reach: tuple[Any, ...]) -> NDArray[np.int32]:
     grids: Any = np.meshgrid(*(np.arange(-n, n + 1) for n in reach), indexing="ij")
-    offsets = np.stack([grid.ravel() for grid in grids], axis=1)
+    offsets = np.stack([grid.ravel() for grid in grids], axis=1).astype(np.int32)
+    return offsets[offsets.any(axis=1)]
+
+
+def _sort(offsets: NDArray[np.int32], steps: NDArray[np.float64]) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+    """Offsets by length, and their shells; within a shell in the order of the indices, whatever rounding does."""
     lengths = np.linalg.norm(offsets @ steps.T, axis=1)
-    near = (lengths <= grow_mm * (1.0 + SAME_DISTANCE)) & offsets.any(axis=1)
-    offsets, lengths = offsets[near], lengths[near]
-    order = np.lexsort((*offsets.T, lengths))
+    order = np.argsort(lengths, kind="stable")
     offsets, lengths = offsets[order], lengths[order]
     shells = np.zeros(len(lengths), dtype=np.int32)
     if len(lengths):
         shells[1:] = np.cumsum(np.diff(lengths) > SAME_DISTANCE * lengths[:-1])
-    # Equal lengths may come in any order of rounding: within a shell the order is that of the indices.
     order = np.lexsort((*offsets.T, shells))
     return np.ascontiguousarray(offsets[order], dtype=np.int32), shells

@@ -16,7 +16,7 @@ def find_boxes(labels: NDArray[Any], numbers: tuple[int, ...], reach: tuple[int,
     """The box (k, j, i) of each number's samples, grown by `reach` (i, j, k) samples and one more, within the grid."""
     from scipy.ndimage import find_objects
 
-    found = find_objects(labels, max_label=max(numbers))
+    found = find_objects(labels, max_label=max(numbers, default=0))
     boxes = {}
     for number in numbers:
         box = found[number - 1]
@@ -28,19 +28,17 @@ def find_boxes(labels: NDArray[Any], numbers: tuple[int, ...], reach: tuple[int,
     return boxes  # type: ignore[return-value]
 
 
-def fill_solid(
-    solid: NDArray[np.uint16],
-    labels: NDArray[np.uint16],
-    number: int,
-    box: Box,
-    offsets: NDArray[np.int32],
-    closed: bool,
-) -> int:
+def fill_solid(solid: NDArray[np.uint16], labels: NDArray[np.uint16], number: int, box: Box, closed: bool) -> int:
     """Make the inside of one label solid, in place.
 
-    A sample below the iso value counts as inside of the label when it lies deep in the mask (all samples within the
-    growth carry the label), or when no way through samples that are not inside leads from it to the outside.  Within
-    the growth of the mask's border it stays what HU say, as far as the outside reaches: HU place the outer surface.
+    What is not inside of the label already is, when one of these holds:
+
+    - It is deep in the mask: all 26 neighbours carry the label too.  (The volume's end is no border of the mask.)
+    - It carries the label, and no way that is three samples wide leads to it from outside.
+    - It carries no label, and no way at all leads to it from outside.
+
+    A way is a chain of face neighbours of which none is inside or deep.  So in the outermost layer of the mask HU
+    decide, as far as the outside comes in: they place the outer surface.  Pores of the cortex do not let it in.
 
     Parameters
     ----------
@@ -51,8 +49,6 @@ def fill_solid(
     number : int
     box : 3 slices
         Of the label and what surrounds it by at least one sample, as `find_boxes` gives it.
-    offsets : ndarray, shape (n, 3), int32
-        Of the growth, see `near_offsets`.
     closed : bool
         Beyond the border of the volume is outside.
 
@@ -61,40 +57,40 @@ def fill_solid(
     int
         Samples that were filled.
     """
-    from scipy.ndimage import label as find_components
+    from scipy.ndimage import binary_dilation, binary_erosion
 
-    own = solid[box] == number
-    passable = np.pad(~(own | _deep(labels[box] == number, offsets)), 1, constant_values=True)
+    cube = np.ones((3, 3, 3), dtype=bool)
+    own, mask = solid[box] == number, labels[box] == number
+    deep = binary_erosion(mask, cube, border_value=1)
+    passable = np.pad(~(own | deep), 1, constant_values=True)
     if not closed:
-        # The way out leads through the sides of the box, but not where the volume itself ends.
-        for axis, (part, size) in enumerate(zip(box, solid.shape, strict=True)):
-            for side, at_end in ((0, part.start == 0), (-1, part.stop == size)):
-                face: list[Any] = [slice(None)] * 3
-                face[axis] = side
-                if at_end:
-                    passable[tuple(face)] = False
-    components, _ = find_components(passable)
-    outer = np.ones(passable.shape, dtype=bool)
-    outer[1:-1, 1:-1, 1:-1] = False
-    ways_out = np.unique(components[outer & passable])
-    is_outside = np.zeros(int(components.max()) + 1, dtype=bool)
-    is_outside[ways_out] = True
-    enclosed = ~is_outside[components][1:-1, 1:-1, 1:-1] | ~passable[1:-1, 1:-1, 1:-1]
-    mine = (labels[box] == number) | (labels[box] == 0)
-    filled = enclosed & ~own & mine & (solid[box] == 0)
+        _close_ends(passable, box, solid.shape)
+    outside = _reach_from_faces(passable)
+    wide = _reach_from_faces(passable & ~binary_dilation(np.pad(own, 1), cube))
+    wide = binary_dilation(wide, cube) & outside
+    inner = (slice(1, -1),) * 3
+    filled = (mask & ~wide[inner]) | ((labels[box] == 0) & ~outside[inner])
+    filled &= solid[box] == 0
     solid[box][filled] = number
     return int(np.count_nonzero(filled))
 
 
-def _deep(mask: NDArray[np.bool_], offsets: NDArray[np.int32]) -> NDArray[np.bool_]:
-    """Samples of the mask all of whose neighbours within the growth are of it; beyond the box goes on as its border."""
-    if not len(offsets):
-        return mask.copy()
-    reach = np.abs(offsets).max(axis=0)
-    padded = np.pad(mask, [(n, n) for n in reach[::-1]], mode="edge")
-    deep = mask.copy()
-    nk, nj, ni = mask.shape
-    for di, dj, dk in offsets:
-        i, j, k = di + reach[0], dj + reach[1], dk + reach[2]
-        deep &= padded[k : k + nk, j : j + nj, i : i + ni]
-    return deep
+def _close_ends(passable: NDArray[np.bool_], box: Box, shape: tuple[int, ...]) -> None:
+    """The way out leads through the sides of the box, but not where the volume itself ends."""
+    for axis, (part, size) in enumerate(zip(box, shape, strict=True)):
+        for side, at_end in ((0, part.start == 0), (-1, part.stop == size)):
+            if at_end:
+                np.moveaxis(passable, axis, 0)[side] = False
+
+
+def _reach_from_faces(passable: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """What can be reached from the sides of the box through face neighbours."""
+    from scipy.ndimage import label as find_components
+
+    components, count = find_components(passable)
+    reached = np.zeros(count + 1, dtype=bool)
+    for axis in range(3):
+        for side in (0, -1):
+            reached[np.unique(np.moveaxis(components, axis, 0)[side])] = True
+    reached[0] = False
+    return np.asarray(reached[components])

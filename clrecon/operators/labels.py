@@ -17,7 +17,7 @@ from clrecon.geometry import Volume
 from clrecon.geometry.field import IsoRule, choose_iso_rule
 from clrecon.kernels import Program, Stopwatch, allocate, download, launch, load_program, upload
 from clrecon.labels import LabelMap, ResampledLabels, resample_labels
-from clrecon.labels.growth import checked_growth, near_offsets
+from clrecon.labels.growth import Growth
 from clrecon.labels.solid import Box, fill_solid, find_boxes
 from clrecon.mesh import Mesh
 from clrecon.opencl import Device, check_budget, choose_device, describe_shortage, memory_limits
@@ -31,21 +31,6 @@ __all__ = ["extract_labels", "prepare_labels"]
 
 SPARE_SLICES = 2
 """Beyond the label's box: the far end of a crossed edge, and what its gradient needs."""
-
-
-@dataclass(frozen=True)
-class _Growth:
-    """How far labels grow: offsets to the samples around, nearest first, and which of them are equally near."""
-
-    mm: float
-    offsets: NDArray[np.int32]
-    shells: NDArray[np.int32]
-
-    @property
-    def reach(self) -> tuple[int, int, int]:
-        """Samples along i, j, k."""
-        i, j, k = np.abs(self.offsets).max(axis=0, initial=0)
-        return int(i), int(j), int(k)
 
 
 @dataclass(frozen=True)
@@ -96,7 +81,7 @@ class _Run:
     """One extraction: what is common to its labels."""
 
     def __init__(
-        self, volume: Volume, taken: ResampledLabels, rule: IsoRule, growth: _Growth, device: Device, solid: bool
+        self, volume: Volume, taken: ResampledLabels, rule: IsoRule, growth: Growth, device: Device, solid: bool
     ):
         self.volume = volume
         self.labels = taken.voxels
@@ -138,8 +123,7 @@ class _Run:
         check_budget(device, self.needs(first, end), memory)
         inside = np.zeros(self.labels.shape, dtype=np.uint16)
         part = inside[first:end]
-        offsets = self.growth.offsets
-        near = np.concatenate([offsets, self.growth.shells[:, None]], axis=1).astype(np.int32)
+        near = np.concatenate([self.growth.offsets, self.growth.shells[:, None]], axis=1)
         with stopwatch.timed("upload"):
             voxels_d = upload(device, self.volume.voxels[first:end])
             labels_d = upload(device, self.labels[first:end])
@@ -155,7 +139,7 @@ class _Run:
             download(device, part, inside_d)
         if self.solid:
             for number, box in boxes.items():
-                fill_solid(inside, self.labels, number, box, offsets, self.rule.closed)
+                fill_solid(inside, self.labels, number, box, self.rule.closed)
             with stopwatch.timed("upload"):
                 inside_d = upload(device, part)
         return _Held(first, end, voxels_d, inside_d, inside)
@@ -213,7 +197,7 @@ class _Run:
             "affine_ijk_to_lps_mm": self.volume.affine.tolist(),
             "device": self.device.label,
             "driver": self.device.driver,
-            "grow_mm": self.growth.mm,
+            "grow_mm": self.growth.grow_mm,
             "solid": self.solid,
             "seconds": dict(self.stopwatch.seconds),
             "kernel_seconds": dict(self.stopwatch.by_kernel),
@@ -248,7 +232,7 @@ def extract_labels(
     """Extract the iso surface of a volume label by label: the label picks the cells, HU place the vertices.
 
     A voxel is inside of a label when it is dense (`iso_value` or more) and the label owns it: by the map, or, without
-    a label there, as the nearest one within `grow_mm`.  Between a dense voxel of the label and one that is neither
+    a label there, as the nearest one within the growth.  Between a dense voxel of the label and one that is neither
     dense nor of any label the vertex is that of `extract_isosurface`, bit for bit.  Elsewhere (the border of two
     labels, dense voxels beyond the growth) it lies half way.  Every mesh is closed and manifold; two labels share the
     vertices of their border, bit for bit.
@@ -265,7 +249,7 @@ def extract_labels(
     numbers : sequence of int or str, optional
         Labels to extract, as `LabelMap.find` takes them; each must have a surface.  None: all that have one.
     grow_mm : float, optional
-        None is 1.5 times the larger in-plane spacing.
+        None is one voxel each way, the 26 neighbours.
     closed : bool
         As `extract_isosurface`.
     solid : bool
@@ -301,8 +285,7 @@ def extract_labels(
         raise UsageError(
             f"the volume has {volume.shape_ijk[0]:,} columns, {marching_cubes.LONGEST_ROW - 2:,} are supported"
         )
-    grow_mm = checked_growth(volume, grow_mm)
-    growth = _Growth(grow_mm, *near_offsets(volume.affine, grow_mm))
+    growth = Growth.of(volume, grow_mm)
     boxes = find_boxes(taken.voxels, chosen, growth.reach)
     names = {number: f"{number} {labels.name(number)}" for number in chosen}
     missing = [number for number in chosen if number not in boxes]

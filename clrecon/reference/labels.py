@@ -9,14 +9,14 @@ from numpy.typing import NDArray
 
 from clrecon.geometry import Volume
 from clrecon.geometry.field import choose_iso_rule
-from clrecon.labels.growth import checked_growth, near_offsets
+from clrecon.labels.growth import Growth
 from clrecon.labels.solid import fill_solid, find_boxes
 from clrecon.reference.isosurface import Surface, extract_inside, sample_grid
 
 __all__ = ["extract_label", "find_solid", "own_labels"]
 
 
-def own_labels(labels: NDArray[Any], volume: Volume, grow_mm: float) -> NDArray[np.uint16]:
+def own_labels(labels: NDArray[Any], volume: Volume, grow_mm: float | None) -> NDArray[np.uint16]:
     """Grow labels into samples without one.
 
     Parameters
@@ -24,24 +24,25 @@ def own_labels(labels: NDArray[Any], volume: Volume, grow_mm: float) -> NDArray[
     labels : ndarray, shape (nk, nj, ni)
         On the grid of the volume; 0 is none.
     volume : Volume
-    grow_mm : float
-        A sample without a label belongs to the nearest label within so many mm, of equally near ones to the lowest.
+    grow_mm : float or None
+        A sample without a label belongs to the nearest label within so many mm, of equally near ones to the lowest;
+        None: to the nearest, in mm, among its 26 neighbours.
 
     Returns
     -------
     ndarray, shape (nk, nj, ni), uint16
         A sample that has a label keeps it.
     """
-    offsets, shells = near_offsets(volume.affine, grow_mm)
+    growth = Growth.of(volume, grow_mm)
+    offsets, shells, reach = growth.offsets, growth.shells, growth.reach
     owner = labels.astype(np.uint16)
     none = 65_536
-    reach = np.abs(offsets).max(axis=0, initial=0)
     padded = np.pad(labels.astype(np.int64), [(n, n) for n in reach[::-1]])
     padded[padded == 0] = none
     nk, nj, ni = labels.shape
     for shell in range(shells.max(initial=-1) + 1):
         nearest = np.full(labels.shape, none)
-        for di, dj, dk in offsets[shells == shell] + reach:
+        for di, dj, dk in offsets[shells == shell] + np.array(reach):
             nearest = np.minimum(nearest, padded[dk : dk + nk, dj : dj + nj, di : di + ni])
         grown = (owner == 0) & (nearest < none)
         owner[grown] = nearest[grown]
@@ -71,14 +72,10 @@ def find_solid(
     ndarray, shape (nk, nj, ni), uint16
     """
     rule = choose_iso_rule(volume, iso_value, closed)
-    grow_mm = checked_growth(volume, grow_mm)
     labels = labels.astype(np.uint16)
     inside = np.where(volume.voxels >= rule.lowest_inside, own_labels(labels, volume, grow_mm), 0).astype(np.uint16)
-    if solid:
-        offsets, _ = near_offsets(volume.affine, grow_mm)
-        reach = tuple(int(n) for n in np.abs(offsets).max(axis=0, initial=0))
-        for number, box in find_boxes(labels, solid, reach).items():  # type: ignore[arg-type]
-            fill_solid(inside, labels, number, box, offsets, closed)
+    for number, box in find_boxes(labels, solid, Growth.of(volume, grow_mm).reach).items():
+        fill_solid(inside, labels, number, box, closed)
     return inside
 
 
