@@ -7,7 +7,6 @@
  *      (where labels are made solid, the host fills their cavities in between)
  *   2. classify_label   per label one bit a sample, packed as cl/isosurface packs the samples of a surface */
 #include "include/volume.h"
-#include "isosurface/mask_rows.h"
 
 /* Parameters  voxels        in   (nk, nj, ni)
  *             labels        in   (nk, nj, ni) label of each sample, 0 is none
@@ -54,7 +53,8 @@ __kernel void own_samples(
 
 /* Parameters  inside      in   slices of (nk, nj, ni) from first_slice on: the label that each sample is inside of
  *             mask        out  (gk, gj, words) bit set where it is `label`
- *             row_states  out  (gk, gj) ROW_OUTSIDE, ROW_INSIDE or ROW_MIXED
+ *             row_extents out  (gk, gj) first word of the row with a bit set, and the one after the last; 0, 0 in rows
+ *                              without any
  *             label       number of the label
  *             ni nj nk, border    of the whole volume
  *             first_slice         slice of the volume that `inside` begins with
@@ -63,9 +63,9 @@ __kernel void own_samples(
  *             words               words a row, ceil((ni + 2 border) / 32)
  * Launch      global = gk * gj rounded up by the host, any local: one item a row, as classify_samples
  * Assumes     the slices of the mask that lie in the volume are among those of `inside`
- * Guarantees  every word of the mask and every state is written; bits beyond the row are 0 */
+ * Guarantees  every word of the mask and every extent is written; bits beyond the row are 0 */
 __kernel void classify_label(
-    __global const ushort *restrict inside, __global uint *restrict mask, __global uchar *restrict row_states,
+    __global const ushort *restrict inside, __global uint *restrict mask, __global ushort2 *restrict row_extents,
     const uint label,
     const int ni, const int nj, const int nk, const int border, const int first_slice, const int first_sample_slice,
     const uint gk, const int words)
@@ -78,15 +78,15 @@ __kernel void classify_label(
     const int j = (int)(row % gj) - border, k = (int)(row / gj) + first_sample_slice - border;
     const int in_volume = j >= 0 && j < nj && k >= 0 && k < nk;
     __global const ushort *samples = inside + (in_volume ? voxel_index(0, j, k - first_slice, ni, nj) : 0);
-    uint any = 0, missing = 0;
+    int begin = words, end = 0;
     for (int w = 0; w < words; ++w) {
         const int first = 32 * w - border;
         uint bits = 0;
         for (int b = max(0, -first); in_volume && b < min(32, ni - first); ++b)
             bits |= (uint)(samples[first + b] == label) << b;
         row_mask[w] = bits;
-        any |= bits;
-        missing |= ~bits & (uint)low_bits(min(32, ni + 2 * border - 32 * w));
+        begin = min(begin, bits != 0 ? w : words);
+        end = bits != 0 ? w + 1 : end;
     }
-    row_states[row] = any == 0 ? ROW_OUTSIDE : missing == 0 ? ROW_INSIDE : ROW_MIXED;
+    row_extents[row] = (ushort2)((ushort)min(begin, end), (ushort)end);
 }

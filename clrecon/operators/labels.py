@@ -26,6 +26,7 @@ from clrecon.operators import marching_cubes
 from clrecon.operators.isosurface import Part, Progress, voxel_level
 from clrecon.operators.marching_cubes import Classified, Placement
 from clrecon.operators.slabs import SampleGrid, Slab
+from clrecon.operators.voxel_types import voxel_variants
 
 __all__ = ["extract_labels", "prepare_labels"]
 
@@ -64,7 +65,7 @@ def prepare_labels(device: Device, dtype: DTypeLike = np.int16) -> tuple[Program
     DeviceError
         The driver's compiler refuses.
     """
-    own = load_program(device, "labels/own_samples.cl", marching_cubes.kernel_variants(device, dtype))
+    own = load_program(device, "labels/own_samples.cl", {**voxel_variants(dtype), **device.kernel_variants})
     return own, marching_cubes.prepare_marching_cubes(device, dtype, labels=True)
 
 
@@ -155,11 +156,11 @@ class _Run:
         needs = {**self.needs(held.first, held.end), **window.scratch()}
         check_budget(device, needs, memory)
         mask_d = allocate(device, 4 * window.mask_rows * self.grid.words)
-        classified = Classified(mask_d, allocate(device, window.mask_rows))
+        classified = Classified(mask_d, allocate(device, 4 * window.mask_rows))
         with stopwatch.running(device):
             launch(
                 device, self.own["classify_label"], window.mask_rows,
-                held.inside_d, mask_d, classified.row_states_d, np.uint32(number),
+                held.inside_d, mask_d, classified.row_extents_d, np.uint32(number),
                 *marching_cubes.volume_scalars(window), np.uint32(window.mask_slices), np.int32(self.grid.words),
                 stopwatch=stopwatch,
             )  # fmt: skip
