@@ -5,7 +5,7 @@
  * Passes
  *   1. own_samples      per sample the label that it is inside of, or 0
  *      (where labels are made solid, the host fills their cavities in between)
- *   2. classify_label   per label one bit a sample, packed as cl/isosurface packs the samples of a surface */
+ *   2. classify_label   per label one bit a sample, packed as cl/isosurface/classify.cl packs the plain surface */
 #include "include/volume.h"
 
 /* Parameters  voxels        in   (nk, nj, ni)

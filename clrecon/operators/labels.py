@@ -65,7 +65,7 @@ def prepare_labels(device: Device, dtype: DTypeLike = np.int16) -> tuple[Program
     DeviceError
         The driver's compiler refuses.
     """
-    own = load_program(device, "labels/own_samples.cl", {**voxel_variants(dtype), **device.kernel_variants})
+    own = load_program(device, "labels/own_samples.cl", voxel_variants(dtype))
     return own, marching_cubes.prepare_marching_cubes(device, dtype, labels=True)
 
 
