@@ -79,7 +79,8 @@ def _read_stream(stream: BinaryIO, name: str, file_bytes: int, compressed: bool)
     ni, nj, nk = shape
     voxels = empty_labels(name, (nk, nj, ni))
     for k, labels in enumerate(iterate_slices(stream, nk, ni * nj, dtype, scale, name)):
-        voxels[k] = labels.reshape(nj, ni)
+        if labels.any():
+            voxels[k] = labels.reshape(nj, ni)
     return LabelMap(voxels, affine, _read_names(extension), warnings=warnings)
 
 

@@ -139,7 +139,8 @@ def _read_voxels(
     if layers == 1:
         voxels = empty_labels(name, (nk, nj, ni))
         for k, plane in enumerate(planes):
-            voxels[k] = plane.reshape(nj, ni)
+            if plane.any():
+                voxels[k] = plane.reshape(nj, ni)
         return LabelMap(voxels, affine, {segment.number: segment.name for segment in segments})
     if not segments:
         raise RefusedInputError(f"{name} has {layers} layers and does not say which segments they hold")

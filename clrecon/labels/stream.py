@@ -6,6 +6,8 @@ compared with the bytes that are there, and what is compressed is inflated one s
 
 from __future__ import annotations
 
+import math
+import os
 import zlib
 from collections.abc import Iterator
 from math import prod
@@ -25,7 +27,10 @@ DEFLATE_RATIO = 1032
 """Deflate cannot shrink anything further than this (zlib's technical note)."""
 
 LARGEST_GRID = 2**32
-"""Voxels; half a terabyte-sized lie is refused, 1500 slices of 1600 x 1600 are not."""
+"""Voxels; 1000 slices of 2048 x 2048."""
+
+LARGEST_SLICE_BYTES = 2**28
+"""As they are stored: slices are inflated one at a time."""
 
 
 def show_name(path: Path) -> str:
@@ -58,6 +63,11 @@ def check_size(name: str, shape: tuple[int, ...], item_bytes: int, file_bytes: i
             f"{name} says that it has {' x '.join(map(str, shape))} voxels: at least 1 an axis and at most"
             f" {LARGEST_GRID:,} altogether are read"
         )
+    if prod(shape[:-1]) * item_bytes > LARGEST_SLICE_BYTES:
+        raise RefusedInputError(
+            f"{name} says that a slice has {' x '.join(map(str, shape[:-1]))} numbers of {item_bytes} bytes: at most"
+            f" {LARGEST_SLICE_BYTES:,} bytes are read"
+        )
     promised = prod(shape) * item_bytes
     possible = file_bytes * (DEFLATE_RATIO if compressed else 1)
     if promised > possible:
@@ -67,14 +77,25 @@ def check_size(name: str, shape: tuple[int, ...], item_bytes: int, file_bytes: i
         )
 
 
-def empty_labels(name: str, shape: tuple[int, int, int], dtype: Any = np.uint16) -> NDArray[Any]:
-    """Zeros of `shape`, or a refusal where there is no memory for them."""
+def empty_labels(name: str, shape: tuple[int, int, int]) -> NDArray[np.uint16]:
+    """Zeros of `shape` that take memory where something else is written, or a refusal where there is none for them."""
+    size = 2 * prod(shape)
     try:
-        return np.zeros(shape, dtype=dtype)
-    except MemoryError as error:
-        raise RefusedInputError(
-            f"{name} has {' x '.join(map(str, shape[::-1]))} voxels: too many for memory"
-        ) from error
+        if size <= physical_memory_bytes():
+            return np.zeros(shape, dtype=np.uint16)
+    except MemoryError:
+        pass
+    raise RefusedInputError(
+        f"{name} has {' x '.join(map(str, shape[::-1]))} voxels: {size / 2**30:,.1f} GiB, more memory than there is"
+    )
+
+
+def physical_memory_bytes() -> float:
+    """Memory of this computer, infinite where the system does not tell."""
+    try:
+        return float(os.sysconf("SC_PHYS_PAGES")) * os.sysconf("SC_PAGE_SIZE")
+    except (AttributeError, ValueError, OSError):  # Windows
+        return math.inf
 
 
 def read_bytes(stream: BinaryIO, count: int, name: str, where: str) -> bytes:

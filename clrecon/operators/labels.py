@@ -91,6 +91,8 @@ class _Run:
         self.device = device
         self.solid = solid
         self.stopwatch = Stopwatch()
+        self.groups = 1
+        self.device_bytes: dict[str, int] = {}
         self.grid = SampleGrid(volume, rule)
         self.level = voxel_level(device, volume, rule)
         self.placement = Placement.of(volume, rule.border)
@@ -167,7 +169,14 @@ class _Run:
             counted = marching_cubes.count(device, window, self.surface, classified, stopwatch)
         if counted.triangles == 0:
             return None
-        check_budget(device, {**needs, **counted.output()}, memory)
+        output = counted.output()
+        check_budget(device, {**needs, **output}, memory)
+        scratch = window.scratch()
+        self.device_bytes = {
+            "volume": sum(needs.values()) - sum(scratch.values()),
+            "scratch": sum(scratch.values()),
+            "output": sum(output.values()),
+        }
         return marching_cubes.emit(
             device, window, self.surface, held.voxels_d, classified, counted, self.placement, 0, stopwatch,
             (held.inside_d, np.uint32(number)),
@@ -198,6 +207,8 @@ class _Run:
             "affine_ijk_to_lps_mm": self.volume.affine.tolist(),
             "device": self.device.label,
             "driver": self.device.driver,
+            "slabs": self.groups,
+            "device_bytes": self.device_bytes,
             "grow_mm": self.growth.grow_mm,
             "solid": self.solid,
             "seconds": dict(self.stopwatch.seconds),
@@ -294,7 +305,9 @@ def extract_labels(
         raise _refuse_label(volume, taken, names[missing[0]], missing[0], rule)
     run = _Run(volume, taken, rule, growth, choose_device(device), solid)
     meshes: dict[int, Mesh] = {}
-    for group in run.group(boxes, memory) if boxes else []:
+    groups = run.group(boxes, memory) if boxes else []
+    run.groups = len(groups)
+    for group in groups:
         held = run.find_inside(group, memory)
         for number, box in group.items():
             if progress is not None:

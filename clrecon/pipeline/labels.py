@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from clrecon.mesh import Mesh
     from clrecon.opencl import Device
     from clrecon.pipeline.parts import Surface
+    from clrecon.pipeline.settings import MeshSettings
 
 __all__ = ["LabelChoice", "choose_labels", "describe_label", "extract_label_surfaces", "open_labels"]
 
@@ -83,7 +84,7 @@ def extract_label_surfaces(
     labels: LabelMap,
     choice: LabelChoice,
     device: Device,
-    closed: bool,
+    settings: MeshSettings,
     progress: Progress,
 ) -> tuple[list[Surface], list[Mesh]]:
     """Extract each label at each iso value.
@@ -113,7 +114,7 @@ def extract_label_surfaces(
     for surface in surfaces:
         meshes = extract_labels(
             volume, labels, surface.iso_value, device, numbers=choice.wanted or None, grow_mm=choice.grow_mm,
-            closed=closed, solid=choice.solid, progress=progress,
+            closed=settings.closed, solid=choice.solid, memory=settings.memory, progress=progress,
         )  # fmt: skip
         found += [(surface, number, mesh) for number, mesh in meshes.items()]
         left_out = [f"{number} {suffixes[number]}" for number in numbers if number not in meshes]

@@ -93,7 +93,7 @@ def make_mesh(
     check_levels(volume, surfaces)
     if labels is not None and settings.labels is not None:
         surfaces, extracted = extract_label_surfaces(
-            volume, surfaces, labels, settings.labels, device, settings.closed, progress
+            volume, surfaces, labels, settings.labels, device, settings, progress
         )
     else:
         extracted = extract_surfaces(volume, surfaces, device, settings, progress)

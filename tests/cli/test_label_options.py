@@ -73,6 +73,14 @@ def test_one_label_is_the_output_itself(device: Any, ct: Path, labels: Path, tmp
     assert [path.name for path in tmp_path.iterdir()] == ["one.stl"]
 
 
+def test_the_memory_that_is_allowed_counts_for_labels_too(
+    device: Any, ct: Path, labels: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    options = ("--labels", labels, "--hu", -150, "--memory", "20kB")
+    assert run(ct, "-o", tmp_path / "bone.stl", *options, device=device) == 5
+    assert "allows 20,000 bytes" in capsys.readouterr().err
+
+
 def test_labels_and_iso_values_together(device: Any, ct: Path, labels: Path, tmp_path: Path) -> None:
     options = ("--labels", labels, "--label", 2, "--label", 1, "--hu", "-150,300")
     assert run(ct, "-o", tmp_path / "b.ply", *options, device=device) == 0

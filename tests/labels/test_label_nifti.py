@@ -131,6 +131,7 @@ def test_without_a_position_it_is_refused(tmp_path):
     [
         ("dim", (3, 32767, 32767, 32767, 1, 1, 1, 1), "at most 4,294,967,296 altogether"),
         ("dim", (3, 1600, 1600, 1600, 1, 1, 1, 1), "cannot come from a file of"),
+        ("dim", (3, 30000, 30000, 2, 1, 1, 1, 1), "says that a slice has"),
         ("dim", (3, -7, 6, 4, 1, 1, 1, 1), "says that it has -7 x 6 x 4 voxels"),
         ("dim", (300, 7, 6, 4, 1, 1, 1, 1), "corrupt NIfTI header|has 7 axes|axes"),
         ("datatype", (12345,), "corrupt NIfTI header"),
@@ -151,6 +152,17 @@ def test_hostile_headers_are_refused_without_taking_memory(tmp_path, field, valu
             read_labels(file)
         assert tracemalloc.get_traced_memory()[1] < 8e6
         tracemalloc.stop()
+
+
+def test_a_small_file_that_would_fill_the_memory_is_refused(tmp_path, monkeypatch):
+    from clrecon.labels import stream
+
+    monkeypatch.setattr(stream, "physical_memory_bytes", lambda: 2**20)
+    with pytest.raises(RefusedInputError, match="1000 x 1000 x 9 voxels: 0.0 GiB, more memory than there is"):
+        read_labels(write_nifti(tmp_path / "a.nii.gz", np.zeros((9, 1000, 1000), np.uint8)))
+    path = write_nifti(tmp_path / "b.nii.gz", np.zeros((1, 20_000, 14_000), np.uint8))  # 280 MB of zeros
+    with pytest.raises(RefusedInputError, match="a slice has 14000 x 20000 numbers of 1 bytes: at most"):
+        read_labels(path)
 
 
 @pytest.mark.fuzz

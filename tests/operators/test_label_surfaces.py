@@ -133,6 +133,8 @@ def test_labels_that_do_not_fit_together_go_through_one_by_one(device, monkeypat
     meshes = extract_labels(volume, LabelMap(labels, OBLIQUE), 3, device, solid=True, memory=500_000)
     assert sum(len(shape) == 3 and shape[1:] == (40, 40) for shape in uploads) == 9  # three for each label
     for number, mesh in meshes.items():
+        assert mesh.report["slabs"] == 3 and sum(mesh.report["device_bytes"].values()) <= 500_000
+        assert expected[number].report["slabs"] == 1
         assert np.array_equal(mesh.vertices, expected[number].vertices)
         assert np.array_equal(mesh.normals, expected[number].normals)
         assert np.array_equal(mesh.triangles, expected[number].triangles)
