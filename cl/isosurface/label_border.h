@@ -7,10 +7,11 @@
 
 #include "include/volume.h"
 #include "isosurface/vertex_group.h"
+#include "labels/label_type.h"
 
 /* For each sample the label that it is inside of, in the slices of the volume that a device holds. */
 typedef struct {
-    __global const ushort *inside;
+    __global const LABEL *inside;
     uint label;
 } label_part;
 
@@ -25,8 +26,8 @@ static inline uint sample_label(const label_part *labels, const volume_part *vol
     return labels->inside[voxel_index(clamp(i, 0, ni - 1), clamp(j, 0, nj - 1), inside_k, ni, nj)];
 }
 
-/* Turn lane n of a gathered group into a vertex half way, where HU do not place it. */
-static inline void gather_border(
+/* Turn lane n of a gathered group into a vertex half way, where HU do not place it; returns 1 then, else 0. */
+static inline uint gather_border(
     vertex_group *group, uint n, const volume_part *volume, const label_part *labels, float iso_level,
     int i, int j, int k, int axis)
 {
@@ -37,7 +38,7 @@ static inline void gather_border(
                                             : other_dense && !own_dense && own == 0;
     group->half_way[n] = !placed;
     if (placed)
-        return;
+        return 0;
 #define INSIDE(i, j, k) ((VALUE)(sample_label(labels, volume, i, j, k) == labels->label))
     group->value[n] = INSIDE(i, j, k);
     group->next_value[n] = INSIDE(i1, j1, k1);
@@ -49,6 +50,7 @@ static inline void gather_border(
     group->next_gradient_j[n] = double_gradient(INSIDE(i1, j1 - 1, k1), INSIDE(i1, j1 + 1, k1), j1, nj, closed);
     group->next_gradient_k[n] = double_gradient(INSIDE(i1, j1, k1 - 1), INSIDE(i1, j1, k1 + 1), k1, nk, closed);
 #undef INSIDE
+    return 1;
 }
 
 #endif

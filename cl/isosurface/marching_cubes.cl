@@ -175,6 +175,7 @@ __kernel void list_words(
  *             active          number of words with work
  *             inside, label   in   with -D LABELS: the label that each sample is inside of, slices as those of `voxels`,
  *                             and the label whose surface it is; see label_border.h
+ *             half_way_count  in/out  with -D LABELS: grows by the vertices that HU do not place
  * Launch      global = ceil(active / WORDS_PER_ITEM) rounded up by the host, any local
  * Guarantees  every position and normal is written once.  Positions are right to one unit in the last place of the
  *             volume's largest coordinate (half a unit up to 4096 samples an axis, where products of a sample number
@@ -189,7 +190,7 @@ __kernel void emit_vertices(
     const int ni, const int nj, const int nk, const int border, const int first_slice, const int first_sample_slice,
     const uint gk, const uint words, const uint row_shift, const uint active
 #ifdef LABELS
-    , __global const ushort *restrict inside, const uint label
+    , __global const LABEL *restrict inside, const uint label, __global uint *restrict half_way_count
 #endif
     )
 {
@@ -200,6 +201,7 @@ __kernel void emit_vertices(
     const volume_part volume = {voxels, ni, nj, nk, first_slice, border, outside};
 #ifdef LABELS
     const label_part labels = {inside, label};
+    uint half_way = 0;
 #endif
     const uint gi = ni + 2 * border, gj = nj + 2 * border;
     slice_frame frame;
@@ -258,7 +260,7 @@ __kernel void emit_vertices(
             const int inner = row_is_inner && i >= 1 && i < ni - 2;
             gather_vertex(&group, gathered, &volume, i, vj, vk, crossed[m] & 3, inner);
 #ifdef LABELS
-            gather_border(&group, gathered, &volume, &labels, iso_level, i, vj, vk, crossed[m] & 3);
+            half_way += gather_border(&group, gathered, &volume, &labels, iso_level, i, vj, vk, crossed[m] & 3);
 #endif
             ++gathered;
             if (gathered == LANES) {
@@ -270,6 +272,10 @@ __kernel void emit_vertices(
     }
     if (gathered != 0)
         write_vertices(&group, &frame, gathered, positions + 3 * written, normals + 3 * written);
+#ifdef LABELS
+    if (half_way != 0)
+        atomic_add(half_way_count, half_way);
+#endif
 }
 
 #if LANES > 1

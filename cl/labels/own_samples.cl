@@ -7,6 +7,7 @@
  *      (where labels are made solid, the host fills their cavities in between)
  *   2. classify_label   per label one bit a sample, packed as cl/isosurface/classify.cl packs the plain surface */
 #include "include/volume.h"
+#include "labels/label_type.h"
 
 /* Parameters  voxels        in   (nk, nj, ni)
  *             labels        in   (nk, nj, ni) label of each sample, 0 is none
@@ -19,8 +20,8 @@
  * Guarantees  every sample is written: 0 where it is not dense; its label; else the label of the nearest sample that has
  *             one, the lowest of equally near ones; 0 where there is none */
 __kernel void own_samples(
-    __global const VOXEL *restrict voxels, __global const ushort *restrict labels, __global const int4 *restrict near,
-    __global ushort *restrict inside, const VOXEL level, const int ni, const int nj, const int nk, const int offsets)
+    __global const VOXEL *restrict voxels, __global const LABEL *restrict labels, __global const int4 *restrict near,
+    __global LABEL *restrict inside, const VOXEL level, const int ni, const int nj, const int nk, const int offsets)
 {
     const size_t at = get_global_id(0);
     const size_t row_length = ni, plane = row_length * (size_t)nj;
@@ -48,13 +49,14 @@ __kernel void own_samples(
             }
         }
     }
-    inside[at] = (ushort)owner;
+    inside[at] = (LABEL)owner;
 }
 
 /* Parameters  inside      in   slices of (nk, nj, ni) from first_slice on: the label that each sample is inside of
  *             mask        out  (gk, gj, words) bit set where it is `label`
  *             row_extents out  (gk, gj) first word of the row with a bit set, and the one after the last; 0, 0 in rows
  *                              without any
+ *             half_way_count  out  0, for emit_vertices to count in
  *             label       number of the label
  *             ni nj nk, border    of the whole volume
  *             first_slice         slice of the volume that `inside` begins with
@@ -65,8 +67,8 @@ __kernel void own_samples(
  * Assumes     the slices of the mask that lie in the volume are among those of `inside`
  * Guarantees  every word of the mask and every extent is written; bits beyond the row are 0 */
 __kernel void classify_label(
-    __global const ushort *restrict inside, __global uint *restrict mask, __global ushort2 *restrict row_extents,
-    const uint label,
+    __global const LABEL *restrict inside, __global uint *restrict mask, __global ushort2 *restrict row_extents,
+    __global uint *restrict half_way_count, const uint label,
     const int ni, const int nj, const int nk, const int border, const int first_slice, const int first_sample_slice,
     const uint gk, const int words)
 {
@@ -74,10 +76,12 @@ __kernel void classify_label(
     const uint row = get_global_id(0);
     if (row >= gj * gk)
         return;
+    if (row == 0)
+        *half_way_count = 0;
     __global uint *row_mask = mask + (size_t)row * words;
     const int j = (int)(row % gj) - border, k = (int)(row / gj) + first_sample_slice - border;
     const int in_volume = j >= 0 && j < nj && k >= 0 && k < nk;
-    __global const ushort *samples = inside + (in_volume ? voxel_index(0, j, k - first_slice, ni, nj) : 0);
+    __global const LABEL *samples = inside + (in_volume ? voxel_index(0, j, k - first_slice, ni, nj) : 0);
     int begin = words, end = 0;
     for (int w = 0; w < words; ++w) {
         const int first = 32 * w - border;

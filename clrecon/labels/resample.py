@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import product
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,8 +31,8 @@ class ResampledLabels:
 
     Attributes
     ----------
-    voxels : ndarray, shape (nk, nj, ni), uint16
-        As those of the volume.
+    voxels : ndarray, shape (nk, nj, ni), uint8 or uint16
+        On the grid of the volume; not to be changed, it may be the map's own array.
     exact : bool
         Every voxel of the volume lies on one of the map (or outside of it): nothing was chosen by distance.
     inside : dict of int to float
@@ -39,7 +40,7 @@ class ResampledLabels:
     warnings : tuple of str
     """
 
-    voxels: NDArray[np.uint16]
+    voxels: NDArray[Any]
     exact: bool
     inside: dict[int, float]
     warnings: tuple[str, ...]
@@ -70,7 +71,8 @@ def resample_labels(labels: LabelMap, volume: Volume) -> ResampledLabels:
     _check_frame_of_reference(labels, volume)
     shares = _shares_inside(labels, volume)
     _check_overlap(labels, volume, shares)
-    voxels, exact = _take_nearest(labels, volume)
+    aligned = _take_aligned(labels, volume)
+    voxels, exact = (aligned, True) if aligned is not None else _take_nearest(labels, volume)
     return ResampledLabels(voxels, exact, shares, labels.warnings)
 
 
@@ -83,7 +85,42 @@ def _check_frame_of_reference(labels: LabelMap, volume: Volume) -> None:
         )
 
 
-def _take_nearest(labels: LabelMap, volume: Volume) -> tuple[NDArray[np.uint16], bool]:
+def _take_aligned(labels: LabelMap, volume: Volume) -> NDArray[Any] | None:
+    """The labels where the grids are one, but for the way the axes run and where they end; None where they are not.
+
+    Not copied when it is the same array.
+    """
+    inverse = np.asarray(np.linalg.inv(labels.affine), dtype=np.float64)
+    starts = apply_affine(inverse, volume.slice_origins())
+    steps = inverse[:3, :3] @ volume.affine[:3, :3]  # columns: steps in the map for one along i, j, k of the volume
+    whole = np.rint(steps).astype(np.int64)
+    origin = np.rint(starts[0]).astype(np.int64)
+    size = np.array(volume.shape_ijk)
+    if (np.abs(whole).sum(axis=0) != 1).any() or (np.abs(whole).sum(axis=1) != 1).any():
+        return None
+    off = np.abs(steps - whole)[:, :2] @ size[:2]
+    off_slices = np.abs(starts - origin - np.arange(len(starts))[:, None] * whole[:, 2])
+    if (off + off_slices).max() > ON_GRID:
+        return None
+    axes = [int(np.flatnonzero(whole[:, b])[0]) for b in range(3)]  # of the map, for i, j, k of the volume
+    view = labels.voxels.transpose([2 - axes[b] for b in (2, 1, 0)])
+    source, target = [], []
+    for b in (2, 1, 0):
+        sign, first, length = whole[axes[b], b], int(origin[axes[b]]), labels.shape_ijk[axes[b]]
+        if sign < 0:
+            view = np.flip(view, 2 - b)
+            first = length - 1 - first
+        begin, end = max(0, -first), min(int(size[b]), length - first)
+        source.append(slice(begin + first, max(begin, end) + first))
+        target.append(slice(begin, max(begin, end)))
+    if view.shape == volume.voxels.shape and not any(part.start for part in (*source, *target)):
+        return np.ascontiguousarray(view)
+    taken = np.zeros(volume.voxels.shape, dtype=labels.voxels.dtype)
+    taken[tuple(target)] = view[tuple(source)]
+    return taken
+
+
+def _take_nearest(labels: LabelMap, volume: Volume) -> tuple[NDArray[Any], bool]:
     """Slice by slice: a slice of the volume is a plane in the map, flat along i and j."""
     ni, nj, nk = volume.shape_ijk
     inverse = np.asarray(np.linalg.inv(labels.affine), dtype=np.float64)
@@ -92,7 +129,7 @@ def _take_nearest(labels: LabelMap, volume: Volume) -> tuple[NDArray[np.uint16],
     along = np.arange(ni)[:, None] * i_step, np.arange(nj)[:, None] * j_step
     # An axis of the map that only i, or only j, moves along needs one index a column, or a row.
     separable = [bool(np.ptp(along[0][:, a]) <= ON_GRID or np.ptp(along[1][:, a]) <= ON_GRID) for a in range(3)]
-    taken = np.zeros((nk, nj, ni), dtype=np.uint16)
+    taken = np.zeros((nk, nj, ni), dtype=labels.voxels.dtype)
     exact = True
     for k in range(nk):
         index, valid = [], np.ones((1, 1), dtype=bool)

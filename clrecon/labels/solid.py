@@ -28,7 +28,7 @@ def find_boxes(labels: NDArray[Any], numbers: tuple[int, ...], reach: tuple[int,
     return boxes  # type: ignore[return-value]
 
 
-def fill_solid(solid: NDArray[np.uint16], labels: NDArray[np.uint16], number: int, box: Box, closed: bool) -> int:
+def fill_solid(solid: NDArray[Any], labels: NDArray[Any], number: int, box: Box, closed: bool) -> int:
     """Make the inside of one label solid, in place.
 
     What is not inside of the label already is, when one of these holds:
@@ -42,9 +42,9 @@ def fill_solid(solid: NDArray[np.uint16], labels: NDArray[np.uint16], number: in
 
     Parameters
     ----------
-    solid : ndarray, shape (nk, nj, ni), uint16
+    solid : ndarray, shape (nk, nj, ni)
         For each sample the label that it is inside of, 0 for none; changed.
-    labels : ndarray, shape (nk, nj, ni), uint16
+    labels : ndarray, shape (nk, nj, ni)
         The mask, not grown.
     number : int
     box : 3 slices

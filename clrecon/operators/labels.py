@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import DTypeLike, NDArray
+from numpy.typing import DTypeLike
 
 from clrecon.errors import NoSurfaceError, UsageError
 from clrecon.geometry import Volume
@@ -26,7 +26,7 @@ from clrecon.operators import marching_cubes
 from clrecon.operators.isosurface import Part, Progress, voxel_level
 from clrecon.operators.marching_cubes import Classified, Placement
 from clrecon.operators.slabs import SampleGrid, Slab
-from clrecon.operators.voxel_types import voxel_variants
+from clrecon.operators.voxel_types import label_variants, voxel_variants
 
 __all__ = ["extract_labels", "prepare_labels"]
 
@@ -42,7 +42,6 @@ class _Held:
     end: int
     voxels_d: Any
     inside_d: Any
-    inside: NDArray[np.uint16]
 
 
 @dataclass(frozen=True)
@@ -57,16 +56,19 @@ class _Window(Slab):
         return self.held
 
 
-def prepare_labels(device: Device, dtype: DTypeLike = np.int16) -> tuple[Program, Program]:
-    """Build the kernels for volumes of `dtype`: those that find what is inside, and those of the surface.
+def prepare_labels(
+    device: Device, dtype: DTypeLike = np.int16, label_dtype: DTypeLike = np.uint8
+) -> tuple[Program, Program]:
+    """Build the kernels for volumes and labels of these types: those that find what is inside, those of the surface.
 
     Raises
     ------
     DeviceError
         The driver's compiler refuses.
     """
-    own = load_program(device, "labels/own_samples.cl", voxel_variants(dtype))
-    return own, marching_cubes.prepare_marching_cubes(device, dtype, labels=True)
+    variants = {**voxel_variants(dtype), **label_variants(label_dtype)}
+    own = load_program(device, "labels/own_samples.cl", variants)
+    return own, marching_cubes.prepare_marching_cubes(device, dtype, label_dtype)
 
 
 def _choose_numbers(labels: LabelMap, numbers: Sequence[int | str] | None) -> tuple[int, ...]:
@@ -92,12 +94,13 @@ class _Run:
         self.solid = solid
         self.stopwatch = Stopwatch()
         self.groups = 1
+        self.share_by_hu = 1.0  # of the vertices of the label that was extracted last
         self.device_bytes: dict[str, int] = {}
         self.grid = SampleGrid(volume, rule)
         self.level = voxel_level(device, volume, rule)
         self.placement = Placement.of(volume, rule.border)
         with self.stopwatch.timed("build"):
-            self.own, self.surface = prepare_labels(device, volume.voxels.dtype)
+            self.own, self.surface = prepare_labels(device, volume.voxels.dtype, taken.voxels.dtype)
 
     def slices_for(self, boxes: dict[int, Box]) -> tuple[int, int]:
         """First and end of the slices of the volume that these labels need."""
@@ -108,7 +111,8 @@ class _Run:
     def needs(self, first: int, end: int) -> dict[str, int]:
         """Bytes on the device while what is inside is found in these slices."""
         samples = self.volume.voxels[first:end].size
-        return {"volume": samples * self.volume.voxels.itemsize, "labels": 2 * samples, "inside": 2 * samples}
+        size = samples * self.labels.itemsize
+        return {"volume": samples * self.volume.voxels.itemsize, "labels": size, "inside": size}
 
     def group(self, boxes: dict[int, Box], memory: int | None) -> list[dict[int, Box]]:
         """All labels at once where their slices fit the device, else one by one: the meshes are the same."""
@@ -124,28 +128,33 @@ class _Run:
         device, stopwatch = self.device, self.stopwatch
         first, end = self.slices_for(boxes)
         check_budget(device, self.needs(first, end), memory)
-        inside = np.zeros(self.labels.shape, dtype=np.uint16)
-        part = inside[first:end]
+        labels = self.labels[first:end]
         near = np.concatenate([self.growth.offsets, self.growth.shells[:, None]], axis=1)
         with stopwatch.timed("upload"):
             voxels_d = upload(device, self.volume.voxels[first:end])
-            labels_d = upload(device, self.labels[first:end])
+            labels_d = upload(device, labels)
             near_d = upload(device, near if len(near) else np.zeros((1, 4), np.int32))
-        inside_d = allocate(device, part.nbytes)
+        inside_d = allocate(device, labels.nbytes)
         with stopwatch.running(device):
             launch(
-                device, self.own["own_samples"], part.size, voxels_d, labels_d, near_d, inside_d, self.level,
-                *(np.int32(n) for n in part.shape[::-1]), np.int32(len(near)),
+                device, self.own["own_samples"], labels.size, voxels_d, labels_d, near_d, inside_d, self.level,
+                *(np.int32(n) for n in labels.shape[::-1]), np.int32(len(near)),
                 stopwatch=stopwatch,
             )  # fmt: skip
-        with stopwatch.timed("download"):
-            download(device, part, inside_d)
         if self.solid:
-            for number, box in boxes.items():
-                fill_solid(inside, self.labels, number, box, self.rule.closed)
-            with stopwatch.timed("upload"):
-                inside_d = upload(device, part)
-        return _Held(first, end, voxels_d, inside_d, inside)
+            inside_d = self._fill(boxes, first, end, inside_d)
+        return _Held(first, end, voxels_d, inside_d)
+
+    def _fill(self, boxes: dict[int, Box], first: int, end: int, inside_d: Any) -> Any:
+        """What is inside with the labels made solid, on the device again."""
+        inside = np.zeros(self.labels.shape, dtype=self.labels.dtype)
+        part = inside[first:end]
+        with self.stopwatch.timed("download"):
+            download(self.device, part, inside_d)
+        for number, box in boxes.items():
+            fill_solid(inside, self.labels, number, box, self.rule.closed)
+        with self.stopwatch.timed("upload"):
+            return upload(self.device, part)
 
     def window(self, box: Box, held: tuple[int, int]) -> _Window:
         """The slices of the sample grid around a label's box."""
@@ -158,11 +167,12 @@ class _Run:
         needs = {**self.needs(held.first, held.end), **window.scratch()}
         check_budget(device, needs, memory)
         mask_d = allocate(device, 4 * window.mask_rows * self.grid.words)
+        half_way_d = allocate(device, 4)
         classified = Classified(mask_d, allocate(device, 4 * window.mask_rows))
         with stopwatch.running(device):
             launch(
                 device, self.own["classify_label"], window.mask_rows,
-                held.inside_d, mask_d, classified.row_extents_d, np.uint32(number),
+                held.inside_d, mask_d, classified.row_extents_d, half_way_d, np.uint32(number),
                 *marching_cubes.volume_scalars(window), np.uint32(window.mask_slices), np.int32(self.grid.words),
                 stopwatch=stopwatch,
             )  # fmt: skip
@@ -177,24 +187,13 @@ class _Run:
             "scratch": sum(scratch.values()),
             "output": sum(output.values()),
         }
-        return marching_cubes.emit(
+        part = marching_cubes.emit(
             device, window, self.surface, held.voxels_d, classified, counted, self.placement, 0, stopwatch,
-            (held.inside_d, np.uint32(number)),
+            (held.inside_d, np.uint32(number), half_way_d),
         )  # fmt: skip
-
-    def share_by_hu(self, held: _Held, number: int, box: Box) -> float:
-        """Share of the vertices of a label that HU place; the others lie half way, on a border of the mask."""
-        inside = np.pad(held.inside[box], self.rule.border)
-        dense = np.pad(self.volume.voxels[box] >= self.rule.lowest_inside, self.rule.border)
-        own = inside == number
-        placing = np.where(own, dense, (inside == 0) & ~dense)
-        placed = crossed = 0
-        for axis in range(3):
-            edges = np.diff(own, axis=axis)
-            crossed += int(np.count_nonzero(edges))
-            both = [np.moveaxis(placing, axis, 0)[cut] for cut in (slice(None, -1), slice(1, None))]
-            placed += int(np.count_nonzero(np.moveaxis(edges, axis, 0) & both[0] & both[1]))
-        return placed / max(crossed, 1)
+        half_way = int(download(device, np.empty(1, np.uint32), half_way_d)[0])
+        self.share_by_hu = 1.0 - half_way / counted.vertices
+        return part
 
     def describe(self) -> dict[str, Any]:
         """What the reports of all labels have in common."""
@@ -322,7 +321,7 @@ def extract_labels(
                 "label": number,
                 "label_name": labels.name(number),
                 "label_inside_share": taken.inside[number],
-                "vertices_by_hu_share": run.share_by_hu(held, number, box),
+                "vertices_by_hu_share": run.share_by_hu,
             }
             report["warnings"] += _warn(taken, report)
             positions, normals, triangles = part

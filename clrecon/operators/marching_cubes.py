@@ -16,7 +16,7 @@ from clrecon.opencl import Device
 from clrecon.operators.bricks import BrickStates
 from clrecon.operators.compaction import exclusive_scan, prepare_scan
 from clrecon.operators.slabs import Slab
-from clrecon.operators.voxel_types import voxel_variants
+from clrecon.operators.voxel_types import label_variants, voxel_variants
 
 __all__ = [
     "Classified",
@@ -58,8 +58,8 @@ class Counted:
         return {"vertices": 24 * self.vertices, "triangles": 12 * self.triangles}
 
 
-def prepare_marching_cubes(device: Device, dtype: DTypeLike, *, labels: bool = False) -> Program:
-    """Build the kernels for volumes of `dtype`; with `labels` those whose emit_vertices takes labels.
+def prepare_marching_cubes(device: Device, dtype: DTypeLike, labels: DTypeLike | None = None) -> Program:
+    """Build the kernels for volumes of `dtype`; with `labels`, their type, those whose emit_vertices takes labels.
 
     Raises
     ------
@@ -67,10 +67,12 @@ def prepare_marching_cubes(device: Device, dtype: DTypeLike, *, labels: bool = F
         The driver's compiler refuses.
     """
     prepare_scan(device)
-    if not labels:
-        _load_classify(device, dtype)
     variants = {**voxel_variants(dtype), **device.kernel_variants}
-    return load_program(device, "isosurface/marching_cubes.cl", {**variants, "LABELS": "1"} if labels else variants)
+    if labels is None:
+        _load_classify(device, dtype)
+    else:
+        variants.update(LABELS="1", **label_variants(labels))
+    return load_program(device, "isosurface/marching_cubes.cl", variants)
 
 
 def _load_classify(device: Device, dtype: DTypeLike) -> Program:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import DTypeLike
 
-__all__ = ["voxel_variants"]
+__all__ = ["label_variants", "voxel_variants"]
 
 _NAMES = {
     "int8": "char", "uint8": "uchar", "int16": "short", "uint16": "ushort", "int32": "int", "float32": "float",
@@ -16,3 +16,8 @@ def voxel_variants(dtype: DTypeLike) -> dict[str, str]:
     """``-D`` definitions of VOXEL and VALUE, see cl/include/volume.h."""
     dtype = np.dtype(dtype)
     return {"VOXEL": _NAMES[dtype.name], "VALUE": "float" if dtype.kind == "f" else "int"}
+
+
+def label_variants(dtype: DTypeLike) -> dict[str, str]:
+    """``-D`` definition of LABEL, see cl/labels/label_type.h."""
+    return {"LABEL": _NAMES[np.dtype(dtype).name]}
