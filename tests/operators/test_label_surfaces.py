@@ -79,6 +79,18 @@ def test_device_equals_twin_for_every_voxel_type(device, dtype):
             assert_equals_twin(mesh, volume, inside, number, iso_value)
 
 
+@pytest.mark.parametrize(("lanes", "words"), [("1", "1"), ("8", "3")])
+@pytest.mark.parametrize("numbers", [(0, 0, 3, 7), (0, 0, 3, 300)], ids=["one-byte", "two-bytes"])
+def test_every_variant_of_the_kernels_gives_the_same_meshes(device, lanes, words, numbers, monkeypatch):
+    volume, labels = random_volume((6, 7, 75), affine=MIRRORED), random_labels((6, 7, 75), numbers=numbers)
+    inside = twin.find_solid(volume, labels, 3)
+    variants = {**device.kernel_variants, "LANES": lanes, "WORDS_PER_ITEM": words}
+    monkeypatch.setattr(device, "kernel_variants", variants)
+    label_map = LabelMap(labels.astype(np.uint8 if max(numbers) < 256 else np.uint16), MIRRORED)
+    for number, mesh in extract_labels(volume, label_map, 3, device).items():
+        assert_equals_twin(mesh, volume, inside, number, 3)
+
+
 @pytest.mark.parametrize("grow_mm", [None, 0.0, 0.6, 2.7, 5.3])
 def test_growth_is_that_of_the_twin_to_the_last_sample(device, grow_mm):
     """The buffer of the device is looked at itself: sizes on both sides of a work-group, ties of distance."""
