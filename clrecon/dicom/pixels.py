@@ -24,6 +24,7 @@ from clrecon.dicom.header import SliceHeader
 from clrecon.dicom.scan import Progress
 from clrecon.errors import RefusedInputError
 from clrecon.geometry import AIR_HU
+from clrecon.geometry.aligned import aligned_empty
 
 __all__ = ["PixelFacts", "read_voxels"]
 
@@ -102,7 +103,7 @@ def _allocate(slices: Sequence[SliceHeader], dtype: np.dtype[Any]) -> NDArray[An
     if available is not None and needed > MEMORY_SHARE * available:
         raise RefusedInputError(f"{what}, {available / 2**30:.2f} GiB are free")
     try:
-        return np.empty(shape, dtype)
+        return aligned_empty(shape, dtype)
     except MemoryError as error:
         raise RefusedInputError(f"{what}, which cannot be had") from error
 
