@@ -11,7 +11,7 @@ from clrecon.geometry.aligned import aligned_empty
 
 
 @pytest.mark.parametrize("dtype", ["int16", "uint8", "float32"])
-@pytest.mark.parametrize("shape", [(0, 3), (1,), (3, 5, 7), (20, 64, 64)])
+@pytest.mark.parametrize("shape", [(1,), (3, 5, 7), (20, 64, 64)])
 def test_arrays_begin_with_a_page(shape, dtype):
     arrays = [aligned_empty(shape, dtype) for _ in range(5)]
     for number, array in enumerate(arrays):
@@ -23,6 +23,5 @@ def test_arrays_begin_with_a_page(shape, dtype):
 
 
 def test_more_than_there_is_is_a_memory_error():
-    with pytest.raises(MemoryError) as caught:
+    with pytest.raises(MemoryError, match="allocate"):
         aligned_empty((2**50,), np.float64)
-    assert isinstance(caught.value, MemoryError)
