@@ -24,6 +24,9 @@ FRAME_MM = 1e-4  # one surface through differently ordered voxels
 SPHERE_DISTANCE_FIELD_VOXEL = 0.03  # sagitta of one edge at R = 5 voxels is 1/40 voxel; measured 0.025
 SPHERE_PARTIAL_VOLUME_RMS_VOXEL = 0.05  # box-averaged edges bend; measured 0.044
 SPHERE_PARTIAL_VOLUME_MAX_VOXEL = 0.15  # measured 0.103
+TWIN_CELL_NORMAL = 2e-4  # normals inside cells: near a saddle the gradient is a small difference; measured 4e-5
+WAIST_DISTANCE_STEP = 1e-9  # the waist of a tunnel: corners of straight lines of the surface, in float64
+CENTRE_DISTANCE_STEP = 0.01  # steps of Newton end this near in 95 % of cells; the others have a flat spot
 
 # --- dicom ---
 AFFINE_MM = 1e-6  # positions and directions are written with 9 decimals (6 where coordinates are 1e5 mm)
@@ -46,6 +49,7 @@ PHANTOM_BLUR_HU = 1e-3  # float32 sums of 1000 HU against scipy
 
 # --- pipeline ---
 VTK_SURFACE_HD95_VOXEL = 0.05  # the bar; measured 3e-5: only rounding differs
+TOPOLOGY_SHARE = 5e-3  # of triangles and volume, separated against trilinear on CT: measured 1e-3 and 2e-3
 VTK_VOLUME = 2e-3  # the bar; measured 5e-5 at 226 HU, at most 8e-4 from 200 to 700 HU: other fans of the same loops
 
 # --- mesh ---

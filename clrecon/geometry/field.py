@@ -26,7 +26,18 @@ LOWEST_OUTSIDE = -(2**30)
 LARGEST_FLOAT = 1e30
 """Differences of float voxels up to here, and their squares after scaling, stay within float32."""
 
-__all__ = ["IsoRule", "choose_iso_rule", "data_range", "slice_normal_matrices", "vertex_margin"]
+TOPOLOGIES = ("separated", "trilinear")
+"""What is done where the corners of a cell do not say which of them are joined, see `IsoRule.topology`."""
+
+__all__ = [
+    "TOPOLOGIES",
+    "IsoRule",
+    "check_topology",
+    "choose_iso_rule",
+    "data_range",
+    "slice_normal_matrices",
+    "vertex_margin",
+]
 
 
 @dataclass(frozen=True)
@@ -48,6 +59,9 @@ class IsoRule:
         The volume is surrounded by `outside`; else the surface ends open at the border.
     value_scale : float
         Power of two that takes the values of float voxels to 1 or below; 1 for integers, which need none.
+    topology : {"separated", "trilinear"}
+        Inside samples that only meet across a face or through a cell are kept apart, or joined where the trilinear
+        interpolation of the samples joins them.
     """
 
     iso_value: float
@@ -56,6 +70,7 @@ class IsoRule:
     outside: float
     closed: bool
     value_scale: float = 1.0
+    topology: str = "separated"
 
     @property
     def border(self) -> int:
@@ -92,7 +107,7 @@ def _lowest_value(volume: Volume) -> float:
     return low
 
 
-def choose_iso_rule(volume: Volume, iso_value: float, closed: bool = True) -> IsoRule:
+def choose_iso_rule(volume: Volume, iso_value: float, closed: bool = True, topology: str = "separated") -> IsoRule:
     """Decide what is inside and where the surface lies.
 
     Parameters
@@ -102,15 +117,18 @@ def choose_iso_rule(volume: Volume, iso_value: float, closed: bool = True) -> Is
         HU.  A sample is inside when its value is >= `iso_value`.
     closed : bool
         Surround the volume with outside.
+    topology : {"separated", "trilinear"}
 
     Raises
     ------
     UsageError
-        `iso_value` is no finite number, or values are too large to be interpolated in float32.
+        `iso_value` is no finite number, there is no such topology, or values are too large to be interpolated in
+        float32.
     NoSurfaceError
         Float voxels that hold NaN or infinite values.
     """
     iso_value = _checked_iso_value(iso_value)
+    check_topology(topology)
     dtype = volume.voxels.dtype
     value_scale = 1.0
     if dtype.kind == "f":
@@ -140,7 +158,18 @@ def choose_iso_rule(volume: Volume, iso_value: float, closed: bool = True) -> Is
             outside = iso_level - max(0.5, abs(iso_level) * 2.0**-20)
         else:
             outside = float(max(lowest_inside - 1, LOWEST_OUTSIDE))
-    return IsoRule(iso_value, lowest_inside, iso_level, outside, closed, value_scale)
+    return IsoRule(iso_value, lowest_inside, iso_level, outside, closed, value_scale, topology)
+
+
+def check_topology(topology: str) -> None:
+    """Refuse what is none of `TOPOLOGIES`.
+
+    Raises
+    ------
+    UsageError
+    """
+    if topology not in TOPOLOGIES:
+        raise UsageError(f"there is no topology {topology!r}: it is one of {', '.join(TOPOLOGIES)}")
 
 
 def _power_of_two_over(largest: float) -> float:

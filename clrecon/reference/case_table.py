@@ -27,7 +27,10 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["CORNERS", "EDGES", "MAX_TRIANGLES", "case_loops", "case_table", "pack_case_table"]
+__all__ = [
+    "CORNERS", "EDGES", "FACES", "FACES_OF_EDGE", "MAX_TRIANGLES", "Triangle",
+    "case_loops", "case_table", "find_ambiguous_faces", "pack_case_table",
+]  # fmt: skip
 
 CORNERS = tuple(((b & 1), (b >> 1) & 1, (b >> 2) & 1) for b in range(8))
 """(x, y, z) of corner b."""
@@ -60,16 +63,28 @@ def _derive_faces() -> tuple[tuple[int, ...], ...]:
     return tuple(faces)
 
 
-_FACES = _derive_faces()
-_FACES_OF_EDGE = tuple(
-    frozenset(number for number, face in enumerate(_FACES) if low in face and high in face) for _, low, high in EDGES
+FACES = _derive_faces()
+"""The corners of face 2 axis (lower) and 2 axis + 1 (upper), counter-clockwise as seen from outside the cell."""
+
+FACES_OF_EDGE = tuple(
+    frozenset(number for number, face in enumerate(FACES) if low in face and high in face) for _, low, high in EDGES
 )
 
 
-def _face_segments(case: int) -> dict[int, int]:
+def find_ambiguous_faces(case: int) -> list[int]:
+    """Return the faces of one case whose inside corners are two diagonal ones."""
+    return [
+        number
+        for number, face in enumerate(FACES)
+        if case >> face[0] & 1 == case >> face[2] & 1 != case >> face[1] & 1 == case >> face[3] & 1
+    ]
+
+
+def _face_segments(case: int, joined: int) -> dict[int, int]:
     """Directed segments of one case: from the edge where a run of inside corners is entered to where it is left."""
-    segments = {}
-    for face in _FACES:
+    segments: dict[int, int] = {}
+    for number, face in enumerate(FACES):
+        starts, stops = [], []
         inside = [bool(case >> corner & 1) for corner in face]
         for start in range(4):
             if not inside[start] or inside[start - 1]:
@@ -77,15 +92,24 @@ def _face_segments(case: int) -> dict[int, int]:
             stop = start
             while inside[(stop + 1) % 4]:
                 stop += 1
-            entered = _EDGE_OF_CORNERS[frozenset((face[start - 1], face[start]))]
-            left = _EDGE_OF_CORNERS[frozenset((face[stop % 4], face[(stop + 1) % 4]))]
-            segments[entered] = left
+            starts.append(_EDGE_OF_CORNERS[frozenset((face[start - 1], face[start]))])
+            stops.append(_EDGE_OF_CORNERS[frozenset((face[stop % 4], face[(stop + 1) % 4]))])
+        if joined >> number & 1:
+            stops.reverse()
+        segments.update(zip(starts, stops, strict=True))
     return segments
 
 
-def case_loops(case: int) -> list[list[int]]:
-    """Return the closed loops of edges of one case, each counter-clockwise as seen from outside (< iso value)."""
-    segments = _face_segments(case)
+def case_loops(case: int, joined: int = 0) -> list[list[int]]:
+    """Return the closed loops of edges of one case, each counter-clockwise as seen from outside (< iso value).
+
+    Parameters
+    ----------
+    case : int
+    joined : int
+        Bit f: the two diagonal inside corners of face f are joined on it; by default no face joins them.
+    """
+    segments = _face_segments(case, joined)
     loops = []
     while segments:
         first = min(segments)
@@ -105,7 +129,7 @@ def _find_fans(loop: list[int]) -> list[list[Triangle]]:
     fans = []
     for turn in range(len(loop)):
         apex, *rest = loop[turn:] + loop[:turn]
-        if all(not _FACES_OF_EDGE[apex] & _FACES_OF_EDGE[edge] for edge in rest[1:-1]):
+        if all(not FACES_OF_EDGE[apex] & FACES_OF_EDGE[edge] for edge in rest[1:-1]):
             fans.append([(apex, rest[n], rest[n + 1]) for n in range(len(rest) - 1)])
     return fans
 

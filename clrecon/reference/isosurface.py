@@ -8,6 +8,8 @@ from numpy.typing import NDArray
 from clrecon.geometry import Volume, is_left_handed
 from clrecon.geometry.field import IsoRule, choose_iso_rule, slice_normal_matrices, vertex_margin
 from clrecon.reference.case_table import CORNERS, EDGES, case_table
+from clrecon.reference.trilinear import find_row, place_cell_vertices
+from clrecon.reference.trilinear_table import CELL_VERTEX
 
 __all__ = ["Surface", "extract_inside", "extract_isosurface", "sample_grid"]
 
@@ -44,22 +46,74 @@ def _gradients(field: NDArray[np.float64], rule: IsoRule) -> NDArray[np.float64]
     return np.stack(parts, axis=-1)
 
 
-def _find_triangles(inside: NDArray[np.bool_], numbers: NDArray[np.int64]) -> NDArray[np.uint32]:
-    """Triangles of all cells, cell by cell; `numbers[k, j, i, axis]` is the vertex on the edge a sample owns."""
+def _find_cases(inside: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """Case of every cell, indexed (k, j, i)."""
     gk, gj, gi = inside.shape
     cases = np.zeros((gk - 1, gj - 1, gi - 1), dtype=np.int64)
     for corner, (x, y, z) in enumerate(CORNERS):
         cases |= inside[z : gk - 1 + z, y : gj - 1 + y, x : gi - 1 + x].astype(np.int64) << corner
-    table = case_table()
-    triangles = []
-    for k, j, i in np.argwhere((cases != 0) & (cases != 255)):
-        for triangle in table[cases[k, j, i]]:
-            owned = ((EDGES[edge][0], CORNERS[EDGES[edge][1]]) for edge in triangle)
-            triangles.append([numbers[k + z, j + y, i + x, axis] for axis, (x, y, z) in owned])
+    return cases
+
+
+def _edge_vertex(numbers: NDArray[np.int64], cell: NDArray[np.int64], edge: int) -> int:
+    """Vertex on an edge of a cell; `numbers[k, j, i, axis]` is the vertex on the edge that a sample owns."""
+    axis, low, _ = EDGES[edge]
+    k, j, i = cell + CORNERS[low][::-1]
+    return int(numbers[k, j, i, axis])
+
+
+def _find_triangles(inside: NDArray[np.bool_], numbers: NDArray[np.int64]) -> NDArray[np.uint32]:
+    """Triangles of all cells by the case table, cell by cell."""
+    cases = _find_cases(inside)
+    triangles = [
+        [_edge_vertex(numbers, cell, edge) for edge in triangle]
+        for cell in np.argwhere((cases != 0) & (cases != 255))
+        for triangle in case_table()[cases[tuple(cell)]]
+    ]
     return np.array(triangles, dtype=np.uint32).reshape(-1, 3)
 
 
-def extract_isosurface(volume: Volume, iso_value: float, *, closed: bool = True) -> Surface:
+CellVertices = tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]
+
+
+def _find_trilinear_triangles(
+    inside: NDArray[np.bool_],
+    numbers: NDArray[np.int64],
+    heights: NDArray[np.float32],
+    margin: NDArray[np.float64],
+) -> tuple[NDArray[np.uint32], CellVertices]:
+    """Triangles as the trilinear field has them, and the vertices inside cells: cell (k, j, i), point, gradient.
+
+    Vertices inside cells are numbered after those on edges, cell by cell.
+    """
+    cases = _find_cases(inside)
+    triangles: list[list[int]] = []
+    cells: list[NDArray[np.int64]] = []
+    points, gradients = [np.empty((0, 3))], [np.empty((0, 3))]
+    first = int(numbers.max()) + 1
+    for cell in np.argwhere((cases != 0) & (cases != 255)):
+        case, (k, j, i) = int(cases[tuple(cell)]), cell
+        corners = [float(heights[k + z, j + y, i + x]) for x, y, z in CORNERS]
+        row = find_row(case, corners)
+        for triangle in row.triangles:
+            triangles.append(
+                [
+                    first + len(cells) + v - CELL_VERTEX if v >= CELL_VERTEX else _edge_vertex(numbers, cell, v)
+                    for v in triangle
+                ]
+            )
+        if row.cell_vertices:
+            cells += [cell] * row.cell_vertices
+            placed = place_cell_vertices(row, case, corners, margin)
+            points.append(placed[0])
+            gradients.append(placed[1])
+    found = (np.array(cells, dtype=np.int64).reshape(-1, 3), np.concatenate(points), np.concatenate(gradients))
+    return np.array(triangles, dtype=np.uint32).reshape(-1, 3), found
+
+
+def extract_isosurface(
+    volume: Volume, iso_value: float, *, closed: bool = True, topology: str = "separated"
+) -> Surface:
     """Extract the iso surface of a small volume.
 
     Parameters
@@ -69,6 +123,8 @@ def extract_isosurface(volume: Volume, iso_value: float, *, closed: bool = True)
         HU.
     closed : bool
         Surround the volume with outside.
+    topology : {"separated", "trilinear"}
+        Keep inside corners apart that only meet across a face or cell, or do as the trilinear field does.
 
     Returns
     -------
@@ -76,7 +132,7 @@ def extract_isosurface(volume: Volume, iso_value: float, *, closed: bool = True)
     normals : ndarray, shape (n, 3), float64, unit, towards lower values
     triangles : ndarray, shape (m, 3), uint32, counter-clockwise as seen from lower values
     """
-    rule = choose_iso_rule(volume, iso_value, closed)
+    rule = choose_iso_rule(volume, iso_value, closed, topology)
     inside = sample_grid(volume, rule, rule.border) >= rule.lowest_inside
     if rule.closed:
         inside[[0, -1]] = inside[:, [0, -1]] = inside[:, :, [0, -1]] = False
@@ -111,7 +167,6 @@ def extract_inside(
     crossed[:, :-1, :, 1] = inside[:, :-1, :] != inside[:, 1:, :]
     crossed[:-1, :, :, 2] = inside[:-1, :, :] != inside[1:, :, :]
     numbers = (np.cumsum(crossed) - 1).reshape(crossed.shape)
-    triangles = _find_triangles(inside, numbers)
 
     owner = np.argwhere(crossed)
     k, j, i, axis = owner.T
@@ -137,6 +192,19 @@ def extract_inside(
     flat = ~slope.any(axis=1)
     rise = np.where(inside[k1, j1, i1], 1.0, -1.0)
     slope[flat] = (rise[:, None] * step)[flat]
+    if rule.topology == "separated":
+        triangles = _find_triangles(inside, numbers)
+    else:
+        heights = field.astype(np.float32) - np.float32(rule.iso_level)
+        margins = vertex_margin(volume, rule.border)
+        triangles, (cells, points, up) = _find_trilinear_triangles(inside, numbers, heights, margins)
+        ck = cells[:, 0]
+        here = cells[:, :0:-1] - rule.border + points[:, :2]
+        placed = origins[ck] + here @ volume.affine[:3, :2].T + points[:, 2:] * (origins[ck + 1] - origins[ck])
+        # Slice by slice: the vertices on edges, then those inside cells.
+        order = np.argsort(np.concatenate([k, ck]), kind="stable")
+        triangles = np.argsort(order).astype(np.uint32)[triangles]
+        positions, slope, k = (np.concatenate(pair)[order] for pair in ((positions, placed), (slope, up), (k, ck)))
     normals = -np.einsum("nij,nj->ni", slice_normal_matrices(volume, rule.border)[k], slope)
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     if is_left_handed(volume.affine):
