@@ -21,6 +21,7 @@
  * and shared without a hash, an atomic or an index array, and the order never depends on the device. */
 #include "include/volume.h"
 #include "include/mc_tables.h"
+#include "isosurface/cell_numbers.h"
 #include "isosurface/mask_rows.h"
 #include "isosurface/vertex_group.h"
 #ifdef LABELS
@@ -293,31 +294,6 @@ static inline void flush_triangles(const uint *waiting, uint count, __global uin
 }
 #endif
 
-/* The crossed edges owned by one row of samples, as emit_triangles numbers them. */
-typedef struct {
-    ulong xy; /* low 32 bits: along x, high: along y */
-    uint z;
-    ulong x_window, y_window; /* samples 0..32 of the word */
-    uint first; /* number of the first vertex of the word */
-} numbered_edges;
-
-static inline void number_edges(
-    numbered_edges *edges, ulong own, ulong next_y, ulong next_z, ulong with_next, uint first)
-{
-    edges->x_window = (own ^ own >> 1) & with_next;
-    edges->y_window = own ^ next_y;
-    edges->xy = (edges->x_window & 0xffffffffUL) | edges->y_window << 32;
-    edges->z = (uint)(own ^ next_z);
-    edges->first = first;
-}
-
-/* Number of the first vertex of the owners from sample b on. */
-static inline uint number_at(const numbered_edges *edges, uint b)
-{
-    const uint before = (1u << b) - 1;
-    return edges->first + (uint)popcount(edges->xy & (before | (ulong)before << 32)) + popcount(edges->z & before);
-}
-
 /* Parameters  mask              in   (gk, gj, words)
  *             active_words      in   (active,)
  *             row_offsets       in   (3, rows_to_count)
@@ -363,46 +339,15 @@ __kernel void emit_triangles(
         const uint j = row - slice_begin;
         if (j + 1 >= gj || k + 1 >= gk)
             continue;
-        /* Rows (y, z) around the row of cells, and those beyond, from which it has the edges of its far side. */
         cell_rows rows;
         load_cell_rows(&rows, mask, j, k, w, gj, words);
         uint rest = find_active_cells(rows, w, gi);
-        const ulong y2z0 = j + 2 < gj ? load_window(mask, row + 2, w, words) : rows.y1z0;
-        const ulong y2z1 = j + 2 < gj ? load_window(mask, row + gj + 2, w, words) : rows.y1z1;
-        const ulong y0z2 = k + 2 < gk ? load_window(mask, row + 2 * gj, w, words) : rows.y0z1;
-        const ulong y1z2 = k + 2 < gk ? load_window(mask, row + 2 * gj + 1, w, words) : rows.y1z1;
-        const ulong with_next = samples_with_next(w, gi);
-#define FIRST(r) (first_vertex + row_offsets[r] + word_vertices[(size_t)(r) * words + w])
-        numbered_edges e0, e1, e2, e3;
-        number_edges(&e0, rows.y0z0, rows.y1z0, rows.y0z1, with_next, FIRST(row));
-        number_edges(&e1, rows.y1z0, y2z0, rows.y1z1, with_next, FIRST(row + 1));
-        number_edges(&e2, rows.y0z1, rows.y1z1, y0z2, with_next, FIRST(row + gj));
-        number_edges(&e3, rows.y1z1, y2z1, y1z2, with_next, FIRST(row + gj + 1));
-#undef FIRST
+        numbered_rows edges;
+        number_rows(&edges, &rows, mask, row_offsets, word_vertices, first_vertex, j, k, w, gi, gj, gk, words);
         for (; rest != 0; rest &= rest - 1) {
             const uint b = lowest_bit(rest);
-            /* Vertex numbers of the cell's 12 edges; those of edges that are not crossed are never looked up. */
             uint numbers[16];
-#define BIT(window, at) ((uint)((window) >> (at)) & 1)
-            const uint at0 = number_at(&e0, b), at1 = number_at(&e1, b), at2 = number_at(&e2, b);
-            const uint x0 = BIT(e0.x_window, b), x1 = BIT(e1.x_window, b), x2 = BIT(e2.x_window, b);
-            const uint y0 = BIT(e0.y_window, b), y1 = BIT(e1.y_window, b), y2 = BIT(e2.y_window, b);
-            const uint after0 = at0 + x0 + y0 + (e0.z >> b & 1) + BIT(e0.x_window, b + 1);
-            const uint after1 = at1 + x1 + y1 + (e1.z >> b & 1) + BIT(e1.x_window, b + 1);
-            const uint after2 = at2 + x2 + y2 + (e2.z >> b & 1) + BIT(e2.x_window, b + 1);
-            numbers[0] = at0;
-            numbers[1] = at1;
-            numbers[2] = at2;
-            numbers[3] = number_at(&e3, b);
-            numbers[4] = at0 + x0;
-            numbers[5] = after0;
-            numbers[6] = at2 + x2;
-            numbers[7] = after2;
-            numbers[8] = at0 + x0 + y0;
-            numbers[9] = after0 + BIT(e0.y_window, b + 1);
-            numbers[10] = at1 + x1 + y1;
-            numbers[11] = after1 + BIT(e1.y_window, b + 1);
-#undef BIT
+            number_cell(numbers, &edges, b);
             const ulong packed = MC_TRIANGLES[cell_case(rows, b)];
             const uint count = (uint)packed & 15;
 #if LANES > 1

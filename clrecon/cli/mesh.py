@@ -62,6 +62,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='number or hash of the series, see "clrecon info" (default: the usable CT series with most slices)',
     )
     parser.add_argument("--space", default="lps", metavar="lps|ras", help="patient frame of the mesh (default: lps)")
+    parser.add_argument(
+        "--topology",
+        default="separated",
+        metavar="T",
+        help="what is done where the voxels leave open which of them are joined: separated keeps them apart (default),"
+        " trilinear joins those that the trilinear interpolation joins",
+    )
     parser.add_argument("--open", action="store_true", help="leave the surface open at the border of the volume")
     parser.add_argument("--keep-largest", type=int, metavar="N", help="keep the N largest components only")
     parser.add_argument(
@@ -96,6 +103,7 @@ def run(options: argparse.Namespace, console: Console) -> int:
         series=options.series,
         space=options.space.lower(),
         closed=not options.open,
+        topology=options.topology.lower(),
         keep_largest=options.keep_largest,
         min_volume_ml=options.min_volume,
         seeds=options.seed,

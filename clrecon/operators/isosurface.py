@@ -20,6 +20,7 @@ from clrecon.operators import marching_cubes
 from clrecon.operators.bricks import BrickRanges, BrickStates, compare_bricks, measure_bricks
 from clrecon.operators.marching_cubes import Counted, Placement
 from clrecon.operators.slabs import SampleGrid, Slab, plan_slabs
+from clrecon.operators.trilinear import check_row, prepare_trilinear
 
 __all__ = [
     "Part",
@@ -131,7 +132,7 @@ class SurfaceExtractor:
         """Free the volume on the device."""
         self._resident_d = self._bricks = None
 
-    def forecast(self, *, closed: bool = True) -> dict[str, int]:
+    def forecast(self, *, closed: bool = True, topology: str = "separated") -> dict[str, int]:
         """What an extraction will take, before anything is computed.
 
         Returns
@@ -145,7 +146,7 @@ class SurfaceExtractor:
         DeviceError
             Not even a slab of one slice fits.
         """
-        grid = SampleGrid(self.volume, IsoRule(0.0, 0, 0.0, 0.0, closed))
+        grid = SampleGrid(self.volume, IsoRule(0.0, 0, 0.0, 0.0, closed, topology=topology))
         slices = self._plan(grid)
         slab = Slab(grid, 0, slices)
         return {
@@ -155,17 +156,26 @@ class SurfaceExtractor:
             "scratch_bytes": sum(slab.scratch().values()),
         }
 
-    def extract(self, iso_value: float, *, closed: bool = True, progress: Progress | None = None) -> Mesh:
+    def extract(
+        self,
+        iso_value: float,
+        *,
+        closed: bool = True,
+        topology: str = "separated",
+        progress: Progress | None = None,
+    ) -> Mesh:
         """Extract the surface at one iso value, see `extract_isosurface`."""
         stopwatch = Stopwatch()
-        grid = SampleGrid(self.volume, choose_iso_rule(self.volume, iso_value, closed))
+        grid = SampleGrid(self.volume, choose_iso_rule(self.volume, iso_value, closed, topology))
+        if topology == "trilinear":
+            check_row(self.volume)
         if min(grid.shape) < 2:
             raise NoSurfaceError(f"an open volume of {grid.shape} voxels has no cells: leave it closed")
         run = _Run(self, grid, stopwatch, voxel_level(self.device, self.volume, grid.rule), self._placement(grid))
         if progress is not None:
             progress("build", 0, 1)
         with stopwatch.timed("build"):
-            prepare_isosurface(self.device, self.volume.voxels.dtype)
+            prepare_isosurface(self.device, self.volume.voxels.dtype, topology)
         if progress is not None:
             progress("build", 1, 1)
         self._extractions += 1
@@ -269,7 +279,7 @@ class _Run:
         with stopwatch.running(device):
             bricks = self.extractor._compare_bricks(self.level, self.grid.rule.border, stopwatch)
             classified = marching_cubes.classify(device, slab, voxels_d, self.level, stopwatch, bricks)
-            counted = marching_cubes.count(device, slab, program, classified, stopwatch)
+            counted = marching_cubes.count(device, slab, program, classified, stopwatch, voxels_d)
         self._check_output(slab, counted)
         part = marching_cubes.emit(
             device, slab, program, voxels_d, classified, counted, self.placement, first_vertex, stopwatch
@@ -295,6 +305,7 @@ class _Run:
             "iso_value_hu": rule.iso_value,
             "iso_level_hu": rule.iso_level,
             "closed_at_border": rule.closed,
+            "topology": rule.topology,
             "outside_hu": rule.outside if rule.closed else None,
             "affine_ijk_to_lps_mm": self.grid.volume.affine.tolist(),
             "device": self.device.label,
@@ -307,14 +318,16 @@ class _Run:
         }
 
 
-def prepare_isosurface(device: Device, dtype: DTypeLike = np.int16) -> Program:
-    """Build the kernels for volumes of `dtype`, so that a later `extract_isosurface` need not wait for them.
+def prepare_isosurface(device: Device, dtype: DTypeLike = np.int16, topology: str = "separated") -> Program:
+    """Build the kernels for volumes of `dtype`, so that a later `extract_isosurface` with `topology` need not wait.
 
     Raises
     ------
     DeviceError
         The driver's compiler refuses.
     """
+    if topology == "trilinear":
+        prepare_trilinear(device, dtype)
     return marching_cubes.prepare_marching_cubes(device, dtype)
 
 
@@ -324,6 +337,7 @@ def extract_isosurface(
     device: Device | str | int | None = None,
     *,
     closed: bool = True,
+    topology: str = "separated",
     memory: int | None = None,
     progress: Progress | None = None,
 ) -> Mesh:
@@ -350,6 +364,10 @@ def extract_isosurface(
         True: the volume is surrounded by air, and the surface is closed where an object leaves the volume.
         Beyond the border the field has the volume's lowest value, but not less than -1024 HU.
         False: the surface ends open at the outermost voxel centres.
+    topology : {"separated", "trilinear"}
+        Where the corners of a cell do not say which of them are joined: "separated" keeps inside voxels apart that
+        only meet across a face; "trilinear" joins what the trilinear interpolation of the voxels joins, on faces
+        and inside cells, so that the surface has the components and tunnels of that field.  Few cells differ.
     memory : int, optional
         Bytes that may be taken on the device, see `SurfaceExtractor`; None is all that it has.
     progress : callable, optional
@@ -368,18 +386,19 @@ def extract_isosurface(
     NoSurfaceError
         The iso value crosses nothing; the message gives the range of the data.
     UsageError
-        `volume` or `iso_value` is not what it should be, values or coordinates are too large for float32, or a row
-        of the volume is too long.
+        `volume`, `iso_value` or `topology` is not what it should be, values or coordinates are too large for
+        float32, or a row of the volume is too long.
     DeviceError
         No device, not even one slice fits its memory, 2^32 vertices or triangles or more, or the device fails or
         computes wrongly.
 
     References
     ----------
-    Lorensen and Cline 1987; Schroeder, Maynard and Geveci 2015.
+    Lorensen and Cline 1987; Schroeder, Maynard and Geveci 2015; for "trilinear" Nielson and Hamann 1991, Chernyaev
+    1995 and Grosso 2016.
     """
     with SurfaceExtractor(volume, device, memory=memory) as extractor:
-        return extractor.extract(iso_value, closed=closed, progress=progress)
+        return extractor.extract(iso_value, closed=closed, topology=topology, progress=progress)
 
 
 def extract_isosurfaces(
@@ -388,6 +407,7 @@ def extract_isosurfaces(
     device: Device | str | int | None = None,
     *,
     closed: bool = True,
+    topology: str = "separated",
     memory: int | None = None,
     progress: Progress | None = None,
 ) -> list[Mesh]:
@@ -406,4 +426,7 @@ def extract_isosurfaces(
     if len(iso_values) == 0:
         raise UsageError("no iso value is given")
     with SurfaceExtractor(volume, device, memory=memory) as extractor:
-        return [extractor.extract(iso_value, closed=closed, progress=progress) for iso_value in iso_values]
+        return [
+            extractor.extract(iso_value, closed=closed, topology=topology, progress=progress)
+            for iso_value in iso_values
+        ]

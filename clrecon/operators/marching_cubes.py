@@ -16,6 +16,7 @@ from clrecon.opencl import Device
 from clrecon.operators.bricks import BrickStates
 from clrecon.operators.compaction import exclusive_scan, prepare_scan
 from clrecon.operators.slabs import Slab
+from clrecon.operators.trilinear import CellVertices, count_cells, emit_cells
 from clrecon.operators.voxel_types import label_variants, voxel_variants
 
 __all__ = [
@@ -43,7 +44,10 @@ class Classified:
 
 @dataclass(frozen=True)
 class Counted:
-    """What `count` leaves on the device of one slab, and the totals of the slab's own rows."""
+    """What `count` leaves on the device of one slab, and the totals of the slab's own rows.
+
+    `cells` is there where the topology is that of the trilinear field.
+    """
 
     row_offsets_d: Any
     word_vertices_d: Any
@@ -52,6 +56,7 @@ class Counted:
     vertices: int
     triangles: int
     active_words: int
+    cells: CellVertices | None = None
 
     def output(self) -> dict[str, int]:
         """Bytes of the slab's mesh."""
@@ -169,8 +174,20 @@ def classify(
     return Classified(mask_d, row_extents_d)
 
 
-def count(device: Device, slab: Slab, program: Program, classified: Classified, stopwatch: Stopwatch) -> Counted:
+def count(
+    device: Device,
+    slab: Slab,
+    program: Program,
+    classified: Classified,
+    stopwatch: Stopwatch,
+    voxels_d: Any = None,
+) -> Counted:
     """Passes 2 to 4: how many vertices and triangles, where those of each word begin, and which words have any.
+
+    Parameters
+    ----------
+    voxels_d : buffer, optional
+        The slices ``slab.voxel_slices`` of the volume; needed for the topology of the trilinear field.
 
     Raises
     ------
@@ -191,6 +208,11 @@ def count(device: Device, slab: Slab, program: Program, classified: Classified, 
         np.uint32(gi), np.uint32(gj), np.uint32(slab.mask_slices), np.uint32(grid.words), flag_words, counted_rows,
         stopwatch=stopwatch,
     )  # fmt: skip
+    cells = None
+    if grid.rule.topology == "trilinear":
+        cells = count_cells(
+            device, slab, voxels_d, classified.mask_d, flags_d, row_counts_d, word_triangles_d, stopwatch
+        )
     scanned = exclusive_scan(device, row_counts_d, 3 * rows, in_place=True, stopwatch=stopwatch)
     if scanned.total >= 2**32:
         raise DeviceMemoryError(
@@ -208,7 +230,8 @@ def count(device: Device, slab: Slab, program: Program, classified: Classified, 
         flags_d, scanned.offsets_d, active_words_d, own_rows, counted_rows, flag_words, np.uint32(grid.row_shift),
         stopwatch=stopwatch,
     )  # fmt: skip
-    return Counted(scanned.offsets_d, word_vertices_d, word_triangles_d, active_words_d, vertices, triangles, active)
+    offsets_d = scanned.offsets_d
+    return Counted(offsets_d, word_vertices_d, word_triangles_d, active_words_d, vertices, triangles, active, cells)
 
 
 def too_many(vertices: int, triangles: int) -> DeviceError:
@@ -262,7 +285,12 @@ def emit(
                 *volume_scalars(slab), np.uint32(slab.mask_slices), *packing, *label_arguments,
                 stopwatch=stopwatch,
             )  # fmt: skip
-        if counted.triangles:
+        if counted.cells is not None:
+            emit_cells(
+                device, slab, voxels_d, classified.mask_d, counted, (frames_d, steps_d, placement.margin),
+                (positions_d, normals_d, triangles_d), first_vertex, stopwatch,
+            )  # fmt: skip
+        elif counted.triangles:
             launch(
                 device, program["emit_triangles"], items,
                 classified.mask_d, counted.active_words_d, counted.row_offsets_d, counted.word_vertices_d,

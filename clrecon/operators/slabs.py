@@ -95,7 +95,9 @@ class Slab:
     def scratch(self) -> dict[str, int]:
         """Bytes of every buffer between the volume and the mesh, by what it is; at most."""
         counted_words = self.counted_rows * self.grid.words
+        cell_vertices = 8 * self.counted_rows + 2 * self.rows * self.grid.words
         return {
+            **({"cell vertices": cell_vertices} if self.grid.rule.topology == "trilinear" else {}),
             "inside mask": 4 * self.mask_rows * self.grid.words,
             "word counts": 4 * counted_words,
             "row extents": 4 * self.mask_rows,

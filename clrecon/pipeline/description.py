@@ -113,6 +113,7 @@ def describe_job(
         "volume_ml": _unless_unknown(sum, (mesh["volume_ml"] for mesh in meshes)),
         "bounds_mm": _unless_unknown(_around, (mesh["bounds_mm"] for mesh in meshes)),
         "closed_at_border": settings.closed,
+        "topology": settings.topology,
         "keep_largest": settings.keep_largest,
         "min_volume_ml": settings.min_volume_ml,
         "seeds_mm": [[float(value) for value in seed] for seed in settings.seeds],

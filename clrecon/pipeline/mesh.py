@@ -74,7 +74,7 @@ def make_mesh(
     check_outputs(output, report_path, first_names(surfaces, settings.split))
 
     progress("device", 0, 0)
-    with DeviceOpening(settings.device, components=settings.selects) as opening:
+    with DeviceOpening(settings.device, settings.selects, settings.topology) as opening:
         from clrecon.dicom import read_volume
 
         labels = open_labels(settings.labels)

@@ -18,11 +18,11 @@ def _choose(name: str | int | Device | None) -> Device:
     return choose_device(name)
 
 
-def _prepare(chosen: Future[Device], components: bool) -> None:
+def _prepare(chosen: Future[Device], components: bool, topology: str) -> None:
     from clrecon.operators.components import prepare_components
     from clrecon.operators.isosurface import prepare_isosurface
 
-    prepare_isosurface(chosen.result())
+    prepare_isosurface(chosen.result(), topology=topology)
     if components:
         prepare_components(chosen.result())
 
@@ -39,12 +39,14 @@ class DeviceOpening:
         As `clrecon.device` takes it.
     components : bool
         Build the kernels that find components too.
+    topology : {"separated", "trilinear"}
+        Build the kernels of this one.
     """
 
-    def __init__(self, name: str | int | Device | None, components: bool = False):
+    def __init__(self, name: str | int | Device | None, components: bool = False, topology: str = "separated"):
         self._pool = ThreadPoolExecutor(max_workers=1, thread_name_prefix="device")
         self._chosen = self._pool.submit(_choose, name)
-        self._prepared = self._pool.submit(_prepare, self._chosen, components)
+        self._prepared = self._pool.submit(_prepare, self._chosen, components, topology)
 
     def wait(self) -> Device:
         """Return the device, ready to work.

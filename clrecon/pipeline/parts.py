@@ -106,7 +106,13 @@ def extract_surfaces(
 
     levels = [surface.iso_value for surface in surfaces]
     return extract_isosurfaces(
-        volume, levels, device, closed=settings.closed, memory=settings.memory, progress=progress
+        volume,
+        levels,
+        device,
+        closed=settings.closed,
+        topology=settings.topology,
+        memory=settings.memory,
+        progress=progress,
     )
 
 

@@ -79,7 +79,9 @@ def _check_isosurface(device: Device) -> str:
         volume = Volume(_random_integers(shape, dtype, 6), affine)
         vertices, _, triangles = isosurface_twin.extract_isosurface(volume, iso_value, closed=closed)
         mesh = extract_isosurface(volume, iso_value, device, closed=closed)
-        if not np.array_equal(mesh.triangles, triangles):
+        resolved = extract_isosurface(volume, iso_value, device, closed=closed, topology="trilinear")
+        expected = isosurface_twin.extract_isosurface(volume, iso_value, closed=closed, topology="trilinear")[2]
+        if not np.array_equal(mesh.triangles, triangles) or not np.array_equal(resolved.triangles, expected):
             raise DeviceError(f"wrong triangles for {dtype} voxels")
         distance = float(np.abs(mesh.vertices - vertices).max()) / min(volume.spacing)
         if not distance <= VERTEX_TOLERANCE_VOXEL:

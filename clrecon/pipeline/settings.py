@@ -31,6 +31,8 @@ class MeshSettings:
         Patient frame of the written mesh.
     closed : bool
         Close the surface where it meets the border of the volume (outside is air).
+    topology : {"separated", "trilinear"}
+        What is done where the voxels around a cell do not say which of them are joined, see `extract_isosurface`.
     keep_largest : int, optional
         Keep only this many components, the largest by area.
     min_volume_ml : float, optional
@@ -66,6 +68,7 @@ class MeshSettings:
     series: str | int | None = None
     space: str = "lps"
     closed: bool = True
+    topology: str = "separated"
     keep_largest: int | None = None
     min_volume_ml: float | None = None
     seeds: Sequence[Sequence[float]] = ()
@@ -96,8 +99,12 @@ class MeshSettings:
                 raise UsageError(f"a seed is a point of three numbers in mm, not {tuple(seed)}")
         self._check_refinement()
         from clrecon.geometry import frame_from_lps  # numpy: not wanted before a job starts
+        from clrecon.geometry.field import check_topology
 
         frame_from_lps(self.space)
+        check_topology(self.topology)
+        if self.labels is not None and self.topology != "separated":
+            raise UsageError(f"the topology {self.topology} follows HU: leave it out with labels, which pick the cells")
 
     def _check_half_way(self) -> None:
         if self.half_way is None:

@@ -204,6 +204,21 @@ def test_open_leaves_the_border_open(device: Any, tmp_path: Path, capsys: pytest
     assert closed == [(True, False), (False, True)]
 
 
+def test_topology_joins_what_the_trilinear_field_joins(
+    device: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    voxels = np.full((5, 8, 9), -1000, np.int16)
+    voxels[2, 3, 3] = voxels[2, 4, 4] = 600  # the saddle between them is at -200
+    folder = write_series(tmp_path / "ct", voxels)
+    arguments = ["mesh", str(folder), "-o", str(tmp_path / "m.stl"), "--hu", "-300", "--json"]
+    found = []
+    for extra in ([], ["--topology", "trilinear"]):
+        assert main([*arguments, "--device", str(device.index), *extra]) == 0
+        report = json.loads(capsys.readouterr().out)
+        found.append((report["topology"], report["components"], report["closed"], report["manifold"]))
+    assert found == [("separated", 2, True, True), ("trilinear", 1, True, True)]
+
+
 def test_two_series_and_the_choice(device: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder = write_series(tmp_path / "ct", number=1)
     write_series(folder, np.full((6, 9, 9), -1000, np.int16), number=2)

@@ -11,6 +11,7 @@ from scipy.spatial import cKDTree
 
 from clrecon.dicom import read_volume
 from clrecon.geometry import AIR_HU, Volume
+from clrecon.operators.isosurface import extract_isosurface
 from clrecon.pipeline.mesh import make_mesh
 from clrecon.pipeline.settings import MeshSettings
 
@@ -60,3 +61,14 @@ def test_real_series_mesh_like_vtk_in_the_true_place(real_data, device, tmp_path
         assert np.percentile(distances, 95) <= tolerances.VTK_SURFACE_HD95_VOXEL * voxel
     assert report["triangles"] == len(faces)
     assert report["volume_ml"] == pytest.approx(enclosed_ml(points, faces), rel=tolerances.VTK_VOLUME)
+
+
+def test_real_ct_stays_sound_with_the_topology_of_the_trilinear_field(real_data, device):
+    """Few cells differ: the two surfaces have nearly the same triangles and volume."""
+    volume = read_volume(real_data / "thoracic_0p8mm")
+    meshes = [extract_isosurface(volume, HU, device, topology=topology) for topology in ("separated", "trilinear")]
+    default, resolved = (mesh.quality() for mesh in meshes)
+    assert resolved["closed"] and resolved["manifold"] and resolved["zero_area_faces"] == 0
+    assert resolved["euler_number"] != default["euler_number"]
+    assert resolved["triangles"] == pytest.approx(default["triangles"], rel=tolerances.TOPOLOGY_SHARE)
+    assert resolved["volume_ml"] == pytest.approx(default["volume_ml"], rel=tolerances.TOPOLOGY_SHARE)

@@ -7,6 +7,7 @@ import math
 import pytest
 
 from clrecon.errors import UsageError
+from clrecon.pipeline.labels import LabelChoice
 from clrecon.pipeline.presets import DEFAULT_PRESET, PRESETS, find_preset
 from clrecon.pipeline.settings import MeshSettings
 
@@ -62,6 +63,8 @@ def test_the_default_preset_keeps_thin_cortex() -> None:
         ({"seeds": [(1.0, 2.0)]}, "point of three numbers"),
         ({"seeds": [(1.0, 2.0, math.inf)]}, "point of three numbers"),
         ({"space": "world"}, "unknown space 'world'"),
+        ({"topology": "manifold"}, "no topology 'manifold'"),
+        ({"topology": "trilinear", "labels": LabelChoice("map.nii")}, "leave it out with labels"),
         ({"keep_largest": 0}, "1 or more, not 0"),
         ({"min_volume_ml": 0.0}, "above 0 ml"),
         ({"min_volume_ml": math.nan}, "above 0 ml"),

@@ -1,0 +1,30 @@
+"""What the topology of the trilinear field costs, beside the default table."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+from measure import alternate, summarise
+from registry import Job, case
+
+__all__ = ["measure_topology"]
+
+
+@case("topology", "surfaces with the topology of the trilinear field, against the default's")
+def measure_topology(job: Job) -> dict[str, Any]:
+    """Host volume to host mesh in one process, kernels built; the "peer" is the default, so ratios are below 1."""
+    from clrecon.operators.isosurface import extract_isosurface
+
+    volume = job.input.volume()
+    meshes: dict[str, Any] = {}
+
+    def run(topology: str) -> float:
+        start = time.perf_counter()
+        meshes[topology] = extract_isosurface(volume, job.hu, job.device, topology=topology)
+        return time.perf_counter() - start
+
+    ours, theirs = alternate(lambda: run("trilinear"), lambda: run("separated"), job.pairs, limit_s=job.limit_s)
+    summary = summarise(ours, theirs)
+    counts = {name: {"vertices": m.vertex_count, "triangles": m.triangle_count} for name, m in meshes.items()}
+    return {**summary, "ratios": {"separated_over_trilinear": summary["ratio"]}, "counts": counts}

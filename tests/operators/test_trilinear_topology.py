@@ -1,0 +1,180 @@
+"""The topology of the trilinear field on the device: against its twin, against the field, and on any data."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import tolerances
+from test_isosurface import MIRRORED, OBLIQUE, SHAPES, assert_sound, random_volume, smooth_volume
+
+from clrecon.errors import UsageError
+from clrecon.geometry import Volume, compose_affine
+from clrecon.geometry.field import choose_iso_rule
+from clrecon.operators.isosurface import SurfaceExtractor, extract_isosurface
+from clrecon.reference import isosurface as twin
+from clrecon.reference.trilinear_table import find_states
+
+
+def extract(volume, iso_value, device, **options):
+    return extract_isosurface(volume, iso_value, device, topology="trilinear", **options)
+
+
+def assert_equals_twin(volume, iso_value, device, closed=True) -> None:
+    vertices, normals, triangles = twin.extract_isosurface(volume, iso_value, closed=closed, topology="trilinear")
+    mesh = extract(volume, iso_value, device, closed=closed)
+    assert np.array_equal(mesh.triangles, triangles)
+    assert np.abs(volume.lps_to_ijk(mesh.vertices) - volume.lps_to_ijk(vertices)).max() <= tolerances.TWIN_VERTEX_VOXEL
+    assert np.abs(mesh.normals - normals).max() <= tolerances.TWIN_CELL_NORMAL
+
+
+@pytest.mark.parametrize("closed", [True, False])
+@pytest.mark.parametrize("shape", SHAPES)
+def test_device_equals_twin_at_word_borders(device, shape, closed):
+    assert_equals_twin(random_volume(shape, high=50), 25, device, closed)
+
+
+@pytest.mark.parametrize("dtype", ["int8", "uint8", "int16", "uint16", "int32", "float32"])
+@pytest.mark.parametrize("affine", [OBLIQUE, MIRRORED], ids=["right-handed", "left-handed"])
+def test_device_equals_twin_for_every_voxel_type(device, dtype, affine):
+    volume = random_volume((5, 6, 37), dtype, high=100, affine=affine)
+    for iso_value in (30, 50.3):
+        assert_equals_twin(volume, iso_value, device)
+
+
+@pytest.mark.parametrize(("dtype", "low", "high"), [("int16", -32768, 32767), ("uint16", 0, 65535),
+                                                    ("int32", -(2**23) + 1, 2**23 - 1)])  # fmt: skip
+def test_device_equals_twin_over_the_whole_range_of_integers(device, dtype, low, high):
+    voxels = np.random.default_rng(4).integers(low, high, (4, 6, 33), endpoint=True).astype(dtype)
+    for iso_value in (0.5 * (low + high) + 0.5, low / 2 + high / 2 + high / 5):
+        assert_equals_twin(Volume(voxels, OBLIQUE), iso_value, device)
+
+
+@pytest.mark.parametrize("scale", [1e-25, 1e-3, 1e25])
+def test_the_scale_of_float_values_does_not_matter(device, scale):
+    voxels = np.random.default_rng(5).normal(size=(4, 5, 33)).astype(np.float32)
+    expected = extract(Volume(voxels, OBLIQUE), 0.0, device, closed=False)
+    mesh = extract(Volume(voxels * np.float32(2.0 ** round(np.log2(scale))), OBLIQUE), 0.0, device, closed=False)
+    assert np.array_equal(mesh.triangles, expected.triangles)
+    assert np.abs(mesh.vertices - expected.vertices).max() < tolerances.FRAME_MM
+
+
+def test_every_state_of_a_cell_equals_the_twin(device):
+    """One cell a case and drawing, apart from each other: thousands of decisions, among them all tunnels."""
+    rng = np.random.default_rng(6)
+    cases = [case for case in range(256) if len(find_states(case)) > 1 or find_states(case)[0].tunnels]
+    voxels = np.zeros((3, 3 * len(cases), 3 * 20), dtype=np.float32)
+    for row, case in enumerate(cases):
+        for column in range(20):
+            sizes = rng.random(8) if column % 2 else np.exp(rng.normal(size=8))
+            signs = np.array([1 if case >> corner & 1 else -1 for corner in range(8)])
+            voxels[0:2, 3 * row : 3 * row + 2, 3 * column : 3 * column + 2] = (sizes * signs).reshape(2, 2, 2)
+    volume = Volume(voxels, np.eye(4))
+    rule = choose_iso_rule(volume, 1e-6, topology="trilinear")
+    assert rule.topology == "trilinear"
+    assert_equals_twin(volume, 1e-6, device)
+    more = extract(volume, 1e-6, device).vertex_count - extract_isosurface(volume, 1e-6, device).vertex_count
+    assert more > 300
+
+
+@pytest.mark.parametrize("high", [2, 3, 6, 100])
+def test_random_integers_are_sound(device, high):
+    for seed, shape in enumerate([(7, 9, 11), (5, 4, 35)]):
+        volume = random_volume(shape, high=high, seed=seed)
+        for iso_value in {1, high // 2, high - 1} - {0}:
+            assert_sound(extract(volume, iso_value, device))
+
+
+def test_steep_integers_far_from_the_origin_are_sound(device):
+    """There the vertices inside cells keep a margin from faces and from each other."""
+    affine = compose_affine((0.3, 0, 0), (0, 0.3, 0), (0, 0, 0.5), (-900, 900, 1800))
+    volume = random_volume((9, 11, 40), "uint16", 65536, affine)
+    for iso_value in (2, 20000, 32768, 60000):
+        assert_sound(extract(volume, iso_value, device))
+
+
+def test_samples_and_saddles_at_the_level_are_sound(device):
+    assert_sound(extract(random_volume((7, 8, 40), "float32", 4), 2.0, device))
+    assert_sound(extract(random_volume((7, 8, 40), "float32", 3, seed=1), 1.0, device))
+
+
+def test_a_surface_without_ambiguous_cells_stays_as_it_is(device):
+    k, j, i = np.indices((9, 10, 11))
+    volume = Volume((100 - 9 * np.sqrt((i - 5.1) ** 2 + (j - 4.6) ** 2 + (k - 4.2) ** 2)).astype(np.float32), OBLIQUE)
+    expected, mesh = extract_isosurface(volume, 70, device), extract(volume, 70, device)
+    assert np.array_equal(mesh.triangles, expected.triangles)
+    assert np.array_equal(mesh.vertices, expected.vertices)
+    assert np.array_equal(mesh.normals, expected.normals)
+
+
+def test_two_corners_that_a_saddle_joins_make_one_part(device):
+    voxels = np.zeros((3, 4, 4), np.int16)
+    voxels[1, 1, 1] = voxels[1, 2, 2] = 100
+    volume = Volume(voxels, OBLIQUE)
+    for iso_value, parts in ((40, 1), (60, 2)):  # the saddle between them is at 50
+        assert extract(volume, iso_value, device).quality()["components"] == parts
+        assert extract_isosurface(volume, iso_value, device).quality()["components"] == 2
+
+
+def test_two_corners_across_a_cell_are_joined_by_a_tunnel(device):
+    voxels = np.full((4, 4, 4), -1.0, np.float32)
+    voxels[1, 1, 1] = voxels[2, 2, 2] = 20.0  # the middle of their cell, the lowest point between them, is at 4.25
+    volume = Volume(voxels, np.eye(4))
+    quality = extract(volume, 3.9, device).quality()
+    assert (quality["components"], quality["genus"]) == (1, 0)
+    assert extract(volume, 4.4, device).quality()["components"] == 2
+    assert extract_isosurface(volume, 3.9, device).quality()["components"] == 2
+
+
+def test_normals_look_the_way_the_faces_do(device):
+    for affine in (OBLIQUE, MIRRORED):
+        mesh = extract(random_volume((9, 9, 40), "float32", 1000, affine), 500, device)
+        corners = mesh.vertices.astype(np.float64)[mesh.triangles]
+        faces = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        along = np.einsum("ij,ij->i", faces, mesh.normals.astype(np.float64)[mesh.triangles].sum(axis=1))
+        assert (along > 0).mean() > 0.9
+        assert np.allclose(np.linalg.norm(mesh.normals, axis=1), 1.0, atol=1e-5)
+
+
+def test_the_order_is_the_same_on_every_run(device):
+    volume = random_volume((6, 9, 70), high=1000)
+    first, second = (extract(volume, 500, device) for _ in range(2))
+    assert np.array_equal(first.triangles, second.triangles)
+    assert np.array_equal(first.vertices, second.vertices)
+    assert np.array_equal(first.normals, second.normals)
+
+
+@pytest.mark.parametrize("closed", [True, False])
+def test_slabs_give_the_same_mesh(device, closed):
+    volume = random_volume((9, 7, 40), high=1000, affine=MIRRORED)
+    expected = extract(volume, 500, device, closed=closed)
+    for slices in (1, 2, 3, 5):
+        with SurfaceExtractor(volume, device) as extractor:
+            extractor._use_smaller_slabs(int(closed), slices)
+            mesh = extractor.extract(500, closed=closed, topology="trilinear")
+        assert mesh.report["slabs"] > 1
+        assert np.array_equal(mesh.triangles, expected.triangles)
+        assert np.array_equal(mesh.vertices, expected.vertices)
+        assert np.array_equal(mesh.normals, expected.normals)
+
+
+def test_the_forecast_holds_what_the_topology_takes(device):
+    with SurfaceExtractor(smooth_volume(), device) as extractor:
+        more = extractor.forecast(topology="trilinear")["scratch_bytes"] - extractor.forecast()["scratch_bytes"]
+        mesh = extractor.extract(100, topology="trilinear")
+    assert more > 0
+    assert mesh.report["topology"] == "trilinear"
+
+
+def test_what_cannot_be_resolved_is_refused(device):
+    with pytest.raises(UsageError, match="no topology 'manifold': it is one of separated, trilinear"):
+        extract_isosurface(random_volume((3, 3, 3)), 3, device, topology="manifold")
+    wide = Volume(np.zeros((1, 2, 3000), np.int8), np.eye(4))
+    with pytest.raises(UsageError, match="3,000 columns: the topology trilinear supports 2,968"):
+        extract(wide, 1, device)
+
+
+@pytest.mark.oclgrind
+def test_no_memory_beyond_the_buffers_is_touched(device):
+    for closed in (True, False):
+        volume = random_volume((3, 4, 34), high=50)
+        assert_equals_twin(volume, 25, device, closed)
