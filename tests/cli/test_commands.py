@@ -82,7 +82,7 @@ def test_mesh_says_nothing_of_the_patient(
     assert main(arguments) == 0
     captured = capsys.readouterr()
     written = output.read_bytes() + report.read_bytes() + (captured.out + captured.err).encode()
-    for secret in (*PATIENT.split("^"), "4711", "19500102", "Scan von", "1.2.826.0.1"):
+    for secret in (*PATIENT.split("^"), "ID-4711", "19500102", "Scan von", "1.2.826.0.1"):
         assert secret.encode() not in written
 
 
