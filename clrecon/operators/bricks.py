@@ -32,6 +32,12 @@ class BrickRanges:
     shape: tuple[int, int, int]
     dtype: np.dtype[Any]
 
+    @property
+    def nbytes(self) -> int:
+        """Bytes on the device."""
+        bi, bj, bk = self.shape
+        return 2 * bi * bj * bk * int(self.dtype.itemsize)
+
 
 @dataclass(frozen=True)
 class BrickStates:

@@ -11,7 +11,7 @@ from numpy.typing import DTypeLike, NDArray
 
 from clrecon.errors import ClreconError, DeviceError, DeviceMemoryError, NoSurfaceError, UsageError
 from clrecon.geometry import Volume
-from clrecon.geometry.field import IsoRule, choose_iso_rule, data_range
+from clrecon.geometry.field import IsoRule, check_topology, choose_iso_rule, data_range
 from clrecon.kernels import Program, Stopwatch, result_pages, upload
 from clrecon.mesh import Mesh
 from clrecon.opencl import Device, choose_device, describe_shortage, memory_limits
@@ -117,7 +117,7 @@ class SurfaceExtractor:
         self._resident_d: Any = None
         self._bricks: BrickRanges | None = None
         self._extractions = 0
-        self._slices: dict[int, int] = {}
+        self._slices: dict[tuple[int, str], int] = {}
         self._placements: dict[int, Placement] = {}
 
     def __enter__(self) -> SurfaceExtractor:
@@ -146,6 +146,7 @@ class SurfaceExtractor:
         DeviceError
             Not even a slab of one slice fits.
         """
+        check_topology(topology)
         grid = SampleGrid(self.volume, IsoRule(0.0, 0, 0.0, 0.0, closed, topology=topology))
         slices = self._plan(grid)
         slab = Slab(grid, 0, slices)
@@ -183,10 +184,10 @@ class SurfaceExtractor:
         return Mesh(positions, triangles, normals, run.describe(len(positions), len(triangles)))
 
     def _plan(self, grid: SampleGrid) -> int:
-        border = grid.rule.border
-        if border not in self._slices:
-            self._slices[border] = plan_slabs(grid, self.device, self.memory)
-        return self._slices[border]
+        key = grid.rule.border, grid.rule.topology
+        if key not in self._slices:
+            self._slices[key] = plan_slabs(grid, self.device, self.memory)
+        return self._slices[key]
 
     def _placement(self, grid: SampleGrid) -> Placement:
         border = grid.rule.border
@@ -196,32 +197,33 @@ class SurfaceExtractor:
 
     def _upload(self, slab: Slab) -> Any:
         """The slices of the volume that the slab reads; all of them stay on the device once they are there."""
-        if self._resident_d is not None:
-            return self._resident_d
-        first, end = slab.voxel_slices
-        voxels_d = upload(self.device, self.volume.voxels[first:end])
-        if slab.slices == slab.grid.shape[2]:
-            self._resident_d = voxels_d
-        return voxels_d
+        if not slab.is_whole:
+            self._resident_d = self._bricks = None
+            first, end = slab.voxel_slices
+            return upload(self.device, self.volume.voxels[first:end])
+        if self._resident_d is None:
+            self._resident_d = upload(self.device, self.volume.voxels)
+        return self._resident_d
 
-    def _compare_bricks(self, level: Any, border: int, stopwatch: Stopwatch) -> BrickStates | None:
+    def _compare_bricks(self, slab: Slab, level: Any, stopwatch: Stopwatch) -> BrickStates | None:
         """How the bricks of a resident volume compare with `level`; None before it pays to measure them.
 
         Measuring takes as long as the first pass over the volume, so a single extraction does without.
         """
-        if self._resident_d is None or self._extractions < 2:
+        if not slab.is_whole or self._extractions < 2:
             return None
         if self._bricks is None:
             volume = self.volume
             self._bricks = measure_bricks(
                 self.device, self._resident_d, volume.shape_ijk, volume.voxels.dtype, stopwatch=stopwatch
             )
-        return compare_bricks(self.device, self._bricks, level, self.volume.shape_ijk[0], border, stopwatch=stopwatch)
+        ni, border = self.volume.shape_ijk[0], slab.grid.rule.border
+        return compare_bricks(self.device, self._bricks, level, ni, border, stopwatch=stopwatch)
 
-    def _use_smaller_slabs(self, border: int, slices: int) -> None:
+    def _use_smaller_slabs(self, rule: IsoRule, slices: int) -> None:
         """Remember that slabs of more slices do not go through."""
         self._resident_d = self._bricks = None
-        self._slices[border] = slices
+        self._slices[rule.border, rule.topology] = slices
 
 
 class _Run:
@@ -253,7 +255,7 @@ class _Run:
                 if slab.slices == 1:
                     raise
                 slices = -(-slab.slices // 2)
-                self.extractor._use_smaller_slabs(self.grid.rule.border, slices)
+                self.extractor._use_smaller_slabs(self.grid.rule, slices)
                 self.warnings.append(f"{error}: continued with slabs of {slices} slices")
                 continue
             parts.append(part)
@@ -277,7 +279,7 @@ class _Run:
         with stopwatch.timed("upload"):
             voxels_d = self.extractor._upload(slab)
         with stopwatch.running(device):
-            bricks = self.extractor._compare_bricks(self.level, self.grid.rule.border, stopwatch)
+            bricks = self.extractor._compare_bricks(slab, self.level, stopwatch)
             classified = marching_cubes.classify(device, slab, voxels_d, self.level, stopwatch, bricks)
             counted = marching_cubes.count(device, slab, program, classified, stopwatch, voxels_d)
         self._check_output(slab, counted)
@@ -291,6 +293,8 @@ class _Run:
         """Refuse a slab whose mesh does not fit beside the rest; note what the slab takes."""
         needs = slab.needs(counted.output())
         needs["active words"] = 4 * counted.active_words
+        if slab.is_whole and self.extractor._bricks is not None:
+            needs["brick ranges"] = self.extractor._bricks.nbytes
         shortage = describe_shortage(memory_limits(self.device, self.extractor.memory), needs)
         if shortage:
             raise DeviceMemoryError(shortage)

@@ -67,6 +67,11 @@ class Slab:
         return self.end - self.first
 
     @property
+    def is_whole(self) -> bool:
+        """The slab is all of the grid."""
+        return self.slices == self.grid.shape[2]
+
+    @property
     def mask_slices(self) -> int:
         """Slices that are classified."""
         return min(self.end + 2, self.grid.shape[2]) - self.first

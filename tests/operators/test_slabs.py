@@ -18,7 +18,7 @@ from clrecon.operators.slabs import SampleGrid, Slab, plan_slabs
 
 def extract_in_slabs(volume, iso_value, device, slices, closed=True):
     extractor = SurfaceExtractor(volume, device)
-    extractor._use_smaller_slabs(int(closed), slices)
+    extractor._use_smaller_slabs(choose_iso_rule(volume, iso_value, closed), slices)
     return extractor.extract(iso_value, closed=closed)
 
 
@@ -43,6 +43,20 @@ def test_slabs_of_any_thickness_give_the_same_mesh(device, shape, dtype, closed)
 def test_a_single_slice_goes_through_in_slabs_of_one(device):
     volume = random_volume((1, 6, 40))
     assert_same(extract_in_slabs(volume, 3, device, 1), extract_isosurface(volume, 3, device))
+
+
+def test_a_resident_volume_can_be_asked_for_a_surface_that_does_not_fit_as_a_whole(device, monkeypatch):
+    """An open surface fits, a closed one needs a little more: in slabs, and not from the wrong slices."""
+    volume = smooth_volume()
+    with SurfaceExtractor(volume, device) as extractor:
+        extractor.extract(100, closed=False)
+        monkeypatch.setattr(isosurface, "plan_slabs", lambda *_: 4)
+        mesh = extractor.extract(100)
+        assert mesh.report["slabs"] > 1
+        again = extractor.extract(100, closed=False)
+    monkeypatch.undo()
+    assert_same(mesh, extract_isosurface(volume, 100, device))
+    assert_same(again, extract_isosurface(volume, 100, device, closed=False))
 
 
 def test_empty_slabs_in_between_do_no_harm(device):

@@ -149,7 +149,7 @@ def test_slabs_give_the_same_mesh(device, closed):
     expected = extract(volume, 500, device, closed=closed)
     for slices in (1, 2, 3, 5):
         with SurfaceExtractor(volume, device) as extractor:
-            extractor._use_smaller_slabs(int(closed), slices)
+            extractor._use_smaller_slabs(choose_iso_rule(volume, 500, closed, "trilinear"), slices)
             mesh = extractor.extract(500, closed=closed, topology="trilinear")
         assert mesh.report["slabs"] > 1
         assert np.array_equal(mesh.triangles, expected.triangles)
