@@ -9,6 +9,12 @@
 #include "include/volume.h"
 #include "isosurface/mask_rows.h"
 
+#ifdef HAS_BUILTIN_PREFETCH
+#define PREFETCH(place) __builtin_prefetch((const void *)(size_t)(place))
+#else
+#define PREFETCH(place)
+#endif
+
 /* Bits of 16 comparison results (-1 or 0 each): bit n is lane n. */
 static inline uint pack_lanes(short16 lanes)
 {
@@ -123,9 +129,10 @@ __kernel void classify_bricks(
     for (int w = extent.x; w < extent.y; ++w) {
         const int first = 32 * w - border;
         uint bits = 0;
-        if (row_states[w] == BRICK_MIXED)
+        if (row_states[w] == BRICK_MIXED) {
             bits = classify_word(row_voxels, first, ni, level);
-        else if (row_states[w] == BRICK_INSIDE)
+            PREFETCH(row_voxels + 2 * ni + first);
+        } else if (row_states[w] == BRICK_INSIDE)
             bits = (uint)(low_bits(min(32, ni - first)) & ~low_bits(max(0, -first)));
         row_mask[w] = bits;
         begin = min(begin, bits != 0 ? w : words);

@@ -81,7 +81,7 @@ def prepare_marching_cubes(device: Device, dtype: DTypeLike, labels: DTypeLike |
 
 
 def _load_classify(device: Device, dtype: DTypeLike) -> Program:
-    return load_program(device, "isosurface/classify.cl", voxel_variants(dtype))
+    return load_program(device, "isosurface/classify.cl", {**voxel_variants(dtype), **device.kernel_variants})
 
 
 def _pad4(rows: NDArray[np.float64]) -> NDArray[np.float32]:
