@@ -37,10 +37,10 @@ def measure_labels(job: Job) -> dict[str, Any]:
     label_map = LabelMap(labels, volume.affine)
     peers = _peers(volume, labels, job.hu, job.peer_threads)
     meshes = extract_labels(volume, label_map, job.hu, job.device)
-    figures: dict[str, Any] = {"ratios": {}, "sides": {}, "triangles": {"clrecon": 0}}
-    figures["triangles"]["clrecon"] = sum(len(mesh.triangles) for mesh in meshes.values())
+    figures: dict[str, Any] = {"ratios": {}, "sides": {}, "peer_triangles": {}}
+    figures["triangles"] = sum(len(mesh.triangles) for mesh in meshes.values())
     for name, peer in peers.items():
-        figures["triangles"][name] = peer()
+        figures["peer_triangles"][name] = peer()
         ours, theirs = alternate(
             lambda: _seconds(lambda: extract_labels(volume, label_map, job.hu, job.device)),
             lambda peer=peer: _seconds(peer),  # type: ignore[misc]
