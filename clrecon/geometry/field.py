@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import product
 
 import numpy as np
@@ -32,6 +33,7 @@ TOPOLOGIES = ("separated", "trilinear")
 __all__ = [
     "TOPOLOGIES",
     "IsoRule",
+    "ValueRange",
     "check_topology",
     "choose_iso_rule",
     "data_range",
@@ -107,7 +109,37 @@ def _lowest_value(volume: Volume) -> float:
     return low
 
 
-def choose_iso_rule(volume: Volume, iso_value: float, closed: bool = True, topology: str = "separated") -> IsoRule:
+class ValueRange:
+    """What of a volume's values an iso rule depends on, each found when it is first asked for and then kept.
+
+    Parameters
+    ----------
+    volume : Volume
+        Its voxels must not change any more.
+    """
+
+    def __init__(self, volume: Volume):
+        self._volume = volume
+
+    @cached_property
+    def ends(self) -> tuple[float, float]:
+        """Lowest and highest value, see `data_range`."""
+        return data_range(self._volume)
+
+    @cached_property
+    def lowest(self) -> float:
+        """Lowest value, but not below `AIR_HU`."""
+        return _lowest_value(self._volume)
+
+
+def choose_iso_rule(
+    volume: Volume,
+    iso_value: float,
+    closed: bool = True,
+    topology: str = "separated",
+    *,
+    values: ValueRange | None = None,
+) -> IsoRule:
     """Decide what is inside and where the surface lies.
 
     Parameters
@@ -118,6 +150,8 @@ def choose_iso_rule(volume: Volume, iso_value: float, closed: bool = True, topol
     closed : bool
         Surround the volume with outside.
     topology : {"separated", "trilinear"}
+    values : ValueRange, optional
+        Of this volume, where it is asked for more than one iso value.
 
     Raises
     ------
@@ -131,8 +165,9 @@ def choose_iso_rule(volume: Volume, iso_value: float, closed: bool = True, topol
     check_topology(topology)
     dtype = volume.voxels.dtype
     value_scale = 1.0
+    values = values or ValueRange(volume)
     if dtype.kind == "f":
-        low, high = data_range(volume)
+        low, high = values.ends
         if not (math.isfinite(low) and math.isfinite(high)):
             raise NoSurfaceError(f"the voxels run from {low} to {high}: infinite values have no iso surface")
         if max(-low, high) > LARGEST_FLOAT:
@@ -141,9 +176,9 @@ def choose_iso_rule(volume: Volume, iso_value: float, closed: bool = True, topol
         iso_level = float(np.float32(iso_value))
         lowest_inside: int | float = iso_level
     else:
-        low = _lowest_value(volume) if closed else float(AIR_HU)
+        low = values.lowest if closed else float(AIR_HU)
         if dtype == np.int32:
-            low, high = data_range(volume)
+            low, high = values.ends
             if max(-low, high) >= LARGEST_INTEGER:
                 raise UsageError(
                     f"the voxels run from {low:.0f} to {high:.0f}: integers from {LARGEST_INTEGER} on cannot be"

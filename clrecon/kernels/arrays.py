@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from clrecon.errors import DeviceError, DeviceMemoryError
+from clrecon.errors import DeviceMemoryError
 from clrecon.kernels.pages import result_pages
 from clrecon.opencl import Device
 from clrecon.opencl.context import describe_error
@@ -55,7 +55,7 @@ def empty_output(device: Device, shape: tuple[int, ...], dtype: DTypeLike) -> tu
     try:
         array = result_pages.empty(shape, dtype)
     except MemoryError as error:
-        raise DeviceError(f"the result does not fit the memory of this computer: {error}") from error
+        raise DeviceMemoryError(f"the memory of this computer does not suffice: {error}") from error
     if device.shares_host_memory and array.nbytes:
         return array, _make_buffer(device, cl.mem_flags.READ_WRITE | cl.mem_flags.USE_HOST_PTR, array.nbytes, array)
     return array, allocate(device, array.nbytes)

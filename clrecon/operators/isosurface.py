@@ -11,7 +11,7 @@ from numpy.typing import DTypeLike, NDArray
 
 from clrecon.errors import ClreconError, DeviceError, DeviceMemoryError, NoSurfaceError, UsageError
 from clrecon.geometry import Volume
-from clrecon.geometry.field import IsoRule, check_topology, choose_iso_rule, data_range
+from clrecon.geometry.field import IsoRule, ValueRange, check_topology, choose_iso_rule, data_range
 from clrecon.kernels import Program, Stopwatch, result_pages, upload
 from clrecon.mesh import Mesh
 from clrecon.opencl import Device, choose_device, describe_shortage, memory_limits
@@ -114,6 +114,7 @@ class SurfaceExtractor:
         self.volume = volume
         self.device = choose_device(device)
         self.memory = memory
+        self._values = ValueRange(volume)
         self._resident_d: Any = None
         self._bricks: BrickRanges | None = None
         self._extractions = 0
@@ -167,7 +168,7 @@ class SurfaceExtractor:
     ) -> Mesh:
         """Extract the surface at one iso value, see `extract_isosurface`."""
         stopwatch = Stopwatch()
-        grid = SampleGrid(self.volume, choose_iso_rule(self.volume, iso_value, closed, topology))
+        grid = SampleGrid(self.volume, choose_iso_rule(self.volume, iso_value, closed, topology, values=self._values))
         if topology == "trilinear":
             check_row(self.volume)
         if min(grid.shape) < 2:

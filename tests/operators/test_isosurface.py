@@ -8,7 +8,7 @@ import tolerances
 from scipy.spatial import cKDTree
 
 from clrecon.errors import DeviceError, NoSurfaceError, UsageError
-from clrecon.geometry import Volume, compose_affine
+from clrecon.geometry import Volume, compose_affine, field
 from clrecon.operators import isosurface, marching_cubes
 from clrecon.operators.isosurface import SurfaceExtractor, extract_isosurface, extract_isosurfaces
 from clrecon.pipeline.selftest import run_selftest
@@ -266,6 +266,20 @@ def test_several_iso_values_are_as_each_alone(device):
         assert np.array_equal(mesh.triangles, alone.triangles)
     with pytest.raises(UsageError, match="no iso value"):
         extract_isosurfaces(volume, [], device)
+
+
+@pytest.mark.parametrize("dtype", ["int16", "int32", "float32"])
+def test_the_values_of_a_resident_volume_are_looked_at_once(device, dtype, monkeypatch):
+    looks = []
+    for name in ("data_range", "_lowest_value"):
+        true_look = getattr(field, name)
+        monkeypatch.setattr(field, name, lambda volume, look=true_look: looks.append(1) or look(volume))
+    volume = Volume(smooth_volume().voxels.astype(dtype), OBLIQUE)
+    with SurfaceExtractor(volume, device) as extractor:
+        meshes = [extractor.extract(iso_value) for iso_value in (50, 100, 150)]
+    assert len(looks) == (2 if dtype == "int32" else 1)
+    monkeypatch.undo()
+    assert np.array_equal(meshes[1].vertices, extract_isosurface(volume, 100, device).vertices)
 
 
 def test_the_volume_is_uploaded_once(device, monkeypatch):
