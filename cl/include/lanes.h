@@ -12,17 +12,13 @@
 #if LANES == 8
 typedef float8 floats;
 typedef int8 ints;
-#define as_ints as_int8
 #define to_floats convert_float8
 #define load_lanes(pointer) vload8(0, pointer)
-#define store_lanes(values, pointer) vstore8(values, 0, pointer)
 #elif LANES == 1
 typedef float floats;
 typedef int ints;
-#define as_ints as_int
 #define to_floats convert_float
 #define load_lanes(pointer) (*(pointer))
-#define store_lanes(values, pointer) (*(pointer) = (values))
 #else
 #error "LANES is 1 or 8"
 #endif
