@@ -110,7 +110,7 @@ def choose_decoder(transfer_syntax: str) -> str:
 
 
 def decode_frame(header: SliceHeader, encapsulated: bytes) -> NDArray[Any]:
-    """Decode the one frame of a compressed slice.
+    """Decode the frame of a compressed slice.
 
     Parameters
     ----------
@@ -136,7 +136,8 @@ def decode_frame(header: SliceHeader, encapsulated: bytes) -> NDArray[Any]:
     if missing:
         raise RefusedInputError(f"{header.name}: truncated: {missing}")
     try:
-        size = read_codestream_size(get_frame(encapsulated, 0, number_of_frames=1))
+        frame_bytes = get_frame(encapsulated, header.frame, number_of_frames=header.frames)
+        size = read_codestream_size(frame_bytes)
         if size is not None and size != (header.rows, header.columns):
             raise RefusedInputError(
                 f"{header.name}: the compressed frame is {size[1]} x {size[0]}, "
@@ -144,13 +145,14 @@ def decode_frame(header: SliceHeader, encapsulated: bytes) -> NDArray[Any]:
             )
         frame, _ = get_decoder(header.transfer_syntax).as_array(  # type: ignore[arg-type]
             encapsulated,
+            index=header.frame,
             raw=True,
             validate=False,
             decoding_plugin=plugin,
             rows=header.rows,
             columns=header.columns,
             samples_per_pixel=1,
-            number_of_frames=1,
+            number_of_frames=header.frames,
             bits_allocated=header.bits_allocated,
             bits_stored=header.bits_stored,
             pixel_representation=int(header.signed),

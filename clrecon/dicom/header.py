@@ -1,4 +1,4 @@
-"""`SliceHeader`: the strict, validated model of one CT image between the parser and the geometry.
+"""`SliceHeader`: the strict, validated model of one CT slice between the parser and the geometry.
 
 No value of a file gets past this module unchecked: numbers are finite, in the right count and within a plausible
 range, or there is a problem that names the file and the tag.
@@ -15,7 +15,7 @@ from clrecon.dicom.elements import CorruptFileError, read_elements
 from clrecon.dicom.text import escape_text, hash_uid
 from clrecon.dicom.values import WANTED_TAGS, ValueProblem, Values
 
-__all__ = ["OtherImage", "SeriesIdentity", "SliceHeader", "read_header"]
+__all__ = ["OtherImage", "SeriesIdentity", "SliceHeader", "read_headers"]
 
 CT_IMAGE_STORAGE = "1.2.840.10008.5.1.4.1.1.2"
 SECONDARY_CAPTURE = "1.2.840.10008.5.1.4.1.1.7"
@@ -23,6 +23,19 @@ DICOMDIR_CLASS = "1.2.840.10008.1.3.10"
 
 DERIVED_WORDS = frozenset("MPR MIP MINIP MAXIP AIP PROJECTION REFORMATTED CPR CURVED VRT SSD".split())
 """Words of ImageType that, beside DERIVED, mean computed images: other planes, projections, renderings."""
+
+PHASE_KEYWORDS = (
+    "TemporalPositionIdentifier",
+    "TriggerTime",
+    "AcquisitionNumber",
+    "AcquisitionDate",
+    "AcquisitionTime",
+    "ConvolutionKernel",
+    "ImageType",
+    "ContentDate",
+    "ContentTime",
+)
+"""What tells the phases of one series apart, the most telling first."""
 
 PIXEL_SPACING_MM = (1e-3, 50.0)
 POSITION_LIMIT_MM = 1e6
@@ -69,9 +82,13 @@ class SliceHeader:
     Attributes
     ----------
     file, name : Path, str
-        Where it is; base name, escaped for messages.
+        Where it is; base name, escaped for messages, with the number of the frame (from 1) where there are several.
+    frame, frames : int
+        Which frame of the file it is, from 0, and how many the file holds.
     localizer : bool
         ImageType says LOCALIZER.
+    phase : tuple of (str, str)
+        Keyword and value of what may tell this slice from another one at the same place (see `PHASE_KEYWORDS`).
     rows, columns : int
     row_cosines, column_cosines : tuple of 3 float
         ImageOrientationPatient as stored.
@@ -95,7 +112,10 @@ class SliceHeader:
     series: SeriesIdentity
     file: Path
     name: str
+    frame: int
+    frames: int
     localizer: bool
+    phase: tuple[tuple[str, str], ...]
     patient_hash: str | None
     frame_of_reference: str
     transfer_syntax: str
@@ -129,17 +149,17 @@ class SliceHeader:
 
     @property
     def pixel_bytes(self) -> int:
-        """Bytes of the uncompressed pixels."""
+        """Bytes of the uncompressed pixels of this slice."""
         return self.rows * self.columns * self.bits_allocated // 8
 
 
-def read_header(path: Path) -> SliceHeader | OtherImage | None:
+def read_headers(path: Path) -> list[SliceHeader] | OtherImage | None:
     """Read and validate the header of one file.
 
     Returns
     -------
-    SliceHeader, OtherImage or None
-        None for a DICOMDIR, which only lists what is on the disk anyway.
+    list of SliceHeader, OtherImage or None
+        One slice, or one a frame; None for a DICOMDIR, which only lists what is on the disk anyway.
 
     Raises
     ------
@@ -180,7 +200,7 @@ def read_header(path: Path) -> SliceHeader | OtherImage | None:
             why = "without ImagePositionPatient (0020,0032): no geometry"
         return other(f"{name}: secondary capture (SOP class {sop_class}): {why}")
     try:
-        return _validate(values, series, path, name)
+        return [_validate(values, series, path, name)]
     except ValueProblem as problem:
         return other(f"{name}: {problem}")
 
@@ -227,6 +247,9 @@ def _validate(values: Values, series: SeriesIdentity, path: Path, name: str) -> 
         series=series,
         file=path,
         name=name,
+        frame=0,
+        frames=1,
+        phase=tuple((keyword, values.word(keyword)) for keyword in PHASE_KEYWORDS if keyword in values),
         localizer="LOCALIZER" in image_type,
         patient_hash=hash_uid(values.text("PatientID").strip()),
         frame_of_reference=values.word("FrameOfReferenceUID"),
@@ -320,8 +343,9 @@ def _check_pixel_room(header: SliceHeader, pixel_vr: str) -> None:
     found = header.pixel_length
     if header.inflate_from < 0:
         found = min(found, max(header.file_bytes - header.pixel_offset, 0))
-    if found < header.pixel_bytes:
+    if found < header.frames * header.pixel_bytes:
+        frames = f"{header.frames} x " if header.frames > 1 else ""
         raise ValueProblem(
-            f"truncated: {header.pixel_bytes} bytes of pixels expected ({header.columns} x {header.rows} x "
-            f"{header.bits_allocated} bit), {found} found"
+            f"truncated: {header.frames * header.pixel_bytes} bytes of pixels expected "
+            f"({frames}{header.columns} x {header.rows} x {header.bits_allocated} bit), {found} found"
         )

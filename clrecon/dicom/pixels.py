@@ -176,7 +176,7 @@ def _load_stored(header: SliceHeader, out: NDArray[Any]) -> NDArray[Any]:
                 file.seek(header.inflate_from)
                 _inflate_into(header, file.read() or b"", stored)
             else:
-                file.seek(header.pixel_offset)
+                file.seek(header.pixel_offset + header.frame * header.pixel_bytes)
                 _read_into(header, file, stored)
     except OSError as error:
         raise RefusedInputError(f"{header.name} cannot be read: {error.strerror or error}") from error
@@ -196,7 +196,8 @@ def _read_into(header: SliceHeader, file: Any, stored: NDArray[Any]) -> None:
 
 
 def _inflate_into(header: SliceHeader, deflated: bytes, stored: NDArray[Any]) -> None:
-    needed = header.pixel_offset + stored.nbytes
+    first = header.pixel_offset + header.frame * stored.nbytes
+    needed = first + stored.nbytes
     if needed > INFLATED_SLICE_LIMIT:
         raise RefusedInputError(
             f"{header.name}: deflated image of {needed} bytes, no more than {INFLATED_SLICE_LIMIT} are inflated"
@@ -205,10 +206,10 @@ def _inflate_into(header: SliceHeader, deflated: bytes, stored: NDArray[Any]) ->
         inflated = zlib.decompressobj(-zlib.MAX_WBITS).decompress(deflated, needed)
     except zlib.error as error:
         raise RefusedInputError(f"{header.name}: the deflated data set is damaged") from error
-    found = max(len(inflated) - header.pixel_offset, 0)
+    found = max(len(inflated) - first, 0)
     if found < stored.nbytes:
         raise RefusedInputError(f"{header.name}: truncated: {stored.nbytes} bytes of pixels expected, {found} found")
-    stored[...] = np.frombuffer(inflated, stored.dtype, stored.size, header.pixel_offset).reshape(stored.shape)
+    stored[...] = np.frombuffer(inflated, stored.dtype, stored.size, first).reshape(stored.shape)
 
 
 def _extend_sign(header: SliceHeader, stored: NDArray[Any]) -> None:

@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from clrecon.dicom.elements import META_START, CorruptFileError, NotDicomError
-from clrecon.dicom.header import OtherImage, SliceHeader, read_header
+from clrecon.dicom.header import OtherImage, SliceHeader, read_headers
 from clrecon.dicom.text import escape_text
 from clrecon.errors import NoDicomError
 
@@ -95,7 +95,7 @@ def scan_path(path: Path, progress: Progress | None = None) -> Scan:
 
 def _take_file(file: Path, scan: Scan) -> None:
     try:
-        header = read_header(file)
+        headers = read_headers(file)
     except NotDicomError as error:
         scan.skipped["not DICOM"] += 1
         reason = _suspect(file, error.start)
@@ -108,12 +108,12 @@ def _take_file(file: Path, scan: Scan) -> None:
         scan.skipped["not readable"] += 1
         scan.corrupt.append(CorruptFile(file, "not readable"))
     else:
-        if header is None:
+        if headers is None:
             scan.skipped["DICOMDIR"] += 1
-        elif isinstance(header, SliceHeader):
-            scan.slices.append(header)
+        elif isinstance(headers, OtherImage):
+            scan.others.append(headers)
         else:
-            scan.others.append(header)
+            scan.slices.extend(headers)
 
 
 def _suspect(file: Path, start: bytes) -> str:

@@ -30,19 +30,19 @@ def deny(monkeypatch):
     """Makes a file or folder one that the system does not let us read, for the superuser too."""
 
     def make_unreadable(path):
-        read_header, scandir = scan.read_header, os.scandir
+        read_headers, scandir = scan.read_headers, os.scandir
 
         def read_or_deny(file):
             if file == path:
                 raise PermissionError(13, "Permission denied")
-            return read_header(file)
+            return read_headers(file)
 
         def scan_or_deny(folder):
             if os.fspath(folder) == str(path):
                 raise PermissionError(13, "Permission denied")
             return scandir(folder)
 
-        monkeypatch.setattr(scan, "read_header", read_or_deny)
+        monkeypatch.setattr(scan, "read_headers", read_or_deny)
         monkeypatch.setattr(scan.os, "scandir", scan_or_deny)
 
     return make_unreadable
