@@ -10,6 +10,9 @@ def float32_unit(points) -> float:
     return float(np.spacing(np.float32(np.abs(points).max())))
 
 
+# --- geometry: maps ---
+FLOAT64_PLACE_MM = 1e-9  # coordinates of some 1000 mm there and back in float64
+
 # --- geometry: iso value half way between two materials ---
 HALF_WAY_STEP_SHARE = 0.03  # of the step between the materials, up to blur 1.5 voxels and 5 % noise: measured 0.025
 HALF_WAY_SHIFT_HU = 3  # what a shift, a scale, air, padding, table or metal may move it by: measured 2 (other edges)
@@ -25,6 +28,8 @@ SPHERE_DISTANCE_FIELD_VOXEL = 0.03  # sagitta of one edge at R = 5 voxels is 1/4
 SPHERE_PARTIAL_VOLUME_RMS_VOXEL = 0.05  # box-averaged edges bend; measured 0.044
 SPHERE_PARTIAL_VOLUME_MAX_VOXEL = 0.15  # measured 0.103
 TWIN_CELL_NORMAL = 2e-4  # normals inside cells: near a saddle the gradient is a small difference; measured 4e-5
+LINEAR_FIELD_MM = 1.2e-3  # vertices keep 4 units of 600 mm off samples, measured in the smallest gap of 0.4 to 1.9 mm
+LINEAR_FIELD_NORMAL = 2e-4  # differences of float32 values over steps of half a millimetre
 WAIST_DISTANCE_STEP = 1e-9  # the waist of a tunnel: corners of straight lines of the surface, in float64
 CENTRE_DISTANCE_STEP = 0.01  # steps of Newton end this near in 95 % of cells; the others have a flat spot
 

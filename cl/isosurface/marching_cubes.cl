@@ -157,9 +157,10 @@ __kernel void list_words(
  *             active_words    in   (active,)
  *             row_offsets     in   (3, rows_to_count)
  *             word_vertices   in   (gk, gj, words)
- *             slice_frames    in   (gk, 6) float4: position of sample (0, 0, k) in mm (rounded to 12 bits, rest),
- *                                  step to slice k + 1, and the three rows of the matrix that maps gradients per
- *                                  index step to gradients per mm
+ *             slice_frames    in   (gk, 9) float4: position of sample (0, 0, k) in mm (rounded to 12 bits, rest),
+ *                                  step to slice k + 1, the three rows of the matrix that maps gradients per index
+ *                                  step at the samples of slice k to gradients per mm, and those of the matrix for
+ *                                  gradients within the cells up to slice k + 1.  With -D UNEVEN the matrices differ
  *             steps           in   (4,) float4: mm for one step along i (rounded to 12 bits, rest), along j
  *             positions       out  (vertices, 3) mm
  *             normals         out  (vertices, 3) unit, towards lower values
@@ -237,7 +238,7 @@ void emit_vertices(
             k = row / gj;
             slice_begin = k * gj;
             slice_end = slice_begin + gj;
-            load_slice_frame(&frame, slice_frames + 6 * (size_t)k);
+            load_slice_frame(&frame, slice_frames, k, gk);
         }
         const uint j = row - slice_begin;
         crossed_edges edges;

@@ -269,7 +269,11 @@ __kernel void emit_cell_vertices(
     frame.i_rest = steps[1].xyz;
     frame.j_step = steps[2].xyz;
     frame.j_rest = steps[3].xyz;
-    load_slice_frame(&frame, slice_frames + 6 * (size_t)k);
+    load_slice_frame(&frame, slice_frames, k, gk);
+    __global const float4 *layer = slice_frames + FRAME_ROWS * (size_t)k + 6;
+    frame.normal_x = layer[0].xyz;
+    frame.normal_y = layer[1].xyz;
+    frame.normal_z = layer[2].xyz;
     cell_rows rows;
     load_cell_rows(&rows, mask, j, k, w, gj, words);
     size_t vertex = first_cell_vertex(row_offsets, cell_vertex_offsets, row, k, gj) + (place & (HAS_CELL_VERTICES - 1));

@@ -26,20 +26,31 @@ typedef struct {
     float3 i_step, i_rest, j_step, j_rest; /* mm for one step along i and j, likewise */
     float3 k_step; /* mm to the next slice */
     float3 normal_x, normal_y, normal_z; /* rows of the matrix from gradients per step to gradients per mm */
+#ifdef UNEVEN
+    float3 next_normal_x, next_normal_y, next_normal_z; /* those of the next slice */
+#endif
     float3 margin; /* smallest distance of a vertex from a sample, in steps */
     float iso_level, value_scale;
 } slice_frame;
 
+#define FRAME_ROWS 9
 
-/* Fill in what differs from slice to slice. */
-static inline void load_slice_frame(slice_frame *frame, __global const float4 *row)
+/* Fill in what differs from slice to slice, for vertices on edges from the samples of slice k of gk. */
+static inline void load_slice_frame(slice_frame *frame, __global const float4 *slice_frames, uint k, uint gk)
 {
+    __global const float4 *row = slice_frames + FRAME_ROWS * (size_t)k;
     frame->origin = row[0].xyz;
     frame->origin_rest = row[1].xyz;
     frame->k_step = row[2].xyz;
     frame->normal_x = row[3].xyz;
     frame->normal_y = row[4].xyz;
     frame->normal_z = row[5].xyz;
+#ifdef UNEVEN
+    row = slice_frames + FRAME_ROWS * (size_t)min(k + 1, gk - 1);
+    frame->next_normal_x = row[3].xyz;
+    frame->next_normal_y = row[4].xyz;
+    frame->next_normal_z = row[5].xyz;
+#endif
 }
 
 /* Twice the gradient in one direction, from the values before and after; one-sided at the ends of an open volume. */
@@ -179,19 +190,39 @@ static inline void write_vertices(
     store_triples(PLACE(x), PLACE(y), PLACE(z), count, positions);
 #undef PLACE
 
-#define SLOPE(c) (value_scale * (to_floats(load_lanes(group->gradient_##c)) + t \
-        * (to_floats(load_lanes(group->next_gradient_##c)) - to_floats(load_lanes(group->gradient_##c)))))
+#define GRADIENT(c) to_floats(load_lanes(group->gradient_##c))
+#define NEXT_GRADIENT(c) to_floats(load_lanes(group->next_gradient_##c))
+#define SLOPE(c) (value_scale * (GRADIENT(c) + t * (NEXT_GRADIENT(c) - GRADIENT(c))))
     floats slope_i = SLOPE(i), slope_j = SLOPE(j), slope_k = SLOPE(k);
 #undef SLOPE
     /* Where the differences cancel, the edge itself says which way is down. */
     const ints flat = slope_i * slope_i + slope_j * slope_j + slope_k * slope_k == 0.0f;
     const floats up = choose(next_value > value, (floats)(1.0f), (floats)(-1.0f));
+#ifdef UNEVEN
+    /* The two ends of an edge along k have steps of their own: each part of the slope goes through its own matrix. */
+#define NEXT_PART(c) choose(along_k & ~flat, value_scale * t * NEXT_GRADIENT(c), (floats)(0.0f))
+    const floats next_i = NEXT_PART(i), next_j = NEXT_PART(j), next_k = NEXT_PART(k);
+#undef NEXT_PART
+    slope_i -= next_i;
+    slope_j -= next_j;
+    slope_k -= next_k;
+#endif
     slope_i = choose(flat & (axis == 0), up, slope_i);
     slope_j = choose(flat & along_j, up, slope_j);
     slope_k = choose(flat & along_k, up, slope_k);
 #define NORMAL(c) (frame->normal_##c.x * slope_i + frame->normal_##c.y * slope_j + frame->normal_##c.z * slope_k)
-    const floats x = NORMAL(x), y = NORMAL(y), z = NORMAL(z);
+    floats x = NORMAL(x), y = NORMAL(y), z = NORMAL(z);
 #undef NORMAL
+#ifdef UNEVEN
+#define NORMAL(c) (frame->next_normal_##c.x * next_i + frame->next_normal_##c.y * next_j \
+        + frame->next_normal_##c.z * next_k)
+    x += NORMAL(x);
+    y += NORMAL(y);
+    z += NORMAL(z);
+#undef NORMAL
+#endif
+#undef NEXT_GRADIENT
+#undef GRADIENT
     const floats scale = -1.0f / sqrt(x * x + y * y + z * z);
     store_triples(x * scale, y * scale, z * scale, count, normals);
 }

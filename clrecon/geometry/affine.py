@@ -18,6 +18,7 @@ from clrecon.errors import UsageError
 __all__ = [
     "apply_affine",
     "checked_affine",
+    "checked_points",
     "column_spacing",
     "compose_affine",
     "is_left_handed",
@@ -92,13 +93,24 @@ def apply_affine(affine: Float64Array, points: ArrayLike) -> Float64Array:
     UsageError
         `points` is not (n, 3).
     """
+    return checked_points(points) @ affine[:3, :3].T + affine[:3, 3]
+
+
+def checked_points(points: ArrayLike) -> Float64Array:
+    """Return points (n, 3) as float64 after checking that they are.
+
+    Raises
+    ------
+    UsageError
+        They are not.
+    """
     try:
-        points = np.asarray(points, dtype=np.float64)
+        checked = np.asarray(points, dtype=np.float64)
     except (TypeError, ValueError) as error:
         raise UsageError(f"points are an array of numbers of shape (n, 3): {error}") from error
-    if points.ndim != 2 or points.shape[1] != 3:
-        raise UsageError(f"points have shape (n, 3), these have {points.shape}")
-    return points @ affine[:3, :3].T + affine[:3, 3]
+    if checked.ndim != 2 or checked.shape[1] != 3:
+        raise UsageError(f"points have shape (n, 3), these have {checked.shape}")
+    return checked
 
 
 def column_spacing(affine: Float64Array) -> tuple[float, float, float]:

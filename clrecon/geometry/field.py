@@ -37,6 +37,7 @@ __all__ = [
     "check_topology",
     "choose_iso_rule",
     "data_range",
+    "layer_normal_matrices",
     "slice_normal_matrices",
     "vertex_margin",
 ]
@@ -263,8 +264,35 @@ def vertex_margin(volume: Volume, border: int) -> NDArray[np.float64]:
 def slice_normal_matrices(volume: Volume, border: int) -> NDArray[np.float64]:
     """For each slice from ``-border`` to ``nk - 1 + border`` the matrix from gradients per step to gradients per mm.
 
+    Gradients are central differences, so the step along k is the mean of the steps to both neighbours: exact for a
+    linear field, however the slices lie.
+
     Returns
     -------
     ndarray, shape (nk + 2 * border, 3, 3), float64
     """
-    return np.broadcast_to(normal_matrix(volume.affine), (volume.shape_ijk[2] + 2 * border, 3, 3))
+    origins = volume.slice_origins(border + 1)
+    return _normal_matrices(volume, border, 0.5 * (origins[2:] - origins[:-2]))
+
+
+def layer_normal_matrices(volume: Volume, border: int) -> NDArray[np.float64]:
+    """The same for the layers of cells from ``-border`` to ``nk - 1 + border``, each up to the next slice.
+
+    Gradients are those of the trilinear field within a cell, per step of that cell.
+
+    Returns
+    -------
+    ndarray, shape (nk + 2 * border, 3, 3), float64
+        The last is the layer beyond the last slice.
+    """
+    return _normal_matrices(volume, border, np.diff(volume.slice_origins(border + 1), axis=0)[1:])
+
+
+def _normal_matrices(volume: Volume, border: int, k_steps: NDArray[np.float64]) -> NDArray[np.float64]:
+    count = volume.shape_ijk[2] + 2 * border
+    if not volume.uneven:
+        return np.broadcast_to(normal_matrix(volume.affine), (count, 3, 3))
+    steps = np.empty((count, 3, 3))
+    steps[:, :, :2] = volume.affine[:3, :2]
+    steps[:, :, 2] = k_steps
+    return np.asarray(np.linalg.inv(steps).transpose(0, 2, 1), dtype=np.float64)

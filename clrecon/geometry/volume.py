@@ -8,8 +8,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from clrecon.errors import UsageError
-from clrecon.geometry.affine import Float64Array, apply_affine, checked_affine, column_spacing
+from clrecon.geometry.affine import Float64Array, apply_affine, checked_affine, checked_points, column_spacing
 from clrecon.geometry.mapping import find_mapping
+from clrecon.geometry.stack import UnevenStack
 
 __all__ = ["AIR_HU", "DEVICE_DTYPES", "Volume"]
 
@@ -63,14 +64,24 @@ class Volume:
         Index (i, j, k) to LPS mm, see `clrecon.geometry.affine`.
     report : dict, optional
         What is known of the origin and the quality of this volume (the certificate of `read_volume`).
+    slice_positions : array_like, shape (nk, 3), optional
+        LPS mm of voxel (0, 0, k), for slices that no affine places: between two of them k runs linearly, beyond the
+        ends in the steps of the ends.  The third column of `affine` is then only nominal.
 
     Raises
     ------
     UsageError
-        `voxels` is not three-dimensional, empty, or of a type that cannot be used; `affine` is not an affine.
+        `voxels` is not three-dimensional, empty, or of a type that cannot be used; `affine` is not an affine;
+        `slice_positions` are no such stack.
     """
 
-    def __init__(self, voxels: ArrayLike, affine: ArrayLike, report: dict[str, Any] | None = None):
+    def __init__(
+        self,
+        voxels: ArrayLike,
+        affine: ArrayLike,
+        report: dict[str, Any] | None = None,
+        slice_positions: ArrayLike | None = None,
+    ):
         array = _as_array(voxels)
         if array.ndim != 3:
             raise UsageError(f"voxels have three axes (k, j, i), these have shape {array.shape}")
@@ -81,6 +92,9 @@ class Volume:
         self._affine = checked_affine(affine)
         self._affine.flags.writeable = False
         self._inverse = np.asarray(np.linalg.inv(self._affine), dtype=np.float64)
+        self._stack: UnevenStack | None = None
+        if slice_positions is not None:
+            self._stack = UnevenStack.of(self._affine, slice_positions, self._voxels.shape[0])
         self.report: dict[str, Any] = {"warnings": []} if report is None else report
 
     @property
@@ -90,8 +104,13 @@ class Volume:
 
     @property
     def affine(self) -> Float64Array:
-        """4x4 float64, index (i, j, k) to LPS mm (read-only)."""
+        """4x4 float64, index (i, j, k) to LPS mm (read-only); where the slices are `uneven` only nominal along k."""
         return self._affine
+
+    @property
+    def uneven(self) -> bool:
+        """True when the slices lie where `slice_origins` says and not on the affine's even steps."""
+        return self._stack is not None
 
     @property
     def spacing(self) -> tuple[float, float, float]:
@@ -105,11 +124,15 @@ class Volume:
         return ni, nj, nk
 
     def ijk_to_lps(self, points: ArrayLike) -> Float64Array:
-        """Map index coordinates (n, 3), fractions allowed, to LPS mm (n, 3), float64."""
+        """Map index coordinates (n, 3), fractions allowed, to LPS mm (n, 3), float64; exact for uneven slices too."""
+        if self._stack is not None:
+            return self._stack.ijk_to_lps(checked_points(points))
         return apply_affine(self._affine, points)
 
     def lps_to_ijk(self, points: ArrayLike) -> Float64Array:
-        """Map LPS mm (n, 3) to index coordinates (n, 3), float64."""
+        """Map LPS mm (n, 3) to index coordinates (n, 3), float64; the inverse of `ijk_to_lps`."""
+        if self._stack is not None:
+            return self._stack.lps_to_ijk(checked_points(points))
         return apply_affine(self._inverse, points)
 
     def slice_origins(self, border: int = 0) -> Float64Array:
@@ -120,7 +143,29 @@ class Volume:
         ndarray, shape (nk + 2 * border, 3), float64
         """
         k = np.arange(-border, self._voxels.shape[0] + border, dtype=np.float64)
+        if self._stack is not None:
+            return self._stack.origins_at(k)
         return self._affine[:3, 3] + k[:, None] * self._affine[:3, 2]
+
+    def with_voxels(self, voxels: ArrayLike, report: dict[str, Any] | None = None) -> Volume:
+        """Return a volume with other values at the same places.
+
+        Parameters
+        ----------
+        voxels : array_like, shape (nk, nj, ni)
+        report : dict, optional
+            In place of a copy of this volume's.
+
+        Raises
+        ------
+        UsageError
+            The shape differs.
+        """
+        array = _as_array(voxels)
+        if array.shape != self._voxels.shape:
+            raise UsageError(f"the voxels have shape {array.shape}, those of this volume {self._voxels.shape}")
+        positions = None if self._stack is None else self.slice_origins()
+        return Volume(array, self._affine, dict(self.report) if report is None else report, positions)
 
     def release_slices(self, first: int, end: int) -> None:
         """Say that slices ``first`` to ``end - 1`` are not needed soon: those of a memory-mapped file leave memory.
@@ -133,4 +178,5 @@ class Volume:
     def __repr__(self) -> str:
         ni, nj, nk = self.shape_ijk
         di, dj, dk = self.spacing
-        return f"Volume({ni} x {nj} x {nk} {self._voxels.dtype}, spacing {di:.4g} x {dj:.4g} x {dk:.4g} mm)"
+        uneven = ", uneven slices" * self.uneven
+        return f"Volume({ni} x {nj} x {nk} {self._voxels.dtype}, spacing {di:.4g} x {dj:.4g} x {dk:.4g} mm{uneven})"

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.geometry import Volume
-from clrecon.geometry.field import IsoRule, slice_normal_matrices
+from clrecon.geometry.field import IsoRule, layer_normal_matrices
 from clrecon.mesh.distances import summarise_distances
 from clrecon.mesh.measures import chunks
 from clrecon.mesh.mesh import Mesh
@@ -120,7 +120,7 @@ def distances_to_iso_surface(volume: Volume, rule: IsoRule, points: Float64Array
     ndarray, shape (n,), float64, mm
         NaN where no surface was found: the field is flat there, or steps across a crease go to and fro.
     """
-    matrices = np.asarray(slice_normal_matrices(volume, rule.border))
+    matrices = np.asarray(layer_normal_matrices(volume, rule.border))
     longest = 0.5 * smallest_voxel_mm(volume)
     distances = np.full(len(points), np.nan)
     for where in chunks(len(points), _PIECE):

@@ -177,7 +177,7 @@ class SurfaceExtractor:
         if progress is not None:
             progress("build", 0, 1)
         with stopwatch.timed("build"):
-            prepare_isosurface(self.device, self.volume.voxels.dtype, topology)
+            prepare_isosurface(self.device, self.volume.voxels.dtype, topology, self.volume.uneven)
         if progress is not None:
             progress("build", 1, 1)
         self._extractions += 1
@@ -276,7 +276,7 @@ class _Run:
 
     def _one_slab(self, slab: Slab, first_vertex: int) -> Part:
         device, stopwatch = self.device, self.stopwatch
-        program = prepare_isosurface(device, self.grid.volume.voxels.dtype)
+        program = prepare_isosurface(device, self.grid.volume.voxels.dtype, uneven=self.grid.volume.uneven)
         with stopwatch.timed("upload"):
             voxels_d = self.extractor._upload(slab)
         with stopwatch.running(device):
@@ -323,8 +323,12 @@ class _Run:
         }
 
 
-def prepare_isosurface(device: Device, dtype: DTypeLike = np.int16, topology: str = "separated") -> Program:
+def prepare_isosurface(
+    device: Device, dtype: DTypeLike = np.int16, topology: str = "separated", uneven: bool = False
+) -> Program:
     """Build the kernels for volumes of `dtype`, so that a later `extract_isosurface` with `topology` need not wait.
+
+    With `uneven` those for volumes whose slices no affine places.
 
     Raises
     ------
@@ -333,7 +337,7 @@ def prepare_isosurface(device: Device, dtype: DTypeLike = np.int16, topology: st
     """
     if topology == "trilinear":
         prepare_trilinear(device, dtype)
-    return marching_cubes.prepare_marching_cubes(device, dtype)
+    return marching_cubes.prepare_marching_cubes(device, dtype, uneven=uneven)
 
 
 def extract_isosurface(

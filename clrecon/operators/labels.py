@@ -57,7 +57,7 @@ class _Window(Slab):
 
 
 def prepare_labels(
-    device: Device, dtype: DTypeLike = np.int16, label_dtype: DTypeLike = np.uint8
+    device: Device, dtype: DTypeLike = np.int16, label_dtype: DTypeLike = np.uint8, uneven: bool = False
 ) -> tuple[Program, Program]:
     """Build the kernels for volumes and labels of these types: those that find what is inside, those of the surface.
 
@@ -68,7 +68,7 @@ def prepare_labels(
     """
     variants = {**voxel_variants(dtype), **label_variants(label_dtype)}
     own = load_program(device, "labels/own_samples.cl", variants)
-    return own, marching_cubes.prepare_marching_cubes(device, dtype, label_dtype)
+    return own, marching_cubes.prepare_marching_cubes(device, dtype, label_dtype, uneven)
 
 
 def _choose_numbers(labels: LabelMap, numbers: Sequence[int | str] | None) -> tuple[int, ...]:
@@ -100,7 +100,7 @@ class _Run:
         self.level = voxel_level(device, volume, rule)
         self.placement = Placement.of(volume, rule.border)
         with self.stopwatch.timed("build"):
-            self.own, self.surface = prepare_labels(device, volume.voxels.dtype, taken.voxels.dtype)
+            self.own, self.surface = prepare_labels(device, volume.voxels.dtype, taken.voxels.dtype, volume.uneven)
 
     def slices_for(self, boxes: dict[int, Box]) -> tuple[int, int]:
         """First and end of the slices of the volume that these labels need."""
@@ -212,8 +212,19 @@ class _Run:
             "solid": self.solid,
             "seconds": dict(self.stopwatch.seconds),
             "kernel_seconds": dict(self.stopwatch.by_kernel),
-            "warnings": list(cache_warnings()),
+            "warnings": [*cache_warnings(), *_warn_of_uneven_growth(self.volume, self.growth)],
         }
+
+
+def _warn_of_uneven_growth(volume: Volume, growth: Growth) -> list[str]:
+    """Offsets to the samples around are one table for all slices, so growth takes the slices as evenly spaced."""
+    if not volume.uneven or not len(growth.offsets):
+        return []
+    steps = np.linalg.norm(np.diff(volume.slice_origins(), axis=0), axis=1)
+    return [
+        f"the slices are unevenly spaced ({steps.min():.3f} to {steps.max():.3f} mm): the growth of the labels takes"
+        f" {volume.spacing[2]:.3f} mm from one to the next everywhere"
+    ]
 
 
 def _refuse_label(volume: Volume, taken: ResampledLabels, label: str, number: int, rule: IsoRule) -> NoSurfaceError:

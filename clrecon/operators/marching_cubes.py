@@ -10,7 +10,7 @@ from numpy.typing import DTypeLike, NDArray
 
 from clrecon.errors import DeviceError, DeviceMemoryError
 from clrecon.geometry import Volume, is_left_handed
-from clrecon.geometry.field import slice_normal_matrices, vertex_margin
+from clrecon.geometry.field import layer_normal_matrices, slice_normal_matrices, vertex_margin
 from clrecon.kernels import Program, Stopwatch, allocate, download, empty_output, launch, load_program, upload
 from clrecon.opencl import Device
 from clrecon.operators.bricks import BrickStates
@@ -63,8 +63,12 @@ class Counted:
         return {"vertices": 24 * self.vertices, "triangles": 12 * self.triangles}
 
 
-def prepare_marching_cubes(device: Device, dtype: DTypeLike, labels: DTypeLike | None = None) -> Program:
+def prepare_marching_cubes(
+    device: Device, dtype: DTypeLike, labels: DTypeLike | None = None, uneven: bool = False
+) -> Program:
     """Build the kernels for volumes of `dtype`; with `labels`, their type, those whose emit_vertices takes labels.
+
+    With `uneven` those for volumes whose slices no affine places.
 
     Raises
     ------
@@ -77,6 +81,8 @@ def prepare_marching_cubes(device: Device, dtype: DTypeLike, labels: DTypeLike |
         _load_classify(device, dtype)
     else:
         variants.update(LABELS="1", **label_variants(labels))
+    if uneven:
+        variants["UNEVEN"] = "1"
     return load_program(device, "isosurface/marching_cubes.cl", variants)
 
 
@@ -104,7 +110,7 @@ class Placement:
 
     Attributes
     ----------
-    slice_frames : ndarray, shape (gk, 6, 4), float32
+    slice_frames : ndarray, shape (gk, 9, 4), float32
     steps : ndarray, shape (4, 4), float32
     margin : ndarray, shape (4,), float32
     """
@@ -125,7 +131,8 @@ class Placement:
         origins = volume.slice_origins(border + 1)[1:]
         head, rest = origins[:-1].astype(np.float32), origins[:-1] - origins[:-1].astype(np.float32)
         parts = [head.astype(np.float64)[:, None], rest[:, None], np.diff(origins, axis=0)[:, None]]
-        frames = _pad4(np.concatenate([*parts, slice_normal_matrices(volume, border)], axis=1))
+        normals = slice_normal_matrices(volume, border), layer_normal_matrices(volume, border)
+        frames = _pad4(np.concatenate([*parts, *normals], axis=1))
         steps = _pad4(np.stack([part for step in (0, 1) for part in _split(volume.affine[:3, step])]))
         return cls(frames, steps, _pad4(vertex_margin(volume, border)))
 
@@ -265,7 +272,7 @@ def emit(
     """
     grid = slab.grid
     volume, rule = grid.volume, grid.rule
-    frames_d = upload(device, placement.slice_frames[slab.first : slab.end])
+    frames_d = upload(device, placement.slice_frames[slab.first : slab.first + slab.mask_slices])
     steps_d = upload(device, placement.steps)
     positions, positions_d = empty_output(device, (counted.vertices, 3), np.float32)
     normals, normals_d = empty_output(device, (counted.vertices, 3), np.float32)

@@ -6,7 +6,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.geometry import Volume, is_left_handed
-from clrecon.geometry.field import IsoRule, choose_iso_rule, slice_normal_matrices, vertex_margin
+from clrecon.geometry.field import (
+    IsoRule,
+    choose_iso_rule,
+    layer_normal_matrices,
+    slice_normal_matrices,
+    vertex_margin,
+)
 from clrecon.reference.case_table import CORNERS, EDGES, case_table
 from clrecon.reference.trilinear import find_row, place_cell_vertices
 from clrecon.reference.trilinear_table import CELL_VERTEX
@@ -184,29 +190,31 @@ def extract_inside(
     here = np.stack([i, j], axis=1) - rule.border
     positions = origins[k] + (here + t * step[:, :2]) @ volume.affine[:3, :2].T + t * (origins[k1] - origins[k])
 
-    slope = (1.0 - t) * gradients[k, j, i] + t * gradients[k1, j1, i1]
+    slope, next_slope = (1.0 - t) * gradients[k, j, i], t * gradients[k1, j1, i1]
     if half_way.any():
         around = np.pad(inside.astype(np.float64), 1, mode="constant" if rule.closed else "edge")
         gradients = _gradients(around, rule)
-        slope[half_way] = (gradients[k, j, i] + gradients[k1, j1, i1])[half_way]
-    flat = ~slope.any(axis=1)
+        slope[half_way], next_slope[half_way] = gradients[k, j, i][half_way], gradients[k1, j1, i1][half_way]
+    flat = ~(slope + next_slope).any(axis=1)
     rise = np.where(inside[k1, j1, i1], 1.0, -1.0)
-    slope[flat] = (rise[:, None] * step)[flat]
+    slope[flat], next_slope[flat] = (rise[:, None] * step)[flat], 0.0
+    at_samples = slice_normal_matrices(volume, rule.border)
+    up = np.einsum("nij,nj->ni", at_samples[k], slope) + np.einsum("nij,nj->ni", at_samples[k1], next_slope)
     if rule.topology == "separated":
         triangles = _find_triangles(inside, numbers)
     else:
         heights = field.astype(np.float32) - np.float32(rule.iso_level)
         margins = vertex_margin(volume, rule.border)
-        triangles, (cells, points, up) = _find_trilinear_triangles(inside, numbers, heights, margins)
+        triangles, (cells, points, cell_slope) = _find_trilinear_triangles(inside, numbers, heights, margins)
         ck = cells[:, 0]
+        cell_up = np.einsum("nij,nj->ni", layer_normal_matrices(volume, rule.border)[ck], cell_slope)
         here = cells[:, :0:-1] - rule.border + points[:, :2]
         placed = origins[ck] + here @ volume.affine[:3, :2].T + points[:, 2:] * (origins[ck + 1] - origins[ck])
         # Slice by slice: the vertices on edges, then those inside cells.
         order = np.argsort(np.concatenate([k, ck]), kind="stable")
         triangles = np.argsort(order).astype(np.uint32)[triangles]
-        positions, slope, k = (np.concatenate(pair)[order] for pair in ((positions, placed), (slope, up), (k, ck)))
-    normals = -np.einsum("nij,nj->ni", slice_normal_matrices(volume, rule.border)[k], slope)
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+        positions, up = (np.concatenate(pair)[order] for pair in ((positions, placed), (up, cell_up)))
+    normals = -up / np.linalg.norm(up, axis=1, keepdims=True)
     if is_left_handed(volume.affine):
         triangles = triangles[:, ::-1].copy()
     return positions, normals, triangles

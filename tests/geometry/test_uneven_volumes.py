@@ -1,0 +1,112 @@
+"""Volumes whose slices lie at places of their own: the map to millimetres and back, and gradients under it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from clrecon.errors import UsageError
+from clrecon.geometry import Volume
+from clrecon.geometry.field import layer_normal_matrices, slice_normal_matrices
+from tests import tolerances
+from tests.dicom_series import rotation
+
+IN_PLANE = rotation((20.0, -35.0, 10.0))[:, :2] * (0.5, 0.7)
+HEIGHTS = np.array([0.0, 1.25, 2.4, 3.75, 8.75, 9.0])
+SIDEWAYS = np.array([0.0, 0.3, 0.2, 1.0, 2.5, 2.0])
+"""Mm along the columns: no two layers are sheared alike."""
+
+
+def positions(sign: float = 1.0) -> np.ndarray:
+    normal = np.cross(*IN_PLANE.T)
+    normal *= sign / np.linalg.norm(normal)
+    return np.array([-120.0, 80.0, -700.0]) + HEIGHTS[:, None] * normal + SIDEWAYS[:, None] * IN_PLANE[:, 1]
+
+
+def uneven(voxels: np.ndarray | None = None, sign: float = 1.0) -> Volume:
+    table = positions(sign)
+    affine = np.eye(4)
+    affine[:3, :2] = IN_PLANE
+    affine[:3, 2] = (table[-1] - table[0]) / (len(table) - 1)
+    affine[:3, 3] = table[0]
+    if voxels is None:
+        voxels = np.zeros((len(table), 5, 4), np.int16)
+    return Volume(voxels, affine, slice_positions=table)
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_every_voxel_lies_at_its_slice(sign):
+    volume = uneven(sign=sign)
+    i, j, k = (axis.ravel() for axis in np.mgrid[:4, :5, :6])
+    points = volume.ijk_to_lps(np.stack([i, j, k], axis=1))
+    truth = positions(sign)[k] + np.stack([i, j], axis=1) @ IN_PLANE.T
+    assert np.abs(points - truth).max() <= tolerances.FLOAT64_PLACE_MM
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_the_map_is_linear_in_each_layer_and_has_an_inverse(sign):
+    volume = uneven(sign=sign)
+    ijk = np.random.default_rng(5).uniform((-2, -2, -2), (6, 7, 8), (400, 3))
+    lps = volume.ijk_to_lps(ijk)
+    assert np.abs(volume.lps_to_ijk(lps) - ijk).max() <= tolerances.FLOAT64_PLACE_MM
+    layer = np.clip(np.floor(ijk[:, 2]).astype(int), 0, 4)
+    low, high = (volume.ijk_to_lps(np.column_stack([ijk[:, :2], layer + end])) for end in (0, 1))
+    part = (ijk[:, 2] - layer)[:, None]
+    assert np.abs(low + part * (high - low) - lps).max() <= tolerances.FLOAT64_PLACE_MM
+
+
+def test_beyond_the_ends_the_steps_of_the_ends_go_on():
+    volume = uneven()
+    origins = volume.slice_origins(border=2)
+    steps = np.diff(origins, axis=0)
+    assert origins[2:-2] == pytest.approx(positions())
+    assert steps[:2] == pytest.approx(np.tile(steps[2], (2, 1)))
+    assert steps[-2:] == pytest.approx(np.tile(steps[-3], (2, 1)))
+
+
+def test_gradients_of_a_linear_field_come_out_exact():
+    slope = np.array([3.0, -2.0, 5.0])
+    volume = uneven()
+    values = volume.slice_origins(border=1) @ slope
+    at_samples, in_layers = slice_normal_matrices(volume, 0), layer_normal_matrices(volume, 0)
+    in_plane = IN_PLANE.T @ slope
+    for k in range(6):
+        before, here, after = values[k : k + 3]
+        assert at_samples[k] @ (*in_plane, (after - before) / 2) == pytest.approx(slope)
+        assert in_layers[k] @ (*in_plane, after - here) == pytest.approx(slope)
+
+
+def test_even_positions_are_the_affine():
+    affine = np.array([[0.5, 0.1, 0.0, -30.0], [0.0, 0.7, -0.4, 20.0], [0.1, 0.0, 1.25, 5.0], [0, 0, 0, 1]])
+    even = Volume(np.zeros((6, 5, 4), np.int16), affine)
+    table = Volume(np.zeros((6, 5, 4), np.int16), affine, slice_positions=even.slice_origins())
+    ijk = np.random.default_rng(8).uniform(-3, 9, (50, 3))
+    assert table.ijk_to_lps(ijk) == pytest.approx(even.ijk_to_lps(ijk))
+    assert table.lps_to_ijk(even.ijk_to_lps(ijk)) == pytest.approx(ijk)
+    assert slice_normal_matrices(table, 1) == pytest.approx(slice_normal_matrices(even, 1))
+    assert even.uneven is False and table.uneven is True
+
+
+def test_other_voxels_at_the_same_places():
+    volume = uneven()
+    volume.report["warnings"].append("kept")
+    other = volume.with_voxels(np.full((6, 5, 4), 7.5, np.float32))
+    assert other.ijk_to_lps([(1, 2, 3.5)]) == pytest.approx(volume.ijk_to_lps([(1, 2, 3.5)]))
+    assert other.uneven and other.voxels.max() == 7.5 and other.report["warnings"] == ["kept"]
+    with pytest.raises(UsageError, match="shape"):
+        volume.with_voxels(np.zeros((6, 5, 3)))
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (lambda table: table[:-1], "5 slice positions for 6 slices"),
+        (lambda table: table[[0, 2, 1, 3, 4, 5]], "from slice 1 to 2"),
+        (lambda table: table[::-1], "advance"),
+        (lambda table: np.where(np.arange(6)[:, None] == 2, np.nan, table), "NaN"),
+    ],
+)
+def test_what_is_no_stack_is_refused(change, says):
+    affine = uneven().affine
+    with pytest.raises(UsageError, match=says):
+        Volume(np.zeros((6, 5, 4), np.int16), affine, slice_positions=change(positions()))

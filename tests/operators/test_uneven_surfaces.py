@@ -1,0 +1,121 @@
+"""Surfaces of volumes whose slices are unevenly spaced: by analysis, and against the numpy twins."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from test_slabs import assert_same, extract_in_slabs
+
+from clrecon.geometry import Volume
+from clrecon.geometry.field import choose_iso_rule
+from clrecon.labels import LabelMap
+from clrecon.mesh.iso_distance import distances_to_iso_surface
+from clrecon.operators.isosurface import extract_isosurface
+from clrecon.operators.labels import extract_labels
+from clrecon.reference.isosurface import extract_isosurface as extract_twin
+from tests import tolerances
+from tests.dicom_series import rotation
+
+GAPS = (1.0,) * 9 + (0.4,) * 3 + (1.9,) * 8 + (1.0,) * 4
+TURN = rotation((15.0, -25.0, 40.0))
+IN_PLANE = TURN[:, :2] * (0.7, 0.5)
+
+
+def make_volume(field, shape=(40, 50), gaps=GAPS, sideways=0.3, dtype=np.float32) -> Volume:
+    """`field` of points (n, 3) in mm around the centre of a stack that is sheared more where its gaps are larger."""
+    heights = np.concatenate([[0.0], np.cumsum(gaps)])
+    rng = np.random.default_rng(2)
+    table = (
+        heights[:, None] * TURN[:, 2]
+        + (sideways * heights + rng.uniform(-0.1, 0.1, len(heights)))[:, None] * TURN[:, 1]
+    )
+    table = table + np.array([40.0, -90.0, -600.0])
+    affine = np.eye(4)
+    affine[:3, :2], affine[:3, 2], affine[:3, 3] = IN_PLANE, (table[-1] - table[0]) / (len(table) - 1), table[0]
+    nj, ni = shape
+    volume = Volume(np.zeros((len(table), nj, ni), dtype), affine, slice_positions=table)
+    k, j, i = np.mgrid[: len(table), :nj, :ni].reshape(3, -1)
+    points = volume.ijk_to_lps(np.stack([i, j, k], axis=1)) - centre_of(volume)
+    return volume.with_voxels(field(points).reshape(len(table), nj, ni).astype(dtype))
+
+
+def centre_of(volume: Volume) -> np.ndarray:
+    return volume.ijk_to_lps([(np.array(volume.shape_ijk) - 1) / 2])[0]
+
+
+def test_a_sphere_keeps_its_shape_through_a_change_of_feed(device):
+    radius = 10.0
+    volume = make_volume(lambda p: radius - np.linalg.norm(p, axis=1), (66, 50))
+    mesh = extract_isosurface(volume, 0.0, device)
+    away = mesh.vertices - centre_of(volume)
+    assert np.abs(np.linalg.norm(away, axis=1) - radius).max() <= tolerances.SPHERE_DISTANCE_FIELD_VOXEL * max(GAPS)
+    quality = mesh.quality()
+    assert quality["closed"] and quality["manifold"] and quality["genus"] == 0
+    exact = 4 / 3 * np.pi * radius**3 / 1000
+    assert exact * 0.96 < quality["volume_ml"] < exact
+    nominal = Volume(volume.voxels, volume.affine)  # the check can fail: evenly spaced slices distort it
+    wrong = extract_isosurface(nominal, 0.0, device).vertices - nominal.ijk_to_lps(
+        [(np.array(volume.shape_ijk) - 1) / 2]
+    )
+    assert np.abs(np.linalg.norm(wrong, axis=1) - radius).max() > 0.5
+
+
+@pytest.mark.parametrize("topology", ["separated", "trilinear"])
+def test_planes_have_their_places_and_normals_everywhere(device, topology):
+    slope = TURN @ np.array([0.35, -0.2, 0.9])
+    slope /= np.linalg.norm(slope)
+    volume = make_volume(lambda p: -(p @ slope))
+    mesh = extract_isosurface(volume, 0.0, device, closed=False, topology=topology)
+    assert np.abs((mesh.vertices - centre_of(volume)) @ slope).max() <= tolerances.LINEAR_FIELD_MM
+    assert np.abs(mesh.normals - slope).max() <= tolerances.LINEAR_FIELD_NORMAL
+
+
+@pytest.mark.parametrize("topology", ["separated", "trilinear"])
+@pytest.mark.parametrize("closed", [True, False])
+@pytest.mark.parametrize("dtype", [np.int16, np.float32])
+def test_the_device_gives_what_the_twin_gives(device, topology, closed, dtype):
+    rng = np.random.default_rng(11)
+    volume = make_volume(lambda p: rng.integers(-500, 500, len(p)), (9, 11), GAPS[5:15], dtype=dtype)
+    mesh = extract_isosurface(volume, 25, device, closed=closed, topology=topology)
+    vertices, normals, triangles = extract_twin(volume, 25, closed=closed, topology=topology)
+    assert np.array_equal(mesh.triangles, triangles)
+    assert np.abs(mesh.vertices - vertices).max() <= tolerances.TWIN_VERTEX_VOXEL * min(volume.spacing)
+    assert np.abs(mesh.normals - normals).max() <= tolerances.TWIN_CELL_NORMAL
+
+
+def test_slabs_give_the_same_surface_bit_for_bit(device):
+    rng = np.random.default_rng(12)
+    volume = make_volume(lambda p: rng.integers(-500, 500, len(p)), (9, 70), GAPS[5:15], dtype=np.int16)
+    whole = extract_isosurface(volume, 10, device)
+    for slices in (1, 2, 3):
+        assert_same(extract_in_slabs(volume, 10, device, slices), whole)
+
+
+def test_distances_to_the_surface_are_right_in_every_layer():
+    slope = TURN @ np.array([0.3, 0.5, 0.8])
+    slope /= np.linalg.norm(slope)
+    volume = make_volume(lambda p: -(p @ slope))
+    rule = choose_iso_rule(volume, 0.0)
+    inner = np.random.default_rng(3).uniform((15, 12, 3), (35, 28, 20), (300, 3))
+    points = volume.ijk_to_lps(inner)
+    away = (points - centre_of(volume)) @ slope
+    near = np.abs(away) < 0.4
+    distances = distances_to_iso_surface(volume, rule, points[near])
+    assert near.sum() >= 10
+    assert np.abs(distances - np.abs(away[near])).max() <= tolerances.LINEAR_FIELD_MM
+
+
+def test_labels_lie_where_the_slices_lie(device):
+    radius = 7.0
+    volume = make_volume(lambda p: 40.0 * (radius - np.linalg.norm(p, axis=1)), (60, 50), dtype=np.int16)
+    plain = extract_isosurface(volume, 0, device)
+    # The map is finer than the gaps and even: it is brought to the slices by their own places.
+    affine = np.diag([0.4, 0.4, 0.4, 1.0])
+    affine[:3, 3] = centre_of(volume) - 0.4 * 30
+    k, j, i = np.mgrid[:61, :61, :61]
+    inside = np.sqrt((k - 30) ** 2 + (j - 30) ** 2 + (i - 30) ** 2) * 0.4 < radius
+    meshes = extract_labels(volume, LabelMap(inside.astype(np.uint8), affine), 0, device=device)
+    own = next(iter(meshes.values()))
+    assert np.array_equal(own.triangles, plain.triangles)
+    assert np.array_equal(own.vertices, plain.vertices)
+    assert any("growth of the labels" in text for text in own.report["warnings"])
