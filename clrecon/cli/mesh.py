@@ -10,6 +10,7 @@ from clrecon.cli.console import Console, printable
 from clrecon.cli.labels import add_label_arguments, describe_labels
 from clrecon.cli.levels import LEVELS_HELP, parse_hu
 from clrecon.cli.points import parse_point
+from clrecon.cli.reading import add_reading, reading_settings
 from clrecon.cli.refinement import add_refinement, describe_refinement, finish_with_gates, refinement_settings
 from clrecon.pipeline.presets import DEFAULT_PRESET, PRESETS
 
@@ -56,11 +57,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="NAME",
         help=f"iso value by tissue, one of: {', '.join(PRESETS)} (default: {DEFAULT_PRESET})",
     )
-    parser.add_argument(
-        "--series",
-        metavar="S",
-        help='number or hash of the series, see "clrecon info" (default: the usable CT series with most slices)',
-    )
     parser.add_argument("--space", default="lps", metavar="lps|ras", help="patient frame of the mesh (default: lps)")
     parser.add_argument(
         "--topology",
@@ -84,6 +80,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         " repeat it for several",
     )
     parser.add_argument("--split", action="store_true", help="write one file a component, the largest first")
+    add_reading(parser)
     add_label_arguments(parser)
     add_refinement(parser)
     add_device(parser)
@@ -100,7 +97,7 @@ def run(options: argparse.Namespace, console: Console) -> int:
     settings = MeshSettings(
         **options.hu,
         preset=options.preset,
-        series=options.series,
+        **reading_settings(options),
         space=options.space.lower(),
         closed=not options.open,
         topology=options.topology.lower(),

@@ -14,10 +14,12 @@ from numpy.typing import NDArray
 
 from clrecon.dicom.gate import Stack
 from clrecon.dicom.header import SliceHeader
+from clrecon.dicom.phases import choose_phase
 from clrecon.dicom.pixels import PixelFacts
 from clrecon.dicom.scan import Scan
 from clrecon.dicom.series import Series
 from clrecon.dicom.text import hash_uid
+from clrecon.errors import RefusedInputError
 
 __all__ = ["certify", "collect_scan_warnings", "collect_series_warnings", "collect_voxel_warnings"]
 
@@ -44,7 +46,7 @@ def collect_series_warnings(series: Series) -> list[str]:
     if series.stack is None or series.kind == "other":
         return []
     headers = series.stack.slices
-    warnings = list(series.stack.warnings)
+    warnings = [*_describe_what_was_left(series), *series.stack.warnings]
     for text in dict.fromkeys(text for header in headers for text in header.warnings):
         warnings.append(f"{text} ({_place(series.stack, lambda h, text=text: text in h.warnings)})")  # type: ignore[misc]
     checks: tuple[tuple[Callable[[SliceHeader], bool], str], ...] = (
@@ -66,6 +68,32 @@ def collect_series_warnings(series: Series) -> list[str]:
             text = text.format(type=odd.rescale_type, intercept=f"{odd.intercept:g}", slope=f"{odd.slope:g}")
             warnings.append(f"{text} ({_place(series.stack, is_so)})")
     return warnings
+
+
+def _describe_what_was_left(series: Series) -> list[str]:
+    """Copies, and the other phases of a series."""
+    try:
+        places = series.places
+    except RefusedInputError:
+        return []
+    warnings = []
+    if places.copies:
+        some = "slices" if places.copies > 1 else "slice"
+        warnings.append(f"{places.copies} duplicate {some} dropped: same place, same pixels as another")
+    if places.phases and series.phase is not None:
+        chosen = choose_phase(places.phases, series.phase)
+        left = sum(len(phase.headers) for phase in places.phases) - len(chosen.headers)
+        which = f"phase {chosen.number} of {len(places.phases)} ({chosen.keyword} {chosen.value})"
+        warnings.append(f"{which} read, {left} slices of others left")
+    return warnings
+
+
+def _describe_phase(series: Series) -> dict[str, Any] | None:
+    phases = series.places.phases
+    if not phases or series.phase is None:
+        return None
+    chosen = choose_phase(phases, series.phase)
+    return {"number": chosen.number, "of": len(phases), "keyword": chosen.keyword, "value": chosen.value}
 
 
 def _place(stack: Stack, is_so: Callable[[SliceHeader], bool]) -> str:
@@ -116,7 +144,9 @@ def certify(
             "uid_hash": hash_uid(series.identity.uid),
             "modality": series.identity.modality,
         },
+        "phase": _describe_phase(series),
         "slices": len(headers),
+        "slices_missing": stack.missing,
         "shape_ijk": [first.columns, first.rows, len(headers)],
         "spacing_mm": [float(length) for length in ((affine[:3, :3] ** 2).sum(axis=0) ** 0.5)],
         "affine_ijk_to_lps_mm": affine.tolist(),

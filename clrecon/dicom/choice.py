@@ -21,7 +21,7 @@ def choose_series(found: Sequence[Series], wanted: int | str | None = None) -> S
     wanted : int or str, optional
         Number in the listing, SeriesInstanceUID, its hash, or the description (whole, or a part that only one
         series has).  None takes the one CT stack with most slices; of several with as many, the one that is
-        usable.
+        usable.  With CT stacks of several patients there is no such choice.
 
     Raises
     ------
@@ -30,13 +30,14 @@ def choose_series(found: Sequence[Series], wanted: int | str | None = None) -> S
     NoDicomError
         There is no CT series, or the one named is none.
     RefusedInputError
-        Several usable CT stacks, or only unusable ones, have the same, largest number of slices; or there is no
-        stack.
+        Several usable CT stacks, or only unusable ones, have the same, largest number of slices; there is no
+        stack; or there are stacks of several patients.
     """
     if wanted is None:
         ct = [series for series in found if series.kind != "other"]
         if not ct:
             raise NoDicomError(_describe_modalities(found))
+        _check_one_patient(ct)
         return _take_largest(ct)
     matches = _match_series(found, wanted)
     if len({series.identity for series in matches}) != 1:
@@ -46,6 +47,15 @@ def choose_series(found: Sequence[Series], wanted: int | str | None = None) -> S
     if chosen.kind == "other":
         raise NoDicomError(f"series {chosen.number} is of modality {chosen.identity.modality}, not CT")
     return chosen
+
+
+def _check_one_patient(ct: Sequence[Series]) -> None:
+    """Of several patients none is the one that was meant because it has more slices."""
+    stacks = [series for series in ct if series.kind == "stack" and series.count > 1]
+    patients = {series.patient for series in stacks if series.patient}
+    if len(patients) > 1:
+        lines = [f"[patient {series.patient or '?'}, series {series.describe()}]" for series in stacks]
+        raise RefusedInputError(f"CT series of {len(patients)} patients, choose one with --series: {join_names(lines)}")
 
 
 def _match_series(found: Sequence[Series], wanted: int | str) -> list[Series]:

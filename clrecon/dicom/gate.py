@@ -3,7 +3,8 @@
 The position of a slice is its ImagePositionPatient and nothing else.  Slices are sorted by the projection of the
 position on the normal n = X x Y (row direction x column direction), so index space is always right-handed.  The
 affine is the least-squares line through all positions: its slice step is a full vector, a tilted gantry is an exact
-shear, and the rounding of positions averages out.
+shear, and the rounding of positions averages out.  Where the positions are farther from that line than rounding
+takes them, each slice keeps its own.
 
 Source: DICOM PS3.3 C.7.6.2.1.1.
 """
@@ -21,7 +22,7 @@ from clrecon.dicom.header import SliceHeader
 from clrecon.dicom.text import join_names
 from clrecon.geometry import compose_affine, tilt_degrees
 
-__all__ = ["Stack", "measure_stack"]
+__all__ = ["Holes", "Line", "Stack", "group_places", "measure_stack"]
 
 Float64Array = NDArray[np.float64]
 
@@ -55,7 +56,7 @@ class Line:
     step, origin : ndarray, shape (3,), float64
         LPS mm, by least squares.
     gap_min_mm, gap_max_mm, gap_median_mm : float
-        Along the normal; the median leaves duplicates out.
+        Along the normal.
     residual_max_mm, residual_rms_mm : float
         Distance of the positions from their places.
     tolerance_mm : float
@@ -63,7 +64,7 @@ class Line:
     worst_slice : int
         Where the residual is largest.
     uneven : bool
-        The residual is over the tolerance.
+        The residual is over the tolerance: the slices are placed one by one, and the line is only nominal.
     """
 
     step: Float64Array | None = None
@@ -97,6 +98,8 @@ class Stack:
         None where there is no affine.
     problems, warnings : tuple of str
         A stack with problems is refused.
+    missing : int
+        Slices that are missing, counted by the usual gap; allowed, or one of the problems.
     """
 
     slices: tuple[SliceHeader, ...]
@@ -107,15 +110,23 @@ class Stack:
     tilt_deg: float | None
     problems: tuple[str, ...]
     warnings: tuple[str, ...]
+    missing: int = 0
+
+    @property
+    def slice_positions(self) -> Float64Array | None:
+        """Positions of the slices where they do not lie on the affine, None where they do."""
+        return self.positions_mm if self.line.uneven else None
 
 
-def measure_stack(headers: Sequence[SliceHeader]) -> Stack:
+def measure_stack(headers: Sequence[SliceHeader], allow_gaps: bool = False) -> Stack:
     """Sort slices, find what is wrong with them, and fit the affine.
 
     Parameters
     ----------
     headers : sequence of SliceHeader
-        At least one.
+        At least one, and no more than one at each place.
+    allow_gaps : bool
+        Missing slices are a warning and no problem.
 
     Returns
     -------
@@ -128,15 +139,18 @@ def measure_stack(headers: Sequence[SliceHeader]) -> Stack:
     normal = np.cross(row, column)
     slices, positions, distances = sort_slices(headers, normal)
     affine: Float64Array | None = None
-    line = Line()
+    line, holes = Line(), Holes()
     if len(slices) == 1:
         problems.append("a single slice cannot make a surface")
     else:
-        line = measure_line(positions, distances)
-        faults = describe_duplicates(slices, distances) + describe_missing(slices, distances)
-        if line.uneven and not faults:
-            faults.append(_describe_unevenness(slices, distances, line))
-        problems += faults
+        line, holes = measure_line(positions, distances), find_holes(distances)
+        if holes.places and allow_gaps:
+            warnings.append(f"{holes.describe()}: what is there is placed exactly, surfaces bridge the gap")
+        elif holes.places:
+            where = holes.describe([header.name for header in slices])
+            problems.append(f"{where}; find them, or take what is there with --allow-gaps")
+        if line.uneven and not problems:
+            warnings.append(_describe_unevenness(distances, line))
         if not problems:
             assert line.step is not None and line.origin is not None
             affine = compose_affine(row * slices[0].di_mm, column * slices[0].dj_mm, line.step, line.origin)
@@ -144,14 +158,13 @@ def measure_stack(headers: Sequence[SliceHeader]) -> Stack:
     tilt = None if affine is None else tilt_degrees(affine)
     if tilt is not None and tilt > TILT_REPORT_DEG:
         warnings.append(f"gantry tilt {tilt:.2f} degrees: kept exactly, as a shear")
-    return Stack(slices, positions, distances, affine, line, tilt, tuple(problems), tuple(warnings))
+    return Stack(slices, positions, distances, affine, line, tilt, tuple(problems), tuple(warnings), holes.missing)
 
 
 def measure_line(positions: Float64Array, distances: Float64Array) -> Line:
     """Fit evenly spaced places to sorted positions (n, 3), n >= 2, and measure gaps and residuals."""
     gaps = np.diff(distances)
-    real_gaps = gaps[gaps >= DUPLICATE_MM]
-    usual = float(np.median(real_gaps)) if real_gaps.size else 0.0
+    usual = float(np.median(gaps))
     step, origin = fit_line(positions)
     residuals = np.linalg.norm(positions - (origin + np.arange(len(positions))[:, None] * step), axis=1)
     tolerance = max(POSITION_TOLERANCE_MM, POSITION_TOLERANCE_GAPS * usual)
@@ -169,11 +182,12 @@ def measure_line(positions: Float64Array, distances: Float64Array) -> Line:
     )
 
 
-def _describe_unevenness(slices: Sequence[SliceHeader], distances: Float64Array, line: Line) -> str:
+def _describe_unevenness(distances: Float64Array, line: Line) -> str:
     return (
         f"slices are unevenly spaced: gaps {line.gap_min_mm:.3f} to {line.gap_max_mm:.3f} mm (usual "
-        f"{line.gap_median_mm:.3f} mm), up to {line.residual_max_mm:.3f} mm from even positions (allowed "
-        f"{line.tolerance_mm:.3f} mm), worst at {distances[line.worst_slice]:.2f} mm ({slices[line.worst_slice].name})"
+        f"{line.gap_median_mm:.3f} mm), up to {line.residual_max_mm:.3f} mm from even positions (taken as even up to "
+        f"{line.tolerance_mm:.3f} mm), worst at {distances[line.worst_slice]:.2f} mm: each slice is placed at its own "
+        "position, the affine is only nominal"
     )
 
 
@@ -204,6 +218,7 @@ def find_mixed_values(headers: Sequence[SliceHeader]) -> list[str]:
             lambda h: h.frame_of_reference,
             lambda h: "another" if h.frame_of_reference else "no",
         ),
+        ("StudyInstanceUID", lambda h: h.series.study, lambda h: "another" if h.series.study else "no"),
     )
     found = []
     for title, key, show in checks:
@@ -272,35 +287,69 @@ def _orthonormalise(row: Float64Array, column: Float64Array) -> tuple[Float64Arr
     return row, column
 
 
-def describe_duplicates(slices: Sequence[SliceHeader], distances: Float64Array) -> list[str]:
-    """Describe slices that share a position."""
-    pairs = [
-        f"{slices[k].name} and {slices[k + 1].name} at {distances[k]:.2f} mm"
-        for k in np.flatnonzero(np.diff(distances) < DUPLICATE_MM).tolist()
-    ]
-    if not pairs:
-        return []
-    return [f"{len(pairs)} duplicate slice{'s' * (len(pairs) > 1)}: {_join_places(pairs)}"]
+@dataclass(frozen=True)
+class Holes:
+    """Gaps in a stack that are too wide, by the rule at `MISSING_RATIO`.
 
+    Attributes
+    ----------
+    places : tuple of int
+        The gap k lies between the slices k and k + 1.
+    gaps_mm : tuple of float
+    ends_mm : tuple of (float, float)
+        Where along the normal the slices before and after lie.
+    usual_mm : float
+    """
 
-def describe_missing(slices: Sequence[SliceHeader], distances: Float64Array) -> list[str]:
-    """Describe holes in the stack, by the rule at `MISSING_RATIO`."""
-    keep = np.concatenate(([True], np.diff(distances) >= DUPLICATE_MM))
-    kept, places = distances[keep], np.flatnonzero(keep).tolist()
-    gaps = np.diff(kept)
-    if len(gaps) < 2:
-        return []
-    usual = float(np.median(gaps))
-    holes = []
-    for k in np.flatnonzero(gaps > MISSING_RATIO * usual).tolist():
-        if not _is_in_run(gaps, k):
-            missing = max(round(gaps[k] / usual) - 1, 1)
-            before, after = slices[places[k + 1] - 1], slices[places[k + 1]]
-            holes.append(
-                f"{missing} slice{'s' * (missing > 1)} missing between {kept[k]:.2f} and {kept[k + 1]:.2f} mm "
-                f"(gap {gaps[k]:.3f} mm, usual {usual:.3f} mm): {before.name}, {after.name}"
+    places: tuple[int, ...] = ()
+    gaps_mm: tuple[float, ...] = ()
+    ends_mm: tuple[tuple[float, float], ...] = ()
+    usual_mm: float = 0.0
+
+    @property
+    def missing(self) -> int:
+        """Slices that would fill the gaps, at the usual distance."""
+        return sum(self._missing(gap) for gap in self.gaps_mm)
+
+    def _missing(self, gap: float) -> int:
+        return max(round(gap / self.usual_mm) - 1, 1)
+
+    def describe(self, names: Sequence[str] = ()) -> str:
+        """Say where they are; with the names of all slices also between which."""
+        texts = []
+        for k, gap, (low, high) in zip(self.places, self.gaps_mm, self.ends_mm, strict=True):
+            count = self._missing(gap)
+            between = f": {names[k]}, {names[k + 1]}" if names else ""
+            texts.append(
+                f"{count} slice{'s' * (count > 1)} missing between {low:.2f} and {high:.2f} mm "
+                f"(gap {gap:.3f} mm, usual {self.usual_mm:.3f} mm){between}"
             )
-    return [_join_places(holes)] if holes else []
+        return _join_places(texts)
+
+
+def find_holes(distances: Float64Array) -> Holes:
+    """Find missing slices among sorted positions (n,) along the normal; two slices alone have none."""
+    gaps = np.diff(distances)
+    if len(gaps) < 2:
+        return Holes()
+    usual = float(np.median(gaps))
+    wide = [k for k in np.flatnonzero(gaps > MISSING_RATIO * usual).tolist() if not _is_in_run(gaps, k)]
+    ends = tuple((float(distances[k]), float(distances[k + 1])) for k in wide)
+    return Holes(tuple(wide), tuple(float(gaps[k]) for k in wide), ends, usual)
+
+
+def group_places(headers: Sequence[SliceHeader]) -> list[list[SliceHeader]]:
+    """The slices at each place, in the order of the places; slices closer than `DUPLICATE_MM` are at one."""
+    row, column = _mean_directions(headers, [], [])
+    slices, _, distances = sort_slices(headers, np.cross(row, column))
+    places: list[list[SliceHeader]] = []
+    last = -np.inf
+    for header, distance in zip(slices, distances.tolist(), strict=True):
+        if distance - last >= DUPLICATE_MM:
+            places.append([])
+            last = distance
+        places[-1].append(header)
+    return places
 
 
 def _is_in_run(gaps: Float64Array, place: int) -> bool:

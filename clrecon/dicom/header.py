@@ -45,12 +45,13 @@ RESCALE_INTERCEPT_LIMIT = 1e9
 
 @dataclass(frozen=True)
 class SeriesIdentity:
-    """What a file says of its series: UID, number (None where missing), description, modality."""
+    """What a file says of its series: UID, number (None where missing), description, modality, UID of the study."""
 
     uid: str
     number: int | None
     description: str
     modality: str
+    study: str = ""
 
 
 @dataclass(frozen=True)
@@ -174,7 +175,11 @@ def read_headers(path: Path) -> list[SliceHeader] | OtherImage | None:
     sop_class = values.word("SOPClassUID") or elements.media_class
     modality = values.word("Modality").strip().upper() or ("CT" if sop_class == CT_IMAGE_STORAGE else "unknown")
     series = SeriesIdentity(
-        values.word("SeriesInstanceUID"), values.whole_or_none("SeriesNumber"), values.description(), modality
+        values.word("SeriesInstanceUID"),
+        values.whole_or_none("SeriesNumber"),
+        values.description(),
+        modality,
+        values.word("StudyInstanceUID"),
     )
     frames = values.whole_or_none("NumberOfFrames")
     kind = (

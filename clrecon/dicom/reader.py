@@ -21,7 +21,12 @@ __all__ = ["list_series", "read_volume"]
 
 
 def read_volume(
-    path: str | os.PathLike[str], series: int | str | None = None, *, progress: Progress | None = None
+    path: str | os.PathLike[str],
+    series: int | str | None = None,
+    *,
+    phase: int | None = None,
+    allow_gaps: bool = False,
+    progress: Progress | None = None,
 ) -> Volume:
     """Read one CT series as a volume in HU and LPS mm.
 
@@ -32,6 +37,10 @@ def read_volume(
     series : int or str, optional
         Number in the listing (from 1), SeriesInstanceUID, its hash, or description.  Default: the one CT series
         with most slices, of several with as many the usable one; what was left is said in the warnings.
+    phase : int, optional
+        Number of the phase, where a series holds several volumes at the same places (`list_series` lists them).
+    allow_gaps : bool
+        Read a stack with missing slices: what is there is placed exactly, with a warning.
     progress : callable, optional
         Called as ``progress(stage, done, total)`` with stage "scan" or "read".
 
@@ -39,7 +48,8 @@ def read_volume(
     -------
     Volume
         ``voxels`` (nk, nj, ni) int16, int32 or float32 in HU, padding at -1024; ``affine`` index (i, j, k) to
-        LPS mm, slices by ascending position along the normal; ``report`` the certificate.
+        LPS mm, slices by ascending position along the normal; ``report`` the certificate.  Unevenly spaced slices
+        keep their own positions (`Volume.uneven`), with a warning.
 
     Raises
     ------
@@ -48,7 +58,7 @@ def read_volume(
     RefusedInputError
         Corrupt files, or geometry or pixels that cannot be trusted; names files and figures.
     UsageError
-        `series` names none or several; `path` is empty or no path.
+        `series` names none or several; there is no such `phase`; `path` is empty or no path.
 
     Notes
     -----
@@ -57,6 +67,8 @@ def read_volume(
     with _quiet_warnings():
         scan, found = _scan_and_group(path, progress)
         chosen = choose_series(found, series)
+        left = describe_left(found, chosen)
+        chosen = chosen.choose(_checked_phase(phase), allow_gaps)
         stack = chosen.stack
         if chosen.problems or stack is None or stack.affine is None:
             raise RefusedInputError(_describe_refusal(chosen))
@@ -65,18 +77,32 @@ def read_volume(
         *collect_series_warnings(chosen),
         *collect_voxel_warnings(voxels, facts),
         *collect_scan_warnings(scan),
-        *describe_left(found, chosen),
+        *left,
     ]
-    return Volume(voxels, stack.affine, certify(chosen, stack, facts, scan, stack.affine, warnings))
+    report = certify(chosen, stack, facts, scan, stack.affine, warnings)
+    return Volume(voxels, stack.affine, report, stack.slice_positions)
 
 
-def list_series(path: str | os.PathLike[str], *, progress: Progress | None = None) -> SeriesListing:
+def _checked_phase(phase: int | None) -> int | None:
+    if phase is None or isinstance(phase, int) and not isinstance(phase, bool) and phase >= 1:
+        return phase
+    raise UsageError(f"a phase is a number from 1, not {phase!r}")
+
+
+def list_series(
+    path: str | os.PathLike[str],
+    series: int | str | None = None,
+    *,
+    phase: int | None = None,
+    allow_gaps: bool = False,
+    progress: Progress | None = None,
+) -> SeriesListing:
     """List the series at a path, with the geometry of each and what is wrong with it.
 
     Parameters
     ----------
-    path, progress
-        As in `read_volume`.
+    path, series, phase, allow_gaps, progress
+        As in `read_volume`, which would read what is chosen here.
 
     Returns
     -------
@@ -89,18 +115,24 @@ def list_series(path: str | os.PathLike[str], *, progress: Progress | None = Non
     RefusedInputError
         All DICOM files are corrupt.
     UsageError
-        `path` is empty or no path.
+        `series` names none or several; there is no such `phase`; `path` is empty or no path.
     """
+    phase = _checked_phase(phase)
     with _quiet_warnings():
         scan, found = _scan_and_group(path, progress)
-        entries = [describe_series(series, collect_series_warnings(series)) for series in found]
-    warnings = collect_scan_warnings(scan)
-    try:
-        chosen = choose_series(found)
-    except (NoDicomError, RefusedInputError) as error:
-        warnings.append(str(error))
-        return SeriesListing(entries, None, dict(scan.skipped), warnings)
-    return SeriesListing(entries, chosen.number, dict(scan.skipped), warnings + describe_left(found, chosen))
+        warnings = collect_scan_warnings(scan)
+        number = None
+        try:
+            chosen = choose_series(found, series)
+        except (NoDicomError, RefusedInputError) as error:
+            warnings.append(str(error))
+        else:
+            number = chosen.number
+            warnings += describe_left(found, chosen)
+            judged = chosen.choose(phase, allow_gaps)
+            found = [judged if one is chosen else one for one in found]
+        entries = [describe_series(one, collect_series_warnings(one)) for one in found]
+    return SeriesListing(entries, number, dict(scan.skipped), warnings)
 
 
 @contextmanager

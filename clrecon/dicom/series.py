@@ -4,17 +4,19 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from clrecon.dicom.gate import Stack, measure_stack
+from clrecon.dicom.gate import Stack, group_places, measure_stack
 from clrecon.dicom.header import OtherImage, SeriesIdentity, SliceHeader
+from clrecon.dicom.phases import Places, choose_phase, describe_phases, have_same_pixels, sort_places
 from clrecon.dicom.scan import CorruptFile, Scan
 from clrecon.dicom.text import hash_uid, join_names
+from clrecon.errors import RefusedInputError
 from clrecon.geometry import column_spacing
 
 __all__ = ["Series", "SeriesEntry", "SeriesListing", "describe_series", "group_series"]
@@ -43,6 +45,12 @@ class Series:
         Files and folders that cannot be read and may be, or hold, slices of it.
     number : int
         Place in the listing, from 1.
+    patient, study : int
+        Which of the patients, and of the studies, in what was scanned, from 1; 0 where the files do not say.
+    phase : int, optional
+        Which of its phases is wanted.
+    allow_gaps : bool
+        Missing slices are a warning and no problem.
     """
 
     identity: SeriesIdentity
@@ -51,6 +59,10 @@ class Series:
     others: list[OtherImage] = field(default_factory=list)
     corrupt: list[CorruptFile] = field(default_factory=list)
     number: int = 0
+    patient: int = 0
+    study: int = 0
+    phase: int | None = None
+    allow_gaps: bool = False
 
     @property
     def count(self) -> int:
@@ -63,9 +75,48 @@ class Series:
         return len(self.headers) + sum(image.frames == 1 for image in self.others)
 
     @cached_property
+    def places(self) -> Places:
+        """The slices without copies, and the phases among them; compares pixels where slices share a place.
+
+        Raises
+        ------
+        RefusedInputError
+            Pixels that have to be compared cannot be read.
+        """
+        if self.kind != "stack" or len(self.headers) < 2:
+            return Places(tuple(self.headers))
+        return sort_places(group_places(self.headers), have_same_pixels)
+
+    @cached_property
     def stack(self) -> Stack | None:
-        """The measured geometry; None without a valid slice."""
-        return measure_stack(self.headers) if self.headers else None
+        """The measured geometry, of the wanted phase where there are several; None without a valid slice."""
+        if not self.headers:
+            return None
+        try:
+            places = self.places
+        except RefusedInputError:
+            return measure_stack(self.headers[:1])  # `problems` says why
+        headers = places.headers
+        if places.phases:
+            headers = choose_phase(places.phases, self.phase or 1).headers
+        elif places.problem:
+            headers = headers[:1]
+        return measure_stack(headers, self.allow_gaps)
+
+    def choose(self, phase: int | None = None, allow_gaps: bool = False) -> Series:
+        """The same series with a phase chosen and gaps allowed.
+
+        Raises
+        ------
+        UsageError
+            It has no such phase.
+        """
+        chosen = replace(self, phase=phase, allow_gaps=allow_gaps)
+        if "places" in self.__dict__:
+            chosen.__dict__["places"] = self.places  # pixels may have been compared for it
+        if phase is not None and (phase != 1 or chosen.places.phases):
+            choose_phase(chosen.places.phases, phase)
+        return chosen
 
     @cached_property
     def problems(self) -> list[str]:
@@ -84,9 +135,20 @@ class Series:
                 + join_names(map(str, self.corrupt))
             )
         # Bad files leave holes, which would only hide the cause.
-        if self.kind == "stack" and self.stack is not None and not texts:
-            problems += self.stack.problems
+        if self.kind == "stack" and not texts:
+            problems += self._find_stack_problems()
         return problems
+
+    def _find_stack_problems(self) -> list[str]:
+        try:
+            places = self.places
+        except RefusedInputError as error:
+            return [f"slices at one place cannot be compared: {error}"]
+        if places.problem:
+            return [places.problem]
+        if places.phases and self.phase is None:
+            return [describe_phases(places.phases)]
+        return list(self.stack.problems) if self.stack is not None else []
 
     def describe(self) -> str:
         """One line for a message on the terminal."""
@@ -109,6 +171,15 @@ class SeriesEntry:
     ----------
     number : int
         From 1, the value that ``series=`` takes.
+    patient, study : int or None
+        Which of the patients and studies that were found, from 1: their identifiers are nowhere.  None where the
+        files do not say.
+    kind : {"stack", "localizer", "capture", "other"}
+        Only stacks are read.
+    phases : list of dict
+        ``{"number", "keyword", "value", "slices"}`` of each volume, where slices share places; else empty.
+    slices : int
+        Images in it; copies and all phases count.
     uid_hash : str or None
         First 16 hexadecimal digits of the SHA-256 of the SeriesInstanceUID, None where the files have none.
     shape_ijk, spacing_mm, affine_ijk_to_lps_mm, tilt_deg : list, list, nested list, float; or None
@@ -133,6 +204,10 @@ class SeriesEntry:
     uneven: bool | None
     warnings: list[str]
     problems: list[str]
+    patient: int | None = None
+    study: int | None = None
+    kind: str = "stack"
+    phases: list[dict[str, Any]] = field(default_factory=list)
 
     def as_dict(self) -> dict[str, Any]:
         """The entry as a dict of JSON types."""
@@ -189,9 +264,22 @@ def group_series(scan: Scan) -> list[Series]:
     found.sort(key=_listing_key)
     for number, series in enumerate(found, start=1):
         series.number = number
+    _number_patients_and_studies(found)
     if scan.corrupt or scan.suspects:
         _blame_corrupt_files(found, scan)
     return found
+
+
+def _number_patients_and_studies(found: Sequence[Series]) -> None:
+    """Tell patients and studies apart by numbers in the order of the listing: a hash of a short ID can be undone."""
+    patients: dict[str, int] = {}
+    studies: dict[str, int] = {}
+    for series in found:
+        patient = next((header.patient_hash for header in series.headers if header.patient_hash), None)
+        if patient is not None:
+            series.patient = patients.setdefault(patient, len(patients) + 1)
+        if series.identity.study:
+            series.study = studies.setdefault(series.identity.study, len(studies) + 1)
 
 
 def _blame_corrupt_files(found: Sequence[Series], scan: Scan) -> None:
@@ -268,7 +356,7 @@ def describe_series(series: Series, warnings: Iterable[str] = ()) -> SeriesEntry
         description=series.identity.description,
         modality=series.identity.modality,
         slices=series.count,
-        shape_ijk=None if first is None else [first.columns, first.rows, len(series.headers)],
+        shape_ijk=None if first is None or stack is None else [first.columns, first.rows, _count_slices(series, stack)],
         spacing_mm=None if affine is None else list(column_spacing(affine)),
         affine_ijk_to_lps_mm=None if affine is None else affine.tolist(),
         tilt_deg=None if stack is None or affine is None else stack.tilt_deg,
@@ -277,4 +365,24 @@ def describe_series(series: Series, warnings: Iterable[str] = ()) -> SeriesEntry
         uneven=None if stack is None else stack.line.uneven,
         warnings=list(warnings),
         problems=list(series.problems),
+        patient=series.patient or None,
+        study=series.study or None,
+        kind=series.kind,
+        phases=_list_phases(series),
     )
+
+
+def _count_slices(series: Series, stack: Stack) -> int:
+    """Of the volume where it is known; of all that was found where it is refused."""
+    return len(series.headers) if series.problems else len(stack.slices)
+
+
+def _list_phases(series: Series) -> list[dict[str, Any]]:
+    try:
+        phases = series.places.phases
+    except RefusedInputError:
+        return []
+    return [
+        {"number": phase.number, "keyword": phase.keyword, "value": phase.value, "slices": len(phase.headers)}
+        for phase in phases
+    ]

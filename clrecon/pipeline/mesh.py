@@ -78,7 +78,9 @@ def make_mesh(
         from clrecon.dicom import read_volume
 
         labels = open_labels(settings.labels)
-        volume = read_volume(source, settings.series, progress=progress)
+        volume = read_volume(
+            source, settings.series, phase=settings.phase, allow_gaps=settings.allow_gaps, progress=progress
+        )
         watch.lap("read")
         device = opening.wait()
         watch.lap("device")

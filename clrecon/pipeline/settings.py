@@ -27,6 +27,10 @@ class MeshSettings:
         In place of an iso value: half way between the two materials, measured in the scan or given in HU.
     series : str or int, optional
         Which series of the input; None leaves the choice to `read_volume`.
+    phase : int, optional
+        Which of its phases, where it has several.
+    allow_gaps : bool
+        Read a stack with missing slices.
     space : {"lps", "ras"}
         Patient frame of the written mesh.
     closed : bool
@@ -66,6 +70,8 @@ class MeshSettings:
     preset: str | None = None
     half_way: str | Sequence[float] | None = None
     series: str | int | None = None
+    phase: int | None = None
+    allow_gaps: bool = False
     space: str = "lps"
     closed: bool = True
     topology: str = "separated"

@@ -14,6 +14,7 @@ from pydicom.uid import (
     ExplicitVRLittleEndian,
     ImplicitVRLittleEndian,
 )
+from tolerances import AFFINE_MM
 
 from clrecon.dicom import list_series, pixels, read_volume
 from clrecon.errors import NoDicomError, RefusedInputError
@@ -352,11 +353,27 @@ def test_real_series(real_data, name, origin, spacing, low, high, mean, bone):
         assert 0.2 < share < 0.25
 
 
-def test_real_uneven_tilted_series_is_refused_with_its_figures(real_data):
-    with pytest.raises(RefusedInputError, match=r"gaps 1\.081 to 6\.999 mm \(usual 4\.002 mm\)"):
-        read_volume(real_data / "head_tilt_gaps")
-    entry = list_series(real_data / "head_tilt_gaps").series[0]
-    assert entry.slices == 28 and entry.uneven is True
+def has_mark(path):
+    return path.is_file() and path.read_bytes()[128:132] == b"DICM"
+
+
+def test_real_uneven_tilted_series_lies_where_its_slices_say(real_data):
+    from pydicom import dcmread
+
+    volume = read_volume(real_data / "head_tilt_gaps")
+    files = [
+        dcmread(path, stop_before_pixels=True) for path in (real_data / "head_tilt_gaps").rglob("*") if has_mark(path)
+    ]
+    truth = np.array(sorted((list(map(float, ds.ImagePositionPatient)) for ds in files), key=lambda place: place[2]))
+    ours = volume.ijk_to_lps([(0, 0, k) for k in range(28)])
+    assert volume.uneven
+    assert np.abs(ours - truth).max() <= AFFINE_MM
+    row, column = np.array(files[0].ImageOrientationPatient, float).reshape(2, 3) * 0.488281
+    far = volume.ijk_to_lps([(511, 511, k) for k in range(28)])
+    assert np.abs(far - (truth + 511 * (row + column))).max() <= 0.001
+    assert volume.report["tilt_deg"] == pytest.approx(18.5, abs=0.05)
+    words = "gaps 1.081 to 6.999 mm (usual 4.002 mm)"
+    assert sum(words in text for text in volume.report["warnings"]) == 1
 
 
 def test_real_enhanced_image_is_named_as_such(real_data):

@@ -1,0 +1,32 @@
+"""The options that say what is read of an input."""
+
+from __future__ import annotations
+
+import argparse
+from typing import Any
+
+__all__ = ["add_reading", "reading_settings"]
+
+
+def add_reading(parser: argparse.ArgumentParser) -> None:
+    """Add --series, --phase and --allow-gaps."""
+    group = parser.add_argument_group("reading")
+    group.add_argument(
+        "--series",
+        metavar="S",
+        help='number, hash, UID or description of the series, see "clrecon info" (default: the usable CT series with'
+        " most slices)",
+    )
+    group.add_argument(
+        "--phase", type=int, metavar="N", help="number of the phase, of a series with several volumes at one place"
+    )
+    group.add_argument(
+        "--allow-gaps",
+        action="store_true",
+        help="read a stack with missing slices: what is there is placed exactly, surfaces bridge the gap",
+    )
+
+
+def reading_settings(options: argparse.Namespace) -> dict[str, Any]:
+    """What `add_reading` was given, as keywords of the settings."""
+    return {"series": options.series, "phase": options.phase, "allow_gaps": options.allow_gaps}

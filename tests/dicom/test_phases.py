@@ -1,0 +1,187 @@
+"""Several slices at one place: copies are dropped, phases are listed and chosen, the rest is refused."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from clrecon.dicom import list_series, read_volume
+from clrecon.dicom.phases import have_same_pixels
+from clrecon.dicom.scan import scan_path
+from clrecon.errors import RefusedInputError, UsageError
+from tests.dicom_series import Plan, set_values, write_series
+
+
+def write_phase(folder, number, shift=0, plan=None, **elements):
+    """A copy of the plan's series with other pixels, and elements that may be functions of the slice."""
+
+    def change(ds, k):
+        ds.PixelData = (np.frombuffer(ds.PixelData, "i2") + shift).tobytes()
+        ds.SOPInstanceUID = f"{ds.SOPInstanceUID}.{number}"
+        for keyword, value in elements.items():
+            setattr(ds, keyword, value(k) if callable(value) else value)
+
+    return write_series(folder, plan or Plan(name=f"phase{number}-{{}}".format), change)
+
+
+def test_identical_slices_are_dropped_with_a_warning(tmp_path):
+    plan = write_series(tmp_path, Plan())
+    write_series(tmp_path, Plan(name="again{}".format), set_values(ContentTime="101010"))
+    volume = read_volume(tmp_path)
+    assert np.array_equal(volume.voxels, plan.hu())
+    assert volume.report["warnings"] == ["7 duplicate slices dropped: same place, same pixels as another"]
+    assert volume.report["files"]["used"] == 7
+    entry = list_series(tmp_path).series[0]
+    assert entry.slices == 14 and entry.shape_ijk == [6, 5, 7] and entry.problems == [] and entry.phases == []
+
+
+def test_one_identical_slice_is_dropped(tmp_path):
+    plan = write_series(tmp_path, Plan())
+    (tmp_path / "copy").write_bytes((tmp_path / "slice003.dcm").read_bytes())
+    volume = read_volume(tmp_path)
+    assert np.array_equal(volume.voxels, plan.hu())
+    assert volume.report["warnings"] == ["1 duplicate slice dropped: same place, same pixels as another"]
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "keyword", "values"),
+    [
+        ({"AcquisitionNumber": 3}, {"AcquisitionNumber": 12}, "AcquisitionNumber", ["3", "12"]),
+        (
+            {"TemporalPositionIdentifier": 1},
+            {"TemporalPositionIdentifier": 2},
+            "TemporalPositionIdentifier",
+            ["1", "2"],
+        ),
+        ({"TriggerTime": "9.5"}, {"TriggerTime": "78.5"}, "TriggerTime", ["9.5", "78.5"]),
+        ({"AcquisitionTime": "101500.5"}, {"AcquisitionTime": "101601"}, "AcquisitionTime", ["+0 s", "+60.5 s"]),
+        ({"AcquisitionDate": "20200101"}, {"AcquisitionDate": "20210704"}, "AcquisitionDate", ["date 1", "date 2"]),
+        ({"ConvolutionKernel": "B31f"}, {"ConvolutionKernel": "B70f"}, "ConvolutionKernel", ["B31f", "B70f"]),
+        ({}, {"AcquisitionNumber": 1}, "AcquisitionNumber", ["1", "(none)"]),
+    ],
+)
+def test_phases_are_listed_and_chosen(tmp_path, first, second, keyword, values):
+    plan = write_phase(tmp_path, 1, **first)
+    write_phase(tmp_path, 2, 500, **second)
+    shifts = [500, 0] if values[-1] == "(none)" else [0, 500]
+    entry = list_series(tmp_path).series[0]
+    assert entry.phases == [
+        {"number": n, "keyword": keyword, "value": value, "slices": 7} for n, value in enumerate(values, start=1)
+    ]
+    assert entry.affine_ijk_to_lps_mm is None and entry.slices == 14
+    with pytest.raises(RefusedInputError) as caught:
+        read_volume(tmp_path)
+    wanted = f"2 phases at the same places, choose one with --phase: [1: {keyword} {values[0]}, 7 slices], [2: "
+    assert wanted in str(caught.value)
+    for number, shift in enumerate(shifts, start=1):
+        volume = read_volume(tmp_path, phase=number)
+        assert np.array_equal(volume.voxels, plan.hu() + shift)
+        assert volume.ijk_to_lps([(2, 3, 4)])[0] == pytest.approx(plan.truth([(2, 3, 4)])[0])
+        told = f"phase {number} of 2 ({keyword} {values[number - 1]}) read, 7 slices of others left"
+        assert told in volume.report["warnings"]
+        assert volume.report["phase"] == {"number": number, "of": 2, "keyword": keyword, "value": values[number - 1]}
+        assert not any("2020" in text or "2021" in text for text in volume.report["warnings"])
+
+
+def test_phases_of_different_extent(tmp_path):
+    write_phase(tmp_path, 1, AcquisitionNumber=1)
+    write_phase(tmp_path, 2, 9, Plan(shape=(4, 5, 6), name="b{}".format), AcquisitionNumber=2)
+    assert [phase["slices"] for phase in list_series(tmp_path).series[0].phases] == [7, 4]
+    assert read_volume(tmp_path, phase=2).shape_ijk == (6, 5, 4)
+
+
+def test_two_elements_together_tell_four_phases_apart(tmp_path):
+    for number, (kernel, phase) in enumerate([("A", 1), ("A", 2), ("B", 1), ("B", 2)]):
+        write_phase(tmp_path, number, 100 * number, ConvolutionKernel=kernel, AcquisitionNumber=phase)
+    phases = list_series(tmp_path).series[0].phases
+    assert [phase["value"] for phase in phases] == ["1, A", "1, B", "2, A", "2, B"]
+    assert {phase["keyword"] for phase in phases} == {"AcquisitionNumber and ConvolutionKernel"}
+    assert read_volume(tmp_path, phase=2).voxels[0, 0, 0] == 900 - 1024 + 200
+
+
+def test_a_time_of_its_own_for_every_slice_ranks_the_visits(tmp_path):
+    plan = write_phase(tmp_path, 1, AcquisitionTime=lambda k: f"1010{10 + k}")
+    write_phase(tmp_path, 2, 300, AcquisitionTime=lambda k: f"1010{30 - k}")
+    phases = list_series(tmp_path).series[0].phases
+    assert [(phase["keyword"], phase["value"]) for phase in phases] == [
+        ("order of AcquisitionTime", "1"),
+        ("order of AcquisitionTime", "2"),
+    ]
+    assert np.array_equal(read_volume(tmp_path, phase=2).voxels, plan.hu() + 300)
+
+
+def test_different_slices_that_nothing_tells_apart_are_refused(tmp_path):
+    write_series(tmp_path, Plan(offsets={3: -1.25}))
+    with pytest.raises(RefusedInputError) as caught:
+        read_volume(tmp_path)
+    assert "duplicate slices with different pixels at 1 place, and no element" in str(caught.value)
+    assert "slice002.dcm, slice003.dcm" in str(caught.value)
+
+
+def test_copies_within_phases_are_dropped_first(tmp_path):
+    write_phase(tmp_path, 1, AcquisitionNumber=1)
+    write_phase(tmp_path, 2, 500, AcquisitionNumber=2)
+    (tmp_path / "copy").write_bytes((tmp_path / "phase2-3").read_bytes())
+    volume = read_volume(tmp_path, phase=2)
+    assert volume.shape_ijk == (6, 5, 7)
+    assert "1 duplicate slice dropped: same place, same pixels as another" in volume.report["warnings"]
+
+
+@pytest.mark.parametrize(
+    ("phase", "says"), [(3, "no phase 3"), (0, "number from 1"), ("2", "number"), (True, "number")]
+)
+def test_phases_that_are_not_there(tmp_path, phase, says):
+    write_phase(tmp_path, 1, AcquisitionNumber=1)
+    write_phase(tmp_path, 2, 500, AcquisitionNumber=2)
+    with pytest.raises(UsageError, match=says):
+        read_volume(tmp_path, phase=phase)
+
+
+def test_a_series_of_one_volume_has_a_first_phase_only(tmp_path):
+    plan = write_series(tmp_path, Plan())
+    assert np.array_equal(read_volume(tmp_path, phase=1).voxels, plan.hu())
+    with pytest.raises(UsageError, match="one slice at each place"):
+        read_volume(tmp_path, phase=2)
+
+
+def test_copies_whose_pixels_cannot_be_read_are_refused(tmp_path, monkeypatch):
+    write_series(tmp_path, Plan())
+    write_series(tmp_path, Plan(name="again{}".format))
+
+    def fail(slices, progress=None):
+        raise RefusedInputError("again0: does not decode")
+
+    monkeypatch.setattr("clrecon.dicom.phases.read_voxels", fail)
+    with pytest.raises(RefusedInputError, match="cannot be compared: again0: does not decode"):
+        read_volume(tmp_path)
+    assert list_series(tmp_path).series[0].phases == []
+
+
+def test_the_same_stored_values_with_another_rescale_are_no_copies(tmp_path):
+    write_series(tmp_path / "a", Plan())
+    write_series(tmp_path / "b", Plan(intercept=-1000))
+    one, other = (scan_path(tmp_path / name).slices[0] for name in "ab")
+    assert have_same_pixels(one, one)
+    assert not have_same_pixels(one, other)
+
+
+def test_of_several_patients_none_is_taken_unasked(tmp_path):
+    write_series(tmp_path / "a", Plan(series=1), set_values(PatientID="ONE"))
+    write_series(tmp_path / "b", Plan(series=2, shape=(4, 5, 6)), set_values(PatientID="TWO"))
+    with pytest.raises(RefusedInputError) as caught:
+        read_volume(tmp_path)
+    assert "CT series of 2 patients, choose one with --series" in str(caught.value)
+    assert "patient 1, series 1" in str(caught.value) and "ONE" not in str(caught.value)
+    assert read_volume(tmp_path, 2).shape_ijk == (6, 5, 4)
+    listing = list_series(tmp_path)
+    assert listing.chosen is None
+    assert [(entry.patient, entry.kind) for entry in listing.series] == [(1, "stack"), (2, "stack")]
+
+
+def test_studies_are_numbered_and_never_mixed(tmp_path):
+    write_series(tmp_path / "a", Plan(series=1), set_values(StudyInstanceUID="1.2.1"))
+    write_series(tmp_path / "b", Plan(series=2, shape=(4, 5, 6)), set_values(StudyInstanceUID="1.2.2"))
+    assert [entry.study for entry in list_series(tmp_path).series] == [1, 2]
+    write_series(tmp_path / "a", Plan(series=1), set_values(3, StudyInstanceUID="1.2.9"))
+    with pytest.raises(RefusedInputError, match="StudyInstanceUID differ within the series: another in"):
+        read_volume(tmp_path, 1)
