@@ -22,6 +22,7 @@ SECONDS = {"read", "upload", "build", "kernels", "download", "write", "total"}
 SERIES = {
     "number", "uid_hash", "description", "modality", "slices", "shape_ijk", "spacing_mm", "affine_ijk_to_lps_mm",
     "tilt_deg", "grid_residual_max_mm", "gap_mm", "uneven", "warnings", "problems",
+    "patient", "study", "kind", "phases",
 }  # fmt: skip
 TRUE_VOLUME_ML = 4.0 / 3.0 * math.pi * RADIUS_MM**3 / 1000.0
 
