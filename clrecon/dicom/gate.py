@@ -333,14 +333,22 @@ def find_holes(distances: Float64Array) -> Holes:
     if len(gaps) < 2:
         return Holes()
     usual = float(np.median(gaps))
+    if usual <= 0.0:
+        return Holes()  # only where the directions are no directions
     wide = [k for k in np.flatnonzero(gaps > MISSING_RATIO * usual).tolist() if not _is_in_run(gaps, k)]
     ends = tuple((float(distances[k]), float(distances[k + 1])) for k in wide)
     return Holes(tuple(wide), tuple(float(gaps[k]) for k in wide), ends, usual)
 
 
 def group_places(headers: Sequence[SliceHeader]) -> list[list[SliceHeader]]:
-    """The slices at each place, in the order of the places; slices closer than `DUPLICATE_MM` are at one."""
-    row, column = _mean_directions(headers, [], [])
+    """The slices at each place, in the order of the places; slices closer than `DUPLICATE_MM` are at one.
+
+    Where the directions are wrong there are no places to compare: each slice is at its own.
+    """
+    problems: list[str] = []
+    row, column = _mean_directions(headers, problems, [])
+    if problems:
+        return [[header] for header in headers]
     slices, _, distances = sort_slices(headers, np.cross(row, column))
     places: list[list[SliceHeader]] = []
     last = -np.inf

@@ -92,6 +92,8 @@ class Series:
         """The measured geometry, of the wanted phase where there are several; None without a valid slice."""
         if not self.headers:
             return None
+        if self.kind != "stack":
+            return measure_stack(self.headers[:1])
         try:
             places = self.places
         except RefusedInputError:

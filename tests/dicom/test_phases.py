@@ -185,3 +185,23 @@ def test_studies_are_numbered_and_never_mixed(tmp_path):
     write_series(tmp_path / "a", Plan(series=1), set_values(3, StudyInstanceUID="1.2.9"))
     with pytest.raises(RefusedInputError, match="StudyInstanceUID differ within the series: another in"):
         read_volume(tmp_path, 1)
+
+
+def test_localizers_at_one_place_and_broken_directions_are_no_phases(tmp_path):
+    for number in range(3):
+        write_series(
+            tmp_path / f"scout{number}",
+            Plan(series=1, shape=(1, 5, 6), name=f"scout{number}-{{}}".format),
+            set_values(ImageType=["ORIGINAL", "PRIMARY", "LOCALIZER"]),
+        )
+
+    def skew(ds, k):
+        ds.ImageOrientationPatient = [
+            float(v) + 0.002 * (axis == 1) for axis, v in enumerate(ds.ImageOrientationPatient)
+        ]
+
+    write_series(tmp_path / "ct", Plan(series=2, angles=(0, 90, 90)), skew)
+    scout, stack = list_series(tmp_path).series
+    assert (scout.kind, scout.slices, scout.phases) == ("localizer", 3, [])
+    assert any("off unit length or right angle" in text for text in stack.problems)
+    assert not any("duplicate" in text for text in stack.problems) and stack.phases == []
