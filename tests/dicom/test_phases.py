@@ -197,7 +197,7 @@ def test_localizers_at_one_place_and_broken_directions_are_no_phases(tmp_path):
 
     def skew(ds, k):
         ds.ImageOrientationPatient = [
-            float(v) + 0.002 * (axis == 1) for axis, v in enumerate(ds.ImageOrientationPatient)
+            float(v) + 0.002 * (axis == 2) for axis, v in enumerate(ds.ImageOrientationPatient)
         ]
 
     write_series(tmp_path / "ct", Plan(series=2, angles=(0, 90, 90)), skew)
