@@ -144,9 +144,9 @@ def _parse(file: BinaryIO, size: int, wanted: tuple[int, ...]) -> DicomElements:
         raise
     except RecursionError as error:
         raise CorruptFileError("sequences are nested too deep") from error
-    except OSError:
-        raise
     except Exception as error:
+        if isinstance(error, OSError) and error.errno is not None:
+            raise  # of the disk; the parser's own, for a sequence that is cut, have no number
         # The parser meets hostile bytes here and may fail in any way; all of them mean the same to us.
         raise CorruptFileError(f"cannot be parsed ({type(error).__name__})") from error
 
