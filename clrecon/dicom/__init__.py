@@ -1,4 +1,4 @@
-"""DICOM in: a folder of classic single-frame CT images becomes a `clrecon.geometry.Volume` in HU and LPS mm."""
+"""DICOM in: CT images, single slices or multi-frame, become a `clrecon.geometry.Volume` in HU and LPS mm."""
 
 from clrecon.dicom.reader import list_series, read_volume
 from clrecon.dicom.series import SeriesEntry, SeriesListing

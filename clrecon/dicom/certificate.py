@@ -165,7 +165,7 @@ def certify(
             "type": first.rescale_type or None,
         },
         "hu_range": [facts.hu_min, facts.hu_max],
-        "files": {"found": scan.files, "used": len(headers), "skipped": dict(scan.skipped)},
+        "files": {"found": scan.files, "used": len({h.file for h in headers}), "skipped": dict(scan.skipped)},
         "warnings": list(warnings),
         "problems": [],
     }

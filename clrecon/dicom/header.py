@@ -7,11 +7,13 @@ range, or there is a problem that names the file and the tag.
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from clrecon.dicom.codecs import describe_undecodable, is_encapsulated
-from clrecon.dicom.elements import CorruptFileError, read_elements
+from clrecon.dicom.concatenation import Concatenation
+from clrecon.dicom.elements import CorruptFileError, DicomElements, read_elements
+from clrecon.dicom.multiframe import ENHANCED_CT, read_groups, split_frames
 from clrecon.dicom.text import escape_text, hash_uid
 from clrecon.dicom.values import WANTED_TAGS, ValueProblem, Values
 
@@ -30,6 +32,7 @@ PHASE_KEYWORDS = (
     "AcquisitionNumber",
     "AcquisitionDate",
     "AcquisitionTime",
+    "KVP",
     "ConvolutionKernel",
     "ImageType",
     "ContentDate",
@@ -61,9 +64,9 @@ class OtherImage:
     Attributes
     ----------
     frames : int
-        Frames it holds, 1 for most.
+        Functional groups of frames that it holds, 1 where it has none.
     kind : {"broken", "capture", "other"}
-        A CT image with a wrong header or several frames; a secondary capture; anything that is no CT.
+        A CT image with a wrong header; a secondary capture; anything that is no CT.
     problem : str
         One line; names the file and the tag where there is one.
     """
@@ -88,8 +91,11 @@ class SliceHeader:
         Which frame of the file it is, from 0, and how many the file holds.
     localizer : bool
         ImageType says LOCALIZER.
+    concatenation : Concatenation or None
+        Of which part of a concatenation it is.
     phase : tuple of (str, str)
-        Keyword and value of what may tell this slice from another one at the same place (see `PHASE_KEYWORDS`).
+        Keyword and value of what may tell this slice from another one at the same place: see `multiframe.PHASES`
+        and `PHASE_KEYWORDS`; the most telling first.
     rows, columns : int
     row_cosines, column_cosines : tuple of 3 float
         ImageOrientationPatient as stored.
@@ -116,6 +122,7 @@ class SliceHeader:
     frame: int
     frames: int
     localizer: bool
+    concatenation: Concatenation | None
     phase: tuple[tuple[str, str], ...]
     patient_hash: str | None
     frame_of_reference: str
@@ -173,7 +180,8 @@ def read_headers(path: Path) -> list[SliceHeader] | OtherImage | None:
     values = Values(elements)
     name = escape_text(path.name)
     sop_class = values.word("SOPClassUID") or elements.media_class
-    modality = values.word("Modality").strip().upper() or ("CT" if sop_class == CT_IMAGE_STORAGE else "unknown")
+    known_class = "CT" if sop_class in (CT_IMAGE_STORAGE, *ENHANCED_CT) else "unknown"
+    modality = values.word("Modality").strip().upper() or known_class
     series = SeriesIdentity(
         values.word("SeriesInstanceUID"),
         values.whole_or_none("SeriesNumber"),
@@ -181,36 +189,66 @@ def read_headers(path: Path) -> list[SliceHeader] | OtherImage | None:
         modality,
         values.word("StudyInstanceUID"),
     )
-    frames = values.whole_or_none("NumberOfFrames")
-    kind = (
-        "other"
-        if modality != "CT"
-        else "capture"
-        if (sop_class + ".").startswith(SECONDARY_CAPTURE + ".")
-        else "broken"
-    )
-
-    def other(problem: str) -> OtherImage:
-        return OtherImage(series, path, name, max(frames or 1, 1), kind, problem)
-
     if modality != "CT":
-        return other(f"modality {modality} is not CT")
+        return OtherImage(series, path, name, 1, "other", f"modality {modality} is not CT")
     if elements.pixel_tag is None:
         raise CorruptFileError("ends before its pixel data")
-    if frames is not None and frames > 1:
-        return other(f"{name}: multi-frame image of {frames} frames: not supported yet")
-    if kind == "capture":
+    if (sop_class + ".").startswith(SECONDARY_CAPTURE + "."):
         why = "its pixels are a picture, not measured HU"
         if "ImagePositionPatient" not in values:
             why = "without ImagePositionPatient (0020,0032): no geometry"
-        return other(f"{name}: secondary capture (SOP class {sop_class}): {why}")
+        return OtherImage(series, path, name, 1, "capture", f"{name}: secondary capture (SOP class {sop_class}): {why}")
+    if sop_class in ENHANCED_CT:
+        return _read_frames(elements, series, path, name)
     try:
+        _check_single_frame(values, sop_class)
         return [_validate(values, series, path, name)]
     except ValueProblem as problem:
-        return other(f"{name}: {problem}")
+        return OtherImage(series, path, name, 1, "broken", f"{name}: {problem}")
 
 
-def _validate(values: Values, series: SeriesIdentity, path: Path, name: str) -> SliceHeader:
+def _check_single_frame(values: Values, sop_class: str) -> None:
+    if "NumberOfFrames" not in values:
+        return
+    frames = values.whole_or_none("NumberOfFrames")
+    if frames is None or frames < 0:
+        raise values.wrong("NumberOfFrames", "1, or nothing, in a single slice")
+    if frames > 1:
+        raise ValueProblem(
+            f"multi-frame image of {frames} frames, SOP class {sop_class}: the places of its frames are not known, "
+            "only Enhanced CT has them: export the series as single slices or as Enhanced CT"
+        )
+
+
+def _read_frames(
+    elements: DicomElements, series: SeriesIdentity, path: Path, name: str
+) -> list[SliceHeader] | OtherImage:
+    """One header a frame of an enhanced image, or the first thing that is wrong with it."""
+    frames, place = 1, name
+    headers: list[SliceHeader] = []
+    try:
+        groups = read_groups(path, elements)
+        frames = len(groups.frames)
+        for number, frame in enumerate(split_frames(elements, groups)):
+            place = f"{name} frame {number + 1}" if frames > 1 else name
+            if frame.problem is not None:
+                raise frame.problem
+            header = _validate(Values(frame.elements), series, path, place, frames=frames)
+            headers.append(
+                replace(
+                    header,
+                    frame=number,
+                    concatenation=groups.concatenation,
+                    phase=(*frame.phase, *header.phase),
+                    warnings=(*header.warnings, *frame.warnings),
+                )
+            )
+    except ValueProblem as problem:
+        return OtherImage(series, path, name, frames, "broken", f"{place}: {problem}")
+    return headers
+
+
+def _validate(values: Values, series: SeriesIdentity, path: Path, name: str, *, frames: int = 1) -> SliceHeader:
     elements = values.elements
     reason = describe_undecodable(elements.transfer_syntax)
     if reason:
@@ -253,7 +291,8 @@ def _validate(values: Values, series: SeriesIdentity, path: Path, name: str) -> 
         file=path,
         name=name,
         frame=0,
-        frames=1,
+        frames=frames,
+        concatenation=None,
         phase=tuple((keyword, values.word(keyword)) for keyword in PHASE_KEYWORDS if keyword in values),
         localizer="LOCALIZER" in image_type,
         patient_hash=hash_uid(values.text("PatientID").strip()),

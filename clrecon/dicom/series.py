@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from clrecon.dicom.concatenation import describe_missing_parts
 from clrecon.dicom.gate import Stack, group_places, measure_stack
 from clrecon.dicom.header import OtherImage, SeriesIdentity, SliceHeader
 from clrecon.dicom.phases import Places, choose_phase, describe_phases, have_same_pixels, sort_places
@@ -43,6 +44,8 @@ class Series:
         Its files that cannot be slices.
     corrupt : list of CorruptFile
         Files and folders that cannot be read and may be, or hold, slices of it.
+    lost : list of str
+        What is known to be missing although it leaves no hole: files of concatenations.
     number : int
         Place in the listing, from 1.
     patient, study : int
@@ -58,6 +61,7 @@ class Series:
     headers: list[SliceHeader] = field(default_factory=list)
     others: list[OtherImage] = field(default_factory=list)
     corrupt: list[CorruptFile] = field(default_factory=list)
+    lost: list[str] = field(default_factory=list)
     number: int = 0
     patient: int = 0
     study: int = 0
@@ -136,6 +140,8 @@ class Series:
                 "files or folders that are cut, corrupt or not readable may belong to it (restore or remove them): "
                 + join_names(map(str, self.corrupt))
             )
+        if not texts:
+            problems += self.lost
         # Bad files leave holes, which would only hide the cause.
         if self.kind == "stack" and not texts:
             problems += self._find_stack_problems()
@@ -252,6 +258,9 @@ def group_series(scan: Scan) -> list[Series]:
     found = []
     for uid in {**slices, **others}:
         parts = _split_slices(slices[uid])
+        lost = describe_missing_parts(slices[uid])
+        for part in parts:
+            part.lost = lost if part.kind == "stack" else []
         for kind in ("capture", "other", "broken"):
             images = [image for image in others[uid] if image.kind == kind]
             if not images:

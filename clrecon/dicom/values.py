@@ -28,6 +28,7 @@ _TAGS = {
     "SeriesDescription": 0x0008103E,
     "PatientID": 0x00100020,
     "SliceThickness": 0x00180050,
+    "KVP": 0x00180060,
     "SpacingBetweenSlices": 0x00180088,
     "ConvolutionKernel": 0x00181210,
     "TriggerTime": 0x00181060,
