@@ -77,9 +77,6 @@ def _take_largest(candidates: Sequence[Series]) -> Series:
             return candidates[0]  # read_volume refuses it with its own problem
         raise RefusedInputError(f"no CT stack among {_list_lines(candidates)}")
     counts = [series.count for series in stacks]
-    single_frame = [series.single_frame_count for series in stacks]
-    if counts != single_frame and any(not series.problems for series in stacks):
-        counts = single_frame  # multi-frame images neither win nor tie against a stack that can be read
     most = max(counts)
     largest = [series for series, count in zip(stacks, counts, strict=True) if count == most]
     if len(largest) == 1:

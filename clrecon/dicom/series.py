@@ -73,11 +73,6 @@ class Series:
         """Slices, the frames of multi-frame images among them."""
         return len(self.headers) + sum(image.frames for image in self.others)
 
-    @property
-    def single_frame_count(self) -> int:
-        """Slices, multi-frame images left out: those are not supported."""
-        return len(self.headers) + sum(image.frames == 1 for image in self.others)
-
     @cached_property
     def places(self) -> Places:
         """The slices without copies, and the phases among them; compares pixels where slices share a place.
