@@ -13,7 +13,7 @@ from pathlib import Path
 from clrecon.dicom.codecs import describe_undecodable, is_encapsulated
 from clrecon.dicom.concatenation import Concatenation
 from clrecon.dicom.elements import CorruptFileError, DicomElements, read_elements
-from clrecon.dicom.multiframe import ENHANCED_CT, read_groups, split_frames
+from clrecon.dicom.multiframe import ENHANCED_CT, FRAME_PHASES, read_groups, split_frames
 from clrecon.dicom.text import escape_text, hash_uid
 from clrecon.dicom.values import WANTED_TAGS, ValueProblem, Values
 
@@ -26,7 +26,7 @@ DICOMDIR_CLASS = "1.2.840.10008.1.3.10"
 DERIVED_WORDS = frozenset("MPR MIP MINIP MAXIP AIP PROJECTION REFORMATTED CPR CURVED VRT SSD".split())
 """Words of ImageType that, beside DERIVED, mean computed images: other planes, projections, renderings."""
 
-PHASE_KEYWORDS = (
+SLICE_PHASES = (
     "TemporalPositionIdentifier",
     "TriggerTime",
     "AcquisitionNumber",
@@ -38,7 +38,8 @@ PHASE_KEYWORDS = (
     "ContentDate",
     "ContentTime",
 )
-"""What tells the phases of one series apart, the most telling first."""
+PHASE_KEYWORDS = (*(keyword for keyword, _, _ in FRAME_PHASES), *SLICE_PHASES)
+"""What tells the phases of one series apart, the most telling first: what only frames say, then what slices say."""
 
 PIXEL_SPACING_MM = (1e-3, 50.0)
 POSITION_LIMIT_MM = 1e6
@@ -94,8 +95,8 @@ class SliceHeader:
     concatenation : Concatenation or None
         Of which part of a concatenation it is.
     phase : tuple of (str, str)
-        Keyword and value of what may tell this slice from another one at the same place: see `multiframe.PHASES`
-        and `PHASE_KEYWORDS`; the most telling first.
+        Keyword and value of what may tell this slice from another one at the same place: see
+        `PHASE_KEYWORDS`; the most telling first.
     rows, columns : int
     row_cosines, column_cosines : tuple of 3 float
         ImageOrientationPatient as stored.
@@ -293,7 +294,7 @@ def _validate(values: Values, series: SeriesIdentity, path: Path, name: str, *, 
         frame=0,
         frames=frames,
         concatenation=None,
-        phase=tuple((keyword, values.word(keyword)) for keyword in PHASE_KEYWORDS if keyword in values),
+        phase=tuple((keyword, values.word(keyword)) for keyword in SLICE_PHASES if keyword in values),
         localizer="LOCALIZER" in image_type,
         patient_hash=hash_uid(values.text("PatientID").strip()),
         frame_of_reference=values.word("FrameOfReferenceUID"),

@@ -13,6 +13,7 @@ Source: DICOM PS3.3 A.38 (Enhanced CT), A.70 (Legacy Converted Enhanced CT), C.7
 from __future__ import annotations
 
 import math
+import re
 import struct
 import zlib
 from collections.abc import Iterable, Iterator
@@ -25,7 +26,7 @@ from clrecon.dicom.sequences import Item, Schema, decode_number, name_tag, read_
 from clrecon.dicom.text import escape_text
 from clrecon.dicom.values import ValueProblem, Values
 
-__all__ = ["ENHANCED_CT", "Frame", "Groups", "read_groups", "split_frames"]
+__all__ = ["ENHANCED_CT", "FRAME_PHASES", "Frame", "Groups", "read_groups", "split_frames"]
 
 ENHANCED_CT = ("1.2.840.10008.5.1.4.1.1.2.1", "1.2.840.10008.5.1.4.1.1.2.2")
 """SOP classes: Enhanced CT Image Storage, Legacy Converted Enhanced CT Image Storage."""
@@ -42,6 +43,8 @@ REAL_WORLD_VALUES = 0x00409096
 UNASSIGNED_SHARED, UNASSIGNED_FRAME = 0x00209170, 0x00209171
 DIMENSIONS, DIMENSION_POINTER, DIMENSION_VALUES = 0x00209222, 0x00209165, 0x00209157
 
+FRAME_ACQUISITION_TIME, FRAME_REFERENCE_TIME = 0x00189074, 0x00189151
+ACQUISITION_DATE_AND_TIME = (0x00080022, 0x00080032)
 IMAGE_TYPE, FRAME_TYPE = 0x00080008, 0x00089007
 PIXEL_PRESENTATION, VOLUMETRIC_PROPERTIES, CALCULATION_TECHNIQUE = 0x00089205, 0x00089206, 0x00089207
 RESCALE_INTERCEPT, RESCALE_SLOPE, RESCALE_TYPE = 0x00281052, 0x00281053, 0x00281054
@@ -54,7 +57,7 @@ GEOMETRY = (0x00200032, 0x00200037, 0x00280030, 0x00180050, 0x00180088)
 """ImagePositionPatient, ImageOrientationPatient, PixelSpacing, SliceThickness, SpacingBetweenSlices: at the top level
 of a multi-frame image these have no place and no meaning."""
 
-PHASES = (
+FRAME_PHASES = (
     ("TemporalPositionIndex", 0x00209128, "L"),
     ("TemporalPositionTimeOffset", 0x0020930D, "d"),
     ("NominalPercentageOfCardiacPhase", 0x00209241, "f"),
@@ -63,8 +66,6 @@ PHASES = (
     ("NominalRespiratoryTriggerDelayTime", 0x00209255, "d"),
     ("StackID", 0x00209056, ""),
     ("FrameAcquisitionNumber", 0x00209156, "H"),
-    ("FrameReferenceDateTime", 0x00189151, ""),
-    ("FrameAcquisitionDateTime", 0x00189074, ""),
 )
 """What the functional groups have to tell frames at the same place apart, the most telling first; "" is text."""
 PLACE_POINTERS = (0x00200032, 0x00200037, 0x00209057, 0x00201041, 0x00209113, 0x00209116, 0x00200013)
@@ -82,7 +83,9 @@ _MACROS: dict[int, Schema] = {
     PIXEL_MEASURES: _wanted(0x00280030, 0x00180050, 0x00180088),
     PIXEL_VALUE_TRANSFORMATION: _wanted(*RESCALE),
     FRAME_TYPE_GROUP: _wanted(FRAME_TYPE, PIXEL_PRESENTATION, VOLUMETRIC_PROPERTIES, CALCULATION_TECHNIQUE),
-    FRAME_CONTENT: _wanted(0x00209056, 0x00209128, 0x00209156, 0x00189151, 0x00189074, DIMENSION_VALUES),
+    FRAME_CONTENT: _wanted(
+        0x00209056, 0x00209128, 0x00209156, FRAME_ACQUISITION_TIME, FRAME_REFERENCE_TIME, DIMENSION_VALUES
+    ),
     0x00189118: _wanted(0x00209241, 0x00209153),  # CardiacSynchronizationSequence
     0x00209253: _wanted(0x00209245, 0x00209255),  # RespiratorySynchronizationSequence
     0x00209310: _wanted(0x0020930D),  # TemporalPositionSequence
@@ -231,6 +234,7 @@ def split_frames(elements: DicomElements, groups: Groups) -> Iterator[Frame]:
             if elements.values.get(LOSSY):  # what is lossy for the file is so for its frames
                 frame.values[LOSSY] = max(elements.values[LOSSY], frame.values[LOSSY])
             _lay_over(frame, (items[0] for tag, items in macros.items() if tag != REAL_WORLD_VALUES))
+            _take_times(frame)
             _check_frame_type(frame, warnings)
             _take_real_world_values(frame, macros.get(REAL_WORLD_VALUES, []), warnings)
         except ValueProblem as problem:
@@ -258,6 +262,16 @@ def _lay_over(frame: DicomElements, items: Iterable[Item]) -> None:
     for item in items:
         frame.values.update(item.values)
         frame.vrs.update(item.vrs)
+
+
+def _take_times(frame: DicomElements) -> None:
+    """When a frame was taken goes to where a slice has it: date and time apart."""
+    for tag in (FRAME_ACQUISITION_TIME, FRAME_REFERENCE_TIME):
+        found = re.match(rb"(\d{8})(\d{2,6}(?:\.\d{1,6})?)", frame.values.get(tag, b""))
+        if found is not None:
+            frame.values.update(zip(ACQUISITION_DATE_AND_TIME, found.groups(), strict=True))
+            frame.vrs.update(zip(ACQUISITION_DATE_AND_TIME, ("DA", "TM"), strict=True))
+            return
 
 
 def _check_frame_type(frame: DicomElements, warnings: list[str]) -> None:
@@ -303,7 +317,7 @@ def _take_real_world_values(frame: DicomElements, mappings: list[Item], warnings
 
 
 def _describe_phase(frame: DicomElements, dimensions: tuple[tuple[int, str], ...]) -> Iterator[tuple[str, str]]:
-    for keyword, tag, form in PHASES:
+    for keyword, tag, form in FRAME_PHASES:
         raw = frame.values.get(tag)
         if not raw:
             continue

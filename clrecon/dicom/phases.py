@@ -159,7 +159,7 @@ def _keyword_choices(places: Sequence[Sequence[SliceHeader]]) -> Iterator[tuple[
     present: dict[str, None] = dict.fromkeys(PHASE_KEYWORDS)
     differing: set[str] = set()
     for slices in places:
-        for keyword in {keyword for header in slices for keyword, _ in header.phase}:
+        for keyword in dict.fromkeys(keyword for header in slices for keyword, _ in header.phase):
             present.setdefault(keyword)
             if len({_values(header, (keyword,)) for header in slices}) > 1:
                 differing.add(keyword)

@@ -221,8 +221,8 @@ PHASES = {
         "FrameContentSequence",
         "FrameAcquisitionDateTime",
         ("20200101101010", "20200101101020"),
-        "FrameAcquisitionDateTime",
-        ("20200101101010", "20200101101020"),
+        "AcquisitionTime",
+        ("101010", "101020"),
     ),
     "energy": ("CTXRayDetailsSequence", "KVP", (80, 140), "KVP", ("80.0", "140.0")),
     "kernel": ("CTReconstructionSequence", "ConvolutionKernel", ("B30", "B70"), "ConvolutionKernel", ("B30", "B70")),
@@ -253,11 +253,17 @@ def test_frames_at_one_place_are_told_apart(tmp_path, syntax, sequence, keyword,
                 setattr(groups, sequence, [Dataset()])
             setattr(getattr(groups, sequence)[0], keyword, values[number // 7])
 
-    write_enhanced(tmp_path / "mf", Plan(syntax=syntax), spoil, order=[*range(7), *range(7)])
+        pixels = np.frombuffer(ds.PixelData, np.uint8).copy()
+        pixels[pixels.size // 2 :] ^= 1  # else they are copies
+        ds.PixelData = pixels.tobytes()
+
+    plan = write_enhanced(tmp_path / "mf", Plan(syntax=syntax), spoil, order=[*range(7), *range(7)])
     headers = read_headers(tmp_path / "mf")
     assert [dict(header.phase).get(name) for header in headers] == [expected[0]] * 7 + [expected[1]] * 7
     assert "DimensionIndexValues ImagePositionPatient" not in dict(headers[0].phase)
-    assert "7 duplicate slices" in refusal(tmp_path)
+    assert f"2 phases at the same places, choose one with --phase: [1: {name} " in refusal(tmp_path)
+    assert_right(read_volume(tmp_path, phase=1), plan)
+    assert [phase["slices"] for phase in list_series(tmp_path).series[0].phases] == [7, 7]
 
 
 # --- rescale from elsewhere ---
