@@ -266,6 +266,16 @@ def test_frames_at_one_place_are_told_apart(tmp_path, syntax, sequence, keyword,
     assert [phase["slices"] for phase in list_series(tmp_path).series[0].phases] == [7, 7]
 
 
+def test_what_a_frame_says_of_itself_stands_over_what_is_shared(tmp_path):
+    def spoil(ds):
+        ds.SharedFunctionalGroupsSequence[0].CTReconstructionSequence = [item(ConvolutionKernel="B30")]
+        frame_groups(ds, 2).CTReconstructionSequence = [item(ConvolutionKernel="B70")]
+
+    write_enhanced(tmp_path / "mf", change=spoil)
+    kernels = [dict(header.phase)["ConvolutionKernel"] for header in read_headers(tmp_path / "mf")]
+    assert kernels == ["B30", "B30", "B70", "B30", "B30", "B30", "B30"]
+
+
 # --- rescale from elsewhere ---
 
 
