@@ -26,6 +26,9 @@ DICOMDIR_CLASS = "1.2.840.10008.1.3.10"
 DERIVED_WORDS = frozenset("MPR MIP MINIP MAXIP AIP PROJECTION REFORMATTED CPR CURVED VRT SSD".split())
 """Words of ImageType that, beside DERIVED, mean computed images: other planes, projections, renderings."""
 
+PATIENT_POSITIONS = frozenset("HFP HFS HFDR HFDL FFDR FFDL FFP FFS LFP LFS RFP RFS AFDR AFDL PFDR PFDL".split())
+"""Defined terms of PatientPosition (PS3.3 C.7.3.1.1.2); anything else is free text and goes nowhere."""
+
 SLICE_PHASES = (
     "TemporalPositionIdentifier",
     "TriggerTime",
@@ -115,6 +118,10 @@ class SliceHeader:
     pixel_offset, pixel_length, inflate_from, file_bytes : int
         See `DicomElements`.
     warnings : tuple of str
+    patient_position : str
+        How the patient lay in the scanner, such as HFS; empty where it is not one of `PATIENT_POSITIONS`.
+    derived : tuple of str
+        The `DERIVED_WORDS` of a derived image; empty for an image that was measured.
     """
 
     series: SeriesIdentity
@@ -155,6 +162,8 @@ class SliceHeader:
     inflate_from: int
     file_bytes: int
     warnings: tuple[str, ...]
+    patient_position: str = ""
+    derived: tuple[str, ...] = ()
 
     @property
     def pixel_bytes(self) -> int:
@@ -284,7 +293,8 @@ def _validate(values: Values, series: SeriesIdentity, path: Path, name: str, *, 
         warnings.append("implicit and explicit VR are mixed up: parsed as found, not as the transfer syntax says")
     image_type = [word.strip() for word in values.text("ImageType").upper().split("\\")]
     derived = sorted(DERIVED_WORDS.intersection(re.split("[^A-Z]+", " ".join(image_type))))
-    if "DERIVED" in image_type and derived:
+    derived = derived if "DERIVED" in image_type else []
+    if derived:
         warnings.append(f"derived images (ImageType has DERIVED and {' '.join(derived)}): maybe not measured HU")
 
     header = SliceHeader(
@@ -326,6 +336,8 @@ def _validate(values: Values, series: SeriesIdentity, path: Path, name: str, *, 
         inflate_from=elements.inflate_from,
         file_bytes=elements.file_bytes,
         warnings=tuple(warnings),
+        patient_position=lay if (lay := values.text("PatientPosition").upper()) in PATIENT_POSITIONS else "",
+        derived=tuple(derived),
     )
     _check_pixel_room(header, elements.pixel_vr)
     return header

@@ -32,6 +32,7 @@ _TAGS = {
     "SpacingBetweenSlices": 0x00180088,
     "ConvolutionKernel": 0x00181210,
     "TriggerTime": 0x00181060,
+    "PatientPosition": 0x00185100,
     "TemporalPositionIdentifier": 0x00200100,
     "AcquisitionNumber": 0x00200012,
     "StudyInstanceUID": 0x0020000D,
