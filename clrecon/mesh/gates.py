@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Any
 
+from clrecon.gates import Gate, at_most, failed_gates, is_true, none_of, unmeasured
+
 __all__ = ["DEVIATION_MEAN_VOXEL", "DEVIATION_P95_VOXEL", "VOLUME_CHANGE_PERCENT", "failed_gates", "judge_mesh"]
 
 DEVIATION_P95_VOXEL = 0.25
@@ -12,8 +14,6 @@ DEVIATION_P95_VOXEL = 0.25
 
 DEVIATION_MEAN_VOXEL = 0.1
 VOLUME_CHANGE_PERCENT = 0.5
-
-Gate = dict[str, Any]
 
 
 def judge_mesh(
@@ -55,8 +55,8 @@ def judge_mesh(
     if iso_distance and iso_distance["vertices_voxel"]:
         found = iso_distance["vertices_voxel"]
         what = "distance of the vertices from the trilinear iso surface"
-        gates.append(_at_most("iso_distance_p95", found["p95"], DEVIATION_P95_VOXEL, "voxel", f"{what}, 95 % of them"))
-        gates.append(_at_most("iso_distance_mean", found["mean"], DEVIATION_MEAN_VOXEL, "voxel", f"{what}, mean"))
+        gates.append(at_most("iso_distance_p95", found["p95"], DEVIATION_P95_VOXEL, "voxel", f"{what}, 95 % of them"))
+        gates.append(at_most("iso_distance_mean", found["mean"], DEVIATION_MEAN_VOXEL, "voxel", f"{what}, mean"))
     if deviation and voxel_mm:
         gates += _gates_of_deviation(deviation, voxel_mm, closed)
     return gates
@@ -65,54 +65,26 @@ def judge_mesh(
 def _gates_of_quality(quality: dict[str, Any], closed: bool, outward: bool) -> Iterator[Gate]:
     sheets = quality["nonmanifold_edges"] + quality["nonmanifold_vertices"]
     if closed:
-        yield _none("closed", quality["boundary_edges"], "edges with one triangle only", quality["closed"])
-    yield _none("manifold", sheets, "edges and vertices with several sheets", quality["manifold"])
-    yield _flag("oriented", quality["oriented"], "all triangles face the same side of the surface")
+        yield none_of("closed", quality["boundary_edges"], "edges with one triangle only", quality["closed"])
+    yield none_of("manifold", sheets, "edges and vertices with several sheets", quality["manifold"])
+    yield is_true("oriented", quality["oriented"], "all triangles face the same side of the surface")
     if closed and outward:
-        yield _flag("outward", quality["outward"], "the triangles face outward, the enclosed volume is above zero")
-    yield _none("zero_area_faces", quality["zero_area_faces"], "triangles without area")
-    yield _none("duplicate_faces", quality["duplicate_faces"], "triangles that are there twice")
+        yield is_true("outward", quality["outward"], "the triangles face outward, the enclosed volume is above zero")
+    yield none_of("zero_area_faces", quality["zero_area_faces"], "triangles without area")
+    yield none_of("duplicate_faces", quality["duplicate_faces"], "triangles that are there twice")
     intersections = quality.get("self_intersections")
     if intersections is None:
-        text = "triangles that cut each other are not looked for"
-        yield {**_none("self_intersections", 0, ""), "measured": None, "ok": None, "text": text}
+        yield unmeasured("self_intersections", 0, None, "triangles that cut each other are not looked for")
     else:
-        yield _none("self_intersections", intersections, "pairs of triangles that cut each other")
+        yield none_of("self_intersections", intersections, "pairs of triangles that cut each other")
 
 
 def _gates_of_deviation(deviation: dict[str, Any], voxel_mm: float, closed: bool) -> Iterator[Gate]:
     p95, mean = deviation["hd95_mm"] / voxel_mm, deviation["assd_mm"] / voxel_mm
     what = "distance from the surface before smoothing and decimation"
-    yield _at_most("deviation_p95", p95, DEVIATION_P95_VOXEL, "voxel", f"{what}, 95 % of it")
-    yield _at_most("deviation_mean", mean, DEVIATION_MEAN_VOXEL, "voxel", f"{what}, mean")
+    yield at_most("deviation_p95", p95, DEVIATION_P95_VOXEL, "voxel", f"{what}, 95 % of it")
+    yield at_most("deviation_mean", mean, DEVIATION_MEAN_VOXEL, "voxel", f"{what}, mean")
     change = deviation["volume_change_percent"]
     if closed and change is not None:
         what = "change of volume by smoothing and decimation"
-        yield _at_most("volume_change", abs(change), VOLUME_CHANGE_PERCENT, "%", what)
-
-
-def _none(name: str, count: int, what: str, ok: bool | None = None) -> Gate:
-    ok = count == 0 if ok is None else ok
-    return {
-        "name": name,
-        "measured": count,
-        "bound": 0,
-        "unit": None,
-        "ok": bool(ok),
-        "text": f"{what}: {count}, none allowed",
-    }
-
-
-def _flag(name: str, flag: bool, what: str) -> Gate:
-    says = what if flag else f"does not hold: {what}"
-    return {"name": name, "measured": bool(flag), "bound": True, "unit": None, "ok": bool(flag), "text": says}
-
-
-def _at_most(name: str, measured: float, bound: float, unit: str, what: str) -> Gate:
-    text = f"{what}: {measured:.3g} {unit}, at most {bound:g}"
-    return {"name": name, "measured": measured, "bound": bound, "unit": unit, "ok": measured <= bound, "text": text}
-
-
-def failed_gates(gates: list[Gate]) -> list[str]:
-    """One line for each gate that was measured and not kept."""
-    return [f"gate {gate['name']} failed: {gate['text']}" for gate in gates if gate["ok"] is False]
+        yield at_most("volume_change", abs(change), VOLUME_CHANGE_PERCENT, "%", what)

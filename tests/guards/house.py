@@ -21,10 +21,11 @@ def _layer(name: str, *allowed: str) -> None:
 _layer("__init__", "errors", "version", "geometry", "dicom", "labels", "mesh", "opencl", "operators")
 _layer("errors")
 _layer("version")
+_layer("gates")
 _layer("files", "errors")
 _layer("geometry", "errors", "files")
-_layer("dicom", "errors", "files", "geometry")
-_layer("mesh", "errors", "version", "files", "geometry")
+_layer("dicom", "errors", "files", "gates", "geometry")
+_layer("mesh", "errors", "version", "files", "gates", "geometry")
 _layer("labels", "errors", "files", "geometry", "dicom")
 _layer("reference", "errors", "files", "geometry", "labels")
 _layer("phantom", "errors", "version", "files", "geometry")
@@ -63,6 +64,7 @@ INSIDE_FUNCTIONS: dict[str, frozenset[str]] = {
     "operators": frozenset({"pyopencl"}),
     "pipeline": frozenset({"pyvista", "skimage", "vtkmodules"}),  # vtkmodules: flying edges, the peer of the bench
     "viewer": frozenset({"pyvista", "vtk", "vtkmodules"}),
+    "cli": frozenset({"rich"}),
 }
 
 
