@@ -11,8 +11,8 @@ from typing import Any
 __all__ = ["Gate", "at_most", "failed_gates", "is_true", "none_of", "unmeasured"]
 
 Gate = dict[str, Any]
-"""``name``, ``measured`` (None: not measured), ``bound``, ``unit`` (None for counts and flags), ``ok`` (None: not
-measured) and ``text``, one line without patient data."""
+"""``name``, ``measured`` (None: not measured), ``bound``, ``unit`` (None for counts, shares and flags), ``ok`` (None:
+not measured) and ``text``, one line without patient data."""
 
 
 def none_of(name: str, count: int, what: str, ok: bool | None = None) -> Gate:
@@ -34,9 +34,9 @@ def is_true(name: str, flag: bool, what: str) -> Gate:
     return {"name": name, "measured": bool(flag), "bound": True, "unit": None, "ok": bool(flag), "text": says}
 
 
-def at_most(name: str, measured: float, bound: float, unit: str, what: str) -> Gate:
+def at_most(name: str, measured: float, bound: float, unit: str | None, what: str) -> Gate:
     """A figure is no larger than its bound."""
-    text = f"{what}: {measured:.3g} {unit}, at most {bound:g}"
+    text = f"{what}: {measured:.3g}{' ' * bool(unit)}{unit or ''}, at most {bound:g}"
     return {"name": name, "measured": measured, "bound": bound, "unit": unit, "ok": measured <= bound, "text": text}
 
 

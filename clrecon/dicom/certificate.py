@@ -14,12 +14,21 @@ from numpy.typing import NDArray
 
 from clrecon.dicom.gate import Stack
 from clrecon.dicom.header import SliceHeader
+from clrecon.dicom.layout import (
+    describe_orientation,
+    describe_thickness,
+    measure_extent,
+    median_thickness,
+    summarise_gaps,
+)
 from clrecon.dicom.phases import choose_phase
 from clrecon.dicom.pixels import PixelFacts
 from clrecon.dicom.scan import Scan
 from clrecon.dicom.series import Series
 from clrecon.dicom.text import hash_uid
+from clrecon.dicom.volume_gates import judge_series
 from clrecon.errors import RefusedInputError
+from clrecon.geometry import column_spacing
 
 __all__ = ["certify", "collect_scan_warnings", "collect_series_warnings", "collect_voxel_warnings"]
 
@@ -89,9 +98,9 @@ def _describe_what_was_left(series: Series) -> list[str]:
 
 
 def _describe_phase(series: Series) -> dict[str, Any] | None:
-    phases = series.places.phases
-    if not phases or series.phase is None:
+    if series.phase is None or not series.places.phases:
         return None
+    phases = series.places.phases
     chosen = choose_phase(phases, series.phase)
     return {"number": chosen.number, "of": len(phases), "keyword": chosen.keyword, "value": chosen.value}
 
@@ -116,28 +125,32 @@ def collect_voxel_warnings(voxels: NDArray[Any], facts: PixelFacts) -> list[str]
 
 
 def certify(
-    series: Series, stack: Stack, facts: PixelFacts, scan: Scan, affine: Any, warnings: Sequence[str]
+    series: Series,
+    stack: Stack,
+    facts: PixelFacts | None,
+    scan: Scan,
+    affine: NDArray[np.float64] | None,
+    warnings: Sequence[str],
 ) -> dict[str, Any]:
-    """Build the report of a volume.
+    """Build the certificate of a series: the report of its volume, and what ``clrecon info`` shows.
 
     Parameters
     ----------
     series, stack : Series, Stack
-        What was read.
-    facts : PixelFacts
+        What was read, or would be.
+    facts : PixelFacts or None
+        None: the pixels were not read, and what only they can say is None.
     scan : Scan
-    affine : ndarray, shape (4, 4)
+    affine : ndarray, shape (4, 4), or None
+        None: the series is refused.
     warnings : sequence of str
 
     Returns
     -------
     dict
-        JSON types only.  Lengths in mm, angles in degrees; ``hu_range`` is that of the voxels as they are in the
-        volume, padding (at -1024) among them.
+        JSON types only, every name in docs/contract.md.  Lengths in mm, angles in degrees; ``hu_range`` is that of
+        the voxels as they are in the volume, padding (at -1024) among them.
     """
-    headers, first = stack.slices, stack.slices[0]
-    slopes, intercepts = [h.slope for h in headers], [h.intercept for h in headers]
-    thickness = sorted(h.slice_thickness_mm for h in headers if h.slice_thickness_mm is not None)
     return {
         "series": {
             "number": series.number,
@@ -145,27 +158,56 @@ def certify(
             "modality": series.identity.modality,
         },
         "phase": _describe_phase(series),
+        **_certify_places(stack, affine),
+        **_certify_values(stack.slices, facts),
+        "files": {"found": scan.files, "used": len({h.file for h in stack.slices}), "skipped": dict(scan.skipped)},
+        "dropped": series.dropped,
+        "gates": judge_series(series, stack, facts),
+        "warnings": list(warnings),
+        "problems": list(series.problems),
+    }
+
+
+def _certify_places(stack: Stack, affine: NDArray[np.float64] | None) -> dict[str, Any]:
+    """Where the slices lie, and how well that is known."""
+    headers, first, line = stack.slices, stack.slices[0], stack.line
+    stated = next((h.stated_gap_mm for h in headers if h.stated_gap_mm is not None), None)
+    lay = {h.patient_position for h in headers}
+    return {
         "slices": len(headers),
         "slices_missing": stack.missing,
         "shape_ijk": [first.columns, first.rows, len(headers)],
-        "spacing_mm": [float(length) for length in ((affine[:3, :3] ** 2).sum(axis=0) ** 0.5)],
-        "affine_ijk_to_lps_mm": affine.tolist(),
+        "spacing_mm": None if affine is None else list(column_spacing(affine)),
+        "extent_mm": None if affine is None else measure_extent(stack),
+        "affine_ijk_to_lps_mm": None if affine is None else affine.tolist(),
+        "orientation": None if affine is None else describe_orientation(affine),
+        "patient_position": (lay.pop() or None) if len(lay) == 1 else None,
         "tilt_deg": stack.tilt_deg,
-        "grid_residual_max_mm": stack.line.residual_max_mm,
-        "grid_residual_rms_mm": stack.line.residual_rms_mm,
-        "gap_mm": {"min": stack.line.gap_min_mm, "max": stack.line.gap_max_mm},
-        "uneven": stack.line.uneven,
-        "slice_thickness_mm": thickness[len(thickness) // 2] if thickness else None,
-        "padding_share": facts.padding_share,
-        "frame_of_reference_hash": hash_uid(first.frame_of_reference) if first.frame_of_reference else None,
+        "grid_residual_max_mm": line.residual_max_mm,
+        "grid_residual_rms_mm": line.residual_rms_mm,
+        "grid_tolerance_mm": line.tolerance_mm,
+        "gap_mm": {"min": line.gap_min_mm, "max": line.gap_max_mm, "median": line.gap_median_mm},
+        "uneven": line.uneven,
+        "gap_runs": summarise_gaps(stack.distances_mm) if line.uneven else None,
+        "slice_positions_mm": stack.positions_mm.tolist() if line.uneven else None,
+        "slice_thickness_mm": median_thickness(headers),
+        "thickness": describe_thickness(headers, stack.distances_mm),
+        "stated_gap_mm": stated,
+        "frame_of_reference_hash": hash_uid(first.frame_of_reference),
+    }
+
+
+def _certify_values(headers: Sequence[SliceHeader], facts: PixelFacts | None) -> dict[str, Any]:
+    """What the voxels' values are."""
+    slopes, intercepts = [h.slope for h in headers], [h.intercept for h in headers]
+    return {
+        "padding_share": None if facts is None else facts.padding_share,
         "transfer_syntaxes": sorted({h.transfer_syntax for h in headers}),
+        "lossy": any(h.lossy for h in headers),
         "rescale": {
             "slope": [min(slopes), max(slopes)],
             "intercept": [min(intercepts), max(intercepts)],
-            "type": first.rescale_type or None,
+            "type": headers[0].rescale_type or None,
         },
-        "hu_range": [facts.hu_min, facts.hu_max],
-        "files": {"found": scan.files, "used": len({h.file for h in headers}), "skipped": dict(scan.skipped)},
-        "warnings": list(warnings),
-        "problems": [],
+        "hu_range": None if facts is None else [facts.hu_min, facts.hu_max],
     }

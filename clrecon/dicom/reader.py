@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import os
 import warnings as python_warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 from clrecon.dicom.certificate import certify, collect_scan_warnings, collect_series_warnings, collect_voxel_warnings
 from clrecon.dicom.choice import choose_series, describe_left
@@ -95,14 +96,18 @@ def list_series(
     *,
     phase: int | None = None,
     allow_gaps: bool = False,
+    pixels: bool = False,
     progress: Progress | None = None,
 ) -> SeriesListing:
-    """List the series at a path, with the geometry of each and what is wrong with it.
+    """List the series at a path, with the geometry of each, what is wrong with it, and the certificate of one.
 
     Parameters
     ----------
     path, series, phase, allow_gaps, progress
         As in `read_volume`, which would read what is chosen here.
+    pixels : bool
+        Read the pixels of the chosen series too, for what only they can say: padding, range of HU, saturation.
+        Without it only headers are read.
 
     Returns
     -------
@@ -113,7 +118,7 @@ def list_series(
     NoDicomError
         Nothing there or no DICOM.
     RefusedInputError
-        All DICOM files are corrupt.
+        All DICOM files are corrupt, or with `pixels` those of the chosen series cannot be read.
     UsageError
         `series` names none or several; there is no such `phase`; `path` is empty or no path.
     """
@@ -121,18 +126,35 @@ def list_series(
     with _quiet_warnings():
         scan, found = _scan_and_group(path, progress)
         warnings = collect_scan_warnings(scan)
-        number = None
+        number, certificate, refusal = None, None, None
         try:
             chosen = choose_series(found, series)
         except (NoDicomError, RefusedInputError) as error:
+            refusal = error
             warnings.append(str(error))
         else:
             number = chosen.number
             warnings += describe_left(found, chosen)
             judged = chosen.choose(phase, allow_gaps)
             found = [judged if one is chosen else one for one in found]
+            certificate = _certify_chosen(judged, scan, warnings, pixels, progress)
         entries = [describe_series(one, collect_series_warnings(one)) for one in found]
-    return SeriesListing(entries, number, dict(scan.skipped), warnings)
+    return SeriesListing(entries, number, dict(scan.skipped), warnings, certificate, refusal)
+
+
+def _certify_chosen(
+    series: Series, scan: Scan, notes: Sequence[str], pixels: bool, progress: Progress | None
+) -> dict[str, Any] | None:
+    """The certificate of one series, None without a valid header; `notes` are the warnings about what is beside it."""
+    stack = series.stack
+    if stack is None or series.kind == "other":
+        return None
+    facts, warnings = None, collect_series_warnings(series)
+    affine = None if series.problems else stack.affine
+    if pixels and affine is not None:
+        voxels, facts = read_voxels(stack.slices, progress)
+        warnings += collect_voxel_warnings(voxels, facts)
+    return certify(series, stack, facts, scan, affine, [*warnings, *notes])
 
 
 @contextmanager

@@ -14,10 +14,11 @@ import numpy as np
 from clrecon.dicom.concatenation import describe_missing_parts
 from clrecon.dicom.gate import Stack, group_places, measure_stack
 from clrecon.dicom.header import OtherImage, SeriesIdentity, SliceHeader
+from clrecon.dicom.layout import measure_extent, median_thickness
 from clrecon.dicom.phases import Places, choose_phase, describe_phases, have_same_pixels, sort_places
 from clrecon.dicom.scan import CorruptFile, Scan
 from clrecon.dicom.text import hash_uid, join_names
-from clrecon.errors import RefusedInputError
+from clrecon.errors import ClreconError, RefusedInputError
 from clrecon.geometry import column_spacing
 
 __all__ = ["Series", "SeriesEntry", "SeriesListing", "describe_series", "group_series"]
@@ -103,6 +104,18 @@ class Series:
         elif places.problem:
             headers = headers[:1]
         return measure_stack(headers, self.allow_gaps)
+
+    @property
+    def dropped(self) -> dict[str, int]:
+        """Reason to number of slices that are not in the stack although their headers are valid."""
+        try:
+            places = self.places
+        except RefusedInputError:
+            return {}
+        phases = sum(len(phase.headers) for phase in places.phases)
+        left = phases - len(choose_phase(places.phases, self.phase).headers) if phases and self.phase else 0
+        counts = {"copy of another slice": places.copies, "other phase": left}
+        return {reason: count for reason, count in counts.items() if count}
 
     def choose(self, phase: int | None = None, allow_gaps: bool = False) -> Series:
         """The same series with a phase chosen and gaps allowed.
@@ -190,7 +203,13 @@ class SeriesEntry:
     grid_residual_max_mm : float or None
         Largest distance of a slice position from the affine.
     gap_mm : dict
-        "min" and "max" distance of neighbouring slices along the normal, None where unknown.
+        "min", "max" and "median" distance of neighbouring slices along the normal, None where unknown.
+    extent_mm : list or None
+        Size of the box of whole voxels along rows, columns and the slice normal.
+    slice_thickness_mm : float or None
+        As stated; plays no part in the geometry.
+    dropped : dict of str to int
+        Reason to number of slices left out of the stack.
     """
 
     number: int
@@ -211,6 +230,9 @@ class SeriesEntry:
     study: int | None = None
     kind: str = "stack"
     phases: list[dict[str, Any]] = field(default_factory=list)
+    extent_mm: list[float] | None = None
+    slice_thickness_mm: float | None = None
+    dropped: dict[str, int] = field(default_factory=dict)
 
     def as_dict(self) -> dict[str, Any]:
         """The entry as a dict of JSON types."""
@@ -225,16 +247,23 @@ class SeriesListing:
     ----------
     series : list of SeriesEntry
     chosen : int or None
-        Number of the series that `read_volume` takes when none is named; None where it would not choose.
+        Number of the series that `read_volume` takes for the same ``series``; None where it would not choose.
     skipped : dict of str to int
         Reason to number of files passed over.
     warnings : list of str
+    certificate : dict or None
+        Of the chosen series, in the form of ``volume.report``, also where it is refused; None where no series is
+        chosen or none of its slices has a valid header.
+    refusal : ClreconError or None
+        Why none is chosen; its text stands in `warnings` too.
     """
 
     series: list[SeriesEntry]
     chosen: int | None
     skipped: dict[str, int]
     warnings: list[str]
+    certificate: dict[str, Any] | None = None
+    refusal: ClreconError | None = None
 
 
 def group_series(scan: Scan) -> list[Series]:
@@ -367,7 +396,11 @@ def describe_series(series: Series, warnings: Iterable[str] = ()) -> SeriesEntry
         affine_ijk_to_lps_mm=None if affine is None else affine.tolist(),
         tilt_deg=None if stack is None or affine is None else stack.tilt_deg,
         grid_residual_max_mm=None if stack is None else stack.line.residual_max_mm,
-        gap_mm={"min": stack.line.gap_min_mm if stack else None, "max": stack.line.gap_max_mm if stack else None},
+        gap_mm={
+            "min": stack.line.gap_min_mm if stack else None,
+            "max": stack.line.gap_max_mm if stack else None,
+            "median": stack.line.gap_median_mm if stack else None,
+        },
         uneven=None if stack is None else stack.line.uneven,
         warnings=list(warnings),
         problems=list(series.problems),
@@ -375,6 +408,9 @@ def describe_series(series: Series, warnings: Iterable[str] = ()) -> SeriesEntry
         study=series.study or None,
         kind=series.kind,
         phases=_list_phases(series),
+        extent_mm=None if stack is None or affine is None else measure_extent(stack),
+        slice_thickness_mm=median_thickness(series.headers),
+        dropped=series.dropped,
     )
 
 

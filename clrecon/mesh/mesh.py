@@ -58,7 +58,8 @@ class Mesh:
         Unit vectors at the vertices that point outward, LPS; kept as float32.
     report : dict, optional
         What is known of the origin of this mesh, free of patient data: ``iso_value_hu``, ``affine_ijk_to_lps_mm``,
-        device, times.  The writers put the first two into the formats that have a place for them.
+        ``certificate`` (the report of the volume), device, times.  The writers put the first three into the formats
+        that have a place for them.
 
     Raises
     ------

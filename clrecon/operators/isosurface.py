@@ -313,6 +313,7 @@ class _Run:
             "topology": rule.topology,
             "outside_hu": rule.outside if rule.closed else None,
             "affine_ijk_to_lps_mm": self.grid.volume.affine.tolist(),
+            "certificate": self.grid.volume.report,
             "device": self.device.label,
             "driver": self.device.driver,
             "slabs": self.slabs,
@@ -387,8 +388,8 @@ def extract_isosurface(
     -------
     Mesh
         Triangles are counter-clockwise and normals point as seen from lower values; `Mesh.report` holds the iso
-        value, the affine, the device, the number of slabs, ``device_bytes`` {volume, scratch, output} of the
-        largest, and the seconds {upload, build, kernels, download}.
+        value, the affine, the certificate (``volume.report``), the device, the number of slabs, ``device_bytes``
+        {volume, scratch, output} of the largest, and the seconds {upload, build, kernels, download}.
 
     Raises
     ------

@@ -204,6 +204,7 @@ class _Run:
             "closed_at_border": rule.closed,
             "outside_hu": rule.outside if rule.closed else None,
             "affine_ijk_to_lps_mm": self.volume.affine.tolist(),
+            "certificate": self.volume.report,
             "device": self.device.label,
             "driver": self.device.driver,
             "slabs": self.groups,

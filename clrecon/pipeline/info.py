@@ -1,11 +1,11 @@
-"""Which series an input holds, and which one a job would use."""
+"""Which series an input holds, which one a job would use, and whether that one can be trusted."""
 
 from __future__ import annotations
 
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from clrecon.errors import ClreconError, NoDicomError, RefusedInputError, UsageError
+from clrecon.errors import ClreconError, NoDicomError, RefusedInputError
 from clrecon.pipeline.progress import Progress
 
 __all__ = ["InputListing", "describe_input"]
@@ -17,14 +17,13 @@ class InputListing(NamedTuple):
     Attributes
     ----------
     listing : dict
-        ``{"series": [...], "chosen": number or None}``; each entry is ``{"number", "uid_hash", "description",
-        "modality", "slices", "shape_ijk", "spacing_mm", "affine_ijk_to_lps_mm", "tilt_deg",
-        "grid_residual_max_mm", "gap_mm": {"min", "max"}, "uneven", "warnings", "problems"}``.  ``chosen`` is what
-        a job would use, None where it would refuse.
+        ``{"series": [...], "chosen": number or None, "certificate": {...} or None}``, see docs/contract.md.
+        ``chosen`` is what a job would use, None where it would refuse; ``certificate`` is that of the series that was
+        judged, refused or not.
     notes : list of str
         Files that were passed over, series that were left, why none is chosen.
     problem : ClreconError or None
-        Why no series at all can be used.
+        Why the command fails: no series at all can be used, the one asked for cannot, or a gate failed.
     """
 
     listing: dict[str, Any]
@@ -32,16 +31,27 @@ class InputListing(NamedTuple):
     problem: ClreconError | None
 
 
-def describe_input(source: str | Path, series: str | None = None, *, progress: Progress | None = None) -> InputListing:
-    """List the series of an input.
+def describe_input(
+    source: str | Path,
+    series: str | None = None,
+    *,
+    pixels: bool = False,
+    strict: bool = False,
+    progress: Progress | None = None,
+) -> InputListing:
+    """List the series of an input and certify one.
 
     Parameters
     ----------
     source : path
         DICOM folder or file.
     series : str, optional
-        Number, hash or description of the series to judge; None leaves the choice to the reader, and any usable
-        series is enough then.
+        Number, SeriesInstanceUID, its hash or description of the series to judge; None leaves the choice to the
+        reader, and any usable series is enough then.
+    pixels : bool
+        Read the pixels of the series that is judged.
+    strict : bool
+        A gate that fails is a problem, and so is that no series was chosen.
     progress : callable, optional
 
     Returns
@@ -51,40 +61,27 @@ def describe_input(source: str | Path, series: str | None = None, *, progress: P
     Raises
     ------
     NoDicomError, RefusedInputError, UsageError
-        Nothing to list, all files corrupt, or not exactly one series answers to `series`.
+        Nothing to list, all files corrupt, pixels that cannot be read, or not exactly one series answers to `series`.
     """
     from clrecon.dicom import list_series
 
-    found = list_series(source, progress=progress)
+    found = list_series(source, series, pixels=pixels, progress=progress)
     entries = [entry.as_dict() for entry in found.series]
-    notes = list(found.warnings)
-    chosen = found.chosen if series is None else _find(entries, series)["number"]
-    listing: dict[str, Any] = {"series": entries, "chosen": chosen}
-    if chosen is not None:
-        problem = _judge(next(entry for entry in entries if entry["number"] == chosen))
+    listing: dict[str, Any] = {"series": entries, "chosen": found.chosen, "certificate": found.certificate}
+    notes, problem = list(found.warnings), found.refusal
+    if found.chosen is not None:
+        problem = _judge(next(entry for entry in entries if entry["number"] == found.chosen))
         if problem is None:
-            return InputListing(listing, notes, None)
+            failed = _judge_gates(listing) if strict else None
+            return InputListing(listing, notes, failed)
         listing["chosen"] = None
-        if series is not None:
-            return InputListing(listing, notes, problem)
         notes.append(str(problem))
-    if any(not entry["problems"] for entry in entries):
+    if series is None and not strict and any(not entry["problems"] for entry in entries):
         return InputListing(listing, notes, None)
-    kind = RefusedInputError if any(entry["modality"] == "CT" for entry in entries) else NoDicomError
-    return InputListing(listing, notes[:-1], kind(notes[-1] if notes else "no series can be used"))
-
-
-def _find(entries: list[dict[str, Any]], series: str) -> dict[str, Any]:
-    wanted = series.strip()
-    folded = wanted.casefold()
-    matches = [entry for entry in entries if entry["uid_hash"] == wanted]
-    matches = matches or [entry for entry in entries if str(entry["number"]) == wanted]
-    matches = matches or [entry for entry in entries if str(entry["description"]).casefold() == folded]
-    if len(matches) == 1:
-        return matches[0]
-    have = ", ".join(f"{entry['number']} ({entry['uid_hash']})" for entry in entries)
-    what = "is not there" if not matches else f"names {len(matches)} series"
-    raise UsageError(f"series {series!r} {what}; the input holds {have}")
+    notes.pop()  # it is what the command ends with
+    if series is None and not any(entry["modality"] == "CT" for entry in entries):
+        problem = NoDicomError(str(problem))
+    return InputListing(listing, notes, problem)
 
 
 def _judge(entry: dict[str, Any]) -> ClreconError | None:
@@ -92,3 +89,13 @@ def _judge(entry: dict[str, Any]) -> ClreconError | None:
         return None
     kind = RefusedInputError if entry["modality"] == "CT" else NoDicomError
     return kind(f"series {entry['number']} cannot be used: {'; '.join(map(str, entry['problems']))}")
+
+
+def _judge_gates(listing: dict[str, Any]) -> ClreconError | None:
+    from clrecon.gates import failed_gates
+
+    failed = failed_gates(listing["certificate"]["gates"])
+    if not failed:
+        return None
+    count = f"{len(failed)} gate{'s' * (len(failed) > 1)}"
+    return RefusedInputError(f"series {listing['chosen']} fails {count}: {'; '.join(failed)}")

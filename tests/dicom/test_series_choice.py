@@ -19,7 +19,7 @@ from clrecon.errors import NoDicomError, RefusedInputError, UsageError
 
 CONTRACT = (
     "number uid_hash description modality slices shape_ijk spacing_mm affine_ijk_to_lps_mm tilt_deg "
-    "grid_residual_max_mm gap_mm uneven warnings problems"
+    "grid_residual_max_mm gap_mm uneven warnings problems kind extent_mm slice_thickness_mm dropped"
 ).split()
 
 
@@ -48,7 +48,7 @@ def test_listing_is_the_contract(two_series):
     assert first["spacing_mm"] == pytest.approx([0.5, 0.7, 1.25])
     assert np.array(first["affine_ijk_to_lps_mm"])[:3, 3] == pytest.approx([-12.5, 31.25, -400.0])
     assert first["tilt_deg"] == pytest.approx(0, abs=1e-6)
-    assert first["gap_mm"] == pytest.approx({"min": 1.25, "max": 1.25})
+    assert first["gap_mm"] == pytest.approx({"min": 1.25, "max": 1.25, "median": 1.25})
     assert first["grid_residual_max_mm"] < 1e-9
     assert (first["uneven"], first["warnings"], first["problems"]) == (False, [], [])
     assert entries[1]["slices"] == 4 and entries[1]["number"] == 2

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -10,6 +11,7 @@ from numpy.typing import NDArray
 
 from clrecon.errors import OutputError
 from clrecon.geometry import frame_from_lps
+from clrecon.mesh.writers.certificate import certificate_lines
 
 if TYPE_CHECKING:
     from clrecon.mesh.mesh import Mesh
@@ -34,6 +36,8 @@ class Content:
     iso_value_hu : float or None
     affine : ndarray, shape (4, 4), float64, or None
         Index (i, j, k) of the volume to LPS mm, whatever `space` is.
+    certificate : tuple of str
+        What is known of the volume, see `clrecon.mesh.writers.certificate`; one printable ASCII line each.
     """
 
     vertices: NDArray[np.float32]
@@ -43,14 +47,15 @@ class Content:
     to_lps: NDArray[np.float64]
     iso_value_hu: float | None
     affine: NDArray[np.float64] | None
+    certificate: tuple[str, ...] = ()
 
     @property
     def remarks(self) -> list[str]:
-        """The facts for formats that have comments: space, unit and, when known, the iso value."""
+        """The facts for formats that have comments: space, unit and, when known, iso value and certificate."""
         remarks = [f"SPACE={self.space}", "UNIT=mm"]
         if self.iso_value_hu is not None:
             remarks.append(f"ISO_VALUE_HU={self.iso_value_hu:.9g}")
-        return remarks
+        return remarks + [f"CERTIFICATE {line}" for line in self.certificate]
 
 
 def describe_mesh(mesh: Mesh, space: str) -> Content:
@@ -58,6 +63,7 @@ def describe_mesh(mesh: Mesh, space: str) -> Content:
     vertices, normals = mesh.in_space(space)
     iso_value = mesh.report.get("iso_value_hu")
     affine = mesh.report.get("affine_ijk_to_lps_mm")
+    certificate = mesh.report.get("certificate")
     return Content(
         vertices=vertices,
         triangles=mesh.triangles,
@@ -66,6 +72,7 @@ def describe_mesh(mesh: Mesh, space: str) -> Content:
         to_lps=frame_from_lps(space).T,
         iso_value_hu=None if iso_value is None else float(iso_value),
         affine=None if affine is None else np.array(affine, dtype=np.float64).reshape(4, 4),
+        certificate=certificate_lines(certificate) if isinstance(certificate, Mapping) else (),
     )
 
 

@@ -6,8 +6,8 @@ takes them to what glTF prescribes: metres, right-handed, Y up, the front facing
     (X, Y, Z) = 0.001 (L, S, -P)
 
 the head up and the face towards the viewer.  It is a rotation times a scale, so that the winding stays.
-``asset.extras`` has the matrix back (column-major, as glTF writes matrices), the frame and the unit.  Own code
-because this matrix and the extras are the point, and it is a page.
+``asset.extras`` has the matrix back (column-major, as glTF writes matrices), the frame, the unit and the
+certificate.  Own code because this matrix and the extras are the point, and it is a page.
 """
 
 from __future__ import annotations
@@ -68,6 +68,8 @@ def _document(content: Content) -> dict[str, Any]:
     }
     if content.iso_value_hu is not None:
         extras["iso_value_hu"] = content.iso_value_hu
+    if content.certificate:
+        extras["certificate"] = list(content.certificate)
     material = {"baseColorFactor": _BONE_COLOUR, "metallicFactor": 0.0, "roughnessFactor": 0.6}
     primitive = {"attributes": attributes, "indices": len(views) - 1, "material": 0, "mode": 4}
     return {

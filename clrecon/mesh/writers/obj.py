@@ -1,4 +1,4 @@
-"""Wavefront OBJ, text, with the frame, the unit and the iso value in comments.
+"""Wavefront OBJ, text, with the frame, the unit, the iso value and the certificate in comments.
 
 Own code because vtkOBJWriter has no comments and reports success on a full disk, and trimesh builds the text in memory.
 Coordinates have nine digits, which give back the same float32; normals have six decimals.
@@ -27,9 +27,10 @@ def _header(content: Content) -> bytes:
 def estimate(content: Content) -> int:
     """Size of the file in bytes, about."""
     digits = len(str(len(content.vertices)))
+    head = len(_header(content))
     if content.normals is None:
-        return 200 + 30 * len(content.vertices) + (3 * digits + 5) * len(content.triangles)
-    return 200 + 58 * len(content.vertices) + (6 * digits + 11) * len(content.triangles)
+        return head + 30 * len(content.vertices) + (3 * digits + 5) * len(content.triangles)
+    return head + 58 * len(content.vertices) + (6 * digits + 11) * len(content.triangles)
 
 
 def write(stream: BinaryIO, content: Content) -> None:

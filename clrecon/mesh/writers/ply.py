@@ -1,4 +1,4 @@
-"""Binary little-endian PLY with the frame, the unit and the iso value in comments.
+"""Binary little-endian PLY with the frame, the unit, the iso value and the certificate in comments.
 
 Own code because vtkPLYWriter reports success on a full disk, and trimesh has no comments.
 Indices are declared ``int`` and not ``uint``, which is what every reader knows: at most 2**31 vertices.

@@ -9,6 +9,7 @@ from __future__ import annotations
 import zipfile
 from pathlib import Path
 from typing import BinaryIO
+from xml.sax.saxutils import escape
 
 from clrecon.errors import OutputError
 from clrecon.mesh.measures import chunks
@@ -72,9 +73,17 @@ def _opening(content: Content) -> str:
         f'{_DECLARATION}<model unit="millimeter" xml:lang="en-US" '
         'xmlns="http://schemas.microsoft.com/3dmanufacturing/core/2015/02">\n'
         '<metadata name="Application">clrecon</metadata>\n'
-        f'<metadata name="Description">{" ".join(content.remarks)}</metadata>\n'
+        f'<metadata name="Description">{_description(content)}</metadata>\n'
         '<resources>\n<object id="1" type="model">\n<mesh>\n<vertices>\n'
     )
+
+
+def _description(content: Content) -> str:
+    """The remarks, the certificate a line each, with what XML reserves as entities."""
+    remarks = content.remarks
+    known = len(remarks) - len(content.certificate)
+    lines = [" ".join(remarks[:known]), *remarks[known:]]
+    return escape("\n".join(lines))
 
 
 def verify(path: Path, content: Content) -> None:

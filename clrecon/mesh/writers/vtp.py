@@ -1,8 +1,8 @@
 """VTP, the XML PolyData of VTK, written by VTK: raw binary data after the XML, with 64-bit headers.
 
 VTK writes to a string and the string to our stream: left to itself it leaves a truncated file on a full disk.  The
-field arrays ``SPACE``, ``UNIT``, ``ISO_VALUE_HU`` and ``AFFINE_IJK_TO_LPS_MM`` (16 numbers, row by row) say what
-the coordinates are; 3D Slicer reads ``SPACE``.
+field arrays ``SPACE``, ``UNIT``, ``ISO_VALUE_HU``, ``AFFINE_IJK_TO_LPS_MM`` (16 numbers, row by row) and
+``CERTIFICATE`` (one text a fact) say what the coordinates are; 3D Slicer reads ``SPACE``.
 """
 
 from __future__ import annotations
@@ -52,11 +52,13 @@ def _field_arrays(content: Content) -> list[Any]:
     from vtkmodules.vtkCommonCore import vtkDoubleArray, vtkStringArray
 
     arrays: list[Any] = []
-    for name, text in (("SPACE", content.space), ("UNIT", "mm")):
+    for name, texts in (("SPACE", (content.space,)), ("UNIT", ("mm",)), ("CERTIFICATE", content.certificate)):
         strings = vtkStringArray()
         strings.SetName(name)
-        strings.InsertNextValue(text)
-        arrays.append(strings)
+        for text in texts:
+            strings.InsertNextValue(text)
+        if texts:
+            arrays.append(strings)
     numbers: list[tuple[str, list[float]]] = []
     if content.iso_value_hu is not None:
         numbers.append(("ISO_VALUE_HU", [content.iso_value_hu]))

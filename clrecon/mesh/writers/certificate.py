@@ -1,0 +1,109 @@
+"""The certificate of the volume that a mesh was made of, as short lines for the comments of its file.
+
+One fact a line: a name, a blank, the value, such as ``tilt_deg 12.5``.  Numbers have nine significant digits, so that
+a line of the same volume is the same in every file.  Only the names below ever get into a file.  A report can be
+anything that a caller made up: what has another form is left out, and texts become one line of plain ASCII.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterable, Iterator, Mapping
+from typing import Any
+
+__all__ = ["LINE_LENGTH", "certificate_lines"]
+
+LINE_LENGTH = 256
+"""Readers of PLY keep comments in buffers of fixed size: 1024 bytes in one that is widely used."""
+WARNINGS_WRITTEN = 20
+RUNS_WRITTEN = 12
+_NUMBERS = (
+    ("grid_residual_max_mm", "grid_residual_max_mm"),
+    ("grid_residual_rms_mm", "grid_residual_rms_mm"),
+    ("grid_tolerance_mm", "grid_tolerance_mm"),
+    ("tilt_deg", "tilt_deg"),
+    ("slice_thickness_mm", "slice_thickness_mm"),
+    ("padding_share", "padding_share"),
+)
+_HASH = re.compile(r"[0-9a-f]{16}")
+_AXES = re.compile(r"[LRPASI]{3}")
+
+
+def certificate_lines(report: Mapping[str, Any]) -> tuple[str, ...]:
+    """The lines for a file.
+
+    Parameters
+    ----------
+    report : mapping
+        ``volume.report``, see docs/contract.md.
+
+    Returns
+    -------
+    tuple of str
+        At most `LINE_LENGTH` printable ASCII characters each, none of them ``=``: readers look for ``SPACE=`` anywhere.
+        Empty where nothing is known.
+    """
+    return tuple(_plain(line) for line in (*_facts(report), *_faults(report)))
+
+
+def _facts(report: Mapping[str, Any]) -> Iterator[str]:
+    for name, key in _NUMBERS:
+        yield from _line(name, [report.get(key)])
+    gaps = report.get("gap_mm")
+    if isinstance(gaps, Mapping):
+        yield from _line("gap_mm", ("min", gaps.get("min"), "max", gaps.get("max"), "median", gaps.get("median")))
+    runs = report.get("gap_runs")
+    if isinstance(runs, list) and 0 < len(runs) <= RUNS_WRITTEN and all(isinstance(run, Mapping) for run in runs):
+        yield from _line("gap_runs", [part for run in runs for part in (run.get("count"), "x", run.get("gap_mm"))])
+    thickness = report.get("thickness")
+    if isinstance(thickness, Mapping) and isinstance(thickness.get("overlap_mm"), Mapping):
+        overlap = thickness["overlap_mm"]
+        yield from _line("slice_overlap_mm", ("min", overlap.get("min"), "max", overlap.get("max")))
+    dropped = report.get("dropped")
+    left = sum(dropped.values()) if isinstance(dropped, Mapping) else None
+    yield from _line("slices", ("used", report.get("slices"), "dropped", left, "missing", report.get("missing_slices")))
+    if isinstance(dropped, Mapping):
+        yield from (f"dropped {count} {reason}" for reason, count in dropped.items())
+    orientation = report.get("orientation")
+    if isinstance(orientation, Mapping) and _AXES.fullmatch(str(orientation.get("axes"))):
+        yield f"axes {orientation['axes']}"
+    affine = report.get("affine_ijk_to_lps_mm")
+    if isinstance(affine, list) and len(affine) == 4 and all(isinstance(row, list) for row in affine):
+        yield from _line("affine_ijk_to_lps_mm", [value for row in affine for value in row])
+    frame = report.get("frame_of_reference_hash")
+    if isinstance(frame, str) and _HASH.fullmatch(frame):
+        yield f"frame_of_reference {frame}"
+
+
+def _faults(report: Mapping[str, Any]) -> Iterator[str]:
+    gates = report.get("gates")
+    if isinstance(gates, list):
+        judged = [gate for gate in gates if isinstance(gate, Mapping) and gate.get("ok") is not None]
+        failed = [gate for gate in judged if not gate["ok"]]
+        yield f"gates {len(judged) - len(failed)} passed {len(failed)} failed"
+        yield from (f"gate_failed {gate.get('name')}: {gate.get('text')}" for gate in failed)
+    warnings = report.get("warnings")
+    if isinstance(warnings, list):
+        yield from (f"warning {text}" for text in warnings[:WARNINGS_WRITTEN])
+        if len(warnings) > WARNINGS_WRITTEN:
+            yield f"warning and {len(warnings) - WARNINGS_WRITTEN} more, in the report"
+
+
+def _line(name: str, values: Iterable[Any]) -> Iterator[str]:
+    """One line of words and numbers; none where one of them is not known."""
+    words = []
+    for value in values:
+        if isinstance(value, str):
+            words.append(value)
+        elif isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value):
+            words.append(f"{value:.9g}")
+        else:
+            return
+    yield " ".join((name, *words))
+
+
+def _plain(text: str) -> str:
+    ascii_text = text.encode("ascii", "backslashreplace").decode("ascii").replace("=", ":")
+    line = "".join(c if c.isprintable() else f"\\x{ord(c):02x}" for c in ascii_text)
+    return line if len(line) <= LINE_LENGTH else line[: LINE_LENGTH - 3] + "..."
