@@ -79,8 +79,6 @@ def describe_input(
     if series is None and not strict and any(not entry["problems"] for entry in entries):
         return InputListing(listing, notes, None)
     notes.pop()  # it is what the command ends with
-    if series is None and not any(entry["modality"] == "CT" for entry in entries):
-        problem = NoDicomError(str(problem))
     return InputListing(listing, notes, problem)
 
 
