@@ -9,7 +9,7 @@ from typing import Any
 
 from clrecon.errors import OutputError
 
-__all__ = ["Console", "printable"]
+__all__ = ["Console", "is_terminal", "printable"]
 
 _STAGES = {
     "device": "choosing a device",
@@ -66,12 +66,12 @@ class Console:
         self._drawn = 0
         self._last_draw = 0.0
         self._start = time.perf_counter()
-        self._moving = _is_terminal(sys.stderr)
+        self._moving = is_terminal(sys.stderr)
 
     def set_loudness(self, quiet: bool, verbose: bool) -> None:
         """`quiet`: errors only.  `verbose`: one plain line a stage on stderr instead of a moving one."""
         self.quiet, self.verbose = quiet, verbose
-        self._moving = _is_terminal(sys.stderr) and not quiet and not verbose
+        self._moving = is_terminal(sys.stderr) and not quiet and not verbose
 
     def say(self, text: str = "") -> None:
         """Print a line of the human result; nothing with ``--json`` or ``-q``."""
@@ -176,7 +176,8 @@ def _discard_stdout() -> None:
     os.close(null)
 
 
-def _is_terminal(stream: Any) -> bool:
+def is_terminal(stream: Any) -> bool:
+    """True where somebody looks at `stream` who sees moving lines and styles."""
     return stream is not None and stream.isatty() and os.environ.get("TERM") != "dumb"
 
 

@@ -80,11 +80,13 @@ def describe_refinement(meshes: list[dict[str, Any]]) -> list[str]:
 def finish_with_gates(report: dict[str, Any], console: Console, strict: bool) -> int:
     """Print the warnings of a report; returns the exit code.
 
-    With `strict` the gates that failed are errors: they are printed with ``--quiet`` and ``--json`` too.
+    With `strict` the gates that failed, of the volume and of the meshes, are errors: they are printed with ``--quiet``
+    and ``--json`` too.
     """
     from clrecon.pipeline.refinement import warn_of_gates
 
-    failed = warn_of_gates(report["gates"]) if strict else []
+    of_volume = [{"mesh": "volume", **gate} for gate in report["volume"].get("gates", ())]
+    failed = warn_of_gates([*of_volume, *report["gates"]]) if strict else []
     for warning in report["warnings"]:
         if warning not in failed:
             console.warn(warning)

@@ -25,7 +25,7 @@ from clrecon.dicom.phases import choose_phase
 from clrecon.dicom.pixels import PixelFacts
 from clrecon.dicom.scan import Scan
 from clrecon.dicom.series import Series
-from clrecon.dicom.text import hash_uid
+from clrecon.dicom.text import escape_text, hash_uid
 from clrecon.dicom.volume_gates import judge_series
 from clrecon.errors import RefusedInputError
 from clrecon.geometry import column_spacing
@@ -151,6 +151,8 @@ def certify(
         JSON types only, every name in docs/contract.md.  Lengths in mm, angles in degrees; ``hu_range`` is that of
         the voxels as they are in the volume, padding (at -1024) among them.
     """
+    gates = judge_series(series, stack, facts)
+    unsaid = [gate["text"] for gate in gates if gate["name"] == "padding_share" and gate["ok"] is False]
     return {
         "series": {
             "number": series.number,
@@ -162,8 +164,8 @@ def certify(
         **_certify_values(stack.slices, facts),
         "files": {"found": scan.files, "used": len({h.file for h in stack.slices}), "skipped": dict(scan.skipped)},
         "dropped": series.dropped,
-        "gates": judge_series(series, stack, facts),
-        "warnings": list(warnings),
+        "gates": gates,
+        "warnings": [*warnings, *unsaid],
         "problems": list(series.problems),
     }
 
@@ -197,12 +199,20 @@ def _certify_places(stack: Stack, affine: NDArray[np.float64] | None) -> dict[st
     }
 
 
+def name_syntax(uid: str) -> str:
+    """Name of a transfer syntax, its UID where it has none."""
+    from pydicom.uid import UID
+
+    return escape_text(UID(uid).name)
+
+
 def _certify_values(headers: Sequence[SliceHeader], facts: PixelFacts | None) -> dict[str, Any]:
     """What the voxels' values are."""
     slopes, intercepts = [h.slope for h in headers], [h.intercept for h in headers]
     return {
         "padding_share": None if facts is None else facts.padding_share,
         "transfer_syntaxes": sorted({h.transfer_syntax for h in headers}),
+        "transfer_syntax_names": sorted({name_syntax(h.transfer_syntax) for h in headers}),
         "lossy": any(h.lossy for h in headers),
         "rescale": {
             "slope": [min(slopes), max(slopes)],

@@ -96,8 +96,6 @@ def judge_parts(parts: Sequence[Part], volume: Volume, settings: MeshSettings) -
 
 def warn_of_gates(gates: Sequence[dict[str, Any]]) -> list[str]:
     """One line for each gate that failed, with the name of its mesh where there are several."""
-    if not gates:
-        return []
-    from clrecon.mesh.gates import failed_gates
+    from clrecon.gates import failed_gates
 
     return [f"{gate['mesh']}: {line}" if gate["mesh"] else line for gate in gates for line in failed_gates([gate])]

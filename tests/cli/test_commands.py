@@ -19,11 +19,6 @@ CONTRACT = {
     "area_mm2", "volume_ml", "bounds_mm", "device", "driver", "version", "warnings", "seconds",
 }  # fmt: skip
 SECONDS = {"read", "upload", "build", "kernels", "download", "write", "total"}
-SERIES = {
-    "number", "uid_hash", "description", "modality", "slices", "shape_ijk", "spacing_mm", "affine_ijk_to_lps_mm",
-    "tilt_deg", "grid_residual_max_mm", "gap_mm", "uneven", "warnings", "problems",
-    "patient", "study", "kind", "phases",
-}  # fmt: skip
 TRUE_VOLUME_ML = 4.0 / 3.0 * math.pi * RADIUS_MM**3 / 1000.0
 
 
@@ -229,46 +224,6 @@ def test_two_series_and_the_choice(device: Any, tmp_path: Path, capsys: pytest.C
     assert captured.err.startswith("clrecon: warning: 1 other series left: [2: CT")
     assert main(["mesh", str(folder), "-o", str(tmp_path / "a.stl"), "--series", "9"]) == 3
     assert "no series matches" in capsys.readouterr().err
-
-
-def test_info_json_is_the_contract(ct: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["info", str(ct), "--json"]) == 0
-    captured = capsys.readouterr()
-    listing = json.loads(captured.out)
-    assert set(listing) == {"series", "chosen"}
-    assert listing["chosen"] == 1
-    (entry,) = listing["series"]
-    assert set(entry) == SERIES
-    assert (entry["slices"], entry["shape_ijk"], entry["modality"]) == (17, [31, 25, 17], "CT")
-    assert entry["spacing_mm"] == pytest.approx(SPACING)
-    assert set(entry["gap_mm"]) == {"min", "max"}
-    assert captured.err == ""
-
-
-def test_info_table_marks_the_choice(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    folder = write_series(tmp_path / "ct", number=1)
-    write_series(folder, np.full((6, 9, 9), -1000, np.int16), number=2)
-    write_series(folder, np.full((3, 9, 9), 5, np.int16), number=3, modality="MR")
-    assert main(["info", str(folder)]) == 0
-    captured = capsys.readouterr()
-    rows = captured.out.splitlines()
-    assert rows[1].split()[:2] == ["*", "1"]
-    assert rows[2].split()[0] == "2"
-    assert "31 x 25" in rows[1] and "0.8 x 1.1 x 1.5" in rows[1]
-    assert "series 3: problem: modality MR is not CT" in rows
-
-
-def test_info_of_equal_series_names_the_way_out(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    folder = write_series(tmp_path / "ct", number=1)
-    write_series(folder, number=2)
-    assert main(["info", str(folder), "--json"]) == 0
-    captured = capsys.readouterr()
-    assert json.loads(captured.out)["chosen"] is None
-    assert "choose one with --series" in captured.err
-    assert main(["info", str(folder), "--series", "2", "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["chosen"] == 2
-    assert main(["info", str(folder), "--series", "7"]) == 3
-    assert "series '7' is not there" in capsys.readouterr().err
 
 
 def test_devices_lists_each(device: Any, capsys: pytest.CaptureFixture[str]) -> None:

@@ -12,7 +12,10 @@ import pytest
 
 import clrecon
 
-HEAVY = {"imagecodecs", "numpy", "pydicom", "pyopencl", "pyvista", "scipy", "skimage", "trimesh", "vtk", "vtkmodules"}
+HEAVY = {
+    "imagecodecs", "numpy", "pydicom", "pyopencl", "pyvista", "rich", "scipy", "skimage", "trimesh", "vtk",
+    "vtkmodules",
+}  # fmt: skip
 LOADED = "import json, sys; print(json.dumps(sorted({name.partition('.')[0] for name in sys.modules})))"
 HELP = """
 import contextlib, io
@@ -41,6 +44,13 @@ def test_import_loads_nothing_heavy(tmp_path: Path) -> None:
 
 def test_help_loads_nothing_heavy(tmp_path: Path) -> None:
     assert loaded_after(HELP, tmp_path) & HEAVY == set()
+
+
+def test_only_a_listing_that_is_shown_loads_rich(tmp_path: Path) -> None:
+    listing = {"series": [], "chosen": None, "certificate": None}
+    show = f"from clrecon.cli import info, mesh, series_table; series_table.render_listing({listing}, [])"
+    assert "rich" not in loaded_after("from clrecon.cli import info, mesh, series_table", tmp_path)
+    assert "rich" in loaded_after(show, tmp_path)
 
 
 def test_a_heavy_import_would_be_seen(tmp_path: Path) -> None:

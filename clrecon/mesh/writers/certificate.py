@@ -19,12 +19,12 @@ LINE_LENGTH = 256
 WARNINGS_WRITTEN = 20
 RUNS_WRITTEN = 12
 _NUMBERS = (
-    ("grid_residual_max_mm", "grid_residual_max_mm"),
-    ("grid_residual_rms_mm", "grid_residual_rms_mm"),
-    ("grid_tolerance_mm", "grid_tolerance_mm"),
-    ("tilt_deg", "tilt_deg"),
-    ("slice_thickness_mm", "slice_thickness_mm"),
-    ("padding_share", "padding_share"),
+    "grid_residual_max_mm",
+    "grid_residual_rms_mm",
+    "grid_tolerance_mm",
+    "tilt_deg",
+    "slice_thickness_mm",
+    "padding_share",
 )
 _HASH = re.compile(r"[0-9a-f]{16}")
 _AXES = re.compile(r"[LRPASI]{3}")
@@ -48,29 +48,27 @@ def certificate_lines(report: Mapping[str, Any]) -> tuple[str, ...]:
 
 
 def _facts(report: Mapping[str, Any]) -> Iterator[str]:
-    for name, key in _NUMBERS:
-        yield from _line(name, [report.get(key)])
-    gaps = report.get("gap_mm")
-    if isinstance(gaps, Mapping):
-        yield from _line("gap_mm", ("min", gaps.get("min"), "max", gaps.get("max"), "median", gaps.get("median")))
-    runs = report.get("gap_runs")
-    if isinstance(runs, list) and 0 < len(runs) <= RUNS_WRITTEN and all(isinstance(run, Mapping) for run in runs):
-        yield from _line("gap_runs", [part for run in runs for part in (run.get("count"), "x", run.get("gap_mm"))])
-    thickness = report.get("thickness")
-    if isinstance(thickness, Mapping) and isinstance(thickness.get("overlap_mm"), Mapping):
-        overlap = thickness["overlap_mm"]
-        yield from _line("slice_overlap_mm", ("min", overlap.get("min"), "max", overlap.get("max")))
-    dropped = report.get("dropped")
-    left = sum(dropped.values()) if isinstance(dropped, Mapping) else None
-    yield from _line("slices", ("used", report.get("slices"), "dropped", left, "missing", report.get("missing_slices")))
-    if isinstance(dropped, Mapping):
-        yield from (f"dropped {count} {reason}" for reason, count in dropped.items())
-    orientation = report.get("orientation")
-    if isinstance(orientation, Mapping) and _AXES.fullmatch(str(orientation.get("axes"))):
-        yield f"axes {orientation['axes']}"
+    for name in _NUMBERS:
+        yield from _line(name, [("", report.get(name))])
+    gaps, dropped, runs = _mapping(report.get("gap_mm")), _mapping(report.get("dropped")), report.get("gap_runs")
+    yield from _line("gap_mm", [(end, gaps.get(end)) for end in ("min", "max", "median")])
+    if isinstance(runs, list) and 0 < len(runs) <= RUNS_WRITTEN:
+        pairs = [(word, _mapping(run).get(key)) for run in runs for word, key in (("", "count"), ("x", "gap_mm"))]
+        yield from _line("gap_runs", pairs)
+    overlap = _mapping(_mapping(report.get("thickness")).get("overlap_mm"))
+    yield from _line("slice_overlap_mm", [(end, overlap.get(end)) for end in ("min", "max")])
+    left = sum(count for count in dropped.values() if isinstance(count, int))
+    numbers = (("used", report.get("slices")), ("dropped", left), ("missing", report.get("slices_missing")))
+    yield from _line("slices", numbers)
+    phase = _mapping(report.get("phase"))
+    yield from _line("phase", [("", phase.get("number")), ("of", phase.get("of"))])
+    yield from (f"dropped {count} {reason}" for reason, count in dropped.items())
+    axes = str(_mapping(report.get("orientation")).get("axes"))
+    if _AXES.fullmatch(axes):
+        yield f"axes {axes}"
     affine = report.get("affine_ijk_to_lps_mm")
     if isinstance(affine, list) and len(affine) == 4 and all(isinstance(row, list) for row in affine):
-        yield from _line("affine_ijk_to_lps_mm", [value for row in affine for value in row])
+        yield from _line("affine_ijk_to_lps_mm", [("", value) for row in affine for value in row])
     frame = report.get("frame_of_reference_hash")
     if isinstance(frame, str) and _HASH.fullmatch(frame):
         yield f"frame_of_reference {frame}"
@@ -90,17 +88,18 @@ def _faults(report: Mapping[str, Any]) -> Iterator[str]:
             yield f"warning and {len(warnings) - WARNINGS_WRITTEN} more, in the report"
 
 
-def _line(name: str, values: Iterable[Any]) -> Iterator[str]:
-    """One line of words and numbers; none where one of them is not known."""
-    words = []
-    for value in values:
-        if isinstance(value, str):
-            words.append(value)
-        elif isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value):
-            words.append(f"{value:.9g}")
-        else:
+def _mapping(value: Any) -> Mapping[Any, Any]:
+    return value if isinstance(value, Mapping) else {}
+
+
+def _line(name: str, pairs: Iterable[tuple[str, Any]]) -> Iterator[str]:
+    """One line of numbers, each with the word before it; none where one of them is no number."""
+    words = [name]
+    for word, value in pairs:
+        if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
             return
-    yield " ".join((name, *words))
+        words += [word] * bool(word) + [f"{value:.9g}"]
+    yield " ".join(words)
 
 
 def _plain(text: str) -> str:

@@ -1,0 +1,131 @@
+"""The certificate of a series in words, for ``clrecon info``."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+__all__ = ["describe_certificate"]
+
+_DIRECTIONS = {"L": "left", "R": "right", "P": "back", "A": "front", "S": "head", "I": "feet"}
+_FIRST = {"HF": "head first", "FF": "feet first"}
+_LYING = {"S": "supine", "P": "prone", "DR": "on the right side", "DL": "on the left side"}
+_RUNS_SHOWN = 6
+_OBLIQUE_DEG = 0.05
+_SAME = 0.01
+"""Lengths that differ by less than this share of a gap are one to the reader."""
+_FINEST_MM = 0.001
+
+
+def describe_certificate(certificate: dict[str, Any] | None) -> list[tuple[str, str]]:
+    """Words for what is known of a series: (what, text) pairs, the gates last; none without a certificate."""
+    if certificate is None:
+        return []
+    return [*_describe_places(certificate), *_describe_values(certificate), *_describe_gates(certificate["gates"])]
+
+
+def _describe_places(of: dict[str, Any]) -> Iterator[tuple[str, str]]:
+    size = " x ".join(str(count) for count in of["shape_ijk"])
+    if of["spacing_mm"] is None:
+        yield "voxels", f"{size}; their places are refused"
+    else:
+        box = "" if of["extent_mm"] is None else f"; the box is {_times(of['extent_mm'], '.1f')} mm"
+        yield "voxels", f"{size} of {_times(of['spacing_mm'], '.4g')} mm{box}"
+    if of["orientation"] is not None:
+        yield "directions", _describe_directions(of["orientation"], of["patient_position"])
+    if of["grid_residual_max_mm"] is not None:
+        yield "positions", _describe_residual(of)
+        yield "gaps", _describe_gaps(of)
+    if of["thickness"] is not None:
+        yield "thickness", _describe_thickness(of["thickness"], of["gap_mm"]["median"])
+    if of["tilt_deg"] is not None:
+        tilted = of["tilt_deg"] > _OBLIQUE_DEG
+        yield "tilt", f"{of['tilt_deg']:.2f} degrees, kept exactly as a shear" if tilted else "none"
+    reasons = "".join(f", {count} dropped ({reason})" for reason, count in of["dropped"].items())
+    missing = f", {of['missing_slices']} missing" if of["missing_slices"] else ""
+    yield "slices", f"{of['slices']} used{reasons or ', none dropped'}{missing}"
+
+
+def _describe_directions(orientation: dict[str, Any], position: str | None) -> str:
+    row, column, normal = (_DIRECTIONS[letter] for letter in orientation["axes"])
+    text = f"rows run to the {row}, columns to the {column}, slices to the {normal}"
+    if orientation["off_axis_deg"] > _OBLIQUE_DEG:
+        text += f", the slices {orientation['off_axis_deg']:.1f} degrees off that axis"
+    if not orientation["right_handed"]:
+        text += "; left-handed"
+    if position:
+        words = [_FIRST.get(position[:2], ""), _LYING.get(position[2:], "")]
+        text += f"; {', '.join(words)} ({position})" if all(words) else f"; patient position {position}"
+    return text
+
+
+def _describe_residual(of: dict[str, Any]) -> str:
+    largest, rms, allowed = (of[f"grid_{name}_mm"] for name in ("residual_max", "residual_rms", "tolerance"))
+    if of["uneven"]:
+        far = f"up to {largest:.3g} mm off even steps (rms {rms:.3g}, allowed {allowed:.3g})"
+        return f"uneven, {far}: each slice has its own place"
+    return f"within {max(largest, _FINEST_MM):.3g} mm of even steps (allowed {allowed:.3g})"
+
+
+def _describe_gaps(of: dict[str, Any]) -> str:
+    low, high, usual = (of["gap_mm"][name] for name in ("min", "max", "median"))
+    stated = of["stated_gap_mm"]
+    said = "" if stated is None else f"; SpacingBetweenSlices says {stated:g}"
+    runs = of["gap_runs"]
+    if not high:
+        return f"none, all slices are at one place{said}"
+    if runs and len(runs) <= _RUNS_SHOWN:
+        return ", then ".join(f"{run['count']} of {run['gap_mm']:.4g}" for run in runs) + f" mm{said}"
+    if high - low > _SAME * usual:
+        return f"{low:.4g} to {high:.4g} mm, usually {usual:.4g}{said}"
+    return f"{usual:.4g} mm{said}"
+
+
+def _describe_thickness(thickness: dict[str, Any], usual_gap: float) -> str:
+    low, high = thickness["min_mm"], thickness["max_mm"]
+    text = f"{low:g} mm" if low == high else f"{low:g} to {high:g} mm"
+    least, most, overlap = (thickness["overlap_mm"][name] for name in ("min", "max", "median"))
+    if most - least > _SAME * usual_gap:
+        return f"{text}: between neighbouring slices from {_overlap(least)} to {_overlap(most)}"
+    if abs(overlap) <= _SAME * usual_gap:
+        return f"{text}: neighbouring slices touch"
+    percent = thickness["overlap_percent"]
+    share = "" if percent is None else f" ({abs(percent):.0f} % of the gap)"
+    return f"{text}: {_overlap(overlap)} between neighbouring slices{share}"
+
+
+def _overlap(length: float) -> str:
+    return f"{length:.3g} mm overlap" if length >= 0.0 else f"{-length:.3g} mm not measured"
+
+
+def _describe_values(of: dict[str, Any]) -> Iterator[tuple[str, str]]:
+    rescale = of["rescale"]
+    slope, intercept = (_span(rescale[name]) for name in ("slope", "intercept"))
+    span = "" if of["hu_range"] is None else f"{of['hu_range'][0]:g} to {of['hu_range'][1]:g}, "
+    kind = rescale["type"] or "HU (the type is not stated)"
+    yield "values", f"{span}{kind}; slope {slope}, intercept {intercept}"
+    if of["padding_share"] is None:
+        yield "padding", "not looked at (--pixels reads it)"
+    else:
+        yield "padding", f"{100.0 * of['padding_share']:.1f} % of the voxels hold no measurement"
+    yield "stored", "; ".join(of["transfer_syntax_names"]) + "; with lossy compression" * of["lossy"]
+    frame = of["frame_of_reference_hash"]
+    yield "frame", f"{frame} (hash of the FrameOfReferenceUID)" if frame else "no FrameOfReferenceUID"
+
+
+def _describe_gates(gates: list[dict[str, Any]]) -> Iterator[tuple[str, str]]:
+    kept = sum(gate["ok"] is True for gate in gates)
+    failed = [gate for gate in gates if gate["ok"] is False]
+    unknown = [gate["name"] for gate in gates if gate["ok"] is None]
+    text = f"{kept} kept, {len(failed)} failed"
+    yield "gates", text + (f", not measured: {', '.join(unknown)}" if unknown else "")
+    for gate in failed:
+        yield "FAILED", f"{gate['name']}: {gate['text']}"
+
+
+def _times(lengths: list[float], form: str) -> str:
+    return " x ".join(f"{length:{form}}" for length in lengths)
+
+
+def _span(ends: list[float]) -> str:
+    return f"{ends[0]:g}" if ends[0] == ends[1] else f"{ends[0]:g} to {ends[1]:g}"

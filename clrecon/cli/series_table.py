@@ -1,0 +1,256 @@
+"""The listing of ``clrecon info`` on the screen: a table as wide as the terminal allows, what is wrong beneath it.
+
+Where stdout is no terminal the text is plain and as wide as it needs to be, so that nothing is cut or folded that a
+script looks for.  Texts from files are put into the table as plain text: nothing in them is markup or a terminal
+sequence.
+"""
+
+from __future__ import annotations
+
+import io
+import os
+import shutil
+import sys
+import textwrap
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from clrecon.cli.console import is_terminal, printable
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+__all__ = ["render_listing"]
+
+_UNLIMITED = 100_000
+_FOLDED_WIDTH = 20
+"""The description is folded to this before a column is left out."""
+_BETWEEN = 2
+_NARROWEST = 20
+
+
+@dataclass(frozen=True)
+class _Column:
+    """A column: its heading, the text of each row, and how readily it is left out (0: never)."""
+
+    heading: str
+    cells: list[str]
+    left_out: int = 0
+    right: bool = False
+    folds: bool = False
+
+    @property
+    def width(self) -> int:
+        """Characters that it needs; cells that fold need no more than `_FOLDED_WIDTH`."""
+        from rich.cells import cell_len
+
+        longest = max((cell_len(cell) for cell in self.cells), default=0)
+        return max(cell_len(self.heading), min(longest, _FOLDED_WIDTH) if self.folds else longest)
+
+
+class _Sink(io.StringIO):
+    """Where rich writes to: text in the encoding of stdout, which decides how lines are drawn."""
+
+    @property
+    def encoding(self) -> str:  # type: ignore[override]
+        return getattr(sys.stdout, "encoding", None) or "ascii"
+
+
+def render_listing(listing: dict[str, Any], certificate: Sequence[tuple[str, str]]) -> list[str]:
+    """Lay out a listing.
+
+    Parameters
+    ----------
+    listing : dict
+        See `clrecon.pipeline.info.InputListing`.
+    certificate : sequence of (str, str)
+        Words for the series that was judged, see `clrecon.cli.certificate`.
+
+    Returns
+    -------
+    list of str
+        Lines for stdout; with styles only where that is a terminal and ``NO_COLOR`` is not set.
+    """
+    terminal = is_terminal(sys.stdout)
+    width = max(shutil.get_terminal_size().columns, _NARROWEST) if terminal else _UNLIMITED
+    entries = _sort_by_patient(listing["series"])
+    lines, left_out = _render_table(entries, listing["chosen"], width, terminal and not os.environ.get("NO_COLOR"))
+    if left_out:
+        lines += _wrap(f"({', '.join(left_out)} left out: a wider window or --json shows them)", width, "")
+    for what, place in (("problem", "problems"), ("warning", "warnings")):
+        for numbers, text in _collect_texts(entries, place):
+            lines += _wrap(f"series {numbers}: {what}: {printable(text)}", width, "    ")
+    if certificate:
+        judged = "as clrecon mesh would read it" if listing["chosen"] else "refused"
+        lines += ["", f"series {listing['certificate']['series']['number']}, {judged}"]
+        lines += [
+            line for what, text in certificate for line in _wrap(f"  {what:<11}{printable(text)}", width, " " * 13)
+        ]
+    return lines
+
+
+def _sort_by_patient(entries: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """The series of one patient and of one study stand together, in the order of their first numbers."""
+    patients = _first_places(entries, "patient_hash")
+    studies = _first_places(entries, "study_hash")
+    return sorted(
+        entries,
+        key=lambda e: (patients.get(e.get("patient_hash"), 0), studies.get(e.get("study_hash"), 0), e["number"]),
+    )
+
+
+def _first_places(entries: Sequence[dict[str, Any]], key: str) -> dict[Any, int]:
+    return {value: place for place, value in enumerate(dict.fromkeys(entry.get(key) for entry in entries))}
+
+
+def _letter(place: int) -> str:
+    """A, B, ... Z, AA, AB, ..."""
+    letters = ""
+    while place >= 0:
+        letters, place = chr(ord("A") + place % 26) + letters, place // 26 - 1
+    return letters
+
+
+def _columns(entries: Sequence[dict[str, Any]], chosen: int | None) -> Iterator[_Column]:
+    """All columns that say something, from left to right."""
+    yield _Column("", ["*" if entry["number"] == chosen else " " for entry in entries])
+    yield _Column("series", [str(entry["number"]) for entry in entries], right=True)
+    patients, studies = _first_places(entries, "patient_hash"), _first_places(entries, "study_hash")
+    if len(patients) > 1:
+        yield _Column("patient", [_letter(patients[entry.get("patient_hash")]) for entry in entries])
+    if len(studies) > 1:
+        yield _Column("study", [str(studies[entry.get("study_hash")] + 1) for entry in entries], right=True)
+    yield _Column("hash", [printable(entry["uid_hash"] or "-") for entry in entries], left_out=3)
+    yield _Column("kind", [_kind(entry) for entry in entries])
+    yield _Column("slices", [str(entry["slices"]) for entry in entries], right=True)
+    phases = [_count(entry.get("phases")) for entry in entries]
+    if any(count > 1 for count in phases):
+        yield _Column("phases", [str(count) if count > 1 else "-" for count in phases], right=True)
+    matrix = [_times(entry["shape_ijk"] and entry["shape_ijk"][:2], "d") for entry in entries]
+    yield _Column("matrix", matrix, left_out=5)
+    yield _Column("spacing mm", [_times(entry["spacing_mm"], ".4g") for entry in entries])
+    yield _Column("extent mm", [_times(entry["extent_mm"], ".0f") for entry in entries], left_out=1)
+    thickness = [entry["slice_thickness_mm"] for entry in entries]
+    yield _Column("thick", ["-" if t is None else f"{t:.4g}" for t in thickness], left_out=2, right=True)
+    tilts = [entry["tilt_deg"] for entry in entries]
+    yield _Column("tilt", ["-" if tilt is None else f"{tilt:.2f}" for tilt in tilts], left_out=4, right=True)
+    yield _Column("description", [printable(entry["description"] or "") for entry in entries], folds=True)
+
+
+def _kind(entry: dict[str, Any]) -> str:
+    """The modality, and what it is where it is no stack of slices."""
+    modality = printable(entry["modality"])
+    return modality if entry["kind"] in ("stack", "other") else f"{modality} {entry['kind']}"
+
+
+def _count(phases: Any) -> int:
+    return phases if isinstance(phases, int) else len(phases or ())
+
+
+def _times(lengths: Sequence[float] | None, form: str) -> str:
+    return " x ".join(f"{length:{form}}" for length in lengths) if lengths else "-"
+
+
+def _render_table(
+    entries: Sequence[dict[str, Any]], chosen: int | None, width: int, styled: bool
+) -> tuple[list[str], list[str]]:
+    """The lines of the table, and the headings of the columns that did not fit; a list where no table fits."""
+    every = list(_columns(entries, chosen))
+    columns = _choose_columns(every, width)
+    if columns is None:
+        return _render_list(every, width), []
+    left_out = [column.heading for column in every if column not in columns]
+    from rich.console import Console, detect_legacy_windows
+
+    styled = styled and not detect_legacy_windows()
+    console = Console(
+        file=_Sink(),
+        width=width,
+        color_system="standard" if styled else None,
+        force_terminal=styled,
+        legacy_windows=False,
+        highlight=False,
+        markup=False,
+        emoji=False,
+    )
+    with console.capture() as captured:
+        console.print(_make_table(columns, entries, chosen))
+    return [line.rstrip() for line in captured.get().splitlines()], left_out
+
+
+def _choose_columns(every: Sequence[_Column], width: int) -> list[_Column] | None:
+    """Those that fit, the dearest first; None where not even those fit that are never left out."""
+    kept = [column for column in every if not column.left_out]
+    free = width - sum(column.width for column in kept) - _BETWEEN * (len(kept) - 1)
+    if free < 0:
+        return None
+    for column in sorted(every, key=lambda column: -column.left_out):
+        if column.left_out and column.width + _BETWEEN <= free:
+            kept.append(column)
+            free -= column.width + _BETWEEN
+    return [column for column in every if column in kept]
+
+
+def _make_table(columns: Sequence[_Column], entries: Sequence[dict[str, Any]], chosen: int | None) -> Table:
+    from rich import box
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table(
+        box=box.SIMPLE_HEAD, show_edge=False, padding=(0, _BETWEEN - 1, 0, 0), pad_edge=False, header_style="bold"
+    )
+    for column in columns:
+        table.add_column(
+            Text(column.heading),
+            justify="right" if column.right else "left",
+            no_wrap=not column.folds,
+            overflow="fold",
+            min_width=column.width,
+        )
+    for row, entry in enumerate(entries):
+        following = entries[row + 1] if row + 1 < len(entries) else entry
+        table.add_row(
+            *(Text(column.cells[row]) for column in columns),
+            style="bold green" if entry["number"] == chosen else "dim" if entry["problems"] else "",
+            end_section=following.get("patient_hash") != entry.get("patient_hash"),
+        )
+    return table
+
+
+def _render_list(columns: Sequence[_Column], width: int) -> list[str]:
+    """All that the table would say, one line a fact."""
+    lines = []
+    for row, mark in enumerate(columns[0].cells):
+        series, *facts = columns[1:]
+        lines.append(f"{mark} {series.heading} {series.cells[row]}")
+        for column in facts:
+            if column.cells[row] not in ("", "-"):
+                lines += _wrap(f"    {column.heading}: {column.cells[row]}", width, " " * 8)
+    return lines
+
+
+def _collect_texts(entries: Sequence[dict[str, Any]], place: str) -> Iterator[tuple[str, str]]:
+    """What is said of several series is said once: ``3, 5-9`` and the text."""
+    numbers: dict[str, list[int]] = {}
+    for entry in entries:
+        for text in entry[place]:
+            numbers.setdefault(str(text), []).append(entry["number"])
+    for text, found in numbers.items():
+        runs: list[list[int]] = []
+        for number in sorted(found):
+            if runs and number == runs[-1][-1] + 1:
+                runs[-1].append(number)
+            else:
+                runs.append([number])
+        yield ", ".join(f"{run[0]}-{run[-1]}" if len(run) > 1 else str(run[0]) for run in runs), text
+
+
+def _wrap(text: str, width: int, indent: str) -> list[str]:
+    return textwrap.wrap(
+        text,
+        width,
+        subsequent_indent=indent[: max(width - _NARROWEST, 0)],
+        drop_whitespace=True,
+        break_on_hyphens=False,
+    )

@@ -1,0 +1,264 @@
+"""``clrecon info``: what is listed, for people and for programs, and what --strict makes of it."""
+
+from __future__ import annotations
+
+import io
+import json
+import re
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from contract_tables import names_in
+from ct_files import PATIENT, SPACING, write_series
+from dicom_series import Plan, set_values
+from dicom_series import write_series as write_plan
+
+from clrecon.cli.certificate import describe_certificate
+from clrecon.cli.main import main
+from clrecon.cli.series_table import render_listing
+
+ANSI = re.compile(r"\x1b\[")
+
+
+class Terminal(io.StringIO):
+    encoding = "utf-8"
+
+    def isatty(self) -> bool:
+        return True
+
+
+@pytest.fixture
+def ct(tmp_path: Path) -> Path:
+    return write_series(tmp_path / "ct")
+
+
+@pytest.fixture
+def terminal(monkeypatch: pytest.MonkeyPatch) -> Any:
+    """Make stdout a terminal so many columns wide; gives it back."""
+
+    def make(columns: int) -> Terminal:
+        stream = Terminal()
+        monkeypatch.setattr(sys, "stdout", stream)
+        monkeypatch.setenv("COLUMNS", str(columns))
+        monkeypatch.setenv("TERM", "xterm")
+        monkeypatch.delenv("NO_COLOR", raising=False)
+        return stream
+
+    return make
+
+
+def entry(number: int, **changes: Any) -> dict[str, Any]:
+    return {
+        "number": number, "uid_hash": f"{number:016x}", "description": "", "modality": "CT", "kind": "stack",
+        "shape_ijk": [512, 512, 99], "spacing_mm": [0.9766, 0.9766, 4.25], "extent_mm": [500.0, 500.0, 421.0],
+        "slice_thickness_mm": 5.0, "tilt_deg": 0.0, "warnings": [], "problems": [], "slices": 99, **changes,
+    }  # fmt: skip
+
+
+def listing(*entries: dict[str, Any], chosen: int | None = 1) -> dict[str, Any]:
+    return {"series": list(entries), "chosen": chosen, "certificate": None}
+
+
+def test_json_is_the_contract(ct: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["info", str(ct), "--json"]) == 0
+    captured = capsys.readouterr()
+    found = json.loads(captured.out)
+    assert set(found) == names_in("clrecon info") == {"series", "chosen", "certificate"}
+    assert found["chosen"] == 1
+    (one,) = found["series"]
+    assert set(one) == names_in("clrecon info", "Of each series:")
+    assert (one["slices"], one["shape_ijk"], one["modality"], one["kind"]) == (17, [31, 25, 17], "CT", "stack")
+    assert one["spacing_mm"] == pytest.approx(SPACING)
+    assert set(found["certificate"]) == names_in("The certificate")
+    assert found["certificate"]["padding_share"] is None
+    assert captured.err == "" and PATIENT.split("^")[0] not in captured.out
+
+
+def test_pixels_are_read_on_request(ct: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["info", str(ct), "--json", "--pixels"]) == 0
+    certificate = json.loads(capsys.readouterr().out)["certificate"]
+    assert (certificate["padding_share"], certificate["hu_range"]) == (0.0, [-1000, 700])
+    assert main(["info", str(ct), "--pixels"]) == 0
+    assert "-1000 to 700, HU" in capsys.readouterr().out
+
+
+def test_the_table_marks_the_choice(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = write_series(tmp_path / "ct", number=1)
+    write_series(folder, np.full((6, 9, 9), -1000, np.int16), number=2)
+    for number in (3, 4, 6):
+        write_series(folder, np.full((3, 9, 9), 5, np.int16), number=number, modality="MR")
+    assert main(["info", str(folder)]) == 0
+    rows = capsys.readouterr().out.splitlines()
+    assert rows[0].split()[:4] == ["series", "hash", "kind", "slices"]
+    assert rows[2].split()[:2] == ["*", "1"] and rows[3].split()[0] == "2"
+    assert "31 x 25" in rows[2] and "0.8 x 1.1 x 1.5" in rows[2]
+    assert "series 3-5: problem: modality MR is not CT" in rows
+    assert "series 1, as clrecon mesh would read it" in rows
+    assert any(re.fullmatch(r"  slices +17 used, none dropped", row) for row in rows)
+
+
+def test_equal_series_name_the_way_out(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = write_series(tmp_path / "ct", number=1)
+    write_series(folder, number=2)
+    assert main(["info", str(folder), "--json"]) == 0
+    captured = capsys.readouterr()
+    found = json.loads(captured.out)
+    assert (found["chosen"], found["certificate"]) == (None, None)
+    assert "choose one with --series" in captured.err
+    assert main(["info", str(folder), "--series", "2", "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["chosen"] == found["certificate"]["series"]["number"] == 2
+    uid_hash = found["series"][1]["uid_hash"]
+    assert main(["info", str(folder), "--series", uid_hash, "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["chosen"] == 2
+    assert main(["info", str(folder), "--series", "7"]) == 3
+    assert "no series matches series='7'; there are [1: CT" in capsys.readouterr().err
+    assert main(["info", str(folder), "--strict"]) == 4
+    assert "choose one with --series" in capsys.readouterr().err
+
+
+def test_strict_holds_a_series_against_its_gates(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_plan(tmp_path / "good")
+    assert main(["info", str(tmp_path / "good"), "--strict"]) == 0
+    assert re.search(r"gates +\d+ kept, 0 failed, not measured: stated_gap, padding_share", capsys.readouterr().out)
+    write_plan(tmp_path / "lossy", change=set_values(LossyImageCompression="01", RescaleType="US"))
+    assert main(["info", str(tmp_path / "lossy")]) == 0
+    capsys.readouterr()
+    assert main(["info", str(tmp_path / "lossy"), "--strict"]) == 4
+    captured = capsys.readouterr()
+    assert "FAILED     lossless: slices with lossy compression: 7, none allowed" in captured.out
+    assert captured.err == (
+        "clrecon: error: series 1 fails 2 gates: gate hu_known failed: slices whose values are not known to be HU: 7, "
+        "none allowed; gate lossless failed: slices with lossy compression: 7, none allowed\n"
+    )
+    assert main(["info", str(tmp_path / "lossy"), "--strict", "--json", "-q"]) == 4
+    captured = capsys.readouterr()
+    assert json.loads(captured.out)["chosen"] == 1
+    assert captured.err.startswith("clrecon: error: series 1 fails 2 gates")
+
+
+def test_a_refused_series_has_its_certificate(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_plan(tmp_path / "hole", Plan(shape=(9, 5, 6), leave_out=(4,)))
+    assert main(["info", str(tmp_path / "hole")]) == 4
+    captured = capsys.readouterr()
+    assert "series 1, refused" in captured.out
+    assert "FAILED     missing_slices: slices missing in between: 1, none allowed" in captured.out
+    assert "series 1 cannot be used: 1 slice missing" in captured.err
+
+
+def test_quiet_prints_nothing(ct: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["info", str(ct), "-q"]) == 0
+    assert capsys.readouterr() == ("", "")
+
+
+def test_a_file_gets_plain_text_of_any_width(ct: Path, capsys: pytest.CaptureFixture[str], monkeypatch: Any) -> None:
+    monkeypatch.setenv("COLUMNS", "40")
+    monkeypatch.setenv("FORCE_COLOR", "1")
+    lines = render_listing(listing(entry(1, description="long " * 60, warnings=["word " * 60])), [])
+    assert not ANSI.search("".join(lines))
+    assert any("long " * 59 in line for line in lines) and any("word " * 59 in line for line in lines)
+    assert main(["info", str(ct)]) == 0
+    captured = capsys.readouterr()
+    assert not ANSI.search(captured.out) and "left out" not in captured.out
+
+
+@pytest.mark.parametrize("columns", [200, 120, 80, 60, 30])
+def test_a_terminal_gets_lines_that_fit(terminal: Any, columns: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    terminal(columns)
+    entries = [entry(1, description="LUMBAR SPINE 0.8 BONE"), entry(12, warnings=["gantry tilt " * 9], tilt_deg=12.5)]
+    words = describe_certificate(None)
+    assert any(ANSI.search(line) for line in render_listing(listing(*entries), words)) == (columns >= 80)
+    monkeypatch.setenv("NO_COLOR", "1")
+    lines = render_listing(listing(*entries), words)
+    assert not ANSI.search("".join(lines))
+    assert max(map(len, lines)) <= columns
+    text = " ".join(" ".join(lines).split())
+    assert all(word in text for word in ("LUMBAR", "SPINE", "0.9766 x 0.9766 x 4.25", "512 x 512", "gantry"))
+    assert ("tilt" in lines[0]) == (columns >= 120)
+    assert ("left out: a wider window" in text) == (columns in (120, 80))
+
+
+def test_a_hostile_description_is_shown_as_it_is(terminal: Any) -> None:
+    hostile = "[bold red]x[/] :smile: \x1b[31mred\x07\u202e"
+    (_, _, row, *_) = render_listing(listing(entry(1, description=hostile, modality="[i]")), [])
+    assert "[bold red]x[/] :smile: \\x1b[31mred\\x07\\u202e" in row and "[i]" in row
+    terminal(200)
+    shown = "".join(render_listing(listing(entry(1, description=hostile, problems=[hostile])), []))
+    assert "\x1b[31mred" not in shown and "\x07" not in shown and "\u202e" not in shown
+
+
+def test_a_plain_encoding_draws_no_lines_that_it_lacks(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "stdout", io.TextIOWrapper(io.BytesIO(), encoding="ascii"))
+    assert "\n".join(render_listing(listing(entry(1)), [])).isascii()
+
+
+def test_patients_and_studies_stand_apart() -> None:
+    entries = [
+        entry(1, patient_hash="x", study_hash="s"),
+        entry(2, patient_hash="y", study_hash="t"),
+        entry(3, patient_hash="x", study_hash="u", phases=["10 %", "60 %"]),
+    ]
+    lines = render_listing(listing(*entries), [])
+    assert lines[0].split()[:3] == ["series", "patient", "study"] and "phases" in lines[0]
+    rows = [line.removeprefix("*").split()[:3] for line in lines if re.match(r"[* ] +\d", line)]
+    assert rows == [["1", "A", "1"], ["3", "A", "2"], ["2", "B", "3"]]
+    assert "x" not in "".join(row[1] for row in rows)
+
+
+def test_thousands_of_series_take_one_line_each() -> None:
+    entries = [entry(number, modality="MR", problems=["modality MR is not CT"]) for number in range(1, 2001)]
+    lines = render_listing(listing(*entries, chosen=None), [])
+    assert len(lines) == 2 + 2000 + 1
+    assert lines[-1] == "series 1-2000: problem: modality MR is not CT"
+
+
+def test_the_certificate_in_words(tmp_path: Path) -> None:
+    from clrecon import list_series
+
+    write_plan(tmp_path, Plan(tilt_deg=12, angles=(3, 4, -5)), set_values(PatientPosition="FFP"))
+    words = dict(describe_certificate(list_series(tmp_path, pixels=True).certificate))
+    assert words["voxels"] == "6 x 5 x 7 of 0.5 x 0.7 x 1.278 mm; the box is 3.0 x 3.5 x 8.8 mm"
+    assert words["directions"] == (
+        "rows run to the left, columns to the back, slices to the head, the slices 5.0 degrees off that axis; "
+        "feet first, prone (FFP)"
+    )
+    assert words["positions"] == "within 0.001 mm of even steps (allowed 0.0125)"
+    assert words["gaps"] == "1.25 mm"
+    assert words["thickness"] == "5 mm: 3.75 mm overlap between neighbouring slices (300 % of the gap)"
+    assert words["tilt"] == "12.00 degrees, kept exactly as a shear"
+    assert words["padding"] == "0.0 % of the voxels hold no measurement"
+    assert words["values"] == "-124 to 145, HU; slope 1, intercept -1024"
+    assert words["stored"] == "Explicit VR Little Endian"
+    assert words["gates"] == "11 kept, 0 failed, not measured: stated_gap"
+    write_plan(tmp_path / "uneven", Plan(offsets={3: 0.4}), set_values(SliceThickness=1))
+    words = dict(describe_certificate(list_series(tmp_path / "uneven").certificate))
+    assert words["gaps"] == "2 of 1.25, then 1 of 1.65, then 1 of 0.85, then 2 of 1.25 mm"
+    assert words["thickness"] == "1 mm: between neighbouring slices from 0.65 mm not measured to 0.15 mm overlap"
+    assert words["positions"].startswith("uneven, up to 0.34")
+
+
+def test_mesh_strict_counts_the_gates_of_the_volume(
+    tmp_path: Path, device: Any, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = write_series(tmp_path / "ct")
+    arguments = ["mesh", str(folder), "-o", str(tmp_path / "a.ply"), "--hu", "100", "--device", str(device.index)]
+    assert main([*arguments, "--strict"]) == 0
+    assert b"comment CERTIFICATE gates 11 passed 0 failed" in (tmp_path / "a.ply").read_bytes()
+    import pydicom
+
+    for path in folder.iterdir():
+        ds = pydicom.dcmread(path)
+        ds.LossyImageCompression = "01"
+        ds.save_as(path)
+    capsys.readouterr()
+    assert main([*arguments, "--strict", "-q"]) == 8
+    assert capsys.readouterr().err.startswith("clrecon: error: volume: gate lossless failed: slices with lossy")
+    assert main([*arguments, "--json"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert [gate["name"] for gate in report["volume"]["gates"] if gate["ok"] is False] == ["lossless"]
+    assert any("lossy compression" in text for text in report["warnings"])
+    assert set(report["volume"]) == names_in("The certificate") - {"warnings"}
+    assert b"comment CERTIFICATE gate_failed lossless: slices with lossy" in (tmp_path / "a.ply").read_bytes()

@@ -1,0 +1,170 @@
+"""The certificate of the volume stands in the mesh files, one fact a line, and nothing else of its report does."""
+
+from __future__ import annotations
+
+import json
+import struct
+import zipfile
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+import sample_meshes as samples
+
+from clrecon import Mesh
+from clrecon.mesh.writers.certificate import LINE_LENGTH, WARNINGS_WRITTEN, certificate_lines
+
+REPORT = {
+    "series": {"number": 3, "uid_hash": "0123456789abcdef", "modality": "CT"},
+    "description": "SECRET",
+    "slices": 27,
+    "missing_slices": 1,
+    "dropped": {"identical duplicate": 4, "other phase": 2},
+    "affine_ijk_to_lps_mm": [[0.5, 0, 0, -12.5], [0, 0.7, 0, 31.25], [0, 0, 1.25, -400], [0, 0, 0, 1]],
+    "orientation": {"axes": "LPS"},
+    "tilt_deg": 18.5,
+    "grid_residual_max_mm": 12.4751234567,
+    "grid_residual_rms_mm": 6.47,
+    "grid_tolerance_mm": 0.04,
+    "gap_mm": {"min": 1.081, "max": 6.999, "median": 4.002},
+    "gap_runs": [{"count": 13, "gap_mm": 4.002}, {"count": 1, "gap_mm": 1.081}],
+    "slice_thickness_mm": 4.0,
+    "thickness": {"overlap_mm": {"min": -0.00193, "max": 4.42}},
+    "padding_share": 0.2127,
+    "frame_of_reference_hash": "ee740dfa4069b59a",
+    "gates": [
+        {"name": "usable", "ok": True, "text": "fine"},
+        {"name": "grid_residual", "ok": False, "text": "12.5 mm, at most 0.04"},
+        {"name": "padding_share", "ok": None, "text": "not read"},
+    ],
+    "warnings": ["gantry tilt 18.50 degrees: kept exactly, as a shear", "4 < 5 & so on"],
+}
+LINES = [
+    "grid_residual_max_mm 12.4751235",
+    "grid_residual_rms_mm 6.47",
+    "grid_tolerance_mm 0.04",
+    "tilt_deg 18.5",
+    "slice_thickness_mm 4",
+    "padding_share 0.2127",
+    "gap_mm min 1.081 max 6.999 median 4.002",
+    "gap_runs 13 x 4.002 1 x 1.081",
+    "slice_overlap_mm min -0.00193 max 4.42",
+    "slices used 27 dropped 6 missing 1",
+    "dropped 4 identical duplicate",
+    "dropped 2 other phase",
+    "axes LPS",
+    "affine_ijk_to_lps_mm 0.5 0 0 -12.5 0 0.7 0 31.25 0 0 1.25 -400 0 0 0 1",
+    "frame_of_reference ee740dfa4069b59a",
+    "gates 1 passed 1 failed",
+    "gate_failed grid_residual: 12.5 mm, at most 0.04",
+    "warning gantry tilt 18.50 degrees: kept exactly, as a shear",
+    "warning 4 < 5 & so on",
+]
+
+
+@pytest.fixture
+def mesh() -> Mesh:
+    vertices, triangles = samples.box()
+    return Mesh(vertices, triangles, report={"iso_value_hu": 226.0, "certificate": REPORT})
+
+
+def test_the_lines():
+    assert list(certificate_lines(REPORT)) == LINES
+
+
+def test_ply_and_obj_comments(mesh, tmp_path):
+    mesh.save(tmp_path / "box.ply", "ras")
+    header = (tmp_path / "box.ply").read_bytes().split(b"end_header\n")[0].decode("ascii").splitlines()
+    assert [line for line in header if "CERTIFICATE" in line] == [f"comment CERTIFICATE {line}" for line in LINES]
+    assert header[2:4] == ["comment SPACE=RAS", "comment UNIT=mm"]
+    mesh.save(tmp_path / "box.obj")
+    lines = (tmp_path / "box.obj").read_text("ascii").splitlines()
+    assert [line for line in lines if "CERTIFICATE" in line] == [f"# CERTIFICATE {line}" for line in LINES]
+
+
+def test_vtp_field_array(mesh, tmp_path):
+    pyvista = pytest.importorskip("pyvista")
+    mesh.save(tmp_path / "box.vtp")
+    fields = pyvista.read(tmp_path / "box.vtp").field_data
+    assert list(fields["CERTIFICATE"]) == LINES
+    assert list(fields["SPACE"]) == ["LPS"]
+
+
+def test_glb_extras_and_3mf_description(mesh, tmp_path):
+    mesh.save(tmp_path / "box.glb")
+    content = (tmp_path / "box.glb").read_bytes()
+    document = json.loads(content[20 : 20 + struct.unpack("<I", content[12:16])[0]])
+    assert document["asset"]["extras"]["certificate"] == LINES
+    mesh.save(tmp_path / "box.3mf")
+    with zipfile.ZipFile(tmp_path / "box.3mf") as package:
+        root = ElementTree.fromstring(package.read("3D/3dmodel.model"))
+    (text,) = [each.text for each in root if each.get("name") == "Description"]
+    assert text.splitlines()[0] == "SPACE=LPS UNIT=mm ISO_VALUE_HU=226"
+    assert text.splitlines()[1:] == [f"CERTIFICATE {line}" for line in LINES]
+
+
+@pytest.mark.parametrize("extension", [".ply", ".obj", ".glb", ".3mf"])
+def test_another_library_still_reads_the_file(mesh, extension, tmp_path):
+    trimesh = pytest.importorskip("trimesh")
+    mesh.save(tmp_path / f"box{extension}")
+    read = trimesh.load_scene(tmp_path / f"box{extension}", process=False).to_mesh()
+    assert (len(read.vertices), len(read.faces)) == (mesh.vertex_count, mesh.triangle_count)
+
+
+def test_vtk_still_reads_ply(mesh, tmp_path):
+    pyvista = pytest.importorskip("pyvista")
+    mesh.save(tmp_path / "box.ply")
+    assert pyvista.read(tmp_path / "box.ply").n_cells == mesh.triangle_count
+
+
+@pytest.mark.parametrize("extension", [".stl", ".ply", ".obj", ".glb", ".3mf", ".vtp"])
+def test_nothing_else_of_the_report_gets_out(mesh, extension, tmp_path):
+    path = tmp_path / f"box{extension}"
+    mesh.save(path)
+    content = path.read_bytes()
+    if extension == ".3mf":
+        with zipfile.ZipFile(path) as package:
+            content += b"".join(package.read(name) for name in package.namelist())
+    assert b"SECRET" not in content and b"0123456789abcdef" not in content
+
+
+@pytest.mark.parametrize(
+    "report",
+    [
+        {},
+        {"warnings": "no list", "gap_mm": 3, "gates": {}, "dropped": [], "orientation": [], "thickness": 5},
+        {
+            "tilt_deg": float("nan"),
+            "grid_residual_max_mm": "0.1\nelement vertex 0",
+            "slices": True,
+            "dropped": {},
+            "gates": 1,
+        },
+        {"frame_of_reference_hash": "1.2.840.113619.2.5", "orientation": {"axes": "DOE"}, "affine_ijk_to_lps_mm": [1]},
+        {"gap_mm": {"min": 1, "max": None, "median": 2}, "gap_runs": [{"count": 1}], "hu_range": [1, 2]},
+    ],
+)
+def test_what_is_not_known_has_no_line(report):
+    assert certificate_lines(report) == ()
+
+
+def test_texts_become_one_plain_line(tmp_path):
+    hostile = ["SPACE=RAS", "line\nend_header\r\nx", "gr\xf6\xdfe \u202e \x1b[31m", "x" * 1000, *["more"] * 30]
+    lines = certificate_lines({"warnings": hostile})
+    assert len(lines) == WARNINGS_WRITTEN + 1 and lines[-1] == "warning and 14 more, in the report"
+    assert lines[0] == "warning SPACE:RAS"
+    assert lines[1] == "warning line\\x0aend_header\\x0d\\x0ax"
+    assert all(line.isascii() and line.isprintable() and len(line) <= LINE_LENGTH for line in lines)
+    mesh = Mesh(*samples.box(), report={"certificate": {"warnings": hostile}})
+    for extension in (".ply", ".obj", ".vtp", ".glb", ".3mf"):
+        assert mesh.save(tmp_path / f"box{extension}") > 0  # every writer reads its file back
+
+
+def test_a_surface_takes_the_certificate_of_its_volume(device):
+    from clrecon import Volume, extract_isosurface
+
+    voxels = np.zeros((6, 6, 6), np.int16)
+    voxels[2:4, 2:4, 2:4] = 500
+    report = {"warnings": ["one"], "tilt_deg": 3.0}
+    mesh = extract_isosurface(Volume(voxels, np.eye(4), report), 250, device=device)
+    assert certificate_lines(mesh.report["certificate"]) == ("tilt_deg 3", "warning one")
