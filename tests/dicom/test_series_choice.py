@@ -319,7 +319,7 @@ def test_ct_small_of_pydicom():
         read_volume(get_testdata_file("CT_small.dcm"))
     entry = list_series(get_testdata_file("CT_small.dcm")).series[0]
     assert entry.shape_ijk == [128, 128, 1]
-    assert entry.affine_ijk_to_lps_mm is None and entry.gap_mm == {"min": None, "max": None}
+    assert entry.affine_ijk_to_lps_mm is None and entry.gap_mm == {"min": None, "max": None, "median": None}
 
 
 def test_progress_counts_files_and_slices(two_series):

@@ -98,7 +98,7 @@ def _line(name: str, pairs: Iterable[tuple[str, Any]]) -> Iterator[str]:
     for word, value in pairs:
         if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
             return
-        words += [word] * bool(word) + [f"{value:.9g}"]
+        words += [word] * bool(word) + [f"{round(value, 9) + 0.0:.9g}"]
     yield " ".join(words)
 
 
