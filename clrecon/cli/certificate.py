@@ -42,8 +42,11 @@ def _describe_places(of: dict[str, Any]) -> Iterator[tuple[str, str]]:
         tilted = of["tilt_deg"] > _OBLIQUE_DEG
         yield "tilt", f"{of['tilt_deg']:.2f} degrees, kept exactly as a shear" if tilted else "none"
     reasons = "".join(f", {count} dropped ({reason})" for reason, count in of["dropped"].items())
-    missing = f", {of['missing_slices']} missing" if of["missing_slices"] else ""
+    missing = f", {of['slices_missing']} missing" if of["slices_missing"] else ""
     yield "slices", f"{of['slices']} used{reasons or ', none dropped'}{missing}"
+    if of["phase"] is not None:
+        phase = of["phase"]
+        yield "phase", f"{phase['number']} of {phase['of']}, {phase['keyword']} {phase['value']}"
 
 
 def _describe_directions(orientation: dict[str, Any], position: str | None) -> str:

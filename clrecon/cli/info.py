@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 
 from clrecon.cli.console import Console
+from clrecon.cli.reading import add_reading, reading_settings
 
 __all__ = ["add_arguments", "run"]
 
@@ -19,14 +20,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("input", metavar="INPUT", help="DICOM folder or file")
     parser.add_argument(
-        "--series", metavar="S", help="number, UID, hash or description of the series to judge, as for clrecon mesh"
-    )
-    parser.add_argument(
-        "--pixels", action="store_true", help="read its pixels too: share of padding, range of HU, saturated metal"
+        "--pixels",
+        action="store_true",
+        help="read the pixels of the series marked * too: share of padding, range of HU, saturated metal",
     )
     parser.add_argument(
         "--strict", action="store_true", help="exit with 4 when it fails a gate, see docs/certificate.md"
     )
+    add_reading(parser)
 
 
 def run(options: argparse.Namespace, console: Console) -> int:
@@ -34,7 +35,11 @@ def run(options: argparse.Namespace, console: Console) -> int:
     from clrecon.pipeline.info import describe_input
 
     found = describe_input(
-        options.input, options.series, pixels=options.pixels, strict=options.strict, progress=console.progress
+        options.input,
+        **reading_settings(options),
+        pixels=options.pixels,
+        strict=options.strict,
+        progress=console.progress,
     )
     console.result(found.listing)
     if not options.json and not options.quiet:

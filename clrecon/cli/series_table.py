@@ -27,6 +27,7 @@ _UNLIMITED = 100_000
 _FOLDED_WIDTH = 20
 """The description is folded to this before a column is left out."""
 _BETWEEN = 2
+_LAST = float("inf")
 _NARROWEST = 20
 
 
@@ -91,42 +92,36 @@ def render_listing(listing: dict[str, Any], certificate: Sequence[tuple[str, str
 
 
 def _sort_by_patient(entries: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """The series of one patient and of one study stand together, in the order of their first numbers."""
-    patients = _first_places(entries, "patient_hash")
-    studies = _first_places(entries, "study_hash")
-    return sorted(
-        entries,
-        key=lambda e: (patients.get(e.get("patient_hash"), 0), studies.get(e.get("study_hash"), 0), e["number"]),
-    )
+    """Where there are several patients or studies, the series of each stand together; unknown ones come last."""
+    several = [key for key in ("patient", "study") if _are_several(entries, key)]
+    return sorted(entries, key=lambda entry: (*(entry[key] or _LAST for key in several), entry["number"]))
 
 
-def _first_places(entries: Sequence[dict[str, Any]], key: str) -> dict[Any, int]:
-    return {value: place for place, value in enumerate(dict.fromkeys(entry.get(key) for entry in entries))}
+def _are_several(entries: Sequence[dict[str, Any]], key: str) -> bool:
+    return len({entry[key] for entry in entries} - {None}) > 1
 
 
-def _letter(place: int) -> str:
-    """A, B, ... Z, AA, AB, ..."""
-    letters = ""
-    while place >= 0:
-        letters, place = chr(ord("A") + place % 26) + letters, place // 26 - 1
-    return letters
+def _letter(number: int | None) -> str:
+    """1, 2, 3, ... as A, B, ... Z, AA, AB, ..."""
+    letters, rest = "", number or 0
+    while rest > 0:
+        letters, rest = chr(ord("A") + (rest - 1) % 26) + letters, (rest - 1) // 26
+    return letters or "-"
 
 
 def _columns(entries: Sequence[dict[str, Any]], chosen: int | None) -> Iterator[_Column]:
     """All columns that say something, from left to right."""
     yield _Column("", ["*" if entry["number"] == chosen else " " for entry in entries])
     yield _Column("series", [str(entry["number"]) for entry in entries], right=True)
-    patients, studies = _first_places(entries, "patient_hash"), _first_places(entries, "study_hash")
-    if len(patients) > 1:
-        yield _Column("patient", [_letter(patients[entry.get("patient_hash")]) for entry in entries])
-    if len(studies) > 1:
-        yield _Column("study", [str(studies[entry.get("study_hash")] + 1) for entry in entries], right=True)
+    if _are_several(entries, "patient"):
+        yield _Column("patient", [_letter(entry["patient"]) for entry in entries])
+    if _are_several(entries, "study"):
+        yield _Column("study", [str(entry["study"] or "-") for entry in entries], right=True)
     yield _Column("hash", [printable(entry["uid_hash"] or "-") for entry in entries], left_out=3)
     yield _Column("kind", [_kind(entry) for entry in entries])
     yield _Column("slices", [str(entry["slices"]) for entry in entries], right=True)
-    phases = [_count(entry.get("phases")) for entry in entries]
-    if any(count > 1 for count in phases):
-        yield _Column("phases", [str(count) if count > 1 else "-" for count in phases], right=True)
+    if any(entry["phases"] for entry in entries):
+        yield _Column("phases", [str(len(entry["phases"]) or "-") for entry in entries], right=True)
     matrix = [_times(entry["shape_ijk"] and entry["shape_ijk"][:2], "d") for entry in entries]
     yield _Column("matrix", matrix, left_out=5)
     yield _Column("spacing mm", [_times(entry["spacing_mm"], ".4g") for entry in entries])
@@ -142,10 +137,6 @@ def _kind(entry: dict[str, Any]) -> str:
     """The modality, and what it is where it is no stack of slices."""
     modality = printable(entry["modality"])
     return modality if entry["kind"] in ("stack", "other") else f"{modality} {entry['kind']}"
-
-
-def _count(phases: Any) -> int:
-    return phases if isinstance(phases, int) else len(phases or ())
 
 
 def _times(lengths: Sequence[float] | None, form: str) -> str:
@@ -208,12 +199,13 @@ def _make_table(columns: Sequence[_Column], entries: Sequence[dict[str, Any]], c
             overflow="fold",
             min_width=column.width,
         )
+    parted = _are_several(entries, "patient")
     for row, entry in enumerate(entries):
         following = entries[row + 1] if row + 1 < len(entries) else entry
         table.add_row(
             *(Text(column.cells[row]) for column in columns),
             style="bold green" if entry["number"] == chosen else "dim" if entry["problems"] else "",
-            end_section=following.get("patient_hash") != entry.get("patient_hash"),
+            end_section=parted and following["patient"] != entry["patient"],
         )
     return table
 

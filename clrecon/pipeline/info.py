@@ -35,6 +35,8 @@ def describe_input(
     source: str | Path,
     series: str | None = None,
     *,
+    phase: int | None = None,
+    allow_gaps: bool = False,
     pixels: bool = False,
     strict: bool = False,
     progress: Progress | None = None,
@@ -48,6 +50,8 @@ def describe_input(
     series : str, optional
         Number, SeriesInstanceUID, its hash or description of the series to judge; None leaves the choice to the
         reader, and any usable series is enough then.
+    phase, allow_gaps
+        As in `clrecon.read_volume`, of the series that is judged.
     pixels : bool
         Read the pixels of the series that is judged.
     strict : bool
@@ -61,11 +65,12 @@ def describe_input(
     Raises
     ------
     NoDicomError, RefusedInputError, UsageError
-        Nothing to list, all files corrupt, pixels that cannot be read, or not exactly one series answers to `series`.
+        Nothing to list, all files corrupt, pixels that cannot be read, or not exactly one series answers to `series`,
+        or it has no such phase.
     """
     from clrecon.dicom import list_series
 
-    found = list_series(source, series, pixels=pixels, progress=progress)
+    found = list_series(source, series, phase=phase, allow_gaps=allow_gaps, pixels=pixels, progress=progress)
     entries = [entry.as_dict() for entry in found.series]
     listing: dict[str, Any] = {"series": entries, "chosen": found.chosen, "certificate": found.certificate}
     notes, problem = list(found.warnings), found.refusal

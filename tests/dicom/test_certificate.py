@@ -76,7 +76,7 @@ def test_an_oblique_tilted_series(tmp_path):
     assert found["orientation"]["off_axis_deg"] == pytest.approx(np.degrees(np.arccos(normal[2])))
     assert found["patient_position"] == "FFP"
     assert (found["uneven"], found["gap_runs"], found["slice_positions_mm"]) == (False, None, None)
-    assert (found["slices"], found["missing_slices"], found["dropped"]) == (7, 0, {})
+    assert (found["slices"], found["slices_missing"], found["dropped"]) == (7, 0, {})
     # Slices 5 mm thick every 1.25 mm share 3.75 mm, three times the gap.
     assert found["thickness"] == {
         "min_mm": 5.0, "max_mm": 5.0, "median_mm": 5.0, "overlap_percent": pytest.approx(300.0),
@@ -166,7 +166,7 @@ def test_the_gap_may_be_stated_along_the_table(tmp_path):
 def test_a_hole_and_a_doubled_slice_are_counted(tmp_path):
     write_series(tmp_path / "hole", Plan(shape=(9, 5, 6), leave_out=(4, 5)))
     hole = certify(tmp_path / "hole")
-    assert hole["missing_slices"] == 2 and failed(hole) >= {"usable", "missing_slices"}
+    assert hole["slices_missing"] == 2 and failed(hole) >= {"usable", "missing_slices"}
     write_series(tmp_path / "doubled")
     write_series(tmp_path / "doubled", Plan(shape=(1, 5, 6), name="again{}".format), set_values(RescaleIntercept=7))
     doubled = list_series(tmp_path / "doubled").certificate

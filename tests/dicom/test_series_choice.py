@@ -19,7 +19,7 @@ from clrecon.errors import NoDicomError, RefusedInputError, UsageError
 
 CONTRACT = (
     "number uid_hash description modality slices shape_ijk spacing_mm affine_ijk_to_lps_mm tilt_deg "
-    "grid_residual_max_mm gap_mm uneven warnings problems kind extent_mm slice_thickness_mm dropped"
+    "grid_residual_max_mm gap_mm uneven warnings problems"
 ).split()
 
 
