@@ -53,7 +53,7 @@ def _describe_directions(orientation: dict[str, Any], position: str | None) -> s
     row, column, normal = (_DIRECTIONS[letter] for letter in orientation["axes"])
     text = f"rows run to the {row}, columns to the {column}, slices to the {normal}"
     if orientation["off_axis_deg"] > _OBLIQUE_DEG:
-        text += f", the slices {orientation['off_axis_deg']:.1f} degrees off that axis"
+        text += f", their normal {orientation['off_axis_deg']:.1f} degrees off that axis"
     if not orientation["right_handed"]:
         text += "; left-handed"
     if position:
@@ -104,7 +104,7 @@ def _overlap(length: float) -> str:
 def _describe_values(of: dict[str, Any]) -> Iterator[tuple[str, str]]:
     rescale = of["rescale"]
     slope, intercept = (_span(rescale[name]) for name in ("slope", "intercept"))
-    span = "" if of["hu_range"] is None else f"{of['hu_range'][0]:g} to {of['hu_range'][1]:g}, "
+    span = "" if of["hu_range"] is None else f"{of['hu_range'][0]:g} to {of['hu_range'][1]:g} "
     kind = rescale["type"] or "HU (the type is not stated)"
     yield "values", f"{span}{kind}; slope {slope}, intercept {intercept}"
     if of["padding_share"] is None:

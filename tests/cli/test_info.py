@@ -5,13 +5,14 @@ from __future__ import annotations
 import io
 import json
 import re
+import shlex
 import sys
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from contract_tables import names_in
+from contract_tables import CONTRACT, names_in
 from ct_files import PATIENT, SPACING, write_series
 from dicom_series import Plan, set_values
 from dicom_series import write_series as write_plan
@@ -83,7 +84,7 @@ def test_pixels_are_read_on_request(ct: Path, capsys: pytest.CaptureFixture[str]
     certificate = json.loads(capsys.readouterr().out)["certificate"]
     assert (certificate["padding_share"], certificate["hu_range"]) == (0.0, [-1000, 700])
     assert main(["info", str(ct), "--pixels"]) == 0
-    assert "-1000 to 700, HU" in capsys.readouterr().out
+    assert "-1000 to 700 HU" in capsys.readouterr().out
 
 
 def test_the_table_marks_the_choice(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -223,7 +224,7 @@ def test_the_certificate_in_words(tmp_path: Path) -> None:
     words = dict(describe_certificate(list_series(tmp_path, pixels=True).certificate))
     assert words["voxels"] == "6 x 5 x 7 of 0.5 x 0.7 x 1.278 mm; the box is 3.0 x 3.5 x 8.8 mm"
     assert words["directions"] == (
-        "rows run to the left, columns to the back, slices to the head, the slices 5.0 degrees off that axis; "
+        "rows run to the left, columns to the back, slices to the head, their normal 5.0 degrees off that axis; "
         "feet first, prone (FFP)"
     )
     assert words["positions"] == "within 0.001 mm of even steps (allowed 0.0125)"
@@ -231,7 +232,7 @@ def test_the_certificate_in_words(tmp_path: Path) -> None:
     assert words["thickness"] == "5 mm: 3.75 mm overlap between neighbouring slices (300 % of the gap)"
     assert words["tilt"] == "12.00 degrees, kept exactly as a shear"
     assert words["padding"] == "0.0 % of the voxels hold no measurement"
-    assert words["values"] == "-124 to 145, HU; slope 1, intercept -1024"
+    assert words["values"] == "-124 to 145 HU; slope 1, intercept -1024"
     assert words["stored"] == "Explicit VR Little Endian"
     assert words["gates"] == "11 kept, 0 failed, not measured: stated_gap"
     write_plan(tmp_path / "uneven", Plan(offsets={3: 0.4}), set_values(SliceThickness=1))
@@ -239,6 +240,22 @@ def test_the_certificate_in_words(tmp_path: Path) -> None:
     assert words["gaps"] == "2 of 1.25, then 1 of 1.65, then 1 of 0.85, then 2 of 1.25 mm"
     assert words["thickness"] == "1 mm: between neighbouring slices from 0.65 mm not measured to 0.15 mm overlap"
     assert words["positions"].startswith("uneven, up to 0.34")
+
+
+def test_the_example_of_the_document(
+    tmp_path: Path, device: Any, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    page = (CONTRACT.parent / "certificate.md").read_text(encoding="utf-8").split("## An example")[1]
+    blocks = [block.splitlines() for block in re.findall(r"(?:^    .*\n)+", page, re.MULTILINE)]
+    commands, words, comments = ([line[4:] for line in block] for block in blocks)
+    monkeypatch.chdir(tmp_path)
+    for command in commands:
+        assert main(shlex.split(command)[1:]) == 0
+    printed = capsys.readouterr().out.splitlines()
+    assert printed[printed.index(words[0]) :] == words
+    assert main(["mesh", "example", "-o", "torus.ply", "--device", str(device.index)]) == 0
+    written = Path("torus.ply").read_bytes().split(b"end_header")[0].decode("ascii").splitlines()
+    assert len(comments) == 8 and [line for line in comments if line not in written] == []
 
 
 def test_mesh_strict_counts_the_gates_of_the_volume(

@@ -10,7 +10,10 @@ from pathlib import Path
 import pytest
 from house import ROOT
 
-DOCUMENTS = ["README.md", "CONTRIBUTING.md", "CHANGELOG.md", "docs/contract.md", "docs/iso_value.md"]
+DOCUMENTS = [
+    "README.md", "CONTRIBUTING.md", "CHANGELOG.md", "docs/contract.md", "docs/iso_value.md", "docs/geometry.md",
+    "docs/certificate.md",
+]  # fmt: skip
 LINK = re.compile(r"\[[^\]]*\]\(([^)#\s]+)[^)]*\)")
 QUOTED = re.compile(r"`((?:\.ci|cl|clrecon|docs|scripts|tests)/[\w./-]*|(?:setup\.cfg|\w+\.(?:md|toml)))`")
 COMMAND = re.compile(r"^ {4}(?:clrecon|python3 scripts/run\.py) +([^#\n]+)", re.MULTILINE)
@@ -63,10 +66,12 @@ def test_a_missing_file_is_found() -> None:
     assert find_missing_files(text, ROOT) == ["docs/contrakt.md", "scripts/gone.py"]
 
 
-def test_readme_commands_are_understood() -> None:
+def test_the_commands_of_documents_are_understood() -> None:
     commands = find_commands((ROOT / "README.md").read_text(encoding="utf-8"))
     assert {command[0] for command in commands} >= {"demo", "mesh", "info", "devices", "phantom", "selftest"}
-    for command in commands:
+    more = find_commands((ROOT / "docs" / "certificate.md").read_text(encoding="utf-8"))
+    assert [command[0] for command in more] == ["phantom", "info"]
+    for command in commands + more:
         parse_command(command)
 
 
