@@ -93,8 +93,11 @@ def render_listing(listing: dict[str, Any], certificate: Sequence[tuple[str, str
 
 def _sort_by_patient(entries: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     """Where there are several patients or studies, the series of each stand together; unknown ones come last."""
-    several = [key for key in ("patient", "study") if _are_several(entries, key)]
-    return sorted(entries, key=lambda entry: (*(entry[key] or _LAST for key in several), entry["number"]))
+    owners = {entry["study"]: entry["patient"] for entry in entries if entry["study"] and entry["patient"]}
+    # Objects that are no CT do not say whose they are, but a study has one patient.
+    known = [{**entry, "patient": entry["patient"] or owners.get(entry["study"])} for entry in entries]
+    several = [key for key in ("patient", "study") if _are_several(known, key)]
+    return sorted(known, key=lambda entry: (*(entry[key] or _LAST for key in several), entry["number"]))
 
 
 def _are_several(entries: Sequence[dict[str, Any]], key: str) -> bool:

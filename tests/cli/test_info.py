@@ -203,11 +203,12 @@ def test_patients_and_studies_stand_apart() -> None:
         entry(2, patient=28, study=2),
         entry(3, study=3, phases=[{"number": 1}, {"number": 2}]),
         entry(4, patient=None, study=None),
+        entry(5, patient=None, study=2, modality="SEG", kind="other"),
     ]
     lines = render_listing(listing(*entries), [])
     assert lines[0].split()[:3] == ["series", "patient", "study"] and "phases" in lines[0]
     rows = [line.removeprefix("*").split()[:3] for line in lines if re.match(r"[* ] +\d", line)]
-    assert rows == [["1", "A", "1"], ["3", "A", "3"], ["2", "AB", "2"], ["4", "-", "-"]]
+    assert rows == [["1", "A", "1"], ["3", "A", "3"], ["2", "AB", "2"], ["5", "AB", "2"], ["4", "-", "-"]]
 
 
 def test_thousands_of_series_take_one_line_each() -> None:
