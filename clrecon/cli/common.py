@@ -30,8 +30,9 @@ _NEGATIVE_LIST = re.compile(r"-[0-9.]+(?:[eE][+-]?[0-9]+)?,")
 
 EXIT_CODES = """\
 exit codes: 0 done; 1 unexpected error; 2 no usable DICOM or no surface; 3 wrong usage;
-            4 corrupt or refused input; 5 no device or device failure; 6 output cannot be
-            written; 8 partly done, or a gate failed with --strict; 130 interrupted"""
+            4 corrupt or refused input, or "info --strict" found a failed gate; 5 no device or
+            device failure; 6 output cannot be written; 8 partly done, or a gate failed with
+            "mesh --strict"; 130 interrupted"""
 
 
 class Parser(argparse.ArgumentParser):
