@@ -10,11 +10,13 @@ from clrecon.geometry.affine import (
     tilt_degrees,
 )
 from clrecon.geometry.frames import SPACES, frame_from_lps, lps_affine_from_ras
+from clrecon.geometry.grid import Grid
 from clrecon.geometry.iso_choice import IsoChoice, choose_iso_value, half_iso_value
 from clrecon.geometry.volume import AIR_HU, Volume
 
 __all__ = [
     "AIR_HU",
+    "Grid",
     "IsoChoice",
     "SPACES",
     "Volume",

@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from clrecon.errors import UsageError
-from clrecon.geometry.affine import Float64Array, apply_affine, checked_affine, checked_points, column_spacing
+from clrecon.geometry.affine import Float64Array, checked_affine, checked_points
+from clrecon.geometry.grid import Grid
 from clrecon.geometry.mapping import find_mapping
 from clrecon.geometry.stack import UnevenStack
 
@@ -51,7 +52,7 @@ def _as_array(voxels: ArrayLike) -> NDArray[Any]:
         raise UsageError(f"voxels are no array of numbers: {error}") from error
 
 
-class Volume:
+class Volume(Grid):
     """Voxels in HU with the affine that places them in the patient.
 
     Parameters
@@ -87,20 +88,12 @@ class Volume:
             raise UsageError(f"voxels have three axes (k, j, i), these have shape {array.shape}")
         if array.size == 0:
             raise UsageError(f"the volume is empty: its shape is {array.shape}")
-        self._voxels = _device_ready(array)
+        super().__init__(_device_ready(array), checked_affine(affine))
         self._mapping = find_mapping(self._voxels)
-        self._affine = checked_affine(affine)
-        self._affine.flags.writeable = False
-        self._inverse = np.asarray(np.linalg.inv(self._affine), dtype=np.float64)
         self._stack: UnevenStack | None = None
         if slice_positions is not None:
             self._stack = UnevenStack.of(self._affine, slice_positions, self._voxels.shape[0])
         self.report: dict[str, Any] = {"warnings": []} if report is None else report
-
-    @property
-    def voxels(self) -> NDArray[Any]:
-        """The voxels, shape (nk, nj, ni)."""
-        return self._voxels
 
     @property
     def affine(self) -> Float64Array:
@@ -112,28 +105,17 @@ class Volume:
         """True when the slices lie where `slice_origins` says and not on the affine's even steps."""
         return self._stack is not None
 
-    @property
-    def spacing(self) -> tuple[float, float, float]:
-        """(di, dj, dk) in mm: the lengths of the affine's three steps."""
-        return column_spacing(self._affine)
-
-    @property
-    def shape_ijk(self) -> tuple[int, int, int]:
-        """(ni, nj, nk), the reverse of ``voxels.shape``."""
-        nk, nj, ni = self._voxels.shape
-        return ni, nj, nk
-
     def ijk_to_lps(self, points: ArrayLike) -> Float64Array:
         """Map index coordinates (n, 3), fractions allowed, to LPS mm (n, 3), float64; exact for uneven slices too."""
         if self._stack is not None:
             return self._stack.ijk_to_lps(checked_points(points))
-        return apply_affine(self._affine, points)
+        return super().ijk_to_lps(points)
 
     def lps_to_ijk(self, points: ArrayLike) -> Float64Array:
         """Map LPS mm (n, 3) to index coordinates (n, 3), float64; the inverse of `ijk_to_lps`."""
         if self._stack is not None:
             return self._stack.lps_to_ijk(checked_points(points))
-        return apply_affine(self._inverse, points)
+        return super().lps_to_ijk(points)
 
     def slice_origins(self, border: int = 0) -> Float64Array:
         """Positions in LPS mm of voxel (0, 0, k) for k from ``-border`` to ``nk - 1 + border``.

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from clrecon.errors import UsageError
-from clrecon.geometry import column_spacing
-from clrecon.geometry.affine import Float64Array, checked_affine
+from clrecon.geometry import Grid
+from clrecon.geometry.affine import checked_affine
 from clrecon.labels.names import check_name, find_number
 
 __all__ = ["LARGEST_NUMBER", "LabelMap"]
@@ -20,8 +20,10 @@ LARGEST_NUMBER = 65_535
 """Label numbers go to a device as 16 bits."""
 
 
-class LabelMap:
+class LabelMap(Grid):
     """Whole numbers that say to which structure a voxel belongs; 0 is none.
+
+    ``voxels`` are uint8 or uint16.
 
     Parameters
     ----------
@@ -51,33 +53,10 @@ class LabelMap:
         frame_of_reference_hash: str | None = None,
         warnings: Sequence[str] = (),
     ):
-        self._voxels = _checked_voxels(voxels)
-        self._affine = checked_affine(affine)
-        self._affine.flags.writeable = False
+        super().__init__(_checked_voxels(voxels), checked_affine(affine))
         self._names = {int(number): check_name(name) for number, name in (names or {}).items()}
         self.frame_of_reference_hash = frame_of_reference_hash
         self.warnings = tuple(warnings)
-
-    @property
-    def voxels(self) -> NDArray[Any]:
-        """The numbers, shape (nk, nj, ni), uint8 or uint16."""
-        return self._voxels
-
-    @property
-    def affine(self) -> Float64Array:
-        """4x4 float64, index (i, j, k) to LPS mm (read-only)."""
-        return self._affine
-
-    @property
-    def spacing(self) -> tuple[float, float, float]:
-        """(di, dj, dk) in mm."""
-        return column_spacing(self._affine)
-
-    @property
-    def shape_ijk(self) -> tuple[int, int, int]:
-        """(ni, nj, nk), the reverse of ``voxels.shape``."""
-        nk, nj, ni = self._voxels.shape
-        return ni, nj, nk
 
     @cached_property
     def counts(self) -> dict[int, int]:

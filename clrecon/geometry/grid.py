@@ -1,0 +1,59 @@
+"""`Grid`: what everything has that is an array of voxels and the affine that places them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from clrecon.geometry.affine import Float64Array, apply_affine, column_spacing
+
+__all__ = ["Grid"]
+
+
+class Grid:
+    """Voxels and their affine: the base of `Volume` and of `clrecon.labels.LabelMap`.
+
+    Parameters
+    ----------
+    voxels : ndarray, shape (nk, nj, ni)
+        Checked by the class that is made.
+    affine : ndarray, shape (4, 4), float64
+        Index (i, j, k) to LPS mm, checked too; it becomes read-only.
+    """
+
+    def __init__(self, voxels: NDArray[Any], affine: Float64Array):
+        self._voxels = voxels
+        self._affine = affine
+        self._affine.flags.writeable = False
+        self._inverse = np.asarray(np.linalg.inv(affine), dtype=np.float64)
+
+    @property
+    def voxels(self) -> NDArray[Any]:
+        """The voxels, shape (nk, nj, ni)."""
+        return self._voxels
+
+    @property
+    def affine(self) -> Float64Array:
+        """4x4 float64, index (i, j, k) to LPS mm (read-only)."""
+        return self._affine
+
+    @property
+    def spacing(self) -> tuple[float, float, float]:
+        """(di, dj, dk) in mm: the lengths of the affine's three steps."""
+        return column_spacing(self._affine)
+
+    @property
+    def shape_ijk(self) -> tuple[int, int, int]:
+        """(ni, nj, nk), the reverse of ``voxels.shape``."""
+        nk, nj, ni = self._voxels.shape
+        return ni, nj, nk
+
+    def ijk_to_lps(self, points: ArrayLike) -> Float64Array:
+        """Map index coordinates (n, 3), fractions allowed, to LPS mm (n, 3), float64."""
+        return apply_affine(self._affine, points)
+
+    def lps_to_ijk(self, points: ArrayLike) -> Float64Array:
+        """Map LPS mm (n, 3) to index coordinates (n, 3), float64; the inverse of `ijk_to_lps`."""
+        return apply_affine(self._inverse, points)
