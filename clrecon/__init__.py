@@ -15,7 +15,6 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from clrecon.dicom import list_series, read_volume
     from clrecon.errors import (
         ClreconError,
         DeviceError,
@@ -33,6 +32,7 @@ if TYPE_CHECKING:
     from clrecon.opencl import Device
     from clrecon.operators.isosurface import SurfaceExtractor, extract_isosurface, extract_isosurfaces
     from clrecon.operators.labels import extract_labels
+    from clrecon.reading import list_series, read_volume
 
     __version__: str
 
@@ -81,9 +81,9 @@ _HOMES = {
     "extract_isosurface": "clrecon.operators.isosurface",
     "extract_isosurfaces": "clrecon.operators.isosurface",
     "extract_labels": "clrecon.operators.labels",
-    "list_series": "clrecon.dicom",
+    "list_series": "clrecon.reading",
     "read_labels": "clrecon.labels",
-    "read_volume": "clrecon.dicom",
+    "read_volume": "clrecon.reading",
     "smooth_mesh": "clrecon.mesh.refinement",
 }
 

@@ -1,27 +1,28 @@
-"""`read_labels`: what kind of file it is, told from its first bytes."""
+"""`read_labels`: one door for every kind of file with labels."""
 
 from __future__ import annotations
 
-import zlib
 from collections.abc import Sequence
 from pathlib import Path
 
 from clrecon.dicom.text import escape_text
 from clrecon.errors import RefusedInputError, UsageError
+from clrecon.formats.grid_file import LABEL_MAP
+from clrecon.formats.kinds import open_grid, tell_kind
+from clrecon.formats.stream import show_name
+from clrecon.labels.grids import read_grid_labels
 from clrecon.labels.label_map import LabelMap
-from clrecon.labels.nifti import is_nifti, read_nifti
-from clrecon.labels.nrrd import is_nrrd, read_nrrd
 from clrecon.labels.overlap import check_wanted
-from clrecon.labels.segmentation import is_dicom, read_segmentation
-from clrecon.labels.stream import show_name
+from clrecon.labels.segmentation import read_segmentation
 
 __all__ = ["read_labels"]
 
 
 def read_labels(path: str | Path, only: Sequence[str | int] | None = None) -> LabelMap:
-    """Read a label map: NIfTI (.nii, .nii.gz), NRRD and 3D Slicer's .seg.nrrd, or DICOM SEG.
+    """Read a label map: NIfTI (.nii, .nii.gz), NRRD and 3D Slicer's .seg.nrrd, MetaImage, or DICOM SEG.
 
-    The kind is told from the content.  NIfTI and NRRD need the extra ``clrecon[labels]``.
+    The kind is told from the content.  NIfTI and NRRD need the extra ``clrecon[labels]``, MetaImage
+    ``clrecon[volumes]``.
 
     Parameters
     ----------
@@ -52,17 +53,15 @@ def read_labels(path: str | Path, only: Sequence[str | int] | None = None) -> La
             raise UsageError(f"there is no label map {escape_text(str(path), 200)}")
         if not path.is_file():
             raise RefusedInputError(f"{show_name(path)} is no regular file")
-        with open(path, "rb") as file:
-            start = file.read(132)
-        start, name = _inflate(start), show_name(path)
-        if is_nifti(start):
-            labels = read_nifti(path)
-        elif is_nrrd(start):
-            labels = read_nrrd(path, wanted)
-        elif is_dicom(start):
+        name, kind = show_name(path), tell_kind(path)
+        if kind is None:
+            raise RefusedInputError(
+                f"{name} is no label map that can be read: NIfTI, NRRD, MetaImage and DICOM SEG are"
+            )
+        if kind == "DICOM":
             labels = read_segmentation(path, wanted)
         else:
-            raise RefusedInputError(f"{name} is no label map that can be read: NIfTI, NRRD and DICOM SEG are")
+            labels = read_grid_labels(open_grid(path, kind, LABEL_MAP), wanted)
     except OSError as error:
         raise RefusedInputError(f"{show_name(path)} cannot be read: {error.strerror or error}") from error
     if not labels.numbers:
@@ -70,13 +69,3 @@ def read_labels(path: str | Path, only: Sequence[str | int] | None = None) -> La
     for label in wanted or ():
         labels.find(label)
     return labels
-
-
-def _inflate(start: bytes) -> bytes:
-    """The first bytes, inflated where they are gzip."""
-    if start[:2] != b"\x1f\x8b":
-        return start
-    try:
-        return zlib.decompressobj(wbits=31).decompress(start, 64)
-    except zlib.error:
-        return b""

@@ -17,12 +17,13 @@ from numpy.typing import NDArray
 
 from clrecon.dicom.text import escape_text, hash_uid
 from clrecon.errors import ClreconError, RefusedInputError
+from clrecon.formats.stream import check_size, show_name
 from clrecon.labels.frames import FrameStack, place_frames
 from clrecon.labels.label_map import LabelMap
 from clrecon.labels.overlap import Painter
-from clrecon.labels.stream import check_size, empty_labels, show_name
+from clrecon.labels.stream import empty_labels
 
-__all__ = ["is_dicom", "read_segmentation"]
+__all__ = ["read_segmentation"]
 
 SEGMENTATION_CLASSES = ("1.2.840.10008.5.1.4.1.1.66.4", "1.2.840.10008.5.1.4.1.1.66.7")
 IMPLICIT_LITTLE, EXPLICIT_LITTLE = "1.2.840.10008.1.2", "1.2.840.10008.1.2.1"
@@ -39,11 +40,6 @@ class _Layout:
     columns: int
     frames: int
     bits: int
-
-
-def is_dicom(start: bytes) -> bool:
-    """True when the first 132 bytes of a file are those of DICOM."""
-    return start[128:132] == b"DICM"
 
 
 def read_segmentation(path: Path, only: tuple[str | int, ...] | None = None) -> LabelMap:

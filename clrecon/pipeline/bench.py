@@ -129,7 +129,7 @@ def _choose_devices(name: str | None) -> list[Device]:
 def _get_volume(source: str | Path | None, series: str | None, progress: Progress) -> tuple[Volume, float]:
     """The volume, and the iso value that suits it."""
     if source is not None:
-        from clrecon.dicom import read_volume
+        from clrecon.reading import read_volume
 
         return read_volume(source, series, progress=progress), find_preset(DEFAULT_PRESET).iso_value
     from clrecon.geometry import Volume

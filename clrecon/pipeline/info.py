@@ -46,7 +46,7 @@ def describe_input(
     Parameters
     ----------
     source : path
-        DICOM folder or file.
+        DICOM folder or file, or a file of another format, see `clrecon.reading.read_volume`.
     series : str, optional
         Number, SeriesInstanceUID, its hash or description of the series to judge; None leaves the choice to the
         reader, and any usable series is enough then.
@@ -68,7 +68,7 @@ def describe_input(
         Nothing to list, all files corrupt, pixels that cannot be read, or not exactly one series answers to `series`,
         or it has no such phase.
     """
-    from clrecon.dicom import list_series
+    from clrecon.reading import list_series
 
     found = list_series(source, series, phase=phase, allow_gaps=allow_gaps, pixels=pixels, progress=progress)
     entries = [entry.as_dict() for entry in found.series]

@@ -44,7 +44,7 @@ def make_mesh(
     Parameters
     ----------
     source : path
-        DICOM folder or file.
+        DICOM folder or file, or a file of another format, see `clrecon.reading.read_volume`.
     output : path
         Mesh file; its extension says the format.
     settings : MeshSettings, optional
@@ -75,7 +75,7 @@ def make_mesh(
 
     progress("device", 0, 0)
     with DeviceOpening(settings.device, settings.selects, settings.topology) as opening:
-        from clrecon.dicom import read_volume
+        from clrecon.reading import read_volume
 
         labels = open_labels(settings.labels)
         volume = read_volume(

@@ -18,7 +18,7 @@ def _layer(name: str, *allowed: str) -> None:
     LEFT_OF[name] = frozenset(allowed)
 
 
-_layer("__init__", "errors", "version", "geometry", "dicom", "labels", "mesh", "opencl", "operators")
+_layer("__init__", "errors", "version", "geometry", "reading", "labels", "mesh", "opencl", "operators")
 _layer("errors")
 _layer("version")
 _layer("gates")
@@ -26,7 +26,9 @@ _layer("files", "errors")
 _layer("geometry", "errors", "files")
 _layer("dicom", "errors", "files", "gates", "geometry")
 _layer("mesh", "errors", "version", "files", "gates", "geometry")
-_layer("labels", "errors", "files", "geometry", "dicom")
+_layer("formats", "errors", "files", "geometry", "dicom")
+_layer("reading", "errors", "geometry", "dicom", "formats")
+_layer("labels", "errors", "files", "geometry", "dicom", "formats")
 _layer("reference", "errors", "files", "geometry", "labels")
 _layer("phantom", "errors", "version", "files", "geometry")
 _layer("opencl", "errors", "files")
@@ -41,6 +43,7 @@ _layer("__main__", "cli")
 AT_MODULE_LEVEL: dict[str, frozenset[str]] = {
     "geometry": frozenset({"numpy"}),
     "dicom": frozenset({"numpy", "pydicom"}),
+    "formats": frozenset({"numpy"}),
     "labels": frozenset({"numpy"}),
     "mesh": frozenset({"numpy"}),
     "reference": frozenset({"numpy"}),
@@ -55,7 +58,8 @@ INSIDE_FUNCTIONS: dict[str, frozenset[str]] = {
     "files": frozenset({"numpy"}),
     "geometry": frozenset({"scipy"}),
     "dicom": frozenset({"imagecodecs", "openjpeg", "rle", "jpeg_ls", "pylibjpeg"}),
-    "labels": frozenset({"nibabel", "nrrd", "pydicom", "scipy"}),
+    "formats": frozenset({"nibabel", "nrrd", "SimpleITK"}),
+    "labels": frozenset({"pydicom", "scipy"}),
     "mesh": frozenset({"scipy", "pyvista", "vtk", "vtkmodules", "fast_simplification"}),
     "reference": frozenset({"scipy"}),
     "phantom": frozenset({"scipy"}),

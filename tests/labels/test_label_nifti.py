@@ -192,9 +192,14 @@ def test_damaged_anywhere_it_is_read_or_refused(tmp_path):
     assert 20 < refused < 300
 
 
-def test_header_and_voxels_in_two_files_are_refused(tmp_path):
-    nibabel.save(nibabel.Nifti1Pair(make_labels().transpose(2, 1, 0), RAS @ OBLIQUE), tmp_path / "a.hdr")
-    with pytest.raises(RefusedInputError, match="header and voxels in two files"):
+def test_header_and_voxels_in_two_files_are_read(tmp_path):
+    voxels = make_labels()
+    nibabel.save(nibabel.Nifti1Pair(voxels.transpose(2, 1, 0), RAS @ OBLIQUE), tmp_path / "a.hdr")
+    labels = read_labels(tmp_path / "a.hdr")
+    assert np.array_equal(labels.voxels, voxels)
+    assert np.abs(labels.affine - OBLIQUE).max() <= tolerances.NIFTI_AFFINE_MM
+    (tmp_path / "a.img").unlink()
+    with pytest.raises(RefusedInputError, match="its voxels are in 'a.img', which is not there"):
         read_labels(tmp_path / "a.hdr")
 
 

@@ -1,4 +1,4 @@
-"""The libraries of the extra `labels`, imported when a file needs them."""
+"""The libraries of the extras `labels` and `volumes`, imported when a file needs them."""
 
 from __future__ import annotations
 
@@ -6,11 +6,14 @@ from importlib import import_module
 from typing import Any
 
 from clrecon.errors import UsageError
+from clrecon.formats.grid_file import Purpose
 
 __all__ = ["import_extra"]
 
+_PACKAGES = {"nrrd": "pynrrd"}
 
-def import_extra(module: str) -> Any:
+
+def import_extra(module: str, purpose: Purpose) -> Any:
     """Import `module`.
 
     Raises
@@ -21,7 +24,7 @@ def import_extra(module: str) -> Any:
     try:
         return import_module(module)
     except ImportError as error:
+        extra = "volumes" if module == "SimpleITK" else purpose.extra
         raise UsageError(
-            f"this label map needs the package {'pynrrd' if module == 'nrrd' else module}:"
-            " pip install 'clrecon[labels]'"
+            f"this {purpose.noun} needs the package {_PACKAGES.get(module, module)}: pip install 'clrecon[{extra}]'"
         ) from error

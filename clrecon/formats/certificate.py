@@ -1,0 +1,72 @@
+"""The certificate of a volume that is not from DICOM: the entries of `clrecon.dicom.certificate`, as far as known."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from clrecon.dicom.pixels import PixelFacts
+from clrecon.formats.grid_file import GridFile
+from clrecon.geometry.affine import column_spacing, slice_normal, tilt_degrees
+
+__all__ = ["MODALITY", "certify_grid", "collect_header_warnings", "gap_mm"]
+
+MODALITY = "unknown"
+NOT_DICOM = "not DICOM: position, spacing and the meaning of the values are as the file says, nothing vouches for them"
+
+SMALLEST_STEP_MM, LARGEST_STEP_MM = 0.005, 50.0
+"""Micro-CT goes down to 0.01 mm; what is beyond was more likely written in other units."""
+
+
+def gap_mm(grid: GridFile) -> float:
+    """Distance of neighbouring slices along their normal."""
+    return abs(float(slice_normal(grid.affine) @ grid.affine[:3, 2]))
+
+
+def collect_header_warnings(grid: GridFile) -> list[str]:
+    """Warnings about a grid file, before its voxels are read."""
+    warnings = [NOT_DICOM, *grid.warnings]
+    spacing = column_spacing(grid.affine)
+    if min(spacing) < SMALLEST_STEP_MM or max(spacing) > LARGEST_STEP_MM:
+        shown = " x ".join(f"{step:.3g}" for step in spacing)
+        warnings.append(f"a spacing of {shown} mm is unusual: maybe the file has other units than it says")
+    return warnings
+
+
+def certify_grid(grid: GridFile, facts: PixelFacts, warnings: Sequence[str]) -> dict[str, Any]:
+    """Build the report of a volume.
+
+    Parameters
+    ----------
+    grid : GridFile
+    facts : PixelFacts
+    warnings : sequence of str
+
+    Returns
+    -------
+    dict
+        JSON types only; the same entries as those of a DICOM volume, None where such a file does not say.
+    """
+    gap = gap_mm(grid)
+    return {
+        "format": grid.kind,
+        "series": {"number": 1, "uid_hash": None, "modality": MODALITY},
+        "slices": grid.shape_ijk[2],
+        "shape_ijk": list(grid.shape_ijk),
+        "spacing_mm": list(column_spacing(grid.affine)),
+        "affine_ijk_to_lps_mm": grid.affine.tolist(),
+        "tilt_deg": tilt_degrees(grid.affine),
+        "grid_residual_max_mm": None,
+        "grid_residual_rms_mm": None,
+        "gap_mm": {"min": gap, "max": gap},
+        "uneven": False,
+        "slice_thickness_mm": None,
+        "padding_share": facts.padding_share,
+        "frame_of_reference_hash": None,
+        "transfer_syntaxes": [],
+        "rescale": {"slope": [grid.slope] * 2, "intercept": [grid.intercept] * 2, "type": None},
+        "hu_range": [facts.hu_min, facts.hu_max],
+        "files": {"found": 1, "used": 1, "skipped": {}},
+        "warnings": list(warnings),
+        "problems": [],
+    }

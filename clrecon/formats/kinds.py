@@ -1,0 +1,58 @@
+"""What kind of file it is, told from its first bytes: names are not trusted."""
+
+from __future__ import annotations
+
+import zlib
+from pathlib import Path
+
+from clrecon.formats.grid_file import GridFile, Purpose
+from clrecon.formats.metaimage import is_metaimage, open_metaimage
+from clrecon.formats.nifti import is_nifti, open_nifti
+from clrecon.formats.nrrd import is_nrrd, open_nrrd
+
+__all__ = ["open_grid", "tell_kind"]
+
+_START_BYTES = 512
+
+
+def tell_kind(path: Path) -> str | None:
+    """The kind of a file: "DICOM", "NIfTI", "NRRD", "MetaImage", or None.
+
+    Raises
+    ------
+    OSError
+        It cannot be read.
+    """
+    with open(path, "rb") as file:
+        start = file.read(_START_BYTES)
+    if start[128:132] == b"DICM":  # what stands before it may look like anything
+        return "DICOM"
+    if is_nifti(_inflate(start)):
+        return "NIfTI"
+    if is_nrrd(start):
+        return "NRRD"
+    return "MetaImage" if is_metaimage(start) else None
+
+
+def _inflate(start: bytes) -> bytes:
+    """The first bytes, inflated where they are gzip."""
+    if start[:2] != b"\x1f\x8b":
+        return start
+    try:
+        return zlib.decompressobj(wbits=31).decompress(start, 64)
+    except zlib.error:
+        return b""
+
+
+def open_grid(path: Path, kind: str, purpose: Purpose) -> GridFile:
+    """Read the header of a file of one of the `kind` "NIfTI", "NRRD" and "MetaImage".
+
+    Raises
+    ------
+    UsageError
+        A package is missing.
+    RefusedInputError
+        The file is not what it is to be read as, cut, corrupt, or does not say where it lies.
+    """
+    opener = {"NIfTI": open_nifti, "NRRD": open_nrrd, "MetaImage": open_metaimage}[kind]
+    return opener(path, purpose)

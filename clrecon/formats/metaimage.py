@@ -1,0 +1,258 @@
+"""MetaImage: .mha, and .mhd with the voxels in one file beside it.
+
+SimpleITK, whose own format this is, says what the header means; it is asked only after every field that counts was
+checked here, and it never reads the voxels.  Both for a reason, seen with SimpleITK 2.5: a header that says NDims =
+100000 ends the process (a write beyond an array), one without a position is placed at the origin, and damaged
+compressed voxels come back as numbers, with nothing but a line on standard error.
+
+Its frame is LPS mm.  AnatomicalOrientation is for people; what counts are TransformMatrix, Offset and ElementSpacing.
+
+Source: the MetaIO documentation (itk.org/Wiki/MetaIO/Documentation) and ITK's MetaImageIO.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from clrecon.dicom.text import escape_text
+from clrecon.errors import RefusedInputError, UsageError
+from clrecon.formats.extras import import_extra
+from clrecon.formats.grid_file import GridFile, Purpose
+from clrecon.formats.stream import VoxelBytes, file_beside, show_name
+from clrecon.geometry.affine import Float64Array, checked_affine
+
+__all__ = ["is_metaimage", "open_metaimage"]
+
+LARGEST_HEADER = 2**20
+LONGEST_KEY, LONGEST_VALUE = 100, 4000
+"""Bytes; MetaIO keeps keys in 255 bytes and values in 32 KiB."""
+
+MM_PER_UNIT = {"": 1.0, "?": 1.0, "mm": 1.0, "cm": 10.0, "um": 0.001}
+"""Of DistanceUnits: not said (read as mm, as everybody does), mm, cm, micron."""
+
+SAME_FIELD = {
+    "Offset": ("Offset", "Position", "Origin"),
+    "TransformMatrix": ("TransformMatrix", "Rotation", "Orientation"),
+    "ByteOrderMSB": ("BinaryDataByteOrderMSB", "ElementByteOrderMSB"),
+}
+"""Names that mean one thing."""
+
+PLAIN = {
+    "HeaderSize": 0.0,
+    "ElementNumberOfChannels": 1.0,
+    "ElementToIntensityFunctionSlope": 1.0,
+    "ElementToIntensityFunctionOffset": 0.0,
+}
+"""Fields that may say this and nothing else."""
+
+ELEMENT_TYPES = (
+    *(f"MET_{sign}{size}" for sign in ("", "U") for size in ("CHAR", "SHORT", "INT", "LONG", "LONG_LONG")),
+    "MET_FLOAT", "MET_DOUBLE",
+)  # fmt: skip
+
+_START = re.compile(rb"\s*(ObjectType|NDims)[ \t]*=")
+
+
+def is_metaimage(start: bytes) -> bool:
+    """True when the first bytes of a file are the first field of a MetaImage header."""
+    return _START.match(start) is not None
+
+
+def open_metaimage(path: Path, purpose: Purpose) -> GridFile:
+    """Read the header.
+
+    Raises
+    ------
+    UsageError
+        SimpleITK is not installed.
+    RefusedInputError
+        The header is corrupt, does not say where the voxels lie, or names files elsewhere or several; the voxels are
+        text, colours or vectors, or have more than three axes.
+    """
+    name = show_name(path)
+    fields, end = _read_fields(path, name)
+    header = _Header(fields, name, purpose)
+    header.check()
+    packing = "zlib" if header.flag("CompressedData", False) else "raw"
+    if fields["ElementDataFile"].upper() == "LOCAL":
+        voxel_bytes = VoxelBytes(path, end, packing)
+    else:
+        voxel_bytes = VoxelBytes(header.data_file(path), 0, packing)
+    shape, dtype, affine = _ask_library(path, header)
+    return GridFile(
+        name=name,
+        purpose=purpose,
+        kind="MetaImage",
+        shape_ijk=shape,
+        dtype=dtype.newbyteorder(">" if header.big_endian else "<"),
+        affine=affine,
+        voxel_bytes=voxel_bytes,
+        warnings=tuple(header.warnings),
+    )
+
+
+def _read_fields(path: Path, name: str) -> tuple[dict[str, str], int]:
+    """The fields up to ElementDataFile, which is the last, and the byte after it."""
+    with open(path, "rb") as file:
+        start = file.read(LARGEST_HEADER)
+    fields: dict[str, str] = {}
+    seen = {""}
+    at = 0
+    while "ElementDataFile" not in fields:
+        line, newline, _ = start[at : at + LONGEST_KEY + LONGEST_VALUE].partition(b"\n")
+        key, mark, value = (part.strip() for part in line.decode("latin-1").partition("="))
+        at += len(line) + len(newline)
+        if not line and not newline or (key and not mark) or len(key) > LONGEST_KEY or len(value) > LONGEST_VALUE:
+            raise RefusedInputError(
+                f"{name} has a corrupt MetaImage header: no line 'ElementDataFile = ...' ends it, it stops at"
+                f" '{escape_text(key)}'"
+            )
+        if key and key.casefold() in seen:
+            raise RefusedInputError(f"{name} has a corrupt MetaImage header: it says {escape_text(key)} twice")
+        seen.add(key.casefold())
+        if key:
+            fields[key] = value
+    return fields, at
+
+
+class _Header:
+    """The fields of a header, checked before any library sees them."""
+
+    def __init__(self, fields: dict[str, str], name: str, purpose: Purpose):
+        self.fields, self.name, self.purpose = fields, name, purpose
+        self.warnings: list[str] = []
+
+    def check(self) -> None:
+        """Refuse what is not one grid of real numbers with a position.
+
+        Raises
+        ------
+        RefusedInputError
+        """
+        self._check_kind()
+        axes = self.numbers("NDims", 1)[0]
+        if axes not in (3, 4):
+            raise self.wrong("NDims", f"a {self.purpose.noun} has three axes")
+        sizes = self.numbers("DimSize", int(axes))
+        if min(sizes) < 1 or max(sizes) > 2**31 or any(n != int(n) for n in sizes):
+            raise self.wrong("DimSize", "whole numbers from 1")
+        if axes == 4 and sizes[3] != 1:
+            shown = " x ".join(f"{n:g}" for n in sizes)
+            raise RefusedInputError(
+                f"{self.name} has 4 axes ({shown}): a {self.purpose.noun} has three: {sizes[3]:g} of them,"
+                " split it into one file each"
+            )
+        if min(self.numbers("ElementSpacing", int(axes))) <= 0:
+            raise self.wrong("ElementSpacing", "steps above 0 mm; directions belong into TransformMatrix")
+        self.numbers("TransformMatrix", int(axes * axes))
+        self.numbers("Offset", int(axes))
+
+    def _check_kind(self) -> None:
+        if self.text("ObjectType", "Image").lower() != "image":
+            raise self.wrong("ObjectType", "Image")
+        if self.text("ElementType").upper() not in ELEMENT_TYPES:
+            raise self.wrong("ElementType", f"a {self.purpose.noun} has one real number a voxel")
+        if not self.flag("BinaryData", True):
+            raise self.wrong("BinaryData", "True: voxels written as text are not read")
+        for key, only in PLAIN.items():
+            if key in self.fields and self.numbers(key, 1) != [only]:
+                raise self.wrong(key, f"{only:g}")
+        if self.text("DistanceUnits", "") not in MM_PER_UNIT:
+            raise self.wrong("DistanceUnits", "mm, cm or um")
+        self.flag("CompressedData", False)
+        if self._name_of("ByteOrderMSB") is None and self.text("ElementType").upper() not in ("MET_CHAR", "MET_UCHAR"):
+            self.warnings.append("the byte order is not said (BinaryDataByteOrderMSB): little endian is taken")
+
+    def wrong(self, key: str, expected: str) -> RefusedInputError:
+        """The refusal of a field."""
+        used = self._name_of(key)
+        if used is None:
+            return RefusedInputError(f"{self.name} is no usable MetaImage: {key} is missing, expected {expected}")
+        shown = escape_text(self.fields[used])
+        return RefusedInputError(f"{self.name} is no usable MetaImage: {used} is '{shown}', expected {expected}")
+
+    def _name_of(self, key: str) -> str | None:
+        """The name under which a field is there."""
+        used = [other for other in SAME_FIELD.get(key, (key,)) if other in self.fields]
+        if len(used) > 1:
+            raise RefusedInputError(f"{self.name} has a corrupt MetaImage header: it says {used[0]} and {used[1]}")
+        return used[0] if used else None
+
+    def text(self, key: str, default: str | None = None) -> str:
+        """The value of a field."""
+        used = self._name_of(key)
+        if used is None and default is None:
+            raise self.wrong(key, "a value")
+        return str(default) if used is None else self.fields[used]
+
+    def numbers(self, key: str, count: int) -> list[float]:
+        """Exactly `count` finite numbers."""
+        expected = "a finite number" if count == 1 else f"{count} finite numbers"
+        if self._name_of(key) is None:
+            raise self.wrong(key, expected + (": it does not say where it lies" * (count > 1 and key != "DimSize")))
+        parts = self.text(key).split()
+        if len(parts) != count or not all(re.fullmatch(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", p) for p in parts):
+            raise self.wrong(key, expected)
+        numbers = [float(part) for part in parts]
+        if not all(map(math.isfinite, numbers)):
+            raise self.wrong(key, expected)
+        return numbers
+
+    def flag(self, key: str, default: bool) -> bool:
+        """True or False."""
+        value = self.text(key, str(default)).lower()
+        if value not in ("true", "t", "1", "false", "f", "0"):
+            raise self.wrong(key, "True or False")
+        return value in ("true", "t", "1")
+
+    @property
+    def big_endian(self) -> bool:
+        """The byte order of the voxels."""
+        return self.flag("ByteOrderMSB", False)
+
+    def data_file(self, path: Path) -> Path:
+        """The one file beside the header that holds the voxels."""
+        named = self.fields["ElementDataFile"]
+        if not named or named.upper().split()[0] == "LIST" or "%" in named:
+            raise self.wrong("ElementDataFile", "LOCAL or one file, not several")
+        return file_beside(path, named)
+
+
+def _ask_library(path: Path, header: _Header) -> tuple[tuple[int, int, int], np.dtype[Any], Float64Array]:
+    """Shape (ni, nj, nk), type and affine, as SimpleITK understands the header."""
+    sitk = import_extra("SimpleITK", header.purpose)
+    reader = sitk.ImageFileReader()
+    reader.SetImageIO("MetaImageIO")  # no other reader is let near the file
+    reader.SetFileName(str(path))
+    try:
+        reader.ReadImageInformation()
+    except RuntimeError as error:
+        raise RefusedInputError(f"{header.name} is no usable MetaImage: SimpleITK cannot read its header") from error
+    kind = reader.GetPixelIDValue()
+    dtype = next((np.dtype(code) for name, code in _PIXELS.items() if getattr(sitk, name) == kind), None)
+    size, axes = tuple(int(n) for n in reader.GetSize()), reader.GetDimension()
+    if dtype is None or list(size) != header.numbers("DimSize", axes) or reader.GetNumberOfComponents() != 1:
+        raise RefusedInputError(f"{header.name} has a corrupt MetaImage header: it can be read in two ways")
+    directions = np.array(reader.GetDirection()).reshape(axes, axes)
+    affine = np.eye(4)
+    affine[:3, :3] = directions[:3, :3] * np.array(reader.GetSpacing()[:3])
+    affine[:3, 3] = reader.GetOrigin()[:3]
+    affine[:3] *= MM_PER_UNIT[header.text("DistanceUnits", "")]
+    try:
+        if np.any(directions[:3, 3:]):
+            raise UsageError("the fourth axis leads through space")
+        return (size[0], size[1], size[2]), dtype, checked_affine(affine)
+    except UsageError as error:
+        raise RefusedInputError(f"{header.name} cannot be placed: {error}") from error
+
+
+_PIXELS = {
+    "sitkInt8": "i1", "sitkUInt8": "u1", "sitkInt16": "i2", "sitkUInt16": "u2", "sitkInt32": "i4", "sitkUInt32": "u4",
+    "sitkInt64": "i8", "sitkUInt64": "u8", "sitkFloat32": "f4", "sitkFloat64": "f8",
+}  # fmt: skip
+"""Names that SimpleITK has for the types of voxels."""

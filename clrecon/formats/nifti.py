@@ -1,0 +1,219 @@
+"""NIfTI-1 and NIfTI-2 (.nii, .nii.gz, and pairs of .hdr and .img).
+
+nibabel parses the header; the voxels are read slice by slice.  NIfTI's frame is RAS mm, and this is where it ends:
+`nifti_affine` gives LPS.
+
+Source: the NIfTI-1 and NIfTI-2 definitions (nifti1.h, nifti2.h).
+"""
+
+from __future__ import annotations
+
+import gzip
+import math
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, BinaryIO, cast
+
+import numpy as np
+
+from clrecon.dicom.text import escape_text
+from clrecon.errors import RefusedInputError, UsageError
+from clrecon.formats.extras import import_extra
+from clrecon.formats.grid_file import GridFile, Purpose
+from clrecon.formats.stream import VoxelBytes, file_beside, read_bytes, show_name
+from clrecon.geometry.affine import Float64Array, checked_affine
+from clrecon.geometry.frames import lps_affine_from_ras
+
+__all__ = ["is_nifti", "nifti_affine", "open_nifti"]
+
+LARGEST_HEADER = 2**24
+"""Bytes before the voxels; extensions of label maps have some 10,000."""
+
+MM_PER_UNIT = {0: 1.0, 1: 1000.0, 2: 1.0, 3: 0.001}
+"""Code of the spatial unit: unknown (read as mm, as everybody does), metre, mm, micron."""
+
+AFFINES_DIFFER_MM = 0.1
+"""sform and qform that are this far apart at a corner are said to disagree: quaternions are float32."""
+
+_FIRST = (b"\x5c\x01\0\0", b"\0\0\x01\x5c")
+_SECOND = (b"\x1c\x02\0\0", b"\0\0\x02\x1c")
+"""The size of the header, 348 or 540, which both begin with; little and big endian."""
+
+
+@dataclass(frozen=True)
+class _Header:
+    """What stands before the voxels: nibabel's header, its size, whether they are in a file of their own, where."""
+
+    parsed: Any
+    size: int
+    paired: bool
+    offset: int
+    extension: bytes
+
+
+def is_nifti(start: bytes) -> bool:
+    """True when the (inflated) first bytes of a file are those of a NIfTI header."""
+    return start[:4] in (*_FIRST, *_SECOND)
+
+
+def open_nifti(path: Path, purpose: Purpose) -> GridFile:
+    """Read the header.
+
+    Raises
+    ------
+    UsageError
+        nibabel is not installed.
+    RefusedInputError
+        The file is cut or corrupt, not placed, has colours, or more than three axes.
+    """
+    name = show_name(path)
+    with open(path, "rb") as file:
+        compressed = _is_gzip(file)
+        header = _read_header(cast(BinaryIO, gzip.GzipFile(fileobj=file)) if compressed else file, name, purpose)
+    try:
+        shape = _shape(header.parsed, name, purpose)
+        dtype = _dtype(header.parsed, name, purpose)
+        slope, intercept = header.parsed.get_slope_inter()
+        affine, warnings = nifti_affine(header.parsed, shape, name)
+    except (ValueError, TypeError, KeyError, OverflowError, _header_errors(purpose)) as error:
+        if isinstance(error, UsageError):
+            raise
+        raise RefusedInputError(f"{name} has a corrupt NIfTI header: {escape_text(str(error))}") from error
+    return GridFile(
+        name=name,
+        purpose=purpose,
+        kind="NIfTI-2" if header.size == 540 else "NIfTI-1",
+        shape_ijk=shape,
+        dtype=dtype,
+        affine=affine,
+        voxel_bytes=_find_voxels(path, compressed, header),
+        slope=1.0 if slope is None else float(slope),
+        intercept=0.0 if intercept is None else float(intercept),
+        warnings=tuple(warnings),
+        extension=header.extension,
+    )
+
+
+def _is_gzip(file: BinaryIO) -> bool:
+    start = file.read(2)
+    file.seek(0)
+    return start == b"\x1f\x8b"
+
+
+def _header_errors(purpose: Purpose) -> type[Exception]:
+    """What nibabel raises about headers."""
+    return import_extra("nibabel", purpose).spatialimages.HeaderDataError  # type: ignore[no-any-return]
+
+
+def _read_header(stream: BinaryIO, name: str, purpose: Purpose) -> _Header:
+    nibabel = import_extra("nibabel", purpose)
+    start = read_bytes(stream, 4, name, "its header")
+    kind, size, magic = (nibabel.Nifti2Header, 540, b"2") if start in _SECOND else (nibabel.Nifti1Header, 348, b"1")
+    parsed = kind(start + read_bytes(stream, size - 4, name, "its header"), check=False)
+    found = parsed["magic"].item()
+    paired = found[:3] == b"ni" + magic
+    if not paired and found[:3] != b"n+" + magic:
+        raise RefusedInputError(
+            f"{name} is no NIfTI file (its mark is {escape_text(repr(found))}): Analyze files do not say where they lie"
+            " and are not read, convert it to .nii.gz"
+        )
+    offset = float(parsed["vox_offset"])
+    first = 0 if paired else size + 4
+    if not (math.isfinite(offset) and first <= offset <= LARGEST_HEADER and offset == int(offset)):
+        raise RefusedInputError(f"{name} has a corrupt NIfTI header: its voxels start at byte {offset:g}")
+    extension = b"" if paired else read_bytes(stream, int(offset) - size, name, "its header")
+    return _Header(parsed, size, paired, int(offset), extension)
+
+
+def _find_voxels(path: Path, compressed: bool, header: _Header) -> VoxelBytes:
+    """In the file itself; of a pair in the .img (or .img.gz) of the same name."""
+    if header.paired:
+        match = re.fullmatch(r"(.*)\.hdr(\.gz)?", path.name, re.IGNORECASE | re.DOTALL)
+        if match is None:
+            raise RefusedInputError(
+                f"{show_name(path)} is the header of a NIfTI pair: its name must end with .hdr, that of the voxels"
+                " with .img"
+            )
+        stem = match[1]
+        names = [f"{stem}.img", f"{stem}.img.gz", f"{stem}.IMG"]
+        path = file_beside(path, next((other for other in names if path.with_name(other).exists()), names[0]))
+        with open(path, "rb") as file:
+            compressed = _is_gzip(file)
+    if compressed:
+        return VoxelBytes(path, packing="gzip", skip=header.offset)
+    return VoxelBytes(path, offset=header.offset)
+
+
+def _shape(header: Any, name: str, purpose: Purpose) -> tuple[int, int, int]:
+    """(ni, nj, nk); further axes of one are none."""
+    shape = tuple(int(n) for n in header.get_data_shape())
+    while len(shape) > 3 and shape[-1] == 1:
+        shape = shape[:-1]
+    if len(shape) != 3:
+        several = f": {math.prod(shape[3:])} of them, split it into one file each" if len(shape) > 3 else ""
+        raise RefusedInputError(
+            f"{name} has {len(shape)} axes ({' x '.join(map(str, shape))}): a {purpose.noun} has three{several}"
+        )
+    return shape[0], shape[1], shape[2]
+
+
+def _dtype(header: Any, name: str, purpose: Purpose) -> np.dtype[Any]:
+    dtype = cast("np.dtype[Any]", header.get_data_dtype())
+    if dtype.kind not in "iuf" or dtype.itemsize > 8:
+        shown = "colours" if dtype.names else str(dtype)
+        raise RefusedInputError(f"{name} is not a {purpose.noun}: its voxels are {shown}; one real number each is read")
+    return dtype
+
+
+def nifti_affine(header: Any, shape: tuple[int, int, int], name: str) -> tuple[Float64Array, list[str]]:
+    """The affine of a NIfTI header, from RAS to LPS: the sform, else the qform.
+
+    Parameters
+    ----------
+    header : nibabel.Nifti1Header or Nifti2Header
+    shape : (ni, nj, nk)
+    name : str
+        Of the file, for messages.
+
+    Returns
+    -------
+    affine : ndarray, shape (4, 4), float64
+        Index (i, j, k) to LPS mm.
+    warnings : list of str
+        One where sform and qform disagree.
+
+    Raises
+    ------
+    RefusedInputError
+        Neither of both, or it is no affine.
+    """
+    sform, qform = (_coded(header, which) for which in ("sform", "qform"))
+    chosen = sform if sform is not None else qform
+    if chosen is None:
+        raise RefusedInputError(
+            f"{name} does not say where it lies (sform_code and qform_code are 0): write it with a position"
+        )
+    unit = MM_PER_UNIT.get(int(header["xyzt_units"]) & 7)
+    if unit is None:
+        raise RefusedInputError(
+            f"{name} has lengths in unknown units (code {int(header['xyzt_units']) & 7}): metres, mm and microns are"
+            " read"
+        )
+    scale = np.diag((unit, unit, unit, 1.0))
+    try:
+        affine = checked_affine(lps_affine_from_ras(scale @ chosen))
+    except UsageError as error:
+        raise RefusedInputError(f"{name} cannot be placed: {error}") from error
+    warnings = []
+    if sform is not None and qform is not None:
+        corners = np.array([[i, j, k, 1] for i in (0, shape[0]) for j in (0, shape[1]) for k in (0, shape[2])])
+        apart = unit * np.linalg.norm(corners @ (sform - qform).T, axis=1).max()
+        if not apart <= AFFINES_DIFFER_MM:
+            warnings.append(f"sform and qform lie {apart:.3g} mm apart: the sform is used")
+    return affine, warnings
+
+
+def _coded(header: Any, which: str) -> Any:
+    """The sform or qform, None where its code is 0."""
+    return getattr(header, f"get_{which}")(coded=True)[0]

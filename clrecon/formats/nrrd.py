@@ -1,0 +1,220 @@
+"""NRRD (.nrrd), header and voxels in one file.
+
+pynrrd parses the header; the voxels are read slice by slice.  A header that points to data in other files is refused:
+such paths could name anything.
+
+Source: the NRRD format definition (teem.sourceforge.net/nrrd/format.html).
+"""
+
+from __future__ import annotations
+
+import re
+import warnings
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clrecon.dicom.text import escape_text
+from clrecon.errors import RefusedInputError, UsageError
+from clrecon.formats.extras import import_extra
+from clrecon.formats.grid_file import LABEL_MAP, GridFile, Purpose
+from clrecon.formats.stream import VoxelBytes, show_name
+from clrecon.geometry.affine import Float64Array, checked_affine, compose_affine
+
+__all__ = ["is_nrrd", "nrrd_affine", "open_nrrd"]
+
+LARGEST_HEADER = 2**20
+
+LPS_FROM_SPACE = {
+    "left-posterior-superior": (1.0, 1.0, 1.0), "lps": (1.0, 1.0, 1.0),
+    "right-anterior-superior": (-1.0, -1.0, 1.0), "ras": (-1.0, -1.0, 1.0),
+    "left-anterior-superior": (1.0, -1.0, 1.0), "las": (1.0, -1.0, 1.0),
+}  # fmt: skip
+"""Signs that take a frame that NRRD knows by name to LPS."""
+
+MM_PER_UNIT = {
+    **dict.fromkeys(("", "mm", "millimeter", "millimeters", "millimetre", "millimetres"), 1.0),
+    **dict.fromkeys(("cm", "centimeter", "centimeters"), 10.0),
+    **dict.fromkeys(("m", "meter", "meters", "metre", "metres"), 1000.0),
+    **dict.fromkeys(("um", "\u00b5m", "\u03bcm", "micron", "microns", "micrometer", "micrometers"), 0.001),
+}
+"""Of "space units"; without one mm, as everybody reads it."""
+
+TYPES = {
+    **dict.fromkeys(("signed char", "int8", "int8_t"), "i1"),
+    **dict.fromkeys(("uchar", "unsigned char", "uint8", "uint8_t"), "u1"),
+    **dict.fromkeys(("short", "short int", "signed short", "signed short int", "int16", "int16_t"), "i2"),
+    **dict.fromkeys(("ushort", "unsigned short", "unsigned short int", "uint16", "uint16_t"), "u2"),
+    **dict.fromkeys(("int", "signed int", "int32", "int32_t"), "i4"),
+    **dict.fromkeys(("uint", "unsigned int", "uint32", "uint32_t"), "u4"),
+    **dict.fromkeys(("longlong", "long long", "signed long long", "int64", "int64_t"), "i8"),
+    **dict.fromkeys(("ulonglong", "unsigned long long", "uint64", "uint64_t"), "u8"),
+    "float": "f4",
+    "double": "f8",
+}
+
+
+def is_nrrd(start: bytes) -> bool:
+    """True when the first bytes of a file are the mark of NRRD."""
+    return start[:4] == b"NRRD"
+
+
+def open_nrrd(path: Path, purpose: Purpose) -> GridFile:
+    """Read the header.
+
+    Raises
+    ------
+    UsageError
+        pynrrd is not installed.
+    RefusedInputError
+        The file is cut or corrupt, not placed, or has more than three axes (label maps: and a list of layers).
+    """
+    name = show_name(path)
+    with open(path, "rb") as file:
+        start = file.read(LARGEST_HEADER)
+    end = re.search(rb"\r?\n\r?\n", start)
+    if end is None:
+        raise RefusedInputError(f"{name} has no voxels: its NRRD header does not end within {LARGEST_HEADER:,} bytes")
+    header = _parse(start[: end.start()], name, purpose)
+    encoding = str(header.get("encoding", "")).lower()
+    if encoding not in ("raw", "gzip", "gz"):
+        raise RefusedInputError(f"{name} is stored as '{escape_text(encoding)}': raw and gzip are read, write it so")
+    layers, shape = _sizes(header, name, purpose)
+    dtype = _dtype(header, name, purpose)
+    return GridFile(
+        name=name,
+        purpose=purpose,
+        kind="NRRD",
+        shape_ijk=shape,
+        layers=layers,
+        dtype=dtype,
+        affine=nrrd_affine(header, name),
+        voxel_bytes=VoxelBytes(path, offset=end.end(), packing="raw" if encoding == "raw" else "gzip"),
+        warnings=_warnings(header),
+        fields=header,
+    )
+
+
+def _parse(text: bytes, name: str, purpose: Purpose) -> dict[str, Any]:
+    nrrd = import_extra("nrrd", purpose)
+    lines = [line + "\n" for line in text.decode("utf-8", "replace").splitlines()]
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            header = dict(nrrd.read_header([*lines, "\n"]))
+    except (nrrd.NRRDError, ValueError, KeyError, TypeError, OverflowError) as error:
+        raise RefusedInputError(f"{name} has a corrupt NRRD header: {escape_text(str(error))}") from error
+    for field in ("data file", "datafile", "line skip", "lineskip", "byte skip", "byteskip"):
+        if header.get(field) not in (None, 0):
+            raise RefusedInputError(
+                f"{name} says '{field}': NRRD files with header and voxels in one file, without a gap, are read"
+            )
+    return header
+
+
+def _warnings(header: dict[str, Any]) -> tuple[str, ...]:
+    if any(header.get(field) is not None for field in ("old min", "oldmin", "old max", "oldmax")):
+        return ("the header says that the values were quantised (old min, old max): they are taken as they are",)
+    return ()
+
+
+def _sizes(header: dict[str, Any], name: str, purpose: Purpose) -> tuple[int, tuple[int, int, int]]:
+    """Layers, and (ni, nj, nk): an axis of one beside the three that lie in space is none."""
+    try:
+        sizes = tuple(int(n) for n in header["sizes"])
+        kinds = [str(kind).lower() for kind in header.get("kinds", ["domain"] * len(sizes))]
+    except (KeyError, TypeError, ValueError) as error:
+        raise RefusedInputError(f"{name} has a corrupt NRRD header: no sizes") from error
+    in_space = _space_axes(header, len(sizes))
+    layered = purpose is LABEL_MAP and len(sizes) == 4 and kinds[:1] == ["list"]
+    beside = [n for axis, n in enumerate(sizes) if axis not in in_space]
+    single = len(in_space) == 3 and all(n == 1 for n in beside)
+    if header.get("dimension") != len(sizes) or not (single or layered):
+        or_layers = ", or a list of layers before them" if purpose is LABEL_MAP else ""
+        several = f"; split it into one file each of the {np.prod(beside)}" if len(in_space) == 3 and beside else ""
+        raise RefusedInputError(
+            f"{name} has {len(sizes)} axes ({' x '.join(map(str, sizes))}): a {purpose.noun} has three"
+            f"{or_layers}{several}"
+        )
+    ni, nj, nk = sizes[-3:] if layered else (sizes[axis] for axis in in_space)
+    return (sizes[0] if layered else 1), (ni, nj, nk)
+
+
+def _space_axes(header: dict[str, Any], count: int) -> list[int]:
+    """The axes that have a direction; all of them where nothing is said."""
+    try:
+        directions: NDArray[np.float64] = np.asarray(header["space directions"], dtype=np.float64)
+        if directions.ndim != 2 or len(directions) != count:
+            return list(range(count))
+        return [axis for axis, step in enumerate(directions) if not np.isnan(step).all()]
+    except (KeyError, TypeError, ValueError):
+        return list(range(count))  # `nrrd_affine` says what is wrong
+
+
+def _dtype(header: dict[str, Any], name: str, purpose: Purpose) -> np.dtype[Any]:
+    code = TYPES.get(str(header.get("type", "")).lower())
+    if code is None:
+        raise RefusedInputError(
+            f"{name} is not a {purpose.noun}: its voxels are '{escape_text(str(header.get('type')))}'; one real number"
+            " each is read"
+        )
+    endian = str(header.get("endian", "")).lower()
+    if code[1:] != "1" and endian not in ("little", "big"):
+        raise RefusedInputError(f"{name} has a corrupt NRRD header: it does not say its endian")
+    return np.dtype((">" if endian == "big" else "<") + code)
+
+
+def nrrd_affine(header: dict[str, Any], name: str) -> Float64Array:
+    """The affine of a NRRD header, from the frame that it names to LPS.
+
+    Parameters
+    ----------
+    header : dict
+        As `nrrd.read_header` gives it.
+    name : str
+        Of the file, for messages.
+
+    Returns
+    -------
+    ndarray, shape (4, 4), float64
+        Index (i, j, k) to LPS mm, of the three axes that have a direction.
+
+    Raises
+    ------
+    RefusedInputError
+        No frame or one without a known direction, unknown units, no directions or origin, or they are no affine.
+    """
+    space = str(header.get("space", "")).strip().lower()
+    if space not in LPS_FROM_SPACE:
+        raise RefusedInputError(
+            f"{name} does not say where it lies in the patient (space '{escape_text(space)}'): write it with the space"
+            " left-posterior-superior, right-anterior-superior or left-anterior-superior"
+        )
+    signs = np.array(LPS_FROM_SPACE[space])
+    try:
+        directions: NDArray[np.float64] = np.asarray(header["space directions"], dtype=np.float64)
+        if len(directions) != header["dimension"]:
+            raise ValueError(f"{len(directions)} directions for {header['dimension']} axes")
+        steps = directions[_space_axes(header, len(directions))]
+        if len(steps) != 3:
+            raise ValueError(f"{len(steps)} axes with a direction")
+        origin = np.asarray(header["space origin"], dtype=np.float64)
+        signs = signs * _unit_scale(header, name)
+        return checked_affine(compose_affine(steps[0] * signs, steps[1] * signs, steps[2] * signs, origin * signs))
+    except (KeyError, IndexError, TypeError, ValueError, UsageError) as error:
+        raise RefusedInputError(
+            f"{name} cannot be placed: its space directions and space origin are no affine ({escape_text(str(error))})"
+        ) from error
+
+
+def _unit_scale(header: dict[str, Any], name: str) -> NDArray[np.float64]:
+    """Millimetres of one unit of each axis of the frame."""
+    units = header.get("space units") or ["mm"] * 3
+    scales = [MM_PER_UNIT.get(str(unit).strip(' "').lower()) for unit in units]
+    if len(scales) != 3 or None in scales:
+        raise RefusedInputError(
+            f"{name} has lengths in unknown units ({escape_text(' '.join(map(str, units)))}): mm, cm, m and um are read"
+        )
+    return np.array(scales, dtype=np.float64)

@@ -1,0 +1,80 @@
+"""`read_grid` and `list_grid`: one file that is not DICOM as a volume, and as a listing."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from clrecon.dicom.certificate import collect_voxel_warnings
+from clrecon.dicom.scan import Progress
+from clrecon.dicom.series import SeriesEntry, SeriesListing
+from clrecon.errors import RefusedInputError
+from clrecon.formats.certificate import MODALITY, certify_grid, collect_header_warnings, gap_mm
+from clrecon.formats.grid_file import VOLUME, GridFile
+from clrecon.formats.kinds import open_grid
+from clrecon.formats.stream import show_name
+from clrecon.formats.values import read_values
+from clrecon.geometry import Volume, column_spacing, tilt_degrees
+
+__all__ = ["list_grid", "read_grid"]
+
+
+def read_grid(path: Path, kind: str, *, progress: Progress | None = None) -> Volume:
+    """Read a volume.
+
+    Parameters
+    ----------
+    path : Path
+    kind : {"NIfTI", "NRRD", "MetaImage"}
+        As `clrecon.formats.kinds.tell_kind` says.
+    progress : callable, optional
+        Called as ``progress("read", done, total)``.
+
+    Raises
+    ------
+    UsageError
+        A package is missing; the message names the extra that brings it.
+    RefusedInputError
+        The file is cut or corrupt, no volume of real numbers, or does not say where it lies.
+    """
+    grid = _open(path, kind)
+    values = read_values(grid, progress)
+    warnings = [
+        *collect_header_warnings(grid),
+        *values.warnings,
+        *collect_voxel_warnings(values.voxels, values.facts),
+    ]
+    return Volume(values.voxels, grid.affine, certify_grid(grid, values.facts, warnings))
+
+
+def list_grid(path: Path, kind: str) -> SeriesListing:
+    """List the one volume of a file, from its header alone; parameters and errors as in `read_grid`."""
+    grid = _open(path, kind)
+    gap = gap_mm(grid)
+    entry = SeriesEntry(
+        number=1,
+        uid_hash=None,
+        description=f"{grid.kind} file, voxels {grid.dtype.name}",
+        modality=MODALITY,
+        slices=grid.shape_ijk[2],
+        shape_ijk=list(grid.shape_ijk),
+        spacing_mm=list(column_spacing(grid.affine)),
+        affine_ijk_to_lps_mm=grid.affine.tolist(),
+        tilt_deg=tilt_degrees(grid.affine),
+        grid_residual_max_mm=None,
+        gap_mm={"min": gap, "max": gap},
+        uneven=False,
+        warnings=collect_header_warnings(grid),
+        problems=[],
+    )
+    return SeriesListing([entry], 1, {}, [])
+
+
+def _open(path: Path, kind: str) -> GridFile:
+    try:
+        grid = open_grid(path, kind, VOLUME)
+    except OSError as error:
+        raise RefusedInputError(f"{show_name(path)} cannot be read: {error.strerror or error}") from error
+    if min(grid.shape_ijk) < 2:
+        shown = " x ".join(map(str, grid.shape_ijk))
+        raise RefusedInputError(f"{grid.name} has {shown} voxels: a volume has two at least along each axis")
+    return grid

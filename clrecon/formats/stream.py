@@ -1,0 +1,208 @@
+"""Numbers out of a stream of bytes, slice by slice, within the memory that the file can account for.
+
+Headers are written by strangers: a small file may promise a huge array, or name a file that is none of its own.
+Nothing is taken before the promise was compared with the bytes that are there, and what is compressed is inflated one
+slice at a time.
+"""
+
+from __future__ import annotations
+
+import gzip
+import io
+import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from math import prod
+from pathlib import Path, PurePosixPath, PureWindowsPath
+from typing import Any, BinaryIO, cast
+
+from clrecon.dicom.text import escape_text
+from clrecon.errors import RefusedInputError
+
+__all__ = ["LARGEST_GRID", "VoxelBytes", "check_end", "check_size", "file_beside", "read_bytes", "show_name"]
+
+DEFLATE_RATIO = 1032
+"""Deflate cannot shrink anything further than this (zlib's technical note)."""
+
+LARGEST_GRID = 2**32
+"""Voxels; 1000 slices of 2048 x 2048."""
+
+LARGEST_SLICE_BYTES = 2**28
+"""As they are stored: slices are inflated one at a time."""
+
+_CHUNK = 2**18
+
+
+def show_name(path: Path) -> str:
+    """The name of a file for messages."""
+    return escape_text(path.name)
+
+
+@dataclass(frozen=True)
+class VoxelBytes:
+    """Where the numbers of a grid are.
+
+    Attributes
+    ----------
+    path : Path
+        The file itself, or the one that its header names.
+    offset : int
+        Bytes before them in the file, where what is compressed begins.
+    packing : {"raw", "gzip", "zlib"}
+    skip : int
+        Inflated bytes before them.
+    """
+
+    path: Path
+    offset: int = 0
+    packing: str = "raw"
+    skip: int = 0
+
+    @property
+    def compressed(self) -> bool:
+        """The numbers are deflated."""
+        return self.packing != "raw"
+
+    @property
+    def file_bytes(self) -> int:
+        """Size of the file."""
+        return self.path.stat().st_size
+
+    @contextmanager
+    def open(self, name: str) -> Iterator[BinaryIO]:
+        """The stream of the numbers, from the first one on; `name` for messages."""
+        with open(self.path, "rb") as file:
+            file.seek(self.offset)
+            stream: BinaryIO = file
+            if self.packing == "gzip":
+                stream = cast(BinaryIO, gzip.GzipFile(fileobj=file))
+            elif self.packing == "zlib":
+                stream = cast(BinaryIO, ZlibFile(file))
+            read_bytes(stream, self.skip, name, "its header")
+            yield stream
+
+
+class ZlibFile(io.RawIOBase):
+    """What a zlib stream inflates to; at its end its checksum is compared."""
+
+    def __init__(self, file: BinaryIO):
+        super().__init__()
+        self._file, self._inflater = file, zlib.decompressobj()
+
+    def readable(self) -> bool:
+        """Always."""
+        return True
+
+    def readinto(self, buffer: Any) -> int:
+        """Fill `buffer` as far as one step inflates; 0 at the end.
+
+        Raises
+        ------
+        EOFError
+            The stream ends before its own end.
+        zlib.error
+            It is corrupt.
+        """
+        target = memoryview(buffer).cast("B")
+        while len(target) and not self._inflater.eof:  # a limit of 0 bytes would be none
+            packed = self._inflater.unconsumed_tail or self._file.read(_CHUNK)
+            part = self._inflater.decompress(packed, len(target))
+            if part:
+                target[: len(part)] = part
+                return len(part)
+            if not packed:
+                raise EOFError("the compressed data end early")
+        return 0
+
+
+def check_size(name: str, shape: tuple[int, ...], item_bytes: int, file_bytes: int, compressed: bool) -> None:
+    """Compare what a header promises with what the file can hold.
+
+    Parameters
+    ----------
+    name : str
+        Of the file.
+    shape : tuple of int
+    item_bytes : int
+        Bytes a number.
+    file_bytes : int
+        Size of the file.
+    compressed : bool
+        The data are deflated.
+
+    Raises
+    ------
+    RefusedInputError
+        The sizes are impossible.
+    """
+    if min(shape) < 1 or prod(shape) > LARGEST_GRID:
+        raise RefusedInputError(
+            f"{name} says that it has {' x '.join(map(str, shape))} voxels: at least 1 an axis and at most"
+            f" {LARGEST_GRID:,} altogether are read"
+        )
+    if prod(shape[:-1]) * item_bytes > LARGEST_SLICE_BYTES:
+        raise RefusedInputError(
+            f"{name} says that a slice has {' x '.join(map(str, shape[:-1]))} numbers of {item_bytes} bytes: at most"
+            f" {LARGEST_SLICE_BYTES:,} bytes are read"
+        )
+    promised = prod(shape) * item_bytes
+    possible = file_bytes * (DEFLATE_RATIO if compressed else 1)
+    if promised > possible:
+        raise RefusedInputError(
+            f"{name} is cut or corrupt: {' x '.join(map(str, shape))} numbers of {item_bytes} bytes cannot come from"
+            f" a file of {file_bytes:,} bytes"
+        )
+
+
+def read_bytes(stream: BinaryIO, count: int, name: str, where: str) -> bytes:
+    """Exactly `count` bytes of a stream, which may be compressed.
+
+    Raises
+    ------
+    RefusedInputError
+        The stream ends before, or is corrupt.
+    """
+    parts, missing = [], count
+    try:
+        while missing > 0:
+            part = stream.read(missing)
+            if not part:
+                raise RefusedInputError(f"{name} is cut: it ends in {where}, {missing:,} bytes before its end")
+            parts.append(part)
+            missing -= len(part)
+    except (EOFError, zlib.error, OSError) as error:
+        raise RefusedInputError(f"{name} is cut or corrupt in {where}: {escape_text(str(error))}") from error
+    return parts[0] if len(parts) == 1 else b"".join(parts)
+
+
+def check_end(stream: BinaryIO, name: str) -> None:
+    """Read to the end of compressed data, where their checksum is."""
+    try:
+        stream.read(1)
+    except (EOFError, zlib.error, OSError) as error:
+        raise RefusedInputError(f"{name} is cut or corrupt at its end: {escape_text(str(error))}") from error
+
+
+def file_beside(header: Path, named: str) -> Path:
+    """The file of voxels that a header names: in the folder of the header or below it.
+
+    Raises
+    ------
+    RefusedInputError
+        It lies, or a link leads, elsewhere; it is not there, or no regular file.
+    """
+    name, shown = show_name(header), escape_text(named)
+    paths = (PurePosixPath(named), PureWindowsPath(named))
+    if "\0" in named or any(path.anchor or ".." in path.parts for path in paths):
+        raise RefusedInputError(f"{name} says that its voxels are in '{shown}': only files beside it are read")
+    folder = header.parent.resolve()
+    try:
+        found = (folder / named).resolve(strict=True)
+    except (OSError, RuntimeError) as error:
+        raise RefusedInputError(f"{name} says that its voxels are in '{shown}', which is not there") from error
+    if not found.is_relative_to(folder):
+        raise RefusedInputError(f"{name} says that its voxels are in '{shown}', a link to another folder: not read")
+    if not found.is_file():
+        raise RefusedInputError(f"{name} says that its voxels are in '{shown}', which is no regular file")
+    return found

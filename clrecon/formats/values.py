@@ -1,0 +1,178 @@
+"""The values of a grid file as voxels of a volume, and doubts whether they are HU.
+
+One rule for every type that is stored: values that are whole numbers, all of them, are whole HU (int16 where every one
+fits, else int32), whatever they are stored as; anything else is float32.  So a CT is the same volume, and gives the
+same mesh, whether it comes from DICOM or from a file that somebody saved it into as float64.  The type is found out on
+the way, in one pass: the volume is widened when a slice asks for more.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clrecon.dicom.pixels import MEMORY_SHARE, PixelFacts, available_memory_bytes
+from clrecon.dicom.scan import Progress
+from clrecon.errors import RefusedInputError
+from clrecon.formats.grid_file import GridFile
+from clrecon.geometry import AIR_HU
+from clrecon.geometry.aligned import aligned_empty
+
+__all__ = ["GridValues", "read_values"]
+
+LADDER = (np.dtype(np.int16), np.dtype(np.int32), np.dtype(np.float32))
+"""Types of a volume, each wider than the one before."""
+
+MOST_LABELS = 256
+"""Different whole numbers: label maps have up to some 120, 8-bit images 256, a CT some thousand."""
+LARGEST_LABEL = 65_535
+
+LEAST_SPAN = 100.0
+"""From air to soft tissue are 1000 HU; normalised values span 1, standardised ones some 10."""
+
+
+@dataclass(frozen=True)
+class GridValues:
+    """Voxels (nk, nj, ni) int16, int32 or float32, what was seen in them, and warnings about them."""
+
+    voxels: NDArray[Any]
+    facts: PixelFacts
+    warnings: list[str]
+
+
+def read_values(grid: GridFile, progress: Progress | None = None) -> GridValues:
+    """Read the voxels of a grid file, scaled as it says.
+
+    NaN, which resampling writes where there was no image, becomes `AIR_HU` with a warning.
+
+    Parameters
+    ----------
+    grid : GridFile
+    progress : callable, optional
+        Called as ``progress("read", done, total)``.
+
+    Raises
+    ------
+    RefusedInputError
+        The data are cut or corrupt, hold infinity, whole numbers beyond 32 bits or nothing but NaN; the volume does
+        not fit into memory.
+    """
+    filling = _Filling(grid)
+    for k, stored in enumerate(grid.iterate_slices()):
+        filling.add(k, stored)
+        if progress is not None:
+            progress("read", k + 1, grid.shape_ijk[2])
+    return filling.finish()
+
+
+class _Filling:
+    """A volume that is filled slice by slice."""
+
+    def __init__(self, grid: GridFile):
+        self._grid = grid
+        self._step = 0  # of the ladder
+        self._voxels = _allocate(grid, LADDER[0])
+        self._holes, self._low, self._high = 0, np.inf, -np.inf
+
+    def add(self, k: int, stored: NDArray[Any]) -> None:
+        """Take slice `k` as it is stored."""
+        values = _scale(stored, self._grid)
+        holes = np.isnan(values) if values.dtype.kind == "f" else None
+        if holes is not None and holes.any():
+            measured = values[~holes]
+            self._holes += values.size - measured.size
+            values = np.where(holes, values.dtype.type(AIR_HU), values)
+        else:
+            measured = values
+        if measured.size:
+            low, high = measured.min().item(), measured.max().item()
+            self._low, self._high = min(self._low, low), max(self._high, high)
+            self._widen(k, self._step_for(k, measured, low, high))
+        np.copyto(self._voxels[k], values, casting="unsafe")  # the step holds them all
+
+    def _step_for(self, k: int, measured: NDArray[Any], low: float, high: float) -> int:
+        """The first step of the ladder that holds these values, not below the one that is reached."""
+        grid = self._grid
+        if not abs(low) + abs(high) < np.inf:
+            raise RefusedInputError(f"{grid.name} is corrupt: {grid.place(k)} holds infinity, which is no CT number")
+        whole = measured.dtype.kind != "f"
+        if not whole and (self._step == 2 or not np.array_equal(measured, np.rint(measured))):
+            if max(abs(low), abs(high)) > np.finfo(np.float32).max:
+                raise RefusedInputError(f"{grid.name}: {grid.place(k)} goes from {low:g} to {high:g}, beyond float32")
+            return 2
+        for step in range(self._step, 2):
+            half = 1 << (8 * LADDER[step].itemsize - 1)
+            if -half <= low and high < half:
+                return step
+        if whole:
+            raise RefusedInputError(
+                f"{grid.name}: {grid.place(k)} goes from {low:,} to {high:,}: whole numbers beyond 32 bits are no CT"
+                " numbers"
+            )
+        return 2
+
+    def _widen(self, k: int, step: int) -> None:
+        """Go up the ladder with the first `k` slices."""
+        if step > self._step:
+            narrow, self._step = self._voxels, step
+            self._voxels = _allocate(self._grid, LADDER[step])
+            self._voxels[:k] = narrow[:k]
+
+    def finish(self) -> GridValues:
+        """What has been read."""
+        voxels, low, high = self._voxels, self._low, self._high
+        if self._holes == voxels.size:
+            raise RefusedInputError(f"{self._grid.name} holds no values: all of its voxels are NaN")
+        warnings = _doubts(voxels, low, high)
+        if self._holes:
+            share = self._holes / voxels.size
+            warnings.insert(0, f"{self._holes:,} voxels ({share:.2%}) are NaN: {AIR_HU} HU, air, is taken for them")
+            low, high = min(low, AIR_HU), max(high, AIR_HU)
+        return GridValues(voxels, PixelFacts(self._holes / voxels.size, float(low), float(high)), warnings)
+
+
+def _allocate(grid: GridFile, dtype: np.dtype[Any]) -> NDArray[Any]:
+    ni, nj, nk = grid.shape_ijk
+    needed = ni * nj * nk * dtype.itemsize
+    available = available_memory_bytes()
+    what = f"{grid.name} has {ni} x {nj} x {nk} voxels, which need {needed / 2**30:.2f} GiB of memory"
+    if available is not None and needed > MEMORY_SHARE * available:
+        raise RefusedInputError(f"{what}; {available / 2**30:.2f} GiB are free")
+    try:
+        return aligned_empty((nk, nj, ni), dtype)
+    except MemoryError as error:
+        raise RefusedInputError(f"{what}, which cannot be had") from error
+
+
+def _scale(stored: NDArray[Any], grid: GridFile) -> NDArray[Any]:
+    """``stored * slope + intercept``: exact for whole numbers, else in float64."""
+    if not grid.scaled:
+        return stored
+    slope, intercept = grid.slope, grid.intercept
+    whole = slope.is_integer() and intercept.is_integer() and max(abs(slope), abs(intercept)) < 2**30
+    if whole and stored.dtype.kind in "iu" and stored.dtype.itemsize <= 4:
+        return stored.astype(np.int64) * int(slope) + int(intercept)
+    with np.errstate(over="ignore", invalid="ignore"):
+        return stored.astype(np.float64) * slope + intercept
+
+
+def _doubts(voxels: NDArray[Any], low: float, high: float) -> list[str]:
+    """Why the values may not be HU; `low` and `high` are those that were measured."""
+    span = f"the values run from {low:.5g} to {high:.5g}"
+    if low >= 0 and voxels.dtype.kind == "i" and high <= LARGEST_LABEL:
+        seen = np.zeros(int(high) + 1, dtype=bool)
+        for plane in voxels:
+            seen[plane[plane >= 0]] = True
+        if np.count_nonzero(seen) <= MOST_LABELS:
+            return [
+                f"{span} in {np.count_nonzero(seen)} different whole numbers: this looks like a label map (those go"
+                " with --labels) or an 8-bit image, not like HU"
+            ]
+    if high - low < LEAST_SPAN:
+        return [f"{span}: normalised, not HU"]
+    if low >= 0:
+        return [f"{span}, none is below 0: not HU, or HU with an offset (often 1024), which iso values then need too"]
+    return []

@@ -1,0 +1,103 @@
+"""Label maps out of grid files: NIfTI with a label table, NRRD with 3D Slicer's segments and layers, MetaImage.
+
+Source: 3D Slicer's segmentation file format; the label table of Caret and Connectome Workbench.
+"""
+
+from __future__ import annotations
+
+import html
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from numpy.typing import NDArray
+
+from clrecon.errors import RefusedInputError
+from clrecon.formats.grid_file import GridFile
+from clrecon.labels.label_map import LabelMap
+from clrecon.labels.overlap import Painter
+from clrecon.labels.stream import empty_labels, iterate_labels
+
+__all__ = ["read_grid_labels"]
+
+_LABEL = re.compile(
+    rb'<Label\b[^>]{0,500}?\bKey="([0-9]{1,9})"[^>]{0,500}>\s*(?:<!\[CDATA\[(.*?)\]\]>|([^<]*))', re.DOTALL
+)
+
+
+@dataclass(frozen=True)
+class _Segment:
+    """One segment of a .seg.nrrd: the voxels of `layer` that hold `value`."""
+
+    number: int
+    name: str
+    layer: int
+    value: int
+
+
+def read_grid_labels(grid: GridFile, only: tuple[str | int, ...] | None = None) -> LabelMap:
+    """Read a label map or a segmentation.
+
+    Parameters
+    ----------
+    grid : GridFile
+    only : tuple of str or int, optional
+        The labels that are wanted: others may overlap.
+
+    Raises
+    ------
+    UsageError
+        A wanted label is not there.
+    RefusedInputError
+        The file is cut or corrupt, no label map, or segments overlap.
+    """
+    segments = _read_segments(grid.fields, grid.name)
+    if grid.layers > 1 and not segments:
+        raise RefusedInputError(f"{grid.name} has {grid.layers} layers and does not say which segments they hold")
+    ni, nj, nk = grid.shape_ijk
+    voxels = empty_labels(grid.name, (nk, nj, ni))
+    if grid.layers > 1:
+        return _merge_layers(grid, voxels, segments, only)
+    for k, plane in enumerate(iterate_labels(grid)):
+        if plane.any():
+            voxels[k] = plane
+    names = {segment.number: segment.name for segment in segments} or _read_names(grid.extension)
+    return LabelMap(voxels, grid.affine, names, warnings=grid.warnings)
+
+
+def _merge_layers(
+    grid: GridFile, voxels: NDArray[Any], segments: Iterable[_Segment], only: tuple[str | int, ...] | None
+) -> LabelMap:
+    """One map of segments that are stored in layers; numbers that layers share are given anew."""
+    segments = list(segments)
+    if len({segment.number for segment in segments}) < len(segments):
+        segments = [_Segment(n, s.name, s.layer, s.value) for n, s in enumerate(segments, start=1)]
+    painter = Painter(grid.name, voxels, {s.number: s.name for s in segments}, only)
+    in_order = {number: place for place, number in enumerate(painter.order)}
+    for k, stack in enumerate(iterate_labels(grid)):
+        for segment in sorted(segments, key=lambda s: in_order[s.number]):
+            painter.paint(k, segment.number, stack[..., segment.layer] == segment.value)
+    return painter.finish(grid.affine, warnings=grid.warnings)
+
+
+def _read_segments(fields: Mapping[str, Any], name: str) -> list[_Segment]:
+    """The segments that the header of a .seg.nrrd names, in their order."""
+    segments = []
+    numbers = sorted({int(m[1]) for field in fields if (m := re.fullmatch(r"Segment([0-9]{1,5})_LabelValue", field))})
+    for n in numbers:
+        try:
+            value, layer = int(fields[f"Segment{n}_LabelValue"]), int(fields.get(f"Segment{n}_Layer", 0))
+        except ValueError as error:
+            raise RefusedInputError(f"{name} has a corrupt NRRD header: value or layer of segment {n}") from error
+        segments.append(_Segment(value, str(fields.get(f"Segment{n}_Name", "")), layer, value))
+    return segments
+
+
+def _read_names(extension: bytes) -> dict[int, str]:
+    """Names in a label table as Caret, Connectome Workbench and TotalSegmentator write it into the header of NIfTI."""
+    names = {}
+    for match in _LABEL.finditer(extension):
+        text = (match[2] or match[3] or b"").decode("utf-8", "replace")
+        names[int(match[1])] = text if match[2] is not None else html.unescape(text)
+    return {number: text for number, text in names.items() if text.strip()}

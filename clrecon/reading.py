@@ -1,0 +1,130 @@
+"""`read_volume` and `list_series` for every kind of input: a folder or file of DICOM, or one file of another format.
+
+The kind is told from the content of the file; its name is not trusted.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from clrecon.dicom.text import escape_text
+from clrecon.errors import RefusedInputError, UsageError
+
+if TYPE_CHECKING:
+    from clrecon.dicom.scan import Progress
+    from clrecon.dicom.series import SeriesListing
+    from clrecon.geometry import Volume
+
+__all__ = ["list_series", "read_volume", "refuse_dicom_options"]
+
+_OTHER_FORMATS = ("NIfTI", "NRRD", "MetaImage")
+_NAMES = (".nii", ".nii.gz", ".hdr", ".img", ".img.gz", ".nrrd", ".nhdr", ".mha", ".mhd")
+"""Ends of names of these formats: for messages alone."""
+
+
+def read_volume(
+    path: str | os.PathLike[str],
+    series: int | str | None = None,
+    *,
+    progress: Progress | None = None,
+    **dicom_options: Any,
+) -> Volume:
+    """Read a volume in HU and LPS mm, from DICOM or from a NIfTI, NRRD or MetaImage file.
+
+    Parameters
+    ----------
+    path : str or path-like
+        A folder of DICOM files, searched with its subfolders; one DICOM file; or a file with a grid and its affine:
+        NIfTI (.nii, .nii.gz, .hdr with .img), NRRD (.nrrd), MetaImage (.mha, .mhd).  Those need the extra
+        ``clrecon[volumes]``.  Told from the content.
+    series : int or str, optional
+        Which series of a DICOM folder, see `clrecon.dicom.read_volume`.
+    progress : callable, optional
+        Called as ``progress(stage, done, total)`` with stage "scan" or "read".
+    **dicom_options
+        Further options of `clrecon.dicom.read_volume`.
+
+    Returns
+    -------
+    Volume
+        ``voxels`` (nk, nj, ni) int16, int32 or float32; ``affine`` index (i, j, k) to LPS mm; ``report`` the
+        certificate.  Of files that are not DICOM the values are what the file says (with its slope and intercept):
+        whole numbers int16 or int32 whatever type they are stored in, others float32, NaN -1024.
+
+    Raises
+    ------
+    NoDicomError
+        Nothing there, no DICOM, or no CT.
+    RefusedInputError
+        Corrupt files, or geometry or values that cannot be trusted; names files and figures.
+    UsageError
+        `series` names none or several; an option for DICOM with another format; a missing package; `path` is empty.
+    """
+    kind = _tell_format(path)
+    if kind is None:
+        from clrecon.dicom import read_volume as read_dicom
+
+        return read_dicom(path, series, progress=progress, **dicom_options)
+    _refuse_options(kind, series=series, **dicom_options)
+    from clrecon.formats import read_grid
+
+    return read_grid(Path(path), kind, progress=progress)
+
+
+def list_series(path: str | os.PathLike[str], *, progress: Progress | None = None) -> SeriesListing:
+    """List what `read_volume` can read at a path; of files that are not DICOM one entry, from the header alone.
+
+    Parameters
+    ----------
+    path, progress
+        As in `read_volume`.
+
+    Raises
+    ------
+    NoDicomError, RefusedInputError, UsageError
+        As `clrecon.dicom.list_series`; a file of another format is corrupt or its package is missing.
+    """
+    kind = _tell_format(path)
+    if kind is None:
+        from clrecon.dicom import list_series as list_dicom
+
+        return list_dicom(path, progress=progress)
+    from clrecon.formats import list_grid
+
+    return list_grid(Path(path), kind)
+
+
+def refuse_dicom_options(path: str | os.PathLike[str], **options: Any) -> None:
+    """Raise UsageError where `path` is a file of another format than DICOM and one of `options` is given."""
+    kind = _tell_format(path)
+    if kind is not None:
+        _refuse_options(kind, **options)
+
+
+def _refuse_options(kind: str, **options: Any) -> None:
+    given = [name for name, value in options.items() if value is not None and value is not False]
+    if given:
+        raise UsageError(f"{' and '.join(given)}: only for DICOM, the input is a {kind} file")
+
+
+def _tell_format(path: str | os.PathLike[str]) -> str | None:
+    """One of the formats that are not DICOM; None leaves it, and what is wrong with it, to the DICOM reader."""
+    from clrecon.formats import tell_kind
+
+    try:
+        file = Path(path)
+        if not os.fspath(path).strip() or not file.is_file():  # a folder, nothing there, a device
+            return None
+        kind = tell_kind(file)
+    except (TypeError, ValueError, OSError):
+        return None
+    if kind in _OTHER_FORMATS:
+        return kind
+    if kind is None and file.name.lower().endswith(_NAMES):
+        pair = "; of a NIfTI pair give the .hdr" if file.name.lower().endswith((".img", ".img.gz")) else ""
+        raise RefusedInputError(
+            f"{escape_text(file.name)} is no NIfTI, NRRD or MetaImage file, whatever its name says{pair}"
+        )
+    return None
