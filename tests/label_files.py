@@ -33,6 +33,7 @@ def write_nifti(
     image = getattr(nibabel, kind)(array.transpose(range(array.ndim)[::-1]), None, dtype=array.dtype)
     image.header.set_data_dtype(array.dtype)
     image.header.set_xyzt_units("mm")
+    image.header["pixdim"][1:4] = np.linalg.norm(affine[:3, :3], axis=0)
     image.header.set_sform(RAS @ affine if sform else None, code=1 if sform else 0)
     image.header.set_qform(RAS @ affine if qform else None, code=1 if qform else 0)
     if extension is not None:

@@ -40,6 +40,7 @@ ROUNDED_AFFINE_MM = 0.006  # positions rounded to 0.01 mm: half of it, and the f
 THOUSAND_FRAMES_S = 1.0  # headers of 1000 frames in one file, on a busy machine; measured 0.11
 
 # --- labels ---
+NIFTI_LARGE_AFFINE_MM = 5e-5  # the same of coordinates up to 1000 mm: half a unit of float32 is 3e-5
 NIFTI_AFFINE_MM = 1e-5  # sform entries and quaternions are float32: coordinates of some 100 mm
 
 REAL_SOLID_VOLUME = 0.05  # a vertebra at 2 mm and 200 HU against its mask, which a network drew; measured -1.2 %

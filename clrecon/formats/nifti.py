@@ -36,6 +36,9 @@ MM_PER_UNIT = {0: 1.0, 1: 1000.0, 2: 1.0, 3: 0.001}
 AFFINES_DIFFER_MM = 0.1
 """sform and qform that are this far apart at a corner are said to disagree: quaternions are float32."""
 
+SPACINGS_DIFFER = 0.01
+"""Of the longest step; ITK takes the spacing from pixdim, others from the sform."""
+
 _FIRST = (b"\x5c\x01\0\0", b"\0\0\x01\x5c")
 _SECOND = (b"\x1c\x02\0\0", b"\0\0\x02\x1c")
 """The size of the header, 348 or 540, which both begin with; little and big endian."""
@@ -181,7 +184,7 @@ def nifti_affine(header: Any, shape: tuple[int, int, int], name: str) -> tuple[F
     affine : ndarray, shape (4, 4), float64
         Index (i, j, k) to LPS mm.
     warnings : list of str
-        One where sform and qform disagree.
+        Where sform and qform, or the affine and pixdim, disagree.
 
     Raises
     ------
@@ -206,6 +209,10 @@ def nifti_affine(header: Any, shape: tuple[int, int, int], name: str) -> tuple[F
     except UsageError as error:
         raise RefusedInputError(f"{name} cannot be placed: {error}") from error
     warnings = []
+    sides, stated = np.linalg.norm(chosen[:3, :3], axis=0), np.abs(header["pixdim"][1:4]).astype(np.float64)
+    if not np.abs(sides - stated).max() <= SPACINGS_DIFFER * sides.max():
+        shown = [" x ".join(f"{unit * step:.4g}" for step in steps) for steps in (stated, sides)]
+        warnings.append(f"pixdim says a spacing of {shown[0]} mm, the affine {shown[1]} mm: the affine is used")
     if sform is not None and qform is not None:
         corners = np.array([[i, j, k, 1] for i in (0, shape[0]) for j in (0, shape[1]) for k in (0, shape[2])])
         apart = unit * np.linalg.norm(corners @ (sform - qform).T, axis=1).max()

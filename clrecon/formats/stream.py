@@ -31,6 +31,9 @@ LARGEST_GRID = 2**32
 LARGEST_SLICE_BYTES = 2**28
 """As they are stored: slices are inflated one at a time."""
 
+LARGEST_SURPLUS = 4096
+"""Bytes after the last number: some writers fill up a block."""
+
 _CHUNK = 2**18
 
 
@@ -177,9 +180,20 @@ def read_bytes(stream: BinaryIO, count: int, name: str, where: str) -> bytes:
 
 
 def check_end(stream: BinaryIO, name: str) -> None:
-    """Read to the end of compressed data, where their checksum is."""
+    """Read to the end of the data, where the checksum of what is compressed is.
+
+    Raises
+    ------
+    RefusedInputError
+        It is wrong, or a good deal follows the last number: damaged data inflate to more as often as to less, and a
+        header with a damaged size promises less.
+    """
+    found = 0
     try:
-        stream.read(1)
+        while part := stream.read(LARGEST_SURPLUS + 1):
+            found += len(part)
+            if found > LARGEST_SURPLUS:
+                raise RefusedInputError(f"{name} is corrupt: it holds more numbers than its header says")
     except (EOFError, zlib.error, OSError) as error:
         raise RefusedInputError(f"{name} is cut or corrupt at its end: {escape_text(str(error))}") from error
 

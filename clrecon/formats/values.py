@@ -100,7 +100,7 @@ class _Filling:
             raise RefusedInputError(f"{grid.name} is corrupt: {grid.place(k)} holds infinity, which is no CT number")
         whole = measured.dtype.kind != "f"
         if not whole and (self._step == 2 or not np.array_equal(measured, np.rint(measured))):
-            if max(abs(low), abs(high)) > np.finfo(np.float32).max:
+            if max(abs(low), abs(high)) > float(np.finfo(np.float32).max):
                 raise RefusedInputError(f"{grid.name}: {grid.place(k)} goes from {low:g} to {high:g}, beyond float32")
             return 2
         for step in range(self._step, 2):

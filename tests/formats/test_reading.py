@@ -1,0 +1,110 @@
+"""One door for every input: the kind is told from the content, and what is for DICOM alone is refused elsewhere."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import sys
+
+import numpy as np
+import pytest
+from dicom_series import Plan, write_series
+from label_files import OBLIQUE
+from volume_files import WRITERS, make_ct
+
+import clrecon
+from clrecon.cli.main import main
+from clrecon.errors import NoDicomError, RefusedInputError, UsageError
+from clrecon.pipeline.info import describe_input
+
+pytest.importorskip("nibabel")
+pytest.importorskip("nrrd")
+pytest.importorskip("SimpleITK")
+
+
+@pytest.mark.parametrize("name", ["a.nii", "a.nii.gz", "gzip.nrrd", "packed.mha"])
+def test_names_are_not_trusted(tmp_path, name):
+    path = WRITERS[name](tmp_path / name, make_ct(), OBLIQUE)
+    for other in ("plain", "b.dcm", "c.nii.gz", "d.mha", "e.nrrd"):
+        shutil.copy(path, tmp_path / other)
+        assert np.array_equal(clrecon.read_volume(tmp_path / other).voxels, make_ct())
+
+
+def test_dicom_is_dicom_whatever_it_is_called_and_whatever_stands_before_it(tmp_path):
+    plan = Plan()
+    write_series(tmp_path, plan)
+    for n, file in enumerate(sorted(tmp_path.iterdir())):
+        content = bytearray(file.read_bytes())
+        content[:4] = (b"NRRD", b"\x5c\x01\0\0", b"NDim")[n % 3]
+        file.unlink()
+        (tmp_path / f"{n}.nii").write_bytes(content)
+    assert np.array_equal(clrecon.read_volume(tmp_path).voxels, plan.hu())
+    assert clrecon.list_series(tmp_path / "0.nii").series[0].modality == "CT"
+
+
+@pytest.mark.parametrize("content", [b"", b"hello", b"\x1f\x8b nonsense", bytes(600)])
+def test_what_is_nothing_of_it_is_refused(tmp_path, content):
+    (tmp_path / "a.nii.gz").write_bytes(content)
+    with pytest.raises(RefusedInputError, match="a.nii.gz is no NIfTI, NRRD or MetaImage file, whatever its name says"):
+        clrecon.read_volume(tmp_path / "a.nii.gz")
+    (tmp_path / "a").write_bytes(content)
+    with pytest.raises(NoDicomError):
+        clrecon.read_volume(tmp_path / "a")
+
+
+def test_what_is_no_path_is_said_as_for_dicom(tmp_path):
+    for nothing, kind in (("", UsageError), (None, UsageError), (tmp_path / "none.nii", NoDicomError)):
+        with pytest.raises(kind):
+            clrecon.read_volume(nothing)
+
+
+@pytest.mark.parametrize("option", [{"series": 1}, {"series": "x"}, {"phase": 2}, {"allow_gaps": True}])
+def test_options_for_dicom_alone_are_refused(tmp_path, option):
+    path = WRITERS["a.nii"](tmp_path / "a.nii", make_ct(), OBLIQUE)
+    with pytest.raises(UsageError, match=f"{next(iter(option))}: only for DICOM, the input is a NIfTI file"):
+        clrecon.read_volume(path, **option)
+    assert clrecon.read_volume(path, None, allow_gaps=False, phase=None).voxels.shape == (4, 6, 7)
+    with pytest.raises(UsageError, match="series: only for DICOM"):
+        describe_input(path, "1")
+
+
+@pytest.mark.parametrize(
+    ("name", "module", "package"),
+    [("a.nii", "nibabel", "nibabel"), ("raw.nrrd", "nrrd", "pynrrd"), ("a.mha", "SimpleITK", "SimpleITK")],
+)
+def test_without_its_package_the_extra_is_named(tmp_path, monkeypatch, name, module, package):
+    path = WRITERS[name](tmp_path / name, make_ct(), OBLIQUE)
+    monkeypatch.setitem(sys.modules, module, None)
+    with pytest.raises(UsageError, match=rf"this volume needs the package {package}: pip install 'clrecon\[volumes\]'"):
+        clrecon.read_volume(path)
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_the_report_and_the_listing_have_the_entries_of_dicom(tmp_path, name):
+    write_series(tmp_path / "ct", Plan())
+    path = WRITERS[name](tmp_path / name, make_ct(), OBLIQUE)
+    dicom, volume = clrecon.read_volume(tmp_path / "ct").report, clrecon.read_volume(path)
+    assert set(dicom) <= set(volume.report)
+    assert volume.report == json.loads(json.dumps(volume.report))
+    assert volume.report["shape_ijk"] == [7, 6, 4] and volume.report["slices"] == 4
+    assert volume.report["spacing_mm"] == pytest.approx(volume.spacing)
+    listing = describe_input(path).listing
+    assert listing["chosen"] == 1 and len(listing["series"]) == 1
+    entry = listing["series"][0]
+    assert set(entry) == set(describe_input(tmp_path / "ct").listing["series"][0])
+    assert entry["affine_ijk_to_lps_mm"] == volume.affine.tolist() and entry["problems"] == []
+    assert entry["modality"] == "unknown" and entry["description"].endswith("voxels int16")
+
+
+def test_the_command_line_takes_them(tmp_path, capsys, device):
+    sphere = np.linalg.norm(np.indices((24, 24, 24)) - 11.7, axis=0)
+    hu = np.clip(1000 - 250 * (sphere - 7), -1000, 1000).astype(np.int16)
+    path = WRITERS["packed.mha"](tmp_path / "a.mha", hu, OBLIQUE)
+    assert main(["info", str(path), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["series"][0]["shape_ijk"] == [24, 24, 24]
+    out = tmp_path / "bone.stl"
+    assert main(["mesh", str(path), "-o", str(out), "--device", str(device.index), "--json"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert report["closed"] and report["volume"]["format"] == "MetaImage" and out.stat().st_size > 1000
+    assert any(text.startswith("not DICOM") for text in report["warnings"])
+    assert main(["mesh", str(path), "-o", str(out), "--series", "1"]) == 3

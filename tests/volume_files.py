@@ -1,0 +1,79 @@
+"""CT volumes in every format that is read, written by nibabel, by pynrrd, and MetaImage by hand from its definition."""
+
+from __future__ import annotations
+
+import zlib
+
+import numpy as np
+from label_files import OBLIQUE, write_nifti, write_nrrd
+
+ROTATED = OBLIQUE.copy()
+ROTATED[:3, :3] = np.linalg.qr(OBLIQUE[:3, :3])[0] @ np.diag((0.7, 0.5, 2.5))
+"""ijk to LPS mm: unequal steps at right angles, oblique."""
+
+LEFT_HANDED = OBLIQUE @ np.diag((1.0, -1.0, 1.0, 1.0))
+
+META_TYPES = {"i1": "CHAR", "u1": "UCHAR", "i2": "SHORT", "u2": "USHORT", "i4": "INT", "u4": "UINT",
+              "i8": "LONG_LONG", "u8": "ULONG_LONG", "f4": "FLOAT", "f8": "DOUBLE"}  # fmt: skip
+
+
+def make_ct(shape=(4, 6, 7), seed=0, low=-1024, high=3000) -> np.ndarray:
+    """voxels[k, j, i], int16 HU."""
+    return np.random.default_rng(seed).integers(low, high, shape).astype(np.int16)
+
+
+def metaimage_fields(voxels, affine=OBLIQUE, **fields) -> dict[str, str]:
+    """The header of voxels[k, j, i] with an LPS affine; a field that is None is left out."""
+
+    def row(values):
+        return " ".join(repr(float(value)) for value in values)
+
+    spacing = np.linalg.norm(affine[:3, :3], axis=0)
+    header = {
+        "ObjectType": "Image",
+        "NDims": "3",
+        "BinaryData": "True",
+        "BinaryDataByteOrderMSB": str(voxels.dtype.str[0] == ">"),
+        "CompressedData": "False",
+        "TransformMatrix": row((affine[:3, :3] / spacing).T.ravel()),
+        "Offset": row(affine[:3, 3]),
+        "CenterOfRotation": "0 0 0",
+        "AnatomicalOrientation": "RAI",
+        "ElementSpacing": row(spacing),
+        "DimSize": " ".join(map(str, voxels.shape[::-1])),
+        "ElementType": f"MET_{META_TYPES[voxels.dtype.str[1:]]}",
+        "ElementDataFile": "LOCAL",
+    } | fields
+    last = "ElementDataFile"
+    return {key: header[key] for key in [*(key for key in header if key != last), last] if header[key] is not None}
+
+
+def write_metaimage(path, voxels, affine=OBLIQUE, *, packed=False, **fields):
+    """Write a MetaImage; voxels go into a file beside it where its name ends with .mhd."""
+    data = np.ascontiguousarray(voxels).tobytes()
+    data = zlib.compress(data) if packed else data
+    beside = path.with_suffix(".zraw" if packed else ".raw") if path.suffix == ".mhd" else None
+    own = {"CompressedData": str(packed), "ElementDataFile": beside.name if beside else "LOCAL"}
+    if packed:
+        own["CompressedDataSize"] = str(len(data))
+    header = metaimage_fields(voxels, affine, **(own | fields))
+    text = "".join(f"{key} = {value}\n" for key, value in header.items()).encode("latin-1")
+    path.write_bytes(text if beside else text + data)
+    if beside:
+        beside.write_bytes(data)
+    return path
+
+
+WRITERS = {
+    "a.nii": write_nifti,
+    "a.nii.gz": write_nifti,
+    "two.nii": lambda *args: write_nifti(*args, kind="Nifti2Image"),
+    "a.hdr": lambda *args: write_nifti(*args, kind="Nifti1Pair"),
+    "raw.nrrd": lambda *args: write_nrrd(*args, encoding="raw"),
+    "gzip.nrrd": lambda *args: write_nrrd(*args, encoding="gzip", space="right-anterior-superior"),
+    "a.mha": write_metaimage,
+    "packed.mha": lambda *args: write_metaimage(*args, packed=True),
+    "a.mhd": write_metaimage,
+    "packed.mhd": lambda *args: write_metaimage(*args, packed=True),
+}
+"""A name of each kind of file to the function that writes it: ``write(path, voxels, affine)``."""
