@@ -28,6 +28,8 @@ def read_volume(
     path: str | os.PathLike[str],
     series: int | str | None = None,
     *,
+    phase: int | None = None,
+    allow_gaps: bool = False,
     progress: Progress | None = None,
     **dicom_options: Any,
 ) -> Volume:
@@ -39,12 +41,10 @@ def read_volume(
         A folder of DICOM files, searched with its subfolders; one DICOM file; or a file with a grid and its affine:
         NIfTI (.nii, .nii.gz, .hdr with .img), NRRD (.nrrd), MetaImage (.mha, .mhd).  Those need the extra
         ``clrecon[volumes]``.  Told from the content.
-    series : int or str, optional
-        Which series of a DICOM folder, see `clrecon.dicom.read_volume`.
+    series, phase, allow_gaps, **dicom_options
+        What is read of a DICOM folder, see `clrecon.dicom.read_volume`.
     progress : callable, optional
         Called as ``progress(stage, done, total)`` with stage "scan" or "read".
-    **dicom_options
-        Further options of `clrecon.dicom.read_volume`.
 
     Returns
     -------
@@ -66,31 +66,39 @@ def read_volume(
     if kind is None:
         from clrecon.dicom import read_volume as read_dicom
 
-        return read_dicom(path, series, progress=progress, **dicom_options)
-    _refuse_options(kind, series=series, **dicom_options)
+        return read_dicom(path, series, phase=phase, allow_gaps=allow_gaps, progress=progress, **dicom_options)
+    _refuse_options(kind, series=series, phase=phase, allow_gaps=allow_gaps, **dicom_options)
     from clrecon.formats import read_grid
 
     return read_grid(Path(path), kind, progress=progress)
 
 
-def list_series(path: str | os.PathLike[str], *, progress: Progress | None = None) -> SeriesListing:
+def list_series(
+    path: str | os.PathLike[str],
+    series: int | str | None = None,
+    *,
+    progress: Progress | None = None,
+    **dicom_options: Any,
+) -> SeriesListing:
     """List what `read_volume` can read at a path; of files that are not DICOM one entry, from the header alone.
 
     Parameters
     ----------
-    path, progress
-        As in `read_volume`.
+    path, series, progress, **dicom_options
+        As in `read_volume` and `clrecon.dicom.list_series`.
 
     Raises
     ------
     NoDicomError, RefusedInputError, UsageError
-        As `clrecon.dicom.list_series`; a file of another format is corrupt or its package is missing.
+        As `clrecon.dicom.list_series`; a file of another format is corrupt, its package is missing, or an option for
+        DICOM is given with it.
     """
     kind = _tell_format(path)
     if kind is None:
         from clrecon.dicom import list_series as list_dicom
 
-        return list_dicom(path, progress=progress)
+        return list_dicom(path, series, progress=progress, **dicom_options)
+    _refuse_options(kind, series=series, **dicom_options)
     from clrecon.formats import list_grid
 
     return list_grid(Path(path), kind)

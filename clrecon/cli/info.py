@@ -18,7 +18,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "there is a series that can be used, 4 when the series found are refused (their problems are listed) or a\n"
         "gate failed with --strict, 2 when there is no CT series."
     )
-    parser.add_argument("input", metavar="INPUT", help="DICOM folder or file")
+    parser.add_argument("input", metavar="INPUT", help="DICOM folder or file, or a NIfTI, NRRD or MetaImage file")
     parser.add_argument(
         "--pixels",
         action="store_true",

@@ -46,7 +46,11 @@ def _epilog() -> str:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of the command."""
     parser.epilog = _epilog()
-    parser.add_argument("input", metavar="INPUT", help="DICOM folder (subfolders and any file names are fine) or file")
+    parser.add_argument(
+        "input",
+        metavar="INPUT",
+        help="DICOM folder (subfolders and any file names are fine) or file; or a NIfTI, NRRD or MetaImage file",
+    )
     parser.add_argument(
         "-o", "--output", metavar="OUT", required=True, help="mesh file: .stl .ply .obj .glb .vtp or .3mf"
     )

@@ -47,24 +47,37 @@ def certify_grid(grid: GridFile, facts: PixelFacts, warnings: Sequence[str]) -> 
     dict
         JSON types only; the same entries as those of a DICOM volume, None where such a file does not say.
     """
-    gap = gap_mm(grid)
+    gap, spacing = gap_mm(grid), column_spacing(grid.affine)
+    ni, nj, nk = grid.shape_ijk
     return {
         "format": grid.kind,
         "series": {"number": 1, "uid_hash": None, "modality": MODALITY},
-        "slices": grid.shape_ijk[2],
-        "shape_ijk": list(grid.shape_ijk),
-        "spacing_mm": list(column_spacing(grid.affine)),
+        "phase": None,
+        "slices": nk,
+        "slices_missing": 0,
+        "dropped": {},
+        "shape_ijk": [ni, nj, nk],
+        "spacing_mm": list(spacing),
+        "extent_mm": [ni * spacing[0], nj * spacing[1], nk * gap],
         "affine_ijk_to_lps_mm": grid.affine.tolist(),
+        "patient_position": None,
         "tilt_deg": tilt_degrees(grid.affine),
         "grid_residual_max_mm": None,
         "grid_residual_rms_mm": None,
-        "gap_mm": {"min": gap, "max": gap},
+        "grid_tolerance_mm": None,
+        "gap_mm": {"min": gap, "max": gap, "median": gap},
         "uneven": False,
+        "gap_runs": None,
+        "slice_positions_mm": None,
         "slice_thickness_mm": None,
-        "padding_share": facts.padding_share,
+        "thickness": None,
+        "stated_gap_mm": None,
         "frame_of_reference_hash": None,
         "transfer_syntaxes": [],
+        "transfer_syntax_names": [],
+        "lossy": None,
         "rescale": {"slope": [grid.slope] * 2, "intercept": [grid.intercept] * 2, "type": None},
+        "padding_share": facts.padding_share,
         "hu_range": [facts.hu_min, facts.hu_max],
         "files": {"found": 1, "used": 1, "skipped": {}},
         "warnings": list(warnings),
