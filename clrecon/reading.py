@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from clrecon.dicom.series import SeriesListing
     from clrecon.geometry import Volume
 
-__all__ = ["list_series", "read_volume", "refuse_dicom_options"]
+__all__ = ["list_series", "read_volume"]
 
 _OTHER_FORMATS = ("NIfTI", "NRRD", "MetaImage")
 _NAMES = (".nii", ".nii.gz", ".hdr", ".img", ".img.gz", ".nrrd", ".nhdr", ".mha", ".mhd")
@@ -77,15 +77,25 @@ def list_series(
     path: str | os.PathLike[str],
     series: int | str | None = None,
     *,
+    phase: int | None = None,
+    allow_gaps: bool = False,
+    pixels: bool = False,
     progress: Progress | None = None,
     **dicom_options: Any,
 ) -> SeriesListing:
-    """List what `read_volume` can read at a path; of files that are not DICOM one entry, from the header alone.
+    """List what `read_volume` can read at a path, with the certificate of what it would read.
 
     Parameters
     ----------
-    path, series, progress, **dicom_options
-        As in `read_volume` and `clrecon.dicom.list_series`.
+    path, series, phase, allow_gaps, progress, **dicom_options
+        As in `read_volume`.
+    pixels : bool
+        Read the voxels too, for what only they can say; without it only headers are read.
+
+    Returns
+    -------
+    SeriesListing
+        Of a file that is not DICOM one entry.
 
     Raises
     ------
@@ -97,18 +107,13 @@ def list_series(
     if kind is None:
         from clrecon.dicom import list_series as list_dicom
 
-        return list_dicom(path, series, progress=progress, **dicom_options)
-    _refuse_options(kind, series=series, **dicom_options)
+        return list_dicom(
+            path, series, phase=phase, allow_gaps=allow_gaps, pixels=pixels, progress=progress, **dicom_options
+        )
+    _refuse_options(kind, series=series, phase=phase, allow_gaps=allow_gaps, **dicom_options)
     from clrecon.formats import list_grid
 
-    return list_grid(Path(path), kind)
-
-
-def refuse_dicom_options(path: str | os.PathLike[str], **options: Any) -> None:
-    """Raise UsageError where `path` is a file of another format than DICOM and one of `options` is given."""
-    kind = _tell_format(path)
-    if kind is not None:
-        _refuse_options(kind, **options)
+    return list_grid(Path(path), kind, pixels=pixels, progress=progress)
 
 
 def _refuse_options(kind: str, **options: Any) -> None:

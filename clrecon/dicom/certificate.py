@@ -154,6 +154,7 @@ def certify(
     gates = judge_series(series, stack, facts)
     unsaid = [gate["text"] for gate in gates if gate["name"] == "padding_share" and gate["ok"] is False]
     return {
+        "format": "DICOM",
         "series": {
             "number": series.number,
             "uid_hash": hash_uid(series.identity.uid),

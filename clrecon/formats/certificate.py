@@ -5,22 +5,20 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from clrecon.dicom.pixels import PixelFacts
+from clrecon.dicom.layout import describe_orientation
+from clrecon.dicom.volume_gates import PADDING_SHARE
 from clrecon.formats.grid_file import GridFile
+from clrecon.formats.values import GridValues
+from clrecon.gates import Gate, at_most, none_of, unmeasured
 from clrecon.geometry.affine import column_spacing, slice_normal, tilt_degrees
 
-__all__ = ["MODALITY", "certify_grid", "collect_header_warnings", "gap_mm"]
+__all__ = ["MODALITY", "certify_grid", "collect_header_warnings"]
 
 MODALITY = "unknown"
 NOT_DICOM = "not DICOM: position, spacing and the meaning of the values are as the file says, nothing vouches for them"
 
 SMALLEST_STEP_MM, LARGEST_STEP_MM = 0.005, 50.0
 """Micro-CT goes down to 0.01 mm; what is beyond was more likely written in other units."""
-
-
-def gap_mm(grid: GridFile) -> float:
-    """Distance of neighbouring slices along their normal."""
-    return abs(float(slice_normal(grid.affine) @ grid.affine[:3, 2]))
 
 
 def collect_header_warnings(grid: GridFile) -> list[str]:
@@ -33,13 +31,14 @@ def collect_header_warnings(grid: GridFile) -> list[str]:
     return warnings
 
 
-def certify_grid(grid: GridFile, facts: PixelFacts, warnings: Sequence[str]) -> dict[str, Any]:
+def certify_grid(grid: GridFile, values: GridValues | None, warnings: Sequence[str]) -> dict[str, Any]:
     """Build the report of a volume.
 
     Parameters
     ----------
     grid : GridFile
-    facts : PixelFacts
+    values : GridValues or None
+        None: the voxels were not read, and what only they can say is None.
     warnings : sequence of str
 
     Returns
@@ -47,7 +46,9 @@ def certify_grid(grid: GridFile, facts: PixelFacts, warnings: Sequence[str]) -> 
     dict
         JSON types only; the same entries as those of a DICOM volume, None where such a file does not say.
     """
-    gap, spacing = gap_mm(grid), column_spacing(grid.affine)
+    facts = None if values is None else values.facts
+    spacing = column_spacing(grid.affine)
+    gap = abs(float(slice_normal(grid.affine) @ grid.affine[:3, 2]))
     ni, nj, nk = grid.shape_ijk
     return {
         "format": grid.kind,
@@ -60,6 +61,7 @@ def certify_grid(grid: GridFile, facts: PixelFacts, warnings: Sequence[str]) -> 
         "spacing_mm": list(spacing),
         "extent_mm": [ni * spacing[0], nj * spacing[1], nk * gap],
         "affine_ijk_to_lps_mm": grid.affine.tolist(),
+        "orientation": describe_orientation(grid.affine),
         "patient_position": None,
         "tilt_deg": tilt_degrees(grid.affine),
         "grid_residual_max_mm": None,
@@ -74,12 +76,35 @@ def certify_grid(grid: GridFile, facts: PixelFacts, warnings: Sequence[str]) -> 
         "stated_gap_mm": None,
         "frame_of_reference_hash": None,
         "transfer_syntaxes": [],
-        "transfer_syntax_names": [],
-        "lossy": None,
+        "transfer_syntax_names": [f"{grid.kind}, {grid.dtype.name}"],
+        "lossy": False,
         "rescale": {"slope": [grid.slope] * 2, "intercept": [grid.intercept] * 2, "type": None},
-        "padding_share": facts.padding_share,
-        "hu_range": [facts.hu_min, facts.hu_max],
+        "padding_share": None if facts is None else facts.padding_share,
+        "hu_range": None if facts is None else [facts.hu_min, facts.hu_max],
         "files": {"found": 1, "used": 1, "skipped": {}},
+        "gates": judge_grid(grid, values),
         "warnings": list(warnings),
         "problems": [],
     }
+
+
+def judge_grid(grid: GridFile, values: GridValues | None) -> list[Gate]:
+    """Hold a grid against the gates of a DICOM volume that mean something for it, and against its own header.
+
+    That the values are HU can be doubted, never shown: that gate fails or is not measured.
+    """
+    doubtful = "values that cannot be HU, or hardly"
+    share = "share of voxels without a measurement (padding)"
+    gates = [
+        none_of("usable", 0, "reasons to refuse the volume"),
+        none_of("header_clear", len(grid.warnings), "contradictions and gaps in the header"),
+    ]
+    if values is not None and values.doubts:
+        gates.append(none_of("hu_known", len(values.doubts), doubtful))
+    else:
+        gates.append(unmeasured("hu_known", 0, None, f"{doubtful}: the file does not say what they are"))
+    if values is None:
+        gates.append(unmeasured("padding_share", PADDING_SHARE, None, f"{share}: the voxels were not read"))
+    else:
+        gates.append(at_most("padding_share", values.facts.padding_share, PADDING_SHARE, None, share))
+    return gates

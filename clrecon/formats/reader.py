@@ -8,12 +8,12 @@ from clrecon.dicom.certificate import collect_voxel_warnings
 from clrecon.dicom.scan import Progress
 from clrecon.dicom.series import SeriesEntry, SeriesListing
 from clrecon.errors import RefusedInputError
-from clrecon.formats.certificate import MODALITY, certify_grid, collect_header_warnings, gap_mm
+from clrecon.formats.certificate import MODALITY, certify_grid, collect_header_warnings
 from clrecon.formats.grid_file import VOLUME, GridFile
 from clrecon.formats.kinds import open_grid
 from clrecon.formats.stream import show_name
-from clrecon.formats.values import read_values
-from clrecon.geometry import Volume, column_spacing, tilt_degrees
+from clrecon.formats.values import GridValues, read_values
+from clrecon.geometry import Volume
 
 __all__ = ["list_grid", "read_grid"]
 
@@ -38,35 +38,46 @@ def read_grid(path: Path, kind: str, *, progress: Progress | None = None) -> Vol
     """
     grid = _open(path, kind)
     values = read_values(grid, progress)
-    warnings = [
-        *collect_header_warnings(grid),
-        *values.warnings,
-        *collect_voxel_warnings(values.voxels, values.facts),
-    ]
-    return Volume(values.voxels, grid.affine, certify_grid(grid, values.facts, warnings))
+    return Volume(values.voxels, grid.affine, certify_grid(grid, values, _collect_warnings(grid, values)))
 
 
-def list_grid(path: Path, kind: str) -> SeriesListing:
-    """List the one volume of a file, from its header alone; parameters and errors as in `read_grid`."""
+def _collect_warnings(grid: GridFile, values: GridValues | None) -> list[str]:
+    warnings = collect_header_warnings(grid)
+    if values is not None:
+        warnings += [*values.warnings, *values.doubts, *collect_voxel_warnings(values.voxels, values.facts)]
+    return warnings
+
+
+def list_grid(path: Path, kind: str, *, pixels: bool = False, progress: Progress | None = None) -> SeriesListing:
+    """List the one volume of a file, with its certificate.
+
+    Parameters
+    ----------
+    path, kind, progress
+        As in `read_grid`.
+    pixels : bool
+        Read the voxels too, for what only they can say; without it only the header is read.
+
+    Raises
+    ------
+    UsageError, RefusedInputError
+        As `read_grid`.
+    """
     grid = _open(path, kind)
-    gap = gap_mm(grid)
+    values = read_values(grid, progress) if pixels else None
+    certificate = certify_grid(grid, values, _collect_warnings(grid, values))
+    copied = ("slices", "shape_ijk", "spacing_mm", "affine_ijk_to_lps_mm", "tilt_deg", "grid_residual_max_mm", "gap_mm",
+              "uneven", "extent_mm", "slice_thickness_mm")  # fmt: skip
     entry = SeriesEntry(
         number=1,
         uid_hash=None,
         description=f"{grid.kind} file, voxels {grid.dtype.name}",
         modality=MODALITY,
-        slices=grid.shape_ijk[2],
-        shape_ijk=list(grid.shape_ijk),
-        spacing_mm=list(column_spacing(grid.affine)),
-        affine_ijk_to_lps_mm=grid.affine.tolist(),
-        tilt_deg=tilt_degrees(grid.affine),
-        grid_residual_max_mm=None,
-        gap_mm={"min": gap, "max": gap},
-        uneven=False,
         warnings=collect_header_warnings(grid),
         problems=[],
+        **{name: certificate[name] for name in copied},
     )
-    return SeriesListing([entry], 1, {}, [])
+    return SeriesListing([entry], 1, {}, [], certificate)
 
 
 def _open(path: Path, kind: str) -> GridFile:

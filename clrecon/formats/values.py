@@ -36,11 +36,12 @@ LEAST_SPAN = 100.0
 
 @dataclass(frozen=True)
 class GridValues:
-    """Voxels (nk, nj, ni) int16, int32 or float32, what was seen in them, and warnings about them."""
+    """Voxels (nk, nj, ni) int16, int32 or float32, what was seen in them, warnings, and why they may not be HU."""
 
     voxels: NDArray[Any]
     facts: PixelFacts
     warnings: list[str]
+    doubts: list[str]
 
 
 def read_values(grid: GridFile, progress: Progress | None = None) -> GridValues:
@@ -126,12 +127,12 @@ class _Filling:
         voxels, low, high = self._voxels, self._low, self._high
         if self._holes == voxels.size:
             raise RefusedInputError(f"{self._grid.name} holds no values: all of its voxels are NaN")
-        warnings = _doubts(voxels, low, high)
+        doubts, warnings = _doubts(voxels, low, high), []
+        share = self._holes / voxels.size
         if self._holes:
-            share = self._holes / voxels.size
-            warnings.insert(0, f"{self._holes:,} voxels ({share:.2%}) are NaN: {AIR_HU} HU, air, is taken for them")
+            warnings = [f"{self._holes:,} voxels ({share:.2%}) are NaN: {AIR_HU} HU, air, is taken for them"]
             low, high = min(low, AIR_HU), max(high, AIR_HU)
-        return GridValues(voxels, PixelFacts(self._holes / voxels.size, float(low), float(high)), warnings)
+        return GridValues(voxels, PixelFacts(share, float(low), float(high)), warnings, doubts)
 
 
 def _allocate(grid: GridFile, dtype: np.dtype[Any]) -> NDArray[Any]:

@@ -8,9 +8,10 @@ import sys
 
 import numpy as np
 import pytest
+from contract_tables import names_in
 from dicom_series import Plan, write_series
 from label_files import OBLIQUE
-from volume_files import WRITERS, make_ct
+from volume_files import WRITERS, make_ct, write_metaimage
 
 import clrecon
 from clrecon.cli.main import main
@@ -53,8 +54,9 @@ def test_what_is_nothing_of_it_is_refused(tmp_path, content):
 
 
 def test_what_is_no_path_is_said_as_for_dicom(tmp_path):
-    for nothing, kind in (("", UsageError), (None, UsageError), (tmp_path / "none.nii", NoDicomError)):
-        with pytest.raises(kind):
+    for nothing, kind, message in (("", UsageError, "path is empty"), (None, UsageError, "a path is a string"),
+                                   (tmp_path / "none.nii", NoDicomError, "none.nii")):  # fmt: skip
+        with pytest.raises(kind, match=message):
             clrecon.read_volume(nothing)
 
 
@@ -84,7 +86,7 @@ def test_the_report_and_the_listing_have_the_entries_of_dicom(tmp_path, name):
     write_series(tmp_path / "ct", Plan())
     path = WRITERS[name](tmp_path / name, make_ct(), OBLIQUE)
     dicom, volume = clrecon.read_volume(tmp_path / "ct").report, clrecon.read_volume(path)
-    assert set(dicom) <= set(volume.report)
+    assert set(dicom) == set(volume.report) == names_in("The certificate")
     assert volume.report == json.loads(json.dumps(volume.report))
     assert volume.report["shape_ijk"] == [7, 6, 4] and volume.report["slices"] == 4
     assert volume.report["spacing_mm"] == pytest.approx(volume.spacing)
@@ -93,7 +95,21 @@ def test_the_report_and_the_listing_have_the_entries_of_dicom(tmp_path, name):
     entry = listing["series"][0]
     assert set(entry) == set(describe_input(tmp_path / "ct").listing["series"][0])
     assert entry["affine_ijk_to_lps_mm"] == volume.affine.tolist() and entry["problems"] == []
+    assert listing["certificate"]["hu_range"] is None
+    read = describe_input(path, pixels=True).listing["certificate"]
+    assert read == volume.report
     assert entry["modality"] == "unknown" and entry["description"].endswith("voxels int16")
+
+
+def test_doubts_fail_gates_that_strict_counts(tmp_path):
+    plain = WRITERS["a.nii"](tmp_path / "a.nii", make_ct(), OBLIQUE)
+    offset = WRITERS["raw.nrrd"](tmp_path / "a.nrrd", make_ct((8, 20, 20), low=0), OBLIQUE)
+    unclear = write_metaimage(tmp_path / "a.mha", make_ct(), BinaryDataByteOrderMSB=None)
+    for path, failed in ((plain, None), (offset, "hu_known"), (unclear, "header_clear")):
+        gates = clrecon.read_volume(path).report["gates"]
+        assert [gate["name"] for gate in gates if gate["ok"] is False] == [failed] * (failed is not None)
+        problem = describe_input(path, pixels=True, strict=True).problem
+        assert (problem is None) if failed is None else f"gate {failed} failed" in str(problem)
 
 
 def test_the_command_line_takes_them(tmp_path, capsys, device):
