@@ -149,7 +149,7 @@ def certify(
     -------
     dict
         JSON types only, every name in docs/contract.md.  Lengths in mm, angles in degrees; ``hu_range`` is that of
-        the voxels as they are in the volume, padding (at -1024) among them.
+        the voxels as they are in the volume, padding (at ``padding_hu``) among them.
     """
     gates = judge_series(series, stack, facts)
     unsaid = [gate["text"] for gate in gates if gate["name"] == "padding_share" and gate["ok"] is False]
@@ -211,6 +211,7 @@ def _certify_values(headers: Sequence[SliceHeader], facts: PixelFacts | None) ->
     slopes, intercepts = [h.slope for h in headers], [h.intercept for h in headers]
     return {
         "padding_share": None if facts is None else facts.padding_share,
+        "padding_hu": None if facts is None else facts.padding_hu,
         "transfer_syntaxes": sorted({h.transfer_syntax for h in headers}),
         "transfer_syntax_names": sorted({name_syntax(h.transfer_syntax) for h in headers}),
         "lossy": any(h.lossy for h in headers),

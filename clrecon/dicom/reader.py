@@ -48,9 +48,10 @@ def read_volume(
     Returns
     -------
     Volume
-        ``voxels`` (nk, nj, ni) int16, int32 or float32 in HU, padding at -1024; ``affine`` index (i, j, k) to
-        LPS mm, slices by ascending position along the normal; ``report`` the certificate.  Unevenly spaced slices
-        keep their own positions (`Volume.uneven`), with a warning.
+        ``voxels`` (nk, nj, ni) int16, int32 or float32 in HU, padding at the air beside it
+        (``report["padding_hu"]``); ``affine`` index (i, j, k) to LPS mm, slices by ascending position along the
+        normal; ``report`` the certificate.  Unevenly spaced slices keep their own positions (`Volume.uneven`), with a
+        warning.
 
     Raises
     ------
