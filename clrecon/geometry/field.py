@@ -234,8 +234,8 @@ def vertex_margin(volume: Volume, border: int) -> NDArray[np.float64]:
     """Smallest distance of a vertex from a sample along i, j, k, in index steps.
 
     Vertices are float32 millimetres from `find_vertex_origin`: two that lie closer to one sample than a few units in
-    the last place of the volume's largest coordinate could fall together, and a triangle between them would have no area.  Four units
-    are kept; a vertex that belongs closer to a sample is moved by less than that.
+    the last place of the volume's largest coordinate could fall together, and a triangle between them would have no
+    area.  Four units are kept; a vertex that belongs closer to a sample is moved by less than that.
 
     Returns
     -------

@@ -166,7 +166,7 @@ class Mesh:
             ``.stl``, ``.ply``, ``.obj``, ``.glb``, ``.vtp`` or ``.3mf``, upper or lower case.
         space : {"lps", "ras"}
             Patient frame of the coordinates; the file says which it is.  Units are mm; GLB carries a node matrix
-            that takes them to the metres, Y up, of glTF.
+            that takes them to the metres, Y up, of glTF.  STL holds float32 only, the others keep float64 vertices.
 
         Returns
         -------

@@ -84,10 +84,13 @@ def describe_job(
         written one by one were found together, and count once), ``bounds_mm`` is the box around all, ``closed``
         and ``manifold`` hold where they hold for each, and what differs or cannot be summed is None.
     """
+    from clrecon.mesh.writers import describe_rounding  # numpy: not wanted before a job starts
+
     certificate = dict(volume.report)
     warnings = [str(text) for text in certificate.pop("warnings", [])]
-    for part in parts:
+    for part, mesh in zip(parts, meshes, strict=True):
         warnings += [str(text) for text in part.mesh.report.get("warnings", [])]
+        warnings += describe_rounding(part.mesh, f".{mesh['output']['format']}")
     level, level_warnings = describe_level(volume, settings, choice)
     warnings += level_warnings
     if settings.preset_used == "skin":
