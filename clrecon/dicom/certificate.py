@@ -9,9 +9,6 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from clrecon.dicom.gate import Stack
 from clrecon.dicom.header import SliceHeader
 from clrecon.dicom.layout import (
@@ -30,12 +27,7 @@ from clrecon.dicom.volume_gates import judge_series
 from clrecon.errors import RefusedInputError
 from clrecon.geometry import column_spacing
 
-__all__ = ["certify", "collect_scan_warnings", "collect_series_warnings", "collect_voxel_warnings"]
-
-CEILING_HU = 3071
-"""Highest HU of 12 stored bits with intercept -1024: metal and its surroundings are cut off there."""
-CEILING_VOXELS = 10
-"""As many voxels at the ceiling may be noise in dense bone."""
+__all__ = ["certify", "collect_scan_warnings", "collect_series_warnings"]
 
 
 def collect_scan_warnings(scan: Scan) -> list[str]:
@@ -112,16 +104,6 @@ def _place(stack: Stack, is_so: Callable[[SliceHeader], bool]) -> str:
         return "all slices"
     first = "the first " * (len(positions) > 1)
     return f"{len(positions)} of {len(stack.slices)} slices, {first}at {positions[0]:.2f} mm"
-
-
-def collect_voxel_warnings(voxels: NDArray[Any], facts: PixelFacts) -> list[str]:
-    """Warnings about the HU that were read."""
-    if facts.hu_max != CEILING_HU:
-        return []
-    count = int(np.count_nonzero(voxels == CEILING_HU))
-    if count <= CEILING_VOXELS:
-        return []
-    return [f"{count} voxels are at {CEILING_HU} HU, the ceiling of 12 bits: metal is saturated, its surface displaced"]
 
 
 def certify(

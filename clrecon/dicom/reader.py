@@ -9,9 +9,10 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from clrecon.dicom.certificate import certify, collect_scan_warnings, collect_series_warnings, collect_voxel_warnings
+from clrecon.dicom.certificate import certify, collect_scan_warnings, collect_series_warnings
 from clrecon.dicom.choice import choose_series, describe_left
 from clrecon.dicom.pixels import read_voxels
+from clrecon.dicom.plausibility import collect_voxel_warnings
 from clrecon.dicom.scan import Progress, Scan, scan_path
 from clrecon.dicom.series import Series, SeriesListing, describe_series, group_series
 from clrecon.dicom.text import escape_text, join_names
@@ -77,7 +78,7 @@ def read_volume(
         voxels, facts = read_voxels(stack.slices, progress)
     warnings = [
         *collect_series_warnings(chosen),
-        *collect_voxel_warnings(voxels, facts),
+        *collect_voxel_warnings(voxels, facts, stack.slices),
         *collect_scan_warnings(scan),
         *left,
     ]

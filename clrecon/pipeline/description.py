@@ -22,6 +22,9 @@ if TYPE_CHECKING:
 
 __all__ = ["describe_job", "describe_part"]
 
+SKIN_HU = (-950.0, -200.0)
+"""Iso values between air and fat: the surface is the skin, and a head's a face."""
+
 _SAID_ABOVE = ("vertices", "triangles", "closed", "manifold", "components", "area_mm2", "volume_ml", "bounds_mm")
 
 
@@ -93,7 +96,7 @@ def describe_job(
         warnings += describe_rounding(part.mesh, f".{mesh['output']['format']}")
     level, level_warnings = describe_level(volume, settings, choice)
     warnings += level_warnings
-    if settings.preset_used == "skin":
+    if any(SKIN_HU[0] <= part.surface.iso_value <= SKIN_HU[1] for part in parts if part.surface.label is None):
         warnings.append("a surface of the skin can show a face: treat the file as one that identifies the patient")
     of_surface = {part.surface: mesh for part, mesh in zip(parts, meshes, strict=True)}.values()
     report: dict[str, Any] = {

@@ -148,6 +148,7 @@ def test_broken_slopes_and_other_slices_keep_one_value(tmp_path):
 
     def change(ds, k):
         stored = np.where(outside, -2000, 2 * (-1001 - (-1024 + k))).astype(np.int16)
+        stored[20, 20] += 80
         ds.PixelData = stored.tobytes()
         ds.add_new("PixelPaddingValue", "SS", -2000)
         set_values(RescaleSlope=0.5, RescaleIntercept=-1024 + k)(ds, k)
@@ -155,7 +156,9 @@ def test_broken_slopes_and_other_slices_keep_one_value(tmp_path):
     write_series(tmp_path, plan, change)
     volume = read_volume(tmp_path)
     assert volume.voxels.dtype == np.float32
-    assert (volume.voxels == -1001).all() and volume.report["padding_hu"] == -1001
+    assert volume.report["padding_hu"] == -1001
+    assert (volume.voxels[:, 20, 20] == -961).all()
+    assert np.count_nonzero(volume.voxels != -1001) == len(volume.voxels)
 
 
 def test_no_padding_says_so(tmp_path):
