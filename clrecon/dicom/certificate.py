@@ -9,6 +9,9 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from clrecon.dicom.gate import Stack
 from clrecon.dicom.header import SliceHeader
 from clrecon.dicom.layout import (

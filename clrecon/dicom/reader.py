@@ -155,7 +155,7 @@ def _certify_chosen(
     affine = None if series.problems else stack.affine
     if pixels and affine is not None:
         voxels, facts = read_voxels(stack.slices, progress)
-        warnings += collect_voxel_warnings(voxels, facts)
+        warnings += collect_voxel_warnings(voxels, facts, stack.slices)
     return certify(series, stack, facts, scan, affine, [*warnings, *notes])
 
 
