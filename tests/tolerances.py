@@ -23,6 +23,7 @@ HALF_WAY_STRIDE_HU = 20  # every fifth of 40 slices in place of each: other bone
 TWIN_VERTEX_VOXEL = 1e-4  # device in float32 against twin in float64, index steps
 VERTEX_ROUNDING_UNITS = 0.6  # half a unit of the last rounding, and what is lost before it
 FAR_VERTEX_MM = 2e-6  # volumes of 30 mm far from the origin: float32 near their centre; measured 6e-7
+FAR_SCAN_MM = 5e-6  # the same, read from positions with 6 decimals, which the fit of the affine averages
 TWIN_NORMAL = 2e-5  # unit vectors in float32
 FRAME_MM = 1e-4  # one surface through differently ordered voxels
 SPHERE_DISTANCE_FIELD_VOXEL = 0.03  # sagitta of one edge at R = 5 voxels is 1/40 voxel; measured 0.025
