@@ -25,6 +25,7 @@ if TYPE_CHECKING:
         UsageError,
     )
     from clrecon.geometry import Volume, choose_iso_value
+    from clrecon.geometry.body import mask_field_of_view, remove_table
     from clrecon.labels import LabelMap, read_labels
     from clrecon.mesh import Mesh
     from clrecon.mesh.distances import compare_meshes
@@ -58,8 +59,10 @@ __all__ = [
     "extract_isosurfaces",
     "extract_labels",
     "list_series",
+    "mask_field_of_view",
     "read_labels",
     "read_volume",
+    "remove_table",
     "smooth_mesh",
 ]
 
@@ -82,8 +85,10 @@ _HOMES = {
     "extract_isosurfaces": "clrecon.operators.isosurface",
     "extract_labels": "clrecon.operators.labels",
     "list_series": "clrecon.reading",
+    "mask_field_of_view": "clrecon.geometry.body",
     "read_labels": "clrecon.labels",
     "read_volume": "clrecon.reading",
+    "remove_table": "clrecon.geometry.body",
     "smooth_mesh": "clrecon.mesh.refinement",
 }
 

@@ -22,6 +22,8 @@ HALF_WAY_STRIDE_HU = 20  # every fifth of 40 slices in place of each: other bone
 # --- operators ---
 TWIN_VERTEX_VOXEL = 1e-4  # device in float32 against twin in float64, index steps
 VERTEX_ROUNDING_UNITS = 0.6  # half a unit of the last rounding, and what is lost before it
+FAR_VERTEX_MM = 2e-6  # volumes of 30 mm far from the origin: float32 near their centre; measured 6e-7
+FAR_SCAN_MM = 5e-6  # the same, read from positions with 6 decimals, which the fit of the affine averages
 TWIN_NORMAL = 2e-5  # unit vectors in float32
 FRAME_MM = 1e-4  # one surface through differently ordered voxels
 SPHERE_DISTANCE_FIELD_VOXEL = 0.03  # sagitta of one edge at R = 5 voxels is 1/40 voxel; measured 0.025
@@ -65,6 +67,7 @@ MESH_VOLUME = 1e-6  # relative; float32 corners of a solid with exact corners, s
 MESH_UNIT_NORMAL = 1e-6  # float32 components; the text formats keep six decimals
 NEAREST_MM = 1e-12  # a distance of a few mm in float64
 NEAREST_SAMPLED_MM = 0.02  # 400 random points on each triangle of 0.6 mm, seen from inside or 4 mm away
+FAR_FILE_MM = 1e-6  # fifteen digits, float64, or float32 of 15 mm with the rest in the matrix, at 1e5 mm
 GLB_METRES = 1e-7  # relative; float32 coordinates through a float64 matrix, read back by another library
 
 # --- smoothing, decimation, distances ---

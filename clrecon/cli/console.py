@@ -16,6 +16,7 @@ _STAGES = {
     "scan": "looking through the files",
     "read": "reading slices",
     "build": "building kernels (takes seconds on the first run on this device), extracting the surface",
+    "mask": "leaving out what is not the patient",
     "choose": "choosing the iso value",
     "select": "selecting components",
     "smooth": "smoothing",

@@ -9,6 +9,7 @@ from clrecon.cli.common import add_device, add_memory, megabytes
 from clrecon.cli.console import Console, printable
 from clrecon.cli.labels import add_label_arguments, describe_labels
 from clrecon.cli.levels import LEVELS_HELP, parse_hu
+from clrecon.cli.masking import add_masking, masking_settings
 from clrecon.cli.points import parse_point
 from clrecon.cli.reading import add_reading, reading_settings
 from clrecon.cli.refinement import add_refinement, describe_refinement, finish_with_gates, refinement_settings
@@ -16,7 +17,7 @@ from clrecon.pipeline.presets import DEFAULT_PRESET, PRESETS
 
 __all__ = ["add_arguments", "describe_mesh", "run"]
 
-_PARTS = ("read", "upload", "build", "kernels", "download", "choose", "select", "refine", "write", "measure")
+_PARTS = ("read", "upload", "build", "kernels", "download", "mask", "choose", "select", "refine", "write", "measure")
 _SHOWN_PARTS = 12
 
 
@@ -85,6 +86,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--split", action="store_true", help="write one file a component, the largest first")
     add_reading(parser)
+    add_masking(parser)
     add_label_arguments(parser)
     add_refinement(parser)
     add_device(parser)
@@ -112,6 +114,7 @@ def run(options: argparse.Namespace, console: Console) -> int:
         labels=choose_labels(options.labels, options.label, options.grow, options.solid),
         device=options.device,
         memory=options.memory,
+        **masking_settings(options),
         **refinement_settings(options),
     )
     report = make_mesh(

@@ -30,12 +30,7 @@ from clrecon.dicom.volume_gates import judge_series
 from clrecon.errors import RefusedInputError
 from clrecon.geometry import column_spacing
 
-__all__ = ["certify", "collect_scan_warnings", "collect_series_warnings", "collect_voxel_warnings"]
-
-CEILING_HU = 3071
-"""Highest HU of 12 stored bits with intercept -1024: metal and its surroundings are cut off there."""
-CEILING_VOXELS = 10
-"""As many voxels at the ceiling may be noise in dense bone."""
+__all__ = ["certify", "collect_scan_warnings", "collect_series_warnings"]
 
 
 def collect_scan_warnings(scan: Scan) -> list[str]:
@@ -114,16 +109,6 @@ def _place(stack: Stack, is_so: Callable[[SliceHeader], bool]) -> str:
     return f"{len(positions)} of {len(stack.slices)} slices, {first}at {positions[0]:.2f} mm"
 
 
-def collect_voxel_warnings(voxels: NDArray[Any], facts: PixelFacts) -> list[str]:
-    """Warnings about the HU that were read."""
-    if facts.hu_max != CEILING_HU:
-        return []
-    count = int(np.count_nonzero(voxels == CEILING_HU))
-    if count <= CEILING_VOXELS:
-        return []
-    return [f"{count} voxels are at {CEILING_HU} HU, the ceiling of 12 bits: metal is saturated, its surface displaced"]
-
-
 def certify(
     series: Series,
     stack: Stack,
@@ -149,7 +134,7 @@ def certify(
     -------
     dict
         JSON types only, every name in docs/contract.md.  Lengths in mm, angles in degrees; ``hu_range`` is that of
-        the voxels as they are in the volume, padding (at -1024) among them.
+        the voxels as they are in the volume, padding (at ``padding_hu``) among them.
     """
     gates = judge_series(series, stack, facts)
     unsaid = [gate["text"] for gate in gates if gate["name"] == "padding_share" and gate["ok"] is False]
@@ -212,6 +197,7 @@ def _certify_values(headers: Sequence[SliceHeader], facts: PixelFacts | None) ->
     slopes, intercepts = [h.slope for h in headers], [h.intercept for h in headers]
     return {
         "padding_share": None if facts is None else facts.padding_share,
+        "padding_hu": None if facts is None else facts.padding_hu,
         "transfer_syntaxes": sorted({h.transfer_syntax for h in headers}),
         "transfer_syntax_names": sorted({name_syntax(h.transfer_syntax) for h in headers}),
         "lossy": any(h.lossy for h in headers),

@@ -1,7 +1,7 @@
 """Pixels of a stack to HU voxels, read in parallel straight into the volume.
 
 Order of the steps for every slice, each in the one place where it is right: stored bits, padding (a stored value,
-found before rescale), sign extension, rescale by the slice's own slope and intercept, padding to `AIR_HU`.
+found before rescale), sign extension, rescale by the slice's own slope and intercept, padding to air (`padding`).
 Integer HU stay integers: int16 where every value fits, else int32; other slopes give float32.  Integer steps run in
 the memory of the volume in modular arithmetic, which is exact because the result is known to fit beforehand.
 """
@@ -21,9 +21,9 @@ from numpy.typing import NDArray
 
 from clrecon.dicom.codecs import choose_decoder, decode_frame, is_encapsulated
 from clrecon.dicom.header import SliceHeader
+from clrecon.dicom.padding import PaddingMasks, pack_mask
 from clrecon.dicom.scan import Progress
 from clrecon.errors import RefusedInputError
-from clrecon.geometry import AIR_HU
 from clrecon.geometry.aligned import aligned_empty
 
 __all__ = ["PixelFacts", "read_voxels"]
@@ -35,11 +35,22 @@ MAX_READERS = 8
 
 @dataclass(frozen=True)
 class PixelFacts:
-    """What was seen in the pixels: share of padding voxels (0 to 1), lowest and highest HU of the volume."""
+    """What was seen in the pixels.
+
+    Attributes
+    ----------
+    padding_share : float
+        Of the voxels, 0 to 1.
+    hu_min, hu_max : float
+        Lowest and highest HU of the volume, padding included.
+    padding_hu : float or None
+        What padding was filled with; None where there is none.
+    """
 
     padding_share: float
     hu_min: float
     hu_max: float
+    padding_hu: float | None = None
 
 
 class _RangeError(Exception):
@@ -109,23 +120,27 @@ def _allocate(slices: Sequence[SliceHeader], dtype: np.dtype[Any]) -> NDArray[An
 
 
 def _fill_volume(slices: Sequence[SliceHeader], voxels: NDArray[Any], progress: Progress | None) -> PixelFacts:
-    padded, low, high = 0, np.inf, -np.inf
+    padding, low, high = PaddingMasks(voxels), np.inf, -np.inf
     with ThreadPoolExecutor(min(MAX_READERS, os.cpu_count() or 1, len(slices))) as pool:
-        jobs = [pool.submit(_fill_slice, header, voxels[k]) for k, header in enumerate(slices)]
+        jobs = {pool.submit(_fill_slice, header, voxels[k]): k for k, header in enumerate(slices)}
         try:
             for done, job in enumerate(as_completed(jobs), start=1):
-                slice_padded, slice_low, slice_high = job.result()
-                padded, low, high = padded + slice_padded, min(low, slice_low), max(high, slice_high)
+                slice_padding, slice_low, slice_high = job.result()
+                padding.add(jobs[job], slice_padding)
+                low, high = min(low, slice_low), max(high, slice_high)
                 if progress is not None:
                     progress("read", done, len(slices))
         except BaseException:
             pool.shutdown(cancel_futures=True)
             raise
-    return PixelFacts(padded / voxels.size, float(low), float(high))
+        padding_hu = padding.fill(pool.map)
+    if padding_hu is not None:
+        low, high = min(low, padding_hu), max(high, padding_hu)
+    return PixelFacts(padding.count / voxels.size, float(low), float(high), padding_hu)
 
 
-def _fill_slice(header: SliceHeader, out: NDArray[Any]) -> tuple[int, float, float]:
-    """Read one slice into `out`; returns its padding voxels and its lowest and highest HU."""
+def _fill_slice(header: SliceHeader, out: NDArray[Any]) -> tuple[Any, float, float]:
+    """Read one slice into `out`; returns its padding, packed, or None, and its lowest and highest measured HU."""
     stored = _load_stored(header, out)
     padding = None
     if header.padding is not None and not _fits_stored_bits(header):
@@ -134,14 +149,11 @@ def _fill_slice(header: SliceHeader, out: NDArray[Any]) -> tuple[int, float, flo
     if header.padding is not None and padding is None:
         padding = _find_padding(header, stored)
     if padding is not None and padding.all():
-        out[...] = AIR_HU
-        return padding.size, float(AIR_HU), float(AIR_HU)
+        return pack_mask(padding), np.inf, -np.inf
 
     low, high = _measured_range(stored, padding)
     ends = (low * header.slope + header.intercept, high * header.slope + header.intercept)
     hu_low, hu_high = min(ends), max(ends)
-    if padding is not None:
-        hu_low, hu_high = min(hu_low, AIR_HU), max(hu_high, AIR_HU)
     if out.dtype.kind == "f":
         out[...] = stored * np.float64(header.slope) + header.intercept
     else:
@@ -154,10 +166,7 @@ def _fill_slice(header: SliceHeader, out: NDArray[Any]) -> tuple[int, float, flo
             np.multiply(out, np.int64(header.slope).astype(out.dtype), out=out)
         if header.intercept != 0.0:
             np.add(out, np.int64(header.intercept).astype(out.dtype), out=out)
-    if padding is None:
-        return 0, hu_low, hu_high
-    np.copyto(out, out.dtype.type(AIR_HU), where=padding)
-    return int(np.count_nonzero(padding)), hu_low, hu_high
+    return None if padding is None else pack_mask(padding), hu_low, hu_high
 
 
 def _load_stored(header: SliceHeader, out: NDArray[Any]) -> NDArray[Any]:

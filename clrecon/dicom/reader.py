@@ -9,9 +9,10 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from clrecon.dicom.certificate import certify, collect_scan_warnings, collect_series_warnings, collect_voxel_warnings
+from clrecon.dicom.certificate import certify, collect_scan_warnings, collect_series_warnings
 from clrecon.dicom.choice import choose_series, describe_left
 from clrecon.dicom.pixels import read_voxels
+from clrecon.dicom.plausibility import collect_voxel_warnings
 from clrecon.dicom.scan import Progress, Scan, scan_path
 from clrecon.dicom.series import Series, SeriesListing, describe_series, group_series
 from clrecon.dicom.text import escape_text, join_names
@@ -48,9 +49,10 @@ def read_volume(
     Returns
     -------
     Volume
-        ``voxels`` (nk, nj, ni) int16, int32 or float32 in HU, padding at -1024; ``affine`` index (i, j, k) to
-        LPS mm, slices by ascending position along the normal; ``report`` the certificate.  Unevenly spaced slices
-        keep their own positions (`Volume.uneven`), with a warning.
+        ``voxels`` (nk, nj, ni) int16, int32 or float32 in HU, padding at the air beside it
+        (``report["padding_hu"]``); ``affine`` index (i, j, k) to LPS mm, slices by ascending position along the
+        normal; ``report`` the certificate.  Unevenly spaced slices keep their own positions (`Volume.uneven`), with a
+        warning.
 
     Raises
     ------
@@ -76,7 +78,7 @@ def read_volume(
         voxels, facts = read_voxels(stack.slices, progress)
     warnings = [
         *collect_series_warnings(chosen),
-        *collect_voxel_warnings(voxels, facts),
+        *collect_voxel_warnings(voxels, facts, stack.slices),
         *collect_scan_warnings(scan),
         *left,
     ]
@@ -153,7 +155,7 @@ def _certify_chosen(
     affine = None if series.problems else stack.affine
     if pixels and affine is not None:
         voxels, facts = read_voxels(stack.slices, progress)
-        warnings += collect_voxel_warnings(voxels, facts)
+        warnings += collect_voxel_warnings(voxels, facts, stack.slices)
     return certify(series, stack, facts, scan, affine, [*warnings, *notes])
 
 

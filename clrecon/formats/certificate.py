@@ -80,6 +80,7 @@ def certify_grid(grid: GridFile, values: GridValues | None, warnings: Sequence[s
         "lossy": False,
         "rescale": {"slope": [grid.slope] * 2, "intercept": [grid.intercept] * 2, "type": None},
         "padding_share": None if facts is None else facts.padding_share,
+        "padding_hu": None if facts is None else facts.padding_hu,
         "hu_range": None if facts is None else [facts.hu_min, facts.hu_max],
         "files": {"found": 1, "used": 1, "skipped": {}},
         "gates": judge_grid(grid, values),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from clrecon.dicom.certificate import collect_voxel_warnings
+from clrecon.dicom.plausibility import collect_voxel_warnings
 from clrecon.dicom.scan import Progress
 from clrecon.dicom.series import SeriesEntry, SeriesListing
 from clrecon.errors import RefusedInputError
@@ -44,7 +44,7 @@ def read_grid(path: Path, kind: str, *, progress: Progress | None = None) -> Vol
 def _collect_warnings(grid: GridFile, values: GridValues | None) -> list[str]:
     warnings = collect_header_warnings(grid)
     if values is not None:
-        warnings += [*values.warnings, *values.doubts, *collect_voxel_warnings(values.voxels, values.facts)]
+        warnings += [*values.warnings, *values.doubts, *collect_voxel_warnings(values.voxels, values.facts, ())]
     return warnings
 
 

@@ -132,7 +132,8 @@ class _Filling:
         if self._holes:
             warnings = [f"{self._holes:,} voxels ({share:.2%}) are NaN: {AIR_HU} HU, air, is taken for them"]
             low, high = min(low, AIR_HU), max(high, AIR_HU)
-        return GridValues(voxels, PixelFacts(share, float(low), float(high)), warnings, doubts)
+        filled = float(AIR_HU) if self._holes else None
+        return GridValues(voxels, PixelFacts(share, float(low), float(high), filled), warnings, doubts)
 
 
 def _allocate(grid: GridFile, dtype: np.dtype[Any]) -> NDArray[Any]:

@@ -9,13 +9,13 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.errors import NoSurfaceError, UsageError
 from clrecon.geometry.affine import normal_matrix
+from clrecon.geometry.precision import find_vertex_origin, float32_step, largest_coordinate
 from clrecon.geometry.volume import AIR_HU, Volume
 
 LARGEST_INTEGER = 2**23
@@ -233,9 +233,9 @@ LARGEST_MARGIN = 0.25
 def vertex_margin(volume: Volume, border: int) -> NDArray[np.float64]:
     """Smallest distance of a vertex from a sample along i, j, k, in index steps.
 
-    Vertices are float32 millimetres: two that lie closer to one sample than a few units in the last place of
-    the volume's largest coordinate could fall together, and a triangle between them would have no area.  Four units
-    are kept; a vertex that belongs closer to a sample is moved by less than that.
+    Vertices are float32 millimetres from `find_vertex_origin`: two that lie closer to one sample than a few units in
+    the last place of the volume's largest coordinate could fall together, and a triangle between them would have no
+    area.  Four units are kept; a vertex that belongs closer to a sample is moved by less than that.
 
     Returns
     -------
@@ -245,18 +245,17 @@ def vertex_margin(volume: Volume, border: int) -> NDArray[np.float64]:
     Raises
     ------
     UsageError
-        The volume lies so far from the origin that float32 cannot tell its voxels apart well.
+        The volume is so large that float32 cannot tell its voxels apart well.
     """
-    ends = [(-border, n - 1 + border) for n in volume.shape_ijk]
-    largest = np.abs(volume.ijk_to_lps(list(product(*ends)))).max()
-    unit = float(np.spacing(np.float32(largest)))
+    largest = largest_coordinate(volume, find_vertex_origin(volume), border)
+    unit = float32_step(largest)
     steps = np.array(volume.spacing)
     steps[2] = np.linalg.norm(np.diff(volume.slice_origins(border=1), axis=0), axis=1).min()
     margin = 4.0 * unit / steps
     if margin.max() > LARGEST_MARGIN:
         raise UsageError(
-            f"the volume reaches {largest:.3g} mm from the origin with steps of {steps.min():.3g} mm:"
-            f" float32 vertices come in steps of {unit:.2g} mm there; shift its origin"
+            f"the volume reaches {largest:.3g} mm from its centre with steps of {steps.min():.3g} mm:"
+            f" float32 vertices come in steps of {unit:.2g} mm there; take a part of it"
         )
     return margin
 

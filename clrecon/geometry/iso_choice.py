@@ -163,7 +163,7 @@ def choose_iso_value(volume: Volume) -> IsoChoice:
     count = max(FEWEST_SLICES, SAMPLED_VOXELS // (voxels.shape[1] * voxels.shape[2]))
     slice_step = -(-voxels.shape[0] // count)
     sampled = range((voxels.shape[0] - 1) % slice_step // 2, voxels.shape[0], slice_step)
-    histogram = _count_values(voxels, sampled)
+    histogram = _leave_padding(_count_values(voxels, sampled), voxels[0].size * len(sampled), volume.report)
     background = _find_background(histogram)
     edges = measure_edges(voxels, sampled, background)
     edges, left_out = leave_contrast_medium(edges)
@@ -226,6 +226,15 @@ def _count_values(voxels: NDArray[Any], sampled: range) -> Float64Array:
             values = np.rint(np.clip(values, low, HIGHEST_HU))
         counts += np.bincount(np.clip(values.astype(np.int32), low, HIGHEST_HU) - low, minlength=len(counts))
     return counts[1:].astype(np.float64)
+
+
+def _leave_padding(histogram: Float64Array, counted: int, report: dict[str, Any]) -> Float64Array:
+    """The histogram without the padding that was filled with air: as one value it would hide the noise of the air."""
+    value, share = report.get("padding_hu"), report.get("padding_share")
+    if value is not None and share is not None and LOWEST_HU <= value <= HIGHEST_HU:
+        place = int(np.rint(value)) - LOWEST_HU
+        histogram[place] = max(histogram[place] - share * counted, 0.0)
+    return histogram
 
 
 def _smooth(histogram: Float64Array) -> Float64Array:

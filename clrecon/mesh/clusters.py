@@ -15,6 +15,7 @@ from clrecon.mesh.connectivity import (
     label_components,
     opposite_half_edges,
 )
+from clrecon.mesh.coordinates import as_stored
 from clrecon.mesh.distances import NearDistance
 from clrecon.mesh.intersections import find_self_intersections
 from clrecon.mesh.measures import cross_products
@@ -110,13 +111,13 @@ class Clusters:
         a, b, c = named.T
         return (a != b) & (b != c) & (c != a)
 
-    def surface(self, origin: Float64Array) -> tuple[NDArray[np.float32], NDArray[np.uint32]]:
-        """Vertices (float32, moved by `origin`) and triangles, numbered without gaps."""
+    def surface(self, origin: Float64Array) -> tuple[NDArray[np.floating], NDArray[np.uint32]]:
+        """Vertices (as stored, moved by `origin`) and triangles, numbered without gaps."""
         faces = self.faces()
         standing = np.unique(faces)
         number = np.zeros(len(self._vertices), dtype=np.uint32)
         number[standing] = np.arange(len(standing), dtype=np.uint32)
-        return (self._places[standing] + origin).astype(np.float32), number[faces]
+        return as_stored(self._places[standing] + origin), number[faces]
 
     def undo(self, names: IntArray) -> int:
         """Take these clusters apart; returns how many vertices that has moved or brought back."""
@@ -173,13 +174,13 @@ class Clusters:
         return np.unique(self._names[self._triangles[lost[self._triangles].any(axis=1)]])
 
     def _find_flat(self, faces: NDArray[np.uint32], origin: Float64Array) -> list[NDArray[np.uint32]]:
-        """Corners of faces without area once coordinates are rounded to float32."""
-        rounded = (self._places + origin).astype(np.float32)
+        """Corners of faces without area once coordinates are rounded."""
+        rounded = as_stored(self._places + origin)
         pieces = cross_products(rounded, faces, np.zeros(3))
         return [faces[where][~cross.any(axis=0)].reshape(-1) for where, _, cross in pieces]
 
     def find_crossing(self, origin: Float64Array) -> IntArray:
-        """Names of clusters at faces that cut each other once coordinates are rounded to float32.
+        """Names of clusters at faces that cut each other once coordinates are rounded.
 
         Only faces that have changed since the last call are looked at, with what lies around them.
         """
@@ -188,7 +189,7 @@ class Clusters:
         faces = named[is_face].astype(np.uint32)
         changed = (named != self._seen_uncut).any(axis=1)[is_face]
         self._seen_uncut = named
-        rounded = (self._places + origin).astype(np.float32)
+        rounded = as_stored(self._places + origin)
         faces = faces[self._beside(faces, changed)]
         return np.unique(faces[find_self_intersections(rounded, faces)])
 

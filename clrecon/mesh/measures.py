@@ -19,7 +19,7 @@ def chunks(count: int, size: int = CHUNK) -> Iterator[slice]:
         yield slice(start, min(start + size, count))
 
 
-def local_origin(vertices: NDArray[np.float32]) -> NDArray[np.float64]:
+def local_origin(vertices: NDArray[np.floating]) -> NDArray[np.float64]:
     """Centre of the bounds, shape (3,), float64.
 
     Patient coordinates can be far from zero; products of them would lose the digits that a volume needs.
@@ -30,11 +30,11 @@ def local_origin(vertices: NDArray[np.float32]) -> NDArray[np.float64]:
 
 
 def corner_edges(
-    vertices: NDArray[np.float32], triangles: NDArray[np.uint32], origin: NDArray[np.float64], size: int = CHUNK
+    vertices: NDArray[np.floating], triangles: NDArray[np.uint32], origin: NDArray[np.float64], size: int = CHUNK
 ) -> Iterator[tuple[slice, NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]]:
     """Go through the triangles, `size` at a time, and give first corner and the two edges from it, float64.
 
-    Coordinates are float32, so that differences and their products are exact in float64.
+    Differences of float32 coordinates and their products are exact in float64.
 
     Yields
     ------
@@ -64,13 +64,13 @@ def cross_product(p: NDArray[np.float64], q: NDArray[np.float64]) -> NDArray[np.
 
 
 def cross_products(
-    vertices: NDArray[np.float32], triangles: NDArray[np.uint32], origin: NDArray[np.float64], size: int = CHUNK
+    vertices: NDArray[np.floating], triangles: NDArray[np.uint32], origin: NDArray[np.float64], size: int = CHUNK
 ) -> Iterator[tuple[slice, NDArray[np.float64], NDArray[np.float64]]]:
     """Go through the triangles, `size` at a time, and give first corner and edge cross product, float64.
 
     The cross product c of the edges from the first corner a is twice the area times the outward normal, and a . c is
     six times the signed volume of the tetrahedron over the origin (divergence theorem).  c is zero for triangles
-    without area and only for those.
+    without area and only for those (where coordinates are float32).
 
     Yields
     ------

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from clrecon.errors import UsageError
 from clrecon.geometry import frame_from_lps
+from clrecon.mesh.coordinates import as_stored
 from clrecon.mesh.quality import measure_quality
 
 __all__ = ["Mesh"]
@@ -26,11 +27,11 @@ def _rows_of_three(values: ArrayLike, name: str) -> NDArray[Any]:
     return array
 
 
-def _as_float32(values: ArrayLike, name: str) -> NDArray[np.float32]:
+def _numbers(values: ArrayLike, name: str) -> NDArray[Any]:
     array = _rows_of_three(values, name)
     if array.dtype.kind not in "fiu":
         raise UsageError(f"{name} are numbers, these are {array.dtype}")
-    return np.ascontiguousarray(array, dtype=np.float32)
+    return array
 
 
 def _as_indices(values: ArrayLike) -> NDArray[np.uint32]:
@@ -51,7 +52,8 @@ class Mesh:
     Parameters
     ----------
     vertices : array_like, shape (n, 3)
-        LPS mm; kept as float32, without a copy when they are C-contiguous float32.
+        LPS mm; kept as float32, without a copy when they are C-contiguous float32.  Others that reach 4096 mm from
+        the origin, where float32 would round them by more than 2e-4 mm, are kept as float64.
     triangles : array_like, shape (m, 3)
         Indices of vertices, counter-clockwise when seen from outside; kept as uint32.
     normals : array_like, shape (n, 3), optional
@@ -75,9 +77,11 @@ class Mesh:
         normals: ArrayLike | None = None,
         report: dict[str, Any] | None = None,
     ):
-        self._vertices = _as_float32(vertices, "vertices")
+        self._vertices = as_stored(_numbers(vertices, "vertices"))
         self._triangles = _as_indices(triangles)
-        self._normals = None if normals is None else _as_float32(normals, "normals")
+        self._normals = (
+            None if normals is None else np.ascontiguousarray(_numbers(normals, "normals"), dtype=np.float32)
+        )
         if len(self._vertices) > _MOST_VERTICES:
             raise UsageError(f"a mesh has at most {_MOST_VERTICES} vertices, this one has {len(self._vertices)}")
         if self._normals is not None and len(self._normals) != len(self._vertices):
@@ -85,8 +89,8 @@ class Mesh:
         self.report: dict[str, Any] = {} if report is None else report
 
     @property
-    def vertices(self) -> NDArray[np.float32]:
-        """Positions in LPS mm, shape (n, 3)."""
+    def vertices(self) -> NDArray[np.floating]:
+        """Positions in LPS mm, shape (n, 3), float32; float64 where they lie far from the origin."""
         return self._vertices
 
     @property
@@ -126,7 +130,7 @@ class Mesh:
                 row = int(np.flatnonzero(~np.isfinite(values).all(axis=1))[0])
                 raise UsageError(f"{name} {row} is not finite: {values[row].tolist()}")
 
-    def in_space(self, space: str) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
+    def in_space(self, space: str) -> tuple[NDArray[np.floating], NDArray[np.float32] | None]:
         """Return vertices and normals in another patient frame; the mesh itself is always LPS.
 
         Parameters
@@ -136,7 +140,7 @@ class Mesh:
 
         Returns
         -------
-        vertices : ndarray, shape (n, 3), float32, mm
+        vertices : ndarray, shape (n, 3), mm, of the type of `vertices`
         normals : ndarray, shape (n, 3), float32, or None
         """
         signs = np.diag(frame_from_lps(space)).astype(np.float32)
@@ -162,7 +166,7 @@ class Mesh:
             ``.stl``, ``.ply``, ``.obj``, ``.glb``, ``.vtp`` or ``.3mf``, upper or lower case.
         space : {"lps", "ras"}
             Patient frame of the coordinates; the file says which it is.  Units are mm; GLB carries a node matrix
-            that takes them to the metres, Y up, of glTF.
+            that takes them to the metres, Y up, of glTF.  STL holds float32 only, the others keep float64 vertices.
 
         Returns
         -------

@@ -13,7 +13,7 @@ Points = NDArray[np.float64]
 
 
 def find_nearest_triangle(
-    vertices: NDArray[np.float32], triangles: NDArray[np.uint32], point: NDArray[np.float64]
+    vertices: NDArray[np.floating], triangles: NDArray[np.uint32], point: NDArray[np.float64]
 ) -> tuple[int, float]:
     """Find the triangle that lies nearest to a point.
 
@@ -22,7 +22,7 @@ def find_nearest_triangle(
 
     Parameters
     ----------
-    vertices : ndarray, shape (n, 3), float32
+    vertices : ndarray, shape (n, 3), float32 or float64
         mm.
     triangles : ndarray, shape (m, 3), uint32
         At least one, every index below n.

@@ -10,14 +10,14 @@ from clrecon.mesh.measures import corner_edges, cross_product
 __all__ = ["vertex_normals"]
 
 
-def vertex_normals(vertices: NDArray[np.float32], triangles: NDArray[np.uint32]) -> NDArray[np.float32]:
+def vertex_normals(vertices: NDArray[np.floating], triangles: NDArray[np.uint32]) -> NDArray[np.float32]:
     """Mean of the face normals, weighted by the angle of each face at the vertex.
 
     Such normals do not depend on how the surface is cut into triangles (Thuermer and Wuethrich 1998).
 
     Parameters
     ----------
-    vertices : ndarray, shape (n, 3), float32
+    vertices : ndarray, shape (n, 3), float32 or float64
     triangles : ndarray, shape (m, 3), uint32
 
     Returns

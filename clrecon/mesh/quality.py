@@ -20,12 +20,12 @@ from clrecon.mesh.measures import corner_edges, cross_product, local_origin
 __all__ = ["measure_quality"]
 
 
-def measure_quality(vertices: NDArray[np.float32], triangles: NDArray[np.uint32]) -> dict[str, Any]:
+def measure_quality(vertices: NDArray[np.floating], triangles: NDArray[np.uint32]) -> dict[str, Any]:
     """Measure a triangle surface.
 
     Parameters
     ----------
-    vertices : ndarray, shape (n, 3), float32
+    vertices : ndarray, shape (n, 3), float32 or float64
         Millimetres.
     triangles : ndarray, shape (m, 3), uint32
         Indices of vertices.
@@ -94,7 +94,7 @@ def measure_quality(vertices: NDArray[np.float32], triangles: NDArray[np.uint32]
 
 
 def _measure_triangles(
-    vertices: NDArray[np.float32], triangles: NDArray[np.uint32]
+    vertices: NDArray[np.floating], triangles: NDArray[np.uint32]
 ) -> tuple[float, float, int, float | None]:
     """Area in mm2, signed volume in mm3, number of triangles without area, shortest edge in mm."""
     twice_area = six_volumes = 0.0

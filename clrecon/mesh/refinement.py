@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from clrecon.errors import NoSurfaceError, UsageError
 from clrecon.mesh.clusters import Clusters
 from clrecon.mesh.connectivity import find_edges
+from clrecon.mesh.coordinates import as_stored
 from clrecon.mesh.distances import NearDistance
 from clrecon.mesh.measures import cross_products, local_origin
 from clrecon.mesh.mesh import Mesh
@@ -108,7 +109,7 @@ def smooth_mesh(mesh: Mesh, iterations: int = 20, max_deviation_mm: float | None
     step[edges.ends[:, edges.uses == 1]] = 0.0  # VTK smooths along the border all the same
     held = _hold_back(before, step, mesh.triangles, bound)
 
-    vertices = (origin + before + step).astype(np.float32)
+    vertices = as_stored(origin + before + step)
     for _ in range(_ROUNDS):
         flat = _flat_corners(vertices, mesh.triangles)
         flat = flat[(vertices[flat] != mesh.vertices[flat]).any(axis=1)]
@@ -168,7 +169,7 @@ def _windowed_sinc(
     return vtk_to_numpy(smoother.GetOutput().GetPoints().GetData()).astype(np.float64)
 
 
-def _flat_corners(vertices: NDArray[np.float32], triangles: NDArray[np.uint32]) -> NDArray[np.integer]:
+def _flat_corners(vertices: NDArray[np.floating], triangles: NDArray[np.uint32]) -> NDArray[np.integer]:
     """Vertices of triangles without area."""
     flat = [
         where.start + np.flatnonzero(~cross.any(axis=0))

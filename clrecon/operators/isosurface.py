@@ -12,6 +12,7 @@ from numpy.typing import DTypeLike, NDArray
 from clrecon.errors import ClreconError, DeviceError, DeviceMemoryError, NoSurfaceError, UsageError
 from clrecon.geometry import Volume
 from clrecon.geometry.field import IsoRule, ValueRange, check_topology, choose_iso_rule, data_range
+from clrecon.geometry.precision import describe_far
 from clrecon.kernels import Program, Stopwatch, result_pages, upload
 from clrecon.mesh import Mesh
 from clrecon.opencl import Device, choose_device, describe_shortage, memory_limits
@@ -182,7 +183,8 @@ class SurfaceExtractor:
             progress("build", 1, 1)
         self._extractions += 1
         positions, normals, triangles = run.all_slabs(self._plan(grid), progress)
-        return Mesh(positions, triangles, normals, run.describe(len(positions), len(triangles)))
+        report = run.describe(len(positions), len(triangles))
+        return Mesh(run.placement.to_lps(positions), triangles, normals, report)
 
     def _plan(self, grid: SampleGrid) -> int:
         key = grid.rule.border, grid.rule.topology
@@ -320,7 +322,7 @@ class _Run:
             "device_bytes": dict(self.largest),
             "seconds": dict(self.stopwatch.seconds),
             "kernel_seconds": dict(self.stopwatch.by_kernel),
-            "warnings": [*cache_warnings(), *self.warnings],
+            "warnings": [*cache_warnings(), *describe_far(self.grid.volume), *self.warnings],
         }
 
 
@@ -357,7 +359,8 @@ def extract_isosurface(
     inside when its value is >= `iso_value`.  For integer voxels and an integer `iso_value` k the surface lies at
     k - 0.5, between the integers, so no face is degenerate.  Vertices are mapped through the volume's affine,
     shear included, once; they are right to one unit in the last place that float32 has for the volume's largest
-    coordinate (6e-5 mm at 1 m), but kept four such units off voxel centres.
+    coordinate (6e-5 mm at 1 m), but kept four such units off voxel centres.  From 4096 mm on they are computed
+    relative to the volume's centre and given as float64.
 
     A volume of any size goes through: what does not fit the device is worked on slab by slab.  The mesh is the same
     bit for bit.
@@ -396,7 +399,7 @@ def extract_isosurface(
     NoSurfaceError
         The iso value crosses nothing; the message gives the range of the data.
     UsageError
-        `volume`, `iso_value` or `topology` is not what it should be, values or coordinates are too large for
+        `volume`, `iso_value` or `topology` is not what it should be, values or the volume are too large for
         float32, or a row of the volume is too long.
     DeviceError
         No device, not even one slice fits its memory, 2^32 vertices or triangles or more, or the device fails or

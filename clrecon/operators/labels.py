@@ -15,6 +15,7 @@ from numpy.typing import DTypeLike
 from clrecon.errors import NoSurfaceError, UsageError
 from clrecon.geometry import Volume
 from clrecon.geometry.field import IsoRule, choose_iso_rule
+from clrecon.geometry.precision import describe_far
 from clrecon.kernels import Program, Stopwatch, allocate, download, launch, load_program, upload
 from clrecon.labels import LabelMap, ResampledLabels, resample_labels
 from clrecon.labels.growth import Growth
@@ -213,7 +214,11 @@ class _Run:
             "solid": self.solid,
             "seconds": dict(self.stopwatch.seconds),
             "kernel_seconds": dict(self.stopwatch.by_kernel),
-            "warnings": [*cache_warnings(), *_warn_of_uneven_growth(self.volume, self.growth)],
+            "warnings": [
+                *cache_warnings(),
+                *describe_far(self.volume),
+                *_warn_of_uneven_growth(self.volume, self.growth),
+            ],
         }
 
 
@@ -337,7 +342,7 @@ def extract_labels(
             }
             report["warnings"] += _warn(taken, report)
             positions, normals, triangles = part
-            meshes[number] = Mesh(positions, triangles, normals, report)
+            meshes[number] = Mesh(run.placement.to_lps(positions), triangles, normals, report)
             run.stopwatch = Stopwatch()  # what is common to all labels counts for the first
     if not meshes:
         raise NoSurfaceError(f"no label has a voxel of {rule.iso_value:g} HU or more in the CT")

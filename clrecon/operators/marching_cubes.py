@@ -11,6 +11,7 @@ from numpy.typing import DTypeLike, NDArray
 from clrecon.errors import DeviceError, DeviceMemoryError
 from clrecon.geometry import Volume, is_left_handed
 from clrecon.geometry.field import layer_normal_matrices, slice_normal_matrices, vertex_margin
+from clrecon.geometry.precision import find_vertex_origin
 from clrecon.kernels import Program, Stopwatch, allocate, download, empty_output, launch, load_program, upload
 from clrecon.opencl import Device
 from clrecon.operators.bricks import BrickStates
@@ -113,11 +114,14 @@ class Placement:
     slice_frames : ndarray, shape (gk, 9, 4), float32
     steps : ndarray, shape (4, 4), float32
     margin : ndarray, shape (4,), float32
+    origin : ndarray, shape (3,), float64, or None
+        What the device's positions are relative to, see `find_vertex_origin`.
     """
 
     slice_frames: NDArray[np.float32]
     steps: NDArray[np.float32]
     margin: NDArray[np.float32]
+    origin: NDArray[np.float64] | None = None
 
     @classmethod
     def of(cls, volume: Volume, border: int) -> Placement:
@@ -126,15 +130,22 @@ class Placement:
         Raises
         ------
         UsageError
-            The volume lies too far from the origin for float32.
+            The volume is too large for float32.
         """
         origins = volume.slice_origins(border + 1)[1:]
+        origin = find_vertex_origin(volume)
+        if origin is not None:
+            origins = origins - origin
         head, rest = origins[:-1].astype(np.float32), origins[:-1] - origins[:-1].astype(np.float32)
         parts = [head.astype(np.float64)[:, None], rest[:, None], np.diff(origins, axis=0)[:, None]]
         normals = slice_normal_matrices(volume, border), layer_normal_matrices(volume, border)
         frames = _pad4(np.concatenate([*parts, *normals], axis=1))
         steps = _pad4(np.stack([part for step in (0, 1) for part in _split(volume.affine[:3, step])]))
-        return cls(frames, steps, _pad4(vertex_margin(volume, border)))
+        return cls(frames, steps, _pad4(vertex_margin(volume, border)), origin)
+
+    def to_lps(self, positions: NDArray[np.float32]) -> NDArray[np.floating]:
+        """Positions as the device computes them to LPS mm: themselves, but float64 in a volume far from the origin."""
+        return positions if self.origin is None else positions + self.origin
 
 
 def volume_scalars(slab: Slab) -> tuple[Any, ...]:

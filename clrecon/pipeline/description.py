@@ -22,6 +22,9 @@ if TYPE_CHECKING:
 
 __all__ = ["describe_job", "describe_part"]
 
+SKIN_HU = (-950.0, -200.0)
+"""Iso values between air and fat: the surface is the skin, and a head's a face."""
+
 _SAID_ABOVE = ("vertices", "triangles", "closed", "manifold", "components", "area_mm2", "volume_ml", "bounds_mm")
 
 
@@ -84,13 +87,16 @@ def describe_job(
         written one by one were found together, and count once), ``bounds_mm`` is the box around all, ``closed``
         and ``manifold`` hold where they hold for each, and what differs or cannot be summed is None.
     """
+    from clrecon.mesh.writers import describe_rounding  # numpy: not wanted before a job starts
+
     certificate = dict(volume.report)
     warnings = [str(text) for text in certificate.pop("warnings", [])]
-    for part in parts:
+    for part, mesh in zip(parts, meshes, strict=True):
         warnings += [str(text) for text in part.mesh.report.get("warnings", [])]
+        warnings += describe_rounding(part.mesh, f".{mesh['output']['format']}")
     level, level_warnings = describe_level(volume, settings, choice)
     warnings += level_warnings
-    if settings.preset_used == "skin":
+    if any(SKIN_HU[0] <= part.surface.iso_value <= SKIN_HU[1] for part in parts if part.surface.label is None):
         warnings.append("a surface of the skin can show a face: treat the file as one that identifies the patient")
     of_surface = {part.surface: mesh for part, mesh in zip(parts, meshes, strict=True)}.values()
     report: dict[str, Any] = {

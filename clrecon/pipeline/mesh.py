@@ -10,6 +10,7 @@ from typing import Any
 from clrecon.pipeline.description import describe_job, describe_part
 from clrecon.pipeline.labels import extract_label_surfaces, open_labels
 from clrecon.pipeline.levels import choose_level
+from clrecon.pipeline.masking import mask_volume
 from clrecon.pipeline.opening import DeviceOpening
 from clrecon.pipeline.outputs import check_outputs, commit_all, count_leftovers, name_outputs, stage_meshes
 from clrecon.pipeline.parts import check_levels, extract_surfaces, first_names, plan_surfaces, select_parts
@@ -85,6 +86,9 @@ def make_mesh(
         device = opening.wait()
         watch.lap("device")
 
+    volume = mask_volume(volume, settings, progress)
+    watch.lap("mask")
+
     if settings.half_way == "auto":
         progress("choose", 0, 0)
     choice = choose_level(volume, settings)
@@ -152,7 +156,8 @@ def _seconds(watch: Stopwatch, origins: Sequence[dict[str, Any]]) -> dict[str, f
     measured = [origin.get("seconds", {}) for origin in origins]
     seconds = {"device": watch.seconds.get("device", 0.0), "read": watch.seconds.get("read", 0.0)}
     seconds.update({part: sum(float(own.get(part, 0.0)) for own in measured) for part in _DEVICE_PARTS})
-    seconds.update({part: watch.seconds.get(part, 0.0) for part in ("choose", "select", "refine", "measure", "write")})
+    later = ("mask", "choose", "select", "refine", "measure", "write")
+    seconds.update({part: watch.seconds.get(part, 0.0) for part in later})
     seconds["other"] = max(0.0, watch.total() - sum(seconds.values()))
     seconds["total"] = watch.total()
     return {part: round(value, 4) for part, value in seconds.items()}

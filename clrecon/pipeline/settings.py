@@ -31,6 +31,10 @@ class MeshSettings:
         Which of its phases, where it has several.
     allow_gaps : bool
         Read a stack with missing slices.
+    remove_table : bool
+        Turn what is not the patient's body into air first, see `clrecon.geometry.body.remove_table`.
+    field_of_view : float or "auto", optional
+        Turn what lies further from the centre of the slices (mm) into air first; "auto": the circle that fits them.
     space : {"lps", "ras"}
         Patient frame of the written mesh.
     closed : bool
@@ -72,6 +76,8 @@ class MeshSettings:
     series: str | int | None = None
     phase: int | None = None
     allow_gaps: bool = False
+    remove_table: bool = False
+    field_of_view: float | str | None = None
     space: str = "lps"
     closed: bool = True
     topology: str = "separated"
@@ -104,6 +110,7 @@ class MeshSettings:
             if len(seed) != 3 or not all(map(math.isfinite, seed)):
                 raise UsageError(f"a seed is a point of three numbers in mm, not {tuple(seed)}")
         self._check_refinement()
+        self._check_field_of_view()
         from clrecon.geometry import frame_from_lps  # numpy: not wanted before a job starts
         from clrecon.geometry.field import check_topology
 
@@ -137,6 +144,14 @@ class MeshSettings:
                 raise UsageError(f"the iso value must be a finite number of HU, not {value}")
             if value in self.levels[:place]:
                 raise UsageError(f"the iso value {value:g} HU is given twice")
+
+    def _check_field_of_view(self) -> None:
+        view = self.field_of_view
+        if isinstance(view, str):
+            if view != "auto":
+                raise UsageError(f"the field of view is a radius in mm or auto, not {view!r}")
+        elif view is not None and not (math.isfinite(view) and view > 0.0):
+            raise UsageError(f"the radius of the field of view is a length in mm above 0, not {view:g}")
 
     def _check_refinement(self) -> None:
         if self.smooth is not None and not 1 <= self.smooth <= 1000:

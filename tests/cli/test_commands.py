@@ -110,14 +110,13 @@ def test_mesh_without_report_measures_nothing(
     assert "measuring the mesh" in captured.err
 
 
+@pytest.mark.parametrize(("level", "said"), [(["--preset", "skin"], "-500 HU (preset skin)"), (["--hu", "-400"], "")])
 def test_skin_warns_that_a_face_shows(
-    device: Any, ct: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    device: Any, ct: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], level: list[str], said: str
 ) -> None:
-    assert (
-        main(["mesh", str(ct), "-o", str(tmp_path / "a.stl"), "--preset", "skin", "--device", str(device.index)]) == 0
-    )
+    assert main(["mesh", str(ct), "-o", str(tmp_path / "a.stl"), *level, "--device", str(device.index)]) == 0
     captured = capsys.readouterr()
-    assert "-500 HU (preset skin)" in captured.out
+    assert said in captured.out
     assert captured.err.startswith("clrecon: warning: a surface of the skin can show a face")
 
 

@@ -50,7 +50,9 @@ def test_half_takes_the_materials_given(
 def test_auto_without_bone_ends_with_2_and_the_modes(
     device: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    water = ct_files.write_series(tmp_path / "water", ct_files.sphere_voxels() * 0 + 8)
+    voxels = ct_files.sphere_voxels() * 0 + 8
+    voxels[0, 0, 0] = 9
+    water = ct_files.write_series(tmp_path / "water", voxels)
     assert run(water, device, tmp_path, "--hu", "auto") == 2
     message = capsys.readouterr().err
     assert "soft tissue has its mode at 8 HU" in message and "give the iso value (--hu N)" in message

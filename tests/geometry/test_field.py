@@ -77,10 +77,18 @@ def test_an_iso_value_is_a_number(bad):
         choose_iso_rule(make_volume(0, 1), bad)
 
 
-def test_a_place_where_float32_is_too_coarse_is_refused():
-    volume = Volume(np.zeros((3, 4, 5), np.int16), np.diag((0.1, 0.1, 0.1, 1.0)) + np.eye(4, k=3) * 1e6)
-    with pytest.raises(UsageError, match=r"reaches 1e\+06 mm .* shift its origin"):
-        vertex_margin(volume, 1)
+def test_a_size_for_which_float32_is_too_coarse_is_refused():
+    steps = np.diag((1e4, 1e4, 1e-3, 1.0))
+    with pytest.raises(UsageError, match=r"reaches 3e\+04 mm from its centre .* take a part"):
+        vertex_margin(Volume(np.zeros((3, 4, 5), np.int16), steps), 1)
+
+
+def test_the_margin_does_not_grow_with_the_distance():
+    spacing = np.diag((0.1, 0.1, 0.1, 1.0))
+    far = Volume(np.zeros((3, 4, 5), np.int16), spacing + np.eye(4, k=3) * 1e6)
+    assert vertex_margin(far, 1).max() < 1e-4
+    near = Volume(np.zeros((3, 4, 5), np.int16), spacing + np.eye(4, k=3) * 4000.0)
+    assert vertex_margin(near, 1) == pytest.approx(4.0 * 2.0**-12 / 0.1)
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf])

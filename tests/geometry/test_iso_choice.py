@@ -213,6 +213,19 @@ def test_a_mapped_volume_is_looked_at_slice_by_slice(tmp_path) -> None:
     assert peak < mapped.nbytes / 20
 
 
+def test_padding_filled_with_air_does_not_hide_the_noise_of_air() -> None:
+    field = np.pad(make_ball(1040.0, -1000.0), ((0, 0), (20, 20), (20, 20)), constant_values=-1000.0)
+    field += np.random.default_rng(3).normal(0, 60, field.shape)
+    inside = circle(field.shape, (field.shape[1] - 1) / 2, (field.shape[2] - 1) / 2, field.shape[1] / 2)
+    unfilled, filled = as_volume(np.where(inside, field, -3024.0)), as_volume(np.where(inside, field, -1000.0))
+    filled.report.update(padding_hu=-1000.0, padding_share=float(1.0 - inside.mean()))
+    expected = choose_iso_value(unfilled)
+    assert expected.background == "air" and expected.noise_hu == pytest.approx(60, abs=6)
+    assert choose_iso_value(filled) == expected
+    filled.report["padding_hu"] = None
+    assert choose_iso_value(filled).noise_hu < 20
+
+
 # --- what is refused ---
 def make_water_phantom() -> np.ndarray:
     tube = np.where(circle((1, 96, 96), 48, 48, 36), 0.0, -1000.0)

@@ -16,15 +16,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO
 
+import numpy as np
+
 from clrecon.errors import NoSurfaceError, OutputError, UsageError
 from clrecon.files import StagedFile, stage_file
+from clrecon.geometry.precision import float32_step
 from clrecon.mesh.writers import glb, obj, ply, stl, threemf, vtp
 from clrecon.mesh.writers.content import Content, describe_mesh
 
 if TYPE_CHECKING:
     from clrecon.mesh.mesh import Mesh
 
-__all__ = ["FORMATS", "MeshFormat", "check_format", "stage_mesh", "write_mesh"]
+__all__ = ["FORMATS", "MeshFormat", "check_format", "describe_rounding", "stage_mesh", "write_mesh"]
 
 
 @dataclass(frozen=True)
@@ -79,6 +82,17 @@ def check_format(path: str | os.PathLike[str]) -> str:
         found = f"the extension {extension!r}" if extension else "no extension"
         raise UsageError(f"the name of the mesh file has {found}: use one of {', '.join(FORMATS)}")
     return extension
+
+
+def describe_rounding(mesh: Mesh, extension: str) -> list[str]:
+    """The warning for a format that cannot hold the vertices as exactly as the mesh does; none for the others."""
+    if extension != ".stl" or mesh.vertices.dtype == np.float32:
+        return []
+    step = float32_step(float(np.abs(mesh.vertices).max()))
+    return [
+        f"STL holds float32: so far from the origin its vertices are rounded to steps of {step:.2g} mm;"
+        " PLY, VTP, OBJ, GLB and 3MF keep them"
+    ]
 
 
 def write_mesh(mesh: Mesh, path: str | os.PathLike[str], space: str = "lps") -> int:

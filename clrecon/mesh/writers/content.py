@@ -25,7 +25,7 @@ class Content:
 
     Attributes
     ----------
-    vertices : ndarray, shape (n, 3), float32
+    vertices : ndarray, shape (n, 3), float32, or float64 far from the origin
         mm in `space`.
     triangles : ndarray, shape (m, 3), uint32
     normals : ndarray, shape (n, 3), float32, or None
@@ -40,7 +40,7 @@ class Content:
         What is known of the volume, see `clrecon.mesh.writers.certificate`; one printable ASCII line each.
     """
 
-    vertices: NDArray[np.float32]
+    vertices: NDArray[np.floating]
     triangles: NDArray[np.uint32]
     normals: NDArray[np.float32] | None
     space: str
@@ -48,6 +48,16 @@ class Content:
     iso_value_hu: float | None
     affine: NDArray[np.float64] | None
     certificate: tuple[str, ...] = ()
+
+    @property
+    def is_double(self) -> bool:
+        """Coordinates need more digits than float32 has."""
+        return self.vertices.dtype == np.float64
+
+    @property
+    def number(self) -> str:
+        """How text formats write a coordinate: so many digits give back the same float32, or 1e-9 mm at 1e5 mm."""
+        return "%.15g" if self.is_double else "%.9g"
 
     @property
     def remarks(self) -> list[str]:

@@ -1,7 +1,8 @@
 """GLB, the binary glTF 2.0 (Khronos): one mesh, one node, no textures.
 
-The buffer holds the vertices in patient millimetres as they are, so that nothing is lost; the matrix of the node
-takes them to what glTF prescribes: metres, right-handed, Y up, the front facing +Z, which is
+The buffer holds the vertices in patient millimetres as they are, so that nothing is lost (far from the origin, where
+float32 is too coarse, less the centre of their bounds, which the matrix adds); the matrix of the node takes them to
+what glTF prescribes: metres, right-handed, Y up, the front facing +Z, which is
 
     (X, Y, Z) = 0.001 (L, S, -P)
 
@@ -19,6 +20,7 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
+from clrecon.mesh.measures import local_origin
 from clrecon.mesh.writers.content import Content, refuse_file
 
 __all__ = ["estimate", "verify", "write"]
@@ -33,13 +35,29 @@ _SCENE_FROM_LPS = np.array(((1, 0, 0), (0, 0, 1), (0, -1, 0)), dtype=np.float64)
 """Rows X, Y, Z of the scene in terms of L, P, S."""
 
 
-def _column_major(rotation: np.ndarray, scale: float) -> list[float]:
+def _column_major(rotation: np.ndarray, scale: float, origin: np.ndarray | None = None) -> list[float]:
     matrix = np.eye(4)
     matrix[:3, :3] = scale * rotation
+    if origin is not None:
+        matrix[:3, 3] = matrix[:3, :3] @ origin
     return [float(value) + 0.0 for value in matrix.T.ravel()]  # + 0.0: no -0
 
 
+def _origin(content: Content) -> np.ndarray:
+    """What the vertices in the buffer are relative to, mm."""
+    return np.rint(local_origin(content.vertices)) if content.is_double else np.zeros(3)
+
+
+def _positions(content: Content) -> np.ndarray:
+    """The vertices as the buffer has them, float32."""
+    vertices = content.vertices - _origin(content) if content.is_double else content.vertices
+    return np.ascontiguousarray(vertices, dtype="<f4")
+
+
 def _document(content: Content) -> dict[str, Any]:
+    low, high = (
+        np.float32(end - _origin(content)) for end in (content.vertices.min(axis=0), content.vertices.max(axis=0))
+    )
     count, indices = len(content.vertices), content.triangles.size
     attributes = {"POSITION": 0}
     views = [{"buffer": 0, "byteOffset": 0, "byteLength": 12 * count, "target": _VERTEX_DATA}]
@@ -49,8 +67,8 @@ def _document(content: Content) -> dict[str, Any]:
             "componentType": _FLOAT,
             "count": count,
             "type": "VEC3",
-            "min": content.vertices.min(axis=0).tolist(),
-            "max": content.vertices.max(axis=0).tolist(),
+            "min": low.tolist(),
+            "max": high.tolist(),
         }
     ]
     if content.normals is not None:
@@ -76,7 +94,7 @@ def _document(content: Content) -> dict[str, Any]:
         "asset": {"version": "2.0", "generator": "clrecon", "extras": extras},
         "scene": 0,
         "scenes": [{"nodes": [0]}],
-        "nodes": [{"name": "surface", "mesh": 0, "matrix": _column_major(rotation, _METRES_PER_MM)}],
+        "nodes": [{"name": "surface", "mesh": 0, "matrix": _column_major(rotation, _METRES_PER_MM, _origin(content))}],
         "meshes": [{"name": "surface", "primitives": [primitive]}],
         # Seen from both sides: a surface that is open at the border of the scan shows its inside.
         "materials": [{"name": "bone", "doubleSided": True, "pbrMetallicRoughness": material}],
@@ -93,7 +111,7 @@ def _json_chunk(content: Content) -> bytes:
 
 def _binary_length(content: Content) -> int:
     normals = 0 if content.normals is None else content.normals.nbytes
-    return content.vertices.nbytes + normals + content.triangles.nbytes
+    return 12 * len(content.vertices) + normals + content.triangles.nbytes
 
 
 def estimate(content: Content) -> int:
@@ -107,7 +125,7 @@ def write(stream: BinaryIO, content: Content) -> None:
     stream.write(struct.pack("<4sII", b"glTF", 2, 20 + len(text) + 8 + _binary_length(content)))
     stream.write(struct.pack("<I4s", len(text), _JSON_CHUNK) + text)
     stream.write(struct.pack("<I4s", _binary_length(content), _BINARY_CHUNK))
-    stream.write(np.ascontiguousarray(content.vertices, dtype="<f4").data)
+    stream.write(_positions(content).data)
     if content.normals is not None:
         stream.write(np.ascontiguousarray(content.normals, dtype="<f4").data)
     stream.write(np.ascontiguousarray(content.triangles, dtype="<u4").data)

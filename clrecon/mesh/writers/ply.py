@@ -7,7 +7,7 @@ Indices are declared ``int`` and not ``uint``, which is what every reader knows:
 from __future__ import annotations
 
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 import numpy as np
 
@@ -22,13 +22,14 @@ _CHUNK = 1 << 14
 
 
 def _header(content: Content) -> bytes:
-    names = ["x", "y", "z"] if content.normals is None else ["x", "y", "z", "nx", "ny", "nz"]
+    coordinate = "double" if content.is_double else "float"
     lines = [
         "ply",
         "format binary_little_endian 1.0",
         *(f"comment {remark}" for remark in content.remarks),
         f"element vertex {len(content.vertices)}",
-        *(f"property float {name}" for name in names),
+        *(f"property {coordinate} {name}" for name in ("x", "y", "z")),
+        *(f"property float {name}" for name in ("nx", "ny", "nz") if content.normals is not None),
         f"element face {len(content.triangles)}",
         "property list uchar int vertex_indices",
         "end_header",
@@ -36,10 +37,17 @@ def _header(content: Content) -> bytes:
     return ("\n".join(lines) + "\n").encode("ascii")
 
 
+def _vertex(content: Content) -> np.dtype[Any]:
+    fields: list[tuple[str, str, tuple[int]]] = [("position", "<f8" if content.is_double else "<f4", (3,))]
+    if content.normals is not None:
+        fields.append(("normal", "<f4", (3,)))
+    return np.dtype(fields)
+
+
 def estimate(content: Content) -> int:
     """Size of the file in bytes, exactly."""
-    row = 12 if content.normals is None else 24
-    return len(_header(content)) + row * len(content.vertices) + _FACE.itemsize * len(content.triangles)
+    rows = _vertex(content).itemsize * len(content.vertices)
+    return len(_header(content)) + rows + _FACE.itemsize * len(content.triangles)
 
 
 def write(stream: BinaryIO, content: Content) -> None:
@@ -47,14 +55,13 @@ def write(stream: BinaryIO, content: Content) -> None:
     if len(content.vertices) > 2**31:
         raise OutputError(f"{len(content.vertices)} vertices are too many for a PLY file, at most {2**31}")
     stream.write(_header(content))
-    columns = 3 if content.normals is None else 6
-    rows = np.empty((_CHUNK, columns), dtype="<f4")
+    rows = np.empty(_CHUNK, dtype=_vertex(content))
     for where in chunks(len(content.vertices), _CHUNK):
         piece = rows[: where.stop - where.start]
-        piece[:, :3] = content.vertices[where]
+        piece["position"] = content.vertices[where]
         if content.normals is not None:
-            piece[:, 3:] = content.normals[where]
-        stream.write(piece.data)
+            piece["normal"] = content.normals[where]
+        stream.write(piece.view(np.uint8).data)
     faces = np.empty(_CHUNK, dtype=_FACE)
     faces["count"] = 3
     for where in chunks(len(content.triangles), _CHUNK):

@@ -32,8 +32,12 @@ _SMALL_PARTS = {
     f'<Relationship Target="/{_MODEL}" Id="rel0" Type="http://schemas.microsoft.com/3dmanufacturing/2013/01/3dmodel"/>\n'
     "</Relationships>\n",
 }
-_VERTEX = '<vertex x="%.9g" y="%.9g" z="%.9g"/>\n'
 _TRIANGLE = '<triangle v1="%d" v2="%d" v3="%d"/>\n'
+
+
+def _vertex(content: Content) -> str:
+    number = content.number
+    return f'<vertex x="{number}" y="{number}" z="{number}"/>\n'
 
 
 def estimate(content: Content) -> int:
@@ -44,7 +48,8 @@ def estimate(content: Content) -> int:
 def _unpacked(content: Content) -> int:
     """Size of the XML in bytes, a little too much."""
     digits = len(str(len(content.vertices)))
-    return 2048 + (len(_VERTEX) + 27) * len(content.vertices) + (len(_TRIANGLE) + 3 * digits) * len(content.triangles)
+    vertex = len(_vertex(content)) + (45 if content.is_double else 27)
+    return 2048 + vertex * len(content.vertices) + (len(_TRIANGLE) + 3 * digits) * len(content.triangles)
 
 
 def write(stream: BinaryIO, content: Content) -> None:
@@ -56,9 +61,10 @@ def write(stream: BinaryIO, content: Content) -> None:
         # The 64-bit extension of ZIP only where it must be: not every reader knows it.
         with package.open(_MODEL, "w", force_zip64=_unpacked(content) > zipfile.ZIP64_LIMIT) as model:
             model.write(_opening(content).encode("ascii"))
+            vertex = _vertex(content)
             for where in chunks(len(content.vertices), _CHUNK):
                 rows = content.vertices[where]
-                model.write((_VERTEX * len(rows) % tuple(rows.ravel().tolist())).encode("ascii"))
+                model.write((vertex * len(rows) % tuple(rows.ravel().tolist())).encode("ascii"))
             model.write(b"</vertices>\n<triangles>\n")
             for where in chunks(len(content.triangles), _CHUNK):
                 corners = content.triangles[where]

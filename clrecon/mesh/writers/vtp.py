@@ -22,8 +22,8 @@ _END = b"</VTKFile>"
 
 def estimate(content: Content) -> int:
     """Size of the data in the file in bytes, without the XML: three indices and an offset a triangle."""
-    row = 12 if content.normals is None else 24
-    return row * len(content.vertices) + 16 * len(content.triangles)
+    normals = 0 if content.normals is None else content.normals.nbytes
+    return content.vertices.nbytes + normals + 16 * len(content.triangles)
 
 
 def write(stream: BinaryIO, content: Content) -> None:

@@ -1,0 +1,39 @@
+"""Options that leave out what is not the patient."""
+
+from __future__ import annotations
+
+import argparse
+from typing import Any
+
+__all__ = ["add_masking", "masking_settings"]
+
+
+def add_masking(parser: argparse.ArgumentParser) -> None:
+    """Declare ``--remove-table`` and ``--fov``."""
+    parser.add_argument(
+        "--remove-table",
+        action="store_true",
+        help="turn what is not the patient's body into air first: table, blankets, cables",
+    )
+    parser.add_argument(
+        "--fov",
+        nargs="?",
+        const="auto",
+        default=None,
+        type=_parse_radius,
+        metavar="RADIUS_MM",
+        help="turn what lies further from the centre of the slices into air first (without a number: the largest circle"
+        " that fits the slice)",
+    )
+
+
+def _parse_radius(text: str) -> float | str:
+    try:
+        return text if text == "auto" else float(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} is no radius in mm") from None
+
+
+def masking_settings(options: argparse.Namespace) -> dict[str, Any]:
+    """Entries of `MeshSettings`."""
+    return {"remove_table": options.remove_table, "field_of_view": options.fov}

@@ -1,0 +1,109 @@
+"""Padding: voxels that hold no measurement, filled with the air that was measured beside them.
+
+A surface between padding and measured air shows the reconstruction circle as a tube.  It appears at every iso value
+between the two, so that no fixed value is safe: air is -1000 HU on paper, -970 to -1010 HU in scans.  Of all values
+the median of the air beside the padding parts fewest of its neighbours from it, whatever the iso value: none where
+air has no noise, else no more than noise parts from noise.  Where the body reaches the circle it still meets air there
+and stays closed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from functools import lru_cache, partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clrecon.geometry import AIR_HU
+
+__all__ = ["PaddingMasks", "pack_mask"]
+
+AIR_RANGE_HU = (-1100, -900)
+"""What counts as air beside the padding.  The table and a blanket are denser; noise goes beyond at both ends alike."""
+SAMPLED_SLICES = 16
+"""So many slices, evenly spread, give some thousand voxels beside the padding."""
+
+KEPT_MASKS = 16
+"""Masks are unpacked for so many slices at once; most scans have the same in all slices."""
+
+Map = Callable[[Callable[[int], Any], Iterable[int]], Iterable[Any]]
+"""`map`, or that of a pool."""
+
+
+def pack_mask(mask: NDArray[np.bool_]) -> tuple[bytes, int]:
+    """A mask of padding in a bit a voxel, and how many voxels it has."""
+    return np.packbits(mask).tobytes(), int(np.count_nonzero(mask))
+
+
+def _unpack_mask(shape: tuple[int, int], bits: bytes) -> NDArray[np.bool_]:
+    return np.unpackbits(np.frombuffer(bits, np.uint8), count=shape[0] * shape[1]).view(np.bool_).reshape(shape)
+
+
+class PaddingMasks:
+    """Where a volume that is being read has padding, slice by slice.
+
+    Parameters
+    ----------
+    voxels : ndarray, shape (nk, nj, ni)
+        The volume, in HU once it is read; what stands in its padding does not matter.
+    """
+
+    def __init__(self, voxels: NDArray[Any]):
+        self._voxels = voxels
+        self._packed: dict[int, bytes] = {}
+        self._counts: dict[int, int] = {}
+        self._distinct: dict[bytes, bytes] = {}
+        self._mask = lru_cache(KEPT_MASKS)(partial(_unpack_mask, voxels.shape[1:]))
+
+    def add(self, k: int, packed: tuple[bytes, int] | None) -> None:
+        """Note the padding of slice `k`, as `pack_mask` gives it; None where it has none."""
+        if packed is not None:
+            bits, self._counts[k] = packed
+            self._packed[k] = self._distinct.setdefault(bits, bits)  # one that others have takes no memory
+
+    @property
+    def count(self) -> int:
+        """Voxels that are padding."""
+        return sum(self._counts.values())
+
+    def fill(self, run: Map = map) -> float | None:
+        """Give all padding the value of the air beside it, or `AIR_HU` where no air lies beside it.
+
+        Parameters
+        ----------
+        run : callable
+            Where slices go through at once: the ``map`` of a pool.
+
+        Returns
+        -------
+        float or None
+            The value in HU; None without padding.
+        """
+        if not self._packed:
+            return None
+        bordered = [k for k in sorted(self._packed) if self._counts[k] < self._voxels[k].size]
+        sampled = bordered[:: -(-len(bordered) // SAMPLED_SLICES)] if bordered else []
+        air = np.concatenate([*run(self._air_beside, sampled), self._voxels[:0].ravel()])
+        value = np.sort(air)[(len(air) - 1) // 2] if len(air) else self._voxels.dtype.type(AIR_HU)
+
+        def fill_slice(k: int) -> None:
+            np.copyto(self._voxels[k], value, where=self._mask(self._packed[k]))
+
+        for _ in run(fill_slice, self._packed):
+            pass
+        return float(value)
+
+    def _air_beside(self, k: int) -> NDArray[Any]:
+        """Measured air next to the padding of a slice, in rows and columns."""
+        mask = self._mask(self._packed[k])
+        beside = np.zeros_like(mask)
+        beside[1:] |= mask[:-1]
+        beside[:-1] |= mask[1:]
+        beside[:, 1:] |= mask[:, :-1]
+        beside[:, :-1] |= mask[:, 1:]
+        beside &= ~mask
+        values = self._voxels[k][beside]
+        low, high = AIR_RANGE_HU
+        return values[(values >= low) & (values <= high)]

@@ -1,0 +1,278 @@
+"""What of a scan is the patient: the body without table and blankets, the circle that was reconstructed.
+
+The body is found on a grid of about 2 mm: dense cells, and the cavities that they enclose (lungs, bowel, sinuses),
+are opened slice by slice so that plates (table tops, shells, straps) come off, and the pieces told apart in three
+dimensions.  Everything thick is kept, arms and legs too; thin parts that hang on it (ears, nose, fingers) come back
+unless they are as long as a table.  What is outside becomes air, with a margin of untouched voxels around the body,
+so that the skin's own edge is as it was measured.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clrecon.errors import RefusedInputError, UsageError
+from clrecon.geometry.volume import AIR_HU, Volume
+
+__all__ = ["find_body", "mask_field_of_view", "remove_table"]
+
+Mask = NDArray[np.bool_]
+
+CELL_MM = 2.0
+"""Size of the cells that the body is found on, where voxels are not larger."""
+TISSUE_HU = -300.0
+"""Between a blanket or foam and fat."""
+OPENING_MM = 7.0
+"""Half the thickness of what comes off: table tops and shells have 2 to 12 mm."""
+THICK_MM = 11.0
+"""A piece beside the body is kept when a circle of this radius fits into it: a hand, not a strap or an edge."""
+LONG_MM = 100.0
+"""Thin parts that hang on the body are kept when they are shorter than this: an ear, not a table."""
+SMALL_MM2 = 2500.0
+"""Enclosed regions of a slice up to this size are filled: bowel gas, sinuses, the airways."""
+LUNG_WALL, AIR_WALL = 0.2, 0.7
+"""Share of the wall that must be thick, of lung and of larger regions of air."""
+LUNG_HU, MOST_AIR = -950.0, 0.2
+"""Lung has fewer cells below this than that share; air, foam and blankets have more."""
+FEWEST_UNMEASURED = 16
+"""Cells beside each other that have one value: fewer have it by chance."""
+MARGIN_MM = 3.0
+"""Untouched voxels around the body: the blurred edge of the skin."""
+AIR_RANGE_HU = (-1100.0, -900.0)
+
+
+def remove_table(volume: Volume) -> Volume:
+    """Turn everything outside of the patient's body into air: table, blankets, cables.
+
+    Bone and all else within the body keep their values; so does a margin of 3 mm around it.  The result is meant to be
+    looked at: a part of the table that lies within the margin stays.
+
+    Parameters
+    ----------
+    volume : Volume
+        A scan in HU.
+
+    Returns
+    -------
+    Volume
+        The same places; ``report["remove_table"]`` has ``voxels_removed``, ``dense_voxels_removed`` (above -300 HU),
+        ``removed_share`` (of all voxels), ``body_share``, ``air_hu``.
+
+    Raises
+    ------
+    RefusedInputError
+        There is nothing thick and dense enough to be a body.
+    """
+    body, step = find_body(volume)
+
+    def outside(k: int) -> Mask:
+        nk, nj, ni = volume.voxels.shape
+        return np.asarray(~np.repeat(np.repeat(body[k // step[2]], step[1], 0), step[0], 1)[:nj, :ni])
+
+    return _turn_into_air(volume, outside, "remove_table", {"body_share": round(float(body.mean()), 4)})
+
+
+def mask_field_of_view(volume: Volume, radius_mm: float | None = None) -> Volume:
+    """Turn everything outside of a circle around the centre of the slices into air.
+
+    Parameters
+    ----------
+    volume : Volume
+        A scan in HU.
+    radius_mm : float, optional
+        Default: the largest circle that fits the slice, which is what scanners reconstruct.
+
+    Returns
+    -------
+    Volume
+        The same places; ``report["field_of_view"]`` has ``radius_mm``, ``voxels_removed``, ``dense_voxels_removed``
+        (above -300 HU), ``removed_share``, ``air_hu``.
+
+    Raises
+    ------
+    UsageError
+        The radius is no length above 0, or so short that no voxel is left.
+    """
+    _, nj, ni = volume.voxels.shape
+    di, dj, _ = volume.spacing
+    largest = min(ni * di, nj * dj) / 2.0
+    radius = largest if radius_mm is None else float(radius_mm)
+    if not (math.isfinite(radius) and radius > 0.0):
+        raise UsageError(f"the radius of the field of view is a length in mm above 0, not {radius:g}")
+    j, i = np.ogrid[:nj, :ni]
+    steps = np.stack(np.broadcast_arrays(i - (ni - 1) / 2.0, j - (nj - 1) / 2.0), axis=-1)
+    mask = np.linalg.norm(steps @ volume.affine[:3, :2].T, axis=-1) > radius
+    if mask.all():
+        raise UsageError(f"a field of view of {radius:g} mm holds no voxel: they are {di:.3g} x {dj:.3g} mm")
+    return _turn_into_air(volume, lambda k: mask, "field_of_view", {"radius_mm": round(radius, 3)})
+
+
+def _turn_into_air(volume: Volume, outside: Callable[[int], Mask], name: str, said: dict[str, Any]) -> Volume:
+    """Give the voxels outside the value that air has there; `outside` gives the mask of a slice."""
+    voxels = np.array(volume.voxels)
+    removed = dense = 0
+    air = _air_level(volume, outside)
+    for k, layer in enumerate(voxels):
+        mask = outside(k)
+        removed += int(np.count_nonzero(mask))
+        dense += int(np.count_nonzero(layer[mask] > TISSUE_HU))
+        layer[mask] = air
+        volume.release_slices(k, k + 1)
+    share = removed / voxels.size
+    facts = {"voxels_removed": removed, "dense_voxels_removed": dense, "removed_share": round(share, 4), **said}
+    facts["air_hu"] = float(air)
+    return volume.with_voxels(voxels, {**volume.report, name: facts})
+
+
+def _air_level(volume: Volume, outside: Callable[[int], Mask]) -> Any:
+    """The median of the air outside, so that no iso value shows where the mask ends; `AIR_HU` where there is none."""
+    low, high = AIR_RANGE_HU
+    found = []
+    for k in range(0, volume.voxels.shape[0], -(-volume.voxels.shape[0] // 16)):
+        values = volume.voxels[k][outside(k)][::7]
+        found.append(values[(values >= low) & (values <= high)])
+    air = np.sort(np.concatenate(found))
+    if len(air):
+        return air[(len(air) - 1) // 2]
+    dtype = volume.voxels.dtype
+    return dtype.type(AIR_HU if dtype.kind == "f" else max(AIR_HU, np.iinfo(dtype).min))
+
+
+def find_body(volume: Volume) -> tuple[Mask, tuple[int, int, int]]:
+    """Find the cells of the patient's body, with its margin.
+
+    Returns
+    -------
+    body : ndarray, shape (ck, cj, ci), bool
+        One entry a cell of ``step`` voxels.
+    step : (int, int, int)
+        Voxels of a cell along i, j, k.
+
+    Raises
+    ------
+    RefusedInputError
+        Nothing is thick and dense enough.
+    """
+    from scipy import ndimage
+
+    step = tuple(max(1, round(CELL_MM / length)) for length in volume.spacing)
+    cell_mm = [count * length for count, length in zip(step, volume.spacing, strict=True)]
+    cells = _average_cells(volume, step)
+    across = math.sqrt(cell_mm[0] * cell_mm[1])
+    tissue = cells > TISSUE_HU
+    tissue |= _find_cavities(cells, tissue, across)
+
+    core = _grow(tissue, -OPENING_MM / across)
+    pieces, count = ndimage.label(core)
+    if count == 0:
+        raise RefusedInputError(
+            f"no body found: nothing above {TISSUE_HU:g} HU is {2 * OPENING_MM:g} mm thick; leave the table in"
+        )
+    sizes = np.bincount(pieces.ravel(), minlength=count + 1)[1:]
+    thick = np.unique(pieces[_grow(core, -(THICK_MM - OPENING_MM) / across)])
+    kept = np.zeros(count + 1, dtype=bool)
+    kept[thick] = kept[1 + int(sizes.argmax())] = True
+    kept[0] = False
+    body = _grow(kept[pieces], OPENING_MM / across) & tissue
+
+    body |= _thin_parts(tissue, body, cell_mm)
+    for layer in body:
+        layer |= ndimage.binary_fill_holes(layer)
+    return _grow(body, MARGIN_MM / across), (step[0], step[1], step[2])
+
+
+def _find_cavities(cells: NDArray[np.float32], tissue: Mask, across: float) -> Mask:
+    """Lungs, bowel, sinuses: what is not dense but belongs to the body, slice by slice.
+
+    Lung is denser than air and has thick tissue beside it; the border of the scan may cut it open.  Air counts where
+    dense cells enclose it and it is small, or nearly all of its wall is thick: the inside of a table has thin shells
+    around it, the gap between back and table has one on one side.
+    """
+    from scipy import ndimage
+
+    in_plane = ndimage.generate_binary_structure(2, 1)[None]
+    unmeasured = _grow(_find_unmeasured(cells), 2)
+    regions, count = ndimage.label(~tissue & ~unmeasured, np.pad(in_plane, ((1, 1), (0, 0), (0, 0))))
+    thick = _grow(_grow(tissue, -OPENING_MM / across), OPENING_MM / across) & tissue
+
+    def cells_beside(mask: Mask) -> NDArray[np.int64]:
+        return np.bincount(regions[ndimage.binary_dilation(mask, in_plane)], minlength=count + 1)
+
+    thick_wall = cells_beside(thick) / np.maximum(cells_beside(tissue), 1)
+    at_border = unmeasured
+    at_border[:, [0, -1]] = at_border[:, :, [0, -1]] = True
+    is_open = cells_beside(at_border) > 0
+    size = np.bincount(regions.ravel(), minlength=count + 1)
+    is_lung = np.bincount(regions[cells < LUNG_HU], minlength=count + 1) < MOST_AIR * size
+    small = size * across**2 < SMALL_MM2
+    kept = np.where(is_lung, thick_wall > LUNG_WALL, ~is_open & (small | (thick_wall > AIR_WALL)))
+    kept[0] = False
+    return np.asarray(kept[regions])
+
+
+def _find_unmeasured(cells: NDArray[np.float32]) -> Mask:
+    """Cells of one value from the corners on: padding, or air without noise."""
+    from scipy import ndimage
+
+    found = np.zeros(cells.shape, dtype=bool)
+    for layer, out in zip(cells, found, strict=True):
+        for corner in (layer[0, 0], layer[0, -1], layer[-1, 0], layer[-1, -1]):
+            out |= layer == corner
+        pieces, count = ndimage.label(out)
+        if count:
+            outer = np.zeros(count + 1, dtype=bool)
+            outer[np.unique(np.concatenate([pieces[[0, -1]].ravel(), pieces[:, [0, -1]].ravel()]))] = True
+            outer &= np.bincount(pieces.ravel()) >= FEWEST_UNMEASURED
+            outer[0] = False
+            out[...] = outer[pieces]
+    return found
+
+
+def _thin_parts(tissue: Mask, body: Mask, cell_mm: list[float]) -> Mask:
+    """What is dense, hangs on the body and is not long."""
+    from scipy import ndimage
+
+    near = ndimage.binary_dilation(body, ndimage.generate_binary_structure(3, 1))
+    pieces, count = ndimage.label(tissue & ~body)
+    if count == 0:
+        return np.zeros_like(body)
+    hangs = np.zeros(count + 1, dtype=bool)
+    hangs[np.unique(pieces[near])] = True
+    for number, box in enumerate(ndimage.find_objects(pieces), start=1):
+        extent = [(part.stop - part.start) * length for part, length in zip(box, cell_mm[::-1], strict=True)]
+        hangs[number] &= math.hypot(*extent) < LONG_MM
+    hangs[0] = False
+    return np.asarray(hangs[pieces])
+
+
+def _grow(mask: Mask, cells: float) -> Mask:
+    """Dilate (or, below 0, erode) slice by slice by so many cells: an octagon, cross and square in turn."""
+    from scipy import ndimage
+
+    change = ndimage.binary_dilation if cells > 0 else ndimage.binary_erosion
+    for turn in range(max(1, round(abs(cells)))):
+        shape = ndimage.generate_binary_structure(2, 1 + turn % 2)[None]
+        mask = change(mask, shape, border_value=cells < 0)  # the border of the scan erodes nothing
+    return mask
+
+
+def _average_cells(volume: Volume, step: tuple[int, ...]) -> NDArray[np.float32]:
+    """Mean HU of each cell; those at the far ends are smaller."""
+    nk, nj, ni = volume.voxels.shape
+    starts = [np.arange(0, size, count) for size, count in zip((ni, nj), step, strict=False)]
+    cells = np.empty((-(-nk // step[2]), len(starts[1]), len(starts[0])), dtype=np.float32)
+    for place in range(len(cells)):
+        first, end = place * step[2], min((place + 1) * step[2], nk)
+        slab = volume.voxels[first:end].sum(axis=0, dtype=np.float32)
+        rows = np.add.reduceat(np.add.reduceat(slab, starts[1], axis=0), starts[0], axis=1)
+        cells[place] = rows / (end - first)
+        volume.release_slices(first, end)
+    for axis, (size, begin) in enumerate(zip((nj, ni), starts[::-1], strict=True), start=1):
+        widths = np.diff(np.append(begin, size)).astype(np.float32)
+        cells /= widths.reshape([-1 if place == axis else 1 for place in range(3)])
+    return cells

@@ -1,0 +1,187 @@
+"""Table and field of view: what is not the patient becomes air, what is the patient stays to the bit."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import clrecon
+from clrecon.errors import RefusedInputError, UsageError
+from clrecon.geometry import AIR_HU, Volume
+from clrecon.geometry.body import find_body, mask_field_of_view, remove_table
+
+SHAPE = (12, 170, 200)
+SPACING = (2.0, 1.8, 2.5)
+AFFINE = np.array([[2.0, 0, 0, -200.0], [0, 1.8, 0.2, -150.0], [0, 0, 2.5, 10.0], [0, 0, 0, 1.0]])
+X, Y = (np.arange(200) - 99.5)[None] * 2.0, (np.arange(170)[:, None] - 84.5) * 1.8
+
+
+def ellipse(x, y, a, b):
+    """Mask (rows, columns) of an ellipse, mm around the centre of the slice."""
+    return ((X - x) / a) ** 2 + ((Y - y) / b) ** 2 <= 1.0
+
+
+def make_patient(lungs=False, arms=True, seed=1):
+    """HU and the mask of the patient: body with spine and ribs, arms with bone, a gas bubble, an ear-like flap."""
+    hu = np.full(SHAPE, -1000.0)
+    body = ellipse(0, -10, 120, 75)
+    parts = [(body, 40.0), (body & ~ellipse(0, -10, 112, 67), 300.0), (body & ~ellipse(0, -10, 106, 61), 40.0)]
+    if lungs:
+        parts += [(ellipse(s * 58, -10, 46, 52), -860.0) for s in (-1, 1)]
+    parts += [(ellipse(0, 35, 14, 14), 500.0), (ellipse(15, -63, 18, 10), -1000.0)]
+    flap = (abs(X) < 3) & (Y > -100) & (Y < -80)
+    parts += [(flap, 60.0)]
+    patient = body | flap
+    if arms:
+        for side in (-1, 1):
+            arm = ellipse(side * 158, 0, 28, 30)
+            patient |= arm
+            parts += [(arm, 40.0), (ellipse(side * 158, 0, 9, 9), 900.0)]
+    for mask, value in parts:
+        hu[:, mask] = value
+    return hu + np.random.default_rng(seed).normal(0, 8, SHAPE), patient
+
+
+def add_table(hu, patient, gap=6.0):
+    """A shell 4 mm thick below the patient, a blanket between, a foam core, a tray further down; returns its mask."""
+    table = (abs(Y - (67 + gap)) < 2.2) | (abs(Y - (90 + gap)) < 2.2) | (abs(Y - 140) < 2.2)
+    table = (table & (abs(X) < 180)) | ((abs(abs(X) - 180) < 2.2) & (Y > 67 + gap) & (Y < 90 + gap))
+    foam = (Y > 69 + gap) & (Y < 88 + gap) & (abs(X) < 178)
+    blanket = (Y > 60) & (Y < 67 + gap) & (abs(X) < 150)
+    for mask, value in ((foam, -960.0), (blanket, -900.0), (table, 350.0)):
+        hu[:, mask & ~patient] = value
+    return table & ~patient
+
+
+def as_volume(hu):
+    return Volume(np.rint(hu).astype(np.int16), AFFINE)
+
+
+@pytest.mark.parametrize("lungs", [False, True])
+@pytest.mark.parametrize("gap", [1.0, 6.0, 25.0])
+def test_the_table_goes_and_the_patient_stays_to_the_bit(gap, lungs):
+    hu, patient = make_patient(lungs)
+    table = add_table(hu, patient, gap)
+    volume = as_volume(hu)
+    before = volume.voxels.copy()
+    cleaned = remove_table(volume)
+    assert np.array_equal(volume.voxels, before)  # the input is not touched
+    assert np.array_equal(cleaned.voxels[:, patient], before[:, patient])
+    near = patient.copy()
+    for _ in range(6):  # the margin, in whole cells of two voxels
+        near[1:] |= near[:-1].copy()
+        near[:-1] |= near[1:].copy()
+        near[:, 1:] |= near[:, :-1].copy()
+        near[:, :-1] |= near[:, 1:].copy()
+    assert (table & ~near).any() and not (cleaned.voxels[:, ~near] >= -300).any()
+    if gap == 25.0:
+        assert not (cleaned.voxels[:, table] >= -300).any()
+    facts = cleaned.report["remove_table"]
+    body, step = find_body(volume)
+    assert step == (1, 1, 1)
+    assert facts["voxels_removed"] == np.count_nonzero(~body)
+    assert (cleaned.voxels[~body] == facts["air_hu"]).all()
+    assert facts["dense_voxels_removed"] > 1000
+
+
+def test_bone_surface_within_the_body_is_the_same_surface():
+    from clrecon.reference.isosurface import extract_isosurface
+
+    hu, patient = make_patient(arms=False)
+    plain = as_volume(hu)
+    add_table(hu, patient, 12.0)
+    expected = extract_isosurface(plain, 250)
+    found = extract_isosurface(remove_table(as_volume(hu)), 250)
+    assert len(expected[0]) == len(found[0]) > 1000
+    assert all(np.array_equal(one, other) for one, other in zip(expected, found, strict=True))
+
+
+@pytest.mark.parametrize("padded", [False, True])
+def test_a_chest_that_the_circle_cuts_keeps_its_wall(padded):
+    """The lungs lie open at the border of the scan, and ribs hang on walls of 14 mm."""
+    hu, patient = make_patient(lungs=True, arms=False)
+    add_table(hu, patient, 6.0)
+    outside = np.hypot(X, Y) > 98.0
+    hu[:, outside] = -1000.0
+    volume = as_volume(hu)
+    volume.voxels[:, outside] = -1000 if padded else hu[:, outside]
+    cleaned = remove_table(volume)
+    inside = patient & ~outside
+    assert np.array_equal(cleaned.voxels[:, inside], volume.voxels[:, inside])
+
+
+def test_a_cropped_scan_has_no_outside():
+    hu, _ = make_patient(lungs=True, arms=False)
+    volume = as_volume(hu[:, 57:105, 60:140])  # below the bubble
+    assert np.array_equal(remove_table(volume).voxels, volume.voxels)
+    assert remove_table(volume).report["remove_table"]["removed_share"] == 0.0
+
+
+def test_uneven_slices_types_and_report_stay():
+    hu, patient = make_patient()
+    add_table(hu, patient)
+    positions = AFFINE[:3, 3] + np.cumsum(np.linspace(1.0, 4.0, SHAPE[0]))[:, None] * np.array([0.0, 0.0, 1.0])
+    volume = Volume(hu.astype(np.float32), AFFINE, {"warnings": ["one"], "tilt_deg": 3.0}, positions)
+    cleaned = remove_table(volume)
+    assert cleaned.voxels.dtype == np.float32 and cleaned.uneven
+    assert np.array_equal(cleaned.slice_origins(), volume.slice_origins())
+    assert (cleaned.report["warnings"], cleaned.report["tilt_deg"]) == (["one"], 3.0)
+    assert "remove_table" not in volume.report
+
+
+def test_what_becomes_air_has_the_level_of_the_air_there():
+    """No iso value shows where the mask ends, but those in the noise of the air itself."""
+    hu, patient = make_patient()
+    hu[hu < -900] += 12.0  # the air of this scan: -988 HU
+    cleaned = remove_table(as_volume(hu))
+    assert cleaned.report["remove_table"]["air_hu"] == pytest.approx(-988, abs=1)
+
+
+def test_nothing_thick_is_no_body():
+    hu = np.full(SHAPE, -1000.0)
+    hu[:, 100:102] = 300.0
+    with pytest.raises(RefusedInputError, match="no body found: nothing above -300 HU is 14 mm thick"):
+        remove_table(as_volume(hu))
+
+
+# --- field of view ---
+@pytest.mark.parametrize(("radius", "expected"), [(None, 153.0), (80.0, 80.0), (400.0, 400.0)])
+def test_outside_of_the_circle_is_air(radius, expected):
+    hu, _ = make_patient()
+    volume = as_volume(hu)
+    masked = mask_field_of_view(volume, radius)
+    distance = np.hypot(X, Y)
+    assert np.array_equal(masked.voxels[:, distance < expected - 1e-6], volume.voxels[:, distance < expected - 1e-6])
+    outside = distance > expected + 1e-6
+    facts = masked.report["field_of_view"]
+    assert facts["radius_mm"] == expected
+    assert facts["voxels_removed"] == SHAPE[0] * np.count_nonzero(outside)
+    assert facts["removed_share"] == pytest.approx(outside.mean(), abs=1e-4)
+    assert (masked.voxels[:, outside] == facts["air_hu"]).all()
+
+
+def test_types_that_cannot_hold_air_get_their_lowest_value():
+    volume = Volume(np.full((2, 9, 9), 200, np.uint8), np.eye(4))
+    assert mask_field_of_view(volume, 2.0).voxels[0, 0, 0] == 0
+    assert mask_field_of_view(Volume(np.full((2, 9, 9), 200, np.int16), np.eye(4)), 2.0).voxels[0, 0, 0] == AIR_HU
+
+
+@pytest.mark.parametrize("radius", [0.0, -1.0, np.nan, 0.1])
+def test_circles_without_a_voxel_are_refused(radius):
+    volume = Volume(np.zeros((2, 10, 10), np.int16), np.eye(4))
+    with pytest.raises(UsageError, match="field of view"):
+        mask_field_of_view(volume, radius)
+
+
+# --- real scans ---
+@pytest.mark.parametrize(("folder", "table_voxels"), [("lumbar_4p25mm", 40_000), ("thoracic_0p8mm", 2_000)])
+def test_real_tables_go_and_real_bone_stays(real_data, folder, table_voxels):
+    """What is as dense as bone may only go below the back, and at the raised rims of the table beside it."""
+    volume = clrecon.read_volume(real_data / folder)
+    cleaned = clrecon.remove_table(volume)
+    gone = (cleaned.voxels != volume.voxels) & (volume.voxels >= 250)
+    assert np.count_nonzero(gone) > table_voxels
+    _, rows, columns = np.nonzero(gone)
+    assert ((rows >= 390) | (abs(columns - 255.5) > 190)).all()
+    below = cleaned.voxels[:, 430:]
+    assert np.count_nonzero(below >= 250) == 0
