@@ -16,7 +16,7 @@ from pydicom.uid import (
 )
 from tolerances import AFFINE_MM
 
-from clrecon.dicom import list_series, pixels, read_volume
+from clrecon.dicom import list_series, pixels, read_volume, stored
 from clrecon.errors import NoDicomError, RefusedInputError
 
 SYNTAXES = "transfer_syntaxes"
@@ -243,7 +243,7 @@ def test_memory_is_asked_for_before_it_is_taken(tmp_path, monkeypatch):
 
 
 def test_a_deflate_bomb_is_not_inflated(tmp_path, monkeypatch):
-    monkeypatch.setattr(pixels, "INFLATED_SLICE_LIMIT", 1_000_000)
+    monkeypatch.setattr(stored, "INFLATED_LIMIT", 1_000_000)
     plan = Plan(syntax=DeflatedExplicitVRLittleEndian)
     for k in range(2):
         ds = make_dataset(plan, k)
@@ -325,6 +325,13 @@ def test_damaged_compressed_frames_are_refused(tmp_path, real_data):
         with pytest.raises(RefusedInputError, match="1: truncated: the compressed pixels have no end mark"):
             read_volume(folder)
         (folder / "1").write_bytes(whole[: len(whole) // 2] + bytes(len(whole) - len(whole) // 2 - 8) + whole[-8:])
+        with pytest.raises(
+            RefusedInputError, match="1: (truncated: the compressed frame has no end mark|the compr.* segment)"
+        ):
+            read_volume(folder)
+        (folder / "1").write_bytes(
+            whole[: len(whole) // 2] + bytes(len(whole) // 8) + whole[len(whole) // 2 + len(whole) // 8 :]
+        )
         try:
             volume = read_volume(folder)
         except RefusedInputError as error:
