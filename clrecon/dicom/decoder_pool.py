@@ -37,7 +37,14 @@ FRAME_MEMORY_BYTES = 256 * 2**20
 MEMORY_PER_PIXEL_BYTE = 32
 """A decoder may take `FRAME_MEMORY_BYTES`, and this much more for each byte of pixels; OpenJPEG takes about 10."""
 
-_PIPE_BYTES = 1 << 20
+ENVIRONMENT = {
+    # One thread each: there are as many processes as cores, and every idle thread costs memory and time.
+    **dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1"),
+    # Memory of one frame serves the next (glibc): giving it back each time takes longer than to decode RLE.
+    **dict.fromkeys(("MALLOC_MMAP_THRESHOLD_", "MALLOC_TRIM_THRESHOLD_"), str(1 << 28)),
+    "MALLOC_TOP_PAD_": str(1 << 24),
+}
+
 _ERROR_TEXT_BYTES = 1000
 _OUT_OF_TIME = tuple(getattr(signal, name, None) for name in ("SIGXCPU", "SIGALRM"))
 
@@ -210,27 +217,29 @@ class _Worker:
         self.deadline = time.monotonic() + START_SECONDS
         if getattr(sys, "frozen", False) or not sys.executable:
             raise DecoderError("cannot be decoded: that needs a Python interpreter to start, and this program has none")
-        # One thread each: there are as many processes as cores, and every idle thread costs memory and time.
-        environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
+        # Of this pipe the process holds the other end: the system tells it when we are gone (see `end_with`).
+        theirs, self._lifeline = os.pipe() if sys.platform.startswith("linux") else (-1, -1)
         try:
             self.process = subprocess.Popen(
-                [sys.executable, "-I", "-S", str(SCRIPT)],
+                [sys.executable, "-I", "-S", str(SCRIPT), str(theirs)],
                 bufsize=0,
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=subprocess.DEVNULL,
-                env=environment,
+                pass_fds=[theirs] if theirs >= 0 else [],
+                env={**os.environ, **ENVIRONMENT},
                 creationflags=getattr(subprocess, "CREATE_NO_WINDOW", 0),
             )
         except OSError as error:
+            _close(self._lifeline)
             raise DecoderError(
                 f"cannot be decoded: no process can be started for it ({error.strerror or error}); "
                 "uncompressed images need none"
             ) from error
+        finally:
+            _close(theirs)
         assert self.process.stdin is not None and self.process.stdout is not None
         self._input, self._output = self.process.stdin, self.process.stdout
-        _widen_pipe(self._input.fileno())
-        _widen_pipe(self._output.fileno())
         path = [entry for entry in sys.path if isinstance(entry, str)]
         self._settings = {"path": path, "decoders": decoders, "seconds": seconds, "memory_bytes": memory_bytes}
 
@@ -275,6 +284,8 @@ class _Worker:
             self.process.wait()
             ended_itself = False
         self._output.close()
+        _close(self._lifeline)
+        self._lifeline = -1
         return ended_itself
 
     def _write(self, data: bytes) -> None:
@@ -303,11 +314,7 @@ class _Worker:
         return escape_text(text.decode("ascii", "replace"), 120)
 
 
-def _widen_pipe(number: int) -> None:
-    """Let a pipe hold a slice where the system allows that (Linux): fewer changes between the processes."""
-    try:
-        import fcntl
 
-        fcntl.fcntl(number, fcntl.F_SETPIPE_SZ, _PIPE_BYTES)
-    except (ImportError, AttributeError, OSError):
-        pass
+def _close(number: int) -> None:
+    if number >= 0:
+        os.close(number)

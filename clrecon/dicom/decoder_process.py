@@ -5,8 +5,7 @@ ends.  It imports numpy and the decoders in use, not clrecon and not pydicom, so
 
 It reads from standard input one line of JSON with settings, and then requests: a line of JSON, and as many bytes of
 compressed frame as it says.  To standard output goes for each a status, a count and as many bytes: the pixels in C
-order, or a text that says what is wrong.  Standard input closes when the parent ends in any way, and that ends this
-process, in the midst of a decoder too.
+order, or a text that says what is wrong.  This process ends with its input, and with its parent: see `end_with`.
 """
 
 from __future__ import annotations
@@ -162,32 +161,22 @@ def limit_time(seconds: float) -> None:
     signal.alarm(int(seconds) + 5)
 
 
-def end_with_input(watch: bool) -> None:
-    """Have the system end this process (SIGIO) as soon as anything happens on standard input: that is, its end.
+def end_with(lifeline: int) -> None:
+    """Have the system end this process (SIGIO) when the other end of a pipe closes: when the parent is gone.
 
-    Between a request and its reply the parent writes nothing.  Linux alone; elsewhere the alarm ends an orphan.
+    That works in the midst of a decoder too.  Where there is no such pipe the alarm ends an orphan.
     """
-    try:
-        import fcntl
-    except ImportError:
+    if lifeline < 0:
         return
-    if not sys.platform.startswith("linux"):
-        return
-    flags = fcntl.fcntl(0, fcntl.F_GETFL)
-    if watch:
-        fcntl.fcntl(0, fcntl.F_SETOWN, os.getpid())
-    fcntl.fcntl(0, fcntl.F_SETFL, flags | os.O_ASYNC if watch else flags & ~os.O_ASYNC)
-    if watch and parent_has_gone():
-        os._exit(1)
-
-
-def parent_has_gone() -> bool:
-    """True when standard input is at its end; nothing is read."""
+    import fcntl
     import select
 
+    fcntl.fcntl(lifeline, fcntl.F_SETOWN, os.getpid())
+    fcntl.fcntl(lifeline, fcntl.F_SETFL, fcntl.fcntl(lifeline, fcntl.F_GETFL) | os.O_ASYNC)
     poll = select.poll()
-    poll.register(0, select.POLLIN)
-    return bool(poll.poll(0))
+    poll.register(lifeline)
+    if poll.poll(0):
+        os._exit(1)  # it went before we asked
 
 
 def answer(decoder: Decoder, data: bytes, request: dict[str, Any]) -> tuple[int, Any]:
@@ -211,6 +200,7 @@ def main() -> None:
     """Serve until standard input ends."""
     if hasattr(signal, "SIGINT"):
         signal.signal(signal.SIGINT, signal.SIG_IGN)  # a terminal sends it to all; the parent decides
+    end_with(int(sys.argv[1]))
     source, sink = sys.stdin.buffer, take_standard_output()
     settings = json.loads(source.readline() or b"null")
     if settings is None:
@@ -229,9 +219,7 @@ def main() -> None:
         if len(data) < request["length"]:
             return
         limit_time(settings["seconds"])
-        end_with_input(True)
         status, body = answer(decoders[request["decoder"]], data, request)
-        end_with_input(False)
         send(sink, status, body)
         del data, body
 
