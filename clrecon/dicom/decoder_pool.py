@@ -218,8 +218,10 @@ class _Worker:
         if getattr(sys, "frozen", False) or not sys.executable:
             raise DecoderError("cannot be decoded: that needs a Python interpreter to start, and this program has none")
         # Of this pipe the process holds the other end: the system tells it when we are gone (see `end_with`).
-        theirs, self._lifeline = os.pipe() if sys.platform.startswith("linux") else (-1, -1)
+        theirs = self._lifeline = -1
         try:
+            if sys.platform.startswith("linux"):
+                theirs, self._lifeline = os.pipe()
             self.process = subprocess.Popen(
                 [sys.executable, "-I", "-S", str(SCRIPT), str(theirs)],
                 bufsize=0,
@@ -312,7 +314,6 @@ class _Worker:
         text = bytearray(count)
         self._read_into(memoryview(text))
         return escape_text(text.decode("ascii", "replace"), 120)
-
 
 
 def _close(number: int) -> None:

@@ -12,6 +12,7 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
+from contextlib import nullcontext
 from dataclasses import dataclass
 from typing import Any
 
@@ -47,7 +48,9 @@ class _RangeError(Exception):
     """The HU of a slice do not fit the type of the volume; a wider one is taken."""
 
 
-def read_voxels(slices: Sequence[SliceHeader], progress: Progress | None = None) -> tuple[NDArray[Any], PixelFacts]:
+def read_voxels(
+    slices: Sequence[SliceHeader], progress: Progress | None = None, source: StoredPixels | None = None
+) -> tuple[NDArray[Any], PixelFacts]:
     """Read the pixels of sorted slices of one size into one volume.
 
     Parameters
@@ -56,6 +59,8 @@ def read_voxels(slices: Sequence[SliceHeader], progress: Progress | None = None)
         In the order of k.
     progress : callable, optional
         Called as ``progress("read", done, total)``.
+    source : StoredPixels, optional
+        One that is open for these slices and stays so; without it the call has its own.
 
     Returns
     -------
@@ -66,13 +71,14 @@ def read_voxels(slices: Sequence[SliceHeader], progress: Progress | None = None)
     Raises
     ------
     RefusedInputError
-        A file is cut short, cannot be read or decoded, the volume does not fit into memory, or all its voxels are
-        padding or have one value.
+        A file is cut short, cannot be read or decoded, the volume does not fit into memory, or all voxels of
+        several slices are padding or have one value.
     """
     integral = all(
         float(h.slope).is_integer() and float(h.intercept).is_integer() and not h.float_pixels for h in slices
     )
-    with StoredPixels(slices) as source:  # a missing decoder shows before anything is allocated
+    # A missing decoder shows here, before anything is allocated.
+    with StoredPixels(slices) if source is None else nullcontext(source) as source:
         for dtype in (np.int16, np.int32) if integral else (np.float32,):
             voxels = _allocate(slices, np.dtype(dtype))
             try:
@@ -80,7 +86,7 @@ def read_voxels(slices: Sequence[SliceHeader], progress: Progress | None = None)
             except _RangeError:
                 del voxels
                 continue
-            if facts.padding_share == 1 or (facts.hu_min == facts.hu_max and voxels.size > 1):
+            if len(slices) > 1 and facts.hu_min == facts.hu_max:
                 what = "is padding" if facts.padding_share == 1 else f"has the value {facts.hu_min:g}"
                 raise RefusedInputError(f"every one of the {voxels.size} voxels {what}: there is no image")
             return voxels, facts
