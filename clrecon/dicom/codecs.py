@@ -31,7 +31,7 @@ _DECODERS = {
     **dict.fromkeys(
         JPEG_2000, ((("openjpeg", "openjpeg"), ("imagecodecs jpeg_2000", "imagecodecs")), "pylibjpeg-openjpeg")
     ),
-    RLE: ((("rle", "rle"), ("imagecodecs rle", "imagecodecs")), "pylibjpeg-rle"),
+    RLE: ((("rle", "rle"),), "pylibjpeg-rle"),
 }
 
 _OTHER_NAMES = {

@@ -58,15 +58,6 @@ def decode_by_rle(data: bytes, request: dict[str, Any]) -> Any:
     return np.frombuffer(pixels, f"<u{bits // 8}").reshape(request["rows"], request["columns"])
 
 
-def decode_by_imagecodecs_rle(data: bytes, request: dict[str, Any]) -> Any:
-    """DICOM's own run length encoding, as `decode_by_rle`."""
-    import numpy as np
-    from imagecodecs import dicomrle_decode
-
-    dtype = np.dtype(request["dtype"]).newbyteorder("<")
-    return np.frombuffer(dicomrle_decode(data, dtype), dtype).reshape(request["rows"], request["columns"])
-
-
 def decode_by_imagecodecs_jpeg(data: bytes, request: dict[str, Any]) -> Any:
     """JPEG lossless, by libjpeg-turbo."""
     from imagecodecs import jpeg8_decode
@@ -93,7 +84,6 @@ DECODERS: dict[str, tuple[Decoder, tuple[str, ...]]] = {
     "openjpeg": (decode_by_openjpeg, ("openjpeg",)),
     "jpeg_ls": (decode_by_jpeg_ls, ("jpeg_ls",)),
     "rle": (decode_by_rle, ("rle.rle",)),
-    "imagecodecs rle": (decode_by_imagecodecs_rle, ("imagecodecs", "imagecodecs._imcd")),
     "imagecodecs jpeg": (decode_by_imagecodecs_jpeg, ("imagecodecs", "imagecodecs._jpeg8")),
     "imagecodecs jpeg_ls": (decode_by_imagecodecs_jpeg_ls, ("imagecodecs", "imagecodecs._jpegls")),
     "imagecodecs jpeg_2000": (decode_by_imagecodecs_jpeg_2000, ("imagecodecs", "imagecodecs._jpeg2k")),

@@ -167,7 +167,9 @@ def _fill_slice(source: StoredPixels, header: SliceHeader, out: NDArray[Any]) ->
     low, high = stored.min(), stored.max()
     if header.float_pixels and not (abs(low) <= FLOAT_LIMIT and abs(high) <= FLOAT_LIMIT):
         raise RefusedInputError(f"{header.name}: Float Pixel Data holds {_describe_unfit(stored)}: those are no HU")
-    hu_low, hu_high = sorted(float(end) * header.slope + header.intercept for end in (low, high))
+    hu_low, hu_high = float(low) * header.slope + header.intercept, float(high) * header.slope + header.intercept
+    if hu_low > hu_high:
+        hu_low, hu_high = hu_high, hu_low
     if out.dtype.kind == "f":
         if header.slope == 1.0 and header.intercept == 0.0:
             if not np.may_share_memory(stored, out):

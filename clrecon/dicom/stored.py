@@ -11,6 +11,7 @@ import sys
 import threading
 import zlib
 from collections.abc import Callable, Sequence
+from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -91,7 +92,7 @@ class StoredPixels:
         RefusedInputError
             The file cannot be read, is cut short, or does not decode; the message names it.
         """
-        dtype = stored_dtype(header)
+        dtype = stored_dtype(header.float_pixels, header.signed, header.bits_allocated)
         fits = out.dtype.itemsize == dtype.itemsize and (out.dtype.kind == "f") == (dtype.kind == "f")
         stored = out.view(dtype) if fits else np.empty(out.shape, dtype)
         try:
@@ -150,10 +151,10 @@ class StoredPixels:
             return known[header.file]
 
 
-def stored_dtype(header: SliceHeader) -> np.dtype[Any]:
-    """The type of the stored values, in native byte order."""
-    kind = "f" if header.float_pixels else "i" if header.signed else "u"
-    return np.dtype(f"{kind}{header.bits_allocated // 8}")
+@cache
+def stored_dtype(floating: bool, signed: bool, bits_allocated: int) -> np.dtype[Any]:
+    """The type of stored values, in native byte order."""
+    return np.dtype(f"{'f' if floating else 'i' if signed else 'u'}{bits_allocated // 8}")
 
 
 def _read_into(file: Any, stored: NDArray[Any]) -> None:

@@ -19,7 +19,8 @@ from pydicom.data import get_testdata_file
 from pydicom.encaps import encapsulate, encapsulate_extended
 from pydicom.uid import ExplicitVRBigEndian
 
-from clrecon.dicom import codestream, encapsulated, read_volume, stored
+from clrecon.dicom import codecs, codestream, decoder_process, encapsulated, read_volume, stored
+from clrecon.dicom.decoder_pool import DecoderPool
 from clrecon.dicom.elements import read_elements
 from clrecon.dicom.header import read_headers
 from clrecon.dicom.stored import StoredPixels
@@ -117,6 +118,30 @@ def test_lossless_codecs_give_back_every_bit(place, name):
     syntax, encode = ENCODERS[name]
     (pixels,) = place(encapsulate([encode(IMAGES[0])]) + END, syntax)
     assert pixels.dtype == np.uint16 and np.array_equal(pixels, IMAGES[0])
+
+
+@pytest.mark.parametrize("decoder", decoder_process.DECODERS)
+def test_every_decoder_of_a_format_gives_the_same(decoder):
+    """Which one is taken depends on what is installed."""
+    name = {
+        "openjpeg": "JPEG 2000",
+        "imagecodecs jpeg_2000": "JPEG 2000",
+        "jpeg_ls": "JPEG-LS",
+        "imagecodecs jpeg_ls": "JPEG-LS",
+        "rle": "RLE",
+        "imagecodecs jpeg": "JPEG lossless 4",
+    }[decoder]
+    pytest.importorskip(decoder.split()[0])
+    out = np.zeros((ROWS, COLUMNS), np.uint16)
+    with DecoderPool([decoder], out.nbytes) as pool:
+        pool.decode(ENCODERS[name][1](IMAGES[1]), decoder, out)
+    assert np.array_equal(out, IMAGES[1])
+
+
+def test_a_decoder_that_is_not_installed_is_named(monkeypatch):
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    with pytest.raises(RefusedInputError, match=r"4\.80 needs a decoder that is not installed: pip install pyjpegls"):
+        codecs.choose_decoder(JPEG + "80")
 
 
 @pytest.mark.parametrize("name", ["JPEG lossless 6", "JPEG-LS", "JPEG 2000", "RLE"])
