@@ -255,7 +255,9 @@ def test_row_38_a_deflate_bomb_is_not_inflated(tmp_path, monkeypatch):
         read_volume(tmp_path)
 
 
-@pytest.mark.parametrize(("slope", "intercept"), [(1, -1024), (3, -1000), (0.25, 0), (-1, 500)])
+@pytest.mark.parametrize(
+    ("slope", "intercept"), [(1, -1024), (3, -1000), (3, 0), (1, 40000), (0.25, 0), (0.3125, 1), (-1, 500)]
+)
 def test_padding_and_range_with_any_rescale(tmp_path, slope, intercept):
     """Whatever way the padding takes to air, it counts in no range but as air."""
 
