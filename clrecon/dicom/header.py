@@ -44,6 +44,9 @@ SLICE_PHASES = (
 PHASE_KEYWORDS = (*(keyword for keyword, _, _ in FRAME_PHASES), *SLICE_PHASES)
 """What tells the phases of one series apart, the most telling first: what only frames say, then what slices say."""
 
+FLOAT_PIXEL_BITS = {0x7FE00008: 32, 0x7FE00009: 64}
+"""Float and Double Float Pixel Data: BitsAllocated (PS3.3 C.7.6.24, C.7.6.25)."""
+
 PIXEL_SPACING_MM = (1e-3, 50.0)
 POSITION_LIMIT_MM = 1e6
 RESCALE_SLOPE = (1e-6, 1e6)
@@ -109,8 +112,10 @@ class SliceHeader:
         Column spacing (PixelSpacing[1]) and row spacing (PixelSpacing[0]).
     slice_thickness_mm, stated_gap_mm : float or None
         SliceThickness and SpacingBetweenSlices; never used for geometry.
-    padding : tuple of (int, int) or None
+    padding : tuple of two numbers or None
         Lowest and highest stored value that mean "no measurement".
+    float_pixels : bool
+        Float or Double Float Pixel Data, which are HU without rescale.
     slope, intercept : float
         1 and 0 where the file has none, see `has_slope` and `has_intercept`.
     patient_hash : str or None
@@ -155,7 +160,8 @@ class SliceHeader:
     has_slope: bool
     has_intercept: bool
     rescale_type: str
-    padding: tuple[int, int] | None
+    padding: tuple[float, float] | None
+    float_pixels: bool
     lossy: bool
     pixel_offset: int
     pixel_length: int
@@ -263,8 +269,6 @@ def _validate(values: Values, series: SeriesIdentity, path: Path, name: str, *, 
     reason = describe_undecodable(elements.transfer_syntax)
     if reason:
         raise ValueProblem(reason)
-    if elements.pixel_tag != 0x7FE00010:
-        raise ValueProblem("Float Pixel Data (7FE0,0008): not supported yet")
     samples, photometric = values.unsigned("SamplesPerPixel", 1), values.word("PhotometricInterpretation")
     if samples != 1 or photometric not in ("MONOCHROME1", "MONOCHROME2"):
         found = photometric or "nothing"
@@ -275,7 +279,8 @@ def _validate(values: Values, series: SeriesIdentity, path: Path, name: str, *, 
     rows, columns = values.unsigned("Rows"), values.unsigned("Columns")
     if rows == 0 or columns == 0:
         raise ValueProblem(f"Rows (0028,0010) x Columns (0028,0011) is {rows} x {columns}")
-    allocated, stored, high_bit, signed = _validate_bits(values)
+    float_pixels = elements.pixel_tag in FLOAT_PIXEL_BITS
+    allocated, stored, high_bit, signed = _validate_float_bits(values) if float_pixels else _validate_bits(values)
     (dj, di), orientation, position = _validate_geometry(values)
     slope, intercept = _validate_rescale(values)
 
@@ -329,7 +334,8 @@ def _validate(values: Values, series: SeriesIdentity, path: Path, name: str, *, 
         has_slope="RescaleSlope" in values,
         has_intercept="RescaleIntercept" in values,
         rescale_type=escape_text(values.word("RescaleType"), 16),
-        padding=values.padding(allocated, signed),
+        padding=values.float_padding(allocated) if float_pixels else values.padding(allocated, signed),
+        float_pixels=float_pixels,
         lossy=values.word("LossyImageCompression") == "01",
         pixel_offset=elements.pixel_offset,
         pixel_length=elements.pixel_length,
@@ -385,6 +391,21 @@ def _validate_bits(values: Values) -> tuple[int, int, int, bool]:
     if representation not in (0, 1):
         raise values.wrong("PixelRepresentation", "0 or 1")
     return allocated, stored, high_bit, representation == 1
+
+
+def _validate_float_bits(values: Values) -> tuple[int, int, int, bool]:
+    """Float pixels fill their cells, are signed, and the standard gives them no rescale (PS3.3 C.7.6.24)."""
+    bits = FLOAT_PIXEL_BITS[values.elements.pixel_tag or 0]
+    if values.unsigned("BitsAllocated") != bits:
+        raise values.wrong("BitsAllocated", f"{bits} for float pixels of this width")
+    if is_encapsulated(values.elements.transfer_syntax):
+        raise ValueProblem("compressed transfer syntax with Float Pixel Data (7FE0,0008)")
+    if _validate_rescale(values) != (1.0, 0.0):
+        raise values.wrong(
+            "RescaleSlope" if _validate_rescale(values)[0] != 1.0 else "RescaleIntercept",
+            "none beside Float Pixel Data (7FE0,0008), which has no rescale",
+        )
+    return bits, bits, bits - 1, True
 
 
 def _check_pixel_room(header: SliceHeader, pixel_vr: str) -> None:

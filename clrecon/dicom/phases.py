@@ -16,6 +16,7 @@ import numpy as np
 
 from clrecon.dicom.header import PHASE_KEYWORDS, SliceHeader
 from clrecon.dicom.pixels import read_voxels
+from clrecon.dicom.stored import StoredPixels
 from clrecon.dicom.text import join_names
 from clrecon.errors import UsageError
 
@@ -111,8 +112,8 @@ def sort_places(places: Sequence[Sequence[SliceHeader]], same: Callable[[SliceHe
     )
 
 
-def have_same_pixels(one: SliceHeader, other: SliceHeader) -> bool:
-    """True when two slices hold the same HU; reads both.
+def have_same_pixels(one: SliceHeader, other: SliceHeader, source: StoredPixels | None = None) -> bool:
+    """True when two slices hold the same HU; reads both, from `source` where many are compared.
 
     Raises
     ------
@@ -121,7 +122,7 @@ def have_same_pixels(one: SliceHeader, other: SliceHeader) -> bool:
     """
     if (one.rows, one.columns) != (other.rows, other.columns):
         return False
-    return bool(np.array_equal(read_voxels([one])[0], read_voxels([other])[0]))
+    return bool(np.array_equal(read_voxels([one], source=source)[0], read_voxels([other], source=source)[0]))
 
 
 def _leave_out_copies(

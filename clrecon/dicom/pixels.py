@@ -4,33 +4,35 @@ Order of the steps for every slice, each in the one place where it is right: sto
 found before rescale), sign extension, rescale by the slice's own slope and intercept, padding to air (`padding`).
 Integer HU stay integers: int16 where every value fits, else int32; other slopes give float32.  Integer steps run in
 the memory of the volume in modular arithmetic, which is exact because the result is known to fit beforehand.
+Float pixel data are HU as they are (float32, from 64 bits too): the standard gives them no rescale (PS3.3 C.7.6.24).
 """
 
 from __future__ import annotations
 
 import os
-import sys
-import zlib
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
+from contextlib import nullcontext
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from clrecon.dicom.codecs import choose_decoder, decode_frame, is_encapsulated
 from clrecon.dicom.header import SliceHeader
 from clrecon.dicom.padding import PaddingMasks, pack_mask
 from clrecon.dicom.scan import Progress
+from clrecon.dicom.stored import StoredPixels, count_readers
 from clrecon.errors import RefusedInputError
 from clrecon.geometry.aligned import aligned_empty
 
 __all__ = ["PixelFacts", "read_voxels"]
 
-INFLATED_SLICE_LIMIT = 256 * 1024 * 1024
 MEMORY_SHARE = 0.9
 MAX_READERS = 8
+MAX_DECODERS = 32
+FLOAT_LIMIT = 1e9
+"""HU beyond this are none; float32 and every later step hold it."""
 
 
 @dataclass(frozen=True)
@@ -57,7 +59,9 @@ class _RangeError(Exception):
     """The HU of a slice do not fit the type of the volume; a wider one is taken."""
 
 
-def read_voxels(slices: Sequence[SliceHeader], progress: Progress | None = None) -> tuple[NDArray[Any], PixelFacts]:
+def read_voxels(
+    slices: Sequence[SliceHeader], progress: Progress | None = None, source: StoredPixels | None = None
+) -> tuple[NDArray[Any], PixelFacts]:
     """Read the pixels of sorted slices of one size into one volume.
 
     Parameters
@@ -66,6 +70,8 @@ def read_voxels(slices: Sequence[SliceHeader], progress: Progress | None = None)
         In the order of k.
     progress : callable, optional
         Called as ``progress("read", done, total)``.
+    source : StoredPixels, optional
+        One that is open for these slices and stays so; without it the call has its own.
 
     Returns
     -------
@@ -78,16 +84,17 @@ def read_voxels(slices: Sequence[SliceHeader], progress: Progress | None = None)
     RefusedInputError
         A file is cut short, cannot be read or decoded, or the volume does not fit into memory.
     """
-    for syntax in sorted({header.transfer_syntax for header in slices}):
-        if is_encapsulated(syntax):
-            choose_decoder(syntax)  # a missing decoder shows before anything is allocated
-    integral = all(float(h.slope).is_integer() and float(h.intercept).is_integer() for h in slices)
-    for dtype in (np.int16, np.int32) if integral else (np.float32,):
-        voxels = _allocate(slices, np.dtype(dtype))
-        try:
-            return voxels, _fill_volume(slices, voxels, progress)
-        except _RangeError:
-            del voxels
+    integral = all(
+        float(h.slope).is_integer() and float(h.intercept).is_integer() and not h.float_pixels for h in slices
+    )
+    # A missing decoder shows here, before anything is allocated.
+    with StoredPixels(slices) if source is None else nullcontext(source) as source:
+        for dtype in (np.int16, np.int32) if integral else (np.float32,):
+            voxels = _allocate(slices, np.dtype(dtype))
+            try:
+                return voxels, _fill_volume(source, slices, voxels, progress)
+            except _RangeError:
+                del voxels
     raise RefusedInputError("the rescaled values do not fit into 32 bits")
 
 
@@ -119,10 +126,13 @@ def _allocate(slices: Sequence[SliceHeader], dtype: np.dtype[Any]) -> NDArray[An
         raise RefusedInputError(f"{what}, which cannot be had") from error
 
 
-def _fill_volume(slices: Sequence[SliceHeader], voxels: NDArray[Any], progress: Progress | None) -> PixelFacts:
+def _fill_volume(
+    source: StoredPixels, slices: Sequence[SliceHeader], voxels: NDArray[Any], progress: Progress | None
+) -> PixelFacts:
     padding, low, high = PaddingMasks(voxels), np.inf, -np.inf
-    with ThreadPoolExecutor(min(MAX_READERS, os.cpu_count() or 1, len(slices))) as pool:
-        jobs = {pool.submit(_fill_slice, header, voxels[k]): k for k, header in enumerate(slices)}
+    most = MAX_DECODERS if source.compressed else MAX_READERS
+    with ThreadPoolExecutor(count_readers(len(slices), most)) as pool:
+        jobs = {pool.submit(_fill_slice, source, header, voxels[k]): k for k, header in enumerate(slices)}
         try:
             for done, job in enumerate(as_completed(jobs), start=1):
                 slice_padding, slice_low, slice_high = job.result()
@@ -130,7 +140,11 @@ def _fill_volume(slices: Sequence[SliceHeader], voxels: NDArray[Any], progress: 
                 low, high = min(low, slice_low), max(high, slice_high)
                 if progress is not None:
                     progress("read", done, len(slices))
+        except _RangeError:
+            pool.shutdown(cancel_futures=True)  # the decoders are needed once more
+            raise
         except BaseException:
+            source.stop()
             pool.shutdown(cancel_futures=True)
             raise
         padding_hu = padding.fill(pool.map)
@@ -139,86 +153,66 @@ def _fill_volume(slices: Sequence[SliceHeader], voxels: NDArray[Any], progress: 
     return PixelFacts(padding.count / voxels.size, float(low), float(high), padding_hu)
 
 
-def _fill_slice(header: SliceHeader, out: NDArray[Any]) -> tuple[Any, float, float]:
+def _fill_slice(
+    source: StoredPixels, header: SliceHeader, out: NDArray[Any]
+) -> tuple[tuple[bytes, int] | None, float, float]:
     """Read one slice into `out`; returns its padding, packed, or None, and its lowest and highest measured HU."""
-    stored = _load_stored(header, out)
-    padding = None
-    if header.padding is not None and not _fits_stored_bits(header):
-        padding = _find_padding(header, stored)  # the value fills the whole cell, unused bits included
-    _extend_sign(header, stored)
-    if header.padding is not None and padding is None:
+    stored = source.load(header, out)
+    whole_cell = header.padding is not None and not header.float_pixels and not _fits_stored_bits(header)
+    padding = _find_padding(header, stored) if whole_cell else None  # the value fills unused bits too
+    if not header.float_pixels:
+        _extend_sign(header, stored)
+    if header.padding is not None and not whole_cell:
         padding = _find_padding(header, stored)
-    if padding is not None and padding.all():
-        return pack_mask(padding), np.inf, -np.inf
-
-    low, high = _measured_range(stored, padding)
-    ends = (low * header.slope + header.intercept, high * header.slope + header.intercept)
-    hu_low, hu_high = min(ends), max(ends)
+    packed = None if padding is None else pack_mask(padding)
+    if padding is not None and packed is not None:
+        if packed[1] == padding.size:
+            return packed, np.inf, -np.inf
+        # A measured value in its place counts for nothing: one pass less over the slice.
+        np.copyto(stored, stored.flat[padding.argmin()], where=padding)
+    low, high = stored.min(), stored.max()
+    if header.float_pixels and not (abs(low) <= FLOAT_LIMIT and abs(high) <= FLOAT_LIMIT):
+        raise RefusedInputError(f"{header.name}: Float Pixel Data holds {_describe_unfit(stored)}: those are no HU")
+    hu_low, hu_high = float(low) * header.slope + header.intercept, float(high) * header.slope + header.intercept
+    if hu_low > hu_high:
+        hu_low, hu_high = hu_high, hu_low
     if out.dtype.kind == "f":
-        out[...] = stored * np.float64(header.slope) + header.intercept
+        if header.slope == 1.0 and header.intercept == 0.0:
+            if not np.may_share_memory(stored, out):
+                out[...] = stored
+        else:
+            out[...] = stored * np.float64(header.slope) + header.intercept
     else:
-        limits = np.iinfo(out.dtype)
-        if hu_low < limits.min or hu_high > limits.max:
-            raise _RangeError
-        if not np.may_share_memory(stored, out):
-            np.copyto(out, stored, casting="unsafe")
-        if header.slope != 1.0:
-            np.multiply(out, np.int64(header.slope).astype(out.dtype), out=out)
-        if header.intercept != 0.0:
-            np.add(out, np.int64(header.intercept).astype(out.dtype), out=out)
-    return None if padding is None else pack_mask(padding), hu_low, hu_high
+        _rescale_integers(header, stored, out, hu_low, hu_high)
+    return packed, hu_low, hu_high
 
 
-def _load_stored(header: SliceHeader, out: NDArray[Any]) -> NDArray[Any]:
-    """Stored values, unused bits included, in native byte order; in the memory of `out` where the sizes agree."""
-    dtype = np.dtype(f"{'i' if header.signed else 'u'}{header.bits_allocated // 8}")
-    try:
-        with open(header.file, "rb", buffering=0) as file:
-            if is_encapsulated(header.transfer_syntax):
-                file.seek(header.pixel_offset)
-                frame = decode_frame(header, file.read() or b"")
-                return np.array(frame, dtype=dtype)
-            stored = out.view(dtype) if out.dtype.itemsize == dtype.itemsize and out.dtype.kind != "f" else None
-            if stored is None:
-                stored = np.empty(out.shape, dtype)
-            if header.inflate_from >= 0:
-                file.seek(header.inflate_from)
-                _inflate_into(header, file.read() or b"", stored)
-            else:
-                file.seek(header.pixel_offset + header.frame * header.pixel_bytes)
-                _read_into(header, file, stored)
-    except OSError as error:
-        raise RefusedInputError(f"{header.name} cannot be read: {error.strerror or error}") from error
-    if header.little_endian != (sys.byteorder == "little"):
-        stored.byteswap(inplace=True)
-    return stored
+def _rescale_integers(
+    header: SliceHeader, stored: NDArray[Any], out: NDArray[Any], hu_low: float, hu_high: float
+) -> None:
+    """Rescale in the memory of the volume, modulo its width: exact, because the result fits."""
+    if not (_fits_dtype(int(hu_low), out.dtype) and _fits_dtype(int(hu_high), out.dtype)):
+        raise _RangeError
+    if not np.may_share_memory(stored, out):
+        np.copyto(out, stored, casting="unsafe")
+    if header.slope != 1.0:
+        np.multiply(out, np.int64(header.slope).astype(out.dtype), out=out)
+    if header.intercept != 0.0:
+        np.add(out, np.int64(header.intercept).astype(out.dtype), out=out)
 
 
-def _read_into(header: SliceHeader, file: Any, stored: NDArray[Any]) -> None:
-    target = stored.data.cast("B")
-    done = 0
-    while done < len(target):
-        count = file.readinto(target[done:])
-        if not count:
-            raise RefusedInputError(f"{header.name}: truncated: {len(target)} bytes of pixels expected, {done} found")
-        done += count
+def _fits_dtype(value: int, dtype: np.dtype[Any]) -> bool:
+    limits = np.iinfo(dtype)
+    return int(limits.min) <= value <= int(limits.max)
 
 
-def _inflate_into(header: SliceHeader, deflated: bytes, stored: NDArray[Any]) -> None:
-    first = header.pixel_offset + header.frame * stored.nbytes
-    needed = first + stored.nbytes
-    if needed > INFLATED_SLICE_LIMIT:
-        raise RefusedInputError(
-            f"{header.name}: deflated image of {needed} bytes, no more than {INFLATED_SLICE_LIMIT} are inflated"
-        )
-    try:
-        inflated = zlib.decompressobj(-zlib.MAX_WBITS).decompress(deflated, needed)
-    except zlib.error as error:
-        raise RefusedInputError(f"{header.name}: the deflated data set is damaged") from error
-    found = max(len(inflated) - first, 0)
-    if found < stored.nbytes:
-        raise RefusedInputError(f"{header.name}: truncated: {stored.nbytes} bytes of pixels expected, {found} found")
-    stored[...] = np.frombuffer(inflated, stored.dtype, stored.size, first).reshape(stored.shape)
+def _describe_unfit(stored: NDArray[Any]) -> str:
+    """Count what is no HU in float pixels."""
+    nan = int(np.count_nonzero(np.isnan(stored)))
+    infinite = int(np.count_nonzero(np.isinf(stored)))
+    if nan or infinite:
+        return f"{nan} NaN and {infinite} infinite values of {stored.size}"
+    return f"values from {float(stored.min()):g} to {float(stored.max()):g}"
 
 
 def _extend_sign(header: SliceHeader, stored: NDArray[Any]) -> None:
@@ -238,19 +232,18 @@ def _fits_stored_bits(header: SliceHeader) -> bool:
 
 
 def _find_padding(header: SliceHeader, stored: NDArray[Any]) -> NDArray[np.bool_] | None:
+    """Mask of the padding; None where there is none."""
     assert header.padding is not None
     low, high = header.padding
-    if high < int(stored.min()) or low > int(stored.max()):
-        return None
-    limits = np.iinfo(stored.dtype)
-    low, high = max(low, int(limits.min)), min(high, int(limits.max))
+    if header.float_pixels:
+        low, high = stored.dtype.type(low), stored.dtype.type(high)
+        if np.isnan(low) or np.isnan(high):
+            mask = np.isnan(stored)  # PS3.3 C.7.6.24: NaN may be the padding value
+            return mask if mask.any() else None
+    else:
+        limits = np.iinfo(stored.dtype)
+        low, high = max(low, int(limits.min)), min(high, int(limits.max))
+        if low > high:
+            return None
     mask = stored == low if low == high else (stored >= low) & (stored <= high)
     return mask if mask.any() else None
-
-
-def _measured_range(stored: NDArray[Any], padding: NDArray[np.bool_] | None) -> tuple[int, int]:
-    """Lowest and highest stored value outside of the padding; not everything is padding."""
-    if padding is None:
-        return int(stored.min()), int(stored.max())
-    measured = stored[~padding]
-    return int(measured.min()), int(measured.max())

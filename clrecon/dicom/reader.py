@@ -11,6 +11,7 @@ from typing import Any
 
 from clrecon.dicom.certificate import certify, collect_scan_warnings, collect_series_warnings
 from clrecon.dicom.choice import choose_series, describe_left
+from clrecon.dicom.containers import advise_on
 from clrecon.dicom.pixels import read_voxels
 from clrecon.dicom.plausibility import collect_voxel_warnings
 from clrecon.dicom.scan import Progress, Scan, scan_path
@@ -183,6 +184,8 @@ def _scan_and_group(path: str | os.PathLike[str], progress: Progress | None) -> 
         reasons = ", ".join(f"{count} {reason}" for reason, count in sorted(scan.skipped.items()))
         looked = f"{scan.files} file{'s' * (scan.files != 1)} looked at" + (f" ({reasons})" if reasons else "")
         hint = "; a DICOMDIR only lists files: name the folder that holds them" if scan.skipped["DICOMDIR"] else ""
+        packed = advise_on(scan.skipped)
+        hint += f"; {packed}" if packed else ""
         raise NoDicomError(f"no DICOM images in {shown}: {looked}{hint}")
     return scan, group_series(scan)
 

@@ -14,6 +14,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from clrecon.dicom.containers import describe_container
 from clrecon.dicom.elements import META_START, CorruptFileError, NotDicomError
 from clrecon.dicom.header import OtherImage, SliceHeader, read_headers
 from clrecon.dicom.text import escape_text
@@ -97,7 +98,7 @@ def _take_file(file: Path, scan: Scan) -> None:
     try:
         headers = read_headers(file)
     except NotDicomError as error:
-        scan.skipped["not DICOM"] += 1
+        scan.skipped[describe_container(error.start) or "not DICOM"] += 1
         reason = _suspect(file, error.start)
         if reason:
             scan.suspects.append(CorruptFile(file, reason))

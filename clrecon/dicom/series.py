@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +17,7 @@ from clrecon.dicom.header import OtherImage, SeriesIdentity, SliceHeader
 from clrecon.dicom.layout import measure_extent, median_thickness
 from clrecon.dicom.phases import Places, choose_phase, describe_phases, have_same_pixels, sort_places
 from clrecon.dicom.scan import CorruptFile, Scan
+from clrecon.dicom.stored import StoredPixels
 from clrecon.dicom.text import hash_uid, join_names
 from clrecon.errors import ClreconError, RefusedInputError
 from clrecon.geometry import column_spacing
@@ -85,7 +86,11 @@ class Series:
         """
         if self.kind != "stack" or len(self.headers) < 2:
             return Places(tuple(self.headers))
-        return sort_places(group_places(self.headers), have_same_pixels)
+        places = group_places(self.headers)
+        if len(places) == len(self.headers):
+            return sort_places(places, have_same_pixels)
+        with StoredPixels(self.headers) as source:
+            return sort_places(places, partial(have_same_pixels, source=source))
 
     @cached_property
     def stack(self) -> Stack | None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import re
+import struct
 from typing import Literal
 
 from clrecon.dicom.elements import DicomElements
@@ -53,6 +54,10 @@ _TAGS = {
     "PixelRepresentation": 0x00280103,
     "PixelPaddingValue": 0x00280120,
     "PixelPaddingRangeLimit": 0x00280121,
+    "FloatPixelPaddingValue": 0x00280122,
+    "DoubleFloatPixelPaddingValue": 0x00280123,
+    "FloatPixelPaddingRangeLimit": 0x00280124,
+    "DoubleFloatPixelPaddingRangeLimit": 0x00280125,
     "RescaleIntercept": 0x00281052,
     "RescaleSlope": 0x00281053,
     "RescaleType": 0x00281054,
@@ -132,6 +137,19 @@ class Values:
             bounds.append(int.from_bytes(raw, self.byte_order, signed=signed))
             if bits_allocated == 8 and not signed:
                 bounds[-1] &= 0xFF
+        return (min(bounds), max(bounds)) if bounds else None
+
+    def float_padding(self, bits: int) -> tuple[float, float] | None:
+        """Range of padding values of float pixels, NaN where that is the padding (PS3.3 C.7.6.24.1)."""
+        prefix, form = ("Double", "d") if bits == 64 else ("", "f")
+        bounds = []
+        for keyword in (f"{prefix}FloatPixelPaddingValue", f"{prefix}FloatPixelPaddingRangeLimit"):
+            raw = self.elements.values.get(_TAGS[keyword], b"")
+            if not raw:
+                break
+            if len(raw) != bits // 8:
+                raise self.wrong(keyword, "one floating point number")
+            bounds.append(struct.unpack(("<" if self.byte_order == "little" else ">") + form, raw)[0])
         return (min(bounds), max(bounds)) if bounds else None
 
     def description(self) -> str:

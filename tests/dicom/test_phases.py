@@ -148,7 +148,7 @@ def test_copies_whose_pixels_cannot_be_read_are_refused(tmp_path, monkeypatch):
     write_series(tmp_path, Plan())
     write_series(tmp_path, Plan(name="again{}".format))
 
-    def fail(slices, progress=None):
+    def fail(slices, progress=None, source=None):
         raise RefusedInputError("again0: does not decode")
 
     monkeypatch.setattr("clrecon.dicom.phases.read_voxels", fail)

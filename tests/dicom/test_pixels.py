@@ -16,7 +16,7 @@ from pydicom.uid import (
 )
 from tolerances import AFFINE_MM
 
-from clrecon.dicom import list_series, pixels, read_volume
+from clrecon.dicom import list_series, pixels, read_volume, stored
 from clrecon.errors import NoDicomError, RefusedInputError
 
 SYNTAXES = "transfer_syntaxes"
@@ -233,7 +233,7 @@ def test_short_pixel_data_names_both_sizes(tmp_path):
         read_volume(tmp_path)
 
 
-def test_memory_is_asked_for_before_it_is_taken(tmp_path, monkeypatch):
+def test_row_39_memory_is_asked_for_before_it_is_taken(tmp_path, monkeypatch):
     write_series(tmp_path)
     monkeypatch.setattr(pixels, "available_memory_bytes", lambda: 100)
     with pytest.raises(RefusedInputError, match="volume of 6 x 5 x 7 voxels needs"):
@@ -242,8 +242,8 @@ def test_memory_is_asked_for_before_it_is_taken(tmp_path, monkeypatch):
     assert pixels.available_memory_bytes() > 1e7
 
 
-def test_a_deflate_bomb_is_not_inflated(tmp_path, monkeypatch):
-    monkeypatch.setattr(pixels, "INFLATED_SLICE_LIMIT", 1_000_000)
+def test_row_38_a_deflate_bomb_is_not_inflated(tmp_path, monkeypatch):
+    monkeypatch.setattr(stored, "INFLATED_LIMIT", 1_000_000)
     plan = Plan(syntax=DeflatedExplicitVRLittleEndian)
     for k in range(2):
         ds = make_dataset(plan, k)
@@ -253,6 +253,25 @@ def test_a_deflate_bomb_is_not_inflated(tmp_path, monkeypatch):
     assert sum(file.stat().st_size for file in tmp_path.iterdir()) < 10_000
     with pytest.raises(RefusedInputError, match="no more than 1000000 are inflated"):
         read_volume(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("slope", "intercept"), [(1, -1024), (3, -1000), (3, 0), (1, 40000), (0.25, 0), (0.3125, 1), (-1, 500)]
+)
+def test_padding_and_range_with_any_rescale(tmp_path, slope, intercept):
+    """Whatever way the padding takes to air, it counts in no range but as air."""
+
+    def pad(array, k):
+        array[1, 1:4] = -30000
+        return array
+
+    change = set_pixels(pad, PixelPaddingValue=-30000, RescaleSlope=slope, RescaleIntercept=intercept)
+    plan = write_series(tmp_path, change=change)
+    volume = read_volume(tmp_path)
+    expected = (plan.hu() + 1024) * slope + intercept
+    expected[:, 1, 1:4] = -1024
+    assert np.array_equal(volume.voxels, expected)
+    assert volume.report["hu_range"] == [expected.min(), expected.max()]
 
 
 # --- real files ---
@@ -325,6 +344,13 @@ def test_damaged_compressed_frames_are_refused(tmp_path, real_data):
         with pytest.raises(RefusedInputError, match="1: truncated: the compressed pixels have no end mark"):
             read_volume(folder)
         (folder / "1").write_bytes(whole[: len(whole) // 2] + bytes(len(whole) - len(whole) // 2 - 8) + whole[-8:])
+        with pytest.raises(
+            RefusedInputError, match="1: (truncated: the compressed frame has no end mark|the compr.* segment)"
+        ):
+            read_volume(folder)
+        (folder / "1").write_bytes(
+            whole[: len(whole) // 2] + bytes(len(whole) // 8) + whole[len(whole) // 2 + len(whole) // 8 :]
+        )
         try:
             volume = read_volume(folder)
         except RefusedInputError as error:

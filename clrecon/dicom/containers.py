@@ -1,0 +1,53 @@
+"""What a file that is no DICOM is, told from its first bytes, so that a message can say what to do about it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+__all__ = ["advise_on", "describe_container"]
+
+# First bytes, the most telling first.
+_STARTS = (
+    (b"PK\x03\x04", "zip archive"),
+    (b"PK\x05\x06", "zip archive"),
+    (b"\x1f\x8b", "gzip file"),
+    (b"BZh", "bzip2 file"),
+    (b"\xfd7zXZ\0", "xz file"),
+    (b"\x28\xb5\x2f\xfd", "zstd file"),
+    (b"7z\xbc\xaf\x27\x1c", "7z archive"),
+    (b"Rar!\x1a\x07", "rar archive"),
+    (b"\x89PNG\r\n\x1a\n", "PNG image"),
+    (b"\xff\xd8\xff", "JPEG image"),
+    (b"\0\0\0\x0cjP  ", "JPEG 2000 image"),
+    (b"\xff\x4f\xff\x51", "JPEG 2000 image"),
+    (b"II*\0", "TIFF image"),
+    (b"MM\0*", "TIFF image"),
+    (b"%PDF-", "PDF document"),
+    (b"NRRD0", "NRRD volume"),
+    (b"ObjectType = Image", "MetaImage volume"),
+    (b"\x5c\x01\0\0", "NIfTI volume"),
+    (b"\0\0\x01\x5c", "NIfTI volume"),
+    (b"\x1c\x02\0\0n+2", "NIfTI volume"),
+    (b"\x7fELF", "program"),
+    (b"MZ", "program"),
+)
+_TAR_MARK = slice(257, 262), b"ustar"
+
+_PACKED = frozenset(
+    ("zip archive", "gzip file", "bzip2 file", "xz file", "zstd file", "7z archive", "rar archive", "tar archive")
+)
+
+
+def describe_container(start: bytes) -> str:
+    """Name the kind of a file by its first bytes (262 or more tell all); empty where they say nothing."""
+    for mark, kind in _STARTS:
+        if start.startswith(mark):
+            return kind
+    where, mark = _TAR_MARK
+    return "tar archive" if start[where] == mark else ""
+
+
+def advise_on(kinds: Iterable[str]) -> str:
+    """What to do about files of these kinds; empty where there is nothing to be said."""
+    packed = sorted(_PACKED.intersection(kinds))
+    return f"unpack the {' and the '.join(packed)} and name the folder" if packed else ""

@@ -1,0 +1,222 @@
+"""The process that decodes compressed frames.  `decoder_pool` runs this file as a script; clrecon never imports it.
+
+Decoders are C code that meets hostile bytes: here they may crash, hang or ask for all memory, and only this process
+ends.  It imports numpy and the decoders in use, not clrecon and not pydicom, so that it starts in a tenth of a second.
+
+It reads from standard input one line of JSON with settings, and then requests: a line of JSON, and as many bytes of
+compressed frame as it says.  To standard output goes for each a status, a count and as many bytes: the pixels in C
+order, or a text that says what is wrong.  This process ends with its input, and with its parent: see `end_with`.
+"""
+
+from __future__ import annotations
+
+import importlib
+import json
+import os
+import signal
+import struct
+import sys
+import time
+from collections.abc import Callable
+from typing import Any, BinaryIO
+
+REPLY = "<BQ"
+"""Status and count of the bytes that follow."""
+
+READY, DONE, FAILED, NO_MEMORY, NO_DECODER = range(5)
+
+SIZE_WITHOUT_PROC = 1 << 30
+"""Address space that is taken as used where the system does not say, in bytes: more than imports need."""
+
+Decoder = Callable[[bytes, dict[str, Any]], Any]
+
+
+def decode_by_openjpeg(data: bytes, request: dict[str, Any]) -> Any:
+    """JPEG 2000, high throughput too."""
+    from openjpeg import decode
+
+    return decode(data, 0)
+
+
+def decode_by_jpeg_ls(data: bytes, request: dict[str, Any]) -> Any:
+    """JPEG-LS."""
+    import numpy as np
+    from jpeg_ls import decode_pixel_data
+
+    pixels, info = decode_pixel_data(data)
+    width = 1 if info["bits_per_sample"] <= 8 else 2
+    return np.frombuffer(pixels, f"<u{width}").reshape(info["height"], info["width"])
+
+
+def decode_by_rle(data: bytes, request: dict[str, Any]) -> Any:
+    """DICOM's own run length encoding."""
+    import numpy as np
+    from rle.rle import decode_frame
+
+    bits = 8 * np.dtype(request["dtype"]).itemsize
+    pixels = decode_frame(data, request["rows"] * request["columns"], bits, "<")
+    return np.frombuffer(pixels, f"<u{bits // 8}").reshape(request["rows"], request["columns"])
+
+
+def decode_by_imagecodecs_jpeg(data: bytes, request: dict[str, Any]) -> Any:
+    """JPEG lossless, by libjpeg-turbo."""
+    from imagecodecs import jpeg8_decode
+
+    return jpeg8_decode(data)
+
+
+def decode_by_imagecodecs_jpeg_ls(data: bytes, request: dict[str, Any]) -> Any:
+    """JPEG-LS, as `decode_by_jpeg_ls`."""
+    from imagecodecs import jpegls_decode
+
+    return jpegls_decode(data)
+
+
+def decode_by_imagecodecs_jpeg_2000(data: bytes, request: dict[str, Any]) -> Any:
+    """JPEG 2000, as `decode_by_openjpeg`."""
+    from imagecodecs import jpeg2k_decode
+
+    return jpeg2k_decode(data)
+
+
+# What a decoder needs is imported at the start: before the limit on memory, and where its lack can be told.
+DECODERS: dict[str, tuple[Decoder, tuple[str, ...]]] = {
+    "openjpeg": (decode_by_openjpeg, ("openjpeg",)),
+    "jpeg_ls": (decode_by_jpeg_ls, ("jpeg_ls",)),
+    "rle": (decode_by_rle, ("rle.rle",)),
+    "imagecodecs jpeg": (decode_by_imagecodecs_jpeg, ("imagecodecs", "imagecodecs._jpeg8")),
+    "imagecodecs jpeg_ls": (decode_by_imagecodecs_jpeg_ls, ("imagecodecs", "imagecodecs._jpegls")),
+    "imagecodecs jpeg_2000": (decode_by_imagecodecs_jpeg_2000, ("imagecodecs", "imagecodecs._jpeg2k")),
+}
+
+
+def load_decoder(name: str) -> Decoder:
+    """Find a decoder by its name, or by MODULE:FUNCTION, and import what it needs."""
+    if ":" in name:
+        module, _, function = name.partition(":")
+        return getattr(importlib.import_module(module), function)
+    decoder, modules = DECODERS[name]
+    for module in ("numpy", *modules):
+        importlib.import_module(module)
+    return decoder
+
+
+def take_standard_output() -> BinaryIO:
+    """Return standard output under another number; what decoders print goes nowhere."""
+    sink = os.fdopen(os.dup(1), "wb", buffering=0)
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, 1)
+    os.dup2(nowhere, 2)
+    os.close(nowhere)
+    return sink
+
+
+def send(sink: BinaryIO, status: int, body: Any = b"") -> None:
+    """Write one reply."""
+    body = memoryview(body).cast("B")
+    for part in (memoryview(struct.pack(REPLY, status, len(body))), body):
+        done = 0
+        while done < len(part):
+            done += sink.write(part[done:])
+
+
+def limit_memory(more_bytes: int) -> None:
+    """Allow `more_bytes` of address space beyond what the imports took, and no core files, where the system can."""
+    try:
+        import resource
+    except ImportError:
+        return  # Windows
+    try:
+        with open("/proc/self/statm", encoding="ascii") as file:
+            used = int(file.read().split()[0]) * resource.getpagesize()
+    except OSError:
+        used = SIZE_WITHOUT_PROC
+    for what, limit in ((resource.RLIMIT_CORE, 0), (resource.RLIMIT_AS, used + more_bytes)):
+        try:
+            resource.setrlimit(what, (limit, limit))
+        except (OSError, ValueError):
+            pass  # a stricter one is set, or the system (macOS) does not know this limit
+
+
+def limit_time(seconds: float) -> None:
+    """End this process when the next frame takes longer. The parent does so too; this holds without it."""
+    try:
+        import resource
+    except ImportError:
+        return
+    hard = resource.getrlimit(resource.RLIMIT_CPU)[1]
+    soft = int(time.process_time() + seconds) + 2
+    if hard == resource.RLIM_INFINITY or soft < hard:
+        resource.setrlimit(resource.RLIMIT_CPU, (soft, hard))
+    signal.alarm(int(seconds) + 5)
+
+
+def end_with(lifeline: int) -> None:
+    """Have the system end this process (SIGIO) when the other end of a pipe closes: when the parent is gone.
+
+    That works in the midst of a decoder too.  Where there is no such pipe the alarm ends an orphan.
+    """
+    if lifeline < 0:
+        return
+    import fcntl
+    import select
+
+    fcntl.fcntl(lifeline, fcntl.F_SETOWN, os.getpid())
+    fcntl.fcntl(lifeline, fcntl.F_SETFL, fcntl.fcntl(lifeline, fcntl.F_GETFL) | os.O_ASYNC)
+    poll = select.poll()
+    poll.register(lifeline)
+    if poll.poll(0):
+        os._exit(1)  # it went before we asked
+
+
+def answer(decoder: Decoder, data: bytes, request: dict[str, Any]) -> tuple[int, Any]:
+    """Decode one frame; return the status of the reply and its body."""
+    import numpy as np
+
+    expected = np.dtype(request["dtype"])
+    try:
+        frame = np.asarray(decoder(data, request))
+        if frame.shape != (request["rows"], request["columns"]) or frame.dtype.itemsize != expected.itemsize:
+            return FAILED, f"an image of shape {frame.shape}, {frame.dtype.name}".encode()
+        return DONE, np.ascontiguousarray(frame, frame.dtype.newbyteorder("<")).view(expected)
+    except MemoryError:
+        return NO_MEMORY, b""
+    except Exception as error:
+        # Decoders fail in any way on hostile bytes; all of them mean that this frame is not to be had.
+        return FAILED, f"{type(error).__name__}: {error}".encode("ascii", "replace")[:200]
+
+
+def main() -> None:
+    """Serve until standard input ends."""
+    if hasattr(signal, "SIGINT"):
+        signal.signal(signal.SIGINT, signal.SIG_IGN)  # a terminal sends it to all; the parent decides
+    end_with(int(sys.argv[1]))
+    source, sink = sys.stdin.buffer, take_standard_output()
+    settings = json.loads(source.readline() or b"null")
+    if settings is None:
+        return
+    sys.path[:] = settings["path"]
+    try:
+        decoders = {name: load_decoder(name) for name in settings["decoders"]}
+    except Exception as error:
+        send(sink, NO_DECODER, f"{type(error).__name__}: {error}".encode("ascii", "replace")[:200])
+        return
+    limit_memory(settings["memory_bytes"])
+    send(sink, READY)
+    while line := source.readline():
+        request = json.loads(line)
+        data = source.read(request["length"])
+        if len(data) < request["length"]:
+            return
+        limit_time(settings["seconds"])
+        status, body = answer(decoders[request["decoder"]], data, request)
+        send(sink, status, body)
+        del data, body
+
+
+if __name__ == "__main__":
+    try:
+        main()
+    except BrokenPipeError:
+        pass  # the parent is gone
+    os._exit(0)
