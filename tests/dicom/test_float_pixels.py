@@ -96,9 +96,9 @@ def test_row_32_all_nan(tmp_path):
         ),
         (
             set_pixels(lambda array, k: array * 0 - 2000, PixelPaddingValue=-2000),
-            "every one of the 210 voxels is padding",
+            "all 210 voxels are padding",
         ),
-        (set_floats(lambda array, k: array * 0 + 3.5), "every one of the 210 voxels has the value 3.5"),
+        (set_floats(lambda array, k: array * 0 + 3.5), "all 210 voxels are 3.5 HU"),
     ],
 )
 def test_row_32_constant_volumes(tmp_path, change, words):
