@@ -12,7 +12,7 @@ from pathlib import Path
 
 from clrecon.dicom.codecs import describe_undecodable, is_encapsulated
 from clrecon.dicom.concatenation import Concatenation
-from clrecon.dicom.elements import CorruptFileError, DicomElements, read_elements
+from clrecon.dicom.elements import CorruptFileError, DicomElements, FileStart, read_elements
 from clrecon.dicom.multiframe import ENHANCED_CT, FRAME_PHASES, read_groups, split_frames
 from clrecon.dicom.text import escape_text, hash_uid
 from clrecon.dicom.values import WANTED_TAGS, ValueProblem, Values
@@ -171,8 +171,14 @@ class SliceHeader:
         return self.rows * self.columns * self.bits_allocated // 8
 
 
-def read_headers(path: Path) -> list[SliceHeader] | OtherImage | None:
+def read_headers(path: Path, start: FileStart | None = None) -> list[SliceHeader] | OtherImage | None:
     """Read and validate the header of one file.
+
+    Parameters
+    ----------
+    path : Path
+    start : FileStart, optional
+        See `read_elements`.
 
     Returns
     -------
@@ -184,7 +190,7 @@ def read_headers(path: Path) -> list[SliceHeader] | OtherImage | None:
     NotDicomError, CorruptFileError, OSError
         As `read_elements`; also corrupt is a CT image that ends before its pixel data.
     """
-    elements = read_elements(path, WANTED_TAGS)
+    elements = read_elements(path, WANTED_TAGS, start)
     if elements.media_class == DICOMDIR_CLASS:
         return None
     values = Values(elements)

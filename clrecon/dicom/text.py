@@ -16,6 +16,8 @@ def escape_text(text: str, limit: int = TEXT_LIMIT) -> str:
 
     Control characters, line breaks, terminal escapes and direction marks come out as ``\\xNN`` or ``\\uNNNN``.
     """
+    if text.isprintable() and len(text) <= limit:
+        return text
     safe = "".join(c if c.isprintable() else c.encode("unicode_escape", "replace").decode("ascii") for c in text)
     return safe if len(safe) <= limit else safe[: limit - 3] + "..."
 
