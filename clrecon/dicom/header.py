@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 
 from clrecon.dicom.codecs import describe_undecodable, is_encapsulated
@@ -50,7 +51,7 @@ RESCALE_SLOPE = (1e-6, 1e6)
 RESCALE_INTERCEPT_LIMIT = 1e9
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class SeriesIdentity:
     """What a file says of its series: UID, number (None where missing), description, modality, UID of the study."""
 
@@ -61,7 +62,7 @@ class SeriesIdentity:
     study: str = ""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class OtherImage:
     """A DICOM object that cannot be a slice, and why.
 
@@ -83,7 +84,7 @@ class OtherImage:
     problem: str
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class SliceHeader:
     """Everything that is known of one CT slice before its pixels are read. All values are validated.
 
@@ -171,6 +172,17 @@ class SliceHeader:
         return self.rows * self.columns * self.bits_allocated // 8
 
 
+# The slices of a series share what they have in common: a tree of 100,000 files stays small in memory.
+_share_identity = lru_cache(1024)(SeriesIdentity)
+
+
+@lru_cache(256)
+def _share_halves(
+    orientation: tuple[float, ...],
+) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
+    return orientation[:3], orientation[3:]  # type: ignore[return-value]
+
+
 def read_headers(path: Path, start: FileStart | None = None) -> list[SliceHeader] | OtherImage | None:
     """Read and validate the header of one file.
 
@@ -198,7 +210,7 @@ def read_headers(path: Path, start: FileStart | None = None) -> list[SliceHeader
     sop_class = values.word("SOPClassUID") or elements.media_class
     known_class = "CT" if sop_class in (CT_IMAGE_STORAGE, *ENHANCED_CT) else "unknown"
     modality = values.word("Modality").strip().upper() or known_class
-    series = SeriesIdentity(
+    series = _share_identity(
         values.word("SeriesInstanceUID"),
         values.whole_or_none("SeriesNumber"),
         values.description(),
@@ -303,6 +315,7 @@ def _validate(values: Values, series: SeriesIdentity, path: Path, name: str, *, 
     if derived:
         warnings.append(f"derived images (ImageType has DERIVED and {' '.join(derived)}): maybe not measured HU")
 
+    row_cosines, column_cosines = _share_halves(orientation)
     header = SliceHeader(
         series=series,
         file=path,
@@ -310,7 +323,7 @@ def _validate(values: Values, series: SeriesIdentity, path: Path, name: str, *, 
         frame=0,
         frames=frames,
         concatenation=None,
-        phase=tuple((keyword, values.word(keyword)) for keyword in SLICE_PHASES if keyword in values),
+        phase=values.pairs(SLICE_PHASES),
         localizer="LOCALIZER" in image_type,
         patient_hash=hash_uid(values.text("PatientID").strip()),
         frame_of_reference=values.word("FrameOfReferenceUID"),
@@ -323,8 +336,8 @@ def _validate(values: Values, series: SeriesIdentity, path: Path, name: str, *, 
         high_bit=high_bit,
         signed=signed,
         photometric=photometric,
-        row_cosines=orientation[:3],  # type: ignore[arg-type]
-        column_cosines=orientation[3:],  # type: ignore[arg-type]
+        row_cosines=row_cosines,
+        column_cosines=column_cosines,
         position_mm=position,  # type: ignore[arg-type]
         di_mm=di,
         dj_mm=dj,

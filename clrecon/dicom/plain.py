@@ -8,6 +8,7 @@ the tests hold the two together on mutated files.
 
 from __future__ import annotations
 
+import re
 import struct
 from functools import lru_cache
 
@@ -57,6 +58,11 @@ SEQUENCE_TAGS = frozenset(
 """Sequences that CT headers hold: in implicit VR an undefined length alone does not tell a sequence."""
 _SEQUENCE_KEYS = frozenset((tag & 0xFFFF) << 16 | tag >> 16 for tag in SEQUENCE_TAGS)
 DEEPEST = 8
+CHARACTER_SET = 0x00080005
+_known_character_sets = re.compile(
+    rb"(ISO_IR \d{1,3}|ISO 2022 IR \d{1,3}|GB18030|GBK)?(\\ISO 2022 IR \d{1,3})* ?"
+).fullmatch
+"""pydicom looks up any other name among Python's codecs, which may fail."""
 
 _explicit_head = struct.Struct("<L2sH").unpack_from
 _implicit_head = struct.Struct("<LL").unpack_from
@@ -77,7 +83,7 @@ def parse_plainly(data: bytes, size: int, wanted: tuple[int, ...]) -> DicomEleme
     size : int
         Bytes of the whole file.
     wanted : tuple of int
-        Tags to keep.
+        Tags to keep; SpecificCharacterSet (0008,0005) is among them.
 
     Returns
     -------
@@ -106,7 +112,7 @@ def _parse(data: bytes, size: int, wanted: tuple[int, ...]) -> DicomElements | N
     else:
         values, vrs, place = _walk_explicit(data, start, _keys(wanted))
     tag, offset, length, vr = read_pixel_head(data[place : place + 12], place, implicit, True)
-    if tag is None:
+    if tag is None or not _known_character_sets(values.get(CHARACTER_SET, b"")):
         return None
     return DicomElements(
         transfer_syntax,

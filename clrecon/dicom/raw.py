@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+from functools import lru_cache
 from typing import NamedTuple
 
 from clrecon.errors import RefusedInputError
@@ -80,6 +81,7 @@ class DicomElements(NamedTuple):
     file_bytes: int
 
 
+@lru_cache(64)
 def decode_uid(value: bytes | None) -> str:
     """A UID without its padding."""
     return (value or b"").rstrip(b"\0 ").decode("ascii", "replace")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterable
+from functools import lru_cache
 
 __all__ = ["escape_text", "hash_uid", "join_names"]
 
@@ -22,6 +23,7 @@ def escape_text(text: str, limit: int = TEXT_LIMIT) -> str:
     return safe if len(safe) <= limit else safe[: limit - 3] + "..."
 
 
+@lru_cache(1024)
 def hash_uid(uid: str) -> str | None:
     """First 16 hexadecimal digits of the SHA-256 of a UID: names a series without giving its identifier away.
 

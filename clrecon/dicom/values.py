@@ -90,6 +90,11 @@ def _known_word(raw: bytes) -> str:
     return escape_text(_decode_text(raw))
 
 
+@lru_cache(_KNOWN_VALUES)
+def _share_pairs(*pairs: tuple[str, str]) -> tuple[tuple[str, str], ...]:
+    return pairs
+
+
 class ValueProblem(RefusedInputError):
     """One value of a header is missing or wrong."""
 
@@ -128,6 +133,10 @@ class Values:
         if raw is None:
             return ""
         return _known_word(raw) if len(raw) <= _KNOWN_BYTES else escape_text(_decode_text(raw))
+
+    def pairs(self, keywords: tuple[str, ...]) -> tuple[tuple[str, str], ...]:
+        """Keyword and value, as `word` gives it, of those that are there."""
+        return _share_pairs(*((keyword, word) for keyword in keywords if (word := self.word(keyword))))
 
     def decimals(self, keyword: str, count: int) -> tuple[float, ...]:
         raw = self.elements.values.get(_TAGS[keyword], b"")
@@ -171,7 +180,7 @@ class Values:
         raw = self.elements.values.get(_TAGS["SeriesDescription"], b"").strip(b" \0")
         charset = self.text("SpecificCharacterSet")
         if raw.isascii() and b"\x1b" not in raw or not charset:
-            return escape_text(raw.decode("latin-1"))
+            return self.word("SeriesDescription")
         from pydicom.charset import convert_encodings, decode_bytes
 
         try:
