@@ -34,8 +34,8 @@ def hash_uid(uid: str) -> str | None:
     return hashlib.sha256(uid.encode("utf-8", "replace")).hexdigest()[:16]
 
 
-def join_names(names: Iterable[str]) -> str:
-    """Names for a message, the first few and then a count."""
+def join_names(names: Iterable[object]) -> str:
+    """Names for a message, the first few and then a count; only those that are shown are made into text."""
     names = list(names)
-    shown = ", ".join(names[:NAMES_SHOWN])
+    shown = ", ".join(map(str, names[:NAMES_SHOWN]))
     return shown if len(names) <= NAMES_SHOWN else f"{shown} and {len(names) - NAMES_SHOWN} more"
