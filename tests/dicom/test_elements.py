@@ -136,6 +136,8 @@ VALUES = st.binary(max_size=12).map(lambda value: value + bytes(len(value) % 2))
 @st.composite
 def element_bytes(draw: st.DrawFn, implicit: bool, depth: int = 3) -> bytes:
     tag, vr = draw(TAGS), draw(VRS)
+    if draw(st.integers(0, 15)) == 0:
+        return struct.pack("<HHL", 0xFFFE, draw(st.sampled_from([0xE000, 0xE00D, 0xE0DD])), 0)
     if depth == 0 or draw(st.integers(0, 2)):
         wrong = draw(st.sampled_from([None] * 12 + [0, 2, 0xFFFFFFFF]))
         return encode(tag, vr, draw(VALUES), implicit, wrong)
@@ -148,7 +150,7 @@ def element_bytes(draw: st.DrawFn, implicit: bool, depth: int = 3) -> bytes:
         else:
             off = draw(st.sampled_from([0] * 10 + [-2, 2, 8]))
             items += struct.pack("<HHL", 0xFFFE, 0xE000, max(len(content) + off, 0)) + content
-    tag = draw(st.sampled_from([(0x0008, 0x1110), (0x0040, 0x0275), (0x0009, 0x1010), tag]))
+    tag = draw(st.sampled_from([(0x0008, 0x1110), (0x0040, 0x0275), (0x0009, 0x1010), (0x6000, 0x3000), tag]))
     vr = draw(st.sampled_from([b"SQ", b"SQ", b"SQ", vr]))
     if draw(st.booleans()):
         return encode(tag, vr, items, implicit)
@@ -157,7 +159,7 @@ def element_bytes(draw: st.DrawFn, implicit: bool, depth: int = 3) -> bytes:
 
 
 @pytest.mark.fuzz
-@settings(max_examples=400, deadline=None)
+@settings(max_examples=500, deadline=None)
 @given(data=st.data(), implicit=st.booleans())
 def test_built_headers_give_the_same_or_nothing(data: st.DataObject, implicit: bool) -> None:
     syntax = b"1.2.840.10008.1.2\0" if implicit else b"1.2.840.10008.1.2.1\0"
