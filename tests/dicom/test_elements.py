@@ -125,6 +125,14 @@ def encode(tag: tuple[int, int], vr: bytes, value: bytes, implicit: bool, length
     return struct.pack("<HH2sHL", *tag, vr, 0, length) + value
 
 
+def wrap(body: bytes, implicit: bool) -> bytes:
+    """A whole file around the elements of `body`."""
+    syntax = b"1.2.840.10008.1.2\0" if implicit else b"1.2.840.10008.1.2.1\0"
+    meta = encode((2, 0x0002), b"UI", b"1.2.840.10008.5.1.4.1.1.2\0", False)
+    meta += encode((2, 0x0010), b"UI", syntax, False)
+    return bytes(128) + b"DICM" + meta + body + encode((0x7FE0, 0x0010), b"OW", bytes(8), implicit)
+
+
 TAGS = st.sampled_from(
     [(tag >> 16, tag & 0xFFFF) for tag in (*WANTED_TAGS, 0x00081110, 0x00081140, 0x00400275, 0x00080016)]
     + [(0x0009, 0x0010), (0x0029, 0x1010), (0x7FE1, 0x0010), (0x7FE0, 0x0001), (0x6000, 0x3000), (0x0008, 0x9999)]
@@ -159,16 +167,65 @@ def element_bytes(draw: st.DrawFn, implicit: bool, depth: int = 3) -> bytes:
 
 
 @pytest.mark.fuzz
-@settings(max_examples=500, deadline=None)
+@settings(max_examples=300, deadline=None)
 @given(data=st.data(), implicit=st.booleans())
 def test_built_headers_give_the_same_or_nothing(data: st.DataObject, implicit: bool) -> None:
-    syntax = b"1.2.840.10008.1.2\0" if implicit else b"1.2.840.10008.1.2.1\0"
-    meta = encode((2, 0x0002), b"UI", b"1.2.840.10008.5.1.4.1.1.2\0", False)
-    meta += encode((2, 0x0010), b"UI", syntax, False)
-    body = b"".join(data.draw(st.lists(element_bytes(implicit), max_size=6)))
-    pixels = encode((0x7FE0, 0x0010), b"OW", bytes(8), implicit)
-    whole = bytes(128) + b"DICM" + meta + body + pixels
+    whole = wrap(b"".join(data.draw(st.lists(element_bytes(implicit), max_size=6))), implicit)
     check_alike(whole, len(whole))
+
+
+def item(content: bytes, defined: bool = True) -> bytes:
+    if defined:
+        return struct.pack("<HHL", 0xFFFE, 0xE000, len(content)) + content
+    return struct.pack("<HHL", 0xFFFE, 0xE000, 0xFFFFFFFF) + content + struct.pack("<HHL", 0xFFFE, 0xE00D, 0)
+
+
+def nest(levels: int, implicit: bool = False) -> bytes:
+    content = b""
+    for _ in range(levels):
+        content = encode((0x0008, 0x1110), b"SQ", item(content, False) + SEQUENCE_END, implicit, 0xFFFFFFFF)
+    return content
+
+
+SEQUENCE_END = struct.pack("<HHL", 0xFFFE, 0xE0DD, 0)
+ITEM_END = struct.pack("<HHL", 0xFFFE, 0xE00D, 0)
+NAME = encode((0x0008, 0x0060), b"CS", b"CT", True)
+NESTED_CHARSET = encode((0x0008, 0x0005), b"CS", b"x\0y ", False)
+
+
+def sequence(items: bytes, implicit: bool, tag: tuple[int, int] = (0x0008, 0x1110)) -> bytes:
+    return encode(tag, b"SQ", items + SEQUENCE_END, implicit, 0xFFFFFFFF)
+
+
+DOUBTFUL = {
+    "a character set inside, which pydicom refuses": (False, sequence(item(NESTED_CHARSET), False)),
+    "an item that ends before its length": (True, sequence(item(ITEM_END + NAME), True)),
+    "an element over the end of its item": (True, sequence(item(NAME)[:-2] + NAME[8:] + b"..", True)),
+    "no item in a sequence": (True, sequence(NAME, True)),
+    "a delimiter between elements": (True, ITEM_END),
+    "nested deeper than anybody writes": (False, nest(plain.DEEPEST + 1)),
+    "bytes of undefined length": (
+        False,
+        encode((0x0009, 0x1010), b"OB", item(b"1234") + SEQUENCE_END, False, 0xFFFFFFFF),
+    ),
+    "an unknown element of undefined length": (True, sequence(item(NAME), True, (0x6000, 0x3000))),
+    "an unknown representation": (False, encode((0x0009, 0x1010), b"ZZ", b"1234", False)),
+    "a character set that pydicom looks up": (False, NESTED_CHARSET),
+    "explicit under implicit": (True, encode((0x0008, 0x0060), b"CS", b"CT", False)),
+    "implicit under explicit": (False, NAME),
+}
+
+
+@pytest.mark.parametrize("case", DOUBTFUL)
+def test_what_is_in_doubt_is_left_open(case: str) -> None:
+    implicit, doubtful = DOUBTFUL[case]
+    assert plain.parse_plainly(wrap(b"", implicit), 500, WANTED_TAGS) is not None
+    assert plain.parse_plainly(wrap(doubtful, implicit), 500, WANTED_TAGS) is None
+
+
+def test_as_deep_as_the_plain_parser_goes() -> None:
+    assert check_alike(wrap(nest(plain.DEEPEST), False), 5000)
+    assert check_alike(wrap(nest(plain.DEEPEST, implicit=True), True), 5000)
 
 
 @pytest.mark.parametrize("syntax", [plain.IMPLICIT_LITTLE, "1.2.840.10008.1.2.1"])
