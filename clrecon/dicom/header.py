@@ -84,7 +84,7 @@ class OtherImage:
     problem: str
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False, repr=False)  # both would be written at every start of the program
 class SliceHeader:
     """Everything that is known of one CT slice before its pixels are read. All values are validated.
 
