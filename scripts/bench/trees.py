@@ -25,7 +25,7 @@ def _make_template() -> bytes:
     ds.SOPInstanceUID = f"{root}.{_SERIES}.{_SLICE}"
     ds.ImageType = ["ORIGINAL", "PRIMARY", "AXIAL"]
     ds.StudyDate = ds.SeriesDate = ds.AcquisitionDate = ds.ContentDate = "20200101"
-    ds.AcquisitionTime, ds.ContentTime = f"{_SLICE}", f"{_SLICE}"
+    ds.AcquisitionTime = ds.ContentTime = "120000"
     ds.Modality, ds.Manufacturer, ds.SeriesDescription = "CT", "clrecon", f"series {_SERIES}"
     ds.PatientID, ds.PatientName = f"{_SERIES}", "Nobody"
     ds.KVP, ds.SliceThickness, ds.ConvolutionKernel = "120", "2", "B30f"
@@ -52,7 +52,7 @@ def write_tree(folder: Path, series: int, slices: int) -> int:
         place = folder / f"{number // 100:04d}" / f"{number:08d}"
         place.mkdir(parents=True)
         for k in range(slices):
-            # The digits stand for a UID, a time, a number and a position in mm: only positions may have a point.
+            # The digits stand for UIDs, a number and positions in mm.
             data = own.replace(b"%d" % _SLICE, b"%08d" % (10_000_000 + k))
             data = data.replace(b"-100\\-100\\%08d" % (10_000_000 + k), b"-100\\-100\\%08.2f" % (k * GAP_MM))
             (place / f"{k:05d}").write_bytes(data)

@@ -65,17 +65,18 @@ def scan_tree(folder: str) -> dict[str, Any]:
     group_series(scan_path(small))
     forget_peak()
     before = resident_bytes("VmRSS")
-    start = time.perf_counter()
+    start, processor = time.perf_counter(), time.process_time()
     scan = scan_path(Path(folder))
     scanned = time.perf_counter()
     series = group_series(scan)
-    grouped = time.perf_counter()
+    grouped, processor = time.perf_counter(), time.process_time() - processor
     peak = resident_bytes("VmHWM")
     return {
         "files": scan.files,
         "slices": len(scan.slices),
         "series": len(series),
         "seconds": grouped - start,
+        "processor": processor,
         "scan": scanned - start,
         "group": grouped - scanned,
         "bytes": None if before is None or peak is None else peak - before,
