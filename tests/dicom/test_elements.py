@@ -17,12 +17,12 @@ from dicom_series import Plan, make_dataset, save_dataset, write_series
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydicom.datadict import DicomDictionary
-from pydicom.uid import DeflatedExplicitVRLittleEndian, ExplicitVRBigEndian, ImplicitVRLittleEndian
+from pydicom.uid import UID, DeflatedExplicitVRLittleEndian, ExplicitVRBigEndian, ImplicitVRLittleEndian
 from pydicom.valuerep import EXPLICIT_VR_LENGTH_16, EXPLICIT_VR_LENGTH_32
 
 from clrecon.dicom import elements, list_series, plain, read_volume
 from clrecon.dicom.careful import parse_carefully
-from clrecon.dicom.raw import CorruptFileError
+from clrecon.dicom.raw import PLAIN_SYNTAXES, CorruptFileError
 from clrecon.dicom.values import WANTED_TAGS
 
 CORPUS = Path(pydicom.__file__).parent / "data" / "test_files"
@@ -69,6 +69,7 @@ def test_the_tables_are_those_of_pydicom() -> None:
     assert {DicomDictionary[tag][0] for tag in plain.SEQUENCE_TAGS} == {"SQ"}
     assert not any(tag >> 16 & 1 for tag in DicomDictionary)  # private elements are known by their items alone
     assert plain.CHARACTER_SET in WANTED_TAGS
+    assert all(UID(uid).name == name for uid, name in PLAIN_SYNTAXES.items())
 
 
 def test_files_of_pydicom_give_the_same() -> None:
@@ -273,14 +274,18 @@ def test_headers_longer_than_what_is_read_first(tmp_path: Path, large: int) -> N
         (DeflatedExplicitVRLittleEndian, True),
     ],
 )
-def test_pydicom_is_loaded_only_where_it_is_needed(tmp_path: Path, syntax: str, careful: bool) -> None:
+def test_what_takes_long_to_load_is_loaded_only_where_it_is_needed(tmp_path: Path, syntax: str, careful: bool) -> None:
     write_series(tmp_path, Plan(syntax=syntax))
-    code = "import sys, clrecon; clrecon.read_volume(sys.argv[1]); print('pydicom' in sys.modules)"
+    code = "import sys, clrecon; clrecon.read_volume(sys.argv[1]); print([n in sys.modules for n in sys.argv[2:]])"
     environment = {**os.environ, "PYTHONPATH": str(Path(elements.__file__).parents[2])}
     done = subprocess.run(
-        [sys.executable, "-c", code, str(tmp_path)], capture_output=True, text=True, env=environment, check=True
+        [sys.executable, "-c", code, str(tmp_path), "pydicom", "numpy.ma", "clrecon.geometry.iso_choice"],
+        capture_output=True,
+        text=True,
+        env=environment,
+        check=True,
     )
-    assert done.stdout.strip() == str(careful)
+    assert done.stdout.strip() == str([careful, False, False])
 
 
 @pytest.mark.parametrize(
