@@ -23,6 +23,7 @@ from clrecon.dicom.layout import (
 )
 from clrecon.dicom.phases import choose_phase
 from clrecon.dicom.pixels import PixelFacts
+from clrecon.dicom.raw import PLAIN_SYNTAXES
 from clrecon.dicom.scan import Scan
 from clrecon.dicom.series import Series
 from clrecon.dicom.text import escape_text, hash_uid
@@ -187,6 +188,8 @@ def _certify_places(stack: Stack, affine: NDArray[np.float64] | None) -> dict[st
 
 def name_syntax(uid: str) -> str:
     """Name of a transfer syntax, its UID where it has none."""
+    if uid in PLAIN_SYNTAXES:
+        return PLAIN_SYNTAXES[uid]  # what most series have: pydicom is not loaded for a name
     from pydicom.uid import UID
 
     return escape_text(UID(uid).name)

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.dicom.header import SliceHeader
+from clrecon.dicom.numbers import median
 from clrecon.dicom.text import join_names
 from clrecon.geometry import compose_affine, tilt_degrees
 
@@ -164,7 +165,7 @@ def measure_stack(headers: Sequence[SliceHeader], allow_gaps: bool = False) -> S
 def measure_line(positions: Float64Array, distances: Float64Array) -> Line:
     """Fit evenly spaced places to sorted positions (n, 3), n >= 2, and measure gaps and residuals."""
     gaps = np.diff(distances)
-    usual = float(np.median(gaps))
+    usual = median(gaps)
     step, origin = fit_line(positions)
     residuals = np.linalg.norm(positions - (origin + np.arange(len(positions))[:, None] * step), axis=1)
     tolerance = max(POSITION_TOLERANCE_MM, POSITION_TOLERANCE_GAPS * usual)
@@ -232,7 +233,7 @@ def find_mixed_values(headers: Sequence[SliceHeader]) -> list[str]:
         usual = patients.most_common(1)[0][0]
         odd = [header for header in headers if header.patient_hash not in (usual, None)]
         found.append(f"PatientID differs within the series: another in {join_names(h.name for h in odd)}")
-    di, dj = np.median([header.di_mm for header in headers]), np.median([header.dj_mm for header in headers])
+    di, dj = median([header.di_mm for header in headers]), median([header.dj_mm for header in headers])
     allowed = PIXEL_SPACING_TOLERANCE * min(di, dj)
     odd = [header for header in headers if max(abs(header.di_mm - di), abs(header.dj_mm - dj)) > allowed]
     if odd:
@@ -332,7 +333,7 @@ def find_holes(distances: Float64Array) -> Holes:
     gaps = np.diff(distances)
     if len(gaps) < 2:
         return Holes()
-    usual = float(np.median(gaps))
+    usual = median(gaps)
     if usual <= 0.0:
         return Holes()  # only where the directions are no directions
     wide = [k for k in np.flatnonzero(gaps > MISSING_RATIO * usual).tolist() if not _is_in_run(gaps, k)]
@@ -366,7 +367,7 @@ def count_missing(distances: Float64Array) -> int:
     gaps = gaps[gaps >= DUPLICATE_MM]
     if len(gaps) < 2:
         return 0
-    usual = float(np.median(gaps))
+    usual = median(gaps)
     holes = [gaps[k] for k in np.flatnonzero(gaps > MISSING_RATIO * usual).tolist() if not _is_in_run(gaps, k)]
     return sum(max(round(gap / usual) - 1, 1) for gap in holes)
 

@@ -8,11 +8,12 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 
 from clrecon.dicom.codecs import describe_undecodable, is_encapsulated
 from clrecon.dicom.concatenation import Concatenation
-from clrecon.dicom.elements import CorruptFileError, DicomElements, read_elements
+from clrecon.dicom.elements import CorruptFileError, DicomElements, FileStart, read_elements
 from clrecon.dicom.multiframe import ENHANCED_CT, FRAME_PHASES, read_groups, split_frames
 from clrecon.dicom.text import escape_text, hash_uid
 from clrecon.dicom.values import WANTED_TAGS, ValueProblem, Values
@@ -53,7 +54,7 @@ RESCALE_SLOPE = (1e-6, 1e6)
 RESCALE_INTERCEPT_LIMIT = 1e9
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class SeriesIdentity:
     """What a file says of its series: UID, number (None where missing), description, modality, UID of the study."""
 
@@ -64,7 +65,7 @@ class SeriesIdentity:
     study: str = ""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class OtherImage:
     """A DICOM object that cannot be a slice, and why.
 
@@ -86,7 +87,7 @@ class OtherImage:
     problem: str
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True, eq=False, repr=False)  # both would be written at every start of the program
 class SliceHeader:
     """Everything that is known of one CT slice before its pixels are read. All values are validated.
 
@@ -177,8 +178,25 @@ class SliceHeader:
         return self.rows * self.columns * self.bits_allocated // 8
 
 
-def read_headers(path: Path) -> list[SliceHeader] | OtherImage | None:
+# The slices of a series share what they have in common: a tree of 100,000 files stays small in memory.
+_share_identity = lru_cache(1024)(SeriesIdentity)
+
+
+@lru_cache(256)
+def _share_halves(
+    orientation: tuple[float, ...],
+) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
+    return orientation[:3], orientation[3:]  # type: ignore[return-value]
+
+
+def read_headers(path: Path, start: FileStart | None = None) -> list[SliceHeader] | OtherImage | None:
     """Read and validate the header of one file.
+
+    Parameters
+    ----------
+    path : Path
+    start : FileStart, optional
+        See `read_elements`.
 
     Returns
     -------
@@ -190,7 +208,7 @@ def read_headers(path: Path) -> list[SliceHeader] | OtherImage | None:
     NotDicomError, CorruptFileError, OSError
         As `read_elements`; also corrupt is a CT image that ends before its pixel data.
     """
-    elements = read_elements(path, WANTED_TAGS)
+    elements = read_elements(path, WANTED_TAGS, start)
     if elements.media_class == DICOMDIR_CLASS:
         return None
     values = Values(elements)
@@ -198,7 +216,7 @@ def read_headers(path: Path) -> list[SliceHeader] | OtherImage | None:
     sop_class = values.word("SOPClassUID") or elements.media_class
     known_class = "CT" if sop_class in (CT_IMAGE_STORAGE, *ENHANCED_CT) else "unknown"
     modality = values.word("Modality").strip().upper() or known_class
-    series = SeriesIdentity(
+    series = _share_identity(
         values.word("SeriesInstanceUID"),
         values.whole_or_none("SeriesNumber"),
         values.description(),
@@ -302,6 +320,7 @@ def _validate(values: Values, series: SeriesIdentity, path: Path, name: str, *, 
     if derived:
         warnings.append(f"derived images (ImageType has DERIVED and {' '.join(derived)}): maybe not measured HU")
 
+    row_cosines, column_cosines = _share_halves(orientation)
     header = SliceHeader(
         series=series,
         file=path,
@@ -309,7 +328,7 @@ def _validate(values: Values, series: SeriesIdentity, path: Path, name: str, *, 
         frame=0,
         frames=frames,
         concatenation=None,
-        phase=tuple((keyword, values.word(keyword)) for keyword in SLICE_PHASES if keyword in values),
+        phase=values.pairs(SLICE_PHASES),
         localizer="LOCALIZER" in image_type,
         patient_hash=hash_uid(values.text("PatientID").strip()),
         frame_of_reference=values.word("FrameOfReferenceUID"),
@@ -322,8 +341,8 @@ def _validate(values: Values, series: SeriesIdentity, path: Path, name: str, *, 
         high_bit=high_bit,
         signed=signed,
         photometric=photometric,
-        row_cosines=orientation[:3],  # type: ignore[arg-type]
-        column_cosines=orientation[3:],  # type: ignore[arg-type]
+        row_cosines=row_cosines,
+        column_cosines=column_cosines,
         position_mm=position,  # type: ignore[arg-type]
         di_mm=di,
         dj_mm=dj,

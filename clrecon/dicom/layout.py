@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from clrecon.dicom.gate import POSITION_TOLERANCE_GAPS, POSITION_TOLERANCE_MM, Stack
 from clrecon.dicom.header import SliceHeader
+from clrecon.dicom.numbers import median
 from clrecon.geometry import is_left_handed, slice_normal
 
 __all__ = [
@@ -127,11 +128,11 @@ def describe_thickness(headers: Sequence[SliceHeader], distances: Float64Array) 
         return None
     gaps = np.diff(distances)
     overlap = (thickness[1:] + thickness[:-1]) / 2.0 - gaps
-    middle, usual = float(np.median(overlap)), float(np.median(gaps))
+    middle, usual = median(overlap), median(gaps)
     return {
         "min_mm": float(thickness.min()),
         "max_mm": float(thickness.max()),
-        "median_mm": float(np.median(thickness)),
+        "median_mm": median(thickness),
         "overlap_mm": {"min": float(overlap.min()), "max": float(overlap.max()), "median": middle},
         "overlap_percent": 100.0 * middle / usual if usual > 0.0 else None,
     }

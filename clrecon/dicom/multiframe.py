@@ -17,11 +17,11 @@ import re
 import struct
 import zlib
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 from clrecon.dicom.concatenation import CONCATENATION_TAGS, Concatenation, read_concatenation
-from clrecon.dicom.elements import IMPLICIT_LITTLE, META_START, DicomElements
+from clrecon.dicom.raw import IMPLICIT_LITTLE, META_START, DicomElements
 from clrecon.dicom.sequences import Item, Schema, decode_number, name_tag, read_sequences
 from clrecon.dicom.text import escape_text
 from clrecon.dicom.values import ValueProblem, Values
@@ -222,7 +222,7 @@ def split_frames(elements: DicomElements, groups: Groups) -> Iterator[Frame]:
     top_values = {tag: value for tag, value in elements.values.items() if tag not in GEOMETRY}
     top_vrs = {tag: vr for tag, vr in elements.vrs.items() if tag not in GEOMETRY}
     for item in groups.frames:
-        frame = replace(elements, values=dict(top_values), vrs=dict(top_vrs))
+        frame = elements._replace(values=dict(top_values), vrs=dict(top_vrs))
         warnings: list[str] = []
         try:
             macros = _merge_macros(groups.shared, item)

@@ -45,7 +45,8 @@ def read_volume(
     allow_gaps : bool
         Read a stack with missing slices: what is there is placed exactly, with a warning.
     progress : callable, optional
-        Called as ``progress(stage, done, total)`` with stage "scan" or "read".
+        Called as ``progress(stage, done, total)`` with stage "scan" or "read", or "no answer yet from NAME" where the
+        disk hangs.
 
     Returns
     -------

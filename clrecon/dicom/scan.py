@@ -10,21 +10,20 @@ from __future__ import annotations
 
 import os
 from collections import Counter
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from clrecon.dicom.containers import describe_container
-from clrecon.dicom.elements import META_START, CorruptFileError, NotDicomError
+from clrecon.dicom.disk import DiskReader, Progress
+from clrecon.dicom.elements import META_START, CorruptFileError, FileStart, has_dicom_mark
 from clrecon.dicom.header import OtherImage, SliceHeader, read_headers
 from clrecon.dicom.text import escape_text
 from clrecon.errors import NoDicomError
 
 __all__ = ["CorruptFile", "Progress", "Scan", "scan_path"]
 
-Progress = Callable[[str, int, int], None]
-
 DICOM_SUFFIXES = (".dcm", ".dic", ".dicom", ".ima")
+PROGRESS_STEPS = 1000
 BLANK_START = bytes(128) + b"DICM"
 APPLE_DOUBLE = b"\x00\x05\x16\x07"
 """Start of the "._NAME" files that macOS puts beside the files of a foreign disk."""
@@ -77,37 +76,46 @@ def scan_path(path: Path, progress: Progress | None = None) -> Scan:
     path : Path
         A folder, searched with its subfolders, or one file.
     progress : callable, optional
-        Called as ``progress("scan", done, total)``.
+        Called as ``progress("scan", done, total)``, about `PROGRESS_STEPS` times in all, and as
+        ``progress("no answer yet from NAME", done, total)`` where the disk hangs.
 
     Raises
     ------
     NoDicomError
         `path` does not exist, cannot be read, or is neither a folder nor a regular file.
+    RefusedInputError
+        The disk or network drive does not answer.
     """
     scan = Scan()
-    files = _list_files(path, scan)
-    scan.files = len(files)
-    for done, file in enumerate(files, start=1):
-        _take_file(file, scan)
-        if progress is not None:
-            progress("scan", done, len(files))
+    with DiskReader(progress) as disk:
+        files = disk.run(lambda: _list_files(path, scan, disk))
+        total = scan.files = len(files)
+        step = max(1, total // PROGRESS_STEPS)
+        for done, (file, start) in enumerate(zip(files, disk.read_starts(files), strict=True), start=1):
+            _take_file(file, start, scan)
+            if progress is not None and (done % step == 0 or done == total):
+                progress("scan", done, total)
     return scan
 
 
-def _take_file(file: Path, scan: Scan) -> None:
-    try:
-        headers = read_headers(file)
-    except NotDicomError as error:
-        scan.skipped[describe_container(error.start) or "not DICOM"] += 1
-        reason = _suspect(file, error.start)
+def _take_file(file: str, start: FileStart | OSError, scan: Scan) -> None:
+    if isinstance(start, FileStart) and not has_dicom_mark(start.prefix):
+        scan.skipped[describe_container(start.prefix) or "not DICOM"] += 1
+        reason = _suspect(file, start.prefix)
         if reason:
-            scan.suspects.append(CorruptFile(file, reason))
+            scan.suspects.append(CorruptFile(Path(file), reason))
+        return
+    try:
+        if isinstance(start, OSError):
+            raise start
+        headers = read_headers(Path(file), start)
     except CorruptFileError as error:
         scan.skipped["corrupt"] += 1
-        scan.corrupt.append(CorruptFile(file, str(error)))
-    except OSError:
+        scan.corrupt.append(CorruptFile(Path(file), str(error)))
+    except OSError as error:
         scan.skipped["not readable"] += 1
-        scan.corrupt.append(CorruptFile(file, "not readable"))
+        why = f": {error.strerror}" if error.strerror else ""
+        scan.corrupt.append(CorruptFile(Path(file), f"not readable{why}"))
     else:
         if headers is None:
             scan.skipped["DICOMDIR"] += 1
@@ -117,20 +125,22 @@ def _take_file(file: Path, scan: Scan) -> None:
             scan.slices.extend(headers)
 
 
-def _suspect(file: Path, start: bytes) -> str:
+def _suspect(file: str, start: bytes) -> str:
     """Say why a file without the mark of DICOM may be what is left of an image; empty where nothing says so."""
-    if file.name.startswith("._") and start.startswith(APPLE_DOUBLE):
+    name = os.path.basename(file)
+    if name.startswith("._") and start.startswith(APPLE_DOUBLE):
         return ""
     if 0 < len(start) < META_START and BLANK_START.startswith(start):
         return "cut within the preamble"
-    return "named like DICOM but is none" if file.suffix.lower() in DICOM_SUFFIXES else ""
+    return "named like DICOM but is none" if os.path.splitext(name)[1].lower() in DICOM_SUFFIXES else ""
 
 
-def _list_files(path: Path, scan: Scan) -> list[Path]:
+def _list_files(path: Path, scan: Scan, disk: DiskReader) -> list[str]:
     """List the regular files at `path`, sorted, and count what was passed over."""
+    disk.touched = str(path)
     try:
         if path.is_file():
-            return [path]
+            return [str(path)]
         if not path.is_dir():
             what = "is neither a folder nor a regular file" if os.path.lexists(path) else "does not exist"
             raise NoDicomError(f"{escape_text(str(path), 256)} {what}")
@@ -144,7 +154,7 @@ def _list_files(path: Path, scan: Scan) -> list[Path]:
     files: list[str] = []
     folders = [str(path)]
     while folders:
-        folder = folders.pop()
+        disk.touched = folder = folders.pop()
         try:
             with os.scandir(folder) as entries:
                 for entry in entries:
@@ -152,7 +162,8 @@ def _list_files(path: Path, scan: Scan) -> list[Path]:
         except OSError:
             scan.skipped["folder not readable"] += 1
             scan.corrupt.append(CorruptFile(Path(folder), "folder not readable"))
-    return [Path(file) for file in sorted(files)]
+    files.sort()
+    return files
 
 
 def _sort_entry(

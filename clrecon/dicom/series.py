@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property, partial
 from pathlib import Path
@@ -151,7 +151,7 @@ class Series:
         if self.corrupt:
             problems.append(
                 "files or folders that are cut, corrupt or not readable may belong to it (restore or remove them): "
-                + join_names(map(str, self.corrupt))
+                + join_names(self.corrupt)
             )
         if not texts:
             problems += self.lost
@@ -336,19 +336,32 @@ def _blame_corrupt_files(found: Sequence[Series], scan: Scan) -> None:
         images: list[SliceHeader | OtherImage] = [*series.headers, *series.others]
         for image in images:
             holders[image.file.parent].add(_group_key(image))
+    folders: dict[str, list[Path]] = defaultdict(list)  # and the other way round
+    for folder, keys in holders.items():
+        for key in keys:
+            folders[key].append(folder)
+    # Every file is looked at once and lists are shared: 10,000 series may stand beside as many bad files.
+    corrupt, loose_corrupt = _sort_by_holder(scan.corrupt, holders)
+    suspects, loose_suspects = _sort_by_holder(scan.suspects, holders)
     for series in found:
-        if series.kind != "stack":
-            continue
-        own = _group_key((series.headers or series.others)[0])
-        spread = sum(own in keys for keys in holders.values()) > 1
-        for corrupt in scan.corrupt:
-            keys = holders.get(corrupt.file.parent)
-            if keys is None or own in keys:
-                series.corrupt.append(corrupt)
-        for suspect in scan.suspects:
-            keys = holders.get(suspect.file.parent)
-            if own in keys if keys is not None else spread:
-                series.corrupt.append(suspect)
+        if series.kind == "stack":
+            own = folders[_group_key((series.headers or series.others)[0])]
+            spread = len(own) > 1
+            near = [files[folder] for files in (corrupt, suspects) for folder in own if folder in files]
+            blamed = [part for part in (*near, loose_corrupt, loose_suspects if spread else []) if part]
+            series.corrupt = blamed[0] if len(blamed) == 1 else [file for part in blamed for file in part]
+
+
+def _sort_by_holder(
+    files: Sequence[CorruptFile], holders: Mapping[Path, object]
+) -> tuple[dict[Path, list[CorruptFile]], list[CorruptFile]]:
+    """Part files by the folders that hold slices; the second are those in no such folder."""
+    held: dict[Path, list[CorruptFile]] = defaultdict(list)
+    loose: list[CorruptFile] = []
+    for file in files:
+        folder = file.file.parent
+        (held[folder] if folder in holders else loose).append(file)
+    return held, loose
 
 
 def _group_key(image: SliceHeader | OtherImage) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterable
+from functools import lru_cache
 
 __all__ = ["escape_text", "hash_uid", "join_names"]
 
@@ -16,10 +17,13 @@ def escape_text(text: str, limit: int = TEXT_LIMIT) -> str:
 
     Control characters, line breaks, terminal escapes and direction marks come out as ``\\xNN`` or ``\\uNNNN``.
     """
+    if text.isprintable() and len(text) <= limit:
+        return text
     safe = "".join(c if c.isprintable() else c.encode("unicode_escape", "replace").decode("ascii") for c in text)
     return safe if len(safe) <= limit else safe[: limit - 3] + "..."
 
 
+@lru_cache(1024)
 def hash_uid(uid: str) -> str | None:
     """First 16 hexadecimal digits of the SHA-256 of a UID: names a series without giving its identifier away.
 
@@ -30,8 +34,8 @@ def hash_uid(uid: str) -> str | None:
     return hashlib.sha256(uid.encode("utf-8", "replace")).hexdigest()[:16]
 
 
-def join_names(names: Iterable[str]) -> str:
-    """Names for a message, the first few and then a count."""
+def join_names(names: Iterable[object]) -> str:
+    """Names for a message, the first few and then a count; only those that are shown are made into text."""
     names = list(names)
-    shown = ", ".join(names[:NAMES_SHOWN])
+    shown = ", ".join(map(str, names[:NAMES_SHOWN]))
     return shown if len(names) <= NAMES_SHOWN else f"{shown} and {len(names) - NAMES_SHOWN} more"

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 import re
 import struct
+from functools import lru_cache
 from typing import Literal
 
 from clrecon.dicom.elements import DicomElements
@@ -67,6 +68,38 @@ WANTED_TAGS = tuple(_TAGS.values())
 _DECIMAL = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
 
 
+# The slices of a series repeat most values byte for byte: what is known is neither checked nor stored again.
+_KNOWN_VALUES = 2048
+_KNOWN_BYTES = 128  # longer values are decoded each time: what is kept must stay small
+
+
+def _decode_text(raw: bytes) -> str:
+    return raw.decode("latin-1").strip(" \0")
+
+
+def _decode_decimals(raw: bytes) -> tuple[float, ...]:
+    """Finite numbers with a decimal point, separated by backslashes; empty where one of them is none."""
+    parts = [part.strip(" \0") for part in raw.decode("latin-1").split("\\")]
+    if not all(map(_DECIMAL.fullmatch, parts)):
+        return ()
+    numbers = tuple(map(float, parts))
+    return numbers if all(map(math.isfinite, numbers)) else ()
+
+
+_known_text = lru_cache(_KNOWN_VALUES)(_decode_text)
+_known_decimals = lru_cache(_KNOWN_VALUES)(_decode_decimals)
+
+
+@lru_cache(_KNOWN_VALUES)
+def _known_word(raw: bytes) -> str:
+    return escape_text(_decode_text(raw))
+
+
+@lru_cache(_KNOWN_VALUES)
+def _share_pairs(*pairs: tuple[str, str]) -> tuple[tuple[str, str], ...]:
+    return pairs
+
+
 class ValueProblem(RefusedInputError):
     """One value of a header is missing or wrong."""
 
@@ -79,7 +112,7 @@ class Values:
         self.byte_order: Literal["little", "big"] = "little" if elements.little_endian else "big"
 
     def __contains__(self, keyword: str) -> bool:
-        return bool(self.elements.values.get(_TAGS[keyword], b"").strip(b" \0"))
+        return self.text(keyword) != ""
 
     def wrong(self, keyword: str, expected: str) -> ValueProblem:
         tag = _TAGS[keyword]
@@ -94,19 +127,27 @@ class Values:
         return ValueProblem(f"{place} is {shown}, expected {expected}")
 
     def text(self, keyword: str) -> str:
-        return self.elements.values.get(_TAGS[keyword], b"").decode("latin-1").strip(" \0")
+        raw = self.elements.values.get(_TAGS[keyword])
+        if raw is None:
+            return ""
+        return _known_text(raw) if len(raw) <= _KNOWN_BYTES else _decode_text(raw)
 
     def word(self, keyword: str) -> str:
-        return escape_text(self.text(keyword))
+        """The text as one safe line."""
+        raw = self.elements.values.get(_TAGS[keyword])
+        if raw is None:
+            return ""
+        return _known_word(raw) if len(raw) <= _KNOWN_BYTES else escape_text(_decode_text(raw))
+
+    def pairs(self, keywords: tuple[str, ...]) -> tuple[tuple[str, str], ...]:
+        """Keyword and value, as `word` gives it, of those that are there."""
+        return _share_pairs(*((keyword, word) for keyword in keywords if (word := self.word(keyword))))
 
     def decimals(self, keyword: str, count: int) -> tuple[float, ...]:
-        parts = [part.strip(" \0") for part in self.text(keyword).split("\\")]
-        expected = "a finite number" if count == 1 else f"{count} finite numbers"
-        if len(parts) != count or not all(_DECIMAL.fullmatch(part) for part in parts):
-            raise self.wrong(keyword, expected)
-        numbers = tuple(float(part) for part in parts)
-        if not all(math.isfinite(number) for number in numbers):
-            raise self.wrong(keyword, expected)
+        raw = self.elements.values.get(_TAGS[keyword], b"")
+        numbers = _known_decimals(raw) if len(raw) <= _KNOWN_BYTES else _decode_decimals(raw)
+        if len(numbers) != count:
+            raise self.wrong(keyword, "a finite number" if count == 1 else f"{count} finite numbers")
         return numbers
 
     def whole_or_none(self, keyword: str) -> int | None:
@@ -157,7 +198,7 @@ class Values:
         raw = self.elements.values.get(_TAGS["SeriesDescription"], b"").strip(b" \0")
         charset = self.text("SpecificCharacterSet")
         if raw.isascii() and b"\x1b" not in raw or not charset:
-            return escape_text(raw.decode("latin-1"))
+            return self.word("SeriesDescription")
         from pydicom.charset import convert_encodings, decode_bytes
 
         try:

@@ -19,6 +19,7 @@ from clrecon.dicom.gate import (
 )
 from clrecon.dicom.header import SliceHeader
 from clrecon.dicom.layout import measure_orientation
+from clrecon.dicom.numbers import median
 from clrecon.dicom.pixels import PixelFacts
 from clrecon.dicom.series import Series
 from clrecon.errors import RefusedInputError
@@ -102,7 +103,7 @@ def _judge_stated_gap(stack: Stack) -> Gate:
     if stated is None or not usual:
         return unmeasured("stated_gap", bound, "%", f"{what}: it is not stated")
     steps = np.diff(stack.positions_mm, axis=0)
-    along = float(np.median(np.linalg.norm(steps, axis=1)))
+    along = median(np.linalg.norm(steps, axis=1))
     off = min(abs(stated - length) / length for length in (usual, along or usual))
     return at_most("stated_gap", 100.0 * off, bound, "%", what)
 

@@ -1,5 +1,8 @@
 """Pure numpy: affines, patient frames and the `Volume` that carries them."""
 
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
 from clrecon.geometry.affine import (
     apply_affine,
     column_spacing,
@@ -11,8 +14,10 @@ from clrecon.geometry.affine import (
 )
 from clrecon.geometry.frames import SPACES, frame_from_lps, lps_affine_from_ras
 from clrecon.geometry.grid import Grid
-from clrecon.geometry.iso_choice import IsoChoice, choose_iso_value, half_iso_value
 from clrecon.geometry.volume import AIR_HU, Volume
+
+if TYPE_CHECKING:
+    from clrecon.geometry.iso_choice import IsoChoice, choose_iso_value, half_iso_value
 
 __all__ = [
     "AIR_HU",
@@ -32,3 +37,10 @@ __all__ = [
     "slice_normal",
     "tilt_degrees",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    """Load the choice of an iso value when it is asked for: reading a scan does not need it."""
+    if name not in ("IsoChoice", "choose_iso_value", "half_iso_value"):
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module("clrecon.geometry.iso_choice"), name)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from typing import Any
 
 import numpy as np
@@ -44,7 +45,8 @@ def _device_ready(voxels: NDArray[Any]) -> NDArray[Any]:
 
 
 def _as_array(voxels: ArrayLike) -> NDArray[Any]:
-    if isinstance(voxels, np.ma.MaskedArray) and np.ma.is_masked(voxels):
+    masked = sys.modules.get("numpy.ma")  # where it is not loaded, no array is masked; to load it takes 10 ms
+    if masked is not None and isinstance(voxels, masked.MaskedArray) and masked.is_masked(voxels):
         raise UsageError("masked voxels: fill them first, for CT with voxels.filled(clrecon.geometry.AIR_HU)")
     try:
         return np.asarray(voxels)

@@ -9,7 +9,7 @@ import pytest
 from dicom_series import Plan, make_dataset, save_dataset, set_values, write_series
 from pydicom.uid import MRImageStorage
 
-from clrecon.dicom import list_series, read_volume, scan
+from clrecon.dicom import disk, list_series, read_volume, scan
 from clrecon.errors import NoDicomError, RefusedInputError
 
 CORRUPT = bytes(128) + b"DICM" + b"\xff" * 50
@@ -30,19 +30,19 @@ def deny(monkeypatch):
     """Makes a file or folder one that the system does not let us read, for the superuser too."""
 
     def make_unreadable(path):
-        read_headers, scandir = scan.read_headers, os.scandir
+        read_start, scandir = disk.read_start, os.scandir
 
         def read_or_deny(file):
-            if file == path:
+            if file == str(path):
                 raise PermissionError(13, "Permission denied")
-            return read_headers(file)
+            return read_start(file)
 
         def scan_or_deny(folder):
             if os.fspath(folder) == str(path):
                 raise PermissionError(13, "Permission denied")
             return scandir(folder)
 
-        monkeypatch.setattr(scan, "read_headers", read_or_deny)
+        monkeypatch.setattr(disk, "read_start", read_or_deny)
         monkeypatch.setattr(scan.os, "scandir", scan_or_deny)
 
     return make_unreadable

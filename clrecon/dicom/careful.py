@@ -1,0 +1,131 @@
+"""The careful parser: pydicom's element generator over any file, however odd, with every way it can fail caught.
+
+The plain parser leaves to it whatever is not in plain order.  pydicom is imported at the first call: most series never
+need it.
+"""
+
+from __future__ import annotations
+
+import io
+import zlib
+from typing import BinaryIO
+
+from clrecon.dicom.raw import (
+    DEFLATED,
+    EXPLICIT_BIG,
+    FIRST_PIXEL_TAG,
+    IMPLICIT_LITTLE,
+    MEDIA_CLASS,
+    META_START,
+    TRANSFER_SYNTAX,
+    UNDEFINED_LENGTH,
+    CorruptFileError,
+    DicomElements,
+    decode_uid,
+    read_pixel_head,
+)
+
+__all__ = ["parse_carefully"]
+
+INFLATED_HEADER_LIMIT = 16 * 1024 * 1024
+
+
+def parse_carefully(file: BinaryIO, size: int, wanted: tuple[int, ...]) -> DicomElements:
+    """Parse a file, or the start of one.
+
+    Parameters
+    ----------
+    file : binary file
+        Begins with the preamble; seekable.
+    size : int
+        Bytes of the whole file.
+    wanted : tuple of int
+        Tags to keep.
+
+    Raises
+    ------
+    CorruptFileError
+    OSError
+    """
+    try:
+        return _parse_file(file, size, wanted)
+    except CorruptFileError:
+        raise
+    except RecursionError as error:
+        raise CorruptFileError("sequences are nested too deep") from error
+    except Exception as error:
+        if isinstance(error, OSError) and error.errno is not None:
+            raise  # of the disk; the parser's own, for a sequence that is cut, have no number
+        # The parser meets hostile bytes here and may fail in any way; all of them mean the same to us.
+        raise CorruptFileError(f"cannot be parsed ({type(error).__name__})") from error
+
+
+def _parse_file(file: BinaryIO, size: int, wanted: tuple[int, ...]) -> DicomElements:
+    file.seek(META_START)
+    meta, _ = _collect(file, implicit=False, little=True, last_group=2, wanted=())
+    transfer_syntax = decode_uid(meta.get(TRANSFER_SYNTAX))
+    media_class = decode_uid(meta.get(MEDIA_CLASS))
+    if not transfer_syntax:
+        raise CorruptFileError("no transfer syntax (0002,0010)")
+
+    start = file.tell()
+    inflate_from = -1
+    if transfer_syntax == DEFLATED:
+        inflate_from, start = start, 0
+        file = io.BytesIO(_inflate_header(file))
+    little = transfer_syntax != EXPLICIT_BIG
+    implicit = transfer_syntax == IMPLICIT_LITTLE
+    found = _looks_implicit(file, start)
+    differs = found is not None and found != implicit
+    implicit = implicit if found is None else found
+    values, vrs = _collect(file, implicit=implicit, little=little, last_group=None, wanted=wanted)
+    place = file.tell()
+    tag, offset, length, vr = read_pixel_head(file.read(12), place, implicit, little)
+    return DicomElements(
+        transfer_syntax, media_class, values, vrs, little, differs, tag, offset, length, vr, inflate_from, size
+    )
+
+
+def _collect(
+    file: BinaryIO, *, implicit: bool, little: bool, last_group: int | None, wanted: tuple[int, ...]
+) -> tuple[dict[int, bytes], dict[int, str | None]]:
+    """Read elements up to the end of `last_group`, or up to the pixel data; the file is left standing there."""
+    from pydicom.filereader import data_element_generator
+
+    def stop(tag: int, vr: str | None, length: int) -> bool:
+        return tag >> 16 != last_group if last_group is not None else int.__ge__(tag, FIRST_PIXEL_TAG)
+
+    values: dict[int, bytes] = {}
+    vrs: dict[int, str | None] = {}
+    for element in data_element_generator(
+        file,
+        implicit,
+        little,
+        stop_when=stop,
+        specific_tags=list(wanted),  # type: ignore[arg-type]
+    ):
+        value = element.value
+        if isinstance(value, bytes) and value:
+            if element.length not in (len(value), UNDEFINED_LENGTH):
+                raise CorruptFileError("ends within an element")
+            values[int(element.tag)] = value
+            vrs[int(element.tag)] = element.VR
+    return values, vrs
+
+
+def _looks_implicit(file: BinaryIO, start: int) -> bool | None:
+    """Tell the encoding from the first element: explicit VR has two capital letters there. None at the end."""
+    head = file.read(6)
+    file.seek(start)
+    if len(head) < 6:
+        return None
+    return not all(0x41 <= letter <= 0x5A for letter in head[4:6])
+
+
+def _inflate_header(file: BinaryIO) -> bytes:
+    """Inflate the start of a deflated data set: enough for its header, and never more than a fixed limit."""
+    inflater = zlib.decompressobj(-zlib.MAX_WBITS)
+    inflated = inflater.decompress(file.read(), INFLATED_HEADER_LIMIT)
+    if not inflated:
+        raise CorruptFileError("nothing in the deflated data set")
+    return inflated
