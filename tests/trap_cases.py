@@ -1,0 +1,412 @@
+"""The trap matrix: CT series that readers place wrongly, each with its truth in mm and what clrecon must do with it.
+
+Every corner voxel of every slice has an HU of its own (a mark), everything else is `BACKGROUND_HU`.  A reader is
+judged by where it puts the marks, so its order of axes and slices plays no part.  Marks of images that are not of the
+stack (a localizer, another phase) start at `FOREIGN_HU`.
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from dicom_series import ROOT, Change, Plan, make_dataset, rotation, save_dataset, set_raw, set_values
+from enhanced_image import save_enhanced
+from pydicom.dataset import Dataset
+
+BACKGROUND_HU = -1000
+FOREIGN_HU = 10_000
+GAP_MM = 1.25
+OBLIQUE = (12.0, -7.0, 20.0)
+
+EXACT, WARNED, REFUSED = "exact", "exact+warning", "refused"
+
+
+@dataclass(frozen=True)
+class Size:
+    """Slices, rows and columns."""
+
+    slices: int = 24
+    rows: int = 6
+    columns: int = 7
+
+
+FIELD_SIZE = Size(120, 48, 56)
+"""The size of the published table."""
+
+
+@dataclass
+class Marks:
+    """Where every mark of the stack lies: HU (m,) and LPS mm (m, 3); the count of slices that carry them."""
+
+    hu: np.ndarray
+    lps_mm: np.ndarray
+    slices: int
+
+
+@dataclass
+class MarkedPlan(Plan):
+    """A plan whose corner voxels are marks, counted from `first_hu`."""
+
+    first_hu: int = 1
+    slopes: tuple[int, ...] = (1,)
+    """Slope of slice k is ``slopes[k % len(slopes)]``; with more than one, marks and background divide by all."""
+
+    def corners(self) -> list[tuple[int, int]]:
+        _, rows, columns = self.shape
+        return [(i, j) for j in (0, rows - 1) for i in (0, columns - 1)]
+
+    def mark_hu(self, k: int, corner: int) -> int:
+        mark = self.first_hu + 4 * k + corner
+        return mark if self.slopes == (1,) else 12 * mark - 4
+
+    def stored(self, k: int) -> np.ndarray:
+        slope = self.slopes[k % len(self.slopes)]
+        hu = np.full(self.shape[1:], BACKGROUND_HU)
+        for corner, (i, j) in enumerate(self.corners()):
+            hu[j, i] = self.mark_hu(k, corner)
+        stored, rest = np.divmod(hu - self.intercept, slope)
+        assert not rest.any()
+        return stored.astype("i2" if self.signed else "u2")
+
+    def marks(self, left_out: Sequence[int] = ()) -> Marks:
+        found = [
+            (self.mark_hu(k, corner), self.truth(np.array([[i, j, k]]))[0])
+            for k in range(self.shape[0])
+            if k not in left_out
+            for corner, (i, j) in enumerate(self.corners())
+        ]
+        return Marks(np.array([hu for hu, _ in found]), np.array([place for _, place in found]), len(found) // 4)
+
+
+@dataclass(frozen=True)
+class Case:
+    """One row of the matrix.
+
+    Attributes
+    ----------
+    verdict : {"exact", "exact+warning", "refused"}
+        What clrecon must do.
+    words : tuple of str
+        Texts that the warnings, or the refusal, must hold.
+    again : mapping or None
+        Options of `read_volume` that make a refused series readable: then exact, with `again_words` in the warnings.
+    bound : {"written", "rounded", "far", "jitter"}
+        Which tolerance of tests/tolerances.py holds for the positions.
+    """
+
+    name: str
+    write: Callable[[Path, Size], Marks]
+    verdict: str = EXACT
+    words: tuple[str, ...] = ()
+    again: Mapping[str, Any] | None = None
+    again_words: tuple[str, ...] = ()
+    bound: str = "written"
+
+
+CASES: dict[str, Case] = {}
+
+
+def _case(name: str, *args: Any, **options: Any) -> Callable[[Callable[[Path, Size], Marks]], None]:
+    def add(write: Callable[[Path, Size], Marks]) -> None:
+        assert name not in CASES
+        CASES[name] = Case(name, write, *args, **options)
+
+    return add
+
+
+def plan_for(size: Size, **changes: Any) -> MarkedPlan:
+    plan = MarkedPlan(shape=(size.slices, size.rows, size.columns), gap=GAP_MM, angles=OBLIQUE)
+    return replace(plan, **changes)
+
+
+def write_slices(folder: Path, plan: MarkedPlan, change: Change | None = None, prefix: str = "") -> Marks:
+    """Write the slices with every attribute that readers ask for; InstanceNumber runs along the normal."""
+    for k in range(plan.shape[0]):
+        if k in plan.leave_out:
+            continue
+        ds = make_dataset(plan, k)
+        ds.RescaleSlope = plan.slopes[k % len(plan.slopes)]
+        ds.InstanceNumber = k + 1
+        ds.StudyInstanceUID, ds.StudyID, ds.AccessionNumber = f"{ROOT}.77", "1", "1"
+        ds.StudyDate, ds.StudyTime, ds.PatientPosition = "20200101", "120000", "HFS"
+        ds.Manufacturer, ds.KVP, ds.AcquisitionNumber = "PHANTOM", 120, 1
+        if change is not None:
+            change(ds, k)
+        ds.file_meta.MediaStorageSOPInstanceUID = ds.SOPInstanceUID
+        save_dataset(ds, folder / (prefix + plan.name(k)))
+    return plan.marks(plan.leave_out)
+
+
+def _both(*changes: Change) -> Change:
+    def change(ds: Dataset, k: int) -> None:
+        for one in changes:
+            one(ds, k)
+
+    return change
+
+
+def _another_image(**values: Any) -> Change:
+    """A change for a second set of images in the same series: SOPInstanceUIDs of their own."""
+
+    def change(ds: Dataset, k: int) -> None:
+        ds.SOPInstanceUID = f"{ds.SOPInstanceUID}.2"
+        for keyword, value in values.items():
+            setattr(ds, keyword, value)
+
+    return change
+
+
+# --- one affine, exactly ---
+def _simple(name: str, *args: Any, change: Change | None = None, plan: Mapping[str, Any] | None = None, **kw: Any):
+    _case(name, *args, **kw)(lambda folder, size: write_slices(folder, plan_for(size, **(plan or {})), change))
+
+
+_simple("regular, non-square pixels")
+_simple("axial", plan={"angles": (0, 0, 0)})
+_simple("sagittal", plan={"angles": (0, 90, 90)})
+_simple("coronal", plan={"angles": (-90, 0, 0)})
+_simple("feet first", plan={"angles": (0, 180, 0)}, change=set_values(PatientPosition="FFS"))
+_simple("prone", plan={"angles": (0, 0, 180)}, change=set_values(PatientPosition="HFP"))
+_simple("normal to the feet", plan={"angles": (180, 0, 0)})
+_simple("names in reverse, InstanceNumber that lies", plan={"name": lambda k: f"{900 - k}"}, change=(
+    lambda ds, k: setattr(ds, "InstanceNumber", (7 * k) % 23)
+))  # fmt: skip
+for degrees in (1.0, 2.5, 12.0, -20.0):
+    _simple(f"tilt {degrees:g} deg", WARNED, (f"tilt {abs(degrees):.2f} degrees",), plan={"tilt_deg": degrees})
+_simple("coordinates of 1e5 mm", plan={"origin": (1e5, -1e5, 9.9e4), "decimals": 6}, bound="far")
+_simple("0.625 mm rounded to 0.01 mm", plan={"gap": 0.625, "decimals": 2, "angles": (0, 0, 0)}, bound="rounded")
+_simple(
+    "SliceThickness 5, SpacingBetweenSlices -5",
+    WARNED,
+    ("SpacingBetweenSlices says -5 mm, the positions say 1.25 mm",),
+    change=set_values(SpacingBetweenSlices=-5),
+)
+
+
+@_case("the last slice lost")
+def _last_lost(folder: Path, size: Size) -> Marks:
+    return write_slices(folder, plan_for(size, leave_out=(size.slices - 1,)))
+
+
+@_case("slices that step sideways", WARNED, ("tilt 12.00 degrees",))
+def _sideways(folder: Path, size: Size) -> Marks:
+    plan = plan_for(size)
+    row = plan.directions[0]
+
+    def change(ds: Dataset, k: int) -> None:
+        shift = k * GAP_MM * np.tan(np.radians(12.0)) * row
+        ds.ImagePositionPatient = [round(float(v), 9) for v in plan.position(k) + shift]
+
+    marks = write_slices(folder, plan, change)
+    k = np.repeat(np.arange(size.slices), 4)[:, None]
+    return replace(marks, lps_mm=marks.lps_mm + k * GAP_MM * np.tan(np.radians(12.0)) * row)
+
+
+@_case("0.001 deg jitter of the orientation", bound="jitter")
+def _jitter(folder: Path, size: Size) -> Marks:
+    def change(ds: Dataset, k: int) -> None:
+        turned = rotation(OBLIQUE) @ rotation((0.0, 0.0, 0.001 * (-1) ** k))
+        ds.ImageOrientationPatient = [round(float(v), 9) for v in (*turned[:, 0], *turned[:, 1])]
+
+    return write_slices(folder, plan_for(size), change)
+
+
+# --- uneven stacks and holes ---
+@_case("gap 1.25 then 2.5 mm", WARNED, ("1.250", "2.500"))
+def _feed(folder: Path, size: Size) -> Marks:
+    half = size.slices // 2
+    return write_slices(folder, plan_for(size, offsets={k: GAP_MM * (k - half) for k in range(half + 1, size.slices)}))
+
+
+@_case("gap 1.25 then 2.5 mm, tilt 12 deg", WARNED, ("tilt 12.00 degrees", "2.500"))
+def _tilted_feed(folder: Path, size: Size) -> Marks:
+    half = size.slices // 2
+    offsets = {k: GAP_MM * (k - half) for k in range(half + 1, size.slices)}
+    return write_slices(folder, plan_for(size, offsets=offsets, tilt_deg=12.0))
+
+
+@_case("one step off by 0.15 mm", WARNED, ("0.14",))
+def _one_off(folder: Path, size: Size) -> Marks:
+    return write_slices(folder, plan_for(size, offsets={size.slices // 2: 0.15}))
+
+
+@_case("+0.19 mm per gap in the second half", WARNED, ("1.250", "1.440"))
+def _drift(folder: Path, size: Size) -> Marks:
+    half = size.slices // 2
+    return write_slices(folder, plan_for(size, offsets={k: 0.19 * (k - half) for k in range(half + 1, size.slices)}))
+
+
+def _lost(name: str, places: Callable[[int], tuple[int, ...]], *words: str) -> None:
+    @_case(name, REFUSED, words, again={"allow_gaps": True}, again_words=words)
+    def write(folder: Path, size: Size) -> Marks:
+        return write_slices(folder, plan_for(size, leave_out=places(size.slices)))
+
+
+_lost("one slice missing", lambda n: (n // 2,), "1 slice missing between", "gap 2.500 mm, usual 1.250 mm")
+_lost("one slice missing at the end", lambda n: (n - 2,), "1 slice missing between")
+_lost("one slice missing at the start", lambda n: (1,), "1 slice missing between")
+_lost("two holes", lambda n: (n // 3, n // 2, n // 2 + 1), "1 slice missing between", "2 slices missing between")
+_lost("two slabs, 12 slices apart", lambda n: tuple(range(n // 4, n // 4 + 12)), "12 slices missing between")
+
+
+# --- more than one stack in a series ---
+@_case("localizer in the same series", WARNED, ("1 slice, localizer",))
+def _localizer(folder: Path, size: Size) -> Marks:
+    scout = plan_for(Size(1, size.rows, size.columns), angles=(0, 90, 90), first_hu=FOREIGN_HU)
+    change = _another_image(ImageType=["ORIGINAL", "PRIMARY", "LOCALIZER"])
+    write_slices(folder, scout, change, "scout")
+    return write_slices(folder, plan_for(size))
+
+
+@_case("localizer that does not say so", WARNED, ("1 other series left",))
+def _silent_localizer(folder: Path, size: Size) -> Marks:
+    scout = plan_for(Size(1, size.rows, size.columns), angles=(0, 90, 90), first_hu=FOREIGN_HU)
+    write_slices(folder, scout, _another_image(), "scout")
+    return write_slices(folder, plan_for(size))
+
+
+@_case("two orientations in one series", WARNED, ("1 other series left",))
+def _two_orientations(folder: Path, size: Size) -> Marks:
+    other = plan_for(Size(size.slices // 2, size.rows, size.columns), angles=(0, 90, 90), first_hu=FOREIGN_HU)
+    write_slices(folder, other, _another_image(), "other")
+    return write_slices(folder, plan_for(size))
+
+
+@_case("three discs, each with its own angle", REFUSED, ("--series",))
+def _discs(folder: Path, size: Size) -> Marks:
+    third = Size(size.slices // 3, size.rows, size.columns)
+    for disc in (0, 1, 2):
+        plan = plan_for(third, angles=(15.0 * disc, 0, 0), first_hu=FOREIGN_HU * disc + 1)
+        change = _another_image() if disc else None
+        marks = write_slices(folder, replace(plan, series=1), _number_images(disc, change), f"disc{disc}")
+        first = marks if not disc else first
+    return first
+
+
+def _number_images(group: int, change: Change | None) -> Change:
+    def number(ds: Dataset, k: int) -> None:
+        if change is not None:
+            change(ds, k)
+        ds.SOPInstanceUID = f"{ROOT}.5.{group + 1}.{k + 1}"
+
+    return number
+
+
+@_case("two FrameOfReferenceUIDs", REFUSED, ("FrameOfReferenceUID differ",))
+def _two_frames(folder: Path, size: Size) -> Marks:
+    def change(ds: Dataset, k: int) -> None:
+        if k >= size.slices // 2:
+            ds.FrameOfReferenceUID = f"{ROOT}.98"
+
+    return write_slices(folder, plan_for(size), change)
+
+
+@_case("orientation turns by 0.5 deg over the stack", REFUSED, ("ImageOrientationPatient differs within the series",))
+def _turning(folder: Path, size: Size) -> Marks:
+    def change(ds: Dataset, k: int) -> None:
+        turned = rotation(OBLIQUE) @ rotation((0.5 * k / (size.slices - 1), 0.0, 0.0))
+        ds.ImageOrientationPatient = [round(float(v), 9) for v in (*turned[:, 0], *turned[:, 1])]
+
+    return write_slices(folder, plan_for(size), change)
+
+
+@_case("PixelSpacing changes half way", REFUSED, ("PixelSpacing differs within the series",))
+def _two_spacings(folder: Path, size: Size) -> Marks:
+    def change(ds: Dataset, k: int) -> None:
+        if k >= size.slices // 2:
+            ds.PixelSpacing = [0.8, 0.6]
+
+    return write_slices(folder, plan_for(size), change)
+
+
+@_case("two series of the same length", REFUSED, ("--series",), again={"series": 1}, again_words=("1 other series",))
+def _two_series(folder: Path, size: Size) -> Marks:
+    marks = write_slices(folder, plan_for(size))
+    other = plan_for(size, series=2, first_hu=FOREIGN_HU, origin=(40.0, 31.0, -300.0))
+    write_slices(folder, other, None, "other")
+    return marks
+
+
+# --- several images at one position ---
+def _copies(name: str, change: Change | None) -> None:
+    @_case(name, WARNED, ("identical", "duplicate"))
+    def write(folder: Path, size: Size) -> Marks:
+        marks = write_slices(folder, plan_for(size))
+        if change is None:
+            for file in sorted(folder.iterdir()):
+                shutil.copy(file, folder / f"copy{file.name}")
+        else:
+            write_slices(folder, plan_for(size), change, "again")
+        return marks
+
+
+_copies("every file twice", None)
+_copies("every slice twice, equal pixels", _another_image())
+
+
+def _phases(name: str, words: tuple[str, ...], **second: Any) -> None:
+    @_case(name, REFUSED, ("--phase", *words), again={"phase": 1})
+    def write(folder: Path, size: Size) -> Marks:
+        first = {keyword: value[0] for keyword, value in second.items()}
+        last = {keyword: value[1] for keyword, value in second.items()}
+        marks = write_slices(folder, plan_for(size), set_values(**first))
+        write_slices(folder, plan_for(size, first_hu=FOREIGN_HU), _another_image(**last), "p")
+        return marks
+
+
+_phases("two phases by acquisition", ("AcquisitionNumber",), AcquisitionNumber=(1, 2))
+_phases("two phases by time", ("AcquisitionTime",), AcquisitionTime=("120000", "120030"))
+_phases("two cardiac phases", ("TriggerTime",), TriggerTime=("100", "500"))
+_phases("two recon kernels", ("ConvolutionKernel",), ConvolutionKernel=("B30f", "B70f"))
+
+
+@_case("two recon kernels, interleaved", WARNED, ("ConvolutionKernel",))
+def _interleaved_kernels(folder: Path, size: Size) -> Marks:
+    def change(ds: Dataset, k: int) -> None:
+        ds.ConvolutionKernel = ("B30f", "B70f")[k % 2]
+
+    return write_slices(folder, plan_for(size), change)
+
+
+# --- headers ---
+@_case("a slice without its position", REFUSED, ("ImagePositionPatient (0020,0032) is missing or empty",))
+def _no_position(folder: Path, size: Size) -> Marks:
+    change = set_values(only=size.slices // 2, ImagePositionPatient=None)
+    return write_slices(folder, plan_for(size), change)
+
+
+_simple(
+    "orientation of zeros",
+    REFUSED,
+    ("ImageOrientationPatient (0020,0037)",),
+    change=set_raw("ImageOrientationPatient", "0\\0\\0\\0\\0\\0"),
+)
+_simple(
+    "PixelSpacing with decimal commas",
+    REFUSED,
+    ("PixelSpacing (0028,0030) is '0,7\\0,5'",),
+    change=set_raw("PixelSpacing", "0,7\\0,5"),
+)
+_simple("slopes 1, 2, 3, 4 slice by slice", plan={"slopes": (1, 2, 3, 4)})
+
+
+# --- multi-frame ---
+def _enhanced(name: str, **kw: Any) -> None:
+    options = {key: kw.pop(key) for key in ("order", "plan") if key in kw}
+
+    @_case(name, **kw)
+    def write(folder: Path, size: Size) -> Marks:
+        plan = plan_for(size, slopes=(1, 2, 3, 4), **options.get("plan", {}))
+        order = [(k * 7 + 3) % size.slices for k in range(size.slices)] if options.get("order") else None
+        save_enhanced(folder / "enhanced.dcm", plan, order)
+        return plan.marks()
+
+
+_enhanced("enhanced CT, slopes 1, 2, 3, 4")
+_enhanced("enhanced CT, frames unsorted", order=True)
+_enhanced("enhanced CT, tilt 12 deg", plan={"tilt_deg": 12.0}, verdict=WARNED, words=("tilt 12.00 degrees",))
