@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -41,7 +41,10 @@ FIELD_SIZE = Size(120, 48, 56)
 
 @dataclass
 class Marks:
-    """Where every mark of the stack lies: HU (m,) and LPS mm (m, 3); the count of slices that carry them."""
+    """Where every mark of the stack lies: HU (m,) and LPS mm (m, 3); the count of slices that carry them.
+
+    NaN where a mark has no place in the frame of the first slice.
+    """
 
     hu: np.ndarray
     lps_mm: np.ndarray
@@ -178,6 +181,7 @@ _simple("names in reverse, InstanceNumber that lies", plan={"name": lambda k: f"
 ))  # fmt: skip
 for degrees in (1.0, 2.5, 12.0, -20.0):
     _simple(f"tilt {degrees:g} deg", WARNED, (f"tilt {abs(degrees):.2f} degrees",), plan={"tilt_deg": degrees})
+_simple("tilt 12 deg, axial", WARNED, ("tilt 12.00 degrees",), plan={"tilt_deg": 12.0, "angles": (0, 0, 0)})
 _simple("coordinates of 1e5 mm", plan={"origin": (1e5, -1e5, 9.9e4), "decimals": 6}, bound="far")
 _simple("0.625 mm rounded to 0.01 mm", plan={"gap": 0.625, "decimals": 2, "angles": (0, 0, 0)}, bound="rounded")
 _simple(
@@ -230,7 +234,12 @@ def _tilted_feed(folder: Path, size: Size) -> Marks:
     return write_slices(folder, plan_for(size, offsets=offsets, tilt_deg=12.0))
 
 
-@_case("one step off by 0.15 mm", WARNED, ("0.14",))
+@_case("one step off by 0.15 mm", WARNED, ("1.250", "1.400"))
+def _one_step(folder: Path, size: Size) -> Marks:
+    return write_slices(folder, plan_for(size, offsets=dict.fromkeys(range(size.slices // 2, size.slices), 0.15)))
+
+
+@_case("one slice off by 0.15 mm", WARNED, ("1.100", "1.400"))
 def _one_off(folder: Path, size: Size) -> Marks:
     return write_slices(folder, plan_for(size, offsets={size.slices // 2: 0.15}))
 
@@ -280,21 +289,14 @@ def _two_orientations(folder: Path, size: Size) -> Marks:
 @_case("three discs, each with its own angle", REFUSED, ("--series",))
 def _discs(folder: Path, size: Size) -> Marks:
     third = Size(size.slices // 3, size.rows, size.columns)
-    for disc in (0, 1, 2):
+    for disc in (2, 1, 0):
         plan = plan_for(third, angles=(15.0 * disc, 0, 0), first_hu=FOREIGN_HU * disc + 1)
-        change = _another_image() if disc else None
-        marks = write_slices(folder, replace(plan, series=1), _number_images(disc, change), f"disc{disc}")
-        first = marks if not disc else first
-    return first
 
+        def number(ds: Dataset, k: int, disc: int = disc) -> None:
+            ds.SOPInstanceUID = f"{ROOT}.5.{disc + 1}.{k + 1}"
 
-def _number_images(group: int, change: Change | None) -> Change:
-    def number(ds: Dataset, k: int) -> None:
-        if change is not None:
-            change(ds, k)
-        ds.SOPInstanceUID = f"{ROOT}.5.{group + 1}.{k + 1}"
-
-    return number
+        marks = write_slices(folder, plan, number, f"disc{disc}")
+    return marks
 
 
 @_case("two FrameOfReferenceUIDs", REFUSED, ("FrameOfReferenceUID differ",))
@@ -303,25 +305,37 @@ def _two_frames(folder: Path, size: Size) -> Marks:
         if k >= size.slices // 2:
             ds.FrameOfReferenceUID = f"{ROOT}.98"
 
-    return write_slices(folder, plan_for(size), change)
+    marks = write_slices(folder, plan_for(size), change)
+    marks.lps_mm[4 * (size.slices // 2) :] = np.nan
+    return marks
 
 
 @_case("orientation turns by 0.5 deg over the stack", REFUSED, ("ImageOrientationPatient differs within the series",))
 def _turning(folder: Path, size: Size) -> Marks:
+    plan = plan_for(size)
+    truth = plan.marks()
+
     def change(ds: Dataset, k: int) -> None:
         turned = rotation(OBLIQUE) @ rotation((0.5 * k / (size.slices - 1), 0.0, 0.0))
         ds.ImageOrientationPatient = [round(float(v), 9) for v in (*turned[:, 0], *turned[:, 1])]
+        for corner, (i, j) in enumerate(plan.corners()):
+            truth.lps_mm[4 * k + corner] = plan.position(k) + 0.5 * i * turned[:, 0] + 0.7 * j * turned[:, 1]
 
-    return write_slices(folder, plan_for(size), change)
+    write_slices(folder, plan, change)
+    return truth
 
 
 @_case("PixelSpacing changes half way", REFUSED, ("PixelSpacing differs within the series",))
 def _two_spacings(folder: Path, size: Size) -> Marks:
+    wide = plan_for(size, pixel_spacing=(0.8, 0.6))
+
     def change(ds: Dataset, k: int) -> None:
         if k >= size.slices // 2:
-            ds.PixelSpacing = [0.8, 0.6]
+            ds.PixelSpacing = list(wide.pixel_spacing)
 
-    return write_slices(folder, plan_for(size), change)
+    marks = write_slices(folder, plan_for(size), change)
+    marks.lps_mm[4 * (size.slices // 2) :] = wide.marks().lps_mm[4 * (size.slices // 2) :]
+    return marks
 
 
 @_case("two series of the same length", REFUSED, ("--series",), again={"series": 1}, again_words=("1 other series",))
