@@ -348,7 +348,7 @@ def _two_series(folder: Path, size: Size) -> Marks:
 
 # --- several images at one position ---
 def _copies(name: str, change: Change | None) -> None:
-    @_case(name, WARNED, ("identical", "duplicate"))
+    @_case(name, WARNED, ("duplicate slices dropped: same place, same pixels",))
     def write(folder: Path, size: Size) -> Marks:
         marks = write_slices(folder, plan_for(size))
         if change is None:
@@ -377,6 +377,28 @@ _phases("two phases by acquisition", ("AcquisitionNumber",), AcquisitionNumber=(
 _phases("two phases by time", ("AcquisitionTime",), AcquisitionTime=("120000", "120030"))
 _phases("two cardiac phases", ("TriggerTime",), TriggerTime=("100", "500"))
 _phases("two recon kernels", ("ConvolutionKernel",), ConvolutionKernel=("B30f", "B70f"))
+
+
+@_case("one slice twice, other pixels", REFUSED, ("parts them into phases",))
+def _one_differs(folder: Path, size: Size) -> Marks:
+    marks = write_slices(folder, plan_for(size))
+    others = plan_for(size, first_hu=FOREIGN_HU, leave_out=tuple(k for k in range(size.slices) if k != 5))
+    write_slices(folder, others, _another_image(), "again")
+    return marks
+
+
+@_case(
+    "two phases, a slice of the second missing",
+    REFUSED,
+    ("--phase",),
+    again={"phase": 1},
+    again_words=("phase 1 of 2",),
+)
+def _phase_with_a_hole(folder: Path, size: Size) -> Marks:
+    marks = write_slices(folder, plan_for(size), set_values(AcquisitionNumber=1))
+    second = plan_for(size, first_hu=FOREIGN_HU, leave_out=(size.slices // 2,))
+    write_slices(folder, second, _another_image(AcquisitionNumber=2), "p")
+    return marks
 
 
 @_case("two recon kernels, interleaved", WARNED, ("ConvolutionKernel",))

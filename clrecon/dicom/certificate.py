@@ -76,7 +76,7 @@ def collect_series_warnings(series: Series) -> list[str]:
 
 
 def _describe_what_was_left(series: Series) -> list[str]:
-    """Copies, and the other phases of a series."""
+    """Copies, the other phases of a series, and reconstructions that are not of one kind."""
     try:
         places = series.places
     except RefusedInputError:
@@ -90,6 +90,11 @@ def _describe_what_was_left(series: Series) -> list[str]:
         left = sum(len(phase.headers) for phase in places.phases) - len(chosen.headers)
         which = f"phase {chosen.number} of {len(places.phases)} ({chosen.keyword} {chosen.value})"
         warnings.append(f"{which} read, {left} slices of others left")
+    kernels = (
+        {dict(header.phase).get("ConvolutionKernel", "") for header in series.stack.slices} if series.stack else ()
+    )
+    if len(kernels) > 1:
+        warnings.append(f"ConvolutionKernel differs between slices ({len(kernels)} kernels): sharp and soft are mixed")
     return warnings
 
 
