@@ -1,68 +1,18 @@
-"""Cut and mutated files: nothing but a ClreconError gets out, in bounded time, and nothing is printed."""
+"""Files made to be read wrongly: each is read right, or refused with its reason."""
 
 from __future__ import annotations
 
-import random
 import struct
-import warnings
 
 import numpy as np
 import pytest
 from dicom_series import Plan, make_dataset, save_dataset, write_series
-from pydicom.uid import DeflatedExplicitVRLittleEndian, ExplicitVRLittleEndian, ImplicitVRLittleEndian
+from pydicom.uid import ImplicitVRLittleEndian
 
-from clrecon.dicom import list_series, read_volume
-from clrecon.errors import ClreconError, RefusedInputError
+from clrecon.dicom import read_volume
+from clrecon.errors import RefusedInputError
 
-SYNTAXES = [ExplicitVRLittleEndian, ImplicitVRLittleEndian, DeflatedExplicitVRLittleEndian]
 PLAN = {"shape": (3, 3, 4), "name": "{}".format}
-
-
-def read_or_refuse(folder):
-    """Read; gives the volume or None where it is refused."""
-    try:
-        return read_volume(folder)
-    except ClreconError as error:
-        assert "\n" not in str(error) and str(error).isprintable()
-        return None
-
-
-@pytest.mark.fuzz
-@pytest.mark.parametrize("syntax", SYNTAXES)
-def test_a_file_cut_anywhere(tmp_path, syntax):
-    plan = write_series(tmp_path, Plan(syntax=syntax, **PLAN))
-    whole = (tmp_path / "1").read_bytes()
-    assert np.array_equal(read_volume(tmp_path).voxels, plan.hu())
-    for length in range(0, len(whole), 3):
-        (tmp_path / "1").write_bytes(whole[:length])
-        volume = read_or_refuse(tmp_path)
-        if length == 0:  # an empty file without an extension is nobody's slice
-            assert volume.voxels.shape[0] == 2 and volume.report["files"]["skipped"] == {"not DICOM": 1}
-        else:
-            assert volume is None or np.array_equal(volume.voxels, plan.hu())
-
-
-@pytest.mark.fuzz
-@pytest.mark.parametrize("syntax", SYNTAXES)
-def test_a_file_with_wrong_bytes(tmp_path, syntax, capfd):
-    write_series(tmp_path, Plan(syntax=syntax, **PLAN))
-    whole = (tmp_path / "1").read_bytes()
-    dice = random.Random(20)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        for _ in range(150):
-            data = bytearray(whole)
-            for _ in range(dice.choice((1, 1, 2, 8))):
-                data[dice.randrange(128, len(data))] = dice.choice((0, 1, 0xFF, 0x5C, dice.randrange(256)))
-            (tmp_path / "1").write_bytes(data)
-            volume = read_or_refuse(tmp_path)
-            assert volume is None or np.isfinite(volume.affine).all()
-            try:
-                list_series(tmp_path / "1")
-            except ClreconError:
-                pass
-    out, err = capfd.readouterr()
-    assert out == "" and err == ""
 
 
 @pytest.mark.parametrize("depth", [300, 5000])
