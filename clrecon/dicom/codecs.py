@@ -56,7 +56,7 @@ def describe_undecodable(transfer_syntax: str) -> str:
     uid = UID(transfer_syntax, validation_mode=IGNORE)
     name = uid.name if uid.name != transfer_syntax else _OTHER_NAMES.get(transfer_syntax, "private or unknown")
     shown = escape_text(transfer_syntax)
-    return f"transfer syntax {shown} ({name}) cannot be decoded: convert the series to an uncompressed one"
+    return f"transfer syntax {shown} ({escape_text(name)}) cannot be decoded: convert the series to an uncompressed one"
 
 
 def choose_decoder(transfer_syntax: str) -> str:

@@ -1,0 +1,170 @@
+"""The list of faults, rows 1 to 48: what each is, what is expected, and which tests hold it.
+
+A test whose own name begins with ``test_row_NN_`` is found by that; the others are listed here as "file::function",
+the file below tests/.  The guard is tests/guards/test_fault_list.py.
+"""
+
+from __future__ import annotations
+
+TRAPS = "dicom/test_trap_matrix.py::test_a_row_of_the_matrix"
+GEOMETRY = "dicom/test_stack_geometry.py::"
+PIXELS = "dicom/test_pixels.py::"
+SERIES = "dicom/test_series_choice.py::"
+HOSTILE = "dicom/test_hostile_files.py::"
+BAD_INPUT = "cli/test_bad_input.py::"
+
+ROWS: dict[int, tuple[str, tuple[str, ...]]] = {
+    1: ("row and column spacing differ: right", (TRAPS, GEOMETRY + "test_voxels_lie_where_they_were_written")),
+    2: ("random order, no extension, lying InstanceNumber: right", (TRAPS,)),
+    3: ("tilt of 1, 2.5, 12, -20 degrees: exact by shear, told", (TRAPS, GEOMETRY + "test_tilt_is_reported")),
+    4: (
+        "one slice missing: refused; --allow-gaps: true positions, told",
+        (TRAPS, "dicom/test_trap_matrix.py::test_a_refused_row_read_on_request"),
+    ),
+    5: ("spacing changes half way: exact positions, told", (TRAPS,)),
+    6: ("drift of 0.19 mm a gap: exact positions, told", (TRAPS,)),
+    7: ("one step off by 0.15 mm: told with its figures", (TRAPS,)),
+    8: ("positions rounded to 0.01 mm: right, no warning", (GEOMETRY + "test_rounded_positions_pass_without_a_word",)),
+    9: ("duplicate slices: equal ones dropped and told, else phases", (TRAPS,)),
+    10: (
+        "two phases or times in one series: refused with their list; --phase",
+        (TRAPS, "dicom/test_phases.py::test_phases_are_listed_and_chosen"),
+    ),
+    11: ("localizer in the series: left out and told", (TRAPS, SERIES + "test_a_localizer_in_the_series_is_parted")),
+    12: (
+        "two series or patients: refused with their list; --series",
+        (
+            SERIES + "test_two_series_of_equal_size_need_a_choice",
+            "dicom/test_phases.py::test_of_several_patients_none_is_taken_unasked",
+        ),
+    ),
+    13: ("two FrameOfReferenceUIDs: refused", (TRAPS, GEOMETRY + "test_mixed_values_are_refused")),
+    14: (
+        "directions not unit or orthogonal: refused; a little: made orthonormal, told",
+        (
+            GEOMETRY + "test_mixed_values_are_refused",
+            GEOMETRY + "test_skewed_directions_are_made_orthonormal_with_a_warning",
+        ),
+    ),
+    15: (
+        "orientation or position zero, NaN, short, missing: refused with file and tag",
+        (GEOMETRY + "test_bad_values_name_file_and_tag",),
+    ),
+    16: (
+        "SliceThickness or SpacingBetweenSlices wrong or negative: not used, told",
+        (
+            TRAPS,
+            GEOMETRY + "test_stated_spacing_is_ignored_with_a_warning",
+            GEOMETRY + "test_a_wrong_thickness_is_only_a_warning",
+        ),
+    ),
+    17: ("feet first, prone, reversed, left-handed: the same in LPS", (TRAPS,)),
+    18: ("oblique or sagittal acquisition: the same in LPS", (TRAPS,)),
+    19: ("coordinates of 1e5 mm: right to 1e-3 mm", (TRAPS,)),
+    20: (
+        "a single slice: refused",
+        (GEOMETRY + "test_stacks_that_are_no_grid_are_refused_by_name", BAD_INPUT + "test_mesh_refuses_input"),
+    ),
+    21: (
+        "Rows or Columns differ between slices: refused, the odd ones named",
+        (GEOMETRY + "test_rows_and_columns_that_differ_are_refused",),
+    ),
+    22: ("enhanced CT, geometry and rescale of each frame, unsorted frames: right", (TRAPS,)),
+    23: (
+        "PixelSpacing 0, negative, huge, with a decimal comma: refused",
+        (TRAPS, GEOMETRY + "test_bad_values_name_file_and_tag"),
+    ),
+    24: (
+        "orientation jitter of 0.001 degrees: right",
+        (TRAPS, GEOMETRY + "test_small_jitter_of_the_directions_is_averaged"),
+    ),
+    25: (
+        "slope and intercept slice by slice: right; slope 0, NaN, infinite, text: refused",
+        (PIXELS + "test_rescale_goes_slice_by_slice", GEOMETRY + "test_bad_values_name_file_and_tag"),
+    ),
+    26: ("padding of -2000 with a skin threshold: no tube", (PIXELS + "test_padding_becomes_air",)),
+    27: (
+        "12-bit signed pixels under overlay bits: right HU",
+        (PIXELS + "test_twelve_bit_signed_values_under_overlay_bits",),
+    ),
+    28: (
+        "MONOCHROME1: told; colour, palette, secondary capture: refused",
+        (
+            PIXELS + "test_doubtful_values_are_kept_with_a_warning",
+            PIXELS + "test_images_that_are_no_ct_slice_are_refused",
+            "dicom/test_doubtful_headers.py::test_a_secondary_capture_with_a_position_is_refused",
+        ),
+    ),
+    29: (
+        "RescaleType not HU, rescale missing: told",
+        (PIXELS + "test_missing_rescale_is_not_hu", PIXELS + "test_doubtful_values_are_kept_with_a_warning"),
+    ),
+    30: (
+        "iso value outside of the data: refused with the range, no empty file",
+        (
+            BAD_INPUT + "test_an_iso_value_above_all_voxels",
+            "operators/test_isosurface.py::test_an_iso_value_outside_the_data_is_refused_with_the_range",
+        ),
+    ),
+    31: (
+        "whole HU that equal the iso value: watertight",
+        ("operators/test_isosurface.py::test_random_integers_at_every_iso_value_are_sound",),
+    ),
+    32: (
+        "constant volume, NaN, infinite voxels: refused",
+        (BAD_INPUT + "test_a_constant_volume", "geometry/test_field.py::test_values_that_are_not_finite_are_refused"),
+    ),
+    33: ("metal cut off at 3071 HU: told", ("dicom/test_doubtful_headers.py::test_saturated_metal_is_told",)),
+    34: ("lossy compression: told", (PIXELS + "test_doubtful_values_are_kept_with_a_warning",)),
+    35: (
+        "empty, text, PNG, cut at every byte: refused or passed over, never a traceback",
+        (
+            BAD_INPUT + "test_mesh_refuses_input",
+            "dicom/test_truncation.py::test_a_slice_cut_at_every_byte",
+            "dicom/test_lost_slices.py::test_what_may_be_left_of_a_slice",
+        ),
+    ),
+    36: ("no preamble or meta header: only with --force", ()),
+    37: ("sequences nested 300 or 5000 deep: refused", (HOSTILE + "test_deeply_nested_sequences",)),
+    38: ("deflate, RLE, JPEG 2000 bombs: refused before inflating", (PIXELS + "test_a_deflate_bomb_is_not_inflated",)),
+    39: (
+        "65535 x 65535 voxels, 2^31 - 1 frames: refused before memory is taken",
+        (
+            PIXELS + "test_memory_is_asked_for_before_it_is_taken",
+            "dicom/test_multiframe_faults.py::test_what_is_wrong_is_refused_by_name",
+        ),
+    ),
+    40: (
+        "garbage for JPEG 2000 or JPEG-LS, a decoder that crashes: that file refused",
+        (PIXELS + "test_damaged_compressed_frames_are_refused",),
+    ),
+    41: (
+        "unknown, retired, private transfer syntax: refused with its UID",
+        (HOSTILE + "test_unknown_transfer_syntax_is_named",),
+    ),
+    42: (
+        "big endian; implicit under explicit: right, told",
+        (
+            PIXELS + "test_native_syntaxes_give_the_same_hu",
+            HOSTILE + "test_implicit_elements_under_an_explicit_syntax",
+        ),
+    ),
+    43: (
+        "DICOMDIR, links, loops, pipes, devices, sockets, folders with names of files: nothing outside is opened",
+        (SERIES + "test_links_and_pipes_are_passed_over",),
+    ),
+    44: ("a program in the preamble: read, told, never copied out", ()),
+    45: (
+        "hostile texts: never in names, escaped in messages",
+        (SERIES + "test_hostile_descriptions_come_out_in_one_printable_line",),
+    ),
+    46: (
+        "bad character set, no permission, a file that vanishes, a disk that hangs: named",
+        (
+            "dicom/test_lost_slices.py::test_a_file_that_cannot_be_opened",
+            "dicom/test_lost_slices.py::test_a_folder_that_cannot_be_read",
+        ),
+    ),
+    47: ("100,000 files, 10,000 series: headers only, bounded memory", ()),
+    48: ("gz, zip, tar: bounded, or refused with what to do", ()),
+}
