@@ -14,7 +14,7 @@ LAST_ROW = 48
 NAMED = re.compile(r"test_rows?_(\d+(?:_and_\d+)*)_")
 
 
-def tests_by_file(folder: Path) -> dict[str, set[str]]:
+def list_tests(folder: Path) -> dict[str, set[str]]:
     found = {}
     for path in sorted(folder.rglob("test_*.py")):
         functions = (node for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.FunctionDef))
@@ -38,7 +38,7 @@ def find_faults(rows: dict[int, tuple[str, tuple[str, ...]]], tests: dict[str, s
 
 
 def test_every_row_has_a_test() -> None:
-    assert find_faults(ROWS, tests_by_file(ROOT / "tests")) == []
+    assert find_faults(ROWS, list_tests(ROOT / "tests")) == []
 
 
 @pytest.mark.parametrize(
@@ -53,12 +53,12 @@ def test_every_row_has_a_test() -> None:
     ],
 )
 def test_a_row_without_a_test_is_found(rows: dict[int, tuple[str, tuple[str, ...]]], fault: str) -> None:
-    tests = tests_by_file(ROOT / "tests")
+    tests = list_tests(ROOT / "tests")
     assert any(found.startswith(fault) for found in find_faults(rows, tests))
 
 
 def test_names_hold_rows() -> None:
     tests = {"a.py": {"test_row_46_a_file", "test_rows_38_and_40_streams"}}
-    rows = {row: ("", ()) for row in range(1, LAST_ROW + 1)}
+    rows = dict.fromkeys(range(1, LAST_ROW + 1), ("", ()))
     left = {int(fault.split()[1]) for fault in find_faults(rows, tests)}
     assert set(rows) - left == {38, 40, 46}
