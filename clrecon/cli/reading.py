@@ -9,7 +9,7 @@ __all__ = ["add_reading", "reading_settings"]
 
 
 def add_reading(parser: argparse.ArgumentParser) -> None:
-    """Add --series, --phase and --allow-gaps."""
+    """Add --series, --phase, --allow-gaps and --force."""
     group = parser.add_argument_group("reading")
     group.add_argument(
         "--series",
@@ -25,8 +25,13 @@ def add_reading(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="read a stack with missing slices: what is there is placed exactly, surfaces bridge the gap",
     )
+    group.add_argument(
+        "--force",
+        action="store_true",
+        help="read data sets without preamble or meta header too; their encoding is guessed",
+    )
 
 
 def reading_settings(options: argparse.Namespace) -> dict[str, Any]:
     """What `add_reading` was given, as keywords of the settings."""
-    return {"series": options.series, "phase": options.phase, "allow_gaps": options.allow_gaps}
+    return {"series": options.series, "phase": options.phase, "allow_gaps": options.allow_gaps, "force": options.force}

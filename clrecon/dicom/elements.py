@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from clrecon.dicom.careful import parse_carefully
+from clrecon.dicom.forced import FORCE_HINT, Start, find_program, restore_start
 from clrecon.dicom.plain import parse_plainly
 from clrecon.dicom.raw import META_START, CorruptFileError, DicomElements, NotDicomError
 
@@ -31,6 +32,8 @@ __all__ = [
 PREFIX_BYTES = 16 * 1024
 LONG_PREFIX_BYTES = 256 * 1024
 """Read at once where the first prefix does not hold the whole header: large private elements, many frames."""
+RESTORED_LIMIT = 16 * 1024 * 1024
+"""Bytes of a file without its start in which its header has to end."""
 # A pipe or device put in the place of a listed file must not make the reader wait for a writer.
 _OPEN_FLAGS = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_CLOEXEC", 0) | getattr(os, "O_BINARY", 0)
 
@@ -65,7 +68,9 @@ def has_dicom_mark(prefix: bytes) -> bool:
     return prefix[128:META_START] == b"DICM"
 
 
-def read_elements(path: Path, wanted: tuple[int, ...], start: FileStart | None = None) -> DicomElements:
+def read_elements(
+    path: Path, wanted: tuple[int, ...], start: FileStart | None = None, force: bool = False
+) -> DicomElements:
     """Read the raw elements of one DICOM file.
 
     Parameters
@@ -75,6 +80,8 @@ def read_elements(path: Path, wanted: tuple[int, ...], start: FileStart | None =
         Tags to keep.
     start : FileStart, optional
         What `read_start` gave for this file, so that it is not read twice.
+    force : bool
+        Read a data set without preamble or meta header too.
 
     Raises
     ------
@@ -86,8 +93,38 @@ def read_elements(path: Path, wanted: tuple[int, ...], start: FileStart | None =
         Cannot be opened or read.
     """
     prefix, size = start or read_start(path)
+    restored = restore_start(prefix)
+    if restored is not None and force:
+        return _read_restored(path, restored, size, wanted)
     if not has_dicom_mark(prefix):
         raise NotDicomError("no DICM mark at byte 128", prefix)
+    if restored is not None:
+        raise CorruptFileError(f"no meta header ({FORCE_HINT})")
+    elements = _read_marked(path, prefix, size, wanted)
+    program = find_program(prefix)
+    if program:
+        elements = elements._replace(remarks=(f"the preamble starts a program ({program}): neither run nor copied",))
+    return elements
+
+
+def _read_restored(path: Path, restored: Start, size: int, wanted: tuple[int, ...]) -> DicomElements:
+    """Read a file as if it had the start that it lacks; all places are those of the file itself."""
+    with open(path, "rb") as file:
+        file.seek(restored.skip)
+        data = restored.head + file.read(RESTORED_LIMIT)
+    added = len(restored.head) - restored.skip
+    elements = parse_carefully(io.BytesIO(data), size + added, wanted)
+    deflated = elements.inflate_from >= 0
+    return elements._replace(
+        pixel_offset=elements.pixel_offset - (0 if deflated else added),
+        inflate_from=elements.inflate_from - added if deflated else -1,
+        file_bytes=size,
+        remarks=(restored.remark,),
+        restored=True,
+    )
+
+
+def _read_marked(path: Path, prefix: bytes, size: int, wanted: tuple[int, ...]) -> DicomElements:
     elements = parse_plainly(prefix, size, wanted)
     if elements is None and len(prefix) < size:
         prefix, size = read_start(path, LONG_PREFIX_BYTES)

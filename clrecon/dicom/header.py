@@ -189,13 +189,14 @@ def _share_halves(
     return orientation[:3], orientation[3:]  # type: ignore[return-value]
 
 
-def read_headers(path: Path, start: FileStart | None = None) -> list[SliceHeader] | OtherImage | None:
+def read_headers(
+    path: Path, start: FileStart | None = None, force: bool = False
+) -> list[SliceHeader] | OtherImage | None:
     """Read and validate the header of one file.
 
     Parameters
     ----------
-    path : Path
-    start : FileStart, optional
+    path, start, force
         See `read_elements`.
 
     Returns
@@ -208,7 +209,7 @@ def read_headers(path: Path, start: FileStart | None = None) -> list[SliceHeader
     NotDicomError, CorruptFileError, OSError
         As `read_elements`; also corrupt is a CT image that ends before its pixel data.
     """
-    elements = read_elements(path, WANTED_TAGS, start)
+    elements = read_elements(path, WANTED_TAGS, start, force)
     if elements.media_class == DICOMDIR_CLASS:
         return None
     values = Values(elements)
@@ -233,6 +234,9 @@ def read_headers(path: Path, start: FileStart | None = None) -> list[SliceHeader
             why = "without ImagePositionPatient (0020,0032): no geometry"
         return OtherImage(series, path, name, 1, "capture", f"{name}: secondary capture (SOP class {sop_class}): {why}")
     if sop_class in ENHANCED_CT:
+        if elements.restored:
+            why = f"{name}: multi-frame image without preamble or meta header: convert it to a DICOM file first"
+            return OtherImage(series, path, name, 1, "broken", why)
         return _read_frames(elements, series, path, name)
     try:
         _check_single_frame(values, sop_class)
@@ -312,6 +316,7 @@ def _validate(values: Values, series: SeriesIdentity, path: Path, name: str, *, 
         except ValueProblem as problem:
             unused[keyword] = None
             warnings.append(f"{problem}; ignored, it plays no part in the geometry")
+    warnings += elements.remarks
     if elements.encoding_differs:
         warnings.append("implicit and explicit VR are mixed up: parsed as found, not as the transfer syntax says")
     image_type = [word.strip() for word in values.text("ImageType").upper().split("\\")]

@@ -67,6 +67,10 @@ class DicomElements(NamedTuple):
     inflate_from : int
         Byte of the file where the deflated data set starts, -1 where it is not deflated.
     file_bytes : int
+    remarks : tuple of str
+        What is odd about the start of the file.
+    restored : bool
+        The file lacks the start of a DICOM file.
     """
 
     transfer_syntax: str
@@ -81,6 +85,8 @@ class DicomElements(NamedTuple):
     pixel_vr: str
     inflate_from: int
     file_bytes: int
+    remarks: tuple[str, ...] = ()
+    restored: bool = False
 
 
 @lru_cache(64)

@@ -14,7 +14,7 @@ from clrecon.dicom.choice import choose_series, describe_left
 from clrecon.dicom.containers import advise_on
 from clrecon.dicom.pixels import read_voxels
 from clrecon.dicom.plausibility import collect_voxel_warnings
-from clrecon.dicom.scan import Progress, Scan, scan_path
+from clrecon.dicom.scan import BARE_DATA_SET, Progress, Scan, scan_path
 from clrecon.dicom.series import Series, SeriesListing, describe_series, group_series
 from clrecon.dicom.text import escape_text, join_names
 from clrecon.errors import NoDicomError, RefusedInputError, UsageError
@@ -29,6 +29,7 @@ def read_volume(
     *,
     phase: int | None = None,
     allow_gaps: bool = False,
+    force: bool = False,
     progress: Progress | None = None,
 ) -> Volume:
     """Read one CT series as a volume in HU and LPS mm.
@@ -44,6 +45,8 @@ def read_volume(
         Number of the phase, where a series holds several volumes at the same places (`list_series` lists them).
     allow_gaps : bool
         Read a stack with missing slices: what is there is placed exactly, with a warning.
+    force : bool
+        Read data sets without preamble or meta header too, their encoding guessed, with a warning.
     progress : callable, optional
         Called as ``progress(stage, done, total)`` with stage "scan" or "read", or "no answer yet from NAME" where the
         disk hangs.
@@ -70,7 +73,7 @@ def read_volume(
     Source: DICOM PS3.3 C.7.6.2 (Image Plane), C.7.5.1 (padding), C.8.2.1 (CT image, rescale).
     """
     with _quiet_warnings():
-        scan, found = _scan_and_group(path, progress)
+        scan, found = _scan_and_group(path, progress, force)
         chosen = choose_series(found, series)
         left = describe_left(found, chosen)
         chosen = chosen.choose(_checked_phase(phase), allow_gaps)
@@ -100,6 +103,7 @@ def list_series(
     *,
     phase: int | None = None,
     allow_gaps: bool = False,
+    force: bool = False,
     pixels: bool = False,
     progress: Progress | None = None,
 ) -> SeriesListing:
@@ -107,7 +111,7 @@ def list_series(
 
     Parameters
     ----------
-    path, series, phase, allow_gaps, progress
+    path, series, phase, allow_gaps, force, progress
         As in `read_volume`, which would read what is chosen here.
     pixels : bool
         Read the pixels of the chosen series too, for what only they can say: padding, range of HU, saturation.
@@ -128,7 +132,7 @@ def list_series(
     """
     phase = _checked_phase(phase)
     with _quiet_warnings():
-        scan, found = _scan_and_group(path, progress)
+        scan, found = _scan_and_group(path, progress, force)
         warnings = collect_scan_warnings(scan)
         number, certificate, refusal = None, None, None
         try:
@@ -169,7 +173,7 @@ def _quiet_warnings() -> Iterator[None]:
         yield
 
 
-def _scan_and_group(path: str | os.PathLike[str], progress: Progress | None) -> tuple[Scan, list[Series]]:
+def _scan_and_group(path: str | os.PathLike[str], progress: Progress | None, force: bool) -> tuple[Scan, list[Series]]:
     try:
         folder = Path(path)
         empty = not os.fspath(path).strip()  # Path("") is the current folder
@@ -177,7 +181,7 @@ def _scan_and_group(path: str | os.PathLike[str], progress: Progress | None) -> 
         raise UsageError(f"a path is a string or a path object, not {type(path).__name__}") from error
     if empty:
         raise UsageError("the input path is empty")
-    scan = scan_path(folder, progress)
+    scan = scan_path(folder, progress, force)
     if not scan.slices and not scan.others:
         shown = escape_text(str(path), 256)
         if scan.skipped["corrupt"]:
@@ -187,6 +191,8 @@ def _scan_and_group(path: str | os.PathLike[str], progress: Progress | None) -> 
         hint = "; a DICOMDIR only lists files: name the folder that holds them" if scan.skipped["DICOMDIR"] else ""
         packed = advise_on(scan.skipped)
         hint += f"; {packed}" if packed else ""
+        bare = sum(suspect.reason == BARE_DATA_SET for suspect in scan.suspects)
+        hint += f"; {bare} like {BARE_DATA_SET}" if bare else ""
         raise NoDicomError(f"no DICOM images in {shown}: {looked}{hint}")
     return scan, group_series(scan)
 

@@ -16,6 +16,7 @@ from pathlib import Path
 from clrecon.dicom.containers import describe_container
 from clrecon.dicom.disk import DiskReader, Progress
 from clrecon.dicom.elements import META_START, CorruptFileError, FileStart, has_dicom_mark
+from clrecon.dicom.forced import FORCE_HINT, restore_start
 from clrecon.dicom.header import OtherImage, SliceHeader, read_headers
 from clrecon.dicom.text import escape_text
 from clrecon.errors import NoDicomError
@@ -25,6 +26,7 @@ __all__ = ["CorruptFile", "Progress", "Scan", "scan_path"]
 DICOM_SUFFIXES = (".dcm", ".dic", ".dicom", ".ima")
 PROGRESS_STEPS = 1000
 BLANK_START = bytes(128) + b"DICM"
+BARE_DATA_SET = f"a data set without preamble ({FORCE_HINT})"
 APPLE_DOUBLE = b"\x00\x05\x16\x07"
 """Start of the "._NAME" files that macOS puts beside the files of a foreign disk."""
 
@@ -68,7 +70,7 @@ class Scan:
     files: int = 0
 
 
-def scan_path(path: Path, progress: Progress | None = None) -> Scan:
+def scan_path(path: Path, progress: Progress | None = None, force: bool = False) -> Scan:
     """Read the headers of all DICOM files at `path`.
 
     Parameters
@@ -78,6 +80,8 @@ def scan_path(path: Path, progress: Progress | None = None) -> Scan:
     progress : callable, optional
         Called as ``progress("scan", done, total)``, about `PROGRESS_STEPS` times in all, and as
         ``progress("no answer yet from NAME", done, total)`` where the disk hangs.
+    force : bool
+        Take data sets without preamble or meta header too.
 
     Raises
     ------
@@ -92,14 +96,15 @@ def scan_path(path: Path, progress: Progress | None = None) -> Scan:
         total = scan.files = len(files)
         step = max(1, total // PROGRESS_STEPS)
         for done, (file, start) in enumerate(zip(files, disk.read_starts(files), strict=True), start=1):
-            _take_file(file, start, scan)
+            _take_file(file, start, scan, force)
             if progress is not None and (done % step == 0 or done == total):
                 progress("scan", done, total)
     return scan
 
 
-def _take_file(file: str, start: FileStart | OSError, scan: Scan) -> None:
-    if isinstance(start, FileStart) and not has_dicom_mark(start.prefix):
+def _take_file(file: str, start: FileStart | OSError, scan: Scan, force: bool) -> None:
+    marked = isinstance(start, OSError) or has_dicom_mark(start.prefix)
+    if isinstance(start, FileStart) and not marked and not (force and restore_start(start.prefix)):
         scan.skipped[describe_container(start.prefix) or "not DICOM"] += 1
         reason = _suspect(file, start.prefix)
         if reason:
@@ -108,7 +113,7 @@ def _take_file(file: str, start: FileStart | OSError, scan: Scan) -> None:
     try:
         if isinstance(start, OSError):
             raise start
-        headers = read_headers(Path(file), start)
+        headers = read_headers(Path(file), start, force)
     except CorruptFileError as error:
         scan.skipped["corrupt"] += 1
         scan.corrupt.append(CorruptFile(Path(file), str(error)))
@@ -132,6 +137,8 @@ def _suspect(file: str, start: bytes) -> str:
         return ""
     if 0 < len(start) < META_START and BLANK_START.startswith(start):
         return "cut within the preamble"
+    if restore_start(start) is not None:
+        return BARE_DATA_SET
     return "named like DICOM but is none" if os.path.splitext(name)[1].lower() in DICOM_SUFFIXES else ""
 
 

@@ -37,6 +37,7 @@ def describe_input(
     *,
     phase: int | None = None,
     allow_gaps: bool = False,
+    force: bool = False,
     pixels: bool = False,
     strict: bool = False,
     progress: Progress | None = None,
@@ -52,6 +53,8 @@ def describe_input(
         reader, and any usable series is enough then.
     phase, allow_gaps
         As in `clrecon.read_volume`, of the series that is judged.
+    force
+        As in `clrecon.read_volume`.
     pixels : bool
         Read the pixels of the series that is judged.
     strict : bool
@@ -70,7 +73,9 @@ def describe_input(
     """
     from clrecon.reading import list_series
 
-    found = list_series(source, series, phase=phase, allow_gaps=allow_gaps, pixels=pixels, progress=progress)
+    found = list_series(
+        source, series, phase=phase, allow_gaps=allow_gaps, force=force, pixels=pixels, progress=progress
+    )
     entries = [entry.as_dict() for entry in found.series]
     listing: dict[str, Any] = {"series": entries, "chosen": found.chosen, "certificate": found.certificate}
     notes, problem = list(found.warnings), found.refusal

@@ -80,7 +80,12 @@ def make_mesh(
 
         labels = open_labels(settings.labels)
         volume = read_volume(
-            source, settings.series, phase=settings.phase, allow_gaps=settings.allow_gaps, progress=progress
+            source,
+            settings.series,
+            phase=settings.phase,
+            allow_gaps=settings.allow_gaps,
+            force=settings.force,
+            progress=progress,
         )
         watch.lap("read")
         device = opening.wait()

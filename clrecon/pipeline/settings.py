@@ -35,6 +35,8 @@ class MeshSettings:
         Turn what is not the patient's body into air first, see `clrecon.geometry.body.remove_table`.
     field_of_view : float or "auto", optional
         Turn what lies further from the centre of the slices (mm) into air first; "auto": the circle that fits them.
+    force : bool
+        Read data sets without preamble or meta header.
     space : {"lps", "ras"}
         Patient frame of the written mesh.
     closed : bool
@@ -78,6 +80,7 @@ class MeshSettings:
     allow_gaps: bool = False
     remove_table: bool = False
     field_of_view: float | str | None = None
+    force: bool = False
     space: str = "lps"
     closed: bool = True
     topology: str = "separated"
