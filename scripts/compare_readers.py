@@ -101,7 +101,8 @@ def judge(found: dict[str, Any], truth: Marks) -> Cell:
     errors = np.linalg.norm(places[known] - expected, axis=1)
     notes = list(best["notes"])
     if truth.slices not in best["shape"]:
-        notes.append(f"{best['shape'][2]} slices")
+        count = best["shape"][2]
+        notes.append(f"{count} slice{'s' * (count != 1)}")
     if not known.all() and known.any():
         notes.append("mixed")
     lost = 1.0 - np.isin(truth.hu, hu).mean()

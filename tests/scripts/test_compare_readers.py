@@ -18,7 +18,7 @@ from trap_cases import Marks  # noqa: E402
 TRUTH = Marks(np.array([1, 2, 3, 4]), np.array([[0.0, 0, 0], [1, 0, 0], [0, 0, 2], [1, 0, 2]]), 2)
 
 
-def found(hu, lps_mm, *, shape=(2, 1, 2), notes=(), warnings=()):
+def found(hu, lps_mm, *, shape=(5, 6, 2), notes=(), warnings=()):
     volume = {"hu": hu, "lps_mm": lps_mm, "shape": list(shape), "notes": list(notes)}
     return {"volumes": [volume], "warnings": list(warnings)}
 
@@ -34,8 +34,8 @@ PLACES = TRUTH.lps_mm.tolist()
         (found([4, 3, 2, 1], PLACES), "2.24 S", True),
         (found([4, 3, 2, 1], PLACES, warnings=["beware"]), "2.24 W", False),
         (found([1, 2, 3, 4], (TRUTH.lps_mm + [0, 0, 0.004]).tolist()), "0.004 S", False),
-        (found([1, 2], PLACES[:2], shape=(2, 1, 1)), "0 S, 1 slices, 50% lost", True),
-        (found([1, 2, 9, 3, 4], [*PLACES[:2], [7, 7, 7], *PLACES[2:]], shape=(2, 1, 3)), "0 S, 3 slices, mixed", True),
+        (found([1, 2], PLACES[:2], shape=(5, 6, 1)), "0 S, 1 slice, 50% lost", True),
+        (found([1, 2, 9, 3, 4], [*PLACES[:2], [7, 7, 7], *PLACES[2:]], shape=(5, 6, 3)), "0 S, 3 slices, mixed", True),
         (found([1, 20, 30, 40], PLACES), "- S, HU wrong", True),
         (found([1, 2, 3, 4], PLACES, notes=["+_Tilt"]), "0 S, +_Tilt", False),
         ({"refused": "ValueError: no", "verdict": "R"}, "R", False),
