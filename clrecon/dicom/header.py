@@ -234,9 +234,6 @@ def read_headers(
             why = "without ImagePositionPatient (0020,0032): no geometry"
         return OtherImage(series, path, name, 1, "capture", f"{name}: secondary capture (SOP class {sop_class}): {why}")
     if sop_class in ENHANCED_CT:
-        if elements.restored:
-            why = f"{name}: multi-frame image without preamble or meta header: convert it to a DICOM file first"
-            return OtherImage(series, path, name, 1, "broken", why)
         return _read_frames(elements, series, path, name)
     try:
         _check_single_frame(values, sop_class)

@@ -167,10 +167,13 @@ def read_groups(path: Path, elements: DicomElements) -> Groups:
     Raises
     ------
     ValueProblem
-        NumberOfFrames is no sane number, the groups are missing, not as many as the frames, or cannot be parsed.
+        NumberOfFrames is no sane number, the groups are missing, not as many as the frames, or cannot be parsed;
+        the file has no meta header.
     OSError
         The file cannot be read.
     """
+    if elements.restored:
+        raise ValueProblem("multi-frame image without preamble or meta header: convert it to a DICOM file first")
     values = Values(elements)
     count = values.whole_or_none("NumberOfFrames")
     if count is None or not 1 <= count <= FRAMES_LIMIT:
