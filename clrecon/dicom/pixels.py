@@ -9,7 +9,6 @@ Float pixel data are HU as they are (float32, from 64 bits too): the standard gi
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import nullcontext
@@ -24,11 +23,10 @@ from clrecon.dicom.padding import PaddingMasks, pack_mask
 from clrecon.dicom.scan import Progress
 from clrecon.dicom.stored import StoredPixels, count_readers
 from clrecon.errors import RefusedInputError
-from clrecon.geometry.aligned import aligned_empty
+from clrecon.geometry.memory import allocate_voxels
 
 __all__ = ["PixelFacts", "read_voxels"]
 
-MEMORY_SHARE = 0.9
 MAX_READERS = 8
 MAX_DECODERS = 32
 FLOAT_LIMIT = 1e9
@@ -90,40 +88,12 @@ def read_voxels(
     # A missing decoder shows here, before anything is allocated.
     with StoredPixels(slices) if source is None else nullcontext(source) as source:
         for dtype in (np.int16, np.int32) if integral else (np.float32,):
-            voxels = _allocate(slices, np.dtype(dtype))
+            voxels = allocate_voxels((len(slices), slices[0].rows, slices[0].columns), dtype)
             try:
                 return voxels, _fill_volume(source, slices, voxels, progress)
             except _RangeError:
                 del voxels
     raise RefusedInputError("the rescaled values do not fit into 32 bits")
-
-
-def available_memory_bytes() -> int | None:
-    """Memory that can be taken without swapping; None where the system does not say."""
-    try:
-        with open("/proc/meminfo", encoding="ascii") as file:
-            for line in file:
-                if line.startswith("MemAvailable:"):
-                    return int(line.split()[1]) * 1024
-    except (OSError, ValueError):
-        pass  # not Linux: ask for the physical memory below
-    try:
-        return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    except (AttributeError, OSError, ValueError):
-        return None
-
-
-def _allocate(slices: Sequence[SliceHeader], dtype: np.dtype[Any]) -> NDArray[Any]:
-    shape = (len(slices), slices[0].rows, slices[0].columns)
-    needed = shape[0] * shape[1] * shape[2] * dtype.itemsize
-    available = available_memory_bytes()
-    what = f"the volume of {shape[2]} x {shape[1]} x {shape[0]} voxels needs {needed / 2**30:.2f} GiB of memory"
-    if available is not None and needed > MEMORY_SHARE * available:
-        raise RefusedInputError(f"{what}, {available / 2**30:.2f} GiB are free")
-    try:
-        return aligned_empty(shape, dtype)
-    except MemoryError as error:
-        raise RefusedInputError(f"{what}, which cannot be had") from error
 
 
 def _fill_volume(

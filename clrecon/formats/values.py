@@ -14,12 +14,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clrecon.dicom.pixels import MEMORY_SHARE, PixelFacts, available_memory_bytes
+from clrecon.dicom.pixels import PixelFacts
 from clrecon.dicom.scan import Progress
 from clrecon.errors import RefusedInputError
 from clrecon.formats.grid_file import GridFile
 from clrecon.geometry import AIR_HU
-from clrecon.geometry.aligned import aligned_empty
+from clrecon.geometry.memory import allocate_voxels
 
 __all__ = ["GridValues", "read_values"]
 
@@ -75,7 +75,7 @@ class _Filling:
     def __init__(self, grid: GridFile):
         self._grid = grid
         self._step = 0  # of the ladder
-        self._voxels = _allocate(grid, LADDER[0])
+        self._voxels = allocate_voxels(grid.shape_ijk[::-1], LADDER[0], grid.name)
         self._holes, self._low, self._high = 0, np.inf, -np.inf
 
     def add(self, k: int, stored: NDArray[Any]) -> None:
@@ -119,7 +119,7 @@ class _Filling:
         """Go up the ladder with the first `k` slices."""
         if step > self._step:
             narrow, self._step = self._voxels, step
-            self._voxels = _allocate(self._grid, LADDER[step])
+            self._voxels = allocate_voxels(self._grid.shape_ijk[::-1], LADDER[step], self._grid.name)
             self._voxels[:k] = narrow[:k]
 
     def finish(self) -> GridValues:
@@ -134,19 +134,6 @@ class _Filling:
             low, high = min(low, AIR_HU), max(high, AIR_HU)
         filled = float(AIR_HU) if self._holes else None
         return GridValues(voxels, PixelFacts(share, float(low), float(high), filled), warnings, doubts)
-
-
-def _allocate(grid: GridFile, dtype: np.dtype[Any]) -> NDArray[Any]:
-    ni, nj, nk = grid.shape_ijk
-    needed = ni * nj * nk * dtype.itemsize
-    available = available_memory_bytes()
-    what = f"{grid.name} has {ni} x {nj} x {nk} voxels, which need {needed / 2**30:.2f} GiB of memory"
-    if available is not None and needed > MEMORY_SHARE * available:
-        raise RefusedInputError(f"{what}; {available / 2**30:.2f} GiB are free")
-    try:
-        return aligned_empty((nk, nj, ni), dtype)
-    except MemoryError as error:
-        raise RefusedInputError(f"{what}, which cannot be had") from error
 
 
 def _scale(stored: NDArray[Any], grid: GridFile) -> NDArray[Any]:

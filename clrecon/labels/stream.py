@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-import os
 from collections.abc import Iterator
 from math import prod
 from typing import Any
@@ -13,6 +11,7 @@ from numpy.typing import NDArray
 
 from clrecon.errors import RefusedInputError
 from clrecon.formats.grid_file import GridFile
+from clrecon.geometry.memory import physical_memory_bytes
 from clrecon.labels.label_map import LARGEST_NUMBER
 
 __all__ = ["empty_labels", "iterate_labels"]
@@ -29,14 +28,6 @@ def empty_labels(name: str, shape: tuple[int, int, int]) -> NDArray[np.uint16]:
     raise RefusedInputError(
         f"{name} has {' x '.join(map(str, shape[::-1]))} voxels: {size / 2**30:,.1f} GiB, more memory than there is"
     )
-
-
-def physical_memory_bytes() -> float:
-    """Memory of this computer, infinite where the system does not tell."""
-    try:
-        return float(os.sysconf("SC_PHYS_PAGES")) * os.sysconf("SC_PAGE_SIZE")
-    except (AttributeError, ValueError, OSError):  # Windows
-        return math.inf
 
 
 def iterate_labels(grid: GridFile) -> Iterator[NDArray[np.uint16]]:

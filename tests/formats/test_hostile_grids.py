@@ -308,13 +308,15 @@ def test_sform_and_qform_that_differ_are_said(tmp_path):
 
 
 def test_a_small_file_that_would_fill_the_memory_is_refused(tmp_path, monkeypatch):
-    from clrecon.formats import values
+    from clrecon.geometry import memory
 
     path = write_nifti(tmp_path / "a.nii.gz", np.zeros((60, 400, 400), np.int16))
     assert path.stat().st_size < 100_000
-    monkeypatch.setattr(values, "available_memory_bytes", lambda: 2**20)
+    monkeypatch.setattr(memory, "available_memory_bytes", lambda: 2**20)
     tracemalloc.start()
-    with pytest.raises(RefusedInputError, match="400 x 400 x 60 voxels, which need 0.02 GiB of memory; 0.00 GiB are"):
+    with pytest.raises(
+        RefusedInputError, match="a.nii.gz: the volume of 400 x 400 x 60 voxels needs 0.02 GiB of memory, 0.00 GiB are"
+    ):
         clrecon.read_volume(path)
     assert tracemalloc.get_traced_memory()[1] < 8e6
     tracemalloc.stop()

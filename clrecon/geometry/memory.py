@@ -1,0 +1,66 @@
+"""Memory for voxels: asked for before it is taken, so that a small file cannot fill the computer."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import DTypeLike, NDArray
+
+from clrecon.errors import RefusedInputError
+from clrecon.geometry.aligned import aligned_empty
+
+__all__ = ["allocate_voxels", "available_memory_bytes", "physical_memory_bytes"]
+
+MEMORY_SHARE = 0.9
+"""Of the memory that is free; the rest is for what is computed beside the volume."""
+
+
+def available_memory_bytes() -> float:
+    """Memory that can be taken without swapping; all that there is, or infinity, where the system does not tell."""
+    try:
+        with open("/proc/meminfo", encoding="ascii") as file:
+            for line in file:
+                if line.startswith("MemAvailable:"):
+                    return float(line.split()[1]) * 1024
+    except (OSError, ValueError):
+        pass  # not Linux
+    return physical_memory_bytes()
+
+
+def physical_memory_bytes() -> float:
+    """Memory of this computer, infinite where the system does not tell (Windows)."""
+    try:
+        return float(os.sysconf("SC_PHYS_PAGES")) * os.sysconf("SC_PAGE_SIZE")
+    except (AttributeError, OSError, ValueError):
+        return math.inf
+
+
+def allocate_voxels(shape: Sequence[int], dtype: DTypeLike, name: str = "") -> NDArray[Any]:
+    """Return an uninitialised array for a volume, see `aligned_empty`.
+
+    Parameters
+    ----------
+    shape : (nk, nj, ni)
+    dtype : numpy type
+    name : str
+        Of the file, for the message.
+
+    Raises
+    ------
+    RefusedInputError
+        It does not fit into the memory that is free.
+    """
+    needed = math.prod(shape) * np.dtype(dtype).itemsize
+    available = available_memory_bytes()
+    size = " x ".join(map(str, reversed(shape)))
+    what = f"{name}{': ' * bool(name)}the volume of {size} voxels needs {needed / 2**30:.2f} GiB of memory"
+    if needed > MEMORY_SHARE * available:
+        raise RefusedInputError(f"{what}, {available / 2**30:.2f} GiB are free")
+    try:
+        return aligned_empty(shape, dtype)
+    except MemoryError as error:
+        raise RefusedInputError(f"{what}, which cannot be had") from error
