@@ -126,7 +126,9 @@ def _turn_into_air(volume: Volume, outside: Callable[[int], Mask], name: str, sa
     share = removed / voxels.size
     facts = {"voxels_removed": removed, "dense_voxels_removed": dense, "removed_share": round(share, 4), **said}
     facts["air_hu"] = float(air)
-    return volume.with_voxels(voxels, {**volume.report, name: facts})
+    masked = volume.with_voxels(voxels)
+    masked.report[name] = facts
+    return masked
 
 
 def _air_level(volume: Volume, outside: Callable[[int], Mask]) -> Any:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from copy import deepcopy
 from typing import Any
 
 import numpy as np
@@ -149,7 +150,7 @@ class Volume(Grid):
         if array.shape != self._voxels.shape:
             raise UsageError(f"the voxels have shape {array.shape}, those of this volume {self._voxels.shape}")
         positions = None if self._stack is None else self.slice_origins()
-        return Volume(array, self._affine, dict(self.report) if report is None else report, positions)
+        return Volume(array, self._affine, deepcopy(self.report) if report is None else report, positions)
 
     def release_slices(self, first: int, end: int) -> None:
         """Say that slices ``first`` to ``end - 1`` are not needed soon: those of a memory-mapped file leave memory.

@@ -93,6 +93,8 @@ def test_other_voxels_at_the_same_places():
     other = volume.with_voxels(np.full((6, 5, 4), 7.5, np.float32))
     assert other.ijk_to_lps([(1, 2, 3.5)]) == pytest.approx(volume.ijk_to_lps([(1, 2, 3.5)]))
     assert other.uneven and other.voxels.max() == 7.5 and other.report["warnings"] == ["kept"]
+    other.report["warnings"].append("its own")
+    assert volume.report["warnings"] == ["kept"]
     with pytest.raises(UsageError, match="shape"):
         volume.with_voxels(np.zeros((6, 5, 3)))
 
