@@ -36,6 +36,7 @@ _TAR_MARK = slice(257, 262), b"ustar"
 _PACKED = frozenset(
     ("zip archive", "gzip file", "bzip2 file", "xz file", "zstd file", "7z archive", "rar archive", "tar archive")
 )
+_GRIDS = frozenset(("NRRD volume", "MetaImage volume", "NIfTI volume"))
 
 
 def describe_container(start: bytes) -> str:
@@ -49,5 +50,10 @@ def describe_container(start: bytes) -> str:
 
 def advise_on(kinds: Iterable[str]) -> str:
     """What to do about files of these kinds; empty where there is nothing to be said."""
-    packed = sorted(_PACKED.intersection(kinds))
-    return f"unpack the {' and the '.join(packed)} and name the folder" if packed else ""
+    kinds = set(kinds)
+    packed, grids = sorted(_PACKED & kinds), sorted(_GRIDS & kinds)
+    advice = [f"unpack each {' and '.join(packed)} and name the folder"] if packed else []
+    if grids or "gzip file" in kinds:
+        what = " or ".join(grids) or "NIfTI volume (.nii.gz)"
+        advice.append(f"a {what} is read when the file itself is named")
+    return "; ".join(advice)

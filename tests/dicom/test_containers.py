@@ -46,7 +46,7 @@ PACKED = {
 def test_row_48_a_packed_series_is_named_with_what_to_do(tmp_path, kind):
     plan = write_series(tmp_path / "ct", Plan(shape=(2, 5, 6)))
     (tmp_path / "packed").write_bytes(PACKED[kind]((tmp_path / "ct" / plan.name(0)).read_bytes()))
-    with pytest.raises(NoDicomError, match=rf"1 file looked at \(1 {kind}\); unpack the {kind} and name the folder"):
+    with pytest.raises(NoDicomError, match=rf"1 file looked at \({kind}: 1\); unpack each {kind} and name the folder"):
         read_volume(tmp_path / "packed")
 
 
@@ -79,5 +79,9 @@ def test_kinds(start, kind):
 def test_advice_is_for_what_can_be_unpacked():
     assert advise_on(["PNG image", "not DICOM"]) == ""
     assert advise_on(["zip archive", "PNG image", "tar archive"]) == (
-        "unpack the tar archive and the zip archive and name the folder"
+        "unpack each tar archive and zip archive and name the folder"
     )
+    assert advise_on(["NRRD volume", "MetaImage volume"]) == (
+        "a MetaImage volume or NRRD volume is read when the file itself is named"
+    )
+    assert advise_on(["gzip file"]).endswith("; a NIfTI volume (.nii.gz) is read when the file itself is named")
