@@ -66,7 +66,7 @@ def _describe_residual(of: dict[str, Any]) -> str:
     largest, rms, allowed = (of[f"grid_{name}_mm"] for name in ("residual_max", "residual_rms", "tolerance"))
     if of["uneven"]:
         far = f"up to {largest:.3g} mm off even steps (rms {rms:.3g}, allowed {allowed:.3g})"
-        return f"uneven, {far}: each slice has its own place"
+        return f"uneven, {far}" + (": each slice has its own place" if of["spacing_mm"] else "")
     return f"within {max(largest, _FINEST_MM):.3g} mm of even steps (allowed {allowed:.3g})"
 
 
@@ -89,16 +89,18 @@ def _describe_thickness(thickness: dict[str, Any], usual_gap: float) -> str:
     text = f"{low:g} mm" if low == high else f"{low:g} to {high:g} mm"
     least, most, overlap = (thickness["overlap_mm"][name] for name in ("min", "max", "median"))
     if most - least > _SAME * usual_gap:
-        return f"{text}: between neighbouring slices from {_overlap(least)} to {_overlap(most)}"
+        return f"{text}: between neighbouring slices from {_overlap(least, usual_gap)} to {_overlap(most, usual_gap)}"
     if abs(overlap) <= _SAME * usual_gap:
         return f"{text}: neighbouring slices touch"
     percent = thickness["overlap_percent"]
     share = "" if percent is None else f" ({abs(percent):.0f} % of the gap)"
-    return f"{text}: {_overlap(overlap)} between neighbouring slices{share}"
+    return f"{text}: {_overlap(overlap, usual_gap)} between neighbouring slices{share}"
 
 
-def _overlap(length: float) -> str:
-    return f"{length:.3g} mm overlap" if length >= 0.0 else f"{-length:.3g} mm not measured"
+def _overlap(length: float, usual_gap: float) -> str:
+    if abs(length) <= _SAME * usual_gap:
+        return "nothing"
+    return f"{length:.3g} mm overlap" if length > 0.0 else f"{-length:.3g} mm not measured"
 
 
 def _describe_values(of: dict[str, Any]) -> Iterator[tuple[str, str]]:
@@ -108,7 +110,7 @@ def _describe_values(of: dict[str, Any]) -> Iterator[tuple[str, str]]:
     kind = rescale["type"] or "HU (the type is not stated)"
     yield "values", f"{span}{kind}; slope {slope}, intercept {intercept}"
     if of["padding_share"] is None:
-        yield "padding", "not looked at (--pixels reads it)"
+        yield "padding", "not looked at" + (" (--pixels reads it)" if of["spacing_mm"] else "")
     else:
         yield "padding", f"{100.0 * of['padding_share']:.1f} % of the voxels hold no measurement"
     yield "stored", "; ".join(of["transfer_syntax_names"]) + "; with lossy compression" * of["lossy"]

@@ -177,7 +177,9 @@ def _describe_volume(volume: dict[str, Any]) -> str:
         parts.append(f"{nk} slices of {ni} x {nj}")
     if volume.get("spacing_mm"):
         di, dj, dk = volume["spacing_mm"]
-        parts.append(f"spacing {di:.4g} x {dj:.4g} x {dk:.4g} mm")
+        gaps = volume["gap_mm"]
+        along = f", uneven gaps of {gaps['min']:.4g} to {gaps['max']:.4g}" if volume["uneven"] else f" x {dk:.4g}"
+        parts.append(f"spacing {di:.4g} x {dj:.4g}{along} mm")
     if volume.get("tilt_deg") and abs(volume["tilt_deg"]) >= 0.05:
         parts.append(f"tilt {volume['tilt_deg']:.2f} degrees")
     return ", ".join(parts)

@@ -104,20 +104,12 @@ def _are_several(entries: Sequence[dict[str, Any]], key: str) -> bool:
     return len({entry[key] for entry in entries} - {None}) > 1
 
 
-def _letter(number: int | None) -> str:
-    """1, 2, 3, ... as A, B, ... Z, AA, AB, ..."""
-    letters, rest = "", number or 0
-    while rest > 0:
-        letters, rest = chr(ord("A") + (rest - 1) % 26) + letters, (rest - 1) // 26
-    return letters or "-"
-
-
 def _columns(entries: Sequence[dict[str, Any]], chosen: int | None) -> Iterator[_Column]:
     """All columns that say something, from left to right."""
     yield _Column("", ["*" if entry["number"] == chosen else " " for entry in entries])
     yield _Column("series", [str(entry["number"]) for entry in entries], right=True)
     if _are_several(entries, "patient"):
-        yield _Column("patient", [_letter(entry["patient"]) for entry in entries])
+        yield _Column("patient", [str(entry["patient"] or "-") for entry in entries], right=True)
     if _are_several(entries, "study"):
         yield _Column("study", [str(entry["study"] or "-") for entry in entries], right=True)
     yield _Column("hash", [printable(entry["uid_hash"] or "-") for entry in entries], left_out=3)

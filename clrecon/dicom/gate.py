@@ -361,17 +361,6 @@ def group_places(headers: Sequence[SliceHeader]) -> list[list[SliceHeader]]:
     return places
 
 
-def count_missing(distances: Float64Array) -> int:
-    """Slices that a stack with sorted positions lacks, by the rule at `MISSING_RATIO`; duplicates count once."""
-    gaps = np.diff(distances)
-    gaps = gaps[gaps >= DUPLICATE_MM]
-    if len(gaps) < 2:
-        return 0
-    usual = median(gaps)
-    holes = [gaps[k] for k in np.flatnonzero(gaps > MISSING_RATIO * usual).tolist() if not _is_in_run(gaps, k)]
-    return sum(max(round(gap / usual) - 1, 1) for gap in holes)
-
-
 def _is_in_run(gaps: Float64Array, place: int) -> bool:
     """True when a gap is one of at least `RUN_LENGTH` consecutive gaps that equal it within `RUN_TOLERANCE`."""
     like = np.abs(gaps - gaps[place]) <= RUN_TOLERANCE * gaps[place]

@@ -6,6 +6,7 @@ import os
 import warnings as python_warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -147,6 +148,9 @@ def list_series(
             found = [judged if one is chosen else one for one in found]
             certificate = _certify_chosen(judged, scan, warnings, pixels, progress)
         entries = [describe_series(one, collect_series_warnings(one)) for one in found]
+        if certificate is not None:  # its pixels may say more than its headers
+            own = [text for text in certificate["warnings"] if text not in warnings]
+            entries = [replace(entry, warnings=own) if entry.number == number else entry for entry in entries]
     return SeriesListing(entries, number, dict(scan.skipped), warnings, certificate, refusal)
 
 
@@ -186,7 +190,7 @@ def _scan_and_group(path: str | os.PathLike[str], progress: Progress | None, for
         shown = escape_text(str(path), 256)
         if scan.skipped["corrupt"]:
             raise RefusedInputError(f"no readable DICOM file in {shown}, corrupt: {join_names(map(str, scan.corrupt))}")
-        reasons = ", ".join(f"{count} {reason}" for reason, count in sorted(scan.skipped.items()))
+        reasons = ", ".join(f"{reason}: {count}" for reason, count in sorted(scan.skipped.items()))
         looked = f"{scan.files} file{'s' * (scan.files != 1)} looked at" + (f" ({reasons})" if reasons else "")
         hint = "; a DICOMDIR only lists files: name the folder that holds them" if scan.skipped["DICOMDIR"] else ""
         packed = advise_on(scan.skipped)

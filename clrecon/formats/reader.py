@@ -65,7 +65,8 @@ def list_grid(path: Path, kind: str, *, pixels: bool = False, progress: Progress
     """
     grid = _open(path, kind)
     values = read_values(grid, progress) if pixels else None
-    certificate = certify_grid(grid, values, _collect_warnings(grid, values))
+    warnings = _collect_warnings(grid, values)
+    certificate = certify_grid(grid, values, warnings)
     copied = ("slices", "shape_ijk", "spacing_mm", "affine_ijk_to_lps_mm", "tilt_deg", "grid_residual_max_mm", "gap_mm",
               "uneven", "extent_mm", "slice_thickness_mm")  # fmt: skip
     entry = SeriesEntry(
@@ -73,7 +74,7 @@ def list_grid(path: Path, kind: str, *, pixels: bool = False, progress: Progress
         uid_hash=None,
         description=f"{grid.kind} file, voxels {grid.dtype.name}",
         modality=MODALITY,
-        warnings=collect_header_warnings(grid),
+        warnings=list(warnings),
         problems=[],
         **{name: certificate[name] for name in copied},
     )

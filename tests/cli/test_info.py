@@ -87,6 +87,22 @@ def test_pixels_are_read_on_request(ct: Path, capsys: pytest.CaptureFixture[str]
     assert "-1000 to 700 HU" in capsys.readouterr().out
 
 
+def test_what_pixels_tell_is_said_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    bright = set_values(PixelData=np.full((30, 30), 4095, np.uint16).tobytes(), BitsStored=12, HighBit=11)
+    write_plan(tmp_path, Plan(shape=(4, 30, 30), signed=False), lambda ds, k: bright(ds, k) if k == 2 else None)
+    text = "900 voxels are at 3071 HU, the ceiling of 12 bits"
+    assert main(["info", str(tmp_path)]) == 0
+    captured = capsys.readouterr()
+    assert text not in captured.out + captured.err
+    assert main(["info", str(tmp_path), "--pixels"]) == 0
+    captured = capsys.readouterr()
+    assert captured.out.count(text) == 1 and text not in captured.err
+    assert main(["info", str(tmp_path), "--pixels", "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["series"][0]["warnings"] == found["certificate"]["warnings"]
+    assert text in found["certificate"]["warnings"][-1]
+
+
 def test_the_table_marks_the_choice(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder = write_series(tmp_path / "ct", number=1)
     write_series(folder, np.full((6, 9, 9), -1000, np.int16), number=2)
@@ -133,8 +149,8 @@ def test_strict_holds_a_series_against_its_gates(tmp_path: Path, capsys: pytest.
     captured = capsys.readouterr()
     assert "FAILED     lossless: slices with lossy compression: 7, none allowed" in captured.out
     assert captured.err == (
-        "clrecon: error: series 1 fails 2 gates: gate hu_known failed: slices whose values are not known to be HU: 7, "
-        "none allowed; gate lossless failed: slices with lossy compression: 7, none allowed\n"
+        "clrecon: error: series 1 fails 2 gates: hu_known: slices whose values are not known to be HU: 7, "
+        "none allowed; lossless: slices with lossy compression: 7, none allowed\n"
     )
     assert main(["info", str(tmp_path / "lossy"), "--strict", "--json", "-q"]) == 4
     captured = capsys.readouterr()
@@ -147,6 +163,7 @@ def test_a_refused_series_has_its_certificate(tmp_path: Path, capsys: pytest.Cap
     assert main(["info", str(tmp_path / "hole")]) == 4
     captured = capsys.readouterr()
     assert "series 1, refused" in captured.out
+    assert "each slice has its own place" not in captured.out and "--pixels reads it" not in captured.out
     assert "FAILED     missing_slices: slices missing in between: 1, none allowed" in captured.out
     assert "series 1 cannot be used: 1 slice missing" in captured.err
 
@@ -208,7 +225,7 @@ def test_patients_and_studies_stand_apart() -> None:
     lines = render_listing(listing(*entries), [])
     assert lines[0].split()[:3] == ["series", "patient", "study"] and "phases" in lines[0]
     rows = [line.removeprefix("*").split()[:3] for line in lines if re.match(r"[* ] +\d", line)]
-    assert rows == [["1", "A", "1"], ["3", "A", "3"], ["2", "AB", "2"], ["5", "AB", "2"], ["4", "-", "-"]]
+    assert rows == [["1", "1", "1"], ["3", "1", "3"], ["2", "28", "2"], ["5", "28", "2"], ["4", "-", "-"]]
 
 
 def test_thousands_of_series_take_one_line_each() -> None:
