@@ -45,7 +45,10 @@ class Parser(argparse.ArgumentParser):
     def parse_known_args(self, args: Sequence[str] | None = None, namespace: Any = None) -> Any:  # type: ignore[override]
         """As argparse does, but ``--seed -12,3,40`` is an option with its value, as ``--hu -12`` is."""
         given = sys.argv[1:] if args is None else args
-        return super().parse_known_args(_join_negative_lists(given), namespace)
+        options, unknown = super().parse_known_args(_join_negative_lists(given), namespace)
+        if unknown:  # said here, the hint names the command
+            self.error(f"unrecognized arguments: {' '.join(unknown)}")
+        return options, unknown
 
     def error(self, message: str) -> NoReturn:
         raise UsageError(f"{message} (see: {self.prog} --help)")
@@ -75,7 +78,7 @@ def add_common(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--debug", action="store_true", help="print the traceback of an error")
 
 
-def add_device(parser: argparse.ArgumentParser) -> None:
+def add_device(parser: argparse._ActionsContainer) -> None:
     """Add --device."""
     parser.add_argument(
         "--device",
@@ -85,7 +88,7 @@ def add_device(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def add_memory(parser: argparse.ArgumentParser) -> None:
+def add_memory(parser: argparse._ActionsContainer) -> None:
     """Add --memory."""
     parser.add_argument(
         "--memory",

@@ -10,12 +10,13 @@ __all__ = ["add_masking", "masking_settings"]
 
 def add_masking(parser: argparse.ArgumentParser) -> None:
     """Declare ``--remove-table`` and ``--fov``."""
-    parser.add_argument(
+    group = parser.add_argument_group("masking")
+    group.add_argument(
         "--remove-table",
         action="store_true",
         help="turn what is not the patient's body into air first: table, blankets, cables",
     )
-    parser.add_argument(
+    group.add_argument(
         "--fov",
         nargs="?",
         const="auto",

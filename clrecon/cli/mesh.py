@@ -12,7 +12,13 @@ from clrecon.cli.levels import LEVELS_HELP, parse_hu
 from clrecon.cli.masking import add_masking, masking_settings
 from clrecon.cli.points import parse_point
 from clrecon.cli.reading import add_reading, reading_settings
-from clrecon.cli.refinement import add_refinement, describe_refinement, finish_with_gates, refinement_settings
+from clrecon.cli.refinement import (
+    add_refinement,
+    add_strict,
+    describe_refinement,
+    finish_with_gates,
+    refinement_settings,
+)
 from clrecon.pipeline.presets import DEFAULT_PRESET, PRESETS
 
 __all__ = ["add_arguments", "describe_mesh", "run"]
@@ -55,27 +61,31 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "-o", "--output", metavar="OUT", required=True, help="mesh file: .stl .ply .obj .glb .vtp or .3mf"
     )
-    level = parser.add_mutually_exclusive_group()
+    add_reading(parser)
+    add_masking(parser)
+    surface = parser.add_argument_group("surface")
+    level = surface.add_mutually_exclusive_group()
     level.add_argument("--hu", type=parse_hu, default={}, metavar="N[,N...]|auto|half:B,T", help=LEVELS_HELP)
     level.add_argument(
         "--preset",
         metavar="NAME",
         help=f"iso value by tissue, one of: {', '.join(PRESETS)} (default: {DEFAULT_PRESET})",
     )
-    parser.add_argument("--space", default="lps", metavar="lps|ras", help="patient frame of the mesh (default: lps)")
-    parser.add_argument(
+    surface.add_argument("--space", default="lps", metavar="lps|ras", help="patient frame of the mesh (default: lps)")
+    surface.add_argument(
         "--topology",
         default="separated",
         metavar="T",
         help="what is done where the voxels leave open which of them are joined: separated keeps them apart (default),"
         " trilinear joins those that the trilinear interpolation joins",
     )
-    parser.add_argument("--open", action="store_true", help="leave the surface open at the border of the volume")
-    parser.add_argument("--keep-largest", type=int, metavar="N", help="keep the N largest components only")
-    parser.add_argument(
+    surface.add_argument("--open", action="store_true", help="leave the surface open at the border of the volume")
+    components = parser.add_argument_group("components")
+    components.add_argument("--keep-largest", type=int, metavar="N", help="keep the N largest components only")
+    components.add_argument(
         "--min-volume", type=float, metavar="ML", help="keep components of at least ML millilitres only"
     )
-    parser.add_argument(
+    components.add_argument(
         "--seed",
         type=parse_point,
         metavar="X,Y,Z",
@@ -84,14 +94,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="keep the component whose surface lies nearest to this point, in mm of the frame of --space;"
         " repeat it for several",
     )
-    parser.add_argument("--split", action="store_true", help="write one file a component, the largest first")
-    add_reading(parser)
-    add_masking(parser)
+    components.add_argument("--split", action="store_true", help="write one file a component, the largest first")
     add_label_arguments(parser)
     add_refinement(parser)
-    add_device(parser)
-    add_memory(parser)
-    parser.add_argument("--report", metavar="FILE", help="write affine, counts, quality, device and times as JSON")
+    device = parser.add_argument_group("device")
+    add_device(device)
+    add_memory(device)
+    checks = parser.add_argument_group("checks")
+    add_strict(checks)
+    checks.add_argument("--report", metavar="FILE", help="write affine, counts, quality, device and times as JSON")
 
 
 def run(options: argparse.Namespace, console: Console) -> int:

@@ -7,7 +7,14 @@ from typing import Any
 
 from clrecon.cli.console import Console
 
-__all__ = ["GATE_FAILED", "add_refinement", "describe_refinement", "finish_with_gates", "refinement_settings"]
+__all__ = [
+    "GATE_FAILED",
+    "add_refinement",
+    "add_strict",
+    "describe_refinement",
+    "finish_with_gates",
+    "refinement_settings",
+]
 
 GATE_FAILED = 8
 """Exit code: everything is written, and ``--strict`` was asked for."""
@@ -16,8 +23,9 @@ _ITERATIONS = 20
 
 
 def add_refinement(parser: argparse.ArgumentParser) -> None:
-    """Add --smooth, --decimate, --max-deviation and --strict."""
-    parser.add_argument(
+    """Add --smooth, --decimate and --max-deviation."""
+    group = parser.add_argument_group("refinement")
+    group.add_argument(
         "--smooth",
         type=int,
         nargs="?",
@@ -25,22 +33,27 @@ def add_refinement(parser: argparse.ArgumentParser) -> None:
         metavar="N",
         help=f"smooth with N iterations of a windowed sinc filter (default: {_ITERATIONS})",
     )
-    parser.add_argument(
+    group.add_argument(
         "--decimate",
         type=float,
         metavar="SHARE",
         help="take away this share of the triangles, such as 0.9, or as much as the largest deviation lets",
     )
-    parser.add_argument(
+    group.add_argument(
         "--max-deviation",
         type=float,
         metavar="MM",
         help="smoothing and decimation each move no vertex further (default: a quarter of the shortest voxel step)",
     )
+
+
+def add_strict(parser: argparse._ActionsContainer) -> None:
+    """Add --strict."""
     parser.add_argument(
         "--strict",
         action="store_true",
-        help=f"exit with {GATE_FAILED} when a mesh fails a gate: closed, manifold, no cuts, close to the scan ...",
+        help=f'exit with {GATE_FAILED} when a gate fails, of the scan (see "clrecon info") or of a mesh: closed,'
+        " manifold, no cuts, close to the scan ...",
     )
 
 

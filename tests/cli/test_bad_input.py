@@ -197,7 +197,7 @@ def test_report_and_mesh_are_two_files(tmp_path: Path, target: Path, capsys: pyt
         (["--seed", "-1,2,x"], "'-1,2,x' is no point"),
         (["--seed", "1,2,inf"], "three numbers"),
         (["--space", "mni"], "unknown space 'mni'"),
-        (["--colour"], "unrecognized arguments: --colour"),
+        (["--colour"], "unrecognized arguments: --colour (see: clrecon mesh --help)"),
         (["-q", "-v"], "not allowed with"),
     ],
 )
