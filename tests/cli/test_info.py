@@ -297,4 +297,6 @@ def test_mesh_strict_counts_the_gates_of_the_volume(
     assert [gate["name"] for gate in report["volume"]["gates"] if gate["ok"] is False] == ["lossless"]
     assert any("lossy compression" in text for text in report["warnings"])
     assert set(report["volume"]) == names_in("The certificate") - {"warnings"}
+    assert set(report) == names_in("clrecon mesh") - {"preset_reason"}
+    assert set(report["meshes"][0]) - set(report) <= names_in("clrecon mesh", "Of each mesh in `meshes`")
     assert b"comment CERTIFICATE gate_failed lossless: slices with lossy" in (tmp_path / "a.ply").read_bytes()
