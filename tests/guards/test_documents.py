@@ -12,7 +12,7 @@ from house import ROOT
 
 DOCUMENTS = [
     "README.md", "CONTRIBUTING.md", "CHANGELOG.md", "docs/contract.md", "docs/iso_value.md", "docs/geometry.md",
-    "docs/certificate.md",
+    "docs/certificate.md", "docs/formats.md", "docs/labels.md",
 ]  # fmt: skip
 LINK = re.compile(r"\[[^\]]*\]\(([^)#\s]+)[^)]*\)")
 QUOTED = re.compile(r"`((?:\.ci|cl|clrecon|docs|scripts|tests)/[\w./-]*|(?:setup\.cfg|\w+\.(?:md|toml)))`")
@@ -71,6 +71,10 @@ def test_the_commands_of_documents_are_understood() -> None:
     assert {command[0] for command in commands} >= {"demo", "mesh", "info", "devices", "phantom", "selftest"}
     more = find_commands((ROOT / "docs" / "certificate.md").read_text(encoding="utf-8"))
     assert [command[0] for command in more] == ["phantom", "info"]
+    for name in ("formats", "iso_value", "labels"):
+        found = find_commands((ROOT / "docs" / f"{name}.md").read_text(encoding="utf-8"))
+        assert found
+        more += found
     for command in commands + more:
         parse_command(command)
 
