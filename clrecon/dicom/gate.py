@@ -23,7 +23,7 @@ from clrecon.dicom.numbers import median
 from clrecon.dicom.text import join_names
 from clrecon.geometry import compose_affine, tilt_degrees
 
-__all__ = ["Holes", "Line", "Stack", "group_places", "measure_stack"]
+__all__ = ["Holes", "Line", "Stack", "group_places", "measure_stack", "measure_stated_gap"]
 
 Float64Array = NDArray[np.float64]
 
@@ -155,7 +155,7 @@ def measure_stack(headers: Sequence[SliceHeader], allow_gaps: bool = False) -> S
         if not problems:
             assert line.step is not None and line.origin is not None
             affine = compose_affine(row * slices[0].di_mm, column * slices[0].dj_mm, line.step, line.origin)
-        warnings += _compare_stated_gap(slices, line.gap_median_mm)
+        warnings += _describe_stated_gap(measure_stated_gap(slices, positions, line.gap_median_mm))
     tilt = None if affine is None else tilt_degrees(affine)
     if tilt is not None and tilt > TILT_REPORT_DEG:
         warnings.append(f"gantry tilt {tilt:.2f} degrees: kept exactly, as a shear")
@@ -377,8 +377,24 @@ def _join_places(places: list[str]) -> str:
     return shown if len(places) <= PLACES_SHOWN else f"{shown}; and {len(places) - PLACES_SHOWN} more"
 
 
-def _compare_stated_gap(slices: Sequence[SliceHeader], usual: float | None) -> list[str]:
+def measure_stated_gap(
+    slices: Sequence[SliceHeader], positions: Float64Array, usual: float | None
+) -> tuple[float, float, float] | None:
+    """SpacingBetweenSlices, the usual distance of the positions (n, 3), and by which share of it the two differ.
+
+    Scanners state the distance along the normal or, tilted, along the table: the nearer one counts.  None where it is
+    not stated or there is no distance.
+    """
     stated = next((h.stated_gap_mm for h in slices if h.stated_gap_mm is not None), None)
-    if stated is None or not usual or abs(stated - usual) <= STATED_GAP_TOLERANCE * usual:
+    if stated is None or not usual:
+        return None
+    along_table = median(np.linalg.norm(np.diff(positions, axis=0), axis=1))
+    measured = min((usual, along_table), key=lambda length: abs(stated - length))
+    return stated, measured, abs(stated - measured) / measured
+
+
+def _describe_stated_gap(found: tuple[float, float, float] | None) -> list[str]:
+    if found is None or found[2] <= STATED_GAP_TOLERANCE:
         return []
-    return [f"SpacingBetweenSlices says {stated:g} mm, the positions say {usual:.4g} mm: the positions are used"]
+    stated, measured, _ = found
+    return [f"SpacingBetweenSlices says {stated:g} mm, the positions say {measured:.4g} mm: the positions are used"]

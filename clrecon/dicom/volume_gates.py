@@ -8,18 +8,16 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 
-import numpy as np
-
 from clrecon.dicom.gate import (
     ORIENTATION_EXACT,
     ORIENTATION_SPREAD_RAD,
     STATED_GAP_TOLERANCE,
     Stack,
     group_places,
+    measure_stated_gap,
 )
 from clrecon.dicom.header import SliceHeader
 from clrecon.dicom.layout import measure_orientation
-from clrecon.dicom.numbers import median
 from clrecon.dicom.pixels import PixelFacts
 from clrecon.dicom.series import Series
 from clrecon.errors import RefusedInputError
@@ -93,19 +91,12 @@ def _count_doubled(series: Series) -> int:
 
 
 def _judge_stated_gap(stack: Stack) -> Gate:
-    """SpacingBetweenSlices against the positions: the one trace that is left when every second slice is gone.
-
-    Scanners state it along the normal or, tilted, along the table: the nearer one counts.
-    """
+    """SpacingBetweenSlices against the positions: the one trace that is left when every second slice is gone."""
     what, bound = "SpacingBetweenSlices differs from the positions by", 100.0 * STATED_GAP_TOLERANCE
-    stated = next((h.stated_gap_mm for h in stack.slices if h.stated_gap_mm is not None), None)
-    usual = stack.line.gap_median_mm
-    if stated is None or not usual:
+    found = measure_stated_gap(stack.slices, stack.positions_mm, stack.line.gap_median_mm)
+    if found is None:
         return unmeasured("stated_gap", bound, "%", f"{what}: it is not stated")
-    steps = np.diff(stack.positions_mm, axis=0)
-    along = median(np.linalg.norm(steps, axis=1))
-    off = min(abs(stated - length) / length for length in (usual, along or usual))
-    return at_most("stated_gap", 100.0 * off, bound, "%", what)
+    return at_most("stated_gap", 100.0 * found[2], bound, "%", what)
 
 
 def _gates_of_values(headers: Sequence[SliceHeader]) -> Iterator[Gate]:
