@@ -30,8 +30,8 @@ def read_volume(
     *,
     phase: int | None = None,
     allow_gaps: bool = False,
+    force: bool = False,
     progress: Progress | None = None,
-    **dicom_options: Any,
 ) -> Volume:
     """Read a volume in HU and LPS mm, from DICOM or from a NIfTI, NRRD or MetaImage file.
 
@@ -41,17 +41,26 @@ def read_volume(
         A folder of DICOM files, searched with its subfolders; one DICOM file; or a file with a grid and its affine:
         NIfTI (.nii, .nii.gz, .hdr with .img), NRRD (.nrrd), MetaImage (.mha, .mhd).  Those need the extra
         ``clrecon[volumes]``.  Told from the content.
-    series, phase, allow_gaps, **dicom_options
-        What is read of a DICOM folder, see `clrecon.dicom.read_volume`.
+    series : int or str, optional
+        Which series of a DICOM folder: its number in the listing (from 1), SeriesInstanceUID, its hash, or
+        description.  Default: the CT series with most slices; what was left is said in the warnings.
+    phase : int, optional
+        Number of the phase, where a series holds several volumes at the same places (`list_series` lists them).
+    allow_gaps : bool
+        Read a stack with missing slices: what is there is placed exactly, with a warning.
+    force : bool
+        Read data sets without preamble or meta header too, their encoding guessed, with a warning.
     progress : callable, optional
-        Called as ``progress(stage, done, total)`` with stage "scan" or "read".
+        Called as ``progress(stage, done, total)`` with stage "scan" or "read", or "no answer yet from NAME" where the
+        disk hangs.
 
     Returns
     -------
     Volume
         ``voxels`` (nk, nj, ni) int16, int32 or float32; ``affine`` index (i, j, k) to LPS mm; ``report`` the
-        certificate.  Of files that are not DICOM the values are what the file says (with its slope and intercept):
-        whole numbers int16 or int32 whatever type they are stored in, others float32, NaN -1024.
+        certificate.  Unevenly spaced slices keep their own positions (`Volume.uneven`).  Of files that are not DICOM
+        the values are what the file says (with its slope and intercept): whole numbers int16 or int32 whatever type
+        they are stored in, others float32, NaN -1024.
 
     Raises
     ------
@@ -60,14 +69,15 @@ def read_volume(
     RefusedInputError
         Corrupt files, or geometry or values that cannot be trusted; names files and figures.
     UsageError
-        `series` names none or several; an option for DICOM with another format; a missing package; `path` is empty.
+        `series` names none or several; there is no such `phase`; an option for DICOM with another format; a missing
+        package; `path` is empty.
     """
     kind = _tell_format(path)
     if kind is None:
         from clrecon.dicom import read_volume as read_dicom
 
-        return read_dicom(path, series, phase=phase, allow_gaps=allow_gaps, progress=progress, **dicom_options)
-    _refuse_options(kind, series=series, phase=phase, allow_gaps=allow_gaps, **dicom_options)
+        return read_dicom(path, series, phase=phase, allow_gaps=allow_gaps, force=force, progress=progress)
+    _refuse_options(kind, series=series, phase=phase, allow_gaps=allow_gaps, force=force)
     from clrecon.formats import read_grid
 
     return read_grid(Path(path), kind, progress=progress)
@@ -79,15 +89,15 @@ def list_series(
     *,
     phase: int | None = None,
     allow_gaps: bool = False,
+    force: bool = False,
     pixels: bool = False,
     progress: Progress | None = None,
-    **dicom_options: Any,
 ) -> SeriesListing:
     """List what `read_volume` can read at a path, with the certificate of what it would read.
 
     Parameters
     ----------
-    path, series, phase, allow_gaps, progress, **dicom_options
+    path, series, phase, allow_gaps, force, progress
         As in `read_volume`.
     pixels : bool
         Read the voxels too, for what only they can say; without it only headers are read.
@@ -108,9 +118,9 @@ def list_series(
         from clrecon.dicom import list_series as list_dicom
 
         return list_dicom(
-            path, series, phase=phase, allow_gaps=allow_gaps, pixels=pixels, progress=progress, **dicom_options
+            path, series, phase=phase, allow_gaps=allow_gaps, force=force, pixels=pixels, progress=progress
         )
-    _refuse_options(kind, series=series, phase=phase, allow_gaps=allow_gaps, **dicom_options)
+    _refuse_options(kind, series=series, phase=phase, allow_gaps=allow_gaps, force=force)
     from clrecon.formats import list_grid
 
     return list_grid(Path(path), kind, pixels=pixels, progress=progress)
