@@ -123,6 +123,11 @@ class Volume(Grid):
     def slice_origins(self, border: int = 0) -> Float64Array:
         """Positions in LPS mm of voxel (0, 0, k) for k from ``-border`` to ``nk - 1 + border``.
 
+        Parameters
+        ----------
+        border : int
+            Slices to go on beyond either end, in the steps of the ends.
+
         Returns
         -------
         ndarray, shape (nk + 2 * border, 3), float64
