@@ -153,6 +153,21 @@ def make_series(syntax: str) -> tuple[bytes, ...]:
     return tuple(files)
 
 
+def make_phases() -> tuple[bytes, ...]:
+    """Two phases of a padded stack with uneven gaps, a copy of a slice, and a localizer."""
+    files = []
+    for phase in (1, 2):
+        plan = Plan(slope=phase, offsets={2: 0.4}, **PLAN)
+        for k in (0, 1, 2, 2):
+            ds = make_dataset(plan, k)
+            ds.AcquisitionNumber, ds.AcquisitionTime = phase, f"1200{phase}0"
+            ds.PixelPaddingValue, ds.PixelPaddingRangeLimit = 905, 907
+            files.append(save_bytes(ds))
+    scout = make_dataset(Plan(angles=(0, 90, 90), **PLAN), 0)
+    scout.ImageType = ["ORIGINAL", "PRIMARY", "LOCALIZER"]
+    return (*files, save_bytes(scout))
+
+
 @functools.cache
 def phantom_seeds() -> dict[str, Seed]:
     seeds = {}

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hostile_bytes import CHANGE_LISTS, Seed, apply_changes, phantom_seeds, pydicom_seeds
+from hostile_bytes import CHANGE_LISTS, Seed, apply_changes, make_phases, phantom_seeds, pydicom_seeds
 from hypothesis import HealthCheck, Phase, given, seed, settings
 from hypothesis import strategies as st
 
@@ -66,12 +66,12 @@ def check_one_read(read: Callable[[], Any]) -> Any:
     return found
 
 
-def check_folder(folder: Path) -> None:
+def check_folder(folder: Path, force: bool = False, phase: int | None = None) -> None:
     """Read and list a folder of hostile files; whatever is said of it is JSON and holds no patient data."""
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        volume = check_one_read(lambda: read_volume(folder))
-        listing = check_one_read(lambda: list_series(folder))
+        volume = check_one_read(lambda: read_volume(folder, phase=phase, force=force))
+        listing = check_one_read(lambda: list_series(folder, force=force))
     told = []
     if volume is not None:
         assert np.isfinite(volume.affine).all() and volume.voxels.size > 0
@@ -124,7 +124,8 @@ def pick(seeds: dict[str, Seed]) -> Any:
 
 @pytest.mark.fuzz
 def test_mutated_slices_of_a_series(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    seeds = phantom_seeds()
+    phases = make_phases()
+    seeds = {**phantom_seeds(), "phases": Seed("phases", phases[len(phases) // 2], phases)}
 
     def check(example: tuple[str, list[Any], str]) -> None:
         name, changes, scope = example
@@ -134,7 +135,7 @@ def test_mutated_slices_of_a_series(tmp_path: Path, capfd: pytest.CaptureFixture
         for k in chosen:
             files[k] = apply_changes(seed_file, files[k], changes)
         write_files(tmp_path / "ct", [files[len(files) // 2]] if scope == "alone" else files)
-        check_folder(tmp_path / "ct")
+        check_folder(tmp_path / "ct", phase=1 if name == "phases" else None)
 
     for name in seeds:
         write_files(tmp_path / "ct", list(seeds[name].series))
@@ -149,9 +150,9 @@ def test_mutated_files_of_pydicom(tmp_path: Path, capfd: pytest.CaptureFixture[s
     assert len(seeds) > 60
 
     def check(example: tuple[str, list[Any], str]) -> None:
-        name, changes, _ = example
+        name, changes, scope = example
         write_files(tmp_path / "ct", [apply_changes(seeds[name], seeds[name].data, changes)])
-        check_folder(tmp_path / "ct")
+        check_folder(tmp_path / "ct", force=scope == "all")
 
     for name in seeds:
         write_files(tmp_path / "ct", [seeds[name].data])
@@ -164,13 +165,14 @@ def test_mutated_files_of_pydicom(tmp_path: Path, capfd: pytest.CaptureFixture[s
 def test_random_bytes(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     start = bytes(128) + b"DICM"
     syntax = b"\x02\0\x10\0UI\x14\x001.2.840.10008.1.2.1\0"
-    heads = st.sampled_from([b"", start, start + syntax, start + syntax.replace(b".2.1\0", b".2.2\0")])
+    heads = st.sampled_from([b"", b"", start, start + syntax, start + syntax.replace(b".2.1\0", b".2.2\0")])
+    bodies = st.binary(max_size=400) | st.binary(max_size=60).map(lambda data: b"\x08\0\x05\0CS\x02\0 A" + data)
 
     def check(example: tuple[bytes, bytes]) -> None:
         write_files(tmp_path / "ct", [b"".join(example)])
-        check_folder(tmp_path / "ct")
+        check_folder(tmp_path / "ct", force=not example[0])
 
-    assert run_campaign(st.tuples(heads, st.binary(max_size=400)), check, 0.1 * SECONDS) > SECONDS
+    assert run_campaign(st.tuples(heads, bodies), check, 0.1 * SECONDS) > SECONDS
     assert capfd.readouterr() == ("", "")
 
 
