@@ -14,6 +14,12 @@ def copy(data, request):
     return np.frombuffer(data, request["dtype"]).reshape(request["rows"], request["columns"])
 
 
+def nap(data, request):
+    """As `copy`, after a second."""
+    time.sleep(1.0)
+    return copy(data, request)
+
+
 def crash(data, request):
     os.kill(os.getpid(), signal.SIGSEGV)
     time.sleep(60)

@@ -15,9 +15,12 @@ import subprocess
 import sys
 import threading
 import time
+from contextlib import ExitStack
+from io import FileIO
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.dicom.decoder_process import DONE, FAILED, NO_DECODER, NO_MEMORY, READY, REPLY
@@ -32,6 +35,9 @@ START_SECONDS = 120.0
 FRAME_SECONDS = 60.0
 SECONDS_PER_MIB = 1.0
 """A frame may take `FRAME_SECONDS`, and this much more for each MiB of its pixels: a hundred times what it needs."""
+
+STOPPED_SECONDS = 2.0
+"""When this process itself stood still for longer (Ctrl-Z, a laptop that sleeps), the decoders did too."""
 
 FRAME_MEMORY_BYTES = 256 * 2**20
 MEMORY_PER_PIXEL_BYTE = 32
@@ -127,7 +133,10 @@ class DecoderPool:
             self._bury(worker)
             raise
         with self._lock:
-            self._idle.append(worker)
+            if not worker.overdue:
+                self._idle.append(worker)
+        if worker.overdue:  # the frame came in the very moment that its time was up
+            self._bury(worker)
         if status == NO_MEMORY:
             raise DecoderError(f"need more than {self.memory_bytes // 2**20} MiB of memory to decode")
         if status != DONE:
@@ -147,7 +156,8 @@ class DecoderPool:
         with self._lock:
             workers, self._workers, self._idle = self._workers, [], []
         for worker in workers:
-            worker.close_input()
+            # It has nothing to lose, and its input may stay open in a process that was forked meanwhile.
+            worker.process.kill()
         for worker in workers:
             worker.wait()
         if self._watchdog is not None:
@@ -174,13 +184,18 @@ class DecoderPool:
 
     def _watch(self) -> None:
         """End processes that take too long: the one way that works on every system with every decoder."""
-        while not self._stopping.wait(min(0.5, self.seconds / 4)):
+        interval, before = min(0.5, self.seconds / 4), time.monotonic()
+        while not self._stopping.wait(interval):
             now = time.monotonic()
+            stopped = now - before - interval
             with self._lock:
-                late = [worker for worker in self._workers if worker.deadline < now]
-            for worker in late:
-                worker.overdue = True
-                worker.process.kill()
+                for worker in self._workers:
+                    if stopped > STOPPED_SECONDS:
+                        worker.deadline += stopped
+                    elif worker.deadline < now:
+                        worker.overdue = True
+                        worker.process.kill()
+            before = now
 
     def _bury(self, worker: _Worker) -> str:
         """Take a process that is dead or of no use out of the pool; say what became of it."""
@@ -217,32 +232,30 @@ class _Worker:
         self.deadline = time.monotonic() + START_SECONDS
         if getattr(sys, "frozen", False) or not sys.executable:
             raise DecoderError("cannot be decoded: that needs a Python interpreter to start, and this program has none")
-        # Of this pipe the process holds the other end: the system tells it when we are gone (see `end_with`).
-        theirs = self._lifeline = -1
-        try:
+        with ExitStack() as theirs, ExitStack() as ours:
+            requests, self._input = _open_pipe(theirs, ours)
+            self._output, replies = _open_pipe(ours, theirs)
+            number = -1
             if sys.platform.startswith("linux"):
-                theirs, self._lifeline = os.pipe()
-            self.process = subprocess.Popen(
-                [sys.executable, "-I", "-S", str(SCRIPT), str(theirs)],
-                bufsize=0,
-                stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE,
-                stderr=subprocess.DEVNULL,
-                pass_fds=[theirs] if theirs >= 0 else [],
-                env={**os.environ, **ENVIRONMENT},
-                creationflags=getattr(subprocess, "CREATE_NO_WINDOW", 0),
-            )
-        except OSError as error:
-            _close(self._lifeline)
-            raise DecoderError(
-                f"cannot be decoded: no process can be started for it ({error.strerror or error}); "
-                "uncompressed images need none"
-            ) from error
-        finally:
-            _close(theirs)
-        assert self.process.stdin is not None and self.process.stdout is not None
-        self._input, self._output = self.process.stdin, self.process.stdout
-        path = [entry for entry in sys.path if isinstance(entry, str)]
+                # Of this pipe we hold the other end: the system tells the process when we are gone (see `end_with`).
+                number = _open_pipe(theirs, ours)[0].fileno()
+            try:
+                self.process = subprocess.Popen(
+                    [sys.executable, "-I", "-S", str(SCRIPT), str(number)],
+                    stdin=requests,
+                    stdout=replies,
+                    stderr=subprocess.DEVNULL,
+                    pass_fds=[number] if number >= 0 else [],
+                    env={**os.environ, **ENVIRONMENT},
+                    creationflags=getattr(subprocess, "CREATE_NO_WINDOW", 0),
+                )
+            except OSError as error:
+                raise DecoderError(
+                    f"cannot be decoded: no process can be started for it ({error.strerror or error}); "
+                    "uncompressed images need none"
+                ) from error
+            self._ours = ours.pop_all()
+        path = _find_modules()
         self._settings = {"path": path, "decoders": decoders, "seconds": seconds, "memory_bytes": memory_bytes}
 
     def ask(self, request: dict[str, Any], data: bytes, out: NDArray[Any], seconds: float) -> tuple[int, str]:
@@ -271,10 +284,6 @@ class _Worker:
         self.deadline = float("inf")
         return status, text
 
-    def close_input(self) -> None:
-        """Tell the process to end."""
-        self._input.close()
-
     def wait(self) -> bool:
         """Wait for its end, kill it where that takes long, and close the pipes; False when it had to be killed."""
         self._input.close()
@@ -285,9 +294,7 @@ class _Worker:
             self.process.kill()
             self.process.wait()
             ended_itself = False
-        self._output.close()
-        _close(self._lifeline)
-        self._lifeline = -1
+        self._ours.close()
         return ended_itself
 
     def _write(self, data: bytes) -> None:
@@ -316,6 +323,30 @@ class _Worker:
         return escape_text(text.decode("ascii", "replace"), 120)
 
 
-def _close(number: int) -> None:
-    if number >= 0:
-        os.close(number)
+def _open_pipe(reader: ExitStack, writer: ExitStack) -> tuple[FileIO, FileIO]:
+    """A pipe whose ends belong to these, beyond the numbers 0 to 2, which are free where a program closed them."""
+    numbers = os.pipe()
+    read, write = (open(_lift(number), mode, 0) for number, mode in zip(numbers, ("rb", "wb"), strict=True))
+    return reader.enter_context(read), writer.enter_context(write)  # type: ignore[arg-type, return-value]
+
+
+def _lift(number: int) -> int:
+    if number > 2 or sys.platform == "win32":
+        return number
+    import fcntl
+
+    lifted = fcntl.fcntl(number, fcntl.F_DUPFD_CLOEXEC, 3)
+    os.close(number)
+    return lifted
+
+
+def _find_modules() -> list[str]:
+    """Where the process looks for modules: as here, but not in the current folder, which may hold anybody's files.
+
+    It does count where numpy itself comes from it.
+    """
+    try:
+        here = {os.getcwd()} - {str(Path(np.__file__).parents[1])}
+    except OSError:
+        here = set()  # it was deleted
+    return [entry for entry in sys.path if isinstance(entry, str) and os.path.isabs(entry) and entry not in here]

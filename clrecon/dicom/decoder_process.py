@@ -138,8 +138,11 @@ def limit_memory(more_bytes: int) -> None:
             pass  # a stricter one is set, or the system (macOS) does not know this limit
 
 
-def limit_time(seconds: float) -> None:
-    """End this process when the next frame takes longer. The parent does so too; this holds without it."""
+def limit_time(seconds: float, orphan: bool) -> None:
+    """End this process when the next frame takes longer. The parent does so too; this holds without it.
+
+    Where an orphan lives on, the clock on the wall counts too: a decoder may wait for nothing.
+    """
     try:
         import resource
     except ImportError:
@@ -148,7 +151,8 @@ def limit_time(seconds: float) -> None:
     soft = int(time.process_time() + seconds) + 2
     if hard == resource.RLIM_INFINITY or soft < hard:
         resource.setrlimit(resource.RLIMIT_CPU, (soft, hard))
-    signal.alarm(int(seconds) + 5)
+    if orphan:
+        signal.alarm(int(seconds) + 5)
 
 
 def end_with(lifeline: int) -> None:
@@ -190,7 +194,8 @@ def main() -> None:
     """Serve until standard input ends."""
     if hasattr(signal, "SIGINT"):
         signal.signal(signal.SIGINT, signal.SIG_IGN)  # a terminal sends it to all; the parent decides
-    end_with(int(sys.argv[1]))
+    lifeline = int(sys.argv[1])
+    end_with(lifeline)
     source, sink = sys.stdin.buffer, take_standard_output()
     settings = json.loads(source.readline() or b"null")
     if settings is None:
@@ -208,8 +213,10 @@ def main() -> None:
         data = source.read(request["length"])
         if len(data) < request["length"]:
             return
-        limit_time(settings["seconds"])
+        limit_time(settings["seconds"], lifeline < 0)
         status, body = answer(decoders[request["decoder"]], data, request)
+        if hasattr(signal, "alarm"):
+            signal.alarm(0)  # the next frame may be long in coming
         send(sink, status, body)
         del data, body
 

@@ -79,6 +79,26 @@ def test_row_40_a_decoder_that_hangs_is_ended():
 
 
 @LINUX
+def test_a_process_may_wait_for_its_next_frame():
+    """A disk or network drive may be slower than any decoder."""
+    with make_pool(seconds=0.1) as pool:
+        assert np.array_equal(decode(pool), PIXELS)
+        time.sleep(6.0)
+        assert np.array_equal(decode(pool), PIXELS)
+
+
+def test_time_in_which_the_whole_program_stood_still_counts_for_nothing(monkeypatch):
+    """Ctrl-Z and fg, or a debugger: the processes stood still with it."""
+    clock, stood_still = time.monotonic, [0.0]
+    monkeypatch.setattr(decoder_pool.time, "monotonic", lambda: clock() + stood_still[0])
+    with make_pool("nap", seconds=20.0) as pool:
+        stop = threading.Timer(0.5, lambda: stood_still.__setitem__(0, 1000.0))
+        stop.start()
+        assert np.array_equal(decode(pool, "nap"), PIXELS)
+        stop.join()
+        assert np.array_equal(decode(pool, "nap"), PIXELS)
+
+
 def test_row_38_a_decoder_that_takes_all_memory_is_stopped():
     with make_pool("allocate", memory_bytes=100 * 2**20) as pool:
         with pytest.raises(DecoderError, match="need more than 100 MiB of memory to decode"):
@@ -182,6 +202,43 @@ time.sleep(0.2)
 print(*pool.process_ids(), flush=True)
 time.sleep(60)
 """
+
+
+STREAMS_CLOSED = """
+import os, sys
+sys.path[:0] = {path!r}
+for number in {numbers!r}:
+    os.close(number)
+import numpy as np
+from clrecon.dicom.decoder_pool import DecoderPool
+out = np.zeros((2, 2), np.int16)
+with DecoderPool(["hostile_decoders:copy"], 16) as pool:
+    pool.decode(bytes(range(8)), "hostile_decoders:copy", out)
+    pool.decode(bytes(range(8)), "hostile_decoders:copy", out)
+os._exit(0 if out.tobytes() == bytes(range(8)) else 9)
+"""
+
+
+@pytest.mark.skipif(os.name != "posix", reason="numbers of open files")
+@pytest.mark.parametrize("numbers", [(0,), (1,), (0, 1, 2), (0, 2)])
+def test_closed_standard_streams_disturb_nothing(numbers):
+    """Services start programs so; what is opened next takes the numbers of the streams."""
+    code = STREAMS_CLOSED.format(path=[entry for entry in sys.path if entry], numbers=numbers)
+    assert subprocess.run([sys.executable, "-c", code], timeout=60).returncode == 0
+
+
+def test_no_module_comes_from_the_current_folder(tmp_path, monkeypatch):
+    """A folder of scans is anybody's: a numpy.py in it must not run."""
+    (tmp_path / "numpy.py").write_text("open('ran', 'w')")
+    (tmp_path / "own_decoder.py").write_text("open('ran', 'w')")
+    monkeypatch.chdir(tmp_path)
+    for entry in ("", ".", str(tmp_path)):
+        monkeypatch.setattr(sys, "path", [entry, *sys.path])
+    with make_pool() as pool:
+        assert np.array_equal(decode(pool), PIXELS)
+    with DecoderPool(["own_decoder:decode"], 8) as pool, pytest.raises(DecoderError, match="No module named"):
+        pool.decode(b"", "own_decoder:decode", np.zeros((1, 1), np.int16))
+    assert not (tmp_path / "ran").exists()
 
 
 @LINUX
