@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import io
 import zlib
-from typing import BinaryIO
+from typing import BinaryIO, cast
 
 from clrecon.dicom.raw import (
     DEFLATED,
@@ -27,7 +27,13 @@ from clrecon.dicom.raw import (
 
 __all__ = ["parse_carefully"]
 
-INFLATED_HEADER_LIMIT = 16 * 1024 * 1024
+INFLATE_STEP = 1 << 18
+READ_LIMIT = 4 * 1024 * 1024
+"""Bytes that are read of one file at most; what is stepped over by its length does not count.
+
+pydicom makes objects of all that sequences of undefined length hold, in 50 times their size and within seconds a MiB,
+and looks for the end of other such values in all that follows.
+"""
 
 
 def parse_carefully(file: BinaryIO, size: int, wanted: tuple[int, ...]) -> DicomElements:
@@ -48,7 +54,7 @@ def parse_carefully(file: BinaryIO, size: int, wanted: tuple[int, ...]) -> Dicom
     OSError
     """
     try:
-        return _parse_file(file, size, wanted)
+        return _parse_file(cast(BinaryIO, _MeteredFile(file)), size, wanted)
     except CorruptFileError:
         raise
     except RecursionError as error:
@@ -58,6 +64,27 @@ def parse_carefully(file: BinaryIO, size: int, wanted: tuple[int, ...]) -> Dicom
             raise  # of the disk; the parser's own, for a sequence that is cut, have no number
         # The parser meets hostile bytes here and may fail in any way; all of them mean the same to us.
         raise CorruptFileError(f"cannot be parsed ({type(error).__name__})") from error
+
+
+class _MeteredFile:
+    """A file of which no more than `READ_LIMIT` bytes are read."""
+
+    def __init__(self, file: BinaryIO):
+        self.seek, self.tell = file.seek, file.tell
+        self._read, self._left = file.read, READ_LIMIT
+
+    def read(self, count: int) -> bytes:
+        """As that of the file.
+
+        Raises
+        ------
+        CorruptFileError
+            The limit is passed.
+        """
+        self._left -= count
+        if self._left < 0:
+            raise CorruptFileError(f"its header takes more than {READ_LIMIT} bytes to read")
+        return self._read(count)
 
 
 def _parse_file(file: BinaryIO, size: int, wanted: tuple[int, ...]) -> DicomElements:
@@ -72,7 +99,7 @@ def _parse_file(file: BinaryIO, size: int, wanted: tuple[int, ...]) -> DicomElem
     inflate_from = -1
     if transfer_syntax == DEFLATED:
         inflate_from, start = start, 0
-        file = io.BytesIO(_inflate_header(file))
+        file = cast(BinaryIO, _MeteredFile(io.BytesIO(_inflate_header(file))))
     little = transfer_syntax != EXPLICIT_BIG
     implicit = transfer_syntax == IMPLICIT_LITTLE
     found = _looks_implicit(file, start)
@@ -125,7 +152,15 @@ def _looks_implicit(file: BinaryIO, start: int) -> bool | None:
 def _inflate_header(file: BinaryIO) -> bytes:
     """Inflate the start of a deflated data set: enough for its header, and never more than a fixed limit."""
     inflater = zlib.decompressobj(-zlib.MAX_WBITS)
-    inflated = inflater.decompress(file.read(), INFLATED_HEADER_LIMIT)
+    inflated = bytearray()
+    while len(inflated) < READ_LIMIT and not inflater.eof:
+        try:
+            deflated = inflater.unconsumed_tail or file.read(INFLATE_STEP)
+        except CorruptFileError:
+            break  # as much as is read of a file: what there is may do
+        if not deflated:
+            break
+        inflated += inflater.decompress(deflated, READ_LIMIT - len(inflated))
     if not inflated:
         raise CorruptFileError("nothing in the deflated data set")
-    return inflated
+    return bytes(inflated)

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from clrecon.dicom.codecs import SYNTAX_NAMES
 from clrecon.dicom.gate import Stack
 from clrecon.dicom.header import SliceHeader
 from clrecon.dicom.layout import (
@@ -23,10 +24,9 @@ from clrecon.dicom.layout import (
 )
 from clrecon.dicom.phases import choose_phase
 from clrecon.dicom.pixels import PixelFacts
-from clrecon.dicom.raw import PLAIN_SYNTAXES
 from clrecon.dicom.scan import Scan
 from clrecon.dicom.series import Series
-from clrecon.dicom.text import escape_text, hash_uid
+from clrecon.dicom.text import hash_uid
 from clrecon.dicom.volume_gates import judge_series
 from clrecon.errors import RefusedInputError
 from clrecon.geometry import column_spacing
@@ -191,15 +191,6 @@ def _certify_places(stack: Stack, affine: NDArray[np.float64] | None) -> dict[st
     }
 
 
-def name_syntax(uid: str) -> str:
-    """Name of a transfer syntax, its UID where it has none."""
-    if uid in PLAIN_SYNTAXES:
-        return PLAIN_SYNTAXES[uid]  # what most series have: pydicom is not loaded for a name
-    from pydicom.uid import UID
-
-    return escape_text(UID(uid).name)
-
-
 def _certify_values(headers: Sequence[SliceHeader], facts: PixelFacts | None) -> dict[str, Any]:
     """What the voxels' values are."""
     slopes, intercepts = [h.slope for h in headers], [h.intercept for h in headers]
@@ -207,7 +198,7 @@ def _certify_values(headers: Sequence[SliceHeader], facts: PixelFacts | None) ->
         "padding_share": None if facts is None else facts.padding_share,
         "padding_hu": None if facts is None else facts.padding_hu,
         "transfer_syntaxes": sorted({h.transfer_syntax for h in headers}),
-        "transfer_syntax_names": sorted({name_syntax(h.transfer_syntax) for h in headers}),
+        "transfer_syntax_names": sorted({SYNTAX_NAMES[h.transfer_syntax] for h in headers}),
         "lossy": any(h.lossy for h in headers),
         "rescale": {
             "slope": [min(slopes), max(slopes)],

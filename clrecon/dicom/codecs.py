@@ -13,7 +13,7 @@ import importlib.util
 from clrecon.dicom.text import escape_text
 from clrecon.errors import RefusedInputError
 
-__all__ = ["NATIVE_SYNTAXES", "choose_decoder", "describe_undecodable", "is_encapsulated"]
+__all__ = ["NATIVE_SYNTAXES", "SYNTAX_NAMES", "choose_decoder", "describe_undecodable", "is_encapsulated"]
 
 NATIVE_SYNTAXES = ("1.2.840.10008.1.2", "1.2.840.10008.1.2.1", "1.2.840.10008.1.2.1.99", "1.2.840.10008.1.2.2")
 
@@ -33,6 +33,24 @@ _DECODERS = {
     ),
     RLE: ((("rle", "rle"),), "pylibjpeg-rle"),
 }
+
+SYNTAX_NAMES = {
+    "1.2.840.10008.1.2": "Implicit VR Little Endian",
+    "1.2.840.10008.1.2.1": "Explicit VR Little Endian",
+    "1.2.840.10008.1.2.1.99": "Deflated Explicit VR Little Endian",
+    "1.2.840.10008.1.2.2": "Explicit VR Big Endian",
+    _JPEG + "57": "JPEG Lossless, Non-Hierarchical (Process 14)",
+    _JPEG + "70": "JPEG Lossless, Non-Hierarchical, First-Order Prediction (Process 14 [Selection Value 1])",
+    _JPEG + "80": "JPEG-LS Lossless Image Compression",
+    _JPEG + "81": "JPEG-LS Lossy (Near-Lossless) Image Compression",
+    _JPEG + "90": "JPEG 2000 Image Compression (Lossless Only)",
+    _JPEG + "91": "JPEG 2000 Image Compression",
+    _JPEG + "201": "High-Throughput JPEG 2000 Image Compression (Lossless Only)",
+    _JPEG + "202": "High-Throughput JPEG 2000 with RPCL Options Image Compression (Lossless Only)",
+    _JPEG + "203": "High-Throughput JPEG 2000 Image Compression",
+    RLE: "RLE Lossless",
+}
+"""All that are read.  pydicom knows them too, but takes a quarter of a second to load."""
 
 _OTHER_NAMES = {
     "1.2.840.113619.5.2": "implicit VR big endian, private to GE",

@@ -34,6 +34,8 @@ LONG_PREFIX_BYTES = 256 * 1024
 """Read at once where the first prefix does not hold the whole header: large private elements, many frames."""
 RESTORED_LIMIT = 16 * 1024 * 1024
 """Bytes of a file without its start in which its header has to end."""
+LONGEST_PREFIX_BYTES = (16 * 2**20, 256 * 2**20)
+"""And where that one does not either: contours, segments and other objects that are nearly all header."""
 # A pipe or device put in the place of a listed file must not make the reader wait for a writer.
 _OPEN_FLAGS = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_CLOEXEC", 0) | getattr(os, "O_BINARY", 0)
 
@@ -58,7 +60,7 @@ def read_start(path: str | Path, limit: int = PREFIX_BYTES) -> FileStart:
         facts = os.fstat(descriptor)
         if not stat.S_ISREG(facts.st_mode):
             raise OSError("no regular file")
-        return FileStart(os.read(descriptor, limit), facts.st_size)
+        return FileStart(os.read(descriptor, min(limit, facts.st_size)), facts.st_size)
     finally:
         os.close(descriptor)
 
@@ -139,5 +141,12 @@ def _read_marked(path: Path, prefix: bytes, size: int, wanted: tuple[int, ...]) 
         elements = None  # most likely an element that reaches over the end of the prefix
     if elements is not None and elements.pixel_tag is not None:
         return elements
+    for limit in LONGEST_PREFIX_BYTES:
+        if len(prefix) < size:
+            prefix, size = read_start(path, limit)
+            elements = parse_plainly(prefix, size, wanted)
+            if elements is not None:
+                return elements
+    del prefix
     with open(path, "rb") as file:
         return parse_carefully(file, size, wanted)

@@ -19,6 +19,8 @@ Pieces = list[tuple[int, int]]
 """First byte in the file and count of bytes of each fragment of a frame."""
 
 MAX_FRAGMENTS = 1_000_000
+FRAGMENTS_PER_FRAME = 1000
+"""At most, on the whole: writers make one, or one of some KiB each."""
 _ITEM, _END = (0xFFFE, 0xE000), (0xFFFE, 0xE0DD)
 _STARTS = (b"\xff\xd8\xff", b"\xff\x4f\xff\x51", b"\0\0\0\x0cjP")
 """First bytes of JPEG and JPEG-LS, JPEG 2000, and JP2."""
@@ -46,7 +48,7 @@ def find_frames(file: BinaryIO, start: int, file_bytes: int, frames: int, transf
     OSError
         The file cannot be read.
     """
-    table, fragments = _walk_items(file, start, file_bytes)
+    table, fragments = _walk_items(file, start, file_bytes, min(MAX_FRAGMENTS, FRAGMENTS_PER_FRAME * (frames + 1)))
     if not fragments:
         raise RefusedInputError("truncated: there are no compressed pixels")
     if len(fragments) == frames:
@@ -72,7 +74,7 @@ def read_pieces(file: BinaryIO, pieces: Pieces) -> bytes:
     return b"".join([_read(file, place, length) for place, length in pieces])
 
 
-def _walk_items(file: BinaryIO, start: int, file_bytes: int) -> tuple[tuple[int, int], Pieces]:
+def _walk_items(file: BinaryIO, start: int, file_bytes: int, most: int) -> tuple[tuple[int, int], Pieces]:
     """Offset table and fragments. A codestream that is cut still decodes to an image, so that must be known here."""
     items: Pieces = []
     place = start
@@ -91,8 +93,8 @@ def _walk_items(file: BinaryIO, start: int, file_bytes: int) -> tuple[tuple[int,
                 f"truncated: {length} bytes of compressed pixels expected, {file_bytes - place} found"
             )
         items.append((place, length))
-        if len(items) > MAX_FRAGMENTS:
-            raise RefusedInputError(f"the compressed pixels are in more than {MAX_FRAGMENTS} fragments")
+        if len(items) > most:
+            raise RefusedInputError(f"the compressed pixels are in more than {most} fragments")
         place += length
     raise RefusedInputError("truncated: the compressed pixels have no end mark")
 

@@ -15,6 +15,7 @@ from clrecon.dicom.codecs import describe_undecodable, is_encapsulated
 from clrecon.dicom.concatenation import Concatenation
 from clrecon.dicom.elements import CorruptFileError, DicomElements, FileStart, read_elements
 from clrecon.dicom.multiframe import ENHANCED_CT, FRAME_PHASES, read_groups, split_frames
+from clrecon.dicom.terms import MODALITIES, RESCALE_TYPES, name_term
 from clrecon.dicom.text import escape_text, hash_uid
 from clrecon.dicom.values import WANTED_TAGS, ValueProblem, Values
 
@@ -216,7 +217,7 @@ def read_headers(
     name = escape_text(path.name)
     sop_class = values.word("SOPClassUID") or elements.media_class
     known_class = "CT" if sop_class in (CT_IMAGE_STORAGE, *ENHANCED_CT) else "unknown"
-    modality = values.word("Modality").strip().upper() or known_class
+    modality = name_term(values.word("Modality").strip().upper(), MODALITIES) or known_class
     series = _share_identity(
         values.word("SeriesInstanceUID"),
         values.whole_or_none("SeriesNumber"),
@@ -310,9 +311,9 @@ def _validate(values: Values, series: SeriesIdentity, path: Path, name: str, *, 
     for keyword in ("SliceThickness", "SpacingBetweenSlices"):
         try:
             unused[keyword] = values.decimals(keyword, 1)[0] if keyword in values else None
-        except ValueProblem as problem:
+        except ValueProblem:
             unused[keyword] = None
-            warnings.append(f"{problem}; ignored, it plays no part in the geometry")
+            warnings.append(f"{keyword} is not a finite number; ignored, it plays no part in the geometry")
     warnings += elements.remarks
     if elements.encoding_differs:
         warnings.append("implicit and explicit VR are mixed up: parsed as found, not as the transfer syntax says")
@@ -354,8 +355,8 @@ def _validate(values: Values, series: SeriesIdentity, path: Path, name: str, *, 
         intercept=intercept,
         has_slope="RescaleSlope" in values,
         has_intercept="RescaleIntercept" in values,
-        rescale_type=escape_text(values.word("RescaleType"), 16),
-        padding=values.float_padding(allocated) if float_pixels else values.padding(allocated, signed),
+        rescale_type=name_term(values.word("RescaleType"), RESCALE_TYPES),
+        padding=values.float_padding(allocated) if float_pixels else values.padding(allocated, stored, signed),
         float_pixels=float_pixels,
         lossy=values.word("LossyImageCompression") == "01",
         pixel_offset=elements.pixel_offset,

@@ -358,7 +358,8 @@ def _read_header_bytes(path: Path, elements: DicomElements) -> tuple[bytes, int]
     with open(path, "rb") as file:
         if elements.inflate_from >= 0:
             file.seek(elements.inflate_from)
-            return zlib.decompressobj(-zlib.MAX_WBITS).decompress(file.read(), elements.pixel_offset), 0
+            deflated = file.read(2 * elements.pixel_offset + 1024)  # what does not shrink grows by 5 bytes in 16 KiB
+            return zlib.decompressobj(-zlib.MAX_WBITS).decompress(deflated, elements.pixel_offset), 0
         data = file.read(elements.pixel_offset)
     start = META_START
     while data[start : start + 2] == b"\x02\0":  # file meta elements: explicit VR little endian

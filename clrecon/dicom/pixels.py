@@ -29,6 +29,8 @@ __all__ = ["PixelFacts", "read_voxels"]
 
 MAX_READERS = 8
 MAX_DECODERS = 32
+DECODER_WORTH_BYTES = 4 << 20
+"""Of pixels: they take about as long to decode as a process takes to start."""
 FLOAT_LIMIT = 1e9
 """HU beyond this are none; float32 and every later step hold it."""
 
@@ -100,10 +102,12 @@ def _fill_volume(
     source: StoredPixels, slices: Sequence[SliceHeader], voxels: NDArray[Any], progress: Progress | None
 ) -> PixelFacts:
     padding, low, high = PaddingMasks(voxels), np.inf, -np.inf
-    most = MAX_DECODERS if source.compressed else MAX_READERS
+    most = MAX_READERS
+    if source.compressed:
+        most = min(MAX_DECODERS, 1 + len(slices) * slices[0].pixel_bytes // DECODER_WORTH_BYTES)
     with ThreadPoolExecutor(count_readers(len(slices), most)) as pool:
-        jobs = {pool.submit(_fill_slice, source, header, voxels[k]): k for k, header in enumerate(slices)}
         try:
+            jobs = {pool.submit(_fill_slice, source, header, voxels[k]): k for k, header in enumerate(slices)}
             for done, job in enumerate(as_completed(jobs), start=1):
                 slice_padding, slice_low, slice_high = job.result()
                 padding.add(jobs[job], slice_padding)

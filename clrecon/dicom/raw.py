@@ -14,9 +14,6 @@ IMPLICIT_LITTLE = "1.2.840.10008.1.2"
 EXPLICIT_LITTLE = "1.2.840.10008.1.2.1"
 DEFLATED = "1.2.840.10008.1.2.1.99"
 EXPLICIT_BIG = "1.2.840.10008.1.2.2"
-PLAIN_SYNTAXES = {IMPLICIT_LITTLE: "Implicit VR Little Endian", EXPLICIT_LITTLE: "Explicit VR Little Endian"}
-"""Transfer syntaxes that need no pydicom, with their names."""
-
 META_START = 132  # 128 bytes of preamble, then "DICM"
 TRANSFER_SYNTAX, MEDIA_CLASS = 0x00020010, 0x00020002
 UNDEFINED_LENGTH = 0xFFFFFFFF

@@ -32,6 +32,9 @@ INFLATED_LIMIT = 1 << 30
 
 INFLATE_STEP = 1 << 20
 
+COMPRESSED_RATIO, COMPRESSED_EXTRA_BYTES = 4, 1 << 20
+"""Bytes of a compressed frame are at most so many times those of its pixels, and these."""
+
 Known = TypeVar("Known")
 
 
@@ -112,6 +115,8 @@ class StoredPixels:
             ) from error
         except RefusedInputError as error:
             raise RefusedInputError(f"{header.name}: {error}") from error
+        except MemoryError as error:
+            raise RefusedInputError(f"{header.name}: there is not enough memory to read its pixels") from error
         if header.little_endian != (sys.byteorder == "little"):
             stored.byteswap(inplace=True)
         return stored
@@ -122,7 +127,9 @@ class StoredPixels:
             def find() -> list[Pieces]:
                 return find_frames(file, header.pixel_offset, header.file_bytes, header.frames, header.transfer_syntax)
 
-            data = read_pieces(file, self._know(self._frames, header, find)[header.frame])
+            pieces = self._know(self._frames, header, find)[header.frame]
+            _check_compressed_bytes(sum(length for _, length in pieces), header.pixel_bytes)
+            data = read_pieces(file, pieces)
         frame = read_codestream(data, header.transfer_syntax, header.rows, header.columns, header.bits_allocated)
         same = np.dtype(frame.dtype).itemsize == stored.dtype.itemsize
         decoded = stored.view(frame.dtype) if same else np.empty(stored.shape, frame.dtype)
@@ -165,6 +172,13 @@ def _read_into(file: Any, stored: NDArray[Any]) -> None:
         if not count:
             raise RefusedInputError(f"truncated: {len(target)} bytes of pixels expected, {done} found")
         done += count
+
+
+def _check_compressed_bytes(found: int, pixel_bytes: int) -> None:
+    """Compression that fails makes an image a little larger, no more."""
+    most = COMPRESSED_RATIO * pixel_bytes + COMPRESSED_EXTRA_BYTES
+    if found > most:
+        raise RefusedInputError(f"the compressed frame has {found} bytes for {pixel_bytes} of pixels, {most} at most")
 
 
 def _inflate_data_set(header: SliceHeader, needed: int) -> bytes:

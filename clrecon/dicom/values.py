@@ -68,6 +68,8 @@ WANTED_TAGS = tuple(_TAGS.values())
 _DECIMAL = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
 
 
+_TEXT_VRS = frozenset("AE AS CS DA DS DT IS LO LT PN SH ST TM UC UI UR UT".split())
+
 # The slices of a series repeat most values byte for byte: what is known is neither checked nor stored again.
 _KNOWN_VALUES = 2048
 _KNOWN_BYTES = 128  # longer values are decoded each time: what is kept must stay small
@@ -162,22 +164,29 @@ class Values:
             raise self.wrong(keyword, "one unsigned number")
         return int.from_bytes(raw, self.byte_order)
 
-    def padding(self, bits_allocated: int, signed: bool) -> tuple[int, int] | None:
+    def padding(self, bits_allocated: int, bits_stored: int, signed: bool) -> tuple[int, int] | None:
         """Range of stored padding values.
 
         Writers give these with the VR of the other signedness too, so the bits are read again in the pixel
-        representation: US 63536 in signed 16-bit pixels is -2000.
+        representation: US 63536 in signed 16-bit pixels is -2000, and so is US 2096 in those of 12 stored bits.
         """
         bounds = []
         for keyword in ("PixelPaddingValue", "PixelPaddingRangeLimit"):
             raw = self.elements.values.get(_TAGS[keyword], b"")
             if not raw:
                 break
-            if len(raw) not in (2, 4):
-                raise self.wrong(keyword, "one number")
-            bounds.append(int.from_bytes(raw, self.byte_order, signed=signed))
+            vr = self.elements.vrs.get(_TAGS[keyword])
+            if vr in _TEXT_VRS or len(raw) != 2 and (len(raw) != 4 or vr in ("US", "SS")):
+                raise self.wrong(keyword, "one binary number")
+            bound = int.from_bytes(raw, self.byte_order, signed=signed)
             if bits_allocated == 8 and not signed:
-                bounds[-1] &= 0xFF
+                bound &= 0xFF
+            if signed:
+                for bits in (bits_stored, bits_allocated):
+                    if 1 << (bits - 1) <= bound < 1 << bits:
+                        bound -= 1 << bits
+                        break
+            bounds.append(bound)
         return (min(bounds), max(bounds)) if bounds else None
 
     def float_padding(self, bits: int) -> tuple[float, float] | None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,7 @@ from numpy.typing import DTypeLike, NDArray
 
 from clrecon.errors import RefusedInputError
 from clrecon.geometry.aligned import aligned_empty
+from clrecon.geometry.control_groups import free_bytes_of_container
 
 __all__ = ["allocate_voxels", "available_memory_bytes", "physical_memory_bytes"]
 
@@ -19,16 +21,20 @@ MEMORY_SHARE = 0.9
 """Of the memory that is free; the rest is for what is computed beside the volume."""
 
 
-def available_memory_bytes() -> float:
-    """Memory that can be taken without swapping; all that there is, or infinity, where the system does not tell."""
+def available_memory_bytes(proc: Path = Path("/proc"), groups: Path = Path("/sys/fs/cgroup")) -> float:
+    """Memory that can be taken without swapping; all that there is, or infinity, where the system does not tell.
+
+    Linux tells a container the memory of the whole computer, and ends what takes more than the container has.
+    """
+    container = free_bytes_of_container(proc, groups)
     try:
-        with open("/proc/meminfo", encoding="ascii") as file:
+        with open(proc / "meminfo", encoding="ascii") as file:
             for line in file:
                 if line.startswith("MemAvailable:"):
-                    return float(line.split()[1]) * 1024
+                    return min(float(line.split()[1]) * 1024, container)
     except (OSError, ValueError):
         pass  # not Linux
-    return physical_memory_bytes()
+    return min(physical_memory_bytes(), container)
 
 
 def physical_memory_bytes() -> float:

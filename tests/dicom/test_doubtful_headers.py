@@ -95,3 +95,19 @@ def test_modality_in_other_letters_is_ct(tmp_path, modality):
     volume = read_volume(tmp_path)
     assert np.array_equal(volume.voxels, plan.hu())
     assert volume.report["series"]["modality"] == "CT"
+
+
+def test_free_text_where_terms_belong_is_not_repeated(tmp_path):
+    """People's names are found in any field; refusals are for the terminal, warnings go into reports."""
+    name = "DOE^JOHN"
+    plan = write_series(tmp_path, change=set_raw("SliceThickness", name))
+    write_series(tmp_path, Plan(series=2, name="other{}".format), set_raw("Modality", name))
+    write_series(tmp_path, Plan(series=3, name="more{}".format, shape=(3, 5, 6)), set_raw("RescaleType", name))
+    volume = read_volume(tmp_path)
+    assert np.array_equal(volume.voxels, plan.hu())
+    thickness, *_ = volume.report["warnings"]
+    assert thickness == "SliceThickness is not a finite number; ignored, it plays no part in the geometry (all slices)"
+    assert "other" in str(list_series(tmp_path).series[1].modality)
+    for number in (1, 3):
+        assert "DOE" not in json.dumps(read_volume(tmp_path, series=number).report)
+    assert "DOE" not in json.dumps([entry.as_dict() for entry in list_series(tmp_path).series])

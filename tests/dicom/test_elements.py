@@ -20,9 +20,9 @@ from pydicom.datadict import DicomDictionary
 from pydicom.uid import UID, DeflatedExplicitVRLittleEndian, ExplicitVRBigEndian, ImplicitVRLittleEndian
 from pydicom.valuerep import EXPLICIT_VR_LENGTH_16, EXPLICIT_VR_LENGTH_32
 
-from clrecon.dicom import elements, list_series, plain, read_volume
+from clrecon.dicom import codecs, elements, list_series, plain, read_volume
 from clrecon.dicom.careful import parse_carefully
-from clrecon.dicom.raw import PLAIN_SYNTAXES, CorruptFileError
+from clrecon.dicom.raw import CorruptFileError
 from clrecon.dicom.values import WANTED_TAGS
 
 CORPUS = Path(pydicom.__file__).parent / "data" / "test_files"
@@ -69,7 +69,8 @@ def test_the_tables_are_those_of_pydicom() -> None:
     assert {DicomDictionary[tag][0] for tag in plain.SEQUENCE_TAGS} == {"SQ"}
     assert not any(tag >> 16 & 1 for tag in DicomDictionary)  # private elements are known by their items alone
     assert plain.CHARACTER_SET in WANTED_TAGS
-    assert all(UID(uid).name == name for uid, name in PLAIN_SYNTAXES.items())
+    assert all(UID(uid).name == name for uid, name in codecs.SYNTAX_NAMES.items())
+    assert not any(codecs.describe_undecodable(uid) for uid in codecs.SYNTAX_NAMES)
 
 
 def test_files_of_pydicom_give_the_same() -> None:
