@@ -307,13 +307,12 @@ def _validate(values: Values, series: SeriesIdentity, path: Path, name: str, *, 
     warnings = []
     if not series.uid:
         warnings.append("no SeriesInstanceUID: the slices of one folder are taken as one series")
-    unused: dict[str, float | None] = {}
-    for keyword in ("SliceThickness", "SpacingBetweenSlices"):
+    unused: dict[str, float | None] = {"SliceThickness": None, "SpacingBetweenSlices": None}
+    for keyword, tag in (("SliceThickness", "(0018,0050)"), ("SpacingBetweenSlices", "(0018,0088)")):
         try:
             unused[keyword] = values.decimals(keyword, 1)[0] if keyword in values else None
         except ValueProblem:
-            unused[keyword] = None
-            warnings.append(f"{keyword} is not a finite number; ignored, it plays no part in the geometry")
+            warnings.append(f"{keyword} {tag} is no finite number; ignored, it plays no part in the geometry")
     warnings += elements.remarks
     if elements.encoding_differs:
         warnings.append("implicit and explicit VR are mixed up: parsed as found, not as the transfer syntax says")

@@ -104,7 +104,7 @@ def _parse(text: bytes, name: str, purpose: Purpose) -> dict[str, Any]:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             header = dict(nrrd.read_header([*lines, "\n"]))
-    except (nrrd.NRRDError, ValueError, KeyError, TypeError, OverflowError) as error:
+    except (nrrd.NRRDError, ValueError, LookupError, TypeError, AttributeError, OverflowError) as error:
         raise RefusedInputError(f"{name} has a corrupt NRRD header: {escape_text(str(error))}") from error
     for field in ("data file", "datafile", "line skip", "lineskip", "byte skip", "byteskip"):
         if header.get(field) not in (None, 0):

@@ -106,7 +106,9 @@ def test_free_text_where_terms_belong_is_not_repeated(tmp_path):
     volume = read_volume(tmp_path)
     assert np.array_equal(volume.voxels, plan.hu())
     thickness, *_ = volume.report["warnings"]
-    assert thickness == "SliceThickness is not a finite number; ignored, it plays no part in the geometry (all slices)"
+    assert thickness == (
+        "SliceThickness (0018,0050) is no finite number; ignored, it plays no part in the geometry (all slices)"
+    )
     assert "other" in str(list_series(tmp_path).series[1].modality)
     for number in (1, 3):
         assert "DOE" not in json.dumps(read_volume(tmp_path, series=number).report)

@@ -2,26 +2,21 @@
 
 from __future__ import annotations
 
-import time
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
 import pydicom
 import pytest
-from compressed_frames import encode_rle
 from dicom_series import Plan, make_dataset, save_dataset, set_raw, set_values, write_series
-from pydicom.encaps import encapsulate
 from pydicom.uid import (
     DeflatedExplicitVRLittleEndian,
     ExplicitVRBigEndian,
     ExplicitVRLittleEndian,
     ImplicitVRLittleEndian,
-    RLELossless,
 )
 from tolerances import AFFINE_MM
 
-from clrecon.dicom import list_series, pixels, read_volume, stored
+from clrecon.dicom import list_series, read_volume, stored
 from clrecon.errors import NoDicomError, RefusedInputError
 from clrecon.geometry import memory
 
@@ -167,49 +162,6 @@ def test_padding_becomes_air(tmp_path, padding, limit, signed):
     assert volume.report["hu_range"] == [-1024, expected.max()]
 
 
-@pytest.mark.parametrize(
-    ("bits", "vr", "raw", "cell"),
-    [
-        (16, "UL", (63536).to_bytes(4, "little"), 0xF830),
-        (16, "SL", (-2000).to_bytes(4, "little", signed=True), 0xF830),
-        (12, "US", (0x0830).to_bytes(2, "little"), 0xF830),
-        (12, "US", (0x0830).to_bytes(2, "little"), 0x0830),
-        (12, "US", (0xF830).to_bytes(2, "little"), 0x0830),
-        (12, "US", (0x8000).to_bytes(2, "little"), 0x8000),
-    ],
-)
-def test_padding_in_any_writing_of_its_bits(tmp_path, bits, vr, raw, cell):
-    """Signed pixels, with and without the sign in the unused bits, and the value in another width or sign."""
-
-    def change(ds, k):
-        array = plan.stored(k).astype(np.uint16) & ((1 << bits) - 1)
-        array[0, :3] = cell
-        set_values(BitsStored=bits, HighBit=bits - 1, PixelData=array.astype(np.uint16).tobytes())(ds, k)
-        tag = pydicom.tag.Tag("PixelPaddingValue")
-        ds[tag] = pydicom.dataelem.RawDataElement(tag, vr, len(raw), raw, 0, False, True)
-
-    plan = Plan()
-    write_series(tmp_path, plan, change)
-    volume = read_volume(tmp_path)
-    expected = plan.hu()
-    expected[:, 0, :3] = volume.report["padding_hu"]
-    assert np.array_equal(volume.voxels, expected)
-    assert volume.report["padding_share"] == pytest.approx(3 / 30)
-
-
-@pytest.mark.parametrize(
-    ("vr", "raw"), [("DS", b"-200"), ("IS", b"-2000 "), ("US", b"\x30\xf8" * 2)], ids=["DS", "IS", "two values"]
-)
-def test_padding_that_is_no_binary_number_is_refused(tmp_path, vr, raw):
-    def change(ds, k):
-        tag = pydicom.tag.Tag("PixelPaddingValue")
-        ds[tag] = pydicom.dataelem.RawDataElement(tag, vr, len(raw), raw, 0, False, True)
-
-    write_series(tmp_path, change=change)
-    with pytest.raises(RefusedInputError, match=r"PixelPaddingValue \(0028,0120\) is .* expected one binary number"):
-        read_volume(tmp_path)
-
-
 def test_a_slice_of_padding_alone(tmp_path):
     change = set_pixels(lambda array, k: array * 0 - 2000 if k == 2 else array, PixelPaddingValue=-2000)
     plan = write_series(tmp_path, change=change)
@@ -235,45 +187,6 @@ def test_doubtful_values_are_kept_with_a_warning(tmp_path, change, words):
     assert np.array_equal(volume.voxels, plan.hu())
     assert words in volume.report["warnings"][0]
     assert list_series(tmp_path).series[0].warnings == volume.report["warnings"]
-
-
-def test_an_interrupt_ends_reading_while_slices_are_still_being_handed_out(tmp_path, monkeypatch):
-    write_series(tmp_path, Plan(shape=(60, 5, 6)))
-    read, submitted, submit = [], [], ThreadPoolExecutor.submit
-
-    def slow(source, header, out):
-        read.append(header)
-        time.sleep(0.05)
-        return None, 0.0, 0.0
-
-    def interrupt(*arguments):
-        submitted.append(arguments)
-        if len(submitted) == 50:
-            raise KeyboardInterrupt
-        return submit(*arguments)
-
-    monkeypatch.setattr(pixels, "_fill_slice", slow)
-    monkeypatch.setattr(ThreadPoolExecutor, "submit", interrupt)
-    with pytest.raises(KeyboardInterrupt):
-        read_volume(tmp_path)
-    assert len(read) <= 2 * pixels.MAX_READERS
-
-
-@pytest.mark.parametrize(("slices", "expected"), [(2, 1), (7, 1), (40, 5)])
-def test_few_frames_start_few_decoders(tmp_path, monkeypatch, slices, expected):
-    """A process takes longer to start than a small frame to decode."""
-    monkeypatch.setattr(pixels, "DECODER_WORTH_BYTES", 600)
-    counts = []
-    monkeypatch.setattr(pixels, "count_readers", lambda slices, most: counts.append(most) or 1)
-    plan = Plan(shape=(slices, 5, 6), syntax=RLELossless)
-
-    def compress(ds, k):
-        ds.PixelData = encapsulate([encode_rle(plan.stored(k))])
-        ds["PixelData"].VR, ds["PixelData"].is_undefined_length = "OB", True
-
-    write_series(tmp_path, plan, compress)
-    assert np.array_equal(read_volume(tmp_path).voxels, plan.hu())
-    assert counts == [expected]
 
 
 def test_missing_rescale_is_not_hu(tmp_path):
@@ -329,32 +242,6 @@ def test_row_39_memory_is_asked_for_before_it_is_taken(tmp_path, monkeypatch):
         read_volume(tmp_path)
     monkeypatch.undo()
     assert 1e7 < memory.available_memory_bytes() <= memory.physical_memory_bytes()
-
-
-@pytest.mark.parametrize(
-    ("line", "files"),
-    [
-        ("0::/pod/box", {"pod/memory.max": 9 << 20, "pod/memory.current": 5 << 20, "pod/box/memory.max": "max"}),
-        ("0::/not/seen/from/within", {"memory.max": 9 << 20, "memory.current": 5 << 20}),
-        ("4:cpu,memory:/box", {"memory/box/memory.limit_in_bytes": 9 << 20,
-                               "memory/box/memory.usage_in_bytes": 5 << 20}),
-        ("0::/box", {"box/memory.max": "max", "box/memory.current": 5 << 20}),
-        ("3:cpu:/box", {"box/memory.max": 9 << 20, "box/memory.current": 5 << 20}),
-    ],
-    ids=["group around it", "its own as the root", "version 1", "no limit", "another group"],
-)  # fmt: skip
-def test_row_39_memory_is_that_of_the_container(tmp_path, line, files):
-    proc, groups = tmp_path / "proc", tmp_path / "groups"
-    (proc / "self").mkdir(parents=True)
-    (proc / "meminfo").write_text("MemTotal: 2097152 kB\nMemAvailable: 1048576 kB\n")
-    (proc / "self" / "cgroup").write_text(line + "\n")
-    for name, value in files.items():
-        (groups / name).parent.mkdir(parents=True, exist_ok=True)
-        (groups / name).write_text(f"{value}\n")
-        stat = "anon 5\ninactive_file 1048576\ntotal_inactive_file 1048576\n"
-        (groups / name).with_name("memory.stat").write_text(stat)
-    limited = 9 << 20 in files.values() and "3:cpu" not in line
-    assert memory.available_memory_bytes(proc, groups) == (5 << 20 if limited else 1 << 30)
 
 
 def test_row_38_a_deflate_bomb_is_not_inflated(tmp_path, monkeypatch):

@@ -186,4 +186,4 @@ def test_a_wrong_thickness_is_only_a_warning(tmp_path):
     write_series(tmp_path, change=set_raw("SliceThickness", "thick"))
     report = read_volume(tmp_path).report
     assert report["slice_thickness_mm"] is None
-    assert "SliceThickness (0018,0050) is 'thick'" in report["warnings"][0]
+    assert "SliceThickness (0018,0050) is no finite number" in report["warnings"][0]

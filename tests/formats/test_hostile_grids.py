@@ -254,6 +254,12 @@ def test_a_single_slice_is_no_volume(tmp_path, name):
         clrecon.read_volume(path)
 
 
+def test_a_field_of_nrrd_without_its_value_is_refused(tmp_path):
+    path = edit(write_nrrd(tmp_path / "a.nrrd", make_ct()), b"space origin: ", b"space origin: \n#")
+    with pytest.raises(RefusedInputError, match="corrupt NRRD header"):
+        clrecon.read_volume(path)
+
+
 def test_without_a_position_it_is_refused(tmp_path):
     with pytest.raises(RefusedInputError, match="does not say where it lies"):
         clrecon.read_volume(write_nifti(tmp_path / "a.nii", make_ct(), sform=False))
