@@ -108,3 +108,24 @@ def test_noise_within_the_tolerance_stays_one_affine(tmp_path):
     fitted = volume.ijk_to_lps([(0, 0, k) for k in range(40)])
     # The fit is nearer to the places that were meant than the stored positions are.
     assert np.abs(fitted - [even.position(k) for k in range(40)]).max() < 0.5 * max(map(abs, offsets.values()))
+
+
+@pytest.mark.parametrize(
+    ("plan", "missing"),
+    [
+        (Plan(shape=(13, 3, 3), leave_out=(2, 5, 8, 11)), 4),
+        (Plan(shape=(4, 3, 3), leave_out=(2,)), 1),
+        (Plan(shape=(40, 3, 3), offsets={k: 1.25 * (k - 10) for k in range(11, 40)}, leave_out=(5,)), 1),
+        (Plan(shape=(40, 3, 3), offsets={k: 1.25 * (k - 10) for k in range(11, 40)}, leave_out=(1,)), 1),
+        (Plan(shape=(40, 3, 3), offsets={k: 1.25 * (k - 10) for k in range(11, 40)}, leave_out=(4, 6)), 2),
+        (Plan(shape=(40, 3, 3), offsets={k: 3.75 * (k - 30) for k in range(31, 40)}, leave_out=(35,)), 1),
+    ],
+    ids=["as many holes as gaps", "three slices", "fine part", "first gap", "two in a row", "coarse part"],
+)
+def test_holes_are_measured_by_the_gaps_beside_them(tmp_path, plan, missing):
+    write_series(tmp_path, plan)
+    with pytest.raises(RefusedInputError, match="1 slice missing between"):
+        read_volume(tmp_path)
+    volume = read_volume(tmp_path, allow_gaps=True)
+    assert_in_place(volume, plan)
+    assert volume.report["slices_missing"] == missing
