@@ -22,6 +22,7 @@ from clrecon.dicom.layout import (
     median_thickness,
     summarise_gaps,
 )
+from clrecon.dicom.mixture import describe_differences
 from clrecon.dicom.phases import choose_phase
 from clrecon.dicom.pixels import PixelFacts
 from clrecon.dicom.scan import Scan
@@ -72,6 +73,7 @@ def collect_series_warnings(series: Series) -> list[str]:
         if odd is not None:
             text = text.format(type=odd.rescale_type, intercept=f"{odd.intercept:g}", slope=f"{odd.slope:g}")
             warnings.append(f"{text} ({_place(series.stack, is_so)})")
+    warnings += [f"{text} ({_place(series.stack, is_so)})" for text, is_so in describe_differences(headers)]
     return warnings
 
 
@@ -90,6 +92,9 @@ def _describe_what_was_left(series: Series) -> list[str]:
         left = sum(len(phase.headers) for phase in places.phases) - len(chosen.headers)
         which = f"phase {chosen.number} of {len(places.phases)} ({chosen.keyword} {chosen.value})"
         warnings.append(f"{which} read, {left} slices of others left")
+        most = max(len(phase.headers) for phase in places.phases)
+        if not places.interleaved and len(chosen.headers) < most:
+            warnings.append(f"phase {chosen.number} has {len(chosen.headers)} slices, another one {most}")
     kernels = (
         {dict(header.phase).get("ConvolutionKernel", "") for header in series.stack.slices} if series.stack else ()
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import defaultdict
 from collections.abc import Sequence
 
@@ -103,7 +104,23 @@ def describe_left(found: Sequence[Series], chosen: Series) -> list[str]:
     for series in left:
         unusable = series.kind == "stack" and series.count >= chosen.count and series.problems
         lines.append(f"[{series.describe_without_text()}{', cannot be used' if unusable else ''}]")
-    return [f"{len(left)} other series left: {join_names(lines)}"]
+    return [f"{len(left)} other series left: {join_names(lines)}", *_describe_other_planes(left, chosen)]
+
+
+def _describe_other_planes(left: Sequence[Series], chosen: Series) -> list[str]:
+    """Warn of slices that were split off the chosen stack: lost at its end they leave no hole."""
+    parts = [one for one in left if one.kind == "stack" and one.headers and one.key == chosen.key]
+    if not parts or not chosen.headers:
+        return []
+    first = chosen.headers[0]
+    chords = [
+        max(math.dist(first.row_cosines, h.row_cosines), math.dist(first.column_cosines, h.column_cosines))
+        for h in (part.headers[0] for part in parts)
+    ]
+    low, high = (math.degrees(2.0 * math.asin(min(chord / 2.0, 1.0))) for chord in (min(chords), max(chords)))
+    count = sum(len(part.headers) for part in parts)
+    angles = f"{low:.1f}" if len(parts) == 1 else f"{low:.1f} to {high:.1f}"
+    return [f"{count} slice{'s' * (count > 1)} of the series that is read left: in another plane, {angles} degrees off"]
 
 
 def _describe_modalities(found: Sequence[Series]) -> str:

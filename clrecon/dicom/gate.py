@@ -43,7 +43,7 @@ RUN_TOLERANCE = 0.05
 """A gap over 1.5 times the usual one means missing slices, unless it is one of at least 3 gaps in a row that are
 equal within 5 %: a change of feed is a run, a hole is not.  The usual gap is the smaller of the two in the middle
 where their count is even, so that as many holes as whole gaps do not pass for the usual; beside such a run it is that
-of the run, so that a hole where the feed is fine is seen however coarse it is elsewhere (of the coarser one between two runs)."""
+of the run (the coarser of two), so that a hole where the feed is fine is seen however coarse it is elsewhere."""
 TILT_REPORT_DEG = 0.05
 STATED_GAP_TOLERANCE = 0.01
 PIXEL_SPACING_TOLERANCE = 1e-5
@@ -336,6 +336,8 @@ def find_holes(distances: Float64Array) -> Holes:
     gaps = np.diff(distances)
     if len(gaps) < 2:
         return Holes()
+    if gaps.max() <= MISSING_RATIO * gaps.min():
+        return Holes()  # as nearly always
     usual = float(np.sort(gaps)[(len(gaps) - 1) // 2])
     if usual <= 0.0:
         return Holes()  # only where the directions are no directions

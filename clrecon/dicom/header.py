@@ -306,7 +306,7 @@ def _validate(values: Values, series: SeriesIdentity, path: Path, name: str, *, 
 
     warnings = []
     if not series.uid:
-        warnings.append("no SeriesInstanceUID: the slices of one folder are taken as one series")
+        warnings.append("no SeriesInstanceUID: the slices of one folder are taken as one series, by SeriesNumber")
     unused: dict[str, float | None] = {"SliceThickness": None, "SpacingBetweenSlices": None}
     for keyword, tag in (("SliceThickness", "(0018,0050)"), ("SpacingBetweenSlices", "(0018,0088)")):
         try:

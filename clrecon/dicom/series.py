@@ -9,13 +9,12 @@ from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from clrecon.dicom.concatenation import describe_missing_parts
 from clrecon.dicom.gate import Stack, group_places, measure_stack
 from clrecon.dicom.header import OtherImage, SeriesIdentity, SliceHeader
 from clrecon.dicom.layout import measure_extent, median_thickness
 from clrecon.dicom.phases import Places, choose_phase, describe_phases, have_same_pixels, sort_places
+from clrecon.dicom.planes import Planes
 from clrecon.dicom.scan import CorruptFile, Scan
 from clrecon.dicom.stored import StoredPixels
 from clrecon.dicom.text import hash_uid, join_names
@@ -24,9 +23,6 @@ from clrecon.geometry import column_spacing
 
 __all__ = ["Series", "SeriesEntry", "SeriesListing", "describe_series", "group_series"]
 
-SPLIT_ANGLE_RAD = np.radians(1.0)
-"""Slices of one SeriesInstanceUID whose directions differ by more are separate stacks (a localizer, another plane);
-below, they are one stack with a fault that the gate names."""
 PROBLEMS_SHOWN = 3
 SLICE_MODALITIES = ("MR", "NM", "PT")
 """Other modalities whose files are slices: a corrupt file among them is one of theirs."""
@@ -74,6 +70,11 @@ class Series:
     def count(self) -> int:
         """Slices, the frames of multi-frame images among them."""
         return len(self.headers) + sum(image.frames for image in self.others)
+
+    @property
+    def key(self) -> str:
+        """What all parts of one series share."""
+        return _group_key((self.headers or self.others)[0])
 
     @cached_property
     def places(self) -> Places:
@@ -168,7 +169,7 @@ class Series:
         if places.problem:
             return [places.problem]
         if places.phases and self.phase is None:
-            return [describe_phases(places.phases)]
+            return [describe_phases(places.phases, places.interleaved)]
         return list(self.stack.problems) if self.stack is not None else []
 
     def describe(self) -> str:
@@ -345,7 +346,7 @@ def _blame_corrupt_files(found: Sequence[Series], scan: Scan) -> None:
     suspects, loose_suspects = _sort_by_holder(scan.suspects, holders)
     for series in found:
         if series.kind == "stack":
-            own = folders[_group_key((series.headers or series.others)[0])]
+            own = folders[series.key]
             spread = len(own) > 1
             near = [files[folder] for files in (corrupt, suspects) for folder in own if folder in files]
             blamed = [part for part in (*near, loose_corrupt, loose_suspects if spread else []) if part]
@@ -365,7 +366,8 @@ def _sort_by_holder(
 
 
 def _group_key(image: SliceHeader | OtherImage) -> str:
-    return image.series.uid or str(image.file.parent)
+    """What the images of one series share: without a UID their folder, and the number where there is one."""
+    return image.series.uid or f"{image.series.number} {image.file.parent}"
 
 
 def _listing_key(series: Series) -> tuple[bool, int, str]:
@@ -375,7 +377,8 @@ def _listing_key(series: Series) -> tuple[bool, int, str]:
 
 def _split_slices(headers: Sequence[SliceHeader]) -> list[Series]:
     """Part the slices of one SeriesInstanceUID by plane, localizers first."""
-    parts: list[tuple[np.ndarray, Series]] = []
+    planes = Planes()
+    parts: list[Series] = []
     known: dict[tuple[float, ...], Series] = {}
     localizers = Series(headers[0].series, "localizer") if headers else None
     for header in headers:
@@ -384,15 +387,12 @@ def _split_slices(headers: Sequence[SliceHeader]) -> list[Series]:
             continue
         key = (*header.row_cosines, *header.column_cosines)
         if key not in known:
-            directions = np.array(key).reshape(2, 3)
-            near = (part for first, part in parts if np.linalg.norm(first - directions, axis=1).max() < SPLIT_ANGLE_RAD)
-            part = next(near, None)
-            if part is None:
-                part = Series(header.series, "stack")
-                parts.append((directions, part))
-            known[key] = part
+            number = planes.find(key)
+            if number == len(parts):
+                parts.append(Series(header.series, "stack"))
+            known[key] = parts[number]
         known[key].headers.append(header)
-    found = [part for _, part in parts]
+    found = parts
     if localizers is not None and localizers.headers:
         found.append(localizers)
     return found

@@ -9,7 +9,7 @@ from clrecon.dicom import list_series, read_volume
 from clrecon.dicom.phases import have_same_pixels
 from clrecon.dicom.scan import scan_path
 from clrecon.errors import RefusedInputError, UsageError
-from tests.dicom_series import Plan, set_values, write_series
+from tests.dicom_series import Plan, make_dataset, save_dataset, set_values, write_series
 
 
 def write_phase(folder, number, shift=0, plan=None, **elements):
@@ -205,3 +205,120 @@ def test_localizers_at_one_place_and_broken_directions_are_no_phases(tmp_path):
     assert (scout.kind, scout.slices, scout.phases) == ("localizer", 3, [])
     assert any("off unit length or right angle" in text for text in stack.problems)
     assert not any("duplicate" in text for text in stack.problems) and stack.phases == []
+
+
+def test_a_slice_that_two_phases_have_alike_belongs_to_both(tmp_path):
+    plan = write_phase(tmp_path, 1, AcquisitionNumber=1)
+    write_phase(tmp_path, 2, 500, AcquisitionNumber=2)
+    for k in (0, 6):
+        ds = make_dataset(plan, k)
+        ds.AcquisitionNumber = 2
+        save_dataset(ds, tmp_path / f"phase2-{k}")
+    (tmp_path / "copy").write_bytes((tmp_path / "phase2-3").read_bytes())
+    expected = plan.hu()
+    expected[1:6] += 500
+    volume = read_volume(tmp_path, phase=2)
+    assert np.array_equal(volume.voxels, expected)
+    assert volume.ijk_to_lps([(0, 0, 0)])[0] == pytest.approx(plan.position(0))
+    assert "1 duplicate slice dropped: same place, same pixels as another" in volume.report["warnings"]
+
+
+def test_visits_are_ranked_where_two_of_them_are_alike(tmp_path):
+    plan = write_phase(tmp_path, 1, AcquisitionTime=lambda k: f"1010{10 + k}")
+    write_phase(tmp_path, 2, 300, AcquisitionTime=lambda k: f"1010{30 + k}")
+    ds = make_dataset(plan, 0)
+    ds.AcquisitionTime = "101030"
+    save_dataset(ds, tmp_path / "phase2-0")
+    expected = plan.hu()
+    expected[1:] += 300
+    assert np.array_equal(read_volume(tmp_path, phase=2).voxels, expected)
+
+
+@pytest.mark.parametrize(
+    ("elements", "plan"),
+    [
+        ({"PixelSpacing": [0.9, 0.9]}, {}),
+        ({"FrameOfReferenceUID": "1.2.3"}, {}),
+        ({}, {"origin": (50.0, 31.25, -400.0)}),
+        ({}, {"angles": (0.0, 0.0, 0.4)}),
+    ],
+    ids=["spacing", "frame", "moved sideways", "turned"],
+)
+def test_slices_with_equal_pixels_and_another_geometry_are_no_copies(tmp_path, elements, plan):
+    write_series(tmp_path, Plan())
+    write_phase(tmp_path, 2, plan=Plan(name="b{}".format, **plan), **elements)
+    with pytest.raises(RefusedInputError, match=r"different pixels or geometry at 7 places|differs within the series"):
+        read_volume(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("first", "second"),
+    [
+        (
+            {"AcquisitionTime": lambda k: f"{235955 + k if k < 5 else k - 5:06d}"},
+            {"AcquisitionTime": lambda k: f"0000{30 + k}"},
+        ),
+        (
+            {"ContentTime": lambda k: f"1010{10 + 2 * k + k % 2}"},
+            {"ContentTime": lambda k: f"1010{10 + 2 * k + 1 - k % 2}"},
+        ),
+        (
+            {"AcquisitionTime": lambda k: f"1010{10 + 3 * k}"},
+            {"AcquisitionTime": lambda k: f"1010{14 + 3 * k}"},
+        ),
+    ],
+    ids=["midnight", "order of reconstruction", "neither passes nor stops"],
+)
+def test_times_that_tell_no_passes_apart_are_not_ranked(tmp_path, first, second):
+    write_phase(tmp_path, 1, **first)
+    write_phase(tmp_path, 2, 500, **second)
+    with pytest.raises(RefusedInputError, match="no element of their headers parts them"):
+        read_volume(tmp_path)
+
+
+def test_stops_with_all_visits_each_are_ranked(tmp_path):
+    plan = write_phase(tmp_path, 1, AcquisitionTime=lambda k: f"10{10 + k // 3}10")
+    write_phase(tmp_path, 2, 500, AcquisitionTime=lambda k: f"10{10 + k // 3}20")
+    assert np.array_equal(read_volume(tmp_path, phase=2).voxels, plan.hu() + 500)
+
+
+@pytest.mark.parametrize(
+    ("keyword", "values", "along"),
+    [("ConvolutionKernel", ("A", "B"), 0.625), ("KVP", (80, 120), 0.4), ("AcquisitionNumber", (1, 2), 5 * 1.25 + 0.5)],
+    ids=["half a gap apart", "uneven", "overlapping acquisitions"],
+)
+def test_volumes_whose_slices_lie_between_each_other_are_phases(tmp_path, keyword, values, along):
+    plans = [Plan(name=f"{n}-{{}}".format, origin=(-12.5, 31.25, -400 + n * along)) for n in (0, 1)]
+    for number, value in enumerate(values):
+        write_phase(tmp_path, number, 500 * number, plans[number], **{keyword: value})
+    with pytest.raises(RefusedInputError) as caught:
+        read_volume(tmp_path)
+    assert f"2 phases whose slices lie between each other, choose one with --phase: [1: {keyword}" in str(caught.value)
+    for number, plan in enumerate(plans):
+        volume = read_volume(tmp_path, phase=number + 1)
+        assert np.array_equal(volume.voxels, plan.hu() + 500 * number) and not volume.uneven
+        assert volume.ijk_to_lps([(2, 3, 4)])[0] == pytest.approx(plan.truth([(2, 3, 4)])[0])
+
+
+@pytest.mark.parametrize(
+    ("elements", "told"),
+    [
+        ({"AcquisitionNumber": lambda k: 1 + k % 2}, "AcquisitionNumber alternates along the stack: maybe several"),
+        ({"KVP": lambda k: (80, 120)[k > 3]}, "KVP differs along the stack: maybe parts"),
+        ({"SliceThickness": lambda k: 1.0 + (k == 3)}, "SliceThickness differs along the stack (1 of 7"),
+        ({"AcquisitionNumber": lambda k: 1 + k // 2}, None),
+        ({"AcquisitionNumber": lambda k: k}, None),
+    ],
+)
+def test_what_differs_along_a_stack_is_said(tmp_path, elements, told):
+    write_phase(tmp_path, 1, **elements)
+    warnings = read_volume(tmp_path).report["warnings"]
+    assert len(warnings) == (told is not None)
+    assert told is None or told in warnings[0]
+
+
+def test_a_phase_that_is_shorter_than_another_is_said(tmp_path):
+    write_phase(tmp_path, 1, AcquisitionNumber=1)
+    write_phase(tmp_path, 2, 500, Plan(name="b{}".format, leave_out=(6,)), AcquisitionNumber=2)
+    assert "phase 2 has 6 slices, another one 7" in read_volume(tmp_path, phase=2).report["warnings"]
+    assert not any("another one" in text for text in read_volume(tmp_path, phase=1).report["warnings"])

@@ -6,6 +6,7 @@ import hashlib
 import json
 import os
 import shutil
+import time
 
 import numpy as np
 import pydicom
@@ -15,6 +16,7 @@ from pydicom.data import get_testdata_file
 from pydicom.uid import MRImageStorage, SecondaryCaptureImageStorage
 
 from clrecon.dicom import list_series, read_volume
+from clrecon.dicom.planes import SPLIT_ANGLE_RAD, Planes
 from clrecon.errors import NoDicomError, RefusedInputError, UsageError
 
 CONTRACT = (
@@ -155,7 +157,9 @@ def test_a_localizer_in_the_series_is_parted(tmp_path, by_type):
     assert np.array_equal(volume.voxels, plan.hu())
     assert volume.spacing[2] == pytest.approx(1.25)
     kind = ", localizer" if by_type else ""
-    assert volume.report["warnings"] == [f"1 other series left: [2: CT {hash_of(1)}, 1 slice{kind}]"]
+    told = [f"1 other series left: [2: CT {hash_of(1)}, 1 slice{kind}]"]
+    told += [] if by_type else ["1 slice of the series that is read left: in another plane, 90.0 degrees off"]
+    assert volume.report["warnings"] == told
     assert read_volume(tmp_path, f"{ROOT}.1").report["slices"] == 7
     assert len(list_series(tmp_path).series) == 2
 
@@ -326,3 +330,39 @@ def test_progress_counts_files_and_slices(two_series):
     calls = []
     read_volume(two_series, progress=lambda *call: calls.append(call))
     assert calls == [("scan", n, 11) for n in range(1, 12)] + [("read", n, 7) for n in range(1, 8)]
+
+
+def test_slices_in_another_plane_of_the_series_are_said(tmp_path):
+    """One at the end of the stack leaves no hole."""
+    across, along = np.cos(np.radians(2.0)), np.sin(np.radians(2.0))
+    write_series(tmp_path, Plan(), set_values(6, ImageOrientationPatient=[1, 0, 0, 0, across, along]))
+    volume = read_volume(tmp_path)
+    assert volume.shape_ijk == (6, 5, 6)
+    told = "1 slice of the series that is read left: in another plane, 2.0 degrees off"
+    assert told in volume.report["warnings"] and told in list_series(tmp_path).warnings
+
+
+def test_series_without_uids_are_parted_by_their_numbers(tmp_path):
+    together = {"SeriesInstanceUID": "", "FrameOfReferenceUID": "1.2.3"}
+    write_series(tmp_path, Plan(series=1), set_values(**together))
+    below = Plan(series=2, shape=(4, 5, 6), name="b{}".format, origin=(-12.5, 31.25, -400 - 4 * 1.25))
+    write_series(tmp_path, below, set_values(**together))
+    assert [entry.slices for entry in list_series(tmp_path).series] == [7, 4]
+    volume = read_volume(tmp_path)
+    assert volume.shape_ijk == (6, 5, 7)
+    assert not any("another plane" in text for text in volume.report["warnings"])
+
+
+def test_a_series_of_many_planes_is_parted_in_linear_time():
+    generator = np.random.default_rng(3)
+    turned = np.linalg.qr(generator.normal(size=(3000, 3, 3)))[0]
+    planes, numbers = Planes(), []
+    started = time.process_time()
+    for axes in turned:
+        plane = tuple(axes[:2].ravel().tolist())
+        numbers.append(planes.find(plane))
+        assert planes.find(tuple(np.add(plane, 1e-5).tolist())) == numbers[-1]
+    assert time.process_time() - started < 10.0  # 18 s where each is held against all others
+    firsts = dict(reversed(list(zip(numbers, turned, strict=True))))
+    apart = max(np.linalg.norm(firsts[n] - axes, axis=1)[:2].max() for n, axes in zip(numbers, turned, strict=True))
+    assert len(firsts) > 2900 and apart < SPLIT_ANGLE_RAD

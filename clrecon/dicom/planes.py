@@ -1,0 +1,46 @@
+"""Which slices of a series lie in one plane, as far as a stack is concerned."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections import defaultdict
+
+__all__ = ["SPLIT_ANGLE_RAD", "Planes"]
+
+SPLIT_ANGLE_RAD = math.radians(1.0)
+"""Slices of one SeriesInstanceUID whose directions differ by more are separate stacks (a localizer, another plane);
+below, they are one stack with a fault that the gate names."""
+
+
+class Planes:
+    """Pairs of directions, numbered as they come; those within `SPLIT_ANGLE_RAD` of an earlier one have its number.
+
+    A series may have as many planes as files: beyond the first few they are looked up by cells of that size.
+    """
+
+    FEW = 4
+
+    def __init__(self) -> None:
+        self._planes: list[tuple[float, ...]] = []
+        self._cells: dict[tuple[int, ...], list[int]] = defaultdict(list)
+
+    def find(self, plane: tuple[float, ...]) -> int:
+        """The number of the first plane near `plane`, which is added where there is none."""
+        for number, known in enumerate(self._planes[: self.FEW]):
+            if _are_near(known, plane):
+                return number
+        cell = tuple(int(value // SPLIT_ANGLE_RAD) for value in plane)
+        if len(self._planes) > self.FEW:
+            around = itertools.product(*((value - 1, value, value + 1) for value in cell))
+            near = (n for key in around for n in self._cells.get(key, ()) if _are_near(self._planes[n], plane))
+            number = min(near, default=-1)
+            if number >= 0:
+                return number
+        self._planes.append(plane)
+        self._cells[cell].append(len(self._planes) - 1)
+        return len(self._planes) - 1
+
+
+def _are_near(one: tuple[float, ...], other: tuple[float, ...]) -> bool:
+    return math.dist(one[:3], other[:3]) < SPLIT_ANGLE_RAD and math.dist(one[3:], other[3:]) < SPLIT_ANGLE_RAD
