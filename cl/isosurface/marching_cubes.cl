@@ -158,7 +158,8 @@ __kernel void list_words(
  *             row_offsets     in   (3, rows_to_count)
  *             word_vertices   in   (gk, gj, words)
  *             slice_frames    in   (gk, 9) float4: position of sample (0, 0, k) in mm (rounded to 12 bits, rest),
- *                                  step to slice k + 1, the three rows of the matrix that maps gradients per index
+ *                                  step to slice k + 1 (w: smallest distance of a vertex from a sample along it, in
+ *                                  steps), the three rows of the matrix that maps gradients per index
  *                                  step at the samples of slice k to gradients per mm, and those of the matrix for
  *                                  gradients within the cells up to slice k + 1.  With -D UNEVEN the matrices differ
  *             steps           in   (4,) float4: mm for one step along i (rounded to 12 bits, rest), along j
@@ -167,7 +168,7 @@ __kernel void list_words(
  *             iso_level       where on an edge the surface lies
  *             outside         value beyond the border of a closed volume
  *             value_scale     power of two that takes the values to 1 or below: squares neither over- nor underflow
- *             margin          smallest distance of a vertex from a sample along x, y, z, in steps: some units in the
+ *             margin          smallest distance of a vertex from a sample along x, y, in steps: some units in the
  *                             last place of the position, so that no triangle collapses when it is rounded
  *             ni nj nk, border   of the whole volume
  *             first_slice     slice of the volume that `voxels` begins with

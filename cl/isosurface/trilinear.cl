@@ -269,6 +269,7 @@ __kernel void emit_cell_vertices(
     frame.i_rest = steps[1].xyz;
     frame.j_step = steps[2].xyz;
     frame.j_rest = steps[3].xyz;
+    frame.margin = margin.xyz;
     load_slice_frame(&frame, slice_frames, k, gk);
     __global const float4 *layer = slice_frames + FRAME_ROWS * (size_t)k + 6;
     frame.normal_x = layer[0].xyz;
@@ -289,9 +290,9 @@ __kernel void emit_cell_vertices(
         sign_values(values, number, heights);
         float3 lower, upper;
         if (row_vertices_of(found) == 1)
-            lower = upper = place_centre(found, values, margin.xyz);
+            lower = upper = place_centre(found, values, frame.margin);
         else
-            place_waist(values, margin.xyz, &lower, &upper);
+            place_waist(values, frame.margin, &lower, &upper);
         const uint diagonal = found >> 24;
         for (uint corner = 0, left = row_vertices_of(found); left != 0; ++corner) {
             if (row_vertices_of(found) > 1 && (corner == diagonal || corner == 7 - diagonal))

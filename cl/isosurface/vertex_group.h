@@ -42,6 +42,7 @@ static inline void load_slice_frame(slice_frame *frame, __global const float4 *s
     frame->origin = row[0].xyz;
     frame->origin_rest = row[1].xyz;
     frame->k_step = row[2].xyz;
+    frame->margin.z = row[2].w; /* layers may be of very different thickness */
     frame->normal_x = row[3].xyz;
     frame->normal_y = row[4].xyz;
     frame->normal_z = row[5].xyz;

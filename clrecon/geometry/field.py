@@ -37,6 +37,7 @@ __all__ = [
     "check_topology",
     "choose_iso_rule",
     "data_range",
+    "layer_margins",
     "layer_normal_matrices",
     "slice_normal_matrices",
     "vertex_margin",
@@ -240,15 +241,15 @@ def vertex_margin(volume: Volume, border: int) -> NDArray[np.float64]:
     Returns
     -------
     ndarray, shape (3,), float64
-        Typically 2e-4 of a step: eight times the rounding of the coordinates themselves.
+        Typically 2e-4 of a step: eight times the rounding of the coordinates themselves.  Along k that of the thinnest
+        layer, see `layer_margins`.
 
     Raises
     ------
     UsageError
         The volume is so large that float32 cannot tell its voxels apart well.
     """
-    largest = largest_coordinate(volume, find_vertex_origin(volume), border)
-    unit = float32_step(largest)
+    largest, unit = _largest_and_unit(volume, border)
     steps = np.array(volume.spacing)
     steps[2] = np.linalg.norm(np.diff(volume.slice_origins(border=1), axis=0), axis=1).min()
     margin = 4.0 * unit / steps
@@ -258,6 +259,28 @@ def vertex_margin(volume: Volume, border: int) -> NDArray[np.float64]:
             f" float32 vertices come in steps of {unit:.2g} mm there; take a part of it"
         )
     return margin
+
+
+def layer_margins(volume: Volume, border: int) -> NDArray[np.float64]:
+    """Smallest distance of a vertex from a sample along k, for each layer of cells, in its own steps.
+
+    The margin of a layer of some micrometres would be tenths of a millimetre in the others.
+
+    Returns
+    -------
+    ndarray, shape (nk + 2 * border,), float64
+        From the layer at slice ``-border``; the last is the layer beyond the last slice.
+    """
+    if not volume.uneven:
+        return np.full(volume.shape_ijk[2] + 2 * border, vertex_margin(volume, border)[2])
+    steps = np.linalg.norm(np.diff(volume.slice_origins(border + 1), axis=0)[1:], axis=1)
+    return 4.0 * _largest_and_unit(volume, border)[1] / steps
+
+
+def _largest_and_unit(volume: Volume, border: int) -> tuple[float, float]:
+    """Largest coordinate that a vertex can have, in mm from where they are counted from, and its float32 step."""
+    largest = largest_coordinate(volume, find_vertex_origin(volume), border)
+    return largest, float32_step(largest)
 
 
 def slice_normal_matrices(volume: Volume, border: int) -> NDArray[np.float64]:

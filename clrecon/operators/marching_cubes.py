@@ -10,7 +10,7 @@ from numpy.typing import DTypeLike, NDArray
 
 from clrecon.errors import DeviceError, DeviceMemoryError
 from clrecon.geometry import Volume, is_left_handed
-from clrecon.geometry.field import layer_normal_matrices, slice_normal_matrices, vertex_margin
+from clrecon.geometry.field import layer_margins, layer_normal_matrices, slice_normal_matrices, vertex_margin
 from clrecon.geometry.precision import find_vertex_origin
 from clrecon.kernels import Program, Stopwatch, allocate, download, empty_output, launch, load_program, upload
 from clrecon.opencl import Device
@@ -140,6 +140,7 @@ class Placement:
         parts = [head.astype(np.float64)[:, None], rest[:, None], np.diff(origins, axis=0)[:, None]]
         normals = slice_normal_matrices(volume, border), layer_normal_matrices(volume, border)
         frames = _pad4(np.concatenate([*parts, *normals], axis=1))
+        frames[:, 2, 3] = layer_margins(volume, border)
         steps = _pad4(np.stack([part for step in (0, 1) for part in _split(volume.affine[:3, step])]))
         return cls(frames, steps, _pad4(vertex_margin(volume, border)), origin)
 

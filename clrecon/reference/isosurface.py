@@ -9,6 +9,7 @@ from clrecon.geometry import Volume, is_left_handed
 from clrecon.geometry.field import (
     IsoRule,
     choose_iso_rule,
+    layer_margins,
     layer_normal_matrices,
     slice_normal_matrices,
     vertex_margin,
@@ -86,11 +87,11 @@ def _find_trilinear_triangles(
     inside: NDArray[np.bool_],
     numbers: NDArray[np.int64],
     heights: NDArray[np.float32],
-    margin: NDArray[np.float64],
+    margins: NDArray[np.float64],
 ) -> tuple[NDArray[np.uint32], CellVertices]:
     """Triangles as the trilinear field has them, and the vertices inside cells: cell (k, j, i), point, gradient.
 
-    Vertices inside cells are numbered after those on edges, cell by cell.
+    Vertices inside cells are numbered after those on edges, cell by cell.  `margins` (gk, 3) are those of each layer.
     """
     cases = _find_cases(inside)
     triangles: list[list[int]] = []
@@ -110,7 +111,7 @@ def _find_trilinear_triangles(
             )
         if row.cell_vertices:
             cells += [cell] * row.cell_vertices
-            placed = place_cell_vertices(row, case, corners, margin)
+            placed = place_cell_vertices(row, case, corners, margins[k])
             points.append(placed[0])
             gradients.append(placed[1])
     found = (np.array(cells, dtype=np.int64).reshape(-1, 3), np.concatenate(points), np.concatenate(gradients))
@@ -179,7 +180,9 @@ def extract_inside(
     step = np.eye(3, dtype=np.int64)[axis]
     i1, j1, k1 = i + step[:, 0], j + step[:, 1], k + step[:, 2]
     value, next_value = field[k, j, i], field[k1, j1, i1]
-    margin = vertex_margin(volume, rule.border)[axis]
+    margins = vertex_margin(volume, rule.border)
+    layers = layer_margins(volume, rule.border)
+    margin = np.where(axis == 2, layers[k], margins[axis])
     half_way = np.zeros(len(owner), dtype=bool)
     if hu_places is not None:
         half_way = ~(hu_places[k, j, i] & hu_places[k1, j1, i1])
@@ -204,8 +207,8 @@ def extract_inside(
         triangles = _find_triangles(inside, numbers)
     else:
         heights = field.astype(np.float32) - np.float32(rule.iso_level)
-        margins = vertex_margin(volume, rule.border)
-        triangles, (cells, points, cell_slope) = _find_trilinear_triangles(inside, numbers, heights, margins)
+        in_cells = np.column_stack([np.broadcast_to(margins[:2], (len(layers), 2)), layers])
+        triangles, (cells, points, cell_slope) = _find_trilinear_triangles(inside, numbers, heights, in_cells)
         ck = cells[:, 0]
         cell_up = np.einsum("nij,nj->ni", layer_normal_matrices(volume, rule.border)[ck], cell_slope)
         here = cells[:, :0:-1] - rule.border + points[:, :2]

@@ -21,13 +21,13 @@ TURN = rotation((15.0, -25.0, 40.0))
 IN_PLANE = TURN[:, :2] * (0.7, 0.5)
 
 
-def make_volume(field, shape=(40, 50), gaps=GAPS, sideways=0.3, dtype=np.float32) -> Volume:
+def make_volume(field, shape=(40, 50), gaps=GAPS, sideways=0.3, dtype=np.float32, noise=0.1) -> Volume:
     """`field` of points (n, 3) in mm around the centre of a stack that is sheared more where its gaps are larger."""
     heights = np.concatenate([[0.0], np.cumsum(gaps)])
     rng = np.random.default_rng(2)
     table = (
         heights[:, None] * TURN[:, 2]
-        + (sideways * heights + rng.uniform(-0.1, 0.1, len(heights)))[:, None] * TURN[:, 1]
+        + (sideways * heights + rng.uniform(-noise, noise, len(heights)))[:, None] * TURN[:, 1]
     )
     table = table + np.array([40.0, -90.0, -600.0])
     affine = np.eye(4)
@@ -91,6 +91,29 @@ def test_the_device_gives_what_the_twin_gives(device, topology, closed, dtype):
     assert np.array_equal(mesh.triangles, triangles)
     assert np.abs(mesh.vertices - vertices).max() <= tolerances.TWIN_VERTEX_VOXEL * min(volume.spacing)
     assert np.abs(mesh.normals - normals).max() <= tolerances.TWIN_CELL_NORMAL
+
+
+THIN = (*GAPS[:10], 0.002, *GAPS[10:18])
+"""With two slices that are hardly apart: rounding takes a good share of that layer, and only of that one."""
+
+
+def test_a_thin_layer_does_not_move_the_surface_in_others(device):
+    slope = TURN[:, 2]
+    volume = make_volume(lambda p: -(p @ slope), gaps=THIN, noise=0.0)
+    for share in (0.01, 0.99):
+        across = (volume.slice_origins()[5] * (1 - share) + volume.slice_origins()[6] * share) @ slope
+        mesh = extract_isosurface(volume, float(centre_of(volume) @ slope - across), device, closed=False)
+        assert np.abs(mesh.vertices @ slope - across).max() <= tolerances.LINEAR_FIELD_MM
+
+
+@pytest.mark.parametrize("topology", ["separated", "trilinear"])
+def test_the_twin_has_a_thin_layer_too(device, topology):
+    rng = np.random.default_rng(12)
+    volume = make_volume(lambda p: rng.integers(-500, 500, len(p)), (9, 11), THIN[5:15], noise=0.0)
+    mesh = extract_isosurface(volume, 25, device, topology=topology)
+    vertices, _, triangles = extract_twin(volume, 25, topology=topology)
+    assert np.array_equal(mesh.triangles, triangles)
+    assert np.abs(mesh.vertices - vertices).max() <= tolerances.TWIN_VERTEX_VOXEL * min(volume.spacing)
 
 
 @pytest.mark.oclgrind
