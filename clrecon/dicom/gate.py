@@ -159,7 +159,10 @@ def measure_stack(headers: Sequence[SliceHeader], allow_gaps: bool = False) -> S
             affine = compose_affine(row * slices[0].di_mm, column * slices[0].dj_mm, line.step, line.origin)
         warnings += _describe_stated_gap(measure_stated_gap(slices, positions, line.gap_median_mm))
     tilt = None if affine is None else tilt_degrees(affine)
-    if tilt is not None and tilt > TILT_REPORT_DEG:
+    aside = _measure_sideways(positions, distances) if line.uneven else 0.0
+    if affine is not None and aside > (line.tolerance_mm or 0.0):
+        warnings.append(f"slices are shifted sideways, up to {aside:.3f} mm off a straight line: placed as they say")
+    elif tilt is not None and tilt > TILT_REPORT_DEG:
         warnings.append(f"gantry tilt {tilt:.2f} degrees: kept exactly, as a shear")
     return Stack(slices, positions, distances, affine, line, tilt, tuple(problems), tuple(warnings), holes.missing)
 
@@ -183,6 +186,14 @@ def measure_line(positions: Float64Array, distances: Float64Array) -> Line:
         worst_slice=int(residuals.argmax()),
         uneven=bool(residuals.max() > tolerance),
     )
+
+
+def _measure_sideways(positions: Float64Array, distances: Float64Array) -> float:
+    """Largest distance in mm of positions (n, 3) from a straight line that advances with the sorted distances."""
+    along = distances - distances.mean()
+    moved = positions - positions.mean(axis=0)
+    slope = along @ moved / np.sum(along**2)
+    return float(np.linalg.norm(moved - along[:, None] * slope, axis=1).max())
 
 
 def _describe_unevenness(distances: Float64Array, line: Line) -> str:

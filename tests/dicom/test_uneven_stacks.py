@@ -60,6 +60,9 @@ def test_slices_that_jump_sideways_are_placed_too(tmp_path):
     plan = write_series(tmp_path, Plan(), sideways)
     volume = read_volume(tmp_path)
     assert volume.uneven
+    told = [text for text in volume.report["warnings"] if "sideways" in text]
+    assert len(told) == 1 and "up to 1.286 mm" in told[0]
+    assert not any("tilt" in text for text in volume.report["warnings"])
     for k in range(7):
         assert volume.ijk_to_lps([(0, 0, k)])[0] == pytest.approx(plan.position(k) + (3.0 * (k >= 4), 0, 0))
 
