@@ -401,12 +401,19 @@ def _phase_with_a_hole(folder: Path, size: Size) -> Marks:
     return marks
 
 
-@_case("two recon kernels, interleaved", WARNED, ("ConvolutionKernel",))
+@_case(
+    "two recon kernels, interleaved",
+    REFUSED,
+    ("--phase", "ConvolutionKernel"),
+    again={"phase": 1},
+    again_words=("phase 1 of 2 (ConvolutionKernel B30f)",),
+)
 def _interleaved_kernels(folder: Path, size: Size) -> Marks:
     def change(ds: Dataset, k: int) -> None:
         ds.ConvolutionKernel = ("B30f", "B70f")[k % 2]
 
-    return write_slices(folder, plan_for(size), change)
+    write_slices(folder, plan_for(size), change)
+    return plan_for(size).marks(tuple(range(1, size.slices, 2)))
 
 
 # --- headers ---

@@ -23,16 +23,16 @@ CERTAIN = (
     "StackID",
     "ConvolutionKernel",
     "KVP",
-    "ImageType",
 )
 """What is one and the same over a volume."""
-POSSIBLE = ("AcquisitionNumber", "FrameAcquisitionNumber", "AcquisitionTime")
-"""What may change from rotation to rotation of one volume: it parts only what is uneven together and even apart."""
+POSSIBLE = ("AcquisitionNumber", "FrameAcquisitionNumber", "AcquisitionTime", "ImageType")
+"""What may change from rotation to rotation, or from file to file, of one volume: it parts only what is uneven together
+and even apart."""
 SMALLEST_VOLUME = 3
 EVEN = 0.05
 """Share by which gaps differ within what counts as even here."""
 THICKNESS_TOLERANCE = 0.01
-ALONG_A_STACK = ("KVP", "ImageType")
+ALTERNATING = ("AcquisitionNumber", "FrameAcquisitionNumber")
 
 
 def values_of(header: SliceHeader, keywords: Sequence[str]) -> tuple[str, ...]:
@@ -104,9 +104,9 @@ def describe_differences(headers: Sequence[SliceHeader]) -> Iterator[tuple[str, 
         Without the values.
     """
     first = headers[0]
-    for keyword, values in _values_along(headers, (*ALONG_A_STACK, *POSSIBLE)):
-        if keyword in ALONG_A_STACK:
-            text = f"{keyword} differs along the stack: maybe parts of several volumes"
+    for keyword, values in _values_along(headers, ("KVP", *ALTERNATING)):
+        if keyword == "KVP":
+            text = "KVP differs along the stack: maybe parts of several volumes"
         elif _find_interleaved(values, headers):
             text = f"{keyword} alternates along the stack: maybe several volumes between each other"
         else:

@@ -263,9 +263,9 @@ def test_nothing_there(tmp_path):
     (tmp_path / "empty").touch()
     (tmp_path / "text.dcm").write_text("DICM " * 100)
     (tmp_path / "picture.png").write_bytes(b"\x89PNG\r\n\x1a\n" + bytes(300))
-    with pytest.raises(NoDicomError, match=r"3 files looked at \(1 PNG image, 2 not DICOM\)"):
+    with pytest.raises(NoDicomError, match=r"3 files looked at \(PNG image: 1, not DICOM: 2\)"):
         list_series(tmp_path)
-    with pytest.raises(NoDicomError, match=r"1 file looked at \(1 not DICOM\)"):
+    with pytest.raises(NoDicomError, match=r"1 file looked at \(not DICOM: 1\)"):
         read_volume(tmp_path / "text.dcm")
     with pytest.raises(UsageError, match="a path is a string or a path object, not int"):
         read_volume(7)
