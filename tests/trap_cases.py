@@ -401,19 +401,11 @@ def _phase_with_a_hole(folder: Path, size: Size) -> Marks:
     return marks
 
 
-@_case(
-    "two recon kernels, interleaved",
-    REFUSED,
-    ("--phase", "ConvolutionKernel"),
-    again={"phase": 1},
-    again_words=("phase 1 of 2 (ConvolutionKernel B30f)",),
-)
+@_case("two recon kernels, interleaved", REFUSED, ("--phase", "ConvolutionKernel"), again={"phase": 1})
 def _interleaved_kernels(folder: Path, size: Size) -> Marks:
-    def change(ds: Dataset, k: int) -> None:
-        ds.ConvolutionKernel = ("B30f", "B70f")[k % 2]
-
-    write_slices(folder, plan_for(size), change)
-    return plan_for(size).marks(tuple(range(1, size.slices, 2)))
+    kernels = ("B30f", "B70f")
+    write_slices(folder, plan_for(size), lambda ds, k: setattr(ds, "ConvolutionKernel", kernels[k % 2]))
+    return plan_for(size).marks(range(1, size.slices, 2))
 
 
 # --- headers ---
