@@ -13,8 +13,8 @@ from clrecon.dicom.text import escape_text
 from clrecon.errors import RefusedInputError, UsageError
 
 if TYPE_CHECKING:
+    from clrecon.dicom.listing import SeriesListing
     from clrecon.dicom.scan import Progress
-    from clrecon.dicom.series import SeriesListing
     from clrecon.geometry import Volume
 
 __all__ = ["list_series", "read_volume"]

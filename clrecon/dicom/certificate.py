@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from clrecon.dicom.codecs import SYNTAX_NAMES
 from clrecon.dicom.gate import Stack
-from clrecon.dicom.header import SliceHeader
 from clrecon.dicom.layout import (
     describe_orientation,
     describe_thickness,
@@ -27,6 +26,7 @@ from clrecon.dicom.phases import choose_phase
 from clrecon.dicom.pixels import PixelFacts
 from clrecon.dicom.scan import Scan
 from clrecon.dicom.series import Series
+from clrecon.dicom.slice_header import SliceHeader
 from clrecon.dicom.text import hash_uid
 from clrecon.dicom.volume_gates import judge_series
 from clrecon.errors import RefusedInputError

@@ -15,7 +15,7 @@ from clrecon.dicom.text import join_names
 from clrecon.dicom.values import ValueProblem
 
 if TYPE_CHECKING:
-    from clrecon.dicom.header import SliceHeader
+    from clrecon.dicom.slice_header import SliceHeader
 
 __all__ = ["CONCATENATION_TAGS", "Concatenation", "describe_missing_parts", "read_concatenation"]
 

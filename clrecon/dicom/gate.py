@@ -18,12 +18,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from clrecon.dicom.header import SliceHeader
+from clrecon.dicom.holes import Holes, find_holes
 from clrecon.dicom.numbers import median
+from clrecon.dicom.slice_header import SliceHeader
 from clrecon.dicom.text import join_names
 from clrecon.geometry import compose_affine, tilt_degrees
 
-__all__ = ["Holes", "Line", "Stack", "group_places", "measure_stack", "measure_stated_gap"]
+__all__ = ["Line", "Stack", "group_places", "measure_stack", "measure_stated_gap"]
 
 Float64Array = NDArray[np.float64]
 
@@ -37,17 +38,9 @@ POSITION_TOLERANCE_MM = 0.01
 POSITION_TOLERANCE_GAPS = 0.01
 """A residual up to the larger of 0.01 mm and 1 % of the gap is rounding and no unevenness."""
 DUPLICATE_MM = 1e-3
-MISSING_RATIO = 1.5
-RUN_LENGTH = 3
-RUN_TOLERANCE = 0.05
-"""A gap over 1.5 times the usual one means missing slices, unless it is one of at least 3 gaps in a row that are
-equal within 5 %: a change of feed is a run, a hole is not.  The usual gap is the smaller of the two in the middle
-where their count is even, so that as many holes as whole gaps do not pass for the usual; beside such a run it is that
-of the run (the coarser of two), so that a hole where the feed is fine is seen however coarse it is elsewhere."""
 TILT_REPORT_DEG = 0.05
 STATED_GAP_TOLERANCE = 0.01
 PIXEL_SPACING_TOLERANCE = 1e-5
-PLACES_SHOWN = 4
 
 
 @dataclass(frozen=True)
@@ -301,70 +294,6 @@ def _orthonormalise(row: Float64Array, column: Float64Array) -> tuple[Float64Arr
     return row, column
 
 
-@dataclass(frozen=True)
-class Holes:
-    """Gaps in a stack that are too wide, by the rule at `MISSING_RATIO`.
-
-    Attributes
-    ----------
-    places : tuple of int
-        The gap k lies between the slices k and k + 1.
-    gaps_mm : tuple of float
-    ends_mm : tuple of (float, float)
-        Where along the normal the slices before and after lie.
-    usual_mm : tuple of float
-        The gap that each would have without a hole.
-    """
-
-    places: tuple[int, ...] = ()
-    gaps_mm: tuple[float, ...] = ()
-    ends_mm: tuple[tuple[float, float], ...] = ()
-    usual_mm: tuple[float, ...] = ()
-
-    @property
-    def missing(self) -> int:
-        """Slices that would fill the gaps, at the usual distance."""
-        return sum(self._counts())
-
-    def _counts(self) -> list[int]:
-        return [max(round(gap / usual) - 1, 1) for gap, usual in zip(self.gaps_mm, self.usual_mm, strict=True)]
-
-    def describe(self, names: Sequence[str] = ()) -> str:
-        """Say where they are; with the names of all slices also between which."""
-        texts = []
-        columns = (self.places, self.gaps_mm, self.ends_mm, self.usual_mm, self._counts())
-        for k, gap, (low, high), usual, count in zip(*columns, strict=True):
-            between = f": {names[k]}, {names[k + 1]}" if names else ""
-            texts.append(
-                f"{count} slice{'s' * (count > 1)} missing between {low:.2f} and {high:.2f} mm "
-                f"(gap {gap:.3f} mm, usual {usual:.3f} mm){between}"
-            )
-        return _join_places(texts)
-
-
-def find_holes(distances: Float64Array) -> Holes:
-    """Find missing slices among sorted positions (n,) along the normal; two slices alone have none."""
-    gaps = np.diff(distances)
-    if len(gaps) < 2:
-        return Holes()
-    if gaps.max() <= MISSING_RATIO * gaps.min():
-        return Holes()  # as nearly always
-    usual = float(np.sort(gaps)[(len(gaps) - 1) // 2])
-    if usual <= 0.0:
-        return Holes()  # only where the directions are no directions
-    in_run = _find_runs(gaps)
-    runs = np.flatnonzero(in_run)
-    wide, usuals = [], []
-    for k in np.flatnonzero(~in_run).tolist():
-        after = int(np.searchsorted(runs, k))
-        beside = max(gaps[runs[max(after - 1, 0) : after + 1]].tolist(), default=usual)
-        if gaps[k] > MISSING_RATIO * min(usual, beside):
-            wide.append(k)
-            usuals.append(beside if gaps[k] > MISSING_RATIO * beside else usual)
-    ends = tuple((float(distances[k]), float(distances[k + 1])) for k in wide)
-    return Holes(tuple(wide), tuple(float(gaps[k]) for k in wide), ends, tuple(usuals))
-
-
 def group_places(headers: Sequence[SliceHeader]) -> list[list[SliceHeader]]:
     """The slices at each place, in the order of the places; slices closer than `DUPLICATE_MM` are at one.
 
@@ -385,30 +314,10 @@ def group_places(headers: Sequence[SliceHeader]) -> list[list[SliceHeader]]:
     return places
 
 
-def _find_runs(gaps: Float64Array) -> NDArray[np.bool_]:
-    """Which gaps are one of at least `RUN_LENGTH` consecutive gaps that equal them within `RUN_TOLERANCE`."""
-    in_run = np.zeros(len(gaps), dtype=bool)
-    for place, gap in enumerate(gaps.tolist()):
-        low, high = max(place - RUN_LENGTH + 1, 0), min(place + RUN_LENGTH, len(gaps))
-        like = (np.abs(gaps[low:high] - gap) <= RUN_TOLERANCE * gap).tolist()
-        first = last = place - low
-        while first > 0 and like[first - 1]:
-            first -= 1
-        while last < len(like) - 1 and like[last + 1]:
-            last += 1
-        in_run[place] = last - first + 1 >= RUN_LENGTH
-    return in_run
-
-
 def _cross(row: Float64Array, column: Float64Array) -> Float64Array:
     """Vector product of two vectors (3,): a tenth of the time of numpy's, of which there are two a series."""
     (a, b, c), (x, y, z) = row.tolist(), column.tolist()
     return np.array((b * z - c * y, c * x - a * z, a * y - b * x))
-
-
-def _join_places(places: list[str]) -> str:
-    shown = "; ".join(places[:PLACES_SHOWN])
-    return shown if len(places) <= PLACES_SHOWN else f"{shown}; and {len(places) - PLACES_SHOWN} more"
 
 
 def measure_stated_gap(

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.dicom.gate import POSITION_TOLERANCE_GAPS, POSITION_TOLERANCE_MM, Stack
-from clrecon.dicom.header import SliceHeader
 from clrecon.dicom.numbers import median
+from clrecon.dicom.slice_header import SliceHeader
 from clrecon.geometry import is_left_handed, slice_normal
 
 __all__ = [

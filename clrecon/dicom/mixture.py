@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 
 import numpy as np
 
-from clrecon.dicom.header import SliceHeader
+from clrecon.dicom.slice_header import SliceHeader
 
 __all__ = ["describe_differences", "find_mixture", "values_of"]
 

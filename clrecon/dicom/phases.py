@@ -15,9 +15,9 @@ from itertools import combinations
 
 import numpy as np
 
-from clrecon.dicom.header import PHASE_KEYWORDS, SliceHeader
 from clrecon.dicom.mixture import find_mixture, values_of
 from clrecon.dicom.pixels import read_voxels
+from clrecon.dicom.slice_header import PHASE_KEYWORDS, SliceHeader
 from clrecon.dicom.stored import StoredPixels
 from clrecon.dicom.text import join_names
 from clrecon.errors import UsageError

@@ -18,9 +18,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clrecon.dicom.header import SliceHeader
 from clrecon.dicom.padding import PaddingMasks, pack_mask
 from clrecon.dicom.scan import Progress
+from clrecon.dicom.slice_header import SliceHeader
 from clrecon.dicom.stored import StoredPixels, count_readers
 from clrecon.errors import RefusedInputError
 from clrecon.geometry.memory import allocate_voxels

@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clrecon.dicom.header import SliceHeader
 from clrecon.dicom.pixels import PixelFacts
+from clrecon.dicom.slice_header import SliceHeader
 from clrecon.errors import RefusedInputError
 from clrecon.geometry import AIR_HU
 

@@ -13,10 +13,11 @@ from typing import Any
 from clrecon.dicom.certificate import certify, collect_scan_warnings, collect_series_warnings
 from clrecon.dicom.choice import choose_series, describe_left
 from clrecon.dicom.containers import advise_on
+from clrecon.dicom.listing import SeriesListing, describe_series
 from clrecon.dicom.pixels import read_voxels
 from clrecon.dicom.plausibility import collect_voxel_warnings
 from clrecon.dicom.scan import BARE_DATA_SET, Progress, Scan, scan_path
-from clrecon.dicom.series import Series, SeriesListing, describe_series, group_series
+from clrecon.dicom.series import Series, group_series
 from clrecon.dicom.text import escape_text, join_names
 from clrecon.errors import NoDicomError, RefusedInputError, UsageError
 from clrecon.geometry import Volume

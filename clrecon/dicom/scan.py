@@ -17,7 +17,8 @@ from clrecon.dicom.containers import describe_container
 from clrecon.dicom.disk import DiskReader, Progress
 from clrecon.dicom.elements import META_START, CorruptFileError, FileStart, has_dicom_mark
 from clrecon.dicom.forced import FORCE_HINT, restore_start
-from clrecon.dicom.header import OtherImage, SliceHeader, read_headers
+from clrecon.dicom.header import read_headers
+from clrecon.dicom.slice_header import OtherImage, SliceHeader
 from clrecon.dicom.text import escape_text
 from clrecon.errors import NoDicomError
 

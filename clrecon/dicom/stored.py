@@ -22,7 +22,7 @@ from clrecon.dicom.codecs import choose_decoder, is_encapsulated
 from clrecon.dicom.codestream import Codestream, read_codestream
 from clrecon.dicom.decoder_pool import DecoderError, DecoderPool
 from clrecon.dicom.encapsulated import Pieces, find_frames, read_pieces
-from clrecon.dicom.header import SliceHeader
+from clrecon.dicom.slice_header import SliceHeader
 from clrecon.errors import RefusedInputError
 
 __all__ = ["StoredPixels"]

@@ -16,10 +16,10 @@ from clrecon.dicom.gate import (
     group_places,
     measure_stated_gap,
 )
-from clrecon.dicom.header import SliceHeader
 from clrecon.dicom.layout import measure_orientation
 from clrecon.dicom.pixels import PixelFacts
 from clrecon.dicom.series import Series
+from clrecon.dicom.slice_header import SliceHeader
 from clrecon.errors import RefusedInputError
 from clrecon.gates import Gate, at_most, none_of, unmeasured
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from clrecon.dicom.listing import SeriesEntry, SeriesListing
 from clrecon.dicom.plausibility import collect_voxel_warnings
 from clrecon.dicom.scan import Progress
-from clrecon.dicom.series import SeriesEntry, SeriesListing
 from clrecon.errors import RefusedInputError
 from clrecon.formats.certificate import MODALITY, certify_grid, collect_header_warnings
 from clrecon.formats.grid_file import VOLUME, GridFile
