@@ -134,12 +134,12 @@ def _refuse_options(kind: str, **options: Any) -> None:
 
 def _tell_format(path: str | os.PathLike[str]) -> str | None:
     """One of the formats that are not DICOM; None leaves it, and what is wrong with it, to the DICOM reader."""
-    from clrecon.formats import tell_kind
-
     try:
         file = Path(path)
         if not os.fspath(path).strip() or not file.is_file():  # a folder, nothing there, a device
             return None
+        from clrecon.formats import tell_kind  # which a folder has no need of
+
         kind = tell_kind(file)
     except (TypeError, ValueError, OSError):
         return None
