@@ -43,7 +43,8 @@ def read_volume(
         ``clrecon[volumes]``.  Told from the content.
     series : int or str, optional
         Which series of a DICOM folder: its number in the listing (from 1), SeriesInstanceUID, its hash, or
-        description.  Default: the CT series with most slices; what was left is said in the warnings.
+        description.  Default: the CT series with most slices, of several with as many the usable one; what was left
+        is said in the warnings.
     phase : int, optional
         Number of the phase, where a series holds several volumes at the same places (`list_series` lists them).
     allow_gaps : bool

@@ -18,6 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from clrecon.dicom.directions import ORIENTATION_EXACT, ORIENTATION_LIMIT, measure_directions
 from clrecon.dicom.holes import Holes, find_holes
 from clrecon.dicom.numbers import median
 from clrecon.dicom.slice_header import SliceHeader
@@ -28,12 +29,6 @@ __all__ = ["Line", "Stack", "group_places", "measure_stack", "measure_stated_gap
 
 Float64Array = NDArray[np.float64]
 
-ORIENTATION_EXACT = 1e-4
-"""Deviation from unit length and right angle that is taken silently (rounding of the stored numbers)."""
-ORIENTATION_LIMIT = 1e-3
-"""Deviation up to which the directions are made orthonormal, with a warning; refused above."""
-ORIENTATION_SPREAD_RAD = 1e-4
-"""Angle by which the directions of single slices may differ from the mean: 0.03 mm over 300 mm."""
 POSITION_TOLERANCE_MM = 0.01
 POSITION_TOLERANCE_GAPS = 0.01
 """A residual up to the larger of 0.01 mm and 1 % of the gap is rounding and no unevenness."""
@@ -254,44 +249,21 @@ def _mean_directions(
     headers: Sequence[SliceHeader], problems: list[str], warnings: list[str]
 ) -> tuple[Float64Array, Float64Array]:
     """Mean row and column directions, orthonormal; appends what is wrong with them."""
-    directions = np.array([(*h.row_cosines, *h.column_cosines) for h in headers], dtype=np.float64).reshape(-1, 2, 3)
-    mean = directions.mean(axis=0)
-    lengths = np.linalg.norm(directions, axis=2)
-    skew = np.abs(np.sum(directions[:, 0] * directions[:, 1], axis=1))
-    deviation = np.maximum(np.abs(lengths - 1.0).max(axis=1), skew)
-    worst = int(deviation.argmax())
-    if deviation[worst] > ORIENTATION_LIMIT:
+    directions = measure_directions(headers)
+    off = directions.deviation
+    if off > ORIENTATION_LIMIT:
         problems.append(
-            f"{headers[worst].name}: ImageOrientationPatient (0020,0037) is off unit length or right angle "
-            f"by {deviation[worst]:.2g} (allowed {ORIENTATION_LIMIT:g})"
+            f"{headers[int(directions.deviations.argmax())].name}: ImageOrientationPatient (0020,0037) is off unit "
+            f"length or right angle by {off:.2g} (allowed {ORIENTATION_LIMIT:g})"
         )
-        mean = np.eye(3)[:2]  # only to sort by; the stack is refused
-    elif deviation[worst] > ORIENTATION_EXACT:
-        warnings.append(
-            f"ImageOrientationPatient is off unit length or right angle by {deviation[worst]:.2g}: made orthonormal"
+    elif off > ORIENTATION_EXACT:
+        warnings.append(f"ImageOrientationPatient is off unit length or right angle by {off:.2g}: made orthonormal")
+    if directions.spread_rad > directions.spread_allowed_rad:
+        problems.append(
+            f"ImageOrientationPatient differs within the series by {np.degrees(directions.spread_rad):.3f} degrees: "
+            f"{headers[int(directions.angles_rad.argmax())].name}"
         )
-    row, column = _orthonormalise(mean[0], mean[1])
-    if deviation[worst] <= ORIENTATION_LIMIT:
-        units = directions / lengths[:, :, None]
-        angles = 2.0 * np.arcsin(np.clip(np.linalg.norm(units - (row, column), axis=2).max(axis=1) / 2.0, 0.0, 1.0))
-        odd = int(angles.argmax())
-        # Skew that was taken out above is no difference between slices.
-        if angles[odd] > ORIENTATION_SPREAD_RAD + deviation[worst]:
-            problems.append(
-                f"ImageOrientationPatient differs within the series by {np.degrees(angles[odd]):.3f} degrees: "
-                f"{headers[odd].name}"
-            )
-    return row, column
-
-
-def _orthonormalise(row: Float64Array, column: Float64Array) -> tuple[Float64Array, Float64Array]:
-    """Nearest orthonormal pair: both directions move by the same angle. Left alone where already exact."""
-    row, column = row / np.linalg.norm(row), column / np.linalg.norm(column)
-    if abs(row @ column) > 1e-9:
-        bisector, across = row + column, row - column
-        bisector, across = bisector / np.linalg.norm(bisector), across / np.linalg.norm(across)
-        row, column = (bisector + across) / np.sqrt(2.0), (bisector - across) / np.sqrt(2.0)
-    return row, column
+    return directions.row, directions.column
 
 
 def group_places(headers: Sequence[SliceHeader]) -> list[list[SliceHeader]]:

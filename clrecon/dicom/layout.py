@@ -15,37 +15,14 @@ from clrecon.dicom.slice_header import SliceHeader
 from clrecon.geometry import is_left_handed, slice_normal
 
 __all__ = [
-    "OrientationFault",
     "describe_orientation",
     "describe_thickness",
     "measure_extent",
-    "measure_orientation",
     "median_thickness",
     "summarise_gaps",
 ]
 
 Float64Array = NDArray[np.float64]
-
-OrientationFault = tuple[float, float]
-"""Largest deviation of the stored directions from unit length and right angle; largest angle in radians between
-those of one slice and the mean."""
-
-
-def measure_orientation(headers: Sequence[SliceHeader]) -> OrientationFault:
-    """How far ImageOrientationPatient is from two orthonormal vectors that all slices share, see `OrientationFault`."""
-    directions = np.array([(*h.row_cosines, *h.column_cosines) for h in headers], dtype=np.float64).reshape(-1, 2, 3)
-    lengths = np.linalg.norm(directions, axis=2)
-    skew = np.abs(np.sum(directions[:, 0] * directions[:, 1], axis=1))
-    deviation = float(np.maximum(np.abs(lengths - 1.0).max(axis=1), skew).max())
-    if lengths.min() == 0.0:
-        return deviation, float("nan")
-    units = directions / lengths[:, :, None]
-    mean = units.mean(axis=0)
-    size = np.linalg.norm(mean, axis=1, keepdims=True)
-    if size.min() == 0.0:
-        return deviation, float(np.pi)
-    chords = np.linalg.norm(units - mean / size, axis=2).max()
-    return deviation, float(2.0 * np.arcsin(min(chords / 2.0, 1.0)))
 
 
 def describe_orientation(affine: Float64Array) -> dict[str, Any]:

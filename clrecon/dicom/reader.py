@@ -40,18 +40,8 @@ def read_volume(
     ----------
     path : str or path-like
         A folder, searched with its subfolders (any file names; DICOMDIR not needed), or one file.
-    series : int or str, optional
-        Number in the listing (from 1), SeriesInstanceUID, its hash, or description.  Default: the one CT series
-        with most slices, of several with as many the usable one; what was left is said in the warnings.
-    phase : int, optional
-        Number of the phase, where a series holds several volumes at the same places (`list_series` lists them).
-    allow_gaps : bool
-        Read a stack with missing slices: what is there is placed exactly, with a warning.
-    force : bool
-        Read data sets without preamble or meta header too, their encoding guessed, with a warning.
-    progress : callable, optional
-        Called as ``progress(stage, done, total)`` with stage "scan" or "read", or "no answer yet from NAME" where the
-        disk hangs.
+    series, phase, allow_gaps, force, progress
+        As in `clrecon.read_volume`.
 
     Returns
     -------

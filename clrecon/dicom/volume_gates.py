@@ -8,15 +8,18 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 
-from clrecon.dicom.gate import (
+from clrecon.dicom.directions import (
     ORIENTATION_EXACT,
+    ORIENTATION_LIMIT,
     ORIENTATION_SPREAD_RAD,
+    measure_directions,
+)
+from clrecon.dicom.gate import (
     STATED_GAP_TOLERANCE,
     Stack,
     group_places,
     measure_stated_gap,
 )
-from clrecon.dicom.layout import measure_orientation
 from clrecon.dicom.pixels import PixelFacts
 from clrecon.dicom.series import Series
 from clrecon.dicom.slice_header import SliceHeader
@@ -66,12 +69,14 @@ def judge_series(series: Series, stack: Stack | None, facts: PixelFacts | None =
 
 
 def _gates_of_places(stack: Stack) -> Iterator[Gate]:
-    deviation, spread = measure_orientation(stack.slices)
+    directions = measure_directions(stack.slices)
     what = "ImageOrientationPatient is off unit length or right angle by"
-    yield at_most("orientation_exact", deviation, ORIENTATION_EXACT, None, what)
-    # Skew is taken out of every slice alike and is no difference between them.
+    yield at_most("orientation_exact", directions.deviation, ORIENTATION_EXACT, None, what)
     what = "ImageOrientationPatient of a slice differs from the mean by"
-    yield at_most("orientation_same", spread, ORIENTATION_SPREAD_RAD + deviation, "rad", what)
+    if directions.deviation > ORIENTATION_LIMIT:
+        yield unmeasured("orientation_same", ORIENTATION_SPREAD_RAD, "rad", f"{what}: there is no mean")
+    else:
+        yield at_most("orientation_same", directions.spread_rad, directions.spread_allowed_rad, "rad", what)
     line = stack.line
     what = "largest distance of a slice from even positions"
     if line.residual_max_mm is None or line.tolerance_mm is None:

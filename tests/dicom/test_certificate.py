@@ -231,3 +231,13 @@ def test_real_series_keep_their_gates(real_data):
         (13, 6.999),
     ]
     assert "grid_residual" in failed(gaps)
+
+
+@pytest.mark.parametrize("orientation", [[1, 0.01, 0, 0, 1, 0], [0, 0, 0, 0, 0, 0]])
+def test_a_stack_without_directions_has_a_certificate_in_strict_json(tmp_path, orientation):
+    write_series(tmp_path, change=set_values(ImageOrientationPatient=orientation))
+    certificate = list_series(tmp_path, 1).certificate
+    json.dumps(certificate, allow_nan=False)
+    gates = {gate["name"]: gate for gate in certificate["gates"]}
+    assert gates["orientation_exact"]["ok"] is False
+    assert gates["orientation_same"]["ok"] is None and gates["orientation_same"]["measured"] is None
