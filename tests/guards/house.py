@@ -18,7 +18,7 @@ def _layer(name: str, *allowed: str) -> None:
     LEFT_OF[name] = frozenset(allowed)
 
 
-_layer("__init__", "errors", "version", "geometry", "reading", "labels", "mesh", "opencl", "operators")
+_layer("__init__", "errors", "version", "geometry", "reading", "labels", "mesh", "rendering", "opencl", "operators")
 _layer("errors")
 _layer("version")
 _layer("gates")
@@ -29,13 +29,14 @@ _layer("mesh", "errors", "version", "files", "gates", "geometry")
 _layer("formats", "errors", "files", "gates", "geometry", "dicom")
 _layer("reading", "errors", "geometry", "dicom", "formats")
 _layer("labels", "errors", "files", "geometry", "dicom", "formats")
-_layer("reference", "errors", "files", "geometry", "labels")
+_layer("reference", "errors", "files", "geometry", "labels", "rendering")
 _layer("phantom", "errors", "version", "files", "geometry")
+_layer("rendering", "errors", "files", "geometry", "labels")
 _layer("opencl", "errors", "files")
 _layer("kernels", "errors", "files", "opencl")
-_layer("operators", "errors", "files", "geometry", "labels", "mesh", "opencl", "kernels")
+_layer("operators", "errors", "files", "geometry", "labels", "mesh", "rendering", "opencl", "kernels")
 _layer("pipeline", *(set(LEFT_OF) - {"__init__"}))
-_layer("viewer", "errors", "files", "geometry", "mesh", "pipeline")
+_layer("viewer", "errors", "files", "geometry", "mesh", "rendering", "pipeline")
 _layer("cli", "errors", "version", "pipeline", "viewer")
 _layer("__main__", "cli")
 
@@ -47,6 +48,7 @@ AT_MODULE_LEVEL: dict[str, frozenset[str]] = {
     "labels": frozenset({"numpy"}),
     "mesh": frozenset({"numpy"}),
     "reference": frozenset({"numpy"}),
+    "rendering": frozenset({"numpy"}),
     "phantom": frozenset({"numpy", "pydicom"}),
     "opencl": frozenset({"numpy"}),
     "kernels": frozenset({"numpy"}),
@@ -62,6 +64,7 @@ INSIDE_FUNCTIONS: dict[str, frozenset[str]] = {
     "labels": frozenset({"pydicom", "scipy"}),
     "mesh": frozenset({"scipy", "pyvista", "vtk", "vtkmodules", "fast_simplification"}),
     "reference": frozenset({"scipy"}),
+    "rendering": frozenset({"scipy", "PIL", "imageio", "pyvista", "vtk"}),
     "phantom": frozenset({"scipy"}),
     "opencl": frozenset({"pyopencl"}),
     "kernels": frozenset({"pyopencl"}),
