@@ -48,7 +48,6 @@ class TransferFunction:
         columns = [np.interp(values, self.points[:, 0], column) for column in self.points[:, 1:].T]
         return np.stack(columns, axis=-1)
 
-    def table(self, low: float, high: float, bins: int) -> NDArray[np.float32]:
-        """Red, green, blue, opacity (bins, 4), float32, at the centres of `bins` equal parts of low..high HU."""
-        centres = low + (np.arange(bins) + 0.5) * ((high - low) / bins)
-        return self(centres).astype(np.float32)
+    def table(self, low: float, high: float, nodes: int) -> NDArray[np.float32]:
+        """Red, green, blue, opacity (nodes, 4), float32, at `nodes` HU evenly from low to high, both included."""
+        return self(np.linspace(low, high, nodes)).astype(np.float32)
