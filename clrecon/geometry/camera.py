@@ -2,19 +2,25 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import NamedTuple
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from clrecon.errors import UsageError
-from clrecon.geometry.affine import Float64Array
+from clrecon.geometry.affine import Float64Array, checked_points
+from clrecon.geometry.grid import Grid
+from clrecon.geometry.views import checked_size, checked_vector, find_up, find_view
 
-__all__ = ["Camera", "CameraBasis"]
+__all__ = ["Camera", "CameraBasis", "box_corners"]
 
 DEFAULT_VIEW_ANGLE = 30.0
 """Degrees from the bottom to the top of a perspective picture, as in VTK."""
+
+RADII_AWAY = 2.0
+"""Where a parallel camera is put, in radii of the volume: outside of it, and near, so that depths keep their digits."""
 
 
 class CameraBasis(NamedTuple):
@@ -25,14 +31,23 @@ class CameraBasis(NamedTuple):
     forward: Float64Array
 
 
-def _vector(what: str, value: ArrayLike) -> tuple[float, float, float]:
-    try:
-        array = np.asarray(value, dtype=np.float64)
-    except (TypeError, ValueError):
-        array = np.empty(0)
-    if array.shape != (3,) or not np.isfinite(array).all():
-        raise UsageError(f"the {what} of a camera is three finite numbers in LPS mm, not {value!r}")
-    return float(array[0]), float(array[1]), float(array[2])
+def box_corners(volume: Grid) -> Float64Array:
+    """Corners of the space that voxels fill, half a voxel beyond the outer centres.
+
+    Parameters
+    ----------
+    volume : Volume or Grid
+
+    Returns
+    -------
+    ndarray, shape (n, 3), float64
+        LPS mm; the first and the last four are those of the whole box, and between them stand those of every slice
+        where the slices are uneven: all that is in the box lies in the convex hull of these points.
+    """
+    ni, nj, nk = volume.shape_ijk
+    inner = np.arange(nk) if getattr(volume, "uneven", False) else np.empty(0)
+    k, j, i = np.meshgrid([-0.5, *inner, nk - 0.5], (-0.5, nj - 0.5), (-0.5, ni - 0.5), indexing="ij")
+    return volume.ijk_to_lps(np.column_stack([i.ravel(), j.ravel(), k.ravel()]))
 
 
 @dataclass(frozen=True)
@@ -69,17 +84,76 @@ class Camera:
 
     def __post_init__(self) -> None:
         for name in ("position", "focal_point", "up"):
-            object.__setattr__(self, name, _vector(name.replace("_", " "), getattr(self, name)))
+            checked = checked_vector(f"the {name.replace('_', ' ')} of a camera", getattr(self, name))
+            object.__setattr__(self, name, checked)
         if self.view_angle is not None and self.parallel_scale is not None:
             raise UsageError("a camera has a view angle (perspective) or a parallel scale, not both")
         if self.parallel_scale is None:
-            angle = DEFAULT_VIEW_ANGLE if self.view_angle is None else self.view_angle
+            angle = DEFAULT_VIEW_ANGLE if self.view_angle is None else _number(self.view_angle)
             if not 1e-3 <= angle <= 179.0:
-                raise UsageError(f"the view angle of a camera lies between 0.001 and 179 degrees, not at {angle!r}")
-            object.__setattr__(self, "view_angle", float(angle))
-        elif not (0.0 < self.parallel_scale < np.inf):
-            raise UsageError(f"the parallel scale of a camera is a length in mm, not {self.parallel_scale!r}")
+                raise UsageError(
+                    f"the view angle of a camera lies between 0.001 and 179 degrees, not at {self.view_angle!r}"
+                )
+            object.__setattr__(self, "view_angle", angle)
+        else:
+            scale = _number(self.parallel_scale)
+            if not (0.0 < scale < np.inf):
+                raise UsageError(f"the parallel scale of a camera is a length in mm, not {self.parallel_scale!r}")
+            object.__setattr__(self, "parallel_scale", scale)
         self.basis()
+
+    @classmethod
+    def fit(
+        cls,
+        volume: Grid,
+        view: str | Sequence[float] = "anterior",
+        zoom: float = 1.0,
+        *,
+        up: str | ArrayLike | None = None,
+        view_angle: float | None = None,
+        size: Sequence[int] = (1024, 1024),
+    ) -> Camera:
+        """Look at the middle of a volume from a side of the patient.
+
+        The sphere around the volume's box just fits into the picture: the volume is whole in every view, as large in
+        one as in the other, and stays so when the camera orbits.
+
+        Parameters
+        ----------
+        volume : Volume or Grid
+            Sheared and uneven ones too.
+        view : str or (float, float)
+            anterior, posterior, left, right, superior, inferior: where the camera stands; or azimuth and elevation in
+            degrees, as a pair or as text ``"AZ,EL"``, see `clrecon.geometry.views.find_view`.
+        zoom : float
+            2 shows everything twice as large, see `zoomed`.
+        up : str or array_like, shape (3,), optional
+            Side of the patient (by the names above), or a direction in LPS, at the top of the picture; default:
+            superior, and anterior in views along the body.
+        view_angle : float, optional
+            Makes a perspective camera of so many degrees; default: a parallel one.
+        size : (int, int)
+            Width and height of the picture: its shorter side is what the sphere must fit into.
+
+        Raises
+        ------
+        UsageError
+            Unknown view (the message lists them) or direction, `up` along the view, or impossible numbers.
+        """
+        width, height = checked_size(size)
+        towards, default_up = find_view(view)
+        up_lps = default_up if up is None else find_up(up)
+        corners = box_corners(volume)
+        middle = np.concatenate([corners[:4], corners[-4:]]).mean(axis=0)
+        radius = float(np.linalg.norm(corners - middle, axis=1).max())
+        shorter = min(1.0, width / height)
+        away = RADII_AWAY * radius
+        if view_angle is not None:
+            in_front = cls(_triple(middle + towards), _triple(middle), _triple(up_lps), view_angle=view_angle)
+            away = radius / np.sin(np.arctan(in_front.half_height() * shorter))
+        scale = radius / shorter if view_angle is None else None
+        position = middle + away * towards
+        return cls(_triple(position), _triple(middle), _triple(up_lps), view_angle, scale).zoomed(zoom)
 
     @property
     def is_parallel(self) -> bool:
@@ -118,3 +192,130 @@ class Camera:
             return self.parallel_scale
         assert self.view_angle is not None
         return float(np.tan(np.radians(0.5 * self.view_angle)))
+
+    def pixel_mm(self, size: Sequence[int]) -> float:
+        """Side of a pixel in mm: everywhere in a parallel picture, at the focal point in a perspective one.
+
+        Parameters
+        ----------
+        size : (int, int)
+            Width and height of the picture.
+        """
+        _, height = checked_size(size)
+        return 2.0 * self.half_height() * (1.0 if self.is_parallel else self.distance) / height
+
+    def rays(self, size: Sequence[int]) -> tuple[Float64Array, Float64Array]:
+        """The ray of each pixel, through its centre (x + 0.5, y + 0.5).
+
+        Parameters
+        ----------
+        size : (int, int)
+            Width and height of the picture.
+
+        Returns
+        -------
+        origins, directions : ndarray, shape (h, w, 3), float64
+            LPS mm and unit vectors; row 0 is the top of the picture.
+        """
+        width, height = checked_size(size)
+        right, up, forward = self.basis()
+        pixel = 2.0 * self.half_height() / height
+        x = (np.arange(width) + 0.5 - 0.5 * width) * pixel
+        y = (0.5 * height - np.arange(height) - 0.5) * pixel
+        offsets = x[None, :, None] * right + y[:, None, None] * up
+        if self.is_parallel:
+            return self.position + offsets, np.broadcast_to(forward, offsets.shape).copy()
+        directions = forward + offsets
+        directions /= np.linalg.norm(directions, axis=2, keepdims=True)
+        return np.broadcast_to(self.position, offsets.shape).copy(), directions
+
+    def project(self, points: ArrayLike, size: Sequence[int]) -> tuple[Float64Array, Float64Array]:
+        """Where points appear in the picture; the inverse of `rays`.
+
+        Parameters
+        ----------
+        points : array_like, shape (n, 3)
+            LPS mm.
+        size : (int, int)
+            Width and height of the picture.
+
+        Returns
+        -------
+        pixels : ndarray, shape (n, 2), float64
+            x to the right and y down from the top left corner of the picture, so that the first pixel's centre is
+            (0.5, 0.5); NaN for points that a perspective camera has beside it or behind it.
+        depths : ndarray, shape (n,), float64
+            Mm along the ray, negative behind a parallel camera; NaN as above.
+        """
+        width, height = checked_size(size)
+        from_position = checked_points(points) - self.position
+        right, up, forward = self.basis()
+        along = from_position @ forward
+        pixel: Any = 2.0 * self.half_height() / height
+        depths = along
+        if not self.is_parallel:
+            along = np.where(along > 1e-9 * self.distance, along, np.nan)
+            pixel = pixel * along
+            depths = np.linalg.norm(from_position, axis=1) + 0.0 * along
+        x = 0.5 * width + from_position @ right / pixel
+        y = 0.5 * height - from_position @ up / pixel
+        return np.column_stack([x, y]), depths
+
+    def orbit(self, azimuth: float, elevation: float = 0.0) -> Camera:
+        """Turn the camera around its focal point, as `fit` counts angles.
+
+        Parameters
+        ----------
+        azimuth : float
+            Degrees about the axis of the body, from anterior towards the patient's left.
+        elevation : float
+            Degrees towards the top of the picture, before the azimuth.
+
+        Returns
+        -------
+        Camera
+            As far from the focal point; its `up` has turned with it.
+        """
+        if not np.isfinite([_number(azimuth), _number(elevation)]).all():
+            raise UsageError(f"a camera orbits by finite angles in degrees, not by {azimuth!r} and {elevation!r}")
+        turn = _rotation((0.0, 0.0, 1.0), azimuth) @ _rotation(self.basis().right, -elevation)
+        offset = turn @ np.subtract(self.position, self.focal_point)
+        return replace(self, position=_triple(self.focal_point + offset), up=_triple(turn @ self.up))
+
+    def zoomed(self, zoom: float) -> Camera:
+        """Show everything `zoom` times as large, from the same place: in less height or at a narrower angle.
+
+        Raises
+        ------
+        UsageError
+            `zoom` is not positive, or makes an angle that no camera has.
+        """
+        factor = _number(zoom)
+        if not (0.0 < factor < np.inf):
+            raise UsageError(f"zoom is a positive number, 2 shows everything twice as large, not {zoom!r}")
+        if factor == 1.0:
+            return self
+        if self.parallel_scale is not None:
+            return replace(self, parallel_scale=self.parallel_scale / factor)
+        return replace(self, view_angle=float(2.0 * np.degrees(np.arctan(self.half_height() / factor))))
+
+
+def _triple(vector: Float64Array) -> tuple[float, float, float]:
+    x, y, z = vector.tolist()
+    return x, y, z
+
+
+def _number(value: Any) -> float:
+    """`value` as a float, NaN for what is none."""
+    try:
+        return float(value)
+    except (TypeError, ValueError):
+        return float("nan")
+
+
+def _rotation(axis: ArrayLike, degrees: float) -> Float64Array:
+    """Right-handed turn about a unit axis, shape (3, 3) (Rodrigues 1840)."""
+    x, y, z = np.asarray(axis, dtype=np.float64)
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    radians = np.radians(degrees)
+    return np.eye(3) + np.sin(radians) * cross + (1.0 - np.cos(radians)) * cross @ cross

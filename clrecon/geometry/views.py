@@ -1,0 +1,132 @@
+"""Names of directions in the patient, the views that are taken from them, and the sizes that pictures may have."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from clrecon.errors import UsageError
+from clrecon.geometry.affine import Float64Array
+
+__all__ = ["DIRECTIONS", "LARGEST_SIDE", "checked_size", "checked_vector", "find_up", "find_view"]
+
+DIRECTIONS: dict[str, tuple[float, float, float]] = {
+    "anterior": (0.0, -1.0, 0.0),
+    "posterior": (0.0, 1.0, 0.0),
+    "left": (1.0, 0.0, 0.0),
+    "right": (-1.0, 0.0, 0.0),
+    "superior": (0.0, 0.0, 1.0),
+    "inferior": (0.0, 0.0, -1.0),
+}
+"""Unit vectors in LPS, from the middle of the patient to each side; a view of that name is taken from there."""
+
+LARGEST_SIDE = 16384
+"""Pixels along a side of a picture: more is a slip of the keyboard."""
+
+
+def checked_vector(what: str, value: ArrayLike) -> tuple[float, float, float]:
+    """Return three finite numbers as floats.
+
+    Raises
+    ------
+    UsageError
+        They are not; the message begins with `what`.
+    """
+    try:
+        array = np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        array = np.empty(0)
+    if array.shape != (3,) or not np.isfinite(array).all():
+        raise UsageError(f"{what} is three finite numbers in LPS mm, not {value!r}")
+    return float(array[0]), float(array[1]), float(array[2])
+
+
+def checked_size(size: Sequence[int]) -> tuple[int, int]:
+    """Return the size of a picture as (width, height).
+
+    Raises
+    ------
+    UsageError
+        Not two whole numbers from 1 to `LARGEST_SIDE`.
+    """
+    try:
+        width, height = size
+        if int(width) == width and int(height) == height:
+            if 1 <= width <= LARGEST_SIDE and 1 <= height <= LARGEST_SIDE:
+                return int(width), int(height)
+    except (TypeError, ValueError, OverflowError):
+        pass
+    raise UsageError(f"the size of a picture is (width, height) in pixels, each from 1 to {LARGEST_SIDE}, not {size!r}")
+
+
+def find_view(view: str | Sequence[float]) -> tuple[Float64Array, Float64Array]:
+    """Where a view is taken from, and what is at its top.
+
+    Parameters
+    ----------
+    view : str or (float, float)
+        A name of `DIRECTIONS`, or azimuth and elevation in degrees, as a pair or as text ``"AZ,EL"``: azimuth turns
+        the camera from anterior towards the patient's left, elevation (-90 to 90) lifts it to the head.
+
+    Returns
+    -------
+    towards, up : ndarray, shape (3,), float64
+        Unit vectors in LPS: from the patient to the camera, and to the top of the picture (the head; for a view along
+        the body, the side of the azimuth, which is anterior for the views by name).
+
+    Raises
+    ------
+    UsageError
+        No such view; the message lists those that there are.
+    """
+    named = DIRECTIONS.get(view.strip().lower()) if isinstance(view, str) else None
+    if named is not None:
+        up = DIRECTIONS["superior"] if named[2] == 0.0 else DIRECTIONS["anterior"]
+        return np.array(named), np.array(up)
+    azimuth, elevation = _find_angles(view)
+    around = _turned_anterior(azimuth)
+    if abs(elevation) == 90.0:
+        return np.array([0.0, 0.0, np.sign(elevation)]), around
+    radians = np.radians(elevation)
+    return np.cos(radians) * around + [0.0, 0.0, np.sin(radians)], np.array(DIRECTIONS["superior"])
+
+
+def find_up(up: str | ArrayLike) -> Float64Array:
+    """Direction in LPS for the top of a picture, from a name of `DIRECTIONS` or three numbers.
+
+    Raises
+    ------
+    UsageError
+        Neither of them.
+    """
+    if isinstance(up, str):
+        named = DIRECTIONS.get(up.strip().lower())
+        if named is None:
+            raise UsageError(f"unknown direction {up!r} for the top of a picture: use one of {', '.join(DIRECTIONS)}")
+        return np.array(named)
+    return np.array(checked_vector("the up direction of a picture", up))
+
+
+def _turned_anterior(azimuth: float) -> Float64Array:
+    """The anterior direction, turned by `azimuth` degrees to the left; exact at quarter turns."""
+    quarters, rest = divmod(azimuth, 90.0)
+    sine, cosine = np.sin(np.radians(rest)), np.cos(np.radians(rest))
+    for _ in range(int(quarters) % 4):
+        sine, cosine = cosine, -sine
+    return np.array([sine, -cosine, 0.0])
+
+
+def _find_angles(view: str | Sequence[float]) -> tuple[float, float]:
+    parts: Sequence[str | float] = view.split(",") if isinstance(view, str) else view
+    try:
+        azimuth, elevation = (float(part) for part in parts)
+    except (TypeError, ValueError):
+        azimuth = elevation = float("nan")
+    if not (np.isfinite(azimuth) and abs(elevation) <= 90.0):
+        raise UsageError(
+            f"unknown view {view!r}: use one of {', '.join(DIRECTIONS)}, or AZIMUTH,ELEVATION in degrees,"
+            " elevation from -90 to 90, such as 30,15"
+        )
+    return azimuth, elevation

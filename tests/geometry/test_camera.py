@@ -1,0 +1,243 @@
+"""Cameras: anatomical sides, rays and their inverse, what fits into a picture, and what is refused."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from clrecon.errors import UsageError
+from clrecon.geometry import Volume
+from clrecon.geometry.camera import Camera, box_corners
+from clrecon.geometry.views import DIRECTIONS
+from tests import tolerances
+
+CENTRE = np.array([12.0, -30.0, 850.0])
+MARKS = {name: CENTRE + 20.0 * np.array(direction) for name, direction in DIRECTIONS.items()}
+"""One point at each side of a patient, none of them symmetric to another in any picture."""
+
+SIZE = (400, 300)
+
+RIGHT_AND_TOP = {
+    "anterior": ("left", "superior"),
+    "posterior": ("right", "superior"),
+    "left": ("posterior", "superior"),
+    "right": ("anterior", "superior"),
+    "superior": ("right", "anterior"),
+    "inferior": ("left", "anterior"),  # as axial slices are shown
+}
+
+
+def box(size=(40, 50, 60), spacing=(0.7, 0.5, 2.5)) -> Volume:
+    affine = np.diag([*spacing, 1.0])
+    affine[:3, 3] = CENTRE - 0.5 * (np.array(size) - 1) * spacing
+    return Volume(np.zeros(size[::-1], np.int16), affine)
+
+
+def sheared() -> Volume:
+    affine = np.array([[0.6, 0.2, 0.1, -30.0], [-0.2, 0.8, 0.9, 20.0], [0.1, 0.0, -2.0, 5.0], [0, 0, 0, 1]])
+    return Volume(np.zeros((17, 30, 25), np.int16), affine)
+
+
+def uneven() -> Volume:
+    positions = np.array([[0.0, 0, 0], [0, 0, 1.25], [0, 30, 2.4], [0, 0, 30.0]]) + CENTRE
+    affine = np.eye(4)
+    affine[:3, 2] = (positions[-1] - positions[0]) / 3
+    affine[:3, 3] = positions[0]
+    return Volume(np.zeros((4, 21, 13), np.int16), affine, slice_positions=positions)
+
+
+@pytest.mark.parametrize("perspective", [None, 40.0])
+@pytest.mark.parametrize("view", DIRECTIONS)
+def test_each_view_has_the_sides_of_the_patient_where_a_radiologist_expects_them(view, perspective):
+    camera = Camera.fit(box(), view, view_angle=perspective, size=SIZE)
+    right, top = RIGHT_AND_TOP[view]
+    names = list(MARKS)
+    pixels, depths = camera.project(list(MARKS.values()), SIZE)
+    place = dict(zip(names, pixels, strict=True))
+    assert names[pixels[:, 0].argmax()] == right
+    assert names[pixels[:, 1].argmin()] == top
+    assert names[depths.argmin()] == view
+    assert place[right][1] == pytest.approx(150.0) and place[top][0] == pytest.approx(200.0)
+
+
+@pytest.mark.parametrize(
+    ("angles", "name"),
+    [("0,0", "anterior"), ((90, 0), "left"), ("180, 0", "posterior"), ("-90,0", "right"), ("270,0", "right")]
+    + [((0.0, 90.0), "superior"), ("0,-90", "inferior"), (" Anterior ", "anterior")],
+)
+def test_angles_name_the_same_views(angles, name):
+    assert Camera.fit(box(), angles) == Camera.fit(box(), name)
+
+
+def test_azimuth_goes_to_the_left_and_elevation_to_the_head():
+    camera = Camera.fit(box(), "30,20")
+    towards = np.subtract(camera.position, camera.focal_point) / camera.distance
+    cosine = np.cos(np.radians(20.0))
+    assert towards == pytest.approx([0.5 * cosine, -np.sqrt(0.75) * cosine, np.sin(np.radians(20.0))])
+    assert camera.up == (0.0, 0.0, 1.0)
+
+
+def test_over_the_head_the_side_of_the_azimuth_is_at_the_top():
+    assert Camera.fit(box(), "90,90").up == DIRECTIONS["left"]
+    assert Camera.fit(box(), "180,-90").up == DIRECTIONS["posterior"]
+
+
+def test_the_top_can_be_chosen():
+    camera = Camera.fit(box(), "superior", up="posterior")
+    assert camera.basis().up == pytest.approx([0.0, 1.0, 0.0])
+    assert camera.basis().right == pytest.approx([1.0, 0.0, 0.0])
+    assert Camera.fit(box(), "anterior", up=(1, 0, 0)).basis().up == pytest.approx([1.0, 0.0, 0.0])
+
+
+def in_picture(camera: Camera, volume: Volume, size) -> np.ndarray:
+    pixels, _ = camera.project(box_corners(volume), size)
+    return ((pixels >= -1e-6) & (pixels <= np.array(size) + 1e-6)).all(axis=1)
+
+
+@pytest.mark.parametrize("size", [(400, 300), (300, 400), (512, 512)])
+@pytest.mark.parametrize("perspective", [None, 50.0])
+@pytest.mark.parametrize("make", [box, sheared, uneven])
+def test_the_whole_volume_is_in_the_picture_of_any_view(make, perspective, size):
+    volume = make()
+    rng = np.random.default_rng(3)
+    for view in [*DIRECTIONS, *zip(rng.uniform(-180, 180, 20), rng.uniform(-90, 90, 20), strict=True)]:
+        camera = Camera.fit(volume, view, view_angle=perspective, size=size)
+        assert in_picture(camera, volume, size).all()
+        assert in_picture(camera.orbit(77.0, 31.0), volume, size).all()
+
+
+@pytest.mark.parametrize("perspective", [None, 50.0])
+def test_the_sphere_of_the_volume_touches_the_border(perspective):
+    volume = box()
+    camera = Camera.fit(volume, view_angle=perspective, size=(300, 400))
+    radius = np.linalg.norm(np.array(volume.shape_ijk) * volume.spacing) / 2
+    right = camera.basis().right
+    if perspective is None:
+        edge, _ = camera.project([CENTRE + radius * right], (300, 400))
+        assert edge[0] == pytest.approx([300.0, 200.0])
+    else:  # the edge of the picture is tangent to the sphere
+        half_angle = np.arctan(camera.half_height() * 300 / 400)
+        assert camera.distance * np.sin(half_angle) == pytest.approx(radius)
+
+
+def test_the_corners_are_half_a_voxel_out():
+    corners = box_corners(box())
+    half = 0.5 * np.array([40, 50, 60]) * (0.7, 0.5, 2.5)
+    assert corners.min(axis=0) == pytest.approx(CENTRE - half)
+    assert corners.max(axis=0) == pytest.approx(CENTRE + half)
+    assert Camera.fit(box()).focal_point == pytest.approx(tuple(CENTRE))
+
+
+def test_slices_that_stick_out_of_an_uneven_stack_are_in_the_picture_too():
+    corners = box_corners(uneven())
+    assert corners[:, 1].max() == pytest.approx(CENTRE[1] + 30.0 + 20.5)
+    assert corners[:, 2].min() == pytest.approx(CENTRE[2] - 0.625)
+    assert corners[:, 2].max() == pytest.approx(CENTRE[2] + 30.0 + 13.8)
+
+
+@pytest.mark.parametrize("perspective", [None, 35.0])
+def test_points_on_rays_project_to_their_pixels(perspective):
+    camera = Camera.fit(sheared(), "40,-25", view_angle=perspective, size=(7, 5)).zoomed(1.7)
+    origins, directions = camera.rays((7, 5))
+    assert origins.shape == directions.shape == (5, 7, 3)
+    depth = np.random.default_rng(1).uniform(0.1, 300.0, (5, 7))
+    pixels, depths = camera.project((origins + depth[..., None] * directions).reshape(-1, 3), (7, 5))
+    y, x = np.mgrid[:5, :7] + 0.5
+    assert np.abs(pixels - np.column_stack([x.ravel(), y.ravel()])).max() <= tolerances.FLOAT64_PLACE_MM
+    assert np.abs(depths - depth.ravel()).max() <= tolerances.FLOAT64_PLACE_MM
+    assert np.linalg.norm(directions, axis=2) == pytest.approx(1.0)
+
+
+def test_a_parallel_ray_is_where_the_definition_says():
+    camera = Camera((0, -100, 0), (0, 0, 0), (0, 0, 2), parallel_scale=10.0)
+    origins, directions = camera.rays((4, 2))
+    assert origins[0, 0] == pytest.approx([-15.0, -100.0, 5.0])
+    assert origins[1, 3] == pytest.approx([15.0, -100.0, -5.0])
+    assert directions[1, 2] == pytest.approx([0.0, 1.0, 0.0])
+    assert camera.pixel_mm((4, 2)) == 10.0
+
+
+def test_a_perspective_ray_is_where_the_definition_says():
+    camera = Camera((0, -100, 0), (0, 0, 0), (0, 0, 1), view_angle=90.0)
+    origins, directions = camera.rays((4, 2))
+    assert origins[1, 2] == pytest.approx([0.0, -100.0, 0.0])
+    assert directions[0, 3] == pytest.approx(np.array([1.5, 1.0, 0.5]) / np.sqrt(3.5))
+    assert camera.pixel_mm((4, 2)) == pytest.approx(100.0)
+
+
+def test_points_behind_a_perspective_camera_are_nowhere():
+    camera = Camera((0, -100, 0), (0, 0, 0), (0, 0, 1), view_angle=90.0)
+    pixels, depths = camera.project([[0, -101, 0], [5, -100, 0], [0, -99, 0]], (4, 4))
+    assert np.isnan(pixels[:2]).all() and np.isnan(depths[:2]).all()
+    assert depths[2] == pytest.approx(1.0)
+    parallel = Camera((0, -100, 0), (0, 0, 0), (0, 0, 1), parallel_scale=10.0)
+    assert parallel.project([[0, -101, 0]], (4, 4))[1] == pytest.approx([-1.0])
+
+
+def test_an_orbit_counts_angles_as_views_do():
+    start = Camera.fit(box(), "anterior")
+    for azimuth, elevation in [(30, 0), (-120, 40), (360, 0), (45, 90), (10, -90)]:
+        turned, truth = start.orbit(azimuth, elevation), Camera.fit(box(), (azimuth, elevation))
+        assert turned.position == pytest.approx(truth.position)
+        sign = -1.0 if elevation == 90 else 1.0  # tilted over the head from the front, the back is at the top
+        assert turned.basis().up == pytest.approx(sign * truth.basis().up)
+        assert turned.parallel_scale == start.parallel_scale
+
+
+def test_zoom_magnifies():
+    for perspective in (None, 60.0):
+        camera = Camera.fit(box(), view_angle=perspective, size=SIZE)
+        wide, _ = camera.project([CENTRE + (3, 0, 4)], SIZE)
+        narrow, _ = camera.zoomed(2.5).project([CENTRE + (3, 0, 4)], SIZE)
+        assert narrow[0] - (200, 150) == pytest.approx(2.5 * (wide[0] - (200, 150)))
+        assert Camera.fit(box(), zoom=2.5, view_angle=perspective, size=SIZE) == camera.zoomed(2.5)
+
+
+@pytest.mark.parametrize("view", ["front", "", "1,2,3", "10", (1,), (0, 91), "nan,0", "inf,0", 5, None, ("a", "b")])
+def test_unknown_views_list_the_known_ones(view):
+    with pytest.raises(UsageError, match="anterior, posterior, left, right, superior, inferior, or AZIMUTH,ELEVATION"):
+        Camera.fit(box(), view)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"up": "top"}, "anterior, posterior, left"),
+        ({"up": (1, 2)}, "three finite numbers"),
+        ({"up": "posterior"}, "runs along its view"),
+        ({"zoom": 0}, "zoom is a positive number"),
+        ({"zoom": "big"}, "zoom is a positive number"),
+        ({"view_angle": 180}, "between 0.001 and 179"),
+        ({"size": (0, 10)}, "from 1 to 16384"),
+        ({"size": (10, 1e6)}, "from 1 to 16384"),
+        ({"size": (10.5, 10)}, "from 1 to 16384"),
+        ({"size": 10}, "from 1 to 16384"),
+    ],
+)
+def test_impossible_fits_are_refused(arguments, message):
+    with pytest.raises(UsageError, match=message):
+        Camera.fit(box(), **arguments)
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        {"position": (0, 0, 0)},
+        {"position": (0, 0, np.nan)},
+        {"up": (0, 1, 0)},
+        {"up": (0, 0, 0)},
+        {"view_angle": 30, "parallel_scale": 10},
+        {"view_angle": 0},
+        {"view_angle": "wide"},
+        {"parallel_scale": -1},
+        {"parallel_scale": np.inf},
+    ],
+)
+def test_impossible_cameras_are_refused(arguments):
+    with pytest.raises(UsageError, match="camera"):
+        Camera(**{"position": (0, -100, 0), "focal_point": (0, 0, 0), "up": (0, 0, 1), **arguments})
+
+
+def test_orbits_are_finite():
+    with pytest.raises(UsageError, match="finite angles"):
+        Camera.fit(box()).orbit(np.nan)
