@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from clrecon.errors import UsageError
 from clrecon.geometry.camera import Camera
 
 __all__ = ["Rendering"]
@@ -31,7 +34,7 @@ class Rendering:
         HU of each pixel, for modes that show values (mip, minip, mean, slice, cpr); NaN outside of the volume.
     mode : str
     report : dict
-        How it was made, free of patient data.
+        How it was made, free of patient data.  ``"pixel_mm"`` says the side of a pixel where no camera does.
     """
 
     image: NDArray[np.uint8]
@@ -41,3 +44,117 @@ class Rendering:
     values: NDArray[np.float32] | None = None
     mode: str = "dvr"
     report: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height in pixels."""
+        return self.image.shape[1], self.image.shape[0]
+
+    @property
+    def pixel_mm(self) -> float | None:
+        """Side of a pixel in mm where it is the same all over the picture, else None (perspective)."""
+        if self.camera is not None:
+            return self.camera.pixel_mm(self.size) if self.camera.is_parallel else None
+        told = self.report.get("pixel_mm")
+        return None if told is None else float(told)
+
+    @property
+    def is_opaque(self) -> bool:
+        """True when no pixel lets a background through."""
+        return bool((self.image[..., 3] == 255).all())
+
+    def with_background(self, color: str | Sequence[float]) -> Rendering:
+        """The same picture before a colour, opaque.
+
+        Parameters
+        ----------
+        color : str or (float, float, float)
+            See `clrecon.rendering.colors.find_color`.
+
+        Returns
+        -------
+        Rendering
+            With an `image` of its own; it shares the other arrays.
+        """
+        from clrecon.rendering.colors import find_color
+
+        opacity = self.image[..., 3:].astype(np.float32) / np.float32(255.0)
+        behind = (255.0 * find_color(color)).astype(np.float32)
+        mixed = opacity * self.image[..., :3] + (np.float32(1.0) - opacity) * behind
+        image = np.full_like(self.image, 255)
+        image[..., :3] = np.rint(mixed)
+        return replace(self, image=image)
+
+    def annotated(self, *, letters: bool = False, scale_bar: bool = False, caption: str | None = None) -> Rendering:
+        """The same picture with sides of the patient, a scale bar or a line of text drawn in.
+
+        See `clrecon.rendering.annotations.annotate`.
+        """
+        from clrecon.rendering.annotations import annotate
+
+        return annotate(self, letters=letters, scale_bar=scale_bar, caption=caption)
+
+    def save(self, path: str | os.PathLike[str], *, quality: int = 95) -> int:
+        """Write the picture to a file whose extension says the format.
+
+        Parameters
+        ----------
+        path : str or path
+            ``.png`` and ``.tif`` keep the opacity and say the mm of a pixel as resolution where the picture is
+            parallel; PNG also says how it was made.  ``.jpg`` takes opaque pictures alone.
+        quality : int
+            Of JPEG, 1 to 100.
+
+        Returns
+        -------
+        int
+            Size of the file in bytes.
+
+        Raises
+        ------
+        UsageError
+            Another extension, or opacity that the format would lose.
+        OutputError
+            The file cannot be written; an older one of that name is intact.
+        """
+        from clrecon.rendering.image_files import write_image
+
+        return write_image(self, path, quality)
+
+    def save_depth(self, path: str | os.PathLike[str], *, expected: bool = False) -> int:
+        """Write `depth` in mm to ``.npy`` or, as float32 with NaN, to ``.tif``.
+
+        Parameters
+        ----------
+        path : str or path
+        expected : bool
+            `expected_depth` in its place.
+
+        Returns
+        -------
+        int
+            Size of the file in bytes.
+        """
+        from clrecon.rendering.image_files import write_floats
+
+        return write_floats(self.expected_depth if expected else self.depth, path, self.pixel_mm)
+
+    def save_values(self, path: str | os.PathLike[str]) -> int:
+        """Write `values` in HU as `save_depth` writes depths.
+
+        Raises
+        ------
+        UsageError
+            The mode has none.
+        """
+        from clrecon.rendering.image_files import write_floats
+
+        if self.values is None:
+            raise UsageError(f"a picture of mode {self.mode} has no values: mip, minip, mean, slice and cpr have them")
+        return write_floats(self.values, path, self.pixel_mm)
+
+    def _repr_png_(self) -> bytes:
+        """What a notebook shows."""
+        from clrecon.rendering.image_files import encode_image
+
+        return encode_image(self, ".png")

@@ -31,7 +31,7 @@ _layer("reading", "errors", "geometry", "dicom", "formats")
 _layer("labels", "errors", "files", "geometry", "dicom", "formats")
 _layer("reference", "errors", "files", "geometry", "labels", "rendering")
 _layer("phantom", "errors", "version", "files", "geometry")
-_layer("rendering", "errors", "files", "geometry", "labels")
+_layer("rendering", "errors", "version", "files", "geometry", "labels")
 _layer("opencl", "errors", "files")
 _layer("kernels", "errors", "files", "opencl")
 _layer("operators", "errors", "files", "geometry", "labels", "mesh", "rendering", "opencl", "kernels")
@@ -58,13 +58,13 @@ AT_MODULE_LEVEL: dict[str, frozenset[str]] = {
 }
 INSIDE_FUNCTIONS: dict[str, frozenset[str]] = {
     "files": frozenset({"numpy"}),
-    "geometry": frozenset({"scipy"}),
+    "geometry": frozenset({"scipy", "pyvista"}),
     "dicom": frozenset({"imagecodecs", "openjpeg", "rle", "jpeg_ls", "pylibjpeg"}),
     "formats": frozenset({"nibabel", "nrrd", "SimpleITK"}),
     "labels": frozenset({"pydicom", "scipy"}),
     "mesh": frozenset({"scipy", "pyvista", "vtk", "vtkmodules", "fast_simplification"}),
     "reference": frozenset({"scipy"}),
-    "rendering": frozenset({"scipy", "PIL", "imageio", "pyvista", "vtk"}),
+    "rendering": frozenset({"scipy", "PIL", "imageio_ffmpeg", "pyvista", "vtk"}),
     "phantom": frozenset({"scipy"}),
     "opencl": frozenset({"pyopencl"}),
     "kernels": frozenset({"pyopencl"}),

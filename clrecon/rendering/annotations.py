@@ -1,0 +1,236 @@
+"""What is drawn into a picture on request: sides of the patient, a scale bar in mm, a line of text."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from clrecon.errors import UsageError
+from clrecon.geometry.camera import Camera
+from clrecon.geometry.views import DIRECTIONS
+from clrecon.rendering.pillow import load_font, load_pillow
+
+if TYPE_CHECKING:
+    from PIL import Image
+
+    from clrecon.rendering.picture import Rendering
+
+__all__ = ["SMALLEST_SIDE", "annotate", "bar_length", "edge_letters", "orientation_letters"]
+
+SMALLEST_SIDE = 64
+"""Pixels; letters in smaller pictures cannot be read."""
+
+LEAST_SHARE = 0.05
+"""Component of a unit vector from which on its letter is shown: a turn by 3 degrees."""
+
+TEXT_SHARE, SMALLEST_TEXT = 1 / 28, 9.0
+"""Height of the text as a share of the shorter side, and in pixels at least."""
+
+LONGEST_BAR_SHARE = 0.35
+"""Of the width.  Rounded down to 1, 2 or 5 x 10^n mm, a bar has at least 14 %."""
+
+
+class _Ink(NamedTuple):
+    """Grey of what is drawn, and of the outline that sets it off."""
+
+    fill: int
+    outline: int
+
+
+def orientation_letters(direction: ArrayLike) -> str:
+    """Name a direction in the patient as DICOM's Patient Orientation does: ``L``, ``LP``, ``PLS``.
+
+    Parameters
+    ----------
+    direction : array_like, shape (3,)
+        In LPS, any length.
+
+    Returns
+    -------
+    str
+        L, R, P, A, S (superior, DICOM's H) and I (inferior, DICOM's F) of the components from the largest to the
+        smallest; components of less than 5 % are left out, and equal ones come in the order of x, y and z.
+
+    Notes
+    -----
+    DICOM PS3.3 C.7.6.1.1.1.
+    """
+    vector = np.asarray(direction, dtype=np.float64)
+    vector = vector / np.linalg.norm(vector)
+    letters = {name[0].upper(): float(np.dot(vector, side)) for name, side in DIRECTIONS.items()}
+    shares = {letter: round(share, 6) for letter, share in letters.items() if share >= LEAST_SHARE}
+    return "".join(sorted(shares, key=lambda letter: (-shares[letter], "LRPASI".index(letter))))
+
+
+def edge_letters(camera: Camera) -> dict[str, str]:
+    """Letters of the directions to the ``left``, ``right``, ``top`` and ``bottom`` edge of a camera's picture."""
+    right, up, _ = camera.basis()
+    edges = {"left": -right, "right": right, "top": up, "bottom": -up}
+    return {edge: orientation_letters(direction) for edge, direction in edges.items()}
+
+
+def bar_length(width_mm: float) -> float:
+    """The longest of 1, 2 and 5 x 10^n mm that is no longer than 35 % of a picture's width in mm."""
+    longest = LONGEST_BAR_SHARE * width_mm * (1.0 + 1e-12)
+    power = 10.0 ** np.floor(np.log10(longest))
+    return float(max(step * power for step in (1.0, 2.0, 5.0) if step * power <= longest))
+
+
+def annotate(
+    rendering: Rendering, *, letters: bool = False, scale_bar: bool = False, caption: str | None = None
+) -> Rendering:
+    """Draw into a picture.
+
+    Parameters
+    ----------
+    rendering : Rendering
+        Not changed.
+    letters : bool
+        The side of the patient that each edge looks to, see `orientation_letters`.
+    scale_bar : bool
+        A bar of a round length at the bottom left.  In a perspective picture it holds in the focal plane and says so.
+    caption : str, optional
+        One line at the top left; cut where the picture ends.
+
+    Returns
+    -------
+    Rendering
+        With an `image` of its own, opaque where something is drawn; it shares the other arrays.
+
+    Raises
+    ------
+    UsageError
+        The picture is smaller than 64 x 64 pixels or too narrow for the text, or its directions or its pixel size
+        are not known (curved reformations).
+    """
+    if not (letters or scale_bar or caption):
+        return rendering
+    width, height = rendering.size
+    if min(width, height) < SMALLEST_SIDE:
+        raise UsageError(
+            f"a picture of {width} x {height} pixels is too small for letters or a scale bar:"
+            f" at least {SMALLEST_SIDE} x {SMALLEST_SIDE}"
+        )
+    page = _Page(rendering)
+    if letters:
+        if rendering.camera is None:
+            raise UsageError("a curved picture has no sides of the patient at its edges: leave the letters out")
+        for edge, text in edge_letters(rendering.camera).items():
+            page.draw_edge(edge, text)
+    if scale_bar:
+        page.draw_bar(*_bar_of(rendering))
+    if caption:
+        page.draw_caption(caption)
+    return replace(rendering, image=page.finish())
+
+
+def _bar_of(rendering: Rendering) -> tuple[float, str]:
+    """Length of the bar in pixels, and what stands over it."""
+    camera, pixel_mm, where = rendering.camera, rendering.pixel_mm, ""
+    if camera is not None and not camera.is_parallel:
+        pixel_mm, where = camera.pixel_mm(rendering.size), " (focal plane)"
+    if pixel_mm is None:
+        raise UsageError("the size of this picture's pixels is not known: leave the scale bar out")
+    length = bar_length(pixel_mm * rendering.size[0])
+    return length / pixel_mm, f"{length:g} mm{where}"
+
+
+class _Page:
+    """A picture that is drawn on: everything as two masks, one of the outlines and one of what they surround."""
+
+    def __init__(self, rendering: Rendering):
+        load_pillow()
+        from PIL import Image, ImageDraw
+
+        self._picture = Image.fromarray(np.ascontiguousarray(rendering.image))
+        self._size = rendering.size
+        self._masks = [Image.new("L", self._size, 0) for _ in range(2)]
+        self._pens = [ImageDraw.Draw(mask) for mask in self._masks]
+        self._ink = _choose_ink(rendering)
+        shorter = min(self._size)
+        text = max(SMALLEST_TEXT, TEXT_SHARE * shorter)
+        self._font = load_font(text)
+        self._margin = max(2, round(0.02 * shorter))
+        self._stroke = max(1, round(text / 14.0))
+        self._boxes: list[tuple[float, float, float, float]] = []
+
+    def draw_edge(self, edge: str, text: str) -> None:
+        """Letters in the middle of an edge."""
+        width, height = self._size
+        gap = self._margin + self._stroke
+        # Anchors of Pillow: left, middle, right; top, middle, baseline.  Capitals have no descender.
+        x, y, anchor = {
+            "left": (gap, height / 2, "lm"),
+            "right": (width - gap, height / 2, "rm"),
+            "top": (width / 2, gap, "mt"),
+            "bottom": (width / 2, height - gap, "ms"),
+        }[edge]
+        self._write((x, y), text, anchor)
+
+    def draw_bar(self, pixels: float, text: str) -> None:
+        """A bar whose filled part is `pixels` long, rounded to whole ones, with text over it."""
+        thickness = max(2, round(0.18 * self._font.size))
+        left = self._margin + self._stroke
+        end = left + max(1, round(pixels))
+        bottom = self._size[1] - left
+        over = thickness + 2 * self._stroke + max(1, round(0.12 * self._font.size))
+        if self._overlaps(self._box((left, bottom - over), text, "ls")):
+            bottom -= round(self._font.size) + self._stroke  # above the letters of the bottom edge
+        for pen, border in zip(self._pens, (self._stroke, 0), strict=True):
+            pen.rectangle((left - border, bottom - thickness - border, end - 1 + border, bottom - 1 + border), fill=255)
+        self._write((left, bottom - over), text, "ls")
+
+    def draw_caption(self, text: str) -> None:
+        """One line at the top left, as much of it as there is room for left of the letters of the top edge."""
+        line = "".join(character if character.isprintable() else " " for character in text)
+        at = (self._margin + self._stroke, self._margin + self._stroke)
+        ends = [left for left, top, _, _ in self._boxes if top < at[1] + self._font.size]
+        room = min([self._size[0] - self._margin, *ends]) - at[0] - 3 * self._stroke
+        if self._font.getlength(line) > room:
+            while line and self._font.getlength(line + "...") > room:
+                line = line[:-1].rstrip()
+            line += "..."
+        self._write(at, line, "lt")
+
+    def finish(self) -> np.ndarray:
+        """The picture with all that was drawn."""
+        from PIL import Image
+
+        picture = self._picture
+        for mask, grey in zip(self._masks, (self._ink.outline, self._ink.fill), strict=True):
+            layer: Image.Image = Image.new("RGBA", self._size, (grey, grey, grey, 0))
+            layer.putalpha(mask)
+            picture = Image.alpha_composite(picture, layer)
+        return np.array(picture)
+
+    def _write(self, at: tuple[float, float], text: str, anchor: str) -> None:
+        box = self._box(at, text, anchor)
+        left, top, right, bottom = box
+        if left < 0 or top < 0 or right > self._size[0] or bottom > self._size[1] or self._overlaps(box):
+            width, height = self._size
+            raise UsageError(
+                f"a picture of {width} x {height} pixels has no room for {text!r}: make it larger, or draw less in it"
+            )
+        self._boxes.append(box)
+        for pen, stroke in zip(self._pens, (self._stroke, 0), strict=True):
+            pen.text(at, text, 255, self._font, anchor, stroke_width=stroke)
+
+    def _box(self, at: tuple[float, float], text: str, anchor: str) -> tuple[float, float, float, float]:
+        return self._pens[0].textbbox(at, text, self._font, anchor, stroke_width=self._stroke)
+
+    def _overlaps(self, box: tuple[float, float, float, float]) -> bool:
+        left, top, right, bottom = box
+        return any(left < r and l < right and top < b and t < bottom for l, t, r, b in self._boxes)  # noqa: E741
+
+
+def _choose_ink(rendering: Rendering) -> _Ink:
+    """White on what is dark or transparent, black on what is bright, judged by the border of the picture."""
+    rim = max(1, round(0.08 * min(rendering.size)))
+    inside = np.zeros(rendering.image.shape[:2], dtype=bool)
+    inside[rim:-rim, rim:-rim] = True
+    border = rendering.image[~inside].astype(np.float64)
+    seen = border[:, :3].mean(axis=1) * border[:, 3] / 255.0
+    return _Ink(0, 255) if seen.mean() > 140.0 else _Ink(255, 0)

@@ -1,0 +1,65 @@
+"""Colours by name, in hexadecimal or as numbers."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+
+import numpy as np
+
+from clrecon.errors import UsageError
+from clrecon.geometry.affine import Float64Array
+
+__all__ = ["COLORS", "find_color"]
+
+COLORS = {
+    "black": "000000",
+    "white": "ffffff",
+    "gray": "808080",
+    "darkgray": "404040",
+    "lightgray": "c0c0c0",
+    "red": "ff0000",
+    "green": "008000",
+    "blue": "0000ff",
+    "yellow": "ffff00",
+    "cyan": "00ffff",
+    "magenta": "ff00ff",
+    "orange": "ffa500",
+    "navy": "000080",
+    "bone": "e3dac9",
+}
+"""Names that are known, with red, green and blue."""
+
+
+def find_color(color: str | Sequence[float]) -> Float64Array:
+    """Red, green and blue from 0 to 1.
+
+    Parameters
+    ----------
+    color : str or (float, float, float)
+        A name of `COLORS` (grey for gray is fine), ``#rgb``, ``#rrggbb``, or three numbers from 0 to 1.
+
+    Returns
+    -------
+    ndarray, shape (3,), float64
+
+    Raises
+    ------
+    UsageError
+        None of these; the message lists the names.
+    """
+    if isinstance(color, str):
+        text = color.strip().lower()
+        digits = COLORS.get(text.replace("grey", "gray"), text.removeprefix("#") if text.startswith("#") else "")
+        if re.fullmatch("[0-9a-f]{3}", digits):
+            digits = "".join(2 * digit for digit in digits)
+        if re.fullmatch("[0-9a-f]{6}", digits):
+            return np.array([int(digits[at : at + 2], 16) / 255.0 for at in (0, 2, 4)])
+    else:
+        try:
+            numbers = np.array(color, dtype=np.float64)
+        except (TypeError, ValueError):
+            numbers = np.empty(0)
+        if numbers.shape == (3,) and (numbers >= 0.0).all() and (numbers <= 1.0).all():
+            return numbers
+    raise UsageError(f"unknown colour {color!r}: use one of {', '.join(COLORS)}, #rrggbb, or three numbers from 0 to 1")

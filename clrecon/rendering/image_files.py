@@ -1,0 +1,157 @@
+"""Files of one picture.  None holds patient data, a date or a path; the same picture gives the same bytes."""
+
+from __future__ import annotations
+
+import os
+from io import BytesIO
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clrecon.errors import UsageError
+from clrecon.files import replace_file
+from clrecon.rendering.pillow import load_pillow
+from clrecon.version import package_version
+
+if TYPE_CHECKING:
+    from clrecon.rendering.picture import Rendering
+
+__all__ = ["FLOAT_FORMATS", "IMAGE_FORMATS", "check_image_path", "encode_image", "write_floats", "write_image"]
+
+IMAGE_FORMATS = {".png": "PNG", ".jpg": "JPEG", ".jpeg": "JPEG", ".tif": "TIFF", ".tiff": "TIFF"}
+"""Extension to Pillow's name."""
+
+FLOAT_FORMATS = (".npy", ".tif", ".tiff")
+
+
+def check_image_path(path: str | os.PathLike[str]) -> str:
+    """Return the extension of a picture file in lower case.
+
+    Raises
+    ------
+    UsageError
+        It is none of `IMAGE_FORMATS`.
+    """
+    return _extension(path, tuple(IMAGE_FORMATS), "picture")
+
+
+def write_image(rendering: Rendering, path: str | os.PathLike[str], quality: int = 95) -> int:
+    """Write a picture; what `Rendering.save` does."""
+    content = encode_image(rendering, check_image_path(path), quality)
+    return _replace(path, content)
+
+
+def encode_image(rendering: Rendering, extension: str, quality: int = 95) -> bytes:
+    """Bytes of the file that `write_image` writes.
+
+    Parameters
+    ----------
+    rendering : Rendering
+    extension : str
+        One of `IMAGE_FORMATS`.
+    quality : int
+        Of JPEG, 1 to 100.
+
+    Raises
+    ------
+    UsageError
+        The format would lose the opacity.
+    """
+    load_pillow()
+    from PIL import Image
+
+    kind = IMAGE_FORMATS[extension]
+    picture = Image.fromarray(np.ascontiguousarray(rendering.image))
+    options: dict[str, Any] = {}
+    if kind == "JPEG":
+        if not rendering.is_opaque:
+            raise UsageError("JPEG cannot hold a transparent background: choose PNG or TIFF, or a background colour")
+        if not 1 <= quality <= 100:
+            raise UsageError(f"the quality of a JPEG file lies between 1 and 100, not at {quality!r}")
+        picture = picture.convert("RGB")
+        # No resolution: JFIF holds whole dots per inch, which is 1 % off at 0.5 mm.
+        options = {"quality": quality, "subsampling": 0}
+    else:
+        options.update(_resolution(rendering.pixel_mm))
+    if kind == "PNG":
+        options["pnginfo"] = _text_chunks(rendering)
+    if kind == "TIFF":
+        options["compression"] = "tiff_lzw"
+    stream = BytesIO()
+    picture.save(stream, kind, **options)
+    return stream.getvalue()
+
+
+def write_floats(array: NDArray[np.float32], path: str | os.PathLike[str], pixel_mm: float | None = None) -> int:
+    """Write one float32 a pixel, NaN included, to a file of `FLOAT_FORMATS`.
+
+    Parameters
+    ----------
+    array : ndarray, shape (h, w)
+    path : str or path
+    pixel_mm : float, optional
+        Side of a pixel, for the resolution of a TIFF file.
+
+    Returns
+    -------
+    int
+        Size of the file in bytes.
+    """
+    extension = _extension(path, FLOAT_FORMATS, "depth or value")
+    floats = np.ascontiguousarray(array, dtype=np.float32)
+    stream = BytesIO()
+    if extension == ".npy":
+        np.save(stream, floats)
+    else:
+        load_pillow()
+        from PIL import Image
+
+        Image.fromarray(floats).save(stream, "TIFF", **_resolution(pixel_mm))
+    return _replace(path, stream.getvalue())
+
+
+def _extension(path: str | os.PathLike[str], known: tuple[str, ...], what: str) -> str:
+    try:
+        extension = os.path.splitext(os.fspath(path))[1].lower()
+    except TypeError as error:
+        raise UsageError(f"a {what} file is named by a string or a path, not {type(path).__name__}") from error
+    if extension not in known:
+        found = f"the extension {extension!r}" if extension else "no extension"
+        raise UsageError(f"the name of the {what} file has {found}: use one of {', '.join(known)}")
+    return extension
+
+
+def _replace(path: str | os.PathLike[str], content: bytes) -> int:
+    def write(stream: Any) -> None:
+        stream.write(content)
+
+    return replace_file(path, write, expected_bytes=len(content))
+
+
+def _resolution(pixel_mm: float | None) -> dict[str, Any]:
+    """Pillow's option for pixels of so many mm; PNG rounds it to whole pixels per metre."""
+    return {} if pixel_mm is None else {"dpi": (25.4 / pixel_mm, 25.4 / pixel_mm)}
+
+
+def _text_chunks(rendering: Rendering) -> Any:
+    from PIL.PngImagePlugin import PngInfo
+
+    text = PngInfo()
+    text.add_text("Software", f"clrecon {package_version()}")
+    text.add_text("Mode", rendering.mode)
+    camera = rendering.camera
+    if camera is not None:
+        from clrecon.rendering.annotations import orientation_letters
+
+        text.add_text("View", f"from {orientation_letters(-camera.basis().forward)}")
+        named = {"position": camera.position, "focal point": camera.focal_point, "up": camera.up}
+        lines = [f"{name} {x:.6g} {y:.6g} {z:.6g}" for name, (x, y, z) in named.items()]
+        if camera.parallel_scale is not None:
+            lines.append(f"parallel scale {camera.parallel_scale:.6g} mm")
+        else:
+            lines.append(f"view angle {camera.view_angle:.6g} degrees")
+        text.add_text("Camera", f"LPS mm: {'; '.join(lines)}")
+    if rendering.pixel_mm is not None:
+        text.add_text("Pixel", f"{rendering.pixel_mm:.6g} mm")
+    return text

@@ -1,0 +1,52 @@
+"""The one door to Pillow, which reads and writes picture files and draws text."""
+
+from __future__ import annotations
+
+import sys
+from typing import TYPE_CHECKING
+
+from clrecon.errors import UsageError
+
+if TYPE_CHECKING:
+    from PIL import ImageFont
+
+__all__ = ["load_font", "load_pillow"]
+
+
+def load_pillow() -> None:
+    """Make ``from PIL import ...`` work from here on.
+
+    The command line hides Pillow from pydicom, which would load it without need, by an entry of None in
+    `sys.modules`; what makes a picture takes the entry away.  pydicom has been loaded without it by then.
+
+    Raises
+    ------
+    UsageError
+        Pillow is not installed.
+    """
+    if sys.modules.get("PIL", load_pillow) is None:
+        del sys.modules["PIL"]
+    try:
+        import PIL.Image  # noqa: F401
+    except ImportError as error:
+        raise UsageError(f"Pillow cannot be imported ({error}): pictures need it, install it with pip") from error
+
+
+def load_font(pixels: float) -> ImageFont.FreeTypeFont:
+    """Pillow's own scalable font, so many pixels high.
+
+    Raises
+    ------
+    UsageError
+        This Pillow has no FreeType.
+    """
+    load_pillow()
+    from PIL import ImageFont
+
+    try:
+        font = ImageFont.load_default(pixels)
+    except ImportError as error:
+        raise UsageError("this Pillow was built without FreeType: it cannot draw text of a size") from error
+    if not isinstance(font, ImageFont.FreeTypeFont):
+        raise UsageError("this Pillow was built without FreeType: it cannot draw text of a size")
+    return font

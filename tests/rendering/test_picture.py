@@ -1,0 +1,194 @@
+"""Pictures and their files: what is kept, what is said, what is refused, and nothing half written."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from clrecon.errors import OutputError, UsageError
+from clrecon.rendering import image_files
+from clrecon.rendering.colors import COLORS, find_color
+from tests import tolerances
+from tests.rendering.picture_files import PARALLEL, PERSPECTIVE, make_picture
+
+CLEAR = (10, 20, 30, 0)
+
+
+@pytest.mark.parametrize("name", ["a.png", "a.PNG", "a.tif", "a.tiff"])
+def test_colours_and_opacity_come_back(tmp_path, name):
+    picture = make_picture(background=(10, 20, 30, 77))
+    size = picture.save(tmp_path / name)
+    assert size == (tmp_path / name).stat().st_size
+    with Image.open(tmp_path / name) as read:
+        assert read.mode == "RGBA"
+        assert np.array_equal(np.array(read), picture.image)
+        millimetres = 25.4 / np.array(read.info["dpi"], dtype=float)
+    assert millimetres == pytest.approx(200.0 / 80, rel=tolerances.PNG_RESOLUTION)
+
+
+def test_the_resolution_is_in_whole_pixels_a_metre(tmp_path):
+    make_picture().save(tmp_path / "a.png")
+    data = (tmp_path / "a.png").read_bytes()
+    at = data.index(b"pHYs") + 4
+    assert [int.from_bytes(data[at + n : at + n + 4], "big") for n in (0, 4)] == [400, 400]
+    assert data[at + 8] == 1  # the metre
+
+
+def test_a_perspective_picture_tells_no_resolution(tmp_path):
+    make_picture(camera=PERSPECTIVE).save(tmp_path / "a.png")
+    assert b"pHYs" not in (tmp_path / "a.png").read_bytes()
+
+
+def test_a_picture_without_a_camera_takes_its_pixels_from_the_report(tmp_path):
+    picture = make_picture(camera=None)
+    assert picture.pixel_mm is None
+    picture.save(tmp_path / "a.png")
+    picture.report["pixel_mm"] = 0.5
+    picture.save(tmp_path / "b.png")
+    assert b"pHYs" not in (tmp_path / "a.png").read_bytes()
+    assert b"pHYs" in (tmp_path / "b.png").read_bytes()
+
+
+def test_png_says_how_it_was_made(tmp_path):
+    make_picture(camera=PARALLEL.orbit(30.0, 10.0)).save(tmp_path / "a.png")
+    with Image.open(tmp_path / "a.png") as read:
+        text = read.text
+    assert text["Software"].startswith("clrecon ")
+    assert text["Mode"] == "dvr"
+    assert text["View"] == "from ALS"
+    assert text["Pixel"] == "2.5 mm"
+    assert text["Camera"].startswith("LPS mm: position 147.721 -255.861 52.0945; focal point 0 0 0; up ")
+    assert text["Camera"].endswith("parallel scale 100 mm")
+
+
+def test_the_same_picture_gives_the_same_bytes(tmp_path):
+    for extension in image_files.IMAGE_FORMATS:
+        first, second = (image_files.encode_image(make_picture(), extension) for _ in range(2))
+        assert first == second
+
+
+def test_jpeg_keeps_an_opaque_picture(tmp_path):
+    picture = make_picture()
+    picture.save(tmp_path / "a.jpg")
+    with Image.open(tmp_path / "a.jpg") as read:
+        difference = np.abs(np.array(read).astype(int) - picture.image[..., :3])
+    assert difference.mean() <= tolerances.JPEG_MEAN_GREY
+
+
+def test_jpeg_loses_no_opacity_silently(tmp_path):
+    with pytest.raises(UsageError, match="transparent background: choose PNG"):
+        make_picture(background=CLEAR).save(tmp_path / "a.jpg")
+    assert not list(tmp_path.iterdir())
+    make_picture(background=CLEAR).with_background("white").save(tmp_path / "a.jpg")
+    with Image.open(tmp_path / "a.jpg") as read:
+        assert min(read.getpixel((0, 0))) >= 250
+
+
+def test_a_background_is_mixed_in_by_opacity():
+    picture = make_picture(background=(200, 100, 0, 51))
+    white = picture.with_background((1.0, 1.0, 1.0))
+    assert white.image[0, 0].tolist() == [244, 224, 204, 255]  # a fifth of the colour, four of white
+    assert np.array_equal(white.image[40, 60], picture.image[40, 60])
+    assert white.is_opaque and not picture.is_opaque
+    assert picture.image[0, 0, 3] == 51
+    assert white.depth is picture.depth
+
+
+@pytest.mark.parametrize("extension", [".npy", ".tif"])
+def test_depths_come_back_with_their_gaps(tmp_path, extension):
+    picture = make_picture()
+    path = tmp_path / f"depth{extension}"
+    for expected in (False, True):
+        picture.save_depth(path, expected=expected)
+        read = np.load(path) if extension == ".npy" else np.array(Image.open(path))
+        assert read.dtype == np.float32
+        assert np.array_equal(read, picture.depth + expected, equal_nan=True)
+
+
+def test_values_are_saved_where_there_are_any(tmp_path):
+    picture = make_picture()
+    with pytest.raises(UsageError, match="mode dvr has no values"):
+        picture.save_values(tmp_path / "hu.npy")
+    picture.values = np.arange(80 * 120, dtype=np.float32).reshape(80, 120)
+    picture.save_values(tmp_path / "hu.npy")
+    assert np.array_equal(np.load(tmp_path / "hu.npy"), picture.values)
+
+
+@pytest.mark.parametrize(
+    ("save", "message"),
+    [
+        (lambda picture, folder: picture.save(folder / "a.bmp"), "use one of .png, .jpg"),
+        (lambda picture, folder: picture.save(folder / "a"), "no extension"),
+        (lambda picture, folder: picture.save(5), "string or a path"),
+        (lambda picture, folder: picture.save(folder / "a.jpg", quality=0), "between 1 and 100"),
+        (lambda picture, folder: picture.save_depth(folder / "a.png"), "use one of .npy, .tif"),
+    ],
+)
+def test_wrong_names_are_refused(tmp_path, save, message):
+    with pytest.raises(UsageError, match=message):
+        save(make_picture(), tmp_path)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_missing_folder_is_said(tmp_path):
+    with pytest.raises(OutputError, match="does not exist, make it first"):
+        make_picture().save(tmp_path / "none" / "a.png")
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="/dev/full")
+def test_a_full_disk_leaves_the_older_picture(tmp_path, monkeypatch):
+    path = tmp_path / "a.png"
+    path.write_bytes(b"older")
+
+    class Usage:
+        total, free = 10**9, 100
+
+    monkeypatch.setattr("clrecon.files.shutil.disk_usage", lambda folder: Usage)
+    with pytest.raises(OutputError, match="are free in"):
+        make_picture().save(path)
+    assert path.read_bytes() == b"older"
+    assert [entry.name for entry in tmp_path.iterdir()] == ["a.png"]
+
+
+def test_a_notebook_gets_a_png():
+    assert make_picture()._repr_png_().startswith(b"\x89PNG")
+
+
+def test_pillow_is_found_where_the_command_line_hides_it(tmp_path):
+    code = f"""
+import sys
+sys.modules["PIL"] = None
+import numpy as np, pydicom
+from clrecon.rendering import Rendering
+image = np.zeros((4, 4, 4), np.uint8)
+Rendering(image, image[..., 0], image[..., 0], None).save({str(tmp_path / "a.png")!r})
+"""
+    subprocess.run([sys.executable, "-c", code], check=True)
+    assert (tmp_path / "a.png").exists()
+
+
+def test_a_missing_pillow_is_said(monkeypatch):
+    monkeypatch.setitem(sys.modules, "PIL", None)
+    monkeypatch.setattr(sys, "path", [])
+    monkeypatch.setattr(sys, "path_importer_cache", {})
+    with pytest.raises(UsageError, match="Pillow cannot be imported"):
+        make_picture().save("a.png")
+
+
+def test_colours_by_name_and_number():
+    for color in ("orange", " Orange ", "#ffa500", "#FFA500", (1.0, 165 / 255, 0.0)):
+        assert find_color(color) == pytest.approx([1.0, 165 / 255, 0.0])
+    assert find_color("#f0a") == pytest.approx([1.0, 0.0, 170 / 255])
+    assert find_color("Grey") == pytest.approx(find_color("gray"))
+    for name in COLORS:
+        assert find_color(name).shape == (3,)
+
+
+@pytest.mark.parametrize("color", ["", "blakc", "#12", "ff0000", "#gggggg", (1, 2, 3), (1, 0), None, (0, 0, np.nan)])
+def test_unknown_colours_list_the_known_ones(color):
+    with pytest.raises(UsageError, match="black, white, gray"):
+        find_color(color)
