@@ -97,3 +97,4 @@ CLI_SPHERE_RADIUS_MM = 0.3  # sagitta of chords of 1.8 mm and the bent ramp; mea
 PNG_RESOLUTION = 1.3e-3  # relative; PNG holds whole pixels a metre, half of one of 400 at 2.5 mm a pixel
 JPEG_MEAN_GREY = 3.0  # of 255, quality 95 on a sharp edge between saturated colours; measured 0.9
 ROUND_BAR = 1e-6  # relative; powers of ten in float64
+VTK_PIXEL = 1e-9  # relative to the largest coordinate; float64 through VTK's matrix

@@ -155,6 +155,27 @@ class Camera:
         position = middle + away * towards
         return cls(_triple(position), _triple(middle), _triple(up_lps), view_angle, scale).zoomed(zoom)
 
+    @classmethod
+    def from_pyvista(cls, source: Any, size: Sequence[int] | None = None) -> Camera:
+        """Take the camera of a PyVista plotter, a PyVista camera or a VTK camera, see `clrecon.geometry.vtk_camera`.
+
+        Parameters
+        ----------
+        source : pyvista.Plotter, pyvista.Camera or vtkCamera
+            Its scene in LPS mm.
+        size : (int, int), optional
+            Of the picture, for cameras whose view angle is the horizontal one; default: the plotter's window.
+        """
+        from clrecon.geometry.vtk_camera import camera_from_vtk
+
+        return camera_from_vtk(source, size)
+
+    def to_pyvista(self) -> Any:
+        """A `pyvista.Camera` that sees the same, for a scene in LPS mm: ``plotter.camera = camera.to_pyvista()``."""
+        from clrecon.geometry.vtk_camera import camera_to_pyvista
+
+        return camera_to_pyvista(self)
+
     @property
     def is_parallel(self) -> bool:
         """True for parallel projection."""
