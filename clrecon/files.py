@@ -27,7 +27,7 @@ from clrecon.errors import OutputError
 if sys.platform != "win32":
     import fcntl
 
-__all__ = ["StagedFile", "allow_open_files", "check_writable", "replace_file", "stage_file"]
+__all__ = ["StagedFile", "allow_open_files", "check_writable", "replace_file", "stage_file", "system_errors"]
 
 _FILES_OF_OTHERS = 200
 """Open files that a job has beside those that it writes: libraries, drivers, their caches."""
@@ -117,7 +117,7 @@ class StagedFile:
         OutputError
             The system refuses; an older target is intact.
         """
-        with _system_errors(self._path):
+        with system_errors(self._path):
             if sys.platform == "win32":
                 self._stream.close()  # an open file cannot be renamed there
             os.replace(self._temporary, self._target)
@@ -139,7 +139,7 @@ def stage_file(
     """
     target = _checked_target(path)
     with contextlib.ExitStack() as stack:
-        with _system_errors(path):
+        with system_errors(path):
             _check_space(path, target.parent, expected_bytes)
             _sweep(target.parent)
             mode = _final_mode(target)
@@ -186,7 +186,7 @@ def check_writable(path: str | os.PathLike[str], *, expected_bytes: int = 0) -> 
         What the file is going to need, as far as it is known.
     """
     target = _checked_target(path)
-    with _system_errors(path):
+    with system_errors(path):
         _check_space(path, target.parent, expected_bytes)
         with _temporary_file(target.parent):
             pass
@@ -198,7 +198,7 @@ def _shown(path: str | os.PathLike[str]) -> str:
 
 
 @contextlib.contextmanager
-def _system_errors(path: str | os.PathLike[str]) -> Iterator[None]:
+def system_errors(path: str | os.PathLike[str]) -> Iterator[None]:
     """Turn errors of the system into one line that names the target and what to do."""
     try:
         yield
@@ -212,7 +212,7 @@ def _checked_target(path: str | os.PathLike[str]) -> Path:
     text = os.fspath(path)
     if "\0" in text:
         raise OutputError(f"cannot write {_shown(path)}: the name holds a null character")
-    with _system_errors(path):
+    with system_errors(path):
         if not text or text.endswith(tuple(filter(None, (os.sep, os.altsep)))):
             raise OutputError(f"cannot write {_shown(path)!r}: this names a folder, name a file in it")
         target = Path(os.path.realpath(text))

@@ -98,3 +98,5 @@ PNG_RESOLUTION = 1.3e-3  # relative; PNG holds whole pixels a metre, half of one
 JPEG_MEAN_GREY = 3.0  # of 255, quality 95 on a sharp edge between saturated colours; measured 0.9
 ROUND_BAR = 1e-6  # relative; powers of ten in float64
 VTK_PIXEL = 1e-9  # relative to the largest coordinate; float64 through VTK's matrix
+MP4_MEAN_GREY = 6.0  # of 255: half the colour resolution on 64 x 40 pixels with sharp edges
+GIF_MEAN_GREY = 6.0  # of 255: 256 colours, dithered

@@ -1,0 +1,197 @@
+"""Moving pictures: the cameras of a turntable, and frames one after the other to a file or a folder.
+
+Frames are taken from an iterator and written as they come, so that a thousand of them need the memory of one.  Before
+the first is asked for, everything is checked that can be: the name, the place, the encoder.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterable, Iterator
+from typing import TYPE_CHECKING, BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clrecon.errors import UsageError
+from clrecon.files import check_writable, replace_file
+from clrecon.geometry.camera import Camera
+
+if TYPE_CHECKING:
+    from clrecon.rendering.picture import Rendering
+
+__all__ = ["ANIMATIONS", "MOST_FRAMES", "check_animation", "turntable_cameras", "write_animation"]
+
+ANIMATIONS = (".mp4", ".gif", ".apng")
+"""Extensions of moving pictures; a name without one is a folder of PNG files."""
+
+MOST_FRAMES = 10_000
+"""More are a slip of the keyboard: five minutes at 30 a second."""
+
+FASTEST = {".mp4": 120.0, ".gif": 50.0, ".apng": 120.0, "": 120.0}
+"""Frames a second; GIF counts hundredths of a second, and browsers slow down what is below two of them."""
+
+SLOWEST = 0.1
+"""Frames a second."""
+
+_Progress = Callable[[str, int, int], None]
+
+
+def turntable_cameras(camera: Camera, frames: int, degrees: float = 360.0) -> list[Camera]:
+    """Cameras around the focal point, about the axis of the body and towards the patient's left.
+
+    Parameters
+    ----------
+    camera : Camera
+        The first one.
+    frames : int
+        How many.
+    degrees : float
+        Whole turns end one step before the first camera, so that the motion can be repeated; other angles end there.
+
+    Raises
+    ------
+    UsageError
+        `frames` is not from 1 to 10000, or `degrees` is not finite.
+    """
+    if not isinstance(frames, (int, np.integer)) or not 1 <= frames <= MOST_FRAMES:
+        raise UsageError(f"a turntable has 1 to {MOST_FRAMES} frames, not {frames!r}")
+    if not np.isfinite(degrees):
+        raise UsageError(f"a turntable turns by a finite angle in degrees, not {degrees!r}")
+    whole = degrees % 360.0 == 0.0
+    step = degrees / max(1, frames if whole else frames - 1)
+    return [camera.orbit(step * frame) for frame in range(frames)]
+
+
+def check_animation(path: str | os.PathLike[str], fps: float = 25.0) -> str:
+    """Refuse what cannot be written, before any frame is computed.
+
+    Parameters
+    ----------
+    path : str or path
+        ``.mp4``, ``.gif``, ``.apng``, or a folder: a name without extension, with a slash at its end, or that is one.
+    fps : float
+        Frames a second.
+
+    Returns
+    -------
+    str
+        The extension, empty for a folder.
+
+    Raises
+    ------
+    UsageError
+        Another extension, no encoder, a folder that holds other things, or an impossible `fps`.
+    OutputError
+        The place cannot be written to.
+    """
+    try:
+        text = os.fspath(path)
+    except TypeError as error:
+        raise UsageError(f"a moving picture is named by a string or a path, not {type(path).__name__}") from error
+    is_folder = text.endswith(tuple(filter(None, (os.sep, os.altsep)))) or os.path.isdir(text)
+    extension = "" if is_folder else os.path.splitext(text)[1].lower()
+    if extension and extension not in ANIMATIONS:
+        raise UsageError(
+            f"a moving picture is not written as {extension!r}: use one of {', '.join(ANIMATIONS)},"
+            " or a name without extension for a folder of PNG files"
+        )
+    if not isinstance(fps, (int, float)) or not SLOWEST <= fps <= FASTEST[extension]:
+        kind = extension[1:].upper() or "a folder of frames"
+        raise UsageError(f"{kind} takes {SLOWEST:g} to {FASTEST[extension]:g} frames a second, not {fps!r}")
+    if extension == ".mp4":
+        from clrecon.rendering.video import find_encoder
+
+        find_encoder()
+    if extension:
+        check_writable(text)
+    else:
+        from clrecon.rendering.frame_folder import check_frame_folder
+
+        check_frame_folder(text)
+    return extension
+
+
+def write_animation(
+    frames: Iterable[Rendering | NDArray[np.uint8]],
+    path: str | os.PathLike[str],
+    fps: float = 25.0,
+    *,
+    total: int = 0,
+    progress: _Progress | None = None,
+) -> int:
+    """Write frames as a moving picture, whole or not at all.
+
+    Parameters
+    ----------
+    frames : iterable of Rendering or of ndarray, shape (h, w, 3) or (h, w, 4), uint8
+        All of one size.  It is asked for the next frame when the one before has been written.
+    path : str or path
+        See `check_animation`.  MP4 is H.264 (BT.709, quality 18), an odd side made even by repeating its last row or
+        column.  GIF has a palette a frame, dithered after Floyd and Steinberg, and repeats, as does APNG, which keeps
+        every colour and the opacity.  A folder gets frame_0000.png, frame_0001.png, ...
+    fps : float
+        Frames a second.
+    total : int
+        How many are to come, for `progress`.
+    progress : callable, optional
+        Called as ``progress("frames", done, total)``.
+
+    Returns
+    -------
+    int
+        Bytes written.
+
+    Raises
+    ------
+    UsageError
+        As in `check_animation`; no frame, frames of several sizes, or opacity that the format would lose.
+    OutputError
+        The file cannot be written; an older one is intact.
+    """
+    extension = check_animation(path, fps)
+    checked = _checked_frames(frames, extension, total, progress)
+    if extension == "":
+        from clrecon.rendering.frame_folder import write_frame_folder
+
+        return write_frame_folder(checked, path)
+    if extension == ".mp4":
+        from clrecon.rendering.video import write_video as write
+    elif extension == ".gif":
+        from clrecon.rendering.animated_files import write_gif as write
+    else:
+        from clrecon.rendering.animated_files import write_apng as write
+
+    def write_all(stream: BinaryIO) -> None:
+        write(stream, checked, fps)
+
+    return replace_file(path, write_all)
+
+
+def _checked_frames(
+    frames: Iterable[Rendering | NDArray[np.uint8]], extension: str, total: int, progress: _Progress | None
+) -> Iterator[NDArray[np.uint8]]:
+    """Frames as arrays (h, w, 3 or 4), the formats without opacity get three channels; says how many are done."""
+    shape: tuple[int, ...] | None = None
+    done = 0
+    for frame in frames:
+        image = np.asarray(getattr(frame, "image", frame))
+        if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] not in (3, 4) or image.size == 0:
+            raise UsageError(f"frame {done} is no picture of uint8 (h, w, 3 or 4): {image.dtype} {image.shape}")
+        if shape is None:
+            shape = image.shape
+        elif image.shape != shape:
+            raise UsageError(f"frame {done} has shape {image.shape}, the frames before it {shape}")
+        if extension in (".mp4", ".gif") and image.shape[2] == 4:
+            if (image[..., 3] != 255).any():
+                raise UsageError(
+                    f"{extension[1:].upper()} cannot hold a transparent background: choose a background colour,"
+                    " APNG or a folder of PNG files"
+                )
+            image = image[..., :3]
+        yield np.ascontiguousarray(image)
+        done += 1
+        if progress is not None:
+            progress("frames", done, total)
+    if done == 0:
+        raise UsageError("a moving picture needs at least one frame")

@@ -1,0 +1,259 @@
+"""Moving pictures: what is in them when they are read again, and what happens when something goes wrong."""
+
+from __future__ import annotations
+
+import subprocess
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from clrecon.errors import OutputError, UsageError
+from clrecon.rendering import motion, video
+from clrecon.rendering.motion import check_animation, turntable_cameras, write_animation
+from tests import tolerances
+from tests.rendering.picture_files import PARALLEL, make_picture
+
+
+@pytest.fixture
+def encoder() -> str:
+    try:
+        return video.find_encoder()
+    except UsageError as error:
+        pytest.skip(str(error))
+
+
+def moving_frames(count=5, size=(63, 40), channels=3):
+    """A bright block that moves by 8 pixels a frame over a coloured ramp."""
+    width, height = size
+    for number in range(count):
+        frame = np.zeros((height, width, channels), np.uint8)
+        frame[..., 0] = np.linspace(20, 200, width, dtype=np.uint8)
+        frame[..., 1] = np.linspace(180, 40, height, dtype=np.uint8)[:, None]
+        frame[10:20, 8 * number : 8 * number + 8] = 250
+        if channels == 4:
+            frame[..., 3] = 255 - 20 * number
+        yield frame
+
+
+def left_over(folder) -> list[str]:
+    return sorted(entry.name for entry in folder.iterdir())
+
+
+def test_a_whole_turn_ends_one_step_before_its_beginning():
+    cameras = turntable_cameras(PARALLEL, 8)
+    assert cameras[0] == PARALLEL
+    assert cameras[2].position == pytest.approx((300.0, 0.0, 0.0))  # a quarter: from the patient's left
+    assert cameras[7].position == pytest.approx(PARALLEL.orbit(-45.0).position)
+
+
+def test_a_part_of_a_turn_ends_at_its_end():
+    cameras = turntable_cameras(PARALLEL, 4, -90.0)
+    assert cameras[-1].position == pytest.approx((-300.0, 0.0, 0.0))
+    assert cameras[1].position == pytest.approx(PARALLEL.orbit(-30.0).position)
+    assert turntable_cameras(PARALLEL, 1, 90.0) == [PARALLEL]
+
+
+@pytest.mark.parametrize(("frames", "degrees"), [(0, 360), (10**6, 360), (2.5, 360), (10, np.nan)])
+def test_impossible_turntables_are_refused(frames, degrees):
+    with pytest.raises(UsageError, match="a turntable"):
+        turntable_cameras(PARALLEL, frames, degrees)
+
+
+def test_mp4_shows_the_frames(tmp_path, encoder):
+    path = tmp_path / "turn.mp4"
+    frames = list(moving_frames(6))
+    assert write_animation(iter(frames), path, 20.0) == path.stat().st_size
+    assert left_over(tmp_path) == ["turn.mp4"]
+    command = [encoder, "-loglevel", "error", "-i", path, "-f", "rawvideo", "-pix_fmt", "rgb24", "-"]
+    data = subprocess.run(command, capture_output=True, check=True).stdout
+    read = np.frombuffer(data, np.uint8).reshape(-1, 40, 64, 3)  # the odd width is made even
+    assert len(read) == 6
+    difference = np.abs(read[:, :, :63].astype(int) - np.array(frames))
+    assert difference.mean() <= tolerances.MP4_MEAN_GREY
+    said = subprocess.run([encoder, "-i", path], capture_output=True, text=True).stderr
+    assert "h264" in said and "yuv420p(tv, bt709" in said and "20 fps" in said
+
+
+def test_gif_shows_the_frames_and_repeats(tmp_path):
+    path = tmp_path / "turn.gif"
+    frames = list(moving_frames(7))
+    assert write_animation(iter(frames), path, 30.0) == path.stat().st_size
+    with Image.open(path) as read:
+        assert (read.n_frames, read.info["loop"], read.size) == (7, 0, (63, 40))
+        durations = []
+        for number, frame in enumerate(frames):
+            read.seek(number)
+            durations.append(read.info["duration"])
+            difference = np.abs(np.array(read.convert("RGB")).astype(int) - frame)
+            assert difference.mean() <= tolerances.GIF_MEAN_GREY
+    assert sum(durations) == 230  # seven thirtieths of a second, in hundredths
+
+
+def test_a_gif_of_two_colours(tmp_path):
+    frames = [np.full((5, 4, 3), shade, np.uint8) for shade in (0, 255)]
+    frames[1][0, 0] = 0
+    write_animation(iter(frames), tmp_path / "a.gif")
+    with Image.open(tmp_path / "a.gif") as read:
+        read.seek(1)
+        assert np.array_equal(np.array(read.convert("RGB")), frames[1])
+
+
+@pytest.mark.parametrize("channels", [3, 4])
+def test_apng_keeps_everything(tmp_path, channels):
+    path = tmp_path / "turn.apng"
+    frames = list(moving_frames(5, channels=channels))
+    assert write_animation(iter(frames), path, 12.5) == path.stat().st_size
+    with Image.open(path) as read:
+        assert (read.n_frames, read.info["loop"], read.info["duration"]) == (5, 0, 80.0)
+        for number, frame in enumerate(frames):
+            read.seek(number)
+            assert np.array_equal(np.array(read), frame)
+
+
+@pytest.mark.parametrize("name", ["turn", "turn/", "v1.2/"])
+def test_a_folder_of_frames(tmp_path, name):
+    pictures = [make_picture(background=(0, 0, 0, opacity)) for opacity in (0, 120, 255)]
+    size = write_animation(iter(pictures), f"{tmp_path}/{name}")
+    folder = tmp_path / name
+    assert left_over(tmp_path) == [folder.name]
+    assert left_over(folder) == ["frame_0000.png", "frame_0001.png", "frame_0002.png"]
+    assert size == sum(entry.stat().st_size for entry in folder.iterdir())
+    for number, picture in enumerate(pictures):
+        assert np.array_equal(np.array(Image.open(folder / f"frame_{number:04d}.png")), picture.image)
+
+
+def test_frames_of_an_earlier_run_are_replaced_and_nothing_else(tmp_path):
+    folder = tmp_path / "turn"
+    write_animation(moving_frames(5), folder)
+    write_animation(moving_frames(2), folder)
+    assert left_over(folder) == ["frame_0000.png", "frame_0001.png"]
+    (folder / "notes.txt").write_text("mine")
+    with pytest.raises(UsageError, match=r"holds other things \(1, such as 'notes.txt'\)"):
+        write_animation(moving_frames(2), folder)
+    assert len(left_over(folder)) == 3 and left_over(tmp_path) == ["turn"]
+
+
+@pytest.mark.parametrize("name", ["turn.mp4", "turn.gif", "turn.apng", "turn"])
+def test_an_interrupted_run_leaves_nothing_and_the_older_file(tmp_path, name, request, monkeypatch):
+    if name.endswith("mp4"):
+        request.getfixturevalue("encoder")
+    scratch = tmp_path / "scratch"
+    scratch.mkdir()
+    monkeypatch.setattr("tempfile.tempdir", str(scratch))
+    place = tmp_path / "place"
+    place.mkdir()
+
+    def interrupted():
+        yield from moving_frames(3)
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        write_animation(interrupted(), place / name)
+    assert left_over(place) == []
+    write_animation(moving_frames(2), place / name)
+    with pytest.raises(KeyboardInterrupt):
+        write_animation(interrupted(), place / name)
+    assert left_over(place) == [name] and left_over(scratch) == []
+    if name == "turn":
+        assert len(left_over(place / name)) == 2
+
+
+@pytest.mark.parametrize("name", ["turn.mp4", "turn.gif", "turn.apng", "turn"])
+def test_frames_are_written_as_they_come(tmp_path, name, request):
+    if name.endswith("mp4"):
+        request.getfixturevalue("encoder")
+    asked, told = [], []
+
+    def watched():
+        for number, frame in enumerate(moving_frames(4)):
+            asked.append((number, len(told)))
+            yield frame
+
+    write_animation(watched(), tmp_path / name, total=4, progress=lambda *step: told.append(step))
+    assert told == [("frames", done, 4) for done in (1, 2, 3, 4)]
+    assert asked == [(0, 0), (1, 1), (2, 2), (3, 3)]
+
+
+def never():
+    raise AssertionError("a frame was computed")
+    yield
+
+
+@pytest.mark.parametrize(
+    ("name", "fps", "error", "message"),
+    [
+        ("turn.avi", 25, UsageError, "use one of .mp4, .gif, .apng, or a name without extension"),
+        ("turn.png", 25, UsageError, "folder of PNG files"),
+        ("turn.gif", 60, UsageError, "GIF takes 0.1 to 50 frames a second"),
+        ("turn", 0, UsageError, "a folder of frames takes"),
+        ("turn.apng", "fast", UsageError, "frames a second"),
+        ("none/turn.gif", 25, OutputError, "does not exist, make it first"),
+        ("none/turn", 25, OutputError, "does not exist, make it first"),
+        ("file", 25, OutputError, "it is a file"),
+    ],
+)
+def test_what_cannot_be_written_is_said_before_the_first_frame(tmp_path, name, fps, error, message):
+    (tmp_path / "file").write_bytes(b"")
+    with pytest.raises(error, match=message):
+        write_animation(never(), tmp_path / name, fps)
+    assert left_over(tmp_path) == ["file"]
+
+
+@pytest.fixture
+def no_encoder(monkeypatch):
+    video.find_encoder.cache_clear()
+    monkeypatch.setitem(__import__("sys").modules, "imageio_ffmpeg", None)
+    yield monkeypatch
+    video.find_encoder.cache_clear()
+
+
+def test_without_an_encoder_the_message_says_what_to_install(tmp_path, no_encoder):
+    no_encoder.setenv("PATH", str(tmp_path))
+    with pytest.raises(UsageError, match=r"no encoder for MP4: pip install 'clrecon\[motion\]'"):
+        write_animation(never(), tmp_path / "turn.mp4")
+    assert left_over(tmp_path) == []
+    assert check_animation(tmp_path / "turn.gif") == ".gif"
+
+
+def fake_ffmpeg(folder, script: str):
+    program = folder / "ffmpeg"
+    program.write_text(f"#!/bin/sh\n{script}\n")
+    program.chmod(0o755)
+
+
+def test_an_ffmpeg_without_h264_is_refused(tmp_path, no_encoder):
+    fake_ffmpeg(tmp_path, "echo ' V..... mpeg4'")
+    no_encoder.setenv("PATH", f"{tmp_path}:/usr/bin:/bin")
+    with pytest.raises(UsageError, match="has no H.264 encoder"):
+        check_animation(tmp_path / "turn.mp4")
+
+
+def test_an_encoder_that_dies_is_quoted(tmp_path, no_encoder):
+    fake_ffmpeg(tmp_path, 'case "$*" in *-encoders) echo " V libx264 "; exit;; esac; echo "No space left" >&2; exit 1')
+    no_encoder.setenv("PATH", f"{tmp_path}:/usr/bin:/bin")
+    with pytest.raises(OutputError, match="the encoder of MP4 failed: No space left"):
+        write_animation(moving_frames(9, (640, 480)), tmp_path / "turn.mp4")
+    assert left_over(tmp_path) == ["ffmpeg"]
+
+
+@pytest.mark.parametrize(
+    ("frames", "name", "message"),
+    [
+        ([], "a.gif", "at least one frame"),
+        ([], "a", "at least one frame"),
+        ([np.zeros((4, 4, 3), np.uint8), np.zeros((4, 5, 3), np.uint8)], "a.apng", r"frame 1 has shape \(4, 5, 3\)"),
+        ([np.zeros((4, 4), np.uint8)], "a.gif", "no picture of uint8"),
+        ([np.zeros((4, 4, 3))], "a.gif", "no picture of uint8"),
+        ([np.zeros((4, 4, 4), np.uint8)], "a.gif", "GIF cannot hold a transparent background"),
+    ],
+)
+def test_wrong_frames_are_refused(tmp_path, frames, name, message):
+    with pytest.raises(UsageError, match=message):
+        write_animation(iter(frames), tmp_path / name)
+    assert left_over(tmp_path) == []
+
+
+def test_a_name_must_be_a_name():
+    with pytest.raises(UsageError, match="string or a path"):
+        motion.check_animation(5)
