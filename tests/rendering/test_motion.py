@@ -75,6 +75,18 @@ def test_mp4_shows_the_frames(tmp_path, encoder):
     assert "h264" in said and "yuv420p(tv, bt709" in said and "20 fps" in said
 
 
+@pytest.mark.parametrize("color", [(227, 60, 40), (30, 160, 70), (40, 60, 200)])
+def test_mp4_keeps_colours(tmp_path, encoder, color):
+    frame = np.full((64, 64, 3), color, np.uint8)
+    write_animation(iter([frame] * 2), tmp_path / "a.mp4")
+    command = [encoder, "-loglevel", "error", "-i", tmp_path / "a.mp4", "-f", "rawvideo", "-pix_fmt"]
+    data = subprocess.run([*command, "rgb24", "-"], capture_output=True, check=True).stdout
+    assert np.abs(np.frombuffer(data, np.uint8).reshape(-1, 3).astype(int) - color).max() <= tolerances.MP4_FLAT_GREY
+    data = subprocess.run([*command, "yuv420p", "-"], capture_output=True, check=True).stdout
+    luma = 16 + 219 / 255 * np.dot((0.2126, 0.7152, 0.0722), color)  # ITU-R BT.709
+    assert abs(np.frombuffer(data, np.uint8)[:4096].mean() - luma) <= 1.0
+
+
 def test_gif_shows_the_frames_and_repeats(tmp_path):
     path = tmp_path / "turn.gif"
     frames = list(moving_frames(7))
