@@ -1,0 +1,147 @@
+"""The table of a picture's rays for the kernels, see cl/include/view.h."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clrecon.geometry import Volume, normal_matrix, slice_normal
+from clrecon.geometry.affine import Float64Array
+from clrecon.geometry.camera import Camera
+from clrecon.rendering import Lighting
+
+__all__ = ["BOX_BORDER", "FieldFrame", "RayView"]
+
+BOX_BORDER = 0.5
+"""Voxels beyond the outermost voxel centres that belong to a volume."""
+
+
+@dataclass(frozen=True)
+class FieldFrame:
+    """LPS mm to field coordinates: indices, or for uneven slices indices in the plane of slice 0 and the height, mm.
+
+    Attributes
+    ----------
+    matrix : ndarray, shape (3, 3), float64
+    offset : ndarray, shape (3,), float64
+        Field coordinates of p are ``matrix @ p + offset``.
+    """
+
+    matrix: Float64Array
+    offset: Float64Array
+
+    @classmethod
+    def of(cls, volume: Volume) -> FieldFrame:
+        """The frame of a volume."""
+        if volume.uneven:
+            origin = volume.slice_origins()[0]
+            normal = slice_normal(volume.affine)
+            if normal @ volume.affine[:3, 2] < 0.0:
+                normal = -normal
+            matrix = np.vstack([np.linalg.pinv(volume.affine[:3, :2]), normal])
+            return cls(matrix, -matrix @ origin)
+        inverse = np.linalg.inv(volume.affine)
+        return cls(inverse[:3, :3], inverse[:3, 3])
+
+    def places(self, points: Float64Array) -> Float64Array:
+        """Field coordinates (n, 3) of LPS points (n, 3)."""
+        return points @ self.matrix.T + self.offset
+
+    def planes(self, planes: Float64Array) -> Float64Array:
+        """Half-spaces (n, 4) ``normal . p >= offset`` of LPS in field coordinates."""
+        normals = planes[:, :3] @ np.linalg.inv(self.matrix)
+        return np.column_stack([normals, planes[:, 3] + normals @ self.offset])
+
+
+def box_corners(volume: Volume, border: float = BOX_BORDER) -> Float64Array:
+    """Corners of all slices and half a voxel beyond the ends, LPS mm (n, 3)."""
+    ni, nj, nk = volume.shape_ijk
+    sides = [(i, j) for i in (-border, ni - 1 + border) for j in (-border, nj - 1 + border)]
+    ks = (-border, *range(nk), nk - 1 + border) if volume.uneven else (-border, nk - 1 + border)
+    return volume.ijk_to_lps([(i, j, k) for k in ks for i, j in sides])
+
+
+@dataclass(frozen=True)
+class RayView:
+    """Rays of a picture, ready for a device.
+
+    Attributes
+    ----------
+    camera : Camera
+    size : (width, height)
+    ray_step : float
+        mm.
+    table : ndarray, shape (rows, 4), float32
+    planes : int
+        Clip planes among the rows.
+    """
+
+    camera: Camera
+    size: tuple[int, int]
+    ray_step: float
+    table: NDArray[np.float32]
+    planes: int
+
+    @classmethod
+    def of(
+        cls,
+        volume: Volume,
+        camera: Camera,
+        size: tuple[int, int],
+        ray_step: float,
+        *,
+        lighting: Lighting | None = None,
+        planes: Float64Array | None = None,
+        box: tuple[Float64Array, Float64Array],
+        focus: tuple[Float64Array, Float64Array],
+    ) -> RayView:
+        """Set the table up.
+
+        Parameters
+        ----------
+        planes : ndarray, shape (n, 4), float64
+            Half-spaces in LPS mm that are kept: ``normal . p >= offset``.
+        box, focus : (low, high), each ndarray, shape (3,), float64
+            Field coordinates of the volume, and of what can show in it.
+        """
+        frame = FieldFrame.of(volume)
+        right, up, forward = camera.basis()
+        width, height = size
+        pixel = 2.0 * camera.half_height() / height
+        position = np.array(camera.position)
+        corner_x, corner_y = (0.5 - 0.5 * width) * pixel, (0.5 * height - 0.5) * pixel
+        corner = right * corner_x + up * corner_y
+        corners = box_corners(volume)
+        centre = 0.5 * (corners.min(axis=0) + corners.max(axis=0))
+        near = float((centre - position) @ forward - np.linalg.norm(corners - centre, axis=1).max())
+        if camera.is_parallel:
+            origins = (position + corner + near * forward, pixel * right, -pixel * up)
+            directions = (forward, np.zeros(3), np.zeros(3))
+        else:
+            near = max(near, 0.0)
+            directions = (forward + corner, pixel * right, -pixel * up)
+            origins = (position + near * directions[0], near * directions[1], near * directions[2])
+        light = Lighting() if lighting is None else lighting
+        toward = np.zeros(3) if light.direction is None else np.array(light.direction) / np.linalg.norm(light.direction)
+        rows = [
+            frame.matrix @ origins[0] + frame.offset,
+            frame.matrix @ origins[1],
+            frame.matrix @ origins[2],
+            *(frame.matrix @ direction for direction in directions),
+            *directions,
+            *box,
+            *focus,
+            *normal_matrix(volume.affine),
+        ]
+        table = np.zeros((len(rows) + 3, 4))
+        table[: len(rows), :3] = rows
+        table[-3] = *toward, 0.0 if light.direction is None else 1.0
+        table[-2] = light.ambient, light.diffuse, light.specular, light.specular_power
+        table[-1] = near, ray_step, 0.0, 0.0
+        count = 0
+        if planes is not None and len(planes):
+            table = np.vstack([table, frame.planes(planes)])
+            count = len(planes)
+        return cls(camera, size, ray_step, table.astype(np.float32), count)
