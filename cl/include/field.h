@@ -22,29 +22,6 @@ typedef struct {
 #define VOXEL2 CLRECON_VECTOR(VOXEL, 2)
 #define VOXEL4 CLRECON_VECTOR(VOXEL, 4)
 
-#if LANES == 8
-#define LANE_NUMBERS ((floats)(0.0f, 1.0f, 2.0f, 3.0f, 4.0f, 5.0f, 6.0f, 7.0f))
-#define to_ints convert_int8
-#define GATHER(table, at) \
-    (table)[(at).s0], (table)[(at).s1], (table)[(at).s2], (table)[(at).s3], (table)[(at).s4], (table)[(at).s5], \
-        (table)[(at).s6], (table)[(at).s7]
-#define store_lanes(vector, array) vstore8(vector, 0, array)
-#define FIRST_LANE(vector) ((vector).s0)
-static inline float largest_lane(const floats v)
-{
-    const float4 half_way = fmax(v.lo, v.hi);
-    const float2 quarter = fmax(half_way.lo, half_way.hi);
-    return fmax(quarter.x, quarter.y);
-}
-#else
-#define LANE_NUMBERS 0.0f
-#define to_ints convert_int
-#define GATHER(table, at) (table)[at]
-#define store_lanes(vector, array) ((array)[0] = (vector))
-#define FIRST_LANE(vector) (vector)
-#define largest_lane(vector) (vector)
-#endif
-
 /* Values at offset `at` from `corner` and one further along i.  Two 16-bit voxels come with one load. */
 #if LANES == 8 && VOXEL_IS_SHORT
 #define PAIR(corner, at) as_int(vload2(0, (corner) + (at)))
@@ -67,9 +44,9 @@ static inline float largest_lane(const floats v)
 /* Values at LANES places near each other, index coordinates. */
 static inline floats sample_lanes(const field *f, const floats i, const floats j, const floats k)
 {
-    const floats at_i = clamp(i, (floats)(0.0f), (floats)(f->last.x));
-    const floats at_j = clamp(j, (floats)(0.0f), (floats)(f->last.y));
-    const floats at_k = clamp(k, (floats)(0.0f), (floats)(f->last.z));
+    const floats at_i = min(max(i, (floats)(0.0f)), (floats)(f->last.x));
+    const floats at_j = min(max(j, (floats)(0.0f)), (floats)(f->last.y));
+    const floats at_k = min(max(k, (floats)(0.0f)), (floats)(f->last.z));
     const ints cell_i = min(to_ints(at_i), (ints)(f->ni - 2));
     const ints cell_j = min(to_ints(at_j), (ints)(f->nj - 2));
     const ints cell_k = clamp(to_ints(at_k), (ints)(f->first_k), (ints)(f->end_k - 2));

@@ -13,12 +13,27 @@
 typedef float8 floats;
 typedef int8 ints;
 #define to_floats convert_float8
+#define to_ints convert_int8
 #define load_lanes(pointer) vload8(0, pointer)
+#define store_lanes(vector, pointer) vstore8(vector, 0, pointer)
+#define LANE_NUMBERS ((floats)(0.0f, 1.0f, 2.0f, 3.0f, 4.0f, 5.0f, 6.0f, 7.0f))
+#define FIRST_LANE(vector) ((vector).s0)
+#define ANY_LANE(condition) any(condition)
+/* Entries of a table, as the elements of a vector literal. */
+#define GATHER(table, at) \
+    (table)[(at).s0], (table)[(at).s1], (table)[(at).s2], (table)[(at).s3], (table)[(at).s4], (table)[(at).s5], \
+        (table)[(at).s6], (table)[(at).s7]
 #elif LANES == 1
 typedef float floats;
 typedef int ints;
 #define to_floats convert_float
+#define to_ints convert_int
 #define load_lanes(pointer) (*(pointer))
+#define store_lanes(vector, pointer) (*(pointer) = (vector))
+#define LANE_NUMBERS 0.0f
+#define FIRST_LANE(vector) (vector)
+#define ANY_LANE(condition) (condition)
+#define GATHER(table, at) (table)[at]
 #else
 #error "LANES is 1 or 8"
 #endif

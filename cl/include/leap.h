@@ -2,27 +2,59 @@
 #ifndef CLRECON_LEAP_H
 #define CLRECON_LEAP_H
 
+#include "include/lanes.h"
+
 #define BRICK_CELLS 8 /* cells along each side of a brick: it reads 9 x 9 x 9 voxels */
+#define BRICKS_PER_CELL (1.0f / BRICK_CELLS)
 
 typedef struct {
-    __global const uchar *distances;
+    __global const uchar *distances; /* (bk, bj, bi) in bricks, 0 where something shows */
     int bi, bj, bk;
 } leap_map;
 
-/* Steps of `stride` from `from` that end in empty bricks; 0 where the brick of `from` shows. */
-static inline int count_free_steps(const leap_map *map, const float4 from, const float4 stride)
+/* LANES rays: place of sample n is start + n * stride, all in indices.  `pace` is 1 / stride, see find_pace(). */
+typedef struct {
+    floats start_i, start_j, start_k, stride_i, stride_j, stride_k, pace_i, pace_j, pace_k;
+} ray_lanes;
+
+/* Samples per index step: large, not infinite, for rays that do not move along an axis. */
+static inline floats find_pace(const floats stride)
 {
-    const int4 cell = convert_int4(fmax(from, (float4)(0.0f)));
-    const int4 brick = min(cell / BRICK_CELLS, (int4)(map->bi - 1, map->bj - 1, map->bk - 1, 0));
-    const int distance = map->distances[(brick.z * map->bj + brick.y) * map->bi + brick.x];
-    if (distance == 0)
-        return 0;
+    return 1.0f / choose(fabs(stride) < 1e-9f, (floats)(1e-9f), stride);
+}
+
+/* Steps along one axis to the face of the empty cube around `brick` that the ray runs to. */
+static inline floats count_to_face(
+    const floats place, const floats stride, const floats pace, const ints brick, const ints distance)
+{
+    const ints face = choose(stride >= 0.0f, brick + distance, brick - distance + 1);
+    return (to_floats(face * BRICK_CELLS) - place) * pace;
+}
+
+/* Steps from sample n of each ray that end in empty bricks; 0 where its brick shows something. */
+static inline floats count_free_steps(const leap_map *map, const ray_lanes *rays, const floats n)
+{
+    const floats i = rays->start_i + n * rays->stride_i, j = rays->start_j + n * rays->stride_j;
+    const floats k = rays->start_k + n * rays->stride_k;
+    const ints brick_i = clamp(to_ints(i * BRICKS_PER_CELL), (ints)(0), (ints)(map->bi - 1));
+    const ints brick_j = clamp(to_ints(j * BRICKS_PER_CELL), (ints)(0), (ints)(map->bj - 1));
+    const ints brick_k = clamp(to_ints(k * BRICKS_PER_CELL), (ints)(0), (ints)(map->bk - 1));
+    const ints at = (brick_k * map->bj + brick_j) * map->bi + brick_i;
+    const ints distance = (ints)(GATHER(map->distances, at));
     /* The cube of bricks less than `distance` away is empty. */
-    const float4 low = convert_float4((brick - (distance - 1)) * BRICK_CELLS);
-    const float4 high = convert_float4((brick + distance) * BRICK_CELLS);
-    const float4 room = select(low - from, high - from, stride >= 0.0f);
-    const float4 steps = room / select(stride, (float4)(1e-12f), fabs(stride) < (float4)(1e-12f));
-    return max(1, (int)ceil(fmin(fmin(fmin(steps.x, steps.y), steps.z), 1e6f)));
+    const floats steps = min(min(count_to_face(i, rays->stride_i, rays->pace_i, brick_i, distance),
+                                 count_to_face(j, rays->stride_j, rays->pace_j, brick_j, distance)),
+        count_to_face(k, rays->stride_k, rays->pace_k, brick_k, distance));
+    return choose(distance > 0, max(ceil(steps), (floats)(1.0f)), (floats)(0.0f));
+}
+
+/* True where the brick of a place shows something. */
+static inline int is_shown(const leap_map *map, const float i, const float j, const float k)
+{
+    const int brick_i = clamp((int)(i * BRICKS_PER_CELL), 0, map->bi - 1);
+    const int brick_j = clamp((int)(j * BRICKS_PER_CELL), 0, map->bj - 1);
+    const int brick_k = clamp((int)(k * BRICKS_PER_CELL), 0, map->bk - 1);
+    return map->distances[(brick_k * map->bj + brick_j) * map->bi + brick_i] == 0;
 }
 
 #endif

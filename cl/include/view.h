@@ -38,14 +38,14 @@ typedef struct {
     float t_in, t_out, focus_in, focus_out;
 } ray;
 
-/* Pixel of work-item `item`.  Groups run tile by tile; `queues` of them at a time take neighbouring tiles, for CPU
- * drivers that cut a launch into as many equal parts as there are cores. */
-static inline int2 find_pixel(const uint item, const uint width, const uint height, const uint queues)
+/* Pixel `index` in the order of tiles.  `queues` parts of that order take every so manyeth tile each, for CPU drivers
+ * that cut a launch into as many equal parts as there are cores. */
+static inline int2 find_pixel(const uint index, const uint width, const uint height, const uint queues)
 {
     const uint columns = (width + TILE - 1) / TILE, rows = (height + TILE - 1) / TILE;
     const uint share = (columns * rows + queues - 1) / queues;
-    const uint group = item / (TILE * TILE), pixel = item % (TILE * TILE);
-    const uint tile = group % share * queues + group / share;
+    const uint place = index / (TILE * TILE), pixel = index % (TILE * TILE);
+    const uint tile = place % share * queues + place / share;
     return (int2)((int)(tile % columns * TILE + pixel % TILE), (int)(tile / columns * TILE + pixel / TILE));
 }
 
@@ -54,9 +54,9 @@ static inline void clip_to_box(const ray *r, const float4 low, const float4 high
     /* A ray along a face neither divides by zero nor gets lost. */
     const float4 step = select(r->step, (float4)(1e-12f), fabs(r->step) < (float4)(1e-12f));
     const float4 to_low = (low - r->origin) / step, to_high = (high - r->origin) / step;
-    const float4 enter = fmin(to_low, to_high), leave = fmax(to_low, to_high);
-    *t_in = fmax(*t_in, fmax(fmax(enter.x, enter.y), enter.z));
-    *t_out = fmin(*t_out, fmin(fmin(leave.x, leave.y), leave.z));
+    const float4 enter = min(to_low, to_high), leave = max(to_low, to_high);
+    *t_in = max(*t_in, max(max(enter.x, enter.y), enter.z));
+    *t_out = min(*t_out, min(min(leave.x, leave.y), leave.z));
 }
 
 /* Set up the ray of pixel (x, y) with its way through the box; perspective rays begin at the camera. */
@@ -81,9 +81,9 @@ static inline void start_ray(
         if (fabs(rate) < 1e-12f)
             r->t_out = at < 0.0f ? r->t_in : r->t_out;
         else if (rate > 0.0f)
-            r->t_in = fmax(r->t_in, crossing);
+            r->t_in = max(r->t_in, crossing);
         else
-            r->t_out = fmin(r->t_out, crossing);
+            r->t_out = min(r->t_out, crossing);
     }
     r->focus_in = r->t_in;
     r->focus_out = r->t_out;
