@@ -61,14 +61,13 @@ def evaluate_curve(positions: Float64Array, values: Float64Array, at: Float64Arr
 
 def merge_curves(first: tuple[Float64Array, Float64Array], second: tuple[Float64Array, Float64Array]) -> Float64Array:
     """Points (n, 1 + k + l) of two curves over the same axis: position, values of the first, values of the second."""
+    steps = {at for positions, _ in (first, second) for at in positions[1:][positions[1:] == positions[:-1]].tolist()}
     rows = []
     for position in np.unique(np.concatenate([first[0], second[0]])):
         at = np.array([position])
-        sides = [
-            np.concatenate([at, evaluate_curve(*first, at, left)[0], evaluate_curve(*second, at, left)[0]])
-            for left in (True, False)
-        ]
-        rows.extend(sides if np.any(sides[0] != sides[1]) else sides[:1])
+        # Elsewhere both sides are equal but for rounding.
+        for left in (True, False) if float(position) in steps else (False,):
+            rows.append(np.concatenate([at, evaluate_curve(*first, at, left)[0], evaluate_curve(*second, at, left)[0]]))
     return np.array(rows)
 
 

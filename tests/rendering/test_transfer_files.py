@@ -255,6 +255,8 @@ def test_slicer_text(tmp_path: Path) -> None:
         opacity = function([-2000, 79.9, 80, 490, 900, 3000])[:, 3]
         np.testing.assert_allclose(opacity, [0, 0, 0.25, 0.5, 0.75, 0.75], atol=FLOAT64_SHARE)
         np.testing.assert_allclose(function([-450, 500])[:, :3], [[0.5, 0.25, 0], [1, 0.75, 0.5]], atol=FLOAT64_SHARE)
+    # Points of both functions, the step alone twice.
+    assert function.points[:, 0].tolist() == [-1000, 80, 80, 100, 900]
     unshaded = load_transfer_function(put(tmp_path, TEXT.replace("1\n1\n", "1\n0\n", 1), "a.vp"))
     assert unshaded.lighting == UNSHADED
     silent = TEXT.splitlines()
@@ -363,3 +365,27 @@ def test_paraview(tmp_path: Path) -> None:
     ):
         with pytest.raises(RefusedInputError, match=message):
             load_transfer_function(put(tmp_path, changed(PARAVIEW, [0, place], new)))
+
+
+@pytest.mark.fuzz
+@pytest.mark.parametrize("sample", [OWN, TEXT, XML, SLICER, PARAVIEW], ids=["own", "vp", "xml", "vp.json", "paraview"])
+def test_mutated_files_are_read_or_refused_in_one_line(tmp_path: Path, sample: Any) -> None:
+    rng = np.random.default_rng(5)
+    words = (b"-1", b"1e999", b"nan", b"null", b"[]", b"{}", b'""', b"9" * 40, b"\xff", b"\x00", b"<", b"-1e308", b"\n")
+    start = put(tmp_path, sample).read_bytes()
+    read = 0
+    for _ in range(400):
+        data = bytearray(start)
+        for _ in range(rng.integers(1, 4)):
+            at = int(rng.integers(len(data)))
+            if rng.integers(2):
+                data[at:at] = words[rng.integers(len(words))]
+            else:
+                del data[at : at + int(rng.integers(1, 20))]
+        try:
+            function = load_transfer_function(put(tmp_path, bytes(data)), "1")
+            assert np.isfinite(function.table(*function.range_hu, 16)).all()
+            read += 1
+        except (RefusedInputError, UsageError) as error:
+            assert "\n" not in str(error) and len(str(error)) < 1000
+    assert 0 < read < 400
