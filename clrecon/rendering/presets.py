@@ -101,7 +101,7 @@ PRESETS: dict[str, Preset] = {
     for preset in (
         _preset(
             "bone",
-            "bone, from thin vertebral cortex on; vessels and organs with contrast medium are dark red",
+            "bone, from thin vertebral cortex on; what contrast medium fills shows too",
             _BONE,
             f"{_TISSUE}; thin vertebral cortex in slices of 4 mm has 150 to 200 HU",
         ),
@@ -160,7 +160,8 @@ PRESETS: dict[str, Preset] = {
                 (170.0, (0.66, 0.10, 0.08), 0.04),
                 (230.0, (0.82, 0.16, 0.11), 0.25),
                 (330.0, (0.90, 0.30, 0.20), 0.6),
-                (450.0, _SPONGY, 0.5),
+                (480.0, (0.92, 0.50, 0.36), 0.55),
+                (650.0, _SPONGY, 0.6),
                 (900.0, _CORTEX, 0.8),
             ],
             f"blood with contrast medium has 150 to 450 HU; {_TISSUE}",
