@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from clrecon.operators.isosurface import SurfaceExtractor, extract_isosurface, extract_isosurfaces
     from clrecon.operators.labels import extract_labels
     from clrecon.reading import list_series, read_volume
+    from clrecon.rendering import Lighting, TransferFunction, load_transfer_function
 
     __version__: str
 
@@ -41,12 +42,14 @@ __all__ = [
     "ClreconError",
     "DeviceError",
     "LabelMap",
+    "Lighting",
     "Mesh",
     "NoDicomError",
     "NoSurfaceError",
     "OutputError",
     "RefusedInputError",
     "SurfaceExtractor",
+    "TransferFunction",
     "UsageError",
     "Volume",
     "__version__",
@@ -59,6 +62,7 @@ __all__ = [
     "extract_isosurfaces",
     "extract_labels",
     "list_series",
+    "load_transfer_function",
     "mask_field_of_view",
     "read_labels",
     "read_volume",
@@ -70,12 +74,14 @@ _HOMES = {
     "ClreconError": "clrecon.errors",
     "DeviceError": "clrecon.errors",
     "LabelMap": "clrecon.labels",
+    "Lighting": "clrecon.rendering",
     "Mesh": "clrecon.mesh",
     "NoDicomError": "clrecon.errors",
     "NoSurfaceError": "clrecon.errors",
     "OutputError": "clrecon.errors",
     "RefusedInputError": "clrecon.errors",
     "SurfaceExtractor": "clrecon.operators.isosurface",
+    "TransferFunction": "clrecon.rendering",
     "UsageError": "clrecon.errors",
     "Volume": "clrecon.geometry",
     "choose_iso_value": "clrecon.geometry",
@@ -85,6 +91,7 @@ _HOMES = {
     "extract_isosurfaces": "clrecon.operators.isosurface",
     "extract_labels": "clrecon.operators.labels",
     "list_series": "clrecon.reading",
+    "load_transfer_function": "clrecon.rendering",
     "mask_field_of_view": "clrecon.geometry.body",
     "read_labels": "clrecon.labels",
     "read_volume": "clrecon.reading",

@@ -2,9 +2,25 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from typing import Any
 
-__all__ = ["Lighting"]
+import numpy as np
+
+from clrecon.errors import UsageError
+
+__all__ = ["UNSHADED", "Lighting"]
+
+
+def _number(name: str, value: Any, low: float, high: float) -> float:
+    try:
+        number = float(value)
+    except (TypeError, ValueError):
+        number = math.nan
+    if not low <= number <= high:
+        raise UsageError(f"the {name} of lighting lies between {low:g} and {high:g}, not at {value!r}")
+    return number
 
 
 @dataclass(frozen=True)
@@ -12,7 +28,8 @@ class Lighting:
     """How a surface with unit normal n, seen from v and lit from l, takes its colour c.
 
     ``c * (ambient + diffuse * |n . l|) + specular * |n . h| ** specular_power`` with h halfway between l and v; both
-    sides of a surface are lit.
+    sides of a surface are lit, and colours beyond 1 are cut.  Ambient 1 without diffuse and specular light is no
+    shading (`UNSHADED`).
 
     Attributes
     ----------
@@ -21,7 +38,13 @@ class Lighting:
     specular_power : float
         Sharpness of the highlight, 1 to 128.
     direction : (float, float, float) or None
-        From the patient towards a light that stays where it is, LPS; None is a light at the camera.
+        From the patient towards a light that stays where it is, LPS, kept as a unit vector; None is a light at the
+        camera.
+
+    Raises
+    ------
+    UsageError
+        A number beyond its range, or a direction that is not three finite numbers or has no length.
     """
 
     ambient: float = 0.2
@@ -29,3 +52,33 @@ class Lighting:
     specular: float = 0.2
     specular_power: float = 15.0
     direction: tuple[float, float, float] | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("ambient", "diffuse", "specular"):
+            object.__setattr__(self, name, _number(name, getattr(self, name), 0.0, 1.0))
+        object.__setattr__(self, "specular_power", _number("specular power", self.specular_power, 1.0, 128.0))
+        if self.direction is not None:
+            object.__setattr__(self, "direction", self._unit(self.direction))
+
+    @staticmethod
+    def _unit(direction: Any) -> tuple[float, float, float]:
+        try:
+            vector = np.asarray(direction, dtype=np.float64)
+        except (TypeError, ValueError):
+            vector = np.empty(0)
+        if vector.shape != (3,) or not np.isfinite(vector).all() or not vector.any():
+            raise UsageError(
+                f"the direction of a light is three finite numbers in LPS that are not all 0, not {direction!r}"
+            )
+        vector = vector / np.abs(vector).max()  # lengths of 1e200 and 1e-200 keep their direction
+        x, y, z = (vector / np.linalg.norm(vector)).tolist()
+        return x, y, z
+
+    @property
+    def shades(self) -> bool:
+        """False where the normal plays no part, so that nobody needs to compute it."""
+        return self.diffuse > 0.0 or self.specular > 0.0
+
+
+UNSHADED = Lighting(ambient=1.0, diffuse=0.0, specular=0.0, specular_power=1.0)
+"""Colours as the transfer function says, without any light."""

@@ -3,27 +3,70 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from clrecon.errors import UsageError
 from clrecon.geometry.affine import Float64Array
+from clrecon.rendering.curves import check_ascending, check_share, evaluate_curve
+from clrecon.rendering.lighting import Lighting
 
 __all__ = ["TransferFunction"]
+
+HU_LIMIT = 1e6
+"""Far beyond any scale of CT values; float32 still tells whole HU apart there."""
+
+END_STEP_HU = 1.0
+"""How far `TransferFunction.range_hu` goes beyond a step at its end, so that both of its sides are within."""
+
+COLUMNS = ("red", "green", "blue", "opacity")
+
+
+def _numbers(what: str, form: str, rows: ArrayLike, width: int) -> Float64Array:
+    try:
+        array = np.array(rows, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise UsageError(f"{what} is made of points {form}, each of {width} numbers: these are not") from None
+    if array.ndim != 2 or array.shape[0] < 1 or array.shape[1] != width:
+        raise UsageError(f"{what} is made of points {form}, not of an array of shape {array.shape}")
+    bad = np.argwhere(~np.isfinite(array))
+    if bad.size:
+        row, column = bad[0]
+        names = form.strip("()").split(", ")
+        raise UsageError(f"point {row + 1} of {what}: {names[column]} is {array[row, column]}, not a finite number")
+    array.setflags(write=False)
+    return array
 
 
 class TransferFunction:
     """Colour and opacity by HU, linear between points and constant beyond the first and the last.
 
+    It cannot be changed once it is made: `scaled` and `shifted` return new ones.  Two are equal when they would give
+    the same picture, whatever their names.
+
     Parameters
     ----------
     points : sequence of (hu, red, green, blue, opacity)
-        HU ascends; two points at one HU are a step.  Colours and opacity 0 to 1.
+        At least one.  HU ascends; two points at one HU are a step, where the second counts from that HU on.  Colours
+        and opacity 0 to 1.
     unit_distance : float
         Way in mm through which a sample's opacity is what the points say (VTK's ScalarOpacityUnitDistance): over
         d mm it is ``1 - (1 - opacity) ** (d / unit_distance)``.
     gradient_opacity : sequence of (HU per mm, factor), optional
-        Factor on the opacity by magnitude of the gradient, linear between points (Levoy 1988).
+        Factor on the opacity by magnitude of the gradient, 0 to 1, linear between points, with steps as above (Levoy
+        1988, "Display of surfaces from volume data").
+    lighting : Lighting, optional
+        The light that it was made for; None leaves it to the picture.
+    name, description : str
+
+    Raises
+    ------
+    UsageError
+        No points, not five numbers each, not finite, HU going back, more than two points at one HU or HU beyond a
+        million, colours or opacities outside of 0..1, a unit distance that is not positive; the same for the gradient
+        opacity.  The message names the point, counted from 1.
     """
 
     def __init__(
@@ -31,23 +74,267 @@ class TransferFunction:
         points: ArrayLike,
         *,
         unit_distance: float = 1.0,
-        gradient_opacity: Sequence[tuple[float, float]] | None = None,
+        gradient_opacity: ArrayLike | Sequence[tuple[float, float]] | None = None,
+        lighting: Lighting | None = None,
+        name: str = "",
+        description: str = "",
     ):
-        self.points = np.array(points, dtype=np.float64)
-        self.unit_distance = float(unit_distance)
-        self.gradient_opacity = None if gradient_opacity is None else np.array(gradient_opacity, dtype=np.float64)
+        self._points = self._check_points(points)
+        self._gradient_opacity = None if gradient_opacity is None else self._check_gradient(gradient_opacity)
+        try:
+            self._unit_distance = float(unit_distance)
+        except (TypeError, ValueError):
+            self._unit_distance = np.nan
+        if not 0.0 < self._unit_distance < np.inf:
+            raise UsageError(f"the unit distance of a transfer function is a length in mm, not {unit_distance!r}")
+        if not (lighting is None or isinstance(lighting, Lighting)):
+            raise UsageError(f"the lighting of a transfer function is a Lighting or None, not {lighting!r}")
+        if not (isinstance(name, str) and isinstance(description, str)):
+            raise UsageError("name and description of a transfer function are text")
+        self._lighting, self._name, self._description = lighting, name, description
+
+    @staticmethod
+    def _check_points(rows: ArrayLike) -> Float64Array:
+        what = "the transfer function"
+        points = _numbers(what, "(hu, red, green, blue, opacity)", rows, 5)
+        hu = points[:, 0]
+        if np.abs(hu).max() > HU_LIMIT:
+            at = int(np.abs(hu).argmax())
+            raise UsageError(f"point {at + 1} of {what} lies at {hu[at]:g} HU, beyond a million")
+        check_ascending(what, "HU", hu)
+        for at, column in np.argwhere((points[:, 1:] < 0) | (points[:, 1:] > 1))[:1]:
+            advice = ": divide numbers up to 255 by 255" if points[:, 1:].max() > 1 else ""
+            check_share(f"{COLUMNS[column]}", points[at, column + 1], at, advice)
+        return points
+
+    @staticmethod
+    def _check_gradient(rows: ArrayLike) -> Float64Array:
+        what = "the gradient opacity"
+        points = _numbers(what, "(HU per mm, factor)", rows, 2)
+        if points[:, 0].min() < 0 or points[:, 0].max() > HU_LIMIT:
+            raise UsageError(f"{what} goes from 0 to at most a million HU per mm")
+        check_ascending(what, "HU per mm", points[:, 0])
+        for at in np.flatnonzero((points[:, 1] < 0) | (points[:, 1] > 1))[:1]:
+            check_share(f"the factor of {what}", points[at, 1], int(at))
+        return points
+
+    @property
+    def points(self) -> Float64Array:
+        """HU, red, green, blue, opacity of each point (n, 5), float64, read-only."""
+        return self._points
+
+    @property
+    def unit_distance(self) -> float:
+        """Way in mm through which the opacities hold."""
+        return self._unit_distance
+
+    @property
+    def gradient_opacity(self) -> Float64Array | None:
+        """HU per mm and factor of each point (m, 2), float64, read-only; None leaves opacities as they are."""
+        return self._gradient_opacity
+
+    @property
+    def lighting(self) -> Lighting | None:
+        """The light that it was made for, or None."""
+        return self._lighting
+
+    @property
+    def name(self) -> str:
+        """What it is called; may be empty."""
+        return self._name
+
+    @property
+    def description(self) -> str:
+        """What it shows; may be empty."""
+        return self._description
 
     @property
     def range_hu(self) -> tuple[float, float]:
-        """HU of the first and of the last point."""
-        return float(self.points[0, 0]), float(self.points[-1, 0])
+        """HU beyond which nothing changes: of the first and of the last point, and `END_STEP_HU` more beyond a step.
+
+        The first of them is always the lower one.
+        """
+        hu = self._points[:, 0]
+        low, high = float(hu[0]), float(hu[-1])
+        alone = hu.size == 1
+        return (
+            low - END_STEP_HU if alone or hu[1] == low else low,
+            high + END_STEP_HU if alone or hu[-2] == high else high,
+        )
 
     def __call__(self, hu: ArrayLike) -> Float64Array:
-        """Red, green, blue and opacity (n, 4), float64, at HU values (n,)."""
-        values = np.asarray(hu, dtype=np.float64)
-        columns = [np.interp(values, self.points[:, 0], column) for column in self.points[:, 1:].T]
-        return np.stack(columns, axis=-1)
+        """Red, green, blue and opacity (..., 4), float64, at HU values (...,); a step has its second point's."""
+        return evaluate_curve(self._points[:, 0], self._points[:, 1:], np.asarray(hu, dtype=np.float64))
 
     def table(self, low: float, high: float, nodes: int) -> NDArray[np.float32]:
-        """Red, green, blue, opacity (nodes, 4), float32, at `nodes` HU evenly from low to high, both included."""
-        return self(np.linspace(low, high, nodes)).astype(np.float32)
+        """Red, green, blue, opacity (nodes, 4), float32, at `nodes` HU evenly from low to high, both included.
+
+        Raises
+        ------
+        UsageError
+            Fewer than two nodes, or not two finite HU of which the second is no lower.
+        """
+        return self(_nodes(low, high, nodes)).astype(np.float32)
+
+    def gradient_factor(self, magnitude: ArrayLike) -> Float64Array:
+        """Factor on the opacity (...,), float64, at magnitudes of the gradient (...,) in HU per mm; 1 without any."""
+        at = np.asarray(magnitude, dtype=np.float64)
+        if self._gradient_opacity is None:
+            return np.ones(at.shape)
+        return evaluate_curve(self._gradient_opacity[:, 0], self._gradient_opacity[:, 1:], at)[..., 0]
+
+    def gradient_table(self, high: float, nodes: int) -> NDArray[np.float32]:
+        """`gradient_factor` (nodes,), float32, at `nodes` magnitudes evenly from 0 to high HU per mm, both included.
+
+        Raises
+        ------
+        UsageError
+            As in `table`.
+        """
+        return self.gradient_factor(_nodes(0.0, high, nodes)).astype(np.float32)
+
+    def changed(self, **changes: Any) -> TransferFunction:
+        """Return the same with other parameters, named as at its making."""
+        own = {name: getattr(self, name) for name in ("points", "unit_distance", "gradient_opacity", "lighting")}
+        return TransferFunction(**{**own, "name": self._name, "description": self._description, **changes})
+
+    def scaled(self, opacity: float) -> TransferFunction:
+        """Return the same with every opacity times `opacity`, at most 1.
+
+        Raises
+        ------
+        UsageError
+            The factor is negative or not finite.
+        """
+        if not 0.0 <= opacity < np.inf:
+            raise UsageError(f"the factor on opacities is 0 or more, not {opacity!r}")
+        points = self._points.copy()
+        points[:, 4] = np.minimum(points[:, 4] * opacity, 1.0)
+        return self.changed(points=points)
+
+    def shifted(self, hu: float) -> TransferFunction:
+        """Return the same, every point `hu` HU further up.
+
+        Raises
+        ------
+        UsageError
+            Beyond a million HU.
+        """
+        points = self._points.copy()
+        points[:, 0] += hu
+        return self.changed(points=points)
+
+    @classmethod
+    def from_window(cls, low: float, high: float, **parameters: Any) -> TransferFunction:
+        """Return grey from black at `low` HU to white at `high` HU, opacity alike: a window for projections.
+
+        Parameters
+        ----------
+        low, high : float
+            HU.  A `low` above `high` makes the lowest HU white (and opaque).
+        **parameters
+            What `TransferFunction` takes beside the points.
+
+        Raises
+        ------
+        UsageError
+            Both are equal or not finite.
+        """
+        if low == high:
+            raise UsageError(f"a window needs two different HU, not {low:g} twice")
+        ends = ((low, 0.0), (high, 1.0))
+        return cls([(hu, grey, grey, grey, grey) for hu, grey in sorted(ends)], **parameters)
+
+    @classmethod
+    def from_pyvista(
+        cls, cmap: Any, opacity: Any, clim: tuple[float, float], *, unit_distance: float = 1.0, **parameters: Any
+    ) -> TransferFunction:
+        """Return what `pyvista.Plotter.add_volume` makes of a colour map, an opacity and limits in HU.
+
+        Parameters
+        ----------
+        cmap : str, list of str or matplotlib colour map
+            As pyvista takes it.
+        opacity : str, float or sequence of float
+            ``"linear"``, ``"sigmoid"``, ``"geom"``, ... with or without ``"_r"``, one opacity for all, or opacities
+            0 to 1 spread evenly over the limits.
+        clim : (float, float)
+            HU of the first and of the last colour.
+        unit_distance : float
+            mm; pyvista's ``opacity_unit_distance``, which it takes from the size of the volume unless told.
+        **parameters
+            What `TransferFunction` takes besides.
+
+        Raises
+        ------
+        UsageError
+            pyvista does not know them.
+        """
+        from clrecon.rendering.vtk_properties import points_from_pyvista
+
+        return cls(points_from_pyvista(cmap, opacity, clim), unit_distance=unit_distance, **parameters)
+
+    @classmethod
+    def from_vtk(cls, volume_property: Any, *, voxel_mm: float = 1.0, **parameters: Any) -> TransferFunction:
+        """Return what a vtkVolumeProperty (or pyvista's) says of the first component: colours, opacities, light.
+
+        Parameters
+        ----------
+        volume_property : vtkVolumeProperty or pyvista.VolumeProperty
+        voxel_mm : float
+            VTK takes gradients in HU per this length, the mean of the three spacings of its volume.
+        **parameters
+            What `TransferFunction` takes beside what the property says.
+
+        Raises
+        ------
+        UsageError
+            It holds no colours or opacities, or some that are out of range.
+        """
+        from clrecon.rendering.vtk_properties import parameters_from_vtk
+
+        return cls(**{**parameters_from_vtk(volume_property, voxel_mm), **parameters})
+
+    def to_vtk(self, *, voxel_mm: float = 1.0) -> Any:
+        """Return a vtkVolumeProperty: colours, opacities, unit distance, light (`Lighting()` where it has none).
+
+        A light with a direction has no place in it.  `voxel_mm` as in `from_vtk`.
+        """
+        from clrecon.rendering.vtk_properties import property_to_vtk
+
+        return property_to_vtk(self, voxel_mm)
+
+    def save(self, path: Any) -> None:
+        """Write it as JSON, as docs/transfer_functions.md says; `load_transfer_function` reads it.
+
+        Raises
+        ------
+        OutputError
+            It cannot be written; an older file of that name is intact.
+        """
+        from clrecon.rendering.transfer_files import save_transfer_function
+
+        save_transfer_function(self, path)
+
+    def _key(self) -> tuple[Any, ...]:
+        gradient = None if self._gradient_opacity is None else self._gradient_opacity.tolist()
+        return self._points.tolist(), gradient, self._unit_distance, self._lighting
+
+    def __eq__(self, other: object) -> bool:
+        return self._key() == other._key() if isinstance(other, TransferFunction) else NotImplemented
+
+    def __hash__(self) -> int:
+        return hash((self._points.tobytes(), self._unit_distance, self._lighting))
+
+    def __repr__(self) -> str:
+        low, high = self._points[0, 0], self._points[-1, 0]
+        name = f"{self._name!r}, " if self._name else ""
+        return f"TransferFunction({name}{len(self._points)} points from {low:g} to {high:g} HU)"
+
+
+def _nodes(low: float, high: float, nodes: int) -> Float64Array:
+    if not (nodes >= 2 and np.isfinite([low, high]).all() and low <= high):
+        raise UsageError(
+            f"a table has two nodes or more from a lower to a higher value, not {nodes} of {low} to {high}"
+        )
+    return np.linspace(low, high, nodes, dtype=np.float64)

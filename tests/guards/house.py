@@ -64,7 +64,7 @@ INSIDE_FUNCTIONS: dict[str, frozenset[str]] = {
     "labels": frozenset({"pydicom", "scipy"}),
     "mesh": frozenset({"scipy", "pyvista", "vtk", "vtkmodules", "fast_simplification"}),
     "reference": frozenset({"scipy"}),
-    "rendering": frozenset({"scipy", "PIL", "imageio_ffmpeg", "pyvista", "vtk"}),
+    "rendering": frozenset({"scipy", "PIL", "imageio_ffmpeg", "pyvista", "vtk", "vtkmodules"}),
     "phantom": frozenset({"scipy"}),
     "opencl": frozenset({"pyopencl"}),
     "kernels": frozenset({"pyopencl"}),

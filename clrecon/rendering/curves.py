@@ -1,0 +1,109 @@
+"""Piecewise linear functions with steps, as transfer functions are made of.
+
+A curve is `positions` (n,), ascending, and `values` (n, k), both float64; two points at one position are a step, where
+the second counts from that position on.  Beyond its ends a curve is constant.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from clrecon.errors import UsageError
+from clrecon.geometry.affine import Float64Array
+
+__all__ = ["check_ascending", "check_share", "evaluate_curve", "merge_curves", "straighten_curve"]
+
+STRAIGHT_PARTS = 32
+"""Straight parts in place of a bent one: at most 0.003 of its rise off."""
+
+
+def check_ascending(what: str, unit: str, positions: Float64Array) -> None:
+    """Refuse positions (n,) that go back, and more than two in one place.
+
+    Raises
+    ------
+    UsageError
+        With the two numbers and their place; points are counted from 1.
+    """
+    back = np.flatnonzero(np.diff(positions) < 0)
+    if back.size:
+        at = int(back[0])
+        raise UsageError(
+            f"{what} goes back from {positions[at]:g} {unit} at point {at + 1} to {positions[at + 1]:g} {unit} at point"
+            f" {at + 2}: order its points by {unit}"
+        )
+    thrice = np.flatnonzero(positions[2:] == positions[:-2])
+    if thrice.size:
+        at = int(thrice[0])
+        raise UsageError(
+            f"{what} has more than two points at {positions[at]:g} {unit}, from point {at + 1} on: a step has two"
+        )
+
+
+def check_share(what: str, value: float, at: int, advice: str = "") -> None:
+    """Refuse a value of point `at` (from 0) that is not in 0..1.
+
+    Raises
+    ------
+    UsageError
+    """
+    if not 0.0 <= value <= 1.0:
+        raise UsageError(f"{what} of point {at + 1} is {value:g}, and must lie between 0 and 1{advice}")
+
+
+def evaluate_curve(positions: Float64Array, values: Float64Array, at: Float64Array, left: bool = False) -> Float64Array:
+    """Values (..., k) of a curve at positions (...,); `left` takes a step's first point where it is."""
+    if left:  # in the mirror it is the second one
+        positions, values, at = -positions[::-1], values[::-1], -at
+    # np.interp takes the last of equal positions: it looks for the place with positions[n] <= at < positions[n + 1].
+    return np.stack([np.interp(at, positions, column) for column in values.T], axis=-1)
+
+
+def merge_curves(first: tuple[Float64Array, Float64Array], second: tuple[Float64Array, Float64Array]) -> Float64Array:
+    """Points (n, 1 + k + l) of two curves over the same axis: position, values of the first, values of the second."""
+    steps = {at for positions, _ in (first, second) for at in positions[1:][positions[1:] == positions[:-1]].tolist()}
+    rows = []
+    for position in np.unique(np.concatenate([first[0], second[0]])):
+        at = np.array([position])
+        # Elsewhere both sides are equal but for rounding.
+        for left in (True, False) if float(position) in steps else (False,):
+            rows.append(np.concatenate([at, evaluate_curve(*first, at, left)[0], evaluate_curve(*second, at, left)[0]]))
+    return np.array(rows)
+
+
+def _bend(sharpness: float) -> tuple[Float64Array, Float64Array]:
+    """Shares of the way and of the rise at which to break a bent way, half way up at 0.5: vtkPiecewiseFunction.
+
+    Breaks are spread over VTK's own parameter s, so that they are dense where the way is steep, and towards its ends.
+    """
+    t = np.arange(1, STRAIGHT_PARTS) / STRAIGHT_PARTS
+    s = np.where(t < 0.5, 2.0 * t * t, 1.0 - 2.0 * (1.0 - t) ** 2)
+    root = 1.0 / (1.0 + 10.0 * sharpness)
+    way = np.where(s < 0.5, 0.5 * (2.0 * s) ** root, 1.0 - 0.5 * (2.0 - 2.0 * s) ** root)
+    rise = s * s * (3.0 - 2.0 * s) + (1.0 - sharpness) * s * (2.0 * s * s - 3.0 * s + 1.0)
+    return way, np.clip(rise, 0.0, 1.0)
+
+
+def straighten_curve(
+    positions: Float64Array, values: Float64Array, midpoints: Float64Array, sharpness: Float64Array, steps: bool
+) -> tuple[Float64Array, Float64Array]:
+    """A curve from VTK's nodes: `midpoints` and `sharpness` (n,) bend the way from each node to the next one.
+
+    Straight to the midpoint and on where sharpness is below 0.01, else `STRAIGHT_PARTS` straight parts; with `steps`
+    (VTK's colours, not its opacities) a step at the midpoint above 0.99.
+    """
+    out_positions, out_values = [positions[:1]], [values[:1]]
+    for n in range(positions.size - 1):
+        middle, sharp = float(np.clip(midpoints[n], 1e-5, 1.0 - 1e-5)), float(sharpness[n])
+        if positions[n + 1] == positions[n] or (sharp < 0.01 and middle == 0.5):
+            way, rise = np.empty(0), np.empty(0)
+        elif sharp > 0.99 and steps:
+            way, rise = np.array([0.5, 0.5]), np.array([0.0, 1.0])
+        elif sharp < 0.01:
+            way, rise = np.array([0.5]), np.array([0.5])
+        else:
+            way, rise = _bend(sharp)
+        way = np.where(way < 0.5, 2.0 * way * middle, middle + (2.0 * way - 1.0) * (1.0 - middle))
+        out_positions += [positions[n] + way * (positions[n + 1] - positions[n]), positions[n + 1 : n + 2]]
+        out_values += [values[n] + rise[:, np.newaxis] * (values[n + 1] - values[n]), values[n + 1 : n + 2]]
+    return np.concatenate(out_positions), np.concatenate(out_values)

@@ -1,0 +1,240 @@
+"""Rendering presets: transfer function, light, mode and window by what a picture shows.
+
+Not to be mixed up with the presets of iso values in `clrecon.pipeline.presets`: some have the same name, because they
+show the same tissue, as a surface there and through opacities here.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from clrecon.errors import UsageError
+from clrecon.rendering.lighting import UNSHADED, Lighting
+from clrecon.rendering.transfer_function import TransferFunction
+
+__all__ = ["DEFAULT_PRESET", "PRESETS", "Preset", "find_preset"]
+
+DEFAULT_PRESET = "bone"
+
+
+@dataclass(frozen=True)
+class Preset:
+    """How a picture is made that shows one thing well.
+
+    Attributes
+    ----------
+    name : str
+    mode : str
+        The mode that it is made for: "dvr", "mip", "minip" or "mean".  A picture takes it unless told another one, so
+        that ``x-ray`` alone gives a mean projection.
+    transfer_function : TransferFunction
+        With its `lighting`; used in "dvr".
+    window : (float, float) or None
+        HU of black and of white in projections; None lets the picture's own values decide.
+    source : str
+        Where the ranges come from.
+    """
+
+    name: str
+    mode: str
+    transfer_function: TransferFunction
+    window: tuple[float, float] | None
+    source: str
+
+    @property
+    def description(self) -> str:
+        """What the picture shows, one line."""
+        return self.transfer_function.description
+
+    @property
+    def lighting(self) -> Lighting:
+        """The light that it is made for; `UNSHADED` has no shading."""
+        return self.transfer_function.lighting or UNSHADED
+
+
+# Colours of what CT shows, as anatomical atlases print them.
+_BLOOD = (0.50, 0.13, 0.10)
+_MUSCLE = (0.70, 0.30, 0.24)
+_FAT = (0.92, 0.82, 0.62)
+_SKIN = (0.90, 0.69, 0.58)
+_MARROW = (0.76, 0.48, 0.33)
+_SPONGY = (0.89, 0.74, 0.55)
+_CORTEX = (0.96, 0.91, 0.80)
+_DENSE = (1.00, 0.99, 0.95)
+_STEEL = (0.72, 0.80, 0.90)
+
+_MATT = Lighting(ambient=0.25, diffuse=0.85, specular=0.15, specular_power=12.0)
+_GLOSSY = Lighting(ambient=0.2, diffuse=0.85, specular=0.25, specular_power=20.0)
+
+_Row = tuple[float, tuple[float, float, float], float]
+
+_BONE: list[_Row] = [
+    (130.0, _BLOOD, 0.0),
+    (220.0, _MARROW, 0.06),
+    (330.0, _SPONGY, 0.35),
+    (700.0, _CORTEX, 0.8),
+    (1300.0, _DENSE, 0.95),
+]
+
+
+def _preset(
+    name: str,
+    description: str,
+    rows: list[_Row],
+    source: str,
+    *,
+    lighting: Lighting = _MATT,
+    mode: str = "dvr",
+    window: tuple[float, float] | None = None,
+) -> Preset:
+    points = [(hu, *color, opacity) for hu, color, opacity in rows]
+    function = TransferFunction(points, lighting=lighting, name=name, description=description)
+    return Preset(name, mode, function, window, source)
+
+
+_TISSUE = "HU of tissues: Prokop and Galanski, Spiral and Multislice Computed Tomography of the Body"
+_WHITE = (1.0, 1.0, 1.0)
+_BLACK = (0.0, 0.0, 0.0)
+
+PRESETS: dict[str, Preset] = {
+    preset.name: preset
+    for preset in (
+        _preset(
+            "bone",
+            "bone, from thin vertebral cortex on; what contrast medium fills shows too",
+            _BONE,
+            f"{_TISSUE}; thin vertebral cortex in slices of 4 mm has 150 to 200 HU",
+        ),
+        _preset(
+            "spine",
+            "bone with the soft tissue round it faintly visible",
+            [
+                (-600.0, _SKIN, 0.0),
+                (-450.0, _SKIN, 0.04),
+                (-250.0, _SKIN, 0.04),
+                (-160.0, _SKIN, 0.001),
+                (-40.0, _MUSCLE, 0.001),
+                (30.0, _MUSCLE, 0.006),
+                (120.0, _MUSCLE, 0.006),
+                *_BONE[1:],
+            ],
+            "bone as in the preset of this name; soft tissue so thin that 200 mm of it let half of the light through",
+        ),
+        _preset(
+            "skin",
+            "the outside of the body; where the scan ends, fat, muscle and bone in section",
+            [
+                (-600.0, _SKIN, 0.0),
+                (-450.0, _SKIN, 0.4),
+                (-300.0, _SKIN, 1.0),
+                (-180.0, _SKIN, 1.0),
+                (-110.0, _FAT, 1.0),
+                (-70.0, _FAT, 1.0),
+                (10.0, _MUSCLE, 1.0),
+                (120.0, _MUSCLE, 1.0),
+                (300.0, _SPONGY, 1.0),
+                (700.0, _CORTEX, 1.0),
+            ],
+            "a blurred edge between air (-1000 HU) and skin (about 0 HU) keeps its place half way",
+            lighting=_GLOSSY,
+        ),
+        _preset(
+            "lung",
+            "airways, lung and its vessels; the body round it is left out but for the edge of its skin",
+            [
+                (-970.0, (0.30, 0.55, 0.85), 0.0),
+                (-900.0, (0.35, 0.60, 0.90), 0.004),
+                (-800.0, (0.60, 0.75, 0.95), 0.008),
+                (-650.0, (0.95, 0.85, 0.80), 0.06),
+                (-450.0, (0.95, 0.55, 0.45), 0.16),
+                (-320.0, (0.90, 0.40, 0.32), 0.12),
+                (-200.0, (0.90, 0.40, 0.32), 0.0),
+            ],
+            "aerated lung has -950 to -500 HU, its vessels pass through -500 to 0 HU in blurred edges",
+        ),
+        _preset(
+            "vessels",
+            "vessels and organs with contrast medium in red, bone paler behind them",
+            [
+                (120.0, _BLOOD, 0.0),
+                (170.0, (0.66, 0.10, 0.08), 0.04),
+                (230.0, (0.82, 0.16, 0.11), 0.25),
+                (330.0, (0.90, 0.30, 0.20), 0.6),
+                (480.0, (0.92, 0.50, 0.36), 0.55),
+                (650.0, _SPONGY, 0.6),
+                (900.0, _CORTEX, 0.8),
+            ],
+            f"blood with contrast medium has 150 to 450 HU; {_TISSUE}",
+            lighting=_GLOSSY,
+        ),
+        _preset(
+            "muscle",
+            "muscles and organs without skin and fat, bone where it lies bare",
+            [
+                (-40.0, _MUSCLE, 0.0),
+                (10.0, _MUSCLE, 0.1),
+                (60.0, _MUSCLE, 0.45),
+                (130.0, (0.78, 0.42, 0.34), 0.6),
+                (250.0, _SPONGY, 0.8),
+                (700.0, _CORTEX, 0.95),
+            ],
+            f"muscle has 40 to 70 HU, fat -120 to -60 HU; {_TISSUE}",
+        ),
+        _preset(
+            "metal",
+            "screws, rods and implants; bone is glass",
+            [
+                (150.0, _MARROW, 0.0),
+                (300.0, _SPONGY, 0.02),
+                (1000.0, _CORTEX, 0.08),
+                (1800.0, _CORTEX, 0.1),
+                (2300.0, _STEEL, 0.7),
+                (3000.0, _STEEL, 1.0),
+            ],
+            "dense cortex and enamel end at about 2000 HU; the 12-bit scale at 3071 HU",
+            lighting=_GLOSSY,
+        ),
+        _preset(
+            "x-ray",
+            "the sum of everything along the ray, as a radiograph (mode mean)",
+            [(-1000.0, _WHITE, 0.0), (0.0, _WHITE, 0.004), (1500.0, _WHITE, 0.02)],
+            "attenuation is proportional to HU + 1000",
+            lighting=UNSHADED,
+            mode="mean",
+        ),
+        _preset(
+            "mip",
+            "the highest value along the ray: bone, vessels with contrast medium, calcifications (mode mip)",
+            [(0.0, _BLACK, 0.0), (1000.0, _WHITE, 0.5)],
+            "soft tissue ends at about 100 HU, contrast medium at 500 HU; cortex has 500 to 1500 HU",
+            lighting=UNSHADED,
+            mode="mip",
+            window=(0.0, 1000.0),
+        ),
+        _preset(
+            "minip",
+            "the lowest value along the ray: airways, emphysema, gas (mode minip; clip the air round the body away)",
+            [(-1000.0, _BLACK, 0.5), (-500.0, _WHITE, 0.0)],
+            "air has -1000 HU, emphysema less than -950 HU, aerated lung -950 to -500 HU",
+            lighting=UNSHADED,
+            mode="minip",
+            window=(-1000.0, -500.0),
+        ),
+    )
+}
+
+
+def find_preset(name: str) -> Preset:
+    """Return the rendering preset called `name`.
+
+    Raises
+    ------
+    UsageError
+        There is none; the message lists what there is.
+    """
+    try:
+        return PRESETS[name]
+    except (KeyError, TypeError):
+        raise UsageError(
+            f"unknown rendering preset {name!r}: use one of {', '.join(PRESETS)}, or a file with a transfer function"
+        ) from None

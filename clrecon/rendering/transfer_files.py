@@ -1,0 +1,220 @@
+"""`load_transfer_function`: one door for files with transfer functions; writing our own.
+
+Our own form is JSON, described in docs/transfer_functions.md.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import stat
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any, BinaryIO
+
+from clrecon.errors import RefusedInputError, UsageError
+from clrecon.files import replace_file
+from clrecon.rendering.json_fields import parse_json, take_color, take_list, take_number, take_object, take_text
+from clrecon.rendering.lighting import Lighting
+from clrecon.rendering.slicer_files import (
+    Entry,
+    read_paraview_json,
+    read_slicer_json,
+    read_slicer_text,
+    read_slicer_xml,
+)
+from clrecon.rendering.transfer_function import TransferFunction
+
+__all__ = ["load_transfer_function", "save_transfer_function"]
+
+FORMAT = "clrecon transfer function"
+VERSION = 1
+SIZE_LIMIT = 1_000_000
+"""Bytes: presets.xml of 3D Slicer has 12 kB."""
+NAMES_LISTED = 60
+
+_FIELDS = ("format", "version", "name", "description", "unit_distance_mm", "points", "gradient_opacity", "lighting")
+_LIGHT = ("ambient", "diffuse", "specular", "specular_power", "direction")
+
+
+def load_transfer_function(path: str | os.PathLike[str], name: str | None = None) -> TransferFunction:
+    """Read a transfer function: clrecon's JSON, 3D Slicer's .vp, .vp.json, presets.xml and .mrml, ParaView's .json.
+
+    The kind is told from the content.  Files of Slicer keep no unit distance but in .vp.json; it is 1 mm, as in
+    Slicer.  Their gradient opacity is in HU per voxel and taken as HU per mm; where it is 1 throughout, as in all
+    presets of Slicer, there is none.
+
+    Parameters
+    ----------
+    path : path
+    name : str, optional
+        Which one of a file with several: its name in any case, or its number from 1.  A file with one needs none.
+
+    Returns
+    -------
+    TransferFunction
+        With the light of the file (`UNSHADED` where its shading is off; None where the form knows of no light).
+
+    Raises
+    ------
+    UsageError
+        There is no such file, or not that name in it, or none was given for several; the message lists them.
+    RefusedInputError
+        It is no regular file, larger than a megabyte, of no known form, or something in it is wrong; the message
+        says the file, the field and its place.
+    """
+    shown = repr(Path(path).name[:200])
+    try:
+        entries = _entries(_read(Path(path), shown))
+        found_name, make = _choose(entries, name, shown)
+        parameters = make()
+        parameters["name"] = parameters.get("name", found_name)
+        return TransferFunction(**parameters)
+    except RefusedInputError as error:
+        raise RefusedInputError(f"{shown}: {error}") from None
+    except UsageError as error:
+        if isinstance(error, _Choice):
+            raise UsageError(str(error)) from None
+        raise RefusedInputError(f"{shown}: {error}") from None
+
+
+class _Choice(UsageError):
+    """What the caller asked for is wrong, not the file."""
+
+
+def _read(path: Path, shown: str) -> bytes:
+    try:
+        status = path.stat()
+    except FileNotFoundError:
+        raise _Choice(f"there is no file {shown} with a transfer function") from None
+    except (OSError, ValueError) as error:
+        raise RefusedInputError(f"it cannot be read: {getattr(error, 'strerror', None) or error}") from None
+    if stat.S_ISDIR(status.st_mode):
+        raise _Choice(f"{shown} is a folder: give the file with the transfer function")
+    if not stat.S_ISREG(status.st_mode):
+        raise RefusedInputError("it is no regular file")
+    try:
+        with path.open("rb") as stream:
+            data = stream.read(SIZE_LIMIT + 1)
+    except OSError as error:
+        raise RefusedInputError(f"it cannot be read: {error.strerror or error}") from None
+    if len(data) > SIZE_LIMIT:
+        raise RefusedInputError(f"it is larger than {SIZE_LIMIT:,} bytes: no transfer function is")
+    return data
+
+
+def _entries(data: bytes) -> list[Entry]:
+    if data.startswith((b"\xff\xfe", b"\xfe\xff")) or data.removeprefix(b"\xef\xbb\xbf").lstrip().startswith(b"<"):
+        return read_slicer_xml(data)
+    try:
+        text = data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise RefusedInputError(f"byte {error.start} is no UTF-8 text") from None
+    start = text.lstrip()[:1]
+    if start in ("{", "["):
+        return _json_entries(parse_json(text))
+    if start.isdigit():
+        return read_slicer_text(text)
+    raise RefusedInputError(
+        "its form is not known: JSON of clrecon, 3D Slicer's .vp, .vp.json and presets.xml, and ParaView's .json are"
+    )
+
+
+def _json_entries(value: Any) -> list[Entry]:
+    if isinstance(value, list):
+        return read_paraview_json(value)
+    if "volumeProperties" in value:
+        return read_slicer_json(value)
+    if "format" not in value:
+        raise RefusedInputError(f'it has no field "format": "{FORMAT}" and no "volumeProperties" of 3D Slicer')
+    name = value.get("name", "")
+    return [(name if isinstance(name, str) else "", lambda: _own_parameters(value))]
+
+
+def _choose(entries: list[Entry], name: str | None, shown: str) -> Entry:
+    names = [entry_name or str(n) for n, (entry_name, _) in enumerate(entries, start=1)]
+    listed = ", ".join(f"{entry!r}"[:66] for entry in names[:NAMES_LISTED])
+    listed += f" and {len(names) - NAMES_LISTED} more" if len(names) > NAMES_LISTED else ""
+    if name is None:
+        if len(entries) > 1:
+            raise _Choice(f"{shown} has {len(entries)} transfer functions, choose one by name: {listed}")
+        return entries[0]
+    wanted = name.strip().casefold()
+    found = [n for n, entry in enumerate(names) if entry.casefold() == wanted]
+    if not found and wanted.isascii() and wanted.isdigit() and 1 <= int(wanted[:9]) <= len(entries):
+        found = [int(wanted[:9]) - 1]
+    if len(found) != 1:
+        what = f"has {len(found)} transfer functions" if found else "has no transfer function"
+        raise _Choice(f"{shown} {what} named {name[:64]!r}; there are: {listed}")
+    return entries[found[0]]
+
+
+def _own_parameters(value: dict[str, Any]) -> dict[str, Any]:
+    what = "the file"
+    take_object(value, what, needed=("format", "version"))
+    if value["format"] != FORMAT:
+        raise RefusedInputError(f'its format is {value["format"]!r:.64}, not "{FORMAT}"')
+    if value["version"] != VERSION or isinstance(value["version"], bool):
+        raise RefusedInputError(f"its version is {value['version']!r:.64}: this clrecon reads version {VERSION}")
+    take_object(value, what, known=_FIELDS, needed=("points",))
+    parameters: dict[str, Any] = {
+        "points": [_own_point(point, f"points[{n}]") for n, point in enumerate(take_list(value["points"], "points"))],
+        "unit_distance": take_number(value.get("unit_distance_mm", 1.0), "unit_distance_mm"),
+        "name": take_text(value.get("name", ""), "name"),
+        "description": take_text(value.get("description", ""), "description"),
+    }
+    if value.get("gradient_opacity") is not None:
+        rows = []
+        for n, point in enumerate(take_list(value["gradient_opacity"], "gradient_opacity")):
+            place, names = f"gradient_opacity[{n}]", ("hu_per_mm", "factor")
+            fields = take_object(point, place, known=names, needed=names)
+            rows.append([take_number(fields[name], f"{place}.{name}") for name in names])
+        parameters["gradient_opacity"] = rows
+    if value.get("lighting") is not None:
+        light = dict(take_object(value["lighting"], "lighting", known=_LIGHT))
+        for name in _LIGHT[:4]:
+            if name in light:
+                light[name] = take_number(light[name], f"lighting.{name}")
+        parameters["lighting"] = Lighting(**light)
+    return parameters
+
+
+def _own_point(point: Any, place: str) -> tuple[float, ...]:
+    names = ("hu", "color", "opacity")
+    fields = take_object(point, place, known=names, needed=names)
+    hu, opacity = (take_number(fields[name], f"{place}.{name}") for name in ("hu", "opacity"))
+    return hu, *take_color(fields["color"], f"{place}.color"), opacity
+
+
+def save_transfer_function(function: TransferFunction, path: str | os.PathLike[str]) -> None:
+    """Write a transfer function as clrecon's JSON, as a whole or not at all; reading it gives the same, to the bit.
+
+    Raises
+    ------
+    OutputError
+        It cannot be written; an older file of that name is intact.
+    """
+    head: dict[str, Any] = {"format": FORMAT, "version": VERSION}
+    if function.name:
+        head["name"] = function.name
+    if function.description:
+        head["description"] = function.description
+    head["unit_distance_mm"] = function.unit_distance
+    if function.lighting is not None:
+        head["lighting"] = {key: value for key, value in asdict(function.lighting).items() if value is not None}
+    fields = [f'  "{key}": {json.dumps(value)}' for key, value in head.items()]
+    points = [{"hu": row[0], "color": row[1:4], "opacity": row[4]} for row in function.points.tolist()]
+    fields.append(_rows("points", points))
+    if function.gradient_opacity is not None:
+        rows = [{"hu_per_mm": place, "factor": factor} for place, factor in function.gradient_opacity.tolist()]
+        fields.append(_rows("gradient_opacity", rows))
+    text = "{\n" + ",\n".join(fields) + "\n}\n"
+
+    def write(stream: BinaryIO) -> None:
+        stream.write(text.encode("utf-8"))
+
+    replace_file(path, write)
+
+
+def _rows(name: str, rows: list[dict[str, Any]]) -> str:
+    return f'  "{name}": [\n' + ",\n".join(f"    {json.dumps(row)}" for row in rows) + "\n  ]"

@@ -1,0 +1,106 @@
+"""Rendering presets: what must show in each shows, and what must not does not; the document names them all."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from clrecon.errors import UsageError
+from clrecon.rendering import DEFAULT_PRESET, PRESETS, UNSHADED, find_preset
+
+pytestmark = pytest.mark.unit
+
+DOCUMENT = Path(__file__).resolve().parents[2] / "docs" / "transfer_functions.md"
+NAMES = ["bone", "spine", "skin", "lung", "vessels", "muscle", "metal", "x-ray", "mip", "minip"]
+
+
+def passes(name: str, hu: float, mm: float) -> float:
+    """Share of the light that a layer of `mm` of one value lets through."""
+    function = PRESETS[name].transfer_function
+    return float((1 - function([hu])[0, 3]) ** (mm / function.unit_distance))
+
+
+def test_they_are_there_and_found() -> None:
+    assert list(PRESETS) == NAMES
+    assert find_preset(DEFAULT_PRESET).name == "bone"
+    for name in ("bonne", "Bone", "", None):
+        with pytest.raises(
+            UsageError, match=f"unknown rendering preset {name!r}: use one of bone, spine, skin, .*file"
+        ):
+            find_preset(name)
+
+
+def test_each_is_whole() -> None:
+    for name, preset in PRESETS.items():
+        assert preset.name == preset.transfer_function.name == name
+        assert preset.description and preset.source
+        assert preset.lighting == preset.transfer_function.lighting
+        assert preset.lighting.shades == (preset.mode == "dvr")
+        assert preset.window is None or preset.window[0] < preset.window[1]
+        low, high = preset.transfer_function.range_hu
+        assert -1100 < low < high < 3100
+
+
+def test_modes_and_windows() -> None:
+    modes = {name: preset.mode for name, preset in PRESETS.items() if preset.mode != "dvr"}
+    assert modes == {"x-ray": "mean", "mip": "mip", "minip": "minip"}
+    assert PRESETS["mip"].window == (0, 1000)
+    assert PRESETS["x-ray"].window is None and PRESETS["x-ray"].lighting == UNSHADED
+
+
+@pytest.mark.parametrize(
+    ("name", "hu", "mm", "low", "high"),
+    [
+        # Clear: less than a tenth of the light is lost.
+        ("bone", 100, 300, 1, 1),
+        ("spine", -1000, 500, 1, 1),
+        ("spine", -100, 50, 0.9, 1),
+        ("lung", -1000, 500, 1, 1),
+        ("lung", 40, 300, 1, 1),
+        ("vessels", 80, 300, 1, 1),
+        ("muscle", -100, 300, 1, 1),
+        ("skin", -800, 300, 1, 1),
+        ("metal", 300, 5, 0.9, 1),
+        # Faint: something of what lies behind is seen.
+        ("spine", 50, 100, 0.3, 0.8),
+        ("lung", -850, 100, 0.3, 0.8),
+        ("metal", 1000, 10, 0.3, 0.8),
+        # Solid: next to nothing passes.
+        ("bone", 400, 10, 0, 0.05),
+        ("spine", 400, 10, 0, 0.05),
+        ("skin", -300, 2, 0, 0.01),
+        ("vessels", 300, 8, 0, 0.05),
+        ("muscle", 55, 10, 0, 0.05),
+        ("metal", 2800, 3, 0, 0.01),
+    ],
+)
+def test_tissues_show_as_they_should(name: str, hu: float, mm: float, low: float, high: float) -> None:
+    assert low <= passes(name, hu, mm) <= high
+
+
+def test_thin_cortex_in_thick_slices_shows_in_bone() -> None:
+    assert passes("bone", 175, 4) < 0.95
+    red, green, blue, _ = PRESETS["bone"].transfer_function([1000])[0]
+    assert min(red, green, blue) > 0.8
+    red, green, blue, _ = PRESETS["vessels"].transfer_function([250])[0]
+    assert red > 2 * max(green, blue)
+
+
+def test_x_ray_grows_with_attenuation() -> None:
+    opacity = PRESETS["x-ray"].transfer_function(np.arange(-1000, 1500, 10))[:, 3]
+    assert opacity[0] == 0 and np.all(np.diff(opacity) > 0)
+
+
+def test_the_document_says_what_they_are() -> None:
+    text = DOCUMENT.read_text(encoding="utf-8")
+    rows = re.findall(r"^\| `([\w-]+)` \| (.*?) \| (\w+) \| (.*?) ?\|$", text, re.MULTILINE)
+    assert [row[0] for row in rows] == NAMES
+    for name, description, mode, begins in rows:
+        preset = PRESETS[name]
+        assert preset.description.startswith(description) and preset.mode == mode
+        if begins:
+            points = preset.transfer_function.points
+            assert float(begins.split()[0]) == points[np.flatnonzero(points[:, 4] > 0)[0] - 1, 0]

@@ -1,0 +1,149 @@
+"""Transfer functions to and from VTK and pyvista, with their own answers as the truth."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from tolerances import BENT_WAY, COLOR_SPACE_WAY, FLOAT64_SHARE
+
+from clrecon.errors import UsageError
+from clrecon.rendering import PRESETS, UNSHADED, Lighting, TransferFunction
+
+pytestmark = pytest.mark.unit
+
+vtk_data = pytest.importorskip("vtkmodules.vtkCommonDataModel")
+vtk_core = pytest.importorskip("vtkmodules.vtkRenderingCore")
+
+STEPPED = [(0, 0, 0, 0, 0), (100, 1, 1, 1, 0.2), (100, 1, 0, 0, 0.6), (300, 1, 1, 0.5, 1)]
+LIGHT = Lighting(0.1, 0.9, 0.3, 20)
+
+
+def make_property(opacity, colors):
+    made = vtk_core.vtkVolumeProperty()
+    made.SetScalarOpacity(opacity)
+    made.SetColor(colors)
+    return made
+
+
+def test_vtk_says_what_the_function_says() -> None:
+    function = TransferFunction(
+        STEPPED, unit_distance=2.5, lighting=LIGHT, gradient_opacity=[(0, 0.1), (40, 0.1), (40, 1)]
+    )
+    made = function.to_vtk(voxel_mm=0.5)
+    hu = np.array([-10, 0, 50, 99.9999, 100, 100.0001, 200, 300, 900.0])
+    found = [[*made.GetRGBTransferFunction().GetColor(x), made.GetScalarOpacity().GetValue(x)] for x in hu]
+    np.testing.assert_allclose(found, function(hu), atol=FLOAT64_SHARE)
+    # VTK's gradient is in HU per voxel of 0.5 mm: 19.9 of them are 39.8 HU per mm.
+    assert [made.GetGradientOpacity().GetValue(x) for x in (19.9, 20.0, 30)] == pytest.approx([0.1, 1, 1])
+    assert made.GetScalarOpacityUnitDistance() == 2.5
+    assert (made.GetShade(), made.GetAmbient(), made.GetDiffuse(), made.GetSpecular()) == (1, 0.1, 0.9, 0.3)
+    assert made.GetSpecularPower() == 20
+
+
+@pytest.mark.parametrize("gradient", [None, [(0, 0), (50, 1), (50, 0.5)]])
+@pytest.mark.parametrize("light", [LIGHT, UNSHADED])
+def test_there_and_back_is_the_same(gradient: object, light: Lighting) -> None:
+    function = TransferFunction(STEPPED, unit_distance=0.25, gradient_opacity=gradient, lighting=light)
+    assert TransferFunction.from_vtk(function.to_vtk()) == function
+    assert TransferFunction.from_vtk(function.to_vtk(voxel_mm=0.5), voxel_mm=0.5) == function
+
+
+def test_every_preset_goes_there_and_back() -> None:
+    for preset in PRESETS.values():
+        assert TransferFunction.from_vtk(preset.transfer_function.to_vtk()) == preset.transfer_function
+
+
+@pytest.mark.parametrize("clamped", [True, False])
+def test_bent_ways_and_ends_as_vtk_has_them(clamped: bool) -> None:
+    rng = np.random.default_rng(7)
+    at = rng.uniform(-1500, 2500, 500)
+    for _ in range(40):
+        opacity, colors = vtk_data.vtkPiecewiseFunction(), vtk_core.vtkColorTransferFunction()
+        places = np.sort(rng.uniform(-1000, 2000, 6))
+        for x in places:
+            middle, sharp = rng.choice([0.5, 0.3, 0.8, 0.01]), rng.choice([0, 0.005, 0.3, 0.5, 0.9, 1])
+            opacity.AddPoint(x, rng.uniform(), middle, sharp)
+            colors.AddRGBPoint(x, *rng.uniform(size=3), middle, sharp)
+        opacity.SetClamping(clamped)
+        function = TransferFunction.from_vtk(make_property(opacity, colors))
+        want = [[*colors.GetColor(x), opacity.GetValue(x)] for x in at]
+        np.testing.assert_allclose(function(at), want, atol=BENT_WAY)
+
+
+@pytest.mark.parametrize("space", ["HSV", "Lab", "Diverging"])
+def test_ways_through_other_colour_spaces(space: str) -> None:
+    colors, opacity = vtk_core.vtkColorTransferFunction(), vtk_data.vtkPiecewiseFunction()
+    getattr(colors, f"SetColorSpaceTo{space}")()
+    for x, color in ((-100, (0.2, 0.3, 0.8)), (200, (0.8, 0.8, 0.3)), (900, (0.7, 0.1, 0.1))):
+        colors.AddRGBPoint(x, *color)
+    opacity.AddPoint(0, 0)
+    opacity.AddPoint(900, 0.5)
+    function = TransferFunction.from_vtk(make_property(opacity, colors))
+    at = np.linspace(-200, 1000, 601)
+    np.testing.assert_allclose(function(at)[:, :3], [colors.GetColor(x) for x in at], atol=COLOR_SPACE_WAY)
+
+
+def test_grey_properties_without_shading() -> None:
+    grey, opacity = vtk_data.vtkPiecewiseFunction(), vtk_data.vtkPiecewiseFunction()
+    for function in (grey, opacity):
+        function.AddPoint(0, 0)
+        function.AddPoint(100, 1)
+    made = vtk_core.vtkVolumeProperty()
+    made.SetColor(grey)
+    made.SetScalarOpacity(opacity)
+    found = TransferFunction.from_vtk(made, name="grey")
+    assert found([25]).tolist() == [[0.25] * 4]
+    assert (found.lighting, found.gradient_opacity, found.name) == (UNSHADED, None, "grey")
+
+
+def test_properties_that_cannot_be_read() -> None:
+    empty = make_property(vtk_data.vtkPiecewiseFunction(), vtk_core.vtkColorTransferFunction())
+    with pytest.raises(UsageError, match="its colour function has no points"):
+        TransferFunction.from_vtk(empty)
+    with pytest.raises(UsageError, match="no vtkVolumeProperty"):
+        TransferFunction.from_vtk("bone")
+    with pytest.raises(UsageError, match="mean spacing of a volume is a length"):
+        TransferFunction.from_vtk(TransferFunction(STEPPED).to_vtk(), voxel_mm=0)
+    with pytest.raises(UsageError, match="mean spacing of a volume is a length"):
+        TransferFunction(STEPPED).to_vtk(voxel_mm=np.nan)
+    colors = vtk_core.vtkColorTransferFunction()
+    colors.AddRGBPoint(1, 0, 0, 0)
+    colors.AddRGBPoint(9, 1, 1, 1)
+    colors.SetScaleToLog10()
+    with pytest.raises(UsageError, match="logarithm"):
+        TransferFunction.from_vtk(make_property(vtk_data.vtkPiecewiseFunction(), colors))
+
+
+@pytest.mark.parametrize("opacity", ["sigmoid_5", "linear_r", 0.3, [0, 0.1, 0.9], list(np.linspace(0, 0.9, 256))])
+def test_pyvista_gives_what_its_scene_shows(opacity: object) -> None:
+    pyvista = pytest.importorskip("pyvista")
+    image = pyvista.ImageData(dimensions=(4, 4, 4))
+    image["hu"] = np.linspace(-200, 1200, 64)
+    plotter = pyvista.Plotter(off_screen=True)
+    # An array of 256 has 0 to 255 there.
+    theirs = np.multiply(opacity, 255) if isinstance(opacity, list) and len(opacity) == 256 else opacity
+    actor = plotter.add_volume(image, cmap="bone", opacity=theirs, clim=(-200, 1200), opacity_unit_distance=1.5)
+    shown = TransferFunction.from_vtk(actor.prop)
+    plotter.close()
+    found = TransferFunction.from_pyvista("bone", opacity, (-200, 1200), unit_distance=1.5, name="x")
+    assert (found.unit_distance, found.name, found.range_hu) == (1.5, "x", (-200, 1200))
+    at = np.linspace(*shown.range_hu, 256)  # some versions of pyvista map HU to 0..255 for the scene
+    np.testing.assert_allclose(found.points[:, 1:], shown(at), atol=FLOAT64_SHARE)
+
+
+@pytest.mark.parametrize(
+    ("cmap", "opacity", "clim", "message"),
+    [
+        ("no-such-map", "linear", (0, 1), "does not take this colour map or opacity: .*no-such-map"),
+        ("bone", "no-such", (0, 1), "does not take .*no-such"),
+        ("bone", 2.0, (0, 1), "between 0 and 1, got 2.0"),
+        ("bone", [0, 3], (0, 1), "two or more numbers between 0 and 1"),
+        ("bone", [0.0] * 300, (0, 1), "does not take"),
+        ("bone", "linear", (5, 5), "a lower and a higher HU"),
+        ("bone", "linear", (0, np.nan), "a lower and a higher HU"),
+    ],
+)
+def test_what_pyvista_does_not_take(cmap: str, opacity: object, clim: tuple[float, float], message: str) -> None:
+    pytest.importorskip("pyvista")
+    with pytest.raises(UsageError, match=message):
+        TransferFunction.from_pyvista(cmap, opacity, clim)
