@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from clrecon.opencl import Device
     from clrecon.operators.isosurface import SurfaceExtractor, extract_isosurface, extract_isosurfaces
     from clrecon.operators.labels import extract_labels
+    from clrecon.operators.renderer import VolumeRenderer, render
     from clrecon.reading import list_series, read_volume
     from clrecon.rendering import Lighting, TransferFunction, load_transfer_function
 
@@ -52,6 +53,7 @@ __all__ = [
     "TransferFunction",
     "UsageError",
     "Volume",
+    "VolumeRenderer",
     "__version__",
     "choose_iso_value",
     "compare_meshes",
@@ -67,6 +69,7 @@ __all__ = [
     "read_labels",
     "read_volume",
     "remove_table",
+    "render",
     "smooth_mesh",
 ]
 
@@ -84,6 +87,7 @@ _HOMES = {
     "TransferFunction": "clrecon.rendering",
     "UsageError": "clrecon.errors",
     "Volume": "clrecon.geometry",
+    "VolumeRenderer": "clrecon.operators.renderer",
     "choose_iso_value": "clrecon.geometry",
     "compare_meshes": "clrecon.mesh.distances",
     "decimate_mesh": "clrecon.mesh.refinement",
@@ -96,6 +100,7 @@ _HOMES = {
     "read_labels": "clrecon.labels",
     "read_volume": "clrecon.reading",
     "remove_table": "clrecon.geometry.body",
+    "render": "clrecon.operators.renderer",
     "smooth_mesh": "clrecon.mesh.refinement",
 }
 

@@ -14,7 +14,7 @@ static inline float3 shade(__global const float4 *restrict view, __global const 
     const float4 phong = view[VIEW_PHONG];
     const float size = dot(gradient, gradient);
     if (size < 1e-12f)
-        return color * (phong.x + phong.y);
+        return min(color * (phong.x + phong.y), 1.0f);
     const float4 fixed_light = view[VIEW_LIGHT];
     const float3 normal = gradient * (1.0f / sqrt(size));
     const float3 light = fixed_light.w > 0.0f ? fixed_light.xyz : -direction;
@@ -27,7 +27,7 @@ static inline float3 shade(__global const float4 *restrict view, __global const 
     const float entry = min(highlight_angle, 1.0f) * (HIGHLIGHTS - 1);
     const int at = min((int)entry, HIGHLIGHTS - 2);
     const float highlight = highlights[at] + (entry - (float)at) * (highlights[at + 1] - highlights[at]);
-    return color * (phong.x + diffuse) + highlight;
+    return min(color * (phong.x + diffuse) + highlight, 1.0f);
 }
 
 #endif

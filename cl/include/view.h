@@ -29,6 +29,18 @@
 
 #define TILE 8 /* work-items go through the picture in tiles of 8 x 8 pixels */
 
+#define FIRST_SLAB 1 /* a picture begins with this slab of slices */
+#define LAST_SLAB 2 /* and ends with it */
+
+/* Picture of premultiplied `color` before `background`, whose w is 1, or 0 for none. */
+static inline uchar4 finish_color(const float4 color, const float4 background)
+{
+    const float opacity = color.w + (1.0f - color.w) * background.w;
+    const float3 rgb = color.xyz + (1.0f - color.w) * background.w * background.xyz;
+    const float4 straight = opacity > 0.0f ? (float4)(rgb / opacity, opacity) : (float4)(0.0f);
+    return convert_uchar4_sat_rte(255.0f * straight);
+}
+
 /* A ray: field coordinates at distance t mm from its origin are origin + t * step.  It crosses the box and what the
  * clip planes leave of it from t_in to t_out, nothing where t_out <= t_in.  Within the focus: focus_in to focus_out. */
 typedef struct {

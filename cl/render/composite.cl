@@ -29,7 +29,7 @@ typedef struct {
 typedef struct {
     float4 start, stride;
     float3 direction;
-    float t_in, offset, rest; /* rest: length of the last segment */
+    float t_in, phase, offset, rest; /* rest: length of the last segment */
     int end, segments;
 } sampled_ray;
 
@@ -40,7 +40,8 @@ typedef struct {
     __global const float *highlights;
     __global const float4 *view;
     float low, scale; /* nearest node to a value v: (v - low) * scale + 0.5 */
-    float ray_step, phase;
+    float ray_step;
+    float slab_low, slab_high; /* samples with slab_low <= k < slab_high are this slab's */
     int shaded;
 } looks;
 
@@ -48,11 +49,11 @@ static inline void add_sample(
     const field *f, const looks *look, const sampled_ray *r, const int n, const int node, const float opacity, sight *seen)
 {
     const float4 color = look->colors[node];
-    float a = opacity, t = r->t_in + ((float)n + look->phase) * look->ray_step;
+    float a = opacity, t = r->t_in + ((float)n + r->phase) * look->ray_step;
     float4 at = r->start + (float)n * r->stride;
     if (n == r->segments - 1) { /* what is left of the way is less than a step */
         a = 1.0f - exp2(color.w * (r->rest / look->ray_step));
-        t = r->t_in + (float)n * look->ray_step + look->phase * r->rest;
+        t = r->t_in + (float)n * look->ray_step + r->phase * r->rest;
     }
     float3 rgb = color.xyz;
     if (look->shaded) {
@@ -78,11 +79,12 @@ static inline int follow_ray(
     const float4 start = r->start, stride = r->stride;
     do {
         const floats number = (float)n + LANE_NUMBERS;
-        const floats value = sample_lanes(
-            f, start.x + number * stride.x, start.y + number * stride.y, start.z + number * stride.z);
+        const floats k = start.z + number * stride.z;
+        const floats value = sample_lanes(f, start.x + number * stride.x, start.y + number * stride.y, k);
         const floats place = (value - look->low) * look->scale + 0.5f;
         const ints node = to_ints(min(max(place, (floats)(0.0f)), (floats)(NODES - 1)));
-        const floats opacity = (floats)(GATHER(look->opacities, node));
+        const floats found = (floats)(GATHER(look->opacities, node));
+        const floats opacity = choose((k >= look->slab_low) & (k < look->slab_high), found, (floats)(0.0f));
         if (ANY_LANE(opacity > 0.0f)) {
             float lane_opacity[LANES];
             int lane_node[LANES];
@@ -97,7 +99,7 @@ static inline int follow_ray(
         }
         n += LANES;
     } while (n < r->end
-             && is_shown(map, start.x + (float)n * stride.x, start.y + (float)n * stride.y, start.z + (float)n * stride.z));
+             && is_shown(map, start.x + (float)n * stride.x, start.y + (float)n * stride.y, start.z + (float)n * stride.z - (float)f->first_k));
     return n;
 }
 
@@ -109,29 +111,32 @@ static inline int follow_ray(
  *             view     in   see include/view.h
  *             states   in/out  (height, width, 2) float4: premultiplied rgba; t of the first hit, sum of w t, -, -
  *             image    out  (height, width) rgba
- *             depths   out  (height, width, 2) first hit and expected depth, mm; NaN where nothing is hit
+ *             depths means  out  (height, width) first hit and expected depth, mm; NaN where nothing is hit
+ *             background    rgb, and 1 where it fills what the rays leave
  *             last_place    indices of the volume's last voxel centres
  *             ni nj    of the buffer; first_k end_k: slices in the buffer; slab_low slab_high: samples with
  *                      slab_low <= k < slab_high are this slab's
  *             bi bj bk bricks
  *             low scale     nearest node to a value
  *             jitter   samples at random places of their segments
- *             stage    bit 0: first slab, bit 1: last slab
+ *             stage    FIRST_SLAB and LAST_SLAB, see include/view.h
  * Launch      global = tiles * 64 / LANES rounded up by the host, any local
  * Guarantees  every pixel of image and depths is written with the last slab */
 __kernel void composite_rays(
     __global const VOXEL *restrict voxels, __global const uchar *restrict leaps,
     __global const float4 *restrict colors, __global const float *restrict opacities,
     __global const float *restrict highlights, __global const float4 *restrict view, __global float4 *restrict states,
-    __global uchar4 *restrict image, __global float2 *restrict depths, const float4 last_place, const int ni,
-    const int nj, const int first_k, const int end_k, const float slab_low, const float slab_high, const int bi,
-    const int bj, const int bk, const float low, const float scale, const uint width, const uint height,
-    const uint planes, const int perspective, const int shaded, const int jitter, const int stage, const uint queues)
+    __global uchar4 *restrict image, __global float *restrict depths, __global float *restrict means,
+    const float4 background, const float4 last_place, const int ni, const int nj, const int first_k, const int end_k,
+    const float slab_low, const float slab_high, const int bi, const int bj, const int bk, const float low,
+    const float scale, const uint width, const uint height, const uint planes, const int perspective, const int shaded,
+    const int jitter, const int stage, const uint queues)
 {
     const uint first_pixel = (uint)get_global_id(0) * LANES;
     const field f = { voxels, ni, nj, first_k, end_k, last_place };
     const leap_map map = { leaps, bi, bj, bk };
-    looks look = { colors, opacities, highlights, view, low, scale, view[VIEW_NEAR].y, 0.5f, shaded };
+    looks look = { colors, opacities, highlights, view, low, scale, view[VIEW_NEAR].y, slab_low, slab_high,
+        shaded };
 
     sampled_ray rays[LANES];
     float starts[6][LANES], numbers[LANES], ends[LANES];
@@ -149,6 +154,7 @@ __kernel void composite_rays(
             ray way;
             start_ray(view, pixel, planes, perspective, &way);
             const float phase = jitter ? jitter_pixel((uint)pixel.x, (uint)pixel.y) : 0.5f;
+            r->phase = phase;
             const float span = way.t_out - way.t_in;
             r->segments = span > 0.0f ? (int)ceil(span / look.ray_step) : 0;
             r->rest = span - (float)(r->segments - 1) * look.ray_step;
@@ -157,7 +163,13 @@ __kernel void composite_rays(
             r->direction = way.direction;
             r->stride = look.ray_step * way.step;
             r->start = way.origin + (way.t_in + phase * look.ray_step) * way.step;
-            if (r->segments > 0 && way.focus_out > way.focus_in) {
+            if (!(stage & FIRST_SLAB)) {
+                const size_t place = (size_t)pixel.y * width + (size_t)pixel.x;
+                sights[lane].color = states[2 * place];
+                sights[lane].first_hit = states[2 * place + 1].x;
+                sights[lane].sum = states[2 * place + 1].y;
+            }
+            if (r->segments > 0 && sights[lane].color.w < OPAQUE && way.focus_out > way.focus_in) {
                 const float first = (way.focus_in - way.t_in) / look.ray_step - phase;
                 const float past = (way.focus_out - way.t_in) / look.ray_step - phase;
                 numbers[lane] = max(floor(first), 0.0f);
@@ -175,7 +187,7 @@ __kernel void composite_rays(
     ray_lanes together;
     together.start_i = load_lanes(starts[0]);
     together.start_j = load_lanes(starts[1]);
-    together.start_k = load_lanes(starts[2]);
+    together.start_k = load_lanes(starts[2]) - (float)first_k;
     together.stride_i = load_lanes(starts[3]);
     together.stride_j = load_lanes(starts[4]);
     together.stride_k = load_lanes(starts[5]);
@@ -205,10 +217,13 @@ __kernel void composite_rays(
         const size_t place = (size_t)pixel.y * width + (size_t)pixel.x;
         const sight *seen = sights + lane;
         const float4 color = seen->color;
-        const float4 straight = color.w > 0.0f ? (float4)(color.xyz / color.w, color.w) : (float4)(0.0f);
-        image[place] = convert_uchar4_sat_rte(255.0f * straight);
-        depths[place] = seen->first_hit < 0.0f
-            ? (float2)(NAN)
-            : (float2)(seen->first_hit + rays[lane].offset, seen->sum / color.w + rays[lane].offset);
+        if (!(stage & LAST_SLAB)) {
+            states[2 * place] = color;
+            states[2 * place + 1] = (float4)(seen->first_hit, seen->sum, 0.0f, 0.0f);
+            continue;
+        }
+        image[place] = finish_color(color, background);
+        depths[place] = seen->first_hit < 0.0f ? NAN : seen->first_hit + rays[lane].offset;
+        means[place] = seen->first_hit < 0.0f ? NAN : seen->sum / color.w + rays[lane].offset;
     }
 }

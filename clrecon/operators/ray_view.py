@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 
 from clrecon.geometry import Volume, normal_matrix, slice_normal
 from clrecon.geometry.affine import Float64Array
-from clrecon.geometry.camera import Camera
+from clrecon.geometry.camera import Camera, box_corners
 from clrecon.rendering import Lighting
 
-__all__ = ["BOX_BORDER", "FieldFrame", "RayView"]
+__all__ = ["BOX_BORDER", "FieldFrame", "RayView", "volume_box"]
 
 BOX_BORDER = 0.5
 """Voxels beyond the outermost voxel centres that belong to a volume."""
@@ -42,7 +42,7 @@ class FieldFrame:
                 normal = -normal
             matrix = np.vstack([np.linalg.pinv(volume.affine[:3, :2]), normal])
             return cls(matrix, -matrix @ origin)
-        inverse = np.linalg.inv(volume.affine)
+        inverse: Float64Array = np.asarray(np.linalg.inv(volume.affine), dtype=np.float64)
         return cls(inverse[:3, :3], inverse[:3, 3])
 
     def places(self, points: Float64Array) -> Float64Array:
@@ -55,12 +55,12 @@ class FieldFrame:
         return np.column_stack([normals, planes[:, 3] + normals @ self.offset])
 
 
-def box_corners(volume: Volume, border: float = BOX_BORDER) -> Float64Array:
-    """Corners of all slices and half a voxel beyond the ends, LPS mm (n, 3)."""
-    ni, nj, nk = volume.shape_ijk
-    sides = [(i, j) for i in (-border, ni - 1 + border) for j in (-border, nj - 1 + border)]
-    ks = (-border, *range(nk), nk - 1 + border) if volume.uneven else (-border, nk - 1 + border)
-    return volume.ijk_to_lps([(i, j, k) for k in ks for i, j in sides])
+def volume_box(volume: Volume) -> tuple[Float64Array, Float64Array]:
+    """Lowest and highest field coordinates of a volume, half a voxel beyond its outermost centres."""
+    if volume.uneven:
+        places = FieldFrame.of(volume).places(box_corners(volume))
+        return places.min(axis=0), places.max(axis=0)
+    return np.full(3, -BOX_BORDER), np.array(volume.shape_ijk) - 1.0 + BOX_BORDER
 
 
 @dataclass(frozen=True)
@@ -137,7 +137,7 @@ class RayView:
         ]
         table = np.zeros((len(rows) + 3, 4))
         table[: len(rows), :3] = rows
-        table[-3] = *toward, 0.0 if light.direction is None else 1.0
+        table[-3] = (*toward, 0.0 if light.direction is None else 1.0)
         table[-2] = light.ambient, light.diffuse, light.specular, light.specular_power
         table[-1] = near, ray_step, 0.0, 0.0
         count = 0

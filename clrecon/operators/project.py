@@ -1,0 +1,44 @@
+"""Projections of a volume along rays: the host's side of cl/render/project.cl."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from clrecon.kernels import Stopwatch, launch, upload
+from clrecon.operators.pictures import PictureBuffers, count_queues
+from clrecon.operators.ray_view import RayView
+from clrecon.operators.resident import RaySlab, ResidentVolume
+
+__all__ = ["PROJECTIONS", "project_slab"]
+
+PROJECTIONS = {"mip": 0, "minip": 1, "mean": 2}
+"""What the kernel calls them."""
+
+
+def project_slab(
+    resident: ResidentVolume,
+    slab: RaySlab,
+    view: RayView,
+    mode: str,
+    output: PictureBuffers,
+    stopwatch: Stopwatch,
+) -> None:
+    """Take one slab into a projection; `output.means_d` gets the values.
+
+    Parameters
+    ----------
+    mode : {"mip", "minip", "mean"}
+    """
+    device = resident.device
+    width, height = view.size
+    queues = count_queues(device)
+    last = np.array([n - 1 for n in resident.volume.shape_ijk] + [0], dtype=np.float32)
+    launch(
+        device, resident.program("render/project.cl")["project_rays"], output.items(queues, 1),
+        slab.voxels_d, resident.measure(slab, stopwatch), upload(device, view.table), output.states_d,
+        output.depths_d, output.means_d, last,
+        np.int32(slab.shape_ijk[0]), np.int32(slab.shape_ijk[1]), np.int32(slab.first_k), np.int32(slab.end_k),
+        np.float32(slab.low_k), np.float32(slab.high_k), *(np.int32(n) for n in slab.bricks),
+        np.uint32(width), np.uint32(height), np.uint32(view.planes), np.int32(not view.camera.is_parallel),
+        np.int32(PROJECTIONS[mode]), np.int32(slab.stage), np.uint32(queues), stopwatch=stopwatch,
+    )  # fmt: skip

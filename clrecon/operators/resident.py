@@ -1,0 +1,251 @@
+"""A volume on a device for rays: its slices, in slabs where they do not fit at once, and what bricks of it hold."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clrecon.geometry import Volume
+from clrecon.geometry.affine import Float64Array
+from clrecon.kernels import Program, Stopwatch, allocate, download, launch, load_program, upload
+from clrecon.opencl import Device, check_budget, describe_shortage, memory_limits
+from clrecon.operators.ray_view import BOX_BORDER
+from clrecon.operators.voxel_types import voxel_variants
+
+__all__ = ["BRICK_CELLS", "LeapMap", "RaySlab", "ResidentVolume", "ray_variants"]
+
+BRICK_CELLS = 8
+"""Cells along each side of a brick, as in cl/include/leap.h."""
+
+OVERLAP = 2
+"""Slices that a slab holds beyond its own at either side: those that cells and gradients at its ends read."""
+
+
+def ray_variants(device: Device, dtype: np.dtype[Any]) -> dict[str, str]:
+    """``-D`` definitions for kernels that sample volumes of `dtype` along rays."""
+    lanes = {"LANES": device.kernel_variants["LANES"]}
+    return {**voxel_variants(dtype), **lanes, "VOXEL_IS_SHORT": str(int(dtype == np.int16))}
+
+
+@dataclass
+class LeapMap:
+    """Which bricks of a slab show something, and how far the next one is.
+
+    Attributes
+    ----------
+    distances_d : buffer, (bk, bj, bi) uint8
+        Chebyshev distance in bricks, 0 where something shows.
+    box : (low, high) or None
+        Voxel indices of the part of the volume that all bricks with something lie in; None where there is none.
+    """
+
+    distances_d: Any
+    box: tuple[Float64Array, Float64Array] | None
+
+
+@dataclass
+class RaySlab:
+    """Slices ``first_k`` to ``end_k - 1`` of a volume on the device, at least two along each axis.
+
+    Attributes
+    ----------
+    voxels_d : buffer, (end_k - first_k, nj, ni)
+    shape_ijk : (ni, nj, slices) of the buffer
+    low_k, high_k : float
+        Samples with ``low_k <= k < high_k`` are this slab's.
+    stage : int
+        Bit 0: the first slab that a picture goes through, bit 1: the last.
+    """
+
+    voxels_d: Any
+    shape_ijk: tuple[int, int, int]
+    first_k: int
+    low_k: float
+    high_k: float
+    stage: int = 3
+    ranges_d: Any = None
+    maps: dict[Any, LeapMap] = field(default_factory=dict)
+
+    @property
+    def bricks(self) -> tuple[int, int, int]:
+        """(bi, bj, bk)."""
+        bi, bj, bk = (max(1, -(-(n - 1) // BRICK_CELLS)) for n in self.shape_ijk)
+        return bi, bj, bk
+
+    @property
+    def end_k(self) -> int:
+        """The slice after the last of the buffer."""
+        return self.first_k + self.shape_ijk[2]
+
+
+def _at_least_two(voxels: NDArray[Any]) -> NDArray[Any]:
+    """Voxels with every axis of length 1 doubled: a cell needs two, and the field is the same."""
+    for axis, length in enumerate(voxels.shape):
+        if length == 1:
+            voxels = np.repeat(voxels, 2, axis=axis)
+    return voxels
+
+
+class ResidentVolume:
+    """A volume on a device, whole or slab by slab.
+
+    Parameters
+    ----------
+    volume : Volume
+        Its voxels must not change.
+    device : Device
+    memory : int, optional
+        Bytes that may be taken on the device; None is all that it has.
+    """
+
+    def __init__(self, volume: Volume, device: Device, memory: int | None = None):
+        self.volume = volume
+        self.device = device
+        self.memory = memory
+        self.dtype = volume.voxels.dtype
+        self._whole: RaySlab | None = None
+
+    def close(self) -> None:
+        """Free what is on the device."""
+        self._whole = None
+
+    def program(self, name: str, **variants: str) -> Program:
+        """Build a kernel file for this volume's type of voxels."""
+        uneven = {"UNEVEN": "1"} if self.volume.uneven else {}
+        return load_program(self.device, name, {**ray_variants(self.device, self.dtype), **uneven, **variants})
+
+    def slab_bytes(self, slices: int) -> dict[str, int]:
+        """Bytes of a slab of so many slices on the device."""
+        ni, nj, _ = (max(2, n) for n in self.volume.shape_ijk)
+        bricks = (-(-ni // BRICK_CELLS)) * (-(-nj // BRICK_CELLS)) * (-(-max(2, slices) // BRICK_CELLS))
+        size = self.dtype.itemsize
+        return {"volume": ni * nj * max(2, slices) * size, "bricks": bricks * (2 * size + 3)}
+
+    def plan(self, others: dict[str, int], extra: dict[str, int]) -> int:
+        """Slices a slab, all where everything fits.
+
+        Parameters
+        ----------
+        others, extra : dict of str to int
+            Bytes of what else is on the device, and of what comes with more than one slab.
+
+        Raises
+        ------
+        DeviceError
+            Not even the smallest slab fits.
+        """
+        nk = self.volume.shape_ijk[2]
+        limits = memory_limits(self.device, self.memory)
+        if not describe_shortage(limits, {**self.slab_bytes(nk), **others}):
+            return nk
+        low, high = 0, nk
+        while high - low > 1:
+            slices = (low + high) // 2
+            if describe_shortage(limits, {**self.slab_bytes(slices + 2 * OVERLAP + 1), **others, **extra}):
+                high = slices
+            else:
+                low = slices
+        if low == 0:
+            check_budget(self.device, {**self.slab_bytes(2 * OVERLAP + 2), **others, **extra}, self.memory)
+        return max(low, 1)
+
+    def slabs(self, slices: int, entry_k: float, stopwatch: Stopwatch) -> Iterator[RaySlab]:
+        """The volume in slabs of `slices` slices, from the one that the rays come from on.
+
+        Parameters
+        ----------
+        slices : int
+            As `plan` says.
+        entry_k : float
+            Slice coordinate of the camera: each ray goes away from it, so slabs are taken by their distance from it.
+        """
+        nk = self.volume.shape_ijk[2]
+        if slices >= nk:
+            if self._whole is None:
+                self._whole = self._upload(0, nk, -np.inf, np.inf, stopwatch)
+            yield self._whole
+            return
+        self._whole = None
+        parts = [(first, min(first + slices, nk)) for first in range(0, nk, slices)]
+        parts.sort(key=lambda part: max(part[0] - entry_k, entry_k - part[1], 0.0))
+        for number, (first, end) in enumerate(parts):
+            low, high = (-np.inf if first == 0 else first), (np.inf if end == nk else end)
+            slab = self._upload(max(first - OVERLAP, 0), min(end + OVERLAP + 1, nk), low, high, stopwatch)
+            slab.stage = (number == 0) + 2 * (number == len(parts) - 1)
+            yield slab
+            self.volume.release_slices(first, end)
+
+    def _upload(self, first: int, end: int, low: float, high: float, stopwatch: Stopwatch) -> RaySlab:
+        voxels = _at_least_two(self.volume.voxels[first:end])
+        with stopwatch.timed("upload"):
+            voxels_d = upload(self.device, voxels)
+        nk, nj, ni = voxels.shape
+        return RaySlab(voxels_d, (ni, nj, nk), first, low, high)
+
+    def measure(self, slab: RaySlab, stopwatch: Stopwatch) -> Any:
+        """Lowest and highest value that samples in each brick of a slab can have, (bk, bj, bi, 2), on the device."""
+        if slab.ranges_d is None:
+            bi, bj, bk = slab.bricks
+            slab.ranges_d = allocate(self.device, 2 * bi * bj * bk * self.dtype.itemsize)
+            launch(
+                self.device, self.program("render/occupancy.cl")["measure_cells"], bi * bj * bk,
+                slab.voxels_d, slab.ranges_d, *(np.int32(n) for n in slab.shape_ijk),
+                *(np.uint32(n) for n in (bi, bj, bk)), stopwatch=stopwatch,
+            )  # fmt: skip
+        return slab.ranges_d
+
+    def find_leaps(
+        self, slab: RaySlab, key: Any, shown: NDArray[np.bool_], low: float, scale: float, stopwatch: Stopwatch
+    ) -> LeapMap:
+        """The leap map for values that show, or the one that was made for `key` before.
+
+        Parameters
+        ----------
+        key : hashable
+            What `shown` follows from.
+        shown : ndarray, shape (nodes,), bool
+            Which nodes of a table of values show anything.
+        low, scale : float
+            Nearest node to a value v: ``floor((v - low) * scale + 0.5)``, within the table.
+        """
+        if key in slab.maps:
+            return slab.maps[key]
+        ranges_d = self.measure(slab, stopwatch)
+        device, program = self.device, self.program("render/occupancy.cl")
+        bi, bj, bk = slab.bricks
+        bricks = bi * bj * bk
+        counts_d = upload(device, np.concatenate([[0], np.cumsum(shown)]).astype(np.int32))
+        from_d, to_d = allocate(device, bricks), allocate(device, bricks)
+        launch(
+            device, program["mark_bricks"], bricks,
+            ranges_d, counts_d, from_d, np.float32(low), np.float32(scale), np.int32(len(shown)), np.uint32(bricks),
+            stopwatch=stopwatch,
+        )  # fmt: skip
+        marked = download(device, np.empty((bk, bj, bi), np.uint8), from_d) == 0
+        for count, stride in ((bi, 1), (bj, bi), (bk, bi * bj)):
+            launch(
+                device, program["spread_distances"], bricks,
+                from_d, to_d, np.int32(count), np.int32(stride), np.uint32(bricks), stopwatch=stopwatch,
+            )  # fmt: skip
+            from_d, to_d = to_d, from_d
+        slab.maps.clear()  # one a slab: a map is made in some milliseconds
+        slab.maps[key] = LeapMap(from_d, self._find_box(marked, slab))
+        return slab.maps[key]
+
+    def _find_box(self, marked: NDArray[np.bool_], slab: RaySlab) -> tuple[Float64Array, Float64Array] | None:
+        ends = []
+        for axis in (2, 1, 0):
+            others = tuple(other for other in range(3) if other != axis)
+            where = np.flatnonzero(marked.any(axis=others))
+            if not len(where):
+                return None
+            ends.append((where[0] * BRICK_CELLS, (where[-1] + 1) * BRICK_CELLS))
+        low, high = np.array(ends, dtype=np.float64).T
+        low[2] += slab.first_k
+        high[2] += slab.first_k
+        # Cells at the ends reach to the border of the volume.
+        return low - BOX_BORDER, high + BOX_BORDER

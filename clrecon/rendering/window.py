@@ -1,0 +1,66 @@
+"""Windows: the range of HU that a grey picture runs from black to white over."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clrecon.errors import UsageError
+
+__all__ = ["BONE_WINDOW", "checked_window", "choose_window", "grey_image"]
+
+BONE_WINDOW = (-450.0, 1050.0)
+"""Level 300, width 1500 HU: marrow, cortex and soft tissue apart from each other."""
+
+
+def checked_window(window: Sequence[float]) -> tuple[float, float]:
+    """Low and high end of a window in HU after checking that they are.
+
+    Raises
+    ------
+    UsageError
+        Not two finite numbers, the lower one first.
+    """
+    try:
+        low, high = (float(end) for end in window)
+    except (TypeError, ValueError):
+        low = high = np.nan
+    if not (-np.inf < low < high < np.inf):
+        raise UsageError(f"a window is its lowest and highest HU, such as (-450, 1050), not {window!r}")
+    return low, high
+
+
+def grey_image(values: NDArray[Any], window: Sequence[float]) -> NDArray[np.uint8]:
+    """Grey picture of values.
+
+    Parameters
+    ----------
+    values : ndarray, shape (h, w), float
+        HU, NaN where there is nothing.
+    window : (low, high)
+        HU that are black and white; linear between.
+
+    Returns
+    -------
+    ndarray, shape (h, w, 4), uint8
+        Opacity 255, and 0 where there is nothing.
+    """
+    low, high = checked_window(window)
+    there = ~np.isnan(values)
+    share = np.clip((np.where(there, values, low) - low) / (high - low), 0.0, 1.0)
+    image = np.empty((*values.shape, 4), np.uint8)
+    image[..., :3] = np.rint(255.0 * share).astype(np.uint8)[..., None]
+    image[..., 3] = np.where(there, 255, 0)
+    return image
+
+
+def choose_window(values: NDArray[Any]) -> tuple[float, float]:
+    """A window from the 1st to the 99th percentile of the values that are there, at least 1 HU wide."""
+    there = values[np.isfinite(values)]
+    if not len(there):
+        return BONE_WINDOW
+    low, high = (float(end) for end in np.percentile(there[:: max(1, len(there) // 100_000)], (1.0, 99.0)))
+    return (low, high) if high - low >= 1.0 else (low - 0.5, low + 0.5)
