@@ -19,12 +19,11 @@ typedef struct {
 #define VOXEL_IS_SHORT 0 /* VOXEL is short: two of them are one int */
 #endif
 
-#define VOXEL2 CLRECON_VECTOR(VOXEL, 2)
-#define VOXEL4 CLRECON_VECTOR(VOXEL, 4)
-
-/* Values at offset `at` from `corner` and one further along i.  Two 16-bit voxels come with one load. */
+/* Values at offset `at` from `corner` and one further along i.  Two 16-bit voxels come with one load.  That it is
+ * volatile keeps compilers from making a gather instruction of them, which takes longer. */
 #if LANES == 8 && VOXEL_IS_SHORT
-#define PAIR(corner, at) as_int(vload2(0, (corner) + (at)))
+typedef int pair_of_shorts __attribute__((aligned(2)));
+#define PAIR(corner, at) (*(volatile __global const pair_of_shorts *)((corner) + (at)))
 #define LOAD_PAIRS(corner, at, low, high) \
     { \
         const ints pairs = (ints)(PAIR(corner, (at).s0), PAIR(corner, (at).s1), PAIR(corner, (at).s2), \
@@ -36,8 +35,8 @@ typedef struct {
 #else
 #define LOAD_PAIRS(corner, at, low, high) \
     { \
-        low = (floats)(GATHER(corner, at)); \
-        high = (floats)(GATHER(corner + 1, at)); \
+        low = (floats)(GATHER(VOXEL, corner, at)); \
+        high = (floats)(GATHER(VOXEL, corner + 1, at)); \
     }
 #endif
 
@@ -71,59 +70,79 @@ static inline floats sample_lanes(const field *f, const floats i, const floats j
     return front + part_k * (back - front);
 }
 
-/* Differences per index step, interpolated within the slices below and above a place: central differences of voxels,
- * half a one-sided difference at the border.  Returns the share of the slice above. */
-static inline float find_differences(const field *f, const float3 place, float4 *below, float4 *above)
+/* Differences per index step at LANES places, interpolated within the slices below and above each: central differences
+ * of voxels, half a one-sided difference at the border. */
+typedef struct {
+    floats below_i, below_j, below_k, above_i, above_j, above_k;
+    floats share; /* of the slice above */
+} slopes;
+
+/* A row of four voxels about a cell's edge along i: value and twice the slope. */
+static inline void sample_row(__global const VOXEL *row, const ints at, const ints to_left, const ints to_right,
+    const floats part, floats *value, floats *slope)
 {
-    const float at_i = clamp(place.x, 0.0f, f->last.x), at_j = clamp(place.y, 0.0f, f->last.y);
-    const float at_k = clamp(place.z, 0.0f, f->last.z);
-    const int i = min((int)at_i, f->ni - 2), j = min((int)at_j, f->nj - 2);
-    const int k = clamp((int)at_k, f->first_k, f->end_k - 2);
-    const float part_i = at_i - (float)i, part_j = at_j - (float)j;
+    floats left, low, high, right;
+    LOAD_PAIRS(row, at + to_left, left, low)
+    LOAD_PAIRS(row, at + to_right, high, right)
+    /* At the border both pairs are the edge's own. */
+    const floats first = choose(to_left < 0, low, left), second = choose(to_right > 0, high, right);
+    *value = first + part * (second - first);
+    *slope = (second - left) + part * ((right - first) - (second - left));
+}
+
+static inline floats sample_edge(__global const VOXEL *row, const ints at, const floats part)
+{
+    floats low, high;
+    LOAD_PAIRS(row, at, low, high)
+    return low + part * (high - low);
+}
+
+static inline void find_slopes(const field *f, const floats i, const floats j, const floats k, slopes *s)
+{
+    const floats at_i = min(max(i, (floats)(0.0f)), (floats)(f->last.x));
+    const floats at_j = min(max(j, (floats)(0.0f)), (floats)(f->last.y));
+    const floats at_k = min(max(k, (floats)(0.0f)), (floats)(f->last.z));
+    const ints cell_i = min(to_ints(at_i), (ints)(f->ni - 2));
+    const ints cell_j = min(to_ints(at_j), (ints)(f->nj - 2));
+    const ints cell_k = clamp(to_ints(at_k), (ints)(f->first_k), (ints)(f->end_k - 2));
+    const floats part = at_i - to_floats(cell_i), far = at_j - to_floats(cell_j), near = 1.0f - far;
+    const int base_i = FIRST_LANE(cell_i), base_j = FIRST_LANE(cell_j), base_k = FIRST_LANE(cell_k);
+    __global const VOXEL *corner = f->voxels + voxel_index(base_i, base_j, base_k - f->first_k, f->ni, f->nj);
+    const ints at = ((cell_k - base_k) * f->nj + (cell_j - base_j)) * f->ni + (cell_i - base_i);
     const int row = f->ni, slice = f->ni * f->nj;
-    __global const VOXEL *corner = f->voxels + voxel_index(i, j, k - f->first_k, f->ni, f->nj);
-    /* Rows through the cell with a voxel more at either side, the rows beside them, and the slices under and over. */
-    const int down = j > 0 ? -row : 0, up = j + 2 < f->nj ? 2 * row : row;
-    const int under = k > f->first_k ? -slice : 0, over = k + 2 < f->end_k ? 2 * slice : slice;
-    float4 middle[4];
-    float2 side[4], beyond[4];
-#define ROW2(at) CLRECON_JOIN(convert_float, 2)(vload2(0, corner + (at)))
-    if (i > 0 && i + 2 < f->ni) {
-#define ROW4(at) CLRECON_JOIN(convert_float, 4)(vload4(0, corner + (at) - 1))
-        middle[0] = ROW4(0);
-        middle[1] = ROW4(row);
-        middle[2] = ROW4(slice);
-        middle[3] = ROW4(slice + row);
-#undef ROW4
-    } else {
-        const int left = i > 0 ? -1 : 0, right = i + 2 < f->ni ? 2 : 1;
-#define ROW4(at) (float4)((float)corner[(at) + left], ROW2(at), (float)corner[(at) + right])
-        middle[0] = ROW4(0);
-        middle[1] = ROW4(row);
-        middle[2] = ROW4(slice);
-        middle[3] = ROW4(slice + row);
-#undef ROW4
-    }
-    side[0] = ROW2(down);
-    side[1] = ROW2(up);
-    side[2] = ROW2(slice + down);
-    side[3] = ROW2(slice + up);
-    beyond[0] = ROW2(under);
-    beyond[1] = ROW2(under + row);
-    beyond[2] = ROW2(over);
-    beyond[3] = ROW2(over + row);
-#undef ROW2
-    const float2 near_i = (float2)(1.0f - part_i, part_i);
-    const float near_j = 1.0f - part_j, far_j = part_j;
-    const float4 low = near_j * middle[0] + far_j * middle[1], high = near_j * middle[2] + far_j * middle[3];
-    const float2 low_i = low.zw - low.xy, high_i = high.zw - high.xy;
-    const float2 low_j = near_j * (middle[1].yz - side[0]) + far_j * (side[1] - middle[0].yz);
-    const float2 high_j = near_j * (middle[3].yz - side[2]) + far_j * (side[3] - middle[2].yz);
-    const float2 low_k = high.yz - (near_j * beyond[0] + far_j * beyond[1]);
-    const float2 high_k = near_j * beyond[2] + far_j * beyond[3] - low.yz;
-    *below = 0.5f * (float4)(dot(low_i, near_i), dot(low_j, near_i), dot(low_k, near_i), 0.0f);
-    *above = 0.5f * (float4)(dot(high_i, near_i), dot(high_j, near_i), dot(high_k, near_i), 0.0f);
-    return at_k - (float)k;
+    const ints to_left = choose(cell_i > 0, (ints)(-1), (ints)(0));
+    const ints to_right = choose(cell_i + 2 < f->ni, (ints)(1), (ints)(0));
+    /* Rows beside the cell, and those under and over it: its own at the border. */
+    const ints down = at + choose(cell_j > 0, (ints)(-row), (ints)(0));
+    const ints up = at + choose(cell_j + 2 < f->nj, (ints)(2 * row), (ints)(row));
+    const ints under = at + choose(cell_k > f->first_k, (ints)(-slice), (ints)(0));
+    const ints over = at + choose(cell_k + 2 < f->end_k, (ints)(2 * slice), (ints)(slice));
+    floats value_00, value_10, value_01, value_11, slope_00, slope_10, slope_01, slope_11;
+    sample_row(corner, at, to_left, to_right, part, &value_00, &slope_00);
+    sample_row(corner + row, at, to_left, to_right, part, &value_10, &slope_10);
+    sample_row(corner + slice, at, to_left, to_right, part, &value_01, &slope_01);
+    sample_row(corner + slice + row, at, to_left, to_right, part, &value_11, &slope_11);
+    s->below_i = 0.5f * (near * slope_00 + far * slope_10);
+    s->above_i = 0.5f * (near * slope_01 + far * slope_11);
+    s->below_j = 0.5f
+        * (near * (value_10 - sample_edge(corner, down, part)) + far * (sample_edge(corner, up, part) - value_00));
+    s->above_j = 0.5f
+        * (near * (value_11 - sample_edge(corner + slice, down, part))
+            + far * (sample_edge(corner + slice, up, part) - value_01));
+    const floats low = near * value_00 + far * value_10, high = near * value_01 + far * value_11;
+    s->below_k = 0.5f
+        * (high - near * sample_edge(corner, under, part) - far * sample_edge(corner + row, under, part));
+    s->above_k = 0.5f
+        * (near * sample_edge(corner, over, part) + far * sample_edge(corner + row, over, part) - low);
+    s->share = at_k - to_floats(cell_k);
+}
+
+/* The same as differences at one place. */
+static inline void mix_slopes(const slopes *s, floats *along_i, floats *along_j, floats *along_k)
+{
+    *along_i = s->below_i + s->share * (s->above_i - s->below_i);
+    *along_j = s->below_j + s->share * (s->above_j - s->below_j);
+    *along_k = s->below_k + s->share * (s->above_k - s->below_k);
 }
 
 #endif

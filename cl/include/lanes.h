@@ -19,10 +19,20 @@ typedef int8 ints;
 #define LANE_NUMBERS ((floats)(0.0f, 1.0f, 2.0f, 3.0f, 4.0f, 5.0f, 6.0f, 7.0f))
 #define FIRST_LANE(vector) ((vector).s0)
 #define ANY_LANE(condition) any(condition)
-/* Entries of a table, as the elements of a vector literal. */
-#define GATHER(table, at) \
-    (table)[(at).s0], (table)[(at).s1], (table)[(at).s2], (table)[(at).s3], (table)[(at).s4], (table)[(at).s5], \
-        (table)[(at).s6], (table)[(at).s7]
+#define LEAST_LANE(vector) least_lane(vector)
+static inline float least_lane(const float8 v)
+{
+    const float4 half_way = min(v.lo, v.hi);
+    const float2 quarter = min(half_way.lo, half_way.hi);
+    return min(quarter.x, quarter.y);
+}
+/* Entries of a table, as the elements of a vector literal.  That they are volatile keeps compilers from making a gather
+ * instruction of them, which takes longer than single loads. */
+#define GATHER(type, table, at) \
+    ENTRY(type, table, (at).s0), ENTRY(type, table, (at).s1), ENTRY(type, table, (at).s2), \
+        ENTRY(type, table, (at).s3), ENTRY(type, table, (at).s4), ENTRY(type, table, (at).s5), \
+        ENTRY(type, table, (at).s6), ENTRY(type, table, (at).s7)
+#define ENTRY(type, table, at) (((volatile __global const type *)(table))[at])
 #elif LANES == 1
 typedef float floats;
 typedef int ints;
@@ -33,7 +43,8 @@ typedef int ints;
 #define LANE_NUMBERS 0.0f
 #define FIRST_LANE(vector) (vector)
 #define ANY_LANE(condition) (condition)
-#define GATHER(table, at) (table)[at]
+#define LEAST_LANE(vector) (vector)
+#define GATHER(type, table, at) (table)[at]
 #else
 #error "LANES is 1 or 8"
 #endif

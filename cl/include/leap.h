@@ -3,6 +3,7 @@
 #define CLRECON_LEAP_H
 
 #include "include/lanes.h"
+#include "include/stack.h"
 
 #define BRICK_CELLS 8 /* cells along each side of a brick: it reads 9 x 9 x 9 voxels */
 #define BRICKS_PER_CELL (1.0f / BRICK_CELLS)
@@ -12,35 +13,55 @@ typedef struct {
     int bi, bj, bk;
 } leap_map;
 
-/* LANES rays: place of sample n is start + n * stride, all in indices.  `pace` is 1 / stride, see find_pace(). */
+/* LANES rays: field coordinates of sample n are start + n * stride.  `pace` is samples per index step along each axis;
+ * where slices lie at places of their own, the least that any layer has. */
 typedef struct {
     floats start_i, start_j, start_k, stride_i, stride_j, stride_k, pace_i, pace_j, pace_k;
 } ray_lanes;
 
-/* Samples per index step: large, not infinite, for rays that do not move along an axis. */
-static inline floats find_pace(const floats stride)
+/* Samples per index step: large, not infinite, for rays that do not move along an axis.  With UNEVEN `slope` is the
+ * largest number of index steps along i, j and k that a mm of height makes. */
+static inline void find_pace(ray_lanes *rays, const float4 slope)
 {
-    return 1.0f / choose(fabs(stride) < 1e-9f, (floats)(1e-9f), stride);
+#ifdef UNEVEN
+    const floats rise = fabs(rays->stride_k);
+    rays->pace_i = 1.0f / max(fabs(rays->stride_i) + rise * slope.x, (floats)(1e-9f));
+    rays->pace_j = 1.0f / max(fabs(rays->stride_j) + rise * slope.y, (floats)(1e-9f));
+    rays->pace_k = 1.0f / max(rise * slope.z, (floats)(1e-9f));
+#else
+    rays->pace_i = 1.0f / choose(fabs(rays->stride_i) < 1e-9f, (floats)(1e-9f), rays->stride_i);
+    rays->pace_j = 1.0f / choose(fabs(rays->stride_j) < 1e-9f, (floats)(1e-9f), rays->stride_j);
+    rays->pace_k = 1.0f / choose(fabs(rays->stride_k) < 1e-9f, (floats)(1e-9f), rays->stride_k);
+#endif
 }
 
-/* Steps along one axis to the face of the empty cube around `brick` that the ray runs to. */
+/* Samples along one axis to the face of the empty cube around `brick` that the ray runs to. */
 static inline floats count_to_face(
     const floats place, const floats stride, const floats pace, const ints brick, const ints distance)
 {
+#ifdef UNEVEN
+    const floats low = to_floats((brick - distance + 1) * BRICK_CELLS);
+    const floats high = to_floats((brick + distance) * BRICK_CELLS);
+    return min(place - low, high - place) * pace;
+#else
     const ints face = choose(stride >= 0.0f, brick + distance, brick - distance + 1);
     return (to_floats(face * BRICK_CELLS) - place) * pace;
+#endif
 }
 
-/* Steps from sample n of each ray that end in empty bricks; 0 where its brick shows something. */
-static inline floats count_free_steps(const leap_map *map, const ray_lanes *rays, const floats n)
+/* Samples from number n of each ray on that lie in empty bricks; 0 where its brick shows something. */
+static inline floats count_free_steps(
+    const leap_map *map, const slice_stack *stack, const ray_lanes *rays, const floats n, const int first_k)
 {
-    const floats i = rays->start_i + n * rays->stride_i, j = rays->start_j + n * rays->stride_j;
-    const floats k = rays->start_k + n * rays->stride_k;
+    floats i = rays->start_i + n * rays->stride_i, j = rays->start_j + n * rays->stride_j;
+    floats k = rays->start_k + n * rays->stride_k;
+    to_indices(stack, &i, &j, &k);
+    k -= (float)first_k;
     const ints brick_i = clamp(to_ints(i * BRICKS_PER_CELL), (ints)(0), (ints)(map->bi - 1));
     const ints brick_j = clamp(to_ints(j * BRICKS_PER_CELL), (ints)(0), (ints)(map->bj - 1));
     const ints brick_k = clamp(to_ints(k * BRICKS_PER_CELL), (ints)(0), (ints)(map->bk - 1));
     const ints at = (brick_k * map->bj + brick_j) * map->bi + brick_i;
-    const ints distance = (ints)(GATHER(map->distances, at));
+    const ints distance = (ints)(GATHER(uchar, map->distances, at));
     /* The cube of bricks less than `distance` away is empty. */
     const floats steps = min(min(count_to_face(i, rays->stride_i, rays->pace_i, brick_i, distance),
                                  count_to_face(j, rays->stride_j, rays->pace_j, brick_j, distance)),
@@ -48,7 +69,7 @@ static inline floats count_free_steps(const leap_map *map, const ray_lanes *rays
     return choose(distance > 0, max(ceil(steps), (floats)(1.0f)), (floats)(0.0f));
 }
 
-/* True where the brick of a place shows something. */
+/* True where the brick of a place shows something; k counts from the first slice of the buffer. */
 static inline int is_shown(const leap_map *map, const float i, const float j, const float k)
 {
     const int brick_i = clamp((int)(i * BRICKS_PER_CELL), 0, map->bi - 1);

@@ -1,33 +1,77 @@
-/* Light on a surface (Phong 1975, with Blinn's halfway vector); both sides of it are lit. */
+/* Light on surfaces (Phong 1975, with Blinn's halfway vector); both sides of them are lit. */
 #ifndef CLRECON_PHONG_H
 #define CLRECON_PHONG_H
 
+#include "include/field.h"
+#include "include/stack.h"
 #include "include/view.h"
 
 #define HIGHLIGHTS 1024 /* entries of a table of specular * cosine ^ power: library powers take 0.2 us on CPU drivers */
 
-/* `color` of a surface with LPS gradient `gradient`, seen along unit vector `direction`; places without a gradient
- * keep ambient and diffuse light. */
-static inline float3 shade(__global const float4 *restrict view, __global const float *restrict highlights,
-    const float3 color, const float3 gradient, const float3 direction)
+/* LPS gradients per mm of LANES places with index coordinate k. */
+static inline void find_gradients(__global const float4 *restrict view, const slice_stack *stack, const slopes *s,
+    const floats k, floats *x, floats *y, floats *z)
 {
-    const float4 phong = view[VIEW_PHONG];
-    const float size = dot(gradient, gradient);
-    if (size < 1e-12f)
-        return min(color * (phong.x + phong.y), 1.0f);
-    const float4 fixed_light = view[VIEW_LIGHT];
-    const float3 normal = gradient * (1.0f / sqrt(size));
-    const float3 light = fixed_light.w > 0.0f ? fixed_light.xyz : -direction;
-    float highlight_angle = fabs(dot(normal, light));
-    const float diffuse = phong.y * highlight_angle;
-    if (fixed_light.w > 0.0f) {
-        const float3 middle = light - direction;
-        highlight_angle = fabs(dot(normal, middle)) / sqrt(max(dot(middle, middle), 1e-12f));
+#ifdef UNEVEN
+    float part[7][LANES], lane_k[LANES], gradient[3][LANES];
+    store_lanes(s->below_i, part[0]);
+    store_lanes(s->below_j, part[1]);
+    store_lanes(s->below_k, part[2]);
+    store_lanes(s->above_i, part[3]);
+    store_lanes(s->above_j, part[4]);
+    store_lanes(s->above_k, part[5]);
+    store_lanes(s->share, part[6]);
+    store_lanes(k, lane_k);
+    for (int lane = 0; lane < LANES; ++lane) {
+        /* Each slice has a matrix of its own. */
+        const int layer = clamp((int)lane_k[lane], 0, stack->nk - 2);
+        const float4 below = (float4)(part[0][lane], part[1][lane], part[2][lane], 0.0f);
+        const float4 above = (float4)(part[3][lane], part[4][lane], part[5][lane], 0.0f);
+        __global const float4 *low = stack->slices + 4 * layer + 1, *high = low + 4;
+        for (int axis = 0; axis < 3; ++axis) {
+            const float from = dot(low[axis], below), to = dot(high[axis], above);
+            gradient[axis][lane] = from + part[6][lane] * (to - from);
+        }
     }
-    const float entry = min(highlight_angle, 1.0f) * (HIGHLIGHTS - 1);
-    const int at = min((int)entry, HIGHLIGHTS - 2);
-    const float highlight = highlights[at] + (entry - (float)at) * (highlights[at + 1] - highlights[at]);
-    return min(color * (phong.x + diffuse) + highlight, 1.0f);
+    *x = load_lanes(gradient[0]);
+    *y = load_lanes(gradient[1]);
+    *z = load_lanes(gradient[2]);
+#else
+    floats i, j, k_step;
+    mix_slopes(s, &i, &j, &k_step);
+    const float4 row_x = view[VIEW_NORMAL_X], row_y = view[VIEW_NORMAL_Y], row_z = view[VIEW_NORMAL_Z];
+    *x = row_x.x * i + row_x.y * j + row_x.z * k_step;
+    *y = row_y.x * i + row_y.y * j + row_y.z * k_step;
+    *z = row_z.x * i + row_z.y * j + row_z.z * k_step;
+#endif
+}
+
+/* Light on LANES places with LPS gradients (x, y, z), seen along unit vectors: a place takes `share` of its own colour
+ * and `highlight` of white.  Without a gradient it keeps ambient and diffuse light. */
+static inline void find_light(__global const float4 *restrict view, __global const float *restrict highlights,
+    const floats x, const floats y, const floats z, const floats direction_x, const floats direction_y,
+    const floats direction_z, floats *share, floats *highlight)
+{
+    const float4 phong = view[VIEW_PHONG], fixed_light = view[VIEW_LIGHT];
+    const floats size = x * x + y * y + z * z;
+    const ints flat = size < 1e-12f;
+    const floats per_size = 1.0f / sqrt(max(size, (floats)(1e-12f)));
+    floats cosine, middle;
+    if (fixed_light.w > 0.0f) {
+        cosine = fabs(x * fixed_light.x + y * fixed_light.y + z * fixed_light.z) * per_size;
+        const floats half_x = fixed_light.x - direction_x, half_y = fixed_light.y - direction_y;
+        const floats half_z = fixed_light.z - direction_z;
+        const floats length_squared = max(half_x * half_x + half_y * half_y + half_z * half_z, (floats)(1e-12f));
+        middle = fabs(x * half_x + y * half_y + z * half_z) * per_size / sqrt(length_squared);
+    } else {
+        cosine = fabs(x * direction_x + y * direction_y + z * direction_z) * per_size;
+        middle = cosine;
+    }
+    const floats entry = min(middle, (floats)(1.0f)) * (HIGHLIGHTS - 1);
+    const ints at = min(to_ints(entry), (ints)(HIGHLIGHTS - 2));
+    const floats low = (floats)(GATHER(float, highlights, at)), high = (floats)(GATHER(float, highlights + 1, at));
+    *share = phong.x + choose(flat, (floats)(phong.y), phong.y * cosine);
+    *highlight = choose(flat, (floats)(0.0f), low + (entry - to_floats(at)) * (high - low));
 }
 
 #endif

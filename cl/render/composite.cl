@@ -4,226 +4,263 @@
  * models for direct volume rendering" (opacity of a segment).  Empty space is leapt over with a map of Chebyshev
  * distances (Cohen and Sheffer 1994, "Proximity clouds").
  *
- * A work-item has LANES neighbouring rays.  They leap together, as a leap is a chain of dependent steps that would
- * leave a CPU waiting; where something shows, each goes on alone and takes LANES samples along its way at a time: no
- * ray then waits for another, and only samples that show are shaded.
+ * A work-item has a packet of LANES neighbouring rays that go on together, sample by sample: they leap as far as all of
+ * them may, and what they do next is decided once for all of them.
  *
- * -D UNEVEN   slices at places of their own */
+ * -D UNEVEN             slices at places of their own
+ * -D GRADIENT_OPACITY   opacity times a function of the gradient's magnitude */
 #include "include/field.h"
 #include "include/jitter.h"
 #include "include/leap.h"
 #include "include/phong.h"
+#include "include/stack.h"
 #include "include/view.h"
 
 #define NODES 4096 /* of the transfer function's table */
+#define GRADIENT_NODES 256 /* of the table of factors by magnitude */
 #define OPAQUE 0.99f /* nothing behind can be seen */
 #define FIRST_SEEN (1.0f / 255.0f) /* opacity that makes a first hit */
+#define SAMPLES_A_LOOK 8 /* samples until a packet looks for empty space again */
 
-/* What a ray has seen so far. */
+/* What rays have seen so far: premultiplied colour, t of the first hit (negative before), sum of t, weighted. */
 typedef struct {
-    float4 color; /* premultiplied */
-    float first_hit, sum; /* t of the first hit, negative before; sum of t, weighted */
-} sight;
+    floats red, green, blue, opacity, first_hit, sum;
+} sights;
 
-/* A ray in samples: sample n lies at start + n * stride, at t = t_in + (n + phase) * ray_step. */
+/* Rays in samples: number n is at t = t_in + (n + phase) * ray_step, the last in the middle of what is left. */
 typedef struct {
-    float4 start, stride;
-    float3 direction;
-    float t_in, phase, offset, rest; /* rest: length of the last segment */
-    int end, segments;
-} sampled_ray;
+    floats t_in, phase, offset, last, rest; /* last: number of the last sample; rest: length of its segment */
+    floats begin, end; /* samples that can show */
+    floats toward_x, toward_y, toward_z; /* unit direction, LPS */
+} packet;
 
 /* Transfer function and light. */
 typedef struct {
-    __global const float4 *colors; /* rgb; w: log2(1 - opacity) over one ray step */
+    __global const int *colors; /* blue, green, red, 10 bits each */
     __global const float *opacities; /* over one ray step */
     __global const float *highlights;
+    __global const float *factors; /* on the opacity, by magnitude of the gradient */
     __global const float4 *view;
     float low, scale; /* nearest node to a value v: (v - low) * scale + 0.5 */
+    float factor_scale; /* nearest node to a magnitude m: m * factor_scale + 0.5 */
+    float steps_per_unit; /* ray steps in the unit distance */
     float ray_step;
     float slab_low, slab_high; /* samples with slab_low <= k < slab_high are this slab's */
     int shaded;
 } looks;
 
-static inline void add_sample(
-    const field *f, const looks *look, const sampled_ray *r, const int n, const int node, const float opacity, sight *seen)
+#ifdef GRADIENT_OPACITY
+#define IS_WEIGHED 1
+#else
+#define IS_WEIGHED 0
+#endif
+
+/* Opacity over `times` as many steps; libraries' logarithms are slow on CPUs, so only where it is needed. */
+static inline floats stretch_opacity(const floats opacity, const floats times)
 {
-    const float4 color = look->colors[node];
-    float a = opacity, t = r->t_in + ((float)n + r->phase) * look->ray_step;
-    float4 at = r->start + (float)n * r->stride;
-    if (n == r->segments - 1) { /* what is left of the way is less than a step */
-        a = 1.0f - exp2(color.w * (r->rest / look->ray_step));
-        t = r->t_in + (float)n * look->ray_step + r->phase * r->rest;
-    }
-    float3 rgb = color.xyz;
-    if (look->shaded) {
-        float4 below, above;
-        const float share = find_differences(f, at.xyz, &below, &above);
-        const float4 step = below + share * (above - below);
-        const float3 gradient = (float3)(dot(look->view[VIEW_NORMAL_X], step), dot(look->view[VIEW_NORMAL_Y], step),
-            dot(look->view[VIEW_NORMAL_Z], step));
-        rgb = shade(look->view, look->highlights, rgb, gradient, r->direction);
-    }
-    const float weight = (1.0f - seen->color.w) * a;
-    seen->color.xyz += weight * rgb;
-    seen->color.w += weight;
-    seen->sum += weight * t;
-    if (seen->first_hit < 0.0f && seen->color.w > FIRST_SEEN)
-        seen->first_hit = t;
+    return 1.0f - exp2(log2(max(1.0f - opacity, (floats)(1e-30f))) * times);
 }
 
-/* Follow a ray from sample n until its brick is empty, it ends or nothing behind can be seen. */
-static inline int follow_ray(
-    const field *f, const leap_map *map, const looks *look, const sampled_ray *r, int n, sight *seen)
+/* Blend sample n of every ray that it shows of. */
+static inline void blend_samples(const field *f, const slice_stack *stack, const looks *look, const packet *rays,
+    const float n, const floats i, const floats j, const floats k, const ints node, floats opacity, sights *seen)
 {
-    const float4 start = r->start, stride = r->stride;
-    do {
-        const floats number = (float)n + LANE_NUMBERS;
-        const floats k = start.z + number * stride.z;
-        const floats value = sample_lanes(f, start.x + number * stride.x, start.y + number * stride.y, k);
-        const floats place = (value - look->low) * look->scale + 0.5f;
-        const ints node = to_ints(min(max(place, (floats)(0.0f)), (floats)(NODES - 1)));
-        const floats found = (floats)(GATHER(look->opacities, node));
-        const floats opacity = choose((k >= look->slab_low) & (k < look->slab_high), found, (floats)(0.0f));
-        if (ANY_LANE(opacity > 0.0f)) {
-            float lane_opacity[LANES];
-            int lane_node[LANES];
-            store_lanes(opacity, lane_opacity);
-            store_lanes(node, lane_node);
-            for (int lane = 0; lane < LANES && n + lane < r->end; ++lane)
-                if (lane_opacity[lane] > 0.0f) {
-                    add_sample(f, look, r, n + lane, lane_node[lane], lane_opacity[lane], seen);
-                    if (seen->color.w >= OPAQUE)
-                        return r->end;
-                }
-        }
-        n += LANES;
-    } while (n < r->end
-             && is_shown(map, start.x + (float)n * stride.x, start.y + (float)n * stride.y, start.z + (float)n * stride.z - (float)f->first_k));
-    return n;
+    floats share = 1.0f, highlight = 0.0f;
+    if (look->shaded || IS_WEIGHED) {
+        slopes s;
+        find_slopes(f, i, j, k, &s);
+        floats x, y, z;
+        find_gradients(look->view, stack, &s, k, &x, &y, &z);
+#if IS_WEIGHED
+        const floats entry = sqrt(x * x + y * y + z * z) * look->factor_scale + 0.5f;
+        const ints at = to_ints(min(entry, (floats)(GRADIENT_NODES - 1)));
+        const floats factor = (floats)(GATHER(float, look->factors, at));
+        /* The factor is on the opacity of the unit distance. */
+        const floats whole = stretch_opacity(opacity, (floats)(look->steps_per_unit));
+        const floats weighed = stretch_opacity(factor * whole, (floats)(1.0f / look->steps_per_unit));
+        opacity = choose(opacity > 0.0f, weighed, opacity);
+#endif
+        if (look->shaded)
+            find_light(look->view, look->highlights, x, y, z, rays->toward_x, rays->toward_y, rays->toward_z, &share,
+                &highlight);
+    }
+    floats t = rays->t_in + (n + rays->phase) * look->ray_step;
+    const ints cut = (rays->last == n) & (opacity > 0.0f);
+    if (ANY_LANE(cut)) {
+        opacity = choose(cut, stretch_opacity(opacity, rays->rest / look->ray_step), opacity);
+        t = choose(cut, rays->t_in + n * look->ray_step + rays->phase * rays->rest, t);
+    }
+    const ints color = (ints)(GATHER(int, look->colors, node));
+    const floats weight = (1.0f - seen->opacity) * opacity;
+    const floats unit = 1.0f / 1023.0f;
+    seen->red += weight * min(to_floats(color >> 20) * unit * share + highlight, (floats)(1.0f));
+    seen->green += weight * min(to_floats((color >> 10) & 1023) * unit * share + highlight, (floats)(1.0f));
+    seen->blue += weight * min(to_floats(color & 1023) * unit * share + highlight, (floats)(1.0f));
+    seen->opacity += weight;
+    seen->sum += weight * t;
+    seen->first_hit = choose((seen->first_hit < 0.0f) & (seen->opacity > FIRST_SEEN), t, seen->first_hit);
 }
 
 /* Parameters  voxels   in   (slices, nj, ni)
  *             leaps    in   (bk, bj, bi) Chebyshev distance in bricks to what shows, 0: shows
- *             colors   in   (NODES) see looks
- *             opacities in  (NODES)
+ *             colors opacities factors  in  (NODES), (NODES), (GRADIENT_NODES) see looks
  *             highlights in (HIGHLIGHTS) see include/phong.h
  *             view     in   see include/view.h
  *             states   in/out  (height, width, 2) float4: premultiplied rgba; t of the first hit, sum of w t, -, -
  *             image    out  (height, width) rgba
  *             depths means  out  (height, width) first hit and expected depth, mm; NaN where nothing is hit
  *             background    rgb, and 1 where it fills what the rays leave
- *             last_place    indices of the volume's last voxel centres
+ *             last_place    indices of the volume's last voxel centres;  slope: see find_pace()
  *             ni nj    of the buffer; first_k end_k: slices in the buffer; slab_low slab_high: samples with
  *                      slab_low <= k < slab_high are this slab's
  *             bi bj bk bricks
- *             low scale     nearest node to a value
+ *             low scale factor_scale steps_per_unit  see looks
  *             jitter   samples at random places of their segments
  *             stage    FIRST_SLAB and LAST_SLAB, see include/view.h
+ *             with UNEVEN the table of slices, see include/stack.h
  * Launch      global = tiles * 64 / LANES rounded up by the host, any local
- * Guarantees  every pixel of image and depths is written with the last slab */
+ * Guarantees  every pixel of image, depths and means is written with the last slab */
 __kernel void composite_rays(
     __global const VOXEL *restrict voxels, __global const uchar *restrict leaps,
-    __global const float4 *restrict colors, __global const float *restrict opacities,
-    __global const float *restrict highlights, __global const float4 *restrict view, __global float4 *restrict states,
-    __global uchar4 *restrict image, __global float *restrict depths, __global float *restrict means,
-    const float4 background, const float4 last_place, const int ni, const int nj, const int first_k, const int end_k,
-    const float slab_low, const float slab_high, const int bi, const int bj, const int bk, const float low,
-    const float scale, const uint width, const uint height, const uint planes, const int perspective, const int shaded,
-    const int jitter, const int stage, const uint queues)
+    __global const int *restrict colors, __global const float *restrict opacities,
+    __global const float *restrict factors, __global const float *restrict highlights,
+    __global const float4 *restrict view, __global float4 *restrict states, __global uchar4 *restrict image,
+    __global float *restrict depths, __global float *restrict means, const float4 background, const float4 last_place,
+    const float4 slope, const int ni, const int nj, const int first_k, const int end_k, const float slab_low,
+    const float slab_high, const int bi, const int bj, const int bk, const float low, const float scale,
+    const float factor_scale, const float steps_per_unit, const uint width, const uint height, const uint planes,
+    const int perspective, const int shaded, const int jitter, const int stage, const uint queues STACK_PARAMETERS)
 {
     const uint first_pixel = (uint)get_global_id(0) * LANES;
     const field f = { voxels, ni, nj, first_k, end_k, last_place };
     const leap_map map = { leaps, bi, bj, bk };
-    looks look = { colors, opacities, highlights, view, low, scale, view[VIEW_NEAR].y, slab_low, slab_high,
-        shaded };
+    const slice_stack stack = STACK_TABLE;
+    const float ray_step = view[VIEW_NEAR].y;
+    const looks look = { colors, opacities, highlights, factors, view, low, scale, factor_scale, steps_per_unit,
+        ray_step, slab_low, slab_high, shaded };
 
-    sampled_ray rays[LANES];
-    float starts[6][LANES], numbers[LANES], ends[LANES];
-    sight sights[LANES];
-    for (int lane = 0; lane < LANES; ++lane) {
-        const int2 pixel = find_pixel(first_pixel + lane, width, height, queues);
-        sampled_ray *r = rays + lane;
-        r->end = 0;
-        numbers[lane] = 0.0f;
-        r->start = r->stride = (float4)(0.0f);
-        sights[lane].color = (float4)(0.0f);
-        sights[lane].first_hit = -1.0f;
-        sights[lane].sum = 0.0f;
-        if (pixel.x < (int)width && pixel.y < (int)height) {
+    ray_lanes course;
+    packet rays;
+    sights seen;
+    seen.red = seen.green = seen.blue = seen.opacity = seen.sum = 0.0f;
+    seen.first_hit = -1.0f;
+    {
+        float lane_of[17][LANES];
+        float state_of[6][LANES];
+        for (int lane = 0; lane < LANES; ++lane) {
+            const int2 pixel = find_pixel(first_pixel + lane, width, height, queues);
+            const int inside = pixel.x < (int)width && pixel.y < (int)height;
             ray way;
             start_ray(view, pixel, planes, perspective, &way);
             const float phase = jitter ? jitter_pixel((uint)pixel.x, (uint)pixel.y) : 0.5f;
-            r->phase = phase;
             const float span = way.t_out - way.t_in;
-            r->segments = span > 0.0f ? (int)ceil(span / look.ray_step) : 0;
-            r->rest = span - (float)(r->segments - 1) * look.ray_step;
-            r->t_in = way.t_in;
-            r->offset = way.offset;
-            r->direction = way.direction;
-            r->stride = look.ray_step * way.step;
-            r->start = way.origin + (way.t_in + phase * look.ray_step) * way.step;
-            if (!(stage & FIRST_SLAB)) {
+            const int segments = span > 0.0f ? (int)ceil(span / ray_step) : 0;
+            const int some = inside && segments > 0 && way.focus_out > way.focus_in;
+            const float4 start = way.origin + (way.t_in + phase * ray_step) * way.step;
+            lane_of[0][lane] = start.x;
+            lane_of[1][lane] = start.y;
+            lane_of[2][lane] = start.z;
+            lane_of[3][lane] = ray_step * way.step.x;
+            lane_of[4][lane] = ray_step * way.step.y;
+            lane_of[5][lane] = ray_step * way.step.z;
+            lane_of[6][lane] = way.t_in;
+            lane_of[7][lane] = phase;
+            lane_of[8][lane] = way.offset;
+            lane_of[9][lane] = (float)(segments - 1);
+            lane_of[10][lane] = span - (float)(segments - 1) * ray_step;
+            lane_of[11][lane] = some ? max(floor((way.focus_in - way.t_in) / ray_step - phase), 0.0f) : MAXFLOAT;
+            lane_of[12][lane] = some
+                ? min(ceil((way.focus_out - way.t_in) / ray_step - phase) + 1.0f, (float)segments) : 0.0f;
+            lane_of[13][lane] = way.direction.x;
+            lane_of[14][lane] = way.direction.y;
+            lane_of[15][lane] = way.direction.z;
+            if (!(stage & FIRST_SLAB) && inside) {
                 const size_t place = (size_t)pixel.y * width + (size_t)pixel.x;
-                sights[lane].color = states[2 * place];
-                sights[lane].first_hit = states[2 * place + 1].x;
-                sights[lane].sum = states[2 * place + 1].y;
-            }
-            if (r->segments > 0 && sights[lane].color.w < OPAQUE && way.focus_out > way.focus_in) {
-                const float first = (way.focus_in - way.t_in) / look.ray_step - phase;
-                const float past = (way.focus_out - way.t_in) / look.ray_step - phase;
-                numbers[lane] = max(floor(first), 0.0f);
-                r->end = min((int)ceil(past) + 1, r->segments);
+                const float4 color = states[2 * place], rest = states[2 * place + 1];
+                state_of[0][lane] = color.x;
+                state_of[1][lane] = color.y;
+                state_of[2][lane] = color.z;
+                state_of[3][lane] = color.w;
+                state_of[4][lane] = rest.x;
+                state_of[5][lane] = rest.y;
             }
         }
-        starts[0][lane] = r->start.x;
-        starts[1][lane] = r->start.y;
-        starts[2][lane] = r->start.z;
-        starts[3][lane] = r->stride.x;
-        starts[4][lane] = r->stride.y;
-        starts[5][lane] = r->stride.z;
-        ends[lane] = (float)r->end;
+        course.start_i = load_lanes(lane_of[0]);
+        course.start_j = load_lanes(lane_of[1]);
+        course.start_k = load_lanes(lane_of[2]);
+        course.stride_i = load_lanes(lane_of[3]);
+        course.stride_j = load_lanes(lane_of[4]);
+        course.stride_k = load_lanes(lane_of[5]);
+        find_pace(&course, slope);
+        rays.t_in = load_lanes(lane_of[6]);
+        rays.phase = load_lanes(lane_of[7]);
+        rays.offset = load_lanes(lane_of[8]);
+        rays.last = load_lanes(lane_of[9]);
+        rays.rest = load_lanes(lane_of[10]);
+        rays.begin = load_lanes(lane_of[11]);
+        rays.end = load_lanes(lane_of[12]);
+        rays.toward_x = load_lanes(lane_of[13]);
+        rays.toward_y = load_lanes(lane_of[14]);
+        rays.toward_z = load_lanes(lane_of[15]);
+        if (!(stage & FIRST_SLAB)) {
+            seen.red = load_lanes(state_of[0]);
+            seen.green = load_lanes(state_of[1]);
+            seen.blue = load_lanes(state_of[2]);
+            seen.opacity = load_lanes(state_of[3]);
+            seen.first_hit = load_lanes(state_of[4]);
+            seen.sum = load_lanes(state_of[5]);
+        }
     }
-    ray_lanes together;
-    together.start_i = load_lanes(starts[0]);
-    together.start_j = load_lanes(starts[1]);
-    together.start_k = load_lanes(starts[2]) - (float)first_k;
-    together.stride_i = load_lanes(starts[3]);
-    together.stride_j = load_lanes(starts[4]);
-    together.stride_k = load_lanes(starts[5]);
-    together.pace_i = find_pace(together.stride_i);
-    together.pace_j = find_pace(together.stride_j);
-    together.pace_k = find_pace(together.stride_k);
-    const floats end = load_lanes(ends);
-    floats n = load_lanes(numbers);
+    float n = LEAST_LANE(rays.begin);
+    floats end = choose(seen.opacity < OPAQUE, rays.end, (floats)(0.0f));
     while (ANY_LANE(n < end)) {
-        for (;;) {
-            const floats free = count_free_steps(&map, &together, n);
-            const ints leaping = (free > 0.0f) & (n < end);
-            if (!ANY_LANE(leaping))
-                break;
-            n = choose(leaping, n + free, n);
+        const floats all_free = count_free_steps(&map, &stack, &course, (floats)(n), first_k);
+        const float free = LEAST_LANE(choose(n < end, max(all_free, rays.begin - n), (floats)(MAXFLOAT)));
+        if (free > 0.0f) {
+            n += free;
+            continue;
         }
-        store_lanes(n, numbers);
-        for (int lane = 0; lane < LANES; ++lane)
-            if (numbers[lane] < ends[lane])
-                numbers[lane] = (float)follow_ray(&f, &map, &look, rays + lane, (int)numbers[lane], sights + lane);
-        n = load_lanes(numbers);
+        for (int sample = 0; sample < SAMPLES_A_LOOK; ++sample, n += 1.0f) {
+            floats i = course.start_i + n * course.stride_i, j = course.start_j + n * course.stride_j;
+            floats k = course.start_k + n * course.stride_k;
+            to_indices(&stack, &i, &j, &k);
+            const floats value = sample_lanes(&f, i, j, k);
+            const floats place = (value - look.low) * look.scale + 0.5f;
+            const ints node = to_ints(min(max(place, (floats)(0.0f)), (floats)(NODES - 1)));
+            const floats found = (floats)(GATHER(float, look.opacities, node));
+            ints counts = (k >= look.slab_low) & (k < look.slab_high) & (n >= rays.begin) & (n < end);
+#ifdef UNEVEN
+            counts &= (i >= -0.5f) & (i <= f.last.x + 0.5f) & (j >= -0.5f) & (j <= f.last.y + 0.5f);
+#endif
+            const floats opacity = choose(counts, found, (floats)(0.0f));
+            if (ANY_LANE(opacity > 0.0f)) {
+                blend_samples(&f, &stack, &look, &rays, n, i, j, k, node, opacity, &seen);
+                end = choose(seen.opacity < OPAQUE, end, (floats)(0.0f));
+            }
+        }
     }
+    float out_of[6][LANES], offset_of[LANES];
+    store_lanes(seen.red, out_of[0]);
+    store_lanes(seen.green, out_of[1]);
+    store_lanes(seen.blue, out_of[2]);
+    store_lanes(seen.opacity, out_of[3]);
+    store_lanes(seen.first_hit, out_of[4]);
+    store_lanes(seen.sum, out_of[5]);
+    store_lanes(rays.offset, offset_of);
     for (int lane = 0; lane < LANES; ++lane) {
         const int2 pixel = find_pixel(first_pixel + lane, width, height, queues);
         if (pixel.x >= (int)width || pixel.y >= (int)height)
             continue;
         const size_t place = (size_t)pixel.y * width + (size_t)pixel.x;
-        const sight *seen = sights + lane;
-        const float4 color = seen->color;
+        const float4 color = (float4)(out_of[0][lane], out_of[1][lane], out_of[2][lane], out_of[3][lane]);
+        const float first_hit = out_of[4][lane], sum = out_of[5][lane];
         if (!(stage & LAST_SLAB)) {
             states[2 * place] = color;
-            states[2 * place + 1] = (float4)(seen->first_hit, seen->sum, 0.0f, 0.0f);
+            states[2 * place + 1] = (float4)(first_hit, sum, 0.0f, 0.0f);
             continue;
         }
         image[place] = finish_color(color, background);
-        depths[place] = seen->first_hit < 0.0f ? NAN : seen->first_hit + rays[lane].offset;
-        means[place] = seen->first_hit < 0.0f ? NAN : seen->sum / color.w + rays[lane].offset;
+        depths[place] = first_hit < 0.0f ? NAN : first_hit + offset_of[lane];
+        means[place] = first_hit < 0.0f ? NAN : sum / color.w + offset_of[lane];
     }
 }

@@ -20,6 +20,9 @@ __all__ = ["NODES", "TransferTables", "composite_slab"]
 NODES = 4096
 """Entries of a transfer function's table, as in cl/render/composite.cl."""
 
+GRADIENT_NODES = 256
+"""Entries of its table of factors by magnitude of the gradient."""
+
 LOWEST_LOG = -1000.0
 """log2 of what an opaque sample lets through: 0 in float32, and no infinity that a length of 0 would make NaN."""
 
@@ -30,8 +33,8 @@ class TransferTables:
 
     Attributes
     ----------
-    colors_d : buffer, (NODES, 4) float32
-        Red, green, blue, and log2 of what a sample lets through.
+    colors_d : buffer, (NODES,) int32
+        Red, green and blue, 10 bits each.
     opacities_d : buffer, (NODES,) float32
         Over one ray step.
     shown : ndarray, shape (NODES,), bool
@@ -41,9 +44,12 @@ class TransferTables:
 
     colors_d: Any
     opacities_d: Any
+    factors_d: Any
     shown: NDArray[np.bool_]
     low: float
     scale: float
+    factor_scale: float
+    steps_per_unit: float
 
     @classmethod
     def of(cls, device: Device, function: TransferFunction, ray_step: float) -> TransferTables:
@@ -53,11 +59,19 @@ class TransferTables:
         with np.errstate(divide="ignore"):
             let_through = np.log2(1.0 - table[:, 3].astype(np.float64)) * (ray_step / function.unit_distance)
         let_through = np.maximum(let_through, LOWEST_LOG)
-        colors = table.copy()
-        colors[:, 3] = let_through
+        red, green, blue = np.rint(1023.0 * table[:, :3].T).astype(np.int32)
+        colors = red << 20 | green << 10 | blue
         opacities = (-np.expm1(let_through * np.log(2.0))).astype(np.float32)
         shown = opacities > 0.0
-        return cls(upload(device, colors), upload(device, opacities), shown, low, (NODES - 1) / (high - low))
+        factors = np.ones(GRADIENT_NODES, np.float32)
+        top = 1.0
+        if function.gradient_opacity is not None:
+            top = max(float(function.gradient_opacity[-1, 0]), 1.0)
+            factors = function.gradient_table(top, GRADIENT_NODES)
+        return cls(
+            upload(device, colors), upload(device, opacities), upload(device, factors), shown, low,
+            (NODES - 1) / (high - low), (GRADIENT_NODES - 1) / top, function.unit_distance / ray_step,
+        )  # fmt: skip
 
 
 def composite_slab(
@@ -89,12 +103,13 @@ def composite_slab(
     last = np.array([n - 1 for n in resident.volume.shape_ijk] + [0], dtype=np.float32)
     launch(
         device, resident.program("render/composite.cl")["composite_rays"], output.items(queues, lanes),
-        slab.voxels_d, leaps.distances_d, tables.colors_d, tables.opacities_d,
+        slab.voxels_d, leaps.distances_d, tables.colors_d, tables.opacities_d, tables.factors_d,
         upload(device, highlight_table(lighting)), upload(device, view.table), output.states_d, output.image_d,
-        output.depths_d, output.means_d, output.background, last,
+        output.depths_d, output.means_d, output.background, last, np.zeros(4, np.float32),
         np.int32(slab.shape_ijk[0]), np.int32(slab.shape_ijk[1]), np.int32(slab.first_k), np.int32(slab.end_k),
         np.float32(slab.low_k), np.float32(slab.high_k), *(np.int32(n) for n in slab.bricks),
-        np.float32(tables.low), np.float32(tables.scale), np.uint32(width), np.uint32(height),
+        np.float32(tables.low), np.float32(tables.scale), np.float32(tables.factor_scale),
+        np.float32(tables.steps_per_unit), np.uint32(width), np.uint32(height),
         np.uint32(view.planes), np.int32(not view.camera.is_parallel), np.int32(lighting.shades), np.int32(jitter),
         np.int32(slab.stage), np.uint32(queues), stopwatch=stopwatch,
     )  # fmt: skip
