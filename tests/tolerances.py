@@ -107,3 +107,7 @@ FLOAT64_SHARE = 1e-12  # colours, opacities and unit vectors of order 1 in float
 STEP_SIDE = 1e-6  # opacities of order 1: rounded to float32, or 0.0001 HU beside a step of 200 HU
 BENT_WAY = 0.003  # 32 straight parts in place of VTK's bent way between two nodes: measured 0.0017
 COLOR_SPACE_WAY = 0.006  # 64 straight parts of RGB in place of a way through HSV or Lab: measured 0.005
+# --- slices and curved reformations ---
+TWIN_SLICE_HU = 1e-4  # float32 interpolation of values up to 100 HU and sums of 20 of them; measured 1e-5
+SLICE_LINEAR_FIELD_HU = 2e-5 * 50.0  # voxels of up to 50 HU, rounded to float32 before and after interpolation
+SLAB_MEAN_HU = 1e-4  # sums of 20 values up to 100 HU in float32
