@@ -1,4 +1,4 @@
-"""Slices and curved reformations: voxels unchanged, analytic fields, numpy's slabs, the twin, slabs of large volumes."""
+"""Slices: voxels unchanged, analytic fields, numpy's slabs, the twin, slabs of large volumes."""
 
 from __future__ import annotations
 
