@@ -118,3 +118,7 @@ ISOMETRY = 1e-4  # chords of pixels on a cylinder of 20 mm against arcs, and row
 SPLINE_CURVATURE = 0.03  # second derivatives of a spline are of second order; measured 0.02 where it begins
 TUBE_EDGE_MM = 0.05  # distance field of a tube of 7 mm in voxels of 0.7 to 1.2 mm: h^2 / 8 r, and pixels of 0.5 mm
 TUBE_ARC = 1e-3  # the bar on arc lengths in a picture
+CANAL_MEAN_MM = 1.5  # canal of the spine phantom, 20 mm wide, on cells of 2.5 x 2.5 x 4 mm; measured 0.8 to 1.1
+CANAL_MAX_MM = 3.5  # measured 1.3 to 2.7, at the ends
+REAL_CANAL_MEAN_MM = 2.5  # cord and canal of labels drawn by a network; measured 1.0 and 1.8
+REAL_CANAL_MAX_MM = 4.0  # measured 1.6 and 2.7

@@ -15,6 +15,7 @@ from clrecon.geometry.camera import Camera
 from clrecon.geometry.curved_sheets import CurvedSheet, straightened_sheet, stretched_length, stretched_sheet
 from clrecon.geometry.curves import Curve
 from clrecon.geometry.sheets import Sheet, find_plane, finest_step, plane_sheet, positive_mm, slab_samples
+from clrecon.geometry.spine_line import find_spine_line
 from clrecon.geometry.views import checked_size, find_up, find_view
 from clrecon.kernels import Stopwatch
 from clrecon.opencl import Device, choose_device
@@ -27,6 +28,9 @@ __all__ = ["CURVED_KINDS", "cut_slice", "reformat_curve"]
 CURVED_KINDS = ("straightened", "stretched")
 
 DEFAULT_SIZE = (1024, 1024)
+
+WHOLE_SHARE = 0.85
+"""Of the height of a volume; where the spine was found over less, that is said."""
 
 DEFAULT_WIDTH_MM = 120.0
 """Width of a curved reformation where neither size nor width is given: a vertebra with what lies around it."""
@@ -188,7 +192,7 @@ def _describe_miss(volume: Volume, camera: Camera) -> str:
 
 def reformat_curve(
     volume: Volume,
-    curve: Curve | ArrayLike,
+    curve: Curve | ArrayLike | str = "spine",
     kind: str = "straightened",
     size: Sequence[int] | None = None,
     device: Device | str | int | None = None,
@@ -210,8 +214,9 @@ def reformat_curve(
     Parameters
     ----------
     volume : Volume
-    curve : Curve or array_like, shape (n, 3)
-        Points of the centre line in LPS mm, all within the volume; a smooth curve is laid through them.
+    curve : Curve, array_like of shape (n, 3), or "spine"
+        Points of the centre line in LPS mm, all within the volume; a smooth curve is laid through them.  "spine" looks
+        for the spinal canal, see `clrecon.geometry.spine_line`.
     kind : {"straightened", "stretched"}
         Straightened: the centre line is a straight line down the picture, each row lies across it.  Stretched: rows
         keep one direction in the patient, the picture is the surface that they make, unrolled; all lengths within
@@ -241,8 +246,8 @@ def reformat_curve(
     Raises
     ------
     UsageError
-        Points that are none, too few or outside of the volume, an unknown kind or view, impossible numbers, a curve
-        that runs along the rows.
+        Points that are none, too few or outside of the volume, no spine that one could be sure of, an unknown kind or
+        view, impossible numbers, a curve that runs along the rows.
     DeviceError
         No device, two slices and the picture do not fit it, or it fails.
     """
@@ -251,8 +256,7 @@ def reformat_curve(
         raise UsageError(f"a curved reformation is {' or '.join(CURVED_KINDS)}, not {kind!r}")
     if not np.isfinite(angle) or (angle != 0.0 and kind == "stretched"):
         raise UsageError(f"the angle turns straightened pictures, in degrees: not {angle!r} in a {kind} one")
-    line = curve if isinstance(curve, Curve) else Curve(curve)
-    line.check_within(volume)
+    line, found = _find_line(volume, curve)
     across, top = _find_directions(view, up)
     turned = bool((line.points[-1] - line.points[0]) @ top > 0.0)
     line = line.reversed() if turned else line
@@ -266,9 +270,26 @@ def reformat_curve(
     made.values[np.isnan(curved.arc)] = np.nan
     nowhere = np.full((height, width), np.nan, np.float32)
     report = job.describe(made, pixel) | {"curve": _describe_curve(line, curved, kind, across, turned)}
-    report["curve"]["angle_deg"] = float(angle)
+    report["curve"] |= {"angle_deg": float(angle), "found": found}
+    if found is not None and found["height_mm"] < WHOLE_SHARE * found["searched_mm"]:
+        report["warnings"].append(
+            f"the spine was found over {found['height_mm']:.0f} mm of the {found['searched_mm']:.0f} mm of the volume"
+        )
     image = grey_image(made.values, job.window)
     return Rendering(image, nowhere, nowhere.copy(), None, made.values, mode="cpr", report=report)
+
+
+def _find_line(volume: Volume, curve: Curve | ArrayLike | str) -> tuple[Curve, dict[str, Any] | None]:
+    """The centre line, and what is known of it where it was looked for."""
+    if isinstance(curve, str):
+        if curve != "spine":
+            raise UsageError(f"a centre line is its points in LPS mm, or 'spine' to look for it: not {curve!r}")
+        spine = find_spine_line(volume)
+        known = {"height_mm": spine.height_mm, "searched_mm": spine.searched_mm, "sure_share": spine.sure_share}
+        return Curve(spine.points), known | {"points_lps_mm": spine.points.round(3).tolist()}
+    line = curve if isinstance(curve, Curve) else Curve(curve)
+    line.check_within(volume)
+    return line, None
 
 
 def _find_directions(view: str | Sequence[float], up: str | ArrayLike | None) -> tuple[Float64Array, Float64Array]:
