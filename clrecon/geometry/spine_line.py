@@ -215,7 +215,7 @@ def _enclosed(bone: Field, distances: tuple[float, ...]) -> Field:
         for distance in distances:
             np.maximum(wall, _shifted(bone, distance * np.cos(angle), distance * np.sin(angle)), out=wall)
         sums += np.minimum(wall / 0.7, 1.0)
-    return sums / DIRECTIONS
+    return np.asarray(sums / DIRECTIONS, dtype=np.float32)
 
 
 def _cortex(cells: _Cells, height: float) -> Field:
