@@ -96,6 +96,7 @@ def cut_slice(
     thickness: float = 0.0,
     combine: str = "mean",
     window: Sequence[float] | None = None,
+    background: str | Sequence[float] = "black",
     memory: int | None = None,
     progress: Progress | None = None,
     voxels_d: Any = None,
@@ -126,6 +127,8 @@ def cut_slice(
         Of the samples that lie within the volume.
     window : (low, high), optional
         HU that are black and white; default -450 to 1050, a window for bone.
+    background : str or colour
+        Where there is nothing of the volume; "transparent" leaves opacity 0 there.
     memory : int, optional
         Bytes that may be taken on the device; a volume that needs more goes through in slabs.
     progress : callable, optional
@@ -136,8 +139,8 @@ def cut_slice(
     Returns
     -------
     Rendering
-        ``values`` in HU, NaN outside of the volume, where ``image`` has opacity 0; ``camera`` parallel with its focal
-        point in the plane, ``depth`` the plane's distance from it.
+        ``values`` in HU, NaN outside of the volume; ``camera`` parallel with its focal point in the plane, ``depth``
+        the plane's distance from it.
 
     Raises
     ------
@@ -161,9 +164,9 @@ def cut_slice(
         raise UsageError(_describe_miss(volume, camera))
     depth = np.where(there, np.float32(camera.distance), np.float32(np.nan))
     report = job.describe(made, camera.pixel_mm((width, height))) | _describe_plane(camera)
-    return Rendering(
-        grey_image(made.values, job.window), depth, depth.copy(), camera, made.values, mode="slice", report=report
-    )
+    image = grey_image(made.values, job.window)
+    seen = Rendering(image, depth, depth.copy(), camera, made.values, mode="slice", report=report)
+    return seen if background == "transparent" else seen.with_background(background)
 
 
 def _describe_plane(camera: Camera) -> dict[str, Any]:
@@ -205,6 +208,7 @@ def reformat_curve(
     thickness: float = 0.0,
     combine: str = "mean",
     window: Sequence[float] | None = None,
+    background: str | Sequence[float] = "black",
     memory: int | None = None,
     progress: Progress | None = None,
     voxels_d: Any = None,
@@ -234,7 +238,7 @@ def reformat_curve(
         Side of a pixel; default: the curve fills the height of `size`, else the smallest distance of voxels.
     width_mm : float, optional
         Width of the picture where no `size` is given; default 120 mm.
-    thickness, combine, window, memory, progress, voxels_d
+    thickness, combine, window, background, memory, progress, voxels_d
         As in `cut_slice`; the slab lies across the picture.
 
     Returns
@@ -276,7 +280,8 @@ def reformat_curve(
             f"the spine was found over {found['height_mm']:.0f} mm of the {found['searched_mm']:.0f} mm of the volume"
         )
     image = grey_image(made.values, job.window)
-    return Rendering(image, nowhere, nowhere.copy(), None, made.values, mode="cpr", report=report)
+    seen = Rendering(image, nowhere, nowhere.copy(), None, made.values, mode="cpr", report=report)
+    return seen if background == "transparent" else seen.with_background(background)
 
 
 def _find_line(volume: Volume, curve: Curve | ArrayLike | str) -> tuple[Curve, dict[str, Any] | None]:

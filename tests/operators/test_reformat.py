@@ -102,10 +102,12 @@ def test_slabs_along_an_axis_are_those_of_numpy(device, combine):
 
 def test_samples_beyond_the_volume_do_not_count(device):
     volume = Volume(np.full((3, 8, 8), 70, np.int16), np.eye(4))
-    cut = cut_slice(volume, "axial", (12, 8), device, pixel_mm=1.0, thickness=20.0)
+    cut = cut_slice(volume, "axial", (12, 8), device, pixel_mm=1.0, thickness=20.0, background="transparent")
     assert np.abs(cut.values[:, 2:10] - 70.0).max() <= tolerances.SLAB_MEAN_HU
     assert np.isnan(cut.values[:, :2]).all() and np.isnan(cut.values[:, 10:]).all()
     assert (cut.image[:, 2:10, 3] == 255).all() and (cut.image[:, :2, 3] == 0).all()
+    plain = cut_slice(volume, "axial", (12, 8), device, pixel_mm=1.0, thickness=20.0, background="white")
+    assert (plain.image[..., 3] == 255).all() and (plain.image[:, :2, :3] == 255).all()
 
 
 def test_voxels_without_weight_are_not_looked_at(device):
@@ -121,6 +123,33 @@ def uneven_aside(voxels) -> Volume:
     even = uneven(voxels)
     aside = np.array([0.0, 0.9, -0.4, 1.7, 1.5, -1.1])[:, None] * even.affine[:3, 0]
     return Volume(voxels, even.affine, slice_positions=even.slice_origins() + aside)
+
+
+def test_an_oblique_slice_equals_that_of_simpleitk(device):
+    """A third opinion: the same plane through the same grid, between the outer voxel centres."""
+    sitk = pytest.importorskip("SimpleITK")
+    volume = even_volume("float32", (20.0, -35.0, 10.0), (0.7, 0.5, 2.5), (12, 14, 16))
+    grid = sitk.GetImageFromArray(volume.voxels)
+    grid.SetSpacing(volume.spacing)
+    grid.SetOrigin(volume.affine[:3, 3].tolist())
+    grid.SetDirection((volume.affine[:3, :3] / volume.spacing).ravel().tolist())
+    cut = cut_slice(volume, (25.0, 40.0), (60, 50), device, zoom=1.5, offset_mm=0.7)
+    right, up, forward = cut.camera.basis()
+    pixel = cut.report["pixel_mm"]
+    first = cut.camera.focal_point + pixel * (-29.5 * right + 24.5 * up)
+    resampler = sitk.ResampleImageFilter()
+    resampler.SetSize((60, 50, 1))
+    resampler.SetOutputSpacing((pixel, pixel, 1.0))
+    resampler.SetOutputOrigin(first.tolist())
+    resampler.SetOutputDirection(np.stack([right, -up, forward], axis=1).ravel().tolist())
+    resampler.SetInterpolator(sitk.sitkLinear)
+    resampler.SetDefaultPixelValue(np.nan)
+    other = sitk.GetArrayFromImage(resampler.Execute(grid))[0]
+    origins, directions = cut.camera.rays((60, 50))
+    ijk = volume.lps_to_ijk((origins + cut.camera.distance * directions).reshape(-1, 3)).reshape(50, 60, 3)
+    within = ((ijk >= 0.0) & (ijk <= (15, 13, 11))).all(axis=2)
+    assert within.sum() > 300
+    assert np.abs(cut.values - other)[within].max() <= tolerances.TWIN_SLICE_HU
 
 
 VOLUMES = {
