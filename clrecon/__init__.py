@@ -24,8 +24,10 @@ if TYPE_CHECKING:
         RefusedInputError,
         UsageError,
     )
+    from clrecon.formats.curve_points import read_curve_points
     from clrecon.geometry import Volume, choose_iso_value
     from clrecon.geometry.body import mask_field_of_view, remove_table
+    from clrecon.geometry.spine_line import find_spine_line
     from clrecon.labels import LabelMap, read_labels
     from clrecon.mesh import Mesh
     from clrecon.mesh.distances import compare_meshes
@@ -33,6 +35,7 @@ if TYPE_CHECKING:
     from clrecon.opencl import Device
     from clrecon.operators.isosurface import SurfaceExtractor, extract_isosurface, extract_isosurfaces
     from clrecon.operators.labels import extract_labels
+    from clrecon.operators.reformat import cut_slice, reformat_curve
     from clrecon.operators.renderer import VolumeRenderer, render
     from clrecon.reading import list_series, read_volume
     from clrecon.rendering import Lighting, TransferFunction, load_transfer_function
@@ -57,17 +60,21 @@ __all__ = [
     "__version__",
     "choose_iso_value",
     "compare_meshes",
+    "cut_slice",
     "decimate_mesh",
     "device",
     "devices",
     "extract_isosurface",
     "extract_isosurfaces",
     "extract_labels",
+    "find_spine_line",
     "list_series",
     "load_transfer_function",
     "mask_field_of_view",
+    "read_curve_points",
     "read_labels",
     "read_volume",
+    "reformat_curve",
     "remove_table",
     "render",
     "smooth_mesh",
@@ -90,15 +97,19 @@ _HOMES = {
     "VolumeRenderer": "clrecon.operators.renderer",
     "choose_iso_value": "clrecon.geometry",
     "compare_meshes": "clrecon.mesh.distances",
+    "cut_slice": "clrecon.operators.reformat",
     "decimate_mesh": "clrecon.mesh.refinement",
     "extract_isosurface": "clrecon.operators.isosurface",
     "extract_isosurfaces": "clrecon.operators.isosurface",
     "extract_labels": "clrecon.operators.labels",
+    "find_spine_line": "clrecon.geometry.spine_line",
     "list_series": "clrecon.reading",
     "load_transfer_function": "clrecon.rendering",
     "mask_field_of_view": "clrecon.geometry.body",
+    "read_curve_points": "clrecon.formats.curve_points",
     "read_labels": "clrecon.labels",
     "read_volume": "clrecon.reading",
+    "reformat_curve": "clrecon.operators.reformat",
     "remove_table": "clrecon.geometry.body",
     "render": "clrecon.operators.renderer",
     "smooth_mesh": "clrecon.mesh.refinement",

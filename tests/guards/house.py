@@ -18,7 +18,10 @@ def _layer(name: str, *allowed: str) -> None:
     LEFT_OF[name] = frozenset(allowed)
 
 
-_layer("__init__", "errors", "version", "geometry", "reading", "labels", "mesh", "rendering", "opencl", "operators")
+_layer(
+    "__init__",
+    *("errors", "version", "geometry", "formats", "reading", "labels", "mesh", "rendering", "opencl", "operators"),
+)
 _layer("errors")
 _layer("version")
 _layer("gates")

@@ -1,0 +1,329 @@
+"""Find the spinal canal: a centre line of the vertebral column for curved reformations.
+
+In slices across the patient every place is asked how much it is like the middle of the spinal canal: soft, closed in
+by cortical bone in all directions (over 24 mm of height, so that arches close the gaps between them), a vertebral body
+in front, nothing but muscle behind, and the left the mirror of the right.  The path through the slices on which most
+of that is found, by dynamic programming, is the canal where it is found for long enough; elsewhere nothing is said.
+Each slice's place is then moved to the middle of the space that the bone encloses, and the line is smoothed.
+
+It is meant for the thoracic and lumbar spine of an adult, in a scan whose directions are those of the patient.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clrecon.errors import UsageError
+from clrecon.geometry.affine import Float64Array
+from clrecon.geometry.volume import Volume
+
+__all__ = ["SpineLine", "find_spine_line"]
+
+Field = NDArray[np.float32]
+
+CELL_MM = (2.5, 2.5, 4.0)
+"""Cells of the grid along x, y, z that the canal is found on."""
+CANAL_RADIUS, BODY_RADIUS = 5.0, 10.0
+RING_MM = (8.0, 10.0, 12.0, 14.0, 16.0)
+"""Distances from the middle of the canal at which its wall may lie."""
+SHELL_MM = (12.0, 15.0, 18.0, 21.0, 24.0)
+"""The same of a vertebral body."""
+BODY_AHEAD_MM = (20.0, 24.0, 28.0)
+"""From the middle of the canal to that of the body."""
+DIRECTIONS = 16
+WORTH = 2.2
+"""Of a place that counts neither for the path nor against it, of about 3.2 that the canal has."""
+WORST = 0.6
+"""What a slice may count against the path at most: one slice with an artefact does not end it."""
+BEND_COST = 0.05
+DEEPER_AHEAD = 1.2
+"""The body is deeper in front of the canal than behind it, at least so many times."""
+SHORTEST_MM = 35.0
+SURE = {"wall": 0.75, "mirror": 0.55, "body": 0.25, "soft": 0.6}
+"""A slice is sure where it has all of these."""
+GAP_MM = 12.0
+"""Slices without it between sure ones: an artefact, or a vertebra that looks different."""
+SMOOTH_MM = 12.0
+POINT_STEP_MM = 15.0
+
+
+@dataclass(frozen=True)
+class SpineLine:
+    """The middle of the spinal canal.
+
+    Attributes
+    ----------
+    points : ndarray, shape (n, 3), float64
+        LPS mm, from the head downwards, about 10 mm apart.
+    sure_share : float
+        Share of the slices of the line that look like a spine in every respect.
+    searched_mm : float
+        Height of the volume; the line may be shorter.
+    """
+
+    points: Float64Array
+    sure_share: float
+    searched_mm: float
+
+    @property
+    def height_mm(self) -> float:
+        """From the lower to the upper end along the body axis."""
+        return float(self.points[0, 2] - self.points[-1, 2])
+
+
+@dataclass(frozen=True)
+class _Cells:
+    """HU (nz, ny, nx) of cells along the patient's axes, the upper slices last, and the centre of the first cell."""
+
+    values: Field
+    origin: Float64Array
+
+    def heights(self, mm: float) -> int:
+        """Cells of a window of `mm` along z: odd."""
+        return max(1, round(mm / CELL_MM[2]) | 1)
+
+
+def find_spine_line(volume: Volume) -> SpineLine:
+    """Find the middle of the spinal canal.
+
+    Parameters
+    ----------
+    volume : Volume
+        A scan in HU.
+
+    Returns
+    -------
+    SpineLine
+
+    Raises
+    ------
+    UsageError
+        Nowhere in the volume it is sure: the message says how much was found.
+    """
+    cells = _average_cells(volume)
+    traits = _find_traits(cells)
+    worth = (
+        traits["body"] + traits["wall"] + 0.5 * traits["soft"] + traits["mirror"]
+        - traits["filled"] - 0.5 * traits["beside"] - traits["behind"]
+    )  # fmt: skip
+    path = _best_path(np.clip(worth - WORTH, -WORST, None))
+    k, j, i = path.T
+    sure = np.logical_and.reduce([traits[name][k, j, i] >= least for name, least in SURE.items()])
+    begin, end = _longest_run(sure)
+    searched, height = len(worth) * CELL_MM[2], (end - begin) * CELL_MM[2]
+    if height < SHORTEST_MM:
+        raise UsageError(
+            f"no spine was found that one could be sure of ({height:.0f} of {searched:.0f} mm look like one):"
+            " give points of the centre line"
+        )
+    ahead, behind = _depths(cells, path[begin:end])
+    if behind is not None and ahead < DEEPER_AHEAD * behind:
+        raise UsageError(
+            f"what looks like a spine has {ahead:.0f} mm of the body in front and {behind:.0f} mm behind: it is none,"
+            " or front and back of the scan are mistaken; give points of the centre line"
+        )
+    return SpineLine(_centre_points(cells, path[begin:end]), float(sure[begin:end].mean()), searched)
+
+
+def _depths(cells: _Cells, path: NDArray[np.int64]) -> tuple[float, float | None]:
+    """Medians of the mm of tissue in front of a path and behind it; None behind where the volume ends within it."""
+    thick = _disc_mean((cells.values > -300.0).astype(np.float32), BODY_RADIUS) > 0.6  # not the table
+    k, j, i = path.T
+    rows = thick[k, :, i]
+    ends = rows.shape[1] - 1 - rows[:, ::-1].argmax(axis=1)
+    ahead = float(np.median(j - rows.argmax(axis=1)) * CELL_MM[1])
+    behind = float(np.median(ends - j) * CELL_MM[1])
+    outside = rows.shape[1] - 1 - ends <= BODY_RADIUS / CELL_MM[1]
+    return ahead, None if np.median(outside) else behind
+
+
+def _longest_run(sure: NDArray[np.bool_]) -> tuple[int, int]:
+    """First and end of the longest run of sure slices; gaps up to `GAP_MM` between them do not part it."""
+    best, begin, last = (0, 0), None, 0
+    for k in np.flatnonzero(sure):
+        if begin is None or (k - last - 1) * CELL_MM[2] > GAP_MM:
+            begin = int(k)
+        last = int(k)
+        if last + 1 - begin > best[1] - best[0]:
+            best = begin, last + 1
+    return best
+
+
+def _average_cells(volume: Volume) -> _Cells:
+    """Mean values of blocks of voxels of about the size of a cell, interpolated at the cells."""
+    from scipy.ndimage import map_coordinates
+
+    size = np.array(volume.shape_ijk)
+    block = np.maximum(1, np.rint(np.minimum(CELL_MM, 2.5) / volume.spacing)).astype(int)
+    block = np.minimum(block, size)
+    whole = size // block * block
+    fi, fj, fk = (int(n) for n in block)
+    means = np.empty((whole // block)[::-1], np.float32)
+    for k in range(len(means)):
+        part = np.clip(volume.voxels[fk * k : fk * (k + 1), : whole[1], : whole[0]], -1024, 1500)
+        rows = part.mean(axis=0, dtype=np.float32)
+        means[k] = rows.reshape(len(means[k]), fj, -1, fi).mean(axis=(1, 3))
+        volume.release_slices(fk * k, fk * (k + 1))
+    corners = volume.ijk_to_lps(
+        [tuple(n - 0.5 if upper else -0.5 for n, upper in zip(size, bits, strict=True)) for bits in np.ndindex(2, 2, 2)]
+    )
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    count = np.maximum(((high - low) / CELL_MM).astype(int), 1)
+    origin = 0.5 * (low + high) - 0.5 * (count - 1) * CELL_MM
+    x, y = (origin[axis] + CELL_MM[axis] * np.arange(count[axis]) for axis in (0, 1))
+    values = np.empty(count[::-1], np.float32)
+    for k in range(count[2]):
+        plane = np.broadcast_arrays(x, y[:, None], origin[2] + CELL_MM[2] * k)
+        ijk = volume.lps_to_ijk(np.stack(plane, axis=-1).reshape(-1, 3))
+        inside = ((ijk >= -0.5) & (ijk <= size - 0.5)).all(axis=1)
+        at = ((ijk + 0.5) / block - 0.5).T[::-1]
+        found = map_coordinates(means, at, order=1, mode="nearest")
+        values[k] = np.where(inside, np.nan_to_num(found, nan=-1024.0), -1024.0).reshape(values[k].shape)
+    return _Cells(values, origin)
+
+
+def _shifted(field: Field, right: float, back: float) -> Field:
+    """The field `right` and `back` mm further in each slice; 0 beyond its ends."""
+    dx, dy = round(right / CELL_MM[0]), round(back / CELL_MM[1])
+    moved = np.zeros_like(field)
+    ny, nx = field.shape[1:]
+    if abs(dx) < nx and abs(dy) < ny:
+        to = (slice(None), slice(max(0, -dy), ny - max(0, dy)), slice(max(0, -dx), nx - max(0, dx)))
+        moved[to] = field[:, max(0, dy) : ny + min(0, dy), max(0, dx) : nx + min(0, dx)]
+    return moved
+
+
+def _disc_mean(field: Field, radius: float) -> Field:
+    """Mean within `radius` mm in each slice."""
+    from scipy.ndimage import convolve
+
+    reach = int(np.ceil(radius / CELL_MM[0]))
+    y, x = np.mgrid[-reach : reach + 1, -reach : reach + 1] * CELL_MM[0]
+    disc = (x**2 + y**2 <= radius**2).astype(np.float32)
+    return np.asarray(convolve(field, disc[None] / disc.sum(), mode="constant"))
+
+
+def _enclosed(bone: Field, distances: tuple[float, ...]) -> Field:
+    """Share of the directions in which bone stands at one of the distances."""
+    sums = np.zeros_like(bone)
+    for angle in np.arange(DIRECTIONS) * (2.0 * np.pi / DIRECTIONS):
+        wall = np.zeros_like(bone)
+        for distance in distances:
+            np.maximum(wall, _shifted(bone, distance * np.cos(angle), distance * np.sin(angle)), out=wall)
+        sums += np.minimum(wall / 0.7, 1.0)
+    return np.asarray(sums / DIRECTIONS, dtype=np.float32)
+
+
+def _cortex(cells: _Cells, height: float) -> Field:
+    """Dense bone anywhere within `height` mm along z, 0 to 1."""
+    from scipy.ndimage import maximum_filter1d
+
+    cortex = np.clip((cells.values - 170.0) / 130.0, 0.0, 1.0)
+    return np.asarray(maximum_filter1d(cortex, cells.heights(height), axis=0, mode="nearest"))
+
+
+def _find_traits(cells: _Cells) -> dict[str, Field]:
+    """How far each cell is like the middle of the spinal canal, 0 to 1 each, by trait."""
+    from scipy.ndimage import maximum_filter, uniform_filter1d
+
+    values = cells.values
+    bone = np.clip((values - 110.0) / 130.0, 0.0, 1.0)
+    bone = uniform_filter1d(bone, cells.heights(16.0), axis=0, mode="nearest")
+    soft = _disc_mean(((values > -80.0) & (values < 130.0)).astype(np.float32), CANAL_RADIUS)
+    wall = _enclosed(maximum_filter(_cortex(cells, 24.0), (1, 2, 2)), RING_MM)
+    body = 0.5 * _disc_mean(bone, BODY_RADIUS) + 0.5 * _enclosed(_cortex(cells, 12.0), SHELL_MM)
+    thick, thin = _disc_mean(bone, 12.0), _disc_mean(bone, CANAL_RADIUS)
+    traits = {
+        "soft": soft,
+        "wall": wall,
+        "body": np.maximum.reduce([_shifted(body, 0.0, -ahead) for ahead in BODY_AHEAD_MM]),
+        "filled": _disc_mean(bone, 4.0),
+        "beside": np.minimum(_shifted(thin, 36.0, -24.0) + _shifted(thin, -36.0, -24.0), 1.0),
+        "behind": np.maximum(_shifted(thick, 0.0, 50.0), _shifted(thick, 0.0, 64.0)),
+    }
+    without = traits["body"] + wall + 0.5 * soft - traits["filled"] - 0.5 * traits["beside"] - traits["behind"]
+    traits["mirror"] = _mirrored(cells, (without > WORTH - 1.3) & (soft > 0.4))
+    return traits
+
+
+def _mirrored(cells: _Cells, wanted: NDArray[np.bool_]) -> Field:
+    """Correlation of the left with the mirrored right, 40 mm aside, 44 mm to the front and 36 to the back."""
+    from scipy.ndimage import uniform_filter, uniform_filter1d
+
+    smooth = uniform_filter1d(np.clip(cells.values, -300.0, 500.0), cells.heights(9.0), axis=0, mode="nearest")
+    smooth = uniform_filter(smooth, (1, 2, 2))
+    back = np.arange(round(-44.0 / CELL_MM[1]), round(36.0 / CELL_MM[1]) + 1, 2)[:, None]
+    aside = np.arange(1, round(40.0 / CELL_MM[0]) + 1, 2)
+    ny, nx = smooth.shape[1:]
+    found = np.zeros_like(smooth)
+    places = np.argwhere(wanted)
+    for part in np.array_split(places, len(places) // 20000 + 1):
+        k, j, i = (axis[:, None, None] for axis in part.T)
+        rows = np.clip(j + back, 0, ny - 1)
+        right = smooth[k, rows, np.clip(i + aside, 0, nx - 1)]
+        left = smooth[k, rows, np.clip(i - aside, 0, nx - 1)]
+        mean = 0.5 * (right + left).mean(axis=(1, 2), keepdims=True)
+        right, left = right - mean, left - mean
+        power = (right**2).sum(axis=(1, 2)) + (left**2).sum(axis=(1, 2))
+        found[tuple(part.T)] = 2.0 * (right * left).sum(axis=(1, 2)) / (power + 1.0)
+    return np.asarray(np.clip(found, 0.0, 1.0), dtype=np.float32)
+
+
+def _best_path(gain: Field) -> NDArray[np.int64]:
+    """Cells (n, 3) as (k, j, i), one a slice, at most one cell aside from slice to slice, with the highest sum.
+
+    It begins and ends where it is best: what counts against it lies between what counts for it.
+    """
+    steps = [(dy, dx) for dy in (-1, 0, 1) for dx in (-1, 0, 1)]
+    sums = gain[0].copy()
+    came = np.full(gain.shape, -1, np.int8)
+    best, end = float(sums.max()), (0, *np.unravel_index(sums.argmax(), sums.shape))
+    for k in range(1, len(gain)):
+        before = np.full((len(steps), *sums.shape), -np.inf, np.float32)
+        padded = np.pad(sums, 1, constant_values=-np.inf)
+        for n, (dy, dx) in enumerate(steps):
+            before[n] = padded[1 + dy : 1 + dy + sums.shape[0], 1 + dx : 1 + dx + sums.shape[1]]
+            before[n] -= BEND_COST * np.hypot(dy, dx)
+        step = before.argmax(axis=0)
+        before_best = np.take_along_axis(before, step[None], axis=0)[0]
+        came[k] = np.where(before_best > 0.0, step, -1)
+        sums = gain[k] + np.maximum(before_best, 0.0)
+        if sums.max() > best:
+            best, end = float(sums.max()), (k, *np.unravel_index(sums.argmax(), sums.shape))
+    path: list[Any] = []
+    k, j, i = (int(n) for n in end)
+    while best > 0.0:
+        path.append((k, j, i))
+        if came[k, j, i] < 0:
+            break
+        dy, dx = steps[came[k, j, i]]
+        k, j, i = k - 1, j + dy, i + dx
+    return np.array(path[::-1], np.int64).reshape(-1, 3)
+
+
+def _centre_points(cells: _Cells, path: NDArray[np.int64]) -> Float64Array:
+    """The middle of what the bone encloses in each slice of a path, smoothed, from the upper end to the lower."""
+    from scipy.ndimage import gaussian_filter1d
+
+    bone = _cortex(cells, 16.0)
+    ny, nx = bone.shape[1:]
+    y, x = np.mgrid[:ny, :nx]
+    middles = path[:, 1:].astype(np.float64)
+    for n, (k, _, _) in enumerate(path):
+        for _ in range(3):
+            distance = np.hypot((y - middles[n, 0]) * CELL_MM[1], (x - middles[n, 1]) * CELL_MM[0])
+            weight = np.clip((11.0 - distance) / CELL_MM[0], 0.0, 1.0) * (1.0 - bone[k])
+            if weight.sum() > 0.0:
+                moved = np.array([(weight * y).sum(), (weight * x).sum()]) / weight.sum()
+                middles[n] += np.clip(moved - middles[n], -1.0, 1.0)
+    # Beyond its ends the line goes on point-symmetrically: smoothing does not bend it there.
+    beyond = min(len(middles) - 1, round(4.0 * SMOOTH_MM / CELL_MM[2]))
+    longer = np.pad(middles, ((beyond, beyond), (0, 0)), mode="reflect", reflect_type="odd")
+    smooth = gaussian_filter1d(longer, SMOOTH_MM / CELL_MM[2], axis=0, mode="nearest")[beyond:][: len(middles)]
+    places = np.column_stack([smooth[:, 1], smooth[:, 0], path[:, 0]]) * CELL_MM + cells.origin
+    count = max(2, round(len(path) * CELL_MM[2] / POINT_STEP_MM) + 1)
+    return places[np.unique(np.rint(np.linspace(0, len(path) - 1, count)).astype(int))][::-1]

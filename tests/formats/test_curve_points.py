@@ -1,0 +1,94 @@
+"""Points of centre lines in files: every kind gives the same points, and what is none is refused with its place."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from clrecon.errors import RefusedInputError, UsageError
+from clrecon.formats.curve_points import read_curve_points
+
+POINTS = np.array([[1.5, -2.0, 30.0], [2.0, -1e1, 28.25], [0.0, 4.0, -7.0]])
+RAS = POINTS * (-1.0, -1.0, 1.0)
+
+
+def markups(points, system="LPS", **fields):
+    control = [{"id": str(n), "position": list(point), "positionStatus": "defined"} for n, point in enumerate(points)]
+    control.append({"id": "9", "position": [0.0, 0.0, 0.0], "positionStatus": "preview"})
+    return {"markups": [{"type": "Curve", "coordinateSystem": system, "controlPoints": control} | fields]}
+
+
+def rows(points, separator):
+    return "".join(separator.join(map(str, point)) + "\n" for point in points)
+
+
+FCSV = "# Markups fiducial file version = 4.11\n# CoordinateSystem = {}\n# columns = id,x,y,z,ow,ox,oy,oz,vis,sel\n"
+
+FILES = {
+    "blanks.txt": "# a line\n\n" + rows(POINTS, "  "),
+    "tabs.dat": "\ufeff" + rows(POINTS, "\t"),
+    "commas.csv": rows(POINTS, ", "),
+    "semicolons.csv": rows(POINTS, ";"),
+    "names.csv": "label,Z,x,Y\n" + "".join(f"p{n},{z},{x},{y}\n" for n, (x, y, z) in enumerate(POINTS)),
+    "list.json": json.dumps(POINTS.tolist()),
+    "object.json": json.dumps({"points": RAS.tolist(), "space": "RAS"}),
+    "curve.mrk.json": json.dumps(markups(POINTS)),
+    "curve_ras.mrk.json": json.dumps(markups(RAS, "RAS", coordinateUnits="mm")),
+    "lps.fcsv": FCSV.format("LPS") + "".join(f"n{n},{x},{y},{z},0,0,0,1,1,1\n" for n, (x, y, z) in enumerate(POINTS)),
+    "ras.fcsv": FCSV.format("0") + "".join(f"n{n},{x},{y},{z},0,0,0,1,1,1\n" for n, (x, y, z) in enumerate(RAS)),
+}
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_all_kinds_of_files_give_the_points(tmp_path, name):
+    (tmp_path / name).write_text(FILES[name], encoding="utf-8")
+    assert np.array_equal(read_curve_points(tmp_path / name), POINTS)
+
+
+def test_the_frame_of_a_text_is_what_one_says(tmp_path):
+    (tmp_path / "ras.txt").write_text(rows(RAS, " "))
+    assert np.array_equal(read_curve_points(tmp_path / "ras.txt", "ras"), POINTS)
+    (tmp_path / "said.mrk.json").write_text(json.dumps(markups(POINTS)))
+    with pytest.raises(UsageError, match="says that its points are LPS, not RAS"):
+        read_curve_points(tmp_path / "said.mrk.json", "ras")
+    with pytest.raises(UsageError, match="lps or ras"):
+        read_curve_points(tmp_path / "ras.txt", "world")
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "says"),
+    [
+        ("a.txt", "1 2 3\n4 five 6\n", "line 2 is not three numbers"),
+        ("a.txt", "1 2 3\n4 5\n", "line 2"),
+        ("a.txt", "1 2 3\n", "1 point,"),
+        ("a.txt", "", "0 points"),
+        ("a.txt", "1 2 3\nnan 2 3\n", "point 1"),
+        ("a.csv", "a,b,c\n1,2,3\n4,5,6\n", "x, y and z"),
+        ("a.csv", "x,y,z\n1,2,3\n4,5\n", "line 3"),
+        ("a.json", "[[1, 2, 3], [1, 2", "no JSON"),
+        ("a.json", "[" * 100000, "no JSON"),
+        ("a.json", '{"point": []}', "no points"),
+        ("a.json", "[[1, 2, 3], [1, true, 3]]", "point 1"),
+        ("a.json", "[[1, 2, 3], [1, 2, 1" + "0" * 400 + "]]", "point 1"),
+        ("a.json", '{"points": [[1, 2, 3], [4, 5, 6]], "space": "IJK"}', "neither LPS nor RAS"),
+        ("a.mrk.json", json.dumps({"markups": []}), "0 markups"),
+        ("a.mrk.json", json.dumps({"markups": markups(POINTS)["markups"] * 2}), "2 markups"),
+        ("a.mrk.json", json.dumps(markups(POINTS, coordinateUnits="m")), "not mm"),
+        ("a.mrk.json", json.dumps({"markups": [{"type": "Curve"}]}), "controlPoints"),
+        ("a.fcsv", FCSV.format("2") + "a,1,2,3\n", "neither"),
+        ("a.fcsv", FCSV.format("LPS") + "a,1,2,3\nb,4,5\n", "line 5"),
+    ],
+)
+def test_what_holds_no_points_is_refused(tmp_path, name, text, says):
+    (tmp_path / name).write_text(text)
+    with pytest.raises(RefusedInputError, match=says):
+        read_curve_points(tmp_path / name)
+
+
+def test_files_that_cannot_be_read_are_refused(tmp_path):
+    (tmp_path / "bytes.txt").write_bytes(b"\xff\xfe\x00")
+    for name, says in [("bytes.txt", "no text"), ("absent.txt", "cannot be read"), (".", "cannot be read")]:
+        with pytest.raises(RefusedInputError, match=says):
+            read_curve_points(tmp_path / name)

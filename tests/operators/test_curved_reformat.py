@@ -1,0 +1,148 @@
+"""Curved reformations of bent tubes with known radius and length, in sheared and uneven volumes."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from clrecon.errors import UsageError
+from clrecon.geometry import Volume
+from clrecon.geometry.curved_sheets import straightened_sheet
+from clrecon.geometry.curves import Curve
+from clrecon.geometry.sheets import slab_samples
+from clrecon.operators.reformat import reformat_curve
+from clrecon.reference.reformat import reformat_sheet
+from tests import tolerances
+
+BEND, TUBE = 40.0, 7.0
+"""Radius of the torus and of its tube, mm."""
+TURN = np.radians(110.0)
+CENTRE = np.array([4.0, -60.0, 200.0])
+
+
+def grids():
+    """A sheared one and an uneven one around the tube: about 60 mm aside, 80 along y and z."""
+    affine = np.eye(4)
+    affine[:3, :3] = [[0.9, 0.0, 0.1], [0.0, 0.8, -0.3], [0.0, 0.0, 1.2]]
+    affine[:3, 3] = CENTRE + (-16.0, -10.0, -46.0)
+    shape = (78, 104, 36)
+    yield Volume(np.zeros(shape, np.float32), affine)
+    heights = np.cumsum(np.tile([0.7, 1.2, 0.9], 34)[:102])
+    positions = affine[:3, 3] + np.stack([0.0 * heights, 0.02 * heights, heights], axis=1) + (0.0, 0.0, -2.0)
+    affine[:3, 2] = (0.0, 0.0, 0.93)
+    yield Volume(np.zeros((102, *shape[1:]), np.float32), affine, slice_positions=positions)
+
+
+def coordinates(volume):
+    """Of each voxel: distance from the middle of the tube, and way along it, from the upper end down."""
+    nk, nj, ni = volume.voxels.shape
+    k, j, i = np.indices((nk, nj, ni)).reshape(3, -1)
+    x, y, z = (volume.ijk_to_lps(np.stack([i, j, k], axis=1)) - CENTRE).T
+    distance = np.hypot(x, np.hypot(y, z) - BEND)
+    way = BEND * (0.5 * TURN - np.arctan2(z, y))
+    return distance.reshape(nk, nj, ni), way.reshape(nk, nj, ni)
+
+
+def centre_line(count=12):
+    angle = np.linspace(-0.5 * TURN, 0.5 * TURN, count)
+    return CENTRE + BEND * np.stack([0.0 * angle, np.cos(angle), np.sin(angle)], axis=1)
+
+
+def edges(values, pixel):
+    """The two crossings of 0 in each row, mm from the middle of the picture; linear between pixels."""
+    found = []
+    for row in values:
+        at = np.flatnonzero(np.diff(row > 0.0))
+        assert len(at) == 2
+        found.append((at + row[at] / (row[at] - row[at + 1]) - 0.5 * (len(row) - 1)) * pixel)
+    return np.array(found)
+
+
+@pytest.mark.parametrize("grid", [0, 1])
+@pytest.mark.parametrize("kind", ["straightened", "stretched"])
+def test_a_bent_tube_stands_straight_and_is_as_wide_and_long_as_it_is(device, grid, kind):
+    volume = list(grids())[grid]
+    distance, way = coordinates(volume)
+    tube = volume.with_voxels((100.0 * (TUBE - distance)).astype(np.float32))
+    seen = reformat_curve(tube, centre_line(), kind, (60, 150), device, view="anterior")
+    pixel = seen.report["pixel_mm"]
+    assert 150 * pixel == pytest.approx(BEND * TURN, rel=tolerances.TUBE_ARC)
+    assert seen.report["curve"]["length_mm"] == pytest.approx(BEND * TURN, rel=tolerances.TUBE_ARC)
+    assert seen.report["curve"]["reversed"] and seen.camera is None and np.isnan(seen.depth).all()
+    assert np.abs(edges(seen.values, pixel) - (-TUBE, TUBE)).max() <= tolerances.TUBE_EDGE_MM
+    marked = reformat_curve(volume.with_voxels(way.astype(np.float32)), centre_line(), kind, (60, 150), device,
+                            view="anterior")  # fmt: skip
+    truth = (np.arange(150) + 0.5) * pixel
+    assert np.abs(marked.values[:, 30] - truth).max() <= tolerances.TUBE_ARC * BEND * TURN
+
+
+@pytest.mark.parametrize("angle", [90.0, 30.0])
+def test_a_round_tube_is_as_wide_from_every_side(device, angle):
+    volume = next(grids())
+    tube = volume.with_voxels((100.0 * (TUBE - coordinates(volume)[0])).astype(np.float32))
+    seen = reformat_curve(tube, centre_line(), "straightened", device=device, view="anterior", angle=angle,
+                          pixel_mm=0.5, width_mm=20.0)  # fmt: skip
+    assert seen.values.shape == (round(BEND * TURN / 0.5), 40)
+    assert np.abs(edges(seen.values, 0.5) - (-TUBE, TUBE)).max() <= tolerances.TUBE_EDGE_MM
+
+
+def test_both_ends_and_sides_are_where_they_belong(device):
+    """From the left the front is at the left of the picture, the head at its top, however the points run."""
+    volume = next(grids())
+    nk, nj, ni = volume.voxels.shape
+    k, j, i = np.indices((nk, nj, ni)).reshape(3, -1)
+    places = volume.ijk_to_lps(np.stack([i, j, k], axis=1)).reshape(nk, nj, ni, 3)
+    line = CENTRE + np.array([(0.0, 30.0, z) for z in (-20.0, 5.0, 20.0)])
+    for points in (line, line[::-1]):
+        for kind in ("straightened", "stretched"):
+            for view, column, axis in [("left", 1, 1), ("anterior", 0, 0), ("right", 1, -1), ("posterior", 0, -1)]:
+                across = volume.with_voxels(places[..., column].astype(np.float32))
+                upward = volume.with_voxels(places[..., 2].astype(np.float32))
+                right = reformat_curve(across, points, kind, (8, 12), device, view=view).values
+                up = reformat_curve(upward, points, kind, (8, 12), device, view=view).values
+                assert np.sign(right[6, 7] - right[6, 0]) == (1 if axis >= 0 else -1)
+                assert up[0, 4] > up[11, 4]
+
+
+def test_a_slab_lies_across_the_picture(device):
+    """Highest value of a slab of 6 mm: a wire 2 mm into the picture is seen, one 5 mm into it is not."""
+    voxels = np.zeros((40, 40, 40), np.int16)
+    voxels[:, 20, 18], voxels[:, 24, 15] = 500, 900  # beside the line at i = 20: 2 and 5 mm towards the right
+    volume = Volume(voxels, np.eye(4))
+    line = [(20.0, 20.0, 2.0), (20.0, 20.0, 38.0)]
+    for kind in ("straightened", "stretched"):
+        thick = reformat_curve(volume, line, kind, (21, 36), device, thickness=6.0, combine="max", pixel_mm=1.0)
+        thin = reformat_curve(volume, line, kind, (21, 36), device, pixel_mm=1.0)
+        assert (thick.values[:, 10] == 500).all() and thick.values.max() == 500
+        assert thin.values.max() == 0
+
+
+def test_the_device_equals_its_twin(device):
+    volume = list(grids())[1]
+    values = np.random.default_rng(4).integers(0, 100, volume.voxels.shape).astype(np.int16)
+    volume = volume.with_voxels(values)
+    seen = reformat_curve(volume, centre_line(), "straightened", (30, 50), device, view="left", thickness=2.0)
+    curve = Curve(centre_line()[::-1])
+    made = straightened_sheet(curve, np.array([0.0, 1.0, 0.0]), (30, 50), curve.length / 50)
+    expected = reformat_sheet(volume, made.sheet, slab_samples(volume, 2.0))
+    assert np.array_equal(np.isnan(seen.values), np.isnan(expected))
+    assert np.nanmax(np.abs(seen.values - expected)) <= tolerances.TWIN_SLICE_HU
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        ({"kind": "projected"}, "straightened or stretched"),
+        ({"view": "front"}, "anterior, posterior"),
+        ({"kind": "stretched", "angle": 5.0}, "angle"),
+        ({"size": (3, 3), "width_mm": 10.0}, "not by both"),
+        ({"width_mm": -1.0}, "width"),
+        ({"pixel_mm": 1e-6}, "size of a picture"),
+        ({"curve": [(0.0, 0.0, 0.0), (1.0, 1.0, 1.0)]}, "point 0 at"),
+        ({"curve": CENTRE[None]}, "at least two"),
+        ({"kind": "stretched", "curve": CENTRE + [(0, 20, 0), (0, 40, 0.1)], "view": "left"}, "another view"),
+    ],
+)
+def test_bad_input_is_refused(device, arguments, says):
+    with pytest.raises(UsageError, match=says):
+        reformat_curve(**{"volume": next(grids()), "curve": centre_line(), "device": device, **arguments})

@@ -1,0 +1,264 @@
+"""Slices: voxels unchanged, analytic fields, numpy's slabs, the twin, slabs of large volumes."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from clrecon.errors import DeviceError, UsageError
+from clrecon.geometry import Volume
+from clrecon.geometry.camera import Camera
+from clrecon.geometry.sheets import find_plane, plane_sheet, slab_samples
+from clrecon.kernels import kernel_files, upload
+from clrecon.operators.reformat import cut_slice, reformat_curve
+from clrecon.operators.sheets import prepare_reformat, sample_sheet
+from clrecon.reference.reformat import reformat_sheet
+from tests import tolerances
+from tests.dicom_series import rotation
+from tests.geometry.test_uneven_volumes import uneven
+
+SHEARED = np.eye(4)
+SHEARED[:3, :3] = rotation((15.0, -25.0, 40.0)) @ [[0.7, 0.0, 0.1], [0.0, 0.5, -0.9], [0.0, 0.0, 2.5]]
+SHEARED[:3, 3] = (-120.0, 80.0, -700.0)
+
+
+def random_voxels(shape, dtype="int16", seed=1):
+    values = np.random.default_rng(seed).integers(0, 100, shape)
+    return values.astype(dtype)
+
+
+def camera_of_slice(volume, k, at=None) -> Camera:
+    """Pixel = voxel: looking along the slices' normal at slice k, rows to the right and columns downwards."""
+    ni, nj, _ = volume.shape_ijk
+    i_step, j_step = volume.affine[:3, 0], volume.affine[:3, 1]
+    middle = volume.ijk_to_lps([((ni - 1) / 2, (nj - 1) / 2, k) if at is None else at])[0]
+    normal = np.cross(i_step, j_step)
+    assert abs(i_step @ j_step) < 1e-9 and np.isclose(np.linalg.norm(i_step), np.linalg.norm(j_step))
+    scale = 0.5 * nj * float(np.linalg.norm(j_step))
+    return Camera(tuple(middle - normal), tuple(middle), tuple(-j_step), parallel_scale=scale)
+
+
+def even_volume(dtype="int16", angles=(0.0, 0.0, 0.0), spacing=(0.7, 0.7, 2.5), shape=(6, 8, 11), shear=0.0):
+    affine = np.eye(4)
+    affine[:3, :3] = rotation(angles) * spacing
+    affine[:3, 2] += shear * affine[:3, 1]
+    affine[:3, 3] = (-31.0, 17.5, 102.0)
+    return Volume(random_voxels(shape, dtype), affine)
+
+
+@pytest.mark.parametrize("dtype", ["int8", "uint8", "int16", "uint16", "int32", "float32"])
+@pytest.mark.parametrize("angles", [(0.0, 0.0, 0.0), (20.0, -35.0, 10.0)])
+@pytest.mark.parametrize("shear", [0.0, 0.8])
+def test_where_a_pixel_is_a_voxel_it_has_its_value(device, dtype, angles, shear):
+    volume = even_volume(dtype, angles, shear=shear)
+    for k in range(6):
+        cut = cut_slice(volume, camera_of_slice(volume, k), (11, 8), device)
+        assert np.array_equal(cut.values, volume.voxels[k].astype(np.float32))
+
+
+def test_the_other_axes_and_the_letters_of_anatomy(device):
+    """Axes along the patient: an axial slice has the left at the right, a sagittal one the front at the left."""
+    volume = Volume(random_voxels((6, 8, 12)), np.diag((1.0, 1.0, 1.0, 1.0)))
+    middle = volume.ijk_to_lps([(6.0, 4.0, 3.0)])[0]  # a voxel beside the middle: pixels lie on voxels
+    places = {"axial": (12, 8), "coronal": (12, 6), "sagittal": (8, 6)}
+    voxels = {"axial": volume.voxels[3], "coronal": volume.voxels[::-1, 4], "sagittal": volume.voxels[::-1, :, 6]}
+    for name, size in places.items():
+        camera = find_plane(volume, name, size, pixel_mm=1.0)
+        shift = (middle - camera.focal_point) @ camera.basis().forward
+        cut = cut_slice(volume, name, size, device, pixel_mm=1.0, offset_mm=float(shift))
+        assert np.array_equal(cut.values, voxels[name])
+        assert cut.report["pixel_mm"] == 1.0 and cut.mode == "slice"
+
+
+@pytest.mark.parametrize("make", [lambda v: Volume(v, SHEARED), uneven])
+def test_oblique_planes_through_a_linear_field_are_exact(device, make):
+    empty = make(np.zeros((6, 5, 4), np.float32))
+    slope = np.array([3.0, -2.0, 5.0])
+    k, j, i = np.indices((6, 5, 4)).reshape(3, -1)
+    field = (empty.ijk_to_lps(np.stack([i, j, k], axis=1)) - empty.affine[:3, 3]) @ slope
+    volume = empty.with_voxels(field.reshape(6, 5, 4).astype(np.float32))
+    for view in ((30.0, 20.0), "left", (-110.0, -45.0)):
+        cut = cut_slice(volume, view, (80, 60), device, offset_mm=0.2)
+        origins, directions = cut.camera.rays((80, 60))
+        points = origins + cut.depth[..., None] * directions
+        inner = np.isfinite(cut.depth)
+        ijk = volume.lps_to_ijk(points[inner])
+        within = ((ijk >= 0.0) & (ijk <= (3, 4, 5))).all(axis=1)
+        assert within.sum() > 50
+        truth = (points[inner] - empty.affine[:3, 3]) @ slope
+        assert np.abs(cut.values[inner] - truth)[within].max() <= tolerances.SLICE_LINEAR_FIELD_HU
+
+
+@pytest.mark.parametrize("combine", ["mean", "max", "min"])
+def test_slabs_along_an_axis_are_those_of_numpy(device, combine):
+    volume = even_volume(spacing=(0.7, 0.7, 0.7), shape=(9, 8, 11))
+    slices = volume.voxels[2:7].astype(np.float64)
+    weighted = (slices[1:] + slices[:-1]).sum(axis=0) / 8.0  # the integral of what is linear between slices
+    truth = {"mean": weighted, "max": slices.max(axis=0), "min": slices.min(axis=0)}[combine]
+    cut = cut_slice(volume, camera_of_slice(volume, 4), (11, 8), device, thickness=4 * 0.7, combine=combine)
+    assert cut.report["samples_a_pixel"] >= 9 and cut.report["sample_step_mm"] <= 0.35 + 1e-12
+    assert np.abs(cut.values - truth).max() <= (tolerances.SLAB_MEAN_HU if combine == "mean" else 0.0)
+
+
+def test_samples_beyond_the_volume_do_not_count(device):
+    volume = Volume(np.full((3, 8, 8), 70, np.int16), np.eye(4))
+    cut = cut_slice(volume, "axial", (12, 8), device, pixel_mm=1.0, thickness=20.0, background="transparent")
+    assert np.abs(cut.values[:, 2:10] - 70.0).max() <= tolerances.SLAB_MEAN_HU
+    assert np.isnan(cut.values[:, :2]).all() and np.isnan(cut.values[:, 10:]).all()
+    assert (cut.image[:, 2:10, 3] == 255).all() and (cut.image[:, :2, 3] == 0).all()
+    plain = cut_slice(volume, "axial", (12, 8), device, pixel_mm=1.0, thickness=20.0, background="white")
+    assert (plain.image[..., 3] == 255).all() and (plain.image[:, :2, :3] == 255).all()
+
+
+def test_voxels_without_weight_are_not_looked_at(device):
+    voxels = random_voxels((5, 4, 4), "float32")
+    voxels[3], voxels[2, 1], voxels[2, :, 2] = np.nan, np.nan, np.nan
+    volume = Volume(voxels, np.eye(4))
+    cut = cut_slice(volume, camera_of_slice(volume, 2), (4, 4), device)
+    assert np.array_equal(cut.values, voxels[2], equal_nan=True) and np.isfinite(cut.values).sum() == 9
+
+
+def uneven_aside(voxels) -> Volume:
+    """Slices that lie aside along rows and columns, no two layers alike."""
+    even = uneven(voxels)
+    aside = np.array([0.0, 0.9, -0.4, 1.7, 1.5, -1.1])[:, None] * even.affine[:3, 0]
+    return Volume(voxels, even.affine, slice_positions=even.slice_origins() + aside)
+
+
+def test_an_oblique_slice_equals_that_of_simpleitk(device):
+    """A third opinion: the same plane through the same grid, between the outer voxel centres."""
+    sitk = pytest.importorskip("SimpleITK")
+    volume = even_volume("float32", (20.0, -35.0, 10.0), (0.7, 0.5, 2.5), (12, 14, 16))
+    grid = sitk.GetImageFromArray(volume.voxels)
+    grid.SetSpacing(volume.spacing)
+    grid.SetOrigin(volume.affine[:3, 3].tolist())
+    grid.SetDirection((volume.affine[:3, :3] / volume.spacing).ravel().tolist())
+    cut = cut_slice(volume, (25.0, 40.0), (60, 50), device, zoom=1.5, offset_mm=0.7)
+    right, up, forward = cut.camera.basis()
+    pixel = cut.report["pixel_mm"]
+    first = cut.camera.focal_point + pixel * (-29.5 * right + 24.5 * up)
+    resampler = sitk.ResampleImageFilter()
+    resampler.SetSize((60, 50, 1))
+    resampler.SetOutputSpacing((pixel, pixel, 1.0))
+    resampler.SetOutputOrigin(first.tolist())
+    resampler.SetOutputDirection(np.stack([right, -up, forward], axis=1).ravel().tolist())
+    resampler.SetInterpolator(sitk.sitkLinear)
+    resampler.SetDefaultPixelValue(np.nan)
+    other = sitk.GetArrayFromImage(resampler.Execute(grid))[0]
+    origins, directions = cut.camera.rays((60, 50))
+    ijk = volume.lps_to_ijk((origins + cut.camera.distance * directions).reshape(-1, 3)).reshape(50, 60, 3)
+    within = ((ijk >= 0.0) & (ijk <= (15, 13, 11))).all(axis=2)
+    assert within.sum() > 300
+    assert np.abs(cut.values - other)[within].max() <= tolerances.TWIN_SLICE_HU
+
+
+VOLUMES = {
+    "sheared": lambda dtype: Volume(random_voxels((9, 7, 11), dtype), SHEARED),
+    "uneven": lambda dtype: uneven(random_voxels((6, 5, 4), dtype)),
+    "uneven aside": lambda dtype: uneven_aside(random_voxels((6, 5, 4), dtype)),
+    "uneven downwards": lambda dtype: uneven(random_voxels((6, 5, 4), dtype), -1.0),
+    "one slice": lambda dtype: Volume(random_voxels((1, 5, 4), dtype), SHEARED),
+    "one voxel": lambda dtype: Volume(random_voxels((1, 1, 1), dtype), SHEARED),
+}
+
+
+@pytest.mark.parametrize("name", VOLUMES)
+@pytest.mark.parametrize("dtype", ["int16", "uint8", "float32"])
+def test_the_device_equals_its_twin(device, name, dtype):
+    volume = VOLUMES[name](dtype)
+    for view, thickness, combine in [("axial", 0.0, "mean"), ((20.0, 30.0), 2.3, "max"), ("sagittal", 7.0, "mean"),
+                                     ((-75.0, 10.0), 3.0, "min")]:  # fmt: skip
+        sheet, _ = plane_sheet(find_plane(volume, view, (31, 33)), (31, 33), 0.1)
+        samples = slab_samples(volume, thickness)
+        expected = reformat_sheet(volume, sheet, samples, combine)
+        made = sample_sheet(device, volume, sheet, samples, combine)
+        assert np.array_equal(np.isnan(made.values), np.isnan(expected))
+        assert np.nanmax(np.abs(made.values - expected)) <= tolerances.TWIN_SLICE_HU
+        assert (~np.isnan(expected)).any()
+
+
+@pytest.mark.parametrize("name", ["sheared", "uneven aside", "uneven downwards"])
+@pytest.mark.parametrize("combine", ["mean", "max", "min"])
+def test_volumes_that_do_not_fit_go_through_in_slabs(device, name, combine):
+    volume = VOLUMES[name]("float32")
+    sheet, _ = plane_sheet(find_plane(volume, (20.0, 30.0), (23, 17)), (23, 17))
+    samples = slab_samples(volume, 3.0 if combine != "mean" else 0.0)
+    whole = sample_sheet(device, volume, sheet, samples, combine)
+    one = 4 * volume.voxels[0].size
+    others = whole.device_bytes - whole.slices * one
+    assert whole.slices >= 4
+    for slices in (2, 3, 4):
+        parts = sample_sheet(device, volume, sheet, samples, combine, memory=others + slices * one)
+        assert parts.slabs == 1 + -(-(whole.slices - slices) // (slices - 1))
+        assert np.array_equal(parts.values, whole.values, equal_nan=True)
+    thick = slab_samples(volume, 5.0)
+    mean = sample_sheet(device, volume, sheet, thick, "mean", memory=others + 2 * one)
+    truth = reformat_sheet(volume, sheet, thick, "mean")
+    assert np.array_equal(np.isnan(mean.values), np.isnan(truth))
+    assert np.nanmax(np.abs(mean.values - truth)) <= tolerances.TWIN_SLICE_HU
+    with pytest.raises(DeviceError, match="two slices at a time are too much"):
+        sample_sheet(device, volume, sheet, samples, combine, memory=others + 2 * one - 1)
+
+
+def test_only_slices_that_are_met_are_taken(device):
+    volume = Volume(random_voxels((50, 8, 8)), np.eye(4))
+    cut = cut_slice(volume, "axial", (8, 8), device, pixel_mm=1.0, memory=8000)
+    assert cut.report["device_bytes"] <= 8000 and cut.report["slabs"] == 1
+
+
+def test_a_volume_on_the_device_is_used_as_it_is(device):
+    volume = VOLUMES["sheared"]("int16")
+    expected = cut_slice(volume, (20.0, 30.0), (31, 20), device, thickness=2.0)
+    resident_d = upload(device, volume.voxels)
+    made = cut_slice(volume, (20.0, 30.0), (31, 20), device, thickness=2.0, voxels_d=resident_d)
+    assert np.array_equal(made.values, expected.values, equal_nan=True)
+
+
+def test_the_picture_runs_over_its_window(device):
+    volume = Volume(np.arange(4, dtype=np.int16).reshape(1, 1, 4) * 100, np.eye(4))
+    cut = cut_slice(volume, "axial", (4, 1), device, pixel_mm=1.0, window=(100, 300))
+    assert cut.image[0, :, 0].tolist() == [0, 0, 128, 255]
+    assert cut.report["window_hu"] == [100.0, 300.0]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        ({"plane": "diagonal"}, "axial, coronal, sagittal"),
+        ({"size": (0, 5)}, "size"),
+        ({"size": (5, 10**6)}, "size"),
+        ({"thickness": -1.0}, "thickness"),
+        ({"thickness": np.nan}, "thickness"),
+        ({"thickness": 1e9}, "beyond every scan"),
+        ({"combine": "median"}, "mean, max, min"),
+        ({"window": (300, 200)}, "window"),
+        ({"offset_mm": 400.0}, "misses the volume, which lies -40[0-9.]+ to -39[0-9.]+ mm"),
+        ({"offset_mm": np.inf}, "offset"),
+        ({"pixel_mm": 0.0}, "size of a pixel"),
+        ({"memory": 0}, "memory"),
+    ],
+)
+def test_bad_input_is_refused(device, arguments, says):
+    volume = even_volume()
+    with pytest.raises(UsageError, match=says):
+        cut_slice(volume, **{"plane": "axial", "size": (8, 8), "device": device, **arguments})
+
+
+def test_the_kernel_file_builds_alone(device):
+    assert "render/reformat.cl" in kernel_files()
+    for unevenly in (False, True):
+        assert prepare_reformat(device, np.int16, unevenly).kernel_names == ["reformat_rows"]
+
+
+@pytest.mark.oclgrind
+def test_reformations_stay_within_their_buffers(device):
+    for name in ("sheared", "uneven", "one slice"):
+        volume = VOLUMES[name]("int16")
+        sheet, _ = plane_sheet(find_plane(volume, (20.0, 30.0), (9, 8)), (9, 8))
+        samples = slab_samples(volume, 2.0)
+        made = sample_sheet(device, volume, sheet, samples, "mean")
+        truth = reformat_sheet(volume, sheet, samples, "mean")
+        assert np.nanmax(np.abs(made.values - truth)) <= tolerances.TWIN_SLICE_HU
+    line = [(0.0, 0.0, 0.5), (2.0, 1.0, 4.0)]
+    bent = reformat_curve(Volume(random_voxels((6, 5, 4)), np.eye(4)), line, "stretched", (7, 9), device, view="left")
+    assert np.isfinite(bent.values).any()
