@@ -110,18 +110,19 @@ def test_depths_are_those_of_the_extracted_mesh_caps_included(cast, steps, dtype
 
 
 def test_a_full_volume_is_closed_half_way_to_the_air_around_it(cast):
-    """Voxels of 976 HU in air of -1024: at 400 HU the surface lies 0.288 of a step beyond the outermost centres."""
+    """Voxels of 976 HU in air of -1024: the surface lies 0.288 or 0.888 of a step beyond the outermost centres."""
     spacing = np.array([0.7, 0.5, 2.5])
     volume = Volume(np.full((4, 5, 6), 976, np.float32), np.diag([*spacing, 1.0]))
-    beyond = (976.0 - 400.0) / 2000.0
     for axis, (towards, up) in enumerate([((1, 0, 0), (0, 0, 1)), ((0, 1, 0), (0, 0, 1)), ((0, 0, 1), (0, 1, 0))]):
         # Outside is the volume's lowest value where that is above air: a voxel of air makes it air.
         voxels = volume.voxels.copy()
         voxels[-1, -1, -1] = -2000.0
         camera = look(volume, towards, 0.2, up=up, distance=50.0)
-        shot = cast(volume.with_voxels(voxels), "surface", iso_value=400.0, camera=camera, size=(4, 4))
-        truth = 50.0 - (0.5 * (volume.shape_ijk[axis] - 1) + beyond) * spacing[axis]
-        assert np.abs(shot.depth - truth).max() <= 2e-3 * spacing[axis]
+        for iso_value in (400.0, -800.0):
+            shot = cast(volume.with_voxels(voxels), "surface", iso_value=iso_value, camera=camera, size=(4, 4))
+            beyond = (976.0 - iso_value) / 2000.0
+            truth = 50.0 - (0.5 * (volume.shape_ijk[axis] - 1) + beyond) * spacing[axis]
+            assert np.abs(shot.depth - truth).max() <= 2e-3 * spacing[axis]
 
 
 def test_a_clip_plane_through_it_is_capped(cast):
@@ -142,7 +143,7 @@ def test_a_clip_plane_through_it_is_capped(cast):
 
 
 def test_a_camera_inside_sees_its_own_cap(cast):
-    volume = even_volume(lambda p: np.full(len(p), 500.0), "even", 12.0, np.int16)
+    volume = even_volume(lambda p: 500.0 + 20.0 * p[:, 0], "even", 12.0, np.int16)  # its gradient lies across the view
     centre = centre_of(volume)
     camera = Camera(tuple(centre), tuple(centre + (0.0, 1.0, 0.0)), (0, 0, 1), view_angle=40.0)
     shot = cast(volume, "surface", iso_value=300.0, camera=camera, size=(8, 8), lighting=MATT)
