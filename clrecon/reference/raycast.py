@@ -25,7 +25,7 @@ __all__ = ["FLAT_GRADIENT", "MODES", "OPAQUE", "TABLE_NODES", "RayPicture", "cas
 MODES = ("dvr", "mip", "minip", "mean")
 
 TABLE_NODES = 4096
-"""Of the transfer function from its first to its last point."""
+"""Entries of the table of a transfer function."""
 
 OPAQUE = 0.99
 """A ray ends at the sample that makes it so opaque."""
@@ -36,8 +36,11 @@ VISIBLE = 1.0 / 255.0
 FLAT_GRADIENT = 1e-6
 """HU per mm; below, a gradient has no direction."""
 
-PLANE_SLACK = 1e-4
-"""Of a sample between two slice planes: a step that divides their distance up to rounding counts as dividing it."""
+PART_SLACK = 1e-3
+"""Of a sample: a step that divides the distance of slice planes but for rounding divides it."""
+
+PLANE_SLACK = 1.0 / 4096.0
+"""Of a sample: a plane that lies before the first or behind the last place but for rounding lies within."""
 
 
 @dataclass
@@ -106,7 +109,7 @@ def cast_rays(
     The field is trilinear between voxel centres; half a voxel beyond the outermost ones has their values.  A ray is
     cut into segments of `ray_step` from where it enters the volume or what the clip planes leave of it, the last
     segment ends where it leaves; there is a sample in the middle of each segment, or with jitter at a part of it that
-    depends on the pixel alone.
+    depends on the pixel alone.  A mean is the integral along the ray by its length.
 
     Parameters
     ----------
@@ -124,7 +127,7 @@ def cast_rays(
     mode : {"dvr", "mip", "minip", "mean"}
         Compositing; highest, lowest, mean value along the ray.
     jitter : bool
-        Without effect on mip and minip, whose samples lie on the slice planes.
+        In dvr; extremes have their samples on slice planes, and means in the middles of segments.
 
     Returns
     -------
@@ -146,7 +149,7 @@ def cast_rays(
             raise UsageError("dvr needs a transfer function")
         found = _composite(rays, transfer_function, lighting, step, part)
     elif mode == "mean":
-        found = _integrate(rays, step, part)
+        found = _integrate(rays, step)
     else:
         found = _find_extreme(rays, step, 1.0 if mode == "mip" else -1.0)
     shape = (height, width)
@@ -163,12 +166,10 @@ Found = tuple[Float64Array, Float64Array, Float64Array, Float64Array]
 def look_up(transfer_function: TransferFunction, hu: Float64Array) -> Float64Array:
     """Red, green, blue, opacity (n, 4) as the device's table has them, float64 of float32.
 
-    Of `TABLE_NODES` HU evenly from the first point to the last, both included, the nearest counts.  The first and the
-    last node are those points as they are, for all that lies beyond them, even where the function has a step there.
+    Of `TABLE_NODES` HU evenly over the function's range, both ends included, the nearest counts.
     """
     low, high = transfer_function.range_hu
     nodes = transfer_function.table(low, high, TABLE_NODES).astype(np.float64)
-    nodes[0], nodes[-1] = transfer_function.points[0, 1:], transfer_function.points[-1, 1:]
     number = np.floor((hu - low) * ((TABLE_NODES - 1) / (high - low)) + 0.5)
     return np.asarray(nodes[np.clip(number, 0, TABLE_NODES - 1).astype(np.int64)])
 
@@ -203,7 +204,6 @@ def _composite(
     rays: _Rays, transfer_function: TransferFunction, lighting: Lighting | None, step: float, part: Float64Array
 ) -> Found:
     voxels = rays.volume.voxels
-    levoy = transfer_function.gradient_opacity
     gradients = voxel_gradients(voxels, slice_normal_matrices(rays.volume, 0))
     rgba = np.zeros((rays.count, 4))
     depth, weighted = np.full(rays.count, np.nan), np.zeros(rays.count)
@@ -215,8 +215,7 @@ def _composite(
         ray, t, length = ray[seen], t[seen], length[seen]
         ijk, colour, opacity = ijk[seen], colour[seen], opacity[seen]
         slope = sample_field(gradients, ijk)
-        if levoy is not None:
-            opacity = opacity * np.interp(np.linalg.norm(slope, axis=1), levoy[:, 0], levoy[:, 1])
+        opacity = opacity * transfer_function.gradient_factor(np.linalg.norm(slope, axis=1))
         if lighting is not None:
             colour = shade(colour, slope, rays.directions[ray], lighting)
         opacity = 1.0 - (1.0 - opacity) ** (length / transfer_function.unit_distance)
@@ -246,9 +245,9 @@ def _segments(
         yield ray, start + part[ray] * length, length
 
 
-def _integrate(rays: _Rays, step: float, part: Float64Array) -> Found:
+def _integrate(rays: _Rays, step: float) -> Found:
     total, way = np.zeros(rays.count), np.zeros(rays.count)
-    for ray, t, length in _segments(rays, step, part, np.zeros(rays.count)):
+    for ray, t, length in _segments(rays, step, np.full(rays.count, 0.5), np.zeros(rays.count)):
         ijk, there = rays.places(ray, t)
         total[ray] += np.where(there, length * sample_field(rays.volume.voxels, ijk), 0.0)
         way[ray] += np.where(there, length, 0.0)
@@ -284,7 +283,7 @@ def _plane_samples(rays: _Rays, step: float) -> Iterator[tuple[NDArray[np.int64]
     axis = np.abs(rates).argmax(axis=1)[:, None]
     rate = np.take_along_axis(rates, axis, axis=1)[:, 0]
     start = np.take_along_axis(rays.origins @ inverse[:3, :3].T + inverse[:3, 3], axis, axis=1)[:, 0]
-    parts = np.maximum(np.ceil(1.0 / (np.abs(rate) * step) - PLANE_SLACK), 1.0)
+    parts = np.maximum(np.ceil(1.0 / (np.abs(rate) * step) - PART_SLACK), 1.0)
     spacing = 1.0 / (np.abs(rate) * parts)
     t_of_plane_0 = -start / rate
     valid = rays.t_out > rays.t_in

@@ -15,14 +15,13 @@ from clrecon.geometry import Volume
 from clrecon.geometry.camera import Camera
 from clrecon.reference.raycast import cast_rays
 from clrecon.reference.surface_rays import cast_surface
-from clrecon.rendering import Lighting, TransferFunction
+from clrecon.rendering import UNSHADED, Lighting, TransferFunction
 from tests.dicom_series import rotation
 
 TURN = rotation((15.0, -25.0, 40.0))
 PLACE = np.array([40.0, -90.0, -600.0])
-UNLIT = Lighting(ambient=1.0, diffuse=0.0, specular=0.0)
 DEVICE_FILES = {"dvr": "composite.cl", "surface": "surface.cl"}
-DEVICE_RENDERS = importlib.util.find_spec("clrecon.operators.render") is not None
+DEVICE_RENDERS = importlib.util.find_spec("clrecon.operators.renderer") is not None
 
 STEPS = {
     "even": np.diag([0.9, 0.9, 0.9]),
@@ -168,7 +167,7 @@ class TwinCaster:
         *,
         iso_value: float | None = None,
         shadows: bool = False,
-        lighting: Lighting | None = UNLIT,
+        lighting: Lighting | None = UNSHADED,
         **settings: Any,
     ) -> Shot:
         if mode == "surface":
@@ -184,8 +183,8 @@ class DeviceCaster:
     def __init__(self, device: Any):
         self.device = device
 
-    def __call__(self, volume: Volume, mode: str = "dvr", *args: Any, lighting=UNLIT, **settings: Any) -> Shot:
-        from clrecon.operators.render import render
+    def __call__(self, volume: Volume, mode: str = "dvr", *args: Any, lighting=UNSHADED, **settings: Any) -> Shot:
+        from clrecon.operators.renderer import render
 
         names = dict(zip(("transfer_function",), args, strict=False))
         found = render(

@@ -14,7 +14,6 @@ from tests.operators.raycast_scenes import (
     GAPS,
     PLACE,
     STEPS,
-    UNLIT,
     ball,
     blobs,
     casters,
@@ -160,6 +159,19 @@ def test_clipping_everything_away_leaves_nothing(cast):
     assert not shot.image.any() and np.isnan(shot.depth).all() and np.isnan(shot.expected_depth).all()
 
 
+def test_jitter_is_the_same_each_time_and_right_on_average(cast):
+    """Sheets of fog that a coarse step meets or misses: opacities differ, and are right together."""
+    volume = even_volume(lambda p: 400.0 + 300.0 * np.sin(1.3 * p[:, 1]), "even", 20.0)
+    fog = TransferFunction([(300, 1, 1, 1, 0.0), (700, 1, 1, 1, 0.1)])
+    settings = {"camera": look(volume, (0.0, 1.0, 0.0), 8.0), "size": (64, 64), "ray_step": 1.5}
+    first, again = (cast(volume, "dvr", fog, jitter=True, **settings).image[..., 3].astype(float) for _ in range(2))
+    plain = cast(volume, "dvr", fog, **settings).image[..., 3].astype(float)
+    fine = cast(volume, "dvr", fog, **settings | {"ray_step": 0.05}).image[..., 3].astype(float)
+    assert np.array_equal(first, again)
+    assert plain.std() < 0.5 < first.std()
+    assert abs(first.mean() - fine.mean()) <= 4.0 * first.std() / 64.0 + 0.5
+
+
 def test_nearer_is_larger_as_much_as_the_angle_says(cast):
     radius, size = 10.0, (64, 64)
     volume = even_volume(lambda p: 300.0 + 100.0 * (radius - np.linalg.norm(p, axis=1)), "even", 23.0)
@@ -212,8 +224,12 @@ def test_uneven_and_even_samplings_of_one_field_look_alike(cast):
     even = Volume(even.voxels, affine)
     soft = TransferFunction([(100, 1, 0.5, 0.3, 0.0), (800, 1, 1, 0.9, 0.3)])
     camera = look(uneven, (0.4, 1.0, 0.5), 14.0)
-    settings = {"camera": camera, "size": (40, 40), "ray_step": 0.4, "lighting": None}
-    images = [cast(volume, "dvr", soft, **settings | {"lighting": UNLIT}).image for volume in (uneven, even)]
+    settings = {
+        "camera": camera,
+        "size": (40, 40),
+        "ray_step": 0.4,
+    }
+    images = [cast(volume, "dvr", soft, **settings).image for volume in (uneven, even)]
     assert np.abs(images[0][..., 3].astype(int) - images[1][..., 3]).max() <= tolerances.RAY_RESAMPLED_255
     assert images[0][..., 3].max() > 150
 
