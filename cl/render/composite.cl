@@ -25,11 +25,12 @@ typedef struct {
     float first_hit, sum; /* t of the first hit, negative before; sum of t, weighted */
 } sight;
 
-/* A ray in samples: sample n lies at start + n * stride, at t = t_in + (n + phase) * ray_step. */
+/* A ray in samples: sample n lies at start + n * stride, at t = t_in + (n + phase) * ray_step.  The last segment is what
+ * is left of the way: its length is `rest`, and its sample has the number `last`, a fraction. */
 typedef struct {
     float4 start, stride;
     float3 direction;
-    float t_in, phase, offset, rest; /* rest: length of the last segment */
+    float t_in, phase, offset, rest, last;
     int end, segments;
 } sampled_ray;
 
@@ -49,12 +50,9 @@ static inline void add_sample(
     const field *f, const looks *look, const sampled_ray *r, const int n, const int node, const float opacity, sight *seen)
 {
     const float4 color = look->colors[node];
-    float a = opacity, t = r->t_in + ((float)n + r->phase) * look->ray_step;
-    float4 at = r->start + (float)n * r->stride;
-    if (n == r->segments - 1) { /* what is left of the way is less than a step */
-        a = 1.0f - exp2(color.w * (r->rest / look->ray_step));
-        t = r->t_in + (float)n * look->ray_step + r->phase * r->rest;
-    }
+    const float number = min((float)n, r->last), t = r->t_in + (number + r->phase) * look->ray_step;
+    const float4 at = r->start + number * r->stride;
+    const float a = n == r->segments - 1 ? 1.0f - exp2(color.w * (r->rest / look->ray_step)) : opacity;
     float3 rgb = color.xyz;
     if (look->shaded) {
         float4 below, above;
@@ -78,7 +76,7 @@ static inline int follow_ray(
 {
     const float4 start = r->start, stride = r->stride;
     do {
-        const floats number = (float)n + LANE_NUMBERS;
+        const floats number = min((float)n + LANE_NUMBERS, (floats)(r->last));
         const floats k = start.z + number * stride.z;
         const floats value = sample_lanes(f, start.x + number * stride.x, start.y + number * stride.y, k);
         const floats place = (value - look->low) * look->scale + 0.5f;
@@ -158,6 +156,7 @@ __kernel void composite_rays(
             const float span = way.t_out - way.t_in;
             r->segments = span > 0.0f ? (int)ceil(span / look.ray_step) : 0;
             r->rest = span - (float)(r->segments - 1) * look.ray_step;
+            r->last = (float)(r->segments - 1) - phase * (1.0f - r->rest / look.ray_step);
             r->t_in = way.t_in;
             r->offset = way.offset;
             r->direction = way.direction;
