@@ -180,7 +180,7 @@ def shade(
     """Phong's shading of colours (n, 3) with gradients (n, 3) as normals, seen along directions (n, 3).
 
     A gradient of no size has no direction: its colour has all of the diffuse light and no highlight.  `lit` 0 is in
-    shadow: ambient light alone.
+    shadow: ambient light alone.  What goes beyond 1 is cut.
     """
     magnitude = np.linalg.norm(gradients, axis=1)
     flat = magnitude < FLAT_GRADIENT
@@ -197,7 +197,7 @@ def shade(
     highlight = np.where(flat, 0.0, np.abs((normals * half_way).sum(axis=1)) ** lighting.specular_power)
     share = np.broadcast_to(np.asarray(lit, dtype=np.float64), magnitude.shape)
     light = lighting.ambient + share * lighting.diffuse * diffuse
-    return colours * light[:, None] + (share * lighting.specular * highlight)[:, None]
+    return np.minimum(colours * light[:, None] + (share * lighting.specular * highlight)[:, None], 1.0)
 
 
 def _composite(

@@ -17,7 +17,7 @@ from tests.operators.raycast_scenes import (
     premultiplied,
     uneven_volume,
 )
-from tests.operators.test_raycast_devices import SIZE, SOFT
+from tests.operators.test_raycast_devices import SOFT
 
 pytestmark = pytest.mark.skipif(not DEVICE_RENDERS, reason="the raycaster of devices is not there")
 
@@ -27,7 +27,7 @@ pytestmark = pytest.mark.skipif(not DEVICE_RENDERS, reason="the raycaster of dev
 @pytest.mark.parametrize("even", [True, False])
 def test_slabs_give_the_picture_of_the_whole(device, mode, towards, even):
     volume = even_volume(blobs, "oblique", 30.0, np.int16) if even else uneven_volume(blobs)
-    settings = {"mode": mode, "camera": look(volume, towards, 16.0, perspective=True), "size": SIZE}
+    settings = {"mode": mode, "camera": look(volume, towards, 16.0, perspective=True), "size": (32, 24)}
     if mode == "dvr":
         settings |= {"transfer_function": SOFT, "lighting": Lighting()}
     whole, parts = (

@@ -131,8 +131,8 @@ def test_extremes_stay_within_the_values_and_around_the_mean(cast, steps):
     slack = tolerances.RAY_AXIS_HU
     assert high.values[hit].max() <= volume.voxels.max() + slack
     assert low.values[hit].min() >= volume.voxels.min() - slack
-    assert (high.values[hit] >= mean.values[hit] - slack).mean() > 0.99  # a corner cut short has other samples
-    assert (low.values[hit] <= mean.values[hit] + slack).mean() > 0.99
+    through = ways_through(volume, camera, (48, 40)) > 3.0  # a corner cut short may have a single sample
+    assert (high.values >= mean.values - slack)[through].all() and (low.values <= mean.values + slack)[through].all()
     assert np.nanmean(high.values - mean.values) > 500.0
 
 
