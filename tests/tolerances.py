@@ -88,6 +88,24 @@ DEVICE_ISO_VERTEX_VOXEL = (
 REFINED_TORUS_VOLUME = 0.03  # partial volume takes 1.2 % off so thin a torus, the gate on refinement 0.5 %
 ISO_SPHERE_SAGITTA_MM = 0.025  # between samples 0.7, 0.5 and 0.9 mm apart a sphere of 8 mm sags sum(h^2) / 8 R
 
+# --- rays ---
+RAY_CHORD = 0.005  # the bar; linear interpolation takes h^2 / 12 of the curvature of a ball: measured 0.0026
+RAY_AXIS_HU = 0.05  # float32 indices of some 100 voxels, 1e-5 of a step, times steps of up to 3000 HU between voxels
+RAY_TIP_VOXEL = 0.5  # a highest value that is flat along the ray, linear between voxels: measured 0.32
+RAY_OPACITY = 0.5 / 255 + 5e-4  # 8 bits; chords of some 10 mm in float32
+RAY_ROUNDING = 0.1  # of 255: what rounding two pictures to 8 bits leaves of their distance
+RAY_SILHOUETTE_VOXEL = 0.08  # a ball of 5 to 10 voxels sags by h^2 / 8 R = 1/40 of a voxel along each axis
+RAY_DEPTH_VOXEL = 0.1  # the bar; measured 0.053 on balls, where the field between voxels sags
+RAY_DISC_AREA = 0.005  # pixels of a disc of 20 on a grid: measured 0.001
+RAY_RESAMPLED_255 = 4  # two samplings of one smooth field, 1.9 mm at most: measured 3
+RAY_SAME_255 = 1  # rounding to 8 bits the other way
+RAY_OUTLINE_SHARE = 0.02  # of pixels: at outlines triangles and the trilinear field between voxels are hit or missed
+RAY_TWIN_SHARE = 0.005  # of pixels: float32 takes the other side of a step of the table, or of the volume's edge
+RAY_TWIN_WORST_255 = 40  # such a pixel gains or loses one sample
+RAY_TWIN_HU = 0.5  # float32 indices of some 100 voxels, steps of 2500 HU between neighbours
+RAY_TWIN_DEPTH_MM = 0.01  # depths of some 200 mm in float32, and sums of 100 of them
+RAY_TWIN_DEPTH_SHARE = 0.02  # of pixels: the first hit may be a sample on
+
 # --- pipeline and command line ---
 PHANTOM_SPHERE_VOLUME_SHARE = 0.01  # sphere of about 12 mm in voxels of 0.5 x 0.7 x 1 mm: measured -0.34 %
 CLI_SPHERE_VOLUME_SHARE = 0.02  # sphere of 9 mm in voxels of 0.8 x 1.1 x 1.5 mm, its edge a ramp of 1 mm

@@ -57,7 +57,8 @@ static inline int2 find_pixel(const uint index, const uint width, const uint hei
     const uint columns = (width + TILE - 1) / TILE, rows = (height + TILE - 1) / TILE;
     const uint share = (columns * rows + queues - 1) / queues;
     const uint place = index / (TILE * TILE), pixel = index % (TILE * TILE);
-    const uint tile = place % share * queues + place / share;
+    /* Work-items beyond the last tile have a pixel below the picture: none is done twice. */
+    const uint tile = place < share * queues ? place % share * queues + place / share : columns * rows;
     return (int2)((int)(tile % columns * TILE + pixel % TILE), (int)(tile / columns * TILE + pixel / TILE));
 }
 

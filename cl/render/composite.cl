@@ -27,9 +27,10 @@ typedef struct {
     floats red, green, blue, opacity, first_hit, sum;
 } sights;
 
-/* Rays in samples: number n is at t = t_in + (n + phase) * ray_step, the last in the middle of what is left. */
+/* Rays in samples: number n is at t = t_in + (n + phase) * ray_step.  The last segment, number `last`, is what is left
+ * of the way: its length is `rest`, and its sample has the number `last_number`, a fraction. */
 typedef struct {
-    floats t_in, phase, offset, last, rest; /* last: number of the last sample; rest: length of its segment */
+    floats t_in, phase, offset, last, last_number, rest;
     floats begin, end; /* samples that can show */
     floats toward_x, toward_y, toward_z; /* unit direction, LPS */
 } packet;
@@ -84,12 +85,10 @@ static inline void blend_samples(const field *f, const slice_stack *stack, const
             find_light(look->view, look->highlights, x, y, z, rays->toward_x, rays->toward_y, rays->toward_z, &share,
                 &highlight);
     }
-    floats t = rays->t_in + (n + rays->phase) * look->ray_step;
+    const floats t = rays->t_in + (min((floats)(n), rays->last_number) + rays->phase) * look->ray_step;
     const ints cut = (rays->last == n) & (opacity > 0.0f);
-    if (ANY_LANE(cut)) {
+    if (ANY_LANE(cut))
         opacity = choose(cut, stretch_opacity(opacity, rays->rest / look->ray_step), opacity);
-        t = choose(cut, rays->t_in + n * look->ray_step + rays->phase * rays->rest, t);
-    }
     const ints color = (ints)(GATHER(int, look->colors, node));
     const floats weight = (1.0f - seen->opacity) * opacity;
     const floats unit = 1.0f / 1023.0f;
@@ -145,7 +144,7 @@ __kernel void composite_rays(
     seen.red = seen.green = seen.blue = seen.opacity = seen.sum = 0.0f;
     seen.first_hit = -1.0f;
     {
-        float lane_of[17][LANES];
+        float lane_of[16][LANES];
         float state_of[6][LANES];
         for (int lane = 0; lane < LANES; ++lane) {
             const int2 pixel = find_pixel(first_pixel + lane, width, height, queues);
@@ -197,6 +196,7 @@ __kernel void composite_rays(
         rays.offset = load_lanes(lane_of[8]);
         rays.last = load_lanes(lane_of[9]);
         rays.rest = load_lanes(lane_of[10]);
+        rays.last_number = rays.last - rays.phase * (1.0f - rays.rest / ray_step);
         rays.begin = load_lanes(lane_of[11]);
         rays.end = load_lanes(lane_of[12]);
         rays.toward_x = load_lanes(lane_of[13]);
@@ -221,8 +221,9 @@ __kernel void composite_rays(
             continue;
         }
         for (int sample = 0; sample < SAMPLES_A_LOOK; ++sample, n += 1.0f) {
-            floats i = course.start_i + n * course.stride_i, j = course.start_j + n * course.stride_j;
-            floats k = course.start_k + n * course.stride_k;
+            const floats number = min((floats)(n), rays.last_number);
+            floats i = course.start_i + number * course.stride_i, j = course.start_j + number * course.stride_j;
+            floats k = course.start_k + number * course.stride_k;
             to_indices(&stack, &i, &j, &k);
             const floats value = sample_lanes(&f, i, j, k);
             const floats place = (value - look.low) * look.scale + 0.5f;

@@ -15,10 +15,11 @@
 
 #define SNAP 4096.0f /* parts of a voxel: what rounding moves a sample off a voxel is less, and does not count */
 
-/* Samples of an extreme: sample n lies where the axis' index is (first + n * toward) / parts. */
+/* Samples of an extreme: sample n lies where the axis' index is (first + n * toward) / parts.  A way so short that none
+ * falls into it (a thin slab between clip planes, a corner of the volume) has one in its middle: `between`. */
 typedef struct {
     int axis, toward, parts;
-    int first, count;
+    int first, count, between;
     float origin, step; /* of the ray, along the axis */
 } crossings;
 
@@ -36,7 +37,9 @@ static inline void plan_crossings(const ray *r, const float ray_step, crossings 
     const float from = (c->origin + r->t_in * c->step) * parts, to = (c->origin + r->t_out * c->step) * parts;
     c->first = c->toward > 0 ? (int)ceil(from - slack) : (int)floor(from + slack);
     const int last = c->toward > 0 ? (int)floor(to + slack) : (int)ceil(to - slack);
-    c->count = r->t_out > r->t_in ? max((last - c->first) * c->toward + 1, 0) : 0;
+    const int found = (last - c->first) * c->toward + 1;
+    c->between = found < 1;
+    c->count = r->t_out > r->t_in ? max(found, 1) : 0;
 }
 
 /* Parameters  voxels   in   (slices, nj, ni)
@@ -88,7 +91,7 @@ __kernel void project_rays(
             t = r.t_in + from + 0.5f * weight;
         } else {
             const floats along = ((float)c.first + number * (float)c.toward) / (float)c.parts;
-            t = (along - c.origin) / c.step;
+            t = c.between ? (floats)(0.5f * (r.t_in + r.t_out)) : (along - c.origin) / c.step;
             weight = choose(number < (float)count, (floats)(1.0f), (floats)(0.0f));
         }
         floats i = r.origin.x + t * r.step.x, j = r.origin.y + t * r.step.y, k = r.origin.z + t * r.step.z;

@@ -107,6 +107,9 @@ class VolumeRenderer:
     ) -> Rendering:
         """Make one picture, see `render`."""
         size = checked_size(size)
+        for what, value, kind in (("camera", camera, Camera), ("lighting", lighting, Lighting), ("clip", clip, Clip)):
+            if not (value is None or isinstance(value, kind)):
+                raise UsageError(f"the {what} of a picture is a {kind.__name__} or None, not {value!r:.60}")
         request = _Request.of(mode, preset, transfer_function, lighting, window)
         if camera is None:
             camera = Camera.fit(self.volume, view, zoom, up=up, view_angle=view_angle, size=size)

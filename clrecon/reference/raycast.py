@@ -1,0 +1,297 @@
+"""Twin of the raycaster: dvr, mip, minip and mean in plain numpy, in float64, a sample of all rays at a time.
+
+References: Levoy 1988, "Display of surfaces from volume data" (compositing front to back, gradient opacity); Phong
+1975 (shading, see `clrecon.rendering.lighting`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from clrecon.errors import UsageError
+from clrecon.geometry import Volume
+from clrecon.geometry.affine import Float64Array
+from clrecon.geometry.camera import Camera
+from clrecon.geometry.field import slice_normal_matrices
+from clrecon.reference.rays import Planes, box_of, find_interval, jitter_pixels, sample_field, voxel_gradients
+from clrecon.rendering import Lighting, TransferFunction
+
+__all__ = ["FLAT_GRADIENT", "MODES", "OPAQUE", "TABLE_NODES", "RayPicture", "cast_rays", "look_up", "shade"]
+
+MODES = ("dvr", "mip", "minip", "mean")
+
+TABLE_NODES = 4096
+"""Entries of the table of a transfer function."""
+
+OPAQUE = 0.99
+"""A ray ends at the sample that makes it so opaque."""
+
+VISIBLE = 1.0 / 255.0
+"""The first hit is the sample after which a ray is more opaque than this."""
+
+FLAT_GRADIENT = 1e-6
+"""HU per mm; below, a gradient has no direction."""
+
+PART_SLACK = 1e-3
+"""Of a sample: a step that divides the distance of slice planes but for rounding divides it."""
+
+PLANE_SLACK = 1.0 / 4096.0
+"""Of a sample: a plane that lies before the first or behind the last place but for rounding lies within."""
+
+
+@dataclass
+class RayPicture:
+    """What rays bring back.
+
+    Attributes
+    ----------
+    rgba : ndarray, shape (h, w, 4), float64
+        Colours times opacity, and opacity; zero for modes that show values.
+    depth : ndarray, shape (h, w), float64
+        First hit, mm along the ray; NaN where nothing is hit.  In mip and minip where the value first is; none in mean.
+    expected_depth : ndarray, shape (h, w), float64
+        Mean depth weighted with what each sample adds to the opacity; that of the value in mip and minip.
+    values : ndarray, shape (h, w), float64
+        HU in mip, minip and mean, NaN outside of the volume; NaN everywhere in dvr.
+    """
+
+    rgba: Float64Array
+    depth: Float64Array
+    expected_depth: Float64Array
+    values: Float64Array
+
+    def image(self) -> NDArray[np.uint8]:
+        """Red, green, blue, opacity, not premultiplied, as in `clrecon.Rendering.image`: shape (h, w, 4), uint8."""
+        opacity = self.rgba[..., 3:]
+        colour = np.divide(self.rgba[..., :3], opacity, out=np.zeros_like(self.rgba[..., :3]), where=opacity > 0)
+        straight = np.concatenate([colour, opacity], axis=-1)
+        return np.floor(255.0 * np.clip(straight, 0.0, 1.0) + 0.5).astype(np.uint8)
+
+
+class _Rays:
+    """The rays of a picture, one after the other, with their way through a volume."""
+
+    def __init__(self, volume: Volume, camera: Camera, size: Sequence[int], clip: Planes | None):
+        origins, directions = camera.rays(size)
+        self.volume = volume
+        self.origins, self.directions = origins.reshape(-1, 3), directions.reshape(-1, 3)
+        self.count = len(self.origins)
+        nearest = -np.inf if camera.is_parallel else 0.0
+        self.t_in, self.t_out, _ = find_interval(self.origins, self.directions, box_of(volume), clip, nearest)
+        self.last_ijk = np.array(volume.shape_ijk) - 1.0
+
+    def places(self, ray: NDArray[np.int64], t: Float64Array) -> tuple[Float64Array, NDArray[np.bool_]]:
+        """Index coordinates at t of rays, and which of them lie in their slice (all of them in an even stack)."""
+        ijk = self.volume.lps_to_ijk(self.origins[ray] + t[:, None] * self.directions[ray])
+        if not self.volume.uneven:
+            return ijk, np.ones(len(ijk), dtype=bool)
+        in_slice = (ijk[:, :2] >= -0.5) & (ijk[:, :2] <= self.last_ijk[:2] + 0.5)
+        return ijk, np.asarray(in_slice.all(axis=1))
+
+
+def cast_rays(
+    volume: Volume,
+    transfer_function: TransferFunction | None,
+    camera: Camera,
+    size: Sequence[int],
+    ray_step: float | None = None,
+    lighting: Lighting | None = None,
+    clip: Planes | None = None,
+    mode: str = "dvr",
+    jitter: bool = False,
+) -> RayPicture:
+    """Send a ray through each pixel.
+
+    The field is trilinear between voxel centres; half a voxel beyond the outermost ones has their values.  A ray is
+    cut into segments of `ray_step` from where it enters the volume or what the clip planes leave of it, the last
+    segment ends where it leaves; there is a sample in the middle of each segment, or with jitter at a part of it that
+    depends on the pixel alone.  A mean is the integral along the ray by its length.
+
+    Parameters
+    ----------
+    volume : Volume
+    transfer_function : TransferFunction or None
+        For dvr.
+    camera : Camera
+    size : (int, int)
+        Width and height of the picture.
+    ray_step : float, optional
+        Mm; default half the smallest spacing.
+    lighting : Lighting, optional
+        None leaves colours as they are.
+    clip : Clip, optional
+    mode : {"dvr", "mip", "minip", "mean"}
+        Compositing; highest, lowest, mean value along the ray.
+    jitter : bool
+        In dvr; extremes have their samples on slice planes, and means in the middles of segments.
+
+    Returns
+    -------
+    RayPicture
+
+    Raises
+    ------
+    UsageError
+        There is no such mode, or dvr without a transfer function.
+    """
+    if mode not in MODES:
+        raise UsageError(f"there is no mode {mode!r}: it is one of {', '.join(MODES)}")
+    step = 0.5 * min(volume.spacing) if ray_step is None else float(ray_step)
+    rays = _Rays(volume, camera, size, clip)
+    width, height = size
+    part = jitter_pixels(width, height).ravel() if jitter else np.full(rays.count, 0.5)
+    if mode == "dvr":
+        if transfer_function is None:
+            raise UsageError("dvr needs a transfer function")
+        found = _composite(rays, transfer_function, lighting, step, part)
+    elif mode == "mean":
+        found = _integrate(rays, step)
+    else:
+        found = _find_extreme(rays, step, 1.0 if mode == "mip" else -1.0)
+    shape = (height, width)
+    rgba, depth, expected_depth, values = found
+    return RayPicture(
+        rgba.reshape(*shape, 4), depth.reshape(shape), expected_depth.reshape(shape), values.reshape(shape)
+    )
+
+
+Found = tuple[Float64Array, Float64Array, Float64Array, Float64Array]
+"""rgba (n, 4), depth, expected depth and values (n,)."""
+
+
+def look_up(transfer_function: TransferFunction, hu: Float64Array) -> Float64Array:
+    """Red, green, blue, opacity (n, 4) as the device's table has them, float64 of float32.
+
+    Of `TABLE_NODES` HU evenly over the function's range, both ends included, the nearest counts.
+    """
+    low, high = transfer_function.range_hu
+    nodes = transfer_function.table(low, high, TABLE_NODES).astype(np.float64)
+    number = np.floor((hu - low) * ((TABLE_NODES - 1) / (high - low)) + 0.5)
+    return np.asarray(nodes[np.clip(number, 0, TABLE_NODES - 1).astype(np.int64)])
+
+
+def shade(
+    colours: Float64Array, gradients: Float64Array, directions: Float64Array, lighting: Lighting, lit: ArrayLike = 1.0
+) -> Float64Array:
+    """Phong's shading of colours (n, 3) with gradients (n, 3) as normals, seen along directions (n, 3).
+
+    A gradient of no size has no direction: its colour has all of the diffuse light and no highlight.  `lit` 0 is in
+    shadow: ambient light alone.  What goes beyond 1 is cut.
+    """
+    magnitude = np.linalg.norm(gradients, axis=1)
+    flat = magnitude < FLAT_GRADIENT
+    normals = gradients / np.where(flat, 1.0, magnitude)[:, None]
+    to_camera = -directions
+    to_light = to_camera
+    if lighting.direction is not None:
+        fixed = np.array(lighting.direction, dtype=np.float64)
+        to_light = np.broadcast_to(fixed / np.linalg.norm(fixed), to_camera.shape)
+    half_way = to_light + to_camera
+    length = np.linalg.norm(half_way, axis=1, keepdims=True)
+    half_way = np.divide(half_way, length, out=np.zeros_like(half_way), where=length > 1e-6)
+    diffuse = np.where(flat, 1.0, np.abs((normals * to_light).sum(axis=1)))
+    highlight = np.where(flat, 0.0, np.abs((normals * half_way).sum(axis=1)) ** lighting.specular_power)
+    share = np.broadcast_to(np.asarray(lit, dtype=np.float64), magnitude.shape)
+    light = lighting.ambient + share * lighting.diffuse * diffuse
+    return np.minimum(colours * light[:, None] + (share * lighting.specular * highlight)[:, None], 1.0)
+
+
+def _composite(
+    rays: _Rays, transfer_function: TransferFunction, lighting: Lighting | None, step: float, part: Float64Array
+) -> Found:
+    voxels = rays.volume.voxels
+    gradients = voxel_gradients(voxels, slice_normal_matrices(rays.volume, 0))
+    rgba = np.zeros((rays.count, 4))
+    depth, weighted = np.full(rays.count, np.nan), np.zeros(rays.count)
+    for ray, t, length in _segments(rays, step, part, rgba[:, 3]):
+        ijk, there = rays.places(ray, t)
+        rgb_opacity = look_up(transfer_function, sample_field(voxels, ijk))
+        colour, opacity = rgb_opacity[:, :3], np.where(there, rgb_opacity[:, 3], 0.0)
+        seen = opacity > 0.0
+        ray, t, length = ray[seen], t[seen], length[seen]
+        ijk, colour, opacity = ijk[seen], colour[seen], opacity[seen]
+        slope = sample_field(gradients, ijk)
+        opacity = opacity * transfer_function.gradient_factor(np.linalg.norm(slope, axis=1))
+        if lighting is not None:
+            colour = shade(colour, slope, rays.directions[ray], lighting)
+        opacity = 1.0 - (1.0 - opacity) ** (length / transfer_function.unit_distance)
+        weight = (1.0 - rgba[ray, 3]) * opacity
+        rgba[ray, :3] += weight[:, None] * colour
+        rgba[ray, 3] += weight
+        weighted[ray] += weight * t
+        first = np.isnan(depth[ray]) & (rgba[ray, 3] > VISIBLE)
+        depth[ray[first]] = t[first]
+    any_weight = rgba[:, 3] > 0.0
+    expected = np.divide(weighted, rgba[:, 3], out=np.full(rays.count, np.nan), where=any_weight)
+    return rgba, depth, expected, np.full(rays.count, np.nan)
+
+
+def _segments(
+    rays: _Rays, step: float, part: Float64Array, opacity: Float64Array
+) -> Iterator[tuple[NDArray[np.int64], Float64Array, Float64Array]]:
+    """Yield segment by segment (ray numbers, t of the sample, length) of the rays that are not opaque yet."""
+    way = rays.t_out - rays.t_in
+    segments = np.where(way > 0.0, np.ceil(way / step), 0.0)
+    for number in range(int(segments.max(initial=0.0))):
+        ray = np.flatnonzero((number < segments) & (opacity < OPAQUE))
+        if len(ray) == 0:
+            return
+        start = rays.t_in[ray] + number * step
+        length = np.clip(rays.t_out[ray] - start, 0.0, step)
+        yield ray, start + part[ray] * length, length
+
+
+def _integrate(rays: _Rays, step: float) -> Found:
+    total, way = np.zeros(rays.count), np.zeros(rays.count)
+    for ray, t, length in _segments(rays, step, np.full(rays.count, 0.5), np.zeros(rays.count)):
+        ijk, there = rays.places(ray, t)
+        total[ray] += np.where(there, length * sample_field(rays.volume.voxels, ijk), 0.0)
+        way[ray] += np.where(there, length, 0.0)
+    mean = np.divide(total, way, out=np.full(rays.count, np.nan), where=way > 0.0)
+    nowhere = np.full(rays.count, np.nan)
+    return np.zeros((rays.count, 4)), nowhere, nowhere.copy(), mean
+
+
+def _find_extreme(rays: _Rays, step: float, sign: float) -> Found:
+    best, depth = np.full(rays.count, -np.inf), np.full(rays.count, np.nan)
+    for ray, t in _plane_samples(rays, step):
+        ijk, there = rays.places(ray, t)
+        values = sign * sample_field(rays.volume.voxels, ijk)
+        better = there & (values > best[ray])
+        best[ray[better]] = values[better]
+        depth[ray[better]] = t[better]
+    values = np.where(np.isnan(depth), np.nan, sign * best)
+    return np.zeros((rays.count, 4)), depth, depth.copy(), values
+
+
+def _plane_samples(rays: _Rays, step: float) -> Iterator[tuple[NDArray[np.int64], Float64Array]]:
+    """Yield sample by sample (ray numbers, t), on all slice planes of the index axis that the ray crosses fastest.
+
+    Between two planes lie as many samples more as `step` asks for; where no sample falls into the way through the
+    volume (a thin slab between clip planes) there is one in its middle.  Uneven stacks have samples in the middles of
+    segments, as everything else.
+    """
+    if rays.volume.uneven:
+        yield from ((ray, t) for ray, t, _ in _segments(rays, step, np.full(rays.count, 0.5), np.zeros(rays.count)))
+        return
+    inverse = np.linalg.inv(rays.volume.affine)
+    rates = rays.directions @ inverse[:3, :3].T
+    axis = np.abs(rates).argmax(axis=1)[:, None]
+    rate = np.take_along_axis(rates, axis, axis=1)[:, 0]
+    start = np.take_along_axis(rays.origins @ inverse[:3, :3].T + inverse[:3, 3], axis, axis=1)[:, 0]
+    parts = np.maximum(np.ceil(1.0 / (np.abs(rate) * step) - PART_SLACK), 1.0)
+    spacing = 1.0 / (np.abs(rate) * parts)
+    t_of_plane_0 = -start / rate
+    valid = rays.t_out > rays.t_in
+    t_in, t_out = np.where(valid, rays.t_in, 0.0), np.where(valid, rays.t_out, -1.0)
+    first = np.ceil((t_in - t_of_plane_0) / spacing - PLANE_SLACK)
+    last = np.floor((t_out - t_of_plane_0) / spacing + PLANE_SLACK)
+    missed = np.flatnonzero(valid & (last < first))
+    yield missed, 0.5 * (t_in + t_out)[missed]
+    for number in range(int((last - first).max(initial=-1.0)) + 1):
+        ray = np.flatnonzero(valid & (first + number <= last))
+        yield ray, t_of_plane_0[ray] + (first[ray] + number) * spacing[ray]

@@ -1,0 +1,206 @@
+"""What the tests of rays share: volumes with known fields, cameras, and one way to cast by twin and by device."""
+
+from __future__ import annotations
+
+import importlib.util
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import conftest
+import numpy as np
+import pytest
+
+from clrecon.geometry import Volume
+from clrecon.geometry.camera import Camera
+from clrecon.reference.raycast import cast_rays
+from clrecon.reference.surface_rays import cast_surface
+from clrecon.rendering import UNSHADED, Lighting, TransferFunction
+from tests.dicom_series import rotation
+
+TURN = rotation((15.0, -25.0, 40.0))
+PLACE = np.array([40.0, -90.0, -600.0])
+DEVICE_FILES = {"dvr": "composite.cl", "surface": "surface.cl"}
+DEVICE_RENDERS = importlib.util.find_spec("clrecon.operators.renderer") is not None
+
+STEPS = {
+    "even": np.diag([0.9, 0.9, 0.9]),
+    "anisotropic": np.diag([0.6, 0.45, 1.3]),
+    "oblique": TURN @ np.diag([0.7, 0.5, 1.2]),
+    "sheared": np.array([[0.7, 0.0, 0.0], [0.0, 0.5, -0.6], [0.0, 0.0, 1.2]]),
+    "mirrored": TURN @ np.diag([0.7, -0.5, 1.2]),
+}
+"""Columns are the steps of i, j, k in mm."""
+
+GAPS = (1.0,) * 12 + (0.4,) * 6 + (1.9,) * 10 + (1.0,) * 9
+
+Field = Callable[[np.ndarray], np.ndarray]
+"""Values (n,) at points (n, 3) in mm from the centre of the volume."""
+
+
+def centre_of(volume: Volume) -> np.ndarray:
+    return volume.ijk_to_lps([(np.array(volume.shape_ijk) - 1) / 2])[0]
+
+
+def fill(volume: Volume, field: Field, dtype: Any = np.float32) -> Volume:
+    k, j, i = np.indices(volume.voxels.shape).reshape(3, -1)
+    points = volume.ijk_to_lps(np.stack([i, j, k], axis=1)) - centre_of(volume)
+    values = np.asarray(field(points), dtype=np.float64).reshape(volume.voxels.shape)
+    return volume.with_voxels(values.astype(dtype) if np.dtype(dtype).kind == "f" else np.rint(values).astype(dtype))
+
+
+def even_volume(field: Field, steps: str, extent: float, dtype: Any = np.float32) -> Volume:
+    """`field` in a volume of about `extent` mm along each axis."""
+    affine = np.eye(4)
+    affine[:3, :3], affine[:3, 3] = STEPS[steps], PLACE
+    shape = [int(np.ceil(extent / length)) for length in np.linalg.norm(STEPS[steps], axis=0)]
+    return fill(Volume(np.zeros(shape[::-1], np.int8), affine), field, dtype)
+
+
+def uneven_volume(
+    field: Field, shape: tuple[int, int] = (66, 52), gaps: Sequence[float] = GAPS, sideways: float = 0.3, noise=0.2
+) -> Volume:
+    """`field` in a turned stack whose slices lie unevenly and sheared, some `noise` mm beside a line."""
+    heights = np.concatenate([[0.0], np.cumsum(gaps)])
+    aside = sideways * heights + np.random.default_rng(2).uniform(-noise, noise, len(heights))
+    table = heights[:, None] * TURN[:, 2] + aside[:, None] * TURN[:, 1] + PLACE
+    affine = np.eye(4)
+    affine[:3, :2] = TURN[:, :2] * (0.7, 0.8)
+    affine[:3, 2], affine[:3, 3] = (table[-1] - table[0]) / len(gaps), table[0]
+    return fill(Volume(np.zeros((len(table), *shape), np.int8), affine, slice_positions=table), field)
+
+
+def ball(radius: float, ramp: float, inside: float = 1000.0, outside: float = -500.0) -> Field:
+    """A ball whose edge is smooth over `ramp` mm (3 x^2 - 2 x^3), half way down at `radius`."""
+
+    def field(points: np.ndarray) -> np.ndarray:
+        share = np.clip((radius - np.linalg.norm(points, axis=1)) / ramp + 0.5, 0.0, 1.0)
+        return outside + (inside - outside) * share**2 * (3.0 - 2.0 * share)
+
+    return field
+
+
+def ball_chords(radius: float, ramp: float, passing: np.ndarray) -> np.ndarray:
+    """Integral of `ball` from 0 outside to 1 inside along lines that pass its centre at distances in mm.
+
+    The ball is a stack of sharp ones of all radii in the ramp, each with its chord 2 sqrt(r^2 - b^2).
+    """
+    share = (np.arange(200) + 0.5) / 200
+    chords = 2.0 * np.sqrt(np.maximum((radius + ramp * (share - 0.5)) ** 2 - passing[..., None] ** 2, 0.0))
+    return (chords * 6.0 * share * (1.0 - share)).mean(axis=-1)
+
+
+def blobs(points: np.ndarray) -> np.ndarray:
+    """Something smooth from -1000 to about 1500 HU with structure in all directions."""
+    x, y, z = points.T / 3.0
+    return 700.0 * np.sin(x) * np.cos(0.8 * y + 0.3) * np.cos(0.7 * z) + 500.0 * np.exp(-(x**2 + y**2 + z**2) / 9.0)
+
+
+def look(
+    volume: Volume,
+    towards: Sequence[float],
+    half_height: float,
+    up: Sequence[float] = (0.1, 0.2, 1.0),
+    perspective: bool = False,
+    distance: float = 200.0,
+) -> Camera:
+    """At the centre of a volume along a direction; `half_height` mm of it to the top of the picture."""
+    centre = centre_of(volume)
+    forward = np.array(towards, dtype=np.float64) / np.linalg.norm(towards)
+    position = centre - distance * forward
+    if perspective:
+        angle = 2.0 * np.degrees(np.arctan(half_height / distance))
+        return Camera(tuple(position), tuple(centre), tuple(up), view_angle=angle)
+    return Camera(tuple(position), tuple(centre), tuple(up), parallel_scale=half_height)
+
+
+def ways_through(
+    volume: Volume, camera: Camera, size: tuple[int, int], first: Any = 0.0, last: Any = None, nearest: float = -np.inf
+) -> np.ndarray:
+    """Length in mm of each ray within the box of voxels `first` to `last` (default: all), half a voxel around them.
+
+    By slabs in index space (Kay and Kajiya 1986), for even stacks; shape (h, w).  Nothing nearer than `nearest` counts.
+    """
+    last = np.array(volume.shape_ijk) - 1.0 if last is None else last
+    origins, directions = camera.rays(size)
+    inverse = np.linalg.inv(volume.affine)
+    start = origins @ inverse[:3, :3].T + inverse[:3, 3]
+    rate = directions @ inverse[:3, :3].T
+    with np.errstate(divide="ignore"):
+        ends = np.stack([(first - 0.5 - start) / rate, (last + 0.5 - start) / rate])
+    way = ends.max(axis=0).min(axis=-1) - np.maximum(ends.min(axis=0).max(axis=-1), nearest)
+    return np.maximum(way, 0.0)
+
+
+def distances_from(point: np.ndarray, camera: Camera, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+    """How far each ray passes a point, and how far along the ray that is, mm: both (h, w)."""
+    origins, directions = camera.rays(size)
+    to_point = point - origins
+    along = (to_point * directions).sum(axis=-1)
+    return np.linalg.norm(to_point - along[..., None] * directions, axis=-1), along
+
+
+def premultiplied(image: np.ndarray) -> np.ndarray:
+    """An image over black, with its opacity: what two pictures differ by to the eye, float64 of 0 to 255."""
+    opacity = image[..., 3:].astype(np.float64)
+    return np.concatenate([image[..., :3] * (opacity / 255.0), opacity], axis=-1)
+
+
+@dataclass
+class Shot:
+    """A picture from either side: the arrays of `clrecon.Rendering` that truth is asked of."""
+
+    image: np.ndarray
+    depth: np.ndarray
+    expected_depth: np.ndarray
+    values: np.ndarray
+
+
+class TwinCaster:
+    """Casts by the numpy twin."""
+
+    def __call__(
+        self,
+        volume: Volume,
+        mode: str = "dvr",
+        transfer_function: TransferFunction | None = None,
+        *,
+        iso_value: float | None = None,
+        shadows: bool = False,
+        lighting: Lighting | None = UNSHADED,
+        **settings: Any,
+    ) -> Shot:
+        if mode == "surface":
+            picture = cast_surface(volume, iso_value, lighting=lighting, shadows=shadows, **settings)
+        else:
+            picture = cast_rays(volume, transfer_function, lighting=lighting, mode=mode, **settings)
+        return Shot(picture.image(), picture.depth, picture.expected_depth, picture.values)
+
+
+class DeviceCaster:
+    """Casts by `clrecon.render` on a device, over no background."""
+
+    def __init__(self, device: Any):
+        self.device = device
+
+    def __call__(self, volume: Volume, mode: str = "dvr", *args: Any, lighting=UNSHADED, **settings: Any) -> Shot:
+        from clrecon.operators.renderer import render
+
+        names = dict(zip(("transfer_function",), args, strict=False))
+        found = render(
+            volume, mode, device=self.device, background="transparent", lighting=lighting, **names, **settings
+        )
+        values = np.full(found.depth.shape, np.nan) if found.values is None else found.values
+        return Shot(found.image, found.depth, found.expected_depth, values)
+
+
+def casters(mode: str = "dvr") -> list[Any]:
+    """Parameters for a test: the twin, and every device where the raycaster has the mode."""
+    devices, reason = conftest.Devices.get()
+    found = [pytest.param(TwinCaster(), id="twin")]
+    if not DEVICE_RENDERS or not (conftest.ROOT / "cl" / "render" / DEVICE_FILES[mode]).exists():
+        return found
+    if not devices and conftest.is_set("CLRECON_REQUIRE_DEVICE"):
+        raise pytest.UsageError(f"CLRECON_REQUIRE_DEVICE is set: {reason}")
+    found += [pytest.param(DeviceCaster(device), id=conftest.device_id(device)) for device in devices]
+    return found

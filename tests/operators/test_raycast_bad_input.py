@@ -1,0 +1,81 @@
+"""What cannot be rendered is refused in one line that says what, the numbers and what to do."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from clrecon.errors import UsageError
+from clrecon.geometry import Volume
+from clrecon.geometry.camera import Camera
+from clrecon.rendering import TransferFunction
+from tests.operators.raycast_scenes import DEVICE_RENDERS, blobs, even_volume
+
+pytestmark = pytest.mark.skipif(not DEVICE_RENDERS, reason="the raycaster of devices is not there")
+
+FOG = TransferFunction([(-100, 1, 1, 1, 0.1), (100, 1, 1, 1, 0.1)])
+
+REFUSED = {
+    "no width": ({"size": (0, 10)}, ["size", "0"]),
+    "negative": ({"size": (10, -4)}, ["size", "-4"]),
+    "absurd size": ({"size": (2_000_000, 2_000_000)}, ["size", "2000000"]),
+    "one number": ({"size": 512}, ["size", "512"]),
+    "fractions": ({"size": (10.5, 4)}, ["size", "10.5"]),
+    "step 0": ({"ray_step": 0.0}, ["ray step", "0"]),
+    "step below 0": ({"ray_step": -1.0}, ["ray step", "-1"]),
+    "step nan": ({"ray_step": float("nan")}, ["ray step", "nan"]),
+    "step inf": ({"ray_step": float("inf")}, ["ray step", "inf"]),
+    "step too fine": ({"ray_step": 1e-4}, ["ray step", "0.0001"]),
+    "step of text": ({"ray_step": "fine"}, ["ray step", "fine"]),
+    "mode": ({"mode": "xray"}, ["xray", "dvr", "mip", "minip", "mean"]),
+    "preset": ({"preset": "bones"}, ["bones", "bone"]),
+    "view": ({"view": "front"}, ["front", "anterior", "inferior"]),
+    "view of nothing": ({"view": ""}, ["anterior"]),
+    "zoom": ({"zoom": 0.0}, ["zoom"]),
+    "background": ({"background": "no such colour"}, ["no such colour"]),
+    "two functions": ({"preset": "bone", "transfer_function": FOG}, ["preset", "transfer function"]),
+    "camera and view": ({"camera": "anterior"}, ["camera"]),
+    "lighting": ({"lighting": 3}, ["lighting"]),
+    "clip": ({"clip": [(0, 0, 1)]}, ["clip"]),
+    "function of numbers": ({"transfer_function": [(0, 1, 1, 1, 1)]}, ["transfer function"]),
+    "window": ({"mode": "mip", "window": (100, 100)}, ["window", "100"]),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_what_cannot_be_is_refused_in_one_line(device, name):
+    from clrecon.operators.renderer import render
+
+    settings, words = REFUSED[name]
+    volume = even_volume(blobs, "even", 8.0, np.int16)
+    with pytest.raises(UsageError) as error:
+        render(volume, device=device, **{"size": (8, 8)} | settings)
+    message = str(error.value)
+    assert "\n" not in message and len(message) < 400
+    assert [word for word in words if word.lower() not in message.lower()] == []
+
+
+@pytest.mark.parametrize("what", [None, np.zeros((4, 4, 4)), "folder"])
+def test_what_is_no_volume_is_refused(device, what):
+    from clrecon.operators.renderer import render
+
+    with pytest.raises(UsageError, match="[Vv]olume"):
+        render(what, size=(8, 8), device=device)
+
+
+def test_voxels_that_are_no_numbers_are_refused_or_not_seen(device):
+    """NaN must neither end in a driver nor spread over pixels whose rays do not meet it."""
+    from clrecon.operators.renderer import render
+
+    volume = even_volume(lambda p: np.zeros(len(p)), "even", 12.0)
+    voxels = volume.voxels.copy()
+    voxels[0, 0, 0] = np.nan
+    camera = Camera.fit(volume, "anterior", size=(16, 16))
+    settings = {"transfer_function": FOG, "camera": camera, "size": (16, 16), "device": device}
+    plain = render(volume, **settings).image
+    try:
+        image = render(Volume(voxels, volume.affine), **settings).image
+    except UsageError as error:
+        assert "NaN" in str(error)
+    else:
+        assert (image != plain).any(axis=-1).sum() <= 9

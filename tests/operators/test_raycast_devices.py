@@ -1,0 +1,203 @@
+"""The raycaster on every device against its numpy twin, against other devices, and against itself."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import conftest
+import numpy as np
+import pytest
+
+from clrecon.geometry import Volume
+from clrecon.geometry.camera import Camera
+from clrecon.geometry.clip import Clip
+from clrecon.kernels.sources import read_kernel_source
+from clrecon.reference.rays import hash_pixels, jitter_pixels
+from clrecon.rendering import UNSHADED, Lighting, TransferFunction
+from tests import tolerances
+from tests.operators.raycast_scenes import (
+    DEVICE_RENDERS,
+    DeviceCaster,
+    TwinCaster,
+    ball,
+    blobs,
+    centre_of,
+    even_volume,
+    look,
+    premultiplied,
+    uneven_volume,
+)
+
+renders = pytest.mark.skipif(not DEVICE_RENDERS, reason="the raycaster of devices is not there")
+
+SIZE = (64, 48)
+SOFT = TransferFunction([(-300, 0.9, 0.2, 0.1, 0.0), (200, 1, 0.7, 0.4, 0.15), (900, 1, 1, 0.9, 0.6)])
+STEEP = TransferFunction([(-200, 0.8, 0.1, 0.1, 0), (100, 1, 0.6, 0.3, 0), (130, 1, 0.9, 0.7, 0.9), (800, 1, 1, 1, 1)])
+LEVOY = TransferFunction(SOFT.points, unit_distance=2.0, gradient_opacity=[(20.0, 0.0), (150.0, 1.0), (600.0, 0.3)])
+LIT = Lighting()
+FIXED = Lighting(0.15, 0.7, 0.4, 20.0, direction=(0.4, -1.0, 0.8))
+
+
+def noise(points: np.ndarray) -> np.ndarray:
+    return np.random.default_rng(11).integers(-1000, 1500, len(points)).astype(float)
+
+
+def scene(volume: Volume, mode: str = "dvr", function: Any = None, /, **settings: Any) -> tuple[Volume, dict[str, Any]]:
+    view = {name: settings.pop(name) for name in ("perspective", "towards", "half_height") if name in settings}
+    camera = look(
+        volume,
+        view.get("towards", (0.4, 1.0, -0.3)),
+        view.get("half_height", 10.0),
+        perspective=view.get("perspective", False),
+    )
+    return volume, {"mode": mode, "transfer_function": function, "camera": camera, "size": SIZE, **settings}
+
+
+def cut(volume: Volume) -> Clip:
+    centre = centre_of(volume)
+    return Clip.box(centre - 5.0, centre + (6.0, 7.0, 4.0)) & Clip.plane(centre, (0.5, 0.4, 1.0))
+
+
+def clipped(volume: Volume, *args: Any, **settings: Any) -> tuple[Volume, dict[str, Any]]:
+    return scene(volume, *args, clip=cut(volume), **settings)
+
+
+SCENES: dict[str, Callable[[], tuple[Volume, dict[str, Any]]]] = {
+    "soft": lambda: scene(even_volume(blobs, "anisotropic", 18.0, np.int16), "dvr", SOFT, lighting=LIT),
+    "unlit": lambda: scene(even_volume(blobs, "mirrored", 18.0), "dvr", SOFT, perspective=True, lighting=UNSHADED),
+    "fixed light": lambda: scene(even_volume(blobs, "oblique", 18.0), "dvr", SOFT, perspective=True, lighting=FIXED),
+    "steep": lambda: scene(even_volume(blobs, "sheared", 18.0, np.int16), "dvr", STEEP, lighting=LIT, ray_step=0.17),
+    "gradient opacity": lambda: scene(even_volume(blobs, "oblique", 18.0), "dvr", LEVOY, lighting=LIT),
+    "clipped": lambda: clipped(even_volume(blobs, "sheared", 18.0), "dvr", SOFT, lighting=FIXED, perspective=True),
+    "jitter": lambda: scene(even_volume(blobs, "even", 18.0), "dvr", SOFT, lighting=UNSHADED, jitter=True, ray_step=1),
+    "coarse": lambda: scene(even_volume(blobs, "even", 18.0), "dvr", SOFT, lighting=LIT, ray_step=3.1),
+    "uneven": lambda: scene(uneven_volume(blobs), "dvr", SOFT, lighting=LIT, perspective=True, half_height=20.0),
+    "uneven clipped": lambda: clipped(uneven_volume(blobs), "dvr", SOFT, lighting=FIXED, towards=(0.2, 0.1, 1.0)),
+    "hollow": lambda: scene(even_volume(ball(3.0, 2.0), "anisotropic", 40.0, np.int16), "dvr", SOFT, lighting=LIT),
+    "mip": lambda: scene(even_volume(noise, "oblique", 12.0, np.int16), "mip"),
+    "minip": lambda: scene(even_volume(noise, "sheared", 12.0, np.int16), "minip", perspective=True),
+    "mip uneven": lambda: scene(uneven_volume(noise), "mip", half_height=20.0),
+    "mip clipped": lambda: clipped(even_volume(blobs, "mirrored", 18.0), "mip", perspective=True),
+    "mean": lambda: scene(even_volume(noise, "oblique", 12.0, np.int16), "mean", perspective=True),
+    "mean clipped": lambda: clipped(even_volume(blobs, "mirrored", 18.0), "mean"),
+    "mean uneven": lambda: scene(uneven_volume(blobs), "mean", half_height=20.0),
+}  # fmt: skip
+
+
+def assert_alike(found: Any, expected: Any, mode: str) -> None:
+    """Two pictures by float32 and float64, or by two compilers."""
+    share = tolerances.RAY_TWIN_SHARE
+    if mode == "dvr":
+        assert expected.image[..., 3].max() > 100
+        away = np.abs(premultiplied(found.image) - premultiplied(expected.image)).max(axis=-1)
+        assert (away <= 2.0).mean() >= 1.0 - share, f"{(away > 2.0).sum()} pixels differ, by up to {away.max():.1f}"
+        assert away.max() <= tolerances.RAY_TWIN_WORST_255
+    else:
+        there = np.isfinite(expected.values)
+        assert (np.isfinite(found.values) != there).mean() <= share
+        away = np.abs(found.values - expected.values)[there & np.isfinite(found.values)]
+        assert (away <= tolerances.RAY_TWIN_HU).mean() >= 1.0 - share, f"up to {away.max():.3g} HU"
+    if mode != "mean":
+        hit = np.isfinite(expected.depth) & np.isfinite(found.depth)
+        assert hit.mean() > 0.05
+        assert (np.isfinite(expected.depth) != np.isfinite(found.depth)).mean() <= share
+        for name in ("depth", "expected_depth"):
+            away = np.abs(getattr(found, name) - getattr(expected, name))[hit]
+            assert (away <= tolerances.RAY_TWIN_DEPTH_MM).mean() >= 1.0 - tolerances.RAY_TWIN_DEPTH_SHARE, name
+
+
+@renders
+@pytest.mark.parametrize("name", SCENES)
+def test_the_kernel_is_its_twin(device, name):
+    volume, settings = SCENES[name]()
+    assert_alike(DeviceCaster(device)(volume, **settings), TwinCaster()(volume, **settings), settings["mode"])
+
+
+@renders
+@pytest.mark.oclgrind
+@pytest.mark.parametrize("mode", ["dvr", "mip", "mean"])
+@pytest.mark.parametrize("even", [True, False])
+def test_raycast_of_few_voxels_is_its_twin(device, mode, even):
+    """Small enough for a simulator: odd sizes, rays past the volume, clip planes, a light that stands still."""
+    volume = (
+        even_volume(blobs, "oblique", 6.0, np.int16) if even else uneven_volume(blobs, (9, 7), (1.0, 0.4, 1.9, 1.0))
+    )
+    camera = look(volume, (0.4, 1.0, -0.3), 5.0, perspective=True)
+    clip = Clip.plane(centre_of(volume), (0.3, 0.2, 1.0))
+    settings = {"mode": mode, "camera": camera, "size": (11, 9), "clip": clip, "ray_step": 0.5}
+    if mode == "dvr":
+        settings |= {"transfer_function": LEVOY, "lighting": FIXED, "jitter": True}
+    found, expected = DeviceCaster(device)(volume, **settings), TwinCaster()(volume, **settings)
+    if mode == "dvr":
+        away = np.abs(premultiplied(found.image) - premultiplied(expected.image))
+        assert expected.image.any() and away.max() <= 2.0
+    else:
+        assert np.array_equal(np.isnan(found.values), np.isnan(expected.values))
+        assert np.nanmax(np.abs(found.values - expected.values)) <= tolerances.RAY_TWIN_HU
+
+
+@renders
+@pytest.mark.parametrize("name", ["soft", "steep", "gradient opacity", "uneven", "mip", "mean"])
+def test_all_devices_give_one_picture(name):
+    from skimage.metrics import structural_similarity
+
+    devices, _ = conftest.Devices.get()
+    if len(devices) < 2:
+        pytest.skip("only one OpenCL device")
+    volume, settings = SCENES[name]()
+    first, *others = [DeviceCaster(device)(volume, **settings) for device in devices]
+    for other in others:
+        a, b = premultiplied(first.image), premultiplied(other.image)
+        assert (np.abs(a - b).max(axis=-1) <= 2.0).mean() >= 1.0 - tolerances.RAY_TWIN_SHARE
+        assert structural_similarity(a, b, channel_axis=-1, data_range=255.0) > 0.99
+        assert_alike(other, first, settings["mode"])
+
+
+def test_jitter_has_the_same_bits_on_devices(device):
+    import pyopencl
+
+    width, height = 37, 19
+    source = (
+        read_kernel_source("include/jitter.h")
+        + """
+    __kernel void jitter_all(__global uint *hashes, __global float *parts, const uint width) {
+        const uint x = get_global_id(0), y = get_global_id(1);
+        hashes[y * width + x] = hash_pixel(x, y);
+        parts[y * width + x] = jitter_pixel(x, y);
+    }"""
+    )
+    context = device.context
+    queue = pyopencl.CommandQueue(context)
+    hashes, parts = np.empty((height, width), np.uint32), np.empty((height, width), np.float32)
+    flags = pyopencl.mem_flags.WRITE_ONLY
+    hashes_d, parts_d = (pyopencl.Buffer(context, flags, array.nbytes) for array in (hashes, parts))
+    program = pyopencl.Program(context, source).build()
+    program.jitter_all(queue, (width, height), (1, 1), hashes_d, parts_d, np.uint32(width))
+    pyopencl.enqueue_copy(queue, hashes, hashes_d)
+    pyopencl.enqueue_copy(queue, parts, parts_d)
+    queue.finish()
+    y, x = np.mgrid[:height, :width]
+    assert np.array_equal(hashes, hash_pixels(x, y))
+    assert np.array_equal(parts, jitter_pixels(width, height))
+
+
+@renders
+def test_two_pictures_of_one_camera_are_one(device):
+    volume, settings = SCENES["steep"]()
+    first, again = (DeviceCaster(device)(volume, **settings) for _ in range(2))
+    assert np.array_equal(first.image, again.image) and np.array_equal(first.depth, again.depth, equal_nan=True)
+
+
+@renders
+@pytest.mark.parametrize("size", [(1, 1), (1, 9), (8, 8), (9, 7), (65, 33)])
+def test_pictures_of_any_size_have_all_their_pixels(device, size):
+    volume = even_volume(lambda p: np.zeros(len(p)), "oblique", 12.0, np.int16)
+    fog = TransferFunction([(-10, 1, 1, 1, 0.2), (10, 1, 1, 1, 0.2)])
+    camera = Camera.fit(volume, (20.0, 30.0), 6.0, size=size)
+    found, expected = (
+        cast(volume, "dvr", fog, camera=camera, size=size) for cast in (DeviceCaster(device), TwinCaster())
+    )
+    assert found.image.shape == (size[1], size[0], 4)
+    assert expected.image[..., 3].max() > 100
+    assert np.abs(found.image[..., 3].astype(int) - expected.image[..., 3]).max() <= 2

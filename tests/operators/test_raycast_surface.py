@@ -1,0 +1,182 @@
+"""Mode surface against analysis and against the extracted mesh: asked of the twin and of every device that has it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from clrecon.geometry import Volume
+from clrecon.geometry.camera import Camera
+from clrecon.geometry.clip import Clip
+from clrecon.operators.isosurface import extract_isosurface
+from clrecon.reference.isosurface import extract_isosurface as extract_twin
+from clrecon.rendering import Lighting
+from tests import tolerances
+from tests.operators.raycast_scenes import (
+    GAPS,
+    STEPS,
+    TURN,
+    TwinCaster,
+    blobs,
+    casters,
+    centre_of,
+    distances_from,
+    even_volume,
+    look,
+    uneven_volume,
+)
+
+MATT = Lighting(ambient=0.2, diffuse=0.8, specular=0.0)
+SLOPE = TURN @ np.array([0.35, -0.2, 0.9])
+SLOPE /= np.linalg.norm(SLOPE)
+
+
+def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
+    if "cast" in metafunc.fixturenames:
+        metafunc.parametrize("cast", casters("surface"))
+
+
+def make(field, steps: str, extent: float) -> Volume:
+    return uneven_volume(field, (34, 30), GAPS[10:30]) if steps == "uneven" else even_volume(field, steps, extent)
+
+
+@pytest.mark.parametrize("perspective", [False, True])
+@pytest.mark.parametrize("steps", [*STEPS, "uneven"])
+def test_a_plane_is_where_it_is_and_lit_as_it_lies(cast, steps, perspective):
+    volume, size = make(lambda p: 200.0 - 40.0 * (p @ SLOPE), steps, 24.0), (32, 32)
+    camera = look(volume, -SLOPE + (0.3, 0.2, 0.0), 5.0, perspective=perspective)
+    shot = cast(volume, "surface", iso_value=200.0, camera=camera, size=size, lighting=MATT)
+    origins, directions = camera.rays(size)
+    truth = ((centre_of(volume) - origins) @ SLOPE) / (directions @ SLOPE)
+    assert np.abs(shot.depth - truth).max() <= 0.01 * max(volume.spacing)
+    light = 255.0 * (0.2 + 0.8 * np.abs(directions @ SLOPE))
+    assert np.abs(shot.image[..., :3] - light[..., None]).max() <= 1.0 + 0.5
+    assert (shot.image[..., 3] == 255).all()
+
+
+@pytest.mark.parametrize("steps", [*STEPS, "uneven"])
+def test_a_ball_has_its_depth_and_its_outline(cast, steps):
+    radius, size = 9.0, (40, 40)
+    volume = make(lambda p: 300.0 + 30.0 * (radius - np.linalg.norm(p, axis=1)), steps, 24.0)
+    longest = 1.9 if steps == "uneven" else max(volume.spacing)
+    for perspective in (False, True):
+        camera = look(volume, (0.5, 1.0, -0.3), 11.0, perspective=perspective)
+        shot = cast(volume, "surface", iso_value=300.0, camera=camera, size=size)
+        passing, along = distances_from(centre_of(volume), camera, size)
+        edge = np.abs(passing - radius) < tolerances.RAY_SILHOUETTE_VOXEL * longest
+        assert np.array_equal(np.isfinite(shot.depth)[~edge], (passing < radius)[~edge])
+        clear = passing < 0.8 * radius
+        truth = along[clear] - np.sqrt(radius**2 - passing[clear] ** 2)
+        assert np.abs(shot.depth[clear] - truth).max() <= tolerances.RAY_DEPTH_VOXEL * longest
+
+
+def mesh_depths(cast, volume: Volume, iso_value: float, camera: Camera, size) -> tuple[np.ndarray, np.ndarray]:
+    """Depth of the closed mesh along each ray by VTK, NaN without, and |cosine| there between ray and normal."""
+    import pyvista
+
+    if isinstance(cast, TwinCaster):
+        vertices, _, triangles = extract_twin(volume, iso_value)
+    else:
+        mesh = extract_isosurface(volume, iso_value, cast.device)
+        vertices, triangles = mesh.vertices, mesh.triangles
+    surface = pyvista.PolyData.from_regular_faces(np.asarray(vertices, np.float64), triangles.astype(np.int64))
+    origins, directions = camera.rays(size)
+    depth, cosine = np.full(origins.shape[:2], np.nan), np.zeros(origins.shape[:2])
+    normals = surface.face_normals
+    for at in np.ndindex(*depth.shape):
+        points, cells = surface.ray_trace(origins[at], origins[at] + 400.0 * directions[at])
+        if len(points):
+            ways = (points - origins[at]) @ directions[at]
+            nearest = int(ways.argmin())
+            depth[at], cosine[at] = ways[nearest], abs(normals[cells[nearest]] @ directions[at])
+    return depth, cosine
+
+
+@pytest.mark.parametrize("dtype", [np.int16, np.float32])
+@pytest.mark.parametrize("steps", ["anisotropic", "sheared", "mirrored", "uneven"])
+def test_depths_are_those_of_the_extracted_mesh_caps_included(cast, steps, dtype):
+    volume, size = make(blobs, steps, 12.0), (32, 32)
+    volume = volume.with_voxels(np.rint(volume.voxels).astype(dtype))
+    camera = look(volume, (0.5, 1.0, 0.4), 7.0, perspective=True)
+    shot = cast(volume, "surface", iso_value=100.0, camera=camera, size=size, ray_step=0.1)
+    depth, cosine = mesh_depths(cast, volume, 100.0, camera, size)
+    both = np.isfinite(depth) & np.isfinite(shot.depth)
+    assert both.mean() > 0.4
+    assert (np.isfinite(depth) != np.isfinite(shot.depth)).mean() <= tolerances.RAY_OUTLINE_SHARE
+    steep = both & (cosine > 0.4)
+    away = np.abs(shot.depth - depth)[steep] * cosine[steep] / (1.9 if steps == "uneven" else max(volume.spacing))
+    assert (away <= tolerances.RAY_DEPTH_VOXEL).mean() >= 1.0 - tolerances.RAY_OUTLINE_SHARE
+    assert np.median(away) <= 0.2 * tolerances.RAY_DEPTH_VOXEL
+
+
+def test_a_full_volume_is_closed_half_way_to_the_air_around_it(cast):
+    """Voxels of 976 HU in air of -1024: the surface lies 0.288 or 0.888 of a step beyond the outermost centres."""
+    spacing = np.array([0.7, 0.5, 2.5])
+    volume = Volume(np.full((4, 5, 6), 976, np.float32), np.diag([*spacing, 1.0]))
+    for axis, (towards, up) in enumerate([((1, 0, 0), (0, 0, 1)), ((0, 1, 0), (0, 0, 1)), ((0, 0, 1), (0, 1, 0))]):
+        # Outside is the volume's lowest value where that is above air: a voxel of air makes it air.
+        voxels = volume.voxels.copy()
+        voxels[-1, -1, -1] = -2000.0
+        camera = look(volume, towards, 0.2, up=up, distance=50.0)
+        for iso_value in (400.0, -800.0):
+            shot = cast(volume.with_voxels(voxels), "surface", iso_value=iso_value, camera=camera, size=(4, 4))
+            beyond = (976.0 - iso_value) / 2000.0
+            truth = 50.0 - (0.5 * (volume.shape_ijk[axis] - 1) + beyond) * spacing[axis]
+            assert np.abs(shot.depth - truth).max() <= 2e-3 * spacing[axis]
+
+
+def test_a_clip_plane_through_it_is_capped(cast):
+    radius, size = 9.0, (40, 40)
+    volume = even_volume(lambda p: 300.0 + 30.0 * (radius - np.linalg.norm(p, axis=1)), "mirrored", 24.0)
+    normal = np.array([0.3, 1.0, 0.2]) / np.linalg.norm([0.3, 1.0, 0.2])
+    clip = Clip.plane(centre_of(volume) + 2.0 * normal, normal)
+    camera = look(volume, (-0.2, 1.0, -0.3), 11.0, perspective=True)
+    shot = cast(volume, "surface", iso_value=300.0, camera=camera, size=size, clip=clip, lighting=MATT)
+    origins, directions = camera.rays(size)
+    truth = (centre_of(volume) + 2.0 * normal - origins) @ normal / (directions @ normal)
+    points = origins + truth[..., None] * directions - centre_of(volume)
+    on_cap = np.linalg.norm(points, axis=-1) < radius - 0.2
+    assert on_cap.sum() > 300
+    assert np.abs(shot.depth - truth)[on_cap].max() <= 1e-3
+    light = 255.0 * (0.2 + 0.8 * np.abs(directions @ normal))
+    assert np.abs(shot.image[..., 0] - light)[on_cap].max() <= 1.0
+
+
+def test_a_camera_inside_sees_its_own_cap(cast):
+    volume = even_volume(lambda p: 500.0 + 20.0 * p[:, 0], "even", 12.0, np.int16)  # its gradient lies across the view
+    centre = centre_of(volume)
+    camera = Camera(tuple(centre), tuple(centre + (0.0, 1.0, 0.0)), (0, 0, 1), view_angle=40.0)
+    shot = cast(volume, "surface", iso_value=300.0, camera=camera, size=(8, 8), lighting=MATT)
+    assert np.abs(shot.depth).max() <= 1e-6 and (shot.image == 255).all()
+
+
+def test_a_ball_throws_its_shadow_on_a_floor(cast):
+    """Floor z < -5, a ball of 3 mm over it, light from the side: what is dark follows from one line a point."""
+
+    def field(points: np.ndarray) -> np.ndarray:
+        return 300.0 + 50.0 * np.maximum(3.0 - np.linalg.norm(points, axis=1), -5.0 - points[:, 2])
+
+    volume, size = even_volume(field, "even", 30.0), (48, 48)
+    centre = centre_of(volume)
+    towards = np.array([0.5, 0.3, 1.0]) / np.linalg.norm([0.5, 0.3, 1.0])
+    lighting = Lighting(0.3, 0.7, 0.0, direction=tuple(towards))
+    camera = look(volume, (0.0, 0.6, -1.0), 9.0)
+    settings = {"iso_value": 300.0, "camera": camera, "size": size, "lighting": lighting}
+    plain, dark = (cast(volume, "surface", shadows=shadows, **settings) for shadows in (False, True))
+    assert np.array_equal(plain.depth, dark.depth)
+    origins, directions = camera.rays(size)
+    points = origins + plain.depth[..., None] * directions - centre
+    floor = (np.abs(points[..., 2] + 5.0) < 0.05) & (np.abs(points[..., :2]) < 12.0).all(axis=-1)
+    passing = np.linalg.norm(points - (points @ towards)[..., None] * towards, axis=-1)
+    shadow, sure = passing < 3.0, np.abs(passing - 3.0) > 0.3
+    assert (floor & shadow & sure).sum() > 50 and (floor & ~shadow & sure).sum() > 500
+    lit = 255.0 * (0.3 + 0.7 * towards[2])
+    assert np.abs(dark.image[..., 0][floor & shadow & sure] - 255.0 * 0.3).max() <= 1.0
+    assert np.abs(dark.image[..., 0][floor & ~shadow & sure] - lit).max() <= 1.5
+    assert np.abs(plain.image[..., 0][floor & sure] - lit).max() <= 1.5
+
+
+def test_nothing_is_hit_where_nothing_is_inside(cast):
+    volume = even_volume(lambda p: np.zeros(len(p)), "even", 8.0, np.int16)
+    shot = cast(volume, "surface", iso_value=300.0, camera=look(volume, (0, 1, 0), 6.0), size=(8, 8))
+    assert not shot.image.any() and np.isnan(shot.depth).all() and np.isnan(shot.expected_depth).all()

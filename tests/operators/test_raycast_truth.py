@@ -1,0 +1,286 @@
+"""Volume rendering against analysis: the same truths are asked of the numpy twin and of every device."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from clrecon.geometry import Volume
+from clrecon.geometry.camera import Camera
+from clrecon.geometry.clip import Clip
+from clrecon.rendering import TransferFunction
+from tests import tolerances
+from tests.operators.raycast_scenes import (
+    GAPS,
+    PLACE,
+    STEPS,
+    ball,
+    blobs,
+    casters,
+    centre_of,
+    distances_from,
+    even_volume,
+    look,
+    uneven_volume,
+    ways_through,
+)
+
+BONE = TransferFunction([(-1000, 1, 1, 1, 0), (300, 1, 1, 1, 0), (300, 1, 1, 1, 1), (3000, 1, 1, 1, 1)])
+"""Opaque from 300 HU on."""
+
+
+def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
+    if "cast" in metafunc.fixturenames:
+        metafunc.parametrize("cast", casters())
+
+
+@pytest.mark.parametrize("ray_step", [0.1, 0.37, 0.5, 1.0, 2.3])
+@pytest.mark.parametrize("perspective", [False, True])
+def test_a_homogeneous_slab_is_as_opaque_as_its_way_is_long(cast, ray_step, perspective):
+    volume = even_volume(lambda p: np.full(len(p), 50.0), "sheared", 12.0, np.int16)
+    fog = TransferFunction([(-100, 0.2, 0.6, 1.0, 0.21), (200, 0.2, 0.6, 1.0, 0.21)], unit_distance=1.7)
+    size = (24, 24)
+    for towards in ((0.0, 1.0, 0.0), (0.5, 1.0, 0.3)):
+        camera = look(volume, towards, 11.0, perspective=perspective)
+        image = cast(volume, "dvr", fog, camera=camera, size=size, ray_step=ray_step).image
+        truth = 1.0 - (1.0 - 0.21) ** (ways_through(volume, camera, size) / 1.7)
+        assert truth.max() < 0.98
+        assert np.abs(image[..., 3] / 255.0 - truth).max() <= tolerances.RAY_OPACITY
+        visible = truth > 0.3
+        assert np.abs(image[visible][:, :3] / 255.0 - (0.2, 0.6, 1.0)).max() <= tolerances.RAY_OPACITY
+
+
+def test_a_smaller_step_brings_a_picture_nearer(cast):
+    volume = even_volume(blobs, "anisotropic", 18.0)
+    soft = TransferFunction([(200, 1, 1, 1, 0.0), (300, 1, 1, 1, 0.5), (400, 1, 1, 1, 0.0)])
+    camera = look(volume, (0.5, 1.0, 0.3), 9.0)
+    steps = (1.6, 0.8, 0.4, 0.05)
+    opacity = [cast(volume, "dvr", soft, camera=camera, size=(40, 40), ray_step=step).image[..., 3] for step in steps]
+    errors = [np.sqrt(((a.astype(float) - opacity[-1]) ** 2).mean()) for a in opacity[:-1]]
+    assert errors[0] > 5.0  # there is something to get nearer to
+    assert errors[1] <= 0.5 * errors[0] + tolerances.RAY_ROUNDING
+    assert errors[2] <= 0.5 * errors[1] + tolerances.RAY_ROUNDING
+
+
+@pytest.mark.parametrize("steps", STEPS)
+def test_the_first_hit_of_a_ball_is_on_its_near_side(cast, steps):
+    radius, size = 9.0, (40, 40)
+    volume = even_volume(lambda p: 300.0 + 100.0 * (radius - np.linalg.norm(p, axis=1)), steps, 24.0)
+    for perspective in (False, True):
+        camera = look(volume, (0.5, 1.0, -0.3), 12.0, perspective=perspective)
+        shot = cast(volume, "dvr", BONE, camera=camera, size=size, ray_step=0.1)
+        passing, along = distances_from(centre_of(volume), camera, size)
+        edge = np.abs(passing - radius) < tolerances.RAY_SILHOUETTE_VOXEL * max(volume.spacing)
+        assert np.array_equal(np.isfinite(shot.depth)[~edge], (passing < radius)[~edge])
+        clear = passing < 0.9 * radius
+        truth = along[clear] - np.sqrt(radius**2 - passing[clear] ** 2)
+        limit = 0.1 + tolerances.RAY_DEPTH_VOXEL * max(volume.spacing)
+        assert np.abs(shot.depth[clear] - truth).max() <= limit
+        assert np.abs(shot.expected_depth[clear] - truth).max() <= limit + 0.1
+
+
+def test_expected_depth_of_fog_is_that_of_its_weights(cast):
+    """Of fog from t_in to t_out the mean of t exp(-m t), by analysis; the first hit is where it becomes visible."""
+    volume = even_volume(lambda p: np.zeros(len(p)), "even", 20.0, np.int16)
+    fog = TransferFunction([(-10, 1, 1, 1, 0.08), (10, 1, 1, 1, 0.08)])
+    camera = look(volume, (0.2, 1.0, 0.3), 9.0)
+    shot = cast(volume, "dvr", fog, camera=camera, size=(24, 24), ray_step=0.05)
+    way = ways_through(volume, camera, (24, 24))
+    there = way > 1.0
+    rate = -np.log(1.0 - 0.08)
+    passed = np.exp(-rate * way[there])
+    mean = 1.0 / rate - way[there] * passed / (1.0 - passed)
+    visible_after = -np.log(1.0 - 1.0 / 255.0) / rate
+    assert np.abs((shot.expected_depth - shot.depth)[there] - (mean - visible_after)).max() <= 0.05 + 0.01
+
+
+SIDES = {  # where the patient's left, front and head are in the picture: right (x = 1) or top (y = 1)
+    "anterior": {"left": (1, 0), "front": None, "head": (0, 1)},
+    "posterior": {"left": (-1, 0), "front": None, "head": (0, 1)},
+    "left": {"left": None, "front": (-1, 0), "head": (0, 1)},
+    "right": {"left": None, "front": (1, 0), "head": (0, 1)},
+    "superior": {"left": (-1, 0), "front": (0, 1), "head": None},
+    "inferior": {"left": (1, 0), "front": (0, 1), "head": None},
+}
+MARKERS = {"left": (9.0, 0.0, 0.0), "front": (0.0, -9.0, 0.0), "head": (0.0, 0.0, 9.0)}
+
+
+@pytest.mark.parametrize("steps", ["even", "mirrored", "sheared"])
+@pytest.mark.parametrize("view", SIDES)
+def test_the_patient_is_the_right_way_round(cast, view, steps):
+    for marker, side in SIDES[view].items():
+        near = ball(3.0, 2.0)
+        volume = even_volume(lambda p, m=marker, near=near: near(p - MARKERS[m]), steps, 26.0, np.int16)
+        camera = Camera.fit(volume, view, size=(40, 40))
+        values = cast(volume, "mip", camera=camera, size=(40, 40)).values
+        y, x = np.argwhere(values > 800.0).mean(axis=0)
+        pixel = camera.pixel_mm((40, 40))
+        expected = (0.0, 0.0) if side is None else (9.0 * side[0], 9.0 * side[1])
+        assert abs((x - 19.5) * pixel - expected[0]) < 1.0
+        assert abs((19.5 - y) * pixel - expected[1]) < 1.0
+
+
+def test_clip_planes_cut_ways_exactly(cast):
+    volume = even_volume(lambda p: np.zeros(len(p)), "mirrored", 30.0, np.int16)
+    fog = TransferFunction([(-10, 1, 1, 1, 0.05), (10, 1, 1, 1, 0.05)])
+    centre, size = centre_of(volume), (20, 20)
+    box = Clip.box(centre - (3.0, 4.0, 5.0), centre + (3.5, 2.0, 4.5))
+    oblique = Clip.plane(centre + (0.5, 0.0, 0.0), (1.0, 1.0, 0.3))
+    for perspective in (False, True):
+        camera = look(volume, (0.3, 1.0, 0.2), 6.0, perspective=perspective)
+        for clip in (box, box & oblique):
+            shot = cast(volume, "dvr", fog, camera=camera, size=size, clip=clip)
+            way = clipped_way(clip, camera, size)
+            assert (way > 0).any() and (way == 0).any()
+            truth = 1.0 - 0.95**way
+            assert np.abs(shot.image[..., 3] / 255.0 - truth).max() <= tolerances.RAY_OPACITY
+
+
+def clipped_way(clip: Clip, camera: Camera, size) -> np.ndarray:
+    """Mm of each ray within clip planes that leave a bounded part, (h, w), by trying 5000 places."""
+    origins, directions = camera.rays(size)
+    t = np.linspace(185.0, 215.0, 5001)
+    way = np.zeros(origins.shape[:2])
+    for at in np.ndindex(*way.shape):
+        heights = (origins[at] @ clip.planes[:, :3].T - clip.planes[:, 3]) + t[:, None] * (
+            directions[at] @ clip.planes[:, :3].T
+        )
+        way[at] = (heights >= 0.0).all(axis=1).sum() * (t[1] - t[0])
+    return way
+
+
+def test_clipping_everything_away_leaves_nothing(cast):
+    volume = even_volume(blobs, "even", 10.0)
+    camera = look(volume, (0.0, 1.0, 0.0), 6.0)
+    gone = Clip.plane(centre_of(volume) + (0.0, 0.0, 99.0), (0.0, 0.0, 1.0))
+    for mode in ("mip", "minip", "mean"):
+        assert np.isnan(cast(volume, mode, camera=camera, size=(8, 8), clip=gone).values).all()
+    shot = cast(volume, "dvr", BONE, camera=camera, size=(8, 8), clip=gone)
+    assert not shot.image.any() and np.isnan(shot.depth).all() and np.isnan(shot.expected_depth).all()
+
+
+def test_jitter_is_the_same_each_time_and_right_on_average(cast):
+    """Sheets of fog that a coarse step meets or misses: opacities differ, and are right together."""
+    volume = even_volume(lambda p: 400.0 + 300.0 * np.sin(1.3 * p[:, 1]), "even", 20.0)
+    fog = TransferFunction([(300, 1, 1, 1, 0.0), (700, 1, 1, 1, 0.1)])
+    settings = {"camera": look(volume, (0.0, 1.0, 0.0), 8.0), "size": (64, 64), "ray_step": 1.5}
+    first, again = (cast(volume, "dvr", fog, jitter=True, **settings).image[..., 3].astype(float) for _ in range(2))
+    plain = cast(volume, "dvr", fog, **settings).image[..., 3].astype(float)
+    fine = cast(volume, "dvr", fog, **settings | {"ray_step": 0.05}).image[..., 3].astype(float)
+    assert np.array_equal(first, again)
+    assert plain.std() < 0.5 < first.std()
+    assert abs(first.mean() - fine.mean()) <= 4.0 * first.std() / 64.0 + 0.5
+
+
+def test_nearer_is_larger_as_much_as_the_angle_says(cast):
+    radius, size = 10.0, (64, 64)
+    volume = even_volume(lambda p: 300.0 + 100.0 * (radius - np.linalg.norm(p, axis=1)), "even", 23.0)
+    centre = centre_of(volume)
+    for distance in (33.0, 75.0):
+        camera = Camera(tuple(centre - (0.0, distance, 0.0)), tuple(centre), (0, 0, 1), view_angle=40.0)
+        shot = cast(volume, "dvr", BONE, camera=camera, size=size, ray_step=0.2)
+        hit = (shot.image[..., 3] > 127).sum()
+        seen = np.tan(np.arcsin(radius / distance)) / np.tan(np.radians(20.0)) * 32.0
+        assert abs(hit / (np.pi * seen**2) - 1.0) <= tolerances.RAY_DISC_AREA
+
+
+def test_a_camera_inside_sees_what_lies_ahead_of_it_alone(cast):
+    volume = even_volume(lambda p: np.zeros(len(p)), "oblique", 24.0, np.int16)
+    fog = TransferFunction([(-10, 1, 1, 1, 0.05), (10, 1, 1, 1, 0.05)])
+    centre, size = centre_of(volume) + (2.0, -1.0, 3.0), (24, 24)
+    camera = Camera(tuple(centre), tuple(centre + (0.3, 1.0, 0.1)), (0, 0, 1), view_angle=70.0)
+    shot = cast(volume, "dvr", fog, camera=camera, size=size)
+    way = ways_through(volume, camera, size, nearest=0.0)
+    assert (way > 5.0).all()
+    assert np.abs(shot.image[..., 3] / 255.0 - (1.0 - 0.95**way)).max() <= tolerances.RAY_OPACITY
+    assert (shot.depth >= 0.0).all() and (shot.depth < 1.0).all()
+
+
+def test_a_ball_in_an_uneven_stack_is_round(cast):
+    radius, size = 12.0, (40, 40)
+    field = lambda p: 300.0 + 50.0 * (radius - np.linalg.norm(p, axis=1))  # noqa: E731
+    volume = uneven_volume(field)
+    for towards in ((0.0, 1.0, 0.0), (0.4, 1.0, 0.5), (0.3, -0.2, 1.0)):
+        camera = look(volume, towards, 14.0, perspective=towards[2] == 0.5)
+        shot = cast(volume, "dvr", BONE, camera=camera, size=size, ray_step=0.2)
+        passing, along = distances_from(centre_of(volume), camera, size)
+        edge = np.abs(passing - radius) < tolerances.RAY_SILHOUETTE_VOXEL * max(GAPS)
+        assert np.array_equal(np.isfinite(shot.depth)[~edge], (passing < radius)[~edge])
+        clear = passing < 0.9 * radius
+        truth = along[clear] - np.sqrt(radius**2 - passing[clear] ** 2)
+        assert np.abs(shot.depth[clear] - truth).max() <= 0.2 + tolerances.RAY_DEPTH_VOXEL * max(GAPS)
+    nominal = Volume(volume.voxels, volume.affine)  # the check can fail: evenly spaced slices distort it
+    shot = cast(nominal, "dvr", BONE, camera=camera, size=size, ray_step=0.2)
+    assert (np.isfinite(shot.depth) != (passing < radius))[~edge].sum() > 20
+
+
+def test_uneven_and_even_samplings_of_one_field_look_alike(cast):
+    field = lambda p: 900.0 * np.exp(-(p[:, 0] ** 2 + 2 * p[:, 1] ** 2 + p[:, 2] ** 2) / 120.0)  # noqa: E731
+    uneven, even = uneven_volume(field), even_volume(field, "even", 60.0)
+    even = Volume(even.voxels, np.block([[even.affine[:3, :3], 0 * PLACE[:, None]], [np.zeros((1, 3)), 1.0]]))
+    move = centre_of(uneven) - centre_of(even)
+    affine = even.affine.copy()
+    affine[:3, 3] += move
+    even = Volume(even.voxels, affine)
+    soft = TransferFunction([(100, 1, 0.5, 0.3, 0.0), (800, 1, 1, 0.9, 0.3)])
+    camera = look(uneven, (0.4, 1.0, 0.5), 14.0)
+    settings = {
+        "camera": camera,
+        "size": (40, 40),
+        "ray_step": 0.4,
+    }
+    images = [cast(volume, "dvr", soft, **settings).image for volume in (uneven, even)]
+    assert np.abs(images[0][..., 3].astype(int) - images[1][..., 3]).max() <= tolerances.RAY_RESAMPLED_255
+    assert images[0][..., 3].max() > 150
+
+
+@pytest.mark.parametrize("dtype", ["int8", "uint8", "int16", "uint16", "int32", "float32"])
+def test_every_voxel_type_gives_the_same_picture(cast, dtype):
+    field = lambda p: np.rint(60.0 + 50.0 * np.sin(p[:, 0] / 2.0) * np.cos(p[:, 1] / 3.0))  # noqa: E731
+    soft = TransferFunction([(40, 1, 0.5, 0.3, 0.0), (110, 1, 1, 0.9, 0.3)])
+    volume, same = (even_volume(field, "oblique", 12.0, kind) for kind in (dtype, "float32"))
+    camera = look(volume, (0.4, 1.0, 0.5), 7.0)
+    images = [cast(v, "dvr", soft, camera=camera, size=(32, 32)).image for v in (volume, same)]
+    assert images[0][..., 3].max() > 60
+    assert np.abs(images[0].astype(int) - images[1]).max() <= tolerances.RAY_SAME_255
+    values = [cast(v, "mip", camera=camera, size=(32, 32)).values for v in (volume, same)]
+    assert np.nanmax(np.abs(values[0] - values[1])) <= tolerances.RAY_AXIS_HU
+
+
+@pytest.mark.parametrize("shape", [(1, 1, 1), (5, 1, 2), (1, 4, 3), (2, 2, 1), (1, 1, 7)])
+def test_volumes_of_few_voxels_are_boxes_of_their_size(cast, shape):
+    volume = Volume(np.full(shape, 700, np.int16), np.diag([1.0, 2.0, 3.0, 1.0]))
+    fog = TransferFunction([(600, 1, 1, 1, 0.1), (800, 1, 1, 1, 0.1)])
+    for perspective in (False, True):
+        camera = look(volume, (0.5, 1.0, 0.3), 8.0, perspective=perspective)
+        way = ways_through(volume, camera, (32, 32))
+        image = cast(volume, "dvr", fog, camera=camera, size=(32, 32), ray_step=0.1).image
+        assert np.abs(image[..., 3] / 255.0 - (1.0 - 0.9**way)).max() <= tolerances.RAY_OPACITY
+        assert image[..., 3].any()
+        for mode in ("mip", "minip", "mean"):
+            values = cast(volume, mode, camera=camera, size=(32, 32), ray_step=0.1).values
+            assert np.array_equal(np.isnan(values), way == 0.0)
+            assert np.nanmax(np.abs(values - 700.0)) <= tolerances.RAY_AXIS_HU
+
+
+def test_what_is_never_opaque_leaves_the_picture_empty(cast):
+    volume = even_volume(blobs, "even", 10.0)
+    clear = TransferFunction([(-1000, 1, 1, 1, 0.0), (3000, 1, 1, 1, 0.0)])
+    shot = cast(volume, "dvr", clear, camera=look(volume, (0, 1, 0), 6.0), size=(16, 12))
+    assert shot.image.shape == (12, 16, 4) and not shot.image.any()
+    assert np.isnan(shot.depth).all() and np.isnan(shot.expected_depth).all()
+
+
+def test_air_at_the_first_point_is_exactly_clear(cast):
+    """A ramp of opacity that begins at the value of most voxels must not lay fog over them."""
+    volume = even_volume(lambda p: np.full(len(p), -1000.0), "even", 60.0, np.int16)
+    ramp = TransferFunction([(-1000, 1, 1, 1, 0.0), (0, 1, 1, 1, 1.0), (3000, 1, 1, 1, 1.0)])
+    shot = cast(volume, "dvr", ramp, camera=look(volume, (0, 1, 0), 20.0), size=(8, 8))
+    assert not shot.image.any() and np.isnan(shot.depth).all()
+
+
+def test_a_step_at_the_first_point_leaves_what_is_below_it_clear(cast):
+    volume = even_volume(lambda p: np.where(p[:, 2] > 0.0, 500.0, 100.0), "even", 10.0, np.int16)
+    step = TransferFunction([(300, 1, 1, 1, 0.0), (300, 1, 1, 1, 0.9), (3000, 1, 1, 1, 0.9)])
+    shot = cast(volume, "dvr", step, camera=look(volume, (0, 1, 0), 3.0, up=(0, 0, 1)), size=(8, 8))
+    assert (shot.image[:3, :, 3] > 250).all() and not shot.image[-3:].any()
