@@ -43,7 +43,7 @@ typedef struct {
     __global const float *factors; /* on the opacity, by magnitude of the gradient */
     __global const float4 *view;
     float low, scale; /* nearest node to a value v: (v - low) * scale + 0.5 */
-    float factor_scale; /* nearest node to a magnitude m: m * factor_scale + 0.5 */
+    float factor_scale; /* entry of a magnitude m, a fraction: m * factor_scale */
     float steps_per_unit; /* ray steps in the unit distance */
     float ray_step;
     float slab_low, slab_high; /* samples with slab_low <= k < slab_high are this slab's */
@@ -73,9 +73,11 @@ static inline void blend_samples(const field *f, const slice_stack *stack, const
         floats x, y, z;
         find_gradients(look->view, stack, &s, k, &x, &y, &z);
 #if IS_WEIGHED
-        const floats entry = sqrt(x * x + y * y + z * z) * look->factor_scale + 0.5f;
-        const ints at = to_ints(min(entry, (floats)(GRADIENT_NODES - 1)));
-        const floats factor = (floats)(GATHER(float, look->factors, at));
+        const floats entry = min(sqrt(x * x + y * y + z * z) * look->factor_scale, (floats)(GRADIENT_NODES - 1));
+        const ints at = min(to_ints(entry), (ints)(GRADIENT_NODES - 2));
+        const floats low = (floats)(GATHER(float, look->factors, at));
+        const floats high = (floats)(GATHER(float, look->factors + 1, at));
+        const floats factor = low + (entry - to_floats(at)) * (high - low);
         /* The factor is on the opacity of the unit distance. */
         const floats whole = stretch_opacity(opacity, (floats)(look->steps_per_unit));
         const floats weighed = stretch_opacity(factor * whole, (floats)(1.0f / look->steps_per_unit));

@@ -7,6 +7,7 @@
  * -D UNEVEN   slices at places of their own */
 #include "include/field.h"
 #include "include/leap.h"
+#include "include/stack.h"
 #include "include/view.h"
 
 #define HIGHEST 0
@@ -56,7 +57,7 @@ __kernel void project_rays(
     __global float4 *restrict states, __global float *restrict depths, __global float *restrict values,
     const float4 last_place, const int ni, const int nj, const int first_k, const int end_k, const float slab_low,
     const float slab_high, const int bi, const int bj, const int bk, const uint width, const uint height,
-    const uint planes, const int perspective, const int which, const int stage, const uint queues)
+    const uint planes, const int perspective, const int which, const int stage, const uint queues STACK_PARAMETERS)
 {
     const int2 pixel = find_pixel((uint)get_global_id(0), width, height, queues);
     if (pixel.x >= (int)width || pixel.y >= (int)height)
@@ -68,10 +69,16 @@ __kernel void project_rays(
     const float ray_step = view[VIEW_NEAR].y;
     const float span = r.t_out - r.t_in;
 
+    const slice_stack stack = STACK_TABLE;
     crossings c;
     plan_crossings(&r, ray_step, &c);
     const int segments = span > 0.0f ? (int)ceil(span / ray_step) : 0;
-    const int count = which == MEAN ? segments : c.count;
+#ifdef UNEVEN
+    const int on_planes = 0; /* no step meets planes at any distance */
+#else
+    const int on_planes = which != MEAN;
+#endif
+    const int count = on_planes ? c.count : segments;
     /* Lowest values are the highest of the field turned over. */
     const float sign = which == LOWEST ? -1.0f : 1.0f;
     float best = which == MEAN ? 0.0f : -MAXFLOAT, t_best = 0.0f, length_mm = 0.0f;
@@ -85,7 +92,7 @@ __kernel void project_rays(
     while (n < count) {
         const floats number = (float)n + LANE_NUMBERS;
         floats t, weight;
-        if (which == MEAN) {
+        if (!on_planes) {
             const floats from = number * ray_step;
             weight = min((floats)(ray_step), span - from);
             t = r.t_in + from + 0.5f * weight;
@@ -95,7 +102,8 @@ __kernel void project_rays(
             weight = choose(number < (float)count, (floats)(1.0f), (floats)(0.0f));
         }
         floats i = r.origin.x + t * r.step.x, j = r.origin.y + t * r.step.y, k = r.origin.z + t * r.step.z;
-        if (which != MEAN) {
+        to_indices(&stack, &i, &j, &k);
+        if (on_planes) {
             i = rint(i * SNAP) / SNAP;
             j = rint(j * SNAP) / SNAP;
             k = rint(k * SNAP) / SNAP;
@@ -115,7 +123,11 @@ __kernel void project_rays(
                 continue;
             }
         }
-        weight = choose((k >= slab_low) & (k < slab_high), max(weight, (floats)(0.0f)), (floats)(0.0f));
+        ints counts = (k >= slab_low) & (k < slab_high);
+#ifdef UNEVEN
+        counts &= (i >= -0.5f) & (i <= f.last.x + 0.5f) & (j >= -0.5f) & (j <= f.last.y + 0.5f);
+#endif
+        weight = choose(counts, max(weight, (floats)(0.0f)), (floats)(0.0f));
         const floats value = sign * sample_lanes(&f, i, j, k);
         float lane_value[LANES], lane_weight[LANES], lane_t[LANES];
         store_lanes(value, lane_value);

@@ -40,6 +40,10 @@ class TransferTables:
     shown : ndarray, shape (NODES,), bool
     low, scale : float
         Nearest node to v: ``floor((v - low) * scale + 0.5)``.
+    factors_d : buffer, (GRADIENT_NODES,) float32
+        On the opacity, by magnitude of the gradient times `factor_scale`; counts where it is `weighed`.
+    steps_per_unit : float
+        Ray steps in the unit distance.
     """
 
     colors_d: Any
@@ -50,6 +54,7 @@ class TransferTables:
     scale: float
     factor_scale: float
     steps_per_unit: float
+    weighed: bool
 
     @classmethod
     def of(cls, device: Device, function: TransferFunction, ray_step: float) -> TransferTables:
@@ -71,6 +76,7 @@ class TransferTables:
         return cls(
             upload(device, colors), upload(device, opacities), upload(device, factors), shown, low,
             (NODES - 1) / (high - low), (GRADIENT_NODES - 1) / top, function.unit_distance / ray_step,
+            function.gradient_opacity is not None,
         )  # fmt: skip
 
 
@@ -97,19 +103,20 @@ def composite_slab(
         Holds what earlier slabs left.
     """
     device = resident.device
+    program = resident.program("render/composite.cl", **({"GRADIENT_OPACITY": "1"} if tables.weighed else {}))
     lanes = int(device.kernel_variants["LANES"])
     width, height = view.size
     queues = count_queues(device)
     last = np.array([n - 1 for n in resident.volume.shape_ijk] + [0], dtype=np.float32)
     launch(
-        device, resident.program("render/composite.cl")["composite_rays"], output.items(queues, lanes),
+        device, program["composite_rays"], output.items(queues, lanes),
         slab.voxels_d, leaps.distances_d, tables.colors_d, tables.opacities_d, tables.factors_d,
         upload(device, highlight_table(lighting)), upload(device, view.table), output.states_d, output.image_d,
-        output.depths_d, output.means_d, output.background, last, np.zeros(4, np.float32),
+        output.depths_d, output.means_d, output.background, last, resident.stack.slope,
         np.int32(slab.shape_ijk[0]), np.int32(slab.shape_ijk[1]), np.int32(slab.first_k), np.int32(slab.end_k),
         np.float32(slab.low_k), np.float32(slab.high_k), *(np.int32(n) for n in slab.bricks),
         np.float32(tables.low), np.float32(tables.scale), np.float32(tables.factor_scale),
         np.float32(tables.steps_per_unit), np.uint32(width), np.uint32(height),
         np.uint32(view.planes), np.int32(not view.camera.is_parallel), np.int32(lighting.shades), np.int32(jitter),
-        np.int32(slab.stage), np.uint32(queues), stopwatch=stopwatch,
+        np.int32(slab.stage), np.uint32(queues), *resident.stack.arguments, stopwatch=stopwatch,
     )  # fmt: skip

@@ -40,5 +40,6 @@ def project_slab(
         np.int32(slab.shape_ijk[0]), np.int32(slab.shape_ijk[1]), np.int32(slab.first_k), np.int32(slab.end_k),
         np.float32(slab.low_k), np.float32(slab.high_k), *(np.int32(n) for n in slab.bricks),
         np.uint32(width), np.uint32(height), np.uint32(view.planes), np.int32(not view.camera.is_parallel),
-        np.int32(PROJECTIONS[mode]), np.int32(slab.stage), np.uint32(queues), stopwatch=stopwatch,
+        np.int32(PROJECTIONS[mode]), np.int32(slab.stage), np.uint32(queues), *resident.stack.arguments,
+        stopwatch=stopwatch,
     )  # fmt: skip

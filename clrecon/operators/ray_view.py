@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,7 +13,7 @@ from clrecon.geometry.affine import Float64Array
 from clrecon.geometry.camera import Camera, box_corners
 from clrecon.rendering import Lighting
 
-__all__ = ["BOX_BORDER", "FieldFrame", "RayView", "volume_box"]
+__all__ = ["BOX_BORDER", "FieldFrame", "RayView", "enclose", "volume_box"]
 
 BOX_BORDER = 0.5
 """Voxels beyond the outermost voxel centres that belong to a volume."""
@@ -57,10 +58,17 @@ class FieldFrame:
 
 def volume_box(volume: Volume) -> tuple[Float64Array, Float64Array]:
     """Lowest and highest field coordinates of a volume, half a voxel beyond its outermost centres."""
-    if volume.uneven:
-        places = FieldFrame.of(volume).places(box_corners(volume))
-        return places.min(axis=0), places.max(axis=0)
-    return np.full(3, -BOX_BORDER), np.array(volume.shape_ijk) - 1.0 + BOX_BORDER
+    return enclose(volume, np.full(3, -BOX_BORDER), np.array(volume.shape_ijk) - 1.0 + BOX_BORDER)
+
+
+def enclose(volume: Volume, low: Float64Array, high: Float64Array) -> tuple[Float64Array, Float64Array]:
+    """Lowest and highest field coordinates of what lies between two corners in voxel indices."""
+    if not volume.uneven:
+        return low, high
+    ks = {low[2], high[2], *range(math.ceil(low[2]), math.floor(high[2]) + 1)}
+    corners = [(i, j, k) for k in ks for i in (low[0], high[0]) for j in (low[1], high[1])]
+    places = FieldFrame.of(volume).places(volume.ijk_to_lps(corners))
+    return places.min(axis=0), places.max(axis=0)
 
 
 @dataclass(frozen=True)

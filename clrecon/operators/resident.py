@@ -13,7 +13,8 @@ from clrecon.geometry import Volume
 from clrecon.geometry.affine import Float64Array
 from clrecon.kernels import Program, Stopwatch, allocate, download, launch, load_program, upload
 from clrecon.opencl import Device, check_budget, describe_shortage, memory_limits
-from clrecon.operators.ray_view import BOX_BORDER
+from clrecon.operators.ray_view import BOX_BORDER, enclose
+from clrecon.operators.stack_table import StackTable
 from clrecon.operators.voxel_types import voxel_variants
 
 __all__ = ["BRICK_CELLS", "LeapMap", "RaySlab", "ResidentVolume", "ray_variants"]
@@ -40,7 +41,7 @@ class LeapMap:
     distances_d : buffer, (bk, bj, bi) uint8
         Chebyshev distance in bricks, 0 where something shows.
     box : (low, high) or None
-        Voxel indices of the part of the volume that all bricks with something lie in; None where there is none.
+        Field coordinates of the part of the volume that all bricks with something lie in; None where there is none.
     """
 
     distances_d: Any
@@ -108,6 +109,7 @@ class ResidentVolume:
         self.memory = memory
         self.dtype = volume.voxels.dtype
         self._whole: RaySlab | None = None
+        self.stack = StackTable.of(volume, device)
 
     def close(self) -> None:
         """Free what is on the device."""
@@ -248,4 +250,4 @@ class ResidentVolume:
         low[2] += slab.first_k
         high[2] += slab.first_k
         # Cells at the ends reach to the border of the volume.
-        return low - BOX_BORDER, high + BOX_BORDER
+        return enclose(self.volume, low - BOX_BORDER, high + BOX_BORDER)
