@@ -19,6 +19,12 @@ __all__ = ["Camera", "CameraBasis", "box_corners"]
 DEFAULT_VIEW_ANGLE = 30.0
 """Degrees from the bottom to the top of a perspective picture, as in VTK."""
 
+FIT_MARGIN = 1.02
+"""Room that a fitted picture leaves around a volume."""
+
+TURN_STEP = 5
+"""Degrees between the directions in which a turning camera is tried."""
+
 RADII_AWAY = 2.0
 """Where a parallel camera is put, in radii of the volume: outside of it, and near, so that depths keep their digits."""
 
@@ -112,11 +118,9 @@ class Camera:
         up: str | ArrayLike | None = None,
         view_angle: float | None = None,
         size: Sequence[int] = (1024, 1024),
+        turning: bool = False,
     ) -> Camera:
-        """Look at the middle of a volume from a side of the patient.
-
-        The sphere around the volume's box just fits into the picture: the volume is whole in every view, as large in
-        one as in the other, and stays so when the camera orbits.
+        """Look at the middle of a volume from a side of the patient, so that all of it just fits into the picture.
 
         Parameters
         ----------
@@ -133,7 +137,9 @@ class Camera:
         view_angle : float, optional
             Makes a perspective camera of so many degrees; default: a parallel one.
         size : (int, int)
-            Width and height of the picture: its shorter side is what the sphere must fit into.
+            Width and height of the picture.
+        turning : bool
+            Leave room for the volume to stay whole while the camera orbits about the axis of the body.
 
         Raises
         ------
@@ -146,14 +152,21 @@ class Camera:
         corners = box_corners(volume)
         middle = np.concatenate([corners[:4], corners[-4:]]).mean(axis=0)
         radius = float(np.linalg.norm(corners - middle, axis=1).max())
-        shorter = min(1.0, width / height)
-        away = RADII_AWAY * radius
-        if view_angle is not None:
-            in_front = cls(_triple(middle + towards), _triple(middle), _triple(up_lps), view_angle=view_angle)
-            away = radius / np.sin(np.arctan(in_front.half_height() * shorter))
-        scale = radius / shorter if view_angle is None else None
-        position = middle + away * towards
+        parallel = view_angle is None
+        near = cls(_triple(middle + towards), _triple(middle), _triple(up_lps), view_angle, 1.0 if parallel else None)
+        turns = range(0, 360, TURN_STEP) if turning else (0,)
+        needs = [near.orbit(turn)._room_for(corners - middle, width / height) for turn in turns]
+        position = middle + (RADII_AWAY * radius if parallel else max(needs)) * towards
+        scale = max(needs) if parallel else None
         return cls(_triple(position), _triple(middle), _triple(up_lps), view_angle, scale).zoomed(zoom)
+
+    def _room_for(self, points: Float64Array, aspect: float) -> float:
+        """Parallel scale, or distance of a perspective camera, at which points about the focal point fit."""
+        right, up, forward = self.basis()
+        across = np.maximum(np.abs(points @ up), np.abs(points @ right) / aspect) * FIT_MARGIN
+        if self.is_parallel:
+            return float(across.max())
+        return float((across / self.half_height() - points @ forward).max())
 
     @classmethod
     def from_pyvista(cls, source: Any, size: Sequence[int] | None = None) -> Camera:
