@@ -49,9 +49,10 @@ static inline floats count_to_face(
 #endif
 }
 
-/* Samples from number n of each ray on that lie in empty bricks; 0 where its brick shows something. */
-static inline floats count_free_steps(
-    const leap_map *map, const slice_stack *stack, const ray_lanes *rays, const floats n, const int first_k)
+/* Samples from number n of each ray on that lie in bricks with none that shows less than `margin` bricks further; 0 where
+ * that is not so from the beginning.  Beyond the bricks counts the nearest one. */
+static inline floats count_free_steps(const leap_map *map, const slice_stack *stack, const ray_lanes *rays,
+    const floats n, const int first_k, const int margin)
 {
     floats i = rays->start_i + n * rays->stride_i, j = rays->start_j + n * rays->stride_j;
     floats k = rays->start_k + n * rays->stride_k;
@@ -61,7 +62,7 @@ static inline floats count_free_steps(
     const ints brick_j = clamp(to_ints(j * BRICKS_PER_CELL), (ints)(0), (ints)(map->bj - 1));
     const ints brick_k = clamp(to_ints(k * BRICKS_PER_CELL), (ints)(0), (ints)(map->bk - 1));
     const ints at = (brick_k * map->bj + brick_j) * map->bi + brick_i;
-    const ints distance = (ints)(GATHER(uchar, map->distances, at));
+    const ints distance = (ints)(GATHER(uchar, map->distances, at)) - margin;
     /* The cube of bricks less than `distance` away is empty. */
     const floats steps = min(min(count_to_face(i, rays->stride_i, rays->pace_i, brick_i, distance),
                                  count_to_face(j, rays->stride_j, rays->pace_j, brick_j, distance)),

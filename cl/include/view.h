@@ -50,15 +50,21 @@ typedef struct {
     float t_in, t_out, focus_in, focus_out;
 } ray;
 
-/* Pixel `index` in the order of tiles.  `queues` parts of that order take every so manyeth tile each, for CPU drivers
+/* Tile of pixel `index` in the order of tiles.  `queues` parts of that order take every so manieth tile each, for CPU drivers
  * that cut a launch into as many equal parts as there are cores. */
+static inline uint find_tile(const uint index, const uint width, const uint height, const uint queues)
+{
+    const uint tiles = (width + TILE - 1) / TILE * ((height + TILE - 1) / TILE);
+    const uint share = (tiles + queues - 1) / queues, place = index / (TILE * TILE);
+    /* Work-items beyond the last tile have a pixel below the picture: none is done twice. */
+    return place < share * queues ? min(place % share * queues + place / share, tiles) : tiles;
+}
+
+/* Pixel `index` in the same order. */
 static inline int2 find_pixel(const uint index, const uint width, const uint height, const uint queues)
 {
-    const uint columns = (width + TILE - 1) / TILE, rows = (height + TILE - 1) / TILE;
-    const uint share = (columns * rows + queues - 1) / queues;
-    const uint place = index / (TILE * TILE), pixel = index % (TILE * TILE);
-    /* Work-items beyond the last tile have a pixel below the picture: none is done twice. */
-    const uint tile = place < share * queues ? place % share * queues + place / share : columns * rows;
+    const uint columns = (width + TILE - 1) / TILE, tile = find_tile(index, width, height, queues);
+    const uint pixel = index % (TILE * TILE);
     return (int2)((int)(tile % columns * TILE + pixel % TILE), (int)(tile / columns * TILE + pixel / TILE));
 }
 
@@ -74,9 +80,9 @@ static inline void clip_to_box(const ray *r, const float4 low, const float4 high
 
 /* Set up the ray of pixel (x, y) with its way through the box; perspective rays begin at the camera. */
 static inline void start_ray(
-    __global const float4 *restrict view, const int2 pixel, const uint planes, const int perspective, ray *r)
+    __global const float4 *restrict view, const float2 pixel, const uint planes, const int perspective, ray *r)
 {
-    const float x = (float)pixel.x, y = (float)pixel.y;
+    const float x = pixel.x, y = pixel.y;
     const float4 direction = view[VIEW_DIRECTION] + x * view[VIEW_DIRECTION_X] + y * view[VIEW_DIRECTION_Y];
     const float length_mm = sqrt(direction.x * direction.x + direction.y * direction.y + direction.z * direction.z);
     r->direction = direction.xyz / length_mm;

@@ -106,6 +106,7 @@ static inline void blend_samples(const field *f, const slice_stack *stack, const
  *             leaps    in   (bk, bj, bi) Chebyshev distance in bricks to what shows, 0: shows
  *             colors opacities factors  in  (NODES), (NODES), (GRADIENT_NODES) see looks
  *             highlights in (HIGHLIGHTS) see include/phong.h
+ *             entries  in   (tile rows, tile columns) t before which nothing shows, MAXFLOAT: nothing does
  *             view     in   see include/view.h
  *             states   in/out  (height, width, 2) float4: premultiplied rgba; t of the first hit, sum of w t, -, -
  *             image    out  (height, width) rgba
@@ -125,6 +126,7 @@ __kernel void composite_rays(
     __global const VOXEL *restrict voxels, __global const uchar *restrict leaps,
     __global const int *restrict colors, __global const float *restrict opacities,
     __global const float *restrict factors, __global const float *restrict highlights,
+    __global const float *restrict entries,
     __global const float4 *restrict view, __global float4 *restrict states, __global uchar4 *restrict image,
     __global float *restrict depths, __global float *restrict means, const float4 background, const float4 last_place,
     const float4 slope, const int ni, const int nj, const int first_k, const int end_k, const float slab_low,
@@ -140,6 +142,20 @@ __kernel void composite_rays(
     const looks look = { colors, opacities, highlights, factors, view, low, scale, factor_scale, steps_per_unit,
         ray_step, slab_low, slab_high, shaded };
 
+    const uint tile = find_tile(first_pixel, width, height, queues);
+    const uint tiles = (width + TILE - 1) / TILE * ((height + TILE - 1) / TILE);
+    const float entry = tile < tiles ? entries[tile] : MAXFLOAT;
+    if (entry == MAXFLOAT && stage == (FIRST_SLAB | LAST_SLAB)) {
+        for (int lane = 0; lane < LANES; ++lane) {
+            const int2 pixel = find_pixel(first_pixel + lane, width, height, queues);
+            if (pixel.x < (int)width && pixel.y < (int)height) {
+                const size_t place = (size_t)pixel.y * width + (size_t)pixel.x;
+                image[place] = finish_color((float4)(0.0f), background);
+                depths[place] = means[place] = NAN;
+            }
+        }
+        return;
+    }
     ray_lanes course;
     packet rays;
     sights seen;
@@ -152,11 +168,11 @@ __kernel void composite_rays(
             const int2 pixel = find_pixel(first_pixel + lane, width, height, queues);
             const int inside = pixel.x < (int)width && pixel.y < (int)height;
             ray way;
-            start_ray(view, pixel, planes, perspective, &way);
+            start_ray(view, convert_float2(pixel), planes, perspective, &way);
             const float phase = jitter ? jitter_pixel((uint)pixel.x, (uint)pixel.y) : 0.5f;
             const float span = way.t_out - way.t_in;
             const int segments = span > 0.0f ? (int)ceil(span / ray_step) : 0;
-            const int some = inside && segments > 0 && way.focus_out > way.focus_in;
+            const int some = inside && segments > 0 && way.focus_out > max(way.focus_in, entry);
             const float4 start = way.origin + (way.t_in + phase * ray_step) * way.step;
             lane_of[0][lane] = start.x;
             lane_of[1][lane] = start.y;
@@ -169,7 +185,8 @@ __kernel void composite_rays(
             lane_of[8][lane] = way.offset;
             lane_of[9][lane] = (float)(segments - 1);
             lane_of[10][lane] = span - (float)(segments - 1) * ray_step;
-            lane_of[11][lane] = some ? max(floor((way.focus_in - way.t_in) / ray_step - phase), 0.0f) : MAXFLOAT;
+            const float enter = max(way.focus_in, entry);
+            lane_of[11][lane] = some ? max(floor((enter - way.t_in) / ray_step - phase), 0.0f) : MAXFLOAT;
             lane_of[12][lane] = some
                 ? min(ceil((way.focus_out - way.t_in) / ray_step - phase) + 1.0f, (float)segments) : 0.0f;
             lane_of[13][lane] = way.direction.x;
@@ -216,7 +233,7 @@ __kernel void composite_rays(
     float n = LEAST_LANE(rays.begin);
     floats end = choose(seen.opacity < OPAQUE, rays.end, (floats)(0.0f));
     while (ANY_LANE(n < end)) {
-        const floats all_free = count_free_steps(&map, &stack, &course, (floats)(n), first_k);
+        const floats all_free = count_free_steps(&map, &stack, &course, (floats)(n), first_k, 0);
         const float free = LEAST_LANE(choose(n < end, max(all_free, rays.begin - n), (floats)(MAXFLOAT)));
         if (free > 0.0f) {
             n += free;

@@ -65,7 +65,7 @@ __kernel void project_rays(
     const size_t place = (size_t)pixel.y * width + (size_t)pixel.x;
     const field f = { voxels, ni, nj, first_k, end_k, last_place };
     ray r;
-    start_ray(view, pixel, planes, perspective, &r);
+    start_ray(view, convert_float2(pixel), planes, perspective, &r);
     const float ray_step = view[VIEW_NEAR].y;
     const float span = r.t_out - r.t_in;
 

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from clrecon.kernels import Stopwatch, launch, upload
+from clrecon.kernels import Stopwatch, allocate, launch, upload
 from clrecon.opencl import Device
 from clrecon.operators.pictures import PictureBuffers, count_queues, highlight_table
 from clrecon.operators.ray_view import RayView
-from clrecon.operators.resident import LeapMap, RaySlab, ResidentVolume
+from clrecon.operators.resident import BRICK_CELLS, LeapMap, RaySlab, ResidentVolume
 from clrecon.rendering import Lighting, TransferFunction
 
 __all__ = ["NODES", "TransferTables", "composite_slab"]
@@ -108,11 +109,12 @@ def composite_slab(
     width, height = view.size
     queues = count_queues(device)
     last = np.array([n - 1 for n in resident.volume.shape_ijk] + [0], dtype=np.float32)
+    entries_d = _enter_tiles(resident, slab, view, leaps, output, stopwatch)
     launch(
         device, program["composite_rays"], output.items(queues, lanes),
         slab.voxels_d, leaps.distances_d, tables.colors_d, tables.opacities_d, tables.factors_d,
-        upload(device, highlight_table(lighting)), upload(device, view.table), output.states_d, output.image_d,
-        output.depths_d, output.means_d, output.background, last, resident.stack.slope,
+        upload(device, highlight_table(lighting)), entries_d, upload(device, view.table), output.states_d,
+        output.image_d, output.depths_d, output.means_d, output.background, last, resident.stack.slope,
         np.int32(slab.shape_ijk[0]), np.int32(slab.shape_ijk[1]), np.int32(slab.first_k), np.int32(slab.end_k),
         np.float32(slab.low_k), np.float32(slab.high_k), *(np.int32(n) for n in slab.bricks),
         np.float32(tables.low), np.float32(tables.scale), np.float32(tables.factor_scale),
@@ -120,3 +122,27 @@ def composite_slab(
         np.uint32(view.planes), np.int32(not view.camera.is_parallel), np.int32(lighting.shades), np.int32(jitter),
         np.int32(slab.stage), np.uint32(queues), *resident.stack.arguments, stopwatch=stopwatch,
     )  # fmt: skip
+
+
+def _enter_tiles(
+    resident: ResidentVolume,
+    slab: RaySlab,
+    view: RayView,
+    leaps: LeapMap,
+    output: PictureBuffers,
+    stopwatch: Stopwatch,
+) -> Any:
+    """For each tile the way in mm before which none of its rays meets anything, on the device."""
+    device = resident.device
+    lanes = int(device.kernel_variants["LANES"])
+    width, height = view.size
+    margin = math.ceil(float((view.spread * resident.stack.steps_per_unit).max()) / BRICK_CELLS)
+    entries_d = allocate(device, 4 * output.tiles)
+    launch(
+        device, resident.program("render/tiles.cl")["enter_tiles"], -(-output.tiles // lanes),
+        leaps.distances_d, upload(device, view.widened(margin * BRICK_CELLS * resident.stack.longest_step)), entries_d,
+        resident.stack.slope, *(np.int32(n) for n in slab.bricks), np.int32(slab.first_k), np.int32(margin),
+        np.uint32(width), np.uint32(height), np.int32(not view.camera.is_parallel), *resident.stack.arguments,
+        stopwatch=stopwatch,
+    )  # fmt: skip
+    return entries_d

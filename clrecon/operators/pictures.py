@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from clrecon.kernels import allocate, download, empty_output
 from clrecon.opencl import Device
+from clrecon.operators.ray_view import TILE
 from clrecon.rendering import Lighting
 from clrecon.rendering.colors import find_color
 
@@ -17,9 +18,6 @@ __all__ = ["HIGHLIGHTS", "PictureBuffers", "count_queues", "highlight_table"]
 
 HIGHLIGHTS = 1024
 """Entries of the table of highlights, as in cl/include/phong.h."""
-
-TILE = 8
-"""Pixels along each side of a tile, as in cl/include/view.h."""
 
 
 def highlight_table(lighting: Lighting) -> NDArray[np.float32]:
@@ -68,9 +66,13 @@ class PictureBuffers:
 
     def items(self, queues: int, lanes: int) -> int:
         """Work-items of a launch, each with `lanes` pixels."""
+        return -(-self.tiles // queues) * queues * (TILE * TILE // lanes)
+
+    @property
+    def tiles(self) -> int:
+        """Tiles of the picture."""
         width, height = self.size
-        tiles = -(-width // TILE) * -(-height // TILE)
-        return -(-tiles // queues) * queues * (TILE * TILE // lanes)
+        return -(-width // TILE) * -(-height // TILE)
 
     def download(self) -> tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.float32]]:
         """Wait, and return image, depths and means."""

@@ -13,7 +13,13 @@ from clrecon.geometry.affine import Float64Array
 from clrecon.geometry.camera import Camera, box_corners
 from clrecon.rendering import Lighting
 
-__all__ = ["BOX_BORDER", "FieldFrame", "RayView", "enclose", "volume_box"]
+__all__ = ["BOX_BORDER", "TILE", "FieldFrame", "RayView", "enclose", "volume_box"]
+
+TILE = 8
+"""Pixels along each side of a tile, as in cl/include/view.h."""
+
+BOX_ROW = 9
+"""Row of the box in the table; its upper end and both of the focus follow."""
 
 BOX_BORDER = 0.5
 """Voxels beyond the outermost voxel centres that belong to a volume."""
@@ -84,6 +90,8 @@ class RayView:
     table : ndarray, shape (rows, 4), float32
     planes : int
         Clip planes among the rows.
+    spread : ndarray, shape (3,), float64
+        Field coordinates that the rays of a tile may be away from the one in its middle, and one ray step more.
     """
 
     camera: Camera
@@ -91,6 +99,7 @@ class RayView:
     ray_step: float
     table: NDArray[np.float32]
     planes: int
+    spread: Float64Array
 
     @classmethod
     def of(
@@ -152,4 +161,16 @@ class RayView:
         if planes is not None and len(planes):
             table = np.vstack([table, frame.planes(planes)])
             count = len(planes)
-        return cls(camera, size, ray_step, table.astype(np.float32), count)
+        reach = 1.0
+        if not camera.is_parallel:  # the rays go apart: to the far side of the volume, in the corner of the picture
+            reach = (near + 2.0 * np.linalg.norm(corners - centre, axis=1).max()) * np.linalg.norm(directions[0])
+        apart = 0.5 * TILE * pixel * reach * (np.abs(frame.matrix @ right) + np.abs(frame.matrix @ up))
+        spread = apart + ray_step * np.linalg.norm(frame.matrix, axis=1)
+        return cls(camera, size, ray_step, table.astype(np.float32), count, spread)
+
+    def widened(self, by: float) -> NDArray[np.float32]:
+        """The table with the focus, `by` larger on all sides, for its box, and without clip planes."""
+        table = self.table[: len(self.table) - self.planes].copy()
+        table[BOX_ROW, :3] = table[BOX_ROW + 2, :3] - by
+        table[BOX_ROW + 1, :3] = table[BOX_ROW + 3, :3] + by
+        return table

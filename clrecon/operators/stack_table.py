@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.geometry import Volume
+from clrecon.geometry.affine import Float64Array
 from clrecon.geometry.field import slice_normal_matrices
 from clrecon.kernels import upload
 from clrecon.opencl import Device
@@ -30,17 +31,23 @@ class StackTable:
         The last arguments of kernels with STACK_PARAMETERS; none for even volumes.
     slope : ndarray, shape (4,), float32
         Largest number of index steps along i, j and k that a mm of height makes.
+    steps_per_unit : ndarray, shape (3,), float64
+        Largest number of index steps along i, j and k that a step in field coordinates can make.
+    longest_step : float
+        Field coordinates that an index step makes at most.
     """
 
     arguments: tuple[Any, ...]
     slope: NDArray[np.float32]
+    steps_per_unit: Float64Array
+    longest_step: float
 
     @classmethod
     def of(cls, volume: Volume, device: Device) -> StackTable:
         """The table of a volume, on the device."""
         slope = np.zeros(4, np.float32)
         if not volume.uneven:
-            return cls((), slope)
+            return cls((), slope, np.ones(3), 1.0)
         nk = volume.shape_ijk[2]
         places = FieldFrame.of(volume).places(volume.slice_origins())
         heights = places[:, 2]
@@ -58,4 +65,8 @@ class StackTable:
         slope[:2] = np.abs(np.diff(places[:, :2], axis=0) / gaps[:, None]).max(axis=0)
         slope[2] = 1.0 / gaps.min()
         arguments = (upload(device, table), upload(device, layers), np.float32(per_mm), np.int32(count), np.int32(nk))
-        return cls(arguments, slope)
+        # What moves along the height moves aside as well.
+        reach = np.array([1.0 + slope[0], 1.0 + slope[1], slope[2]])
+        return cls(
+            arguments, slope, reach, float(max(1.0, gaps.max(), *np.abs(np.diff(places[:, :2], axis=0)).max(axis=0)))
+        )
