@@ -13,6 +13,26 @@ def float32_unit(points) -> float:
 # --- geometry: maps ---
 FLOAT64_PLACE_MM = 1e-9  # coordinates of some 1000 mm there and back in float64
 
+# --- geometry: images of pyvista ---
+IMAGE_POINT_MM = 1e-9  # VTK places points by direction and spacing in float64
+IMAGE_SURFACE_MM = 1e-4  # float32 vertices some 200 mm from the origin, placed by another program: measured 2e-5
+IMAGE_VOLUME = 1e-4  # of a sphere within one set of vertices, other fans of the same loops: measured 1e-5
+RESAMPLED_RAMP_HU = 1e-3  # trilinear interpolation of a ramp of 500 HU is the ramp, in float32: measured 1e-4
+
+# --- pictures in scenes of pyvista ---
+FLOAT32_POINT_MM = 1e-4  # float32 coordinates up to 1000 mm: half a unit is 3e-5
+FLOAT32_POINT_PIXEL = 1e-4  # the same in pixels of 9 mm, 100 mm from a camera
+DRAWN_PICTURE_LEVELS = 1  # of 255; OpenGL may round colours down
+DRAWN_BLEND_LEVELS = 3  # of 255, two blendings in 8 bits, one of them divided by an opacity of 0.4
+DRAWN_OUTLINE_SHARE = 0.01  # pixels on the outlines of balls of 120 facets, smoothed by the driver; measured 0.004
+DRAWN_DEPTH_MM = 0.4  # facets of a ball of 20 mm sag 0.03, and more where they are seen edge on: measured 0.2
+
+# --- pictures against VTK's fixed-point mapper: SSIM of luminance ---
+VTK_LIKENESS_SMOOTH = 0.99  # samples of another phase, HU rounded to integers; measured 0.995 to 0.999
+VTK_LIKENESS_SPINE = 0.95  # the bar; it interpolates shades of voxels, we shade interpolated gradients: measured 0.954
+BENCH_LIKENESS = 0.98  # SSIM of a ball in 60 x 50 pixels; measured 0.9935 to 0.9993
+VTK_LIKENESS_SPINE_UNSHADED = 0.99  # measured 0.997
+
 # --- geometry: iso value half way between two materials ---
 HALF_WAY_STEP_SHARE = 0.03  # of the step between the materials, up to blur 1.5 voxels and 5 % noise: measured 0.025
 HALF_WAY_SHIFT_HU = 3  # what a shift, a scale, air, padding, table or metal may move it by: measured 2 (other edges)

@@ -165,6 +165,33 @@ class Volume(Grid):
         if self._mapping is not None:
             self._mapping.release(self._voxels[first:end])
 
+    def to_pyvista(self, resample: bool = False) -> Any:
+        """Return the volume as ``pyvista.ImageData`` in LPS mm, its HU as the active point data ``HU``.
+
+        The points lie where `ijk_to_lps` puts the voxels, i runs fastest.  The image shares the memory of the voxels:
+        a change of one is a change of the other.  It is a copy where the axes are left-handed (a field array ``SLICES``
+        then says that the slices are in reverse order, which VTK needs) or where it is resampled.  Field arrays
+        ``SPACE`` and ``UNIT`` say what the coordinates are.
+
+        Contour it with ``image.contour([250], method="flying_edges")``: pyvista's default method does not look at an
+        image's direction.
+
+        Parameters
+        ----------
+        resample : bool
+            A volume that is sheared or unevenly spaced, which no image can hold, is resampled (trilinear) to a regular
+            grid of the same spacing around all its voxels; what lies beyond them is `AIR_HU`.  A field array
+            ``RESAMPLED`` says so.  Other volumes stay as they are.
+
+        Raises
+        ------
+        UsageError
+            The volume is sheared or unevenly spaced, and is not to be resampled.
+        """
+        from clrecon.geometry.image_data import make_image_data
+
+        return make_image_data(self, resample)
+
     def __repr__(self) -> str:
         ni, nj, nk = self.shape_ijk
         di, dj, dk = self.spacing

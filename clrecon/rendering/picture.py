@@ -153,6 +153,33 @@ class Rendering:
             raise UsageError(f"a picture of mode {self.mode} has no values: mip, minip, mean, slice and cpr have them")
         return write_floats(self.values, path, self.pixel_mm)
 
+    def to_pyvista(self, form: str = "points", *, expected: bool = False, distance: float | None = None) -> Any:
+        """Return the picture as something that a PyVista scene in LPS mm can hold beside meshes.
+
+        Show it with ``plotter.add_mesh(data, scalars="RGBA", rgba=True, lighting=False)``, or let
+        `clrecon.viewer.add_rendering` do it.  Field arrays ``SPACE`` and ``UNIT`` say what the coordinates are.
+
+        Parameters
+        ----------
+        form : {"points", "plane"}
+            ``"points"``: ``pyvista.PolyData`` with a point for each pixel that hits something, where its ray does,
+            with point data ``RGBA``, ``depth`` (mm) and, where there are `values`, ``HU``.
+            ``"plane"``: ``pyvista.ImageData`` with a cell for each pixel, across the view, with cell data ``RGBA``
+            and, where there are `values`, ``HU``; seen by the picture's camera it is the picture.
+        expected : bool
+            Points at the expected depth, not at the first hit.
+        distance : float, optional
+            Of the plane from the camera, mm along the view; default: through the focal point.
+
+        Raises
+        ------
+        UsageError
+            The picture has no camera, or hits nothing that could be points; no such form or distance.
+        """
+        from clrecon.rendering.scene import rendering_to_pyvista
+
+        return rendering_to_pyvista(self, form, expected=expected, distance=distance)
+
     def _repr_png_(self) -> bytes:
         """What a notebook shows."""
         from clrecon.rendering.image_files import encode_image

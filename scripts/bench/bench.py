@@ -60,6 +60,7 @@ def make_parser() -> argparse.ArgumentParser:
     run.add_argument(
         "--work", type=Path, default=default_work(), help="folder for made-up inputs (default %(default)s)"
     )
+    run.add_argument("--pictures", type=Path, metavar="DIR", help="keep the pictures of both sides here, as PNG")
     run.add_argument("--json", type=Path, metavar="DIR", help="keep the results here")
     compare = commands.add_parser("compare", help="compare with a baseline; exit code 1 when a ratio fell")
     compare.add_argument("baseline", type=Path)
@@ -114,7 +115,9 @@ def run_cases(options: argparse.Namespace) -> int:
     for device in choose_devices(options.device):
         for given in inputs:
             for case in cases:
-                job = Job(given, options.hu, options.pairs, device, options.peer_threads, options.limit)
+                job = Job(
+                    given, options.hu, options.pairs, device, options.peer_threads, options.limit, options.pictures
+                )
                 print(f"{case.name} on {given.name}, {device.label} {device.driver} ...", file=sys.stderr, flush=True)
                 try:
                     result = complete(case, job, machine, case.measure(job))
@@ -159,6 +162,10 @@ def keep(result: dict[str, Any], folder: Path | None) -> None:
         print(f"    scratch, {name:<19}{sides['median']:10.3f} bytes a voxel")
     if result.get("scratch_bytes_a_voxel") is not None:
         print(f"    scratch, as summed          {result['scratch_bytes_a_voxel']:10.3f} bytes a voxel")
+    for name, found in result.get("ssim", {}).items():
+        print(f"    SSIM, {name:<22}{found['same_box']:10.4f}  (whole volume {found['whole_volume']:.4f})")
+    if "transfer_change" in result:
+        print(f"    another transfer function   {result['transfer_change']['percent_of_frame']:10.1f} % of a frame")
     for over, fits in result.get("fits", {}).items():
         print(f"    linear over {over}: R2 {fits['clrecon']['r2']:.4f} (peer {fits['peer']['r2']:.4f})")
     if folder is not None:

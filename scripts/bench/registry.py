@@ -38,6 +38,8 @@ class Job:
         Threads of VTK's flying edges.
     limit_s : float
         Start no further pair after so many seconds; for `clrecon.pipeline.pairs.alternate`.
+    pictures : Path or None
+        Folder where cases that draw keep what both sides drew.
     """
 
     input: BenchInput
@@ -46,6 +48,7 @@ class Job:
     device: Any
     peer_threads: int
     limit_s: float
+    pictures: Path | None = None
 
 
 @dataclass(frozen=True)

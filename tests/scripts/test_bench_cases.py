@@ -12,16 +12,19 @@ import pytest
 from bench_harness import FOLDER
 
 from clrecon.errors import UsageError
+from tests import tolerances
 
 import bench  # isort: skip
 import floors  # isort: skip
 import inputs  # isort: skip
 import isosurface  # isort: skip
 import measure  # isort: skip
+import raycast  # isort: skip
 import registry  # isort: skip
 import scaling  # isort: skip
 
-EXPECTED = {"isosurface-cold", "isosurface-resident", "isosurface-first-call", "scaling", "memory", "main-job"}
+EXPECTED = {"isosurface-cold", "isosurface-resident", "isosurface-first-call", "scaling", "memory", "main-job",
+            "raycast-warm", "raycast-first", "raycast-gpu-mapper"}  # fmt: skip
 
 
 def test_every_case_is_listed(capsys: pytest.CaptureFixture[str]) -> None:
@@ -144,8 +147,8 @@ def test_a_program_that_fails_or_hangs_is_an_error() -> None:
         measure.run_program([sys.executable, "-c", "import time; time.sleep(60)"], timeout_s=0.2)
 
 
-def run_cases(names: list[str], given: str, device: Any, tmp_path: Path) -> dict[str, dict[str, Any]]:
-    places = ["--work", str(tmp_path / "work"), "--json", str(tmp_path / "new")]
+def run_cases(names: list[str], given: str, device: Any, tmp_path: Path, *more: str) -> dict[str, dict[str, Any]]:
+    places = ["--work", str(tmp_path / "work"), "--json", str(tmp_path / "new"), *more]
     arguments = ["run", *names, "--input", given, "--device", str(device.index), "--pairs", "3", *places]
     assert bench.main(arguments) == 0
     kept = [json.loads(path.read_text()) for path in (tmp_path / "new").iterdir()]
@@ -176,6 +179,55 @@ def test_surfaces_in_one_process_are_measured(device: Any, tmp_path: Path, monke
     assert len(kept["scaling"]["sizes"]) >= 5
     assert kept["scaling"]["sizes"][0]["voxels"] < kept["scaling"]["sizes"][-1]["voxels"] == 32**3
     assert {"voxels", "triangles"} == set(kept["scaling"]["fits"])
+
+
+def test_pictures_are_measured(device: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from PIL import Image
+
+    monkeypatch.setattr(raycast, "SIZE", (60, 50))
+    kept = run_cases(
+        ["raycast-warm", "raycast-first"], "cube32", device, tmp_path, "--pictures", str(tmp_path / "seen")
+    )
+    for result in kept.values():
+        assert set(result["ratios"]) == {"parallel", "perspective"}
+        assert result["size"] == [60, 50] and result["ray_step_mm"] == 0.25
+        for side in result["sides"].values():
+            assert side["pairs"] == len(side["ours"]) == len(side["theirs"]) == 3
+            assert side["peer"]["name"] == "vtkFixedPointVolumeRayCastMapper"
+    warm = kept["raycast-warm"]
+    assert all(found["same_box"] > tolerances.BENCH_LIKENESS for found in warm["ssim"].values())
+    assert warm["transfer_change"]["same_s"]["median"] > 0
+    seen = sorted(path.name for path in (tmp_path / "seen").iterdir())
+    assert seen == [
+        f"raycast-cube32-{shot}-{side}.png"
+        for shot in ("parallel", "perspective")
+        for side in ("clrecon", "fixed_point")
+    ]
+    assert np.asarray(Image.open(tmp_path / "seen" / seen[1])).mean() > 1.0
+
+
+def test_the_mapper_on_opengl_is_measured(device: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from peers.vtk_gpu import GpuPeer
+
+    monkeypatch.setattr(raycast, "SIZE", (60, 50))
+    volume = inputs.parse_input("cube32", tmp_path / "work").volume()
+    try:
+        with GpuPeer(volume.voxels, raycast.make_shots(volume)[0].scene(volume)) as peer:
+            renderer = peer.renderer
+    except RuntimeError as error:
+        pytest.skip(f"no OpenGL here: {error}")
+    result = run_cases(["raycast-gpu-mapper"], "cube32", device, tmp_path)["raycast-gpu-mapper"]
+    for side in result["sides"].values():
+        assert side["peer"]["renderer"] == renderer and side["peer_first_s"] > 0.0
+    assert all(found["same_box"] > tolerances.BENCH_LIKENESS for found in result["ssim"].values())
+
+
+def test_a_peer_that_dies_is_an_error(tmp_path: Path) -> None:
+    from peers.vtk_gpu import GpuPeer
+
+    volume = inputs.parse_input("cube8", tmp_path).volume()
+    with pytest.raises(RuntimeError, match="(?s)its process died: .*allow_pickle"):
+        GpuPeer(np.array([None]), raycast.make_shots(volume)[0].scene(volume))
 
 
 @pytest.mark.slow
