@@ -5,7 +5,7 @@
 #include "include/lanes.h"
 #include "include/stack.h"
 
-#define BRICK_CELLS 8 /* cells along each side of a brick: it reads 9 x 9 x 9 voxels */
+#define BRICK_CELLS 4 /* cells along each side of a brick: it reads 5 x 5 x 5 voxels */
 #define BRICKS_PER_CELL (1.0f / BRICK_CELLS)
 
 typedef struct {

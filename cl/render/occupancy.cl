@@ -3,12 +3,17 @@
  * Passes
  *   1. measure_cells     once a volume: lowest and highest value that a sample in a brick can have
  *   2. mark_bricks       once a transfer function
- *   3. spread_distances  three times, along i, j, k: a separable Chebyshev distance transform */
+ *   3. spread_in_rows    along i, and
+ *   4. spread_along      along j and along k: a separable Chebyshev distance transform */
 #include "include/leap.h"
 #include "include/volume.h"
 
+#define FARTHEST 15 /* bricks: to leap further takes longer to prepare than it saves */
+
+#define VOXEL4 CLRECON_VECTOR(VOXEL, 4)
+
 /* Parameters  voxels  in   (nk, nj, ni)
- *             ranges  out  (bk, bj, bi, 2) lowest and highest of the 9 x 9 x 9 voxels around the cells of a brick
+ *             ranges  out  (bk, bj, bi, 2) lowest and highest of the 5 x 5 x 5 voxels around the cells of a brick
  *             ni nj nk, bi bj bk   voxels, bricks: ceil(cells / BRICK_CELLS), at least 1
  * Launch      global = bi * bj * bk rounded up by the host, any local
  * Assumes     no voxel is NaN; at least two voxels along each axis
@@ -25,23 +30,21 @@ __kernel void measure_cells(
     const int i_last = min(i + BRICK_CELLS, ni - 1);
     const int j_last = min(j + BRICK_CELLS, nj - 1), k_last = min(k + BRICK_CELLS, nk - 1);
     VOXEL lowest = voxels[voxel_index(i, j, k, ni, nj)], highest = lowest;
-    if (ni >= 8) {
-        /* Eight voxels and the one after them; at the end of a row the last eight. */
-        const int from = min(i, ni - 8);
-        VOXEL8 low = (VOXEL8)(lowest), high = low;
+    if (ni >= BRICK_CELLS) {
+        /* Four voxels and the one after them; at the end of a row its last four. */
+        const int from = min(i, ni - BRICK_CELLS);
+        VOXEL4 low = (VOXEL4)(lowest), high = low;
         for (int at_k = k; at_k <= k_last; ++at_k)
             for (int at_j = j; at_j <= j_last; ++at_j) {
                 __global const VOXEL *row = voxels + voxel_index(0, at_j, at_k, ni, nj);
-                const VOXEL8 values = vload8(0, row + from);
+                const VOXEL4 values = vload4(0, row + from);
                 low = min(low, values);
                 high = max(high, values);
                 lowest = min(lowest, row[i_last]);
                 highest = max(highest, row[i_last]);
             }
-        lowest = min(lowest, min(min(min(low.s0, low.s1), min(low.s2, low.s3)),
-                                 min(min(low.s4, low.s5), min(low.s6, low.s7))));
-        highest = max(highest, max(max(max(high.s0, high.s1), max(high.s2, high.s3)),
-                                   max(max(high.s4, high.s5), max(high.s6, high.s7))));
+        lowest = min(lowest, min(min(low.x, low.y), min(low.z, low.w)));
+        highest = max(highest, max(max(high.x, high.y), max(high.z, high.w)));
     } else {
         for (int at_k = k; at_k <= k_last; ++at_k)
             for (int at_j = j; at_j <= j_last; ++at_j)
@@ -57,7 +60,7 @@ __kernel void measure_cells(
 
 /* Parameters  ranges     in   (bricks, 2)
  *             shown      in   (bins + 1) how many bins before each show anything
- *             distances  out  (bricks) 0 where a brick may show something, 255 elsewhere
+ *             distances  out  (bricks) 0 where a brick may show something, FARTHEST elsewhere
  *             bins_low bins_scale bins   node of a value v: (v - bins_low) * bins_scale + 0.5, clamped to 0..bins - 1
  * Launch      global = bricks rounded up by the host, any local
  * Guarantees  every distance is written; rounding never hides a bin */
@@ -72,28 +75,71 @@ __kernel void mark_bricks(
     const float low = ((float)ranges[2 * (size_t)brick] - bins_low) * bins_scale + 0.49f;
     const float high = ((float)ranges[2 * (size_t)brick + 1] - bins_low) * bins_scale + 0.51f;
     const int first = (int)clamp(low, 0.0f, last), end = (int)clamp(high, 0.0f, last) + 1;
-    distances[brick] = shown[end] > shown[first] ? 0 : 255;
+    distances[brick] = shown[end] > shown[first] ? 0 : FARTHEST;
 }
 
-/* Parameters  from   in   (bricks) distances so far
- *             to     out  (bricks) the same with what lies along the line through each brick
- *             count  bricks a line;  stride: from one to the next;  bricks: all
- * Launch      global = bricks rounded up by the host, any local
- * Guarantees  to = min over the line of max(distance along it, from) */
-__kernel void spread_distances(
-    __global const uchar *restrict from, __global uchar *restrict to, const int count, const int stride,
-    const uint bricks)
+/* Parameters  from   in   (rows, bi) 0 or FARTHEST
+ *             to     out  (rows, bi) distance along the row
+ * Launch      global = rows rounded up by the host, any local
+ * Guarantees  every distance is written, none above FARTHEST */
+__kernel void spread_in_rows(
+    __global const uchar *restrict from, __global uchar *restrict to, const int bi, const uint rows)
 {
-    const uint brick = get_global_id(0);
-    if (brick >= bricks)
+    const uint row = get_global_id(0);
+    if (row >= rows)
         return;
-    const int here = (int)(brick / (uint)stride % (uint)count);
-    int best = from[brick];
-    for (int way = 1; way < best && (way <= here || here + way < count); ++way) {
-        if (way <= here)
-            best = min(best, max(way, (int)from[brick - way * stride]));
-        if (here + way < count)
-            best = min(best, max(way, (int)from[brick + way * stride]));
+    __global const uchar *own = from + (size_t)row * bi;
+    __global uchar *out = to + (size_t)row * bi;
+    int distance = FARTHEST;
+    for (int i = 0; i < bi; ++i) {
+        distance = min(distance + 1, (int)own[i]);
+        out[i] = (uchar)distance;
     }
-    to[brick] = (uchar)best;
+    for (int i = bi - 1; i >= 0; --i) {
+        distance = min(distance + 1, (int)out[i]);
+        out[i] = (uchar)distance;
+    }
+}
+
+/* Parameters  from   in   (outer, count, stride) distances so far
+ *             to     out  the same with what lies along the middle axis
+ *             chunks of 16 bricks that cover `stride`;  items: outer * count * chunks
+ * Launch      global = items rounded up by the host, any local
+ * Guarantees  to = min along the axis of max(distance along it, from) */
+__kernel void spread_along(
+    __global const uchar *restrict from, __global uchar *restrict to, const int count, const int stride,
+    const int chunks, const uint items)
+{
+    const uint item = get_global_id(0);
+    if (item >= items)
+        return;
+    const int line = (int)(item / (uint)chunks % (uint)count);
+    const size_t row = (size_t)(item / (uint)chunks) * stride;
+    const int first = (int)(item % (uint)chunks) * 16;
+    if (stride >= 16) {
+        /* The last chunk takes the last 16: some of them twice. */
+        const size_t here = row + min(first, stride - 16);
+        uchar16 best = vload16(0, from + here);
+        for (int way = 1; way < FARTHEST && any(best > (uchar16)((uchar)way)); ++way) {
+            uchar16 near = (uchar16)((uchar)FARTHEST);
+            if (way <= line)
+                near = vload16(0, from + here - (size_t)way * stride);
+            if (line + way < count)
+                near = min(near, vload16(0, from + here + (size_t)way * stride));
+            best = min(best, max(near, (uchar16)((uchar)way)));
+        }
+        vstore16(best, 0, to + here);
+        return;
+    }
+    for (int at = 0; at < stride; ++at) {
+        const size_t here = row + at;
+        int best = from[here];
+        for (int way = 1; way < best; ++way) {
+            if (way <= line)
+                best = min(best, max(way, (int)from[here - (size_t)way * stride]));
+            if (line + way < count)
+                best = min(best, max(way, (int)from[here + (size_t)way * stride]));
+        }
+        to[here] = (uchar)best;
+    }
 }

@@ -19,7 +19,7 @@ from clrecon.operators.voxel_types import voxel_variants
 
 __all__ = ["BRICK_CELLS", "LeapMap", "RaySlab", "ResidentVolume", "ray_variants"]
 
-BRICK_CELLS = 8
+BRICK_CELLS = 4
 """Cells along each side of a brick, as in cl/include/leap.h."""
 
 OVERLAP = 2
@@ -228,12 +228,20 @@ class ResidentVolume:
             stopwatch=stopwatch,
         )  # fmt: skip
         marked = download(device, np.empty((bk, bj, bi), np.uint8), from_d) == 0
-        for count, stride in ((bi, 1), (bj, bi), (bk, bi * bj)):
-            launch(
-                device, program["spread_distances"], bricks,
-                from_d, to_d, np.int32(count), np.int32(stride), np.uint32(bricks), stopwatch=stopwatch,
-            )  # fmt: skip
+        launch(
+            device, program["spread_in_rows"], bj * bk, from_d, to_d, np.int32(bi), np.uint32(bj * bk),
+            stopwatch=stopwatch,
+        )  # fmt: skip
+        for outer, count, stride in ((bk, bj, bi), (1, bk, bi * bj)):
             from_d, to_d = to_d, from_d
+            chunks = -(-stride // 16)
+            items = outer * count * chunks
+            launch(
+                device, program["spread_along"], items,
+                from_d, to_d, np.int32(count), np.int32(stride), np.int32(chunks), np.uint32(items),
+                stopwatch=stopwatch,
+            )  # fmt: skip
+        from_d = to_d
         slab.maps.clear()  # one a slab: a map is made in some milliseconds
         slab.maps[key] = LeapMap(from_d, self._find_box(marked, slab))
         return slab.maps[key]
