@@ -60,10 +60,11 @@ def even_volume(field: Field, steps: str, extent: float, dtype: Any = np.float32
 def uneven_volume(
     field: Field, shape: tuple[int, int] = (66, 52), gaps: Sequence[float] = GAPS, sideways: float = 0.3, noise=0.2
 ) -> Volume:
-    """`field` in a turned stack whose slices lie unevenly and sheared, some `noise` mm beside a line."""
+    """`field` in a turned stack whose slices lie unevenly, sheared along i and j, some `noise` mm beside a line."""
     heights = np.concatenate([[0.0], np.cumsum(gaps)])
-    aside = sideways * heights + np.random.default_rng(2).uniform(-noise, noise, len(heights))
-    table = heights[:, None] * TURN[:, 2] + aside[:, None] * TURN[:, 1] + PLACE
+    aside = np.outer(heights, (-0.5 * sideways, sideways))
+    aside += np.random.default_rng(2).uniform(-noise, noise, aside.shape)
+    table = heights[:, None] * TURN[:, 2] + aside @ TURN[:, :2].T + PLACE
     affine = np.eye(4)
     affine[:3, :2] = TURN[:, :2] * (0.7, 0.8)
     affine[:3, 2], affine[:3, 3] = (table[-1] - table[0]) / len(gaps), table[0]
