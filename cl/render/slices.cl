@@ -38,7 +38,7 @@ __kernel void overlay_slices(
         return;
     const size_t at_pixel = (size_t)pixel.y * width + (size_t)pixel.x;
     ray r;
-    start_ray(view, pixel, planes, perspective, &r);
+    start_ray(view, convert_float2(pixel), planes, perspective, &r);
 
     float4 seen = (float4)(0.0f);
     float first_hit = NO_HIT, sum = 0.0f;

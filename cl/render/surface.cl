@@ -122,7 +122,7 @@ static inline void find_inside(const scene *s, bundle *all)
     while (ANY_LANE(n < limit)) {
         const floats furthest = limit - (all->last_counts ? 1.0f : 0.0f);
         for (;;) {
-            const floats free = count_free_steps(&s->map, &s->stack, &together, n, s->field.inner.first_k);
+            const floats free = count_free_steps(&s->map, &s->stack, &together, n, s->field.inner.first_k, 0);
             const ints leaping = (free > 0.0f) & (n < furthest);
             if (!ANY_LANE(leaping))
                 break;
@@ -520,7 +520,7 @@ __kernel void trace_surface(
         sights[lane].sum = 0.0f;
         sights[lane].label = OUT;
         int n = 0, end = 0;
-        start_ray(view, pixel, planes, perspective, rays + lane);
+        start_ray(view, convert_float2(pixel), planes, perspective, rays + lane);
         end = start_line(rays + lane, look.ray_step, slab_low, slab_high, all.lines + lane, &n);
         if (pixel.x >= (int)width || pixel.y >= (int)height)
             end = 0;
