@@ -62,7 +62,7 @@ static inline float find_differences(const field *f, const float3 place, float4 
 
 /* `color` of a surface with LPS gradient `gradient`, seen along unit vector `direction`; places without a gradient
  * keep ambient and diffuse light. */
-static inline float3 shade(__global const float4 *restrict view, __global const float *restrict highlights,
+static inline float3 shade(__global const float4 *view, __global const float *highlights,
     const float3 color, const float3 gradient, const float3 direction)
 {
     const float4 phong = view[VIEW_PHONG];

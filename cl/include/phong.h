@@ -9,7 +9,7 @@
 #define HIGHLIGHTS 1024 /* entries of a table of specular * cosine ^ power: library powers take 0.2 us on CPU drivers */
 
 /* LPS gradients per mm of LANES places with index coordinate k. */
-static inline void find_gradients(__global const float4 *restrict view, const slice_stack *stack, const slopes *s,
+static inline void find_gradients(__global const float4 *view, const slice_stack *stack, const slopes *s,
     const floats k, floats *x, floats *y, floats *z)
 {
 #ifdef UNEVEN
@@ -48,7 +48,7 @@ static inline void find_gradients(__global const float4 *restrict view, const sl
 
 /* Light on LANES places with LPS gradients (x, y, z), seen along unit vectors: a place takes `share` of its own colour
  * and `highlight` of white.  Without a gradient it keeps ambient and diffuse light. */
-static inline void find_light(__global const float4 *restrict view, __global const float *restrict highlights,
+static inline void find_light(__global const float4 *view, __global const float *highlights,
     const floats x, const floats y, const floats z, const floats direction_x, const floats direction_y,
     const floats direction_z, floats *share, floats *highlight)
 {

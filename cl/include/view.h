@@ -80,7 +80,7 @@ static inline void clip_to_box(const ray *r, const float4 low, const float4 high
 
 /* Set up the ray of pixel (x, y) with its way through the box; perspective rays begin at the camera. */
 static inline void start_ray(
-    __global const float4 *restrict view, const float2 pixel, const uint planes, const int perspective, ray *r)
+    __global const float4 *view, const float2 pixel, const uint planes, const int perspective, ray *r)
 {
     const float x = pixel.x, y = pixel.y;
     const float4 direction = view[VIEW_DIRECTION] + x * view[VIEW_DIRECTION_X] + y * view[VIEW_DIRECTION_Y];

@@ -159,7 +159,7 @@ static inline float find_crossing(const scene *s, const line *along, const int n
 }
 
 /* LPS gradient of differences per index step in slice k.  Layers beyond the ends are as thick as those at the ends. */
-static inline float3 to_lps(const scene *s, __global const float4 *restrict view, const float4 step, const int k)
+static inline float3 to_lps(const scene *s, __global const float4 *view, const float4 step, const int k)
 {
 #ifdef UNEVEN
     __global const float4 *rows = s->stack.slices + 4 * clamp(k, 0, s->stack.nk - 1) + 1;
@@ -170,7 +170,7 @@ static inline float3 to_lps(const scene *s, __global const float4 *restrict view
 }
 
 /* LPS gradient at a place in field coordinates. */
-static inline float3 find_gradient(const scene *s, __global const float4 *restrict view, const float4 place)
+static inline float3 find_gradient(const scene *s, __global const float4 *view, const float4 place)
 {
     float4 below, above;
     const float3 at = index_of(s, place);
@@ -186,7 +186,7 @@ static inline float3 find_gradient(const scene *s, __global const float4 *restri
 /* Normal of a cap: of the clip plane that a ray comes in through where it begins inside, or against its direction where
  * it begins at a camera in there. */
 static inline float3 find_cap(
-    __global const float4 *restrict view, __global const float4 *restrict normals, const uint planes,
+    __global const float4 *view, __global const float4 *normals, const uint planes,
     const int perspective, const ray *r)
 {
     float latest = perspective ? -r->offset : -MAXFLOAT;
@@ -206,7 +206,7 @@ static inline float3 find_cap(
 #ifdef LABELS
 /* Label of a place on the surface: of the nearest voxel of its cell that is inside and has one. */
 static inline uint find_surface_label(
-    const scene *s, __global const LABEL *restrict labels, const float4 field_place)
+    const scene *s, __global const LABEL *labels, const float4 field_place)
 {
     const closed_field *f = &s->field;
     const float3 place = index_of(s, field_place);
@@ -231,7 +231,7 @@ static inline uint find_surface_label(
 /* The first sample of n to end - 1 that is outside, or inside of another label than `passed`; end where there is none.
  * `label` becomes that other label, 0 where it is outside. */
 static inline int leave_label(
-    const scene *s, __global const LABEL *restrict labels, const line *along, int n, const int end,
+    const scene *s, __global const LABEL *labels, const line *along, int n, const int end,
     const uint passed, uint *label)
 {
     int going = 1;
@@ -248,7 +248,7 @@ static inline int leave_label(
 
 /* Differences per index step of being in a label, over the 27 voxels around a place. */
 static inline float4 find_label_differences(
-    __global const LABEL *restrict labels, const field *f, const float3 place, const uint label)
+    __global const LABEL *labels, const field *f, const float3 place, const uint label)
 {
     float4 sum = (float4)(0.0f);
     for (int c = -1; c <= 1; ++c)
@@ -262,7 +262,7 @@ static inline float4 find_label_differences(
 
 /* Share of the light that comes through what is inside from sample n of a line on, which is. */
 static inline float let_light_through(
-    const scene *s, __global const LABEL *restrict labels, __global const float4 *restrict label_colors,
+    const scene *s, __global const LABEL *labels, __global const float4 *label_colors,
     const line *to_light, int n, const int end)
 {
     float light = 1.0f;
@@ -287,7 +287,7 @@ static inline float let_light_through(
 /* The way from a place to the fixed light: samples from a ray step on, as far as anything can be inside.  Returns how
  * many. */
 static inline int start_to_light(
-    __global const float4 *restrict view, const uint planes, const float4 place, const float4 light_step,
+    __global const float4 *view, const uint planes, const float4 place, const float4 light_step,
     const float ray_step, line *to_light)
 {
     ray r;
@@ -347,7 +347,7 @@ typedef struct {
     float ray_step;
 } looks;
 
-static inline void load_sight(__global const float4 *restrict states, const size_t at_pixel, sight *seen)
+static inline void load_sight(__global const float4 *states, const size_t at_pixel, sight *seen)
 {
     const float4 state = states[2 * at_pixel + 1];
     seen->color = states[2 * at_pixel];
@@ -358,8 +358,8 @@ static inline void load_sight(__global const float4 *restrict states, const size
 
 /* Keep what a ray has seen for the next slab, or after the last make its pixel of it. */
 static inline void store_sight(
-    const sight *seen, const float offset, const int stage, const size_t at_pixel, __global float4 *restrict states,
-    __global uchar4 *restrict image, __global float *restrict depths, __global float *restrict means,
+    const sight *seen, const float offset, const int stage, const size_t at_pixel, __global float4 *states,
+    __global uchar4 *image, __global float *depths, __global float *means,
     const float4 background)
 {
     const float4 color = seen->color;
@@ -439,7 +439,7 @@ static inline void add_hit(
 /* Let a ray go on through the label that it is in.  Where it comes into another one that is a hit; returns whether the
  * ray has more samples. */
 static inline int pass_label(
-    const scene *s, __global const LABEL *restrict labels, const looks *look, const line *along, float *number,
+    const scene *s, __global const LABEL *labels, const looks *look, const line *along, float *number,
     const float end, sight *seen, hit *h)
 {
     uint label = 0;
