@@ -22,7 +22,7 @@ from clrecon.operators.composite import TransferTables, composite_slab
 from clrecon.operators.pictures import PictureBuffers
 from clrecon.operators.project import PROJECTIONS, project_slab
 from clrecon.operators.ray_view import RayView, volume_box
-from clrecon.operators.resident import ResidentVolume
+from clrecon.operators.resident import ResidentVolume, entry_slice
 from clrecon.rendering import Lighting, Rendering, TransferFunction
 from clrecon.rendering.presets import DEFAULT_PRESET, find_preset
 from clrecon.rendering.window import checked_window, choose_window, grey_image
@@ -207,7 +207,7 @@ class _Job:
         box = volume_box(renderer.volume)
         slabs = 0
         with stopwatch.running(device):
-            for slab in resident.slabs(slices, self._entry_k(), stopwatch):
+            for slab in resident.slabs(slices, entry_slice(renderer.volume, self.camera), stopwatch):
                 slabs += 1
                 if request.mode in PROJECTIONS:
                     project_slab(resident, slab, self._view(box, box), request.mode, output, stopwatch)
@@ -253,13 +253,6 @@ class _Job:
             self.renderer.volume, self.camera, self.size, self.ray_step,
             lighting=self.request.lighting, planes=self.planes, box=box, focus=focus,
         )  # fmt: skip
-
-    def _entry_k(self) -> float:
-        """Slice coordinate that the rays come from."""
-        place = np.array(self.camera.position)
-        if self.camera.is_parallel:
-            place -= 1e5 * self.camera.basis().forward
-        return float(self.renderer.volume.lps_to_ijk(place[None])[0, 2])
 
 
 def render(

@@ -11,19 +11,28 @@ from numpy.typing import NDArray
 
 from clrecon.geometry import Volume
 from clrecon.geometry.affine import Float64Array
+from clrecon.geometry.camera import Camera
 from clrecon.kernels import Program, Stopwatch, allocate, download, launch, load_program, upload
 from clrecon.opencl import Device, check_budget, describe_shortage, memory_limits
 from clrecon.operators.ray_view import BOX_BORDER, enclose
 from clrecon.operators.stack_table import StackTable
 from clrecon.operators.voxel_types import voxel_variants
 
-__all__ = ["BRICK_CELLS", "LeapMap", "RaySlab", "ResidentVolume", "ray_variants"]
+__all__ = ["BRICK_CELLS", "LeapMap", "RaySlab", "ResidentVolume", "entry_slice", "pad_slices", "ray_variants"]
 
 BRICK_CELLS = 4
 """Cells along each side of a brick, as in cl/include/leap.h."""
 
 OVERLAP = 2
 """Slices that a slab holds beyond its own at either side: those that cells and gradients at its ends read."""
+
+
+def entry_slice(volume: Volume, camera: Camera) -> float:
+    """Slice coordinate that the rays of a picture come from, see `ResidentVolume.slabs`."""
+    place = np.array(camera.position)
+    if camera.is_parallel:
+        place -= 1e5 * camera.basis().forward
+    return float(volume.lps_to_ijk(place[None])[0, 2])
 
 
 def ray_variants(device: Device, dtype: np.dtype[Any]) -> dict[str, str]:
@@ -83,7 +92,7 @@ class RaySlab:
         return self.first_k + self.shape_ijk[2]
 
 
-def _at_least_two(voxels: NDArray[Any]) -> NDArray[Any]:
+def pad_slices(voxels: NDArray[Any]) -> NDArray[Any]:
     """Voxels with every axis of length 1 doubled: a cell needs two, and the field is the same."""
     for axis, length in enumerate(voxels.shape):
         if length == 1:
@@ -127,32 +136,39 @@ class ResidentVolume:
         size = self.dtype.itemsize
         return {"volume": ni * nj * max(2, slices) * size, "bricks": bricks * (2 * size + 3)}
 
-    def plan(self, others: dict[str, int], extra: dict[str, int]) -> int:
+    def plan(self, others: dict[str, int], extra: dict[str, int], beside: int = 0) -> int:
         """Slices a slab, all where everything fits.
 
         Parameters
         ----------
         others, extra : dict of str to int
             Bytes of what else is on the device, and of what comes with more than one slab.
+        beside : int
+            Bytes a voxel of what a slab has with it, such as labels.
 
         Raises
         ------
         DeviceError
             Not even the smallest slab fits.
         """
-        nk = self.volume.shape_ijk[2]
+        ni, nj, nk = self.volume.shape_ijk
+
+        def needs(slices: int) -> dict[str, int]:
+            with_it = {"labels": beside * max(2, ni) * max(2, nj) * max(2, slices)} if beside else {}
+            return {**self.slab_bytes(slices), **with_it, **others}
+
         limits = memory_limits(self.device, self.memory)
-        if not describe_shortage(limits, {**self.slab_bytes(nk), **others}):
+        if not describe_shortage(limits, needs(nk)):
             return nk
         low, high = 0, nk
         while high - low > 1:
             slices = (low + high) // 2
-            if describe_shortage(limits, {**self.slab_bytes(slices + 2 * OVERLAP + 1), **others, **extra}):
+            if describe_shortage(limits, {**needs(slices + 2 * OVERLAP + 1), **extra}):
                 high = slices
             else:
                 low = slices
         if low == 0:
-            check_budget(self.device, {**self.slab_bytes(2 * OVERLAP + 2), **others, **extra}, self.memory)
+            check_budget(self.device, {**needs(2 * OVERLAP + 2), **extra}, self.memory)
         return max(low, 1)
 
     def slabs(self, slices: int, entry_k: float, stopwatch: Stopwatch) -> Iterator[RaySlab]:
@@ -182,7 +198,7 @@ class ResidentVolume:
             self.volume.release_slices(first, end)
 
     def _upload(self, first: int, end: int, low: float, high: float, stopwatch: Stopwatch) -> RaySlab:
-        voxels = _at_least_two(self.volume.voxels[first:end])
+        voxels = pad_slices(self.volume.voxels[first:end])
         with stopwatch.timed("upload"):
             voxels_d = upload(self.device, voxels)
         nk, nj, ni = voxels.shape

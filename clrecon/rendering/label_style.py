@@ -1,0 +1,113 @@
+"""`LabelStyle`: the colour and opacity that each label has in a picture."""
+
+from __future__ import annotations
+
+import colorsys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clrecon.errors import UsageError
+from clrecon.labels import LabelMap
+from clrecon.rendering.colors import find_color
+
+__all__ = ["LabelStyle", "distinct_colors"]
+
+NO_COLOR = (-1.0, -1.0, -1.0)
+"""In the table: the colour that is there without labels."""
+
+GOLDEN_SHARE = 0.618034
+"""Of the circle of hues, from one colour to the next: however many are taken, they lie apart."""
+
+
+@dataclass(frozen=True)
+class LabelStyle:
+    """How the labels of a map look; what has no label, or is not named, looks as it does without.
+
+    Attributes
+    ----------
+    labels : LabelMap
+    table : ndarray, shape (largest number + 1, 4), float32
+        Red, green, blue and opacity by number, 0 to 1; red below 0 keeps the colour that is there without labels.
+    """
+
+    labels: LabelMap
+    table: NDArray[np.float32]
+
+    @classmethod
+    def of(
+        cls,
+        labels: LabelMap,
+        colors: Mapping[int | str, str | Sequence[float]] | None = None,
+        opacity: Mapping[int | str, float] | None = None,
+    ) -> LabelStyle:
+        """Choose colours and opacities.
+
+        >>> LabelStyle.of(labels, colors={"L1": "orange"}, opacity={"L2": 0.2})
+
+        Parameters
+        ----------
+        labels : LabelMap
+        colors : mapping of label to colour, optional
+            Labels by number or name as `LabelMap.find` takes them, colours as `find_color` does.  Labels that are not
+            named keep the colour of the picture; without any mapping every label has a colour of its own, see
+            `distinct_colors`.
+        opacity : mapping of label to float, optional
+            0 to 1: a factor on the opacity; labels that are not named keep theirs.
+
+        Raises
+        ------
+        UsageError
+            Not a label map, an unknown label or colour, an opacity that is none, or a label that is named twice.
+        """
+        if not isinstance(labels, LabelMap):
+            raise UsageError(f"labels are a LabelMap, see clrecon.read_labels, not {type(labels).__name__}")
+        table = np.tile(np.array([*NO_COLOR, 1.0], dtype=np.float32), (int(labels.voxels.max()) + 1, 1))
+        if colors is None:
+            numbers = labels.numbers
+            table[list(numbers), :3] = distinct_colors(len(numbers))
+        for number, color in _by_number(labels, "colours", colors).items():
+            table[number, :3] = find_color(color)
+        for number, factor in _by_number(labels, "opacities", opacity).items():
+            table[number, 3] = _check_opacity(labels.name(number), factor)
+        table.flags.writeable = False
+        return cls(labels, table)
+
+    @property
+    def is_opaque(self) -> bool:
+        """True when no label lets anything through."""
+        return bool((self.table[:, 3] >= 1.0).all())
+
+
+def _by_number(labels: LabelMap, what: str, mapping: Mapping | None) -> dict:
+    if mapping is None:
+        return {}
+    if not isinstance(mapping, Mapping):
+        raise UsageError(f"{what} of labels are a mapping such as {{'L2': ...}}, not {type(mapping).__name__}")
+    found: dict = {}
+    for label, value in mapping.items():
+        number = labels.find(label)
+        if number in found:
+            raise UsageError(f"{what} of labels: label {number} {labels.name(number)} is named twice")
+        found[number] = value
+    return found
+
+
+def _check_opacity(name: str, factor: float) -> float:
+    try:
+        number = float(factor)
+    except (TypeError, ValueError):
+        number = float("nan")
+    if not 0.0 <= number <= 1.0:
+        raise UsageError(f"the opacity of label {name} is a number from 0 to 1, not {factor!r}")
+    return number
+
+
+def distinct_colors(count: int) -> NDArray[np.float64]:
+    """Colours (count, 3) from 0 to 1 that lie apart in hue; the first ones are the same for every `count`."""
+    hues = (0.08 + GOLDEN_SHARE * np.arange(count)) % 1.0
+    bright = (0.95, 0.8)
+    colors = [colorsys.hsv_to_rgb(hue, 0.55 + 0.2 * (n % 3 == 1), bright[n % 2]) for n, hue in enumerate(hues)]
+    return np.array(colors, dtype=np.float64).reshape(count, 3)

@@ -1,0 +1,160 @@
+"""Labels in pictures: colours, what is translucent and what is seen through it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from clrecon.geometry import Volume
+from clrecon.geometry.camera import Camera
+from clrecon.geometry.clip import Clip
+from clrecon.labels import LabelMap
+from clrecon.operators.resident import ResidentVolume
+from clrecon.operators.surface_rays import cast_surface
+from clrecon.rendering import Lighting, Rendering
+from clrecon.rendering.label_style import LabelStyle
+from tests import tolerances
+from tests.operators.ray_scenes import GRIDS, centre_of, look, make_volume, positions, premultiplied
+
+SIZE = (40, 36)
+UNLIT = Lighting(1.0, 0.0, 0.0)
+NAMES = {1: "vertebrae_L1", 2: "vertebrae_L2", 3: "rib_left_1"}
+RED, BLUE = np.array([255.0, 0.0, 0.0]), np.array([0.0, 0.0, 255.0])
+
+
+def cast(
+    device, volume: Volume, camera: Camera, style: LabelStyle | None, memory=None, size=SIZE, **settings
+) -> Rendering:
+    settings = {"lighting": UNLIT, "color": "white", **settings}
+    resident = ResidentVolume(volume, device, memory)
+    return cast_surface(resident, 300.0, camera, size, 0.5 * min(volume.spacing), style=style, **settings)
+
+
+def two_balls(grid: str, gap: float = 2.0) -> tuple[Volume, LabelMap]:
+    """Label 1, a ball of 4 mm in front (smaller y), and behind it 2, one of 6 mm; `gap` mm apart."""
+    fields = [lambda p: 4.0 - np.linalg.norm(p + (0, 4.0 + gap / 2, 0), axis=-1)]
+    fields += [lambda p: 6.0 - np.linalg.norm(p - (0, 6.0 + gap / 2, 0), axis=-1)]
+    volume = make_volume(lambda p: 300.0 + 60.0 * np.maximum(*(field(p) for field in fields)), grid, 32.0, np.int16)
+    front, back = (field(positions(volume)) > -0.8 for field in fields)
+    return volume, LabelMap(np.where(front, 1, np.where(back, 2, 0)).astype(np.uint8), volume.affine, NAMES)
+
+
+def two_blocks() -> tuple[Volume, LabelMap]:
+    """Blocks of 1000 HU that touch: label 1 where j < 10, label 2 from there on; a third of no label beside them."""
+    voxels, numbers = np.full((16, 24, 30), -1000, np.int16), np.zeros((16, 24, 30), np.uint16)
+    voxels[3:13, 4:16, 3:15] = voxels[3:13, 4:16, 20:26] = 1000
+    numbers[3:13, 4:10, 3:15], numbers[3:13, 10:16, 3:15] = 1, 2
+    volume = Volume(voxels, np.eye(4))
+    return volume, LabelMap(numbers, volume.affine, NAMES)
+
+
+def depth_of_ball(camera: Camera, centre: np.ndarray, radius: float) -> np.ndarray:
+    origins, directions = camera.rays(SIZE)
+    along = ((centre - origins) * directions).sum(axis=-1)
+    passing = np.linalg.norm(centre - origins - along[..., None] * directions, axis=-1)
+    with np.errstate(invalid="ignore"):
+        return np.where(passing < 0.8 * radius, along - np.sqrt(radius**2 - passing**2), np.nan)
+
+
+@pytest.mark.parametrize("grid", GRIDS)
+def test_what_is_translucent_shows_what_is_behind(device, grid):
+    if grid == "uneven":  # a label map has an even grid: the labels of an uneven stack are the nearest
+        pytest.skip("label maps lie on even grids")
+    volume, labels = two_balls(grid)
+    camera = look(volume, (0.0, 1.0, 0.1), 8.0)
+    front, back = (depth_of_ball(camera, centre_of(volume) + (0, y, 0), r) for y, r in ((-5.0, 4.0), (7.0, 6.0)))
+    both = np.isfinite(front) & np.isfinite(back)
+    assert both.sum() > 60
+    colors = {"L1": "red", "L2": "blue"}
+    for opacity, color in ((1.0, RED), (0.25, 0.25 * RED + 0.75 * BLUE), (0.0, BLUE)):
+        found = cast(device, volume, camera, LabelStyle.of(labels, colors, {"L1": opacity}))
+        assert np.abs(found.image[both][:, :3] - color).max() <= 1.0 and (found.image[both][:, 3] == 255).all()
+        near = back if opacity == 0.0 else front
+        assert np.abs(found.depth - near)[both].max() <= tolerances.SURFACE_RAY_VOXEL * max(volume.spacing)
+        mean = opacity * front + (1.0 - opacity) * back
+        assert np.abs(found.expected_depth - mean)[both].max() <= tolerances.SURFACE_RAY_VOXEL * max(volume.spacing)
+
+
+def test_it_is_translucent_where_nothing_is_behind(device):
+    volume, labels = two_balls("even")
+    camera = look(volume, (1.0, 0.0, 0.0), 12.0)
+    found = cast(device, volume, camera, LabelStyle.of(labels, {}, {"L1": 0.4}))
+    whole = cast(device, volume, camera, None)
+    assert np.array_equal(np.isfinite(found.depth), np.isfinite(whole.depth))
+    opacity, counts = np.unique(found.image[..., 3], return_counts=True)
+    seen = set(opacity[counts > 20].tolist())
+    assert seen == {0, 102, 255}
+    assert (found.image[found.image[..., 3] > 0][:, :3] == 255).all()  # without colours all keep the picture's
+
+
+def test_labels_that_touch_have_their_border(device):
+    volume, labels = two_blocks()
+    camera = look(volume, (0.0, 1.0, 0.0), 8.0)
+    style = LabelStyle.of(labels, {"L1": "red", "L2": "blue"}, {"L1": 0.0})
+    found = cast(device, volume, camera, style, lighting=Lighting(0.2, 0.8, 0.0))
+    # Rays run along +y: label 2 begins half way between rows 9 and 10; the camera is 150 mm before row 11.5.
+    border = np.abs(found.depth - (150.0 + 9.5 - 11.5)) <= 0.5
+    assert border.sum() > 400
+    inner = found.image[
+        border & np.roll(border, 2, 0) & np.roll(border, -2, 0) & np.roll(border, 2, 1) & np.roll(border, -2, 1)
+    ]
+    assert (inner == (0, 0, 255, 255)).all()  # seen head-on: its normal is that of the border
+
+
+def test_what_has_no_label_or_is_not_named_looks_as_it_does_without(device):
+    volume, labels = two_blocks()
+    camera = look(volume, (0.1, 1.0, -0.2), 10.0)
+    plain = cast(device, volume, camera, None, color="bone")
+    assert np.array_equal(plain.image, cast(device, volume, camera, LabelStyle.of(labels, {}), color="bone").image)
+    red = cast(device, volume, camera, LabelStyle.of(labels, {1: "red"}), color="bone")
+    turned = (red.image != plain.image).any(axis=-1)
+    assert 100 < turned.sum() < (plain.image[..., 3] > 0).sum() - 100
+    assert (red.image[turned][:, :3] == (255, 0, 0)).all()
+
+
+def test_labels_of_another_grid_are_brought_to_the_volume(device):
+    volume, labels = two_blocks()
+    coarse = LabelMap(labels.voxels[::2, ::2, ::2], np.diag([2.0, 2.0, 2.0, 1.0]), NAMES)
+    camera, colors = look(volume, (0.1, 1.0, -0.2), 10.0), {"L1": "red", "L2": "blue"}
+    fine, rough = (cast(device, volume, camera, LabelStyle.of(which, colors)) for which in (labels, coarse))
+    assert np.array_equal(fine.depth, rough.depth, equal_nan=True)
+    assert (fine.image == rough.image).all(axis=-1).mean() > 0.8
+
+
+def test_shadows_of_what_is_translucent_are_as_dark(device):
+    volume, labels = two_balls("even", gap=3.0)
+    camera = look(volume, (1.0, 1.0, 0.0), 12.0)
+    light = Lighting(0.2, 0.8, 0.0, direction=(0.0, -1.0, 0.0))
+    opaque, lit, half = (
+        cast(device, volume, camera, LabelStyle.of(labels, {}, {"L1": opacity}), lighting=light, shadows=shadows)
+        for opacity, shadows in ((1.0, True), (1.0, False), (0.5, True))
+    )
+    dark = (opaque.image[..., 0] == 51) & (lit.image[..., 0] > 150)  # ambient alone, where the ball behind is in shadow
+    assert dark.sum() > 20
+    middle = 0.5 * (opaque.image[dark][:, 0].astype(float) + lit.image[dark][:, 0])
+    assert np.median(np.abs(half.image[dark][:, 0] - middle)) <= 1.0
+
+
+@pytest.mark.parametrize("towards", [(0.2, 0.3, 1.0), (0.1, 1.0, 0.2)])
+def test_slabs_give_the_picture_of_the_whole(device, towards):
+    volume, labels = two_balls("oblique")
+    camera, style = look(volume, towards, 10.0, True), LabelStyle.of(labels, None, {"L1": 0.3, "L2": 0.6})
+    memory = 44 * SIZE[0] * SIZE[1] + volume.voxels.nbytes * 3 // 5
+    whole = cast(device, volume, camera, style)
+    parts = cast(device, volume, camera, style, memory)
+    assert parts.report["slabs"] > 2
+    away = np.abs(premultiplied(whole.image) - premultiplied(parts.image)).max(axis=-1)
+    assert (away <= 1.0).mean() >= 1.0 - tolerances.SURFACE_TWIN_SHARE
+    assert np.allclose(whole.depth, parts.depth, atol=1e-3, equal_nan=True)
+
+
+@pytest.mark.oclgrind
+def test_a_small_picture_under_the_simulator(device):
+    volume, labels = two_blocks()
+    style = LabelStyle.of(labels, None, {"L1": 0.3, "L2": 0.6})
+    clip = Clip.plane(centre_of(volume), (0.0, 0.5, 1.0))
+    found = cast(
+        device, volume, look(volume, (0.1, 1.0, -0.3), 8.0), style, size=(12, 9), clip=clip, shadows=True,
+        lighting=Lighting(direction=(0.5, -0.5, 1.0)),
+    )  # fmt: skip
+    assert 20 < (found.image[..., 3] > 0).sum()

@@ -1,0 +1,164 @@
+"""Slices in space: where they are, in which order they hide each other, and against their twin."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from clrecon.errors import DeviceError, UsageError
+from clrecon.geometry import Volume
+from clrecon.geometry.camera import Camera
+from clrecon.geometry.clip import Clip
+from clrecon.operators.slice_overlay import choose_slices, overlay_slices
+from clrecon.reference.slice_overlay import overlay_slices as overlay_twin
+from clrecon.rendering import TransferFunction
+from tests import tolerances
+from tests.operators.ray_scenes import GRIDS, blobs, centre_of, look, make_volume, premultiplied
+
+SIZE = (56, 48)
+WINDOW = (-500.0, 700.0)
+
+
+def grey(hu: np.ndarray) -> np.ndarray:
+    return np.clip((hu - WINDOW[0]) / (WINDOW[1] - WINDOW[0]), 0.0, 1.0)[:, None].repeat(3, axis=1)
+
+
+def assert_twin(device, volume, camera, slices, clip=None, opacity=0.4, lowest=-300.0, **settings):
+    found = overlay_slices(
+        volume, device, camera, SIZE, slices=slices, opacity=opacity, lowest_hu=lowest, window=WINDOW, clip=clip,
+        **settings,
+    )  # fmt: skip
+    planes = None if clip is None else clip.planes
+    rgba, depth = overlay_twin(volume, camera, SIZE, slices, opacity, lowest, grey, planes)
+    assert (rgba[..., 3] > 0).mean() > 0.2
+    away = np.abs(premultiplied(found.image) - 255.0 * rgba).max(axis=-1)
+    assert (away <= 2.0).mean() >= 1.0 - tolerances.SLICE_EDGE_SHARE
+    both = np.isfinite(depth) & np.isfinite(found.depth)
+    assert (np.isfinite(depth) != np.isfinite(found.depth)).mean() <= tolerances.SLICE_EDGE_SHARE
+    far = np.abs(found.depth - depth)[both] > tolerances.SLICE_DEPTH_MM
+    assert far.mean() <= tolerances.SLICE_EDGE_SHARE
+    return found
+
+
+@pytest.mark.parametrize("perspective", [False, True])
+@pytest.mark.parametrize("grid", GRIDS)
+def test_the_kernel_is_its_twin(device, grid, perspective):
+    volume = make_volume(blobs, grid, dtype=np.int16)
+    assert_twin(device, volume, look(volume, (0.4, 0.8, -0.7), 14.0, perspective), [1, 4, 7, 12])
+
+
+def test_from_below_through_clip_planes_and_in_floats(device):
+    volume = make_volume(blobs, "uneven")
+    clip = Clip.plane(centre_of(volume), (0.5, 0.4, 1.0))
+    assert_twin(device, volume, look(volume, (0.3, -0.6, 0.8), 14.0), [2, 3, 9, 14, 15], clip)
+
+
+def test_a_camera_between_the_slices_sees_them_on_both_sides(device):
+    volume = make_volume(lambda p: 100.0 + 20.0 * p[:, 2], "even", 22.0, np.int16)
+    centre = centre_of(volume) + (0.0, 0.0, 0.4)
+    camera = Camera(tuple(centre), tuple(centre + (0.0, 1.0, 0.0)), (0, 0, 1), view_angle=120.0)
+    found = assert_twin(device, volume, camera, [3, 9, 15, 21], opacity=1.0)
+    assert found.image[:20, :, 0].mean() > found.image[-20:, :, 0].mean() + 10  # bright above, dark below
+
+
+@pytest.mark.oclgrind
+def test_a_few_slices_under_the_simulator(device):
+    volume = make_volume(blobs, "sheared", 6.0, np.int16)
+    camera = look(volume, (0.4, 0.8, -0.7), 5.0)
+    found = overlay_slices(volume, device, camera, (12, 9), slices=[0, 2, 4], window=WINDOW)
+    rgba, _ = overlay_twin(volume, camera, (12, 9), [0, 2, 4], 0.5, -300.0, grey)
+    assert (np.abs(premultiplied(found.image) - 255.0 * rgba).max(axis=-1) <= 2.0).mean() > 0.95
+
+
+@pytest.mark.parametrize("grid", GRIDS)
+@pytest.mark.parametrize("perspective", [False, True])
+def test_a_marked_voxel_is_where_the_camera_projects_it(device, grid, perspective):
+    volume = make_volume(lambda p: np.full(len(p), -900.0), grid, 16.0, np.int16)
+    k, j, i = volume.voxels.shape[0] // 3, volume.voxels.shape[1] // 2, 5
+    voxels = volume.voxels.copy()
+    voxels[k, j - 1 : j + 2, i - 1 : i + 2] = 600
+    volume = volume.with_voxels(voxels)
+    camera, size = look(volume, (0.2, 0.5, 0.9), 12.0, perspective), (160, 160)
+    pixels, depths = camera.project(volume.ijk_to_lps([(i, j, k)]), size)
+    found = overlay_slices(volume, device, camera, size, slices=[0, k, k + 1], opacity=0.7)
+    x, y = pixels[0]
+    assert found.image[int(y), int(x), 3] == round(0.7 * 255)
+    assert abs(found.depth[int(y), int(x)] - depths[0]) < camera.pixel_mm(size)
+    shown = np.argwhere(found.image[..., 3] > 0)
+    assert np.abs(shown.mean(axis=0)[::-1] + 0.5 - pixels[0]).max() < 1.0  # a patch around it, and nothing else
+    others = overlay_slices(volume, device, camera, size, slices=[0, k + 2])
+    assert not others.image.any() and np.isnan(others.depth).all()
+
+
+def test_opacity_adds_up_and_front_hides_back(device):
+    voxels = np.zeros((8, 12, 12), np.int16) + 100 * np.arange(8, dtype=np.int16)[:, None, None]
+    volume = Volume(voxels, np.diag([1.0, 1.0, 2.0, 1.0]))
+    above, below = (look(volume, (0.0, 0.01, z), 4.0) for z in (-1.0, 1.0))
+    settings = {"window": (0.0, 700.0), "lowest_hu": -1000.0}
+    found = overlay_slices(volume, device, above, (8, 8), slices=[1, 3, 6], opacity=0.25, **settings)
+    assert (found.image[..., 3] == round(255 * (1.0 - 0.75**3))).all()
+    hidden = [
+        overlay_slices(volume, device, camera, (8, 8), slices=3, opacity=1.0, **settings) for camera in (above, below)
+    ]
+    assert (hidden[0].image[..., 0] == round(255 * 600 / 700)).all()  # slices 0, 3 and 6, from the head: 6
+    assert (hidden[1].image[..., 0] == 0).all() and (hidden[1].image[..., 3] == 255).all()
+    assert np.abs(hidden[0].depth - (150.0 - 5.0)).max() < 0.1  # slice 6 lies 5 mm above the middle
+
+
+def test_colours_of_a_transfer_function(device):
+    volume = make_volume(lambda p: np.full(len(p), 150.0), "even", 8.0, np.int16)
+    function = TransferFunction([(0, 1, 0, 0, 0), (300, 0, 1, 0, 0)])
+    found = overlay_slices(
+        volume, device, look(volume, (0.0, 0.1, -1.0), 2.0), (4, 4), slices=[4], opacity=1.0, transfer_function=function
+    )
+    assert np.abs(found.image[..., :3].astype(int) - (128, 128, 0)).max() <= 1
+
+
+def test_parts_that_fit_the_memory_give_the_same_picture(device):
+    volume = make_volume(blobs, "oblique", 26.0, np.int16)
+    camera, slices, size = look(volume, (0.4, 0.8, -0.7), 14.0, True), list(range(0, 20, 2)), (16, 12)
+    whole = overlay_slices(volume, device, camera, size, slices=slices)
+    picture, one = 44 * size[0] * size[1], volume.voxels[0].nbytes
+    assert picture + 3 * one < 10 * one
+    parts = overlay_slices(volume, device, camera, size, slices=slices, memory=picture + 3 * one)
+    assert np.array_equal(whole.image, parts.image)
+    assert np.array_equal(whole.depth, parts.depth, equal_nan=True)
+    with pytest.raises(DeviceError, match="slice"):
+        overlay_slices(volume, device, camera, size, slices=slices, memory=picture)
+
+
+def test_slices_that_are_seen_edge_on_say_so(device):
+    volume = make_volume(blobs, "even", 8.0, np.int16)
+    camera = Camera.fit(volume, "anterior")
+    assert "edge-on" in overlay_slices(volume, device, camera, (8, 8)).report["warnings"][0]
+    assert not overlay_slices(volume, device, Camera.fit(volume, (30, 20)), (8, 8)).report["warnings"]
+
+
+def test_slices_are_chosen_evenly_or_by_number():
+    volume = Volume(np.zeros((100, 2, 2), np.int16), np.eye(4))
+    assert choose_slices(volume) == [0, 9, 18, 27, 36, 45, 54, 63, 72, 81, 90, 99]
+    assert choose_slices(volume, 40) == [0, 40, 80]
+    assert choose_slices(volume, [7, 3]) == [3, 7]
+    assert choose_slices(Volume(np.zeros((3, 2, 2), np.int16), np.eye(4))) == [0, 1, 2]
+
+
+@pytest.mark.parametrize(
+    ("wrong", "says"),
+    [
+        ({"slices": 0}, "every 0th slice"),
+        ({"slices": [1, 99]}, "slice 99 is not there: the volume has slices 0 to 8"),
+        ({"slices": [1, 1]}, "twice"),
+        ({"slices": []}, "whole numbers"),
+        ({"slices": [0.5]}, "whole numbers"),
+        ({"slices": "all"}, "whole numbers"),
+        ({"opacity": 0.0}, "opacity of a slice"),
+        ({"opacity": 1.5}, "opacity of a slice"),
+        ({"lowest_hu": "air"}, "lowest HU"),
+        ({"window": (5, 5)}, "window"),
+        ({"window": (0, 9), "transfer_function": TransferFunction([(0, 0, 0, 0, 0), (1, 1, 1, 1, 1)])}, "not by both"),
+    ],
+)
+def test_bad_input_is_refused(device, wrong, says):
+    volume = make_volume(blobs, "even", 8.0, np.int16)
+    with pytest.raises(UsageError, match=says):
+        overlay_slices(volume, device, Camera.fit(volume), (8, 8), **wrong)
