@@ -97,6 +97,6 @@ def test_smooth_bodies_look_as_vtk_draws_them(device, axes, shaded, view_angle):
 
 def test_a_spine_looks_as_vtk_draws_it(device):
     volume = spine()
-    camera = Camera.fit(volume, "30,20", 1.6, size=SIZE)
+    camera = Camera.fit(volume, "30,20", size=SIZE)
     assert likeness(*draw(volume, camera, True, device)) >= tolerances.VTK_LIKENESS_SPINE
     assert likeness(*draw(volume, camera, False, device)) >= tolerances.VTK_LIKENESS_SPINE_UNSHADED
