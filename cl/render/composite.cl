@@ -8,9 +8,11 @@
  * them may, and what they do next is decided once for all of them.
  *
  * -D UNEVEN             slices at places of their own
- * -D GRADIENT_OPACITY   opacity times a function of the gradient's magnitude */
+ * -D GRADIENT_OPACITY   opacity times a function of the gradient's magnitude
+ * -D LABELS             labels with colours and opacities */
 #include "include/field.h"
 #include "include/jitter.h"
+#include "include/label_color.h"
 #include "include/leap.h"
 #include "include/phong.h"
 #include "include/stack.h"
@@ -48,7 +50,17 @@ typedef struct {
     float ray_step;
     float slab_low, slab_high; /* samples with slab_low <= k < slab_high are this slab's */
     int shaded;
+#ifdef LABELS
+    __global const LABEL *labels;
+    __global const float4 *label_colors;
+#endif
 } looks;
+
+#ifdef LABELS
+#define LABEL_PARAMETERS , __global const LABEL *restrict labels, __global const float4 *restrict label_colors
+#else
+#define LABEL_PARAMETERS
+#endif
 
 #ifdef GRADIENT_OPACITY
 #define IS_WEIGHED 1
@@ -92,11 +104,21 @@ static inline void blend_samples(const field *f, const slice_stack *stack, const
     if (ANY_LANE(cut))
         opacity = choose(cut, stretch_opacity(opacity, rays->rest / look->ray_step), opacity);
     const ints color = (ints)(GATHER(int, look->colors, node));
-    const floats weight = (1.0f - seen->opacity) * opacity;
     const floats unit = 1.0f / 1023.0f;
-    seen->red += weight * min(to_floats(color >> 20) * unit * share + highlight, (floats)(1.0f));
-    seen->green += weight * min(to_floats((color >> 10) & 1023) * unit * share + highlight, (floats)(1.0f));
-    seen->blue += weight * min(to_floats(color & 1023) * unit * share + highlight, (floats)(1.0f));
+    floats red = to_floats(color >> 20) * unit, green = to_floats((color >> 10) & 1023) * unit;
+    floats blue = to_floats(color & 1023) * unit;
+#ifdef LABELS
+    const ints number = find_labels(look->labels, f, i, j, k);
+    const floats label_red = LABEL_CHANNEL(look->label_colors, number, 0);
+    const floats tinted = choose(label_red < 0.0f, (floats)(0.0f), (floats)(LABEL_TINT));
+    red += tinted * (label_red - red);
+    green += tinted * (LABEL_CHANNEL(look->label_colors, number, 1) - green);
+    blue += tinted * (LABEL_CHANNEL(look->label_colors, number, 2) - blue);
+#endif
+    const floats weight = (1.0f - seen->opacity) * opacity;
+    seen->red += weight * min(red * share + highlight, (floats)(1.0f));
+    seen->green += weight * min(green * share + highlight, (floats)(1.0f));
+    seen->blue += weight * min(blue * share + highlight, (floats)(1.0f));
     seen->opacity += weight;
     seen->sum += weight * t;
     seen->first_hit = choose((seen->first_hit < 0.0f) & (seen->opacity > FIRST_SEEN), t, seen->first_hit);
@@ -119,6 +141,7 @@ static inline void blend_samples(const field *f, const slice_stack *stack, const
  *             low scale factor_scale steps_per_unit  see looks
  *             jitter   samples at random places of their segments
  *             stage    FIRST_SLAB and LAST_SLAB, see include/view.h
+ *             with LABELS those of the buffer's slices, and the table of include/label_color.h
  *             with UNEVEN the table of slices, see include/stack.h
  * Launch      global = tiles * 64 / LANES rounded up by the host, any local
  * Guarantees  every pixel of image, depths and means is written with the last slab */
@@ -132,7 +155,8 @@ __kernel void composite_rays(
     const float4 slope, const int ni, const int nj, const int first_k, const int end_k, const float slab_low,
     const float slab_high, const int bi, const int bj, const int bk, const float low, const float scale,
     const float factor_scale, const float steps_per_unit, const uint width, const uint height, const uint planes,
-    const int perspective, const int shaded, const int jitter, const int stage, const uint queues STACK_PARAMETERS)
+    const int perspective, const int shaded, const int jitter, const int stage, const uint queues
+    LABEL_PARAMETERS STACK_PARAMETERS)
 {
     const uint first_pixel = (uint)get_global_id(0) * LANES;
     const field f = { voxels, ni, nj, first_k, end_k, last_place };
@@ -140,7 +164,11 @@ __kernel void composite_rays(
     const slice_stack stack = STACK_TABLE;
     const float ray_step = view[VIEW_NEAR].y;
     const looks look = { colors, opacities, highlights, factors, view, low, scale, factor_scale, steps_per_unit,
-        ray_step, slab_low, slab_high, shaded };
+        ray_step, slab_low, slab_high, shaded,
+#ifdef LABELS
+        labels, label_colors
+#endif
+    };
 
     const uint tile = find_tile(first_pixel, width, height, queues);
     const uint tiles = (width + TILE - 1) / TILE * ((height + TILE - 1) / TILE);
@@ -252,7 +280,18 @@ __kernel void composite_rays(
 #ifdef UNEVEN
             counts &= (i >= -0.5f) & (i <= f.last.x + 0.5f) & (j >= -0.5f) & (j <= f.last.y + 0.5f);
 #endif
-            const floats opacity = choose(counts, found, (floats)(0.0f));
+            floats opacity = choose(counts, found, (floats)(0.0f));
+#ifdef LABELS
+            if (ANY_LANE(opacity > 0.0f)) { /* the factor is on the opacity of the unit distance */
+                const floats factor
+                    = LABEL_CHANNEL(look.label_colors, find_labels(look.labels, &f, i, j, k), 3);
+                if (ANY_LANE((factor < 1.0f) & (opacity > 0.0f))) {
+                    const floats whole = stretch_opacity(opacity, (floats)(look.steps_per_unit));
+                    const floats faded = stretch_opacity(factor * whole, (floats)(1.0f / look.steps_per_unit));
+                    opacity = choose(factor < 1.0f, faded, opacity);
+                }
+            }
+#endif
             if (ANY_LANE(opacity > 0.0f)) {
                 blend_samples(&f, &stack, &look, &rays, n, i, j, k, node, opacity, &seen);
                 end = choose(seen.opacity < OPAQUE, end, (floats)(0.0f));

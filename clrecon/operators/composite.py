@@ -10,11 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.kernels import Stopwatch, allocate, launch, upload
+from clrecon.labels.resample import ResampledLabels
 from clrecon.opencl import Device
 from clrecon.operators.pictures import PictureBuffers, count_queues, highlight_table
 from clrecon.operators.ray_view import RayView
-from clrecon.operators.resident import BRICK_CELLS, LeapMap, RaySlab, ResidentVolume
+from clrecon.operators.resident import BRICK_CELLS, LeapMap, RaySlab, ResidentVolume, pad_slices
+from clrecon.operators.voxel_types import label_variants
 from clrecon.rendering import Lighting, TransferFunction
+from clrecon.rendering.label_style import LabelStyle
 
 __all__ = ["NODES", "TransferTables", "composite_slab"]
 
@@ -89,6 +92,8 @@ def composite_slab(
     leaps: LeapMap,
     lighting: Lighting,
     jitter: bool,
+    labels: ResampledLabels | None,
+    style: LabelStyle | None,
     output: PictureBuffers,
     stopwatch: Stopwatch,
 ) -> None:
@@ -100,11 +105,20 @@ def composite_slab(
         With the slab's focus.
     leaps : LeapMap
         Of this slab, for the transfer function of `tables`.
+    labels : ResampledLabels, optional
+        On the grid of the volume, and how its labels look.
+    style : LabelStyle, optional
     output : PictureBuffers
         Holds what earlier slabs left.
     """
     device = resident.device
-    program = resident.program("render/composite.cl", **({"GRADIENT_OPACITY": "1"} if tables.weighed else {}))
+    variants = {"GRADIENT_OPACITY": "1"} if tables.weighed else {}
+    label_tables: tuple[Any, ...] = ()
+    if labels is not None and style is not None:
+        variants |= {"LABELS": "1", **label_variants(labels.voxels.dtype)}
+        held = pad_slices(labels.voxels[slab.first_k : slab.end_k])
+        label_tables = (upload(device, held), upload(device, style.table))
+    program = resident.program("render/composite.cl", **variants)
     lanes = int(device.kernel_variants["LANES"])
     width, height = view.size
     queues = count_queues(device)
@@ -120,7 +134,8 @@ def composite_slab(
         np.float32(tables.low), np.float32(tables.scale), np.float32(tables.factor_scale),
         np.float32(tables.steps_per_unit), np.uint32(width), np.uint32(height),
         np.uint32(view.planes), np.int32(not view.camera.is_parallel), np.int32(lighting.shades), np.int32(jitter),
-        np.int32(slab.stage), np.uint32(queues), *resident.stack.arguments, stopwatch=stopwatch,
+        np.int32(slab.stage), np.uint32(queues), *label_tables, *resident.stack.arguments,
+        stopwatch=stopwatch,
     )  # fmt: skip
 
 

@@ -1,40 +1,72 @@
-"""Pictures of a volume: one volume on a device, any number of pictures."""
+"""Pictures of a volume: one volume on a device, any number of pictures in any mode."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from types import TracebackType
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike
 
 from clrecon.errors import UsageError
 from clrecon.geometry import Volume
-from clrecon.geometry.affine import Float64Array
 from clrecon.geometry.camera import Camera
 from clrecon.geometry.clip import Clip
 from clrecon.geometry.views import checked_size
-from clrecon.kernels import Stopwatch
+from clrecon.labels import LabelMap
 from clrecon.opencl import Device, choose_device
-from clrecon.operators.composite import TransferTables, composite_slab
-from clrecon.operators.pictures import PictureBuffers
-from clrecon.operators.project import PROJECTIONS, project_slab
-from clrecon.operators.ray_view import RayView, volume_box
-from clrecon.operators.resident import ResidentVolume, entry_slice
+from clrecon.operators.composite import TransferTables
+from clrecon.operators.project import PROJECTIONS
+from clrecon.operators.ray_pictures import RayPicture, take_picture
+from clrecon.operators.resident import ResidentVolume
 from clrecon.rendering import Lighting, Rendering, TransferFunction
+from clrecon.rendering.label_style import LabelStyle
 from clrecon.rendering.presets import DEFAULT_PRESET, find_preset
-from clrecon.rendering.window import checked_window, choose_window, grey_image
+from clrecon.rendering.window import checked_window
 
 __all__ = ["MODES", "VolumeRenderer", "render"]
 
-MODES = ("dvr", "mip", "minip", "mean")
+MODES = ("dvr", "mip", "minip", "mean", "surface", "slices", "slice", "cpr")
 """Kinds of pictures."""
 
 DEFAULT_SIZE = (1024, 1024)
+DEFAULT_ISO_VALUE = 200.0
+"""HU of surfaces: bone, thin cortex of vertebrae with it."""
+
 SMALLEST_STEP = 0.01
 """Ray steps below this share of the smallest spacing add time and nothing else."""
+
+_SHADED = ("dvr", "surface")
+_LABELLED = ("dvr", "surface")
+_CUT = ("slice", "cpr")
+_RAYS = ("dvr", "mip", "minip", "mean", "surface", "slices")
+
+KNOWN_IN: dict[str, tuple[str, ...]] = {
+    "transfer_function": ("dvr", "slices"),
+    "lighting": _SHADED,
+    "window": (*PROJECTIONS, "slices", *_CUT),
+    "ray_step": ("dvr", *PROJECTIONS, "surface"),
+    "view_angle": _RAYS,
+    "clip": _RAYS,
+    "jitter": ("dvr",),
+    "iso_value": ("surface",),
+    "color": ("surface",),
+    "shadows": ("surface",),
+    "depth_cue": ("surface",),
+    "labels": _LABELLED,
+    "label_colors": _LABELLED,
+    "label_opacity": _LABELLED,
+    "slices": ("slices",),
+    "slice_opacity": ("slices",),
+    "offset_mm": ("slice",),
+    "thickness": _CUT,
+    "combine": _CUT,
+    "curve": ("cpr",),
+    "cpr": ("cpr",),
+}
+"""Options that mean something in some modes only."""
 
 
 class VolumeRenderer:
@@ -93,29 +125,136 @@ class VolumeRenderer:
         transfer_function: TransferFunction | None = None,
         camera: Camera | None = None,
         view: str | Sequence[float] = "anterior",
-        size: Sequence[int] = DEFAULT_SIZE,
+        size: Sequence[int] | None = None,
         ray_step: float | None = None,
         *,
         up: str | Sequence[float] | None = None,
         zoom: float = 1.0,
         view_angle: float | None = None,
-        lighting: Lighting | None = None,
-        window: Sequence[float] | None = None,
-        clip: Clip | None = None,
         background: str | Sequence[float] = "black",
-        jitter: bool = False,
+        **options: Any,
     ) -> Rendering:
         """Make one picture, see `render`."""
-        size = checked_size(size)
-        for what, value, kind in (("camera", camera, Camera), ("lighting", lighting, Lighting), ("clip", clip, Clip)):
+        if size is not None or mode != "cpr":
+            size = checked_size(DEFAULT_SIZE if size is None else size)
+        for what, value, kind in (
+            ("camera", camera, Camera), ("lighting", options.get("lighting"), Lighting),
+            ("clip", options.get("clip"), Clip), ("transfer function", transfer_function, TransferFunction),
+            ("labels", options.get("labels"), LabelMap),
+        ):  # fmt: skip
             if not (value is None or isinstance(value, kind)):
                 raise UsageError(f"the {what} of a picture is a {kind.__name__} or None, not {value!r:.60}")
-        request = _Request.of(mode, preset, transfer_function, lighting, window)
+        mode = _choose_mode(mode, preset, transfer_function)
+        given = {"transfer_function": transfer_function, "ray_step": ray_step, "view_angle": view_angle, **options}
+        _check_options(mode, given)
+        if mode == "cpr":
+            if camera is not None:
+                raise UsageError("a curved reformation has no camera: view and up say which way one looks at it")
+            return self._reformat(view, size, up, background, preset, options)
+        assert size is not None
+        if mode == "slice":
+            return self._cut(camera, view, size, zoom, up, background, preset, options)
         if camera is None:
             camera = Camera.fit(self.volume, view, zoom, up=up, view_angle=view_angle, size=size)
+        ground = None if background == "transparent" else background
         step = self._checked_step(ray_step)
-        job = _Job(self, request, camera, size, step, clip, None if background == "transparent" else background)
-        return job.run(jitter)
+        if mode == "surface":
+            return self._surface(camera, size, step, ground, options)
+        if mode == "slices":
+            return self._overlay(camera, size, transfer_function, ground, options)
+        chosen = find_preset(DEFAULT_PRESET if preset is None else preset)
+        function = chosen.transfer_function if transfer_function is None else transfer_function
+        picture = RayPicture(
+            mode, camera, size, step, function, options.get("lighting") or function.lighting or Lighting(),
+            _choose_window(preset, options), options.get("clip"), ground, bool(options.get("jitter")),
+            _label_style(options),
+        )  # fmt: skip
+        tables = None if mode in PROJECTIONS else self._transfer_tables(function, step)
+        return take_picture(self._resident, picture, tables)
+
+    def _surface(
+        self,
+        camera: Camera,
+        size: tuple[int, int],
+        step: float,
+        background: str | Sequence[float] | None,
+        options: Mapping[str, Any],
+    ) -> Rendering:
+        from clrecon.operators.surface_rays import SURFACE_COLOR, cast_surface
+
+        iso_value = options.get("iso_value")
+        return cast_surface(
+            self._resident, DEFAULT_ISO_VALUE if iso_value is None else iso_value, camera, size, step,
+            lighting=options.get("lighting"), clip=options.get("clip"), color=options.get("color") or SURFACE_COLOR,
+            background=background, shadows=bool(options.get("shadows")), depth_cue=options.get("depth_cue") or 0.0,
+            style=_label_style(options),
+        )  # fmt: skip
+
+    def _overlay(
+        self,
+        camera: Camera,
+        size: tuple[int, int],
+        function: TransferFunction | None,
+        background: str | Sequence[float] | None,
+        options: Mapping[str, Any],
+    ) -> Rendering:
+        from clrecon.operators.slice_overlay import DEFAULT_OPACITY, overlay_slices
+
+        opacity = options.get("slice_opacity")
+        return overlay_slices(
+            self.volume, self.device, camera, size, slices=options.get("slices"),
+            opacity=DEFAULT_OPACITY if opacity is None else opacity, window=options.get("window"),
+            transfer_function=function, clip=options.get("clip"), background=background, memory=self.memory,
+        )  # fmt: skip
+
+    def _cut(
+        self,
+        camera: Camera | None,
+        view: str | Sequence[float],
+        size: tuple[int, int],
+        zoom: float,
+        up: str | Sequence[float] | None,
+        background: str | Sequence[float],
+        preset: str | None,
+        options: Mapping[str, Any],
+    ) -> Rendering:
+        from clrecon.operators.reformat import cut_slice
+
+        own: dict[str, Any] = {} if camera is not None else {"zoom": zoom, "up": up}
+        offset = options.get("offset_mm")
+        return cut_slice(
+            self.volume, view if camera is None else camera, size, self.device,
+            offset_mm=0.0 if offset is None else offset, **own, **self._slab_options(background, preset, options),
+        )  # fmt: skip
+
+    def _reformat(
+        self,
+        view: str | Sequence[float],
+        size: Sequence[int] | None,
+        up: str | Sequence[float] | None,
+        background: str | Sequence[float],
+        preset: str | None,
+        options: Mapping[str, Any],
+    ) -> Rendering:
+        from clrecon.operators.reformat import reformat_curve
+
+        curve: ArrayLike | str | None = options.get("curve")
+        return reformat_curve(
+            self.volume, "spine" if curve is None else curve, options.get("cpr") or "straightened", size, self.device,
+            view=view, up=up, **self._slab_options(background, preset, options),
+        )  # fmt: skip
+
+    def _slab_options(
+        self, background: str | Sequence[float], preset: str | None, options: Mapping[str, Any]
+    ) -> dict[str, Any]:
+        thickness = options.get("thickness")
+        return {
+            "thickness": 0.0 if thickness is None else thickness,
+            "combine": options.get("combine") or "mean",
+            "window": _choose_window(preset, options),
+            "background": background,
+            "memory": self.memory,
+        }
 
     def _checked_step(self, ray_step: float | None) -> float:
         smallest = min(self.volume.spacing)
@@ -140,119 +279,41 @@ class VolumeRenderer:
         return self._tables[key]
 
 
-class _Request:
-    """What is to be seen, after presets and defaults have had their say."""
-
-    def __init__(self, mode: str, function: TransferFunction, lighting: Lighting, window: tuple[float, float] | None):
-        self.mode = mode
-        self.function = function
-        self.lighting = lighting
-        self.window = window
-
-    @classmethod
-    def of(
-        cls,
-        mode: str | None,
-        preset: str | None,
-        function: TransferFunction | None,
-        lighting: Lighting | None,
-        window: Sequence[float] | None,
-    ) -> _Request:
-        if function is not None and not isinstance(function, TransferFunction):
-            raise UsageError(f"the transfer function is a TransferFunction, not {type(function).__name__}")
-        if function is not None and preset is not None:
-            raise UsageError(f"a picture has a preset ({preset}) or a transfer function, not both")
-        chosen = find_preset(DEFAULT_PRESET if preset is None else preset)
-        if mode is None:
-            mode = chosen.mode if function is None else "dvr"
-        if mode not in MODES:
-            raise UsageError(f"there is no mode {mode!r}: it is one of {', '.join(MODES)}")
-        if function is None:
-            function = chosen.transfer_function
-        if lighting is None:
-            lighting = function.lighting or Lighting()
-        if window is not None:
-            window = checked_window(window)
-        elif preset is not None:
-            window = chosen.window
-        return cls(mode, function, lighting, None if window is None else (window[0], window[1]))
+def _choose_mode(mode: str | None, preset: str | None, function: TransferFunction | None) -> str:
+    """The mode that is asked for, or the preset's own."""
+    if function is not None and preset is not None:
+        raise UsageError(f"a picture has a preset ({preset}) or a transfer function, not both")
+    chosen = find_preset(DEFAULT_PRESET if preset is None else preset)
+    if mode is None:
+        return chosen.mode if function is None else "dvr"
+    if mode not in MODES:
+        raise UsageError(f"there is no mode {mode!r}: it is one of {', '.join(MODES)}")
+    return mode
 
 
-class _Job:
-    """One picture: from slab to slab."""
+def _check_options(mode: str, given: Mapping[str, Any]) -> None:
+    """Refuse options that do not exist, or mean nothing in a mode."""
+    for name, value in given.items():
+        if name not in KNOWN_IN:
+            raise UsageError(f"a picture has no option {name!r}: it is one of {', '.join(KNOWN_IN)}")
+        if value is not None and value is not False and mode not in KNOWN_IN[name]:
+            raise UsageError(f"{name} means nothing in mode {mode}: it belongs to {', '.join(KNOWN_IN[name])}")
 
-    def __init__(
-        self,
-        renderer: VolumeRenderer,
-        request: _Request,
-        camera: Camera,
-        size: tuple[int, int],
-        ray_step: float,
-        clip: Clip | None,
-        background: str | Sequence[float] | None,
-    ):
-        self.renderer = renderer
-        self.request = request
-        self.stopwatch = Stopwatch()
-        self.background = background
-        self.camera, self.size, self.ray_step = camera, size, ray_step
-        self.planes = clip.planes if clip is not None else None
 
-    def run(self, jitter: bool) -> Rendering:
-        """Go through the slabs and collect the picture."""
-        renderer, request, stopwatch = self.renderer, self.request, self.stopwatch
-        resident, device = renderer._resident, renderer.device
-        slices = resident.plan(*PictureBuffers.needs(self.size))
-        output = PictureBuffers(device, self.size, self.background, slices < renderer.volume.shape_ijk[2])
-        box = volume_box(renderer.volume)
-        slabs = 0
-        with stopwatch.running(device):
-            for slab in resident.slabs(slices, entry_slice(renderer.volume, self.camera), stopwatch):
-                slabs += 1
-                if request.mode in PROJECTIONS:
-                    project_slab(resident, slab, self._view(box, box), request.mode, output, stopwatch)
-                else:
-                    tables = renderer._transfer_tables(request.function, self.ray_step)
-                    key = (request.function, self.ray_step)
-                    leaps = resident.find_leaps(slab, key, tables.shown, tables.low, tables.scale, stopwatch)
-                    view = self._view(box, box if leaps.box is None else leaps.box, nothing=leaps.box is None)
-                    composite_slab(resident, slab, view, tables, leaps, request.lighting, jitter, output, stopwatch)
-        with stopwatch.timed("download"):
-            image, depths, means = output.download()
-        report = {
-            "mode": request.mode,
-            "device": device.label,
-            "driver": device.driver,
-            "ray_step_mm": self.ray_step,
-            "slabs": slabs,
-            "seconds": dict(stopwatch.seconds),
-            "kernel_seconds": dict(stopwatch.by_kernel),
-            "warnings": [],
-        }
-        if request.mode in PROJECTIONS:
-            return self._finish_projection(means, depths, report)
-        report["unit_distance_mm"] = request.function.unit_distance
-        return Rendering(image, depths, means, self.camera, None, request.mode, report)
+def _choose_window(preset: str | None, options: Mapping[str, Any]) -> tuple[float, float] | None:
+    window = options.get("window")
+    if window is not None:
+        return checked_window(window)
+    return None if preset is None else find_preset(preset).window
 
-    def _finish_projection(
-        self, values: NDArray[np.float32], depths: NDArray[np.float32], report: dict[str, Any]
-    ) -> Rendering:
-        window = self.request.window or choose_window(values)
-        report["window_hu"] = list(window)
-        made = Rendering(
-            grey_image(values, window), depths, depths.copy(), self.camera, values, self.request.mode, report
-        )
-        return made if self.background is None else made.with_background(self.background)
 
-    def _view(
-        self, box: tuple[Float64Array, Float64Array], focus: tuple[Float64Array, Float64Array], nothing: bool = False
-    ) -> RayView:
-        if nothing:
-            focus = (focus[1], focus[1])
-        return RayView.of(
-            self.renderer.volume, self.camera, self.size, self.ray_step,
-            lighting=self.request.lighting, planes=self.planes, box=box, focus=focus,
-        )  # fmt: skip
+def _label_style(options: Mapping[str, Any]) -> LabelStyle | None:
+    if options.get("labels") is None:
+        for name in ("label_colors", "label_opacity"):
+            if options.get(name) is not None:
+                raise UsageError(f"{name} says how labels look: give the labels too")
+        return None
+    return LabelStyle.of(options["labels"], options.get("label_colors"), options.get("label_opacity"))
 
 
 def render(
@@ -262,7 +323,7 @@ def render(
     transfer_function: TransferFunction | None = None,
     camera: Camera | None = None,
     view: str | Sequence[float] = "anterior",
-    size: Sequence[int] = DEFAULT_SIZE,
+    size: Sequence[int] | None = None,
     ray_step: float | None = None,
     device: Device | str | int | None = None,
     *,
@@ -274,8 +335,9 @@ def render(
     Parameters
     ----------
     volume : Volume
-    mode : {"dvr", "mip", "minip", "mean"}, optional
-        Default is the preset's, or "dvr".
+    mode : {"dvr", "mip", "minip", "mean", "surface", "slices", "slice", "cpr"}, optional
+        Volume rendering, highest, lowest or mean value along each ray, shaded surface at an iso value, slices in space,
+        a plane through the volume, curved planar reformation.  Default is the preset's, or "dvr".
     preset : str, optional
         See `clrecon.rendering.presets`; default "bone".
     transfer_function : TransferFunction, optional
@@ -284,8 +346,8 @@ def render(
         In place of `view`, `up`, `zoom` and `view_angle`.
     view : str or (azimuth, elevation)
         See `Camera.fit`, which also takes `up`, `zoom` and `view_angle`.
-    size : (width, height)
-        Pixels.
+    size : (width, height), optional
+        Pixels; default 1024 x 1024, and what the curve needs in "cpr".
     ray_step : float, optional
         mm between samples; default half the smallest spacing.
     device : Device, str or int, optional
@@ -293,9 +355,21 @@ def render(
     memory : int, optional
         Bytes that may be taken on the device; default all that it has.
     **options
-        ``lighting``; ``window``, HU that are black and white in projections, by default the 1st to the 99th
-        percentile; ``clip``, a `Clip`; ``background``, a colour or "transparent"; ``jitter``, samples at random places
-        of their segments.
+        ``background``, a colour or "transparent"; and by mode (others refuse them):
+
+        dvr, surface: ``lighting``; ``labels``, a `LabelMap`, with ``label_colors`` and ``label_opacity``, mappings of
+        label to colour and to a factor on the opacity.  dvr: ``jitter``, samples at random places of their segments.
+
+        surface: ``iso_value`` in HU (default 200), ``color``, ``shadows`` (they need a fixed light), ``depth_cue``.
+
+        mip, minip, mean, slices, slice, cpr: ``window``, HU that are black and white; default the 1st to the 99th
+        percentile in projections, -450 to 1050 HU else.
+
+        slices: ``slices``, how many or which, ``slice_opacity``.  slice, cpr: ``thickness`` in mm with ``combine``
+        ("mean", "max", "min").  slice: ``offset_mm`` along the view.  cpr: ``curve``, points (n, 3) in LPS mm (default:
+        the spinal canal, found), ``cpr`` ("straightened", "stretched").
+
+        All but slice and cpr: ``clip``, a `Clip`.
 
     Returns
     -------
