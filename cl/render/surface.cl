@@ -9,154 +9,17 @@
  *
  * -D UNEVEN   slices at places of their own
  * -D LABELS   labels with colours and opacities: through what is translucent the ray goes on */
-#include "include/closed_field.h"
-#include "include/leap.h"
-#include "include/phong.h"
-#include "include/stack.h"
+#include "include/hit.h"
 #include "include/view.h"
+#include "render/surface_lines.h"
 #ifdef LABELS
-#include "include/label_color.h"
+#include "render/surface_labels.h"
 #endif
 
 #define OPAQUE 0.99f /* nothing behind can be seen */
 #define FIRST_SEEN (1.0f / 255.0f) /* opacity that makes a first hit */
-#define DARK 0.01f /* no light is left */
 #define OUT (-1.0f) /* in place of the label that a ray passes through */
 #define NO_HIT (-MAXFLOAT)
-#define SPLIT (LANES > 1 ? LANES : 2)
-#define NARROWED 64 /* a crossing is sought in a part of a step this small, and there on a line */
-
-/* Samples along a line in field coordinates: number n is at start + min(n, last) * stride. */
-typedef struct {
-    float4 start, stride;
-    float last;
-} line;
-
-typedef struct {
-    closed_field field;
-    leap_map map;
-    slice_stack stack;
-    float4 slope; /* see find_pace() */
-} scene;
-
-static inline floats sample_line(const scene *s, const line *along, const floats number)
-{
-    const floats n = min(number, (floats)(along->last));
-    floats i = along->start.x + n * along->stride.x, j = along->start.y + n * along->stride.y;
-    floats k = along->start.z + n * along->stride.z;
-    to_indices(&s->stack, &i, &j, &k);
-    return sample_closed(&s->field, i, j, k);
-}
-
-static inline float4 place_on(const line *along, const float number)
-{
-    return along->start + min(number, along->last) * along->stride;
-}
-
-/* Index coordinates of a place in field coordinates. */
-static inline float3 index_of(const scene *s, const float4 place)
-{
-    floats i = (floats)(place.x), j = (floats)(place.y), k = (floats)(place.z);
-    to_indices(&s->stack, &i, &j, &k);
-    return (float3)(FIRST_LANE(i), FIRST_LANE(j), FIRST_LANE(k));
-}
-
-/* Samples of LANES lines, those from `numbers` to below `ends`.  With `last_counts` no leap may skip the last of them:
- * it is less than a stride from the one before. */
-typedef struct {
-    line lines[LANES];
-    float numbers[LANES], ends[LANES];
-    int last_counts;
-} bundle;
-
-static inline void gather_lines(const scene *s, const bundle *all, ray_lanes *together)
-{
-    float parts[6][LANES];
-    for (int lane = 0; lane < LANES; ++lane) {
-        const float4 start = all->lines[lane].start, stride = all->lines[lane].stride;
-        parts[0][lane] = start.x;
-        parts[1][lane] = start.y;
-        parts[2][lane] = start.z;
-        parts[3][lane] = stride.x;
-        parts[4][lane] = stride.y;
-        parts[5][lane] = stride.z;
-    }
-    together->start_i = load_lanes(parts[0]);
-    together->start_j = load_lanes(parts[1]);
-    together->start_k = load_lanes(parts[2]);
-    together->stride_i = load_lanes(parts[3]);
-    together->stride_j = load_lanes(parts[4]);
-    together->stride_k = load_lanes(parts[5]);
-    find_pace(together, s->slope);
-}
-
-/* Follow a line from sample n until one is inside, its brick cannot reach the level, or it ends.  (rusticl of Mesa 22
- * goes wrong where such a loop returns from its middle.) */
-static inline int follow_line(const scene *s, const line *along, int n, const int end, int *found)
-{
-    int going = 1;
-    while (going) {
-        const floats value = sample_line(s, along, (float)n + LANE_NUMBERS);
-        if (ANY_LANE(value >= s->field.level)) {
-            n += (int)LEAST_LANE(choose(value >= s->field.level, LANE_NUMBERS, (floats)(LANES)));
-            *found = n < end;
-            going = 0;
-        } else {
-            n += LANES;
-            const float3 next = index_of(s, along->start + (float)n * along->stride);
-            going = n < end && is_shown(&s->map, next.x, next.y, next.z - (float)s->field.inner.first_k);
-        }
-    }
-    return min(n, end);
-}
-
-/* Move `numbers` of all lines to their first sample that is inside, or to their ends. */
-static inline void find_inside(const scene *s, bundle *all)
-{
-    ray_lanes together;
-    gather_lines(s, all, &together);
-    float limits[LANES];
-    for (int lane = 0; lane < LANES; ++lane)
-        limits[lane] = all->ends[lane];
-    floats n = load_lanes(all->numbers), limit = load_lanes(limits);
-    while (ANY_LANE(n < limit)) {
-        const floats furthest = limit - (all->last_counts ? 1.0f : 0.0f);
-        for (;;) {
-            const floats free = count_free_steps(&s->map, &s->stack, &together, n, s->field.inner.first_k, 0);
-            const ints leaping = (free > 0.0f) & (n < furthest);
-            if (!ANY_LANE(leaping))
-                break;
-            n = choose(leaping, min(n + free, furthest), n);
-        }
-        store_lanes(n, all->numbers);
-        for (int lane = 0; lane < LANES; ++lane)
-            if (all->numbers[lane] < limits[lane]) {
-                int found = 0;
-                all->numbers[lane] = (float)follow_line(
-                    s, all->lines + lane, (int)all->numbers[lane], (int)limits[lane], &found);
-                limits[lane] = found ? -1.0f : limits[lane];
-            }
-        n = load_lanes(all->numbers);
-        limit = load_lanes(limits);
-    }
-}
-
-/* Where on a line the field reaches the level: between sample n - 1, which is outside, and n, which is inside. */
-static inline float find_crossing(const scene *s, const line *along, const int n)
-{
-    float low = (float)(n - 1), high = min((float)n, along->last);
-    for (int parts = 1; parts < NARROWED; parts *= SPLIT) {
-        const float part = (high - low) / (float)SPLIT;
-        const floats number = low + part * (LANE_NUMBERS + 1.0f);
-        const floats value = sample_line(s, along, number);
-        high = LEAST_LANE(choose(value >= s->field.level, number, (floats)(high)));
-        low = high - part;
-    }
-    const float at_low = FIRST_LANE(sample_line(s, along, (floats)(low)));
-    const float at_high = FIRST_LANE(sample_line(s, along, (floats)(high)));
-    const float share = (s->field.level - at_low) / max(at_high - at_low, 1e-20f);
-    return low + clamp(share, 0.0f, 1.0f) * (high - low);
-}
 
 /* LPS gradient of differences per index step in slice k.  Layers beyond the ends are as thick as those at the ends. */
 static inline float3 to_lps(const scene *s, __global const float4 *view, const float4 step, const int k)
@@ -202,87 +65,6 @@ static inline float3 find_cap(
     }
     return normal;
 }
-
-#ifdef LABELS
-/* Label of a place on the surface: of the nearest voxel of its cell that is inside and has one. */
-static inline uint find_surface_label(
-    const scene *s, __global const LABEL *labels, const float4 field_place)
-{
-    const closed_field *f = &s->field;
-    const float3 place = index_of(s, field_place);
-    const float3 base = floor(place);
-    float nearest = MAXFLOAT;
-    uint found = 0;
-    for (int corner = 0; corner < 8; ++corner) {
-        const float3 at = base + (float3)((float)(corner & 1), (float)(corner >> 1 & 1), (float)(corner >> 2));
-        const float3 away = at - place;
-        const float distance = dot(away, away);
-        if (distance >= nearest || read_closed(f, (int)at.x, (int)at.y, (int)at.z) < f->level)
-            continue;
-        const uint label = find_label(labels, &f->inner, at);
-        if (label != 0) {
-            nearest = distance;
-            found = label;
-        }
-    }
-    return found;
-}
-
-/* The first sample of n to end - 1 that is outside, or inside of another label than `passed`; end where there is none.
- * `label` becomes that other label, 0 where it is outside. */
-static inline int leave_label(
-    const scene *s, __global const LABEL *labels, const line *along, int n, const int end,
-    const uint passed, uint *label)
-{
-    int going = 1;
-    *label = 0;
-    while (going && n < end) {
-        const int outside = FIRST_LANE(sample_line(s, along, (floats)((float)n))) < s->field.level;
-        const uint here = outside ? 0 : find_label(labels, &s->field.inner, index_of(s, place_on(along, (float)n)));
-        going = !outside && (here == 0 || here == passed);
-        *label = going ? 0 : here;
-        n += going;
-    }
-    return n;
-}
-
-/* Differences per index step of being in a label, over the 27 voxels around a place. */
-static inline float4 find_label_differences(
-    __global const LABEL *labels, const field *f, const float3 place, const uint label)
-{
-    float4 sum = (float4)(0.0f);
-    for (int c = -1; c <= 1; ++c)
-        for (int b = -1; b <= 1; ++b)
-            for (int a = -1; a <= 1; ++a) {
-                const float4 way = (float4)((float)a, (float)b, (float)c, 0.0f);
-                sum += find_label(labels, f, place + way.xyz) == label ? way : (float4)(0.0f);
-            }
-    return sum / 18.0f;
-}
-
-/* Share of the light that comes through what is inside from sample n of a line on, which is. */
-static inline float let_light_through(
-    const scene *s, __global const LABEL *labels, __global const float4 *label_colors,
-    const line *to_light, int n, const int end)
-{
-    float light = 1.0f;
-    uint label = find_surface_label(s, labels, place_on(to_light, (float)n));
-    int inside = 1;
-    while (n < end && light > DARK) {
-        if (inside) {
-            const uint passed = label;
-            light *= 1.0f - label_colors[passed].w;
-            n = leave_label(s, labels, to_light, n + 1, end, passed, &label);
-            inside = label != 0;
-        } else {
-            n = follow_line(s, to_light, n, end, &inside);
-            if (inside)
-                label = find_surface_label(s, labels, place_on(to_light, (float)n));
-        }
-    }
-    return light;
-}
-#endif
 
 /* The way from a place to the fixed light: samples from a ray step on, as far as anything can be inside.  Returns how
  * many. */
