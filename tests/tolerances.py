@@ -120,9 +120,9 @@ RAY_DISC_AREA = 0.005  # pixels of a disc of 20 on a grid: measured 0.001
 RAY_RESAMPLED_255 = 4  # two samplings of one smooth field, 1.9 mm at most: measured 3
 RAY_SAME_255 = 1  # rounding to 8 bits the other way
 RAY_OUTLINE_SHARE = 0.02  # of pixels: at outlines triangles and the trilinear field between voxels are hit or missed
-RAY_TWIN_SHARE = 0.005  # of pixels: float32 takes the other side of a step of the table, or of the volume's edge
-RAY_TWIN_WORST_255 = 40  # such a pixel gains or loses one sample
-RAY_TWIN_HU = 0.5  # float32 indices of some 100 voxels, steps of 2500 HU between neighbours
+RAY_TWIN_SHARE = 0.002  # of pixels: float32 takes the other side of a step of the table, or of an edge; measured 0
+RAY_TWIN_WORST_255 = 8  # such a pixel gains or loses one faint sample; measured 1
+RAY_TWIN_HU = 0.5  # extremes snap to 1/4096 of a voxel, steps of 2500 HU between neighbours: measured 0.34
 RAY_TWIN_DEPTH_MM = 0.01  # depths of some 200 mm in float32, and sums of 100 of them
 RAY_TWIN_DEPTH_SHARE = 0.02  # of pixels: the first hit may be a sample on
 
