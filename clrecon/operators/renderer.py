@@ -38,14 +38,13 @@ DEFAULT_ISO_VALUE = 200.0
 SMALLEST_STEP = 0.01
 """Ray steps below this share of the smallest spacing add time and nothing else."""
 
-_SHADED = ("dvr", "surface")
 _LABELLED = ("dvr", "surface")
 _CUT = ("slice", "cpr")
 _RAYS = ("dvr", "mip", "minip", "mean", "surface", "slices")
 
 KNOWN_IN: dict[str, tuple[str, ...]] = {
-    "transfer_function": ("dvr", "slices"),
-    "lighting": _SHADED,
+    "transfer_function": ("dvr", *PROJECTIONS, "slices"),  # part of the look that all pictures of a series share
+    "lighting": _RAYS,
     "window": (*PROJECTIONS, "slices", *_CUT),
     "ray_step": ("dvr", *PROJECTIONS, "surface"),
     "view_angle": _RAYS,
