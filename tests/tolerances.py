@@ -119,6 +119,7 @@ RAY_DEPTH_VOXEL = 0.1  # the bar; measured 0.053 on balls, where the field betwe
 RAY_DISC_AREA = 0.005  # pixels of a disc of 20 on a grid: measured 0.001
 RAY_RESAMPLED_255 = 4  # two samplings of one smooth field, 1.9 mm at most: measured 3
 RAY_SAME_255 = 1  # rounding to 8 bits the other way
+LABEL_COLOR_255 = 6  # straight colours are premultiplied ones of 8 bits over opacities of some tens; measured 3
 RAY_OUTLINE_SHARE = 0.02  # of pixels: at outlines triangles and the trilinear field between voxels are hit or missed
 RAY_TWIN_SHARE = 0.002  # of pixels: float32 takes the other side of a step of the table, or of an edge; measured 0
 RAY_TWIN_WORST_255 = 8  # such a pixel gains or loses one faint sample; measured 1
