@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, BinaryIO
 
 from clrecon.errors import UsageError
 from clrecon.pipeline.outputs import check_distinct
+from clrecon.pipeline.render_modes import find_misplaced
 from clrecon.pipeline.render_settings import RenderSettings
 
 if TYPE_CHECKING:
@@ -98,6 +99,10 @@ def check_pictures(files: PictureFiles, settings: RenderSettings) -> None:
     from clrecon.rendering.pillow import load_pillow
 
     load_pillow()
+    given = {name for name in ("depth", "values") if getattr(files, name) is not None}
+    misplaced = find_misplaced(settings.mode_used, given)
+    if misplaced:
+        raise UsageError(misplaced)
     if settings.background == "transparent":
         for path in (files.picture, files.turntable):
             if path is not None and f".{format_of(path)}" in OPAQUE_ONLY:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -70,7 +71,7 @@ def make_pictures(
     curve = read_curve(settings.curve)
 
     progress("device", 0, 0)
-    with DeviceOpening(settings.device, _prepare(settings)) as opening:
+    with DeviceOpening(settings.device, partial(_prepare, settings=settings)) as opening:
         labels = read_look(settings.labels)
         volume = _read(source, settings, progress)
         watch.lap("read")
@@ -84,9 +85,7 @@ def make_pictures(
         notes.append(note)
         watch.lap("curve")
 
-    studio = Studio(
-        volume, device, settings, function=function, curve=curve, labels=labels, progress=progress
-    )  # fmt: skip
+    studio = Studio(volume, device, settings, function=function, curve=curve, labels=labels, progress=progress)
     with studio, ExitStack() as staged:  # all files are on the disk before any replaces an older one
         pictures, written = _take_views(studio, settings, files, staged, watch, progress)
         turntable = _turn(studio, volume, settings, files, watch, progress)
@@ -99,13 +98,21 @@ def make_pictures(
     return report
 
 
-def _prepare(settings: RenderSettings) -> Any:
-    """What builds the kernels while the volume is read."""
+def _prepare(device: Device, settings: RenderSettings) -> None:
+    """Build the kernels for int16, by a small picture of nothing."""
+    import numpy as np
 
-    def prepare(device: Device) -> None:
-        return None
+    from clrecon.geometry import Volume
 
-    return prepare
+    nothing = Volume(np.zeros((2, 2, 2), np.int16), np.eye(4))
+    if settings.mode_used == "cpr":
+        from clrecon.operators.reformat import cut_slice  # the same kernel
+
+        cut_slice(nothing, "axial", (8, 8), device)
+        return
+    plain = RenderSettings(settings.mode_used, size=(8, 8), iso_value=0.0 if settings.mode_used == "surface" else None)
+    with Studio(nothing, device, plain, progress=ignore_progress) as studio:
+        studio.take_view(plain.views_used[0])
 
 
 def _read(source: str | Path, settings: RenderSettings, progress: Progress) -> Volume:

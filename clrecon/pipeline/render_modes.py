@@ -34,7 +34,7 @@ class _Place(NamedTuple):
 
 _PLACES = (
     _Place("preset", "--preset", ("dvr", "mip", "minip", "mean")),
-    _Place("transfer_function", "--transfer-function", ("dvr", "mip", "minip", "mean")),
+    _Place("transfer_function", "--transfer-function", ("dvr",)),
     _Place("iso_value", "--iso", ("surface",)),
     _Place("shadows", "--shadows", ("surface",)),
     _Place("light", "--light", ("dvr", "surface")),
@@ -45,8 +45,8 @@ _PLACES = (
     _Place("zoom", "--zoom", (*_RAYS, "slice")),
     _Place("clip", "--clip and --clip-box", _RAYS),
     _Place("letters", "--letters", (*_RAYS, "slice")),
-    _Place("depth_path", "--depth", (*_RAYS, "slice")),
-    _Place("values_path", "--values", _GREY),
+    _Place("depth", "--depth", ("dvr", "mip", "minip", "surface", "slice")),
+    _Place("values", "--values", _GREY),
     _Place("turntable", "--turntable", _RAYS),
     _Place("thickness", "--thickness", _CUT),
     _Place("combine", "--combine", _CUT),
@@ -65,7 +65,7 @@ def find_misplaced(mode: str, given: set[str]) -> str | None:
     mode : str
         One of `MODES`.
     given : set of str
-        Names of settings that differ from what they are without being asked for.
+        Names of settings that differ from what they are without being asked for, and of files of `PictureFiles`.
     """
     for setting, option, modes in _PLACES:
         if setting in given and mode not in modes:

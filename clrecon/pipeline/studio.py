@@ -114,9 +114,9 @@ class Studio:
         device: Device,
         settings: RenderSettings,
         *,
-        function: TransferFunction | None,
-        curve: Float64Array | None,
-        labels: LabelMap | None,
+        function: TransferFunction | None = None,
+        curve: Float64Array | None = None,
+        labels: LabelMap | None = None,
         progress: Progress,
     ):
         self._volume, self._device, self._settings = volume, device, settings
@@ -159,7 +159,7 @@ class Studio:
         return replace(light if light.shades else Lighting(), direction=settings.light_direction())
 
     def take_view(self, view: str) -> Rendering:
-        """The picture of one of the views, with its background, and with what is drawn into it."""
+        """The picture of one of the views, with what is drawn into it."""
         settings = self._settings
         if settings.mode_used == "cpr":
             return self._finish(self._reformat(view))
@@ -171,9 +171,11 @@ class Studio:
 
     def _finish(self, picture: Rendering) -> Rendering:
         settings = self._settings
-        if settings.background != "transparent":
-            picture = picture.with_background(settings.background)
         return picture.annotated(letters=settings.letters, scale_bar=settings.scale_bar, caption=settings.caption)
+
+    def _before_background(self, picture: Rendering) -> Rendering:
+        background = self._settings.background
+        return picture if background == "transparent" else picture.with_background(background)
 
     def _cast(self, camera: Camera) -> Rendering:
         from clrecon.operators.renderer import VolumeRenderer
@@ -183,38 +185,42 @@ class Studio:
             self._renderer = self._stack.enter_context(
                 VolumeRenderer(self._volume, self._device, memory=settings.memory)
             )
-        options: dict[str, Any] = {}
-        if settings.mode_used == "dvr" or self._settings.transfer_function is not None:
-            options["transfer_function"] = self.function
-        if settings.mode_used == "surface":
-            options.update(iso_value=settings.iso_value, shadows=settings.shadows)
-        if self.labels is not None and settings.labels is not None:
-            options.update(
-                labels=self.labels,
-                label_colors=dict(settings.labels.colors),
-                label_opacity=dict(settings.labels.opacities),
-            )
         picture: Rendering = self._renderer.render(
             settings.mode_used,
             camera=camera,
             size=settings.size_used,
             ray_step=settings.ray_step,
+            transfer_function=self.function,
             lighting=self.lighting,
             window=self.window,
             clip=settings.clip,
-            background="transparent",
+            background=settings.background,
             jitter=settings.jitter,
-            **options,
+            **self._more(),
         )
         return picture
+
+    def _more(self) -> dict[str, Any]:
+        """Options that only some pictures have."""
+        settings = self._settings
+        more: dict[str, Any] = {}
+        if settings.mode_used == "surface":
+            more.update(iso_value=settings.iso_value, shadows=settings.shadows)
+        if self.labels is not None and settings.labels is not None:
+            look = settings.labels
+            plain = not (look.colors or look.opacities)  # then every label has a colour of its own
+            more.update(labels=self.labels, label_colors=None if plain else dict(look.colors))
+            more.update(label_opacity=dict(look.opacities))
+        return more
 
     def _cut(self, camera: Camera) -> Rendering:
         from clrecon.operators.reformat import cut_slice
 
         settings = self._settings
-        return cut_slice(
+        picture = cut_slice(
             self._volume, camera, settings.size_used, self._device, offset_mm=settings.offset_mm, **self._slab()
         )
+        return self._before_background(picture)
 
     def _reformat(self, view: str) -> Rendering:
         from clrecon.operators.reformat import reformat_curve
@@ -222,9 +228,10 @@ class Studio:
         settings = self._settings
         assert self._curve is not None
         kind = settings.cpr or "straightened"
-        return reformat_curve(
+        picture = reformat_curve(
             self._volume, self._curve, kind, settings.size, self._device, view=view, up=settings.up, **self._slab()
         )
+        return self._before_background(picture)
 
     def _slab(self) -> dict[str, Any]:
         settings = self._settings
