@@ -16,7 +16,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of the command."""
     parser.epilog = (
         "Writes a made-up CT series of a spine to OUT/ct, a picture of it to OUT/bone.png, its bone surface to\n"
-        "OUT/bone.stl and the report to OUT/report.json, and holds a sphere of known size against its mesh. A second run replaces the first."
+        "OUT/bone.stl and the report to OUT/report.json, and holds a sphere of known size against its mesh.\n"
+        "A second run replaces the first."
     )
     parser.add_argument("output", metavar="OUT", nargs="?", help="folder (default: clrecon-demo)")
     add_device(parser)

@@ -57,7 +57,6 @@ def describe_picture(picture: Rendering, name: str, view: str) -> dict[str, Any]
         "plane": made.get("plane"),
         "curve": made.get("curve"),
         "slabs": made.get("slabs", 1),
-        "device_bytes": made.get("device_bytes"),
         "seconds": made.get("seconds"),
     }
 

@@ -168,14 +168,6 @@ class RenderSettings:
         misplaced = find_misplaced(self.mode_used, self._given())
         if misplaced:
             raise UsageError(misplaced)
-        if self.preset is not None:
-            from clrecon.rendering.presets import find_preset
-
-            made_for = find_preset(self.preset).mode
-            if self.mode_used not in ("dvr", made_for):
-                raise UsageError(
-                    f"preset {self.preset} is made for mode {made_for}, not {self.mode_used}: leave one out"
-                )
         self._check_place()
         self._check_mode()
         check_memory(self.memory)

@@ -130,7 +130,7 @@ class Studio:
             preset = find_preset(settings.preset_used)
         self.function = preset.transfer_function if function is None and preset is not None else function
         self.window: Sequence[float] | None = settings.window
-        if self.window is None and preset is not None and preset.mode == settings.mode_used:
+        if self.window is None and preset is not None:
             self.window = preset.window
 
     def __enter__(self) -> Studio:
