@@ -23,7 +23,7 @@ from clrecon.pipeline.render_modes import MODES
 
 __all__ = ["add_arguments", "run"]
 
-_PARTS = ("read", "mask", "curve", "render", "turntable", "write")
+_PARTS = ("read", "mask", "render", "turntable", "write")
 _EXAMPLES = """\
 examples:
   clrecon render CT_FOLDER -o bone.png

@@ -14,10 +14,10 @@ from clrecon.pipeline.opening import DeviceOpening
 from clrecon.pipeline.outputs import commit_all
 from clrecon.pipeline.pictures import PictureFiles, check_pictures, format_of, name_view, stage_picture
 from clrecon.pipeline.progress import Progress, Stopwatch, ignore_progress
-from clrecon.pipeline.render_report import describe_picture, describe_pictures
-from clrecon.pipeline.render_settings import SPINE, RenderSettings
+from clrecon.pipeline.render_report import describe_picture, describe_pictures, warn_of_picture
+from clrecon.pipeline.render_settings import RenderSettings
 from clrecon.pipeline.report import peak_memory_bytes, stage_report
-from clrecon.pipeline.studio import Studio, find_curve, read_curve, read_function, read_look
+from clrecon.pipeline.studio import Studio, read_curve, read_function, read_look
 
 if TYPE_CHECKING:
     from clrecon.files import StagedFile
@@ -79,17 +79,12 @@ def make_pictures(
         watch.lap("device")
     volume = mask_volume(volume, settings, progress)
     watch.lap("mask")
-    notes: list[str] = []
-    if settings.curve == SPINE:
-        curve, note = find_curve(volume, progress)
-        notes.append(note)
-        watch.lap("curve")
 
     studio = Studio(volume, device, settings, function=function, curve=curve, labels=labels, progress=progress)
     with studio, ExitStack() as staged:  # all files are on the disk before any replaces an older one
         pictures, written = _take_views(studio, settings, files, staged, watch, progress)
         turntable = _turn(studio, volume, settings, files, watch, progress)
-        report = describe_pictures(volume, settings, studio, device, pictures, turntable, notes)
+        report = describe_pictures(volume, settings, studio, device, pictures, turntable)
         report["seconds"] = _seconds(watch)
         report["peak_memory_bytes"] = peak_memory_bytes()
         if files.report is not None:
@@ -150,6 +145,7 @@ def _take_views(
         own = stage_picture(staged, picture, files, name)
         outputs = {what: {"format": format_of(path), "bytes": file.size} for what, (path, file) in own.items()}
         pictures.append(describe_picture(picture, name, view) | outputs)
+        studio.warnings += warn_of_picture(picture)
         written += [file for _, file in own.values()]
         watch.lap("write")
     return pictures, written
@@ -188,7 +184,7 @@ def _turn(
 
 
 def _seconds(watch: Stopwatch) -> dict[str, float]:
-    parts = ("device", "read", "mask", "curve", "render", "turntable", "write")
+    parts = ("device", "read", "mask", "render", "turntable", "write")
     seconds = {part: watch.seconds.get(part, 0.0) for part in parts}
     seconds["other"] = max(0.0, watch.total() - sum(seconds.values()))
     seconds["total"] = watch.total()

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from clrecon.pipeline.studio import Studio
     from clrecon.rendering import Rendering, TransferFunction
 
-__all__ = ["describe_camera", "describe_picture", "describe_pictures"]
+__all__ = ["describe_camera", "describe_picture", "describe_pictures", "warn_of_picture"]
 
 FACE_WARNING = "a picture of the skin can show a face: treat the file as one that identifies the patient"
 
@@ -61,6 +61,16 @@ def describe_picture(picture: Rendering, name: str, view: str) -> dict[str, Any]
     }
 
 
+def warn_of_picture(picture: Rendering) -> list[str]:
+    """What is to be known of a picture before it is used."""
+    made = picture.report
+    warnings = [str(text) for text in made.get("warnings", [])]
+    found = (made.get("curve") or {}).get("found")
+    if found is not None:
+        warnings.append("the centre line is the spinal canal as it was found: look whether it is the canal")
+    return warnings
+
+
 def describe_pictures(
     volume: Volume,
     settings: RenderSettings,
@@ -68,7 +78,6 @@ def describe_pictures(
     device: Device,
     pictures: Sequence[dict[str, Any]],
     turntable: dict[str, Any] | None,
-    notes: Sequence[str] = (),
 ) -> dict[str, Any]:
     """Compose the report of a job, all but times and memory.
 
@@ -77,16 +86,14 @@ def describe_pictures(
     volume : Volume
     settings : RenderSettings
     studio : Studio
-        With the transfer function and the light that were used.
+        With the transfer function and the light that were used, and the warnings of its pictures.
     device : Device
     pictures : sequence of dict
         What `describe_picture` says of each, and its files.
     turntable : dict, optional
-    notes : sequence of str
-        Warnings of the job itself.
     """
     certificate = dict(volume.report)
-    warnings = [str(text) for text in certificate.pop("warnings", [])] + list(notes)
+    warnings = [str(text) for text in certificate.pop("warnings", [])] + studio.warnings
     if _shows_skin(settings, studio.function):
         warnings.append(FACE_WARNING)
     lighting = studio.lighting

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from clrecon.opencl import Device
     from clrecon.rendering import Lighting, Rendering, TransferFunction
 
-__all__ = ["Studio", "find_curve", "read_curve", "read_function", "read_look"]
+__all__ = ["Studio", "read_curve", "read_function", "read_look"]
 
 
 def read_function(named: str | None) -> TransferFunction | None:
@@ -56,24 +56,6 @@ def read_curve(named: str | None) -> Float64Array | None:
     return read_curve_points(named)
 
 
-def find_curve(volume: Volume, progress: Progress) -> tuple[Float64Array, str]:
-    """Find the spinal canal; returns points (n, 3) in LPS mm and what is to be known of them.
-
-    Raises
-    ------
-    UsageError
-        As `clrecon.geometry.spine_line.find_spine_line`.
-    """
-    from clrecon.geometry.spine_line import find_spine_line
-
-    progress("curve", 0, 0)
-    line = find_spine_line(volume)
-    return line.points, (
-        f"the centre line is the spinal canal as it was found over {line.height_mm:.0f} of {line.searched_mm:.0f} mm,"
-        f" {100.0 * line.sure_share:.0f} % of its slices sure: look whether it is the canal"
-    )
-
-
 def read_look(look: LabelLook | None) -> LabelMap | None:
     """Read the label map, None where there is none.
 
@@ -103,7 +85,7 @@ class Studio:
     function : TransferFunction, optional
         From a file; None leaves it to the preset.
     curve : ndarray, shape (n, 3), optional
-        LPS mm; of curved reformations.
+        LPS mm; of curved reformations, None is the spinal canal.
     labels : LabelMap, optional
     progress : callable
     """
@@ -121,6 +103,7 @@ class Studio:
     ):
         self._volume, self._device, self._settings = volume, device, settings
         self._curve, self.labels, self._progress = curve, labels, progress
+        self.warnings: list[str] = []
         self._stack = ExitStack()
         self._renderer: Any = None
         preset = None
@@ -173,10 +156,6 @@ class Studio:
         settings = self._settings
         return picture.annotated(letters=settings.letters, scale_bar=settings.scale_bar, caption=settings.caption)
 
-    def _before_background(self, picture: Rendering) -> Rendering:
-        background = self._settings.background
-        return picture if background == "transparent" else picture.with_background(background)
-
     def _cast(self, camera: Camera) -> Rendering:
         from clrecon.operators.renderer import VolumeRenderer
 
@@ -217,21 +196,21 @@ class Studio:
         from clrecon.operators.reformat import cut_slice
 
         settings = self._settings
-        picture = cut_slice(
+        return cut_slice(
             self._volume, camera, settings.size_used, self._device, offset_mm=settings.offset_mm, **self._slab()
         )
-        return self._before_background(picture)
 
     def _reformat(self, view: str) -> Rendering:
         from clrecon.operators.reformat import reformat_curve
 
         settings = self._settings
-        assert self._curve is not None
         kind = settings.cpr or "straightened"
-        picture = reformat_curve(
-            self._volume, self._curve, kind, settings.size, self._device, view=view, up=settings.up, **self._slab()
+        curve = "spine" if self._curve is None else self._curve
+        if self._curve is None:
+            self._progress("curve", 0, 0)
+        return reformat_curve(
+            self._volume, curve, kind, settings.size, self._device, view=view, up=settings.up, **self._slab()
         )
-        return self._before_background(picture)
 
     def _slab(self) -> dict[str, Any]:
         settings = self._settings
@@ -239,6 +218,7 @@ class Studio:
             "thickness": settings.thickness,
             "combine": settings.combine or "mean",
             "window": self.window,
+            "background": settings.background,
             "memory": settings.memory,
             "progress": self._progress,
         }
