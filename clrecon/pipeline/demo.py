@@ -91,9 +91,7 @@ def make_demo(
 
 
 def _look(device: str) -> RenderSettings:
-    return RenderSettings(
-        preset="bone", views=["25,10"], zoom=1.6, ray_step=0.25, letters=True, scale_bar=True, device=device
-    )
+    return RenderSettings(preset="bone", views=["25,10"], ray_step=0.25, letters=True, scale_bar=True, device=device)
 
 
 def check_sphere(device: Device) -> dict[str, Any]:

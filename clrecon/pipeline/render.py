@@ -165,7 +165,8 @@ def _turn(
         return None
     from clrecon.rendering.motion import turntable_cameras, write_animation
 
-    cameras = turntable_cameras(settings.camera(volume, settings.views_used[0]), turn.frames, turn.degrees)
+    first = settings.camera(volume, settings.views_used[0], turning=True)
+    cameras = turntable_cameras(first, turn.frames, turn.degrees)
 
     def frames() -> Iterator[Rendering]:
         for camera in cameras:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from clrecon.errors import UsageError
 from clrecon.pipeline.checks import check_field_of_view, check_memory
@@ -315,8 +315,8 @@ class RenderSettings:
             raise UsageError(f"unknown light {self.light!r}: use one of {known}, or a direction X,Y,Z in LPS")
         return DIRECTIONS[self.light]
 
-    def camera(self, volume: Grid, view: str) -> Camera:
-        """The camera of one of the views.
+    def camera(self, volume: Grid, view: str, turning: bool = False) -> Camera:
+        """The camera of one of the views; with `turning` the volume stays whole when the camera orbits.
 
         Raises
         ------
@@ -325,12 +325,13 @@ class RenderSettings:
         """
         from clrecon.geometry.camera import Camera
 
-        options: dict[str, Any] = {"up": self.up, "size": self.size_used}
         if self.mode_used == "slice":
             from clrecon.geometry.sheets import find_plane
 
-            return find_plane(volume, view, options.pop("size"), zoom=self.zoom, up=self.up)  # type: ignore[arg-type]
-        return Camera.fit(volume, view, self.zoom, view_angle=self.view_angle, **options)
+            return find_plane(volume, view, self.size_used, zoom=self.zoom, up=self.up)  # type: ignore[arg-type]
+        return Camera.fit(
+            volume, view, self.zoom, up=self.up, view_angle=self.view_angle, size=self.size_used, turning=turning
+        )
 
 
 def describe_presets() -> dict[str, str]:
