@@ -13,6 +13,7 @@ from clrecon.cli.render_values import (
     parse_label_opacity,
     parse_light,
     parse_picture_size,
+    parse_slices,
     parse_views,
     parse_window,
 )
@@ -38,7 +39,8 @@ _FRAMES, _FPS, _DEGREES, _ANGLE = 100, 25.0, 360.0, 30.0
 
 _SETTINGS = (
     "mode", "preset", "transfer_function", "window", "up", "zoom", "size", "ray_step", "light", "shadows", "jitter",
-    "clip_box", "background", "letters", "scale_bar", "caption", "thickness", "combine", "curve", "cpr",
+    "clip_box", "background", "color", "slices", "slice_opacity", "letters", "scale_bar", "caption", "thickness",
+    "combine", "curve", "cpr",
 )  # fmt: skip
 """Options that are settings of the same name."""
 
@@ -56,6 +58,7 @@ def add_looks(parser: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--iso", dest="iso_value", type=float, metavar="HU", help="iso value of mode surface: inside is HU and above"
     )
+    group.add_argument("--color", metavar="C", help="colour of a surface, such as orange or #ff8000 (default: bone)")
     group.add_argument(
         "--window", type=parse_window, metavar="LOW,HIGH", help="HU that are black and white, of modes that show HU"
     )
@@ -130,13 +133,20 @@ def add_region(parser: argparse.ArgumentParser) -> None:
 
 
 def add_curve(parser: argparse.ArgumentParser) -> None:
-    """Add the options of slices and curved reformations."""
+    """Add the options of slices, in space and alone, and of curved reformations."""
     group = parser.add_argument_group("slices and curved reformations")
     group.add_argument("--thickness", type=float, default=0.0, metavar="MM", help="of the slab (default: 0, a plane)")
     group.add_argument("--combine", metavar="HOW", help="mean, max or min of a slab (default: mean)")
     group.add_argument(
         "--offset", type=float, default=0.0, metavar="MM", help="move the slice away from the camera by so much"
     )
+    group.add_argument(
+        "--slices",
+        type=parse_slices,
+        metavar="N|K,K,...",
+        help="of mode slices: every N-th, or with a comma those numbers, from 0 (default: about twelve)",
+    )
+    group.add_argument("--slice-opacity", type=float, metavar="SHARE", help="of each of them (default: 0.5)")
     group.add_argument(
         "--curve",
         metavar="FILE|auto",

@@ -13,6 +13,7 @@ __all__ = [
     "parse_label_opacity",
     "parse_light",
     "parse_picture_size",
+    "parse_slices",
     "parse_views",
     "parse_window",
 ]
@@ -81,6 +82,17 @@ def parse_clip_box(text: str) -> tuple[float, ...]:
 def parse_clip_plane(text: str) -> tuple[float, ...]:
     """Read ``PX,PY,PZ,NX,NY,NZ``: a point in LPS mm and a normal."""
     return _numbers(text, 6, "a plane: a point in LPS mm and the direction of the side that stays, PX,PY,PZ,NX,NY,NZ")
+
+
+def parse_slices(text: str) -> int | tuple[int, ...]:
+    """Read ``N``, every N-th slice, or ``K,K,...``: those numbers; a comma at the end makes a single number one."""
+    try:
+        numbers = tuple(int(part) for part in text.split(",") if part.strip())
+    except ValueError:
+        numbers = ()
+    if not numbers:
+        raise argparse.ArgumentTypeError(f"{text!r} is no number N (every N-th slice) and no list of slices K,K,...")
+    return numbers if "," in text else numbers[0]
 
 
 def parse_label_color(text: str) -> tuple[str, str]:

@@ -12,6 +12,7 @@ MODES = {
     "minip": "the lowest HU along each ray",
     "mean": "the mean HU along each ray, as a radiograph",
     "surface": "the shaded surface at an iso value",
+    "slices": "slices of the scan in space, translucent, each where it lies",
     "slice": "a plane through the volume in any direction, as thick as wanted",
     "cpr": "curved planar reformation along a centre line",
 }
@@ -19,8 +20,9 @@ MODES = {
 
 VIEWS = ("anterior", "posterior", "left", "right", "superior", "inferior")
 
-_RAYS = ("dvr", "mip", "minip", "mean", "surface")
-_GREY = ("mip", "minip", "mean", "slice", "cpr")
+_SAMPLED = ("dvr", "mip", "minip", "mean", "surface")
+_RAYS = (*_SAMPLED, "slices")
+_VALUES = ("mip", "minip", "mean", "slice", "cpr")
 _CUT = ("slice", "cpr")
 
 
@@ -33,27 +35,30 @@ class _Place(NamedTuple):
 
 
 _PLACES = (
-    _Place("preset", "--preset", ("dvr", "mip", "minip", "mean")),
-    _Place("transfer_function", "--transfer-function", ("dvr",)),
+    _Place("preset", "--preset", ("dvr", "mip", "minip", "mean", "slices")),
+    _Place("transfer_function", "--transfer-function", ("dvr", "slices")),
     _Place("iso_value", "--iso", ("surface",)),
+    _Place("color", "--color", ("surface",)),
     _Place("shadows", "--shadows", ("surface",)),
     _Place("light", "--light", ("dvr", "surface")),
     _Place("jitter", "--jitter", ("dvr",)),
-    _Place("ray_step", "--ray-step", ("dvr", "mip", "minip", "mean", "surface")),
-    _Place("window", "--window", _GREY),
+    _Place("ray_step", "--ray-step", _SAMPLED),
+    _Place("window", "--window", (*_VALUES, "slices")),
+    _Place("slices", "--slices", ("slices",)),
+    _Place("slice_opacity", "--slice-opacity", ("slices",)),
     _Place("view_angle", "--perspective", _RAYS),
     _Place("zoom", "--zoom", (*_RAYS, "slice")),
     _Place("clip", "--clip and --clip-box", _RAYS),
     _Place("letters", "--letters", (*_RAYS, "slice")),
-    _Place("depth", "--depth", ("dvr", "mip", "minip", "surface", "slice")),
-    _Place("values", "--values", _GREY),
+    _Place("depth", "--depth", ("dvr", "mip", "minip", "surface", "slices", "slice")),
+    _Place("values", "--values", _VALUES),
     _Place("turntable", "--turntable", _RAYS),
     _Place("thickness", "--thickness", _CUT),
     _Place("combine", "--combine", _CUT),
     _Place("offset_mm", "--offset", ("slice",)),
     _Place("curve", "--curve", ("cpr",)),
     _Place("cpr", "--cpr", ("cpr",)),
-    _Place("labels", "--labels", ("dvr",)),
+    _Place("labels", "--labels", ("surface",)),
 )
 
 

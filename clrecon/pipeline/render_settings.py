@@ -89,6 +89,8 @@ class RenderSettings:
         ``FILE`` or ``FILE:NAME``, see `clrecon.rendering.transfer_files.load_transfer_function`.
     iso_value : float, optional
         Of a surface, HU.
+    color : str, optional
+        Of a surface; default that of bone.
     window : (float, float), optional
         HU that are black and white, of modes that show HU.
     views : sequence of str
@@ -111,6 +113,8 @@ class RenderSettings:
         Drawn into the pictures.
     thickness, combine, offset_mm
         Of slices, see `clrecon.operators.reformat.cut_slice`.
+    slices, slice_opacity
+        Of slices in space, see `clrecon.operators.slice_overlay.overlay_slices`.
     curve : str, optional
         File with the centre line, or "auto": the spinal canal.
     cpr : {"straightened", "stretched"}
@@ -129,6 +133,7 @@ class RenderSettings:
     preset: str | None = None
     transfer_function: str | None = None
     iso_value: float | None = None
+    color: str | None = None
     window: Sequence[float] | None = None
     views: Sequence[str] = ()
     up: str | Sequence[float] | None = None
@@ -148,6 +153,8 @@ class RenderSettings:
     thickness: float = 0.0
     combine: str | None = None
     offset_mm: float = 0.0
+    slices: int | Sequence[int] | None = None
+    slice_opacity: float | None = None
     curve: str | None = None
     cpr: str | None = None
     labels: LabelLook | None = None
@@ -189,6 +196,8 @@ class RenderSettings:
                 raise UsageError("give either a preset or a file with a transfer function, not both")
         if self.background != "transparent":
             find_color(self.background)
+        if self.color is not None:
+            find_color(self.color)
         if self.window is not None:
             checked_window(self.window)
         if isinstance(self.light, str) and self.light not in LIGHTS:
@@ -231,6 +240,10 @@ class RenderSettings:
         if self.mode_used == "surface":
             if self.iso_value is None or not math.isfinite(self.iso_value):
                 raise UsageError(f"a surface needs its iso value in HU (--iso N), {self.iso_value} is none")
+        if self.slice_opacity is not None and not 0.0 < self.slice_opacity <= 1.0:
+            raise UsageError(f"the opacity of a slice lies above 0 and up to 1, not at {self.slice_opacity:g}")
+        if self.shadows and self.light_direction() is None:
+            raise UsageError("shadows need a light beside the camera: --light with a side of the patient, or X,Y,Z")
         if not 0.0 <= self.thickness < math.inf:
             raise UsageError(f"the thickness of a slice is a length in mm, not {self.thickness:g}")
         if not math.isfinite(self.offset_mm):

@@ -164,27 +164,35 @@ class Studio:
             self._renderer = self._stack.enter_context(
                 VolumeRenderer(self._volume, self._device, memory=settings.memory)
             )
-        picture: Rendering = self._renderer.render(
-            settings.mode_used,
-            camera=camera,
-            size=settings.size_used,
-            ray_step=settings.ray_step,
-            transfer_function=self.function,
-            lighting=self.lighting,
-            window=self.window,
-            clip=settings.clip,
-            background=settings.background,
-            jitter=settings.jitter,
-            **self._more(),
-        )
+        options: dict[str, Any] = {
+            "camera": camera,
+            "size": settings.size_used,
+            "ray_step": settings.ray_step,
+            "lighting": self.lighting,
+            "window": self.window,
+            "clip": settings.clip,
+            "background": settings.background,
+            "jitter": settings.jitter,
+        }
+        picture: Rendering = self._renderer.render(settings.mode_used, **options, **self._more())
         return picture
 
     def _more(self) -> dict[str, Any]:
         """Options that only some pictures have."""
         settings = self._settings
         more: dict[str, Any] = {}
-        if settings.mode_used == "surface":
+        if settings.mode_used == "dvr":
+            more["transfer_function"] = self.function
+        elif settings.mode_used == "surface":
             more.update(iso_value=settings.iso_value, shadows=settings.shadows)
+            if settings.color is not None:
+                more["color"] = settings.color
+        elif settings.mode_used == "slices":
+            more["slices"] = settings.slices
+            if settings.slice_opacity is not None:
+                more["slice_opacity"] = settings.slice_opacity
+            if settings.window is None:
+                more["transfer_function"] = self.function
         if self.labels is not None and settings.labels is not None:
             look = settings.labels
             plain = not (look.colors or look.opacities)  # then every label has a colour of its own

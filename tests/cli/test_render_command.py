@@ -250,6 +250,14 @@ def test_a_transfer_function_from_a_file(render: Renders) -> None:
     assert image[..., 1].max() > 240 and image[..., [0, 2]].max() == 0
 
 
+def test_slices_in_space(render: Renders) -> None:
+    image, report = render("--mode", "slices", "--slices", "13,", "--slice-opacity", 1.0, "--view", "superior")
+    assert report["pictures"][0]["slices"] == [13]
+    assert side_of(lit(image)) == SEEN["superior"]
+    assert render("--mode", "slices", "--slices", "4")[1]["pictures"][0]["slices"] == [0, 4, 8, 12, 16]
+    assert not lit(render("--mode", "slices", "--slices", "1,2", "--view", "superior")[0]).any()
+
+
 def test_labels_have_colours(render: Renders) -> None:
     pytest.importorskip("nibabel")
     voxels = np.zeros(SHAPE_KJI, np.uint8)
@@ -257,12 +265,15 @@ def test_labels_have_colours(render: Renders) -> None:
     affine = np.diag([*SPACING, 1.0])
     affine[:3, 3] = ORIGIN
     path = write_nifti(render.folder / "labels.nii.gz", voxels, affine)
-    image, report = render("--labels", path, "--label-color", "20=blue", "--light", "none")
+    surface = ("--iso", ISO, "--light", "none", "--labels", path)
+    image, report = render(*surface, "--label-color", "20=blue")
     assert report["labels"] == [{"label_number": 20, "label": report["labels"][0]["label"], "color": "blue",
                                  "opacity": None}]  # fmt: skip
     assert image[lit(image)][:, 2].mean() > 2.0 * image[lit(image)][:, 0].mean()
-    gone = render("--labels", path, "--label-opacity", "20=0")[0]
-    assert lit(gone).sum() < 0.5 * lit(image).sum()
+    plain = render(*surface[:4], "--color", "red")[0]
+    assert plain[..., :3][lit(plain)].mean(axis=0) == pytest.approx([255, 0, 0], abs=5)
+    faint = render(*surface, "--label-color", "20=blue", "--label-opacity", "20=0.3")[0]
+    assert faint[lit(image)][:, 2].mean() < 0.8 * image[lit(image)][:, 2].mean()
 
 
 def test_what_is_drawn(render: Renders) -> None:
@@ -351,6 +362,10 @@ WRONG = {
     "colour": (["--background", "octarine"], 3, "octarine"),
     "light": (["--light", "sun"], 3, "head, none, anterior"),
     "surface without a value": (["--mode", "surface"], 3, "--iso"),
+    "shadows of the camera": (["--iso", "100", "--shadows"], 3, "--light"),
+    "slices": (["--mode", "slices", "--slices", "a,b"], 3, "every N-th"),
+    "slice not there": (["--mode", "slices", "--slices", "17,"], 3, "slices 0 to 16"),
+    "slice opacity": (["--mode", "slices", "--slice-opacity", "0"], 3, "opacity of a slice"),
     "shadows elsewhere": (["--shadows"], 3, "--shadows means nothing in mode dvr"),
     "curve missing": (["--mode", "cpr"], 3, "--curve"),
     "curve file": (["--curve", "nowhere.csv"], 4, "nowhere.csv"),
