@@ -39,8 +39,8 @@ _FRAMES, _FPS, _DEGREES, _ANGLE = 100, 25.0, 360.0, 30.0
 
 _SETTINGS = (
     "mode", "preset", "transfer_function", "window", "up", "zoom", "size", "ray_step", "light", "shadows", "jitter",
-    "clip_box", "background", "color", "slices", "slice_opacity", "letters", "scale_bar", "caption", "thickness",
-    "combine", "curve", "cpr",
+    "clip_box", "background", "color", "depth_cue", "slices", "slice_opacity", "letters", "scale_bar", "caption",
+    "thickness", "combine", "curve", "cpr",
 )  # fmt: skip
 """Options that are settings of the same name."""
 
@@ -56,7 +56,11 @@ def add_looks(parser: argparse.ArgumentParser) -> None:
         help="colours and opacities by HU from a file of clrecon, 3D Slicer or ParaView, see docs/rendering.md",
     )
     group.add_argument(
-        "--iso", dest="iso_value", type=float, metavar="HU", help="iso value of mode surface: inside is HU and above"
+        "--iso",
+        dest="iso_value",
+        type=float,
+        metavar="HU",
+        help="iso value of mode surface, inside is HU and above (default: 200)",
     )
     group.add_argument("--color", metavar="C", help="colour of a surface, such as orange or #ff8000 (default: bone)")
     group.add_argument(
@@ -71,6 +75,9 @@ def add_looks(parser: argparse.ArgumentParser) -> None:
         metavar="L",
         help="head: a light at the camera; a side of the patient, or X,Y,Z in LPS: a light that stays where it is;"
         " none: colours as they are (default: what the preset says)",
+    )
+    group.add_argument(
+        "--depth-cue", type=float, metavar="SHARE", help="of its brightness, which a surface loses with the distance"
     )
     group.add_argument("--shadows", action="store_true", help="shadows on a surface; wants a light beside the camera")
     group.add_argument(

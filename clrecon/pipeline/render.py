@@ -100,14 +100,10 @@ def _prepare(device: Device, settings: RenderSettings) -> None:
     from clrecon.geometry import Volume
 
     nothing = Volume(np.zeros((2, 2, 2), np.int16), np.eye(4))
-    if settings.mode_used == "cpr":
-        from clrecon.operators.reformat import cut_slice  # the same kernel
-
-        cut_slice(nothing, "axial", (8, 8), device)
-        return
-    plain = RenderSettings(settings.mode_used, size=(8, 8), iso_value=0.0 if settings.mode_used == "surface" else None)
-    with Studio(nothing, device, plain, progress=ignore_progress) as studio:
-        studio.take_view(plain.views_used[0])
+    mode = "slice" if settings.mode_used == "cpr" else settings.mode_used  # the same kernel, and no curve is needed
+    with Studio(nothing, device, RenderSettings(mode, size=(8, 8), iso_value=0.0 if mode == "surface" else None),
+                progress=ignore_progress) as studio:  # fmt: skip
+        studio.take_view("anterior")
 
 
 def _read(source: str | Path, settings: RenderSettings, progress: Progress) -> Volume:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 __all__ = ["MODES", "VIEWS", "find_misplaced"]
 
 MODES = {
@@ -20,46 +18,49 @@ MODES = {
 
 VIEWS = ("anterior", "posterior", "left", "right", "superior", "inferior")
 
-_SAMPLED = ("dvr", "mip", "minip", "mean", "surface")
-_RAYS = (*_SAMPLED, "slices")
-_VALUES = ("mip", "minip", "mean", "slice", "cpr")
-_CUT = ("slice", "cpr")
+_RAYS = ("dvr", "mip", "minip", "mean", "surface", "slices")
 
+_MODES_OF = {
+    "preset": ("dvr", "mip", "minip", "mean", "slices", "slice", "cpr"),
+    "zoom": (*_RAYS, "slice"),
+    "letters": (*_RAYS, "slice"),
+    "depth": ("dvr", "mip", "minip", "surface", "slices", "slice"),
+    "values": ("mip", "minip", "mean", "slice", "cpr"),
+    "turntable": _RAYS,
+}
+"""Settings that the renderer does not know; of all others it says itself in which modes they mean something."""
 
-class _Place(NamedTuple):
-    """A setting, the option of the command that gives it, and the modes that know it."""
+_OPTIONS = {
+    "preset": "--preset",
+    "transfer_function": "--transfer-function",
+    "iso_value": "--iso",
+    "color": "--color",
+    "depth_cue": "--depth-cue",
+    "window": "--window",
+    "ray_step": "--ray-step",
+    "light": "--light",
+    "shadows": "--shadows",
+    "jitter": "--jitter",
+    "zoom": "--zoom",
+    "view_angle": "--perspective",
+    "clip_box": "--clip-box",
+    "clip_planes": "--clip",
+    "letters": "--letters",
+    "depth": "--depth",
+    "values": "--values",
+    "slices": "--slices",
+    "slice_opacity": "--slice-opacity",
+    "thickness": "--thickness",
+    "combine": "--combine",
+    "offset_mm": "--offset",
+    "curve": "--curve",
+    "cpr": "--cpr",
+    "labels": "--labels",
+    "turntable": "--turntable",
+}
+"""Settings, and the options of the command that give them."""
 
-    setting: str
-    option: str
-    modes: tuple[str, ...]
-
-
-_PLACES = (
-    _Place("preset", "--preset", ("dvr", "mip", "minip", "mean", "slices")),
-    _Place("transfer_function", "--transfer-function", ("dvr", "slices")),
-    _Place("iso_value", "--iso", ("surface",)),
-    _Place("color", "--color", ("surface",)),
-    _Place("shadows", "--shadows", ("surface",)),
-    _Place("light", "--light", ("dvr", "surface")),
-    _Place("jitter", "--jitter", ("dvr",)),
-    _Place("ray_step", "--ray-step", _SAMPLED),
-    _Place("window", "--window", (*_VALUES, "slices")),
-    _Place("slices", "--slices", ("slices",)),
-    _Place("slice_opacity", "--slice-opacity", ("slices",)),
-    _Place("view_angle", "--perspective", _RAYS),
-    _Place("zoom", "--zoom", (*_RAYS, "slice")),
-    _Place("clip", "--clip and --clip-box", _RAYS),
-    _Place("letters", "--letters", (*_RAYS, "slice")),
-    _Place("depth", "--depth", ("dvr", "mip", "minip", "surface", "slices", "slice")),
-    _Place("values", "--values", _VALUES),
-    _Place("turntable", "--turntable", _RAYS),
-    _Place("thickness", "--thickness", _CUT),
-    _Place("combine", "--combine", _CUT),
-    _Place("offset_mm", "--offset", ("slice",)),
-    _Place("curve", "--curve", ("cpr",)),
-    _Place("cpr", "--cpr", ("cpr",)),
-    _Place("labels", "--labels", ("surface",)),
-)
+_RENDERER_NAMES = {"light": "lighting", "clip_box": "clip", "clip_planes": "clip"}
 
 
 def find_misplaced(mode: str, given: set[str]) -> str | None:
@@ -72,7 +73,10 @@ def find_misplaced(mode: str, given: set[str]) -> str | None:
     given : set of str
         Names of settings that differ from what they are without being asked for, and of files of `PictureFiles`.
     """
-    for setting, option, modes in _PLACES:
+    from clrecon.operators.renderer import KNOWN_IN  # numpy: not wanted before a job starts
+
+    for setting, option in _OPTIONS.items():
+        modes = _MODES_OF.get(setting) or KNOWN_IN[_RENDERER_NAMES.get(setting, setting)]
         if setting in given and mode not in modes:
             return f"{option} means nothing in mode {mode}: it belongs to {', '.join(modes)}"
     return None

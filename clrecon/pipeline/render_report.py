@@ -104,8 +104,9 @@ def describe_pictures(
         "mode": settings.mode_used,
         "preset": settings.preset_used,
         "transfer_function": _describe_function(studio.function),
-        "iso_value_hu": settings.iso_value,
+        "iso_value_hu": settings.iso_value_used,
         "color": settings.color,
+        "depth_cue": settings.depth_cue,
         "lighting": None if lighting is None else asdict(lighting),
         "shadows": settings.shadows,
         "jitter": settings.jitter,
@@ -159,8 +160,8 @@ def _shows_skin(settings: RenderSettings, function: TransferFunction | None) -> 
     """True where something between air and fat is not transparent: the picture shows the outside of the body."""
     import numpy as np
 
-    if settings.mode_used == "surface" and settings.iso_value is not None:
-        return SKIN_HU[0] <= settings.iso_value <= SKIN_HU[1]
+    if settings.iso_value_used is not None:
+        return SKIN_HU[0] <= settings.iso_value_used <= SKIN_HU[1]
     if settings.mode_used != "dvr" or function is None:
         return False
     return bool((function(np.linspace(*SKIN_HU, 751))[:, 3] > 0.0).any())

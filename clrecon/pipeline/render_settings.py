@@ -88,9 +88,11 @@ class RenderSettings:
     transfer_function : str, optional
         ``FILE`` or ``FILE:NAME``, see `clrecon.rendering.transfer_files.load_transfer_function`.
     iso_value : float, optional
-        Of a surface, HU.
+        Of a surface, HU; default that of the renderer.
     color : str, optional
         Of a surface; default that of bone.
+    depth_cue : float, optional
+        Share of its brightness that a surface loses from the nearest to the farthest place.
     window : (float, float), optional
         HU that are black and white, of modes that show HU.
     views : sequence of str
@@ -116,7 +118,7 @@ class RenderSettings:
     slices, slice_opacity
         Of slices in space, see `clrecon.operators.slice_overlay.overlay_slices`.
     curve : str, optional
-        File with the centre line, or "auto": the spinal canal.
+        File with the centre line, or "auto": the spinal canal, which mode cpr also takes without one.
     cpr : {"straightened", "stretched"}
     labels : LabelLook, optional
     turntable : Turntable, optional
@@ -134,6 +136,7 @@ class RenderSettings:
     transfer_function: str | None = None
     iso_value: float | None = None
     color: str | None = None
+    depth_cue: float | None = None
     window: Sequence[float] | None = None
     views: Sequence[str] = ()
     up: str | Sequence[float] | None = None
@@ -182,8 +185,7 @@ class RenderSettings:
 
     def _given(self) -> set[str]:
         """Names of the settings that are not what they are by default."""
-        given = {own.name for own in fields(self) if getattr(self, own.name) != own.default}
-        return given | ({"clip"} if self.clip_box is not None or self.clip_planes else set())
+        return {own.name for own in fields(self) if getattr(self, own.name) != own.default}
 
     def _check_looks(self) -> None:
         from clrecon.rendering.colors import find_color
@@ -237,9 +239,10 @@ class RenderSettings:
     def _check_mode(self) -> None:
         if self.ray_step is not None and not 0.0 < self.ray_step < math.inf:
             raise UsageError(f"the ray step is a length in mm above 0, not {self.ray_step:g}")
-        if self.mode_used == "surface":
-            if self.iso_value is None or not math.isfinite(self.iso_value):
-                raise UsageError(f"a surface needs its iso value in HU (--iso N), {self.iso_value} is none")
+        if self.iso_value is not None and not math.isfinite(self.iso_value):
+            raise UsageError(f"the iso value of a surface is a number of HU, not {self.iso_value}")
+        if self.depth_cue is not None and not 0.0 <= self.depth_cue <= 1.0:
+            raise UsageError(f"the depth cue is a share of the brightness from 0 to 1, not {self.depth_cue:g}")
         if self.slice_opacity is not None and not 0.0 < self.slice_opacity <= 1.0:
             raise UsageError(f"the opacity of a slice lies above 0 and up to 1, not at {self.slice_opacity:g}")
         if self.shadows and self.light_direction() is None:
@@ -252,11 +255,8 @@ class RenderSettings:
             raise UsageError(f"samples of a thick slice are combined by {', '.join(COMBINE)}, not {self.combine!r}")
         if self.cpr is not None and self.cpr not in CURVED:
             raise UsageError(f"a curved reformation is {' or '.join(CURVED)}, not {self.cpr!r}")
-        if self.mode_used == "cpr":
-            if self.curve is None:
-                raise UsageError("a curved reformation needs its centre line: --curve FILE, or --curve auto")
-            if len(self.views_used) > 1:
-                raise UsageError("a curved reformation is seen from one side: give one view")
+        if self.mode_used == "cpr" and len(self.views_used) > 1:
+            raise UsageError("a curved reformation is seen from one side: give one view")
 
     @property
     def mode_used(self) -> str:
@@ -281,6 +281,15 @@ class RenderSettings:
         from clrecon.rendering.presets import DEFAULT_PRESET
 
         return DEFAULT_PRESET
+
+    @property
+    def iso_value_used(self) -> float | None:
+        """HU of the surface, None in other modes."""
+        if self.mode_used != "surface":
+            return None
+        from clrecon.operators.renderer import DEFAULT_ISO_VALUE
+
+        return DEFAULT_ISO_VALUE if self.iso_value is None else self.iso_value
 
     @property
     def views_used(self) -> tuple[str, ...]:

@@ -22,6 +22,12 @@ if TYPE_CHECKING:
 
 __all__ = ["Studio", "read_curve", "read_function", "read_look"]
 
+SHARED_OPTIONS = (
+    "ray_step", "clip", "jitter", "color", "shadows", "depth_cue", "slices", "slice_opacity", "offset_mm", "thickness",
+    "combine", "cpr",
+)  # fmt: skip
+"""Options of `clrecon.operators.renderer.render` that are settings of the same name."""
+
 
 def read_function(named: str | None) -> TransferFunction | None:
     """Read the transfer function ``FILE`` or ``FILE:NAME``, None where there is none.
@@ -144,89 +150,44 @@ class Studio:
     def take_view(self, view: str) -> Rendering:
         """The picture of one of the views, with what is drawn into it."""
         settings = self._settings
-        if settings.mode_used == "cpr":
-            return self._finish(self._reformat(view))
-        return self.take(settings.camera(self._volume, view))
+        if settings.mode_used != "cpr":
+            return self.take(settings.camera(self._volume, view))
+        if self._curve is None:
+            self._progress("curve", 0, 0)
+        return self._render(view=view, up=settings.up, size=settings.size)
 
     def take(self, camera: Camera) -> Rendering:
         """The picture of a camera."""
-        return self._finish(self._cut(camera) if self._settings.mode_used == "slice" else self._cast(camera))
+        return self._render(camera=camera, size=self._settings.size_used)
 
-    def _finish(self, picture: Rendering) -> Rendering:
-        settings = self._settings
-        return picture.annotated(letters=settings.letters, scale_bar=settings.scale_bar, caption=settings.caption)
-
-    def _cast(self, camera: Camera) -> Rendering:
-        from clrecon.operators.renderer import VolumeRenderer
+    def _render(self, **place: Any) -> Rendering:
+        from clrecon.operators.renderer import KNOWN_IN, VolumeRenderer
 
         settings = self._settings
         if self._renderer is None:
             self._renderer = self._stack.enter_context(
                 VolumeRenderer(self._volume, self._device, memory=settings.memory)
             )
-        options: dict[str, Any] = {
-            "camera": camera,
-            "size": settings.size_used,
-            "ray_step": settings.ray_step,
-            "lighting": self.lighting,
-            "window": self.window,
-            "clip": settings.clip,
-            "background": settings.background,
-            "jitter": settings.jitter,
-        }
-        picture: Rendering = self._renderer.render(settings.mode_used, **options, **self._more())
-        return picture
+        mode = settings.mode_used
+        known = {name: value for name, value in self._options().items() if mode in KNOWN_IN[name]}
+        picture: Rendering = self._renderer.render(mode, background=settings.background, **place, **known)
+        return picture.annotated(letters=settings.letters, scale_bar=settings.scale_bar, caption=settings.caption)
 
-    def _more(self) -> dict[str, Any]:
-        """Options that only some pictures have."""
+    def _options(self) -> dict[str, Any]:
+        """Options that mean something in some modes only."""
         settings = self._settings
-        more: dict[str, Any] = {}
-        if settings.mode_used == "dvr":
-            more["transfer_function"] = self.function
-        elif settings.mode_used == "surface":
-            more.update(iso_value=settings.iso_value, shadows=settings.shadows)
-            if settings.color is not None:
-                more["color"] = settings.color
-        elif settings.mode_used == "slices":
-            more["slices"] = settings.slices
-            if settings.slice_opacity is not None:
-                more["slice_opacity"] = settings.slice_opacity
-            if settings.window is None:
-                more["transfer_function"] = self.function
+        options: dict[str, Any] = {name: getattr(settings, name) for name in SHARED_OPTIONS}
+        window = None if settings.mode_used == "slices" and self.function is not None else self.window
+        options.update(
+            transfer_function=self.function,
+            window=window,
+            lighting=self.lighting,
+            curve=self._curve,
+            iso_value=settings.iso_value_used,
+        )
         if self.labels is not None and settings.labels is not None:
             look = settings.labels
             plain = not (look.colors or look.opacities)  # then every label has a colour of its own
-            more.update(labels=self.labels, label_colors=None if plain else dict(look.colors))
-            more.update(label_opacity=dict(look.opacities))
-        return more
-
-    def _cut(self, camera: Camera) -> Rendering:
-        from clrecon.operators.reformat import cut_slice
-
-        settings = self._settings
-        return cut_slice(
-            self._volume, camera, settings.size_used, self._device, offset_mm=settings.offset_mm, **self._slab()
-        )
-
-    def _reformat(self, view: str) -> Rendering:
-        from clrecon.operators.reformat import reformat_curve
-
-        settings = self._settings
-        kind = settings.cpr or "straightened"
-        curve = "spine" if self._curve is None else self._curve
-        if self._curve is None:
-            self._progress("curve", 0, 0)
-        return reformat_curve(
-            self._volume, curve, kind, settings.size, self._device, view=view, up=settings.up, **self._slab()
-        )
-
-    def _slab(self) -> dict[str, Any]:
-        settings = self._settings
-        return {
-            "thickness": settings.thickness,
-            "combine": settings.combine or "mean",
-            "window": self.window,
-            "background": settings.background,
-            "memory": settings.memory,
-            "progress": self._progress,
-        }
+            options.update(labels=self.labels, label_colors=None if plain else dict(look.colors))
+            options.update(label_opacity=dict(look.opacities))
+        return options

@@ -166,6 +166,11 @@ def test_light(render: Renders) -> None:
     assert render("--light", "none")[1]["lighting"]["ambient"] == 1.0
 
 
+def test_depth_cue_darkens_what_is_far(render: Renders) -> None:
+    plain, cued = (render("--iso", ISO, *extra)[0].astype(int) for extra in ([], ["--depth-cue", "0.6"]))
+    assert (cued <= plain).all() and cued[lit(plain)].mean() < 0.95 * plain[lit(plain)].mean()
+
+
 def test_shadows_darken(ct: Path, tmp_path: Path, device: Any, capsys: pytest.CaptureFixture[str]) -> None:
     voxels = np.full(SHAPE_KJI, AIR_HU, np.int16)
     voxels[2:4, 2:23, 2:29] = BLOCK_HU
@@ -272,6 +277,9 @@ def test_labels_have_colours(render: Renders) -> None:
     assert image[lit(image)][:, 2].mean() > 2.0 * image[lit(image)][:, 0].mean()
     plain = render(*surface[:4], "--color", "red")[0]
     assert plain[..., :3][lit(plain)].mean(axis=0) == pytest.approx([255, 0, 0], abs=5)
+    through = render("--labels", path, "--label-color", "20=blue", "--light", "none")[0]
+    assert through[lit(through)][:, 2].mean() > 2.0 * through[lit(through)][:, 0].mean()
+    assert not lit(render("--labels", path, "--label-opacity", "20=0")[0])[lit(through)].all()
     faint = render(*surface, "--label-color", "20=blue", "--label-opacity", "20=0.3")[0]
     assert faint[lit(image)][:, 2].mean() < 0.8 * image[lit(image)][:, 2].mean()
 
@@ -361,13 +369,12 @@ WRONG = {
     "plane": (["--clip", "0,0,0,0,0,0"], 3, "length 0"),
     "colour": (["--background", "octarine"], 3, "octarine"),
     "light": (["--light", "sun"], 3, "head, none, anterior"),
-    "surface without a value": (["--mode", "surface"], 3, "--iso"),
+    "depth cue": (["--iso", "100", "--depth-cue", "2"], 3, "depth cue"),
     "shadows of the camera": (["--iso", "100", "--shadows"], 3, "--light"),
     "slices": (["--mode", "slices", "--slices", "a,b"], 3, "every N-th"),
     "slice not there": (["--mode", "slices", "--slices", "17,"], 3, "slices 0 to 16"),
     "slice opacity": (["--mode", "slices", "--slice-opacity", "0"], 3, "opacity of a slice"),
     "shadows elsewhere": (["--shadows"], 3, "--shadows means nothing in mode dvr"),
-    "curve missing": (["--mode", "cpr"], 3, "--curve"),
     "curve file": (["--curve", "nowhere.csv"], 4, "nowhere.csv"),
     "letters on a curve": (["--curve", "auto", "--letters"], 3, "--letters"),
     "small letters": (["--letters", "--size", "20"], 3, "at least 64"),
