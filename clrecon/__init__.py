@@ -27,6 +27,8 @@ if TYPE_CHECKING:
     from clrecon.formats.curve_points import read_curve_points
     from clrecon.geometry import Volume, choose_iso_value
     from clrecon.geometry.body import mask_field_of_view, remove_table
+    from clrecon.geometry.camera import Camera
+    from clrecon.geometry.clip import Clip
     from clrecon.geometry.spine_line import find_spine_line
     from clrecon.labels import LabelMap, read_labels
     from clrecon.mesh import Mesh
@@ -38,11 +40,14 @@ if TYPE_CHECKING:
     from clrecon.operators.reformat import cut_slice, reformat_curve
     from clrecon.operators.renderer import VolumeRenderer, render
     from clrecon.reading import list_series, read_volume
-    from clrecon.rendering import Lighting, TransferFunction, load_transfer_function
+    from clrecon.rendering import Lighting, Rendering, TransferFunction, load_transfer_function
+    from clrecon.rendering.motion import turntable_cameras, write_animation
 
     __version__: str
 
 __all__ = [
+    "Camera",
+    "Clip",
     "ClreconError",
     "DeviceError",
     "LabelMap",
@@ -52,6 +57,7 @@ __all__ = [
     "NoSurfaceError",
     "OutputError",
     "RefusedInputError",
+    "Rendering",
     "SurfaceExtractor",
     "TransferFunction",
     "UsageError",
@@ -78,9 +84,13 @@ __all__ = [
     "remove_table",
     "render",
     "smooth_mesh",
+    "turntable_cameras",
+    "write_animation",
 ]
 
 _HOMES = {
+    "Camera": "clrecon.geometry.camera",
+    "Clip": "clrecon.geometry.clip",
     "ClreconError": "clrecon.errors",
     "DeviceError": "clrecon.errors",
     "LabelMap": "clrecon.labels",
@@ -90,6 +100,7 @@ _HOMES = {
     "NoSurfaceError": "clrecon.errors",
     "OutputError": "clrecon.errors",
     "RefusedInputError": "clrecon.errors",
+    "Rendering": "clrecon.rendering",
     "SurfaceExtractor": "clrecon.operators.isosurface",
     "TransferFunction": "clrecon.rendering",
     "UsageError": "clrecon.errors",
@@ -113,6 +124,8 @@ _HOMES = {
     "remove_table": "clrecon.geometry.body",
     "render": "clrecon.operators.renderer",
     "smooth_mesh": "clrecon.mesh.refinement",
+    "turntable_cameras": "clrecon.rendering.motion",
+    "write_animation": "clrecon.rendering.motion",
 }
 
 

@@ -15,8 +15,9 @@ __all__ = ["add_arguments", "run"]
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of the command."""
     parser.epilog = (
-        "Writes a made-up CT series of a spine to OUT/ct, its bone surface to OUT/bone.stl and the report to\n"
-        "OUT/report.json, and holds a sphere of known size against its mesh. A second run replaces the first."
+        "Writes a made-up CT series of a spine to OUT/ct, a picture of it to OUT/bone.png, its bone surface to\n"
+        "OUT/bone.stl and the report to OUT/report.json, and holds a sphere of known size against its mesh.\n"
+        "A second run replaces the first."
     )
     parser.add_argument("output", metavar="OUT", nargs="?", help="folder (default: clrecon-demo)")
     add_device(parser)
@@ -37,6 +38,7 @@ def run(options: argparse.Namespace, console: Console) -> int:
 
 def _summary(outcome: dict[str, Any]) -> list[str]:
     folder, check, seconds = printable(outcome["folder"]), outcome["check"], outcome["seconds"]
+    width, height = outcome["picture"]["pictures"][0]["size"]
     error = 100.0 * (check["volume_ml"] / check["true_volume_ml"] - 1.0)
     spacing = " x ".join(f"{step:.3g}" for step in check["spacing_mm"])
     return [
@@ -45,6 +47,8 @@ def _summary(outcome: dict[str, Any]) -> list[str]:
         f"check    sphere in voxels of {spacing} mm, gantry tilted {check['tilt_deg']:.3g} degrees:"
         f" {check['volume_ml']:.4f} ml of {check['true_volume_ml']:.4f} ml ({error:+.2f} %),"
         f" no vertex off by more than {check['radius_error_max_mm']:.3f} mm",
-        f"wrote    {folder}/ct, {folder}/bone.stl, {folder}/report.json in {seconds['total']:.1f} s",
+        f"wrote    {folder}/ct, bone.png, bone.stl and report.json beside it in {seconds['total']:.1f} s",
+        f"picture  {folder}/bone.png: volume rendering, {width} x {height}, without OpenGL or a screen",
         f"next     clrecon mesh {folder}/ct -o bone.stl",
+        f"         clrecon render {folder}/ct -o left.png --view left",
     ]

@@ -26,12 +26,13 @@ class _Command(NamedTuple):
 
 COMMANDS = {
     "mesh": _Command("clrecon.cli.mesh", "make a mesh from a CT series: the main job"),
+    "render": _Command("clrecon.cli.render", "make pictures of a CT series, still or moving"),
     "info": _Command("clrecon.cli.info", "show which series a folder holds and whether they can be used"),
     "devices": _Command("clrecon.cli.devices", "show the OpenCL devices and which one would be used"),
     "phantom": _Command("clrecon.cli.phantom", "write a made-up CT series with a known surface"),
     "selftest": _Command("clrecon.cli.selftest", "check that a device computes rightly"),
     "bench": _Command("clrecon.cli.bench", "time every stage on this computer, beside VTK's flying edges"),
-    "demo": _Command("clrecon.cli.demo", "phantom, mesh and report in one go: what clrecon does, in seconds"),
+    "demo": _Command("clrecon.cli.demo", "phantom, mesh, picture and report in one go: what clrecon does, in seconds"),
 }
 
 UNUSED_MODULES = ("requests", "PIL")

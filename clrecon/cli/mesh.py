@@ -21,7 +21,7 @@ from clrecon.cli.refinement import (
 )
 from clrecon.pipeline.presets import DEFAULT_PRESET, PRESETS
 
-__all__ = ["add_arguments", "describe_mesh", "run"]
+__all__ = ["add_arguments", "describe_mesh", "describe_volume", "run"]
 
 _PARTS = ("read", "upload", "build", "kernels", "download", "mask", "choose", "select", "refine", "write", "measure")
 _SHOWN_PARTS = 12
@@ -151,7 +151,7 @@ def describe_mesh(report: dict[str, Any]) -> list[str]:
     border = "closed" if report["closed_at_border"] else "open"
     levels = ", ".join(f"{level:g}" for level in dict.fromkeys(mesh["iso_value_hu"] for mesh in report["meshes"]))
     return [
-        f"input    {_describe_volume(report['volume'])}",
+        f"input    {describe_volume(report['volume'])}",
         f"surface  {levels} HU ({reason}), {border} at the border of the volume",
         f"mesh     {report['vertices']:,} vertices, {report['triangles']:,} triangles",
         *_describe_quality(report),
@@ -181,7 +181,8 @@ def _describe_choice(report: dict[str, Any]) -> str:
     return f"auto: half way between {below} {choice['tissue_hu']:.0f} and bone {choice['bone_hu']:.0f} HU"
 
 
-def _describe_volume(volume: dict[str, Any]) -> str:
+def describe_volume(volume: dict[str, Any]) -> str:
+    """What was read, in one line, from the certificate of a report."""
     parts = []
     if volume.get("shape_ijk"):
         ni, nj, nk = volume["shape_ijk"]

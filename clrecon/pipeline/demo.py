@@ -1,4 +1,4 @@
-"""The demonstration: phantom, mesh and report in one folder, and one surface whose size is known exactly."""
+"""The demonstration: phantom, mesh, picture and report in one folder, and one surface whose size is known exactly."""
 
 from __future__ import annotations
 
@@ -7,7 +7,10 @@ from typing import TYPE_CHECKING, Any
 
 from clrecon.errors import OutputError, UsageError
 from clrecon.pipeline.mesh import make_mesh
+from clrecon.pipeline.pictures import PictureFiles
 from clrecon.pipeline.progress import Progress, Stopwatch
+from clrecon.pipeline.render import make_pictures
+from clrecon.pipeline.render_settings import RenderSettings
 from clrecon.pipeline.settings import MeshSettings
 
 if TYPE_CHECKING:
@@ -16,7 +19,7 @@ if TYPE_CHECKING:
 __all__ = ["DEMO_FILES", "DEMO_FOLDER", "make_demo"]
 
 DEMO_FOLDER = "clrecon-demo"
-DEMO_FILES = ("ct", "bone.stl", "report.json")
+DEMO_FILES = ("ct", "bone.stl", "bone.png", "report.json")
 
 _TILT_DEG, _OBLIQUE_DEG = 12.0, (10.0, -5.0, 30.0)
 
@@ -24,7 +27,7 @@ _TILT_DEG, _OBLIQUE_DEG = 12.0, (10.0, -5.0, 30.0)
 def make_demo(
     output: str | Path = DEMO_FOLDER, device: str | None = None, *, progress: Progress | None = None
 ) -> dict[str, Any]:
-    """Write a phantom CT series, its bone mesh and the report; check a sphere of known volume.
+    """Write a phantom CT series, a picture of it, its bone mesh and the report; check a sphere of known volume.
 
     Parameters
     ----------
@@ -38,7 +41,7 @@ def make_demo(
     -------
     dict
         ``folder``, ``files``, ``affine_error_mm`` (largest difference between the affine of the report and that of
-        the truth), ``check`` (see `check_sphere`), ``seconds`` and ``mesh`` (the report of the mesh).
+        the truth), ``check`` (see `check_sphere`), ``seconds``, ``mesh`` and ``picture`` (the reports of both).
 
     Raises
     ------
@@ -56,6 +59,10 @@ def make_demo(
     settings = PhantomSettings(kind="spine", size=(256, 192), slices=110, spacing=(1.0, 1.0, 1.25))
     truth = write_phantom(folder / "ct", settings, progress=progress)
     watch.lap("phantom")
+    picture = make_pictures(
+        folder / "ct", PictureFiles(folder / "bone.png"), _look(str(chosen.index)), progress=progress
+    )
+    watch.lap("picture")
     report = make_mesh(
         folder / "ct",
         folder / "bone.stl",
@@ -79,7 +86,12 @@ def make_demo(
         "check": check,
         "seconds": {part: round(value, 4) for part, value in seconds.items()},
         "mesh": report,
+        "picture": picture,
     }
+
+
+def _look(device: str) -> RenderSettings:
+    return RenderSettings(preset="bone", views=["25,10"], ray_step=0.25, letters=True, scale_bar=True, device=device)
 
 
 def check_sphere(device: Device) -> dict[str, Any]:

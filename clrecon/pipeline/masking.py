@@ -1,19 +1,20 @@
-"""What of the scan is left out before a surface is extracted: what is not the patient, what is not in view."""
+"""What of the scan is left out before a surface or a picture is made: what is not the patient, what is not in view."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
 from clrecon.pipeline.progress import Progress
-from clrecon.pipeline.settings import MeshSettings
 
 if TYPE_CHECKING:
     from clrecon.geometry import Volume
+    from clrecon.pipeline.render_settings import RenderSettings
+    from clrecon.pipeline.settings import MeshSettings
 
 __all__ = ["mask_volume"]
 
 
-def mask_volume(volume: Volume, settings: MeshSettings, progress: Progress) -> Volume:
+def mask_volume(volume: Volume, settings: MeshSettings | RenderSettings, progress: Progress) -> Volume:
     """The volume with air outside of the field of view and of the body, as far as the settings ask for it.
 
     Raises

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,7 @@ from clrecon.pipeline.description import describe_job, describe_part
 from clrecon.pipeline.labels import extract_label_surfaces, open_labels
 from clrecon.pipeline.levels import choose_level
 from clrecon.pipeline.masking import mask_volume
-from clrecon.pipeline.opening import DeviceOpening
+from clrecon.pipeline.opening import DeviceOpening, prepare_surfaces
 from clrecon.pipeline.outputs import check_outputs, commit_all, count_leftovers, name_outputs, stage_meshes
 from clrecon.pipeline.parts import check_levels, extract_surfaces, first_names, plan_surfaces, select_parts
 from clrecon.pipeline.progress import Progress, Stopwatch, ignore_progress
@@ -75,7 +76,8 @@ def make_mesh(
     check_outputs(output, report_path, first_names(surfaces, settings.split))
 
     progress("device", 0, 0)
-    with DeviceOpening(settings.device, settings.selects, settings.topology) as opening:
+    prepare = partial(prepare_surfaces, components=settings.selects, topology=settings.topology)
+    with DeviceOpening(settings.device, prepare) as opening:
         from clrecon.reading import read_volume
 
         labels = open_labels(settings.labels)

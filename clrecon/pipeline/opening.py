@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from types import TracebackType
 from typing import TYPE_CHECKING
@@ -9,7 +10,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from clrecon.opencl import Device
 
-__all__ = ["DeviceOpening"]
+__all__ = ["DeviceOpening", "prepare_surfaces"]
 
 
 def _choose(name: str | int | Device | None) -> Device:
@@ -18,13 +19,18 @@ def _choose(name: str | int | Device | None) -> Device:
     return choose_device(name)
 
 
-def _prepare(chosen: Future[Device], components: bool, topology: str) -> None:
+def _prepare(chosen: Future[Device], prepare: Callable[[Device], None]) -> None:
+    prepare(chosen.result())
+
+
+def prepare_surfaces(device: Device, components: bool, topology: str) -> None:
+    """Build the kernels that find surfaces of this topology and, where asked for, components."""
     from clrecon.operators.components import prepare_components
     from clrecon.operators.isosurface import prepare_isosurface
 
-    prepare_isosurface(chosen.result(), topology=topology)
+    prepare_isosurface(device, topology=topology)
     if components:
-        prepare_components(chosen.result())
+        prepare_components(device)
 
 
 class DeviceOpening:
@@ -37,16 +43,14 @@ class DeviceOpening:
     ----------
     name : str, int, Device or None
         As `clrecon.device` takes it.
-    components : bool
-        Build the kernels that find components too.
-    topology : {"separated", "trilinear"}
-        Build the kernels of this one.
+    prepare : callable
+        Builds the kernels on the device that it is given.
     """
 
-    def __init__(self, name: str | int | Device | None, components: bool = False, topology: str = "separated"):
+    def __init__(self, name: str | int | Device | None, prepare: Callable[[Device], None]):
         self._pool = ThreadPoolExecutor(max_workers=1, thread_name_prefix="device")
         self._chosen = self._pool.submit(_choose, name)
-        self._prepared = self._pool.submit(_prepare, self._chosen, components, topology)
+        self._prepared = self._pool.submit(_prepare, self._chosen, prepare)
 
     def wait(self) -> Device:
         """Return the device, ready to work.

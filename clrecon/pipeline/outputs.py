@@ -6,6 +6,7 @@ import os
 import re
 from collections.abc import Sequence
 from contextlib import ExitStack
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -15,7 +16,15 @@ if TYPE_CHECKING:
     from clrecon.files import StagedFile
     from clrecon.mesh import Mesh
 
-__all__ = ["MOST_FILES", "check_outputs", "commit_all", "count_leftovers", "name_outputs", "stage_meshes"]
+__all__ = [
+    "MOST_FILES",
+    "check_distinct",
+    "check_outputs",
+    "commit_all",
+    "count_leftovers",
+    "name_outputs",
+    "stage_meshes",
+]
 
 MOST_FILES = 1000
 """Meshes a job.  More are crumbs that nobody opens, and every one of them keeps a file open until all are written."""
@@ -47,17 +56,32 @@ def name_outputs(output: str | Path, names: Sequence[str], report_path: str | Pa
         )
     stem, extension = os.path.splitext(os.fspath(output))
     paths = [f"{stem}_{name}{extension}" if name else output for name in names]
-    owners: dict[str, str] = {}
-    if report_path is not None:
-        owners[_identity(report_path)] = "the report"
-    for name, path in zip(names, paths, strict=True):
+    for name in names:
         if os.path.basename(name) != name or "\\" in name:
             raise UsageError(f"{name!r} cannot be a part of the name of a file")
-        own = f"the mesh {name}" if name else "the mesh"
-        other = owners.setdefault(_identity(path), own)
-        if other is not own:
-            raise UsageError(f"{own} and {other} cannot be the same file: {path}")
+    owned = [(f"the mesh {name}" if name else "the mesh", path) for name, path in zip(names, paths, strict=True)]
+    check_distinct([] if report_path is None else [("the report", report_path)], owned)
     return paths
+
+
+def check_distinct(*owned: Sequence[tuple[str, str | Path]]) -> None:
+    """Refuse two outputs that are one file.
+
+    Parameters
+    ----------
+    *owned : sequence of (str, path)
+        What a file is, and where it is going to be.
+
+    Raises
+    ------
+    UsageError
+    """
+    owners: dict[str, str] = {}
+    for own, path in chain(*owned):
+        other = owners.get(_identity(path))
+        if other is not None:
+            raise UsageError(f"{own} and {other} cannot be the same file: {path}")
+        owners[_identity(path)] = own
 
 
 def count_leftovers(output: str | Path, paths: Sequence[str | Path]) -> int:

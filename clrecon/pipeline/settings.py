@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from clrecon.errors import UsageError
+from clrecon.pipeline.checks import check_field_of_view, check_memory
 from clrecon.pipeline.labels import LabelChoice
 from clrecon.pipeline.presets import DEFAULT_PRESET, find_preset
 
@@ -107,13 +108,12 @@ class MeshSettings:
             raise UsageError(f"the number of components to keep must be 1 or more, not {self.keep_largest}")
         if self.min_volume_ml is not None and not (math.isfinite(self.min_volume_ml) and self.min_volume_ml > 0):
             raise UsageError(f"the smallest volume to keep must be above 0 ml, not {self.min_volume_ml}")
-        if self.memory is not None and self.memory < 1:
-            raise UsageError(f"the memory that may be taken must be above 0 bytes, not {self.memory}")
+        check_memory(self.memory)
         for seed in self.seeds:
             if len(seed) != 3 or not all(map(math.isfinite, seed)):
                 raise UsageError(f"a seed is a point of three numbers in mm, not {tuple(seed)}")
         self._check_refinement()
-        self._check_field_of_view()
+        check_field_of_view(self.field_of_view)
         from clrecon.geometry import frame_from_lps  # numpy: not wanted before a job starts
         from clrecon.geometry.field import check_topology
 
@@ -147,14 +147,6 @@ class MeshSettings:
                 raise UsageError(f"the iso value must be a finite number of HU, not {value}")
             if value in self.levels[:place]:
                 raise UsageError(f"the iso value {value:g} HU is given twice")
-
-    def _check_field_of_view(self) -> None:
-        view = self.field_of_view
-        if isinstance(view, str):
-            if view != "auto":
-                raise UsageError(f"the field of view is a radius in mm or auto, not {view!r}")
-        elif view is not None and not (math.isfinite(view) and view > 0.0):
-            raise UsageError(f"the radius of the field of view is a length in mm above 0, not {view:g}")
 
     def _check_refinement(self) -> None:
         if self.smooth is not None and not 1 <= self.smooth <= 1000:

@@ -17,7 +17,16 @@ from clrecon.version import package_version
 if TYPE_CHECKING:
     from clrecon.rendering.picture import Rendering
 
-__all__ = ["FLOAT_FORMATS", "IMAGE_FORMATS", "check_image_path", "encode_image", "write_floats", "write_image"]
+__all__ = [
+    "FLOAT_FORMATS",
+    "IMAGE_FORMATS",
+    "check_float_path",
+    "check_image_path",
+    "encode_floats",
+    "encode_image",
+    "write_floats",
+    "write_image",
+]
 
 IMAGE_FORMATS = {".png": "PNG", ".jpg": "JPEG", ".jpeg": "JPEG", ".tif": "TIFF", ".tiff": "TIFF"}
 """Extension to Pillow's name."""
@@ -98,7 +107,22 @@ def write_floats(array: NDArray[np.float32], path: str | os.PathLike[str], pixel
     int
         Size of the file in bytes.
     """
-    extension = _extension(path, FLOAT_FORMATS, "depth or value")
+    return _replace(path, encode_floats(array, check_float_path(path), pixel_mm))
+
+
+def check_float_path(path: str | os.PathLike[str]) -> str:
+    """Return the extension of a file of depths or values in lower case.
+
+    Raises
+    ------
+    UsageError
+        It is none of `FLOAT_FORMATS`.
+    """
+    return _extension(path, FLOAT_FORMATS, "depth or value")
+
+
+def encode_floats(array: NDArray[np.float32], extension: str, pixel_mm: float | None = None) -> bytes:
+    """Bytes of the file that `write_floats` writes; `extension` is one of `FLOAT_FORMATS`."""
     floats = np.ascontiguousarray(array, dtype=np.float32)
     stream = BytesIO()
     if extension == ".npy":
@@ -108,7 +132,7 @@ def write_floats(array: NDArray[np.float32], path: str | os.PathLike[str], pixel
         from PIL import Image
 
         Image.fromarray(floats).save(stream, "TIFF", **_resolution(pixel_mm))
-    return _replace(path, stream.getvalue())
+    return stream.getvalue()
 
 
 def _extension(path: str | os.PathLike[str], known: tuple[str, ...], what: str) -> str:

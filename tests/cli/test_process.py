@@ -104,3 +104,24 @@ def test_an_interrupt_leaves_nothing(number: signal.Signals, tmp_path: Path) -> 
     assert (process.returncode, output) == (130, "")
     assert errors == "clrecon: error: interrupted\n"
     assert list(tmp_path.iterdir()) == []
+
+
+def test_pillow_is_hidden_from_all_but_what_makes_pictures(tmp_path: Path) -> None:
+    write_series(tmp_path / "ct")
+    told = "import sys; print(sys.modules.get('PIL') is not None)"
+    code = f"import atexit; from clrecon.cli import main; atexit.register(lambda: exec({told!r})); main.run()"
+    root = Path(__file__).resolve().parents[2]
+    found = []
+    for command in (["info"], ["render", "-o", str(tmp_path / "a.png"), "--size", "32", "-q"]):
+        done = subprocess.run(
+            [sys.executable, "-c", code, *command, str(tmp_path / "ct")],
+            env={**os.environ, "PYTHONPATH": str(root)},
+            capture_output=True,
+            text=True,
+            timeout=120,
+        )
+        found.append((done.returncode, done.stdout.splitlines()[-1]))
+    if found[1][0] == 5:
+        pytest.skip("no OpenCL device")
+    assert found == [(0, "False"), (0, "True")]
+    assert (tmp_path / "a.png").stat().st_size > 100

@@ -13,7 +13,7 @@ from house import ROOT
 DOCUMENTS = [
     "README.md", "CONTRIBUTING.md", "CHANGELOG.md", "docs/contract.md", "docs/iso_value.md", "docs/geometry.md",
     "docs/certificate.md", "docs/formats.md", "docs/labels.md", "docs/calibration.md", "docs/transfer_functions.md",
-    "docs/slices.md",
+    "docs/slices.md", "docs/rendering.md",
 ]  # fmt: skip
 LINK = re.compile(r"\[[^\]]*\]\(([^)#\s]+)[^)]*\)")
 QUOTED = re.compile(r"`((?:\.ci|cl|clrecon|docs|scripts|tests)/[\w./-]*|(?:setup\.cfg|\w+\.(?:md|toml)))`")
@@ -69,10 +69,10 @@ def test_a_missing_file_is_found() -> None:
 
 def test_the_commands_of_documents_are_understood() -> None:
     commands = find_commands((ROOT / "README.md").read_text(encoding="utf-8"))
-    assert {command[0] for command in commands} >= {"demo", "mesh", "info", "devices", "phantom", "selftest"}
+    assert {command[0] for command in commands} >= {"demo", "mesh", "render", "info", "devices", "phantom", "selftest"}
     more = find_commands((ROOT / "docs" / "certificate.md").read_text(encoding="utf-8"))
     assert [command[0] for command in more] == ["phantom", "info"]
-    for name in ("formats", "iso_value", "labels"):
+    for name in ("formats", "iso_value", "labels", "rendering"):
         found = find_commands((ROOT / "docs" / f"{name}.md").read_text(encoding="utf-8"))
         assert found
         more += found

@@ -6,8 +6,10 @@ import json
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import tolerances
+from PIL import Image
 
 from clrecon.errors import DeviceError, NoSurfaceError, OutputError, UsageError
 from clrecon.phantom import PhantomSettings, write_phantom
@@ -110,11 +112,15 @@ def test_demo_writes_and_replaces(device: Any, tmp_path: Path) -> None:
     first = make_demo(folder, str(device.index))
     (folder / "report.json").write_text("{}")
     second = make_demo(folder, str(device.index))
-    assert sorted(path.name for path in folder.iterdir()) == ["bone.stl", "ct", "report.json"]
+    assert sorted(path.name for path in folder.iterdir()) == ["bone.png", "bone.stl", "ct", "report.json"]
     report = json.loads((folder / "report.json").read_text())
     assert report["triangles"] == first["mesh"]["triangles"] == second["mesh"]["triangles"] > 100_000
     assert (report["closed"], report["manifold"]) == (True, True)
     assert first["affine_error_mm"] < 1e-6
+    with Image.open(folder / "bone.png") as picture:
+        pixels = np.asarray(picture)
+    assert pixels.shape == (1024, 1024, 4) and 0.05 < (pixels[..., :3].max(axis=-1) > 60).mean() < 0.5
+    assert second["picture"]["pictures"][0]["output"]["bytes"] == (folder / "bone.png").stat().st_size
     check = first["check"]
     assert check["volume_ml"] == pytest.approx(check["true_volume_ml"], rel=tolerances.PHANTOM_SPHERE_VOLUME_SHARE)
     assert check["radius_error_max_mm"] < 0.15 * max(check["spacing_mm"])

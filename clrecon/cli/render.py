@@ -1,0 +1,161 @@
+"""``clrecon render``: a CT series in, pictures out."""
+
+from __future__ import annotations
+
+import argparse
+from typing import Any
+
+from clrecon.cli.common import add_device, add_memory, megabytes
+from clrecon.cli.console import Console, printable
+from clrecon.cli.masking import add_masking, masking_settings
+from clrecon.cli.mesh import describe_volume
+from clrecon.cli.reading import add_reading, reading_settings
+from clrecon.cli.render_options import (
+    add_camera,
+    add_curve,
+    add_labels,
+    add_looks,
+    add_motion,
+    add_region,
+    render_settings,
+)
+from clrecon.pipeline.render_modes import MODES
+
+__all__ = ["add_arguments", "run"]
+
+_PARTS = ("read", "mask", "render", "turntable", "write")
+_EXAMPLES = """\
+examples:
+  clrecon render CT_FOLDER -o bone.png
+  clrecon render CT_FOLDER -o spine.png --preset spine --view 30,15 --letters --scale-bar
+  clrecon render CT_FOLDER -o xray.png --preset x-ray --view left
+  clrecon render CT_FOLDER -o skull.png --iso 300 --light 1,-1,1 --shadows --background white
+  clrecon render CT_FOLDER -o slice.png --mode slice --view axial,coronal,sagittal --window -450,1050
+  clrecon render CT_FOLDER -o spine.png --curve auto
+  clrecon render CT_FOLDER --turntable bone.mp4"""
+
+
+def _epilog() -> str:
+    from clrecon.pipeline.render_settings import describe_presets  # numpy: not wanted by other commands
+
+    described = describe_presets()
+    width = max(map(len, (*MODES, *described)))
+    return "\n".join(
+        (
+            "modes:",
+            *(f"  {name:<{width}}  {text}" for name, text in MODES.items()),
+            "",
+            "presets:",
+            *(f"  {name:<{width}}  {text}" for name, text in described.items()),
+            "",
+            "The patient's left is at the right of an anterior view. Every file is written as a whole or not at all.",
+            "",
+            _EXAMPLES,
+        )
+    )
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of the command."""
+    parser.epilog = _epilog()
+    parser.add_argument(
+        "input",
+        metavar="INPUT",
+        help="DICOM folder (subfolders and any file names are fine) or file; or a NIfTI, NRRD or MetaImage file",
+    )
+    parser.add_argument(
+        "-o", "--output", metavar="OUT", help="picture: .png, .jpg or .tif; may be left out with --turntable"
+    )
+    add_looks(parser)
+    add_camera(parser)
+    add_region(parser)
+    add_curve(parser)
+    add_labels(parser)
+    add_motion(parser)
+    add_reading(parser)
+    add_masking(parser)
+    device = parser.add_argument_group("device")
+    add_device(device)
+    add_memory(device)
+    device.add_argument("--report", metavar="FILE", help="write camera, settings, certificate, device, times as JSON")
+
+
+def run(options: argparse.Namespace, console: Console) -> int:
+    """Run the command; returns the exit code."""
+    from clrecon.pipeline.pictures import PictureFiles
+    from clrecon.pipeline.render import make_pictures
+    from clrecon.pipeline.render_settings import RenderSettings
+
+    files = PictureFiles(options.output, options.depth, options.values, options.turntable, options.report)
+    settings = RenderSettings(
+        **render_settings(options),
+        **reading_settings(options),
+        **masking_settings(options),
+        device=options.device,
+        memory=options.memory,
+    )
+    report = make_pictures(options.input, files, settings, progress=console.progress)
+    console.result(report)
+    for line in describe_report(report):
+        console.say(line)
+    for line in _describe_files(report, files):
+        console.say(line)
+    for warning in report["warnings"]:
+        console.warn(warning)
+    return 0
+
+
+def describe_report(report: dict[str, Any]) -> list[str]:
+    """The report for people: what was read, what it shows, on which device, in which time."""
+    return [
+        f"input    {describe_volume(report['volume'])}",
+        f"picture  {_describe_look(report)}",
+        *(f"         {line}" for line in map(_describe_picture, report["pictures"])),
+        f"device   {printable(report['device'])}",
+        f"time     {_describe_times(report['seconds'])}",
+    ]
+
+
+def _describe_look(report: dict[str, Any]) -> str:
+    parts = [f"mode {report['mode']}"]
+    if report["preset"]:
+        parts.append(f"preset {report['preset']}")
+    elif report["transfer_function"]:
+        parts.append("transfer function as given")
+    if report["iso_value_hu"] is not None:
+        parts.append(f"{report['iso_value_hu']:g} HU")
+    if report["thickness_mm"]:
+        parts.append(f"{report['combine']} of {report['thickness_mm']:g} mm")
+    if report["turntable"]:
+        turn = report["turntable"]
+        parts.append(f"{turn['frames']} frames over {turn['degrees']:g} degrees, {turn['seconds_a_frame']:.3f} s each")
+    return ", ".join(parts)
+
+
+def _describe_picture(picture: dict[str, Any]) -> str:
+    width, height = picture["size"]
+    scale = f"{picture['pixel_mm']:.4g} mm a pixel" if picture["pixel_mm"] else "perspective"
+    window = picture["window_hu"]
+    shown = f", {window[0]:g} to {window[1]:g} HU" if window else ""
+    return f"{picture['view']}: {width} x {height}, {scale}{shown}"
+
+
+def _describe_files(report: dict[str, Any], files: Any) -> list[str]:
+    from clrecon.pipeline.pictures import path_of
+
+    lines = []
+    for what, path in (("output", files.picture), ("depth_output", files.depth), ("values_output", files.values)):
+        for picture in report["pictures"]:
+            if path is not None and what in picture:
+                named = path_of(path, picture["name"] or "")
+                lines.append(f"wrote    {printable(named)}, {megabytes(picture[what]['bytes'])}")
+    if report["turntable"]:
+        lines.append(f"wrote    {printable(files.turntable)}, {megabytes(report['turntable']['output']['bytes'])}")
+    if files.report:
+        lines.append(f"report   {printable(files.report)}")
+    return lines
+
+
+def _describe_times(seconds: dict[str, float]) -> str:
+    parts = ", ".join(f"{part} {seconds[part]:.2f}" for part in _PARTS if seconds.get(part, 0.0) >= 0.005)
+    return f"{seconds['total']:.2f} s ({parts})"

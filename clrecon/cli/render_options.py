@@ -1,0 +1,249 @@
+"""The options of ``clrecon render`` by what they are about, and the settings that they make."""
+
+from __future__ import annotations
+
+import argparse
+from typing import TYPE_CHECKING, Any
+
+from clrecon.cli.render_values import (
+    parse_clip_box,
+    parse_clip_plane,
+    parse_direction,
+    parse_label_color,
+    parse_label_opacity,
+    parse_light,
+    parse_picture_size,
+    parse_slices,
+    parse_views,
+    parse_window,
+)
+from clrecon.errors import UsageError
+from clrecon.pipeline.render_modes import MODES, VIEWS
+
+if TYPE_CHECKING:
+    from clrecon.pipeline.render_settings import LabelLook, Turntable
+
+__all__ = [
+    "add_camera",
+    "add_curve",
+    "add_labels",
+    "add_looks",
+    "add_motion",
+    "add_region",
+    "label_look",
+    "render_settings",
+    "turntable",
+]
+
+_FRAMES, _FPS, _DEGREES, _ANGLE = 100, 25.0, 360.0, 30.0
+
+_SETTINGS = (
+    "mode", "preset", "transfer_function", "window", "up", "zoom", "size", "ray_step", "light", "shadows", "jitter",
+    "clip_box", "background", "color", "depth_cue", "slices", "slice_opacity", "letters", "scale_bar", "caption",
+    "thickness", "combine", "curve", "cpr",
+)  # fmt: skip
+"""Options that are settings of the same name."""
+
+
+def add_looks(parser: argparse.ArgumentParser) -> None:
+    """Add what a picture shows, and in which colours."""
+    group = parser.add_argument_group("what is shown")
+    group.add_argument("--mode", metavar="M", help=f"one of: {', '.join(MODES)} (default: what the other options ask)")
+    group.add_argument("--preset", metavar="NAME", help="colours, opacities, light and mode by tissue (default: bone)")
+    group.add_argument(
+        "--transfer-function",
+        metavar="FILE[:NAME]",
+        help="colours and opacities by HU from a file of clrecon, 3D Slicer or ParaView, see docs/rendering.md",
+    )
+    group.add_argument(
+        "--iso",
+        dest="iso_value",
+        type=float,
+        metavar="HU",
+        help="iso value of mode surface, inside is HU and above (default: 200)",
+    )
+    group.add_argument("--color", metavar="C", help="colour of a surface, such as orange or #ff8000 (default: bone)")
+    group.add_argument(
+        "--window", type=parse_window, metavar="LOW,HIGH", help="HU that are black and white, of modes that show HU"
+    )
+    group.add_argument(
+        "--ray-step", type=float, metavar="MM", help="way between samples (default: half the smallest spacing)"
+    )
+    group.add_argument(
+        "--light",
+        type=parse_light,
+        metavar="L",
+        help="head: a light at the camera; a side of the patient, or X,Y,Z in LPS: a light that stays where it is;"
+        " none: colours as they are (default: what the preset says)",
+    )
+    group.add_argument(
+        "--depth-cue", type=float, metavar="SHARE", help="of its brightness, which a surface loses with the distance"
+    )
+    group.add_argument("--shadows", action="store_true", help="shadows on a surface; wants a light beside the camera")
+    group.add_argument(
+        "--jitter", action="store_true", help="begin each ray at a place of its own: grain in place of rings"
+    )
+
+
+def add_camera(parser: argparse.ArgumentParser) -> None:
+    """Add where a picture is taken from, and what surrounds what it shows."""
+    group = parser.add_argument_group("camera and picture")
+    group.add_argument(
+        "--view",
+        type=parse_views,
+        metavar="V[,V...]|AZ,EL",
+        action="append",
+        default=[],
+        help=f"where the camera stands: {', '.join(VIEWS)}; or degrees from anterior to the patient's left and to the"
+        " head; of slices also axial, coronal, sagittal; several make a picture each: out_left.png"
+        " (default: anterior)",
+    )
+    group.add_argument(
+        "--up", type=parse_direction, metavar="SIDE|X,Y,Z", help="what is at the top (default: superior, else anterior)"
+    )
+    group.add_argument("--zoom", type=float, default=1.0, metavar="F", help="2 shows everything twice as large")
+    group.add_argument(
+        "--size", type=parse_picture_size, metavar="W[xH]", help="pixels of the picture (default: 1024x1024)"
+    )
+    group.add_argument(
+        "--perspective",
+        type=float,
+        nargs="?",
+        const=_ANGLE,
+        metavar="DEGREES",
+        help=f"perspective of so many degrees from bottom to top ({_ANGLE:g} without a number; default: parallel)",
+    )
+    group.add_argument(
+        "--background", default="black", metavar="C", help="colour, such as white or #102030, or transparent"
+    )
+    group.add_argument("--letters", action="store_true", help="draw the sides of the patient: L, R, A, P, S, I")
+    group.add_argument("--scale-bar", action="store_true", help="draw a bar of a round length in mm")
+    group.add_argument("--caption", metavar="TEXT", help="draw a line of text at the top left")
+    group.add_argument("--depth", metavar="FILE", help="write mm along the ray to the first hit: .npy or .tif, float32")
+    group.add_argument("--values", metavar="FILE", help="write the HU of modes that show HU: .npy or .tif, float32")
+
+
+def add_region(parser: argparse.ArgumentParser) -> None:
+    """Add what part of space is shown."""
+    group = parser.add_argument_group("clipping, in mm of the patient (LPS)")
+    group.add_argument(
+        "--clip-box", type=parse_clip_box, metavar="X0,X1,Y0,Y1,Z0,Z1", help="keep a box; a side left empty is open"
+    )
+    group.add_argument(
+        "--clip",
+        type=parse_clip_plane,
+        metavar="PX,PY,PZ,NX,NY,NZ",
+        action="append",
+        default=[],
+        help="keep the side of a plane through a point that a normal points to; may be given again",
+    )
+
+
+def add_curve(parser: argparse.ArgumentParser) -> None:
+    """Add the options of slices, in space and alone, and of curved reformations."""
+    group = parser.add_argument_group("slices and curved reformations")
+    group.add_argument("--thickness", type=float, default=0.0, metavar="MM", help="of the slab (default: 0, a plane)")
+    group.add_argument("--combine", metavar="HOW", help="mean, max or min of a slab (default: mean)")
+    group.add_argument(
+        "--offset", type=float, default=0.0, metavar="MM", help="move the slice away from the camera by so much"
+    )
+    group.add_argument(
+        "--slices",
+        type=parse_slices,
+        metavar="N|K,K,...",
+        help="of mode slices: every N-th, or with a comma those numbers, from 0 (default: about twelve)",
+    )
+    group.add_argument("--slice-opacity", type=float, metavar="SHARE", help="of each of them (default: 0.5)")
+    group.add_argument(
+        "--curve",
+        metavar="FILE|auto",
+        help="centre line: a text, CSV or JSON file of points in LPS mm, or markups of 3D Slicer; auto: the spinal"
+        " canal, found in the scan",
+    )
+    group.add_argument("--cpr", metavar="KIND", help="straightened or stretched (default: straightened)")
+
+
+def add_labels(parser: argparse.ArgumentParser) -> None:
+    """Add labels that look different."""
+    group = parser.add_argument_group("labels")
+    group.add_argument(
+        "--labels", metavar="FILE", help="label map: NIfTI, NRRD (.seg.nrrd too), MetaImage or DICOM SEG"
+    )
+    group.add_argument(
+        "--label-color",
+        type=parse_label_color,
+        metavar="LABEL=COLOUR",
+        action="append",
+        default=[],
+        help="colour of a label, by name or number; may be given again",
+    )
+    group.add_argument(
+        "--label-opacity",
+        type=parse_label_opacity,
+        metavar="LABEL=SHARE",
+        action="append",
+        default=[],
+        help="factor on the opacity of a label, 0 to 1; may be given again",
+    )
+
+
+def add_motion(parser: argparse.ArgumentParser) -> None:
+    """Add the turntable."""
+    group = parser.add_argument_group("motion")
+    group.add_argument(
+        "--turntable", metavar="OUT", help="turn round the patient: .mp4, .gif, .apng, or a folder of PNG files"
+    )
+    group.add_argument("--frames", type=int, metavar="N", help=f"how many (default: {_FRAMES})")
+    group.add_argument("--fps", type=float, metavar="N", help=f"frames a second (default: {_FPS:g})")
+    group.add_argument("--degrees", type=float, metavar="D", help=f"how far, to the left (default: {_DEGREES:g})")
+
+
+def render_settings(options: argparse.Namespace) -> dict[str, Any]:
+    """What the options above say, as keywords of `RenderSettings`."""
+    return {
+        **{name: getattr(options, name) for name in _SETTINGS},
+        "iso_value": options.iso_value,
+        "views": tuple(view for views in options.view for view in views),
+        "view_angle": options.perspective,
+        "clip_planes": tuple(options.clip),
+        "offset_mm": options.offset,
+        "labels": label_look(options),
+        "turntable": turntable(options),
+    }
+
+
+def label_look(options: argparse.Namespace) -> LabelLook | None:
+    """What the options of labels say, None without a label map.
+
+    Raises
+    ------
+    UsageError
+        An option that means something with a label map only.
+    """
+    if options.labels is not None:
+        from clrecon.pipeline.render_settings import LabelLook
+
+        return LabelLook(options.labels, dict(options.label_color), dict(options.label_opacity))
+    for option, given in (("--label-color", options.label_color), ("--label-opacity", options.label_opacity)):
+        if given:
+            raise UsageError(f"{option} says how a label looks: give the label map with --labels FILE")
+    return None
+
+
+def turntable(options: argparse.Namespace) -> Turntable | None:
+    """What the options of motion say, None without any.
+
+    Raises
+    ------
+    UsageError
+        An option that means something with a turntable only.
+    """
+    given = {name: getattr(options, name) for name in ("frames", "fps", "degrees")}
+    given = {name: value for name, value in given.items() if value is not None}
+    if options.turntable is not None:
+        from clrecon.pipeline.render_settings import Turntable
+
+        return Turntable(**given)
+    if given:
+        raise UsageError(f"--{next(iter(given))} says how a picture moves: name it with --turntable OUT")
+    return None

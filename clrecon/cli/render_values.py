@@ -1,0 +1,115 @@
+"""What the options of ``clrecon render`` may say."""
+
+from __future__ import annotations
+
+import argparse
+import math
+
+__all__ = [
+    "parse_clip_box",
+    "parse_clip_plane",
+    "parse_direction",
+    "parse_label_color",
+    "parse_label_opacity",
+    "parse_light",
+    "parse_picture_size",
+    "parse_slices",
+    "parse_views",
+    "parse_window",
+]
+
+
+def _numbers(text: str, count: int, form: str) -> tuple[float, ...]:
+    """So many numbers with commas between them."""
+    try:
+        values = tuple(float(part) for part in text.split(","))
+    except ValueError:
+        values = ()
+    if len(values) != count:
+        raise argparse.ArgumentTypeError(f"{text!r} is not {form}")
+    return values
+
+
+def parse_picture_size(text: str) -> tuple[int, int]:
+    """Read ``512`` or ``512x384`` as width and height."""
+    parts = text.lower().split("x")
+    try:
+        width, height = (int(part) for part in (parts if len(parts) == 2 else (*parts, *parts)))
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} is no size in pixels: write it as 1024 or 1024x768") from None
+    return width, height
+
+
+def parse_views(text: str) -> tuple[str, ...]:
+    """Read ``left``, ``anterior,left,posterior`` or ``AZ,EL``: names or one pair of angles."""
+    parts = tuple(part.strip().lower() for part in text.split(","))
+    if any(part[:1].isalpha() for part in parts):
+        return parts
+    return (",".join(parts),)
+
+
+def parse_direction(text: str) -> str | tuple[float, ...]:
+    """Read a name, or ``X,Y,Z``."""
+    return _numbers(text, 3, "a side of the patient, nor a direction X,Y,Z in LPS") if "," in text else text.lower()
+
+
+def parse_light(text: str) -> str | tuple[float, ...]:
+    """Read ``head``, ``none``, a side of the patient, or ``X,Y,Z``."""
+    return parse_direction(text)
+
+
+def parse_window(text: str) -> tuple[float, ...]:
+    """Read ``LOW,HIGH`` in HU."""
+    return _numbers(text, 2, "a window: the HU that are black and white, LOW,HIGH, such as -450,1050")
+
+
+def parse_clip_box(text: str) -> tuple[float, ...]:
+    """Read ``X0,X1,Y0,Y1,Z0,Z1`` in LPS mm; what is left empty is open."""
+    parts = text.split(",")
+    try:
+        values = tuple(
+            float(part) if part.strip() else (math.inf if place % 2 else -math.inf) for place, part in enumerate(parts)
+        )
+    except ValueError:
+        values = ()
+    if len(values) != 6:
+        raise argparse.ArgumentTypeError(
+            f"{text!r} is no box: X0,X1,Y0,Y1,Z0,Z1 in LPS mm, a side that stays open empty, such as ,,-50,20,,"
+        )
+    return values
+
+
+def parse_clip_plane(text: str) -> tuple[float, ...]:
+    """Read ``PX,PY,PZ,NX,NY,NZ``: a point in LPS mm and a normal."""
+    return _numbers(text, 6, "a plane: a point in LPS mm and the direction of the side that stays, PX,PY,PZ,NX,NY,NZ")
+
+
+def parse_slices(text: str) -> int | tuple[int, ...]:
+    """Read ``N``, every N-th slice, or ``K,K,...``: those numbers; a comma at the end makes a single number one."""
+    try:
+        numbers = tuple(int(part) for part in text.split(",") if part.strip())
+    except ValueError:
+        numbers = ()
+    if not numbers:
+        raise argparse.ArgumentTypeError(f"{text!r} is no number N (every N-th slice) and no list of slices K,K,...")
+    return numbers if "," in text else numbers[0]
+
+
+def parse_label_color(text: str) -> tuple[str, str]:
+    """Read ``LABEL=COLOUR``."""
+    label, _, color = text.rpartition("=")
+    if not label or not color:
+        raise argparse.ArgumentTypeError(f"{text!r} is not LABEL=COLOUR, such as L2=red or 20=#ff8000")
+    return label, color
+
+
+def parse_label_opacity(text: str) -> tuple[str, float]:
+    """Read ``LABEL=OPACITY``."""
+    label, _, number = text.rpartition("=")
+    try:
+        opacity = float(number)
+    except ValueError:
+        opacity = math.nan
+    if not label or math.isnan(opacity):
+        raise argparse.ArgumentTypeError(f"{text!r} is not LABEL=OPACITY, such as L2=0.2")
+    return label, opacity

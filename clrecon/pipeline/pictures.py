@@ -1,0 +1,163 @@
+"""The files of a picture job: what they are called, that they can be written, and writing them as a whole."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, BinaryIO
+
+from clrecon.errors import UsageError
+from clrecon.pipeline.outputs import check_distinct
+from clrecon.pipeline.render_modes import find_misplaced
+from clrecon.pipeline.render_settings import RenderSettings
+
+if TYPE_CHECKING:
+    from clrecon.files import StagedFile
+    from clrecon.rendering import Rendering
+
+__all__ = ["PictureFiles", "check_pictures", "format_of", "name_view", "path_of", "stage_picture"]
+
+OPAQUE_ONLY = (".jpg", ".jpeg", ".mp4", ".gif")
+
+
+@dataclass(frozen=True)
+class PictureFiles:
+    """Where the outputs of a job go; with several views each file of a picture gets a name of its own.
+
+    Parameters
+    ----------
+    picture : path, optional
+        .png, .jpg or .tif.
+    depth, values : path, optional
+        .npy or .tif: mm to the first hit, HU.
+    turntable : path, optional
+        See `clrecon.rendering.motion.check_animation`.
+    report : path, optional
+        JSON.
+
+    Raises
+    ------
+    UsageError
+        There is nothing to write, or depths and values without a picture.
+    """
+
+    picture: str | Path | None = None
+    depth: str | Path | None = None
+    values: str | Path | None = None
+    turntable: str | Path | None = None
+    report: str | Path | None = None
+
+    def __post_init__(self) -> None:
+        if self.picture is None and self.turntable is None:
+            raise UsageError("there is nothing to write: name a picture (-o out.png) or a turntable (--turntable)")
+        if self.picture is None and (self.depth is not None or self.values is not None):
+            raise UsageError("depths and values belong to a picture: name it too (-o out.png)")
+
+
+def name_view(view: str, views: Sequence[str]) -> str:
+    """What stands between the stem of a file and its extension: nothing for a single view.
+
+    Returns
+    -------
+    str
+        The view's own name, or ``az30_el-15`` for angles.
+    """
+    if len(views) == 1:
+        return ""
+    azimuth, comma, elevation = view.strip().lower().partition(",")
+    return f"az{float(azimuth):g}_el{float(elevation):g}" if comma else azimuth
+
+
+def path_of(path: str | Path, name: str) -> str | Path:
+    """``out.png`` and ``left`` make ``out_left.png``; an empty name changes nothing."""
+    stem, extension = os.path.splitext(os.fspath(path))
+    return f"{stem}_{name}{extension}" if name else path
+
+
+def format_of(path: str | Path) -> str:
+    """Extension of a file in lower case, without its dot; empty for a folder."""
+    return os.path.splitext(os.fspath(path))[1].lower().lstrip(".")
+
+
+def check_pictures(files: PictureFiles, settings: RenderSettings) -> None:
+    """Refuse outputs that cannot be written, before any work is done.
+
+    Raises
+    ------
+    UsageError
+        An unknown extension, two outputs that are one file, a format that cannot hold what is asked of it, no encoder
+        for a moving picture, or Pillow is not installed.
+    OutputError
+        A folder is missing or cannot be written to, or a target is no regular file.
+    """
+    from clrecon.files import check_writable
+    from clrecon.rendering.image_files import check_float_path, check_image_path
+    from clrecon.rendering.motion import check_animation
+    from clrecon.rendering.pillow import load_pillow
+
+    load_pillow()
+    given = {name for name in ("depth", "values") if getattr(files, name) is not None}
+    misplaced = find_misplaced(settings.mode_used, given)
+    if misplaced:
+        raise UsageError(misplaced)
+    if settings.background == "transparent":
+        for path in (files.picture, files.turntable):
+            if path is not None and f".{format_of(path)}" in OPAQUE_ONLY:
+                raise UsageError(
+                    f"{format_of(path).upper()} cannot hold a transparent background:"
+                    " choose PNG, TIFF or APNG, or a colour (--background)"
+                )
+    of_views = {"the picture": files.picture, "the depths": files.depth, "the values": files.values}
+    owned: list[tuple[str, str | Path]] = [] if files.report is None else [("the report", files.report)]
+    for what, path in of_views.items():
+        if path is not None:
+            (check_image_path if what == "the picture" else check_float_path)(path)
+            names = [name_view(view, settings.views_used) for view in settings.views_used]
+            owned += [(f"{what} {name}".rstrip(), path_of(path, name)) for name in names]
+    moving = [] if files.turntable is None else [("the turntable", files.turntable)]
+    check_distinct(owned, moving)
+    for _, path in owned:
+        check_writable(path)
+    if files.turntable is not None and settings.turntable is not None:
+        check_animation(files.turntable, settings.turntable.fps)
+
+
+def stage_picture(
+    stack: ExitStack, picture: Rendering, files: PictureFiles, name: str
+) -> dict[str, tuple[str | Path, StagedFile]]:
+    """Write a picture, and its depths and values where they are asked for, under temporary names.
+
+    Returns
+    -------
+    dict
+        ``output`` and, where there is one, ``depth_output`` and ``values_output``: the path and the staged file.
+
+    Raises
+    ------
+    OutputError
+        One of them cannot be written; all older files are intact.
+    """
+    from clrecon.files import stage_file
+    from clrecon.rendering.image_files import encode_floats, encode_image
+
+    def stage(path: str | Path, content: bytes) -> tuple[str | Path, StagedFile]:
+        def write(stream: BinaryIO) -> None:
+            stream.write(content)
+
+        named = path_of(path, name)
+        return named, stack.enter_context(stage_file(named, write, expected_bytes=len(content)))
+
+    assert files.picture is not None
+    staged = {"output": stage(files.picture, encode_image(picture, f".{format_of(files.picture)}"))}
+    if files.depth is not None:
+        staged["depth_output"] = stage(
+            files.depth, encode_floats(picture.depth, f".{format_of(files.depth)}", picture.pixel_mm)
+        )
+    if files.values is not None and picture.values is not None:
+        staged["values_output"] = stage(
+            files.values, encode_floats(picture.values, f".{format_of(files.values)}", picture.pixel_mm)
+        )
+    return staged

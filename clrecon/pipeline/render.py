@@ -1,0 +1,188 @@
+"""The picture job: a CT series in, pictures and moving pictures out, with their report."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import ExitStack
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from clrecon.errors import UsageError
+from clrecon.pipeline.masking import mask_volume
+from clrecon.pipeline.opening import DeviceOpening
+from clrecon.pipeline.outputs import commit_all
+from clrecon.pipeline.pictures import PictureFiles, check_pictures, format_of, name_view, stage_picture
+from clrecon.pipeline.progress import Progress, Stopwatch, ignore_progress
+from clrecon.pipeline.render_report import describe_picture, describe_pictures, warn_of_picture
+from clrecon.pipeline.render_settings import RenderSettings
+from clrecon.pipeline.report import peak_memory_bytes, stage_report
+from clrecon.pipeline.studio import Studio, read_curve, read_function, read_look
+
+if TYPE_CHECKING:
+    from clrecon.files import StagedFile
+    from clrecon.geometry import Volume
+    from clrecon.opencl import Device
+    from clrecon.rendering import Rendering
+
+__all__ = ["make_pictures"]
+
+
+def make_pictures(
+    source: str | Path,
+    files: PictureFiles,
+    settings: RenderSettings | None = None,
+    *,
+    progress: Progress | None = None,
+) -> dict[str, Any]:
+    """Read a CT series and take the pictures that are asked for.
+
+    Outputs that cannot be written are refused first, then files that say how (transfer function, centre line), then a
+    device that is not there, then the input.  Pictures are written under temporary names and renamed when all are
+    done, the turntable among them; the report comes last, as the commit mark.
+
+    Parameters
+    ----------
+    source : path
+        DICOM folder or file, or a file of another format, see `clrecon.reading.read_volume`.
+    files : PictureFiles
+    settings : RenderSettings, optional
+    progress : callable, optional
+        ``progress(stage, done, total)``.
+
+    Returns
+    -------
+    dict
+        The report, see `clrecon.pipeline.render_report.describe_pictures`; with ``seconds`` and
+        ``peak_memory_bytes``.
+
+    Raises
+    ------
+    UsageError, OutputError, DeviceError, NoDicomError, RefusedInputError
+        No picture is written then, and older files are intact.
+    """
+    settings = settings or RenderSettings()
+    progress = progress or ignore_progress
+    if (files.turntable is None) != (settings.turntable is None):
+        raise UsageError("a turntable needs both: where it goes, and how it turns")
+    watch = Stopwatch()
+    check_pictures(files, settings)
+    function = read_function(settings.transfer_function)
+    curve = read_curve(settings.curve)
+
+    progress("device", 0, 0)
+    with DeviceOpening(settings.device, partial(_prepare, settings=settings)) as opening:
+        labels = read_look(settings.labels)
+        volume = _read(source, settings, progress)
+        watch.lap("read")
+        device = opening.wait()
+        watch.lap("device")
+    volume = mask_volume(volume, settings, progress)
+    watch.lap("mask")
+
+    studio = Studio(volume, device, settings, function=function, curve=curve, labels=labels, progress=progress)
+    with studio, ExitStack() as staged:  # all files are on the disk before any replaces an older one
+        pictures, written = _take_views(studio, settings, files, staged, watch, progress)
+        turntable = _turn(studio, volume, settings, files, watch, progress)
+        report = describe_pictures(volume, settings, studio, device, pictures, turntable)
+        report["seconds"] = _seconds(watch)
+        report["peak_memory_bytes"] = peak_memory_bytes()
+        if files.report is not None:
+            written.append(staged.enter_context(stage_report(files.report, report)))
+        commit_all(written)
+    return report
+
+
+def _prepare(device: Device, settings: RenderSettings) -> None:
+    """Build the kernels for int16, by a small picture of nothing."""
+    import numpy as np
+
+    from clrecon.geometry import Volume
+
+    nothing = Volume(np.zeros((2, 2, 2), np.int16), np.eye(4))
+    mode = "slice" if settings.mode_used == "cpr" else settings.mode_used  # the same kernel, and no curve is needed
+    with Studio(nothing, device, RenderSettings(mode, size=(8, 8), iso_value=0.0 if mode == "surface" else None),
+                progress=ignore_progress) as studio:  # fmt: skip
+        studio.take_view("anterior")
+
+
+def _read(source: str | Path, settings: RenderSettings, progress: Progress) -> Volume:
+    from clrecon.reading import read_volume
+
+    return read_volume(
+        source,
+        settings.series,
+        phase=settings.phase,
+        allow_gaps=settings.allow_gaps,
+        force=settings.force,
+        progress=progress,
+    )
+
+
+def _take_views(
+    studio: Studio,
+    settings: RenderSettings,
+    files: PictureFiles,
+    staged: ExitStack,
+    watch: Stopwatch,
+    progress: Progress,
+) -> tuple[list[dict[str, Any]], list[StagedFile]]:
+    """Take the picture of each view and write it under a temporary name; returns what the report says of them."""
+    pictures: list[dict[str, Any]] = []
+    written: list[StagedFile] = []
+    if files.picture is None:
+        return pictures, written
+    views = settings.views_used
+    for place, view in enumerate(views):
+        progress("render", place, len(views) if len(views) > 1 else 0)
+        picture = studio.take_view(view)
+        watch.lap("render")
+        name = name_view(view, views)
+        own = stage_picture(staged, picture, files, name)
+        outputs = {what: {"format": format_of(path), "bytes": file.size} for what, (path, file) in own.items()}
+        pictures.append(describe_picture(picture, name, view) | outputs)
+        studio.warnings += warn_of_picture(picture)
+        written += [file for _, file in own.values()]
+        watch.lap("write")
+    return pictures, written
+
+
+def _turn(
+    studio: Studio,
+    volume: Volume,
+    settings: RenderSettings,
+    files: PictureFiles,
+    watch: Stopwatch,
+    progress: Progress,
+) -> dict[str, Any] | None:
+    """Write the turntable, frame by frame; returns what the report says of it."""
+    turn = settings.turntable
+    if files.turntable is None or turn is None:
+        return None
+    from clrecon.rendering.motion import turntable_cameras, write_animation
+
+    first = settings.camera(volume, settings.views_used[0], turning=True)
+    cameras = turntable_cameras(first, turn.frames, turn.degrees)
+
+    def frames() -> Iterator[Rendering]:
+        for camera in cameras:
+            yield studio.take(camera)
+
+    progress("frames", 0, turn.frames)
+    size = write_animation(frames(), files.turntable, turn.fps, total=turn.frames, progress=progress)
+    seconds = watch.lap("turntable")
+    return {
+        "frames": turn.frames,
+        "fps": turn.fps,
+        "degrees": turn.degrees,
+        "seconds_a_frame": round(seconds / turn.frames, 4),
+        "output": {"format": format_of(files.turntable) or "folder", "bytes": size},
+    }
+
+
+def _seconds(watch: Stopwatch) -> dict[str, float]:
+    parts = ("device", "read", "mask", "render", "turntable", "write")
+    seconds = {part: watch.seconds.get(part, 0.0) for part in parts}
+    seconds["other"] = max(0.0, watch.total() - sum(seconds.values()))
+    seconds["total"] = watch.total()
+    return {part: round(value, 4) for part, value in seconds.items()}

@@ -1,0 +1,82 @@
+"""Modes of pictures, and which settings mean something in which."""
+
+from __future__ import annotations
+
+__all__ = ["MODES", "VIEWS", "find_misplaced"]
+
+MODES = {
+    "dvr": "volume rendering: every HU with the colour and opacity of a transfer function",
+    "mip": "the highest HU along each ray",
+    "minip": "the lowest HU along each ray",
+    "mean": "the mean HU along each ray, as a radiograph",
+    "surface": "the shaded surface at an iso value",
+    "slices": "slices of the scan in space, translucent, each where it lies",
+    "slice": "a plane through the volume in any direction, as thick as wanted",
+    "cpr": "curved planar reformation along a centre line",
+}
+"""Names, and what the pictures show."""
+
+VIEWS = ("anterior", "posterior", "left", "right", "superior", "inferior")
+
+_RAYS = ("dvr", "mip", "minip", "mean", "surface", "slices")
+
+_MODES_OF = {
+    "preset": ("dvr", "mip", "minip", "mean", "slices", "slice", "cpr"),
+    "zoom": (*_RAYS, "slice"),
+    "letters": (*_RAYS, "slice"),
+    "depth": ("dvr", "mip", "minip", "surface", "slices", "slice"),
+    "values": ("mip", "minip", "mean", "slice", "cpr"),
+    "turntable": _RAYS,
+}
+"""Settings that the renderer does not know; of all others it says itself in which modes they mean something."""
+
+_OPTIONS = {
+    "preset": "--preset",
+    "transfer_function": "--transfer-function",
+    "iso_value": "--iso",
+    "color": "--color",
+    "depth_cue": "--depth-cue",
+    "window": "--window",
+    "ray_step": "--ray-step",
+    "light": "--light",
+    "shadows": "--shadows",
+    "jitter": "--jitter",
+    "zoom": "--zoom",
+    "view_angle": "--perspective",
+    "clip_box": "--clip-box",
+    "clip_planes": "--clip",
+    "letters": "--letters",
+    "depth": "--depth",
+    "values": "--values",
+    "slices": "--slices",
+    "slice_opacity": "--slice-opacity",
+    "thickness": "--thickness",
+    "combine": "--combine",
+    "offset_mm": "--offset",
+    "curve": "--curve",
+    "cpr": "--cpr",
+    "labels": "--labels",
+    "turntable": "--turntable",
+}
+"""Settings, and the options of the command that give them."""
+
+_RENDERER_NAMES = {"light": "lighting", "clip_box": "clip", "clip_planes": "clip"}
+
+
+def find_misplaced(mode: str, given: set[str]) -> str | None:
+    """Say which of the settings `given` means nothing in a mode; None where all do.
+
+    Parameters
+    ----------
+    mode : str
+        One of `MODES`.
+    given : set of str
+        Names of settings that differ from what they are without being asked for, and of files of `PictureFiles`.
+    """
+    from clrecon.operators.renderer import KNOWN_IN  # numpy: not wanted before a job starts
+
+    for setting, option in _OPTIONS.items():
+        modes = _MODES_OF.get(setting) or KNOWN_IN[_RENDERER_NAMES.get(setting, setting)]
+        if setting in given and mode not in modes:
+            return f"{option} means nothing in mode {mode}: it belongs to {', '.join(modes)}"
+    return None

@@ -1,0 +1,171 @@
+"""What the report of a picture job says: of the whole job, and of each picture."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict
+from typing import TYPE_CHECKING, Any
+
+from clrecon.pipeline.description import SKIN_HU
+from clrecon.pipeline.render_settings import LabelLook, RenderSettings
+from clrecon.pipeline.report import platform_name
+from clrecon.version import package_version
+
+if TYPE_CHECKING:
+    from clrecon.geometry import Volume
+    from clrecon.geometry.camera import Camera
+    from clrecon.labels import LabelMap
+    from clrecon.opencl import Device
+    from clrecon.pipeline.studio import Studio
+    from clrecon.rendering import Rendering, TransferFunction
+
+__all__ = ["describe_camera", "describe_picture", "describe_pictures", "warn_of_picture"]
+
+FACE_WARNING = "a picture of the skin can show a face: treat the file as one that identifies the patient"
+
+
+def describe_camera(camera: Camera | None) -> dict[str, Any] | None:
+    """A camera as `Camera` takes it, LPS mm; None where the picture is no projection."""
+    if camera is None:
+        return None
+    return {
+        "position_lps_mm": list(camera.position),
+        "focal_point_lps_mm": list(camera.focal_point),
+        "up_lps": list(camera.up),
+        "view_angle_deg": camera.view_angle,
+        "parallel_scale_mm": camera.parallel_scale,
+    }
+
+
+def describe_picture(picture: Rendering, name: str, view: str) -> dict[str, Any]:
+    """One object of ``pictures``, all but the files; ranges are None where there is nothing to be measured."""
+    import numpy as np
+
+    made = picture.report
+    hit = np.isfinite(picture.depth)
+    return {
+        "name": name or None,
+        "view": view,
+        "size": list(picture.size),
+        "camera": describe_camera(picture.camera),
+        "pixel_mm": picture.pixel_mm,
+        "hit_share": float(hit.mean()) if picture.camera is not None else None,
+        "depth_mm": _range(picture.depth[hit]),
+        "values_hu": None if picture.values is None else _range(picture.values[np.isfinite(picture.values)]),
+        "window_hu": made.get("window_hu"),
+        "ray_step_mm": made.get("ray_step_mm"),
+        "slices": made.get("slices"),
+        "plane": made.get("plane"),
+        "curve": made.get("curve"),
+        "slabs": made.get("slabs", 1),
+        "seconds": made.get("seconds"),
+    }
+
+
+def warn_of_picture(picture: Rendering) -> list[str]:
+    """What is to be known of a picture before it is used."""
+    made = picture.report
+    warnings = [str(text) for text in made.get("warnings", [])]
+    found = (made.get("curve") or {}).get("found")
+    if found is not None:
+        warnings.append("the centre line is the spinal canal as it was found: look whether it is the canal")
+    return warnings
+
+
+def describe_pictures(
+    volume: Volume,
+    settings: RenderSettings,
+    studio: Studio,
+    device: Device,
+    pictures: Sequence[dict[str, Any]],
+    turntable: dict[str, Any] | None,
+) -> dict[str, Any]:
+    """Compose the report of a job, all but times and memory.
+
+    Parameters
+    ----------
+    volume : Volume
+    settings : RenderSettings
+    studio : Studio
+        With the transfer function and the light that were used, and the warnings of its pictures.
+    device : Device
+    pictures : sequence of dict
+        What `describe_picture` says of each, and its files.
+    turntable : dict, optional
+    """
+    certificate = dict(volume.report)
+    warnings = [str(text) for text in certificate.pop("warnings", [])] + studio.warnings
+    if _shows_skin(settings, studio.function):
+        warnings.append(FACE_WARNING)
+    lighting = studio.lighting
+    clip = settings.clip
+    return {
+        "affine_ijk_to_lps_mm": volume.affine.tolist(),
+        "mode": settings.mode_used,
+        "preset": settings.preset_used,
+        "transfer_function": _describe_function(studio.function),
+        "iso_value_hu": settings.iso_value_used,
+        "color": settings.color,
+        "depth_cue": settings.depth_cue,
+        "lighting": None if lighting is None else asdict(lighting),
+        "shadows": settings.shadows,
+        "jitter": settings.jitter,
+        "background": settings.background,
+        "clip_planes_lps_mm": [] if clip is None else clip.planes.tolist(),
+        "thickness_mm": settings.thickness if settings.mode_used in ("slice", "cpr") else None,
+        "combine": (settings.combine or "mean") if settings.thickness else None,
+        "offset_mm": settings.offset_mm if settings.mode_used == "slice" else None,
+        "labels": _describe_labels(settings.labels, studio.labels),
+        "pictures": list(pictures),
+        "turntable": turntable,
+        "device": device.label,
+        "driver": device.driver,
+        "memory_allowed_bytes": settings.memory,
+        "version": package_version(),
+        "platform": platform_name(),
+        "warnings": list(dict.fromkeys(warnings)),
+        "volume": certificate,
+    }
+
+
+def _describe_function(function: TransferFunction | None) -> dict[str, Any] | None:
+    if function is None:
+        return None
+    gradient = function.gradient_opacity
+    return {
+        "points": function.points.tolist(),
+        "unit_distance_mm": function.unit_distance,
+        "gradient_opacity": None if gradient is None else gradient.tolist(),
+    }
+
+
+def _describe_labels(look: LabelLook | None, labels: LabelMap | None) -> list[dict[str, Any]] | None:
+    """The labels that look different, called as files are: the map's own names can be anything."""
+    if look is None or labels is None:
+        return None
+    from clrecon.labels import file_suffixes
+
+    looks: dict[int, dict[str, Any]] = {}
+    for what, chosen in (("color", look.colors), ("opacity", look.opacities)):
+        for label, value in chosen.items():
+            looks.setdefault(labels.find(label), {})[what] = value
+    names = file_suffixes({number: labels.name(number) for number in looks})
+    return [
+        {"label_number": number, "label": names[number], "color": own.get("color"), "opacity": own.get("opacity")}
+        for number, own in sorted(looks.items())
+    ]
+
+
+def _shows_skin(settings: RenderSettings, function: TransferFunction | None) -> bool:
+    """True where something between air and fat is not transparent: the picture shows the outside of the body."""
+    import numpy as np
+
+    if settings.iso_value_used is not None:
+        return SKIN_HU[0] <= settings.iso_value_used <= SKIN_HU[1]
+    if settings.mode_used != "dvr" or function is None:
+        return False
+    return bool((function(np.linspace(*SKIN_HU, 751))[:, 3] > 0.0).any())
+
+
+def _range(values: Any) -> list[float] | None:
+    return [float(values.min()), float(values.max())] if values.size else None

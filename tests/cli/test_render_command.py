@@ -1,0 +1,441 @@
+"""``clrecon render``: what each option does to a picture, and what is said of what cannot be."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from ct_files import ORIGIN, PATIENT, SPACING, write_series
+from label_files import write_nifti
+from PIL import Image
+
+from clrecon.cli.main import main
+
+SHAPE_KJI = (17, 25, 31)
+BLOCK = (slice(11, 15), slice(3, 9), slice(22, 28))
+"""A block (k, j, i) near the patient's head, front and left: no two views of it are alike."""
+BLOCK_HU, AIR_HU = 1200, -1000
+ISO = 100
+SIDE = 64
+
+
+@pytest.fixture(scope="module")
+def ct(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    voxels = np.full(SHAPE_KJI, AIR_HU, np.int16)
+    voxels[BLOCK] = BLOCK_HU
+    return write_series(tmp_path_factory.mktemp("ct") / "scan", voxels)
+
+
+def lps(ijk: tuple[float, float, float]) -> np.ndarray:
+    return np.array(ORIGIN) + np.array(SPACING) * ijk
+
+
+class Renders:
+    """Runs the command on the block, 64 x 64 pixels, and returns the picture with its report."""
+
+    def __init__(self, ct: Path, folder: Path, device: Any, capsys: pytest.CaptureFixture[str]):
+        self.ct, self.folder, self.device, self.capsys = ct, folder, device, capsys
+
+    def code(self, *arguments: object) -> int:
+        given = [str(argument) for argument in arguments]
+        size = [] if "--size" in given else ["--size", str(SIDE)]
+        return main(["render", str(self.ct), *given, *size, "--device", str(self.device.index)])
+
+    def report(self, *arguments: object) -> dict[str, Any]:
+        assert self.code(*arguments, "--json") == 0, self.capsys.readouterr().err
+        report: dict[str, Any] = json.loads(self.capsys.readouterr().out)
+        return report
+
+    def __call__(self, *arguments: object, name: str = "a.png") -> tuple[np.ndarray, dict[str, Any]]:
+        report = self.report("-o", self.folder / name, *arguments)
+        return np.asarray(Image.open(self.folder / name)), report
+
+
+@pytest.fixture
+def render(ct: Path, tmp_path: Path, device: Any, capsys: pytest.CaptureFixture[str]) -> Renders:
+    return Renders(ct, tmp_path, device, capsys)
+
+
+def lit(image: np.ndarray) -> np.ndarray:
+    return np.asarray(image[..., :3].max(axis=-1) > 20)
+
+
+def side_of(mask: np.ndarray) -> tuple[str, str]:
+    """Where the middle of what is marked lies: left or right, top or bottom."""
+    rows, columns = np.nonzero(mask)
+    height, width = mask.shape
+    return (
+        "right" if columns.mean() > 0.5 * (width - 1) else "left",
+        "top" if rows.mean() < 0.5 * (height - 1) else "bottom",
+    )
+
+
+SEEN = {
+    "anterior": ("right", "top"),
+    "posterior": ("left", "top"),
+    "left": ("left", "top"),
+    "right": ("right", "top"),
+    "superior": ("left", "top"),
+    "inferior": ("right", "top"),
+    "0,0": ("right", "top"),
+    "90,0": ("left", "top"),
+    "-90,0": ("right", "top"),
+}
+
+
+@pytest.mark.parametrize("mode", [["--mode", "dvr"], ["--preset", "mip"], ["--iso", ISO]])
+def test_sides_of_the_patient_are_where_they_should_be(mode: list[Any], render: Renders) -> None:
+    for view, expected in SEEN.items():
+        image, report = render(*mode, "--view", view)
+        shown = lit(image)
+        assert 10 < shown.sum() < 0.2 * shown.size
+        assert side_of(shown) == expected, view
+        assert report["pictures"][0]["view"] == view
+
+
+OFFSETS = {"axial": 4.5 * SPACING[2], "coronal": -6.5 * SPACING[1], "sagittal": -9.5 * SPACING[0]}
+"""From the middle of the volume to that of the block, away from the camera."""
+
+
+@pytest.mark.parametrize(("plane", "view"), [("axial", "inferior"), ("coronal", "anterior"), ("sagittal", "left")])
+def test_slices_are_seen_as_radiologists_see_them(plane: str, view: str, render: Renders) -> None:
+    image, report = render("--mode", "slice", "--view", plane, "--offset", OFFSETS[plane])
+    assert side_of(lit(image)) == SEEN[view]
+    assert (report["mode"], report["offset_mm"]) == ("slice", OFFSETS[plane])
+    assert report["pictures"][0]["values_hu"] == [AIR_HU, BLOCK_HU]
+    assert not lit(render("--mode", "slice", "--view", plane)[0]).any()
+
+
+def test_several_views_are_several_files(render: Renders) -> None:
+    report = render.report("-o", render.folder / "a.png", "--view", "anterior,left", "--view", "-30,15.5")
+    assert sorted(path.name for path in render.folder.iterdir()) == [
+        "a_anterior.png", "a_az-30_el15.5.png", "a_left.png",
+    ]  # fmt: skip
+    assert [picture["name"] for picture in report["pictures"]] == ["anterior", "left", "az-30_el15.5"]
+
+
+def test_zoom_shows_everything_larger(render: Renders) -> None:
+    small, large = (lit(render("--zoom", zoom)[0]).sum() for zoom in (0.5, 1.0))
+    assert 3.0 < large / small < 5.0
+
+
+def test_up_turns_the_picture(render: Renders) -> None:
+    assert side_of(lit(render("--up", "left")[0])) == ("left", "top")
+    assert side_of(lit(render("--up", "0,0,-1")[0])) == ("left", "bottom")
+
+
+def test_size_and_perspective(render: Renders) -> None:
+    image, report = render("--size", "80x64", "--perspective", "20")
+    assert image.shape == (64, 80, 4)
+    (picture,) = report["pictures"]
+    assert (picture["camera"]["view_angle_deg"], picture["pixel_mm"]) == (20.0, None)
+    assert render("--perspective")[1]["pictures"][0]["camera"]["view_angle_deg"] == 30.0
+
+
+def test_background(render: Renders) -> None:
+    assert render()[0][0, 0].tolist() == [0, 0, 0, 255]
+    assert render("--background", "#ff8000")[0][0, 0].tolist() == [255, 128, 0, 255]
+    transparent = render("--background", "transparent")[0]
+    assert transparent[0, 0, 3] == 0 and transparent[..., 3].max() > 200
+
+
+def test_clipping_leaves_out(render: Renders) -> None:
+    low, high = lps((21.5, -0.5, -0.5)), lps((24.5, 25, 17))
+    whole = lit(render()[0]).sum()
+    half, report = render("--clip-box", f",{high[0]},,,,")
+    assert 0.4 < lit(half).sum() / whole < 0.65
+    assert report["clip_planes_lps_mm"] == [[-1.0, 0.0, 0.0, pytest.approx(-high[0])]]
+    other = render("--clip", f"{high[0]},0,0,1,0,0")[0]
+    assert lit(half).sum() + lit(other).sum() == pytest.approx(whole, abs=0.15 * whole)
+    nothing = render("--clip", f"{low[0]},0,0,-1,0,0", "--clip", f"{low[0]},0,0,-2,0,0")[1]
+    assert nothing["pictures"][0]["hit_share"] == 0.0 and nothing["pictures"][0]["depth_mm"] is None
+
+
+def test_light(render: Renders) -> None:
+    flat, report = render("--iso", ISO, "--light", "none", "--view", "30,30")
+    assert report["lighting"]["diffuse"] == 0.0
+    assert len(np.unique(flat[lit(flat)], axis=0)) == 1
+    head = render("--iso", ISO, "--view", "30,30")[0]
+    side, report = render("--iso", ISO, "--view", "30,30", "--light", "superior")
+    assert report["lighting"]["direction"] == [0.0, 0.0, 1.0]
+    assert render("--iso", ISO, "--light", "0,0,5")[1]["lighting"]["direction"] == [0.0, 0.0, 1.0]
+    assert (head != side).any()
+    assert render("--light", "none")[1]["lighting"]["ambient"] == 1.0
+
+
+def test_depth_cue_darkens_what_is_far(render: Renders) -> None:
+    plain, cued = (render("--iso", ISO, *extra)[0].astype(int) for extra in ([], ["--depth-cue", "0.6"]))
+    assert (cued <= plain).all() and cued[lit(plain)].mean() < 0.95 * plain[lit(plain)].mean()
+
+
+def test_shadows_darken(ct: Path, tmp_path: Path, device: Any, capsys: pytest.CaptureFixture[str]) -> None:
+    voxels = np.full(SHAPE_KJI, AIR_HU, np.int16)
+    voxels[2:4, 2:23, 2:29] = BLOCK_HU
+    voxels[10:13, 8:17, 10:21] = BLOCK_HU
+    render = Renders(write_series(tmp_path / "ct", voxels), tmp_path, device, capsys)
+    plain, dark = (
+        render("--iso", ISO, "--view", "superior", "--light", "0.5,0,1", *extra)[0].astype(int)
+        for extra in ([], ["--shadows"])
+    )
+    assert (dark <= plain).all()
+    assert 20 < (dark < plain - 20).any(axis=-1).sum() < 0.3 * dark.shape[0] * dark.shape[1]
+
+
+def test_ray_step_and_jitter(render: Renders) -> None:
+    plain, report = render("--ray-step", "0.9")
+    assert report["pictures"][0]["ray_step_mm"] == pytest.approx(0.9)
+    jittered, report = render("--ray-step", "0.9", "--jitter")
+    assert report["jitter"] is True
+    assert (plain != jittered).any()
+    default = render()[1]["pictures"][0]["ray_step_mm"]
+    assert default == pytest.approx(0.5 * min(SPACING))
+
+
+def test_window_is_black_and_white(render: Renders) -> None:
+    image, report = render("--mode", "mip", "--window", f"{AIR_HU},{3 * BLOCK_HU}", "--values", render.folder / "v.npy")
+    assert report["pictures"][0]["window_hu"] == [AIR_HU, 3 * BLOCK_HU]
+    values = np.load(render.folder / "v.npy")
+    assert report["pictures"][0]["values_hu"] == [float(np.nanmin(values)), BLOCK_HU]
+    expected = 255.0 * (BLOCK_HU - AIR_HU) / (3 * BLOCK_HU - AIR_HU)
+    assert image[..., :3].max() == round(expected)
+
+
+def test_depth_is_millimetres(render: Renders) -> None:
+    report = render("--iso", ISO, "--depth", render.folder / "d.npy")[1]
+    depth = np.load(render.folder / "d.npy")
+    assert depth.dtype == np.float32 and depth.shape == (SIDE, SIDE)
+    front = lps((0, 2.5, 0))[1]  # ISO lies half way between air and the block, between voxels 2 and 3
+    position = report["pictures"][0]["camera"]["position_lps_mm"][1]
+    assert float(np.nanmedian(depth)) == pytest.approx(front - position, abs=0.02)
+    render("--iso", ISO, "--depth", render.folder / "d.tif")
+    assert np.array_equal(np.asarray(Image.open(render.folder / "d.tif")), depth, equal_nan=True)
+
+
+def test_slabs_combine(render: Renders) -> None:
+    middle = lps((0, 12, 0))[1] - lps((0, 5.5, 0))[1]
+    found = {}
+    for combine in ("mean", "max", "min"):
+        report = render(
+            *("--mode", "slice", "--view", "coronal", "--offset", -middle, "--thickness", 12.0, "--combine", combine)
+        )[1]
+        assert (report["thickness_mm"], report["combine"]) == (12.0, combine)
+        found[combine] = report["pictures"][0]["values_hu"][1]
+    assert found["max"] == BLOCK_HU and found["min"] == AIR_HU
+    assert AIR_HU < found["mean"] < BLOCK_HU
+
+
+@pytest.mark.parametrize("kind", ["straightened", "stretched"])
+def test_a_curve_from_a_file(kind: str, render: Renders) -> None:
+    points = [lps((24.5, 5.5, k)) for k in (1, 8, 15)]
+    (render.folder / "line.csv").write_text("x,y,z\n" + "\n".join(",".join(map(str, point)) for point in points))
+    image, report = render("--curve", render.folder / "line.csv", "--cpr", kind)
+    assert (report["mode"], report["pictures"][0]["curve"]["kind"]) == ("cpr", kind)
+    assert report["pictures"][0]["curve"]["length_mm"] == pytest.approx(14 * SPACING[2])
+    assert report["pictures"][0]["camera"] is None
+    assert side_of(lit(image))[1] == "top"
+
+
+def test_a_transfer_function_from_a_file(render: Renders) -> None:
+    content = {
+        "format": "clrecon transfer function",
+        "version": 1,
+        "points": [
+            {"hu": 0, "color": [0, 1, 0], "opacity": 0},
+            {"hu": 200, "color": [0, 1, 0], "opacity": 1},
+        ],
+        "lighting": {"ambient": 1.0, "diffuse": 0.0, "specular": 0.0},
+    }
+    path = render.folder / "green.json"
+    path.write_text(json.dumps(content))
+    image, report = render("--transfer-function", path)
+    assert (report["preset"], report["transfer_function"]["points"][1]) == (None, [200, 0, 1, 0, 1])
+    assert image[..., 1].max() > 240 and image[..., [0, 2]].max() == 0
+
+
+def test_slices_in_space(render: Renders) -> None:
+    image, report = render("--mode", "slices", "--slices", "13,", "--slice-opacity", 1.0, "--view", "superior")
+    assert report["pictures"][0]["slices"] == [13]
+    assert side_of(lit(image)) == SEEN["superior"]
+    assert render("--mode", "slices", "--slices", "4")[1]["pictures"][0]["slices"] == [0, 4, 8, 12, 16]
+    assert not lit(render("--mode", "slices", "--slices", "1,2", "--view", "superior")[0]).any()
+
+
+def test_labels_have_colours(render: Renders) -> None:
+    pytest.importorskip("nibabel")
+    voxels = np.zeros(SHAPE_KJI, np.uint8)
+    voxels[BLOCK] = 20
+    affine = np.diag([*SPACING, 1.0])
+    affine[:3, 3] = ORIGIN
+    path = write_nifti(render.folder / "labels.nii.gz", voxels, affine)
+    surface = ("--iso", ISO, "--light", "none", "--labels", path)
+    image, report = render(*surface, "--label-color", "20=blue")
+    assert report["labels"] == [{"label_number": 20, "label": report["labels"][0]["label"], "color": "blue",
+                                 "opacity": None}]  # fmt: skip
+    assert image[lit(image)][:, 2].mean() > 2.0 * image[lit(image)][:, 0].mean()
+    plain = render(*surface[:4], "--color", "red")[0]
+    assert plain[..., :3][lit(plain)].mean(axis=0) == pytest.approx([255, 0, 0], abs=5)
+    through = render("--labels", path, "--label-color", "20=blue", "--light", "none")[0]
+    assert through[lit(through)][:, 2].mean() > 2.0 * through[lit(through)][:, 0].mean()
+    assert not lit(render("--labels", path, "--label-opacity", "20=0")[0])[lit(through)].all()
+    faint = render(*surface, "--label-color", "20=blue", "--label-opacity", "20=0.3")[0]
+    assert faint[lit(image)][:, 2].mean() < 0.8 * image[lit(image)][:, 2].mean()
+
+
+def test_what_is_drawn(render: Renders) -> None:
+    plain = render("--size", "128")[0]
+    for extra in (["--letters"], ["--scale-bar"], ["--caption", "T12"]):
+        drawn = render("--size", "128", *extra)[0]
+        assert (drawn != plain).any() and not lit(drawn)[60:68, 60:68].any()
+
+
+def test_turntable_as_gif_and_as_folder(render: Renders) -> None:
+    report = render.report("--turntable", render.folder / "a.gif", "--frames", "3", "--fps", "10")
+    assert report["pictures"] == []
+    assert report["turntable"]["output"] == {"format": "gif", "bytes": (render.folder / "a.gif").stat().st_size}
+    assert (report["turntable"]["frames"], report["turntable"]["fps"]) == (3, 10.0)
+    assert Image.open(render.folder / "a.gif").n_frames == 3
+    report = render("--turntable", render.folder / "frames", "--frames", "4")[1]
+    names = sorted(path.name for path in (render.folder / "frames").iterdir())
+    assert names == [f"frame_{number:04d}.png" for number in range(4)]
+    frames = [np.asarray(Image.open(render.folder / "frames" / name)) for name in names]
+    assert [side_of(lit(frame))[0] for frame in (frames[0], frames[2])] == ["right", "left"]
+    assert report["turntable"]["output"]["format"] == "folder"
+
+
+def test_slabs_make_the_same_picture(render: Renders) -> None:
+    whole = render()[0]
+    parts, report = render("--memory", "100kB")
+    assert report["memory_allowed_bytes"] == 100_000
+    assert np.abs(whole.astype(int) - parts).max() <= 2
+
+
+def test_masking_is_done_before(render: Renders) -> None:
+    report = render("--fov", "5")[1]
+    assert report["pictures"][0]["hit_share"] == 0.0
+    assert report["volume"]["field_of_view"]["radius_mm"] == 5.0
+    assert any("outside of 5 mm" in warning for warning in report["warnings"])
+
+
+def test_what_people_are_told(render: Renders) -> None:
+    assert render.code("-o", render.folder / "a.png", "--view", "anterior,left", "--letters", "-v") == 0
+    captured = render.capsys.readouterr()
+    assert "17 slices of 31 x 25, spacing 0.8 x 1.1 x 1.5 mm" in captured.out
+    assert "mode dvr, preset bone" in captured.out
+    assert "anterior: 64 x 64" in captured.out and "a_left.png" in captured.out
+    assert "rendering" in captured.err
+    assert render.code("-o", render.folder / "a.png", "-q") == 0
+    assert render.capsys.readouterr() == ("", "")
+
+
+def test_nothing_is_said_of_the_patient(render: Renders) -> None:
+    outputs = [render.folder / name for name in ("a.png", "a.npy", "a.json", "a.apng")]
+    picture, depth, report, turntable = outputs
+    assert render.code("-o", picture, "--depth", depth, "--report", report, "--turntable", turntable,
+                       "--frames", 2, "-v") == 0  # fmt: skip
+    captured = render.capsys.readouterr()
+    written = b"".join(path.read_bytes() for path in outputs) + (captured.out + captured.err).encode()
+    for secret in (*PATIENT.split("^"), "ID-4711", "19500102", "1.2.826.0.1"):
+        assert secret.encode() not in written
+
+
+@pytest.mark.parametrize(("preset", "warns"), [("skin", True), ("bone", False), ("x-ray", False)])
+def test_a_face_is_warned_of(preset: str, warns: bool, render: Renders) -> None:
+    report = render("--preset", preset)[1]
+    assert any("can show a face" in warning for warning in report["warnings"]) == warns
+
+
+WRONG = {
+    "preset": (["--preset", "bones"], 3, "use one of bone, "),
+    "mode": (["--mode", "raycast"], 3, "use one of dvr, "),
+    "view": (["--view", "front"], 3, "anterior, posterior"),
+    "angle": (["--view", "30,95"], 3, "elevation from -90 to 90"),
+    "view twice": (["--view", "left,left"], 3, "twice"),
+    "up along the view": (["--up", "anterior"], 3, "up direction"),
+    "size 0": (["--size", "0"], 3, "not (0, 0)"),
+    "size absurd": (["--size", "99999x10"], 3, "99999"),
+    "size of words": (["--size", "big"], 3, "1024x768"),
+    "zoom": (["--zoom", "0"], 3, "zoom"),
+    "perspective": (["--perspective", "190"], 3, "190"),
+    "step": (["--ray-step", "-1"], 3, "ray step"),
+    "step too fine": (["--ray-step", "0.0001"], 3, "ray step"),
+    "window": (["--mode", "mip", "--window", "100,100"], 3, "window"),
+    "window of one": (["--mode", "mip", "--window", "100"], 3, "LOW,HIGH"),
+    "window elsewhere": (["--window", "0,100"], 3, "--window means nothing in mode dvr"),
+    "box": (["--clip-box", "0,1,2"], 3, "X0,X1"),
+    "box without room": (["--clip-box", "5,1,,,,"], 3, "holds nothing"),
+    "plane": (["--clip", "0,0,0,0,0,0"], 3, "length 0"),
+    "colour": (["--background", "octarine"], 3, "octarine"),
+    "light": (["--light", "sun"], 3, "head, none, anterior"),
+    "depth cue": (["--iso", "100", "--depth-cue", "2"], 3, "depth cue"),
+    "shadows of the camera": (["--iso", "100", "--shadows"], 3, "--light"),
+    "slices": (["--mode", "slices", "--slices", "a,b"], 3, "every N-th"),
+    "slice not there": (["--mode", "slices", "--slices", "17,"], 3, "slices 0 to 16"),
+    "slice opacity": (["--mode", "slices", "--slice-opacity", "0"], 3, "opacity of a slice"),
+    "shadows elsewhere": (["--shadows"], 3, "--shadows means nothing in mode dvr"),
+    "curve file": (["--curve", "nowhere.csv"], 4, "nowhere.csv"),
+    "letters on a curve": (["--curve", "auto", "--letters"], 3, "--letters"),
+    "small letters": (["--letters", "--size", "20"], 3, "at least 64"),
+    "function file": (["--transfer-function", "nowhere.json"], 3, "nowhere.json"),
+    "two functions": (["--transfer-function", "a.json", "--preset", "bone"], 3, "not both"),
+    "label option": (["--label-color", "1=red"], 3, "--labels FILE"),
+    "label colour": (["--labels", "a.nii", "--label-color", "1"], 3, "LABEL=COLOUR"),
+    "label opacity": (["--labels", "a.nii", "--label-opacity", "1=7"], 3, "between 0 and 1"),
+    "turntable option": (["--frames", "9"], 3, "--turntable OUT"),
+    "no frames": (["--turntable", "OUT/b.gif", "--frames", "0"], 3, "1 to 10000"),
+    "turntable format": (["--turntable", "OUT/b.avi"], 3, ".mp4"),
+    "turntable of a slice": (["--mode", "slice", "--turntable", "OUT/b.gif"], 3, "--turntable means nothing"),
+    "turntable of views": (["--view", "left,right", "--turntable", "OUT/b.gif"], 3, "one view"),
+    "transparent gif": (["--turntable", "OUT/b.gif", "--background", "transparent"], 3, "GIF"),
+    "depth format": (["--depth", "OUT/d.exr"], 3, ".npy"),
+    "values of dvr": (["--values", "OUT/v.npy"], 3, "--values means nothing"),
+    "one file twice": (["--depth", "OUT/a.tif", "-o", "OUT/a.tif"], 3, "cannot be the same file"),
+    "picture format": (["-o", "OUT/a.bmp"], 3, ".png"),
+    "transparent jpg": (["-o", "OUT/a.jpg", "--background", "transparent"], 3, "JPG"),
+    "no folder": (["-o", "OUT/gone/a.png"], 6, "gone"),
+    "no series": (["--series", "9"], 3, "no series matches"),
+    "device": (["--device", "abacus"], 5, "abacus"),
+    "curve outside": (["--curve", "OUT/../far.txt"], 3, "outside of the volume"),
+}
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_wrong_arguments_are_one_line_and_leave_nothing(
+    name: str, ct: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    extra, code, words = WRONG[name]
+    out = tmp_path / "out"
+    out.mkdir()
+    (tmp_path / "far.txt").write_text("0 0 9000\n0 0 9100\n")
+    arguments = [text.replace("OUT", str(out)) for text in extra]
+    for option, value in (("-o", str(out / "a.png")), ("--size", "32")):  # small, should it be rendered after all
+        if option not in arguments:
+            arguments += [option, value]
+    found = main(["render", str(ct), *arguments])
+    captured = capsys.readouterr()
+    assert (found, captured.out) == (code, "")
+    (line,) = captured.err.splitlines()
+    assert line.startswith("clrecon: error: ") and words in line
+    assert list(out.iterdir()) == []
+
+
+def test_nothing_to_write_is_wrong_usage(ct: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["render", str(ct)]) == 3
+    assert "name a picture (-o out.png) or a turntable" in capsys.readouterr().err
+    assert main(["render", str(ct), "--turntable", str(tmp_path / "a.gif"), "--depth", str(tmp_path / "d.npy")]) == 3
+    assert "belong to a picture" in capsys.readouterr().err
+
+
+def test_no_encoder_is_said_before_anything_is_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from clrecon.rendering import video
+
+    video.find_encoder.cache_clear()
+    monkeypatch.setattr(video, "_find_ffmpeg", lambda: None)
+    assert main(["render", str(tmp_path / "no CT"), "--turntable", str(tmp_path / "a.mp4")]) == 3
+    assert "no encoder for MP4" in capsys.readouterr().err
+    video.find_encoder.cache_clear()
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,203 @@
+"""The picture job: order of work, what is left when a step fails, what the report says."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from contract_tables import names_in
+from PIL import Image
+
+from clrecon.errors import DeviceError, OutputError, RefusedInputError, UsageError
+from clrecon.phantom import PhantomSettings, write_phantom
+from clrecon.pipeline.pictures import PictureFiles, name_view, path_of
+from clrecon.pipeline.render import make_pictures
+from clrecon.pipeline.render_settings import LabelLook, RenderSettings, Turntable
+from clrecon.pipeline.studio import read_function
+
+SIZE = (48, 40)
+
+
+@pytest.fixture(scope="module")
+def sphere(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]:
+    """A tilted, oblique, anisotropic sphere."""
+    folder = tmp_path_factory.mktemp("render") / "ct"
+    settings = PhantomSettings(
+        kind="sphere", size=(44, 60), slices=31, spacing=(0.5, 0.7, 1.0), tilt=15.0, oblique=(20.0, 5.0, -40.0), noise=0
+    )
+    return folder, write_phantom(folder, settings)
+
+
+def test_a_sphere_is_a_disc_of_its_size_from_every_side(
+    device: Any, sphere: tuple[Path, dict[str, Any]], tmp_path: Path
+) -> None:
+    folder, truth = sphere
+    surface = truth["surface"]
+    files = PictureFiles(tmp_path / "a.png", depth=tmp_path / "d.npy", report=tmp_path / "r.json")
+    settings = RenderSettings(views=("anterior", "left", "40,-25"), size=SIZE, device=str(device.index))
+    report = make_pictures(folder, files, settings)
+    assert json.loads((tmp_path / "r.json").read_text()) == json.loads(json.dumps(report))
+    for picture in report["pictures"]:
+        depth = np.load(tmp_path / f"d_{picture['name']}.npy")
+        hit = np.isfinite(depth)
+        area = hit.sum() * picture["pixel_mm"] ** 2
+        assert area == pytest.approx(np.pi * surface["radius_mm"] ** 2, rel=0.08)
+        position, focal = (np.array(picture["camera"][f"{what}_lps_mm"]) for what in ("position", "focal_point"))
+        forward = (focal - position) / np.linalg.norm(focal - position)
+        nearest = (np.array(surface["center_lps_mm"]) - position) @ forward - surface["radius_mm"]
+        assert float(np.nanmin(depth)) == pytest.approx(nearest, abs=0.7)
+
+
+def test_the_report_is_what_the_contract_says(device: Any, sphere: tuple[Path, dict[str, Any]], tmp_path: Path) -> None:
+    files = PictureFiles(tmp_path / "a.png", turntable=tmp_path / "frames", depth=tmp_path / "a.npy")
+    settings = RenderSettings(
+        "mip", window=(-100, 100), size=SIZE, turntable=Turntable(2), device=str(device.index), memory=10**9
+    )
+    report = make_pictures(sphere[0], files, settings)
+    assert set(report) == names_in("clrecon render INPUT")
+    optional = {"depth_output", "values_output"}
+    pictures = names_in("clrecon render INPUT", "Of each picture:")
+    assert set(report["pictures"][0]) | optional == pictures
+    assert (report["mode"], report["device"], report["memory_allowed_bytes"]) == ("mip", device.label, 10**9)
+    assert report["volume"]["tilt_deg"] == pytest.approx(15.0, abs=1e-3)
+    seconds = dict(report["seconds"])
+    assert seconds.pop("total") == pytest.approx(sum(seconds.values()), abs=0.01)
+    assert report["turntable"]["output"]["bytes"] == sum(
+        path.stat().st_size for path in (tmp_path / "frames").iterdir()
+    )
+
+
+def test_progress_and_order_of_work(device: Any, sphere: tuple[Path, dict[str, Any]], tmp_path: Path) -> None:
+    stages: list[tuple[str, int, int]] = []
+    files = PictureFiles(tmp_path / "a.png", turntable=tmp_path / "a.gif")
+    settings = RenderSettings(size=SIZE, turntable=Turntable(3, 10.0, 90.0), device=str(device.index))
+    make_pictures(sphere[0], files, settings, progress=lambda *step: stages.append(step))
+    assert list(dict.fromkeys(stage for stage, _, _ in stages)) == ["device", "scan", "read", "render", "frames"]
+    assert [step for step in stages if step[0] == "frames"] == [("frames", done, 3) for done in range(4)]
+
+
+def test_outputs_then_files_then_device_then_input(tmp_path: Path) -> None:
+    nowhere = tmp_path / "nowhere"
+    bad = RenderSettings(device="abacus", transfer_function=str(tmp_path / "none.json"))
+    with pytest.raises(OutputError, match="nowhere"):
+        make_pictures(nowhere, PictureFiles(nowhere / "a.png"), bad)
+    with pytest.raises(UsageError, match="none.json"):
+        make_pictures(nowhere, PictureFiles(tmp_path / "a.png"), bad)
+    with pytest.raises(DeviceError, match="abacus|no OpenCL device"):
+        make_pictures(nowhere, PictureFiles(tmp_path / "a.png"), RenderSettings(device="abacus"))
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("fails", ["encode_floats", "stage_report", "write_animation", "second view"])
+def test_a_step_that_fails_leaves_the_old_files(
+    fails: str, device: Any, sphere: tuple[Path, dict[str, Any]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    names = {"picture": "a_left.png", "depth": "a_left.npy", "report": "a.json", "turntable": "a.gif"}
+    for name in names.values():
+        (tmp_path / name).write_bytes(b"old")
+    views = ("left", "right") if fails == "second view" else ("left",)
+    moving = None if fails == "second view" else tmp_path / "a.gif"
+    stem = "a" if fails == "second view" else "a_left"
+    files = PictureFiles(tmp_path / f"{stem}.png", tmp_path / f"{stem}.npy", None, moving, tmp_path / "a.json")
+    settings = RenderSettings(
+        views=views, size=SIZE, turntable=Turntable(2) if moving else None, device=str(device.index)
+    )
+
+    def fail(*_: Any, **__: Any) -> Any:
+        raise OutputError("the disk is full")
+
+    if fails == "second view":
+        from clrecon.pipeline.studio import Studio
+
+        real = Studio.take_view
+        monkeypatch.setattr(Studio, "take_view", lambda studio, view: fail() if view == "right" else real(studio, view))
+    else:
+        home = {
+            "encode_floats": "clrecon.rendering.image_files.encode_floats",
+            "stage_report": "clrecon.pipeline.render.stage_report",
+            "write_animation": "clrecon.rendering.motion.write_animation",
+        }[fails]
+        monkeypatch.setattr(home, fail)
+    with pytest.raises(OutputError, match="full"):
+        make_pictures(sphere[0], files, settings)
+    kept = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    moved = {"a.gif"} if fails == "stage_report" else set()  # a finished turntable is in its place by then
+    assert {name for name, content in kept.items() if content != b"old"} == moved
+    assert set(kept) == set(names.values())
+
+
+def test_a_volume_in_slabs_is_the_same_picture(
+    device: Any, sphere: tuple[Path, dict[str, Any]], tmp_path: Path
+) -> None:
+    found = []
+    for memory in (None, 130_000):
+        settings = RenderSettings(size=SIZE, views=("30,20",), device=str(device.index), memory=memory)
+        report = make_pictures(sphere[0], PictureFiles(tmp_path / "a.png"), settings)
+        found.append((report["pictures"][0]["slabs"], np.asarray(Image.open(tmp_path / "a.png")).astype(int)))
+    assert found[0][0] == 1 < found[1][0]
+    assert np.abs(found[0][1] - found[1][1]).max() <= 2
+
+
+def test_names_of_views() -> None:
+    assert [name_view(view, ("left", "30,-5.50")) for view in ("left", "30,-5.50")] == ["left", "az30_el-5.5"]
+    assert name_view("left", ("left",)) == ""
+    assert (path_of("x/a.png", "left"), path_of("x/a.png", "")) == ("x/a_left.png", "x/a.png")
+
+
+def test_what_the_mode_is() -> None:
+    assert [settings.mode_used for settings in (
+        RenderSettings(), RenderSettings(preset="x-ray"), RenderSettings(iso_value=0.0), RenderSettings(curve="auto"),
+        RenderSettings(preset="x-ray", mode="dvr"),
+    )] == ["dvr", "mean", "surface", "cpr", "dvr"]  # fmt: skip
+    assert (RenderSettings().preset_used, RenderSettings("mip").preset_used) == ("bone", None)
+    assert (RenderSettings("slice").views_used, RenderSettings().views_used) == (("axial",), ("anterior",))
+    assert RenderSettings(clip_box=(-1, 1, -2, 2, 0, float("inf"))).clip is not None
+
+
+@pytest.mark.parametrize(
+    ("wrong", "words"),
+    [
+        ({"turntable": Turntable(), "views": ("left", "right")}, "one view"),
+        ({"thickness": -1.0, "mode": "slice"}, "thickness"),
+        ({"combine": "sum", "mode": "slice"}, "mean, max, min"),
+        ({"offset_mm": float("nan"), "mode": "slice"}, "offset"),
+        ({"curve": "auto", "cpr": "bent"}, "straightened or stretched"),
+        ({"curve": "auto", "views": ("left", "right")}, "one view"),
+        ({"memory": 0}, "memory"),
+        ({"field_of_view": -3.0}, "field of view"),
+        ({"iso_value": float("inf")}, "iso value"),
+        ({"ray_step": float("nan")}, "ray step"),
+        ({"light": (0, 0, 0)}, "direction of a light"),
+        ({"clip_planes": [(0, 0, 0, 1)]}, "six numbers"),
+        ({"clip_box": (0, 1)}, "six numbers"),
+    ],
+)
+def test_impossible_settings_are_refused(wrong: dict[str, Any], words: str) -> None:
+    with pytest.raises(UsageError, match=words):
+        RenderSettings(**wrong)
+
+
+def test_impossible_labels_are_refused() -> None:
+    with pytest.raises(UsageError, match="octarine"):
+        LabelLook("a.nii", {"L1": "octarine"})
+    with pytest.raises(UsageError, match="L1 is 1.5"):
+        LabelLook("a.nii", {}, {"L1": 1.5})
+
+
+def test_functions_are_named_by_file_and_name(tmp_path: Path) -> None:
+    points = [{"hu": hu, "color": [1, 1, 1], "opacity": opacity} for hu, opacity in ((0, 0), (9, 1))]
+    content = {"format": "clrecon transfer function", "version": 1, "name": "glass", "points": points}
+    path = tmp_path / "a:b.json"
+    path.write_text(json.dumps(content))
+    for named in (str(path), f"{path}:glass"):
+        function = read_function(named)
+        assert function is not None and function.points[1, 0] == 9
+    with pytest.raises(UsageError, match="glass"):
+        read_function(f"{path}:stone")
+    (tmp_path / "bad.json").write_text("{}")
+    with pytest.raises(RefusedInputError, match="bad.json"):
+        read_function(str(tmp_path / "bad.json"))
+    assert read_function(None) is None
