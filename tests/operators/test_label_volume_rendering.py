@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-
 import tolerances
+
 from clrecon import Camera, LabelMap, TransferFunction, UsageError, Volume, render
 from clrecon.rendering.lighting import UNSHADED
 
 SPACING = (0.7, 0.5, 1.1)
-SHAPE = (12, 10, 20)
+SHAPE = (40, 10, 20)
 """Voxels along k, j, i."""
 
 GREY = TransferFunction([(0, 0.5, 0.5, 0.5, 0.1), (200, 0.5, 0.5, 0.5, 0.1)], unit_distance=2.0)
@@ -29,21 +29,21 @@ def block() -> tuple[Volume, LabelMap]:
 
 def ahead(volume: Volume) -> Camera:
     """Along j, one pixel a voxel of i."""
-    middle = volume.ijk_to_lps([(9.5, 4.5, 5.5)])[0]
-    return Camera(middle - (0, 50, 0), middle, (0, 0, 1), parallel_scale=10 * SPACING[0])
+    middle = volume.ijk_to_lps([(9.5, 4.5, 20.5)])[0]
+    return Camera(middle - (0, 50, 0), middle, (0, 0, 1), parallel_scale=2 * SPACING[0])
 
 
 @pytest.mark.oclgrind
-@pytest.mark.parametrize("memory", [None, 40_000])
+@pytest.mark.parametrize("memory", [None, 12_000])
 def test_labels_change_opacity_and_colour_as_they_say(device, memory):
     volume, labels = block()
     options = {"label_colors": {3: "red"}, "label_opacity": {1: 0.25, 3: 0.5}}
     made = render(
-        volume, transfer_function=GREY, camera=ahead(volume), size=(20, 20), ray_step=0.3, device=device, memory=memory,
+        volume, transfer_function=GREY, camera=ahead(volume), size=(20, 4), ray_step=0.3, device=device, memory=memory,
         lighting=UNSHADED, background="transparent", labels=labels, **options,
     )  # fmt: skip
     assert (made.report["slabs"] > 1) == (memory is not None)
-    row = made.image[10].astype(float)
+    row = made.image[2].astype(float)
     through = SHAPE[1] * SPACING[1] / GREY.unit_distance
     for columns, factor in ((slice(1, 9), 0.25), (slice(11, 14), 0.5), (slice(16, 19), 1.0)):
         expected = 255.0 * (1.0 - (1.0 - factor * 0.1) ** through)
@@ -56,12 +56,12 @@ def test_labels_change_opacity_and_colour_as_they_say(device, memory):
 
 def test_a_label_without_opacity_shows_what_is_behind(device):
     volume, labels = block()
-    settings = {"camera": ahead(volume), "size": (20, 20), "device": device, "background": "transparent"}
+    settings = {"camera": ahead(volume), "size": (20, 4), "device": device, "background": "transparent"}
     hidden = render(volume, transfer_function=GREY, labels=labels, label_colors={}, label_opacity={1: 0.0}, **settings)
     plain = render(volume, transfer_function=GREY, **settings)
-    assert (hidden.image[5:15, 1:9, 3] == 0).all()
-    assert np.isnan(hidden.depth[5:15, 1:9]).all()
-    assert np.array_equal(hidden.image[5:15, 11:19], plain.image[5:15, 11:19])
+    assert (hidden.image[:, 1:9, 3] == 0).all()
+    assert np.isnan(hidden.depth[:, 1:9]).all()
+    assert np.array_equal(hidden.image[:, 11:19], plain.image[:, 11:19])
 
 
 def test_colours_of_labels_without_labels_are_refused(device):
