@@ -179,34 +179,29 @@ class TwinCaster:
 
 
 class DeviceCaster:
-    """Casts on a device, over no background: by `clrecon.render`, surfaces by the operator."""
+    """Casts by `clrecon.render` on a device, over no background; light goes to the modes that have some."""
 
     def __init__(self, device: Any):
         self.device = device
 
-    def __call__(self, volume: Volume, mode: str = "dvr", *args: Any, lighting=UNSHADED, **settings: Any) -> Shot:
-        if mode == "surface":
-            found = self.cast_surface(volume, lighting=lighting, **settings)
-        else:
-            from clrecon.operators.renderer import render
+    def __call__(
+        self,
+        volume: Volume,
+        mode: str = "dvr",
+        transfer_function: TransferFunction | None = None,
+        *,
+        lighting: Lighting = UNSHADED,
+        **settings: Any,
+    ) -> Shot:
+        from clrecon.operators.renderer import render
 
-            names = dict(zip(("transfer_function",), args, strict=False))
-            found = render(
-                volume, mode, device=self.device, background="transparent", lighting=lighting, **names, **settings
-            )
+        if mode == "dvr":
+            settings |= {"transfer_function": transfer_function, "lighting": lighting}
+        elif mode == "surface":
+            settings |= {"color": (1.0, 1.0, 1.0), "lighting": lighting}
+        found = render(volume, mode, device=self.device, background="transparent", **settings)
         values = np.full(found.depth.shape, np.nan) if found.values is None else found.values
         return Shot(found.image, found.depth, found.expected_depth, values)
-
-    def cast_surface(self, volume: Volume, ray_step: float | None = None, **settings: Any) -> Any:
-        from clrecon.operators.resident import ResidentVolume
-        from clrecon.operators.surface_rays import cast_surface
-
-        step = 0.5 * min(volume.spacing) if ray_step is None else ray_step
-        resident = ResidentVolume(volume, self.device)
-        try:
-            return cast_surface(resident, ray_step=step, color=(1.0, 1.0, 1.0), **settings)
-        finally:
-            resident.close()
 
 
 def casters(mode: str = "dvr") -> list[Any]:
