@@ -23,6 +23,7 @@
 #define OPAQUE 0.99f /* nothing behind can be seen */
 #define FIRST_SEEN (1.0f / 255.0f) /* opacity that makes a first hit */
 #define SAMPLES_A_LOOK 8 /* samples until a packet looks for empty space again */
+#define AT_ONCE 4 /* of them taken before any is blended */
 
 /* What rays have seen so far: premultiplied colour, t of the first hit (negative before), sum of t, weighted. */
 typedef struct {
@@ -74,10 +75,51 @@ static inline floats stretch_opacity(const floats opacity, const floats times)
     return 1.0f - exp2(log2(max(1.0f - opacity, (floats)(1e-30f))) * times);
 }
 
-/* Blend sample n of every ray that it shows of. */
-static inline void blend_samples(const field *f, const slice_stack *stack, const looks *look, const packet *rays,
-    const float n, const floats i, const floats j, const floats k, const ints node, floats opacity, sights *seen)
+/* Indices of sample n of each ray. */
+static inline void find_places(const slice_stack *stack, const ray_lanes *course, const packet *rays, const float n,
+    floats *i, floats *j, floats *k)
 {
+    const floats number = min((floats)(n), rays->last_number);
+    *i = course->start_i + number * course->stride_i;
+    *j = course->start_j + number * course->stride_j;
+    *k = course->start_k + number * course->stride_k;
+    to_indices(stack, i, j, k);
+}
+
+/* Opacity over one ray step of sample n of each ray, and its node of the table; 0 for samples that do not count. */
+static inline floats find_opacity(const field *f, const slice_stack *stack, const looks *look, const ray_lanes *course,
+    const packet *rays, const float n, ints *node)
+{
+    floats i, j, k;
+    find_places(stack, course, rays, n, &i, &j, &k);
+    const floats value = sample_lanes(f, i, j, k);
+    const floats place = (value - look->low) * look->scale + 0.5f;
+    *node = to_ints(min(max(place, (floats)(0.0f)), (floats)(NODES - 1)));
+    floats opacity = (floats)(GATHER(float, look->opacities, *node));
+    ints counts = (k >= look->slab_low) & (k < look->slab_high) & (n >= rays->begin);
+#ifdef UNEVEN
+    counts &= (i >= -0.5f) & (i <= f->last.x + 0.5f) & (j >= -0.5f) & (j <= f->last.y + 0.5f);
+#endif
+    opacity = choose(counts, opacity, (floats)(0.0f));
+#ifdef LABELS
+    if (ANY_LANE(opacity > 0.0f)) { /* the factor is on the opacity of the unit distance */
+        const floats factor = LABEL_CHANNEL(look->label_colors, find_labels(look->labels, f, i, j, k), 3);
+        if (ANY_LANE((factor < 1.0f) & (opacity > 0.0f))) {
+            const floats whole = stretch_opacity(opacity, (floats)(look->steps_per_unit));
+            const floats faded = stretch_opacity(factor * whole, (floats)(1.0f / look->steps_per_unit));
+            opacity = choose(factor < 1.0f, faded, opacity);
+        }
+    }
+#endif
+    return opacity;
+}
+
+/* Blend sample n of every ray that it shows of. */
+static inline void blend_samples(const field *f, const slice_stack *stack, const looks *look, const ray_lanes *course,
+    const packet *rays, const float n, const ints node, floats opacity, sights *seen)
+{
+    floats i, j, k;
+    find_places(stack, course, rays, n, &i, &j, &k);
     floats share = 1.0f, highlight = 0.0f;
     if (look->shaded || IS_WEIGHED) {
         slopes s;
@@ -260,42 +302,37 @@ __kernel void composite_rays(
     }
     float n = LEAST_LANE(rays.begin);
     floats end = choose(seen.opacity < OPAQUE, rays.end, (floats)(0.0f));
+    int shows = 0; /* the sample before: then the next one probably does too */
     while (ANY_LANE(n < end)) {
-        const floats all_free = count_free_steps(&map, &stack, &course, (floats)(n), first_k, 0);
-        const float free = LEAST_LANE(choose(n < end, max(all_free, rays.begin - n), (floats)(MAXFLOAT)));
-        if (free > 0.0f) {
-            n += free;
-            continue;
+        if (!shows) {
+            const floats all_free = count_free_steps(&map, &stack, &course, (floats)(n), first_k, 0);
+            const float free = LEAST_LANE(choose(n < end, max(all_free, rays.begin - n), (floats)(MAXFLOAT)));
+            if (free > 0.0f) {
+                n += free;
+                continue;
+            }
         }
-        for (int sample = 0; sample < SAMPLES_A_LOOK; ++sample, n += 1.0f) {
-            const floats number = min((floats)(n), rays.last_number);
-            floats i = course.start_i + number * course.stride_i, j = course.start_j + number * course.stride_j;
-            floats k = course.start_k + number * course.stride_k;
-            to_indices(&stack, &i, &j, &k);
-            const floats value = sample_lanes(&f, i, j, k);
-            const floats place = (value - look.low) * look.scale + 0.5f;
-            const ints node = to_ints(min(max(place, (floats)(0.0f)), (floats)(NODES - 1)));
-            const floats found = (floats)(GATHER(float, look.opacities, node));
-            ints counts = (k >= look.slab_low) & (k < look.slab_high) & (n >= rays.begin) & (n < end);
-#ifdef UNEVEN
-            counts &= (i >= -0.5f) & (i <= f.last.x + 0.5f) & (j >= -0.5f) & (j <= f.last.y + 0.5f);
-#endif
-            floats opacity = choose(counts, found, (floats)(0.0f));
-#ifdef LABELS
-            if (ANY_LANE(opacity > 0.0f)) { /* the factor is on the opacity of the unit distance */
-                const floats factor
-                    = LABEL_CHANNEL(look.label_colors, find_labels(look.labels, &f, i, j, k), 3);
-                if (ANY_LANE((factor < 1.0f) & (opacity > 0.0f))) {
-                    const floats whole = stretch_opacity(opacity, (floats)(look.steps_per_unit));
-                    const floats faded = stretch_opacity(factor * whole, (floats)(1.0f / look.steps_per_unit));
-                    opacity = choose(factor < 1.0f, faded, opacity);
+        for (int part = 0; part < SAMPLES_A_LOOK && ANY_LANE(n < end); part += AT_ONCE) {
+            floats opacity[AT_ONCE];
+            ints node[AT_ONCE];
+            floats together = 0.0f;
+            /* Whether one of some samples shows is decided once: their loads need not wait for each other. */
+#pragma unroll
+            for (int sample = 0; sample < AT_ONCE; ++sample) {
+                opacity[sample] = find_opacity(&f, &stack, &look, &course, &rays, n + (float)sample, node + sample);
+                together = max(together, opacity[sample]);
+            }
+            shows = ANY_LANE((together > 0.0f) & (n < end));
+            if (shows)
+                for (int sample = 0; sample < AT_ONCE; ++sample) {
+                    const float number = n + (float)sample;
+                    const floats seen_here = choose(number < end, opacity[sample], (floats)(0.0f));
+                    if (ANY_LANE(seen_here > 0.0f)) {
+                        blend_samples(&f, &stack, &look, &course, &rays, number, node[sample], seen_here, &seen);
+                        end = choose(seen.opacity < OPAQUE, end, (floats)(0.0f));
+                    }
                 }
-            }
-#endif
-            if (ANY_LANE(opacity > 0.0f)) {
-                blend_samples(&f, &stack, &look, &rays, n, i, j, k, node, opacity, &seen);
-                end = choose(seen.opacity < OPAQUE, end, (floats)(0.0f));
-            }
+            n += (float)AT_ONCE;
         }
     }
     float out_of[6][LANES], offset_of[LANES];
