@@ -5,8 +5,14 @@
 #include "include/lanes.h"
 #include "include/stack.h"
 
-#define BRICK_CELLS 4 /* cells along each side of a brick: it reads 5 x 5 x 5 voxels */
+/* Cells of a brick along i and j, and along k, where slices that lie far apart want fewer (-D BRICK_CELLS_K=1, 2 or 4).
+ * A brick of n cells reads n + 1 voxels. */
+#define BRICK_CELLS 4
+#ifndef BRICK_CELLS_K
+#define BRICK_CELLS_K 4
+#endif
 #define BRICKS_PER_CELL (1.0f / BRICK_CELLS)
+#define BRICKS_PER_CELL_K (1.0f / BRICK_CELLS_K)
 
 typedef struct {
     __global const uchar *distances; /* (bk, bj, bi) in bricks, 0 where something shows */
@@ -37,15 +43,15 @@ static inline void find_pace(ray_lanes *rays, const float4 slope)
 
 /* Samples along one axis to the face of the empty cube around `brick` that the ray runs to. */
 static inline floats count_to_face(
-    const floats place, const floats stride, const floats pace, const ints brick, const ints distance)
+    const floats place, const floats stride, const floats pace, const ints brick, const ints distance, const int cells)
 {
 #ifdef UNEVEN
-    const floats low = to_floats((brick - distance + 1) * BRICK_CELLS);
-    const floats high = to_floats((brick + distance) * BRICK_CELLS);
+    const floats low = to_floats((brick - distance + 1) * cells);
+    const floats high = to_floats((brick + distance) * cells);
     return min(place - low, high - place) * pace;
 #else
     const ints face = choose(stride >= 0.0f, brick + distance, brick - distance + 1);
-    return (to_floats(face * BRICK_CELLS) - place) * pace;
+    return (to_floats(face * cells) - place) * pace;
 #endif
 }
 
@@ -60,13 +66,13 @@ static inline floats count_free_steps(const leap_map *map, const slice_stack *st
     k -= (float)first_k;
     const ints brick_i = clamp(to_ints(i * BRICKS_PER_CELL), (ints)(0), (ints)(map->bi - 1));
     const ints brick_j = clamp(to_ints(j * BRICKS_PER_CELL), (ints)(0), (ints)(map->bj - 1));
-    const ints brick_k = clamp(to_ints(k * BRICKS_PER_CELL), (ints)(0), (ints)(map->bk - 1));
+    const ints brick_k = clamp(to_ints(k * BRICKS_PER_CELL_K), (ints)(0), (ints)(map->bk - 1));
     const ints at = (brick_k * map->bj + brick_j) * map->bi + brick_i;
     const ints distance = (ints)(GATHER(uchar, map->distances, at)) - margin;
     /* The cube of bricks less than `distance` away is empty. */
-    const floats steps = min(min(count_to_face(i, rays->stride_i, rays->pace_i, brick_i, distance),
-                                 count_to_face(j, rays->stride_j, rays->pace_j, brick_j, distance)),
-        count_to_face(k, rays->stride_k, rays->pace_k, brick_k, distance));
+    const floats steps = min(min(count_to_face(i, rays->stride_i, rays->pace_i, brick_i, distance, BRICK_CELLS),
+                                 count_to_face(j, rays->stride_j, rays->pace_j, brick_j, distance, BRICK_CELLS)),
+        count_to_face(k, rays->stride_k, rays->pace_k, brick_k, distance, BRICK_CELLS_K));
     return choose(distance > 0, max(ceil(steps), (floats)(1.0f)), (floats)(0.0f));
 }
 
@@ -75,7 +81,7 @@ static inline int is_shown(const leap_map *map, const float i, const float j, co
 {
     const int brick_i = clamp((int)(i * BRICKS_PER_CELL), 0, map->bi - 1);
     const int brick_j = clamp((int)(j * BRICKS_PER_CELL), 0, map->bj - 1);
-    const int brick_k = clamp((int)(k * BRICKS_PER_CELL), 0, map->bk - 1);
+    const int brick_k = clamp((int)(k * BRICKS_PER_CELL_K), 0, map->bk - 1);
     return map->distances[(brick_k * map->bj + brick_j) * map->bi + brick_i] == 0;
 }
 

@@ -13,8 +13,8 @@
 #define VOXEL4 CLRECON_VECTOR(VOXEL, 4)
 
 /* Parameters  voxels  in   (nk, nj, ni)
- *             ranges  out  (bk, bj, bi, 2) lowest and highest of the 5 x 5 x 5 voxels around the cells of a brick
- *             ni nj nk, bi bj bk   voxels, bricks: ceil(cells / BRICK_CELLS), at least 1
+ *             ranges  out  (bk, bj, bi, 2) lowest and highest of the voxels around the cells of a brick
+ *             ni nj nk, bi bj bk   voxels, bricks: ceil(cells / BRICK_CELLS), along k / BRICK_CELLS_K, at least 1
  * Launch      global = bi * bj * bk rounded up by the host, any local
  * Assumes     no voxel is NaN; at least two voxels along each axis
  * Guarantees  every range is written */
@@ -26,9 +26,9 @@ __kernel void measure_cells(
     if (brick >= (size_t)bi * bj * bk)
         return;
     const int i = BRICK_CELLS * (int)(brick % bi), j = BRICK_CELLS * (int)(brick / bi % bj);
-    const int k = BRICK_CELLS * (int)(brick / bi / bj);
+    const int k = BRICK_CELLS_K * (int)(brick / bi / bj);
     const int i_last = min(i + BRICK_CELLS, ni - 1);
-    const int j_last = min(j + BRICK_CELLS, nj - 1), k_last = min(k + BRICK_CELLS, nk - 1);
+    const int j_last = min(j + BRICK_CELLS, nj - 1), k_last = min(k + BRICK_CELLS_K, nk - 1);
     VOXEL lowest = voxels[voxel_index(i, j, k, ni, nj)], highest = lowest;
     if (ni >= BRICK_CELLS) {
         /* Four voxels and the one after them; at the end of a row its last four. */

@@ -151,7 +151,7 @@ def _enter_tiles(
     device = resident.device
     lanes = int(device.kernel_variants["LANES"])
     width, height = view.size
-    margin = math.ceil(float((view.spread * resident.stack.steps_per_unit).max()) / BRICK_CELLS)
+    margin = math.ceil((view.spread * resident.stack.steps_per_unit / resident.brick_cells).max())
     entries_d = allocate(device, 4 * output.tiles)
     launch(
         device, resident.program("render/tiles.cl")["enter_tiles"], -(-output.tiles // lanes),

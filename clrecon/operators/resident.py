@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any
@@ -21,7 +22,15 @@ from clrecon.operators.voxel_types import voxel_variants
 __all__ = ["BRICK_CELLS", "LeapMap", "RaySlab", "ResidentVolume", "entry_slice", "pad_slices", "ray_variants"]
 
 BRICK_CELLS = 4
-"""Cells along each side of a brick, as in cl/include/leap.h."""
+"""Cells of a brick along i and j, as in cl/include/leap.h."""
+
+
+def choose_brick_cells(volume: Volume) -> tuple[int, int, int]:
+    """Cells of a brick along i, j and k: fewer along k where slices lie farther apart than voxels in them."""
+    di, dj, dk = volume.spacing
+    across = dk / max(di, dj)
+    return BRICK_CELLS, BRICK_CELLS, 1 if across >= 3.0 else 2 if across >= 1.5 else BRICK_CELLS
+
 
 OVERLAP = 2
 """Slices that a slab holds beyond its own at either side: those that cells and gradients at its ends read."""
@@ -76,6 +85,7 @@ class RaySlab:
     first_k: int
     low_k: float
     high_k: float
+    brick_cells: tuple[int, int, int]
     stage: int = 3
     ranges_d: Any = None
     maps: dict[Any, LeapMap] = field(default_factory=dict)
@@ -83,7 +93,7 @@ class RaySlab:
     @property
     def bricks(self) -> tuple[int, int, int]:
         """(bi, bj, bk)."""
-        bi, bj, bk = (max(1, -(-(n - 1) // BRICK_CELLS)) for n in self.shape_ijk)
+        bi, bj, bk = (max(1, -(-(n - 1) // c)) for n, c in zip(self.shape_ijk, self.brick_cells, strict=True))
         return bi, bj, bk
 
     @property
@@ -119,6 +129,7 @@ class ResidentVolume:
         self.dtype = volume.voxels.dtype
         self._whole: RaySlab | None = None
         self.stack = StackTable.of(volume, device)
+        self.brick_cells = choose_brick_cells(volume)
 
     def close(self) -> None:
         """Free what is on the device."""
@@ -126,13 +137,14 @@ class ResidentVolume:
 
     def program(self, name: str, **variants: str) -> Program:
         """Build a kernel file for this volume's type of voxels."""
-        uneven = {"UNEVEN": "1"} if self.volume.uneven else {}
-        return load_program(self.device, name, {**ray_variants(self.device, self.dtype), **uneven, **variants})
+        own = {"UNEVEN": "1"} if self.volume.uneven else {}
+        own["BRICK_CELLS_K"] = str(self.brick_cells[2])
+        return load_program(self.device, name, {**ray_variants(self.device, self.dtype), **own, **variants})
 
     def slab_bytes(self, slices: int) -> dict[str, int]:
         """Bytes of a slab of so many slices on the device."""
         ni, nj, _ = (max(2, n) for n in self.volume.shape_ijk)
-        bricks = (-(-ni // BRICK_CELLS)) * (-(-nj // BRICK_CELLS)) * (-(-max(2, slices) // BRICK_CELLS))
+        bricks = math.prod(-(-n // c) for n, c in zip((ni, nj, max(2, slices)), self.brick_cells, strict=True))
         size = self.dtype.itemsize
         return {"volume": ni * nj * max(2, slices) * size, "bricks": bricks * (2 * size + 3)}
 
@@ -202,7 +214,7 @@ class ResidentVolume:
         with stopwatch.timed("upload"):
             voxels_d = upload(self.device, voxels)
         nk, nj, ni = voxels.shape
-        return RaySlab(voxels_d, (ni, nj, nk), first, low, high)
+        return RaySlab(voxels_d, (ni, nj, nk), first, low, high, self.brick_cells)
 
     def measure(self, slab: RaySlab, stopwatch: Stopwatch) -> Any:
         """Lowest and highest value that samples in each brick of a slab can have, (bk, bj, bi, 2), on the device."""
@@ -269,7 +281,8 @@ class ResidentVolume:
             where = np.flatnonzero(marked.any(axis=others))
             if not len(where):
                 return None
-            ends.append((where[0] * BRICK_CELLS, (where[-1] + 1) * BRICK_CELLS))
+            cells = self.brick_cells[2 - axis]
+            ends.append((where[0] * cells, (where[-1] + 1) * cells))
         low, high = np.array(ends, dtype=np.float64).T
         low[2] += slab.first_k
         high[2] += slab.first_k
