@@ -274,8 +274,8 @@ class VolumeRenderer:
         way = float(np.linalg.norm(np.ptp(box_corners(self.volume), axis=0)))
         if way > MOST_SAMPLES * step:
             raise UsageError(
-                f"a ray of {way:.4g} mm through the volume would have {way / step:.3g} samples {step:.3g} mm apart, more"
-                f" than {MOST_SAMPLES:.0e}: give a ray step of at least {way / MOST_SAMPLES:.3g} mm"
+                f"a ray of {way:.4g} mm through the volume would have {way / step:.3g} samples {step:.3g} mm apart,"
+                f" more than {MOST_SAMPLES:.0e}: give a ray step of at least {way / MOST_SAMPLES:.3g} mm"
             )
         return step
 

@@ -111,6 +111,7 @@ def test_scattered_voxels_from_anywhere(device, monkeypatch, uneven):
     assert shown > 20
 
 
+@pytest.mark.oclgrind
 def test_what_is_opaque_is_so_in_the_shortest_last_segment(device):
     voxels = np.zeros((20, 6, 6), np.int16)
     voxels[10:] = 1000
