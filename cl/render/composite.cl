@@ -69,10 +69,12 @@ typedef struct {
 #define IS_WEIGHED 0
 #endif
 
-/* Opacity over `times` as many steps; libraries' logarithms are slow on CPUs, so only where it is needed. */
+/* Opacity over `times` as many steps; libraries' logarithms are slow on CPUs, so only where it is needed.  What is
+ * opaque stays so, however short the way. */
 static inline floats stretch_opacity(const floats opacity, const floats times)
 {
-    return 1.0f - exp2(log2(max(1.0f - opacity, (floats)(1e-30f))) * times);
+    const floats stretched = 1.0f - exp2(log2(max(1.0f - opacity, (floats)(1e-30f))) * times);
+    return choose(opacity < 1.0f, stretched, (floats)(1.0f));
 }
 
 /* Indices of sample n of each ray. */
@@ -305,7 +307,9 @@ __kernel void composite_rays(
     int shows = 0; /* the sample before: then the next one probably does too */
     while (ANY_LANE(n < end)) {
         if (!shows) {
-            const floats all_free = count_free_steps(&map, &stack, &course, (floats)(n), first_k, 0);
+            /* The last sample of a ray lies before its place in the row. */
+            const floats here = min((floats)(n), rays.last_number);
+            const floats all_free = count_free_steps(&map, &stack, &course, here, first_k, 0);
             const float free = LEAST_LANE(choose(n < end, max(all_free, rays.begin - n), (floats)(MAXFLOAT)));
             if (free > 0.0f) {
                 n += free;

@@ -27,6 +27,9 @@ NODES = 4096
 GRADIENT_NODES = 256
 """Entries of its table of factors by magnitude of the gradient."""
 
+FARTHEST = 15
+"""Bricks that a leap goes at most, as in cl/render/occupancy.cl: with that as its margin none is left."""
+
 LOWEST_LOG = -1000.0
 """log2 of what an opaque sample lets through: 0 in float32, and no infinity that a length of 0 would make NaN."""
 
@@ -97,7 +100,7 @@ def composite_slab(
     output: PictureBuffers,
     stopwatch: Stopwatch,
 ) -> None:
-    """Blend one slab into a picture.
+    """Blend one slab into a picture, and wait.
 
     Parameters
     ----------
@@ -123,20 +126,21 @@ def composite_slab(
     width, height = view.size
     queues = count_queues(device)
     last = np.array([n - 1 for n in resident.volume.shape_ijk] + [0], dtype=np.float32)
-    entries_d = _enter_tiles(resident, slab, view, leaps, output, stopwatch)
-    launch(
-        device, program["composite_rays"], output.items(queues, lanes),
-        slab.voxels_d, leaps.distances_d, tables.colors_d, tables.opacities_d, tables.factors_d,
-        upload(device, highlight_table(lighting)), entries_d, upload(device, view.table), output.states_d,
-        output.image_d, output.depths_d, output.means_d, output.background, last, resident.stack.slope,
-        np.int32(slab.shape_ijk[0]), np.int32(slab.shape_ijk[1]), np.int32(slab.first_k), np.int32(slab.end_k),
-        np.float32(slab.low_k), np.float32(slab.high_k), *(np.int32(n) for n in slab.bricks),
-        np.float32(tables.low), np.float32(tables.scale), np.float32(tables.factor_scale),
-        np.float32(tables.steps_per_unit), np.uint32(width), np.uint32(height),
-        np.uint32(view.planes), np.int32(not view.camera.is_parallel), np.int32(lighting.shades), np.int32(jitter),
-        np.int32(slab.stage), np.uint32(queues), *label_tables, *resident.stack.arguments,
-        stopwatch=stopwatch,
-    )  # fmt: skip
+    with stopwatch.running(device):  # to its end: CPU devices read the arrays of the host that end here
+        entries_d = _enter_tiles(resident, slab, view, leaps, output, stopwatch)
+        launch(
+            device, program["composite_rays"], output.items(queues, lanes),
+            slab.voxels_d, leaps.distances_d, tables.colors_d, tables.opacities_d, tables.factors_d,
+            upload(device, highlight_table(lighting)), entries_d, upload(device, view.table), output.states_d,
+            output.image_d, output.depths_d, output.means_d, output.background, last, resident.stack.slope,
+            np.int32(slab.shape_ijk[0]), np.int32(slab.shape_ijk[1]), np.int32(slab.first_k), np.int32(slab.end_k),
+            np.float32(slab.low_k), np.float32(slab.high_k), *(np.int32(n) for n in slab.bricks),
+            np.float32(tables.low), np.float32(tables.scale), np.float32(tables.factor_scale),
+            np.float32(tables.steps_per_unit), np.uint32(width), np.uint32(height),
+            np.uint32(view.planes), np.int32(not view.camera.is_parallel), np.int32(lighting.shades), np.int32(jitter),
+            np.int32(slab.stage), np.uint32(queues), *label_tables, *resident.stack.arguments,
+            stopwatch=stopwatch,
+        )  # fmt: skip
 
 
 def _enter_tiles(
@@ -151,11 +155,11 @@ def _enter_tiles(
     device = resident.device
     lanes = int(device.kernel_variants["LANES"])
     width, height = view.size
-    margin = math.ceil((view.spread * resident.stack.steps_per_unit / resident.brick_cells).max())
+margin = math.ceil(min((resident.stack.index_steps(view.spread) / resident.brick_cells).max(), FARTHEST))
     entries_d = allocate(device, 4 * output.tiles)
     launch(
         device, resident.program("render/tiles.cl")["enter_tiles"], -(-output.tiles // lanes),
-        leaps.distances_d, upload(device, view.widened(margin * BRICK_CELLS * resident.stack.longest_step)), entries_d,
+        leaps.distances_d, upload(device, view.widened()), entries_d,
         resident.stack.slope, *(np.int32(n) for n in slab.bricks), np.int32(slab.first_k), np.int32(margin),
         np.uint32(width), np.uint32(height), np.int32(not view.camera.is_parallel), *resident.stack.arguments,
         stopwatch=stopwatch,

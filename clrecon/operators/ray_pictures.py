@@ -100,12 +100,11 @@ class _Job:
         slabs = 0
         for slab in resident.slabs(slices, entry_slice(resident.volume, picture.camera), stopwatch):
             slabs += 1
-            with stopwatch.running(device):  # to its end: CPU devices read the arrays of the host
-                if self.tables is None:
-                    view = self._view(self.box)
-                    project_slab(resident, slab, view, picture.mode, output, stopwatch)
-                else:
-                    self._composite(slab, self.tables, output)
+            if self.tables is None:
+                with stopwatch.running(device):  # to its end: CPU devices read the arrays of the host
+                    project_slab(resident, slab, self._view(self.box), picture.mode, output, stopwatch)
+            else:
+                self._composite(slab, self.tables, output)
         with stopwatch.timed("download"):
             image, depths, means = output.download()
         report = {
@@ -126,7 +125,8 @@ class _Job:
     def _composite(self, slab: RaySlab, tables: TransferTables, output: PictureBuffers) -> None:
         picture, stopwatch = self.picture, self.stopwatch
         key = (picture.function, picture.ray_step)
-        leaps = self.resident.find_leaps(slab, key, tables.shown, tables.low, tables.scale, stopwatch)
+        with stopwatch.running(self.resident.device):
+            leaps = self.resident.find_leaps(slab, key, tables.shown, tables.low, tables.scale, stopwatch)
         nothing = (self.box[1], self.box[1])
         view = self._view(nothing if leaps.box is None else leaps.box)
         composite_slab(

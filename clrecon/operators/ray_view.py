@@ -161,16 +161,29 @@ class RayView:
         if planes is not None and len(planes):
             table = np.vstack([table, frame.planes(planes)])
             count = len(planes)
-        reach = 1.0
-        if not camera.is_parallel:  # the rays go apart: to the far side of the volume, in the corner of the picture
-            reach = (near + 2.0 * np.linalg.norm(corners - centre, axis=1).max()) * np.linalg.norm(directions[0])
-        apart = 0.5 * TILE * pixel * reach * (np.abs(frame.matrix @ right) + np.abs(frame.matrix @ up))
-        spread = apart + ray_step * np.linalg.norm(frame.matrix, axis=1)
+        across, along = 0.5 * TILE * pixel, 0.0
+        if not camera.is_parallel:
+            across, along = _perspective_spread(camera, size, float(np.linalg.norm(corners - position, axis=1).max()))
+        axes = np.abs(frame.matrix @ np.column_stack([right, up, forward]))
+        spread = axes @ (across, across, along) + ray_step * np.linalg.norm(frame.matrix, axis=1)
         return cls(camera, size, ray_step, table.astype(np.float32), count, spread)
 
-    def widened(self, by: float) -> NDArray[np.float32]:
-        """The table with the focus, `by` larger on all sides, for its box, and without clip planes."""
+    def widened(self) -> NDArray[np.float32]:
+        """The table with the focus, larger by the spread on all sides, for its box, and without clip planes."""
         table = self.table[: len(self.table) - self.planes].copy()
-        table[BOX_ROW, :3] = table[BOX_ROW + 2, :3] - by
-        table[BOX_ROW + 1, :3] = table[BOX_ROW + 3, :3] + by
+        table[BOX_ROW, :3] = table[BOX_ROW + 2, :3] - self.spread
+        table[BOX_ROW + 1, :3] = table[BOX_ROW + 3, :3] + self.spread
         return table
+
+
+def _perspective_spread(camera: Camera, size: tuple[int, int], farthest: float) -> tuple[float, float]:
+    """How far, across the view and along it, rays of a tile are from the one in its middle, up to `farthest` mm away.
+
+    Places that are as far along two rays differ by that distance times the difference of their unit directions, which
+    is at most that of the directions with length 1 along the view; along the view, times the sine of the angle to it.
+    """
+    width, height = size
+    pixel = 2.0 * camera.half_height() / height
+    edge = pixel * math.hypot(0.5 * width + TILE, 0.5 * height + TILE)  # tiles may go beyond the picture
+    across = math.sqrt(2.0) * 0.5 * (TILE - 1) * pixel * farthest
+    return across, across * edge / math.hypot(1.0, edge)

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from clrecon.errors import UsageError
 from clrecon.geometry import Volume
-from clrecon.geometry.camera import Camera
+from clrecon.geometry.camera import Camera, box_corners
 from clrecon.geometry.clip import Clip
 from clrecon.geometry.views import checked_size
 from clrecon.labels import LabelMap
@@ -37,6 +37,9 @@ DEFAULT_ISO_VALUE = 200.0
 
 SMALLEST_STEP = 0.01
 """Ray steps below this share of the smallest spacing add time and nothing else."""
+
+MOST_SAMPLES = 1e7
+"""Of a ray: they are counted in float32, which is exact up to 1.6e7."""
 
 _LABELLED = ("dvr", "surface")
 _CUT = ("slice", "cpr")
@@ -267,6 +270,12 @@ class VolumeRenderer:
             raise UsageError(
                 f"the ray step is a length in mm, at least {SMALLEST_STEP * smallest:.3g} in this volume"
                 f" (a hundredth of its smallest spacing), not {ray_step!r}"
+            )
+        way = float(np.linalg.norm(np.ptp(box_corners(self.volume), axis=0)))
+        if way > MOST_SAMPLES * step:
+            raise UsageError(
+                f"a ray of {way:.4g} mm through the volume would have {way / step:.3g} samples {step:.3g} mm apart,"
+                f" more than {MOST_SAMPLES:.0e}: give a ray step of at least {way / MOST_SAMPLES:.3g} mm"
             )
         return step
 

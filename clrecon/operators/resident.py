@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clrecon.geometry import Volume
+from clrecon.geometry import Volume, slice_normal
 from clrecon.geometry.affine import Float64Array
 from clrecon.geometry.camera import Camera
 from clrecon.kernels import Program, Stopwatch, allocate, download, launch, load_program, upload
@@ -35,13 +35,17 @@ def choose_brick_cells(volume: Volume) -> tuple[int, int, int]:
 OVERLAP = 2
 """Slices that a slab holds beyond its own at either side: those that cells and gradients at its ends read."""
 
+MOST_VOXELS = (1 << 31) - 1
+"""Of a slab, where kernels take several samples at once: what they differ by in their places is an int."""
+
 
 def entry_slice(volume: Volume, camera: Camera) -> float:
-    """Slice coordinate that the rays of a picture come from, see `ResidentVolume.slabs`."""
-    place = np.array(camera.position)
-    if camera.is_parallel:
-        place -= 1e5 * camera.basis().forward
-    return float(volume.lps_to_ijk(place[None])[0, 2])
+    """Slice coordinate that the rays of a picture come from, see `ResidentVolume.slabs`; infinite for parallel rays."""
+    if camera.is_parallel:  # however far back they begin, in a view along the slices too
+        normal = slice_normal(volume.affine)
+        rate = float(normal @ camera.basis().forward) * float(normal @ volume.affine[:3, 2])
+        return -np.inf if rate > 0.0 else np.inf
+    return float(volume.lps_to_ijk([camera.position])[0, 2])
 
 
 def ray_variants(device: Device, dtype: np.dtype[Any]) -> dict[str, str]:
@@ -170,12 +174,14 @@ class ResidentVolume:
             return {**self.slab_bytes(slices), **with_it, **others}
 
         limits = memory_limits(self.device, self.memory)
-        if not describe_shortage(limits, needs(nk)):
+        most = MOST_VOXELS // (max(2, ni) * max(2, nj)) if int(self.device.kernel_variants["LANES"]) > 1 else nk
+        if nk <= most and not describe_shortage(limits, needs(nk)):
             return nk
         low, high = 0, nk
         while high - low > 1:
             slices = (low + high) // 2
-            if describe_shortage(limits, {**needs(slices + 2 * OVERLAP + 1), **extra}):
+            held = slices + 2 * OVERLAP + 1
+            if held > most or describe_shortage(limits, {**needs(held), **extra}):
                 high = slices
             else:
                 low = slices
@@ -192,6 +198,7 @@ class ResidentVolume:
             As `plan` says.
         entry_k : float
             Slice coordinate of the camera: each ray goes away from it, so slabs are taken by their distance from it.
+            Infinite: from that end on.
         """
         nk = self.volume.shape_ijk[2]
         if slices >= nk:
@@ -201,7 +208,10 @@ class ResidentVolume:
             return
         self._whole = None
         parts = [(first, min(first + slices, nk)) for first in range(0, nk, slices)]
-        parts.sort(key=lambda part: max(part[0] - entry_k, entry_k - part[1], 0.0))
+        if np.isfinite(entry_k):
+            parts.sort(key=lambda part: max(part[0] - entry_k, entry_k - part[1], 0.0))
+        elif entry_k > 0.0:
+            parts.reverse()
         for number, (first, end) in enumerate(parts):
             low, high = (-np.inf if first == 0 else first), (np.inf if end == nk else end)
             slab = self._upload(max(first - OVERLAP, 0), min(end + OVERLAP + 1, nk), low, high, stopwatch)

@@ -31,23 +31,17 @@ class StackTable:
         The last arguments of kernels with STACK_PARAMETERS; none for even volumes.
     slope : ndarray, shape (4,), float32
         Largest number of index steps along i, j and k that a mm of height makes.
-    steps_per_unit : ndarray, shape (3,), float64
-        Largest number of index steps along i, j and k that a step in field coordinates can make.
-    longest_step : float
-        Field coordinates that an index step makes at most.
     """
 
     arguments: tuple[Any, ...]
     slope: NDArray[np.float32]
-    steps_per_unit: Float64Array
-    longest_step: float
 
     @classmethod
     def of(cls, volume: Volume, device: Device) -> StackTable:
         """The table of a volume, on the device."""
         slope = np.zeros(4, np.float32)
         if not volume.uneven:
-            return cls((), slope, np.ones(3), 1.0)
+            return cls((), slope)
         nk = volume.shape_ijk[2]
         places = FieldFrame.of(volume).places(volume.slice_origins())
         heights = places[:, 2]
@@ -65,8 +59,12 @@ class StackTable:
         slope[:2] = np.abs(np.diff(places[:, :2], axis=0) / gaps[:, None]).max(axis=0)
         slope[2] = 1.0 / gaps.min()
         arguments = (upload(device, table), upload(device, layers), np.float32(per_mm), np.int32(count), np.int32(nk))
-        # What moves along the height moves aside as well.
-        reach = np.array([1.0 + slope[0], 1.0 + slope[1], slope[2]])
-        return cls(
-            arguments, slope, reach, float(max(1.0, gaps.max(), *np.abs(np.diff(places[:, :2], axis=0)).max(axis=0)))
-        )
+        return cls(arguments, slope)
+
+    def index_steps(self, apart: Float64Array) -> Float64Array:
+        """Index steps (3,) that places `apart` (3,) in field coordinates, not negative, are apart at most."""
+        if not self.arguments:
+            return apart
+        # What lies at another height lies aside as well.
+        steps: Float64Array = np.array([apart[0], apart[1], 0.0]) + apart[2] * self.slope[:3]
+        return steps

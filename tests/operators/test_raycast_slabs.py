@@ -31,7 +31,7 @@ def test_slabs_give_the_picture_of_the_whole(device, mode, towards, even):
     if mode == "dvr":
         settings |= {"transfer_function": SOFT, "lighting": Lighting()}
     whole, parts = (
-        DeviceCaster(device)(volume, **settings, memory=memory) for memory in (None, volume.voxels.nbytes // 2)
+        DeviceCaster(device)(volume, **settings, memory=memory) for memory in (None, 3 * volume.voxels.nbytes // 5)
     )
     assert np.abs(premultiplied(whole.image) - premultiplied(parts.image)).max() <= tolerances.RAY_SAME_255
     for name in ("depth", "expected_depth", "values"):
