@@ -265,7 +265,12 @@ def _temporary_file(folder: Path) -> Iterator[tuple[Path, BinaryIO]]:
                 if not _lock_new(stream):
                     continue
                 _own_names.add(temporary.name)
-                yield temporary, stream
+                try:
+                    yield temporary, stream
+                except BaseException:
+                    with contextlib.suppress(OSError):  # what waits in the buffer fails as the first error did
+                        stream.close()
+                    raise
                 return
         finally:
             _own_names.discard(temporary.name)

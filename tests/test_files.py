@@ -145,7 +145,8 @@ def test_bytes_that_are_lost_are_noticed(older):
     check_untouched(older)
 
 
-def test_limit_on_the_size_of_files(older):
+@pytest.mark.parametrize("piece", [100_000, 300])  # more and less than the buffer holds
+def test_limit_on_the_size_of_files(older, piece):
     """A real limit of the system, in a process of its own."""
     code = f"""
         import resource
@@ -153,7 +154,7 @@ def test_limit_on_the_size_of_files(older):
         from clrecon.files import replace_file
         resource.setrlimit(resource.RLIMIT_FSIZE, (4096, 4096))
         try:
-            replace_file({str(older)!r}, lambda stream: stream.write(bytes(100_000)))
+            replace_file({str(older)!r}, lambda stream: [stream.write(bytes({piece})) for _ in range(500)])
         except OutputError as error:
             print(error)
     """

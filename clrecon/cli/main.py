@@ -73,6 +73,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 def run() -> None:
     """Console script: run `main`, end the process with its exit code."""
     signal.signal(signal.SIGTERM, _interrupt)
+    if hasattr(signal, "SIGHUP") and signal.getsignal(signal.SIGHUP) == signal.SIG_DFL:  # nohup ignores it: so do we
+        signal.signal(signal.SIGHUP, _interrupt)
     for name in UNUSED_MODULES:
         sys.modules.setdefault(name, None)  # type: ignore[arg-type]
     code = main()
@@ -125,7 +127,7 @@ def _escape_unencodable() -> None:
 
 
 def _interrupt(number: int, frame: FrameType | None) -> None:
-    """SIGTERM ends a command like Ctrl-C, so that temporary files are removed."""
+    """SIGTERM and SIGHUP (a closed terminal) end a command like Ctrl-C, so that temporary files are removed."""
     raise KeyboardInterrupt
 
 

@@ -42,7 +42,7 @@ def read_curve_points(path: str | Path, space: str | None = None) -> Float64Arra
     Raises
     ------
     UsageError
-        Unknown frame, or not the one that the file says.
+        There is no such file; unknown frame, or not the one that the file says.
     RefusedInputError
         The file cannot be read, or is not what its name says; the message has the line or the point.
     """
@@ -76,6 +76,8 @@ def _read_text(file: Path, shown: str) -> str:
         if file.stat().st_size > LARGEST_BYTES:
             raise RefusedInputError(f"{shown} has {file.stat().st_size:,} bytes: this is no list of points")
         return file.read_text(encoding="utf-8-sig")
+    except FileNotFoundError as error:
+        raise UsageError(f"there is no file {shown} with the points of a centre line") from error
     except OSError as error:
         raise RefusedInputError(f"the points cannot be read from {shown}: {error.strerror or error}") from error
     except UnicodeDecodeError as error:

@@ -46,9 +46,11 @@ def _device_ready(voxels: NDArray[Any]) -> NDArray[Any]:
 
 
 def _as_array(voxels: ArrayLike) -> NDArray[Any]:
-    masked = sys.modules.get("numpy.ma")  # where it is not loaded, no array is masked; to load it takes 10 ms
-    if masked is not None and isinstance(voxels, masked.MaskedArray) and masked.is_masked(voxels):
-        raise UsageError("masked voxels: fill them first, for CT with voxels.filled(clrecon.geometry.AIR_HU)")
+    if "numpy.ma" in sys.modules:  # where it is not loaded, no array is masked; to load it takes 10 ms
+        import numpy.ma as masked  # waits where another thread is about to load it: half loaded, it has no MaskedArray
+
+        if isinstance(voxels, masked.MaskedArray) and masked.is_masked(voxels):
+            raise UsageError("masked voxels: fill them first, for CT with voxels.filled(clrecon.geometry.AIR_HU)")
     try:
         return np.asarray(voxels)
     except ValueError as error:

@@ -145,7 +145,7 @@ class VolumeRenderer:
             ("labels", options.get("labels"), LabelMap),
         ):  # fmt: skip
             if not (value is None or isinstance(value, kind)):
-                raise UsageError(f"the {what} of a picture is a {kind.__name__} or None, not {value!r:.60}")
+                raise UsageError(f"the {what} of a picture is a {kind.__name__} or None, not {type(value).__name__}")
         mode = _choose_mode(mode, preset, transfer_function)
         given = {"transfer_function": transfer_function, "ray_step": ray_step, "view_angle": view_angle, **options}
         _check_options(mode, given)

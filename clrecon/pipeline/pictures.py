@@ -89,16 +89,18 @@ def check_pictures(files: PictureFiles, settings: RenderSettings) -> None:
     ------
     UsageError
         An unknown extension, two outputs that are one file, a format that cannot hold what is asked of it, no encoder
-        for a moving picture, or Pillow is not installed.
+        for a moving picture, a caption that cannot be drawn, or Pillow is not installed.
     OutputError
         A folder is missing or cannot be written to, or a target is no regular file.
     """
     from clrecon.files import check_writable
+    from clrecon.rendering.annotations import check_caption
     from clrecon.rendering.image_files import check_float_path, check_image_path
     from clrecon.rendering.motion import check_animation
     from clrecon.rendering.pillow import load_pillow
 
     load_pillow()
+    check_caption(settings.caption)
     given = {name for name in ("depth", "values") if getattr(files, name) is not None}
     misplaced = find_misplaced(settings.mode_used, given)
     if misplaced:

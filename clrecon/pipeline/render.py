@@ -14,7 +14,7 @@ from clrecon.pipeline.opening import DeviceOpening
 from clrecon.pipeline.outputs import commit_all
 from clrecon.pipeline.pictures import PictureFiles, check_pictures, format_of, name_view, stage_picture
 from clrecon.pipeline.progress import Progress, Stopwatch, ignore_progress
-from clrecon.pipeline.render_report import describe_picture, describe_pictures, warn_of_picture
+from clrecon.pipeline.render_report import describe_picture, describe_pictures, find_emptiness, warn_of_picture
 from clrecon.pipeline.render_settings import RenderSettings
 from clrecon.pipeline.report import peak_memory_bytes, stage_report
 from clrecon.pipeline.studio import Studio, read_curve, read_function, read_look
@@ -164,13 +164,20 @@ def _turn(
     first = settings.camera(volume, settings.views_used[0], turning=True)
     cameras = turntable_cameras(first, turn.frames, turn.degrees)
 
+    empty: list[str] | None = []
+
     def frames() -> Iterator[Rendering]:
+        nonlocal empty
         for camera in cameras:
-            yield studio.take(camera)
+            picture = studio.take(camera)
+            why = None if empty is None else find_emptiness(picture)
+            empty = None if empty is None or why is None else [*empty, why]
+            yield picture
 
     progress("frames", 0, turn.frames)
     size = write_animation(frames(), files.turntable, turn.fps, total=turn.frames, progress=progress)
     seconds = watch.lap("turntable")
+    studio.warnings += (empty or [])[:1]  # one frame with something in it is enough
     return {
         "frames": turn.frames,
         "fps": turn.fps,

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from clrecon.pipeline.studio import Studio
     from clrecon.rendering import Rendering, TransferFunction
 
-__all__ = ["describe_camera", "describe_picture", "describe_pictures", "warn_of_picture"]
+__all__ = ["describe_camera", "describe_picture", "describe_pictures", "find_emptiness", "warn_of_picture"]
 
 FACE_WARNING = "a picture of the skin can show a face: treat the file as one that identifies the patient"
 
@@ -62,10 +62,34 @@ def describe_picture(picture: Rendering, name: str, view: str) -> dict[str, Any]
     }
 
 
+def find_emptiness(picture: Rendering) -> str | None:
+    """Say why there is nothing to be seen in a picture; None where there is something."""
+    import numpy as np
+
+    values = None if picture.values is None else picture.values[np.isfinite(picture.values)]
+    if values is None or not values.size:
+        if np.isfinite(picture.depth).any():
+            return None
+        return (
+            f"nothing of the volume shows in mode {picture.mode}:"
+            " look at view and zoom, at what is clipped, and at the iso value or the transfer function"
+        )
+    low, high = picture.report.get("window_hu") or (-np.inf, np.inf)
+    shade = "black" if values.max() <= low else "white" if values.min() >= high else None
+    if shade is None:
+        return None
+    shown = f"{values.min():g} to {values.max():g}"
+    air = ": the air round the body is the lowest, clip it away (--clip-box)" if picture.mode == "minip" else ""
+    return f"all of the picture is {shade}: its {shown} HU lie beyond the window from {low:g} to {high:g}{air}"
+
+
 def warn_of_picture(picture: Rendering) -> list[str]:
     """What is to be known of a picture before it is used."""
     made = picture.report
     warnings = [str(text) for text in made.get("warnings", [])]
+    empty = find_emptiness(picture)
+    if empty is not None and not warnings:  # slices that are seen edge-on say so themselves
+        warnings.append(empty)
     found = (made.get("curve") or {}).get("found")
     if found is not None:
         warnings.append("the centre line is the spinal canal as it was found: look whether it is the canal")

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
     from clrecon.rendering.picture import Rendering
 
-__all__ = ["SMALLEST_SIDE", "annotate", "bar_length", "edge_letters", "orientation_letters"]
+__all__ = ["SMALLEST_SIDE", "annotate", "bar_length", "check_caption", "edge_letters", "orientation_letters"]
 
 SMALLEST_SIDE = 64
 """Pixels; letters in smaller pictures cannot be read."""
@@ -104,8 +104,9 @@ def annotate(
     ------
     UsageError
         The picture is smaller than 64 x 64 pixels or too narrow for the text, or its directions or its pixel size
-        are not known (curved reformations).
+        are not known (curved reformations), or the font lacks a character of the caption.
     """
+    check_caption(caption)
     if not (letters or scale_bar or caption):
         return rendering
     width, height = rendering.size
@@ -125,6 +126,25 @@ def annotate(
     if caption:
         page.draw_caption(caption)
     return replace(rendering, image=page.finish())
+
+
+def check_caption(caption: str | None) -> None:
+    """Refuse a line of text with characters that the font does not have: they would be drawn as boxes.
+
+    Raises
+    ------
+    UsageError
+        Names them.
+    """
+    if not caption:
+        return
+    font = load_font(4.0 * SMALLEST_TEXT)
+    box = bytes(font.getmask("\uffff"))  # no character: what the font draws instead of one that it lacks
+    absent = [
+        letter for letter in dict.fromkeys(caption) if letter.isprintable() and bytes(font.getmask(letter)) == box
+    ]
+    if absent:
+        raise UsageError(f"captions cannot be drawn with {' '.join(absent)}: the font has plain Latin letters only")
 
 
 def _bar_of(rendering: Rendering) -> tuple[float, str]:

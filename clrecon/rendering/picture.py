@@ -45,6 +45,10 @@ class Rendering:
     mode: str = "dvr"
     report: dict[str, Any] = field(default_factory=dict)
 
+    def __repr__(self) -> str:
+        width, height = self.size
+        return f"<Rendering {self.mode}, {width} x {height} pixels, camera {self.camera}>"
+
     @property
     def size(self) -> tuple[int, int]:
         """Width and height in pixels."""

@@ -375,7 +375,7 @@ WRONG = {
     "slice not there": (["--mode", "slices", "--slices", "17,"], 3, "slices 0 to 16"),
     "slice opacity": (["--mode", "slices", "--slice-opacity", "0"], 3, "opacity of a slice"),
     "shadows elsewhere": (["--shadows"], 3, "--shadows means nothing in mode dvr"),
-    "curve file": (["--curve", "nowhere.csv"], 4, "nowhere.csv"),
+    "curve file": (["--curve", "nowhere.csv"], 3, "there is no file"),
     "letters on a curve": (["--curve", "auto", "--letters"], 3, "--letters"),
     "small letters": (["--letters", "--size", "20"], 3, "at least 64"),
     "function file": (["--transfer-function", "nowhere.json"], 3, "nowhere.json"),

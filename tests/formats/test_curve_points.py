@@ -89,6 +89,8 @@ def test_what_holds_no_points_is_refused(tmp_path, name, text, says):
 
 def test_files_that_cannot_be_read_are_refused(tmp_path):
     (tmp_path / "bytes.txt").write_bytes(b"\xff\xfe\x00")
-    for name, says in [("bytes.txt", "no text"), ("absent.txt", "cannot be read"), (".", "cannot be read")]:
+    for name, says in [("bytes.txt", "no text"), (".", "cannot be read")]:
         with pytest.raises(RefusedInputError, match=says):
             read_curve_points(tmp_path / name)
+    with pytest.raises(UsageError, match="there is no file"):
+        read_curve_points(tmp_path / "absent.txt")

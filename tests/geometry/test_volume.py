@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 
@@ -82,6 +85,27 @@ def test_masked_and_ragged_voxels_are_refused():
         Volume([[[1, 2], [3]]], np.eye(4))
     with pytest.raises(UsageError, match="float32"):
         Volume(np.full((2, 2, 2), 1e300), np.eye(4))
+
+
+def test_a_volume_is_made_while_another_thread_loads_masked_arrays():
+    code = """
+import builtins, sys, threading, time
+import numpy as np
+from clrecon.geometry import Volume
+load = builtins.__import__
+def slow(name, *rest):
+    if threading.current_thread().name == "other" and sys.modules.get("numpy.ma") is not None:
+        time.sleep(0.02)
+    return load(name, *rest)
+builtins.__import__ = slow
+thread = threading.Thread(target=lambda: np.unique([1, 2]), name="other")
+thread.start()
+while "numpy.ma" not in sys.modules:
+    time.sleep(0.001)
+Volume(np.zeros((2, 2, 2), np.int16), np.eye(4))
+thread.join()
+"""
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
 
 
 @pytest.mark.parametrize("affine", ["x", [[1, 2], [3]], np.eye(4) * 1j, None])

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -139,6 +141,33 @@ def test_a_volume_in_slabs_is_the_same_picture(
         found.append((report["pictures"][0]["slabs"], np.asarray(Image.open(tmp_path / "a.png")).astype(int)))
     assert found[0][0] == 1 < found[1][0]
     assert np.abs(found[0][1] - found[1][1]).max() <= 2
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        ({"iso_value": 30000.0}, "mode surface"),
+        ({"clip_box": (5000, 6000, -np.inf, np.inf, -np.inf, np.inf)}, "mode dvr"),
+        ({"clip_box": (5000, 6000, -np.inf, np.inf, -np.inf, np.inf), "mode": "mip"}, "mode mip"),
+        ({"preset": "minip"}, "picture is black.*clip it away"),
+        ({"mode": "slice", "window": (20000, 30000)}, "picture is black"),
+        ({"mode": "slice", "window": (-30000, -20000)}, "picture is white"),
+    ],
+)
+def test_a_picture_of_nothing_says_so(
+    device: Any, sphere: tuple[Path, dict[str, Any]], tmp_path: Path, settings: dict[str, Any], words: str
+) -> None:
+    looks = RenderSettings(size=SIZE, device=str(device.index), **settings)
+    report = make_pictures(sphere[0], PictureFiles(tmp_path / "a.png"), looks)
+    assert [text for text in report["warnings"] if re.search(words, text)]
+    if looks.mode_used != "slice":
+        turning = replace(looks, turntable=Turntable(2))
+        report = make_pictures(sphere[0], PictureFiles(turntable=tmp_path / "b.gif"), turning)
+        assert [text for text in report["warnings"] if re.search(words, text)]
+    fine = make_pictures(
+        sphere[0], PictureFiles(tmp_path / "a.png"), RenderSettings(size=SIZE, device=str(device.index))
+    )
+    assert not [text for text in fine["warnings"] if "picture is" in text or "nothing" in text]
 
 
 def test_names_of_views() -> None:

@@ -8,7 +8,13 @@ import pytest
 from clrecon.errors import UsageError
 from clrecon.geometry import Volume
 from clrecon.geometry.camera import Camera
-from clrecon.rendering.annotations import LONGEST_BAR_SHARE, bar_length, edge_letters, orientation_letters
+from clrecon.rendering.annotations import (
+    LONGEST_BAR_SHARE,
+    bar_length,
+    check_caption,
+    edge_letters,
+    orientation_letters,
+)
 from tests import tolerances
 from tests.rendering.picture_files import PARALLEL, PERSPECTIVE, make_picture
 
@@ -126,6 +132,14 @@ def test_the_smallest_picture_has_room_for_all():
     picture = make_picture((64, 64))
     marked = picture.annotated(letters=True, scale_bar=True)
     assert drawn(picture, marked).any()
+
+
+@pytest.mark.parametrize("caption", ["größe", "\u8179", "T12 \u00b2"])
+def test_what_the_font_lacks_is_refused_and_not_drawn_as_boxes(caption):
+    absent = next(letter for letter in caption if ord(letter) > 127)
+    with pytest.raises(UsageError, match=absent):
+        make_picture((400, 300)).annotated(caption=caption)
+    check_caption("T12 ~ 5 mm, 30\u00b0 (a_b)\ttab")
 
 
 def test_a_caption_is_cut_where_the_picture_ends():

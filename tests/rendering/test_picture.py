@@ -191,3 +191,8 @@ def test_colours_by_name_and_number():
 def test_unknown_colours_list_the_known_ones(color):
     with pytest.raises(UsageError, match="black, white, gray"):
         find_color(color)
+
+
+def test_a_picture_is_told_in_one_line():
+    told = repr(make_picture((40, 30)))
+    assert "40 x 30" in told and "dvr" in told and "\n" not in told and len(told) < 400
