@@ -24,6 +24,9 @@ __all__ = ["NODES", "TransferTables", "composite_slab"]
 NODES = 4096
 """Entries of a transfer function's table, as in cl/render/composite.cl."""
 
+FARTHEST_BRICK = 255
+"""No distance of bricks is larger, see cl/render/occupancy.cl."""
+
 GRADIENT_NODES = 256
 """Entries of its table of factors by magnitude of the gradient."""
 
@@ -156,7 +159,8 @@ def _enter_tiles(
     launch(
         device, resident.program("render/tiles.cl")["enter_tiles"], -(-output.tiles // lanes),
         leaps.distances_d, upload(device, view.widened(margin * BRICK_CELLS * resident.stack.longest_step)), entries_d,
-        resident.stack.slope, *(np.int32(n) for n in slab.bricks), np.int32(slab.first_k), np.int32(margin),
+        resident.stack.slope, *(np.int32(n) for n in slab.bricks), np.int32(slab.first_k),
+        np.int32(min(margin, FARTHEST_BRICK)),
         np.uint32(width), np.uint32(height), np.int32(not view.camera.is_parallel), *resident.stack.arguments,
         stopwatch=stopwatch,
     )  # fmt: skip

@@ -14,7 +14,7 @@ from clrecon.geometry.affine import Float64Array
 from clrecon.geometry.camera import Camera
 from clrecon.kernels import Program, Stopwatch, allocate, download, launch, load_program, upload
 from clrecon.opencl import Device, check_budget, describe_shortage, memory_limits
-from clrecon.operators.ray_view import BOX_BORDER, enclose
+from clrecon.operators.ray_view import BOX_BORDER, FieldFrame, enclose
 from clrecon.operators.stack_table import StackTable
 from clrecon.operators.voxel_types import voxel_variants
 
@@ -27,12 +27,15 @@ OVERLAP = 2
 """Slices that a slab holds beyond its own at either side: those that cells and gradients at its ends read."""
 
 
+ENDLESS = 1e9
+"""Slices that no volume has."""
+
+
 def entry_slice(volume: Volume, camera: Camera) -> float:
     """Slice coordinate that the rays of a picture come from, see `ResidentVolume.slabs`."""
-    place = np.array(camera.position)
-    if camera.is_parallel:
-        place -= 1e5 * camera.basis().forward
-    return float(volume.lps_to_ijk(place[None])[0, 2])
+    if camera.is_parallel:  # whatever its position: the rays run through all of space
+        return float(-np.sign((FieldFrame.of(volume).matrix @ camera.basis().forward)[2]) * ENDLESS)
+    return float(volume.lps_to_ijk(np.array(camera.position)[None])[0, 2])
 
 
 def ray_variants(device: Device, dtype: np.dtype[Any]) -> dict[str, str]:
@@ -118,11 +121,21 @@ class ResidentVolume:
         self.memory = memory
         self.dtype = volume.voxels.dtype
         self._whole: RaySlab | None = None
-        self.stack = StackTable.of(volume, device)
+        self._context = device.context
+        self._stack = StackTable.of(volume, device)
 
     def close(self) -> None:
         """Free what is on the device."""
         self._whole = None
+
+    @property
+    def stack(self) -> StackTable:
+        """Where the slices lie, on the device."""
+        if self._context is not self.device.context:  # it failed, and what was there is lost
+            self._context = self.device.context
+            self._whole = None
+            self._stack = StackTable.of(self.volume, self.device)
+        return self._stack
 
     def program(self, name: str, **variants: str) -> Program:
         """Build a kernel file for this volume's type of voxels."""
@@ -182,10 +195,12 @@ class ResidentVolume:
             Slice coordinate of the camera: each ray goes away from it, so slabs are taken by their distance from it.
         """
         nk = self.volume.shape_ijk[2]
+        _ = self.stack
         if slices >= nk:
-            if self._whole is None:
-                self._whole = self._upload(0, nk, -np.inf, np.inf, stopwatch)
-            yield self._whole
+            whole = self._whole
+            if whole is None:
+                whole = self._whole = self._upload(0, nk, -np.inf, np.inf, stopwatch)
+            yield whole
             return
         self._whole = None
         parts = [(first, min(first + slices, nk)) for first in range(0, nk, slices)]
@@ -230,8 +245,9 @@ class ResidentVolume:
         low, scale : float
             Nearest node to a value v: ``floor((v - low) * scale + 0.5)``, within the table.
         """
-        if key in slab.maps:
-            return slab.maps[key]
+        known = slab.maps.get(key)
+        if known is not None:
+            return known
         ranges_d = self.measure(slab, stopwatch)
         device, program = self.device, self.program("render/occupancy.cl")
         bi, bj, bk = slab.bricks
@@ -259,8 +275,8 @@ class ResidentVolume:
             )  # fmt: skip
         from_d = to_d
         slab.maps.clear()  # one a slab: a map is made in some milliseconds
-        slab.maps[key] = LeapMap(from_d, self._find_box(marked, slab))
-        return slab.maps[key]
+        made = slab.maps[key] = LeapMap(from_d, self._find_box(marked, slab))
+        return made
 
     def _find_box(self, marked: NDArray[np.bool_], slab: RaySlab) -> tuple[Float64Array, Float64Array] | None:
         ends = []
