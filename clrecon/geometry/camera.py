@@ -37,6 +37,10 @@ class CameraBasis(NamedTuple):
     forward: Float64Array
 
 
+FARTHEST_MM = 1e9
+"""What float32 coordinates of a device can be far from a volume, and no patient is."""
+
+
 def box_corners(volume: Grid) -> Float64Array:
     """Corners of the space that voxels fill, half a voxel beyond the outer centres.
 
@@ -92,6 +96,9 @@ class Camera:
         for name in ("position", "focal_point", "up"):
             checked = checked_vector(f"the {name.replace('_', ' ')} of a camera", getattr(self, name))
             object.__setattr__(self, name, checked)
+        for name in ("position", "focal_point"):
+            if max(map(abs, getattr(self, name))) > FARTHEST_MM:
+                raise UsageError(f"the {name.replace('_', ' ')} of a camera is within a thousand kilometres")
         if self.view_angle is not None and self.parallel_scale is not None:
             raise UsageError("a camera has a view angle (perspective) or a parallel scale, not both")
         if self.parallel_scale is None:
@@ -103,8 +110,11 @@ class Camera:
             object.__setattr__(self, "view_angle", angle)
         else:
             scale = _number(self.parallel_scale)
-            if not (0.0 < scale < np.inf):
-                raise UsageError(f"the parallel scale of a camera is a length in mm, not {self.parallel_scale!r}")
+            if not 0.0 < scale <= FARTHEST_MM:
+                raise UsageError(
+                    "the parallel scale of a camera is a length in mm, above 0 to a thousand kilometres, not"
+                    f" {self.parallel_scale!r}"
+                )
             object.__setattr__(self, "parallel_scale", scale)
         self.basis()
 
@@ -212,7 +222,7 @@ class Camera:
         if length < 1e-6:
             raise UsageError("position and focal point of a camera lie in one place: there is no direction to look in")
         forward /= length
-        up = np.array(self.up)
+        up = np.array(self.up) / max(np.abs(self.up).max(), 1e-12)  # so that 1e200 has a length
         size = np.linalg.norm(up)
         right = np.cross(forward, up)
         if size < 1e-12 or np.linalg.norm(right) < 1e-6 * size:

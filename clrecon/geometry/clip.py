@@ -39,7 +39,8 @@ class Clip:
             raise UsageError(f"clip planes are (normal, offset), shape (n, 4); these have shape {table.shape}")
         if not np.isfinite(table).all():
             raise UsageError("a clip plane holds NaN or infinite numbers")
-        lengths = np.linalg.norm(table[:, :3], axis=1, keepdims=True)
+        largest = np.abs(table[:, :3]).max(axis=1, initial=0.0, keepdims=True)
+        lengths = largest * np.linalg.norm(table[:, :3] / np.maximum(largest, 1e-12), axis=1, keepdims=True)
         if len(table) and lengths.min() < 1e-12:
             raise UsageError(f"clip plane {int(lengths.argmin())} has a normal of length 0: it has no inner side")
         self._planes: Float64Array = table / lengths + 0.0  # no -0.0: equal clips have equal bytes

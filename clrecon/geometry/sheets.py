@@ -230,11 +230,15 @@ def plane_sheet(camera: Camera, size: Sequence[int], offset_mm: float = 0.0) -> 
         The size is not one, or the offset is not finite.
     """
     width, height = checked_size(size)
-    if not np.isfinite(offset_mm):
+    try:
+        offset = float(offset_mm)
+    except (TypeError, ValueError, OverflowError):
+        offset = np.nan
+    if not np.isfinite(offset):
         raise UsageError(f"the offset of a slice is a length in mm, not {offset_mm!r}")
     right, up, forward = camera.basis()
     pixel = camera.pixel_mm(size)
-    shift = offset_mm * forward
+    shift = offset * forward
     centre = np.add(camera.focal_point, shift)
     position = np.add(camera.position, shift)
     own = Camera(_triple(position), _triple(centre), camera.up, parallel_scale=0.5 * height * pixel)

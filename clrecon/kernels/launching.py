@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any
 
 from clrecon.opencl import Device
@@ -24,7 +24,7 @@ class Stopwatch:
     def __init__(self) -> None:
         self.seconds: dict[str, float] = {"upload": 0.0, "build": 0.0, "kernels": 0.0, "download": 0.0}
         self.by_kernel: dict[str, float] = {}
-        self._events: list[tuple[str, Any]] = []
+        self._events: list[tuple[str, Any, tuple[Any, ...]]] = []
 
     @contextmanager
     def timed(self, part: str) -> Iterator[None]:
@@ -35,20 +35,30 @@ class Stopwatch:
         finally:
             self.seconds[part] += time.perf_counter() - start
 
-    def record(self, kernel: str, event: Any) -> None:
-        """Keep the event of a launch until `settle`."""
-        self._events.append((kernel, event))
+    def record(self, kernel: str, event: Any, arguments: tuple[Any, ...] = ()) -> None:
+        """Keep the event of a launch, and what the kernel reads and writes, until it is over.
+
+        A CPU device works in numpy's own memory: what nobody refers to any more would be given back under its hands.
+        """
+        self._events.append((kernel, event, arguments))
 
     @contextmanager
     def running(self, device: Device) -> Iterator[None]:
-        """Time a block that launches kernels, and wait for them at its end."""
+        """Time a block that launches kernels, and wait for them at its end, however it ends."""
         start = time.perf_counter()
-        yield
+        queue = device.queue
+        try:
+            yield
+        except BaseException:
+            with suppress(import_pyopencl().Error):  # a lost device has nothing left that works
+                queue.finish()
+            self._events.clear()
+            raise
         finish(device)
         wall = time.perf_counter() - start
         busy = 0.0
         has_times = device.has_event_times
-        for kernel, event in self._events:
+        for kernel, event, _ in self._events:
             try:
                 spent = 1e-9 * (event.profile.end - event.profile.start)
             except import_pyopencl().Error:  # a driver without times: the mesh is good all the same
@@ -113,4 +123,4 @@ def launch(
         what = f"kernel {kernel.function_name} ({rounded:,} items in groups of {group}) failed"
         raise device.fail(what, error) from error
     if stopwatch is not None:
-        stopwatch.record(kernel.function_name, event)
+        stopwatch.record(kernel.function_name, event, arguments)

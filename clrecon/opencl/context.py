@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import sys
 import threading
@@ -91,6 +92,7 @@ class Device:
         self.programs: dict[tuple[str, tuple[str, ...]], Any] = {}
         self._context: Any = None
         self._queue: Any = None
+        self._process = os.getpid()
 
     @property
     def score(self) -> tuple[int, int, tuple[int, ...], int]:
@@ -120,6 +122,7 @@ class Device:
             The driver refuses.
         """
         cl = quirks.import_pyopencl()
+        self._refuse_fork()
         with self.lock:
             if self._context is None:
                 try:
@@ -132,6 +135,7 @@ class Device:
     def queue(self) -> Any:
         """The in-order command queue, with profiling."""
         cl = quirks.import_pyopencl()
+        self._refuse_fork()
         with self.lock:
             if self._queue is None:
                 try:
@@ -140,6 +144,14 @@ class Device:
                 except cl.Error as error:
                     raise DeviceError(f"device {self.label} gives no queue: {describe_error(error)}") from error
             return self._queue
+
+    def _refuse_fork(self) -> None:
+        """Refuse to work for a process that was forked off: drivers' threads are not there, it would wait forever."""
+        if self._process != os.getpid():
+            raise DeviceError(
+                f"{self.label} was opened by the process that this one was forked from, which no driver survives: start"
+                " processes with multiprocessing.get_context('spawn'), or fork before the first use of a device"
+            )
 
     def fail(self, what: str, error: Exception) -> DeviceError:
         """Return the error for a failed call, and forget context and queue: a lost device needs fresh ones."""

@@ -14,7 +14,7 @@ from clrecon.labels.resample import ResampledLabels
 from clrecon.opencl import Device
 from clrecon.operators.pictures import PictureBuffers, count_queues, highlight_table
 from clrecon.operators.ray_view import RayView
-from clrecon.operators.resident import BRICK_CELLS, LeapMap, RaySlab, ResidentVolume, pad_slices
+from clrecon.operators.resident import LeapMap, RaySlab, ResidentVolume, pad_slices
 from clrecon.operators.voxel_types import label_variants
 from clrecon.rendering import Lighting, TransferFunction
 from clrecon.rendering.label_style import LabelStyle
@@ -155,7 +155,7 @@ def _enter_tiles(
     device = resident.device
     lanes = int(device.kernel_variants["LANES"])
     width, height = view.size
-margin = math.ceil(min((resident.stack.index_steps(view.spread) / resident.brick_cells).max(), FARTHEST))
+    margin = math.ceil(min((resident.stack.index_steps(view.spread) / resident.brick_cells).max(), FARTHEST))
     entries_d = allocate(device, 4 * output.tiles)
     launch(
         device, resident.program("render/tiles.cl")["enter_tiles"], -(-output.tiles // lanes),

@@ -21,6 +21,9 @@ TILE = 8
 BOX_ROW = 9
 """Row of the box in the table; its upper end and both of the focus follow."""
 
+ENDLESS = 1e30
+"""Offset of a clip plane that nothing comes near, in float32."""
+
 BOX_BORDER = 0.5
 """Voxels beyond the outermost voxel centres that belong to a volume."""
 
@@ -159,7 +162,7 @@ class RayView:
         table[-1] = near, ray_step, 0.0, 0.0
         count = 0
         if planes is not None and len(planes):
-            table = np.vstack([table, frame.planes(planes)])
+            table = np.vstack([table, np.clip(frame.planes(planes), -ENDLESS, ENDLESS)])
             count = len(planes)
         across, along = 0.5 * TILE * pixel, 0.0
         if not camera.is_parallel:

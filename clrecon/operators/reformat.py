@@ -21,6 +21,7 @@ from clrecon.kernels import Stopwatch
 from clrecon.opencl import Device, choose_device
 from clrecon.operators.sheets import Progress, Reformation, sample_sheet
 from clrecon.rendering import Rendering
+from clrecon.rendering.colors import is_transparent
 from clrecon.rendering.window import BONE_WINDOW, checked_window, grey_image
 
 __all__ = ["CURVED_KINDS", "cut_slice", "reformat_curve"]
@@ -166,7 +167,7 @@ def cut_slice(
     report = job.describe(made, camera.pixel_mm((width, height))) | _describe_plane(camera)
     image = grey_image(made.values, job.window)
     seen = Rendering(image, depth, depth.copy(), camera, made.values, mode="slice", report=report)
-    return seen if background == "transparent" else seen.with_background(background)
+    return seen if is_transparent(background) else seen.with_background(background)
 
 
 def _describe_plane(camera: Camera) -> dict[str, Any]:
@@ -256,7 +257,7 @@ def reformat_curve(
         No device, two slices and the picture do not fit it, or it fails.
     """
     job = _Job(volume, device, thickness, combine, window, memory)
-    if kind not in CURVED_KINDS:
+    if not isinstance(kind, str) or kind not in CURVED_KINDS:
         raise UsageError(f"a curved reformation is {' or '.join(CURVED_KINDS)}, not {kind!r}")
     if not np.isfinite(angle) or (angle != 0.0 and kind == "stretched"):
         raise UsageError(f"the angle turns straightened pictures, in degrees: not {angle!r} in a {kind} one")
@@ -281,7 +282,7 @@ def reformat_curve(
         )
     image = grey_image(made.values, job.window)
     seen = Rendering(image, nowhere, nowhere.copy(), None, made.values, mode="cpr", report=report)
-    return seen if background == "transparent" else seen.with_background(background)
+    return seen if is_transparent(background) else seen.with_background(background)
 
 
 def _find_line(volume: Volume, curve: Curve | ArrayLike | str) -> tuple[Curve, dict[str, Any] | None]:

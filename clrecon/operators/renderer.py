@@ -22,6 +22,7 @@ from clrecon.operators.project import PROJECTIONS
 from clrecon.operators.ray_pictures import RayPicture, take_picture
 from clrecon.operators.resident import ResidentVolume
 from clrecon.rendering import Lighting, Rendering, TransferFunction
+from clrecon.rendering.colors import is_transparent
 from clrecon.rendering.label_style import LabelStyle
 from clrecon.rendering.presets import DEFAULT_PRESET, find_preset
 from clrecon.rendering.window import checked_window
@@ -38,8 +39,8 @@ DEFAULT_ISO_VALUE = 200.0
 SMALLEST_STEP = 0.01
 """Ray steps below this share of the smallest spacing add time and nothing else."""
 
-MOST_SAMPLES = 1e7
-"""Of a ray: they are counted in float32, which is exact up to 1.6e7."""
+MOST_STEPS = 1 << 21
+"""Ray steps through the diagonal of a volume: float32 counts them, with room for where a sample lies in its step."""
 
 _LABELLED = ("dvr", "surface")
 _CUT = ("slice", "cpr")
@@ -105,7 +106,7 @@ class VolumeRenderer:
         self.device = choose_device(device)
         self.memory = memory
         self._resident = ResidentVolume(volume, self.device, memory)
-        self._tables: dict[tuple[TransferFunction, float], TransferTables] = {}
+        self._tables: dict[tuple[TransferFunction, float, Any], TransferTables] = {}
 
     def __enter__(self) -> VolumeRenderer:
         return self
@@ -118,7 +119,7 @@ class VolumeRenderer:
     def close(self) -> None:
         """Free the volume on the device."""
         self._resident.close()
-        self._tables.clear()
+        self._tables = {}
 
     def render(
         self,
@@ -158,7 +159,7 @@ class VolumeRenderer:
             return self._cut(camera, view, size, zoom, up, background, preset, options)
         if camera is None:
             camera = Camera.fit(self.volume, view, zoom, up=up, view_angle=view_angle, size=size)
-        ground = None if background == "transparent" else background
+        ground = None if is_transparent(background) else background
         step = self._checked_step(ray_step)
         if mode == "surface":
             return self._surface(camera, size, step, ground, options)
@@ -168,7 +169,7 @@ class VolumeRenderer:
         function = chosen.transfer_function if transfer_function is None else transfer_function
         picture = RayPicture(
             mode, camera, size, step, function, options.get("lighting") or function.lighting or Lighting(),
-            _choose_window(preset, options), options.get("clip"), ground, bool(options.get("jitter")),
+            _choose_window(preset, options), options.get("clip"), ground, _is_set(options, "jitter"),
             _label_style(options),
         )  # fmt: skip
         tables = None if mode in PROJECTIONS else self._transfer_tables(function, step)
@@ -184,11 +185,10 @@ class VolumeRenderer:
     ) -> Rendering:
         from clrecon.operators.surface_rays import SURFACE_COLOR, cast_surface
 
-        iso_value = options.get("iso_value")
         return cast_surface(
-            self._resident, DEFAULT_ISO_VALUE if iso_value is None else iso_value, camera, size, step,
-            lighting=options.get("lighting"), clip=options.get("clip"), color=options.get("color") or SURFACE_COLOR,
-            background=background, shadows=bool(options.get("shadows")), depth_cue=options.get("depth_cue") or 0.0,
+            self._resident, _given(options, "iso_value", DEFAULT_ISO_VALUE), camera, size, step,
+            lighting=options.get("lighting"), clip=options.get("clip"), color=_given(options, "color", SURFACE_COLOR),
+            background=background, shadows=_is_set(options, "shadows"), depth_cue=_given(options, "depth_cue", 0.0),
             style=_label_style(options),
         )  # fmt: skip
 
@@ -202,10 +202,9 @@ class VolumeRenderer:
     ) -> Rendering:
         from clrecon.operators.slice_overlay import DEFAULT_OPACITY, overlay_slices
 
-        opacity = options.get("slice_opacity")
         return overlay_slices(
             self.volume, self.device, camera, size, slices=options.get("slices"),
-            opacity=DEFAULT_OPACITY if opacity is None else opacity, window=options.get("window"),
+            opacity=_given(options, "slice_opacity", DEFAULT_OPACITY), window=options.get("window"),
             transfer_function=function, clip=options.get("clip"), background=background, memory=self.memory,
         )  # fmt: skip
 
@@ -223,10 +222,9 @@ class VolumeRenderer:
         from clrecon.operators.reformat import cut_slice
 
         own: dict[str, Any] = {} if camera is not None else {"zoom": zoom, "up": up}
-        offset = options.get("offset_mm")
         return cut_slice(
             self.volume, view if camera is None else camera, size, self.device,
-            offset_mm=0.0 if offset is None else offset, **own, **self._slab_options(background, preset, options),
+            offset_mm=_given(options, "offset_mm", 0.0), **own, **self._slab_options(background, preset, options),
         )  # fmt: skip
 
     def _reformat(
@@ -240,51 +238,47 @@ class VolumeRenderer:
     ) -> Rendering:
         from clrecon.operators.reformat import reformat_curve
 
-        curve: ArrayLike | str | None = options.get("curve")
+        curve: ArrayLike | str = _given(options, "curve", "spine")
         return reformat_curve(
-            self.volume, "spine" if curve is None else curve, options.get("cpr") or "straightened", size, self.device,
+            self.volume, curve, _given(options, "cpr", "straightened"), size, self.device,
             view=view, up=up, **self._slab_options(background, preset, options),
         )  # fmt: skip
 
     def _slab_options(
         self, background: str | Sequence[float], preset: str | None, options: Mapping[str, Any]
     ) -> dict[str, Any]:
-        thickness = options.get("thickness")
         return {
-            "thickness": 0.0 if thickness is None else thickness,
-            "combine": options.get("combine") or "mean",
+            "thickness": _given(options, "thickness", 0.0),
+            "combine": _given(options, "combine", "mean"),
             "window": _choose_window(preset, options),
             "background": background,
             "memory": self.memory,
         }
 
     def _checked_step(self, ray_step: float | None) -> float:
-        smallest = min(self.volume.spacing)
+        smallest, corners = min(self.volume.spacing), box_corners(self.volume)
+        diagonal = float(np.linalg.norm(np.ptp(corners, axis=0)))
+        finest = max(SMALLEST_STEP * smallest, diagonal / MOST_STEPS)
         if ray_step is None:
-            return 0.5 * smallest
+            return max(0.5 * smallest, finest)
         try:
             step = float(ray_step)
-        except (TypeError, ValueError):
+        except (TypeError, ValueError, OverflowError):
             step = math.nan
-        if not (math.isfinite(step) and step >= SMALLEST_STEP * smallest):
-            raise UsageError(
-                f"the ray step is a length in mm, at least {SMALLEST_STEP * smallest:.3g} in this volume"
-                f" (a hundredth of its smallest spacing), not {ray_step!r}"
-            )
-        way = float(np.linalg.norm(np.ptp(box_corners(self.volume), axis=0)))
-        if way > MOST_SAMPLES * step:
-            raise UsageError(
-                f"a ray of {way:.4g} mm through the volume would have {way / step:.3g} samples {step:.3g} mm apart,"
-                f" more than {MOST_SAMPLES:.0e}: give a ray step of at least {way / MOST_SAMPLES:.3g} mm"
-            )
-        return step
+        if finest <= step < math.inf:
+            return min(step, 2.0 * diagonal)  # one sample, in the middle of what a ray crosses
+        raise UsageError(
+            f"the ray step is a length in mm, at least {finest:.3g} in this volume (a hundredth of its smallest"
+            f" spacing, and {MOST_STEPS:,} through its diagonal), not {ray_step!r}"
+        )
 
     def _transfer_tables(self, function: TransferFunction, ray_step: float) -> TransferTables:
-        key = (function, ray_step)
-        if key not in self._tables:
-            self._tables.clear()
-            self._tables[key] = TransferTables.of(self.device, function, ray_step)
-        return self._tables[key]
+        key = (function, ray_step, self.device.context)
+        tables = self._tables.get(key)
+        if tables is None:
+            tables = TransferTables.of(self.device, function, ray_step)
+            self._tables = {key: tables}  # replaced as a whole: other threads may be looking
+        return tables
 
 
 def _choose_mode(mode: str | None, preset: str | None, function: TransferFunction | None) -> str:
@@ -294,7 +288,7 @@ def _choose_mode(mode: str | None, preset: str | None, function: TransferFunctio
     chosen = find_preset(DEFAULT_PRESET if preset is None else preset)
     if mode is None:
         return chosen.mode if function is None else "dvr"
-    if mode not in MODES:
+    if not isinstance(mode, str) or mode not in MODES:
         raise UsageError(f"there is no mode {mode!r}: it is one of {', '.join(MODES)}")
     return mode
 
@@ -306,6 +300,18 @@ def _check_options(mode: str, given: Mapping[str, Any]) -> None:
             raise UsageError(f"a picture has no option {name!r}: it is one of {', '.join(KNOWN_IN)}")
         if value is not None and value is not False and mode not in KNOWN_IN[name]:
             raise UsageError(f"{name} means nothing in mode {mode}: it belongs to {', '.join(KNOWN_IN[name])}")
+
+
+def _given(options: Mapping[str, Any], name: str, default: Any) -> Any:
+    value = options.get(name)
+    return default if value is None else value
+
+
+def _is_set(options: Mapping[str, Any], name: str) -> bool:
+    value = _given(options, name, False)
+    if not isinstance(value, (bool, np.bool_)):
+        raise UsageError(f"{name} is True or False, not {value!r:.60}")
+    return bool(value)
 
 
 def _choose_window(preset: str | None, options: Mapping[str, Any]) -> tuple[float, float] | None:

@@ -132,12 +132,22 @@ class ResidentVolume:
         self.memory = memory
         self.dtype = volume.voxels.dtype
         self._whole: RaySlab | None = None
-        self.stack = StackTable.of(volume, device)
+        self._context = device.context
+        self._stack = StackTable.of(volume, device)
         self.brick_cells = choose_brick_cells(volume)
 
     def close(self) -> None:
         """Free what is on the device."""
         self._whole = None
+
+    @property
+    def stack(self) -> StackTable:
+        """Where the slices lie, on the device."""
+        if self._context is not self.device.context:  # it failed, and what was there is lost
+            self._context = self.device.context
+            self._whole = None
+            self._stack = StackTable.of(self.volume, self.device)
+        return self._stack
 
     def program(self, name: str, **variants: str) -> Program:
         """Build a kernel file for this volume's type of voxels."""
@@ -201,10 +211,12 @@ class ResidentVolume:
             Infinite: from that end on.
         """
         nk = self.volume.shape_ijk[2]
+        _ = self.stack
         if slices >= nk:
-            if self._whole is None:
-                self._whole = self._upload(0, nk, -np.inf, np.inf, stopwatch)
-            yield self._whole
+            whole = self._whole
+            if whole is None:
+                whole = self._whole = self._upload(0, nk, -np.inf, np.inf, stopwatch)
+            yield whole
             return
         self._whole = None
         parts = [(first, min(first + slices, nk)) for first in range(0, nk, slices)]
@@ -252,8 +264,9 @@ class ResidentVolume:
         low, scale : float
             Nearest node to a value v: ``floor((v - low) * scale + 0.5)``, within the table.
         """
-        if key in slab.maps:
-            return slab.maps[key]
+        known = slab.maps.get(key)
+        if known is not None:
+            return known
         ranges_d = self.measure(slab, stopwatch)
         device, program = self.device, self.program("render/occupancy.cl")
         bi, bj, bk = slab.bricks
@@ -281,8 +294,8 @@ class ResidentVolume:
             )  # fmt: skip
         from_d = to_d
         slab.maps.clear()  # one a slab: a map is made in some milliseconds
-        slab.maps[key] = LeapMap(from_d, self._find_box(marked, slab))
-        return slab.maps[key]
+        made = slab.maps[key] = LeapMap(from_d, self._find_box(marked, slab))
+        return made
 
     def _find_box(self, marked: NDArray[np.bool_], slab: RaySlab) -> tuple[Float64Array, Float64Array] | None:
         ends = []

@@ -239,7 +239,7 @@ def sample_sheet(
     DeviceError
         Two slices and the picture do not fit the device, or it fails.
     """
-    if combine not in COMBINATIONS:
+    if not isinstance(combine, str) or combine not in COMBINATIONS:
         raise UsageError(f"the samples of a slab are combined by one of {', '.join(COMBINATIONS)}, not {combine!r}")
     run = _Run(device, volume, sheet, samples, COMBINATIONS.index(combine), stopwatch or Stopwatch())
     slices = run.plan(memory) if voxels_d is None else volume.shape_ijk[2]

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
 from clrecon.errors import UsageError
 from clrecon.geometry.affine import Float64Array
 
-__all__ = ["COLORS", "find_color"]
+__all__ = ["COLORS", "find_color", "is_transparent"]
 
 COLORS = {
     "black": "000000",
@@ -29,6 +30,11 @@ COLORS = {
     "bone": "e3dac9",
 }
 """Names that are known, with red, green and blue."""
+
+
+def is_transparent(background: Any) -> bool:
+    """True for the name of no background."""
+    return isinstance(background, str) and background == "transparent"
 
 
 def find_color(color: str | Sequence[float]) -> Float64Array:

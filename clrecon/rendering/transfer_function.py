@@ -15,6 +15,9 @@ from clrecon.rendering.lighting import Lighting
 
 __all__ = ["TransferFunction"]
 
+UNIT_LIMIT_MM = 1e9
+"""Of the unit distance, and one by it: float32 holds what a ray step makes of them."""
+
 HU_LIMIT = 1e6
 """Far beyond any scale of CT values; float32 still tells whole HU apart there."""
 
@@ -83,10 +86,13 @@ class TransferFunction:
         self._gradient_opacity = None if gradient_opacity is None else self._check_gradient(gradient_opacity)
         try:
             self._unit_distance = float(unit_distance)
-        except (TypeError, ValueError):
+        except (TypeError, ValueError, OverflowError):
             self._unit_distance = np.nan
-        if not 0.0 < self._unit_distance < np.inf:
-            raise UsageError(f"the unit distance of a transfer function is a length in mm, not {unit_distance!r}")
+        if not 1.0 / UNIT_LIMIT_MM <= self._unit_distance <= UNIT_LIMIT_MM:
+            raise UsageError(
+                "the unit distance of a transfer function is a length in mm, above 0 and at most"
+                f" {UNIT_LIMIT_MM:g}, not {unit_distance!r}"
+            )
         if not (lighting is None or isinstance(lighting, Lighting)):
             raise UsageError(f"the lighting of a transfer function is a Lighting or None, not {lighting!r}")
         if not (isinstance(name, str) and isinstance(description, str)):
