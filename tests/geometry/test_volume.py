@@ -102,10 +102,11 @@ thread = threading.Thread(target=lambda: np.unique([1, 2]), name="other")
 thread.start()
 while "numpy.ma" not in sys.modules:
     time.sleep(0.001)
-Volume(np.zeros((2, 2, 2), np.int16), np.eye(4))
+print(Volume(np.zeros((2, 2, 2), np.int16), np.eye(4)).shape_ijk)
 thread.join()
 """
-    subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+    assert (run.stderr, run.stdout) == ("", "(2, 2, 2)\n")
 
 
 @pytest.mark.parametrize("affine", ["x", [[1, 2], [3]], np.eye(4) * 1j, None])
