@@ -39,8 +39,8 @@ DEFAULT_ISO_VALUE = 200.0
 SMALLEST_STEP = 0.01
 """Ray steps below this share of the smallest spacing add time and nothing else."""
 
-MOST_STEPS = 1 << 21
-"""Ray steps through the diagonal of a volume: float32 counts them, with room for where a sample lies in its step."""
+MOST_STEPS = 1 << 15
+"""Ray steps through the diagonal of a volume: float32 counts them, and Mesa's llvmpipe ends loops after 65535 turns."""
 
 _LABELLED = ("dvr", "surface")
 _CUT = ("slice", "cpr")
@@ -138,6 +138,8 @@ class VolumeRenderer:
         **options: Any,
     ) -> Rendering:
         """Make one picture, see `render`."""
+        if not (mode is None or isinstance(mode, str)):
+            raise UsageError(f"there is no mode {mode!r:.60}: it is one of {', '.join(MODES)}")
         if size is not None or mode != "cpr":
             size = checked_size(DEFAULT_SIZE if size is None else size)
         for what, value, kind in (
@@ -256,8 +258,8 @@ class VolumeRenderer:
         }
 
     def _checked_step(self, ray_step: float | None) -> float:
-        smallest, corners = min(self.volume.spacing), box_corners(self.volume)
-        diagonal = float(np.linalg.norm(np.ptp(corners, axis=0)))
+        smallest = min(self.volume.spacing)
+        diagonal = float(np.linalg.norm(np.ptp(box_corners(self.volume), axis=0)))
         finest = max(SMALLEST_STEP * smallest, diagonal / MOST_STEPS)
         if ray_step is None:
             return max(0.5 * smallest, finest)
@@ -288,7 +290,7 @@ def _choose_mode(mode: str | None, preset: str | None, function: TransferFunctio
     chosen = find_preset(DEFAULT_PRESET if preset is None else preset)
     if mode is None:
         return chosen.mode if function is None else "dvr"
-    if not isinstance(mode, str) or mode not in MODES:
+    if mode not in MODES:
         raise UsageError(f"there is no mode {mode!r}: it is one of {', '.join(MODES)}")
     return mode
 

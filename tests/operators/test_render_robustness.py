@@ -1,0 +1,226 @@
+"""Pictures in hard times: absurd numbers, failing devices, forked processes, threads, pages that are used again."""
+
+from __future__ import annotations
+
+import os
+import threading
+
+import numpy as np
+import pytest
+
+import clrecon
+from clrecon.errors import DeviceError, UsageError
+from clrecon.geometry import Volume
+from clrecon.geometry.camera import Camera
+from clrecon.geometry.clip import Clip
+from clrecon.kernels import launching
+from clrecon.operators.resident import entry_slice
+from clrecon.rendering import TransferFunction
+
+pytestmark = pytest.mark.opencl
+
+SIZE = (16, 16)
+HARD = TransferFunction([(0, 1, 0, 0, 0.0), (200, 1, 1, 0, 0.6)])
+
+
+def body(shape: tuple[int, int, int] = (12, 16, 20), spacing: tuple[float, float, float] = (0.9, 0.8, 1.2)) -> Volume:
+    voxels = np.full(shape, -1000, np.int16)
+    inner = voxels[2:-2, 3:-3, 4:-4]
+    inner[...] = np.random.default_rng(1).integers(100, 1500, inner.shape)
+    return Volume(voxels, np.diag([*spacing, 1.0]))
+
+
+def along_k(volume: Volume, scale: float, away: float = 1000.0) -> Camera:
+    centre = 0.5 * (np.array(volume.shape_ijk) - 1) * volume.spacing
+    return Camera(tuple(centre - [0, 0, away]), tuple(centre), (1, 0, 0), parallel_scale=scale)
+
+
+@pytest.mark.parametrize("mode", ["dvr", "mip", "mean", "surface"])
+def test_rays_of_a_thousand_million_steps_end(device, mode):
+    """Half the smallest spacing is 5e-6 of the way between two slices: float32 would count without ever arriving."""
+    volume = body((24, 16, 20), (1e-4, 1.0, 1000.0))
+    picture = clrecon.render(volume, mode, camera=along_k(volume, 1e-3), size=(4, 4), device=device)
+    assert picture.image[..., :3].any()
+    with pytest.raises(UsageError, match="ray step"):
+        clrecon.render(volume, mode, ray_step=5e-5, size=(4, 4), device=device)
+
+
+ABSURD = {
+    "camera": lambda: Camera((0, -1e300, 0), (0, 0, 0), (0, 0, 1)),
+    "focus": lambda: Camera((0, 0, 0), (0, 1e12, 0), (0, 0, 1)),
+    "scale": lambda: Camera((0, -1, 0), (0, 0, 0), (0, 0, 1), parallel_scale=1e300),
+    "unit": lambda: TransferFunction([(0, 1, 1, 1, 1)], unit_distance=1e300),
+    "small unit": lambda: TransferFunction([(0, 1, 1, 1, 1)], unit_distance=1e-300),
+}
+
+
+@pytest.mark.parametrize("what", ABSURD)
+def test_what_float32_cannot_hold_is_refused(what):
+    with pytest.raises(UsageError):
+        ABSURD[what]()
+
+
+TWO = np.array([1.0, 2.0])
+REFUSED = {
+    "offset": {"mode": "slice", "offset_mm": "x"},
+    "offsets": {"mode": "slice", "offset_mm": TWO},
+    "combine": {"mode": "slice", "combine": TWO},
+    "cpr": {"mode": "cpr", "curve": [(3, 3, 3), (5, 5, 9)], "cpr": TWO},
+    "background": {"background": TWO},
+    "background of a slice": {"mode": "slice", "background": TWO},
+    "colour": {"mode": "surface", "color": TWO},
+    "cue": {"mode": "surface", "depth_cue": TWO},
+    "shadows": {"mode": "surface", "shadows": TWO},
+    "jitter": {"jitter": "no"},
+    "mode": {"mode": TWO},
+    "step": {"ray_step": 10**400},
+    "zoom": {"zoom": 1e-300},
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_arrays_and_text_in_place_of_numbers_are_refused(device, name):
+    settings = {"view": "axial"} if "slice" in str(REFUSED[name].get("mode")) else {}
+    with pytest.raises(UsageError) as error:
+        clrecon.render(body(), size=SIZE, device=device, **settings, **REFUSED[name])
+    assert "\n" not in str(error.value)
+
+
+def test_colours_may_be_arrays(device):
+    red = np.array([1.0, 0.0, 0.0])
+    for mode in ("dvr", "slice"):
+        settings = {"view": "axial"} if mode == "slice" else {}
+        given = clrecon.render(body(), mode, background=red, size=SIZE, device=device, **settings)
+        named = clrecon.render(body(), mode, background="red", size=SIZE, device=device, **settings)
+        assert np.array_equal(given.image, named.image)
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("mode", ["dvr", "mip", "surface"])
+def test_numbers_at_the_ends_of_their_ranges_make_pictures(device, mode):
+    volume = body()
+    for options in (
+        {"ray_step": 1e300},
+        {"clip": Clip([(0, 0, 1, -1e300)])},
+        {"clip": Clip.plane((0, 0, 0), (0, 0, 1e300))},
+        {"camera": along_k(volume, 1e9)},
+        {"camera": along_k(volume, 1e-9)},
+        {"camera": Camera((0, 0, 0), (1, 0, 0), (0, 0, 1e200), view_angle=179.0)},
+    ):
+        clrecon.render(volume, mode, size=SIZE, device=device, **options)
+
+
+def test_slabs_come_in_the_order_of_the_rays_wherever_a_parallel_camera_is(device):
+    """Its position only measures depths: beside the volume, behind it or far away, the picture is the same."""
+    volume = body((40, 16, 20))
+    centre = 0.5 * (np.array(volume.shape_ijk) - 1) * volume.spacing
+    forward = np.array([0.0, 0.6, 0.8])
+    settings = {"transfer_function": HARD, "size": SIZE, "device": device}
+    pictures = []
+    for away in (-3e5, 0.0, 3e5):
+        place = centre - away * forward
+        camera = Camera(tuple(place), tuple(place + 100.0 * forward), (0, -1, 0), parallel_scale=20.0)
+        assert entry_slice(volume, camera) < -40  # rays go up
+        pictures.append(clrecon.render(volume, camera=camera, memory=25_000, **settings))
+        assert pictures[-1].report["slabs"] > 2
+    assert all(np.array_equal(picture.image, pictures[1].image) for picture in pictures)
+
+
+@pytest.mark.parametrize("mode", ["dvr", "mip", "surface", "slices"])
+def test_after_a_failure_the_next_picture_is_made_on_a_fresh_device(device, monkeypatch, mode):
+    import pyopencl as cl
+
+    with clrecon.VolumeRenderer(body(), device) as renderer:
+        good = renderer.render(mode, size=SIZE, view=(20, 30)).image
+        lost = renderer.device.context
+
+        monkeypatch.setattr(launching, "finish", lambda device: _fail(device, cl))
+        with pytest.raises(DeviceError, match="gone"):
+            renderer.render(mode, size=SIZE, view=(20, 30))
+        monkeypatch.undo()
+        assert renderer.device.context is not lost
+        assert np.array_equal(renderer.render(mode, size=SIZE, view=(20, 30)).image, good)
+        whole = renderer._resident._whole
+        # Strict drivers refuse what belongs to the lost context.
+        assert whole is None or mode == "slices" or whole.voxels_d.context == renderer.device.context
+        assert all(key[2] == renderer.device.context for key in renderer._tables)
+
+
+def _fail(device, cl):
+    device.queue.finish()
+    raise device.fail("a kernel failed", cl.RuntimeError("the device is gone"))
+
+
+def test_a_device_that_is_too_small_is_named(device, monkeypatch):
+    monkeypatch.setattr(device, "memory_bytes", 1000)
+    for mode in ("dvr", "mip", "surface", "slices", "slice"):
+        settings = {"view": "axial"} if mode == "slice" else {}
+        with pytest.raises(DeviceError, match="1,000 bytes"):
+            clrecon.render(body(), mode, size=SIZE, device=device, **settings)
+    monkeypatch.undo()
+    monkeypatch.setattr(device, "max_allocation_bytes", 6000)
+    small = clrecon.render(body(), size=(8, 8), device=device)  # in slabs
+    monkeypatch.undo()
+    assert small.report["slabs"] > 1
+    # Past the largest picture of 16384 x 16384 pixels nothing is taken before the sum is known.
+    with pytest.raises(DeviceError, match="picture"):
+        clrecon.render(body(), size=(16384, 16384), device=device, memory=1 << 28)
+
+
+def test_pictures_stay_what_they_were(device):
+    """Their pages are lent from a pool, and later pictures of the same size come from the same pool."""
+    with clrecon.VolumeRenderer(body(), device) as renderer:
+        kept = renderer.render("mip", size=(640, 512), view=(10, 20))
+        copies = [array.copy() for array in (kept.image, kept.depth, kept.values)]
+        for azimuth in range(4):
+            renderer.render("dvr", size=(640, 512), view=(azimuth, 0))
+    clrecon.render(body(), "surface", size=(640, 512), device=device)
+    for array, copy in zip((kept.image, kept.depth, kept.values), copies, strict=True):
+        assert np.array_equal(array, copy, equal_nan=array.dtype.kind == "f")
+
+
+def test_threads_share_a_renderer(device):
+    functions = [HARD, HARD.shifted(100.0), HARD.shifted(300.0)]
+    with clrecon.VolumeRenderer(body(), device) as renderer:
+        alone = [renderer.render(transfer_function=f, size=SIZE, jitter=True).image for f in functions]
+        wrong: list[object] = []
+
+        def work(number: int) -> None:
+            try:
+                for _ in range(6):
+                    image = renderer.render(transfer_function=functions[number], size=SIZE, jitter=True).image
+                    if not np.array_equal(image, alone[number]):
+                        wrong.append(number)
+            except Exception as error:  # noqa: BLE001
+                wrong.append(error)
+
+        threads = [threading.Thread(target=work, args=(number,)) for number in range(3)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+    assert wrong == []
+
+
+def test_what_a_kernel_works_in_lives_until_it_is_over():
+    """A CPU device works in numpy's memory, which must not be given back while a launch is in flight."""
+    import gc
+    import weakref
+
+    class Buffer:
+        pass
+
+    stopwatch, buffer = launching.Stopwatch(), Buffer()
+    alive = weakref.ref(buffer)
+    stopwatch.record("kernel", None, (buffer,))
+    del buffer
+    gc.collect()
+    assert alive() is not None
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork on this system")
+def test_a_forked_process_is_told_so_and_does_not_wait_forever(device, monkeypatch):
+    clrecon.render(body(), size=SIZE, device=device)
+    monkeypatch.setattr(os, "getpid", lambda: -1)
+    with pytest.raises(DeviceError, match="spawn"):
+        clrecon.render(body(), size=SIZE, device=device)
