@@ -1,0 +1,85 @@
+#!/usr/bin/env python3
+"""Make the pictures of README and docs/rendering.md anew, from a phantom.
+
+    clrecon phantom --kind spine --size 512x512 --slices 149 -o SPINE
+    python scripts/make_gallery.py SPINE docs/images
+
+The one beside VTK needs scikit-image too, and prints how alike the two are.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path[:0] = [str(ROOT), str(ROOT / "scripts" / "bench" / "peers")]
+
+import clrecon  # noqa: E402
+from clrecon.rendering.presets import find_preset  # noqa: E402
+
+TILE = (330, 230)
+BESIDE = (495, 300)
+
+
+def draw_modes(renderer: clrecon.VolumeRenderer, ray_step: float) -> np.ndarray:
+    """Six modes, each with its name in a corner; (h, w, 3) uint8."""
+    light = clrecon.Lighting(direction=(-0.3, -1.0, 0.6))
+    pictures = {
+        "dvr, preset spine": {"preset": "spine", "view": "35,15", "ray_step": ray_step, "zoom": 1.25},
+        "surface, shadows": {"mode": "surface", "view": "20,10", "shadows": True, "lighting": light, "zoom": 1.25},
+        "mip": {"mode": "mip", "view": "35,15", "zoom": 1.25},
+        "mean, preset x-ray": {"preset": "x-ray"},
+        "slices": {"mode": "slices", "slices": 10, "view": "40,25", "zoom": 1.25},
+        "slice, 5 mm thick": {"mode": "slice", "view": "sagittal", "thickness": 5.0, "zoom": 1.3},
+    }
+    tiles = [
+        renderer.render(size=TILE, **options).annotated(caption=name).image[..., :3]
+        for name, options in pictures.items()
+    ]
+    return np.vstack([np.hstack(tiles[:3]), np.hstack(tiles[3:])])
+
+
+def draw_beside_vtk(renderer: clrecon.VolumeRenderer) -> np.ndarray:
+    """clrecon's picture, and that of VTK's fixed-point mapper with the same camera and functions."""
+    from skimage.metrics import structural_similarity
+    from vtk_fixed_point import FixedPointPeer
+    from vtk_stage import scene_of
+
+    volume, bone = renderer.volume, find_preset("bone")
+    camera = clrecon.Camera.fit(volume, "25,10", 1.2, size=BESIDE)
+    step = 0.5 * min(volume.spacing)
+    ours = renderer.render("dvr", "bone", camera=camera, size=BESIDE, ray_step=step).image[..., :3]
+    scene = scene_of(volume, camera, bone.transfer_function, bone.lighting, size=BESIDE, ray_step=step)
+    peer = FixedPointPeer(volume.voxels, scene, threads=1)
+    peer.first_frame()
+    theirs = peer.picture()[..., :3]
+    grey = [picture @ (0.299, 0.587, 0.114) for picture in (ours, theirs)]
+    print(f"SSIM {structural_similarity(*grey, data_range=255):.3f}")
+    return np.hstack([ours, theirs])
+
+
+def main() -> None:
+    """Read the phantom and write three pictures."""
+    from clrecon.rendering.pillow import load_pillow
+
+    if len(sys.argv) != 3:
+        raise SystemExit(__doc__)
+    folder = Path(sys.argv[2])
+    load_pillow()
+    from PIL import Image
+
+    volume = clrecon.read_volume(sys.argv[1])
+    fine = 0.25 * min(volume.spacing)
+    with clrecon.VolumeRenderer(volume) as renderer:
+        bone = renderer.render("dvr", "bone", view="25,10", size=(760, 400), zoom=1.1, ray_step=fine)
+        bone.annotated(letters=True, scale_bar=True).save(folder / "render-bone.png")
+        modes = Image.fromarray(draw_modes(renderer, fine))
+        modes.convert("P", palette=Image.Palette.ADAPTIVE, colors=255).save(folder / "render-modes.png", optimize=True)
+        Image.fromarray(draw_beside_vtk(renderer)).save(folder / "render-vtk.png")
+
+
+if __name__ == "__main__":
+    main()
