@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 ROOT = Path(__file__).resolve().parents[1]
-sys.path[:0] = [str(ROOT), str(ROOT / "scripts" / "bench" / "peers")]
+sys.path[:0] = [str(ROOT), str(ROOT / "scripts" / "bench")]
 
 import clrecon  # noqa: E402
 from clrecon.rendering.presets import find_preset  # noqa: E402
@@ -44,9 +44,9 @@ def draw_modes(renderer: clrecon.VolumeRenderer, ray_step: float) -> np.ndarray:
 
 def draw_beside_vtk(renderer: clrecon.VolumeRenderer) -> np.ndarray:
     """clrecon's picture, and that of VTK's fixed-point mapper with the same camera and functions."""
+    from peers.vtk_fixed_point import FixedPointPeer
+    from peers.vtk_stage import scene_of
     from skimage.metrics import structural_similarity
-    from vtk_fixed_point import FixedPointPeer
-    from vtk_stage import scene_of
 
     volume, bone = renderer.volume, find_preset("bone")
     camera = clrecon.Camera.fit(volume, "25,10", 1.2, size=BESIDE)
