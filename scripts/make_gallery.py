@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -27,7 +28,7 @@ BESIDE = (495, 300)
 def draw_modes(renderer: clrecon.VolumeRenderer, ray_step: float) -> np.ndarray:
     """Six modes, each with its name in a corner; (h, w, 3) uint8."""
     light = clrecon.Lighting(direction=(-0.3, -1.0, 0.6))
-    pictures = {
+    pictures: dict[str, dict[str, Any]] = {
         "dvr, preset spine": {"preset": "spine", "view": "35,15", "ray_step": ray_step, "zoom": 1.25},
         "surface, shadows": {"mode": "surface", "view": "20,10", "shadows": True, "lighting": light, "zoom": 1.25},
         "mip": {"mode": "mip", "view": "35,15", "zoom": 1.25},
