@@ -5,18 +5,13 @@
 #include "include/lanes.h"
 #include "include/stack.h"
 
-/* Cells of a brick along i and j, and along k, where slices that lie far apart want fewer (-D BRICK_CELLS_K=1, 2 or 4).
- * A brick of n cells reads n + 1 voxels. */
-#define BRICK_CELLS 4
-#ifndef BRICK_CELLS_K
-#define BRICK_CELLS_K 4
-#endif
+#define BRICK_CELLS 4 /* of a brick along i and j; it reads a voxel more */
 #define BRICKS_PER_CELL (1.0f / BRICK_CELLS)
-#define BRICKS_PER_CELL_K (1.0f / BRICK_CELLS_K)
 
 typedef struct {
     __global const uchar *distances; /* (bk, bj, bi) in bricks, 0 where something shows */
     int bi, bj, bk;
+    int cells_k; /* of a brick along k: fewer where slices lie far apart */
 } leap_map;
 
 /* LANES rays: field coordinates of sample n are start + n * stride.  `pace` is samples per index step along each axis;
@@ -60,19 +55,20 @@ static inline floats count_to_face(
 static inline floats count_free_steps(const leap_map *map, const slice_stack *stack, const ray_lanes *rays,
     const floats n, const int first_k, const int margin)
 {
+    const float bricks_per_k = 1.0f / (float)map->cells_k;
     floats i = rays->start_i + n * rays->stride_i, j = rays->start_j + n * rays->stride_j;
     floats k = rays->start_k + n * rays->stride_k;
     to_indices(stack, &i, &j, &k);
     k -= (float)first_k;
     const ints brick_i = clamp(to_ints(i * BRICKS_PER_CELL), (ints)(0), (ints)(map->bi - 1));
     const ints brick_j = clamp(to_ints(j * BRICKS_PER_CELL), (ints)(0), (ints)(map->bj - 1));
-    const ints brick_k = clamp(to_ints(k * BRICKS_PER_CELL_K), (ints)(0), (ints)(map->bk - 1));
+    const ints brick_k = clamp(to_ints(k * bricks_per_k), (ints)(0), (ints)(map->bk - 1));
     const ints at = (brick_k * map->bj + brick_j) * map->bi + brick_i;
     const ints distance = (ints)(GATHER(uchar, map->distances, at)) - margin;
     /* The cube of bricks less than `distance` away is empty. */
     const floats steps = min(min(count_to_face(i, rays->stride_i, rays->pace_i, brick_i, distance, BRICK_CELLS),
                                  count_to_face(j, rays->stride_j, rays->pace_j, brick_j, distance, BRICK_CELLS)),
-        count_to_face(k, rays->stride_k, rays->pace_k, brick_k, distance, BRICK_CELLS_K));
+        count_to_face(k, rays->stride_k, rays->pace_k, brick_k, distance, map->cells_k));
     return choose(distance > 0, max(ceil(steps), (floats)(1.0f)), (floats)(0.0f));
 }
 
@@ -81,7 +77,7 @@ static inline int is_shown(const leap_map *map, const float i, const float j, co
 {
     const int brick_i = clamp((int)(i * BRICKS_PER_CELL), 0, map->bi - 1);
     const int brick_j = clamp((int)(j * BRICKS_PER_CELL), 0, map->bj - 1);
-    const int brick_k = clamp((int)(k * BRICKS_PER_CELL_K), 0, map->bk - 1);
+    const int brick_k = clamp((int)(k / (float)map->cells_k), 0, map->bk - 1);
     return map->distances[(brick_k * map->bj + brick_j) * map->bi + brick_i] == 0;
 }
 

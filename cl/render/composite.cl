@@ -181,7 +181,7 @@ static inline void blend_samples(const field *f, const slice_stack *stack, const
  *             last_place    indices of the volume's last voxel centres;  slope: see find_pace()
  *             ni nj    of the buffer; first_k end_k: slices in the buffer; slab_low slab_high: samples with
  *                      slab_low <= k < slab_high are this slab's
- *             bi bj bk bricks
+ *             bi bj bk bricks, cells_k of each along k
  *             low scale factor_scale steps_per_unit  see looks
  *             jitter   samples at random places of their segments
  *             stage    FIRST_SLAB and LAST_SLAB, see include/view.h
@@ -197,14 +197,15 @@ __kernel void composite_rays(
     __global const float4 *restrict view, __global float4 *restrict states, __global uchar4 *restrict image,
     __global float *restrict depths, __global float *restrict means, const float4 background, const float4 last_place,
     const float4 slope, const int ni, const int nj, const int first_k, const int end_k, const float slab_low,
-    const float slab_high, const int bi, const int bj, const int bk, const float low, const float scale,
+    const float slab_high, const int bi, const int bj, const int bk, const int cells_k, const float low,
+    const float scale,
     const float factor_scale, const float steps_per_unit, const uint width, const uint height, const uint planes,
     const int perspective, const int shaded, const int jitter, const int stage, const uint queues
     LABEL_PARAMETERS STACK_PARAMETERS)
 {
     const uint first_pixel = (uint)get_global_id(0) * LANES;
     const field f = { voxels, ni, nj, first_k, end_k, last_place };
-    const leap_map map = { leaps, bi, bj, bk };
+    const leap_map map = { leaps, bi, bj, bk, cells_k };
     const slice_stack stack = STACK_TABLE;
     const float ray_step = view[VIEW_NEAR].y;
     const looks look = { colors, opacities, highlights, factors, view, low, scale, factor_scale, steps_per_unit,

@@ -14,21 +14,21 @@
 
 /* Parameters  voxels  in   (nk, nj, ni)
  *             ranges  out  (bk, bj, bi, 2) lowest and highest of the voxels around the cells of a brick
- *             ni nj nk, bi bj bk   voxels, bricks: ceil(cells / BRICK_CELLS), along k / BRICK_CELLS_K, at least 1
+ *             ni nj nk, bi bj bk   voxels, bricks: ceil(cells / BRICK_CELLS), along k cells / cells_k, at least 1
  * Launch      global = bi * bj * bk rounded up by the host, any local
  * Assumes     no voxel is NaN; at least two voxels along each axis
  * Guarantees  every range is written */
 __kernel void measure_cells(
     __global const VOXEL *restrict voxels, __global VOXEL *restrict ranges, const int ni, const int nj, const int nk,
-    const uint bi, const uint bj, const uint bk)
+    const uint bi, const uint bj, const uint bk, const int cells_k)
 {
     const size_t brick = get_global_id(0);
     if (brick >= (size_t)bi * bj * bk)
         return;
     const int i = BRICK_CELLS * (int)(brick % bi), j = BRICK_CELLS * (int)(brick / bi % bj);
-    const int k = BRICK_CELLS_K * (int)(brick / bi / bj);
+    const int k = cells_k * (int)(brick / bi / bj);
     const int i_last = min(i + BRICK_CELLS, ni - 1);
-    const int j_last = min(j + BRICK_CELLS, nj - 1), k_last = min(k + BRICK_CELLS_K, nk - 1);
+    const int j_last = min(j + BRICK_CELLS, nj - 1), k_last = min(k + cells_k, nk - 1);
     VOXEL lowest = voxels[voxel_index(i, j, k, ni, nj)], highest = lowest;
     if (ni >= BRICK_CELLS) {
         /* Four voxels and the one after them; at the end of a row its last four. */

@@ -56,7 +56,8 @@ __kernel void project_rays(
     __global const VOXEL *restrict voxels, __global const VOXEL *restrict ranges, __global const float4 *restrict view,
     __global float4 *restrict states, __global float *restrict depths, __global float *restrict values,
     const float4 last_place, const int ni, const int nj, const int first_k, const int end_k, const float slab_low,
-    const float slab_high, const int bi, const int bj, const int bk, const uint width, const uint height,
+    const float slab_high, const int bi, const int bj, const int bk, const int cells_k, const uint width,
+    const uint height,
     const uint planes, const int perspective, const int which, const int stage, const uint queues STACK_PARAMETERS)
 {
     const int2 pixel = find_pixel((uint)get_global_id(0), width, height, queues);
@@ -110,12 +111,12 @@ __kernel void project_rays(
             const float from_i = FIRST_LANE(i), from_j = FIRST_LANE(j), from_k = FIRST_LANE(k) - (float)first_k;
             const int brick_i = clamp((int)(from_i * BRICKS_PER_CELL), 0, bi - 1);
             const int brick_j = clamp((int)(from_j * BRICKS_PER_CELL), 0, bj - 1);
-            const int brick_k = clamp((int)(from_k * BRICKS_PER_CELL_K), 0, bk - 1);
+            const int brick_k = clamp((int)(from_k / (float)cells_k), 0, bk - 1);
             const size_t brick = ((size_t)brick_k * bj + brick_j) * bi + brick_i;
             if (sign * (float)ranges[2 * brick + (which == HIGHEST)] <= best) {
                 const float room_i = (float)((brick_i + (r.step.x >= 0.0f)) * BRICK_CELLS) - from_i;
                 const float room_j = (float)((brick_j + (r.step.y >= 0.0f)) * BRICK_CELLS) - from_j;
-                const float room_k = (float)((brick_k + (r.step.z >= 0.0f)) * BRICK_CELLS_K) - from_k;
+                const float room_k = (float)((brick_k + (r.step.z >= 0.0f)) * cells_k) - from_k;
                 const float t_i = fabs(r.step.x) > 1e-9f ? room_i / r.step.x : MAXFLOAT;
                 const float t_j = fabs(r.step.y) > 1e-9f ? room_j / r.step.y : MAXFLOAT;
                 const float t_k = fabs(r.step.z) > 1e-9f ? room_k / r.step.z : MAXFLOAT;

@@ -278,6 +278,7 @@ __kernel void trace_surface(
     __global float *restrict depths, __global float *restrict means, const float4 background,
     const float4 last_place, const float4 slope, const int ni, const int nj, const int first_k,
     const int end_k, const float slab_low, const float slab_high, const int bi, const int bj, const int bk,
+    const int cells_k,
     const float level, const float outside, const float4 color, const float4 light_step, const float4 cue,
     const uint width, const uint height, const uint planes, const int perspective, const int stage,
     const uint queues STACK_PARAMETERS)
@@ -285,7 +286,7 @@ __kernel void trace_surface(
     const uint first_pixel = (uint)get_global_id(0) * LANES;
     const field inner = { voxels, ni, nj, first_k, end_k, last_place };
     const closed_field f = { inner, level, outside };
-    const leap_map map = { leaps, bi, bj, bk };
+    const leap_map map = { leaps, bi, bj, bk, cells_k };
     const slice_stack stack = STACK_TABLE;
     const scene s = { f, map, stack, slope };
     const looks look = { view, normals, highlights, planes, perspective, color, light_step, cue, view[VIEW_NEAR].y };

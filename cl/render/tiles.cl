@@ -9,19 +9,20 @@
  *             view     in   see include/view.h; its box is as much larger as rays may be away from the middle one
  *             entries  out  (tile rows, tile columns) t in mm before which no ray of the tile meets anything,
  *                           MAXFLOAT: none does
- *             bi bj bk bricks;  first_k: slice that they begin with
+ *             bi bj bk bricks, cells_k of each along k;  first_k: slice that they begin with
  *             margin   bricks that rays of a tile may be away from the middle one
  *             width height     of the picture
  * Launch      global = tiles / LANES rounded up by the host, any local
  * Guarantees  every entry is written */
 __kernel void enter_tiles(
     __global const uchar *restrict leaps, __global const float4 *restrict view, __global float *restrict entries,
-    const float4 slope, const int bi, const int bj, const int bk, const int first_k, const int margin,
+    const float4 slope, const int bi, const int bj, const int bk, const int cells_k, const int first_k,
+    const int margin,
     const uint width, const uint height, const int perspective STACK_PARAMETERS)
 {
     const uint first_tile = (uint)get_global_id(0) * LANES;
     const uint columns = (width + TILE - 1) / TILE, tiles = columns * ((height + TILE - 1) / TILE);
-    const leap_map map = { leaps, bi, bj, bk };
+    const leap_map map = { leaps, bi, bj, bk, cells_k };
     const slice_stack stack = STACK_TABLE;
     const float ray_step = view[VIEW_NEAR].y;
     float lane_of[6][LANES], t_of[LANES], ends[LANES];

@@ -134,7 +134,7 @@ def composite_slab(
             upload(device, highlight_table(lighting)), entries_d, upload(device, view.table), output.states_d,
             output.image_d, output.depths_d, output.means_d, output.background, last, resident.stack.slope,
             np.int32(slab.shape_ijk[0]), np.int32(slab.shape_ijk[1]), np.int32(slab.first_k), np.int32(slab.end_k),
-            np.float32(slab.low_k), np.float32(slab.high_k), *(np.int32(n) for n in slab.bricks),
+            np.float32(slab.low_k), np.float32(slab.high_k), *slab.brick_arguments,
             np.float32(tables.low), np.float32(tables.scale), np.float32(tables.factor_scale),
             np.float32(tables.steps_per_unit), np.uint32(width), np.uint32(height),
             np.uint32(view.planes), np.int32(not view.camera.is_parallel), np.int32(lighting.shades), np.int32(jitter),
@@ -160,7 +160,7 @@ def _enter_tiles(
     launch(
         device, resident.program("render/tiles.cl")["enter_tiles"], -(-output.tiles // lanes),
         leaps.distances_d, upload(device, view.widened()), entries_d,
-        resident.stack.slope, *(np.int32(n) for n in slab.bricks), np.int32(slab.first_k), np.int32(margin),
+        resident.stack.slope, *slab.brick_arguments, np.int32(slab.first_k), np.int32(margin),
         np.uint32(width), np.uint32(height), np.int32(not view.camera.is_parallel), *resident.stack.arguments,
         stopwatch=stopwatch,
     )  # fmt: skip

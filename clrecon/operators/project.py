@@ -38,7 +38,7 @@ def project_slab(
         slab.voxels_d, resident.measure(slab, stopwatch), upload(device, view.table), output.states_d,
         output.depths_d, output.means_d, last,
         np.int32(slab.shape_ijk[0]), np.int32(slab.shape_ijk[1]), np.int32(slab.first_k), np.int32(slab.end_k),
-        np.float32(slab.low_k), np.float32(slab.high_k), *(np.int32(n) for n in slab.bricks),
+        np.float32(slab.low_k), np.float32(slab.high_k), *slab.brick_arguments,
         np.uint32(width), np.uint32(height), np.uint32(view.planes), np.int32(not view.camera.is_parallel),
         np.int32(PROJECTIONS[mode]), np.int32(slab.stage), np.uint32(queues), *resident.stack.arguments,
         stopwatch=stopwatch,

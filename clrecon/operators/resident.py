@@ -101,6 +101,11 @@ class RaySlab:
         return bi, bj, bk
 
     @property
+    def brick_arguments(self) -> tuple[np.int32, ...]:
+        """How kernels are told of bricks: (bi, bj, bk), and cells of each along k."""
+        return tuple(np.int32(n) for n in (*self.bricks, self.brick_cells[2]))
+
+    @property
     def end_k(self) -> int:
         """The slice after the last of the buffer."""
         return self.first_k + self.shape_ijk[2]
@@ -152,7 +157,6 @@ class ResidentVolume:
     def program(self, name: str, **variants: str) -> Program:
         """Build a kernel file for this volume's type of voxels."""
         own = {"UNEVEN": "1"} if self.volume.uneven else {}
-        own["BRICK_CELLS_K"] = str(self.brick_cells[2])
         return load_program(self.device, name, {**ray_variants(self.device, self.dtype), **own, **variants})
 
     def slab_bytes(self, slices: int) -> dict[str, int]:
@@ -246,7 +250,7 @@ class ResidentVolume:
             launch(
                 self.device, self.program("render/occupancy.cl")["measure_cells"], bi * bj * bk,
                 slab.voxels_d, slab.ranges_d, *(np.int32(n) for n in slab.shape_ijk),
-                *(np.uint32(n) for n in (bi, bj, bk)), stopwatch=stopwatch,
+                *(np.uint32(n) for n in (bi, bj, bk)), np.int32(slab.brick_cells[2]), stopwatch=stopwatch,
             )  # fmt: skip
         return slab.ranges_d
 

@@ -208,7 +208,7 @@ class _Job:
                 upload(device, highlight_table(look.lighting)), output.states_d, output.image_d, output.depths_d,
                 output.means_d, output.background, _float4(*last), resident.stack.slope,
                 np.int32(slab.shape_ijk[0]), np.int32(slab.shape_ijk[1]), np.int32(slab.first_k), np.int32(slab.end_k),
-                np.float32(low_k), np.float32(high_k), *(np.int32(n) for n in slab.bricks), np.float32(rule.iso_level),
+                np.float32(low_k), np.float32(high_k), *slab.brick_arguments, np.float32(rule.iso_level),
                 np.float32(rule.outside), _float4(*look.color), self._light_step(), self._cue(), np.uint32(width),
                 np.uint32(height), np.uint32(view.planes), np.int32(not self.camera.is_parallel), np.int32(slab.stage),
                 np.uint32(queues), *resident.stack.arguments, stopwatch=self.stopwatch,
