@@ -14,7 +14,7 @@ from registry import Job, case
 __all__ = ["Shot", "make_shots", "measure_first", "measure_gpu_mapper", "measure_warm"]
 
 SIZE = (1024, 1024)
-ZOOM = 1.6
+ZOOM = 1.0
 """The volume then fills the picture; at 1 there is room around it to turn in."""
 VIEW_ANGLE = 30.0
 GPU_PAIRS = 3
