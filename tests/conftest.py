@@ -91,9 +91,16 @@ class Devices:
         return cls.found
 
 
+def first_of(devices: list[Any]) -> list[Any]:
+    """The first device, for tests marked ``first_device``; with CLRECON_TEST_EVERY_DEVICE=1 all."""
+    return devices if is_set("CLRECON_TEST_EVERY_DEVICE") else devices[:1]
+
+
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
     if "device" in metafunc.fixturenames:
         devices, reason = Devices.get()
+        if metafunc.definition.get_closest_marker("first_device"):
+            devices = first_of(devices)
         parameters = devices or [pytest.param(reason, id="no-device")]
         ids = [device_id(device) for device in devices] or None
         metafunc.parametrize("device", parameters, ids=ids, indirect=True, scope="session")

@@ -207,6 +207,7 @@ class DeviceCaster:
 def casters(mode: str = "dvr") -> list[Any]:
     """Parameters for a test: the twin, and every device where the raycaster has the mode."""
     devices, reason = conftest.Devices.get()
+    devices = conftest.first_of(devices)
     found = [pytest.param(TwinCaster(), id="twin")]
     if not DEVICE_RENDERS or not (conftest.ROOT / "cl" / "render" / DEVICE_FILES[mode]).exists():
         return found

@@ -14,6 +14,8 @@ from clrecon.operators.reformat import reformat_curve
 from clrecon.reference.reformat import reformat_sheet
 from tests import tolerances
 
+pytestmark = pytest.mark.first_device
+
 BEND, TUBE = 40.0, 7.0
 """Radius of the torus and of its tube, mm."""
 TURN = np.radians(110.0)

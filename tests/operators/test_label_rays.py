@@ -16,6 +16,8 @@ from clrecon.rendering.label_style import LabelStyle
 from tests import tolerances
 from tests.operators.ray_scenes import STEPS, centre_of, look, make_volume, positions, premultiplied
 
+pytestmark = pytest.mark.first_device
+
 SIZE = (40, 36)
 UNLIT = Lighting(1.0, 0.0, 0.0)
 NAMES = {1: "vertebrae_L1", 2: "vertebrae_L2", 3: "rib_left_1"}

@@ -18,6 +18,8 @@ from clrecon.rendering import UNSHADED, Rendering, TransferFunction
 from tests import tolerances
 from tests.dicom_series import rotation
 
+pytestmark = pytest.mark.first_device
+
 BRIGHT = TransferFunction([(400.0, 1.0, 1.0, 1.0, 0.0), (500.0, 1.0, 0.5, 0.2, 1.0)])
 
 

@@ -11,7 +11,10 @@ from clrecon.geometry.camera import Camera
 from clrecon.rendering import TransferFunction
 from tests.operators.raycast_scenes import DEVICE_RENDERS, blobs, even_volume
 
-pytestmark = pytest.mark.skipif(not DEVICE_RENDERS, reason="the raycaster of devices is not there")
+pytestmark = [
+    pytest.mark.skipif(not DEVICE_RENDERS, reason="the raycaster of devices is not there"),
+    pytest.mark.first_device,
+]
 
 FOG = TransferFunction([(-100, 1, 1, 1, 0.1), (100, 1, 1, 1, 0.1)])
 

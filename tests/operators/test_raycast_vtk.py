@@ -25,7 +25,7 @@ from peers.vtk_fixed_point import FixedPointPeer  # noqa: E402
 from peers.vtk_stage import scene_of  # noqa: E402
 from raycast import likeness  # noqa: E402
 
-pytestmark = pytest.mark.opencl
+pytestmark = [pytest.mark.opencl, pytest.mark.first_device]
 
 SIZE = (200, 200)
 BONE = find_preset("bone")

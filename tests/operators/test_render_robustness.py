@@ -17,7 +17,7 @@ from clrecon.kernels import launching
 from clrecon.operators.resident import entry_slice
 from clrecon.rendering import TransferFunction
 
-pytestmark = pytest.mark.opencl
+pytestmark = [pytest.mark.opencl, pytest.mark.first_device]
 
 SIZE = (16, 16)
 HARD = TransferFunction([(0, 1, 0, 0, 0.0), (200, 1, 1, 0, 0.6)])

@@ -20,6 +20,8 @@ from clrecon.pipeline.render import make_pictures
 from clrecon.pipeline.render_settings import LabelLook, RenderSettings, Turntable
 from clrecon.pipeline.studio import read_function
 
+pytestmark = pytest.mark.first_device
+
 SIZE = (48, 40)
 
 
