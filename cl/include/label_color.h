@@ -41,11 +41,4 @@ static inline float3 tint(const float3 color, const float4 label_color, const fl
     return label_color.x < 0.0f ? color : color + share * (label_color.xyz - color);
 }
 
-/* Opacity `factor` times what it was at the unit distance, whatever the step: `clear` is log2(1 - opacity) over one ray
- * step, `steps` how many of them make the unit distance; returned is the new log2(1 - opacity) over one ray step. */
-static inline float fade(const float clear, const float factor, const float steps)
-{
-    return log2(max(1.0f - factor * (1.0f - exp2(clear * steps)), 1e-9f)) / steps;
-}
-
 #endif
