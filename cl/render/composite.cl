@@ -77,6 +77,13 @@ static inline floats stretch_opacity(const floats opacity, const floats times)
     return choose(opacity < 1.0f, stretched, (floats)(1.0f));
 }
 
+/* Opacity over one ray step where the opacity of the unit distance has a factor. */
+static inline floats weigh_opacity(const looks *look, const floats opacity, const floats factor)
+{
+    const floats whole = stretch_opacity(opacity, (floats)(look->steps_per_unit));
+    return stretch_opacity(factor * whole, (floats)(1.0f / look->steps_per_unit));
+}
+
 /* Indices of sample n of each ray. */
 static inline void find_places(const slice_stack *stack, const ray_lanes *course, const packet *rays, const float n,
     floats *i, floats *j, floats *k)
@@ -104,13 +111,10 @@ static inline floats find_opacity(const field *f, const slice_stack *stack, cons
 #endif
     opacity = choose(counts, opacity, (floats)(0.0f));
 #ifdef LABELS
-    if (ANY_LANE(opacity > 0.0f)) { /* the factor is on the opacity of the unit distance */
+    if (ANY_LANE(opacity > 0.0f)) {
         const floats factor = LABEL_CHANNEL(look->label_colors, find_labels(look->labels, f, i, j, k), 3);
-        if (ANY_LANE((factor < 1.0f) & (opacity > 0.0f))) {
-            const floats whole = stretch_opacity(opacity, (floats)(look->steps_per_unit));
-            const floats faded = stretch_opacity(factor * whole, (floats)(1.0f / look->steps_per_unit));
-            opacity = choose(factor < 1.0f, faded, opacity);
-        }
+        if (ANY_LANE((factor < 1.0f) & (opacity > 0.0f)))
+            opacity = choose(factor < 1.0f, weigh_opacity(look, opacity, factor), opacity);
     }
 #endif
     return opacity;
@@ -134,10 +138,7 @@ static inline void blend_samples(const field *f, const slice_stack *stack, const
         const floats low = (floats)(GATHER(float, look->factors, at));
         const floats high = (floats)(GATHER(float, look->factors + 1, at));
         const floats factor = low + (entry - to_floats(at)) * (high - low);
-        /* The factor is on the opacity of the unit distance. */
-        const floats whole = stretch_opacity(opacity, (floats)(look->steps_per_unit));
-        const floats weighed = stretch_opacity(factor * whole, (floats)(1.0f / look->steps_per_unit));
-        opacity = choose(opacity > 0.0f, weighed, opacity);
+        opacity = choose(opacity > 0.0f, weigh_opacity(look, opacity, factor), opacity);
 #endif
         if (look->shaded)
             find_light(look->view, look->highlights, x, y, z, rays->toward_x, rays->toward_y, rays->toward_z, &share,
@@ -193,13 +194,12 @@ __kernel void composite_rays(
     __global const VOXEL *restrict voxels, __global const uchar *restrict leaps,
     __global const int *restrict colors, __global const float *restrict opacities,
     __global const float *restrict factors, __global const float *restrict highlights,
-    __global const float *restrict entries,
-    __global const float4 *restrict view, __global float4 *restrict states, __global uchar4 *restrict image,
+    __global const float *restrict entries, __global const float4 *restrict view,
+    __global float4 *restrict states, __global uchar4 *restrict image,
     __global float *restrict depths, __global float *restrict means, const float4 background, const float4 last_place,
     const float4 slope, const int ni, const int nj, const int first_k, const int end_k, const float slab_low,
     const float slab_high, const int bi, const int bj, const int bk, const int cells_k, const float low,
-    const float scale,
-    const float factor_scale, const float steps_per_unit, const uint width, const uint height, const uint planes,
+    const float scale, const float factor_scale, const float steps_per_unit, const uint width, const uint height, const uint planes,
     const int perspective, const int shaded, const int jitter, const int stage, const uint queues
     LABEL_PARAMETERS STACK_PARAMETERS)
 {

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from clrecon.errors import DeviceError
+from clrecon.errors import DeviceError, UsageError
 from clrecon.opencl.context import Device
 
-__all__ = ["MemoryLimits", "check_budget", "describe_shortage", "memory_limits"]
+__all__ = ["MemoryLimits", "check_budget", "check_memory", "describe_shortage", "memory_limits"]
 
 
 def _mib(size: int) -> str:
@@ -39,6 +39,17 @@ class MemoryLimits:
         if self.asked:
             return f"{_mib(self.total_bytes)} are allowed on {self.label}"
         return f"{self.label} has {_mib(self.total_bytes)}, at most {_mib(self.buffer_bytes)} in one buffer"
+
+
+def check_memory(memory: int | None) -> None:
+    """Refuse what is no number of bytes that may be taken on a device; None is all of its memory.
+
+    Raises
+    ------
+    UsageError
+    """
+    if memory is not None and (isinstance(memory, bool) or not isinstance(memory, int) or memory < 1):
+        raise UsageError(f"memory is a whole number of bytes, not {memory!r}")
 
 
 def memory_limits(device: Device, memory: int | None = None) -> MemoryLimits:

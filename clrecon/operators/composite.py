@@ -14,7 +14,7 @@ from clrecon.labels.resample import ResampledLabels
 from clrecon.opencl import Device
 from clrecon.operators.pictures import PictureBuffers, count_queues, highlight_table
 from clrecon.operators.ray_view import RayView
-from clrecon.operators.resident import LeapMap, RaySlab, ResidentVolume, pad_slices
+from clrecon.operators.resident import FARTHEST, LeapMap, RaySlab, ResidentVolume, pad_slices
 from clrecon.operators.voxel_types import label_variants
 from clrecon.rendering import Lighting, TransferFunction
 from clrecon.rendering.label_style import LabelStyle
@@ -26,9 +26,6 @@ NODES = 4096
 
 GRADIENT_NODES = 256
 """Entries of its table of factors by magnitude of the gradient."""
-
-FARTHEST = 15
-"""Bricks that a leap goes at most, as in cl/render/occupancy.cl: with that as its margin none is left."""
 
 LOWEST_LOG = -1000.0
 """log2 of what an opaque sample lets through: 0 in float32, and no infinity that a length of 0 would make NaN."""

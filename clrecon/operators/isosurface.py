@@ -15,7 +15,7 @@ from clrecon.geometry.field import IsoRule, ValueRange, check_topology, choose_i
 from clrecon.geometry.precision import describe_far
 from clrecon.kernels import Program, Stopwatch, result_pages, upload
 from clrecon.mesh import Mesh
-from clrecon.opencl import Device, choose_device, describe_shortage, memory_limits
+from clrecon.opencl import Device, check_memory, choose_device, describe_shortage, memory_limits
 from clrecon.opencl.quirks import cache_warnings
 from clrecon.operators import marching_cubes
 from clrecon.operators.bricks import BrickRanges, BrickStates, compare_bricks, measure_bricks
@@ -107,8 +107,7 @@ class SurfaceExtractor:
     def __init__(self, volume: Volume, device: Device | str | int | None = None, *, memory: int | None = None):
         if not isinstance(volume, Volume):
             raise UsageError(f"a surface needs a Volume, not {type(volume).__name__}: clrecon.Volume(voxels, affine)")
-        if memory is not None and (isinstance(memory, bool) or not isinstance(memory, int) or memory < 1):
-            raise UsageError(f"memory is a whole number of bytes, not {memory!r}")
+        check_memory(memory)
         ni = volume.shape_ijk[0]
         if ni + 2 > marching_cubes.LONGEST_ROW:
             raise UsageError(f"the volume has {ni:,} columns, {marching_cubes.LONGEST_ROW - 2:,} are supported")

@@ -18,7 +18,7 @@ from clrecon.geometry.sheets import Sheet, find_plane, finest_step, plane_sheet,
 from clrecon.geometry.spine_line import find_spine_line
 from clrecon.geometry.views import checked_size, find_up, find_view
 from clrecon.kernels import Stopwatch
-from clrecon.opencl import Device, choose_device
+from clrecon.opencl import Device, check_memory, choose_device
 from clrecon.operators.sheets import Progress, Reformation, sample_sheet
 from clrecon.rendering import Rendering
 from clrecon.rendering.colors import is_transparent
@@ -51,8 +51,7 @@ class _Job:
     ):
         if not isinstance(volume, Volume):
             raise UsageError(f"a slice needs a Volume, not {type(volume).__name__}: clrecon.Volume(voxels, affine)")
-        if memory is not None and (isinstance(memory, bool) or not isinstance(memory, int) or memory < 1):
-            raise UsageError(f"memory is a whole number of bytes, not {memory!r}")
+        check_memory(memory)
         self.volume, self.memory, self.combine = volume, memory, combine
         self.samples = slab_samples(volume, thickness)
         self.thickness = float(thickness)

@@ -16,7 +16,7 @@ from clrecon.geometry.camera import Camera, box_corners
 from clrecon.geometry.clip import Clip
 from clrecon.geometry.views import checked_size
 from clrecon.labels import LabelMap
-from clrecon.opencl import Device, choose_device
+from clrecon.opencl import Device, check_memory, choose_device
 from clrecon.operators.composite import TransferTables
 from clrecon.operators.project import PROJECTIONS
 from clrecon.operators.ray_pictures import RayPicture, take_picture
@@ -98,8 +98,7 @@ class VolumeRenderer:
     def __init__(self, volume: Volume, device: Device | str | int | None = None, *, memory: int | None = None):
         if not isinstance(volume, Volume):
             raise UsageError(f"a picture needs a Volume, not {type(volume).__name__}: clrecon.Volume(voxels, affine)")
-        if memory is not None and (isinstance(memory, bool) or not isinstance(memory, int) or memory < 1):
-            raise UsageError(f"memory is a whole number of bytes, not {memory!r}")
+        check_memory(memory)
         if volume.voxels.dtype.kind == "f" and not np.isfinite(volume.voxels).all():
             raise UsageError("the voxels hold NaN or infinite values: fill them first, for CT with -1024")
         self.volume = volume

@@ -19,10 +19,22 @@ from clrecon.operators.ray_view import BOX_BORDER, enclose
 from clrecon.operators.stack_table import StackTable
 from clrecon.operators.voxel_types import voxel_variants
 
-__all__ = ["BRICK_CELLS", "LeapMap", "RaySlab", "ResidentVolume", "entry_slice", "pad_slices", "ray_variants"]
+__all__ = [
+    "BRICK_CELLS",
+    "FARTHEST",
+    "LeapMap",
+    "RaySlab",
+    "ResidentVolume",
+    "entry_slice",
+    "pad_slices",
+    "ray_variants",
+]
 
 BRICK_CELLS = 4
 """Cells of a brick along i and j, as in cl/include/leap.h."""
+
+FARTHEST = 15
+"""Bricks that a leap goes at most, as in cl/render/occupancy.cl: with that as its margin none is left."""
 
 
 def choose_brick_cells(volume: Volume) -> tuple[int, int, int]:
