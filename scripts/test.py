@@ -3,8 +3,9 @@
 
     python3 scripts/test.py [--fast] [PYTEST ARGUMENTS]
 
---fast leaves out the tests marked slow and the Oclgrind check.  Everything else goes to pytest.  The exit status is
-not 0 when any of the four fails, or when no test ran.  See CONTRIBUTING.md for the variables that choose devices.
+--fast leaves out the tests marked slow and the Oclgrind check.  Everything else goes to pytest; without such arguments
+the whole suite runs in as many processes as there are cores, four at most.  The exit status is not 0 when any of the
+four fails, or when no test ran.  See CONTRIBUTING.md for the variables that choose devices.
 """
 
 import os
@@ -17,6 +18,8 @@ import shutil
 import subprocess
 
 from _environment import ROOT, SetupError, ensure_environment, program_path
+
+MOST_PROCESSES = 4
 
 
 def main() -> int:
@@ -38,8 +41,13 @@ def main() -> int:
     }
     if not fast and (shutil.which("oclgrind") or os.environ.get("CLRECON_REQUIRE_OCLGRIND")):
         steps["oclgrind"] = [python, os.path.join("scripts", "check_oclgrind.py")]
+    # Kernels are built on one core: much of the suite is that.  A file of tests stays in one process.  A process that
+    # crashes ends the run, as it does without others: pytest-xdist 3.8 waits for ever for what took its place.
+    cores = min(os.cpu_count() or 1, MOST_PROCESSES)
+    options = ["-n", str(cores), "--dist", "loadfile", "--max-worker-restart", "0"]
+    spread = options if cores > 1 and not arguments else []
     # pytest comes last: its closing line is the closing line of this program
-    steps["pytest"] = [python, "-m", "pytest", "-q", *(["-m", "not slow"] if fast else []), *arguments]
+    steps["pytest"] = [python, "-m", "pytest", "-q", *spread, *(["-m", "not slow"] if fast else []), *arguments]
     environment = {**os.environ, "CLRECON_REQUIRE_TESTS": "1"}
     failed = []
     for name, command in steps.items():

@@ -19,6 +19,8 @@ CLRECON_REQUIRE_TESTS=1
 from __future__ import annotations
 
 import os
+import signal
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -126,6 +128,14 @@ def real_data() -> Path:
             pytest.fail(f"CLRECON_TEST_DATA={named!r} is not a folder")
         pytest.skip("real CT data is absent (CLRECON_TEST_DATA names its folder)")
     return folder
+
+
+@pytest.fixture(scope="session", autouse=True)
+def interruptible() -> Iterator[None]:
+    """Ctrl-C as in a terminal, here and in processes of tests: what a shell starts in the background ignores it."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
 
 
 @pytest.fixture(scope="session")

@@ -98,3 +98,31 @@ def test_a_project_that_cannot_be_written_is_told_so(tmp_path: Path) -> None:
     done = start(project)
     assert done.returncode == 1
     assert "cannot be written" in done.stderr and "Traceback" not in done.stderr
+
+
+STAND_IN = """
+import os, sys
+ROOT = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))
+class SetupError(Exception): pass
+def ensure_environment(*_, **__): return ""
+def program_path(_, name): return sys.executable if name == "python" else "true"
+"""
+
+
+@posix_only
+def test_a_test_that_ends_its_process_ends_the_run(tmp_path: Path) -> None:
+    """Two processes on a file of tests each, one of which is killed: no waiting for it, and no success."""
+    for name, text in {
+        "scripts/_environment.py": STAND_IN,
+        "test_a.py": "import os\ndef test_one(): os.kill(os.getpid(), 9)\ndef test_two(): assert 1\n",
+        **{f"test_b{number}.py": "def test_it(): assert 1\n" for number in range(5)},
+    }.items():
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text(text)
+    script = shutil.copy(ROOT / "scripts" / "test.py", tmp_path / "scripts")
+    code = f"import os, runpy, sys\nos.cpu_count = lambda: 2\nsys.path.insert(0, {str(tmp_path / 'scripts')!r})\n"
+    code += f"sys.argv = ['test.py', '--fast']\nrunpy.run_path({str(script)!r}, run_name='__main__')"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
+    assert done.returncode == 1 and "INTERNALERROR" not in done.stdout
+    assert "crashed while running 'test_a.py::test_one'" in done.stdout
+    assert " failed, " in done.stdout.splitlines()[-1] and done.stderr.splitlines()[-1] == "pytest failed"
