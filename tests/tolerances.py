@@ -171,3 +171,4 @@ SURFACE_LIGHT_255 = 6.0  # normals of a ball from differences over two voxels, o
 SURFACE_TWIN_SHARE = 0.01  # of pixels: outlines, and edges of shadows, that float32 puts on the other side
 SURFACE_TWIN_MM = 0.005  # a crossing is sought to 1e-3 of a step of up to 1.7 mm
 SURFACE_OUTLINE_SHARE = 0.02  # of pixels: at outlines triangles and the trilinear field between voxels part
+WINDOW_SHARE = 0.51 / 16384  # weights of 14 bits, rounded

@@ -21,7 +21,7 @@ static inline floats inner_share(const floats at, const float last)
 /* Values at LANES places near each other, index coordinates. */
 static inline floats sample_closed(const closed_field *f, const floats i, const floats j, const floats k)
 {
-    const floats value = sample_lanes(&f->inner, i, j, k);
+    const floats value = sample_lanes(&f->inner, i, j, k, 0);
     const float4 last = f->inner.last;
     const floats share = inner_share(i, last.x) * inner_share(j, last.y) * inner_share(k, last.z);
     /* A value on the level stays on it. */

@@ -18,13 +18,23 @@ typedef int8 ints;
 #define store_lanes(vector, pointer) vstore8(vector, 0, pointer)
 #define LANE_NUMBERS ((floats)(0.0f, 1.0f, 2.0f, 3.0f, 4.0f, 5.0f, 6.0f, 7.0f))
 #define FIRST_LANE(vector) ((vector).s0)
-#define ANY_LANE(condition) any(condition)
+#define ANY_LANE(condition) any_lane(condition)
 #define LEAST_LANE(vector) least_lane(vector)
+static inline int any_lane(const int8 condition)
+{
+#ifdef __AVX__
+    return __builtin_ia32_movmskps256(as_float8(condition)) != 0;
+#else
+    const int4 half_way = condition.lo | condition.hi;
+    const int2 quarter = half_way.lo | half_way.hi;
+    return (quarter.x | quarter.y) != 0;
+#endif
+}
 static inline float least_lane(const float8 v)
 {
-    const float4 half_way = min(v.lo, v.hi);
-    const float2 quarter = min(half_way.lo, half_way.hi);
-    return min(quarter.x, quarter.y);
+    const float4 half_way = v.lo < v.hi ? v.lo : v.hi;
+    const float2 quarter = half_way.lo < half_way.hi ? half_way.lo : half_way.hi;
+    return quarter.x < quarter.y ? quarter.x : quarter.y;
 }
 /* Entries of a table, as the elements of a vector literal.  That they are volatile keeps compilers from making a gather
  * instruction of them, which takes longer than single loads. */
@@ -52,5 +62,18 @@ typedef int ints;
 /* Lanes of `yes` where the condition holds, of `no` elsewhere.  OpenCL's select() takes true to be -1 in a vector
  * and 1 in a scalar; ?: takes both. */
 #define choose(condition, yes, no) ((condition) ? (yes) : (no))
+
+/* Some CPU drivers call a function for every min() and max() of vectors. */
+static inline floats lesser(const floats a, const floats b) { return choose(a < b, a, b); }
+static inline floats greater(const floats a, const floats b) { return choose(a > b, a, b); }
+static inline ints lesser_int(const ints a, const ints b) { return choose(a < b, a, b); }
+static inline ints greater_int(const ints a, const ints b) { return choose(a > b, a, b); }
+
+/* Least whole number that is not less; |x| < 2^31. */
+static inline floats round_up(const floats x)
+{
+    const floats whole = to_floats(to_ints(x));
+    return choose(whole < x, whole + 1.0f, whole);
+}
 
 #endif

@@ -26,9 +26,9 @@ static inline void find_pace(ray_lanes *rays, const float4 slope)
 {
 #ifdef UNEVEN
     const floats rise = fabs(rays->stride_k);
-    rays->pace_i = 1.0f / max(fabs(rays->stride_i) + rise * slope.x, (floats)(1e-9f));
-    rays->pace_j = 1.0f / max(fabs(rays->stride_j) + rise * slope.y, (floats)(1e-9f));
-    rays->pace_k = 1.0f / max(rise * slope.z, (floats)(1e-9f));
+    rays->pace_i = 1.0f / greater(fabs(rays->stride_i) + rise * slope.x, (floats)(1e-9f));
+    rays->pace_j = 1.0f / greater(fabs(rays->stride_j) + rise * slope.y, (floats)(1e-9f));
+    rays->pace_k = 1.0f / greater(rise * slope.z, (floats)(1e-9f));
 #else
     rays->pace_i = 1.0f / choose(fabs(rays->stride_i) < 1e-9f, (floats)(1e-9f), rays->stride_i);
     rays->pace_j = 1.0f / choose(fabs(rays->stride_j) < 1e-9f, (floats)(1e-9f), rays->stride_j);
@@ -43,7 +43,7 @@ static inline floats count_to_face(
 #ifdef UNEVEN
     const floats low = to_floats((brick - distance + 1) * cells);
     const floats high = to_floats((brick + distance) * cells);
-    return min(place - low, high - place) * pace;
+    return lesser(place - low, high - place) * pace;
 #else
     const ints face = choose(stride >= 0.0f, brick + distance, brick - distance + 1);
     return (to_floats(face * cells) - place) * pace;
@@ -60,16 +60,16 @@ static inline floats count_free_steps(const leap_map *map, const slice_stack *st
     floats k = rays->start_k + n * rays->stride_k;
     to_indices(stack, &i, &j, &k);
     k -= (float)first_k;
-    const ints brick_i = clamp(to_ints(i * BRICKS_PER_CELL), (ints)(0), (ints)(map->bi - 1));
-    const ints brick_j = clamp(to_ints(j * BRICKS_PER_CELL), (ints)(0), (ints)(map->bj - 1));
-    const ints brick_k = clamp(to_ints(k * bricks_per_k), (ints)(0), (ints)(map->bk - 1));
+    const ints brick_i = lesser_int(greater_int(to_ints(i * BRICKS_PER_CELL), (ints)(0)), (ints)(map->bi - 1));
+    const ints brick_j = lesser_int(greater_int(to_ints(j * BRICKS_PER_CELL), (ints)(0)), (ints)(map->bj - 1));
+    const ints brick_k = lesser_int(greater_int(to_ints(k * bricks_per_k), (ints)(0)), (ints)(map->bk - 1));
     const ints at = (brick_k * map->bj + brick_j) * map->bi + brick_i;
     const ints distance = (ints)(GATHER(uchar, map->distances, at)) - margin;
     /* The cube of bricks less than `distance` away is empty. */
-    const floats steps = min(min(count_to_face(i, rays->stride_i, rays->pace_i, brick_i, distance, BRICK_CELLS),
+    const floats steps = lesser(lesser(count_to_face(i, rays->stride_i, rays->pace_i, brick_i, distance, BRICK_CELLS),
                                  count_to_face(j, rays->stride_j, rays->pace_j, brick_j, distance, BRICK_CELLS)),
         count_to_face(k, rays->stride_k, rays->pace_k, brick_k, distance, map->cells_k));
-    return choose(distance > 0, max(ceil(steps), (floats)(1.0f)), (floats)(0.0f));
+    return choose(distance > 0, greater(round_up(steps), (floats)(1.0f)), (floats)(0.0f));
 }
 
 /* True where the brick of a place shows something; k counts from the first slice of the buffer. */

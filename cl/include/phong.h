@@ -8,6 +8,24 @@
 
 #define HIGHLIGHTS 1024 /* entries of a table of specular * cosine ^ power: library powers take 0.2 us on CPU drivers */
 
+/* Highlight of LANES cosines of 0 to 1: specular * cosine ^ power. */
+static inline floats find_highlight(const float4 phong, __global const float *highlights, const floats cosine)
+{
+    const int power = (int)phong.w;
+    if ((float)power == phong.w) { /* squares are faster than a table */
+        floats result = phong.z, square = cosine;
+        for (int bits = power; bits > 0; bits >>= 1) {
+            result = bits & 1 ? result * square : result;
+            square = square * square;
+        }
+        return result;
+    }
+    const floats entry = cosine * (HIGHLIGHTS - 1);
+    const ints at = lesser_int(to_ints(entry), (ints)(HIGHLIGHTS - 2));
+    const floats low = (floats)(GATHER(float, highlights, at)), high = (floats)(GATHER(float, highlights + 1, at));
+    return low + (entry - to_floats(at)) * (high - low);
+}
+
 /* LPS gradients per mm of LANES places with index coordinate k. */
 static inline void find_gradients(__global const float4 *view, const slice_stack *stack, const slopes *s,
     const floats k, floats *x, floats *y, floats *z)
@@ -47,31 +65,28 @@ static inline void find_gradients(__global const float4 *view, const slice_stack
 }
 
 /* Light on LANES places with LPS gradients (x, y, z), seen along unit vectors: a place takes `share` of its own colour
- * and `highlight` of white.  Without a gradient it keeps ambient and diffuse light. */
+ * and `highlight` of white.  The smaller the gradient the less counts its direction. */
 static inline void find_light(__global const float4 *view, __global const float *highlights,
     const floats x, const floats y, const floats z, const floats direction_x, const floats direction_y,
     const floats direction_z, floats *share, floats *highlight)
 {
     const float4 phong = view[VIEW_PHONG], fixed_light = view[VIEW_LIGHT];
     const floats size = x * x + y * y + z * z;
-    const ints flat = size < 1e-12f;
-    const floats per_size = 1.0f / sqrt(max(size, (floats)(1e-12f)));
+    const floats per_size = 1.0f / sqrt(greater(size, (floats)(1e-12f)));
     floats cosine, middle;
     if (fixed_light.w > 0.0f) {
         cosine = fabs(x * fixed_light.x + y * fixed_light.y + z * fixed_light.z) * per_size;
         const floats half_x = fixed_light.x - direction_x, half_y = fixed_light.y - direction_y;
         const floats half_z = fixed_light.z - direction_z;
-        const floats length_squared = max(half_x * half_x + half_y * half_y + half_z * half_z, (floats)(1e-12f));
+        const floats length_squared = greater(half_x * half_x + half_y * half_y + half_z * half_z, (floats)(1e-12f));
         middle = fabs(x * half_x + y * half_y + z * half_z) * per_size / sqrt(length_squared);
     } else {
         cosine = fabs(x * direction_x + y * direction_y + z * direction_z) * per_size;
         middle = cosine;
     }
-    const floats entry = min(middle, (floats)(1.0f)) * (HIGHLIGHTS - 1);
-    const ints at = min(to_ints(entry), (ints)(HIGHLIGHTS - 2));
-    const floats low = (floats)(GATHER(float, highlights, at)), high = (floats)(GATHER(float, highlights + 1, at));
-    *share = phong.x + choose(flat, (floats)(phong.y), phong.y * cosine);
-    *highlight = choose(flat, (floats)(0.0f), low + (entry - to_floats(at)) * (high - low));
+    const floats certain = size / (size + view[VIEW_NEAR].z);
+    *share = phong.x + phong.y * (1.0f + certain * (cosine - 1.0f));
+    *highlight = certain * find_highlight(phong, highlights, lesser(middle, (floats)(1.0f)));
 }
 
 #endif

@@ -24,7 +24,7 @@
 #define VIEW_NORMAL_Z 15
 #define VIEW_LIGHT 16 /* xyz: LPS direction to a light that stands still; w: 1, or 0 for a light at the camera */
 #define VIEW_PHONG 17 /* ambient, diffuse, specular, power of the highlight */
-#define VIEW_NEAR 18 /* x: mm along an unnormalised direction from the camera to VIEW_ORIGIN; y: ray step, mm */
+#define VIEW_NEAR 18 /* x: mm along an unnormalised direction from the camera to VIEW_ORIGIN; y: ray step, mm; z: square of Lighting.soft_gradient */
 #define VIEW_PLANES 19 /* clip planes: kept is where xyz . field coordinates >= w */
 
 #define TILE 8 /* work-items go through the picture in tiles of 8 x 8 pixels */

@@ -11,10 +11,12 @@
  * -D GRADIENT_OPACITY   opacity times a function of the gradient's magnitude
  * -D LABELS             labels with colours and opacities */
 #include "include/field.h"
+#include "include/inner_samples.h"
 #include "include/jitter.h"
 #include "include/label_color.h"
 #include "include/leap.h"
 #include "include/phong.h"
+#include "include/ray_packet.h"
 #include "include/stack.h"
 #include "include/view.h"
 
@@ -24,6 +26,7 @@
 #define FIRST_SEEN (1.0f / 255.0f) /* opacity that makes a first hit */
 #define SAMPLES_A_LOOK 8 /* samples until a packet looks for empty space again */
 #define AT_ONCE 4 /* of them taken before any is blended */
+#define SAMPLES_AHEAD 6.0f /* that their voxels are asked for */
 
 /* What rays have seen so far: premultiplied colour, t of the first hit (negative before), sum of t, weighted. */
 typedef struct {
@@ -36,6 +39,7 @@ typedef struct {
     floats t_in, phase, offset, last, last_number, rest;
     floats begin, end; /* samples that can show */
     floats toward_x, toward_y, toward_z; /* unit direction, LPS */
+    float inner_begin, inner_end; /* samples of which all rays have every voxel that they need, see find_opacity() */
 } packet;
 
 /* Transfer function and light. */
@@ -50,6 +54,7 @@ typedef struct {
     float steps_per_unit; /* ray steps in the unit distance */
     float ray_step;
     float slab_low, slab_high; /* samples with slab_low <= k < slab_high are this slab's */
+    int first_shown, last_shown; /* nodes with opacity lie between */
     int shaded;
 #ifdef LABELS
     __global const LABEL *labels;
@@ -73,7 +78,7 @@ typedef struct {
  * opaque stays so, however short the way. */
 static inline floats stretch_opacity(const floats opacity, const floats times)
 {
-    const floats stretched = 1.0f - exp2(log2(max(1.0f - opacity, (floats)(1e-30f))) * times);
+    const floats stretched = 1.0f - exp2(log2(greater(1.0f - opacity, (floats)(1e-30f))) * times);
     return choose(opacity < 1.0f, stretched, (floats)(1.0f));
 }
 
@@ -84,32 +89,37 @@ static inline floats weigh_opacity(const looks *look, const floats opacity, cons
     return stretch_opacity(factor * whole, (floats)(1.0f / look->steps_per_unit));
 }
 
-/* Indices of sample n of each ray. */
+/* Indices of sample n of each ray; `inner` as in find_opacity(). */
 static inline void find_places(const slice_stack *stack, const ray_lanes *course, const packet *rays, const float n,
-    floats *i, floats *j, floats *k)
+    const int inner, floats *i, floats *j, floats *k)
 {
-    const floats number = min((floats)(n), rays->last_number);
+    const floats number = inner ? (floats)(n) : lesser((floats)(n), rays->last_number);
     *i = course->start_i + number * course->stride_i;
     *j = course->start_j + number * course->stride_j;
     *k = course->start_k + number * course->stride_k;
     to_indices(stack, i, j, k);
 }
 
-/* Opacity over one ray step of sample n of each ray, and its node of the table; 0 for samples that do not count. */
+/* Opacity over one ray step of sample n of each ray, and its node of the table; 0 for samples that do not count.  With
+ * `inner` they all count, lie within the volume with all voxels that they need, and are not the last of their rays. */
 static inline floats find_opacity(const field *f, const slice_stack *stack, const looks *look, const ray_lanes *course,
-    const packet *rays, const float n, ints *node)
+    const packet *rays, const float n, const int inner, ints *node)
 {
     floats i, j, k;
-    find_places(stack, course, rays, n, &i, &j, &k);
-    const floats value = sample_lanes(f, i, j, k);
+    find_places(stack, course, rays, n, inner, &i, &j, &k);
+    const floats value = sample_lanes(f, i, j, k, inner);
     const floats place = (value - look->low) * look->scale + 0.5f;
-    *node = to_ints(min(max(place, (floats)(0.0f)), (floats)(NODES - 1)));
+    *node = to_ints(lesser(greater(place, (floats)(0.0f)), (floats)(NODES - 1)));
+    if (!ANY_LANE((*node >= look->first_shown) & (*node <= look->last_shown)))
+        return 0.0f;
     floats opacity = (floats)(GATHER(float, look->opacities, *node));
-    ints counts = (k >= look->slab_low) & (k < look->slab_high) & (n >= rays->begin);
+    if (!inner) {
+        ints counts = (k >= look->slab_low) & (k < look->slab_high) & (n >= rays->begin);
 #ifdef UNEVEN
-    counts &= (i >= -0.5f) & (i <= f->last.x + 0.5f) & (j >= -0.5f) & (j <= f->last.y + 0.5f);
+        counts &= (i >= -0.5f) & (i <= f->last.x + 0.5f) & (j >= -0.5f) & (j <= f->last.y + 0.5f);
 #endif
-    opacity = choose(counts, opacity, (floats)(0.0f));
+        opacity = choose(counts, opacity, (floats)(0.0f));
+    }
 #ifdef LABELS
     if (ANY_LANE(opacity > 0.0f)) {
         const floats factor = LABEL_CHANNEL(look->label_colors, find_labels(look->labels, f, i, j, k), 3);
@@ -122,19 +132,19 @@ static inline floats find_opacity(const field *f, const slice_stack *stack, cons
 
 /* Blend sample n of every ray that it shows of. */
 static inline void blend_samples(const field *f, const slice_stack *stack, const looks *look, const ray_lanes *course,
-    const packet *rays, const float n, const ints node, floats opacity, sights *seen)
+    const packet *rays, const float n, const int inner, const ints node, floats opacity, sights *seen)
 {
     floats i, j, k;
-    find_places(stack, course, rays, n, &i, &j, &k);
+    find_places(stack, course, rays, n, inner, &i, &j, &k);
     floats share = 1.0f, highlight = 0.0f;
     if (look->shaded || IS_WEIGHED) {
         slopes s;
-        find_slopes(f, i, j, k, &s);
+        find_slopes(f, i, j, k, inner, &s);
         floats x, y, z;
         find_gradients(look->view, stack, &s, k, &x, &y, &z);
 #if IS_WEIGHED
-        const floats entry = min(sqrt(x * x + y * y + z * z) * look->factor_scale, (floats)(GRADIENT_NODES - 1));
-        const ints at = min(to_ints(entry), (ints)(GRADIENT_NODES - 2));
+        const floats entry = lesser(sqrt(x * x + y * y + z * z) * look->factor_scale, (floats)(GRADIENT_NODES - 1));
+        const ints at = lesser_int(to_ints(entry), (ints)(GRADIENT_NODES - 2));
         const floats low = (floats)(GATHER(float, look->factors, at));
         const floats high = (floats)(GATHER(float, look->factors + 1, at));
         const floats factor = low + (entry - to_floats(at)) * (high - low);
@@ -144,7 +154,7 @@ static inline void blend_samples(const field *f, const slice_stack *stack, const
             find_light(look->view, look->highlights, x, y, z, rays->toward_x, rays->toward_y, rays->toward_z, &share,
                 &highlight);
     }
-    const floats t = rays->t_in + (min((floats)(n), rays->last_number) + rays->phase) * look->ray_step;
+    const floats t = rays->t_in + (lesser((floats)(n), rays->last_number) + rays->phase) * look->ray_step;
     const ints cut = (rays->last == n) & (opacity > 0.0f);
     if (ANY_LANE(cut))
         opacity = choose(cut, stretch_opacity(opacity, rays->rest / look->ray_step), opacity);
@@ -161,12 +171,75 @@ static inline void blend_samples(const field *f, const slice_stack *stack, const
     blue += tinted * (LABEL_CHANNEL(look->label_colors, number, 2) - blue);
 #endif
     const floats weight = (1.0f - seen->opacity) * opacity;
-    seen->red += weight * min(red * share + highlight, (floats)(1.0f));
-    seen->green += weight * min(green * share + highlight, (floats)(1.0f));
-    seen->blue += weight * min(blue * share + highlight, (floats)(1.0f));
+    seen->red += weight * lesser(red * share + highlight, (floats)(1.0f));
+    seen->green += weight * lesser(green * share + highlight, (floats)(1.0f));
+    seen->blue += weight * lesser(blue * share + highlight, (floats)(1.0f));
     seen->opacity += weight;
     seen->sum += weight * t;
     seen->first_hit = choose((seen->first_hit < 0.0f) & (seen->opacity > FIRST_SEEN), t, seen->first_hit);
+}
+
+/* Set up the rays of LANES pixels that are neighbours in a row; nothing shows before `entry`. */
+static inline void start_rays(const field *f, const looks *look, const int2 first_pixel, const int2 size,
+    const uint planes, const int perspective, const int jitter, const float entry, const float4 slope,
+    ray_lanes *course, packet *rays)
+{
+    const float ray_step = look->ray_step;
+    const floats x = (float)first_pixel.x + LANE_NUMBERS, y = (float)first_pixel.y;
+    ray_packet way;
+    start_packet(look->view, x, y, planes, perspective, &way);
+    rays->phase = 0.5f;
+    if (jitter) {
+        float phase_of[LANES];
+        for (int lane = 0; lane < LANES; ++lane)
+            phase_of[lane] = jitter_pixel((uint)(first_pixel.x + lane), (uint)first_pixel.y);
+        rays->phase = load_lanes(phase_of);
+    }
+    lay_course(&way, way.t_in + rays->phase * ray_step, (floats)(ray_step), slope, course);
+    rays->t_in = way.t_in;
+    rays->offset = way.offset;
+    rays->toward_x = way.toward_x;
+    rays->toward_y = way.toward_y;
+    rays->toward_z = way.toward_z;
+    const floats span = way.t_out - way.t_in;
+    const floats segments = choose(span > 0.0f, round_up(span / ray_step), (floats)(0.0f));
+    rays->last = segments - 1.0f;
+    rays->rest = span - rays->last * ray_step;
+    rays->last_number = rays->last - rays->phase * (1.0f - rays->rest / ray_step);
+    const floats enter = greater(way.focus_in, (floats)(entry));
+    const ints some = (x < (float)size.x) & (y < (float)size.y) & (segments > 0.0f) & (way.focus_out > enter);
+    const floats begin = round_up(greater((enter - way.t_in) / ray_step - rays->phase, (floats)(0.0f))) - 1.0f;
+    const floats end = round_up((way.focus_out - way.t_in) / ray_step - rays->phase) + 1.0f;
+    rays->begin = choose(some, greater(begin, (floats)(0.0f)), (floats)(MAXFLOAT));
+    rays->end = choose(some, lesser(end, segments), (floats)(0.0f));
+    find_inner(f, &way, way.t_in + rays->phase * ray_step, (floats)(ray_step), rays->last, look->slab_low,
+        look->slab_high, &rays->inner_begin, &rays->inner_end);
+    /* Rays that begin later than others count from there on. */
+    rays->inner_begin = max(rays->inner_begin, -LEAST_LANE(-choose(some, rays->begin, (floats)(0.0f))));
+}
+
+/* What earlier slabs left. */
+static inline void load_sights(__global const float4 *states, const int2 first_pixel, const int2 size, sights *seen)
+{
+    float lane_of[6][LANES];
+    for (int lane = 0; lane < LANES; ++lane) {
+        const int inside = first_pixel.x + lane < size.x && first_pixel.y < size.y;
+        const size_t place = (size_t)first_pixel.y * (size_t)size.x + (size_t)(first_pixel.x + lane);
+        const float4 color = inside ? states[2 * place] : (float4)(0.0f);
+        const float4 rest = inside ? states[2 * place + 1] : (float4)(0.0f);
+        lane_of[0][lane] = color.x;
+        lane_of[1][lane] = color.y;
+        lane_of[2][lane] = color.z;
+        lane_of[3][lane] = color.w;
+        lane_of[4][lane] = rest.x;
+        lane_of[5][lane] = rest.y;
+    }
+    seen->red = load_lanes(lane_of[0]);
+    seen->green = load_lanes(lane_of[1]);
+    seen->blue = load_lanes(lane_of[2]);
+    seen->opacity = load_lanes(lane_of[3]);
+    seen->first_hit = load_lanes(lane_of[4]);
+    seen->sum = load_lanes(lane_of[5]);
 }
 
 /* Parameters  voxels   in   (slices, nj, ni)
@@ -183,7 +256,7 @@ static inline void blend_samples(const field *f, const slice_stack *stack, const
  *             ni nj    of the buffer; first_k end_k: slices in the buffer; slab_low slab_high: samples with
  *                      slab_low <= k < slab_high are this slab's
  *             bi bj bk bricks, cells_k of each along k
- *             low scale factor_scale steps_per_unit  see looks
+ *             low scale first_shown last_shown factor_scale steps_per_unit  see looks
  *             jitter   samples at random places of their segments
  *             stage    FIRST_SLAB and LAST_SLAB, see include/view.h
  *             with LABELS those of the buffer's slices, and the table of include/label_color.h
@@ -199,8 +272,9 @@ __kernel void composite_rays(
     __global float *restrict depths, __global float *restrict means, const float4 background, const float4 last_place,
     const float4 slope, const int ni, const int nj, const int first_k, const int end_k, const float slab_low,
     const float slab_high, const int bi, const int bj, const int bk, const int cells_k, const float low,
-    const float scale, const float factor_scale, const float steps_per_unit, const uint width, const uint height, const uint planes,
-    const int perspective, const int shaded, const int jitter, const int stage, const uint queues
+    const float scale, const int first_shown, const int last_shown, const float factor_scale,
+    const float steps_per_unit, const uint width, const uint height, const uint planes, const int perspective,
+    const int shaded, const int jitter, const int stage, const uint queues
     LABEL_PARAMETERS STACK_PARAMETERS)
 {
     const uint first_pixel = (uint)get_global_id(0) * LANES;
@@ -209,7 +283,7 @@ __kernel void composite_rays(
     const slice_stack stack = STACK_TABLE;
     const float ray_step = view[VIEW_NEAR].y;
     const looks look = { colors, opacities, highlights, factors, view, low, scale, factor_scale, steps_per_unit,
-        ray_step, slab_low, slab_high, shaded,
+        ray_step, slab_low, slab_high, first_shown, last_shown, shaded,
 #ifdef LABELS
         labels, label_colors
 #endif
@@ -229,89 +303,24 @@ __kernel void composite_rays(
         }
         return;
     }
+    const int2 pixel_of_first = find_pixel(first_pixel, width, height, queues), size = { (int)width, (int)height };
     ray_lanes course;
     packet rays;
+    start_rays(&f, &look, pixel_of_first, size, planes, perspective, jitter, entry, slope, &course, &rays);
     sights seen;
     seen.red = seen.green = seen.blue = seen.opacity = seen.sum = 0.0f;
     seen.first_hit = -1.0f;
-    {
-        float lane_of[16][LANES];
-        float state_of[6][LANES];
-        for (int lane = 0; lane < LANES; ++lane) {
-            const int2 pixel = find_pixel(first_pixel + lane, width, height, queues);
-            const int inside = pixel.x < (int)width && pixel.y < (int)height;
-            ray way;
-            start_ray(view, convert_float2(pixel), planes, perspective, &way);
-            const float phase = jitter ? jitter_pixel((uint)pixel.x, (uint)pixel.y) : 0.5f;
-            const float span = way.t_out - way.t_in;
-            const int segments = span > 0.0f ? (int)ceil(span / ray_step) : 0;
-            const int some = inside && segments > 0 && way.focus_out > max(way.focus_in, entry);
-            const float4 start = way.origin + (way.t_in + phase * ray_step) * way.step;
-            lane_of[0][lane] = start.x;
-            lane_of[1][lane] = start.y;
-            lane_of[2][lane] = start.z;
-            lane_of[3][lane] = ray_step * way.step.x;
-            lane_of[4][lane] = ray_step * way.step.y;
-            lane_of[5][lane] = ray_step * way.step.z;
-            lane_of[6][lane] = way.t_in;
-            lane_of[7][lane] = phase;
-            lane_of[8][lane] = way.offset;
-            lane_of[9][lane] = (float)(segments - 1);
-            lane_of[10][lane] = span - (float)(segments - 1) * ray_step;
-            const float enter = max(way.focus_in, entry);
-            lane_of[11][lane] = some ? max(floor((enter - way.t_in) / ray_step - phase), 0.0f) : MAXFLOAT;
-            lane_of[12][lane] = some
-                ? min(ceil((way.focus_out - way.t_in) / ray_step - phase) + 1.0f, (float)segments) : 0.0f;
-            lane_of[13][lane] = way.direction.x;
-            lane_of[14][lane] = way.direction.y;
-            lane_of[15][lane] = way.direction.z;
-            if (!(stage & FIRST_SLAB) && inside) {
-                const size_t place = (size_t)pixel.y * width + (size_t)pixel.x;
-                const float4 color = states[2 * place], rest = states[2 * place + 1];
-                state_of[0][lane] = color.x;
-                state_of[1][lane] = color.y;
-                state_of[2][lane] = color.z;
-                state_of[3][lane] = color.w;
-                state_of[4][lane] = rest.x;
-                state_of[5][lane] = rest.y;
-            }
-        }
-        course.start_i = load_lanes(lane_of[0]);
-        course.start_j = load_lanes(lane_of[1]);
-        course.start_k = load_lanes(lane_of[2]);
-        course.stride_i = load_lanes(lane_of[3]);
-        course.stride_j = load_lanes(lane_of[4]);
-        course.stride_k = load_lanes(lane_of[5]);
-        find_pace(&course, slope);
-        rays.t_in = load_lanes(lane_of[6]);
-        rays.phase = load_lanes(lane_of[7]);
-        rays.offset = load_lanes(lane_of[8]);
-        rays.last = load_lanes(lane_of[9]);
-        rays.rest = load_lanes(lane_of[10]);
-        rays.last_number = rays.last - rays.phase * (1.0f - rays.rest / ray_step);
-        rays.begin = load_lanes(lane_of[11]);
-        rays.end = load_lanes(lane_of[12]);
-        rays.toward_x = load_lanes(lane_of[13]);
-        rays.toward_y = load_lanes(lane_of[14]);
-        rays.toward_z = load_lanes(lane_of[15]);
-        if (!(stage & FIRST_SLAB)) {
-            seen.red = load_lanes(state_of[0]);
-            seen.green = load_lanes(state_of[1]);
-            seen.blue = load_lanes(state_of[2]);
-            seen.opacity = load_lanes(state_of[3]);
-            seen.first_hit = load_lanes(state_of[4]);
-            seen.sum = load_lanes(state_of[5]);
-        }
-    }
+    if (!(stage & FIRST_SLAB))
+        load_sights(states, pixel_of_first, size, &seen);
     float n = LEAST_LANE(rays.begin);
     floats end = choose(seen.opacity < OPAQUE, rays.end, (floats)(0.0f));
     int shows = 0; /* the sample before: then the next one probably does too */
     while (ANY_LANE(n < end)) {
         if (!shows) {
             /* The last sample of a ray lies before its place in the row. */
-            const floats here = min((floats)(n), rays.last_number);
+            const floats here = lesser((floats)(n), rays.last_number);
             const floats all_free = count_free_steps(&map, &stack, &course, here, first_k, 0);
-            const float free = LEAST_LANE(choose(n < end, max(all_free, rays.begin - n), (floats)(MAXFLOAT)));
+            const float free = LEAST_LANE(choose(n < end, greater(all_free, rays.begin - n), (floats)(MAXFLOAT)));
             if (free > 0.0f) {
                 n += free;
                 continue;
@@ -321,22 +330,34 @@ __kernel void composite_rays(
             floats opacity[AT_ONCE];
             ints node[AT_ONCE];
             floats together = 0.0f;
+            const int inner = HAS_INNER && n >= rays.inner_begin && n + (float)AT_ONCE <= rays.inner_end;
+#if HAS_INNER
+            const float ahead = n + SAMPLES_AHEAD;
+            if (inner && ahead < rays.inner_end)
+                fetch_cell_early(&f, course.start_i.s0 + ahead * course.stride_i.s0,
+                    course.start_j.s0 + ahead * course.stride_j.s0, course.start_k.s0 + ahead * course.stride_k.s0);
+#endif
             /* Whether one of some samples shows is decided once: their loads need not wait for each other. */
+#if LANES == 1
 #pragma unroll
+#endif
             for (int sample = 0; sample < AT_ONCE; ++sample) {
-                opacity[sample] = find_opacity(&f, &stack, &look, &course, &rays, n + (float)sample, node + sample);
-                together = max(together, opacity[sample]);
+                const float number = n + (float)sample;
+                opacity[sample] = find_opacity(&f, &stack, &look, &course, &rays, number, inner, &node[sample]);
+                together = greater(together, opacity[sample]);
             }
             shows = ANY_LANE((together > 0.0f) & (n < end));
-            if (shows)
+            if (shows) {
                 for (int sample = 0; sample < AT_ONCE; ++sample) {
                     const float number = n + (float)sample;
                     const floats seen_here = choose(number < end, opacity[sample], (floats)(0.0f));
                     if (ANY_LANE(seen_here > 0.0f)) {
-                        blend_samples(&f, &stack, &look, &course, &rays, number, node[sample], seen_here, &seen);
+                        blend_samples(
+                            &f, &stack, &look, &course, &rays, number, inner, node[sample], seen_here, &seen);
                         end = choose(seen.opacity < OPAQUE, end, (floats)(0.0f));
                     }
                 }
+            }
             n += (float)AT_ONCE;
         }
     }

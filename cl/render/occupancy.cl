@@ -12,6 +12,14 @@
 
 #define VOXEL4 CLRECON_VECTOR(VOXEL, 4)
 
+typedef VOXEL4 some_voxels __attribute__((aligned(sizeof(VOXEL))));
+typedef uchar16 some_bytes __attribute__((aligned(1)));
+#define BYTES(from) (*(__global const some_bytes *)(from))
+
+/* PoCL 3.0 calls a function for each min(), max(), any() and vload16(). */
+#define LESSER(a, b) ((a) < (b) ? (a) : (b))
+#define GREATER(a, b) ((a) > (b) ? (a) : (b))
+
 /* Parameters  voxels  in   (nk, nj, ni)
  *             ranges  out  (bk, bj, bi, 2) lowest and highest of the voxels around the cells of a brick
  *             ni nj nk, bi bj bk   voxels, bricks: ceil(cells / BRICK_CELLS), along k cells / cells_k, at least 1
@@ -37,11 +45,11 @@ __kernel void measure_cells(
         for (int at_k = k; at_k <= k_last; ++at_k)
             for (int at_j = j; at_j <= j_last; ++at_j) {
                 __global const VOXEL *row = voxels + voxel_index(0, at_j, at_k, ni, nj);
-                const VOXEL4 values = vload4(0, row + from);
-                low = min(low, values);
-                high = max(high, values);
-                lowest = min(lowest, row[i_last]);
-                highest = max(highest, row[i_last]);
+                const VOXEL4 values = *(__global const some_voxels *)(row + from);
+                low = LESSER(low, values);
+                high = GREATER(high, values);
+                lowest = LESSER(lowest, row[i_last]);
+                highest = GREATER(highest, row[i_last]);
             }
         lowest = min(lowest, min(min(low.x, low.y), min(low.z, low.w)));
         highest = max(highest, max(max(high.x, high.y), max(high.z, high.w)));
@@ -50,8 +58,8 @@ __kernel void measure_cells(
             for (int at_j = j; at_j <= j_last; ++at_j)
                 for (int at_i = i; at_i <= i_last; ++at_i) {
                     const VOXEL value = voxels[voxel_index(at_i, at_j, at_k, ni, nj)];
-                    lowest = min(lowest, value);
-                    highest = max(highest, value);
+                    lowest = LESSER(lowest, value);
+                    highest = GREATER(highest, value);
                 }
     }
     ranges[2 * brick] = lowest;
@@ -74,7 +82,7 @@ __kernel void mark_bricks(
     const float last = (float)(bins - 1);
     const float low = ((float)ranges[2 * (size_t)brick] - bins_low) * bins_scale + 0.49f;
     const float high = ((float)ranges[2 * (size_t)brick + 1] - bins_low) * bins_scale + 0.51f;
-    const int first = (int)clamp(low, 0.0f, last), end = (int)clamp(high, 0.0f, last) + 1;
+    const int first = (int)LESSER(GREATER(low, 0.0f), last), end = (int)LESSER(GREATER(high, 0.0f), last) + 1;
     distances[brick] = shown[end] > shown[first] ? 0 : FARTHEST;
 }
 
@@ -92,11 +100,11 @@ __kernel void spread_in_rows(
     __global uchar *out = to + (size_t)row * bi;
     int distance = FARTHEST;
     for (int i = 0; i < bi; ++i) {
-        distance = min(distance + 1, (int)own[i]);
+        distance = LESSER(distance + 1, (int)own[i]);
         out[i] = (uchar)distance;
     }
     for (int i = bi - 1; i >= 0; --i) {
-        distance = min(distance + 1, (int)out[i]);
+        distance = LESSER(distance + 1, (int)out[i]);
         out[i] = (uchar)distance;
     }
 }
@@ -119,16 +127,22 @@ __kernel void spread_along(
     if (stride >= 16) {
         /* The last chunk takes the last 16: some of them twice. */
         const size_t here = row + min(first, stride - 16);
-        uchar16 best = vload16(0, from + here);
-        for (int way = 1; way < FARTHEST && any(best > (uchar16)((uchar)way)); ++way) {
+        uchar16 best = BYTES(from + here);
+        for (int way = 1; way < FARTHEST; ++way) {
+            const ulong2 further_off = as_ulong2(best > (uchar16)((uchar)way));
+            if ((further_off.x | further_off.y) == 0)
+                break;
             uchar16 near = (uchar16)((uchar)FARTHEST);
             if (way <= line)
-                near = vload16(0, from + here - (size_t)way * stride);
-            if (line + way < count)
-                near = min(near, vload16(0, from + here + (size_t)way * stride));
-            best = min(best, max(near, (uchar16)((uchar)way)));
+                near = BYTES(from + here - (size_t)way * stride);
+            if (line + way < count) {
+                const uchar16 further = BYTES(from + here + (size_t)way * stride);
+                near = LESSER(near, further);
+            }
+            near = GREATER(near, (uchar16)((uchar)way));
+            best = LESSER(best, near);
         }
-        vstore16(best, 0, to + here);
+        *(__global some_bytes *)(to + here) = best;
         return;
     }
     for (int at = 0; at < stride; ++at) {

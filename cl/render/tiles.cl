@@ -2,6 +2,7 @@
  *
  * The ray in the middle of the tile leaps, and the empty space around it must reach as far as the others are away. */
 #include "include/leap.h"
+#include "include/ray_packet.h"
 #include "include/stack.h"
 #include "include/view.h"
 
@@ -25,32 +26,17 @@ __kernel void enter_tiles(
     const leap_map map = { leaps, bi, bj, bk, cells_k };
     const slice_stack stack = STACK_TABLE;
     const float ray_step = view[VIEW_NEAR].y;
-    float lane_of[6][LANES], t_of[LANES], ends[LANES];
+    float x_of[LANES], y_of[LANES];
     for (int lane = 0; lane < LANES; ++lane) {
         const uint tile = min(first_tile + (uint)lane, tiles - 1);
-        const float2 middle = (float2)((float)(tile % columns * TILE), (float)(tile / columns * TILE))
-            + 0.5f * (float)(TILE - 1);
-        ray way;
-        start_ray(view, middle, 0, perspective, &way);
-        const float4 start = way.origin + way.t_in * way.step;
-        lane_of[0][lane] = start.x;
-        lane_of[1][lane] = start.y;
-        lane_of[2][lane] = start.z;
-        lane_of[3][lane] = ray_step * way.step.x;
-        lane_of[4][lane] = ray_step * way.step.y;
-        lane_of[5][lane] = ray_step * way.step.z;
-        t_of[lane] = way.t_in;
-        ends[lane] = way.t_out > way.t_in ? (way.t_out - way.t_in) / ray_step : 0.0f;
+        x_of[lane] = (float)(tile % columns * TILE) + 0.5f * (float)(TILE - 1);
+        y_of[lane] = (float)(tile / columns * TILE) + 0.5f * (float)(TILE - 1);
     }
+    ray_packet middle;
+    start_packet(view, load_lanes(x_of), load_lanes(y_of), 0, perspective, &middle);
     ray_lanes course;
-    course.start_i = load_lanes(lane_of[0]);
-    course.start_j = load_lanes(lane_of[1]);
-    course.start_k = load_lanes(lane_of[2]);
-    course.stride_i = load_lanes(lane_of[3]);
-    course.stride_j = load_lanes(lane_of[4]);
-    course.stride_k = load_lanes(lane_of[5]);
-    find_pace(&course, slope);
-    const floats end = load_lanes(ends);
+    lay_course(&middle, middle.t_in, (floats)(ray_step), slope, &course);
+    const floats end = choose(middle.t_out > middle.t_in, (middle.t_out - middle.t_in) / ray_step, (floats)(0.0f));
     floats n = 0.0f;
     for (;;) {
         const floats free = count_free_steps(&map, &stack, &course, n, first_k, margin);
@@ -59,10 +45,11 @@ __kernel void enter_tiles(
             break;
         n = choose(leaping, n + free, n);
     }
-    store_lanes(n, lane_of[0]);
+    /* A leap ends on the far side of a face: the step before it may have been short of it. */
+    float entry_of[LANES];
+    const floats before = greater(n - 1.0f, (floats)(0.0f));
+    store_lanes(choose(n < end, middle.t_in + before * ray_step, (floats)(MAXFLOAT)), entry_of);
     for (int lane = 0; lane < LANES; ++lane)
         if (first_tile + (uint)lane < tiles)
-            /* A leap ends on the far side of a face: the step before it may have been short of it. */
-            entries[first_tile + lane] = lane_of[0][lane] < ends[lane]
-                ? t_of[lane] + max(lane_of[0][lane] - 1.0f, 0.0f) * ray_step : MAXFLOAT;
+            entries[first_tile + lane] = entry_of[lane];
 }

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from clrecon.errors import DeviceError, UsageError
 from clrecon.opencl.context import Device
@@ -11,8 +11,10 @@ from clrecon.opencl.context import Device
 __all__ = ["MemoryLimits", "check_budget", "check_memory", "describe_shortage", "memory_limits"]
 
 
-def _mib(size: int) -> str:
-    return f"{size / 2**20:,.0f} MiB" if size >= 2**20 else f"{size:,} bytes"
+def _mib(size: int, up: bool = False) -> str:
+    if size < 2**20:
+        return f"{size:,} bytes"
+    return f"{-(-size // 2**20) if up else round(size / 2**20):,} MiB"
 
 
 @dataclass(frozen=True)
@@ -23,22 +25,37 @@ class MemoryLimits:
     ----------
     label : str
         The device, for messages.
-    total_bytes, buffer_bytes : int
-        All buffers together, and the largest single one.
-    asked : bool
-        The total is what the user allows, less than what the device has.
+    device_bytes, device_buffer_bytes : int
+        What it has for all buffers together, and for the largest single one.
+    asked_bytes : int, optional
+        What the user allows, where that is less.
     """
 
     label: str
-    total_bytes: int
-    buffer_bytes: int
-    asked: bool
+    device_bytes: int
+    device_buffer_bytes: int
+    asked_bytes: int | None
+
+    @property
+    def total_bytes(self) -> int:
+        """What all buffers together may take."""
+        return self.device_bytes if self.asked_bytes is None else self.asked_bytes
+
+    @property
+    def buffer_bytes(self) -> int:
+        """What a single buffer may take."""
+        return min(self.device_buffer_bytes, self.total_bytes)
+
+    def device_fits(self, buffers: Mapping[str, int]) -> bool:
+        """Whether the device has room for `buffers`, whatever the user allows of it."""
+        sizes = buffers.values()
+        return sum(sizes) <= self.device_bytes and max(sizes, default=0) <= self.device_buffer_bytes
 
     def describe(self) -> str:
         """What there is, for messages."""
-        if self.asked:
-            return f"{_mib(self.total_bytes)} are allowed on {self.label}"
-        return f"{self.label} has {_mib(self.total_bytes)}, at most {_mib(self.buffer_bytes)} in one buffer"
+        if self.asked_bytes is not None:
+            return f"{_mib(self.asked_bytes)} are allowed on {self.label} by --memory (memory= in Python)"
+        return f"{self.label} has {_mib(self.device_bytes)}, at most {_mib(self.device_buffer_bytes)} in one buffer"
 
 
 def check_memory(memory: int | None) -> None:
@@ -54,21 +71,24 @@ def check_memory(memory: int | None) -> None:
 
 def memory_limits(device: Device, memory: int | None = None) -> MemoryLimits:
     """The device's own limits, or `memory` bytes where that is less."""
-    asked = memory is not None and memory < device.memory_bytes
-    total = int(memory) if asked and memory is not None else device.memory_bytes
-    return MemoryLimits(device.label, total, min(device.max_allocation_bytes, total), asked)
+    asked = int(memory) if memory is not None and memory < device.memory_bytes else None
+    largest = min(device.max_allocation_bytes, device.memory_bytes)
+    return MemoryLimits(device.label, device.memory_bytes, largest, asked)
 
 
 def describe_shortage(limits: MemoryLimits, buffers: Mapping[str, int]) -> str:
     """Why `buffers` do not fit together or one of them not alone; empty where they do."""
     for what, size in buffers.items():
-        if size > limits.buffer_bytes:
-            return f"the {what} needs a buffer of {_mib(size)}, {limits.label} allows {_mib(limits.buffer_bytes)}"
+        if size > limits.device_buffer_bytes:
+            most = _mib(limits.device_buffer_bytes)
+            return f"the {what} needs a buffer of {_mib(size)}, {limits.label} allows {most}"
     total = sum(buffers.values())
-    if total > limits.total_bytes:
-        parts = ", ".join(f"{what} {_mib(size)}" for what, size in buffers.items())
-        return f"this needs {_mib(total)} on the device ({parts}): {limits.describe()}"
-    return ""
+    if total <= limits.total_bytes:
+        return ""
+    if not limits.device_fits(buffers):
+        limits = replace(limits, asked_bytes=None)  # allowing more would not help
+    parts = ", ".join(f"{what} {_mib(size)}" for what, size in buffers.items())
+    return f"this needs {_mib(total, up=True)} on the device ({parts}): {limits.describe()}"
 
 
 def check_budget(device: Device, buffers: Mapping[str, int], memory: int | None = None) -> int:
@@ -90,9 +110,12 @@ def check_budget(device: Device, buffers: Mapping[str, int], memory: int | None 
     Raises
     ------
     DeviceError
-        A buffer is over the device's largest allocation, or the sum is over its memory.
+        A buffer is over the device's largest allocation, or the sum is over its memory, or over what is allowed of it.
     """
-    shortage = describe_shortage(memory_limits(device, memory), buffers)
+    limits = memory_limits(device, memory)
+    shortage = describe_shortage(limits, buffers)
     if shortage:
+        if limits.device_fits(buffers):
+            raise DeviceError(f"{shortage}: allow that much or ask for less")
         raise DeviceError(f"{shortage}: use a device with more memory or a smaller volume")
     return sum(buffers.values())

@@ -60,6 +60,12 @@ class TransferTables:
     steps_per_unit: float
     weighed: bool
 
+    @property
+    def shown_ends(self) -> tuple[np.int32, np.int32]:
+        """First and last node with opacity; (NODES, -1) without one."""
+        shown = np.flatnonzero(self.shown)
+        return (np.int32(shown[0]), np.int32(shown[-1])) if len(shown) else (np.int32(NODES), np.int32(-1))
+
     @classmethod
     def of(cls, device: Device, function: TransferFunction, ray_step: float) -> TransferTables:
         """Tables of `function` for samples every `ray_step` mm."""
@@ -132,7 +138,7 @@ def composite_slab(
             output.image_d, output.depths_d, output.means_d, output.background, last, resident.stack.slope,
             np.int32(slab.shape_ijk[0]), np.int32(slab.shape_ijk[1]), np.int32(slab.first_k), np.int32(slab.end_k),
             np.float32(slab.low_k), np.float32(slab.high_k), *slab.brick_arguments,
-            np.float32(tables.low), np.float32(tables.scale), np.float32(tables.factor_scale),
+            np.float32(tables.low), np.float32(tables.scale), *tables.shown_ends, np.float32(tables.factor_scale),
             np.float32(tables.steps_per_unit), np.uint32(width), np.uint32(height),
             np.uint32(view.planes), np.int32(not view.camera.is_parallel), np.int32(lighting.shades), np.int32(jitter),
             np.int32(slab.stage), np.uint32(queues), *label_tables, *resident.stack.arguments,

@@ -31,10 +31,10 @@ def project_slab(
     """
     device = resident.device
     width, height = view.size
-    queues = count_queues(device)
+    queues, lanes = count_queues(device), int(device.kernel_variants["LANES"])
     last = np.array([n - 1 for n in resident.volume.shape_ijk] + [0], dtype=np.float32)
     launch(
-        device, resident.program("render/project.cl")["project_rays"], output.items(queues, 1),
+        device, resident.program("render/project.cl")["project_rays"], output.items(queues, lanes),
         slab.voxels_d, resident.measure(slab, stopwatch), upload(device, view.table), output.states_d,
         output.depths_d, output.means_d, last,
         np.int32(slab.shape_ijk[0]), np.int32(slab.shape_ijk[1]), np.int32(slab.first_k), np.int32(slab.end_k),

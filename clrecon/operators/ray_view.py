@@ -12,6 +12,7 @@ from clrecon.geometry import Volume, normal_matrix, slice_normal
 from clrecon.geometry.affine import Float64Array
 from clrecon.geometry.camera import Camera, box_corners
 from clrecon.rendering import Lighting
+from clrecon.rendering.lighting import LEAST_SOFT_GRADIENT
 
 __all__ = ["BOX_BORDER", "TILE", "FieldFrame", "RayView", "enclose", "volume_box"]
 
@@ -159,7 +160,7 @@ class RayView:
         table[: len(rows), :3] = rows
         table[-3] = (*toward, 0.0 if light.direction is None else 1.0)
         table[-2] = light.ambient, light.diffuse, light.specular, light.specular_power
-        table[-1] = near, ray_step, 0.0, 0.0
+        table[-1] = near, ray_step, max(light.soft_gradient, LEAST_SOFT_GRADIENT) ** 2, 0.0
         count = 0
         if planes is not None and len(planes):
             table = np.vstack([table, np.clip(frame.planes(planes), -ENDLESS, ENDLESS)])

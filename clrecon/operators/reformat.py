@@ -250,8 +250,10 @@ def reformat_curve(
     Raises
     ------
     UsageError
-        Points that are none, too few or outside of the volume, no spine that one could be sure of, an unknown kind or
-        view, impossible numbers, a curve that runs along the rows.
+        Points that are none, too few or outside of the volume, an unknown kind or view, impossible numbers, a curve
+        that runs along the rows.
+    RefusedInputError
+        No spine that one could be sure of.
     DeviceError
         No device, two slices and the picture do not fit it, or it fails.
     """

@@ -33,6 +33,7 @@ MODES = ("dvr", "mip", "minip", "mean", "surface", "slices", "slice", "cpr")
 """Kinds of pictures."""
 
 DEFAULT_SIZE = (1024, 1024)
+DEFAULT_VIEW = "anterior"
 DEFAULT_ISO_VALUE = 200.0
 """HU of surfaces: bone, thin cortex of vertebrae with it."""
 
@@ -51,6 +52,7 @@ KNOWN_IN: dict[str, tuple[str, ...]] = {
     "lighting": _RAYS,
     "window": (*PROJECTIONS, "slices", *_CUT),
     "ray_step": ("dvr", *PROJECTIONS, "surface"),
+    "zoom": (*_RAYS, "slice"),
     "view_angle": _RAYS,
     "clip": _RAYS,
     "jitter": ("dvr",),
@@ -126,12 +128,12 @@ class VolumeRenderer:
         preset: str | None = None,
         transfer_function: TransferFunction | None = None,
         camera: Camera | None = None,
-        view: str | Sequence[float] = "anterior",
+        view: str | Sequence[float] | None = None,
         size: Sequence[int] | None = None,
         ray_step: float | None = None,
         *,
         up: str | Sequence[float] | None = None,
-        zoom: float = 1.0,
+        zoom: float | None = None,
         view_angle: float | None = None,
         background: str | Sequence[float] = "black",
         **options: Any,
@@ -149,11 +151,14 @@ class VolumeRenderer:
             if not (value is None or isinstance(value, kind)):
                 raise UsageError(f"the {what} of a picture is a {kind.__name__} or None, not {type(value).__name__}")
         mode = _choose_mode(mode, preset, transfer_function)
-        given = {"transfer_function": transfer_function, "ray_step": ray_step, "view_angle": view_angle, **options}
-        _check_options(mode, given)
-        if mode == "cpr":
-            if camera is not None:
+        given = {"transfer_function": transfer_function, "ray_step": ray_step, "zoom": zoom, "view_angle": view_angle}
+        _check_options(mode, given | options)
+        if camera is not None:
+            if mode == "cpr":
                 raise UsageError("a curved reformation has no camera: view and up say which way one looks at it")
+            _check_alone(view=view, up=up, zoom=zoom, view_angle=view_angle)
+        view, zoom = DEFAULT_VIEW if view is None else view, 1.0 if zoom is None else zoom
+        if mode == "cpr":
             return self._reformat(view, size, up, background, preset, options)
         assert size is not None
         if mode == "slice":
@@ -303,6 +308,14 @@ def _check_options(mode: str, given: Mapping[str, Any]) -> None:
             raise UsageError(f"{name} means nothing in mode {mode}: it belongs to {', '.join(KNOWN_IN[name])}")
 
 
+def _check_alone(**placing: Any) -> None:
+    """Refuse what places a camera beside a camera that is given."""
+    given = [name for name, value in placing.items() if value is not None]
+    if given:
+        them = " and ".join(filter(None, (", ".join(given[:-1]), given[-1])))
+        raise UsageError(f"a camera says by itself where a picture is taken from: leave out {them}, or the camera")
+
+
 def _given(options: Mapping[str, Any], name: str, default: Any) -> Any:
     value = options.get(name)
     return default if value is None else value
@@ -337,7 +350,7 @@ def render(
     preset: str | None = None,
     transfer_function: TransferFunction | None = None,
     camera: Camera | None = None,
-    view: str | Sequence[float] = "anterior",
+    view: str | Sequence[float] | None = None,
     size: Sequence[int] | None = None,
     ray_step: float | None = None,
     device: Device | str | int | None = None,
@@ -358,9 +371,9 @@ def render(
     transfer_function : TransferFunction, optional
         In place of a preset.
     camera : Camera, optional
-        In place of `view`, `up`, `zoom` and `view_angle`.
-    view : str or (azimuth, elevation)
-        See `Camera.fit`, which also takes `up`, `zoom` and `view_angle`.
+        In place of `view`, `up`, `zoom` and `view_angle`, which are refused beside it.
+    view : str or (azimuth, elevation), optional
+        Default "anterior".  See `Camera.fit`, which also takes `up`, `zoom` and `view_angle`.
     size : (width, height), optional
         Pixels; default 1024 x 1024, and what the curve needs in "cpr".
     ray_step : float, optional
@@ -394,6 +407,8 @@ def render(
     ------
     UsageError
         A value that cannot be; the message lists what can.
+    RefusedInputError
+        The spinal canal is to be found, and there is none that one could be sure of.
     DeviceError
         No device, not enough memory, or the device fails.
     """

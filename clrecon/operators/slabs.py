@@ -162,7 +162,7 @@ def plan_slabs(grid: SampleGrid, device: Device, memory: int | None = None) -> i
         needs = Slab(grid, first, first + 1).needs()
         raise DeviceError(
             f"one slice with its neighbours needs {sum(needs.values()):,} bytes, and room for its mesh:"
-            f" {limits.describe()}; give more memory or use another device"
+            f" {limits.describe()}; {'use another device' if limits.asked_bytes is None else 'allow more'}"
         )
     low, high = 1, gk  # fits, does not
     while high - low > 1:

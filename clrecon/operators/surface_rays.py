@@ -17,6 +17,7 @@ from clrecon.geometry.clip import Clip
 from clrecon.geometry.field import IsoRule, ValueRange, choose_iso_rule
 from clrecon.kernels import Stopwatch, launch, upload
 from clrecon.labels import resample_labels
+from clrecon.opencl import memory_limits
 from clrecon.operators.pictures import PictureBuffers, count_queues, highlight_table
 from clrecon.operators.ray_view import FieldFrame, RayView, enclose
 from clrecon.operators.resident import LeapMap, RaySlab, ResidentVolume, entry_slice, pad_slices
@@ -158,8 +159,8 @@ class _Job:
         if slices < nk:
             if self.look.shadows:
                 raise DeviceError(
-                    f"shadows need the whole volume on the device, {slices} of its {nk} slices fit {device.label}: give"
-                    " it more memory, use another device or leave the shadows out"
+                    f"shadows need the whole volume on the device, {slices} of its {nk} slices fit:"
+                    f" {memory_limits(device, resident.memory).describe()}; give more memory or leave the shadows out"
                 )
             self._shorten_steps(warnings)
         output = PictureBuffers(device, self.size, background, slices < nk)

@@ -19,6 +19,7 @@ from clrecon.geometry.camera import Camera
 from clrecon.geometry.field import slice_normal_matrices
 from clrecon.reference.rays import Planes, box_of, find_interval, jitter_pixels, sample_field, voxel_gradients
 from clrecon.rendering import Lighting, TransferFunction
+from clrecon.rendering.lighting import LEAST_SOFT_GRADIENT
 
 __all__ = ["FLAT_GRADIENT", "MODES", "OPAQUE", "TABLE_NODES", "RayPicture", "cast_rays", "look_up", "shade"]
 
@@ -175,12 +176,18 @@ def look_up(transfer_function: TransferFunction, hu: Float64Array) -> Float64Arr
 
 
 def shade(
-    colours: Float64Array, gradients: Float64Array, directions: Float64Array, lighting: Lighting, lit: ArrayLike = 1.0
+    colours: Float64Array,
+    gradients: Float64Array,
+    directions: Float64Array,
+    lighting: Lighting,
+    lit: ArrayLike = 1.0,
+    soft_gradient: float = 0.0,
 ) -> Float64Array:
     """Phong's shading of colours (n, 3) with gradients (n, 3) as normals, seen along directions (n, 3).
 
     A gradient of no size has no direction: its colour has all of the diffuse light and no highlight.  `lit` 0 is in
-    shadow: ambient light alone.  What goes beyond 1 is cut.
+    shadow: ambient light alone.  With `soft_gradient` (HU per mm) directions of small gradients count less, see
+    `clrecon.rendering.Lighting`.  What goes beyond 1 is cut.
     """
     magnitude = np.linalg.norm(gradients, axis=1)
     flat = magnitude < FLAT_GRADIENT
@@ -195,6 +202,8 @@ def shade(
     half_way = np.divide(half_way, length, out=np.zeros_like(half_way), where=length > 1e-6)
     diffuse = np.where(flat, 1.0, np.abs((normals * to_light).sum(axis=1)))
     highlight = np.where(flat, 0.0, np.abs((normals * half_way).sum(axis=1)) ** lighting.specular_power)
+    certain = magnitude**2 / (magnitude**2 + max(soft_gradient, FLAT_GRADIENT) ** 2)
+    diffuse, highlight = 1.0 + certain * (diffuse - 1.0), certain * highlight
     share = np.broadcast_to(np.asarray(lit, dtype=np.float64), magnitude.shape)
     light = lighting.ambient + share * lighting.diffuse * diffuse
     return np.minimum(colours * light[:, None] + (share * lighting.specular * highlight)[:, None], 1.0)
@@ -217,7 +226,8 @@ def _composite(
         slope = sample_field(gradients, ijk)
         opacity = opacity * transfer_function.gradient_factor(np.linalg.norm(slope, axis=1))
         if lighting is not None:
-            colour = shade(colour, slope, rays.directions[ray], lighting)
+            softness = max(lighting.soft_gradient, LEAST_SOFT_GRADIENT)
+            colour = shade(colour, slope, rays.directions[ray], lighting, soft_gradient=softness)
         opacity = 1.0 - (1.0 - opacity) ** (length / transfer_function.unit_distance)
         weight = (1.0 - rgba[ray, 3]) * opacity
         rgba[ray, :3] += weight[:, None] * colour

@@ -10,7 +10,10 @@ import numpy as np
 
 from clrecon.errors import UsageError
 
-__all__ = ["UNSHADED", "Lighting"]
+__all__ = ["LEAST_SOFT_GRADIENT", "UNSHADED", "Lighting"]
+
+LEAST_SOFT_GRADIENT = 0.01
+"""HU per mm: what float32 leaves of differences where the field is flat is a hundredth of it."""
 
 
 def _number(name: str, value: Any, low: float, high: float) -> float:
@@ -31,12 +34,19 @@ class Lighting:
     sides of a surface are lit, and colours beyond 1 are cut.  Ambient 1 without diffuse and specular light is no
     shading (`UNSHADED`).
 
+    In volume rendering n is the direction of the gradient, which says little where the gradient g is small: in the
+    middle of thin bone, and in noise.  There the light fades, with ``s = |g|^2 / (|g|^2 + soft_gradient^2)``, from
+    Phong's (s = 1) to all of the diffuse and none of the specular light (s = 0).
+
     Attributes
     ----------
     ambient, diffuse, specular : float
         Shares of the light, 0 to 1.
     specular_power : float
         Sharpness of the highlight, 1 to 128.
+    soft_gradient : float
+        HU per mm, 0 to 10,000: the gradient that has half of its shading in volume rendering; 0 shades all alike
+        but what is flat (`LEAST_SOFT_GRADIENT`).
     direction : (float, float, float) or None
         From the patient towards a light that stays where it is, LPS, kept as a unit vector; None is a light at the
         camera.
@@ -52,11 +62,13 @@ class Lighting:
     specular: float = 0.2
     specular_power: float = 15.0
     direction: tuple[float, float, float] | None = None
+    soft_gradient: float = 0.0
 
     def __post_init__(self) -> None:
         for name in ("ambient", "diffuse", "specular"):
             object.__setattr__(self, name, _number(name, getattr(self, name), 0.0, 1.0))
         object.__setattr__(self, "specular_power", _number("specular power", self.specular_power, 1.0, 128.0))
+        object.__setattr__(self, "soft_gradient", _number("soft gradient", self.soft_gradient, 0.0, 10_000.0))
         if self.direction is not None:
             object.__setattr__(self, "direction", self._unit(self.direction))
 

@@ -6,7 +6,7 @@ show the same tissue, as a surface there and through opacities here.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from clrecon.errors import UsageError
 from clrecon.rendering.lighting import UNSHADED, Lighting
@@ -63,8 +63,12 @@ _CORTEX = (0.96, 0.91, 0.80)
 _DENSE = (1.00, 0.99, 0.95)
 _STEEL = (0.72, 0.80, 0.90)
 
-_MATT = Lighting(ambient=0.25, diffuse=0.85, specular=0.15, specular_power=12.0)
-_GLOSSY = Lighting(ambient=0.2, diffuse=0.85, specular=0.25, specular_power=20.0)
+SOFT_GRADIENT = 25.0
+"""HU per mm.  Surfaces of bone have 100 to 1000, noise of 10 HU in voxels of 0.7 mm 10 to 15."""
+
+_MATT = Lighting(ambient=0.25, diffuse=0.85, specular=0.15, specular_power=12.0, soft_gradient=SOFT_GRADIENT)
+_SOFT = replace(_MATT, soft_gradient=0.3 * SOFT_GRADIENT)  # where muscle meets fat are 30 to 100 HU per mm
+_GLOSSY = Lighting(ambient=0.2, diffuse=0.85, specular=0.25, specular_power=20.0, soft_gradient=SOFT_GRADIENT)
 
 _Row = tuple[float, tuple[float, float, float], float]
 
@@ -179,6 +183,7 @@ PRESETS: dict[str, Preset] = {
                 (700.0, _CORTEX, 0.95),
             ],
             f"muscle has 40 to 70 HU, fat -120 to -60 HU; {_TISSUE}",
+            lighting=_SOFT,
         ),
         _preset(
             "metal",

@@ -34,7 +34,7 @@ SIZE_LIMIT = 1_000_000
 NAMES_LISTED = 60
 
 _FIELDS = ("format", "version", "name", "description", "unit_distance_mm", "points", "gradient_opacity", "lighting")
-_LIGHT = ("ambient", "diffuse", "specular", "specular_power", "direction")
+_LIGHT = ("ambient", "diffuse", "specular", "specular_power", "soft_gradient", "direction")
 
 
 def load_transfer_function(path: str | os.PathLike[str], name: str | None = None) -> TransferFunction:
@@ -172,7 +172,7 @@ def _own_parameters(value: dict[str, Any]) -> dict[str, Any]:
         parameters["gradient_opacity"] = rows
     if value.get("lighting") is not None:
         light = dict(take_object(value["lighting"], "lighting", known=_LIGHT))
-        for name in _LIGHT[:4]:
+        for name in _LIGHT[:5]:
             if name in light:
                 light[name] = take_number(light[name], f"lighting.{name}")
         parameters["lighting"] = Lighting(**light)

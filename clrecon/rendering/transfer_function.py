@@ -304,7 +304,8 @@ class TransferFunction:
     def to_vtk(self, *, voxel_mm: float = 1.0) -> Any:
         """Return a vtkVolumeProperty: colours, opacities, unit distance, light (`Lighting()` where it has none).
 
-        A light with a direction has no place in it.  `voxel_mm` as in `from_vtk`.
+        A light with a direction has no place in it, nor one that fades with the gradient.  `voxel_mm` as in
+        `from_vtk`.
         """
         from clrecon.rendering.vtk_properties import property_to_vtk
 

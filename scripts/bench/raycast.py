@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -63,12 +63,13 @@ def make_shots(volume: Any) -> list[Shot]:
     from clrecon.rendering.presets import find_preset
 
     preset, step = find_preset("bone"), 0.5 * min(volume.spacing)
+    lighting = replace(preset.lighting, soft_gradient=0.0)  # as VTK's
 
     def fit(angle: float | None) -> Any:
         return Camera.fit(volume, "anterior", ZOOM, view_angle=angle, size=SIZE)
 
     return [
-        Shot(name, fit(angle), preset.transfer_function, preset.lighting, step)
+        Shot(name, fit(angle), preset.transfer_function, lighting, step)
         for name, angle in (("parallel", None), ("perspective", VIEW_ANGLE))
     ]
 

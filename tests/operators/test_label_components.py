@@ -147,6 +147,7 @@ def test_too_little_memory_is_said_before_it_is_taken(device, monkeypatch):
     monkeypatch.setattr(components, "allocate", lambda *_: pytest.fail("memory was taken"))
     with pytest.raises(DeviceMemoryError, match="component offsets"):
         label_components(device, soup(1000, 10), 1000)
+    monkeypatch.setattr(device, "memory_bytes", 17_000)
     with pytest.raises(DeviceMemoryError, match="15,000 bytes are allowed"):
         label_components(device, soup(1000, 10), 1000, memory=15_000)
 

@@ -16,6 +16,7 @@ pytestmark = [
     pytest.mark.first_device,
 ]
 
+AHEAD = Camera((0.0, -100.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 1.0), parallel_scale=20.0)
 FOG = TransferFunction([(-100, 1, 1, 1, 0.1), (100, 1, 1, 1, 0.1)])
 
 REFUSED = {
@@ -41,7 +42,15 @@ REFUSED = {
     "zoom": ({"zoom": 0.0}, ["zoom"]),
     "background": ({"background": "no such colour"}, ["no such colour"]),
     "two functions": ({"preset": "bone", "transfer_function": FOG}, ["preset", "transfer function"]),
-    "camera and view": ({"camera": "anterior"}, ["camera"]),
+    "camera of text": ({"camera": "anterior"}, ["camera"]),
+    "camera and view": ({"camera": AHEAD, "view": "anterior"}, ["leave out view, or the camera"]),
+    "camera and zoom": ({"camera": AHEAD, "zoom": 2.0, "mode": "mip"}, ["leave out zoom, or the camera"]),
+    "camera and more": (
+        {"camera": AHEAD, "view": (30, 15), "up": "left", "view_angle": 20.0},
+        ["leave out view, up and view_angle, or the camera"],
+    ),
+    "camera and up of a slice": ({"camera": AHEAD, "up": (0, 0, 1), "mode": "slice"}, ["leave out up, or"]),
+    "zoom of a curve": ({"mode": "cpr", "zoom": 2.0}, ["zoom means nothing in mode cpr"]),
     "lighting": ({"lighting": 3}, ["lighting"]),
     "clip": ({"clip": [(0, 0, 1)]}, ["clip"]),
     "function of numbers": ({"transfer_function": [(0, 1, 1, 1, 1)]}, ["transfer function"]),

@@ -8,7 +8,7 @@ import pytest
 from clrecon.geometry import Volume
 from clrecon.geometry.camera import Camera
 from clrecon.geometry.clip import Clip
-from clrecon.rendering import TransferFunction
+from clrecon.rendering import Lighting, TransferFunction
 from tests import tolerances
 from tests.operators.raycast_scenes import (
     GAPS,
@@ -48,6 +48,22 @@ def test_a_homogeneous_slab_is_as_opaque_as_its_way_is_long(cast, ray_step, pers
         assert np.abs(image[..., 3] / 255.0 - truth).max() <= tolerances.RAY_OPACITY
         visible = truth > 0.3
         assert np.abs(image[visible][:, :3] / 255.0 - (0.2, 0.6, 1.0)).max() <= tolerances.RAY_OPACITY
+
+
+@pytest.mark.parametrize("soft_gradient", [0.0, 25.0, 120.0])
+def test_light_fades_with_the_gradient(cast, soft_gradient):
+    """A field that rises by 60 HU per mm, 50 degrees off the view, opaque and of one colour."""
+    along = np.array([np.sin(np.radians(50.0)), np.cos(np.radians(50.0)), 0.0])
+    volume = even_volume(lambda p: 2000.0 + 60.0 * (p @ along), "oblique", 14.0)
+    opaque = TransferFunction([(-3000, 0.5, 0.7, 0.4, 1.0), (9000, 0.5, 0.7, 0.4, 1.0)])
+    lighting = Lighting(0.15, 0.6, 0.3, 7.0, soft_gradient=soft_gradient)
+    camera = look(volume, (0.0, 1.0, 0.0), 2.0)
+    clip = Clip.plane(centre_of(volume), (0.0, 1.0, 0.0))  # the first samples lie well within the volume
+    image = cast(volume, "dvr", opaque, camera=camera, size=(8, 8), ray_step=0.3, lighting=lighting, clip=clip).image
+    cosine, share = np.cos(np.radians(50.0)), 60.0**2 / (60.0**2 + soft_gradient**2)
+    light = 0.15 + 0.6 * (1.0 + share * (cosine - 1.0))
+    truth = 255.0 * (np.array([0.5, 0.7, 0.4]) * light + 0.3 * share * cosine**7)
+    assert np.abs(image[..., :3] - truth).max() <= tolerances.RAY_SAME_255
 
 
 def test_a_smaller_step_brings_a_picture_nearer(cast):

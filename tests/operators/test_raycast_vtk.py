@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -72,12 +73,13 @@ def what_vtk_sees(volume: Volume) -> Clip:
 def draw(volume: Volume, camera: Camera, shaded: bool, device: Any) -> tuple[np.ndarray, np.ndarray]:
     """Both pictures."""
     function, step = BONE.transfer_function, 0.5 * min(volume.spacing)
-    lighting = BONE.lighting if shaded else UNSHADED
+    phong = replace(BONE.lighting, soft_gradient=0.0)  # VTK has no other
+    lighting = phong if shaded else UNSHADED
     ours = clrecon.render(
         volume, transfer_function=function, camera=camera, size=SIZE, ray_step=step, device=device,
         lighting=lighting, clip=what_vtk_sees(volume), background="black",
     )  # fmt: skip
-    scene = scene_of(volume, camera, function, BONE.lighting, size=SIZE, ray_step=step, shade=shaded)
+    scene = scene_of(volume, camera, function, phong, size=SIZE, ray_step=step, shade=shaded)
     peer = FixedPointPeer(volume.voxels, scene, threads=1)
     peer.first_frame()
     return ours.image, peer.picture()

@@ -115,7 +115,7 @@ def test_ours_there_and_back_to_the_bit(tmp_path: Path) -> None:
         points,
         unit_distance=1 / 3,
         gradient_opacity=[(0, 0.1), (1 / 7, 1)],
-        lighting=Lighting(0.1, 0.7, 0.3, 99, direction=(1, 2, 3)),
+        lighting=Lighting(0.1, 0.7, 0.3, 99, direction=(1, 2, 3), soft_gradient=1 / 3),
         name='a "b" \u00e4\n',
         description="d\\e",
     )

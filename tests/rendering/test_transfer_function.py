@@ -193,6 +193,7 @@ def test_lighting_keeps_a_unit_direction() -> None:
         ({"specular": None}, "specular of lighting"),
         ({"specular_power": 0.5}, "specular power of lighting lies between 1 and 128"),
         ({"specular_power": 129}, "specular power of lighting lies between 1 and 128"),
+        ({"soft_gradient": -1}, "soft gradient of lighting lies between 0 and 1"),
         ({"direction": (0, 0, 0)}, "not all 0"),
         ({"direction": (0, np.inf, 0)}, "three finite numbers in LPS"),
         ({"direction": (0, 1)}, "three finite numbers in LPS"),

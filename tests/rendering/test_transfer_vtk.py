@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from tolerances import BENT_WAY, COLOR_SPACE_WAY, FLOAT64_SHARE
@@ -50,7 +52,13 @@ def test_there_and_back_is_the_same(gradient: object, light: Lighting) -> None:
 
 def test_every_preset_goes_there_and_back() -> None:
     for preset in PRESETS.values():
-        assert TransferFunction.from_vtk(preset.transfer_function.to_vtk()) == preset.transfer_function
+        function = preset.transfer_function
+        phong = replace(function.lighting, soft_gradient=0.0)  # VTK has no other
+        kept = TransferFunction(
+            function.points, unit_distance=function.unit_distance, gradient_opacity=function.gradient_opacity,
+            lighting=phong,
+        )  # fmt: skip
+        assert TransferFunction.from_vtk(function.to_vtk()) == kept
 
 
 @pytest.mark.parametrize("clamped", [True, False])

@@ -67,13 +67,14 @@ def scene_of(
     Raises
     ------
     RuntimeError
-        VTK cannot draw it: slices that are uneven or sheared, gradient opacity, a light of its own.
+        VTK cannot draw it: slices that are uneven or sheared, gradient opacity, a light of its own, light that fades
+        with the gradient.
     """
     steps = volume.affine[:3, :3] / volume.spacing
     if volume.uneven or np.abs(steps.T @ steps - np.eye(3)).max() > 1e-4:
         raise RuntimeError("the peer draws volumes with axes at right angles and even slices only")
-    if function.gradient_opacity is not None or lighting.direction is not None:
-        raise RuntimeError("the peer draws with opacity by HU and a light at the camera only")
+    if function.gradient_opacity is not None or lighting.direction is not None or lighting.soft_gradient > 0.0:
+        raise RuntimeError("the peer draws with opacity by HU, a light at the camera and Phong's shading only")
     return Scene(
         affine=volume.affine.tolist(),
         points=np.asarray(function.points).tolist(),
