@@ -16,26 +16,39 @@ import os
 import re
 import secrets
 import shutil
+import signal
 import stat
 import sys
+import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import BinaryIO
+from typing import BinaryIO, Protocol
 
 from clrecon.errors import OutputError
 
 if sys.platform != "win32":
     import fcntl
 
-__all__ = ["StagedFile", "allow_open_files", "check_writable", "replace_file", "stage_file", "system_errors"]
+__all__ = [
+    "Staged",
+    "StagedFile",
+    "allow_open_files",
+    "check_writable",
+    "final_mode",
+    "hold_interrupts",
+    "replace_file",
+    "stage_file",
+    "system_errors",
+    "temporary_folder",
+]
 
 _FILES_OF_OTHERS = 200
 """Open files that a job has beside those that it writes: libraries, drivers, their caches."""
 
-_TEMPORARY = re.compile(r"\.clrecon-[0-9a-f]{16}\.tmp")
+_TEMPORARY = re.compile(r"\.clrecon-[0-9a-f]{16}\.(?:tmp|folder)")
 
 _own_names: set[str] = set()
-"""Temporary files that this process is writing: when it stages a thousand, looking at each every time would cost."""
+"""Temporary files and folders that this process is writing: with a thousand, looking at each every time would cost."""
 
 _ADVICE = {
     errno.ENOSPC: "the disk is full: free some space or choose another folder",
@@ -96,6 +109,16 @@ def replace_file(
     return staged.size
 
 
+class Staged(Protocol):
+    """What is finished under a temporary name: a file, or a folder of them."""
+
+    size: int
+    """Bytes."""
+
+    def commit(self) -> None:
+        """Put it in its place."""
+
+
 class StagedFile:
     """A finished file under a temporary name beside its target.
 
@@ -142,7 +165,7 @@ def stage_file(
         with system_errors(path):
             _check_space(path, target.parent, expected_bytes)
             _sweep(target.parent)
-            mode = _final_mode(target)
+            mode = final_mode(target)
             temporary, stream = stack.enter_context(_temporary_file(target.parent))
             write(stream)
             stream.flush()
@@ -157,6 +180,29 @@ def stage_file(
                 with contextlib.suppress(PermissionError):  # some network file systems keep the mode to themselves
                     os.fchmod(stream.fileno(), mode)
         yield StagedFile(path, temporary, target, stream, size)
+
+
+@contextlib.contextmanager
+def hold_interrupts() -> Iterator[None]:
+    """Keep Ctrl-C, and other signals that this process handles, waiting until the ``with`` block is done.
+
+    For the moment in which files that belong together are put into their places.  Other threads are never interrupted.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    came: list[int] = []
+    handlers = {}
+    for number in (signal.SIGINT, signal.SIGTERM, getattr(signal, "SIGHUP", signal.SIGINT)):
+        if callable(signal.getsignal(number)) and number not in handlers:
+            handlers[number] = signal.signal(number, lambda number, _: came.append(number))
+    try:
+        yield
+    finally:
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
+        if came:
+            signal.raise_signal(came[0])
 
 
 def allow_open_files(count: int) -> None:
@@ -243,15 +289,15 @@ def _check_space(path: str | os.PathLike[str], folder: Path, expected_bytes: int
         )
 
 
-def _final_mode(target: Path) -> int:
-    """Permissions for the finished file: those of the file that it replaces, else what the umask allows."""
+def final_mode(target: Path, new: int = 0o666) -> int:
+    """Permissions for what is finished: those of what it replaces, else of `new` what the umask allows."""
     try:
         return stat.S_IMODE(os.stat(target).st_mode) & 0o777
     except FileNotFoundError:
         # The umask can only be read by setting it; a file that another thread makes meanwhile is the stricter.
         umask = os.umask(0o077)
         os.umask(umask)
-        return 0o666 & ~umask
+        return new & ~umask
 
 
 @contextlib.contextmanager
@@ -278,6 +324,41 @@ def _temporary_file(folder: Path) -> Iterator[tuple[Path, BinaryIO]]:
                 temporary.unlink()
 
 
+@contextlib.contextmanager
+def temporary_folder(parent: Path) -> Iterator[Path]:
+    """Make a folder with a random name, for the owner only, and remove it in the end unless it was renamed.
+
+    As with files, those of processes that are dead are removed by the next one that writes into `parent`.
+    """
+    _sweep(parent)
+    with contextlib.ExitStack() as stack:
+        while True:
+            made = parent / f".clrecon-{secrets.token_hex(8)}.folder"
+            stack.callback(_own_names.discard, made.name)
+            _own_names.add(made.name)
+            stack.callback(shutil.rmtree, made, ignore_errors=True)
+            made.mkdir(mode=0o700)
+            if sys.platform == "win32" or _lock_folder(stack, made):
+                break
+        yield made
+
+
+def _lock_folder(stack: contextlib.ExitStack, made: Path) -> bool:
+    """Lock a folder that was just made until `stack` closes; False when another process was about to sweep it."""
+    try:
+        descriptor = os.open(made, os.O_RDONLY | getattr(os, "O_NOFOLLOW", 0))
+    except FileNotFoundError:
+        return False
+    stack.callback(os.close, descriptor)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    except OSError:
+        return True
+    return made.exists()
+
+
 def _lock_new(stream: BinaryIO) -> bool:
     """Lock a file that was just created against `_sweep`; False when another process was about to sweep it."""
     if sys.platform != "win32":
@@ -291,7 +372,7 @@ def _lock_new(stream: BinaryIO) -> bool:
 
 
 def _sweep(folder: Path) -> None:
-    """Remove temporary files of processes that are dead: those of our pattern that nobody holds a lock on."""
+    """Remove temporary files and folders of dead processes: those of our pattern that nobody has locked."""
     if sys.platform == "win32":
         return
     with os.scandir(folder) as entries:
@@ -300,12 +381,17 @@ def _sweep(folder: Path) -> None:
         temporary = folder / name
         # Vanished meanwhile, someone else's, or locked by a living process: none of our business.
         with contextlib.suppress(OSError):
-            descriptor = os.open(temporary, os.O_RDWR | os.O_NOFOLLOW | os.O_NONBLOCK)
+            is_folder = name.endswith(".folder")
+            access = os.O_RDONLY | os.O_DIRECTORY if is_folder else os.O_RDWR
+            descriptor = os.open(temporary, access | os.O_NOFOLLOW | os.O_NONBLOCK)
             try:
                 status = os.fstat(descriptor)
-                if stat.S_ISREG(status.st_mode) and status.st_uid == os.geteuid():
+                if (is_folder or stat.S_ISREG(status.st_mode)) and status.st_uid == os.geteuid():
                     fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                    temporary.unlink()
+                    if is_folder:
+                        shutil.rmtree(temporary, ignore_errors=True)
+                    else:
+                        temporary.unlink()
             finally:
                 os.close(descriptor)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 from clrecon.cli.render_values import (
@@ -43,6 +44,15 @@ _SETTINGS = (
     "thickness", "combine", "curve", "cpr",
 )  # fmt: skip
 """Options that are settings of the same name."""
+
+
+def _add_repeated(
+    group: argparse._ArgumentGroup, option: str, parse: Callable[[str], Any], metavar: str, text: str
+) -> None:
+    """Add an option that may be given again; what is given makes a list."""
+    group.add_argument(
+        option, type=parse, metavar=metavar, action="append", default=[], help=f"{text}; may be given again"
+    )
 
 
 def add_looks(parser: argparse.ArgumentParser) -> None:
@@ -88,16 +98,11 @@ def add_looks(parser: argparse.ArgumentParser) -> None:
 def add_camera(parser: argparse.ArgumentParser) -> None:
     """Add where a picture is taken from, and what surrounds what it shows."""
     group = parser.add_argument_group("camera and picture")
-    group.add_argument(
-        "--view",
-        type=parse_views,
-        metavar="V[,V...]|AZ,EL",
-        action="append",
-        default=[],
-        help=f"where the camera stands: {', '.join(VIEWS)}; or degrees from anterior to the patient's left and to the"
-        " head; of slices also axial, coronal, sagittal; several make a picture each: out_left.png"
-        " (default: anterior)",
-    )
+    _add_repeated(
+        group, "--view", parse_views, "V[,V...]|AZ,EL",
+        f"where the camera stands: {', '.join(VIEWS)}; or degrees from anterior to the patient's left and to the head;"
+        " of slices also axial, coronal, sagittal (default: anterior); several make a picture each: out_left.png",
+    )  # fmt: skip
     group.add_argument(
         "--up", type=parse_direction, metavar="SIDE|X,Y,Z", help="what is at the top (default: superior, else anterior)"
     )
@@ -129,14 +134,10 @@ def add_region(parser: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--clip-box", type=parse_clip_box, metavar="X0,X1,Y0,Y1,Z0,Z1", help="keep a box; a side left empty is open"
     )
-    group.add_argument(
-        "--clip",
-        type=parse_clip_plane,
-        metavar="PX,PY,PZ,NX,NY,NZ",
-        action="append",
-        default=[],
-        help="keep the side of a plane through a point that a normal points to; may be given again",
-    )
+    _add_repeated(
+        group, "--clip", parse_clip_plane, "PX,PY,PZ,NX,NY,NZ",
+        "keep the side of a plane through a point that a normal points to",
+    )  # fmt: skip
 
 
 def add_curve(parser: argparse.ArgumentParser) -> None:
@@ -169,21 +170,9 @@ def add_labels(parser: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--labels", metavar="FILE", help="label map: NIfTI, NRRD (.seg.nrrd too), MetaImage or DICOM SEG"
     )
-    group.add_argument(
-        "--label-color",
-        type=parse_label_color,
-        metavar="LABEL=COLOUR",
-        action="append",
-        default=[],
-        help="colour of a label, by name or number; may be given again",
-    )
-    group.add_argument(
-        "--label-opacity",
-        type=parse_label_opacity,
-        metavar="LABEL=SHARE",
-        action="append",
-        default=[],
-        help="factor on the opacity of a label, 0 to 1; may be given again",
+    _add_repeated(group, "--label-color", parse_label_color, "LABEL=COLOUR", "colour of a label, by name or number")
+    _add_repeated(
+        group, "--label-opacity", parse_label_opacity, "LABEL=SHARE", "factor on the opacity of a label, 0 to 1"
     )
 
 

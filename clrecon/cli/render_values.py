@@ -5,6 +5,8 @@ from __future__ import annotations
 import argparse
 import math
 
+from clrecon.pipeline.render_modes import VIEWS
+
 __all__ = [
     "parse_clip_box",
     "parse_clip_plane",
@@ -43,8 +45,15 @@ def parse_picture_size(text: str) -> tuple[int, int]:
 def parse_views(text: str) -> tuple[str, ...]:
     """Read ``left``, ``anterior,left,posterior`` or ``AZ,EL``: names or one pair of angles."""
     parts = tuple(part.strip().lower() for part in text.split(","))
-    if any(part[:1].isalpha() for part in parts):
+    if all(part[:1].isalpha() for part in parts):
         return parts
+    try:
+        _azimuth, _elevation = (float(part) for part in parts)
+    except ValueError:
+        raise argparse.ArgumentTypeError(
+            f"{text!r} is neither names of views with commas between them ({', '.join(VIEWS)}; of slices axial,"
+            " coronal, sagittal), nor one AZ,EL in degrees, such as 30,15: give --view again for further ones"
+        ) from None
     return (",".join(parts),)
 
 

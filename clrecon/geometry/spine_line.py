@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clrecon.errors import UsageError
+from clrecon.errors import RefusedInputError
 from clrecon.geometry.affine import Float64Array
 from clrecon.geometry.volume import Volume
 
@@ -101,7 +101,7 @@ def find_spine_line(volume: Volume) -> SpineLine:
 
     Raises
     ------
-    UsageError
+    RefusedInputError
         Nowhere in the volume it is sure: the message says how much was found.
     """
     cells = _average_cells(volume)
@@ -116,13 +116,13 @@ def find_spine_line(volume: Volume) -> SpineLine:
     begin, end = _longest_run(sure)
     searched, height = len(worth) * CELL_MM[2], (end - begin) * CELL_MM[2]
     if height < SHORTEST_MM:
-        raise UsageError(
+        raise RefusedInputError(
             f"no spine was found that one could be sure of ({height:.0f} of {searched:.0f} mm look like one):"
             " give points of the centre line"
         )
     ahead, behind = _depths(cells, path[begin:end])
     if behind is not None and ahead < DEEPER_AHEAD * behind:
-        raise UsageError(
+        raise RefusedInputError(
             f"what looks like a spine has {ahead:.0f} mm of the body in front and {behind:.0f} mm behind: it is none,"
             " or front and back of the scan are mistaken; give points of the centre line"
         )

@@ -13,7 +13,7 @@ from clrecon.pipeline.labels import extract_label_surfaces, open_labels
 from clrecon.pipeline.levels import choose_level
 from clrecon.pipeline.masking import mask_volume
 from clrecon.pipeline.opening import DeviceOpening, prepare_surfaces
-from clrecon.pipeline.outputs import check_outputs, commit_all, count_leftovers, name_outputs, stage_meshes
+from clrecon.pipeline.outputs import check_kept, check_outputs, commit_all, count_leftovers, name_outputs, stage_meshes
 from clrecon.pipeline.parts import check_levels, extract_surfaces, first_names, plan_surfaces, select_parts
 from clrecon.pipeline.progress import Progress, Stopwatch, ignore_progress
 from clrecon.pipeline.refinement import judge_parts, refine_surface, warn_of_gates
@@ -74,6 +74,7 @@ def make_mesh(
     watch = Stopwatch()
     surfaces = plan_surfaces(settings.levels)
     check_outputs(output, report_path, first_names(surfaces, settings.split))
+    check_kept(report_path, source, None if settings.labels is None else settings.labels.path)
 
     progress("device", 0, 0)
     prepare = partial(prepare_surfaces, components=settings.selects, topology=settings.topology)

@@ -13,12 +13,13 @@ from typing import TYPE_CHECKING
 from clrecon.errors import OutputError, UsageError
 
 if TYPE_CHECKING:
-    from clrecon.files import StagedFile
+    from clrecon.files import Staged, StagedFile
     from clrecon.mesh import Mesh
 
 __all__ = [
     "MOST_FILES",
     "check_distinct",
+    "check_kept",
     "check_outputs",
     "commit_all",
     "count_leftovers",
@@ -84,6 +85,18 @@ def check_distinct(*owned: Sequence[tuple[str, str | Path]]) -> None:
         owners[_identity(path)] = own
 
 
+def check_kept(report_path: str | Path | None, *inputs: str | Path | None) -> None:
+    """Refuse a report, whose name may end as it likes, in the place of a file that the job reads.
+
+    Raises
+    ------
+    UsageError
+    """
+    for path in inputs:
+        if path and report_path is not None and _identity(path) == _identity(report_path):
+            raise UsageError(f"the report would replace a file that is read: {report_path}")
+
+
 def count_leftovers(output: str | Path, paths: Sequence[str | Path]) -> int:
     """Count the numbered files of `output` that are not among `paths`: components of an earlier run that had more.
 
@@ -137,18 +150,21 @@ def stage_meshes(stack: ExitStack, meshes: Sequence[Mesh], paths: Sequence[str |
     return [stack.enter_context(stage_mesh(mesh, path, space)) for mesh, path in zip(meshes, paths, strict=True)]
 
 
-def commit_all(files: Sequence[StagedFile]) -> None:
-    """Put staged files into their places, one after the other.
+def commit_all(files: Sequence[Staged]) -> None:
+    """Put staged files into their places, one after the other; Ctrl-C waits until all of them are there.
 
     Raises
     ------
     OutputError
         The system refuses one of them; the message says how many are in place already.
     """
-    for done, file in enumerate(files):
-        try:
-            file.commit()
-        except OutputError as error:
-            if done == 0:
-                raise
-            raise OutputError(f"{error} ({done} of {len(files)} files of this job are in place already)") from error
+    from clrecon.files import hold_interrupts
+
+    with hold_interrupts():
+        for done, file in enumerate(files):
+            try:
+                file.commit()
+            except OutputError as error:
+                if done == 0:
+                    raise
+                raise OutputError(f"{error} ({done} of {len(files)} files of this job are in place already)") from error

@@ -88,15 +88,16 @@ def check_pictures(files: PictureFiles, settings: RenderSettings) -> None:
     Raises
     ------
     UsageError
-        An unknown extension, two outputs that are one file, a format that cannot hold what is asked of it, no encoder
-        for a moving picture, a caption that cannot be drawn, or Pillow is not installed.
+        An unknown extension, two outputs that are one file, or one in the folder of frames, a format that cannot hold
+        what is asked of it, no encoder for a moving picture, a caption that cannot be drawn, or Pillow is not
+        installed.
     OutputError
         A folder is missing or cannot be written to, or a target is no regular file.
     """
     from clrecon.files import check_writable
     from clrecon.rendering.annotations import check_caption
     from clrecon.rendering.image_files import check_float_path, check_image_path
-    from clrecon.rendering.motion import check_animation
+    from clrecon.rendering.motion import animation_kind, check_animation
     from clrecon.rendering.pillow import load_pillow
 
     load_pillow()
@@ -106,10 +107,12 @@ def check_pictures(files: PictureFiles, settings: RenderSettings) -> None:
     if misplaced:
         raise UsageError(misplaced)
     if settings.background == "transparent":
-        for path in (files.picture, files.turntable):
-            if path is not None and f".{format_of(path)}" in OPAQUE_ONLY:
+        picture = "" if files.picture is None else format_of(files.picture)
+        turntable = "" if files.turntable is None else animation_kind(files.turntable)[1:]
+        for kind in (picture, turntable):
+            if f".{kind}" in OPAQUE_ONLY:
                 raise UsageError(
-                    f"{format_of(path).upper()} cannot hold a transparent background:"
+                    f"{kind.upper()} cannot hold a transparent background:"
                     " choose PNG, TIFF or APNG, or a colour (--background)"
                 )
     of_views = {"the picture": files.picture, "the depths": files.depth, "the values": files.values}
@@ -124,7 +127,16 @@ def check_pictures(files: PictureFiles, settings: RenderSettings) -> None:
     for _, path in owned:
         check_writable(path)
     if files.turntable is not None and settings.turntable is not None:
-        check_animation(files.turntable, settings.turntable.fps)
+        if check_animation(files.turntable, settings.turntable.fps) == "":
+            _check_outside(files.turntable, owned)
+
+
+def _check_outside(folder: str | Path, owned: Sequence[tuple[str, str | Path]]) -> None:
+    """Refuse files in the folder of frames, which is replaced as a whole."""
+    frames = Path(os.path.realpath(folder))
+    for what, path in owned:
+        if frames in Path(os.path.realpath(path)).parents:
+            raise UsageError(f"{what} cannot lie in {folder}, which holds frames and nothing else: name another folder")
 
 
 def stage_picture(

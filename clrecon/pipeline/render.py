@@ -9,9 +9,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from clrecon.errors import UsageError
+from clrecon.files import allow_open_files
 from clrecon.pipeline.masking import mask_volume
 from clrecon.pipeline.opening import DeviceOpening
-from clrecon.pipeline.outputs import commit_all
+from clrecon.pipeline.outputs import check_kept, commit_all
 from clrecon.pipeline.pictures import PictureFiles, check_pictures, format_of, name_view, stage_picture
 from clrecon.pipeline.progress import Progress, Stopwatch, ignore_progress
 from clrecon.pipeline.render_report import describe_picture, describe_pictures, find_emptiness, warn_of_picture
@@ -20,7 +21,7 @@ from clrecon.pipeline.report import peak_memory_bytes, stage_report
 from clrecon.pipeline.studio import Studio, read_curve, read_function, read_look
 
 if TYPE_CHECKING:
-    from clrecon.files import StagedFile
+    from clrecon.files import Staged
     from clrecon.geometry import Volume
     from clrecon.opencl import Device
     from clrecon.rendering import Rendering
@@ -67,6 +68,8 @@ def make_pictures(
         raise UsageError("a turntable needs both: where it goes, and how it turns")
     watch = Stopwatch()
     check_pictures(files, settings)
+    check_kept(files.report, source, *settings.files_read)
+    allow_open_files(3 * len(settings.views_used) + 2)  # picture, depths and values of each view, turntable, report
     function = read_function(settings.transfer_function)
     curve = read_curve(settings.curve)
 
@@ -83,7 +86,8 @@ def make_pictures(
     studio = Studio(volume, device, settings, function=function, curve=curve, labels=labels, progress=progress)
     with studio, ExitStack() as staged:  # all files are on the disk before any replaces an older one
         pictures, written = _take_views(studio, settings, files, staged, watch, progress)
-        turntable = _turn(studio, volume, settings, files, watch, progress)
+        turntable, moving = _turn(studio, volume, settings, files, staged, watch, progress)
+        written += moving
         report = describe_pictures(volume, settings, studio, device, pictures, turntable)
         report["seconds"] = _seconds(watch)
         report["peak_memory_bytes"] = peak_memory_bytes()
@@ -126,10 +130,10 @@ def _take_views(
     staged: ExitStack,
     watch: Stopwatch,
     progress: Progress,
-) -> tuple[list[dict[str, Any]], list[StagedFile]]:
+) -> tuple[list[dict[str, Any]], list[Staged]]:
     """Take the picture of each view and write it under a temporary name; returns what the report says of them."""
     pictures: list[dict[str, Any]] = []
-    written: list[StagedFile] = []
+    written: list[Staged] = []
     if files.picture is None:
         return pictures, written
     views = settings.views_used
@@ -152,14 +156,15 @@ def _turn(
     volume: Volume,
     settings: RenderSettings,
     files: PictureFiles,
+    staged: ExitStack,
     watch: Stopwatch,
     progress: Progress,
-) -> dict[str, Any] | None:
-    """Write the turntable, frame by frame; returns what the report says of it."""
+) -> tuple[dict[str, Any] | None, list[Staged]]:
+    """Write the turntable, frame by frame and under a temporary name; returns what the report says of it."""
     turn = settings.turntable
     if files.turntable is None or turn is None:
-        return None
-    from clrecon.rendering.motion import turntable_cameras, write_animation
+        return None, []
+    from clrecon.rendering.motion import animation_kind, stage_animation, turntable_cameras
 
     first = settings.camera(volume, settings.views_used[0], turning=True)
     cameras = turntable_cameras(first, turn.frames, turn.degrees)
@@ -175,16 +180,19 @@ def _turn(
             yield picture
 
     progress("frames", 0, turn.frames)
-    size = write_animation(frames(), files.turntable, turn.fps, total=turn.frames, progress=progress)
+    moving = staged.enter_context(
+        stage_animation(frames(), files.turntable, turn.fps, total=turn.frames, progress=progress)
+    )
     seconds = watch.lap("turntable")
     studio.warnings += (empty or [])[:1]  # one frame with something in it is enough
-    return {
+    described = {
         "frames": turn.frames,
         "fps": turn.fps,
         "degrees": turn.degrees,
         "seconds_a_frame": round(seconds / turn.frames, 4),
-        "output": {"format": format_of(files.turntable) or "folder", "bytes": size},
+        "output": {"format": animation_kind(files.turntable)[1:] or "folder", "bytes": moving.size},
     }
+    return described, [moving]
 
 
 def _seconds(watch: Stopwatch) -> dict[str, float]:

@@ -22,7 +22,6 @@ _RAYS = ("dvr", "mip", "minip", "mean", "surface", "slices")
 
 _MODES_OF = {
     "preset": ("dvr", "mip", "minip", "mean", "slices", "slice", "cpr"),
-    "zoom": (*_RAYS, "slice"),
     "letters": (*_RAYS, "slice"),
     "depth": ("dvr", "mip", "minip", "surface", "slices", "slice"),
     "values": ("mip", "minip", "mean", "slice", "cpr"),

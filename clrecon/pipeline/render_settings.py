@@ -302,6 +302,14 @@ class RenderSettings:
         return DEFAULT_SIZE if self.size is None else self.size
 
     @property
+    def files_read(self) -> tuple[str, ...]:
+        """Files that say how, beside the scan."""
+        function = self.transfer_function or ""
+        curve = "" if self.curve in (None, SPINE) else self.curve
+        look = "" if self.labels is None else self.labels.path
+        return tuple(path for path in (function, function.rpartition(":")[0], curve, look) if path)
+
+    @property
     def clip(self) -> Clip | None:
         """The part of space that is shown."""
         from clrecon.geometry.clip import Clip

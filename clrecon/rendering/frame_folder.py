@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import re
-import secrets
-import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -13,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.errors import OutputError, UsageError
-from clrecon.files import system_errors
+from clrecon.files import final_mode, hold_interrupts, system_errors, temporary_folder
 
-__all__ = ["check_frame_folder", "write_frame_folder"]
+__all__ = ["check_frame_folder", "stage_frame_folder"]
 
 _FRAME = re.compile(r"frame_[0-9]{4,}\.png")
 
@@ -26,9 +25,9 @@ def check_frame_folder(path: str | os.PathLike[str]) -> Path:
     Raises
     ------
     UsageError
-        It is there and holds more than frames of an earlier run.
+        It is there and holds more than frames of an earlier run, or is the current folder.
     OutputError
-        It is no folder, or what it is to stand in is missing or cannot be written to.
+        It is no folder or cannot be replaced, or what it is to stand in is missing or cannot be written to.
     """
     folder = Path(os.path.realpath(path))
     with system_errors(path):
@@ -41,14 +40,53 @@ def check_frame_folder(path: str | os.PathLike[str]) -> Path:
                     f"the folder {path} holds other things ({len(others)}, such as {sorted(others)[0]!r}):"
                     " name a new or empty one for the frames"
                 )
+            if os.path.samefile(folder, os.curdir):  # whoever stands in it would stand in what was removed
+                raise UsageError(f"the frames replace the folder {path}, which is the current one: name one in it")
+            if os.path.ismount(folder):
+                raise OutputError(f"cannot write {path}: a disk is mounted there, name a folder in it for the frames")
+            if not os.access(folder, os.W_OK):
+                raise OutputError(f"cannot write {path}: the folder is there and write-protected")
+        elif folder.is_symlink():
+            raise OutputError(f"cannot write {path}: it is a symbolic link that leads back to itself")
         if not folder.parent.is_dir():
             raise OutputError(f"cannot write {path}: the folder {folder.parent} does not exist, make it first")
-        _make_beside(folder).rmdir()
+        with temporary_folder(folder.parent):
+            pass
     return folder
 
 
-def write_frame_folder(frames: Iterator[NDArray[np.uint8]], path: str | os.PathLike[str]) -> int:
-    """Write frames (h, w, 3 or 4) as frame_0000.png, ... and return their bytes together."""
+class StagedFolder:
+    """A finished folder of frames under a temporary name beside its place.
+
+    Attributes
+    ----------
+    size : int
+        Bytes of its files together.
+    """
+
+    def __init__(self, path: str | os.PathLike[str], made: Path, folder: Path, size: int):
+        self._path, self._made, self._folder = path, made, folder
+        self.size = size
+
+    def commit(self) -> None:
+        """Put the folder into its place; frames of an earlier run are removed at the end of the ``with`` block.
+
+        Raises
+        ------
+        OutputError
+            The system refuses; an older folder is intact.
+        """
+        with system_errors(self._path), hold_interrupts():
+            _swap(self._made, self._folder)
+
+
+@contextlib.contextmanager
+def stage_frame_folder(frames: Iterator[NDArray[np.uint8]], path: str | os.PathLike[str]) -> Iterator[StagedFolder]:
+    """Write frames (h, w, 3 or 4) as frame_0000.png, ... into a folder under a temporary name.
+
+    `StagedFolder.commit` in the ``with`` block puts it in place; a folder that is not committed is removed at the end
+    of the block.
+    """
     from clrecon.rendering.pillow import load_pillow
 
     load_pillow()
@@ -56,36 +94,26 @@ def write_frame_folder(frames: Iterator[NDArray[np.uint8]], path: str | os.PathL
 
     folder = check_frame_folder(path)
     size = 0
-    with system_errors(path):
-        made = _make_beside(folder)
-        try:
+    with contextlib.ExitStack() as stack:
+        with system_errors(path):
+            made = stack.enter_context(temporary_folder(folder.parent))
             for number, frame in enumerate(frames):
                 with open(made / f"frame_{number:04d}.png", "xb") as stream:
                     Image.fromarray(frame).save(stream, "PNG")
                     stream.flush()
                     os.fsync(stream.fileno())
                     size += stream.tell()
-            _swap(made, folder)
-        finally:
-            shutil.rmtree(made, ignore_errors=True)
-    return size
-
-
-def _make_beside(folder: Path) -> Path:
-    made = folder.parent / f".clrecon-{secrets.token_hex(8)}.frames"
-    made.mkdir()
-    return made
+            made.chmod(final_mode(folder, 0o777))
+        yield StagedFolder(path, made, folder, size)
 
 
 def _swap(made: Path, folder: Path) -> None:
-    """Put `made` into the place of `folder`, whose frames of an earlier run are removed when that is done."""
+    """Put `made` into the place of `folder`; frames of an earlier run get the temporary name, to be removed with it."""
     older = made.with_suffix(".older")
-    if folder.exists():
-        folder.rename(older)
     try:
+        if folder.exists():
+            folder.rename(older)
         made.rename(folder)
-    except BaseException:
+    finally:
         if older.exists():
-            older.rename(folder)
-        raise
-    shutil.rmtree(older, ignore_errors=True)
+            older.rename(made if folder.exists() else folder)

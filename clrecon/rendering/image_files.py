@@ -33,6 +33,9 @@ IMAGE_FORMATS = {".png": "PNG", ".jpg": "JPEG", ".jpeg": "JPEG", ".tif": "TIFF",
 
 FLOAT_FORMATS = (".npy", ".tif", ".tiff")
 
+_MOST_PER_METRE = 2**31 - 1
+"""Pixels per metre that PNG can say."""
+
 
 def check_image_path(path: str | os.PathLike[str]) -> str:
     """Return the extension of a picture file in lower case.
@@ -154,8 +157,10 @@ def _replace(path: str | os.PathLike[str], content: bytes) -> int:
 
 
 def _resolution(pixel_mm: float | None) -> dict[str, Any]:
-    """Pillow's option for pixels of so many mm; PNG rounds it to whole pixels per metre."""
-    return {} if pixel_mm is None else {"dpi": (25.4 / pixel_mm, 25.4 / pixel_mm)}
+    """Pillow's option for pixels of so many mm; PNG rounds it to whole pixels per metre, and has 32 bits for them."""
+    if pixel_mm is None or not 1.0 <= 1000.0 / pixel_mm <= _MOST_PER_METRE:
+        return {}
+    return {"dpi": (25.4 / pixel_mm, 25.4 / pixel_mm)}
 
 
 def _text_chunks(rendering: Rendering) -> Any:

@@ -6,6 +6,7 @@ the first is asked for, everything is checked that can be: the name, the place, 
 
 from __future__ import annotations
 
+import contextlib
 import os
 from collections.abc import Callable, Iterable, Iterator
 from typing import TYPE_CHECKING, BinaryIO
@@ -14,13 +15,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.errors import UsageError
-from clrecon.files import check_writable, replace_file
+from clrecon.files import Staged, check_writable, stage_file
 from clrecon.geometry.camera import Camera
 
 if TYPE_CHECKING:
     from clrecon.rendering.picture import Rendering
 
-__all__ = ["ANIMATIONS", "MOST_FRAMES", "check_animation", "turntable_cameras", "write_animation"]
+__all__ = [
+    "ANIMATIONS",
+    "MOST_FRAMES",
+    "animation_kind",
+    "check_animation",
+    "stage_animation",
+    "turntable_cameras",
+    "write_animation",
+]
 
 ANIMATIONS = (".mp4", ".gif", ".apng")
 """Extensions of moving pictures; a name without one is a folder of PNG files."""
@@ -63,6 +72,13 @@ def turntable_cameras(camera: Camera, frames: int, degrees: float = 360.0) -> li
     return [camera.orbit(step * frame) for frame in range(frames)]
 
 
+def animation_kind(path: str | os.PathLike[str]) -> str:
+    """Extension of a moving picture in lower case, empty for a folder: without one, with a slash, or there as one."""
+    text = os.fspath(path)
+    is_folder = text.endswith(tuple(filter(None, (os.sep, os.altsep)))) or os.path.isdir(text)
+    return "" if is_folder else os.path.splitext(text)[1].lower()
+
+
 def check_animation(path: str | os.PathLike[str], fps: float = 25.0) -> str:
     """Refuse what cannot be written, before any frame is computed.
 
@@ -89,8 +105,9 @@ def check_animation(path: str | os.PathLike[str], fps: float = 25.0) -> str:
         text = os.fspath(path)
     except TypeError as error:
         raise UsageError(f"a moving picture is named by a string or a path, not {type(path).__name__}") from error
-    is_folder = text.endswith(tuple(filter(None, (os.sep, os.altsep)))) or os.path.isdir(text)
-    extension = "" if is_folder else os.path.splitext(text)[1].lower()
+    if not text:
+        raise UsageError("the name of the moving picture is empty")
+    extension = animation_kind(text)
     if extension and extension not in ANIMATIONS:
         raise UsageError(
             f"a moving picture is not written as {extension!r}: use one of {', '.join(ANIMATIONS)},"
@@ -149,12 +166,33 @@ def write_animation(
     OutputError
         The file cannot be written; an older one is intact.
     """
+    with stage_animation(frames, path, fps, total=total, progress=progress) as staged:
+        staged.commit()
+    return staged.size
+
+
+@contextlib.contextmanager
+def stage_animation(
+    frames: Iterable[Rendering | NDArray[np.uint8]],
+    path: str | os.PathLike[str],
+    fps: float = 25.0,
+    *,
+    total: int = 0,
+    progress: _Progress | None = None,
+) -> Iterator[Staged]:
+    """Write a moving picture under a temporary name; ``commit`` of what is yielded puts it in place.
+
+    For files that belong together: stage all of them, then commit one after the other.  What is not committed is
+    removed at the end of the block.  Parameters and errors as in `write_animation`.
+    """
     extension = check_animation(path, fps)
     checked = _checked_frames(frames, extension, total, progress)
     if extension == "":
-        from clrecon.rendering.frame_folder import write_frame_folder
+        from clrecon.rendering.frame_folder import stage_frame_folder
 
-        return write_frame_folder(checked, path)
+        with stage_frame_folder(checked, path) as folder:
+            yield folder
+        return
     if extension == ".mp4":
         from clrecon.rendering.video import write_video as write
     elif extension == ".gif":
@@ -165,7 +203,8 @@ def write_animation(
     def write_all(stream: BinaryIO) -> None:
         write(stream, checked, fps)
 
-    return replace_file(path, write_all)
+    with stage_file(path, write_all) as file:
+        yield file
 
 
 def _checked_frames(

@@ -78,7 +78,7 @@ def test_the_memory_that_is_allowed_counts_for_labels_too(
 ) -> None:
     options = ("--labels", labels, "--hu", -150, "--memory", "20kB")
     assert run(ct, "-o", tmp_path / "bone.stl", *options, device=device) == 5
-    assert "allows 20,000 bytes" in capsys.readouterr().err
+    assert "20,000 bytes are allowed on" in capsys.readouterr().err
 
 
 def test_labels_and_iso_values_together(device: Any, ct: Path, labels: Path, tmp_path: Path) -> None:

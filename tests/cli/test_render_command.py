@@ -353,6 +353,10 @@ WRONG = {
     "preset": (["--preset", "bones"], 3, "use one of bone, "),
     "mode": (["--mode", "raycast"], 3, "use one of dvr, "),
     "view": (["--view", "front"], 3, "anterior, posterior"),
+    "names and angles": (["--view", "anterior,left,30,15"], 3, "'anterior,left,30,15' is neither names of views with"),
+    "angles twice": (["--view", "30,15,60,15"], 3, "nor one AZ,EL in degrees, such as 30,15: give --view again"),
+    "one angle": (["--view", "30"], 3, "anterior, posterior, left, right, superior, inferior; of slices axial"),
+    "an empty view": (["--view", "left,"], 3, "neither names of views"),
     "angle": (["--view", "30,95"], 3, "elevation from -90 to 90"),
     "view twice": (["--view", "left,left"], 3, "twice"),
     "up along the view": (["--up", "anterior"], 3, "up direction"),
@@ -377,6 +381,7 @@ WRONG = {
     "slice not there": (["--mode", "slices", "--slices", "17,"], 3, "slices 0 to 16"),
     "slice opacity": (["--mode", "slices", "--slice-opacity", "0"], 3, "opacity of a slice"),
     "shadows elsewhere": (["--shadows"], 3, "--shadows means nothing in mode dvr"),
+    "no spine": (["--curve", "auto"], 4, "no spine was found that one could be sure of"),
     "curve file": (["--curve", "nowhere.csv"], 3, "there is no file"),
     "letters on a curve": (["--curve", "auto", "--letters"], 3, "--letters"),
     "small letters": (["--letters", "--size", "20"], 3, "at least 64"),
@@ -399,6 +404,7 @@ WRONG = {
     "no folder": (["-o", "OUT/gone/a.png"], 6, "gone"),
     "no series": (["--series", "9"], 3, "no series matches"),
     "device": (["--device", "abacus"], 5, "abacus"),
+    "memory": (["--memory", "5kB"], 5, "5,000 bytes are allowed on"),
     "curve outside": (["--curve", "OUT/../far.txt"], 3, "outside of the volume"),
 }
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from clrecon import read_labels, read_volume
-from clrecon.errors import UsageError
+from clrecon.errors import RefusedInputError
 from clrecon.geometry import Volume
 from clrecon.geometry.curves import Curve
 from clrecon.geometry.spine_line import find_spine_line
@@ -100,7 +100,7 @@ def made_up(name: str, phantom) -> Volume:
 
 @pytest.mark.parametrize("name", ["air", "noise", "ball", "skull", "one voxel", "mirrored", "front", "short"])
 def test_where_there_is_none_points_are_asked_for(phantom, name):
-    with pytest.raises(UsageError, match="give points of the centre line"):
+    with pytest.raises(RefusedInputError, match="give points of the centre line"):
         find_spine_line(made_up(name, phantom))
 
 
@@ -131,7 +131,7 @@ def test_real_spines_against_their_labels(real_data):
 def test_real_scans_are_found_or_refused(real_data):
     line = find_spine_line(read_volume(real_data / "thoracic_0p8mm"))
     assert line.height_mm >= 0.9 * line.searched_mm and line.sure_share > 0.9
-    with pytest.raises(UsageError, match="no spine was found"):
+    with pytest.raises(RefusedInputError, match="no spine was found"):
         find_spine_line(read_volume(real_data / "head_tilt_gaps"))
 
 

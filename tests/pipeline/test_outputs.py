@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import signal
+import threading
 from contextlib import ExitStack
 from pathlib import Path
 
@@ -10,8 +12,14 @@ import pytest
 
 from clrecon.errors import OutputError, UsageError
 from clrecon.files import stage_file
-from clrecon.pipeline.outputs import MOST_FILES, check_outputs, commit_all, name_outputs
+from clrecon.pipeline.labels import LabelChoice
+from clrecon.pipeline.mesh import make_mesh
+from clrecon.pipeline.outputs import MOST_FILES, check_kept, check_outputs, commit_all, name_outputs
 from clrecon.pipeline.parts import first_names, plan_surfaces
+from clrecon.pipeline.pictures import PictureFiles
+from clrecon.pipeline.render import make_pictures
+from clrecon.pipeline.render_settings import LabelLook, RenderSettings
+from clrecon.pipeline.settings import MeshSettings
 
 pytestmark = pytest.mark.unit
 
@@ -108,3 +116,61 @@ def test_a_thousand_files_can_be_staged_at_once(tmp_path: Path) -> None:
                 stack.enter_context(stage_file(tmp_path / f"{number}", lambda stream: stream.write(b"x")))
     finally:
         resource.setrlimit(resource.RLIMIT_NOFILE, limits)
+
+
+def test_a_report_replaces_no_file_that_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """All inputs stay what they are, also through a link; names that are no files count for nothing."""
+    monkeypatch.chdir(tmp_path)
+    for name in ("ct.nrrd", "labels.nrrd", "tf.json", "line.json"):
+        (tmp_path / name).write_bytes(b"mine")
+    (tmp_path / "link.json").symlink_to("ct.nrrd")
+    for report in ("ct.nrrd", "link.json", "labels.nrrd"):
+        with pytest.raises(UsageError, match="would replace a file that is read"):
+            make_mesh("ct.nrrd", "a.stl", MeshSettings(labels=LabelChoice("labels.nrrd")), report_path=report)
+    for report, settings in {
+        "ct.nrrd": RenderSettings(),
+        "tf.json": RenderSettings(transfer_function="tf.json:bone"),
+        "line.json": RenderSettings(curve="line.json"),
+        "labels.nrrd": RenderSettings(labels=LabelLook("labels.nrrd")),
+    }.items():
+        with pytest.raises(UsageError, match="would replace a file that is read"):
+            make_pictures("ct.nrrd", PictureFiles("a.png", report=report), settings)
+    assert {path.read_bytes() for path in tmp_path.iterdir()} == {b"mine"} and len(list(tmp_path.iterdir())) == 5
+    check_kept("auto", "ct.nrrd", *RenderSettings(curve="auto").files_read)
+    check_kept(None, "ct.nrrd")
+
+
+class Disturbed:
+    """A staged file during whose commit the user presses Ctrl-C."""
+
+    size = 1
+
+    def __init__(self, number: int):
+        self.number, self.done = number, 0
+
+    def commit(self) -> None:
+        signal.raise_signal(self.number)
+        self.done += 1
+
+
+@pytest.mark.parametrize("fails", [False, True])
+def test_an_interrupt_waits_until_all_files_are_in_place(fails: bool, tmp_path: Path) -> None:
+    handler = signal.getsignal(signal.SIGINT)
+    files = [Disturbed(signal.SIGINT), Disturbed(signal.SIGINT)]
+    with ExitStack() as stack:
+        own = stack.enter_context(stage_file(tmp_path / "a.json", lambda stream: stream.write(b"new")))
+        if fails:
+            (tmp_path / "a.json").mkdir()
+        with pytest.raises(KeyboardInterrupt):
+            commit_all([*files, own])
+    assert [file.done for file in files] == [1, 1]
+    assert (tmp_path / "a.json").is_dir() == fails
+    assert signal.getsignal(signal.SIGINT) is handler
+
+
+def test_other_threads_commit_without_signals(tmp_path: Path) -> None:
+    with stage_file(tmp_path / "a.json", lambda stream: stream.write(b"new")) as staged:
+        thread = threading.Thread(target=commit_all, args=([staged],))
+        thread.start()
+        thread.join()
+    assert (tmp_path / "a.json").read_bytes() == b"new"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -55,6 +56,20 @@ def test_a_sphere_is_a_disc_of_its_size_from_every_side(
         assert float(np.nanmin(depth)) == pytest.approx(nearest, abs=0.7)
 
 
+@pytest.mark.parametrize("mode", ["dvr", "slice"])
+def test_views_have_scales_of_their_own_until_zoom_makes_them_one(
+    mode: str, device: Any, sphere: tuple[Path, dict[str, Any]], tmp_path: Path
+) -> None:
+    files = PictureFiles(tmp_path / "a.png")
+    settings = RenderSettings(mode, views=("anterior", "left", "superior"), size=SIZE, device=str(device.index))
+    fitted = {made["view"]: made["pixel_mm"] for made in make_pictures(sphere[0], files, settings)["pictures"]}
+    largest = max(fitted.values())
+    assert min(fitted.values()) < 0.95 * largest
+    for view, pixel_mm in fitted.items():
+        alone = make_pictures(sphere[0], files, replace(settings, views=(view,), zoom=pixel_mm / largest))
+        assert alone["pictures"][0]["pixel_mm"] == pytest.approx(largest, rel=1e-4)
+
+
 def test_the_report_is_what_the_contract_says(device: Any, sphere: tuple[Path, dict[str, Any]], tmp_path: Path) -> None:
     files = PictureFiles(tmp_path / "a.png", turntable=tmp_path / "frames", depth=tmp_path / "a.npy")
     settings = RenderSettings(
@@ -95,7 +110,7 @@ def test_outputs_then_files_then_device_then_input(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("fails", ["encode_floats", "stage_report", "write_animation", "second view"])
+@pytest.mark.parametrize("fails", ["encode_floats", "stage_report", "stage_animation", "second view", "commit"])
 def test_a_step_that_fails_leaves_the_old_files(
     fails: str, device: Any, sphere: tuple[Path, dict[str, Any]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -122,15 +137,70 @@ def test_a_step_that_fails_leaves_the_old_files(
         home = {
             "encode_floats": "clrecon.rendering.image_files.encode_floats",
             "stage_report": "clrecon.pipeline.render.stage_report",
-            "write_animation": "clrecon.rendering.motion.write_animation",
+            "stage_animation": "clrecon.rendering.motion.stage_animation",
+            "commit": "clrecon.files.StagedFile.commit",
         }[fails]
         monkeypatch.setattr(home, fail)
     with pytest.raises(OutputError, match="full"):
         make_pictures(sphere[0], files, settings)
     kept = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
-    moved = {"a.gif"} if fails == "stage_report" else set()  # a finished turntable is in its place by then
-    assert {name for name, content in kept.items() if content != b"old"} == moved
-    assert set(kept) == set(names.values())
+    assert kept == dict.fromkeys(names.values(), b"old")
+
+
+def test_a_folder_of_frames_waits_for_the_report(
+    device: Any, sphere: tuple[Path, dict[str, Any]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    frames = tmp_path / "frames"
+    settings = RenderSettings(size=SIZE, turntable=Turntable(2), device=str(device.index))
+    make_pictures(sphere[0], PictureFiles(turntable=frames), settings)
+    older = {path.name: path.read_bytes() for path in frames.iterdir()}
+
+    def fail(*_: Any) -> Any:
+        raise OutputError("the disk is full")
+
+    other = replace(settings, turntable=Turntable(3), views=("left",))
+    with monkeypatch.context() as patch, pytest.raises(OutputError, match="full"):
+        patch.setattr("clrecon.pipeline.render.stage_report", fail)
+        make_pictures(sphere[0], PictureFiles(turntable=frames, report=tmp_path / "a.json"), other)
+    assert {path.name: path.read_bytes() for path in frames.iterdir()} == older
+    assert [path.name for path in tmp_path.iterdir()] == ["frames"]
+    make_pictures(sphere[0], PictureFiles(turntable=frames, report=tmp_path / "a.json"), other)
+    assert sorted(path.name for path in frames.iterdir()) == [f"frame_000{number}.png" for number in range(3)]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.json", "frames"]
+
+
+def test_the_report_calls_a_folder_a_folder(device: Any, sphere: tuple[Path, dict[str, Any]], tmp_path: Path) -> None:
+    settings = RenderSettings(size=SIZE, turntable=Turntable(2), background="transparent", device=str(device.index))
+    made = make_pictures(sphere[0], PictureFiles(turntable=f"{tmp_path}/v1.2/"), settings)
+    again = make_pictures(sphere[0], PictureFiles(turntable=tmp_path / "v1.2"), settings)
+    assert [report["turntable"]["output"]["format"] for report in (made, again)] == ["folder", "folder"]
+    (tmp_path / "v1.2").rename(tmp_path / "v1.gif")
+    assert make_pictures(sphere[0], PictureFiles(turntable=tmp_path / "v1.gif"), settings)["turntable"]["frames"] == 2
+
+
+@pytest.mark.skipif(os.name != "posix", reason="the limit of open files is that of POSIX systems")
+def test_many_views_raise_the_limit_of_open_files(
+    device: Any, sphere: tuple[Path, dict[str, Any]], tmp_path: Path
+) -> None:
+    import resource
+
+    limits = resource.getrlimit(resource.RLIMIT_NOFILE)
+    settings = RenderSettings(views=[f"{angle},0" for angle in range(60)], size=(8, 8), device=str(device.index))
+    with open(os.devnull) as file:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (file.fileno() + 30, limits[1]))
+    try:
+        report = make_pictures(sphere[0], PictureFiles(tmp_path / "a.png", tmp_path / "a.npy"), settings)
+    finally:
+        resource.setrlimit(resource.RLIMIT_NOFILE, limits)
+    assert len(report["pictures"]) == 60 and len(list(tmp_path.iterdir())) == 120
+
+
+def test_nothing_else_goes_into_the_folder_of_frames(tmp_path: Path) -> None:
+    (tmp_path / "frames").mkdir()
+    files = PictureFiles(turntable=tmp_path / "frames", report=tmp_path / "frames" / "a.json")
+    with pytest.raises(UsageError, match="the report cannot lie in .*frames, which holds frames and nothing else"):
+        make_pictures(tmp_path / "nowhere", files, RenderSettings(turntable=Turntable(2)))
+    assert list((tmp_path / "frames").iterdir()) == []
 
 
 def test_a_volume_in_slabs_is_the_same_picture(

@@ -10,7 +10,7 @@ from PIL import Image
 
 from clrecon.errors import OutputError, UsageError
 from clrecon.rendering import motion, video
-from clrecon.rendering.motion import check_animation, turntable_cameras, write_animation
+from clrecon.rendering.motion import check_animation, stage_animation, turntable_cameras, write_animation
 from tests import tolerances
 from tests.rendering.picture_files import PARALLEL, make_picture
 
@@ -169,6 +169,24 @@ def test_an_interrupted_run_leaves_nothing_and_the_older_file(tmp_path, name, re
     assert left_over(place) == [name] and left_over(scratch) == []
     if name == "turn":
         assert len(left_over(place / name)) == 2
+
+
+@pytest.mark.parametrize("name", ["turn.gif", "turn"])
+def test_what_is_not_committed_leaves_the_older_one(tmp_path, name):
+    write_animation(moving_frames(2), tmp_path / name)
+    with stage_animation(moving_frames(3), tmp_path / name) as staged:
+        assert count_frames(tmp_path / name) == 2 and staged.size > 0
+    assert (left_over(tmp_path), count_frames(tmp_path / name)) == ([name], 2)
+    with stage_animation(moving_frames(3), tmp_path / name) as staged:
+        staged.commit()
+    assert (left_over(tmp_path), count_frames(tmp_path / name)) == ([name], 3)
+
+
+def count_frames(path) -> int:
+    if path.is_dir():
+        return len(left_over(path))
+    with Image.open(path) as read:
+        return read.n_frames
 
 
 @pytest.mark.parametrize("name", ["turn.mp4", "turn.gif", "turn.apng", "turn"])

@@ -53,6 +53,19 @@ def test_a_picture_without_a_camera_takes_its_pixels_from_the_report(tmp_path):
     assert b"pHYs" in (tmp_path / "b.png").read_bytes()
 
 
+@pytest.mark.parametrize(("pixel_mm", "told"), [(4.7e-7, True), (4.6e-7, False), (999.0, True), (1001.0, False)])
+def test_a_zoom_beyond_what_files_can_say_is_no_error(tmp_path, pixel_mm, told):
+    """PNG has 32 bits for pixels a metre."""
+    picture = make_picture(camera=None)
+    picture.report["pixel_mm"] = pixel_mm
+    image_files.write_floats(picture.depth, tmp_path / "d.tif", pixel_mm)
+    picture.save(tmp_path / "a.tif")
+    picture.save(tmp_path / "a.png")
+    with Image.open(tmp_path / "a.png") as read:
+        assert ("dpi" in read.info) == told
+        assert np.array_equal(np.array(read), picture.image)
+
+
 def test_png_says_how_it_was_made(tmp_path):
     make_picture(camera=PARALLEL.orbit(30.0, 10.0)).save(tmp_path / "a.png")
     with Image.open(tmp_path / "a.png") as read:

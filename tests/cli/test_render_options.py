@@ -1,0 +1,35 @@
+"""The options of ``clrecon render`` as the parser hands them on."""
+
+from __future__ import annotations
+
+import argparse
+
+import pytest
+
+from clrecon.cli.render_options import add_camera, add_labels, add_region
+
+GIVEN_TWICE = {
+    "view": (["anterior,left", "30,15"], [("anterior", "left"), ("30,15",)]),
+    "clip": (["0,0,0,1,0,0", "0,0,5,0,0,1"], [(0, 0, 0, 1, 0, 0), (0, 0, 5, 0, 0, 1)]),
+    "label_color": (["L1=red", "20=#ff8000"], [("L1", "red"), ("20", "#ff8000")]),
+    "label_opacity": (["L1=0.2", "20=1"], [("L1", 0.2), ("20", 1.0)]),
+}
+
+
+@pytest.fixture
+def parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser()
+    for add in (add_camera, add_region, add_labels):
+        add(parser)
+    return parser
+
+
+@pytest.mark.parametrize("name", GIVEN_TWICE)
+def test_what_may_be_given_again_makes_a_list(name: str, parser: argparse.ArgumentParser) -> None:
+    texts, values = GIVEN_TWICE[name]
+    option = f"--{name.replace('_', '-')}"
+    options = parser.parse_args([part for text in texts for part in (option, text)])
+    assert getattr(options, name) == values
+    assert getattr(parser.parse_args([]), name) == []  # a parser keeps nothing from the last time
+    help_of = {action.dest: action.help for action in parser._actions}
+    assert str(help_of[name]).endswith("; may be given again")

@@ -1,0 +1,152 @@
+"""A folder of frames as a whole: what is refused before anything is drawn, what is left when something fails."""
+
+from __future__ import annotations
+
+import errno
+import os
+import signal
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from clrecon.errors import OutputError, UsageError
+from clrecon.files import replace_file
+from clrecon.rendering.motion import check_animation, stage_animation, write_animation
+
+NAMES = ["frame_0000.png", "frame_0001.png"]
+STALE = ".clrecon-0123456789abcdef.folder"
+
+
+def frames(count: int = 2) -> list[np.ndarray]:
+    return [np.full((8, 8, 3), 100 * number, np.uint8) for number in range(count)]
+
+
+def names(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.iterdir())
+
+
+@pytest.fixture
+def older(tmp_path: Path) -> Path:
+    """A folder with three frames of an earlier run."""
+    write_animation(frames(3), tmp_path / "turn")
+    return tmp_path / "turn"
+
+
+@pytest.mark.parametrize("name", [".", "./", "../turn"])
+def test_the_current_folder_is_not_replaced(name: str, older: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whoever stands in it would stand in a folder that was removed."""
+    monkeypatch.chdir(older)
+    with pytest.raises(UsageError, match="which is the current one"):
+        check_animation(name)
+    assert len(names(older)) == 3 and os.path.samefile(older, ".")
+
+
+def test_no_name_is_not_the_current_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(UsageError, match="name of the moving picture is empty"):
+        write_animation(frames(), "")
+    assert names(tmp_path) == []
+
+
+def test_what_cannot_be_replaced_is_said_before_anything_is_drawn(
+    older: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    with monkeypatch.context() as patch, pytest.raises(OutputError, match="a disk is mounted there"):
+        patch.setattr("os.path.ismount", lambda path: os.path.samefile(path, older))
+        check_animation(older)
+    with monkeypatch.context() as patch, pytest.raises(OutputError, match="write-protected"):
+        patch.setattr("os.access", lambda path, _: not os.path.samefile(path, older))
+        check_animation(older)
+    (tmp_path / "loop").symlink_to("loop")
+    with pytest.raises(OutputError, match="leads back to itself"):
+        check_animation(tmp_path / "loop")
+    assert names(tmp_path) == ["loop", "turn"]
+
+
+@pytest.mark.skipif(os.name != "posix", reason="permissions of POSIX")
+def test_permissions_are_those_of_the_folder_that_is_replaced(tmp_path: Path) -> None:
+    umask = os.umask(0o027)
+    try:
+        write_animation(frames(), tmp_path / "turn")
+        assert (tmp_path / "turn").stat().st_mode & 0o777 == 0o750
+        (tmp_path / "turn").chmod(0o700)
+        with stage_animation(frames(), tmp_path / "turn") as staged:
+            (made,) = (path for path in tmp_path.iterdir() if path.name.startswith(".clrecon-"))
+            assert made.stat().st_mode & 0o777 == 0o700
+            staged.commit()
+    finally:
+        os.umask(umask)
+    assert (tmp_path / "turn").stat().st_mode & 0o777 == 0o700
+    assert names(tmp_path) == ["turn"] and names(tmp_path / "turn") == NAMES
+
+
+@pytest.mark.parametrize("when", ["before", "after"])
+@pytest.mark.parametrize("place", [1, 2, 3])
+def test_an_interrupt_between_two_renames(place: int, when: str, older: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The older folder goes, the new one comes, the older one gets a name to be removed by: none of it alone."""
+    true_way, done = os.rename, []
+
+    def rename(source: Path, target: Path) -> None:
+        done.append(target)
+        if (len(done), when) == (place, "before"):
+            signal.raise_signal(signal.SIGINT)
+        true_way(source, target)
+        if (len(done), when) == (place, "after"):
+            signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr("os.rename", rename)
+    with pytest.raises(KeyboardInterrupt):
+        write_animation(frames(2), older)
+    assert names(older.parent) == ["turn"] and names(older) == NAMES
+    assert len(done) == 3
+
+
+@pytest.mark.parametrize("place", [1, 2])
+def test_a_rename_that_fails_leaves_the_older_folder(place: int, older: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    true_way, done = os.rename, []
+
+    def rename(source: Path, target: Path) -> None:
+        done.append(target)
+        if len(done) == place:
+            raise OSError(errno.EBUSY, "busy")
+        true_way(source, target)
+
+    monkeypatch.setattr("os.rename", rename)
+    with pytest.raises(OutputError, match="turn: busy"):
+        write_animation(frames(2), older)
+    assert names(older.parent) == ["turn"] and len(names(older)) == 3
+
+
+@pytest.mark.skipif(os.name != "posix", reason="locks of POSIX")
+@pytest.mark.parametrize("writes", ["frames", "a file"])
+def test_what_a_killed_process_left_is_removed_by_the_next(writes: str, tmp_path: Path) -> None:
+    import fcntl
+
+    def write() -> None:
+        if writes == "frames":
+            write_animation(frames(), tmp_path / "turn")
+        else:
+            replace_file(tmp_path / "turn", lambda stream: stream.write(b"x"))
+
+    (tmp_path / STALE).mkdir()
+    (tmp_path / STALE / "frame_0000.png").write_bytes(b"half")
+    (tmp_path / ".clrecon-notes.folder").mkdir()
+    descriptor = os.open(tmp_path / STALE, os.O_RDONLY)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX)  # as the process that is writing it does
+        write()
+        assert names(tmp_path) == [STALE, ".clrecon-notes.folder", "turn"]
+    finally:
+        os.close(descriptor)
+    write()
+    assert names(tmp_path) == [".clrecon-notes.folder", "turn"]
+
+
+def test_a_folder_that_is_being_written_is_locked(tmp_path: Path) -> None:
+    with stage_animation(frames(), tmp_path / "turn") as staged:
+        during = names(tmp_path)
+        replace_file(tmp_path / "other", lambda stream: stream.write(b"x"))
+        assert names(tmp_path) == sorted([*during, "other"]) and len(during) == 1
+        staged.commit()
+    assert names(tmp_path) == ["other", "turn"]
