@@ -10,6 +10,7 @@ The one beside VTK needs scikit-image too, and prints how alike the two are.
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -52,8 +53,9 @@ def draw_beside_vtk(renderer: clrecon.VolumeRenderer) -> np.ndarray:
     volume, bone = renderer.volume, find_preset("bone")
     camera = clrecon.Camera.fit(volume, "25,10", 1.2, size=BESIDE)
     step = 0.5 * min(volume.spacing)
-    ours = renderer.render("dvr", "bone", camera=camera, size=BESIDE, ray_step=step).image[..., :3]
-    scene = scene_of(volume, camera, bone.transfer_function, bone.lighting, size=BESIDE, ray_step=step)
+    light = replace(bone.lighting, soft_gradient=0.0)  # as VTK's
+    ours = renderer.render("dvr", "bone", camera=camera, size=BESIDE, ray_step=step, lighting=light).image[..., :3]
+    scene = scene_of(volume, camera, bone.transfer_function, light, size=BESIDE, ray_step=step)
     peer = FixedPointPeer(volume.voxels, scene, threads=1)
     peer.first_frame()
     theirs = peer.picture()[..., :3]
