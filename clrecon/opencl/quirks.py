@@ -1,4 +1,7 @@
-"""Every exception that a driver or pyopencl needs, each with its reason, in this one place."""
+"""Every exception that a driver or pyopencl needs, each with its reason, in this one place.
+
+One has a file of its own: `clrecon.opencl.unknown_cpu`.
+"""
 
 from __future__ import annotations
 
@@ -6,6 +9,7 @@ import atexit
 import os
 import shutil
 import tempfile
+import time
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -24,6 +28,10 @@ __all__ = [
 
 SIMULATOR_PLATFORMS = ("oclgrind",)
 """Simulators claim to be fast devices (Oclgrind: CPU, GPU and accelerator at once) and are 1000 times slower."""
+
+_NO_CACHES = {"PYOPENCL_NO_CACHE": "1", "MESA_SHADER_CACHE_DISABLE": "true", "MESA_GLSL_CACHE_DISABLE": "true"}
+"""Where nothing can be kept.  Mesa (before 22.1 under the last name) writes its cache from a thread of its own, even
+into a folder that is being removed.  PoCL cannot do without one."""
 
 
 @cache
@@ -51,6 +59,15 @@ def _is_usable(folder: Path) -> bool:
     return True
 
 
+def _remove_tree(folder: str) -> None:
+    """Remove a folder into which threads of a driver may still be writing: another file fails the removal of one."""
+    for pause in (0.0, 0.01, 0.03, 0.1, 0.3):
+        time.sleep(pause)
+        shutil.rmtree(folder, ignore_errors=True)
+        if not os.path.lexists(folder):
+            return
+
+
 @cache
 def cache_warnings() -> tuple[str, ...]:
     """See to it that drivers can keep built kernels; what to tell the user when they cannot.
@@ -66,8 +83,8 @@ def cache_warnings() -> tuple[str, ...]:
         folder = tempfile.mkdtemp(prefix="clrecon-")
     except OSError:
         return ("no folder for built kernels can be written: OpenCL drivers may show no device",)
-    atexit.register(shutil.rmtree, folder, ignore_errors=True)
-    os.environ.update(PYOPENCL_NO_CACHE="1", POCL_CACHE_DIR=folder, XDG_CACHE_HOME=folder)
+    atexit.register(_remove_tree, folder)
+    os.environ.update(_NO_CACHES, POCL_CACHE_DIR=folder, XDG_CACHE_HOME=folder)
     return ("the cache folder cannot be written: kernels are built anew by every process",)
 
 
