@@ -48,7 +48,8 @@ def load_program(device: Device, name: str, variants: Mapping[str, str] | None =
     DeviceError
         The driver's compiler refuses; the message holds its first complaint, the log follows in ``__cause__``.
     """
-    options = tuple(f"-D{macro}={value}" for macro, value in sorted((variants or {}).items()))
+    chosen = (f"-D{macro}={value}" for macro, value in sorted((variants or {}).items()))
+    options = (*device.build_options, *chosen)
     key = (name, options)
     with device.lock:
         if key not in device.programs:

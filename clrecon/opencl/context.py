@@ -10,6 +10,7 @@ from typing import Any
 
 from clrecon.errors import DeviceError, DeviceMemoryError
 from clrecon.opencl import quirks
+from clrecon.opencl.unknown_cpu import NameOfCpu, has_unknown_cpu
 
 __all__ = ["GROUP_SIZE", "Device", "describe_error"]
 
@@ -62,6 +63,8 @@ class Device:
         Built programs are kept for the next process, see `clrecon.kernels.binaries`.
     kernel_variants : dict of str to str
         ``-D`` definitions for kernels that are written for vectors, see `quirks.kernel_variants`.
+    build_options : tuple of str
+        For every program: tells apart, in caches that computers share, what the driver does not.
     lock : threading.RLock
         Held while a kernel gets its arguments and is enqueued: kernels are shared between threads.
     """
@@ -88,11 +91,27 @@ class Device:
         self.keeps_binaries: bool = quirks.is_slow_from_its_cache(self.platform)
         self.kernel_variants: dict[str, str] = quirks.kernel_variants(self.platform, self.type)
         self.shortcoming: str = _find_shortcoming(cl_device)
+        self.build_options: tuple[str, ...] = ()
+        self._cpu: NameOfCpu | None = None
+        if has_unknown_cpu(self.platform, self.version) and not self.shortcoming:
+            self._name_cpu()
         self.lock = threading.RLock()
         self.programs: dict[tuple[str, tuple[str, ...]], Any] = {}
         self._context: Any = None
         self._queue: Any = None
         self._process = os.getpid()
+
+    def _name_cpu(self) -> None:
+        """Prepare to name the CPU for a compiler that does not know it, see `clrecon.opencl.unknown_cpu`."""
+        try:
+            self._cpu = NameOfCpu(self.cl_device.int_ptr)
+        except LookupError as error:
+            self.shortcoming = (
+                f"its compiler is older than this CPU and builds nothing for it ({error}): install PoCL 3.1 or newer"
+                " (pocl-opencl-icd of the system, or pocl of conda-forge) or `pip install intel-opencl-rt`"
+            )
+        else:
+            self.build_options = (f"-DCPU_NAME={self._cpu.name}",)
 
     @property
     def score(self) -> tuple[int, int, tuple[int, ...], int]:
@@ -126,8 +145,10 @@ class Device:
         with self.lock:
             if self._context is None:
                 try:
+                    if self._cpu is not None:
+                        self._cpu.write()
                     self._context = cl.Context([self.cl_device])
-                except cl.Error as error:
+                except (cl.Error, LookupError) as error:
                     raise DeviceError(f"device {self.label} cannot be opened: {describe_error(error)}") from error
             return self._context
 
