@@ -63,7 +63,7 @@ SCAN_PEAK_BYTES_A_FILE = 1300  # with the list of paths and 64 starts of files: 
 FAR_AFFINE_MM = 1e-3  # coordinates of 1e5 mm, positions written with 6 decimals: measured 1e-6
 JITTER_AFFINE_MM = 1e-4  # directions off by 0.001 degrees in every slice: 8e-5 mm over a corner 4.6 mm away
 
-THOUSAND_FRAMES_S = 1.0  # headers of 1000 frames in one file, on a busy machine; measured 0.11
+THOUSAND_FRAMES_S = 1.0  # of processors, for headers of 1000 frames in one file; measured 0.11
 
 # --- labels ---
 NIFTI_LARGE_AFFINE_MM = 5e-5  # the same of coordinates up to 1000 mm: half a unit of float32 is 3e-5

@@ -166,9 +166,9 @@ FAULTS = {
 @pytest.mark.parametrize("change, words", FAULTS.values(), ids=FAULTS)
 def test_what_is_wrong_is_refused_by_name(tmp_path, change, words):
     write_enhanced(tmp_path / "mf", change=change, shared=())
-    start = time.perf_counter()
+    start = time.process_time()
     assert words in refusal(tmp_path)
-    assert time.perf_counter() - start < THOUSAND_FRAMES_S
+    assert time.process_time() - start < THOUSAND_FRAMES_S
     assert list_series(tmp_path).series[0].problems
 
 
