@@ -40,7 +40,7 @@ def has_unknown_cpu(platform_name: str, device_version: str) -> bool:
         sys.platform == "linux"
         and platform.machine() == "x86_64"
         and "portable computing language" in platform_name.lower()
-        and re.search(r"HSTR: pthread-x86_64-[a-z0-9_-]*-generic$", device_version.strip()) is not None
+        and re.search(r"HSTR: [a-z]+-x86_64-[a-z0-9_-]*-generic$", device_version.strip()) is not None
     )
 
 
