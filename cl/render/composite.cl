@@ -100,19 +100,24 @@ static inline void find_places(const slice_stack *stack, const ray_lanes *course
     to_indices(stack, i, j, k);
 }
 
-/* Opacity over one ray step of sample n of each ray, and its node of the table; 0 for samples that do not count.  With
- * `inner` they all count, lie within the volume with all voxels that they need, and are not the last of their rays. */
-static inline floats find_opacity(const field *f, const slice_stack *stack, const looks *look, const ray_lanes *course,
-    const packet *rays, const float n, const int inner, ints *node)
+/* Node of the transfer function of sample n of each ray; `inner` as in find_opacity(). */
+static inline ints find_node(const field *f, const slice_stack *stack, const looks *look, const ray_lanes *course,
+    const packet *rays, const float n, const int inner)
 {
     floats i, j, k;
     find_places(stack, course, rays, n, inner, &i, &j, &k);
-    const floats value = sample_lanes(f, i, j, k, inner);
-    const floats place = (value - look->low) * look->scale + 0.5f;
-    *node = to_ints(lesser(greater(place, (floats)(0.0f)), (floats)(NODES - 1)));
-    if (!ANY_LANE((*node >= look->first_shown) & (*node <= look->last_shown)))
-        return 0.0f;
-    floats opacity = (floats)(GATHER(float, look->opacities, *node));
+    const floats place = (sample_lanes(f, i, j, k, inner) - look->low) * look->scale + 0.5f;
+    return to_ints(lesser(greater(place, (floats)(0.0f)), (floats)(NODES - 1)));
+}
+
+/* Opacity over one ray step of sample n of each ray; 0 for samples that do not count.  With `inner` they all count, lie
+ * within the volume with all voxels that they need, and are not the last of their rays. */
+static inline floats find_opacity(const field *f, const slice_stack *stack, const looks *look, const ray_lanes *course,
+    const packet *rays, const float n, const int inner, const ints node)
+{
+    floats i, j, k;
+    find_places(stack, course, rays, n, inner, &i, &j, &k);
+    floats opacity = (floats)(GATHER(float, look->opacities, node));
     if (!inner) {
         ints counts = (k >= look->slab_low) & (k < look->slab_high) & (n >= rays->begin);
 #ifdef UNEVEN
@@ -327,9 +332,7 @@ __kernel void composite_rays(
             }
         }
         for (int part = 0; part < SAMPLES_A_LOOK && ANY_LANE(n < end); part += AT_ONCE) {
-            floats opacity[AT_ONCE];
-            ints node[AT_ONCE];
-            floats together = 0.0f;
+            ints node[AT_ONCE], may_show = 0;
             const int inner = HAS_INNER && n >= rays.inner_begin && n + (float)AT_ONCE <= rays.inner_end;
 #if HAS_INNER
             const float ahead = n + SAMPLES_AHEAD;
@@ -342,15 +345,15 @@ __kernel void composite_rays(
 #pragma unroll
 #endif
             for (int sample = 0; sample < AT_ONCE; ++sample) {
-                const float number = n + (float)sample;
-                opacity[sample] = find_opacity(&f, &stack, &look, &course, &rays, number, inner, &node[sample]);
-                together = greater(together, opacity[sample]);
+                node[sample] = find_node(&f, &stack, &look, &course, &rays, n + (float)sample, inner);
+                may_show |= (node[sample] >= first_shown) & (node[sample] <= last_shown);
             }
-            shows = ANY_LANE((together > 0.0f) & (n < end));
+            shows = ANY_LANE(may_show & (n < end));
             if (shows) {
                 for (int sample = 0; sample < AT_ONCE; ++sample) {
                     const float number = n + (float)sample;
-                    const floats seen_here = choose(number < end, opacity[sample], (floats)(0.0f));
+                    const floats opacity = find_opacity(&f, &stack, &look, &course, &rays, number, inner, node[sample]);
+                    const floats seen_here = choose(number < end, opacity, (floats)(0.0f));
                     if (ANY_LANE(seen_here > 0.0f)) {
                         blend_samples(
                             &f, &stack, &look, &course, &rays, number, inner, node[sample], seen_here, &seen);
