@@ -8,13 +8,14 @@
 
 #define HIGHLIGHTS 1024 /* entries of a table of specular * cosine ^ power: library powers take 0.2 us on CPU drivers */
 
-/* Highlight of LANES cosines of 0 to 1: specular * cosine ^ power. */
-static inline floats find_highlight(const float4 phong, __global const float *highlights, const floats cosine)
+/* Highlight of LANES cosines of 0 to 1, and their squares: specular * cosine ^ power. */
+static inline floats find_highlight(
+    const float4 phong, __global const float *highlights, const floats cosine, const floats cosine_squared)
 {
     const int power = (int)phong.w;
     if ((float)power == phong.w) { /* squares are faster than a table */
-        floats result = phong.z, square = cosine;
-        for (int bits = power; bits > 0; bits >>= 1) {
+        floats result = power & 1 ? phong.z * cosine : (floats)(phong.z), square = cosine_squared;
+        for (int bits = power >> 1; bits > 0; bits >>= 1) {
             result = bits & 1 ? result * square : result;
             square = square * square;
         }
@@ -71,22 +72,25 @@ static inline void find_light(__global const float4 *view, __global const float 
     const floats direction_z, floats *share, floats *highlight)
 {
     const float4 phong = view[VIEW_PHONG], fixed_light = view[VIEW_LIGHT];
-    const floats size = x * x + y * y + z * z;
-    const floats per_size = 1.0f / sqrt(greater(size, (floats)(1e-12f)));
-    floats cosine, middle;
+    const floats size = x * x + y * y + z * z, divisor = greater(size, (floats)(1e-12f));
+    floats cosine_squared, middle_squared;
     if (fixed_light.w > 0.0f) {
-        cosine = fabs(x * fixed_light.x + y * fixed_light.y + z * fixed_light.z) * per_size;
+        const floats along = x * fixed_light.x + y * fixed_light.y + z * fixed_light.z;
+        cosine_squared = along * along / divisor;
         const floats half_x = fixed_light.x - direction_x, half_y = fixed_light.y - direction_y;
         const floats half_z = fixed_light.z - direction_z;
         const floats length_squared = greater(half_x * half_x + half_y * half_y + half_z * half_z, (floats)(1e-12f));
-        middle = fabs(x * half_x + y * half_y + z * half_z) * per_size / sqrt(length_squared);
+        const floats half_way = x * half_x + y * half_y + z * half_z;
+        middle_squared = lesser(half_way * half_way / (divisor * length_squared), (floats)(1.0f));
     } else {
-        cosine = fabs(x * direction_x + y * direction_y + z * direction_z) * per_size;
-        middle = cosine;
+        const floats along = x * direction_x + y * direction_y + z * direction_z;
+        cosine_squared = along * along / divisor;
+        middle_squared = lesser(cosine_squared, (floats)(1.0f));
     }
+    const floats cosine = sqrt(cosine_squared);
     const floats certain = size / (size + view[VIEW_NEAR].z);
     *share = phong.x + phong.y * (1.0f + certain * (cosine - 1.0f));
-    *highlight = certain * find_highlight(phong, highlights, lesser(middle, (floats)(1.0f)));
+    *highlight = certain * find_highlight(phong, highlights, sqrt(middle_squared), middle_squared);
 }
 
 #endif
