@@ -50,26 +50,49 @@ static inline floats count_to_face(
 #endif
 }
 
-/* Samples from number n of each ray on that lie in bricks with none that shows less than `margin` bricks further; 0 where
- * that is not so from the beginning.  Beyond the bricks counts the nearest one. */
+/* Places of LANES rays, k from the first slice of the buffer, the bricks that they lie in, and how many bricks around
+ * those show nothing: 0 where they do themselves. */
+typedef struct {
+    floats i, j, k;
+    ints brick_i, brick_j, brick_k, distance;
+} brick_lanes;
+
+/* Bricks of sample n of each ray; beyond the bricks counts the nearest one.  With `margin` what shows is taken to be so
+ * many bricks nearer. */
+static inline void find_bricks(const leap_map *map, const slice_stack *stack, const ray_lanes *rays, const floats n,
+    const int first_k, const int margin, brick_lanes *b)
+{
+    const float bricks_per_k = 1.0f / (float)map->cells_k;
+    b->i = rays->start_i + n * rays->stride_i;
+    b->j = rays->start_j + n * rays->stride_j;
+    b->k = rays->start_k + n * rays->stride_k;
+    to_indices(stack, &b->i, &b->j, &b->k);
+    b->k -= (float)first_k;
+    b->brick_i = lesser_int(greater_int(to_ints(b->i * BRICKS_PER_CELL), (ints)(0)), (ints)(map->bi - 1));
+    b->brick_j = lesser_int(greater_int(to_ints(b->j * BRICKS_PER_CELL), (ints)(0)), (ints)(map->bj - 1));
+    b->brick_k = lesser_int(greater_int(to_ints(b->k * bricks_per_k), (ints)(0)), (ints)(map->bk - 1));
+    const ints at = (b->brick_k * map->bj + b->brick_j) * map->bi + b->brick_i;
+    b->distance = (ints)(GATHER(uchar, map->distances, at)) - margin;
+}
+
+/* Samples of each ray to the faces of the cube of empty bricks around it, a fraction; not above 0 where it is in none. */
+static inline floats count_to_faces(const leap_map *map, const ray_lanes *rays, const brick_lanes *b)
+{
+    return lesser(
+        lesser(count_to_face(b->i, rays->stride_i, rays->pace_i, b->brick_i, b->distance, BRICK_CELLS),
+            count_to_face(b->j, rays->stride_j, rays->pace_j, b->brick_j, b->distance, BRICK_CELLS)),
+        count_to_face(b->k, rays->stride_k, rays->pace_k, b->brick_k, b->distance, map->cells_k));
+}
+
+/* Samples from number n of each ray on that lie in bricks with none that shows less than `margin` bricks further; 0
+ * where that is not so from the beginning. */
 static inline floats count_free_steps(const leap_map *map, const slice_stack *stack, const ray_lanes *rays,
     const floats n, const int first_k, const int margin)
 {
-    const float bricks_per_k = 1.0f / (float)map->cells_k;
-    floats i = rays->start_i + n * rays->stride_i, j = rays->start_j + n * rays->stride_j;
-    floats k = rays->start_k + n * rays->stride_k;
-    to_indices(stack, &i, &j, &k);
-    k -= (float)first_k;
-    const ints brick_i = lesser_int(greater_int(to_ints(i * BRICKS_PER_CELL), (ints)(0)), (ints)(map->bi - 1));
-    const ints brick_j = lesser_int(greater_int(to_ints(j * BRICKS_PER_CELL), (ints)(0)), (ints)(map->bj - 1));
-    const ints brick_k = lesser_int(greater_int(to_ints(k * bricks_per_k), (ints)(0)), (ints)(map->bk - 1));
-    const ints at = (brick_k * map->bj + brick_j) * map->bi + brick_i;
-    const ints distance = (ints)(GATHER(uchar, map->distances, at)) - margin;
-    /* The cube of bricks less than `distance` away is empty. */
-    const floats steps = lesser(lesser(count_to_face(i, rays->stride_i, rays->pace_i, brick_i, distance, BRICK_CELLS),
-                                 count_to_face(j, rays->stride_j, rays->pace_j, brick_j, distance, BRICK_CELLS)),
-        count_to_face(k, rays->stride_k, rays->pace_k, brick_k, distance, map->cells_k));
-    return choose(distance > 0, greater(round_up(steps), (floats)(1.0f)), (floats)(0.0f));
+    brick_lanes b;
+    find_bricks(map, stack, rays, n, first_k, margin, &b);
+    const floats steps = round_up(count_to_faces(map, rays, &b));
+    return choose(b.distance > 0, greater(steps, (floats)(1.0f)), (floats)(0.0f));
 }
 
 /* True where the brick of a place shows something; k counts from the first slice of the buffer. */

@@ -323,11 +323,13 @@ __kernel void composite_rays(
     while (ANY_LANE(n < end)) {
         if (!shows) {
             /* The last sample of a ray lies before its place in the row. */
-            const floats here = lesser((floats)(n), rays.last_number);
-            const floats all_free = count_free_steps(&map, &stack, &course, here, first_k, 0);
-            const float free = LEAST_LANE(choose(n < end, greater(all_free, rays.begin - n), (floats)(MAXFLOAT)));
-            if (free > 0.0f) {
-                n += free;
+            brick_lanes bricks;
+            find_bricks(&map, &stack, &course, lesser((floats)(n), rays.last_number), first_k, 0, &bricks);
+            if (!ANY_LANE((n < end) & (n >= rays.begin) & (bricks.distance == 0))) {
+                const floats free = greater(count_to_faces(&map, &course, &bricks), rays.begin - n);
+                const float least = LEAST_LANE(choose(n < end, free, (floats)(MAXFLOAT)));
+                const int whole = (int)least;
+                n += (float)max(whole + ((float)whole < least), 1);
                 continue;
             }
         }
