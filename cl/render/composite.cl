@@ -346,6 +346,10 @@ __kernel void composite_rays(
 #if LANES == 1
 #pragma unroll
 #endif
+            /* Whether one of some samples may show is decided once: their loads need not wait for each other. */
+#if LANES == 1
+#pragma unroll
+#endif
             for (int sample = 0; sample < AT_ONCE; ++sample) {
                 node[sample] = find_node(&f, &stack, &look, &course, &rays, n + (float)sample, inner);
                 may_show |= (node[sample] >= first_shown) & (node[sample] <= last_shown);
