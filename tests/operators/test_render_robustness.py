@@ -164,8 +164,9 @@ def test_a_device_that_is_too_small_is_named(device, monkeypatch):
     small = clrecon.render(body(), size=(8, 8), device=device)  # in slabs
     monkeypatch.undo()
     assert small.report["slabs"] > 1
-    # Past the largest picture of 16384 x 16384 pixels nothing is taken before the sum is known.
-    with pytest.raises(DeviceError, match="picture"):
+    # Of the largest picture of 16384 x 16384 pixels nothing is taken before the sum is known; which buffer is too large
+    # by itself depends on the device, and PoCL's largest on the memory that is free when it starts.
+    with pytest.raises(DeviceError, match="picture|states of the rays"):
         clrecon.render(body(), size=(16384, 16384), device=device, memory=1 << 28)
 
 
