@@ -7,6 +7,7 @@
 
 #define BRICK_CELLS 4 /* of a brick along i and j; it reads a voxel more */
 #define BRICKS_PER_CELL (1.0f / BRICK_CELLS)
+#define FARTHEST 15 /* bricks that a leap goes at most */
 
 typedef struct {
     __global const uchar *distances; /* (bk, bj, bi) in bricks, 0 where something shows */
@@ -50,17 +51,16 @@ static inline floats count_to_face(
 #endif
 }
 
-/* Places of LANES rays, k from the first slice of the buffer, the bricks that they lie in, and how many bricks around
- * those show nothing: 0 where they do themselves. */
+/* Places of LANES rays, k from the first slice of the buffer, the bricks that they lie in, and how far off in bricks the
+ * nearest one that shows is: 0 where they do themselves. */
 typedef struct {
     floats i, j, k;
     ints brick_i, brick_j, brick_k, distance;
 } brick_lanes;
 
-/* Bricks of sample n of each ray; beyond the bricks counts the nearest one.  With `margin` what shows is taken to be so
- * many bricks nearer. */
-static inline void find_bricks(const leap_map *map, const slice_stack *stack, const ray_lanes *rays, const floats n,
-    const int first_k, const int margin, brick_lanes *b)
+/* Bricks that sample n of each ray lies in, and their places in the map; beyond the bricks counts the nearest one. */
+static inline ints place_bricks(const leap_map *map, const slice_stack *stack, const ray_lanes *rays, const floats n,
+    const int first_k, brick_lanes *b)
 {
     const float bricks_per_k = 1.0f / (float)map->cells_k;
     b->i = rays->start_i + n * rays->stride_i;
@@ -71,17 +71,18 @@ static inline void find_bricks(const leap_map *map, const slice_stack *stack, co
     b->brick_i = lesser_int(greater_int(to_ints(b->i * BRICKS_PER_CELL), (ints)(0)), (ints)(map->bi - 1));
     b->brick_j = lesser_int(greater_int(to_ints(b->j * BRICKS_PER_CELL), (ints)(0)), (ints)(map->bj - 1));
     b->brick_k = lesser_int(greater_int(to_ints(b->k * bricks_per_k), (ints)(0)), (ints)(map->bk - 1));
-    const ints at = (b->brick_k * map->bj + b->brick_j) * map->bi + b->brick_i;
-    b->distance = (ints)(GATHER(uchar, map->distances, at)) - margin;
+    return (b->brick_k * map->bj + b->brick_j) * map->bi + b->brick_i;
 }
 
-/* Samples of each ray to the faces of the cube of empty bricks around it, a fraction; not above 0 where it is in none. */
+/* Samples of each ray to the faces of the cube of empty bricks around it, a fraction; 0 where it is in none. */
 static inline floats count_to_faces(const leap_map *map, const ray_lanes *rays, const brick_lanes *b)
 {
-    return lesser(
+    const floats steps = lesser(
         lesser(count_to_face(b->i, rays->stride_i, rays->pace_i, b->brick_i, b->distance, BRICK_CELLS),
             count_to_face(b->j, rays->stride_j, rays->pace_j, b->brick_j, b->distance, BRICK_CELLS)),
         count_to_face(b->k, rays->stride_k, rays->pace_k, b->brick_k, b->distance, map->cells_k));
+    /* Half a voxel before the first brick, which belongs to it, a face lies ahead of what shows too. */
+    return choose(b->distance > 0, steps, (floats)(0.0f));
 }
 
 /* Samples from number n of each ray on that lie in bricks with none that shows less than `margin` bricks further; 0
@@ -90,7 +91,8 @@ static inline floats count_free_steps(const leap_map *map, const slice_stack *st
     const floats n, const int first_k, const int margin)
 {
     brick_lanes b;
-    find_bricks(map, stack, rays, n, first_k, margin, &b);
+    const ints at = place_bricks(map, stack, rays, n, first_k, &b);
+    b.distance = (ints)(GATHER(uchar, map->distances, at)) - margin;
     const floats steps = round_up(count_to_faces(map, rays, &b));
     return choose(b.distance > 0, greater(steps, (floats)(1.0f)), (floats)(0.0f));
 }

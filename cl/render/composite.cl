@@ -2,7 +2,7 @@
  *
  * References: Levoy 1988, "Display of surfaces from volume data" (shading, opacity by gradient); Max 1995, "Optical
  * models for direct volume rendering" (opacity of a segment).  Empty space is leapt over with a map of Chebyshev
- * distances (Cohen and Sheffer 1994, "Proximity clouds").
+ * distances (Cohen and Sheffer 1994, "Proximity clouds") and of what lies ahead.
  *
  * A work-item has a packet of LANES neighbouring rays that go on together, sample by sample: they leap as far as all of
  * them may, and what they do next is decided once for all of them.
@@ -15,6 +15,7 @@
 #include "include/jitter.h"
 #include "include/label_color.h"
 #include "include/leap.h"
+#include "include/look_ahead.h"
 #include "include/phong.h"
 #include "include/ray_packet.h"
 #include "include/stack.h"
@@ -248,7 +249,7 @@ static inline void load_sights(__global const float4 *states, const int2 first_p
 }
 
 /* Parameters  voxels   in   (slices, nj, ni)
- *             leaps    in   (bk, bj, bi) Chebyshev distance in bricks to what shows, 0: shows
+ *             ways     in   (bk, bj, bi) how far nothing shows, see include/look_ahead.h
  *             colors opacities factors  in  (NODES), (NODES), (GRADIENT_NODES) see looks
  *             highlights in (HIGHLIGHTS) see include/phong.h
  *             entries  in   (tile rows, tile columns) t before which nothing shows, MAXFLOAT: nothing does
@@ -262,6 +263,7 @@ static inline void load_sights(__global const float4 *states, const int2 first_p
  *                      slab_low <= k < slab_high are this slab's
  *             bi bj bk bricks, cells_k of each along k
  *             low scale first_shown last_shown factor_scale steps_per_unit  see looks
+ *             main_axis ahead eye aside   see main_way
  *             jitter   samples at random places of their segments
  *             stage    FIRST_SLAB and LAST_SLAB, see include/view.h
  *             with LABELS those of the buffer's slices, and the table of include/label_color.h
@@ -269,7 +271,7 @@ static inline void load_sights(__global const float4 *states, const int2 first_p
  * Launch      global = tiles * 64 / LANES rounded up by the host, any local
  * Guarantees  every pixel of image, depths and means is written with the last slab */
 __kernel void composite_rays(
-    __global const VOXEL *restrict voxels, __global const uchar *restrict leaps,
+    __global const VOXEL *restrict voxels, __global const uchar *restrict ways,
     __global const int *restrict colors, __global const float *restrict opacities,
     __global const float *restrict factors, __global const float *restrict highlights,
     __global const float *restrict entries, __global const float4 *restrict view,
@@ -279,12 +281,14 @@ __kernel void composite_rays(
     const float slab_high, const int bi, const int bj, const int bk, const int cells_k, const float low,
     const float scale, const int first_shown, const int last_shown, const float factor_scale,
     const float steps_per_unit, const uint width, const uint height, const uint planes, const int perspective,
-    const int shaded, const int jitter, const int stage, const uint queues
+    const int shaded, const int jitter, const int stage, const uint queues, const int main_axis, const int ahead, const float4 eye,
+    const float aside
     LABEL_PARAMETERS STACK_PARAMETERS)
 {
     const uint first_pixel = (uint)get_global_id(0) * LANES;
     const field f = { voxels, ni, nj, first_k, end_k, last_place };
-    const leap_map map = { leaps, bi, bj, bk, cells_k };
+    const leap_map map = { ways, bi, bj, bk, cells_k };
+    const main_way way = { main_axis, ahead, eye, aside };
     const slice_stack stack = STACK_TABLE;
     const float ray_step = view[VIEW_NEAR].y;
     const looks look = { colors, opacities, highlights, factors, view, low, scale, factor_scale, steps_per_unit,
@@ -324,10 +328,15 @@ __kernel void composite_rays(
         if (!shows) {
             /* The last sample of a ray lies before its place in the row. */
             brick_lanes bricks;
-            find_bricks(&map, &stack, &course, lesser((floats)(n), rays.last_number), first_k, 0, &bricks);
+            const ints at
+                = place_bricks(&map, &stack, &course, lesser((floats)(n), rays.last_number), first_k, &bricks);
+            const ints seen_from_here = (ints)(GATHER(uchar, ways, at));
+            bricks.distance = DISTANCE_OF(seen_from_here);
             if (!ANY_LANE((n < end) & (n >= rays.begin) & (bricks.distance == 0))) {
-                const floats free = greater(count_to_faces(&map, &course, &bricks), rays.begin - n);
-                const float least = LEAST_LANE(choose(n < end, free, (floats)(MAXFLOAT)));
+                const floats free = greater(count_to_faces(&map, &course, &bricks),
+                    count_ahead(&map, &way, &course, &bricks, AHEAD_OF(seen_from_here)));
+                const floats leap = greater(free, rays.begin - n);
+                const float least = LEAST_LANE(choose(n < end, leap, (floats)(MAXFLOAT)));
                 const int whole = (int)least;
                 n += (float)max(whole + ((float)whole < least), 1);
                 continue;

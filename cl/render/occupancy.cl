@@ -4,11 +4,11 @@
  *   1. measure_cells     once a volume: lowest and highest value that a sample in a brick can have
  *   2. mark_bricks       once a transfer function
  *   3. spread_in_rows    along i, and
- *   4. spread_along      along j and along k: a separable Chebyshev distance transform */
+ *   4. spread_along      along j and along k: a separable Chebyshev distance transform
+ *   5. look_ahead        once a picture: how far the way is free in the direction of its rays */
 #include "include/leap.h"
+#include "include/look_ahead.h"
 #include "include/volume.h"
-
-#define FARTHEST 15 /* bricks: to leap further takes longer to prepare than it saves */
 
 #define VOXEL4 CLRECON_VECTOR(VOXEL, 4)
 
@@ -155,5 +155,39 @@ __kernel void spread_along(
                 best = min(best, max(way, (int)from[here + (size_t)way * stride]));
         }
         to[here] = (uchar)best;
+    }
+}
+
+/* Parameters  distances  in   (bk, bj, bi) as spread_along() left them
+ *             ways       out  (bk, bj, bi) see include/look_ahead.h: the same in the low four bits; in the high ones for
+ *                             how many bricks ahead, the own one counted, nothing shows in its row and in those beside it
+ *                             that rays through it drift to.  Beyond the last brick nothing does
+ *             main_axis ahead eye aside   see main_way
+ * Launch      global = rows of bricks along the main axis rounded up by the host, any local
+ * Guarantees  every way is written */
+__kernel void look_ahead(
+    __global const uchar *restrict distances, __global uchar *restrict ways, const int bi, const int bj, const int bk,
+    const int main_axis, const int ahead, const float4 eye, const float aside)
+{
+    const main_way way = { main_axis, ahead, eye, aside };
+    /* Axes: the main one, and u and v across it. */
+    const int count = main_axis == 0 ? bi : main_axis == 1 ? bj : bk;
+    const int count_u = main_axis == 0 ? bj : bi, count_v = main_axis == 2 ? bj : bk;
+    const int stride = main_axis == 0 ? 1 : main_axis == 1 ? bi : bi * bj;
+    const int stride_u = main_axis == 0 ? bi : 1, stride_v = main_axis == 2 ? bi : bi * bj;
+    const uint row = get_global_id(0);
+    if (row >= (uint)count_u * (uint)count_v)
+        return;
+    const int u = (int)(row % (uint)count_u), v = (int)(row / (uint)count_u);
+    const int beside_u = find_beside(&way, u, main_axis == 0 ? eye.y : eye.x, count_u);
+    const int beside_v = find_beside(&way, v, main_axis == 2 ? eye.y : eye.z, count_v);
+    const int here = u * stride_u + v * stride_v, to_u = (beside_u - u) * stride_u, to_v = (beside_v - v) * stride_v;
+    int free = FARTHEST;
+    for (int n = 0; n < count; ++n) {
+        const int brick = ahead > 0 ? count - 1 - n : n;
+        __global const uchar *row = distances + (size_t)brick * stride + here;
+        const int is_free = row[0] > 0 && row[to_u] > 0 && row[to_v] > 0 && row[to_u + to_v] > 0;
+        free = is_free ? LESSER(free + 1, FARTHEST) : 0;
+        ways[(size_t)brick * stride + here] = (uchar)(free << 4 | row[0]);
     }
 }

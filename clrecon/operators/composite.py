@@ -9,11 +9,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from clrecon.geometry.camera import Camera
 from clrecon.kernels import Stopwatch, allocate, launch, upload
 from clrecon.labels.resample import ResampledLabels
 from clrecon.opencl import Device
 from clrecon.operators.pictures import PictureBuffers, count_queues, highlight_table
-from clrecon.operators.ray_view import RayView
+from clrecon.operators.ray_view import FieldFrame, RayView
 from clrecon.operators.resident import FARTHEST, LeapMap, RaySlab, ResidentVolume, pad_slices
 from clrecon.operators.voxel_types import label_variants
 from clrecon.rendering import Lighting, TransferFunction
@@ -26,6 +27,9 @@ NODES = 4096
 
 GRADIENT_NODES = 256
 """Entries of its table of factors by magnitude of the gradient."""
+
+LEAST_DRIFT = 0.02
+"""Bricks aside for each brick ahead that rays drift: with less they stay in a row of bricks for long."""
 
 LOWEST_LOG = -1000.0
 """log2 of what an opaque sample lets through: 0 in float32, and no infinity that a length of 0 would make NaN."""
@@ -90,6 +94,48 @@ class TransferTables:
         )  # fmt: skip
 
 
+@dataclass(frozen=True)
+class MainWay:
+    """The direction that most rays of a picture have among the bricks of a slab.
+
+    Attributes
+    ----------
+    axis : int
+        0, 1 or 2 for i, j or k.
+    ahead : int
+        1 or -1: the direction along it.
+    eye : ndarray, shape (4,), float32
+        The camera in bricks, and 1; or the direction of all rays in bricks, 1 along `axis`, and 0.
+    aside : float
+        Bricks off the camera, or aside for each brick ahead, from which on rays count as drifting aside.
+    """
+
+    axis: int
+    ahead: int
+    eye: NDArray[np.float32]
+    aside: float
+
+    @classmethod
+    def of(cls, resident: ResidentVolume, slab: RaySlab, camera: Camera) -> MainWay:
+        """That of the ray in the middle."""
+        frame, cells = FieldFrame.of(resident.volume), np.array(slab.brick_cells, np.float64)
+        forward = frame.matrix @ camera.basis().forward / cells
+        axis = int(np.argmax(np.abs(forward)))
+        ahead = 1 if forward[axis] > 0.0 else -1
+        if camera.is_parallel:
+            eye, aside = np.append(forward / np.abs(forward).max(), 0.0), LEAST_DRIFT
+        else:
+            place = (frame.places(np.array([camera.position]))[0] - (0.0, 0.0, slab.first_k)) / cells
+            nearest = -ahead * place[axis] if ahead > 0 else place[axis] - slab.bricks[axis]
+            eye, aside = np.append(place, 1.0), max(LEAST_DRIFT * nearest, 0.5)
+        return cls(axis, ahead, eye.astype(np.float32), aside)
+
+    @property
+    def arguments(self) -> tuple[Any, ...]:
+        """How kernels are told of it."""
+        return np.int32(self.axis), np.int32(self.ahead), self.eye, np.float32(self.aside)
+
+
 def composite_slab(
     resident: ResidentVolume,
     slab: RaySlab,
@@ -131,9 +177,11 @@ def composite_slab(
     last = np.array([n - 1 for n in resident.volume.shape_ijk] + [0], dtype=np.float32)
     with stopwatch.running(device):  # to its end: CPU devices read the arrays of the host that end here
         entries_d = _enter_tiles(resident, slab, view, leaps, output, stopwatch)
+        way = MainWay.of(resident, slab, view.camera)
+        ways_d = _look_ahead(resident, slab, way, leaps, stopwatch)
         launch(
             device, program["composite_rays"], output.items(queues, lanes),
-            slab.voxels_d, leaps.distances_d, tables.colors_d, tables.opacities_d, tables.factors_d,
+            slab.voxels_d, ways_d, tables.colors_d, tables.opacities_d, tables.factors_d,
             upload(device, highlight_table(lighting)), entries_d, upload(device, view.table), output.states_d,
             output.image_d, output.depths_d, output.means_d, output.background, last, resident.stack.slope,
             np.int32(slab.shape_ijk[0]), np.int32(slab.shape_ijk[1]), np.int32(slab.first_k), np.int32(slab.end_k),
@@ -141,7 +189,7 @@ def composite_slab(
             np.float32(tables.low), np.float32(tables.scale), *tables.shown_ends, np.float32(tables.factor_scale),
             np.float32(tables.steps_per_unit), np.uint32(width), np.uint32(height),
             np.uint32(view.planes), np.int32(not view.camera.is_parallel), np.int32(lighting.shades), np.int32(jitter),
-            np.int32(slab.stage), np.uint32(queues), *label_tables, *resident.stack.arguments,
+            np.int32(slab.stage), np.uint32(queues), *way.arguments, *label_tables, *resident.stack.arguments,
             stopwatch=stopwatch,
         )  # fmt: skip
 
@@ -168,3 +216,15 @@ def _enter_tiles(
         stopwatch=stopwatch,
     )  # fmt: skip
     return entries_d
+
+
+def _look_ahead(resident: ResidentVolume, slab: RaySlab, way: MainWay, leaps: LeapMap, stopwatch: Stopwatch) -> Any:
+    """For each brick how far nothing shows around it, and ahead of it along the main way, on the device."""
+    bricks = slab.bricks
+    count = math.prod(bricks)
+    ways_d = allocate(resident.device, count)
+    launch(
+        resident.device, resident.program("render/occupancy.cl")["look_ahead"], count // bricks[way.axis],
+        leaps.distances_d, ways_d, *(np.int32(n) for n in bricks), *way.arguments, stopwatch=stopwatch,
+    )  # fmt: skip
+    return ways_d

@@ -34,7 +34,7 @@ BRICK_CELLS = 4
 """Cells of a brick along i and j, as in cl/include/leap.h."""
 
 FARTHEST = 15
-"""Bricks that a leap goes at most, as in cl/render/occupancy.cl: with that as its margin none is left."""
+"""Bricks that a leap goes at most, as in cl/include/leap.h: with that as its margin none is left."""
 
 
 def choose_brick_cells(volume: Volume) -> tuple[int, int, int]:
@@ -176,7 +176,7 @@ class ResidentVolume:
         ni, nj, _ = (max(2, n) for n in self.volume.shape_ijk)
         bricks = math.prod(-(-n // c) for n, c in zip((ni, nj, max(2, slices)), self.brick_cells, strict=True))
         size = self.dtype.itemsize
-        return {"volume": ni * nj * max(2, slices) * size, "bricks": bricks * (2 * size + 3)}
+        return {"volume": ni * nj * max(2, slices) * size, "bricks": bricks * (2 * size + 4)}
 
     def plan(self, others: dict[str, int], extra: dict[str, int], beside: int = 0) -> int:
         """Slices a slab, all where everything fits.

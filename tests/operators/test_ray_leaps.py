@@ -113,6 +113,51 @@ def test_scattered_voxels_from_anywhere(device, monkeypatch, uneven):
     assert shown > 20
 
 
+def larger(rng, affine) -> Volume:
+    """Bright voxels, rows and slices, with room for rows of bricks between them."""
+    voxels = np.zeros(rng.integers(20, 120, 3), np.int16)
+    for number in range(8):
+        at: list = [int(rng.integers(0, n)) for n in voxels.shape]
+        if number % 2:
+            at[rng.integers(3)] = slice(None)
+        voxels[tuple(at)] = 1000
+    return Volume(voxels, affine)
+
+
+def scene(seed: int):
+    """A volume, a camera near it or looking along one of its axes, and settings."""
+    rng = np.random.default_rng(seed)
+    volume = scattered(rng, False)
+    if seed % 2:
+        volume = larger(rng, volume.affine)
+    ends = volume.ijk_to_lps([np.zeros(3), np.array(volume.shape_ijk) - 1.0])
+    radius = 0.6 * float(np.linalg.norm(ends[1] - ends[0]))
+    towards = rng.normal(size=3)
+    if seed % 5 < 2:
+        axis = volume.affine[:3, rng.integers(3)] * rng.choice([-1, 1])
+        towards = 0.05 * (seed % 5) * towards + axis / np.linalg.norm(axis)
+    middle = ends.mean(axis=0)
+    position = tuple(middle - towards / np.linalg.norm(towards) * radius * rng.uniform(0.02, 3.0))
+    lens = {"parallel_scale": radius} if seed % 3 == 0 else {"view_angle": float(rng.choice([20.0, 60.0, 150.0]))}
+    camera = Camera(position, tuple(middle), tuple(rng.normal(size=3)), **lens)
+    return volume, camera, {"size": (48, 35), "ray_step": radius * 10.0 ** rng.uniform(-2.3, -0.5)}
+
+
+# Scenes that lost something once: what shows half a voxel before the first brick, rows beside one that end sooner.
+LOST_ONCE = (4406, 7282, 8362, 9701, 13084)
+
+
+def test_what_is_free_ahead_hides_nothing(device, monkeypatch):
+    shown = 0
+    for seed in (*range(200), *LOST_ONCE):
+        volume, camera, settings = scene(seed)
+        whole = take_every_sample(monkeypatch, volume, device, camera, **settings)
+        if (whole.image[..., 3] > 0).any():
+            shown += 1
+            assert_same(take(volume, device, camera, **settings), whole)
+    assert shown > 100
+
+
 @pytest.mark.oclgrind
 def test_what_is_opaque_is_so_in_the_shortest_last_segment(device):
     voxels = np.zeros((20, 6, 6), np.int16)
