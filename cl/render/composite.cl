@@ -346,14 +346,10 @@ __kernel void composite_rays(
             ints node[AT_ONCE], may_show = 0;
             const int inner = HAS_INNER && n >= rays.inner_begin && n + (float)AT_ONCE <= rays.inner_end;
 #if HAS_INNER
-            const float ahead = n + SAMPLES_AHEAD;
-            if (inner && ahead < rays.inner_end)
-                fetch_cell_early(&f, course.start_i.s0 + ahead * course.stride_i.s0,
-                    course.start_j.s0 + ahead * course.stride_j.s0, course.start_k.s0 + ahead * course.stride_k.s0);
-#endif
-            /* Whether one of some samples shows is decided once: their loads need not wait for each other. */
-#if LANES == 1
-#pragma unroll
+            const float early = n + SAMPLES_AHEAD;
+            if (inner && early < rays.inner_end)
+                fetch_cell_early(&f, course.start_i.s0 + early * course.stride_i.s0,
+                    course.start_j.s0 + early * course.stride_j.s0, course.start_k.s0 + early * course.stride_k.s0);
 #endif
             /* Whether one of some samples may show is decided once: their loads need not wait for each other. */
 #if LANES == 1

@@ -126,7 +126,7 @@ class MainWay:
             eye, aside = np.append(forward / np.abs(forward).max(), 0.0), LEAST_DRIFT
         else:
             place = (frame.places(np.array([camera.position]))[0] - (0.0, 0.0, slab.first_k)) / cells
-            nearest = -ahead * place[axis] if ahead > 0 else place[axis] - slab.bricks[axis]
+            nearest = -place[axis] if ahead > 0 else place[axis] - slab.bricks[axis]  # brick on the way
             eye, aside = np.append(place, 1.0), max(LEAST_DRIFT * nearest, 0.5)
         return cls(axis, ahead, eye.astype(np.float32), aside)
 
