@@ -10,6 +10,8 @@
 #include "include/look_ahead.h"
 #include "include/volume.h"
 
+#define ROWS_AT_ONCE 4
+
 #define VOXEL4 CLRECON_VECTOR(VOXEL, 4)
 
 typedef VOXEL4 some_voxels __attribute__((aligned(sizeof(VOXEL))));
@@ -88,24 +90,33 @@ __kernel void mark_bricks(
 
 /* Parameters  from   in   (rows, bi) 0 or FARTHEST
  *             to     out  (rows, bi) distance along the row
- * Launch      global = rows rounded up by the host, any local
+ * Launch      global = rows / ROWS_AT_ONCE rounded up by the host, any local
  * Guarantees  every distance is written, none above FARTHEST */
 __kernel void spread_in_rows(
     __global const uchar *restrict from, __global uchar *restrict to, const int bi, const uint rows)
 {
-    const uint row = get_global_id(0);
-    if (row >= rows)
+    const uint first = (uint)get_global_id(0) * ROWS_AT_ONCE;
+    if (first >= rows)
         return;
-    __global const uchar *own = from + (size_t)row * bi;
-    __global uchar *out = to + (size_t)row * bi;
-    int distance = FARTHEST;
+    /* Each step waits for the one before it: other rows have some meanwhile.  The last item may take its last row twice. */
+    const size_t begin_0 = (size_t)first * bi, begin_1 = (size_t)LESSER(first + 1, rows - 1) * bi;
+    const size_t begin_2 = (size_t)LESSER(first + 2, rows - 1) * bi, begin_3 = (size_t)LESSER(first + 3, rows - 1) * bi;
+    int4 distance = FARTHEST;
     for (int i = 0; i < bi; ++i) {
-        distance = LESSER(distance + 1, (int)own[i]);
-        out[i] = (uchar)distance;
+        const int4 own = (int4)(from[begin_0 + i], from[begin_1 + i], from[begin_2 + i], from[begin_3 + i]);
+        distance = LESSER(distance + 1, own);
+        to[begin_0 + i] = (uchar)distance.x;
+        to[begin_1 + i] = (uchar)distance.y;
+        to[begin_2 + i] = (uchar)distance.z;
+        to[begin_3 + i] = (uchar)distance.w;
     }
     for (int i = bi - 1; i >= 0; --i) {
-        distance = LESSER(distance + 1, (int)out[i]);
-        out[i] = (uchar)distance;
+        const int4 own = (int4)(to[begin_0 + i], to[begin_1 + i], to[begin_2 + i], to[begin_3 + i]);
+        distance = LESSER(distance + 1, own);
+        to[begin_0 + i] = (uchar)distance.x;
+        to[begin_1 + i] = (uchar)distance.y;
+        to[begin_2 + i] = (uchar)distance.z;
+        to[begin_3 + i] = (uchar)distance.w;
     }
 }
 

@@ -37,6 +37,10 @@ FARTHEST = 15
 """Bricks that a leap goes at most, as in cl/include/leap.h: with that as its margin none is left."""
 
 
+ROWS_AT_ONCE = 4
+"""Rows of bricks that a work-item takes, as in cl/render/occupancy.cl."""
+
+
 def choose_brick_cells(volume: Volume) -> tuple[int, int, int]:
     """Cells of a brick along i, j and k: fewer along k where slices lie farther apart than voxels in them."""
     di, dj, dk = volume.spacing
@@ -294,10 +298,9 @@ class ResidentVolume:
             ranges_d, counts_d, from_d, np.float32(low), np.float32(scale), np.int32(len(shown)), np.uint32(bricks),
             stopwatch=stopwatch,
         )  # fmt: skip
-        marked = download(device, np.empty((bk, bj, bi), np.uint8), from_d) == 0
         launch(
-            device, program["spread_in_rows"], bj * bk, from_d, to_d, np.int32(bi), np.uint32(bj * bk),
-            stopwatch=stopwatch,
+            device, program["spread_in_rows"], -(-bj * bk // ROWS_AT_ONCE),
+            from_d, to_d, np.int32(bi), np.uint32(bj * bk), stopwatch=stopwatch,
         )  # fmt: skip
         for outer, count, stride in ((bk, bj, bi), (1, bk, bi * bj)):
             from_d, to_d = to_d, from_d
@@ -310,17 +313,19 @@ class ResidentVolume:
             )  # fmt: skip
         from_d = to_d
         slab.maps.clear()  # one a slab: a map is made in some milliseconds
+        marked = download(device, np.empty((bk, bj, bi), np.uint8), from_d) == 0
         made = slab.maps[key] = LeapMap(from_d, self._find_box(marked, slab))
         return made
 
     def _find_box(self, marked: NDArray[np.bool_], slab: RaySlab) -> tuple[Float64Array, Float64Array] | None:
         ends = []
-        for axis in (2, 1, 0):
-            others = tuple(other for other in range(3) if other != axis)
-            where = np.flatnonzero(marked.any(axis=others))
+        across = marked.any(axis=0)
+        for along, cells in zip(
+            (across.any(axis=0), across.any(axis=1), marked.any(axis=(1, 2))), self.brick_cells, strict=True
+        ):
+            where = np.flatnonzero(along)
             if not len(where):
                 return None
-            cells = self.brick_cells[2 - axis]
             ends.append((where[0] * cells, (where[-1] + 1) * cells))
         low, high = np.array(ends, dtype=np.float64).T
         low[2] += slab.first_k

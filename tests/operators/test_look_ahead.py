@@ -6,6 +6,7 @@ import itertools
 
 import numpy as np
 import pytest
+from scipy import ndimage
 
 from clrecon.geometry import Volume
 from clrecon.geometry.camera import Camera
@@ -61,6 +62,31 @@ def test_ways_are_what_is_counted(device, axis, is_parallel):
         ways = look(device, shape, distances, way)
         assert np.array_equal(ways & FARTHEST, distances)
         assert np.array_equal(ways >> 4, count_ahead(distances, way))
+
+
+@pytest.mark.oclgrind
+@pytest.mark.parametrize("shape", [(2, 2, 2), (5, 9, 70), (23, 6, 7), (9, 83, 2), (30, 31, 33)])
+def test_distances_are_those_of_a_chessboard(device, shape):
+    """SciPy's distance transform to the bricks that hold a bright voxel, cut off at the farthest."""
+    rng = np.random.default_rng(shape)
+    voxels = np.zeros(shape, np.int16)
+    for _ in range(3):
+        voxels[tuple(rng.integers(0, shape))] = 1000
+    resident, stopwatch = ResidentVolume(Volume(voxels, np.eye(4)), device), Stopwatch()
+    slab = next(resident.slabs(shape[0], np.inf, stopwatch))
+    counts = slab.bricks[::-1]
+    bright = np.zeros(counts, bool)
+    for brick in np.ndindex(counts):  # cells of a brick end at the voxels that the next one begins with
+        bright[brick] = (voxels[tuple(slice(4 * n, 4 * n + 5) for n in brick)] > 500).any()
+    with stopwatch.running(device):
+        leaps = resident.find_leaps(slab, "key", np.arange(100) > 50, 0.0, 0.1, stopwatch)
+        found = download(device, np.empty(counts, np.uint8), leaps.distances_d)
+    truth = ndimage.distance_transform_cdt(~bright, "chessboard")
+    assert np.array_equal(found, np.minimum(truth, FARTHEST))
+    low, high = leaps.box
+    for axis in range(3):
+        where = 4 * np.flatnonzero(bright.any(axis=tuple(n for n in range(3) if n != 2 - axis)))
+        assert (low[axis], high[axis]) == (where[0] - 0.5, where[-1] + 4.5)
 
 
 def test_the_main_way_is_that_of_the_ray_in_the_middle(device):
