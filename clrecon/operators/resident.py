@@ -319,10 +319,9 @@ class ResidentVolume:
 
     def _find_box(self, marked: NDArray[np.bool_], slab: RaySlab) -> tuple[Float64Array, Float64Array] | None:
         ends = []
-        across = marked.any(axis=0)
-        for along, cells in zip(
-            (across.any(axis=0), across.any(axis=1), marked.any(axis=(1, 2))), self.brick_cells, strict=True
-        ):
+        across = np.any(marked, axis=0)
+        each = np.any(across, axis=0), np.any(across, axis=1), np.any(marked, axis=(1, 2))
+        for along, cells in zip(each, self.brick_cells, strict=True):
             where = np.flatnonzero(along)
             if not len(where):
                 return None
