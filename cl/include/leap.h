@@ -74,13 +74,19 @@ static inline ints place_bricks(const leap_map *map, const slice_stack *stack, c
     return (b->brick_k * map->bj + b->brick_j) * map->bi + b->brick_i;
 }
 
+/* Samples of each ray to the faces of a box that reaches so many bricks ahead along each axis, the own one counted. */
+static inline floats count_to_box(const leap_map *map, const ray_lanes *rays, const brick_lanes *b, const ints reach_i,
+    const ints reach_j, const ints reach_k)
+{
+    return lesser(lesser(count_to_face(b->i, rays->stride_i, rays->pace_i, b->brick_i, reach_i, BRICK_CELLS),
+                      count_to_face(b->j, rays->stride_j, rays->pace_j, b->brick_j, reach_j, BRICK_CELLS)),
+        count_to_face(b->k, rays->stride_k, rays->pace_k, b->brick_k, reach_k, map->cells_k));
+}
+
 /* Samples of each ray to the faces of the cube of empty bricks around it, a fraction; 0 where it is in none. */
 static inline floats count_to_faces(const leap_map *map, const ray_lanes *rays, const brick_lanes *b)
 {
-    const floats steps = lesser(
-        lesser(count_to_face(b->i, rays->stride_i, rays->pace_i, b->brick_i, b->distance, BRICK_CELLS),
-            count_to_face(b->j, rays->stride_j, rays->pace_j, b->brick_j, b->distance, BRICK_CELLS)),
-        count_to_face(b->k, rays->stride_k, rays->pace_k, b->brick_k, b->distance, map->cells_k));
+    const floats steps = count_to_box(map, rays, b, b->distance, b->distance, b->distance);
     /* Half a voxel before the first brick, which belongs to it, a face lies ahead of what shows too. */
     return choose(b->distance > 0, steps, (floats)(0.0f));
 }

@@ -42,10 +42,7 @@ static inline floats count_ahead(
     const ints reach_i = way->axis == 0 ? free : reach_aside(way, b->brick_i, way->eye.x, rays->stride_i);
     const ints reach_j = way->axis == 1 ? free : reach_aside(way, b->brick_j, way->eye.y, rays->stride_j);
     const ints reach_k = way->axis == 2 ? free : reach_aside(way, b->brick_k, way->eye.z, rays->stride_k);
-    const floats steps = lesser(
-        lesser(count_to_face(b->i, rays->stride_i, rays->pace_i, b->brick_i, reach_i, BRICK_CELLS),
-            count_to_face(b->j, rays->stride_j, rays->pace_j, b->brick_j, reach_j, BRICK_CELLS)),
-        count_to_face(b->k, rays->stride_k, rays->pace_k, b->brick_k, reach_k, map->cells_k));
+    const floats steps = count_to_box(map, rays, b, reach_i, reach_j, reach_k);
     const floats stride = way->axis == 0 ? rays->stride_i : way->axis == 1 ? rays->stride_j : rays->stride_k;
     return choose((free > 0) & (stride * (float)way->ahead > 0.0f), steps, (floats)(0.0f));
 #endif

@@ -88,6 +88,19 @@ __kernel void mark_bricks(
     distances[brick] = shown[end] > shown[first] ? 0 : FARTHEST;
 }
 
+/* Take one step along four rows, which begin at `rows`: distances at brick i from those at the brick before. */
+static inline int4 step_in_rows(
+    __global const uchar *from, __global uchar *to, const ulong4 rows, const int i, const int4 before)
+{
+    const int4 own = (int4)(from[rows.x + i], from[rows.y + i], from[rows.z + i], from[rows.w + i]);
+    const int4 distance = LESSER(before + 1, own);
+    to[rows.x + i] = (uchar)distance.x;
+    to[rows.y + i] = (uchar)distance.y;
+    to[rows.z + i] = (uchar)distance.z;
+    to[rows.w + i] = (uchar)distance.w;
+    return distance;
+}
+
 /* Parameters  from   in   (rows, bi) 0 or FARTHEST
  *             to     out  (rows, bi) distance along the row
  * Launch      global = rows / ROWS_AT_ONCE rounded up by the host, any local
@@ -99,25 +112,14 @@ __kernel void spread_in_rows(
     if (first >= rows)
         return;
     /* Each step waits for the one before it: other rows have some meanwhile.  The last item may take its last row twice. */
-    const size_t begin_0 = (size_t)first * bi, begin_1 = (size_t)LESSER(first + 1, rows - 1) * bi;
-    const size_t begin_2 = (size_t)LESSER(first + 2, rows - 1) * bi, begin_3 = (size_t)LESSER(first + 3, rows - 1) * bi;
+    const uint last = rows - 1;
+    const ulong4 begin = (ulong4)(first, LESSER(first + 1, last), LESSER(first + 2, last), LESSER(first + 3, last))
+        * (ulong)bi;
     int4 distance = FARTHEST;
-    for (int i = 0; i < bi; ++i) {
-        const int4 own = (int4)(from[begin_0 + i], from[begin_1 + i], from[begin_2 + i], from[begin_3 + i]);
-        distance = LESSER(distance + 1, own);
-        to[begin_0 + i] = (uchar)distance.x;
-        to[begin_1 + i] = (uchar)distance.y;
-        to[begin_2 + i] = (uchar)distance.z;
-        to[begin_3 + i] = (uchar)distance.w;
-    }
-    for (int i = bi - 1; i >= 0; --i) {
-        const int4 own = (int4)(to[begin_0 + i], to[begin_1 + i], to[begin_2 + i], to[begin_3 + i]);
-        distance = LESSER(distance + 1, own);
-        to[begin_0 + i] = (uchar)distance.x;
-        to[begin_1 + i] = (uchar)distance.y;
-        to[begin_2 + i] = (uchar)distance.z;
-        to[begin_3 + i] = (uchar)distance.w;
-    }
+    for (int i = 0; i < bi; ++i)
+        distance = step_in_rows(from, to, begin, i, distance);
+    for (int i = bi - 1; i >= 0; --i)
+        distance = step_in_rows(to, to, begin, i, distance);
 }
 
 /* Parameters  from   in   (outer, count, stride) distances so far
