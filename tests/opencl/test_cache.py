@@ -65,7 +65,8 @@ def test_where_nothing_can_be_kept_no_driver_is_asked_to(monkeypatch):
     from clrecon.opencl import quirks
 
     for name in (*quirks._NO_CACHES, "XDG_CACHE_HOME"):
-        monkeypatch.delenv(name, raising=False)
+        monkeypatch.setenv(name, "")  # what was not there is noted too, and taken away in the end
+        monkeypatch.delenv(name)
     monkeypatch.setenv("POCL_CACHE_DIR", "/proc/nowhere")
     leaving = []
     monkeypatch.setattr(quirks, "atexit", SimpleNamespace(register=lambda *call: leaving.append(call)))
