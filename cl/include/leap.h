@@ -7,7 +7,7 @@
 
 #define BRICK_CELLS 4 /* of a brick along i and j; it reads a voxel more */
 #define BRICKS_PER_CELL (1.0f / BRICK_CELLS)
-#define FARTHEST 15 /* bricks that a leap goes at most */
+#define FARTHEST 15 /* bricks that a leap goes at most: more take longer to prepare than they save; four bits hold it */
 
 typedef struct {
     __global const uchar *distances; /* (bk, bj, bi) in bricks, 0 where something shows */

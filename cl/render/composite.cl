@@ -281,8 +281,8 @@ __kernel void composite_rays(
     const float slab_high, const int bi, const int bj, const int bk, const int cells_k, const float low,
     const float scale, const int first_shown, const int last_shown, const float factor_scale,
     const float steps_per_unit, const uint width, const uint height, const uint planes, const int perspective,
-    const int shaded, const int jitter, const int stage, const uint queues, const int main_axis, const int ahead, const float4 eye,
-    const float aside
+    const int shaded, const int jitter, const int stage, const uint queues, const int main_axis, const int ahead,
+    const float4 eye, const float aside
     LABEL_PARAMETERS STACK_PARAMETERS)
 {
     const uint first_pixel = (uint)get_global_id(0) * LANES;

@@ -111,7 +111,8 @@ __kernel void spread_in_rows(
     const uint first = (uint)get_global_id(0) * ROWS_AT_ONCE;
     if (first >= rows)
         return;
-    /* Each step waits for the one before it: other rows have some meanwhile.  The last item may take its last row twice. */
+    /* Each step waits for the one before it: other rows have some meanwhile.  The last item may take its last row
+     * twice. */
     const uint last = rows - 1;
     const ulong4 begin = (ulong4)(first, LESSER(first + 1, last), LESSER(first + 2, last), LESSER(first + 3, last))
         * (ulong)bi;
@@ -198,9 +199,9 @@ __kernel void look_ahead(
     int free = FARTHEST;
     for (int n = 0; n < count; ++n) {
         const int brick = ahead > 0 ? count - 1 - n : n;
-        __global const uchar *row = distances + (size_t)brick * stride + here;
-        const int is_free = row[0] > 0 && row[to_u] > 0 && row[to_v] > 0 && row[to_u + to_v] > 0;
+        __global const uchar *own = distances + (size_t)brick * stride + here;
+        const int is_free = own[0] > 0 && own[to_u] > 0 && own[to_v] > 0 && own[to_u + to_v] > 0;
         free = is_free ? LESSER(free + 1, FARTHEST) : 0;
-        ways[(size_t)brick * stride + here] = (uchar)(free << 4 | row[0]);
+        ways[(size_t)brick * stride + here] = (uchar)(free << 4 | own[0]);
     }
 }
