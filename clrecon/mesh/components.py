@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from clrecon.errors import NoSurfaceError, UsageError
 from clrecon.mesh.connectivity import label_components
+from clrecon.mesh.coordinates import rounding_step
 from clrecon.mesh.measures import CHUNK, cross_products, local_origin
 from clrecon.mesh.mesh import Mesh
 from clrecon.mesh.nearest import find_nearest_triangle
@@ -26,6 +27,12 @@ SEED_REACH_MM = 20.0
 lies 15 mm from its wall."""
 
 
+_ROUNDING_OF_AREA = 4.0
+"""Two components are of equal area when they differ by less than this, times the rounding step of the coordinates,
+times the square root of the area.  Rounding moves each vertex on its own: the area changes by about 0.3 of that
+product, by up to 1 where triangles are long and thin."""
+
+
 @dataclass(frozen=True)
 class _Chosen:
     """Components of a mesh and which of them are kept.
@@ -34,8 +41,8 @@ class _Chosen:
     ----------
     label_of_vertex, label_of_triangle : ndarray, int64
         Number of the component; -1 for vertices that no triangle uses.
-    areas : ndarray, shape (count,), float64
-        mm2.
+    ranked : ndarray, shape (count,), int64
+        Components from the largest area to the smallest, see `_rank`; in their own order where no rank was asked for.
     keep : ndarray, shape (count,), bool
     facts : dict
         What the report of the outcome says of it.
@@ -43,7 +50,7 @@ class _Chosen:
 
     label_of_vertex: NDArray[np.int64]
     label_of_triangle: NDArray[np.int64]
-    areas: NDArray[np.float64]
+    ranked: NDArray[np.int64]
     keep: NDArray[np.bool_]
     facts: dict[str, object]
 
@@ -67,7 +74,8 @@ def select_components(
     ----------
     mesh : Mesh
     keep_largest : int, optional
-        Keep so many components, those of largest area (of equal ones the first).
+        Keep so many components, those of largest area.  Of components whose areas differ by no more than the
+        rounding of the coordinates explains the first in the mesh is kept.
     min_volume_ml : float, optional
         Keep components that enclose at least so much, whatever the sign.  What an open component encloses is
         measured as if its rim were joined to the mean of its corners.
@@ -137,7 +145,7 @@ def split_components(
             " leave the small ones out (--min-volume ML, --keep-largest N)"
         )
     rank = np.full(len(chosen.keep) + 1, len(kept))  # the last entry is for unused vertices, whose label is -1
-    rank[kept[np.argsort(-chosen.areas[kept], kind="stable")]] = np.arange(len(kept))
+    rank[chosen.ranked[chosen.keep[chosen.ranked]]] = np.arange(len(kept))
     vertex_order, vertex_ends = _group(rank[chosen.label_of_vertex], len(kept))
     triangle_order, triangle_ends = _group(rank[chosen.label_of_triangle], len(kept))
     number = np.empty(mesh.vertex_count, dtype=np.int64)
@@ -182,11 +190,19 @@ def _choose(
     count, labels = label_components(mesh.triangles, mesh.vertex_count) if labelled is None else labelled
     label_of_triangle = labels[mesh.triangles[:, 0]]
     areas, volumes = _measure_components(
-        mesh, label_of_triangle, count, areas=rank or keep_largest is not None, volumes=min_volume_ml is not None
+        mesh,
+        label_of_triangle,
+        count,
+        areas=rank or keep_largest is not None or min_volume_ml is not None,
+        volumes=min_volume_ml is not None,
     )
+    ranked = _rank(areas, rounding_step(mesh.vertices)) if rank or keep_largest is not None else np.arange(count)
     keep = np.ones(count, dtype=bool)
     if min_volume_ml is not None:
-        keep = volumes >= min_volume_ml
+        # Rounding moves no vertex further than half a step along each axis, and the volume by no more than the area
+        # times that way: a component of exactly the least volume is kept wherever it lies.
+        way = 0.5 * math.sqrt(3.0) * rounding_step(mesh.vertices)
+        keep = volumes + way * areas / 1000.0 >= min_volume_ml
         if not keep.any():
             raise NoSurfaceError(
                 f"none of the {count} components encloses {min_volume_ml:g} ml: "
@@ -196,10 +212,34 @@ def _choose(
     if len(seeds):
         keep, facts["seed_distances_mm"] = _find_at_seeds(mesh, label_of_triangle, keep, seeds)
     if keep_largest is not None:
-        ranked = np.argsort(-areas, kind="stable")
         keep[ranked[keep[ranked]][keep_largest:]] = False
     facts.update(components_found=count, components_kept=int(np.count_nonzero(keep)))
-    return _Chosen(labels, label_of_triangle, areas, keep, facts)
+    return _Chosen(labels, label_of_triangle, ranked, keep, facts)
+
+
+def _rank(areas: NDArray[np.float64], step: float) -> NDArray[np.int64]:
+    """Components from the largest area to the smallest, those of equal area in their own order.
+
+    Equal are those whose area differs from that of the first of their group by no more than rounding explains.
+
+    Parameters
+    ----------
+    areas : ndarray, shape (count,), float64
+        mm2.
+    step : float
+        mm, of the coordinates: `rounding_step`.
+    """
+    ranked = np.argsort(-areas, kind="stable")
+    falling = areas[ranked]
+    least = falling - _ROUNDING_OF_AREA * step * np.sqrt(falling)
+    ends: list[int] = np.searchsorted(-falling, -least, side="right").tolist()
+    first = 0
+    while first < len(ranked):
+        end = ends[first]
+        if end > first + 1:
+            ranked[first:end] = np.sort(ranked[first:end])
+        first = end
+    return ranked
 
 
 def _find_at_seeds(

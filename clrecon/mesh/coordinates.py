@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clrecon.geometry.precision import is_far
+from clrecon.geometry.precision import float32_step, is_far
 
-__all__ = ["as_stored"]
+__all__ = ["as_stored", "rounding_step"]
 
 
 def as_stored(points: NDArray[Any]) -> NDArray[np.floating]:
@@ -27,3 +27,23 @@ def as_stored(points: NDArray[Any]) -> NDArray[np.floating]:
     """
     dtype = np.float64 if points.dtype != np.float32 and is_far(points) else np.float32
     return np.ascontiguousarray(points, dtype=dtype)
+
+
+def rounding_step(vertices: NDArray[np.floating]) -> float:
+    """Length in mm of the steps that coordinates of vertices have been rounded to.
+
+    Parameters
+    ----------
+    vertices : ndarray, shape (n, 3), float32 or float64, mm
+
+    Returns
+    -------
+    float
+        The step of float32 at the largest coordinate.  float64 vertices were computed in float32 relative to a point
+        near their centre: the step there.
+    """
+    if len(vertices) == 0:
+        return 0.0
+    low, high = vertices.min(axis=0).astype(np.float64), vertices.max(axis=0).astype(np.float64)
+    largest = np.abs([low, high]).max() if vertices.dtype == np.float32 else 0.5 * (high - low).max()
+    return float32_step(float(largest))

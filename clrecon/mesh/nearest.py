@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
+from clrecon.mesh.coordinates import rounding_step
 from clrecon.mesh.measures import chunks
 
 __all__ = ["find_nearest_triangle"]
@@ -32,7 +35,7 @@ def find_nearest_triangle(
     Returns
     -------
     triangle : int
-        Row of `triangles`; of several that are equally near the first.
+        Row of `triangles`; of several that are equally near, up to the rounding of the coordinates, the first.
     distance : float
         mm.
     """
@@ -48,9 +51,10 @@ def find_nearest_triangle(
         gap = np.maximum(np.maximum(low, -high), 0.0)
         box_distance[where] = np.einsum("ij,ij->j", gap, gap)
         nearest_corner = min(nearest_corner, *(float(corner_distance[corner].min()) for corner in (a, b, c)))
-    near = np.flatnonzero(box_distance <= nearest_corner)
+    slack = 2.0 * rounding_step(vertices)  # a point and a triangle are each rounded
+    near = np.flatnonzero(box_distance <= (math.sqrt(nearest_corner) + slack) ** 2)
     distances = _distances_from_origin(*(columns[:, triangles[near, corner]].T for corner in range(3)))
-    first = int(distances.argmin())
+    first = int(np.flatnonzero(distances <= distances.min() + slack)[0])
     return int(near[first]), float(distances[first])
 
 

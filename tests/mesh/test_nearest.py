@@ -71,3 +71,12 @@ def test_distance_from_a_sphere_equals_brute_force(radius):
     least = np.linalg.norm(sampled - point, axis=2).min()
     assert distance <= least
     assert distance == pytest.approx(least, abs=tolerances.NEAREST_SAMPLED_MM)
+
+
+def test_of_equal_ones_the_first_wherever_they_lie():
+    """A point half way between two boxes, whose coordinates are rounded differently at each place."""
+    for place in np.random.default_rng(6).uniform(-900, 900, (40, 3)):
+        boxes = samples.join(samples.box((2.1, 0, 0)), samples.box((-3.1, 0, 0)))
+        triangle, distance = nearest((boxes[0] + place, boxes[1]), place + (0, 0.5, 0.5))
+        assert distance == pytest.approx(2.1, abs=1e-3)
+        assert triangle < 12
