@@ -38,4 +38,18 @@ def describe_labels(meshes: list[dict[str, Any]]) -> list[str]:
     grow_mm = labels[0]["grow_mm"]
     growth = "one voxel" if grow_mm is None else f"{grow_mm:.3g} mm"
     kind = ", solid" if labels[0]["solid"] else ""
-    return [f"labels   {count} label{'s' * (count > 1)}{kind}, grown by {growth}; HU place {share} % of the vertices"]
+    return [
+        f"labels   {count} label{'s' * (count > 1)}{kind}, grown by {growth}; HU place {share} % of the vertices",
+        *_describe_volumes(labels),
+    ]
+
+
+def _describe_volumes(labels: list[dict[str, Any]]) -> list[str]:
+    """The volumes of the meshes beside those of the voxels of their labels, all together."""
+    surfaces = {(mesh["label_number"], mesh["iso_value_hu"]): mesh for mesh in labels}.values()
+    if any(mesh["label_mesh_ml"] is None for mesh in surfaces):
+        return []
+    label_ml = sum(mesh["label_ml"] * mesh["label_inside_share"] for mesh in surfaces)
+    mesh_ml = sum(mesh["label_mesh_ml"] for mesh in surfaces)
+    change = 100.0 * (mesh_ml / label_ml - 1.0)
+    return [f"         {mesh_ml:,.2f} ml of mesh for {label_ml:,.2f} ml of labels ({change:+.1f} %)"]

@@ -20,6 +20,7 @@ from clrecon.kernels import Program, Stopwatch, allocate, download, launch, load
 from clrecon.labels import LabelMap, ResampledLabels, resample_labels
 from clrecon.labels.growth import Growth
 from clrecon.labels.solid import Box, fill_solid, find_boxes
+from clrecon.labels.volumes import count_ml, label_ml, slice_voxel_ml
 from clrecon.mesh import Mesh
 from clrecon.opencl import Device, check_budget, choose_device, describe_shortage, memory_limits
 from clrecon.opencl.quirks import cache_warnings
@@ -292,8 +293,9 @@ def extract_labels(
     -------
     dict of int to Mesh
         In the order asked for, else ascending.  `Mesh.report` has, beside what `extract_isosurface` says, ``label``,
-        ``label_name``, ``label_inside_share`` (of the labelled voxels, in the volume), ``vertices_by_hu_share``,
-        ``grow_mm`` and ``solid``.
+        ``label_name``, ``label_inside_share`` (of the labelled voxels, in the volume), ``label_ml`` (volume of its
+        voxels, on the map's own grid), ``label_taken_ml`` (the same on the grid of the volume),
+        ``vertices_by_hu_share``, ``grow_mm`` and ``solid``.
 
     Raises
     ------
@@ -316,6 +318,7 @@ def extract_labels(
     growth = Growth.of(volume, grow_mm)
     boxes = find_boxes(taken.voxels, chosen, growth.reach)
     names = {number: f"{number} {labels.name(number)}" for number in chosen}
+    voxel_ml = slice_voxel_ml(volume)
     missing = [number for number in chosen if number not in boxes]
     if missing and numbers is not None:
         raise _refuse_label(volume, taken, names[missing[0]], missing[0], rule)
@@ -338,6 +341,8 @@ def extract_labels(
                 "label": number,
                 "label_name": labels.name(number),
                 "label_inside_share": taken.inside[number],
+                "label_ml": label_ml(labels, number),
+                "label_taken_ml": count_ml(taken.voxels, number, box, voxel_ml),
                 "vertices_by_hu_share": run.share_by_hu,
             }
             report["warnings"] += _warn(taken, report)

@@ -15,12 +15,16 @@ if TYPE_CHECKING:
     from clrecon.labels import LabelMap
     from clrecon.mesh import Mesh
     from clrecon.opencl import Device
-    from clrecon.pipeline.parts import Surface
+    from clrecon.pipeline.parts import Part, Surface
     from clrecon.pipeline.settings import MeshSettings
 
-__all__ = ["LabelChoice", "choose_labels", "describe_label", "extract_label_surfaces", "open_labels"]
+__all__ = [
+    "LabelChoice", "choose_labels", "describe_label", "extract_label_surfaces", "judge_label_volumes", "open_labels",
+]  # fmt: skip
 
 NAMES_SHOWN = 5
+
+_FACTS = ("label_inside_share", "label_ml", "label_taken_ml", "vertices_by_hu_share", "grow_mm", "solid")
 
 
 @dataclass(frozen=True)
@@ -135,5 +139,54 @@ def describe_label(origin: dict[str, Any]) -> dict[str, Any]:
     """Entries of a mesh of a label in the report, from the mesh's own; none for other meshes."""
     if "label" not in origin:
         return {}
-    facts = {name: origin[name] for name in ("label_inside_share", "vertices_by_hu_share", "grow_mm", "solid")}
-    return {"label_number": origin["label"], **facts}
+    return {"label_number": origin["label"], **{name: origin[name] for name in _FACTS}}
+
+
+def judge_label_volumes(parts: Sequence[Part], closed: bool) -> list[dict[str, Any]]:
+    """Hold the meshes of each label, all its components together, against the volume of its voxels in the CT.
+
+    `closed` says that surfaces are closed at the border of the scan.  Each part of a label gets ``label_mesh_ml`` among
+    its `facts`.
+
+    Returns
+    -------
+    list of dict
+        A gate a label and iso value, see `clrecon.mesh.gates.judge_label_volume`.
+    """
+    from clrecon.mesh.gates import judge_label_volume
+    from clrecon.mesh.measures import enclosed_ml
+
+    by_surface: dict[Surface, list[Part]] = {}
+    for part in parts:
+        if part.surface.label is not None:
+            by_surface.setdefault(part.surface, []).append(part)
+    gates = []
+    for surface, own in by_surface.items():
+        origin = own[0].mesh.report
+        label_ml = _ml_in_ct(origin)
+        mesh_ml = sum(enclosed_ml(part.mesh.vertices, part.mesh.triangles) for part in own) if closed else None
+        advice = "" if mesh_ml is None else _advise(mesh_ml < label_ml, origin)
+        gates.append({"mesh": surface.name or None, **judge_label_volume(mesh_ml, label_ml, advice)})
+        for part in own:
+            part.facts["label_mesh_ml"] = mesh_ml
+    return gates
+
+
+def _ml_in_ct(origin: dict[str, Any]) -> float:
+    """The volume of the label's voxels that lie in the CT; where the centres of all lie outside, of what is taken."""
+    return float(origin["label_ml"] * origin["label_inside_share"] or origin["label_taken_ml"])
+
+
+def _advise(too_small: bool, origin: dict[str, Any]) -> str:
+    """What to do about a mesh that is much smaller, or larger, than its label."""
+    kept, found = origin.get("components_kept"), origin.get("components_found")
+    if too_small and kept is not None and kept < found:
+        return f"{kept} of its {found} components were kept"
+    if not too_small:
+        return "dense voxels around the label were taken in; a higher --hu or a smaller --grow takes fewer"
+    if origin["solid"]:
+        return f"much of the label lies below {origin['iso_value_hu']:g} HU up to its border; a lower --hu takes it in"
+    return (
+        f"what lies below {origin['iso_value_hu']:g} HU is left out; --solid fills the marrow of bones, soft tissue"
+        " needs a lower --hu"
+    )

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from clrecon.pipeline.description import describe_job, describe_part
-from clrecon.pipeline.labels import extract_label_surfaces, open_labels
+from clrecon.pipeline.labels import extract_label_surfaces, judge_label_volumes, open_labels
 from clrecon.pipeline.levels import choose_level
 from clrecon.pipeline.masking import mask_volume
 from clrecon.pipeline.opening import DeviceOpening, prepare_surfaces
@@ -133,7 +133,7 @@ def make_mesh(
         for place, part in enumerate(parts):
             progress("measure", place, len(parts) if len(parts) > 1 else 0)
             part.quality = part.mesh.quality()
-    gates = judge_parts(parts, volume, settings)
+    gates = judge_parts(parts, volume, settings) + judge_label_volumes(parts, settings.closed)
     watch.lap("measure")
 
     progress("write", 0, 0)

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import tolerances
+from contract_tables import names_in
 from ct_files import ORIGIN, PATIENT, RADIUS_MM, SPACING, sphere_voxels, write_series
 from label_files import write_nifti
 
@@ -71,6 +72,44 @@ def test_one_label_is_the_output_itself(device: Any, ct: Path, labels: Path, tmp
         options = ("--labels", labels, "--label", label, "--solid", "--grow", "0.9", "--hu", -150)
         assert run(ct, "-o", tmp_path / "one.stl", *options, device=device) == 0
     assert [path.name for path in tmp_path.iterdir()] == ["one.stl"]
+
+
+def test_a_mesh_that_is_not_of_its_labels_size_is_said(
+    device: Any, ct: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A label half of which is as thin as air: as lung meshed at the level of bone."""
+    voxels = np.zeros(sphere_voxels().shape, np.uint8)
+    voxels[2:-2, 2:-2, 2:-2] = 1
+    map_file = write_nifti(tmp_path / "a.nii.gz", voxels, AFFINE)
+    options = ("--labels", map_file, "--hu", -150)
+    assert run(ct, "-o", tmp_path / "b.stl", *options, device=device) == 0  # said without a report too
+    captured = capsys.readouterr()
+    assert "gate label_volume failed: the mesh has" in captured.err
+    assert "what lies below -150 HU is left out; --solid" in captured.err
+    assert "ml of mesh for" in captured.out
+    arguments = (*options, "--strict", "--report", tmp_path / "r.json")
+    assert run(ct, "-o", tmp_path / "b.stl", *arguments, device=device) == 8
+    report = json.loads((tmp_path / "r.json").read_text())
+    (mesh,) = report["meshes"]
+    label_ml = np.count_nonzero(voxels) * np.prod(SPACING) / 1000.0
+    assert mesh["label_ml"] == pytest.approx(label_ml, rel=1e-6)  # NIfTI holds spacings as float32
+    assert mesh["label_taken_ml"] == pytest.approx(label_ml, rel=1e-6)
+    assert mesh["label_mesh_ml"] == pytest.approx(SPHERE_ML, rel=tolerances.CLI_SPHERE_VOLUME_SHARE)
+    (gate,) = (gate for gate in report["gates"] if gate["name"] == "label_volume")
+    assert gate["measured"] == pytest.approx(100 * (1 - mesh["label_mesh_ml"] / label_ml)) and gate["ok"] is False
+    assert run(ct, "-o", tmp_path / "b.stl", *options, "--open", "--report", tmp_path / "r.json", device=device) == 0
+    report = json.loads((tmp_path / "r.json").read_text())
+    assert [gate["ok"] for gate in report["gates"] if gate["name"] == "label_volume"] == [None]
+    assert report["meshes"][0]["label_mesh_ml"] is None
+    assert names_in("clrecon mesh INPUT", "Of each mesh in `meshes`") <= set(report["meshes"][0])
+
+
+def test_components_of_a_label_count_together(device: Any, ct: Path, labels: Path, tmp_path: Path) -> None:
+    options = ("--labels", labels, "--label", 2, "--hu", -150, "--split", "--report", tmp_path / "r.json")
+    assert run(ct, "-o", tmp_path / "b.stl", *options, device=device) == 0
+    report = json.loads((tmp_path / "r.json").read_text())
+    assert report["volume_ml"] == pytest.approx(report["meshes"][0]["label_mesh_ml"], rel=1e-6)
+    assert [gate["mesh"] for gate in report["gates"] if gate["name"] == "label_volume"] == [None]
 
 
 def test_the_memory_that_is_allowed_counts_for_labels_too(

@@ -8,7 +8,8 @@ import sample_meshes as samples
 
 from clrecon.mesh import Mesh
 from clrecon.mesh.distances import compare_meshes
-from clrecon.mesh.gates import failed_gates, judge_mesh
+from clrecon.mesh.gates import failed_gates, judge_label_volume, judge_mesh
+from clrecon.mesh.measures import enclosed_ml
 
 pytestmark = pytest.mark.unit
 
@@ -96,3 +97,21 @@ def test_vertices_off_the_iso_surface():
 
     assert (at(0.25, 0.1), at(0.26, 0.1), at(0.25, 0.11)) == (set(), {"iso_distance_p95"}, {"iso_distance_mean"})
     assert judge_mesh(iso_distance={"vertices_voxel": None}) == []
+
+
+def test_the_volume_of_a_label():
+    assert judge_label_volume(24.0, 63.0, "fill it")["ok"] is False
+    assert judge_label_volume(24.0, 63.0, "fill it")["text"] == (
+        "the mesh has 24 ml, the label 63 ml (-61.9 %, at most 15 % either way): fill it"
+    )
+    near = judge_label_volume(63.0 * 1.149, 63.0, "fill it")
+    assert near["ok"] is True and near["measured"] == pytest.approx(14.9) and "fill it" not in near["text"]
+    assert judge_label_volume(63.0 * 1.151, 63.0)["ok"] is False
+    assert judge_label_volume(None, 63.0)["ok"] is None
+
+
+def test_enclosed_volume_is_that_of_the_quality():
+    mesh = Mesh(*samples.torus())
+    volume_ml = mesh.quality()["volume_ml"]
+    assert enclosed_ml(mesh.vertices, mesh.triangles) == pytest.approx(volume_ml, rel=1e-12)
+    assert enclosed_ml(mesh.vertices, mesh.triangles[:, ::-1]) == pytest.approx(-volume_ml, rel=1e-12)
