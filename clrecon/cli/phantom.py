@@ -11,18 +11,21 @@ __all__ = ["add_arguments", "run"]
 
 _SETTINGS = (
     "kind", "size", "slices", "spacing", "tilt", "oblique", "noise", "point_spread_mm", "seed", "radius_mm",
+    "table", "table_gap_mm", "prone",
 )  # fmt: skip
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of the command."""
     parser.epilog = (
-        "Writes a real DICOM series and truth.json with the affine and the exact area and volume. Same settings and\n"
-        "seed, same files.\n\n"
-        "example:\n  clrecon phantom phantom/ --kind torus --spacing 0.7 0.5 2.5 --tilt 12 --oblique 10 -5 30"
+        "Writes a real DICOM series and truth.json with the affine and the exact area and volume, or with the voxels\n"
+        "of each material and the label map materials.nrrd. Same settings and seed, same files.\n\n"
+        f"kinds:\n{_list_kinds()}\n\n"
+        "examples:\n  clrecon phantom phantom/ --kind torus --spacing 0.7 0.5 2.5 --tilt 12 --oblique 10 -5 30\n"
+        "  clrecon phantom phantom/ --kind skull --table headrest --table-gap 4"
     )
     parser.add_argument("output", metavar="OUT", help="folder for the series")
-    parser.add_argument("--kind", metavar="K", help="spine, sphere, torus, cylinder or plane (default: spine)")
+    parser.add_argument("--kind", metavar="K", help="what to make, see below (default: spine)")
     parser.add_argument("--size", metavar="N", help="columns and rows, like 256 or 256x192")
     parser.add_argument("--slices", type=int, metavar="N")
     parser.add_argument(
@@ -37,7 +40,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--point-spread", dest="point_spread_mm", type=float, metavar="MM", help="standard deviation of the blur"
     )
     parser.add_argument("--radius", dest="radius_mm", type=float, metavar="MM", help="radius of an analytic shape")
+    parser.add_argument("--table", metavar="T", help="what a body lies on: none, flat, curved or headrest")
+    parser.add_argument("--table-gap", dest="table_gap_mm", type=float, metavar="MM", help="between body and table")
+    parser.add_argument("--prone", action="store_true", default=None, help="the patient lies on the face")
     parser.add_argument("--seed", type=int, metavar="N")
+
+
+def _list_kinds() -> str:
+    from clrecon.pipeline.phantom import describe_kinds
+
+    return "\n".join(f"  {name:<9} {said}" for name, said in describe_kinds().items())
 
 
 def run(options: argparse.Namespace, console: Console) -> int:
@@ -58,7 +70,11 @@ def _summary(truth: dict[str, Any], output: str) -> list[str]:
     lines = [f"phantom  {truth['kind']}, {nk} slices of {ni} x {nj}, spacing {spacing} mm"]
     if truth["tilt_deg"] >= 0.05:
         lines[0] += f", tilt {truth['tilt_deg']:.2f} degrees"
+    for material, part in (truth["parts"] or {}).items():
+        dense = f", {part['voxels_above_300_hu']:,} voxels above 300 HU" if part["voxels_above_300_hu"] else ""
+        lines.append(f"{material:<8} {part['volume_ml']:,.1f} ml{dense}")
     lines.append(f"surface  at {truth['iso_value_hu']:g} HU")
     if truth["surface"]:
         lines[-1] += f": {truth['surface']['area_mm2']:,.1f} mm2, {truth['surface']['volume_ml']:,.3f} ml"
-    return [*lines, f"wrote    {printable(output)}, with the truth in truth.json"]
+    beside = "truth.json and materials.nrrd" if truth["parts"] else "truth.json"
+    return [*lines, f"wrote    {printable(output)}, with the truth in {beside}"]

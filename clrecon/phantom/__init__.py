@@ -1,4 +1,4 @@
-"""Phantoms with a known truth: analytic bodies and a believable spine, as voxels or as a DICOM CT series.
+"""Phantoms with a known truth: analytic bodies, a believable spine and odd bodies, as voxels or as a DICOM CT series.
 
 The names are loaded when first used, so that importing this package costs nothing.
 """
@@ -9,13 +9,15 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from clrecon.phantom.build import make_phantom, write_phantom
+    from clrecon.phantom.build import label_materials, make_phantom, write_phantom
     from clrecon.phantom.sampling import add_noise, apply_point_spread, sample_distance, sample_occupancy
+    from clrecon.phantom.scenes import MATERIALS
     from clrecon.phantom.settings import KINDS, PhantomSettings, parse_size
     from clrecon.phantom.shapes import Body, Box, Cylinder, HalfSpace, Sphere, Torus
 
 __all__ = [
     "KINDS",
+    "MATERIALS",
     "Body",
     "Box",
     "Cylinder",
@@ -25,6 +27,7 @@ __all__ = [
     "Torus",
     "add_noise",
     "apply_point_spread",
+    "label_materials",
     "make_phantom",
     "parse_size",
     "sample_distance",
@@ -33,8 +36,9 @@ __all__ = [
 ]
 
 _MODULES = {
-    "build": ("make_phantom", "write_phantom"),
+    "build": ("label_materials", "make_phantom", "write_phantom"),
     "sampling": ("add_noise", "apply_point_spread", "sample_distance", "sample_occupancy"),
+    "scenes": ("MATERIALS",),
     "settings": ("KINDS", "PhantomSettings", "parse_size"),
     "shapes": ("Body", "Box", "Cylinder", "HalfSpace", "Sphere", "Torus"),
 }

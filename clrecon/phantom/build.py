@@ -1,4 +1,7 @@
-"""Make a phantom: voxels, affine and truth, in memory or as a DICOM series beside its truth.json."""
+"""Make a phantom: voxels, affine and truth, in memory or as a DICOM series beside its truth.json.
+
+A scene has a label map of its materials beside it too.
+"""
 
 from __future__ import annotations
 
@@ -17,20 +20,24 @@ from clrecon.geometry import column_spacing, tilt_degrees
 from clrecon.phantom.anatomy import Anatomy
 from clrecon.phantom.bodies import choose_body
 from clrecon.phantom.dicom_series import RESCALE_INTERCEPT, write_series
+from clrecon.phantom.label_map import write_label_map
 from clrecon.phantom.sampling import Progress, add_noise, apply_point_spread, sample_occupancy
-from clrecon.phantom.settings import CENTRE_LPS_MM, PhantomSettings, Placement, place_slices
+from clrecon.phantom.scene_plans import plan_scene
+from clrecon.phantom.scenes import CEILING_HU, DENSE_HU, LabelArray, describe_parts, draw_scene
+from clrecon.phantom.settings import CENTRE_LPS_MM, KINDS, PhantomSettings, Placement, place_slices
 from clrecon.phantom.spine import draw_spine
 from clrecon.version import package_version
 
-__all__ = ["SPINE_ISO_HU", "TRUTH_NAME", "make_phantom", "write_phantom"]
+__all__ = ["SPINE_ISO_HU", "TRUTH_NAME", "label_materials", "make_phantom", "write_phantom"]
 
 TRUTH_NAME = "truth.json"
+MATERIALS_NAME = "materials.nrrd"
 
 SPINE_ISO_HU = 226.0
 """Suggested iso value for the spine: above discs, organs and noise, below the blurred thin cortex."""
 
 _GENERATOR = "clrecon phantom"
-_OURS = re.compile(r"IM\d{4}\.dcm|truth\.json")
+_OURS = re.compile(r"IM\d{4}\.dcm|truth\.json|materials\.nrrd")
 
 
 def _describe_spine(anatomy: Anatomy, affine: NDArray[np.float64], settings: PhantomSettings) -> dict[str, Any]:
@@ -61,12 +68,15 @@ def _describe_spine(anatomy: Anatomy, affine: NDArray[np.float64], settings: Pha
 
 def _make(
     settings: PhantomSettings, placement: Placement, progress: Progress | None
-) -> tuple[NDArray[np.int16], dict[str, Any]]:
+) -> tuple[NDArray[np.int16], dict[str, Any], LabelArray | None]:
     affine = placement.affine
     surface: dict[str, Any] | None = None
     spine: dict[str, Any] | None = None
     half_maximum: float | None = None
-    if settings.kind == "spine":
+    labels: LabelArray | None = None
+    if KINDS[settings.kind].is_scene:
+        field, labels = draw_scene(plan_scene(settings), settings, affine, progress)
+    elif settings.kind == "spine":
         field, anatomy = draw_spine(settings, affine, progress)
         spine = _describe_spine(anatomy, affine, settings)
     else:
@@ -79,8 +89,9 @@ def _make(
     apply_point_spread(field, affine, settings.point_spread_mm, progress)
     add_noise(field, settings.noise, settings.seed)
     voxels = np.empty(field.shape, dtype=np.int16)
+    floor, ceiling = (-32768, 32767 + RESCALE_INTERCEPT) if labels is None else (RESCALE_INTERCEPT, CEILING_HU)
     for k in range(len(field)):
-        voxels[k] = np.rint(np.clip(field[k], -32768, 32767 + RESCALE_INTERCEPT))
+        voxels[k] = np.rint(np.clip(field[k], floor, ceiling))
     truth = {
         "generator": _GENERATOR,
         "version": package_version(),
@@ -90,16 +101,23 @@ def _make(
         "spacing_mm": list(column_spacing(affine)),
         "slice_gap_along_normal_mm": float(placement.slice_thickness),
         "tilt_deg": tilt_degrees(affine),
-        "iso_value_hu": SPINE_ISO_HU if half_maximum is None else half_maximum,
+        "iso_value_hu": _iso_value(settings, half_maximum),
         "half_maximum_hu": half_maximum,
         "surface": surface,
         "spine": spine,
+        "parts": None if labels is None else describe_parts(voxels, labels, affine),
         "noise_hu": settings.noise,
         "point_spread_mm": settings.point_spread_mm,
         "seed": settings.seed,
         "settings": settings.as_dict(),
     }
-    return voxels, truth
+    return voxels, truth, labels
+
+
+def _iso_value(settings: PhantomSettings, half_maximum: float | None) -> float:
+    if half_maximum is not None:
+        return half_maximum
+    return SPINE_ISO_HU if settings.kind == "spine" else DENSE_HU
 
 
 def make_phantom(
@@ -122,8 +140,9 @@ def make_phantom(
     truth : dict
         Plain JSON types: ``kind, shape_ijk, affine_ijk_to_lps_mm, spacing_mm (di, dj, dk), tilt_deg,
         iso_value_hu``, ``half_maximum_hu`` and ``surface`` (analytic shapes, else null), ``spine`` (centres of the
-        vertebrae, the marker on the patient's left and what is absent, else null), ``noise_hu, point_spread_mm,
-        seed, version, settings``.
+        vertebrae, the marker on the patient's left and what is absent, else null), ``parts`` (scenes: each material
+        with its label in `label_materials`, voxels, volume and voxels above 300 HU, else null), ``noise_hu,
+        point_spread_mm, seed, version, settings``.
 
     Raises
     ------
@@ -131,8 +150,31 @@ def make_phantom(
         The shape does not fit the volume.
     """
     placement = place_slices(settings)
-    voxels, truth = _make(settings, placement, progress)
+    voxels, truth, _ = _make(settings, placement, progress)
     return voxels, placement.affine, truth
+
+
+def label_materials(settings: PhantomSettings) -> LabelArray:
+    """Say of what each voxel of a scene is, to the voxel: the truth beside the voxels of `make_phantom`.
+
+    Parameters
+    ----------
+    settings : PhantomSettings
+        Of a kind that is a scene.
+
+    Returns
+    -------
+    ndarray, shape (nk, nj, ni), uint8
+        Place in `clrecon.phantom.MATERIALS`, see ``parts`` of the truth.
+
+    Raises
+    ------
+    UsageError
+        The kind is no scene.
+    """
+    if not KINDS[settings.kind].is_scene:
+        raise UsageError(f"a {settings.kind} is no scene of materials: its truth is a surface or a list of levels")
+    return draw_scene(plan_scene(settings), settings, place_slices(settings).affine)[1]
 
 
 def _check_replaceable(folder: Path) -> None:
@@ -190,7 +232,7 @@ def _put_in_place(finished: Path, folder: Path) -> None:
 def write_phantom(
     out_folder: str | Path, settings: PhantomSettings, progress: Progress | None = None
 ) -> dict[str, Any]:
-    """Write a phantom as a DICOM CT series with a truth.json.
+    """Write a phantom as a DICOM CT series with a truth.json, a scene with the label map materials.nrrd too.
 
     The series is written into a temporary folder beside `out_folder`, read back, and then renamed: `out_folder` is
     complete or untouched.
@@ -219,7 +261,7 @@ def write_phantom(
     try:
         _check_replaceable(folder)
         placement = place_slices(settings)
-        voxels, truth = _make(settings, placement, progress)
+        voxels, truth, labels = _make(settings, placement, progress)
         temporary = Path(tempfile.mkdtemp(prefix=".clrecon-", dir=folder.parent))
         try:
             finished = temporary / "series"
@@ -227,6 +269,8 @@ def write_phantom(
             write_series(finished, voxels, settings, placement, progress)
             text = json.dumps(truth, indent=2) + "\n"
             (finished / TRUTH_NAME).write_text(text, encoding="utf-8")
+            if labels is not None:
+                write_label_map(finished / MATERIALS_NAME, labels, placement.affine)
             _put_in_place(finished, folder)
         finally:
             shutil.rmtree(temporary, ignore_errors=True)

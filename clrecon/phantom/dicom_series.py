@@ -65,7 +65,7 @@ def _make_headers(settings: PhantomSettings, placement: Placement) -> Iterator[F
         header.StudyDescription, header.SeriesDescription = "clrecon phantom", f"phantom {settings.kind}"
         header.PatientName, header.PatientID = "PHANTOM^CLRECON", "PHANTOM"
         header.PatientBirthDate = header.PatientSex = ""
-        header.PatientPosition = "HFS"
+        header.PatientPosition = "HFP" if settings.prone else "HFS"
         header.KVP, header.SliceThickness = "120", placement.slice_thickness
         if float(placement.tilt) != 0.0:
             header.GantryDetectorTilt = placement.tilt

@@ -17,11 +17,57 @@ from numpy.typing import NDArray
 from clrecon.errors import UsageError
 from clrecon.geometry import compose_affine
 
-__all__ = ["KINDS", "PhantomSettings", "Placement", "format_decimal", "parse_size", "place_slices"]
+__all__ = [
+    "KINDS",
+    "TABLE_NAMES",
+    "Kind",
+    "PhantomSettings",
+    "Placement",
+    "format_decimal",
+    "parse_size",
+    "place_slices",
+]
 
 Float64Array = NDArray[np.float64]
 
-KINDS = ("spine", "sphere", "torus", "cylinder", "plane")
+
+@dataclass(frozen=True)
+class Kind:
+    """What kind of phantom there is, and what its settings are where they are not given."""
+
+    said: str
+    spacing: tuple[float, float, float] = (1.0, 1.0, 1.25)
+    noise: float = 0.0
+    point_spread_mm: float = 0.0
+    table: str | None = None
+    """Of a kind that lies on a table; None: an analytic shape, which lies on nothing."""
+    is_scene: bool = False
+
+
+def _scene(said: str, spacing: tuple[float, float, float], table: str = "none") -> Kind:
+    return Kind(said, spacing, noise=12.0, point_spread_mm=0.5, table=table, is_scene=True)
+
+
+KINDS = {
+    "spine": Kind("thoracic and lumbar spine in a trunk", noise=12.0, point_spread_mm=0.5, table="own"),
+    "sphere": Kind("ball"),
+    "torus": Kind("ring"),
+    "cylinder": Kind("cylinder with flat ends"),
+    "plane": Kind("oblique slab"),
+    "skull": _scene("dry skull, a specimen without soft tissue", (0.9, 0.9, 1.5)),
+    "head": _scene("the skull in soft tissue, with air in sinuses and throat", (0.9, 0.9, 1.5)),
+    "bones": _scene("dry bones that lie apart", (0.9, 0.9, 1.5)),
+    "limb": _scene("lower leg, off the centre", (0.9, 0.9, 1.5)),
+    "pair": _scene("two legs of two sizes, air between them", (0.9, 0.9, 1.5)),
+    "pelvis": _scene("pelvis with a hip prosthesis and a screw at the ceiling of 12 bits", (1.5, 1.5, 1.5)),
+    "contrast": _scene("trunk with heart and vessels brighter and larger than the spine", (1.4, 1.4, 2.0)),
+    "water": _scene("cylinder of water in an acrylic shell", (1.0, 1.0, 1.5)),
+    "empty": _scene("a table with nothing on it", (1.7, 1.7, 2.0), "curved"),
+}
+"""Each kind with what it shows and its defaults."""
+
+TABLE_NAMES = ("none", "flat", "curved", "headrest")
+"""Tables that a body may lie on; without a name a spine lies on a curved couch of its own."""
 
 CENTRE_LPS_MM = (-3.5, -142.25, -418.75)
 """Centre of the volume: away from zero, as on a real couch, so that a lost origin shows."""
@@ -68,15 +114,16 @@ class PhantomSettings:
 
     Attributes
     ----------
-    kind : {"spine", "sphere", "torus", "cylinder", "plane"}
-        ``plane`` is an oblique slab with finite faces, so that it has an area and a volume.
+    kind : str
+        One of `KINDS`.  ``plane`` is an oblique slab with finite faces, so that it has an area and a volume.
     size : (columns, rows)
         Extents of a slice in pixels.
     slices : int
         Number of slices.
     spacing : (dj, di, dk)
         mm, in DICOM's order: distance between rows, between columns, and between neighbouring slices **along the
-        slice normal**.  With a tilted gantry the slice step itself is longer: ``dk / cos(tilt)``.
+        slice normal**.  With a tilted gantry the slice step itself is longer: ``dk / cos(tilt)``.  Default: that of
+        the kind, so that 256 x 256 pixels hold it whole.
     tilt : float
         Gantry tilt in degrees: slices rotated about the patient's x axis while the table still moves along z, so
         the slice step is not parallel to the slice normal (a shear).  At most 45 either way.
@@ -84,17 +131,25 @@ class PhantomSettings:
         Degrees by which the whole frame (slices and slice step) is then rotated rigidly about the patient's x,
         then y, then z axis.
     noise : float
-        Standard deviation of white Gaussian noise in HU; default 12 for the spine, 0 for an analytic shape.
+        Standard deviation of white Gaussian noise in HU; default 12, 0 for an analytic shape.
     point_spread_mm : float
-        Standard deviation of the Gaussian point spread in mm; default 0.5 for the spine, 0 for an analytic shape.
+        Standard deviation of the Gaussian point spread in mm; default 0.5, 0 for an analytic shape.
     seed : int
         Same settings and seed give the same bytes; another seed moves the shape by part of a voxel, and gives other
         noise and texture.
     inside_hu, outside_hu : float
-        HU of an analytic shape and of what surrounds it (not used by the spine).
+        HU of an analytic shape and of what surrounds it (not used by other kinds).
     radius_mm : float, optional
         Sphere radius, torus centre-line radius, cylinder radius, or half the thickness of the plane's slab.
         Default: a part of the field of view.
+    table : {"none", "flat", "curved", "headrest"}, optional
+        What the body lies on; default: nothing, the spine's own couch, a curved table for the kind ``empty``.  Not
+        for analytic shapes.
+    table_gap_mm : float
+        Between body and table: 0 touches, below 0 the body sinks in.  The spine's own couch takes no account of it.
+    prone : bool
+        The patient lies on the face: the table is at the front, and the image's rows and columns are turned by half a
+        turn about z, as a scanner does it (PatientPosition HFP).
     transfer_syntax : {"explicit", "implicit"}
         Value representations in the files, both little endian and uncompressed.
 
@@ -107,7 +162,7 @@ class PhantomSettings:
     kind: str = "spine"
     size: tuple[int, int] = (256, 256)
     slices: int = 120
-    spacing: tuple[float, float, float] = (1.0, 1.0, 1.25)
+    spacing: tuple[float, float, float] = None  # type: ignore[assignment]  # three numbers once constructed
     tilt: float = 0.0
     oblique: tuple[float, float, float] = (0.0, 0.0, 0.0)
     noise: float = None  # type: ignore[assignment]  # a number once constructed
@@ -116,6 +171,9 @@ class PhantomSettings:
     inside_hu: float = 1000.0
     outside_hu: float = -1000.0
     radius_mm: float | None = None
+    table: str | None = None
+    table_gap_mm: float = 0.0
+    prone: bool = False
     transfer_syntax: str = "explicit"
 
     def __post_init__(self) -> None:
@@ -123,9 +181,9 @@ class PhantomSettings:
             raise UsageError(f"unknown phantom kind {self.kind!r}: use one of {', '.join(KINDS)}")
         if self.transfer_syntax not in ("explicit", "implicit"):
             raise UsageError(f"unknown transfer syntax {self.transfer_syntax!r}: use explicit or implicit")
-        for name, default in (("noise", 12.0), ("point_spread_mm", 0.5)):
+        for name in ("spacing", "noise", "point_spread_mm"):
             if getattr(self, name) is None:
-                object.__setattr__(self, name, default if self.kind == "spine" else 0.0)
+                object.__setattr__(self, name, getattr(KINDS[self.kind], name))
         # tuples whatever came (a list from a command line): equal settings compare and describe equal
         for name, length in (("size", 2), ("spacing", 3), ("oblique", 3)):
             value = tuple(getattr(self, name))
@@ -149,6 +207,23 @@ class PhantomSettings:
             raise UsageError(f"inside ({self.inside_hu:g}) and outside ({self.outside_hu:g}) differ by less than 1 HU")
         if self.radius_mm is not None:
             _check_number("radius", self.radius_mm, 1e-3, 1e4, "mm")
+        _check_number("gap between body and table", self.table_gap_mm, -100.0, 500.0, "mm")
+        self._check_lying()
+
+    def _check_lying(self) -> None:
+        if self.table is not None and self.table not in TABLE_NAMES:
+            raise UsageError(f"unknown table {self.table!r}: use one of {', '.join(TABLE_NAMES)}")
+        lies = self.table is not None or self.table_gap_mm != 0.0 or self.prone
+        if lies and KINDS[self.kind].table is None:
+            raise UsageError(f"a {self.kind} lies on nothing: table, gap and prone are for spine and the other bodies")
+        if self.table_gap_mm != 0.0 and self.table_used in ("none", "own"):
+            names = ", ".join(TABLE_NAMES[1:])
+            raise UsageError(f"a gap of {self.table_gap_mm:g} mm needs a table: name one of {names}")
+
+    @property
+    def table_used(self) -> str:
+        """Name of the table: the given one, else that of the kind; ``own`` for the couch that the spine has."""
+        return self.table or KINDS[self.kind].table or "none"
 
     @property
     def shape_kji(self) -> tuple[int, int, int]:
@@ -156,10 +231,17 @@ class PhantomSettings:
         return self.slices, self.size[1], self.size[0]
 
     def as_dict(self) -> dict[str, Any]:
-        """All settings as plain JSON types."""
-        return {
+        """All settings as plain JSON types; `table`, `table_gap_mm` and `prone` where they are not the default.
+
+        UIDs are made of these texts: those of a phantom of an earlier version stay.
+        """
+        plain = {
             name: list(value) if isinstance(value, tuple) else value for name, value in dataclasses.asdict(self).items()
         }
+        for name, default in (("table", None), ("table_gap_mm", 0.0), ("prone", False)):
+            if plain[name] == default:
+                del plain[name]
+        return plain
 
 
 def _check_integer(name: str, value: Any, low: int, high: int) -> None:
@@ -225,6 +307,8 @@ def place_slices(settings: PhantomSettings) -> Placement:
     dj, di, dk = settings.spacing
     tilt = math.radians(settings.tilt)
     rotation = _rotation(settings.oblique)
+    if settings.prone:
+        rotation = rotation @ np.diag((-1.0, -1.0, 1.0))
     row = rotation @ (1.0, 0.0, 0.0)
     column = rotation @ (0.0, math.cos(tilt), -math.sin(tilt))
     step = rotation @ (0.0, 0.0, dk / math.cos(tilt))

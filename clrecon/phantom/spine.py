@@ -15,8 +15,11 @@ from numpy.typing import NDArray
 from clrecon.geometry import column_spacing
 from clrecon.phantom.anatomy import Anatomy, Vertebra, plan_anatomy
 from clrecon.phantom.fields import Field, capsule, coverage, ellipse, waves_at
+from clrecon.phantom.placing import Piece, PlacedPiece, Window, paint
 from clrecon.phantom.sampling import Progress
+from clrecon.phantom.scenes import Plan
 from clrecon.phantom.settings import CENTRE_LPS_MM, PhantomSettings
+from clrecon.phantom.tables import lay_under
 from clrecon.phantom.tissue import draw_tissue
 from clrecon.phantom.vertebra import local_bounds, vertebra_distance
 
@@ -36,64 +39,6 @@ VEIN_HU = 60.0
 MARKER_HU = 2200.0
 
 
-class _Part:
-    """A piece with a box of its own: drawn only where that box meets a slice."""
-
-    def __init__(self, center: Float64Array, axes: Float64Array, low: Float64Array, high: Float64Array):
-        self.center, self.axes = center, axes
-        self.corners = center + np.array(list(itertools.product(*zip(low, high, strict=True)))) @ axes
-
-
-class _Window:
-    """The part of a slice in which a piece lies, and coordinates there."""
-
-    def __init__(self, region: tuple[slice, slice], local: Float64Array, k: float):
-        self.region = region
-        j = np.arange(region[0].start, region[0].stop, dtype=np.float64)[:, None]
-        i = np.arange(region[1].start, region[1].stop, dtype=np.float64)[None, :]
-        self.x, self.y, self.z = (
-            (row[0] * i + row[1] * j + (row[2] * k + row[3])).astype(np.float32) for row in local[:3]
-        )
-
-
-def _local_affine(affine: Float64Array, center: Float64Array, axes: Float64Array) -> Float64Array:
-    """Index to the local frame of a part."""
-    local = np.eye(4)
-    local[:3, :3] = axes @ affine[:3, :3]
-    local[:3, 3] = axes @ (affine[:3, 3] - center)
-    return local
-
-
-class _Placed:
-    """A part with its box in indices and its local affine."""
-
-    def __init__(self, part: _Part, affine: Float64Array, shape_kji: tuple[int, int, int]):
-        inverse = np.linalg.inv(affine)
-        ijk = part.corners @ inverse[:3, :3].T + inverse[:3, 3]
-        self.low = np.floor(ijk.min(axis=0)).astype(int)
-        self.high = np.ceil(ijk.max(axis=0)).astype(int) + 1
-        nk, nj, ni = shape_kji
-        self.region = (
-            slice(min(max(self.low[1], 0), nj), max(min(self.high[1], nj), 0)),
-            slice(min(max(self.low[0], 0), ni), max(min(self.high[0], ni), 0)),
-        )
-        self.local = _local_affine(affine, part.center, part.axes)
-
-    def meets(self, k: int) -> bool:
-        """Whether slice k can hold some of the part."""
-        rows, columns = self.region
-        return bool(self.low[2] <= k < self.high[2]) and rows.start < rows.stop and columns.start < columns.stop
-
-    def window(self, k: float) -> _Window:
-        """Coordinates on the (sub-)slice k."""
-        return _Window(self.region, self.local, k)
-
-
-def _paint(canvas: Field, region: tuple[slice, slice], share: Field, hu: float | Field) -> None:
-    view = canvas[region]
-    view += share * (hu - view)
-
-
 class _Scene:
     """All bone parts of an anatomy, placed on one grid."""
 
@@ -101,8 +46,8 @@ class _Scene:
         self.anatomy, self.ramp = anatomy, ramp_mm
         margin = np.full(3, 2.0 * ramp_mm + float(np.linalg.norm(affine[:3, :3], axis=0).max()))
 
-        def place(center: Float64Array, axes: Float64Array, low: Float64Array, high: Float64Array) -> _Placed:
-            return _Placed(_Part(center, axes, low - margin, high + margin), affine, shape_kji)
+        def place(center: Float64Array, axes: Float64Array, low: Float64Array, high: Float64Array) -> PlacedPiece:
+            return PlacedPiece(Piece(center, axes, low - margin, high + margin), affine, shape_kji)
 
         self.discs = []
         for disc in anatomy.discs:
@@ -130,7 +75,7 @@ class _Scene:
                 inside = np.minimum(wall, np.float32(disc.half_length) - np.abs(at.z))
                 # fibrous ring a little denser than the nucleus
                 ring = np.float32(DISC_HU) + np.float32(14.0) * coverage(8.0 - wall, 8.0)
-                _paint(canvas, placed.region, coverage(inside, self.ramp), ring)
+                paint(canvas, placed.region, coverage(inside, self.ramp), ring)
         self._draw_ribs(canvas, scratch, slice_k, k)
         for vertebra, placed in self.vertebrae:
             if placed.meets(slice_k):
@@ -138,7 +83,7 @@ class _Scene:
         if self.marker.meets(slice_k):
             at = self.marker.window(k)
             ball = np.float32(self.anatomy.marker_radius) - np.sqrt(at.x * at.x + at.y * at.y + at.z * at.z)
-            _paint(canvas, at.region, coverage(ball, self.ramp), MARKER_HU)
+            paint(canvas, at.region, coverage(ball, self.ramp), MARKER_HU)
 
     def _draw_ribs(self, canvas: Field, scratch: Field, slice_k: int, k: float) -> None:
         """All ribs as one union, so that the joints of the rods do not show."""
@@ -155,11 +100,11 @@ class _Scene:
         rows = slice(min(p.region[0].start for *_, p in active), max(p.region[0].stop for *_, p in active))
         columns = slice(min(p.region[1].start for *_, p in active), max(p.region[1].stop for *_, p in active))
         rib = scratch[rows, columns]
-        _paint(canvas, (rows, columns), coverage(rib, self.ramp), CORTEX_HU)
-        _paint(canvas, (rows, columns), coverage(rib - np.float32(1.0), self.ramp), RIB_MARROW_HU)
+        paint(canvas, (rows, columns), coverage(rib, self.ramp), CORTEX_HU)
+        paint(canvas, (rows, columns), coverage(rib - np.float32(1.0), self.ramp), RIB_MARROW_HU)
         rib[...] = -1e3
 
-    def _draw_vertebra(self, canvas: Field, vertebra: Vertebra, at: _Window) -> None:
+    def _draw_vertebra(self, canvas: Field, vertebra: Vertebra, at: Window) -> None:
         bone = vertebra_distance(vertebra, at.x, at.y, at.z)
         if bone.max() <= -self.ramp:
             return
@@ -172,8 +117,8 @@ class _Scene:
         vein = capsule(at.x, at.y, at.z, (0.0, vertebra.depth / 2.0, 0.0), (0.0, 2.0, 0.0), 2.4, 1.0, 1.0)
         marrow += coverage(vein, 1.5) * (np.float32(VEIN_HU) - marrow)
         shell = np.float32(BODY_CORTEX_HU) + np.float32(CORTEX_HU - BODY_CORTEX_HU) * arch
-        _paint(canvas, at.region, coverage(bone, self.ramp), shell)
-        _paint(canvas, at.region, coverage(bone - cortex, self.ramp), marrow)
+        paint(canvas, at.region, coverage(bone, self.ramp), shell)
+        paint(canvas, at.region, coverage(bone - cortex, self.ramp), marrow)
 
 
 def draw_spine(
@@ -206,12 +151,15 @@ def draw_spine(
     extent = (shape[2] * di, shape[1] * dj, shape[0] * dk)
     anatomy = plan_anatomy(extent, grid[:3, :3], settings.seed)
     scene = _Scene(anatomy, grid, shape, ramp)
+    body = Plan([], front=-anatomy.half_depth, back=anatomy.half_depth)
+    own = settings.table_used == "own"
+    table = None if own else lay_under(body, settings.table_used, settings.table_gap_mm, settings.prone)
     voxels = np.empty(shape, dtype=np.float32)
     offsets = (np.arange(subslices) + 0.5) / subslices - 0.5
 
     def draw(k: int) -> None:
-        full = _Window((slice(0, shape[1]), slice(0, shape[2])), grid, float(k))
-        tissue = draw_tissue(anatomy, full.x, full.y, full.z, ramp, settings.seed)
+        full = Window((slice(0, shape[1]), slice(0, shape[2])), grid, float(k))
+        tissue = draw_tissue(anatomy, full.x, full.y, full.z, ramp, settings.seed, table, settings.prone)
         scratch = np.full(shape[1:], -1e3, dtype=np.float32)
         voxels[k] = 0.0
         for offset in offsets:

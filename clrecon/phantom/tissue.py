@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from clrecon.phantom.anatomy import Anatomy
 from clrecon.phantom.fields import Field, capsule, coverage, ellipse, ellipsoid
+from clrecon.phantom.scenes import Part
 
 __all__ = ["draw_tissue"]
 
@@ -32,7 +35,7 @@ def _blend(canvas: Field, share: Field, hu: float) -> None:
 
 
 def _draw_couch(canvas: Field, anatomy: Anatomy, x: Field, y: Field, ramp: float) -> None:
-    """A curved carbon couch under the back: a thin shell round foam, endless along z."""
+    """A curved carbon couch under the back: a thin shell round foam, endless along z; `y` runs downwards."""
     top = y - np.float32(anatomy.half_depth + 2.0)
     bowed = top + np.float32(0.16 / anatomy.half_width) * x * x
     shell = np.minimum(np.minimum(bowed, 32.0 - top), np.float32(0.95 * anatomy.half_width) - np.abs(x))
@@ -102,7 +105,9 @@ _BAND = 24000
 """Pixels drawn at once: temporaries that stay in the cache, and below the size at which memory is mapped anew."""
 
 
-def draw_tissue(anatomy: Anatomy, x: Field, y: Field, z: Field, ramp: float, seed: int) -> Field:
+def draw_tissue(
+    anatomy: Anatomy, x: Field, y: Field, z: Field, ramp: float, seed: int, table: Sequence[Part] | None, prone: bool
+) -> Field:
     """Draw one slice without bone, in bands of rows.
 
     Parameters
@@ -113,6 +118,10 @@ def draw_tissue(anatomy: Anatomy, x: Field, y: Field, z: Field, ramp: float, see
     ramp : float
         Width of an interface, mm.
     seed : int
+    table : sequence of Part, optional
+        What the body lies on; None: a couch of its own.
+    prone : bool
+        That couch is under the front.
 
     Returns
     -------
@@ -123,13 +132,16 @@ def draw_tissue(anatomy: Anatomy, x: Field, y: Field, z: Field, ramp: float, see
     rows = max(1, _BAND // x.shape[1])
     for start in range(0, x.shape[0], rows):
         band = slice(start, start + rows)
+        if table is None:
+            _draw_couch(canvas[band], anatomy, x[band], -y[band] if prone else y[band], ramp)
+        for part in table or ():
+            _blend(canvas[band], coverage(part.distance_at(x[band], y[band], z[band]), ramp), part.hu)
         _draw_band(canvas[band], anatomy, x[band], y[band], z[band], ramp, seed)
     return canvas
 
 
 def _draw_band(canvas: Field, anatomy: Anatomy, x: Field, y: Field, z: Field, ramp: float, seed: int) -> None:
-    """Draw onto `canvas`, which holds air."""
-    _draw_couch(canvas, anatomy, x, y, ramp)
+    """Draw onto `canvas`, which holds air and the couch."""
     cavity = _draw_wall(canvas, anatomy, x, y, ramp)
     lung = _draw_organs(canvas, anatomy, cavity, x, y, z, ramp, seed)
 

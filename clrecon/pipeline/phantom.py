@@ -7,7 +7,14 @@ from typing import Any
 
 from clrecon.pipeline.progress import Progress
 
-__all__ = ["make_phantom"]
+__all__ = ["describe_kinds", "make_phantom"]
+
+
+def describe_kinds() -> dict[str, str]:
+    """Name of each kind of phantom, and what it shows."""
+    from clrecon.phantom import KINDS
+
+    return {name: kind.said for name, kind in KINDS.items()}
 
 
 def make_phantom(output: str | Path, *, progress: Progress | None = None, **settings: Any) -> dict[str, Any]:
@@ -16,7 +23,7 @@ def make_phantom(output: str | Path, *, progress: Progress | None = None, **sett
     Parameters
     ----------
     output : path
-        Folder for the DICOM files and ``truth.json``.
+        Folder for the DICOM files, ``truth.json`` and, of a scene, ``materials.nrrd``.
     progress : callable, optional
     **settings
         Fields of `clrecon.phantom.PhantomSettings`; those that are None keep their default.  ``size`` may be a
