@@ -33,7 +33,7 @@ def draw_modes(renderer: clrecon.VolumeRenderer, ray_step: float) -> np.ndarray:
         "dvr, preset spine": {"preset": "spine", "view": "35,15", "ray_step": ray_step, "zoom": 1.25},
         "surface, shadows": {"mode": "surface", "view": "20,10", "shadows": True, "lighting": light, "zoom": 1.25},
         "mip": {"mode": "mip", "view": "35,15", "zoom": 1.25},
-        "mean, preset x-ray": {"preset": "x-ray"},
+        "drr, preset x-ray": {"preset": "x-ray"},
         "slices": {"mode": "slices", "slices": 10, "view": "40,25", "zoom": 1.25},
         "slice, 5 mm thick": {"mode": "slice", "view": "sagittal", "thickness": 5.0, "zoom": 1.3},
     }

@@ -8,6 +8,15 @@
 #include "include/volume.h"
 #include "include/window.h"
 
+/* -D LEAST_VALUE: voxels with lower values count as if they had this one, before anything is interpolated. */
+#ifdef LEAST_VALUE
+#define HOLD_FLOATS(values) greater(values, (floats)(LEAST_VALUE))
+#define HOLD_PAIRS(pairs) hold_pairs(pairs)
+#else
+#define HOLD_FLOATS(values) (values)
+#define HOLD_PAIRS(pairs) (pairs)
+#endif
+
 /* A volume, or the slices of it from first_k to end_k - 1 that a device holds: at least two along each axis. */
 typedef struct {
     __global const VOXEL *voxels;
@@ -76,6 +85,14 @@ static inline void find_cells(
 }
 
 #if HAS_WINDOWS
+#ifdef LEAST_VALUE
+static inline short16 hold_pairs(const short16 pairs)
+{
+    const short16 least = (short)(LEAST_VALUE);
+    return pairs > least ? pairs : least;
+}
+#endif
+
 /* True where all cells of `inner` places lie in one row, so near each other that a window shows them and the voxels
  * beside them; `row` and `at` are set then.  Rows have at least WINDOW voxels. */
 static inline int find_window(const field *f, cell_lanes *c)
@@ -106,10 +123,10 @@ static inline floats sample_window(const field *f, const cell_lanes *c)
     const int row = f->ni, slice = f->ni * f->nj;
     const choice pairs = choose_pairs(c->at);
     const short16 weights = weigh_pairs(c->part_i);
-    const floats front_near = to_floats(mix_pairs(take_pairs(c->row, pairs), weights));
-    const floats front_far = to_floats(mix_pairs(take_pairs(c->row + row, pairs), weights));
-    const floats back_near = to_floats(mix_pairs(take_pairs(c->row + slice, pairs), weights));
-    const floats back_far = to_floats(mix_pairs(take_pairs(c->row + slice + row, pairs), weights));
+#define EDGE(to_row) to_floats(mix_pairs(HOLD_PAIRS(take_pairs(c->row + (to_row), pairs)), weights))
+    const floats front_near = EDGE(0), front_far = EDGE(row);
+    const floats back_near = EDGE(slice), back_far = EDGE(slice + row);
+#undef EDGE
     const floats front = front_near + c->part_j * (front_far - front_near);
     const floats back = back_near + c->part_j * (back_far - back_near);
     return (front + c->part_k * (back - front)) * (1.0f / SHARES);
@@ -138,6 +155,15 @@ static inline void find_window_slopes(const field *f, const cell_lanes *c, slope
 }
 #endif
 
+static inline floats sample_held_edge(__global const VOXEL *row, const ints at, const floats part)
+{
+    floats low, high;
+    LOAD_PAIRS(row, at, low, high)
+    low = HOLD_FLOATS(low);
+    high = HOLD_FLOATS(high);
+    return low + part * (high - low);
+}
+
 /* Values at LANES places near each other, index coordinates; `inner` as in find_cells(), 0 where that is not known. */
 static inline floats sample_lanes(const field *f, const floats i, const floats j, const floats k, const int inner)
 {
@@ -152,15 +178,10 @@ static inline floats sample_lanes(const field *f, const floats i, const floats j
     __global const VOXEL *corner = f->voxels + voxel_index(base_i, base_j, base_k - f->first_k, f->ni, f->nj);
     const ints at = ((c.k - base_k) * f->nj + (c.j - base_j)) * f->ni + (c.i - base_i);
     const int row = f->ni, slice = f->ni * f->nj;
-    floats low, high;
-    LOAD_PAIRS(corner, at, low, high)
-    const floats front_near = low + c.part_i * (high - low);
-    LOAD_PAIRS(corner + row, at, low, high)
-    const floats front_far = low + c.part_i * (high - low);
-    LOAD_PAIRS(corner + slice, at, low, high)
-    const floats back_near = low + c.part_i * (high - low);
-    LOAD_PAIRS(corner + slice + row, at, low, high)
-    const floats back_far = low + c.part_i * (high - low);
+    const floats front_near = sample_held_edge(corner, at, c.part_i);
+    const floats front_far = sample_held_edge(corner + row, at, c.part_i);
+    const floats back_near = sample_held_edge(corner + slice, at, c.part_i);
+    const floats back_far = sample_held_edge(corner + slice + row, at, c.part_i);
     const floats front = front_near + c.part_j * (front_far - front_near);
     const floats back = back_near + c.part_j * (back_far - back_near);
     return front + c.part_k * (back - front);

@@ -1,11 +1,13 @@
-/* Projections: the highest, the lowest or the mean value along each ray.
+/* Projections: the highest, the lowest or the mean value along each ray, or the water that attenuates as much as what
+ * lies along it: a digitally reconstructed radiograph.
  *
  * Extremes are taken of samples on every slice plane of the axis that runs most along the ray, and evenly between
  * them: along an axis of the volume they are its own voxels.  Bricks that cannot hold a better value are passed over.
- * Means are integrals: samples in the middle of segments, weighted with their lengths.  A work-item has a packet of
+ * Means and radiographs are integrals: samples in the middle of segments, weighted with their lengths.  A work-item has a packet of
  * LANES neighbouring rays, as in composite.cl.
  *
- * -D UNEVEN   slices at places of their own */
+ * -D UNEVEN        slices at places of their own
+ * -D LEAST_VALUE   of radiographs: HU of air, which lower voxels count as */
 #include "include/field.h"
 #include "include/inner_samples.h"
 #include "include/leap.h"
@@ -16,6 +18,10 @@
 #define HIGHEST 0
 #define LOWEST 1
 #define MEAN 2
+#define RADIOGRAPH 3
+
+#define AIR_HU (-1000.0f) /* attenuates nothing: shares of water's attenuation are (HU - AIR_HU) * WATER_PER_HU */
+#define WATER_PER_HU 0.001f
 
 #define SNAP 4096.0f /* parts of a voxel: what rounding moves a sample off a voxel is less, and does not count */
 #define SAMPLES_A_LOOK 8 /* samples until a packet looks for bricks without a better value again */
@@ -106,7 +112,7 @@ static inline floats count_useless(const leap_map *map, __global const VOXEL *li
  *             view     in   see include/view.h
  *             states   in/out  (height, width, 2) float4: value or integral, t, length, -; -
  *             depths   out  (height, width) mm to the extreme; NaN where the ray misses, and for means
- *             values   out  (height, width) NaN where the ray misses
+ *             values   out  (height, width) NaN where the ray misses; of radiographs mm of water, 0 there
  *             the rest as in composite.cl
  * Launch      global = tiles * 64 / LANES rounded up by the host, any local
  * Guarantees  every pixel is written with the last slab */
@@ -131,7 +137,13 @@ __kernel void project_rays(
 #ifdef UNEVEN
     const int on_planes = 0; /* no step meets planes at any distance */
 #else
-    const int on_planes = which != MEAN;
+    const int on_planes = which == HIGHEST || which == LOWEST;
+#endif
+    const int sums = which == MEAN || which == RADIOGRAPH;
+#ifdef UNEVEN
+    const int leaps = 0; /* rays are no lines among the bricks */
+#else
+    const int leaps = which != MEAN;
 #endif
     if (on_planes)
         plan_crossings(&way, ray_step, &course, &row);
@@ -143,8 +155,8 @@ __kernel void project_rays(
 
     /* Lowest values are the highest of the field turned over. */
     const float sign = which == LOWEST ? -1.0f : 1.0f;
-    __global const VOXEL *limits = ranges + (which == HIGHEST);
-    floats best = which == MEAN ? 0.0f : -MAXFLOAT, best_t = 0.0f, length_mm = 0.0f;
+    __global const VOXEL *limits = ranges + (which != LOWEST);
+    floats best = sums ? 0.0f : -MAXFLOAT, best_t = 0.0f, length_mm = 0.0f;
     float lane_of[3][LANES], offset_of[LANES];
     if (!(stage & FIRST_SLAB)) {
         for (int lane = 0; lane < LANES; ++lane) {
@@ -161,10 +173,11 @@ __kernel void project_rays(
     }
     float n = 0.0f;
     while (ANY_LANE(n < end)) {
-        if (on_planes) {
+        if (leaps) {
             const floats i = snap(course.start_i + n * course.stride_i), j = snap(course.start_j + n * course.stride_j);
             const floats k = snap(course.start_k + n * course.stride_k) - (float)first_k;
-            const floats useless = count_useless(&map, limits, sign, &course, best, i, j, k);
+            const floats least = which == RADIOGRAPH ? (floats)(AIR_HU) : best;
+            const floats useless = count_useless(&map, limits, sign, &course, least, i, j, k);
             const float free = LEAST_LANE(choose(n < end, useless, (floats)(MAXFLOAT)));
             if (free > 0.0f) {
                 n += free;
@@ -189,10 +202,11 @@ __kernel void project_rays(
                 counts &= (i >= -0.5f) & (i <= f.last.x + 0.5f) & (j >= -0.5f) & (j <= f.last.y + 0.5f);
 #endif
                 const floats value = sign * sample_lanes(&f, i, j, k, inner);
-                if (which == MEAN) {
+                if (sums) {
                     const floats mm = choose(number < row.count - 1.0f, (floats)(ray_step), row.rest);
                     const floats weight = choose(counts, greater(mm, (floats)(0.0f)), (floats)(0.0f));
-                    best += weight * value;
+                    const floats water = greater(value - AIR_HU, (floats)(0.0f)) * WATER_PER_HU;
+                    best += weight * (which == MEAN ? value : water);
                     length_mm += weight;
                 } else {
                     const ints better = counts & (value > best);
@@ -218,7 +232,8 @@ __kernel void project_rays(
         }
         const int missed = !(lane_of[2][lane] > 0.0f);
         const float mean = lane_of[0][lane] / lane_of[2][lane];
-        values[place] = missed ? NAN : which == MEAN ? mean : sign * lane_of[0][lane];
-        depths[place] = missed || which == MEAN ? NAN : lane_of[1][lane] + offset_of[lane];
+        const float missing = which == RADIOGRAPH ? 0.0f : NAN; /* what is not scanned is air */
+        values[place] = missed ? missing : which == MEAN ? mean : sign * lane_of[0][lane];
+        depths[place] = missed || sums ? NAN : lane_of[1][lane] + offset_of[lane];
     }
 }

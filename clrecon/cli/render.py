@@ -137,6 +137,9 @@ def _describe_picture(picture: dict[str, Any]) -> str:
     scale = f"{picture['pixel_mm']:.4g} mm a pixel" if picture["pixel_mm"] else "perspective"
     window = picture["window_hu"]
     shown = f", {window[0]:g} to {window[1]:g} HU" if window else ""
+    if picture["window_mm_water"]:
+        low, high = picture["window_mm_water"]
+        shown = f", {low:.4g} to {high:.4g} mm of water"
     return f"{picture['view']}: {width} x {height}, {scale}{shown}"
 
 

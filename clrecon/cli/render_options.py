@@ -74,7 +74,10 @@ def add_looks(parser: argparse.ArgumentParser) -> None:
     )
     group.add_argument("--color", metavar="C", help="colour of a surface, such as orange or #ff8000 (default: bone)")
     group.add_argument(
-        "--window", type=parse_window, metavar="LOW,HIGH", help="HU that are black and white, of modes that show HU"
+        "--window",
+        type=parse_window,
+        metavar="LOW,HIGH",
+        help="HU that are black and white, of modes that show HU; mm of water in mode drr",
     )
     group.add_argument(
         "--ray-step", type=float, metavar="MM", help="way between samples (default: half the smallest spacing)"

@@ -9,9 +9,12 @@ from clrecon.operators.pictures import PictureBuffers, count_queues
 from clrecon.operators.ray_view import RayView
 from clrecon.operators.resident import RaySlab, ResidentVolume
 
-__all__ = ["PROJECTIONS", "project_slab"]
+__all__ = ["AIR_HU", "PROJECTIONS", "project_slab"]
 
-PROJECTIONS = {"mip": 0, "minip": 1, "mean": 2}
+AIR_HU = -1000.0
+"""Attenuates nothing, as in cl/render/project.cl: lower values are padding, or what a mask left."""
+
+PROJECTIONS = {"mip": 0, "minip": 1, "mean": 2, "drr": 3}
 """What the kernel calls them."""
 
 
@@ -27,14 +30,15 @@ def project_slab(
 
     Parameters
     ----------
-    mode : {"mip", "minip", "mean"}
+    mode : {"mip", "minip", "mean", "drr"}
     """
+    variants = {"LEAST_VALUE": f"({AIR_HU:g})"} if mode == "drr" else {}
     device = resident.device
     width, height = view.size
     queues, lanes = count_queues(device), int(device.kernel_variants["LANES"])
     last = np.array([n - 1 for n in resident.volume.shape_ijk] + [0], dtype=np.float32)
     launch(
-        device, resident.program("render/project.cl")["project_rays"], output.items(queues, lanes),
+        device, resident.program("render/project.cl", **variants)["project_rays"], output.items(queues, lanes),
         slab.voxels_d, resident.measure(slab, stopwatch), upload(device, view.table), output.states_d,
         output.depths_d, output.means_d, last,
         np.int32(slab.shape_ijk[0]), np.int32(slab.shape_ijk[1]), np.int32(slab.first_k), np.int32(slab.end_k),

@@ -21,7 +21,7 @@ from clrecon.operators.ray_view import RayView, volume_box
 from clrecon.operators.resident import RaySlab, ResidentVolume, entry_slice
 from clrecon.rendering import Lighting, Rendering, TransferFunction
 from clrecon.rendering.label_style import LabelStyle
-from clrecon.rendering.window import choose_window, grey_image
+from clrecon.rendering.window import choose_water_window, choose_window, grey_image
 
 __all__ = ["RayPicture", "take_picture"]
 
@@ -32,7 +32,7 @@ class RayPicture:
 
     Attributes
     ----------
-    mode : {"dvr", "mip", "minip", "mean"}
+    mode : {"dvr", "mip", "minip", "mean", "drr"}
     camera : Camera
     size : (width, height)
     ray_step : float
@@ -41,7 +41,7 @@ class RayPicture:
         Of volume rendering.
     lighting : Lighting
     window : (low, high) or None
-        HU that are black and white in projections; None chooses by what there is.
+        HU, in drr mm of water, that are black and white in projections; None chooses by what there is.
     clip : Clip or None
     background : colour or None
         None leaves the picture transparent where nothing is.
@@ -138,9 +138,12 @@ class _Job:
         self, values: NDArray[np.float32], depths: NDArray[np.float32], report: dict[str, Any]
     ) -> Rendering:
         picture = self.picture
-        window = picture.window or choose_window(values)
-        report["window_hu"] = list(window)
+        is_water = picture.mode == "drr"
+        window = picture.window or (choose_water_window if is_water else choose_window)(values)
+        report["window_mm_water" if is_water else "window_hu"] = list(window)
         image = grey_image(values, window)
+        if is_water:
+            image[values <= 0.0, 3] = 0  # nothing attenuates there, within the volume or beside it
         made = Rendering(image, depths, depths.copy(), picture.camera, values, picture.mode, report)
         return made if picture.background is None else made.with_background(picture.background)
 

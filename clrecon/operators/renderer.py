@@ -29,7 +29,7 @@ from clrecon.rendering.window import checked_window
 
 __all__ = ["MODES", "VolumeRenderer", "render"]
 
-MODES = ("dvr", "mip", "minip", "mean", "surface", "slices", "slice", "cpr")
+MODES = ("dvr", "mip", "minip", "mean", "drr", "surface", "slices", "slice", "cpr")
 """Kinds of pictures."""
 
 DEFAULT_SIZE = (1024, 1024)
@@ -45,7 +45,7 @@ MOST_STEPS = 1 << 15
 
 _LABELLED = ("dvr", "surface")
 _CUT = ("slice", "cpr")
-_RAYS = ("dvr", "mip", "minip", "mean", "surface", "slices")
+_RAYS = ("dvr", "mip", "minip", "mean", "drr", "surface", "slices")
 
 KNOWN_IN: dict[str, tuple[str, ...]] = {
     "transfer_function": ("dvr", *PROJECTIONS, "slices"),  # part of the look that all pictures of a series share
@@ -175,8 +175,8 @@ class VolumeRenderer:
         function = chosen.transfer_function if transfer_function is None else transfer_function
         picture = RayPicture(
             mode, camera, size, step, function, options.get("lighting") or function.lighting or Lighting(),
-            _choose_window(preset, options), options.get("clip"), ground, _is_set(options, "jitter"),
-            _label_style(options),
+            _choose_window(None if mode == "drr" else preset, options), options.get("clip"), ground,
+            _is_set(options, "jitter"), _label_style(options),
         )  # fmt: skip
         tables = None if mode in PROJECTIONS else self._transfer_tables(function, step)
         return take_picture(self._resident, picture, tables)
@@ -363,9 +363,10 @@ def render(
     Parameters
     ----------
     volume : Volume
-    mode : {"dvr", "mip", "minip", "mean", "surface", "slices", "slice", "cpr"}, optional
-        Volume rendering, highest, lowest or mean value along each ray, shaded surface at an iso value, slices in space,
-        a plane through the volume, curved planar reformation.  Default is the preset's, or "dvr".
+    mode : {"dvr", "mip", "minip", "mean", "drr", "surface", "slices", "slice", "cpr"}, optional
+        Volume rendering, highest, lowest or mean value along each ray, radiograph (the water that attenuates as much),
+        shaded surface at an iso value, slices in space, a plane through the volume, curved planar reformation.  Default
+        is the preset's, or "dvr".
     preset : str, optional
         See `clrecon.rendering.presets`; default "bone".
     transfer_function : TransferFunction, optional
@@ -391,7 +392,8 @@ def render(
         surface: ``iso_value`` in HU (default 200), ``color``, ``shadows`` (they need a fixed light), ``depth_cue``.
 
         mip, minip, mean, slices, slice, cpr: ``window``, HU that are black and white; default the 1st to the 99th
-        percentile in projections, -450 to 1050 HU else.
+        percentile in projections, -450 to 1050 HU else.  drr: ``window`` in mm of water; default the 1st to the 99th
+        percentile of the rays that meet the body.
 
         slices: ``slices``, how many or which, ``slice_opacity``.  slice, cpr: ``thickness`` in mm with ``combine``
         ("mean", "max", "min").  slice: ``offset_mm`` along the view.  cpr: ``curve``, points (n, 3) in LPS mm (default:

@@ -8,7 +8,8 @@ MODES = {
     "dvr": "volume rendering: every HU with the colour and opacity of a transfer function",
     "mip": "the highest HU along each ray",
     "minip": "the lowest HU along each ray",
-    "mean": "the mean HU along each ray, as a radiograph",
+    "mean": "the mean HU along each ray",
+    "drr": "a radiograph: the water that attenuates as much as all along the ray, mm",
     "surface": "the shaded surface at an iso value",
     "slices": "slices of the scan in space, translucent, each where it lies",
     "slice": "a plane through the volume in any direction, as thick as wanted",
@@ -18,13 +19,13 @@ MODES = {
 
 VIEWS = ("anterior", "posterior", "left", "right", "superior", "inferior")
 
-_RAYS = ("dvr", "mip", "minip", "mean", "surface", "slices")
+_RAYS = ("dvr", "mip", "minip", "mean", "drr", "surface", "slices")
 
 _MODES_OF = {
-    "preset": ("dvr", "mip", "minip", "mean", "slices", "slice", "cpr"),
+    "preset": ("dvr", "mip", "minip", "mean", "drr", "slices", "slice", "cpr"),
     "letters": (*_RAYS, "slice"),
     "depth": ("dvr", "mip", "minip", "surface", "slices", "slice"),
-    "values": ("mip", "minip", "mean", "slice", "cpr"),
+    "values": ("mip", "minip", "mean", "drr", "slice", "cpr"),
     "turntable": _RAYS,
 }
 """Settings that the renderer does not know; of all others it says itself in which modes they mean something."""

@@ -42,6 +42,8 @@ def describe_picture(picture: Rendering, name: str, view: str) -> dict[str, Any]
     import numpy as np
 
     made = picture.report
+    values = None if picture.values is None else _range(picture.values[np.isfinite(picture.values)])
+    is_water = picture.mode == "drr"
     hit = np.isfinite(picture.depth)
     return {
         "name": name or None,
@@ -51,8 +53,10 @@ def describe_picture(picture: Rendering, name: str, view: str) -> dict[str, Any]
         "pixel_mm": picture.pixel_mm,
         "hit_share": float(hit.mean()) if picture.camera is not None else None,
         "depth_mm": _range(picture.depth[hit]),
-        "values_hu": None if picture.values is None else _range(picture.values[np.isfinite(picture.values)]),
+        "values_hu": None if is_water else values,
         "window_hu": made.get("window_hu"),
+        "values_mm_water": values if is_water else None,
+        "window_mm_water": made.get("window_mm_water"),
         "ray_step_mm": made.get("ray_step_mm"),
         "slices": made.get("slices"),
         "plane": made.get("plane"),
@@ -74,13 +78,14 @@ def find_emptiness(picture: Rendering) -> str | None:
             f"nothing of the volume shows in mode {picture.mode}:"
             " look at view and zoom, at what is clipped, and at the iso value or the transfer function"
         )
-    low, high = picture.report.get("window_hu") or (-np.inf, np.inf)
+    is_water = picture.mode == "drr"
+    low, high = picture.report.get("window_mm_water" if is_water else "window_hu") or (-np.inf, np.inf)
     shade = "black" if values.max() <= low else "white" if values.min() >= high else None
     if shade is None:
         return None
-    shown = f"{values.min():g} to {values.max():g}"
+    shown, unit = f"{values.min():g} to {values.max():g}", "mm of water" if is_water else "HU"
     air = ": the air round the body is the lowest, clip it away (--clip-box)" if picture.mode == "minip" else ""
-    return f"all of the picture is {shade}: its {shown} HU lie beyond the window from {low:g} to {high:g}{air}"
+    return f"all of the picture is {shade}: its {shown} {unit} lie beyond the window from {low:g} to {high:g}{air}"
 
 
 def warn_of_picture(picture: Rendering) -> list[str]:

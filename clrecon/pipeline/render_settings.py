@@ -94,7 +94,7 @@ class RenderSettings:
     depth_cue : float, optional
         Share of its brightness that a surface loses from the nearest to the farthest place.
     window : (float, float), optional
-        HU that are black and white, of modes that show HU.
+        HU that are black and white, of modes that show HU; mm of water in drr.
     views : sequence of str
         One picture each, see `clrecon.geometry.camera.Camera.fit`; slices know axial, coronal and sagittal too.
     up, zoom, size, view_angle

@@ -1,4 +1,4 @@
-"""Twin of the raycaster: dvr, mip, minip and mean in plain numpy, in float64, a sample of all rays at a time.
+"""Twin of the raycaster: dvr, mip, minip, mean and drr in plain numpy, in float64, a sample of all rays at a time.
 
 References: Levoy 1988, "Display of surfaces from volume data" (compositing front to back, gradient opacity); Phong
 1975 (shading, see `clrecon.rendering.lighting`).
@@ -23,7 +23,10 @@ from clrecon.rendering.lighting import LEAST_SOFT_GRADIENT
 
 __all__ = ["FLAT_GRADIENT", "MODES", "OPAQUE", "TABLE_NODES", "RayPicture", "cast_rays", "look_up", "shade"]
 
-MODES = ("dvr", "mip", "minip", "mean")
+MODES = ("dvr", "mip", "minip", "mean", "drr")
+
+AIR_HU = -1000.0
+"""Attenuates nothing; lower values, padding and what a mask left, count as this."""
 
 TABLE_NODES = 4096
 """Entries of the table of a transfer function."""
@@ -53,11 +56,12 @@ class RayPicture:
     rgba : ndarray, shape (h, w, 4), float64
         Colours times opacity, and opacity; zero for modes that show values.
     depth : ndarray, shape (h, w), float64
-        First hit, mm along the ray; NaN where nothing is hit.  In mip and minip where the value first is; none in mean.
+        First hit, mm along the ray; NaN where nothing is hit.  In mip and minip where the value first is; none in mean
+        and drr.
     expected_depth : ndarray, shape (h, w), float64
         Mean depth weighted with what each sample adds to the opacity; that of the value in mip and minip.
     values : ndarray, shape (h, w), float64
-        HU in mip, minip and mean, NaN outside of the volume; NaN everywhere in dvr.
+        HU in mip, minip and mean, NaN outside of the volume; in drr mm of water, 0 there; NaN everywhere in dvr.
     """
 
     rgba: Float64Array
@@ -110,7 +114,8 @@ def cast_rays(
     The field is trilinear between voxel centres; half a voxel beyond the outermost ones has their values.  A ray is
     cut into segments of `ray_step` from where it enters the volume or what the clip planes leave of it, the last
     segment ends where it leaves; there is a sample in the middle of each segment, or with jitter at a part of it that
-    depends on the pixel alone.  A mean is the integral along the ray by its length.
+    depends on the pixel alone.  A mean is the integral along the ray by its length.  A radiograph is the integral of
+    attenuation relative to water, of the field between voxels of max(HU, -1000) / 1000 + 1.
 
     Parameters
     ----------
@@ -125,10 +130,10 @@ def cast_rays(
     lighting : Lighting, optional
         None leaves colours as they are.
     clip : Clip, optional
-    mode : {"dvr", "mip", "minip", "mean"}
-        Compositing; highest, lowest, mean value along the ray.
+    mode : {"dvr", "mip", "minip", "mean", "drr"}
+        Compositing; highest, lowest, mean value along the ray; water that attenuates as much as all along it.
     jitter : bool
-        In dvr; extremes have their samples on slice planes, and means in the middles of segments.
+        In dvr; extremes have their samples on slice planes, and integrals in the middles of segments.
 
     Returns
     -------
@@ -149,8 +154,8 @@ def cast_rays(
         if transfer_function is None:
             raise UsageError("dvr needs a transfer function")
         found = _composite(rays, transfer_function, lighting, step, part)
-    elif mode == "mean":
-        found = _integrate(rays, step)
+    elif mode in ("mean", "drr"):
+        found = _integrate(rays, step, as_water=mode == "drr")
     else:
         found = _find_extreme(rays, step, 1.0 if mode == "mip" else -1.0)
     shape = (height, width)
@@ -255,15 +260,18 @@ def _segments(
         yield ray, start + part[ray] * length, length
 
 
-def _integrate(rays: _Rays, step: float) -> Found:
+def _integrate(rays: _Rays, step: float, as_water: bool) -> Found:
+    voxels = rays.volume.voxels
+    if as_water:
+        voxels = np.maximum(voxels.astype(np.float64), AIR_HU) / -AIR_HU + 1.0
     total, way = np.zeros(rays.count), np.zeros(rays.count)
     for ray, t, length in _segments(rays, step, np.full(rays.count, 0.5), np.zeros(rays.count)):
         ijk, there = rays.places(ray, t)
-        total[ray] += np.where(there, length * sample_field(rays.volume.voxels, ijk), 0.0)
+        total[ray] += np.where(there, length * sample_field(voxels, ijk), 0.0)
         way[ray] += np.where(there, length, 0.0)
     mean = np.divide(total, way, out=np.full(rays.count, np.nan), where=way > 0.0)
     nowhere = np.full(rays.count, np.nan)
-    return np.zeros((rays.count, 4)), nowhere, nowhere.copy(), mean
+    return np.zeros((rays.count, 4)), nowhere, nowhere.copy(), total if as_water else mean
 
 
 def _find_extreme(rays: _Rays, step: float, sign: float) -> Found:

@@ -31,7 +31,8 @@ class Rendering:
     camera : Camera or None
         None where the picture is no projection (curved reformations).
     values : ndarray, shape (h, w), float32, or None
-        HU of each pixel, for modes that show values (mip, minip, mean, slice, cpr); NaN outside of the volume.
+        HU of each pixel, for modes that show values (mip, minip, mean, slice, cpr); NaN outside of the volume.  In drr
+        the water in mm that attenuates as much as all that lies along the ray, 0 outside of the volume.
     mode : str
     report : dict
         How it was made, free of patient data.  ``"pixel_mm"`` says the side of a pixel where no camera does.
@@ -144,7 +145,7 @@ class Rendering:
         return write_floats(self.expected_depth if expected else self.depth, path, self.pixel_mm)
 
     def save_values(self, path: str | os.PathLike[str]) -> int:
-        """Write `values` in HU as `save_depth` writes depths.
+        """Write `values` as `save_depth` writes depths.
 
         Raises
         ------
@@ -154,7 +155,8 @@ class Rendering:
         from clrecon.rendering.image_files import write_floats
 
         if self.values is None:
-            raise UsageError(f"a picture of mode {self.mode} has no values: mip, minip, mean, slice and cpr have them")
+            having = "mip, minip, mean, drr, slice and cpr"
+            raise UsageError(f"a picture of mode {self.mode} has no values: {having} have them")
         return write_floats(self.values, path, self.pixel_mm)
 
     def to_pyvista(self, form: str = "points", *, expected: bool = False, distance: float | None = None) -> Any:

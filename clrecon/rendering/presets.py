@@ -25,12 +25,12 @@ class Preset:
     ----------
     name : str
     mode : str
-        The mode that it is made for: "dvr", "mip", "minip" or "mean".  A picture takes it unless told another one, so
-        that ``x-ray`` alone gives a mean projection.
+        The mode that it is made for: "dvr", "mip", "minip" or "drr".  A picture takes it unless told another one, so
+        that ``x-ray`` alone gives a radiograph.
     transfer_function : TransferFunction
         With its `lighting`; used in "dvr".
     window : (float, float) or None
-        HU of black and of white in projections; None lets the picture's own values decide.
+        HU of black and of white in projections (of "drr" there is none); None lets the picture's own values decide.
     source : str
         Where the ranges come from.
     """
@@ -201,11 +201,11 @@ PRESETS: dict[str, Preset] = {
         ),
         _preset(
             "x-ray",
-            "the sum of everything along the ray, as a radiograph (mode mean)",
+            "a radiograph: the attenuation of everything along the ray, summed up (mode drr)",
             [(-1000.0, _WHITE, 0.0), (0.0, _WHITE, 0.004), (1500.0, _WHITE, 0.02)],
             "attenuation is proportional to HU + 1000",
             lighting=UNSHADED,
-            mode="mean",
+            mode="drr",
         ),
         _preset(
             "mip",

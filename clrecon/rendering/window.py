@@ -10,10 +10,13 @@ from numpy.typing import NDArray
 
 from clrecon.errors import UsageError
 
-__all__ = ["BONE_WINDOW", "checked_window", "choose_window", "grey_image"]
+__all__ = ["BODY_SHARE", "BONE_WINDOW", "checked_window", "choose_water_window", "choose_window", "grey_image"]
 
 BONE_WINDOW = (-450.0, 1050.0)
 """Level 300, width 1500 HU: marrow, cortex and soft tissue apart from each other."""
+
+BODY_SHARE = 0.05
+"""Of the most water along a ray: rays with less meet air, a table or the fold of a blanket, and no body."""
 
 
 def checked_window(window: Sequence[float]) -> tuple[float, float]:
@@ -62,5 +65,26 @@ def choose_window(values: NDArray[Any]) -> tuple[float, float]:
     there = values[np.isfinite(values)]
     if not len(there):
         return BONE_WINDOW
-    low, high = (float(end) for end in np.percentile(there[:: max(1, len(there) // 100_000)], (1.0, 99.0)))
+    low, high = _percentiles(there)
     return (low, high) if high - low >= 1.0 else (low - 0.5, low + 0.5)
+
+
+def choose_water_window(values: NDArray[Any]) -> tuple[float, float]:
+    """A window from the 1st to the 99th percentile of the rays of a radiograph that meet the body.
+
+    Parameters
+    ----------
+    values : ndarray, float
+        Mm of water, see `clrecon.rendering.Rendering.values`.  Rays with less than `BODY_SHARE` of the most do not
+        count.  Where all that do have the same, black is nothing at all.
+    """
+    most = float(values.max(initial=0.0))
+    if not most > 0.0:
+        return 0.0, 1.0
+    low, high = _percentiles(values[values > BODY_SHARE * most])
+    return (low, high) if high - low >= 0.01 * high else (0.0, high)
+
+
+def _percentiles(values: NDArray[Any]) -> tuple[float, float]:
+    low, high = (float(end) for end in np.percentile(values[:: max(1, len(values) // 100_000)], (1.0, 99.0)))
+    return low, high

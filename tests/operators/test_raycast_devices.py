@@ -83,6 +83,9 @@ SCENES: dict[str, Callable[[], tuple[Volume, dict[str, Any]]]] = {
     "mip clipped": lambda: clipped(even_volume(blobs, "mirrored", 18.0), "mip", perspective=True),
     "mean": lambda: scene(even_volume(noise, "oblique", 12.0, np.int16), "mean", perspective=True),
     "mean clipped": lambda: clipped(even_volume(blobs, "mirrored", 18.0), "mean"),
+    "drr": lambda: scene(even_volume(noise, "oblique", 12.0, np.int16), "drr", perspective=True),
+    "drr clipped": lambda: clipped(even_volume(blobs, "mirrored", 18.0), "drr"),
+    "drr uneven": lambda: scene(uneven_volume(blobs), "drr", half_height=20.0),
     "mean uneven": lambda: scene(uneven_volume(blobs), "mean", half_height=20.0),
 }  # fmt: skip
 
@@ -100,7 +103,7 @@ def assert_alike(found: Any, expected: Any, mode: str) -> None:
         assert (np.isfinite(found.values) != there).mean() <= share
         away = np.abs(found.values - expected.values)[there & np.isfinite(found.values)]
         assert (away <= tolerances.RAY_TWIN_HU).mean() >= 1.0 - share, f"up to {away.max():.3g} HU"
-    if mode != "mean":
+    if mode not in ("mean", "drr"):
         hit = np.isfinite(expected.depth) & np.isfinite(found.depth)
         assert hit.mean() > 0.05
         assert (np.isfinite(expected.depth) != np.isfinite(found.depth)).mean() <= share
@@ -126,7 +129,9 @@ def test_flat_places_are_not_lit_by_rounding(device):
 
 @renders
 @pytest.mark.oclgrind
-@pytest.mark.parametrize(("mode", "function"), [("dvr", SOFT), ("dvr", LEVOY), ("mip", None), ("mean", None)])
+@pytest.mark.parametrize(
+    ("mode", "function"), [("dvr", SOFT), ("dvr", LEVOY), ("mip", None), ("mean", None), ("drr", None)]
+)
 @pytest.mark.parametrize("even", [True, False])
 def test_raycast_of_few_voxels_is_its_twin(device, mode, function, even):
     """Small enough for a simulator: odd sizes, rays past the volume, clip planes, a light that stands still."""
@@ -148,7 +153,7 @@ def test_raycast_of_few_voxels_is_its_twin(device, mode, function, even):
 
 
 @renders
-@pytest.mark.parametrize("name", ["soft", "steep", "gradient opacity", "uneven", "mip", "mean"])
+@pytest.mark.parametrize("name", ["soft", "steep", "gradient opacity", "uneven", "mip", "mean", "drr"])
 def test_all_devices_give_one_picture(name):
     from skimage.metrics import structural_similarity
 

@@ -19,6 +19,7 @@ from tests.operators.raycast_scenes import (
     distances_from,
     even_volume,
     look,
+    uneven_volume,
     ways_through,
 )
 
@@ -80,6 +81,69 @@ def rays_off_edges(volume: Volume, camera: Camera, size, low, high) -> np.ndarra
                 both &= ((at > low + 1.6) & (at < high - 1.6))[..., others].all(axis=-1)
         clear |= both
     return clear
+
+
+WATER_VIEWS = [(0.0, 1.0, 0.0), (1.0, 1.0, 0.0), (1.0, 0.0, 0.0), (0.3, 1.0, 0.2), (1.0, 0.4, -2.0)]
+PADDING_HU = -3024.0
+FINE_GAPS = (1.0,) * 18 + (0.4,) * 10 + (0.9,) * 20
+
+
+@pytest.mark.parametrize("perspective", [False, True])
+@pytest.mark.parametrize("steps", [*STEPS, "uneven"])
+def test_a_radiograph_tells_the_water_in_a_ball(cast, steps, perspective):
+    """1.5 times as dense as water, in air: what lies beside the ball, within the volume or not, adds nothing."""
+    radius, size = 14.0, (32, 24)
+    spacing = 1.5 if steps == "uneven" else float(np.linalg.norm(STEPS[steps], axis=0).max())
+    ramp, field = 4.0 * spacing, ball(radius, 4.0 * spacing, 500.0, -1000.0)
+    volume = uneven_volume(field, gaps=FINE_GAPS) if steps == "uneven" else even_volume(field, steps, 46.0)
+    for towards in WATER_VIEWS:
+        camera = look(volume, towards, 22.0, perspective=perspective)
+        passing, _ = distances_from(centre_of(volume), camera, size)
+        water = cast(volume, "drr", camera=camera, size=size).values
+        assert not water[passing > radius + 0.5 * ramp + 2.0 * spacing].any()
+        well_inside = passing < 0.7 * radius
+        assert well_inside.sum() > 50
+        truth = 1.5 * ball_chords(radius, ramp, passing[well_inside])
+        assert np.abs(water[well_inside] / truth - 1.0).max() <= tolerances.RAY_CHORD
+
+
+@pytest.mark.parametrize("perspective", [False, True])
+@pytest.mark.parametrize("steps", STEPS)
+def test_a_radiograph_tells_the_water_in_a_block_beside_padding(cast, steps, perspective):
+    """A block of water turned every way: its chords, whether it lies in air or in values that stand for nothing."""
+    size, low, high = (40, 30), np.array([6, 8, 4]), np.array([21, 25, 15])
+    affine = np.eye(4)
+    affine[:3, :3], affine[:3, 3] = STEPS[steps], PLACE
+    voxels = np.full((20, 34, 28), PADDING_HU, np.int16)
+    voxels[:, ::2] = -1000
+    voxels[low[2] : high[2] + 1, low[1] : high[1] + 1, low[0] : high[0] + 1] = 0
+    volume = Volume(voxels, affine)
+    for along in ((0.0, 1.0, 0.0), (0.2, 1.0, 0.1), (1.0, 0.2, -0.1), (0.3, 0.2, 1.0)):
+        camera = look(volume, STEPS[steps] @ along, 6.0, perspective=perspective)
+        water = cast(volume, "drr", camera=camera, size=size).values
+        ways = ways_through(volume, camera, size, low, high)
+        clear = rays_off_edges(volume, camera, size, low, high)
+        assert clear.sum() > 30
+        assert np.abs(water[clear] / ways[clear] - 1.0).max() <= tolerances.RAY_CHORD
+        beside = ways_through(volume, camera, size, low - 1.0, high + 1.0) == 0.0
+        assert not water[beside].any()
+
+
+def test_the_box_of_a_volume_does_not_show_in_a_radiograph(cast):
+    """A slab of water at 45 degrees: a mean lights up where the box is short, a sum follows the way through it."""
+    voxels = np.full((24, 48, 48), -1000, np.int16)
+    voxels[4:20, 4:44, 4:44] = 0
+    volume = Volume(voxels, np.eye(4))
+    camera, size = look(volume, (1.0, 1.0, 0.0), 6.0, up=(0.0, 0.0, 1.0)), (110, 20)
+    water = cast(volume, "drr", camera=camera, size=size).values[10]
+    across = (np.arange(size[0]) - 54.5) * 0.6
+    way = np.maximum(40.0 * np.sqrt(2.0) - 2.0 * np.abs(across), 0.0)
+    off_corners = np.abs(np.abs(across) - 20.0 * np.sqrt(2.0)) > 1.0
+    off_corners &= np.abs(across) > 1.0
+    assert np.abs(water - way)[off_corners].max() <= tolerances.RAY_CHORD * way.max()
+    clip = Clip.plane(centre_of(volume), (1.0, 1.0, 0.0))
+    half = cast(volume, "drr", camera=camera, size=size, clip=clip).values[10]
+    assert np.abs(half - 0.5 * way)[off_corners].max() <= tolerances.RAY_CHORD * way.max()
 
 
 AXIS_VIEWS = [

@@ -215,9 +215,28 @@ def test_a_volume_in_slabs_is_the_same_picture(
     assert np.abs(found[0][1] - found[1][1]).max() <= 2
 
 
+def test_an_x_ray_is_a_sum_in_mm_of_water(
+    device: Any, sphere: tuple[Path, dict[str, Any]], tmp_path: Path
+) -> None:
+    """The window runs over the rays that meet the body, and is in mm of water where it is given too."""
+    files = PictureFiles(tmp_path / "a.png", values=tmp_path / "v.npy")
+    settings = RenderSettings(preset="x-ray", size=SIZE, device=str(device.index))
+    report = make_pictures(sphere[0], files, settings)
+    picture, values = report["pictures"][0], np.load(tmp_path / "v.npy")
+    most = float(values.max())
+    assert report["mode"] == "drr" and picture["values_hu"] is None and picture["window_hu"] is None
+    assert picture["values_mm_water"] == [0.0, pytest.approx(most)]
+    low, high = picture["window_mm_water"]
+    assert 0.05 * most < low < high <= most
+    told = make_pictures(sphere[0], files, replace(settings, window=(0.0, 2.0 * most)))["pictures"][0]
+    assert told["window_mm_water"] == [0.0, pytest.approx(2.0 * most)]
+    assert np.asarray(Image.open(tmp_path / "a.png").convert("L")).max() in (127, 128)
+
+
 @pytest.mark.parametrize(
     ("settings", "words"),
     [
+        ({"preset": "x-ray", "clip_box": (5000, 6000, -np.inf, np.inf, -np.inf, np.inf)}, "black.*mm of water"),
         ({"iso_value": 30000.0}, "mode surface"),
         ({"clip_box": (5000, 6000, -np.inf, np.inf, -np.inf, np.inf)}, "mode dvr"),
         ({"clip_box": (5000, 6000, -np.inf, np.inf, -np.inf, np.inf), "mode": "mip"}, "mode mip"),
@@ -252,7 +271,7 @@ def test_what_the_mode_is() -> None:
     assert [settings.mode_used for settings in (
         RenderSettings(), RenderSettings(preset="x-ray"), RenderSettings(iso_value=0.0), RenderSettings(curve="auto"),
         RenderSettings(preset="x-ray", mode="dvr"),
-    )] == ["dvr", "mean", "surface", "cpr", "dvr"]  # fmt: skip
+    )] == ["dvr", "drr", "surface", "cpr", "dvr"]  # fmt: skip
     assert (RenderSettings().preset_used, RenderSettings("mip").preset_used) == ("bone", None)
     assert (RenderSettings("slice").views_used, RenderSettings().views_used) == (("axial",), ("anterior",))
     assert RenderSettings(clip_box=(-1, 1, -2, 2, 0, float("inf"))).clip is not None

@@ -46,7 +46,7 @@ def test_each_is_whole() -> None:
 
 def test_modes_and_windows() -> None:
     modes = {name: preset.mode for name, preset in PRESETS.items() if preset.mode != "dvr"}
-    assert modes == {"x-ray": "mean", "mip": "mip", "minip": "minip"}
+    assert modes == {"x-ray": "drr", "mip": "mip", "minip": "minip"}
     assert PRESETS["mip"].window == (0, 1000)
     assert PRESETS["x-ray"].window is None and PRESETS["x-ray"].lighting == UNSHADED
 
