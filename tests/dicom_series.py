@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -157,3 +158,36 @@ def set_values(only: int | None = None, **values: Any) -> Change:
                     setattr(ds, keyword, value)
 
     return change
+
+
+def element_bytes(keyword: str, value: bytes, implicit: bool = False) -> bytes:
+    """A little-endian element with exactly this value, also where it is odd or no number."""
+    from pydicom.datadict import dictionary_VR, tag_for_keyword
+
+    tag = tag_for_keyword(keyword) or 0
+    head = struct.pack("<HH", tag >> 16, tag & 0xFFFF)
+    vr = dictionary_VR(tag).encode()
+    return head + (struct.pack("<L", len(value)) if implicit else vr + struct.pack("<H", len(value))) + value
+
+
+def find_element(data: bytes, keyword: str, implicit: bool = False) -> tuple[int, int, int]:
+    """First byte of an element with a short head, of its value, and of what follows."""
+    head = element_bytes(keyword, b"", implicit)[: 4 if implicit else 6]
+    assert data.count(head) == 1, f"{keyword} stands {data.count(head)} times in the file"
+    start = data.index(head)
+    length = struct.unpack_from("<L" if implicit else "<H", data, start + len(head))[0]
+    return start, start + 8, start + 8 + length
+
+
+def edit_value(path: Path, keyword: str, change: Callable[[bytes], bytes]) -> None:
+    """Change the bytes of a value in a file, in explicit VR; its length follows."""
+    data = path.read_bytes()
+    start, value, end = find_element(data, keyword)
+    path.write_bytes(data[:start] + element_bytes(keyword, change(data[value:end])) + data[end:])
+
+
+def insert_after(path: Path, keyword: str, extra: bytes, implicit: bool = False) -> None:
+    """Put bytes behind an element of a file."""
+    data = path.read_bytes()
+    _, _, end = find_element(data, keyword, implicit)
+    path.write_bytes(data[:end] + extra + data[end:])

@@ -1,148 +1,38 @@
-"""The trap matrix: CT series that readers place wrongly, each with its truth in mm and what clrecon must do with it.
-
-Every corner voxel of every slice has an HU of its own (a mark), everything else is `BACKGROUND_HU`.  A reader is
-judged by where it puts the marks, so its order of axes and slices plays no part.  Marks of images that are not of the
-stack (a localizer, another phase) start at `FOREIGN_HU`.
-"""
+"""The trap matrix: CT series that readers place wrongly, each with its truth in mm and what clrecon must do with it."""
 
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from dicom_series import ROOT, Change, Plan, make_dataset, rotation, save_dataset, set_raw, set_values
+from dicom_series import ROOT, Change, rotation, set_raw, set_values
 from enhanced_image import save_enhanced
 from pydicom.dataset import Dataset
+from trap_bytes import add_byte_cases
+from trap_plan import (
+    BACKGROUND_HU,
+    CASES,
+    EXACT,
+    FIELD_SIZE,
+    FOREIGN_HU,
+    GAP_MM,
+    OBLIQUE,
+    REFUSED,
+    WARNED,
+    Case,
+    Marks,
+    Size,
+    plan_for,
+    write_slices,
+)
+from trap_plan import add_case as _case
+from trap_plan import add_simple as _simple
 
-BACKGROUND_HU = -1000
-FOREIGN_HU = 10_000
-GAP_MM = 1.25
-OBLIQUE = (12.0, -7.0, 20.0)
-
-EXACT, WARNED, REFUSED = "exact", "exact+warning", "refused"
-
-
-@dataclass(frozen=True)
-class Size:
-    """Slices, rows and columns."""
-
-    slices: int = 24
-    rows: int = 6
-    columns: int = 7
-
-
-FIELD_SIZE = Size(120, 48, 56)
-"""The size of the published table."""
-
-
-@dataclass
-class Marks:
-    """Where every mark of the stack lies: HU (m,) and LPS mm (m, 3); the count of slices that carry them.
-
-    NaN where a mark has no place in the frame of the first slice.
-    """
-
-    hu: np.ndarray
-    lps_mm: np.ndarray
-    slices: int
-
-
-@dataclass
-class MarkedPlan(Plan):
-    """A plan whose corner voxels are marks, counted from `first_hu`."""
-
-    first_hu: int = 1
-    slopes: tuple[int, ...] = (1,)
-    """Slope of slice k is ``slopes[k % len(slopes)]``; with more than one, marks and background divide by all."""
-
-    def corners(self) -> list[tuple[int, int]]:
-        _, rows, columns = self.shape
-        return [(i, j) for j in (0, rows - 1) for i in (0, columns - 1)]
-
-    def mark_hu(self, k: int, corner: int) -> int:
-        mark = self.first_hu + 4 * k + corner
-        return mark if self.slopes == (1,) else 12 * mark - 4
-
-    def stored(self, k: int) -> np.ndarray:
-        slope = self.slopes[k % len(self.slopes)]
-        hu = np.full(self.shape[1:], BACKGROUND_HU)
-        for corner, (i, j) in enumerate(self.corners()):
-            hu[j, i] = self.mark_hu(k, corner)
-        stored, rest = np.divmod(hu - self.intercept, slope)
-        assert not rest.any()
-        return stored.astype("i2" if self.signed else "u2")
-
-    def marks(self, left_out: Sequence[int] = ()) -> Marks:
-        found = [
-            (self.mark_hu(k, corner), self.truth(np.array([[i, j, k]]))[0])
-            for k in range(self.shape[0])
-            if k not in left_out
-            for corner, (i, j) in enumerate(self.corners())
-        ]
-        return Marks(np.array([hu for hu, _ in found]), np.array([place for _, place in found]), len(found) // 4)
-
-
-@dataclass(frozen=True)
-class Case:
-    """One row of the matrix.
-
-    Attributes
-    ----------
-    verdict : {"exact", "exact+warning", "refused"}
-        What clrecon must do.
-    words : tuple of str
-        Texts that the warnings, or the refusal, must hold.
-    again : mapping or None
-        Options of `read_volume` that make a refused series readable: then exact, with `again_words` in the warnings.
-    bound : {"written", "rounded", "far", "jitter"}
-        Which tolerance of tests/tolerances.py holds for the positions.
-    """
-
-    name: str
-    write: Callable[[Path, Size], Marks]
-    verdict: str = EXACT
-    words: tuple[str, ...] = ()
-    again: Mapping[str, Any] | None = None
-    again_words: tuple[str, ...] = ()
-    bound: str = "written"
-
-
-CASES: dict[str, Case] = {}
-
-
-def _case(name: str, *args: Any, **options: Any) -> Callable[[Callable[[Path, Size], Marks]], None]:
-    def add(write: Callable[[Path, Size], Marks]) -> None:
-        assert name not in CASES
-        CASES[name] = Case(name, write, *args, **options)
-
-    return add
-
-
-def plan_for(size: Size, **changes: Any) -> MarkedPlan:
-    plan = MarkedPlan(shape=(size.slices, size.rows, size.columns), gap=GAP_MM, angles=OBLIQUE)
-    return replace(plan, **changes)
-
-
-def write_slices(folder: Path, plan: MarkedPlan, change: Change | None = None, prefix: str = "") -> Marks:
-    """Write the slices with every attribute that readers ask for; InstanceNumber runs along the normal."""
-    for k in range(plan.shape[0]):
-        if k in plan.leave_out:
-            continue
-        ds = make_dataset(plan, k)
-        ds.RescaleSlope = plan.slopes[k % len(plan.slopes)]
-        ds.InstanceNumber = k + 1
-        ds.StudyInstanceUID, ds.StudyID, ds.AccessionNumber = f"{ROOT}.77", "1", "1"
-        ds.StudyDate, ds.StudyTime, ds.PatientPosition = "20200101", "120000", "HFS"
-        ds.Manufacturer, ds.KVP, ds.AcquisitionNumber = "PHANTOM", 120, 1
-        if change is not None:
-            change(ds, k)
-        ds.file_meta.MediaStorageSOPInstanceUID = ds.SOPInstanceUID
-        save_dataset(ds, folder / (prefix + plan.name(k)))
-    return plan.marks(plan.leave_out)
+__all__ = ["BACKGROUND_HU", "CASES", "EXACT", "FIELD_SIZE", "REFUSED", "WARNED", "Case", "Marks", "Size"]
 
 
 def _both(*changes: Change) -> Change:
@@ -165,10 +55,6 @@ def _another_image(**values: Any) -> Change:
 
 
 # --- one affine, exactly ---
-def _simple(name: str, *args: Any, change: Change | None = None, plan: Mapping[str, Any] | None = None, **kw: Any):
-    _case(name, *args, **kw)(lambda folder, size: write_slices(folder, plan_for(size, **(plan or {})), change))
-
-
 _simple("regular, non-square pixels")
 _simple("axial", plan={"angles": (0, 0, 0)})
 _simple("sagittal", plan={"angles": (0, 90, 90)})
@@ -428,6 +314,9 @@ _simple(
     change=set_raw("PixelSpacing", "0,7\\0,5"),
 )
 _simple("slopes 1, 2, 3, 4 slice by slice", plan={"slopes": (1, 2, 3, 4)})
+
+
+add_byte_cases()
 
 
 # --- multi-frame ---

@@ -28,6 +28,10 @@ from clrecon.dicom.raw import (
 __all__ = ["parse_carefully"]
 
 INFLATE_STEP = 1 << 18
+META_TAGS = (MEDIA_CLASS, TRANSFER_SYNTAX)
+DESCRIPTIVE_TAGS = (0x00080005, 0x0008103E)
+"""SpecificCharacterSet and SeriesDescription: a label, in which two values spoil nothing that is measured."""
+
 READ_LIMIT = 4 * 1024 * 1024
 """Bytes that are read of one file at most; what is stepped over by its length does not count.
 
@@ -89,7 +93,7 @@ class _MeteredFile:
 
 def _parse_file(file: BinaryIO, size: int, wanted: tuple[int, ...]) -> DicomElements:
     file.seek(META_START)
-    meta, _ = _collect(file, implicit=False, little=True, last_group=2, wanted=())
+    meta, _, meta_remarks = _collect(file, implicit=False, little=True, last_group=2, wanted=())
     transfer_syntax = decode_uid(meta.get(TRANSFER_SYNTAX))
     media_class = decode_uid(meta.get(MEDIA_CLASS))
     if not transfer_syntax:
@@ -105,18 +109,34 @@ def _parse_file(file: BinaryIO, size: int, wanted: tuple[int, ...]) -> DicomElem
     found = _looks_implicit(file, start)
     differs = found is not None and found != implicit
     implicit = implicit if found is None else found
-    values, vrs = _collect(file, implicit=implicit, little=little, last_group=None, wanted=wanted)
+    values, vrs, remarks = _collect(file, implicit=implicit, little=little, last_group=None, wanted=wanted)
     place = file.tell()
     tag, offset, length, vr = read_pixel_head(file.read(12), place, implicit, little)
     return DicomElements(
-        transfer_syntax, media_class, values, vrs, little, differs, tag, offset, length, vr, inflate_from, size
+        transfer_syntax,
+        media_class,
+        values,
+        vrs,
+        little,
+        differs,
+        tag,
+        offset,
+        length,
+        vr,
+        inflate_from,
+        size,
+        tuple(dict.fromkeys(meta_remarks + remarks)),
     )
 
 
 def _collect(
     file: BinaryIO, *, implicit: bool, little: bool, last_group: int | None, wanted: tuple[int, ...]
-) -> tuple[dict[int, bytes], dict[int, str | None]]:
-    """Read elements up to the end of `last_group`, or up to the pixel data; the file is left standing there."""
+) -> tuple[dict[int, bytes], dict[int, str | None], list[str]]:
+    """Read elements up to the end of `last_group`, or up to the pixel data; the file is left standing there.
+
+    Returns values, their VRs, and what is odd about their order.  pydicom's data sets keep the last of two elements
+    of one tag without a word: here they are met one by one.
+    """
     from pydicom.filereader import data_element_generator
 
     def stop(tag: int, vr: str | None, length: int) -> bool:
@@ -124,6 +144,7 @@ def _collect(
 
     values: dict[int, bytes] = {}
     vrs: dict[int, str | None] = {}
+    order = _Order()
     for element in data_element_generator(
         file,
         implicit,
@@ -137,7 +158,46 @@ def _collect(
                 raise CorruptFileError("ends within an element")
             values[int(element.tag)] = value
             vrs[int(element.tag)] = element.VR
-    return values, vrs
+        if last_group is None or element.tag in META_TAGS:
+            order.add(int(element.tag), value if isinstance(value, bytes) else b"")
+    return values, vrs, order.remarks
+
+
+class _Order:
+    """Watches over elements that stand twice, or after one of a higher tag (PS3.5 7.1 has neither).
+
+    Which of two values was meant nobody can tell: where it may change a result the file is corrupt.  The same value
+    twice, or in another place than it should be, is what it is.
+    """
+
+    def __init__(self) -> None:
+        self.remarks: list[str] = []
+        self._values: dict[int, bytes] = {}
+        self._last = 0
+
+    def add(self, tag: int, value: bytes) -> None:
+        """Take the next element.
+
+        Raises
+        ------
+        CorruptFileError
+            It was there before, with another value.
+        """
+        from pydicom.datadict import keyword_for_tag
+
+        place = f"{keyword_for_tag(tag)} ({tag >> 16:04X},{tag & 0xFFFF:04X})".lstrip()
+        value = value.rstrip(b" \0")
+        if tag not in self._values:
+            if tag < self._last:
+                self.remarks.append(f"{place} is not in the order of tags: taken all the same")
+            self._last = max(tag, self._last)
+        elif self._values[tag] == value:
+            self.remarks.append(f"{place} is there twice, with the same value")
+        elif tag in DESCRIPTIVE_TAGS:
+            self.remarks.append(f"{place} is there twice, with two values: the last is taken")
+        else:
+            raise CorruptFileError(f"{place} is there twice, with two values")
+        self._values[tag] = value
 
 
 def _looks_implicit(file: BinaryIO, start: int) -> bool | None:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 from clrecon.dicom.sequences import Item, decode_number, name_tag
 from clrecon.dicom.text import join_names
-from clrecon.dicom.values import ValueProblem
+from clrecon.dicom.values import ValueProblem, decode_text
 
 if TYPE_CHECKING:
     from clrecon.dicom.slice_header import SliceHeader
@@ -47,7 +47,7 @@ class Concatenation:
 
 def read_concatenation(top: Item, frames: int, little: bool) -> Concatenation | None:
     """Read the place of a file in its concatenation from its top level; None where it is in none."""
-    uid = top.values.get(UID, b"").decode("latin-1").strip(" \0")
+    uid = decode_text(top.values.get(UID, b""))
     if not uid:
         return None
     part = decode_number(top.values.get(PART, b""), "H", little)

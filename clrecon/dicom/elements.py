@@ -105,7 +105,8 @@ def read_elements(
     elements = _read_marked(path, prefix, size, wanted)
     program = find_program(prefix)
     if program:
-        elements = elements._replace(remarks=(f"the preamble starts a program ({program}): neither run nor copied",))
+        remark = f"the preamble starts a program ({program}): neither run nor copied"
+        elements = elements._replace(remarks=(remark, *elements.remarks))
     return elements
 
 
@@ -121,7 +122,7 @@ def _read_restored(path: Path, restored: Start, size: int, wanted: tuple[int, ..
         pixel_offset=elements.pixel_offset - (0 if deflated else added),
         inflate_from=elements.inflate_from - added if deflated else -1,
         file_bytes=size,
-        remarks=(restored.remark,),
+        remarks=(restored.remark, *elements.remarks),
         restored=True,
     )
 

@@ -13,7 +13,7 @@ from typing import BinaryIO
 from clrecon.dicom.codecs import RLE
 from clrecon.errors import RefusedInputError
 
-__all__ = ["Pieces", "find_frames", "read_pieces"]
+__all__ = ["ITEMS_END", "Pieces", "find_end", "find_frames", "read_pieces"]
 
 Pieces = list[tuple[int, int]]
 """First byte in the file and count of bytes of each fragment of a frame."""
@@ -22,6 +22,8 @@ MAX_FRAGMENTS = 1_000_000
 FRAGMENTS_PER_FRAME = 1000
 """At most, on the whole: writers make one, or one of some KiB each."""
 _ITEM, _END = (0xFFFE, 0xE000), (0xFFFE, 0xE0DD)
+ITEMS_END = struct.pack("<HHL", *_END, 0)
+"""The last bytes of a file with compressed pixels, unless other elements follow."""
 _STARTS = (b"\xff\xd8\xff", b"\xff\x4f\xff\x51", b"\0\0\0\x0cjP")
 """First bytes of JPEG and JPEG-LS, JPEG 2000, and JP2."""
 
@@ -48,7 +50,7 @@ def find_frames(file: BinaryIO, start: int, file_bytes: int, frames: int, transf
     OSError
         The file cannot be read.
     """
-    table, fragments = _walk_items(file, start, file_bytes, min(MAX_FRAGMENTS, FRAGMENTS_PER_FRAME * (frames + 1)))
+    table, fragments, _ = _walk_items(file, start, file_bytes, min(MAX_FRAGMENTS, FRAGMENTS_PER_FRAME * (frames + 1)))
     if not fragments:
         raise RefusedInputError("truncated: there are no compressed pixels")
     if len(fragments) == frames:
@@ -69,13 +71,21 @@ def find_frames(file: BinaryIO, start: int, file_bytes: int, frames: int, transf
     return [fragments[a:b] for a, b in zip(firsts, [*firsts[1:], len(fragments)], strict=True)]
 
 
+def find_end(file: BinaryIO, start: int, file_bytes: int) -> int:
+    """The byte behind the compressed pixel data; parameters and errors as those of `find_frames`."""
+    return _walk_items(file, start, file_bytes, MAX_FRAGMENTS)[2]
+
+
 def read_pieces(file: BinaryIO, pieces: Pieces) -> bytes:
     """Read the fragments of one frame."""
     return b"".join([_read(file, place, length) for place, length in pieces])
 
 
-def _walk_items(file: BinaryIO, start: int, file_bytes: int, most: int) -> tuple[tuple[int, int], Pieces]:
-    """Offset table and fragments. A codestream that is cut still decodes to an image, so that must be known here."""
+def _walk_items(file: BinaryIO, start: int, file_bytes: int, most: int) -> tuple[tuple[int, int], Pieces, int]:
+    """Offset table, fragments, and the place behind them.
+
+    A codestream that is cut still decodes to an image, so that must be known here.
+    """
     items: Pieces = []
     place = start
     file.seek(start)
@@ -83,7 +93,7 @@ def _walk_items(file: BinaryIO, start: int, file_bytes: int, most: int) -> tuple
         group, element, length = struct.unpack("<HHL", _read(file, place, 8))
         place += 8
         if (group, element) == _END:
-            return (items[0] if items else (place, 0)), items[1:]
+            return (items[0] if items else (place, 0)), items[1:], place
         if (group, element) != _ITEM:
             raise RefusedInputError(
                 f"truncated: no item of compressed pixels where one is expected ({group:04X},{element:04X})"

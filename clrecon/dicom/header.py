@@ -15,6 +15,7 @@ from clrecon.dicom.codecs import describe_undecodable, is_encapsulated
 from clrecon.dicom.elements import CorruptFileError, DicomElements, FileStart, read_elements
 from clrecon.dicom.multiframe import ENHANCED_CT, read_groups, split_frames
 from clrecon.dicom.slice_header import SLICE_PHASES, OtherImage, SeriesIdentity, SliceHeader
+from clrecon.dicom.surplus import check_surplus
 from clrecon.dicom.terms import MODALITIES, RESCALE_TYPES, name_term
 from clrecon.dicom.text import escape_text, hash_uid
 from clrecon.dicom.values import WANTED_TAGS, ValueProblem, Values
@@ -69,7 +70,8 @@ def read_headers(
     Raises
     ------
     NotDicomError, CorruptFileError, OSError
-        As `read_elements`; also corrupt is a CT image that ends before its pixel data.
+        As `read_elements`; also corrupt is a CT image that ends before its pixel data, or goes on behind it with
+        what is no element.
     """
     elements = read_elements(path, WANTED_TAGS, start, force)
     if elements.media_class == DICOMDIR_CLASS:
@@ -96,10 +98,12 @@ def read_headers(
             why = "without ImagePositionPatient (0020,0032): no geometry"
         return OtherImage(series, path, name, 1, "capture", f"{name}: secondary capture (SOP class {sop_class}): {why}")
     if sop_class in ENHANCED_CT:
-        return _read_frames(elements, series, path, name)
+        return _read_frames(elements, series, path, name, force)
     try:
         _check_single_frame(values, sop_class)
-        return [_validate(values, series, path, name)]
+        header = _validate(values, series, path, name)
+        said = check_surplus(elements, header, force)
+        return [replace(header, warnings=(*header.warnings, *said)) if said else header]
     except ValueProblem as problem:
         return OtherImage(series, path, name, 1, "broken", f"{name}: {problem}")
 
@@ -118,11 +122,12 @@ def _check_single_frame(values: Values, sop_class: str) -> None:
 
 
 def _read_frames(
-    elements: DicomElements, series: SeriesIdentity, path: Path, name: str
+    elements: DicomElements, series: SeriesIdentity, path: Path, name: str, force: bool
 ) -> list[SliceHeader] | OtherImage:
     """One header a frame of an enhanced image, or the first thing that is wrong with it."""
     frames, place = 1, name
     headers: list[SliceHeader] = []
+    said: tuple[str, ...] = ()
     try:
         groups = read_groups(path, elements)
         frames = len(groups.frames)
@@ -131,13 +136,15 @@ def _read_frames(
             if frame.problem is not None:
                 raise frame.problem
             header = _validate(Values(frame.elements), series, path, place, frames=frames)
+            if number == 0:
+                said = check_surplus(elements, header, force)
             headers.append(
                 replace(
                     header,
                     frame=number,
                     concatenation=groups.concatenation,
                     phase=(*frame.phase, *header.phase),
-                    warnings=(*header.warnings, *frame.warnings),
+                    warnings=(*header.warnings, *said, *groups.warnings, *frame.warnings),
                 )
             )
     except ValueProblem as problem:
@@ -174,7 +181,7 @@ def _validate(values: Values, series: SeriesIdentity, path: Path, name: str, *, 
             unused[keyword] = values.decimals(keyword, 1)[0] if keyword in values else None
         except ValueProblem:
             warnings.append(f"{keyword} {tag} is no finite number; ignored, it plays no part in the geometry")
-    warnings += elements.remarks
+    warnings += (*dict.fromkeys(values.warnings), *elements.remarks)
     if elements.encoding_differs:
         warnings.append("implicit and explicit VR are mixed up: parsed as found, not as the transfer syntax says")
     image_type = [word.strip() for word in values.text("ImageType").upper().split("\\")]

@@ -24,7 +24,7 @@ from clrecon.dicom.concatenation import CONCATENATION_TAGS, Concatenation, read_
 from clrecon.dicom.raw import IMPLICIT_LITTLE, META_START, DicomElements
 from clrecon.dicom.sequences import Item, Schema, decode_number, name_tag, read_sequences
 from clrecon.dicom.text import escape_text
-from clrecon.dicom.values import ValueProblem, Values
+from clrecon.dicom.values import ValueProblem, Values, decode_text
 
 __all__ = ["ENHANCED_CT", "FRAME_PHASES", "Frame", "Groups", "read_groups", "split_frames"]
 
@@ -126,12 +126,14 @@ class Groups:
     dimensions : tuple of (int, str)
         Place in DimensionIndexValues and name of the dimensions that are not a place in the patient.
     concatenation : Concatenation or None
+    warnings : tuple of str
     """
 
     shared: Item
     frames: list[Item]
     dimensions: tuple[tuple[int, str], ...]
     concatenation: Concatenation | None
+    warnings: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -208,6 +210,7 @@ def read_groups(path: Path, elements: DicomElements) -> Groups:
         frames,
         tuple(_name_dimensions(top.sequences.get(DIMENSIONS, []), elements.little_endian)),
         read_concatenation(top, count, elements.little_endian),
+        tuple(f"{name_tag(tag)} is there twice in one item, with the same value" for tag in sorted(top.repeated)),
     )
 
 
@@ -305,7 +308,7 @@ def _take_real_world_values(frame: DicomElements, mappings: list[Item], warnings
         return
     for mapping in mappings:
         units = [unit.values.get(CODE_VALUE, b"") for unit in mapping.sequences.get(REAL_UNITS, [])]
-        if not any(unit.decode("latin-1").strip(" \0") in HU_CODES for unit in units):
+        if not any(decode_text(unit) in HU_CODES for unit in units):
             continue
         for tag, target in ((REAL_SLOPE, RESCALE_SLOPE), (REAL_INTERCEPT, RESCALE_INTERCEPT)):
             number = decode_number(mapping.values.get(tag, b""), "d", frame.little_endian)
@@ -328,7 +331,7 @@ def _describe_phase(frame: DicomElements, dimensions: tuple[tuple[int, str], ...
             number = decode_number(raw, form, frame.little_endian)
             text = "" if number is None else f"{number:.10g}"
         else:
-            text = escape_text(raw.decode("latin-1").strip(" \0"))
+            text = escape_text(decode_text(raw))
         if text:
             yield keyword, text
     indices = frame.values.get(DIMENSION_VALUES, b"")
@@ -371,4 +374,4 @@ def _read_header_bytes(path: Path, elements: DicomElements) -> tuple[bytes, int]
 
 def _words(raw: bytes | None) -> list[str]:
     """The values of a code string, at least one."""
-    return [word.strip(" \0") for word in (raw or b"").decode("latin-1").upper().split("\\")]
+    return [word.strip(" ") for word in decode_text(raw or b"").upper().split("\\")]

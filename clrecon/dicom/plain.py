@@ -1,7 +1,8 @@
 """The plain parser: the header of a file in plain order, by nothing but lengths, many times as fast as the careful one.
 
 Plain is: little endian, encoded as the transfer syntax says, known value representations, no length that leads past
-the bytes at hand, sequences of undefined length that hold clean items, and pixel data at the end.  Anything else is
+the bytes at hand, sequences of undefined length that hold clean items, wanted elements in rising order and once each,
+and pixel data at the end.  Anything else is
 not judged here: the answer is None, and `careful` decides.  What this module does answer is what `careful` answers;
 the tests hold the two together on mutated files.
 """
@@ -143,6 +144,7 @@ def _walk_explicit(
     """
     values: dict[int, bytes] = {}
     vrs: dict[int, str | None] = {}
+    last = 0
     while True:
         key, name, length = _explicit_head(data, place)
         group = key & 0xFFFF
@@ -167,16 +169,21 @@ def _walk_explicit(
                 continue
         else:
             raise _NotPlainError
-        if length and key in wanted:
+        if key in wanted:
             tag = wanted[key]
-            values[tag] = data[place : place + length]
-            vrs[tag] = vr
+            if tag <= last:
+                raise _NotPlainError
+            last = tag
+            if length:
+                values[tag] = data[place : place + length]
+                vrs[tag] = vr
         place += length
 
 
 def _walk_implicit(data: bytes, place: int, wanted: dict[int, int]) -> tuple[dict[int, bytes], int]:
     """As `_walk_explicit`, of a data set in implicit VR."""
     values: dict[int, bytes] = {}
+    last = 0
     while True:
         key, length = _implicit_head(data, place)
         group = key & 0xFFFF
@@ -188,8 +195,13 @@ def _walk_implicit(data: bytes, place: int, wanted: dict[int, int]) -> tuple[dic
                 raise _NotPlainError
             place = _skip_items(data, place, True, DEEPEST)
             continue
-        if length and key in wanted:
-            values[wanted[key]] = data[place : place + length]
+        if key in wanted:
+            tag = wanted[key]
+            if tag <= last:
+                raise _NotPlainError
+            last = tag
+            if length:
+                values[tag] = data[place : place + length]
         place += length
 
 

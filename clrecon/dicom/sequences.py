@@ -16,7 +16,7 @@ from typing import Any
 
 from clrecon.dicom.values import ValueProblem
 
-__all__ = ["Item", "Schema", "decode_number", "name_tag", "read_sequences"]
+__all__ = ["LONG_VRS", "Item", "Schema", "decode_number", "name_tag", "read_sequences", "skip_sequence"]
 
 Schema = Mapping[int, Any]
 """Wanted tag to None for a value, to the schema of its items for a sequence."""
@@ -40,11 +40,14 @@ class Item:
     vrs : dict of int to str or None
         Their value representations; None in implicit VR.
     sequences : dict of int to list of Item
+    repeated : set of int
+        Of the whole data set alone: wanted tags that stand twice in one of its items, with the same value.
     """
 
     values: dict[int, bytes] = field(default_factory=dict)
     vrs: dict[int, str | None] = field(default_factory=dict)
     sequences: dict[int, list[Item]] = field(default_factory=dict)
+    repeated: set[int] = field(default_factory=set, compare=False)
 
 
 @dataclass(frozen=True)
@@ -85,10 +88,24 @@ def read_sequences(
     Raises
     ------
     ValueProblem
-        A length reaches over its container, a sequence is nested too deep or holds too many items.
+        A length reaches over its container, a sequence is nested too deep or holds too many items; a wanted sequence
+        stands twice in one data set, or a wanted value with another one.
     """
     walk = _Walk(data, items_limit)
-    return walk.read_data_set(start, len(data), schema, _make_encoding(implicit, little_endian), "", top=True)[0]
+    top, _ = walk.read_data_set(start, len(data), schema, _make_encoding(implicit, little_endian), "", top=True)
+    top.repeated = walk.repeated
+    return top
+
+
+def skip_sequence(data: bytes, *, implicit: bool, little_endian: bool) -> int:
+    """Bytes of a sequence of undefined length from its first item to behind its end.
+
+    Raises
+    ------
+    ValueProblem
+        It does not end within `data`, holds something else than items, or is nested too deep.
+    """
+    return _Walk(data, 0).skip(0, len(data), _make_encoding(implicit, little_endian))
 
 
 class _Walk:
@@ -96,6 +113,7 @@ class _Walk:
         self.data = data
         self.items_left = items_limit
         self.items_limit = items_limit
+        self.repeated: set[int] = set()
 
     def read_head(self, place: int, end: int, encoding: _Encoding) -> tuple[int, bytes, int, int]:
         """Tag, VR (empty in implicit VR), length, and where the value starts."""
@@ -121,6 +139,7 @@ class _Walk:
     ) -> tuple[Item, int]:
         """Read the elements up to `end`, or to the delimiter of an item; returns what follows them, too."""
         item = Item()
+        seen: dict[int, bytes] = {}
         while place < end:
             if top and end - place < 8:
                 break
@@ -128,6 +147,8 @@ class _Walk:
             if tag == ITEM_END or top and tag >= PIXEL_GROUP:
                 break
             inner = schema.get(tag)
+            if tag in item.sequences:
+                raise ValueProblem(f"{name_tag(tag)} is there twice" + (f" in an item of {where}" if where else ""))
             if inner is not None and (length == UNDEFINED_LENGTH or vr in (b"SQ", b"UN", b"")):
                 inside = _UNKNOWN if vr == b"UN" else encoding
                 item.sequences[tag], place = self.read_items(place, end, length, inner, inside, _place(tag))
@@ -140,10 +161,23 @@ class _Walk:
                         f"the element {_place(tag)} needs {length} bytes, {end - place} are left"
                         + (f" in {where}" if where else "")
                     )
-                if length and inner is None and tag in schema:
-                    item.values[tag], item.vrs[tag] = self.data[place:stop], VR_NAMES.get(vr)
+                if inner is None and tag in schema:
+                    value = self.data[place:stop]
+                    self.compare(seen, tag, value, where)
+                    if value:
+                        item.values[tag], item.vrs[tag] = value, VR_NAMES.get(vr)
                 place = stop
         return item, place
+
+    def compare(self, seen: dict[int, bytes], tag: int, value: bytes, where: str) -> None:
+        """Compare a value with what its item held of that tag before: of two nobody can tell which was meant."""
+        if tag not in seen:
+            seen[tag] = value
+        elif seen[tag] == value:
+            self.repeated.add(tag)
+        else:
+            inside = f" in an item of {where}" if where else ""
+            raise ValueProblem(f"{name_tag(tag)} is there twice{inside}, with two values")
 
     def read_items(
         self, place: int, end: int, length: int, schema: Schema, encoding: _Encoding, where: str

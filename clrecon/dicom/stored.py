@@ -23,12 +23,10 @@ from clrecon.dicom.codestream import Codestream, read_codestream
 from clrecon.dicom.decoder_pool import DecoderError, DecoderPool
 from clrecon.dicom.encapsulated import Pieces, find_frames, read_pieces
 from clrecon.dicom.slice_header import SliceHeader
+from clrecon.dicom.surplus import INFLATED_LIMIT
 from clrecon.errors import RefusedInputError
 
 __all__ = ["StoredPixels"]
-
-INFLATED_LIMIT = 1 << 30
-"""Bytes of one data set that are inflated at most; never more than its header says it has."""
 
 INFLATE_STEP = 1 << 20
 

@@ -16,7 +16,7 @@ from clrecon.dicom.elements import DicomElements
 from clrecon.dicom.text import escape_text
 from clrecon.errors import RefusedInputError
 
-__all__ = ["WANTED_TAGS", "ValueProblem", "Values"]
+__all__ = ["WANTED_TAGS", "ValueProblem", "Values", "decode_text"]
 
 _TAGS = {
     "SpecificCharacterSet": 0x00080005,
@@ -75,26 +75,30 @@ _KNOWN_VALUES = 2048
 _KNOWN_BYTES = 128  # longer values are decoded each time: what is kept must stay small
 
 
-def _decode_text(raw: bytes) -> str:
-    return raw.decode("latin-1").strip(" \0")
+def decode_text(raw: bytes) -> str:
+    """Text without its padding: spaces, and NUL at its end alone, which elsewhere stands in place of a character."""
+    return raw.decode("latin-1").rstrip(" \0").lstrip(" ")
 
 
 def _decode_decimals(raw: bytes) -> tuple[float, ...]:
-    """Finite numbers with a decimal point, separated by backslashes; empty where one of them is none."""
-    parts = [part.strip(" \0") for part in raw.decode("latin-1").split("\\")]
+    """Finite numbers with a decimal point, separated by backslashes; empty where one of them is none.
+
+    NUL is padding behind the last number and nowhere else: in place of a minus sign it would turn the number round.
+    """
+    parts = [part.strip(" ") for part in raw.rstrip(b"\0").decode("latin-1").split("\\")]
     if not all(map(_DECIMAL.fullmatch, parts)):
         return ()
     numbers = tuple(map(float, parts))
     return numbers if all(map(math.isfinite, numbers)) else ()
 
 
-_known_text = lru_cache(_KNOWN_VALUES)(_decode_text)
+_known_text = lru_cache(_KNOWN_VALUES)(decode_text)
 _known_decimals = lru_cache(_KNOWN_VALUES)(_decode_decimals)
 
 
 @lru_cache(_KNOWN_VALUES)
 def _known_word(raw: bytes) -> str:
-    return escape_text(_decode_text(raw))
+    return escape_text(decode_text(raw))
 
 
 @lru_cache(_KNOWN_VALUES)
@@ -102,15 +106,27 @@ def _share_pairs(*pairs: tuple[str, str]) -> tuple[tuple[str, str], ...]:
     return pairs
 
 
+def _place(keyword: str) -> str:
+    tag = _TAGS[keyword]
+    return f"{keyword} ({tag >> 16:04X},{tag & 0xFFFF:04X})"
+
+
 class ValueProblem(RefusedInputError):
     """One value of a header is missing or wrong."""
 
 
 class Values:
-    """Typed access to raw elements; every accessor checks what it returns."""
+    """Typed access to raw elements; every accessor checks what it returns.
+
+    Attributes
+    ----------
+    warnings : list of str
+        What is doubtful in the numbers that were asked for.
+    """
 
     def __init__(self, elements: DicomElements):
         self.elements = elements
+        self.warnings: list[str] = []
         self.byte_order: Literal["little", "big"] = "little" if elements.little_endian else "big"
 
     def __contains__(self, keyword: str) -> bool:
@@ -118,28 +134,28 @@ class Values:
 
     def wrong(self, keyword: str, expected: str) -> ValueProblem:
         tag = _TAGS[keyword]
-        place = f"{keyword} ({tag >> 16:04X},{tag & 0xFFFF:04X})"
+        place = _place(keyword)
         if keyword not in self and not self.elements.values.get(tag):
             return ValueProblem(f"{place} is missing or empty, expected {expected}")
         raw = self.elements.values[tag]
         vr = self.elements.vrs.get(tag)
         binary = vr in ("US", "SS", "UL") or (vr is None and keyword in _BINARY)
         number = int.from_bytes(raw, self.byte_order)
-        shown = str(number) if binary else f"'{escape_text(raw.decode('latin-1').strip(chr(0) + ' '))}'"
+        shown = str(number) if binary else f"'{escape_text(decode_text(raw))}'"
         return ValueProblem(f"{place} is {shown}, expected {expected}")
 
     def text(self, keyword: str) -> str:
         raw = self.elements.values.get(_TAGS[keyword])
         if raw is None:
             return ""
-        return _known_text(raw) if len(raw) <= _KNOWN_BYTES else _decode_text(raw)
+        return _known_text(raw) if len(raw) <= _KNOWN_BYTES else decode_text(raw)
 
     def word(self, keyword: str) -> str:
         """The text as one safe line."""
         raw = self.elements.values.get(_TAGS[keyword])
         if raw is None:
             return ""
-        return _known_word(raw) if len(raw) <= _KNOWN_BYTES else escape_text(_decode_text(raw))
+        return _known_word(raw) if len(raw) <= _KNOWN_BYTES else escape_text(decode_text(raw))
 
     def pairs(self, keywords: tuple[str, ...]) -> tuple[tuple[str, str], ...]:
         """Keyword and value, as `word` gives it, of those that are there."""
@@ -150,6 +166,8 @@ class Values:
         numbers = _known_decimals(raw) if len(raw) <= _KNOWN_BYTES else _decode_decimals(raw)
         if len(numbers) != count:
             raise self.wrong(keyword, "a finite number" if count == 1 else f"{count} finite numbers")
+        if raw[-1:] == b"\0":
+            self.warnings.append(f"{_place(keyword)} ends with NUL, taken as padding: its last digit may be lost")
         return numbers
 
     def whole_or_none(self, keyword: str) -> int | None:

@@ -1,0 +1,60 @@
+"""Rows of the trap matrix whose files hold bytes that no writer meant."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from dicom_series import edit_value, element_bytes, insert_after
+from trap_plan import BACKGROUND_HU, REFUSED, WARNED, Marks, Size, add_case, add_simple, plan_for, write_slices
+
+
+def _spoiled(name: str, spoil: Callable[[Path], None], *words: str, **changes: Any) -> None:
+    """All files are spoiled behind their writer's back; `changes` of the plan."""
+
+    @add_case(name, REFUSED, words)
+    def write(folder: Path, size: Size) -> Marks:
+        marks = write_slices(folder, plan_for(size, **changes))
+        for file in sorted(folder.iterdir()):
+            spoil(file)
+        return marks
+
+
+def _send_as_text(file: Path) -> None:
+    """What a transfer in text mode makes of the pixels: each LF becomes CRLF."""
+    data = file.read_bytes()
+    start = data.index(b"\xe0\x7f\x10\0OW") + 12
+    file.write_bytes(data[:start] + data[start:].replace(b"\n", b"\r\n"))
+
+
+def add_byte_cases() -> None:
+    """Put the rows into `CASES`."""
+    _spoiled(
+        "NUL for the minus sign of x",
+        lambda file: edit_value(file, "ImagePositionPatient", lambda value: b"\0" + value[1:]),
+        "ImagePositionPatient (0020,0032) is '\\x00",
+    )
+    _spoiled(
+        "NUL for the minus sign of the intercept",
+        lambda file: edit_value(file, "RescaleIntercept", lambda value: b"\0" + value[1:]),
+        "RescaleIntercept (0028,1052) is '\\x00",
+    )
+    _spoiled(
+        "PixelSpacing twice, with two values",
+        lambda file: insert_after(file, "PixelSpacing", element_bytes("PixelSpacing", b"7\\7 ")),
+        "PixelSpacing (0028,0030) is there twice, with two values",
+    )
+    add_simple(
+        "Columns one less than there are",
+        REFUSED,
+        ("more pixels than the header says",),
+        change=lambda ds, k: setattr(ds, "Columns", ds.Columns - 1),
+    )
+    add_simple(
+        "zeros behind the pixels",
+        WARNED,
+        ("the rest is zeros, taken as padding",),
+        change=lambda ds, k: setattr(ds, "PixelData", ds.PixelData + bytes(512)),
+    )
+    _spoiled("pixels sent as text", _send_as_text, "it was sent as text", intercept=BACKGROUND_HU - 10)
