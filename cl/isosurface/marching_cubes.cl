@@ -164,7 +164,7 @@ __kernel void list_words(
  *                                  gradients within the cells up to slice k + 1.  With -D UNEVEN the matrices differ
  *             steps           in   (4,) float4: mm for one step along i (rounded to 12 bits, rest), along j
  *             positions       out  (vertices, 3) mm
- *             normals         out  (vertices, 3) unit, towards lower values
+ *             normals         out  (vertices, 3) unit, towards lower values; with -D RANGE away from the range
  *             iso_level       where on an edge the surface lies
  *             outside         value beyond the border of a closed volume
  *             value_scale     power of two that takes the values to 1 or below: squares neither over- nor underflow
@@ -179,6 +179,8 @@ __kernel void list_words(
  *             inside, label   in   with -D LABELS: the label that each sample is inside of, slices as those of `voxels`,
  *                             and the label whose surface it is; see label_border.h
  *             half_way_count  in/out  with -D LABELS: grows by the vertices that HU do not place
+ *             upper_level     with -D RANGE: where on an edge from inside to above the range the surface lies
+ *             highest         with -D RANGE: the range's highest value
  * Launch      global = ceil(active / WORDS_PER_ITEM) rounded up by the host, any local
  * Guarantees  every position and normal is written once.  Positions are right to one unit in the last place of the
  *             volume's largest coordinate (half a unit up to 4096 samples an axis, where products of a sample number
@@ -195,6 +197,9 @@ void emit_vertices(
     const uint gk, const uint words, const uint row_shift, const uint active
 #ifdef LABELS
     , __global const LABEL *restrict inside, const uint label, __global uint *restrict half_way_count
+#endif
+#ifdef RANGE
+    , const float upper_level, const float highest
 #endif
     )
 {
@@ -216,6 +221,10 @@ void emit_vertices(
     frame.margin = margin.xyz;
     frame.iso_level = iso_level;
     frame.value_scale = value_scale;
+#ifdef RANGE
+    frame.upper_level = upper_level;
+    frame.highest = highest;
+#endif
 
     /* First touches of the volume wait for memory: ask for all that the item will need before it needs any of it. */
     for (uint n = begin; n < end; ++n) {

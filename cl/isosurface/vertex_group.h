@@ -31,6 +31,9 @@ typedef struct {
 #endif
     float3 margin; /* smallest distance of a vertex from a sample, in steps */
     float iso_level, value_scale;
+#ifdef RANGE
+    float upper_level, highest; /* where the surface lies above the range, and the range's highest value */
+#endif
 } slice_frame;
 
 #define FRAME_ROWS 9
@@ -177,7 +180,14 @@ static inline void write_vertices(
     const floats next_value = to_floats(load_lanes(group->next_value));
     const floats keep = choose(
         along_k, (floats)(frame->margin.z), choose(along_j, (floats)(frame->margin.y), (floats)(frame->margin.x)));
-    floats t = clamp((frame->iso_level - value) / (next_value - value), keep, 1.0f - keep);
+#ifdef RANGE
+    /* One end is inside: the other one lies above the range where the larger of both does. */
+    const ints above = greater(value, next_value) > frame->highest;
+    const floats level = choose(above, (floats)(frame->upper_level), (floats)(frame->iso_level));
+#else
+    const float level = frame->iso_level;
+#endif
+    floats t = clamp((level - value) / (next_value - value), keep, 1.0f - keep);
     floats value_scale = (floats)(frame->value_scale);
 #ifdef LABELS
     const ints half_way = load_lanes(group->half_way) != 0;
@@ -224,7 +234,11 @@ static inline void write_vertices(
 #endif
 #undef NEXT_GRADIENT
 #undef GRADIENT
+#ifdef RANGE
+    const floats scale = choose(above, (floats)(1.0f), (floats)(-1.0f)) / sqrt(x * x + y * y + z * z);
+#else
     const floats scale = -1.0f / sqrt(x * x + y * y + z * z);
+#endif
     store_triples(x * scale, y * scale, z * scale, count, normals);
 }
 

@@ -26,7 +26,7 @@ __all__ = [
 
 INTERRUPTED = 130
 
-_NEGATIVE_LIST = re.compile(r"-[0-9.]+(?:[eE][+-]?[0-9]+)?,")
+_NEGATIVE_LIST = re.compile(r"-[0-9.]+(?:[eE][+-]?[0-9]+)?[,:]")
 
 EXIT_CODES = """\
 exit codes: 0 done; 1 unexpected error; 2 no usable DICOM or no surface; 3 wrong usage;

@@ -8,7 +8,8 @@ from typing import Any
 __all__ = ["LEVELS_HELP", "parse_hu", "parse_levels"]
 
 LEVELS_HELP = (
-    "iso value in HU, inside is N and above; several with commas make one mesh each;"
+    "iso value in HU, inside is N and above; A:B is a range, inside is from A to B; several with commas make one mesh"
+    " each;"
     " auto: half way between bone and the tissue beside it, measured in the scan;"
     " half:BONE,TISSUE: half way between these two"
 )
@@ -16,7 +17,7 @@ _HALF = "half:"
 
 
 def parse_hu(text: str) -> dict[str, Any]:
-    """Read the value of ``--hu``: numbers, ``auto`` or ``half:BONE,TISSUE``; returns entries of `MeshSettings`.
+    """Read the value of ``--hu``: numbers, ranges, ``auto`` or ``half:BONE,TISSUE``; returns entries of `MeshSettings`.
 
     Raises
     ------
@@ -26,15 +27,29 @@ def parse_hu(text: str) -> dict[str, Any]:
     if text == "auto":
         return {"half_way": "auto"}
     if not text.startswith(_HALF):
-        return {"iso_value": parse_levels(text)}
+        return {"iso_value": tuple(_parse_level(part, text) for part in text.split(","))}
     materials = parse_levels(text.removeprefix(_HALF))
     if len(materials) != 2:
         raise argparse.ArgumentTypeError(f"{text!r} does not name two materials in HU, as half:1200,40 does")
     return {"half_way": materials}
 
 
-def parse_levels(text: str) -> tuple[float, ...]:
-    """Read one number, or several with commas between them.
+def _parse_level(part: str, text: str) -> float | tuple[float, float]:
+    """A number, or the two ends of a range A:B."""
+    if ":" not in part:
+        return parse_levels(part, text)[0]
+    ends = part.split(":")
+    if len(ends) != 2 or not all(ends):
+        where = f" in {text!r}" if part != text else ""
+        raise argparse.ArgumentTypeError(
+            f"{part!r}{where} is no range A:B of two numbers of HU; from A on is --hu A, below B is --below B"
+        )
+    low, high = (parse_levels(end, text)[0] for end in ends)
+    return low, high
+
+
+def parse_levels(text: str, whole: str | None = None) -> tuple[float, ...]:
+    """Read one number, or several with commas between them; `whole` is what `text` is a part of.
 
     Raises
     ------
@@ -46,6 +61,6 @@ def parse_levels(text: str) -> tuple[float, ...]:
         try:
             levels.append(float(part))
         except ValueError:
-            where = f" in {text!r}" if part != text else ""
+            where = f" in {whole or text!r}" if part != (whole or text) else ""
             raise argparse.ArgumentTypeError(f"{part!r}{where} is no number of HU") from None
     return tuple(levels)

@@ -8,7 +8,7 @@ from typing import Any
 from clrecon.cli.common import add_device, add_memory, megabytes
 from clrecon.cli.console import Console, printable
 from clrecon.cli.labels import add_label_arguments, describe_labels
-from clrecon.cli.levels import LEVELS_HELP, parse_hu
+from clrecon.cli.levels import LEVELS_HELP, parse_hu, parse_levels
 from clrecon.cli.masking import add_masking, masking_settings
 from clrecon.cli.points import parse_point
 from clrecon.cli.reading import add_reading, reading_settings
@@ -45,6 +45,8 @@ def _epilog() -> str:
             "  clrecon mesh CT_FOLDER -o skull.glb --hu 300 --keep-largest 1 --report skull.json",
             "  clrecon mesh CT_FOLDER -o bone.stl --hu auto",
             "  clrecon mesh CT_FOLDER -o bone.stl --hu 200,350 --min-volume 1 --split",
+            "  clrecon mesh CT_FOLDER -o fat.stl --hu -150:-30 --remove-table",
+            "  clrecon mesh CT_FOLDER -o lung.stl --below -400 --keep-largest 2",
             "  clrecon mesh CT_FOLDER -o bone.stl --labels spine.nii.gz --label T12 --label L1",
         )
     )
@@ -65,12 +67,20 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_masking(parser)
     surface = parser.add_argument_group("surface")
     level = surface.add_mutually_exclusive_group()
-    level.add_argument("--hu", type=parse_hu, default={}, metavar="N[,N...]|auto|half:B,T", help=LEVELS_HELP)
+    level.add_argument("--hu", type=parse_hu, default={}, metavar="N[,N...]|A:B|auto|half:B,T", help=LEVELS_HELP)
+    level.add_argument(
+        "--below",
+        type=parse_levels,
+        metavar="N[,N...]",
+        help="in place of an iso value: inside is what lies below N HU, such as lungs, airways and sinuses (-400); the"
+        " air round the patient is left out",
+    )
     level.add_argument(
         "--preset",
         metavar="NAME",
         help=f"iso value by tissue, one of: {', '.join(PRESETS)} (default: {DEFAULT_PRESET})",
     )
+    surface.add_argument("--keep-outside", action="store_true", help="with --below: leave the air round the patient in")
     surface.add_argument("--space", default="lps", metavar="lps|ras", help="patient frame of the mesh (default: lps)")
     surface.add_argument(
         "--topology",
@@ -113,6 +123,8 @@ def run(options: argparse.Namespace, console: Console) -> int:
 
     settings = MeshSettings(
         **options.hu,
+        below=options.below,
+        keep_outside=options.keep_outside,
         preset=options.preset,
         **reading_settings(options),
         space=options.space.lower(),
@@ -149,7 +161,7 @@ def describe_mesh(report: dict[str, Any]) -> list[str]:
     """The report for people: what was read, what came out, on which device, in which time."""
     reason = _describe_choice(report)
     border = "closed" if report["closed_at_border"] else "open"
-    levels = ", ".join(f"{level:g}" for level in dict.fromkeys(mesh["iso_value_hu"] for mesh in report["meshes"]))
+    levels = ", ".join(dict.fromkeys(_describe_inside(*mesh["inside_hu"]) for mesh in report["meshes"]))
     return [
         f"input    {describe_volume(report['volume'])}",
         f"surface  {levels} HU ({reason}), {border} at the border of the volume",
@@ -161,6 +173,13 @@ def describe_mesh(report: dict[str, Any]) -> list[str]:
         f"device   {printable(report['device'])}{_describe_slabs(report)}",
         f"time     {_describe_times(report['seconds'])}",
     ]
+
+
+def _describe_inside(low: float | None, high: float | None) -> str:
+    """What a surface encloses, as it is asked for."""
+    if high is None:
+        return f"{low:g}"
+    return f"below {high:g}" if low is None else f"{low:g}:{high:g}"
 
 
 def _describe_slabs(report: dict[str, Any]) -> str:

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from clrecon.errors import RefusedInputError, UsageError
 from clrecon.geometry.volume import AIR_HU, Volume
 
-__all__ = ["find_body", "mask_field_of_view", "remove_table"]
+__all__ = ["find_body", "find_unmeasured", "mask_field_of_view", "remove_table"]
 
 Mask = NDArray[np.bool_]
 
@@ -198,7 +198,7 @@ def _find_cavities(cells: NDArray[np.float32], tissue: Mask, across: float) -> M
     from scipy import ndimage
 
     in_plane = ndimage.generate_binary_structure(2, 1)[None]
-    unmeasured = _grow(_find_unmeasured(cells), 2)
+    unmeasured = _grow(find_unmeasured(cells), 2)
     regions, count = ndimage.label(~tissue & ~unmeasured, np.pad(in_plane, ((1, 1), (0, 0), (0, 0))))
     thick = _grow(_grow(tissue, -OPENING_MM / across), OPENING_MM / across) & tissue
 
@@ -217,8 +217,8 @@ def _find_cavities(cells: NDArray[np.float32], tissue: Mask, across: float) -> M
     return np.asarray(kept[regions])
 
 
-def _find_unmeasured(cells: NDArray[np.float32]) -> Mask:
-    """Cells of one value from the corners on: padding, or air without noise."""
+def find_unmeasured(cells: NDArray[Any]) -> Mask:
+    """Cells, or voxels, of one value from the corners of a slice on: padding, or air without noise."""
     from scipy import ndimage
 
     found = np.zeros(cells.shape, dtype=bool)

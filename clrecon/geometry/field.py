@@ -7,11 +7,13 @@ for the device operators and their numpy twins alike.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import DTypeLike, NDArray
 
 from clrecon.errors import NoSurfaceError, UsageError
 from clrecon.geometry.affine import normal_matrix
@@ -30,9 +32,13 @@ LARGEST_FLOAT = 1e30
 TOPOLOGIES = ("separated", "trilinear")
 """What is done where the corners of a cell do not say which of them are joined, see `IsoRule.topology`."""
 
+Level = float | Sequence[float]
+"""An iso value, or the two ends of a range: HU."""
+
 __all__ = [
     "TOPOLOGIES",
     "IsoRule",
+    "Level",
     "ValueRange",
     "check_topology",
     "choose_iso_rule",
@@ -46,12 +52,12 @@ __all__ = [
 
 @dataclass(frozen=True)
 class IsoRule:
-    """How one iso value divides one volume.
+    """How one iso value, or a range of HU, divides one volume.
 
     Attributes
     ----------
     iso_value : float
-        As asked for, HU.
+        As asked for, HU; of a range its lower end.
     lowest_inside : int or float
         A sample is inside when its value is >= this.  For integer voxels the lowest integer >= the iso value.
     iso_level : float
@@ -66,6 +72,16 @@ class IsoRule:
     topology : {"separated", "trilinear"}
         Inside samples that only meet across a face or through a cell are kept apart, or joined where the trilinear
         interpolation of the samples joins them.
+    inside : {"above", "below", "between"}
+        What the surface encloses: the samples from `lowest_inside` on; the others, in which case it is the surface
+        of "above" turned round, and `outside` lies above the level; or those of a range.
+    upper_value : float or None
+        Of a range the upper end as asked for, HU; it belongs to the range.
+    highest_inside : int, float or None
+        Of a range: a sample is inside up to this value.  For integer voxels the highest integer <= the upper end.
+    upper_level : float or None
+        Of a range: where the surface lies between an inside sample and one above the range.  For integer voxels and
+        an integer end k it is k + 0.5.
     """
 
     iso_value: float
@@ -75,11 +91,54 @@ class IsoRule:
     closed: bool
     value_scale: float = 1.0
     topology: str = "separated"
+    inside: str = "above"
+    upper_value: float | None = None
+    highest_inside: int | float | None = None
+    upper_level: float | None = None
 
     @property
     def border(self) -> int:
         """Layers of outside around the volume: 1 when closed, else 0."""
         return int(self.closed)
+
+    @property
+    def levels(self) -> tuple[float, ...]:
+        """Every level at which the surface may lie: one, or the two of a range."""
+        return (self.iso_level,) if self.upper_level is None else (self.iso_level, self.upper_level)
+
+    def mark_inside(self, values: NDArray[Any]) -> NDArray[np.bool_]:
+        """Which of these values are inside."""
+        if self.inside == "below":
+            return values < self.lowest_inside
+        marked = values >= self.lowest_inside
+        return marked if self.highest_inside is None else marked & (values <= self.highest_inside)
+
+    def describe(self) -> str:
+        """What is asked for, in words: ``200 HU``, ``below -400 HU``, ``100 to 300 HU``."""
+        if self.upper_value is not None:
+            return f"{self.iso_value:g} to {self.upper_value:g} HU"
+        return f"{'below ' if self.inside == 'below' else ''}{self.iso_value:g} HU"
+
+    def as_report(self) -> dict[str, Any]:
+        """Entries of a mesh's report: what is inside, and where the surface lies, HU.
+
+        ``iso_value_hu`` and ``iso_level_hu`` are None for a range; ``inside_hu`` and ``inside_levels_hu`` are
+        ``[low, high]``, None for the end that is open.
+        """
+        value, level = self.iso_value, self.iso_level
+        ends: dict[str, tuple[list[float | None], list[float | None]]] = {
+            "above": ([value, None], [level, None]),
+            "below": ([None, value], [None, level]),
+            "between": ([value, self.upper_value], [level, self.upper_level]),
+        }
+        ranged = self.inside == "between"
+        return {
+            "iso_value_hu": None if ranged else value,
+            "iso_level_hu": None if ranged else level,
+            "inside": self.inside,
+            "inside_hu": ends[self.inside][0],
+            "inside_levels_hu": ends[self.inside][1],
+        }
 
 
 def data_range(volume: Volume) -> tuple[float, float]:
@@ -136,10 +195,11 @@ class ValueRange:
 
 def choose_iso_rule(
     volume: Volume,
-    iso_value: float,
+    iso_value: Level,
     closed: bool = True,
     topology: str = "separated",
     *,
+    below: bool = False,
     values: ValueRange | None = None,
 ) -> IsoRule:
     """Decide what is inside and where the surface lies.
@@ -147,24 +207,26 @@ def choose_iso_rule(
     Parameters
     ----------
     volume : Volume
-    iso_value : float
-        HU.  A sample is inside when its value is >= `iso_value`.
+    iso_value : float or (float, float)
+        HU.  A sample is inside when its value is >= `iso_value`; of a range, when it lies within, both ends included.
     closed : bool
         Surround the volume with outside.
     topology : {"separated", "trilinear"}
+    below : bool
+        A sample is inside when its value is < `iso_value`: the same surface, turned round.
     values : ValueRange, optional
         Of this volume, where it is asked for more than one iso value.
 
     Raises
     ------
     UsageError
-        `iso_value` is no finite number, there is no such topology, or values are too large to be interpolated in
-        float32.
+        `iso_value` is no finite number nor a range of two, there is no such topology, it does not go with a range, or
+        values are too large to be interpolated in float32.
     NoSurfaceError
         Float voxels that hold NaN or infinite values.
     """
-    iso_value = _checked_iso_value(iso_value)
-    check_topology(topology)
+    iso_value, upper_value = _checked_level(iso_value, below)
+    check_topology(topology, ranged=upper_value is not None)
     dtype = volume.voxels.dtype
     value_scale = 1.0
     values = values or ValueRange(volume)
@@ -174,7 +236,7 @@ def choose_iso_rule(
             raise NoSurfaceError(f"the voxels run from {low} to {high}: infinite values have no iso surface")
         if max(-low, high) > LARGEST_FLOAT:
             raise UsageError(f"the voxels run from {low:g} to {high:g}: beyond {LARGEST_FLOAT:g} is not supported")
-        value_scale = _power_of_two_over(max(-low, high, abs(iso_value)))
+        value_scale = _power_of_two_over(max(-low, high, abs(iso_value), abs(upper_value or 0.0)))
         iso_level = float(np.float32(iso_value))
         lowest_inside: int | float = iso_level
     else:
@@ -188,18 +250,49 @@ def choose_iso_rule(
                 )
         lowest_inside = math.ceil(iso_value)
         iso_level = iso_value - 0.5 if lowest_inside == iso_value else iso_value
-    outside = max(low, float(AIR_HU))
-    if outside >= iso_level:
-        # Everything is inside, or the iso value is below air: a value beyond the level, of the voxels' own kind.
-        if dtype.kind == "f":
-            outside = iso_level - max(0.5, abs(iso_level) * 2.0**-20)
-        else:
-            outside = float(max(lowest_inside - 1, LOWEST_OUTSIDE))
-    return IsoRule(iso_value, lowest_inside, iso_level, outside, closed, value_scale, topology)
+    inside = "below" if below else "above"
+    rule = IsoRule(iso_value, lowest_inside, iso_level, 0.0, closed, value_scale, topology, inside)
+    if upper_value is not None:
+        rule = _end_range(rule, upper_value, dtype)
+    return replace(rule, outside=_choose_outside(rule, max(low, float(AIR_HU)), dtype))
 
 
-def check_topology(topology: str) -> None:
-    """Refuse what is none of `TOPOLOGIES`.
+def _end_range(rule: IsoRule, upper_value: float, dtype: DTypeLike) -> IsoRule:
+    """The rule of a range: what is below its upper end, and that end itself, is inside."""
+    if np.dtype(dtype).kind == "f":
+        upper_level = float(np.float32(upper_value))
+        highest_inside: int | float = upper_level
+        if upper_level <= rule.iso_level:
+            raise UsageError(f"the ends of the range {rule.iso_value:g} to {upper_value:g} HU are one float32 number")
+    else:
+        highest_inside = math.floor(upper_value)
+        upper_level = upper_value + 0.5 if highest_inside == upper_value else upper_value
+    return replace(
+        rule, inside="between", upper_value=upper_value, highest_inside=highest_inside, upper_level=upper_level
+    )
+
+
+def _choose_outside(rule: IsoRule, low: float, dtype: DTypeLike) -> float:
+    """The value beyond the border: `low`, which is the lowest of the volume or air, or what takes its part.
+
+    Where that is inside (everything is, or the level lies below air), a value beyond the level.  For what lies below
+    an iso value, as far above the level as `low` is below: the surface of air ends half way to the border.  Always of
+    the voxels' own kind.
+    """
+    level, is_float = rule.iso_level, np.dtype(dtype).kind == "f"
+    least = max(0.5, abs(level) * 2.0**-20)
+    if rule.inside == "below":
+        if is_float:
+            return level + max(level - low, least)
+        mirrored = min(math.ceil(2.0 * level - low), LARGEST_INTEGER)
+        return float(min(max(rule.lowest_inside, mirrored), -LOWEST_OUTSIDE))
+    if low < level:
+        return low
+    return level - least if is_float else float(max(rule.lowest_inside - 1, LOWEST_OUTSIDE))
+
+
+def check_topology(topology: str, ranged: bool = False) -> None:
+    """Refuse what is none of `TOPOLOGIES`, and the one that knows no range.
 
     Raises
     ------
@@ -207,12 +300,30 @@ def check_topology(topology: str) -> None:
     """
     if topology not in TOPOLOGIES:
         raise UsageError(f"there is no topology {topology!r}: it is one of {', '.join(TOPOLOGIES)}")
+    if ranged and topology == "trilinear":
+        raise UsageError(
+            "the topology trilinear follows one level, a range has two: leave it out, or give one iso value"
+        )
 
 
 def _power_of_two_over(largest: float) -> float:
     """A power of two that takes `largest` to 1 or below, as far as float32 has one."""
     _, exponent = math.frexp(largest)
     return 2.0 ** min(max(-exponent, -126), 126)
+
+
+def _checked_level(level: Level, below: bool) -> tuple[float, float | None]:
+    """The iso value, or the two ends of a range."""
+    if isinstance(level, str | int | float) or np.ndim(level) == 0:
+        return _checked_iso_value(level), None  # type: ignore[arg-type]
+    if len(level) != 2:
+        raise UsageError(f"a range of HU has two ends, not {tuple(level)}")
+    low, high = (_checked_iso_value(end) for end in level)
+    if low >= high:
+        raise UsageError(f"the range {low:g} to {high:g} HU holds nothing: give its lower end first")
+    if below:
+        raise UsageError(f"below takes one iso value, not the range {low:g} to {high:g} HU")
+    return low, high
 
 
 def _checked_iso_value(iso_value: float) -> float:

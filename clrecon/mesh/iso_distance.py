@@ -45,13 +45,16 @@ def rule_of_report(report: dict[str, Any]) -> IsoRule | None:
     Parameters
     ----------
     report : dict
-        Of a mesh: ``iso_value_hu``, ``iso_level_hu``, ``outside_hu``, ``closed_at_border``.
+        Of a mesh: ``iso_level_hu`` or ``inside_levels_hu``, ``outside_hu``, ``closed_at_border``.
     """
-    level, closed = report.get("iso_level_hu"), bool(report.get("closed_at_border", False))
-    if level is None or (closed and report.get("outside_hu") is None):
+    ends = report.get("inside_levels_hu") or [report.get("iso_level_hu")]
+    levels = [float(level) for level in ends if level is not None]
+    closed = bool(report.get("closed_at_border", False))
+    if not levels or (closed and report.get("outside_hu") is None):
         return None
-    value = float(report.get("iso_value_hu", level))
-    return IsoRule(value, value, float(level), float(report["outside_hu"]) if closed else 0.0, closed)
+    outside = float(report["outside_hu"]) if closed else 0.0
+    upper = levels[1] if len(levels) > 1 else None
+    return IsoRule(levels[0], levels[0], levels[0], outside, closed, upper_level=upper)
 
 
 def trilinear_field(volume: Volume, rule: IsoRule, ijk: Float64Array) -> tuple[Float64Array, Float64Array]:
@@ -104,6 +107,8 @@ def _samples(volume: Volume, rule: IsoRule, ijk: NDArray[np.int64]) -> Float64Ar
 def distances_to_iso_surface(volume: Volume, rule: IsoRule, points: Float64Array) -> Float64Array:
     """Distances of points near the trilinear iso surface from it, by Newton steps along the gradient.
 
+    The surface of a range is that of both its ends: the nearer one counts.
+
     A step is residual over gradient, at most half a voxel long, in mm through the affine of the slice, so that
     sheared and unevenly spaced stacks are right too.  The answer is the way to a point of the surface: never less
     than the distance itself, and equal to it where the surface is smooth.
@@ -112,7 +117,7 @@ def distances_to_iso_surface(volume: Volume, rule: IsoRule, points: Float64Array
     ----------
     volume : Volume
     rule : IsoRule
-        Gives the level `iso_level` and what is beyond the border.
+        Gives the levels and what is beyond the border.
     points : ndarray, shape (n, 3), float64, LPS mm
 
     Returns
@@ -120,6 +125,13 @@ def distances_to_iso_surface(volume: Volume, rule: IsoRule, points: Float64Array
     ndarray, shape (n,), float64, mm
         NaN where no surface was found: the field is flat there, or steps across a crease go to and fro.
     """
+    distances = _distances_to_level(volume, rule, rule.iso_level, points)
+    for level in rule.levels[1:]:
+        distances = np.fmin(distances, _distances_to_level(volume, rule, level, points))
+    return distances
+
+
+def _distances_to_level(volume: Volume, rule: IsoRule, level: float, points: Float64Array) -> Float64Array:
     matrices = np.asarray(layer_normal_matrices(volume, rule.border))
     longest = 0.5 * smallest_voxel_mm(volume)
     distances = np.full(len(points), np.nan)
@@ -134,7 +146,7 @@ def distances_to_iso_surface(volume: Volume, rule: IsoRule, points: Float64Array
             square = np.einsum("na,na->n", gradient, gradient)
             uphill = square > 0.0
             going, value, gradient, square = going[uphill], value[uphill], gradient[uphill], square[uphill]
-            step = ((rule.iso_level - value) / square)[:, None] * gradient
+            step = ((level - value) / square)[:, None] * gradient
             length = np.linalg.norm(step, axis=1)
             step *= np.minimum(1.0, longest / np.maximum(length, longest))[:, None]
             here[going] += step

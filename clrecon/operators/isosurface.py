@@ -11,7 +11,7 @@ from numpy.typing import DTypeLike, NDArray
 
 from clrecon.errors import ClreconError, DeviceError, DeviceMemoryError, NoSurfaceError, UsageError
 from clrecon.geometry import Volume
-from clrecon.geometry.field import IsoRule, ValueRange, check_topology, choose_iso_rule, data_range
+from clrecon.geometry.field import IsoRule, Level, ValueRange, check_topology, choose_iso_rule, data_range
 from clrecon.geometry.precision import describe_far
 from clrecon.kernels import Program, Stopwatch, result_pages, upload
 from clrecon.mesh import Mesh
@@ -41,15 +41,23 @@ Part = tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.uint32]]
 
 def _refuse_level(device: Device, volume: Volume, rule: IsoRule) -> ClreconError:
     low, high = data_range(volume)
+    runs = f"the volume runs from {low:g} to {high:g} HU"
+    if rule.inside == "between":
+        marked = sum(int(np.count_nonzero(rule.mark_inside(voxels))) for voxels in volume.voxels)
+        if 0 < marked < volume.voxels.size or (marked and rule.closed):
+            return _refuse_device(device, rule, runs)
+        how_many = "every" if marked else "no"
+        return NoSurfaceError(f"no surface of {rule.describe()}: {how_many} voxel lies within, {runs}")
     if low < rule.lowest_inside <= high:
-        return DeviceError(
-            f"{device.label} found no surface at {rule.iso_value:g} HU although the volume runs from {low:g} to"
-            f" {high:g} HU: it computes wrongly, see `clrecon selftest` and try another device"
-        )
+        return _refuse_device(device, rule, runs)
     where = "above" if rule.lowest_inside > high else "at or below the lowest of"
-    return NoSurfaceError(
-        f"no surface at {rule.iso_value:g} HU: the volume runs from {low:g} to {high:g} HU,"
-        f" the iso value lies {where} that range"
+    return NoSurfaceError(f"no surface at {rule.describe()}: {runs}, the iso value lies {where} that range")
+
+
+def _refuse_device(device: Device, rule: IsoRule, runs: str) -> DeviceError:
+    return DeviceError(
+        f"{device.label} found no surface at {rule.describe()} although {runs}: it computes wrongly,"
+        " see `clrecon selftest` and try another device"
     )
 
 
@@ -62,6 +70,19 @@ def voxel_level(device: Device, volume: Volume, rule: IsoRule) -> Any:
     if rule.lowest_inside > limits.max:
         raise _refuse_level(device, volume, rule)
     return dtype.type(max(rule.lowest_inside, limits.min))
+
+
+def _voxel_levels(device: Device, volume: Volume, rule: IsoRule) -> tuple[Any, ...]:
+    """The same and, of a range, the highest inside value."""
+    level, highest, dtype = voxel_level(device, volume, rule), rule.highest_inside, volume.voxels.dtype
+    if highest is None:
+        return (level,)
+    if dtype.kind == "f":
+        return level, np.float32(highest)
+    limits = np.iinfo(dtype)
+    if highest < max(rule.lowest_inside, limits.min):
+        raise _refuse_level(device, volume, rule)
+    return level, dtype.type(min(highest, limits.max))
 
 
 def _join(parts: list[Part]) -> Part:
@@ -160,24 +181,26 @@ class SurfaceExtractor:
 
     def extract(
         self,
-        iso_value: float,
+        iso_value: Level,
         *,
         closed: bool = True,
         topology: str = "separated",
+        below: bool = False,
         progress: Progress | None = None,
     ) -> Mesh:
-        """Extract the surface at one iso value, see `extract_isosurface`."""
+        """Extract the surface at one iso value, or of one range, see `extract_isosurface`."""
         stopwatch = Stopwatch()
-        grid = SampleGrid(self.volume, choose_iso_rule(self.volume, iso_value, closed, topology, values=self._values))
+        rule = choose_iso_rule(self.volume, iso_value, closed, topology, below=below, values=self._values)
+        grid = SampleGrid(self.volume, rule)
         if topology == "trilinear":
             check_row(self.volume)
         if min(grid.shape) < 2:
             raise NoSurfaceError(f"an open volume of {grid.shape} voxels has no cells: leave it closed")
-        run = _Run(self, grid, stopwatch, voxel_level(self.device, self.volume, grid.rule), self._placement(grid))
+        run = _Run(self, grid, stopwatch, _voxel_levels(self.device, self.volume, rule), self._placement(grid))
         if progress is not None:
             progress("build", 0, 1)
         with stopwatch.timed("build"):
-            prepare_isosurface(self.device, self.volume.voxels.dtype, topology, self.volume.uneven)
+            prepare_isosurface(self.device, self.volume.voxels.dtype, topology, self.volume.uneven, rule.inside)
         if progress is not None:
             progress("build", 1, 1)
         self._extractions += 1
@@ -207,12 +230,13 @@ class SurfaceExtractor:
             self._resident_d = upload(self.device, self.volume.voxels)
         return self._resident_d
 
-    def _compare_bricks(self, slab: Slab, level: Any, stopwatch: Stopwatch) -> BrickStates | None:
-        """How the bricks of a resident volume compare with `level`; None before it pays to measure them.
+    def _compare_bricks(self, slab: Slab, levels: tuple[Any, ...], stopwatch: Stopwatch) -> BrickStates | None:
+        """How the bricks of a resident volume compare with the only level; None before it pays to measure them.
 
-        Measuring takes as long as the first pass over the volume, so a single extraction does without.
+        Measuring takes as long as the first pass over the volume, so a single extraction does without.  So do ranges
+        and what lies below a level: all voxels are read for them.
         """
-        if not slab.is_whole or self._extractions < 2:
+        if not slab.is_whole or self._extractions < 2 or slab.grid.rule.inside != "above":
             return None
         if self._bricks is None:
             volume = self.volume
@@ -220,7 +244,7 @@ class SurfaceExtractor:
                 self.device, self._resident_d, volume.shape_ijk, volume.voxels.dtype, stopwatch=stopwatch
             )
         ni, border = self.volume.shape_ijk[0], slab.grid.rule.border
-        return compare_bricks(self.device, self._bricks, level, ni, border, stopwatch=stopwatch)
+        return compare_bricks(self.device, self._bricks, levels[0], ni, border, stopwatch=stopwatch)
 
     def _use_smaller_slabs(self, rule: IsoRule, slices: int) -> None:
         """Remember that slabs of more slices do not go through."""
@@ -232,13 +256,18 @@ class _Run:
     """One extraction: from slab to slab, with fewer slices a slab when the device has no room for more."""
 
     def __init__(
-        self, extractor: SurfaceExtractor, grid: SampleGrid, stopwatch: Stopwatch, level: Any, placement: Placement
+        self,
+        extractor: SurfaceExtractor,
+        grid: SampleGrid,
+        stopwatch: Stopwatch,
+        levels: tuple[Any, ...],
+        placement: Placement,
     ):
         self.extractor = extractor
         self.device = extractor.device
         self.grid = grid
         self.stopwatch = stopwatch
-        self.level = level
+        self.levels = levels
         self.placement = placement
         self.slabs = 0
         self.largest = {"volume": 0, "scratch": 0, "output": 0}
@@ -277,12 +306,13 @@ class _Run:
 
     def _one_slab(self, slab: Slab, first_vertex: int) -> Part:
         device, stopwatch = self.device, self.stopwatch
-        program = prepare_isosurface(device, self.grid.volume.voxels.dtype, uneven=self.grid.volume.uneven)
+        volume, inside = self.grid.volume, self.grid.rule.inside
+        program = prepare_isosurface(device, volume.voxels.dtype, uneven=volume.uneven, inside=inside)
         with stopwatch.timed("upload"):
             voxels_d = self.extractor._upload(slab)
         with stopwatch.running(device):
-            bricks = self.extractor._compare_bricks(slab, self.level, stopwatch)
-            classified = marching_cubes.classify(device, slab, voxels_d, self.level, stopwatch, bricks)
+            bricks = self.extractor._compare_bricks(slab, self.levels, stopwatch)
+            classified = marching_cubes.classify(device, slab, voxels_d, self.levels, stopwatch, bricks)
             counted = marching_cubes.count(device, slab, program, classified, stopwatch, voxels_d)
         self._check_output(slab, counted)
         part = marching_cubes.emit(
@@ -308,8 +338,7 @@ class _Run:
         """The report of a mesh: how it was made, free of patient data."""
         rule = self.grid.rule
         return {
-            "iso_value_hu": rule.iso_value,
-            "iso_level_hu": rule.iso_level,
+            **rule.as_report(),
             "closed_at_border": rule.closed,
             "topology": rule.topology,
             "outside_hu": rule.outside if rule.closed else None,
@@ -326,11 +355,15 @@ class _Run:
 
 
 def prepare_isosurface(
-    device: Device, dtype: DTypeLike = np.int16, topology: str = "separated", uneven: bool = False
+    device: Device,
+    dtype: DTypeLike = np.int16,
+    topology: str = "separated",
+    uneven: bool = False,
+    inside: str = "above",
 ) -> Program:
     """Build the kernels for volumes of `dtype`, so that a later `extract_isosurface` with `topology` need not wait.
 
-    With `uneven` those for volumes whose slices no affine places.
+    With `uneven` those for volumes whose slices no affine places; `inside` as `IsoRule.inside`.
 
     Raises
     ------
@@ -339,16 +372,17 @@ def prepare_isosurface(
     """
     if topology == "trilinear":
         prepare_trilinear(device, dtype)
-    return marching_cubes.prepare_marching_cubes(device, dtype, uneven=uneven)
+    return marching_cubes.prepare_marching_cubes(device, dtype, uneven=uneven, inside=inside)
 
 
 def extract_isosurface(
     volume: Volume,
-    iso_value: float,
+    iso_value: Level,
     device: Device | str | int | None = None,
     *,
     closed: bool = True,
     topology: str = "separated",
+    below: bool = False,
     memory: int | None = None,
     progress: Progress | None = None,
 ) -> Mesh:
@@ -368,8 +402,11 @@ def extract_isosurface(
     ----------
     volume : Volume
         Its voxels may be a memory-mapped file larger than the memory of the computer.
-    iso_value : float
-        HU.
+    iso_value : float or (float, float)
+        HU; or the two ends of a range.  Inside of a range are the voxels from its lower to its upper end, both
+        included; the surface lies where the values cross the end that they cross: at 100 to 300 and integer voxels
+        at 99.5 and at 300.5, as those at the iso values 100 and 301 do.  What lies between two neighbouring voxels
+        below and above the range is no voxel of it, and has no surface.
     device : Device, str or int, optional
         See `clrecon.device`; None is the best of the machine.
     closed : bool
@@ -380,6 +417,10 @@ def extract_isosurface(
         Where the corners of a cell do not say which of them are joined: "separated" keeps inside voxels apart that
         only meet across a face; "trilinear" joins what the trilinear interpolation of the voxels joins, on faces
         and inside cells, so that the surface has the components and tunnels of that field.  Few cells differ.
+        "trilinear" knows no range.
+    below : bool
+        Enclose what lies below the iso value: the same vertices and triangles, turned round.  Beyond the border the
+        field then lies as far above the level as it would lie below it otherwise, so that the surface is closed.
     memory : int, optional
         Bytes that may be taken on the device, see `SurfaceExtractor`; None is all that it has.
     progress : callable, optional
@@ -389,9 +430,10 @@ def extract_isosurface(
     Returns
     -------
     Mesh
-        Triangles are counter-clockwise and normals point as seen from lower values; `Mesh.report` holds the iso
-        value, the affine, the certificate (``volume.report``), the device, the number of slabs, ``device_bytes``
-        {volume, scratch, output} of the largest, and the seconds {upload, build, kernels, download}.
+        Triangles are counter-clockwise and normals point as seen from outside: from lower values, with `below` from
+        higher ones; `Mesh.report` holds the iso value or the range, the affine, the certificate (``volume.report``),
+        the device, the number of slabs, ``device_bytes`` {volume, scratch, output} of the largest, and the seconds
+        {upload, build, kernels, download}.
 
     Raises
     ------
@@ -410,24 +452,25 @@ def extract_isosurface(
     1995 and Grosso 2016.
     """
     with SurfaceExtractor(volume, device, memory=memory) as extractor:
-        return extractor.extract(iso_value, closed=closed, topology=topology, progress=progress)
+        return extractor.extract(iso_value, closed=closed, topology=topology, below=below, progress=progress)
 
 
 def extract_isosurfaces(
     volume: Volume,
-    iso_values: Sequence[float],
+    iso_values: Sequence[Level],
     device: Device | str | int | None = None,
     *,
     closed: bool = True,
     topology: str = "separated",
+    below: bool = False,
     memory: int | None = None,
     progress: Progress | None = None,
 ) -> list[Mesh]:
-    """Extract the surfaces of a volume at several iso values, which is uploaded once.
+    """Extract the surfaces of a volume at several iso values or of several ranges; the volume is uploaded once.
 
     Parameters
     ----------
-    iso_values : sequence of float
+    iso_values : sequence of float or (float, float)
         HU, at least one.
 
     Returns
@@ -439,6 +482,6 @@ def extract_isosurfaces(
         raise UsageError("no iso value is given")
     with SurfaceExtractor(volume, device, memory=memory) as extractor:
         return [
-            extractor.extract(iso_value, closed=closed, topology=topology, progress=progress)
+            extractor.extract(iso_value, closed=closed, topology=topology, below=below, progress=progress)
             for iso_value in iso_values
         ]

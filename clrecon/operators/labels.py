@@ -201,8 +201,7 @@ class _Run:
         """What the reports of all labels have in common."""
         rule = self.rule
         return {
-            "iso_value_hu": rule.iso_value,
-            "iso_level_hu": rule.iso_level,
+            **rule.as_report(),
             "closed_at_border": rule.closed,
             "outside_hu": rule.outside if rule.closed else None,
             "affine_ijk_to_lps_mm": self.volume.affine.tolist(),

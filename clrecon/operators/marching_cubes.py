@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -9,7 +10,7 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from clrecon.errors import DeviceError, DeviceMemoryError
-from clrecon.geometry import Volume, is_left_handed
+from clrecon.geometry import Volume
 from clrecon.geometry.field import layer_margins, layer_normal_matrices, slice_normal_matrices, vertex_margin
 from clrecon.geometry.precision import find_vertex_origin
 from clrecon.kernels import Program, Stopwatch, allocate, download, empty_output, launch, load_program, upload
@@ -65,11 +66,11 @@ class Counted:
 
 
 def prepare_marching_cubes(
-    device: Device, dtype: DTypeLike, labels: DTypeLike | None = None, uneven: bool = False
+    device: Device, dtype: DTypeLike, labels: DTypeLike | None = None, uneven: bool = False, inside: str = "above"
 ) -> Program:
     """Build the kernels for volumes of `dtype`; with `labels`, their type, those whose emit_vertices takes labels.
 
-    With `uneven` those for volumes whose slices no affine places.
+    With `uneven` those for volumes whose slices no affine places; `inside` as `IsoRule.inside`.
 
     Raises
     ------
@@ -78,8 +79,10 @@ def prepare_marching_cubes(
     """
     prepare_scan(device)
     variants = {**voxel_variants(dtype), **device.kernel_variants}
+    if inside == "between":
+        variants["RANGE"] = "1"
     if labels is None:
-        _load_classify(device, dtype)
+        _load_classify(device, dtype, inside)
     else:
         variants.update(LABELS="1", **label_variants(labels))
     if uneven:
@@ -87,8 +90,10 @@ def prepare_marching_cubes(
     return load_program(device, "isosurface/marching_cubes.cl", variants)
 
 
-def _load_classify(device: Device, dtype: DTypeLike) -> Program:
-    return load_program(device, "isosurface/classify.cl", {**voxel_variants(dtype), **device.kernel_variants})
+def _load_classify(device: Device, dtype: DTypeLike, inside: str = "above") -> Program:
+    own = {"above": {}, "below": {"BORDER_INSIDE": "1"}, "between": {"RANGE": "1"}}[inside]
+    variants = {**voxel_variants(dtype), **device.kernel_variants, **own}
+    return load_program(device, "isosurface/classify.cl", variants)
 
 
 def _pad4(rows: NDArray[np.float64]) -> NDArray[np.float32]:
@@ -159,35 +164,35 @@ def classify(
     device: Device,
     slab: Slab,
     voxels_d: Any,
-    level: Any,
+    levels: Sequence[Any],
     stopwatch: Stopwatch,
     bricks: BrickStates | None = None,
 ) -> Classified:
-    """Pass 1: which samples of the slab are inside.
+    """Pass 1: which samples of the slab are inside; of a rule that encloses what is below, those that are not.
 
     Parameters
     ----------
     voxels_d : buffer
         The slices ``slab.voxel_slices`` of the volume.
-    level : scalar of the voxels' type
-        Lowest inside value.
+    levels : sequence of scalars of the voxels' type
+        Lowest inside value and, of a range, the highest.
     bricks : BrickStates, optional
-        How the bricks of the volume compare with `level`, where the slab is all of it.
+        How the bricks of the volume compare with the only level, where the slab is all of it.
     """
-    program = _load_classify(device, slab.grid.volume.voxels.dtype)
+    program = _load_classify(device, slab.grid.volume.voxels.dtype, slab.grid.rule.inside)
     mask_d = allocate(device, 4 * slab.mask_rows * slab.grid.words)
     row_extents_d = allocate(device, 4 * slab.mask_rows)
     if bricks is not None:
         shape, border = slab.grid.volume.shape_ijk, slab.grid.rule.border
         launch(
             device, program["classify_bricks"], slab.mask_rows,
-            bricks.states_d, bricks.extents_d, voxels_d, mask_d, row_extents_d, level,
+            bricks.states_d, bricks.extents_d, voxels_d, mask_d, row_extents_d, *levels,
             *(np.int32(n) for n in (*shape, border, slab.grid.words)), stopwatch=stopwatch,
         )  # fmt: skip
         return Classified(mask_d, row_extents_d)
     launch(
         device, program["classify_samples"], slab.mask_rows,
-        voxels_d, mask_d, row_extents_d, level, *volume_scalars(slab), np.uint32(slab.mask_slices),
+        voxels_d, mask_d, row_extents_d, *levels, *volume_scalars(slab), np.uint32(slab.mask_slices),
         np.int32(slab.grid.words), stopwatch=stopwatch,
     )  # fmt: skip
     return Classified(mask_d, row_extents_d)
@@ -291,6 +296,7 @@ def emit(
     triangles, triangles_d = empty_output(device, (counted.triangles, 3), np.uint32)
     active = counted.active_words
     packing = (np.uint32(grid.words), np.uint32(grid.row_shift), np.uint32(active))
+    upper = () if rule.upper_level is None else (np.float32(rule.upper_level), np.float32(rule.highest_inside))
     items = -(-active // int(device.kernel_variants["WORDS_PER_ITEM"]))
     value = np.float32 if volume.voxels.dtype.kind == "f" else np.int32
     gi, gj, _ = grid.shape
@@ -301,7 +307,7 @@ def emit(
                 voxels_d, classified.mask_d, counted.active_words_d, counted.row_offsets_d, counted.word_vertices_d,
                 frames_d, steps_d, positions_d, normals_d,
                 np.float32(rule.iso_level), value(rule.outside), np.float32(rule.value_scale), placement.margin,
-                *volume_scalars(slab), np.uint32(slab.mask_slices), *packing, *label_arguments,
+                *volume_scalars(slab), np.uint32(slab.mask_slices), *packing, *label_arguments, *upper,
                 stopwatch=stopwatch,
             )  # fmt: skip
         if counted.cells is not None:
@@ -315,10 +321,12 @@ def emit(
                 classified.mask_d, counted.active_words_d, counted.row_offsets_d, counted.word_vertices_d,
                 counted.word_triangles_d, triangles_d, np.uint32(first_vertex), np.uint32(slab.counted_rows),
                 np.uint32(gi), np.uint32(gj), np.uint32(slab.mask_slices), *packing,
-                np.int32(is_left_handed(volume.affine)),
+                np.int32(grid.winds_backwards),
                 stopwatch=stopwatch,
             )  # fmt: skip
     with stopwatch.timed("download"):
         for array, array_d in ((positions, positions_d), (normals, normals_d), (triangles, triangles_d)):
             download(device, array, array_d)
+    if rule.inside == "below":
+        np.negative(normals, out=normals)
     return positions, normals, triangles

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 from clrecon.errors import DeviceError
-from clrecon.geometry import Volume
+from clrecon.geometry import Volume, is_left_handed
 from clrecon.geometry.field import IsoRule
 from clrecon.opencl import Device, describe_shortage, memory_limits
 
@@ -47,6 +47,11 @@ class SampleGrid:
     def flag_words(self) -> int:
         """32-bit words a row of one flag a word."""
         return 1 << (self.row_shift - 5)
+
+    @property
+    def winds_backwards(self) -> bool:
+        """The winding of the case table is turned: in a left-handed volume, or to enclose what the mask leaves out."""
+        return is_left_handed(self.volume.affine) != (self.rule.inside == "below")
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import DTypeLike
 
 from clrecon.errors import UsageError
-from clrecon.geometry import Volume, is_left_handed
+from clrecon.geometry import Volume
 from clrecon.kernels import Program, Stopwatch, allocate, launch, load_program
 from clrecon.opencl import Device
 from clrecon.operators.compaction import exclusive_scan
@@ -128,7 +128,7 @@ def emit_cells(
     cells: CellVertices = counted.cells
     positions_d, normals_d, triangles_d = output
     active = counted.active_words
-    mirrored = np.int32(is_left_handed(slab.grid.volume.affine))
+    mirrored = np.int32(slab.grid.winds_backwards)
     packing = (*_field_scalars(slab), np.uint32(slab.grid.row_shift), np.uint32(active))
     common = (voxels_d, mask_d, counted.active_words_d, counted.row_offsets_d)
     if counted.triangles:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from clrecon.pipeline.labels import describe_label
 from clrecon.pipeline.levels import describe_level
-from clrecon.pipeline.parts import Part
+from clrecon.pipeline.parts import Part, Surface
 from clrecon.pipeline.presets import find_preset
 from clrecon.pipeline.report import platform_name
 from clrecon.pipeline.settings import MeshSettings
@@ -39,8 +39,11 @@ def describe_part(part: Part, file: StagedFile, output: str | os.PathLike[str], 
     return {
         "name": part.name or None,
         "label": part.surface.label,
-        "iso_value_hu": part.surface.iso_value,
+        "iso_value_hu": origin.get("iso_value_hu"),
         "iso_level_hu": origin.get("iso_level_hu"),
+        "inside": origin.get("inside"),
+        "inside_hu": origin.get("inside_hu"),
+        "inside_levels_hu": origin.get("inside_levels_hu"),
         "vertices": part.mesh.vertex_count,
         "triangles": part.mesh.triangle_count,
         "closed": quality.get("closed"),
@@ -96,13 +99,14 @@ def describe_job(
         warnings += describe_rounding(part.mesh, f".{mesh['output']['format']}")
     level, level_warnings = describe_level(volume, settings, choice)
     warnings += level_warnings
-    if any(SKIN_HU[0] <= part.surface.iso_value <= SKIN_HU[1] for part in parts if part.surface.label is None):
+    if any(_shows_skin(part.surface, settings) for part in parts):
         warnings.append("a surface of the skin can show a face: treat the file as one that identifies the patient")
     of_surface = {part.surface: mesh for part, mesh in zip(parts, meshes, strict=True)}.values()
     report: dict[str, Any] = {
         "affine_ijk_to_lps_mm": volume.affine.tolist(),
         "iso_value_hu": _common(mesh["iso_value_hu"] for mesh in meshes),
         "iso_level_hu": _common(mesh["iso_level_hu"] for mesh in meshes),
+        **{name: _common(mesh[name] for mesh in meshes) for name in ("inside", "inside_hu", "inside_levels_hu")},
         "outside_hu": _common(part.mesh.report.get("outside_hu") for part in parts),
         **level,
         "preset": settings.preset_used,
@@ -143,6 +147,14 @@ def describe_job(
     if settings.preset_used is not None:
         report["preset_reason"] = find_preset(settings.preset_used).source
     return report
+
+
+def _shows_skin(surface: Surface, settings: MeshSettings) -> bool:
+    """One of its levels lies between air and fat, and the outside of the body is not left out."""
+    if surface.label is not None or (surface.below and not settings.keep_outside):
+        return False
+    levels = surface.iso_value if isinstance(surface.iso_value, tuple) else (surface.iso_value,)
+    return any(SKIN_HU[0] <= level <= SKIN_HU[1] for level in levels)
 
 
 def _largest(taken: Iterable[dict[str, int]]) -> dict[str, int]:

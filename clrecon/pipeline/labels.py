@@ -116,6 +116,8 @@ def extract_label_surfaces(
     numbers = [labels.find(label) for label in choice.wanted] or labels.numbers
     suffixes = file_suffixes({number: labels.name(number) for number in numbers})  # reports hold no other names
     for surface in surfaces:
+        if isinstance(surface.iso_value, tuple):  # refused with the settings
+            raise UsageError(f"labels take one iso value, not {surface.describe()}")
         meshes = extract_labels(
             volume, labels, surface.iso_value, device, numbers=choice.wanted or None, grow_mm=choice.grow_mm,
             closed=settings.closed, solid=choice.solid, memory=settings.memory, progress=progress,

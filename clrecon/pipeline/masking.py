@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from clrecon.pipeline.render_settings import RenderSettings
     from clrecon.pipeline.settings import MeshSettings
 
-__all__ = ["mask_volume"]
+__all__ = ["leave_outside", "mask_volume"]
 
 
 def mask_volume(volume: Volume, settings: MeshSettings | RenderSettings, progress: Progress) -> Volume:
@@ -44,6 +44,37 @@ def mask_volume(volume: Volume, settings: MeshSettings | RenderSettings, progres
         warnings.append(
             f"outside of the body is air now: {100.0 * facts['removed_share']:.3g} % of the voxels,"
             f" {facts['dense_voxels_removed']:,} of them dense (table, blankets); look whether the body is whole"
+        )
+    volume.report["warnings"] = warnings
+    return volume
+
+
+def leave_outside(volume: Volume, settings: MeshSettings, progress: Progress) -> Volume:
+    """The volume without the air round the patient, where the settings ask for what lies below an iso value.
+
+    Raises
+    ------
+    RefusedInputError
+        There is no body.
+    NoSurfaceError
+        All that lies below is outside of it.
+    """
+    if settings.below is None or settings.keep_outside:
+        return volume
+    from clrecon.geometry.outside_air import leave_outside_air
+
+    progress("mask", 0, 0)
+    warnings = list(volume.report["warnings"])
+    volume = leave_outside_air(volume, [level for level in settings.levels if not isinstance(level, tuple)])
+    facts = volume.report["outside_air"]
+    warnings.append(
+        f"air outside of the body was left out: {facts['left_out_ml']:,.0f} ml, {facts['kept_ml']:,.1f} ml within it"
+        " are kept (--keep-outside takes all)"
+    )
+    if facts["opening_mm2"] > 0.0:
+        warnings.append(
+            f"airways are open to the outside and were cut there: {facts['opening_mm2']:,.0f} mm2 of cut, a flat end of"
+            " the surface where nostrils, mouth or ears are; look at it there"
         )
     volume.report["warnings"] = warnings
     return volume

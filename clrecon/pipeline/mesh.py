@@ -11,7 +11,7 @@ from typing import Any
 from clrecon.pipeline.description import describe_job, describe_part
 from clrecon.pipeline.labels import extract_label_surfaces, judge_label_volumes, open_labels
 from clrecon.pipeline.levels import choose_level
-from clrecon.pipeline.masking import mask_volume
+from clrecon.pipeline.masking import leave_outside, mask_volume
 from clrecon.pipeline.opening import DeviceOpening, prepare_surfaces
 from clrecon.pipeline.outputs import check_kept, check_outputs, commit_all, count_leftovers, name_outputs, stage_meshes
 from clrecon.pipeline.parts import check_levels, extract_surfaces, first_names, plan_surfaces, select_parts
@@ -72,12 +72,12 @@ def make_mesh(
     progress = progress or ignore_progress
     measure = report_path is not None if measure is None else measure
     watch = Stopwatch()
-    surfaces = plan_surfaces(settings.levels)
+    surfaces = plan_surfaces(settings.levels, below=settings.below is not None)
     check_outputs(output, report_path, first_names(surfaces, settings.split))
     check_kept(report_path, source, None if settings.labels is None else settings.labels.path)
 
     progress("device", 0, 0)
-    prepare = partial(prepare_surfaces, components=settings.selects, topology=settings.topology)
+    prepare = partial(prepare_surfaces, components=settings.selects, topology=settings.topology, inside=settings.inside)
     with DeviceOpening(settings.device, prepare) as opening:
         from clrecon.reading import read_volume
 
@@ -105,6 +105,7 @@ def make_mesh(
     watch.lap("choose")
 
     check_levels(volume, surfaces)
+    volume = leave_outside(volume, settings, progress)
     if labels is not None and settings.labels is not None:
         surfaces, extracted = extract_label_surfaces(
             volume, surfaces, labels, settings.labels, device, settings, progress

@@ -23,12 +23,12 @@ def _prepare(chosen: Future[Device], prepare: Callable[[Device], None]) -> None:
     prepare(chosen.result())
 
 
-def prepare_surfaces(device: Device, components: bool, topology: str) -> None:
+def prepare_surfaces(device: Device, components: bool, topology: str, inside: str = "above") -> None:
     """Build the kernels that find surfaces of this topology and, where asked for, components."""
     from clrecon.operators.components import prepare_components
     from clrecon.operators.isosurface import prepare_isosurface
 
-    prepare_isosurface(device, topology=topology)
+    prepare_isosurface(device, topology=topology, inside=inside)
     if components:
         prepare_components(device)
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from clrecon.errors import DeviceMemoryError, NoSurfaceError, UsageError
 from clrecon.pipeline.outputs import MOST_FILES
 from clrecon.pipeline.progress import Progress
-from clrecon.pipeline.settings import MeshSettings
+from clrecon.pipeline.settings import MeshSettings, name_level
 
 if TYPE_CHECKING:
     from clrecon.geometry import Volume
@@ -27,15 +27,22 @@ class Surface:
     ----------
     name : str
         What tells its files from those of the other surfaces, such as ``"200hu"``; empty where it is the only one.
-    iso_value : float
-        HU.
+    iso_value : float or (float, float)
+        HU; or the two ends of a range.
+    below : bool
+        It encloses what lies below the iso value.
     label : str or int or None
         Of the label map that picks its cells, where there is one.
     """
 
     name: str
-    iso_value: float
+    iso_value: float | tuple[float, ...]
     label: str | int | None = None
+    below: bool = False
+
+    def describe(self) -> str:
+        """What it encloses: ``200 HU``, ``100:300 HU``, ``below -400 HU``."""
+        return f"{'below ' if self.below else ''}{name_level(self.iso_value)} HU"
 
 
 @dataclass
@@ -62,11 +69,17 @@ class Part:
     facts: dict[str, Any] = field(default_factory=dict)
 
 
-def plan_surfaces(levels: Sequence[float]) -> list[Surface]:
-    """One surface an iso value (HU), in their order."""
+def plan_surfaces(levels: Sequence[float | tuple[float, ...]], below: bool = False) -> list[Surface]:
+    """One surface an iso value or range (HU), in their order."""
     if len(levels) == 1:
-        return [Surface("", levels[0])]
-    return [Surface(f"{_digits(level)}hu", level) for level in levels]
+        return [Surface("", levels[0], below=below)]
+    return [Surface(_name_surface(level, below), level, below=below) for level in levels]
+
+
+def _name_surface(level: float | tuple[float, ...], below: bool) -> str:
+    """``200hu``, ``100to300hu``, ``below-400hu``: what tells the files of surfaces apart."""
+    numbers = level if isinstance(level, tuple) else (level,)
+    return f"{'below' if below else ''}{'to'.join(map(_digits, numbers))}hu"
 
 
 def _digits(value: float) -> str:
@@ -76,7 +89,7 @@ def _digits(value: float) -> str:
 
 
 def check_levels(volume: Volume, surfaces: Sequence[Surface]) -> None:
-    """Refuse iso values that have every voxel inside.
+    """Refuse what has every voxel inside.
 
     Raises
     ------
@@ -85,9 +98,14 @@ def check_levels(volume: Volume, surfaces: Sequence[Surface]) -> None:
     """
     low, high = volume.report["hu_range"]
     for surface in surfaces:
-        if surface.iso_value <= low:  # the surface would be the box of the scan
+        level = surface.iso_value
+        if isinstance(level, tuple):
+            all_inside = level[0] <= low and level[1] >= high
+        else:
+            all_inside = level > high if surface.below else level <= low
+        if all_inside:  # the surface would be the box of the scan
             raise NoSurfaceError(
-                f"no surface at {surface.iso_value:g} HU: every voxel is inside,"
+                f"no surface at {surface.describe()}: every voxel is inside,"
                 f" the volume runs from {low:g} to {high:g} HU"
             )
 
@@ -111,6 +129,7 @@ def extract_surfaces(
         device,
         closed=settings.closed,
         topology=settings.topology,
+        below=settings.below is not None,
         memory=settings.memory,
         progress=progress,
     )
@@ -144,7 +163,7 @@ def select_parts(surface: Surface, mesh: Mesh, settings: MeshSettings, device: D
             return [Part(surface, surface.name, select_components(mesh, *limits, seeds=seeds, labelled=labelled))]
         pieces = split_components(mesh, *limits, seeds=seeds, labelled=labelled, most=MOST_FILES)
     except (NoSurfaceError, UsageError) as error:
-        raise type(error)(f"at {surface.iso_value:g} HU: {error}") from error
+        raise type(error)(f"at {surface.describe()}: {error}") from error
     return [Part(surface, _name_piece(surface, place), piece) for place, piece in enumerate(pieces, start=1)]
 
 

@@ -11,7 +11,12 @@ from clrecon.pipeline.checks import check_field_of_view, check_memory
 from clrecon.pipeline.labels import LabelChoice
 from clrecon.pipeline.presets import DEFAULT_PRESET, find_preset
 
-__all__ = ["MeshSettings"]
+__all__ = ["MeshSettings", "name_level"]
+
+
+def name_level(level: float | Sequence[float]) -> str:
+    """An iso value or a range as it is written: ``200``, ``100:300``."""
+    return ":".join(f"{value:g}" for value in level) if isinstance(level, Sequence) else f"{level:g}"
 
 
 @dataclass(frozen=True)
@@ -20,8 +25,13 @@ class MeshSettings:
 
     Parameters
     ----------
-    iso_value : float or sequence of float, optional
-        HU; inside is ``>= iso_value``.  Several make one mesh each.
+    iso_value : float or sequence of float or (low, high), optional
+        HU; inside is ``>= iso_value``.  Several make one mesh each.  A pair in the sequence is a range, both ends
+        included: ``((100, 300),)``.
+    below : float or sequence of float, optional
+        In place of an iso value: inside is ``< below``, HU.  The air round the patient is left out.
+    keep_outside : bool
+        With `below`: leave the air round the patient in.
     preset : str, optional
         Name of an iso value, see `clrecon.pipeline.presets`.  Neither of both means the preset "bone".
     half_way : "auto" or (bone, tissue), optional
@@ -73,7 +83,9 @@ class MeshSettings:
         A value is impossible, or two exclude each other.
     """
 
-    iso_value: float | Sequence[float] | None = None
+    iso_value: float | Sequence[float | Sequence[float]] | None = None
+    below: float | Sequence[float] | None = None
+    keep_outside: bool = False
     preset: str | None = None
     half_way: str | Sequence[float] | None = None
     series: str | int | None = None
@@ -100,6 +112,7 @@ class MeshSettings:
     def __post_init__(self) -> None:
         if self.iso_value is not None and self.preset is not None:
             raise UsageError("give either an iso value in HU or a preset, not both")
+        self._check_below()
         self._check_half_way()
         if self.preset is not None:
             find_preset(self.preset)
@@ -119,6 +132,8 @@ class MeshSettings:
 
         frame_from_lps(self.space)
         check_topology(self.topology)
+        if self.labels is not None and self.below is not None:
+            raise UsageError("labels take what lies from one iso value on, not below it")
         if self.labels is not None and self.topology != "separated":
             raise UsageError(f"the topology {self.topology} follows HU: leave it out with labels, which pick the cells")
 
@@ -137,16 +152,41 @@ class MeshSettings:
             raise UsageError(f"half way needs two numbers of HU, bone and tissue, not {tuple(self.half_way)}")
         half_iso_value(*self.half_way)
 
+    def _check_below(self) -> None:
+        if self.below is None:
+            if self.keep_outside:
+                raise UsageError("what is outside of the patient is only left out of what lies below an iso value")
+            return
+        if self.iso_value is not None or self.preset is not None or self.half_way is not None:
+            raise UsageError("give either an iso value or what to stay below, not both")
+
     def _check_levels(self) -> None:
         if isinstance(self.half_way, str):
             return
         if not self.levels:
             raise UsageError("give at least one iso value in HU")
-        for place, value in enumerate(self.levels):
-            if not math.isfinite(value):
-                raise UsageError(f"the iso value must be a finite number of HU, not {value}")
-            if value in self.levels[:place]:
-                raise UsageError(f"the iso value {value:g} HU is given twice")
+        for place, level in enumerate(self.levels):
+            for value in level if isinstance(level, tuple) else (level,):
+                if not math.isfinite(value):
+                    raise UsageError(f"the iso value must be a finite number of HU, not {value}")
+            if level in self.levels[:place]:
+                raise UsageError(f"the iso value {name_level(level)} HU is given twice")
+            self._check_range(level)
+
+    def _check_range(self, level: float | tuple[float, ...]) -> None:
+        if not isinstance(level, tuple):
+            return
+        name = name_level(level)
+        if len(level) != 2:
+            raise UsageError(f"a range of HU has two ends, {name} has {len(level)}")
+        if level[0] >= level[1]:
+            raise UsageError(f"the range {name} HU holds nothing: give its lower end first, then a higher one")
+        if self.below is not None:
+            raise UsageError(f"below takes iso values, not the range {name} HU")
+        if self.labels is not None:
+            raise UsageError(f"labels take one iso value, not the range {name} HU")
+        if self.topology == "trilinear":
+            raise UsageError(f"the topology trilinear follows one level, the range {name} HU has two: leave it out")
 
     def _check_refinement(self) -> None:
         if self.smooth is not None and not 1 <= self.smooth <= 1000:
@@ -161,8 +201,10 @@ class MeshSettings:
             raise UsageError(f"the largest deviation is a length in mm above 0, not {self.max_deviation_mm:g}")
 
     @property
-    def levels(self) -> tuple[float, ...]:
-        """The iso values in HU that are used, one a surface; NaN for the one that the scan has yet to give."""
+    def levels(self) -> tuple[float | tuple[float, ...], ...]:
+        """The iso values or ranges in HU that are used, one a surface; NaN for what the scan has yet to give."""
+        if self.below is not None:
+            return tuple(self.below) if isinstance(self.below, Sequence) else (self.below,)
         if isinstance(self.half_way, str):
             return (math.nan,)
         if self.half_way is not None:
@@ -172,8 +214,15 @@ class MeshSettings:
         if self.iso_value is None:
             return (find_preset(self.preset or DEFAULT_PRESET).iso_value,)
         if isinstance(self.iso_value, Sequence):
-            return tuple(self.iso_value)
+            return tuple(tuple(level) if isinstance(level, Sequence) else level for level in self.iso_value)
         return (self.iso_value,)
+
+    @property
+    def inside(self) -> str:
+        """What the surfaces enclose, see `clrecon.geometry.field.IsoRule`; "between" where one of them is a range."""
+        if self.below is not None:
+            return "below"
+        return "between" if any(isinstance(level, tuple) for level in self.levels) else "above"
 
     @property
     def refines(self) -> bool:
@@ -183,7 +232,7 @@ class MeshSettings:
     @property
     def preset_used(self) -> str | None:
         """Name of the preset behind `levels`, None where the value was given or is half way."""
-        named = self.iso_value is not None or self.half_way is not None
+        named = any(given is not None for given in (self.iso_value, self.below, self.half_way))
         return None if named else (self.preset or DEFAULT_PRESET)
 
     @property

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from clrecon.geometry import Volume, is_left_handed
 from clrecon.geometry.field import (
     IsoRule,
+    Level,
     choose_iso_rule,
     layer_margins,
     layer_normal_matrices,
@@ -119,31 +120,37 @@ def _find_trilinear_triangles(
 
 
 def extract_isosurface(
-    volume: Volume, iso_value: float, *, closed: bool = True, topology: str = "separated"
+    volume: Volume, iso_value: Level, *, closed: bool = True, topology: str = "separated", below: bool = False
 ) -> Surface:
     """Extract the iso surface of a small volume.
 
     Parameters
     ----------
     volume : Volume
-    iso_value : float
-        HU.
+    iso_value : float or (float, float)
+        HU, or the two ends of a range.
     closed : bool
         Surround the volume with outside.
     topology : {"separated", "trilinear"}
         Keep inside corners apart that only meet across a face or cell, or do as the trilinear field does.
+    below : bool
+        Inside is what lies below the iso value.
 
     Returns
     -------
     vertices : ndarray, shape (n, 3), float64, LPS mm
-    normals : ndarray, shape (n, 3), float64, unit, towards lower values
-    triangles : ndarray, shape (m, 3), uint32, counter-clockwise as seen from lower values
+    normals : ndarray, shape (n, 3), float64, unit, towards what is outside
+    triangles : ndarray, shape (m, 3), uint32, counter-clockwise as seen from outside
     """
-    rule = choose_iso_rule(volume, iso_value, closed, topology)
-    inside = sample_grid(volume, rule, rule.border) >= rule.lowest_inside
+    rule = choose_iso_rule(volume, iso_value, closed, topology, below=below)
+    inside = rule.mark_inside(sample_grid(volume, rule, rule.border))
     if rule.closed:
         inside[[0, -1]] = inside[:, [0, -1]] = inside[:, :, [0, -1]] = False
-    return extract_inside(volume, rule, inside)
+    if not below:
+        return extract_inside(volume, rule, inside)
+    # The surface round the others, turned: so it is the same one as that of the iso value, ambiguous cells too.
+    positions, normals, triangles = extract_inside(volume, rule, ~inside)
+    return positions, -normals, triangles[:, ::-1].copy()
 
 
 def extract_inside(
@@ -164,7 +171,7 @@ def extract_inside(
     Returns
     -------
     vertices, normals, triangles
-        As `extract_isosurface`.
+        As `extract_isosurface`; normals point down, and up where the surface ends a range at its upper end.
     """
     field = sample_grid(volume, rule, rule.border)
     gradients = _gradients(sample_grid(volume, rule, rule.border + 1), rule)
@@ -187,7 +194,11 @@ def extract_inside(
     if hu_places is not None:
         half_way = ~(hu_places[k, j, i] & hu_places[k1, j1, i1])
     change = np.where(half_way, 1.0, next_value - value)
-    t = np.where(half_way, 0.5, np.clip((rule.iso_level - value) / change, margin, 1.0 - margin))[:, None]
+    above = np.zeros(len(owner), dtype=bool)
+    if rule.highest_inside is not None:  # the outside end lies above the range
+        above = np.maximum(value, next_value) > rule.highest_inside
+    level = np.where(above, rule.upper_level or 0.0, rule.iso_level)
+    t = np.where(half_way, 0.5, np.clip((level - value) / change, margin, 1.0 - margin))[:, None]
 
     origins = volume.slice_origins(rule.border)
     here = np.stack([i, j], axis=1) - rule.border
@@ -198,6 +209,7 @@ def extract_inside(
         around = np.pad(inside.astype(np.float64), 1, mode="constant" if rule.closed else "edge")
         gradients = _gradients(around, rule)
         slope[half_way], next_slope[half_way] = gradients[k, j, i][half_way], gradients[k1, j1, i1][half_way]
+    slope[above], next_slope[above] = -slope[above], -next_slope[above]  # from here on they point inwards
     flat = ~(slope + next_slope).any(axis=1)
     rise = np.where(inside[k1, j1, i1], 1.0, -1.0)
     slope[flat], next_slope[flat] = (rise[:, None] * step)[flat], 0.0

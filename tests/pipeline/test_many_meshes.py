@@ -211,3 +211,46 @@ def test_surfaces_are_those_of_each_iso_value_alone(device: Any) -> None:
         assert mesh.report["iso_value_hu"] == level
         np.testing.assert_array_equal(mesh.vertices, alone.vertices)
         np.testing.assert_array_equal(mesh.triangles, alone.triangles)
+
+
+@pytest.mark.usefixtures("boxes")
+def test_ranges_and_iso_values_are_named_by_their_ends(device: Any, tmp_path: Path) -> None:
+    report = run(tmp_path, device, iso_value=(200.0, (100.0, 300.0), (-50.5, 500.0)), strict=True)
+    assert [mesh["name"] for mesh in report["meshes"]] == ["200hu", "100to300hu", "-50.5to500hu"]
+    assert [mesh["inside"] for mesh in report["meshes"]] == ["above", "between", "between"]
+    assert [mesh["iso_value_hu"] for mesh in report["meshes"]] == [200.0, None, None]
+    assert [mesh["inside_hu"] for mesh in report["meshes"]] == [[200.0, None], [100.0, 300.0], [-50.5, 500.0]]
+    assert [mesh["components"] for mesh in report["meshes"]] == [3, 1, 1]
+    assert report["meshes"][1]["inside_levels_hu"] == [99.5, 300.5]
+    assert (report["inside"], report["inside_hu"], report["preset"]) == (None, None, None)
+    assert all(gate["ok"] is not False for gate in report["gates"])
+    assert "INSIDE=100 to 300 HU" in (tmp_path / "bone_100to300hu.ply").read_bytes()[:2000].decode("latin-1")
+
+
+@pytest.mark.usefixtures("boxes")
+def test_below_encloses_the_rest(device: Any, tmp_path: Path) -> None:
+    report = run(tmp_path, device, below=(200.0, 500.0), keep_outside=True)
+    assert [mesh["name"] for mesh in report["meshes"]] == ["below200hu", "below500hu"]
+    assert [mesh["components"] for mesh in report["meshes"]] == [4, 3]
+    box = 30 * 0.5 * 20 * 0.8 * 12 * 2.0 / 1000.0
+    bone = run(tmp_path, device, iso_value=200.0)["volume_ml"]
+    assert report["meshes"][0]["volume_ml"] == pytest.approx(box - bone, rel=0.02)
+    assert report["outside_hu"] is None
+    alone = run(tmp_path, device, below=200.0, keep_outside=True, keep_largest=1)
+    assert (alone["iso_value_hu"], alone["inside"], alone["components"]) == (200.0, "below", 1)
+    assert alone["iso_distance"]["vertices_voxel"]["max"] < 1e-3
+
+
+@pytest.mark.usefixtures("boxes")
+@pytest.mark.parametrize(
+    ("settings", "said"),
+    [
+        ({"below": 900.0}, "no surface at below 900 HU: every voxel is inside"),
+        ({"iso_value": ((-2000.0, 900.0),)}, "no surface at -2000:900 HU: every voxel is inside"),
+        ({"iso_value": ((810.0, 900.0),)}, "no surface of 810 to 900 HU: no voxel lies within"),
+    ],
+)
+def test_what_holds_all_or_nothing_is_refused(settings: Any, said: str, device: Any, tmp_path: Path) -> None:
+    with pytest.raises(NoSurfaceError, match=said):
+        run(tmp_path, device, **settings, **({"keep_outside": True} if "below" in settings else {}))
+    assert not list(tmp_path.iterdir())

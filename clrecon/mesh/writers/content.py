@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -36,6 +36,8 @@ class Content:
     iso_value_hu : float or None
     affine : ndarray, shape (4, 4), float64, or None
         Index (i, j, k) of the volume to LPS mm, whatever `space` is.
+    inside : str or None
+        What the surface encloses, where that is not what lies from the iso value on: "below -400 HU".
     certificate : tuple of str
         What is known of the volume, see `clrecon.mesh.writers.certificate`; one printable ASCII line each.
     """
@@ -48,6 +50,7 @@ class Content:
     iso_value_hu: float | None
     affine: NDArray[np.float64] | None
     certificate: tuple[str, ...] = ()
+    inside: str | None = None
 
     @property
     def is_double(self) -> bool:
@@ -65,6 +68,8 @@ class Content:
         remarks = [f"SPACE={self.space}", "UNIT=mm"]
         if self.iso_value_hu is not None:
             remarks.append(f"ISO_VALUE_HU={self.iso_value_hu:.9g}")
+        if self.inside is not None:
+            remarks.append(f"INSIDE={self.inside}")
         return remarks + [f"CERTIFICATE {line}" for line in self.certificate]
 
 
@@ -83,7 +88,15 @@ def describe_mesh(mesh: Mesh, space: str) -> Content:
         iso_value_hu=None if iso_value is None else float(iso_value),
         affine=None if affine is None else np.array(affine, dtype=np.float64).reshape(4, 4),
         certificate=certificate_lines(certificate) if isinstance(certificate, Mapping) else (),
+        inside=_describe_inside(mesh.report.get("inside_hu")),
     )
+
+
+def _describe_inside(ends: Sequence[float | None] | None) -> str | None:
+    """What lies within these ends, None where the upper one is open."""
+    if ends is None or ends[1] is None:
+        return None
+    return f"below {ends[1]:.9g} HU" if ends[0] is None else f"{ends[0]:.9g} to {ends[1]:.9g} HU"
 
 
 def refuse_file(words: str, found: object, expected: object) -> OutputError:

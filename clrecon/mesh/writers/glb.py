@@ -86,6 +86,8 @@ def _document(content: Content) -> dict[str, Any]:
     }
     if content.iso_value_hu is not None:
         extras["iso_value_hu"] = content.iso_value_hu
+    if content.inside is not None:
+        extras["inside"] = content.inside
     if content.certificate:
         extras["certificate"] = list(content.certificate)
     material = {"baseColorFactor": _BONE_COLOUR, "metallicFactor": 0.0, "roughnessFactor": 0.6}

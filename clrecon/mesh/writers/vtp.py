@@ -52,7 +52,9 @@ def _field_arrays(content: Content) -> list[Any]:
     from vtkmodules.vtkCommonCore import vtkDoubleArray, vtkStringArray
 
     arrays: list[Any] = []
-    for name, texts in (("SPACE", (content.space,)), ("UNIT", ("mm",)), ("CERTIFICATE", content.certificate)):
+    inside = () if content.inside is None else (content.inside,)
+    texts_by_name = {"SPACE": (content.space,), "UNIT": ("mm",), "INSIDE": inside, "CERTIFICATE": content.certificate}
+    for name, texts in texts_by_name.items():
         strings = vtkStringArray()
         strings.SetName(name)
         for text in texts:

@@ -1,0 +1,172 @@
+"""What below an iso value is air round the patient, and what is lung, airway, sinus or bowel gas.
+
+The body (`clrecon.geometry.body`) says what is outside: its cavities belong to it.  Where an airway is open to the
+outside, at nostrils or mouth, it is cut a little under the skin, and the area of the cut is said.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clrecon.errors import NoSurfaceError, RefusedInputError
+from clrecon.geometry.body import MARGIN_MM, TISSUE_HU, find_body, find_unmeasured
+from clrecon.geometry.volume import AIR_HU, Volume
+
+__all__ = ["leave_outside_air"]
+
+Mask = NDArray[np.bool_]
+
+SKIN_MM = 2.0
+"""Air less deep than this under the outline of the body is outside: folds of the skin, the steps of the outline."""
+DEEP_MM = 5.0
+"""Air that is joined to the outside is a cavity of the body where it reaches so far under `SKIN_MM`."""
+OPEN_MM = 12.0
+"""Slices in which an airway is open (parted lips) are closed as their neighbours are, up to this height."""
+
+
+def leave_outside_air(volume: Volume, levels: Sequence[float]) -> Volume:
+    """Lift the air round the patient above iso values, so that it is not among what lies below them.
+
+    Parameters
+    ----------
+    volume : Volume
+        A scan in HU.
+    levels : sequence of float
+        Iso values, HU.  What is denser than -300 HU is never left out.
+
+    Returns
+    -------
+    Volume
+        The same places.  Air outside has a value so far above the highest level that a surface between it and air of
+        the body lies half way.  ``report["outside_air"]`` has ``left_out_ml``, ``kept_ml`` (below the highest level),
+        ``opening_mm2`` (area in which measured air of both meets) and ``filled_hu`` (the value).
+
+    Raises
+    ------
+    RefusedInputError
+        There is no body.
+    NoSurfaceError
+        All that lies below the levels is outside.
+    """
+    level = min(max(levels), TISSUE_HU)
+    try:
+        body, step = find_body(volume)
+    except RefusedInputError as error:
+        raise RefusedInputError(f"{error}: what is outside of it is not known (--keep-outside takes all)") from None
+    body = _close_along_k(body, int(OPEN_MM / (2.0 * step[2] * volume.spacing[2])))
+    across = math.sqrt(step[0] * volume.spacing[0] * step[1] * volume.spacing[1])
+    unmeasured = find_unmeasured(volume.voxels)
+    # A lung that the circle of the reconstruction cuts reaches up to it: what was not measured takes nothing away.
+    inner = _shrink(body | unmeasured[:: step[2], :: step[1], :: step[0]], (MARGIN_MM + SKIN_MM) / across)
+    deep = _to_voxels(_shrink(body, (MARGIN_MM + SKIN_MM + DEEP_MM) / across, border=False), step, volume)
+    within = _to_voxels(inner, step, volume)
+
+    air = np.empty(volume.voxels.shape, dtype=bool)
+    for k, layer in enumerate(volume.voxels):
+        np.less(layer, level, out=air[k])
+        volume.release_slices(k, k + 1)
+    kept = _find_cavities(air, within & ~unmeasured, deep)
+    outside = air & ~kept
+    opening = _touching_mm2(kept, outside & ~unmeasured, volume)
+
+    filled = _value_above(max(levels), volume.voxels.dtype)
+    voxels = np.array(volume.voxels)
+    voxels[outside] = filled
+    left_out_ml, kept_ml = _millilitres(outside, volume), _millilitres(voxels < max(levels), volume)
+    if kept_ml == 0.0:
+        raise NoSurfaceError(
+            f"nothing below {max(levels):g} HU lies within the body: {left_out_ml:,.1f} ml are outside of it"
+            " (--keep-outside takes them)"
+        )
+    changed = volume.with_voxels(voxels)
+    changed.report["outside_air"] = {
+        "left_out_ml": round(left_out_ml, 3),
+        "kept_ml": round(kept_ml, 3),
+        "opening_mm2": round(opening, 1),
+        "filled_hu": float(filled),
+    }
+    return changed
+
+
+def _find_cavities(air: Mask, within: Mask, deep: Mask) -> Mask:
+    """Air within the outline that is either not joined to the air outside, or reaches deep."""
+    from scipy import ndimage
+
+    pieces, count = ndimage.label(air & within)
+    keep = np.zeros(count + 1, dtype=bool)
+    keep[np.unique(pieces[deep])] = True
+    joined = np.zeros(count + 1, dtype=bool)
+    outside = air & ~within
+    for low, high in _neighbours():
+        joined[np.unique(pieces[low][outside[high]])] = True
+        joined[np.unique(pieces[high][outside[low]])] = True
+    keep |= ~joined
+    keep[0] = False
+    return np.asarray(keep[pieces])
+
+
+def _touching_mm2(kept: Mask, outside: Mask, volume: Volume) -> float:
+    """Area of the faces between voxels of one and of the other."""
+    steps = volume.affine[:3, :3].T
+    areas = [float(np.linalg.norm(np.cross(steps[(axis + 1) % 3], steps[(axis + 2) % 3]))) for axis in (2, 1, 0)]
+    total = 0.0
+    for area, (low, high) in zip(areas, _neighbours(), strict=True):
+        faces = np.count_nonzero(kept[low] & outside[high]) + np.count_nonzero(outside[low] & kept[high])
+        total += area * int(faces)
+    return total
+
+
+def _millilitres(mask: Mask, volume: Volume) -> float:
+    """Volume of the voxels of a mask; a slice reaches half way to its neighbours."""
+    steps = np.gradient(volume.slice_origins(border=1), axis=0)[1:-1]
+    across = np.cross(volume.affine[:3, 0], volume.affine[:3, 1])
+    return float(np.count_nonzero(mask, axis=(1, 2)) @ np.abs(steps @ across)) / 1000.0
+
+
+def _neighbours() -> Iterator[tuple[Any, Any]]:
+    """Of the pairs of neighbours along k, j and i the lower and the upper ones."""
+    for axis in range(3):
+        low, high = [slice(None)] * 3, [slice(None)] * 3
+        low[axis], high[axis] = slice(None, -1), slice(1, None)
+        yield tuple(low), tuple(high)
+
+
+def _shrink(mask: Mask, cells: float, border: bool = True) -> Mask:
+    """Erode slice by slice; what is beyond the border of the scan erodes nothing unless `border` is False."""
+    from scipy import ndimage
+
+    for turn in range(max(1, round(cells))):
+        shape = ndimage.generate_binary_structure(2, 1 + turn % 2)[None]
+        mask = ndimage.binary_erosion(mask, shape, border_value=border)
+    return mask
+
+
+def _close_along_k(mask: Mask, reach: int) -> Mask:
+    """What is inside both above and below, at most so many slices away, is inside."""
+    from scipy.ndimage import maximum_filter1d, minimum_filter1d
+
+    size, around = 2 * reach + 1, ((reach, reach), (0, 0), (0, 0))
+    grown = maximum_filter1d(np.pad(mask, around).view(np.uint8), size, axis=0, mode="constant")
+    closed = minimum_filter1d(grown, size, axis=0, mode="constant", cval=1)
+    return np.asarray(closed[reach : len(closed) - reach].astype(bool))
+
+
+def _to_voxels(cells: Mask, step: tuple[int, int, int], volume: Volume) -> Mask:
+    nk, nj, ni = volume.voxels.shape
+    voxels = cells
+    for axis, count in enumerate(reversed(step)):
+        voxels = np.repeat(voxels, count, axis=axis)
+    return np.asarray(voxels[:nk, :nj, :ni])
+
+
+def _value_above(level: float, dtype: np.dtype[Any]) -> Any:
+    """As far above a level as air lies below it, as far as the type has it."""
+    value = level + max(level - AIR_HU, 1.0)
+    if dtype.kind == "f":
+        return dtype.type(value)
+    return dtype.type(min(math.ceil(value), np.iinfo(dtype).max))

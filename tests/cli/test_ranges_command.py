@@ -1,0 +1,102 @@
+"""``--hu A:B`` and ``--below N``: what they make, say and refuse."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+from typing import Any
+
+import ct_files
+import numpy as np
+import pytest
+
+from clrecon.cli.levels import parse_hu
+from clrecon.cli.main import main
+from clrecon.errors import UsageError
+from clrecon.pipeline.labels import LabelChoice
+from clrecon.pipeline.settings import MeshSettings
+
+
+@pytest.fixture(scope="module")
+def ct(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A body of water, with a lung that a wall of 30 mm parts from the air around."""
+    k, j, i = np.indices((20, 100, 120))
+    x, y = (i - 59.5) * ct_files.SPACING[0], (j - 49.5) * ct_files.SPACING[1]
+    voxels = np.full(k.shape, -1000, np.int16)
+    voxels[x**2 + y**2 < 40.0**2] = 40
+    lung = x**2 + y**2 + ((k - 9.5) * ct_files.SPACING[2]) ** 2 < 10.0**2
+    voxels[lung] = -850
+    return ct_files.write_series(tmp_path_factory.mktemp("ct"), voxels)
+
+
+def run(ct: Path, device: Any, tmp_path: Path, *arguments: str) -> int:
+    return main(["mesh", str(ct), "-o", str(tmp_path / "b.stl"), "--device", str(device.index), *arguments])
+
+
+def test_below_is_the_lung_without_the_air_outside(
+    ct: Path, device: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(ct, device, tmp_path, "--below", "-400", "--strict", "--json") == 0
+    report = json.loads(capsys.readouterr().out)
+    assert (report["components"], report["inside_hu"], report["iso_level_hu"]) == (1, [None, -400.0], -400.5)
+    assert report["volume_ml"] == pytest.approx(4.0 / 3.0 * np.pi, rel=0.03)
+    assert report["volume"]["outside_air"]["opening_mm2"] == 0.0
+    assert any(text.startswith("air outside of the body was left out: ") for text in report["warnings"])
+    assert not any("face" in text for text in report["warnings"])
+    assert run(ct, device, tmp_path, "--below", "-400", "--keep-outside") == 0
+    shown = capsys.readouterr()
+    assert "surface  below -400 HU (as given), closed" in shown.out
+    assert "can show a face" in shown.err
+
+
+def test_a_range_and_an_iso_value_together(
+    ct: Path, device: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(ct, device, tmp_path, "--hu", "-900:-700,0", "-v") == 0
+    assert "surface  -900:-700, 0 HU (as given)" in capsys.readouterr().out
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["b_-900to-700hu.stl", "b_0hu.stl"]
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("100:", "'100:' is no range A:B of two numbers of HU; from A on is --hu A, below B is --below B"),
+        (":300", "':300' is no range"),
+        ("200,1:2:3", "'1:2:3' in '200,1:2:3' is no range"),
+        ("100:b", "'b' in '100:b' is no number of HU"),
+    ],
+)
+def test_what_is_no_range_is_said(text: str, said: str) -> None:
+    with pytest.raises(argparse.ArgumentTypeError) as caught:
+        parse_hu(text)
+    assert said in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("settings", "said"),
+    [
+        ({"iso_value": ((300.0, 100.0),)}, "the range 300:100 HU holds nothing"),
+        ({"iso_value": ((100.0, 300.0), (100.0, 300.0))}, "the iso value 100:300 HU is given twice"),
+        ({"iso_value": ((100.0, 300.0),), "topology": "trilinear"}, "the range 100:300 HU has two"),
+        ({"iso_value": ((100.0, 300.0),), "labels": LabelChoice("a")}, "labels take one iso value"),
+        ({"below": -400.0, "labels": LabelChoice("a")}, "not below it"),
+        ({"below": -400.0, "iso_value": 200.0}, "not both"),
+        ({"below": -400.0, "preset": "bone"}, "not both"),
+        ({"below": (-400.0, -400.0)}, "given twice"),
+        ({"below": ()}, "at least one"),
+        ({"keep_outside": True}, "only left out of what lies below"),
+    ],
+)
+def test_settings_that_exclude_each_other_are_refused(settings: Any, said: str) -> None:
+    with pytest.raises(UsageError, match=said):
+        MeshSettings(**settings)
+
+
+def test_options_that_exclude_each_other_end_with_3(
+    ct: Path, device: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(ct, device, tmp_path, "--below", "-400", "--hu", "200") == 3
+    assert "not allowed with argument" in capsys.readouterr().err
+    assert run(ct, device, tmp_path, "--hu", "300:100") == 3
+    assert "give its lower end first" in capsys.readouterr().err
