@@ -13,6 +13,7 @@ from dicom_series import ROOT, Change, rotation, set_raw, set_values
 from enhanced_image import save_enhanced
 from pydicom.dataset import Dataset
 from trap_bytes import add_byte_cases
+from trap_mixtures import add_mixture_cases
 from trap_plan import (
     BACKGROUND_HU,
     CASES,
@@ -287,11 +288,7 @@ def _phase_with_a_hole(folder: Path, size: Size) -> Marks:
     return marks
 
 
-@_case("two recon kernels, interleaved", REFUSED, ("--phase", "ConvolutionKernel"), again={"phase": 1})
-def _interleaved_kernels(folder: Path, size: Size) -> Marks:
-    kernels = ("B30f", "B70f")
-    write_slices(folder, plan_for(size), lambda ds, k: setattr(ds, "ConvolutionKernel", kernels[k % 2]))
-    return plan_for(size).marks(range(1, size.slices, 2))
+add_mixture_cases()
 
 
 # --- headers ---

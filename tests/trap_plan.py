@@ -16,6 +16,8 @@ import numpy as np
 from dicom_series import ROOT, Change, Plan, make_dataset, save_dataset
 
 BACKGROUND_HU = -1000
+BODY_HU = -100
+"""Of what is there to be seen, where a case has it."""
 FOREIGN_HU = 10_000
 GAP_MM = 1.25
 OBLIQUE = (12.0, -7.0, 20.0)

@@ -40,7 +40,7 @@ and looks for the end of other such values in all that follows.
 """
 
 
-def parse_carefully(file: BinaryIO, size: int, wanted: tuple[int, ...]) -> DicomElements:
+def parse_carefully(file: BinaryIO, size: int, wanted: tuple[int, ...] | None) -> DicomElements:
     """Parse a file, or the start of one.
 
     Parameters
@@ -49,8 +49,8 @@ def parse_carefully(file: BinaryIO, size: int, wanted: tuple[int, ...]) -> Dicom
         Begins with the preamble; seekable.
     size : int
         Bytes of the whole file.
-    wanted : tuple of int
-        Tags to keep.
+    wanted : tuple of int or None
+        Tags to keep; None keeps all.
 
     Raises
     ------
@@ -91,7 +91,7 @@ class _MeteredFile:
         return self._read(count)
 
 
-def _parse_file(file: BinaryIO, size: int, wanted: tuple[int, ...]) -> DicomElements:
+def _parse_file(file: BinaryIO, size: int, wanted: tuple[int, ...] | None) -> DicomElements:
     file.seek(META_START)
     meta, _, meta_remarks = _collect(file, implicit=False, little=True, last_group=2, wanted=())
     transfer_syntax = decode_uid(meta.get(TRANSFER_SYNTAX))
@@ -130,7 +130,7 @@ def _parse_file(file: BinaryIO, size: int, wanted: tuple[int, ...]) -> DicomElem
 
 
 def _collect(
-    file: BinaryIO, *, implicit: bool, little: bool, last_group: int | None, wanted: tuple[int, ...]
+    file: BinaryIO, *, implicit: bool, little: bool, last_group: int | None, wanted: tuple[int, ...] | None
 ) -> tuple[dict[int, bytes], dict[int, str | None], list[str]]:
     """Read elements up to the end of `last_group`, or up to the pixel data; the file is left standing there.
 
@@ -150,7 +150,7 @@ def _collect(
         implicit,
         little,
         stop_when=stop,
-        specific_tags=list(wanted),  # type: ignore[arg-type]
+        specific_tags=None if wanted is None else list(wanted),  # type: ignore[arg-type]
     ):
         value = element.value
         if isinstance(value, bytes) and value:

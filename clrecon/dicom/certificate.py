@@ -21,6 +21,7 @@ from clrecon.dicom.layout import (
     median_thickness,
     summarise_gaps,
 )
+from clrecon.dicom.likeness import Likeness
 from clrecon.dicom.mixture import describe_differences
 from clrecon.dicom.phases import choose_phase
 from clrecon.dicom.pixels import PixelFacts
@@ -74,6 +75,9 @@ def collect_series_warnings(series: Series) -> list[str]:
             text = text.format(type=odd.rescale_type, intercept=f"{odd.intercept:g}", slope=f"{odd.slope:g}")
             warnings.append(f"{text} ({_place(series.stack, is_so)})")
     warnings += [f"{text} ({_place(series.stack, is_so)})" for text, is_so in describe_differences(headers)]
+    doubt = series.find_doubt()
+    if doubt and not any(doubt in text for text in warnings):
+        warnings.append(doubt)
     return warnings
 
 
@@ -127,6 +131,7 @@ def certify(
     scan: Scan,
     affine: NDArray[np.float64] | None,
     warnings: Sequence[str],
+    likeness: Likeness | None = None,
 ) -> dict[str, Any]:
     """Build the certificate of a series: the report of its volume, and what ``clrecon info`` shows.
 
@@ -140,6 +145,8 @@ def certify(
     affine : ndarray, shape (4, 4), or None
         None: the series is refused.
     warnings : sequence of str
+    likeness : Likeness or None
+        Of the slices; None: the pixels were not read, or there are too few.
 
     Returns
     -------
@@ -147,7 +154,7 @@ def certify(
         JSON types only, every name in docs/contract.md.  Lengths in mm, angles in degrees; ``hu_range`` is that of
         the voxels as they are in the volume, padding (at ``padding_hu``) among them.
     """
-    gates = judge_series(series, stack, facts)
+    gates = judge_series(series, stack, facts, likeness)
     unsaid = [gate["text"] for gate in gates if gate["name"] == "padding_share" and gate["ok"] is False]
     return {
         "format": "DICOM",

@@ -71,15 +71,15 @@ def has_dicom_mark(prefix: bytes) -> bool:
 
 
 def read_elements(
-    path: Path, wanted: tuple[int, ...], start: FileStart | None = None, force: bool = False
+    path: Path, wanted: tuple[int, ...] | None, start: FileStart | None = None, force: bool = False
 ) -> DicomElements:
     """Read the raw elements of one DICOM file.
 
     Parameters
     ----------
     path : Path
-    wanted : tuple of int
-        Tags to keep.
+    wanted : tuple of int or None
+        Tags to keep; None keeps all whose length is defined.
     start : FileStart, optional
         What `read_start` gave for this file, so that it is not read twice.
     force : bool
@@ -110,7 +110,7 @@ def read_elements(
     return elements
 
 
-def _read_restored(path: Path, restored: Start, size: int, wanted: tuple[int, ...]) -> DicomElements:
+def _read_restored(path: Path, restored: Start, size: int, wanted: tuple[int, ...] | None) -> DicomElements:
     """Read a file as if it had the start that it lacks; all places are those of the file itself."""
     with open(path, "rb") as file:
         file.seek(restored.skip)
@@ -127,7 +127,7 @@ def _read_restored(path: Path, restored: Start, size: int, wanted: tuple[int, ..
     )
 
 
-def _read_marked(path: Path, prefix: bytes, size: int, wanted: tuple[int, ...]) -> DicomElements:
+def _read_marked(path: Path, prefix: bytes, size: int, wanted: tuple[int, ...] | None) -> DicomElements:
     elements = parse_plainly(prefix, size, wanted)
     if elements is None and len(prefix) < size:
         prefix, size = read_start(path, LONG_PREFIX_BYTES)

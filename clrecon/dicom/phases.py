@@ -10,11 +10,12 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import combinations
 
 import numpy as np
 
+from clrecon.dicom.attributes import Alternation
 from clrecon.dicom.mixture import find_mixture, values_of
 from clrecon.dicom.pixels import read_voxels
 from clrecon.dicom.slice_header import PHASE_KEYWORDS, SliceHeader
@@ -22,7 +23,7 @@ from clrecon.dicom.stored import StoredPixels
 from clrecon.dicom.text import join_names
 from clrecon.errors import UsageError
 
-__all__ = ["Phase", "Places", "choose_phase", "describe_phases", "have_same_pixels", "sort_places"]
+__all__ = ["Phase", "Places", "choose_phase", "describe_phases", "have_same_pixels", "part_alternating", "sort_places"]
 
 PLACES_SHOWN = 4
 PHASES_SHOWN = 12
@@ -84,6 +85,8 @@ class Places:
         Why slices at one place can neither be left out nor told apart; empty where there is nothing to say.
     interleaved : bool
         The phases share no place: the slices of one lie between those of another.
+    doubt : str
+        What alternates along the stack and may yet be one volume; empty where there is nothing to say.
     """
 
     headers: tuple[SliceHeader, ...]
@@ -91,6 +94,7 @@ class Places:
     phases: tuple[Phase, ...] = field(default=())
     problem: str = ""
     interleaved: bool = False
+    doubt: str = ""
 
 
 def sort_places(places: Sequence[Sequence[SliceHeader]], same: Callable[[SliceHeader, SliceHeader], bool]) -> Places:
@@ -125,6 +129,33 @@ def sort_places(places: Sequence[Sequence[SliceHeader]], same: Callable[[SliceHe
         problem=f"duplicate slices with different pixels{'' if alike else ' or geometry'} at {len(crowded)} "
         f"place{'s' * (len(crowded) > 1)}, and no element of their headers parts them into phases: {shown}{more}",
     )
+
+
+def part_alternating(places: Places, found: Alternation) -> Places:
+    """The same slices as phases by what alternates along them, none at the place of another.
+
+    Parameters
+    ----------
+    places : Places
+        One slice at each place.
+    found : Alternation
+    """
+    members = [tuple(places.headers[k] for k in group) for group in found.groups]
+    if not found.tag:
+        shown = [f"{number} of {len(members)}" for number in range(1, len(members) + 1)]
+        keyword = "place"
+    elif found.heaps:
+        shown, keyword = [str(number) for number in range(1, len(members) + 1)], f"order of {found.name}"
+    elif found.name in PHASE_KEYWORDS:
+        keyword = found.name
+        shown = _show((keyword,), [values_of(headers[0], (keyword,)) for headers in members])
+    else:  # free text may hold anything
+        shown, keyword = [f"value {number}" for number in range(1, len(members) + 1)], found.name
+    phases = tuple(
+        Phase(number, keyword, text, headers)
+        for number, (text, headers) in enumerate(zip(shown, members, strict=True), start=1)
+    )
+    return replace(places, phases=phases, interleaved=True, doubt="")
 
 
 def lie_alike(one: SliceHeader, other: SliceHeader) -> bool:

@@ -72,7 +72,17 @@ class _NotPlainError(Exception):
     """Left to the careful parser."""
 
 
-def parse_plainly(data: bytes, size: int, wanted: tuple[int, ...]) -> DicomElements | None:
+class _Everything(dict[int, int]):
+    """Any element, but for those of undefined length: stands in place of a table of wanted tags."""
+
+    def __contains__(self, key: object) -> bool:
+        return True
+
+    def __missing__(self, key: int) -> int:
+        return (key & 0xFFFF) << 16 | key >> 16
+
+
+def parse_plainly(data: bytes, size: int, wanted: tuple[int, ...] | None) -> DicomElements | None:
     """Parse the start of a file.
 
     Parameters
@@ -81,8 +91,8 @@ def parse_plainly(data: bytes, size: int, wanted: tuple[int, ...]) -> DicomEleme
         Begins with the preamble.
     size : int
         Bytes of the whole file.
-    wanted : tuple of int
-        Tags to keep; SpecificCharacterSet (0008,0005) is among them.
+    wanted : tuple of int or None
+        Tags to keep; SpecificCharacterSet (0008,0005) is among them.  None keeps all of defined length.
 
     Returns
     -------
@@ -95,7 +105,7 @@ def parse_plainly(data: bytes, size: int, wanted: tuple[int, ...]) -> DicomEleme
         return None
 
 
-def _parse(data: bytes, size: int, wanted: tuple[int, ...]) -> DicomElements | None:
+def _parse(data: bytes, size: int, wanted: tuple[int, ...] | None) -> DicomElements | None:
     meta, _, start = _walk_explicit(data, META_START, _keys((TRANSFER_SYNTAX, MEDIA_CLASS)), meta=True)
     transfer_syntax = decode_uid(meta.get(TRANSFER_SYNTAX))
     if not transfer_syntax or transfer_syntax in (DEFLATED, EXPLICIT_BIG):
@@ -130,8 +140,10 @@ def _parse(data: bytes, size: int, wanted: tuple[int, ...]) -> DicomElements | N
 
 
 @lru_cache(maxsize=8)
-def _keys(tags: tuple[int, ...]) -> dict[int, int]:
+def _keys(tags: tuple[int, ...] | None) -> dict[int, int]:
     """Tags as they lie in the file to tags."""
+    if tags is None:
+        return _Everything()
     return {(tag & 0xFFFF) << 16 | tag >> 16: tag for tag in tags}
 
 
@@ -163,7 +175,7 @@ def _walk_explicit(
             (length,) = _long_length(data, place + 8)
             place += 12
             if length == UNDEFINED_LENGTH:
-                if vr != "SQ" or meta or key in wanted:
+                if vr != "SQ" or meta or wanted.get(key):
                     raise _NotPlainError
                 place = _skip_items(data, place, False, DEEPEST)
                 continue
@@ -191,7 +203,7 @@ def _walk_implicit(data: bytes, place: int, wanted: dict[int, int]) -> tuple[dic
             return values, place
         place += 8
         if length == UNDEFINED_LENGTH:
-            if key in wanted or not _is_sequence(data, place, key):
+            if wanted.get(key) or not _is_sequence(data, place, key):
                 raise _NotPlainError
             place = _skip_items(data, place, True, DEEPEST)
             continue

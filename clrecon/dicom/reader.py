@@ -13,6 +13,7 @@ from typing import Any
 from clrecon.dicom.certificate import certify, collect_scan_warnings, collect_series_warnings
 from clrecon.dicom.choice import choose_series, describe_left
 from clrecon.dicom.containers import advise_on
+from clrecon.dicom.likeness import Likeness, judge_likeness
 from clrecon.dicom.listing import SeriesListing, describe_series
 from clrecon.dicom.pixels import read_voxels
 from clrecon.dicom.plausibility import collect_voxel_warnings
@@ -73,13 +74,15 @@ def read_volume(
         if chosen.problems or stack is None or stack.affine is None:
             raise RefusedInputError(_describe_refusal(chosen))
         voxels, facts = read_voxels(stack.slices, progress)
+        likeness = judge_likeness(voxels, stack)
     warnings = [
         *collect_series_warnings(chosen),
+        *_describe_likeness(likeness),
         *collect_voxel_warnings(voxels, facts, stack.slices),
         *collect_scan_warnings(scan),
         *left,
     ]
-    report = certify(chosen, stack, facts, scan, stack.affine, warnings)
+    report = certify(chosen, stack, facts, scan, stack.affine, warnings, likeness)
     return Volume(voxels, stack.affine, report, stack.slice_positions)
 
 
@@ -152,12 +155,17 @@ def _certify_chosen(
     stack = series.stack
     if stack is None or series.kind == "other":
         return None
-    facts, warnings = None, collect_series_warnings(series)
+    facts, likeness, warnings = None, None, collect_series_warnings(series)
     affine = None if series.problems else stack.affine
     if pixels and affine is not None:
         voxels, facts = read_voxels(stack.slices, progress)
-        warnings += collect_voxel_warnings(voxels, facts, stack.slices)
-    return certify(series, stack, facts, scan, affine, [*warnings, *notes])
+        likeness = judge_likeness(voxels, stack)
+        warnings += [*_describe_likeness(likeness), *collect_voxel_warnings(voxels, facts, stack.slices)]
+    return certify(series, stack, facts, scan, affine, [*warnings, *notes], likeness)
+
+
+def _describe_likeness(likeness: Likeness | None) -> list[str]:
+    return [f"{likeness}, --phase takes one"] if likeness is not None and likeness.is_mixed else []
 
 
 @contextmanager

@@ -8,9 +8,19 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from pathlib import Path
 
+from clrecon.dicom.attributes import alternate_places, find_alternation
 from clrecon.dicom.concatenation import describe_missing_parts
 from clrecon.dicom.gate import Stack, group_places, measure_stack
-from clrecon.dicom.phases import Places, choose_phase, describe_phases, have_same_pixels, sort_places
+from clrecon.dicom.likeness import judge_likeness
+from clrecon.dicom.phases import (
+    Places,
+    choose_phase,
+    describe_phases,
+    have_same_pixels,
+    part_alternating,
+    sort_places,
+)
+from clrecon.dicom.pixels import read_voxels
 from clrecon.dicom.planes import Planes
 from clrecon.dicom.scan import CorruptFile, Scan
 from clrecon.dicom.slice_header import OtherImage, SeriesIdentity, SliceHeader
@@ -108,6 +118,13 @@ class Series:
             headers = headers[:1]
         return measure_stack(headers, self.allow_gaps)
 
+    def find_doubt(self) -> str:
+        """What alternates along the stack and may yet be one volume; empty where there is nothing to say."""
+        try:
+            return self.places.doubt
+        except RefusedInputError:
+            return ""
+
     @property
     def dropped(self) -> dict[str, int]:
         """Reason to number of slices that are not in the stack although their headers are valid."""
@@ -121,7 +138,10 @@ class Series:
         return {reason: count for reason, count in counts.items() if count}
 
     def choose(self, phase: int | None = None, allow_gaps: bool = False) -> Series:
-        """The same series with a phase chosen and gaps allowed.
+        """The same series with a phase chosen and gaps allowed, and looked at more closely.
+
+        Volumes between each other are found by whatever alternates in the headers, which are read once more for it;
+        where that may be so within one volume, or a phase is asked for that no header tells, by the pixels as well.
 
         Raises
         ------
@@ -129,11 +149,34 @@ class Series:
             It has no such phase.
         """
         chosen = replace(self, phase=phase, allow_gaps=allow_gaps)
-        if "places" in self.__dict__:
-            chosen.__dict__["places"] = self.places  # pixels may have been compared for it
+        try:
+            chosen.__dict__["places"] = self._part_further(self.places, phase)
+        except RefusedInputError:
+            return chosen  # its `problems` say why
         if phase is not None and (phase != 1 or chosen.places.phases):
             choose_phase(chosen.places.phases, phase)
         return chosen
+
+    def _part_further(self, places: Places, phase: int | None) -> Places:
+        """Phases by what alternates along a stack with one slice at each place."""
+        if self.kind != "stack" or self.others or places.phases or places.problem or len(places.headers) < 2:
+            return places
+        stack = measure_stack(places.headers, allow_gaps=True)
+        if stack.problems:
+            return places
+        places = replace(places, headers=stack.slices)
+        found = find_alternation(stack.slices, not stack.line.uneven)
+        if found is not None and found.certain:
+            return part_alternating(places, found)
+        if found is None and phase is None:
+            return places
+        likeness = judge_likeness(read_voxels(stack.slices)[0], stack)
+        if likeness is not None and likeness.is_mixed:
+            return part_alternating(places, found or alternate_places(len(stack.slices), likeness.period))
+        if found is None:
+            return places
+        doubt = f"{found.name} alternates along the stack: maybe several volumes between each other"
+        return replace(places, doubt=doubt)
 
     @cached_property
     def problems(self) -> list[str]:

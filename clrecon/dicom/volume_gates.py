@@ -20,6 +20,7 @@ from clrecon.dicom.gate import (
     group_places,
     measure_stated_gap,
 )
+from clrecon.dicom.likeness import Likeness
 from clrecon.dicom.pixels import PixelFacts
 from clrecon.dicom.series import Series
 from clrecon.dicom.slice_header import SliceHeader
@@ -33,7 +34,9 @@ PADDING_SHARE = 0.75
 was measured is likely to be masked by a wrong PixelPaddingValue."""
 
 
-def judge_series(series: Series, stack: Stack | None, facts: PixelFacts | None = None) -> list[Gate]:
+def judge_series(
+    series: Series, stack: Stack | None, facts: PixelFacts | None = None, likeness: Likeness | None = None
+) -> list[Gate]:
     """Hold a series against the gates.
 
     Parameters
@@ -43,6 +46,8 @@ def judge_series(series: Series, stack: Stack | None, facts: PixelFacts | None =
         Its slices as they are, or would be, read.
     facts : PixelFacts, optional
         Of its pixels; without them the gates on pixels are not measured.
+    likeness : Likeness, optional
+        Of its slices; None where they are too few, or too small, as well.
 
     Returns
     -------
@@ -59,6 +64,7 @@ def judge_series(series: Series, stack: Stack | None, facts: PixelFacts | None =
     gates += _gates_of_places(stack)
     what = "slices at the place of another that differ from it and are no phases"
     gates.append(none_of("duplicate_slices", _count_doubled(series), what))
+    gates.append(_judge_one_volume(series, likeness))
     gates += _gates_of_values(stack.slices)
     share = "share of voxels without a measurement (padding)"
     if facts is None:
@@ -85,6 +91,15 @@ def _gates_of_places(stack: Stack) -> Iterator[Gate]:
     yield at_most("grid_residual", line.residual_max_mm, line.tolerance_mm, "mm", what)
     yield none_of("missing_slices", stack.missing, "slices missing in between")
     yield _judge_stated_gap(stack)
+
+
+def _judge_one_volume(series: Series, likeness: Likeness | None) -> Gate:
+    """Neighbours that are less alike than slices farther apart, and what alternates from slice to slice."""
+    doubts = 0 if series.stack is None or series.find_doubt() == "" else 1
+    what = "signs of several volumes between each other: a header that alternates, neighbours less alike than others"
+    if likeness is None and not doubts:
+        return unmeasured("one_volume", 0, None, f"{what}: the pixels were not read, or too few")
+    return none_of("one_volume", doubts + (likeness is not None and likeness.is_mixed), what)
 
 
 def _count_doubled(series: Series) -> int:

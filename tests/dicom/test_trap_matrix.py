@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from tolerances import AFFINE_MM, FAR_AFFINE_MM, JITTER_AFFINE_MM, ROUNDED_AFFINE_MM
 from trap_cases import BACKGROUND_HU, CASES, EXACT, REFUSED, WARNED, Case, Marks, Size
+from trap_plan import BODY_HU
 
 from clrecon.dicom import read_volume
 from clrecon.errors import ClreconError, RefusedInputError
@@ -20,7 +21,7 @@ BOUNDS_MM = {"written": AFFINE_MM, "rounded": ROUNDED_AFFINE_MM, "far": FAR_AFFI
 def check_marks(volume: Volume, truth: Marks, bound_mm: float) -> None:
     """Every mark of the stack is there once, at its place, and nothing else is."""
     assert volume.voxels.shape[0] == truth.slices
-    kji = np.argwhere(volume.voxels != BACKGROUND_HU)
+    kji = np.argwhere((volume.voxels != BACKGROUND_HU) & (volume.voxels != BODY_HU))
     hu = volume.voxels[tuple(kji.T)]
     order, expected = np.argsort(hu), np.argsort(truth.hu)
     assert np.array_equal(hu[order], truth.hu[expected])
