@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import os
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -10,15 +11,24 @@ from dicom_series import edit_value, element_bytes, insert_after
 from trap_plan import BACKGROUND_HU, REFUSED, WARNED, Marks, Size, add_case, add_simple, plan_for, write_slices
 
 
-def _spoiled(name: str, spoil: Callable[[Path], None], *words: str, **changes: Any) -> None:
-    """All files are spoiled behind their writer's back; `changes` of the plan."""
+def _spoiled(
+    name: str, spoil: Callable[[Path], None], *words: str, last: bool = False, plan: Mapping[str, Any] | None = None
+) -> None:
+    """All files, or the last one, are spoiled behind their writer's back; `plan` is what its plan is changed in."""
 
     @add_case(name, REFUSED, words)
     def write(folder: Path, size: Size) -> Marks:
-        marks = write_slices(folder, plan_for(size, **changes))
-        for file in sorted(folder.iterdir()):
+        marks = write_slices(folder, plan_for(size, **(plan or {})))
+        for file in sorted(folder.iterdir())[-1 if last else 0 :]:
             spoil(file)
         return marks
+
+
+def damage(file: Path, place: int, data: bytes) -> None:
+    """Write over bytes of a file."""
+    with open(file, "r+b") as stream:
+        stream.seek(place)
+        stream.write(data)
 
 
 def _send_as_text(file: Path) -> None:
@@ -57,4 +67,18 @@ def add_byte_cases() -> None:
         ("the rest is zeros, taken as padding",),
         change=lambda ds, k: setattr(ds, "PixelData", ds.PixelData + bytes(512)),
     )
-    _spoiled("pixels sent as text", _send_as_text, "it was sent as text", intercept=BACKGROUND_HU - 10)
+    media: dict[str, Any] = {"last": True, "plan": {"name": "IM{:04d}".format}}
+    _spoiled("the last slice empty, no suffix", lambda file: os.truncate(file, 0), "but empty", **media)
+    _spoiled(
+        "the last slice without its mark, no suffix",
+        lambda file: damage(file, 128, b"DIXM"),
+        "DICOM by its header, but without the mark at byte 128",
+        **media,
+    )
+    _spoiled(
+        "the last slice zeroed, no suffix",
+        lambda file: damage(file, 0, bytes(file.stat().st_size)),
+        "named like slices, but blank",
+        **media,
+    )
+    _spoiled("pixels sent as text", _send_as_text, "it was sent as text", plan={"intercept": BACKGROUND_HU - 10})

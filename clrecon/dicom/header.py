@@ -16,7 +16,7 @@ from clrecon.dicom.elements import CorruptFileError, DicomElements, FileStart, r
 from clrecon.dicom.multiframe import ENHANCED_CT, read_groups, split_frames
 from clrecon.dicom.slice_header import SLICE_PHASES, OtherImage, SeriesIdentity, SliceHeader
 from clrecon.dicom.surplus import check_surplus
-from clrecon.dicom.terms import MODALITIES, RESCALE_TYPES, name_term
+from clrecon.dicom.terms import MODALITIES, OTHER_TERM, RESCALE_TYPES, name_term
 from clrecon.dicom.text import escape_text, hash_uid
 from clrecon.dicom.values import WANTED_TAGS, ValueProblem, Values
 
@@ -74,9 +74,12 @@ def read_headers(
         what is no element.
     """
     elements = read_elements(path, WANTED_TAGS, start, force)
-    if elements.media_class == DICOMDIR_CLASS:
-        return None
     values = Values(elements)
+    if elements.media_class == DICOMDIR_CLASS:
+        if elements.pixel_tag is None and "SOPClassUID" not in values:
+            return None
+        remark = "the meta header says that it is a DICOMDIR: read as the image that it holds"
+        values.elements = elements = elements._replace(remarks=(*elements.remarks, remark))
     name = escape_text(path.name)
     sop_class = values.word("SOPClassUID") or elements.media_class
     known_class = "CT" if sop_class in (CT_IMAGE_STORAGE, *ENHANCED_CT) else "unknown"
@@ -88,6 +91,9 @@ def read_headers(
         modality,
         values.word("StudyInstanceUID"),
     )
+    if modality == OTHER_TERM and sop_class in (CT_IMAGE_STORAGE, *ENHANCED_CT):
+        problem = f"{name}: Modality (0008,0060) is no term of the standard, expected CT in a CT image"
+        return OtherImage(series, path, name, 1, "broken", problem)
     if modality != "CT":
         return OtherImage(series, path, name, 1, "other", f"modality {modality} is not CT")
     if elements.pixel_tag is None:

@@ -1,7 +1,7 @@
 """Walk a folder, or take one file, and read the header of every DICOM file in it.
 
-Names, extensions and DICOMDIR files play no part in what is read; an extension only makes a file that is no DICOM a
-suspect of being what is left of one.  Nothing but regular files inside the folder is opened: devices,
+Names, extensions and DICOMDIR files play no part in what is read; they only make a file that is no DICOM a suspect of
+being what is left of one (`remains`).  Nothing but regular files inside the folder is opened: devices,
 pipes and links are skipped and counted (a link into the folder is met again at its own place; a link out of it is
 none of our business).
 """
@@ -18,6 +18,7 @@ from clrecon.dicom.disk import DiskReader, Progress
 from clrecon.dicom.elements import META_START, CorruptFileError, FileStart, has_dicom_mark
 from clrecon.dicom.forced import FORCE_HINT, restore_start
 from clrecon.dicom.header import read_headers
+from clrecon.dicom.remains import Stranger, describe_start, find_remains
 from clrecon.dicom.slice_header import OtherImage, SliceHeader
 from clrecon.dicom.text import escape_text
 from clrecon.errors import NoDicomError
@@ -59,6 +60,8 @@ class Scan:
         Files that say they are DICOM and cannot be parsed; files and folders that cannot be read at all.
     suspects : list of CorruptFile
         Files that are no DICOM by their content, but look like what is left of one.
+    strangers : list of Stranger
+        All others that are no DICOM.
     files : int
         Regular files looked at.
     """
@@ -68,6 +71,7 @@ class Scan:
     skipped: Counter[str] = field(default_factory=Counter)
     corrupt: list[CorruptFile] = field(default_factory=list)
     suspects: list[CorruptFile] = field(default_factory=list)
+    strangers: list[Stranger] = field(default_factory=list)
     files: int = 0
 
 
@@ -100,7 +104,16 @@ def scan_path(path: Path, progress: Progress | None = None, force: bool = False)
             _take_file(file, start, scan, force)
             if progress is not None and (done % step == 0 or done == total):
                 progress("scan", done, total)
+    if scan.strangers:
+        _suspect_strangers(scan)
     return scan
+
+
+def _suspect_strangers(scan: Scan) -> None:
+    slices = {str(header.file): header.file_bytes for header in scan.slices}
+    broken = {str(image.file): 0 for image in scan.others if image.kind == "broken"}
+    for path, reason in find_remains(scan.strangers, (slices | broken).items()):
+        scan.suspects.append(CorruptFile(path, reason))
 
 
 def _take_file(file: str, start: FileStart | OSError, scan: Scan, force: bool) -> None:
@@ -110,6 +123,8 @@ def _take_file(file: str, start: FileStart | OSError, scan: Scan, force: bool) -
         reason = _suspect(file, start.prefix)
         if reason:
             scan.suspects.append(CorruptFile(Path(file), reason))
+        else:
+            scan.strangers.append(Stranger(file, start.size, describe_start(start.prefix)))
         return
     try:
         if isinstance(start, OSError):

@@ -215,9 +215,7 @@ def test_a_volume_in_slabs_is_the_same_picture(
     assert np.abs(found[0][1] - found[1][1]).max() <= 2
 
 
-def test_an_x_ray_is_a_sum_in_mm_of_water(
-    device: Any, sphere: tuple[Path, dict[str, Any]], tmp_path: Path
-) -> None:
+def test_an_x_ray_is_a_sum_in_mm_of_water(device: Any, sphere: tuple[Path, dict[str, Any]], tmp_path: Path) -> None:
     """The window runs over the rays that meet the body, and is in mm of water where it is given too."""
     files = PictureFiles(tmp_path / "a.png", values=tmp_path / "v.npy")
     settings = RenderSettings(preset="x-ray", size=SIZE, device=str(device.index))
