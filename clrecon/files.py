@@ -1,4 +1,4 @@
-"""Writing files so that a reader finds the whole new file or the whole old one, never a part.
+"""Files that are read are regular ones, and those that are written are found whole, the new one or the old one.
 
 A file is written to a temporary one in the same folder (created exclusively, readable by the owner only, with a
 random name), flushed to the disk, checked, and only then renamed over the target.  Whatever goes wrong before the
@@ -36,6 +36,9 @@ __all__ = [
     "check_writable",
     "final_mode",
     "hold_interrupts",
+    "is_dicom",
+    "open_regular",
+    "read_regular",
     "replace_file",
     "stage_file",
     "system_errors",
@@ -49,6 +52,9 @@ _TEMPORARY = re.compile(r"\.clrecon-[0-9a-f]{16}\.(?:tmp|folder)")
 
 _own_names: set[str] = set()
 """Temporary files and folders that this process is writing: with a thousand, looking at each every time would cost."""
+
+# A pipe or device put in the place of a file must not make the reader wait for a writer.
+_READ = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_CLOEXEC", 0) | getattr(os, "O_BINARY", 0)
 
 _ADVICE = {
     errno.ENOSPC: "the disk is full: free some space or choose another folder",
@@ -70,6 +76,30 @@ _KINDS: tuple[tuple[Callable[[int], bool], str], ...] = (
     (stat.S_ISBLK, "a block device: only regular files are written"),
     (stat.S_ISCHR, "a character device: only regular files are written"),
 )
+
+
+def open_regular(path: str | os.PathLike[str], buffering: int = -1) -> BinaryIO:
+    """Open a file for reading, as ``open(path, "rb", buffering)`` does, if it is a regular one.
+
+    Raises
+    ------
+    OSError
+        It cannot be opened, or is a folder, FIFO, socket or device, which is not waited for.
+    """
+    descriptor = os.open(path, _READ)
+    if stat.S_ISREG(os.fstat(descriptor).st_mode):
+        return os.fdopen(descriptor, "rb", buffering)
+    os.close(descriptor)
+    raise OSError(errno.EINVAL, "it is no regular file")
+
+
+def read_regular(path: str | os.PathLike[str], limit: int) -> bytes:
+    """Read a regular file of `limit` bytes at most; raises OSError as `open_regular` does, or where it is larger."""
+    with open_regular(path) as stream:
+        data = stream.read(limit + 1)
+    if len(data) > limit:
+        raise OSError(errno.EFBIG, f"it is larger than {limit:,} bytes")
+    return data
 
 
 def replace_file(
@@ -276,7 +306,18 @@ def _checked_target(path: str | os.PathLike[str]) -> Path:
                 raise OutputError(f"cannot write {_shown(path)}: it is {words}")
         if not os.access(target, os.W_OK):
             raise OutputError(f"cannot write {_shown(path)}: the file is there and write-protected")
+        if is_dicom(target):
+            raise OutputError(f"cannot write {_shown(path)}: a DICOM file is there, which is never replaced")
     return target
+
+
+def is_dicom(path: str | os.PathLike[str]) -> bool:
+    """True for a file with the mark of DICOM: what was measured cannot be made again."""
+    try:
+        with open_regular(path, 0) as stream:
+            return stream.read(132)[128:] == b"DICM"
+    except OSError:
+        return False
 
 
 def _check_space(path: str | os.PathLike[str], folder: Path, expected_bytes: int) -> None:

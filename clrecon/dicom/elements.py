@@ -17,6 +17,7 @@ from clrecon.dicom.careful import parse_carefully
 from clrecon.dicom.forced import FORCE_HINT, Start, find_program, restore_start
 from clrecon.dicom.plain import parse_plainly
 from clrecon.dicom.raw import META_START, CorruptFileError, DicomElements, NotDicomError
+from clrecon.files import open_regular
 
 __all__ = [
     "META_START",
@@ -112,7 +113,7 @@ def read_elements(
 
 def _read_restored(path: Path, restored: Start, size: int, wanted: tuple[int, ...] | None) -> DicomElements:
     """Read a file as if it had the start that it lacks; all places are those of the file itself."""
-    with open(path, "rb") as file:
+    with open_regular(path) as file:
         file.seek(restored.skip)
         data = restored.head + file.read(RESTORED_LIMIT)
     added = len(restored.head) - restored.skip
@@ -149,5 +150,5 @@ def _read_marked(path: Path, prefix: bytes, size: int, wanted: tuple[int, ...] |
             if elements is not None:
                 return elements
     del prefix
-    with open(path, "rb") as file:
+    with open_regular(path) as file:
         return parse_carefully(file, size, wanted)

@@ -25,8 +25,9 @@ from clrecon.dicom.raw import IMPLICIT_LITTLE, META_START, DicomElements
 from clrecon.dicom.sequences import Item, Schema, decode_number, name_tag, read_sequences
 from clrecon.dicom.text import escape_text
 from clrecon.dicom.values import ValueProblem, Values, decode_text
+from clrecon.files import open_regular
 
-__all__ = ["ENHANCED_CT", "FRAME_PHASES", "Frame", "Groups", "read_groups", "split_frames"]
+__all__ = ["ENHANCED_CT", "FRAME_PHASES", "Frame", "Groups", "find_data_set", "read_groups", "split_frames"]
 
 ENHANCED_CT = ("1.2.840.10008.5.1.4.1.1.2.1", "1.2.840.10008.5.1.4.1.1.2.2")
 """SOP classes: Enhanced CT Image Storage, Legacy Converted Enhanced CT Image Storage."""
@@ -358,18 +359,23 @@ def _read_header_bytes(path: Path, elements: DicomElements) -> tuple[bytes, int]
     """The data set up to its pixel data, and where in these bytes it starts."""
     if elements.pixel_offset > HEADER_BYTES_LIMIT:
         raise ValueProblem(f"a header of {elements.pixel_offset} bytes, no more than {HEADER_BYTES_LIMIT} are read")
-    with open(path, "rb") as file:
+    with open_regular(path) as file:
         if elements.inflate_from >= 0:
             file.seek(elements.inflate_from)
             deflated = file.read(2 * elements.pixel_offset + 1024)  # what does not shrink grows by 5 bytes in 16 KiB
             return zlib.decompressobj(-zlib.MAX_WBITS).decompress(deflated, elements.pixel_offset), 0
         data = file.read(elements.pixel_offset)
+    return data, find_data_set(data)
+
+
+def find_data_set(data: bytes) -> int:
+    """The byte behind the file meta elements."""
     start = META_START
     while data[start : start + 2] == b"\x02\0":  # file meta elements: explicit VR little endian
         long = data[start + 4 : start + 6] in (b"OB", b"UN", b"OW", b"SQ", b"UT")
         length = int.from_bytes(data[start + 8 : start + 12] if long else data[start + 6 : start + 8], "little")
         start += (12 if long else 8) + length
-    return data, start
+    return start
 
 
 def _words(raw: bytes | None) -> list[str]:

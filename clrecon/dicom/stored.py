@@ -25,6 +25,7 @@ from clrecon.dicom.encapsulated import Pieces, find_frames, read_pieces
 from clrecon.dicom.slice_header import SliceHeader
 from clrecon.dicom.surplus import INFLATED_LIMIT
 from clrecon.errors import RefusedInputError
+from clrecon.files import open_regular
 
 __all__ = ["StoredPixels"]
 
@@ -102,7 +103,7 @@ class StoredPixels:
             if header.inflate_from >= 0:
                 self._inflate(header, stored)
             else:
-                with open(header.file, "rb", buffering=0) as file:
+                with open_regular(header.file, 0) as file:
                     file.seek(header.pixel_offset + header.frame * header.pixel_bytes)
                     _read_into(file, stored)
         except OSError as error:
@@ -120,7 +121,7 @@ class StoredPixels:
         return stored
 
     def _decode(self, header: SliceHeader, stored: NDArray[Any]) -> NDArray[Any]:
-        with open(header.file, "rb") as file:
+        with open_regular(header.file) as file:
 
             def find() -> list[Pieces]:
                 return find_frames(file, header.pixel_offset, header.file_bytes, header.frames, header.transfer_syntax)
@@ -189,7 +190,7 @@ def _inflate_data_set(header: SliceHeader, needed: int) -> bytes:
     inflater = zlib.decompressobj(-zlib.MAX_WBITS)
     inflated = bytearray()
     try:
-        with open(header.file, "rb", buffering=0) as file:
+        with open_regular(header.file, 0) as file:
             file.seek(header.inflate_from)
             while len(inflated) < needed and not inflater.eof:
                 deflated = inflater.unconsumed_tail or file.read(INFLATE_STEP)

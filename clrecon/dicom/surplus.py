@@ -23,6 +23,7 @@ from clrecon.dicom.sequences import LONG_VRS, skip_sequence
 from clrecon.dicom.slice_header import SliceHeader
 from clrecon.dicom.values import ValueProblem
 from clrecon.errors import RefusedInputError
+from clrecon.files import open_regular
 
 __all__ = ["check_surplus"]
 
@@ -71,7 +72,7 @@ def check_surplus(elements: DicomElements, header: SliceHeader, force: bool = Fa
     if header.pixel_length in (expected, length) and end == header.file_bytes and header.inflate_from < 0:
         return ()
     size = header.file_bytes
-    with open(header.file, "rb") as opened:
+    with open_regular(header.file) as opened:
         file: BinaryIO = opened
         if header.inflate_from >= 0:
             if header.pixel_offset + expected > INFLATED_LIMIT:
@@ -89,7 +90,7 @@ def check_surplus(elements: DicomElements, header: SliceHeader, force: bool = Fa
 
 
 def _check_encapsulated(elements: DicomElements, header: SliceHeader, force: bool) -> tuple[str, ...]:
-    with open(header.file, "rb") as file:
+    with open_regular(header.file) as file:
         file.seek(max(header.file_bytes - len(ITEMS_END), 0))
         if file.read() == ITEMS_END:
             return ()

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from clrecon.errors import RefusedInputError, UsageError
+from clrecon.files import read_regular
 from clrecon.formats.stream import show_name
 from clrecon.geometry.affine import Float64Array
 
@@ -73,9 +74,7 @@ def read_curve_points(path: str | Path, space: str | None = None) -> Float64Arra
 
 def _read_text(file: Path, shown: str) -> str:
     try:
-        if file.stat().st_size > LARGEST_BYTES:
-            raise RefusedInputError(f"{shown} has {file.stat().st_size:,} bytes: this is no list of points")
-        return file.read_text(encoding="utf-8-sig")
+        return read_regular(file, LARGEST_BYTES).decode("utf-8-sig")
     except FileNotFoundError as error:
         raise UsageError(f"there is no file {shown} with the points of a centre line") from error
     except OSError as error:

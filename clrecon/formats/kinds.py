@@ -5,6 +5,7 @@ from __future__ import annotations
 import zlib
 from pathlib import Path
 
+from clrecon.files import open_regular
 from clrecon.formats.grid_file import GridFile, Purpose
 from clrecon.formats.metaimage import is_metaimage, open_metaimage
 from clrecon.formats.nifti import is_nifti, open_nifti
@@ -23,7 +24,7 @@ def tell_kind(path: Path) -> str | None:
     OSError
         It cannot be read.
     """
-    with open(path, "rb") as file:
+    with open_regular(path) as file:
         start = file.read(_START_BYTES)
     if start[128:132] == b"DICM":  # what stands before it may look like anything
         return "DICOM"

@@ -21,6 +21,7 @@ import numpy as np
 
 from clrecon.dicom.text import escape_text
 from clrecon.errors import RefusedInputError, UsageError
+from clrecon.files import open_regular
 from clrecon.formats.extras import import_extra
 from clrecon.formats.grid_file import GridFile, Purpose
 from clrecon.formats.stream import VoxelBytes, file_beside, show_name
@@ -98,7 +99,7 @@ def open_metaimage(path: Path, purpose: Purpose) -> GridFile:
 
 def _read_fields(path: Path, name: str) -> tuple[dict[str, str], int]:
     """The fields up to ElementDataFile, which is the last, and the byte after it."""
-    with open(path, "rb") as file:
+    with open_regular(path) as file:
         start = file.read(LARGEST_HEADER)
     fields: dict[str, str] = {}
     seen = {""}

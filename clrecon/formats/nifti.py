@@ -19,6 +19,7 @@ import numpy as np
 
 from clrecon.dicom.text import escape_text
 from clrecon.errors import RefusedInputError, UsageError
+from clrecon.files import open_regular
 from clrecon.formats.extras import import_extra
 from clrecon.formats.grid_file import GridFile, Purpose
 from clrecon.formats.stream import VoxelBytes, file_beside, read_bytes, show_name
@@ -71,7 +72,7 @@ def open_nifti(path: Path, purpose: Purpose) -> GridFile:
         The file is cut or corrupt, not placed, has colours, or more than three axes.
     """
     name = show_name(path)
-    with open(path, "rb") as file:
+    with open_regular(path) as file:
         compressed = _is_gzip(file)
         header = _read_header(cast(BinaryIO, gzip.GzipFile(fileobj=file)) if compressed else file, name, purpose)
     try:
@@ -141,7 +142,7 @@ def _find_voxels(path: Path, compressed: bool, header: _Header) -> VoxelBytes:
         stem = match[1]
         names = [f"{stem}.img", f"{stem}.img.gz", f"{stem}.IMG"]
         path = file_beside(path, next((other for other in names if path.with_name(other).exists()), names[0]))
-        with open(path, "rb") as file:
+        with open_regular(path) as file:
             compressed = _is_gzip(file)
     if compressed:
         return VoxelBytes(path, packing="gzip", skip=header.offset)

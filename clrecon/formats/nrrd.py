@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from clrecon.dicom.text import escape_text
 from clrecon.errors import RefusedInputError, UsageError
+from clrecon.files import open_regular
 from clrecon.formats.extras import import_extra
 from clrecon.formats.grid_file import LABEL_MAP, GridFile, Purpose
 from clrecon.formats.stream import VoxelBytes, show_name
@@ -72,7 +73,7 @@ def open_nrrd(path: Path, purpose: Purpose) -> GridFile:
         The file is cut or corrupt, not placed, or has more than three axes (label maps: and a list of layers).
     """
     name = show_name(path)
-    with open(path, "rb") as file:
+    with open_regular(path) as file:
         start = file.read(LARGEST_HEADER)
     end = re.search(rb"\r?\n\r?\n", start)
     if end is None:

@@ -19,6 +19,7 @@ from typing import Any, BinaryIO, cast
 
 from clrecon.dicom.text import escape_text
 from clrecon.errors import RefusedInputError
+from clrecon.files import open_regular
 
 __all__ = ["LARGEST_GRID", "VoxelBytes", "check_end", "check_size", "file_beside", "read_bytes", "show_name"]
 
@@ -75,7 +76,7 @@ class VoxelBytes:
     @contextmanager
     def open(self, name: str) -> Iterator[BinaryIO]:
         """The stream of the numbers, from the first one on; `name` for messages."""
-        with open(self.path, "rb") as file:
+        with open_regular(self.path) as file:
             file.seek(self.offset)
             stream: BinaryIO = file
             if self.packing == "gzip":

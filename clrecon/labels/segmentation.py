@@ -15,8 +15,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from clrecon.dicom.multiframe import find_data_set
+from clrecon.dicom.sequences import Schema, read_sequences
 from clrecon.dicom.text import escape_text, hash_uid
+from clrecon.dicom.values import ValueProblem
 from clrecon.errors import ClreconError, RefusedInputError
+from clrecon.files import open_regular
 from clrecon.formats.stream import check_size, show_name
 from clrecon.labels.frames import FrameStack, place_frames
 from clrecon.labels.label_map import LabelMap
@@ -29,6 +33,20 @@ SEGMENTATION_CLASSES = ("1.2.840.10008.5.1.4.1.1.66.4", "1.2.840.10008.5.1.4.1.1
 IMPLICIT_LITTLE, EXPLICIT_LITTLE = "1.2.840.10008.1.2", "1.2.840.10008.1.2.1"
 RLE_LOSSLESS = "1.2.840.10008.1.2.5"
 MOST_FRAMES = 1_000_000
+LARGEST_BYTES = 2**32
+_PLACE: Schema = {
+    0x00209113: {0x00200032: None},  # PlanePositionSequence: ImagePositionPatient
+    0x00209116: {0x00200037: None},  # PlaneOrientationSequence: ImageOrientationPatient
+    0x00289110: dict.fromkeys((0x00180050, 0x00180088, 0x00280030)),  # PixelMeasuresSequence
+    0x0062000A: {0x0062000B: None},  # SegmentIdentificationSequence: ReferencedSegmentNumber
+}
+_ONCE: Schema = {
+    **dict.fromkeys((0x00200052, 0x00280008, 0x00280010, 0x00280011, 0x00280100, 0x00280101, 0x00620001)),
+    0x00620002: dict.fromkeys((0x00620004, 0x00620005)),  # SegmentSequence: SegmentNumber, SegmentLabel
+    0x52009229: _PLACE,
+    0x52009230: _PLACE,
+}
+"""What places and names the segments."""
 
 
 @dataclass(frozen=True)
@@ -108,7 +126,10 @@ def _parse(path: Path, name: str) -> Any:
                 f"{name} is stored with transfer syntax {escape_text(syntax)}: of DICOM SEG uncompressed little endian"
                 " and RLE are read, convert it"
             )
-        dataset = dcmread(path)
+        with open_regular(path) as file:
+            _check_elements(file.read(LARGEST_BYTES + 1), name, syntax == IMPLICIT_LITTLE)
+            file.seek(0)
+            dataset = dcmread(file)
         sop_class = str(dataset.get("SOPClassUID", ""))
     except ClreconError:
         raise
@@ -119,6 +140,18 @@ def _parse(path: Path, name: str) -> Any:
             f"{name} is DICOM but no segmentation (class {escape_text(sop_class)}): a SEG object holds labels"
         )
     return dataset
+
+
+def _check_elements(data: bytes, name: str, implicit: bool) -> None:
+    """Refuse elements that stand twice with two values: pydicom keeps the last of them without a word."""
+    if len(data) > LARGEST_BYTES:
+        raise RefusedInputError(f"{name} is larger than {LARGEST_BYTES:,} bytes: no segmentation is read from it")
+    try:
+        read_sequences(
+            data, find_data_set(data), _ONCE, implicit=implicit, little_endian=True, items_limit=4 * MOST_FRAMES
+        )
+    except ValueProblem as problem:
+        raise RefusedInputError(f"{name} is a corrupt DICOM file: {problem}") from problem
 
 
 def _read_layout(dataset: Any, name: str, file_bytes: int) -> _Layout:

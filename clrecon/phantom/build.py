@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.errors import OutputError, UsageError
+from clrecon.files import read_regular
 from clrecon.geometry import column_spacing, tilt_degrees
 from clrecon.phantom.anatomy import Anatomy
 from clrecon.phantom.bodies import choose_body
@@ -31,6 +32,8 @@ from clrecon.version import package_version
 __all__ = ["SPINE_ISO_HU", "TRUTH_NAME", "label_materials", "make_phantom", "write_phantom"]
 
 TRUTH_NAME = "truth.json"
+LARGEST_TRUTH = 1 << 28
+"""Bytes; of a series of thousands of slices it has some MiB."""
 MATERIALS_NAME = "materials.nrrd"
 
 SPINE_ISO_HU = 226.0
@@ -205,8 +208,8 @@ def _check_replaceable(folder: Path) -> None:
             f"{folder.name} holds {len(names)} files that are not a phantom ({example}): give a new or empty folder"
         )
     try:
-        generator = json.loads((folder / TRUTH_NAME).read_text(encoding="utf-8"))["generator"]
-    except (ValueError, KeyError, TypeError) as error:
+        generator = json.loads(read_regular(folder / TRUTH_NAME, LARGEST_TRUTH))["generator"]
+    except (OSError, ValueError, KeyError, TypeError) as error:
         raise UsageError(f"{folder.name}/{TRUTH_NAME} is not of a phantom: give a new or empty folder") from error
     if generator != _GENERATOR:
         raise UsageError(f"{folder.name}/{TRUTH_NAME} is not of a phantom: give a new or empty folder")

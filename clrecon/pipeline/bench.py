@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from clrecon.errors import DeviceError, NoSurfaceError, UsageError
 from clrecon.pipeline.machine import free_cores, processor_name, usable_cores
+from clrecon.pipeline.outputs import check_kept
 from clrecon.pipeline.pairs import alternate, spread, summarise
 from clrecon.pipeline.presets import DEFAULT_PRESET, find_preset
 from clrecon.pipeline.progress import Progress, Stopwatch, ignore_progress
@@ -80,6 +81,7 @@ def run_bench(
         from clrecon.files import check_writable
 
         check_writable(report_path)
+        check_kept([("the report", report_path)], source)
     progress("device", 0, 0)
     devices = _choose_devices(device)
     watch = Stopwatch()

@@ -73,8 +73,8 @@ def make_mesh(
     measure = report_path is not None if measure is None else measure
     watch = Stopwatch()
     surfaces = plan_surfaces(settings.levels, below=settings.below is not None)
-    check_outputs(output, report_path, first_names(surfaces, settings.split))
-    check_kept(report_path, source, None if settings.labels is None else settings.labels.path)
+    outputs = check_outputs(output, report_path, first_names(surfaces, settings.split))
+    check_kept(outputs, source, None if settings.labels is None else settings.labels.path)
 
     progress("device", 0, 0)
     prepare = partial(prepare_surfaces, components=settings.selects, topology=settings.topology, inside=settings.inside)

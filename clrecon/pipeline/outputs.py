@@ -10,7 +10,7 @@ from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from clrecon.errors import OutputError, UsageError
+from clrecon.errors import ClreconError, OutputError, UsageError
 
 if TYPE_CHECKING:
     from clrecon.files import Staged, StagedFile
@@ -85,16 +85,55 @@ def check_distinct(*owned: Sequence[tuple[str, str | Path]]) -> None:
         owners[_identity(path)] = own
 
 
-def check_kept(report_path: str | Path | None, *inputs: str | Path | None) -> None:
-    """Refuse a report, whose name may end as it likes, in the place of a file that the job reads.
+def check_kept(outputs: Sequence[tuple[str, str | Path | None]], *inputs: str | Path | None) -> None:
+    """Refuse outputs in the place of files that the job reads, whatever name or link leads there.
+
+    A file with the mark of DICOM is replaced by no output (`clrecon.files`); here it is data sets without one, files of
+    other formats with those of their voxels, and files that say how.
+
+    Parameters
+    ----------
+    outputs : sequence of (str, path or None)
+        What an output is, and where it is going to be: a file, or a folder that is replaced as a whole.
+    *inputs : path or None
+        Files and folders that are read; None and "" are none.
 
     Raises
     ------
     UsageError
     """
-    for path in inputs:
-        if path and report_path is not None and _identity(path) == _identity(report_path):
-            raise UsageError(f"the report would replace a file that is read: {report_path}")
+    there = [(what, path) for what, path in outputs if path is not None and os.path.exists(path)]
+    read = [path for one in inputs if one and there for path in (one, _find_voxels(one)) if path]
+    for what, path in there:
+        inside = os.path.join(os.path.realpath(path), "")
+        for one in read:
+            same = _identity(path) == _identity(one) or os.path.exists(one) and os.path.samefile(path, one)
+            if same or os.path.isdir(path) and os.path.realpath(one).startswith(inside):
+                raise UsageError(f"{what} would replace a file that is read: {path}")
+        if os.path.isfile(path) and _is_bare_data_set(path):
+            raise UsageError(f"{what} would replace a DICOM data set: {path}")
+
+
+def _find_voxels(path: str | Path) -> Path | None:
+    """The file that a header names for its voxels; None where it is the same, or there is no such header."""
+    from clrecon.formats import VOLUME, open_grid, tell_kind
+
+    try:
+        kind = tell_kind(Path(path)) if os.path.isfile(path) else None
+        return open_grid(Path(path), kind, VOLUME).voxel_bytes.path if kind and kind != "DICOM" else None
+    except (ClreconError, OSError):
+        return None  # reading says what is wrong with it
+
+
+def _is_bare_data_set(path: str | Path) -> bool:
+    from clrecon.dicom.forced import restore_start
+    from clrecon.files import open_regular
+
+    try:
+        with open_regular(path) as stream:
+            return restore_start(stream.read(256)) is not None
+    except OSError:
+        return False
 
 
 def count_leftovers(output: str | Path, paths: Sequence[str | Path]) -> int:
@@ -115,24 +154,33 @@ def _identity(path: str | Path) -> str:
     return os.path.realpath(path).casefold()
 
 
-def check_outputs(output: str | Path, report_path: str | Path | None, names: Sequence[str] = ("",)) -> None:
+def check_outputs(
+    output: str | Path, report_path: str | Path | None, names: Sequence[str] = ("",)
+) -> list[tuple[str, str | Path]]:
     """Refuse outputs that cannot be written, before any work is done.
+
+    Returns
+    -------
+    list of (str, path)
+        What each of them is, and where it goes.
 
     Raises
     ------
     UsageError
         Unknown extension, or two outputs are one file.
     OutputError
-        A folder is missing or cannot be written, or a target is no regular file.
+        A folder is missing or cannot be written, or a target is no regular file, or a DICOM file.
     """
     from clrecon.files import check_writable
     from clrecon.mesh import check_format
 
     check_format(output)
-    for path in name_outputs(output, names, report_path):
-        check_writable(path)
+    outputs = [("the mesh", path) for path in name_outputs(output, names, report_path)]
     if report_path is not None:
-        check_writable(report_path)
+        outputs.append(("the report", report_path))
+    for _, path in outputs:
+        check_writable(path)
+    return outputs
 
 
 def stage_meshes(stack: ExitStack, meshes: Sequence[Mesh], paths: Sequence[str | Path], space: str) -> list[StagedFile]:

@@ -82,8 +82,13 @@ def format_of(path: str | Path) -> str:
     return os.path.splitext(os.fspath(path))[1].lower().lstrip(".")
 
 
-def check_pictures(files: PictureFiles, settings: RenderSettings) -> None:
+def check_pictures(files: PictureFiles, settings: RenderSettings) -> list[tuple[str, str | Path]]:
     """Refuse outputs that cannot be written, before any work is done.
+
+    Returns
+    -------
+    list of (str, path)
+        What each of them is, and where it goes.
 
     Raises
     ------
@@ -129,6 +134,7 @@ def check_pictures(files: PictureFiles, settings: RenderSettings) -> None:
     if files.turntable is not None and settings.turntable is not None:
         if check_animation(files.turntable, settings.turntable.fps) == "":
             _check_outside(files.turntable, owned)
+    return [*owned, *moving]
 
 
 def _check_outside(folder: str | Path, owned: Sequence[tuple[str, str | Path]]) -> None:

@@ -67,8 +67,7 @@ def make_pictures(
     if (files.turntable is None) != (settings.turntable is None):
         raise UsageError("a turntable needs both: where it goes, and how it turns")
     watch = Stopwatch()
-    check_pictures(files, settings)
-    check_kept(files.report, source, *settings.files_read)
+    check_kept(check_pictures(files, settings), source, *settings.files_read)
     allow_open_files(3 * len(settings.views_used) + 2)  # picture, depths and values of each view, turntable, report
     function = read_function(settings.transfer_function)
     curve = read_curve(settings.curve)

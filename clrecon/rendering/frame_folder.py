@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.errors import OutputError, UsageError
-from clrecon.files import final_mode, hold_interrupts, system_errors, temporary_folder
+from clrecon.files import final_mode, hold_interrupts, is_dicom, system_errors, temporary_folder
 
 __all__ = ["check_frame_folder", "stage_frame_folder"]
 
@@ -40,6 +40,8 @@ def check_frame_folder(path: str | os.PathLike[str]) -> Path:
                     f"the folder {path} holds other things ({len(others)}, such as {sorted(others)[0]!r}):"
                     " name a new or empty one for the frames"
                 )
+            if any(is_dicom(entry.path) for entry in os.scandir(folder)):
+                raise OutputError(f"cannot write {path}: DICOM files are there, which are never replaced")
             if os.path.samefile(folder, os.curdir):  # whoever stands in it would stand in what was removed
                 raise UsageError(f"the frames replace the folder {path}, which is the current one: name one in it")
             if os.path.ismount(folder):

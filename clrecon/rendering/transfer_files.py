@@ -5,6 +5,7 @@ Our own form is JSON, described in docs/transfer_functions.md.
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import stat
@@ -13,7 +14,7 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from clrecon.errors import RefusedInputError, UsageError
-from clrecon.files import replace_file
+from clrecon.files import read_regular, replace_file
 from clrecon.rendering.json_fields import parse_json, take_color, take_list, take_number, take_object, take_text
 from clrecon.rendering.lighting import Lighting
 from clrecon.rendering.slicer_files import (
@@ -94,13 +95,11 @@ def _read(path: Path, shown: str) -> bytes:
     if not stat.S_ISREG(status.st_mode):
         raise RefusedInputError("it is no regular file")
     try:
-        with path.open("rb") as stream:
-            data = stream.read(SIZE_LIMIT + 1)
+        return read_regular(path, SIZE_LIMIT)
     except OSError as error:
+        if error.errno == errno.EFBIG:
+            raise RefusedInputError(f"{error.strerror}: no transfer function is") from None
         raise RefusedInputError(f"it cannot be read: {error.strerror or error}") from None
-    if len(data) > SIZE_LIMIT:
-        raise RefusedInputError(f"it is larger than {SIZE_LIMIT:,} bytes: no transfer function is")
-    return data
 
 
 def _entries(data: bytes) -> list[Entry]:

@@ -186,6 +186,19 @@ def test_damaged_anywhere_it_is_read_or_refused(tmp_path):
     assert 20 < refused < 150
 
 
+@pytest.mark.parametrize(("keyword", "value"), [("Rows", b"\7\0"), ("FrameOfReferenceUID", b"1.2\0")])
+def test_an_element_twice_with_two_values_is_refused(tmp_path, keyword, value):
+    """pydicom takes the second in silence."""
+    write_seg(tmp_path / "a.dcm", masks(), ct_slices())
+    assert read_labels(tmp_path / "a.dcm").numbers
+    data = (tmp_path / "a.dcm").read_bytes()
+    head = dicom_series.element_bytes(keyword, b"")[:6]
+    end = data.index(head) + 8 + int.from_bytes(data[data.index(head) + 6 : data.index(head) + 8], "little")
+    (tmp_path / "a.dcm").write_bytes(data[:end] + dicom_series.element_bytes(keyword, value) + data[end:])
+    with pytest.raises(RefusedInputError, match=rf"a.dcm is a corrupt DICOM file: {keyword} .* is there twice"):
+        read_labels(tmp_path / "a.dcm")
+
+
 def test_real_segmentation_and_nrrd_agree(real_data):
     folder = real_data / "seg_and_labels"
     volume = read_volume(folder / "ct-3slice")

@@ -136,8 +136,8 @@ def test_a_report_replaces_no_file_that_is_read(tmp_path: Path, monkeypatch: pyt
         with pytest.raises(UsageError, match="would replace a file that is read"):
             make_pictures("ct.nrrd", PictureFiles("a.png", report=report), settings)
     assert {path.read_bytes() for path in tmp_path.iterdir()} == {b"mine"} and len(list(tmp_path.iterdir())) == 5
-    check_kept("auto", "ct.nrrd", *RenderSettings(curve="auto").files_read)
-    check_kept(None, "ct.nrrd")
+    check_kept([("the report", "auto")], "ct.nrrd", *RenderSettings(curve="auto").files_read)
+    check_kept([("the report", None)], "ct.nrrd")
 
 
 class Disturbed:

@@ -1,0 +1,133 @@
+"""Only regular files are read, and no more of them than makes sense: a FIFO waits for ever, /dev/zero has no end."""
+
+from __future__ import annotations
+
+import ast
+import os
+import sys
+from pathlib import Path
+
+import pytest
+from guards.house import ROOT
+
+from clrecon.errors import ClreconError, RefusedInputError, UsageError
+from clrecon.files import open_regular, read_regular
+from clrecon.formats.curve_points import LARGEST_BYTES, read_curve_points
+from clrecon.labels import read_labels
+from clrecon.phantom import PhantomSettings, write_phantom
+from clrecon.reading import list_series, read_volume
+from clrecon.rendering import load_transfer_function
+
+pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="FIFOs and devices of POSIX")
+
+READERS = {
+    "volume": read_volume,
+    "listing": list_series,
+    "labels": read_labels,
+    "curve": read_curve_points,
+    "transfer function": load_transfer_function,
+}
+
+
+@pytest.fixture(params=["fifo", "link to a fifo", "zero", "random", "folder"])
+def no_file(request, tmp_path):
+    """What is there and is no regular file."""
+    place = tmp_path / "odd"
+    if request.param == "fifo":
+        os.mkfifo(place)
+    elif request.param == "link to a fifo":
+        os.mkfifo(tmp_path / "pipe")
+        place.symlink_to("pipe")
+    elif request.param == "folder":
+        place.mkdir()
+    else:
+        place.symlink_to(f"/dev/{request.param}")
+    return place
+
+
+@pytest.mark.parametrize("reader", READERS)
+def test_no_reader_waits(no_file, reader):
+    with pytest.raises(ClreconError) as caught:
+        READERS[reader](no_file)
+    assert "\n" not in str(caught.value)
+
+
+def test_what_is_no_regular_file_is_not_opened(no_file):
+    before = len(os.listdir("/proc/self/fd")) if Path("/proc/self/fd").is_dir() else 0
+    with pytest.raises(OSError, match="no regular file"):
+        open_regular(no_file)
+    assert before == 0 or len(os.listdir("/proc/self/fd")) == before
+
+
+def test_a_regular_file_is_read_as_far_as_it_may(tmp_path):
+    (tmp_path / "a").write_bytes(b"12345")
+    assert read_regular(tmp_path / "a", 5) == b"12345"
+    with pytest.raises(OSError, match="larger than 4 bytes"):
+        read_regular(tmp_path / "a", 4)
+    with open_regular(tmp_path / "a", 0) as stream:
+        assert stream.read(2) == b"12"
+
+
+def test_the_points_of_a_curve_are_bounded(tmp_path):
+    with open(tmp_path / "large", "wb") as stream:
+        stream.truncate(LARGEST_BYTES + 1)
+    with pytest.raises(RefusedInputError, match="large: it is larger than 16,777,216 bytes"):
+        read_curve_points(tmp_path / "large")
+
+
+def test_a_phantom_does_not_wait_for_its_truth(tmp_path):
+    folder = tmp_path / "phantom"
+    folder.mkdir()
+    os.mkfifo(folder / "truth.json")
+    with pytest.raises(UsageError, match="truth.json is not of a phantom"):
+        write_phantom(folder, PhantomSettings(kind="sphere"))
+
+
+OWN = {
+    "files.py": "the helper itself",
+    "cli/console.py": "the null device",
+    "dicom/decoder_pool.py": "pipes to its own processes",
+    "dicom/decoder_process.py": "its own pipes and memory",
+    "dicom/elements.py": "looks at kind and size with one call, for speed",
+    "geometry/control_groups.py": "the system",
+    "geometry/memory.py": "the system",
+    "kernels/binaries.py": "its own cache",
+    "kernels/sources.py": "its own sources",
+    "mesh/writers/glb.py": "what it has just written",
+    "mesh/writers/obj.py": "what it has just written",
+    "mesh/writers/ply.py": "what it has just written",
+    "mesh/writers/stl.py": "what it has just written",
+    "mesh/writers/threemf.py": "what it has just written",
+    "mesh/writers/vtp.py": "what it has just written",
+    "opencl/unknown_cpu.py": "the system",
+    "pipeline/machine.py": "the system",
+    "rendering/frame_folder.py": "new frames",
+    "rendering/video.py": "its own temporary files",
+}
+"""Modules that open files by themselves, and what they are."""
+
+
+def find_openings(text: str) -> int:
+    """Calls of open, of methods of that name with a mode, and of those of paths that read."""
+    count = 0
+    for node in ast.walk(ast.parse(text)):
+        if not isinstance(node, ast.Call):
+            continue
+        name = node.func.id if isinstance(node.func, ast.Name) else getattr(node.func, "attr", "")
+        method = isinstance(node.func, ast.Attribute)
+        owner = node.func.value.id if method and isinstance(node.func.value, ast.Name) else ""
+        mode = any(isinstance(arg, ast.Constant) and arg.value in ("r", "rb", "w", "wb", "xb") for arg in node.args)
+        count += name == "open" and (not method or owner == "os" or mode)
+        count += method and name in ("read_text", "read_bytes", "fromfile", "memmap", "dcmread")
+    return count
+
+
+def test_files_that_are_read_go_through_one_helper():
+    folder = ROOT / "clrecon"
+    found = {str(path.relative_to(folder)) for path in folder.rglob("*.py") if find_openings(path.read_text())}
+    assert found == set(OWN)
+
+
+def test_the_search_finds_what_it_should():
+    assert find_openings("open(path)") == find_openings("path.open('rb')") == find_openings("os.open(p, 0)") == 1
+    assert find_openings("path.read_text()") == 1 and find_openings("open_regular(p); source.open(name)") == 0
