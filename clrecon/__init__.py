@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     from clrecon.mesh.refinement import decimate_mesh, smooth_mesh
     from clrecon.opencl import Device
     from clrecon.operators.isosurface import SurfaceExtractor, extract_isosurface, extract_isosurfaces
+    from clrecon.operators.label_masks import extract_label_masks
     from clrecon.operators.labels import extract_labels
     from clrecon.operators.reformat import cut_slice, reformat_curve
     from clrecon.operators.renderer import VolumeRenderer, render
@@ -72,6 +73,7 @@ __all__ = [
     "devices",
     "extract_isosurface",
     "extract_isosurfaces",
+    "extract_label_masks",
     "extract_labels",
     "find_spine_line",
     "list_series",
@@ -112,6 +114,7 @@ _HOMES = {
     "decimate_mesh": "clrecon.mesh.refinement",
     "extract_isosurface": "clrecon.operators.isosurface",
     "extract_isosurfaces": "clrecon.operators.isosurface",
+    "extract_label_masks": "clrecon.operators.label_masks",
     "extract_labels": "clrecon.operators.labels",
     "find_spine_line": "clrecon.geometry.spine_line",
     "list_series": "clrecon.reading",

@@ -27,6 +27,9 @@
 #ifdef LABELS
 #include "isosurface/label_border.h"
 #endif
+#ifdef MASKS
+#include "isosurface/mask_border.h"
+#endif
 
 #ifndef WORDS_PER_ITEM
 #define WORDS_PER_ITEM 1
@@ -181,6 +184,8 @@ __kernel void list_words(
  *             half_way_count  in/out  with -D LABELS: grows by the vertices that HU do not place
  *             upper_level     with -D RANGE: where on an edge from inside to above the range the surface lies
  *             highest         with -D RANGE: the range's highest value
+ *             map, label, occupied  in   with -D MASKS: the label map, the label, and the occupancy of all labels, where
+ *                             `voxels` is that of the label; slices as those of `voxels`; see mask_border.h
  * Launch      global = ceil(active / WORDS_PER_ITEM) rounded up by the host, any local
  * Guarantees  every position and normal is written once.  Positions are right to one unit in the last place of the
  *             volume's largest coordinate (half a unit up to 4096 samples an axis, where products of a sample number
@@ -201,13 +206,22 @@ void emit_vertices(
 #ifdef RANGE
     , const float upper_level, const float highest
 #endif
+#ifdef MASKS
+    , __global const LABEL *restrict map, const uint label, __global const VOXEL *restrict occupied
+#endif
     )
 {
     const uint begin = get_global_id(0) * WORDS_PER_ITEM;
     if (begin >= active)
         return;
     const uint end = min(begin + WORDS_PER_ITEM, active);
+#ifdef MASKS
+    /* Beyond the map its border goes on: edges that lead out are placed apart from all others. */
+    const volume_part volume = {voxels, ni, nj, nk, first_slice, 0, outside};
+    const mask_part masks = {map, {occupied, ni, nj, nk, first_slice, 0, outside}, label, (int)iso_level};
+#else
     const volume_part volume = {voxels, ni, nj, nk, first_slice, border, outside};
+#endif
 #ifdef LABELS
     const label_part labels = {inside, label};
     uint half_way = 0;
@@ -274,6 +288,9 @@ void emit_vertices(
             gather_vertex(&group, gathered, &volume, i, vj, vk, crossed[m] & 3, inner);
 #ifdef LABELS
             half_way += gather_border(&group, gathered, &volume, &labels, iso_level, i, vj, vk, crossed[m] & 3);
+#endif
+#ifdef MASKS
+            gather_mask_border(&group, gathered, &masks, i, vj, vk, crossed[m] & 3, inner);
 #endif
             ++gathered;
             if (gathered == LANES) {

@@ -9,6 +9,17 @@
 #ifndef CLRECON_MASK_ROWS_H
 #define CLRECON_MASK_ROWS_H
 
+/* Bits of 16 comparison results (-1 or 0 each): bit n is lane n. */
+static inline uint pack_lanes(short16 lanes)
+{
+    const ushort16 bits = as_ushort16(lanes)
+        & (ushort16)(1, 2, 4, 8, 16, 32, 64, 128, 256, 512, 1024, 2048, 4096, 8192, 16384, 32768);
+    const ushort8 by8 = bits.lo | bits.hi;
+    const ushort4 by4 = by8.lo | by8.hi;
+    const ushort2 by2 = by4.lo | by4.hi;
+    return by2.x | by2.y;
+}
+
 /* Row number of (j, k). */
 static inline uint row_index(uint j, uint k, uint gj)
 {

@@ -129,9 +129,7 @@ class SurfaceExtractor:
         if not isinstance(volume, Volume):
             raise UsageError(f"a surface needs a Volume, not {type(volume).__name__}: clrecon.Volume(voxels, affine)")
         check_memory(memory)
-        ni = volume.shape_ijk[0]
-        if ni + 2 > marching_cubes.LONGEST_ROW:
-            raise UsageError(f"the volume has {ni:,} columns, {marching_cubes.LONGEST_ROW - 2:,} are supported")
+        marching_cubes.check_row(volume.shape_ijk[0])
         self.volume = volume
         self.device = choose_device(device)
         self.memory = memory

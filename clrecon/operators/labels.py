@@ -30,10 +30,10 @@ from clrecon.operators.marching_cubes import Classified, Placement
 from clrecon.operators.slabs import SampleGrid, Slab
 from clrecon.operators.voxel_types import label_variants, voxel_variants
 
-__all__ = ["extract_labels", "prepare_labels"]
+__all__ = ["Window", "choose_numbers", "extract_labels", "prepare_labels"]
 
-SPARE_SLICES = 2
-"""Beyond the label's box: the far end of a crossed edge, and what its gradient needs."""
+SPARE_SLICES = 3
+"""Beyond the label's box: the far end of a crossed edge, what its gradient needs, and the last slices of the mask."""
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ class _Held:
 
 
 @dataclass(frozen=True)
-class _Window(Slab):
+class Window(Slab):
     """The slices of the sample grid that hold one label and a layer around it, of what the device holds."""
 
     held: tuple[int, int] = (0, 0)
@@ -73,7 +73,8 @@ def prepare_labels(
     return own, marching_cubes.prepare_marching_cubes(device, dtype, label_dtype, uneven)
 
 
-def _choose_numbers(labels: LabelMap, numbers: Sequence[int | str] | None) -> tuple[int, ...]:
+def choose_numbers(labels: LabelMap, numbers: Sequence[int | str] | None) -> tuple[int, ...]:
+    """The numbers of the labels that are asked for, each once; all that are there where none are named."""
     if numbers is None:
         return labels.numbers
     chosen = tuple(dict.fromkeys(labels.find(number) for number in numbers))
@@ -158,9 +159,9 @@ class _Run:
         with self.stopwatch.timed("upload"):
             return upload(self.device, part)
 
-    def window(self, box: Box, held: tuple[int, int]) -> _Window:
+    def window(self, box: Box, held: tuple[int, int]) -> Window:
         """The slices of the sample grid around a label's box."""
-        return _Window(self.grid, box[0].start, box[0].stop + 2 * self.rule.border, held)
+        return Window(self.grid, box[0].start, box[0].stop + 2 * self.rule.border, held)
 
     def extract_one(self, held: _Held, number: int, box: Box, memory: int | None) -> Part | None:
         """Positions, normals and triangles of one label, None where nothing is inside of it."""
@@ -308,12 +309,9 @@ def extract_labels(
         As `extract_isosurface`.
     """
     taken = resample_labels(labels, volume)
-    chosen = _choose_numbers(labels, numbers)
+    chosen = choose_numbers(labels, numbers)
     rule = choose_iso_rule(volume, iso_value, closed)
-    if volume.shape_ijk[0] + 2 > marching_cubes.LONGEST_ROW:
-        raise UsageError(
-            f"the volume has {volume.shape_ijk[0]:,} columns, {marching_cubes.LONGEST_ROW - 2:,} are supported"
-        )
+    marching_cubes.check_row(volume.shape_ijk[0])
     growth = Growth.of(volume, grow_mm)
     boxes = find_boxes(taken.voxels, chosen, growth.reach)
     names = {number: f"{number} {labels.name(number)}" for number in chosen}

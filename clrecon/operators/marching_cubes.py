@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from clrecon.errors import DeviceError, DeviceMemoryError
+from clrecon.errors import DeviceError, DeviceMemoryError, UsageError
 from clrecon.geometry import Volume
 from clrecon.geometry.field import layer_margins, layer_normal_matrices, slice_normal_matrices, vertex_margin
 from clrecon.geometry.precision import find_vertex_origin
@@ -24,7 +24,9 @@ from clrecon.operators.voxel_types import label_variants, voxel_variants
 __all__ = [
     "Classified",
     "Counted",
+    "Emission",
     "Placement",
+    "check_row",
     "classify",
     "count",
     "emit",
@@ -34,6 +36,17 @@ __all__ = [
 
 LONGEST_ROW = 13_000
 """Samples a row: places in a row are 16-bit numbers, and a cell has at most 5 triangles."""
+
+
+def check_row(ni: int) -> None:
+    """Refuse rows that are too long.
+
+    Raises
+    ------
+    UsageError
+    """
+    if ni + 2 > LONGEST_ROW:
+        raise UsageError(f"the volume has {ni:,} columns, {LONGEST_ROW - 2:,} are supported")
 
 
 @dataclass(frozen=True)
@@ -66,11 +79,18 @@ class Counted:
 
 
 def prepare_marching_cubes(
-    device: Device, dtype: DTypeLike, labels: DTypeLike | None = None, uneven: bool = False, inside: str = "above"
+    device: Device,
+    dtype: DTypeLike,
+    labels: DTypeLike | None = None,
+    uneven: bool = False,
+    inside: str = "above",
+    *,
+    masks: bool = False,
 ) -> Program:
     """Build the kernels for volumes of `dtype`; with `labels`, their type, those whose emit_vertices takes labels.
 
-    With `uneven` those for volumes whose slices no affine places; `inside` as `IsoRule.inside`.
+    With `uneven` those for volumes whose slices no affine places; `inside` as `IsoRule.inside`; with `masks` those for
+    labels' own surfaces, whose volumes are occupancies.
 
     Raises
     ------
@@ -84,7 +104,7 @@ def prepare_marching_cubes(
     if labels is None:
         _load_classify(device, dtype, inside)
     else:
-        variants.update(LABELS="1", **label_variants(labels))
+        variants.update({"MASKS" if masks else "LABELS": "1"}, **label_variants(labels))
     if uneven:
         variants["UNEVEN"] = "1"
     return load_program(device, "isosurface/marching_cubes.cl", variants)
@@ -266,6 +286,77 @@ def too_many(vertices: int, triangles: int) -> DeviceError:
     )
 
 
+class Emission:
+    """Passes 3 and 4: the mesh of a slab, on the device until it is downloaded.
+
+    Parameters
+    ----------
+    voxels_d : buffer
+        The slices ``slab.voxel_slices`` of the volume.
+    """
+
+    def __init__(
+        self, device: Device, slab: Slab, program: Program, voxels_d: Any, classified: Classified, counted: Counted,
+        placement: Placement, stopwatch: Stopwatch,
+    ):  # fmt: skip
+        self._device, self._slab, self._program, self._stopwatch = device, slab, program, stopwatch
+        self._voxels_d, self._classified, self._counted, self._placement = voxels_d, classified, counted, placement
+        self.frames_d = upload(device, placement.slice_frames[slab.first : slab.first + slab.mask_slices])
+        self.steps_d = upload(device, placement.steps)
+        self._positions, self.positions_d = empty_output(device, (counted.vertices, 3), np.float32)
+        self._normals, self.normals_d = empty_output(device, (counted.vertices, 3), np.float32)
+        self._triangles, self.triangles_d = empty_output(device, (counted.triangles, 3), np.uint32)
+        self._packing = (np.uint32(slab.grid.words), np.uint32(slab.grid.row_shift), np.uint32(counted.active_words))
+        self._items = -(-counted.active_words // int(device.kernel_variants["WORDS_PER_ITEM"]))
+
+    def vertices(self, iso_level: float, label_arguments: tuple[Any, ...] = ()) -> None:
+        """Launch what writes positions and normals; it may be done again at another level.
+
+        `label_arguments` is what emit_vertices takes more in a program that was built with labels.
+        """
+        if not self._counted.vertices:
+            return
+        slab, counted, rule = self._slab, self._counted, self._slab.grid.rule
+        value = np.float32 if slab.grid.volume.voxels.dtype.kind == "f" else np.int32
+        upper = () if rule.upper_level is None else (np.float32(rule.upper_level), np.float32(rule.highest_inside))
+        launch(
+            self._device, self._program["emit_vertices"], self._items,
+            self._voxels_d, self._classified.mask_d, counted.active_words_d, counted.row_offsets_d,
+            counted.word_vertices_d, self.frames_d, self.steps_d, self.positions_d, self.normals_d,
+            np.float32(iso_level), value(rule.outside), np.float32(rule.value_scale), self._placement.margin,
+            *volume_scalars(slab), np.uint32(slab.mask_slices), *self._packing, *label_arguments, *upper,
+            stopwatch=self._stopwatch,
+        )  # fmt: skip
+
+    def triangles(self, first_vertex: int = 0) -> None:
+        """Launch what writes triangles; `first_vertex` is how many vertices all slabs before have."""
+        if not self._counted.triangles:
+            return
+        slab, counted = self._slab, self._counted
+        gi, gj, _ = slab.grid.shape
+        launch(
+            self._device, self._program["emit_triangles"], self._items,
+            self._classified.mask_d, counted.active_words_d, counted.row_offsets_d, counted.word_vertices_d,
+            counted.word_triangles_d, self.triangles_d, np.uint32(first_vertex), np.uint32(slab.counted_rows),
+            np.uint32(gi), np.uint32(gj), np.uint32(slab.mask_slices), *self._packing,
+            np.int32(slab.grid.winds_backwards),
+            stopwatch=self._stopwatch,
+        )  # fmt: skip
+
+    def download(self) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.uint32]]:
+        """Positions, normals and triangles, here."""
+        with self._stopwatch.timed("download"):
+            for array, array_d in (
+                (self._positions, self.positions_d),
+                (self._normals, self.normals_d),
+                (self._triangles, self.triangles_d),
+            ):
+                download(self._device, array, array_d)
+        if self._slab.grid.rule.inside == "below":
+            np.negative(self._normals, out=self._normals)
+        return self._positions, self._normals, self._triangles
+
+
 def emit(
     device: Device,
     slab: Slab,
@@ -278,55 +369,16 @@ def emit(
     stopwatch: Stopwatch,
     label_arguments: tuple[Any, ...] = (),
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.uint32]]:
-    """Passes 3 and 4: positions, normals and triangles of the slab.
-
-    Parameters
-    ----------
-    first_vertex : int
-        Vertices of all slabs before.
-    label_arguments : tuple
-        What emit_vertices takes more in a program that was built with labels.
-    """
-    grid = slab.grid
-    volume, rule = grid.volume, grid.rule
-    frames_d = upload(device, placement.slice_frames[slab.first : slab.first + slab.mask_slices])
-    steps_d = upload(device, placement.steps)
-    positions, positions_d = empty_output(device, (counted.vertices, 3), np.float32)
-    normals, normals_d = empty_output(device, (counted.vertices, 3), np.float32)
-    triangles, triangles_d = empty_output(device, (counted.triangles, 3), np.uint32)
-    active = counted.active_words
-    packing = (np.uint32(grid.words), np.uint32(grid.row_shift), np.uint32(active))
-    upper = () if rule.upper_level is None else (np.float32(rule.upper_level), np.float32(rule.highest_inside))
-    items = -(-active // int(device.kernel_variants["WORDS_PER_ITEM"]))
-    value = np.float32 if volume.voxels.dtype.kind == "f" else np.int32
-    gi, gj, _ = grid.shape
+    """Passes 3 and 4 at once: positions, normals and triangles of the slab, see `Emission`."""
+    emission = Emission(device, slab, program, voxels_d, classified, counted, placement, stopwatch)
     with stopwatch.running(device):
-        if counted.vertices:
-            launch(
-                device, program["emit_vertices"], items,
-                voxels_d, classified.mask_d, counted.active_words_d, counted.row_offsets_d, counted.word_vertices_d,
-                frames_d, steps_d, positions_d, normals_d,
-                np.float32(rule.iso_level), value(rule.outside), np.float32(rule.value_scale), placement.margin,
-                *volume_scalars(slab), np.uint32(slab.mask_slices), *packing, *label_arguments, *upper,
-                stopwatch=stopwatch,
-            )  # fmt: skip
+        emission.vertices(slab.grid.rule.iso_level, label_arguments)
         if counted.cells is not None:
             emit_cells(
-                device, slab, voxels_d, classified.mask_d, counted, (frames_d, steps_d, placement.margin),
-                (positions_d, normals_d, triangles_d), first_vertex, stopwatch,
+                device, slab, voxels_d, classified.mask_d, counted,
+                (emission.frames_d, emission.steps_d, placement.margin),
+                (emission.positions_d, emission.normals_d, emission.triangles_d), first_vertex, stopwatch,
             )  # fmt: skip
-        elif counted.triangles:
-            launch(
-                device, program["emit_triangles"], items,
-                classified.mask_d, counted.active_words_d, counted.row_offsets_d, counted.word_vertices_d,
-                counted.word_triangles_d, triangles_d, np.uint32(first_vertex), np.uint32(slab.counted_rows),
-                np.uint32(gi), np.uint32(gj), np.uint32(slab.mask_slices), *packing,
-                np.int32(grid.winds_backwards),
-                stopwatch=stopwatch,
-            )  # fmt: skip
-    with stopwatch.timed("download"):
-        for array, array_d in ((positions, positions_d), (normals, normals_d), (triangles, triangles_d)):
-            download(device, array, array_d)
-    if rule.inside == "below":
-        np.negative(normals, out=normals)
-    return positions, normals, triangles
+        else:
+            emission.triangles(first_vertex)
+    return emission.download()

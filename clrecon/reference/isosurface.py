@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -19,7 +21,10 @@ from clrecon.reference.case_table import CORNERS, EDGES, case_table
 from clrecon.reference.trilinear import find_row, place_cell_vertices
 from clrecon.reference.trilinear_table import CELL_VERTEX
 
-__all__ = ["Surface", "extract_inside", "extract_isosurface", "sample_grid"]
+__all__ = [
+    "CrossedEdges", "Surface", "build_surface", "edge_margins", "extract_inside", "extract_isosurface",
+    "find_crossed_edges", "gradients", "sample_grid",
+]  # fmt: skip
 
 Surface = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.uint32]]
 """Vertices (n, 3) and normals (n, 3), LPS mm, and triangles (m, 3)."""
@@ -33,7 +38,7 @@ def sample_grid(volume: Volume, rule: IsoRule, layers: int) -> NDArray[np.float6
     return np.pad(values, layers, mode="edge")
 
 
-def _gradients(field: NDArray[np.float64], rule: IsoRule) -> NDArray[np.float64]:
+def gradients(field: NDArray[np.float64], closed: bool) -> NDArray[np.float64]:
     """Gradient per index step (d/di, d/dj, d/dk) at every sample: central, one-sided at an open border.
 
     `field` has one more layer on every side than the result.
@@ -44,7 +49,7 @@ def _gradients(field: NDArray[np.float64], rule: IsoRule) -> NDArray[np.float64]
         first = np.take(change, range(change.shape[axis] - 1), axis=axis)
         second = np.take(change, range(1, change.shape[axis]), axis=axis)
         weight = np.full(first.shape[axis], 0.5)
-        if not rule.closed:
+        if not closed:
             weight[[0, -1]] = 1.0
         shape = [1, 1, 1]
         shape[axis] = -1
@@ -174,42 +179,92 @@ def extract_inside(
         As `extract_isosurface`; normals point down, and up where the surface ends a range at its upper end.
     """
     field = sample_grid(volume, rule, rule.border)
-    gradients = _gradients(sample_grid(volume, rule, rule.border + 1), rule)
+    slopes = gradients(sample_grid(volume, rule, rule.border + 1), rule.closed)
+    edges = find_crossed_edges(inside)
+    value, next_value = field[edges.near], field[edges.far]
+    margin = edge_margins(volume, rule, edges)
+    half_way = np.zeros(len(edges.axis), dtype=bool)
+    if hu_places is not None:
+        half_way = ~(hu_places[edges.near] & hu_places[edges.far])
+    change = np.where(half_way, 1.0, next_value - value)
+    above = np.zeros(len(edges.axis), dtype=bool)
+    if rule.highest_inside is not None:  # the outside end lies above the range
+        above = np.maximum(value, next_value) > rule.highest_inside
+    level = np.where(above, rule.upper_level or 0.0, rule.iso_level)
+    t = np.where(half_way, 0.5, np.clip((level - value) / change, margin, 1.0 - margin))
+    slope, next_slope = (1.0 - t[:, None]) * slopes[edges.near], t[:, None] * slopes[edges.far]
+    if half_way.any():
+        around = np.pad(inside.astype(np.float64), 1, mode="constant" if rule.closed else "edge")
+        slopes = gradients(around, rule.closed)
+        slope[half_way], next_slope[half_way] = slopes[edges.near][half_way], slopes[edges.far][half_way]
+    slope[above], next_slope[above] = -slope[above], -next_slope[above]  # from here on they point inwards
+    return build_surface(volume, rule, inside, edges, t, slope, next_slope)
 
+
+@dataclass(frozen=True)
+class CrossedEdges:
+    """Edges of the sample grid between a sample inside and one outside, in the order of their vertices.
+
+    Attributes
+    ----------
+    numbers : ndarray, shape (gk, gj, gi, 3), int64
+        The vertex on the edge that a sample owns along each axis, where it is crossed.
+    near, far : tuple of three ndarray, shape (n,), int64
+        (k, j, i) of the owner and of the other end.
+    axis : ndarray, shape (n,), int64
+    """
+
+    numbers: NDArray[np.int64]
+    near: tuple[NDArray[np.int64], ...]
+    far: tuple[NDArray[np.int64], ...]
+    axis: NDArray[np.int64]
+
+
+def find_crossed_edges(inside: NDArray[np.bool_]) -> CrossedEdges:
+    """The crossed edges of a sample grid, shape (gk, gj, gi)."""
     crossed = np.zeros((*inside.shape, 3), dtype=bool)
     crossed[:, :, :-1, 0] = inside[:, :, :-1] != inside[:, :, 1:]
     crossed[:, :-1, :, 1] = inside[:, :-1, :] != inside[:, 1:, :]
     crossed[:-1, :, :, 2] = inside[:-1, :, :] != inside[1:, :, :]
     numbers = (np.cumsum(crossed) - 1).reshape(crossed.shape)
+    k, j, i, axis = np.argwhere(crossed).T
+    return CrossedEdges(numbers, (k, j, i), (k + (axis == 2), j + (axis == 1), i + (axis == 0)), axis)
 
-    owner = np.argwhere(crossed)
-    k, j, i, axis = owner.T
+
+def edge_margins(volume: Volume, rule: IsoRule, edges: CrossedEdges) -> NDArray[np.float64]:
+    """Smallest distance of each vertex from a sample, in steps, shape (n,)."""
+    margins, layers = vertex_margin(volume, rule.border), layer_margins(volume, rule.border)
+    return np.asarray(np.where(edges.axis == 2, layers[edges.near[0]], margins[edges.axis]))
+
+
+def build_surface(
+    volume: Volume,
+    rule: IsoRule,
+    inside: NDArray[np.bool_],
+    edges: CrossedEdges,
+    t: NDArray[np.float64],
+    slope: NDArray[np.float64],
+    next_slope: NDArray[np.float64],
+) -> Surface:
+    """Place the vertices at the parts `t` of their edges, and write the triangles.
+
+    Parameters
+    ----------
+    t : ndarray, shape (n,)
+        From the near end of each edge.
+    slope, next_slope : ndarray, shape (n, 3)
+        The two ends' parts of the gradient at the vertex, per step along i, j, k; where their sum vanishes the edge
+        itself says which way is down.
+    """
+    (k, j, i), (k1, j1, i1), axis, numbers = edges.near, edges.far, edges.axis, edges.numbers
+    slope, next_slope = slope.copy(), next_slope.copy()
+    field = sample_grid(volume, rule, rule.border)
+    margins, layers = vertex_margin(volume, rule.border), layer_margins(volume, rule.border)
     step = np.eye(3, dtype=np.int64)[axis]
-    i1, j1, k1 = i + step[:, 0], j + step[:, 1], k + step[:, 2]
-    value, next_value = field[k, j, i], field[k1, j1, i1]
-    margins = vertex_margin(volume, rule.border)
-    layers = layer_margins(volume, rule.border)
-    margin = np.where(axis == 2, layers[k], margins[axis])
-    half_way = np.zeros(len(owner), dtype=bool)
-    if hu_places is not None:
-        half_way = ~(hu_places[k, j, i] & hu_places[k1, j1, i1])
-    change = np.where(half_way, 1.0, next_value - value)
-    above = np.zeros(len(owner), dtype=bool)
-    if rule.highest_inside is not None:  # the outside end lies above the range
-        above = np.maximum(value, next_value) > rule.highest_inside
-    level = np.where(above, rule.upper_level or 0.0, rule.iso_level)
-    t = np.where(half_way, 0.5, np.clip((level - value) / change, margin, 1.0 - margin))[:, None]
-
     origins = volume.slice_origins(rule.border)
     here = np.stack([i, j], axis=1) - rule.border
-    positions = origins[k] + (here + t * step[:, :2]) @ volume.affine[:3, :2].T + t * (origins[k1] - origins[k])
-
-    slope, next_slope = (1.0 - t) * gradients[k, j, i], t * gradients[k1, j1, i1]
-    if half_way.any():
-        around = np.pad(inside.astype(np.float64), 1, mode="constant" if rule.closed else "edge")
-        gradients = _gradients(around, rule)
-        slope[half_way], next_slope[half_way] = gradients[k, j, i][half_way], gradients[k1, j1, i1][half_way]
-    slope[above], next_slope[above] = -slope[above], -next_slope[above]  # from here on they point inwards
+    along = t[:, None]
+    positions = origins[k] + (here + along * step[:, :2]) @ volume.affine[:3, :2].T + along * (origins[k1] - origins[k])
     flat = ~(slope + next_slope).any(axis=1)
     rise = np.where(inside[k1, j1, i1], 1.0, -1.0)
     slope[flat], next_slope[flat] = (rise[:, None] * step)[flat], 0.0
@@ -223,8 +278,8 @@ def extract_inside(
         triangles, (cells, points, cell_slope) = _find_trilinear_triangles(inside, numbers, heights, in_cells)
         ck = cells[:, 0]
         cell_up = np.einsum("nij,nj->ni", layer_normal_matrices(volume, rule.border)[ck], cell_slope)
-        here = cells[:, :0:-1] - rule.border + points[:, :2]
-        placed = origins[ck] + here @ volume.affine[:3, :2].T + points[:, 2:] * (origins[ck + 1] - origins[ck])
+        in_slice = cells[:, :0:-1] - rule.border + points[:, :2]
+        placed = origins[ck] + in_slice @ volume.affine[:3, :2].T + points[:, 2:] * (origins[ck + 1] - origins[ck])
         # Slice by slice: the vertices on edges, then those inside cells.
         order = np.argsort(np.concatenate([k, ck]), kind="stable")
         triangles = np.argsort(order).astype(np.uint32)[triangles]

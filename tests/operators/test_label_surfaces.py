@@ -236,6 +236,16 @@ def test_every_pass_on_a_small_volume(device):
         assert np.array_equal(mesh.triangles, twin.extract_label(volume, inside, number, 3)[2])
 
 
+@pytest.mark.oclgrind
+def test_a_label_without_growth_between_other_slices(device):
+    """The slices that are held reach as far as those that are read."""
+    volume, labels = random_volume((12, 4, 33)), np.zeros((12, 4, 33), np.uint16)
+    labels[4:6] = 3
+    inside = twin.find_solid(volume, labels, 3, grow_mm=0)
+    mesh = extract_labels(volume, LabelMap(labels, OBLIQUE), 3, device, grow_mm=0)[3]
+    assert np.array_equal(mesh.triangles, twin.extract_label(volume, inside, 3, 3)[2])
+
+
 def test_a_real_vertebra_is_sound(device, real_data):
     from clrecon.dicom import read_volume
     from clrecon.labels import read_labels

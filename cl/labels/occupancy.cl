@@ -1,0 +1,247 @@
+/* The occupancy of a label: its mask smoothed by two rounds of [1 2 1] / 4 along each axis, exact in whole numbers.
+ *
+ * References: our own; smoothing binary samples before contouring is old (Gibson 1998 names what is wrong with it alone:
+ * thin parts vanish; here the mask keeps deciding what is inside, see isosurface/mask_border.h).
+ *
+ * One axis:  weights  1  4  6  4  1   of samples i - 2 .. i + 2; beyond the map its outermost samples go on
+ *
+ * Passes
+ *   1. find_boxes       where each label lies
+ *   2. smooth_rows      along i: 0 to 16 a sample
+ *   3. smooth_across    along j and k: 0 to 4096, stored times FINENESS
+ *   4. classify_mask    one bit a sample: carries the label
+ *      (counting and writing: cl/isosurface/marching_cubes.cl with -D MASKS)
+ *   5. sum_volumes      what the triangles enclose, for the choice of the level */
+#include "include/volume.h"
+#include "isosurface/mask_rows.h"
+#include "labels/label_type.h"
+#include "labels/occupancy.h"
+
+#if REACH != 2
+#error "the rows below have five samples"
+#endif
+
+/* Parameters  boxes    out  (labels, 6) highest int three times, lowest int three times: no box yet
+ *             labels
+ * Launch      global = labels rounded up by the host, any local */
+__kernel void clear_boxes(__global int *restrict boxes, const uint labels)
+{
+    const uint item = get_global_id(0);
+    if (item >= labels)
+        return;
+    for (uint axis = 0; axis < 3; ++axis) {
+        boxes[6 * item + axis] = INT_MAX;
+        boxes[6 * item + 3 + axis] = INT_MIN;
+    }
+}
+
+/* Widen the box of a label by samples begin .. end - 1 of row (j, k). */
+static inline void widen_box(__global int *box, int begin, int end, int j, int k)
+{
+    atomic_min(box, begin);
+    atomic_min(box + 1, j);
+    atomic_min(box + 2, k);
+    atomic_max(box + 3, end - 1);
+    atomic_max(box + 4, j);
+    atomic_max(box + 5, k);
+}
+
+/* Parameters  map      in      (nk, nj, ni)
+ *             boxes    in/out  (labels, 6) lowest i, j, k of each label, highest i, j, k; from clear_boxes
+ *             ni nj nk
+ * Launch      global = nk * nj rounded up by the host, any local: one item a row
+ * Races       items widen the same box by atomic minimum and maximum: in any order with the same outcome
+ * Guarantees  boxes are those of all samples of the label; label 0 is left out */
+__kernel void find_boxes(
+    __global const LABEL *restrict map, __global int *restrict boxes, const int ni, const int nj, const int nk)
+{
+    const uint item = get_global_id(0);
+    if (item >= (uint)nj * (uint)nk)
+        return;
+    const int j = (int)(item % nj), k = (int)(item / nj);
+    __global const LABEL *row = map + voxel_index(0, j, k, ni, nj);
+    uint open = 0; /* the label whose samples begin .. end - 1 of the row are not in its box yet */
+    int begin = 0, end = 0, i = 0;
+    while (i < ni) {
+        const LABEL label = row[i];
+        const int first = i++;
+        while (i + 16 <= ni && pack_lanes(convert_short16(vload16(0, row + i) != label)) == 0)
+            i += 16;
+        while (i < ni && row[i] == label)
+            ++i;
+        if (label == 0)
+            continue;
+        if (label != open) {
+            if (open != 0)
+                widen_box(boxes + 6 * (size_t)open, begin, end, j, k);
+            open = label;
+            begin = first;
+        }
+        end = i;
+    }
+    if (open != 0)
+        widen_box(boxes + 6 * (size_t)open, begin, end, j, k);
+}
+
+/* 16 samples from `at` on: 255 where they carry `label`, or any label where that is 0; else 0. */
+static inline uchar16 find_label(__global const LABEL *at, const LABEL label)
+{
+    const short16 found = convert_short16(vload16(0, at) == (LABEL)label);
+    return as_uchar16(convert_char16(label != 0 ? found : ~found));
+}
+
+/* Parameters  map       in   slices of (nk, nj, ni) from first_slice on
+ *             rows      out  (slices, nj, ni) sums along i
+ *             label     number of the label; 0: all labels
+ *             ni nj     of the whole map
+ *             begin_i end_i begin_j end_j   the samples that are wanted: others are not written
+ *             slices
+ * Launch      global = slices * (end_j - begin_j) rounded up by the host, any local: one item a row
+ * Guarantees  every wanted sum is written; samples up to 15 before or behind them in the row may be too, right as well */
+__kernel void smooth_rows(
+    __global const LABEL *restrict map, __global uchar *restrict rows, const uint label,
+    const int ni, const int nj, const int begin_i, const int end_i, const int begin_j, const int end_j,
+    const uint slices)
+{
+    const uint item = get_global_id(0), height = end_j - begin_j;
+    if (item >= height * slices)
+        return;
+    const size_t row = voxel_index(0, begin_j + (int)(item % height), (int)(item / height), ni, nj);
+    __global const LABEL *in = map + row;
+    __global uchar *out = rows + row;
+#define AT(i) ((uchar)(label != 0 ? in[clamp(i, 0, ni - 1)] == label : in[clamp(i, 0, ni - 1)] != 0))
+    int i = begin_i;
+    while (i < end_i) {
+        if (i >= REACH && i + 16 + REACH <= ni) {
+            const uchar16 sum = (find_label(in + i - 2, (LABEL)label) & (uchar)1)
+                + (find_label(in + i - 1, (LABEL)label) & (uchar)4) + (find_label(in + i, (LABEL)label) & (uchar)6)
+                + (find_label(in + i + 1, (LABEL)label) & (uchar)4) + (find_label(in + i + 2, (LABEL)label) & (uchar)1);
+            vstore16(sum, 0, out + i);
+            i += 16;
+        } else {
+            out[i] = AT(i - 2) + AT(i + 2) + (uchar)4 * (AT(i - 1) + AT(i + 1)) + (uchar)6 * AT(i);
+            ++i;
+        }
+    }
+#undef AT
+}
+
+/* Parameters  rows        in   (row_slices, nj, ni) of smooth_rows, from slice first_row_slice of the map on
+ *             occupancy   out  as `rows`
+ *             ni nj nk    of the whole map
+ *             begin_i end_i begin_j end_j   the samples that are wanted: others are not written
+ *             first_row_slice   slice of the map that both begin with
+ *             first_slice slices   those that are wanted
+ * Launch      global = slices * (end_j - begin_j) rounded up by the host, any local: one item a row
+ * Assumes     `rows` has the wanted samples and those REACH around them, as far as the map goes
+ * Guarantees  every wanted occupancy is written; samples up to 15 behind them in the row may be too, with any value */
+__kernel void smooth_across(
+    __global const uchar *restrict rows, __global short *restrict occupancy,
+    const int ni, const int nj, const int nk, const int begin_i, const int end_i, const int begin_j, const int end_j,
+    const int first_row_slice, const int first_slice, const uint slices)
+{
+    const uint item = get_global_id(0), height = end_j - begin_j;
+    if (item >= height * slices)
+        return;
+    const int j = begin_j + (int)(item % height), k = first_slice + (int)(item / height);
+    __global short *out = occupancy + voxel_index(0, j, k - first_row_slice, ni, nj);
+    size_t along_j[5], along_k[5];
+    for (int d = -REACH; d <= REACH; ++d) {
+        along_j[d + REACH] = voxel_index(0, clamp(j + d, 0, nj - 1), 0, ni, nj);
+        along_k[d + REACH] = voxel_index(0, 0, clamp(k + d, 0, nk - 1) - first_row_slice, ni, nj);
+    }
+    int i = begin_i;
+    for (; i + 16 <= ni && i < end_i; i += 16) {
+        ushort16 sum = 0;
+        for (int d = 0; d <= 2 * REACH; ++d) {
+#define ROW(n) convert_ushort16(vload16(0, rows + along_k[d] + along_j[n] + i))
+            const ushort16 plane = ROW(0) + ROW(4) + (ushort)4 * (ROW(1) + ROW(3)) + (ushort)6 * ROW(2);
+#undef ROW
+            sum += (ushort)weigh(d - REACH) * plane;
+        }
+        vstore16(as_short16(sum * (ushort)FINENESS), 0, out + i);
+    }
+    for (; i < end_i; ++i) {
+        int sum = 0;
+        for (int d = 0; d <= 2 * REACH; ++d)
+            for (int n = 0; n <= 2 * REACH; ++n)
+                sum += weigh(d - REACH) * weigh(n - REACH) * rows[along_k[d] + along_j[n] + i];
+        out[i] = (short)(FINENESS * sum);
+    }
+}
+
+/* The word of 32 samples that starts at voxel `first` of a row; `first` may lie before it, samples may lie beyond. */
+static inline uint classify_label_word(__global const LABEL *row, int first, int ni, LABEL label)
+{
+    if (first >= 0 && first + 32 <= ni)
+        return pack_lanes(convert_short16(vload16(0, row + first) == label))
+            | pack_lanes(convert_short16(vload16(0, row + first + 16) == label)) << 16;
+    uint bits = 0;
+    for (int b = max(0, -first); b < min(32, ni - first); ++b)
+        bits |= (uint)(row[first + b] == label) << b;
+    return bits;
+}
+
+/* Parameters  map         in   slices of (nk, nj, ni) from first_slice on
+ *             mask        out  (gk, gj, words) bit set where the sample carries `label`
+ *             row_extents out  (gk, gj) first word of the row with a bit set, and the one after the last; 0, 0 in rows
+ *                              without any
+ *             label       number of the label
+ *             begin_j end_j   rows that may hold it
+ *             ni nj nk, border    of the whole map
+ *             first_slice         slice of the map that `map` begins with
+ *             first_sample_slice  slice of the sample grid that the mask begins with
+ *             gk                  slices of the mask
+ *             words               words a row, ceil((ni + 2 border) / 32)
+ * Launch      global = gk * gj rounded up by the host, any local: one item a row, as classify_samples
+ * Assumes     the slices of the mask that lie in the map are among those of `map`
+ * Guarantees  every word of the mask and every extent is written; bits beyond the row are 0 */
+__kernel void classify_mask(
+    __global const LABEL *restrict map, __global uint *restrict mask, __global ushort2 *restrict row_extents,
+    const uint label, const int begin_j, const int end_j,
+    const int ni, const int nj, const int nk, const int border, const int first_slice, const int first_sample_slice,
+    const uint gk, const int words)
+{
+    const uint gj = nj + 2 * border;
+    const uint row = get_global_id(0);
+    if (row >= gj * gk)
+        return;
+    __global uint *row_mask = mask + (size_t)row * words;
+    const int j = (int)(row % gj) - border, k = (int)(row / gj) + first_sample_slice - border;
+    const int in_box = j >= begin_j && j < end_j && k >= 0 && k < nk;
+    __global const LABEL *samples = map + (in_box ? voxel_index(0, j, k - first_slice, ni, nj) : 0);
+    int begin = words, end = 0;
+    for (int w = 0; w < words; ++w) {
+        const uint bits = in_box ? classify_label_word(samples, 32 * w - border, ni, (LABEL)label) : 0;
+        row_mask[w] = bits;
+        begin = min(begin, bits != 0 ? w : words);
+        end = bits != 0 ? w + 1 : end;
+    }
+    row_extents[row] = (ushort2)((ushort)min(begin, end), (ushort)end);
+}
+
+/* Parameters  positions   in   (vertices, 3) mm
+ *             triangles   in   (triangle_count, 3)
+ *             sums        out  (ceil(triangle_count / triangles_per_sum),) six times the volume between so many
+ *                              triangles and `centre`, mm3
+ *             centre      mm, near the triangles: products of small numbers keep their digits
+ *             triangle_count
+ * Launch      global = sums rounded up by the host, any local
+ * Guarantees  every sum is written once: the same on every run */
+__kernel void sum_volumes(
+    __global const float *restrict positions, __global const uint *restrict triangles, __global float *restrict sums,
+    const float4 centre, const uint triangle_count, const uint triangles_per_sum)
+{
+    const uint item = get_global_id(0);
+    const ulong begin = (ulong)item * triangles_per_sum;
+    if (begin >= triangle_count)
+        return;
+    const uint end = (uint)min(begin + triangles_per_sum, (ulong)triangle_count);
+    float sum = 0.0f;
+    for (uint n = (uint)begin; n < end; ++n) {
+        const uint3 corners = vload3(n, triangles);
+        const float3 a = vload3(corners.x, positions), b = vload3(corners.y, positions), c = vload3(corners.z, positions);
+        sum += dot(a - centre.xyz, cross(b - a, c - a));
+    }
+    sums[item] = sum;
+}

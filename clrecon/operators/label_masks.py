@@ -1,0 +1,351 @@
+"""Extract labels' own surfaces: the mask says what is inside, its smoothed occupancy places the vertices.
+
+The host side of cl/labels/occupancy.cl; counting and writing are those of cl/isosurface/marching_cubes.cl.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import DTypeLike
+
+from clrecon.errors import RefusedInputError, UsageError
+from clrecon.geometry import Volume
+from clrecon.geometry.field import IsoRule
+from clrecon.geometry.precision import describe_far
+from clrecon.kernels import Program, Stopwatch, allocate, download, launch, load_program, upload
+from clrecon.labels import LabelMap
+from clrecon.labels.occupancy import FULL, KEEP, REACH, STEEPNESS, next_level
+from clrecon.labels.solid import Box, find_boxes
+from clrecon.labels.volumes import label_ml
+from clrecon.mesh import Mesh
+from clrecon.opencl import Device, check_budget, choose_device, describe_shortage, memory_limits
+from clrecon.opencl.quirks import cache_warnings
+from clrecon.operators import marching_cubes
+from clrecon.operators.isosurface import Part, Progress
+from clrecon.operators.labels import Window, choose_numbers
+from clrecon.operators.marching_cubes import Classified, Counted, Placement
+from clrecon.operators.slabs import SampleGrid
+from clrecon.operators.voxel_types import label_variants
+
+__all__ = ["extract_label_masks", "prepare_label_masks"]
+
+SPARE_SLICES = 3 + REACH
+"""Beyond the label's box: slices of the mask, gradients, and what their occupancy needs."""
+
+TRIANGLES_PER_SUM = 256
+
+
+def prepare_label_masks(device: Device, label_dtype: DTypeLike = np.uint8) -> tuple[Program, Program]:
+    """Build the kernels for labels of this type: those of the occupancy, those of the surface.
+
+    Raises
+    ------
+    DeviceError
+        The driver's compiler refuses.
+    """
+    own = load_program(device, "labels/occupancy.cl", {"VOXEL": "short", "VALUE": "int", **label_variants(label_dtype)})
+    return own, marching_cubes.prepare_marching_cubes(device, np.int16, label_dtype, masks=True)
+
+
+@dataclass(frozen=True)
+class _Held:
+    """Slices of a map on the device, and room for what is computed from them."""
+
+    first: int
+    end: int
+    map_d: Any
+    rows_d: Any
+    occupancy_d: Any
+    occupied_d: Any
+
+
+class _Run:
+    """One extraction: what is common to its labels."""
+
+    def __init__(self, labels: LabelMap, device: Device, closed: bool):
+        self.labels = labels
+        self.device = device
+        self.stopwatch = Stopwatch()
+        self.groups = 1
+        self.device_bytes: dict[str, int] = {}
+        self.grid = SampleGrid(Volume(labels.voxels, labels.affine), IsoRule(0.5, FULL // 2, FULL / 2, 0.0, closed))
+        placement = Placement.of(self.grid.volume, self.grid.rule.border)
+        frames = placement.slice_frames.copy()
+        frames[:, 2, 3] = np.maximum(frames[:, 2, 3], KEEP)
+        self.placement = replace(placement, slice_frames=frames, margin=np.maximum(placement.margin, np.float32(KEEP)))
+        with self.stopwatch.timed("build"):
+            self.own, self.surface = prepare_label_masks(device, labels.voxels.dtype)
+
+    @property
+    def has_neighbours(self) -> bool:
+        """More than one label is there: two may touch."""
+        return len(self.labels.numbers) > 1
+
+    def find_boxes(self, numbers: Sequence[int], memory: int | None) -> dict[int, Box]:
+        """The box (k, j, i) of each label and the samples around it; on the device where the whole map fits it."""
+        voxels = self.labels.voxels
+        table = np.empty((self.labels.numbers[-1] + 1, 6), np.int32)
+        if describe_shortage(memory_limits(self.device, memory), {"labels": voxels.nbytes, "boxes": table.nbytes}):
+            return find_boxes(voxels, tuple(numbers), (0, 0, 0))
+        with self.stopwatch.timed("upload"):
+            map_d = upload(self.device, voxels)
+        table_d = allocate(self.device, table.nbytes)
+        ni, nj, nk = self.labels.shape_ijk
+        with self.stopwatch.running(self.device):
+            launch(
+                self.device, self.own["clear_boxes"], len(table), table_d, np.uint32(len(table)),
+                stopwatch=self.stopwatch,
+            )  # fmt: skip
+            launch(
+                self.device, self.own["find_boxes"], nj * nk, map_d, table_d, *(np.int32(n) for n in (ni, nj, nk)),
+                stopwatch=self.stopwatch,
+            )  # fmt: skip
+        download(self.device, table, table_d)
+        boxes: dict[int, Box] = {}
+        for number in numbers:
+            low, high = np.maximum(table[number, :3] - 1, 0), np.minimum(table[number, 3:] + 2, (ni, nj, nk))
+            i, j, k = (slice(int(begin), int(end)) for begin, end in zip(low, high, strict=True))
+            boxes[number] = (k, j, i)
+        return boxes
+
+    def slices_for(self, boxes: dict[int, Box]) -> tuple[int, int]:
+        """First and end of the slices of the map that these labels need."""
+        first = max(0, min(box[0].start for box in boxes.values()) - SPARE_SLICES)
+        return first, min(self.labels.shape_ijk[2], max(box[0].stop for box in boxes.values()) + SPARE_SLICES)
+
+    def needs(self, first: int, end: int) -> dict[str, int]:
+        """Bytes on the device for these slices."""
+        samples = self.labels.voxels[first:end].size
+        return {
+            "labels": samples * self.labels.voxels.itemsize,
+            "row sums": samples,
+            "occupancy": 2 * samples,
+            "occupancy of all labels": 2 * samples * self.has_neighbours,
+        }
+
+    def group(self, boxes: dict[int, Box], memory: int | None) -> list[dict[int, Box]]:
+        """All labels at once where their slices fit the device, else one by one: the meshes are the same."""
+        room = memory_limits(self.device, memory)
+        scratch = max(sum(self.window(box, (0, 0)).scratch().values()) for box in boxes.values())
+        needs = {**self.needs(*self.slices_for(boxes)), "scratch": min(scratch, room.buffer_bytes)}
+        if not describe_shortage(room, needs):
+            return [boxes]
+        return [{number: box} for number, box in boxes.items()]
+
+    def hold(self, boxes: dict[int, Box], memory: int | None) -> _Held:
+        """Upload the slices that the labels need, and find the occupancy of all labels."""
+        device = self.device
+        first, end = self.slices_for(boxes)
+        check_budget(device, self.needs(first, end), memory)
+        with self.stopwatch.timed("upload"):
+            map_d = upload(device, self.labels.voxels[first:end])
+        samples = self.labels.voxels[first:end].size
+        rows_d, occupancy_d = allocate(device, samples), allocate(device, 2 * samples)
+        occupied_d = allocate(device, 2 * samples) if self.has_neighbours else occupancy_d
+        held = _Held(first, end, map_d, rows_d, occupancy_d, occupied_d)
+        if self.has_neighbours:
+            around = tuple(
+                slice(min(box[axis].start for box in boxes.values()), max(box[axis].stop for box in boxes.values()))
+                for axis in range(3)
+            )
+            with self.stopwatch.running(device):
+                self._smooth(held, 0, around, occupied_d)  # type: ignore[arg-type]
+        return held
+
+    def _smooth(self, held: _Held, number: int, box: Box, occupancy_d: Any) -> None:
+        """The occupancy of a label (0: of all) in a box and REACH samples around, which are what gradients need."""
+        ni, nj, nk = self.labels.shape_ijk
+        inner = [
+            (max(0, part.start - REACH), min(n, part.stop + REACH)) for part, n in zip(box, (nk, nj, ni), strict=True)
+        ]
+        (begin_k, end_k), (begin_j, end_j), along_i = inner
+        row_j = max(0, begin_j - REACH), min(nj, end_j + REACH)
+        slices = held.end - held.first
+        launch(
+            self.device, self.own["smooth_rows"], slices * (row_j[1] - row_j[0]),
+            held.map_d, held.rows_d, np.uint32(number),
+            *(np.int32(n) for n in (ni, nj, *along_i, *row_j)), np.uint32(slices), stopwatch=self.stopwatch,
+        )  # fmt: skip
+        launch(
+            self.device, self.own["smooth_across"], (end_k - begin_k) * (end_j - begin_j),
+            held.rows_d, occupancy_d, *(np.int32(n) for n in (ni, nj, nk, *along_i, begin_j, end_j)),
+            np.int32(held.first), np.int32(begin_k), np.uint32(end_k - begin_k), stopwatch=self.stopwatch,
+        )  # fmt: skip
+
+    def window(self, box: Box, held: tuple[int, int]) -> Window:
+        """The slices of the sample grid around a label's box."""
+        return Window(self.grid, box[0].start, box[0].stop + 2 * self.grid.rule.border, held)
+
+    def extract_one(self, held: _Held, number: int, box: Box, memory: int | None) -> tuple[Part, int]:
+        """Positions, normals and triangles of one label, and the level that places them."""
+        device, stopwatch = self.device, self.stopwatch
+        window = self.window(box, (held.first, held.end))
+        needs = {**self.needs(held.first, held.end), **window.scratch()}
+        check_budget(device, needs, memory)
+        mask_d = allocate(device, 4 * window.mask_rows * self.grid.words)
+        classified = Classified(mask_d, allocate(device, 4 * window.mask_rows))
+        with stopwatch.running(device):
+            self._smooth(held, number, box, held.occupancy_d)
+            launch(
+                device, self.own["classify_mask"], window.mask_rows,
+                held.map_d, mask_d, classified.row_extents_d, np.uint32(number),
+                np.int32(box[1].start), np.int32(box[1].stop),
+                *marching_cubes.volume_scalars(window), np.uint32(window.mask_slices), np.int32(self.grid.words),
+                stopwatch=stopwatch,
+            )  # fmt: skip
+            counted = marching_cubes.count(device, window, self.surface, classified, stopwatch)
+        output = counted.output()
+        check_budget(device, {**needs, **output}, memory)
+        scratch = window.scratch()
+        self.device_bytes = {
+            "volume": sum(needs.values()) - sum(scratch.values()),
+            "scratch": sum(scratch.values()),
+            "output": sum(output.values()),
+        }
+        return self._keep_volume(held, window, classified, counted, number, box)
+
+    def _keep_volume(
+        self, held: _Held, window: Window, classified: Classified, counted: Counted, number: int, box: Box
+    ) -> tuple[Part, int]:
+        """Try levels until the mesh has the volume of the label's voxels, as near as a level brings it."""
+        emission = marching_cubes.Emission(
+            self.device, window, self.surface, held.occupancy_d, classified, counted, self.placement, self.stopwatch
+        )
+        wanted = 1000.0 * label_ml(self.labels, number)
+        # Every crossed edge carries a voxel's face; faces of all directions are about 1.5 times the area.
+        area_voxels = counted.vertices / 1.5
+        mm3_per_level = -area_voxels * abs(np.linalg.det(self.labels.affine[:3, :3])) / (STEEPNESS * FULL)
+        tried: list[tuple[int, float]] = []
+        arguments = (held.map_d, np.uint32(number), held.occupied_d)
+        with self.stopwatch.running(self.device):
+            emission.triangles()
+        level = next_level(tried, wanted, mm3_per_level)
+        while True:
+            with self.stopwatch.running(self.device):
+                emission.vertices(level, arguments)
+            if not self.grid.rule.closed or any(level == earlier for earlier, _ in tried):
+                return emission.download(), level
+            tried.append((level, self._enclosed_mm3(emission, counted.triangles, box)))
+            following = next_level(tried, wanted, mm3_per_level)
+            if following == level:
+                return emission.download(), level
+            level = following
+
+    def _enclosed_mm3(self, emission: marching_cubes.Emission, triangles: int, box: Box) -> float:
+        """What the mesh on the device encloses: sums of some hundred triangles there, all of them here."""
+        middle = [[(part.start + part.stop - 1) / 2 for part in box[::-1]]]
+        centre = np.zeros(4, np.float32)
+        centre[:3] = self.labels.ijk_to_lps(middle)[0]
+        if self.placement.origin is not None:
+            centre[:3] = self.labels.ijk_to_lps(middle)[0] - self.placement.origin
+        sums = np.empty(-(-triangles // TRIANGLES_PER_SUM), np.float32)
+        sums_d = allocate(self.device, sums.nbytes)
+        with self.stopwatch.running(self.device):
+            launch(
+                self.device, self.own["sum_volumes"], len(sums), emission.positions_d, emission.triangles_d, sums_d,
+                centre, np.uint32(triangles), np.uint32(TRIANGLES_PER_SUM), stopwatch=self.stopwatch,
+            )  # fmt: skip
+        return float(download(self.device, sums, sums_d).sum(dtype=np.float64)) / 6.0
+
+    def describe(self) -> dict[str, Any]:
+        """What the reports of all labels have in common."""
+        return {
+            "surface": "mask",
+            "closed_at_border": self.grid.rule.closed,
+            "affine_ijk_to_lps_mm": self.labels.affine.tolist(),
+            "device": self.device.label,
+            "driver": self.device.driver,
+            "slabs": self.groups,
+            "device_bytes": self.device_bytes,
+            "seconds": dict(self.stopwatch.seconds),
+            "kernel_seconds": dict(self.stopwatch.by_kernel),
+            "warnings": [*cache_warnings(), *describe_far(self.grid.volume), *self.labels.warnings],
+        }
+
+
+def extract_label_masks(
+    labels: LabelMap,
+    device: Device | str | int | None = None,
+    *,
+    numbers: Sequence[int | str] | None = None,
+    closed: bool = True,
+    memory: int | None = None,
+    progress: Progress | None = None,
+) -> dict[int, Mesh]:
+    """Extract each label's own surface: that of its mask, without its steps and with its volume.
+
+    Every voxel of the label is inside of its mesh and no other voxel is, so nothing is lost and nothing joined: the
+    vertices move along the edges between the centres of neighbours that differ, and stay within half a voxel of their
+    common face.  Where on an edge they lie says the occupancy, the mask smoothed by two rounds of [1 2 1] / 4 along
+    each axis: at the level that gives the mesh the volume of the label's voxels; between two labels where both lead by
+    as much, which both take, bit for bit.  Where the map ends the mesh ends flat, at the faces of its voxels.  HU play
+    no part: bones, organs and air are all the same.
+
+    Parameters
+    ----------
+    labels : LabelMap
+        The surfaces lie on its own grid: nothing is resampled.
+    device : Device, str or int, optional
+        See `clrecon.device`; None is the best of the machine.
+    numbers : sequence of int or str, optional
+        Labels to extract, as `LabelMap.find` takes them.  None: all that are there.
+    closed : bool
+        Close the surface where it meets the border of the map.
+    memory : int, optional
+        Bytes that may be taken on the device; None is all that it has.  Where the slices of all labels do not fit
+        together, the labels go through one by one; the meshes are the same.
+    progress : callable, optional
+        Called as ``progress("labels", done, total)``.
+
+    Returns
+    -------
+    dict of int to Mesh
+        In the order asked for, else ascending.  Each mesh is closed and manifold.  `Mesh.report` has ``surface``
+        ("mask"), ``label``, ``label_name``, ``label_ml`` (the volume of its voxels), ``mask_level`` (the share of
+        occupancy at which it lies), ``closed_at_border``, the affine, the device and the seconds.
+
+    Raises
+    ------
+    UsageError
+        Not a LabelMap, an unknown label, or rows of the map are too long.
+    RefusedInputError
+        The label map is empty.
+    DeviceError
+        No device, not even one label fits its memory, 2^32 vertices or triangles or more, or the device fails.
+
+    References
+    ----------
+    Gibson 1998, Constrained elastic surface nets (a surface that is smoothed within the voxels of its mask); Lorensen
+    and Cline 1987.
+    """
+    if not isinstance(labels, LabelMap):
+        raise UsageError(f"labels' own surfaces need a LabelMap, see clrecon.read_labels, not {type(labels).__name__}")
+    if not labels.numbers:
+        raise RefusedInputError("the label map is empty: no voxel has a label")
+    marching_cubes.check_row(labels.shape_ijk[0])
+    chosen = choose_numbers(labels, numbers)
+    run = _Run(labels, choose_device(device), closed)
+    boxes = run.find_boxes(chosen, memory)
+    groups = run.group(boxes, memory)
+    run.groups = len(groups)
+    meshes: dict[int, Mesh] = {}
+    for group in groups:
+        held = run.hold(group, memory)
+        for number, box in group.items():
+            if progress is not None:
+                progress("labels", len(meshes), len(boxes))
+            (positions, normals, triangles), level = run.extract_one(held, number, box, memory)
+            report = {
+                **run.describe(),
+                "label": number,
+                "label_name": labels.name(number),
+                "label_ml": label_ml(labels, number),
+                "mask_level": level / FULL,
+            }
+            meshes[number] = Mesh(run.placement.to_lps(positions), triangles, normals, report)
+            run.stopwatch = Stopwatch()  # what is common to all labels counts for the first
+    return meshes
