@@ -17,6 +17,12 @@ def add_label_arguments(parser: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--label", metavar="NAME|N", action="append", help="this label only; may be given again (default: all)"
     )
+    group.add_argument(
+        "--surface",
+        metavar="hu|mask",
+        help="hu: HU place the vertices (default); mask: the label's own surface, smoothed within its voxels and with"
+        " their volume, whatever the HU: organs, lungs, what HU do not show",
+    )
     group.add_argument("--solid", action="store_true", help="fill what is less dense within a label: marrow")
     group.add_argument(
         "--grow",
@@ -31,10 +37,13 @@ def describe_labels(meshes: list[dict[str, Any]]) -> list[str]:
     labels = [mesh for mesh in meshes if mesh["label"] is not None]
     if not labels:
         return []
+    count = len({mesh["label_number"] for mesh in labels})
+    if labels[0]["surface"] == "mask":
+        kinds = [f"labels   {count} label{'s' * (count > 1)}, by {'their' if count > 1 else 'its'} own mask"]
+        return kinds + _describe_volumes(labels)
     shares = [100.0 * mesh["vertices_by_hu_share"] for mesh in labels]
     low, high = min(shares), max(shares)
     share = f"{low:.0f}" if round(low) == round(high) else f"{low:.0f} to {high:.0f}"
-    count = len({mesh["label_number"] for mesh in labels})
     grow_mm = labels[0]["grow_mm"]
     growth = "one voxel" if grow_mm is None else f"{grow_mm:.3g} mm"
     kind = ", solid" if labels[0]["solid"] else ""
@@ -49,7 +58,8 @@ def _describe_volumes(labels: list[dict[str, Any]]) -> list[str]:
     surfaces = {(mesh["label_number"], mesh["iso_value_hu"]): mesh for mesh in labels}.values()
     if any(mesh["label_mesh_ml"] is None for mesh in surfaces):
         return []
-    label_ml = sum(mesh["label_ml"] * mesh["label_inside_share"] for mesh in surfaces)
+    by_hu = labels[0]["surface"] == "hu"  # its own surface goes on beyond the CT
+    label_ml = sum(mesh["label_ml"] * (mesh["label_inside_share"] if by_hu else 1.0) for mesh in surfaces)
     mesh_ml = sum(mesh["label_mesh_ml"] for mesh in surfaces)
     change = 100.0 * (mesh_ml / label_ml - 1.0)
     return [f"         {mesh_ml:,.2f} ml of mesh for {label_ml:,.2f} ml of labels ({change:+.1f} %)"]

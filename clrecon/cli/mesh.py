@@ -134,7 +134,7 @@ def run(options: argparse.Namespace, console: Console) -> int:
         min_volume_ml=options.min_volume,
         seeds=options.seed,
         split=options.split,
-        labels=choose_labels(options.labels, options.label, options.grow, options.solid),
+        labels=choose_labels(options.labels, options.label, options.grow, options.solid, options.surface),
         device=options.device,
         memory=options.memory,
         **masking_settings(options),
@@ -159,12 +159,10 @@ def run(options: argparse.Namespace, console: Console) -> int:
 
 def describe_mesh(report: dict[str, Any]) -> list[str]:
     """The report for people: what was read, what came out, on which device, in which time."""
-    reason = _describe_choice(report)
     border = "closed" if report["closed_at_border"] else "open"
-    levels = ", ".join(dict.fromkeys(_describe_inside(*mesh["inside_hu"]) for mesh in report["meshes"]))
     return [
         f"input    {describe_volume(report['volume'])}",
-        f"surface  {levels} HU ({reason}), {border} at the border of the volume",
+        f"surface  {_describe_surfaces(report)}, {border} at the border of the volume",
         f"mesh     {report['vertices']:,} vertices, {report['triangles']:,} triangles",
         *_describe_quality(report),
         *describe_labels(report["meshes"]),
@@ -173,6 +171,14 @@ def describe_mesh(report: dict[str, Any]) -> list[str]:
         f"device   {printable(report['device'])}{_describe_slabs(report)}",
         f"time     {_describe_times(report['seconds'])}",
     ]
+
+
+def _describe_surfaces(report: dict[str, Any]) -> str:
+    """What the surfaces enclose, and why."""
+    inside = dict.fromkeys(tuple(mesh["inside_hu"] or ()) for mesh in report["meshes"])
+    if () in inside:
+        return "masks of labels, whatever their HU"
+    return f"{', '.join(_describe_inside(*ends) for ends in inside)} HU ({_describe_choice(report)})"
 
 
 def _describe_inside(low: float | None, high: float | None) -> str:

@@ -13,7 +13,7 @@ from clrecon.errors import RefusedInputError, UsageError
 from clrecon.geometry import Volume, apply_affine
 from clrecon.labels.label_map import LabelMap
 
-__all__ = ["LEAST_SHARE_INSIDE", "ResampledLabels", "resample_labels"]
+__all__ = ["LEAST_SHARE_INSIDE", "ResampledLabels", "check_together", "resample_labels"]
 
 LEAST_SHARE_INSIDE = 0.01
 """Of the labelled voxels.  A whole body's labels on a scan of one joint have more; those of another scan have not."""
@@ -66,14 +66,31 @@ def resample_labels(labels: LabelMap, volume: Volume) -> ResampledLabels:
     """
     if not isinstance(labels, LabelMap) or not isinstance(volume, Volume):
         raise UsageError("a label map is brought to a volume: resample_labels(LabelMap, Volume)")
+    shares = check_together(labels, volume)
+    aligned = _take_aligned(labels, volume)
+    voxels, exact = (aligned, True) if aligned is not None else _take_nearest(labels, volume)
+    return ResampledLabels(voxels, exact, shares, labels.warnings)
+
+
+def check_together(labels: LabelMap, volume: Volume) -> dict[int, float]:
+    """Refuse a label map that cannot be of this scan.
+
+    Returns
+    -------
+    dict of int to float
+        For each number its share of labelled voxels that lie inside the volume, 0 to 1.
+
+    Raises
+    ------
+    RefusedInputError
+        It is empty, says that it belongs to another frame of reference, or less than 1 % of it lies inside the volume.
+    """
     if not labels.numbers:
         raise RefusedInputError("the label map is empty: no voxel has a label")
     _check_frame_of_reference(labels, volume)
     shares = _shares_inside(labels, volume)
     _check_overlap(labels, volume, shares)
-    aligned = _take_aligned(labels, volume)
-    voxels, exact = (aligned, True) if aligned is not None else _take_nearest(labels, volume)
-    return ResampledLabels(voxels, exact, shares, labels.warnings)
+    return shares
 
 
 def _check_frame_of_reference(labels: LabelMap, volume: Volume) -> None:

@@ -203,6 +203,8 @@ class _Run:
         rule = self.rule
         return {
             **rule.as_report(),
+            "surface": "hu",
+            "mask_level": None,
             "closed_at_border": rule.closed,
             "outside_hu": rule.outside if rule.closed else None,
             "affine_ijk_to_lps_mm": self.volume.affine.tolist(),

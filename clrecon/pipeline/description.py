@@ -151,7 +151,7 @@ def describe_job(
 
 def _shows_skin(surface: Surface, settings: MeshSettings) -> bool:
     """One of its levels lies between air and fat, and the outside of the body is not left out."""
-    if surface.label is not None or (surface.below and not settings.keep_outside):
+    if surface.label is not None or surface.iso_value is None or (surface.below and not settings.keep_outside):
         return False
     levels = surface.iso_value if isinstance(surface.iso_value, tuple) else (surface.iso_value,)
     return any(SKIN_HU[0] <= level <= SKIN_HU[1] for level in levels)

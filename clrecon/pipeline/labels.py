@@ -24,7 +24,10 @@ __all__ = [
 
 NAMES_SHOWN = 5
 
-_FACTS = ("label_inside_share", "label_ml", "label_taken_ml", "vertices_by_hu_share", "grow_mm", "solid")
+_FACTS = (
+    "surface", "label_inside_share", "label_ml", "label_taken_ml", "vertices_by_hu_share", "mask_level", "grow_mm",
+    "solid",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -41,16 +44,35 @@ class LabelChoice:
         See `clrecon.operators.labels.extract_labels`.
     solid : bool
         Fill what is less dense within a label.
+    surface : {"hu", "mask"}
+        HU place the vertices (`clrecon.operators.labels.extract_labels`), or each label has its own surface
+        (`clrecon.operators.label_masks.extract_label_masks`).
+
+    Raises
+    ------
+    UsageError
+        There is no such surface, or growth or filling by HU is asked for where HU play no part.
     """
 
     path: str | Path
     wanted: tuple[str | int, ...] = ()
     grow_mm: float | None = None
     solid: bool = False
+    surface: str = "hu"
+
+    def __post_init__(self) -> None:
+        if self.surface not in ("hu", "mask"):
+            raise UsageError(f"labels have no surface {self.surface!r}: it is hu or mask")
+        if self.surface == "mask" and (self.solid or self.grow_mm is not None):
+            raise UsageError("the surface of a mask is solid and does not grow: leave out --solid and --grow")
 
 
 def choose_labels(
-    path: str | None, wanted: Sequence[str] | None = None, grow_mm: float | None = None, solid: bool = False
+    path: str | None,
+    wanted: Sequence[str] | None = None,
+    grow_mm: float | None = None,
+    solid: bool = False,
+    surface: str | None = None,
 ) -> LabelChoice | None:
     """What the options of a command ask for, None where there is no label map.
 
@@ -60,8 +82,9 @@ def choose_labels(
         An option that means something with a label map only.
     """
     if path is not None:
-        return LabelChoice(path, tuple(wanted or ()), grow_mm, solid)
-    for option, given in (("--label", bool(wanted)), ("--solid", solid), ("--grow", grow_mm is not None)):
+        return LabelChoice(path, tuple(wanted or ()), grow_mm, solid, "hu" if surface is None else surface.lower())
+    options = {"--label": wanted, "--solid": solid, "--grow": grow_mm is not None, "--surface": surface}
+    for option, given in options.items():
         if given:
             raise UsageError(f"{option} says how labels become meshes: give their file with --labels FILE")
     return None
@@ -91,7 +114,7 @@ def extract_label_surfaces(
     settings: MeshSettings,
     progress: Progress,
 ) -> tuple[list[Surface], list[Mesh]]:
-    """Extract each label at each iso value.
+    """Extract each label at each iso value, or once where its own surface is asked for.
 
     Parameters
     ----------
@@ -116,6 +139,10 @@ def extract_label_surfaces(
     numbers = [labels.find(label) for label in choice.wanted] or labels.numbers
     suffixes = file_suffixes({number: labels.name(number) for number in numbers})  # reports hold no other names
     for surface in surfaces:
+        if surface.iso_value is None:
+            masks = _extract_masks(volume, labels, choice, device, settings, progress)
+            found += [(surface, number, mesh) for number, mesh in masks.items()]
+            continue
         if isinstance(surface.iso_value, tuple):  # refused with the settings
             raise UsageError(f"labels take one iso value, not {surface.describe()}")
         meshes = extract_labels(
@@ -135,6 +162,32 @@ def extract_label_surfaces(
         name = "_".join(part for part in (suffixes[number], surface.name) if part) if len(found) > 1 else ""
         named.append(replace(surface, name=name, label=suffixes[number]))
     return named, [mesh for _, _, mesh in found]
+
+
+def _extract_masks(
+    volume: Volume, labels: LabelMap, choice: LabelChoice, device: Device, settings: MeshSettings, progress: Progress
+) -> dict[int, Mesh]:
+    """Each label's own surface, on the map's own grid; the map must lie on the scan all the same."""
+    from clrecon.labels.resample import check_together
+    from clrecon.operators.label_masks import extract_label_masks
+
+    shares = check_together(labels, volume)
+    meshes = extract_label_masks(
+        labels, device, numbers=choice.wanted or None, closed=settings.closed, memory=settings.memory, progress=progress
+    )
+    for number, mesh in meshes.items():
+        mesh.report |= {
+            "certificate": volume.report,
+            "label_inside_share": shares[number],
+            "label_taken_ml": None,
+            "vertices_by_hu_share": None,
+            "grow_mm": None,
+            "solid": False,
+        }
+        if shares[number] < 1.0:
+            share = f"{100 * (1 - shares[number]):.3g} %"
+            mesh.report["warnings"].append(f"{share} of label {number} lie outside the CT: its surface goes on there")
+    return meshes
 
 
 def describe_label(origin: dict[str, Any]) -> dict[str, Any]:
@@ -165,10 +218,12 @@ def judge_label_volumes(parts: Sequence[Part], closed: bool) -> list[dict[str, A
     gates = []
     for surface, own in by_surface.items():
         origin = own[0].mesh.report
-        label_ml = _ml_in_ct(origin)
+        by_hu = origin["surface"] == "hu"
+        label_ml = _ml_in_ct(origin) if by_hu else origin["label_ml"]
         mesh_ml = sum(enclosed_ml(part.mesh.vertices, part.mesh.triangles) for part in own) if closed else None
         advice = "" if mesh_ml is None else _advise(mesh_ml < label_ml, origin)
-        gates.append({"mesh": surface.name or None, **judge_label_volume(mesh_ml, label_ml, advice)})
+        gate = judge_label_volume(mesh_ml, label_ml, advice, by_hu=by_hu)
+        gates.append({"mesh": surface.name or None, **gate})
         for part in own:
             part.facts["label_mesh_ml"] = mesh_ml
     return gates
@@ -184,11 +239,14 @@ def _advise(too_small: bool, origin: dict[str, Any]) -> str:
     kept, found = origin.get("components_kept"), origin.get("components_found")
     if too_small and kept is not None and kept < found:
         return f"{kept} of its {found} components were kept"
+    if origin["surface"] == "mask":
+        return "no level makes up for borders with other labels or what was done after it; the mask itself is kept"
     if not too_small:
-        return "dense voxels around the label were taken in; a higher --hu or a smaller --grow takes fewer"
+        return (
+            "dense voxels around the label were taken in; a higher --hu or a smaller --grow takes fewer, --surface mask"
+            " takes the label as it is"
+        )
+    below = f"below {origin['iso_value_hu']:g} HU"
     if origin["solid"]:
-        return f"much of the label lies below {origin['iso_value_hu']:g} HU up to its border; a lower --hu takes it in"
-    return (
-        f"what lies below {origin['iso_value_hu']:g} HU is left out; --solid fills the marrow of bones, soft tissue"
-        " needs a lower --hu"
-    )
+        return f"much of the label lies {below} up to its border; a lower --hu or --surface mask takes it in"
+    return f"what lies {below} is left out; --solid fills the marrow of bones, --surface mask takes organs and all else"

@@ -38,6 +38,8 @@ def describe_level(
     volume: Volume, settings: MeshSettings, choice: IsoChoice | None
 ) -> tuple[dict[str, Any], list[str]]:
     """Entries of the report, and warnings."""
+    if not settings.follows_hu:
+        return {"iso_value_reason": "none: the masks of the labels", "iso_value_choice": None}, []
     if choice is None:
         preset = settings.preset_used
         reason = "as given" if preset is None else f"preset {preset}: {find_preset(preset).source}"

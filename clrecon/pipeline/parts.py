@@ -27,8 +27,8 @@ class Surface:
     ----------
     name : str
         What tells its files from those of the other surfaces, such as ``"200hu"``; empty where it is the only one.
-    iso_value : float or (float, float)
-        HU; or the two ends of a range.
+    iso_value : float or (float, float) or None
+        HU; or the two ends of a range; None: it is a label's own.
     below : bool
         It encloses what lies below the iso value.
     label : str or int or None
@@ -36,12 +36,14 @@ class Surface:
     """
 
     name: str
-    iso_value: float | tuple[float, ...]
+    iso_value: float | tuple[float, ...] | None
     label: str | int | None = None
     below: bool = False
 
     def describe(self) -> str:
         """What it encloses: ``200 HU``, ``100:300 HU``, ``below -400 HU``."""
+        if self.iso_value is None:
+            return "the mask"
         return f"{'below ' if self.below else ''}{name_level(self.iso_value)} HU"
 
 
@@ -70,9 +72,9 @@ class Part:
 
 
 def plan_surfaces(levels: Sequence[float | tuple[float, ...]], below: bool = False) -> list[Surface]:
-    """One surface an iso value or range (HU), in their order."""
-    if len(levels) == 1:
-        return [Surface("", levels[0], below=below)]
+    """One surface an iso value or range (HU), in their order; without any the one of a mask."""
+    if len(levels) < 2:
+        return [Surface("", levels[0] if levels else None, below=below)]
     return [Surface(_name_surface(level, below), level, below=below) for level in levels]
 
 
@@ -99,6 +101,8 @@ def check_levels(volume: Volume, surfaces: Sequence[Surface]) -> None:
     low, high = volume.report["hu_range"]
     for surface in surfaces:
         level = surface.iso_value
+        if level is None:
+            continue
         if isinstance(level, tuple):
             all_inside = level[0] <= low and level[1] >= high
         else:
@@ -122,7 +126,7 @@ def extract_surfaces(
     """
     from clrecon.operators.isosurface import extract_isosurfaces
 
-    levels = [surface.iso_value for surface in surfaces]
+    levels = [surface.iso_value for surface in surfaces if surface.iso_value is not None]
     return extract_isosurfaces(
         volume,
         levels,

@@ -112,6 +112,7 @@ class MeshSettings:
     def __post_init__(self) -> None:
         if self.iso_value is not None and self.preset is not None:
             raise UsageError("give either an iso value in HU or a preset, not both")
+        self._check_masks()
         self._check_below()
         self._check_half_way()
         if self.preset is not None:
@@ -137,6 +138,17 @@ class MeshSettings:
         if self.labels is not None and self.topology != "separated":
             raise UsageError(f"the topology {self.topology} follows HU: leave it out with labels, which pick the cells")
 
+    def _check_masks(self) -> None:
+        """Labels' own surfaces do not depend on HU: what chooses or changes them would do nothing, in silence."""
+        if self.follows_hu:
+            return
+        levels = (self.iso_value, self.below, self.preset, self.half_way)
+        if any(given is not None for given in (*levels, self.field_of_view)) or self.remove_table:
+            raise UsageError(
+                "the surface of a mask does not depend on HU: leave out iso values, presets, and what turns voxels into"
+                " air"
+            )
+
     def _check_half_way(self) -> None:
         if self.half_way is None:
             return
@@ -161,7 +173,7 @@ class MeshSettings:
             raise UsageError("give either an iso value or what to stay below, not both")
 
     def _check_levels(self) -> None:
-        if isinstance(self.half_way, str):
+        if isinstance(self.half_way, str) or not self.follows_hu:
             return
         if not self.levels:
             raise UsageError("give at least one iso value in HU")
@@ -203,6 +215,8 @@ class MeshSettings:
     @property
     def levels(self) -> tuple[float | tuple[float, ...], ...]:
         """The iso values or ranges in HU that are used, one a surface; NaN for what the scan has yet to give."""
+        if not self.follows_hu:
+            return ()
         if self.below is not None:
             return tuple(self.below) if isinstance(self.below, Sequence) else (self.below,)
         if isinstance(self.half_way, str):
@@ -218,6 +232,11 @@ class MeshSettings:
         return (self.iso_value,)
 
     @property
+    def follows_hu(self) -> bool:
+        """HU place the surfaces; else they are labels' own."""
+        return self.labels is None or self.labels.surface == "hu"
+
+    @property
     def inside(self) -> str:
         """What the surfaces enclose, see `clrecon.geometry.field.IsoRule`; "between" where one of them is a range."""
         if self.below is not None:
@@ -231,9 +250,9 @@ class MeshSettings:
 
     @property
     def preset_used(self) -> str | None:
-        """Name of the preset behind `levels`, None where the value was given or is half way."""
+        """Name of the preset behind `levels`, None where the value was given, is half way, or there is none."""
         named = any(given is not None for given in (self.iso_value, self.below, self.half_way))
-        return None if named else (self.preset or DEFAULT_PRESET)
+        return None if named or not self.follows_hu else (self.preset or DEFAULT_PRESET)
 
     @property
     def selects(self) -> bool:

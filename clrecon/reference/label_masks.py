@@ -110,7 +110,7 @@ def choose_level(labels: NDArray[Any], affine: NDArray[np.float64], number: int)
     """The level at which the mesh of a label encloses the volume of its voxels."""
     wanted = np.count_nonzero(labels == number) * abs(np.linalg.det(affine[:3, :3]))
     tried: list[tuple[int, float]] = []
-    level = next_level(tried, wanted, 0.0)
+    level = next_level(tried, wanted, -1.0)
     while all(level != earlier for earlier, _ in tried):
         vertices, _, triangles = extract_label_mask(labels, affine, number, level)
         corners = (vertices - vertices.mean(axis=0))[triangles]

@@ -85,7 +85,7 @@ def test_a_mesh_that_is_not_of_its_labels_size_is_said(
     assert run(ct, "-o", tmp_path / "b.stl", *options, device=device) == 0  # said without a report too
     captured = capsys.readouterr()
     assert "gate label_volume failed: the mesh has" in captured.err
-    assert "what lies below -150 HU is left out; --solid" in captured.err
+    assert "what lies below -150 HU is left out; --solid" in captured.err and "--surface mask" in captured.err
     assert "ml of mesh for" in captured.out
     arguments = (*options, "--strict", "--report", tmp_path / "r.json")
     assert run(ct, "-o", tmp_path / "b.stl", *arguments, device=device) == 8
@@ -102,6 +102,55 @@ def test_a_mesh_that_is_not_of_its_labels_size_is_said(
     assert [gate["ok"] for gate in report["gates"] if gate["name"] == "label_volume"] == [None]
     assert report["meshes"][0]["label_mesh_ml"] is None
     assert names_in("clrecon mesh INPUT", "Of each mesh in `meshes`") <= set(report["meshes"][0])
+
+
+def test_the_labels_own_surface_does_not_depend_on_hu(
+    device: Any, ct: Path, labels: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    options = ("--labels", labels, "--surface", "mask", "--strict", "--report", tmp_path / "r.json")
+    assert run(ct, "-o", tmp_path / "b.ply", *options, device=device) == 0
+    captured = capsys.readouterr()
+    assert "surface  masks of labels, whatever their HU, closed" in captured.out
+    assert "labels   3 labels, by their own mask" in captured.out and "(+0.0 %)" in captured.out
+    report = json.loads((tmp_path / "r.json").read_text())
+    assert [mesh["name"] for mesh in report["meshes"]] == ["left_half", "RIGHT_half", "Doe_Jane_x1b_31m"]
+    assert report["iso_value_hu"] is None and report["preset"] is None and report["inside_hu"] is None
+    for mesh in report["meshes"]:
+        assert mesh["surface"] == "mask" and 0.0 < mesh["mask_level"] < 1.0 and mesh["label_taken_ml"] is None
+        assert mesh["volume_ml"] == pytest.approx(mesh["label_ml"], rel=tolerances.MASK_VOLUME)
+        assert names_in("clrecon mesh INPUT", "Of each mesh in `meshes`") <= set(mesh)
+
+
+def test_a_mask_that_leaves_the_ct_goes_on_there(
+    device: Any, ct: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shifted = AFFINE.copy()
+    shifted[2, 3] += 6 * SPACING[2]
+    map_file = write_nifti(tmp_path / "a.nii.gz", (sphere_voxels() >= 0).astype(np.uint8), shifted)
+    arguments = ("-o", tmp_path / "b.stl", "--labels", map_file, "--surface", "mask", "--report", tmp_path / "r.json")
+    assert run(ct, *arguments, device=device) == 0
+    assert "of label 1 lie outside the CT: its surface goes on there" in capsys.readouterr().err
+    (mesh,) = json.loads((tmp_path / "r.json").read_text())["meshes"]
+    assert mesh["label_inside_share"] < 1.0
+    assert mesh["volume_ml"] == pytest.approx(mesh["label_ml"], rel=tolerances.MASK_VOLUME)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["--hu", "200"], "the surface of a mask does not depend on HU"),
+        (["--preset", "bone"], "the surface of a mask does not depend on HU"),
+        (["--remove-table"], "the surface of a mask does not depend on HU"),
+        (["--solid"], "the surface of a mask is solid and does not grow"),
+        (["--surface", "nets"], "labels have no surface 'nets': it is hu or mask"),
+    ],
+)
+def test_what_masks_do_not_look_at_is_refused(
+    options: list[str], words: str, ct: Path, labels: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(ct, "-o", tmp_path / "b.stl", "--labels", labels, "--surface", "mask", *options) == 3
+    assert words in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_components_of_a_label_count_together(device: Any, ct: Path, labels: Path, tmp_path: Path) -> None:
@@ -149,7 +198,7 @@ def test_what_cannot_be_is_said_in_one_line(
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("options", [["--solid"], ["--label", "1"], ["--grow", "1"]])
+@pytest.mark.parametrize("options", [["--solid"], ["--label", "1"], ["--grow", "1"], ["--surface", "hu"]])
 def test_label_options_without_labels_are_refused(
     options: list[str], ct: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
