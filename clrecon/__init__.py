@@ -33,7 +33,8 @@ if TYPE_CHECKING:
     from clrecon.labels import LabelMap, read_labels
     from clrecon.mesh import Mesh
     from clrecon.mesh.distances import compare_meshes
-    from clrecon.mesh.refinement import decimate_mesh, smooth_mesh
+    from clrecon.mesh.refinement import decimate_mesh
+    from clrecon.mesh.smoothing import smooth_mesh
     from clrecon.opencl import Device
     from clrecon.operators.isosurface import SurfaceExtractor, extract_isosurface, extract_isosurfaces
     from clrecon.operators.label_masks import extract_label_masks
@@ -126,7 +127,7 @@ _HOMES = {
     "reformat_curve": "clrecon.operators.reformat",
     "remove_table": "clrecon.geometry.body",
     "render": "clrecon.operators.renderer",
-    "smooth_mesh": "clrecon.mesh.refinement",
+    "smooth_mesh": "clrecon.mesh.smoothing",
     "turntable_cameras": "clrecon.rendering.motion",
     "write_animation": "clrecon.rendering.motion",
 }

@@ -43,7 +43,7 @@ def add_refinement(parser: argparse.ArgumentParser) -> None:
         "--max-deviation",
         type=float,
         metavar="MM",
-        help="smoothing and decimation each move no vertex further (default: a quarter of the shortest voxel step)",
+        help="smoothing and decimation each move nothing further (default: a quarter of the shortest voxel step)",
     )
 
 
@@ -77,8 +77,7 @@ def describe_refinement(meshes: list[dict[str, Any]]) -> list[str]:
     if "smooth" in worst:
         parts.append(f"smoothed ({worst['smooth']['iterations']} iterations)")
     if "decimate" in worst:
-        asked = worst["decimate"]["fraction"]
-        parts.append(f"{100 * worst['decimate']['reached']:.1f} % of {100 * asked:g} % of the triangles taken away")
+        parts.append(_describe_decimation(worst["decimate"]))
     deviation, voxel = worst["deviation"], worst["voxel_mm"]
     if deviation["volume_change_percent"] is not None:
         parts.append(f"volume {deviation['volume_change_percent']:+.2f} %")
@@ -88,6 +87,15 @@ def describe_refinement(meshes: list[dict[str, Any]]) -> list[str]:
         for name, key in (("mean", "assd_mm"), ("95 % within", "hd95_mm"), ("largest", "max_mm"))
     )
     return [f"{which} {', '.join(parts)}", f"         from the surface before: {lengths}"]
+
+
+def _describe_decimation(found: dict[str, Any]) -> str:
+    """How much was taken away of what was asked for, and what ended it."""
+    asked, reached = 100 * found["fraction"], 100 * found["reached"]
+    if found["ended_by"] == "share":
+        return f"{reached:.1f} % of the triangles taken away, as asked"
+    bound = f"the bound of {found['max_deviation_mm']:.3g} mm"
+    return f"{reached:.1f} % of the triangles taken away of {asked:g} % asked for: {bound} ended it"
 
 
 def finish_with_gates(report: dict[str, Any], console: Console, strict: bool) -> int:

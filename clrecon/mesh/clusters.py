@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -15,15 +13,12 @@ from clrecon.mesh.connectivity import (
     label_components,
     opposite_half_edges,
 )
-from clrecon.mesh.coordinates import as_stored
-from clrecon.mesh.distances import NearDistance
-from clrecon.mesh.intersections import find_self_intersections
+from clrecon.mesh.coordinates import as_stored, find_coincident
+from clrecon.mesh.deviation import Deviation
+from clrecon.mesh.intersections import find_beside, find_self_intersections
 from clrecon.mesh.measures import cross_products
 
 __all__ = ["Clusters"]
-
-_FEW = 0.05
-"""Share of faces up to which it pays to look for what lies around them."""
 
 Float64Array = NDArray[np.float64]
 IntArray = NDArray[np.integer]
@@ -33,44 +28,35 @@ class Clusters:
     """A mesh whose vertices are brought together: the surface is the given one with vertices renamed.
 
     Every edge collapse renames one vertex to another and drops the triangles that have both.  The end of many of
-    them is a name for each vertex and a place for each name; a cluster is undone by giving its vertices their own
-    names and places back.
+    them is a name for each vertex and a place for each name.  Collapses come in rounds; a cluster is undone by giving
+    its vertices the names and places that they had before the last round.
 
     Parameters
     ----------
-    vertices : ndarray, shape (n, 3), float64, mm, relative to a local origin
+    vertices : ndarray, shape (n, 3), float64, mm, relative to `origin`
     triangles : ndarray, shape (m, 3), uint32
-    names : ndarray, shape (n,), int
-        For each vertex the one that stands for its cluster.
-    places : ndarray, shape (n, 3), float64
-        Where the vertices that stand for a cluster come to lie; of the others not used.
+    origin : ndarray, shape (3,), float64, mm
+        Places are kept rounded as a `Mesh` stores them, with this added.
     """
 
-    def __init__(self, vertices: Float64Array, triangles: NDArray[np.uint32], names: IntArray, places: Float64Array):
-        self._vertices, self._triangles = vertices, triangles
-        self._names, self._places = names, places
+    def __init__(self, vertices: Float64Array, triangles: NDArray[np.uint32], origin: Float64Array):
+        self._triangles, self._origin = triangles, origin
+        self._names, self._places = np.arange(len(vertices)), self._rounded(vertices)
+        self._before = self._names, self._places
         self._components = label_components(triangles, len(vertices))
-        self._seen: IntArray = np.full(triangles.shape, -1)
-        self._seen_uncut: IntArray = np.full(triangles.shape, -1)
-        self._before: tuple[Any, NearDistance] | None = None
+        # Vertices whose name or place is new since the surface was last looked at for cuts and for distances.
+        self._new_to_cuts, self._new_to_distances = (np.zeros(len(vertices), dtype=bool) for _ in range(2))
 
-    @classmethod
-    def from_collapses(
-        cls,
-        vertices: Float64Array,
-        triangles: NDArray[np.uint32],
-        collapses: IntArray,
-        points: Float64Array,
-        faces: IntArray,
-    ) -> Clusters:
-        """Read the clusters off a list of collapses.
+    def _rounded(self, places: Float64Array) -> Float64Array:
+        return as_stored(places + self._origin).astype(np.float64) - self._origin
+
+    def collapse(self, collapses: IntArray, points: Float64Array, faces: IntArray) -> None:
+        """Make a round of collapses.
 
         Parameters
         ----------
-        vertices, triangles : ndarray
-            The mesh before.
         collapses : ndarray, shape (c, 2)
-            In each the second vertex went into the first, which goes on.
+            In each the second vertex of the present `surface` went into the first, which goes on.
         points, faces : ndarray
             The mesh after; its vertices are those that go on and have faces, in their order.
 
@@ -79,31 +65,53 @@ class Clusters:
         RuntimeError
             The mesh after is not what the collapses say.
         """
-        names = np.arange(len(vertices))
-        names[collapses[:, 1]] = collapses[:, 0]
+        standing = self.standing()
+        into = np.arange(len(standing))
+        into[collapses[:, 1]] = collapses[:, 0]
         while True:
-            further = names[names]
-            if np.array_equal(further, names):
+            further = into[into]
+            if np.array_equal(further, into):
                 break
-            names = further
-        clusters = cls(vertices, triangles, names, vertices.copy())
-        left = clusters.faces()
-        standing = np.unique(left)
-        number = np.full(len(vertices), -1)
-        number[standing] = np.arange(len(standing))
-        if len(standing) != len(points) or not np.array_equal(number[left], faces):
+            into = further
+        rename = np.arange(len(self._names))
+        rename[standing] = standing[into]
+        names, places = rename[self._names], self._places.copy()
+        left = self._faces_of(names)
+        going_on = np.unique(left)
+        number = np.full(len(names), -1)
+        number[going_on] = np.arange(len(going_on))
+        if len(going_on) != len(points) or not np.array_equal(number[left], faces):
             raise RuntimeError("the collapses that fast-simplification lists do not lead to its result")
-        clusters._places[standing] = points
-        return clusters
+        # A vertex that nothing went into stays where it is.
+        gained = np.bincount(rename, minlength=len(names))[going_on] > 1
+        places[going_on[gained]] = self._rounded(points[gained])
+        self._before = self._names, self._places
+        self._names, self._places = names, places
+        new = self._has_moved()
+        for fresh in (self._new_to_cuts, self._new_to_distances):
+            fresh[names[new]] = True
 
     @property
     def collapsed_count(self) -> int:
         """Number of vertices that have gone into another."""
         return int(np.count_nonzero(self._names != np.arange(len(self._names))))
 
+    @property
+    def names(self) -> IntArray:
+        """For each vertex the one that stands for its cluster, shape (n,)."""
+        return self._names
+
+    @property
+    def places(self) -> Float64Array:
+        """Where the vertices that stand for a cluster lie, shape (n, 3), relative to the origin; of others not used."""
+        return self._places
+
     def faces(self) -> NDArray[np.uint32]:
         """Triangles with three different names, shape (k, 3)."""
-        named = self._names.astype(np.uint32)[self._triangles]
+        return self._faces_of(self._names)
+
+    def _faces_of(self, names: IntArray) -> NDArray[np.uint32]:
+        named = names.astype(np.uint32)[self._triangles]
         return named[self._is_face(named)]
 
     @staticmethod
@@ -111,36 +119,45 @@ class Clusters:
         a, b, c = named.T
         return (a != b) & (b != c) & (c != a)
 
-    def surface(self, origin: Float64Array) -> tuple[NDArray[np.floating], NDArray[np.uint32]]:
-        """Vertices (as stored, moved by `origin`) and triangles, numbered without gaps."""
-        faces = self.faces()
-        standing = np.unique(faces)
-        number = np.zeros(len(self._vertices), dtype=np.uint32)
+    def standing(self) -> IntArray:
+        """The vertices that stand for a cluster and have faces, in their order."""
+        used = np.zeros(len(self._names), dtype=bool)
+        used[self.faces().reshape(-1)] = True
+        return np.flatnonzero(used)
+
+    def surface(self) -> tuple[Float64Array, NDArray[np.uint32]]:
+        """Places relative to the origin, and triangles, numbered without gaps."""
+        faces, standing = self.faces(), self.standing()
+        number = np.zeros(len(self._names), dtype=np.uint32)
         number[standing] = np.arange(len(standing), dtype=np.uint32)
-        return as_stored(self._places[standing] + origin), number[faces]
+        return self._places[standing], number[faces]
 
     def undo(self, names: IntArray) -> int:
         """Take these clusters apart; returns how many vertices that has moved or brought back."""
         marked = np.zeros(len(self._names), dtype=bool)
         marked[names] = True
-        marked = marked[self._names]
-        moved = marked & self._has_moved()
-        self._names[marked] = np.flatnonzero(marked)
-        self._places[marked] = self._vertices[marked]
+        moved = marked[self._names] & self._has_moved()
+        names_before, places_before = self._before
+        self._names[moved] = names_before[moved]
+        back = self._names[moved]
+        self._places[back] = places_before[back]
+        for fresh in (self._new_to_cuts, self._new_to_distances):
+            fresh[back] = True
         return int(np.count_nonzero(moved))
 
     def _has_moved(self) -> NDArray[np.bool_]:
-        """Vertices that have gone into another, or that stand for a cluster elsewhere."""
-        return (self._names != np.arange(len(self._names))) | (self._places != self._vertices).any(axis=1)
+        """Vertices whose name, or the place of it, is another than before the last round."""
+        names_before, places_before = self._before
+        return (self._names != names_before) | (self._places[self._names] != places_before[names_before]).any(axis=1)
 
-    def find_faults(self, origin: Float64Array) -> IntArray:
+    def find_faults(self) -> IntArray:
         """Names of clusters that have spoilt the surface.
 
-        At edges and vertices that are not manifold, at faces without area or doubled, and of components of which
-        nothing is left or that have come apart.
+        At edges and vertices that are not manifold, at faces without area or doubled, at places that two vertices
+        share, and of components of which nothing is left or that have come apart.
         """
         faces = self.faces()
-        size = len(self._vertices)
+        size = len(self._names)
         edges = find_edges(faces, size)
         faults = []
         if not edges.oriented:  # as is every mesh with three faces at an edge
@@ -154,13 +171,13 @@ class Clusters:
         # The waist can be a vertex that stands for itself alone: what touches it twice is a cluster beside it.
         faults += [split, faces[np.isin(faces, split).any(axis=1)].reshape(-1) if len(split) else split]
         if not any(map(len, faults)):  # the rest can only be told, or costs less, when these are gone
-            faults += [self._find_lost(faces, edges), *self._find_flat(faces, origin)]
+            faults += [self._find_lost(faces, edges), *self._find_flat(faces), self._find_coincident()]
         return np.unique(np.concatenate(faults).astype(np.int64))
 
     def _find_lost(self, faces: NDArray[np.uint32], edges: Edges) -> IntArray:
         """Names of components without a face, and of all but the largest part of those that have come apart."""
         count, labels = self._components
-        now, parts = label_components(faces, len(self._vertices), edges)
+        now, parts = label_components(faces, len(self._names), edges)
         part_size = np.bincount(parts[faces[:, 0]], minlength=now)
         whole = np.full(now, -1)
         whole[parts[faces[:, 0]]] = labels[faces[:, 0]]
@@ -173,75 +190,51 @@ class Clusters:
         # With what lies around: a part that has come apart can consist of vertices that all stand for themselves.
         return np.unique(self._names[self._triangles[lost[self._triangles].any(axis=1)]])
 
-    def _find_flat(self, faces: NDArray[np.uint32], origin: Float64Array) -> list[NDArray[np.uint32]]:
+    def _stored(self) -> NDArray[np.floating]:
+        return as_stored(self._places + self._origin)
+
+    def _find_flat(self, faces: NDArray[np.uint32]) -> list[NDArray[np.uint32]]:
         """Corners of faces without area once coordinates are rounded."""
-        rounded = as_stored(self._places + origin)
-        pieces = cross_products(rounded, faces, np.zeros(3))
+        pieces = cross_products(self._stored(), faces, np.zeros(3))
         return [faces[where][~cross.any(axis=0)].reshape(-1) for where, _, cross in pieces]
 
-    def find_crossing(self, origin: Float64Array) -> IntArray:
+    def _find_coincident(self) -> IntArray:
+        """Names that have come to lie at one place once coordinates are rounded."""
+        standing = self.standing()
+        return standing[find_coincident(as_stored(self._places[standing] + self._origin))]
+
+    def find_crossing(self) -> IntArray:
         """Names of clusters at faces that cut each other once coordinates are rounded.
 
         Only faces that have changed since the last call are looked at, with what lies around them.
         """
-        named = self._names[self._triangles]
-        is_face = self._is_face(named)
-        faces = named[is_face].astype(np.uint32)
-        changed = (named != self._seen_uncut).any(axis=1)[is_face]
-        self._seen_uncut = named
-        rounded = as_stored(self._places + origin)
-        faces = faces[self._beside(faces, changed)]
-        return np.unique(faces[find_self_intersections(rounded, faces)])
+        faces = self.faces()
+        changed = np.asarray(self._new_to_cuts[faces].any(axis=1))
+        self._new_to_cuts[:] = False
+        stored = self._stored()
+        faces = faces[find_beside(stored, faces, changed)]
+        return np.unique(faces[find_self_intersections(stored, faces)])
 
-    def _beside(self, faces: NDArray[np.uint32], changed: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """Faces that can touch one of those that have changed."""
-        if np.count_nonzero(changed) > _FEW * len(faces):
-            return np.ones(len(faces), dtype=bool)
-        if not changed.any():
-            return changed
-        from scipy.spatial import cKDTree
+    def find_far(self, deviation: Deviation) -> IntArray:
+        """Names of clusters where the surface has moved too far, or from where a part of it has gone too far.
 
-        corners = self._places[faces]
-        centres = corners.mean(axis=1)
-        reach = 2.0 * float(np.linalg.norm(corners - centres[:, None], axis=2).max())
-        return np.isfinite(cKDTree(centres[changed]).query(centres, distance_upper_bound=reach, workers=-1)[0])
-
-    def find_far(self, bound: float, all_vertices: bool) -> IntArray:
-        """Names of clusters where the surface has moved too far.
-
-        Looked at are the vertices as they were, against the surface as it is now, and every place and the centre of
-        every face, against the surface as it was; of these, after the first call, only what has changed since.
+        Only what has changed since the last call is looked at.
 
         Parameters
         ----------
-        bound : float
-            mm.
-        all_vertices : bool
-            Look at all vertices that have moved, also where nothing has changed around the one that stands for them:
-            what was close to them can have been given up.
+        deviation : Deviation
+            The surface as it was, with the same triangles, and the bound.
         """
-        named = self._names[self._triangles]
-        changed = (named != self._seen).any(axis=1)
-        self._seen = named
+        faces = self.faces()
+        changed = self._new_to_distances[faces].any(axis=1)
+        self._new_to_distances[:] = False
+        # Of a triangle as it was the distance is taken from the faces around its names: where one of these is new.
         touched = np.zeros(len(self._names), dtype=bool)
-        touched[named[changed]] = True
-        has_moved = self._has_moved()
-        moved = np.flatnonzero(has_moved if all_vertices else has_moved & touched[self._names])
-        gone_into = self._names[moved]
-        left_behind = NearDistance(self._places, self.faces())(self._vertices[moved], gone_into, bound) > bound
-
-        faces = named[changed & self._is_face(named) & has_moved[named].any(axis=1)]
-        standing = np.unique(gone_into[touched[gone_into]])
-        points = np.concatenate([self._places[standing], self._places[faces].mean(axis=1)])
-        away = self._distances_from_before(points, bound) > bound
-        off_place, off_face = standing[away[: len(standing)]], faces[away[len(standing) :]]
-        return np.unique(np.concatenate([gone_into[left_behind], off_place, off_face.reshape(-1)]))
-
-    def _distances_from_before(self, points: Float64Array, bound: float) -> Float64Array:
-        from scipy.spatial import cKDTree
-
-        if self._before is None:
-            tree = cKDTree(self._vertices, balanced_tree=False, compact_nodes=False)
-            self._before = tree, NearDistance(self._vertices, self._triangles)
-        tree, distance = self._before
-        return distance(points, tree.query(points, workers=-1)[1], bound)
+        touched[faces[changed]] = True
+        named = self._names[self._triangles]
+        rows = np.flatnonzero(touched[named].any(axis=1))
+        rows = rows[deviation.can_be_far(rows, self._names, self._places)]
+        left_behind = rows[deviation.is_far_from(rows, self._names, self._places, faces)]
+        now = faces[changed]
+        away = now[deviation.are_far(self._places, now)]
+        return np.unique(np.concatenate([named[left_behind].reshape(-1), away.reshape(-1)]))

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from clrecon.geometry.precision import float32_step, is_far
 
-__all__ = ["as_stored", "rounding_step"]
+__all__ = ["as_stored", "find_coincident", "rounding_step"]
 
 
 def as_stored(points: NDArray[Any]) -> NDArray[np.floating]:
@@ -47,3 +47,33 @@ def rounding_step(vertices: NDArray[np.floating]) -> float:
     low, high = vertices.min(axis=0).astype(np.float64), vertices.max(axis=0).astype(np.float64)
     largest = np.abs([low, high]).max() if vertices.dtype == np.float32 else 0.5 * (high - low).max()
     return float32_step(float(largest))
+
+
+def find_coincident(vertices: NDArray[np.floating]) -> NDArray[np.int64]:
+    """Find the vertices that lie at the place of another one.
+
+    Files without an index, such as STL, join these when they are read: what is closed by index can then be open.
+
+    Parameters
+    ----------
+    vertices : ndarray, shape (n, 3), float32 or float64
+
+    Returns
+    -------
+    ndarray, shape (k,), int64
+        All vertices of each such place, in order of the place's coordinates.
+    """
+    # Scrambled coordinates, as in count_duplicate_faces: only vertices whose sums are equal are compared in full.
+    mixed = np.zeros(len(vertices), dtype=np.uint64)
+    for column in vertices.T:
+        bits = (column + column.dtype.type(0)).view(f"u{column.dtype.itemsize}")  # + 0: -0 is 0
+        mixed = (mixed ^ bits) * np.uint64(0x9E3779B97F4A7C15)
+        mixed ^= mixed >> np.uint64(29)
+    ordered = np.sort(mixed)
+    repeated = ordered[1:][ordered[1:] == ordered[:-1]]
+    if len(repeated) == 0:
+        return np.zeros(0, dtype=np.int64)
+    suspects = np.flatnonzero(np.isin(mixed, repeated))
+    suspects = suspects[np.lexsort(vertices[suspects].T[::-1])]
+    same = (vertices[suspects[1:]] == vertices[suspects[:-1]]).all(axis=1)
+    return suspects[np.concatenate([same, [False]]) | np.concatenate([[False], same])]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,15 @@ from clrecon.mesh.connectivity import order_by_number
 from clrecon.mesh.measures import chunks, cross_product, cross_products, local_origin
 from clrecon.mesh.mesh import Mesh
 
-__all__ = ["SAMPLES", "NearDistance", "SurfaceDistance", "compare_meshes", "sample_surface", "summarise_distances"]
+__all__ = [
+    "SAMPLES",
+    "NearDistance",
+    "SurfaceDistance",
+    "compare_meshes",
+    "sample_surface",
+    "summarise_distances",
+    "triangle_distances",
+]
 
 SAMPLES = 50_000
 """Points a side: the 95th percentile then stands on the 2500 largest distances."""
@@ -24,6 +33,8 @@ _STEPS_U, _STEPS_V = 0.7548776662466927, 0.5698402909980532
 """Powers of the inverse of the plastic number: the two-dimensional low-discrepancy sequence R2 (Roberts 2018)."""
 
 Points = NDArray[np.float64]
+Columns = NDArray[np.float64]
+"""Shape (3, k): one row each for x, y, z."""
 
 
 def sample_surface(vertices: NDArray[np.floating], triangles: NDArray[np.uint32], count: int = SAMPLES) -> Points:
@@ -98,9 +109,8 @@ class SurfaceDistance:
 class NearDistance:
     """Distances from points to a surface where a vertex of it is known to be near each point.
 
-    Where the foot of a perpendicular lies within a triangle around that vertex and its length is within a limit, that
-    length is the answer: never less than the distance to the surface.  Only for the other points all triangles are
-    searched, and the answer is exact.
+    Where a triangle around that vertex is near enough, its distance is the answer: never less than the distance to the
+    surface.  Only for the other points all triangles are searched, and the answer is exact.
 
     Parameters
     ----------
@@ -117,7 +127,7 @@ class NearDistance:
         self._exact: SurfaceDistance | None = None
 
     def __call__(self, points: Points, near: NDArray[np.integer], limit: float) -> NDArray[np.float64]:
-        """Distances in mm, shape (k,).
+        """Distances in mm, shape (k,): not exact up to the limit, where the length of a perpendicular is enough.
 
         Parameters
         ----------
@@ -127,30 +137,66 @@ class NearDistance:
         limit : float
             mm.
         """
-        found = np.full(len(points), np.inf)
-        for where in chunks(len(points), _PIECE):
-            first = self._begin[near[where]]
-            count = self._begin[near[where] + 1] - first
-            start = np.concatenate([[0], np.cumsum(count)[:-1]])
-            pair = np.repeat(np.arange(len(count)), count)
-            face = self._face_of[np.arange(len(pair)) - start[pair] + first[pair]]
-            length = _perpendicular(points[where].T.take(pair, axis=1), self._columns, self._triangles[face])
-            some = count > 0
-            if some.any():
-                found[where][some] = np.minimum.reduceat(length, start[some])
+        found, _ = self._around(points, near, _perpendicular)
         rest = np.flatnonzero(~(found <= limit))
+        if len(rest):
+            found[rest], _ = self._around(points[rest], near[rest], triangle_distances)
+            rest = rest[~(found[rest] <= limit)]
         if len(rest):
             self._exact = self._exact or SurfaceDistance(self._vertices, self._triangles)
             found[rest] = self._exact(points[rest])
         return found
 
+    def find_around(self, points: Points, near: NDArray[np.integer]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+        """Distances from the triangles around some vertices alone: infinite, and row -1, where there is none.
 
-def _perpendicular(points: Points, columns: Points, faces: NDArray[np.uint32]) -> NDArray[np.float64]:
-    """Length of the perpendicular from each point to its face, infinite where the foot is outside of the face."""
-    a, b, c = (columns.take(corner, axis=1) for corner in faces.T.astype(np.intp))
-    b -= a
-    c -= a
-    points -= a
+        Parameters
+        ----------
+        points : ndarray, shape (k, 3), float64, mm
+        near : ndarray, shape (k, v), int
+            Vertices for each point.
+        """
+        found, rows = self._around(points, near[:, 0], triangle_distances)
+        for others in near.T[1:]:
+            length, row = self._around(points, others, triangle_distances)
+            rows = np.where(length < found, row, rows)
+            found = np.minimum(found, length)
+        return found, rows
+
+    def from_triangles(self, points: Points, rows: NDArray[np.integer]) -> NDArray[np.float64]:
+        """Distances in mm, shape (k,), of each of the points from one triangle."""
+        found = np.empty(len(points))
+        for where in chunks(len(points), 4 * _PIECE):
+            found[where] = triangle_distances(points[where].T, *self._corners(rows[where]))
+        return found
+
+    def _corners(self, rows: NDArray[np.integer]) -> tuple[Columns, Columns, Columns]:
+        a, b, c = self._triangles[rows].T.astype(np.intp)
+        return self._columns.take(a, axis=1), self._columns.take(b, axis=1), self._columns.take(c, axis=1)
+
+    def _around(
+        self, points: Points, near: NDArray[np.integer], measure: Callable[..., NDArray[np.float64]]
+    ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+        """The least of a measure of the triangles around the vertices that are near, and their rows."""
+        found, rows = np.full(len(points), np.inf), np.full(len(points), -1)
+        for where in chunks(len(points), _PIECE):
+            first = self._begin[near[where]]
+            count = self._begin[near[where] + 1] - first
+            start = np.concatenate([[0], np.cumsum(count)[:-1]])
+            pair = np.repeat(np.arange(len(count)), count)
+            row = self._face_of[np.arange(len(pair)) - start[pair] + first[pair]]
+            length = measure(points[where].T.take(pair, axis=1), *self._corners(row))
+            some = count > 0
+            if some.any():
+                found[where][some] = np.minimum.reduceat(length, start[some])
+                shortest = np.flatnonzero(length == found[where][pair])[::-1]  # backwards: of equal ones the first
+                rows[where][pair[shortest]] = row[shortest]
+        return found, rows
+
+
+def _perpendicular(points: Columns, a: Columns, b: Columns, c: Columns) -> NDArray[np.float64]:
+    """Length of the perpendicular from each point to its triangle, infinite where the foot is outside of it."""
+    b, c, points = b - a, c - a, points - a
     cross = cross_product(b, c)
     square = np.einsum("ij,ij->j", cross, cross)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -159,6 +205,32 @@ def _perpendicular(points: Points, columns: Points, faces: NDArray[np.uint32]) -
         v = np.einsum("ij,ij->j", cross_product(b, points), cross) / square
         length = np.abs(np.einsum("ij,ij->j", points, cross)) / np.sqrt(square)
     return np.where((u >= 0.0) & (v >= 0.0) & (u + v <= 1.0), length, np.inf)
+
+
+def triangle_distances(points: Columns, a: Columns, b: Columns, c: Columns) -> NDArray[np.float64]:
+    """Distance of each point from its triangle: the length of the perpendicular, or to the nearest edge.
+
+    Parameters
+    ----------
+    points, a, b, c : ndarray, shape (3, k), float64, mm
+        Points and corners, one row each for x, y, z.
+
+    Returns
+    -------
+    ndarray, shape (k,), float64, mm
+    """
+    shortest = _perpendicular(points, a, b, c)
+    beside = np.flatnonzero(np.isinf(shortest))
+    points, a, b, c = (columns.take(beside, axis=1) for columns in (points, a, b, c))
+    square = np.full(len(beside), np.inf)
+    for start, end in ((a, b), (b, c), (c, a)):
+        along, there = end - start, points - start
+        length = np.einsum("ij,ij->j", along, along)
+        share = np.clip(np.einsum("ij,ij->j", along, there) / np.where(length > 0.0, length, 1.0), 0.0, 1.0)
+        there -= share * along
+        np.minimum(square, np.einsum("ij,ij->j", there, there), out=square)
+    shortest[beside] = np.sqrt(square)
+    return shortest
 
 
 def summarise_distances(distances: NDArray[np.float64]) -> dict[str, float]:

@@ -9,12 +9,15 @@ from numpy.typing import NDArray
 
 from clrecon.mesh.measures import chunks, local_origin
 
-__all__ = ["count_self_intersections", "find_self_intersections"]
+__all__ = ["count_self_intersections", "find_beside", "find_self_intersections"]
 
 _CELLS_A_TRIANGLE = 8
 """On average at most; the cells grow until it holds."""
 
 _PIECE = 1 << 14
+
+_FEW = 0.05
+"""Share of triangles up to which it pays to look for what lies around them."""
 
 Float64Array = NDArray[np.float64]
 Pairs = tuple[NDArray[np.int64], NDArray[np.int64]]
@@ -61,6 +64,33 @@ def find_self_intersections(vertices: NDArray[np.floating], triangles: NDArray[n
                 cut = _cut(points[:, one[where]], points[:, other[where]])
                 found.append(np.column_stack([one[where][cut], other[where][cut]]))
     return np.concatenate(found)
+
+
+def find_beside(
+    vertices: NDArray[np.floating], triangles: NDArray[np.uint32], changed: NDArray[np.bool_]
+) -> NDArray[np.bool_]:
+    """Find the triangles that can touch one of those that have changed, and these themselves.
+
+    Parameters
+    ----------
+    vertices : ndarray, shape (n, 3), mm
+    triangles : ndarray, shape (m, 3), uint32
+    changed : ndarray, shape (m,), bool
+
+    Returns
+    -------
+    ndarray, shape (m,), bool
+    """
+    if np.count_nonzero(changed) > _FEW * len(triangles):
+        return np.ones(len(triangles), dtype=bool)
+    if not changed.any():
+        return changed
+    from scipy.spatial import cKDTree
+
+    corners = vertices[triangles]
+    centres = corners.mean(axis=1, dtype=np.float64)
+    reach = 2.0 * float(np.linalg.norm(corners - centres[:, None], axis=2).max())
+    return np.isfinite(cKDTree(centres[changed]).query(centres, distance_upper_bound=reach, workers=-1)[0])
 
 
 def _neighbours(low: Float64Array, high: Float64Array) -> Iterator[Pairs]:

@@ -28,7 +28,8 @@ def refine_surface(mesh: Mesh, settings: MeshSettings, progress: Progress = igno
     if not settings.refines:
         return mesh
     from clrecon.mesh.distances import compare_meshes
-    from clrecon.mesh.refinement import BOUND_VOXEL, decimate_mesh, default_deviation, smooth_mesh
+    from clrecon.mesh.refinement import BOUND_VOXEL, decimate_mesh, default_deviation
+    from clrecon.mesh.smoothing import smooth_mesh
 
     raw = mesh
     if settings.smooth is not None:

@@ -9,11 +9,12 @@ import tolerances
 
 from clrecon.errors import UsageError
 from clrecon.geometry import Volume
-from clrecon.mesh import Mesh
+from clrecon.mesh import Mesh, split_components
 from clrecon.mesh.clusters import Clusters
 from clrecon.mesh.distances import SurfaceDistance
 from clrecon.mesh.intersections import count_self_intersections
 from clrecon.mesh.refinement import decimate_mesh
+from clrecon.mesh.smoothing import smooth_mesh
 from clrecon.reference.isosurface import extract_isosurface
 
 pytestmark = pytest.mark.unit
@@ -21,22 +22,26 @@ pytestmark = pytest.mark.unit
 FAR = np.array([-150.25, 1071.5, -846.0])
 
 
-def noise_surface(seed: int, size: int = 12, closed: bool = True) -> Mesh:
+def noise_surface(seed: int, shape: tuple[int, int, int] = (12, 12, 12), closed: bool = True) -> Mesh:
     """Specks, bridges and tunnels of a voxel's size: what edge collapses tear."""
-    voxels = np.random.default_rng(seed).integers(-500, 500, (size, size, size)).astype(np.int16)
+    voxels = np.random.default_rng(seed).integers(-500, 500, shape).astype(np.int16)
     affine = np.diag([0.7, 0.5, 1.25, 1.0])
     affine[:3, 3] = FAR
     vertices, _, triangles = extract_isosurface(Volume(voxels, affine), 120, closed=closed)
     return Mesh(vertices, triangles, None, {"affine_ijk_to_lps_mm": affine.tolist()})
 
 
+def looked_at(mesh: Mesh) -> np.ndarray:
+    """Vertices, middles of edges and centres of triangles."""
+    corners = mesh.vertices[mesh.triangles].astype(float)
+    middles = 0.5 * (corners + corners[:, (1, 2, 0)])
+    return np.concatenate([mesh.vertices.astype(float), middles.reshape(-1, 3), corners.mean(axis=1)])
+
+
 def check_within(mesh: Mesh, before: Mesh, bound: float) -> None:
-    centres = mesh.vertices[mesh.triangles].mean(axis=1, dtype=float)
-    there = SurfaceDistance(before.vertices, before.triangles)
-    back = SurfaceDistance(mesh.vertices, mesh.triangles)
     limit = bound + tolerances.float32_unit(before.vertices)
-    assert back(before.vertices.astype(float)).max() <= limit
-    assert there(np.concatenate([mesh.vertices.astype(float), centres])).max() <= limit
+    for one, other in ((mesh, before), (before, mesh)):
+        assert SurfaceDistance(other.vertices, other.triangles)(looked_at(one)).max() <= limit
 
 
 def test_a_sphere_loses_nine_of_ten_triangles_within_the_bound():
@@ -71,6 +76,15 @@ def test_a_torus_stays_a_torus():
     assert quality["triangles"] < 3000
 
 
+@pytest.mark.parametrize("seed", range(10, 14))
+def test_no_triangle_of_either_surface_is_further_than_the_bound(seed):
+    """Smoothing and decimation of noise, each from the surface that it was given."""
+    rough = noise_surface(seed, (24, 25, 15))
+    smooth = smooth_mesh(rough)
+    check_within(smooth, rough, 0.125)
+    check_within(decimate_mesh(smooth, 0.9), smooth, 0.125)
+
+
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("bound", [None, 0.6])
 def test_torn_topology_is_mended(seed, bound):
@@ -100,29 +114,61 @@ def test_an_open_surface_keeps_its_border_in_the_plane():
     assert (after["manifold"], after["components"]) == (before["manifold"], before["components"])
 
 
-def test_clusters_that_do_not_lead_to_the_result_are_found():
+def test_what_ended_the_decimation_is_said():
+    sphere = Mesh(*samples.sphere(FAR, 20.0, 5))
+    said = [decimate_mesh(sphere, 0.9, bound).report["refinement"]["decimate"] for bound in (0.5, 0.001)]
+    assert [each["ended_by"] for each in said] == ["share", "bound"]
+    assert said[0]["reached"] == pytest.approx(0.9, abs=2 / sphere.triangle_count)
+    assert said[1]["reached"] < 0.9
+
+
+def test_each_component_keeps_its_volume():
+    """Walls of a cavity count too; the shift is within the bound."""
+    inner, outer = samples.sphere(FAR, 8.0, 4), samples.sphere(FAR, 10.0, 5)
+    other = samples.sphere(FAR + (40.0, 0, 0), 3.0, 4)
+    mesh = Mesh(*samples.join((inner[0], inner[1][:, ::-1]), outer, other))
+    small = decimate_mesh(mesh, 0.8, 0.4)
+    check_within(small, mesh, 0.4)
+    for part, before in zip(split_components(small), split_components(mesh), strict=True):
+        assert part.triangle_count < before.triangle_count
+        assert part.quality()["volume_ml"] == pytest.approx(before.quality()["volume_ml"], rel=1e-5)
+
+
+def test_collapses_that_do_not_lead_to_the_result_are_found():
     vertices, triangles = samples.sphere(rounds=1)
-    faces = triangles.astype(np.uint32)
-    clusters = Clusters.from_collapses(vertices, faces, np.zeros((0, 2), int), vertices, triangles)
+    clusters = Clusters(vertices, triangles.astype(np.uint32), np.zeros(3))
+    clusters.collapse(np.zeros((0, 2), int), vertices, triangles)
     assert clusters.collapsed_count == 0
     with pytest.raises(RuntimeError, match="do not lead to its result"):
-        Clusters.from_collapses(vertices, faces, triangles[:1, :2], vertices, triangles)
+        clusters.collapse(triangles[:1, :2], vertices, triangles)
 
 
-def test_clusters_are_undone_as_a_whole():
+def test_clusters_are_undone_as_a_whole_and_by_rounds():
     vertices, triangles = samples.sphere(rounds=1)
-    a, b, c = triangles[0]
-    names = np.arange(len(vertices))
-    names[[b, c]] = a
-    places = vertices.copy()
-    places[a] = vertices[[a, b, c]].mean(axis=0)
-    clusters = Clusters(vertices, triangles.astype(np.uint32), names, places)
+    a, b, c = (int(corner) for corner in triangles[0])
+    faces = triangles.astype(np.uint32)
+    clusters = Clusters(vertices, faces, np.zeros(3))
+    places = {a: vertices[[a, b, c]].mean(axis=0)}
+
+    def after(gone: list[int]) -> tuple[np.ndarray, np.ndarray]:
+        """Points and faces when these have gone into the first corner."""
+        names = np.arange(len(vertices))
+        names[gone] = a
+        left = names[triangles]
+        left = left[(left != left[:, (1, 2, 0)]).all(axis=1)]
+        standing = np.unique(left)
+        points = np.array([places.get(int(vertex), vertices[vertex]) for vertex in standing])
+        return points, np.searchsorted(standing, left)
+
+    clusters.collapse(np.array([[a, b]]), *after([b]))
+    standing = clusters.standing()
+    one, other = np.searchsorted(standing, [a, c])
+    clusters.collapse(np.array([[one, other]]), *after([b, c]))
     assert (clusters.collapsed_count, len(clusters.faces())) == (2, len(triangles) - 4)
     assert clusters.undo(np.array([c])) == 0  # it stands for nothing any more
-    assert clusters.undo(np.array([a])) == 3
-    back, faces = clusters.surface(np.zeros(3))
-    np.testing.assert_array_equal(faces, triangles)
-    np.testing.assert_array_equal(back, vertices.astype(np.float32))
+    assert clusters.undo(np.array([a])) == 1  # only what the last round has moved: c
+    assert (clusters.collapsed_count, len(clusters.faces())) == (1, len(triangles) - 2)
+    np.testing.assert_allclose(clusters.places[a], places[a], atol=1e-6)
 
 
 @pytest.mark.parametrize("fraction", [0.0, 1.0, -0.1, 90.0, float("nan")])

@@ -113,7 +113,7 @@ def test_strict_is_an_exit_code_and_nothing_else(
     assert main(arguments) == 0
     told = capsys.readouterr()
     assert "clrecon: warning: gate deviation_p95 failed: distance from the surface before" in told.err
-    assert "% of 97 % of the triangles taken away" in told.out
+    assert "% of the triangles taken away" in told.out
     content = output.read_bytes()
     output.unlink()
 
@@ -157,7 +157,7 @@ def test_impossible_settings(options: dict[str, Any], complaint: str) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("folder", ["lumbar_4p25mm", "thoracic_0p8mm"])
+@pytest.mark.parametrize("folder", ["lumbar_4p25mm", "thoracolumbar_labels/ct_2mm_jpeg2000"])
 def test_real_surfaces_keep_every_gate(real_data: Path, device: Any, tmp_path: Path, folder: str) -> None:
     settings = MeshSettings(
         iso_value=226, keep_largest=1, smooth=20, decimate=0.9, strict=True, device=str(device.index)
@@ -165,6 +165,5 @@ def test_real_surfaces_keep_every_gate(real_data: Path, device: Any, tmp_path: P
     report = make_mesh(real_data / folder, tmp_path / "a.stl", settings)
     assert (report["closed"], report["manifold"], report["components"]) == (True, True, 1)
     assert report["refinement"]["decimate"]["reached"] > 0.6
-    failed = {gate["name"] for gate in report["gates"] if gate["ok"] is False}
-    assert failed <= {"volume_change", "iso_distance_mean", "iso_distance_p95", "self_intersections"}
+    check_gates(report)
     assert np.isfinite(report["refinement"]["deviation"]["max_mm"])

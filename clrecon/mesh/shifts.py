@@ -1,0 +1,171 @@
+"""Small shifts of vertices: that give components their volume back, and that spoil nothing."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clrecon.mesh.connectivity import find_edges, label_components
+from clrecon.mesh.coordinates import as_stored, find_coincident
+from clrecon.mesh.intersections import find_beside, find_self_intersections
+from clrecon.mesh.measures import cross_products
+
+__all__ = ["Volumes", "measure_volumes", "move_vertices", "restore_volumes", "shorten_steps"]
+
+_VOLUME_STEPS = 4
+"""Newton steps along the normals; the first leaves about a hundredth of what is missing."""
+
+_ROUNDS = 40
+"""Of taking back, at most; each halves steps or widens the place, on CT 2 to 5 are needed."""
+
+_SMALLEST_SHARE = 0.2
+"""Of a step that is taken back by halves; what is shorter is taken back whole."""
+
+_ROUNDS_OF_ITS_OWN = 3
+"""After so many rounds the vertices around an offending place are taken back too."""
+
+Float64Array = NDArray[np.float64]
+IntArray = NDArray[np.integer]
+
+
+@dataclass(frozen=True)
+class Volumes:
+    """Components of a surface, and what they enclose.
+
+    Attributes
+    ----------
+    labels : ndarray, shape (n,), int64
+        Component of each vertex; -1 for vertices that no triangle uses.
+    mm3 : ndarray, shape (count,), float64
+        Enclosed volume, negative for walls of cavities; of open components without meaning.
+    is_open : ndarray, shape (count,), bool
+    """
+
+    labels: NDArray[np.int64]
+    mm3: Float64Array
+    is_open: NDArray[np.bool_]
+
+
+def measure_volumes(vertices: Float64Array, triangles: NDArray[np.uint32]) -> Volumes:
+    """Measure the components of a surface; `vertices` have shape (n, 3), in mm from a point near them."""
+    edges = find_edges(triangles, len(vertices))
+    count, labels = label_components(triangles, len(vertices), edges)
+    is_open = np.zeros(count, dtype=bool)
+    is_open[labels[edges.ends[:, edges.uses == 1].reshape(-1)]] = True
+    return Volumes(labels, _volumes(vertices, triangles, labels, count)[0], is_open)
+
+
+def restore_volumes(
+    vertices: Float64Array,
+    step: Float64Array,
+    triangles: NDArray[np.uint32],
+    labels: NDArray[np.int64],
+    wanted: Volumes,
+    longest: float,
+) -> None:
+    """Change steps so that each closed component gets the volume it had, by a shift along the normals.
+
+    Thin sheets lose a large share of their volume by a small shift: 6 % of a thin-walled bone at voxels of 3 mm were
+    0.03 voxel.
+
+    Parameters
+    ----------
+    vertices : ndarray, shape (n, 3), float64, mm
+    step : ndarray, shape (n, 3), float64, mm
+        Changed in place; none becomes longer than `longest`.
+    triangles : ndarray, shape (m, 3), uint32
+    labels : ndarray, shape (n,), int64
+        Which component of `wanted` each vertex belongs to, -1 for none.
+    wanted : Volumes
+    longest : float
+        mm.
+    """
+    count = len(wanted.mm3)
+    moving = np.flatnonzero((labels >= 0) & ~np.append(wanted.is_open, True)[labels])
+    for _ in range(_VOLUME_STEPS):
+        volumes, gradient = _volumes(vertices + step, triangles, labels, count)
+        length = np.sqrt(np.einsum("an,an->n", gradient, gradient))
+        total = np.bincount(labels[moving], length[moving], count)
+        shift = np.divide(wanted.mm3 - volumes, total, out=np.zeros(count), where=total > 0.0)
+        along = gradient[:, moving] * (shift[labels[moving]] / np.maximum(length[moving], np.finfo(float).tiny))
+        step[moving] += along.T
+        shorten_steps(step, longest)
+
+
+def _volumes(
+    vertices: Float64Array, triangles: NDArray[np.uint32], labels: NDArray[np.int64], count: int
+) -> tuple[Float64Array, Float64Array]:
+    """Volume of each component in mm3, and its gradient by the places of the vertices, shape (3, n), mm2."""
+    volumes = np.zeros(count)
+    cross_of = np.empty((3, len(triangles)))
+    for where, corner, cross in cross_products(vertices, triangles, np.zeros(3), max(count, 1 << 14)):
+        volumes += np.bincount(labels[triangles[where, 0]], np.einsum("ij,ij->j", corner, cross), count)
+        cross_of[:, where] = cross
+    gradient = np.zeros((3, len(vertices)))
+    for corners in triangles.T:
+        for axis in range(3):
+            gradient[axis] += np.bincount(corners, cross_of[axis], len(vertices))
+    return volumes / 6.0, gradient / 6.0
+
+
+def shorten_steps(step: Float64Array, longest: float) -> int:
+    """Shorten steps, shape (n, 3), to `longest` mm, in place; returns how many were longer."""
+    length = np.sqrt(np.einsum("na,na->n", step, step))
+    far = np.flatnonzero(length > longest)
+    step[far] *= (longest / length[far])[:, None]
+    return len(far)
+
+
+def move_vertices(
+    vertices: NDArray[np.floating], triangles: NDArray[np.uint32], step: Float64Array
+) -> tuple[NDArray[np.floating], int]:
+    """Move vertices, but less or not where triangles would cut each other, lose their area or share a place.
+
+    Parameters
+    ----------
+    vertices : ndarray, shape (n, 3), float32 or float64, mm
+    triangles : ndarray, shape (m, 3), uint32
+    step : ndarray, shape (n, 3), float64, mm
+
+    Returns
+    -------
+    vertices : ndarray, shape (n, 3)
+        As stored.  What was spoilt before may still be.
+    taken_back : int
+        Vertices that have not gone all the way.
+    """
+    share = np.ones(len(vertices))
+    moved = as_stored(vertices + step)
+    look_at = np.ones(len(triangles), dtype=bool)
+    for turn in range(_ROUNDS):
+        spoilt = _find_spoilt(moved, triangles, look_at)
+        if turn >= _ROUNDS_OF_ITS_OWN:
+            beside = np.zeros(len(vertices), dtype=bool)
+            beside[spoilt] = True
+            spoilt = np.unique(triangles[beside[triangles].any(axis=1)])
+        spoilt = spoilt[share[spoilt] > 0.0]
+        if len(spoilt) == 0:
+            break
+        share[spoilt] *= 0.5
+        share[spoilt[share[spoilt] < _SMALLEST_SHARE]] = 0.0
+        moved[spoilt] = vertices[spoilt] + share[spoilt, None] * step[spoilt]
+        changed = np.zeros(len(vertices), dtype=bool)
+        changed[spoilt] = True
+        look_at = np.asarray(changed[triangles].any(axis=1))
+    return moved, int(np.count_nonzero(share < 1.0))
+
+
+def _find_spoilt(
+    vertices: NDArray[np.floating], triangles: NDArray[np.uint32], look_at: NDArray[np.bool_]
+) -> NDArray[np.int64]:
+    """Vertices of triangles without area, of triangles that cut each other, and of those at one place."""
+    flat = [
+        where.start + np.flatnonzero(~cross.any(axis=0))
+        for where, _, cross in cross_products(vertices, triangles, np.zeros(3))
+    ]
+    near = triangles[find_beside(vertices, triangles, look_at)]
+    cut = near[find_self_intersections(vertices, near)]
+    found = [triangles[np.concatenate(flat)].reshape(-1), cut.reshape(-1), find_coincident(vertices)]
+    return np.unique(np.concatenate(found).astype(np.int64))
