@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Any
 
-__all__ = ["Gate", "at_most", "failed_gates", "is_true", "none_of", "unmeasured"]
+__all__ = ["Gate", "at_least", "at_most", "failed_gates", "is_true", "none_of", "unmeasured"]
 
 Gate = dict[str, Any]
 """``name``, ``measured`` (None: not measured), ``bound``, ``unit`` (None for counts, shares and flags), ``ok`` (None:
@@ -38,6 +38,12 @@ def at_most(name: str, measured: float, bound: float, unit: str | None, what: st
     """A figure is no larger than its bound."""
     text = f"{what}: {measured:.3g}{' ' * bool(unit)}{unit or ''}, at most {bound:g}"
     return {"name": name, "measured": measured, "bound": bound, "unit": unit, "ok": measured <= bound, "text": text}
+
+
+def at_least(name: str, measured: float, bound: float, unit: str | None, what: str) -> Gate:
+    """A figure is no smaller than its bound."""
+    text = f"{what}: {measured:.4g}{' ' * bool(unit)}{unit or ''}, at least {bound:g}"
+    return {"name": name, "measured": measured, "bound": bound, "unit": unit, "ok": measured >= bound, "text": text}
 
 
 def unmeasured(name: str, bound: float | bool, unit: str | None, why: str) -> Gate:

@@ -9,12 +9,17 @@ __all__ = ["add_masking", "masking_settings"]
 
 
 def add_masking(parser: argparse.ArgumentParser) -> None:
-    """Declare ``--remove-table`` and ``--fov``."""
+    """Declare ``--remove-table``, ``--allow-bone-loss`` and ``--fov``."""
     group = parser.add_argument_group("masking")
     group.add_argument(
         "--remove-table",
         action="store_true",
         help="turn what is not the patient's body into air first: table, blankets, cables",
+    )
+    group.add_argument(
+        "--allow-bone-loss",
+        action="store_true",
+        help="go on where --remove-table takes more than 2 %% of the bone, which else is refused",
     )
     group.add_argument(
         "--fov",
@@ -37,4 +42,8 @@ def _parse_radius(text: str) -> float | str:
 
 def masking_settings(options: argparse.Namespace) -> dict[str, Any]:
     """Entries of `MeshSettings`."""
-    return {"remove_table": options.remove_table, "field_of_view": options.fov}
+    return {
+        "remove_table": options.remove_table,
+        "allow_bone_loss": options.allow_bone_loss,
+        "field_of_view": options.fov,
+    }

@@ -17,14 +17,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.errors import RefusedInputError, UsageError
+from clrecon.geometry.body_cells import Cells, Mask, grow, measure_cells
+from clrecon.geometry.dense_pieces import BONE_KEPT, DensePieces, find_dense_pieces, judge_bone, judge_circle
 from clrecon.geometry.volume import AIR_HU, Volume
 
 __all__ = ["find_body", "find_unmeasured", "mask_field_of_view", "remove_table"]
 
-Mask = NDArray[np.bool_]
-
-CELL_MM = 2.0
-"""Size of the cells that the body is found on, where voxels are not larger."""
 TISSUE_HU = -300.0
 """Between a blanket or foam and fat."""
 OPENING_MM = 7.0
@@ -46,35 +44,50 @@ MARGIN_MM = 3.0
 AIR_RANGE_HU = (-1100.0, -900.0)
 
 
-def remove_table(volume: Volume) -> Volume:
+def remove_table(volume: Volume, *, allow_bone_loss: bool = False) -> Volume:
     """Turn everything outside of the patient's body into air: table, blankets, cables.
 
-    Bone and all else within the body keep their values; so does a margin of 3 mm around it.  The result is meant to be
-    looked at: a part of the table that lies within the margin stays.
+    Bone and all else within the body keep their values; so does a margin of 3 mm around it.  Dry specimens are kept
+    whole, see `clrecon.geometry.dense_pieces`.  The result is meant to be looked at: a part of the table that lies
+    within the margin stays.
 
     Parameters
     ----------
     volume : Volume
         A scan in HU.
+    allow_bone_loss : bool
+        Go on where less than 98 % of the bone stays; the gate ``bone_kept`` has failed then.
 
     Returns
     -------
     Volume
         The same places; ``report["remove_table"]`` has ``voxels_removed``, ``dense_voxels_removed`` (above -300 HU),
-        ``removed_share`` (of all voxels), ``body_share``, ``air_hu``.
+        ``removed_share`` (of all voxels), ``body_share``, ``air_hu`` and what `judge_bone` says of bone;
+        ``report["gates"]`` has the gate ``bone_kept`` too.
 
     Raises
     ------
     RefusedInputError
-        There is nothing thick and dense enough to be a body.
+        There is nothing thick and dense enough to be a body, and no bone; or the gate fails.
     """
-    body, step = find_body(volume)
+    cells = measure_cells(volume)
+    body, pieces = _find_body(cells)
+    bone, gate = judge_bone(cells, pieces, body)
+    if gate["ok"] is False and not allow_bone_loss:
+        raise RefusedInputError(
+            f"the table cannot be told from the body: of {bone['bone_voxels']:,} voxels of bone above 300 HU"
+            f" {bone['bone_voxels_removed']:,} would go with it, bone_kept {bone['bone_kept']:.3f} and at least"
+            f" {BONE_KEPT:g} is needed; leave the table in, or allow the loss of bone"
+        )
+    step = cells.step
 
     def outside(k: int) -> Mask:
         nk, nj, ni = volume.voxels.shape
         return np.asarray(~np.repeat(np.repeat(body[k // step[2]], step[1], 0), step[0], 1)[:nj, :ni])
 
-    return _turn_into_air(volume, outside, "remove_table", {"body_share": round(float(body.mean()), 4)})
+    masked = _turn_into_air(volume, outside, "remove_table", {"body_share": round(float(body.mean()), 4), **bone})
+    masked.report["gates"] = [*masked.report.get("gates", []), gate]
+    return masked
 
 
 def mask_field_of_view(volume: Volume, radius_mm: float | None = None) -> Volume:
@@ -91,7 +104,8 @@ def mask_field_of_view(volume: Volume, radius_mm: float | None = None) -> Volume
     -------
     Volume
         The same places; ``report["field_of_view"]`` has ``radius_mm``, ``voxels_removed``, ``dense_voxels_removed``
-        (above -300 HU), ``removed_share``, ``air_hu``.
+        (above -300 HU), ``removed_share``, ``air_hu`` and what `judge_circle` says of bone.  Without a radius
+        ``report["gates"]`` has the gate ``bone_in_circle``: a circle that was not chosen should cut no bone.
 
     Raises
     ------
@@ -109,7 +123,15 @@ def mask_field_of_view(volume: Volume, radius_mm: float | None = None) -> Volume
     mask = np.linalg.norm(steps @ volume.affine[:3, :2].T, axis=-1) > radius
     if mask.all():
         raise UsageError(f"a field of view of {radius:g} mm holds no voxel: they are {di:.3g} x {dj:.3g} mm")
-    return _turn_into_air(volume, lambda k: mask, "field_of_view", {"radius_mm": round(radius, 3)})
+    cells = measure_cells(volume)
+    si, sj, _ = cells.step
+    _, cj, ci = cells.mean.shape
+    middle = np.ix_(np.minimum(np.arange(cj) * sj + sj // 2, nj - 1), np.minimum(np.arange(ci) * si + si // 2, ni - 1))
+    bone, gate = judge_circle(cells, ~mask[middle])
+    masked = _turn_into_air(volume, lambda k: mask, "field_of_view", {"radius_mm": round(radius, 3), **bone})
+    if radius_mm is None:
+        masked.report["gates"] = [*masked.report.get("gates", []), gate]
+    return masked
 
 
 def _turn_into_air(volume: Volume, outside: Callable[[int], Mask], name: str, said: dict[str, Any]) -> Volume:
@@ -158,37 +180,51 @@ def find_body(volume: Volume) -> tuple[Mask, tuple[int, int, int]]:
     Raises
     ------
     RefusedInputError
-        Nothing is thick and dense enough.
+        Nothing is thick and dense enough, and there is no bone.
     """
+    cells = measure_cells(volume)
+    return _find_body(cells)[0], cells.step
+
+
+def _find_body(cells: Cells) -> tuple[Mask, DensePieces]:
+    """The body with its margin, and what was decided on all that is as dense as bone."""
     from scipy import ndimage
 
-    step = tuple(max(1, round(CELL_MM / length)) for length in volume.spacing)
-    cell_mm = [count * length for count, length in zip(step, volume.spacing, strict=True)]
-    cells = _average_cells(volume, step)
-    across = math.sqrt(cell_mm[0] * cell_mm[1])
-    tissue = cells > TISSUE_HU
-    tissue |= _find_cavities(cells, tissue, across)
+    across = cells.across
+    dense_enough = cells.mean > TISSUE_HU
+    thick = grow(grow(dense_enough, -OPENING_MM / across), OPENING_MM / across) & dense_enough
+    tissue = dense_enough | _find_cavities(cells.mean, dense_enough, thick, across)
+    body = _thick_parts(tissue, across)
+    pieces = find_dense_pieces(cells, dense_enough, thick, body)
+    if not (body.any() or pieces.added.any()):
+        raise RefusedInputError(
+            f"no body found: nothing above {TISSUE_HU:g} HU is {2 * OPENING_MM:g} mm thick, and there is no bone;"
+            " leave the table in"
+        )
+    body |= _thin_parts(tissue, body, cells.size_mm)
+    body |= pieces.added
+    for layer in body:
+        layer |= ndimage.binary_fill_holes(layer)
+    return grow(body, MARGIN_MM / across), pieces
 
-    core = _grow(tissue, -OPENING_MM / across)
+
+def _thick_parts(tissue: Mask, across: float) -> Mask:
+    """The largest piece that is left after opening, and others that are thick; all False where nothing is left."""
+    from scipy import ndimage
+
+    core = grow(tissue, -OPENING_MM / across)
     pieces, count = ndimage.label(core)
     if count == 0:
-        raise RefusedInputError(
-            f"no body found: nothing above {TISSUE_HU:g} HU is {2 * OPENING_MM:g} mm thick; leave the table in"
-        )
+        return np.zeros_like(tissue)
     sizes = np.bincount(pieces.ravel(), minlength=count + 1)[1:]
-    thick = np.unique(pieces[_grow(core, -(THICK_MM - OPENING_MM) / across)])
+    thick = np.unique(pieces[grow(core, -(THICK_MM - OPENING_MM) / across)])
     kept = np.zeros(count + 1, dtype=bool)
     kept[thick] = kept[1 + int(sizes.argmax())] = True
     kept[0] = False
-    body = _grow(kept[pieces], OPENING_MM / across) & tissue
-
-    body |= _thin_parts(tissue, body, cell_mm)
-    for layer in body:
-        layer |= ndimage.binary_fill_holes(layer)
-    return _grow(body, MARGIN_MM / across), (step[0], step[1], step[2])
+    return grow(kept[pieces], OPENING_MM / across) & tissue
 
 
-def _find_cavities(cells: NDArray[np.float32], tissue: Mask, across: float) -> Mask:
+def _find_cavities(cells: NDArray[np.float32], tissue: Mask, thick: Mask, across: float) -> Mask:
     """Lungs, bowel, sinuses: what is not dense but belongs to the body, slice by slice.
 
     Lung is denser than air and has thick tissue beside it; the border of the scan may cut it open.  Air counts where
@@ -198,9 +234,8 @@ def _find_cavities(cells: NDArray[np.float32], tissue: Mask, across: float) -> M
     from scipy import ndimage
 
     in_plane = ndimage.generate_binary_structure(2, 1)[None]
-    unmeasured = _grow(find_unmeasured(cells), 2)
+    unmeasured = grow(find_unmeasured(cells), 2)
     regions, count = ndimage.label(~tissue & ~unmeasured, np.pad(in_plane, ((1, 1), (0, 0), (0, 0))))
-    thick = _grow(_grow(tissue, -OPENING_MM / across), OPENING_MM / across) & tissue
 
     def cells_beside(mask: Mask) -> NDArray[np.int64]:
         return np.bincount(regions[ndimage.binary_dilation(mask, in_plane)], minlength=count + 1)
@@ -235,7 +270,7 @@ def find_unmeasured(cells: NDArray[Any]) -> Mask:
     return found
 
 
-def _thin_parts(tissue: Mask, body: Mask, cell_mm: list[float]) -> Mask:
+def _thin_parts(tissue: Mask, body: Mask, cell_mm: tuple[float, float, float]) -> Mask:
     """What is dense, hangs on the body and is not long."""
     from scipy import ndimage
 
@@ -250,31 +285,3 @@ def _thin_parts(tissue: Mask, body: Mask, cell_mm: list[float]) -> Mask:
         hangs[number] &= math.hypot(*extent) < LONG_MM
     hangs[0] = False
     return np.asarray(hangs[pieces])
-
-
-def _grow(mask: Mask, cells: float) -> Mask:
-    """Dilate (or, below 0, erode) slice by slice by so many cells: an octagon, cross and square in turn."""
-    from scipy import ndimage
-
-    change = ndimage.binary_dilation if cells > 0 else ndimage.binary_erosion
-    for turn in range(max(1, round(abs(cells)))):
-        shape = ndimage.generate_binary_structure(2, 1 + turn % 2)[None]
-        mask = change(mask, shape, border_value=cells < 0)  # the border of the scan erodes nothing
-    return mask
-
-
-def _average_cells(volume: Volume, step: tuple[int, ...]) -> NDArray[np.float32]:
-    """Mean HU of each cell; those at the far ends are smaller."""
-    nk, nj, ni = volume.voxels.shape
-    starts = [np.arange(0, size, count) for size, count in zip((ni, nj), step, strict=False)]
-    cells = np.empty((-(-nk // step[2]), len(starts[1]), len(starts[0])), dtype=np.float32)
-    for place in range(len(cells)):
-        first, end = place * step[2], min((place + 1) * step[2], nk)
-        slab = volume.voxels[first:end].sum(axis=0, dtype=np.float32)
-        rows = np.add.reduceat(np.add.reduceat(slab, starts[1], axis=0), starts[0], axis=1)
-        cells[place] = rows / (end - first)
-        volume.release_slices(first, end)
-    for axis, (size, begin) in enumerate(zip((nj, ni), starts[::-1], strict=True), start=1):
-        widths = np.diff(np.append(begin, size)).astype(np.float32)
-        cells /= widths.reshape([-1 if place == axis else 1 for place in range(3)])
-    return cells

@@ -57,6 +57,13 @@ def _as_array(voxels: ArrayLike) -> NDArray[Any]:
         raise UsageError(f"voxels are no array of numbers: {error}") from error
 
 
+def _value_range(values: NDArray[Any]) -> list[float] | None:
+    """Lowest and highest number; None where there is none."""
+    if values.dtype.kind == "f":
+        values = values[np.isfinite(values)]
+    return [float(values.min()), float(values.max())] if values.size else None
+
+
 class Volume(Grid):
     """Voxels in HU with the affine that places them in the patient.
 
@@ -142,6 +149,9 @@ class Volume(Grid):
     def with_voxels(self, voxels: ArrayLike, report: dict[str, Any] | None = None) -> Volume:
         """Return a volume with other values at the same places.
 
+        ``hu_range`` of the copied report is that of the new values.  What else it says of voxels, such as
+        ``padding_share`` and ``padding_hu``, is of the series as it was read.
+
         Parameters
         ----------
         voxels : array_like, shape (nk, nj, ni)
@@ -157,7 +167,11 @@ class Volume(Grid):
         if array.shape != self._voxels.shape:
             raise UsageError(f"the voxels have shape {array.shape}, those of this volume {self._voxels.shape}")
         positions = None if self._stack is None else self.slice_origins()
-        return Volume(array, self._affine, deepcopy(self.report) if report is None else report, positions)
+        if report is None:
+            report = deepcopy(self.report)
+            if report.get("hu_range") is not None:
+                report["hu_range"] = _value_range(array)
+        return Volume(array, self._affine, report, positions)
 
     def release_slices(self, first: int, end: int) -> None:
         """Say that slices ``first`` to ``end - 1`` are not needed soon: those of a memory-mapped file leave memory.

@@ -41,7 +41,7 @@ def _flat(plan: Plan) -> list[Part]:
         return np.minimum(4.0 - np.abs(np.abs(x) - np.float32(200.0)), 4.0 - np.abs(y - 34.0))
 
     rails = Part("table", 1800.0, rail, (-205.0, 29.0, -ENDLESS), (205.0, 39.0, ENDLESS))
-    return [*_sandwich(outline, 2.0, 250.0, 210.0, 0.0), rails]
+    return [*_sandwich(outline, 3.0, 250.0, 210.0, 0.0), rails]
 
 
 def _curved(plan: Plan) -> list[Part]:

@@ -6,7 +6,7 @@ import math
 
 from clrecon.errors import UsageError
 
-__all__ = ["check_field_of_view", "check_memory"]
+__all__ = ["check_bone_loss", "check_field_of_view", "check_memory"]
 
 
 def check_memory(memory: int | None) -> None:
@@ -19,6 +19,18 @@ def check_memory(memory: int | None) -> None:
     """
     if memory is not None and memory < 1:
         raise UsageError(f"the memory that may be taken must be above 0 bytes, not {memory}")
+
+
+def check_bone_loss(remove_table: bool, allow_bone_loss: bool) -> None:
+    """Refuse a loss that nothing can cause.
+
+    Raises
+    ------
+    UsageError
+        The loss of bone is allowed, and no table is to be removed.
+    """
+    if allow_bone_loss and not remove_table:
+        raise UsageError("a loss of bone is allowed, but nothing takes any: ask for the removal of the table too")
 
 
 def check_field_of_view(view: float | str | None) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from clrecon.pipeline.progress import Progress
 
@@ -22,7 +22,7 @@ def mask_volume(volume: Volume, settings: MeshSettings | RenderSettings, progres
     UsageError
         The field of view holds nothing.
     RefusedInputError
-        There is no body to be told from its table.
+        There is no body to be told from its table, or bone would go with it.
     """
     if settings.field_of_view is None and not settings.remove_table:
         return volume
@@ -37,16 +37,35 @@ def mask_volume(volume: Volume, settings: MeshSettings | RenderSettings, progres
         warnings.append(
             f"outside of {facts['radius_mm']:.4g} mm around the centre of the slices is air now:"
             f" {100.0 * facts['removed_share']:.3g} % of the voxels, {facts['dense_voxels_removed']:,} of them dense"
+            + _describe_cut(facts)
         )
     if settings.remove_table:
-        volume = remove_table(volume)
+        volume = remove_table(volume, allow_bone_loss=settings.allow_bone_loss)
         facts = volume.report["remove_table"]
         warnings.append(
             f"outside of the body is air now: {100.0 * facts['removed_share']:.3g} % of the voxels,"
-            f" {facts['dense_voxels_removed']:,} of them dense (table, blankets); look whether the body is whole"
+            f" {facts['dense_voxels_removed']:,} of them dense (table, blankets);{_describe_bone(facts)}"
+            " look whether the body is whole"
         )
     volume.report["warnings"] = warnings
     return volume
+
+
+def _describe_bone(facts: dict[str, Any]) -> str:
+    if facts["bone_kept"] is None:
+        return " no bone above 300 HU;"
+    what = "the dry bone" if facts["specimen"] else "the bone"
+    return f" of {what} {100.0 * facts['bone_kept']:.4g} % stay ({facts['bone_voxels_removed']:,} voxels go);"
+
+
+def _describe_cut(facts: dict[str, Any]) -> str:
+    """What bone a circle has cut; nothing where it has cut none."""
+    lost = facts["bone_voxels_removed"]
+    if not lost:
+        return ""
+    apart = facts["bone_voxels_apart"]
+    whole = f", {apart:,} of them in pieces that lie outside whole" if apart else ""
+    return f"; it cuts bone off: {100.0 * (1.0 - facts['bone_kept']):.3g} %, {lost:,} voxels above 300 HU{whole}"
 
 
 def leave_outside(volume: Volume, settings: MeshSettings, progress: Progress) -> Volume:

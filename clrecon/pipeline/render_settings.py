@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, fields
 from typing import TYPE_CHECKING
 
 from clrecon.errors import UsageError
-from clrecon.pipeline.checks import check_field_of_view, check_memory
+from clrecon.pipeline.checks import check_bone_loss, check_field_of_view, check_memory
 from clrecon.pipeline.render_modes import MODES, find_misplaced
 
 if TYPE_CHECKING:
@@ -122,7 +122,7 @@ class RenderSettings:
     cpr : {"straightened", "stretched"}
     labels : LabelLook, optional
     turntable : Turntable, optional
-    series, phase, allow_gaps, force, remove_table, field_of_view, device, memory
+    series, phase, allow_gaps, force, remove_table, allow_bone_loss, field_of_view, device, memory
         As in `clrecon.pipeline.settings.MeshSettings`.
 
     Raises
@@ -167,6 +167,7 @@ class RenderSettings:
     allow_gaps: bool = False
     force: bool = False
     remove_table: bool = False
+    allow_bone_loss: bool = False
     field_of_view: float | str | None = None
     device: str | None = None
     memory: int | None = None
@@ -182,6 +183,7 @@ class RenderSettings:
         self._check_mode()
         check_memory(self.memory)
         check_field_of_view(self.field_of_view)
+        check_bone_loss(self.remove_table, self.allow_bone_loss)
 
     def _given(self) -> set[str]:
         """Names of the settings that are not what they are by default."""

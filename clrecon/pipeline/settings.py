@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from clrecon.errors import UsageError
-from clrecon.pipeline.checks import check_field_of_view, check_memory
+from clrecon.pipeline.checks import check_bone_loss, check_field_of_view, check_memory
 from clrecon.pipeline.labels import LabelChoice
 from clrecon.pipeline.presets import DEFAULT_PRESET, find_preset
 
@@ -44,6 +44,8 @@ class MeshSettings:
         Read a stack with missing slices.
     remove_table : bool
         Turn what is not the patient's body into air first, see `clrecon.geometry.body.remove_table`.
+    allow_bone_loss : bool
+        Go on where this takes more than 2 % of the bone.
     field_of_view : float or "auto", optional
         Turn what lies further from the centre of the slices (mm) into air first; "auto": the circle that fits them.
     force : bool
@@ -92,6 +94,7 @@ class MeshSettings:
     phase: int | None = None
     allow_gaps: bool = False
     remove_table: bool = False
+    allow_bone_loss: bool = False
     field_of_view: float | str | None = None
     force: bool = False
     space: str = "lps"
@@ -128,6 +131,7 @@ class MeshSettings:
                 raise UsageError(f"a seed is a point of three numbers in mm, not {tuple(seed)}")
         self._check_refinement()
         check_field_of_view(self.field_of_view)
+        check_bone_loss(self.remove_table, self.allow_bone_loss)
         from clrecon.geometry import frame_from_lps  # numpy: not wanted before a job starts
         from clrecon.geometry.field import check_topology
 

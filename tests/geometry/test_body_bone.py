@@ -1,0 +1,162 @@
+"""Bone stays when the table goes: specimens, limbs, metal, prone, two bodies; and the gate where it does not."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from odd_bodies import BODIES, make_odd
+
+from clrecon.errors import RefusedInputError
+from clrecon.geometry import Volume
+from clrecon.geometry.body import mask_field_of_view, remove_table
+
+SPECIMENS = {"skull", "skull-prone", "bones"}
+
+
+def gate_of(volume: Volume, name: str = "bone_kept") -> dict[str, Any]:
+    return next(gate for gate in volume.report["gates"] if gate["name"] == name)
+
+
+def share_kept(before: Volume, after: Volume, mask: np.ndarray) -> float:
+    return float((before.voxels == after.voxels)[mask].mean())
+
+
+@pytest.mark.parametrize("name", [name for name in BODIES if name not in ("empty", "water")])
+def test_bone_stays_and_the_table_goes(name: str) -> None:
+    body = make_odd(name)
+    cleaned = remove_table(body.volume)
+    facts = cleaned.report["remove_table"]
+    assert share_kept(body.volume, cleaned, body.dense) > 0.999
+    less_dense = body.of("bone", "metal", "contrast") & (body.volume.voxels > 0)
+    assert share_kept(body.volume, cleaned, less_dense) > 0.98
+    assert share_kept(body.volume, cleaned, body.of("table") & (body.volume.voxels > -300)) < 0.35
+    assert facts["specimen"] == (name in SPECIMENS)
+    assert facts["bone_kept"] > 0.999
+    assert facts["bone_voxels"] >= 0.97 * np.count_nonzero(body.dense)
+    gate = gate_of(cleaned)
+    assert gate["ok"] and gate["bound"] == 0.98 and gate["measured"] == pytest.approx(facts["bone_kept"], abs=1e-6)
+
+
+def test_a_table_alone_is_no_body() -> None:
+    for name in ("empty", "empty-curved"):
+        voxels = np.array(make_odd("empty").volume.voxels)
+        if name == "empty-curved":
+            voxels[voxels > 700] = -1000  # without its rails
+        with pytest.raises(RefusedInputError, match="no body found.*there is no bone"):
+            remove_table(Volume(voxels, make_odd("empty").volume.affine))
+
+
+def test_water_has_no_bone_to_keep() -> None:
+    body = make_odd("water")
+    cleaned = remove_table(body.volume)
+    facts = cleaned.report["remove_table"]
+    assert share_kept(body.volume, cleaned, body.of("water")) > 0.99
+    assert facts["bone_kept"] is None and not facts["specimen"]
+    assert gate_of(cleaned)["ok"] is None
+
+
+@pytest.mark.parametrize("change", ["soft bone", "a slab", "noise", "aluminium"])
+def test_a_skull_of_another_kind_is_kept(change: str) -> None:
+    body = make_odd("skull-prone")
+    voxels, keep = np.array(body.volume.voxels), slice(None)
+    if change == "soft bone":
+        voxels[body.dense] = np.minimum(0.45 * voxels[body.dense], 690)
+    elif change == "a slab":  # of 30 mm: as straight as a table there
+        keep = slice(24, 32)
+    elif change == "noise":
+        voxels += np.rint(np.random.default_rng(5).normal(0, 110, voxels.shape)).astype(np.int16)
+    else:
+        voxels[body.of("table") & (voxels.mean(axis=0) > -100)] = 1700
+    volume = Volume(voxels[keep], body.volume.affine)
+    cleaned = remove_table(volume)
+    dense = (volume.voxels > 300) & body.dense[keep]
+    assert dense.any() and share_kept(volume, cleaned, dense) > 0.999
+    if change != "a slab":
+        assert share_kept(volume, cleaned, body.of("table") & (voxels > -100)) < 0.3
+
+
+def dry_shafts() -> tuple[Volume, np.ndarray]:
+    """Three dry shafts along z through all slices, on a flat table with rails; HU and the mask of the shafts."""
+    y, x = np.mgrid[:84, :84] * 2.0 - 83.0
+    hu, bone = np.full((40, 84, 84), -1000.0), np.zeros((40, 84, 84), dtype=bool)
+    for number, layer in enumerate(hu):
+        layer[((y > 34) & (y < 37)) | ((y > 56) & (y < 59))] = 250
+        layer[(abs(abs(x) - 70) < 4) & (abs(y - 66) < 4)] = 1800
+        for middle, radius, wall in ((-30.0, 14.0, 5.0), (6.0, 8.0, 3.0), (40.0, 11.0, 3.0)):
+            way = np.hypot(x - middle - 3 * np.sin(number / 15), y - 34 + radius)
+            cavity = radius - wall - 1.5 * np.sin(number / 6)
+            layer[way < radius], layer[way < cavity] = 1400, -700
+            bone[number] |= way < radius
+    hu += np.random.default_rng(3).normal(0, 12, hu.shape)
+    affine = np.diag((2.0, 2.0, 3.0, 1.0))
+    return Volume(np.rint(hu).astype(np.int16), affine), bone & (hu > 300)
+
+
+def test_straight_shafts_that_touch_a_table_are_no_rails() -> None:
+    volume, bone = dry_shafts()
+    cleaned = remove_table(volume)
+    assert share_kept(volume, cleaned, bone) > 0.999
+    assert cleaned.report["remove_table"]["bone_voxels"] == pytest.approx(np.count_nonzero(bone), rel=0.05)
+    assert not (cleaned.voxels[:, 76:] > 300).any()  # the rails
+
+
+def beside(*names: str) -> tuple[Volume, np.ndarray]:
+    """Two bodies in one scan, side by side."""
+    bodies = [make_odd(name) for name in names]
+    voxels = np.concatenate([body.volume.voxels for body in bodies], axis=2)
+    return Volume(voxels, bodies[0].volume.affine), np.concatenate([body.dense for body in bodies], axis=2)
+
+
+def test_a_dry_skull_beside_a_patient_is_a_second_body() -> None:
+    volume, dense = beside("skull", "limb")
+    cleaned = remove_table(volume)
+    facts = cleaned.report["remove_table"]
+    assert not facts["specimen"]
+    assert share_kept(volume, cleaned, dense) > 0.98  # loose teeth go
+    assert share_kept(volume, cleaned, dense) == pytest.approx(facts["bone_kept"], abs=0.01)
+
+
+def test_what_would_go_with_the_table_is_refused_with_its_figures() -> None:
+    """Dry bones beside a leg, some of them too small for a body: nothing tells them from equipment."""
+    volume, dense = beside("bones", "limb")
+    with pytest.raises(RefusedInputError, match=r"of [\d,]+ voxels of bone .* [\d,]+ would go .*bone_kept 0\.\d+"):
+        remove_table(volume)
+    cleaned = remove_table(volume, allow_bone_loss=True)
+    gate, facts = gate_of(cleaned), cleaned.report["remove_table"]
+    assert gate["ok"] is False and gate["measured"] < 0.98
+    assert facts["bone_voxels_removed"] == round(facts["bone_voxels"] * (1.0 - gate["measured"]))
+    assert share_kept(volume, cleaned, dense) == pytest.approx(gate["measured"], abs=0.05)
+
+
+def test_the_range_of_values_is_that_of_the_voxels_that_are_left() -> None:
+    body = make_odd("pelvis")
+    given = [float(body.volume.voxels.min()), float(body.volume.voxels.max())]
+    volume = Volume(body.volume.voxels, body.volume.affine, {"warnings": [], "hu_range": given, "padding_share": 0.1})
+    cut = mask_field_of_view(volume, 60.0)
+    assert cut.report["hu_range"] == [cut.voxels.min(), cut.voxels.max()] != given
+    assert remove_table(volume).report["hu_range"][1] == 3071
+    assert (volume.report["hu_range"], cut.report["padding_share"]) == (given, 0.1)
+
+
+@pytest.mark.parametrize("name", ["pair", "limb", "head"])
+def test_a_circle_says_what_bone_it_cuts(name: str) -> None:
+    body = make_odd(name)
+    masked = mask_field_of_view(body.volume, 45.0)
+    facts = masked.report["field_of_view"]
+    lost = np.count_nonzero(body.dense & (masked.voxels != body.volume.voxels))
+    assert lost > 100  # the circle cuts bone
+    # pieces of the table are not hard; what is cut is counted to a cell
+    assert facts["bone_voxels_removed"] == pytest.approx(lost, rel=0.05)
+    assert facts["bone_kept"] == pytest.approx(1.0 - lost / np.count_nonzero(body.dense), abs=0.02)
+    assert "gates" not in masked.report  # the circle was chosen
+
+
+def test_a_circle_that_was_not_chosen_has_a_gate() -> None:
+    whole = mask_field_of_view(make_odd("head").volume)
+    assert gate_of(whole, "bone_in_circle")["ok"] and whole.report["field_of_view"]["bone_voxels_removed"] == 0
+    limb = make_odd("limb").volume
+    moved = mask_field_of_view(Volume(np.roll(limb.voxels, (-45, 25), axis=(1, 2)), limb.affine))
+    assert gate_of(moved, "bone_in_circle")["ok"] is False
+    assert moved.report["field_of_view"]["bone_kept"] < 0.98
