@@ -173,6 +173,11 @@ def _trilinear_volume(case: int) -> Fraction:
     return Fraction(int(np.sum(field > half) + np.sum(field >= half)), 2 * _SAMPLES**3)
 
 
+def _chords(triangles: list[Triangle]) -> list[tuple[int, ...]]:
+    """The triangles without their direction, in order: the same for a case and its complement cut alike."""
+    return sorted(tuple(sorted(triangle)) for triangle in triangles)
+
+
 def _choose_triangles(case: int) -> tuple[Triangle, ...]:
     """The fans of a case by the rule at the head of this module; the first of equals."""
     loops = case_loops(case)
@@ -189,7 +194,7 @@ def _choose_triangles(case: int) -> tuple[Triangle, ...]:
     def error(triangles: list[Triangle]) -> Fraction:
         return abs(Fraction(_volume_at_faces(case) + _enclosed_volume(triangles), 48) - wanted)
 
-    nearest = min(choices, key=error)
+    nearest = min(choices, key=lambda triangles: (error(triangles), _chords(triangles)))
     return tuple(nearest)
 
 

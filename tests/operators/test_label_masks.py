@@ -198,6 +198,17 @@ def test_touching_labels_share_their_border(device):
         assert abs(volume_share(mesh)) <= tolerances.MASK_VOLUME
 
 
+def test_a_curved_border_is_shared_to_the_last_triangle(device):
+    """Where neither label is apart on a face of a cell, both cut the border into the same triangles."""
+    shape = (26, 28, 40)
+    inner = mask_of(shape, 8.0)
+    labels = np.where(inner, 2, mask_of(shape, 12.0)).astype(np.uint8)
+    meshes = extract_label_masks(LabelMap(labels, OBLIQUE), device)
+    pairs, edges = cancelled_pairs(meshes.values())
+    assert pairs == len(meshes[2].triangles)  # all of the inner label
+    assert all(edges.get((b, a), 0) == count for (a, b), count in edges.items())
+
+
 def test_no_groove_runs_along_the_border_and_gaps_stay_open(device):
     shape = (16, 30, 40)
     labels = np.zeros(shape, np.uint8)
