@@ -50,7 +50,8 @@ def read_volume(
     allow_gaps : bool
         Read a stack with missing slices: what is there is placed exactly, with a warning.
     force : bool
-        Read data sets without preamble or meta header too, their encoding guessed, with a warning.
+        Read data sets without preamble or meta header too, their encoding guessed, and leave out bytes that are left
+        over behind the pixels, with a warning each.
     progress : callable, optional
         Called as ``progress(stage, done, total)`` with stage "scan" or "read", or "no answer yet from NAME" where the
         disk hangs.

@@ -28,7 +28,8 @@ def add_reading(parser: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--force",
         action="store_true",
-        help="read data sets without preamble or meta header too; their encoding is guessed",
+        help="read data sets without preamble or meta header too, their encoding guessed; leave out what is left"
+        " over behind the pixels",
     )
 
 

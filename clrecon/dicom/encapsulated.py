@@ -13,7 +13,7 @@ from typing import BinaryIO
 from clrecon.dicom.codecs import RLE
 from clrecon.errors import RefusedInputError
 
-__all__ = ["ITEMS_END", "Pieces", "find_end", "find_frames", "read_pieces"]
+__all__ = ["Pieces", "find_end", "find_frames", "read_pieces"]
 
 Pieces = list[tuple[int, int]]
 """First byte in the file and count of bytes of each fragment of a frame."""
@@ -22,8 +22,6 @@ MAX_FRAGMENTS = 1_000_000
 FRAGMENTS_PER_FRAME = 1000
 """At most, on the whole: writers make one, or one of some KiB each."""
 _ITEM, _END = (0xFFFE, 0xE000), (0xFFFE, 0xE0DD)
-ITEMS_END = struct.pack("<HHL", *_END, 0)
-"""The last bytes of a file with compressed pixels, unless other elements follow."""
 _STARTS = (b"\xff\xd8\xff", b"\xff\x4f\xff\x51", b"\0\0\0\x0cjP")
 """First bytes of JPEG and JPEG-LS, JPEG 2000, and JP2."""
 

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.dicom.codecs import is_encapsulated
-from clrecon.dicom.encapsulated import ITEMS_END, find_end
+from clrecon.dicom.encapsulated import find_end
 from clrecon.dicom.raw import PIXEL_TAGS, UNDEFINED_LENGTH, CorruptFileError, DicomElements
 from clrecon.dicom.sequences import LONG_VRS, skip_sequence
 from clrecon.dicom.slice_header import SliceHeader
@@ -32,6 +32,8 @@ INFLATED_LIMIT = 1 << 30
 """Bytes of one data set that are inflated at most."""
 LOOKED_AT_BYTES = 16 * 2**20
 """Of a sequence without length, or of a deflated data set behind its pixels."""
+MOST_PADDING_BYTES = 64 * 2**20
+"""More zeros are none, and more of a picture is not looked at: a sparse file holds them without end."""
 MOST_ELEMENTS = 10_000
 SHEARED = 0.98
 """Rows are so much more alike with another count of columns.  Noise alone makes no difference."""
@@ -77,7 +79,7 @@ def check_surplus(elements: DicomElements, header: SliceHeader, force: bool = Fa
         if header.inflate_from >= 0:
             if header.pixel_offset + expected > INFLATED_LIMIT:
                 return ()  # reading refuses it
-            inflated = _inflate(file, header.inflate_from, max(end, header.pixel_offset + expected))
+            inflated = _inflate(file, header.inflate_from, header.pixel_offset + expected)
             file, size = io.BytesIO(inflated), len(inflated)
             if size < header.pixel_offset + expected:
                 return ()  # it is cut, which reading says
@@ -91,13 +93,8 @@ def check_surplus(elements: DicomElements, header: SliceHeader, force: bool = Fa
 
 def _check_encapsulated(elements: DicomElements, header: SliceHeader, force: bool) -> tuple[str, ...]:
     with open_regular(header.file) as file:
-        file.seek(max(header.file_bytes - len(ITEMS_END), 0))
-        if file.read() == ITEMS_END:
-            return ()
         try:
             end = find_end(file, header.pixel_offset, header.file_bytes)
-        except CorruptFileError:
-            raise
         except RefusedInputError:
             return ()  # cut or damaged, which reading says
         return tuple(_judge_tail(file, elements, end, header.file_bytes, force)) if end < header.file_bytes else ()
@@ -125,6 +122,9 @@ def _judge_excess(file: BinaryIO, header: SliceHeader, expected: int, found: int
 
 
 def _is_zero(file: BinaryIO, place: int, count: int) -> bool:
+    """True for bytes of 0; of more than `MOST_PADDING_BYTES` nobody looks whether they are."""
+    if count > MOST_PADDING_BYTES:
+        return False
     file.seek(place)
     while count > 0:
         part = file.read(min(count, _CHUNK))
@@ -140,18 +140,22 @@ def _find_hidden_columns(file: BinaryIO, header: SliceHeader, found: int) -> int
     columns, rest = divmod(found, header.frames * header.rows * item)
     if rest or columns <= header.columns or header.rows < 2:
         return 0
+    rows = min(header.rows, MOST_PADDING_BYTES // (columns * item))
     file.seek(header.pixel_offset)
     kind = "f" if header.float_pixels else "i" if header.signed else "u"
-    data = file.read(header.rows * columns * item)
+    data = file.read(rows * columns * item)
+    if rows < 2 or len(data) < rows * columns * item:
+        return 0
     pixels = np.frombuffer(data, f"{'<' if header.little_endian else '>'}{kind}{item}").astype(np.float64)
-    told = _measure_steps(pixels[: header.rows * header.columns].reshape(header.rows, header.columns))
-    other = _measure_steps(pixels.reshape(header.rows, columns))
+    told = _measure_steps(pixels[: rows * header.columns].reshape(rows, header.columns))
+    other = _measure_steps(pixels.reshape(rows, columns))
     return columns if other < SHEARED * told else 0
 
 
 def _measure_steps(picture: NDArray[np.float64]) -> float:
-    """Mean size of the steps between rows."""
-    return float(np.mean(np.abs(np.diff(picture, axis=0))))
+    """Mean size of the steps between rows; of float pixels some may be no numbers."""
+    with np.errstate(all="ignore"):
+        return float(np.mean(np.abs(np.diff(picture, axis=0))))
 
 
 def _judge_tail(file: BinaryIO, elements: DicomElements, end: int, size: int, force: bool) -> list[str]:

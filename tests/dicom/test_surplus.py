@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import struct
 
 import numpy as np
@@ -264,6 +265,15 @@ def test_what_follows_compressed_pixels(tmp_path, name):
     check_refused(tmp_path, "45 bytes behind the pixel data are no elements of DICOM")
 
 
+@pytest.mark.parametrize("name", [*COMPRESSED, *NATIVE])
+def test_two_files_in_one(tmp_path, name):
+    """The second is not read in silence: neither its pixels nor that it is there."""
+    files = make_series((COMPRESSED | NATIVE)[name])
+    for k, data in enumerate(files):
+        (tmp_path / NAME(k)).write_bytes(data + files[0])
+    check_refused(tmp_path, "bytes behind the ")
+
+
 @pytest.mark.parametrize("name", COMPRESSED)
 @pytest.mark.parametrize(("keyword", "value"), [("Columns", 31), ("Rows", 31), ("Columns", 16)])
 def test_compressed_pixels_of_another_size(tmp_path, name, keyword, value):
@@ -273,13 +283,21 @@ def test_compressed_pixels_of_another_size(tmp_path, name, keyword, value):
     check_refused(tmp_path, "IM000")
 
 
+def test_a_sparse_file_is_not_read_to_its_end(tmp_path):
+    """Zeros without end take no space on the disk, and neither time nor memory here."""
+    write(tmp_path)
+    for file in tmp_path.iterdir():
+        os.truncate(file, 1 << 36)
+    check_refused(tmp_path, "bytes behind the pixel data are no elements of DICOM")
+
+
 def test_a_file_in_plain_order_is_not_opened_again(tmp_path, monkeypatch):
     write(tmp_path)
 
     def fail(*args):
         raise AssertionError("looked at a file that has no surplus")
 
-    monkeypatch.setattr(surplus, "open", fail, raising=False)
+    monkeypatch.setattr(surplus, "open_regular", fail)
     assert list_series(tmp_path).series[0].slices == 3
     append(tmp_path, b"\0\0")
     with pytest.raises(AssertionError, match="no surplus"):
