@@ -28,13 +28,15 @@ EMPTY, TEXT, UNKNOWN = "empty", "text", "no DICOM"
 SIZE_BYTES = 256
 """Headers of slices differ by a few digits: a file is as large as a slice up to this."""
 FEWEST_RANDOM_NAMES = 3
+META_WITHIN = 1024
+"""Bytes in which a meta header begins, whose file lost or gained some before it."""
 
 _META_ELEMENT = re.compile(rb"\x02\0[\0-\x16]\0(UL|UI|OB|SH|AE)")
 _SYNTAX_OR_CLASS = re.compile(rb"\x02\0[\x02\x03\x10]\0UI")
 _DIGITS = re.compile(r"\d+")
 _RANDOM = (re.compile(r"[0-9A-Z_]{6,}"), re.compile(r"[0-9a-f-]{6,}"))
 """Alphabets of names that writers draw or count with letters, such as IM00001B."""
-_ADDED = (".gz", ".bz2", ".xz", ".zst", ".zip", ".7z", ".part", ".partial", ".crdownload", ".tmp", ".bad")
+_ADDED = frozenset("gz bz2 xz zst zip 7z part partial crdownload tmp bad".split())
 """Suffixes that packers and broken transfers add to a name."""
 _PACKED = ("gzip file", "bzip2 file", "xz file", "zstd file", "zip archive", "7z archive")
 _OF_THE_SYSTEM = frozenset(("thumbs.db", "ehthumbs.db", "desktop.ini"))
@@ -65,7 +67,8 @@ class _Slices:
             self.random = next((kind for kind in _RANDOM if all(map(kind.fullmatch, self.names))), None)
 
     def has_name_like(self, name: str) -> bool:
-        if "#" in _pattern(name) and _pattern(name) in self.patterns:
+        pattern = _pattern(name)
+        if "#" in pattern and pattern in self.patterns:
             return True
         drawn = self.random is not None and len(name) == self.length and self.random.fullmatch(name)
         return bool(drawn) and any(map(str.isdigit, name))
@@ -95,9 +98,9 @@ def describe_start(start: bytes) -> str:
     kind = describe_container(start)
     if kind:
         return kind
-    if not 0x20 <= start[0] < 0x7F and start.count(start[:1]) == len(start):
+    if not 0x20 <= start[0] < 0x7F and not start.strip(start[:1]):
         return f"blank, all bytes {start[0]:02X}"
-    if b"\0UI" in start and _SYNTAX_OR_CLASS.search(start):
+    if _SYNTAX_OR_CLASS.search(start, 0, META_WITHIN):
         return DAMAGED_START
     return UNKNOWN if b"\0" in start else TEXT
 
@@ -121,7 +124,7 @@ def find_remains(strangers: Sequence[Stranger], slices: Iterable[tuple[str, int]
     folders: dict[str, _Slices] = defaultdict(_Slices)
     paths: set[str] = set()  # of the slices: name and folder, as patterns
     for file, size in slices:
-        folder, name = os.path.split(file)
+        folder, _, name = file.rpartition(os.sep)
         known = folders[folder]
         known.names.add(name)
         known.sizes.append(size)
@@ -137,7 +140,7 @@ def find_remains(strangers: Sequence[Stranger], slices: Iterable[tuple[str, int]
 
 
 def _judge(stranger: Stranger, folders: dict[str, _Slices], paths: set[str]) -> str:
-    folder, name = os.path.split(stranger.file)
+    folder, _, name = stranger.file.rpartition(os.sep)
     if stranger.what in (DAMAGED_MARK, DAMAGED_START):
         return stranger.what
     known = folders.get(folder)
@@ -159,8 +162,8 @@ def _judge(stranger: Stranger, folders: dict[str, _Slices], paths: set[str]) -> 
 
 
 def _strip_added(name: str) -> tuple[str, str]:
-    stem, suffix = os.path.splitext(name)
-    return (stem, suffix) if suffix.lower() in _ADDED else (name, "")
+    stem, point, suffix = name.rpartition(".")
+    return (stem, suffix) if point and suffix.lower() in _ADDED else (name, "")
 
 
 def _say(what: str) -> str:

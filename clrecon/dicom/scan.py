@@ -124,7 +124,7 @@ def _take_file(file: str, start: FileStart | OSError, scan: Scan, force: bool) -
         if reason:
             scan.suspects.append(CorruptFile(Path(file), reason))
         else:
-            scan.strangers.append(Stranger(file, start.size, describe_start(start.prefix)))
+            scan.strangers.append(Stranger(str(Path(file)), start.size, describe_start(start.prefix)))
         return
     try:
         if isinstance(start, OSError):

@@ -162,6 +162,16 @@ def test_a_damaged_modality_is_no_other_series(tmp_path):
         read_volume(tmp_path)
 
 
+@pytest.mark.parametrize("path", [".", "../ct", "ct/../../ct/"])
+def test_a_folder_by_any_name(tmp_path, monkeypatch, path):
+    plan = write_series(tmp_path / "ct", plan_with("IM0001"))
+    (tmp_path / "ct" / "ct").mkdir()
+    (tmp_path / "ct" / plan.name(COUNT - 1)).write_bytes(b"")
+    monkeypatch.chdir(tmp_path / "ct")
+    with pytest.raises(RefusedInputError, match="IM0012: named like slices, but empty"):
+        read_volume(path)
+
+
 def test_both_ends_at_once(tmp_path):
     plan = write_series(tmp_path, plan_with("IM0001"))
     for k in (0, COUNT - 1):
