@@ -35,6 +35,9 @@ from clrecon.geometry import column_spacing
 
 __all__ = ["certify", "collect_scan_warnings", "collect_series_warnings"]
 
+SAID_BY_GATES = ("padding_share", "stored_bits", "plausible_spacing", "gap_thickness", "plausible_hu")
+"""Gates whose text is a warning where they fail; of the others a warning says more."""
+
 
 def collect_scan_warnings(scan: Scan) -> list[str]:
     """Warnings about files that were passed over although they claim to be DICOM, or could not be looked at."""
@@ -155,7 +158,7 @@ def certify(
         the voxels as they are in the volume, padding (at ``padding_hu``) among them.
     """
     gates = judge_series(series, stack, facts, likeness)
-    unsaid = [gate["text"] for gate in gates if gate["name"] == "padding_share" and gate["ok"] is False]
+    unsaid = [gate["text"] for gate in gates if gate["name"] in SAID_BY_GATES and gate["ok"] is False]
     return {
         "format": "DICOM",
         "series": {

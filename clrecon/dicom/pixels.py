@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import nullcontext
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +22,7 @@ from clrecon.dicom.padding import PaddingMasks, pack_mask
 from clrecon.dicom.scan import Progress
 from clrecon.dicom.slice_header import SliceHeader
 from clrecon.dicom.stored import StoredPixels, count_readers
+from clrecon.dicom.stray_bits import StrayBits, describe_stray_bits, find_stray_bits
 from clrecon.errors import RefusedInputError
 from clrecon.geometry.memory import allocate_voxels
 
@@ -47,12 +48,27 @@ class PixelFacts:
         Lowest and highest HU of the volume, padding included.
     padding_hu : float or None
         What padding was filled with; None where there is none.
+    stray : int
+        Values that lost bits of theirs, see `clrecon.dicom.stray_bits`.
+    stray_text : str
+        What is to be said of them; empty where there are none.
     """
 
     padding_share: float
     hu_min: float
     hu_max: float
     padding_hu: float | None = None
+    stray: int = 0
+    stray_text: str = ""
+
+
+class _SliceFacts(NamedTuple):
+    """What was seen in one slice: its padding, packed, its lowest and highest measured HU, and bits that are odd."""
+
+    padding: tuple[bytes, int] | None
+    low: float
+    high: float
+    stray: StrayBits | None
 
 
 class _RangeError(Exception):
@@ -102,6 +118,7 @@ def _fill_volume(
     source: StoredPixels, slices: Sequence[SliceHeader], voxels: NDArray[Any], progress: Progress | None
 ) -> PixelFacts:
     padding, low, high = PaddingMasks(voxels), np.inf, -np.inf
+    stray: list[StrayBits | None] = [None] * len(slices)
     most = MAX_READERS
     if source.compressed:
         most = min(MAX_DECODERS, 1 + len(slices) * slices[0].pixel_bytes // DECODER_WORTH_BYTES)
@@ -109,9 +126,10 @@ def _fill_volume(
         try:
             jobs = {pool.submit(_fill_slice, source, header, voxels[k]): k for k, header in enumerate(slices)}
             for done, job in enumerate(as_completed(jobs), start=1):
-                slice_padding, slice_low, slice_high = job.result()
-                padding.add(jobs[job], slice_padding)
-                low, high = min(low, slice_low), max(high, slice_high)
+                seen = job.result()
+                padding.add(jobs[job], seen.padding)
+                low, high = min(low, seen.low), max(high, seen.high)
+                stray[jobs[job]] = seen.stray
                 if progress is not None:
                     progress("read", done, len(slices))
         except _RangeError:
@@ -124,24 +142,25 @@ def _fill_volume(
         padding_hu = padding.fill(pool.map)
     if padding_hu is not None:
         low, high = min(low, padding_hu), max(high, padding_hu)
-    return PixelFacts(padding.count / voxels.size, float(low), float(high), padding_hu)
+    count, text = describe_stray_bits(stray, slices)
+    return PixelFacts(padding.count / voxels.size, float(low), float(high), padding_hu, count, text)
 
 
-def _fill_slice(
-    source: StoredPixels, header: SliceHeader, out: NDArray[Any]
-) -> tuple[tuple[bytes, int] | None, float, float]:
-    """Read one slice into `out`; returns its padding, packed, or None, and its lowest and highest measured HU."""
+def _fill_slice(source: StoredPixels, header: SliceHeader, out: NDArray[Any]) -> _SliceFacts:
+    """Read one slice into `out`."""
     stored = source.load(header, out)
     whole_cell = header.padding is not None and not header.float_pixels and not _fits_stored_bits(header)
     padding = _find_padding(header, stored) if whole_cell else None  # the value fills unused bits too
+    stray = None
     if not header.float_pixels:
+        stray = find_stray_bits(header, stored, padding)
         _extend_sign(header, stored)
     if header.padding is not None and not whole_cell:
         padding = _find_padding(header, stored)
     packed = None if padding is None else pack_mask(padding)
     if padding is not None and packed is not None:
         if packed[1] == padding.size:
-            return packed, np.inf, -np.inf
+            return _SliceFacts(packed, np.inf, -np.inf, stray)
         # A measured value in its place counts for nothing: one pass less over the slice.
         np.copyto(stored, stored.flat[padding.argmin()], where=padding)
     low, high = stored.min(), stored.max()
@@ -158,7 +177,7 @@ def _fill_slice(
             out[...] = stored * np.float64(header.slope) + header.intercept
     else:
         _rescale_integers(header, stored, out, hu_low, hu_high)
-    return packed, hu_low, hu_high
+    return _SliceFacts(packed, hu_low, hu_high, stray)
 
 
 def _rescale_integers(

@@ -3,7 +3,7 @@
 Headers lie about rescale: an intercept that is missing or was applied twice shifts everything by 1024 HU, and no
 geometry check sees it.  The figures below are shares of a sample of the voxels; a warning needs air *and* soft tissue
 in the wrong places, 1000 HU apart, so that scans without air (a cropped spine) or without soft tissue (a dry bone)
-raise none.
+raise none.  A figure that is told is counted in all voxels.
 """
 
 from __future__ import annotations
@@ -27,6 +27,10 @@ CEILING_HU = 3071
 """Where no header says how values were stored."""
 CEILING_VOXELS = 10
 """As many voxels at the ceiling may be noise in dense bone."""
+
+CEILING_LEVELS, CEILING_SPIKE = 8, 10.0
+"""With values beyond a ceiling it is one where it has so many times the voxels of the values around it: what was cut
+off there and then interpolated, or put beside slices with more bits, goes beyond in a few voxels."""
 
 METAL_HU = 2000
 """Cortical bone ends here."""
@@ -74,12 +78,12 @@ def collect_voxel_warnings(voxels: NDArray[Any], facts: PixelFacts, slices: Sequ
     if shares is None:
         return warnings
     if shares.fits(0):
-        return warnings + _warn_of_padding(shares)
+        return warnings + _warn_of_padding(shares, voxels)
     if facts.hu_min < LOWEST_AIR_HU and shares.fits(-INTERCEPT_HU) and not shares.is_specimen():
         return [*warnings, _describe_shift(-INTERCEPT_HU, "seems to have been applied twice")]
     if shares.fits(INTERCEPT_HU) and shares.between(-np.inf, LEAST_RAW_HU) < MOST_BEYOND:
         return [*warnings, _describe_shift(INTERCEPT_HU, "seems to be missing")]
-    return warnings + _warn_of_padding(shares)
+    return warnings + _warn_of_padding(shares, voxels)
 
 
 def _describe_shift(shift: int, what: str) -> str:
@@ -102,13 +106,26 @@ def _warn_of_saturation(voxels: NDArray[Any], facts: PixelFacts, slices: Sequenc
                 members.setdefault((ceiling, bits), []).append(k)
     warnings = []
     for (ceiling, bits), places in sorted(members.items()):
-        if any(voxels[k].max() > ceiling for k in places):
-            continue  # these were measured with more bits
-        count = sum(int(np.count_nonzero(voxels[k] == ceiling)) for k in places)
-        if count > CEILING_VOXELS:
-            what = "metal is saturated, its surface" if ceiling > METAL_HU else "dense bone is cut off, its surface"
-            warnings.append(f"{count} voxels are at {ceiling:g} HU, the ceiling of {bits} bits: {what} displaced")
+        slope = abs(slices[places[0]].slope) if slices else 1.0
+        at, above, beside = np.sum([_count_near(voxels[k], ceiling, slope) for k in places], axis=0).tolist()
+        # Values that go on beyond were measured with more bits, unless so many have just this one.
+        if at <= CEILING_VOXELS or above and at <= CEILING_SPIKE * beside / (2 * CEILING_LEVELS):
+            continue
+        what = "metal is saturated, its surface" if ceiling > METAL_HU else "dense bone is cut off, its surface"
+        more = f" and {above} are above it, at most at {facts.hu_max:g} HU" if above else ""
+        warnings.append(f"{at} voxels are at {ceiling:g} HU, the ceiling of {bits} bits{more}: {what} displaced")
     return warnings
+
+
+def _count_near(picture: NDArray[Any], ceiling: float, slope: float) -> tuple[int, int, int]:
+    """Voxels of a slice at the ceiling, above it, and on the `CEILING_LEVELS` next values to either side."""
+    near = picture[picture >= ceiling - (CEILING_LEVELS + 0.5) * slope]
+    at = int(np.count_nonzero(near == ceiling))
+    return (
+        at,
+        int(np.count_nonzero(near > ceiling)),
+        int(np.count_nonzero(near <= ceiling + (CEILING_LEVELS + 0.5) * slope)) - at,
+    )
 
 
 class _Shares:
@@ -153,12 +170,16 @@ class _Shares:
         return float(found[counts.argmax()]), float(counts.max()) / len(self.values)
 
 
-def _warn_of_padding(shares: _Shares) -> list[str]:
-    """One value far below air that many voxels have, without being declared as padding."""
+def _warn_of_padding(shares: _Shares, voxels: NDArray[Any]) -> list[str]:
+    """One value far below air that many voxels have, without being declared as padding.
+
+    The sample says which value it is; how many have it is counted in all voxels.
+    """
     found = shares.commonest_below(LOWEST_AIR_HU)
     if found is None or found[1] < LEAST_PADDING_SHARE:
         return []
-    value, share = found
+    value = found[0]
+    share = sum(int(np.count_nonzero(picture == value)) for picture in voxels) / voxels.size
     return [
         f"{100.0 * share:.3g} % of the voxels are at {value:g} HU, below air: padding that the files do not declare; it"
         f" is left as it is and counts as outside, only iso values from {value:g} to about -1000 HU show its border"

@@ -8,6 +8,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 
+import numpy as np
+
 from clrecon.dicom.directions import (
     ORIENTATION_EXACT,
     ORIENTATION_LIMIT,
@@ -32,6 +34,20 @@ __all__ = ["PADDING_SHARE", "judge_series"]
 PADDING_SHARE = 0.75
 """A circle in its square leaves 0.21 as padding, a 500 mm circle in a field of 800 mm 0.69; above that most of what
 was measured is likely to be masked by a wrong PixelPaddingValue."""
+
+
+PIXEL_MM = (0.005, 10.0)
+"""From the finest micro-CT in use to attenuation maps of PET and SPECT."""
+GAP_MM = (0.005, 50.0)
+GAP_THICKNESSES = 2.0
+"""More between the slices that was not measured than was: a high-resolution lung scan has 10, and no surface."""
+SLOPES, INTERCEPTS = (1e-3, 100.0), (-40_000.0, 40_000.0)
+"""Scanners write 1, some fractions of it or a few; below 0 bone is dark.  Stored 16-bit values in the middle of their
+range need an intercept of 32768."""
+LOWEST_HU, DENSEST_HU = (-10_000.0, 500.0), (-900.0, 70_000.0)
+"""Padding that nobody declared goes down to -8192; a cut out of bone alone has fat or water in it.  Less dense than
+-900 is air alone; 16 bits end at 65535."""
+STRAY = "values beyond the stored bits"
 
 
 def judge_series(
@@ -61,15 +77,19 @@ def judge_series(
     ]
     if stack is None:
         return gates
+    gates.append(_judge_spacing(stack))
     gates += _gates_of_places(stack)
     what = "slices at the place of another that differ from it and are no phases"
     gates.append(none_of("duplicate_slices", _count_doubled(series), what))
     gates.append(_judge_one_volume(series, likeness))
     gates += _gates_of_values(stack.slices)
+    gates.append(_judge_hu(stack.slices, facts))
     share = "share of voxels without a measurement (padding)"
     if facts is None:
         gates.append(unmeasured("padding_share", PADDING_SHARE, None, f"{share}: the pixels were not read"))
+        gates.append(unmeasured("stored_bits", 0, None, f"{STRAY}: the pixels were not read"))
     else:
+        gates.append(none_of("stored_bits", facts.stray, facts.stray_text or STRAY))
         gates.append(at_most("padding_share", facts.padding_share, PADDING_SHARE, None, share))
     return gates
 
@@ -90,7 +110,49 @@ def _gates_of_places(stack: Stack) -> Iterator[Gate]:
         return
     yield at_most("grid_residual", line.residual_max_mm, line.tolerance_mm, "mm", what)
     yield none_of("missing_slices", stack.missing, "slices missing in between")
+    yield _judge_thickness(stack)
     yield _judge_stated_gap(stack)
+
+
+def _judge_spacing(stack: Stack) -> Gate:
+    """Pixels and gaps of a size that scanners have: a mesh a thousand times too large looks like any other."""
+    first, usual = stack.slices[0], stack.line.gap_median_mm
+    (low, high), (gap_low, gap_high) = PIXEL_MM, GAP_MM
+    odd = [f"pixels of {mm:g} mm" for mm in sorted({first.di_mm, first.dj_mm}) if not low <= mm <= high]
+    if usual is not None and not gap_low <= usual <= gap_high:
+        odd.append(f"gaps of {usual:g} mm")
+    what = f"spacings that no scanner has, outside of {low:g} to {high:g} mm, gaps up to {gap_high:g} mm"
+    return none_of("plausible_spacing", len(odd), f"{what} ({', '.join(odd)})" if odd else what)
+
+
+def _judge_thickness(stack: Stack) -> Gate:
+    """Gaps against SliceThickness: how much of the tissue was measured at all."""
+    what = "largest gap between slices in thicknesses of theirs, beyond 1 nobody measured the tissue between"
+    thickness = np.array([header.slice_thickness_mm or 0.0 for header in stack.slices])
+    if (thickness <= 0.0).any():
+        return unmeasured("gap_thickness", GAP_THICKNESSES, None, f"{what}: the thickness is not stated")
+    gaps = np.diff(stack.distances_mm)
+    worst = int(np.argmax(2.0 * gaps / (thickness[1:] + thickness[:-1])))
+    ratio = float(2.0 * gaps[worst] / (thickness[worst] + thickness[worst + 1]))
+    if ratio > GAP_THICKNESSES:
+        what += f" ({gaps[worst]:g} mm at a thickness of {thickness[worst]:g} mm)"
+    return at_most("gap_thickness", ratio, GAP_THICKNESSES, None, what)
+
+
+def _judge_hu(headers: Sequence[SliceHeader], facts: PixelFacts | None) -> Gate:
+    """Rescale, air and the densest voxel as CT has them; without pixels rescale alone."""
+    odd = []
+    for name, values, (low, high) in (
+        ("RescaleSlope", [header.slope for header in headers], SLOPES),
+        ("RescaleIntercept", [header.intercept for header in headers], INTERCEPTS),
+    ):
+        odd += [f"{name} {value:g}" for value in (min(values), max(values)) if not low <= value <= high][:1]
+    if facts is not None and facts.hu_min <= facts.hu_max and not _count_unknown(headers):
+        for name, value, (low, high) in (("lowest", facts.hu_min, LOWEST_HU), ("densest", facts.hu_max, DENSEST_HU)):
+            if not low <= value <= high:
+                odd.append(f"{name} voxel {value:g} HU, expected {low:g} to {high:g}")
+    what = "figures of HU that no CT has"
+    return none_of("plausible_hu", len(odd), f"{what} ({'; '.join(odd)})" if odd else what)
 
 
 def _judge_one_volume(series: Series, likeness: Likeness | None) -> Gate:
@@ -119,8 +181,11 @@ def _judge_stated_gap(stack: Stack) -> Gate:
     return at_most("stated_gap", 100.0 * found[2], bound, "%", what)
 
 
+def _count_unknown(headers: Sequence[SliceHeader]) -> int:
+    return sum(not (h.has_slope and h.has_intercept) or h.rescale_type not in ("", "HU") for h in headers)
+
+
 def _gates_of_values(headers: Sequence[SliceHeader]) -> Iterator[Gate]:
-    unknown = sum(not (h.has_slope and h.has_intercept) or h.rescale_type not in ("", "HU") for h in headers)
-    yield none_of("hu_known", unknown, "slices whose values are not known to be HU")
+    yield none_of("hu_known", _count_unknown(headers), "slices whose values are not known to be HU")
     yield none_of("lossless", sum(h.lossy for h in headers), "slices with lossy compression")
     yield none_of("measured_images", sum(bool(h.derived) for h in headers), "slices that were computed from others")

@@ -170,7 +170,7 @@ def choose_iso_value(volume: Volume) -> IsoChoice:
     bone, tissue = _median(edges.bone, edges.contrast), _median(edges.tissue, edges.contrast)
     least = max(SEED_ABOVE_TISSUE_HU, LEAST_CONTRAST_SIGMAS * background.noise)
     if len(edges.bone) < FEWEST_EDGES or bone - tissue < least:
-        raise NoSurfaceError(_no_bone(background, edges, histogram))
+        raise NoSurfaceError(_no_bone(background, edges, histogram, len(sampled)))
     return _describe(background, edges, left_out, sampled)
 
 
@@ -205,11 +205,11 @@ def _describe(background: Background, edges: BoneEdges, left_out: float, sampled
     )
 
 
-def _no_bone(background: Background, edges: BoneEdges, histogram: Float64Array) -> str:
+def _no_bone(background: Background, edges: BoneEdges, histogram: Float64Array, slices: int) -> str:
     above = histogram[background.seed - LOWEST_HU :].sum() / max(histogram.sum(), 1.0)
     return (
         f"no bone found to choose the iso value by: {background.name} has its mode at {background.mode:.0f} HU with a "
-        f"noise of {background.noise:.0f} HU, {above:.2%} of the voxels lie above {background.seed} HU and "
+        f"noise of {background.noise:.0f} HU, {above:.2%} of the voxels of {slices} slices lie above {background.seed} HU and "
         f"{len(edges.bone)} edges of bone rise from it; {_WAY_OUT}"
     )
 

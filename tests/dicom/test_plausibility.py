@@ -125,6 +125,17 @@ def test_padding_that_is_not_declared_is_told_with_its_share(tmp_path, value):
     assert volume.report["padding_hu"] is None
 
 
+def test_the_share_is_that_of_all_voxels(tmp_path):
+    """Rows and slices that a sample leaves out count as well."""
+    shape = (40, 200, 160)
+    hu = np.random.default_rng(7).integers(-1010, -990, shape).astype(float)
+    hu[:, 40:160, 30:130] = np.random.default_rng(8).integers(20, 60, (40, 120, 100))
+    hu[: 8 + 3, :33] = -1500
+    hu[20:, :, :29] = -1500
+    (warning,) = told(write_hu(tmp_path, hu))
+    assert warning.startswith(f"{100.0 * (hu == -1500).mean():.3g} % of the voxels are at -1500 HU")
+
+
 def test_noise_below_air_is_no_padding(tmp_path):
     hu = np.where(make_scan() < -900, np.random.default_rng(3).normal(-1000, 90, SHAPE).round(), make_scan())
     assert hu.min() < -1200
@@ -153,11 +164,22 @@ def test_the_top_of_the_stored_bits_is_a_ceiling(tmp_path, bits, signed, top, wo
         assert warnings[0].startswith(f"24 voxels are at {top} HU, the ") and words in warnings[0]
 
 
-def test_values_beyond_12_bits_mean_that_3071_is_no_ceiling(tmp_path):
+def test_values_that_go_on_beyond_12_bits_mean_that_3071_is_no_ceiling(tmp_path):
     hu = make_scan()
-    hu[:, 23:25, 23:25] = 3071
-    hu[3, 23, 23] = 3500
+    hu[:, 20:28, 20:28] = 3040 + np.arange(SHAPE[0] * 64).reshape(-1, 8, 8) % 64  # six voxels at each value
+    hu[:, 20:28, 20] = 3072  # and a crowd beside
     assert told(write_hu(tmp_path, hu)) == []
+
+
+def test_a_ceiling_with_a_few_values_beyond_is_one(tmp_path):
+    hu = make_scan()
+    hu[:, 18:26, 18:26] = np.random.default_rng(6).integers(2600, 3071, (SHAPE[0], 8, 8))
+    hu[1:5, 20:24, 20:28] = 3071
+    hu[5, 20, 18:22] = hu[0, 20:25, 18:23] = 3500
+    warnings = told(write_hu(tmp_path, hu))
+    assert [text.split(":")[0] for text in warnings] == [
+        "128 voxels are at 3071 HU, the ceiling of 12 bits and 29 are above it, at most at 3500 HU"
+    ]
 
 
 def test_each_slice_has_its_own_ceiling(tmp_path):
