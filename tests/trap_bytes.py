@@ -65,6 +65,7 @@ def add_byte_cases() -> None:
         "zeros behind the pixels",
         WARNED,
         ("the rest is zeros, taken as padding",),
+        harmless=True,
         change=lambda ds, k: setattr(ds, "PixelData", ds.PixelData + bytes(512)),
     )
     media: dict[str, Any] = {"last": True, "plan": {"name": "IM{:04d}".format}}

@@ -99,6 +99,10 @@ class Case:
         Options of `read_volume` that make a refused series readable: then exact, with `again_words` in the warnings.
     bound : {"written", "rounded", "far", "jitter"}
         Which tolerance of tests/tolerances.py holds for the positions.
+    looks_right : bool
+        Each slice has its place, and yet it is not the volume that it seems: a table of its own.
+    harmless : bool
+        Who reads it without a word is right all the same.
     """
 
     name: str
@@ -108,6 +112,8 @@ class Case:
     again: Mapping[str, Any] | None = None
     again_words: tuple[str, ...] = ()
     bound: str = "written"
+    looks_right: bool = False
+    harmless: bool = False
 
 
 CASES: dict[str, Case] = {}

@@ -31,6 +31,7 @@ MOST_TOGETHER = 2
 MOST_VALUES = 8
 """An element with more values counts by heaps of numbers: the times of a first and a second pass."""
 MOST_HEAPS = 4
+LONGEST_VALUE = 64
 DENSER = 1.3
 """Where two volumes overlap in part, slices lie this much closer together than beside it."""
 WINDOW, WINDOWS = 32, 3
@@ -165,7 +166,12 @@ def _read_values(header: SliceHeader) -> dict[int, bytes]:
         values = read_elements(header.file, None, force=True).values
     except (OSError, CorruptFileError, NotDicomError):
         return {}
-    return {tag: raw.strip(b" \0") for tag, raw in values.items() if _is_compared(tag)}
+    return {tag: _shorten(raw.strip(b" \0")) for tag, raw in values.items() if _is_compared(tag)}
+
+
+def _shorten(raw: bytes) -> bytes:
+    """Vendors keep whole files in one element: of a long value only what tells it from others is kept."""
+    return raw if len(raw) <= LONGEST_VALUE else hash(raw).to_bytes(8, "little", signed=True) + b"..."
 
 
 def _is_compared(tag: int) -> bool:

@@ -7,7 +7,7 @@ are cut off; where they were part of the value, because BitsStored is too small,
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -95,7 +95,7 @@ def _read_overlay_bits(header: SliceHeader) -> list[int]:
         values = read_elements(header.file, OVERLAY_BITS, force=True).values
     except (OSError, CorruptFileError, NotDicomError):
         return []
-    order = "little" if header.little_endian else "big"
+    order: Literal["little", "big"] = "little" if header.little_endian else "big"
     return [bit for raw in values.values() if (bit := int.from_bytes(raw[:2], order)) > 0]
 
 

@@ -44,8 +44,8 @@ GAP_THICKNESSES = 2.0
 SLOPES, INTERCEPTS = (1e-3, 100.0), (-40_000.0, 40_000.0)
 """Scanners write 1, some fractions of it or a few; below 0 bone is dark.  Stored 16-bit values in the middle of their
 range need an intercept of 32768."""
-LOWEST_HU, DENSEST_HU = (-10_000.0, 500.0), (-900.0, 70_000.0)
-"""Padding that nobody declared goes down to -8192; a cut out of bone alone has fat or water in it.  Less dense than
+LOWEST_HU, DENSEST_HU = (-10_000.0, 1000.0), (-900.0, 70_000.0)
+"""Padding that nobody declared goes down to -8192; a cut out of bone has spongy parts.  Less dense than
 -900 is air alone; 16 bits end at 65535."""
 STRAY = "values beyond the stored bits"
 

@@ -209,8 +209,8 @@ def _no_bone(background: Background, edges: BoneEdges, histogram: Float64Array, 
     above = histogram[background.seed - LOWEST_HU :].sum() / max(histogram.sum(), 1.0)
     return (
         f"no bone found to choose the iso value by: {background.name} has its mode at {background.mode:.0f} HU with a "
-        f"noise of {background.noise:.0f} HU, {above:.2%} of the voxels of {slices} slices lie above {background.seed} HU and "
-        f"{len(edges.bone)} edges of bone rise from it; {_WAY_OUT}"
+        f"noise of {background.noise:.0f} HU, {above:.2%} of the voxels of {slices} slices lie above "
+        f"{background.seed} HU and {len(edges.bone)} edges of bone rise from it; {_WAY_OUT}"
     )
 
 

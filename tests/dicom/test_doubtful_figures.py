@@ -53,9 +53,9 @@ def test_a_thickness_that_is_not_stated(tmp_path):
     ("values", "words"),
     [
         ({"RescaleSlope": -1}, "RescaleSlope -1"),
-        ({"RescaleSlope": 100000}, "RescaleSlope 100000; lowest voxel 8.9999e+07 HU, expected -10000 to 500; dens"),
-        ({"RescaleIntercept": 100000}, "RescaleIntercept 100000; lowest voxel 100900 HU, expected -10000 to 500; dens"),
-        ({"RescaleIntercept": -15000}, "lowest voxel -14100 HU, expected -10000 to 500; densest voxel -13831 HU"),
+        ({"RescaleSlope": 100000}, "RescaleSlope 100000; lowest voxel 8.9999e+07 HU, expected -10000 to 1000; d"),
+        ({"RescaleIntercept": 100000}, "RescaleIntercept 100000; lowest voxel 100900 HU, expected -10000 to 1000; d"),
+        ({"RescaleIntercept": -15000}, "lowest voxel -14100 HU, expected -10000 to 1000; densest voxel -13831 HU"),
         ({"RescaleSlope": 0.5}, None),
         ({"RescaleSlope": 8, "RescaleIntercept": -8192}, None),
     ],

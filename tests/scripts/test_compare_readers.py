@@ -46,6 +46,13 @@ def test_cells(answer, text, silent_fault):
     assert cell.text() == text and cell.is_silent_fault() is silent_fault
 
 
+def test_any_volume_of_a_doubtful_series_without_a_word_is_a_silent_fault():
+    name = "two acquisition times, interleaved"
+    rows = {name: {"one": compare_readers.judge(found([1, 2, 3, 4], PLACES), TRUTH)}}
+    assert compare_readers.make_table(rows, ["one"], markdown=True)[2] == f"| {name} | **0 S** |"
+    assert not rows[name]["one"].is_silent_fault()
+
+
 def test_two_frames_have_no_distance():
     truth = Marks(TRUTH.hu, np.where(np.arange(4)[:, None] < 2, TRUTH.lps_mm, np.nan), 2)
     cell = compare_readers.judge(found([1, 2, 3, 4], PLACES), truth)
