@@ -77,12 +77,15 @@ class Alternation:
         It is the same within one volume.
     heaps : bool
         The groups are heaps of numbers, each slice with its own.
+    absent : int or None
+        Which group has no such element.
     """
 
     tag: int
     groups: tuple[tuple[int, ...], ...]
     certain: bool
     heaps: bool = False
+    absent: int | None = None
 
     @property
     def name(self) -> str:
@@ -135,7 +138,8 @@ def _find_in(headers: Sequence[SliceHeader]) -> Alternation | None:
                 continue
             groups = tuple(tuple(k for k, code in enumerate(codes) if code == one) for one in sorted(set(codes)))
             certain = tag >> 16 & 1 == 0 and tag not in DOUBTFUL and tag != INSTANCE_NUMBER
-            found = Alternation(tag, groups, certain, heaps)
+            absent = next((number for number, group in enumerate(groups) if column[group[0]] == b""), None)
+            found = Alternation(tag, groups, certain, heaps, absent)
             if certain:
                 return found
             doubtful = doubtful or found

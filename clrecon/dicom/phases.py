@@ -150,7 +150,8 @@ def part_alternating(places: Places, found: Alternation) -> Places:
         keyword = found.name
         shown = _show((keyword,), [values_of(headers[0], (keyword,)) for headers in members])
     else:  # free text may hold anything
-        shown, keyword = [f"value {number}" for number in range(1, len(members) + 1)], found.name
+        shown = ["(none)" if number == found.absent else f"value {number + 1}" for number in range(len(members))]
+        keyword = found.name
     phases = tuple(
         Phase(number, keyword, text, headers)
         for number, (text, headers) in enumerate(zip(shown, members, strict=True), start=1)
@@ -339,8 +340,8 @@ def describe_phases(phases: Sequence[Phase], interleaved: bool = False) -> str:
     return f"{len(phases)} phases {where}, choose one with --phase: [{'], ['.join(shown)}]{more}"
 
 
-def choose_phase(phases: Sequence[Phase], wanted: int) -> Phase:
-    """The phase of that number.
+def choose_phase(phases: Sequence[Phase], wanted: int, interleaved: bool = False) -> Phase:
+    """The phase of that number; `interleaved` as in `Places`, for the message.
 
     Raises
     ------
@@ -352,4 +353,4 @@ def choose_phase(phases: Sequence[Phase], wanted: int) -> Phase:
             return phase
     if not phases:
         raise UsageError(f"there is no phase {wanted!r}: the series has one slice at each place")
-    raise UsageError(f"there is no phase {wanted!r}: {describe_phases(phases)}")
+    raise UsageError(f"there is no phase {wanted!r}: {describe_phases(phases, interleaved)}")

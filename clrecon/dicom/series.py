@@ -154,7 +154,7 @@ class Series:
         except RefusedInputError:
             return chosen  # its `problems` say why
         if phase is not None and (phase != 1 or chosen.places.phases):
-            choose_phase(chosen.places.phases, phase)
+            choose_phase(chosen.places.phases, phase, chosen.places.interleaved)
         return chosen
 
     def _part_further(self, places: Places, phase: int | None) -> Places:

@@ -76,6 +76,9 @@ def test_whatever_alternates_parts_two_volumes(tmp_path, first, second, keyword)
     said = refusal(tmp_path)
     assert f"2 phases whose slices lie between each other, choose one with --phase: [1: {keyword} " in said
     assert "12 slices], [2:" in said and "DOE" not in said
+    assert keyword != "ContrastBolusAgent" or "[1: ContrastBolusAgent (none), 12 slices]" in said
+    with pytest.raises(UsageError, match="no phase 3: 2 phases whose slices lie between each other"):
+        read_volume(tmp_path, phase=3)
     assert list_series(tmp_path).certificate["affine_ijk_to_lps_mm"] is None
     for number, plan in enumerate(plans):
         volume = read_volume(tmp_path, phase=number + 1)
