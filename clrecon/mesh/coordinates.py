@@ -9,7 +9,10 @@ from numpy.typing import NDArray
 
 from clrecon.geometry.precision import float32_step, is_far
 
-__all__ = ["as_stored", "find_coincident", "rounding_step"]
+__all__ = ["as_stored", "find_coincident", "rounded_apart", "rounding_step"]
+
+
+_MOST_STEPS_APART = 64
 
 
 def as_stored(points: NDArray[Any]) -> NDArray[np.floating]:
@@ -77,3 +80,32 @@ def find_coincident(vertices: NDArray[np.floating]) -> NDArray[np.int64]:
     suspects = suspects[np.lexsort(vertices[suspects].T[::-1])]
     same = (vertices[suspects[1:]] == vertices[suspects[:-1]]).all(axis=1)
     return suspects[np.concatenate([same, [False]]) | np.concatenate([[False], same])]
+
+
+def rounded_apart(vertices: NDArray[np.floating]) -> NDArray[np.float32]:
+    """Vertices in float32 of which no two lie at one place, unless they did before.
+
+    Parameters
+    ----------
+    vertices : ndarray, shape (n, 3), float32 or float64, mm
+
+    Returns
+    -------
+    ndarray, shape (n, 3), float32
+        The nearest ones; where several vertices meet in one, all but the first go on by steps of float32.
+    """
+    rounded = vertices.astype(np.float32)
+    if vertices.dtype == np.float32:
+        return rounded
+    together = np.zeros(len(vertices), dtype=bool)
+    together[find_coincident(vertices)] = True
+    for turn in range(_MOST_STEPS_APART):
+        meeting = find_coincident(rounded)
+        meeting = meeting[~together[meeting]]
+        again = np.concatenate([[False], (rounded[meeting[1:]] == rounded[meeting[:-1]]).all(axis=1)])
+        going = meeting[again[: len(meeting)]]
+        if len(going) == 0:
+            break
+        axis = (turn + np.arange(len(going))) % 3
+        rounded[going, axis] = np.nextafter(rounded[going, axis], np.float32(np.inf))
+    return rounded

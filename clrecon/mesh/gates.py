@@ -62,11 +62,8 @@ def judge_mesh(
     gates: list[Gate] = []
     if quality:
         gates += _gates_of_quality(quality, closed, outward)
-    if iso_distance and iso_distance["vertices_voxel"]:
-        found = iso_distance["vertices_voxel"]
-        what = "distance of the vertices from the trilinear iso surface"
-        gates.append(at_most("iso_distance_p95", found["p95"], DEVIATION_P95_VOXEL, "voxel", f"{what}, 95 % of them"))
-        gates.append(at_most("iso_distance_mean", found["mean"], DEVIATION_MEAN_VOXEL, "voxel", f"{what}, mean"))
+    if iso_distance:
+        gates += _gates_of_iso_distance(iso_distance)
     if deviation and voxel_mm:
         gates += _gates_of_deviation(deviation, voxel_mm, closed)
     return gates
@@ -101,7 +98,11 @@ def judge_label_volume(mesh_ml: float | None, label_ml: float, advice: str = "",
 def _gates_of_quality(quality: dict[str, Any], closed: bool, outward: bool) -> Iterator[Gate]:
     sheets = quality["nonmanifold_edges"] + quality["nonmanifold_vertices"]
     if closed:
-        yield none_of("closed", quality["boundary_edges"], "edges with one triangle only", quality["closed"])
+        if quality["boundary_edges"] or not quality["open_edges_by_place"]:
+            yield none_of("closed", quality["boundary_edges"], "edges with one triangle only", quality["closed"])
+        else:
+            what = "edges that are not in two triangles once vertices at one place are joined, as in STL"
+            yield none_of("closed", quality["open_edges_by_place"], what, quality["closed"])
     yield none_of("manifold", sheets, "edges and vertices with several sheets", quality["manifold"])
     yield is_true("oriented", quality["oriented"], "all triangles face the same side of the surface")
     if closed and outward:
@@ -113,6 +114,19 @@ def _gates_of_quality(quality: dict[str, Any], closed: bool, outward: bool) -> I
         yield unmeasured("self_intersections", 0, None, "triangles that cut each other are not looked for")
     else:
         yield none_of("self_intersections", intersections, "pairs of triangles that cut each other")
+
+
+def _gates_of_iso_distance(iso_distance: dict[str, Any]) -> Iterator[Gate]:
+    what = "vertices and centres of triangles from which no trilinear iso surface was reached"
+    yield none_of("iso_distance_found", iso_distance["not_found"], what)
+    what = "distance of the vertices from the trilinear iso surface"
+    measures = (("p95", DEVIATION_P95_VOXEL, "95 % of them"), ("mean", DEVIATION_MEAN_VOXEL, "mean"))
+    for name, bound, which in measures:
+        found = iso_distance["vertices_voxel"]
+        if found:
+            yield at_most(f"iso_distance_{name}", found[name], bound, "voxel", f"{what}, {which}")
+        else:
+            yield unmeasured(f"iso_distance_{name}", bound, "voxel", f"{what}: none was reached")
 
 
 def _gates_of_deviation(deviation: dict[str, Any], voxel_mm: float, closed: bool) -> Iterator[Gate]:

@@ -29,6 +29,11 @@ _STEPS = 12
 _ON_THE_SURFACE = 1e-3
 """mm by which a last step may still move a point that counts as found."""
 
+_REACH_VOXEL = 2.0
+"""How far from a point the surface is looked for along rays, where steps along the gradient have not led to it."""
+
+_RAY_STEP_VOXEL = 0.125
+
 _PIECE = 1 << 15
 
 Float64Array = NDArray[np.float64]
@@ -109,6 +114,7 @@ def distances_to_iso_surface(volume: Volume, rule: IsoRule, points: Float64Array
 
     The surface of a range is that of both its ends: the nearer one counts.
 
+    Where the field is flat, or steps across a crease go to and fro, the surface is looked for along 26 rays.
     A step is residual over gradient, at most half a voxel long, in mm through the affine of the slice, so that
     sheared and unevenly spaced stacks are right too.  The answer is the way to a point of the surface: never less
     than the distance itself, and equal to it where the surface is smooth.
@@ -123,7 +129,7 @@ def distances_to_iso_surface(volume: Volume, rule: IsoRule, points: Float64Array
     Returns
     -------
     ndarray, shape (n,), float64, mm
-        NaN where no surface was found: the field is flat there, or steps across a crease go to and fro.
+        NaN where no surface was found: neither along the gradient nor within two voxels along rays.
     """
     distances = _distances_to_level(volume, rule, rule.iso_level, points)
     for level in rule.levels[1:]:
@@ -156,6 +162,35 @@ def _distances_to_level(volume: Volume, rule: IsoRule, level: float, points: Flo
             going = going[~there]
             if len(going) == 0:
                 break
+    lost = np.flatnonzero(np.isnan(distances))
+    distances[lost] = _distances_along_rays(volume, rule, points[lost])
+    return distances
+
+
+def _distances_along_rays(volume: Volume, rule: IsoRule, points: Float64Array) -> Float64Array:
+    """Way to the nearest place, along one of 26 rays, where the field goes through the level; NaN where none does."""
+    voxel = smallest_voxel_mm(volume)
+    steps = np.array([[x, y, z] for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1) if x or y or z], float)
+    rays = steps / np.linalg.norm(steps, axis=1, keepdims=True)
+    ways = _RAY_STEP_VOXEL * voxel * np.arange(1, round(_REACH_VOXEL / _RAY_STEP_VOXEL) + 1)
+    distances = np.full(len(points), np.nan)
+    for where in chunks(len(points), 256):
+        here = points[where]
+
+        def above(of: Float64Array) -> Float64Array:
+            value, _ = trilinear_field(volume, rule, volume.lps_to_ijk(of.reshape(-1, 3)))
+            return (value - rule.iso_level).reshape(of.shape[:-1])
+
+        before, way_before = np.repeat(above(here)[:, None], len(rays), axis=1), 0.0
+        for way in ways:
+            after = above(here[:, None] + way * rays)
+            crossed = (before >= 0.0) != (after >= 0.0)
+            with np.errstate(divide="ignore", invalid="ignore"):
+                share = before / (before - after)
+            found = np.where(crossed, way_before + share * (way - way_before), np.inf).min(axis=1)
+            new = np.isnan(distances[where]) & np.isfinite(found)
+            distances[where][new] = found[new]
+            before, way_before = after, way
     return distances
 
 
@@ -183,7 +218,7 @@ def measure_iso_distance(mesh: Mesh, volume: Volume, rule: IsoRule, samples: int
         ``vertices_voxel``, ``centres_voxel`` : the same in units of the shortest voxel step
         ``voxel_mm`` : that step
         ``samples`` : ``{"vertices", "centres"}``, points measured
-        ``not_found`` : int, points from which no surface was reached
+        ``not_found`` : int, points from which no surface was reached; the figures above are of the others
     """
     voxel = smallest_voxel_mm(volume)
     vertices = mesh.vertices[:: -(-mesh.vertex_count // samples) or 1].astype(np.float64)

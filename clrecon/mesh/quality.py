@@ -9,12 +9,14 @@ from numpy.typing import NDArray
 
 from clrecon.errors import UsageError
 from clrecon.mesh.connectivity import (
+    Edges,
     count_duplicate_faces,
     find_edges,
     find_split_vertices,
     label_components,
     opposite_half_edges,
 )
+from clrecon.mesh.coordinates import find_coincident
 from clrecon.mesh.measures import corner_edges, cross_product, local_origin
 
 __all__ = ["measure_quality"]
@@ -34,12 +36,15 @@ def measure_quality(vertices: NDArray[np.floating], triangles: NDArray[np.uint32
     -------
     dict
         ``vertices``, ``triangles`` : int
-        ``closed`` : bool, there are triangles and every edge is in exactly two
+        ``closed`` : bool, there are triangles and every edge is in exactly two, also when vertices at one place are
+        joined, as readers of STL do
         ``manifold`` : bool, no edge in more than two faces, no two faces along an edge in one direction, the faces
         around every vertex one fan, no face with a vertex twice
         ``oriented`` : bool, no two faces run along an edge in the same direction
         ``boundary_edges``, ``nonmanifold_edges`` : int, edges in one face, in more than two
         ``nonmanifold_vertices`` : int, vertices whose faces fall apart into several fans
+        ``coincident_vertices`` : int, used vertices at the place of another one
+        ``open_edges_by_place`` : int, edges that are not in exactly two faces once such vertices are joined
         ``components`` : int, parts that share no vertex
         ``euler_number`` : int, used vertices - edges + faces
         ``genus`` : int or None, handles of all parts together; None if not closed and manifold
@@ -67,7 +72,8 @@ def measure_quality(vertices: NDArray[np.floating], triangles: NDArray[np.uint32
     unused = int(np.count_nonzero(labels < 0))
     loops = triangles.size - len(edges.half_edges)
     euler_number = vertex_count - unused - edges.count + triangle_count
-    closed = triangle_count > 0 and edges.boundary == 0 and edges.nonmanifold == 0
+    coincident, open_by_place = _count_by_place(vertices, triangles, labels >= 0, edges)
+    closed = triangle_count > 0 and edges.boundary == 0 and edges.nonmanifold == 0 and open_by_place == 0
     manifold = triangle_count > 0 and edges.nonmanifold == 0 and edges.oriented and split_vertices == 0 and loops == 0
     area, volume, zero_area, shortest = _measure_triangles(vertices, triangles)
     return {
@@ -79,6 +85,8 @@ def measure_quality(vertices: NDArray[np.floating], triangles: NDArray[np.uint32
         "boundary_edges": edges.boundary,
         "nonmanifold_edges": edges.nonmanifold,
         "nonmanifold_vertices": split_vertices,
+        "coincident_vertices": coincident,
+        "open_edges_by_place": open_by_place,
         "components": components,
         "euler_number": euler_number,
         "genus": components - euler_number // 2 if closed and manifold else None,
@@ -91,6 +99,23 @@ def measure_quality(vertices: NDArray[np.floating], triangles: NDArray[np.uint32
         "outward": volume > 0.0,
         "bounds_mm": [vertices.min(axis=0).tolist(), vertices.max(axis=0).tolist()] if vertex_count else None,
     }
+
+
+def _count_by_place(
+    vertices: NDArray[np.floating], triangles: NDArray[np.uint32], used: NDArray[np.bool_], edges: Edges
+) -> tuple[int, int]:
+    """Used vertices at the place of another, and edges that are not in two faces once these are joined."""
+    coincident = find_coincident(vertices)
+    coincident = coincident[used[coincident]]
+    places, first, number = np.unique(vertices[coincident], axis=0, return_index=True, return_inverse=True)
+    if len(places) == len(coincident):  # what they share a place with is not used
+        return 0, edges.boundary + edges.nonmanifold
+    joined = np.arange(len(vertices), dtype=np.uint32)
+    joined[coincident] = coincident[first][number.reshape(-1)]
+    faces = joined[triangles]
+    a, b, c = faces.T
+    by_place = find_edges(faces[(a != b) & (b != c) & (c != a)], len(vertices))
+    return len(coincident), by_place.boundary + by_place.nonmanifold
 
 
 def _measure_triangles(

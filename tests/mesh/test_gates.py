@@ -93,10 +93,10 @@ def test_a_deviation_in_voxels(radius, expected):
 
 def test_vertices_off_the_iso_surface():
     def at(p95: float, mean: float) -> set[str]:
-        return failed(judge_mesh(iso_distance={"vertices_voxel": {"p95": p95, "mean": mean}}))
+        return failed(judge_mesh(iso_distance={"vertices_voxel": {"p95": p95, "mean": mean}, "not_found": 0}))
 
     assert (at(0.25, 0.1), at(0.26, 0.1), at(0.25, 0.11)) == (set(), {"iso_distance_p95"}, {"iso_distance_mean"})
-    assert judge_mesh(iso_distance={"vertices_voxel": None}) == []
+    assert failed(judge_mesh(iso_distance={"vertices_voxel": None, "not_found": 3})) == {"iso_distance_found"}
 
 
 def test_the_volume_of_a_label():
@@ -115,3 +115,18 @@ def test_enclosed_volume_is_that_of_the_quality():
     volume_ml = mesh.quality()["volume_ml"]
     assert enclosed_ml(mesh.vertices, mesh.triangles) == pytest.approx(volume_ml, rel=1e-12)
     assert enclosed_ml(mesh.vertices, mesh.triangles[:, ::-1]) == pytest.approx(-volume_ml, rel=1e-12)
+
+
+def test_a_surface_that_is_open_once_vertices_at_one_place_are_joined():
+    gates = of(samples.join(samples.box(), samples.box((1, 1, 0))))
+    assert failed(gates) == {"closed"}
+    assert "once vertices at one place are joined" in failed_gates(gates)[0]
+
+
+def test_points_that_reach_no_iso_surface_fail_their_gate():
+    figures = {"mean": 0.01, "rms": 0.02, "p95": 0.03, "max": 0.1}
+    for found, count in ((figures, 0), (figures, 1), (None, 20)):
+        gates = judge_mesh(iso_distance={"vertices_voxel": found, "not_found": count})
+        assert [gate["name"] for gate in gates] == ["iso_distance_found", "iso_distance_p95", "iso_distance_mean"]
+        assert failed(gates) == ({"iso_distance_found"} if count else set())
+        assert gates[1]["ok"] is (True if found else None)

@@ -143,3 +143,26 @@ def test_the_rule_is_read_from_the_report_of_a_mesh():
     assert (opened.closed, opened.border) == (False, 0)
     assert rule_of_report({}) is None
     assert rule_of_report({**closed, "outside_hu": None}) is None
+
+
+def test_a_mesh_where_no_surface_is_counts_all_its_points():
+    volume = volume_of(lambda lps: np.where(lps[:, 0] > lps[:, 0].mean(), 900.0, -900.0))
+    rule = choose_iso_rule(volume, 100, closed=False)
+    far = volume.ijk_to_lps(np.array([[0.2, 1, 1], [0.3, 2, 1], [0.1, 1, 2]], float))
+    flat = volume_of(lambda lps: np.full(len(lps), -900.0))
+    found = measure_iso_distance(Mesh(far, [[0, 1, 2]]), flat, rule)
+    assert (found["not_found"], found["vertices_voxel"], found["centres_voxel"]) == (4, None, None)
+
+
+def test_where_the_gradient_leads_nowhere_rays_find_the_surface():
+    """In a flat plateau beside a step the gradient is zero; the surface lies within two voxels."""
+    volume = volume_of(lambda lps: np.zeros(len(lps)))
+    volume.voxels[:, :, 5:] = 900.0  # i from 5 on; between 4 and 5 the field rises
+    rule = choose_iso_rule(volume, 450, closed=False)
+    point = volume.ijk_to_lps(np.array([[3.8, 4.0, 3.0], [4.2, 4.0, 3.0], [0.5, 4.0, 3.0]]))
+    distances = distances_to_iso_surface(volume, rule, point)
+    normal = np.linalg.inv(volume.affine[:3, :3])[0]
+    across = 1.0 / np.linalg.norm(normal)  # of one step along i, straight to the plane
+    assert 0.7 * across <= distances[0] <= 1.4 * 0.7 * across
+    assert distances[1] == pytest.approx(0.3 * across, abs=1e-3)
+    assert np.isnan(distances[2])

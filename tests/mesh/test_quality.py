@@ -44,6 +44,8 @@ def test_box_far_from_the_origin():
         "components": 1,
         "euler_number": 2,
         "genus": 0,
+        "coincident_vertices": 0,
+        "open_edges_by_place": 0,
         "zero_area_faces": 0,
         "duplicate_faces": 0,
         "unused_vertices": 0,
@@ -242,3 +244,21 @@ def test_edges_between_the_highest_vertex_numbers():
     last = 2**32 - 2
     edges = find_edges(np.array([[0, last - 1, last], [last, last - 1, 1]], np.uint32), last + 1)
     assert (edges.count, edges.boundary, edges.nonmanifold, edges.oriented) == (5, 4, 0, True)
+
+
+def test_vertices_at_one_place_are_joined_before_a_surface_is_called_closed():
+    """Two boxes that touch along an edge, each closed: STL makes one of them, with an edge in four faces."""
+    apart = samples.join(samples.box(), samples.box((2, 2, 0)))
+    edge = samples.join(samples.box(), samples.box((1, 1, 0)))
+    corner = samples.join(samples.box(), samples.box((1, 1, 1)))
+    for mesh, coincident, open_edges in ((apart, 0, 0), (edge, 4, 1), (corner, 2, 0)):
+        quality = Mesh(*mesh).quality()
+        assert (quality["boundary_edges"], quality["nonmanifold_edges"]) == (0, 0)
+        assert (quality["coincident_vertices"], quality["open_edges_by_place"]) == (coincident, open_edges)
+        assert quality["closed"] == (open_edges == 0)
+
+
+def test_vertices_that_nothing_uses_do_not_count_by_place():
+    vertices, triangles = samples.box()
+    quality = Mesh(np.concatenate([vertices, vertices]), triangles).quality()
+    assert (quality["coincident_vertices"], quality["open_edges_by_place"], quality["closed"]) == (0, 0, True)

@@ -335,3 +335,19 @@ def test_more_than_one_piece(tmp_path):
         polydata = pyvista.read(tmp_path / f"bone{extension}")
         corners = np.float32(polydata.points)[polydata.regular_faces]
         np.testing.assert_array_equal(corners, mesh.vertices[mesh.triangles])
+
+
+def test_stl_keeps_vertices_apart_that_float32_would_bring_together(tmp_path):
+    """100 m from the origin steps are 8 um: a closed surface with finer details must not be open in the file."""
+    vertices, triangles = samples.sphere((1e5, -9e4, 8e4), 0.02, 3)
+    mesh = Mesh(vertices, triangles)
+    assert mesh.vertices.dtype == np.float64
+    assert len(np.unique(mesh.vertices.astype(np.float32), axis=0)) < mesh.vertex_count
+    mesh.save(tmp_path / "far.stl")
+    packed = np.frombuffer((tmp_path / "far.stl").read_bytes()[84:], np.uint8).reshape(-1, 50)
+    corners = packed[:, 12:48].copy().view("<f4").reshape(-1, 3)
+    places, number = np.unique(corners, axis=0, return_inverse=True)
+    assert len(places) == mesh.vertex_count
+    by_place = Mesh(places, number.reshape(-1, 3)).quality()
+    assert (by_place["closed"], by_place["boundary_edges"], by_place["manifold"]) == (True, 0, True)
+    assert np.abs(corners - mesh.vertices[mesh.triangles].reshape(-1, 3)).max() < 0.05

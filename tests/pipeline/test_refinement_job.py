@@ -35,7 +35,7 @@ def test_a_job_measures_what_it_has_extracted(device: Any, noisy_torus: Any, tmp
     settings = MeshSettings(iso_value=truth["iso_value_hu"], keep_largest=1, device=str(device.index), strict=True)
     report = make_mesh(folder, tmp_path / "a.stl", settings)
     check_gates(report)
-    assert len(report["gates"]) == 9
+    assert len(report["gates"]) == 10
     assert all(gate["ok"] for gate in report["gates"])
     assert report["quality"]["self_intersections"] == 0
     assert report["quality"]["genus"] == 1

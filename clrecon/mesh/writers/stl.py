@@ -16,6 +16,7 @@ from typing import BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
+from clrecon.mesh.coordinates import rounded_apart
 from clrecon.mesh.writers.content import Content, refuse_file
 
 __all__ = ["estimate", "verify", "write"]
@@ -41,7 +42,9 @@ def estimate(content: Content) -> int:
 def write(stream: BinaryIO, content: Content) -> None:
     """Write facets with unit normals from their corners; the normal of a facet without area is zero."""
     stream.write(_header(content) + struct.pack("<I", len(content.triangles)))
-    coordinates = [np.ascontiguousarray(content.vertices[:, axis]) for axis in range(3)]
+    # Readers join vertices at one place: where rounding brings vertices together the surface would be open.
+    vertices = rounded_apart(content.vertices)
+    coordinates = [np.ascontiguousarray(vertices[:, axis]) for axis in range(3)]
     with ThreadPoolExecutor(max_workers=2) as pool:  # numpy works outside the interpreter's lock
         waiting: deque[Future[bytearray]] = deque()
         for start in range(0, len(content.triangles), _CHUNK):
