@@ -13,8 +13,10 @@ from clrecon.cli.masking import add_masking, masking_settings
 from clrecon.cli.points import parse_point
 from clrecon.cli.reading import add_reading, reading_settings
 from clrecon.cli.refinement import (
+    add_purpose,
     add_refinement,
     add_strict,
+    describe_purposes,
     describe_refinement,
     finish_with_gates,
     refinement_settings,
@@ -44,6 +46,7 @@ def _epilog() -> str:
             "  clrecon mesh CT_FOLDER -o bone.stl",
             "  clrecon mesh CT_FOLDER -o skull.glb --hu 300 --keep-largest 1 --report skull.json",
             "  clrecon mesh CT_FOLDER -o bone.stl --hu auto",
+            "  clrecon mesh CT_FOLDER -o print.3mf --for print",
             "  clrecon mesh CT_FOLDER -o bone.stl --hu 200,350 --min-volume 1 --split",
             "  clrecon mesh CT_FOLDER -o fat.stl --hu -150:-30 --remove-table",
             "  clrecon mesh CT_FOLDER -o lung.stl --below -400 --keep-largest 2",
@@ -63,6 +66,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "-o", "--output", metavar="OUT", required=True, help="mesh file: .stl .ply .obj .glb .vtp or .3mf"
     )
+    add_purpose(parser)
     add_reading(parser)
     add_masking(parser)
     surface = parser.add_argument_group("surface")
@@ -119,9 +123,10 @@ def run(options: argparse.Namespace, console: Console) -> int:
     """Run the command; returns the exit code."""
     from clrecon.pipeline.labels import choose_labels
     from clrecon.pipeline.mesh import make_mesh
+    from clrecon.pipeline.purposes import settings_for
     from clrecon.pipeline.settings import MeshSettings
 
-    settings = MeshSettings(
+    given = dict(
         **options.hu,
         below=options.below,
         keep_outside=options.keep_outside,
@@ -140,6 +145,7 @@ def run(options: argparse.Namespace, console: Console) -> int:
         **masking_settings(options),
         **refinement_settings(options),
     )
+    settings = MeshSettings(**settings_for(options.purpose, given))
     report = make_mesh(
         options.input,
         options.output,
@@ -154,7 +160,7 @@ def run(options: argparse.Namespace, console: Console) -> int:
     console.say(f"wrote    {_describe_files(options.output, report)}")
     if options.report:
         console.say(f"report   {printable(options.report)}")
-    return finish_with_gates(report, console, options.strict)
+    return finish_with_gates(report, console, settings.strict)
 
 
 def describe_mesh(report: dict[str, Any]) -> list[str]:
@@ -168,6 +174,7 @@ def describe_mesh(report: dict[str, Any]) -> list[str]:
         *describe_labels(report["meshes"]),
         *_describe_parts(report["meshes"]),
         *describe_refinement(report["meshes"]),
+        *describe_purposes(report["meshes"]),
         f"device   {printable(report['device'])}{_describe_slabs(report)}",
         f"time     {_describe_times(report['seconds'])}",
     ]

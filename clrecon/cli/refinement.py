@@ -6,11 +6,14 @@ import argparse
 from typing import Any
 
 from clrecon.cli.console import Console
+from clrecon.pipeline.purposes import PURPOSES
 
 __all__ = [
     "GATE_FAILED",
+    "add_purpose",
     "add_refinement",
     "add_strict",
+    "describe_purposes",
     "describe_refinement",
     "finish_with_gates",
     "refinement_settings",
@@ -57,6 +60,17 @@ def add_strict(parser: argparse._ActionsContainer) -> None:
     )
 
 
+def add_purpose(parser: argparse._ActionsContainer) -> None:
+    """Add --for."""
+    parser.add_argument(
+        "--for",
+        dest="purpose",
+        metavar="PURPOSE",
+        help="what the mesh is for, with the settings that this takes (others given beside it win); "
+        + "; ".join(f"{purpose.name}: {purpose.description}".replace("%", "%%") for purpose in PURPOSES.values()),
+    )
+
+
 def refinement_settings(options: argparse.Namespace) -> dict[str, Any]:
     """The fields of `MeshSettings` that these options set."""
     return {
@@ -96,6 +110,24 @@ def _describe_decimation(found: dict[str, Any]) -> str:
         return f"{reached:.1f} % of the triangles taken away, as asked"
     bound = f"the bound of {found['max_deviation_mm']:.3g} mm"
     return f"{reached:.1f} % of the triangles taken away of {asked:g} % asked for: {bound} ended it"
+
+
+def describe_purposes(meshes: list[dict[str, Any]]) -> list[str]:
+    """What a person who prints the mesh wants to know; of several the first."""
+    found = [mesh["print"] for mesh in meshes if mesh.get("print")]
+    if not found:
+        return []
+    facts, wall, left_out = found[0], found[0]["wall"], found[0]["left_out"]
+    which = "print    " if len(found) == 1 else "print    (first mesh) "
+    lines = [f"{which}size {' x '.join(f'{length:.1f}' for length in facts['size_mm'])} mm"]
+    if wall["median_mm"] is not None:
+        lines[0] += (
+            f", walls {wall['median_mm']:.1f} mm (median), 5 % below {wall['p5_mm']:.2g} mm,"
+            f" {100 * wall['thin_share']:.1f} % below {wall['thin_mm']:g} mm"
+        )
+    pieces = f"{left_out['pieces']:,} pieces of {left_out['pieces_ml']:.3g} ml together"
+    cavities = f"{left_out['cavities']:,} closed cavities of {left_out['cavities_ml']:.3g} ml"
+    return [*lines, f"         left out {pieces}, filled {cavities}"]
 
 
 def finish_with_gates(report: dict[str, Any], console: Console, strict: bool) -> int:

@@ -19,6 +19,7 @@ __all__ = [
     "SurfaceDistance",
     "compare_meshes",
     "sample_surface",
+    "sample_surface_points",
     "summarise_distances",
     "triangle_distances",
 ]
@@ -55,6 +56,13 @@ def sample_surface(vertices: NDArray[np.floating], triangles: NDArray[np.uint32]
     NoSurfaceError
         The surface has no area.
     """
+    return sample_surface_points(vertices, triangles, count)[0]
+
+
+def sample_surface_points(
+    vertices: NDArray[np.floating], triangles: NDArray[np.uint32], count: int = SAMPLES
+) -> tuple[Points, NDArray[np.int64]]:
+    """As `sample_surface`, with the row of the triangle of each point, shape (count,)."""
     area = np.zeros(len(triangles))
     for where, _, cross in cross_products(vertices, triangles, np.zeros(3)):
         area[where] = np.sqrt(np.einsum("ij,ij->j", cross, cross))
@@ -63,11 +71,13 @@ def sample_surface(vertices: NDArray[np.floating], triangles: NDArray[np.uint32]
         raise NoSurfaceError("a surface without area has no points to measure from")
     number = np.arange(count, dtype=np.float64)
     chosen = np.searchsorted(up_to, (number + 0.5) * (up_to[-1] / count))
-    chosen = triangles[np.minimum(chosen, len(triangles) - 1)]
+    rows = np.minimum(chosen, len(triangles) - 1)
     # The square root spreads the points evenly over a triangle.
     u, v = np.sqrt(number * _STEPS_U % 1.0), number * _STEPS_V % 1.0
     weights = (1.0 - u, u * (1.0 - v), u * v)
-    return sum(w[:, None] * vertices[corner].astype(np.float64) for w, corner in zip(weights, chosen.T, strict=True))
+    corners = triangles[rows].T
+    points = sum(w[:, None] * vertices[corner].astype(np.float64) for w, corner in zip(weights, corners, strict=True))
+    return np.asarray(points), rows
 
 
 class SurfaceDistance:

@@ -41,6 +41,9 @@ _ROUNDS = 12
 _LEAST_GAIN = 0.04
 """Rounds of collapses go on while one takes away more than this share of the triangles that are left."""
 
+_SHARE_SLACK = 0.005
+"""Of the triangles that are to be left: so many more count as reached."""
+
 _SHARE_FOR_VOLUME = 0.1
 """Of the bound, kept for the shift that gives components their volume back."""
 
@@ -126,8 +129,9 @@ def decimate_mesh(mesh: Mesh, fraction: float, max_deviation_mm: float | None = 
     longest = max(_SHARE_FOR_VOLUME * bound - rounding_step(mesh.vertices), 0.0)
     deviation = Deviation(mesh.vertices - origin, mesh.triangles, (1.0 - _SHARE_FOR_VOLUME) * bound)
     wanted = (1.0 - fraction) * mesh.triangle_count
+    nearly = wanted * (1.0 + _SHARE_SLACK) + 2
     left, rounds, taken_back = mesh.triangle_count, 0, 0
-    while left > wanted + 2 and rounds < _ROUNDS:
+    while left > nearly and rounds < _ROUNDS:
         _collapse(clusters, wanted / left, bound)
         collapsed = clusters.collapsed_count
         _mend(clusters, deviation)
@@ -140,7 +144,7 @@ def decimate_mesh(mesh: Mesh, fraction: float, max_deviation_mm: float | None = 
     said = {
         "fraction": fraction,
         "reached": 1.0 - len(triangles) / mesh.triangle_count,
-        "ended_by": "share" if left <= wanted + 2 else "bound",
+        "ended_by": "share" if left <= nearly else "bound",
         "rounds": rounds,
         "max_deviation_mm": bound,
         "triangles_before": mesh.triangle_count,

@@ -25,6 +25,9 @@ __all__ = ["describe_job", "describe_part"]
 SKIN_HU = (-950.0, -200.0)
 """Iso values between air and fat: the surface is the skin, and a head's a face."""
 
+_OF_ONE = ("quality", "iso_distance", "refinement", "print")
+"""What stands at the top of the report too where there is one mesh."""
+
 _SAID_ABOVE = ("vertices", "triangles", "closed", "manifold", "components", "area_mm2", "volume_ml", "bounds_mm")
 
 
@@ -128,6 +131,7 @@ def describe_job(
         "min_volume_ml": settings.min_volume_ml,
         "seeds_mm": [[float(value) for value in seed] for seed in settings.seeds],
         "split": settings.split,
+        "purpose": settings.purpose,
         "device": device.label,
         "driver": device.driver,
         "memory_allowed_bytes": settings.memory,
@@ -137,7 +141,7 @@ def describe_job(
         "platform": platform_name(),
         "warnings": list(dict.fromkeys(warnings)),
         "volume": certificate,
-        **{name: meshes[0][name] if len(meshes) == 1 else None for name in ("quality", "iso_distance", "refinement")},
+        **{name: meshes[0][name] if len(meshes) == 1 else None for name in _OF_ONE},
         "meshes": list(meshes),
         "output": {
             "format": meshes[0]["output"]["format"],

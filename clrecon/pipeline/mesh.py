@@ -16,7 +16,7 @@ from clrecon.pipeline.opening import DeviceOpening, prepare_surfaces
 from clrecon.pipeline.outputs import check_kept, check_outputs, commit_all, count_leftovers, name_outputs, stage_meshes
 from clrecon.pipeline.parts import check_levels, extract_surfaces, first_names, plan_surfaces, select_parts
 from clrecon.pipeline.progress import Progress, Stopwatch, ignore_progress
-from clrecon.pipeline.refinement import judge_parts, refine_surface, warn_of_gates
+from clrecon.pipeline.refinement import describe_purposes, judge_parts, refine_surface, warn_of_gates
 from clrecon.pipeline.report import peak_memory_bytes, stage_report
 from clrecon.pipeline.settings import MeshSettings
 
@@ -135,6 +135,7 @@ def make_mesh(
             progress("measure", place, len(parts) if len(parts) > 1 else 0)
             part.quality = part.mesh.quality()
     gates = judge_parts(parts, volume, settings) + judge_label_volumes(parts, settings.closed)
+    purpose_warnings = describe_purposes(parts)
     watch.lap("measure")
 
     progress("write", 0, 0)
@@ -151,7 +152,7 @@ def make_mesh(
                 f"{leftovers:,} more numbered files of this name lie beside the new ones, from an earlier run"
             )
         report["gates"] = gates
-        report["warnings"] += warn_of_gates(gates)
+        report["warnings"] += purpose_warnings + warn_of_gates(gates)
         report["seconds"] = _seconds(watch, origins)
         report["peak_memory_bytes"] = peak_memory_bytes()
         if report_path is not None:

@@ -62,6 +62,8 @@ class Part:
         What `Mesh.quality` says; empty where it was not measured.
     facts : dict
         More entries of its object in the report.
+    pieces : (dict, dict), optional
+        What the components of its surface enclose, as extracted and as kept; where the purpose asks for it.
     """
 
     surface: Surface
@@ -69,6 +71,7 @@ class Part:
     mesh: Mesh
     quality: dict[str, Any] = field(default_factory=dict)
     facts: dict[str, Any] = field(default_factory=dict)
+    pieces: tuple[dict[str, float], dict[str, float]] | None = None
 
 
 def plan_surfaces(levels: Sequence[float | tuple[float, ...]], below: bool = False) -> list[Surface]:
@@ -140,6 +143,26 @@ def extract_surfaces(
 
 
 def select_parts(surface: Surface, mesh: Mesh, settings: MeshSettings, device: Device) -> list[Part]:
+    """Keep the components that the settings ask for, and measure what the purpose of the mesh asks for.
+
+    Raises
+    ------
+    NoSurfaceError, UsageError
+        As `_select_parts`.
+    """
+    if settings.purpose is None:
+        return _select_parts(surface, mesh, settings, device)
+    from clrecon.pipeline.purposes import measure_pieces
+
+    found = measure_pieces(mesh)
+    parts = _select_parts(surface, mesh, settings, device)
+    each = [measure_pieces(part.mesh) for part in parts]
+    for part in parts:
+        part.pieces = found, {name: sum(kept[name] for kept in each) for name in found}
+    return parts
+
+
+def _select_parts(surface: Surface, mesh: Mesh, settings: MeshSettings, device: Device) -> list[Part]:
     """Keep the components that the settings ask for, together or one by one.
 
     Raises

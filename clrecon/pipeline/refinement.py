@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from clrecon.geometry import Volume
     from clrecon.mesh import Mesh
 
-__all__ = ["judge_parts", "refine_surface", "warn_of_gates"]
+__all__ = ["describe_purposes", "judge_parts", "refine_surface", "warn_of_gates"]
 
 
 def refine_surface(mesh: Mesh, settings: MeshSettings, progress: Progress = ignore_progress) -> Mesh:
@@ -93,6 +93,19 @@ def judge_parts(parts: Sequence[Part], volume: Volume, settings: MeshSettings) -
         part.facts |= {"iso_distance": iso_distance, "refinement": refinement}
         gates += [{"mesh": part.name or None, **gate} for gate in found]
     return gates
+
+
+def describe_purposes(parts: Sequence[Part]) -> list[str]:
+    """Measure what the purpose of the meshes asks for, as ``print`` in the `facts` of each; returns warnings."""
+    from clrecon.pipeline.purposes import describe_print, warn_of_print
+
+    warnings = []
+    for part in parts:
+        part.facts["print"] = None if part.pieces is None else describe_print(part.mesh, *part.pieces)
+        if part.facts["print"] is not None:
+            name = f"{part.name}: " if part.name else ""
+            warnings += [name + text for text in warn_of_print(part.facts["print"])]
+    return warnings
 
 
 def warn_of_gates(gates: Sequence[dict[str, Any]]) -> list[str]:

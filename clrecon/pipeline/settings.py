@@ -10,6 +10,7 @@ from clrecon.errors import UsageError
 from clrecon.pipeline.checks import check_bone_loss, check_field_of_view, check_memory
 from clrecon.pipeline.labels import LabelChoice
 from clrecon.pipeline.presets import DEFAULT_PRESET, find_preset
+from clrecon.pipeline.purposes import find_purpose
 
 __all__ = ["MeshSettings", "name_level"]
 
@@ -76,6 +77,8 @@ class MeshSettings:
         Share of the triangles to take away, see `clrecon.mesh.decimate_mesh`; None: none.
     max_deviation_mm : float, optional
         Bound of each of both, mm; None: a quarter of the shortest voxel step.
+    purpose : str, optional
+        What the mesh is for: more is measured.  It sets nothing here, see `clrecon.pipeline.purposes.settings_for`.
     strict : bool
         Measure whatever a gate needs, triangles that cut each other too.
 
@@ -110,6 +113,7 @@ class MeshSettings:
     smooth: int | None = None
     decimate: float | None = None
     max_deviation_mm: float | None = None
+    purpose: str | None = None
     strict: bool = False
 
     def __post_init__(self) -> None:
@@ -117,6 +121,8 @@ class MeshSettings:
             raise UsageError("give either an iso value in HU or a preset, not both")
         self._check_masks()
         self._check_below()
+        if self.purpose is not None:
+            find_purpose(self.purpose)
         self._check_half_way()
         if self.preset is not None:
             find_preset(self.preset)

@@ -1,0 +1,173 @@
+"""What a mesh is for: names that stand for settings, and what is measured for them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from clrecon.errors import UsageError
+
+if TYPE_CHECKING:
+    from clrecon.mesh import Mesh
+
+__all__ = [
+    "PURPOSES",
+    "Purpose",
+    "describe_print",
+    "find_purpose",
+    "measure_pieces",
+    "settings_for",
+    "warn_of_print",
+]
+
+THIN_MM = 1.0
+"""Walls below this break or are not printed at all by common printers (layers of 0.1 to 0.3 mm, nozzles of 0.4 mm)."""
+
+THIN_SHARE = 0.05
+"""Share of the surface with thin walls from which on it is said as a warning."""
+
+
+@dataclass(frozen=True)
+class Purpose:
+    """A name that stands for settings.
+
+    Attributes
+    ----------
+    name : str
+    settings : dict
+        Fields of `MeshSettings` that it sets where they are not given.
+    description : str
+        One line, with the options that it stands for.
+    """
+
+    name: str
+    settings: dict[str, Any]
+    description: str
+
+
+PURPOSES: dict[str, Purpose] = {
+    purpose.name: purpose
+    for purpose in (
+        Purpose(
+            "print",
+            {"keep_largest": 1, "smooth": 20, "decimate": 0.9, "strict": True},
+            "--keep-largest 1 --smooth --decimate 0.9 --strict: one closed piece; size and thickness of walls are said",
+        ),
+    )
+}
+
+
+def find_purpose(name: str) -> Purpose:
+    """The purpose of this name.
+
+    Raises
+    ------
+    UsageError
+        There is none.
+    """
+    if name not in PURPOSES:
+        raise UsageError(f"a mesh can be for {', '.join(PURPOSES)}, not for {name!r}")
+    return PURPOSES[name]
+
+
+def settings_for(name: str | None, given: dict[str, Any]) -> dict[str, Any]:
+    """The fields of `MeshSettings` that a purpose sets beside those that are given, which win.
+
+    Parameters
+    ----------
+    name : str, optional
+    given : dict
+        Fields; None, False and what is empty are not given.
+
+    Returns
+    -------
+    dict
+        The given fields, and ``purpose``.  Where components are chosen in another way none is left out for it.
+
+    Raises
+    ------
+    UsageError
+        Unknown purpose, or a surface that is left open.
+    """
+    if name is None:
+        return dict(given)
+    fields = dict(find_purpose(name).settings)
+    if not given.get("closed", True):
+        raise UsageError(f"a surface for {name} is closed: leave --open out")
+    if any(given.get(other) for other in ("seeds", "min_volume_ml", "split", "labels")):
+        del fields["keep_largest"]
+    taken = {field: value for field, value in fields.items() if not given.get(field)}
+    return {**given, **taken, "purpose": name}
+
+
+def measure_pieces(mesh: Mesh) -> dict[str, float]:
+    """What the components of a surface enclose.
+
+    Returns
+    -------
+    dict
+        ``pieces``, ``pieces_ml`` : components that enclose something, and how much
+        ``cavities``, ``cavities_ml`` : walls of cavities, and what they enclose
+    """
+    from clrecon.mesh.measures import local_origin
+    from clrecon.mesh.shifts import measure_volumes
+
+    found = measure_volumes(mesh.vertices - local_origin(mesh.vertices), mesh.triangles).mm3 / 1000.0
+    return {
+        "pieces": int((found > 0.0).sum()),
+        "pieces_ml": float(found[found > 0.0].sum()),
+        "cavities": int((found < 0.0).sum()),
+        "cavities_ml": float(-found[found < 0.0].sum()),
+    }
+
+
+def describe_print(mesh: Mesh, found: dict[str, float], kept: dict[str, float]) -> dict[str, Any]:
+    """What a person who prints a mesh wants to know: ``print`` of the report.
+
+    Parameters
+    ----------
+    mesh : Mesh
+        As it is written.
+    found, kept : dict
+        `measure_pieces` of the surface as it was extracted, and of what was kept of it.
+
+    Returns
+    -------
+    dict
+        ``size_mm`` : x, y, z of the box around it
+        ``wall`` : see `clrecon.mesh.thickness.measure_walls`
+        ``left_out`` : pieces and cavities as in `measure_pieces`; cavities that are left out are filled
+        ``pieces``, ``pieces_ml``, ``cavities``, ``cavities_ml`` : those that are in it
+    """
+    from clrecon.mesh.thickness import measure_walls
+
+    size = mesh.vertices.max(axis=0).astype(float) - mesh.vertices.min(axis=0)
+    return {
+        "size_mm": size.tolist(),
+        "wall": measure_walls(mesh.vertices, mesh.triangles, THIN_MM),
+        "left_out": {name: max(found[name] - kept[name], 0) for name in found},
+        **kept,
+    }
+
+
+def warn_of_print(facts: dict[str, Any]) -> list[str]:
+    """Warnings of what `describe_print` says: thin walls, closed cavities, the wrong piece."""
+    warnings = []
+    wall, left_out = facts["wall"], facts["left_out"]
+    if wall["thin_share"] is not None and wall["thin_share"] > THIN_SHARE:
+        warnings.append(
+            f"{100 * wall['thin_share']:.0f} % of the surface has a wall below {wall['thin_mm']:g} mm, which can break"
+            " or be lost in a print: lower --hu, or print it larger"
+        )
+    if facts["cavities"]:
+        warnings.append(
+            f"{facts['cavities']:,} closed cavities of {facts['cavities_ml']:.2g} ml together are in it: powder or"
+            " resin stays in them; --keep-largest 1 fills them"
+        )
+    if left_out["pieces_ml"] > facts["pieces_ml"]:
+        warnings.append(
+            f"what was left out encloses {left_out['pieces_ml']:.3g} ml, more than the {facts['pieces_ml']:.3g} ml that"
+            " were kept: is it the right piece? The piece of largest area can be a table (--remove-table); --seed X,Y,Z"
+            " keeps the one at a point"
+        )
+    return warnings

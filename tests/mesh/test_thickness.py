@@ -1,0 +1,45 @@
+"""Thickness of walls where it is known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import sample_meshes as samples
+
+from clrecon.mesh.thickness import measure_walls, wall_thickness
+
+pytestmark = pytest.mark.unit
+
+FAR = np.array([-150.25, 1071.5, -846.0])
+
+
+def shell(outer: float, inner: float) -> samples.Arrays:
+    out, within = samples.sphere(FAR, outer, 5), samples.sphere(FAR, inner, 5)
+    return samples.join(out, (within[0], within[1][:, ::-1]))
+
+
+def test_a_slab_is_as_thick_as_it_is():
+    vertices, triangles = samples.box(FAR, (40.0, 30.0, 2.5))
+    thickness = wall_thickness(vertices, triangles.astype(np.uint32), 3000)
+    sides = np.array([[40.0 * 30, 2.5], [40 * 2.5, 30.0], [30 * 2.5, 40.0]])
+    for area, length in sides:
+        share = np.mean(np.abs(thickness - length) < 1e-9 * 1e6)
+        assert share == pytest.approx(area / sides[:, 0].sum(), abs=0.01)
+    np.testing.assert_array_equal(thickness, wall_thickness(vertices, triangles.astype(np.uint32), 3000))
+
+
+def test_the_wall_of_a_shell():
+    vertices, triangles = shell(20.0, 18.8)
+    found = measure_walls(vertices, triangles.astype(np.uint32), 1.0, 4000)
+    assert found["median_mm"] == pytest.approx(1.2, abs=0.03)
+    assert found["p5_mm"] == pytest.approx(1.2, abs=0.05)
+    assert (found["thin_share"], found["thin_mm"], found["samples"]) == (0.0, 1.0, 4000)
+    assert found["not_measured"] < 40
+    thin = measure_walls(vertices, triangles.astype(np.uint32), 1.5, 4000)
+    assert thin["thin_share"] > 0.99
+
+
+def test_an_open_sheet_has_no_wall():
+    vertices = np.array([[0.0, 0, 0], [10, 0, 0], [0, 10, 0]])
+    found = measure_walls(vertices, np.array([[0, 1, 2]], np.uint32), 1.0, 50)
+    assert (found["min_mm"], found["thin_share"], found["not_measured"]) == (None, None, 50)

@@ -1,0 +1,65 @@
+"""--for print: the settings it stands for, and what it says."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from clrecon.cli.main import main
+from clrecon.errors import UsageError
+from clrecon.phantom import PhantomSettings, write_phantom
+from clrecon.pipeline.purposes import settings_for, warn_of_print
+from clrecon.pipeline.settings import MeshSettings
+
+
+def test_what_is_given_wins() -> None:
+    assert settings_for(None, {"smooth": None}) == {"smooth": None}
+    plain = settings_for("print", {"smooth": None, "strict": False, "closed": True, "seeds": []})
+    assert MeshSettings(**plain) == MeshSettings(
+        keep_largest=1, smooth=20, decimate=0.9, strict=True, purpose="print", seeds=[]
+    )
+    own = settings_for("print", {"keep_largest": 2, "smooth": 5, "decimate": 0.5})
+    assert (own["keep_largest"], own["smooth"], own["decimate"]) == (2, 5, 0.5)
+    for other in ({"seeds": [(0, 0, 0)]}, {"min_volume_ml": 1.0}, {"split": True}):
+        assert settings_for("print", {**other, "keep_largest": None})["keep_largest"] is None
+
+
+def test_impossible_purposes() -> None:
+    with pytest.raises(UsageError, match="can be for print, not for 'fun'"):
+        settings_for("fun", {})
+    with pytest.raises(UsageError, match="leave --open out"):
+        settings_for("print", {"closed": False})
+    with pytest.raises(UsageError, match="not for 'fun'"):
+        MeshSettings(purpose="fun")
+
+
+def test_warnings_say_what_can_go_wrong() -> None:
+    wall = {"thin_share": 0.01, "thin_mm": 1.0}
+    good = {"wall": wall, "left_out": {"pieces_ml": 1.0}, "pieces_ml": 2.0, "cavities": 0, "cavities_ml": 0.0}
+    assert warn_of_print(good) == []
+    assert "20 % of the surface" in warn_of_print({**good, "wall": {**wall, "thin_share": 0.2}})[0]
+    assert "closed cavities" in warn_of_print({**good, "cavities": 3, "cavities_ml": 0.2})[0]
+    assert "is it the right piece" in warn_of_print({**good, "left_out": {"pieces_ml": 2.1}})[0]
+
+
+def test_a_print_of_a_phantom(device: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    settings = PhantomSettings(kind="torus", size=(72, 56), slices=31, spacing=(0.5, 0.7, 1.0), noise=30.0)
+    truth = write_phantom(tmp_path / "ct", settings)
+    arguments = ["mesh", str(tmp_path / "ct"), "-o", str(tmp_path / "a.stl"), "--hu", f"{truth['iso_value_hu']:g}"]
+    arguments += ["--device", str(device.index), "--for", "print", "--report", str(tmp_path / "a.json")]
+    assert main(arguments) == 0
+    told = capsys.readouterr().out
+    report = json.loads((tmp_path / "a.json").read_text())
+    facts = report["print"]
+    assert (report["purpose"], report["keep_largest"], report["components"]) == ("print", 1, 1)
+    size = np.ptp(np.array(report["bounds_mm"]), axis=0)
+    np.testing.assert_allclose(facts["size_mm"], size, atol=1e-4)
+    assert "print    size " + " x ".join(f"{length:.1f}" for length in size) in told
+    assert (facts["pieces"], facts["cavities"]) == (1, 0)
+    assert facts["pieces_ml"] == pytest.approx(report["volume_ml"], rel=0.01)
+    assert 0.0 < facts["wall"]["p5_mm"] <= facts["wall"]["median_mm"] <= size.max()
+    assert main([*arguments, "--open"]) == 3
