@@ -168,29 +168,31 @@ def _distances_to_level(volume: Volume, rule: IsoRule, level: float, points: Flo
 
 
 def _distances_along_rays(volume: Volume, rule: IsoRule, points: Float64Array) -> Float64Array:
-    """Way to the nearest place, along one of 26 rays, where the field goes through the level; NaN where none does."""
-    voxel = smallest_voxel_mm(volume)
-    steps = np.array([[x, y, z] for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1) if x or y or z], float)
-    rays = steps / np.linalg.norm(steps, axis=1, keepdims=True)
-    ways = _RAY_STEP_VOXEL * voxel * np.arange(1, round(_REACH_VOXEL / _RAY_STEP_VOXEL) + 1)
+    """Way to the nearest place, along one of 26 rays through the grid, where the field goes through the level.
+
+    A ray is `_REACH_VOXEL` steps long, along each axis that it follows.  NaN where none meets the level.
+    """
+    rays = np.array([[i, j, k] for i in (-1, 0, 1) for j in (-1, 0, 1) for k in (-1, 0, 1) if i or j or k], float)
+    ways = _RAY_STEP_VOXEL * np.arange(1, round(_REACH_VOXEL / _RAY_STEP_VOXEL) + 1)
     distances = np.full(len(points), np.nan)
     for where in chunks(len(points), 256):
-        here = points[where]
+        start = volume.lps_to_ijk(points[where])[:, None]
 
-        def above(of: Float64Array) -> Float64Array:
-            value, _ = trilinear_field(volume, rule, volume.lps_to_ijk(of.reshape(-1, 3)))
-            return (value - rule.iso_level).reshape(of.shape[:-1])
+        def above(ijk: Float64Array) -> Float64Array:
+            value, _ = trilinear_field(volume, rule, ijk.reshape(-1, 3))
+            return (value - rule.iso_level).reshape(ijk.shape[:-1])
 
-        before, way_before = np.repeat(above(here)[:, None], len(rays), axis=1), 0.0
+        nearest = np.full(len(start), np.inf)
+        before, way_before = np.repeat(above(start), len(rays), axis=1), 0.0
         for way in ways:
-            after = above(here[:, None] + way * rays)
-            crossed = (before >= 0.0) != (after >= 0.0)
-            with np.errstate(divide="ignore", invalid="ignore"):
-                share = before / (before - after)
-            found = np.where(crossed, way_before + share * (way - way_before), np.inf).min(axis=1)
-            new = np.isnan(distances[where]) & np.isfinite(found)
-            distances[where][new] = found[new]
+            after = above(start + way * rays)
+            row, ray = np.nonzero((before >= 0.0) != (after >= 0.0))
+            share = before[row, ray] / (before[row, ray] - after[row, ray])
+            met = start[row, 0] + (way_before + share * (way - way_before))[:, None] * rays[ray]
+            length = np.linalg.norm(volume.ijk_to_lps(met) - points[where][row], axis=1)
+            np.minimum.at(nearest, row, length)
             before, way_before = after, way
+        distances[where] = np.where(np.isfinite(nearest), nearest, np.nan)
     return distances
 
 

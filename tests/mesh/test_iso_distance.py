@@ -163,6 +163,6 @@ def test_where_the_gradient_leads_nowhere_rays_find_the_surface():
     distances = distances_to_iso_surface(volume, rule, point)
     normal = np.linalg.inv(volume.affine[:3, :3])[0]
     across = 1.0 / np.linalg.norm(normal)  # of one step along i, straight to the plane
-    assert 0.7 * across <= distances[0] <= 1.4 * 0.7 * across
+    assert 0.7 * across <= distances[0] <= 1.4 * 0.7 * across  # the rays follow the sheared grid
     assert distances[1] == pytest.approx(0.3 * across, abs=1e-3)
     assert np.isnan(distances[2])
