@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from clrecon.geometry import Volume
 from clrecon.phantom import KINDS, MATERIALS, PhantomSettings, label_materials, make_phantom
 
-COARSE = 2.0
+COARSE = 2.3
 """Steps of a small phantom in those of its kind: 2 to 4 mm."""
 
 BODIES: dict[str, dict[str, Any]] = {
@@ -60,7 +60,7 @@ def settings_of(name: str) -> PhantomSettings:
     """Settings of a small phantom of `BODIES`."""
     given = BODIES[name]
     dj, di, dk = (COARSE * step for step in KINDS[given["kind"]].spacing)
-    return PhantomSettings(size=(128, 124), slices=48, spacing=(dj, 1.04 * di, dk), **given)
+    return PhantomSettings(size=(112, 108), slices=42, spacing=(dj, 1.04 * di, dk), **given)
 
 
 @functools.cache

@@ -110,9 +110,8 @@ def _label(cells: Cells, mask: Mask) -> _Pieces:
 
 def _sum_by(labels: NDArray[np.int32], of: NDArray[Any], count: int) -> Float64Array:
     """Sum for each label; 0 for label 0."""
-    sums = np.bincount(labels.ravel(), weights=of.ravel(), minlength=count + 1).astype(np.float64)
-    sums[0] = 0.0
-    return sums
+    labelled = labels > 0
+    return np.bincount(labels[labelled], weights=of[labelled], minlength=count + 1).astype(np.float64)
 
 
 def find_dense_pieces(cells: Cells, tissue: Mask, thick: Mask, body: Mask) -> DensePieces:

@@ -1,0 +1,172 @@
+"""Odd bodies through the jobs: what each option takes is what the truth says, or it is refused or said with figures."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from odd_bodies import BODIES, OddBody, make_odd, settings_of
+
+from clrecon.errors import ClreconError, NoSurfaceError, RefusedInputError
+from clrecon.phantom import write_phantom
+from clrecon.pipeline.mesh import make_mesh
+from clrecon.pipeline.pictures import PictureFiles
+from clrecon.pipeline.render import make_pictures
+from clrecon.pipeline.render_settings import RenderSettings
+from clrecon.pipeline.settings import MeshSettings
+
+pytestmark = pytest.mark.first_device
+
+BONY = [name for name in BODIES if name not in ("water", "empty")]
+SPINELESS = ("skull", "bones", "pelvis", "water")
+FEW = ("skull", "bones", "pair", "pelvis", "contrast")
+"""Each option with all bodies takes minutes; these differ the most."""
+
+
+@pytest.fixture(scope="session")
+def series(tmp_path_factory: pytest.TempPathFactory) -> Any:
+    """Folder of the series of a body, written when it is first asked for."""
+    folder = tmp_path_factory.mktemp("odd")
+
+    def written(name: str) -> Path:
+        if not (folder / name).is_dir():
+            write_phantom(folder / name, settings_of(name))
+        return folder / name
+
+    return written
+
+
+def mesh_of(series: Any, device: Any, folder: Path, name: str, **settings: Any) -> tuple[dict[str, Any], np.ndarray]:
+    """Report, and the vertices in index coordinates (i, j, k)."""
+    import trimesh
+
+    path = folder / "mesh.ply"
+    report = make_mesh(series(name), path, MeshSettings(device=str(device.index), **settings), measure=True)
+    vertices = np.asarray(trimesh.load(path, process=False).vertices)
+    return report, make_odd(name).volume.lps_to_ijk(vertices)
+
+
+def share_near(body: OddBody, vertices: np.ndarray, *materials: str) -> float:
+    """Share of the vertices that lie within a voxel of these materials."""
+    from scipy import ndimage
+
+    near = ndimage.binary_dilation(body.of(*materials), np.ones((3, 3, 3)))
+    i, j, k = np.clip(np.rint(vertices).astype(int), 0, np.array(near.shape[::-1]) - 1).T
+    return float(near[k, j, i].mean())
+
+
+@pytest.mark.parametrize("name", BONY)
+def test_the_mesh_without_the_table_is_that_of_the_bone(series: Any, device: Any, tmp_path: Path, name: str) -> None:
+    body = make_odd(name)
+    report, vertices = mesh_of(series, device, tmp_path, name, iso_value=300.0, remove_table=True, strict=True)
+    facts = report["volume"]["remove_table"]
+    assert facts["bone_kept"] >= 0.98
+    assert next(gate for gate in report["volume"]["gates"] if gate["name"] == "bone_kept")["ok"]
+    assert any(f"{100 * facts['bone_kept']:.4g} % stay" in warning for warning in report["warnings"])
+    low, high = report["volume"]["hu_range"]
+    assert low <= facts["air_hu"] and high == body.volume.voxels.max()
+    materials = ("bone", "metal", "contrast")
+    assert share_near(body, vertices, *materials) > 0.8  # the rest is skin and table in the margin
+    # every dense body is there: its voxels have the surface beside them or lie within
+    _, whole = mesh_of(series, device, tmp_path, name, iso_value=300.0)
+    expected = whole[_of_body(body, whole)]
+    assert np.count_nonzero(_of_body(body, vertices)) == pytest.approx(len(expected), rel=0.02)
+
+
+def _of_body(body: OddBody, vertices: np.ndarray) -> np.ndarray:
+    """Vertices between the voxels of bone, and far from the table."""
+    from scipy import ndimage
+
+    near = ndimage.binary_dilation(body.of("bone", "metal", "contrast"), np.ones((3, 3, 3)))
+    near &= ~ndimage.binary_dilation(body.of("table"), np.ones((3, 3, 3)))
+    i, j, k = np.clip(np.rint(vertices).astype(int), 0, np.array(near.shape[::-1]) - 1).T
+    return np.asarray(near[k, j, i])
+
+
+@pytest.mark.parametrize("settings", [{"remove_table": True}, {"remove_table": True, "half_way": "auto"}])
+def test_a_table_alone_is_refused_and_writes_nothing(
+    series: Any, device: Any, tmp_path: Path, settings: dict[str, Any]
+) -> None:
+    path = tmp_path / "mesh.stl"
+    with pytest.raises(RefusedInputError, match="no body found"):
+        make_mesh(series("empty"), path, MeshSettings(device=str(device.index), **settings))
+    assert not list(tmp_path.iterdir())
+
+
+def test_water_without_its_table_has_no_surface_at_the_level_of_bone(series: Any, device: Any, tmp_path: Path) -> None:
+    with pytest.raises(NoSurfaceError, match="HU"):
+        mesh_of(series, device, tmp_path, "water", iso_value=300.0, remove_table=True)
+    _, vertices = mesh_of(series, device, tmp_path, "water", iso_value=-300.0, remove_table=True, keep_largest=1)
+    assert share_near(make_odd("water"), vertices, "water") > 0.7
+
+
+@pytest.mark.parametrize("name", ("limb", "empty", *FEW))
+def test_a_circle_says_what_it_cuts(series: Any, device: Any, tmp_path: Path, name: str) -> None:
+    body = make_odd(name)
+    report, vertices = mesh_of(series, device, tmp_path, name, iso_value=-300.0, field_of_view=60.0)
+    facts = report["volume"]["field_of_view"]
+    centre = (np.array(body.volume.shape_ijk[:2]) - 1.0) / 2.0
+    assert (np.linalg.norm((vertices[:, :2] - centre) * body.volume.spacing[:2], axis=1) < 60.0 + 4.0).all()
+    cuts = facts["bone_voxels_removed"] > 0
+    assert cuts == any("it cuts bone off" in warning for warning in report["warnings"])
+    if name in ("pair", "pelvis", "skull"):
+        assert cuts and facts["bone_kept"] < 0.98
+
+
+@pytest.mark.parametrize("name", BODIES)
+def test_a_level_that_the_scan_gives_fits_its_bone_or_is_refused(
+    series: Any, device: Any, tmp_path: Path, name: str
+) -> None:
+    body = make_odd(name)
+    try:
+        report, vertices = mesh_of(series, device, tmp_path, name, half_way="auto")
+    except ClreconError as error:
+        assert any(letter.isdigit() for letter in str(error))  # a refusal with its figures
+        assert name not in ("head", "limb", "pair", "pelvis"), error
+        return
+    choice = report["iso_value_choice"]
+    assert choice["tissue_hu"] < report["iso_value_hu"] < choice["bone_hu"]
+    if name == "contrast":
+        assert choice["contrast_medium_share"] > 0.0
+    elif name == "water":  # the brightest is its shell, and the report says so: this is no bone
+        assert choice["bone_hu"] < 300.0
+    else:  # rails of a table are hard too
+        assert share_near(body, vertices, "bone", "metal", "table") > 0.9
+
+
+@pytest.mark.parametrize("name", FEW)
+def test_the_largest_piece_is_of_the_body(series: Any, device: Any, tmp_path: Path, name: str) -> None:
+    body = make_odd(name)
+    report, vertices = mesh_of(series, device, tmp_path, name, iso_value=300.0, remove_table=True, keep_largest=1)
+    assert report["components_kept"] == 1 <= report["components_found"]
+    assert share_near(body, vertices, "bone", "metal", "contrast") > 0.9
+
+
+@pytest.mark.parametrize("name", FEW)
+def test_a_seed_in_bone_keeps_bone(series: Any, device: Any, tmp_path: Path, name: str) -> None:
+    body = make_odd(name)
+    dense = np.argwhere(body.of("bone") & (body.volume.voxels > 500))
+    seed = body.volume.ijk_to_lps(dense[len(dense) // 2][None, ::-1])[0]
+    report, vertices = mesh_of(series, device, tmp_path, name, iso_value=300.0, seeds=[tuple(seed)])
+    assert report["components_kept"] == 1
+    nearest = np.linalg.norm(body.volume.ijk_to_lps(vertices) - seed, axis=1).min()
+    assert nearest < 10.0 and share_near(body, vertices, "bone", "metal", "table") > 0.9
+
+
+@pytest.mark.parametrize("name", SPINELESS)
+def test_no_spine_is_found_where_there_is_none(series: Any, device: Any, tmp_path: Path, name: str) -> None:
+    settings = RenderSettings(curve="auto", device=str(device.index), size=(40, 40))
+    with pytest.raises(RefusedInputError, match="spine|canal"):
+        make_pictures(series(name), PictureFiles(picture=str(tmp_path / "spine.png")), settings)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("name", FEW)
+def test_pictures_say_what_was_left_out(series: Any, device: Any, tmp_path: Path, name: str) -> None:
+    settings = RenderSettings(preset="bone", remove_table=True, device=str(device.index), size=(48, 40))
+    report = make_pictures(series(name), PictureFiles(picture=str(tmp_path / "bone.png")), settings)
+    assert report["volume"]["remove_table"]["bone_kept"] >= 0.98
+    assert any("of them dense (table, blankets)" in warning for warning in report["warnings"])
+    assert not any("nothing of the volume shows" in warning for warning in report["warnings"])
