@@ -23,23 +23,30 @@ typedef struct {
     int level;
 } mask_part;
 
+/* Index `at` of an axis of n samples, held within it; drivers call clamp() as a function. */
+static inline int hold_within(int at, int n)
+{
+    return at < 0 ? 0 : at >= n ? n - 1 : at;
+}
+
 /* By how much the own label of sample (i, j, k), whose number is `own`, leads before all others there; 1 at least. */
 static inline int find_lead(const mask_part *masks, int i, int j, int k, uint own)
 {
     const int ni = masks->occupied.ni, nj = masks->occupied.nj, nk = masks->occupied.nk;
+    const int before_2 = hold_within(i - 2, ni), before_1 = hold_within(i - 1, ni);
+    const int after_1 = hold_within(i + 1, ni), after_2 = hold_within(i + 2, ni);
     int lead = 0;
     for (int dk = -REACH; dk <= REACH; ++dk) {
-        const int k1 = clamp(k + dk, 0, nk - 1) - masks->occupied.first_k;
+        const int k1 = hold_within(k + dk, nk) - masks->occupied.first_k;
         for (int dj = -REACH; dj <= REACH; ++dj) {
-            __global const LABEL *row = masks->map + voxel_index(0, clamp(j + dj, 0, nj - 1), k1, ni, nj);
-            const int weight = weigh(dk) * weigh(dj);
-            for (int di = -REACH; di <= REACH; ++di) {
-                const uint there = row[clamp(i + di, 0, ni - 1)];
-                lead += there == own ? weight * weigh(di) : there != 0 ? -weight * weigh(di) : 0;
-            }
+            __global const LABEL *row = masks->map + voxel_index(0, hold_within(j + dj, nj), k1, ni, nj);
+#define SIDE(at) ((row[at] == own) * 2 - (row[at] != 0)) /* 1: its own, -1: another's, 0: nobody's */
+            lead += weigh(dk) * weigh(dj)
+                * (SIDE(before_2) + SIDE(after_2) + 4 * (SIDE(before_1) + SIDE(after_1)) + 6 * SIDE(i));
+#undef SIDE
         }
     }
-    return max(lead, 1);
+    return lead > 1 ? lead : 1;
 }
 
 /* Give lane n of a gathered group, which holds the label's occupancy, the values and gradients that place its vertex. */

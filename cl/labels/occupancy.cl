@@ -99,7 +99,7 @@ static inline uchar16 find_label(__global const LABEL *at, const LABEL label)
  * Launch      global = slices * (end_j - begin_j) rounded up by the host, any local: one item a row
  * Guarantees  every wanted sum is written; samples up to 15 before or behind them in the row may be too, right as well */
 __kernel void smooth_rows(
-    __global const LABEL *restrict map, __global uchar *restrict rows, const uint label,
+    __global const LABEL *restrict map, __global ushort *restrict rows, const uint label,
     const int ni, const int nj, const int begin_i, const int end_i, const int begin_j, const int end_j,
     const uint slices)
 {
@@ -108,18 +108,18 @@ __kernel void smooth_rows(
         return;
     const size_t row = voxel_index(0, begin_j + (int)(item % height), (int)(item / height), ni, nj);
     __global const LABEL *in = map + row;
-    __global uchar *out = rows + row;
-#define AT(i) ((uchar)(label != 0 ? in[clamp(i, 0, ni - 1)] == label : in[clamp(i, 0, ni - 1)] != 0))
+    __global ushort *out = rows + row;
+#define AT(i) ((ushort)(label != 0 ? in[clamp(i, 0, ni - 1)] == label : in[clamp(i, 0, ni - 1)] != 0))
     int i = begin_i;
     while (i < end_i) {
         if (i >= REACH && i + 16 + REACH <= ni) {
             const uchar16 sum = (find_label(in + i - 2, (LABEL)label) & (uchar)1)
                 + (find_label(in + i - 1, (LABEL)label) & (uchar)4) + (find_label(in + i, (LABEL)label) & (uchar)6)
                 + (find_label(in + i + 1, (LABEL)label) & (uchar)4) + (find_label(in + i + 2, (LABEL)label) & (uchar)1);
-            vstore16(sum, 0, out + i);
+            vstore16(convert_ushort16(sum), 0, out + i); /* once here: the next pass reads each 25 times */
             i += 16;
         } else {
-            out[i] = AT(i - 2) + AT(i + 2) + (uchar)4 * (AT(i - 1) + AT(i + 1)) + (uchar)6 * AT(i);
+            out[i] = (ushort)(AT(i - 2) + AT(i + 2) + 4 * (AT(i - 1) + AT(i + 1)) + 6 * AT(i));
             ++i;
         }
     }
@@ -136,7 +136,7 @@ __kernel void smooth_rows(
  * Assumes     `rows` has the wanted samples and those REACH around them, as far as the map goes
  * Guarantees  every wanted occupancy is written; samples up to 15 behind them in the row may be too, with any value */
 __kernel void smooth_across(
-    __global const uchar *restrict rows, __global short *restrict occupancy,
+    __global const ushort *restrict rows, __global short *restrict occupancy,
     const int ni, const int nj, const int nk, const int begin_i, const int end_i, const int begin_j, const int end_j,
     const int first_row_slice, const int first_slice, const uint slices)
 {
@@ -154,7 +154,7 @@ __kernel void smooth_across(
     for (; i + 16 <= ni && i < end_i; i += 16) {
         ushort16 sum = 0;
         for (int d = 0; d <= 2 * REACH; ++d) {
-#define ROW(n) convert_ushort16(vload16(0, rows + along_k[d] + along_j[n] + i))
+#define ROW(n) vload16(0, rows + along_k[d] + along_j[n] + i)
             const ushort16 plane = ROW(0) + ROW(4) + (ushort)4 * (ROW(1) + ROW(3)) + (ushort)6 * ROW(2);
 #undef ROW
             sum += (ushort)weigh(d - REACH) * plane;

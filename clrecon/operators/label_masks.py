@@ -122,7 +122,7 @@ class _Run:
         samples = self.labels.voxels[first:end].size
         return {
             "labels": samples * self.labels.voxels.itemsize,
-            "row sums": samples,
+            "row sums": 2 * samples,
             "occupancy": 2 * samples,
             "occupancy of all labels": 2 * samples * self.has_neighbours,
         }
@@ -144,7 +144,7 @@ class _Run:
         with self.stopwatch.timed("upload"):
             map_d = upload(device, self.labels.voxels[first:end])
         samples = self.labels.voxels[first:end].size
-        rows_d, occupancy_d = allocate(device, samples), allocate(device, 2 * samples)
+        rows_d, occupancy_d = allocate(device, 2 * samples), allocate(device, 2 * samples)
         occupied_d = allocate(device, 2 * samples) if self.has_neighbours else occupancy_d
         held = _Held(first, end, map_d, rows_d, occupancy_d, occupied_d)
         if self.has_neighbours:

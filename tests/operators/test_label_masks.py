@@ -116,6 +116,30 @@ def test_a_sphere_has_its_volume_and_no_steps(device, radius):
     assert np.sqrt(np.mean((np.linalg.norm(outward, axis=1) - radius) ** 2)) <= tolerances.MASK_SPHERE_VOXEL
 
 
+def test_surface_nets_are_smaller_bodies(device):
+    """VTK's surface nets as a third opinion: the same border, but smoothed into a smaller body."""
+    filters = pytest.importorskip("vtkmodules.vtkFiltersCore")
+    from vtkmodules.util.numpy_support import numpy_to_vtk, vtk_to_numpy
+    from vtkmodules.vtkCommonDataModel import vtkImageData
+
+    labels = mask_of((29, 30, 31), 11.2).astype(np.uint8)
+    image, nets = vtkImageData(), filters.vtkSurfaceNets3D()
+    image.SetDimensions(*labels.shape[::-1])
+    image.GetPointData().SetScalars(numpy_to_vtk(labels.ravel()))
+    nets.SetInputData(image)
+    nets.SetValue(0, 1)
+    nets.SetNumberOfIterations(16)
+    nets.SetOutputMeshTypeToTriangles()
+    nets.Update()
+    points = vtk_to_numpy(nets.GetOutput().GetPoints().GetData())
+    triangles = vtk_to_numpy(nets.GetOutput().GetPolys().GetConnectivityArray()).reshape(-1, 3).astype(np.uint32)
+    mesh = extract_label_masks(LabelMap(labels, np.eye(4)), device)[1]
+    theirs = 1000.0 * abs(enclosed_ml(points, triangles)) / np.count_nonzero(labels) - 1.0
+    assert abs(volume_share(mesh)) < 0.1 * abs(theirs)
+    distance, _ = cKDTree(points).query(mesh.vertices)
+    assert distance.max() < 1.0
+
+
 def test_a_tilted_plane_has_no_steps(device):
     k, j, i = np.indices((24, 40, 40))
     labels = (k - 12 <= 0.2 * (i - 20) + 0.37 * (j - 20)).astype(np.uint8)
