@@ -91,22 +91,22 @@ static inline uchar16 find_label(__global const LABEL *at, const LABEL label)
 }
 
 /* Parameters  map       in   slices of (nk, nj, ni) from first_slice on
- *             rows      out  (slices, nj, ni) sums along i
+ *             rows      out  as `map`: sums along i
  *             label     number of the label; 0: all labels
  *             ni nj     of the whole map
  *             begin_i end_i begin_j end_j   the samples that are wanted: others are not written
- *             slices
+ *             begin_slice slices            the same of slices, counted from first_slice
  * Launch      global = slices * (end_j - begin_j) rounded up by the host, any local: one item a row
  * Guarantees  every wanted sum is written; samples up to 15 before or behind them in the row may be too, right as well */
 __kernel void smooth_rows(
     __global const LABEL *restrict map, __global ushort *restrict rows, const uint label,
     const int ni, const int nj, const int begin_i, const int end_i, const int begin_j, const int end_j,
-    const uint slices)
+    const int begin_slice, const uint slices)
 {
     const uint item = get_global_id(0), height = end_j - begin_j;
     if (item >= height * slices)
         return;
-    const size_t row = voxel_index(0, begin_j + (int)(item % height), (int)(item / height), ni, nj);
+    const size_t row = voxel_index(0, begin_j + (int)(item % height), begin_slice + (int)(item / height), ni, nj);
     __global const LABEL *in = map + row;
     __global ushort *out = rows + row;
 #define AT(i) ((ushort)(label != 0 ? in[clamp(i, 0, ni - 1)] == label : in[clamp(i, 0, ni - 1)] != 0))

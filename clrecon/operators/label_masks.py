@@ -164,11 +164,13 @@ class _Run:
         ]
         (begin_k, end_k), (begin_j, end_j), along_i = inner
         row_j = max(0, begin_j - REACH), min(nj, end_j + REACH)
-        slices = held.end - held.first
+        row_k = max(held.first, begin_k - REACH), min(held.end, end_k + REACH)
+        slices = row_k[1] - row_k[0]
         launch(
             self.device, self.own["smooth_rows"], slices * (row_j[1] - row_j[0]),
             held.map_d, held.rows_d, np.uint32(number),
-            *(np.int32(n) for n in (ni, nj, *along_i, *row_j)), np.uint32(slices), stopwatch=self.stopwatch,
+            *(np.int32(n) for n in (ni, nj, *along_i, *row_j, row_k[0] - held.first)), np.uint32(slices),
+            stopwatch=self.stopwatch,
         )  # fmt: skip
         launch(
             self.device, self.own["smooth_across"], (end_k - begin_k) * (end_j - begin_j),
