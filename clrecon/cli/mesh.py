@@ -47,6 +47,7 @@ def _epilog() -> str:
             "  clrecon mesh CT_FOLDER -o skull.glb --hu 300 --keep-largest 1 --report skull.json",
             "  clrecon mesh CT_FOLDER -o bone.stl --hu auto",
             "  clrecon mesh CT_FOLDER -o print.3mf --for print",
+            "  clrecon mesh CT_FOLDER -o bone.stl --hu auto --keep bone",
             "  clrecon mesh CT_FOLDER -o bone.stl --hu 200,350 --min-volume 1 --split",
             "  clrecon mesh CT_FOLDER -o fat.stl --hu -150:-30 --remove-table",
             "  clrecon mesh CT_FOLDER -o lung.stl --below -400 --keep-largest 2",
@@ -95,6 +96,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     surface.add_argument("--open", action="store_true", help="leave the surface open at the border of the volume")
     components = parser.add_argument_group("components")
+    components.add_argument(
+        "--keep",
+        metavar="bone",
+        help="bone: keep the components whose walls look like bone, not heart and vessels with contrast medium, nor a"
+        " table",
+    )
     components.add_argument("--keep-largest", type=int, metavar="N", help="keep the N largest components only")
     components.add_argument(
         "--min-volume", type=float, metavar="ML", help="keep components of at least ML millilitres only"
@@ -135,6 +142,7 @@ def run(options: argparse.Namespace, console: Console) -> int:
         space=options.space.lower(),
         closed=not options.open,
         topology=options.topology.lower(),
+        keep=None if options.keep is None else options.keep.lower(),
         keep_largest=options.keep_largest,
         min_volume_ml=options.min_volume,
         seeds=options.seed,

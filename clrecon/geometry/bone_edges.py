@@ -139,10 +139,19 @@ def _walk(
     return end, steepest
 
 
-def leave_contrast_medium(edges: BoneEdges) -> tuple[BoneEdges, float]:
-    """Leave out edges into flat, faint plateaus, unless most are; returns the rest and the share left out."""
+def leave_contrast_medium(edges: BoneEdges) -> tuple[BoneEdges, float, float]:
+    """Leave out edges into flat, faint plateaus, unless most are.
+
+    Returns
+    -------
+    BoneEdges
+    float
+        Share of the contrast that was left out.
+    float
+        Share that is flat and faint, left out or not.
+    """
     total = edges.contrast.sum()
     share = float(edges.contrast[edges.flat].sum() / total) if total else 0.0
     if share > LARGEST_FLAT_SHARE:
-        return edges, 0.0
-    return edges.where(~edges.flat), share
+        return edges, 0.0, share
+    return edges.where(~edges.flat), share, share

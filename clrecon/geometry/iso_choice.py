@@ -32,7 +32,7 @@ from clrecon.errors import NoSurfaceError, UsageError
 from clrecon.geometry.bone_edges import Background, BoneEdges, leave_contrast_medium, measure_edges
 from clrecon.geometry.volume import AIR_HU, Volume
 
-__all__ = ["IsoChoice", "choose_iso_value", "half_iso_value"]
+__all__ = ["CONTRAST_SAID", "IsoChoice", "choose_iso_value", "half_iso_value"]
 
 Float64Array = NDArray[np.float64]
 
@@ -60,6 +60,8 @@ SPECIMEN_SEED_HU = 150
 FAT_BELOW_TISSUE_HU = 250
 """The low side of an edge is soft tissue or fat: not further below the mode than this."""
 
+CONTRAST_SAID = 0.05
+"""Share of the contrast in flat plateaus that is said; scans without contrast medium have up to 0.02."""
 FEWEST_EDGES = 64
 LEAST_CONTRAST_SIGMAS = 6.0
 
@@ -96,6 +98,8 @@ class IsoChoice:
         passing by a slice, is lost.
     contrast_medium_share : float or None
         Share of the contrast left out because it ends in a flat plateau below `CONTRAST_MEDIUM_HU`.
+    flat_share : float or None
+        The same share before it was decided: more than three quarters are not left out but taken for bone.
     slices, slice_step : int or None
         Slices looked at and the distance from one to the next.
     """
@@ -113,6 +117,7 @@ class IsoChoice:
     steepness_hu_per_voxel: float | None = None
     faint_share: float | None = None
     contrast_medium_share: float | None = None
+    flat_share: float | None = None
     slices: int | None = None
     slice_step: int | None = None
 
@@ -166,16 +171,17 @@ def choose_iso_value(volume: Volume) -> IsoChoice:
     histogram = _leave_padding(_count_values(voxels, sampled), voxels[0].size * len(sampled), volume.report)
     background = _find_background(histogram)
     edges = measure_edges(voxels, sampled, background)
-    edges, left_out = leave_contrast_medium(edges)
+    edges, left_out, flat_share = leave_contrast_medium(edges)
     bone, tissue = _median(edges.bone, edges.contrast), _median(edges.tissue, edges.contrast)
     least = max(SEED_ABOVE_TISSUE_HU, LEAST_CONTRAST_SIGMAS * background.noise)
     if len(edges.bone) < FEWEST_EDGES or bone - tissue < least:
         raise NoSurfaceError(_no_bone(background, edges, histogram, len(sampled)))
-    return _describe(background, edges, left_out, sampled)
+    return _describe(background, edges, (left_out, flat_share), sampled)
 
 
-def _describe(background: Background, edges: BoneEdges, left_out: float, sampled: range) -> IsoChoice:
-    """The choice that the edges make, with its figures."""
+def _describe(background: Background, edges: BoneEdges, flat: tuple[float, float], sampled: range) -> IsoChoice:
+    """The choice that the edges make, with its figures; `flat` are the shares left out and found."""
+    left_out, flat_share = flat
     bone, tissue = _median(edges.bone, edges.contrast), _median(edges.tissue, edges.contrast)
     iso_value = float(math.floor((bone + tissue) / 2.0 + 0.5))
     half = (edges.bone + edges.tissue) / 2.0
@@ -186,6 +192,9 @@ def _describe(background: Background, edges: BoneEdges, left_out: float, sampled
         f"medians of {len(half):,} edges in {len(sampled)} slices; single edges spread by {spread:.0f} HU, "
         f"{spread / steepness:.2f} voxel"
     )
+    if flat_share >= CONTRAST_SAID:
+        done = "left out" if left_out else "taken for bone, as nearly all is of this kind"
+        reason += f"; {100.0 * flat_share:.0f} % of the contrast ends in flat plateaus, as of contrast medium: {done}"
     return IsoChoice(
         iso_value,
         round(bone, 1),
@@ -200,6 +209,7 @@ def _describe(background: Background, edges: BoneEdges, left_out: float, sampled
         steepness_hu_per_voxel=round(steepness, 1),
         faint_share=round(float(np.mean(edges.bone < iso_value)), 4),
         contrast_medium_share=round(left_out, 4),
+        flat_share=round(flat_share, 4),
         slices=len(sampled),
         slice_step=sampled.step,
     )

@@ -62,6 +62,7 @@ def select_components(
     *,
     seeds: Sequence[Sequence[float]] = (),
     labelled: Labelled | None = None,
+    among: NDArray[np.bool_] | None = None,
 ) -> Mesh:
     """Keep the largest components of a surface, or those at given points.
 
@@ -83,6 +84,8 @@ def select_components(
         Keep the components whose surface lies nearest to one of these points, LPS mm.
     labelled : (int, ndarray), optional
         What `label_components` returns for this mesh, where it is known already (a device finds it sooner).
+    among : ndarray, shape (count,), bool, optional
+        Of the components of `labelled`, those that may be kept.
 
     Returns
     -------
@@ -99,7 +102,7 @@ def select_components(
     NoSurfaceError
         The mesh is empty or no component is large enough; the message has the largest.
     """
-    chosen = _choose(mesh, keep_largest, min_volume_ml, seeds, labelled)
+    chosen = _choose(mesh, keep_largest, min_volume_ml, seeds, labelled, among)
     if chosen.keep.all():
         mesh.report.update(chosen.facts)
         return mesh
@@ -113,13 +116,14 @@ def split_components(
     *,
     seeds: Sequence[Sequence[float]] = (),
     labelled: Labelled | None = None,
+    among: NDArray[np.bool_] | None = None,
     most: int | None = None,
 ) -> list[Mesh]:
     """Take a surface apart into its components.
 
     Parameters
     ----------
-    mesh, keep_largest, min_volume_ml, seeds, labelled
+    mesh, keep_largest, min_volume_ml, seeds, labelled, among
         As in `select_components`; components that it would drop are left out.
     most : int, optional
         Refuse more components than this.
@@ -137,7 +141,7 @@ def split_components(
     NoSurfaceError
         As `select_components`.
     """
-    chosen = _choose(mesh, keep_largest, min_volume_ml, seeds, labelled, rank=True)
+    chosen = _choose(mesh, keep_largest, min_volume_ml, seeds, labelled, among, rank=True)
     kept = np.flatnonzero(chosen.keep)
     if most is not None and len(kept) > most:
         raise UsageError(
@@ -172,6 +176,7 @@ def _choose(
     min_volume_ml: float | None,
     seeds: Sequence[Sequence[float]],
     labelled: Labelled | None,
+    among: NDArray[np.bool_] | None = None,
     *,
     rank: bool = False,
 ) -> _Chosen:
@@ -197,16 +202,17 @@ def _choose(
         volumes=min_volume_ml is not None,
     )
     ranked = _rank(areas, rounding_step(mesh.vertices)) if rank or keep_largest is not None else np.arange(count)
-    keep = np.ones(count, dtype=bool)
+    keep = np.ones(count, dtype=bool) if among is None else np.array(among, dtype=bool)
     if min_volume_ml is not None:
         # Rounding moves no vertex further than half a step along each axis, and the volume by no more than the area
         # times that way: a component of exactly the least volume is kept wherever it lies.
         way = 0.5 * math.sqrt(3.0) * rounding_step(mesh.vertices)
-        keep = volumes + way * areas / 1000.0 >= min_volume_ml
+        candidates = keep.copy()
+        keep &= volumes + way * areas / 1000.0 >= min_volume_ml
         if not keep.any():
             raise NoSurfaceError(
-                f"none of the {count} components encloses {min_volume_ml:g} ml: "
-                f"the largest has {volumes.max():.4g} ml, ask for less"
+                f"none of the {np.count_nonzero(candidates)} components encloses {min_volume_ml:g} ml: "
+                f"the largest has {volumes[candidates].max(initial=0.0):.4g} ml, ask for less"
             )
     facts: dict[str, object] = {}
     if len(seeds):

@@ -20,6 +20,7 @@ __all__ = [
     "rule_of_report",
     "smallest_voxel_mm",
     "trilinear_field",
+    "trilinear_values",
 ]
 
 SAMPLES = 100_000
@@ -35,6 +36,7 @@ _REACH_VOXEL = 2.0
 _RAY_STEP_VOXEL = 0.125
 
 _PIECE = 1 << 15
+_CORNERS = [np.array([corner & 1, corner >> 1 & 1, corner >> 2]) for corner in range(8)]
 
 Float64Array = NDArray[np.float64]
 
@@ -80,15 +82,10 @@ def trilinear_field(volume: Volume, rule: IsoRule, ijk: Float64Array) -> tuple[F
     gradient : ndarray, shape (n, 3), float64
         HU a step along i, j, k.
     """
-    size = np.array(volume.shape_ijk)
-    low = -rule.border
-    point = np.clip(ijk, low, size - 1 + rule.border)
-    cell = np.clip(np.floor(point).astype(np.int64), low, np.maximum(size - 2 + rule.border, low))
-    t = point - cell
     value = np.zeros(len(ijk))
     gradient = np.zeros((len(ijk), 3))
-    for corner in range(8):
-        bits = np.array([corner & 1, corner >> 1 & 1, corner >> 2])
+    cell, t = _split_cells(volume, rule, ijk)
+    for bits in _CORNERS:
         weight = np.where(bits, t, 1.0 - t)
         sample = _samples(volume, rule, cell + bits)
         value += sample * weight.prod(axis=1)
@@ -96,6 +93,24 @@ def trilinear_field(volume: Volume, rule: IsoRule, ijk: Float64Array) -> tuple[F
             others = weight[:, (axis + 1) % 3] * weight[:, (axis + 2) % 3]
             gradient[:, axis] += np.where(bits[axis], sample, -sample) * others
     return value, gradient
+
+
+def trilinear_values(volume: Volume, rule: IsoRule, ijk: Float64Array) -> Float64Array:
+    """The values of `trilinear_field` alone, sooner."""
+    value = np.zeros(len(ijk))
+    cell, t = _split_cells(volume, rule, ijk)
+    for bits in _CORNERS:
+        value += _samples(volume, rule, cell + bits) * np.where(bits, t, 1.0 - t).prod(axis=1)
+    return value
+
+
+def _split_cells(volume: Volume, rule: IsoRule, ijk: Float64Array) -> tuple[NDArray[np.int64], Float64Array]:
+    """The lowest corner of the cell of each point, and where in it the point lies."""
+    size = np.array(volume.shape_ijk)
+    low = -rule.border
+    point = np.clip(ijk, low, size - 1 + rule.border)
+    cell = np.clip(np.floor(point).astype(np.int64), low, np.maximum(size - 2 + rule.border, low))
+    return cell, point - cell
 
 
 def _samples(volume: Volume, rule: IsoRule, ijk: NDArray[np.int64]) -> Float64Array:

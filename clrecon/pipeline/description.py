@@ -25,7 +25,7 @@ __all__ = ["describe_job", "describe_part"]
 SKIN_HU = (-950.0, -200.0)
 """Iso values between air and fat: the surface is the skin, and a head's a face."""
 
-_OF_ONE = ("quality", "iso_distance", "refinement", "print")
+_OF_ONE = ("quality", "walls", "iso_distance", "refinement", "print")
 """What stands at the top of the report too where there is one mesh."""
 
 _SAID_ABOVE = ("vertices", "triangles", "closed", "manifold", "components", "area_mm2", "volume_ml", "bounds_mm")
@@ -127,6 +127,7 @@ def describe_job(
         "bounds_mm": _unless_unknown(_around, (mesh["bounds_mm"] for mesh in meshes)),
         "closed_at_border": settings.closed,
         "topology": settings.topology,
+        "keep": settings.keep,
         "keep_largest": settings.keep_largest,
         "min_volume_ml": settings.min_volume_ml,
         "seeds_mm": [[float(value) for value in seed] for seed in settings.seeds],

@@ -57,4 +57,22 @@ def describe_level(
             f"slices are {volume.spacing[2]:.3g} mm apart: walls thinner than that may be lost at"
             f" {choice.iso_value:g} HU; compare with a lower iso value, such as --preset bone"
         )
+    warnings += _warn_of_contrast(choice)
     return {"iso_value_reason": choice.reason, "iso_value_choice": choice.as_dict()}, warnings
+
+
+def _warn_of_contrast(choice: IsoChoice) -> list[str]:
+    from clrecon.geometry.iso_choice import CONTRAST_SAID
+
+    if choice.flat_share is None or choice.flat_share < CONTRAST_SAID:
+        return []
+    share = f"{100.0 * choice.flat_share:.0f} % of the contrast at the edges ends in flat plateaus below 600 HU"
+    if not choice.contrast_medium_share:
+        return [
+            f"{share}: too much to be left out of the choice of {choice.iso_value:g} HU. Where that is contrast medium"
+            " and not a body of one material, the level is not that of bone: give it (--hu N)"
+        ]
+    return [
+        f"{share}, as heart, vessels and organs with contrast medium do. They were left out of the choice of"
+        f" {choice.iso_value:g} HU; what of them is brighter is in the surface: --keep bone keeps what looks like bone"
+    ]

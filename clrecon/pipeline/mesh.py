@@ -8,6 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from clrecon.pipeline.bone import judge_surfaces, warn_of_walls
 from clrecon.pipeline.description import describe_job, describe_part
 from clrecon.pipeline.labels import extract_label_surfaces, judge_label_volumes, open_labels
 from clrecon.pipeline.levels import choose_level
@@ -119,10 +120,11 @@ def make_mesh(
     parts = [
         part
         for surface, mesh in zip(surfaces, extracted, strict=True)
-        for part in select_parts(surface, mesh, settings, device)
+        for part in select_parts(surface, mesh, settings, device, volume)
     ]
     del extracted
     paths = name_outputs(output, [part.name for part in parts], report_path)
+    judge_surfaces(parts, volume, settings)
     watch.lap("select")
 
     if settings.refines:
@@ -151,6 +153,7 @@ def make_mesh(
             report["warnings"].append(
                 f"{leftovers:,} more numbered files of this name lie beside the new ones, from an earlier run"
             )
+        report["warnings"] += warn_of_walls(parts, settings)
         report["gates"] = gates
         report["warnings"] += purpose_warnings + warn_of_gates(gates)
         report["seconds"] = _seconds(watch, origins)

@@ -142,7 +142,7 @@ def extract_surfaces(
     )
 
 
-def select_parts(surface: Surface, mesh: Mesh, settings: MeshSettings, device: Device) -> list[Part]:
+def select_parts(surface: Surface, mesh: Mesh, settings: MeshSettings, device: Device, volume: Volume) -> list[Part]:
     """Keep the components that the settings ask for, and measure what the purpose of the mesh asks for.
 
     Raises
@@ -151,24 +151,24 @@ def select_parts(surface: Surface, mesh: Mesh, settings: MeshSettings, device: D
         As `_select_parts`.
     """
     if settings.purpose is None:
-        return _select_parts(surface, mesh, settings, device)
+        return _select_parts(surface, mesh, settings, device, volume)
     from clrecon.pipeline.purposes import measure_pieces
 
     found = measure_pieces(mesh)
-    parts = _select_parts(surface, mesh, settings, device)
+    parts = _select_parts(surface, mesh, settings, device, volume)
     each = [measure_pieces(part.mesh) for part in parts]
     for part in parts:
         part.pieces = found, {name: sum(kept[name] for kept in each) for name in found}
     return parts
 
 
-def _select_parts(surface: Surface, mesh: Mesh, settings: MeshSettings, device: Device) -> list[Part]:
+def _select_parts(surface: Surface, mesh: Mesh, settings: MeshSettings, device: Device, volume: Volume) -> list[Part]:
     """Keep the components that the settings ask for, together or one by one.
 
     Raises
     ------
     NoSurfaceError
-        No component is large enough.
+        No component is large enough, or none is bone.
     UsageError
         A seed is near no component, or more components are to be written one by one than anyone can want.
     """
@@ -176,6 +176,7 @@ def _select_parts(surface: Surface, mesh: Mesh, settings: MeshSettings, device: 
         return [Part(surface, surface.name, mesh)]
     from clrecon.geometry import frame_from_lps
     from clrecon.mesh import select_components, split_components
+    from clrecon.mesh.connectivity import label_components as find_labels
     from clrecon.operators.components import label_components
 
     limits = (settings.keep_largest, settings.min_volume_ml)
@@ -185,10 +186,17 @@ def _select_parts(surface: Surface, mesh: Mesh, settings: MeshSettings, device: 
         labelled = label_components(device, mesh.triangles, mesh.vertex_count, memory=settings.memory)
     except DeviceMemoryError as error:  # the outcome is the same, it only takes longer
         mesh.report.setdefault("warnings", []).append(f"{error}: they were found without it")
+    among = None
+    if settings.keep == "bone":
+        from clrecon.pipeline.bone import find_bone
+
+        labelled = labelled or find_labels(mesh.triangles, mesh.vertex_count)
+        among = find_bone(mesh, volume, surface, labelled)
     try:
         if not settings.split:
-            return [Part(surface, surface.name, select_components(mesh, *limits, seeds=seeds, labelled=labelled))]
-        pieces = split_components(mesh, *limits, seeds=seeds, labelled=labelled, most=MOST_FILES)
+            kept = select_components(mesh, *limits, seeds=seeds, labelled=labelled, among=among)
+            return [Part(surface, surface.name, kept)]
+        pieces = split_components(mesh, *limits, seeds=seeds, labelled=labelled, among=among, most=MOST_FILES)
     except (NoSurfaceError, UsageError) as error:
         raise type(error)(f"at {surface.describe()}: {error}") from error
     return [Part(surface, _name_piece(surface, place), piece) for place, piece in enumerate(pieces, start=1)]

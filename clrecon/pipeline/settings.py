@@ -57,6 +57,9 @@ class MeshSettings:
         Close the surface where it meets the border of the volume (outside is air).
     topology : {"separated", "trilinear"}
         What is done where the voxels around a cell do not say which of them are joined, see `extract_isosurface`.
+    keep : "bone", optional
+        Keep only the components that look like bone, see `clrecon.mesh.walls`.  With `keep_largest`: of these the
+        largest.
     keep_largest : int, optional
         Keep only this many components, the largest by area.
     min_volume_ml : float, optional
@@ -103,6 +106,7 @@ class MeshSettings:
     space: str = "lps"
     closed: bool = True
     topology: str = "separated"
+    keep: str | None = None
     keep_largest: int | None = None
     min_volume_ml: float | None = None
     seeds: Sequence[Sequence[float]] = ()
@@ -127,6 +131,7 @@ class MeshSettings:
         if self.preset is not None:
             find_preset(self.preset)
         self._check_levels()
+        self._check_keep()
         if self.keep_largest is not None and self.keep_largest < 1:
             raise UsageError(f"the number of components to keep must be 1 or more, not {self.keep_largest}")
         if self.min_volume_ml is not None and not (math.isfinite(self.min_volume_ml) and self.min_volume_ml > 0):
@@ -173,6 +178,16 @@ class MeshSettings:
         if len(self.half_way) != 2:
             raise UsageError(f"half way needs two numbers of HU, bone and tissue, not {tuple(self.half_way)}")
         half_iso_value(*self.half_way)
+
+    def _check_keep(self) -> None:
+        if self.keep is None:
+            return
+        if self.keep != "bone":
+            raise UsageError(f"what is kept can be told for bone, not for {self.keep!r}: keep is bone or left out")
+        if self.labels is not None:
+            raise UsageError("labels say what is kept: leave keep bone out")
+        if self.inside != "above":
+            raise UsageError("bone lies above an iso value: keep bone goes with neither below nor a range")
 
     def _check_below(self) -> None:
         if self.below is None:
@@ -267,4 +282,6 @@ class MeshSettings:
     @property
     def selects(self) -> bool:
         """Whether components are told apart."""
+        if self.keep is not None:
+            return True
         return self.split or bool(self.seeds) or self.keep_largest is not None or self.min_volume_ml is not None

@@ -1,0 +1,203 @@
+"""What a surface is the wall of, told by the HU beneath it: bone, contrast medium, metal.
+
+Bone has a compact wall: within some millimetres under its surface values rise to 600 HU and more somewhere on every
+bone, and they vary from place to place.  Heart and vessels with contrast medium are of one value that stays below, and
+go on with it beneath the surface.  Thin shells of a table reach neither.  Figures are in docs/iso_value.md.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clrecon.errors import UsageError
+from clrecon.geometry import Volume
+from clrecon.geometry.field import IsoRule
+from clrecon.mesh.iso_distance import trilinear_values
+from clrecon.mesh.mesh import Mesh
+
+__all__ = [
+    "MOST_SAMPLES",
+    "Walls",
+    "judge_components",
+    "judge_walls",
+    "lie_near_line",
+    "looks_like_bone",
+    "normals_of",
+    "sample_walls",
+]
+
+COMPACT_HU = 600.0
+"""Compact bone reaches it under its surface; contrast medium in heart and vessels stays below."""
+METAL_HU = 2000.0
+DEPTHS_MM = tuple(0.5 * step for step in range(9))
+"""Along the inward normal."""
+WALL_MM = 3.0
+"""The wall is the highest value up to this depth."""
+FLAT_MM, FLAT_HU = 1.5, 120.0
+"""A wall is flat where it has ended by this depth, and values beyond differ by no more."""
+NEAR_MM = 15.0
+"""Bone has compact walls somewhere within this distance of every place."""
+LEAST_COMPACT = 0.05
+FAINT_HU, FAINT_SPREAD_HU = 500.0, 200.0
+"""Thin bone whose walls are blurred away: the densest places reach this, and stand out from the rest by so much.
+Vessels of 400 HU and table shells have one value, to 140 HU."""
+LEAST_FLAT = 0.05
+MOST_SAMPLES = 8_000
+MOST_COMPONENT_SAMPLES = 500
+FEWEST_VERTICES = 150
+"""A component of fewer is a crumb, and not told."""
+
+
+@dataclass(frozen=True)
+class Walls:
+    """What lies beneath some vertices of a surface; shapes (n,).
+
+    Attributes
+    ----------
+    points : ndarray, shape (n, 3), float64, LPS mm
+    wall : ndarray, HU
+        Highest value up to `WALL_MM` beneath.
+    flat : ndarray, bool
+        Beneath it is of one value, below `COMPACT_HU` and inside all the way to the last depth.
+    """
+
+    points: NDArray[np.float64]
+    wall: NDArray[np.float64]
+    flat: NDArray[np.bool_]
+
+    def where(self, rows: slice) -> Walls:
+        """Those of some of the vertices."""
+        return Walls(self.points[rows], self.wall[rows], self.flat[rows])
+
+
+def sample_walls(vertices: NDArray[np.floating], normals: NDArray[np.floating], volume: Volume, rule: IsoRule) -> Walls:
+    """Look beneath vertices of a surface, along their normals.
+
+    Parameters
+    ----------
+    vertices, normals : ndarray, shape (n, 3)
+        Of a mesh that was extracted from `volume`, LPS mm.
+    volume : Volume
+    rule : IsoRule
+        The mesh was made with it.
+    """
+    points, inward = vertices.astype(np.float64), -normals.astype(np.float64)
+    values = np.empty((len(DEPTHS_MM), len(points)))
+    for value, depth in zip(values, DEPTHS_MM, strict=True):
+        value[:] = trilinear_values(volume, rule, volume.lps_to_ijk(points + depth * inward))
+    depths = np.array(DEPTHS_MM)
+    wall = values[depths <= WALL_MM].max(axis=0)
+    deep = values[depths >= FLAT_MM]
+    low, high = deep.min(axis=0), deep.max(axis=0)
+    return Walls(points, wall, (wall < COMPACT_HU) & (low > rule.iso_level) & (high - low < FLAT_HU))
+
+
+def judge_walls(walls: Walls) -> dict[str, Any]:
+    """What a surface looks like.
+
+    Returns
+    -------
+    dict
+        ``looks_like`` : "bone", "faint bone", "metal", "contrast medium" (or another even body) or "no bone" (a thin
+        shell of a table, noise)
+        ``compact_share`` : of the surface, how much has a wall of `COMPACT_HU` or more
+        ``contrast_share`` : how much is flat beneath and has no compact wall within about `NEAR_MM`
+        ``metal_share`` : how much has a wall above `METAL_HU`
+        ``wall_hu`` : ``{"median", "p90", "p99"}`` of the walls
+        ``samples`` : int, vertices looked at
+    """
+    median, p90, p99 = (float(value) for value in np.percentile(walls.wall, (50, 90, 99)))
+    compact = walls.wall >= COMPACT_HU
+    compact_share = float(compact.mean())
+    contrast_share = float((walls.flat & ~_is_near(walls.points, compact)).mean())
+    metal_share = float((walls.wall > METAL_HU).mean())
+    if metal_share > 0.5:
+        looks_like = "metal"
+    elif compact_share >= LEAST_COMPACT:
+        looks_like = "bone"
+    elif p99 >= FAINT_HU and p99 - median >= FAINT_SPREAD_HU:
+        looks_like = "faint bone"
+    else:
+        looks_like = "contrast medium" if contrast_share >= LEAST_FLAT else "no bone"
+    return {
+        "looks_like": looks_like,
+        "compact_share": round(compact_share, 4),
+        "contrast_share": round(contrast_share, 4),
+        "metal_share": round(metal_share, 4),
+        "wall_hu": {"median": round(median, 1), "p90": round(p90, 1), "p99": round(p99, 1)},
+        "samples": len(walls.wall),
+    }
+
+
+def looks_like_bone(judged: dict[str, Any] | None) -> bool:
+    """The surface is that of bone, faint or not."""
+    return judged is not None and judged["looks_like"] in ("bone", "faint bone")
+
+
+def judge_components(
+    mesh: Mesh, volume: Volume, rule: IsoRule, count: int, label_of_vertex: NDArray[np.int64]
+) -> list[dict[str, Any] | None]:
+    """The same for each component of a surface; None for crumbs of less than `FEWEST_VERTICES`.
+
+    Parameters
+    ----------
+    mesh : Mesh
+        With normals.
+    volume, rule
+        As `sample_walls`.
+    count, label_of_vertex
+        What `clrecon.mesh.connectivity.label_components` returns.
+    """
+    order = np.argsort(label_of_vertex, kind="stable")
+    ends = np.searchsorted(label_of_vertex[order], np.arange(count + 1))
+    sizes = np.diff(ends)
+    told = np.flatnonzero(sizes >= FEWEST_VERTICES)
+    chosen = [order[ends[one] : ends[one + 1] : -(-sizes[one] // MOST_COMPONENT_SAMPLES)] for one in told]
+    judged: list[dict[str, Any] | None] = [None] * count
+    if len(told) == 0:
+        return judged
+    rows = np.concatenate(chosen)
+    walls = sample_walls(mesh.vertices[rows], normals_of(mesh)[rows], volume, rule)
+    first = 0
+    for component, own in zip(told, chosen, strict=True):
+        judged[component] = judge_walls(walls.where(slice(first, first + len(own))))
+        first += len(own)
+    return judged
+
+
+def normals_of(mesh: Mesh) -> NDArray[np.float32]:
+    """The normals of a mesh.
+
+    Raises
+    ------
+    UsageError
+        It has none.
+    """
+    if mesh.normals is None:
+        raise UsageError("walls are looked for along normals: the mesh has none")
+    return mesh.normals
+
+
+def _is_near(points: NDArray[np.float64], marked: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Points with a marked one in their cell of `NEAR_MM` or in one of the 26 around it."""
+    cells = np.floor((points - points.min(axis=0)) / NEAR_MM).astype(np.int64) + 1
+    sizes = cells.max(axis=0) + 2
+    strides = np.array([sizes[1] * sizes[2], sizes[2], 1])
+    near = np.unique(cells[marked] @ strides)
+    for stride in strides:
+        near = np.unique(np.concatenate([near - stride, near, near + stride]))
+    return np.isin(cells @ strides, near)
+
+
+def lie_near_line(points: NDArray[np.floating], line: NDArray[np.float64], distance: float) -> NDArray[np.bool_]:
+    """Which points lie nearer than `distance` to a line through points (n, 3), all in mm."""
+    near = np.zeros(len(points), dtype=bool)
+    for start, end in zip(line[:-1], line[1:], strict=True):
+        way = end - start
+        along = np.clip((points - start) @ way / max(float(way @ way), 1e-12), 0.0, 1.0)
+        near |= np.linalg.norm(points - start - along[:, None] * way, axis=1) < distance
+    return near

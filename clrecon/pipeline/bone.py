@@ -1,0 +1,178 @@
+"""Which components of a surface are bone, and what is said where a surface is not."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+from clrecon.errors import NoSurfaceError, RefusedInputError, UsageError
+from clrecon.pipeline.parts import Part, Surface
+from clrecon.pipeline.settings import MeshSettings
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from clrecon.geometry import Volume
+    from clrecon.mesh import Mesh
+    from clrecon.mesh.components import Labelled
+
+__all__ = ["find_bone", "judge_surfaces", "warn_of_walls"]
+
+LOWEST_BONE_HU = 100.0
+"""Iso values from here on are those of bone: muscle and organs without contrast medium stay below."""
+CONTRAST_SHARE = 0.04
+"""Of a surface of bone, more than this that looks like contrast medium is said: spongy bone gives up to 0.03."""
+NAMES_SHOWN = 5
+SPINE_MM = 20.0
+"""The wall of the spinal canal lies nearer to its middle than this."""
+
+
+def find_bone(mesh: Mesh, volume: Volume, surface: Surface, labelled: Labelled) -> NDArray[np.bool_]:
+    """Which components look like bone or, where none does, which one holds the spinal canal.
+
+    Returns
+    -------
+    ndarray, shape (count,), bool
+
+    Raises
+    ------
+    NoSurfaceError
+        None is bone; the message has the figures of the largest.
+    """
+    import numpy as np
+
+    from clrecon.mesh.iso_distance import rule_of_report
+    from clrecon.mesh.walls import judge_components, looks_like_bone
+
+    rule = rule_of_report(mesh.report)
+    if rule is None:
+        raise UsageError("bone is told from an iso surface of HU only")
+    count, labels = labelled
+    judged = judge_components(mesh, volume, rule, count, labels)
+    bone = np.array([looks_like_bone(one) for one in judged], dtype=bool)
+    if bone.any():
+        return bone
+    bone = _holds_spine(mesh, volume, count, labels)
+    if not bone.any():
+        told = [one for one in judged if one is not None]
+        raise NoSurfaceError(f"at {surface.describe()}: {_describe_none(told, count)}")
+    mesh.report.setdefault("warnings", []).append(
+        f"at {surface.describe()} no component has walls like bone: the one round the spinal canal was kept"
+    )
+    return bone
+
+
+def _describe_none(told: Sequence[dict[str, Any]], count: int) -> str:
+    if not told:
+        return f"nothing that could be bone: {count:,} components, all of them crumbs"
+    largest = max(told, key=lambda one: int(one["samples"]))
+    return (
+        f"nothing here looks like bone: of {count:,} components the largest {_looks(largest)};"
+        " those of bone reach 600 at 5 % and more of it (--keep-largest N keeps by size)"
+    )
+
+
+def _looks(judged: dict[str, Any]) -> str:
+    wall = judged["wall_hu"]
+    like = {"no bone": "no bone", "contrast medium": "contrast medium or another even body"}
+    return (
+        f"looks like {like.get(judged['looks_like'], judged['looks_like'])}: its walls have {wall['median']:.0f} HU,"
+        f" {wall['p99']:.0f} at the densest 1 %, and reach 600 at {100.0 * judged['compact_share']:.1f} %"
+    )
+
+
+def _holds_spine(mesh: Mesh, volume: Volume, count: int, labels: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """The component with the most vertices around the spinal canal, where one is found."""
+    import numpy as np
+
+    from clrecon.geometry.spine_line import find_spine_line
+    from clrecon.mesh.walls import lie_near_line
+
+    found = np.zeros(count, dtype=bool)
+    try:
+        line = find_spine_line(volume).points
+    except RefusedInputError:
+        return found
+    used = np.flatnonzero(labels >= 0)
+    used = used[:: -(-len(used) // 100_000) or 1]
+    near = lie_near_line(mesh.vertices[used], line, SPINE_MM)
+    if near.any():
+        found[np.bincount(labels[used][near], minlength=count).argmax()] = True
+    return found
+
+
+def judge_surfaces(parts: Sequence[Part], volume: Volume, settings: MeshSettings) -> None:
+    """Note in the `facts` of each part what its walls look like: ``walls``, None for what is no surface of bone."""
+    import numpy as np
+
+    from clrecon.mesh.iso_distance import rule_of_report
+    from clrecon.mesh.walls import MOST_SAMPLES, judge_walls, normals_of, sample_walls
+
+    for part in parts:
+        part.facts["walls"] = None
+    lowest = -math.inf if settings.half_way == "auto" else LOWEST_BONE_HU
+    chosen = [part for part in parts if _is_of_bone(part.surface, lowest) and part.mesh.vertex_count]
+    for surface in dict.fromkeys(part.surface for part in chosen):
+        own = [part for part in chosen if part.surface == surface]
+        rule = rule_of_report(own[0].mesh.report)
+        if rule is None:
+            continue
+        step = -(-sum(part.mesh.vertex_count for part in own) // MOST_SAMPLES)
+        vertices = [part.mesh.vertices[::step] for part in own]
+        normals = [normals_of(part.mesh)[::step] for part in own]
+        walls = sample_walls(np.concatenate(vertices), np.concatenate(normals), volume, rule)
+        ends = np.cumsum([0, *map(len, vertices)])
+        for part, first, end in zip(own, ends[:-1], ends[1:], strict=True):
+            part.facts["walls"] = judge_walls(walls.where(slice(first, end)))
+
+
+def _is_of_bone(surface: Surface, lowest: float) -> bool:
+    level = surface.iso_value
+    if surface.label is not None or surface.below or level is None or isinstance(level, tuple):
+        return False
+    return level >= lowest
+
+
+def warn_of_walls(parts: Sequence[Part], settings: MeshSettings) -> list[str]:
+    """What is to be known where a surface that was to be bone is contrast medium, or joined to it."""
+    warnings = []
+    for surface in dict.fromkeys(part.surface for part in parts):
+        own = [part for part in parts if part.surface == surface and part.facts.get("walls")]
+        if settings.split:
+            warnings += _warn_of_pieces(own)
+        elif own:
+            warnings += _warn_of_whole(own[0], settings)
+    return warnings
+
+
+def _warn_of_pieces(parts: Sequence[Part]) -> list[str]:
+    names = [part.name for part in parts if part.facts["walls"]["looks_like"] == "contrast medium"]
+    if not names:
+        return []
+    more = f" and {len(names) - NAMES_SHOWN} more" if len(names) > NAMES_SHOWN else ""
+    shown = ", ".join(names[:NAMES_SHOWN])
+    return [
+        f"not bone but contrast medium or another even body by their walls: {shown}{more} (--keep bone leaves it out)"
+    ]
+
+
+def _warn_of_whole(part: Part, settings: MeshSettings) -> list[str]:
+    from clrecon.mesh.walls import looks_like_bone
+
+    judged = part.facts["walls"]
+    where = f"at {part.surface.describe()} {'what is kept' if settings.selects else 'the surface'}"
+    if not looks_like_bone(judged):
+        meant = settings.keep_largest is not None or settings.half_way == "auto" or settings.preset_used == "bone"
+        if not meant or settings.seeds:
+            return []
+        return [f"{where} {_looks(judged)}; --keep bone keeps what looks like bone"]
+    if judged["contrast_share"] < CONTRAST_SHARE:
+        return []
+    joined = settings.keep == "bone"
+    advice = "a higher iso value parts them" if joined else "--keep bone leaves out what touches no bone"
+    return [
+        f"{where} is in part like heart, vessels or organs with contrast medium (about"
+        f" {100.0 * judged['contrast_share']:.0f} % is even beneath and far from compact bone): {advice}"
+    ]

@@ -1,0 +1,91 @@
+"""Walls of bone, of contrast medium, of metal and of a table are told apart, component by component."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from clrecon.errors import UsageError
+from clrecon.geometry import Volume
+from clrecon.geometry.field import choose_iso_rule
+from clrecon.mesh import Mesh
+from clrecon.mesh.connectivity import label_components
+from clrecon.mesh.walls import Walls, judge_components, judge_walls, looks_like_bone, normals_of, sample_walls
+from clrecon.reference.isosurface import extract_isosurface
+
+AFFINE = np.diag((1.0, 1.0, 1.5, 1.0))
+SHAPE = (24, 40, 48)
+
+
+def make_volume(*bodies, noise=12.0, blur=0.8) -> Volume:
+    """Balls (i, j, k, radius in mm, HU) in tissue of 40 HU, later ones over earlier ones, blurred."""
+    from scipy.ndimage import gaussian_filter
+
+    k, j, i = np.indices(SHAPE)
+    hu = np.full(SHAPE, 40.0)
+    for at_i, at_j, at_k, radius, value in bodies:
+        hu[(i - at_i) ** 2 + (j - at_j) ** 2 + (1.5 * (k - at_k)) ** 2 < radius**2] = value
+    hu = gaussian_filter(hu, blur) + np.random.default_rng(1).normal(0, noise, SHAPE)
+    return Volume(np.rint(hu).astype(np.int16), AFFINE)
+
+
+def judge(volume: Volume, iso_value=200.0) -> list:
+    """What each component looks like, the largest first."""
+    vertices, normals, triangles = extract_isosurface(volume, iso_value)
+    mesh = Mesh(vertices, triangles, normals.astype(np.float32))
+    count, labels = label_components(mesh.triangles, mesh.vertex_count)
+    judged = judge_components(mesh, volume, choose_iso_rule(volume, iso_value), count, labels)
+    order = np.argsort(-np.bincount(labels), kind="stable")
+    return [judged[component] for component in order]
+
+
+BONE = ((12, 12, 12, 9, 900), (12, 12, 12, 6.5, 120))
+VESSEL = ((34, 20, 12, 11, 380),)
+
+
+@pytest.mark.parametrize(
+    ("bodies", "looks_like"),
+    [
+        (BONE, "bone"),
+        (((20, 20, 12, 10, 1400),), "bone"),  # compact all through
+        (VESSEL, "contrast medium"),
+        (((20, 20, 12, 10, 3000),), "metal"),
+        (((20, 20, 12, 13, 450), (20, 20, 12, 10, -900)), "no bone"),  # the shell of a table
+        (((20, 20, 12, 12, 260), (20, 9, 12, 1.9, 800), (24, 30, 12, 1.9, 800)), "faint bone"),
+    ],
+)
+def test_what_a_wall_looks_like(bodies, looks_like):
+    found = judge(make_volume(*bodies))[0]
+    assert found["looks_like"] == looks_like
+    assert looks_like_bone(found) == ("bone" in looks_like and looks_like != "no bone")
+
+
+def test_components_are_told_apart_and_crumbs_are_not():
+    vessel, bone, marrow, *crumbs = judge(make_volume(*BONE, *VESSEL, (4, 36, 4, 2.0, 1400)))
+    assert [one["looks_like"] for one in (vessel, bone, marrow)] == ["contrast medium", "bone", "bone"]
+    assert crumbs == [None]
+    assert (vessel["compact_share"], bone["contrast_share"]) == (0.0, 0.0)
+    assert bone["compact_share"] > 0.5
+    assert vessel["contrast_share"] > 0.5
+    assert bone["wall_hu"]["median"] > 500.0 > 420.0 > vessel["wall_hu"]["p99"]
+
+
+def test_a_vessel_that_is_joined_to_bone_is_a_share_of_it():
+    along = np.linspace(0.0, 100.0, 501)
+    points = np.column_stack([along, np.zeros((501, 2))])
+    bone = along < 40.0
+    found = judge_walls(Walls(points, np.where(bone, 900.0, 350.0), ~bone))
+    assert (found["looks_like"], found["compact_share"]) == ("bone", pytest.approx(0.4, abs=0.01))
+    assert found["contrast_share"] == pytest.approx(0.4, abs=0.05)  # up to 60 mm bone is near
+
+
+def test_walls_are_looked_for_along_normals():
+    volume = make_volume(*VESSEL)
+    vertices, normals, triangles = extract_isosurface(volume, 200.0)
+    walls = sample_walls(vertices, normals, volume, choose_iso_rule(volume, 200.0))
+    outside = sample_walls(vertices, -normals, volume, choose_iso_rule(volume, 200.0))
+    assert walls.flat.mean() > 0.8
+    assert not outside.flat.any()
+    assert judge_walls(outside)["wall_hu"]["median"] < 260.0
+    with pytest.raises(UsageError, match="the mesh has none"):
+        normals_of(Mesh(vertices, triangles))
