@@ -30,10 +30,8 @@ _STEPS = 12
 _ON_THE_SURFACE = 1e-3
 """mm by which a last step may still move a point that counts as found."""
 
-_REACH_VOXEL = 2.0
-"""How far from a point the surface is looked for along rays, where steps along the gradient have not led to it."""
-
-_RAY_STEP_VOXEL = 0.125
+_LINE_STEPS = 16
+"""Parts of the way to a voxel on the other side of the level."""
 
 _PIECE = 1 << 15
 _CORNERS = [np.array([corner & 1, corner >> 1 & 1, corner >> 2]) for corner in range(8)]
@@ -129,8 +127,8 @@ def distances_to_iso_surface(volume: Volume, rule: IsoRule, points: Float64Array
 
     The surface of a range is that of both its ends: the nearer one counts.
 
-    Where the field is flat, or steps across a crease go to and fro, the surface is looked for along 26 rays.
-    A step is residual over gradient, at most half a voxel long, in mm through the affine of the slice, so that
+    Where the field is flat, or steps across a crease go to and fro, the surface is looked for on the way to the voxels
+    around.  A step is residual over gradient, at most half a voxel long, in mm through the affine of the slice, so that
     sheared and unevenly spaced stacks are right too.  The answer is the way to a point of the surface: never less
     than the distance itself, and equal to it where the surface is smooth.
 
@@ -144,11 +142,14 @@ def distances_to_iso_surface(volume: Volume, rule: IsoRule, points: Float64Array
     Returns
     -------
     ndarray, shape (n,), float64, mm
-        NaN where no surface was found: neither along the gradient nor within two voxels along rays.
+        NaN where no surface was found: neither along the gradient nor on the way to the voxels around.
     """
     distances = _distances_to_level(volume, rule, rule.iso_level, points)
     for level in rule.levels[1:]:
         distances = np.fmin(distances, _distances_to_level(volume, rule, level, points))
+    lost = np.flatnonzero(np.isnan(distances))
+    for level in rule.levels:
+        distances[lost] = np.fmin(distances[lost], _distances_along_lines(volume, rule, level, points[lost]))
     return distances
 
 
@@ -177,35 +178,36 @@ def _distances_to_level(volume: Volume, rule: IsoRule, level: float, points: Flo
             going = going[~there]
             if len(going) == 0:
                 break
-    lost = np.flatnonzero(np.isnan(distances))
-    distances[lost] = _distances_along_rays(volume, rule, points[lost])
     return distances
 
 
-def _distances_along_rays(volume: Volume, rule: IsoRule, points: Float64Array) -> Float64Array:
-    """Way to the nearest place, along one of 26 rays through the grid, where the field goes through the level.
+def _distances_along_lines(volume: Volume, rule: IsoRule, level: float, points: Float64Array) -> Float64Array:
+    """Way to the level along straight lines to the voxels around; NaN where these lie on the same side as the point.
 
-    A ray is `_REACH_VOXEL` steps long, along each axis that it follows.  NaN where none meets the level.
+    A trilinear field has its extremes at the corners of the cells: where the level runs through the cell of a point or
+    one beside it, one of the 64 voxels around lies on the other side, and the line to it meets the level.
     """
-    rays = np.array([[i, j, k] for i in (-1, 0, 1) for j in (-1, 0, 1) for k in (-1, 0, 1) if i or j or k], float)
-    ways = _RAY_STEP_VOXEL * np.arange(1, round(_REACH_VOXEL / _RAY_STEP_VOXEL) + 1)
+    corners = np.array([[i, j, k] for i in range(-1, 3) for j in range(-1, 3) for k in range(-1, 3)], float)
     distances = np.full(len(points), np.nan)
-    for where in chunks(len(points), 256):
-        start = volume.lps_to_ijk(points[where])[:, None]
+    for where in chunks(len(points), 1024):
+        start = volume.lps_to_ijk(points[where])
+        nearest = np.full(len(start), np.inf)
 
         def above(ijk: Float64Array) -> Float64Array:
             value, _ = trilinear_field(volume, rule, ijk.reshape(-1, 3))
-            return (value - rule.iso_level).reshape(ijk.shape[:-1])
+            return (value - level).reshape(ijk.shape[:-1])
 
-        nearest = np.full(len(start), np.inf)
-        before, way_before = np.repeat(above(start), len(rays), axis=1), 0.0
-        for way in ways:
-            after = above(start + way * rays)
-            row, ray = np.nonzero((before >= 0.0) != (after >= 0.0))
-            share = before[row, ray] / (before[row, ray] - after[row, ray])
-            met = start[row, 0] + (way_before + share * (way - way_before))[:, None] * rays[ray]
-            length = np.linalg.norm(volume.ijk_to_lps(met) - points[where][row], axis=1)
-            np.minimum.at(nearest, row, length)
+        ends = np.floor(start)[:, None] + corners
+        here = above(start)
+        row, corner = np.nonzero((above(ends) >= 0.0) != (here >= 0.0)[:, None])
+        line = ends[row, corner] - start[row]
+        before, way_before = here[row], 0.0
+        for way in np.arange(1, _LINE_STEPS + 1) / _LINE_STEPS:
+            after = above(start[row] + way * line)
+            met = np.flatnonzero((before >= 0.0) != (after >= 0.0))
+            share = before[met] / (before[met] - after[met])
+            ijk = start[row[met]] + (way_before + share * (way - way_before))[:, None] * line[met]
+            np.minimum.at(nearest, row[met], np.linalg.norm(volume.ijk_to_lps(ijk) - points[where][row[met]], axis=1))
             before, way_before = after, way
         distances[where] = np.where(np.isfinite(nearest), nearest, np.nan)
     return distances
