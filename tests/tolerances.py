@@ -123,6 +123,7 @@ RAY_SILHOUETTE_VOXEL = 0.08  # a ball of 5 to 10 voxels sags by h^2 / 8 R = 1/40
 RAY_DEPTH_VOXEL = 0.1  # the bar; measured 0.053 on balls, where the field between voxels sags
 RAY_DISC_AREA = 0.005  # pixels of a disc of 20 on a grid: measured 0.001
 RAY_RESAMPLED_255 = 4  # two samplings of one smooth field, 1.9 mm at most: measured 3
+RAY_STEP_LIKENESS = 0.99  # SSIM of pictures by the default step and by one ten times finer: the bar
 RAY_SAME_255 = 1  # rounding to 8 bits the other way
 LABEL_COLOR_255 = 6  # straight colours are premultiplied ones of 8 bits over opacities of some tens; measured 3
 RAY_OUTLINE_SHARE = 0.02  # of pixels: at outlines triangles and the trilinear field between voxels are hit or missed

@@ -4,11 +4,14 @@
  * models for direct volume rendering" (opacity of a segment).  Empty space is leapt over with a map of Chebyshev
  * distances (Cohen and Sheffer 1994, "Proximity clouds") and of what lies ahead.
  *
+ * Where the transfer function is steep, segments are taken in parts, see steep_segments.h.
+ *
  * A work-item has a packet of LANES neighbouring rays that go on together, sample by sample: they leap as far as all of
  * them may, and what they do next is decided once for all of them.
  *
  * -D UNEVEN             slices at places of their own
  * -D GRADIENT_OPACITY   opacity times a function of the gradient's magnitude
+ * -D TAKES_PARTS=1      steep segments in parts; steps are so short that values are nearly linear between samples
  * -D LABELS             labels with colours and opacities */
 #include "include/field.h"
 #include "include/inner_samples.h"
@@ -20,8 +23,8 @@
 #include "include/ray_packet.h"
 #include "include/stack.h"
 #include "include/view.h"
+#include "render/steep_segments.h"
 
-#define NODES 4096 /* of the transfer function's table */
 #define GRADIENT_NODES 256 /* of the table of factors by magnitude */
 #define OPAQUE 0.99f /* nothing behind can be seen */
 #define FIRST_SEEN (1.0f / 255.0f) /* opacity that makes a first hit */
@@ -33,35 +36,6 @@
 typedef struct {
     floats red, green, blue, opacity, first_hit, sum;
 } sights;
-
-/* Rays in samples: number n is at t = t_in + (n + phase) * ray_step.  The last segment, number `last`, is what is left
- * of the way: its length is `rest`, and its sample has the number `last_number`, a fraction. */
-typedef struct {
-    floats t_in, phase, offset, last, last_number, rest;
-    floats begin, end; /* samples that can show */
-    floats toward_x, toward_y, toward_z; /* unit direction, LPS */
-    float inner_begin, inner_end; /* samples of which all rays have every voxel that they need, see find_opacity() */
-} packet;
-
-/* Transfer function and light. */
-typedef struct {
-    __global const int *colors; /* blue, green, red, 10 bits each */
-    __global const float *opacities; /* over one ray step */
-    __global const float *highlights;
-    __global const float *factors; /* on the opacity, by magnitude of the gradient */
-    __global const float4 *view;
-    float low, scale; /* nearest node to a value v: (v - low) * scale + 0.5 */
-    float factor_scale; /* entry of a magnitude m, a fraction: m * factor_scale */
-    float steps_per_unit; /* ray steps in the unit distance */
-    float ray_step;
-    float slab_low, slab_high; /* samples with slab_low <= k < slab_high are this slab's */
-    int first_shown, last_shown; /* nodes with opacity lie between */
-    int shaded;
-#ifdef LABELS
-    __global const LABEL *labels;
-    __global const float4 *label_colors;
-#endif
-} looks;
 
 #ifdef LABELS
 #define LABEL_PARAMETERS , __global const LABEL *restrict labels, __global const float4 *restrict label_colors
@@ -90,44 +64,28 @@ static inline floats weigh_opacity(const looks *look, const floats opacity, cons
     return stretch_opacity(factor * whole, (floats)(1.0f / look->steps_per_unit));
 }
 
-/* Indices of sample n of each ray; `inner` as in find_opacity(). */
-static inline void find_places(const slice_stack *stack, const ray_lanes *course, const packet *rays, const float n,
-    const int inner, floats *i, floats *j, floats *k)
-{
-    const floats number = inner ? (floats)(n) : lesser((floats)(n), rays->last_number);
-    *i = course->start_i + number * course->stride_i;
-    *j = course->start_j + number * course->stride_j;
-    *k = course->start_k + number * course->stride_k;
-    to_indices(stack, i, j, k);
-}
-
-/* Node of the transfer function of sample n of each ray; `inner` as in find_opacity(). */
-static inline ints find_node(const field *f, const slice_stack *stack, const looks *look, const ray_lanes *course,
-    const packet *rays, const float n, const int inner)
-{
-    floats i, j, k;
-    find_places(stack, course, rays, n, inner, &i, &j, &k);
-    const floats place = (sample_lanes(f, i, j, k, inner) - look->low) * look->scale + 0.5f;
-    return to_ints(lesser(greater(place, (floats)(0.0f)), (floats)(NODES - 1)));
-}
-
-/* Opacity over one ray step of sample n of each ray; 0 for samples that do not count.  With `inner` they all count, lie
- * within the volume with all voxels that they need, and are not the last of their rays. */
+/* Opacity over one ray step of segment n of each ray, which is seen at `number`; 0 for segments that do not count.  With
+ * `inner` they all count, lie within the volume with all voxels that they need, and are not the last of their rays. */
 static inline floats find_opacity(const field *f, const slice_stack *stack, const looks *look, const ray_lanes *course,
-    const packet *rays, const float n, const int inner, const ints node)
+    const packet *rays, const float n, const int inner, const ints counts, const segment_values *v, floats *number,
+    floats *value)
 {
-    floats i, j, k;
-    find_places(stack, course, rays, n, inner, &i, &j, &k);
-    floats opacity = (floats)(GATHER(float, look->opacities, node));
+    floats i, j, k, shift;
+    floats opacity = find_steep_opacity(
+        look, v, counts, (floats)(GATHER(float, look->opacities, find_node(v->here))), &shift, value);
+    *number = n + shift;
     if (!inner) {
-        ints counts = (k >= look->slab_low) & (k < look->slab_high) & (n >= rays->begin);
+        find_places(stack, course, rays, (floats)(n), 0, &i, &j, &k);
+        *number = choose(rays->last == n, rays->last_number + shift * (rays->rest / look->ray_step), *number);
+        ints within = (k >= look->slab_low) & (k < look->slab_high) & (n >= rays->begin);
 #ifdef UNEVEN
-        counts &= (i >= -0.5f) & (i <= f->last.x + 0.5f) & (j >= -0.5f) & (j <= f->last.y + 0.5f);
+        within &= (i >= -0.5f) & (i <= f->last.x + 0.5f) & (j >= -0.5f) & (j <= f->last.y + 0.5f);
 #endif
-        opacity = choose(counts, opacity, (floats)(0.0f));
+        opacity = choose(within, opacity, (floats)(0.0f));
     }
 #ifdef LABELS
     if (ANY_LANE(opacity > 0.0f)) {
+        find_places(stack, course, rays, *number, 1, &i, &j, &k);
         const floats factor = LABEL_CHANNEL(look->label_colors, find_labels(look->labels, f, i, j, k), 3);
         if (ANY_LANE((factor < 1.0f) & (opacity > 0.0f)))
             opacity = choose(factor < 1.0f, weigh_opacity(look, opacity, factor), opacity);
@@ -136,12 +94,13 @@ static inline floats find_opacity(const field *f, const slice_stack *stack, cons
     return opacity;
 }
 
-/* Blend sample n of every ray that it shows of. */
+/* Blend segment n of every ray that it shows of: seen at `number`, with this value and opacity there. */
 static inline void blend_samples(const field *f, const slice_stack *stack, const looks *look, const ray_lanes *course,
-    const packet *rays, const float n, const int inner, const ints node, floats opacity, sights *seen)
+    const packet *rays, const float n, const int inner, const floats number, const floats value, floats opacity,
+    sights *seen)
 {
     floats i, j, k;
-    find_places(stack, course, rays, n, inner, &i, &j, &k);
+    find_places(stack, course, rays, number, 1, &i, &j, &k);
     floats share = 1.0f, highlight = 0.0f;
     if (look->shaded || IS_WEIGHED) {
         slopes s;
@@ -160,21 +119,21 @@ static inline void blend_samples(const field *f, const slice_stack *stack, const
             find_light(look->view, look->highlights, x, y, z, rays->toward_x, rays->toward_y, rays->toward_z, &share,
                 &highlight);
     }
-    const floats t = rays->t_in + (lesser((floats)(n), rays->last_number) + rays->phase) * look->ray_step;
+    const floats t = rays->t_in + (number + rays->phase) * look->ray_step;
     const ints cut = (rays->last == n) & (opacity > 0.0f);
     if (ANY_LANE(cut))
         opacity = choose(cut, stretch_opacity(opacity, rays->rest / look->ray_step), opacity);
-    const ints color = (ints)(GATHER(int, look->colors, node));
+    const ints color = (ints)(GATHER(int, look->colors, find_node(value)));
     const floats unit = 1.0f / 1023.0f;
     floats red = to_floats(color >> 20) * unit, green = to_floats((color >> 10) & 1023) * unit;
     floats blue = to_floats(color & 1023) * unit;
 #ifdef LABELS
-    const ints number = find_labels(look->labels, f, i, j, k);
-    const floats label_red = LABEL_CHANNEL(look->label_colors, number, 0);
+    const ints label = find_labels(look->labels, f, i, j, k);
+    const floats label_red = LABEL_CHANNEL(look->label_colors, label, 0);
     const floats tinted = choose(label_red < 0.0f, (floats)(0.0f), (floats)(LABEL_TINT));
     red += tinted * (label_red - red);
-    green += tinted * (LABEL_CHANNEL(look->label_colors, number, 1) - green);
-    blue += tinted * (LABEL_CHANNEL(look->label_colors, number, 2) - blue);
+    green += tinted * (LABEL_CHANNEL(look->label_colors, label, 1) - green);
+    blue += tinted * (LABEL_CHANNEL(look->label_colors, label, 2) - blue);
 #endif
     const floats weight = (1.0f - seen->opacity) * opacity;
     seen->red += weight * lesser(red * share + highlight, (floats)(1.0f));
@@ -214,8 +173,9 @@ static inline void start_rays(const field *f, const looks *look, const int2 firs
     rays->last_number = rays->last - rays->phase * (1.0f - rays->rest / ray_step);
     const floats enter = greater(way.focus_in, (floats)(entry));
     const ints some = (x < (float)size.x) & (y < (float)size.y) & (segments > 0.0f) & (way.focus_out > enter);
-    const floats begin = round_up(greater((enter - way.t_in) / ray_step - rays->phase, (floats)(0.0f))) - 1.0f;
-    const floats end = round_up((way.focus_out - way.t_in) / ray_step - rays->phase) + 1.0f;
+    /* The segments around the first and the last place that can show, and one more for rounding. */
+    const floats begin = round_up(greater((enter - way.t_in) / ray_step - rays->phase, (floats)(0.0f))) - 2.0f;
+    const floats end = round_up((way.focus_out - way.t_in) / ray_step - rays->phase) + 2.0f;
     rays->begin = choose(some, greater(begin, (floats)(0.0f)), (floats)(MAXFLOAT));
     rays->end = choose(some, lesser(end, segments), (floats)(0.0f));
     find_inner(f, &way, way.t_in + rays->phase * ray_step, (floats)(ray_step), rays->last, look->slab_low,
@@ -250,7 +210,7 @@ static inline void load_sights(__global const float4 *states, const int2 first_p
 
 /* Parameters  voxels   in   (slices, nj, ni)
  *             ways     in   (bk, bj, bi) how far nothing shows, see include/look_ahead.h
- *             colors opacities factors  in  (NODES), (NODES), (GRADIENT_NODES) see looks
+ *             colors opacities clears changes factors  in  (NODES) each, (GRADIENT_NODES), see looks
  *             highlights in (HIGHLIGHTS) see include/phong.h
  *             entries  in   (tile rows, tile columns) t before which nothing shows, MAXFLOAT: nothing does
  *             view     in   see include/view.h
@@ -262,7 +222,9 @@ static inline void load_sights(__global const float4 *states, const int2 first_p
  *             ni nj    of the buffer; first_k end_k: slices in the buffer; slab_low slab_high: samples with
  *                      slab_low <= k < slab_high are this slab's
  *             bi bj bk bricks, cells_k of each along k
- *             low scale first_shown last_shown factor_scale steps_per_unit  see looks
+ *             has_dense  whether a step has more opacity than DENSE anywhere
+ *             one_sided  whether all nodes that show something are the first ones, or the last ones
+ *             low scale first_shown last_shown narrow factor_scale steps_per_unit  see looks
  *             main_axis ahead eye aside   see main_way
  *             jitter   samples at random places of their segments
  *             stage    FIRST_SLAB and LAST_SLAB, see include/view.h
@@ -273,13 +235,15 @@ static inline void load_sights(__global const float4 *states, const int2 first_p
 __kernel void composite_rays(
     __global const VOXEL *restrict voxels, __global const uchar *restrict ways,
     __global const int *restrict colors, __global const float *restrict opacities,
+    __global const float *restrict clears, __global const float *restrict changes,
     __global const float *restrict factors, __global const float *restrict highlights,
     __global const float *restrict entries, __global const float4 *restrict view,
     __global float4 *restrict states, __global uchar4 *restrict image,
     __global float *restrict depths, __global float *restrict means, const float4 background, const float4 last_place,
     const float4 slope, const int ni, const int nj, const int first_k, const int end_k, const float slab_low,
     const float slab_high, const int bi, const int bj, const int bk, const int cells_k, const float low,
-    const float scale, const int first_shown, const int last_shown, const float factor_scale,
+    const float scale, const int first_shown, const int last_shown, const float narrow,
+    const int has_dense, const int one_sided, const float factor_scale,
     const float steps_per_unit, const uint width, const uint height, const uint planes, const int perspective,
     const int shaded, const int jitter, const int stage, const uint queues, const int main_axis, const int ahead,
     const float4 eye, const float aside
@@ -291,8 +255,12 @@ __kernel void composite_rays(
     const main_way way = { main_axis, ahead, eye, aside };
     const slice_stack stack = STACK_TABLE;
     const float ray_step = view[VIEW_NEAR].y;
-    const looks look = { colors, opacities, highlights, factors, view, low, scale, factor_scale, steps_per_unit,
-        ray_step, slab_low, slab_high, first_shown, last_shown, shaded,
+    /* Values beyond the first and the last node count as these. */
+    const float first_value = first_shown > 0 ? (float)first_shown : -MAXFLOAT;
+    const float last_value = last_shown < NODES - 1 ? (float)last_shown + 1.0f : MAXFLOAT;
+    const looks look = { colors, opacities, clears, changes, narrow, highlights, factors, view, low, scale, factor_scale, steps_per_unit,
+        ray_step, slab_low, slab_high, first_value,
+        last_value, shaded,
 #ifdef LABELS
         labels, label_colors
 #endif
@@ -323,7 +291,8 @@ __kernel void composite_rays(
         load_sights(states, pixel_of_first, size, &seen);
     float n = LEAST_LANE(rays.begin);
     floats end = choose(seen.opacity < OPAQUE, rays.end, (floats)(0.0f));
-    int shows = 0; /* the sample before: then the next one probably does too */
+    floats before = 0.0f, here = 0.0f; /* values of samples n - 1 and n, where `goes_on` */
+    int goes_on = 0, shows = 0; /* the samples before: then the next ones probably do too */
     while (ANY_LANE(n < end)) {
         if (!shows) {
             /* The last sample of a ray lies before its place in the row. */
@@ -339,12 +308,30 @@ __kernel void composite_rays(
                 const float least = LEAST_LANE(choose(n < end, leap, (floats)(MAXFLOAT)));
                 const int whole = (int)least;
                 n += (float)max(whole + ((float)whole < least), 1);
+                goes_on = 0;
                 continue;
             }
         }
+        if (!goes_on) {
+            int inner = HAS_INNER && n >= rays.inner_begin && n + 1.0f <= rays.inner_end;
+            here = find_value(&f, &stack, &look, &course, &rays, (floats)(n), inner);
+            /* The segment of the sample before reaches half way to this one.  Where one side of the values shows, and
+             * this one does not, that segment shows nothing either. */
+            if (TAKES_PARTS && !(one_sided && !ANY_LANE((here >= look.first_value) & (here < look.last_value)))) {
+                n = max(n - 1.0f, 0.0f);
+                inner = HAS_INNER && n - 1.0f >= rays.inner_begin && n + 1.0f <= rays.inner_end;
+                const floats place = n > 0.0f ? (floats)(n - 1.0f) : -lesser(rays.phase, (floats)(0.5f));
+                here = find_value(&f, &stack, &look, &course, &rays, (floats)(n), inner);
+                before = find_value(&f, &stack, &look, &course, &rays, place, inner);
+                before = n > 0.0f ? before : before + (before - here);
+            } else {
+                before = here;
+            }
+            goes_on = 1;
+        }
         for (int part = 0; part < SAMPLES_A_LOOK && ANY_LANE(n < end); part += AT_ONCE) {
-            ints node[AT_ONCE], may_show = 0;
-            const int inner = HAS_INNER && n >= rays.inner_begin && n + (float)AT_ONCE <= rays.inner_end;
+            floats value[AT_ONCE + 2];
+            const int inner = HAS_INNER && n - 1.0f >= rays.inner_begin && n + (float)(AT_ONCE + 1) <= rays.inner_end;
 #if HAS_INNER
             const float early = n + SAMPLES_AHEAD;
             if (inner && early < rays.inner_end)
@@ -352,22 +339,38 @@ __kernel void composite_rays(
                     course.start_j.s0 + early * course.stride_j.s0, course.start_k.s0 + early * course.stride_k.s0);
 #endif
             /* Whether one of some samples may show is decided once: their loads need not wait for each other. */
+            value[0] = before;
+            value[1] = here;
+            floats least = lesser(before, here), most = greater(before, here), widest = fabs(here - before);
 #if LANES == 1
 #pragma unroll
 #endif
-            for (int sample = 0; sample < AT_ONCE; ++sample) {
-                node[sample] = find_node(&f, &stack, &look, &course, &rays, n + (float)sample, inner);
-                may_show |= (node[sample] >= first_shown) & (node[sample] <= last_shown);
+            for (int sample = 2; sample < AT_ONCE + 2; ++sample) {
+                value[sample] = find_value(
+                    &f, &stack, &look, &course, &rays, (floats)(n + (float)(sample - 1)), inner);
+                least = lesser(least, value[sample]);
+                most = greater(most, value[sample]);
+                widest = greater(widest, fabs(value[sample] - value[sample - 1]));
             }
-            shows = ANY_LANE(may_show & (n < end));
+            before = value[AT_ONCE];
+            here = value[AT_ONCE + 1];
+            shows = ANY_LANE((most >= look.first_value) & (least < look.last_value) & (n < end));
+            const int may_be_steep = TAKES_PARTS && (has_dense || ANY_LANE(widest > narrow));
             if (shows) {
                 for (int sample = 0; sample < AT_ONCE; ++sample) {
-                    const float number = n + (float)sample;
-                    const floats opacity = find_opacity(&f, &stack, &look, &course, &rays, number, inner, node[sample]);
-                    const floats seen_here = choose(number < end, opacity, (floats)(0.0f));
+                    const float segment = n + (float)sample;
+                    const ints counts = segment < end;
+                    if (!ANY_LANE(counts))
+                        break;
+                    const segment_values v = { value[sample], value[sample + 1], value[sample + 2],
+                        segment > 0.0f ? 2.0f : 1.0f, may_be_steep };
+                    floats number, seen_value;
+                    const floats opacity = find_opacity(
+                        &f, &stack, &look, &course, &rays, segment, inner, counts, &v, &number, &seen_value);
+                    const floats seen_here = choose(counts, opacity, (floats)(0.0f));
                     if (ANY_LANE(seen_here > 0.0f)) {
-                        blend_samples(
-                            &f, &stack, &look, &course, &rays, number, inner, node[sample], seen_here, &seen);
+                        blend_samples(&f, &stack, &look, &course, &rays, segment, inner, number, seen_value, seen_here,
+                            &seen);
                         end = choose(seen.opacity < OPAQUE, end, (floats)(0.0f));
                     }
                 }

@@ -46,6 +46,8 @@ __all__ = [
     "layer_margins",
     "layer_normal_matrices",
     "slice_normal_matrices",
+    "takes_parts",
+    "takes_parts",
     "vertex_margin",
 ]
 
@@ -419,6 +421,15 @@ def layer_normal_matrices(volume: Volume, border: int) -> NDArray[np.float64]:
         The last is the layer beyond the last slice.
     """
     return _normal_matrices(volume, border, np.diff(volume.slice_origins(border + 1), axis=0)[1:])
+
+
+def takes_parts(volume: Volume, ray_step: float) -> bool:
+    """True where steps of `ray_step` mm go from cell to cell and leave none out: no index changes by more than 1.
+
+    Between such samples values are nearly linear, so that a volume rendering may take their segments in parts.
+    """
+    steps_per_mm = np.linalg.norm(layer_normal_matrices(volume, border=0), axis=1)
+    return bool(ray_step * steps_per_mm.max() <= 1.0)
 
 
 def _normal_matrices(volume: Volume, border: int, k_steps: NDArray[np.float64]) -> NDArray[np.float64]:

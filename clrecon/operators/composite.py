@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.geometry.camera import Camera
+from clrecon.geometry.field import takes_parts
 from clrecon.kernels import Stopwatch, allocate, launch, upload
 from clrecon.labels.resample import ResampledLabels
 from clrecon.opencl import Device
@@ -19,6 +20,7 @@ from clrecon.operators.resident import FARTHEST, LeapMap, RaySlab, ResidentVolum
 from clrecon.operators.voxel_types import label_variants
 from clrecon.rendering import Lighting, TransferFunction
 from clrecon.rendering.label_style import LabelStyle
+from clrecon.rendering.steepness import PARTS, Steepness
 
 __all__ = ["NODES", "TransferTables", "composite_slab"]
 
@@ -45,7 +47,13 @@ class TransferTables:
         Red, green and blue, 10 bits each.
     opacities_d : buffer, (NODES,) float32
         Over one ray step.
+    clears_d : buffer, (NODES,) float32
+        What one of `PARTS` parts of it lets through.
+    changes_d : buffer, (NODES,) float32
+        How much the opacity over one ray step changes up to each node, up or down.
     shown : ndarray, shape (NODES,), bool
+    steepness : Steepness
+        Of `opacities_d`.
     low, scale : float
         Nearest node to v: ``floor((v - low) * scale + 0.5)``.
     factors_d : buffer, (GRADIENT_NODES,) float32
@@ -56,10 +64,13 @@ class TransferTables:
 
     colors_d: Any
     opacities_d: Any
+    clears_d: Any
+    changes_d: Any
     factors_d: Any
     shown: NDArray[np.bool_]
     low: float
     scale: float
+    steepness: Steepness
     factor_scale: float
     steps_per_unit: float
     weighed: bool
@@ -69,6 +80,11 @@ class TransferTables:
         """First and last node with opacity; (NODES, -1) without one."""
         shown = np.flatnonzero(self.shown)
         return (np.int32(shown[0]), np.int32(shown[-1])) if len(shown) else (np.int32(NODES), np.int32(-1))
+
+    @property
+    def is_one_sided(self) -> bool:
+        """True where all nodes that show something are the first ones, or the last ones."""
+        return int(np.count_nonzero(np.diff(self.shown.astype(np.int8)))) <= 1
 
     @classmethod
     def of(cls, device: Device, function: TransferFunction, ray_step: float) -> TransferTables:
@@ -81,6 +97,9 @@ class TransferTables:
         red, green, blue = np.rint(1023.0 * table[:, :3].T).astype(np.int32)
         colors = red << 20 | green << 10 | blue
         opacities = (-np.expm1(let_through * np.log(2.0))).astype(np.float32)
+        clears = np.exp2(let_through / PARTS).astype(np.float32)
+        scale = (NODES - 1) / (high - low)
+        steepness = Steepness.of(opacities, scale)
         shown = opacities > 0.0
         factors = np.ones(GRADIENT_NODES, np.float32)
         top = 1.0
@@ -88,8 +107,9 @@ class TransferTables:
             top = max(float(function.gradient_opacity[-1, 0]), 1.0)
             factors = function.gradient_table(top, GRADIENT_NODES)
         return cls(
-            upload(device, colors), upload(device, opacities), upload(device, factors), shown, low,
-            (NODES - 1) / (high - low), (GRADIENT_NODES - 1) / top, function.unit_distance / ray_step,
+            upload(device, colors), upload(device, opacities), upload(device, clears),
+            upload(device, steepness.changes.astype(np.float32)), upload(device, factors), shown, low,
+            scale, steepness, (GRADIENT_NODES - 1) / top, function.unit_distance / ray_step,
             function.gradient_opacity is not None,
         )  # fmt: skip
 
@@ -165,6 +185,8 @@ def composite_slab(
     """
     device = resident.device
     variants = {"GRADIENT_OPACITY": "1"} if tables.weighed else {}
+    if tables.steepness.is_steep and takes_parts(resident.volume, view.ray_step):
+        variants |= {"TAKES_PARTS": "1"}
     label_tables: tuple[Any, ...] = ()
     if labels is not None and style is not None:
         variants |= {"LABELS": "1", **label_variants(labels.voxels.dtype)}
@@ -181,12 +203,15 @@ def composite_slab(
         ways_d = _look_ahead(resident, slab, way, leaps, stopwatch)
         launch(
             device, program["composite_rays"], output.items(queues, lanes),
-            slab.voxels_d, ways_d, tables.colors_d, tables.opacities_d, tables.factors_d,
+            slab.voxels_d, ways_d, tables.colors_d, tables.opacities_d, tables.clears_d, tables.changes_d,
+            tables.factors_d,
             upload(device, highlight_table(lighting)), entries_d, upload(device, view.table), output.states_d,
             output.image_d, output.depths_d, output.means_d, output.background, last, resident.stack.slope,
             np.int32(slab.shape_ijk[0]), np.int32(slab.shape_ijk[1]), np.int32(slab.first_k), np.int32(slab.end_k),
             np.float32(slab.low_k), np.float32(slab.high_k), *slab.brick_arguments,
-            np.float32(tables.low), np.float32(tables.scale), *tables.shown_ends, np.float32(tables.factor_scale),
+            np.float32(tables.low), np.float32(tables.scale), *tables.shown_ends,
+            np.float32(tables.steepness.narrow), np.int32(tables.steepness.has_dense), np.int32(tables.is_one_sided),
+            np.float32(tables.factor_scale),
             np.float32(tables.steps_per_unit), np.uint32(width), np.uint32(height),
             np.uint32(view.planes), np.int32(not view.camera.is_parallel), np.int32(lighting.shades), np.int32(jitter),
             np.int32(slab.stage), np.uint32(queues), *way.arguments, *label_tables, *resident.stack.arguments,

@@ -16,10 +16,11 @@ from clrecon.errors import UsageError
 from clrecon.geometry import Volume
 from clrecon.geometry.affine import Float64Array
 from clrecon.geometry.camera import Camera
-from clrecon.geometry.field import slice_normal_matrices
+from clrecon.geometry.field import slice_normal_matrices, takes_parts
 from clrecon.reference.rays import Planes, box_of, find_interval, jitter_pixels, sample_field, voxel_gradients
 from clrecon.rendering import Lighting, TransferFunction
 from clrecon.rendering.lighting import LEAST_SOFT_GRADIENT
+from clrecon.rendering.steepness import DENSE, PARTS, STEEP, Steepness
 
 __all__ = ["FLAT_GRADIENT", "MODES", "OPAQUE", "TABLE_NODES", "RayPicture", "cast_rays", "look_up", "shade"]
 
@@ -221,13 +222,18 @@ def _composite(
     gradients = voxel_gradients(voxels, slice_normal_matrices(rays.volume, 0))
     rgba = np.zeros((rays.count, 4))
     depth, weighted = np.full(rays.count, np.nan), np.zeros(rays.count)
-    for ray, t, length in _segments(rays, step, part, rgba[:, 3]):
+    steep = _SteepSegments(rays, transfer_function, step, part)
+    for number, (ray, t, length) in enumerate(_segments(rays, step, part, rgba[:, 3])):
         ijk, there = rays.places(ray, t)
-        rgb_opacity = look_up(transfer_function, sample_field(voxels, ijk))
-        colour, opacity = rgb_opacity[:, :3], np.where(there, rgb_opacity[:, 3], 0.0)
+        values = sample_field(voxels, ijk)
+        opacity = look_up(transfer_function, values)[:, 3]
+        if steep.is_there:
+            t, values, opacity = steep.take_parts(number, ray, t, length, values, opacity)
+        opacity = np.where(there, opacity, 0.0)
         seen = opacity > 0.0
-        ray, t, length = ray[seen], t[seen], length[seen]
-        ijk, colour, opacity = ijk[seen], colour[seen], opacity[seen]
+        ray, t, length, opacity = ray[seen], t[seen], length[seen], opacity[seen]
+        colour = look_up(transfer_function, values[seen])[:, :3]
+        ijk, _ = rays.places(ray, t)
         slope = sample_field(gradients, ijk)
         opacity = opacity * transfer_function.gradient_factor(np.linalg.norm(slope, axis=1))
         if lighting is not None:
@@ -243,6 +249,77 @@ def _composite(
     any_weight = rgba[:, 3] > 0.0
     expected = np.divide(weighted, rgba[:, 3], out=np.full(rays.count, np.nan), where=any_weight)
     return rgba, depth, expected, np.full(rays.count, np.nan)
+
+
+class _SteepSegments:
+    """Segments in parts, where the transfer function is steep between their samples and those beside them.
+
+    Values are those of a parabola through the three samples, no farther than the samples themselves; the parts are
+    blended, and what they show together is lit where it is seen on average.
+    """
+
+    def __init__(self, rays: _Rays, function: TransferFunction, step: float, part: Float64Array):
+        self.rays, self.function, self.step, self.part = rays, function, step, part
+        low, high = function.range_hu
+        self.low, self.scale = low, (TABLE_NODES - 1) / (high - low)
+        table = function.table(low, high, TABLE_NODES)[:, 3].astype(np.float64)
+        self.clear = (1.0 - table) ** (step / function.unit_distance)
+        self.steepness = Steepness.of((1.0 - self.clear).astype(np.float32), self.scale)
+        self.is_there = self.steepness.is_steep and takes_parts(rays.volume, step)
+        shown = np.flatnonzero(self.clear < 1.0)
+        first, end = (int(shown[0]), int(shown[-1]) + 1) if len(shown) else (TABLE_NODES, -1)
+        # Values beyond the first and the last node count as these.
+        self.first = -np.inf if first == 0 else float(first)
+        self.last = np.inf if end == TABLE_NODES else float(end)
+
+    def nodes(self, values: Float64Array) -> NDArray[np.int64]:
+        """Nodes of the table at values in nodes, fractions."""
+        return np.clip(values, 0, TABLE_NODES - 1).astype(np.int64)
+
+    def sample(self, number: float | Float64Array, ray: NDArray[np.int64]) -> Float64Array:
+        """Values of samples of rays, in nodes; beyond the last sample its own."""
+        rays, part = self.rays, self.part[ray]
+        way = rays.t_out[ray] - rays.t_in[ray]
+        last = np.ceil(way / self.step) - 1.0
+        t_last = rays.t_in[ray] + last * self.step + part * (way - last * self.step)
+        t = np.minimum(rays.t_in[ray] + (number + part) * self.step, t_last)
+        ijk, _ = rays.places(ray, t)
+        return (sample_field(rays.volume.voxels, ijk) - self.low) * self.scale + 0.5
+
+    def take_parts(
+        self, number: int, ray: NDArray[np.int64], t: Float64Array, length: Float64Array, values: Float64Array,
+        opacity: Float64Array,
+    ) -> tuple[Float64Array, Float64Array, Float64Array]:  # fmt: skip
+        """Places, values and opacities of segments `number`, whose samples have `values` and `opacity`."""
+        here, after = (values - self.low) * self.scale + 0.5, self.sample(number + 1, ray)
+        before = self.sample(number - 1 if number else -np.minimum(self.part[ray], 0.5), ray)
+        if number == 0:
+            before = 2.0 * before - here
+        nothing = np.maximum(before, here) < self.first
+        nothing |= np.minimum(before, here) >= self.last
+        front, back = np.where(nothing, 0.0, 0.5 * (before - here)), 0.5 * (after - here)
+        least, most = np.minimum(np.minimum(front, back), 0.0), np.maximum(np.maximum(front, back), 0.0)
+        changes = self.steepness.changes
+        change = changes[self.nodes(here + most)] - changes[self.nodes(here + least)]
+        dense = 1.0 - self.clear[self.nodes(here)] > DENSE
+        steep = (here + most >= self.first) & (here + least < self.last)
+        steep &= ((most - least > self.steepness.narrow) & (change > STEEP)) | dense
+        clear, seen_at, seen_value = np.ones(len(ray)), np.zeros(len(ray)), np.zeros(len(ray))
+        for at in (np.arange(PARTS) + 0.5) / PARTS - 0.5:
+            end = (2.0 if number else 1.0) * front if at < 0.0 else 2.0 * back
+            rise = np.clip(at * (back - front + at * (back + front)), np.minimum(end, 0.0), np.maximum(end, 0.0))
+            behind = clear * self.clear[self.nodes(here + rise)] ** (1.0 / PARTS)
+            seen_at += (clear - behind) * at
+            seen_value += (clear - behind) * (here + rise)
+            clear = behind
+        whole = np.maximum(1.0 - clear, 1e-6)
+        in_parts = (seen_value / whole - 0.5) / self.scale + self.low
+        over_unit = 1.0 - clear ** (self.function.unit_distance / self.step)
+        return (
+            np.where(steep, t + seen_at / whole * length, t),
+            np.where(steep, in_parts, values),
+            np.where(steep, over_unit, opacity),
+        )
 
 
 def _segments(

@@ -70,6 +70,8 @@ SCENES: dict[str, Callable[[], tuple[Volume, dict[str, Any]]]] = {
     "fading": lambda: scene(even_volume(blobs, "oblique", 18.0, np.int16), "dvr", SOFT, lighting=FADING),
     "fixed light": lambda: scene(even_volume(blobs, "oblique", 18.0), "dvr", SOFT, perspective=True, lighting=FIXED),
     "steep": lambda: scene(even_volume(blobs, "sheared", 18.0, np.int16), "dvr", STEEP, lighting=LIT, ray_step=0.17),
+    "steep jitter": lambda: clipped(even_volume(blobs, "mirrored", 18.0), "dvr", STEEP, lighting=FIXED, jitter=True),
+    "steep uneven": lambda: scene(uneven_volume(blobs), "dvr", STEEP, lighting=LIT, half_height=20.0, ray_step=0.19),
     "gradient opacity": lambda: scene(even_volume(blobs, "oblique", 18.0), "dvr", LEVOY, lighting=LIT),
     "clipped": lambda: clipped(even_volume(blobs, "sheared", 18.0), "dvr", SOFT, lighting=FIXED, perspective=True),
     "jitter": lambda: scene(even_volume(blobs, "even", 18.0), "dvr", SOFT, lighting=UNSHADED, jitter=True, ray_step=1),

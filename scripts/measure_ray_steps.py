@@ -1,0 +1,59 @@
+#!/usr/bin/env python3
+"""Measure how alike (SSIM) pictures of each preset by the default ray step are to those by one ten times finer.
+
+    python scripts/measure_ray_steps.py CT_FOLDER [DEVICE]
+
+Prints a line a preset: of the view from the front and of an oblique one the SSIM of the whole picture (grey values of 8
+bits) and that of its pixels in which something shows, without the background.  It needs scikit-image.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT))
+
+import clrecon  # noqa: E402
+from clrecon.rendering.presets import PRESETS  # noqa: E402
+
+SIZE = (512, 512)
+VIEWS = ("anterior", "30,20")
+FINER = 10.0
+
+
+def compare(coarse: np.ndarray, fine: np.ndarray) -> tuple[float, float]:
+    """SSIM of the luminance of two pictures (h, w, 4), uint8: of all, and where either is not black."""
+    from skimage.metrics import structural_similarity
+
+    grey = [np.rint(picture[..., :3] @ (0.2126, 0.7152, 0.0722)) for picture in (coarse, fine)]
+    whole, local = structural_similarity(*grey, data_range=255.0, full=True)
+    shown = (grey[0] > 0.0) | (grey[1] > 0.0)
+    return float(whole), float(local[shown].mean()) if shown.any() else 1.0
+
+
+def main() -> None:
+    """Print the figures of every preset for volume rendering."""
+    if len(sys.argv) not in (2, 3):
+        raise SystemExit(__doc__)
+    volume = clrecon.read_volume(sys.argv[1])
+    step = 0.5 * min(volume.spacing)
+    with clrecon.VolumeRenderer(volume, sys.argv[2] if len(sys.argv) == 3 else None) as renderer:
+        for name, preset in PRESETS.items():
+            if preset.mode != "dvr":
+                continue
+            found = []
+            for view in VIEWS:
+                pictures = [
+                    renderer.render("dvr", name, view=view, size=SIZE, ray_step=ray_step).image
+                    for ray_step in (step, step / FINER)
+                ]
+                found.append("{:.4f} whole {:.4f} shown".format(*compare(*pictures)))
+            print(f"{name:10s} {'; '.join(found)}", flush=True)
+
+
+if __name__ == "__main__":
+    main()
