@@ -130,15 +130,20 @@ def describe_purposes(meshes: list[dict[str, Any]]) -> list[str]:
     return [*lines, f"         left out {pieces}, filled {cavities}"]
 
 
+GATES_OF_AFFINE = ("grid_residual",)
+"""Gates of a scan that say whether its affine places every slice.  Meshes follow the position of each slice itself."""
+
+
 def finish_with_gates(report: dict[str, Any], console: Console, strict: bool) -> int:
     """Print the warnings of a report; returns the exit code.
 
     With `strict` the gates that failed, of the volume and of the meshes, are errors: they are printed with ``--quiet``
-    and ``--json`` too.
+    and ``--json`` too.  Not so `GATES_OF_AFFINE`: that the slices are uneven is a warning.
     """
     from clrecon.pipeline.refinement import warn_of_gates
 
-    of_volume = [{"mesh": "volume", **gate} for gate in report["volume"].get("gates", ())]
+    gates = [gate for gate in report["volume"].get("gates", ()) if gate["name"] not in GATES_OF_AFFINE]
+    of_volume = [{"mesh": "volume", **gate} for gate in gates]
     failed = warn_of_gates([*of_volume, *report["gates"]]) if strict else []
     for warning in report["warnings"]:
         if warning not in failed:

@@ -302,3 +302,23 @@ def test_mesh_strict_counts_the_gates_of_the_volume(
     assert set(report) == names_in("clrecon mesh") - {"preset_reason"}
     assert set(report["meshes"][0]) - set(report) <= names_in("clrecon mesh", "Of each mesh in `meshes`")
     assert b"comment CERTIFICATE gate_failed lossless: slices with lossy" in (tmp_path / "a.ply").read_bytes()
+
+
+def test_mesh_strict_takes_slices_that_are_placed_one_by_one(
+    tmp_path: Path, device: Any, capsys: pytest.CaptureFixture[str]
+) -> None:
+    import pydicom
+
+    folder = write_series(tmp_path / "ct")
+    for path in folder.iterdir():
+        ds = pydicom.dcmread(path)
+        if ds.InstanceNumber > 9:
+            ds.ImagePositionPatient[2] += 0.3  # one gap is wider
+            ds.save_as(path)
+    arguments = ["mesh", str(folder), "-o", str(tmp_path / "a.ply"), "--hu", "100", "--device", str(device.index)]
+    assert main([*arguments, "--strict", "--json"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    said = report["volume"]
+    assert said["uneven"] and [gate["name"] for gate in said["gates"] if gate["ok"] is False] == ["grid_residual"]
+    assert any("unevenly spaced" in text for text in report["warnings"])
+    assert main(["info", str(folder), "--strict"]) == 4
