@@ -127,7 +127,7 @@ def _judge_spacing(stack: Stack) -> Gate:
 
 def _judge_thickness(stack: Stack) -> Gate:
     """Gaps against SliceThickness: how much of the tissue was measured at all."""
-    what = "largest gap between slices in thicknesses of theirs, beyond 1 nobody measured the tissue between"
+    what = "largest gap between slices as a multiple of SliceThickness; above 1 the tissue between was not measured"
     thickness = np.array([header.slice_thickness_mm or 0.0 for header in stack.slices])
     if (thickness <= 0.0).any():
         return unmeasured("gap_thickness", GAP_THICKNESSES, None, f"{what}: the thickness is not stated")
