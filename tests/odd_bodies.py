@@ -12,8 +12,10 @@ from numpy.typing import NDArray
 from clrecon.geometry import Volume
 from clrecon.phantom import KINDS, MATERIALS, PhantomSettings, label_materials, make_phantom
 
-COARSE = 2.3
-"""Steps of a small phantom in those of its kind: 2 to 4 mm."""
+COARSE = 2.8
+"""Steps of a small phantom in those of its kind: 2.5 to 5 mm."""
+FINER = {"bones": 2.3}
+"""The same where rims in the table are as thin as a coarse voxel."""
 
 BODIES: dict[str, dict[str, Any]] = {
     "skull": {"kind": "skull", "table": "headrest"},
@@ -59,8 +61,10 @@ class OddBody:
 def settings_of(name: str) -> PhantomSettings:
     """Settings of a small phantom of `BODIES`."""
     given = BODIES[name]
-    dj, di, dk = (COARSE * step for step in KINDS[given["kind"]].spacing)
-    return PhantomSettings(size=(112, 108), slices=42, spacing=(dj, 1.04 * di, dk), **given)
+    coarse = FINER.get(name, COARSE)
+    dj, di, dk = (coarse * step for step in KINDS[given["kind"]].spacing)
+    columns, rows, slices = (round(extent / coarse) for extent in (258, 248, 97))  # in steps of its kind
+    return PhantomSettings(size=(columns, rows), slices=slices, spacing=(dj, 1.04 * di, dk), **given)
 
 
 @functools.cache

@@ -25,7 +25,10 @@ from clrecon.pipeline.presets import DEFAULT_PRESET, PRESETS
 
 __all__ = ["add_arguments", "describe_mesh", "describe_volume", "run"]
 
-_PARTS = ("read", "upload", "build", "kernels", "download", "mask", "choose", "select", "refine", "write", "measure")
+_PARTS = (
+    *("device", "read", "mask", "choose", "upload", "build", "kernels", "download"),
+    *("select", "refine", "measure", "write", "other"),
+)
 _SHOWN_PARTS = 12
 
 

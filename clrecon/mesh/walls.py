@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from clrecon.errors import UsageError
 from clrecon.geometry import Volume
+from clrecon.geometry.dense_pieces import RAIL_MM, STRAIGHT_MM
 from clrecon.geometry.field import IsoRule
 from clrecon.mesh.iso_distance import trilinear_values
 from clrecon.mesh.mesh import Mesh
@@ -22,6 +23,8 @@ from clrecon.mesh.mesh import Mesh
 __all__ = [
     "MOST_SAMPLES",
     "Walls",
+    "find_rails",
+    "is_straight",
     "judge_components",
     "judge_walls",
     "lie_near_line",
@@ -50,6 +53,10 @@ MOST_SAMPLES = 8_000
 MOST_COMPONENT_SAMPLES = 500
 FEWEST_VERTICES = 150
 """A component of fewer is a crumb, and not told."""
+RAIL_SECTIONS = 8
+"""Parts of the scan, along its slices, in which the cross section of a rail is compared."""
+RAIL_SHIFT_MM = 1.0
+"""Sides of a rail move by no more than this, or half a voxel, from part to part: noise and shadows."""
 
 
 @dataclass(frozen=True)
@@ -167,6 +174,73 @@ def judge_components(
         judged[component] = judge_walls(walls.where(slice(first, first + len(own))))
         first += len(own)
     return judged
+
+
+def find_rails(
+    mesh: Mesh, volume: Volume, label_of_vertex: NDArray[np.int64], chosen: NDArray[np.bool_]
+) -> NDArray[np.bool_]:
+    """Which of the chosen components are rails of a table: thin, and the same in all slices.
+
+    A table moves through the scanner along the step of the slices; bones taper and bend, and shafts are thicker than
+    `RAIL_MM`.  In scans shorter than `STRAIGHT_MM` bones are as straight, and nothing is found.
+
+    Parameters
+    ----------
+    mesh : Mesh
+    volume : Volume
+        The mesh was extracted from it.
+    label_of_vertex : ndarray, shape (n,), int64
+        The component of each vertex, below 0 for none.
+    chosen : ndarray, shape (count,), bool
+        Components to look at.
+
+    Returns
+    -------
+    ndarray, shape (count,), bool
+    """
+    rails = np.zeros(len(chosen), dtype=bool)
+    last = volume.shape_ijk[2] - 1
+    if last * volume.spacing[2] < STRAIGHT_MM:
+        return rails
+    order = np.argsort(label_of_vertex, kind="stable")
+    ends = np.searchsorted(label_of_vertex[order], np.arange(len(chosen) + 1))
+    for one in np.flatnonzero(chosen):
+        rows = order[ends[one] : ends[one + 1]]
+        rails[one] = _is_rail(volume.lps_to_ijk(mesh.vertices[rows].astype(np.float64)), volume.spacing, last)
+    return rails
+
+
+def is_straight(points: NDArray[np.float64], volume: Volume) -> bool:
+    """Points (n, 3), LPS mm, of a surface lie between the same sides from the first slice to the last."""
+    last = volume.shape_ijk[2] - 1
+    if last * volume.spacing[2] < STRAIGHT_MM:
+        return False
+    return _measure_section(volume.lps_to_ijk(points), volume.spacing, last) is not None
+
+
+def _is_rail(points: NDArray[np.float64], spacing: tuple[float, float, float], last: int) -> bool:
+    """The same cross section, and a thin one, from the first slice to the last; points in index coordinates."""
+    width = _measure_section(points, spacing, last)
+    return width is not None and bool((width - spacing[:2]).min() <= RAIL_MM)  # it is blurred by about a voxel
+
+
+def _measure_section(
+    points: NDArray[np.float64], spacing: tuple[float, float, float], last: int
+) -> NDArray[np.float64] | None:
+    """Width and height, mm, of what is the same in all slices; None where it is not."""
+    k = points[:, 2]
+    if k.min() > 1.0 or k.max() < last - 1.0:
+        return None
+    within = (k >= 1.0) & (k <= last - 1.0)  # without what closes the surface at the border of the scan
+    section = ((k[within] - 1.0) * (RAIL_SECTIONS / max(last - 2.0, 1.0))).astype(int).clip(0, RAIL_SECTIONS - 1)
+    across = points[within, :2] * spacing[:2]
+    if np.bincount(section, minlength=RAIL_SECTIONS).min() == 0:
+        return None
+    sides = np.array([np.percentile(across[section == part], (2, 98), axis=0) for part in range(RAIL_SECTIONS)])
+    moved = np.ptp(sides, axis=0).max(axis=0)
+    if (moved > np.maximum(RAIL_SHIFT_MM, 0.5 * np.array(spacing[:2]))).any():
+        return None
+    return np.asarray(np.diff(np.median(sides, axis=0), axis=0)[0])
 
 
 def normals_of(mesh: Mesh) -> NDArray[np.float32]:

@@ -207,6 +207,8 @@ class PhantomSettings:
             raise UsageError(f"inside ({self.inside_hu:g}) and outside ({self.outside_hu:g}) differ by less than 1 HU")
         if self.radius_mm is not None:
             _check_number("radius", self.radius_mm, 1e-3, 1e4, "mm")
+            if KINDS[self.kind].table is not None:
+                raise UsageError(f"a {self.kind} has no radius: it is for sphere, torus, cylinder and plane")
         _check_number("gap between body and table", self.table_gap_mm, -100.0, 500.0, "mm")
         self._check_lying()
 

@@ -7,14 +7,16 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from clrecon.errors import NoSurfaceError, RefusedInputError, UsageError
-from clrecon.pipeline.parts import Part, Surface
+from clrecon.pipeline.levels import warn_of_contrast
+from clrecon.pipeline.parts import Bones, Part, Surface
 from clrecon.pipeline.settings import MeshSettings
 
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from clrecon.geometry import Volume
+    from clrecon.geometry import IsoChoice, Volume
+    from clrecon.geometry.field import IsoRule
     from clrecon.mesh import Mesh
     from clrecon.mesh.components import Labelled
 
@@ -44,42 +46,60 @@ def find_bone(mesh: Mesh, volume: Volume, surface: Surface, labelled: Labelled) 
     import numpy as np
 
     from clrecon.mesh.iso_distance import rule_of_report
-    from clrecon.mesh.walls import judge_components, looks_like_bone
+    from clrecon.mesh.walls import find_rails, judge_components, looks_like_bone
 
     rule = rule_of_report(mesh.report)
     if rule is None:
         raise UsageError("bone is told from an iso surface of HU only")
     count, labels = labelled
     judged = judge_components(mesh, volume, rule, count, labels)
-    bone = np.array([looks_like_bone(one) for one in judged], dtype=bool)
+    like_bone = np.array([looks_like_bone(one) for one in judged], dtype=bool)
+    rails = find_rails(mesh, volume, labels, like_bone)
+    bone = like_bone & ~rails
     if bone.any():
+        if rails.any():
+            mesh.report.setdefault("warnings", []).append(
+                f"at {surface.describe()} {_describe_rails(int(rails.sum()))}: left out"
+            )
         return bone
     bone = _holds_spine(mesh, volume, count, labels)
     if not bone.any():
-        told = [one for one in judged if one is not None]
-        raise NoSurfaceError(f"at {surface.describe()}: {_describe_none(told, count)}")
+        told = [one for one, is_rail in zip(judged, rails, strict=True) if one is not None and not is_rail]
+        raise NoSurfaceError(f"at {surface.describe()}: {_describe_none(told, count, int(rails.sum()))}")
     mesh.report.setdefault("warnings", []).append(
         f"at {surface.describe()} no component has walls like bone: the one round the spinal canal was kept"
     )
     return bone
 
 
-def _describe_none(told: Sequence[dict[str, Any]], count: int) -> str:
+def _describe_none(told: Sequence[dict[str, Any]], count: int, rails: int) -> str:
+    but = f"; {_describe_rails(rails)}" if rails else ""
     if not told:
-        return f"nothing that could be bone: {count:,} components, all of them crumbs"
+        others = "all others" if rails else "all of them"
+        return f"nothing that could be bone: {count:,} components, {others} crumbs{but}"
     largest = max(told, key=lambda one: int(one["samples"]))
     return (
         f"nothing here looks like bone: of {count:,} components the largest {_looks(largest)};"
-        " those of bone reach 600 at 5 % and more of it (--keep-largest N keeps by size)"
+        f" those of bone reach 600 at 5 % and more of it (--keep-largest N keeps by size){but}"
     )
 
 
+def _describe_rails(rails: int) -> str:
+    """Components that are dense as bone, and straight as the rails of a table."""
+    many = "s are" if rails != 1 else " is"
+    return f"{rails:,} component{many} as dense as bone but the same in all slices, as the rails of a table"
+
+
 def _looks(judged: dict[str, Any]) -> str:
+    like = {"contrast medium": "contrast medium or another even body"}
+    return f"looks like {like.get(judged['looks_like'], judged['looks_like'])}: its walls {_figures(judged)}"
+
+
+def _figures(judged: dict[str, Any]) -> str:
     wall = judged["wall_hu"]
-    like = {"no bone": "no bone", "contrast medium": "contrast medium or another even body"}
     return (
-        f"looks like {like.get(judged['looks_like'], judged['looks_like'])}: its walls have {wall['median']:.0f} HU,"
-        f" {wall['p99']:.0f} at the densest 1 %, and reach 600 at {100.0 * judged['compact_share']:.1f} %"
+        f"have {wall['median']:.0f} HU, {wall['p99']:.0f} at the densest 1 %, and reach 600 at"
+        f" {100.0 * judged['compact_share']:.1f} %"
     )
 
 
@@ -108,7 +128,7 @@ def judge_surfaces(parts: Sequence[Part], volume: Volume, settings: MeshSettings
     import numpy as np
 
     from clrecon.mesh.iso_distance import rule_of_report
-    from clrecon.mesh.walls import MOST_SAMPLES, judge_walls, normals_of, sample_walls
+    from clrecon.mesh.walls import MOST_SAMPLES, is_straight, judge_walls, normals_of, sample_walls
 
     for part in parts:
         part.facts["walls"] = None
@@ -125,7 +145,25 @@ def judge_surfaces(parts: Sequence[Part], volume: Volume, settings: MeshSettings
         walls = sample_walls(np.concatenate(vertices), np.concatenate(normals), volume, rule)
         ends = np.cumsum([0, *map(len, vertices)])
         for part, first, end in zip(own, ends[:-1], ends[1:], strict=True):
-            part.facts["walls"] = judge_walls(walls.where(slice(first, end)))
+            own_walls = walls.where(slice(first, end))
+            judged = part.facts["walls"] = judge_walls(own_walls)
+            doubtful = judged["looks_like"] != "bone" or is_straight(own_walls.points, volume)
+            if doubtful and _means_bone(settings) and not settings.selects:
+                part.bones = _count_bones(part.mesh, volume, rule)
+
+
+def _count_bones(mesh: Mesh, volume: Volume, rule: IsoRule) -> Bones:
+    """How many components of a surface that as a whole does not look like bone are bone after all."""
+    import numpy as np
+
+    from clrecon.mesh.connectivity import label_components
+    from clrecon.mesh.walls import find_rails, judge_components, looks_like_bone
+
+    count, labels = label_components(mesh.triangles, mesh.vertex_count)
+    judged = judge_components(mesh, volume, rule, count, labels)
+    like_bone = np.array([looks_like_bone(one) for one in judged], dtype=bool)
+    rails = find_rails(mesh, volume, labels, like_bone)
+    return Bones(count, int(np.count_nonzero(like_bone & ~rails)), int(np.count_nonzero(rails)))
 
 
 def _is_of_bone(surface: Surface, lowest: float) -> bool:
@@ -135,16 +173,48 @@ def _is_of_bone(surface: Surface, lowest: float) -> bool:
     return level >= lowest
 
 
-def warn_of_walls(parts: Sequence[Part], settings: MeshSettings) -> list[str]:
-    """What is to be known where a surface that was to be bone is contrast medium, or joined to it."""
+def warn_of_walls(parts: Sequence[Part], settings: MeshSettings, choice: IsoChoice | None = None) -> list[str]:
+    """What is to be known where a surface that was to be bone is contrast medium, joined to it, or something else.
+
+    Parameters
+    ----------
+    parts : sequence of Part
+        Judged by `judge_surfaces`.
+    settings : MeshSettings
+    choice : IsoChoice, optional
+        How the iso value was chosen; what its edges say of contrast medium is said here too.
+    """
+    contrast = [] if choice is None else warn_of_contrast(choice)
     warnings = []
     for surface in dict.fromkeys(part.surface for part in parts):
         own = [part for part in parts if part.surface == surface and part.facts.get("walls")]
         if settings.split:
             warnings += _warn_of_pieces(own)
         elif own:
-            warnings += _warn_of_whole(own[0], settings)
-    return warnings
+            boneless = _warn_of_no_bone(own[0], settings)
+            if boneless and choice is not None and choice.contrast_medium_share:
+                contrast = []  # the same figures, with an advice that helps only where there is bone
+            warnings += boneless or _warn_of_whole(own[0], settings)
+    return contrast + warnings
+
+
+def _warn_of_no_bone(part: Part, settings: MeshSettings) -> list[str]:
+    """What is said of a surface at a level of bone none of whose components is bone."""
+    from clrecon.mesh.walls import looks_like_bone
+
+    if part.bones is None or part.bones.bone:
+        return []
+    judged = part.facts["walls"]
+    rails = f"; {_describe_rails(part.bones.rails)}" if part.bones.rails else ""
+    # thin bone has no clear walls: rails among thinner shells look like it
+    surface = f"its walls {_figures(judged)}" if looks_like_bone(judged) else f"the surface {_looks(judged)}"
+    many = f"{part.bones.components:,} component{'s' * (part.bones.components != 1)}"
+    return [f"at {part.surface.describe()} nothing here looks like bone, none of {many}: {surface}{rails}"]
+
+
+def _means_bone(settings: MeshSettings) -> bool:
+    """The surface was asked for as that of bone."""
+    return settings.half_way == "auto" or settings.preset_used == "bone"
 
 
 def _warn_of_pieces(parts: Sequence[Part]) -> list[str]:
@@ -164,8 +234,7 @@ def _warn_of_whole(part: Part, settings: MeshSettings) -> list[str]:
     judged = part.facts["walls"]
     where = f"at {part.surface.describe()} {'what is kept' if settings.selects else 'the surface'}"
     if not looks_like_bone(judged):
-        meant = settings.keep_largest is not None or settings.half_way == "auto" or settings.preset_used == "bone"
-        if not meant or settings.seeds:
+        if settings.seeds or not (settings.keep_largest is not None or _means_bone(settings)):
             return []
         return [f"{where} {_looks(judged)}; --keep bone keeps what looks like bone"]
     if judged["contrast_share"] < CONTRAST_SHARE:

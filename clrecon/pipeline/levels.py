@@ -10,7 +10,7 @@ from clrecon.pipeline.settings import MeshSettings
 if TYPE_CHECKING:
     from clrecon.geometry import IsoChoice, Volume
 
-__all__ = ["choose_level", "describe_level"]
+__all__ = ["choose_level", "describe_level", "warn_of_contrast"]
 
 THICK_SLICES_MM = 2.5
 """From here on thin walls across the slices lose so much that half way between the materials can be too high: with
@@ -57,11 +57,11 @@ def describe_level(
             f"slices are {volume.spacing[2]:.3g} mm apart: walls thinner than that may be lost at"
             f" {choice.iso_value:g} HU; compare with a lower iso value, such as --preset bone"
         )
-    warnings += _warn_of_contrast(choice)
     return {"iso_value_reason": choice.reason, "iso_value_choice": choice.as_dict()}, warnings
 
 
-def _warn_of_contrast(choice: IsoChoice) -> list[str]:
+def warn_of_contrast(choice: IsoChoice) -> list[str]:
+    """What the edges that an iso value was chosen by say of contrast medium."""
     from clrecon.geometry.iso_choice import CONTRAST_SAID
 
     if choice.flat_share is None or choice.flat_share < CONTRAST_SAID:

@@ -107,6 +107,7 @@ def make_mesh(
 
     check_levels(volume, surfaces)
     volume = leave_outside(volume, settings, progress)
+    watch.lap("mask")
     if labels is not None and settings.labels is not None:
         surfaces, extracted = extract_label_surfaces(
             volume, surfaces, labels, settings.labels, device, settings, progress
@@ -153,7 +154,7 @@ def make_mesh(
             report["warnings"].append(
                 f"{leftovers:,} more numbered files of this name lie beside the new ones, from an earlier run"
             )
-        report["warnings"] += warn_of_walls(parts, settings)
+        report["warnings"] += warn_of_walls(parts, settings, choice)
         report["gates"] = gates
         report["warnings"] += purpose_warnings + warn_of_gates(gates)
         report["seconds"] = _seconds(watch, origins)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from clrecon.errors import DeviceMemoryError, NoSurfaceError, UsageError
 from clrecon.pipeline.outputs import MOST_FILES
@@ -16,7 +16,16 @@ if TYPE_CHECKING:
     from clrecon.mesh import Mesh
     from clrecon.opencl import Device
 
-__all__ = ["Part", "Surface", "check_levels", "extract_surfaces", "first_names", "plan_surfaces", "select_parts"]
+__all__ = [
+    "Bones",
+    "Part",
+    "Surface",
+    "check_levels",
+    "extract_surfaces",
+    "first_names",
+    "plan_surfaces",
+    "select_parts",
+]
 
 
 @dataclass(frozen=True)
@@ -47,6 +56,14 @@ class Surface:
         return f"{'below ' if self.below else ''}{name_level(self.iso_value)} HU"
 
 
+class Bones(NamedTuple):
+    """Of a surface: its components, those that look like bone, and those that would but are rails of a table."""
+
+    components: int
+    bone: int
+    rails: int
+
+
 @dataclass
 class Part:
     """A mesh that becomes a file of its own: a surface, or a component of one.
@@ -64,6 +81,8 @@ class Part:
         More entries of its object in the report.
     pieces : (dict, dict), optional
         What the components of its surface enclose, as extracted and as kept; where the purpose asks for it.
+    bones : Bones, optional
+        How many of its components are bone, where it as a whole does not look like bone.
     """
 
     surface: Surface
@@ -72,6 +91,7 @@ class Part:
     quality: dict[str, Any] = field(default_factory=dict)
     facts: dict[str, Any] = field(default_factory=dict)
     pieces: tuple[dict[str, float], dict[str, float]] | None = None
+    bones: Bones | None = None
 
 
 def plan_surfaces(levels: Sequence[float | tuple[float, ...]], below: bool = False) -> list[Surface]:

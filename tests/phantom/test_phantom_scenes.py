@@ -123,6 +123,7 @@ def test_a_written_scene_has_its_materials_in_place(tmp_path: Path) -> None:
     ("given", "says"),
     [
         ({"kind": "skull", "table": "soft"}, "'soft'.*none, flat, curved, headrest"),
+        ({"kind": "skull", "radius_mm": 30.0}, "a skull has no radius"),
         ({"kind": "sphere", "table": "flat"}, "a sphere lies on nothing"),
         ({"kind": "torus", "prone": True}, "a torus lies on nothing"),
         ({"kind": "skull", "table_gap_mm": 5.0}, "gap of 5 mm needs a table.*flat, curved"),

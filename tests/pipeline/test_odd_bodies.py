@@ -13,6 +13,7 @@ from clrecon.errors import ClreconError, NoSurfaceError, RefusedInputError
 from clrecon.phantom import write_phantom
 from clrecon.pipeline.mesh import make_mesh
 from clrecon.pipeline.pictures import PictureFiles
+from clrecon.pipeline.purposes import settings_for
 from clrecon.pipeline.render import make_pictures
 from clrecon.pipeline.render_settings import RenderSettings
 from clrecon.pipeline.settings import MeshSettings
@@ -71,18 +72,17 @@ def test_the_mesh_without_the_table_is_that_of_the_bone(series: Any, device: Any
     assert share_near(body, vertices, *materials) > 0.8  # the rest is skin and table in the margin
     # every dense body is there: its voxels have the surface beside them or lie within
     _, whole = mesh_of(series, device, tmp_path, name, iso_value=300.0)
-    expected = whole[_of_body(body, whole)]
-    assert np.count_nonzero(_of_body(body, vertices)) == pytest.approx(len(expected), rel=0.02)
+    assert vertices_of_bone(body, vertices) == pytest.approx(vertices_of_bone(body, whole), rel=0.02)
 
 
-def _of_body(body: OddBody, vertices: np.ndarray) -> np.ndarray:
-    """Vertices between the voxels of bone, and far from the table."""
+def vertices_of_bone(body: OddBody, vertices: np.ndarray, *materials: str) -> int:
+    """How many vertices lie between the voxels of bone, and far from the table."""
     from scipy import ndimage
 
-    near = ndimage.binary_dilation(body.of("bone", "metal", "contrast"), np.ones((3, 3, 3)))
+    near = ndimage.binary_dilation(body.of(*(materials or ("bone", "metal", "contrast"))), np.ones((3, 3, 3)))
     near &= ~ndimage.binary_dilation(body.of("table"), np.ones((3, 3, 3)))
     i, j, k = np.clip(np.rint(vertices).astype(int), 0, np.array(near.shape[::-1]) - 1).T
-    return np.asarray(near[k, j, i])
+    return int(np.count_nonzero(near[k, j, i]))
 
 
 @pytest.mark.parametrize("settings", [{"remove_table": True}, {"remove_table": True, "half_way": "auto"}])
@@ -170,3 +170,77 @@ def test_pictures_say_what_was_left_out(series: Any, device: Any, tmp_path: Path
     assert report["volume"]["remove_table"]["bone_kept"] >= 0.98
     assert any("of them dense (table, blankets)" in warning for warning in report["warnings"])
     assert not any("nothing of the volume shows" in warning for warning in report["warnings"])
+
+
+@pytest.mark.parametrize("name", ("water", "empty"))
+def test_what_holds_no_bone_says_so_once(series: Any, device: Any, tmp_path: Path, name: str) -> None:
+    report, _ = mesh_of(series, device, tmp_path, name, half_way="auto")
+    (said,) = [warning for warning in report["warnings"] if "like bone" in warning or "contrast" in warning]
+    assert "nothing here looks like bone, none of" in said
+    assert f"{report['walls']['wall_hu']['median']:.0f} HU" in said
+    assert ("rails of a table" in said) == (name == "empty")  # hard as bone, and straight
+    before = (tmp_path / "mesh.ply").read_bytes()
+    with pytest.raises(NoSurfaceError, match="nothing (here looks like|that could be) bone"):
+        mesh_of(series, device, tmp_path, name, half_way="auto", keep="bone")
+    assert (tmp_path / "mesh.ply").read_bytes() == before
+
+
+@pytest.mark.parametrize("name", ("skull-prone", "limb", "pair", "pelvis"))
+def test_bone_is_kept_and_no_alarm_is_false(series: Any, device: Any, tmp_path: Path, name: str) -> None:
+    body = make_odd(name)
+    report, vertices = mesh_of(series, device, tmp_path, name, preset="bone", remove_table=True, keep="bone")
+    assert report["walls"]["looks_like"] == "bone"
+    assert share_near(body, vertices, "bone", "metal") > 0.8
+    everything, whole = mesh_of(series, device, tmp_path, name, preset="bone")
+    kept, there = (vertices_of_bone(body, some, "bone") for some in (vertices, whole))
+    assert kept > (0.9 if name == "skull-prone" else 0.95) * there  # walls of its cavities are pieces of their own
+    assert not any("looks like" in warning for warning in report["warnings"] + everything["warnings"])
+
+
+def test_contrast_medium_goes_where_bone_is_kept(series: Any, device: Any, tmp_path: Path) -> None:
+    body = make_odd("contrast")
+    everything, whole = mesh_of(series, device, tmp_path, "contrast", preset="bone", remove_table=True)
+    assert share_near(body, whole, "contrast") > 0.3
+    assert any("in part like heart, vessels or organs" in warning for warning in everything["warnings"])
+    _, vertices = mesh_of(series, device, tmp_path, "contrast", preset="bone", remove_table=True, keep="bone")
+    assert share_near(body, vertices, "contrast") < 0.05 < 0.9 < share_near(body, vertices, "bone")
+
+
+@pytest.mark.parametrize(("name", "kept_ml"), [("head", (20.0, 400.0)), ("contrast", (200.0, 6000.0))])
+def test_air_within_a_body_is_told_from_the_air_around_it(
+    series: Any, device: Any, tmp_path: Path, name: str, kept_ml: tuple[float, float]
+) -> None:
+    body = make_odd(name)
+    report, vertices = mesh_of(series, device, tmp_path, name, below=-400.0)
+    facts = report["volume"]["outside_air"]
+    assert kept_ml[0] < facts["kept_ml"] < kept_ml[1] < facts["left_out_ml"]
+    assert any(f"{facts['kept_ml']:,.1f} ml within it" in warning for warning in report["warnings"])
+    assert share_near(body, vertices, "table") < 0.1
+
+
+def test_an_empty_table_holds_no_air_of_a_body(series: Any, device: Any, tmp_path: Path) -> None:
+    with pytest.raises(ClreconError, match=r"\d"):
+        mesh_of(series, device, tmp_path, "empty", below=-400.0)
+
+
+def test_a_range_takes_contrast_medium_and_leaves_metal(series: Any, device: Any, tmp_path: Path) -> None:
+    body = make_odd("contrast")
+    _, vertices = mesh_of(series, device, tmp_path, "contrast", iso_value=((200.0, 500.0),), remove_table=True)
+    assert share_near(body, vertices, "contrast", "bone") > 0.9
+    body = make_odd("pelvis")
+    _, vertices = mesh_of(series, device, tmp_path, "pelvis", iso_value=((2500.0, 3071.0),))
+    assert share_near(body, vertices, "metal") > 0.95
+
+
+@pytest.mark.parametrize("name", ("limb", "pair"))
+def test_a_print_is_of_the_body_closed_and_says_what_it_left_out(
+    series: Any, device: Any, tmp_path: Path, name: str
+) -> None:
+    given = settings_for("print", {"iso_value": 300.0, "remove_table": True})
+    report, vertices = mesh_of(series, device, tmp_path, name, **given)
+    assert share_near(make_odd(name), vertices, "bone", "metal") > 0.9
+    assert (report["closed"], report["components"]) == (True, 1)
+    assert all(gate["ok"] for gate in report["gates"] if gate["name"] in ("bone_kept", "watertight"))
+    left_out = report["print"]["left_out"]
+    if name == "pair":  # the other leg
+        assert left_out["pieces_ml"] > 0.0 and any("left out" in warning for warning in report["warnings"])
