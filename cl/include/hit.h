@@ -72,7 +72,10 @@ static inline float3 shade(__global const float4 *view, __global const float *hi
     const float4 fixed_light = view[VIEW_LIGHT];
     const float3 normal = gradient * (1.0f / sqrt(size));
     const float3 light = fixed_light.w > 0.0f ? fixed_light.xyz : -direction;
-    float highlight_angle = fabs(dot(normal, light));
+    const float along = dot(normal, light);
+    if (along * dot(normal, direction) >= 0.0f)
+        return min(color * phong.x, 1.0f); /* light and viewer on different sides */
+    float highlight_angle = fabs(along);
     const float diffuse = phong.y * highlight_angle;
     if (fixed_light.w > 0.0f) {
         const float3 middle = light - direction;

@@ -1,4 +1,5 @@
-/* Light on surfaces (Phong 1975, with Blinn's halfway vector); both sides of them are lit. */
+/* Light on surfaces (Phong 1975, with Blinn's halfway vector).  Normals count as turned to the viewer, so that a light
+ * at the camera lights both sides of a surface; a fixed light lights only what faces it, as VTK's do. */
 #ifndef CLRECON_PHONG_H
 #define CLRECON_PHONG_H
 
@@ -76,12 +77,15 @@ static inline void find_light(__global const float4 *view, __global const float 
     floats cosine_squared, middle_squared;
     if (fixed_light.w > 0.0f) {
         const floats along = x * fixed_light.x + y * fixed_light.y + z * fixed_light.z;
-        cosine_squared = along * along / divisor;
+        const floats ahead = x * direction_x + y * direction_y + z * direction_z;
+        const ints lit = along * ahead < 0.0f; /* light and viewer on the same side */
+        cosine_squared = choose(lit, along * along / divisor, (floats)(0.0f));
         const floats half_x = fixed_light.x - direction_x, half_y = fixed_light.y - direction_y;
         const floats half_z = fixed_light.z - direction_z;
         const floats length_squared = greater(half_x * half_x + half_y * half_y + half_z * half_z, (floats)(1e-12f));
         const floats half_way = x * half_x + y * half_y + z * half_z;
-        middle_squared = lesser(half_way * half_way / (divisor * length_squared), (floats)(1.0f));
+        const floats squared = lesser(half_way * half_way / (divisor * length_squared), (floats)(1.0f));
+        middle_squared = choose(lit, squared, (floats)(0.0f));
     } else {
         const floats along = x * direction_x + y * direction_y + z * direction_z;
         cosine_squared = along * along / divisor;

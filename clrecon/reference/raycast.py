@@ -191,9 +191,10 @@ def shade(
 ) -> Float64Array:
     """Phong's shading of colours (n, 3) with gradients (n, 3) as normals, seen along directions (n, 3).
 
-    A gradient of no size has no direction: its colour has all of the diffuse light and no highlight.  `lit` 0 is in
-    shadow: ambient light alone.  With `soft_gradient` (HU per mm) directions of small gradients count less, see
-    `clrecon.rendering.Lighting`.  What goes beyond 1 is cut.
+    Normals count as turned to the camera, and a fixed light lights only what faces it.  A gradient of no size has no
+    direction: its colour has all of the diffuse light and no highlight.  `lit` 0 is in shadow: ambient light alone.
+    With `soft_gradient` (HU per mm) directions of small gradients count less, see `clrecon.rendering.Lighting`.  What
+    goes beyond 1 is cut.
     """
     magnitude = np.linalg.norm(gradients, axis=1)
     flat = magnitude < FLAT_GRADIENT
@@ -206,8 +207,11 @@ def shade(
     half_way = to_light + to_camera
     length = np.linalg.norm(half_way, axis=1, keepdims=True)
     half_way = np.divide(half_way, length, out=np.zeros_like(half_way), where=length > 1e-6)
-    diffuse = np.where(flat, 1.0, np.abs((normals * to_light).sum(axis=1)))
-    highlight = np.where(flat, 0.0, np.abs((normals * half_way).sum(axis=1)) ** lighting.specular_power)
+    along = (normals * to_light).sum(axis=1)
+    faces_light = along * (normals * to_camera).sum(axis=1) > 0.0  # light and camera on the same side
+    diffuse = np.where(flat, 1.0, np.where(faces_light, np.abs(along), 0.0))
+    shine = np.abs((normals * half_way).sum(axis=1)) ** lighting.specular_power
+    highlight = np.where(flat | ~faces_light, 0.0, shine)
     certain = magnitude**2 / (magnitude**2 + max(soft_gradient, FLAT_GRADIENT) ** 2)
     diffuse, highlight = 1.0 + certain * (diffuse - 1.0), certain * highlight
     share = np.broadcast_to(np.asarray(lit, dtype=np.float64), magnitude.shape)

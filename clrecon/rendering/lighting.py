@@ -30,9 +30,9 @@ def _number(name: str, value: Any, low: float, high: float) -> float:
 class Lighting:
     """How a surface with unit normal n, seen from v and lit from l, takes its colour c.
 
-    ``c * (ambient + diffuse * |n . l|) + specular * |n . h| ** specular_power`` with h halfway between l and v; both
-    sides of a surface are lit, and colours beyond 1 are cut.  Ambient 1 without diffuse and specular light is no
-    shading (`UNSHADED`).
+    ``c * (ambient + diffuse * n . l) + specular * (n . h) ** specular_power`` with h halfway between l and v, and n
+    turned to v; where n . l is not above 0 only the ambient light is left.  Colours beyond 1 are cut.  Ambient 1
+    without diffuse and specular light is no shading (`UNSHADED`).
 
     In volume rendering n is the direction of the gradient, which says little where the gradient g is small: in the
     middle of thin bone, and in noise.  There the light fades, with ``s = |g|^2 / (|g|^2 + soft_gradient^2)``, from

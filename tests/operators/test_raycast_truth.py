@@ -67,6 +67,26 @@ def test_light_fades_with_the_gradient(cast, soft_gradient):
     assert np.abs(image[..., :3] - truth).max() <= tolerances.RAY_SAME_255
 
 
+@pytest.mark.parametrize("rise", [60.0, -60.0])
+@pytest.mark.parametrize("mode", ["dvr", "surface"])
+def test_a_fixed_light_lights_only_the_side_that_faces_it(cast, mode, rise):
+    """A plane 50 degrees off the view; of the field that falls along the view a surface shows its cut face, facing the
+    camera.  A light from the patient's left reaches what is turned there, one from the right leaves ambient light."""
+    along = np.array([np.sin(np.radians(50.0)), np.cos(np.radians(50.0)), 0.0])
+    volume = even_volume(lambda p: 2000.0 + rise * (p @ along), "oblique", 14.0)
+    opaque = TransferFunction([(-3000, 1, 1, 1, 1), (9000, 1, 1, 1, 1)])
+    what = {"transfer_function": opaque} if mode == "dvr" else {"iso_value": 2000.0 - abs(rise)}
+    clip = Clip.plane(centre_of(volume), along if mode == "surface" else (0.0, 1.0, 0.0))
+    for side in (1.0, -1.0):
+        light = np.array([-side * np.sin(np.radians(20.0)), -np.cos(np.radians(20.0)), 0.0])
+        for turn in (light, np.array([-side, 0.0, 0.0])):
+            lighting = Lighting(0.2, 0.7, 0.0, direction=tuple(turn))
+            camera = look(volume, (0.0, 1.0, 0.0), 2.0)
+            image = cast(volume, mode, camera=camera, size=(8, 8), lighting=lighting, clip=clip, **what).image
+            truth = 255.0 * (0.2 + 0.7 * max(-along @ turn, 0.0))
+            assert np.abs(image[..., :3] - truth).max() <= tolerances.RAY_SAME_255 + 0.5
+
+
 def test_a_smaller_step_brings_a_picture_nearer(cast):
     volume = even_volume(blobs, "anisotropic", 18.0)
     soft = TransferFunction([(200, 1, 1, 1, 0.0), (300, 1, 1, 1, 0.5), (400, 1, 1, 1, 0.0)])
