@@ -4,14 +4,16 @@
  * models for direct volume rendering" (opacity of a segment).  Empty space is leapt over with a map of Chebyshev
  * distances (Cohen and Sheffer 1994, "Proximity clouds") and of what lies ahead.
  *
- * Where the transfer function is steep, segments are taken in parts, see steep_segments.h.
+ * Where the transfer function is steep, segments are taken in parts, see steep_segments.h.  A variant of its own does
+ * so: the samples beside each segment cost time, and functions without a steep place need none.
  *
  * A work-item has a packet of LANES neighbouring rays that go on together, sample by sample: they leap as far as all of
  * them may, and what they do next is decided once for all of them.
  *
  * -D UNEVEN             slices at places of their own
  * -D GRADIENT_OPACITY   opacity times a function of the gradient's magnitude
- * -D TAKES_PARTS=1      steep segments in parts; steps are so short that values are nearly linear between samples
+ * -D TAKES_PARTS=1      steep segments in parts; steps are so short that values are nearly linear between samples;
+ *                       default 0, samples alone
  * -D LABELS             labels with colours and opacities */
 #include "include/field.h"
 #include "include/inner_samples.h"
@@ -64,19 +66,29 @@ static inline floats weigh_opacity(const looks *look, const floats opacity, cons
     return stretch_opacity(factor * whole, (floats)(1.0f / look->steps_per_unit));
 }
 
-/* Opacity over one ray step of segment n of each ray, which is seen at `number`; 0 for segments that do not count.  With
- * `inner` they all count, lie within the volume with all voxels that they need, and are not the last of their rays. */
+/* Opacity over one ray step of segment n of each ray, which is seen at `number`; 0 for segments that do not count.
+ * With `inner` they all count, lie within the volume with all voxels that they need, and are not the last of their
+ * rays. */
 static inline floats find_opacity(const field *f, const slice_stack *stack, const looks *look, const ray_lanes *course,
     const packet *rays, const float n, const int inner, const ints counts, const segment_values *v, floats *number,
     floats *value)
 {
-    floats i, j, k, shift;
-    floats opacity = find_steep_opacity(
-        look, v, counts, (floats)(GATHER(float, look->opacities, find_node(v->here))), &shift, value);
+    floats i, j, k;
+    floats opacity = (floats)(GATHER(float, look->opacities, find_node(v->here)));
+    *number = n;
+    *value = v->here;
+#if TAKES_PARTS
+    floats shift;
+    opacity = find_steep_opacity(look, v, counts, opacity, &shift, value);
     *number = n + shift;
+#endif
     if (!inner) {
         find_places(stack, course, rays, (floats)(n), 0, &i, &j, &k);
+#if TAKES_PARTS
         *number = choose(rays->last == n, rays->last_number + shift * (rays->rest / look->ray_step), *number);
+#else
+        *number = lesser((floats)(n), rays->last_number);
+#endif
         ints within = (k >= look->slab_low) & (k < look->slab_high) & (n >= rays->begin);
 #ifdef UNEVEN
         within &= (i >= -0.5f) & (i <= f->last.x + 0.5f) & (j >= -0.5f) & (j <= f->last.y + 0.5f);
@@ -173,9 +185,10 @@ static inline void start_rays(const field *f, const looks *look, const int2 firs
     rays->last_number = rays->last - rays->phase * (1.0f - rays->rest / ray_step);
     const floats enter = greater(way.focus_in, (floats)(entry));
     const ints some = (x < (float)size.x) & (y < (float)size.y) & (segments > 0.0f) & (way.focus_out > enter);
-    /* The segments around the first and the last place that can show, and one more for rounding. */
-    const floats begin = round_up(greater((enter - way.t_in) / ray_step - rays->phase, (floats)(0.0f))) - 2.0f;
-    const floats end = round_up((way.focus_out - way.t_in) / ray_step - rays->phase) + 2.0f;
+    /* The samples, or the segments in parts, around the first and the last place that can show; one more to round. */
+    const float more = 1.0f + (float)BESIDE;
+    const floats begin = round_up(greater((enter - way.t_in) / ray_step - rays->phase, (floats)(0.0f))) - more;
+    const floats end = round_up((way.focus_out - way.t_in) / ray_step - rays->phase) + more;
     rays->begin = choose(some, greater(begin, (floats)(0.0f)), (floats)(MAXFLOAT));
     rays->end = choose(some, lesser(end, segments), (floats)(0.0f));
     find_inner(f, &way, way.t_in + rays->phase * ray_step, (floats)(ray_step), rays->last, look->slab_low,
@@ -258,9 +271,8 @@ __kernel void composite_rays(
     /* Values beyond the first and the last node count as these. */
     const float first_value = first_shown > 0 ? (float)first_shown : -MAXFLOAT;
     const float last_value = last_shown < NODES - 1 ? (float)last_shown + 1.0f : MAXFLOAT;
-    const looks look = { colors, opacities, clears, changes, narrow, highlights, factors, view, low, scale, factor_scale, steps_per_unit,
-        ray_step, slab_low, slab_high, first_value,
-        last_value, shaded,
+    const looks look = { colors, opacities, clears, changes, narrow, highlights, factors, view, low, scale,
+        factor_scale, steps_per_unit, ray_step, slab_low, slab_high, first_value, last_value, shaded,
 #ifdef LABELS
         labels, label_colors
 #endif
@@ -291,8 +303,11 @@ __kernel void composite_rays(
         load_sights(states, pixel_of_first, size, &seen);
     float n = LEAST_LANE(rays.begin);
     floats end = choose(seen.opacity < OPAQUE, rays.end, (floats)(0.0f));
+    int shows = 0; /* the samples before: then the next ones probably do too */
+#if TAKES_PARTS
     floats before = 0.0f, here = 0.0f; /* values of samples n - 1 and n, where `goes_on` */
-    int goes_on = 0, shows = 0; /* the samples before: then the next ones probably do too */
+    int goes_on = 0;
+#endif
     while (ANY_LANE(n < end)) {
         if (!shows) {
             /* The last sample of a ray lies before its place in the row. */
@@ -308,16 +323,19 @@ __kernel void composite_rays(
                 const float least = LEAST_LANE(choose(n < end, leap, (floats)(MAXFLOAT)));
                 const int whole = (int)least;
                 n += (float)max(whole + ((float)whole < least), 1);
+#if TAKES_PARTS
                 goes_on = 0;
+#endif
                 continue;
             }
         }
+#if TAKES_PARTS
         if (!goes_on) {
             int inner = HAS_INNER && n >= rays.inner_begin && n + 1.0f <= rays.inner_end;
             here = find_value(&f, &stack, &look, &course, &rays, (floats)(n), inner);
             /* The segment of the sample before reaches half way to this one.  Where one side of the values shows, and
              * this one does not, that segment shows nothing either. */
-            if (TAKES_PARTS && !(one_sided && !ANY_LANE((here >= look.first_value) & (here < look.last_value)))) {
+            if (!one_sided || ANY_LANE((here >= look.first_value) & (here < look.last_value))) {
                 n = max(n - 1.0f, 0.0f);
                 inner = HAS_INNER && n - 1.0f >= rays.inner_begin && n + 1.0f <= rays.inner_end;
                 const floats place = n > 0.0f ? (floats)(n - 1.0f) : -lesser(rays.phase, (floats)(0.5f));
@@ -329,9 +347,11 @@ __kernel void composite_rays(
             }
             goes_on = 1;
         }
+#endif
         for (int part = 0; part < SAMPLES_A_LOOK && ANY_LANE(n < end); part += AT_ONCE) {
-            floats value[AT_ONCE + 2];
-            const int inner = HAS_INNER && n - 1.0f >= rays.inner_begin && n + (float)(AT_ONCE + 1) <= rays.inner_end;
+            floats value[AT_ONCE + 2 * BESIDE];
+            const int inner = HAS_INNER && n - (float)BESIDE >= rays.inner_begin
+                && n + (float)(AT_ONCE + BESIDE) <= rays.inner_end;
 #if HAS_INNER
             const float early = n + SAMPLES_AHEAD;
             if (inner && early < rays.inner_end)
@@ -339,31 +359,46 @@ __kernel void composite_rays(
                     course.start_j.s0 + early * course.stride_j.s0, course.start_k.s0 + early * course.stride_k.s0);
 #endif
             /* Whether one of some samples may show is decided once: their loads need not wait for each other. */
+#if TAKES_PARTS
             value[0] = before;
             value[1] = here;
             floats least = lesser(before, here), most = greater(before, here), widest = fabs(here - before);
+#else
+            ints may_show = 0;
+#endif
 #if LANES == 1
 #pragma unroll
 #endif
-            for (int sample = 2; sample < AT_ONCE + 2; ++sample) {
+            for (int sample = 2 * BESIDE; sample < AT_ONCE + 2 * BESIDE; ++sample) {
                 value[sample] = find_value(
-                    &f, &stack, &look, &course, &rays, (floats)(n + (float)(sample - 1)), inner);
+                    &f, &stack, &look, &course, &rays, (floats)(n + (float)(sample - BESIDE)), inner);
+#if TAKES_PARTS
                 least = lesser(least, value[sample]);
                 most = greater(most, value[sample]);
                 widest = greater(widest, fabs(value[sample] - value[sample - 1]));
+#else
+                may_show |= (value[sample] >= look.first_value) & (value[sample] < look.last_value);
+#endif
             }
+#if TAKES_PARTS
             before = value[AT_ONCE];
             here = value[AT_ONCE + 1];
-            shows = ANY_LANE((most >= look.first_value) & (least < look.last_value) & (n < end));
-            const int may_be_steep = TAKES_PARTS && (has_dense || ANY_LANE(widest > narrow));
+            const ints may_show = (most >= look.first_value) & (least < look.last_value);
+            const int may_be_steep = has_dense || ANY_LANE(widest > narrow);
+#endif
+            shows = ANY_LANE(may_show & (n < end));
             if (shows) {
                 for (int sample = 0; sample < AT_ONCE; ++sample) {
                     const float segment = n + (float)sample;
                     const ints counts = segment < end;
                     if (!ANY_LANE(counts))
                         break;
+#if TAKES_PARTS
                     const segment_values v = { value[sample], value[sample + 1], value[sample + 2],
                         segment > 0.0f ? 2.0f : 1.0f, may_be_steep };
+#else
+                    const segment_values v = { value[sample] };
+#endif
                     floats number, seen_value;
                     const floats opacity = find_opacity(
                         &f, &stack, &look, &course, &rays, segment, inner, counts, &v, &number, &seen_value);

@@ -2,10 +2,10 @@
  *
  * A segment has its sample in its middle.  Where the transfer function is steep between that sample and its neighbours
  * the segment is taken in PARTS parts, with values of a parabola through these samples (pre-integrated tables take a
- * line: Engel, Kraus and Ertl 2001, "High-quality pre-integrated volume rendering"; lines cut the tops of thin bone off),
- * and its light and colour are those of the place where it is seen: without that, surfaces have rings like the grain of
- * wood.  What the twin in clrecon/reference/raycast.py does without leaps comes out the same: bricks that show nothing
- * hold no values between which something shows. */
+ * line: Engel, Kraus and Ertl 2001, "High-quality pre-integrated volume rendering"; lines cut the tops of thin bone
+ * off), and its light and colour are those of the place where it is seen: without that, surfaces have rings like the
+ * grain of wood.  What the twin in clrecon/reference/raycast.py does without leaps comes out the same: bricks that show
+ * nothing hold no values between which something shows. */
 #ifndef CLRECON_STEEP_SEGMENTS_H
 #define CLRECON_STEEP_SEGMENTS_H
 
@@ -21,6 +21,7 @@
 #ifndef TAKES_PARTS
 #define TAKES_PARTS 0
 #endif
+#define BESIDE TAKES_PARTS /* samples at either side of a segment that it needs */
 
 /* Rays in samples: number n is at t = t_in + (n + phase) * ray_step.  The last segment, number `last`, is what is left
  * of the way: its length is `rest`, and its sample has the number `last_number`, a fraction. */
@@ -79,21 +80,27 @@ static inline ints find_node(const floats value)
     return to_ints(lesser(greater(value, (floats)(0.0f)), (floats)(NODES - 1)));
 }
 
-/* Values of the samples before a segment, in its middle, and after it. */
+/* Values of the samples before a segment, in its middle, and after it; without parts that in its middle alone. */
 typedef struct {
+#if TAKES_PARTS
     floats before, here, after;
     float reach; /* twice the share of the way to `before` that values may go: half of it lies before the ray */
     int may_be_steep;
+#else
+    floats here;
+#endif
 } segment_values;
 
-/* Opacity over one ray step of a segment whose values run through its sample and the neighbours, where that is steep; `shift` is the place where it is seen, in samples from its own, 0 where it is not steep, and `value` is that of
- * this place. */
+#if TAKES_PARTS
+/* Opacity over one ray step of a segment whose values run through its sample and the neighbours, where that is steep;
+ * `shift` is the place where it is seen, in samples from its own, 0 where it is not steep, and `value` is that of this
+ * place. */
 static inline floats find_steep_opacity(
     const looks *look, const segment_values *v, const ints counts, const floats opacity, floats *shift, floats *value)
 {
     *shift = 0.0f;
     *value = v->here;
-    if (!TAKES_PARTS || !v->may_be_steep)
+    if (!v->may_be_steep)
         return opacity;
     /* What surely shows nothing plays no part: rays may have leapt to here. */
     const ints clear_before = ((v->before < look->first_value) & (v->here < look->first_value))
@@ -129,5 +136,6 @@ static inline floats find_steep_opacity(
     *value = choose(steep, seen_value * share, *value);
     return choose(steep, whole, opacity);
 }
+#endif
 
 #endif

@@ -47,7 +47,6 @@ __all__ = [
     "layer_normal_matrices",
     "slice_normal_matrices",
     "takes_parts",
-    "takes_parts",
     "vertex_margin",
 ]
 
