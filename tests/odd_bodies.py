@@ -14,8 +14,8 @@ from clrecon.phantom import KINDS, MATERIALS, PhantomSettings, label_materials, 
 
 COARSE = 2.8
 """Steps of a small phantom in those of its kind: 2.5 to 5 mm."""
-FINER = {"bones": 2.3}
-"""The same where rims in the table are as thin as a coarse voxel."""
+FINER = dict.fromkeys(("bones", "limb", "skull", "skull-prone"), 2.3)
+"""The same of those whose rims in the table, or whose table, are as thin as a coarse voxel, and of what lies beside."""
 
 BODIES: dict[str, dict[str, Any]] = {
     "skull": {"kind": "skull", "table": "headrest"},
