@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """Make the pictures of README and docs/rendering.md anew, from a phantom.
 
-    clrecon phantom --kind spine --size 512x512 --slices 149 -o SPINE
+    clrecon phantom SPINE --kind spine --size 512x512 --slices 149 --spacing 0.7 0.7 1.0
     python scripts/make_gallery.py SPINE docs/images
 
 The one beside VTK needs scikit-image too, and prints how alike the two are.
