@@ -139,12 +139,14 @@ def test_files_hold_what_the_mesh_does(far_mesh, extension, space, tmp_path):
     points, faces = read_back(path, space)
     warnings = describe_rounding(far_mesh, extension)
     expected = far_mesh.vertices[far_mesh.triangles]
-    off = np.abs(points[faces] - expected).max()
+    off = np.abs(points[faces] - expected)
     if extension == ".stl":
-        assert off <= 0.5 * float32_step(1e5)
+        steps = off / float32_step(1e5)
+        assert steps.max() <= 1.5  # what rounding brings to one place is kept apart by a step
+        assert np.mean(steps.max(axis=2) > 0.5) <= 0.01
         assert "steps of 0.0078 mm" in warnings[0]
     else:
-        assert off <= tolerances.FAR_FILE_MM
+        assert off.max() <= tolerances.FAR_FILE_MM
         assert warnings == []
 
 
