@@ -2,11 +2,13 @@
 
 Bone has a compact wall: within some millimetres under its surface values rise to 600 HU and more somewhere on every
 bone, and they vary from place to place.  Heart and vessels with contrast medium are of one value that stays below, and
-go on with it beneath the surface.  Thin shells of a table reach neither.  Figures are in docs/iso_value.md.
+go on with it beneath the surface.  Thin shells of a table reach neither.  Within a voxel everything is even: in voxels
+of more than 1 mm depths are counted in voxels.  Figures are in docs/iso_value.md.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -36,14 +38,13 @@ __all__ = [
 COMPACT_HU = 600.0
 """Compact bone reaches it under its surface; contrast medium in heart and vessels stays below."""
 METAL_HU = 2000.0
-DEPTHS_MM = tuple(0.5 * step for step in range(9))
-"""Along the inward normal."""
-WALL_MM = 3.0
-"""The wall is the highest value up to this depth."""
-FLAT_MM, FLAT_HU = 1.5, 120.0
-"""A wall is flat where it has ended by this depth, and values beyond differ by no more."""
-NEAR_MM = 15.0
-"""Bone has compact walls somewhere within this distance of every place."""
+WALL_MM = (0.0, 0.5, 1.0, 1.5, 2.0, 2.5, 3.0)
+"""Depths along the inward normal: the wall is the highest value there.  To 1.5 voxels where that is deeper."""
+FLAT_MM, FLAT_HU = (1.5, 2.0, 2.5, 3.0, 3.5, 4.0), 120.0
+"""A wall is flat where it has ended at these depths, in voxels where they are of more than 1 mm along the normal:
+values there differ by no more."""
+NEAR_MM, NEAR_STEPS = 15.0, 5.0
+"""Bone has compact walls somewhere within this distance, or so many voxels, of every place: coarse ones blur most."""
 LEAST_COMPACT = 0.05
 FAINT_HU, FAINT_SPREAD_HU = 500.0, 200.0
 """Thin bone whose walls are blurred away: the densest places reach this, and stand out from the rest by so much.
@@ -67,18 +68,21 @@ class Walls:
     ----------
     points : ndarray, shape (n, 3), float64, LPS mm
     wall : ndarray, HU
-        Highest value up to `WALL_MM` beneath.
+        Highest value at the depths `WALL_MM`.
     flat : ndarray, bool
         Beneath it is of one value, below `COMPACT_HU` and inside all the way to the last depth.
+    near_mm : float
+        How far off a compact wall may be.
     """
 
     points: NDArray[np.float64]
     wall: NDArray[np.float64]
     flat: NDArray[np.bool_]
+    near_mm: float = NEAR_MM
 
     def where(self, rows: slice) -> Walls:
         """Those of some of the vertices."""
-        return Walls(self.points[rows], self.wall[rows], self.flat[rows])
+        return Walls(self.points[rows], self.wall[rows], self.flat[rows], self.near_mm)
 
 
 def sample_walls(vertices: NDArray[np.floating], normals: NDArray[np.floating], volume: Volume, rule: IsoRule) -> Walls:
@@ -93,14 +97,23 @@ def sample_walls(vertices: NDArray[np.floating], normals: NDArray[np.floating], 
         The mesh was made with it.
     """
     points, inward = vertices.astype(np.float64), -normals.astype(np.float64)
-    values = np.empty((len(DEPTHS_MM), len(points)))
-    for value, depth in zip(values, DEPTHS_MM, strict=True):
-        value[:] = trilinear_values(volume, rule, volume.lps_to_ijk(points + depth * inward))
-    depths = np.array(DEPTHS_MM)
-    wall = values[depths <= WALL_MM].max(axis=0)
-    deep = values[depths >= FLAT_MM]
+    longer = np.maximum(_step_along(inward, volume), 1.0)
+
+    def look_beneath(depths_mm: Sequence[float], times: NDArray[np.float64]) -> NDArray[np.float64]:
+        ways = (points + (depth * times)[:, None] * inward for depth in depths_mm)
+        return np.stack([trilinear_values(volume, rule, volume.lps_to_ijk(way)) for way in ways])
+
+    wall = look_beneath(WALL_MM, np.maximum(FLAT_MM[0] * longer / WALL_MM[-1], 1.0)).max(axis=0)
+    deep = look_beneath(FLAT_MM, longer)
     low, high = deep.min(axis=0), deep.max(axis=0)
-    return Walls(points, wall, (wall < COMPACT_HU) & (low > rule.iso_level) & (high - low < FLAT_HU))
+    flat = (wall < COMPACT_HU) & (low > rule.iso_level) & (high - low < FLAT_HU)
+    return Walls(points, wall, flat, max(NEAR_MM, NEAR_STEPS * max(volume.spacing)))
+
+
+def _step_along(directions: NDArray[np.float64], volume: Volume) -> NDArray[np.float64]:
+    """Way in mm along unit vectors (n, 3) from one plane of voxels to the next, of the axis that they cross soonest."""
+    steps = directions @ np.linalg.inv(volume.affine[:3, :3]).T
+    return np.asarray(1.0 / np.maximum(np.abs(steps).max(axis=1), 1e-9))
 
 
 def judge_walls(walls: Walls) -> dict[str, Any]:
@@ -112,7 +125,7 @@ def judge_walls(walls: Walls) -> dict[str, Any]:
         ``looks_like`` : "bone", "faint bone", "metal", "contrast medium" (or another even body) or "no bone" (a thin
         shell of a table, noise)
         ``compact_share`` : of the surface, how much has a wall of `COMPACT_HU` or more
-        ``contrast_share`` : how much is flat beneath and has no compact wall within about `NEAR_MM`
+        ``contrast_share`` : how much is flat beneath and has no compact wall within about ``near_mm``
         ``metal_share`` : how much has a wall above `METAL_HU`
         ``wall_hu`` : ``{"median", "p90", "p99"}`` of the walls
         ``samples`` : int, vertices looked at
@@ -120,7 +133,7 @@ def judge_walls(walls: Walls) -> dict[str, Any]:
     median, p90, p99 = (float(value) for value in np.percentile(walls.wall, (50, 90, 99)))
     compact = walls.wall >= COMPACT_HU
     compact_share = float(compact.mean())
-    contrast_share = float((walls.flat & ~_is_near(walls.points, compact)).mean())
+    contrast_share = float((walls.flat & ~_is_near(walls.points, compact, walls.near_mm)).mean())
     metal_share = float((walls.wall > METAL_HU).mean())
     if metal_share > 0.5:
         looks_like = "metal"
@@ -256,9 +269,9 @@ def normals_of(mesh: Mesh) -> NDArray[np.float32]:
     return mesh.normals
 
 
-def _is_near(points: NDArray[np.float64], marked: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Points with a marked one in their cell of `NEAR_MM` or in one of the 26 around it."""
-    cells = np.floor((points - points.min(axis=0)) / NEAR_MM).astype(np.int64) + 1
+def _is_near(points: NDArray[np.float64], marked: NDArray[np.bool_], size_mm: float) -> NDArray[np.bool_]:
+    """Points with a marked one in their cell of `size_mm` or in one of the 26 around it."""
+    cells = np.floor((points - points.min(axis=0)) / size_mm).astype(np.int64) + 1
     sizes = cells.max(axis=0) + 2
     strides = np.array([sizes[1] * sizes[2], sizes[2], 1])
     near = np.unique(cells[marked] @ strides)

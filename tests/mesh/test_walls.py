@@ -11,6 +11,7 @@ from clrecon.geometry.field import choose_iso_rule
 from clrecon.mesh import Mesh
 from clrecon.mesh.connectivity import label_components
 from clrecon.mesh.walls import Walls, judge_components, judge_walls, looks_like_bone, normals_of, sample_walls
+from clrecon.phantom import KINDS, PhantomSettings, make_phantom
 from clrecon.reference.isosurface import extract_isosurface
 
 AFFINE = np.diag((1.0, 1.0, 1.5, 1.0))
@@ -89,3 +90,38 @@ def test_walls_are_looked_for_along_normals():
     assert judge_walls(outside)["wall_hu"]["median"] < 260.0
     with pytest.raises(UsageError, match="the mesh has none"):
         normals_of(Mesh(vertices, triangles))
+
+
+@pytest.mark.parametrize(("kind", "kept_before"), [("spine", 0.31), ("contrast", 0.21), ("pelvis", 0.54)])
+def test_coarse_voxels_are_no_contrast_medium(kind, kept_before):
+    """In voxels of 4 mm all is even from 1.5 to 4 mm: `kept_before` of the bone counted as contrast medium."""
+    dj, _, dk = KINDS[kind].spacing
+    settings = PhantomSettings(kind, (round(64 * dj),) * 2, slices=round(30 * dk), spacing=(4.0, 4.0, 4.0))
+    volume = Volume(*make_phantom(settings)[:2])
+    vertices, normals, triangles = extract_isosurface(volume, 200.0)
+    mesh, rule = Mesh(vertices, triangles, normals.astype(np.float32)), choose_iso_rule(volume, 200.0)
+    count, labels = label_components(mesh.triangles, mesh.vertex_count)
+    judged = judge_components(mesh, volume, rule, count, labels)
+    bone = np.array([looks_like_bone(one) for one in judged])[labels]
+    kept = judge_walls(sample_walls(vertices[bone], mesh.normals[bone], volume, rule))
+    assert kept["contrast_share"] < 0.025 < 0.15 * kept_before
+    whole = judge_walls(sample_walls(vertices, mesh.normals, volume, rule))
+    others = [one for one in judged if one is not None and not looks_like_bone(one)]
+    if kind == "contrast":  # heart, aorta, vena cava, kidneys
+        assert [one["looks_like"] for one in others] == ["contrast medium"] * 5
+        assert whole["contrast_share"] > 0.2
+    else:
+        assert {one["looks_like"] for one in others} <= {"no bone", "metal"}
+        assert whole["contrast_share"] < 0.025
+
+
+def test_depths_are_in_voxels_along_the_normal():
+    """One slab of even HU that ends 8 mm deep: in voxels of 1 mm that is flat beneath, in slices of 4 mm it is not."""
+    for thick, is_flat in ((1.0, True), (4.0, False)):
+        k = np.arange(40) * thick
+        slab = np.where((k > 20.0) & (k < 28.0 + thick), 300.0, 0.0)
+        volume = Volume(np.tile(slab[:, None, None], (1, 4, 4)).astype(np.int16), np.diag((1.0, 1.0, thick, 1.0)))
+        points = np.array([[1.5, 1.5, 20.6]])
+        walls = sample_walls(points, np.array([[0.0, 0.0, -1.0]]), volume, choose_iso_rule(volume, 100.0))
+        assert walls.flat.tolist() == [is_flat]
+        assert walls.near_mm == max(15.0, 5.0 * thick)
