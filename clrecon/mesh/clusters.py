@@ -14,7 +14,7 @@ from clrecon.mesh.connectivity import (
     opposite_half_edges,
 )
 from clrecon.mesh.coordinates import as_stored, find_coincident
-from clrecon.mesh.deviation import Deviation
+from clrecon.mesh.deviation import WITNESSES, Deviation
 from clrecon.mesh.intersections import find_beside, find_self_intersections
 from clrecon.mesh.measures import cross_products
 
@@ -44,6 +44,10 @@ class Clusters:
         self._names, self._places = np.arange(len(vertices)), self._rounded(vertices)
         self._before = self._names, self._places
         self._components = label_components(triangles, len(vertices))
+        # For each triangle as it was those whose faces show that it lies within the bound; -1 where that is not known.
+        itself = np.where(self._is_face(triangles), np.arange(len(triangles), dtype=np.int32), np.int32(-1))
+        self._witnesses = np.repeat(itself[None], WITNESSES, axis=0)
+        self._witnesses_before = self._witnesses
         # Vertices whose name or place is new since the surface was last looked at for cuts and for distances.
         self._new_to_cuts, self._new_to_distances = (np.zeros(len(vertices), dtype=bool) for _ in range(2))
 
@@ -85,7 +89,7 @@ class Clusters:
         # A vertex that nothing went into stays where it is.
         gained = np.bincount(rename, minlength=len(names))[going_on] > 1
         places[going_on[gained]] = self._rounded(points[gained])
-        self._before = self._names, self._places
+        self._before, self._witnesses_before = (self._names, self._places), self._witnesses.copy()
         self._names, self._places = names, places
         new = self._has_moved()
         for fresh in (self._new_to_cuts, self._new_to_distances):
@@ -148,7 +152,8 @@ class Clusters:
     def _has_moved(self) -> NDArray[np.bool_]:
         """Vertices whose name, or the place of it, is another than before the last round."""
         names_before, places_before = self._before
-        return (self._names != names_before) | (self._places[self._names] != places_before[names_before]).any(axis=1)
+        x, y, z = (self._places != places_before).T
+        return np.asarray((self._names != names_before) | (x | y | z)[self._names])
 
     def find_faults(self) -> IntArray:
         """Names of clusters that have spoilt the surface.
@@ -206,35 +211,63 @@ class Clusters:
     def find_crossing(self) -> IntArray:
         """Names of clusters at faces that cut each other once coordinates are rounded.
 
-        Only faces that have changed since the last call are looked at, with what lies around them.
+        Only faces that have changed since the last call, and are not as they were before the round, are looked at, with
+        what lies around them.
         """
-        faces = self.faces()
-        changed = np.asarray(self._new_to_cuts[faces].any(axis=1))
+        named = self._names.astype(np.uint32)[self._triangles]
+        is_face = self._is_face(named)
+        faces = named[is_face]
+        changed = _any_corner(self._new_to_cuts, faces) & _any_corner(self._has_moved(), self._triangles[is_face])
         self._new_to_cuts[:] = False
         stored = self._stored()
-        faces = faces[find_beside(stored, faces, changed)]
-        return np.unique(faces[find_self_intersections(stored, faces)])
+        near = find_beside(stored, faces, changed)
+        faces = faces[near]
+        return np.unique(faces[find_self_intersections(stored, faces, changed[near])])
 
     def find_far(self, deviation: Deviation) -> IntArray:
         """Names of clusters where the surface has moved too far, or from where a part of it has gone too far.
 
-        Only what has changed since the last call is looked at.
+        Only what has changed since the last call and since before the round is looked at: what lay within the bound
+        before the round does so again where it was undone.
 
         Parameters
         ----------
         deviation : Deviation
             The surface as it was, with the same triangles, and the bound.
         """
-        faces = self.faces()
-        changed = self._new_to_distances[faces].any(axis=1)
+        named = self._names.astype(np.uint32)[self._triangles]
+        is_face = self._is_face(named)
+        new = _any_corner(self._new_to_distances, named)
         self._new_to_distances[:] = False
-        # Of a triangle as it was the distance is taken from the faces around its names: where one of these is new.
-        touched = np.zeros(len(self._names), dtype=bool)
-        touched[faces[changed]] = True
-        named = self._names[self._triangles]
-        rows = np.flatnonzero(touched[named].any(axis=1))
+        differs = _any_corner(self._has_moved(), self._triangles)
+
+        changed = _any_witness(new, self._witnesses)
+        as_before = changed & ~_any_witness(differs, self._witnesses_before)
+        self._witnesses[:, as_before] = self._witnesses_before[:, as_before]
+        rows = np.flatnonzero(changed & ~as_before)
+        self._witnesses[:, rows] = rows
         rows = rows[deviation.can_be_far(rows, self._names, self._places)]
-        left_behind = rows[deviation.is_far_from(rows, self._names, self._places, faces)]
-        now = faces[changed]
+        is_left_behind, seen = deviation.is_far_from(rows, self._names, self._places, named[is_face])
+        self._witnesses[:, rows] = np.append(np.flatnonzero(is_face), -1)[seen]
+
+        now = named[is_face & new & differs]
         away = now[deviation.are_far(self._places, now)]
-        return np.unique(np.concatenate([named[left_behind].reshape(-1), away.reshape(-1)]))
+        # One that is as it was before the round comes within the bound again when what it was near to comes back.
+        left_behind = rows[is_left_behind]
+        left_alone = self._witnesses_before[:, left_behind[~differs[left_behind]]]
+        found = named[left_behind], away, named[left_alone[left_alone >= 0]]
+        return np.unique(np.concatenate([names.reshape(-1) for names in found]))
+
+
+def _any_corner(flags: NDArray[np.bool_], triangles: IntArray) -> NDArray[np.bool_]:
+    """Which triangles, shape (m, 3), have a corner whose flag is set."""
+    a, b, c = triangles.T
+    return np.asarray(flags[a] | flags[b] | flags[c])
+
+
+def _any_witness(flags: NDArray[np.bool_], witnesses: IntArray) -> NDArray[np.bool_]:
+    """Which triangles have a witness, shape (7, m), whose flag is set, or none."""
+    found = witnesses[0] < 0
+    for rows in witnesses:
+        found |= flags[rows]
+    return found

@@ -7,10 +7,19 @@ from numpy.typing import NDArray
 
 from clrecon.mesh.distances import NearDistance
 
-__all__ = ["Deviation"]
+__all__ = ["WITNESSES", "Deviation"]
+
+WITNESSES = 7
+"""Faces that can be needed to show that a triangle is within the bound: for its corners, its middle and its edges."""
 
 _MOST_STEPS = 12
 """Parts of an edge of the surface as it is now that are looked at, at most."""
+
+_MANY = 10_000
+"""Points from which on it pays to start threads."""
+
+_MIDDLES = np.array([[1, 1, 1], [1, 1, 0], [0, 1, 1], [1, 0, 1]]) / [[3], [2], [2], [2]]
+"""Barycentric coordinates of the middle of a triangle and of its edges."""
 
 Float64Array = NDArray[np.float64]
 IntArray = NDArray[np.integer]
@@ -55,11 +64,12 @@ class Deviation:
         changed = (a == b) | (b == c) | (c == a)
         step = places[names] - self._vertices
         has_moved = np.einsum("na,na->n", step, step) > self._bound * self._bound
-        return np.asarray(changed | has_moved[triangles].any(axis=1))
+        one, two, three = triangles.T
+        return np.asarray(changed | has_moved[one] | has_moved[two] | has_moved[three])
 
     def is_far_from(
         self, rows: IntArray, names: IntArray, places: Float64Array, faces: NDArray[np.uint32]
-    ) -> NDArray[np.bool_]:
+    ) -> tuple[NDArray[np.bool_], IntArray]:
         """Which triangles of the surface as it was lie further than the bound from the surface as it is now.
 
         The distance from one triangle is a convex function: where the corners all lie within the bound of one triangle,
@@ -79,26 +89,34 @@ class Deviation:
 
         Returns
         -------
-        ndarray, shape (k,), bool
+        far : ndarray, shape (k,), bool
+        witnesses : ndarray, shape (7, k), int
+            Rows of `faces` that show that a triangle is within: as long as these stay, it is.  -1 where it is not.
         """
         now = NearDistance(places, faces)
         triangles = self._triangles[rows]
-        used, number = np.unique(triangles, return_inverse=True)
-        number = number.reshape(triangles.shape)
-        length, nearest = now.find_around(self._vertices[used], names[used][:, None])
+        used = np.zeros(len(names), dtype=bool)
+        used[triangles] = True
+        number = np.cumsum(used)[triangles] - 1
+        used = np.flatnonzero(used)
+        length, nearest = now.find_within(self._vertices[used], names[used], self._bound)
         far = np.asarray((length > self._bound)[number].any(axis=1))
+        beside = nearest[number]
+        witnesses = np.concatenate([beside.T, np.repeat(beside[:, :1].T, WITNESSES - 3, axis=0)])
         # The middle of the triangle and of its edges, from the faces that are nearest to the corners, then from all.
         rest = np.flatnonzero(~far)
-        rest = rest[~self._are_within(now, self._vertices[triangles[rest]], nearest[number[rest]])]
-        corners = self._vertices[triangles[rest]]
-        points = np.einsum("wi,nia->nwa", _weights(2), corners).reshape(-1, 3)
-        of, beside = (np.repeat(values, 4, axis=0) for values in (rest, nearest[number[rest]]))
+        rest = rest[~self._are_within(now, self._vertices[triangles[rest]], beside[rest])]
+        points = np.einsum("wi,nia->wna", _MIDDLES, self._vertices[triangles[rest]]).reshape(-1, 3)
+        point = np.arange(len(points))
         for corner in range(3):
-            beyond = now.from_triangles(points, beside[:, corner]) > self._bound
-            of, points, beside = of[beyond], points[beyond], beside[beyond]
-        beyond = now.find_around(points, names[triangles[of]])[0] > self._bound
-        far[of[beyond]] = True
-        return far
+            near = beside[rest[point % len(rest)], corner]
+            point = point[now.from_triangles(points[point], near) > self._bound]
+        of = rest[point % len(rest)]
+        length, row = now.find_around(points[point], names[triangles[of]])
+        witnesses[3 + point // len(rest), of] = row
+        far[of[length > self._bound]] = True
+        witnesses[:, far] = -1
+        return far, witnesses
 
     def _are_within(self, now: NearDistance, corners: Float64Array, nearest: IntArray) -> NDArray[np.bool_]:
         """Whether one of the faces that are nearest to the corners, shape (k, 3), is within the bound of all three."""
@@ -131,32 +149,45 @@ class Deviation:
         far = np.zeros(len(faces), dtype=bool)
         if len(faces) == 0:
             return far
+        a, b, c = faces.T
         used = np.unique(faces)
         is_far = np.zeros(len(places), dtype=bool)
         is_far[used] = self._find_far(places[used])
-        far |= is_far[faces].any(axis=1)
-        edges = places[faces[:, (1, 2, 0)]] - places[faces]
-        longest = np.sqrt(np.einsum("nia,nia->ni", edges, edges)).max(axis=1)
+        far |= is_far[a] | is_far[b] | is_far[c]
+
+        start, end = (corners.reshape(-1) for corners in (faces, faces[:, (1, 2, 0)]))
+        key = np.minimum(start, end) * np.int64(len(places)) + np.maximum(start, end)
+        key, edge = np.unique(key, return_inverse=True)
+        ends = np.stack(np.divmod(key, len(places)), axis=1)
+        is_far = self._find_far_within(places[ends], ~is_far[ends].any(axis=1))
+        a, b, c = edge.reshape(-1, 3).T
+        far |= is_far[a] | is_far[b] | is_far[c]
+        return far | self._find_far_within(places[faces], ~far)
+
+    def _find_far_within(self, corners: Float64Array, look_at: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Which edges, shape (n, 2, 3), or triangles, shape (n, 3, 3), have a point inside that lies too far."""
+        sides = corners - np.roll(corners, 1, axis=1)
+        longest = np.sqrt(np.einsum("nia,nia->in", sides, sides).max(axis=0))
         steps = np.clip(2 * np.ceil(longest / (4.0 * self._step)), 2, _MOST_STEPS).astype(int)
+        far = np.zeros(len(corners), dtype=bool)
         for count in np.unique(steps):
-            these = np.flatnonzero((steps == count) & ~far)
-            weights = _weights(int(count))
-            points = np.einsum("wi,nia->nwa", weights, places[faces[these]])
-            found = self._find_far(points.reshape(-1, 3))
-            far[these] = found.reshape(points.shape[:2]).any(axis=1)
+            these = np.flatnonzero((steps == count) & look_at)
+            weights = _inner_weights(int(count), corners.shape[1])
+            points = np.einsum("wi,nia->nwa", weights, corners[these])
+            far[these] = self._find_far(points.reshape(-1, 3)).reshape(points.shape[:2]).any(axis=1)
         return far
 
     def _find_far(self, points: Float64Array) -> NDArray[np.bool_]:
-        near = self._tree.query(points, workers=-1)[1]
+        near = self._tree.query(points, workers=-1 if len(points) > _MANY else 1)[1]
         far: NDArray[np.bool_] = self._distance(points, near, self._bound) > self._bound
         return far
 
 
-def _weights(steps: int) -> Float64Array:
-    """Barycentric coordinates of the middle of a triangle and of a lattice without its corners, shape (w, 3)."""
-    i, j = (axis.reshape(-1) for axis in np.meshgrid(np.arange(steps), np.arange(steps), indexing="ij"))
-    inside = i + j <= steps
-    k = steps - i - j
-    inside &= k < steps
-    lattice = np.column_stack([i, j, k])[inside] / steps
-    return np.concatenate([np.full((1, 3), 1.0 / 3.0), lattice])
+def _inner_weights(steps: int, corners: int) -> Float64Array:
+    """Barycentric coordinates of a lattice inside of an edge (2 corners) or a triangle (3), and of its middle."""
+    axes = np.meshgrid(*[np.arange(1, steps)] * (corners - 1), indexing="ij")
+    lattice = np.stack([axis.reshape(-1) for axis in axes], axis=1)
+    last = steps - lattice.sum(axis=1, keepdims=True)
+    lattice = np.concatenate([lattice, last], axis=1)[last[:, 0] > 0]
+    middle = np.full((1, corners), 1.0 / corners)
+    return np.unique(np.concatenate([lattice / steps, middle]), axis=0)

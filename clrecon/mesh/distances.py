@@ -147,15 +147,28 @@ class NearDistance:
         limit : float
             mm.
         """
-        found, _ = self._around(points, near, _perpendicular)
+        found, _ = self.find_within(points, near, limit)
         rest = np.flatnonzero(~(found <= limit))
-        if len(rest):
-            found[rest], _ = self._around(points[rest], near[rest], triangle_distances)
-            rest = rest[~(found[rest] <= limit)]
         if len(rest):
             self._exact = self._exact or SurfaceDistance(self._vertices, self._triangles)
             found[rest] = self._exact(points[rest])
         return found
+
+    def find_within(
+        self, points: Points, near: NDArray[np.integer], limit: float
+    ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+        """Distances from the triangles around one vertex alone, and their rows; up to the limit as `__call__` says.
+
+        Parameters
+        ----------
+        points, near, limit
+            As in `__call__`.
+        """
+        found, rows = self._around(points, near, _perpendicular)
+        rest = np.flatnonzero(~(found <= limit))
+        if len(rest):
+            found[rest], rows[rest] = self._around(points[rest], near[rest], triangle_distances)
+        return found, rows
 
     def find_around(self, points: Points, near: NDArray[np.integer]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
         """Distances from the triangles around some vertices alone: infinite, and row -1, where there is none.
@@ -182,7 +195,9 @@ class NearDistance:
 
     def _corners(self, rows: NDArray[np.integer]) -> tuple[Columns, Columns, Columns]:
         a, b, c = self._triangles[rows].T.astype(np.intp)
-        return self._columns.take(a, axis=1), self._columns.take(b, axis=1), self._columns.take(c, axis=1)
+        # "clip" saves the check of every index, which costs more than the look-up; triangles have been checked.
+        one, two, three = (self._columns.take(corner, axis=1, mode="clip") for corner in (a, b, c))
+        return one, two, three
 
     def _around(
         self, points: Points, near: NDArray[np.integer], measure: Callable[..., NDArray[np.float64]]
@@ -195,7 +210,8 @@ class NearDistance:
             start = np.concatenate([[0], np.cumsum(count)[:-1]])
             pair = np.repeat(np.arange(len(count)), count)
             row = self._face_of[np.arange(len(pair)) - start[pair] + first[pair]]
-            length = measure(points[where].T.take(pair, axis=1), *self._corners(row))
+            columns = np.ascontiguousarray(points[where].T)
+            length = measure(columns.take(pair, axis=1, mode="clip"), *self._corners(row))
             some = count > 0
             if some.any():
                 found[where][some] = np.minimum.reduceat(length, start[some])

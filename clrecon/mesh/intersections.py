@@ -28,7 +28,9 @@ def count_self_intersections(vertices: NDArray[np.floating], triangles: NDArray[
     return len(find_self_intersections(vertices, triangles))
 
 
-def find_self_intersections(vertices: NDArray[np.floating], triangles: NDArray[np.uint32]) -> NDArray[np.int64]:
+def find_self_intersections(
+    vertices: NDArray[np.floating], triangles: NDArray[np.uint32], changed: NDArray[np.bool_] | None = None
+) -> NDArray[np.int64]:
     """Find the pairs of triangles that cut each other.
 
     Two triangles cut each other when an edge of one goes through the inside of the other (Moeller 1997 for the
@@ -38,6 +40,8 @@ def find_self_intersections(vertices: NDArray[np.floating], triangles: NDArray[n
     ----------
     vertices : ndarray, shape (n, 3), mm
     triangles : ndarray, shape (m, 3), uint32
+    changed : ndarray, shape (m,), bool, optional
+        Only pairs with one of these are looked at.
 
     Returns
     -------
@@ -50,6 +54,9 @@ def find_self_intersections(vertices: NDArray[np.floating], triangles: NDArray[n
         low, high = (np.ascontiguousarray(end.T) for end in (points.min(axis=0), points.max(axis=0)))
         corners = np.ascontiguousarray(triangles.T)
         for one, other in _neighbours(low, high):
+            if changed is not None:
+                looked_at = changed.take(one) | changed.take(other)
+                one, other = one[looked_at], other[looked_at]
             for axis in range(3):
                 overlap = low[axis].take(one) <= high[axis].take(other)
                 overlap &= low[axis].take(other) <= high[axis].take(one)
@@ -143,15 +150,19 @@ def _enter_into_cells(first: NDArray[np.int32], last: NDArray[np.int32]) -> tupl
 def _cut(one: Float64Array, other: Float64Array) -> NDArray[np.bool_]:
     """Does an edge of one triangle go through the inside of the other; corners have shape (3, k, 3)."""
     found = np.zeros(one.shape[1], dtype=bool)
-    for edges, face in ((one, other), (other, one)):
-        sides = [_volume(face[0], face[1], face[2], corner) for corner in edges]
+    rows = np.arange(one.shape[1])
+    for _ in range(2):
+        sides = np.stack([_volume(other[0], other[1], other[2], corner) for corner in one])
+        # What lies on one side of the other's plane is cut by none of its edges either.
+        astride = (sides > 0.0).any(axis=0) & (sides < 0.0).any(axis=0)
+        rows, one, other, sides = rows[astride], one[:, astride], other[:, astride], sides[:, astride]
         for a, b in ((0, 1), (1, 2), (2, 0)):
-            through = np.flatnonzero((sides[a] > 0.0) != (sides[b] > 0.0))
-            through = through[(sides[a][through] != 0.0) & (sides[b][through] != 0.0)]
-            p, q = edges[a][through], edges[b][through]
-            turns = [_volume(p, q, face[c][through], face[(c + 1) % 3][through]) for c in range(3)]
+            through = np.flatnonzero(((sides[a] > 0.0) & (sides[b] < 0.0)) | ((sides[a] < 0.0) & (sides[b] > 0.0)))
+            p, q = one[a][through], one[b][through]
+            turns = [_volume(p, q, other[c][through], other[(c + 1) % 3][through]) for c in range(3)]
             inside = np.all([turn > 0.0 for turn in turns], axis=0) | np.all([turn < 0.0 for turn in turns], axis=0)
-            found[through] |= inside
+            found[rows[through]] |= inside
+        one, other = other, one
     return found
 
 

@@ -38,7 +38,7 @@ _TRIES = 200
 """Of mending, at most; each undoes something, on CT 3 to 8 are needed."""
 
 _ROUNDS = 12
-_LEAST_GAIN = 0.08
+_LEAST_GAIN = 0.15
 """Rounds of collapses go on while one takes away more than this share of the triangles that are left."""
 
 _SHARE_SLACK = 0.005

@@ -165,7 +165,8 @@ def _find_spoilt(
         where.start + np.flatnonzero(~cross.any(axis=0))
         for where, _, cross in cross_products(vertices, triangles, np.zeros(3))
     ]
-    near = triangles[find_beside(vertices, triangles, look_at)]
-    cut = near[find_self_intersections(vertices, near)]
+    beside = find_beside(vertices, triangles, look_at)
+    near = triangles[beside]
+    cut = near[find_self_intersections(vertices, near, None if look_at.all() else look_at[beside])]
     found = [triangles[np.concatenate(flat)].reshape(-1), cut.reshape(-1), find_coincident(vertices)]
     return np.unique(np.concatenate(found).astype(np.int64))

@@ -11,9 +11,10 @@ from clrecon.errors import UsageError
 from clrecon.geometry import Volume
 from clrecon.mesh import Mesh, split_components
 from clrecon.mesh.clusters import Clusters
+from clrecon.mesh.deviation import Deviation
 from clrecon.mesh.distances import SurfaceDistance
 from clrecon.mesh.intersections import count_self_intersections
-from clrecon.mesh.refinement import decimate_mesh
+from clrecon.mesh.refinement import _collapse, _mend, decimate_mesh
 from clrecon.mesh.smoothing import smooth_mesh
 from clrecon.reference.isosurface import extract_isosurface
 
@@ -83,6 +84,23 @@ def test_no_triangle_of_either_surface_is_further_than_the_bound(seed):
     smooth = smooth_mesh(rough)
     check_within(smooth, rough, 0.125)
     check_within(decimate_mesh(smooth, 0.9), smooth, 0.125)
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_what_is_not_looked_at_again_is_still_within_the_bound(seed):
+    """After some rounds of mending, which look at what has changed, all of both surfaces is looked at."""
+    mesh = smooth_mesh(noise_surface(seed, (24, 25, 15)))
+    clusters = Clusters(mesh.vertices - FAR, mesh.triangles, FAR)
+    deviation = Deviation(mesh.vertices - FAR, mesh.triangles, 0.1)
+    for _ in range(3):
+        _collapse(clusters, 0.5, 0.125)
+        _mend(clusters, deviation)
+        faces, rows = clusters.faces(), np.arange(mesh.triangle_count)
+        rows = rows[deviation.can_be_far(rows, clusters.names, clusters.places)]
+        assert 0 < len(rows) < mesh.triangle_count
+        far, _ = deviation.is_far_from(rows, clusters.names, clusters.places, faces)
+        assert not far.any()
+        assert not deviation.are_far(clusters.places, faces).any()
 
 
 @pytest.mark.parametrize("seed", range(4))
