@@ -72,6 +72,7 @@ NIFTI_AFFINE_MM = 1e-5  # sform entries and quaternions are float32: coordinates
 REAL_SOLID_VOLUME = 0.05  # a vertebra at 2 mm and 200 HU against its mask, which a network drew; measured -1.2 %
 MASK_VOLUME = 0.001  # of a mask's volume; levels are looked for until 0.0003 is reached
 MASK_VOLUME_THIN = 0.03  # one level more or less changes the six vertices of a single voxel by 1.2 %; measured 2.1 %
+MASK_VOLUME_FILLED = 0.02  # of labels that fill a map: notches where three of them meet take 0.8 % of such small ones
 MASK_SPHERE_NORMAL_DEG = 5.0  # rms over the vertices of masks of spheres; measured 3.6 to 4.7, with steps 15
 MASK_SPHERE_VOXEL = 0.12  # rms distance from the sphere; measured 0.07 to 0.1, with steps 0.20
 MASK_PLANE_NORMAL_DEG = 5.0  # of a tilted plane; measured 3.5, with steps 20

@@ -186,6 +186,7 @@ __kernel void list_words(
  *             highest         with -D RANGE: the range's highest value
  *             map, label, occupied  in   with -D MASKS: the label map, the label, and the occupancy of all labels, where
  *                             `voxels` is that of the label; slices as those of `voxels`; see mask_border.h
+ *             biases          in   (highest label + 1,) with -D MASKS: see mask_border.h
  * Launch      global = ceil(active / WORDS_PER_ITEM) rounded up by the host, any local
  * Guarantees  every position and normal is written once.  Positions are right to one unit in the last place of the
  *             volume's largest coordinate (half a unit up to 4096 samples an axis, where products of a sample number
@@ -207,7 +208,8 @@ void emit_vertices(
     , const float upper_level, const float highest
 #endif
 #ifdef MASKS
-    , __global const LABEL *restrict map, const uint label, __global const VOXEL *restrict occupied
+    , __global const LABEL *restrict map, const uint label, __global const VOXEL *restrict occupied,
+    __global const int *restrict biases
 #endif
     )
 {
@@ -218,7 +220,8 @@ void emit_vertices(
 #ifdef MASKS
     /* Beyond the map its border goes on: edges that lead out are placed apart from all others. */
     const volume_part volume = {voxels, ni, nj, nk, first_slice, 0, outside};
-    const mask_part masks = {map, {occupied, ni, nj, nk, first_slice, 0, outside}, label, (int)iso_level};
+    const mask_part masks = {map, {occupied, ni, nj, nk, first_slice, 0, outside}, label, (int)iso_level,
+        biases};
 #else
     const volume_part volume = {voxels, ni, nj, nk, first_slice, border, outside};
 #endif

@@ -4,7 +4,7 @@
  *
  *   other end            the vertex lies where
  *   without a label      the label's occupancy crosses its level; where other labels lie alongside, that of all labels
- *   another label        both labels lead by as much: the same point for both, whatever their levels
+ *   another label        both labels lead by as much, with the bias of each: the same point for both
  *   beyond the map       half way: the map ends at the faces of its voxels
  *
  * Ends on the wrong side of the level count as just on their own side, so that a vertex stays on its edge. */
@@ -21,6 +21,7 @@ typedef struct {
     volume_part occupied; /* occupancy of all labels together */
     uint label;
     int level;
+    __global const int *biases; /* by label: by how much it comes before others, in units of the occupancy */
 } mask_part;
 
 /* Index `at` of an axis of n samples, held within it; drivers call clamp() as a function. */
@@ -29,8 +30,8 @@ static inline int hold_within(int at, int n)
     return at < 0 ? 0 : at >= n ? n - 1 : at;
 }
 
-/* By how much the own label of sample (i, j, k), whose number is `own`, leads before all others there; 1 at least. */
-static inline int find_lead(const mask_part *masks, int i, int j, int k, uint own)
+/* By how much label `own`, that of sample (i, j, k), leads before `other` there, in units of the occupancy; 1 at least. */
+static inline int find_lead(const mask_part *masks, int i, int j, int k, uint own, uint other)
 {
     const int ni = masks->occupied.ni, nj = masks->occupied.nj, nk = masks->occupied.nk;
     const int before_2 = hold_within(i - 2, ni), before_1 = hold_within(i - 1, ni);
@@ -40,13 +41,13 @@ static inline int find_lead(const mask_part *masks, int i, int j, int k, uint ow
         const int k1 = hold_within(k + dk, nk) - masks->occupied.first_k;
         for (int dj = -REACH; dj <= REACH; ++dj) {
             __global const LABEL *row = masks->map + voxel_index(0, hold_within(j + dj, nj), k1, ni, nj);
-#define SIDE(at) ((row[at] == own) * 2 - (row[at] != 0)) /* 1: its own, -1: another's, 0: nobody's */
+#define SIDE(at) ((row[at] == own) - (row[at] == other))
             lead += weigh(dk) * weigh(dj)
                 * (SIDE(before_2) + SIDE(after_2) + 4 * (SIDE(before_1) + SIDE(after_1)) + 6 * SIDE(i));
 #undef SIDE
         }
     }
-    return lead > 1 ? lead : 1;
+    return lead > 0 ? FINENESS * lead : 1;
 }
 
 /* Give lane n of a gathered group, which holds the label's occupancy, the values and gradients that place its vertex. */
@@ -67,7 +68,9 @@ static inline void gather_mask_border(
     const uint there = masks->map[voxel_index(i1, j1, k1 - all->first_k, all->ni, all->nj)];
     const int begins = here == masks->label; /* the label is at the near end of the edge */
     if (here != 0 && there != 0) {
-        const int lead = find_lead(masks, i, j, k, here), next_lead = find_lead(masks, i1, j1, k1, there);
+        const int before = masks->biases[here] - masks->biases[there];
+        const int lead = max(find_lead(masks, i, j, k, here, there) + before, 1);
+        const int next_lead = max(find_lead(masks, i1, j1, k1, there, here) - before, 1);
         group->value[n] = level + (begins ? lead : -lead);
         group->next_value[n] = level + (begins ? -next_lead : next_lead);
         return;

@@ -6,12 +6,11 @@
  * One axis:  weights  1  4  6  4  1   of samples i - 2 .. i + 2; beyond the map its outermost samples go on
  *
  * Passes
- *   1. find_boxes       where each label lies
- *   2. smooth_rows      along i: 0 to 16 a sample
- *   3. smooth_across    along j and k: 0 to 4096, stored times FINENESS
- *   4. classify_mask    one bit a sample: carries the label
+ *   1. smooth_rows      along i: 0 to 16 a sample
+ *   2. smooth_across    along j and k: 0 to 4096, stored times FINENESS
+ *   3. classify_mask    one bit a sample: carries the label
  *      (counting and writing: cl/isosurface/marching_cubes.cl with -D MASKS)
- *   5. sum_volumes      what the triangles enclose, for the choice of the level */
+ *   4. sum_volumes      what the triangles enclose, for the choice of the level */
 #include "include/volume.h"
 #include "isosurface/mask_rows.h"
 #include "labels/label_type.h"
@@ -20,68 +19,6 @@
 #if REACH != 2
 #error "the rows below have five samples"
 #endif
-
-/* Parameters  boxes    out  (labels, 6) highest int three times, lowest int three times: no box yet
- *             labels
- * Launch      global = labels rounded up by the host, any local */
-__kernel void clear_boxes(__global int *restrict boxes, const uint labels)
-{
-    const uint item = get_global_id(0);
-    if (item >= labels)
-        return;
-    for (uint axis = 0; axis < 3; ++axis) {
-        boxes[6 * item + axis] = INT_MAX;
-        boxes[6 * item + 3 + axis] = INT_MIN;
-    }
-}
-
-/* Widen the box of a label by samples begin .. end - 1 of row (j, k). */
-static inline void widen_box(__global int *box, int begin, int end, int j, int k)
-{
-    atomic_min(box, begin);
-    atomic_min(box + 1, j);
-    atomic_min(box + 2, k);
-    atomic_max(box + 3, end - 1);
-    atomic_max(box + 4, j);
-    atomic_max(box + 5, k);
-}
-
-/* Parameters  map      in      (nk, nj, ni)
- *             boxes    in/out  (labels, 6) lowest i, j, k of each label, highest i, j, k; from clear_boxes
- *             ni nj nk
- * Launch      global = nk * nj rounded up by the host, any local: one item a row
- * Races       items widen the same box by atomic minimum and maximum: in any order with the same outcome
- * Guarantees  boxes are those of all samples of the label; label 0 is left out */
-__kernel void find_boxes(
-    __global const LABEL *restrict map, __global int *restrict boxes, const int ni, const int nj, const int nk)
-{
-    const uint item = get_global_id(0);
-    if (item >= (uint)nj * (uint)nk)
-        return;
-    const int j = (int)(item % nj), k = (int)(item / nj);
-    __global const LABEL *row = map + voxel_index(0, j, k, ni, nj);
-    uint open = 0; /* the label whose samples begin .. end - 1 of the row are not in its box yet */
-    int begin = 0, end = 0, i = 0;
-    while (i < ni) {
-        const LABEL label = row[i];
-        const int first = i++;
-        while (i + 16 <= ni && pack_lanes(convert_short16(vload16(0, row + i) != label)) == 0)
-            i += 16;
-        while (i < ni && row[i] == label)
-            ++i;
-        if (label == 0)
-            continue;
-        if (label != open) {
-            if (open != 0)
-                widen_box(boxes + 6 * (size_t)open, begin, end, j, k);
-            open = label;
-            begin = first;
-        }
-        end = i;
-    }
-    if (open != 0)
-        widen_box(boxes + 6 * (size_t)open, begin, end, j, k);
-}
 
 /* 16 samples from `at` on: 255 where they carry `label`, or any label where that is 0; else 0. */
 static inline uchar16 find_label(__global const LABEL *at, const LABEL label)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-__all__ = ["FULL", "KEEP", "REACH", "STEEPNESS", "next_level"]
+__all__ = ["FULL", "KEEP", "LEVELS", "REACH", "START", "STEEPNESS", "VOLUME_SHARE", "next_level"]
 
 REACH = 2
 """Samples each way, as REACH of cl/labels/occupancy.h."""

@@ -18,14 +18,16 @@ from clrecon.geometry.field import IsoRule
 from clrecon.geometry.precision import describe_far
 from clrecon.kernels import Program, Stopwatch, allocate, download, launch, load_program, upload
 from clrecon.labels import LabelMap
+from clrecon.labels.enclosed import FACES_PER_AREA, Borders, choose_levels, find_enclosed, level_biases
 from clrecon.labels.occupancy import FULL, KEEP, REACH, STEEPNESS, next_level
-from clrecon.labels.solid import Box, find_boxes
+from clrecon.labels.solid import Box
 from clrecon.labels.volumes import label_ml
 from clrecon.mesh import Mesh
 from clrecon.opencl import Device, check_budget, choose_device, describe_shortage, memory_limits
 from clrecon.opencl.quirks import cache_warnings
 from clrecon.operators import marching_cubes
 from clrecon.operators.isosurface import Part, Progress
+from clrecon.operators.label_survey import survey_labels
 from clrecon.operators.labels import Window, choose_numbers
 from clrecon.operators.marching_cubes import Classified, Counted, Placement
 from clrecon.operators.slabs import SampleGrid
@@ -77,6 +79,8 @@ class _Run:
         frames = placement.slice_frames.copy()
         frames[:, 2, 3] = np.maximum(frames[:, 2, 3], KEEP)
         self.placement = replace(placement, slice_frames=frames, margin=np.maximum(placement.margin, np.float32(KEEP)))
+        self.levels: dict[int, int] = {}
+        self.biases_d = upload(device, level_biases({}, labels.numbers[-1] + 1))
         with self.stopwatch.timed("build"):
             self.own, self.surface = prepare_label_masks(device, labels.voxels.dtype)
 
@@ -84,33 +88,6 @@ class _Run:
     def has_neighbours(self) -> bool:
         """More than one label is there: two may touch."""
         return len(self.labels.numbers) > 1
-
-    def find_boxes(self, numbers: Sequence[int], memory: int | None) -> dict[int, Box]:
-        """The box (k, j, i) of each label and the samples around it; on the device where the whole map fits it."""
-        voxels = self.labels.voxels
-        table = np.empty((self.labels.numbers[-1] + 1, 6), np.int32)
-        if describe_shortage(memory_limits(self.device, memory), {"labels": voxels.nbytes, "boxes": table.nbytes}):
-            return find_boxes(voxels, tuple(numbers), (0, 0, 0))
-        with self.stopwatch.timed("upload"):
-            map_d = upload(self.device, voxels)
-        table_d = allocate(self.device, table.nbytes)
-        ni, nj, nk = self.labels.shape_ijk
-        with self.stopwatch.running(self.device):
-            launch(
-                self.device, self.own["clear_boxes"], len(table), table_d, np.uint32(len(table)),
-                stopwatch=self.stopwatch,
-            )  # fmt: skip
-            launch(
-                self.device, self.own["find_boxes"], nj * nk, map_d, table_d, *(np.int32(n) for n in (ni, nj, nk)),
-                stopwatch=self.stopwatch,
-            )  # fmt: skip
-        download(self.device, table, table_d)
-        boxes: dict[int, Box] = {}
-        for number in numbers:
-            low, high = np.maximum(table[number, :3] - 1, 0), np.minimum(table[number, 3:] + 2, (ni, nj, nk))
-            i, j, k = (slice(int(begin), int(end)) for begin, end in zip(low, high, strict=True))
-            boxes[number] = (k, j, i)
-        return boxes
 
     def slices_for(self, boxes: dict[int, Box]) -> tuple[int, int]:
         """First and end of the slices of the map that these labels need."""
@@ -182,8 +159,31 @@ class _Run:
         """The slices of the sample grid around a label's box."""
         return Window(self.grid, box[0].start, box[0].stop + 2 * self.grid.rule.border, held)
 
-    def extract_one(self, held: _Held, number: int, box: Box, memory: int | None) -> tuple[Part, int]:
-        """Positions, normals and triangles of one label, and the level that places them."""
+    def keep_enclosed(self, numbers: Sequence[int], boxes: dict[int, Box], memory: int | None) -> None:
+        """Find the levels of labels that others enclose: they are the same whichever labels are asked for."""
+        own = {number: boxes[number] for number in numbers}
+        groups = self.group(own, memory)
+        held = [self.hold(groups[0], memory)] if len(groups) == 1 else []
+        voxel_mm3 = abs(np.linalg.det(self.labels.affine[:3, :3]))
+
+        def measure(levels: dict[int, int]) -> dict[int, float]:
+            self._take_levels(levels)
+            found = {}
+            for group in groups:
+                there = held[0] if held else self.hold(group, memory)
+                for number, box in group.items():
+                    started = self._start_one(there, number, box, memory)
+                    found[number] = started.enclosed_mm3(levels[number]) / voxel_mm3
+            return found
+
+        self._take_levels(choose_levels(Borders.of(self.labels.voxels, numbers, boxes), measure))
+
+    def _take_levels(self, levels: dict[int, int]) -> None:
+        self.levels = levels
+        self.biases_d = upload(self.device, level_biases(levels, self.labels.numbers[-1] + 1))
+
+    def _start_one(self, held: _Held, number: int, box: Box, memory: int | None) -> _Started:
+        """All of a label's mesh but its vertices, which depend on levels."""
         device, stopwatch = self.device, self.stopwatch
         window = self.window(box, (held.first, held.end))
         needs = {**self.needs(held.first, held.end), **window.scratch()}
@@ -208,50 +208,21 @@ class _Run:
             "scratch": sum(scratch.values()),
             "output": sum(output.values()),
         }
-        return self._keep_volume(held, window, classified, counted, number, box)
-
-    def _keep_volume(
-        self, held: _Held, window: Window, classified: Classified, counted: Counted, number: int, box: Box
-    ) -> tuple[Part, int]:
-        """Try levels until the mesh has the volume of the label's voxels, as near as a level brings it."""
         emission = marching_cubes.Emission(
-            self.device, window, self.surface, held.occupancy_d, classified, counted, self.placement, self.stopwatch
+            device, window, self.surface, held.occupancy_d, classified, counted, self.placement, stopwatch
         )
-        wanted = 1000.0 * label_ml(self.labels, number)
-        # Every crossed edge carries a voxel's face; faces of all directions are about 1.5 times the area.
-        area_voxels = counted.vertices / 1.5
-        mm3_per_level = -area_voxels * abs(np.linalg.det(self.labels.affine[:3, :3])) / (STEEPNESS * FULL)
-        tried: list[tuple[int, float]] = []
-        arguments = (held.map_d, np.uint32(number), held.occupied_d)
-        with self.stopwatch.running(self.device):
+        with stopwatch.running(device):
             emission.triangles()
-        level = next_level(tried, wanted, mm3_per_level)
-        while True:
-            with self.stopwatch.running(self.device):
-                emission.vertices(level, arguments)
-            if not self.grid.rule.closed or any(level == earlier for earlier, _ in tried):
-                return emission.download(), level
-            tried.append((level, self._enclosed_mm3(emission, counted.triangles, box)))
-            following = next_level(tried, wanted, mm3_per_level)
-            if following == level:
-                return emission.download(), level
-            level = following
+        return _Started(self, held, number, box, counted, emission)
 
-    def _enclosed_mm3(self, emission: marching_cubes.Emission, triangles: int, box: Box) -> float:
-        """What the mesh on the device encloses: sums of some hundred triangles there, all of them here."""
-        middle = [[(part.start + part.stop - 1) / 2 for part in box[::-1]]]
-        centre = np.zeros(4, np.float32)
-        centre[:3] = self.labels.ijk_to_lps(middle)[0]
-        if self.placement.origin is not None:
-            centre[:3] = self.labels.ijk_to_lps(middle)[0] - self.placement.origin
-        sums = np.empty(-(-triangles // TRIANGLES_PER_SUM), np.float32)
-        sums_d = allocate(self.device, sums.nbytes)
-        with self.stopwatch.running(self.device):
-            launch(
-                self.device, self.own["sum_volumes"], len(sums), emission.positions_d, emission.triangles_d, sums_d,
-                centre, np.uint32(triangles), np.uint32(TRIANGLES_PER_SUM), stopwatch=self.stopwatch,
-            )  # fmt: skip
-        return float(download(self.device, sums, sums_d).sum(dtype=np.float64)) / 6.0
+    def extract_one(self, held: _Held, number: int, box: Box, memory: int | None) -> tuple[Part, int]:
+        """Positions, normals and triangles of one label, and the level that places them."""
+        started = self._start_one(held, number, box, memory)
+        level = self.levels.get(number)
+        if level is None:
+            return started.keep_volume(1000.0 * label_ml(self.labels, number), self.grid.rule.closed)
+        started.place(level)
+        return started.emission.download(), level
 
     def describe(self) -> dict[str, Any]:
         """What the reports of all labels have in common."""
@@ -267,6 +238,59 @@ class _Run:
             "kernel_seconds": dict(self.stopwatch.by_kernel),
             "warnings": [*cache_warnings(), *describe_far(self.grid.volume), *self.labels.warnings],
         }
+
+
+@dataclass(frozen=True)
+class _Started:
+    """A label's mesh on the device, whose vertices are placed at one level after the other."""
+
+    run: _Run
+    held: _Held
+    number: int
+    box: Box
+    counted: Counted
+    emission: marching_cubes.Emission
+
+    def place(self, level: int) -> None:
+        """Write the vertices, as they are at this level."""
+        arguments = (self.held.map_d, np.uint32(self.number), self.held.occupied_d, self.run.biases_d)
+        with self.run.stopwatch.running(self.run.device):
+            self.emission.vertices(level, arguments)
+
+    def enclosed_mm3(self, level: int) -> float:
+        """What the mesh encloses at a level: sums of some hundred triangles on the device, all of them here."""
+        self.place(level)
+        device, stopwatch, placement = self.run.device, self.run.stopwatch, self.run.placement
+        middle = [[(part.start + part.stop - 1) / 2 for part in self.box[::-1]]]
+        centre = np.zeros(4, np.float32)
+        centre[:3] = self.run.labels.ijk_to_lps(middle)[0]
+        if placement.origin is not None:
+            centre[:3] = self.run.labels.ijk_to_lps(middle)[0] - placement.origin
+        triangles = self.counted.triangles
+        sums = np.empty(-(-triangles // TRIANGLES_PER_SUM), np.float32)
+        sums_d = allocate(device, sums.nbytes)
+        with stopwatch.running(device):
+            launch(
+                device, self.run.own["sum_volumes"], len(sums), self.emission.positions_d, self.emission.triangles_d,
+                sums_d, centre, np.uint32(triangles), np.uint32(TRIANGLES_PER_SUM), stopwatch=stopwatch,
+            )  # fmt: skip
+        return float(download(device, sums, sums_d).sum(dtype=np.float64)) / 6.0
+
+    def keep_volume(self, wanted: float, closed: bool) -> tuple[Part, int]:
+        """Try levels until the mesh has the volume of the label's voxels, mm3, as near as a level brings it."""
+        # Every crossed edge carries a voxel's face; faces of all directions are about 1.5 times the area.
+        area_voxels = self.counted.vertices / FACES_PER_AREA
+        mm3_per_level = -area_voxels * abs(np.linalg.det(self.run.labels.affine[:3, :3])) / (STEEPNESS * FULL)
+        tried: list[tuple[int, float]] = []
+        level = next_level(tried, wanted, mm3_per_level)
+        while closed and all(level != earlier for earlier, _ in tried):
+            tried.append((level, self.enclosed_mm3(level)))
+            following = next_level(tried, wanted, mm3_per_level)
+            if following == level:
+                return self.emission.download(), level
+            level = following
+        self.place(level)
+        return self.emission.download(), level
 
 
 def extract_label_masks(
@@ -331,7 +355,10 @@ def extract_label_masks(
     marching_cubes.check_row(labels.shape_ijk[0])
     chosen = choose_numbers(labels, numbers)
     run = _Run(labels, choose_device(device), closed)
-    boxes = run.find_boxes(chosen, memory)
+    everywhere, faces = survey_labels(labels, run.device, memory, run.stopwatch)
+    if closed and faces[:, 1].any() and (enclosed := find_enclosed(labels.voxels, faces, everywhere)):
+        run.keep_enclosed(enclosed, everywhere, memory)
+    boxes = {number: everywhere[number] for number in chosen}
     groups = run.group(boxes, memory)
     run.groups = len(groups)
     meshes: dict[int, Mesh] = {}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -9,10 +10,18 @@ from numpy.typing import NDArray
 
 from clrecon.geometry import Volume
 from clrecon.geometry.field import IsoRule
+from clrecon.labels.enclosed import Borders, choose_levels, count_faces, find_enclosed, level_biases
 from clrecon.labels.occupancy import FULL, KEEP, REACH, next_level
-from clrecon.reference.isosurface import Surface, build_surface, edge_margins, find_crossed_edges, gradients
+from clrecon.reference.isosurface import (
+    CrossedEdges,
+    Surface,
+    build_surface,
+    edge_margins,
+    find_crossed_edges,
+    gradients,
+)
 
-__all__ = ["choose_level", "extract_label_mask", "find_occupancy"]
+__all__ = ["choose_enclosed", "choose_level", "extract_label_mask", "find_occupancy"]
 
 WEIGHTS = (1, 4, 6, 4, 1)
 """Two rounds of [1 2 1]."""
@@ -29,7 +38,13 @@ def find_occupancy(mask: NDArray[np.bool_]) -> NDArray[np.int64]:
 
 
 def extract_label_mask(
-    labels: NDArray[Any], affine: NDArray[np.float64], number: int, level: int, *, closed: bool = True
+    labels: NDArray[Any],
+    affine: NDArray[np.float64],
+    number: int,
+    level: int,
+    *,
+    closed: bool = True,
+    enclosed: Mapping[int, int] | None = None,
 ) -> Surface:
     """Extract one label's own surface at one level.
 
@@ -38,8 +53,9 @@ def extract_label_mask(
     - without a label the vertex lies where the label's occupancy crosses the level, ends on the wrong side of it
       counting as one step on their own side; where the other labels are no less dense at the label's end than at the
       far one (they lie alongside, not across a gap) the occupancy of all labels counts in place of the label's;
-    - with another label it lies where both lead by as much: by how much the number of a sample leads there over all
-      other numbers together, at least by 1;
+    - with another label it lies where both lead by as much: by how much the number of a sample leads there over
+      that of the edge's other end, at least by 1; an enclosed label leads by as much more as its level is
+      lower than the other's, or than `START` where that has none;
     - beyond the map it lies half way.
 
     No vertex comes nearer to a sample than `KEEP` of its edge.
@@ -53,6 +69,8 @@ def extract_label_mask(
         1 to `FULL` - 1.
     closed : bool
         The surface is closed at the border of the map.
+    enclosed : dict of int to int, optional
+        The levels of labels that others enclose, see `choose_enclosed`.
 
     Returns
     -------
@@ -83,8 +101,11 @@ def extract_label_mask(
     t = (level - value) / (next_value - value)
 
     between = ~leads_out & (grown[edges.near] != 0) & (grown[edges.far] != 0)
-    lead = np.pad(_find_leads(labels), border, mode="edge")
-    t[between] = (lead[edges.near] / (lead[edges.near] + lead[edges.far]))[between]
+    biases = level_biases(dict(enclosed or {}), int(labels.max()) + 1)[grown]
+    before = biases[edges.near] - biases[edges.far]
+    lead, next_lead = (np.maximum(lead, 1) for lead in _find_leads(labels, own, edges, inside, grown, border))
+    value, next_value = np.maximum(lead + before, 1), np.maximum(next_lead - before, 1)
+    t[between] = (value / (value + next_value))[between]
     t[leads_out] = 0.5
     keep = np.maximum(edge_margins(volume, rule, edges), KEEP)
     t = np.clip(t, keep, 1.0 - keep)
@@ -96,25 +117,66 @@ def extract_label_mask(
     return build_surface(volume, rule, inside, edges, t, slope, next_slope)
 
 
-def _find_leads(labels: NDArray[Any]) -> NDArray[np.int64]:
-    """By how much the number of each sample leads there over all other numbers together, 1 at least."""
-    everyone = find_occupancy(labels != 0)
-    lead = np.ones(labels.shape, dtype=np.int64)
-    for number in np.unique(labels[labels != 0]):
-        mask = labels == number
-        lead[mask] = np.maximum(2 * find_occupancy(mask) - everyone, 1)[mask]
-    return lead
+def _find_leads(
+    labels: NDArray[Any],
+    own: NDArray[np.int64],
+    edges: CrossedEdges,
+    inside: NDArray[np.bool_],
+    grown: NDArray[np.int64],
+    border: int,
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """By how much the number of either end of each edge leads there over that of the other one.
+
+    `own` is the occupancy of the label whose samples are `inside`, `grown` has the number of each sample of the grid.
+    """
+    starts = inside[edges.near]
+    other = np.where(starts, grown[edges.far], grown[edges.near])
+    leads = np.zeros((2, len(other)), np.int64)
+    values = np.pad(own, border, mode="edge")
+    for number in np.unique(other):
+        among = other == number
+        rival = np.pad((FULL // 4096) * find_occupancy(labels == number), border, mode="edge")
+        for place, ends in enumerate((edges.near, edges.far)):
+            leads[place][among] = (values - rival)[ends][among]
+    return np.where(starts, leads[0], -leads[0]), np.where(starts, -leads[1], leads[1])
 
 
-def choose_level(labels: NDArray[Any], affine: NDArray[np.float64], number: int) -> int:
-    """The level at which the mesh of a label encloses the volume of its voxels."""
+def _volume_mm3(vertices: NDArray[np.float64], triangles: NDArray[np.uint32]) -> float:
+    corners = (vertices - vertices.mean(axis=0))[triangles]
+    return float(np.einsum("ni,ni->", corners[:, 0], np.cross(corners[:, 1], corners[:, 2]))) / 6.0
+
+
+def choose_enclosed(labels: NDArray[Any], affine: NDArray[np.float64]) -> dict[int, int]:
+    """The levels of the labels that others enclose, at which each encloses the volume of its voxels."""
+    numbers = find_enclosed(labels, count_faces(labels))
+    if not numbers:
+        return {}
+    voxel_mm3 = abs(np.linalg.det(affine[:3, :3]))
+
+    def measure(levels: dict[int, int]) -> dict[int, float]:
+        found = {}
+        for number, level in levels.items():
+            vertices, _, triangles = extract_label_mask(labels, affine, number, level, enclosed=levels)
+            found[number] = _volume_mm3(vertices, triangles) / voxel_mm3
+        return found
+
+    return choose_levels(Borders.of(labels, numbers), measure)
+
+
+def choose_level(
+    labels: NDArray[Any],
+    affine: NDArray[np.float64],
+    number: int,
+    enclosed: Mapping[int, int] | None = None,
+) -> int:
+    """The level at which the mesh of a label encloses the volume of its voxels; `enclosed` as `extract_label_mask`."""
+    if enclosed and number in enclosed:
+        return enclosed[number]
     wanted = np.count_nonzero(labels == number) * abs(np.linalg.det(affine[:3, :3]))
     tried: list[tuple[int, float]] = []
     level = next_level(tried, wanted, -1.0)
     while all(level != earlier for earlier, _ in tried):
-        vertices, _, triangles = extract_label_mask(labels, affine, number, level)
-        corners = (vertices - vertices.mean(axis=0))[triangles]
-        volume = float(np.einsum("ni,ni->", corners[:, 0], np.cross(corners[:, 1], corners[:, 2]))) / 6.0
-        tried.append((level, volume))
+        vertices, _, triangles = extract_label_mask(labels, affine, number, level, enclosed=enclosed)
+        tried.append((level, _volume_mm3(vertices, triangles)))
         level = next_level(tried, wanted, -wanted / FULL)
     return level

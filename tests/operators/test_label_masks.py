@@ -9,11 +9,14 @@ from scipy.spatial import cKDTree
 
 from clrecon.errors import DeviceError, RefusedInputError, UsageError
 from clrecon.geometry import apply_affine
+from clrecon.kernels import Stopwatch
 from clrecon.labels import LabelMap
+from clrecon.labels.enclosed import count_faces, find_enclosed
 from clrecon.labels.occupancy import FULL, KEEP
+from clrecon.labels.solid import find_boxes
 from clrecon.mesh.measures import enclosed_ml
-from clrecon.operators import label_masks as operator
 from clrecon.operators.label_masks import extract_label_masks
+from clrecon.operators.label_survey import survey_labels
 from clrecon.reference import label_masks as twin
 
 OBLIQUE = np.array([[0.7, 0.1, 0.05, -250.0], [-0.1, 0.5, 0.2, -300.0], [0.0, 0.05, 2.5, -846.0], [0, 0, 0, 1.0]])
@@ -43,6 +46,11 @@ def volume_share(mesh) -> float:
     return enclosed_ml(mesh.vertices, mesh.triangles) / mesh.report["label_ml"] - 1.0
 
 
+def enclosed_levels(labels, meshes) -> dict[int, int]:
+    numbers = find_enclosed(labels, count_faces(labels))
+    return {number: round(meshes[number].report["mask_level"] * FULL) for number in numbers}
+
+
 def assert_sound(mesh) -> dict:
     quality = mesh.quality()
     assert quality["closed"] and quality["manifold"] and quality["oriented"] and quality["volume_ml"] > 0
@@ -58,10 +66,13 @@ def test_device_equals_twin(device, shape, closed):
     affine = MIRRORED if shape[0] % 2 else OBLIQUE
     labels = random_labels(shape)
     meshes = extract_label_masks(LabelMap(labels, affine), device, closed=closed)
+    enclosed = enclosed_levels(labels, meshes) if closed else {}
     assert tuple(meshes) == tuple(np.unique(labels[labels > 0]))
     for number, mesh in meshes.items():
         level = round(mesh.report["mask_level"] * FULL)
-        vertices, normals, triangles = twin.extract_label_mask(labels, affine, number, level, closed=closed)
+        vertices, normals, triangles = twin.extract_label_mask(
+            labels, affine, number, level, closed=closed, enclosed=enclosed
+        )
         assert np.array_equal(mesh.triangles, triangles)
         away = apply_affine(np.linalg.inv(affine), mesh.vertices) - apply_affine(np.linalg.inv(affine), vertices)
         assert np.abs(away).max() <= tolerances.TWIN_VERTEX_VOXEL
@@ -79,12 +90,21 @@ def test_the_level_is_that_of_the_twin(device):
         assert abs(mesh.report["mask_level"] * FULL - twin.choose_level(labels, OBLIQUE, number)) <= 2
 
 
+def test_the_levels_of_enclosed_labels_are_those_of_the_twin(device):
+    labels = np.where(mask_of((12, 13, 14), 3.0), 2, mask_of((12, 13, 14), 5.2)).astype(np.uint8)
+    meshes = extract_label_masks(LabelMap(labels, OBLIQUE), device)
+    levels = twin.choose_enclosed(labels, OBLIQUE)
+    assert set(levels) == {1, 2}
+    for number, mesh in meshes.items():
+        assert abs(mesh.report["mask_level"] * FULL - levels[number]) <= 2
+
+
 def test_boxes_are_those_of_the_voxels(device):
     labels = random_labels((7, 9, 70), seed=3, numbers=(0, 0, 0, 0, 0, 2, 5, 6))
-    run = operator._Run(LabelMap(labels, np.eye(4)), device, True)
-    expected = operator.find_boxes(labels, (2, 5, 6), (0, 0, 0))
-    assert run.find_boxes((2, 5, 6), None) == expected
-    assert run.find_boxes((2, 5, 6), 100) == expected  # does not fit: without the device
+    expected = find_boxes(labels, (2, 5, 6), (0, 0, 0)), count_faces(labels).tolist()
+    for memory in (None, 100):  # does not fit: without the device
+        boxes, faces = survey_labels(LabelMap(labels, np.eye(4)), device, memory, Stopwatch())
+        assert (boxes, faces.tolist()) == expected
 
 
 def test_every_voxel_of_the_mask_is_inside_and_no_other(device):
@@ -231,6 +251,46 @@ def test_a_curved_border_is_shared_to_the_last_triangle(device):
     pairs, edges = cancelled_pairs(meshes.values())
     assert pairs == len(meshes[2].triangles)  # all of the inner label
     assert all(edges.get((b, a), 0) == count for (a, b), count in edges.items())
+
+
+@pytest.mark.parametrize("radius", [3.0, 8.0])
+def test_a_label_that_another_encloses_keeps_its_volume(device, radius):
+    """5 % short of it at the middle between both, with a radius of 8 voxels."""
+    shape = (26, 28, 40)
+    labels = np.where(mask_of(shape, radius), 2, mask_of(shape, 12.0)).astype(np.uint8)
+    meshes = extract_label_masks(LabelMap(labels, OBLIQUE), device)
+    for mesh in meshes.values():
+        assert abs(volume_share(mesh)) <= tolerances.MASK_VOLUME
+        assert_sound(mesh)
+    assert meshes[2].report["mask_level"] < meshes[1].report["mask_level"] - 0.05
+    alone = extract_label_masks(LabelMap(labels, OBLIQUE), device, numbers=[2])[2]
+    assert np.array_equal(alone.vertices, meshes[2].vertices)
+
+
+def cells_of(shape, count, kept=1.0) -> np.ndarray:
+    """A map full of cells, each nearest to a point; some of them have no label."""
+    random = np.random.default_rng(0)
+    points = random.random((count, 3)) * shape
+    _, nearest = cKDTree(points).query(np.moveaxis(np.indices(shape), 0, -1))
+    return np.where((random.random(count) < kept)[nearest], nearest + 1, 0).astype(np.uint8)
+
+
+def test_cells_that_enclose_each_other_keep_their_volumes(device):
+    labels = cells_of((24, 30, 36), 30, kept=0.6)
+    assert (count_faces(labels)[:, 1] > count_faces(labels)[:, 0]).sum() >= 5
+    for mesh in extract_label_masks(LabelMap(labels, MIRRORED), device).values():
+        assert abs(volume_share(mesh)) <= tolerances.MASK_VOLUME
+        assert_sound(mesh)
+
+
+def test_cells_that_fill_a_map_lack_the_same_share(device):
+    """What notches between three of them take, no level brings back."""
+    shares = [
+        volume_share(mesh)
+        for mesh in extract_label_masks(LabelMap(cells_of((20, 24, 28), 8), OBLIQUE), device).values()
+    ]
+    assert -tolerances.MASK_VOLUME_FILLED < min(shares) and max(shares) < 0
+    assert np.ptp(shares) <= tolerances.MASK_VOLUME
 
 
 def test_no_groove_runs_along_the_border_and_gaps_stay_open(device):

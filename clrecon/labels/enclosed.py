@@ -1,0 +1,179 @@
+"""Labels that others enclose: which they are, and the levels at which all of them keep their volumes.
+
+Such a label has little or no free surface to keep its volume with, so its level moves its borders too, and with them
+the volumes of its neighbours: the levels of all of them are looked for together.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clrecon.labels.occupancy import FULL, LEVELS, START, STEEPNESS, VOLUME_SHARE
+
+__all__ = ["FACES_PER_AREA", "Borders", "choose_levels", "count_faces", "find_enclosed", "level_biases"]
+
+FACES_PER_AREA = 1.5
+"""Faces of the voxels at a border, of all directions, for each voxel face of its area."""
+
+MOST_SWEEPS = 16
+"""Three or four do; labels of some voxels, whose vertices come to the ends of their edges, need more."""
+
+DRIFT = 1e-4
+"""Part of the diagonal that is added to it: where enclosed labels fill a whole map, their levels have no zero."""
+
+
+def count_faces(labels: NDArray[Any]) -> NDArray[np.int64]:
+    """Faces of each label's voxels, shape (highest number + 1, 2): towards voxels without a label, towards others'.
+
+    The ends of the map count as neither.
+    """
+    faces = np.zeros((int(labels.max(initial=0)) + 1, 2), np.int64)
+    for axis in range(3):
+        size = labels.shape[axis]
+        ends = np.take(labels, range(size - 1), axis=axis), np.take(labels, range(1, size), axis=axis)
+        for own, other in (ends, ends[::-1]):
+            for place, found in enumerate(((own != 0) & (other == 0), (own != 0) & (other != 0) & (own != other))):
+                faces[:, place] += np.bincount(own[found], minlength=len(faces))
+    return faces
+
+
+def find_enclosed(
+    labels: NDArray[Any], faces: NDArray[Any], boxes: Mapping[int, tuple[slice, ...]] | None = None
+) -> tuple[int, ...]:
+    """The labels that share more faces with others than they have free, and those that touch them.
+
+    Parameters
+    ----------
+    labels : ndarray, shape (nk, nj, ni)
+    faces : ndarray
+        The table of `count_faces`.
+    boxes : dict of int to 3 slices, optional
+        Of each label and the samples around it; None: the whole map.
+    """
+    enclosed = np.flatnonzero(faces[:, 1] > faces[:, 0])
+    involved = set(enclosed.tolist())
+    for number in enclosed:
+        part = labels if boxes is None else labels[boxes[int(number)]]
+        involved.update(np.flatnonzero(_count_between(part, int(number))).tolist())
+    return tuple(sorted(involved - {0}))
+
+
+def _count_between(part: NDArray[Any], number: int) -> NDArray[np.int64]:
+    """Faces between the samples of a label and those of each other number, by that number."""
+    faces = np.zeros(int(part.max()) + 1, np.int64)
+    for axis in range(3):
+        size = part.shape[axis]
+        low, high = (np.take(part, ends, axis=axis) for ends in (range(size - 1), range(1, size)))
+        for own, other in ((low, high), (high, low)):
+            faces += np.bincount(other[(own == number) & (other != number)], minlength=len(faces))
+    return faces
+
+
+def level_biases(levels: dict[int, int], size: int) -> NDArray[np.int32]:
+    """By how much each label comes before others where they touch, shape (size,), in units of the occupancy.
+
+    A label that is not in `levels` has none: its borders are those of the level `START`.
+    """
+    biases = np.zeros(size, np.int32)
+    for number, level in levels.items():
+        biases[number] = START - level
+    return biases
+
+
+@dataclass(frozen=True)
+class Borders:
+    """How the volumes of enclosed labels change with their levels.
+
+    Attributes
+    ----------
+    numbers : tuple of int
+    voxels : ndarray, shape (n,)
+        Voxels of each label.
+    slopes : scipy.sparse array, shape (n, n)
+        Voxels that label `row` loses for a step of the level of label `column`.
+    parts : ndarray, shape (n,)
+        Labels that touch each other, over others too, have the same number.
+    filled : ndarray, shape (n,)
+        Labels of a part that nothing but the end of the map bounds.
+    """
+
+    numbers: tuple[int, ...]
+    voxels: NDArray[np.float64]
+    slopes: Any
+    parts: NDArray[np.integer[Any]]
+    filled: NDArray[np.bool_]
+
+    @classmethod
+    def of(
+        cls, labels: NDArray[Any], numbers: Sequence[int], boxes: Mapping[int, tuple[slice, ...]] | None = None
+    ) -> Borders:
+        """Count the faces between the labels `numbers`; each box holds its label and the samples around it."""
+        from scipy.sparse import coo_array
+        from scipy.sparse.csgraph import connected_components
+
+        table = np.full(int(labels.max(initial=0)) + 1, -1)
+        table[list(numbers)] = np.arange(len(numbers))
+        step = 1.0 / (FACES_PER_AREA * STEEPNESS * FULL)
+        entries: list[tuple[int, int, float]] = []
+        counts, outlets = [], []
+        for row, number in enumerate(numbers):
+            part = labels if boxes is None else labels[boxes[number]]
+            counts.append(float(np.count_nonzero(part == number)))
+            faces = _count_between(part, number)
+            outlets.append(faces[0] + faces[1:][table[1 : len(faces)] < 0].sum() > 0)
+            shared = faces[1:].sum()  # the lead of one label before another rises twice as fast as an occupancy
+            entries.append((row, row, (1.0 + DRIFT) * step * (faces[0] + 0.5 * shared)))
+            for other in np.flatnonzero(faces):
+                if other != 0 and table[other] >= 0:
+                    entries.append((row, int(table[other]), -0.5 * step * faces[other]))
+        rows, columns, values = zip(*entries, strict=True)
+        slopes = coo_array((values, (rows, columns)), shape=(len(numbers),) * 2).tocsc()
+        _, parts = connected_components(slopes, directed=False)
+        open_parts = np.bincount(parts, outlets) > 0
+        return cls(tuple(numbers), np.array(counts), slopes, parts, ~open_parts[parts])
+
+    def share_rest(self, short: NDArray[np.float64]) -> NDArray[np.float64]:
+        """What labels are short of, without what all of those lack that fill a whole map: nothing can bring it."""
+        weights = np.where(self.filled, self.voxels, 0.0)
+        rest = np.bincount(self.parts, np.where(self.filled, short, 0.0))
+        share = rest / np.maximum(np.bincount(self.parts, weights), 1.0)
+        return short - weights * share[self.parts]
+
+
+def choose_levels(borders: Borders, measure: Callable[[dict[int, int]], dict[int, float]]) -> dict[int, int]:
+    """The levels at which enclosed labels have the volumes of their voxels, as near as levels bring them.
+
+    Parameters
+    ----------
+    borders : Borders
+    measure : callable
+        From the levels of all of them to the volumes of their meshes, in voxels.
+    """
+    from scipy.sparse.linalg import spsolve
+
+    levels = dict.fromkeys(borders.numbers, START)
+    best: tuple[float, dict[int, int]] | None = None
+    for _ in range(MOST_SWEEPS):
+        volumes = measure(levels)
+        short = borders.voxels - np.array([volumes[number] for number in borders.numbers])
+        short = borders.share_rest(short)
+        shares = np.abs(short) / borders.voxels
+        if best is None or shares.sum() < best[0]:
+            best = float(shares.sum()), levels
+        if shares.max() <= VOLUME_SHARE:
+            break
+        steps = np.atleast_1d(spsolve(borders.slopes, short))
+        following = {
+            number: min(max(levels[number] - round(float(step)), LEVELS[0]), LEVELS[1])
+            for number, step in zip(borders.numbers, steps, strict=True)
+        }
+        if following == levels:
+            break
+        levels = following
+    assert best is not None
+    return best[1]
