@@ -16,10 +16,39 @@ if sys.version_info < (3, 10):
 
 import shutil
 import subprocess
+import tempfile
+from contextlib import ExitStack
 
 from _environment import ROOT, SetupError, ensure_environment, program_path
 
 MOST_PROCESSES = 4
+
+
+def run_steps(steps: dict[str, list[str]], environment: dict[str, str], beside: str) -> list[str]:
+    """Run the steps in their order and return the names of those that failed.
+
+    The step `beside` uses one core: it runs from the beginning, and what it says is printed at its place.
+    """
+    failed = []
+    with ExitStack() as early:
+        if beside in steps:
+            said = early.enter_context(tempfile.TemporaryFile())
+            process = early.enter_context(
+                subprocess.Popen(steps[beside], cwd=ROOT, env=environment, stdout=said, stderr=subprocess.STDOUT)
+            )
+            early.callback(process.kill)  # where this program is interrupted; does nothing once it has ended
+        for name, command in steps.items():
+            print(f"== {name}", flush=True)
+            if name == beside:
+                code = process.wait()
+                said.seek(0)
+                print(said.read().decode(errors="replace"), end="", flush=True)
+            else:
+                code = subprocess.run(command, cwd=ROOT, env=environment).returncode
+            if code:
+                failed.append(name)
+                print(f"{name} failed", file=sys.stderr, flush=True)
+    return failed
 
 
 def main() -> int:
@@ -41,20 +70,16 @@ def main() -> int:
     }
     if not fast and (shutil.which("oclgrind") or os.environ.get("CLRECON_REQUIRE_OCLGRIND")):
         steps["oclgrind"] = [python, os.path.join("scripts", "check_oclgrind.py")]
-    # Kernels are built on one core: much of the suite is that.  A file of tests stays in one process.  A process that
+    # Kernels are built on one core: much of the suite is that.  Each process has its part of the tests in their order,
+    # and one that is done takes half of what another has left: none waits for the longest file.  A process that
     # crashes ends the run, as it does without others: pytest-xdist 3.8 waits for ever for what took its place.
     cores = min(os.cpu_count() or 1, MOST_PROCESSES)
-    options = ["-n", str(cores), "--dist", "loadfile", "--max-worker-restart", "0"]
+    options = ["-n", str(cores), "--dist", "worksteal", "--max-worker-restart", "0"]
     spread = options if cores > 1 and not arguments else []
     # pytest comes last: its closing line is the closing line of this program
     steps["pytest"] = [python, "-m", "pytest", "-q", *spread, *(["-m", "not slow"] if fast else []), *arguments]
     environment = {**os.environ, "CLRECON_REQUIRE_TESTS": "1"}
-    failed = []
-    for name, command in steps.items():
-        print(f"== {name}", flush=True)
-        if subprocess.run(command, cwd=ROOT, env=environment).returncode:
-            failed.append(name)
-            print(f"{name} failed", file=sys.stderr, flush=True)
+    failed = run_steps(steps, environment, beside="oclgrind" if cores > 1 else "")
     if failed and failed != ["pytest"]:
         print(f"failed: {', '.join(failed)}", file=sys.stderr, flush=True)
     return 1 if failed else 0

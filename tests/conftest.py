@@ -44,6 +44,10 @@ def find_devices() -> tuple[list[Any], str]:
         found = list_devices()
     except DeviceError as error:
         return [], str(error)
+    for device in found:
+        # PoCL builds every kernel once more before it gives a binary away, for groups of any size: half of all its
+        # building.  The processes of commands keep binaries, and so do tests/kernels/test_binaries.py.
+        device.keeps_binaries = False
     devices = [device for device in found if is_set("CLRECON_TEST_SIMULATORS") or not device.is_simulator]
     wanted = os.environ.get("CLRECON_TEST_DEVICE", "").strip().lower()
     if wanted:
@@ -96,6 +100,21 @@ class Devices:
 def first_of(devices: list[Any]) -> list[Any]:
     """The first device, for tests marked ``first_device``; with CLRECON_TEST_EVERY_DEVICE=1 all."""
     return devices if is_set("CLRECON_TEST_EVERY_DEVICE") else devices[:1]
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Leave out the parameters marked ``first_device`` on all other devices."""
+    devices = Devices.found[0] if Devices.found else []
+    others = [device for device in devices if device not in first_of(devices)]
+    left_out = {
+        item
+        for item in items
+        if isinstance(item, pytest.Function)
+        and item.get_closest_marker("first_device")
+        and hasattr(item, "callspec")
+        and any(item.callspec.params.get("device") is device for device in others)
+    }
+    items[:] = [item for item in items if item not in left_out]
 
 
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:

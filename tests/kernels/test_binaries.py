@@ -12,6 +12,7 @@ from clrecon.kernels import binaries, program
 from clrecon.kernels.binaries import binary_key, read_binary, store_binary
 from clrecon.kernels.program import load_program
 from clrecon.kernels.sources import read_kernel_source
+from clrecon.opencl import quirks
 
 KEY = binary_key("device", "source")
 
@@ -20,6 +21,14 @@ KEY = binary_key("device", "source")
 def own_cache(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     return tmp_path / "clrecon" / "kernels"
+
+
+@pytest.fixture(autouse=True)
+def as_for_users(request, monkeypatch):
+    """Binaries are kept: `find_devices` of the conftest turns that off for all other tests."""
+    if "device" in request.fixturenames:
+        device = request.getfixturevalue("device")
+        monkeypatch.setattr(device, "keeps_binaries", quirks.is_slow_from_its_cache(device.platform))
 
 
 def test_what_was_stored_is_read(own_cache):

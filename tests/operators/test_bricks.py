@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from test_isosurface import OBLIQUE, random_volume, smooth_volume
+from voxel_types import VOXEL_TYPES
 
 from clrecon.geometry import Volume
 from clrecon.kernels import download, upload
@@ -15,7 +16,7 @@ from clrecon.reference import bricks as twin
 SHAPES = [(1, 1, 1), (3, 9, 7), (8, 8, 8), (9, 7, 8), (17, 16, 33), (8, 9, 100)]
 
 
-@pytest.mark.parametrize("dtype", ["int8", "uint8", "int16", "uint16", "int32", "float32"])
+@pytest.mark.parametrize("dtype", VOXEL_TYPES)
 @pytest.mark.parametrize("shape", SHAPES)
 def test_ranges_and_states_equal_those_of_the_twin(device, shape, dtype):
     volume = random_volume(shape, dtype, high=100)

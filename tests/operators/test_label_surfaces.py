@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import tolerances
+from voxel_types import VOXEL_TYPES
 
 from clrecon.errors import DeviceError, NoSurfaceError, RefusedInputError, UsageError
 from clrecon.geometry import Volume
@@ -69,7 +70,7 @@ def test_device_equals_twin(device, shape, solid, closed):
             assert mesh.report["vertices_by_hu_share"] == pytest.approx(by_hu, abs=1e-12)
 
 
-@pytest.mark.parametrize("dtype", ["int8", "uint8", "int16", "uint16", "int32", "float32"])
+@pytest.mark.parametrize("dtype", VOXEL_TYPES)
 def test_device_equals_twin_for_every_voxel_type(device, dtype):
     shape = (6, 7, 37)
     volume, labels = random_volume(shape, dtype, MIRRORED, high=100), random_labels(shape)
@@ -79,6 +80,7 @@ def test_device_equals_twin_for_every_voxel_type(device, dtype):
             assert_equals_twin(mesh, volume, inside, number, iso_value)
 
 
+@pytest.mark.first_device  # the same lines as without labels, which every device builds with "1", "1"
 @pytest.mark.parametrize(("lanes", "words"), [("1", "1"), ("8", "3")])
 @pytest.mark.parametrize("numbers", [(0, 0, 3, 7), (0, 0, 3, 300)], ids=["one-byte", "two-bytes"])
 def test_every_variant_of_the_kernels_gives_the_same_meshes(device, lanes, words, numbers, monkeypatch):

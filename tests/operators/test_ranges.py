@@ -7,6 +7,7 @@ import pytest
 import tolerances
 from test_isosurface import MIRRORED, OBLIQUE, SHAPES, assert_sound, random_volume, smooth_volume
 from test_slabs import assert_same
+from voxel_types import VOXEL_TYPES
 
 from clrecon.errors import DeviceError, NoSurfaceError, UsageError
 from clrecon.geometry import Volume
@@ -40,7 +41,7 @@ def ball(radius: float, size: int = 33) -> Volume:
     return Volume((radius - np.sqrt(i * i + j * j + k * k)).astype(np.float32), affine)
 
 
-@pytest.mark.parametrize("dtype", ["int8", "uint8", "int16", "uint16", "int32", "float32"])
+@pytest.mark.parametrize("dtype", VOXEL_TYPES)
 @pytest.mark.parametrize("affine", [OBLIQUE, MIRRORED], ids=["right-handed", "left-handed"])
 def test_device_equals_twin_for_every_voxel_type(device, dtype, affine):
     volume = random_volume((5, 6, 37), dtype, high=100, affine=affine)
@@ -159,6 +160,7 @@ def test_a_resident_volume_gives_the_same_in_any_order(device):
             assert_same(extractor.extract(level, **options), extract_isosurface(volume, level, device, **options))
 
 
+@pytest.mark.first_device
 def test_the_variant_of_gpus_gives_the_same_mesh(device, monkeypatch):
     volume = smooth_volume((9, 11, 75), affine=MIRRORED)
     monkeypatch.setattr(device, "kernel_variants", {**device.kernel_variants, "LANES": "1", "WORDS_PER_ITEM": "1"})

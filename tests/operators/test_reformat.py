@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from voxel_types import VOXEL_TYPES
 
 from clrecon.errors import DeviceError, UsageError
 from clrecon.geometry import Volume
@@ -46,7 +47,7 @@ def even_volume(dtype="int16", angles=(0.0, 0.0, 0.0), spacing=(0.7, 0.7, 2.5), 
     return Volume(random_voxels(shape, dtype), affine)
 
 
-@pytest.mark.parametrize("dtype", ["int8", "uint8", "int16", "uint16", "int32", "float32"])
+@pytest.mark.parametrize("dtype", VOXEL_TYPES)
 @pytest.mark.parametrize("angles", [(0.0, 0.0, 0.0), (20.0, -35.0, 10.0)])
 @pytest.mark.parametrize("shear", [0.0, 0.8])
 def test_where_a_pixel_is_a_voxel_it_has_its_value(device, dtype, angles, shear):

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import tolerances
 from test_isosurface import MIRRORED, OBLIQUE, SHAPES, assert_sound, random_volume, smooth_volume
+from voxel_types import VOXEL_TYPES
 
 from clrecon.errors import UsageError
 from clrecon.geometry import Volume, compose_affine
@@ -33,7 +34,7 @@ def test_device_equals_twin_at_word_borders(device, shape, closed):
     assert_equals_twin(random_volume(shape, high=50), 25, device, closed)
 
 
-@pytest.mark.parametrize("dtype", ["int8", "uint8", "int16", "uint16", "int32", "float32"])
+@pytest.mark.parametrize("dtype", VOXEL_TYPES)
 @pytest.mark.parametrize("affine", [OBLIQUE, MIRRORED], ids=["right-handed", "left-handed"])
 def test_device_equals_twin_for_every_voxel_type(device, dtype, affine):
     volume = random_volume((5, 6, 37), dtype, high=100, affine=affine)

@@ -107,6 +107,7 @@ def test_survey_says_why_no_device_is_used(device: Any) -> None:
     assert "abacus" in str(problem)
 
 
+@pytest.mark.first_device  # its mesh and its pictures are tested on every device in tests/operators
 def test_demo_writes_and_replaces(device: Any, tmp_path: Path) -> None:
     folder = tmp_path / "demo"
     first = make_demo(folder, str(device.index))

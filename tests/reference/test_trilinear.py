@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from fractions import Fraction
+from functools import cache
 from itertools import permutations, product
 
 import numpy as np
@@ -22,7 +23,12 @@ from clrecon.reference.trilinear_table import CELL_VERTEX, cell_state, find_regi
 MARGIN = np.full(3, 1e-4)
 MOST_DRAWINGS = 2000
 """Cells that are drawn to find one of a kind: one in about 40 has a tunnel."""
-AMBIGUOUS = [case for case in range(256) if len(find_states(case)) > 1 or cell_state(case, 0).tunnels]
+
+
+@cache
+def ambiguous_cases() -> list[int]:
+    """Cases with more than one state, or with a tunnel; found when a test asks: it takes seconds."""
+    return [case for case in range(256) if len(find_states(case)) > 1 or cell_state(case, 0).tunnels]
 
 
 def draw_cell(rng, case: int) -> np.ndarray:
@@ -37,7 +43,7 @@ def draw_cells(seed: int, count: int):
     rng = np.random.default_rng(seed)
     for n in range(count):
         for _ in range(MOST_DRAWINGS):
-            case = int(rng.choice(AMBIGUOUS))
+            case = int(rng.choice(ambiguous_cases()))
             heights = draw_cell(rng, case)
             tunnels = cell_state(case, decide_faces(case, heights)).tunnels
             if n % 3 == 0 or (tunnels and (n % 3 == 1 or find_row(case, heights).cell_vertices > 1)):
@@ -51,7 +57,7 @@ def draw_with_vertices(seed: int, count: int, cell_vertices: int):
     """Cells with that many vertices inside; whole numbers half a unit from the level, so that scaling is exact."""
     rng = np.random.default_rng(seed)
     for _ in range(count * MOST_DRAWINGS):
-        case = int(rng.choice(AMBIGUOUS))
+        case = int(rng.choice(ambiguous_cases()))
         drawn = draw_cell(rng, case)
         heights = np.float32(np.trunc(1000 * drawn) + np.copysign(0.5, drawn))
         if find_row(case, heights).cell_vertices == cell_vertices:
@@ -122,7 +128,7 @@ def test_scaling_rounds_towards_zero_and_never_overflows():
 def test_faces_are_decided_by_the_sign_at_the_saddle():
     rng = np.random.default_rng(4)
     for _ in range(500):
-        case = int(rng.choice(AMBIGUOUS))
+        case = int(rng.choice(ambiguous_cases()))
         heights = [
             Fraction(int(size) * (1 if case >> c & 1 else -1), 2) for c, size in enumerate(rng.integers(1, 9, 8))
         ]
