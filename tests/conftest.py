@@ -149,6 +149,23 @@ def real_data() -> Path:
     return folder
 
 
+@pytest.fixture(scope="session")
+def shared_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder that the processes of this session share, for what takes long to make."""
+    root = tmp_path_factory.getbasetemp()
+    folder = (root.parent if "PYTEST_XDIST_WORKER" in os.environ else root) / "shared"
+    folder.mkdir(exist_ok=True)
+    return folder
+
+
+@pytest.fixture(scope="session")
+def odd(shared_folder: Path) -> Any:
+    """The odd bodies of `odd_bodies`."""
+    from odd_bodies import OddBodies
+
+    return OddBodies(shared_folder)
+
+
 @pytest.fixture(scope="session", autouse=True)
 def interruptible() -> Iterator[None]:
     """Ctrl-C as in a terminal, here and in processes of tests: what a shell starts in the background ignores it."""

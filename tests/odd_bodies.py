@@ -1,16 +1,21 @@
-"""Odd bodies for tests: small phantoms on tables, each made once a process, with the voxels of their bone."""
+"""Odd bodies for tests: small phantoms on tables with the voxels of their bone, each made once for all processes."""
 
 from __future__ import annotations
 
 import functools
+import os
+import tempfile
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.geometry import Volume
-from clrecon.phantom import KINDS, MATERIALS, PhantomSettings, label_materials, make_phantom
+from clrecon.labels import read_labels
+from clrecon.phantom import KINDS, MATERIALS, PhantomSettings, write_phantom
+from clrecon.reading import read_volume
 
 COARSE = 2.8
 """Steps of a small phantom in those of its kind: 2.5 to 5 mm."""
@@ -38,13 +43,11 @@ class OddBody:
 
     Attributes
     ----------
-    settings : PhantomSettings
     volume : Volume
     labels : ndarray, shape (nk, nj, ni), uint8
         Place in `MATERIALS`.
     """
 
-    settings: PhantomSettings
     volume: Volume
     labels: NDArray[np.uint8]
 
@@ -67,10 +70,37 @@ def settings_of(name: str) -> PhantomSettings:
     return PhantomSettings(size=(columns, rows), slices=slices, spacing=(dj, 1.04 * di, dk), **given)
 
 
+def write_odd(folder: Path, name: str) -> Path:
+    """The series of a body of `BODIES` in `folder`, which processes share: who asks first makes it."""
+    series = folder / name
+    if not series.is_dir():
+        with tempfile.TemporaryDirectory(dir=folder) as own:
+            write_phantom(Path(own) / name, settings_of(name))
+            try:
+                os.rename(Path(own) / name, series)
+            except OSError:
+                if not series.is_dir():  # else another process was first
+                    raise
+    return series
+
+
 @functools.cache
-def make_odd(name: str) -> OddBody:
-    """Make a body of `BODIES`; not to be changed."""
-    settings = settings_of(name)
-    voxels, affine, _ = make_phantom(settings)
-    voxels.flags.writeable = False
-    return OddBody(settings, Volume(voxels, affine), label_materials(settings))
+def read_odd(folder: Path, name: str) -> OddBody:
+    """A body of `BODIES`; not to be changed."""
+    series = write_odd(folder, name)
+    volume, labels = read_volume(series), read_labels(series / "materials.nrrd").voxels
+    volume.voxels.flags.writeable = False
+    return OddBody(Volume(volume.voxels, volume.affine), labels)
+
+
+class OddBodies:
+    """What the fixture `odd` gives: bodies by name, as series and as voxels."""
+
+    def __init__(self, folder: Path):
+        self._folder = folder
+
+    def series(self, name: str) -> Path:
+        return write_odd(self._folder, name)
+
+    def __getitem__(self, name: str) -> OddBody:
+        return read_odd(self._folder, name)

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from odd_bodies import BODIES, make_odd
+from odd_bodies import BODIES, OddBodies
 
 from clrecon.errors import RefusedInputError
 from clrecon.geometry import Volume
@@ -24,8 +24,8 @@ def share_kept(before: Volume, after: Volume, mask: np.ndarray) -> float:
 
 
 @pytest.mark.parametrize("name", [name for name in BODIES if name not in ("empty", "water")])
-def test_bone_stays_and_the_table_goes(name: str) -> None:
-    body = make_odd(name)
+def test_bone_stays_and_the_table_goes(odd: OddBodies, name: str) -> None:
+    body = odd[name]
     cleaned = remove_table(body.volume)
     facts = cleaned.report["remove_table"]
     assert share_kept(body.volume, cleaned, body.dense) > 0.999
@@ -39,17 +39,17 @@ def test_bone_stays_and_the_table_goes(name: str) -> None:
     assert gate["ok"] and gate["bound"] == 0.98 and gate["measured"] == pytest.approx(facts["bone_kept"], abs=1e-6)
 
 
-def test_a_table_alone_is_no_body() -> None:
+def test_a_table_alone_is_no_body(odd: OddBodies) -> None:
     for name in ("empty", "empty-curved"):
-        voxels = np.array(make_odd("empty").volume.voxels)
+        voxels = np.array(odd["empty"].volume.voxels)
         if name == "empty-curved":
             voxels[voxels > 700] = -1000  # without its rails
         with pytest.raises(RefusedInputError, match="no body found.*there is no bone"):
-            remove_table(Volume(voxels, make_odd("empty").volume.affine))
+            remove_table(Volume(voxels, odd["empty"].volume.affine))
 
 
-def test_water_has_no_bone_to_keep() -> None:
-    body = make_odd("water")
+def test_water_has_no_bone_to_keep(odd: OddBodies) -> None:
+    body = odd["water"]
     cleaned = remove_table(body.volume)
     facts = cleaned.report["remove_table"]
     assert share_kept(body.volume, cleaned, body.of("water")) > 0.99
@@ -58,8 +58,8 @@ def test_water_has_no_bone_to_keep() -> None:
 
 
 @pytest.mark.parametrize("change", ["soft bone", "a slab", "noise", "aluminium"])
-def test_a_skull_of_another_kind_is_kept(change: str) -> None:
-    body = make_odd("skull-prone")
+def test_a_skull_of_another_kind_is_kept(odd: OddBodies, change: str) -> None:
+    body = odd["skull-prone"]
     voxels, keep = np.array(body.volume.voxels), slice(None)
     if change == "soft bone":
         voxels[body.dense] = np.minimum(0.45 * voxels[body.dense], 690)
@@ -102,15 +102,15 @@ def test_straight_shafts_that_touch_a_table_are_no_rails() -> None:
     assert not (cleaned.voxels[:, 76:] > 300).any()  # the rails
 
 
-def beside(*names: str) -> tuple[Volume, np.ndarray]:
+def beside(odd: OddBodies, *names: str) -> tuple[Volume, np.ndarray]:
     """Two bodies in one scan, side by side."""
-    bodies = [make_odd(name) for name in names]
+    bodies = [odd[name] for name in names]
     voxels = np.concatenate([body.volume.voxels for body in bodies], axis=2)
     return Volume(voxels, bodies[0].volume.affine), np.concatenate([body.dense for body in bodies], axis=2)
 
 
-def test_a_dry_skull_beside_a_patient_is_a_second_body() -> None:
-    volume, dense = beside("skull", "limb")
+def test_a_dry_skull_beside_a_patient_is_a_second_body(odd: OddBodies) -> None:
+    volume, dense = beside(odd, "skull", "limb")
     cleaned = remove_table(volume)
     facts = cleaned.report["remove_table"]
     assert not facts["specimen"]
@@ -118,9 +118,9 @@ def test_a_dry_skull_beside_a_patient_is_a_second_body() -> None:
     assert share_kept(volume, cleaned, dense) == pytest.approx(facts["bone_kept"], abs=0.01)
 
 
-def test_what_would_go_with_the_table_is_refused_with_its_figures() -> None:
+def test_what_would_go_with_the_table_is_refused_with_its_figures(odd: OddBodies) -> None:
     """Dry bones beside a leg, some of them too small for a body: nothing tells them from equipment."""
-    volume, dense = beside("bones", "limb")
+    volume, dense = beside(odd, "bones", "limb")
     with pytest.raises(RefusedInputError, match=r"of [\d,]+ voxels of bone .* [\d,]+ would go .*bone_kept 0\.\d+"):
         remove_table(volume)
     cleaned = remove_table(volume, allow_bone_loss=True)
@@ -130,8 +130,8 @@ def test_what_would_go_with_the_table_is_refused_with_its_figures() -> None:
     assert share_kept(volume, cleaned, dense) == pytest.approx(gate["measured"], abs=0.05)
 
 
-def test_the_range_of_values_is_that_of_the_voxels_that_are_left() -> None:
-    body = make_odd("pelvis")
+def test_the_range_of_values_is_that_of_the_voxels_that_are_left(odd: OddBodies) -> None:
+    body = odd["pelvis"]
     given = [float(body.volume.voxels.min()), float(body.volume.voxels.max())]
     volume = Volume(body.volume.voxels, body.volume.affine, {"warnings": [], "hu_range": given, "padding_share": 0.1})
     cut = mask_field_of_view(volume, 60.0)
@@ -141,8 +141,8 @@ def test_the_range_of_values_is_that_of_the_voxels_that_are_left() -> None:
 
 
 @pytest.mark.parametrize("name", ["pair", "limb", "head"])
-def test_a_circle_says_what_bone_it_cuts(name: str) -> None:
-    body = make_odd(name)
+def test_a_circle_says_what_bone_it_cuts(odd: OddBodies, name: str) -> None:
+    body = odd[name]
     masked = mask_field_of_view(body.volume, 45.0)
     facts = masked.report["field_of_view"]
     lost = np.count_nonzero(body.dense & (masked.voxels != body.volume.voxels))
@@ -153,10 +153,10 @@ def test_a_circle_says_what_bone_it_cuts(name: str) -> None:
     assert "gates" not in masked.report  # the circle was chosen
 
 
-def test_a_circle_that_was_not_chosen_has_a_gate() -> None:
-    whole = mask_field_of_view(make_odd("head").volume)
+def test_a_circle_that_was_not_chosen_has_a_gate(odd: OddBodies) -> None:
+    whole = mask_field_of_view(odd["head"].volume)
     assert gate_of(whole, "bone_in_circle")["ok"] and whole.report["field_of_view"]["bone_voxels_removed"] == 0
-    limb = make_odd("limb").volume
+    limb = odd["limb"].volume
     moved = mask_field_of_view(Volume(np.roll(limb.voxels, (-45, 25), axis=(1, 2)), limb.affine))
     assert gate_of(moved, "bone_in_circle")["ok"] is False
     assert moved.report["field_of_view"]["bone_kept"] < 0.98

@@ -7,10 +7,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from odd_bodies import BODIES, OddBody, make_odd, settings_of
+from odd_bodies import BODIES, OddBodies, OddBody
 
 from clrecon.errors import ClreconError, NoSurfaceError, RefusedInputError
-from clrecon.phantom import write_phantom
 from clrecon.pipeline.mesh import make_mesh
 from clrecon.pipeline.pictures import PictureFiles
 from clrecon.pipeline.purposes import settings_for
@@ -22,31 +21,16 @@ pytestmark = pytest.mark.first_device
 
 BONY = [name for name in BODIES if name not in ("water", "empty")]
 SPINELESS = ("skull", "bones", "pelvis", "water")
-FEW = ("skull", "bones", "pair", "pelvis", "contrast")
-"""Each option with all bodies takes minutes; these differ the most."""
 
 
-@pytest.fixture(scope="session")
-def series(tmp_path_factory: pytest.TempPathFactory) -> Any:
-    """Folder of the series of a body, written when it is first asked for."""
-    folder = tmp_path_factory.mktemp("odd")
-
-    def written(name: str) -> Path:
-        if not (folder / name).is_dir():
-            write_phantom(folder / name, settings_of(name))
-        return folder / name
-
-    return written
-
-
-def mesh_of(series: Any, device: Any, folder: Path, name: str, **settings: Any) -> tuple[dict[str, Any], np.ndarray]:
+def mesh_of(odd: OddBodies, device: Any, folder: Path, name: str, **settings: Any) -> tuple[dict[str, Any], np.ndarray]:
     """Report, and the vertices in index coordinates (i, j, k)."""
     import trimesh
 
     path = folder / "mesh.ply"
-    report = make_mesh(series(name), path, MeshSettings(device=str(device.index), **settings), measure=True)
+    report = make_mesh(odd.series(name), path, MeshSettings(device=str(device.index), **settings))
     vertices = np.asarray(trimesh.load(path, process=False).vertices)
-    return report, make_odd(name).volume.lps_to_ijk(vertices)
+    return report, odd[name].volume.lps_to_ijk(vertices)
 
 
 def share_near(body: OddBody, vertices: np.ndarray, *materials: str) -> float:
@@ -59,9 +43,9 @@ def share_near(body: OddBody, vertices: np.ndarray, *materials: str) -> float:
 
 
 @pytest.mark.parametrize("name", BONY)
-def test_the_mesh_without_the_table_is_that_of_the_bone(series: Any, device: Any, tmp_path: Path, name: str) -> None:
-    body = make_odd(name)
-    report, vertices = mesh_of(series, device, tmp_path, name, iso_value=300.0, remove_table=True, strict=True)
+def test_the_mesh_without_the_table_is_that_of_the_bone(odd: OddBodies, device: Any, tmp_path: Path, name: str) -> None:
+    body = odd[name]
+    report, vertices = mesh_of(odd, device, tmp_path, name, iso_value=300.0, remove_table=True, strict=True)
     facts = report["volume"]["remove_table"]
     assert facts["bone_kept"] >= 0.98
     assert next(gate for gate in report["volume"]["gates"] if gate["name"] == "bone_kept")["ok"]
@@ -71,7 +55,7 @@ def test_the_mesh_without_the_table_is_that_of_the_bone(series: Any, device: Any
     materials = ("bone", "metal", "contrast")
     assert share_near(body, vertices, *materials) > 0.8  # the rest is skin and table in the margin
     # every dense body is there: its voxels have the surface beside them or lie within
-    _, whole = mesh_of(series, device, tmp_path, name, iso_value=300.0)
+    _, whole = mesh_of(odd, device, tmp_path, name, iso_value=300.0)
     assert vertices_of_bone(body, vertices) == pytest.approx(vertices_of_bone(body, whole), rel=0.02)
 
 
@@ -87,25 +71,27 @@ def vertices_of_bone(body: OddBody, vertices: np.ndarray, *materials: str) -> in
 
 @pytest.mark.parametrize("settings", [{"remove_table": True}, {"remove_table": True, "half_way": "auto"}])
 def test_a_table_alone_is_refused_and_writes_nothing(
-    series: Any, device: Any, tmp_path: Path, settings: dict[str, Any]
+    odd: OddBodies, device: Any, tmp_path: Path, settings: dict[str, Any]
 ) -> None:
     path = tmp_path / "mesh.stl"
     with pytest.raises(RefusedInputError, match="no body found"):
-        make_mesh(series("empty"), path, MeshSettings(device=str(device.index), **settings))
+        make_mesh(odd.series("empty"), path, MeshSettings(device=str(device.index), **settings))
     assert not list(tmp_path.iterdir())
 
 
-def test_water_without_its_table_has_no_surface_at_the_level_of_bone(series: Any, device: Any, tmp_path: Path) -> None:
+def test_water_without_its_table_has_no_surface_at_the_level_of_bone(
+    odd: OddBodies, device: Any, tmp_path: Path
+) -> None:
     with pytest.raises(NoSurfaceError, match="HU"):
-        mesh_of(series, device, tmp_path, "water", iso_value=300.0, remove_table=True)
-    _, vertices = mesh_of(series, device, tmp_path, "water", iso_value=-300.0, remove_table=True, keep_largest=1)
-    assert share_near(make_odd("water"), vertices, "water") > 0.7
+        mesh_of(odd, device, tmp_path, "water", iso_value=300.0, remove_table=True)
+    _, vertices = mesh_of(odd, device, tmp_path, "water", iso_value=-300.0, remove_table=True, keep_largest=1)
+    assert share_near(odd["water"], vertices, "water") > 0.7
 
 
-@pytest.mark.parametrize("name", ("limb", "empty", *FEW))
-def test_a_circle_says_what_it_cuts(series: Any, device: Any, tmp_path: Path, name: str) -> None:
-    body = make_odd(name)
-    report, vertices = mesh_of(series, device, tmp_path, name, iso_value=-300.0, field_of_view=60.0)
+@pytest.mark.parametrize("name", BODIES)
+def test_a_circle_says_what_it_cuts(odd: OddBodies, device: Any, tmp_path: Path, name: str) -> None:
+    body = odd[name]
+    report, vertices = mesh_of(odd, device, tmp_path, name, iso_value=-300.0, field_of_view=60.0)
     facts = report["volume"]["field_of_view"]
     centre = (np.array(body.volume.shape_ijk[:2]) - 1.0) / 2.0
     assert (np.linalg.norm((vertices[:, :2] - centre) * body.volume.spacing[:2], axis=1) < 60.0 + 4.0).all()
@@ -117,11 +103,11 @@ def test_a_circle_says_what_it_cuts(series: Any, device: Any, tmp_path: Path, na
 
 @pytest.mark.parametrize("name", BODIES)
 def test_a_level_that_the_scan_gives_fits_its_bone_or_is_refused(
-    series: Any, device: Any, tmp_path: Path, name: str
+    odd: OddBodies, device: Any, tmp_path: Path, name: str
 ) -> None:
-    body = make_odd(name)
+    body = odd[name]
     try:
-        report, vertices = mesh_of(series, device, tmp_path, name, half_way="auto")
+        report, vertices = mesh_of(odd, device, tmp_path, name, half_way="auto")
     except ClreconError as error:
         assert any(letter.isdigit() for letter in str(error))  # a refusal with its figures
         assert name not in ("head", "limb", "pair", "pelvis"), error
@@ -136,109 +122,109 @@ def test_a_level_that_the_scan_gives_fits_its_bone_or_is_refused(
         assert share_near(body, vertices, "bone", "metal", "table") > 0.9
 
 
-@pytest.mark.parametrize("name", FEW)
-def test_the_largest_piece_is_of_the_body(series: Any, device: Any, tmp_path: Path, name: str) -> None:
-    body = make_odd(name)
-    report, vertices = mesh_of(series, device, tmp_path, name, iso_value=300.0, remove_table=True, keep_largest=1)
+@pytest.mark.parametrize("name", BONY)
+def test_the_largest_piece_is_of_the_body(odd: OddBodies, device: Any, tmp_path: Path, name: str) -> None:
+    body = odd[name]
+    report, vertices = mesh_of(odd, device, tmp_path, name, iso_value=300.0, remove_table=True, keep_largest=1)
     assert report["components_kept"] == 1 <= report["components_found"]
     assert share_near(body, vertices, "bone", "metal", "contrast") > 0.9
 
 
-@pytest.mark.parametrize("name", FEW)
-def test_a_seed_in_bone_keeps_bone(series: Any, device: Any, tmp_path: Path, name: str) -> None:
-    body = make_odd(name)
+@pytest.mark.parametrize("name", BONY)
+def test_a_seed_in_bone_keeps_bone(odd: OddBodies, device: Any, tmp_path: Path, name: str) -> None:
+    body = odd[name]
     dense = np.argwhere(body.of("bone") & (body.volume.voxels > 500))
     seed = body.volume.ijk_to_lps(dense[len(dense) // 2][None, ::-1])[0]
-    report, vertices = mesh_of(series, device, tmp_path, name, iso_value=300.0, seeds=[tuple(seed)])
+    report, vertices = mesh_of(odd, device, tmp_path, name, iso_value=300.0, seeds=[tuple(seed)])
     assert report["components_kept"] == 1
     nearest = np.linalg.norm(body.volume.ijk_to_lps(vertices) - seed, axis=1).min()
     assert nearest < 10.0 and share_near(body, vertices, "bone", "metal", "table") > 0.9
 
 
 @pytest.mark.parametrize("name", SPINELESS)
-def test_no_spine_is_found_where_there_is_none(series: Any, device: Any, tmp_path: Path, name: str) -> None:
+def test_no_spine_is_found_where_there_is_none(odd: OddBodies, device: Any, tmp_path: Path, name: str) -> None:
     settings = RenderSettings(curve="auto", device=str(device.index), size=(40, 40))
     with pytest.raises(RefusedInputError, match="spine|canal"):
-        make_pictures(series(name), PictureFiles(picture=str(tmp_path / "spine.png")), settings)
+        make_pictures(odd.series(name), PictureFiles(picture=str(tmp_path / "spine.png")), settings)
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("name", FEW)
-def test_pictures_say_what_was_left_out(series: Any, device: Any, tmp_path: Path, name: str) -> None:
+@pytest.mark.parametrize("name", BONY)
+def test_pictures_say_what_was_left_out(odd: OddBodies, device: Any, tmp_path: Path, name: str) -> None:
     settings = RenderSettings(preset="bone", remove_table=True, device=str(device.index), size=(48, 40))
-    report = make_pictures(series(name), PictureFiles(picture=str(tmp_path / "bone.png")), settings)
+    report = make_pictures(odd.series(name), PictureFiles(picture=str(tmp_path / "bone.png")), settings)
     assert report["volume"]["remove_table"]["bone_kept"] >= 0.98
     assert any("of them dense (table, blankets)" in warning for warning in report["warnings"])
     assert not any("nothing of the volume shows" in warning for warning in report["warnings"])
 
 
 @pytest.mark.parametrize("name", ("water", "empty"))
-def test_what_holds_no_bone_says_so_once(series: Any, device: Any, tmp_path: Path, name: str) -> None:
-    report, _ = mesh_of(series, device, tmp_path, name, half_way="auto")
+def test_what_holds_no_bone_says_so_once(odd: OddBodies, device: Any, tmp_path: Path, name: str) -> None:
+    report, _ = mesh_of(odd, device, tmp_path, name, half_way="auto")
     (said,) = [warning for warning in report["warnings"] if "like bone" in warning or "contrast" in warning]
     assert "nothing here looks like bone, none of" in said
     assert f"{report['walls']['wall_hu']['median']:.0f} HU" in said
     assert ("rails of a table" in said) == (name == "empty")  # hard as bone, and straight
     before = (tmp_path / "mesh.ply").read_bytes()
     with pytest.raises(NoSurfaceError, match="nothing (here looks like|that could be) bone"):
-        mesh_of(series, device, tmp_path, name, half_way="auto", keep="bone")
+        mesh_of(odd, device, tmp_path, name, half_way="auto", keep="bone")
     assert (tmp_path / "mesh.ply").read_bytes() == before
 
 
 @pytest.mark.parametrize("name", ("skull-prone", "limb", "pair", "pelvis"))
-def test_bone_is_kept_and_no_alarm_is_false(series: Any, device: Any, tmp_path: Path, name: str) -> None:
-    body = make_odd(name)
-    report, vertices = mesh_of(series, device, tmp_path, name, preset="bone", remove_table=True, keep="bone")
+def test_bone_is_kept_and_no_alarm_is_false(odd: OddBodies, device: Any, tmp_path: Path, name: str) -> None:
+    body = odd[name]
+    report, vertices = mesh_of(odd, device, tmp_path, name, preset="bone", remove_table=True, keep="bone")
     assert report["walls"]["looks_like"] == "bone"
     assert share_near(body, vertices, "bone", "metal") > 0.8
-    everything, whole = mesh_of(series, device, tmp_path, name, preset="bone")
+    everything, whole = mesh_of(odd, device, tmp_path, name, preset="bone")
     kept, there = (vertices_of_bone(body, some, "bone") for some in (vertices, whole))
     assert kept > (0.9 if name == "skull-prone" else 0.95) * there  # walls of its cavities are pieces of their own
     assert not any("looks like" in warning for warning in report["warnings"] + everything["warnings"])
 
 
-def test_contrast_medium_goes_where_bone_is_kept(series: Any, device: Any, tmp_path: Path) -> None:
-    body = make_odd("contrast")
-    everything, whole = mesh_of(series, device, tmp_path, "contrast", preset="bone", remove_table=True)
+def test_contrast_medium_goes_where_bone_is_kept(odd: OddBodies, device: Any, tmp_path: Path) -> None:
+    body = odd["contrast"]
+    everything, whole = mesh_of(odd, device, tmp_path, "contrast", preset="bone", remove_table=True)
     assert share_near(body, whole, "contrast") > 0.3
     assert any("in part like heart, vessels or organs" in warning for warning in everything["warnings"])
-    _, vertices = mesh_of(series, device, tmp_path, "contrast", preset="bone", remove_table=True, keep="bone")
+    _, vertices = mesh_of(odd, device, tmp_path, "contrast", preset="bone", remove_table=True, keep="bone")
     assert share_near(body, vertices, "contrast") < 0.05 < 0.9 < share_near(body, vertices, "bone")
 
 
 @pytest.mark.parametrize(("name", "kept_ml"), [("head", (20.0, 400.0)), ("contrast", (200.0, 6000.0))])
 def test_air_within_a_body_is_told_from_the_air_around_it(
-    series: Any, device: Any, tmp_path: Path, name: str, kept_ml: tuple[float, float]
+    odd: OddBodies, device: Any, tmp_path: Path, name: str, kept_ml: tuple[float, float]
 ) -> None:
-    body = make_odd(name)
-    report, vertices = mesh_of(series, device, tmp_path, name, below=-400.0)
+    body = odd[name]
+    report, vertices = mesh_of(odd, device, tmp_path, name, below=-400.0)
     facts = report["volume"]["outside_air"]
     assert kept_ml[0] < facts["kept_ml"] < kept_ml[1] < facts["left_out_ml"]
     assert any(f"{facts['kept_ml']:,.1f} ml within it" in warning for warning in report["warnings"])
     assert share_near(body, vertices, "table") < 0.1
 
 
-def test_an_empty_table_holds_no_air_of_a_body(series: Any, device: Any, tmp_path: Path) -> None:
+def test_an_empty_table_holds_no_air_of_a_body(odd: OddBodies, device: Any, tmp_path: Path) -> None:
     with pytest.raises(ClreconError, match=r"\d"):
-        mesh_of(series, device, tmp_path, "empty", below=-400.0)
+        mesh_of(odd, device, tmp_path, "empty", below=-400.0)
 
 
-def test_a_range_takes_contrast_medium_and_leaves_metal(series: Any, device: Any, tmp_path: Path) -> None:
-    body = make_odd("contrast")
-    _, vertices = mesh_of(series, device, tmp_path, "contrast", iso_value=((200.0, 500.0),), remove_table=True)
+def test_a_range_takes_contrast_medium_and_leaves_metal(odd: OddBodies, device: Any, tmp_path: Path) -> None:
+    body = odd["contrast"]
+    _, vertices = mesh_of(odd, device, tmp_path, "contrast", iso_value=((200.0, 500.0),), remove_table=True)
     assert share_near(body, vertices, "contrast", "bone") > 0.9
-    body = make_odd("pelvis")
-    _, vertices = mesh_of(series, device, tmp_path, "pelvis", iso_value=((2500.0, 3071.0),))
+    body = odd["pelvis"]
+    _, vertices = mesh_of(odd, device, tmp_path, "pelvis", iso_value=((2500.0, 3071.0),))
     assert share_near(body, vertices, "metal") > 0.95
 
 
 @pytest.mark.parametrize("name", ("limb", "pair"))
 def test_a_print_is_of_the_body_closed_and_says_what_it_left_out(
-    series: Any, device: Any, tmp_path: Path, name: str
+    odd: OddBodies, device: Any, tmp_path: Path, name: str
 ) -> None:
     given = settings_for("print", {"iso_value": 300.0, "remove_table": True})
-    report, vertices = mesh_of(series, device, tmp_path, name, **given)
-    assert share_near(make_odd(name), vertices, "bone", "metal") > 0.9
+    report, vertices = mesh_of(odd, device, tmp_path, name, **given)
+    assert share_near(odd[name], vertices, "bone", "metal") > 0.9
     assert (report["closed"], report["components"]) == (True, 1)
     assert all(gate["ok"] for gate in report["gates"] if gate["name"] in ("bone_kept", "watertight"))
     left_out = report["print"]["left_out"]
