@@ -54,7 +54,8 @@ def find_devices() -> tuple[list[Any], str]:
         devices = [
             device
             for device in devices
-            if wanted == str(device.index) or wanted in f"{device.platform} {device.name}".lower()
+            if wanted == str(device.index)
+            or (not wanted.isdigit() and wanted in f"{device.platform} {device.name}".lower())
         ]
         if not devices:
             there = "; ".join(f"{device.index}: {device.label}" for device in found) or "none"

@@ -74,6 +74,36 @@ def test_exit_status_of_a_session(tmp_path: Path, test: str, variables: dict[str
     assert done.returncode == code, done.stdout + done.stderr
 
 
+TWO_DEVICES = """
+import pytest
+from types import SimpleNamespace
+import clrecon.opencl
+names = ("CPU", "llvmpipe (LLVM 15.0.6, 256 bits)")
+same = {"platform": "p", "type": "cpu", "version": "", "driver": "", "is_simulator": False}
+found = [SimpleNamespace(index=index, name=name, **same) for index, name in enumerate(names)]
+clrecon.opencl.list_devices = lambda: found
+@pytest.mark.parametrize("kind", ["int16", pytest.param("int8", marks=pytest.mark.first_device)])
+def test_kinds(device, kind):
+    assert not device.keeps_binaries
+@pytest.mark.first_device
+def test_first(device):
+    assert device is found[0]
+"""
+
+
+@pytest.mark.parametrize(
+    ("variables", "passed"),
+    [
+        ({}, "4 passed"),  # one parameter on both devices, the other and the last test on the first
+        ({"CLRECON_TEST_EVERY_DEVICE": "1"}, "1 failed, 5 passed"),
+        ({"CLRECON_TEST_DEVICE": "0"}, "3 passed"),  # the 0 in the name of the other is no index
+    ],
+)
+def test_what_is_marked_runs_on_the_first_device(tmp_path: Path, variables: dict[str, str], passed: str) -> None:
+    done = run_pytest(tmp_path, TWO_DEVICES, **variables)
+    assert passed in done.stdout.splitlines()[-1], done.stdout + done.stderr
+
+
 def test_required_platforms_are_there(device: object) -> None:
     """Asks for the devices of this session, so that a platform that got lost shows in every run."""
     wanted = os.environ.get("CLRECON_REQUIRE_PLATFORMS", "")

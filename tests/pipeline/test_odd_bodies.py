@@ -20,7 +20,7 @@ from clrecon.pipeline.settings import MeshSettings
 pytestmark = pytest.mark.first_device
 
 BONY = [name for name in BODIES if name not in ("water", "empty")]
-SPINELESS = ("skull", "bones", "pelvis", "water")
+SPINELESS = [name for name in BODIES if name != "contrast"]
 
 
 def mesh_of(odd: OddBodies, device: Any, folder: Path, name: str, **settings: Any) -> tuple[dict[str, Any], np.ndarray]:
@@ -149,6 +149,13 @@ def test_no_spine_is_found_where_there_is_none(odd: OddBodies, device: Any, tmp_
     assert not list(tmp_path.iterdir())
 
 
+def test_a_trunk_has_a_spine(odd: OddBodies, device: Any, tmp_path: Path) -> None:
+    settings = RenderSettings(curve="auto", device=str(device.index), size=(40, 40))
+    report = make_pictures(odd.series("contrast"), PictureFiles(picture=str(tmp_path / "spine.png")), settings)
+    (picture,) = report["pictures"]
+    assert picture["curve"] and (tmp_path / "spine.png").stat().st_size > 200
+
+
 @pytest.mark.parametrize("name", BONY)
 def test_pictures_say_what_was_left_out(odd: OddBodies, device: Any, tmp_path: Path, name: str) -> None:
     settings = RenderSettings(preset="bone", remove_table=True, device=str(device.index), size=(48, 40))
@@ -171,15 +178,21 @@ def test_what_holds_no_bone_says_so_once(odd: OddBodies, device: Any, tmp_path: 
     assert (tmp_path / "mesh.ply").read_bytes() == before
 
 
-@pytest.mark.parametrize("name", ("skull-prone", "limb", "pair", "pelvis"))
-def test_bone_is_kept_and_no_alarm_is_false(odd: OddBodies, device: Any, tmp_path: Path, name: str) -> None:
+@pytest.mark.parametrize(
+    ("name", "least"),  # walls of cavities are pieces of their own, and loose pieces of dry bone go
+    [("skull", 0.9), ("skull-prone", 0.9), ("head", 0.95), ("bones", 0.7), ("limb", 0.95), ("pair", 0.95),
+     ("pelvis", 0.95)],
+)  # fmt: skip
+def test_bone_is_kept_and_no_alarm_is_false(
+    odd: OddBodies, device: Any, tmp_path: Path, name: str, least: float
+) -> None:
     body = odd[name]
     report, vertices = mesh_of(odd, device, tmp_path, name, preset="bone", remove_table=True, keep="bone")
     assert report["walls"]["looks_like"] == "bone"
     assert share_near(body, vertices, "bone", "metal") > 0.8
     everything, whole = mesh_of(odd, device, tmp_path, name, preset="bone")
     kept, there = (vertices_of_bone(body, some, "bone") for some in (vertices, whole))
-    assert kept > (0.9 if name == "skull-prone" else 0.95) * there  # walls of its cavities are pieces of their own
+    assert kept > least * there
     assert not any("looks like" in warning for warning in report["warnings"] + everything["warnings"])
 
 
@@ -192,7 +205,16 @@ def test_contrast_medium_goes_where_bone_is_kept(odd: OddBodies, device: Any, tm
     assert share_near(body, vertices, "contrast") < 0.05 < 0.9 < share_near(body, vertices, "bone")
 
 
-@pytest.mark.parametrize(("name", "kept_ml"), [("head", (20.0, 400.0)), ("contrast", (200.0, 6000.0))])
+@pytest.mark.parametrize(
+    ("name", "kept_ml"),
+    [
+        ("skull", (1000.0, 1600.0)),  # the hollow of the brain
+        ("skull-prone", (1000.0, 1600.0)),
+        ("head", (20.0, 400.0)),
+        ("bones", (5.0, 40.0)),
+        ("contrast", (200.0, 6000.0)),
+    ],
+)
 def test_air_within_a_body_is_told_from_the_air_around_it(
     odd: OddBodies, device: Any, tmp_path: Path, name: str, kept_ml: tuple[float, float]
 ) -> None:
@@ -202,11 +224,17 @@ def test_air_within_a_body_is_told_from_the_air_around_it(
     assert kept_ml[0] < facts["kept_ml"] < kept_ml[1] < facts["left_out_ml"]
     assert any(f"{facts['kept_ml']:,.1f} ml within it" in warning for warning in report["warnings"])
     assert share_near(body, vertices, "table") < 0.1
+    assert share_near(body, vertices, "tissue", "bone") > 0.85
 
 
-def test_an_empty_table_holds_no_air_of_a_body(odd: OddBodies, device: Any, tmp_path: Path) -> None:
-    with pytest.raises(ClreconError, match=r"\d"):
-        mesh_of(odd, device, tmp_path, "empty", below=-400.0)
+@pytest.mark.parametrize("name", ("limb", "pair", "pelvis", "water", "empty"))
+def test_what_holds_no_air_of_a_body_is_refused(odd: OddBodies, device: Any, tmp_path: Path, name: str) -> None:
+    expected = (
+        "no body found" if name == "empty" else r"nothing below -400 HU lies within the body: [\d,.]+ ml are outside"
+    )
+    with pytest.raises(ClreconError, match=expected):
+        mesh_of(odd, device, tmp_path, name, below=-400.0)
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_range_takes_contrast_medium_and_leaves_metal(odd: OddBodies, device: Any, tmp_path: Path) -> None:
