@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from clrecon.dicom.gate import TILT_REPORT_DEG, Stack
 from clrecon.dicom.stored import count_readers
 
-__all__ = ["Likeness", "judge_likeness", "measure_likeness"]
+__all__ = ["Likeness", "judge_likeness", "judge_slices", "measure_likeness"]
 
 LEAST_LIKENESS = 1.25
 """Differences from neighbours over those from the slice one period on, from which slices of several volumes lie between
@@ -89,9 +89,14 @@ class Likeness:
 
 def judge_likeness(voxels: NDArray[Any], stack: Stack) -> Likeness | None:
     """`measure_likeness` of a stack that was read, voxels (nk, nj, ni); of a long one where it is most suspicious."""
-    parts = stack.tilt_deg is not None and stack.tilt_deg <= TILT_REPORT_DEG
+    return judge_slices(voxels, stack.tilt_deg, uneven=stack.line.uneven)
+
+
+def judge_slices(voxels: NDArray[Any], tilt_deg: float | None, *, uneven: bool = False) -> Likeness | None:
+    """The same of slices (n, rows, columns) along any axis of a grid; None for the tilt: not known."""
+    parts = tilt_deg is not None and tilt_deg <= TILT_REPORT_DEG
     count = len(voxels)
-    if stack.line.uneven or count <= WINDOW * WINDOWS:
+    if uneven or count <= WINDOW * WINDOWS:
         return measure_likeness(voxels, parts)
     starts = [(count - WINDOW) * place // (WINDOWS - 1) for place in range(WINDOWS)]
     found = [measure_likeness(voxels[first : first + WINDOW], parts) for first in starts]

@@ -29,7 +29,7 @@ from clrecon.dicom.slice_header import SliceHeader
 from clrecon.errors import RefusedInputError
 from clrecon.gates import Gate, at_most, none_of, unmeasured
 
-__all__ = ["PADDING_SHARE", "judge_series"]
+__all__ = ["PADDING_SHARE", "judge_figures", "judge_series", "judge_steps", "list_odd_values"]
 
 PADDING_SHARE = 0.75
 """A circle in its square leaves 0.21 as padding, a 500 mm circle in a field of 800 mm 0.69; above that most of what
@@ -115,12 +115,16 @@ def _gates_of_places(stack: Stack) -> Iterator[Gate]:
 
 
 def _judge_spacing(stack: Stack) -> Gate:
+    first = stack.slices[0]
+    return judge_steps((first.di_mm, first.dj_mm), stack.line.gap_median_mm)
+
+
+def judge_steps(pixels_mm: Sequence[float], gap_mm: float | None) -> Gate:
     """Pixels and gaps of a size that scanners have: a mesh a thousand times too large looks like any other."""
-    first, usual = stack.slices[0], stack.line.gap_median_mm
     (low, high), (gap_low, gap_high) = PIXEL_MM, GAP_MM
-    odd = [f"pixels of {mm:g} mm" for mm in sorted({first.di_mm, first.dj_mm}) if not low <= mm <= high]
-    if usual is not None and not gap_low <= usual <= gap_high:
-        odd.append(f"gaps of {usual:g} mm")
+    odd = [f"pixels of {mm:g} mm" for mm in sorted(set(pixels_mm)) if not low <= mm <= high]
+    if gap_mm is not None and not gap_low <= gap_mm <= gap_high:
+        odd.append(f"gaps of {gap_mm:g} mm")
     what = f"spacings that no scanner has, outside of {low:g} to {high:g} mm, gaps up to {gap_high:g} mm"
     return none_of("plausible_spacing", len(odd), f"{what} ({', '.join(odd)})" if odd else what)
 
@@ -148,9 +152,21 @@ def _judge_hu(headers: Sequence[SliceHeader], facts: PixelFacts | None) -> Gate:
     ):
         odd += [f"{name} {value:g}" for value in (min(values), max(values)) if not low <= value <= high][:1]
     if facts is not None and facts.hu_min <= facts.hu_max and not _count_unknown(headers):
-        for name, value, (low, high) in (("lowest", facts.hu_min, LOWEST_HU), ("densest", facts.hu_max, DENSEST_HU)):
-            if not low <= value <= high:
-                odd.append(f"{name} voxel {value:g} HU, expected {low:g} to {high:g}")
+        odd += list_odd_values(facts)
+    return judge_figures(odd)
+
+
+def list_odd_values(facts: PixelFacts) -> list[str]:
+    """The lowest and the densest voxel, where no CT has such a one."""
+    return [
+        f"{name} voxel {value:g} HU, expected {low:g} to {high:g}"
+        for name, value, (low, high) in (("lowest", facts.hu_min, LOWEST_HU), ("densest", facts.hu_max, DENSEST_HU))
+        if not low <= value <= high
+    ]
+
+
+def judge_figures(odd: Sequence[str]) -> Gate:
+    """The gate ``plausible_hu``, of the figures that are odd."""
     what = "figures of HU that no CT has"
     return none_of("plausible_hu", len(odd), f"{what} ({'; '.join(odd)})" if odd else what)
 

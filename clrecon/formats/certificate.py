@@ -6,29 +6,39 @@ from collections.abc import Sequence
 from typing import Any
 
 from clrecon.dicom.layout import describe_orientation
-from clrecon.dicom.volume_gates import PADDING_SHARE
+from clrecon.dicom.volume_gates import PADDING_SHARE, judge_figures, judge_steps, list_odd_values
 from clrecon.formats.grid_file import GridFile
 from clrecon.formats.values import GridValues
 from clrecon.gates import Gate, at_most, none_of, unmeasured
 from clrecon.geometry.affine import column_spacing, slice_normal, tilt_degrees
 
-__all__ = ["MODALITY", "certify_grid", "collect_header_warnings"]
+__all__ = ["MODALITY", "certify_grid", "collect_header_warnings", "collect_value_warnings"]
 
 MODALITY = "unknown"
 NOT_DICOM = "not DICOM: position, spacing and the meaning of the values are as the file says, nothing vouches for them"
 
-SMALLEST_STEP_MM, LARGEST_STEP_MM = 0.005, 50.0
-"""Micro-CT goes down to 0.01 mm; what is beyond was more likely written in other units."""
-
 
 def collect_header_warnings(grid: GridFile) -> list[str]:
     """Warnings about a grid file, before its voxels are read."""
-    warnings = [NOT_DICOM, *grid.warnings]
-    spacing = column_spacing(grid.affine)
-    if min(spacing) < SMALLEST_STEP_MM or max(spacing) > LARGEST_STEP_MM:
-        shown = " x ".join(f"{step:.3g}" for step in spacing)
-        warnings.append(f"a spacing of {shown} mm is unusual: maybe the file has other units than it says")
+    spacing = judge_spacing(grid)
+    unusual = [f"{spacing['text']}: maybe the file has other units than it says"] if spacing["ok"] is False else []
+    return [NOT_DICOM, *grid.warnings, *unusual]
+
+
+def collect_value_warnings(values: GridValues) -> list[str]:
+    """Warnings about what was read, beside those of the voxels of any volume."""
+    warnings = [*values.warnings, *values.doubts]
+    if values.likeness is not None and values.likeness.is_mixed:
+        warnings.append(str(values.likeness))
+    if not values.doubts and (odd := list_odd_values(values.facts)):
+        warnings.append(judge_figures(odd)["text"])
     return warnings
+
+
+def judge_spacing(grid: GridFile) -> Gate:
+    """The gate ``plausible_spacing``: axes may be in any order, the longest step is that of the slices."""
+    *pixels, gap = sorted(column_spacing(grid.affine))
+    return judge_steps(pixels, gap)
 
 
 def certify_grid(grid: GridFile, values: GridValues | None, warnings: Sequence[str]) -> dict[str, Any]:
@@ -96,14 +106,24 @@ def judge_grid(grid: GridFile, values: GridValues | None) -> list[Gate]:
     """
     doubtful = "values that cannot be HU, or hardly"
     share = "share of voxels without a measurement (padding)"
+    mixed = "signs of several volumes between each other: neighbouring slices less alike than others"
     gates = [
         none_of("usable", 0, "reasons to refuse the volume"),
         none_of("header_clear", len(grid.warnings), "contradictions and gaps in the header"),
+        judge_spacing(grid),
     ]
+    if values is None or values.likeness is None:
+        gates.append(unmeasured("one_volume", 0, None, f"{mixed}: the voxels were not read, or too few"))
+    else:
+        gates.append(none_of("one_volume", int(values.likeness.is_mixed), mixed))
     if values is not None and values.doubts:
         gates.append(none_of("hu_known", len(values.doubts), doubtful))
     else:
         gates.append(unmeasured("hu_known", 0, None, f"{doubtful}: the file does not say what they are"))
+    if values is None or values.doubts:
+        gates.append(unmeasured("plausible_hu", 0, None, "figures of HU that no CT has: not read, or hardly HU"))
+    else:
+        gates.append(judge_figures(list_odd_values(values.facts)))
     if values is None:
         gates.append(unmeasured("padding_share", PADDING_SHARE, None, f"{share}: the voxels were not read"))
     else:

@@ -8,7 +8,7 @@ from clrecon.dicom.listing import SeriesEntry, SeriesListing
 from clrecon.dicom.plausibility import collect_voxel_warnings
 from clrecon.dicom.scan import Progress
 from clrecon.errors import RefusedInputError
-from clrecon.formats.certificate import MODALITY, certify_grid, collect_header_warnings
+from clrecon.formats.certificate import MODALITY, certify_grid, collect_header_warnings, collect_value_warnings
 from clrecon.formats.grid_file import VOLUME, GridFile
 from clrecon.formats.kinds import open_grid
 from clrecon.formats.stream import show_name
@@ -44,7 +44,7 @@ def read_grid(path: Path, kind: str, *, progress: Progress | None = None) -> Vol
 def _collect_warnings(grid: GridFile, values: GridValues | None) -> list[str]:
     warnings = collect_header_warnings(grid)
     if values is not None:
-        warnings += [*values.warnings, *values.doubts, *collect_voxel_warnings(values.voxels, values.facts, ())]
+        warnings += [*collect_value_warnings(values), *collect_voxel_warnings(values.voxels, values.facts, ())]
     return warnings
 
 

@@ -14,11 +14,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from clrecon.dicom.likeness import Likeness, judge_slices
 from clrecon.dicom.pixels import PixelFacts
 from clrecon.dicom.scan import Progress
 from clrecon.errors import RefusedInputError
 from clrecon.formats.grid_file import GridFile
 from clrecon.geometry import AIR_HU
+from clrecon.geometry.affine import column_spacing, tilt_degrees
 from clrecon.geometry.memory import allocate_voxels
 
 __all__ = ["GridValues", "read_values"]
@@ -36,12 +38,16 @@ LEAST_SPAN = 100.0
 
 @dataclass(frozen=True)
 class GridValues:
-    """Voxels (nk, nj, ni) int16, int32 or float32, what was seen in them, warnings, and why they may not be HU."""
+    """Voxels (nk, nj, ni) int16, int32 or float32, what was seen in them, warnings, and why they may not be HU.
+
+    `likeness` is that of the slices along the axis of the longest step; None where there are too few.
+    """
 
     voxels: NDArray[Any]
     facts: PixelFacts
     warnings: list[str]
     doubts: list[str]
+    likeness: Likeness | None
 
 
 def read_values(grid: GridFile, progress: Progress | None = None) -> GridValues:
@@ -133,7 +139,15 @@ class _Filling:
             warnings = [f"{self._holes:,} voxels ({share:.2%}) are NaN: {AIR_HU} HU, air, is taken for them"]
             low, high = min(low, AIR_HU), max(high, AIR_HU)
         filled = float(AIR_HU) if self._holes else None
-        return GridValues(voxels, PixelFacts(share, float(low), float(high), filled), warnings, doubts)
+        facts = PixelFacts(share, float(low), float(high), filled)
+        return GridValues(voxels, facts, warnings, doubts, _judge_likeness(voxels, self._grid))
+
+
+def _judge_likeness(voxels: NDArray[Any], grid: GridFile) -> Likeness | None:
+    """Of the slices as they were most likely measured: a file may have its axes in any order, slices lie farthest."""
+    spacing = column_spacing(grid.affine)
+    axis = max((2, 1, 0), key=lambda place: round(spacing[place], 4))  # equal steps: the last one
+    return judge_slices(np.moveaxis(voxels, 2 - axis, 0), tilt_degrees(grid.affine))
 
 
 def _scale(stored: NDArray[Any], grid: GridFile) -> NDArray[Any]:

@@ -112,6 +112,41 @@ def test_doubts_fail_gates_that_strict_counts(tmp_path):
         assert (problem is None) if failed is None else f"fails 1 gate: {failed}: " in str(problem)
 
 
+def test_figures_that_no_scan_has_fail_gates_of_dicom_too(tmp_path):
+    ct, metres = make_ct(), np.diag((0.001, 0.001, 0.001, 1.0)) @ OBLIQUE
+    bright = ct.astype(np.int32)
+    bright[1, 2, 3] = 80_000
+    cases = [
+        (WRITERS["a.nii"](tmp_path / "a.nii", ct, metres), "plausible_spacing", "pixels of 0.000"),
+        (WRITERS["raw.nrrd"](tmp_path / "a.nrrd", bright, OBLIQUE), "plausible_hu", "densest voxel 80000 HU"),
+    ]
+    for path, name, said in cases:
+        report = clrecon.read_volume(path).report
+        (failed,) = [gate for gate in report["gates"] if gate["ok"] is False]
+        assert failed["name"] == name and said in failed["text"]
+        assert any(failed["text"] in text for text in report["warnings"])
+        assert f"fails 1 gate: {name}: " in str(describe_input(path, pixels=True, strict=True).problem)
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_two_volumes_between_each_other_show_in_any_order_of_the_axes(tmp_path, axis):
+    """Slices along k, j or i of the file: those of one body, or of two that alternate."""
+    k, j, i = np.indices((24, 40, 40))
+    bodies = [40.0 + 900.0 * (np.hypot(j - 20 - 6 * shift, i - 20 + k / 8) < 9) for shift in (0, 1)]
+    for mixed in (False, True):
+        hu = np.where((k % 2 == 1) & mixed, bodies[1], bodies[0]) - 1000.0 * (np.hypot(j - 20, i - 20) > 19)
+        steps = np.ones(3)
+        steps[2 - axis] = 3.0  # the slices lie farthest apart
+        voxels = np.ascontiguousarray(np.moveaxis(np.rint(hu), 0, axis)).astype(np.int16)
+        path = WRITERS["a.nii"](tmp_path / f"{mixed}.nii", voxels, np.diag((*steps, 1.0)))
+        report = clrecon.read_volume(path).report
+        gates = {gate["name"]: gate for gate in report["gates"]}
+        assert gates["one_volume"]["measured"] == int(mixed) and gates["plausible_hu"]["ok"]
+        assert any("between each other" in text for text in report["warnings"]) == mixed
+        listed = {gate["name"]: gate["ok"] for gate in describe_input(path).listing["certificate"]["gates"]}
+        assert listed["one_volume"] is listed["plausible_hu"] is None
+
+
 def test_the_command_line_takes_them(tmp_path, capsys, device):
     sphere = np.linalg.norm(np.indices((24, 24, 24)) - 11.7, axis=0)
     hu = np.clip(1000 - 250 * (sphere - 7), -1000, 1000).astype(np.int16)
