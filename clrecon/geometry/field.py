@@ -120,6 +120,10 @@ class IsoRule:
             return f"{self.iso_value:g} to {self.upper_value:g} HU"
         return f"{'below ' if self.inside == 'below' else ''}{self.iso_value:g} HU"
 
+    def describe_place(self) -> str:
+        """The same behind "surface": ``at 200 HU``, ``of what lies below -400 HU``."""
+        return f"of what lies {self.describe()}" if self.inside == "below" else f"at {self.describe()}"
+
     def as_report(self) -> dict[str, Any]:
         """Entries of a mesh's report: what is inside, and where the surface lies, HU.
 

@@ -51,12 +51,12 @@ def _refuse_level(device: Device, volume: Volume, rule: IsoRule) -> ClreconError
     if low < rule.lowest_inside <= high:
         return _refuse_device(device, rule, runs)
     where = "above" if rule.lowest_inside > high else "at or below the lowest of"
-    return NoSurfaceError(f"no surface at {rule.describe()}: {runs}, the iso value lies {where} that range")
+    return NoSurfaceError(f"no surface {rule.describe_place()}: {runs}, the iso value lies {where} that range")
 
 
 def _refuse_device(device: Device, rule: IsoRule, runs: str) -> DeviceError:
     return DeviceError(
-        f"{device.label} found no surface at {rule.describe()} although {runs}: it computes wrongly,"
+        f"{device.label} found no surface {rule.describe_place()} although {runs}: it computes wrongly,"
         " see `clrecon selftest` and try another device"
     )
 

@@ -31,8 +31,17 @@ SPINE_MM = 20.0
 """The wall of the spinal canal lies nearer to its middle than this."""
 
 
-def find_bone(mesh: Mesh, volume: Volume, surface: Surface, labelled: Labelled) -> NDArray[np.bool_]:
+def find_bone(
+    mesh: Mesh, volume: Volume, surface: Surface, labelled: Labelled, *, without_table: bool = False
+) -> NDArray[np.bool_]:
     """Which components look like bone or, where none does, which one holds the spinal canal.
+
+    Parameters
+    ----------
+    mesh, volume, surface, labelled
+        The components of `surface` in `volume`.
+    without_table : bool
+        The table was taken out of the volume: it is not said what takes it out.
 
     Returns
     -------
@@ -58,8 +67,10 @@ def find_bone(mesh: Mesh, volume: Volume, surface: Surface, labelled: Labelled) 
     bone = like_bone & ~rails
     if bone.any():
         if rails.any():
+            touching = "; table that touches bone is one component with it, --remove-table takes it away first"
             mesh.report.setdefault("warnings", []).append(
                 f"at {surface.describe()} {_describe_rails(int(rails.sum()))}: left out"
+                + ("" if without_table else touching)
             )
         return bone
     bone = _holds_spine(mesh, volume, count, labels)
@@ -240,7 +251,10 @@ def _warn_of_whole(part: Part, settings: MeshSettings) -> list[str]:
     if judged["contrast_share"] < CONTRAST_SHARE:
         return []
     joined = settings.keep == "bone"
-    advice = "a higher iso value parts them" if joined else "--keep bone leaves out what touches no bone"
+    apart = "a higher iso value parts them"
+    if not settings.remove_table:
+        apart += "; where it is a table that touches bone, --remove-table takes that away first"
+    advice = apart if joined else "--keep bone leaves out what touches no bone"
     return [
         f"{where} is in part like heart, vessels or organs with contrast medium (about"
         f" {100.0 * judged['contrast_share']:.0f} % is even beneath and far from compact bone): {advice}"

@@ -92,8 +92,8 @@ def leave_outside(volume: Volume, settings: MeshSettings, progress: Progress) ->
     )
     if facts["opening_mm2"] > 0.0:
         warnings.append(
-            f"airways are open to the outside and were cut there: {facts['opening_mm2']:,.0f} mm2 of cut, a flat end of"
-            " the surface where nostrils, mouth or ears are; look at it there"
+            f"cavities are open to the outside and were cut there: {facts['opening_mm2']:,.0f} mm2 of cut, a flat end"
+            " of the surface at each opening (nostrils, mouth, ears, holes of a dry bone); look at it there"
         )
     volume.report["warnings"] = warnings
     return volume

@@ -55,6 +55,11 @@ class Surface:
             return "the mask"
         return f"{'below ' if self.below else ''}{name_level(self.iso_value)} HU"
 
+    @property
+    def place(self) -> str:
+        """The same behind "surface": ``at 200 HU``, ``of what lies below -400 HU``."""
+        return f"of what lies {self.describe()}" if self.below else f"at {self.describe()}"
+
 
 class Bones(NamedTuple):
     """Of a surface: its components, those that look like bone, and those that would but are rails of a table."""
@@ -132,8 +137,7 @@ def check_levels(volume: Volume, surfaces: Sequence[Surface]) -> None:
             all_inside = level > high if surface.below else level <= low
         if all_inside:  # the surface would be the box of the scan
             raise NoSurfaceError(
-                f"no surface at {surface.describe()}: every voxel is inside,"
-                f" the volume runs from {low:g} to {high:g} HU"
+                f"no surface {surface.place}: every voxel is inside, the volume runs from {low:g} to {high:g} HU"
             )
 
 
@@ -211,14 +215,14 @@ def _select_parts(surface: Surface, mesh: Mesh, settings: MeshSettings, device: 
         from clrecon.pipeline.bone import find_bone
 
         labelled = labelled or find_labels(mesh.triangles, mesh.vertex_count)
-        among = find_bone(mesh, volume, surface, labelled)
+        among = find_bone(mesh, volume, surface, labelled, without_table=settings.remove_table)
     try:
         if not settings.split:
             kept = select_components(mesh, *limits, seeds=seeds, labelled=labelled, among=among)
             return [Part(surface, surface.name, kept)]
         pieces = split_components(mesh, *limits, seeds=seeds, labelled=labelled, among=among, most=MOST_FILES)
     except (NoSurfaceError, UsageError) as error:
-        raise type(error)(f"at {surface.describe()}: {error}") from error
+        raise type(error)(f"{surface.place}: {error}") from error
     return [Part(surface, _name_piece(surface, place), piece) for place, piece in enumerate(pieces, start=1)]
 
 

@@ -212,7 +212,7 @@ def test_a_range_that_holds_nothing_says_the_range_of_the_data(device):
     with pytest.raises(NoSurfaceError, match="every voxel lies within"):
         extract_isosurface(volume, (0, 5), device, closed=False)
     assert_sound(extract_isosurface(volume, (0, 5), device))
-    with pytest.raises(NoSurfaceError, match="no surface at below 0 HU"):
+    with pytest.raises(NoSurfaceError, match="no surface of what lies below 0 HU"):
         extract_isosurface(volume, 0, device, below=True)
     with pytest.raises(UsageError, match="are one float32 number"):
         extract_isosurface(random_volume((3, 4, 5), "float32"), (1.0, 1.0 + 1e-12), device)

@@ -245,7 +245,7 @@ def test_below_encloses_the_rest(device: Any, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("settings", "said"),
     [
-        ({"below": 900.0}, "no surface at below 900 HU: every voxel is inside"),
+        ({"below": 900.0}, "no surface of what lies below 900 HU: every voxel is inside"),
         ({"iso_value": ((-2000.0, 900.0),)}, "no surface at -2000:900 HU: every voxel is inside"),
         ({"iso_value": ((810.0, 900.0),)}, "no surface of 810 to 900 HU: no voxel lies within"),
     ],

@@ -1,0 +1,42 @@
+"""Table that touches bone is one component with it: warnings of ``keep="bone"`` say what takes it away first."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from clrecon.geometry import Volume
+from clrecon.geometry.field import choose_iso_rule
+from clrecon.mesh import Mesh
+from clrecon.mesh.connectivity import label_components
+from clrecon.pipeline.bone import find_bone, warn_of_walls
+from clrecon.pipeline.parts import Part, Surface
+from clrecon.pipeline.settings import MeshSettings
+from clrecon.reference.isosurface import extract_isosurface
+
+
+@pytest.mark.parametrize("without_table", [False, True])
+def test_rails_that_are_left_out_say_so(without_table):
+    k, j, i = np.indices((36, 24, 36))
+    hu = np.where((abs(i - 28) < 4) & (abs(j - 12) < 4), 1500.0, 0.0)
+    hu[np.hypot(i - 11, j - 12) < 5 + 3 * np.sin(k / 4)] = 1000.0
+    volume = Volume(np.rint(hu).astype(np.int16), np.diag((1.0, 1.0, 2.0, 1.0)))
+    vertices, normals, triangles = extract_isosurface(volume, 300.0)
+    report = {**choose_iso_rule(volume, 300.0).as_report(), "iso_level_hu": 299.5}
+    mesh = Mesh(vertices, triangles, normals.astype(np.float32), report)
+    labelled = label_components(mesh.triangles, mesh.vertex_count)
+    bone = find_bone(mesh, volume, Surface(300.0, ""), labelled, without_table=without_table)
+    assert bone.sum() == 1 and len(bone) == 2
+    (said,) = mesh.report["warnings"]
+    assert "1 component is as dense as bone but the same in all slices" in said and ": left out" in said
+    assert ("--remove-table" in said) != without_table
+
+
+@pytest.mark.parametrize("remove_table", [False, True])
+def test_what_is_even_beneath_may_be_a_table(remove_table):
+    walls = {"looks_like": "bone", "contrast_share": 0.1, "compact_share": 0.5}
+    part = Part(Surface(300.0, ""), "", Mesh(np.zeros((3, 3), np.float32), np.zeros((0, 3), np.uint32)))
+    part.facts["walls"] = walls
+    (said,) = warn_of_walls([part], MeshSettings(keep="bone", remove_table=remove_table))
+    assert "about 10 % is even beneath" in said and "a higher iso value parts them" in said
+    assert ("--remove-table" in said) != remove_table
