@@ -92,7 +92,7 @@ def judge_likeness(voxels: NDArray[Any], stack: Stack) -> Likeness | None:
     return judge_slices(voxels, stack.tilt_deg, uneven=stack.line.uneven)
 
 
-def judge_slices(voxels: NDArray[Any], tilt_deg: float | None, *, uneven: bool = False) -> Likeness | None:
+def judge_slices(voxels: NDArray[Any], tilt_deg: float | None, *, uneven: bool | None = False) -> Likeness | None:
     """The same of slices (n, rows, columns) along any axis of a grid; None for the tilt: not known."""
     parts = tilt_deg is not None and tilt_deg <= TILT_REPORT_DEG
     count = len(voxels)
