@@ -126,7 +126,7 @@ def describe_purposes(meshes: list[dict[str, Any]]) -> list[str]:
             f" {100 * wall['thin_share']:.1f} % below {wall['thin_mm']:g} mm"
         )
     pieces = f"{left_out['pieces']:,} pieces of {left_out['pieces_ml']:.3g} ml together"
-    cavities = f"{left_out['cavities']:,} closed cavities of {left_out['cavities_ml']:.3g} ml"
+    cavities = f"{left_out['cavities']:,} closed cavities of {left_out['cavities_ml'] + 0.0:.3g} ml"  # + 0.0: no "-0"
     return [*lines, f"         left out {pieces}, filled {cavities}"]
 
 

@@ -222,7 +222,8 @@ def _select_parts(surface: Surface, mesh: Mesh, settings: MeshSettings, device: 
             return [Part(surface, surface.name, kept)]
         pieces = split_components(mesh, *limits, seeds=seeds, labelled=labelled, among=among, most=MOST_FILES)
     except (NoSurfaceError, UsageError) as error:
-        raise type(error)(f"{surface.place}: {error}") from error
+        label = "" if surface.label is None else f"{surface.label} "  # of several one is too small, or too far
+        raise type(error)(f"{label}{surface.place}: {error}") from error
     return [Part(surface, _name_piece(surface, place), piece) for place, piece in enumerate(pieces, start=1)]
 
 

@@ -161,6 +161,104 @@ def test_components_of_a_label_count_together(device: Any, ct: Path, labels: Pat
     assert [gate["mesh"] for gate in report["gates"] if gate["name"] == "label_volume"] == [None]
 
 
+@pytest.fixture(scope="module")
+def pieces(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two halves of the sphere of 1.4 and 1.6 ml, a corner beside the second one, and a label of 0.01 ml."""
+    voxels = np.zeros(sphere_voxels().shape, np.uint8)
+    dense = sphere_voxels() >= 0
+    voxels[:, :, :15] = dense[:, :, :15]
+    voxels[:, :, 15:] = 2 * dense[:, :, 15:]
+    voxels[-3:, -3:, -3:] = 2
+    voxels[:2, :2, :2] = 3
+    return Path(write_nifti(tmp_path_factory.mktemp("pieces") / "a.nii.gz", voxels, AFFINE))
+
+
+def mask_job(ct: Path, pieces: Path, folder: Path, options: list[str], device: Any) -> dict[str, Any]:
+    """The report of a job on labels' own surfaces that must end well."""
+    arguments = ("--labels", pieces, "--surface", "mask", "--report", folder / "r.json", *options)
+    assert run(ct, "-o", folder / "b.stl", *arguments, device=device) == 0
+    report: dict[str, Any] = json.loads((folder / "r.json").read_text())
+    assert report["closed"] and report["manifold"]
+    return report
+
+
+def failed_volumes(report: dict[str, Any]) -> list[str]:
+    return [gate["mesh"] for gate in report["gates"] if gate["name"] == "label_volume" and not gate["ok"]]
+
+
+CORNER = ",".join(str(value) for value in np.array(ORIGIN) + SPACING * np.array([29.0, 23.0, 15.0]))
+
+
+@pytest.mark.parametrize(
+    ("options", "names", "failed"),
+    [
+        (["--split"], ["label_1_001", "label_2_001", "label_2_002", "label_3_001"], []),
+        (["--keep-largest", "1"], ["label_1", "label_2", "label_3"], ["label_2"]),
+        (["--min-volume", "0.5", "--label", "1", "--label", "2"], ["label_1", "label_2"], ["label_2"]),
+        (["--seed", CORNER, "--label", "2"], [None], [None]),
+        (["--smooth"], ["label_1", "label_2", "label_3"], []),
+        (["--smooth", "--decimate", "0.5"], ["label_1", "label_2", "label_3"], []),
+        (["--for", "print", "--label", "1"], [None], []),
+    ],
+)
+def test_components_and_refinement_of_masks(
+    options: list[str], names: list[str], failed: list[str], device: Any, ct: Path, pieces: Path, tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    """What leaves components out makes the gate of the volume fail, and it says why; refinement keeps it."""
+    report = mask_job(ct, pieces, tmp_path, options, device)
+    assert [mesh["name"] for mesh in report["meshes"]] == names
+    assert failed_volumes(report) == failed
+    captured = capsys.readouterr()
+    assert ("1 of its 2 components were kept" in captured.err) == bool(failed) and " -0 ml" not in captured.out
+
+
+@pytest.mark.parametrize(
+    ("options", "code", "words"),
+    [
+        (["--min-volume", "0.5"], 2, "label_3 at the mask: none of the 1 components encloses 0.5 ml"),
+        (["--seed", "0,0,0"], 3, "label_1 at the mask: the seed at LPS (0, 0, 0) mm lies"),
+        (["--seed", "1,2"], 3, "'1,2' is no point: three numbers in mm with commas"),
+        (["--keep-largest", "0"], 3, "the number of components to keep must be 1 or more"),
+        (["--min-volume", "-1"], 3, "the smallest volume to keep must be above 0 ml"),
+        (["--decimate", "2"], 3, "the share of triangles to take away lies between 0 and 1"),
+        (["--smooth", "0"], 3, "smoothing takes from 1 to 1000 iterations"),
+        (["--max-deviation", "0.1"], 3, "a largest deviation bounds smoothing and decimation"),
+        (["--keep", "bone"], 3, "labels say what is kept"),
+        (["--below", "-400"], 3, "the surface of a mask does not depend on HU"),
+        (["--topology", "trilinear"], 3, "the topology trilinear follows HU"),
+    ],
+)
+def test_what_cannot_be_with_masks_is_said_in_one_line(
+    options: list[str], code: int, words: str, device: Any, ct: Path, pieces: Path, tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    arguments = ("--labels", pieces, "--surface", "mask", *options)
+    assert run(ct, "-o", tmp_path / "b.stl", *arguments, device=device) == code
+    error = capsys.readouterr().err
+    assert words in error and error.count("\n") == 1
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_labels_that_miss_their_volume_fail_the_gate(
+    device: Any, ct: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Small cells that fill the map: notches between three of them take 3 %, which no level brings back."""
+    shape = sphere_voxels().shape
+    points = np.random.default_rng(0).random((60, 3)) * shape
+    away = np.linalg.norm(np.moveaxis(np.indices(shape), 0, -1)[..., None, :] - points, axis=-1)
+    cells = Path(write_nifti(tmp_path / "a.nii.gz", (away.argmin(axis=-1) + 1).astype(np.uint8), AFFINE))
+    arguments = ("-o", tmp_path / "b.stl", "--labels", cells, "--surface", "mask", "--report", tmp_path / "r.json")
+    assert run(ct, *arguments, "--strict", device=device) == 8
+    assert "gate label_volume failed: the mesh has" in capsys.readouterr().err
+    report = json.loads((tmp_path / "r.json").read_text())
+    gates = [gate for gate in report["gates"] if gate["name"] == "label_volume"]
+    assert len(gates) == 60 and sum(gate["ok"] is False for gate in gates) >= 50
+    for gate, mesh in zip(gates, report["meshes"], strict=True):
+        missing = 100 * abs(mesh["volume_ml"] / mesh["label_ml"] - 1)
+        assert gate["measured"] == pytest.approx(missing, abs=1e-6) and gate["ok"] == (missing <= gate["bound"] == 1.0)
+
+
 def test_the_memory_that_is_allowed_counts_for_labels_too(
     device: Any, ct: Path, labels: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
