@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from test_isosurface import OBLIQUE, random_volume, smooth_volume
-from voxel_types import VOXEL_TYPES
+from variants import VOXEL_TYPES
 
 from clrecon.geometry import Volume
 from clrecon.kernels import download, upload

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import tolerances
 from scipy.spatial import cKDTree
-from voxel_types import VOXEL_TYPES
+from variants import VOXEL_TYPES
 
 from clrecon.errors import DeviceError, NoSurfaceError, UsageError
 from clrecon.geometry import Volume, compose_affine, field

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import tolerances
-from voxel_types import VOXEL_TYPES
+from variants import VOXEL_TYPES
 
 from clrecon.errors import DeviceError, NoSurfaceError, RefusedInputError, UsageError
 from clrecon.geometry import Volume

@@ -7,7 +7,7 @@ import pytest
 import tolerances
 from test_isosurface import MIRRORED, OBLIQUE, SHAPES, assert_sound, random_volume, smooth_volume
 from test_slabs import assert_same
-from voxel_types import VOXEL_TYPES
+from variants import VOXEL_TYPES
 
 from clrecon.errors import DeviceError, NoSurfaceError, UsageError
 from clrecon.geometry import Volume

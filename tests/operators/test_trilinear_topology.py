@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import tolerances
 from test_isosurface import MIRRORED, OBLIQUE, SHAPES, assert_sound, random_volume, smooth_volume
-from voxel_types import VOXEL_TYPES
+from variants import VOXEL_TYPES
 
 from clrecon.errors import UsageError
 from clrecon.geometry import Volume, compose_affine
