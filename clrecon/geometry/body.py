@@ -37,6 +37,9 @@ LUNG_WALL, AIR_WALL = 0.2, 0.7
 """Share of the wall that must be thick, of lung and of larger regions of air."""
 LUNG_HU, MOST_AIR = -950.0, 0.2
 """Lung has fewer cells below this than that share; air, foam and blankets have more."""
+FOAM_HU, FOAM_WALL, FOAM_MM = -900.0, 0.3, 10.0
+"""Foam of a trough that fits a body closely is no lung: most of it is below this, no more of its wall is thick, and it
+is nowhere thicker than twice this.  Lung in three scans is thicker, and has thicker walls or more HU."""
 FEWEST_UNMEASURED = 16
 """Cells beside each other that have one value: fewer have it by chance."""
 MARGIN_MM = 3.0
@@ -247,7 +250,13 @@ def _find_cavities(cells: NDArray[np.float32], tissue: Mask, thick: Mask, across
     size = np.bincount(regions.ravel(), minlength=count + 1)
     is_lung = np.bincount(regions[cells < LUNG_HU], minlength=count + 1) < MOST_AIR * size
     small = size * across**2 < SMALL_MM2
+    foam = is_lung & ~small & (thick_wall > LUNG_WALL) & (thick_wall <= FOAM_WALL)
+    foam &= np.bincount(regions[cells < FOAM_HU], minlength=count + 1) > 0.5 * size
+    foam[0] = False
+    if foam.any():
+        foam[np.unique(regions[grow(foam[regions], -FOAM_MM / across)])] = False
     kept = np.where(is_lung, thick_wall > LUNG_WALL, ~is_open & (small | (thick_wall > AIR_WALL)))
+    kept &= ~foam
     kept[0] = False
     return np.asarray(kept[regions])
 

@@ -11,6 +11,7 @@ from odd_bodies import BODIES, OddBodies
 from clrecon.errors import RefusedInputError
 from clrecon.geometry import Volume
 from clrecon.geometry.body import mask_field_of_view, remove_table
+from clrecon.phantom import MATERIALS, PhantomSettings, label_materials, make_phantom
 
 SPECIMENS = {"skull", "skull-prone", "bones"}
 
@@ -37,6 +38,18 @@ def test_bone_stays_and_the_table_goes(odd: OddBodies, name: str) -> None:
     assert facts["bone_voxels"] >= 0.97 * np.count_nonzero(body.dense)
     gate = gate_of(cleaned)
     assert gate["ok"] and gate["bound"] == 0.98 and gate["measured"] == pytest.approx(facts["bone_kept"], abs=1e-6)
+
+
+def test_foam_of_a_trough_that_fits_closely_is_no_lung() -> None:
+    """The back presses on the trough: a quarter of the wall of its foam of -930 HU is thick, as of a lung."""
+    settings = PhantomSettings("pelvis", (184, 177), slices=40, spacing=(2.1, 2.1, 2.1), table="curved")
+    voxels, affine, _ = make_phantom(settings)
+    volume, labels = Volume(voxels, affine), label_materials(settings)
+    cleaned = remove_table(volume)
+    table = labels == MATERIALS.index("table")
+    assert share_kept(volume, cleaned, (voxels > 300) & ~table) == 1.0
+    assert share_kept(volume, cleaned, table & (voxels > -300)) < 0.35  # all of it stayed
+    assert cleaned.report["remove_table"]["bone_kept"] == 1.0
 
 
 def test_a_table_alone_is_no_body(odd: OddBodies) -> None:
