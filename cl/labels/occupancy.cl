@@ -20,6 +20,9 @@
 #error "the rows below have five samples"
 #endif
 
+#define STRIP 16 /* samples of a row that are smoothed at once, or not at all */
+#define WHOLE 16 /* the sum along a row where all samples count */
+
 /* 16 samples from `at` on: 255 where they carry `label`, or any label where that is 0; else 0. */
 static inline uchar16 find_label(__global const LABEL *at, const LABEL label)
 {
@@ -27,8 +30,17 @@ static inline uchar16 find_label(__global const LABEL *at, const LABEL label)
     return as_uchar16(convert_char16(label != 0 ? found : ~found));
 }
 
+/* Note that sums of samples first .. last of a row are not all 0, or not all WHOLE, in its flags: see smooth_rows. */
+static inline void note_strips(__global uint2 *flags, int first, int last, int occupied, int vacant)
+{
+    for (int strip = first / STRIP; strip <= last / STRIP; ++strip)
+        flags[strip / 32] |= (uint2)((uint)occupied << (strip & 31), (uint)vacant << (strip & 31));
+}
+
 /* Parameters  map       in   slices of (nk, nj, ni) from first_slice on
  *             rows      out  as `map`: sums along i
+ *             strips    out  (slices of the map, nj, flag_words) bit n of the one: of samples STRIP n .. STRIP n + 15 of
+ *                            the row some may have sums above 0; of the other: some may have sums below WHOLE
  *             label     number of the label; 0: all labels
  *             ni nj     of the whole map
  *             begin_i end_i begin_j end_j   the samples that are wanted: others are not written
@@ -36,8 +48,8 @@ static inline uchar16 find_label(__global const LABEL *at, const LABEL label)
  * Launch      global = slices * (end_j - begin_j) rounded up by the host, any local: one item a row
  * Guarantees  every wanted sum is written; samples up to 15 before or behind them in the row may be too, right as well */
 __kernel void smooth_rows(
-    __global const LABEL *restrict map, __global ushort *restrict rows, const uint label,
-    const int ni, const int nj, const int begin_i, const int end_i, const int begin_j, const int end_j,
+    __global const LABEL *restrict map, __global ushort *restrict rows, __global uint2 *restrict strips,
+    const uint label, const int ni, const int nj, const int begin_i, const int end_i, const int begin_j, const int end_j,
     const int begin_slice, const uint slices)
 {
     const uint item = get_global_id(0), height = end_j - begin_j;
@@ -46,6 +58,10 @@ __kernel void smooth_rows(
     const size_t row = voxel_index(0, begin_j + (int)(item % height), begin_slice + (int)(item / height), ni, nj);
     __global const LABEL *in = map + row;
     __global ushort *out = rows + row;
+    const int flag_words = (ni + 32 * STRIP - 1) / (32 * STRIP);
+    __global uint2 *flags = strips + row / ni * flag_words;
+    for (int w = 0; w < flag_words; ++w)
+        flags[w] = (uint2)(0, 0);
 #define AT(i) ((ushort)(label != 0 ? in[clamp(i, 0, ni - 1)] == label : in[clamp(i, 0, ni - 1)] != 0))
     int i = begin_i;
     while (i < end_i) {
@@ -53,17 +69,48 @@ __kernel void smooth_rows(
             const uchar16 sum = (find_label(in + i - 2, (LABEL)label) & (uchar)1)
                 + (find_label(in + i - 1, (LABEL)label) & (uchar)4) + (find_label(in + i, (LABEL)label) & (uchar)6)
                 + (find_label(in + i + 1, (LABEL)label) & (uchar)4) + (find_label(in + i + 2, (LABEL)label) & (uchar)1);
+            const ulong2 sums = as_ulong2(sum), missing = as_ulong2(sum ^ (uchar)WHOLE);
+            note_strips(flags, i, i + 15, (sums.x | sums.y) != 0, (missing.x | missing.y) != 0);
             vstore16(convert_ushort16(sum), 0, out + i); /* once here: the next pass reads each 25 times */
             i += 16;
         } else {
             out[i] = (ushort)(AT(i - 2) + AT(i + 2) + 4 * (AT(i - 1) + AT(i + 1)) + 6 * AT(i));
+            note_strips(flags, i, i, out[i] != 0, out[i] != WHOLE);
             ++i;
         }
     }
 #undef AT
 }
 
+/* Occupancies of the 16 samples of a strip, from the sums of 5 x 5 rows. */
+static inline void smooth_strip(
+    __global const ushort *rows, const size_t *along_j, const size_t *along_k, __global short *out)
+{
+    ushort16 sum = 0;
+    for (int d = 0; d <= 2 * REACH; ++d) {
+#define ROW(n) vload16(0, rows + along_k[d] + along_j[n])
+        const ushort16 plane = ROW(0) + ROW(4) + (ushort)4 * (ROW(1) + ROW(3)) + (ushort)6 * ROW(2);
+#undef ROW
+        sum += (ushort)weigh(d - REACH) * plane;
+    }
+    vstore16(as_short16(sum * (ushort)FINENESS), 0, out);
+}
+
+/* The same of the last samples of a row, from `first` on. */
+static inline void smooth_rest(
+    __global const ushort *rows, const size_t *along_j, const size_t *along_k, __global short *out, int first, int ni)
+{
+    for (int i = first; i < ni; ++i) {
+        int sum = 0;
+        for (int d = 0; d <= 2 * REACH; ++d)
+            for (int n = 0; n <= 2 * REACH; ++n)
+                sum += weigh(d - REACH) * weigh(n - REACH) * rows[along_k[d] + along_j[n] + i];
+        out[i] = (short)(FINENESS * sum);
+    }
+}
+
 /* Parameters  rows        in   (row_slices, nj, ni) of smooth_rows, from slice first_row_slice of the map on
+ *             strips      in   those of smooth_rows, with as many slices
  *             occupancy   out  as `rows`
  *             ni nj nk    of the whole map
  *             begin_i end_i begin_j end_j   the samples that are wanted: others are not written
@@ -71,9 +118,10 @@ __kernel void smooth_rows(
  *             first_slice slices   those that are wanted
  * Launch      global = slices * (end_j - begin_j) rounded up by the host, any local: one item a row
  * Assumes     `rows` has the wanted samples and those REACH around them, as far as the map goes
- * Guarantees  every wanted occupancy is written; samples up to 15 behind them in the row may be too, with any value */
+ * Guarantees  every wanted occupancy above 0 and below FULL is written; those of other samples may be, and samples up to
+ *             15 before or behind them in the row, with any value: vertices depend on none of them */
 __kernel void smooth_across(
-    __global const ushort *restrict rows, __global short *restrict occupancy,
+    __global const ushort *restrict rows, __global const uint2 *restrict strips, __global short *restrict occupancy,
     const int ni, const int nj, const int nk, const int begin_i, const int end_i, const int begin_j, const int end_j,
     const int first_row_slice, const int first_slice, const uint slices)
 {
@@ -87,23 +135,19 @@ __kernel void smooth_across(
         along_j[d + REACH] = voxel_index(0, clamp(j + d, 0, nj - 1), 0, ni, nj);
         along_k[d + REACH] = voxel_index(0, 0, clamp(k + d, 0, nk - 1) - first_row_slice, ni, nj);
     }
-    int i = begin_i;
-    for (; i + 16 <= ni && i < end_i; i += 16) {
-        ushort16 sum = 0;
-        for (int d = 0; d <= 2 * REACH; ++d) {
-#define ROW(n) vload16(0, rows + along_k[d] + along_j[n] + i)
-            const ushort16 plane = ROW(0) + ROW(4) + (ushort)4 * (ROW(1) + ROW(3)) + (ushort)6 * ROW(2);
-#undef ROW
-            sum += (ushort)weigh(d - REACH) * plane;
-        }
-        vstore16(as_short16(sum * (ushort)FINENESS), 0, out + i);
-    }
-    for (; i < end_i; ++i) {
-        int sum = 0;
+    const int flag_words = (ni + 32 * STRIP - 1) / (32 * STRIP);
+    for (int w = begin_i / (32 * STRIP); 32 * STRIP * w < end_i; ++w) {
+        uint2 flags = 0; /* where all sums are 0, or all are WHOLE, no border is near */
         for (int d = 0; d <= 2 * REACH; ++d)
             for (int n = 0; n <= 2 * REACH; ++n)
-                sum += weigh(d - REACH) * weigh(n - REACH) * rows[along_k[d] + along_j[n] + i];
-        out[i] = (short)(FINENESS * sum);
+                flags |= strips[(along_k[d] + along_j[n]) / ni * flag_words + w];
+        for (uint busy = flags.x & flags.y; busy != 0; busy &= busy - 1) {
+            const int first = STRIP * (32 * w + (int)lowest_bit(busy));
+            if (first + STRIP <= ni)
+                smooth_strip(rows + first, along_j, along_k, out + first);
+            else
+                smooth_rest(rows, along_j, along_k, out, first, ni);
+        }
     }
 }
 

@@ -8,6 +8,24 @@
 #include "isosurface/mask_rows.h"
 #include "labels/label_type.h"
 
+/* 16 labels, and whether any bit of them is set: without conversions, which some drivers call as functions. */
+#define JOIN_NAMES(a, b) a##b
+#define JOIN(a, b) JOIN_NAMES(a, b)
+#define LABEL16 JOIN(LABEL, 16)
+#define ANY_BIT(labels) JOIN(any_bit_, LABEL)(labels)
+
+static inline int any_bit_uchar(uchar16 labels)
+{
+    const ulong2 parts = as_ulong2(labels);
+    return (parts.x | parts.y) != 0;
+}
+
+static inline int any_bit_ushort(ushort16 labels)
+{
+    const ulong4 parts = as_ulong4(labels);
+    return (parts.x | parts.y | parts.z | parts.w) != 0;
+}
+
 /* Parameters  boxes    out  (labels, 6) highest int three times, lowest int three times: no box yet
  *             faces    out  (labels, 2) 0
  *             labels
@@ -118,10 +136,9 @@ __kernel void count_faces(
     found_faces near = {0, 0, 0}, far = {0, 0, 0}; /* of the row's own samples, of those next to them */
     for (int first = 0; first < ni; first += 16) {
         if (first + 17 <= ni) {
-            const short16 differ = convert_short16((vload16(0, row + first) != vload16(0, row + first + 1))
-                | (vload16(0, row + first) != vload16(0, row + first + along_j))
-                | (vload16(0, row + first) != vload16(0, row + first + along_k)));
-            if (pack_lanes(differ) == 0)
+            const LABEL16 own = vload16(0, row + first);
+            if (!ANY_BIT((own ^ vload16(0, row + first + 1)) | (own ^ vload16(0, row + first + along_j))
+                    | (own ^ vload16(0, row + first + along_k))))
                 continue;
         }
         for (int i = first; i < min(first + 16, ni); ++i) {

@@ -39,6 +39,8 @@ SPARE_SLICES = 3 + REACH
 """Beyond the label's box: slices of the mask, gradients, and what their occupancy needs."""
 
 TRIANGLES_PER_SUM = 256
+SAMPLES_PER_FLAGS = 32 * 16
+"""Of a row: 32 strips of 16 samples, as cl/labels/occupancy.cl."""
 
 
 def prepare_label_masks(device: Device, label_dtype: DTypeLike = np.uint8) -> tuple[Program, Program]:
@@ -61,6 +63,7 @@ class _Held:
     end: int
     map_d: Any
     rows_d: Any
+    strips_d: Any
     occupancy_d: Any
     occupied_d: Any
 
@@ -100,9 +103,15 @@ class _Run:
         return {
             "labels": samples * self.labels.voxels.itemsize,
             "row sums": 2 * samples,
+            "strips": self.strip_bytes(end - first),
             "occupancy": 2 * samples,
             "occupancy of all labels": 2 * samples * self.has_neighbours,
         }
+
+    def strip_bytes(self, slices: int) -> int:
+        """Bytes of two flags for each 16 samples of a row."""
+        ni, nj, _ = self.labels.shape_ijk
+        return 8 * -(-ni // SAMPLES_PER_FLAGS) * nj * slices
 
     def group(self, boxes: dict[int, Box], memory: int | None) -> list[dict[int, Box]]:
         """All labels at once where their slices fit the device, else one by one: the meshes are the same."""
@@ -123,7 +132,8 @@ class _Run:
         samples = self.labels.voxels[first:end].size
         rows_d, occupancy_d = allocate(device, 2 * samples), allocate(device, 2 * samples)
         occupied_d = allocate(device, 2 * samples) if self.has_neighbours else occupancy_d
-        held = _Held(first, end, map_d, rows_d, occupancy_d, occupied_d)
+        strips_d = allocate(device, self.strip_bytes(end - first))
+        held = _Held(first, end, map_d, rows_d, strips_d, occupancy_d, occupied_d)
         if self.has_neighbours:
             around = tuple(
                 slice(min(box[axis].start for box in boxes.values()), max(box[axis].stop for box in boxes.values()))
@@ -145,13 +155,13 @@ class _Run:
         slices = row_k[1] - row_k[0]
         launch(
             self.device, self.own["smooth_rows"], slices * (row_j[1] - row_j[0]),
-            held.map_d, held.rows_d, np.uint32(number),
+            held.map_d, held.rows_d, held.strips_d, np.uint32(number),
             *(np.int32(n) for n in (ni, nj, *along_i, *row_j, row_k[0] - held.first)), np.uint32(slices),
             stopwatch=self.stopwatch,
         )  # fmt: skip
         launch(
             self.device, self.own["smooth_across"], (end_k - begin_k) * (end_j - begin_j),
-            held.rows_d, occupancy_d, *(np.int32(n) for n in (ni, nj, nk, *along_i, begin_j, end_j)),
+            held.rows_d, held.strips_d, occupancy_d, *(np.int32(n) for n in (ni, nj, nk, *along_i, begin_j, end_j)),
             np.int32(held.first), np.int32(begin_k), np.uint32(end_k - begin_k), stopwatch=self.stopwatch,
         )  # fmt: skip
 
