@@ -127,7 +127,14 @@ def describe_purposes(meshes: list[dict[str, Any]]) -> list[str]:
         )
     pieces = f"{left_out['pieces']:,} pieces of {left_out['pieces_ml']:.3g} ml together"
     cavities = f"{left_out['cavities']:,} closed cavities of {left_out['cavities_ml'] + 0.0:.3g} ml"  # + 0.0: no "-0"
-    return [*lines, f"         left out {pieces}, filled {cavities}"]
+    lines.append(f"         left out {pieces}, filled {cavities}")
+    if left_out["not_bone"] is not None:
+        bone = left_out["pieces"] + facts["pieces"] - left_out["not_bone"]
+        lines.append(
+            f"         kept {facts['pieces']:,} of {bone:,} pieces with walls like bone; {left_out['not_bone']:,} of"
+            f" {left_out['not_bone_ml']:.3g} ml are not, or are crumbs"
+        )
+    return lines
 
 
 GATES_OF_AFFINE = ("grid_residual",)

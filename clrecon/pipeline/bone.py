@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 from clrecon.errors import NoSurfaceError, RefusedInputError, UsageError
 from clrecon.pipeline.levels import warn_of_contrast
 from clrecon.pipeline.parts import Bones, Part, Surface
+from clrecon.pipeline.presets import LOWEST_BONE_HU
 from clrecon.pipeline.settings import MeshSettings
 
 if TYPE_CHECKING:
@@ -22,8 +23,6 @@ if TYPE_CHECKING:
 
 __all__ = ["find_bone", "judge_surfaces", "warn_of_walls"]
 
-LOWEST_BONE_HU = 100.0
-"""Iso values from here on are those of bone: muscle and organs without contrast medium stay below."""
 CONTRAST_SHARE = 0.04
 """Of a surface of bone, more than this that looks like contrast medium is said: spongy bone gives up to 0.03."""
 NAMES_SHOWN = 5
@@ -32,7 +31,13 @@ SPINE_MM = 20.0
 
 
 def find_bone(
-    mesh: Mesh, volume: Volume, surface: Surface, labelled: Labelled, *, without_table: bool = False
+    mesh: Mesh,
+    volume: Volume,
+    surface: Surface,
+    labelled: Labelled,
+    *,
+    without_table: bool = False,
+    advice: str = "--keep-largest N keeps by size",
 ) -> NDArray[np.bool_]:
     """Which components look like bone or, where none does, which one holds the spinal canal.
 
@@ -50,7 +55,7 @@ def find_bone(
     Raises
     ------
     NoSurfaceError
-        None is bone; the message has the figures of the largest.
+        None is bone; the message has the figures of the largest, and the advice.
     """
     import numpy as np
 
@@ -76,7 +81,7 @@ def find_bone(
     bone = _holds_spine(mesh, volume, count, labels)
     if not bone.any():
         told = [one for one, is_rail in zip(judged, rails, strict=True) if one is not None and not is_rail]
-        raise NoSurfaceError(f"at {surface.describe()}: {_describe_none(told, count, int(rails.sum()))}")
+        raise NoSurfaceError(f"at {surface.describe()}: {_describe_none(told, count, int(rails.sum()))} ({advice})")
     mesh.report.setdefault("warnings", []).append(
         f"at {surface.describe()} no component has walls like bone: the one round the spinal canal was kept"
     )
@@ -91,7 +96,7 @@ def _describe_none(told: Sequence[dict[str, Any]], count: int, rails: int) -> st
     largest = max(told, key=lambda one: int(one["samples"]))
     return (
         f"nothing here looks like bone: of {count:,} components the largest {_looks(largest)};"
-        f" those of bone reach 600 at 5 % and more of it (--keep-largest N keeps by size){but}"
+        f" those of bone reach 600 at 5 % and more of it{but}"
     )
 
 

@@ -178,9 +178,9 @@ def select_parts(surface: Surface, mesh: Mesh, settings: MeshSettings, device: D
         return _select_parts(surface, mesh, settings, device, volume)
     from clrecon.pipeline.purposes import measure_pieces
 
-    found = measure_pieces(mesh)
+    found = measure_pieces(mesh.vertices, mesh.triangles)
     parts = _select_parts(surface, mesh, settings, device, volume)
-    each = [measure_pieces(part.mesh) for part in parts]
+    each = [measure_pieces(part.mesh.vertices, part.mesh.triangles) for part in parts]
     for part in parts:
         part.pieces = found, {name: sum(kept[name] for kept in each) for name in found}
     return parts
@@ -215,7 +215,15 @@ def _select_parts(surface: Surface, mesh: Mesh, settings: MeshSettings, device: 
         from clrecon.pipeline.bone import find_bone
 
         labelled = labelled or find_labels(mesh.triangles, mesh.vertex_count)
-        among = find_bone(mesh, volume, surface, labelled, without_table=settings.remove_table)
+        among = find_bone(
+            mesh, volume, surface, labelled, without_table=settings.remove_table, advice=_advice(settings)
+        )
+        if settings.purpose is not None:
+            from clrecon.pipeline.purposes import measure_pieces
+
+            other = mesh.triangles[~among[labelled[1][mesh.triangles[:, 0]]]]
+            no_bone = measure_pieces(mesh.vertices, other)
+            mesh.report.update(not_bone=no_bone["pieces"], not_bone_ml=no_bone["pieces_ml"])
     try:
         if not settings.split:
             kept = select_components(mesh, *limits, seeds=seeds, labelled=labelled, among=among)
@@ -225,6 +233,13 @@ def _select_parts(surface: Surface, mesh: Mesh, settings: MeshSettings, device: 
         label = "" if surface.label is None else f"{surface.label} "  # of several one is too small, or too far
         raise type(error)(f"{label}{surface.place}: {error}") from error
     return [Part(surface, _name_piece(surface, place), piece) for place, piece in enumerate(pieces, start=1)]
+
+
+def _advice(settings: MeshSettings) -> str:
+    """What to do where nothing is bone."""
+    if settings.purpose is None:
+        return "--keep-largest N keeps by size"
+    return f"--for {settings.purpose} keeps bone: --keep-largest 1 takes the largest component, whatever it is"
 
 
 def first_names(surfaces: Sequence[Surface], split: bool) -> list[str]:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from clrecon.errors import UsageError
 
-__all__ = ["DEFAULT_PRESET", "PRESETS", "Preset", "find_preset"]
+__all__ = ["DEFAULT_PRESET", "HIGHEST_BONE_HU", "LOWEST_BONE_HU", "PRESETS", "Preset", "find_preset"]
 
 
 @dataclass(frozen=True)
@@ -31,6 +31,10 @@ class Preset:
 
 
 DEFAULT_PRESET = "bone"
+
+LOWEST_BONE_HU, HIGHEST_BONE_HU = 100.0, 1500.0
+"""Iso values between these are those of bone: muscle and organs without contrast medium stay below, what lies above is
+enamel and metal."""
 
 _INVESALIUS = "InVesalius 3, lower bound of its preset"
 

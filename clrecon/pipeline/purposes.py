@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from clrecon.errors import UsageError
+from clrecon.pipeline.presets import HIGHEST_BONE_HU, LOWEST_BONE_HU
 
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
     from clrecon.mesh import Mesh
 
 __all__ = [
@@ -50,8 +55,9 @@ PURPOSES: dict[str, Purpose] = {
     for purpose in (
         Purpose(
             "print",
-            {"keep_largest": 1, "smooth": 20, "decimate": 0.9, "strict": True},
-            "--keep-largest 1 --smooth --decimate 0.9 --strict: one closed piece; size and thickness of walls are said",
+            {"keep": "bone", "keep_largest": 1, "smooth": 20, "decimate": 0.9, "strict": True},
+            "--keep bone --keep-largest 1 --smooth --decimate 0.9 --strict: one closed piece, of bone at iso values of"
+            " bone; size and thickness of walls are said",
         ),
     )
 }
@@ -82,7 +88,8 @@ def settings_for(name: str | None, given: dict[str, Any]) -> dict[str, Any]:
     Returns
     -------
     dict
-        The given fields, and ``purpose``.  Where components are chosen in another way none is left out for it.
+        The given fields, and ``purpose``.  Where components are chosen in another way none is left out for it, and bone
+        is told from other things only where all iso values are those of bone, from 100 to 1500 HU or ``"auto"``.
 
     Raises
     ------
@@ -96,12 +103,26 @@ def settings_for(name: str | None, given: dict[str, Any]) -> dict[str, Any]:
         raise UsageError(f"a surface for {name} is closed: leave --open out")
     if any(given.get(other) for other in ("seeds", "min_volume_ml", "split", "labels")):
         del fields["keep_largest"]
+    chosen = any(given.get(other) for other in ("keep_largest", "seeds", "min_volume_ml"))
+    if chosen or not _at_levels_of_bone(given):
+        del fields["keep"]
     taken = {field: value for field, value in fields.items() if not given.get(field)}
     return {**given, **taken, "purpose": name}
 
 
-def measure_pieces(mesh: Mesh) -> dict[str, float]:
-    """What the components of a surface enclose.
+def _at_levels_of_bone(given: dict[str, Any]) -> bool:
+    """Whether all surfaces that these fields of `MeshSettings` ask for are iso surfaces at levels of bone."""
+    from clrecon.pipeline.settings import MeshSettings
+
+    settings = MeshSettings(**given)
+    if settings.labels is not None or settings.inside != "above":
+        return False
+    levels = [float(level) for level in settings.levels if not isinstance(level, tuple)]
+    return all(math.isnan(level) or LOWEST_BONE_HU <= level <= HIGHEST_BONE_HU for level in levels)
+
+
+def measure_pieces(vertices: NDArray[np.floating], triangles: NDArray[np.uint32]) -> dict[str, float]:
+    """What the components of a surface enclose; `vertices` have shape (n, 3), in mm, `triangles` (m, 3).
 
     Returns
     -------
@@ -112,7 +133,7 @@ def measure_pieces(mesh: Mesh) -> dict[str, float]:
     from clrecon.mesh.measures import local_origin
     from clrecon.mesh.shifts import measure_volumes
 
-    found = measure_volumes(mesh.vertices - local_origin(mesh.vertices), mesh.triangles).mm3 / 1000.0
+    found = measure_volumes(vertices - local_origin(vertices), triangles).mm3 / 1000.0
     return {
         "pieces": int((found > 0.0).sum()),
         "pieces_ml": float(found[found > 0.0].sum()),
@@ -136,7 +157,9 @@ def describe_print(mesh: Mesh, found: dict[str, float], kept: dict[str, float]) 
     dict
         ``size_mm`` : x, y, z of the box around it
         ``wall`` : see `clrecon.mesh.thickness.measure_walls`
-        ``left_out`` : pieces and cavities as in `measure_pieces`; cavities that are left out are filled
+        ``left_out`` : pieces and cavities as in `measure_pieces`; cavities that are left out are filled; and
+        ``not_bone``, ``not_bone_ml``, the pieces whose walls are not like bone or that are crumbs, None where that was
+        not asked
         ``pieces``, ``pieces_ml``, ``cavities``, ``cavities_ml`` : those that are in it
     """
     from clrecon.mesh.thickness import measure_walls
@@ -145,7 +168,10 @@ def describe_print(mesh: Mesh, found: dict[str, float], kept: dict[str, float]) 
     return {
         "size_mm": size.tolist(),
         "wall": measure_walls(mesh.vertices, mesh.triangles, THIN_MM),
-        "left_out": {name: max(found[name] - kept[name], 0) for name in found},
+        "left_out": {
+            **{name: max(found[name] - kept[name], 0) for name in found},
+            **{name: mesh.report.get(name) for name in ("not_bone", "not_bone_ml")},
+        },
         **kept,
     }
 
@@ -164,10 +190,13 @@ def warn_of_print(facts: dict[str, Any]) -> list[str]:
             f"{facts['cavities']:,} closed cavities of {facts['cavities_ml']:.2g} ml together are in it: powder or"
             " resin stays in them; --keep-largest 1 fills them"
         )
-    if left_out["pieces_ml"] > facts["pieces_ml"]:
+    bone_told = left_out.get("not_bone") is not None
+    other_ml = left_out["pieces_ml"] - (left_out["not_bone_ml"] if bone_told else 0.0)
+    if other_ml > facts["pieces_ml"]:
+        table = "" if bone_told else " The piece of largest area can be a table (--remove-table);"
         warnings.append(
-            f"what was left out encloses {left_out['pieces_ml']:.3g} ml, more than the {facts['pieces_ml']:.3g} ml that"
-            " were kept: is it the right piece? The piece of largest area can be a table (--remove-table); --seed X,Y,Z"
-            " keeps the one at a point"
+            f"{'bone that' if bone_told else 'what'} was left out encloses {other_ml:.3g} ml, more than the"
+            f" {facts['pieces_ml']:.3g} ml that were kept: is it the right piece?{table} --seed X,Y,Z keeps the one at"
+            " a point"
         )
     return warnings

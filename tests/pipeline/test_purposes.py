@@ -12,6 +12,7 @@ import pytest
 from clrecon.cli.main import main
 from clrecon.errors import UsageError
 from clrecon.phantom import PhantomSettings, write_phantom
+from clrecon.pipeline.labels import LabelChoice
 from clrecon.pipeline.purposes import settings_for, warn_of_print
 from clrecon.pipeline.settings import MeshSettings
 
@@ -20,12 +21,40 @@ def test_what_is_given_wins() -> None:
     assert settings_for(None, {"smooth": None}) == {"smooth": None}
     plain = settings_for("print", {"smooth": None, "strict": False, "closed": True, "seeds": []})
     assert MeshSettings(**plain) == MeshSettings(
-        keep_largest=1, smooth=20, decimate=0.9, strict=True, purpose="print", seeds=[]
+        keep="bone", keep_largest=1, smooth=20, decimate=0.9, strict=True, purpose="print", seeds=[]
     )
     own = settings_for("print", {"keep_largest": 2, "smooth": 5, "decimate": 0.5})
     assert (own["keep_largest"], own["smooth"], own["decimate"]) == (2, 5, 0.5)
     for other in ({"seeds": [(0, 0, 0)]}, {"min_volume_ml": 1.0}, {"split": True}):
         assert settings_for("print", {**other, "keep_largest": None})["keep_largest"] is None
+
+
+@pytest.mark.parametrize(
+    ("given", "keep"),
+    [
+        ({}, "bone"),
+        ({"preset": "spongy-bone"}, "bone"),
+        ({"iso_value": 300.0}, "bone"),
+        ({"iso_value": (200.0, 700.0)}, "bone"),
+        ({"half_way": "auto"}, "bone"),
+        ({"half_way": (1000.0, 40.0)}, "bone"),
+        ({"split": True}, "bone"),
+        ({"preset": "skin"}, None),
+        ({"preset": "metal"}, None),
+        ({"iso_value": 2600.0}, None),
+        ({"iso_value": (200.0, -500.0)}, None),
+        ({"iso_value": ((100.0, 300.0),)}, None),
+        ({"below": -400.0}, None),
+        ({"labels": LabelChoice("a")}, None),
+        ({"labels": LabelChoice("a", surface="mask")}, None),
+        ({"keep_largest": 2}, None),
+        ({"min_volume_ml": 1.0}, None),
+        ({"seeds": [(0.0, 0.0, 0.0)]}, None),
+        ({"seeds": [(0.0, 0.0, 0.0)], "keep": "bone"}, "bone"),
+    ],
+)
+def test_bone_is_kept_where_the_level_is_that_of_bone_and_nothing_else_is_chosen(given: Any, keep: str | None) -> None:
+    assert MeshSettings(**settings_for("print", given)).keep == keep
 
 
 def test_impossible_purposes() -> None:
@@ -44,6 +73,10 @@ def test_warnings_say_what_can_go_wrong() -> None:
     assert "20 % of the surface" in warn_of_print({**good, "wall": {**wall, "thin_share": 0.2}})[0]
     assert "closed cavities" in warn_of_print({**good, "cavities": 3, "cavities_ml": 0.2})[0]
     assert "is it the right piece" in warn_of_print({**good, "left_out": {"pieces_ml": 2.1}})[0]
+    told = {"pieces_ml": 4.1, "not_bone": 1, "not_bone_ml": 2.2}
+    assert warn_of_print({**good, "left_out": told}) == []
+    told["not_bone_ml"] = 1.0
+    assert "bone that was left out encloses 3.1 ml" in warn_of_print({**good, "left_out": told})[0]
 
 
 def test_a_print_of_a_phantom(device: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
