@@ -262,11 +262,11 @@ def test_a_print_is_of_the_body_closed_and_says_what_it_left_out(
 
 
 @pytest.mark.parametrize("name", ("skull", "bones", "limb", "pair", "pelvis", "contrast"))
-def test_a_print_is_of_bone_and_says_what_is_none(series: Any, device: Any, tmp_path: Path, name: str) -> None:
+def test_a_print_is_of_bone_and_says_what_is_none(odd: OddBodies, device: Any, tmp_path: Path, name: str) -> None:
     """Without --remove-table."""
     given = settings_for("print", {"iso_value": 300.0, "smooth": 5, "decimate": 0.3})
-    report, vertices = mesh_of(series, device, tmp_path, name, **given)
-    assert share_near(make_odd(name), vertices, "bone", "metal") > 0.9
+    report, vertices = mesh_of(odd, device, tmp_path, name, **given)
+    assert share_near(odd[name], vertices, "bone", "metal") > 0.9
     assert (report["keep"], report["components"]) == ("bone", 1)
     left_out, kept_ml = report["print"]["left_out"], report["print"]["pieces_ml"]
     assert 0.0 <= left_out["not_bone_ml"] <= left_out["pieces_ml"]
@@ -276,10 +276,10 @@ def test_a_print_is_of_bone_and_says_what_is_none(series: Any, device: Any, tmp_
 
 
 def test_a_print_of_what_is_no_bone_is_refused_and_says_how_to_have_it(
-    series: Any, device: Any, tmp_path: Path
+    odd: OddBodies, device: Any, tmp_path: Path
 ) -> None:
     with pytest.raises(NoSurfaceError, match=r"--for print keeps bone: --keep-largest 1 takes the largest"):
-        mesh_of(series, device, tmp_path, "empty", **settings_for("print", {}))
+        mesh_of(odd, device, tmp_path, "empty", **settings_for("print", {}))
     given = settings_for("print", {"keep_largest": 1, "smooth": 5, "decimate": 0.3})
-    report, _ = mesh_of(series, device, tmp_path, "empty", **given)
+    report, _ = mesh_of(odd, device, tmp_path, "empty", **given)
     assert (report["keep"], report["print"]["left_out"]["not_bone"]) == (None, None)
