@@ -1,0 +1,202 @@
+#!/usr/bin/env python3
+"""Run the same commands with two checkouts of clrecon and compare all that they write, byte for byte.
+
+    python scripts/compare_versions.py OLD NEW [CT_FOLDER ...] [--labels FILE] [--device D] [--only TEXT] [--quick]
+
+OLD and NEW are folders of the project: `git worktree add ../old COMMIT` makes one.  Each runs with the environment in
+its own `.venv-test` or `.venv`, else one is made.  Without CT_FOLDER two phantoms are compared (a spine, and a skull
+that lies oblique with tilted slices); folders of real series come on top of them.
+
+Compared are exit codes, meshes, pictures, reports and what stands on the console.  Left out of reports are times, sizes
+of processes and caches: the names in VOLATILE.  The exit status is 0 when nothing differs, and 1 with a line for each
+difference.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import re
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+VOLATILE = frozenset({"seconds", "seconds_a_frame", "peak_memory_bytes", "version"})
+"""Names in reports whose values differ from run to run, or between versions by their nature."""
+
+PHANTOMS = {
+    "spine": ["--kind", "spine", "--size", "128x128", "--slices", "60", "--spacing", "1.4", "1.4", "2.0"],
+    "skull": [
+        *("--kind", "skull", "--size", "112x96", "--slices", "70", "--spacing", "2.0", "2.2", "2.5"),
+        *("--tilt", "9", "--oblique", "5", "-8", "20", "--table", "headrest"),
+    ],
+}
+
+MESHES = {
+    "bone.stl": [],
+    "auto.ply": ["--hu", "auto", "--space", "ras"],
+    "topology.glb": ["--hu", "250", "--topology", "trilinear", "--open"],
+    "two.obj": ["--hu", "180,400", "--memory", "24MB"],
+    "range.vtp": ["--hu", "100:300"],
+    "below.stl": ["--below", "-400", "--keep-largest", "2"],
+    "body.3mf": ["--preset", "skin", "--remove-table", "--keep-largest", "1"],
+    "kept.ply": ["--keep", "bone", "--min-volume", "0.5", "--split"],
+    "refined.ply": ["--keep-largest", "1", "--smooth", "--decimate", "0.9", "--strict"],
+    "print.3mf": ["--for", "print"],
+    "wrong.xyz": [],
+    "nothing.stl": ["--hu", "5000"],
+}
+
+LABEL_MESHES = {
+    "labels.ply": [],
+    "solid.ply": ["--solid"],
+    "masks.ply": ["--surface", "mask"],
+}
+
+_SMALL = ["--size", "200x160"]
+PICTURES = {
+    "bone.png": [],
+    "skin.png": ["--preset", "skin", "--view", "left", "--light", "left"],
+    "mip.png": ["--mode", "mip", "--view", "30,20", "--values", "mip.npy"],
+    "minip.png": ["--mode", "minip", "--clip-box", "-60,60,,,,"],
+    "mean.png": ["--mode", "mean", "--perspective"],
+    "drr.png": ["--preset", "x-ray"],
+    "surface.png": ["--iso", "250", "--shadows", "--light", "left", "--depth", "depth.npy", "--memory", "24MB"],
+    "slice.png": ["--mode", "slice", "--view", "axial", "--thickness", "6", "--combine", "max"],
+    "slices.png": ["--mode", "slices", "--slices", "12"],
+    "letters.png": ["--letters", "--scale-bar", "--caption", "A caption", "--background", "white"],
+    "turn.apng": ["--turntable", "turn.apng", "--frames", "3", "--size", "64x64"],
+    "wrong.png": ["--mode", "mip", "--iso", "200"],
+}
+
+
+def main() -> int:
+    options = _parse()
+    with tempfile.TemporaryDirectory() as scratch:
+        differences = list(_compare_all(options, Path(scratch)))
+    for line in differences:
+        print(line)
+    print("no difference" if not differences else f"{len(differences)} differences")
+    return 1 if differences else 0
+
+
+def _parse() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("old", type=Path)
+    parser.add_argument("new", type=Path)
+    parser.add_argument("inputs", type=Path, nargs="*", metavar="CT_FOLDER")
+    parser.add_argument("--labels", type=Path, help="label map of the last CT_FOLDER")
+    parser.add_argument("--device", default="0")
+    parser.add_argument("--only", default="", help="only commands whose words hold this text")
+    parser.add_argument("--quick", action="store_true", help="the first phantom alone")
+    return parser.parse_args()
+
+
+def _program(checkout: Path) -> list[str]:
+    """How clrecon of a checkout is called."""
+    for name in (".venv-test", ".venv"):
+        python = checkout / name / ("Scripts/python.exe" if sys.platform == "win32" else "bin/python")
+        if python.exists():
+            return [str(python.absolute()), "-m", "clrecon"]
+    return [sys.executable, str((checkout / "scripts" / "run.py").resolve())]
+
+
+def _compare_all(options: argparse.Namespace, scratch: Path) -> Iterator[str]:
+    old, new = _program(options.old), _program(options.new)
+    inputs: dict[str, Path] = {}
+    for name, arguments in list(PHANTOMS.items())[: 1 if options.quick else None]:
+        inputs[name] = scratch / name
+        for program, folder in ((old, scratch / f"{name}.old"), (new, inputs[name])):
+            subprocess.run([*program, "phantom", str(folder), *arguments, "-q"], check=True)
+        yield from (f"phantom {name}: {line}" for line in _compare_folders(scratch / f"{name}.old", inputs[name]))
+    inputs.update((folder.name, folder.absolute()) for folder in options.inputs)
+    for name, folder in inputs.items():
+        labels = folder / "materials.nrrd" if (folder / "materials.nrrd").exists() else None
+        if options.labels is not None and folder.name == options.inputs[-1].name:
+            labels = options.labels.absolute()
+        for number, command in enumerate(_commands(folder, labels, options.device)):
+            if options.only not in " ".join(command):
+                continue
+            folders = [scratch / f"{side}-{name}-{number}" for side in ("old", "new")]
+            texts = [_run([*program, *command], place) for program, place in zip((old, new), folders, strict=True)]
+            shown = " ".join(command).replace(str(folder), name)
+            found = [] if texts[0] == texts[1] else [f"{a!r} became {b!r}" for a, b in _pairs(*texts) if a != b]
+            found += _compare_folders(*folders)
+            print(f"{'differs' if found else 'equal'}  {shown}", file=sys.stderr, flush=True)
+            yield from (f"{shown}: {line}" for line in found)
+
+
+def _commands(folder: Path, labels: Path | None, device: str) -> Iterator[list[str]]:
+    yield ["info", str(folder), "--pixels", "--json"]
+    yield ["info", str(folder), "--strict"]
+    for name, arguments in MESHES.items():
+        yield ["mesh", str(folder), "-o", name, *arguments, "--device", device, "--report", f"{name}.json"]
+    for name, arguments in LABEL_MESHES.items() if labels is not None else ():
+        own = ["--labels", str(labels), *arguments]
+        yield ["mesh", str(folder), "-o", name, *own, "--device", device, "--report", f"{name}.json"]
+    for name, arguments in PICTURES.items():
+        picture = [] if "--turntable" in arguments else ["-o", name]
+        size = [] if "--size" in arguments else _SMALL
+        yield ["render", str(folder), *picture, *arguments, *size, "--device", device, "--report", f"{name}.json"]
+    if labels is not None:
+        own = ["-o", "labels.png", "--labels", str(labels), *_SMALL]
+        yield ["render", str(folder), *own, "--device", device, "--report", "labels.png.json"]
+
+
+def _run(command: list[str], folder: Path) -> tuple[int, str, str]:
+    """Exit code, stdout and stderr of a command that runs in `folder`, times and progress left out."""
+    folder.mkdir()
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, errors="replace")
+    return done.returncode, _still(done.stdout), _still(done.stderr)
+
+
+def _still(text: str) -> str:
+    """`text` without the line of times and what progress wrote over."""
+    return re.sub(r"(?m)^time +\d.*\n", "", re.sub(r"[^\n]*\r", "", text))
+
+
+def _pairs(old: tuple[int, str, str], new: tuple[int, str, str]) -> Iterator[tuple[Any, Any]]:
+    yield old[0], new[0]
+    for a, b in zip(old[1:], new[1:], strict=True):
+        before, after = a.splitlines(), b.splitlines()
+        length = max(len(before), len(after))
+        padded = (lines + [""] * (length - len(lines)) for lines in (before, after))
+        yield from zip(*padded, strict=True)
+
+
+def _compare_folders(old: Path, new: Path) -> list[str]:
+    """A line for each file that is not the same in both folders."""
+    names = [{path.relative_to(top).as_posix() for path in top.rglob("*") if path.is_file()} for top in (old, new)]
+    found = [f"{name} is written by one side only" for name in sorted(names[0] ^ names[1])]
+    for name in sorted(names[0] & names[1]):
+        before, after = (old / name).read_bytes(), (new / name).read_bytes()
+        if before == after:
+            continue
+        if name.endswith(".json"):
+            found += [f"{name}: {line}" for line in differing_names(json.loads(before), json.loads(after))]
+        else:
+            first = next((i for i, (a, b) in enumerate(zip(before, after, strict=False)) if a != b), None)
+            found.append(f"{name}: {len(before)} and {len(after)} bytes, first difference at {first}")
+    return found
+
+
+def differing_names(old: Any, new: Any, name: str = "") -> Iterator[str]:
+    """Names of a report whose values differ, with both values; those in VOLATILE are left out."""
+    if isinstance(old, dict) and isinstance(new, dict):
+        for key in [*old, *(key for key in new if key not in old)]:
+            if key not in VOLATILE:
+                yield from differing_names(old.get(key, "absent"), new.get(key, "absent"), f"{name}.{key}".lstrip("."))
+        if list(old) != list(new) and set(old) == set(new):
+            yield f"{name or 'report'}: another order of names"
+    elif isinstance(old, list) and isinstance(new, list) and len(old) == len(new):
+        for number, (a, b) in enumerate(zip(old, new, strict=True)):
+            yield from differing_names(a, b, f"{name}[{number}]")
+    elif old != new:
+        yield f"{name}: {old!r} became {new!r}"
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,49 @@
+"""scripts/compare_versions.py finds what differs between two versions, and nothing else."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import pytest
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "scripts"))
+
+from compare_versions import _compare_folders, _still, differing_names  # noqa: E402
+
+
+def test_a_value_that_changed_is_named() -> None:
+    old = {"mesh": {"triangles": 12, "bounds_mm": [[0, 1], [2, 3]]}, "seconds": {"read": 1.0}}
+    new = {"mesh": {"triangles": 12, "bounds_mm": [[0, 1], [2, 4]]}, "seconds": {"read": 2.0}}
+    assert list(differing_names(old, new)) == ["mesh.bounds_mm[1][1]: 3 became 4"]
+    assert list(differing_names(old, old | {"seconds": {}})) == []
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "line"),
+    [
+        ({"a": 1}, {"a": 1, "b": 2}, "b: 'absent' became 2"),
+        ({"a": 1, "b": 2}, {"b": 2, "a": 1}, "report: another order of names"),
+        ({"a": [1]}, {"a": [1, 2]}, "a: [1] became [1, 2]"),
+        ({"a": 1}, {"a": 1.5}, "a: 1 became 1.5"),
+    ],
+)
+def test_names_order_and_lengths_count(old: dict, new: dict, line: str) -> None:
+    assert list(differing_names(old, new)) == [line]
+
+
+def test_a_changed_byte_and_a_missing_file_are_found(tmp_path: Path) -> None:
+    for side, data in (("old", b"solid bone"), ("new", b"solid bane")):
+        (tmp_path / side).mkdir()
+        (tmp_path / side / "a.stl").write_bytes(data)
+    (tmp_path / "new" / "b.png").write_bytes(b"")
+    assert _compare_folders(tmp_path / "old", tmp_path / "new") == [
+        "b.png is written by one side only",
+        "a.stl: 10 and 10 bytes, first difference at 7",
+    ]
+    assert _compare_folders(tmp_path / "old", tmp_path / "old") == []
+
+
+def test_only_times_are_left_out_of_the_console() -> None:
+    text = "read 1/9\rread 9/9\rvertices 12\ntime     1.9 s (read 0.72, write 0.03)\nwarning: 3 s\n"
+    assert _still(text) == "vertices 12\nwarning: 3 s\n"
