@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import ast
 import sys
-from collections.abc import Iterator
+from collections.abc import Container, Iterable, Iterator, Mapping
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -167,3 +167,54 @@ def find_layer_faults(source: str, module: str, is_package: bool = False) -> lis
                 where = "" if deferred else " at module level"
                 faults.append(f"{module}:{line}: layer {own} may not import {top}{where}")
     return faults
+
+
+def imported_files(source: str, known: Container[str]) -> set[str]:
+    """Modules of `known` that `source` imports, wherever in the file and for whatever: deferred, for annotations."""
+    found = set()
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.ImportFrom) and node.module:
+            found |= {
+                f"{node.module}.{alias.name}" if f"{node.module}.{alias.name}" in known else node.module
+                for alias in node.names
+            }
+        elif isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+    return {name for name in found if name in known}
+
+
+def find_circles(imports: Mapping[str, Iterable[str]]) -> list[list[str]]:
+    """Groups of names that reach each other through `imports` (name -> names it imports), each sorted.
+
+    Tarjan's strongly connected components (1972), without recursion.
+    """
+    order: dict[str, int] = {}
+    lowest: dict[str, int] = {}
+    path: list[str] = []
+    circles = []
+    for start in imports:
+        work = [(start, iter(imports[start]))] if start not in order else []
+        while work:
+            name, others = work[-1]
+            if name not in order:
+                order[name] = lowest[name] = len(order)
+                path.append(name)
+            unseen = None
+            for other in others:
+                if other in imports and other not in order:
+                    unseen = other
+                    break
+                if other in path:
+                    lowest[name] = min(lowest[name], order[other])
+            if unseen is not None:
+                work.append((unseen, iter(imports[unseen])))
+                continue
+            work.pop()
+            if work:
+                lowest[work[-1][0]] = min(lowest[work[-1][0]], lowest[name])
+            if lowest[name] == order[name]:
+                group = path[path.index(name) :]
+                del path[path.index(name) :]
+                if len(group) > 1 or name in imports[name]:
+                    circles.append(sorted(group))
+    return circles
