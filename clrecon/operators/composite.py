@@ -25,7 +25,7 @@ from clrecon.rendering.steepness import PARTS, Steepness
 __all__ = ["NODES", "TransferTables", "composite_slab"]
 
 NODES = 4096
-"""Entries of a transfer function's table, as in cl/render/composite.cl."""
+"""Entries of a transfer function's table, as in cl/render/steep_segments.h."""
 
 GRADIENT_NODES = 256
 """Entries of its table of factors by magnitude of the gradient."""

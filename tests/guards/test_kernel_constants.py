@@ -1,0 +1,79 @@
+"""A number that Python and the kernels both know has one value: each pair is listed here and compared."""
+
+from __future__ import annotations
+
+import re
+from importlib import import_module
+
+import pytest
+from house import PACKAGE, ROOT
+
+from clrecon.operators.sheets import COMBINATIONS
+
+PAIRS = [
+    ("clrecon.labels.occupancy.REACH", "labels/occupancy.h", "REACH"),
+    ("clrecon.operators.bricks.BRICK", "bricks/bricks.h", "BRICK"),
+    ("clrecon.operators.compaction.COMPACT_WORDS", "compaction/compact.cl", "COMPACT_WORDS"),
+    ("clrecon.operators.compaction.SCAN_PER_ITEM", "compaction/scan.cl", "SCAN_PER_ITEM"),
+    ("clrecon.operators.composite.GRADIENT_NODES", "render/composite.cl", "GRADIENT_NODES"),
+    ("clrecon.operators.composite.NODES", "render/steep_segments.h", "NODES"),
+    ("clrecon.operators.pictures.HIGHLIGHTS", "include/phong.h", "HIGHLIGHTS"),
+    ("clrecon.operators.project.AIR_HU", "render/project.cl", "AIR_HU"),
+    ("clrecon.operators.ray_view.BOX_ROW", "include/view.h", "VIEW_BOX_LOW"),
+    ("clrecon.operators.ray_view.TILE", "include/view.h", "TILE"),
+    ("clrecon.operators.resident.BRICK_CELLS", "include/leap.h", "BRICK_CELLS"),
+    ("clrecon.operators.resident.FARTHEST", "include/leap.h", "FARTHEST"),
+    ("clrecon.operators.resident.ROWS_AT_ONCE", "render/occupancy.cl", "ROWS_AT_ONCE"),
+    ("clrecon.operators.slice_overlay.NODES", "render/slices.cl", "BINS"),
+    ("clrecon.rendering.steepness.DENSE", "render/steep_segments.h", "DENSE"),
+    ("clrecon.rendering.steepness.PARTS", "render/steep_segments.h", "PARTS"),
+    ("clrecon.rendering.steepness.STEEP", "render/steep_segments.h", "STEEP"),
+]
+"""Name in Python, kernel file below cl/, name there."""
+
+_DOCUMENTED = re.compile(r'(?m)^([A-Z][A-Z_]*)\b[^\n]*= [^\n]*\n"""[^"]*\bcl/[\w/]+\.(?:cl|h)\b')
+"""A constant whose docstring names a kernel file."""
+
+
+def macro_value(text: str, name: str) -> float:
+    """The number that ``#define name`` stands for in the source of a kernel file."""
+    (value,) = re.findall(rf"(?m)^#define {name} +\(?(-?[0-9.]+)f?\)?(?= |$)", text)
+    return float(value)
+
+
+def listed_in(source: str) -> set[str]:
+    """Constants of a module that say that a kernel file has them too."""
+    return set(_DOCUMENTED.findall(source))
+
+
+@pytest.mark.parametrize(("python", "file", "macro"), PAIRS)
+def test_python_and_kernel_agree(python: str, file: str, macro: str) -> None:
+    module, _, name = python.rpartition(".")
+    kernel = macro_value((ROOT / "cl" / file).read_text(encoding="utf-8"), macro)
+    assert kernel == getattr(import_module(module), name)
+
+
+def test_combinations_have_the_numbers_of_the_kernel() -> None:
+    text = (ROOT / "cl/render/reformat.cl").read_text(encoding="utf-8")
+    numbers = [macro_value(text, f"COMBINE_{name.upper()}") for name in COMBINATIONS]
+    assert numbers == list(range(len(COMBINATIONS)))
+
+
+def test_every_constant_that_names_a_kernel_file_is_compared() -> None:
+    known = {name for name, _, _ in PAIRS} | {"clrecon.operators.sheets.COMBINATIONS"}
+    found = {
+        f"{'.'.join(path.relative_to(ROOT).with_suffix('').parts)}.{name}"
+        for path in PACKAGE.rglob("*.py")
+        for name in listed_in(path.read_text(encoding="utf-8"))
+    }
+    assert len(found) > 10
+    assert found - known == set()
+
+
+def test_a_constant_that_drifted_would_be_seen() -> None:
+    text = "#define OTHER 3\n#define PARTS 8 /* of a segment */\n#define AIR_HU (-1000.0f)\n#define STEEP 0.1f\n"
+    assert [macro_value(text, name) for name in ("PARTS", "AIR_HU", "STEEP")] == [8, -1000, 0.1]
+    with pytest.raises(ValueError, match="not enough values"):
+        macro_value(text, "BRICK")
+    assert listed_in('BRICK = 8\n"""Voxels along a side, as in cl/bricks/bricks.h."""\n') == {"BRICK"}
+    assert listed_in('BRICK = 8\n"""Voxels along a side."""\n') == set()
