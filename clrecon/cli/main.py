@@ -14,7 +14,9 @@ from typing import NamedTuple
 
 from clrecon.cli.common import EXIT_CODES, Parser, guard
 from clrecon.cli.console import Console
+from clrecon.cli.wording import speaker_of
 from clrecon.errors import UsageError
+from clrecon.wording import spoken_by
 
 __all__ = ["main", "run"]
 
@@ -113,10 +115,11 @@ def _dispatch(arguments: list[str], console: Console) -> int:
         console.result({"version": package_version()})
         console.say(f"clrecon {package_version()}")
         return 0
-    if module is None:
+    if module is None or called is None:
         raise UsageError(f"no command given: use one of {', '.join(COMMANDS)} (see: clrecon --help)")
     console.set_loudness(quiet=options.quiet, verbose=options.verbose)
-    return int(module.run(options, console))
+    with spoken_by(speaker_of(commands.choices[called])):
+        return int(module.run(options, console))
 
 
 def _escape_unencodable() -> None:

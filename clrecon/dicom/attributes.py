@@ -166,7 +166,7 @@ def _read_columns(headers: Sequence[SliceHeader]) -> dict[int, list[bytes]]:
 def _read_values(header: SliceHeader) -> dict[int, bytes]:
     """What is compared of one file: nothing where it has changed since it was scanned, which its pixels will tell."""
     try:
-        # What was taken with --force is read as it was then; nothing else is read differently by it.
+        # What was taken by force is read as it was then; nothing else is read differently by it.
         values = read_elements(header.file, None, force=True).values
     except (OSError, CorruptFileError, NotDicomError):
         return {}

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from clrecon.dicom.series import Series
 from clrecon.dicom.text import hash_uid, join_names
 from clrecon.errors import NoDicomError, RefusedInputError, UsageError
+from clrecon.wording import name_parameter
 
 __all__ = ["choose_series", "describe_left"]
 
@@ -56,7 +57,9 @@ def _check_one_patient(ct: Sequence[Series]) -> None:
     patients = {series.patient for series in stacks if series.patient}
     if len(patients) > 1:
         lines = [f"[patient {series.patient or '?'}, series {series.describe()}]" for series in stacks]
-        raise RefusedInputError(f"CT series of {len(patients)} patients, choose one with --series: {join_names(lines)}")
+        raise RefusedInputError(
+            f"CT series of {len(patients)} patients, choose one with {name_parameter('series')}: {join_names(lines)}"
+        )
 
 
 def _match_series(found: Sequence[Series], wanted: int | str) -> list[Series]:
@@ -91,7 +94,8 @@ def _take_largest(candidates: Sequence[Series]) -> Series:
         reasons = join_names(f"[series {series.number}: {series.problems[0]}]" for series in largest)
         raise RefusedInputError(f"{len(largest)} CT series have {most} slices each and none can be used: {reasons}")
     raise RefusedInputError(
-        f"{len(usable)} CT series have {most} slices each, choose one with --series: {_list_lines(usable)}"
+        f"{len(usable)} CT series have {most} slices each, choose one with {name_parameter('series')}:"
+        f" {_list_lines(usable)}"
     )
 
 

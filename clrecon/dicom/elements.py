@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from clrecon.dicom.careful import parse_carefully
-from clrecon.dicom.forced import FORCE_HINT, Start, find_program, restore_start
+from clrecon.dicom.forced import Start, describe_way_out, find_program, restore_start
 from clrecon.dicom.plain import parse_plainly
 from clrecon.dicom.raw import META_START, CorruptFileError, DicomElements, NotDicomError
 from clrecon.files import open_regular
@@ -102,7 +102,7 @@ def read_elements(
     if not has_dicom_mark(prefix):
         raise NotDicomError("no DICM mark at byte 128", prefix)
     if restored is not None:
-        raise CorruptFileError(f"no meta header ({FORCE_HINT})")
+        raise CorruptFileError(f"no meta header ({describe_way_out()})")
     elements = _read_marked(path, prefix, size, wanted)
     program = find_program(prefix)
     if program:

@@ -11,10 +11,11 @@ from __future__ import annotations
 import struct
 from typing import NamedTuple
 
-__all__ = ["FORCE_HINT", "Start", "find_program", "restore_start"]
+from clrecon.wording import name_parameter
+
+__all__ = ["Start", "describe_way_out", "find_program", "restore_start"]
 
 MARK_END = 132  # 128 bytes of preamble, then "DICM"
-FORCE_HINT = "--force, force=True in Python, guesses it"
 PREAMBLE = bytes(128) + b"DICM"
 FIRST_GROUP = 0x0008
 FIRST_LENGTH_LIMIT = 1024
@@ -40,6 +41,11 @@ class Start(NamedTuple):
     head: bytes
     skip: int
     remark: str
+
+
+def describe_way_out() -> str:
+    """What can be done about a data set whose encoding stands nowhere."""
+    return f"{name_parameter('force', True)} guesses it"
 
 
 def find_program(start: bytes) -> str:

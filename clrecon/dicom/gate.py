@@ -24,6 +24,7 @@ from clrecon.dicom.numbers import median
 from clrecon.dicom.slice_header import SliceHeader
 from clrecon.dicom.text import join_names
 from clrecon.geometry import compose_affine, tilt_degrees
+from clrecon.wording import name_parameter
 
 __all__ = ["Line", "Stack", "group_places", "measure_stack", "measure_stated_gap"]
 
@@ -139,7 +140,7 @@ def measure_stack(headers: Sequence[SliceHeader], allow_gaps: bool = False) -> S
             warnings.append(f"{holes.describe()}: what is there is placed exactly, surfaces bridge the gap")
         elif holes.places:
             where = holes.describe([header.name for header in slices])
-            problems.append(f"{where}; find them, or take what is there with --allow-gaps")
+            problems.append(f"{where}; find them, or take what is there with {name_parameter('allow_gaps', True)}")
         if line.uneven and not problems:
             warnings.append(_describe_unevenness(distances, line))
         if not problems:

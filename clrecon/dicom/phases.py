@@ -22,6 +22,7 @@ from clrecon.dicom.slice_header import PHASE_KEYWORDS, SliceHeader
 from clrecon.dicom.stored import StoredPixels
 from clrecon.dicom.text import join_names
 from clrecon.errors import UsageError
+from clrecon.wording import name_parameter
 
 __all__ = ["Phase", "Places", "choose_phase", "describe_phases", "have_same_pixels", "part_alternating", "sort_places"]
 
@@ -337,7 +338,7 @@ def describe_phases(phases: Sequence[Phase], interleaved: bool = False) -> str:
     shown = [str(phase) for phase in phases[:PHASES_SHOWN]]
     more = f" and {len(phases) - PHASES_SHOWN} more" if len(phases) > PHASES_SHOWN else ""
     where = "whose slices lie between each other" if interleaved else "at the same places"
-    return f"{len(phases)} phases {where}, choose one with --phase: [{'], ['.join(shown)}]{more}"
+    return f"{len(phases)} phases {where}, choose one with {name_parameter('phase')}: [{'], ['.join(shown)}]{more}"
 
 
 def choose_phase(phases: Sequence[Phase], wanted: int, interleaved: bool = False) -> Phase:

@@ -13,6 +13,7 @@ from typing import Any
 from clrecon.dicom.certificate import certify, collect_scan_warnings, collect_series_warnings
 from clrecon.dicom.choice import choose_series, describe_left
 from clrecon.dicom.containers import advise_on
+from clrecon.dicom.forced import describe_way_out
 from clrecon.dicom.likeness import Likeness, judge_likeness
 from clrecon.dicom.listing import SeriesListing, describe_series
 from clrecon.dicom.pixels import read_voxels
@@ -22,6 +23,7 @@ from clrecon.dicom.series import Series, group_series
 from clrecon.dicom.text import escape_text, join_names
 from clrecon.errors import NoDicomError, RefusedInputError, UsageError
 from clrecon.geometry import Volume
+from clrecon.wording import name_parameter
 
 __all__ = ["list_series", "read_volume"]
 
@@ -165,7 +167,7 @@ def _certify_chosen(
 
 
 def _describe_likeness(likeness: Likeness | None) -> list[str]:
-    return [f"{likeness}, --phase takes one"] if likeness is not None and likeness.is_mixed else []
+    return [f"{likeness}, {name_parameter('phase')} takes one"] if likeness is not None and likeness.is_mixed else []
 
 
 @contextmanager
@@ -194,8 +196,8 @@ def _scan_and_group(path: str | os.PathLike[str], progress: Progress | None, for
         hint = "; a DICOMDIR only lists files: name the folder that holds them" if scan.skipped["DICOMDIR"] else ""
         packed = advise_on(scan.skipped)
         hint += f"; {packed}" if packed else ""
-        bare = sum(suspect.reason == BARE_DATA_SET for suspect in scan.suspects)
-        hint += f"; {bare} like {BARE_DATA_SET}" if bare else ""
+        bare = sum(suspect.reason.startswith(BARE_DATA_SET) for suspect in scan.suspects)
+        hint += f"; {bare} like {BARE_DATA_SET} ({describe_way_out()})" if bare else ""
         raise NoDicomError(f"no DICOM images in {shown}: {looked}{hint}")
     return scan, group_series(scan)
 

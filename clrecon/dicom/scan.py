@@ -16,7 +16,7 @@ from pathlib import Path
 from clrecon.dicom.containers import describe_container
 from clrecon.dicom.disk import DiskReader, Progress
 from clrecon.dicom.elements import META_START, CorruptFileError, FileStart, has_dicom_mark
-from clrecon.dicom.forced import FORCE_HINT, restore_start
+from clrecon.dicom.forced import describe_way_out, restore_start
 from clrecon.dicom.header import read_headers
 from clrecon.dicom.remains import Stranger, describe_start, find_remains
 from clrecon.dicom.slice_header import OtherImage, SliceHeader
@@ -28,7 +28,7 @@ __all__ = ["CorruptFile", "Progress", "Scan", "scan_path"]
 DICOM_SUFFIXES = (".dcm", ".dic", ".dicom", ".ima")
 PROGRESS_STEPS = 1000
 BLANK_START = bytes(128) + b"DICM"
-BARE_DATA_SET = f"a data set without preamble ({FORCE_HINT})"
+BARE_DATA_SET = "a data set without preamble"
 APPLE_DOUBLE = b"\x00\x05\x16\x07"
 """Start of the "._NAME" files that macOS puts beside the files of a foreign disk."""
 
@@ -154,7 +154,7 @@ def _suspect(file: str, start: bytes) -> str:
     if 0 < len(start) < META_START and BLANK_START.startswith(start):
         return "cut within the preamble"
     if restore_start(start) is not None:
-        return BARE_DATA_SET
+        return f"{BARE_DATA_SET} ({describe_way_out()})"
     return "named like DICOM but is none" if os.path.splitext(name)[1].lower() in DICOM_SUFFIXES else ""
 
 

@@ -12,6 +12,7 @@ from clrecon.errors import RefusedInputError, UsageError
 from clrecon.geometry.affine import Float64Array
 from clrecon.labels.label_map import LARGEST_NUMBER, LabelMap
 from clrecon.labels.names import check_name, find_number
+from clrecon.wording import name_parameter
 
 __all__ = ["Painter", "check_wanted"]
 
@@ -80,7 +81,7 @@ class Painter:
             raise RefusedInputError(
                 f"segments of {self._file} overlap: {a} {self._names[a]} and {b} {self._names[b]} share {count:,}"
                 f" voxels{f', and {len(self._shared) - 1} more pairs' if len(self._shared) > 1 else ''};"
-                " choose labels that do not overlap with --label, one run each"
+                f" choose labels that do not overlap with {name_parameter('wanted')}, one run each"
             )
         return LabelMap(self._voxels, affine, self._names, **options)
 

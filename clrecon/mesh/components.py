@@ -15,6 +15,7 @@ from clrecon.mesh.coordinates import rounding_step
 from clrecon.mesh.measures import CHUNK, cross_products, local_origin
 from clrecon.mesh.mesh import Mesh
 from clrecon.mesh.nearest import find_nearest_triangle
+from clrecon.wording import name_parameter
 
 __all__ = ["Labelled", "select_components", "split_components"]
 
@@ -146,7 +147,8 @@ def split_components(
     if most is not None and len(kept) > most:
         raise UsageError(
             f"the surface has {len(kept):,} components, at most {most:,} are written one by one:"
-            " leave the small ones out (--min-volume ML, --keep-largest N)"
+            f" leave the small ones out ({name_parameter('min_volume_ml', 'ML')},"
+            f" {name_parameter('keep_largest', 'N')})"
         )
     rank = np.full(len(chosen.keep) + 1, len(kept))  # the last entry is for unused vertices, whose label is -1
     rank[chosen.ranked[chosen.keep[chosen.ranked]]] = np.arange(len(kept))

@@ -49,7 +49,7 @@ class Device:
     Attributes
     ----------
     index : int
-        Place in `list_devices`, the number that ``--device`` takes.
+        Place in `list_devices`, the number that chooses it.
     name, platform, type, version, driver : str
         `type` is "gpu", "accelerator", "cpu" or "custom"; `platform` is the platform's name.
     memory_bytes, max_allocation_bytes : int
@@ -183,7 +183,7 @@ class Device:
         return kind(f"{what} on {self.label}: {describe_error(error)}")
 
     def describe(self) -> dict[str, Any]:
-        """Facts for ``clrecon devices --json`` and reports."""
+        """Facts for listings and reports."""
         return {
             "index": self.index,
             "name": self.name,

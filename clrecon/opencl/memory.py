@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 from clrecon.errors import DeviceError, UsageError
 from clrecon.opencl.context import Device
+from clrecon.wording import name_parameter
 
 __all__ = ["MemoryLimits", "check_budget", "check_memory", "describe_shortage", "memory_limits"]
 
@@ -54,7 +55,7 @@ class MemoryLimits:
     def describe(self) -> str:
         """What there is, for messages."""
         if self.asked_bytes is not None:
-            return f"{_mib(self.asked_bytes)} are allowed on {self.label} by --memory (memory= in Python)"
+            return f"{_mib(self.asked_bytes)} are allowed on {self.label} by {name_parameter('memory')}"
         return f"{self.label} has {_mib(self.device_bytes)}, at most {_mib(self.device_buffer_bytes)} in one buffer"
 
 

@@ -11,6 +11,7 @@ from typing import Any
 from clrecon.errors import DeviceError
 from clrecon.opencl import quirks
 from clrecon.opencl.context import Device, describe_error
+from clrecon.wording import name_parameter
 
 __all__ = ["choose_device", "driver_advice", "list_devices", "list_platforms"]
 
@@ -156,7 +157,8 @@ def choose_device(name: str | int | Device | None = None) -> Device:
         matches = [device for device in devices if not device.is_simulator and not device.shortcoming]
     if not matches:
         raise DeviceError(
-            f"no device to choose among {_list_for_message(devices)} (simulators must be named with --device):"
+            f"no device to choose among {_list_for_message(devices)} (simulators must be named with"
+            f" {name_parameter('device')}):"
             f" {driver_advice()}"
         )
     return max(matches, key=lambda device: device.score)

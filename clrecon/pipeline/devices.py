@@ -16,7 +16,7 @@ def survey_devices(name: str | None = None) -> tuple[dict[str, Any], DeviceError
     Parameters
     ----------
     name : str, optional
-        What a job would be told with ``--device``.
+        What a job would be told as `device`.
 
     Returns
     -------

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 from clrecon.pipeline.presets import find_preset
 from clrecon.pipeline.settings import MeshSettings
+from clrecon.wording import name_parameter
 
 if TYPE_CHECKING:
     from clrecon.geometry import IsoChoice, Volume
@@ -55,7 +56,7 @@ def describe_level(
     if choice.method == "auto" and volume.spacing[2] > THICK_SLICES_MM:
         warnings.append(
             f"slices are {volume.spacing[2]:.3g} mm apart: walls thinner than that may be lost at"
-            f" {choice.iso_value:g} HU; compare with a lower iso value, such as --preset bone"
+            f" {choice.iso_value:g} HU; compare with a lower iso value, such as {name_parameter('preset', 'bone')}"
         )
     return {"iso_value_reason": choice.reason, "iso_value_choice": choice.as_dict()}, warnings
 
@@ -70,9 +71,11 @@ def warn_of_contrast(choice: IsoChoice) -> list[str]:
     if not choice.contrast_medium_share:
         return [
             f"{share}: too much to be left out of the choice of {choice.iso_value:g} HU. Where that is contrast medium"
-            " and not a body of one material, the level is not that of bone: give it (--hu N)"
+            f" and not a body of one material, the level is not that of bone: give it"
+            f" ({name_parameter('iso_value', 'N')})"
         ]
     return [
         f"{share}, as heart, vessels and organs with contrast medium do. They were left out of the choice of"
-        f" {choice.iso_value:g} HU; what of them is brighter is in the surface: --keep bone keeps what looks like bone"
+        f" {choice.iso_value:g} HU; what of them is brighter is in the surface:"
+        f" {name_parameter('keep', 'bone')} keeps what looks like bone"
     ]

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from clrecon.errors import ClreconError, OutputError, UsageError
+from clrecon.wording import name_parameter
 
 if TYPE_CHECKING:
     from clrecon.files import Staged, StagedFile
@@ -53,7 +54,8 @@ def name_outputs(output: str | Path, names: Sequence[str], report_path: str | Pa
     if len(names) > MOST_FILES:
         raise UsageError(
             f"{len(names):,} meshes are more than {MOST_FILES:,} files:"
-            " leave small components out (--min-volume ML, --keep-largest N) or ask for fewer iso values"
+            f" leave small components out ({name_parameter('min_volume_ml', 'ML')},"
+            f" {name_parameter('keep_largest', 'N')}) or ask for fewer iso values"
         )
     stem, extension = os.path.splitext(os.fspath(output))
     paths = [f"{stem}_{name}{extension}" if name else output for name in names]

@@ -13,6 +13,7 @@ from clrecon.errors import UsageError
 from clrecon.pipeline.outputs import check_distinct
 from clrecon.pipeline.render_modes import find_misplaced
 from clrecon.pipeline.render_settings import RenderSettings
+from clrecon.wording import name_parameter
 
 if TYPE_CHECKING:
     from clrecon.files import StagedFile
@@ -52,9 +53,14 @@ class PictureFiles:
 
     def __post_init__(self) -> None:
         if self.picture is None and self.turntable is None:
-            raise UsageError("there is nothing to write: name a picture (-o out.png) or a turntable (--turntable)")
+            raise UsageError(
+                f"there is nothing to write: name a picture ({name_parameter('picture', 'out.png')}) or a turntable"
+                f" ({name_parameter('turntable')})"
+            )
         if self.picture is None and (self.depth is not None or self.values is not None):
-            raise UsageError("depths and values belong to a picture: name it too (-o out.png)")
+            raise UsageError(
+                f"depths and values belong to a picture: name it too ({name_parameter('picture', 'out.png')})"
+            )
 
 
 def name_view(view: str, views: Sequence[str]) -> str:
@@ -118,7 +124,7 @@ def check_pictures(files: PictureFiles, settings: RenderSettings) -> list[tuple[
             if f".{kind}" in OPAQUE_ONLY:
                 raise UsageError(
                     f"{kind.upper()} cannot hold a transparent background:"
-                    " choose PNG, TIFF or APNG, or a colour (--background)"
+                    f" choose PNG, TIFF or APNG, or a colour ({name_parameter('background')})"
                 )
     of_views = {"the picture": files.picture, "the depths": files.depth, "the values": files.values}
     owned: list[tuple[str, str | Path]] = [] if files.report is None else [("the report", files.report)]

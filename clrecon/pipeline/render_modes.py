@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from clrecon.wording import name_parameter
+
 __all__ = ["MODES", "VIEWS", "find_misplaced"]
 
 MODES = {
@@ -30,35 +32,12 @@ _MODES_OF = {
 }
 """Settings that the renderer does not know; of all others it says itself in which modes they mean something."""
 
-_OPTIONS = {
-    "preset": "--preset",
-    "transfer_function": "--transfer-function",
-    "iso_value": "--iso",
-    "color": "--color",
-    "depth_cue": "--depth-cue",
-    "window": "--window",
-    "ray_step": "--ray-step",
-    "light": "--light",
-    "shadows": "--shadows",
-    "jitter": "--jitter",
-    "zoom": "--zoom",
-    "view_angle": "--perspective",
-    "clip_box": "--clip-box",
-    "clip_planes": "--clip",
-    "letters": "--letters",
-    "depth": "--depth",
-    "values": "--values",
-    "slices": "--slices",
-    "slice_opacity": "--slice-opacity",
-    "thickness": "--thickness",
-    "combine": "--combine",
-    "offset_mm": "--offset",
-    "curve": "--curve",
-    "cpr": "--cpr",
-    "labels": "--labels",
-    "turntable": "--turntable",
-}
-"""Settings, and the options of the command that give them."""
+_CHECKED = (
+    "preset", "transfer_function", "iso_value", "color", "depth_cue", "window", "ray_step", "light", "shadows",
+    "jitter", "zoom", "view_angle", "clip_box", "clip_planes", "letters", "depth", "values", "slices", "slice_opacity",
+    "thickness", "combine", "offset_mm", "curve", "cpr", "labels", "turntable",
+)  # fmt: skip
+"""Settings that mean nothing in some modes, in the order in which they are looked at."""
 
 _RENDERER_NAMES = {"light": "lighting", "clip_box": "clip", "clip_planes": "clip"}
 
@@ -75,8 +54,8 @@ def find_misplaced(mode: str, given: set[str]) -> str | None:
     """
     from clrecon.operators.renderer import KNOWN_IN  # numpy: not wanted before a job starts
 
-    for setting, option in _OPTIONS.items():
+    for setting in _CHECKED:
         modes = _MODES_OF.get(setting) or KNOWN_IN[_RENDERER_NAMES.get(setting, setting)]
         if setting in given and mode not in modes:
-            return f"{option} means nothing in mode {mode}: it belongs to {', '.join(modes)}"
+            return f"{name_parameter(setting)} means nothing in mode {mode}: it belongs to {', '.join(modes)}"
     return None

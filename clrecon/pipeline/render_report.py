@@ -10,6 +10,7 @@ from clrecon.pipeline.description import SKIN_HU
 from clrecon.pipeline.render_settings import LabelLook, RenderSettings
 from clrecon.pipeline.report import platform_name
 from clrecon.version import package_version
+from clrecon.wording import name_parameter
 
 if TYPE_CHECKING:
     from clrecon.geometry import Volume
@@ -84,7 +85,8 @@ def find_emptiness(picture: Rendering) -> str | None:
     if shade is None:
         return None
     shown, unit = f"{values.min():g} to {values.max():g}", "mm of water" if is_water else "HU"
-    air = ": the air round the body is the lowest, clip it away (--clip-box)" if picture.mode == "minip" else ""
+    clip = f": the air round the body is the lowest, clip it away ({name_parameter('clip_box')})"
+    air = clip if picture.mode == "minip" else ""
     return f"all of the picture is {shade}: its {shown} {unit} lie beyond the window from {low:g} to {high:g}{air}"
 
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 from clrecon.errors import UsageError
 from clrecon.pipeline.checks import check_bone_loss, check_field_of_view, check_memory
 from clrecon.pipeline.render_modes import MODES, find_misplaced
+from clrecon.wording import name_parameter
 
 if TYPE_CHECKING:
     from clrecon.geometry.camera import Camera
@@ -248,7 +249,10 @@ class RenderSettings:
         if self.slice_opacity is not None and not 0.0 < self.slice_opacity <= 1.0:
             raise UsageError(f"the opacity of a slice lies above 0 and up to 1, not at {self.slice_opacity:g}")
         if self.shadows and self.light_direction() is None:
-            raise UsageError("shadows need a light beside the camera: --light with a side of the patient, or X,Y,Z")
+            raise UsageError(
+                f"shadows need a light beside the camera: {name_parameter('light')} with a side of the patient, or"
+                " X,Y,Z"
+            )
         if not 0.0 <= self.thickness < math.inf:
             raise UsageError(f"the thickness of a slice is a length in mm, not {self.thickness:g}")
         if not math.isfinite(self.offset_mm):

@@ -74,7 +74,7 @@ def refusal(folder):
 def test_whatever_alternates_parts_two_volumes(tmp_path, first, second, keyword):
     plans = write_volumes(tmp_path, first, second)
     said = refusal(tmp_path)
-    assert f"2 phases whose slices lie between each other, choose one with --phase: [1: {keyword} " in said
+    assert f"2 phases whose slices lie between each other, choose one with phase: [1: {keyword} " in said
     assert "12 slices], [2:" in said and "DOE" not in said
     assert keyword != "ContrastBolusAgent" or "[1: ContrastBolusAgent (none), 12 slices]" in said
     with pytest.raises(UsageError, match="no phase 3: 2 phases whose slices lie between each other"):
@@ -169,7 +169,7 @@ def test_pixels_alone_are_told_and_chosen_from(tmp_path):
     (plan, _) = write_volumes(tmp_path, {}, {}, pixels=picture(6))
     volume = read_volume(tmp_path)
     said = [text for text in volume.report["warnings"] if "less alike than each is to the next but one" in text]
-    assert len(said) == 1 and "maybe two volumes between each other, --phase takes one" in said[0]
+    assert len(said) == 1 and "maybe two volumes between each other, phase takes one" in said[0]
     assert [gate["name"] for gate in volume.report["gates"] if gate["ok"] is False] == ["one_volume"]
     chosen = read_volume(tmp_path, phase=1)
     assert chosen.report["phase"] == {"number": 1, "of": 2, "keyword": "place", "value": "1 of 2"}

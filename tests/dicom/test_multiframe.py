@@ -262,7 +262,7 @@ def test_frames_at_one_place_are_told_apart(tmp_path, syntax, sequence, keyword,
     headers = read_headers(tmp_path / "mf")
     assert [dict(header.phase).get(name) for header in headers] == [expected[0]] * 7 + [expected[1]] * 7
     assert "DimensionIndexValues ImagePositionPatient" not in dict(headers[0].phase)
-    assert f"2 phases at the same places, choose one with --phase: [1: {name} " in refusal(tmp_path)
+    assert f"2 phases at the same places, choose one with phase: [1: {name} " in refusal(tmp_path)
     assert_right(read_volume(tmp_path, phase=1), plan)
     assert [phase["slices"] for phase in list_series(tmp_path).series[0].phases] == [7, 7]
 

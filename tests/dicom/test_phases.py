@@ -71,7 +71,7 @@ def test_phases_are_listed_and_chosen(tmp_path, first, second, keyword, values):
     assert entry.affine_ijk_to_lps_mm is None and entry.slices == 14
     with pytest.raises(RefusedInputError) as caught:
         read_volume(tmp_path)
-    wanted = f"2 phases at the same places, choose one with --phase: [1: {keyword} {values[0]}, 7 slices], [2: "
+    wanted = f"2 phases at the same places, choose one with phase: [1: {keyword} {values[0]}, 7 slices], [2: "
     assert wanted in str(caught.value)
     for number, shift in enumerate(shifts, start=1):
         volume = read_volume(tmp_path, phase=number)
@@ -170,7 +170,7 @@ def test_of_several_patients_none_is_taken_unasked(tmp_path):
     write_series(tmp_path / "b", Plan(series=2, shape=(4, 5, 6)), set_values(PatientID="TWO"))
     with pytest.raises(RefusedInputError) as caught:
         read_volume(tmp_path)
-    assert "CT series of 2 patients, choose one with --series" in str(caught.value)
+    assert "CT series of 2 patients, choose one with series" in str(caught.value)
     assert "patient 1, series 1" in str(caught.value) and "ONE" not in str(caught.value)
     assert read_volume(tmp_path, 2).shape_ijk == (6, 5, 4)
     listing = list_series(tmp_path)
@@ -293,7 +293,7 @@ def test_volumes_whose_slices_lie_between_each_other_are_phases(tmp_path, keywor
         write_phase(tmp_path, number, 500 * number, plans[number], **{keyword: value})
     with pytest.raises(RefusedInputError) as caught:
         read_volume(tmp_path)
-    assert f"2 phases whose slices lie between each other, choose one with --phase: [1: {keyword}" in str(caught.value)
+    assert f"2 phases whose slices lie between each other, choose one with phase: [1: {keyword}" in str(caught.value)
     for number, plan in enumerate(plans):
         volume = read_volume(tmp_path, phase=number + 1)
         assert np.array_equal(volume.voxels, plan.hu() + 500 * number) and not volume.uneven

@@ -87,11 +87,11 @@ def test_unknown_or_vague_names_list_what_is_there(two_series, wanted, words):
 def test_two_series_of_equal_size_need_a_choice(tmp_path):
     write_series(tmp_path, Plan(series=1))
     write_series(tmp_path, Plan(series=2, name="x{}".format))
-    with pytest.raises(RefusedInputError, match=r"2 CT series have 7 slices each, choose one with --series: \[1: CT"):
+    with pytest.raises(RefusedInputError, match=r"2 CT series have 7 slices each, choose one with series: \[1: CT"):
         read_volume(tmp_path)
     listing = list_series(tmp_path)
     assert listing.chosen is None
-    assert "choose one with --series" in listing.warnings[0]
+    assert "choose one with series" in listing.warnings[0]
     assert read_volume(tmp_path, series=2).report["series"]["uid_hash"] == hash_of(2)
 
 

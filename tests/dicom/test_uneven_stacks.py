@@ -78,7 +78,7 @@ def test_slices_that_jump_sideways_are_placed_too(tmp_path):
 )
 def test_missing_slices_are_read_only_when_that_is_allowed(tmp_path, plan, missing):
     write_series(tmp_path, plan)
-    with pytest.raises(RefusedInputError, match="missing between .* --allow-gaps"):
+    with pytest.raises(RefusedInputError, match="missing between .* allow_gaps=True"):
         read_volume(tmp_path)
     volume = read_volume(tmp_path, allow_gaps=True)
     assert_in_place(volume, plan)

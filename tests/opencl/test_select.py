@@ -124,7 +124,7 @@ def test_the_budget_names_the_limit_that_is_in_the_way(machine):
     parts = {"volume": 2**20, "picture": 2**19}
     with pytest.raises(DeviceError, match=(
         r"^this needs 2 MiB on the device \(volume 1 MiB, picture 524,288 bytes\): 1,000,000 bytes are allowed on .* by"
-        r" --memory \(memory= in Python\): allow that much or ask for less$"
+        r" memory: allow that much or ask for less$"
     )):  # fmt: skip
         check_budget(cpu, parts, 10**6)
     with pytest.raises(DeviceError, match=r"MiB\): 1 MiB are allowed on"):  # one buffer alone is over it

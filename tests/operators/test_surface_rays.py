@@ -238,5 +238,5 @@ def test_bad_input_is_refused(device):
     with pytest.raises(UsageError, match="finite number of HU"):
         cast(device, volume, np.nan, camera)
     big = make_volume(blobs, "even", 22.0, np.int16)
-    with pytest.raises(DeviceError, match="shadows need the whole volume .* allowed on .* by --memory"):
+    with pytest.raises(DeviceError, match="shadows need the whole volume .* allowed on .* by memory"):
         cast(device, big, 100.0, camera, (8, 8), lighting=FIXED, shadows=True, memory=half_of(big, (8, 8)))

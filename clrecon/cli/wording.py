@@ -1,0 +1,44 @@
+"""Parameters of the library in the words of the command line: the one place that translates them."""
+
+from __future__ import annotations
+
+import argparse
+
+from clrecon.wording import Speaker, in_python
+
+__all__ = ["speaker_of"]
+
+_DESTINATIONS = {
+    "clip_planes": "clip",
+    "closed": "open",
+    "field_of_view": "fov",
+    "files": "labels",
+    "grow_mm": "grow",
+    "half_way": "hu",
+    "iso_value": "hu",
+    "label_map": "labels",
+    "min_volume_ml": "min_volume",
+    "offset_mm": "offset",
+    "picture": "output",
+    "seeds": "seed",
+    "view_angle": "perspective",
+    "wanted": "label",
+}
+"""Parameters whose option has another name, where the command has none of the parameter's own name."""
+
+
+def speaker_of(parser: argparse.ArgumentParser) -> Speaker:
+    """Words for the parameters that a command has options for; the others are named as in Python."""
+    options = {action.dest: max(action.option_strings, key=len) for action in parser._actions if action.option_strings}
+
+    def speak(parameter: str, value: object = None) -> str:
+        option = options.get(parameter) or options.get(_DESTINATIONS.get(parameter, ""))
+        if option is None:
+            return in_python(parameter, value)
+        if value is None or value is True or (parameter == "closed" and value is False):
+            return option
+        if parameter == "half_way":
+            return f"{option} {'auto' if value == 'auto' else 'half:' + str(value).strip('()').replace(', ', ',')}"
+        return f"{option} {str(value).strip('()').replace(', ', ',')}"
+
+    return speak

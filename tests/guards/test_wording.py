@@ -1,0 +1,102 @@
+"""Messages name a parameter as its caller knows it: by its option on the command line, by its name in Python."""
+
+from __future__ import annotations
+
+import ast
+import re
+from importlib import import_module
+
+import pytest
+from house import PACKAGE, ROOT
+
+from clrecon.cli.common import Parser, add_common
+from clrecon.cli.main import COMMANDS
+from clrecon.cli.wording import speaker_of
+from clrecon.wording import in_python, name_parameter, spoken_by
+
+OPTION = re.compile(r"(?<![\w-])--[a-z][a-z-]*")
+
+
+def parser_of(command: str) -> Parser:
+    parser = Parser(prog=command)
+    import_module(COMMANDS[command].module).add_arguments(parser)
+    add_common(parser)
+    return parser
+
+
+def find_options(source: str) -> list[str]:
+    """Options of a command line that stand in the texts of a module, docstrings and comments included."""
+    return OPTION.findall(source)
+
+
+def named_parameters(source: str) -> set[str]:
+    """Parameters that a module names by `name_parameter` with a literal."""
+    return {
+        str(node.args[0].value)
+        for node in ast.walk(ast.parse(source))
+        if isinstance(node, ast.Call)
+        and getattr(node.func, "id", "") == "name_parameter"
+        and isinstance(node.args[0], ast.Constant)
+    }
+
+
+@pytest.mark.parametrize(
+    ("parameter", "value", "python", "mesh"),
+    [
+        ("keep_largest", "N", "keep_largest=N", "--keep-largest N"),
+        ("min_volume_ml", "ML", "min_volume_ml=ML", "--min-volume ML"),
+        ("keep", "bone", "keep='bone'", "--keep bone"),
+        ("iso_value", "N", "iso_value=N", "--hu N"),
+        ("half_way", "(BONE, TISSUE)", "half_way=(BONE, TISSUE)", "--hu half:BONE,TISSUE"),
+        ("half_way", "auto", "half_way='auto'", "--hu auto"),
+        ("force", True, "force=True", "--force"),
+        ("closed", False, "closed=False", "--open"),
+        ("series", None, "series", "--series"),
+        ("ray_step", None, "ray_step", "ray_step"),
+    ],
+)
+def test_words_of_python_and_of_a_command(parameter: str, value: object, python: str, mesh: str) -> None:
+    assert name_parameter(parameter, value) == in_python(parameter, value) == python
+    with spoken_by(speaker_of(parser_of("mesh"))):
+        assert name_parameter(parameter, value) == mesh
+    assert name_parameter(parameter, value) == python
+
+
+def test_the_same_parameter_has_another_option_in_another_command() -> None:
+    assert speaker_of(parser_of("render"))("iso_value", 300) == "--iso 300"
+    assert speaker_of(parser_of("mesh"))("iso_value", 300) == "--hu 300"
+
+
+def test_words_of_python_come_back_after_an_error() -> None:
+    with pytest.raises(ValueError, match="in a block"), spoken_by(lambda parameter, value: "another"):
+        raise ValueError("in a block")
+    assert name_parameter("force", True) == "force=True"
+
+
+def test_every_parameter_that_the_library_names_has_an_option() -> None:
+    speakers = [speaker_of(parser_of(command)) for command in COMMANDS]
+    named = {name for path in PACKAGE.rglob("*.py") for name in named_parameters(path.read_text(encoding="utf-8"))}
+    assert len(named) > 10
+    assert {name for name in named if all(speak(name, None) == name for speak in speakers)} == set()
+
+
+LEFT = {
+    "clrecon/dicom/surplus.py", "clrecon/formats/values.py", "clrecon/geometry/iso_choice.py",
+    "clrecon/geometry/outside_air.py", "clrecon/pipeline/bone.py", "clrecon/pipeline/labels.py",
+    "clrecon/pipeline/masking.py", "clrecon/pipeline/purposes.py",
+}  # fmt: skip
+"""Files that still name options; the list gets shorter only."""
+
+
+def test_no_option_is_named_outside_of_the_command_line() -> None:
+    found = {
+        path.relative_to(ROOT).as_posix(): options
+        for path in PACKAGE.rglob("*.py")
+        if not path.is_relative_to(PACKAGE / "cli") and (options := find_options(path.read_text(encoding="utf-8")))
+    }
+    assert set(found) == LEFT
+
+
+def test_a_named_option_and_a_named_parameter_are_found() -> None:
+    assert find_options('raise UsageError("leave --open out, or -o; a--b, x - -y, ---")') == ["--open"]
+    assert named_parameters("x = f\"{name_parameter('force', True)}\"\nname_parameter(setting)") == {"force"}
