@@ -104,7 +104,7 @@ def read_regular(path: str | os.PathLike[str], limit: int) -> bytes:
 
 def replace_file(
     path: str | os.PathLike[str],
-    write: Callable[[BinaryIO], None],
+    write: Callable[[BinaryIO], object],
     verify: Callable[[Path], None] | None = None,
     *,
     expected_bytes: int = 0,
@@ -180,7 +180,7 @@ class StagedFile:
 @contextlib.contextmanager
 def stage_file(
     path: str | os.PathLike[str],
-    write: Callable[[BinaryIO], None],
+    write: Callable[[BinaryIO], object],
     verify: Callable[[Path], None] | None = None,
     *,
     expected_bytes: int = 0,

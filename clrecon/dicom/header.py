@@ -14,7 +14,8 @@ from pathlib import Path
 from clrecon.dicom.codecs import describe_undecodable, is_encapsulated
 from clrecon.dicom.elements import CorruptFileError, DicomElements, FileStart, read_elements
 from clrecon.dicom.multiframe import ENHANCED_CT, read_groups, split_frames
-from clrecon.dicom.slice_header import SLICE_PHASES, OtherImage, SeriesIdentity, SliceHeader
+from clrecon.dicom.phase_tags import SLICE_PHASES
+from clrecon.dicom.slice_header import OtherImage, SeriesIdentity, SliceHeader
 from clrecon.dicom.surplus import check_surplus
 from clrecon.dicom.terms import MODALITIES, OTHER_TERM, RESCALE_TYPES, name_term
 from clrecon.dicom.text import escape_text, hash_uid

@@ -21,13 +21,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from clrecon.dicom.concatenation import CONCATENATION_TAGS, Concatenation, read_concatenation
+from clrecon.dicom.phase_tags import FRAME_PHASES
 from clrecon.dicom.raw import IMPLICIT_LITTLE, META_START, DicomElements
 from clrecon.dicom.sequences import Item, Schema, decode_number, name_tag, read_sequences
 from clrecon.dicom.text import escape_text
 from clrecon.dicom.values import ValueProblem, Values, decode_text
 from clrecon.files import open_regular
 
-__all__ = ["ENHANCED_CT", "FRAME_PHASES", "Frame", "Groups", "find_data_set", "read_groups", "split_frames"]
+__all__ = ["ENHANCED_CT", "Frame", "Groups", "find_data_set", "read_groups", "split_frames"]
 
 ENHANCED_CT = ("1.2.840.10008.5.1.4.1.1.2.1", "1.2.840.10008.5.1.4.1.1.2.2")
 """SOP classes: Enhanced CT Image Storage, Legacy Converted Enhanced CT Image Storage."""
@@ -58,17 +59,6 @@ GEOMETRY = (0x00200032, 0x00200037, 0x00280030, 0x00180050, 0x00180088)
 """ImagePositionPatient, ImageOrientationPatient, PixelSpacing, SliceThickness, SpacingBetweenSlices: at the top level
 of a multi-frame image these have no place and no meaning."""
 
-FRAME_PHASES = (
-    ("TemporalPositionIndex", 0x00209128, "L"),
-    ("TemporalPositionTimeOffset", 0x0020930D, "d"),
-    ("NominalPercentageOfCardiacPhase", 0x00209241, "f"),
-    ("NominalCardiacTriggerDelayTime", 0x00209153, "d"),
-    ("NominalPercentageOfRespiratoryPhase", 0x00209245, "f"),
-    ("NominalRespiratoryTriggerDelayTime", 0x00209255, "d"),
-    ("StackID", 0x00209056, ""),
-    ("FrameAcquisitionNumber", 0x00209156, "H"),
-)
-"""What the functional groups have to tell frames at the same place apart, the most telling first; "" is text."""
 PLACE_POINTERS = (0x00200032, 0x00200037, 0x00209057, 0x00201041, 0x00209113, 0x00209116, 0x00200013)
 """Dimensions that only number the places: position, orientation, InStackPositionNumber, SliceLocation; and the files
 that a converter had before it, InstanceNumber."""

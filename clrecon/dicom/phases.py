@@ -17,8 +17,9 @@ import numpy as np
 
 from clrecon.dicom.attributes import Alternation
 from clrecon.dicom.mixture import find_mixture, values_of
+from clrecon.dicom.phase_tags import PHASE_KEYWORDS
 from clrecon.dicom.pixels import read_voxels
-from clrecon.dicom.slice_header import PHASE_KEYWORDS, SliceHeader
+from clrecon.dicom.slice_header import SliceHeader
 from clrecon.dicom.stored import StoredPixels
 from clrecon.dicom.text import join_names
 from clrecon.errors import UsageError

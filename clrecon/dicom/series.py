@@ -9,9 +9,9 @@ from functools import cached_property, partial
 from pathlib import Path
 
 from clrecon.dicom.attributes import alternate_places, find_alternation
-from clrecon.dicom.concatenation import describe_missing_parts
 from clrecon.dicom.gate import Stack, group_places, measure_stack
 from clrecon.dicom.likeness import judge_likeness
+from clrecon.dicom.missing_parts import describe_missing_parts
 from clrecon.dicom.phases import (
     Places,
     choose_phase,

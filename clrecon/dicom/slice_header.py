@@ -6,24 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from clrecon.dicom.concatenation import Concatenation
-from clrecon.dicom.multiframe import FRAME_PHASES
 
-__all__ = ["PHASE_KEYWORDS", "SLICE_PHASES", "OtherImage", "SeriesIdentity", "SliceHeader"]
-
-SLICE_PHASES = (
-    "TemporalPositionIdentifier",
-    "TriggerTime",
-    "AcquisitionNumber",
-    "AcquisitionDate",
-    "AcquisitionTime",
-    "KVP",
-    "ConvolutionKernel",
-    "ImageType",
-    "ContentDate",
-    "ContentTime",
-)
-PHASE_KEYWORDS = (*(keyword for keyword, _, _ in FRAME_PHASES), *SLICE_PHASES)
-"""What tells the phases of one series apart, the most telling first: what only frames say, then what slices say."""
+__all__ = ["OtherImage", "SeriesIdentity", "SliceHeader"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,7 +59,7 @@ class SliceHeader:
         Of which part of a concatenation it is.
     phase : tuple of (str, str)
         Keyword and value of what may tell this slice from another one at the same place: see
-        `PHASE_KEYWORDS`; the most telling first.
+        `clrecon.dicom.phase_tags.PHASE_KEYWORDS`; the most telling first.
     rows, columns : int
     row_cosines, column_cosines : tuple of 3 float
         ImageOrientationPatient as stored.

@@ -189,15 +189,15 @@ class Camera:
         size : (int, int), optional
             Of the picture, for cameras whose view angle is the horizontal one; default: the plotter's window.
         """
-        from clrecon.geometry.vtk_camera import camera_from_vtk
+        from clrecon.geometry.vtk_camera import parameters_from_vtk
 
-        return camera_from_vtk(source, size)
+        return cls(**parameters_from_vtk(source, size))
 
     def to_pyvista(self) -> Any:
         """A `pyvista.Camera` that sees the same, for a scene in LPS mm: ``plotter.camera = camera.to_pyvista()``."""
-        from clrecon.geometry.vtk_camera import camera_to_pyvista
+        from clrecon.geometry.vtk_camera import make_pyvista_camera
 
-        return camera_to_pyvista(self)
+        return make_pyvista_camera(self.position, self.focal_point, self.up, self.view_angle, self.parallel_scale)
 
     @property
     def is_parallel(self) -> bool:

@@ -206,7 +206,9 @@ class Volume(Grid):
         """
         from clrecon.geometry.image_data import make_image_data
 
-        return make_image_data(self, resample)
+        dtype = self.voxels.dtype
+        air = AIR_HU if dtype.kind == "f" else max(AIR_HU, np.iinfo(dtype).min)
+        return make_image_data(self, self.slice_origins(), self.uneven, resample, air)
 
     def __repr__(self) -> str:
         ni, nj, nk = self.shape_ijk

@@ -1,4 +1,7 @@
-"""`Camera` from and to VTK's, which PyVista's is one of: the same words, with conditions that ours does not have."""
+"""Cameras of VTK, and PyVista's among them, as the parameters of a `Camera` and back.
+
+A camera of VTK has conditions that ours does not have: they are refused.
+"""
 
 from __future__ import annotations
 
@@ -8,18 +11,19 @@ from typing import Any
 import numpy as np
 
 from clrecon.errors import UsageError
-from clrecon.geometry.camera import Camera
 from clrecon.geometry.views import checked_size
 
-__all__ = ["camera_from_vtk", "camera_to_pyvista"]
+__all__ = ["make_pyvista_camera", "parameters_from_vtk"]
+
+Point = Sequence[float]
 
 NEAR_AND_FAR = (0.01, 100.0)
 """Clipping range of a PyVista camera in distances to its focal point, until the scene sets its own: VTK's default
 ends at 1000 mm, which is in the midst of a patient."""
 
 
-def camera_from_vtk(source: Any, size: Sequence[int] | None = None) -> Camera:
-    """What a VTK or PyVista camera, or the camera of a plotter, sees.
+def parameters_from_vtk(source: Any, size: Sequence[int] | None = None) -> dict[str, Any]:
+    """Parameters of the `Camera` that sees what a VTK or PyVista camera, or the camera of a plotter, sees.
 
     Parameters
     ----------
@@ -38,9 +42,9 @@ def camera_from_vtk(source: Any, size: Sequence[int] | None = None) -> Camera:
     if not hasattr(camera, "GetFocalPoint"):
         raise UsageError(f"{type(source).__name__} is no PyVista plotter, PyVista camera or VTK camera")
     _refuse_distortion(camera)
-    placed = camera.GetPosition(), camera.GetFocalPoint(), camera.GetViewUp()
+    placed = {"position": camera.GetPosition(), "focal_point": camera.GetFocalPoint(), "up": camera.GetViewUp()}
     if camera.GetParallelProjection():
-        return Camera(*placed, parallel_scale=camera.GetParallelScale())
+        return {**placed, "parallel_scale": camera.GetParallelScale()}
     angle = camera.GetViewAngle()
     if camera.GetUseHorizontalViewAngle():
         window = getattr(source, "window_size", None) if size is None else size
@@ -48,25 +52,28 @@ def camera_from_vtk(source: Any, size: Sequence[int] | None = None) -> Camera:
             raise UsageError("the view angle of this camera is the horizontal one: say the size of the picture too")
         width, height = checked_size(window)
         angle = float(np.degrees(2.0 * np.arctan(np.tan(np.radians(0.5 * angle)) * height / width)))
-    return Camera(*placed, view_angle=angle)
+    return {**placed, "view_angle": angle}
 
 
-def camera_to_pyvista(camera: Camera) -> Any:
-    """A `pyvista.Camera` that sees what `camera` does; its view angle is the vertical one."""
+def make_pyvista_camera(
+    position: Point, focal_point: Point, up: Point, view_angle: float | None, parallel_scale: float | None
+) -> Any:
+    """A `pyvista.Camera` from the parameters of a `Camera`; its view angle is the vertical one."""
     import pyvista
 
     made = pyvista.Camera()
     made.SetUseHorizontalViewAngle(False)
-    made.SetPosition(*camera.position)
-    made.SetFocalPoint(*camera.focal_point)
-    made.SetViewUp(*camera.up)
-    made.parallel_projection = camera.is_parallel  # its own flag beside VTK's
-    if camera.parallel_scale is not None:
-        made.SetParallelScale(camera.parallel_scale)
+    made.SetPosition(*position)
+    made.SetFocalPoint(*focal_point)
+    made.SetViewUp(*up)
+    made.parallel_projection = parallel_scale is not None  # its own flag beside VTK's
+    if parallel_scale is not None:
+        made.SetParallelScale(parallel_scale)
     else:
-        made.SetViewAngle(camera.view_angle)
+        made.SetViewAngle(view_angle)
+    distance = float(np.linalg.norm(np.subtract(focal_point, position)))
     near, far = NEAR_AND_FAR
-    made.SetClippingRange(near * camera.distance, far * camera.distance)
+    made.SetClippingRange(near * distance, far * distance)
     return made
 
 

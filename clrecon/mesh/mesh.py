@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,9 @@ from clrecon.errors import UsageError
 from clrecon.geometry import frame_from_lps
 from clrecon.mesh.coordinates import as_stored
 from clrecon.mesh.quality import measure_quality
+from clrecon.mesh.writers import write_mesh
+from clrecon.mesh.writers.certificate import certificate_lines
+from clrecon.mesh.writers.content import Content
 
 __all__ = ["Mesh"]
 
@@ -44,6 +48,13 @@ def _as_indices(values: ArrayLike) -> NDArray[np.uint32]:
         if low < 0 or high >= _MOST_VERTICES:
             raise UsageError(f"triangles hold indices from {low} to {high}: they must fit 32 bits without a sign")
     return np.ascontiguousarray(array, dtype=np.uint32)
+
+
+def _describe_inside(ends: Sequence[float | None] | None) -> str | None:
+    """What lies within these ends, None where the upper one is open."""
+    if ends is None or ends[1] is None:
+        return None
+    return f"below {ends[1]:.9g} HU" if ends[0] is None else f"{ends[0]:.9g} to {ends[1]:.9g} HU"
 
 
 class Mesh:
@@ -150,6 +161,24 @@ class Mesh:
         vertices = self._vertices * signs + np.float32(0)
         return vertices, None if self._normals is None else self._normals * signs + np.float32(0)
 
+    def describe(self, space: str) -> Content:
+        """What goes into a file of the mesh in `space`; from `report` nothing else ever does."""
+        vertices, normals = self.in_space(space)
+        iso_value = self.report.get("iso_value_hu")
+        affine = self.report.get("affine_ijk_to_lps_mm")
+        certificate = self.report.get("certificate")
+        return Content(
+            vertices=vertices,
+            triangles=self.triangles,
+            normals=normals,
+            space=space.upper(),
+            to_lps=frame_from_lps(space).T,
+            iso_value_hu=None if iso_value is None else float(iso_value),
+            affine=None if affine is None else np.array(affine, dtype=np.float64).reshape(4, 4),
+            certificate=certificate_lines(certificate) if isinstance(certificate, Mapping) else (),
+            inside=_describe_inside(self.report.get("inside_hu")),
+        )
+
     def quality(self) -> dict[str, Any]:
         """Measure the mesh, see `clrecon.mesh.measure_quality` for the entries."""
         return measure_quality(self._vertices, self._triangles)
@@ -182,8 +211,6 @@ class Mesh:
         OutputError
             The file cannot be written; an older one of that name is intact.
         """
-        from clrecon.mesh.writers import write_mesh
-
         return write_mesh(self, path, space)
 
     def to_pyvista(self) -> Any:

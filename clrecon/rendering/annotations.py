@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from clrecon.errors import UsageError
 from clrecon.geometry.camera import Camera
 from clrecon.geometry.views import DIRECTIONS
+from clrecon.rendering.picture_data import PictureData
 from clrecon.rendering.pillow import load_font, load_pillow
 
 if TYPE_CHECKING:
     from PIL import Image
-
-    from clrecon.rendering.picture import Rendering
 
 __all__ = ["SMALLEST_SIDE", "annotate", "bar_length", "check_caption", "edge_letters", "orientation_letters"]
 
@@ -80,13 +78,13 @@ def bar_length(width_mm: float) -> float:
 
 
 def annotate(
-    rendering: Rendering, *, letters: bool = False, scale_bar: bool = False, caption: str | None = None
-) -> Rendering:
+    rendering: PictureData, *, letters: bool = False, scale_bar: bool = False, caption: str | None = None
+) -> NDArray[np.uint8]:
     """Draw into a picture.
 
     Parameters
     ----------
-    rendering : Rendering
+    rendering : PictureData
         Not changed.
     letters : bool
         The side of the patient that each edge looks to, see `orientation_letters`.
@@ -97,8 +95,8 @@ def annotate(
 
     Returns
     -------
-    Rendering
-        With an `image` of its own, opaque where something is drawn; it shares the other arrays.
+    ndarray, shape (h, w, 4), uint8
+        The image, opaque where something is drawn; that of the picture itself where nothing is.
 
     Raises
     ------
@@ -108,7 +106,7 @@ def annotate(
     """
     check_caption(caption)
     if not (letters or scale_bar or caption):
-        return rendering
+        return rendering.image
     width, height = rendering.size
     if min(width, height) < SMALLEST_SIDE:
         raise UsageError(
@@ -125,7 +123,7 @@ def annotate(
         page.draw_bar(*_bar_of(rendering))
     if caption:
         page.draw_caption(caption)
-    return replace(rendering, image=page.finish())
+    return page.finish()
 
 
 def check_caption(caption: str | None) -> None:
@@ -147,7 +145,7 @@ def check_caption(caption: str | None) -> None:
         raise UsageError(f"captions cannot be drawn with {' '.join(absent)}: the font has plain Latin letters only")
 
 
-def _bar_of(rendering: Rendering) -> tuple[float, str]:
+def _bar_of(rendering: PictureData) -> tuple[float, str]:
     """Length of the bar in pixels, and what stands over it."""
     camera, pixel_mm, where = rendering.camera, rendering.pixel_mm, ""
     if camera is not None and not camera.is_parallel:
@@ -161,7 +159,7 @@ def _bar_of(rendering: Rendering) -> tuple[float, str]:
 class _Page:
     """A picture that is drawn on: everything as two masks, one of the outlines and one of what they surround."""
 
-    def __init__(self, rendering: Rendering):
+    def __init__(self, rendering: PictureData):
         load_pillow()
         from PIL import Image, ImageDraw
 
@@ -246,7 +244,7 @@ class _Page:
         return any(left < r and l < right and top < b and t < bottom for l, t, r, b in self._boxes)  # noqa: E741
 
 
-def _choose_ink(rendering: Rendering) -> _Ink:
+def _choose_ink(rendering: PictureData) -> _Ink:
     """White on what is dark or transparent, black on what is bright, judged by the border of the picture."""
     rim = max(1, round(0.08 * min(rendering.size)))
     inside = np.zeros(rendering.image.shape[:2], dtype=bool)

@@ -4,18 +4,16 @@ from __future__ import annotations
 
 import os
 from io import BytesIO
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.errors import UsageError
 from clrecon.files import replace_file
+from clrecon.rendering.picture_data import PictureData
 from clrecon.rendering.pillow import load_pillow
 from clrecon.version import package_version
-
-if TYPE_CHECKING:
-    from clrecon.rendering.picture import Rendering
 
 __all__ = [
     "FLOAT_FORMATS",
@@ -48,18 +46,18 @@ def check_image_path(path: str | os.PathLike[str]) -> str:
     return _extension(path, tuple(IMAGE_FORMATS), "picture")
 
 
-def write_image(rendering: Rendering, path: str | os.PathLike[str], quality: int = 95) -> int:
+def write_image(rendering: PictureData, path: str | os.PathLike[str], quality: int = 95) -> int:
     """Write a picture; what `Rendering.save` does."""
     content = encode_image(rendering, check_image_path(path), quality)
     return _replace(path, content)
 
 
-def encode_image(rendering: Rendering, extension: str, quality: int = 95) -> bytes:
+def encode_image(rendering: PictureData, extension: str, quality: int = 95) -> bytes:
     """Bytes of the file that `write_image` writes.
 
     Parameters
     ----------
-    rendering : Rendering
+    rendering : PictureData
     extension : str
         One of `IMAGE_FORMATS`.
     quality : int
@@ -163,7 +161,7 @@ def _resolution(pixel_mm: float | None) -> dict[str, Any]:
     return {"dpi": (25.4 / pixel_mm, 25.4 / pixel_mm)}
 
 
-def _text_chunks(rendering: Rendering) -> Any:
+def _text_chunks(rendering: PictureData) -> Any:
     from PIL.PngImagePlugin import PngInfo
 
     text = PngInfo()

@@ -4,20 +4,19 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from clrecon.errors import UsageError
-from clrecon.geometry.camera import Camera
+from clrecon.rendering.picture_data import PictureData
 
 __all__ = ["Rendering"]
 
 
 @dataclass
-class Rendering:
+class Rendering(PictureData):
     """A picture of a volume.
 
     Attributes
@@ -38,35 +37,9 @@ class Rendering:
         How it was made, free of patient data.  ``"pixel_mm"`` says the side of a pixel where no camera does.
     """
 
-    image: NDArray[np.uint8]
-    depth: NDArray[np.float32]
-    expected_depth: NDArray[np.float32]
-    camera: Camera | None
-    values: NDArray[np.float32] | None = None
-    mode: str = "dvr"
-    report: dict[str, Any] = field(default_factory=dict)
-
     def __repr__(self) -> str:
         width, height = self.size
         return f"<Rendering {self.mode}, {width} x {height} pixels, camera {self.camera}>"
-
-    @property
-    def size(self) -> tuple[int, int]:
-        """Width and height in pixels."""
-        return self.image.shape[1], self.image.shape[0]
-
-    @property
-    def pixel_mm(self) -> float | None:
-        """Side of a pixel in mm where it is the same all over the picture, else None (perspective)."""
-        if self.camera is not None:
-            return self.camera.pixel_mm(self.size) if self.camera.is_parallel else None
-        told = self.report.get("pixel_mm")
-        return None if told is None else float(told)
-
-    @property
-    def is_opaque(self) -> bool:
-        """True when no pixel lets a background through."""
-        return bool((self.image[..., 3] == 255).all())
 
     def with_background(self, color: str | Sequence[float]) -> Rendering:
         """The same picture before a colour, opaque.
@@ -97,7 +70,8 @@ class Rendering:
         """
         from clrecon.rendering.annotations import annotate
 
-        return annotate(self, letters=letters, scale_bar=scale_bar, caption=caption)
+        image = annotate(self, letters=letters, scale_bar=scale_bar, caption=caption)
+        return replace(self, image=image)
 
     def save(self, path: str | os.PathLike[str], *, quality: int = 95) -> int:
         """Write the picture to a file whose extension says the format.

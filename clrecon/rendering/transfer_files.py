@@ -1,4 +1,4 @@
-"""`load_transfer_function`: one door for files with transfer functions; writing our own.
+"""`load_transfer_function`: one door for files with transfer functions.
 
 Our own form is JSON, described in docs/transfer_functions.md.
 """
@@ -6,15 +6,13 @@ Our own form is JSON, described in docs/transfer_functions.md.
 from __future__ import annotations
 
 import errno
-import json
 import os
 import stat
-from dataclasses import asdict
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 from clrecon.errors import RefusedInputError, UsageError
-from clrecon.files import read_regular, replace_file
+from clrecon.files import read_regular
 from clrecon.rendering.json_fields import parse_json, take_color, take_list, take_number, take_object, take_text
 from clrecon.rendering.lighting import Lighting
 from clrecon.rendering.slicer_files import (
@@ -25,11 +23,10 @@ from clrecon.rendering.slicer_files import (
     read_slicer_xml,
 )
 from clrecon.rendering.transfer_function import TransferFunction
+from clrecon.rendering.transfer_text import FORMAT, VERSION
 
-__all__ = ["load_transfer_function", "save_transfer_function"]
+__all__ = ["load_transfer_function"]
 
-FORMAT = "clrecon transfer function"
-VERSION = 1
 SIZE_LIMIT = 1_000_000
 """Bytes: presets.xml of 3D Slicer has 12 kB."""
 NAMES_LISTED = 60
@@ -183,37 +180,3 @@ def _own_point(point: Any, place: str) -> tuple[float, ...]:
     fields = take_object(point, place, known=names, needed=names)
     hu, opacity = (take_number(fields[name], f"{place}.{name}") for name in ("hu", "opacity"))
     return hu, *take_color(fields["color"], f"{place}.color"), opacity
-
-
-def save_transfer_function(function: TransferFunction, path: str | os.PathLike[str]) -> None:
-    """Write a transfer function as clrecon's JSON, as a whole or not at all; reading it gives the same, to the bit.
-
-    Raises
-    ------
-    OutputError
-        It cannot be written; an older file of that name is intact.
-    """
-    head: dict[str, Any] = {"format": FORMAT, "version": VERSION}
-    if function.name:
-        head["name"] = function.name
-    if function.description:
-        head["description"] = function.description
-    head["unit_distance_mm"] = function.unit_distance
-    if function.lighting is not None:
-        head["lighting"] = {key: value for key, value in asdict(function.lighting).items() if value is not None}
-    fields = [f'  "{key}": {json.dumps(value)}' for key, value in head.items()]
-    points = [{"hu": row[0], "color": row[1:4], "opacity": row[4]} for row in function.points.tolist()]
-    fields.append(_rows("points", points))
-    if function.gradient_opacity is not None:
-        rows = [{"hu_per_mm": place, "factor": factor} for place, factor in function.gradient_opacity.tolist()]
-        fields.append(_rows("gradient_opacity", rows))
-    text = "{\n" + ",\n".join(fields) + "\n}\n"
-
-    def write(stream: BinaryIO) -> None:
-        stream.write(text.encode("utf-8"))
-
-    replace_file(path, write)
-
-
-def _rows(name: str, rows: list[dict[str, Any]]) -> str:
-    return f'  "{name}": [\n' + ",\n".join(f"    {json.dumps(row)}" for row in rows) + "\n  ]"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -319,9 +320,18 @@ class TransferFunction:
         OutputError
             It cannot be written; an older file of that name is intact.
         """
-        from clrecon.rendering.transfer_files import save_transfer_function
+        from clrecon.files import replace_file
+        from clrecon.rendering.transfer_text import transfer_text
 
-        save_transfer_function(self, path)
+        names = {"name": self.name, "description": self.description}
+        head: dict[str, Any] = {key: text for key, text in names.items() if text}
+        head["unit_distance_mm"] = self.unit_distance
+        if self.lighting is not None:
+            head["lighting"] = {key: value for key, value in asdict(self.lighting).items() if value is not None}
+        gradient = None if self.gradient_opacity is None else self.gradient_opacity.tolist()
+        text = transfer_text(head, self.points.tolist(), gradient).encode("utf-8")
+
+        replace_file(path, lambda stream: stream.write(text))
 
     def _key(self) -> tuple[Any, ...]:
         gradient = None if self._gradient_opacity is None else self._gradient_opacity.tolist()

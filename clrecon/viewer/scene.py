@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 
 from clrecon.errors import UsageError
 from clrecon.rendering import Rendering
-from clrecon.rendering.scene import merge_layers, rendering_to_pyvista
+from clrecon.rendering.layers import merge_layers
+from clrecon.rendering.scene import rendering_to_pyvista
 
 if TYPE_CHECKING:
     from clrecon.geometry.camera import Camera

@@ -9,7 +9,7 @@ import pytest
 
 from clrecon.errors import UsageError
 from clrecon.geometry import AIR_HU, Volume, compose_affine
-from clrecon.geometry.image_data import regular_grid, shear_degrees
+from clrecon.geometry.regular import regular_grid, shear_degrees
 from clrecon.mesh import Mesh
 from clrecon.reference.isosurface import extract_isosurface
 from tests import tolerances
@@ -168,7 +168,7 @@ def test_a_resampled_ramp_is_the_ramp_and_air_is_around_it(name):
 @pytest.mark.parametrize("name", hard_volumes())
 def test_the_grid_covers_the_volume_with_its_spacing(name):
     volume = hard_volumes()[name]
-    grid = regular_grid(volume)
+    grid = regular_grid(volume, volume.slice_origins())
     assert shear_degrees(grid.affine) < 1e-6 and np.linalg.det(grid.affine[:3, :3]) > 0.0
     steps = np.linalg.norm(grid.affine[:3, :3], axis=0)
     assert steps[:2] == pytest.approx(volume.spacing[:2])
@@ -179,7 +179,7 @@ def test_the_grid_covers_the_volume_with_its_spacing(name):
 
 def test_planes_of_a_tilted_volume_are_planes_of_its_grid():
     volume = sphere(TILTED)
-    grid = regular_grid(volume)
+    grid = regular_grid(volume, volume.slice_origins())
     assert grid.shape_ijk[2] == SHAPE[0] and grid.shape_ijk[1] > SHAPE[1]
     k = (volume.slice_origins() - grid.affine[:3, 3]) @ np.linalg.inv(grid.affine[:3, :3]).T[:, 2]
     assert k == pytest.approx(np.arange(SHAPE[0]), abs=1e-9)

@@ -265,7 +265,7 @@ class FullDisk(io.RawIOBase):
 @pytest.mark.faults
 @pytest.mark.parametrize("extension", EVERY)
 def test_every_writer_notices_a_full_disk(mesh, extension):
-    content = writers.describe_mesh(mesh, "lps")
+    content = mesh.describe("lps")
     with pytest.raises(OSError, match="No space left"):
         FORMATS[extension].write(FullDisk(700), content)
 
@@ -275,7 +275,7 @@ def test_every_writer_notices_a_full_disk(mesh, extension):
 def test_a_file_that_was_cut_or_belongs_to_another_mesh_is_found(mesh, extension, tmp_path):
     path = tmp_path / f"bone{extension}"
     mesh.save(path)
-    content = writers.describe_mesh(mesh, "lps")
+    content = mesh.describe("lps")
     FORMATS[extension].verify(path, content)
     whole = path.read_bytes()
     for length in (len(whole) - 2, len(whole) // 2, 90):
@@ -285,7 +285,7 @@ def test_a_file_that_was_cut_or_belongs_to_another_mesh_is_found(mesh, extension
     path.write_bytes(whole)
     fewer = Mesh(mesh.vertices, mesh.triangles[1:], mesh.normals, mesh.report)
     with pytest.raises(OutputError, match="did not arrive on the disk"):
-        FORMATS[extension].verify(path, writers.describe_mesh(fewer, "lps"))
+        FORMATS[extension].verify(path, fewer.describe("lps"))
 
 
 @pytest.mark.faults
@@ -310,7 +310,7 @@ def test_an_older_file_survives_a_failed_check(mesh, extension, tmp_path, monkey
 def test_estimate_is_about_right(extension, tmp_path):
     mesh = Mesh(*samples.torus(200, 100))
     size = mesh.save(tmp_path / f"bone{extension}")
-    estimate = FORMATS[extension].estimate(writers.describe_mesh(mesh, "lps"))
+    estimate = FORMATS[extension].estimate(mesh.describe("lps"))
     assert 0.5 * size <= estimate <= 1.1 * size
     if extension in (".stl", ".ply", ".glb"):
         assert estimate == size

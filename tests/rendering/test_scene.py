@@ -8,7 +8,7 @@ import pytest
 from clrecon.errors import UsageError
 from clrecon.geometry.camera import Camera
 from clrecon.rendering import Rendering
-from clrecon.rendering.scene import merge_layers
+from clrecon.rendering.layers import merge_layers
 from tests import tolerances
 
 WIDTH, HEIGHT = 14, 9

@@ -14,7 +14,7 @@ from collections.abc import Callable
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, BinaryIO
+from typing import BinaryIO
 
 import numpy as np
 
@@ -22,10 +22,7 @@ from clrecon.errors import NoSurfaceError, OutputError, UsageError
 from clrecon.files import StagedFile, stage_file
 from clrecon.geometry.precision import float32_step
 from clrecon.mesh.writers import glb, obj, ply, stl, threemf, vtp
-from clrecon.mesh.writers.content import Content, describe_mesh
-
-if TYPE_CHECKING:
-    from clrecon.mesh.mesh import Mesh
+from clrecon.mesh.writers.content import Content, Writable
 
 __all__ = ["FORMATS", "MeshFormat", "check_format", "describe_rounding", "stage_mesh", "write_mesh"]
 
@@ -84,7 +81,7 @@ def check_format(path: str | os.PathLike[str]) -> str:
     return extension
 
 
-def describe_rounding(mesh: Mesh, extension: str) -> list[str]:
+def describe_rounding(mesh: Writable, extension: str) -> list[str]:
     """The warning for a format that cannot hold the vertices as exactly as the mesh does; none for the others."""
     if extension != ".stl" or mesh.vertices.dtype == np.float32:
         return []
@@ -95,7 +92,7 @@ def describe_rounding(mesh: Mesh, extension: str) -> list[str]:
     ]
 
 
-def write_mesh(mesh: Mesh, path: str | os.PathLike[str], space: str = "lps") -> int:
+def write_mesh(mesh: Writable, path: str | os.PathLike[str], space: str = "lps") -> int:
     """Write a mesh to a file; what `Mesh.save` does.
 
     Returns
@@ -108,12 +105,12 @@ def write_mesh(mesh: Mesh, path: str | os.PathLike[str], space: str = "lps") -> 
     return staged.size
 
 
-def stage_mesh(mesh: Mesh, path: str | os.PathLike[str], space: str = "lps") -> AbstractContextManager[StagedFile]:
+def stage_mesh(mesh: Writable, path: str | os.PathLike[str], space: str = "lps") -> AbstractContextManager[StagedFile]:
     """Write a mesh under a temporary name, to be committed with other files; see `clrecon.files.stage_file`."""
     extension = check_format(path)
     chosen = FORMATS[extension]
     mesh.check()
-    content = describe_mesh(mesh, space)
+    content = mesh.describe(space)
     if mesh.triangle_count == 0:
         raise NoSurfaceError(f"the surface is empty: no {extension[1:].upper()} file is written")
     expected_bytes = chosen.estimate(content)

@@ -2,21 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.errors import OutputError
-from clrecon.geometry import frame_from_lps
-from clrecon.mesh.writers.certificate import certificate_lines
 
-if TYPE_CHECKING:
-    from clrecon.mesh.mesh import Mesh
-
-__all__ = ["Content", "describe_mesh", "refuse_file"]
+__all__ = ["Content", "Writable", "refuse_file"]
 
 
 @dataclass(frozen=True)
@@ -73,30 +67,15 @@ class Content:
         return remarks + [f"CERTIFICATE {line}" for line in self.certificate]
 
 
-def describe_mesh(mesh: Mesh, space: str) -> Content:
-    """Turn a mesh into `space` and pick from its report what goes into files: nothing else ever does."""
-    vertices, normals = mesh.in_space(space)
-    iso_value = mesh.report.get("iso_value_hu")
-    affine = mesh.report.get("affine_ijk_to_lps_mm")
-    certificate = mesh.report.get("certificate")
-    return Content(
-        vertices=vertices,
-        triangles=mesh.triangles,
-        normals=normals,
-        space=space.upper(),
-        to_lps=frame_from_lps(space).T,
-        iso_value_hu=None if iso_value is None else float(iso_value),
-        affine=None if affine is None else np.array(affine, dtype=np.float64).reshape(4, 4),
-        certificate=certificate_lines(certificate) if isinstance(certificate, Mapping) else (),
-        inside=_describe_inside(mesh.report.get("inside_hu")),
-    )
+class Writable(Protocol):
+    """What can be written: a `Mesh`."""
 
-
-def _describe_inside(ends: Sequence[float | None] | None) -> str | None:
-    """What lies within these ends, None where the upper one is open."""
-    if ends is None or ends[1] is None:
-        return None
-    return f"below {ends[1]:.9g} HU" if ends[0] is None else f"{ends[0]:.9g} to {ends[1]:.9g} HU"
+    @property
+    def triangle_count(self) -> int: ...
+    @property
+    def vertices(self) -> NDArray[np.floating]: ...
+    def check(self) -> None: ...
+    def describe(self, space: str) -> Content: ...
 
 
 def refuse_file(words: str, found: object, expected: object) -> OutputError:

@@ -1,0 +1,32 @@
+"""Elements that tell the phases of one series apart: several volumes at one place."""
+
+from __future__ import annotations
+
+__all__ = ["FRAME_PHASES", "PHASE_KEYWORDS", "SLICE_PHASES"]
+
+FRAME_PHASES = (
+    ("TemporalPositionIndex", 0x00209128, "L"),
+    ("TemporalPositionTimeOffset", 0x0020930D, "d"),
+    ("NominalPercentageOfCardiacPhase", 0x00209241, "f"),
+    ("NominalCardiacTriggerDelayTime", 0x00209153, "d"),
+    ("NominalPercentageOfRespiratoryPhase", 0x00209245, "f"),
+    ("NominalRespiratoryTriggerDelayTime", 0x00209255, "d"),
+    ("StackID", 0x00209056, ""),
+    ("FrameAcquisitionNumber", 0x00209156, "H"),
+)
+"""What the functional groups have to tell frames at the same place apart, the most telling first; "" is text."""
+
+SLICE_PHASES = (
+    "TemporalPositionIdentifier",
+    "TriggerTime",
+    "AcquisitionNumber",
+    "AcquisitionDate",
+    "AcquisitionTime",
+    "KVP",
+    "ConvolutionKernel",
+    "ImageType",
+    "ContentDate",
+    "ContentTime",
+)
+PHASE_KEYWORDS = (*(keyword for keyword, _, _ in FRAME_PHASES), *SLICE_PHASES)
+"""What tells the phases of one series apart, the most telling first: what only frames say, then what slices say."""
