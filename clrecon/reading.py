@@ -14,8 +14,8 @@ from clrecon.errors import RefusedInputError, UsageError
 
 if TYPE_CHECKING:
     from clrecon.dicom.listing import SeriesListing
-    from clrecon.dicom.scan import Progress
     from clrecon.geometry import Volume
+    from clrecon.progress import Progress
 
 __all__ = ["list_series", "read_volume"]
 

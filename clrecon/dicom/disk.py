@@ -20,10 +20,10 @@ from typing import Any, TypeVar
 from clrecon.dicom.elements import FileStart, read_start
 from clrecon.dicom.text import escape_text
 from clrecon.errors import RefusedInputError
+from clrecon.progress import Progress
 
 __all__ = ["DiskReader", "Progress"]
 
-Progress = Callable[[str, int, int], None]
 T = TypeVar("T")
 
 NOTICE_S = 10.0

@@ -19,12 +19,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.dicom.padding import PaddingMasks, pack_mask
-from clrecon.dicom.scan import Progress
 from clrecon.dicom.slice_header import SliceHeader
 from clrecon.dicom.stored import StoredPixels, count_readers
 from clrecon.dicom.stray_bits import StrayBits, describe_stray_bits, find_stray_bits
 from clrecon.errors import RefusedInputError
 from clrecon.geometry.memory import allocate_voxels
+from clrecon.progress import Progress
 
 __all__ = ["PixelFacts", "read_voxels"]
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from clrecon.dicom.containers import describe_container
-from clrecon.dicom.disk import DiskReader, Progress
+from clrecon.dicom.disk import DiskReader
 from clrecon.dicom.elements import META_START, CorruptFileError, FileStart, has_dicom_mark
 from clrecon.dicom.forced import describe_way_out, restore_start
 from clrecon.dicom.header import read_headers
@@ -22,8 +22,9 @@ from clrecon.dicom.remains import Stranger, describe_start, find_remains
 from clrecon.dicom.slice_header import OtherImage, SliceHeader
 from clrecon.dicom.text import escape_text
 from clrecon.errors import NoDicomError
+from clrecon.progress import Progress
 
-__all__ = ["CorruptFile", "Progress", "Scan", "scan_path"]
+__all__ = ["CorruptFile", "Scan", "scan_path"]
 
 DICOM_SUFFIXES = (".dcm", ".dic", ".dicom", ".ima")
 PROGRESS_STEPS = 1000

@@ -6,7 +6,6 @@ from pathlib import Path
 
 from clrecon.dicom.listing import SeriesEntry, SeriesListing
 from clrecon.dicom.plausibility import collect_voxel_warnings
-from clrecon.dicom.scan import Progress
 from clrecon.errors import RefusedInputError
 from clrecon.formats.certificate import MODALITY, certify_grid, collect_header_warnings, collect_value_warnings
 from clrecon.formats.grid_file import VOLUME, GridFile
@@ -14,6 +13,7 @@ from clrecon.formats.kinds import open_grid
 from clrecon.formats.stream import show_name
 from clrecon.formats.values import GridValues, read_values
 from clrecon.geometry import Volume
+from clrecon.progress import Progress
 
 __all__ = ["list_grid", "read_grid"]
 

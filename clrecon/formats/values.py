@@ -16,12 +16,12 @@ from numpy.typing import NDArray
 
 from clrecon.dicom.likeness import Likeness, judge_slices
 from clrecon.dicom.pixels import PixelFacts
-from clrecon.dicom.scan import Progress
 from clrecon.errors import RefusedInputError
 from clrecon.formats.grid_file import GridFile
 from clrecon.geometry import AIR_HU
 from clrecon.geometry.affine import column_spacing, tilt_degrees
 from clrecon.geometry.memory import allocate_voxels
+from clrecon.progress import Progress
 
 __all__ = ["GridValues", "read_values"]
 

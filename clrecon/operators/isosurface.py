@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from types import TracebackType
 from typing import Any
 
@@ -22,10 +22,10 @@ from clrecon.operators.bricks import BrickRanges, BrickStates, compare_bricks, m
 from clrecon.operators.marching_cubes import Counted, Placement
 from clrecon.operators.slabs import SampleGrid, Slab, plan_slabs
 from clrecon.operators.trilinear import check_row, prepare_trilinear
+from clrecon.progress import Progress
 
 __all__ = [
     "Part",
-    "Progress",
     "SurfaceExtractor",
     "extract_isosurface",
     "extract_isosurfaces",
@@ -33,7 +33,6 @@ __all__ = [
     "voxel_level",
 ]
 
-Progress = Callable[[str, int, int], None]
 
 Part = tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.uint32]]
 """Positions, normals and triangles of one slab."""

@@ -26,12 +26,13 @@ from clrecon.mesh import Mesh
 from clrecon.opencl import Device, check_budget, choose_device, describe_shortage, memory_limits
 from clrecon.opencl.quirks import cache_warnings
 from clrecon.operators import marching_cubes
-from clrecon.operators.isosurface import Part, Progress
+from clrecon.operators.isosurface import Part
 from clrecon.operators.label_survey import survey_labels
 from clrecon.operators.labels import Window, choose_numbers
 from clrecon.operators.marching_cubes import Classified, Counted, Placement
 from clrecon.operators.slabs import SampleGrid
 from clrecon.operators.voxel_types import label_variants
+from clrecon.progress import Progress
 
 __all__ = ["extract_label_masks", "prepare_label_masks"]
 

@@ -25,10 +25,11 @@ from clrecon.mesh import Mesh
 from clrecon.opencl import Device, check_budget, choose_device, describe_shortage, memory_limits
 from clrecon.opencl.quirks import cache_warnings
 from clrecon.operators import marching_cubes
-from clrecon.operators.isosurface import Part, Progress, voxel_level
+from clrecon.operators.isosurface import Part, voxel_level
 from clrecon.operators.marching_cubes import Classified, Placement
 from clrecon.operators.slabs import SampleGrid, Slab
 from clrecon.operators.voxel_types import label_variants, voxel_variants
+from clrecon.progress import Progress
 
 __all__ = ["Window", "choose_numbers", "extract_labels", "prepare_labels"]
 

@@ -19,7 +19,8 @@ from clrecon.geometry.spine_line import find_spine_line
 from clrecon.geometry.views import checked_size, find_up, find_view
 from clrecon.kernels import Stopwatch
 from clrecon.opencl import Device, check_memory, choose_device
-from clrecon.operators.sheets import Progress, Reformation, sample_sheet
+from clrecon.operators.sheets import Reformation, sample_sheet
+from clrecon.progress import Progress
 from clrecon.rendering import Rendering
 from clrecon.rendering.colors import is_transparent
 from clrecon.rendering.window import BONE_WINDOW, checked_window, grey_image

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,6 +15,7 @@ from clrecon.geometry.sheets import Sheet, SlabSamples
 from clrecon.kernels import Program, Stopwatch, allocate, download, launch, load_program, upload
 from clrecon.opencl import Device, describe_shortage, memory_limits
 from clrecon.operators.voxel_types import voxel_variants
+from clrecon.progress import Progress
 
 __all__ = ["COMBINATIONS", "Reformation", "prepare_reformat", "sample_sheet"]
 
@@ -27,8 +27,6 @@ SAMPLES_A_LAUNCH = 1 << 23
 
 FARTHEST = 2.0**30
 """Index steps, or mm, from the volume that fixed point can hold."""
-
-Progress = Callable[[str, int, int], None]
 
 
 @dataclass(frozen=True)

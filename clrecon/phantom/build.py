@@ -22,11 +22,12 @@ from clrecon.phantom.anatomy import Anatomy
 from clrecon.phantom.bodies import choose_body
 from clrecon.phantom.dicom_series import RESCALE_INTERCEPT, write_series
 from clrecon.phantom.label_map import write_label_map
-from clrecon.phantom.sampling import Progress, add_noise, apply_point_spread, sample_occupancy
+from clrecon.phantom.sampling import add_noise, apply_point_spread, sample_occupancy
 from clrecon.phantom.scene_plans import plan_scene
 from clrecon.phantom.scenes import CEILING_HU, DENSE_HU, LabelArray, describe_parts, draw_scene
 from clrecon.phantom.settings import CENTRE_LPS_MM, KINDS, PhantomSettings, Placement, place_slices
 from clrecon.phantom.spine import draw_spine
+from clrecon.progress import Progress
 from clrecon.version import package_version
 
 __all__ = ["SPINE_ISO_HU", "TRUTH_NAME", "label_materials", "make_phantom", "write_phantom"]

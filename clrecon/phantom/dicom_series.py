@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.errors import OutputError
-from clrecon.phantom.sampling import Progress
 from clrecon.phantom.settings import PhantomSettings, Placement
+from clrecon.progress import Progress
 
 if TYPE_CHECKING:
     from pydicom.dataset import FileDataset

@@ -16,12 +16,12 @@ from clrecon.errors import UsageError
 from clrecon.geometry import apply_affine, column_spacing
 from clrecon.geometry.affine import checked_affine
 from clrecon.phantom.shapes import Body
+from clrecon.progress import Progress
 
-__all__ = ["Progress", "add_noise", "apply_point_spread", "map_slices", "sample_distance", "sample_occupancy"]
+__all__ = ["add_noise", "apply_point_spread", "map_slices", "sample_distance", "sample_occupancy"]
 
 Float32Array = NDArray[np.float32]
 Float64Array = NDArray[np.float64]
-Progress = Callable[[str, int, int], None]
 
 _CHUNK = 1 << 21
 """Points evaluated at once: bounds the scratch memory to some hundred MB."""

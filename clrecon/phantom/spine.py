@@ -16,12 +16,12 @@ from clrecon.geometry import column_spacing
 from clrecon.phantom.anatomy import Anatomy, Vertebra, plan_anatomy
 from clrecon.phantom.fields import Field, capsule, coverage, ellipse, waves_at
 from clrecon.phantom.placing import Piece, PlacedPiece, Window, paint
-from clrecon.phantom.sampling import Progress
 from clrecon.phantom.scenes import Plan
 from clrecon.phantom.settings import CENTRE_LPS_MM, PhantomSettings
 from clrecon.phantom.tables import lay_under
 from clrecon.phantom.tissue import draw_tissue
 from clrecon.phantom.vertebra import local_bounds, vertebra_distance
+from clrecon.progress import Progress
 
 __all__ = ["draw_spine"]
 

@@ -9,12 +9,13 @@ from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
 from clrecon.errors import DeviceError, NoSurfaceError, UsageError
+from clrecon.pipeline.laps import Laps
 from clrecon.pipeline.machine import free_cores, processor_name, usable_cores
 from clrecon.pipeline.outputs import check_kept
 from clrecon.pipeline.pairs import alternate, spread, summarise
 from clrecon.pipeline.presets import DEFAULT_PRESET, find_preset
-from clrecon.pipeline.progress import Progress, Stopwatch, ignore_progress
 from clrecon.pipeline.report import platform_name, stage_report
+from clrecon.progress import Progress, ignore_progress
 from clrecon.version import package_version
 
 if TYPE_CHECKING:
@@ -84,7 +85,7 @@ def run_bench(
         check_kept([("the report", report_path)], source)
     progress("device", 0, 0)
     devices = _choose_devices(device)
-    watch = Stopwatch()
+    watch = Laps()
     volume, suggested = _get_volume(source, series, progress)
     watch.lap("make" if source is None else "read")
     hu = suggested if iso_value is None else iso_value

@@ -6,12 +6,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from clrecon.errors import OutputError, UsageError
+from clrecon.pipeline.laps import Laps
 from clrecon.pipeline.mesh import make_mesh
 from clrecon.pipeline.pictures import PictureFiles
-from clrecon.pipeline.progress import Progress, Stopwatch
 from clrecon.pipeline.render import make_pictures
 from clrecon.pipeline.render_settings import RenderSettings
 from clrecon.pipeline.settings import MeshSettings
+from clrecon.progress import Progress
 
 if TYPE_CHECKING:
     from clrecon.opencl import Device
@@ -52,7 +53,7 @@ def make_demo(
     from clrecon.opencl import choose_device
     from clrecon.phantom import PhantomSettings, write_phantom
 
-    watch = Stopwatch()
+    watch = Laps()
     folder = Path(output)
     _prepare(folder)
     chosen = choose_device(device)

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from clrecon.errors import UsageError
-from clrecon.pipeline.progress import Progress
+from clrecon.progress import Progress
 
 if TYPE_CHECKING:
     from clrecon.geometry import Volume

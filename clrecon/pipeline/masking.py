@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from clrecon.pipeline.progress import Progress
+from clrecon.progress import Progress
 
 if TYPE_CHECKING:
     from clrecon.geometry import Volume

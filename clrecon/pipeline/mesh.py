@@ -11,15 +11,16 @@ from typing import Any
 from clrecon.pipeline.bone import judge_surfaces, warn_of_walls
 from clrecon.pipeline.description import describe_job, describe_part
 from clrecon.pipeline.labels import extract_label_surfaces, judge_label_volumes, open_labels
+from clrecon.pipeline.laps import Laps
 from clrecon.pipeline.levels import choose_level
 from clrecon.pipeline.masking import leave_outside, mask_volume
 from clrecon.pipeline.opening import DeviceOpening, prepare_surfaces
 from clrecon.pipeline.outputs import check_kept, check_outputs, commit_all, count_leftovers, name_outputs, stage_meshes
 from clrecon.pipeline.parts import check_levels, extract_surfaces, first_names, plan_surfaces, select_parts
-from clrecon.pipeline.progress import Progress, Stopwatch, ignore_progress
 from clrecon.pipeline.refinement import describe_purposes, judge_parts, refine_surface, warn_of_gates
 from clrecon.pipeline.report import peak_memory_bytes, stage_report
 from clrecon.pipeline.settings import MeshSettings
+from clrecon.progress import Progress, ignore_progress
 
 __all__ = ["make_mesh"]
 
@@ -72,7 +73,7 @@ def make_mesh(
     settings = settings or MeshSettings()
     progress = progress or ignore_progress
     measure = report_path is not None if measure is None else measure
-    watch = Stopwatch()
+    watch = Laps()
     surfaces = plan_surfaces(settings.levels, below=settings.below is not None)
     outputs = check_outputs(output, report_path, first_names(surfaces, settings.split))
     check_kept(outputs, source, None if settings.labels is None else settings.labels.path)
@@ -165,7 +166,7 @@ def make_mesh(
     return report
 
 
-def _seconds(watch: Stopwatch, origins: Sequence[dict[str, Any]]) -> dict[str, float]:
+def _seconds(watch: Laps, origins: Sequence[dict[str, Any]]) -> dict[str, float]:
     """Seconds by part of the job; `origins` are the reports of the surfaces."""
     measured = [origin.get("seconds", {}) for origin in origins]
     seconds = {"device": watch.seconds.get("device", 0.0), "read": watch.seconds.get("read", 0.0)}

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from clrecon.errors import DeviceMemoryError, NoSurfaceError, UsageError
 from clrecon.pipeline.outputs import MOST_FILES
-from clrecon.pipeline.progress import Progress
 from clrecon.pipeline.settings import MeshSettings, name_level
+from clrecon.progress import Progress
 
 if TYPE_CHECKING:
     from clrecon.geometry import Volume

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from clrecon.pipeline.parts import Part
-from clrecon.pipeline.progress import Progress, ignore_progress
 from clrecon.pipeline.settings import MeshSettings
+from clrecon.progress import Progress, ignore_progress
 
 if TYPE_CHECKING:
     from clrecon.geometry import Volume

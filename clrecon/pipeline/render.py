@@ -10,15 +10,16 @@ from typing import TYPE_CHECKING, Any
 
 from clrecon.errors import UsageError
 from clrecon.files import allow_open_files
+from clrecon.pipeline.laps import Laps
 from clrecon.pipeline.masking import mask_volume
 from clrecon.pipeline.opening import DeviceOpening
 from clrecon.pipeline.outputs import check_kept, commit_all
 from clrecon.pipeline.pictures import PictureFiles, check_pictures, format_of, name_view, stage_picture
-from clrecon.pipeline.progress import Progress, Stopwatch, ignore_progress
 from clrecon.pipeline.render_report import describe_picture, describe_pictures, find_emptiness, warn_of_picture
 from clrecon.pipeline.render_settings import RenderSettings
 from clrecon.pipeline.report import peak_memory_bytes, stage_report
 from clrecon.pipeline.studio import Studio, read_curve, read_function, read_look
+from clrecon.progress import Progress, ignore_progress
 
 if TYPE_CHECKING:
     from clrecon.files import Staged
@@ -66,7 +67,7 @@ def make_pictures(
     progress = progress or ignore_progress
     if (files.turntable is None) != (settings.turntable is None):
         raise UsageError("a turntable needs both: where it goes, and how it turns")
-    watch = Stopwatch()
+    watch = Laps()
     check_kept(check_pictures(files, settings), source, *settings.files_read)
     allow_open_files(3 * len(settings.views_used) + 2)  # picture, depths and values of each view, turntable, report
     function = read_function(settings.transfer_function)
@@ -127,7 +128,7 @@ def _take_views(
     settings: RenderSettings,
     files: PictureFiles,
     staged: ExitStack,
-    watch: Stopwatch,
+    watch: Laps,
     progress: Progress,
 ) -> tuple[list[dict[str, Any]], list[Staged]]:
     """Take the picture of each view and write it under a temporary name; returns what the report says of them."""
@@ -156,7 +157,7 @@ def _turn(
     settings: RenderSettings,
     files: PictureFiles,
     staged: ExitStack,
-    watch: Stopwatch,
+    watch: Laps,
     progress: Progress,
 ) -> tuple[dict[str, Any] | None, list[Staged]]:
     """Write the turntable, frame by frame and under a temporary name; returns what the report says of it."""
@@ -194,7 +195,7 @@ def _turn(
     return described, [moving]
 
 
-def _seconds(watch: Stopwatch) -> dict[str, float]:
+def _seconds(watch: Laps) -> dict[str, float]:
     parts = ("device", "read", "mask", "render", "turntable", "write")
     seconds = {part: watch.seconds.get(part, 0.0) for part in parts}
     seconds["other"] = max(0.0, watch.total() - sum(seconds.values()))

@@ -9,8 +9,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
-from clrecon.pipeline.progress import Progress
 from clrecon.pipeline.render_settings import SPINE, LabelLook, RenderSettings
+from clrecon.progress import Progress
 
 if TYPE_CHECKING:
     from clrecon.geometry import Volume

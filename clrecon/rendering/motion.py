@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from typing import TYPE_CHECKING, BinaryIO
 
 import numpy as np
@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from clrecon.errors import UsageError
 from clrecon.files import Staged, check_writable, stage_file
 from clrecon.geometry.camera import Camera
+from clrecon.progress import Progress
 
 if TYPE_CHECKING:
     from clrecon.rendering.picture import Rendering
@@ -42,8 +43,6 @@ FASTEST = {".mp4": 120.0, ".gif": 50.0, ".apng": 120.0, "": 120.0}
 
 SLOWEST = 0.1
 """Frames a second."""
-
-_Progress = Callable[[str, int, int], None]
 
 
 def turntable_cameras(camera: Camera, frames: int, degrees: float = 360.0) -> list[Camera]:
@@ -135,7 +134,7 @@ def write_animation(
     fps: float = 25.0,
     *,
     total: int = 0,
-    progress: _Progress | None = None,
+    progress: Progress | None = None,
 ) -> int:
     """Write frames as a moving picture, whole or not at all.
 
@@ -178,7 +177,7 @@ def stage_animation(
     fps: float = 25.0,
     *,
     total: int = 0,
-    progress: _Progress | None = None,
+    progress: Progress | None = None,
 ) -> Iterator[Staged]:
     """Write a moving picture under a temporary name; ``commit`` of what is yielded puts it in place.
 
@@ -208,7 +207,7 @@ def stage_animation(
 
 
 def _checked_frames(
-    frames: Iterable[Rendering | NDArray[np.uint8]], extension: str, total: int, progress: _Progress | None
+    frames: Iterable[Rendering | NDArray[np.uint8]], extension: str, total: int, progress: Progress | None
 ) -> Iterator[NDArray[np.uint8]]:
     """Frames as arrays (h, w, 3 or 4), the formats without opacity get three channels; says how many are done."""
     shape: tuple[int, ...] | None = None

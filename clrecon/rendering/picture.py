@@ -71,7 +71,7 @@ class Rendering(PictureData):
         from clrecon.rendering.annotations import annotate
 
         image = annotate(self, letters=letters, scale_bar=scale_bar, caption=caption)
-        return replace(self, image=image)
+        return self if image is self.image else replace(self, image=image)
 
     def save(self, path: str | os.PathLike[str], *, quality: int = 95) -> int:
         """Write the picture to a file whose extension says the format.

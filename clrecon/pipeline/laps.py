@@ -1,21 +1,13 @@
-"""How jobs tell what they are doing."""
+"""What the parts of a job take."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from time import perf_counter
 
-__all__ = ["Progress", "Stopwatch", "ignore_progress"]
-
-Progress = Callable[[str, int, int], None]
-"""Called as ``progress(stage, done, total)``; ``total`` is 0 where the end is not known."""
+__all__ = ["Laps"]
 
 
-def ignore_progress(stage: str, done: int = 0, total: int = 0) -> None:
-    """Take a step of progress and do nothing with it."""
-
-
-class Stopwatch:
+class Laps:
     """Seconds by part of a job, on the wall clock."""
 
     def __init__(self) -> None:
@@ -31,5 +23,5 @@ class Stopwatch:
         return elapsed
 
     def total(self) -> float:
-        """Seconds since this stopwatch was made."""
+        """Seconds since the first lap began."""
         return perf_counter() - self._start

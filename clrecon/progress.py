@@ -1,0 +1,14 @@
+"""How work that takes long tells what it is doing."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+__all__ = ["Progress", "ignore_progress"]
+
+Progress = Callable[[str, int, int], None]
+"""Called as ``progress(stage, done, total)``; ``total`` is 0 where the end is not known."""
+
+
+def ignore_progress(stage: str, done: int = 0, total: int = 0) -> None:
+    """Take a step of progress and do nothing with it."""
