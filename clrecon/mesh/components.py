@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 from clrecon.errors import NoSurfaceError, UsageError
 from clrecon.mesh.connectivity import label_components
 from clrecon.mesh.coordinates import rounding_step
-from clrecon.mesh.measures import CHUNK, cross_products, local_origin
+from clrecon.mesh.measures import cross_products
 from clrecon.mesh.mesh import Mesh
 from clrecon.mesh.nearest import find_nearest_triangle
+from clrecon.pieces import CHUNK, local_origin
 from clrecon.wording import name_parameter
 
 __all__ = ["Labelled", "select_components", "split_components"]

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from clrecon.geometry import Volume
 from clrecon.geometry.field import IsoRule, layer_normal_matrices
 from clrecon.mesh.distances import summarise_distances
-from clrecon.mesh.measures import chunks
 from clrecon.mesh.mesh import Mesh
+from clrecon.pieces import chunks
 
 __all__ = [
     "SAMPLES",

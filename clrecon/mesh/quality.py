@@ -17,7 +17,8 @@ from clrecon.mesh.connectivity import (
     opposite_half_edges,
 )
 from clrecon.mesh.coordinates import find_coincident
-from clrecon.mesh.measures import corner_edges, cross_product, local_origin
+from clrecon.mesh.measures import corner_edges, cross_product
+from clrecon.pieces import local_origin
 
 __all__ = ["measure_quality"]
 

@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 from clrecon.errors import UsageError
 from clrecon.mesh.connectivity import find_edges
 from clrecon.mesh.coordinates import rounding_step
-from clrecon.mesh.measures import local_origin
 from clrecon.mesh.mesh import Mesh
 from clrecon.mesh.normals import vertex_normals
 from clrecon.mesh.refinement import carry_on, check_refinement
 from clrecon.mesh.shifts import measure_volumes, move_vertices, restore_volumes, shorten_steps
+from clrecon.pieces import local_origin
 
 __all__ = ["smooth_mesh"]
 

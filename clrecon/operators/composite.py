@@ -14,8 +14,9 @@ from clrecon.geometry.field import takes_parts
 from clrecon.kernels import Stopwatch, allocate, launch, upload
 from clrecon.labels.resample import ResampledLabels
 from clrecon.opencl import Device
+from clrecon.operators.frame import FieldFrame
 from clrecon.operators.pictures import PictureBuffers, count_queues, highlight_table
-from clrecon.operators.ray_view import FieldFrame, RayView
+from clrecon.operators.ray_view import RayView
 from clrecon.operators.resident import FARTHEST, LeapMap, RaySlab, ResidentVolume, pad_slices
 from clrecon.operators.voxel_types import label_variants
 from clrecon.rendering import Lighting, TransferFunction

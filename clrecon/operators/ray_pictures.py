@@ -15,9 +15,10 @@ from clrecon.geometry.clip import Clip
 from clrecon.kernels import Stopwatch
 from clrecon.labels.resample import resample_labels
 from clrecon.operators.composite import TransferTables, composite_slab
+from clrecon.operators.frame import volume_box
 from clrecon.operators.pictures import PictureBuffers
 from clrecon.operators.project import PROJECTIONS, project_slab
-from clrecon.operators.ray_view import RayView, volume_box
+from clrecon.operators.ray_view import RayView
 from clrecon.operators.resident import RaySlab, ResidentVolume, entry_slice
 from clrecon.rendering import Lighting, Rendering, TransferFunction
 from clrecon.rendering.label_style import LabelStyle

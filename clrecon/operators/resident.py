@@ -15,7 +15,7 @@ from clrecon.geometry.affine import Float64Array
 from clrecon.geometry.camera import Camera
 from clrecon.kernels import Program, Stopwatch, allocate, download, launch, load_program, upload
 from clrecon.opencl import Device, check_budget, describe_shortage, memory_limits
-from clrecon.operators.ray_view import BOX_BORDER, enclose
+from clrecon.operators.frame import BOX_BORDER, enclose
 from clrecon.operators.stack_table import StackTable
 from clrecon.operators.voxel_types import voxel_variants
 

@@ -16,8 +16,9 @@ from clrecon.geometry.camera import Camera
 from clrecon.geometry.clip import Clip
 from clrecon.kernels import Stopwatch, launch, load_program, upload
 from clrecon.opencl import Device, check_budget, describe_shortage, memory_limits
+from clrecon.operators.frame import FieldFrame, volume_box
 from clrecon.operators.pictures import PictureBuffers, count_queues
-from clrecon.operators.ray_view import FieldFrame, RayView, volume_box
+from clrecon.operators.ray_view import RayView
 from clrecon.operators.voxel_types import voxel_variants
 from clrecon.rendering import Rendering, TransferFunction
 from clrecon.rendering.window import checked_window

@@ -13,7 +13,7 @@ from clrecon.geometry.affine import Float64Array
 from clrecon.geometry.field import slice_normal_matrices
 from clrecon.kernels import upload
 from clrecon.opencl import Device
-from clrecon.operators.ray_view import FieldFrame
+from clrecon.operators.frame import FieldFrame
 
 __all__ = ["StackTable"]
 

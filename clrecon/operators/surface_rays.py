@@ -18,8 +18,9 @@ from clrecon.geometry.field import IsoRule, ValueRange, choose_iso_rule
 from clrecon.kernels import Stopwatch, launch, upload
 from clrecon.labels import resample_labels
 from clrecon.opencl import memory_limits
+from clrecon.operators.frame import FieldFrame, enclose
 from clrecon.operators.pictures import PictureBuffers, count_queues, highlight_table
-from clrecon.operators.ray_view import FieldFrame, RayView, enclose
+from clrecon.operators.ray_view import RayView
 from clrecon.operators.resident import LeapMap, RaySlab, ResidentVolume, entry_slice, pad_slices
 from clrecon.operators.voxel_types import label_variants
 from clrecon.rendering import Lighting, Rendering

@@ -130,8 +130,8 @@ def measure_pieces(vertices: NDArray[np.floating], triangles: NDArray[np.uint32]
         ``pieces``, ``pieces_ml`` : components that enclose something, and how much
         ``cavities``, ``cavities_ml`` : walls of cavities, and what they enclose
     """
-    from clrecon.mesh.measures import local_origin
     from clrecon.mesh.shifts import measure_volumes
+    from clrecon.pieces import local_origin
 
     found = measure_volumes(vertices - local_origin(vertices), triangles).mm3 / 1000.0
     return {

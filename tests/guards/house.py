@@ -27,10 +27,11 @@ _layer("version")
 _layer("gates")
 _layer("wording")
 _layer("progress")
+_layer("pieces")
 _layer("files", "errors")
 _layer("geometry", "errors", "wording", "files", "gates")
 _layer("dicom", "progress", "errors", "wording", "files", "gates", "geometry")
-_layer("mesh", "errors", "wording", "version", "files", "gates", "geometry")
+_layer("mesh", "pieces", "errors", "wording", "version", "files", "gates", "geometry")
 _layer("formats", "progress", "errors", "wording", "files", "gates", "geometry", "dicom")
 _layer("reading", "progress", "errors", "geometry", "dicom", "formats")
 _layer("labels", "progress", "errors", "wording", "files", "geometry", "dicom", "formats")
@@ -47,6 +48,7 @@ _layer("__main__", "cli")
 
 # Third-party packages: at module level (paid by whoever imports the layer), or only inside functions.
 AT_MODULE_LEVEL: dict[str, frozenset[str]] = {
+    "pieces": frozenset({"numpy"}),
     "geometry": frozenset({"numpy"}),
     "dicom": frozenset({"numpy", "pydicom"}),
     "formats": frozenset({"numpy"}),

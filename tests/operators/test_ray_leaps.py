@@ -12,7 +12,7 @@ from clrecon.geometry.clip import Clip
 from clrecon.kernels import upload
 from clrecon.labels import LabelMap
 from clrecon.operators import composite, resident
-from clrecon.operators.ray_view import volume_box
+from clrecon.operators.frame import volume_box
 from clrecon.operators.renderer import VolumeRenderer, render
 from clrecon.rendering import UNSHADED, Rendering, TransferFunction
 from tests import tolerances

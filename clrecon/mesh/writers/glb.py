@@ -20,8 +20,8 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from clrecon.mesh.measures import local_origin
 from clrecon.mesh.writers.content import Content, refuse_file
+from clrecon.pieces import local_origin
 
 __all__ = ["estimate", "verify", "write"]
 

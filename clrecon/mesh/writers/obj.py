@@ -11,8 +11,8 @@ from typing import BinaryIO
 
 import numpy as np
 
-from clrecon.mesh.measures import chunks
 from clrecon.mesh.writers.content import Content, refuse_file
+from clrecon.pieces import chunks
 
 __all__ = ["estimate", "verify", "write"]
 

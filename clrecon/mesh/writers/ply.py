@@ -12,8 +12,8 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from clrecon.errors import OutputError
-from clrecon.mesh.measures import chunks
 from clrecon.mesh.writers.content import Content, refuse_file
+from clrecon.pieces import chunks
 
 __all__ = ["estimate", "verify", "write"]
 
