@@ -5,7 +5,7 @@
 
 The table "places" has series whose voxels are easily placed wrongly, "doubts" those that look right and are not the
 volume that they seem.  Each cell is the largest distance in mm of a corner voxel of any slice from its true place, and
-S (silent), W (the reader warned) or R (it refused).  The cases are those of tests/trap_cases.py, written into a
+S (silent), W (the reader warned) or R (it refused).  The cases are those of tests/support/trap_cases.py, written into a
 temporary folder.  Every reader runs with its defaults, in a process of its own for every case, with a time limit; one
 that is not installed gives n/a.  All of them: pip install SimpleITK highdicom dicom2nifti dicom-numpy dcm2niix nibabel.
 """
@@ -31,7 +31,7 @@ from typing import Any
 import numpy as np
 
 ROOT = Path(__file__).resolve().parent.parent
-sys.path[:0] = [str(ROOT), str(ROOT / "tests"), str(ROOT / "scripts")]
+sys.path[:0] = [str(ROOT), str(ROOT / "tests" / "support"), str(ROOT / "scripts")]
 
 from reader_peers import READERS  # noqa: E402
 from trap_cases import CASES, FIELD_SIZE, Case, Marks, Size  # type: ignore[import-not-found]  # noqa: E402

@@ -6,9 +6,9 @@ import json
 
 import numpy as np
 import pytest
+from dicom_series import Plan, write_series
 
 from clrecon.cli.main import main
-from tests.dicom_series import Plan, write_series
 
 SHAPE = (8, 10, 11)
 

@@ -1,4 +1,4 @@
-"""Rows of the list of faults that no test of its own subject holds; tests/fault_rows.py says where the others are."""
+"""Rows of the list of faults that no test of its own subject holds; tests/support/fault_rows.py has all of them."""
 
 from __future__ import annotations
 

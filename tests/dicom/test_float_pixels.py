@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from dicom_series import Plan, set_values, write_series
 from pydicom.uid import DeflatedExplicitVRLittleEndian, ExplicitVRLittleEndian, ImplicitVRLittleEndian
-from test_pixels import set_pixels
+from stored_pixels import set_pixels
 
 from clrecon.dicom import read_volume
 from clrecon.errors import RefusedInputError

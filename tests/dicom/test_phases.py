@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from dicom_series import Plan, make_dataset, save_dataset, set_values, write_series
 
 from clrecon.dicom import list_series, read_volume
 from clrecon.dicom.phases import have_same_pixels
 from clrecon.dicom.scan import scan_path
 from clrecon.errors import RefusedInputError, UsageError
-from tests.dicom_series import Plan, make_dataset, save_dataset, set_values, write_series
 
 
 def write_phase(folder, number, shift=0, plan=None, **elements):

@@ -14,6 +14,7 @@ from pydicom.uid import (
     ExplicitVRLittleEndian,
     ImplicitVRLittleEndian,
 )
+from stored_pixels import set_pixels
 from tolerances import AFFINE_MM
 
 from clrecon.dicom import list_series, read_volume, stored
@@ -22,17 +23,6 @@ from clrecon.geometry import memory
 
 SYNTAXES = "transfer_syntaxes"
 LOSSLESS = ["1.2.2", "1.2.1.99", "4.90", "4.80", "4.70", "4.57", "1.2.1", "1.2", "1.2.5"]
-
-
-def set_pixels(make, **values):
-    """A change that puts `make(stored array)` in place of the stored pixels."""
-
-    def change(ds, k):
-        array = np.frombuffer(ds.PixelData, np.int16).reshape(ds.Rows, ds.Columns).copy()
-        ds.PixelData = np.ascontiguousarray(make(array, k)).tobytes()
-        set_values(**values)(ds, k)
-
-    return change
 
 
 @pytest.mark.parametrize(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from dicom_series import Plan, make_dataset, save_dataset, set_raw, set_values, write_series
+from lost_slices import MISSING
 from tolerances import AFFINE_MM, ROUNDED_AFFINE_MM
 
 from clrecon.dicom import list_series, read_volume
@@ -82,9 +83,6 @@ def test_skewed_directions_are_made_orthonormal_with_a_warning(tmp_path):
     assert volume.affine[:3, 0] @ volume.affine[:3, 1] == pytest.approx(0.0, abs=1e-12)
     assert volume.affine[1, 0] / 0.5 == pytest.approx(0.00025, abs=1e-8)
     assert "0.0005: made orthonormal" in volume.report["warnings"][0]
-
-
-MISSING = "1 slice missing between -398.75 and -396.25 mm (gap 2.500 mm, usual 1.250 mm): slice001.dcm, slice003.dcm"
 
 
 @pytest.mark.parametrize(

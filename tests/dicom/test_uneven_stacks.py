@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from test_stack_geometry import MISSING
+import tolerances
+from dicom_series import Plan, write_series
+from lost_slices import MISSING
 
 from clrecon.dicom import list_series, read_volume
 from clrecon.errors import RefusedInputError
-from tests import tolerances
-from tests.dicom_series import Plan, write_series
 
 OBLIQUE = (20.0, -15.0, 30.0)
 

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import tolerances
 
 from clrecon.errors import UsageError
 from clrecon.geometry import Volume
 from clrecon.geometry.camera import Camera, box_corners
 from clrecon.geometry.views import DIRECTIONS
-from tests import tolerances
 
 CENTRE = np.array([12.0, -30.0, 850.0])
 MARKS = {name: CENTRE + 20.0 * np.array(direction) for name, direction in DIRECTIONS.items()}

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import tolerances
+from dicom_series import rotation
 
 from clrecon.errors import UsageError
 from clrecon.geometry import Volume
 from clrecon.geometry.curved_sheets import straightened_sheet, stretched_length, stretched_sheet
 from clrecon.geometry.curves import Curve, rotation_minimising_normals
-from tests import tolerances
-from tests.dicom_series import rotation
 
 RADIUS = 80.0
 

@@ -6,14 +6,14 @@ import gc
 
 import numpy as np
 import pytest
+import tolerances
+from dicom_series import rotation
 
 from clrecon.errors import UsageError
 from clrecon.geometry import AIR_HU, Volume, compose_affine
 from clrecon.geometry.regular import regular_grid, shear_degrees
 from clrecon.mesh import Mesh
 from clrecon.reference.isosurface import extract_isosurface
-from tests import tolerances
-from tests.dicom_series import rotation
 
 pyvista = pytest.importorskip("pyvista")
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from test_body import AFFINE, SHAPE, add_table, as_volume, ellipse, make_patient
+from body_volumes import AFFINE, SHAPE, add_table, as_volume, ellipse, make_patient
 
 from clrecon.errors import NoSurfaceError, RefusedInputError
 from clrecon.geometry import Volume

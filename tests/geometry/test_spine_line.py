@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import tolerances
+from dicom_series import rotation
 
 from clrecon import read_labels, read_volume
 from clrecon.errors import RefusedInputError
@@ -12,8 +14,6 @@ from clrecon.geometry.curves import Curve
 from clrecon.geometry.spine_line import find_spine_line
 from clrecon.phantom import PhantomSettings, make_phantom
 from clrecon.phantom.anatomy import plan_anatomy
-from tests import tolerances
-from tests.dicom_series import rotation
 
 SETTINGS = PhantomSettings(size=(160, 144), slices=60, spacing=(1.9, 1.8, 2.5))
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import tolerances
 
 from clrecon.errors import UsageError
 from clrecon.geometry.camera import Camera
-from tests import tolerances
 
 pyvista = pytest.importorskip("pyvista")
 

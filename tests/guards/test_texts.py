@@ -56,6 +56,19 @@ def test_every_test_asserts_a_value() -> None:
     assert lazy == {}
 
 
+_FROM_TESTS = re.compile(r"(?m)^\s*(?:from|import) (?:tests\b|guards\b|test_\w+)")
+
+
+def test_helpers_of_tests_are_imported_one_way() -> None:
+    folder = ROOT / "tests"
+    files = [path for path in project_files(".py") if path.is_relative_to(folder)]
+    helpers = [path for path in files if not path.name.startswith(("test_", "conftest"))]
+    assert len(helpers) > 10 and {path.parent for path in helpers} == {folder / "support"}
+    assert [path.name for path in files if _FROM_TESTS.search(path.read_text(encoding="utf-8"))] == []
+    assert _FROM_TESTS.search("import numpy\nfrom tests.support import house\n")
+    assert _FROM_TESTS.search("def f():\n    import test_texts\n")
+
+
 def test_test_files_have_names_of_their_own() -> None:
     names = [path.name for path in project_files(".py") if path.is_relative_to(ROOT / "tests")]
     assert sorted(names) == sorted(set(names))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from test_isosurface import OBLIQUE, random_volume, smooth_volume
+from surface_volumes import OBLIQUE, random_volume, smooth_volume
 from variants import VOXEL_TYPES
 
 from clrecon.geometry import Volume

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import tolerances
 
 from clrecon.errors import UsageError
 from clrecon.geometry import Volume
@@ -12,7 +13,6 @@ from clrecon.geometry.curves import Curve
 from clrecon.geometry.sheets import slab_samples
 from clrecon.operators.reformat import reformat_curve
 from clrecon.reference.reformat import reformat_sheet
-from tests import tolerances
 
 pytestmark = pytest.mark.first_device
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import tolerances
 from scipy.spatial import cKDTree
+from surface_volumes import MIRRORED, OBLIQUE, SHAPES, assert_sound, random_volume, smooth_volume
 from variants import VOXEL_TYPES
 
 from clrecon.errors import DeviceError, NoSurfaceError, UsageError
@@ -14,32 +15,6 @@ from clrecon.operators import isosurface, marching_cubes
 from clrecon.operators.isosurface import SurfaceExtractor, extract_isosurface, extract_isosurfaces
 from clrecon.pipeline.selftest import run_selftest
 from clrecon.reference import isosurface as twin
-
-OBLIQUE = np.array([[0.7, 0.1, 0.05, -250.0], [-0.1, 0.5, 0.2, -300.0], [0.0, 0.05, 2.5, -846.0], [0, 0, 0, 1.0]])
-MIRRORED = OBLIQUE @ np.diag((-1.0, 1.0, 1.0, 1.0))
-SHAPES = [(5, 7, 9), (4, 4, 30), (3, 5, 31), (3, 5, 32), (4, 3, 33), (2, 3, 63), (3, 2, 64), (2, 4, 65), (3, 3, 100),
-          (2, 3, 1023), (2, 2, 1024), (2, 3, 1030), (3, 2, 2100)]  # fmt: skip
-"""(nk, nj, ni) on both sides of a mask word (32 samples) and of a word of flags (1024 samples)."""
-
-
-def random_volume(shape, dtype="int16", high=6, affine=OBLIQUE, seed=0) -> Volume:
-    return Volume(np.random.default_rng(seed).integers(0, high, shape).astype(dtype), affine)
-
-
-def smooth_volume(shape=(23, 27, 45), affine=OBLIQUE, seed=1) -> Volume:
-    from scipy.ndimage import gaussian_filter
-
-    field = gaussian_filter(np.random.default_rng(seed).normal(size=shape), 2.0)
-    return Volume((field / field.std() * 300).astype(np.int16), affine)
-
-
-def assert_sound(mesh) -> None:
-    """Closed, manifold, outward, no zero-area face, every vertex used."""
-    quality = mesh.quality()
-    assert quality["closed"] and quality["manifold"]
-    assert quality["volume_ml"] > 0.0
-    assert quality["zero_area_faces"] == 0
-    assert quality["unused_vertices"] == 0
 
 
 @pytest.mark.parametrize("closed", [True, False])

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import tolerances
+from ray_scenes import STEPS, centre_of, look, make_volume, positions, premultiplied
 
 from clrecon.geometry import Volume
 from clrecon.geometry.camera import Camera
@@ -13,8 +15,6 @@ from clrecon.operators.resident import ResidentVolume
 from clrecon.operators.surface_rays import cast_surface
 from clrecon.rendering import Lighting, Rendering
 from clrecon.rendering.label_style import LabelStyle
-from tests import tolerances
-from tests.operators.ray_scenes import STEPS, centre_of, look, make_volume, positions, premultiplied
 
 pytestmark = pytest.mark.first_device
 

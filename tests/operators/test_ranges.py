@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import tolerances
-from test_isosurface import MIRRORED, OBLIQUE, SHAPES, assert_sound, random_volume, smooth_volume
-from test_slabs import assert_same
+from slab_surfaces import assert_same
+from surface_volumes import MIRRORED, OBLIQUE, SHAPES, assert_sound, random_volume, smooth_volume
 from variants import VOXEL_TYPES
 
 from clrecon.errors import DeviceError, NoSurfaceError, UsageError

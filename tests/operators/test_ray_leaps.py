@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import tolerances
+from dicom_series import rotation
 
 from clrecon.errors import UsageError
 from clrecon.geometry import Volume
@@ -15,8 +17,6 @@ from clrecon.operators import composite, resident
 from clrecon.operators.frame import volume_box
 from clrecon.operators.renderer import VolumeRenderer, render
 from clrecon.rendering import UNSHADED, Rendering, TransferFunction
-from tests import tolerances
-from tests.dicom_series import rotation
 
 pytestmark = pytest.mark.first_device
 

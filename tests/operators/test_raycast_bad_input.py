@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from raycast_scenes import DEVICE_RENDERS, blobs, even_volume
 
 from clrecon.errors import UsageError
 from clrecon.geometry import Volume
 from clrecon.geometry.camera import Camera
 from clrecon.rendering import TransferFunction
-from tests.operators.raycast_scenes import DEVICE_RENDERS, blobs, even_volume
 
 pytestmark = [
     pytest.mark.skipif(not DEVICE_RENDERS, reason="the raycaster of devices is not there"),

@@ -8,16 +8,8 @@ from typing import Any
 import conftest
 import numpy as np
 import pytest
-from variants import all_but
-
-from clrecon.geometry import Volume
-from clrecon.geometry.camera import Camera
-from clrecon.geometry.clip import Clip
-from clrecon.kernels.sources import read_kernel_source
-from clrecon.reference.rays import hash_pixels, jitter_pixels
-from clrecon.rendering import UNSHADED, Lighting, TransferFunction
-from tests import tolerances
-from tests.operators.raycast_scenes import (
+import tolerances
+from raycast_scenes import (
     DEVICE_RENDERS,
     DeviceCaster,
     TwinCaster,
@@ -29,11 +21,19 @@ from tests.operators.raycast_scenes import (
     premultiplied,
     uneven_volume,
 )
+from soft_function import SOFT
+from variants import all_but
+
+from clrecon.geometry import Volume
+from clrecon.geometry.camera import Camera
+from clrecon.geometry.clip import Clip
+from clrecon.kernels.sources import read_kernel_source
+from clrecon.reference.rays import hash_pixels, jitter_pixels
+from clrecon.rendering import UNSHADED, Lighting, TransferFunction
 
 renders = pytest.mark.skipif(not DEVICE_RENDERS, reason="the raycaster of devices is not there")
 
 SIZE = (64, 48)
-SOFT = TransferFunction([(-300, 0.9, 0.2, 0.1, 0.0), (200, 1, 0.7, 0.4, 0.15), (900, 1, 1, 0.9, 0.6)])
 STEEP = TransferFunction([(-200, 0.8, 0.1, 0.1, 0), (100, 1, 0.6, 0.3, 0), (130, 1, 0.9, 0.7, 0.9), (800, 1, 1, 1, 1)])
 LEVOY = TransferFunction(SOFT.points, unit_distance=2.0, gradient_opacity=[(20.0, 0.0), (150.0, 1.0), (600.0, 0.3)])
 LIT = Lighting()

@@ -4,11 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-
-from clrecon.reference.raycast import MODES
-from clrecon.rendering import Lighting
-from tests import tolerances
-from tests.operators.raycast_scenes import (
+import tolerances
+from raycast_scenes import (
     DEVICE_RENDERS,
     DeviceCaster,
     blobs,
@@ -17,7 +14,10 @@ from tests.operators.raycast_scenes import (
     premultiplied,
     uneven_volume,
 )
-from tests.operators.test_raycast_devices import SOFT
+from soft_function import SOFT
+
+from clrecon.reference.raycast import MODES
+from clrecon.rendering import Lighting
 
 pytestmark = pytest.mark.skipif(not DEVICE_RENDERS, reason="the raycaster of devices is not there")
 

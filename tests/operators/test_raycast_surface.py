@@ -4,15 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-
-from clrecon.geometry import Volume
-from clrecon.geometry.camera import Camera
-from clrecon.geometry.clip import Clip
-from clrecon.operators.isosurface import extract_isosurface
-from clrecon.reference.isosurface import extract_isosurface as extract_twin
-from clrecon.rendering import Lighting
-from tests import tolerances
-from tests.operators.raycast_scenes import (
+import tolerances
+from raycast_scenes import (
     GAPS,
     STEPS,
     TURN,
@@ -25,6 +18,13 @@ from tests.operators.raycast_scenes import (
     look,
     uneven_volume,
 )
+
+from clrecon.geometry import Volume
+from clrecon.geometry.camera import Camera
+from clrecon.geometry.clip import Clip
+from clrecon.operators.isosurface import extract_isosurface
+from clrecon.reference.isosurface import extract_isosurface as extract_twin
+from clrecon.rendering import Lighting
 
 MATT = Lighting(ambient=0.2, diffuse=0.8, specular=0.0)
 SLOPE = TURN @ np.array([0.35, -0.2, 0.9])

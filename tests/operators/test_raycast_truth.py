@@ -4,14 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-
-from clrecon.geometry import Volume
-from clrecon.geometry.camera import Camera
-from clrecon.geometry.clip import Clip
-from clrecon.rendering import Lighting, TransferFunction
-from clrecon.rendering.presets import PRESETS
-from tests import tolerances
-from tests.operators.raycast_scenes import (
+import tolerances
+from raycast_scenes import (
     GAPS,
     PLACE,
     STEPS,
@@ -25,6 +19,12 @@ from tests.operators.raycast_scenes import (
     uneven_volume,
     ways_through,
 )
+
+from clrecon.geometry import Volume
+from clrecon.geometry.camera import Camera
+from clrecon.geometry.clip import Clip
+from clrecon.rendering import Lighting, TransferFunction
+from clrecon.rendering.presets import PRESETS
 
 BONE = TransferFunction([(-1000, 1, 1, 1, 0), (300, 1, 1, 1, 0), (300, 1, 1, 1, 1), (3000, 1, 1, 1, 1)])
 """Opaque from 300 HU on."""

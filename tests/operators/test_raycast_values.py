@@ -4,12 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-
-from clrecon.geometry import Volume
-from clrecon.geometry.camera import Camera
-from clrecon.geometry.clip import Clip
-from tests import tolerances
-from tests.operators.raycast_scenes import (
+import tolerances
+from raycast_scenes import (
     PLACE,
     STEPS,
     ball,
@@ -22,6 +18,10 @@ from tests.operators.raycast_scenes import (
     uneven_volume,
     ways_through,
 )
+
+from clrecon.geometry import Volume
+from clrecon.geometry.camera import Camera
+from clrecon.geometry.clip import Clip
 
 
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:

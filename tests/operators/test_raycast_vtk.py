@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import tolerances
+from dicom_series import rotation
 
 import clrecon
 from clrecon.geometry import Volume
@@ -16,15 +16,12 @@ from clrecon.geometry.camera import Camera
 from clrecon.geometry.clip import Clip
 from clrecon.rendering.lighting import UNSHADED
 from clrecon.rendering.presets import find_preset
-from tests import tolerances
-from tests.dicom_series import rotation
 
 pytest.importorskip("vtkmodules.vtkRenderingVolumeOpenGL2")
-sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "scripts" / "bench"))
 
-from peers.vtk_fixed_point import FixedPointPeer  # noqa: E402
-from peers.vtk_stage import scene_of  # noqa: E402
-from raycast import likeness  # noqa: E402
+from peers.vtk_fixed_point import FixedPointPeer
+from peers.vtk_stage import scene_of
+from raycast import likeness
 
 pytestmark = [pytest.mark.opencl, pytest.mark.first_device]
 

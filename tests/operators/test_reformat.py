@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import tolerances
+from dicom_series import rotation
+from uneven_volume import uneven
 from variants import VOXEL_TYPES
 
 from clrecon.errors import DeviceError, UsageError
@@ -14,9 +17,6 @@ from clrecon.kernels import kernel_files, upload
 from clrecon.operators.reformat import cut_slice, reformat_curve
 from clrecon.operators.sheets import prepare_reformat, sample_sheet
 from clrecon.reference.reformat import reformat_sheet
-from tests import tolerances
-from tests.dicom_series import rotation
-from tests.geometry.test_uneven_volumes import uneven
 
 SHEARED = np.eye(4)
 SHEARED[:3, :3] = rotation((15.0, -25.0, 40.0)) @ [[0.7, 0.0, 0.1], [0.0, 0.5, -0.9], [0.0, 0.0, 2.5]]

@@ -7,14 +7,14 @@ import sys
 
 import numpy as np
 import pytest
+import tolerances
+from raycast_scenes import DeviceCaster, look, premultiplied
 
 from clrecon.geometry import Volume
 from clrecon.kernels.arrays import download, empty_output, upload
 from clrecon.kernels.sources import read_kernel_source
 from clrecon.operators import resident
 from clrecon.rendering import Lighting, TransferFunction
-from tests import tolerances
-from tests.operators.raycast_scenes import DeviceCaster, look, premultiplied
 
 FUNCTION = TransferFunction([(-300, 0.9, 0.2, 0.1, 0.0), (200, 1, 0.7, 0.4, 0.15), (900, 1, 1, 0.9, 0.6)])
 ALONG_J, ALONG_K, NEARLY_J = (0.0, 1.0, 0.0), (0.0, 0.05, -1.0), (0.02, 1.0, 0.03)

@@ -6,7 +6,8 @@ import dataclasses
 
 import numpy as np
 import pytest
-from test_isosurface import MIRRORED, OBLIQUE, random_volume, smooth_volume
+from slab_surfaces import assert_same, extract_in_slabs
+from surface_volumes import MIRRORED, OBLIQUE, random_volume, smooth_volume
 
 from clrecon.errors import DeviceError, DeviceMemoryError, UsageError
 from clrecon.geometry import Volume
@@ -14,18 +15,6 @@ from clrecon.geometry.field import choose_iso_rule
 from clrecon.operators import isosurface, marching_cubes
 from clrecon.operators.isosurface import SurfaceExtractor, extract_isosurface
 from clrecon.operators.slabs import SampleGrid, Slab, plan_slabs
-
-
-def extract_in_slabs(volume, iso_value, device, slices, closed=True):
-    extractor = SurfaceExtractor(volume, device)
-    extractor._use_smaller_slabs(choose_iso_rule(volume, iso_value, closed), slices)
-    return extractor.extract(iso_value, closed=closed)
-
-
-def assert_same(mesh, expected) -> None:
-    assert np.array_equal(mesh.triangles, expected.triangles)
-    assert np.array_equal(mesh.vertices, expected.vertices)
-    assert np.array_equal(mesh.normals, expected.normals)
 
 
 @pytest.mark.parametrize("closed", [True, False])

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import tolerances
+from ray_scenes import GRIDS, blobs, centre_of, look, make_volume, premultiplied
 
 from clrecon.errors import DeviceError, UsageError
 from clrecon.geometry import Volume
@@ -12,8 +14,6 @@ from clrecon.geometry.clip import Clip
 from clrecon.operators.slice_overlay import choose_slices, overlay_slices
 from clrecon.reference.slice_overlay import overlay_slices as overlay_twin
 from clrecon.rendering import TransferFunction
-from tests import tolerances
-from tests.operators.ray_scenes import GRIDS, blobs, centre_of, look, make_volume, premultiplied
 
 SIZE = (56, 48)
 WINDOW = (-500.0, 700.0)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import tolerances
+from ray_scenes import GRIDS, LONGEST_STEP, blobs, centre_of, look, make_volume, premultiplied
 from variants import all_but
 
 from clrecon.errors import DeviceError, UsageError
@@ -15,8 +17,6 @@ from clrecon.operators.resident import ResidentVolume
 from clrecon.operators.surface_rays import cast_surface
 from clrecon.reference.surface_rays import cast_surface as cast_twin
 from clrecon.rendering import Lighting, Rendering
-from tests import tolerances
-from tests.operators.ray_scenes import GRIDS, LONGEST_STEP, blobs, centre_of, look, make_volume, premultiplied
 
 SIZE = (56, 48)
 UNLIT = Lighting(1.0, 0.0, 0.0)

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from test_slabs import assert_same, extract_in_slabs
+import tolerances
+from dicom_series import rotation
+from slab_surfaces import assert_same, extract_in_slabs
 
 from clrecon.geometry import Volume
 from clrecon.geometry.field import choose_iso_rule
@@ -13,8 +15,6 @@ from clrecon.mesh.iso_distance import distances_to_iso_surface
 from clrecon.operators.isosurface import extract_isosurface
 from clrecon.operators.labels import extract_labels
 from clrecon.reference.isosurface import extract_isosurface as extract_twin
-from tests import tolerances
-from tests.dicom_series import rotation
 
 GAPS = (1.0,) * 9 + (0.4,) * 3 + (1.9,) * 8 + (1.0,) * 4
 TURN = rotation((15.0, -25.0, 40.0))

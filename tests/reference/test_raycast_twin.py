@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import tolerances
+from raycast_scenes import STEPS, centre_of, even_volume, look, uneven_volume
 from scipy.ndimage import map_coordinates
 
 from clrecon.errors import UsageError
@@ -14,8 +16,6 @@ from clrecon.geometry.field import slice_normal_matrices
 from clrecon.reference.raycast import TABLE_NODES, cast_rays, look_up, shade
 from clrecon.reference.rays import box_of, find_interval, hash_pixels, jitter_pixels, sample_field, voxel_gradients
 from clrecon.rendering import Lighting, TransferFunction
-from tests import tolerances
-from tests.operators.raycast_scenes import STEPS, centre_of, even_volume, look, uneven_volume
 
 SLOPE = np.array([3.0, -2.0, 5.0])
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import tolerances
+from picture_files import PARALLEL, PERSPECTIVE, make_picture
 
 from clrecon.errors import UsageError
 from clrecon.geometry import Volume
@@ -15,8 +17,6 @@ from clrecon.rendering.annotations import (
     edge_letters,
     orientation_letters,
 )
-from tests import tolerances
-from tests.rendering.picture_files import PARALLEL, PERSPECTIVE, make_picture
 
 BLACK, WHITE, CLEAR = (0, 0, 0, 255), (255, 255, 255, 255), (0, 0, 0, 0)
 

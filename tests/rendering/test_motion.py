@@ -6,13 +6,13 @@ import subprocess
 
 import numpy as np
 import pytest
+import tolerances
+from picture_files import PARALLEL, make_picture
 from PIL import Image
 
 from clrecon.errors import OutputError, UsageError
 from clrecon.rendering import motion, video
 from clrecon.rendering.motion import check_animation, stage_animation, turntable_cameras, write_animation
-from tests import tolerances
-from tests.rendering.picture_files import PARALLEL, make_picture
 
 
 @pytest.fixture

@@ -7,13 +7,13 @@ import sys
 
 import numpy as np
 import pytest
+import tolerances
+from picture_files import PARALLEL, PERSPECTIVE, make_picture
 from PIL import Image
 
 from clrecon.errors import OutputError, UsageError
 from clrecon.rendering import image_files
 from clrecon.rendering.colors import COLORS, find_color
-from tests import tolerances
-from tests.rendering.picture_files import PARALLEL, PERSPECTIVE, make_picture
 
 CLEAR = (10, 20, 30, 0)
 

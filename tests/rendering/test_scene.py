@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import tolerances
 
 from clrecon.errors import UsageError
 from clrecon.geometry.camera import Camera
 from clrecon.rendering import Rendering
 from clrecon.rendering.layers import merge_layers
-from tests import tolerances
 
 WIDTH, HEIGHT = 14, 9
 CAMERAS = [

@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+import tolerances
 from bench_harness import FOLDER
 
 from clrecon.errors import UsageError
-from tests import tolerances
 
 import bench  # isort: skip
 import floors  # isort: skip

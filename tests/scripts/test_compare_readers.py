@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 import json
-import sys
 from pathlib import Path
 
+import compare_readers
 import numpy as np
 import pytest
+from trap_cases import Marks
 
 ROOT = Path(__file__).resolve().parents[2]
-sys.path.insert(0, str(ROOT / "scripts"))
-
-import compare_readers  # noqa: E402
-from trap_cases import Marks  # noqa: E402
 
 TRUTH = Marks(np.array([1, 2, 3, 4]), np.array([[0.0, 0, 0], [1, 0, 0], [0, 0, 2], [1, 0, 2]]), 2)
 

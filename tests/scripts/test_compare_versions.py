@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
 import pytest
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "scripts"))
-
-from compare_versions import _compare_folders, _still, differing_names  # noqa: E402
+from compare_versions import _compare_folders, _still, differing_names
 
 
 def test_a_value_that_changed_is_named() -> None:

@@ -7,12 +7,12 @@ import sys
 
 import numpy as np
 import pytest
+import tolerances
 
 from clrecon.errors import UsageError
 from clrecon.geometry.camera import Camera
 from clrecon.rendering import Rendering
 from clrecon.viewer import add_rendering, merge_scene
-from tests import tolerances
 
 pyvista = pytest.importorskip("pyvista")
 

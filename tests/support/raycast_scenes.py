@@ -10,13 +10,13 @@ from typing import Any
 import conftest
 import numpy as np
 import pytest
+from dicom_series import rotation
 
 from clrecon.geometry import Volume
 from clrecon.geometry.camera import Camera
 from clrecon.reference.raycast import cast_rays
 from clrecon.reference.surface_rays import cast_surface
 from clrecon.rendering import UNSHADED, Lighting, TransferFunction
-from tests.dicom_series import rotation
 
 TURN = rotation((15.0, -25.0, 40.0))
 PLACE = np.array([40.0, -90.0, -600.0])

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 from typing import Any
 
 FOLDER = Path(__file__).resolve().parents[2] / "scripts" / "bench"
-sys.path.insert(0, str(FOLDER))
 
 POCL = {
     "platform": "Portable Computing Language",

@@ -155,7 +155,7 @@ def find_layer_faults(source: str, module: str, is_package: bool = False) -> lis
     """Imports in `source` that the table does not allow, one line each."""
     own = layer_of(module)
     if own not in LEFT_OF:
-        return [f"{module}: layer {own!r} is not in the table of tests/guards/house.py"]
+        return [f"{module}: layer {own!r} is not in the table of tests/support/house.py"]
     faults = []
     for name, deferred, line in walk_imports(ast.parse(source), module, is_package):
         top = name.split(".")[0]

@@ -6,10 +6,10 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
+from dicom_series import rotation
 
 from clrecon.geometry import Volume
 from clrecon.geometry.camera import Camera
-from tests.dicom_series import rotation
 
 TURN = rotation((15.0, -25.0, 40.0))
 PLACE = np.array([40.0, -90.0, -600.0])

@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from guards.house import ROOT
+from house import ROOT
 
 from clrecon.errors import ClreconError, RefusedInputError, UsageError
 from clrecon.files import open_regular, read_regular

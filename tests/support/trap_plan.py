@@ -98,7 +98,7 @@ class Case:
     again : mapping or None
         Options of `read_volume` that make a refused series readable: then exact, with `again_words` in the warnings.
     bound : {"written", "rounded", "far", "jitter"}
-        Which tolerance of tests/tolerances.py holds for the positions.
+        Which tolerance of tests/support/tolerances.py holds for the positions.
     looks_right : bool
         Each slice has its place, and yet it is not the volume that it seems: a table of its own.
     harmless : bool

@@ -1,0 +1,35 @@
+"""Volumes that surfaces are found in, and what a sound surface is."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from clrecon.geometry import Volume
+
+OBLIQUE = np.array([[0.7, 0.1, 0.05, -250.0], [-0.1, 0.5, 0.2, -300.0], [0.0, 0.05, 2.5, -846.0], [0, 0, 0, 1.0]])
+
+MIRRORED = OBLIQUE @ np.diag((-1.0, 1.0, 1.0, 1.0))
+
+SHAPES = [(5, 7, 9), (4, 4, 30), (3, 5, 31), (3, 5, 32), (4, 3, 33), (2, 3, 63), (3, 2, 64), (2, 4, 65), (3, 3, 100),
+          (2, 3, 1023), (2, 2, 1024), (2, 3, 1030), (3, 2, 2100)]  # fmt: skip
+"""(nk, nj, ni) on both sides of a mask word (32 samples) and of a word of flags (1024 samples)."""
+
+
+def random_volume(shape, dtype="int16", high=6, affine=OBLIQUE, seed=0) -> Volume:
+    return Volume(np.random.default_rng(seed).integers(0, high, shape).astype(dtype), affine)
+
+
+def smooth_volume(shape=(23, 27, 45), affine=OBLIQUE, seed=1) -> Volume:
+    from scipy.ndimage import gaussian_filter
+
+    field = gaussian_filter(np.random.default_rng(seed).normal(size=shape), 2.0)
+    return Volume((field / field.std() * 300).astype(np.int16), affine)
+
+
+def assert_sound(mesh) -> None:
+    """Closed, manifold, outward, no zero-area face, every vertex used."""
+    quality = mesh.quality()
+    assert quality["closed"] and quality["manifold"]
+    assert quality["volume_ml"] > 0.0
+    assert quality["zero_area_faces"] == 0
+    assert quality["unused_vertices"] == 0
