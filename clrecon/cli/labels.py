@@ -3,9 +3,14 @@
 from __future__ import annotations
 
 import argparse
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-__all__ = ["add_label_arguments", "describe_labels"]
+from clrecon.errors import UsageError
+
+if TYPE_CHECKING:
+    from clrecon.pipeline.labels import LabelChoice
+
+__all__ = ["add_label_arguments", "describe_labels", "label_choice"]
 
 
 def add_label_arguments(parser: argparse.ArgumentParser) -> None:
@@ -30,6 +35,31 @@ def add_label_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="MM",
         help="dense voxels this near to a label are its own (default: one voxel each way)",
     )
+
+
+def label_choice(options: argparse.Namespace) -> LabelChoice | None:
+    """What the options above ask for, None where there is no label map.
+
+    Raises
+    ------
+    UsageError
+        An option that means something with a label map only.
+    """
+    if options.labels is not None:
+        from clrecon.pipeline.labels import LabelChoice
+
+        surface = "hu" if options.surface is None else options.surface.lower()
+        return LabelChoice(options.labels, tuple(options.label or ()), options.grow, options.solid, surface)
+    given = {
+        "--label": options.label,
+        "--solid": options.solid,
+        "--grow": options.grow is not None,
+        "--surface": options.surface,
+    }
+    for option, value in given.items():
+        if value:
+            raise UsageError(f"{option} says how labels become meshes: give their file with --labels FILE")
+    return None
 
 
 def describe_labels(meshes: list[dict[str, Any]]) -> list[str]:

@@ -7,7 +7,7 @@ from typing import Any
 
 from clrecon.cli.common import add_device, add_memory, megabytes
 from clrecon.cli.console import Console, printable
-from clrecon.cli.labels import add_label_arguments, describe_labels
+from clrecon.cli.labels import add_label_arguments, describe_labels, label_choice
 from clrecon.cli.levels import LEVELS_HELP, parse_hu, parse_levels
 from clrecon.cli.masking import add_masking, masking_settings
 from clrecon.cli.points import parse_point
@@ -131,7 +131,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace, console: Console) -> int:
     """Run the command; returns the exit code."""
-    from clrecon.pipeline.labels import choose_labels
     from clrecon.pipeline.mesh import make_mesh
     from clrecon.pipeline.purposes import settings_for
     from clrecon.pipeline.settings import MeshSettings
@@ -150,7 +149,7 @@ def run(options: argparse.Namespace, console: Console) -> int:
         min_volume_ml=options.min_volume,
         seeds=options.seed,
         split=options.split,
-        labels=choose_labels(options.labels, options.label, options.grow, options.solid, options.surface),
+        labels=label_choice(options),
         device=options.device,
         memory=options.memory,
         **masking_settings(options),

@@ -6,7 +6,7 @@ import argparse
 from typing import Any
 
 from clrecon.cli.console import Console
-from clrecon.pipeline.purposes import PURPOSES
+from clrecon.pipeline.purposes import PURPOSES, Purpose
 
 __all__ = [
     "GATE_FAILED",
@@ -67,7 +67,7 @@ def add_purpose(parser: argparse._ActionsContainer) -> None:
         dest="purpose",
         metavar="PURPOSE",
         help="what the mesh is for, with the settings that this takes (others given beside it win); "
-        + "; ".join(f"{purpose.name}: {purpose.description}".replace("%", "%%") for purpose in PURPOSES.values()),
+        + "; ".join(map(_describe_purpose, PURPOSES.values())),
     )
 
 
@@ -110,6 +110,15 @@ def _describe_decimation(found: dict[str, Any]) -> str:
         return f"{reached:.1f} % of the triangles taken away, as asked"
     bound = f"the bound of {found['max_deviation_mm']:.3g} mm"
     return f"{reached:.1f} % of the triangles taken away of {asked:g} % asked for: {bound} ended it"
+
+
+def _describe_purpose(purpose: Purpose) -> str:
+    """A purpose with the options that it stands for, as help of an option."""
+    options = [
+        f"--{field.replace('_', '-')}" + ("" if value is True else f" {value}")
+        for field, value in purpose.settings.items()
+    ]
+    return f"{purpose.name}: {' '.join(options)}: {purpose.description}".replace("%", "%%")
 
 
 def describe_purposes(meshes: list[dict[str, Any]]) -> list[str]:

@@ -24,6 +24,7 @@ from clrecon.dicom.slice_header import SliceHeader
 from clrecon.dicom.values import ValueProblem
 from clrecon.errors import RefusedInputError
 from clrecon.files import open_regular
+from clrecon.wording import name_parameter
 
 __all__ = ["check_surplus"]
 
@@ -37,7 +38,6 @@ MOST_PADDING_BYTES = 64 * 2**20
 MOST_ELEMENTS = 10_000
 SHEARED = 0.98
 """Rows are so much more alike with another count of columns.  Noise alone makes no difference."""
-LEAVE_OUT = "--force, force=True in Python, leaves the rest out"
 _CHUNK = 2**20
 
 
@@ -118,7 +118,7 @@ def _judge_excess(file: BinaryIO, header: SliceHeader, expected: int, found: int
         counts += ": more pixels than the header says"
     if force:
         return f"{counts}; the rest was left out on demand"
-    raise ValueProblem(f"{counts} ({LEAVE_OUT})")
+    raise ValueProblem(f"{counts} ({name_parameter('force', True)} leaves the rest out)")
 
 
 def _is_zero(file: BinaryIO, place: int, count: int) -> bool:
@@ -163,7 +163,7 @@ def _judge_tail(file: BinaryIO, elements: DicomElements, end: int, size: int, fo
     if _is_zero(file, end, size - end):
         counts = f"{size - end} zero bytes behind the pixel data"
         if not force:
-            raise CorruptFileError(f"{counts} ({LEAVE_OUT})")
+            raise CorruptFileError(f"{counts} ({name_parameter('force', True)} leaves the rest out)")
         return [f"{counts}: left out on demand"]
     try:
         _check_tail(file, end, size, implicit=not elements.pixel_vr, little_endian=elements.little_endian)

@@ -22,6 +22,7 @@ from clrecon.geometry import AIR_HU
 from clrecon.geometry.affine import column_spacing, tilt_degrees
 from clrecon.geometry.memory import allocate_voxels
 from clrecon.progress import Progress
+from clrecon.wording import name_parameter
 
 __all__ = ["GridValues", "read_values"]
 
@@ -172,7 +173,7 @@ def _doubts(voxels: NDArray[Any], low: float, high: float) -> list[str]:
         if np.count_nonzero(seen) <= MOST_LABELS:
             return [
                 f"{span} in {np.count_nonzero(seen)} different whole numbers: this looks like a label map (those go"
-                " with --labels) or an 8-bit image, not like HU"
+                f" with {name_parameter('labels')}) or an 8-bit image, not like HU"
             ]
     if high - low < LEAST_SPAN:
         return [f"{span}: normalised, not HU"]

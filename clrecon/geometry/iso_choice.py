@@ -31,6 +31,7 @@ from numpy.typing import NDArray
 from clrecon.errors import NoSurfaceError, UsageError
 from clrecon.geometry.bone_edges import Background, BoneEdges, leave_contrast_medium, measure_edges
 from clrecon.geometry.volume import AIR_HU, Volume
+from clrecon.wording import name_parameter
 
 __all__ = ["CONTRAST_SAID", "IsoChoice", "choose_iso_value", "half_iso_value"]
 
@@ -65,7 +66,10 @@ CONTRAST_SAID = 0.05
 FEWEST_EDGES = 64
 LEAST_CONTRAST_SIGMAS = 6.0
 
-_WAY_OUT = "give the iso value (--hu N) or the two materials (--hu half:BONE,TISSUE)"
+
+def _describe_way_out() -> str:
+    two = name_parameter("half_way", "(BONE, TISSUE)")
+    return f"give the iso value ({name_parameter('iso_value', 'N')}) or the two materials ({two})"
 
 
 @dataclass(frozen=True)
@@ -220,7 +224,7 @@ def _no_bone(background: Background, edges: BoneEdges, histogram: Float64Array, 
     return (
         f"no bone found to choose the iso value by: {background.name} has its mode at {background.mode:.0f} HU with a "
         f"noise of {background.noise:.0f} HU, {above:.2%} of the voxels of {slices} slices lie above "
-        f"{background.seed} HU and {len(edges.bone)} edges of bone rise from it; {_WAY_OUT}"
+        f"{background.seed} HU and {len(edges.bone)} edges of bone rise from it; {_describe_way_out()}"
     )
 
 
@@ -290,11 +294,13 @@ def _find_background(histogram: Float64Array) -> Background:
         return Background("air", mode, noise, SPECIMEN_SEED_HU, -math.inf, mode + max(50.0, 2.0 * noise))
     total = histogram.sum()
     if not total:
-        raise NoSurfaceError(f"nothing but padding (up to {AIR_HU} HU) to choose the iso value by; {_WAY_OUT}")
+        raise NoSurfaceError(
+            f"nothing but padding (up to {AIR_HU} HU) to choose the iso value by; {_describe_way_out()}"
+        )
     raise NoSurfaceError(
         f"no two materials to choose the iso value by: no mode between {FAT_HU[0]} and {SOFT_TISSUE_HU[1]} HU "
         f"(soft tissue) nor below {AIR_MODE_HU} HU (air), most voxels are near "
-        f"{int(np.argmax(smooth)) + LOWEST_HU} HU; {_WAY_OUT}"
+        f"{int(np.argmax(smooth)) + LOWEST_HU} HU; {_describe_way_out()}"
     )
 
 

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from clrecon.errors import NoSurfaceError, RefusedInputError
 from clrecon.geometry.body import MARGIN_MM, TISSUE_HU, find_body, find_unmeasured
 from clrecon.geometry.volume import AIR_HU, Volume
+from clrecon.wording import name_parameter
 
 __all__ = ["leave_outside_air"]
 
@@ -57,7 +58,8 @@ def leave_outside_air(volume: Volume, levels: Sequence[float]) -> Volume:
     try:
         body, step = find_body(volume)
     except RefusedInputError as error:
-        raise RefusedInputError(f"{error}: what is outside of it is not known (--keep-outside takes all)") from None
+        way_out = f"{name_parameter('keep_outside', True)} takes all"
+        raise RefusedInputError(f"{error}: what is outside of it is not known ({way_out})") from None
     body = _close_along_k(body, int(OPEN_MM / (2.0 * step[2] * volume.spacing[2])))
     across = math.sqrt(step[0] * volume.spacing[0] * step[1] * volume.spacing[1])
     unmeasured = find_unmeasured(volume.voxels)
@@ -81,7 +83,7 @@ def leave_outside_air(volume: Volume, levels: Sequence[float]) -> Volume:
     if kept_ml == 0.0:
         raise NoSurfaceError(
             f"nothing below {max(levels):g} HU lies within the body: {left_out_ml:,.1f} ml are outside of it"
-            " (--keep-outside takes them)"
+            f" ({name_parameter('keep_outside', True)} takes them)"
         )
     changed = volume.with_voxels(voxels)
     changed.report["outside_air"] = {

@@ -11,6 +11,7 @@ from clrecon.pipeline.levels import warn_of_contrast
 from clrecon.pipeline.parts import Bones, Part, Surface
 from clrecon.pipeline.presets import LOWEST_BONE_HU
 from clrecon.pipeline.settings import MeshSettings
+from clrecon.wording import name_parameter
 
 if TYPE_CHECKING:
     import numpy as np
@@ -37,7 +38,7 @@ def find_bone(
     labelled: Labelled,
     *,
     without_table: bool = False,
-    advice: str = "--keep-largest N keeps by size",
+    advice: str,
 ) -> NDArray[np.bool_]:
     """Which components look like bone or, where none does, which one holds the spinal canal.
 
@@ -72,7 +73,8 @@ def find_bone(
     bone = like_bone & ~rails
     if bone.any():
         if rails.any():
-            touching = "; table that touches bone is one component with it, --remove-table takes it away first"
+            away = name_parameter("remove_table", True)
+            touching = f"; table that touches bone is one component with it, {away} takes it away first"
             mesh.report.setdefault("warnings", []).append(
                 f"at {surface.describe()} {_describe_rails(int(rails.sum()))}: left out"
                 + ("" if without_table else touching)
@@ -240,7 +242,8 @@ def _warn_of_pieces(parts: Sequence[Part]) -> list[str]:
     more = f" and {len(names) - NAMES_SHOWN} more" if len(names) > NAMES_SHOWN else ""
     shown = ", ".join(names[:NAMES_SHOWN])
     return [
-        f"not bone but contrast medium or another even body by their walls: {shown}{more} (--keep bone leaves it out)"
+        f"not bone but contrast medium or another even body by their walls: {shown}{more}"
+        f" ({name_parameter('keep', 'bone')} leaves it out)"
     ]
 
 
@@ -252,14 +255,16 @@ def _warn_of_whole(part: Part, settings: MeshSettings) -> list[str]:
     if not looks_like_bone(judged):
         if settings.seeds or not (settings.keep_largest is not None or _means_bone(settings)):
             return []
-        return [f"{where} {_looks(judged)}; --keep bone keeps what looks like bone"]
+        return [f"{where} {_looks(judged)}; {name_parameter('keep', 'bone')} keeps what looks like bone"]
     if judged["contrast_share"] < CONTRAST_SHARE:
         return []
     joined = settings.keep == "bone"
     apart = "a higher iso value parts them"
     if not settings.remove_table:
-        apart += "; where it is a table that touches bone, --remove-table takes that away first"
-    advice = apart if joined else "--keep bone leaves out what touches no bone"
+        apart += (
+            f"; where it is a table that touches bone, {name_parameter('remove_table', True)} takes that away first"
+        )
+    advice = apart if joined else f"{name_parameter('keep', 'bone')} leaves out what touches no bone"
     return [
         f"{where} is in part like heart, vessels or organs with contrast medium (about"
         f" {100.0 * judged['contrast_share']:.0f} % is even beneath and far from compact bone): {advice}"

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from clrecon.errors import UsageError
 from clrecon.progress import Progress
+from clrecon.wording import name_parameter
 
 if TYPE_CHECKING:
     from clrecon.geometry import Volume
@@ -19,7 +20,7 @@ if TYPE_CHECKING:
     from clrecon.pipeline.settings import MeshSettings
 
 __all__ = [
-    "LabelChoice", "choose_labels", "describe_label", "extract_label_surfaces", "judge_label_volumes", "open_labels",
+    "LabelChoice", "describe_label", "extract_label_surfaces", "judge_label_volumes", "open_labels",
 ]  # fmt: skip
 
 NAMES_SHOWN = 5
@@ -64,30 +65,10 @@ class LabelChoice:
         if self.surface not in ("hu", "mask"):
             raise UsageError(f"labels have no surface {self.surface!r}: it is hu or mask")
         if self.surface == "mask" and (self.solid or self.grow_mm is not None):
-            raise UsageError("the surface of a mask is solid and does not grow: leave out --solid and --grow")
-
-
-def choose_labels(
-    path: str | None,
-    wanted: Sequence[str] | None = None,
-    grow_mm: float | None = None,
-    solid: bool = False,
-    surface: str | None = None,
-) -> LabelChoice | None:
-    """What the options of a command ask for, None where there is no label map.
-
-    Raises
-    ------
-    UsageError
-        An option that means something with a label map only.
-    """
-    if path is not None:
-        return LabelChoice(path, tuple(wanted or ()), grow_mm, solid, "hu" if surface is None else surface.lower())
-    options = {"--label": wanted, "--solid": solid, "--grow": grow_mm is not None, "--surface": surface}
-    for option, given in options.items():
-        if given:
-            raise UsageError(f"{option} says how labels become meshes: give their file with --labels FILE")
-    return None
+            raise UsageError(
+                f"the surface of a mask is solid and does not grow: leave out {name_parameter('solid')} and"
+                f" {name_parameter('grow_mm')}"
+            )
 
 
 def open_labels(choice: LabelChoice | None) -> LabelMap | None:
@@ -241,12 +222,14 @@ def _advise(too_small: bool, origin: dict[str, Any]) -> str:
         return f"{kept} of its {found} components were kept"
     if origin["surface"] == "mask":
         return "no level makes up for borders with other labels or what was done after it; the mask itself is kept"
+    level, mask = name_parameter("iso_value"), name_parameter("surface", "mask")
     if not too_small:
         return (
-            "dense voxels around the label were taken in; a higher --hu or a smaller --grow takes fewer, --surface mask"
-            " takes the label as it is"
+            f"dense voxels around the label were taken in; a higher {level} or a smaller {name_parameter('grow_mm')}"
+            f" takes fewer, {mask} takes the label as it is"
         )
     below = f"below {origin['iso_value_hu']:g} HU"
     if origin["solid"]:
-        return f"much of the label lies {below} up to its border; a lower --hu or --surface mask takes it in"
-    return f"what lies {below} is left out; --solid fills the marrow of bones, --surface mask takes organs and all else"
+        return f"much of the label lies {below} up to its border; a lower {level} or {mask} takes it in"
+    solid = name_parameter("solid", True)
+    return f"what lies {below} is left out; {solid} fills the marrow of bones, {mask} takes organs and all else"

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from clrecon.progress import Progress
+from clrecon.wording import name_parameter
 
 if TYPE_CHECKING:
     from clrecon.geometry import Volume
@@ -88,7 +89,7 @@ def leave_outside(volume: Volume, settings: MeshSettings, progress: Progress) ->
     facts = volume.report["outside_air"]
     warnings.append(
         f"air outside of the body was left out: {facts['left_out_ml']:,.0f} ml, {facts['kept_ml']:,.1f} ml within it"
-        " are kept (--keep-outside takes all)"
+        f" are kept ({name_parameter('keep_outside', True)} takes all)"
     )
     if facts["opening_mm2"] > 0.0:
         warnings.append(

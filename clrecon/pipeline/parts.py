@@ -10,6 +10,7 @@ from clrecon.errors import DeviceMemoryError, NoSurfaceError, UsageError
 from clrecon.pipeline.outputs import MOST_FILES
 from clrecon.pipeline.settings import MeshSettings, name_level
 from clrecon.progress import Progress
+from clrecon.wording import name_parameter
 
 if TYPE_CHECKING:
     from clrecon.geometry import Volume
@@ -238,8 +239,9 @@ def _select_parts(surface: Surface, mesh: Mesh, settings: MeshSettings, device: 
 def _advice(settings: MeshSettings) -> str:
     """What to do where nothing is bone."""
     if settings.purpose is None:
-        return "--keep-largest N keeps by size"
-    return f"--for {settings.purpose} keeps bone: --keep-largest 1 takes the largest component, whatever it is"
+        return f"{name_parameter('keep_largest', 'N')} keeps by size"
+    purpose, largest = name_parameter("purpose", settings.purpose), name_parameter("keep_largest", 1)
+    return f"{purpose} keeps bone: {largest} takes the largest component, whatever it is"
 
 
 def first_names(surfaces: Sequence[Surface], split: bool) -> list[str]:

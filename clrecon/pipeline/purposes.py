@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from clrecon.errors import UsageError
 from clrecon.pipeline.presets import HIGHEST_BONE_HU, LOWEST_BONE_HU
+from clrecon.wording import name_parameter
 
 if TYPE_CHECKING:
     import numpy as np
@@ -42,7 +43,7 @@ class Purpose:
     settings : dict
         Fields of `MeshSettings` that it sets where they are not given.
     description : str
-        One line, with the options that it stands for.
+        One line.
     """
 
     name: str
@@ -56,8 +57,7 @@ PURPOSES: dict[str, Purpose] = {
         Purpose(
             "print",
             {"keep": "bone", "keep_largest": 1, "smooth": 20, "decimate": 0.9, "strict": True},
-            "--keep bone --keep-largest 1 --smooth --decimate 0.9 --strict: one closed piece, of bone at iso values of"
-            " bone; size and thickness of walls are said",
+            "one closed piece, of bone at iso values of bone; size and thickness of walls are said",
         ),
     )
 }
@@ -100,7 +100,7 @@ def settings_for(name: str | None, given: dict[str, Any]) -> dict[str, Any]:
         return dict(given)
     fields = dict(find_purpose(name).settings)
     if not given.get("closed", True):
-        raise UsageError(f"a surface for {name} is closed: leave --open out")
+        raise UsageError(f"a surface for {name} is closed: leave {name_parameter('closed', False)} out")
     if any(given.get(other) for other in ("seeds", "min_volume_ml", "split", "labels")):
         del fields["keep_largest"]
     chosen = any(given.get(other) for other in ("keep_largest", "seeds", "min_volume_ml"))
@@ -183,20 +183,21 @@ def warn_of_print(facts: dict[str, Any]) -> list[str]:
     if wall["thin_share"] is not None and wall["thin_share"] > THIN_SHARE:
         warnings.append(
             f"{100 * wall['thin_share']:.0f} % of the surface has a wall below {wall['thin_mm']:g} mm, which can break"
-            " or be lost in a print: lower --hu, or print it larger"
+            f" or be lost in a print: lower {name_parameter('iso_value')}, or print it larger"
         )
     if facts["cavities"]:
         warnings.append(
             f"{facts['cavities']:,} closed cavities of {facts['cavities_ml']:.2g} ml together are in it: powder or"
-            " resin stays in them; --keep-largest 1 fills them"
+            f" resin stays in them; {name_parameter('keep_largest', 1)} fills them"
         )
     bone_told = left_out.get("not_bone") is not None
     other_ml = left_out["pieces_ml"] - (left_out["not_bone_ml"] if bone_told else 0.0)
     if other_ml > facts["pieces_ml"]:
-        table = "" if bone_told else " The piece of largest area can be a table (--remove-table);"
+        away, seed = name_parameter("remove_table", True), name_parameter("seeds", "X,Y,Z")
+        table = "" if bone_told else f" The piece of largest area can be a table ({away});"
         warnings.append(
             f"{'bone that' if bone_told else 'what'} was left out encloses {other_ml:.3g} ml, more than the"
-            f" {facts['pieces_ml']:.3g} ml that were kept: is it the right piece?{table} --seed X,Y,Z keeps the one at"
-            " a point"
+            f" {facts['pieces_ml']:.3g} ml that were kept: is it the right piece?{table} {seed} keeps the one at a"
+            " point"
         )
     return warnings

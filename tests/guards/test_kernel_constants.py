@@ -8,6 +8,7 @@ from importlib import import_module
 import pytest
 from house import PACKAGE, ROOT
 
+from clrecon.operators.label_masks import SAMPLES_PER_FLAGS
 from clrecon.operators.sheets import COMBINATIONS
 
 PAIRS = [
@@ -59,8 +60,16 @@ def test_combinations_have_the_numbers_of_the_kernel() -> None:
     assert numbers == list(range(len(COMBINATIONS)))
 
 
+def test_flags_of_strips_are_words_of_the_kernel() -> None:
+    text = (ROOT / "cl/labels/occupancy.cl").read_text(encoding="utf-8")
+    assert SAMPLES_PER_FLAGS == 32 * macro_value(text, "STRIP")
+
+
 def test_every_constant_that_names_a_kernel_file_is_compared() -> None:
-    known = {name for name, _, _ in PAIRS} | {"clrecon.operators.sheets.COMBINATIONS"}
+    known = {name for name, _, _ in PAIRS} | {
+        "clrecon.operators.sheets.COMBINATIONS",
+        "clrecon.operators.label_masks.SAMPLES_PER_FLAGS",
+    }
     found = {
         f"{'.'.join(path.relative_to(ROOT).with_suffix('').parts)}.{name}"
         for path in PACKAGE.rglob("*.py")

@@ -80,21 +80,13 @@ def test_every_parameter_that_the_library_names_has_an_option() -> None:
     assert {name for name in named if all(speak(name, None) == name for speak in speakers)} == set()
 
 
-LEFT = {
-    "clrecon/dicom/surplus.py", "clrecon/formats/values.py", "clrecon/geometry/iso_choice.py",
-    "clrecon/geometry/outside_air.py", "clrecon/pipeline/bone.py", "clrecon/pipeline/labels.py",
-    "clrecon/pipeline/masking.py", "clrecon/pipeline/purposes.py",
-}  # fmt: skip
-"""Files that still name options; the list gets shorter only."""
-
-
 def test_no_option_is_named_outside_of_the_command_line() -> None:
     found = {
         path.relative_to(ROOT).as_posix(): options
         for path in PACKAGE.rglob("*.py")
         if not path.is_relative_to(PACKAGE / "cli") and (options := find_options(path.read_text(encoding="utf-8")))
     }
-    assert set(found) == LEFT
+    assert found == {}
 
 
 def test_a_named_option_and_a_named_parameter_are_found() -> None:
