@@ -255,7 +255,7 @@ def test_what_has_no_two_materials_is_refused(name) -> None:
     field, words = REFUSED[name]
     with pytest.raises(NoSurfaceError, match=words) as caught:
         choose_iso_value(as_volume(field))
-    assert "--hu N" in str(caught.value) and "\n" not in str(caught.value)
+    assert "iso_value=N" in str(caught.value) and "\n" not in str(caught.value)
 
 
 def test_nan_is_refused() -> None:

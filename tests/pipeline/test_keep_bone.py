@@ -51,7 +51,7 @@ def test_a_heart_is_never_kept_in_silence(level: Any, read: Any, device: Any, tm
     assert largest["walls"]["looks_like"] == "contrast medium"
     assert largest["volume_ml"] == pytest.approx(HEART_ML, rel=0.15)
     (said,) = [text for text in largest["warnings"] if "what is kept looks like contrast medium" in text]
-    assert "reach 600 at 0.0 %; --keep bone" in said
+    assert "reach 600 at 0.0 %; keep='bone'" in said
     bone = run(tmp_path, device, keep="bone", keep_largest=1, **level)
     assert bone["walls"]["looks_like"] == "bone"
     assert BONE_ML < bone["volume_ml"] < 0.6 * HEART_ML  # 200 HU lies outside of half way

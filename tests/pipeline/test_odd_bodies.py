@@ -278,7 +278,7 @@ def test_a_print_is_of_bone_and_says_what_is_none(odd: OddBodies, device: Any, t
 def test_a_print_of_what_is_no_bone_is_refused_and_says_how_to_have_it(
     odd: OddBodies, device: Any, tmp_path: Path
 ) -> None:
-    with pytest.raises(NoSurfaceError, match=r"--for print keeps bone: --keep-largest 1 takes the largest"):
+    with pytest.raises(NoSurfaceError, match=r"purpose='print' keeps bone: keep_largest=1 takes the largest"):
         mesh_of(odd, device, tmp_path, "empty", **settings_for("print", {}))
     given = settings_for("print", {"keep_largest": 1, "smooth": 5, "decimate": 0.3})
     report, _ = mesh_of(odd, device, tmp_path, "empty", **given)

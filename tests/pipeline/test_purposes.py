@@ -60,7 +60,7 @@ def test_bone_is_kept_where_the_level_is_that_of_bone_and_nothing_else_is_chosen
 def test_impossible_purposes() -> None:
     with pytest.raises(UsageError, match="can be for print, not for 'fun'"):
         settings_for("fun", {})
-    with pytest.raises(UsageError, match="leave --open out"):
+    with pytest.raises(UsageError, match="leave closed=False out"):
         settings_for("print", {"closed": False})
     with pytest.raises(UsageError, match="not for 'fun'"):
         MeshSettings(purpose="fun")

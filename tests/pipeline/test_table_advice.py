@@ -25,11 +25,11 @@ def test_rails_that_are_left_out_say_so(without_table):
     report = {**choose_iso_rule(volume, 300.0).as_report(), "iso_level_hu": 299.5}
     mesh = Mesh(vertices, triangles, normals.astype(np.float32), report)
     labelled = label_components(mesh.triangles, mesh.vertex_count)
-    bone = find_bone(mesh, volume, Surface(300.0, ""), labelled, without_table=without_table)
+    bone = find_bone(mesh, volume, Surface(300.0, ""), labelled, without_table=without_table, advice="")
     assert bone.sum() == 1 and len(bone) == 2
     (said,) = mesh.report["warnings"]
     assert "1 component is as dense as bone but the same in all slices" in said and ": left out" in said
-    assert ("--remove-table" in said) != without_table
+    assert ("remove_table=True" in said) != without_table
 
 
 @pytest.mark.parametrize("remove_table", [False, True])
@@ -39,4 +39,4 @@ def test_what_is_even_beneath_may_be_a_table(remove_table):
     part.facts["walls"] = walls
     (said,) = warn_of_walls([part], MeshSettings(keep="bone", remove_table=remove_table))
     assert "about 10 % is even beneath" in said and "a higher iso value parts them" in said
-    assert ("--remove-table" in said) != remove_table
+    assert ("remove_table=True" in said) != remove_table
