@@ -9,13 +9,13 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from clrecon.dicom.text import escape_text
 from clrecon.errors import RefusedInputError, UsageError
+from clrecon.system.text import escape_text
 
 if TYPE_CHECKING:
     from clrecon.dicom.listing import SeriesListing
     from clrecon.geometry import Volume
-    from clrecon.progress import Progress
+    from clrecon.system.progress import Progress
 
 __all__ = ["list_series", "read_volume"]
 

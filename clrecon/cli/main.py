@@ -16,7 +16,7 @@ from clrecon.cli.common import EXIT_CODES, Parser, guard
 from clrecon.cli.console import Console
 from clrecon.cli.wording import speaker_of
 from clrecon.errors import UsageError
-from clrecon.wording import spoken_by
+from clrecon.system.wording import spoken_by
 
 __all__ = ["main", "run"]
 

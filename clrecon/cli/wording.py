@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from clrecon.wording import Speaker, in_python
+from clrecon.system.wording import Speaker, in_python
 
 __all__ = ["speaker_of"]
 

@@ -28,10 +28,10 @@ from clrecon.dicom.pixels import PixelFacts
 from clrecon.dicom.scan import Scan
 from clrecon.dicom.series import Series
 from clrecon.dicom.slice_header import SliceHeader
-from clrecon.dicom.text import hash_uid
 from clrecon.dicom.volume_gates import judge_series
 from clrecon.errors import RefusedInputError
 from clrecon.geometry import column_spacing
+from clrecon.system.text import hash_uid
 
 __all__ = ["certify", "collect_scan_warnings", "collect_series_warnings"]
 

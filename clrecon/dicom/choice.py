@@ -7,9 +7,9 @@ from collections import defaultdict
 from collections.abc import Sequence
 
 from clrecon.dicom.series import Series
-from clrecon.dicom.text import hash_uid, join_names
 from clrecon.errors import NoDicomError, RefusedInputError, UsageError
-from clrecon.wording import name_parameter
+from clrecon.system.text import hash_uid, join_names
+from clrecon.system.wording import name_parameter
 
 __all__ = ["choose_series", "describe_left"]
 

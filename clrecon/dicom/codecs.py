@@ -10,8 +10,8 @@ from __future__ import annotations
 
 import importlib.util
 
-from clrecon.dicom.text import escape_text
 from clrecon.errors import RefusedInputError
+from clrecon.system.text import escape_text
 
 __all__ = ["NATIVE_SYNTAXES", "SYNTAX_NAMES", "choose_decoder", "describe_undecodable", "is_encapsulated"]
 

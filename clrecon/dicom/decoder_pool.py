@@ -24,8 +24,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.dicom.decoder_process import DONE, FAILED, NO_DECODER, NO_MEMORY, READY, REPLY
-from clrecon.dicom.text import escape_text
 from clrecon.errors import RefusedInputError
+from clrecon.system.text import escape_text
 
 __all__ = ["DecoderError", "DecoderPool"]
 

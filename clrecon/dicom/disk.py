@@ -18,9 +18,9 @@ from time import perf_counter
 from typing import Any, TypeVar
 
 from clrecon.dicom.elements import FileStart, read_start
-from clrecon.dicom.text import escape_text
 from clrecon.errors import RefusedInputError
-from clrecon.progress import Progress
+from clrecon.system.progress import Progress
+from clrecon.system.text import escape_text
 
 __all__ = ["DiskReader", "Progress"]
 

@@ -17,7 +17,7 @@ from clrecon.dicom.careful import parse_carefully
 from clrecon.dicom.forced import Start, describe_way_out, find_program, restore_start
 from clrecon.dicom.plain import parse_plainly
 from clrecon.dicom.raw import META_START, CorruptFileError, DicomElements, NotDicomError
-from clrecon.files import open_regular
+from clrecon.system.files import open_regular
 
 __all__ = [
     "META_START",

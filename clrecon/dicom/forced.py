@@ -11,7 +11,7 @@ from __future__ import annotations
 import struct
 from typing import NamedTuple
 
-from clrecon.wording import name_parameter
+from clrecon.system.wording import name_parameter
 
 __all__ = ["Start", "describe_way_out", "find_program", "restore_start"]
 

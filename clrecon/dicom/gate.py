@@ -22,9 +22,9 @@ from clrecon.dicom.directions import ORIENTATION_EXACT, ORIENTATION_LIMIT, measu
 from clrecon.dicom.holes import Holes, find_holes
 from clrecon.dicom.numbers import median
 from clrecon.dicom.slice_header import SliceHeader
-from clrecon.dicom.text import join_names
 from clrecon.geometry import compose_affine, tilt_degrees
-from clrecon.wording import name_parameter
+from clrecon.system.text import join_names
+from clrecon.system.wording import name_parameter
 
 __all__ = ["Line", "Stack", "group_places", "measure_stack", "measure_stated_gap"]
 

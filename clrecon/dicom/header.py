@@ -18,8 +18,8 @@ from clrecon.dicom.phase_tags import SLICE_PHASES
 from clrecon.dicom.slice_header import OtherImage, SeriesIdentity, SliceHeader
 from clrecon.dicom.surplus import check_surplus
 from clrecon.dicom.terms import MODALITIES, OTHER_TERM, RESCALE_TYPES, name_term
-from clrecon.dicom.text import escape_text, hash_uid
 from clrecon.dicom.values import WANTED_TAGS, ValueProblem, Values
+from clrecon.system.text import escape_text, hash_uid
 
 __all__ = ["read_headers"]
 

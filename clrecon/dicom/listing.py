@@ -9,9 +9,9 @@ from typing import Any
 from clrecon.dicom.gate import Stack
 from clrecon.dicom.layout import measure_extent, median_thickness
 from clrecon.dicom.series import Series
-from clrecon.dicom.text import hash_uid
 from clrecon.errors import ClreconError, RefusedInputError
 from clrecon.geometry import column_spacing
+from clrecon.system.text import hash_uid
 
 __all__ = ["SeriesEntry", "SeriesListing", "describe_series"]
 

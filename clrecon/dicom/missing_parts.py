@@ -7,7 +7,7 @@ from collections.abc import Iterable
 
 from clrecon.dicom.concatenation import Concatenation
 from clrecon.dicom.slice_header import SliceHeader
-from clrecon.dicom.text import join_names
+from clrecon.system.text import join_names
 
 __all__ = ["describe_missing_parts"]
 

@@ -24,9 +24,9 @@ from clrecon.dicom.concatenation import CONCATENATION_TAGS, Concatenation, read_
 from clrecon.dicom.phase_tags import FRAME_PHASES
 from clrecon.dicom.raw import IMPLICIT_LITTLE, META_START, DicomElements
 from clrecon.dicom.sequences import Item, Schema, decode_number, name_tag, read_sequences
-from clrecon.dicom.text import escape_text
 from clrecon.dicom.values import ValueProblem, Values, decode_text
-from clrecon.files import open_regular
+from clrecon.system.files import open_regular
+from clrecon.system.text import escape_text
 
 __all__ = ["ENHANCED_CT", "Frame", "Groups", "find_data_set", "read_groups", "split_frames"]
 

@@ -21,9 +21,9 @@ from clrecon.dicom.phase_tags import PHASE_KEYWORDS
 from clrecon.dicom.pixels import read_voxels
 from clrecon.dicom.slice_header import SliceHeader
 from clrecon.dicom.stored import StoredPixels
-from clrecon.dicom.text import join_names
 from clrecon.errors import UsageError
-from clrecon.wording import name_parameter
+from clrecon.system.text import join_names
+from clrecon.system.wording import name_parameter
 
 __all__ = ["Phase", "Places", "choose_phase", "describe_phases", "have_same_pixels", "part_alternating", "sort_places"]
 

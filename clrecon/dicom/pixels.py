@@ -23,8 +23,8 @@ from clrecon.dicom.slice_header import SliceHeader
 from clrecon.dicom.stored import StoredPixels, count_readers
 from clrecon.dicom.stray_bits import StrayBits, describe_stray_bits, find_stray_bits
 from clrecon.errors import RefusedInputError
-from clrecon.geometry.memory import allocate_voxels
-from clrecon.progress import Progress
+from clrecon.system.memory import allocate_voxels
+from clrecon.system.progress import Progress
 
 __all__ = ["PixelFacts", "read_voxels"]
 

@@ -20,11 +20,11 @@ from clrecon.dicom.pixels import read_voxels
 from clrecon.dicom.plausibility import collect_voxel_warnings
 from clrecon.dicom.scan import BARE_DATA_SET, Scan, scan_path
 from clrecon.dicom.series import Series, group_series
-from clrecon.dicom.text import escape_text, join_names
 from clrecon.errors import NoDicomError, RefusedInputError, UsageError
 from clrecon.geometry import Volume
-from clrecon.progress import Progress
-from clrecon.wording import name_parameter
+from clrecon.system.progress import Progress
+from clrecon.system.text import escape_text, join_names
+from clrecon.system.wording import name_parameter
 
 __all__ = ["list_series", "read_volume"]
 

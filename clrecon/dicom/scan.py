@@ -20,9 +20,9 @@ from clrecon.dicom.forced import describe_way_out, restore_start
 from clrecon.dicom.header import read_headers
 from clrecon.dicom.remains import Stranger, describe_start, find_remains
 from clrecon.dicom.slice_header import OtherImage, SliceHeader
-from clrecon.dicom.text import escape_text
 from clrecon.errors import NoDicomError
-from clrecon.progress import Progress
+from clrecon.system.progress import Progress
+from clrecon.system.text import escape_text
 
 __all__ = ["CorruptFile", "Scan", "scan_path"]
 

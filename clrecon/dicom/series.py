@@ -25,8 +25,8 @@ from clrecon.dicom.planes import Planes
 from clrecon.dicom.scan import CorruptFile, Scan
 from clrecon.dicom.slice_header import OtherImage, SeriesIdentity, SliceHeader
 from clrecon.dicom.stored import StoredPixels
-from clrecon.dicom.text import hash_uid, join_names
 from clrecon.errors import RefusedInputError
+from clrecon.system.text import hash_uid, join_names
 
 __all__ = ["Series", "group_series"]
 

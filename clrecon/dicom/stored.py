@@ -25,7 +25,7 @@ from clrecon.dicom.encapsulated import Pieces, find_frames, read_pieces
 from clrecon.dicom.slice_header import SliceHeader
 from clrecon.dicom.surplus import INFLATED_LIMIT
 from clrecon.errors import RefusedInputError
-from clrecon.files import open_regular
+from clrecon.system.files import open_regular
 
 __all__ = ["StoredPixels"]
 

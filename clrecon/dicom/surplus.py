@@ -23,8 +23,8 @@ from clrecon.dicom.sequences import LONG_VRS, skip_sequence
 from clrecon.dicom.slice_header import SliceHeader
 from clrecon.dicom.values import ValueProblem
 from clrecon.errors import RefusedInputError
-from clrecon.files import open_regular
-from clrecon.wording import name_parameter
+from clrecon.system.files import open_regular
+from clrecon.system.wording import name_parameter
 
 __all__ = ["check_surplus"]
 

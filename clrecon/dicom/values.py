@@ -13,8 +13,8 @@ from functools import lru_cache
 from typing import Literal
 
 from clrecon.dicom.elements import DicomElements
-from clrecon.dicom.text import escape_text
 from clrecon.errors import RefusedInputError
+from clrecon.system.text import escape_text
 
 __all__ = ["WANTED_TAGS", "ValueProblem", "Values", "decode_text"]
 

@@ -1,4 +1,4 @@
-"""What a CT series must fulfil to be measured on: named gates, in the form of `clrecon.gates`.
+"""What a CT series must fulfil to be measured on: named gates, in the form of `clrecon.system.gates`.
 
 A gate is a fact that moves a surface in the patient or changes its level, and that a user of the mesh could not see.
 Everything else that is odd is a warning alone; docs/certificate.md says which is which, and why.
@@ -27,7 +27,7 @@ from clrecon.dicom.pixels import PixelFacts
 from clrecon.dicom.series import Series
 from clrecon.dicom.slice_header import SliceHeader
 from clrecon.errors import RefusedInputError
-from clrecon.gates import Gate, at_most, none_of, unmeasured
+from clrecon.system.gates import Gate, at_most, none_of, unmeasured
 
 __all__ = ["PADDING_SHARE", "judge_figures", "judge_series", "judge_steps", "list_odd_values"]
 
@@ -68,7 +68,7 @@ def judge_series(
     Returns
     -------
     list of dict
-        See `clrecon.gates.Gate`.  The texts hold no file names.
+        See `clrecon.system.gates.Gate`.  The texts hold no file names.
     """
     refused = len(series.problems)
     gates = [

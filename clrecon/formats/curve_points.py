@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from clrecon.errors import RefusedInputError, UsageError
-from clrecon.files import read_regular
 from clrecon.formats.stream import show_name
 from clrecon.geometry.affine import Float64Array
+from clrecon.system.files import read_regular
 
 __all__ = ["read_curve_points"]
 

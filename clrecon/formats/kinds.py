@@ -5,11 +5,11 @@ from __future__ import annotations
 import zlib
 from pathlib import Path
 
-from clrecon.files import open_regular
 from clrecon.formats.grid_file import GridFile, Purpose
 from clrecon.formats.metaimage import is_metaimage, open_metaimage
 from clrecon.formats.nifti import is_nifti, open_nifti
 from clrecon.formats.nrrd import is_nrrd, open_nrrd
+from clrecon.system.files import open_regular
 
 __all__ = ["open_grid", "tell_kind"]
 

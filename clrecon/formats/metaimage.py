@@ -19,13 +19,13 @@ from typing import Any
 
 import numpy as np
 
-from clrecon.dicom.text import escape_text
 from clrecon.errors import RefusedInputError, UsageError
-from clrecon.files import open_regular
 from clrecon.formats.extras import import_extra
 from clrecon.formats.grid_file import GridFile, Purpose
 from clrecon.formats.stream import VoxelBytes, file_beside, show_name
 from clrecon.geometry.affine import Float64Array, checked_affine
+from clrecon.system.files import open_regular
+from clrecon.system.text import escape_text
 
 __all__ = ["is_metaimage", "open_metaimage"]
 

@@ -17,14 +17,14 @@ from typing import Any, BinaryIO, cast
 
 import numpy as np
 
-from clrecon.dicom.text import escape_text
 from clrecon.errors import RefusedInputError, UsageError
-from clrecon.files import open_regular
 from clrecon.formats.extras import import_extra
 from clrecon.formats.grid_file import GridFile, Purpose
 from clrecon.formats.stream import VoxelBytes, file_beside, read_bytes, show_name
 from clrecon.geometry.affine import Float64Array, checked_affine
 from clrecon.geometry.frames import lps_affine_from_ras
+from clrecon.system.files import open_regular
+from clrecon.system.text import escape_text
 
 __all__ = ["is_nifti", "nifti_affine", "open_nifti"]
 

@@ -16,13 +16,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clrecon.dicom.text import escape_text
 from clrecon.errors import RefusedInputError, UsageError
-from clrecon.files import open_regular
 from clrecon.formats.extras import import_extra
 from clrecon.formats.grid_file import LABEL_MAP, GridFile, Purpose
 from clrecon.formats.stream import VoxelBytes, show_name
 from clrecon.geometry.affine import Float64Array, checked_affine, compose_affine
+from clrecon.system.files import open_regular
+from clrecon.system.text import escape_text
 
 __all__ = ["is_nrrd", "nrrd_affine", "open_nrrd"]
 

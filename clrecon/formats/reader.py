@@ -13,7 +13,7 @@ from clrecon.formats.kinds import open_grid
 from clrecon.formats.stream import show_name
 from clrecon.formats.values import GridValues, read_values
 from clrecon.geometry import Volume
-from clrecon.progress import Progress
+from clrecon.system.progress import Progress
 
 __all__ = ["list_grid", "read_grid"]
 

@@ -17,9 +17,9 @@ from math import prod
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Any, BinaryIO, cast
 
-from clrecon.dicom.text import escape_text
 from clrecon.errors import RefusedInputError
-from clrecon.files import open_regular
+from clrecon.system.files import open_regular
+from clrecon.system.text import escape_text
 
 __all__ = ["LARGEST_GRID", "VoxelBytes", "check_end", "check_size", "file_beside", "read_bytes", "show_name"]
 

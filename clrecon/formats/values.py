@@ -20,9 +20,9 @@ from clrecon.errors import RefusedInputError
 from clrecon.formats.grid_file import GridFile
 from clrecon.geometry import AIR_HU
 from clrecon.geometry.affine import column_spacing, tilt_degrees
-from clrecon.geometry.memory import allocate_voxels
-from clrecon.progress import Progress
-from clrecon.wording import name_parameter
+from clrecon.system.memory import allocate_voxels
+from clrecon.system.progress import Progress
+from clrecon.system.wording import name_parameter
 
 __all__ = ["GridValues", "read_values"]
 

@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 from clrecon.errors import NoSurfaceError, UsageError
 from clrecon.geometry.bone_edges import Background, BoneEdges, leave_contrast_medium, measure_edges
 from clrecon.geometry.volume import AIR_HU, Volume
-from clrecon.wording import name_parameter
+from clrecon.system.wording import name_parameter
 
 __all__ = ["CONTRAST_SAID", "IsoChoice", "choose_iso_value", "half_iso_value"]
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from clrecon.errors import NoSurfaceError, RefusedInputError
 from clrecon.geometry.body import MARGIN_MM, TISSUE_HU, find_body, find_unmeasured
 from clrecon.geometry.volume import AIR_HU, Volume
-from clrecon.wording import name_parameter
+from clrecon.system.wording import name_parameter
 
 __all__ = ["leave_outside_air"]
 

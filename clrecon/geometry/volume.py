@@ -12,8 +12,8 @@ from numpy.typing import ArrayLike, NDArray
 from clrecon.errors import UsageError
 from clrecon.geometry.affine import Float64Array, checked_affine, checked_points
 from clrecon.geometry.grid import Grid
-from clrecon.geometry.mapping import find_mapping
 from clrecon.geometry.stack import UnevenStack
+from clrecon.system.mapping import find_mapping
 
 __all__ = ["AIR_HU", "DEVICE_DTYPES", "Volume"]
 

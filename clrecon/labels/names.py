@@ -9,8 +9,8 @@ import re
 from collections import Counter
 from collections.abc import Collection, Mapping
 
-from clrecon.dicom.text import escape_text
 from clrecon.errors import UsageError
+from clrecon.system.text import escape_text
 
 __all__ = ["check_name", "file_suffixes", "find_number", "label_suffix", "list_labels"]
 

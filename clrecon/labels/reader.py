@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from clrecon.dicom.text import escape_text
 from clrecon.errors import RefusedInputError, UsageError
 from clrecon.formats.grid_file import LABEL_MAP
 from clrecon.formats.kinds import open_grid, tell_kind
@@ -14,6 +13,7 @@ from clrecon.labels.grids import read_grid_labels
 from clrecon.labels.label_map import LabelMap
 from clrecon.labels.overlap import check_wanted
 from clrecon.labels.segmentation import read_segmentation
+from clrecon.system.text import escape_text
 
 __all__ = ["read_labels"]
 

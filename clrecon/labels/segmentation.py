@@ -17,15 +17,15 @@ from numpy.typing import NDArray
 
 from clrecon.dicom.multiframe import find_data_set
 from clrecon.dicom.sequences import Schema, read_sequences
-from clrecon.dicom.text import escape_text, hash_uid
 from clrecon.dicom.values import ValueProblem
 from clrecon.errors import ClreconError, RefusedInputError
-from clrecon.files import open_regular
 from clrecon.formats.stream import check_size, show_name
 from clrecon.labels.frames import FrameStack, place_frames
 from clrecon.labels.label_map import LabelMap
 from clrecon.labels.overlap import Painter
 from clrecon.labels.stream import empty_labels
+from clrecon.system.files import open_regular
+from clrecon.system.text import escape_text, hash_uid
 
 __all__ = ["read_segmentation"]
 

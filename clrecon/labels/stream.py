@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from clrecon.errors import RefusedInputError
 from clrecon.formats.grid_file import GridFile
-from clrecon.geometry.memory import physical_memory_bytes
 from clrecon.labels.label_map import LARGEST_NUMBER
+from clrecon.system.memory import physical_memory_bytes
 
 __all__ = ["empty_labels", "iterate_labels"]
 

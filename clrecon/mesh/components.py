@@ -15,8 +15,8 @@ from clrecon.mesh.coordinates import rounding_step
 from clrecon.mesh.measures import cross_products
 from clrecon.mesh.mesh import Mesh
 from clrecon.mesh.nearest import find_nearest_triangle
-from clrecon.pieces import CHUNK, local_origin
-from clrecon.wording import name_parameter
+from clrecon.system.pieces import CHUNK, local_origin
+from clrecon.system.wording import name_parameter
 
 __all__ = ["Labelled", "select_components", "split_components"]
 

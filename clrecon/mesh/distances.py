@@ -12,7 +12,7 @@ from clrecon.errors import NoSurfaceError, UsageError
 from clrecon.mesh.connectivity import order_by_number
 from clrecon.mesh.measures import cross_product, cross_products
 from clrecon.mesh.mesh import Mesh
-from clrecon.pieces import chunks, local_origin
+from clrecon.system.pieces import chunks, local_origin
 
 __all__ = [
     "SAMPLES",

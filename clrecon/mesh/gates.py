@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Any
 
-from clrecon.gates import Gate, at_most, failed_gates, is_true, none_of, unmeasured
+from clrecon.system.gates import Gate, at_most, failed_gates, is_true, none_of, unmeasured
 
 __all__ = [
     "DEVIATION_MEAN_VOXEL", "DEVIATION_P95_VOXEL", "LABEL_VOLUME_PERCENT", "MASK_VOLUME_PERCENT",

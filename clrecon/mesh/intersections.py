@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from clrecon.pieces import chunks, local_origin
+from clrecon.system.pieces import chunks, local_origin
 
 __all__ = ["count_self_intersections", "find_beside", "find_self_intersections"]
 

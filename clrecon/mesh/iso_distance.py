@@ -11,7 +11,7 @@ from clrecon.geometry import Volume
 from clrecon.geometry.field import IsoRule, layer_normal_matrices
 from clrecon.mesh.distances import summarise_distances
 from clrecon.mesh.mesh import Mesh
-from clrecon.pieces import chunks
+from clrecon.system.pieces import chunks
 
 __all__ = [
     "SAMPLES",

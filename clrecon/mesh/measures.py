@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from clrecon.pieces import CHUNK, chunks, local_origin
+from clrecon.system.pieces import CHUNK, chunks, local_origin
 
 __all__ = ["corner_edges", "cross_product", "cross_products", "enclosed_ml"]
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.mesh.coordinates import rounding_step
-from clrecon.pieces import chunks
+from clrecon.system.pieces import chunks
 
 __all__ = ["find_nearest_triangle"]
 

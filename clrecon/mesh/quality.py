@@ -18,7 +18,7 @@ from clrecon.mesh.connectivity import (
 )
 from clrecon.mesh.coordinates import find_coincident
 from clrecon.mesh.measures import corner_edges, cross_product
-from clrecon.pieces import local_origin
+from clrecon.system.pieces import local_origin
 
 __all__ = ["measure_quality"]
 

@@ -19,7 +19,7 @@ from clrecon.mesh.deviation import Deviation
 from clrecon.mesh.mesh import Mesh
 from clrecon.mesh.normals import vertex_normals
 from clrecon.mesh.shifts import measure_volumes, move_vertices, restore_volumes
-from clrecon.pieces import local_origin
+from clrecon.system.pieces import local_origin
 
 __all__ = ["BOUND_VOXEL", "carry_on", "check_refinement", "decimate_mesh", "default_deviation"]
 

@@ -16,7 +16,7 @@ from clrecon.mesh.mesh import Mesh
 from clrecon.mesh.normals import vertex_normals
 from clrecon.mesh.refinement import carry_on, check_refinement
 from clrecon.mesh.shifts import measure_volumes, move_vertices, restore_volumes, shorten_steps
-from clrecon.pieces import local_origin
+from clrecon.system.pieces import local_origin
 
 __all__ = ["smooth_mesh"]
 

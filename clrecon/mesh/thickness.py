@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.mesh.distances import sample_surface_points
-from clrecon.pieces import local_origin
+from clrecon.system.pieces import local_origin
 
 __all__ = ["SAMPLES", "measure_walls", "wall_thickness"]
 

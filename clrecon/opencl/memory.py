@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 from clrecon.errors import DeviceError, UsageError
 from clrecon.opencl.context import Device
-from clrecon.wording import name_parameter
+from clrecon.system.wording import name_parameter
 
 __all__ = ["MemoryLimits", "check_budget", "check_memory", "describe_shortage", "memory_limits"]
 

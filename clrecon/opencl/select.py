@@ -11,7 +11,7 @@ from typing import Any
 from clrecon.errors import DeviceError
 from clrecon.opencl import quirks
 from clrecon.opencl.context import Device, describe_error
-from clrecon.wording import name_parameter
+from clrecon.system.wording import name_parameter
 
 __all__ = ["choose_device", "driver_advice", "list_devices", "list_platforms"]
 

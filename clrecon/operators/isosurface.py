@@ -22,7 +22,7 @@ from clrecon.operators.bricks import BrickRanges, BrickStates, compare_bricks, m
 from clrecon.operators.marching_cubes import Counted, Placement
 from clrecon.operators.slabs import SampleGrid, Slab, plan_slabs
 from clrecon.operators.trilinear import check_row, prepare_trilinear
-from clrecon.progress import Progress
+from clrecon.system.progress import Progress
 
 __all__ = [
     "Part",

@@ -32,7 +32,7 @@ from clrecon.operators.labels import Window, choose_numbers
 from clrecon.operators.marching_cubes import Classified, Counted, Placement
 from clrecon.operators.slabs import SampleGrid
 from clrecon.operators.voxel_types import label_variants
-from clrecon.progress import Progress
+from clrecon.system.progress import Progress
 
 __all__ = ["extract_label_masks", "prepare_label_masks"]
 

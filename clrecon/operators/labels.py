@@ -29,7 +29,7 @@ from clrecon.operators.isosurface import Part, voxel_level
 from clrecon.operators.marching_cubes import Classified, Placement
 from clrecon.operators.slabs import SampleGrid, Slab
 from clrecon.operators.voxel_types import label_variants, voxel_variants
-from clrecon.progress import Progress
+from clrecon.system.progress import Progress
 
 __all__ = ["Window", "choose_numbers", "extract_labels", "prepare_labels"]
 

@@ -20,10 +20,10 @@ from clrecon.geometry.views import checked_size, find_up, find_view
 from clrecon.kernels import Stopwatch
 from clrecon.opencl import Device, check_memory, choose_device
 from clrecon.operators.sheets import Reformation, sample_sheet
-from clrecon.progress import Progress
 from clrecon.rendering import Rendering
 from clrecon.rendering.colors import is_transparent
 from clrecon.rendering.window import BONE_WINDOW, checked_window, grey_image
+from clrecon.system.progress import Progress
 
 __all__ = ["CURVED_KINDS", "cut_slice", "reformat_curve"]
 

@@ -15,7 +15,7 @@ from clrecon.geometry.sheets import Sheet, SlabSamples
 from clrecon.kernels import Program, Stopwatch, allocate, download, launch, load_program, upload
 from clrecon.opencl import Device, describe_shortage, memory_limits
 from clrecon.operators.voxel_types import voxel_variants
-from clrecon.progress import Progress
+from clrecon.system.progress import Progress
 
 __all__ = ["COMBINATIONS", "Reformation", "prepare_reformat", "sample_sheet"]
 

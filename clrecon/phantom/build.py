@@ -16,7 +16,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.errors import OutputError, UsageError
-from clrecon.files import read_regular
 from clrecon.geometry import column_spacing, tilt_degrees
 from clrecon.phantom.anatomy import Anatomy
 from clrecon.phantom.bodies import choose_body
@@ -27,7 +26,8 @@ from clrecon.phantom.scene_plans import plan_scene
 from clrecon.phantom.scenes import CEILING_HU, DENSE_HU, LabelArray, describe_parts, draw_scene
 from clrecon.phantom.settings import CENTRE_LPS_MM, KINDS, PhantomSettings, Placement, place_slices
 from clrecon.phantom.spine import draw_spine
-from clrecon.progress import Progress
+from clrecon.system.files import read_regular
+from clrecon.system.progress import Progress
 from clrecon.version import package_version
 
 __all__ = ["SPINE_ISO_HU", "TRUTH_NAME", "label_materials", "make_phantom", "write_phantom"]

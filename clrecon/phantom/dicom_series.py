@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from clrecon.errors import OutputError
 from clrecon.phantom.settings import PhantomSettings, Placement
-from clrecon.progress import Progress
+from clrecon.system.progress import Progress
 
 if TYPE_CHECKING:
     from pydicom.dataset import FileDataset

@@ -16,7 +16,7 @@ from clrecon.errors import UsageError
 from clrecon.geometry import apply_affine, column_spacing
 from clrecon.geometry.affine import checked_affine
 from clrecon.phantom.shapes import Body
-from clrecon.progress import Progress
+from clrecon.system.progress import Progress
 
 __all__ = ["add_noise", "apply_point_spread", "map_slices", "sample_distance", "sample_occupancy"]
 

@@ -17,7 +17,7 @@ from clrecon.geometry import column_spacing
 from clrecon.phantom.fields import Field, coverage
 from clrecon.phantom.placing import Piece, PlacedPiece, Window, paint
 from clrecon.phantom.settings import CENTRE_LPS_MM, PhantomSettings
-from clrecon.progress import Progress
+from clrecon.system.progress import Progress
 
 __all__ = ["AIR_HU", "CEILING_HU", "DENSE_HU", "MATERIALS", "Part", "Plan", "describe_parts", "draw_scene"]
 

@@ -21,7 +21,7 @@ from clrecon.phantom.settings import CENTRE_LPS_MM, PhantomSettings
 from clrecon.phantom.tables import lay_under
 from clrecon.phantom.tissue import draw_tissue
 from clrecon.phantom.vertebra import local_bounds, vertebra_distance
-from clrecon.progress import Progress
+from clrecon.system.progress import Progress
 
 __all__ = ["draw_spine"]
 

@@ -15,7 +15,7 @@ from clrecon.pipeline.outputs import check_kept
 from clrecon.pipeline.pairs import alternate, spread, summarise
 from clrecon.pipeline.presets import DEFAULT_PRESET, find_preset
 from clrecon.pipeline.report import platform_name, stage_report
-from clrecon.progress import Progress, ignore_progress
+from clrecon.system.progress import Progress, ignore_progress
 from clrecon.version import package_version
 
 if TYPE_CHECKING:
@@ -79,7 +79,7 @@ def run_bench(
     progress = progress or ignore_progress
     _check_arguments(source, iso_value, runs, series)
     if report_path is not None:
-        from clrecon.files import check_writable
+        from clrecon.system.files import check_writable
 
         check_writable(report_path)
         check_kept([("the report", report_path)], source)

@@ -11,7 +11,7 @@ from clrecon.pipeline.levels import warn_of_contrast
 from clrecon.pipeline.parts import Bones, Part, Surface
 from clrecon.pipeline.presets import LOWEST_BONE_HU
 from clrecon.pipeline.settings import MeshSettings
-from clrecon.wording import name_parameter
+from clrecon.system.wording import name_parameter
 
 if TYPE_CHECKING:
     import numpy as np

@@ -12,7 +12,7 @@ from clrecon.pipeline.pictures import PictureFiles
 from clrecon.pipeline.render import make_pictures
 from clrecon.pipeline.render_settings import RenderSettings
 from clrecon.pipeline.settings import MeshSettings
-from clrecon.progress import Progress
+from clrecon.system.progress import Progress
 
 if TYPE_CHECKING:
     from clrecon.opencl import Device

@@ -15,10 +15,10 @@ from clrecon.pipeline.settings import MeshSettings
 from clrecon.version import package_version
 
 if TYPE_CHECKING:
-    from clrecon.files import StagedFile
     from clrecon.geometry import IsoChoice, Volume
     from clrecon.mesh import Mesh
     from clrecon.opencl import Device
+    from clrecon.system.files import StagedFile
 
 __all__ = ["describe_job", "describe_part"]
 

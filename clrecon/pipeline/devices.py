@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from clrecon.errors import DeviceError
-from clrecon.progress import Progress, ignore_progress
+from clrecon.system.progress import Progress, ignore_progress
 
 __all__ = ["run_device_selftest", "survey_devices"]
 

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from clrecon.errors import ClreconError, NoDicomError, RefusedInputError
-from clrecon.progress import Progress
+from clrecon.system.progress import Progress
 
 __all__ = ["InputListing", "describe_input"]
 

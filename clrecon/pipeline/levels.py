@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 from clrecon.pipeline.presets import find_preset
 from clrecon.pipeline.settings import MeshSettings
-from clrecon.wording import name_parameter
+from clrecon.system.wording import name_parameter
 
 if TYPE_CHECKING:
     from clrecon.geometry import IsoChoice, Volume

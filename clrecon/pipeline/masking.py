@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from clrecon.progress import Progress
-from clrecon.wording import name_parameter
+from clrecon.system.progress import Progress
+from clrecon.system.wording import name_parameter
 
 if TYPE_CHECKING:
     from clrecon.geometry import Volume

@@ -20,7 +20,7 @@ from clrecon.pipeline.parts import check_levels, extract_surfaces, first_names, 
 from clrecon.pipeline.refinement import describe_purposes, judge_parts, refine_surface, warn_of_gates
 from clrecon.pipeline.report import peak_memory_bytes, stage_report
 from clrecon.pipeline.settings import MeshSettings
-from clrecon.progress import Progress, ignore_progress
+from clrecon.system.progress import Progress, ignore_progress
 
 __all__ = ["make_mesh"]
 

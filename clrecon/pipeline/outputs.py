@@ -11,11 +11,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from clrecon.errors import ClreconError, OutputError, UsageError
-from clrecon.wording import name_parameter
+from clrecon.system.wording import name_parameter
 
 if TYPE_CHECKING:
-    from clrecon.files import Staged, StagedFile
     from clrecon.mesh import Mesh
+    from clrecon.system.files import Staged, StagedFile
 
 __all__ = [
     "MOST_FILES",
@@ -90,8 +90,8 @@ def check_distinct(*owned: Sequence[tuple[str, str | Path]]) -> None:
 def check_kept(outputs: Sequence[tuple[str, str | Path | None]], *inputs: str | Path | None) -> None:
     """Refuse outputs in the place of files that the job reads, whatever name or link leads there.
 
-    A file with the mark of DICOM is replaced by no output (`clrecon.files`); here it is data sets without one, files of
-    other formats with those of their voxels, and files that say how.
+    A file with the mark of DICOM is replaced by no output (`clrecon.system.files`); here it is data sets without one,
+    files of other formats with those of their voxels, and files that say how.
 
     Parameters
     ----------
@@ -129,7 +129,7 @@ def _find_voxels(path: str | Path) -> Path | None:
 
 def _is_bare_data_set(path: str | Path) -> bool:
     from clrecon.dicom.forced import restore_start
-    from clrecon.files import open_regular
+    from clrecon.system.files import open_regular
 
     try:
         with open_regular(path) as stream:
@@ -173,8 +173,8 @@ def check_outputs(
     OutputError
         A folder is missing or cannot be written, or a target is no regular file, or a DICOM file.
     """
-    from clrecon.files import check_writable
     from clrecon.mesh import check_format
+    from clrecon.system.files import check_writable
 
     check_format(output)
     outputs = [("the mesh", path) for path in name_outputs(output, names, report_path)]
@@ -193,8 +193,8 @@ def stage_meshes(stack: ExitStack, meshes: Sequence[Mesh], paths: Sequence[str |
     OutputError
         One of them cannot be written; all older files are intact.
     """
-    from clrecon.files import allow_open_files
     from clrecon.mesh import stage_mesh
+    from clrecon.system.files import allow_open_files
 
     allow_open_files(len(meshes))
     return [stack.enter_context(stage_mesh(mesh, path, space)) for mesh, path in zip(meshes, paths, strict=True)]
@@ -208,7 +208,7 @@ def commit_all(files: Sequence[Staged]) -> None:
     OutputError
         The system refuses one of them; the message says how many are in place already.
     """
-    from clrecon.files import hold_interrupts
+    from clrecon.system.files import hold_interrupts
 
     with hold_interrupts():
         for done, file in enumerate(files):

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from clrecon.errors import DeviceMemoryError, NoSurfaceError, UsageError
 from clrecon.pipeline.outputs import MOST_FILES
 from clrecon.pipeline.settings import MeshSettings, name_level
-from clrecon.progress import Progress
-from clrecon.wording import name_parameter
+from clrecon.system.progress import Progress
+from clrecon.system.wording import name_parameter
 
 if TYPE_CHECKING:
     from clrecon.geometry import Volume

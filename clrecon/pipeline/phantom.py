@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from clrecon.progress import Progress
+from clrecon.system.progress import Progress
 
 __all__ = ["describe_kinds", "make_phantom"]
 

@@ -13,11 +13,11 @@ from clrecon.errors import UsageError
 from clrecon.pipeline.outputs import check_distinct
 from clrecon.pipeline.render_modes import find_misplaced
 from clrecon.pipeline.render_settings import RenderSettings
-from clrecon.wording import name_parameter
+from clrecon.system.wording import name_parameter
 
 if TYPE_CHECKING:
-    from clrecon.files import StagedFile
     from clrecon.rendering import Rendering
+    from clrecon.system.files import StagedFile
 
 __all__ = ["PictureFiles", "check_pictures", "format_of", "name_view", "path_of", "stage_picture"]
 
@@ -105,11 +105,11 @@ def check_pictures(files: PictureFiles, settings: RenderSettings) -> list[tuple[
     OutputError
         A folder is missing or cannot be written to, or a target is no regular file.
     """
-    from clrecon.files import check_writable
     from clrecon.rendering.annotations import check_caption
     from clrecon.rendering.image_files import check_float_path, check_image_path
     from clrecon.rendering.motion import animation_kind, check_animation
     from clrecon.rendering.pillow import load_pillow
+    from clrecon.system.files import check_writable
 
     load_pillow()
     check_caption(settings.caption)
@@ -166,8 +166,8 @@ def stage_picture(
     OutputError
         One of them cannot be written; all older files are intact.
     """
-    from clrecon.files import stage_file
     from clrecon.rendering.image_files import encode_floats, encode_image
+    from clrecon.system.files import stage_file
 
     def stage(path: str | Path, content: bytes) -> tuple[str | Path, StagedFile]:
         def write(stream: BinaryIO) -> None:

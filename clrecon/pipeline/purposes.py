@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from clrecon.errors import UsageError
 from clrecon.pipeline.presets import HIGHEST_BONE_HU, LOWEST_BONE_HU
-from clrecon.wording import name_parameter
+from clrecon.system.wording import name_parameter
 
 if TYPE_CHECKING:
     import numpy as np
@@ -131,7 +131,7 @@ def measure_pieces(vertices: NDArray[np.floating], triangles: NDArray[np.uint32]
         ``cavities``, ``cavities_ml`` : walls of cavities, and what they enclose
     """
     from clrecon.mesh.shifts import measure_volumes
-    from clrecon.pieces import local_origin
+    from clrecon.system.pieces import local_origin
 
     found = measure_volumes(vertices - local_origin(vertices), triangles).mm3 / 1000.0
     return {

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from clrecon.pipeline.parts import Part
 from clrecon.pipeline.settings import MeshSettings
-from clrecon.progress import Progress, ignore_progress
+from clrecon.system.progress import Progress, ignore_progress
 
 if TYPE_CHECKING:
     from clrecon.geometry import Volume
@@ -110,6 +110,6 @@ def describe_purposes(parts: Sequence[Part]) -> list[str]:
 
 def warn_of_gates(gates: Sequence[dict[str, Any]]) -> list[str]:
     """One line for each gate that failed, with the name of its mesh where there are several."""
-    from clrecon.gates import failed_gates
+    from clrecon.system.gates import failed_gates
 
     return [f"{gate['mesh']}: {line}" if gate["mesh"] else line for gate in gates for line in failed_gates([gate])]

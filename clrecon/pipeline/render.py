@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from clrecon.errors import UsageError
-from clrecon.files import allow_open_files
 from clrecon.pipeline.laps import Laps
 from clrecon.pipeline.masking import mask_volume
 from clrecon.pipeline.opening import DeviceOpening
@@ -19,13 +18,14 @@ from clrecon.pipeline.render_report import describe_picture, describe_pictures, 
 from clrecon.pipeline.render_settings import RenderSettings
 from clrecon.pipeline.report import peak_memory_bytes, stage_report
 from clrecon.pipeline.studio import Studio, read_curve, read_function, read_look
-from clrecon.progress import Progress, ignore_progress
+from clrecon.system.files import allow_open_files
+from clrecon.system.progress import Progress, ignore_progress
 
 if TYPE_CHECKING:
-    from clrecon.files import Staged
     from clrecon.geometry import Volume
     from clrecon.opencl import Device
     from clrecon.rendering import Rendering
+    from clrecon.system.files import Staged
 
 __all__ = ["make_pictures"]
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from clrecon.wording import name_parameter
+from clrecon.system.wording import name_parameter
 
 __all__ = ["MODES", "VIEWS", "find_misplaced"]
 

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 from clrecon.pipeline.description import SKIN_HU
 from clrecon.pipeline.render_settings import LabelLook, RenderSettings
 from clrecon.pipeline.report import platform_name
+from clrecon.system.wording import name_parameter
 from clrecon.version import package_version
-from clrecon.wording import name_parameter
 
 if TYPE_CHECKING:
     from clrecon.geometry import Volume

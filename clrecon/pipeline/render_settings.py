@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from clrecon.errors import UsageError
 from clrecon.pipeline.checks import check_bone_loss, check_field_of_view, check_memory
 from clrecon.pipeline.render_modes import MODES, find_misplaced
-from clrecon.wording import name_parameter
+from clrecon.system.wording import name_parameter
 
 if TYPE_CHECKING:
     from clrecon.geometry.camera import Camera

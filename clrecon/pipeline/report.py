@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, BinaryIO
 from clrecon.errors import ClreconError
 
 if TYPE_CHECKING:
-    from clrecon.files import StagedFile
+    from clrecon.system.files import StagedFile
 
 __all__ = ["error_as_dict", "peak_memory_bytes", "platform_name", "to_json", "stage_report"]
 
@@ -56,7 +56,7 @@ def stage_report(path: str | Path, report: Mapping[str, Any]) -> AbstractContext
     OutputError
         The file cannot be written; an older one of that name is intact.
     """
-    from clrecon.files import stage_file
+    from clrecon.system.files import stage_file
 
     content = (to_json(report) + "\n").encode("ascii")
 

@@ -10,7 +10,7 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
 from clrecon.pipeline.render_settings import SPINE, LabelLook, RenderSettings
-from clrecon.progress import Progress
+from clrecon.system.progress import Progress
 
 if TYPE_CHECKING:
     from clrecon.geometry import Volume

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.errors import OutputError, UsageError
-from clrecon.files import final_mode, hold_interrupts, is_dicom, system_errors, temporary_folder
+from clrecon.system.files import final_mode, hold_interrupts, is_dicom, system_errors, temporary_folder
 
 __all__ = ["check_frame_folder", "stage_frame_folder"]
 

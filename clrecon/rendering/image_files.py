@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.errors import UsageError
-from clrecon.files import replace_file
 from clrecon.rendering.picture_data import PictureData
 from clrecon.rendering.pillow import load_pillow
+from clrecon.system.files import replace_file
 from clrecon.version import package_version
 
 __all__ = [

@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.errors import UsageError
-from clrecon.files import Staged, check_writable, stage_file
 from clrecon.geometry.camera import Camera
-from clrecon.progress import Progress
+from clrecon.system.files import Staged, check_writable, stage_file
+from clrecon.system.progress import Progress
 
 if TYPE_CHECKING:
     from clrecon.rendering.picture import Rendering

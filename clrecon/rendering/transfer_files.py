@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 from clrecon.errors import RefusedInputError, UsageError
-from clrecon.files import read_regular
 from clrecon.rendering.json_fields import parse_json, take_color, take_list, take_number, take_object, take_text
 from clrecon.rendering.lighting import Lighting
 from clrecon.rendering.slicer_files import (
@@ -24,6 +23,7 @@ from clrecon.rendering.slicer_files import (
 )
 from clrecon.rendering.transfer_function import TransferFunction
 from clrecon.rendering.transfer_text import FORMAT, VERSION
+from clrecon.system.files import read_regular
 
 __all__ = ["load_transfer_function"]
 

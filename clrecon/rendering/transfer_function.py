@@ -320,8 +320,8 @@ class TransferFunction:
         OutputError
             It cannot be written; an older file of that name is intact.
         """
-        from clrecon.files import replace_file
         from clrecon.rendering.transfer_text import transfer_text
+        from clrecon.system.files import replace_file
 
         names = {"name": self.name, "description": self.description}
         head: dict[str, Any] = {key: text for key, text in names.items() if text}

@@ -19,7 +19,7 @@ from tolerances import AFFINE_MM
 
 from clrecon.dicom import list_series, read_volume, stored
 from clrecon.errors import NoDicomError, RefusedInputError
-from clrecon.geometry import memory
+from clrecon.system import memory
 
 SYNTAXES = "transfer_syntaxes"
 LOSSLESS = ["1.2.2", "1.2.1.99", "4.90", "4.80", "4.70", "4.57", "1.2.1", "1.2", "1.2.5"]

@@ -13,7 +13,7 @@ from pydicom.encaps import encapsulate
 from pydicom.uid import RLELossless
 
 from clrecon.dicom import pixels, read_volume
-from clrecon.geometry import memory
+from clrecon.system import memory
 
 
 def test_an_interrupt_ends_reading_while_slices_are_still_being_handed_out(tmp_path, monkeypatch):

@@ -314,7 +314,7 @@ def test_sform_and_qform_that_differ_are_said(tmp_path):
 
 
 def test_a_small_file_that_would_fill_the_memory_is_refused(tmp_path, monkeypatch):
-    from clrecon.geometry import memory
+    from clrecon.system import memory
 
     path = write_nifti(tmp_path / "a.nii.gz", np.zeros((60, 400, 400), np.int16))
     assert path.stat().st_size < 100_000

@@ -12,7 +12,7 @@ from house import PACKAGE, ROOT
 from clrecon.cli.common import Parser, add_common
 from clrecon.cli.main import COMMANDS
 from clrecon.cli.wording import speaker_of
-from clrecon.wording import in_python, name_parameter, spoken_by
+from clrecon.system.wording import in_python, name_parameter, spoken_by
 
 OPTION = re.compile(r"(?<![\w-])--[a-z][a-z-]*")
 

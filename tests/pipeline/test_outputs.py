@@ -11,7 +11,6 @@ from pathlib import Path
 import pytest
 
 from clrecon.errors import OutputError, UsageError
-from clrecon.files import stage_file
 from clrecon.pipeline.labels import LabelChoice
 from clrecon.pipeline.mesh import make_mesh
 from clrecon.pipeline.outputs import MOST_FILES, check_kept, check_outputs, commit_all, name_outputs
@@ -20,6 +19,7 @@ from clrecon.pipeline.pictures import PictureFiles
 from clrecon.pipeline.render import make_pictures
 from clrecon.pipeline.render_settings import LabelLook, RenderSettings
 from clrecon.pipeline.settings import MeshSettings
+from clrecon.system.files import stage_file
 
 pytestmark = pytest.mark.unit
 
@@ -97,7 +97,7 @@ def test_a_rename_that_fails_says_what_is_in_place(blocked: int, tmp_path: Path)
 def test_a_thousand_files_can_be_staged_at_once(tmp_path: Path) -> None:
     import resource
 
-    from clrecon.files import allow_open_files
+    from clrecon.system.files import allow_open_files
 
     limits = resource.getrlimit(resource.RLIMIT_NOFILE)
     resource.setrlimit(resource.RLIMIT_NOFILE, (200, limits[1]))

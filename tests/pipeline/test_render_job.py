@@ -138,7 +138,7 @@ def test_a_step_that_fails_leaves_the_old_files(
             "encode_floats": "clrecon.rendering.image_files.encode_floats",
             "stage_report": "clrecon.pipeline.render.stage_report",
             "stage_animation": "clrecon.rendering.motion.stage_animation",
-            "commit": "clrecon.files.StagedFile.commit",
+            "commit": "clrecon.system.files.StagedFile.commit",
         }[fails]
         monkeypatch.setattr(home, fail)
     with pytest.raises(OutputError, match="full"):

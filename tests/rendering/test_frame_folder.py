@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from clrecon.errors import OutputError, UsageError
-from clrecon.files import replace_file
 from clrecon.rendering.motion import check_animation, stage_animation, write_animation
+from clrecon.system.files import replace_file
 
 NAMES = ["frame_0000.png", "frame_0001.png"]
 STALE = ".clrecon-0123456789abcdef.folder"

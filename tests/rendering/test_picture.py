@@ -159,7 +159,7 @@ def test_a_full_disk_leaves_the_older_picture(tmp_path, monkeypatch):
     class Usage:
         total, free = 10**9, 100
 
-    monkeypatch.setattr("clrecon.files.shutil.disk_usage", lambda folder: Usage)
+    monkeypatch.setattr("clrecon.system.files.shutil.disk_usage", lambda folder: Usage)
     with pytest.raises(OutputError, match="are free in"):
         make_picture().save(path)
     assert path.read_bytes() == b"older"

@@ -24,31 +24,27 @@ _layer(
 )
 _layer("errors")
 _layer("version")
-_layer("gates")
-_layer("wording")
-_layer("progress")
-_layer("pieces")
-_layer("files", "errors")
-_layer("geometry", "errors", "wording", "files", "gates")
-_layer("dicom", "progress", "errors", "wording", "files", "gates", "geometry")
-_layer("mesh", "pieces", "errors", "wording", "version", "files", "gates", "geometry")
-_layer("formats", "progress", "errors", "wording", "files", "gates", "geometry", "dicom")
-_layer("reading", "progress", "errors", "geometry", "dicom", "formats")
-_layer("labels", "progress", "errors", "wording", "files", "geometry", "dicom", "formats")
-_layer("reference", "progress", "errors", "files", "geometry", "labels", "rendering")
-_layer("phantom", "progress", "errors", "wording", "version", "files", "geometry")
-_layer("rendering", "progress", "errors", "wording", "version", "files", "geometry", "labels")
-_layer("opencl", "errors", "wording", "files")
-_layer("kernels", "errors", "files", "opencl")
-_layer("operators", "progress", "errors", "files", "geometry", "labels", "mesh", "rendering", "opencl", "kernels")
+_layer("system", "errors")
+_layer("geometry", "errors", "system")
+_layer("dicom", "system", "errors", "geometry")
+_layer("mesh", "system", "errors", "version", "geometry")
+_layer("formats", "system", "errors", "geometry", "dicom")
+_layer("reading", "system", "errors", "geometry", "dicom", "formats")
+_layer("labels", "system", "errors", "geometry", "dicom", "formats")
+_layer("reference", "system", "errors", "geometry", "labels", "rendering")
+_layer("phantom", "system", "errors", "version", "geometry")
+_layer("rendering", "system", "errors", "version", "geometry", "labels")
+_layer("opencl", "errors", "system")
+_layer("kernels", "errors", "system", "opencl")
+_layer("operators", "system", "errors", "geometry", "labels", "mesh", "rendering", "opencl", "kernels")
 _layer("pipeline", *(set(LEFT_OF) - {"__init__"}))
-_layer("viewer", "errors", "files", "geometry", "mesh", "rendering", "pipeline")
-_layer("cli", "errors", "wording", "version", "pipeline", "viewer")
+_layer("viewer", "errors", "system", "geometry", "mesh", "rendering", "pipeline")
+_layer("cli", "errors", "system", "version", "pipeline", "viewer")
 _layer("__main__", "cli")
 
 # Third-party packages: at module level (paid by whoever imports the layer), or only inside functions.
 AT_MODULE_LEVEL: dict[str, frozenset[str]] = {
-    "pieces": frozenset({"numpy"}),
+    "system": frozenset({"numpy"}),
     "geometry": frozenset({"numpy"}),
     "dicom": frozenset({"numpy", "pydicom"}),
     "formats": frozenset({"numpy"}),
@@ -64,7 +60,6 @@ AT_MODULE_LEVEL: dict[str, frozenset[str]] = {
     "viewer": frozenset({"numpy"}),
 }
 INSIDE_FUNCTIONS: dict[str, frozenset[str]] = {
-    "files": frozenset({"numpy"}),
     "geometry": frozenset({"scipy", "pyvista"}),
     "dicom": frozenset({"imagecodecs", "openjpeg", "rle", "jpeg_ls", "pylibjpeg"}),
     "formats": frozenset({"nibabel", "nrrd", "SimpleITK"}),

@@ -17,7 +17,7 @@ import pytest
 
 from clrecon import files
 from clrecon.errors import OutputError, UsageError
-from clrecon.files import check_writable, replace_file
+from clrecon.system.files import check_writable, replace_file
 
 pytestmark = [
     pytest.mark.unit,
@@ -151,7 +151,7 @@ def test_limit_on_the_size_of_files(older, piece):
     code = f"""
         import resource
         from clrecon.errors import OutputError
-        from clrecon.files import replace_file
+        from clrecon.system.files import replace_file
         resource.setrlimit(resource.RLIMIT_FSIZE, (4096, 4096))
         try:
             replace_file({str(older)!r}, lambda stream: [stream.write(bytes({piece})) for _ in range(500)])
@@ -276,7 +276,7 @@ def test_process_that_is_stopped(older, how):
     """The older file stays; what a killed process leaves is removed by the next writer, and only that."""
     code = f"""
         import sys, time
-        from clrecon.files import replace_file
+        from clrecon.system.files import replace_file
         def write(stream):
             stream.write(b"half")
             stream.flush()

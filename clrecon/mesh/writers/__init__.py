@@ -19,10 +19,10 @@ from typing import BinaryIO
 import numpy as np
 
 from clrecon.errors import NoSurfaceError, OutputError, UsageError
-from clrecon.files import StagedFile, stage_file
 from clrecon.geometry.precision import float32_step
 from clrecon.mesh.writers import glb, obj, ply, stl, threemf, vtp
 from clrecon.mesh.writers.content import Content, Writable
+from clrecon.system.files import StagedFile, stage_file
 
 __all__ = ["FORMATS", "MeshFormat", "check_format", "describe_rounding", "stage_mesh", "write_mesh"]
 
@@ -106,7 +106,7 @@ def write_mesh(mesh: Writable, path: str | os.PathLike[str], space: str = "lps")
 
 
 def stage_mesh(mesh: Writable, path: str | os.PathLike[str], space: str = "lps") -> AbstractContextManager[StagedFile]:
-    """Write a mesh under a temporary name, to be committed with other files; see `clrecon.files.stage_file`."""
+    """Write a mesh under a temporary name, to be committed with other files; see `clrecon.system.files.stage_file`."""
     extension = check_format(path)
     chosen = FORMATS[extension]
     mesh.check()

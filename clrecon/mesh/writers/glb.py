@@ -21,7 +21,7 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from clrecon.mesh.writers.content import Content, refuse_file
-from clrecon.pieces import local_origin
+from clrecon.system.pieces import local_origin
 
 __all__ = ["estimate", "verify", "write"]
 

@@ -12,7 +12,7 @@ from typing import BinaryIO
 import numpy as np
 
 from clrecon.mesh.writers.content import Content, refuse_file
-from clrecon.pieces import chunks
+from clrecon.system.pieces import chunks
 
 __all__ = ["estimate", "verify", "write"]
 

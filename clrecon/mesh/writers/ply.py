@@ -13,7 +13,7 @@ import numpy as np
 
 from clrecon.errors import OutputError
 from clrecon.mesh.writers.content import Content, refuse_file
-from clrecon.pieces import chunks
+from clrecon.system.pieces import chunks
 
 __all__ = ["estimate", "verify", "write"]
 

@@ -13,7 +13,7 @@ from xml.sax.saxutils import escape
 
 from clrecon.errors import OutputError
 from clrecon.mesh.writers.content import Content, refuse_file
-from clrecon.pieces import chunks
+from clrecon.system.pieces import chunks
 
 __all__ = ["estimate", "verify", "write"]
 

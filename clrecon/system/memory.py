@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from clrecon.errors import RefusedInputError
-from clrecon.geometry.aligned import aligned_empty
-from clrecon.geometry.control_groups import free_bytes_of_container
+from clrecon.system.aligned import aligned_empty
+from clrecon.system.control_groups import free_bytes_of_container
 
 __all__ = ["allocate_voxels", "available_memory_bytes", "physical_memory_bytes"]
 
