@@ -46,7 +46,7 @@ def find_devices() -> tuple[list[Any], str]:
         return [], str(error)
     for device in found:
         # PoCL builds every kernel once more before it gives a binary away, for groups of any size: half of all its
-        # building.  The processes of commands keep binaries, and so do tests/kernels/test_binaries.py.
+        # building.  The processes of commands keep binaries, and so do tests/opencl/test_binaries.py.
         device.keeps_binaries = False
     devices = [device for device in found if is_set("CLRECON_TEST_SIMULATORS") or not device.is_simulator]
     wanted = os.environ.get("CLRECON_TEST_DEVICE", "").strip().lower()

@@ -1,17 +1,36 @@
-"""OpenCL devices: what is there, which one is used, and how much memory it has. The only layer that finds drivers."""
+"""OpenCL and nothing else: devices and their memory, kernel sources and programs, arrays and launches.
 
+The only room that finds drivers, and the only one that knows where the kernel files are.
+"""
+
+from clrecon.opencl.arrays import allocate, download, empty_output, upload
 from clrecon.opencl.context import Device
+from clrecon.opencl.launching import Stopwatch, launch
 from clrecon.opencl.memory import MemoryLimits, check_budget, check_memory, describe_shortage, memory_limits
+from clrecon.opencl.pages import result_pages
+from clrecon.opencl.program import Program, load_program
 from clrecon.opencl.select import choose_device, list_devices, list_platforms
+from clrecon.opencl.sources import kernel_files, read_kernel_source
 
 __all__ = [
     "Device",
     "MemoryLimits",
+    "Program",
+    "Stopwatch",
+    "allocate",
     "check_budget",
     "check_memory",
     "choose_device",
     "describe_shortage",
+    "download",
+    "empty_output",
+    "kernel_files",
+    "launch",
     "list_devices",
     "list_platforms",
+    "load_program",
     "memory_limits",
+    "read_kernel_source",
+    "result_pages",
+    "upload",
 ]

@@ -60,7 +60,7 @@ class Device:
     shortcoming : str
         Why the device cannot be used; empty where it can.
     keeps_binaries : bool
-        Built programs are kept for the next process, see `clrecon.kernels.binaries`.
+        Built programs are kept for the next process, see `clrecon.opencl.binaries`.
     kernel_variants : dict of str to str
         ``-D`` definitions for kernels that are written for vectors, see `quirks.kernel_variants`.
     build_options : tuple of str

@@ -7,8 +7,14 @@ from typing import Any
 
 import numpy as np
 
-from clrecon.kernels import Program, Stopwatch, allocate, launch, load_program
-from clrecon.opencl import Device
+from clrecon.opencl import (
+    Device,
+    Program,
+    Stopwatch,
+    allocate,
+    launch,
+    load_program,
+)
 from clrecon.operators.voxel_types import voxel_variants
 
 __all__ = ["BRICK", "BrickRanges", "BrickStates", "compare_bricks", "measure_bricks", "prepare_bricks"]

@@ -8,8 +8,15 @@ from typing import Any
 import numpy as np
 
 from clrecon.errors import UsageError
-from clrecon.kernels import Program, Stopwatch, allocate, download, launch, load_program
-from clrecon.opencl import Device
+from clrecon.opencl import (
+    Device,
+    Program,
+    Stopwatch,
+    allocate,
+    download,
+    launch,
+    load_program,
+)
 
 __all__ = ["Compacted", "Scanned", "compact", "exclusive_scan", "prepare_scan"]
 

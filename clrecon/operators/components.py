@@ -8,8 +8,18 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from clrecon.errors import DeviceError, DeviceMemoryError, UsageError
-from clrecon.kernels import Program, Stopwatch, allocate, download, launch, load_program, upload
-from clrecon.opencl import Device, describe_shortage, memory_limits
+from clrecon.opencl import (
+    Device,
+    Program,
+    Stopwatch,
+    allocate,
+    describe_shortage,
+    download,
+    launch,
+    load_program,
+    memory_limits,
+    upload,
+)
 from clrecon.operators.compaction import LARGEST_SCAN, Compacted, compact, exclusive_scan, prepare_scan
 
 __all__ = ["label_components", "prepare_components"]

@@ -11,9 +11,14 @@ from numpy.typing import NDArray
 
 from clrecon.geometry.camera import Camera
 from clrecon.geometry.field import takes_parts
-from clrecon.kernels import Stopwatch, allocate, launch, upload
 from clrecon.labels.resample import ResampledLabels
-from clrecon.opencl import Device
+from clrecon.opencl import (
+    Device,
+    Stopwatch,
+    allocate,
+    launch,
+    upload,
+)
 from clrecon.operators.frame import FieldFrame
 from clrecon.operators.pictures import PictureBuffers, count_queues, highlight_table
 from clrecon.operators.ray_view import RayView

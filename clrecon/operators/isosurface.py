@@ -13,9 +13,18 @@ from clrecon.errors import ClreconError, DeviceError, DeviceMemoryError, NoSurfa
 from clrecon.geometry import Volume
 from clrecon.geometry.field import IsoRule, Level, ValueRange, check_topology, choose_iso_rule, data_range
 from clrecon.geometry.precision import describe_far
-from clrecon.kernels import Program, Stopwatch, result_pages, upload
 from clrecon.mesh import Mesh
-from clrecon.opencl import Device, check_memory, choose_device, describe_shortage, memory_limits
+from clrecon.opencl import (
+    Device,
+    Program,
+    Stopwatch,
+    check_memory,
+    choose_device,
+    describe_shortage,
+    memory_limits,
+    result_pages,
+    upload,
+)
 from clrecon.opencl.quirks import cache_warnings
 from clrecon.operators import marching_cubes
 from clrecon.operators.bricks import BrickRanges, BrickStates, compare_bricks, measure_bricks

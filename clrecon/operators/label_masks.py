@@ -16,14 +16,26 @@ from clrecon.errors import RefusedInputError, UsageError
 from clrecon.geometry import Volume
 from clrecon.geometry.field import IsoRule
 from clrecon.geometry.precision import describe_far
-from clrecon.kernels import Program, Stopwatch, allocate, download, launch, load_program, upload
 from clrecon.labels import LabelMap
 from clrecon.labels.enclosed import FACES_PER_AREA, Borders, choose_levels, find_enclosed, level_biases
 from clrecon.labels.occupancy import FULL, KEEP, REACH, STEEPNESS, next_level
 from clrecon.labels.solid import Box
 from clrecon.labels.volumes import label_ml
 from clrecon.mesh import Mesh
-from clrecon.opencl import Device, check_budget, choose_device, describe_shortage, memory_limits
+from clrecon.opencl import (
+    Device,
+    Program,
+    Stopwatch,
+    allocate,
+    check_budget,
+    choose_device,
+    describe_shortage,
+    download,
+    launch,
+    load_program,
+    memory_limits,
+    upload,
+)
 from clrecon.opencl.quirks import cache_warnings
 from clrecon.operators import marching_cubes
 from clrecon.operators.isosurface import Part

@@ -11,11 +11,21 @@ from typing import Any
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from clrecon.kernels import Program, Stopwatch, allocate, download, launch, load_program, upload
 from clrecon.labels import LabelMap
 from clrecon.labels.enclosed import count_faces
 from clrecon.labels.solid import Box, find_boxes
-from clrecon.opencl import Device, describe_shortage, memory_limits
+from clrecon.opencl import (
+    Device,
+    Program,
+    Stopwatch,
+    allocate,
+    describe_shortage,
+    download,
+    launch,
+    load_program,
+    memory_limits,
+    upload,
+)
 from clrecon.operators.voxel_types import label_variants
 
 __all__ = ["prepare_survey", "survey_labels"]

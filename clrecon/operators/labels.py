@@ -16,13 +16,25 @@ from clrecon.errors import NoSurfaceError, UsageError
 from clrecon.geometry import Volume
 from clrecon.geometry.field import IsoRule, choose_iso_rule
 from clrecon.geometry.precision import describe_far
-from clrecon.kernels import Program, Stopwatch, allocate, download, launch, load_program, upload
 from clrecon.labels import LabelMap, ResampledLabels, resample_labels
 from clrecon.labels.growth import Growth
 from clrecon.labels.solid import Box, fill_solid, find_boxes
 from clrecon.labels.volumes import count_ml, label_ml, slice_voxel_ml
 from clrecon.mesh import Mesh
-from clrecon.opencl import Device, check_budget, choose_device, describe_shortage, memory_limits
+from clrecon.opencl import (
+    Device,
+    Program,
+    Stopwatch,
+    allocate,
+    check_budget,
+    choose_device,
+    describe_shortage,
+    download,
+    launch,
+    load_program,
+    memory_limits,
+    upload,
+)
 from clrecon.opencl.quirks import cache_warnings
 from clrecon.operators import marching_cubes
 from clrecon.operators.isosurface import Part, voxel_level

@@ -13,8 +13,17 @@ from clrecon.errors import DeviceError, DeviceMemoryError, UsageError
 from clrecon.geometry import Volume
 from clrecon.geometry.field import layer_margins, layer_normal_matrices, slice_normal_matrices, vertex_margin
 from clrecon.geometry.precision import find_vertex_origin
-from clrecon.kernels import Program, Stopwatch, allocate, download, empty_output, launch, load_program, upload
-from clrecon.opencl import Device
+from clrecon.opencl import (
+    Device,
+    Program,
+    Stopwatch,
+    allocate,
+    download,
+    empty_output,
+    launch,
+    load_program,
+    upload,
+)
 from clrecon.operators.bricks import BrickStates
 from clrecon.operators.compaction import exclusive_scan, prepare_scan
 from clrecon.operators.slabs import Slab

@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clrecon.kernels import allocate, download, empty_output
-from clrecon.opencl import Device
+from clrecon.opencl import Device, allocate, download, empty_output
 from clrecon.operators.ray_view import TILE
 from clrecon.rendering import Lighting
 from clrecon.rendering.colors import find_color

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from clrecon.kernels import Stopwatch, launch, upload
+from clrecon.opencl import Stopwatch, launch, upload
 from clrecon.operators.pictures import PictureBuffers, count_queues
 from clrecon.operators.ray_view import RayView
 from clrecon.operators.resident import RaySlab, ResidentVolume

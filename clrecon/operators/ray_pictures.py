@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from clrecon.geometry.affine import Float64Array
 from clrecon.geometry.camera import Camera
 from clrecon.geometry.clip import Clip
-from clrecon.kernels import Stopwatch
 from clrecon.labels.resample import resample_labels
+from clrecon.opencl import Stopwatch
 from clrecon.operators.composite import TransferTables, composite_slab
 from clrecon.operators.frame import volume_box
 from clrecon.operators.pictures import PictureBuffers

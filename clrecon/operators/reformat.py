@@ -17,8 +17,7 @@ from clrecon.geometry.curves import Curve
 from clrecon.geometry.sheets import Sheet, find_plane, finest_step, plane_sheet, positive_mm, slab_samples
 from clrecon.geometry.spine_line import find_spine_line
 from clrecon.geometry.views import checked_size, find_up, find_view
-from clrecon.kernels import Stopwatch
-from clrecon.opencl import Device, check_memory, choose_device
+from clrecon.opencl import Device, Stopwatch, check_memory, choose_device
 from clrecon.operators.sheets import Reformation, sample_sheet
 from clrecon.rendering import Rendering
 from clrecon.rendering.colors import is_transparent

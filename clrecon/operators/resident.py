@@ -13,8 +13,19 @@ from numpy.typing import NDArray
 from clrecon.geometry import Volume, slice_normal
 from clrecon.geometry.affine import Float64Array
 from clrecon.geometry.camera import Camera
-from clrecon.kernels import Program, Stopwatch, allocate, download, launch, load_program, upload
-from clrecon.opencl import Device, check_budget, describe_shortage, memory_limits
+from clrecon.opencl import (
+    Device,
+    Program,
+    Stopwatch,
+    allocate,
+    check_budget,
+    describe_shortage,
+    download,
+    launch,
+    load_program,
+    memory_limits,
+    upload,
+)
 from clrecon.operators.frame import BOX_BORDER, enclose
 from clrecon.operators.stack_table import StackTable
 from clrecon.operators.voxel_types import voxel_variants

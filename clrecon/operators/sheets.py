@@ -12,8 +12,18 @@ from clrecon.errors import DeviceError, DeviceMemoryError, UsageError
 from clrecon.geometry import Volume, slice_normal
 from clrecon.geometry.affine import Float64Array
 from clrecon.geometry.sheets import Sheet, SlabSamples
-from clrecon.kernels import Program, Stopwatch, allocate, download, launch, load_program, upload
-from clrecon.opencl import Device, describe_shortage, memory_limits
+from clrecon.opencl import (
+    Device,
+    Program,
+    Stopwatch,
+    allocate,
+    describe_shortage,
+    download,
+    launch,
+    load_program,
+    memory_limits,
+    upload,
+)
 from clrecon.operators.voxel_types import voxel_variants
 from clrecon.system.progress import Progress
 

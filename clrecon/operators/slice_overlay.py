@@ -14,8 +14,16 @@ from clrecon.geometry import Volume
 from clrecon.geometry.affine import Float64Array
 from clrecon.geometry.camera import Camera
 from clrecon.geometry.clip import Clip
-from clrecon.kernels import Stopwatch, launch, load_program, upload
-from clrecon.opencl import Device, check_budget, describe_shortage, memory_limits
+from clrecon.opencl import (
+    Device,
+    Stopwatch,
+    check_budget,
+    describe_shortage,
+    launch,
+    load_program,
+    memory_limits,
+    upload,
+)
 from clrecon.operators.frame import FieldFrame, volume_box
 from clrecon.operators.pictures import PictureBuffers, count_queues
 from clrecon.operators.ray_view import RayView

@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from clrecon.geometry import Volume
 from clrecon.geometry.affine import Float64Array
 from clrecon.geometry.field import slice_normal_matrices
-from clrecon.kernels import upload
-from clrecon.opencl import Device
+from clrecon.opencl import Device, upload
 from clrecon.operators.frame import FieldFrame
 
 __all__ = ["StackTable"]

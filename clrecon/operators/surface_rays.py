@@ -15,9 +15,8 @@ from clrecon.geometry.affine import Float64Array
 from clrecon.geometry.camera import Camera, box_corners
 from clrecon.geometry.clip import Clip
 from clrecon.geometry.field import IsoRule, ValueRange, choose_iso_rule
-from clrecon.kernels import Stopwatch, launch, upload
 from clrecon.labels import resample_labels
-from clrecon.opencl import memory_limits
+from clrecon.opencl import Stopwatch, launch, memory_limits, upload
 from clrecon.operators.frame import FieldFrame, enclose
 from clrecon.operators.pictures import PictureBuffers, count_queues, highlight_table
 from clrecon.operators.ray_view import RayView

@@ -10,8 +10,14 @@ from numpy.typing import DTypeLike
 
 from clrecon.errors import UsageError
 from clrecon.geometry import Volume
-from clrecon.kernels import Program, Stopwatch, allocate, launch, load_program
-from clrecon.opencl import Device
+from clrecon.opencl import (
+    Device,
+    Program,
+    Stopwatch,
+    allocate,
+    launch,
+    load_program,
+)
 from clrecon.operators.compaction import exclusive_scan
 from clrecon.operators.slabs import Slab
 from clrecon.operators.voxel_types import voxel_variants

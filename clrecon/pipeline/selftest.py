@@ -11,9 +11,8 @@ from numpy.typing import NDArray
 
 from clrecon.errors import ClreconError, DeviceError
 from clrecon.geometry import Volume
-from clrecon.kernels import download, upload
 from clrecon.labels import LabelMap
-from clrecon.opencl import Device
+from clrecon.opencl import Device, download, upload
 from clrecon.operators.compaction import compact, exclusive_scan
 from clrecon.operators.components import label_components
 from clrecon.operators.isosurface import extract_isosurface

@@ -24,8 +24,8 @@ def measure_components(job: Job) -> dict[str, Any]:
     import numpy as np
     from scipy import ndimage
 
-    from clrecon.kernels import Stopwatch
     from clrecon.mesh import connectivity
+    from clrecon.opencl import Stopwatch
     from clrecon.operators.components import label_components
     from clrecon.operators.isosurface import extract_isosurface
 

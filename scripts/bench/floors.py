@@ -95,7 +95,7 @@ def copy_bandwidth(device: Any) -> dict[str, float]:
 
 
 def _device_copy(device: Any) -> Any:
-    from clrecon.kernels import allocate
+    from clrecon.opencl import allocate
     from clrecon.opencl.quirks import import_pyopencl
 
     cl = import_pyopencl()

@@ -128,7 +128,7 @@ def test_the_wheel_works_from_another_folder(tmp_path: Path) -> None:
     where = run("python", "-c", "import clrecon, clrecon.cl; print(clrecon.__file__); print(clrecon.cl.__file__)")
     assert where.returncode == 0, where.stderr
     assert all(Path(line).is_relative_to(tmp_path) for line in where.stdout.split("\n") if line)
-    sources = run("python", "-c", "from clrecon.kernels.sources import kernel_files; print(*kernel_files())")
+    sources = run("python", "-c", "from clrecon.opencl.sources import kernel_files; print(*kernel_files())")
     assert sources.stdout.split() == sorted(name[len("clrecon/cl/") :] for name in kernels if name.endswith(".cl"))
     assert run("clrecon", "--version").stdout.split()[-1] == read_setup()["metadata"]["version"]
 

@@ -150,7 +150,7 @@ def test_a_device_names_its_cpu_when_it_is_opened_and_not_before(device, monkeyp
 
 
 def test_programs_get_what_tells_caches_apart(device, monkeypatch):
-    from clrecon.kernels import load_program, program
+    from clrecon.opencl import load_program, program
 
     seen = []
     monkeypatch.setattr(program, "_build", lambda device, name, options: seen.append(options))

@@ -8,7 +8,7 @@ from surface_volumes import OBLIQUE, random_volume, smooth_volume
 from variants import VOXEL_TYPES
 
 from clrecon.geometry import Volume
-from clrecon.kernels import download, upload
+from clrecon.opencl import download, upload
 from clrecon.operators.bricks import compare_bricks, measure_bricks
 from clrecon.operators.isosurface import SurfaceExtractor, extract_isosurface
 from clrecon.reference import bricks as twin

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from clrecon.errors import UsageError
-from clrecon.kernels import download, upload
+from clrecon.opencl import download, upload
 from clrecon.opencl.context import GROUP_SIZE
 from clrecon.operators.compaction import SCAN_PER_ITEM, compact, exclusive_scan
 from clrecon.reference import compaction as twin

@@ -10,7 +10,7 @@ from scipy import ndimage
 
 from clrecon.geometry import Volume
 from clrecon.geometry.camera import Camera
-from clrecon.kernels import Stopwatch, download, upload
+from clrecon.opencl import Stopwatch, download, upload
 from clrecon.operators import composite
 from clrecon.operators.composite import MainWay
 from clrecon.operators.resident import FARTHEST, LeapMap, ResidentVolume

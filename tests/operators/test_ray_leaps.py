@@ -11,8 +11,8 @@ from clrecon.errors import UsageError
 from clrecon.geometry import Volume
 from clrecon.geometry.camera import Camera
 from clrecon.geometry.clip import Clip
-from clrecon.kernels import upload
 from clrecon.labels import LabelMap
+from clrecon.opencl import upload
 from clrecon.operators import composite, resident
 from clrecon.operators.frame import volume_box
 from clrecon.operators.renderer import VolumeRenderer, render

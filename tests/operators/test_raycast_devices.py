@@ -27,7 +27,7 @@ from variants import all_but
 from clrecon.geometry import Volume
 from clrecon.geometry.camera import Camera
 from clrecon.geometry.clip import Clip
-from clrecon.kernels.sources import read_kernel_source
+from clrecon.opencl.sources import read_kernel_source
 from clrecon.reference.rays import hash_pixels, jitter_pixels
 from clrecon.rendering import UNSHADED, Lighting, TransferFunction
 

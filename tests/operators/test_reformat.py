@@ -13,7 +13,7 @@ from clrecon.errors import DeviceError, UsageError
 from clrecon.geometry import Volume
 from clrecon.geometry.camera import Camera
 from clrecon.geometry.sheets import find_plane, plane_sheet, slab_samples
-from clrecon.kernels import kernel_files, upload
+from clrecon.opencl import kernel_files, upload
 from clrecon.operators.reformat import cut_slice, reformat_curve
 from clrecon.operators.sheets import prepare_reformat, sample_sheet
 from clrecon.reference.reformat import reformat_sheet

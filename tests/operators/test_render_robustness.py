@@ -13,7 +13,7 @@ from clrecon.errors import DeviceError, UsageError
 from clrecon.geometry import Volume
 from clrecon.geometry.camera import Camera
 from clrecon.geometry.clip import Clip
-from clrecon.kernels import launching
+from clrecon.opencl import launching
 from clrecon.operators.resident import entry_slice
 from clrecon.rendering import TransferFunction
 

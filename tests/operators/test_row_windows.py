@@ -11,8 +11,8 @@ import tolerances
 from raycast_scenes import DeviceCaster, look, premultiplied
 
 from clrecon.geometry import Volume
-from clrecon.kernels.arrays import download, empty_output, upload
-from clrecon.kernels.sources import read_kernel_source
+from clrecon.opencl.arrays import download, empty_output, upload
+from clrecon.opencl.sources import read_kernel_source
 from clrecon.operators import resident
 from clrecon.rendering import Lighting, TransferFunction
 

@@ -35,8 +35,7 @@ _layer("reference", "system", "errors", "geometry", "labels", "rendering")
 _layer("phantom", "system", "errors", "version", "geometry")
 _layer("rendering", "system", "errors", "version", "geometry", "labels")
 _layer("opencl", "errors", "system")
-_layer("kernels", "errors", "system", "opencl")
-_layer("operators", "system", "errors", "geometry", "labels", "mesh", "rendering", "opencl", "kernels")
+_layer("operators", "system", "errors", "geometry", "labels", "mesh", "rendering", "opencl")
 _layer("pipeline", *(set(LEFT_OF) - {"__init__"}))
 _layer("viewer", "errors", "system", "geometry", "mesh", "rendering", "pipeline")
 _layer("cli", "errors", "system", "version", "pipeline", "viewer")
@@ -54,7 +53,6 @@ AT_MODULE_LEVEL: dict[str, frozenset[str]] = {
     "rendering": frozenset({"numpy"}),
     "phantom": frozenset({"numpy", "pydicom"}),
     "opencl": frozenset({"numpy"}),
-    "kernels": frozenset({"numpy"}),
     "operators": frozenset({"numpy"}),
     "pipeline": frozenset({"numpy"}),
     "viewer": frozenset({"numpy"}),
@@ -69,7 +67,6 @@ INSIDE_FUNCTIONS: dict[str, frozenset[str]] = {
     "rendering": frozenset({"scipy", "PIL", "imageio_ffmpeg", "pyvista", "vtk", "vtkmodules"}),
     "phantom": frozenset({"scipy"}),
     "opencl": frozenset({"pyopencl"}),
-    "kernels": frozenset({"pyopencl"}),
     "operators": frozenset({"pyopencl"}),
     "pipeline": frozenset({"pyvista", "skimage", "vtkmodules"}),  # vtkmodules: flying edges, the peer of the bench
     "viewer": frozenset({"pyvista", "vtk", "vtkmodules"}),

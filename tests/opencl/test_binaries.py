@@ -8,11 +8,10 @@ import numpy as np
 import pytest
 
 from clrecon.errors import DeviceError
-from clrecon.kernels import binaries, program
-from clrecon.kernels.binaries import binary_key, read_binary, store_binary
-from clrecon.kernels.program import load_program
-from clrecon.kernels.sources import read_kernel_source
-from clrecon.opencl import quirks
+from clrecon.opencl import binaries, program, quirks
+from clrecon.opencl.binaries import binary_key, read_binary, store_binary
+from clrecon.opencl.program import load_program
+from clrecon.opencl.sources import read_kernel_source
 
 KEY = binary_key("device", "source")
 
@@ -92,7 +91,7 @@ def test_the_next_process_takes_the_binary(device, monkeypatch):
 
 
 def test_binaries_compute_what_sources_do(device, monkeypatch):
-    from clrecon.kernels import upload
+    from clrecon.opencl import upload
     from clrecon.operators.compaction import compact
 
     mask = np.random.default_rng(0).integers(0, 2**32, 1000, dtype=np.uint32)

@@ -8,10 +8,10 @@ from contextlib import suppress
 from typing import Any
 
 from clrecon.errors import DeviceError
-from clrecon.kernels.binaries import binary_key, read_binary, store_binary
-from clrecon.kernels.sources import read_kernel_source
-from clrecon.opencl import Device
+from clrecon.opencl.binaries import binary_key, read_binary, store_binary
+from clrecon.opencl.context import Device
 from clrecon.opencl.quirks import import_pyopencl
+from clrecon.opencl.sources import read_kernel_source
 
 __all__ = ["Program", "load_program"]
 

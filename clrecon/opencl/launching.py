@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from typing import Any
 
-from clrecon.opencl import Device
+from clrecon.opencl.context import Device
 from clrecon.opencl.quirks import import_pyopencl
 
 __all__ = ["Stopwatch", "launch"]

@@ -8,9 +8,8 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from clrecon.errors import DeviceMemoryError
-from clrecon.kernels.pages import result_pages
-from clrecon.opencl import Device
-from clrecon.opencl.context import describe_error
+from clrecon.opencl.context import Device, describe_error
+from clrecon.opencl.pages import result_pages
 from clrecon.opencl.quirks import import_pyopencl
 
 __all__ = ["allocate", "download", "empty_output", "upload"]

@@ -7,7 +7,12 @@ import re
 import pytest
 
 from clrecon.errors import DeviceError
-from clrecon.kernels import kernel_files, load_program, read_kernel_source, sources
+from clrecon.opencl import (
+    kernel_files,
+    load_program,
+    read_kernel_source,
+    sources,
+)
 
 
 def test_every_theme_is_found():
@@ -56,7 +61,7 @@ def test_every_voxel_type_builds(voxel, device):
 
 def test_a_compiler_error_names_the_true_file_and_line(device, monkeypatch):
     text = '#line 1 "cl/theme/file.cl"\n__kernel void broken(__global int *a)\n{\n    a[0] = missing_name;\n}\n'
-    monkeypatch.setattr("clrecon.kernels.program.read_kernel_source", lambda name: text)
+    monkeypatch.setattr("clrecon.opencl.program.read_kernel_source", lambda name: text)
     with pytest.raises(DeviceError, match=r"theme/file.cl does not build on") as caught:
         load_program(device, "theme/file.cl")
     log = str(caught.value) + str(caught.value.__cause__)
