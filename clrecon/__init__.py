@@ -15,6 +15,9 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from clrecon.anatomy.body import mask_field_of_view, remove_table
+    from clrecon.anatomy.iso_choice import choose_iso_value
+    from clrecon.anatomy.spine_line import find_spine_line
     from clrecon.errors import (
         ClreconError,
         DeviceError,
@@ -25,11 +28,9 @@ if TYPE_CHECKING:
         UsageError,
     )
     from clrecon.formats.curve_points import read_curve_points
-    from clrecon.geometry import Volume, choose_iso_value
-    from clrecon.geometry.body import mask_field_of_view, remove_table
+    from clrecon.geometry import Volume
     from clrecon.geometry.camera import Camera
     from clrecon.geometry.clip import Clip
-    from clrecon.geometry.spine_line import find_spine_line
     from clrecon.labels import LabelMap, read_labels
     from clrecon.mesh import Mesh
     from clrecon.mesh.distances import compare_meshes
@@ -109,7 +110,7 @@ _HOMES = {
     "UsageError": "clrecon.errors",
     "Volume": "clrecon.geometry",
     "VolumeRenderer": "clrecon.operators.renderer",
-    "choose_iso_value": "clrecon.geometry",
+    "choose_iso_value": "clrecon.anatomy.iso_choice",
     "compare_meshes": "clrecon.mesh.distances",
     "cut_slice": "clrecon.operators.reformat",
     "decimate_mesh": "clrecon.mesh.refinement",
@@ -117,15 +118,15 @@ _HOMES = {
     "extract_isosurfaces": "clrecon.operators.isosurface",
     "extract_label_masks": "clrecon.operators.label_masks",
     "extract_labels": "clrecon.operators.labels",
-    "find_spine_line": "clrecon.geometry.spine_line",
+    "find_spine_line": "clrecon.anatomy.spine_line",
     "list_series": "clrecon.reading",
     "load_transfer_function": "clrecon.rendering",
-    "mask_field_of_view": "clrecon.geometry.body",
+    "mask_field_of_view": "clrecon.anatomy.body",
     "read_curve_points": "clrecon.formats.curve_points",
     "read_labels": "clrecon.labels",
     "read_volume": "clrecon.reading",
     "reformat_curve": "clrecon.operators.reformat",
-    "remove_table": "clrecon.geometry.body",
+    "remove_table": "clrecon.anatomy.body",
     "render": "clrecon.operators.renderer",
     "smooth_mesh": "clrecon.mesh.smoothing",
     "turntable_cameras": "clrecon.rendering.motion",

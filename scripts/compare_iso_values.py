@@ -22,10 +22,10 @@ from numpy.typing import NDArray
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))
 
+from clrecon.anatomy import iso_choice as choice  # noqa: E402
+from clrecon.anatomy.bone_edges import measure_edges  # noqa: E402
 from clrecon.errors import NoSurfaceError  # noqa: E402
 from clrecon.geometry import Volume, column_spacing  # noqa: E402
-from clrecon.geometry import iso_choice as choice  # noqa: E402
-from clrecon.geometry.bone_edges import measure_edges  # noqa: E402
 
 Array = NDArray[Any]
 SPHERE_RADIUS, BONE_HU, TISSUE_HU = 10.0, 1040.0, 40.0

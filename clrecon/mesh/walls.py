@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from clrecon.anatomy.dense_pieces import RAIL_MM, STRAIGHT_MM
 from clrecon.errors import UsageError
 from clrecon.geometry import Volume
-from clrecon.geometry.dense_pieces import RAIL_MM, STRAIGHT_MM
 from clrecon.geometry.field import IsoRule
 from clrecon.mesh.iso_distance import trilinear_values
 from clrecon.mesh.mesh import Mesh

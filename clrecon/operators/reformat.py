@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from clrecon.anatomy.spine_line import find_spine_line
 from clrecon.errors import UsageError
 from clrecon.geometry import Volume
 from clrecon.geometry.affine import Float64Array
@@ -15,7 +16,6 @@ from clrecon.geometry.camera import Camera
 from clrecon.geometry.curved_sheets import CurvedSheet, straightened_sheet, stretched_length, stretched_sheet
 from clrecon.geometry.curves import Curve
 from clrecon.geometry.sheets import Sheet, find_plane, finest_step, plane_sheet, positive_mm, slab_samples
-from clrecon.geometry.spine_line import find_spine_line
 from clrecon.geometry.views import checked_size, find_up, find_view
 from clrecon.opencl import Device, Stopwatch, check_memory, choose_device
 from clrecon.operators.sheets import Reformation, sample_sheet
@@ -220,7 +220,7 @@ def reformat_curve(
     volume : Volume
     curve : Curve, array_like of shape (n, 3), or "spine"
         Points of the centre line in LPS mm, all within the volume; a smooth curve is laid through them.  "spine" looks
-        for the spinal canal, see `clrecon.geometry.spine_line`.
+        for the spinal canal, see `clrecon.anatomy.spine_line`.
     kind : {"straightened", "stretched"}
         Straightened: the centre line is a straight line down the picture, each row lies across it.  Stretched: rows
         keep one direction in the patient, the picture is the surface that they make, unrolled; all lengths within

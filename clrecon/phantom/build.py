@@ -17,10 +17,10 @@ from numpy.typing import NDArray
 
 from clrecon.errors import OutputError, UsageError
 from clrecon.geometry import column_spacing, tilt_degrees
-from clrecon.phantom.anatomy import Anatomy
 from clrecon.phantom.bodies import choose_body
 from clrecon.phantom.dicom_series import RESCALE_INTERCEPT, write_series
 from clrecon.phantom.label_map import write_label_map
+from clrecon.phantom.plan import Anatomy
 from clrecon.phantom.sampling import add_noise, apply_point_spread, sample_occupancy
 from clrecon.phantom.scene_plans import plan_scene
 from clrecon.phantom.scenes import CEILING_HU, DENSE_HU, LabelArray, describe_parts, draw_scene

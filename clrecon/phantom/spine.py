@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.geometry import column_spacing
-from clrecon.phantom.anatomy import Anatomy, Vertebra, plan_anatomy
 from clrecon.phantom.fields import Field, capsule, coverage, ellipse, waves_at
 from clrecon.phantom.placing import Piece, PlacedPiece, Window, paint
+from clrecon.phantom.plan import Anatomy, Vertebra, plan_anatomy
 from clrecon.phantom.scenes import Plan
 from clrecon.phantom.settings import CENTRE_LPS_MM, PhantomSettings
 from clrecon.phantom.tables import lay_under

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from clrecon.phantom.anatomy import Anatomy
 from clrecon.phantom.fields import Field, capsule, coverage, ellipse, ellipsoid
+from clrecon.phantom.plan import Anatomy
 from clrecon.phantom.scenes import Part
 
 __all__ = ["draw_tissue"]

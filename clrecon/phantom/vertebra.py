@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from clrecon.phantom.anatomy import Vertebra
 from clrecon.phantom.fields import Field, capsule, ellipse, smooth_union
+from clrecon.phantom.plan import Vertebra
 
 __all__ = ["canal_distance", "local_bounds", "vertebra_distance"]
 

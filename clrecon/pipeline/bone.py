@@ -17,7 +17,8 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from clrecon.geometry import IsoChoice, Volume
+    from clrecon.anatomy.iso_choice import IsoChoice
+    from clrecon.geometry import Volume
     from clrecon.geometry.field import IsoRule
     from clrecon.mesh import Mesh
     from clrecon.mesh.components import Labelled
@@ -125,7 +126,7 @@ def _holds_spine(mesh: Mesh, volume: Volume, count: int, labels: NDArray[np.int6
     """The component with the most vertices around the spinal canal, where one is found."""
     import numpy as np
 
-    from clrecon.geometry.spine_line import find_spine_line
+    from clrecon.anatomy.spine_line import find_spine_line
     from clrecon.mesh.walls import lie_near_line
 
     found = np.zeros(count, dtype=bool)

@@ -15,7 +15,8 @@ from clrecon.pipeline.settings import MeshSettings
 from clrecon.version import package_version
 
 if TYPE_CHECKING:
-    from clrecon.geometry import IsoChoice, Volume
+    from clrecon.anatomy.iso_choice import IsoChoice
+    from clrecon.geometry import Volume
     from clrecon.mesh import Mesh
     from clrecon.opencl import Device
     from clrecon.system.files import StagedFile

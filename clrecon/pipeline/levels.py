@@ -9,7 +9,8 @@ from clrecon.pipeline.settings import MeshSettings
 from clrecon.system.wording import name_parameter
 
 if TYPE_CHECKING:
-    from clrecon.geometry import IsoChoice, Volume
+    from clrecon.anatomy.iso_choice import IsoChoice
+    from clrecon.geometry import Volume
 
 __all__ = ["choose_level", "describe_level", "warn_of_contrast"]
 
@@ -26,7 +27,7 @@ def choose_level(volume: Volume, settings: MeshSettings) -> IsoChoice | None:
     NoSurfaceError
         "auto" finds no two materials.
     """
-    from clrecon.geometry import choose_iso_value, half_iso_value
+    from clrecon.anatomy.iso_choice import choose_iso_value, half_iso_value
 
     if settings.half_way is None:
         return None
@@ -63,7 +64,7 @@ def describe_level(
 
 def warn_of_contrast(choice: IsoChoice) -> list[str]:
     """What the edges that an iso value was chosen by say of contrast medium."""
-    from clrecon.geometry.iso_choice import CONTRAST_SAID
+    from clrecon.anatomy.iso_choice import CONTRAST_SAID
 
     if choice.flat_share is None or choice.flat_share < CONTRAST_SAID:
         return []

@@ -27,7 +27,7 @@ def mask_volume(volume: Volume, settings: MeshSettings | RenderSettings, progres
     """
     if settings.field_of_view is None and not settings.remove_table:
         return volume
-    from clrecon.geometry.body import mask_field_of_view, remove_table
+    from clrecon.anatomy.body import mask_field_of_view, remove_table
 
     progress("mask", 0, 0)
     warnings = list(volume.report["warnings"])
@@ -81,7 +81,7 @@ def leave_outside(volume: Volume, settings: MeshSettings, progress: Progress) ->
     """
     if settings.below is None or settings.keep_outside:
         return volume
-    from clrecon.geometry.outside_air import leave_outside_air
+    from clrecon.anatomy.outside_air import leave_outside_air
 
     progress("mask", 0, 0)
     warnings = list(volume.report["warnings"])

@@ -44,7 +44,7 @@ class MeshSettings:
     allow_gaps : bool
         Read a stack with missing slices.
     remove_table : bool
-        Turn what is not the patient's body into air first, see `clrecon.geometry.body.remove_table`.
+        Turn what is not the patient's body into air first, see `clrecon.anatomy.body.remove_table`.
     allow_bone_loss : bool
         Go on where this takes more than 2 % of the bone.
     field_of_view : float or "auto", optional
@@ -173,7 +173,7 @@ class MeshSettings:
             if self.half_way != "auto":
                 raise UsageError(f"half way between what? {self.half_way!r} is neither auto nor two numbers of HU")
             return
-        from clrecon.geometry import half_iso_value  # numpy: not wanted before a job starts
+        from clrecon.anatomy.iso_choice import half_iso_value
 
         if len(self.half_way) != 2:
             raise UsageError(f"half way needs two numbers of HU, bone and tissue, not {tuple(self.half_way)}")
@@ -247,7 +247,7 @@ class MeshSettings:
         if isinstance(self.half_way, str):
             return (math.nan,)
         if self.half_way is not None:
-            from clrecon.geometry import half_iso_value  # numpy: not wanted before a job starts
+            from clrecon.anatomy.iso_choice import half_iso_value
 
             return (half_iso_value(*self.half_way).iso_value,)
         if self.iso_value is None:

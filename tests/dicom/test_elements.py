@@ -280,7 +280,7 @@ def test_what_takes_long_to_load_is_loaded_only_where_it_is_needed(tmp_path: Pat
     code = "import sys, clrecon; clrecon.read_volume(sys.argv[1]); print([n in sys.modules for n in sys.argv[2:]])"
     environment = {**os.environ, "PYTHONPATH": str(Path(elements.__file__).parents[2])}
     done = subprocess.run(
-        [sys.executable, "-c", code, str(tmp_path), "pydicom", "numpy.ma", "clrecon.geometry.iso_choice"],
+        [sys.executable, "-c", code, str(tmp_path), "pydicom", "numpy.ma", "clrecon.anatomy.iso_choice"],
         capture_output=True,
         text=True,
         env=environment,

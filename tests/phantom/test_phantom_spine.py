@@ -7,7 +7,7 @@ import pytest
 
 from clrecon.geometry import apply_affine
 from clrecon.phantom import PhantomSettings, make_phantom
-from clrecon.phantom.anatomy import plan_anatomy
+from clrecon.phantom.plan import plan_anatomy
 from clrecon.phantom.vertebra import canal_distance, vertebra_distance
 
 CLEAN = {"noise": 0.0, "point_spread_mm": 0.0}

@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 import tolerances
 
+from clrecon.anatomy.iso_choice import half_iso_value
 from clrecon.errors import NoSurfaceError, UsageError
-from clrecon.geometry import Volume, half_iso_value
+from clrecon.geometry import Volume
 from clrecon.pipeline.levels import choose_level, describe_level
 from clrecon.pipeline.mesh import make_mesh
 from clrecon.pipeline.settings import MeshSettings

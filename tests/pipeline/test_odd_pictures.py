@@ -9,8 +9,8 @@ import pytest
 from odd_bodies import BODIES, OddBodies
 from scipy import ndimage
 
+from clrecon.anatomy.body import remove_table
 from clrecon.geometry import Volume
-from clrecon.geometry.body import remove_table
 from clrecon.operators.renderer import VolumeRenderer
 from clrecon.pipeline.render_report import find_emptiness
 from clrecon.rendering import PRESETS, Rendering

@@ -20,22 +20,35 @@ def _layer(name: str, *allowed: str) -> None:
 
 _layer(
     "__init__",
-    *("errors", "version", "geometry", "formats", "reading", "labels", "mesh", "rendering", "opencl", "operators"),
+    *(
+        "errors",
+        "version",
+        "geometry",
+        "anatomy",
+        "formats",
+        "reading",
+        "labels",
+        "mesh",
+        "rendering",
+        "opencl",
+        "operators",
+    ),
 )
 _layer("errors")
 _layer("version")
 _layer("system", "errors")
 _layer("geometry", "errors", "system")
+_layer("anatomy", "errors", "system", "geometry")
 _layer("dicom", "system", "errors", "geometry")
-_layer("mesh", "system", "errors", "version", "geometry")
-_layer("formats", "system", "errors", "geometry", "dicom")
+_layer("mesh", "system", "errors", "version", "geometry", "anatomy")
+_layer("formats", "system", "errors", "geometry", "anatomy", "dicom")
 _layer("reading", "system", "errors", "geometry", "dicom", "formats")
 _layer("labels", "system", "errors", "geometry", "dicom", "formats")
 _layer("reference", "system", "errors", "geometry", "labels", "rendering")
 _layer("phantom", "system", "errors", "version", "geometry")
 _layer("rendering", "system", "errors", "version", "geometry", "labels")
 _layer("opencl", "errors", "system")
-_layer("operators", "system", "errors", "geometry", "labels", "mesh", "rendering", "opencl")
+_layer("operators", "system", "errors", "geometry", "anatomy", "labels", "mesh", "rendering", "opencl")
 _layer("pipeline", *(set(LEFT_OF) - {"__init__"}))
 _layer("viewer", "errors", "system", "geometry", "mesh", "rendering", "pipeline")
 _layer("cli", "errors", "system", "version", "pipeline", "viewer")
@@ -45,6 +58,7 @@ _layer("__main__", "cli")
 AT_MODULE_LEVEL: dict[str, frozenset[str]] = {
     "system": frozenset({"numpy"}),
     "geometry": frozenset({"numpy"}),
+    "anatomy": frozenset({"numpy"}),
     "dicom": frozenset({"numpy", "pydicom"}),
     "formats": frozenset({"numpy"}),
     "labels": frozenset({"numpy"}),
@@ -59,6 +73,7 @@ AT_MODULE_LEVEL: dict[str, frozenset[str]] = {
 }
 INSIDE_FUNCTIONS: dict[str, frozenset[str]] = {
     "geometry": frozenset({"scipy", "pyvista"}),
+    "anatomy": frozenset({"scipy"}),
     "dicom": frozenset({"imagecodecs", "openjpeg", "rle", "jpeg_ls", "pylibjpeg"}),
     "formats": frozenset({"nibabel", "nrrd", "SimpleITK"}),
     "labels": frozenset({"pydicom", "scipy"}),

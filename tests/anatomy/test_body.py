@@ -7,9 +7,9 @@ import pytest
 from body_volumes import AFFINE, SHAPE, X, Y, add_table, as_volume, make_patient
 
 import clrecon
+from clrecon.anatomy.body import find_body, mask_field_of_view, remove_table
 from clrecon.errors import RefusedInputError, UsageError
 from clrecon.geometry import AIR_HU, Volume
-from clrecon.geometry.body import find_body, mask_field_of_view, remove_table
 
 SPACING = (2.0, 1.8, 2.5)
 

@@ -16,9 +16,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from clrecon.anatomy.body_cells import Cells, Mask, grow, measure_cells
+from clrecon.anatomy.dense_pieces import BONE_KEPT, DensePieces, find_dense_pieces, judge_bone, judge_circle
 from clrecon.errors import RefusedInputError, UsageError
-from clrecon.geometry.body_cells import Cells, Mask, grow, measure_cells
-from clrecon.geometry.dense_pieces import BONE_KEPT, DensePieces, find_dense_pieces, judge_bone, judge_circle
 from clrecon.geometry.volume import AIR_HU, Volume
 
 __all__ = ["find_body", "find_unmeasured", "mask_field_of_view", "remove_table"]
@@ -51,7 +51,7 @@ def remove_table(volume: Volume, *, allow_bone_loss: bool = False) -> Volume:
     """Turn everything outside of the patient's body into air: table, blankets, cables.
 
     Bone and all else within the body keep their values; so does a margin of 3 mm around it.  Dry specimens are kept
-    whole, see `clrecon.geometry.dense_pieces`.  The result is meant to be looked at: a part of the table that lies
+    whole, see `clrecon.anatomy.dense_pieces`.  The result is meant to be looked at: a part of the table that lies
     within the margin stays.
 
     Parameters

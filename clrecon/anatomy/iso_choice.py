@@ -28,8 +28,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from clrecon.anatomy.bone_edges import Background, BoneEdges, leave_contrast_medium, measure_edges
 from clrecon.errors import NoSurfaceError, UsageError
-from clrecon.geometry.bone_edges import Background, BoneEdges, leave_contrast_medium, measure_edges
 from clrecon.geometry.volume import AIR_HU, Volume
 from clrecon.system.wording import name_parameter
 

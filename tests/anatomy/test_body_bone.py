@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from odd_bodies import BODIES, OddBodies
 
+from clrecon.anatomy.body import mask_field_of_view, remove_table
 from clrecon.errors import RefusedInputError
 from clrecon.geometry import Volume
-from clrecon.geometry.body import mask_field_of_view, remove_table
 from clrecon.phantom import MATERIALS, PhantomSettings, label_materials, make_phantom
 
 SPECIMENS = {"skull", "skull-prone", "bones"}

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from body_volumes import AFFINE, SHAPE, add_table, as_volume, ellipse, make_patient
 
+from clrecon.anatomy.outside_air import leave_outside_air
 from clrecon.errors import NoSurfaceError, RefusedInputError
 from clrecon.geometry import Volume
-from clrecon.geometry.outside_air import leave_outside_air
 
 ML = abs(np.linalg.det(AFFINE[:3, :3])) / 1000.0
 

@@ -1,6 +1,6 @@
 """What below an iso value is air round the patient, and what is lung, airway, sinus or bowel gas.
 
-The body (`clrecon.geometry.body`) says what is outside: its cavities belong to it.  Where an airway is open to the
+The body (`clrecon.anatomy.body`) says what is outside: its cavities belong to it.  Where an airway is open to the
 outside, at nostrils or mouth, it is cut a little under the skin, and the area of the cut is said.
 """
 
@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from clrecon.anatomy.body import MARGIN_MM, TISSUE_HU, find_body, find_unmeasured
 from clrecon.errors import NoSurfaceError, RefusedInputError
-from clrecon.geometry.body import MARGIN_MM, TISSUE_HU, find_body, find_unmeasured
 from clrecon.geometry.volume import AIR_HU, Volume
 from clrecon.system.wording import name_parameter
 

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clrecon.geometry.body_cells import DENSE_HU, Cells, Mask
+from clrecon.anatomy.body_cells import DENSE_HU, Cells, Mask
 from clrecon.system.gates import Gate, at_least, unmeasured
 
 __all__ = ["BONE_KEPT", "DensePieces", "find_dense_pieces", "judge_bone", "judge_circle"]

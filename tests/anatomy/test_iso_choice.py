@@ -16,9 +16,10 @@ from hypothesis import strategies as st
 from scipy.ndimage import gaussian_filter
 
 import clrecon
+from clrecon.anatomy import iso_choice
+from clrecon.anatomy.iso_choice import choose_iso_value, half_iso_value
 from clrecon.errors import NoSurfaceError, UsageError
-from clrecon.geometry import Volume, half_iso_value, iso_choice
-from clrecon.geometry.iso_choice import choose_iso_value
+from clrecon.geometry import Volume
 from clrecon.phantom import PhantomSettings, make_phantom
 
 SPINE = {"size": (192, 192), "slices": 40, "spacing": (1.0, 1.0, 1.25)}
