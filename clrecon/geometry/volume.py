@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from clrecon.errors import UsageError
 from clrecon.geometry.affine import Float64Array, checked_affine, checked_points
 from clrecon.geometry.grid import Grid
-from clrecon.geometry.stack import UnevenStack
+from clrecon.geometry.uneven import UnevenStack
 from clrecon.system.mapping import find_mapping
 
 __all__ = ["AIR_HU", "DEVICE_DTYPES", "Volume"]
@@ -204,7 +204,7 @@ class Volume(Grid):
         UsageError
             The volume is sheared or unevenly spaced, and is not to be resampled.
         """
-        from clrecon.geometry.image_data import make_image_data
+        from clrecon.geometry.vtk import make_image_data
 
         dtype = self.voxels.dtype
         air = AIR_HU if dtype.kind == "f" else max(AIR_HU, np.iinfo(dtype).min)

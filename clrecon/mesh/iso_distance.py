@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.geometry import Volume
-from clrecon.geometry.field import IsoRule, layer_normal_matrices
+from clrecon.geometry.iso_rule import IsoRule, layer_normal_matrices
 from clrecon.mesh.distances import summarise_distances
 from clrecon.mesh.mesh import Mesh
 from clrecon.system.pieces import chunks
@@ -226,7 +226,7 @@ def measure_iso_distance(mesh: Mesh, volume: Volume, rule: IsoRule, samples: int
     volume : Volume
         The mesh was made from it.
     rule : IsoRule
-        The mesh was made with it, see `clrecon.geometry.field.choose_iso_rule`.
+        The mesh was made with it, see `clrecon.geometry.iso_rule.choose_iso_rule`.
     samples : int
         Vertices and triangles that are looked at, at most: every n-th.
 

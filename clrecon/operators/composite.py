@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.geometry.camera import Camera
-from clrecon.geometry.field import takes_parts
+from clrecon.geometry.iso_rule import takes_parts
 from clrecon.labels.resample import ResampledLabels
 from clrecon.opencl import (
     Device,

@@ -11,7 +11,7 @@ from numpy.typing import DTypeLike, NDArray
 
 from clrecon.errors import ClreconError, DeviceError, DeviceMemoryError, NoSurfaceError, UsageError
 from clrecon.geometry import Volume
-from clrecon.geometry.field import IsoRule, Level, ValueRange, check_topology, choose_iso_rule, data_range
+from clrecon.geometry.iso_rule import IsoRule, Level, ValueRange, check_topology, choose_iso_rule, data_range
 from clrecon.geometry.precision import describe_far
 from clrecon.mesh import Mesh
 from clrecon.opencl import (

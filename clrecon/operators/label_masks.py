@@ -14,7 +14,7 @@ from numpy.typing import DTypeLike
 
 from clrecon.errors import RefusedInputError, UsageError
 from clrecon.geometry import Volume
-from clrecon.geometry.field import IsoRule
+from clrecon.geometry.iso_rule import IsoRule
 from clrecon.geometry.precision import describe_far
 from clrecon.labels import LabelMap
 from clrecon.labels.enclosed import FACES_PER_AREA, Borders, choose_levels, find_enclosed, level_biases

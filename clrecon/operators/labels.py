@@ -14,7 +14,7 @@ from numpy.typing import DTypeLike
 
 from clrecon.errors import NoSurfaceError, UsageError
 from clrecon.geometry import Volume
-from clrecon.geometry.field import IsoRule, choose_iso_rule
+from clrecon.geometry.iso_rule import IsoRule, choose_iso_rule
 from clrecon.geometry.precision import describe_far
 from clrecon.labels import LabelMap, ResampledLabels, resample_labels
 from clrecon.labels.growth import Growth

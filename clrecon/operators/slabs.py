@@ -8,7 +8,7 @@ from functools import cached_property
 
 from clrecon.errors import DeviceError
 from clrecon.geometry import Volume, is_left_handed
-from clrecon.geometry.field import IsoRule
+from clrecon.geometry.iso_rule import IsoRule
 from clrecon.opencl import Device, describe_shortage, memory_limits
 
 __all__ = ["SampleGrid", "Slab", "plan_slabs"]

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from clrecon.geometry import Volume
 from clrecon.geometry.affine import Float64Array
-from clrecon.geometry.field import slice_normal_matrices
+from clrecon.geometry.iso_rule import slice_normal_matrices
 from clrecon.opencl import Device, upload
 from clrecon.operators.frame import FieldFrame
 

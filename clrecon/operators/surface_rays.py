@@ -14,7 +14,7 @@ from clrecon.geometry import Volume
 from clrecon.geometry.affine import Float64Array
 from clrecon.geometry.camera import Camera, box_corners
 from clrecon.geometry.clip import Clip
-from clrecon.geometry.field import IsoRule, ValueRange, choose_iso_rule
+from clrecon.geometry.iso_rule import IsoRule, ValueRange, choose_iso_rule
 from clrecon.labels import resample_labels
 from clrecon.opencl import Stopwatch, launch, memory_limits, upload
 from clrecon.operators.frame import FieldFrame, enclose
@@ -54,7 +54,7 @@ def cast_surface(
     """Show where the field first reaches an iso value along each ray.
 
     The field is that of the closed mesh of `extract_isosurface`, so that depths are those of the mesh: surrounded by a
-    layer of outside, its surface at the level of `clrecon.geometry.field.IsoRule`.  Between the first sample that is
+    layer of outside, its surface at the level of `clrecon.geometry.iso_rule.IsoRule`.  Between the first sample that is
     inside and the one before, the surface is found to 1e-3 of a step.  A ray that begins inside has its hit at once: on
     a clip plane with the plane's normal, so that cut bone is flat; at a camera in there with the ray's direction.
 

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
     from clrecon.anatomy.iso_choice import IsoChoice
     from clrecon.geometry import Volume
-    from clrecon.geometry.field import IsoRule
+    from clrecon.geometry.iso_rule import IsoRule
     from clrecon.mesh import Mesh
     from clrecon.mesh.components import Labelled
 

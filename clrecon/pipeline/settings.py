@@ -144,7 +144,7 @@ class MeshSettings:
         check_field_of_view(self.field_of_view)
         check_bone_loss(self.remove_table, self.allow_bone_loss)
         from clrecon.geometry import frame_from_lps  # numpy: not wanted before a job starts
-        from clrecon.geometry.field import check_topology
+        from clrecon.geometry.iso_rule import check_topology
 
         frame_from_lps(self.space)
         check_topology(self.topology)
@@ -263,7 +263,7 @@ class MeshSettings:
 
     @property
     def inside(self) -> str:
-        """What the surfaces enclose, see `clrecon.geometry.field.IsoRule`; "between" where one of them is a range."""
+        """What the surfaces enclose, see `clrecon.geometry.iso_rule.IsoRule`; "between" where one is a range."""
         if self.below is not None:
             return "below"
         return "between" if any(isinstance(level, tuple) for level in self.levels) else "above"

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.geometry import Volume, is_left_handed
-from clrecon.geometry.field import (
+from clrecon.geometry.iso_rule import (
     IsoRule,
     Level,
     choose_iso_rule,

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.geometry import Volume
-from clrecon.geometry.field import IsoRule
+from clrecon.geometry.iso_rule import IsoRule
 from clrecon.labels.enclosed import Borders, choose_levels, count_faces, find_enclosed, level_biases
 from clrecon.labels.occupancy import FULL, KEEP, REACH, next_level
 from clrecon.reference.isosurface import (

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.geometry import Volume
-from clrecon.geometry.field import choose_iso_rule
+from clrecon.geometry.iso_rule import choose_iso_rule
 from clrecon.labels.growth import Growth
 from clrecon.labels.solid import fill_solid, find_boxes
 from clrecon.reference.isosurface import Surface, extract_inside, sample_grid

@@ -16,7 +16,7 @@ from clrecon.errors import UsageError
 from clrecon.geometry import Volume
 from clrecon.geometry.affine import Float64Array
 from clrecon.geometry.camera import Camera
-from clrecon.geometry.field import slice_normal_matrices, takes_parts
+from clrecon.geometry.iso_rule import slice_normal_matrices, takes_parts
 from clrecon.reference.rays import Planes, box_of, find_interval, jitter_pixels, sample_field, voxel_gradients
 from clrecon.rendering import Lighting, TransferFunction
 from clrecon.rendering.lighting import LEAST_SOFT_GRADIENT

@@ -155,7 +155,7 @@ def voxel_gradients(voxels: NDArray, matrices: Float64Array) -> Float64Array:
     ----------
     voxels : ndarray, shape (nk, nj, ni)
     matrices : ndarray, shape (nk, 3, 3), float64
-        Of each slice, from `clrecon.geometry.field.slice_normal_matrices`.
+        Of each slice, from `clrecon.geometry.iso_rule.slice_normal_matrices`.
 
     Returns
     -------

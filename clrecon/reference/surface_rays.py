@@ -1,7 +1,7 @@
 """Twin of mode surface: the first place of each ray where the closed field reaches an iso value, shaded.
 
 The field is the one that `clrecon.operators.isosurface` takes its closed mesh from: surrounded by a layer of outside,
-its surface at the level of `clrecon.geometry.field.IsoRule`.
+its surface at the level of `clrecon.geometry.iso_rule.IsoRule`.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from clrecon.geometry import Volume
 from clrecon.geometry.affine import Float64Array
 from clrecon.geometry.camera import Camera
-from clrecon.geometry.field import choose_iso_rule, slice_normal_matrices
+from clrecon.geometry.iso_rule import choose_iso_rule, slice_normal_matrices
 from clrecon.reference.raycast import RayPicture, shade
 from clrecon.reference.rays import Planes, box_of, find_interval, sample_field, voxel_gradients
 from clrecon.rendering import Lighting
@@ -93,7 +93,7 @@ def cast_surface(
     Raises
     ------
     UsageError, NoSurfaceError
-        As `clrecon.geometry.field.choose_iso_rule`.
+        As `clrecon.geometry.iso_rule.choose_iso_rule`.
     """
     step = 0.5 * min(volume.spacing) if ray_step is None else float(ray_step)
     field, box = _ClosedField(volume, iso_value), box_of(volume, border=1.0)

@@ -93,7 +93,7 @@ class PeerSide:
 def level_of(volume: Any, hu: float) -> float:
     """Where the surface lies between two voxels: k - 0.5 for whole HU.  Asks one voxel: the caches stay as they are."""
     from clrecon.geometry import Volume
-    from clrecon.geometry.field import choose_iso_rule
+    from clrecon.geometry.iso_rule import choose_iso_rule
 
     return float(choose_iso_rule(Volume(volume.voxels[:1, :1, :1], volume.affine), hu, closed=False).iso_level)
 

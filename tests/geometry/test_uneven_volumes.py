@@ -9,7 +9,7 @@ from uneven_volume import IN_PLANE, positions, uneven
 
 from clrecon.errors import UsageError
 from clrecon.geometry import Volume
-from clrecon.geometry.field import layer_normal_matrices, slice_normal_matrices
+from clrecon.geometry.iso_rule import layer_normal_matrices, slice_normal_matrices
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])

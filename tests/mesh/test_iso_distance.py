@@ -8,7 +8,7 @@ import tolerances
 from scipy.ndimage import map_coordinates
 
 from clrecon.geometry import Volume, compose_affine
-from clrecon.geometry.field import choose_iso_rule
+from clrecon.geometry.iso_rule import choose_iso_rule
 from clrecon.mesh import Mesh
 from clrecon.mesh.iso_distance import (
     distances_to_iso_surface,

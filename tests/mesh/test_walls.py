@@ -7,7 +7,7 @@ import pytest
 
 from clrecon.errors import UsageError
 from clrecon.geometry import Volume
-from clrecon.geometry.field import choose_iso_rule
+from clrecon.geometry.iso_rule import choose_iso_rule
 from clrecon.mesh import Mesh
 from clrecon.mesh.connectivity import label_components
 from clrecon.mesh.walls import Walls, judge_components, judge_walls, looks_like_bone, normals_of, sample_walls

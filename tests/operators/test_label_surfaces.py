@@ -9,7 +9,7 @@ from variants import VOXEL_TYPES
 
 from clrecon.errors import DeviceError, NoSurfaceError, RefusedInputError, UsageError
 from clrecon.geometry import Volume
-from clrecon.geometry.field import choose_iso_rule
+from clrecon.geometry.iso_rule import choose_iso_rule
 from clrecon.labels import LabelMap, resample_labels
 from clrecon.labels.growth import Growth
 from clrecon.operators import labels as operator

@@ -11,7 +11,7 @@ from surface_volumes import MIRRORED, OBLIQUE, random_volume, smooth_volume
 
 from clrecon.errors import DeviceError, DeviceMemoryError, UsageError
 from clrecon.geometry import Volume
-from clrecon.geometry.field import choose_iso_rule
+from clrecon.geometry.iso_rule import choose_iso_rule
 from clrecon.operators import isosurface, marching_cubes
 from clrecon.operators.isosurface import SurfaceExtractor, extract_isosurface
 from clrecon.operators.slabs import SampleGrid, Slab, plan_slabs

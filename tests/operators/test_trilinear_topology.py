@@ -10,7 +10,7 @@ from variants import VOXEL_TYPES
 
 from clrecon.errors import UsageError
 from clrecon.geometry import Volume, compose_affine
-from clrecon.geometry.field import choose_iso_rule
+from clrecon.geometry.iso_rule import choose_iso_rule
 from clrecon.operators.isosurface import SurfaceExtractor, extract_isosurface
 from clrecon.reference import isosurface as twin
 from clrecon.reference.trilinear_table import find_states

@@ -9,7 +9,7 @@ from dicom_series import rotation
 from slab_surfaces import assert_same, extract_in_slabs
 
 from clrecon.geometry import Volume
-from clrecon.geometry.field import choose_iso_rule
+from clrecon.geometry.iso_rule import choose_iso_rule
 from clrecon.labels import LabelMap
 from clrecon.mesh.iso_distance import distances_to_iso_surface
 from clrecon.operators.isosurface import extract_isosurface

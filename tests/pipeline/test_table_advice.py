@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from clrecon.geometry import Volume
-from clrecon.geometry.field import choose_iso_rule
+from clrecon.geometry.iso_rule import choose_iso_rule
 from clrecon.mesh import Mesh
 from clrecon.mesh.connectivity import label_components
 from clrecon.pipeline.bone import find_bone, warn_of_walls

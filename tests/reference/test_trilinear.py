@@ -13,7 +13,7 @@ import tolerances
 from trilinear_truth import find_topology
 
 from clrecon.geometry import Volume
-from clrecon.geometry.field import choose_iso_rule
+from clrecon.geometry.iso_rule import choose_iso_rule
 from clrecon.mesh import Mesh
 from clrecon.reference.case_table import CORNERS, EDGES, FACES, find_ambiguous_faces
 from clrecon.reference.isosurface import extract_isosurface

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from clrecon.geometry.field import choose_iso_rule
+from clrecon.geometry.iso_rule import choose_iso_rule
 from clrecon.operators.isosurface import SurfaceExtractor
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from clrecon.errors import NoSurfaceError, UsageError
 from clrecon.geometry import AIR_HU, Volume
-from clrecon.geometry.field import choose_iso_rule, vertex_margin
+from clrecon.geometry.iso_rule import choose_iso_rule, vertex_margin
 
 
 def make_volume(low: float, high: float, dtype: str = "int16") -> Volume:
