@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from clrecon.errors import RefusedInputError, UsageError
-from clrecon.formats.stream import show_name
 from clrecon.geometry.affine import Float64Array
 from clrecon.system.files import read_regular
+from clrecon.system.text import escape_text
 
 __all__ = ["read_curve_points"]
 
@@ -50,7 +50,7 @@ def read_curve_points(path: str | Path, space: str | None = None) -> Float64Arra
     if space is not None and space not in ("lps", "ras"):
         raise UsageError(f"points are in the frame lps or ras, not {space!r}")
     file = Path(path)
-    shown = show_name(file)
+    shown = escape_text(file.name)
     text = _read_text(file, shown)
     name = file.name.lower()
     if name.endswith(".fcsv"):

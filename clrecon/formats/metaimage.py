@@ -22,7 +22,7 @@ import numpy as np
 from clrecon.errors import RefusedInputError, UsageError
 from clrecon.formats.extras import import_extra
 from clrecon.formats.grid_file import GridFile, Purpose
-from clrecon.formats.stream import VoxelBytes, file_beside, show_name
+from clrecon.formats.stream import VoxelBytes, file_beside
 from clrecon.geometry.affine import Float64Array, checked_affine
 from clrecon.system.files import open_regular
 from clrecon.system.text import escape_text
@@ -75,7 +75,7 @@ def open_metaimage(path: Path, purpose: Purpose) -> GridFile:
         The header is corrupt, does not say where the voxels lie, or names files elsewhere or several; the voxels are
         text, colours or vectors, or have more than three axes.
     """
-    name = show_name(path)
+    name = escape_text(path.name)
     fields, end = _read_fields(path, name)
     header = _Header(fields, name, purpose)
     header.check()

@@ -20,7 +20,7 @@ import numpy as np
 from clrecon.errors import RefusedInputError, UsageError
 from clrecon.formats.extras import import_extra
 from clrecon.formats.grid_file import GridFile, Purpose
-from clrecon.formats.stream import VoxelBytes, file_beside, read_bytes, show_name
+from clrecon.formats.stream import VoxelBytes, file_beside, read_bytes
 from clrecon.geometry.affine import Float64Array, checked_affine
 from clrecon.geometry.frames import lps_affine_from_ras
 from clrecon.system.files import open_regular
@@ -71,7 +71,7 @@ def open_nifti(path: Path, purpose: Purpose) -> GridFile:
     RefusedInputError
         The file is cut or corrupt, not placed, has colours, or more than three axes.
     """
-    name = show_name(path)
+    name = escape_text(path.name)
     with open_regular(path) as file:
         compressed = _is_gzip(file)
         header = _read_header(cast(BinaryIO, gzip.GzipFile(fileobj=file)) if compressed else file, name, purpose)
@@ -136,7 +136,7 @@ def _find_voxels(path: Path, compressed: bool, header: _Header) -> VoxelBytes:
         match = re.fullmatch(r"(.*)\.hdr(\.gz)?", path.name, re.IGNORECASE | re.DOTALL)
         if match is None:
             raise RefusedInputError(
-                f"{show_name(path)} is the header of a NIfTI pair: its name must end with .hdr, that of the voxels"
+                f"{escape_text(path.name)} is the header of a NIfTI pair: its name must end with .hdr, that of the voxels"
                 " with .img"
             )
         stem = match[1]

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from clrecon.errors import RefusedInputError, UsageError
 from clrecon.formats.extras import import_extra
 from clrecon.formats.grid_file import LABEL_MAP, GridFile, Purpose
-from clrecon.formats.stream import VoxelBytes, show_name
+from clrecon.formats.stream import VoxelBytes
 from clrecon.geometry.affine import Float64Array, checked_affine, compose_affine
 from clrecon.system.files import open_regular
 from clrecon.system.text import escape_text
@@ -72,7 +72,7 @@ def open_nrrd(path: Path, purpose: Purpose) -> GridFile:
     RefusedInputError
         The file is cut or corrupt, not placed, or has more than three axes (label maps: and a list of layers).
     """
-    name = show_name(path)
+    name = escape_text(path.name)
     with open_regular(path) as file:
         start = file.read(LARGEST_HEADER)
     end = re.search(rb"\r?\n\r?\n", start)

@@ -10,10 +10,10 @@ from clrecon.errors import RefusedInputError
 from clrecon.formats.certificate import MODALITY, certify_grid, collect_header_warnings, collect_value_warnings
 from clrecon.formats.grid_file import VOLUME, GridFile
 from clrecon.formats.kinds import open_grid
-from clrecon.formats.stream import show_name
 from clrecon.formats.values import GridValues, read_values
 from clrecon.geometry import Volume
 from clrecon.system.progress import Progress
+from clrecon.system.text import escape_text
 
 __all__ = ["list_grid", "read_grid"]
 
@@ -85,7 +85,7 @@ def _open(path: Path, kind: str) -> GridFile:
     try:
         grid = open_grid(path, kind, VOLUME)
     except OSError as error:
-        raise RefusedInputError(f"{show_name(path)} cannot be read: {error.strerror or error}") from error
+        raise RefusedInputError(f"{escape_text(path.name)} cannot be read: {error.strerror or error}") from error
     if min(grid.shape_ijk) < 2:
         shown = " x ".join(map(str, grid.shape_ijk))
         raise RefusedInputError(f"{grid.name} has {shown} voxels: a volume has two at least along each axis")

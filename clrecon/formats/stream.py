@@ -21,7 +21,7 @@ from clrecon.errors import RefusedInputError
 from clrecon.system.files import open_regular
 from clrecon.system.text import escape_text
 
-__all__ = ["LARGEST_GRID", "VoxelBytes", "check_end", "check_size", "file_beside", "read_bytes", "show_name"]
+__all__ = ["LARGEST_GRID", "VoxelBytes", "check_end", "check_size", "file_beside", "read_bytes"]
 
 DEFLATE_RATIO = 1032
 """Deflate cannot shrink anything further than this (zlib's technical note)."""
@@ -36,11 +36,6 @@ LARGEST_SURPLUS = 4096
 """Bytes after the last number: some writers fill up a block."""
 
 _CHUNK = 2**18
-
-
-def show_name(path: Path) -> str:
-    """The name of a file for messages."""
-    return escape_text(path.name)
 
 
 @dataclass(frozen=True)
@@ -207,7 +202,7 @@ def file_beside(header: Path, named: str) -> Path:
     RefusedInputError
         It lies, or a link leads, elsewhere; it is not there, or no regular file.
     """
-    name, shown = show_name(header), escape_text(named)
+    name, shown = escape_text(header.name), escape_text(named)
     paths = (PurePosixPath(named), PureWindowsPath(named))
     if "\0" in named or any(path.anchor or ".." in path.parts for path in paths):
         raise RefusedInputError(f"{name} says that its voxels are in '{shown}': only files beside it are read")

@@ -8,7 +8,6 @@ from pathlib import Path
 from clrecon.errors import RefusedInputError, UsageError
 from clrecon.formats.grid_file import LABEL_MAP
 from clrecon.formats.kinds import open_grid, tell_kind
-from clrecon.formats.stream import show_name
 from clrecon.labels.grids import read_grid_labels
 from clrecon.labels.label_map import LabelMap
 from clrecon.labels.overlap import check_wanted
@@ -47,13 +46,13 @@ def read_labels(path: str | Path, only: Sequence[str | int] | None = None) -> La
     wanted = check_wanted(only)
     path = Path(path)
     if path.is_dir():
-        raise UsageError(f"{show_name(path)} is a folder: give the file with the labels")
+        raise UsageError(f"{escape_text(path.name)} is a folder: give the file with the labels")
     try:
         if not path.exists():
             raise UsageError(f"there is no label map {escape_text(str(path), 200)}")
         if not path.is_file():
-            raise RefusedInputError(f"{show_name(path)} is no regular file")
-        name, kind = show_name(path), tell_kind(path)
+            raise RefusedInputError(f"{escape_text(path.name)} is no regular file")
+        name, kind = escape_text(path.name), tell_kind(path)
         if kind is None:
             raise RefusedInputError(
                 f"{name} is no label map that can be read: NIfTI, NRRD, MetaImage and DICOM SEG are"
@@ -63,7 +62,7 @@ def read_labels(path: str | Path, only: Sequence[str | int] | None = None) -> La
         else:
             labels = read_grid_labels(open_grid(path, kind, LABEL_MAP), wanted)
     except OSError as error:
-        raise RefusedInputError(f"{show_name(path)} cannot be read: {error.strerror or error}") from error
+        raise RefusedInputError(f"{escape_text(path.name)} cannot be read: {error.strerror or error}") from error
     if not labels.numbers:
         raise RefusedInputError(f"{name} is empty: no voxel has a label")
     for label in wanted or ():

@@ -19,7 +19,7 @@ from clrecon.dicom.multiframe import find_data_set
 from clrecon.dicom.sequences import Schema, read_sequences
 from clrecon.dicom.values import ValueProblem
 from clrecon.errors import ClreconError, RefusedInputError
-from clrecon.formats.stream import check_size, show_name
+from clrecon.formats.stream import check_size
 from clrecon.labels.frames import FrameStack, place_frames
 from clrecon.labels.label_map import LabelMap
 from clrecon.labels.overlap import Painter
@@ -79,7 +79,7 @@ def read_segmentation(path: Path, only: tuple[str | int, ...] | None = None) -> 
     """
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # pydicom's quote the file unescaped
-        return _read(path, show_name(path), only)
+        return _read(path, escape_text(path.name), only)
 
 
 def _read(path: Path, name: str, only: tuple[str | int, ...] | None) -> LabelMap:
