@@ -27,10 +27,7 @@ if TYPE_CHECKING:
         RefusedInputError,
         UsageError,
     )
-    from clrecon.formats.curve_points import read_curve_points
     from clrecon.geometry import Volume
-    from clrecon.geometry.camera import Camera
-    from clrecon.geometry.clip import Clip
     from clrecon.labels import LabelMap, read_labels
     from clrecon.mesh import Mesh
     from clrecon.mesh.distances import compare_meshes
@@ -44,7 +41,10 @@ if TYPE_CHECKING:
     from clrecon.operators.renderer import VolumeRenderer, render
     from clrecon.reading import list_series, read_volume
     from clrecon.rendering import Lighting, Rendering, TransferFunction, load_transfer_function
-    from clrecon.rendering.motion import turntable_cameras, write_animation
+    from clrecon.rendering.movies.movie import turntable_cameras, write_animation
+    from clrecon.rendering.views.camera import Camera
+    from clrecon.rendering.views.centre_line_files import read_curve_points
+    from clrecon.rendering.views.clip import Clip
 
     __version__: str
 
@@ -93,8 +93,8 @@ __all__ = [
 ]
 
 _HOMES = {
-    "Camera": "clrecon.geometry.camera",
-    "Clip": "clrecon.geometry.clip",
+    "Camera": "clrecon.rendering.views.camera",
+    "Clip": "clrecon.rendering.views.clip",
     "ClreconError": "clrecon.errors",
     "DeviceError": "clrecon.errors",
     "LabelMap": "clrecon.labels",
@@ -122,15 +122,15 @@ _HOMES = {
     "list_series": "clrecon.reading",
     "load_transfer_function": "clrecon.rendering",
     "mask_field_of_view": "clrecon.anatomy.body",
-    "read_curve_points": "clrecon.formats.curve_points",
+    "read_curve_points": "clrecon.rendering.views.centre_line_files",
     "read_labels": "clrecon.labels",
     "read_volume": "clrecon.reading",
     "reformat_curve": "clrecon.operators.reformat",
     "remove_table": "clrecon.anatomy.body",
     "render": "clrecon.operators.renderer",
     "smooth_mesh": "clrecon.mesh.smoothing",
-    "turntable_cameras": "clrecon.rendering.motion",
-    "write_animation": "clrecon.rendering.motion",
+    "turntable_cameras": "clrecon.rendering.movies.movie",
+    "write_animation": "clrecon.rendering.movies.movie",
 }
 
 

@@ -20,7 +20,7 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT), str(ROOT / "scripts" / "bench")]
 
 import clrecon  # noqa: E402
-from clrecon.rendering.presets import find_preset  # noqa: E402
+from clrecon.rendering.looks.presets import find_preset  # noqa: E402
 
 TILE = (330, 230)
 BESIDE = (495, 300)
@@ -66,7 +66,7 @@ def draw_beside_vtk(renderer: clrecon.VolumeRenderer) -> np.ndarray:
 
 def main() -> None:
     """Read the phantom and write three pictures."""
-    from clrecon.rendering.pillow import load_pillow
+    from clrecon.rendering.pictures.pillow import load_pillow
 
     if len(sys.argv) != 3:
         raise SystemExit(__doc__)

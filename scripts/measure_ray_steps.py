@@ -18,7 +18,7 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
 import clrecon  # noqa: E402
-from clrecon.rendering.presets import PRESETS  # noqa: E402
+from clrecon.rendering.looks.presets import PRESETS  # noqa: E402
 
 SIZE = (512, 512)
 VIEWS = ("anterior", "30,20")

@@ -40,7 +40,7 @@ COMMANDS = {
 UNUSED_MODULES = ("requests", "PIL")
 """pydicom imports these where it finds them, to download test files and for colour profiles.  Reading needs neither,
 and they cost as much time as reading a series; ``None`` in `sys.modules` is "not installed".  What makes pictures
-takes Pillow out again when it starts: `clrecon.rendering.pillow`."""
+takes Pillow out again when it starts: `clrecon.rendering.pictures.pillow`."""
 
 DESCRIPTION = "Surfaces in patient millimetres from CT series, computed on any OpenCL device."
 

@@ -136,8 +136,8 @@ def _find_voxels(path: Path, compressed: bool, header: _Header) -> VoxelBytes:
         match = re.fullmatch(r"(.*)\.hdr(\.gz)?", path.name, re.IGNORECASE | re.DOTALL)
         if match is None:
             raise RefusedInputError(
-                f"{escape_text(path.name)} is the header of a NIfTI pair: its name must end with .hdr, that of the voxels"
-                " with .img"
+                f"{escape_text(path.name)} is the header of a NIfTI pair: its name must end with .hdr, that of the"
+                " voxels with .img"
             )
         stem = match[1]
         names = [f"{stem}.img", f"{stem}.img.gz", f"{stem}.IMG"]

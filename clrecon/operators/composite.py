@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clrecon.geometry.camera import Camera
 from clrecon.geometry.iso_rule import takes_parts
 from clrecon.labels.resample import ResampledLabels
 from clrecon.opencl import (
@@ -25,8 +24,9 @@ from clrecon.operators.ray_view import RayView
 from clrecon.operators.resident import FARTHEST, LeapMap, RaySlab, ResidentVolume, pad_slices
 from clrecon.operators.voxel_types import label_variants
 from clrecon.rendering import Lighting, TransferFunction
-from clrecon.rendering.label_style import LabelStyle
-from clrecon.rendering.steepness import PARTS, Steepness
+from clrecon.rendering.looks.label_style import LabelStyle
+from clrecon.rendering.looks.steepness import PARTS, Steepness
+from clrecon.rendering.views.camera import Camera
 
 __all__ = ["NODES", "TransferTables", "composite_slab"]
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from clrecon.opencl import Device, allocate, download, empty_output
 from clrecon.operators.ray_view import TILE
 from clrecon.rendering import Lighting
-from clrecon.rendering.colors import find_color
+from clrecon.rendering.looks.colors import find_color
 
 __all__ = ["HIGHLIGHTS", "PictureBuffers", "count_queues", "highlight_table"]
 

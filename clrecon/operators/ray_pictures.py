@@ -10,8 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.geometry.affine import Float64Array
-from clrecon.geometry.camera import Camera
-from clrecon.geometry.clip import Clip
 from clrecon.labels.resample import resample_labels
 from clrecon.opencl import Stopwatch
 from clrecon.operators.composite import TransferTables, composite_slab
@@ -21,8 +19,10 @@ from clrecon.operators.project import PROJECTIONS, project_slab
 from clrecon.operators.ray_view import RayView
 from clrecon.operators.resident import RaySlab, ResidentVolume, entry_slice
 from clrecon.rendering import Lighting, Rendering, TransferFunction
-from clrecon.rendering.label_style import LabelStyle
-from clrecon.rendering.window import choose_water_window, choose_window, grey_image
+from clrecon.rendering.looks.label_style import LabelStyle
+from clrecon.rendering.looks.window import choose_water_window, choose_window, grey_image
+from clrecon.rendering.views.camera import Camera
+from clrecon.rendering.views.clip import Clip
 
 __all__ = ["RayPicture", "take_picture"]
 

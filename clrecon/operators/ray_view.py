@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 
 from clrecon.geometry import Volume, normal_matrix
 from clrecon.geometry.affine import Float64Array
-from clrecon.geometry.camera import Camera, box_corners
 from clrecon.operators.frame import FieldFrame
 from clrecon.rendering import Lighting
-from clrecon.rendering.lighting import LEAST_SOFT_GRADIENT
+from clrecon.rendering.looks.lighting import LEAST_SOFT_GRADIENT
+from clrecon.rendering.views.camera import Camera, box_corners
 
 __all__ = ["TILE", "RayView"]
 

@@ -12,16 +12,16 @@ from clrecon.anatomy.spine_line import find_spine_line
 from clrecon.errors import UsageError
 from clrecon.geometry import Volume
 from clrecon.geometry.affine import Float64Array
-from clrecon.geometry.camera import Camera
-from clrecon.geometry.curved_sheets import CurvedSheet, straightened_sheet, stretched_length, stretched_sheet
-from clrecon.geometry.curves import Curve
-from clrecon.geometry.sheets import Sheet, find_plane, finest_step, plane_sheet, positive_mm, slab_samples
-from clrecon.geometry.views import checked_size, find_up, find_view
 from clrecon.opencl import Device, Stopwatch, check_memory, choose_device
 from clrecon.operators.sheets import Reformation, sample_sheet
 from clrecon.rendering import Rendering
-from clrecon.rendering.colors import is_transparent
-from clrecon.rendering.window import BONE_WINDOW, checked_window, grey_image
+from clrecon.rendering.looks.colors import is_transparent
+from clrecon.rendering.looks.window import BONE_WINDOW, checked_window, grey_image
+from clrecon.rendering.views.camera import Camera
+from clrecon.rendering.views.centre_line import Curve
+from clrecon.rendering.views.curved import CurvedSheet, straightened_sheet, stretched_length, stretched_sheet
+from clrecon.rendering.views.directions import checked_size, find_up, find_view
+from clrecon.rendering.views.plane import Sheet, find_plane, finest_step, plane_sheet, positive_mm, slab_samples
 from clrecon.system.progress import Progress
 
 __all__ = ["CURVED_KINDS", "cut_slice", "reformat_curve"]
@@ -117,12 +117,12 @@ def cut_slice(
     device : Device, str or int, optional
         See `clrecon.device`.
     zoom, up, pixel_mm
-        Of a plane by name, see `clrecon.geometry.sheets.find_plane`.
+        Of a plane by name, see `clrecon.rendering.views.plane.find_plane`.
     offset_mm : float
         Moves the plane along the view, away from the camera.
     thickness : float
         Mm of the slab around the plane whose samples are combined, half of it to either side; 0 is the plane alone.
-        Samples are at most half the smallest distance of voxels apart, see `clrecon.geometry.sheets.SlabSamples`.
+        Samples are at most half the smallest distance of voxels apart, see `clrecon.rendering.views.plane.SlabSamples`.
     combine : {"mean", "max", "min"}
         Of the samples that lie within the volume.
     window : (low, high), optional
@@ -182,7 +182,7 @@ def _describe_plane(camera: Camera) -> dict[str, Any]:
 
 
 def _describe_miss(volume: Volume, camera: Camera) -> str:
-    from clrecon.geometry.camera import box_corners
+    from clrecon.rendering.views.camera import box_corners
 
     along = (box_corners(volume) - camera.focal_point) @ camera.basis().forward
     if along.min() > 0.0 or along.max() < 0.0:
@@ -224,7 +224,7 @@ def reformat_curve(
     kind : {"straightened", "stretched"}
         Straightened: the centre line is a straight line down the picture, each row lies across it.  Stretched: rows
         keep one direction in the patient, the picture is the surface that they make, unrolled; all lengths within
-        that surface are kept.  See `clrecon.geometry.curved_sheets`.
+        that surface are kept.  See `clrecon.rendering.views.curved`.
     size : (int, int), optional
         Width and height of the picture; default: as many pixels as the curve is long, and `width_mm`.
     device : Device, str or int, optional

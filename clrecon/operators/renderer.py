@@ -12,9 +12,6 @@ from numpy.typing import ArrayLike
 
 from clrecon.errors import UsageError
 from clrecon.geometry import Volume
-from clrecon.geometry.camera import Camera, box_corners
-from clrecon.geometry.clip import Clip
-from clrecon.geometry.views import checked_size
 from clrecon.labels import LabelMap
 from clrecon.opencl import Device, check_memory, choose_device
 from clrecon.operators.composite import TransferTables
@@ -22,10 +19,13 @@ from clrecon.operators.project import PROJECTIONS
 from clrecon.operators.ray_pictures import RayPicture, take_picture
 from clrecon.operators.resident import ResidentVolume
 from clrecon.rendering import Lighting, Rendering, TransferFunction
-from clrecon.rendering.colors import is_transparent
-from clrecon.rendering.label_style import LabelStyle
-from clrecon.rendering.presets import DEFAULT_PRESET, find_preset
-from clrecon.rendering.window import checked_window
+from clrecon.rendering.looks.colors import is_transparent
+from clrecon.rendering.looks.label_style import LabelStyle
+from clrecon.rendering.looks.presets import DEFAULT_PRESET, find_preset
+from clrecon.rendering.looks.window import checked_window
+from clrecon.rendering.views.camera import Camera, box_corners
+from clrecon.rendering.views.clip import Clip
+from clrecon.rendering.views.directions import checked_size
 
 __all__ = ["MODES", "VolumeRenderer", "render"]
 
@@ -368,7 +368,7 @@ def render(
         shaded surface at an iso value, slices in space, a plane through the volume, curved planar reformation.  Default
         is the preset's, or "dvr".
     preset : str, optional
-        See `clrecon.rendering.presets`; default "bone".
+        See `clrecon.rendering.looks.presets`; default "bone".
     transfer_function : TransferFunction, optional
         In place of a preset.
     camera : Camera, optional

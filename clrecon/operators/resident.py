@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from clrecon.geometry import Volume, slice_normal
 from clrecon.geometry.affine import Float64Array
-from clrecon.geometry.camera import Camera
 from clrecon.opencl import (
     Device,
     Program,
@@ -29,6 +28,7 @@ from clrecon.opencl import (
 from clrecon.operators.frame import BOX_BORDER, enclose
 from clrecon.operators.stack_table import StackTable
 from clrecon.operators.voxel_types import voxel_variants
+from clrecon.rendering.views.camera import Camera
 
 __all__ = [
     "BRICK_CELLS",

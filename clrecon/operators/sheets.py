@@ -11,7 +11,6 @@ from numpy.typing import DTypeLike, NDArray
 from clrecon.errors import DeviceError, DeviceMemoryError, UsageError
 from clrecon.geometry import Volume, slice_normal
 from clrecon.geometry.affine import Float64Array
-from clrecon.geometry.sheets import Sheet, SlabSamples
 from clrecon.opencl import (
     Device,
     Program,
@@ -25,6 +24,7 @@ from clrecon.opencl import (
     upload,
 )
 from clrecon.operators.voxel_types import voxel_variants
+from clrecon.rendering.views.plane import Sheet, SlabSamples
 from clrecon.system.progress import Progress
 
 __all__ = ["COMBINATIONS", "Reformation", "prepare_reformat", "sample_sheet"]

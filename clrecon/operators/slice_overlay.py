@@ -12,8 +12,6 @@ from numpy.typing import NDArray
 from clrecon.errors import UsageError
 from clrecon.geometry import Volume
 from clrecon.geometry.affine import Float64Array
-from clrecon.geometry.camera import Camera
-from clrecon.geometry.clip import Clip
 from clrecon.opencl import (
     Device,
     Stopwatch,
@@ -29,7 +27,9 @@ from clrecon.operators.pictures import PictureBuffers, count_queues
 from clrecon.operators.ray_view import RayView
 from clrecon.operators.voxel_types import voxel_variants
 from clrecon.rendering import Rendering, TransferFunction
-from clrecon.rendering.window import checked_window
+from clrecon.rendering.looks.window import checked_window
+from clrecon.rendering.views.camera import Camera
+from clrecon.rendering.views.clip import Clip
 
 __all__ = ["DEFAULT_OPACITY", "LOWEST_SHOWN_HU", "choose_slices", "overlay_slices"]
 

@@ -12,8 +12,6 @@ from numpy.typing import NDArray
 from clrecon.errors import DeviceError, UsageError
 from clrecon.geometry import Volume
 from clrecon.geometry.affine import Float64Array
-from clrecon.geometry.camera import Camera, box_corners
-from clrecon.geometry.clip import Clip
 from clrecon.geometry.iso_rule import IsoRule, ValueRange, choose_iso_rule
 from clrecon.labels import resample_labels
 from clrecon.opencl import Stopwatch, launch, memory_limits, upload
@@ -23,8 +21,10 @@ from clrecon.operators.ray_view import RayView
 from clrecon.operators.resident import LeapMap, RaySlab, ResidentVolume, entry_slice, pad_slices
 from clrecon.operators.voxel_types import label_variants
 from clrecon.rendering import Lighting, Rendering
-from clrecon.rendering.colors import find_color
-from clrecon.rendering.label_style import LabelStyle
+from clrecon.rendering.looks.colors import find_color
+from clrecon.rendering.looks.label_style import LabelStyle
+from clrecon.rendering.views.camera import Camera, box_corners
+from clrecon.rendering.views.clip import Clip
 
 __all__ = ["SURFACE_COLOR", "cast_surface"]
 
@@ -70,7 +70,7 @@ def cast_surface(
     lighting : Lighting, optional
     clip : Clip, optional
     color : str or (float, float, float)
-        Of the surface, see `clrecon.rendering.colors.find_color`.
+        Of the surface, see `clrecon.rendering.looks.colors.find_color`.
     background : str or (float, float, float), optional
         None leaves the picture transparent where nothing is hit.
     shadows : bool

@@ -35,7 +35,7 @@ class PictureFiles:
     depth, values : path, optional
         .npy or .tif: mm to the first hit, HU.
     turntable : path, optional
-        See `clrecon.rendering.motion.check_animation`.
+        See `clrecon.rendering.movies.movie.check_animation`.
     report : path, optional
         JSON.
 
@@ -105,10 +105,10 @@ def check_pictures(files: PictureFiles, settings: RenderSettings) -> list[tuple[
     OutputError
         A folder is missing or cannot be written to, or a target is no regular file.
     """
-    from clrecon.rendering.annotations import check_caption
-    from clrecon.rendering.image_files import check_float_path, check_image_path
-    from clrecon.rendering.motion import animation_kind, check_animation
-    from clrecon.rendering.pillow import load_pillow
+    from clrecon.rendering.movies.movie import animation_kind, check_animation
+    from clrecon.rendering.pictures.annotations import check_caption
+    from clrecon.rendering.pictures.image_files import check_float_path, check_image_path
+    from clrecon.rendering.pictures.pillow import load_pillow
     from clrecon.system.files import check_writable
 
     load_pillow()
@@ -166,7 +166,7 @@ def stage_picture(
     OutputError
         One of them cannot be written; all older files are intact.
     """
-    from clrecon.rendering.image_files import encode_floats, encode_image
+    from clrecon.rendering.pictures.image_files import encode_floats, encode_image
     from clrecon.system.files import stage_file
 
     def stage(path: str | Path, content: bytes) -> tuple[str | Path, StagedFile]:

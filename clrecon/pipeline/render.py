@@ -164,7 +164,7 @@ def _turn(
     turn = settings.turntable
     if files.turntable is None or turn is None:
         return None, []
-    from clrecon.rendering.motion import animation_kind, stage_animation, turntable_cameras
+    from clrecon.rendering.movies.movie import animation_kind, stage_animation, turntable_cameras
 
     first = settings.camera(volume, settings.views_used[0], turning=True)
     cameras = turntable_cameras(first, turn.frames, turn.degrees)

@@ -14,11 +14,11 @@ from clrecon.version import package_version
 
 if TYPE_CHECKING:
     from clrecon.geometry import Volume
-    from clrecon.geometry.camera import Camera
     from clrecon.labels import LabelMap
     from clrecon.opencl import Device
     from clrecon.pipeline.studio import Studio
     from clrecon.rendering import Rendering, TransferFunction
+    from clrecon.rendering.views.camera import Camera
 
 __all__ = ["describe_camera", "describe_picture", "describe_pictures", "find_emptiness", "warn_of_picture"]
 

@@ -13,9 +13,9 @@ from clrecon.pipeline.render_modes import MODES, find_misplaced
 from clrecon.system.wording import name_parameter
 
 if TYPE_CHECKING:
-    from clrecon.geometry.camera import Camera
-    from clrecon.geometry.clip import Clip
     from clrecon.geometry.grid import Grid
+    from clrecon.rendering.views.camera import Camera
+    from clrecon.rendering.views.clip import Clip
 
 __all__ = ["DEFAULT_SIZE", "SPINE", "LabelLook", "RenderSettings", "Turntable", "describe_presets"]
 
@@ -56,7 +56,7 @@ class LabelLook:
     path : path
         NIfTI, NRRD, MetaImage or DICOM SEG.
     colors : mapping of str to str
-        Number or name of a label to a colour, see `clrecon.rendering.colors.find_color`.
+        Number or name of a label to a colour, see `clrecon.rendering.looks.colors.find_color`.
     opacities : mapping of str to float
         The same to a factor on its opacity.
     """
@@ -66,7 +66,7 @@ class LabelLook:
     opacities: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        from clrecon.rendering.colors import find_color
+        from clrecon.rendering.looks.colors import find_color
 
         for color in self.colors.values():
             find_color(color)
@@ -85,9 +85,9 @@ class RenderSettings:
         One of `clrecon.pipeline.render_modes.MODES`; default: what `iso_value` (surface), `curve` (cpr) or the preset
         ask for, else volume rendering.
     preset : str, optional
-        See `clrecon.rendering.presets`; default "bone" for volume rendering.
+        See `clrecon.rendering.looks.presets`; default "bone" for volume rendering.
     transfer_function : str, optional
-        ``FILE`` or ``FILE:NAME``, see `clrecon.rendering.transfer_files.load_transfer_function`.
+        ``FILE`` or ``FILE:NAME``, see `clrecon.rendering.looks.transfer_files.load_transfer_function`.
     iso_value : float, optional
         Of a surface, HU; default that of the renderer.
     color : str, optional
@@ -97,7 +97,7 @@ class RenderSettings:
     window : (float, float), optional
         HU that are black and white, of modes that show HU; mm of water in drr.
     views : sequence of str
-        One picture each, see `clrecon.geometry.camera.Camera.fit`; slices know axial, coronal and sagittal too.
+        One picture each, see `clrecon.rendering.views.camera.Camera.fit`; slices know axial, coronal and sagittal too.
     up, zoom, size, view_angle
         As in `Camera.fit`; without a size 1024 x 1024, and what the curve needs for a curved reformation.
     ray_step : float, optional
@@ -191,9 +191,9 @@ class RenderSettings:
         return {own.name for own in fields(self) if getattr(self, own.name) != own.default}
 
     def _check_looks(self) -> None:
-        from clrecon.rendering.colors import find_color
-        from clrecon.rendering.presets import find_preset
-        from clrecon.rendering.window import checked_window
+        from clrecon.rendering.looks.colors import find_color
+        from clrecon.rendering.looks.presets import find_preset
+        from clrecon.rendering.looks.window import checked_window
 
         if self.preset is not None:
             find_preset(self.preset)
@@ -215,11 +215,11 @@ class RenderSettings:
         import numpy as np
 
         from clrecon.geometry.grid import Grid
-        from clrecon.geometry.views import checked_size
+        from clrecon.rendering.views.directions import checked_size
 
         checked_size(self.size_used)
         if self.letters or self.scale_bar or self.caption:
-            from clrecon.rendering.annotations import SMALLEST_SIDE
+            from clrecon.rendering.pictures.annotations import SMALLEST_SIDE
 
             if min(self.size_used) < SMALLEST_SIDE:
                 raise UsageError(
@@ -233,7 +233,7 @@ class RenderSettings:
             self.camera(voxel, view)
         _ = self.clip
         if self.turntable is not None:
-            from clrecon.rendering.motion import turntable_cameras
+            from clrecon.rendering.movies.movie import turntable_cameras
 
             if len(self.views_used) > 1:
                 raise UsageError("a turntable starts from one view: give one")
@@ -274,7 +274,7 @@ class RenderSettings:
         if self.curve is not None:
             return "cpr"
         if self.preset is not None:
-            from clrecon.rendering.presets import find_preset
+            from clrecon.rendering.looks.presets import find_preset
 
             return find_preset(self.preset).mode
         return "dvr"
@@ -284,7 +284,7 @@ class RenderSettings:
         """Name of the preset, None where the mode or a transfer function does without."""
         if self.preset is not None or self.mode_used != "dvr" or self.transfer_function is not None:
             return self.preset
-        from clrecon.rendering.presets import DEFAULT_PRESET
+        from clrecon.rendering.looks.presets import DEFAULT_PRESET
 
         return DEFAULT_PRESET
 
@@ -318,7 +318,7 @@ class RenderSettings:
     @property
     def clip(self) -> Clip | None:
         """The part of space that is shown."""
-        from clrecon.geometry.clip import Clip
+        from clrecon.rendering.views.clip import Clip
 
         clip = Clip()
         if self.clip_box is not None:
@@ -339,8 +339,8 @@ class RenderSettings:
         UsageError
             Neither a side of the patient nor three numbers.
         """
-        from clrecon.geometry.views import DIRECTIONS
         from clrecon.rendering import Lighting
+        from clrecon.rendering.views.directions import DIRECTIONS
 
         if self.light is None or self.light in LIGHTS:
             return None
@@ -359,10 +359,10 @@ class RenderSettings:
         UsageError
             As `Camera.fit`.
         """
-        from clrecon.geometry.camera import Camera
+        from clrecon.rendering.views.camera import Camera
 
         if self.mode_used == "slice":
-            from clrecon.geometry.sheets import find_plane
+            from clrecon.rendering.views.plane import find_plane
 
             return find_plane(volume, view, self.size_used, zoom=self.zoom, up=self.up)  # type: ignore[arg-type]
         return Camera.fit(
@@ -372,6 +372,6 @@ class RenderSettings:
 
 def describe_presets() -> dict[str, str]:
     """Names of the presets of pictures, and what each shows."""
-    from clrecon.rendering.presets import PRESETS
+    from clrecon.rendering.looks.presets import PRESETS
 
     return {preset.name: preset.description for preset in PRESETS.values()}

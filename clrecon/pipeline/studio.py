@@ -15,10 +15,10 @@ from clrecon.system.progress import Progress
 if TYPE_CHECKING:
     from clrecon.geometry import Volume
     from clrecon.geometry.affine import Float64Array
-    from clrecon.geometry.camera import Camera
     from clrecon.labels import LabelMap
     from clrecon.opencl import Device
     from clrecon.rendering import Lighting, Rendering, TransferFunction
+    from clrecon.rendering.views.camera import Camera
 
 __all__ = ["Studio", "read_curve", "read_function", "read_look"]
 
@@ -35,11 +35,11 @@ def read_function(named: str | None) -> TransferFunction | None:
     Raises
     ------
     UsageError, RefusedInputError
-        As `clrecon.rendering.transfer_files.load_transfer_function`.
+        As `clrecon.rendering.looks.transfer_files.load_transfer_function`.
     """
     if named is None:
         return None
-    from clrecon.rendering.transfer_files import load_transfer_function
+    from clrecon.rendering.looks.transfer_files import load_transfer_function
 
     path, colon, name = named.rpartition(":")
     if colon and not Path(named).exists() and Path(path).exists():
@@ -53,11 +53,11 @@ def read_curve(named: str | None) -> Float64Array | None:
     Raises
     ------
     UsageError, RefusedInputError
-        As `clrecon.formats.curve_points.read_curve_points`.
+        As `clrecon.rendering.views.centre_line_files.read_curve_points`.
     """
     if named is None or named == SPINE:
         return None
-    from clrecon.formats.curve_points import read_curve_points
+    from clrecon.rendering.views.centre_line_files import read_curve_points
 
     return read_curve_points(named)
 
@@ -114,7 +114,7 @@ class Studio:
         self._renderer: Any = None
         preset = None
         if settings.preset_used is not None:
-            from clrecon.rendering.presets import find_preset
+            from clrecon.rendering.looks.presets import find_preset
 
             preset = find_preset(settings.preset_used)
         self.function = preset.transfer_function if function is None and preset is not None else function
@@ -134,7 +134,7 @@ class Studio:
     def lighting(self) -> Lighting | None:
         """The light that shaded pictures have, None in modes without."""
         from clrecon.rendering import Lighting
-        from clrecon.rendering.lighting import UNSHADED
+        from clrecon.rendering.looks.lighting import UNSHADED
 
         settings = self._settings
         if settings.mode_used not in ("dvr", "surface"):

@@ -1,7 +1,7 @@
 """Twin of the raycaster: dvr, mip, minip, mean and drr in plain numpy, in float64, a sample of all rays at a time.
 
 References: Levoy 1988, "Display of surfaces from volume data" (compositing front to back, gradient opacity); Phong
-1975 (shading, see `clrecon.rendering.lighting`).
+1975 (shading, see `clrecon.rendering.looks.lighting`).
 """
 
 from __future__ import annotations
@@ -15,12 +15,12 @@ from numpy.typing import ArrayLike, NDArray
 from clrecon.errors import UsageError
 from clrecon.geometry import Volume
 from clrecon.geometry.affine import Float64Array
-from clrecon.geometry.camera import Camera
 from clrecon.geometry.iso_rule import slice_normal_matrices, takes_parts
 from clrecon.reference.rays import Planes, box_of, find_interval, jitter_pixels, sample_field, voxel_gradients
 from clrecon.rendering import Lighting, TransferFunction
-from clrecon.rendering.lighting import LEAST_SOFT_GRADIENT
-from clrecon.rendering.steepness import DENSE, PARTS, STEEP, Steepness
+from clrecon.rendering.looks.lighting import LEAST_SOFT_GRADIENT
+from clrecon.rendering.looks.steepness import DENSE, PARTS, STEEP, Steepness
+from clrecon.rendering.views.camera import Camera
 
 __all__ = ["FLAT_GRADIENT", "MODES", "OPAQUE", "TABLE_NODES", "RayPicture", "cast_rays", "look_up", "shade"]
 

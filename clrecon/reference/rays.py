@@ -26,7 +26,7 @@ __all__ = [
 
 
 class Planes(Protocol):
-    """What a `clrecon.geometry.clip.Clip` has: unit normals and offsets (n, 4), kept where normal . p >= offset."""
+    """What `clrecon.rendering.views.clip.Clip` has: unit normals and offsets (n, 4); normal . p >= offset is kept."""
 
     @property
     def planes(self) -> Float64Array: ...

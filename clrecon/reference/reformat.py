@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from clrecon.geometry import Volume
 from clrecon.geometry.affine import Float64Array
-from clrecon.geometry.sheets import Sheet, SlabSamples
+from clrecon.rendering.views.plane import Sheet, SlabSamples
 
 __all__ = ["EDGE", "is_inside", "reformat_sheet", "sample_field"]
 

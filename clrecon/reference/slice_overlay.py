@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from clrecon.geometry import Volume
 from clrecon.geometry.affine import Float64Array
-from clrecon.geometry.camera import Camera
+from clrecon.rendering.views.camera import Camera
 
 __all__ = ["overlay_slices"]
 

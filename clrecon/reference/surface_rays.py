@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 
 from clrecon.geometry import Volume
 from clrecon.geometry.affine import Float64Array
-from clrecon.geometry.camera import Camera
 from clrecon.geometry.iso_rule import choose_iso_rule, slice_normal_matrices
 from clrecon.reference.raycast import RayPicture, shade
 from clrecon.reference.rays import Planes, box_of, find_interval, sample_field, voxel_gradients
 from clrecon.rendering import Lighting
+from clrecon.rendering.views.camera import Camera
 
 __all__ = ["cast_surface"]
 

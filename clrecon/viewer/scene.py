@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 
 from clrecon.errors import UsageError
 from clrecon.rendering import Rendering
-from clrecon.rendering.layers import merge_layers
-from clrecon.rendering.scene import rendering_to_pyvista
+from clrecon.rendering.pictures.layers import merge_layers
+from clrecon.rendering.pictures.vtk import rendering_to_pyvista
 
 if TYPE_CHECKING:
-    from clrecon.geometry.camera import Camera
+    from clrecon.rendering.views.camera import Camera
 
 __all__ = ["add_rendering", "merge_scene"]
 

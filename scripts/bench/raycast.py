@@ -59,8 +59,8 @@ class Shot:
 
 def make_shots(volume: Any) -> list[Shot]:
     """Anterior, in parallel and in perspective projection; preset bone, half the smallest spacing, shaded."""
-    from clrecon.geometry.camera import Camera
-    from clrecon.rendering.presets import find_preset
+    from clrecon.rendering.looks.presets import find_preset
+    from clrecon.rendering.views.camera import Camera
 
     preset, step = find_preset("bone"), 0.5 * min(volume.spacing)
     lighting = replace(preset.lighting, soft_gradient=0.0)  # as VTK's
@@ -156,7 +156,7 @@ def measure_likeness(job: Job, volume: Any, renderer: Any, shot: Shot, peer: Any
     """
     import numpy as np
 
-    from clrecon.geometry.clip import Clip
+    from clrecon.rendering.views.clip import Clip
 
     inner = volume.ijk_to_lps([(0, 0, 0), np.array(volume.shape_ijk) - 1.0])
     whole = renderer.render(**shot.options()).image

@@ -439,7 +439,7 @@ def test_nothing_to_write_is_wrong_usage(ct: Path, tmp_path: Path, capsys: pytes
 def test_no_encoder_is_said_before_anything_is_read(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from clrecon.rendering import video
+    from clrecon.rendering.movies import video
 
     video.find_encoder.cache_clear()
     monkeypatch.setattr(video, "_find_ffmpeg", lambda: None)

@@ -26,9 +26,9 @@ PAIRS = [
     ("clrecon.operators.resident.FARTHEST", "include/leap.h", "FARTHEST"),
     ("clrecon.operators.resident.ROWS_AT_ONCE", "render/occupancy.cl", "ROWS_AT_ONCE"),
     ("clrecon.operators.slice_overlay.NODES", "render/slices.cl", "BINS"),
-    ("clrecon.rendering.steepness.DENSE", "render/steep_segments.h", "DENSE"),
-    ("clrecon.rendering.steepness.PARTS", "render/steep_segments.h", "PARTS"),
-    ("clrecon.rendering.steepness.STEEP", "render/steep_segments.h", "STEEP"),
+    ("clrecon.rendering.looks.steepness.DENSE", "render/steep_segments.h", "DENSE"),
+    ("clrecon.rendering.looks.steepness.PARTS", "render/steep_segments.h", "PARTS"),
+    ("clrecon.rendering.looks.steepness.STEEP", "render/steep_segments.h", "STEEP"),
 ]
 """Name in Python, kernel file below cl/, name there."""
 

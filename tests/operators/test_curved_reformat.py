@@ -8,11 +8,11 @@ import tolerances
 
 from clrecon.errors import UsageError
 from clrecon.geometry import Volume
-from clrecon.geometry.curved_sheets import straightened_sheet
-from clrecon.geometry.curves import Curve
-from clrecon.geometry.sheets import slab_samples
 from clrecon.operators.reformat import reformat_curve
 from clrecon.reference.reformat import reformat_sheet
+from clrecon.rendering.views.centre_line import Curve
+from clrecon.rendering.views.curved import straightened_sheet
+from clrecon.rendering.views.plane import slab_samples
 
 pytestmark = pytest.mark.first_device
 

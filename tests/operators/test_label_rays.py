@@ -8,13 +8,13 @@ import tolerances
 from ray_scenes import STEPS, centre_of, look, make_volume, positions, premultiplied
 
 from clrecon.geometry import Volume
-from clrecon.geometry.camera import Camera
-from clrecon.geometry.clip import Clip
 from clrecon.labels import LabelMap
 from clrecon.operators.resident import ResidentVolume
 from clrecon.operators.surface_rays import cast_surface
 from clrecon.rendering import Lighting, Rendering
-from clrecon.rendering.label_style import LabelStyle
+from clrecon.rendering.looks.label_style import LabelStyle
+from clrecon.rendering.views.camera import Camera
+from clrecon.rendering.views.clip import Clip
 
 pytestmark = pytest.mark.first_device
 

@@ -7,7 +7,7 @@ import pytest
 import tolerances
 
 from clrecon import Camera, LabelMap, TransferFunction, UsageError, Volume, render
-from clrecon.rendering.lighting import UNSHADED
+from clrecon.rendering.looks.lighting import UNSHADED
 
 SPACING = (0.7, 0.5, 1.1)
 SHAPE = (40, 10, 20)

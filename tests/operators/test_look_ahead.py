@@ -9,11 +9,11 @@ import pytest
 from scipy import ndimage
 
 from clrecon.geometry import Volume
-from clrecon.geometry.camera import Camera
 from clrecon.opencl import Stopwatch, download, upload
 from clrecon.operators import composite
 from clrecon.operators.composite import MainWay
 from clrecon.operators.resident import FARTHEST, LeapMap, ResidentVolume
+from clrecon.rendering.views.camera import Camera
 
 
 def look(device, shape, distances, way: MainWay):

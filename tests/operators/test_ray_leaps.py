@@ -9,14 +9,14 @@ from dicom_series import rotation
 
 from clrecon.errors import UsageError
 from clrecon.geometry import Volume
-from clrecon.geometry.camera import Camera
-from clrecon.geometry.clip import Clip
 from clrecon.labels import LabelMap
 from clrecon.opencl import upload
 from clrecon.operators import composite, resident
 from clrecon.operators.frame import volume_box
 from clrecon.operators.renderer import VolumeRenderer, render
 from clrecon.rendering import UNSHADED, Rendering, TransferFunction
+from clrecon.rendering.views.camera import Camera
+from clrecon.rendering.views.clip import Clip
 
 pytestmark = pytest.mark.first_device
 

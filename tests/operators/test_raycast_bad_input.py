@@ -8,8 +8,8 @@ from raycast_scenes import DEVICE_RENDERS, blobs, even_volume
 
 from clrecon.errors import UsageError
 from clrecon.geometry import Volume
-from clrecon.geometry.camera import Camera
 from clrecon.rendering import TransferFunction
+from clrecon.rendering.views.camera import Camera
 
 pytestmark = [
     pytest.mark.skipif(not DEVICE_RENDERS, reason="the raycaster of devices is not there"),

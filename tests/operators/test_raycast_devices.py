@@ -25,11 +25,11 @@ from soft_function import SOFT
 from variants import all_but
 
 from clrecon.geometry import Volume
-from clrecon.geometry.camera import Camera
-from clrecon.geometry.clip import Clip
 from clrecon.opencl.sources import read_kernel_source
 from clrecon.reference.rays import hash_pixels, jitter_pixels
 from clrecon.rendering import UNSHADED, Lighting, TransferFunction
+from clrecon.rendering.views.camera import Camera
+from clrecon.rendering.views.clip import Clip
 
 renders = pytest.mark.skipif(not DEVICE_RENDERS, reason="the raycaster of devices is not there")
 

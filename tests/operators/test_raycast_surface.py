@@ -20,11 +20,11 @@ from raycast_scenes import (
 )
 
 from clrecon.geometry import Volume
-from clrecon.geometry.camera import Camera
-from clrecon.geometry.clip import Clip
 from clrecon.operators.isosurface import extract_isosurface
 from clrecon.reference.isosurface import extract_isosurface as extract_twin
 from clrecon.rendering import Lighting
+from clrecon.rendering.views.camera import Camera
+from clrecon.rendering.views.clip import Clip
 
 MATT = Lighting(ambient=0.2, diffuse=0.8, specular=0.0)
 SLOPE = TURN @ np.array([0.35, -0.2, 0.9])

@@ -21,10 +21,10 @@ from raycast_scenes import (
 )
 
 from clrecon.geometry import Volume
-from clrecon.geometry.camera import Camera
-from clrecon.geometry.clip import Clip
 from clrecon.rendering import Lighting, TransferFunction
-from clrecon.rendering.presets import PRESETS
+from clrecon.rendering.looks.presets import PRESETS
+from clrecon.rendering.views.camera import Camera
+from clrecon.rendering.views.clip import Clip
 
 BONE = TransferFunction([(-1000, 1, 1, 1, 0), (300, 1, 1, 1, 0), (300, 1, 1, 1, 1), (3000, 1, 1, 1, 1)])
 """Opaque from 300 HU on."""

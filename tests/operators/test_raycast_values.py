@@ -20,8 +20,8 @@ from raycast_scenes import (
 )
 
 from clrecon.geometry import Volume
-from clrecon.geometry.camera import Camera
-from clrecon.geometry.clip import Clip
+from clrecon.rendering.views.camera import Camera
+from clrecon.rendering.views.clip import Clip
 
 
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:

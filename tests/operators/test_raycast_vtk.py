@@ -12,10 +12,10 @@ from dicom_series import rotation
 
 import clrecon
 from clrecon.geometry import Volume
-from clrecon.geometry.camera import Camera
-from clrecon.geometry.clip import Clip
-from clrecon.rendering.lighting import UNSHADED
-from clrecon.rendering.presets import find_preset
+from clrecon.rendering.looks.lighting import UNSHADED
+from clrecon.rendering.looks.presets import find_preset
+from clrecon.rendering.views.camera import Camera
+from clrecon.rendering.views.clip import Clip
 
 pytest.importorskip("vtkmodules.vtkRenderingVolumeOpenGL2")
 

@@ -11,12 +11,12 @@ from variants import VOXEL_TYPES
 
 from clrecon.errors import DeviceError, UsageError
 from clrecon.geometry import Volume
-from clrecon.geometry.camera import Camera
-from clrecon.geometry.sheets import find_plane, plane_sheet, slab_samples
 from clrecon.opencl import kernel_files, upload
 from clrecon.operators.reformat import cut_slice, reformat_curve
 from clrecon.operators.sheets import prepare_reformat, sample_sheet
 from clrecon.reference.reformat import reformat_sheet
+from clrecon.rendering.views.camera import Camera
+from clrecon.rendering.views.plane import find_plane, plane_sheet, slab_samples
 
 SHEARED = np.eye(4)
 SHEARED[:3, :3] = rotation((15.0, -25.0, 40.0)) @ [[0.7, 0.0, 0.1], [0.0, 0.5, -0.9], [0.0, 0.0, 2.5]]

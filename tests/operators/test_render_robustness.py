@@ -11,11 +11,11 @@ import pytest
 import clrecon
 from clrecon.errors import DeviceError, UsageError
 from clrecon.geometry import Volume
-from clrecon.geometry.camera import Camera
-from clrecon.geometry.clip import Clip
 from clrecon.opencl import launching
 from clrecon.operators.resident import entry_slice
 from clrecon.rendering import TransferFunction
+from clrecon.rendering.views.camera import Camera
+from clrecon.rendering.views.clip import Clip
 
 pytestmark = [pytest.mark.opencl, pytest.mark.first_device]
 

@@ -141,7 +141,7 @@ import ctypes, mmap, sys
 import numpy as np
 import clrecon
 from clrecon.geometry import Volume
-from clrecon.geometry.camera import Camera
+from clrecon.rendering.views.camera import Camera
 shape = tuple(int(n) for n in sys.argv[2].split(","))
 size = 2 * int(np.prod(shape))
 assert size % mmap.PAGESIZE == 0

@@ -9,11 +9,11 @@ from ray_scenes import GRIDS, blobs, centre_of, look, make_volume, premultiplied
 
 from clrecon.errors import DeviceError, UsageError
 from clrecon.geometry import Volume
-from clrecon.geometry.camera import Camera
-from clrecon.geometry.clip import Clip
 from clrecon.operators.slice_overlay import choose_slices, overlay_slices
 from clrecon.reference.slice_overlay import overlay_slices as overlay_twin
 from clrecon.rendering import TransferFunction
+from clrecon.rendering.views.camera import Camera
+from clrecon.rendering.views.clip import Clip
 
 SIZE = (56, 48)
 WINDOW = (-500.0, 700.0)

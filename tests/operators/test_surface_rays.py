@@ -10,13 +10,13 @@ from variants import all_but
 
 from clrecon.errors import DeviceError, UsageError
 from clrecon.geometry import Volume
-from clrecon.geometry.camera import Camera
-from clrecon.geometry.clip import Clip
 from clrecon.operators.isosurface import extract_isosurface
 from clrecon.operators.resident import ResidentVolume
 from clrecon.operators.surface_rays import cast_surface
 from clrecon.reference.surface_rays import cast_surface as cast_twin
 from clrecon.rendering import Lighting, Rendering
+from clrecon.rendering.views.camera import Camera
+from clrecon.rendering.views.clip import Clip
 
 SIZE = (56, 48)
 UNLIT = Lighting(1.0, 0.0, 0.0)

@@ -135,9 +135,9 @@ def test_a_step_that_fails_leaves_the_old_files(
         monkeypatch.setattr(Studio, "take_view", lambda studio, view: fail() if view == "right" else real(studio, view))
     else:
         home = {
-            "encode_floats": "clrecon.rendering.image_files.encode_floats",
+            "encode_floats": "clrecon.rendering.pictures.image_files.encode_floats",
             "stage_report": "clrecon.pipeline.render.stage_report",
-            "stage_animation": "clrecon.rendering.motion.stage_animation",
+            "stage_animation": "clrecon.rendering.movies.movie.stage_animation",
             "commit": "clrecon.system.files.StagedFile.commit",
         }[fails]
         monkeypatch.setattr(home, fail)

@@ -9,14 +9,14 @@ from picture_files import PARALLEL, PERSPECTIVE, make_picture
 
 from clrecon.errors import UsageError
 from clrecon.geometry import Volume
-from clrecon.geometry.camera import Camera
-from clrecon.rendering.annotations import (
+from clrecon.rendering.pictures.annotations import (
     LONGEST_BAR_SHARE,
     bar_length,
     check_caption,
     edge_letters,
     orientation_letters,
 )
+from clrecon.rendering.views.camera import Camera
 
 BLACK, WHITE, CLEAR = (0, 0, 0, 255), (255, 255, 255, 255), (0, 0, 0, 0)
 
@@ -102,7 +102,7 @@ def test_a_perspective_bar_holds_in_the_focal_plane(monkeypatch):
     picture = make_picture((400, 300), BLACK, PERSPECTIVE)
     picture.image[:] = BLACK
     texts = []
-    from clrecon.rendering import annotations
+    from clrecon.rendering.pictures import annotations
 
     write = annotations._Page._write
     monkeypatch.setattr(

@@ -11,8 +11,9 @@ from picture_files import PARALLEL, make_picture
 from PIL import Image
 
 from clrecon.errors import OutputError, UsageError
-from clrecon.rendering import motion, video
-from clrecon.rendering.motion import check_animation, stage_animation, turntable_cameras, write_animation
+from clrecon.rendering.movies import movie as motion
+from clrecon.rendering.movies import video
+from clrecon.rendering.movies.movie import check_animation, stage_animation, turntable_cameras, write_animation
 
 
 @pytest.fixture

@@ -12,8 +12,8 @@ from picture_files import PARALLEL, PERSPECTIVE, make_picture
 from PIL import Image
 
 from clrecon.errors import OutputError, UsageError
-from clrecon.rendering import image_files
-from clrecon.rendering.colors import COLORS, find_color
+from clrecon.rendering.looks.colors import COLORS, find_color
+from clrecon.rendering.pictures import image_files
 
 CLEAR = (10, 20, 30, 0)
 

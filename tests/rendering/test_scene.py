@@ -7,9 +7,9 @@ import pytest
 import tolerances
 
 from clrecon.errors import UsageError
-from clrecon.geometry.camera import Camera
 from clrecon.rendering import Rendering
-from clrecon.rendering.layers import merge_layers
+from clrecon.rendering.pictures.layers import merge_layers
+from clrecon.rendering.views.camera import Camera
 
 WIDTH, HEIGHT = 14, 9
 CAMERAS = [

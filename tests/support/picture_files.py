@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from clrecon.geometry.camera import Camera
 from clrecon.rendering import Rendering
+from clrecon.rendering.views.camera import Camera
 
 PARALLEL = Camera((0, -300, 0), (0, 0, 0), (0, 0, 1), parallel_scale=100.0)
 PERSPECTIVE = Camera((0, -300, 0), (0, 0, 0), (0, 0, 1), view_angle=40.0)

@@ -9,7 +9,7 @@ import numpy as np
 from dicom_series import rotation
 
 from clrecon.geometry import Volume
-from clrecon.geometry.camera import Camera
+from clrecon.rendering.views.camera import Camera
 
 TURN = rotation((15.0, -25.0, 40.0))
 PLACE = np.array([40.0, -90.0, -600.0])

@@ -13,10 +13,10 @@ import pytest
 from dicom_series import rotation
 
 from clrecon.geometry import Volume
-from clrecon.geometry.camera import Camera
 from clrecon.reference.raycast import cast_rays
 from clrecon.reference.surface_rays import cast_surface
 from clrecon.rendering import UNSHADED, Lighting, TransferFunction
+from clrecon.rendering.views.camera import Camera
 
 TURN = rotation((15.0, -25.0, 40.0))
 PLACE = np.array([40.0, -90.0, -600.0])

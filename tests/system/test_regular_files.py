@@ -11,11 +11,11 @@ import pytest
 from house import ROOT
 
 from clrecon.errors import ClreconError, RefusedInputError, UsageError
-from clrecon.formats.curve_points import LARGEST_BYTES, read_curve_points
 from clrecon.labels import read_labels
 from clrecon.phantom import PhantomSettings, write_phantom
 from clrecon.reading import list_series, read_volume
 from clrecon.rendering import load_transfer_function
+from clrecon.rendering.views.centre_line_files import LARGEST_BYTES, read_curve_points
 from clrecon.system.files import open_regular, read_regular
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="FIFOs and devices of POSIX")

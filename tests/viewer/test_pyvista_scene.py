@@ -10,8 +10,8 @@ import pytest
 import tolerances
 
 from clrecon.errors import UsageError
-from clrecon.geometry.camera import Camera
 from clrecon.rendering import Rendering
+from clrecon.rendering.views.camera import Camera
 from clrecon.viewer import add_rendering, merge_scene
 
 pyvista = pytest.importorskip("pyvista")

@@ -15,10 +15,10 @@ import numpy as np
 
 from clrecon.errors import RefusedInputError
 from clrecon.geometry.affine import Float64Array
-from clrecon.rendering.curves import merge_curves
-from clrecon.rendering.json_fields import take_color, take_list, take_number, take_object, take_text
-from clrecon.rendering.lighting import UNSHADED, Lighting
-from clrecon.rendering.vtk_properties import curve_from_nodes, gradient_points
+from clrecon.rendering.looks.json_fields import take_color, take_list, take_number, take_object, take_text
+from clrecon.rendering.looks.lighting import UNSHADED, Lighting
+from clrecon.rendering.looks.piecewise import merge_curves
+from clrecon.rendering.looks.vtk import curve_from_nodes, gradient_points
 
 __all__ = ["Entry", "read_paraview_json", "read_slicer_json", "read_slicer_text", "read_slicer_xml"]
 

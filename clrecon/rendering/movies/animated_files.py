@@ -25,7 +25,7 @@ _REPEAT_FOR_EVER = b"\x21\xff\x0bNETSCAPE2.0\x03\x01\x00\x00\x00"
 
 def write_gif(stream: BinaryIO, frames: Iterator[NDArray[np.uint8]], fps: float) -> None:
     """Write frames (h, w, 3), each with the 256 colours that suit it best."""
-    from clrecon.rendering.pillow import load_pillow
+    from clrecon.rendering.pictures.pillow import load_pillow
 
     load_pillow()
     first = next(frames)
@@ -77,7 +77,7 @@ def _gif_picture(frame: NDArray[np.uint8]) -> tuple[bytes, bytes]:
 
 def write_apng(stream: BinaryIO, frames: Iterator[NDArray[np.uint8]], fps: float) -> None:
     """Write frames (h, w, 3 or 4) without loss; `stream` must be able to go back: the count of frames comes first."""
-    from clrecon.rendering.pillow import load_pillow
+    from clrecon.rendering.pictures.pillow import load_pillow
 
     load_pillow()
     first = next(frames)

@@ -17,8 +17,8 @@ import numpy as np
 
 from clrecon.errors import UsageError
 from clrecon.geometry.affine import Float64Array
-from clrecon.geometry.curves import Curve, rotation_minimising_normals
-from clrecon.geometry.sheets import Sheet
+from clrecon.rendering.views.centre_line import Curve, rotation_minimising_normals
+from clrecon.rendering.views.plane import Sheet
 
 __all__ = ["CurvedSheet", "FRAME_STEP_MM", "straightened_sheet", "stretched_sheet"]
 

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.errors import UsageError
-from clrecon.geometry.camera import Camera
-from clrecon.rendering.picture_data import PictureData
+from clrecon.rendering.pictures.picture_data import PictureData
+from clrecon.rendering.views.camera import Camera
 
 __all__ = ["FORMS", "rendering_to_pyvista"]
 

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.errors import UsageError
-from clrecon.rendering.picture_data import PictureData
-from clrecon.rendering.pillow import load_pillow
+from clrecon.rendering.pictures.picture_data import PictureData
+from clrecon.rendering.pictures.pillow import load_pillow
 from clrecon.system.files import replace_file
 from clrecon.version import package_version
 
@@ -169,7 +169,7 @@ def _text_chunks(rendering: PictureData) -> Any:
     text.add_text("Mode", rendering.mode)
     camera = rendering.camera
     if camera is not None:
-        from clrecon.rendering.annotations import orientation_letters
+        from clrecon.rendering.pictures.annotations import orientation_letters
 
         text.add_text("View", f"from {orientation_letters(-camera.basis().forward)}")
         named = {"position": camera.position, "focal point": camera.focal_point, "up": camera.up}

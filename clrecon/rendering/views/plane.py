@@ -15,9 +15,9 @@ from numpy.typing import ArrayLike
 
 from clrecon.errors import UsageError
 from clrecon.geometry.affine import Float64Array
-from clrecon.geometry.camera import Camera, box_corners
-from clrecon.geometry.views import DIRECTIONS, checked_size
 from clrecon.geometry.volume import Volume
+from clrecon.rendering.views.camera import Camera, box_corners
+from clrecon.rendering.views.directions import DIRECTIONS, checked_size
 
 __all__ = [
     "PLANES",

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from clrecon.errors import UsageError
-from clrecon.geometry.views import checked_size
+from clrecon.rendering.views.directions import checked_size
 
 __all__ = ["make_pyvista_camera", "parameters_from_vtk"]
 

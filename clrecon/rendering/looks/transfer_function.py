@@ -11,8 +11,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from clrecon.errors import UsageError
 from clrecon.geometry.affine import Float64Array
-from clrecon.rendering.curves import check_ascending, check_share, evaluate_curve
-from clrecon.rendering.lighting import Lighting
+from clrecon.rendering.looks.lighting import Lighting
+from clrecon.rendering.looks.piecewise import check_ascending, check_share, evaluate_curve
 
 __all__ = ["TransferFunction"]
 
@@ -277,7 +277,7 @@ class TransferFunction:
         UsageError
             pyvista does not know them.
         """
-        from clrecon.rendering.vtk_properties import points_from_pyvista
+        from clrecon.rendering.looks.vtk import points_from_pyvista
 
         return cls(points_from_pyvista(cmap, opacity, clim), unit_distance=unit_distance, **parameters)
 
@@ -298,7 +298,7 @@ class TransferFunction:
         UsageError
             It holds no colours or opacities, or some that are out of range.
         """
-        from clrecon.rendering.vtk_properties import parameters_from_vtk
+        from clrecon.rendering.looks.vtk import parameters_from_vtk
 
         return cls(**{**parameters_from_vtk(volume_property, voxel_mm), **parameters})
 
@@ -308,7 +308,7 @@ class TransferFunction:
         A light with a direction has no place in it, nor one that fades with the gradient.  `voxel_mm` as in
         `from_vtk`.
         """
-        from clrecon.rendering.vtk_properties import property_to_vtk
+        from clrecon.rendering.looks.vtk import property_to_vtk
 
         return property_to_vtk(self, voxel_mm)
 
@@ -320,7 +320,7 @@ class TransferFunction:
         OutputError
             It cannot be written; an older file of that name is intact.
         """
-        from clrecon.rendering.transfer_text import transfer_text
+        from clrecon.rendering.looks.transfer_text import transfer_text
         from clrecon.system.files import replace_file
 
         names = {"name": self.name, "description": self.description}

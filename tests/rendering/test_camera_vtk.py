@@ -7,7 +7,7 @@ import pytest
 import tolerances
 
 from clrecon.errors import UsageError
-from clrecon.geometry.camera import Camera
+from clrecon.rendering.views.camera import Camera
 
 pyvista = pytest.importorskip("pyvista")
 

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from clrecon.errors import UsageError
 from clrecon.geometry.affine import Float64Array, checked_points
 from clrecon.geometry.grid import Grid
-from clrecon.geometry.views import checked_size, checked_vector, find_up, find_view
+from clrecon.rendering.views.directions import checked_size, checked_vector, find_up, find_view
 
 __all__ = ["Camera", "CameraBasis", "box_corners"]
 
@@ -138,7 +138,7 @@ class Camera:
             Sheared and uneven ones too.
         view : str or (float, float)
             anterior, posterior, left, right, superior, inferior: where the camera stands; or azimuth and elevation in
-            degrees, as a pair or as text ``"AZ,EL"``, see `clrecon.geometry.views.find_view`.
+            degrees, as a pair or as text ``"AZ,EL"``, see `clrecon.rendering.views.directions.find_view`.
         zoom : float
             2 shows everything twice as large, see `zoomed`.
         up : str or array_like, shape (3,), optional
@@ -180,7 +180,7 @@ class Camera:
 
     @classmethod
     def from_pyvista(cls, source: Any, size: Sequence[int] | None = None) -> Camera:
-        """Take the camera of a PyVista plotter, a PyVista camera or a VTK camera, see `clrecon.geometry.vtk_camera`.
+        """Take the camera of a PyVista plotter, a PyVista camera or a VTK camera, see `clrecon.rendering.views.vtk`.
 
         Parameters
         ----------
@@ -189,13 +189,13 @@ class Camera:
         size : (int, int), optional
             Of the picture, for cameras whose view angle is the horizontal one; default: the plotter's window.
         """
-        from clrecon.geometry.vtk_camera import parameters_from_vtk
+        from clrecon.rendering.views.vtk import parameters_from_vtk
 
         return cls(**parameters_from_vtk(source, size))
 
     def to_pyvista(self) -> Any:
         """A `pyvista.Camera` that sees the same, for a scene in LPS mm: ``plotter.camera = camera.to_pyvista()``."""
-        from clrecon.geometry.vtk_camera import make_pyvista_camera
+        from clrecon.rendering.views.vtk import make_pyvista_camera
 
         return make_pyvista_camera(self.position, self.focal_point, self.up, self.view_angle, self.parallel_scale)
 

@@ -8,8 +8,8 @@ import tolerances
 
 from clrecon.errors import UsageError
 from clrecon.geometry import Volume
-from clrecon.geometry.camera import Camera, box_corners
-from clrecon.geometry.views import DIRECTIONS
+from clrecon.rendering.views.camera import Camera, box_corners
+from clrecon.rendering.views.directions import DIRECTIONS
 
 CENTRE = np.array([12.0, -30.0, 850.0])
 MARKS = {name: CENTRE + 20.0 * np.array(direction) for name, direction in DIRECTIONS.items()}

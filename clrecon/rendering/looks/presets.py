@@ -9,8 +9,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 from clrecon.errors import UsageError
-from clrecon.rendering.lighting import UNSHADED, Lighting
-from clrecon.rendering.transfer_function import TransferFunction
+from clrecon.rendering.looks.lighting import UNSHADED, Lighting
+from clrecon.rendering.looks.transfer_function import TransferFunction
 
 __all__ = ["DEFAULT_PRESET", "PRESETS", "Preset", "find_preset"]
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from clrecon.errors import UsageError
-from clrecon.rendering.picture_data import PictureData
+from clrecon.rendering.pictures.picture_data import PictureData
 
 __all__ = ["Rendering"]
 
@@ -47,14 +47,14 @@ class Rendering(PictureData):
         Parameters
         ----------
         color : str or (float, float, float)
-            See `clrecon.rendering.colors.find_color`.
+            See `clrecon.rendering.looks.colors.find_color`.
 
         Returns
         -------
         Rendering
             With an `image` of its own; it shares the other arrays.
         """
-        from clrecon.rendering.colors import find_color
+        from clrecon.rendering.looks.colors import find_color
 
         opacity = self.image[..., 3:].astype(np.float32) / np.float32(255.0)
         behind = (255.0 * find_color(color)).astype(np.float32)
@@ -66,9 +66,9 @@ class Rendering(PictureData):
     def annotated(self, *, letters: bool = False, scale_bar: bool = False, caption: str | None = None) -> Rendering:
         """The same picture with sides of the patient, a scale bar or a line of text drawn in.
 
-        See `clrecon.rendering.annotations.annotate`.
+        See `clrecon.rendering.pictures.annotations.annotate`.
         """
-        from clrecon.rendering.annotations import annotate
+        from clrecon.rendering.pictures.annotations import annotate
 
         image = annotate(self, letters=letters, scale_bar=scale_bar, caption=caption)
         return self if image is self.image else replace(self, image=image)
@@ -96,7 +96,7 @@ class Rendering(PictureData):
         OutputError
             The file cannot be written; an older one of that name is intact.
         """
-        from clrecon.rendering.image_files import write_image
+        from clrecon.rendering.pictures.image_files import write_image
 
         return write_image(self, path, quality)
 
@@ -114,7 +114,7 @@ class Rendering(PictureData):
         int
             Size of the file in bytes.
         """
-        from clrecon.rendering.image_files import write_floats
+        from clrecon.rendering.pictures.image_files import write_floats
 
         return write_floats(self.expected_depth if expected else self.depth, path, self.pixel_mm)
 
@@ -126,7 +126,7 @@ class Rendering(PictureData):
         UsageError
             The mode has none.
         """
-        from clrecon.rendering.image_files import write_floats
+        from clrecon.rendering.pictures.image_files import write_floats
 
         if self.values is None:
             having = "mip, minip, mean, drr, slice and cpr"
@@ -156,12 +156,12 @@ class Rendering(PictureData):
         UsageError
             The picture has no camera, or hits nothing that could be points; no such form or distance.
         """
-        from clrecon.rendering.scene import rendering_to_pyvista
+        from clrecon.rendering.pictures.vtk import rendering_to_pyvista
 
         return rendering_to_pyvista(self, form, expected=expected, distance=distance)
 
     def _repr_png_(self) -> bytes:
         """What a notebook shows."""
-        from clrecon.rendering.image_files import encode_image
+        from clrecon.rendering.pictures.image_files import encode_image
 
         return encode_image(self, ".png")

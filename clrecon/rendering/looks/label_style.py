@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from clrecon.errors import UsageError
 from clrecon.labels import LabelMap
-from clrecon.rendering.colors import find_color
+from clrecon.rendering.looks.colors import find_color
 
 __all__ = ["LabelStyle", "distinct_colors"]
 

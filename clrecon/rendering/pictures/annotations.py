@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from clrecon.errors import UsageError
-from clrecon.geometry.camera import Camera
-from clrecon.geometry.views import DIRECTIONS
-from clrecon.rendering.picture_data import PictureData
-from clrecon.rendering.pillow import load_font, load_pillow
+from clrecon.rendering.pictures.picture_data import PictureData
+from clrecon.rendering.pictures.pillow import load_font, load_pillow
+from clrecon.rendering.views.camera import Camera
+from clrecon.rendering.views.directions import DIRECTIONS
 
 if TYPE_CHECKING:
     from PIL import Image

@@ -89,7 +89,7 @@ def stage_frame_folder(frames: Iterator[NDArray[np.uint8]], path: str | os.PathL
     `StagedFolder.commit` in the ``with`` block puts it in place; a folder that is not committed is removed at the end
     of the block.
     """
-    from clrecon.rendering.pillow import load_pillow
+    from clrecon.rendering.pictures.pillow import load_pillow
 
     load_pillow()
     from PIL import Image

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.errors import UsageError
-from clrecon.rendering.picture import Rendering
+from clrecon.rendering.pictures.picture import Rendering
 
 __all__ = ["merge_layers"]
 

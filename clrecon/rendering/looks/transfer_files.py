@@ -12,17 +12,17 @@ from pathlib import Path
 from typing import Any
 
 from clrecon.errors import RefusedInputError, UsageError
-from clrecon.rendering.json_fields import parse_json, take_color, take_list, take_number, take_object, take_text
-from clrecon.rendering.lighting import Lighting
-from clrecon.rendering.slicer_files import (
+from clrecon.rendering.looks.json_fields import parse_json, take_color, take_list, take_number, take_object, take_text
+from clrecon.rendering.looks.lighting import Lighting
+from clrecon.rendering.looks.slicer_files import (
     Entry,
     read_paraview_json,
     read_slicer_json,
     read_slicer_text,
     read_slicer_xml,
 )
-from clrecon.rendering.transfer_function import TransferFunction
-from clrecon.rendering.transfer_text import FORMAT, VERSION
+from clrecon.rendering.looks.transfer_function import TransferFunction
+from clrecon.rendering.looks.transfer_text import FORMAT, VERSION
 from clrecon.system.files import read_regular
 
 __all__ = ["load_transfer_function"]

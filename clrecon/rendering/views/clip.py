@@ -7,7 +7,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from clrecon.errors import UsageError
 from clrecon.geometry.affine import Float64Array, checked_points
-from clrecon.geometry.views import checked_vector
+from clrecon.rendering.views.directions import checked_vector
 
 __all__ = ["Clip"]
 

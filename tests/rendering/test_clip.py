@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from clrecon.errors import UsageError
-from clrecon.geometry.clip import Clip
+from clrecon.rendering.views.clip import Clip
 
 POINTS = np.random.default_rng(8).uniform(-10.0, 10.0, (500, 3))
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clrecon.geometry.camera import Camera
+from clrecon.rendering.views.camera import Camera
 
 __all__ = ["PictureData"]
 

@@ -15,12 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.errors import UsageError
-from clrecon.geometry.camera import Camera
+from clrecon.rendering.views.camera import Camera
 from clrecon.system.files import Staged, check_writable, stage_file
 from clrecon.system.progress import Progress
 
 if TYPE_CHECKING:
-    from clrecon.rendering.picture import Rendering
+    from clrecon.rendering.pictures.picture import Rendering
 
 __all__ = [
     "ANIMATIONS",
@@ -116,13 +116,13 @@ def check_animation(path: str | os.PathLike[str], fps: float = 25.0) -> str:
         kind = extension[1:].upper() or "a folder of frames"
         raise UsageError(f"{kind} takes {SLOWEST:g} to {FASTEST[extension]:g} frames a second, not {fps!r}")
     if extension == ".mp4":
-        from clrecon.rendering.video import find_encoder
+        from clrecon.rendering.movies.video import find_encoder
 
         find_encoder()
     if extension:
         check_writable(text)
     else:
-        from clrecon.rendering.frame_folder import check_frame_folder
+        from clrecon.rendering.movies.frame_folder import check_frame_folder
 
         check_frame_folder(text)
     return extension
@@ -187,17 +187,17 @@ def stage_animation(
     extension = check_animation(path, fps)
     checked = _checked_frames(frames, extension, total, progress)
     if extension == "":
-        from clrecon.rendering.frame_folder import stage_frame_folder
+        from clrecon.rendering.movies.frame_folder import stage_frame_folder
 
         with stage_frame_folder(checked, path) as folder:
             yield folder
         return
     if extension == ".mp4":
-        from clrecon.rendering.video import write_video as write
+        from clrecon.rendering.movies.video import write_video as write
     elif extension == ".gif":
-        from clrecon.rendering.animated_files import write_gif as write
+        from clrecon.rendering.movies.animated_files import write_gif as write
     else:
-        from clrecon.rendering.animated_files import write_apng as write
+        from clrecon.rendering.movies.animated_files import write_apng as write
 
     def write_all(stream: BinaryIO) -> None:
         write(stream, checked, fps)

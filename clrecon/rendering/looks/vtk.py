@@ -10,8 +10,8 @@ from numpy.typing import ArrayLike
 
 from clrecon.errors import UsageError
 from clrecon.geometry.affine import Float64Array
-from clrecon.rendering.curves import merge_curves, straighten_curve
-from clrecon.rendering.lighting import UNSHADED, Lighting
+from clrecon.rendering.looks.lighting import UNSHADED, Lighting
+from clrecon.rendering.looks.piecewise import merge_curves, straighten_curve
 
 __all__ = ["curve_from_nodes", "parameters_from_vtk", "points_from_pyvista", "property_to_vtk"]
 

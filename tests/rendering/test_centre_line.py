@@ -9,8 +9,8 @@ from dicom_series import rotation
 
 from clrecon.errors import UsageError
 from clrecon.geometry import Volume
-from clrecon.geometry.curved_sheets import straightened_sheet, stretched_length, stretched_sheet
-from clrecon.geometry.curves import Curve, rotation_minimising_normals
+from clrecon.rendering.views.centre_line import Curve, rotation_minimising_normals
+from clrecon.rendering.views.curved import straightened_sheet, stretched_length, stretched_sheet
 
 RADIUS = 80.0
 

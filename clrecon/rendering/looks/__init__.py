@@ -1,0 +1,1 @@
+"""What a picture shows in which colours: transfer functions, lighting, presets, windows."""

@@ -1,0 +1,1 @@
+"""Pictures that move: cameras that turn, and their files."""
