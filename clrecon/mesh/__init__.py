@@ -1,21 +1,11 @@
-"""Surface meshes in patient millimetres: measure them, select their parts, write them to files.
+"""Surface meshes in patient millimetres: measure them and select their parts.
 
-Smoothing and decimation (`clrecon.mesh.refinement`), distances (`clrecon.mesh.distances`) and gates
-(`clrecon.mesh.gates`) are imported by those who use them.
+Smoothing and decimation (`clrecon.mesh.refine`) and distances and gates (`clrecon.mesh.compare`) are imported by those
+who use them; files are in `clrecon.exchange`.
 """
 
 from clrecon.mesh.components import select_components, split_components
 from clrecon.mesh.mesh import Mesh
 from clrecon.mesh.quality import measure_quality
-from clrecon.mesh.writers import FORMATS, check_format, stage_mesh, write_mesh
 
-__all__ = [
-    "FORMATS",
-    "Mesh",
-    "check_format",
-    "measure_quality",
-    "select_components",
-    "split_components",
-    "stage_mesh",
-    "write_mesh",
-]
+__all__ = ["Mesh", "measure_quality", "select_components", "split_components"]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from clrecon.exchange.coordinates import as_stored, find_coincident
 from clrecon.mesh.connectivity import (
     Edges,
     find_edges,
@@ -13,7 +14,6 @@ from clrecon.mesh.connectivity import (
     label_components,
     opposite_half_edges,
 )
-from clrecon.mesh.coordinates import as_stored, find_coincident
 from clrecon.mesh.deviation import WITNESSES, Deviation
 from clrecon.mesh.intersections import find_beside, find_self_intersections
 from clrecon.mesh.measures import cross_products

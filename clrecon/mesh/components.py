@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.errors import NoSurfaceError, UsageError
+from clrecon.exchange.coordinates import rounding_step
 from clrecon.mesh.connectivity import label_components
-from clrecon.mesh.coordinates import rounding_step
 from clrecon.mesh.measures import cross_products
 from clrecon.mesh.mesh import Mesh
 from clrecon.mesh.nearest import find_nearest_triangle

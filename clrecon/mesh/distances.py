@@ -93,7 +93,7 @@ class SurfaceDistance:
     def __init__(self, vertices: NDArray[np.floating], triangles: NDArray[np.uint32]):
         from vtkmodules.vtkCommonDataModel import vtkStaticCellLocator
 
-        from clrecon.mesh.vtk_bridge import make_polydata
+        from clrecon.exchange.polydata import make_polydata
 
         self._origin = local_origin(vertices)
         self._polydata = make_polydata(vertices - self._origin, np.ascontiguousarray(triangles), None)

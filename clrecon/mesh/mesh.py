@@ -10,12 +10,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from clrecon.errors import UsageError
+from clrecon.exchange.certificate import certificate_lines
+from clrecon.exchange.content import Content
+from clrecon.exchange.coordinates import as_stored
+from clrecon.exchange.formats import write_mesh
 from clrecon.geometry import frame_from_lps
-from clrecon.mesh.coordinates import as_stored
 from clrecon.mesh.quality import measure_quality
-from clrecon.mesh.writers import write_mesh
-from clrecon.mesh.writers.certificate import certificate_lines
-from clrecon.mesh.writers.content import Content
 
 __all__ = ["Mesh"]
 
@@ -226,7 +226,7 @@ class Mesh:
         """
         import pyvista
 
-        from clrecon.mesh.vtk_bridge import make_polydata
+        from clrecon.exchange.polydata import make_polydata
 
         self.check()
         polydata = pyvista.wrap(make_polydata(self._vertices, self._triangles, self._normals))

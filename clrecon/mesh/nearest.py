@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from clrecon.mesh.coordinates import rounding_step
+from clrecon.exchange.coordinates import rounding_step
 from clrecon.system.pieces import chunks
 
 __all__ = ["find_nearest_triangle"]

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.errors import UsageError
+from clrecon.exchange.coordinates import find_coincident
 from clrecon.mesh.connectivity import (
     Edges,
     count_duplicate_faces,
@@ -16,7 +17,6 @@ from clrecon.mesh.connectivity import (
     label_components,
     opposite_half_edges,
 )
-from clrecon.mesh.coordinates import find_coincident
 from clrecon.mesh.measures import corner_edges, cross_product
 from clrecon.system.pieces import local_origin
 

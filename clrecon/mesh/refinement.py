@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.errors import NoSurfaceError, UsageError
+from clrecon.exchange.coordinates import as_stored, rounding_step
 from clrecon.mesh.clusters import Clusters
-from clrecon.mesh.coordinates import as_stored, rounding_step
 from clrecon.mesh.deviation import Deviation
 from clrecon.mesh.mesh import Mesh
 from clrecon.mesh.normals import vertex_normals

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from clrecon.exchange.coordinates import as_stored, find_coincident
 from clrecon.mesh.connectivity import find_edges, label_components
-from clrecon.mesh.coordinates import as_stored, find_coincident
 from clrecon.mesh.intersections import find_beside, find_self_intersections
 from clrecon.mesh.measures import cross_products
 

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.errors import UsageError
+from clrecon.exchange.coordinates import rounding_step
 from clrecon.mesh.connectivity import find_edges
-from clrecon.mesh.coordinates import rounding_step
 from clrecon.mesh.mesh import Mesh
 from clrecon.mesh.normals import vertex_normals
 from clrecon.mesh.refinement import carry_on, check_refinement
@@ -86,7 +86,7 @@ def _windowed_sinc(
     from vtkmodules.util.numpy_support import vtk_to_numpy
     from vtkmodules.vtkFiltersCore import vtkWindowedSincPolyDataFilter
 
-    from clrecon.mesh.vtk_bridge import make_polydata
+    from clrecon.exchange.polydata import make_polydata
 
     smoother = vtkWindowedSincPolyDataFilter()
     smoother.SetInputData(make_polydata(vertices, triangles, None))

@@ -46,7 +46,7 @@ def wall_thickness(
     from vtkmodules.vtkCommonCore import reference
     from vtkmodules.vtkCommonDataModel import vtkStaticCellLocator
 
-    from clrecon.mesh.vtk_bridge import make_polydata
+    from clrecon.exchange.polydata import make_polydata
 
     origin = local_origin(vertices)
     near = vertices - origin

@@ -94,7 +94,7 @@ def describe_job(
         written one by one were found together, and count once), ``bounds_mm`` is the box around all, ``closed``
         and ``manifold`` hold where they hold for each, and what differs or cannot be summed is None.
     """
-    from clrecon.mesh.writers import describe_rounding  # numpy: not wanted before a job starts
+    from clrecon.exchange.formats import describe_rounding
 
     certificate = dict(volume.report)
     warnings = [str(text) for text in certificate.pop("warnings", [])]

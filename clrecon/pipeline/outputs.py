@@ -173,7 +173,7 @@ def check_outputs(
     OutputError
         A folder is missing or cannot be written, or a target is no regular file, or a DICOM file.
     """
-    from clrecon.mesh import check_format
+    from clrecon.exchange.formats import check_format
     from clrecon.system.files import check_writable
 
     check_format(output)
@@ -193,7 +193,7 @@ def stage_meshes(stack: ExitStack, meshes: Sequence[Mesh], paths: Sequence[str |
     OutputError
         One of them cannot be written; all older files are intact.
     """
-    from clrecon.mesh import stage_mesh
+    from clrecon.exchange.formats import stage_mesh
     from clrecon.system.files import allow_open_files
 
     allow_open_files(len(meshes))

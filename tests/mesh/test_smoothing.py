@@ -8,8 +8,8 @@ import sample_meshes as samples
 import tolerances
 
 from clrecon.errors import NoSurfaceError, UsageError
+from clrecon.exchange.coordinates import find_coincident
 from clrecon.mesh import Mesh
-from clrecon.mesh.coordinates import find_coincident
 from clrecon.mesh.distances import SurfaceDistance
 from clrecon.mesh.intersections import count_self_intersections
 from clrecon.mesh.normals import vertex_normals

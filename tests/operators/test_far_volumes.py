@@ -7,12 +7,12 @@ import pytest
 import tolerances
 
 import clrecon
+from clrecon.exchange.coordinates import find_coincident
+from clrecon.exchange.formats import FORMATS, describe_rounding
 from clrecon.geometry import Volume
 from clrecon.geometry.precision import FAR_MM, find_vertex_origin, float32_step
 from clrecon.labels import LabelMap
-from clrecon.mesh import FORMATS, Mesh
-from clrecon.mesh.coordinates import find_coincident
-from clrecon.mesh.writers import describe_rounding
+from clrecon.mesh import Mesh
 from clrecon.operators.isosurface import extract_isosurface
 from clrecon.operators.labels import extract_labels
 from clrecon.reference import isosurface as twin

@@ -40,7 +40,8 @@ _layer("system", "errors")
 _layer("geometry", "errors", "system")
 _layer("anatomy", "errors", "system", "geometry")
 _layer("dicom", "system", "errors", "geometry")
-_layer("mesh", "system", "errors", "version", "geometry", "anatomy")
+_layer("exchange", "errors", "version", "system", "geometry")
+_layer("mesh", "system", "errors", "version", "geometry", "anatomy", "exchange")
 _layer("formats", "system", "errors", "geometry", "anatomy", "dicom")
 _layer("reading", "system", "errors", "geometry", "dicom", "formats")
 _layer("labels", "system", "errors", "geometry", "dicom", "formats")
@@ -63,6 +64,7 @@ AT_MODULE_LEVEL: dict[str, frozenset[str]] = {
     "formats": frozenset({"numpy"}),
     "labels": frozenset({"numpy"}),
     "mesh": frozenset({"numpy"}),
+    "exchange": frozenset({"numpy"}),
     "reference": frozenset({"numpy"}),
     "rendering": frozenset({"numpy"}),
     "phantom": frozenset({"numpy", "pydicom"}),
@@ -77,6 +79,7 @@ INSIDE_FUNCTIONS: dict[str, frozenset[str]] = {
     "dicom": frozenset({"imagecodecs", "openjpeg", "rle", "jpeg_ls", "pylibjpeg"}),
     "formats": frozenset({"nibabel", "nrrd", "SimpleITK"}),
     "labels": frozenset({"pydicom", "scipy"}),
+    "exchange": frozenset({"vtk", "vtkmodules"}),
     "mesh": frozenset({"scipy", "pyvista", "vtk", "vtkmodules", "fast_simplification"}),
     "reference": frozenset({"scipy"}),
     "rendering": frozenset({"scipy", "PIL", "imageio_ffmpeg", "pyvista", "vtk", "vtkmodules"}),
@@ -113,7 +116,7 @@ def project_files(*suffixes: str) -> list[Path]:
 
 
 def layer_of(module: str) -> str:
-    """``clrecon.mesh.writers.stl`` -> ``mesh``; ``clrecon`` -> ``__init__``."""
+    """``clrecon.mesh.refine.smoothing`` -> ``mesh``; ``clrecon`` -> ``__init__``."""
     parts = module.split(".")
     return parts[1] if len(parts) > 1 else "__init__"
 

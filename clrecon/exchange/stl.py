@@ -16,8 +16,8 @@ from typing import BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from clrecon.mesh.coordinates import rounded_apart
-from clrecon.mesh.writers.content import Content, refuse_file
+from clrecon.exchange.content import Content, refuse_file
+from clrecon.exchange.coordinates import rounded_apart
 
 __all__ = ["estimate", "verify", "write"]
 

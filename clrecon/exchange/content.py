@@ -33,7 +33,7 @@ class Content:
     inside : str or None
         What the surface encloses, where that is not what lies from the iso value on: "below -400 HU".
     certificate : tuple of str
-        What is known of the volume, see `clrecon.mesh.writers.certificate`; one printable ASCII line each.
+        What is known of the volume, see `clrecon.exchange.certificate`; one printable ASCII line each.
     """
 
     vertices: NDArray[np.floating]

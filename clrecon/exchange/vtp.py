@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from clrecon.errors import OutputError
-from clrecon.mesh.vtk_bridge import make_polydata
-from clrecon.mesh.writers.content import Content, refuse_file
+from clrecon.exchange.content import Content, refuse_file
+from clrecon.exchange.polydata import make_polydata
 
 __all__ = ["estimate", "verify", "write"]
 

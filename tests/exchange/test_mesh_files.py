@@ -13,7 +13,9 @@ import sample_meshes as samples
 import tolerances
 
 from clrecon.errors import NoSurfaceError, OutputError, UsageError
-from clrecon.mesh import FORMATS, Mesh, writers
+from clrecon.exchange import formats as writers
+from clrecon.exchange.formats import FORMATS
+from clrecon.mesh import Mesh
 
 pytestmark = pytest.mark.unit
 

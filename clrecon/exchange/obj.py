@@ -11,7 +11,7 @@ from typing import BinaryIO
 
 import numpy as np
 
-from clrecon.mesh.writers.content import Content, refuse_file
+from clrecon.exchange.content import Content, refuse_file
 from clrecon.system.pieces import chunks
 
 __all__ = ["estimate", "verify", "write"]

@@ -12,7 +12,7 @@ from typing import BinaryIO
 from xml.sax.saxutils import escape
 
 from clrecon.errors import OutputError
-from clrecon.mesh.writers.content import Content, refuse_file
+from clrecon.exchange.content import Content, refuse_file
 from clrecon.system.pieces import chunks
 
 __all__ = ["estimate", "verify", "write"]

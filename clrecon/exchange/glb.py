@@ -20,7 +20,7 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from clrecon.mesh.writers.content import Content, refuse_file
+from clrecon.exchange.content import Content, refuse_file
 from clrecon.system.pieces import local_origin
 
 __all__ = ["estimate", "verify", "write"]

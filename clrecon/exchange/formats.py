@@ -19,9 +19,16 @@ from typing import BinaryIO
 import numpy as np
 
 from clrecon.errors import NoSurfaceError, OutputError, UsageError
+from clrecon.exchange import (
+    glb,
+    obj,
+    ply,
+    stl,
+    threemf,
+    vtp,
+)
+from clrecon.exchange.content import Content, Writable
 from clrecon.geometry.precision import float32_step
-from clrecon.mesh.writers import glb, obj, ply, stl, threemf, vtp
-from clrecon.mesh.writers.content import Content, Writable
 from clrecon.system.files import StagedFile, stage_file
 
 __all__ = ["FORMATS", "MeshFormat", "check_format", "describe_rounding", "stage_mesh", "write_mesh"]
