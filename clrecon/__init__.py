@@ -30,9 +30,9 @@ if TYPE_CHECKING:
     from clrecon.geometry import Volume
     from clrecon.labels import LabelMap, read_labels
     from clrecon.mesh import Mesh
-    from clrecon.mesh.distances import compare_meshes
-    from clrecon.mesh.refinement import decimate_mesh
-    from clrecon.mesh.smoothing import smooth_mesh
+    from clrecon.mesh.compare.distances import compare_meshes
+    from clrecon.mesh.refine.decimation import decimate_mesh
+    from clrecon.mesh.refine.smoothing import smooth_mesh
     from clrecon.opencl import Device
     from clrecon.operators.isosurface import SurfaceExtractor, extract_isosurface, extract_isosurfaces
     from clrecon.operators.label_masks import extract_label_masks
@@ -111,9 +111,9 @@ _HOMES = {
     "Volume": "clrecon.geometry",
     "VolumeRenderer": "clrecon.operators.renderer",
     "choose_iso_value": "clrecon.anatomy.iso_choice",
-    "compare_meshes": "clrecon.mesh.distances",
+    "compare_meshes": "clrecon.mesh.compare.distances",
     "cut_slice": "clrecon.operators.reformat",
-    "decimate_mesh": "clrecon.mesh.refinement",
+    "decimate_mesh": "clrecon.mesh.refine.decimation",
     "extract_isosurface": "clrecon.operators.isosurface",
     "extract_isosurfaces": "clrecon.operators.isosurface",
     "extract_label_masks": "clrecon.operators.label_masks",
@@ -128,7 +128,7 @@ _HOMES = {
     "reformat_curve": "clrecon.operators.reformat",
     "remove_table": "clrecon.anatomy.body",
     "render": "clrecon.operators.renderer",
-    "smooth_mesh": "clrecon.mesh.smoothing",
+    "smooth_mesh": "clrecon.mesh.refine.smoothing",
     "turntable_cameras": "clrecon.rendering.movies.movie",
     "write_animation": "clrecon.rendering.movies.movie",
 }

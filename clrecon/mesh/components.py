@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from clrecon.errors import NoSurfaceError, UsageError
 from clrecon.exchange.coordinates import rounding_step
 from clrecon.mesh.connectivity import label_components
-from clrecon.mesh.measures import cross_products
 from clrecon.mesh.mesh import Mesh
 from clrecon.mesh.nearest import find_nearest_triangle
+from clrecon.mesh.triangles import cross_products
 from clrecon.system.pieces import CHUNK, local_origin
 from clrecon.system.wording import name_parameter
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from clrecon.mesh.measures import corner_edges, cross_product
+from clrecon.mesh.triangles import corner_edges, cross_product
 
 __all__ = ["vertex_normals"]
 

@@ -17,7 +17,7 @@ from clrecon.mesh.connectivity import (
     label_components,
     opposite_half_edges,
 )
-from clrecon.mesh.measures import corner_edges, cross_product
+from clrecon.mesh.triangles import corner_edges, cross_product
 from clrecon.system.pieces import local_origin
 
 __all__ = ["measure_quality"]

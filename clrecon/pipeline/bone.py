@@ -61,8 +61,8 @@ def find_bone(
     """
     import numpy as np
 
-    from clrecon.mesh.iso_distance import rule_of_report
-    from clrecon.mesh.walls import find_rails, judge_components, looks_like_bone
+    from clrecon.mesh.compare.iso_distance import rule_of_report
+    from clrecon.mesh.compare.walls import find_rails, judge_components, looks_like_bone
 
     rule = rule_of_report(mesh.report)
     if rule is None:
@@ -127,7 +127,7 @@ def _holds_spine(mesh: Mesh, volume: Volume, count: int, labels: NDArray[np.int6
     import numpy as np
 
     from clrecon.anatomy.spine_line import find_spine_line
-    from clrecon.mesh.walls import lie_near_line
+    from clrecon.mesh.compare.walls import lie_near_line
 
     found = np.zeros(count, dtype=bool)
     try:
@@ -146,8 +146,8 @@ def judge_surfaces(parts: Sequence[Part], volume: Volume, settings: MeshSettings
     """Note in the `facts` of each part what its walls look like: ``walls``, None for what is no surface of bone."""
     import numpy as np
 
-    from clrecon.mesh.iso_distance import rule_of_report
-    from clrecon.mesh.walls import MOST_SAMPLES, is_straight, judge_walls, normals_of, sample_walls
+    from clrecon.mesh.compare.iso_distance import rule_of_report
+    from clrecon.mesh.compare.walls import MOST_SAMPLES, is_straight, judge_walls, normals_of, sample_walls
 
     for part in parts:
         part.facts["walls"] = None
@@ -175,8 +175,8 @@ def _count_bones(mesh: Mesh, volume: Volume, rule: IsoRule) -> Bones:
     """How many components of a surface that as a whole does not look like bone are bone after all."""
     import numpy as np
 
+    from clrecon.mesh.compare.walls import find_rails, judge_components, looks_like_bone
     from clrecon.mesh.connectivity import label_components
-    from clrecon.mesh.walls import find_rails, judge_components, looks_like_bone
 
     count, labels = label_components(mesh.triangles, mesh.vertex_count)
     judged = judge_components(mesh, volume, rule, count, labels)
@@ -219,7 +219,7 @@ def warn_of_walls(parts: Sequence[Part], settings: MeshSettings, choice: IsoChoi
 
 def _warn_of_no_bone(part: Part, settings: MeshSettings) -> list[str]:
     """What is said of a surface at a level of bone none of whose components is bone."""
-    from clrecon.mesh.walls import looks_like_bone
+    from clrecon.mesh.compare.walls import looks_like_bone
 
     if part.bones is None or part.bones.bone:
         return []
@@ -249,7 +249,7 @@ def _warn_of_pieces(parts: Sequence[Part]) -> list[str]:
 
 
 def _warn_of_whole(part: Part, settings: MeshSettings) -> list[str]:
-    from clrecon.mesh.walls import looks_like_bone
+    from clrecon.mesh.compare.walls import looks_like_bone
 
     judged = part.facts["walls"]
     where = f"at {part.surface.describe()} {'what is kept' if settings.selects else 'the surface'}"

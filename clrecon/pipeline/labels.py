@@ -187,10 +187,10 @@ def judge_label_volumes(parts: Sequence[Part], closed: bool) -> list[dict[str, A
     Returns
     -------
     list of dict
-        A gate a label and iso value, see `clrecon.mesh.gates.judge_label_volume`.
+        A gate a label and iso value, see `clrecon.mesh.compare.gates.judge_label_volume`.
     """
-    from clrecon.mesh.gates import judge_label_volume
-    from clrecon.mesh.measures import enclosed_ml
+    from clrecon.mesh.compare.gates import judge_label_volume
+    from clrecon.mesh.triangles import enclosed_ml
 
     by_surface: dict[Surface, list[Part]] = {}
     for part in parts:

@@ -130,7 +130,7 @@ def measure_pieces(vertices: NDArray[np.floating], triangles: NDArray[np.uint32]
         ``pieces``, ``pieces_ml`` : components that enclose something, and how much
         ``cavities``, ``cavities_ml`` : walls of cavities, and what they enclose
     """
-    from clrecon.mesh.shifts import measure_volumes
+    from clrecon.mesh.refine.shifts import measure_volumes
     from clrecon.system.pieces import local_origin
 
     found = measure_volumes(vertices - local_origin(vertices), triangles).mm3 / 1000.0
@@ -156,13 +156,13 @@ def describe_print(mesh: Mesh, found: dict[str, float], kept: dict[str, float]) 
     -------
     dict
         ``size_mm`` : x, y, z of the box around it
-        ``wall`` : see `clrecon.mesh.thickness.measure_walls`
+        ``wall`` : see `clrecon.mesh.compare.thickness.measure_walls`
         ``left_out`` : pieces and cavities as in `measure_pieces`; cavities that are left out are filled; and
         ``not_bone``, ``not_bone_ml``, the pieces whose walls are not like bone or that are crumbs, None where that was
         not asked
         ``pieces``, ``pieces_ml``, ``cavities``, ``cavities_ml`` : those that are in it
     """
-    from clrecon.mesh.thickness import measure_walls
+    from clrecon.mesh.compare.thickness import measure_walls
 
     size = mesh.vertices.max(axis=0).astype(float) - mesh.vertices.min(axis=0)
     return {

@@ -22,14 +22,14 @@ def refine_surface(mesh: Mesh, settings: MeshSettings, progress: Progress = igno
     Returns
     -------
     Mesh
-        Its report has ``refinement``: ``smooth``, ``decimate`` (see `clrecon.mesh.refinement`) and ``deviation``,
+        Its report: ``refinement``: ``smooth``, ``decimate`` (see `clrecon.mesh.refine.decimation`), ``deviation``,
         which is `clrecon.mesh.compare_meshes` with the surface before, and ``voxel_mm``.
     """
     if not settings.refines:
         return mesh
-    from clrecon.mesh.distances import compare_meshes
-    from clrecon.mesh.refinement import BOUND_VOXEL, decimate_mesh, default_deviation
-    from clrecon.mesh.smoothing import smooth_mesh
+    from clrecon.mesh.compare.distances import compare_meshes
+    from clrecon.mesh.refine.decimation import BOUND_VOXEL, decimate_mesh, default_deviation
+    from clrecon.mesh.refine.smoothing import smooth_mesh
 
     raw = mesh
     if settings.smooth is not None:
@@ -62,15 +62,15 @@ def judge_parts(parts: Sequence[Part], volume: Volume, settings: MeshSettings) -
     Returns
     -------
     list of dict
-        All gates, see `clrecon.mesh.gates.judge_mesh`, each with ``mesh``, the name of its part or None.
+        All gates, see `clrecon.mesh.compare.gates.judge_mesh`, each with ``mesh``, the name of its part or None.
     """
     if not (settings.refines or any(part.quality for part in parts)):
         for part in parts:
             part.facts |= {"iso_distance": None, "refinement": None}
         return []
-    from clrecon.mesh.gates import judge_mesh
+    from clrecon.mesh.compare.gates import judge_mesh
+    from clrecon.mesh.compare.iso_distance import measure_iso_distance, rule_of_report
     from clrecon.mesh.intersections import count_self_intersections
-    from clrecon.mesh.iso_distance import measure_iso_distance, rule_of_report
 
     gates = []
     for part in parts:

@@ -58,7 +58,7 @@ class MeshSettings:
     topology : {"separated", "trilinear"}
         What is done where the voxels around a cell do not say which of them are joined, see `extract_isosurface`.
     keep : "bone", optional
-        Keep only the components that look like bone, see `clrecon.mesh.walls`.  With `keep_largest`: of these the
+        Keep only components that look like bone, see `clrecon.mesh.compare.walls`.  With `keep_largest`: of these the
         largest.
     keep_largest : int, optional
         Keep only this many components, the largest by area.

@@ -110,7 +110,7 @@ def _volumes_ml(labels: Any, points: Any, triangles: Any, beside: Any) -> dict[i
     """The volume of each label in the peer's mesh: its triangles, turned so that it lies behind all of them."""
     import numpy as np
 
-    from clrecon.mesh.measures import enclosed_ml
+    from clrecon.mesh.triangles import enclosed_ml
 
     volumes = {}
     for number in labels.numbers:

@@ -10,12 +10,12 @@ import tolerances
 from clrecon.errors import UsageError
 from clrecon.geometry import Volume
 from clrecon.mesh import Mesh, split_components
-from clrecon.mesh.clusters import Clusters
-from clrecon.mesh.deviation import Deviation
-from clrecon.mesh.distances import SurfaceDistance
+from clrecon.mesh.compare.distances import SurfaceDistance
 from clrecon.mesh.intersections import count_self_intersections
-from clrecon.mesh.refinement import _collapse, _mend, decimate_mesh
-from clrecon.mesh.smoothing import smooth_mesh
+from clrecon.mesh.refine.clusters import Clusters
+from clrecon.mesh.refine.decimation import _collapse, _mend, decimate_mesh
+from clrecon.mesh.refine.deviation import Deviation
+from clrecon.mesh.refine.smoothing import smooth_mesh
 from clrecon.reference.isosurface import extract_isosurface
 
 pytestmark = pytest.mark.unit

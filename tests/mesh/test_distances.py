@@ -9,7 +9,7 @@ import tolerances
 
 from clrecon.errors import NoSurfaceError, UsageError
 from clrecon.mesh import Mesh
-from clrecon.mesh.distances import NearDistance, SurfaceDistance, compare_meshes, sample_surface
+from clrecon.mesh.compare.distances import NearDistance, SurfaceDistance, compare_meshes, sample_surface
 
 pytestmark = pytest.mark.unit
 

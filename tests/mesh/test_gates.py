@@ -7,9 +7,9 @@ import pytest
 import sample_meshes as samples
 
 from clrecon.mesh import Mesh
-from clrecon.mesh.distances import compare_meshes
-from clrecon.mesh.gates import failed_gates, judge_label_volume, judge_mesh
-from clrecon.mesh.measures import enclosed_ml
+from clrecon.mesh.compare.distances import compare_meshes
+from clrecon.mesh.compare.gates import failed_gates, judge_label_volume, judge_mesh
+from clrecon.mesh.triangles import enclosed_ml
 
 pytestmark = pytest.mark.unit
 

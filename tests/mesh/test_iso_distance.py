@@ -10,7 +10,7 @@ from scipy.ndimage import map_coordinates
 from clrecon.geometry import Volume, compose_affine
 from clrecon.geometry.iso_rule import choose_iso_rule
 from clrecon.mesh import Mesh
-from clrecon.mesh.iso_distance import (
+from clrecon.mesh.compare.iso_distance import (
     distances_to_iso_surface,
     measure_iso_distance,
     rule_of_report,

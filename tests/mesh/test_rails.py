@@ -7,7 +7,7 @@ import pytest
 
 from clrecon.geometry import Volume
 from clrecon.mesh import Mesh
-from clrecon.mesh.walls import find_rails, is_straight
+from clrecon.mesh.compare.walls import find_rails, is_straight
 
 LAST = 40
 """The slices go from 0 to this; 2 mm from one to the next."""

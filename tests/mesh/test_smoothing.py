@@ -10,10 +10,10 @@ import tolerances
 from clrecon.errors import NoSurfaceError, UsageError
 from clrecon.exchange.coordinates import find_coincident
 from clrecon.mesh import Mesh
-from clrecon.mesh.distances import SurfaceDistance
+from clrecon.mesh.compare.distances import SurfaceDistance
 from clrecon.mesh.intersections import count_self_intersections
 from clrecon.mesh.normals import vertex_normals
-from clrecon.mesh.smoothing import _windowed_sinc, smooth_mesh
+from clrecon.mesh.refine.smoothing import _windowed_sinc, smooth_mesh
 
 pytestmark = pytest.mark.unit
 

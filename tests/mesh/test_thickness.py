@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import sample_meshes as samples
 
-from clrecon.mesh.thickness import measure_walls, wall_thickness
+from clrecon.mesh.compare.thickness import measure_walls, wall_thickness
 
 pytestmark = pytest.mark.unit
 

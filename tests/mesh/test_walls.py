@@ -9,8 +9,8 @@ from clrecon.errors import UsageError
 from clrecon.geometry import Volume
 from clrecon.geometry.iso_rule import choose_iso_rule
 from clrecon.mesh import Mesh
+from clrecon.mesh.compare.walls import Walls, judge_components, judge_walls, looks_like_bone, normals_of, sample_walls
 from clrecon.mesh.connectivity import label_components
-from clrecon.mesh.walls import Walls, judge_components, judge_walls, looks_like_bone, normals_of, sample_walls
 from clrecon.phantom import KINDS, PhantomSettings, make_phantom
 from clrecon.reference.isosurface import extract_isosurface
 

@@ -13,7 +13,7 @@ from clrecon.labels import LabelMap
 from clrecon.labels.enclosed import count_faces, find_enclosed
 from clrecon.labels.occupancy import FULL, KEEP
 from clrecon.labels.solid import find_boxes
-from clrecon.mesh.measures import enclosed_ml
+from clrecon.mesh.triangles import enclosed_ml
 from clrecon.opencl import Stopwatch
 from clrecon.operators.label_masks import extract_label_masks
 from clrecon.operators.label_survey import survey_labels

@@ -12,7 +12,7 @@ from variants import VOXEL_TYPES
 from clrecon.errors import DeviceError, NoSurfaceError, UsageError
 from clrecon.geometry import Volume
 from clrecon.geometry.iso_rule import choose_iso_rule
-from clrecon.mesh.iso_distance import measure_iso_distance, rule_of_report
+from clrecon.mesh.compare.iso_distance import measure_iso_distance, rule_of_report
 from clrecon.operators import marching_cubes
 from clrecon.operators.isosurface import SurfaceExtractor, extract_isosurface
 from clrecon.reference import isosurface as twin

@@ -11,7 +11,7 @@ from slab_surfaces import assert_same, extract_in_slabs
 from clrecon.geometry import Volume
 from clrecon.geometry.iso_rule import choose_iso_rule
 from clrecon.labels import LabelMap
-from clrecon.mesh.iso_distance import distances_to_iso_surface
+from clrecon.mesh.compare.iso_distance import distances_to_iso_surface
 from clrecon.operators.isosurface import extract_isosurface
 from clrecon.operators.labels import extract_labels
 from clrecon.reference.isosurface import extract_isosurface as extract_twin

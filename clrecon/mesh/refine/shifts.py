@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from clrecon.exchange.coordinates import as_stored, find_coincident
 from clrecon.mesh.connectivity import find_edges, label_components
 from clrecon.mesh.intersections import find_beside, find_self_intersections
-from clrecon.mesh.measures import cross_products
+from clrecon.mesh.triangles import cross_products
 
 __all__ = ["Volumes", "measure_volumes", "move_vertices", "restore_volumes", "shorten_steps"]
 

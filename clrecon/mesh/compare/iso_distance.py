@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from clrecon.geometry import Volume
 from clrecon.geometry.iso_rule import IsoRule, layer_normal_matrices
-from clrecon.mesh.distances import summarise_distances
+from clrecon.mesh.compare.distances import summarise_distances
 from clrecon.mesh.mesh import Mesh
 from clrecon.system.pieces import chunks
 

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from clrecon.errors import NoSurfaceError, UsageError
 from clrecon.mesh.connectivity import order_by_number
-from clrecon.mesh.measures import cross_product, cross_products
 from clrecon.mesh.mesh import Mesh
+from clrecon.mesh.triangles import cross_product, cross_products
 from clrecon.system.pieces import chunks, local_origin
 
 __all__ = [

@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 
 from clrecon.errors import NoSurfaceError, UsageError
 from clrecon.exchange.coordinates import as_stored, rounding_step
-from clrecon.mesh.clusters import Clusters
-from clrecon.mesh.deviation import Deviation
 from clrecon.mesh.mesh import Mesh
 from clrecon.mesh.normals import vertex_normals
-from clrecon.mesh.shifts import measure_volumes, move_vertices, restore_volumes
+from clrecon.mesh.refine.clusters import Clusters
+from clrecon.mesh.refine.deviation import Deviation
+from clrecon.mesh.refine.shifts import measure_volumes, move_vertices, restore_volumes
 from clrecon.system.pieces import local_origin
 
 __all__ = ["BOUND_VOXEL", "carry_on", "check_refinement", "decimate_mesh", "default_deviation"]

@@ -19,7 +19,7 @@ from clrecon.anatomy.dense_pieces import RAIL_MM, STRAIGHT_MM
 from clrecon.errors import UsageError
 from clrecon.geometry import Volume
 from clrecon.geometry.iso_rule import IsoRule
-from clrecon.mesh.iso_distance import trilinear_values
+from clrecon.mesh.compare.iso_distance import trilinear_values
 from clrecon.mesh.mesh import Mesh
 
 __all__ = [

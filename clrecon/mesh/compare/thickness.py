@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clrecon.mesh.distances import sample_surface_points
+from clrecon.mesh.compare.distances import sample_surface_points
 from clrecon.system.pieces import local_origin
 
 __all__ = ["SAMPLES", "measure_walls", "wall_thickness"]

@@ -14,9 +14,9 @@ from clrecon.mesh.connectivity import (
     label_components,
     opposite_half_edges,
 )
-from clrecon.mesh.deviation import WITNESSES, Deviation
 from clrecon.mesh.intersections import find_beside, find_self_intersections
-from clrecon.mesh.measures import cross_products
+from clrecon.mesh.refine.deviation import WITNESSES, Deviation
+from clrecon.mesh.triangles import cross_products
 
 __all__ = ["Clusters"]
 

@@ -14,8 +14,8 @@ from clrecon.exchange.coordinates import rounding_step
 from clrecon.mesh.connectivity import find_edges
 from clrecon.mesh.mesh import Mesh
 from clrecon.mesh.normals import vertex_normals
-from clrecon.mesh.refinement import carry_on, check_refinement
-from clrecon.mesh.shifts import measure_volumes, move_vertices, restore_volumes, shorten_steps
+from clrecon.mesh.refine.decimation import carry_on, check_refinement
+from clrecon.mesh.refine.shifts import measure_volumes, move_vertices, restore_volumes, shorten_steps
 from clrecon.system.pieces import local_origin
 
 __all__ = ["smooth_mesh"]

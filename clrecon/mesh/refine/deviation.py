@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from clrecon.mesh.distances import NearDistance
+from clrecon.mesh.compare.distances import NearDistance
 
 __all__ = ["WITNESSES", "Deviation"]
 

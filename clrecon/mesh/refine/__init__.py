@@ -1,0 +1,1 @@
+"""Smoothing and decimation within a bound."""
