@@ -13,7 +13,7 @@ from clrecon.errors import RefusedInputError, UsageError
 from clrecon.system.text import escape_text
 
 if TYPE_CHECKING:
-    from clrecon.dicom.listing import SeriesListing
+    from clrecon.dicom.series.listing import SeriesListing
     from clrecon.geometry import Volume
     from clrecon.system.progress import Progress
 

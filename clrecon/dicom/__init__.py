@@ -1,6 +1,6 @@
 """DICOM in: CT images, single slices or multi-frame, become a `clrecon.geometry.Volume` in HU and LPS mm."""
 
-from clrecon.dicom.listing import SeriesEntry, SeriesListing
 from clrecon.dicom.reader import list_series, read_volume
+from clrecon.dicom.series.listing import SeriesEntry, SeriesListing
 
 __all__ = ["SeriesEntry", "SeriesListing", "list_series", "read_volume"]

@@ -10,16 +10,16 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from clrecon.dicom.certificate import certify, collect_scan_warnings, collect_series_warnings
-from clrecon.dicom.choice import choose_series, describe_left
-from clrecon.dicom.containers import advise_on
-from clrecon.dicom.forced import describe_way_out
-from clrecon.dicom.likeness import Likeness, judge_likeness
-from clrecon.dicom.listing import SeriesListing, describe_series
-from clrecon.dicom.pixels import read_voxels
-from clrecon.dicom.plausibility import collect_voxel_warnings
-from clrecon.dicom.scan import BARE_DATA_SET, Scan, scan_path
-from clrecon.dicom.series import Series, group_series
+from clrecon.dicom.parse.containers import advise_on
+from clrecon.dicom.parse.forced import describe_way_out
+from clrecon.dicom.pixels.voxels import read_voxels
+from clrecon.dicom.series.certificate import certify, collect_scan_warnings, collect_series_warnings
+from clrecon.dicom.series.choice import choose_series, describe_left
+from clrecon.dicom.series.likeness import Likeness, judge_likeness
+from clrecon.dicom.series.listing import SeriesListing, describe_series
+from clrecon.dicom.series.plausibility import collect_voxel_warnings
+from clrecon.dicom.series.scan import BARE_DATA_SET, Scan, scan_path
+from clrecon.dicom.series.series import Series, group_series
 from clrecon.errors import NoDicomError, RefusedInputError, UsageError
 from clrecon.geometry import Volume
 from clrecon.system.progress import Progress

@@ -1,12 +1,12 @@
-"""The certificate of a volume that is not from DICOM: the entries of `clrecon.dicom.certificate`, as far as known."""
+"""The certificate of a volume that is not from DICOM: entries of `clrecon.dicom.series.certificate`, where known."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from typing import Any
 
-from clrecon.dicom.layout import describe_orientation
-from clrecon.dicom.volume_gates import PADDING_SHARE, judge_figures, judge_steps, list_odd_values
+from clrecon.dicom.series.gates import PADDING_SHARE, judge_figures, judge_steps, list_odd_values
+from clrecon.dicom.stack.layout import describe_orientation
 from clrecon.formats.grid_file import GridFile
 from clrecon.formats.values import GridValues
 from clrecon.geometry.affine import column_spacing, slice_normal, tilt_degrees

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from clrecon.dicom.listing import SeriesEntry, SeriesListing
-from clrecon.dicom.plausibility import collect_voxel_warnings
+from clrecon.dicom.series.listing import SeriesEntry, SeriesListing
+from clrecon.dicom.series.plausibility import collect_voxel_warnings
 from clrecon.errors import RefusedInputError
 from clrecon.formats.certificate import MODALITY, certify_grid, collect_header_warnings, collect_value_warnings
 from clrecon.formats.grid_file import VOLUME, GridFile

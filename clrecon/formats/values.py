@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clrecon.dicom.likeness import Likeness, judge_slices
-from clrecon.dicom.pixels import PixelFacts
+from clrecon.dicom.pixels.voxels import PixelFacts
+from clrecon.dicom.series.likeness import Likeness, judge_slices
 from clrecon.errors import RefusedInputError
 from clrecon.formats.grid_file import GridFile
 from clrecon.geometry import AIR_HU

@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clrecon.dicom.multiframe import find_data_set
-from clrecon.dicom.sequences import Schema, read_sequences
-from clrecon.dicom.values import ValueProblem
+from clrecon.dicom.headers.multiframe import find_data_set
+from clrecon.dicom.parse.sequences import Schema, read_sequences
+from clrecon.dicom.parse.values import ValueProblem
 from clrecon.errors import ClreconError, RefusedInputError
 from clrecon.formats.stream import check_size
 from clrecon.labels.frames import FrameStack, place_frames

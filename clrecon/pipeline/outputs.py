@@ -128,7 +128,7 @@ def _find_voxels(path: str | Path) -> Path | None:
 
 
 def _is_bare_data_set(path: str | Path) -> bool:
-    from clrecon.dicom.forced import restore_start
+    from clrecon.dicom.parse.forced import restore_start
     from clrecon.system.files import open_regular
 
     try:

@@ -12,7 +12,7 @@ from dicom_series import Plan, set_raw, set_values, write_series
 
 from clrecon import list_series, read_volume
 from clrecon.dicom import reader
-from clrecon.dicom.layout import describe_orientation, summarise_gaps
+from clrecon.dicom.stack.layout import describe_orientation, summarise_gaps
 from clrecon.geometry import compose_affine
 
 IDENTITY = set_values(

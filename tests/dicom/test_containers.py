@@ -13,7 +13,7 @@ import pytest
 from dicom_series import Plan, write_series
 
 from clrecon.dicom import read_volume
-from clrecon.dicom.containers import advise_on, describe_container
+from clrecon.dicom.parse.containers import advise_on, describe_container
 from clrecon.errors import NoDicomError
 
 

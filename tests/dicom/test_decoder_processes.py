@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from clrecon.dicom import decoder_pool
-from clrecon.dicom.decoder_pool import DecoderError, DecoderPool
+from clrecon.dicom.pixels.decoder_pool import DecoderError, DecoderPool
+from clrecon.dicom.pixels.voxels import decoder_pool
 
 PIXELS = np.arange(12 * 9, dtype=np.int16).reshape(12, 9)
 LINUX = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="how processes end is looked up in /proc")
@@ -193,7 +193,7 @@ SCRIPT = """
 import sys, threading, time
 import numpy as np
 sys.path[:0] = {path!r}
-from clrecon.dicom.decoder_pool import DecoderPool
+from clrecon.dicom.pixels.decoder_pool import DecoderPool
 pool = DecoderPool(["hostile_decoders:copy", "hostile_decoders:hang"], 16)
 out = np.zeros((2, 2), np.int16)
 pool.decode(bytes(8), "hostile_decoders:copy", out)
@@ -210,7 +210,7 @@ sys.path[:0] = {path!r}
 for number in {numbers!r}:
     os.close(number)
 import numpy as np
-from clrecon.dicom.decoder_pool import DecoderPool
+from clrecon.dicom.pixels.decoder_pool import DecoderPool
 out = np.zeros((2, 2), np.int16)
 with DecoderPool(["hostile_decoders:copy"], 16) as pool:
     pool.decode(bytes(range(8)), "hostile_decoders:copy", out)

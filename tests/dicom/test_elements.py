@@ -20,10 +20,12 @@ from pydicom.datadict import DicomDictionary
 from pydicom.uid import UID, DeflatedExplicitVRLittleEndian, ExplicitVRBigEndian, ImplicitVRLittleEndian
 from pydicom.valuerep import EXPLICIT_VR_LENGTH_16, EXPLICIT_VR_LENGTH_32
 
-from clrecon.dicom import codecs, elements, list_series, plain, read_volume
-from clrecon.dicom.careful import parse_carefully
-from clrecon.dicom.raw import CorruptFileError
-from clrecon.dicom.values import WANTED_TAGS
+from clrecon.dicom import list_series, read_volume
+from clrecon.dicom.parse import elements, plain
+from clrecon.dicom.parse import transfer_syntaxes as codecs
+from clrecon.dicom.parse.careful import parse_carefully
+from clrecon.dicom.parse.raw import CorruptFileError
+from clrecon.dicom.parse.values import WANTED_TAGS
 
 CORPUS = Path(pydicom.__file__).parent / "data" / "test_files"
 MUTATIONS = 6000

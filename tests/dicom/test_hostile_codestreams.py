@@ -24,8 +24,9 @@ from compressed_frames import (
 from dicom_series import Plan, make_dataset, save_dataset, write_series
 from pydicom.encaps import encapsulate
 
-from clrecon.dicom import codestream, read_volume
-from clrecon.dicom.stored import StoredPixels
+from clrecon.dicom import read_volume
+from clrecon.dicom.pixels.stored import StoredPixels
+from clrecon.dicom.pixels.voxels import codestream
 from clrecon.errors import RefusedInputError
 
 

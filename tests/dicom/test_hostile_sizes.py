@@ -11,8 +11,9 @@ from dicom_series import Plan, make_dataset, save_dataset, write_series
 from pydicom.encaps import encapsulate
 from pydicom.uid import DeflatedExplicitVRLittleEndian, JPEG2000Lossless
 
-from clrecon.dicom import careful, elements, plain, read_volume
-from clrecon.dicom.stored import StoredPixels
+from clrecon.dicom import read_volume
+from clrecon.dicom.parse import careful, elements, plain
+from clrecon.dicom.pixels.stored import StoredPixels
 from clrecon.errors import RefusedInputError
 
 SAMPLES_PER_PIXEL = b"\x28\0\x02\0"

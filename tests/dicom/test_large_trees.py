@@ -14,10 +14,12 @@ import pytest
 from dicom_series import write_series
 from tolerances import HEADER_BYTES, SCAN_PEAK_BYTES_A_FILE
 
-from clrecon.dicom import careful, disk, header, list_series, plain, read_volume, scan
-from clrecon.dicom.elements import PREFIX_BYTES, read_start
-from clrecon.dicom.scan import CorruptFile, scan_path
-from clrecon.dicom.series import group_series
+from clrecon.dicom import list_series, read_volume
+from clrecon.dicom.headers import header
+from clrecon.dicom.parse import careful, plain
+from clrecon.dicom.parse.elements import PREFIX_BYTES, read_start
+from clrecon.dicom.series.scan import CorruptFile, scan_path
+from clrecon.dicom.series.series import disk, group_series, scan
 from clrecon.errors import RefusedInputError
 
 
@@ -220,6 +222,6 @@ def test_the_plain_parser_reads_every_test_series(tmp_path: Path, monkeypatch: p
         answers.append(parse(*given))  # type: ignore[arg-type]
         return answers[-1]
 
-    monkeypatch.setattr("clrecon.dicom.elements.parse_plainly", watch)
+    monkeypatch.setattr("clrecon.dicom.parse.elements.parse_plainly", watch)
     assert len(scan_path(tmp_path).slices) == 7
     assert len(answers) == 7 and None not in answers

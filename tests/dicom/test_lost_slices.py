@@ -9,7 +9,8 @@ import pytest
 from dicom_series import Plan, make_dataset, save_dataset, set_values, write_series
 from pydicom.uid import MRImageStorage
 
-from clrecon.dicom import disk, list_series, read_volume, scan
+from clrecon.dicom import list_series, read_volume
+from clrecon.dicom.series.series import disk, scan
 from clrecon.errors import NoDicomError, RefusedInputError
 
 CORRUPT = bytes(128) + b"DICM" + b"\xff" * 50

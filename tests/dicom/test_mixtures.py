@@ -8,8 +8,8 @@ import tolerances
 from dicom_series import Plan, write_series
 
 from clrecon.dicom import list_series, read_volume
-from clrecon.dicom.attributes import alternates
-from clrecon.dicom.likeness import measure_likeness
+from clrecon.dicom.series.likeness import measure_likeness
+from clrecon.dicom.stack.attributes import alternates
 from clrecon.errors import RefusedInputError, UsageError
 
 GAP = 1.25

@@ -33,8 +33,8 @@ from pydicom.uid import (
 from tolerances import AFFINE_MM, THOUSAND_FRAMES_S
 
 from clrecon.dicom import list_series, read_volume
-from clrecon.dicom.header import read_headers
-from clrecon.dicom.slice_header import OtherImage
+from clrecon.dicom.headers.header import read_headers
+from clrecon.dicom.headers.slice_header import OtherImage
 
 SHUFFLED = (4, 0, 6, 2, 5, 1, 3)
 PLANS = {

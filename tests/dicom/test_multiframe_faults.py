@@ -19,7 +19,8 @@ from enhanced_series import (
 from pydicom.dataset import Dataset
 from tolerances import THOUSAND_FRAMES_S
 
-from clrecon.dicom import list_series, multiframe, read_volume
+from clrecon.dicom import list_series, read_volume
+from clrecon.dicom.headers import multiframe
 from clrecon.errors import NoDicomError, RefusedInputError
 
 

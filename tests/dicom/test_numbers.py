@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from clrecon.dicom.numbers import median
+from clrecon.dicom.stack.numbers import median
 
 
 @given(st.lists(st.floats(-1e9, 1e9), min_size=1, max_size=9))

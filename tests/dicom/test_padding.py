@@ -10,7 +10,7 @@ import pytest
 from dicom_series import Plan, set_values, write_series
 
 from clrecon.dicom import read_volume
-from clrecon.dicom.padding import PaddingMasks, pack_mask
+from clrecon.dicom.pixels.padding import PaddingMasks, pack_mask
 from clrecon.geometry import AIR_HU
 from clrecon.reference.isosurface import extract_isosurface
 

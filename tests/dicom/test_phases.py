@@ -7,8 +7,8 @@ import pytest
 from dicom_series import Plan, make_dataset, save_dataset, set_values, write_series
 
 from clrecon.dicom import list_series, read_volume
-from clrecon.dicom.phases import have_same_pixels
-from clrecon.dicom.scan import scan_path
+from clrecon.dicom.series.phases import have_same_pixels
+from clrecon.dicom.series.scan import scan_path
 from clrecon.errors import RefusedInputError, UsageError
 
 
@@ -151,7 +151,7 @@ def test_copies_whose_pixels_cannot_be_read_are_refused(tmp_path, monkeypatch):
     def fail(slices, progress=None, source=None):
         raise RefusedInputError("again0: does not decode")
 
-    monkeypatch.setattr("clrecon.dicom.phases.read_voxels", fail)
+    monkeypatch.setattr("clrecon.dicom.series.phases.read_voxels", fail)
     with pytest.raises(RefusedInputError, match="cannot be compared: again0: does not decode"):
         read_volume(tmp_path)
     assert list_series(tmp_path).series[0].phases == []

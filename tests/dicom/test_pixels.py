@@ -17,7 +17,8 @@ from pydicom.uid import (
 from stored_pixels import set_pixels
 from tolerances import AFFINE_MM
 
-from clrecon.dicom import list_series, read_volume, stored
+from clrecon.dicom import list_series, read_volume
+from clrecon.dicom.pixels.voxels import stored
 from clrecon.errors import NoDicomError, RefusedInputError
 from clrecon.system import memory
 

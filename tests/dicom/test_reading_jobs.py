@@ -12,7 +12,8 @@ from dicom_series import Plan, write_series
 from pydicom.encaps import encapsulate
 from pydicom.uid import RLELossless
 
-from clrecon.dicom import pixels, read_volume
+from clrecon.dicom import read_volume
+from clrecon.dicom.pixels.voxels import voxels as pixels
 from clrecon.system import memory
 
 

@@ -10,7 +10,7 @@ import pytest
 from dicom_series import Plan, make_dataset, save_dataset, set_values, write_series
 
 from clrecon.dicom import list_series, read_volume
-from clrecon.dicom.remains import describe_start
+from clrecon.dicom.series.remains import describe_start
 from clrecon.errors import RefusedInputError
 
 COUNT = 12

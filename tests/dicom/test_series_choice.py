@@ -16,7 +16,7 @@ from pydicom.data import get_testdata_file
 from pydicom.uid import MRImageStorage, SecondaryCaptureImageStorage
 
 from clrecon.dicom import list_series, read_volume
-from clrecon.dicom.planes import SPLIT_ANGLE_RAD, Planes
+from clrecon.dicom.stack.planes import SPLIT_ANGLE_RAD, Planes
 from clrecon.errors import NoDicomError, RefusedInputError, UsageError
 
 CONTRACT = (

@@ -17,7 +17,8 @@ from pydicom.uid import (
     ImplicitVRLittleEndian,
 )
 
-from clrecon.dicom import list_series, read_volume, surplus
+from clrecon.dicom import list_series, read_volume
+from clrecon.dicom.headers import surplus
 from clrecon.errors import RefusedInputError
 
 NAME = "IM{:04d}".format

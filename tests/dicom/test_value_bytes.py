@@ -23,7 +23,7 @@ from pydicom.dataset import Dataset
 from pydicom.uid import ExplicitVRLittleEndian, ImplicitVRLittleEndian
 
 from clrecon.dicom import read_volume
-from clrecon.dicom.values import decode_text
+from clrecon.dicom.parse.values import decode_text
 from clrecon.errors import RefusedInputError
 
 PLAN = Plan(shape=(4, 5, 6), origin=(-98.0, 31.25, -400.0), name="IM{:04d}".format)

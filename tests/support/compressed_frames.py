@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from dicom_series import Plan, write_series
 
-from clrecon.dicom.header import read_headers
-from clrecon.dicom.stored import StoredPixels
+from clrecon.dicom.headers.header import read_headers
+from clrecon.dicom.pixels.stored import StoredPixels
 
 imagecodecs = pytest.importorskip("imagecodecs")
 rle = pytest.importorskip("rle.rle")

@@ -1,0 +1,1 @@
+"""Elements of a file to the headers of its slices."""

@@ -1,0 +1,373 @@
+"""From a multi-frame CT image to the elements of each of its frames, as if each were a file of its own.
+
+What a classic image says at its top level, an enhanced one says in functional groups: shared by all frames or for
+each of them.  The wanted values of the groups are laid over those of the top level, so that one set of checks
+(`clrecon.dicom.headers.header`) stands over slices and frames alike.  A frame's place is its Plane Position alone:
+the order of the frames, In-Stack Position Number and Dimension Index Values play no part in the geometry, they only
+help to tell frames at the same place apart.
+
+Source: DICOM PS3.3 A.38 (Enhanced CT), A.70 (Legacy Converted Enhanced CT), C.7.6.16 (functional groups), C.7.6.17
+(dimensions), C.8.15 (Enhanced CT).
+"""
+
+from __future__ import annotations
+
+import math
+import re
+import struct
+import zlib
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from clrecon.dicom.headers.concatenation import CONCATENATION_TAGS, Concatenation, read_concatenation
+from clrecon.dicom.headers.phase_tags import FRAME_PHASES
+from clrecon.dicom.parse.raw import IMPLICIT_LITTLE, META_START, DicomElements
+from clrecon.dicom.parse.sequences import Item, Schema, decode_number, name_tag, read_sequences
+from clrecon.dicom.parse.values import ValueProblem, Values, decode_text
+from clrecon.system.files import open_regular
+from clrecon.system.text import escape_text
+
+__all__ = ["ENHANCED_CT", "Frame", "Groups", "find_data_set", "read_groups", "split_frames"]
+
+ENHANCED_CT = ("1.2.840.10008.5.1.4.1.1.2.1", "1.2.840.10008.5.1.4.1.1.2.2")
+"""SOP classes: Enhanced CT Image Storage, Legacy Converted Enhanced CT Image Storage."""
+
+FRAMES_LIMIT = 65_536
+HEADER_BYTES_LIMIT = 256 * 1024 * 1024
+ITEMS_PER_FRAME = 64
+
+SHARED_GROUPS, FRAME_GROUPS = 0x52009229, 0x52009230
+PLANE_POSITION, PLANE_ORIENTATION, PIXEL_MEASURES = 0x00209113, 0x00209116, 0x00289110
+PIXEL_VALUE_TRANSFORMATION = 0x00289145
+FRAME_TYPE_GROUP, FRAME_CONTENT = 0x00189329, 0x00209111
+REAL_WORLD_VALUES = 0x00409096
+UNASSIGNED_SHARED, UNASSIGNED_FRAME = 0x00209170, 0x00209171
+DIMENSIONS, DIMENSION_POINTER, DIMENSION_VALUES = 0x00209222, 0x00209165, 0x00209157
+
+FRAME_ACQUISITION_TIME, FRAME_REFERENCE_TIME = 0x00189074, 0x00189151
+ACQUISITION_DATE_AND_TIME = (0x00080022, 0x00080032)
+IMAGE_TYPE, FRAME_TYPE = 0x00080008, 0x00089007
+PIXEL_PRESENTATION, VOLUMETRIC_PROPERTIES, CALCULATION_TECHNIQUE = 0x00089205, 0x00089206, 0x00089207
+RESCALE_INTERCEPT, RESCALE_SLOPE, RESCALE_TYPE = 0x00281052, 0x00281053, 0x00281054
+RESCALE = (RESCALE_INTERCEPT, RESCALE_SLOPE, RESCALE_TYPE)
+LOSSY = 0x00282110
+REAL_SLOPE, REAL_INTERCEPT, REAL_UNITS, CODE_VALUE = 0x00409225, 0x00409224, 0x004008EA, 0x00080100
+CALIBRATING = (PLANE_POSITION, PLANE_ORIENTATION, PIXEL_MEASURES, PIXEL_VALUE_TRANSFORMATION, REAL_WORLD_VALUES)
+HU_CODES = ("[hnsf'U]", "HU")  # UCUM
+GEOMETRY = (0x00200032, 0x00200037, 0x00280030, 0x00180050, 0x00180088)
+"""ImagePositionPatient, ImageOrientationPatient, PixelSpacing, SliceThickness, SpacingBetweenSlices: at the top level
+of a multi-frame image these have no place and no meaning."""
+
+PLACE_POINTERS = (0x00200032, 0x00200037, 0x00209057, 0x00201041, 0x00209113, 0x00209116, 0x00200013)
+"""Dimensions that only number the places: position, orientation, InStackPositionNumber, SliceLocation; and the files
+that a converter had before it, InstanceNumber."""
+
+
+def _wanted(*tags: int) -> Schema:
+    return dict.fromkeys(tags)
+
+
+_MACROS: dict[int, Schema] = {
+    PLANE_POSITION: _wanted(0x00200032),
+    PLANE_ORIENTATION: _wanted(0x00200037),
+    PIXEL_MEASURES: _wanted(0x00280030, 0x00180050, 0x00180088),
+    PIXEL_VALUE_TRANSFORMATION: _wanted(*RESCALE),
+    FRAME_TYPE_GROUP: _wanted(FRAME_TYPE, PIXEL_PRESENTATION, VOLUMETRIC_PROPERTIES, CALCULATION_TECHNIQUE),
+    FRAME_CONTENT: _wanted(
+        0x00209056, 0x00209128, 0x00209156, FRAME_ACQUISITION_TIME, FRAME_REFERENCE_TIME, DIMENSION_VALUES
+    ),
+    0x00189118: _wanted(0x00209241, 0x00209153),  # CardiacSynchronizationSequence
+    0x00209253: _wanted(0x00209245, 0x00209255),  # RespiratorySynchronizationSequence
+    0x00209310: _wanted(0x0020930D),  # TemporalPositionSequence
+    0x00189314: _wanted(0x00181210),  # CTReconstructionSequence: ConvolutionKernel
+    0x00189325: _wanted(0x00180060),  # CTXRayDetailsSequence: KVP
+}
+_MAPPING: Schema = {REAL_SLOPE: None, REAL_INTERCEPT: None, REAL_UNITS: _wanted(CODE_VALUE)}
+# What a classic image said outside of the macros: when and how it was taken, padding, and rescale where a converter
+# did not move it; nothing of the geometry and nothing of the form of the pixels.
+_UNASSIGNED = _wanted(
+    0x00080022, 0x00080023, 0x00080032, 0x00080033, 0x00180060, 0x00181060, 0x00181210, 0x00200012, 0x00200100,
+    0x00280120, 0x00280121, *RESCALE, LOSSY,
+)  # fmt: skip
+_GROUPS: Schema = {**_MACROS, REAL_WORLD_VALUES: _MAPPING}
+_SCHEMA: Schema = {
+    DIMENSIONS: _wanted(DIMENSION_POINTER),
+    **dict.fromkeys(CONCATENATION_TAGS),
+    SHARED_GROUPS: {**_GROUPS, UNASSIGNED_SHARED: _UNASSIGNED},
+    FRAME_GROUPS: {**_GROUPS, UNASSIGNED_FRAME: _UNASSIGNED},
+}
+
+NO_PLANE = ("CURVED_MPR", "VOLUME_RENDER", "SURFACE_RENDER")
+COMPUTED = ("MAX_IP", "MIN_IP", "MPR")
+COMPUTED_CONTRAST = (
+    "ADDITION DIVISION MASKED MAXIMUM MEAN MEDIAN MINIMUM MULTIPLICATION QUANTITY STD_DEVIATION SUBTRACTION"
+).split()
+
+
+@dataclass(frozen=True)
+class Groups:
+    """The functional groups of one file, still undecoded.
+
+    Attributes
+    ----------
+    shared : Item
+    frames : list of Item
+        One a frame.
+    dimensions : tuple of (int, str)
+        Place in DimensionIndexValues and name of the dimensions that are not a place in the patient.
+    concatenation : Concatenation or None
+    warnings : tuple of str
+    """
+
+    shared: Item
+    frames: list[Item]
+    dimensions: tuple[tuple[int, str], ...]
+    concatenation: Concatenation | None
+    warnings: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One frame as a classic image would have it.
+
+    Attributes
+    ----------
+    elements : DicomElements
+        Those of the file, the values of the frame's groups laid over them.
+    phase : tuple of (str, str)
+        Keyword and value, see `SliceHeader`.
+    warnings : tuple of str
+    problem : ValueProblem or None
+        What is wrong with its groups; the elements are not to be used then.
+    """
+
+    elements: DicomElements
+    phase: tuple[tuple[str, str], ...]
+    warnings: tuple[str, ...]
+    problem: ValueProblem | None = None
+
+
+def read_groups(path: Path, elements: DicomElements) -> Groups:
+    """Read the functional groups of a multi-frame image, of which the elements of the top level are known.
+
+    Parameters
+    ----------
+    path : Path
+    elements : DicomElements
+        Those of the top level, with NumberOfFrames; there is pixel data.
+
+    Raises
+    ------
+    ValueProblem
+        NumberOfFrames is no sane number, the groups are missing, not as many as the frames, or cannot be parsed;
+        the file has no meta header.
+    OSError
+        The file cannot be read.
+    """
+    if elements.restored:
+        raise ValueProblem("multi-frame image without preamble or meta header: convert it to a DICOM file first")
+    values = Values(elements)
+    count = values.whole_or_none("NumberOfFrames")
+    if count is None or not 1 <= count <= FRAMES_LIMIT:
+        raise values.wrong("NumberOfFrames", f"a whole number from 1 to {FRAMES_LIMIT}")
+    data, start = _read_header_bytes(path, elements)
+    try:
+        top = read_sequences(
+            data,
+            start,
+            _SCHEMA,
+            implicit=(elements.transfer_syntax == IMPLICIT_LITTLE) != elements.encoding_differs,
+            little_endian=elements.little_endian,
+            items_limit=ITEMS_PER_FRAME * (count + 1),
+        )
+    except ValueProblem as problem:
+        raise ValueProblem(f"the functional groups cannot be parsed: {problem}") from problem
+    frames = top.sequences.get(FRAME_GROUPS, [])
+    if not frames:
+        raise ValueProblem(
+            "PerFrameFunctionalGroupsSequence (5200,9230) is missing or empty: the places of the frames are not known"
+        )
+    if len(frames) != count:
+        raise ValueProblem(
+            f"NumberOfFrames (0028,0008) is {count}, PerFrameFunctionalGroupsSequence (5200,9230) holds {len(frames)} "
+            "items: one a frame expected"
+        )
+    shared = top.sequences.get(SHARED_GROUPS, [])
+    if len(shared) > 1:
+        raise ValueProblem(f"SharedFunctionalGroupsSequence (5200,9229) holds {len(shared)} items, expected 1")
+    return Groups(
+        shared[0] if shared else Item(),
+        frames,
+        tuple(_name_dimensions(top.sequences.get(DIMENSIONS, []), elements.little_endian)),
+        read_concatenation(top, count, elements.little_endian),
+        tuple(f"{name_tag(tag)} is there twice in one item, with the same value" for tag in sorted(top.repeated)),
+    )
+
+
+def split_frames(elements: DicomElements, groups: Groups) -> Iterator[Frame]:
+    """Give each frame the elements that a classic image of it would have.
+
+    Of one value at several places the first of these is taken: macro of the frame, shared macro, unassigned
+    attributes of the frame, shared ones, top level.
+
+    Yields
+    ------
+    Frame
+        In the order of the file.
+    """
+    top_values = {tag: value for tag, value in elements.values.items() if tag not in GEOMETRY}
+    top_vrs = {tag: vr for tag, vr in elements.vrs.items() if tag not in GEOMETRY}
+    for item in groups.frames:
+        frame = elements._replace(values=dict(top_values), vrs=dict(top_vrs))
+        warnings: list[str] = []
+        try:
+            macros = _merge_macros(groups.shared, item)
+            _lay_over(frame, groups.shared.sequences.get(UNASSIGNED_SHARED, []))
+            _lay_over(frame, item.sequences.get(UNASSIGNED_FRAME, []))
+            if PIXEL_VALUE_TRANSFORMATION in macros:
+                for tag in RESCALE:  # a slope of the macro is not to meet an intercept from elsewhere
+                    frame.values.pop(tag, None)
+            if elements.values.get(LOSSY):  # what is lossy for the file is so for its frames
+                frame.values[LOSSY] = max(elements.values[LOSSY], frame.values[LOSSY])
+            _lay_over(frame, (items[0] for tag, items in macros.items() if tag != REAL_WORLD_VALUES))
+            _take_times(frame)
+            _check_frame_type(frame, warnings)
+            _take_real_world_values(frame, macros.get(REAL_WORLD_VALUES, []), warnings)
+        except ValueProblem as problem:
+            yield Frame(elements, (), (), problem)
+        else:
+            yield Frame(frame, tuple(_describe_phase(frame, groups.dimensions)), tuple(warnings))
+
+
+def _merge_macros(shared: Item, frame: Item) -> dict[int, list[Item]]:
+    """The macros of one frame that are not empty; refuses those that are there twice and do not agree."""
+    macros: dict[int, list[Item]] = {}
+    for source in (shared, frame):
+        for tag, items in source.sequences.items():
+            if tag in (UNASSIGNED_SHARED, UNASSIGNED_FRAME) or not items:
+                continue
+            if len(items) > 1 and tag != REAL_WORLD_VALUES:
+                raise ValueProblem(f"{name_tag(tag)} holds {len(items)} items, expected 1")
+            if tag in macros and tag in CALIBRATING and items != macros[tag]:
+                raise ValueProblem(f"{name_tag(tag)} is in the shared and in the frame's groups, and they differ")
+            macros[tag] = items
+    return macros
+
+
+def _lay_over(frame: DicomElements, items: Iterable[Item]) -> None:
+    for item in items:
+        frame.values.update(item.values)
+        frame.vrs.update(item.vrs)
+
+
+def _take_times(frame: DicomElements) -> None:
+    """When a frame was taken goes to where a slice has it: date and time apart."""
+    for tag in (FRAME_ACQUISITION_TIME, FRAME_REFERENCE_TIME):
+        found = re.match(rb"(\d{8})(\d{2,6}(?:\.\d{1,6})?)", frame.values.get(tag, b""))
+        if found is not None:
+            frame.values.update(zip(ACQUISITION_DATE_AND_TIME, found.groups(), strict=True))
+            frame.vrs.update(zip(ACQUISITION_DATE_AND_TIME, ("DA", "TM"), strict=True))
+            return
+
+
+def _check_frame_type(frame: DicomElements, warnings: list[str]) -> None:
+    """FrameType takes the place of ImageType; frames that are no plane, or no measured HU, are refused or warned of."""
+    values = frame.values
+    if FRAME_TYPE in values:
+        values[IMAGE_TYPE], frame.vrs[IMAGE_TYPE] = values.pop(FRAME_TYPE), frame.vrs.pop(FRAME_TYPE)
+    elif _words(values.get(IMAGE_TYPE))[0] == "MIXED":
+        raise ValueProblem(f"{name_tag(FRAME_TYPE)} is missing, and ImageType (0008,0008) is MIXED")
+    presentation = _words(values.get(PIXEL_PRESENTATION))[0]
+    if presentation not in ("", "MONOCHROME"):
+        raise ValueProblem(f"{name_tag(PIXEL_PRESENTATION)} is '{presentation}', expected MONOCHROME")
+    if _words(values.get(VOLUMETRIC_PROPERTIES))[0] == "DISTORTED":
+        raise ValueProblem(f"{name_tag(VOLUMETRIC_PROPERTIES)} is 'DISTORTED': the frame is no plane of the patient")
+    technique = _words(values.get(CALCULATION_TECHNIQUE))[0]
+    if technique in NO_PLANE:
+        raise ValueProblem(f"{name_tag(CALCULATION_TECHNIQUE)} is '{technique}', expected a plane of measured HU")
+    computed = [technique] if technique in COMPUTED else []
+    computed += [word for word in _words(values.get(IMAGE_TYPE))[3:4] if word in COMPUTED_CONTRAST]
+    if computed:
+        warnings.append(f"computed frames ({', '.join(computed)}): maybe not measured HU")
+
+
+def _take_real_world_values(frame: DicomElements, mappings: list[Item], warnings: list[str]) -> None:
+    """Take the mapping to HU for the rescale, where there is none or it leads to something else."""
+    kind = _words(frame.values.get(RESCALE_TYPE))[0]
+    if RESCALE_SLOPE in frame.values and kind in ("", "HU"):
+        return
+    for mapping in mappings:
+        units = [unit.values.get(CODE_VALUE, b"") for unit in mapping.sequences.get(REAL_UNITS, [])]
+        if not any(decode_text(unit) in HU_CODES for unit in units):
+            continue
+        for tag, target in ((REAL_SLOPE, RESCALE_SLOPE), (REAL_INTERCEPT, RESCALE_INTERCEPT)):
+            number = decode_number(mapping.values.get(tag, b""), "d", frame.little_endian)
+            if number is None or not math.isfinite(number) or (tag == REAL_SLOPE and number == 0.0):
+                found = "missing" if number is None else f"{number:g}"
+                raise ValueProblem(f"{name_tag(tag)} is {found}, expected a finite number")
+            frame.values[target], frame.vrs[target] = repr(number).encode(), "DS"
+        frame.values[RESCALE_TYPE], frame.vrs[RESCALE_TYPE] = b"HU", "LO"
+        warnings.append(f"RescaleType is {escape_text(kind, 16)}: " if kind else "no RescaleSlope: ")
+        warnings[-1] += "HU by RealWorldValueMappingSequence (0040,9096)"
+        return
+
+
+def _describe_phase(frame: DicomElements, dimensions: tuple[tuple[int, str], ...]) -> Iterator[tuple[str, str]]:
+    for keyword, tag, form in FRAME_PHASES:
+        raw = frame.values.get(tag)
+        if not raw:
+            continue
+        if form:
+            number = decode_number(raw, form, frame.little_endian)
+            text = "" if number is None else f"{number:.10g}"
+        else:
+            text = escape_text(decode_text(raw))
+        if text:
+            yield keyword, text
+    indices = frame.values.get(DIMENSION_VALUES, b"")
+    for place, name in dimensions:
+        number = decode_number(indices[4 * place : 4 * place + 4], "L", frame.little_endian)
+        if number is not None:
+            yield f"DimensionIndexValues {name}", f"{number:g}"
+
+
+def _name_dimensions(dimensions: list[Item], little: bool) -> Iterator[tuple[int, str]]:
+    from pydicom.datadict import keyword_for_tag
+
+    for place, dimension in enumerate(dimensions):
+        raw = dimension.values.get(DIMENSION_POINTER, b"")
+        if len(raw) != 4:
+            continue
+        group, element = struct.unpack("<HH" if little else ">HH", raw)
+        pointer = group << 16 | element
+        if pointer not in PLACE_POINTERS:
+            yield place, keyword_for_tag(pointer) or f"({group:04X},{element:04X})"
+
+
+def _read_header_bytes(path: Path, elements: DicomElements) -> tuple[bytes, int]:
+    """The data set up to its pixel data, and where in these bytes it starts."""
+    if elements.pixel_offset > HEADER_BYTES_LIMIT:
+        raise ValueProblem(f"a header of {elements.pixel_offset} bytes, no more than {HEADER_BYTES_LIMIT} are read")
+    with open_regular(path) as file:
+        if elements.inflate_from >= 0:
+            file.seek(elements.inflate_from)
+            deflated = file.read(2 * elements.pixel_offset + 1024)  # what does not shrink grows by 5 bytes in 16 KiB
+            return zlib.decompressobj(-zlib.MAX_WBITS).decompress(deflated, elements.pixel_offset), 0
+        data = file.read(elements.pixel_offset)
+    return data, find_data_set(data)
+
+
+def find_data_set(data: bytes) -> int:
+    """The byte behind the file meta elements."""
+    start = META_START
+    while data[start : start + 2] == b"\x02\0":  # file meta elements: explicit VR little endian
+        long = data[start + 4 : start + 6] in (b"OB", b"UN", b"OW", b"SQ", b"UT")
+        length = int.from_bytes(data[start + 8 : start + 12] if long else data[start + 6 : start + 8], "little")
+        start += (12 if long else 8) + length
+    return start
+
+
+def _words(raw: bytes | None) -> list[str]:
+    """The values of a code string, at least one."""
+    return [word.strip(" ") for word in decode_text(raw or b"").upper().split("\\")]

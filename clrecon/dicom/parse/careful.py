@@ -1,0 +1,226 @@
+"""The careful parser: pydicom's element generator over any file, however odd, with every way it can fail caught.
+
+The plain parser leaves to it whatever is not in plain order.  pydicom is imported at the first call: most series never
+need it.
+"""
+
+from __future__ import annotations
+
+import io
+import zlib
+from typing import BinaryIO, cast
+
+from clrecon.dicom.parse.raw import (
+    DEFLATED,
+    EXPLICIT_BIG,
+    FIRST_PIXEL_TAG,
+    IMPLICIT_LITTLE,
+    MEDIA_CLASS,
+    META_START,
+    TRANSFER_SYNTAX,
+    UNDEFINED_LENGTH,
+    CorruptFileError,
+    DicomElements,
+    decode_uid,
+    read_pixel_head,
+)
+
+__all__ = ["parse_carefully"]
+
+INFLATE_STEP = 1 << 18
+META_TAGS = (MEDIA_CLASS, TRANSFER_SYNTAX)
+DESCRIPTIVE_TAGS = (0x00080005, 0x0008103E)
+"""SpecificCharacterSet and SeriesDescription: a label, in which two values spoil nothing that is measured."""
+
+READ_LIMIT = 4 * 1024 * 1024
+"""Bytes that are read of one file at most; what is stepped over by its length does not count.
+
+pydicom makes objects of all that sequences of undefined length hold, in 50 times their size and within seconds a MiB,
+and looks for the end of other such values in all that follows.
+"""
+
+
+def parse_carefully(file: BinaryIO, size: int, wanted: tuple[int, ...] | None) -> DicomElements:
+    """Parse a file, or the start of one.
+
+    Parameters
+    ----------
+    file : binary file
+        Begins with the preamble; seekable.
+    size : int
+        Bytes of the whole file.
+    wanted : tuple of int or None
+        Tags to keep; None keeps all.
+
+    Raises
+    ------
+    CorruptFileError
+    OSError
+    """
+    try:
+        return _parse_file(cast(BinaryIO, _MeteredFile(file)), size, wanted)
+    except CorruptFileError:
+        raise
+    except RecursionError as error:
+        raise CorruptFileError("sequences are nested too deep") from error
+    except Exception as error:
+        if isinstance(error, OSError) and error.errno is not None:
+            raise  # of the disk; the parser's own, for a sequence that is cut, have no number
+        # The parser meets hostile bytes here and may fail in any way; all of them mean the same to us.
+        raise CorruptFileError(f"cannot be parsed ({type(error).__name__})") from error
+
+
+class _MeteredFile:
+    """A file of which no more than `READ_LIMIT` bytes are read."""
+
+    def __init__(self, file: BinaryIO):
+        self.seek, self.tell = file.seek, file.tell
+        self._read, self._left = file.read, READ_LIMIT
+
+    def read(self, count: int) -> bytes:
+        """As that of the file.
+
+        Raises
+        ------
+        CorruptFileError
+            The limit is passed.
+        """
+        self._left -= count
+        if self._left < 0:
+            raise CorruptFileError(f"its header takes more than {READ_LIMIT} bytes to read")
+        return self._read(count)
+
+
+def _parse_file(file: BinaryIO, size: int, wanted: tuple[int, ...] | None) -> DicomElements:
+    file.seek(META_START)
+    meta, _, meta_remarks = _collect(file, implicit=False, little=True, last_group=2, wanted=())
+    transfer_syntax = decode_uid(meta.get(TRANSFER_SYNTAX))
+    media_class = decode_uid(meta.get(MEDIA_CLASS))
+    if not transfer_syntax:
+        raise CorruptFileError("no transfer syntax (0002,0010)")
+
+    start = file.tell()
+    inflate_from = -1
+    if transfer_syntax == DEFLATED:
+        inflate_from, start = start, 0
+        file = cast(BinaryIO, _MeteredFile(io.BytesIO(_inflate_header(file))))
+    little = transfer_syntax != EXPLICIT_BIG
+    implicit = transfer_syntax == IMPLICIT_LITTLE
+    found = _looks_implicit(file, start)
+    differs = found is not None and found != implicit
+    implicit = implicit if found is None else found
+    values, vrs, remarks = _collect(file, implicit=implicit, little=little, last_group=None, wanted=wanted)
+    place = file.tell()
+    tag, offset, length, vr = read_pixel_head(file.read(12), place, implicit, little)
+    return DicomElements(
+        transfer_syntax,
+        media_class,
+        values,
+        vrs,
+        little,
+        differs,
+        tag,
+        offset,
+        length,
+        vr,
+        inflate_from,
+        size,
+        tuple(dict.fromkeys(meta_remarks + remarks)),
+    )
+
+
+def _collect(
+    file: BinaryIO, *, implicit: bool, little: bool, last_group: int | None, wanted: tuple[int, ...] | None
+) -> tuple[dict[int, bytes], dict[int, str | None], list[str]]:
+    """Read elements up to the end of `last_group`, or up to the pixel data; the file is left standing there.
+
+    Returns values, their VRs, and what is odd about their order.  pydicom's data sets keep the last of two elements
+    of one tag without a word: here they are met one by one.
+    """
+    from pydicom.filereader import data_element_generator
+
+    def stop(tag: int, vr: str | None, length: int) -> bool:
+        return tag >> 16 != last_group if last_group is not None else int.__ge__(tag, FIRST_PIXEL_TAG)
+
+    values: dict[int, bytes] = {}
+    vrs: dict[int, str | None] = {}
+    order = _Order()
+    for element in data_element_generator(
+        file,
+        implicit,
+        little,
+        stop_when=stop,
+        specific_tags=None if wanted is None else list(wanted),  # type: ignore[arg-type]
+    ):
+        value = element.value
+        if isinstance(value, bytes) and value:
+            if element.length not in (len(value), UNDEFINED_LENGTH):
+                raise CorruptFileError("ends within an element")
+            values[int(element.tag)] = value
+            vrs[int(element.tag)] = element.VR
+        if last_group is None or element.tag in META_TAGS:
+            order.add(int(element.tag), value if isinstance(value, bytes) else b"")
+    return values, vrs, order.remarks
+
+
+class _Order:
+    """Watches over elements that stand twice, or after one of a higher tag (PS3.5 7.1 has neither).
+
+    Which of two values was meant nobody can tell: where it may change a result the file is corrupt.  The same value
+    twice, or in another place than it should be, is what it is.
+    """
+
+    def __init__(self) -> None:
+        self.remarks: list[str] = []
+        self._values: dict[int, bytes] = {}
+        self._last = 0
+
+    def add(self, tag: int, value: bytes) -> None:
+        """Take the next element.
+
+        Raises
+        ------
+        CorruptFileError
+            It was there before, with another value.
+        """
+        from pydicom.datadict import keyword_for_tag
+
+        place = f"{keyword_for_tag(tag)} ({tag >> 16:04X},{tag & 0xFFFF:04X})".lstrip()
+        value = value.rstrip(b" \0")
+        if tag not in self._values:
+            if tag < self._last:
+                self.remarks.append(f"{place} is not in the order of tags: taken all the same")
+            self._last = max(tag, self._last)
+        elif self._values[tag] == value:
+            self.remarks.append(f"{place} is there twice, with the same value")
+        elif tag in DESCRIPTIVE_TAGS:
+            self.remarks.append(f"{place} is there twice, with two values: the last is taken")
+        else:
+            raise CorruptFileError(f"{place} is there twice, with two values")
+        self._values[tag] = value
+
+
+def _looks_implicit(file: BinaryIO, start: int) -> bool | None:
+    """Tell the encoding from the first element: explicit VR has two capital letters there. None at the end."""
+    head = file.read(6)
+    file.seek(start)
+    if len(head) < 6:
+        return None
+    return not all(0x41 <= letter <= 0x5A for letter in head[4:6])
+
+
+def _inflate_header(file: BinaryIO) -> bytes:
+    """Inflate the start of a deflated data set: enough for its header, and never more than a fixed limit."""
+    inflater = zlib.decompressobj(-zlib.MAX_WBITS)
+    inflated = bytearray()
+    while len(inflated) < READ_LIMIT and not inflater.eof:
+        try:
+            deflated = inflater.unconsumed_tail or file.read(INFLATE_STEP)
+        except CorruptFileError:
+            break  # as much as is read of a file: what there is may do
+        if not deflated:
+            break
+        inflated += inflater.decompress(deflated, READ_LIMIT - len(inflated))
+    if not inflated:
+        raise CorruptFileError("nothing in the deflated data set")
+    return bytes(inflated)

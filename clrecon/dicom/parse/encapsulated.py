@@ -1,0 +1,128 @@
+"""Where the frames of compressed pixel data lie in a file (DICOM PS3.5 A.4).
+
+Pixel data is a row of items: first the basic offset table, which may be empty, then fragments.  The items are walked
+once a file.  An extended offset table (7FE0,0001) is not needed: it is allowed only where every frame is one fragment
+(PS3.3 C.7.6.3.1.8), and then the fragments say it all.
+"""
+
+from __future__ import annotations
+
+import struct
+from typing import BinaryIO
+
+from clrecon.dicom.parse.transfer_syntaxes import RLE
+from clrecon.errors import RefusedInputError
+
+__all__ = ["Pieces", "find_end", "find_frames", "read_pieces"]
+
+Pieces = list[tuple[int, int]]
+"""First byte in the file and count of bytes of each fragment of a frame."""
+
+MAX_FRAGMENTS = 1_000_000
+FRAGMENTS_PER_FRAME = 1000
+"""At most, on the whole: writers make one, or one of some KiB each."""
+_ITEM, _END = (0xFFFE, 0xE000), (0xFFFE, 0xE0DD)
+_STARTS = (b"\xff\xd8\xff", b"\xff\x4f\xff\x51", b"\0\0\0\x0cjP")
+"""First bytes of JPEG and JPEG-LS, JPEG 2000, and JP2."""
+
+
+def find_frames(file: BinaryIO, start: int, file_bytes: int, frames: int, transfer_syntax: str) -> list[Pieces]:
+    """Find the fragments of every frame.
+
+    Parameters
+    ----------
+    file : binary file
+        Buffered, opened for reading.
+    start : int
+        Byte of the first item.
+    file_bytes : int
+        Size of the file.
+    frames : int
+        How many the header says there are.
+    transfer_syntax : str
+
+    Raises
+    ------
+    RefusedInputError
+        The items are damaged or cut off, or do not tell the frames apart.  The message names no file.
+    OSError
+        The file cannot be read.
+    """
+    table, fragments, _ = _walk_items(file, start, file_bytes, min(MAX_FRAGMENTS, FRAGMENTS_PER_FRAME * (frames + 1)))
+    if not fragments:
+        raise RefusedInputError("truncated: there are no compressed pixels")
+    if len(fragments) == frames:
+        return [[fragment] for fragment in fragments]
+    if len(fragments) < frames:
+        raise RefusedInputError(f"truncated: {frames} frames expected, {len(fragments)} fragments found")
+    if transfer_syntax == RLE:
+        if frames == 1:
+            return [fragments]
+        raise RefusedInputError(f"{len(fragments)} fragments for {frames} RLE frames, which have one each")
+    firsts = _firsts_by_table(file, table, fragments, frames) or [
+        n for n, (place, length) in enumerate(fragments) if _read(file, place, min(length, 6)).startswith(_STARTS)
+    ]
+    if len(firsts) != frames or firsts[0] != 0:
+        raise RefusedInputError(
+            f"{frames} frame{'s' * (frames != 1)} expected, {len(firsts)} found in {len(fragments)} fragments"
+        )
+    return [fragments[a:b] for a, b in zip(firsts, [*firsts[1:], len(fragments)], strict=True)]
+
+
+def find_end(file: BinaryIO, start: int, file_bytes: int) -> int:
+    """The byte behind the compressed pixel data; parameters and errors as those of `find_frames`."""
+    return _walk_items(file, start, file_bytes, MAX_FRAGMENTS)[2]
+
+
+def read_pieces(file: BinaryIO, pieces: Pieces) -> bytes:
+    """Read the fragments of one frame."""
+    return b"".join([_read(file, place, length) for place, length in pieces])
+
+
+def _walk_items(file: BinaryIO, start: int, file_bytes: int, most: int) -> tuple[tuple[int, int], Pieces, int]:
+    """Offset table, fragments, and the place behind them.
+
+    A codestream that is cut still decodes to an image, so that must be known here.
+    """
+    items: Pieces = []
+    place = start
+    file.seek(start)
+    while place + 8 <= file_bytes:
+        group, element, length = struct.unpack("<HHL", _read(file, place, 8))
+        place += 8
+        if (group, element) == _END:
+            return (items[0] if items else (place, 0)), items[1:], place
+        if (group, element) != _ITEM:
+            raise RefusedInputError(
+                f"truncated: no item of compressed pixels where one is expected ({group:04X},{element:04X})"
+            )
+        if length > file_bytes - place:
+            raise RefusedInputError(
+                f"truncated: {length} bytes of compressed pixels expected, {file_bytes - place} found"
+            )
+        items.append((place, length))
+        if len(items) > most:
+            raise RefusedInputError(f"the compressed pixels are in more than {most} fragments")
+        place += length
+    raise RefusedInputError("truncated: the compressed pixels have no end mark")
+
+
+def _firsts_by_table(file: BinaryIO, table: tuple[int, int], fragments: Pieces, frames: int) -> list[int]:
+    """Number of the first fragment of each frame by the basic offset table; empty where that does not fit."""
+    place, length = table
+    if length != 4 * frames:
+        return []
+    offsets = struct.unpack(f"<{frames}L", _read(file, place, length))
+    number = {fragment[0] - fragments[0][0]: n for n, fragment in enumerate(fragments)}
+    firsts = [number.get(offset, -1) for offset in offsets]
+    rising = all(a < b for a, b in zip(firsts, firsts[1:], strict=False))
+    return firsts if rising and firsts[0] == 0 else []
+
+
+def _read(file: BinaryIO, place: int, count: int) -> bytes:
+    if file.tell() != place:
+        file.seek(place)
+    data = file.read(count)
+    if len(data) < count:
+        raise RefusedInputError(f"truncated: {count} bytes of compressed pixels expected, {len(data)} found")
+    return data

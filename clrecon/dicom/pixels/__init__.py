@@ -1,0 +1,1 @@
+"""Stored pixels of slices to voxels in HU."""

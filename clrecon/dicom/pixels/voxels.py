@@ -1,0 +1,242 @@
+"""Pixels of a stack to HU voxels, read in parallel straight into the volume.
+
+Order of the steps for every slice, each in the one place where it is right: stored bits, padding (a stored value,
+found before rescale), sign extension, rescale by the slice's own slope and intercept, padding to air (`padding`).
+Integer HU stay integers: int16 where every value fits, else int32; other slopes give float32.  Integer steps run in
+the memory of the volume in modular arithmetic, which is exact because the result is known to fit beforehand.
+Float pixel data are HU as they are (float32, from 64 bits too): the standard gives them no rescale (PS3.3 C.7.6.24).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from contextlib import nullcontext
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clrecon.dicom.headers.slice_header import SliceHeader
+from clrecon.dicom.pixels.padding import PaddingMasks, pack_mask
+from clrecon.dicom.pixels.stored import StoredPixels, count_readers
+from clrecon.dicom.pixels.stray_bits import StrayBits, describe_stray_bits, find_stray_bits
+from clrecon.errors import RefusedInputError
+from clrecon.system.memory import allocate_voxels
+from clrecon.system.progress import Progress
+
+__all__ = ["PixelFacts", "read_voxels"]
+
+MAX_READERS = 8
+MAX_DECODERS = 32
+DECODER_WORTH_BYTES = 4 << 20
+"""Of pixels: they take about as long to decode as a process takes to start."""
+FLOAT_LIMIT = 1e9
+"""HU beyond this are none; float32 and every later step hold it."""
+
+
+@dataclass(frozen=True)
+class PixelFacts:
+    """What was seen in the pixels.
+
+    Attributes
+    ----------
+    padding_share : float
+        Of the voxels, 0 to 1.
+    hu_min, hu_max : float
+        Lowest and highest HU of the volume, padding included.
+    padding_hu : float or None
+        What padding was filled with; None where there is none.
+    stray : int
+        Values that lost bits of theirs, see `clrecon.dicom.pixels.stray_bits`.
+    stray_text : str
+        What is to be said of them; empty where there are none.
+    """
+
+    padding_share: float
+    hu_min: float
+    hu_max: float
+    padding_hu: float | None = None
+    stray: int = 0
+    stray_text: str = ""
+
+
+class _SliceFacts(NamedTuple):
+    """What was seen in one slice: its padding, packed, its lowest and highest measured HU, and bits that are odd."""
+
+    padding: tuple[bytes, int] | None
+    low: float
+    high: float
+    stray: StrayBits | None
+
+
+class _RangeError(Exception):
+    """The HU of a slice do not fit the type of the volume; a wider one is taken."""
+
+
+def read_voxels(
+    slices: Sequence[SliceHeader], progress: Progress | None = None, source: StoredPixels | None = None
+) -> tuple[NDArray[Any], PixelFacts]:
+    """Read the pixels of sorted slices of one size into one volume.
+
+    Parameters
+    ----------
+    slices : sequence of SliceHeader
+        In the order of k.
+    progress : callable, optional
+        Called as ``progress("read", done, total)``.
+    source : StoredPixels, optional
+        One that is open for these slices and stays so; without it the call has its own.
+
+    Returns
+    -------
+    voxels : ndarray, shape (n, rows, columns), int16, int32 or float32
+        HU.
+    facts : PixelFacts
+
+    Raises
+    ------
+    RefusedInputError
+        A file is cut short, cannot be read or decoded, or the volume does not fit into memory.
+    """
+    integral = all(
+        float(h.slope).is_integer() and float(h.intercept).is_integer() and not h.float_pixels for h in slices
+    )
+    # A missing decoder shows here, before anything is allocated.
+    with StoredPixels(slices) if source is None else nullcontext(source) as source:
+        for dtype in (np.int16, np.int32) if integral else (np.float32,):
+            voxels = allocate_voxels((len(slices), slices[0].rows, slices[0].columns), dtype)
+            try:
+                return voxels, _fill_volume(source, slices, voxels, progress)
+            except _RangeError:
+                del voxels
+    raise RefusedInputError("the rescaled values do not fit into 32 bits")
+
+
+def _fill_volume(
+    source: StoredPixels, slices: Sequence[SliceHeader], voxels: NDArray[Any], progress: Progress | None
+) -> PixelFacts:
+    padding, low, high = PaddingMasks(voxels), np.inf, -np.inf
+    stray: list[StrayBits | None] = [None] * len(slices)
+    most = MAX_READERS
+    if source.compressed:
+        most = min(MAX_DECODERS, 1 + len(slices) * slices[0].pixel_bytes // DECODER_WORTH_BYTES)
+    with ThreadPoolExecutor(count_readers(len(slices), most)) as pool:
+        try:
+            jobs = {pool.submit(_fill_slice, source, header, voxels[k]): k for k, header in enumerate(slices)}
+            for done, job in enumerate(as_completed(jobs), start=1):
+                seen = job.result()
+                padding.add(jobs[job], seen.padding)
+                low, high = min(low, seen.low), max(high, seen.high)
+                stray[jobs[job]] = seen.stray
+                if progress is not None:
+                    progress("read", done, len(slices))
+        except _RangeError:
+            pool.shutdown(cancel_futures=True)  # the decoders are needed once more
+            raise
+        except BaseException:
+            source.stop()
+            pool.shutdown(cancel_futures=True)
+            raise
+        padding_hu = padding.fill(pool.map)
+    if padding_hu is not None:
+        low, high = min(low, padding_hu), max(high, padding_hu)
+    count, text = describe_stray_bits(stray, slices)
+    return PixelFacts(padding.count / voxels.size, float(low), float(high), padding_hu, count, text)
+
+
+def _fill_slice(source: StoredPixels, header: SliceHeader, out: NDArray[Any]) -> _SliceFacts:
+    """Read one slice into `out`."""
+    stored = source.load(header, out)
+    whole_cell = header.padding is not None and not header.float_pixels and not _fits_stored_bits(header)
+    padding = _find_padding(header, stored) if whole_cell else None  # the value fills unused bits too
+    stray = None
+    if not header.float_pixels:
+        stray = find_stray_bits(header, stored, padding)
+        _extend_sign(header, stored)
+    if header.padding is not None and not whole_cell:
+        padding = _find_padding(header, stored)
+    packed = None if padding is None else pack_mask(padding)
+    if padding is not None and packed is not None:
+        if packed[1] == padding.size:
+            return _SliceFacts(packed, np.inf, -np.inf, stray)
+        # A measured value in its place counts for nothing: one pass less over the slice.
+        np.copyto(stored, stored.flat[padding.argmin()], where=padding)
+    low, high = stored.min(), stored.max()
+    if header.float_pixels and not (abs(low) <= FLOAT_LIMIT and abs(high) <= FLOAT_LIMIT):
+        raise RefusedInputError(f"{header.name}: Float Pixel Data holds {_describe_unfit(stored)}: those are no HU")
+    hu_low, hu_high = float(low) * header.slope + header.intercept, float(high) * header.slope + header.intercept
+    if hu_low > hu_high:
+        hu_low, hu_high = hu_high, hu_low
+    if out.dtype.kind == "f":
+        if header.slope == 1.0 and header.intercept == 0.0:
+            if not np.may_share_memory(stored, out):
+                out[...] = stored
+        else:
+            out[...] = stored * np.float64(header.slope) + header.intercept
+    else:
+        _rescale_integers(header, stored, out, hu_low, hu_high)
+    return _SliceFacts(packed, hu_low, hu_high, stray)
+
+
+def _rescale_integers(
+    header: SliceHeader, stored: NDArray[Any], out: NDArray[Any], hu_low: float, hu_high: float
+) -> None:
+    """Rescale in the memory of the volume, modulo its width: exact, because the result fits."""
+    if not (_fits_dtype(int(hu_low), out.dtype) and _fits_dtype(int(hu_high), out.dtype)):
+        raise _RangeError
+    if not np.may_share_memory(stored, out):
+        np.copyto(out, stored, casting="unsafe")
+    if header.slope != 1.0:
+        np.multiply(out, np.int64(header.slope).astype(out.dtype), out=out)
+    if header.intercept != 0.0:
+        np.add(out, np.int64(header.intercept).astype(out.dtype), out=out)
+
+
+def _fits_dtype(value: int, dtype: np.dtype[Any]) -> bool:
+    limits = np.iinfo(dtype)
+    return int(limits.min) <= value <= int(limits.max)
+
+
+def _describe_unfit(stored: NDArray[Any]) -> str:
+    """Count what is no HU in float pixels."""
+    nan = int(np.count_nonzero(np.isnan(stored)))
+    infinite = int(np.count_nonzero(np.isinf(stored)))
+    if nan or infinite:
+        return f"{nan} NaN and {infinite} infinite values of {stored.size}"
+    return f"values from {float(stored.min()):g} to {float(stored.max()):g}"
+
+
+def _extend_sign(header: SliceHeader, stored: NDArray[Any]) -> None:
+    """Drop the bits around the stored ones (overlays live there) and extend the sign, in place."""
+    if header.bits_stored == header.bits_allocated:
+        return
+    np.left_shift(stored, header.bits_allocated - 1 - header.high_bit, out=stored)
+    np.right_shift(stored, header.bits_allocated - header.bits_stored, out=stored)
+
+
+def _fits_stored_bits(header: SliceHeader) -> bool:
+    """True when the padding values can be written in the stored bits."""
+    assert header.padding is not None
+    half = 1 << (header.bits_stored - 1)
+    low, high = (-half, half - 1) if header.signed else (0, 2 * half - 1)
+    return low <= header.padding[0] and header.padding[1] <= high
+
+
+def _find_padding(header: SliceHeader, stored: NDArray[Any]) -> NDArray[np.bool_] | None:
+    """Mask of the padding; None where there is none."""
+    assert header.padding is not None
+    low, high = header.padding
+    if header.float_pixels:
+        low, high = stored.dtype.type(low), stored.dtype.type(high)
+        if np.isnan(low) or np.isnan(high):
+            mask = np.isnan(stored)  # PS3.3 C.7.6.24: NaN may be the padding value
+            return mask if mask.any() else None
+    else:
+        limits = np.iinfo(stored.dtype)
+        low, high = max(low, int(limits.min)), min(high, int(limits.max))
+        if low > high:
+            return None
+    mask = stored == low if low == high else (stored >= low) & (stored <= high)
+    return mask if mask.any() else None

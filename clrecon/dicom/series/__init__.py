@@ -1,0 +1,1 @@
+"""Files to series, and what is known of them."""

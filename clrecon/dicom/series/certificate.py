@@ -1,0 +1,224 @@
+"""The certificate: what is known of a volume's origin and geometry, as a dict without patient data.
+
+People put names into file names and series descriptions: warnings and reports hold neither, but counts and positions.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clrecon.dicom.headers.slice_header import SliceHeader
+from clrecon.dicom.parse.transfer_syntaxes import SYNTAX_NAMES
+from clrecon.dicom.pixels.voxels import PixelFacts
+from clrecon.dicom.series.gates import judge_series
+from clrecon.dicom.series.likeness import Likeness
+from clrecon.dicom.series.phases import choose_phase
+from clrecon.dicom.series.scan import Scan
+from clrecon.dicom.series.series import Series
+from clrecon.dicom.stack.fit import Stack
+from clrecon.dicom.stack.layout import (
+    describe_orientation,
+    describe_thickness,
+    measure_extent,
+    median_thickness,
+    summarise_gaps,
+)
+from clrecon.dicom.stack.mixture import describe_differences
+from clrecon.errors import RefusedInputError
+from clrecon.geometry import column_spacing
+from clrecon.system.text import hash_uid
+
+__all__ = ["certify", "collect_scan_warnings", "collect_series_warnings"]
+
+SAID_BY_GATES = ("padding_share", "stored_bits", "plausible_spacing", "gap_thickness", "plausible_hu")
+"""Gates whose text is a warning where they fail; of the others a warning says more."""
+
+
+def collect_scan_warnings(scan: Scan) -> list[str]:
+    """Warnings about files that were passed over although they claim to be DICOM, or could not be looked at."""
+    warnings = []
+    if scan.skipped["corrupt"]:
+        warnings.append(f"{scan.skipped['corrupt']} corrupt file{'s' * (scan.skipped['corrupt'] > 1)} skipped")
+    warnings += [f"{count} skipped: {reason}" for reason, count in Counter(s.reason for s in scan.suspects).items()]
+    for reason in ("not readable", "folder not readable", "link out of the folder"):
+        if scan.skipped[reason]:
+            warnings.append(f"{scan.skipped[reason]} skipped: {reason}")
+    return warnings
+
+
+def collect_series_warnings(series: Series) -> list[str]:
+    """Warnings about one series, from its headers and its geometry."""
+    if series.stack is None or series.kind == "other":
+        return []
+    headers = series.stack.slices
+    warnings = [*_describe_what_was_left(series), *series.stack.warnings]
+    for text in dict.fromkeys(text for header in headers for text in header.warnings):
+        warnings.append(f"{text} ({_place(series.stack, lambda h, text=text: text in h.warnings)})")  # type: ignore[misc]
+    checks: tuple[tuple[Callable[[SliceHeader], bool], str], ...] = (
+        (
+            lambda h: not h.has_slope,
+            "no RescaleSlope: slope 1, intercept {intercept} taken: maybe not HU",
+        ),
+        (
+            lambda h: h.has_slope and not h.has_intercept,
+            "no RescaleIntercept: slope {slope}, intercept 0 taken: maybe not HU",
+        ),
+        (lambda h: h.rescale_type not in ("", "HU"), "RescaleType is '{type}': the values are not HU"),
+        (lambda h: h.photometric == "MONOCHROME1", "MONOCHROME1: meant to be shown inverted; the values are kept"),
+        (lambda h: h.lossy, "lossy compression: the values are not those that were measured"),
+    )
+    for is_so, text in checks:
+        odd = next((header for header in headers if is_so(header)), None)
+        if odd is not None:
+            text = text.format(type=odd.rescale_type, intercept=f"{odd.intercept:g}", slope=f"{odd.slope:g}")
+            warnings.append(f"{text} ({_place(series.stack, is_so)})")
+    warnings += [f"{text} ({_place(series.stack, is_so)})" for text, is_so in describe_differences(headers)]
+    doubt = series.find_doubt()
+    if doubt and not any(doubt in text for text in warnings):
+        warnings.append(doubt)
+    return warnings
+
+
+def _describe_what_was_left(series: Series) -> list[str]:
+    """Copies, the other phases of a series, and reconstructions that are not of one kind."""
+    try:
+        places = series.places
+    except RefusedInputError:
+        return []
+    warnings = []
+    if places.copies:
+        some = "slices" if places.copies > 1 else "slice"
+        warnings.append(f"{places.copies} duplicate {some} dropped: same place, same pixels as another")
+    if places.phases and series.phase is not None:
+        chosen = choose_phase(places.phases, series.phase)
+        left = sum(len(phase.headers) for phase in places.phases) - len(chosen.headers)
+        which = f"phase {chosen.number} of {len(places.phases)} ({chosen.keyword} {chosen.value})"
+        warnings.append(f"{which} read, {left} slices of others left")
+        most = max(len(phase.headers) for phase in places.phases)
+        if not places.interleaved and len(chosen.headers) < most:
+            warnings.append(f"phase {chosen.number} has {len(chosen.headers)} slices, another one {most}")
+    kernels = (
+        {dict(header.phase).get("ConvolutionKernel", "") for header in series.stack.slices} if series.stack else ()
+    )
+    if len(kernels) > 1:
+        warnings.append(f"ConvolutionKernel differs between slices ({len(kernels)} kernels): sharp and soft are mixed")
+    return warnings
+
+
+def _describe_phase(series: Series) -> dict[str, Any] | None:
+    if series.phase is None or not series.places.phases:
+        return None
+    phases = series.places.phases
+    chosen = choose_phase(phases, series.phase)
+    return {"number": chosen.number, "of": len(phases), "keyword": chosen.keyword, "value": chosen.value}
+
+
+def _place(stack: Stack, is_so: Callable[[SliceHeader], bool]) -> str:
+    """Which slices, by count and position along the normal: their file names may hold the patient's."""
+    positions = [place for header, place in zip(stack.slices, stack.distances_mm, strict=True) if is_so(header)]
+    if len(positions) == len(stack.slices):
+        return "all slices"
+    first = "the first " * (len(positions) > 1)
+    return f"{len(positions)} of {len(stack.slices)} slices, {first}at {positions[0]:.2f} mm"
+
+
+def certify(
+    series: Series,
+    stack: Stack,
+    facts: PixelFacts | None,
+    scan: Scan,
+    affine: NDArray[np.float64] | None,
+    warnings: Sequence[str],
+    likeness: Likeness | None = None,
+) -> dict[str, Any]:
+    """Build the certificate of a series: the report of its volume, and what ``clrecon info`` shows.
+
+    Parameters
+    ----------
+    series, stack : Series, Stack
+        What was read, or would be.
+    facts : PixelFacts or None
+        None: the pixels were not read, and what only they can say is None.
+    scan : Scan
+    affine : ndarray, shape (4, 4), or None
+        None: the series is refused.
+    warnings : sequence of str
+    likeness : Likeness or None
+        Of the slices; None: the pixels were not read, or there are too few.
+
+    Returns
+    -------
+    dict
+        JSON types only, every name in docs/contract.md.  Lengths in mm, angles in degrees; ``hu_range`` is that of
+        the voxels as they are in the volume, padding (at ``padding_hu``) among them.
+    """
+    gates = judge_series(series, stack, facts, likeness)
+    unsaid = [gate["text"] for gate in gates if gate["name"] in SAID_BY_GATES and gate["ok"] is False]
+    return {
+        "format": "DICOM",
+        "series": {
+            "number": series.number,
+            "uid_hash": hash_uid(series.identity.uid),
+            "modality": series.identity.modality,
+        },
+        "phase": _describe_phase(series),
+        **_certify_places(stack, affine),
+        **_certify_values(stack.slices, facts),
+        "files": {"found": scan.files, "used": len({h.file for h in stack.slices}), "skipped": dict(scan.skipped)},
+        "dropped": series.dropped,
+        "gates": gates,
+        "warnings": [*warnings, *unsaid],
+        "problems": list(series.problems),
+    }
+
+
+def _certify_places(stack: Stack, affine: NDArray[np.float64] | None) -> dict[str, Any]:
+    """Where the slices lie, and how well that is known."""
+    headers, first, line = stack.slices, stack.slices[0], stack.line
+    stated = next((h.stated_gap_mm for h in headers if h.stated_gap_mm is not None), None)
+    lay = {h.patient_position for h in headers}
+    return {
+        "slices": len(headers),
+        "slices_missing": stack.missing,
+        "shape_ijk": [first.columns, first.rows, len(headers)],
+        "spacing_mm": None if affine is None else list(column_spacing(affine)),
+        "extent_mm": None if affine is None else measure_extent(stack),
+        "affine_ijk_to_lps_mm": None if affine is None else affine.tolist(),
+        "orientation": None if affine is None else describe_orientation(affine),
+        "patient_position": (lay.pop() or None) if len(lay) == 1 else None,
+        "tilt_deg": stack.tilt_deg,
+        "grid_residual_max_mm": line.residual_max_mm,
+        "grid_residual_rms_mm": line.residual_rms_mm,
+        "grid_tolerance_mm": line.tolerance_mm,
+        "gap_mm": {"min": line.gap_min_mm, "max": line.gap_max_mm, "median": line.gap_median_mm},
+        "uneven": line.uneven,
+        "gap_runs": summarise_gaps(stack.distances_mm) if line.uneven else None,
+        "slice_positions_mm": stack.positions_mm.tolist() if line.uneven else None,
+        "slice_thickness_mm": median_thickness(headers),
+        "thickness": describe_thickness(headers, stack.distances_mm),
+        "stated_gap_mm": stated,
+        "frame_of_reference_hash": hash_uid(first.frame_of_reference),
+    }
+
+
+def _certify_values(headers: Sequence[SliceHeader], facts: PixelFacts | None) -> dict[str, Any]:
+    """What the voxels' values are."""
+    slopes, intercepts = [h.slope for h in headers], [h.intercept for h in headers]
+    return {
+        "padding_share": None if facts is None else facts.padding_share,
+        "padding_hu": None if facts is None else facts.padding_hu,
+        "transfer_syntaxes": sorted({h.transfer_syntax for h in headers}),
+        "transfer_syntax_names": sorted({SYNTAX_NAMES[h.transfer_syntax] for h in headers}),
+        "lossy": any(h.lossy for h in headers),
+        "rescale": {
+            "slope": [min(slopes), max(slopes)],
+            "intercept": [min(intercepts), max(intercepts)],
+            "type": headers[0].rescale_type or None,
+        },
+        "hu_range": None if facts is None else [facts.hu_min, facts.hu_max],
+    }

@@ -1,0 +1,207 @@
+"""What a CT series must fulfil to be measured on: named gates, in the form of `clrecon.system.gates`.
+
+A gate is a fact that moves a surface in the patient or changes its level, and that a user of the mesh could not see.
+Everything else that is odd is a warning alone; docs/certificate.md says which is which, and why.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from clrecon.dicom.headers.slice_header import SliceHeader
+from clrecon.dicom.pixels.voxels import PixelFacts
+from clrecon.dicom.series.likeness import Likeness
+from clrecon.dicom.series.series import Series
+from clrecon.dicom.stack.directions import (
+    ORIENTATION_EXACT,
+    ORIENTATION_LIMIT,
+    ORIENTATION_SPREAD_RAD,
+    measure_directions,
+)
+from clrecon.dicom.stack.fit import (
+    STATED_GAP_TOLERANCE,
+    Stack,
+    group_places,
+    measure_stated_gap,
+)
+from clrecon.errors import RefusedInputError
+from clrecon.system.gates import Gate, at_most, none_of, unmeasured
+
+__all__ = ["PADDING_SHARE", "judge_figures", "judge_series", "judge_steps", "list_odd_values"]
+
+PADDING_SHARE = 0.75
+"""A circle in its square leaves 0.21 as padding, a 500 mm circle in a field of 800 mm 0.69; above that most of what
+was measured is likely to be masked by a wrong PixelPaddingValue."""
+
+
+PIXEL_MM = (0.005, 10.0)
+"""From the finest micro-CT in use to attenuation maps of PET and SPECT."""
+GAP_MM = (0.005, 50.0)
+GAP_THICKNESSES = 2.0
+"""More between the slices that was not measured than was: a high-resolution lung scan has 10, and no surface."""
+SLOPES, INTERCEPTS = (1e-3, 100.0), (-40_000.0, 40_000.0)
+"""Scanners write 1, some fractions of it or a few; below 0 bone is dark.  Stored 16-bit values in the middle of their
+range need an intercept of 32768."""
+LOWEST_HU, DENSEST_HU = (-10_000.0, 1000.0), (-900.0, 70_000.0)
+"""Padding that nobody declared goes down to -8192; a cut out of bone has spongy parts.  Less dense than
+-900 is air alone; 16 bits end at 65535."""
+STRAY = "values beyond the stored bits"
+
+
+def judge_series(
+    series: Series, stack: Stack | None, facts: PixelFacts | None = None, likeness: Likeness | None = None
+) -> list[Gate]:
+    """Hold a series against the gates.
+
+    Parameters
+    ----------
+    series : Series
+    stack : Stack or None
+        Its slices as they are, or would be, read.
+    facts : PixelFacts, optional
+        Of its pixels; without them the gates on pixels are not measured.
+    likeness : Likeness, optional
+        Of its slices; None where they are too few, or too small, as well.
+
+    Returns
+    -------
+    list of dict
+        See `clrecon.system.gates.Gate`.  The texts hold no file names.
+    """
+    refused = len(series.problems)
+    gates = [
+        none_of("usable", refused, "reasons to refuse the series"),
+        none_of("readable", len(series.corrupt) + len(series.others), "files that may hold slices of it, unreadable"),
+    ]
+    if stack is None:
+        return gates
+    gates.append(_judge_spacing(stack))
+    gates += _gates_of_places(stack)
+    what = "slices at the place of another that differ from it and are no phases"
+    gates.append(none_of("duplicate_slices", _count_doubled(series), what))
+    gates.append(_judge_one_volume(series, likeness))
+    gates += _gates_of_values(stack.slices)
+    gates.append(_judge_hu(stack.slices, facts))
+    share = "share of voxels without a measurement (padding)"
+    if facts is None:
+        gates.append(unmeasured("padding_share", PADDING_SHARE, None, f"{share}: the pixels were not read"))
+        gates.append(unmeasured("stored_bits", 0, None, f"{STRAY}: the pixels were not read"))
+    else:
+        gates.append(none_of("stored_bits", facts.stray, facts.stray_text or STRAY))
+        gates.append(at_most("padding_share", facts.padding_share, PADDING_SHARE, None, share))
+    return gates
+
+
+def _gates_of_places(stack: Stack) -> Iterator[Gate]:
+    directions = measure_directions(stack.slices)
+    what = "ImageOrientationPatient is off unit length or right angle by"
+    yield at_most("orientation_exact", directions.deviation, ORIENTATION_EXACT, None, what)
+    what = "ImageOrientationPatient of a slice differs from the mean by"
+    if directions.deviation > ORIENTATION_LIMIT:
+        yield unmeasured("orientation_same", ORIENTATION_SPREAD_RAD, "rad", f"{what}: there is no mean")
+    else:
+        yield at_most("orientation_same", directions.spread_rad, directions.spread_allowed_rad, "rad", what)
+    line = stack.line
+    what = "largest distance of a slice from even positions"
+    if line.residual_max_mm is None or line.tolerance_mm is None:
+        yield unmeasured("grid_residual", 0.01, "mm", f"{what}: there is one slice")
+        return
+    yield at_most("grid_residual", line.residual_max_mm, line.tolerance_mm, "mm", what)
+    yield none_of("missing_slices", stack.missing, "slices missing in between")
+    yield _judge_thickness(stack)
+    yield _judge_stated_gap(stack)
+
+
+def _judge_spacing(stack: Stack) -> Gate:
+    first = stack.slices[0]
+    return judge_steps((first.di_mm, first.dj_mm), stack.line.gap_median_mm)
+
+
+def judge_steps(pixels_mm: Sequence[float], gap_mm: float | None) -> Gate:
+    """Pixels and gaps of a size that scanners have: a mesh a thousand times too large looks like any other."""
+    (low, high), (gap_low, gap_high) = PIXEL_MM, GAP_MM
+    odd = [f"pixels of {mm:g} mm" for mm in sorted(set(pixels_mm)) if not low <= mm <= high]
+    if gap_mm is not None and not gap_low <= gap_mm <= gap_high:
+        odd.append(f"gaps of {gap_mm:g} mm")
+    what = f"spacings that no scanner has, outside of {low:g} to {high:g} mm, gaps up to {gap_high:g} mm"
+    return none_of("plausible_spacing", len(odd), f"{what} ({', '.join(odd)})" if odd else what)
+
+
+def _judge_thickness(stack: Stack) -> Gate:
+    """Gaps against SliceThickness: how much of the tissue was measured at all."""
+    what = "largest gap between slices as a multiple of SliceThickness; above 1 the tissue between was not measured"
+    thickness = np.array([header.slice_thickness_mm or 0.0 for header in stack.slices])
+    if (thickness <= 0.0).any():
+        return unmeasured("gap_thickness", GAP_THICKNESSES, None, f"{what}: the thickness is not stated")
+    gaps = np.diff(stack.distances_mm)
+    worst = int(np.argmax(2.0 * gaps / (thickness[1:] + thickness[:-1])))
+    ratio = float(2.0 * gaps[worst] / (thickness[worst] + thickness[worst + 1]))
+    if ratio > GAP_THICKNESSES:
+        what += f" ({gaps[worst]:g} mm at a thickness of {thickness[worst]:g} mm)"
+    return at_most("gap_thickness", ratio, GAP_THICKNESSES, None, what)
+
+
+def _judge_hu(headers: Sequence[SliceHeader], facts: PixelFacts | None) -> Gate:
+    """Rescale, air and the densest voxel as CT has them; without pixels rescale alone."""
+    odd = []
+    for name, values, (low, high) in (
+        ("RescaleSlope", [header.slope for header in headers], SLOPES),
+        ("RescaleIntercept", [header.intercept for header in headers], INTERCEPTS),
+    ):
+        odd += [f"{name} {value:g}" for value in (min(values), max(values)) if not low <= value <= high][:1]
+    if facts is not None and facts.hu_min <= facts.hu_max and not _count_unknown(headers):
+        odd += list_odd_values(facts)
+    return judge_figures(odd)
+
+
+def list_odd_values(facts: PixelFacts) -> list[str]:
+    """The lowest and the densest voxel, where no CT has such a one."""
+    return [
+        f"{name} voxel {value:g} HU, expected {low:g} to {high:g}"
+        for name, value, (low, high) in (("lowest", facts.hu_min, LOWEST_HU), ("densest", facts.hu_max, DENSEST_HU))
+        if not low <= value <= high
+    ]
+
+
+def judge_figures(odd: Sequence[str]) -> Gate:
+    """The gate ``plausible_hu``, of the figures that are odd."""
+    what = "figures of HU that no CT has"
+    return none_of("plausible_hu", len(odd), f"{what} ({'; '.join(odd)})" if odd else what)
+
+
+def _judge_one_volume(series: Series, likeness: Likeness | None) -> Gate:
+    """Neighbours that are less alike than slices farther apart, and what alternates from slice to slice."""
+    doubts = 0 if series.stack is None or series.find_doubt() == "" else 1
+    what = "signs of several volumes between each other: a header that alternates, neighbours less alike than others"
+    if likeness is None and not doubts:
+        return unmeasured("one_volume", 0, None, f"{what}: the pixels were not read, or too few")
+    return none_of("one_volume", doubts + (likeness is not None and likeness.is_mixed), what)
+
+
+def _count_doubled(series: Series) -> int:
+    try:
+        places = series.places
+    except RefusedInputError:
+        return 0  # the pixels cannot be compared: a reason to refuse it, which is counted already
+    return len(places.headers) - len(group_places(places.headers)) if places.problem else 0
+
+
+def _judge_stated_gap(stack: Stack) -> Gate:
+    """SpacingBetweenSlices against the positions: the one trace that is left when every second slice is gone."""
+    what, bound = "SpacingBetweenSlices differs from the positions by", 100.0 * STATED_GAP_TOLERANCE
+    found = measure_stated_gap(stack.slices, stack.positions_mm, stack.line.gap_median_mm)
+    if found is None:
+        return unmeasured("stated_gap", bound, "%", f"{what}: it is not stated")
+    return at_most("stated_gap", 100.0 * found[2], bound, "%", what)
+
+
+def _count_unknown(headers: Sequence[SliceHeader]) -> int:
+    return sum(not (h.has_slope and h.has_intercept) or h.rescale_type not in ("", "HU") for h in headers)
+
+
+def _gates_of_values(headers: Sequence[SliceHeader]) -> Iterator[Gate]:
+    yield none_of("hu_known", _count_unknown(headers), "slices whose values are not known to be HU")
+    yield none_of("lossless", sum(h.lossy for h in headers), "slices with lossy compression")
+    yield none_of("measured_images", sum(bool(h.derived) for h in headers), "slices that were computed from others")

@@ -1,0 +1,205 @@
+"""Walk a folder, or take one file, and read the header of every DICOM file in it.
+
+Names, extensions and DICOMDIR files play no part in what is read; they only make a file that is no DICOM a suspect of
+being what is left of one (`remains`).  Nothing but regular files inside the folder is opened: devices,
+pipes and links are skipped and counted (a link into the folder is met again at its own place; a link out of it is
+none of our business).
+"""
+
+from __future__ import annotations
+
+import os
+from collections import Counter
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from clrecon.dicom.headers.header import read_headers
+from clrecon.dicom.headers.slice_header import OtherImage, SliceHeader
+from clrecon.dicom.parse.containers import describe_container
+from clrecon.dicom.parse.elements import META_START, CorruptFileError, FileStart, has_dicom_mark
+from clrecon.dicom.parse.forced import describe_way_out, restore_start
+from clrecon.dicom.series.disk import DiskReader
+from clrecon.dicom.series.remains import Stranger, describe_start, find_remains
+from clrecon.errors import NoDicomError
+from clrecon.system.progress import Progress
+from clrecon.system.text import escape_text
+
+__all__ = ["CorruptFile", "Scan", "scan_path"]
+
+DICOM_SUFFIXES = (".dcm", ".dic", ".dicom", ".ima")
+PROGRESS_STEPS = 1000
+BLANK_START = bytes(128) + b"DICM"
+BARE_DATA_SET = "a data set without preamble"
+APPLE_DOUBLE = b"\x00\x05\x16\x07"
+"""Start of the "._NAME" files that macOS puts beside the files of a foreign disk."""
+
+
+@dataclass(frozen=True)
+class CorruptFile:
+    """A file, or a folder, that may be or hold a DICOM image and is not readable as such."""
+
+    file: Path
+    reason: str
+
+    def __str__(self) -> str:
+        return f"{escape_text(self.file.name)}: {self.reason}"
+
+
+@dataclass
+class Scan:
+    """What is in a folder.
+
+    Attributes
+    ----------
+    slices : list of SliceHeader
+        Valid CT slices, in the order of their paths.
+    others : list of OtherImage
+        DICOM objects that are none.
+    skipped : Counter
+        Reason to number of files (or folders) that were passed over.
+    corrupt : list of CorruptFile
+        Files that say they are DICOM and cannot be parsed; files and folders that cannot be read at all.
+    suspects : list of CorruptFile
+        Files that are no DICOM by their content, but look like what is left of one.
+    strangers : list of Stranger
+        All others that are no DICOM.
+    files : int
+        Regular files looked at.
+    """
+
+    slices: list[SliceHeader] = field(default_factory=list)
+    others: list[OtherImage] = field(default_factory=list)
+    skipped: Counter[str] = field(default_factory=Counter)
+    corrupt: list[CorruptFile] = field(default_factory=list)
+    suspects: list[CorruptFile] = field(default_factory=list)
+    strangers: list[Stranger] = field(default_factory=list)
+    files: int = 0
+
+
+def scan_path(path: Path, progress: Progress | None = None, force: bool = False) -> Scan:
+    """Read the headers of all DICOM files at `path`.
+
+    Parameters
+    ----------
+    path : Path
+        A folder, searched with its subfolders, or one file.
+    progress : callable, optional
+        Called as ``progress("scan", done, total)``, about `PROGRESS_STEPS` times in all, and as
+        ``progress("no answer yet from NAME", done, total)`` where the disk hangs.
+    force : bool
+        Take data sets without preamble or meta header too.
+
+    Raises
+    ------
+    NoDicomError
+        `path` does not exist, cannot be read, or is neither a folder nor a regular file.
+    RefusedInputError
+        The disk or network drive does not answer.
+    """
+    scan = Scan()
+    with DiskReader(progress) as disk:
+        files = disk.run(lambda: _list_files(path, scan, disk))
+        total = scan.files = len(files)
+        step = max(1, total // PROGRESS_STEPS)
+        for done, (file, start) in enumerate(zip(files, disk.read_starts(files), strict=True), start=1):
+            _take_file(file, start, scan, force)
+            if progress is not None and (done % step == 0 or done == total):
+                progress("scan", done, total)
+    if scan.strangers:
+        _suspect_strangers(scan)
+    return scan
+
+
+def _suspect_strangers(scan: Scan) -> None:
+    slices = {str(header.file): header.file_bytes for header in scan.slices}
+    broken = {str(image.file): 0 for image in scan.others if image.kind == "broken"}
+    for path, reason in find_remains(scan.strangers, (slices | broken).items()):
+        scan.suspects.append(CorruptFile(path, reason))
+
+
+def _take_file(file: str, start: FileStart | OSError, scan: Scan, force: bool) -> None:
+    marked = isinstance(start, OSError) or has_dicom_mark(start.prefix)
+    if isinstance(start, FileStart) and not marked and not (force and restore_start(start.prefix)):
+        scan.skipped[describe_container(start.prefix) or "not DICOM"] += 1
+        reason = _suspect(file, start.prefix)
+        if reason:
+            scan.suspects.append(CorruptFile(Path(file), reason))
+        else:
+            scan.strangers.append(Stranger(str(Path(file)), start.size, describe_start(start.prefix)))
+        return
+    try:
+        if isinstance(start, OSError):
+            raise start
+        headers = read_headers(Path(file), start, force)
+    except CorruptFileError as error:
+        scan.skipped["corrupt"] += 1
+        scan.corrupt.append(CorruptFile(Path(file), str(error)))
+    except OSError as error:
+        scan.skipped["not readable"] += 1
+        why = f": {error.strerror}" if error.strerror else ""
+        scan.corrupt.append(CorruptFile(Path(file), f"not readable{why}"))
+    else:
+        if headers is None:
+            scan.skipped["DICOMDIR"] += 1
+        elif isinstance(headers, OtherImage):
+            scan.others.append(headers)
+        else:
+            scan.slices.extend(headers)
+
+
+def _suspect(file: str, start: bytes) -> str:
+    """Say why a file without the mark of DICOM may be what is left of an image; empty where nothing says so."""
+    name = os.path.basename(file)
+    if name.startswith("._") and start.startswith(APPLE_DOUBLE):
+        return ""
+    if 0 < len(start) < META_START and BLANK_START.startswith(start):
+        return "cut within the preamble"
+    if restore_start(start) is not None:
+        return f"{BARE_DATA_SET} ({describe_way_out()})"
+    return "named like DICOM but is none" if os.path.splitext(name)[1].lower() in DICOM_SUFFIXES else ""
+
+
+def _list_files(path: Path, scan: Scan, disk: DiskReader) -> list[str]:
+    """List the regular files at `path`, sorted, and count what was passed over."""
+    disk.touched = str(path)
+    try:
+        if path.is_file():
+            return [str(path)]
+        if not path.is_dir():
+            what = "is neither a folder nor a regular file" if os.path.lexists(path) else "does not exist"
+            raise NoDicomError(f"{escape_text(str(path), 256)} {what}")
+        with os.scandir(path):
+            pass
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or str(error)
+        raise NoDicomError(f"{escape_text(str(path), 256)} cannot be read: {reason}") from error
+
+    root = os.path.realpath(path)
+    files: list[str] = []
+    folders = [str(path)]
+    while folders:
+        disk.touched = folder = folders.pop()
+        try:
+            with os.scandir(folder) as entries:
+                for entry in entries:
+                    _sort_entry(entry, root, files, folders, scan.skipped)
+        except OSError:
+            scan.skipped["folder not readable"] += 1
+            scan.corrupt.append(CorruptFile(Path(folder), "folder not readable"))
+    files.sort()
+    return files
+
+
+def _sort_entry(
+    entry: os.DirEntry[str], root: str, files: list[str], folders: list[str], skipped: Counter[str]
+) -> None:
+    if entry.is_symlink():
+        target = os.path.realpath(entry.path)
+        inside = target == root or target.startswith(root.rstrip(os.sep) + os.sep)
+        skipped["link inside the folder" if inside else "link out of the folder"] += 1
+    elif entry.is_file(follow_symlinks=False):
+        files.append(entry.path)
+    elif entry.is_dir(follow_symlinks=False):
+        folders.append(entry.path)
+    else:
+        skipped["not a regular file"] += 1

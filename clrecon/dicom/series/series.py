@@ -1,0 +1,351 @@
+"""Slices to series: group and number."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property, partial
+from pathlib import Path
+
+from clrecon.dicom.headers.slice_header import OtherImage, SeriesIdentity, SliceHeader
+from clrecon.dicom.pixels.stored import StoredPixels
+from clrecon.dicom.pixels.voxels import read_voxels
+from clrecon.dicom.series.likeness import judge_likeness
+from clrecon.dicom.series.missing_parts import describe_missing_parts
+from clrecon.dicom.series.phases import (
+    Places,
+    choose_phase,
+    describe_phases,
+    have_same_pixels,
+    part_alternating,
+    sort_places,
+)
+from clrecon.dicom.series.scan import CorruptFile, Scan
+from clrecon.dicom.stack.attributes import alternate_places, find_alternation
+from clrecon.dicom.stack.fit import Stack, group_places, measure_stack
+from clrecon.dicom.stack.planes import Planes
+from clrecon.errors import RefusedInputError
+from clrecon.system.text import hash_uid, join_names
+
+__all__ = ["Series", "group_series"]
+
+PROBLEMS_SHOWN = 3
+SLICE_MODALITIES = ("MR", "NM", "PT")
+"""Other modalities whose files are slices: a corrupt file among them is one of theirs."""
+
+
+@dataclass
+class Series:
+    """One stack of a series, or a series that cannot be one.
+
+    Attributes
+    ----------
+    kind : {"stack", "localizer", "capture", "other"}
+        Only stacks are ever chosen; "other" is no CT.
+    headers : list of SliceHeader
+        Valid slices, unsorted.
+    others : list of OtherImage
+        Its files that cannot be slices.
+    corrupt : list of CorruptFile
+        Files and folders that cannot be read and may be, or hold, slices of it.
+    lost : list of str
+        What is known to be missing although it leaves no hole: files of concatenations.
+    number : int
+        Place in the listing, from 1.
+    patient, study : int
+        Which of the patients, and of the studies, in what was scanned, from 1; 0 where the files do not say.
+    phase : int, optional
+        Which of its phases is wanted.
+    allow_gaps : bool
+        Missing slices are a warning and no problem.
+    """
+
+    identity: SeriesIdentity
+    kind: str
+    headers: list[SliceHeader] = field(default_factory=list)
+    others: list[OtherImage] = field(default_factory=list)
+    corrupt: list[CorruptFile] = field(default_factory=list)
+    lost: list[str] = field(default_factory=list)
+    number: int = 0
+    patient: int = 0
+    study: int = 0
+    phase: int | None = None
+    allow_gaps: bool = False
+
+    @property
+    def count(self) -> int:
+        """Slices, the frames of multi-frame images among them."""
+        return len(self.headers) + sum(image.frames for image in self.others)
+
+    @property
+    def key(self) -> str:
+        """What all parts of one series share."""
+        return _group_key((self.headers or self.others)[0])
+
+    @cached_property
+    def places(self) -> Places:
+        """The slices without copies, and the phases among them; compares pixels where slices share a place.
+
+        Raises
+        ------
+        RefusedInputError
+            Pixels that have to be compared cannot be read.
+        """
+        if self.kind != "stack" or len(self.headers) < 2:
+            return Places(tuple(self.headers))
+        places = group_places(self.headers)
+        if len(places) == len(self.headers):
+            return sort_places(places, have_same_pixels)
+        with StoredPixels(self.headers) as source:
+            return sort_places(places, partial(have_same_pixels, source=source))
+
+    @cached_property
+    def stack(self) -> Stack | None:
+        """The measured geometry, of the wanted phase where there are several; None without a valid slice."""
+        if not self.headers:
+            return None
+        if self.kind != "stack":
+            return measure_stack(self.headers[:1])
+        try:
+            places = self.places
+        except RefusedInputError:
+            return measure_stack(self.headers[:1])  # `problems` says why
+        headers = places.headers
+        if places.phases:
+            headers = choose_phase(places.phases, self.phase or 1).headers
+        elif places.problem:
+            headers = headers[:1]
+        return measure_stack(headers, self.allow_gaps)
+
+    def find_doubt(self) -> str:
+        """What alternates along the stack and may yet be one volume; empty where there is nothing to say."""
+        try:
+            return self.places.doubt
+        except RefusedInputError:
+            return ""
+
+    @property
+    def dropped(self) -> dict[str, int]:
+        """Reason to number of slices that are not in the stack although their headers are valid."""
+        try:
+            places = self.places
+        except RefusedInputError:
+            return {}
+        phases = sum(len(phase.headers) for phase in places.phases)
+        left = phases - len(choose_phase(places.phases, self.phase).headers) if phases and self.phase else 0
+        counts = {"copy of another slice": places.copies, "other phase": left}
+        return {reason: count for reason, count in counts.items() if count}
+
+    def choose(self, phase: int | None = None, allow_gaps: bool = False) -> Series:
+        """The same series with a phase chosen and gaps allowed, and looked at more closely.
+
+        Volumes between each other are found by whatever alternates in the headers, which are read once more for it;
+        where that may be so within one volume, or a phase is asked for that no header tells, by the pixels as well.
+
+        Raises
+        ------
+        UsageError
+            It has no such phase.
+        """
+        chosen = replace(self, phase=phase, allow_gaps=allow_gaps)
+        try:
+            chosen.__dict__["places"] = self._part_further(self.places, phase)
+        except RefusedInputError:
+            return chosen  # its `problems` say why
+        if phase is not None and (phase != 1 or chosen.places.phases):
+            choose_phase(chosen.places.phases, phase, chosen.places.interleaved)
+        return chosen
+
+    def _part_further(self, places: Places, phase: int | None) -> Places:
+        """Phases by what alternates along a stack with one slice at each place."""
+        if self.kind != "stack" or self.others or places.phases or places.problem or len(places.headers) < 2:
+            return places
+        stack = measure_stack(places.headers, allow_gaps=True)
+        if stack.problems:
+            return places
+        places = replace(places, headers=stack.slices)
+        found = find_alternation(stack.slices, not stack.line.uneven)
+        if found is not None and found.certain:
+            return part_alternating(places, found)
+        if found is None and phase is None:
+            return places
+        likeness = judge_likeness(read_voxels(stack.slices)[0], stack)
+        if likeness is not None and likeness.is_mixed:
+            return part_alternating(places, found or alternate_places(len(stack.slices), likeness.period))
+        if found is None:
+            return places
+        doubt = f"{found.name} alternates along the stack: maybe several volumes between each other"
+        return replace(places, doubt=doubt)
+
+    @cached_property
+    def problems(self) -> list[str]:
+        """Why this series is refused; empty where it is usable."""
+        if self.kind == "other":
+            return [f"modality {self.identity.modality} is not CT"]
+        texts = [image.problem for image in self.others]
+        problems = texts[:PROBLEMS_SHOWN]
+        if len(texts) > PROBLEMS_SHOWN:
+            problems.append(f"and {len(texts) - PROBLEMS_SHOWN} more files with a problem")
+        if self.kind == "localizer":
+            problems.append("localizer images, not a stack")
+        if self.corrupt:
+            problems.append(
+                "files or folders that are cut, corrupt or not readable may belong to it (restore or remove them): "
+                + join_names(self.corrupt)
+            )
+        if not texts:
+            problems += self.lost
+        # Bad files leave holes, which would only hide the cause.
+        if self.kind == "stack" and not texts:
+            problems += self._find_stack_problems()
+        return problems
+
+    def _find_stack_problems(self) -> list[str]:
+        try:
+            places = self.places
+        except RefusedInputError as error:
+            return [f"slices at one place cannot be compared: {error}"]
+        if places.problem:
+            return [places.problem]
+        if places.phases and self.phase is None:
+            return [describe_phases(places.phases, places.interleaved)]
+        return list(self.stack.problems) if self.stack is not None else []
+
+    def describe(self) -> str:
+        """One line for a message on the terminal."""
+        return f"{self.number}: {self.identity.modality} '{self.identity.description}', {self._describe_count()}"
+
+    def describe_without_text(self) -> str:
+        """One line for a warning: without the description, since people type names into it."""
+        return f"{self.number}: {self.identity.modality} {hash_uid(self.identity.uid)}, {self._describe_count()}"
+
+    def _describe_count(self) -> str:
+        kind = "" if self.kind in ("stack", "other") else f", {self.kind}"
+        return f"{self.count} slice{'s' * (self.count != 1)}{kind}"
+
+
+def group_series(scan: Scan) -> list[Series]:
+    """Group what was scanned into numbered series.
+
+    One SeriesInstanceUID (where it was removed: one folder) gives one `Series`, or several where it mixes planes,
+    localizers or secondary captures with a stack.  Numbers follow (SeriesNumber, SeriesInstanceUID, larger part first)
+    and so do not depend on names.
+    """
+    slices: dict[str, list[SliceHeader]] = defaultdict(list)
+    others: dict[str, list[OtherImage]] = defaultdict(list)
+    for header in scan.slices:
+        slices[_group_key(header)].append(header)
+    for image in scan.others:
+        others[_group_key(image)].append(image)
+    found = []
+    for uid in {**slices, **others}:
+        parts = _split_slices(slices[uid])
+        lost = describe_missing_parts(slices[uid])
+        for part in parts:
+            part.lost = lost if part.kind == "stack" else []
+        for kind in ("capture", "other", "broken"):
+            images = [image for image in others[uid] if image.kind == kind]
+            if not images:
+                continue
+            stacks = [part for part in parts if part.kind == "stack"]
+            if kind == "broken" and stacks:
+                max(stacks, key=lambda part: len(part.headers)).others = images
+            else:
+                parts.append(Series(images[0].series, "stack" if kind == "broken" else kind, others=images))
+        parts.sort(key=lambda part: (part.kind != "stack", -part.count))
+        found += parts
+    found.sort(key=_listing_key)
+    for number, series in enumerate(found, start=1):
+        series.number = number
+    _number_patients_and_studies(found)
+    if scan.corrupt or scan.suspects:
+        _blame_corrupt_files(found, scan)
+    return found
+
+
+def _number_patients_and_studies(found: Sequence[Series]) -> None:
+    """Tell patients and studies apart by numbers in the order of the listing: a hash of a short ID can be undone."""
+    patients: dict[str, int] = {}
+    studies: dict[str, int] = {}
+    for series in found:
+        patient = next((header.patient_hash for header in series.headers if header.patient_hash), None)
+        if patient is not None:
+            series.patient = patients.setdefault(patient, len(patients) + 1)
+        if series.identity.study:
+            series.study = studies.setdefault(series.identity.study, len(studies) + 1)
+
+
+def _blame_corrupt_files(found: Sequence[Series], scan: Scan) -> None:
+    """Give every stack the unreadable files that may belong to it: a lost slice at its end would leave no hole.
+
+    A corrupt or unreadable file may belong to any stack, unless its folder holds slices of other series only.  A
+    suspect may belong to a stack with slices in its folder, or to one whose slices lie in several folders where its
+    own folder holds no slices at all.
+    """
+    holders: dict[Path, set[str]] = defaultdict(set)  # folder to the series, by UID, with slices in it
+    for series in found:
+        if series.kind == "capture" or series.kind == "other" and series.identity.modality not in SLICE_MODALITIES:
+            continue
+        images: list[SliceHeader | OtherImage] = [*series.headers, *series.others]
+        for image in images:
+            holders[image.file.parent].add(_group_key(image))
+    folders: dict[str, list[Path]] = defaultdict(list)  # and the other way round
+    for folder, keys in holders.items():
+        for key in keys:
+            folders[key].append(folder)
+    # Every file is looked at once and lists are shared: 10,000 series may stand beside as many bad files.
+    corrupt, loose_corrupt = _sort_by_holder(scan.corrupt, holders)
+    suspects, loose_suspects = _sort_by_holder(scan.suspects, holders)
+    for series in found:
+        if series.kind == "stack":
+            own = folders[series.key]
+            spread = len(own) > 1
+            near = [files[folder] for files in (corrupt, suspects) for folder in own if folder in files]
+            blamed = [part for part in (*near, loose_corrupt, loose_suspects if spread else []) if part]
+            series.corrupt = blamed[0] if len(blamed) == 1 else [file for part in blamed for file in part]
+
+
+def _sort_by_holder(
+    files: Sequence[CorruptFile], holders: Mapping[Path, object]
+) -> tuple[dict[Path, list[CorruptFile]], list[CorruptFile]]:
+    """Part files by the folders that hold slices; the second are those in no such folder."""
+    held: dict[Path, list[CorruptFile]] = defaultdict(list)
+    loose: list[CorruptFile] = []
+    for file in files:
+        folder = file.file.parent
+        (held[folder] if folder in holders else loose).append(file)
+    return held, loose
+
+
+def _group_key(image: SliceHeader | OtherImage) -> str:
+    """What the images of one series share: without a UID their folder, and the number where there is one."""
+    return image.series.uid or f"{image.series.number} {image.file.parent}"
+
+
+def _listing_key(series: Series) -> tuple[bool, int, str]:
+    number = series.identity.number
+    return number is None, number or 0, series.identity.uid
+
+
+def _split_slices(headers: Sequence[SliceHeader]) -> list[Series]:
+    """Part the slices of one SeriesInstanceUID by plane, localizers first."""
+    planes = Planes()
+    parts: list[Series] = []
+    known: dict[tuple[float, ...], Series] = {}
+    localizers = Series(headers[0].series, "localizer") if headers else None
+    for header in headers:
+        if header.localizer and localizers is not None:
+            localizers.headers.append(header)
+            continue
+        key = (*header.row_cosines, *header.column_cosines)
+        if key not in known:
+            number = planes.find(key)
+            if number == len(parts):
+                parts.append(Series(header.series, "stack"))
+            known[key] = parts[number]
+        known[key].headers.append(header)
+    found = parts
+    if localizers is not None and localizers.headers:
+        found.append(localizers)
+    return found

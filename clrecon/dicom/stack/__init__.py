@@ -1,0 +1,1 @@
+"""Headers of slices to a stack with an affine."""

@@ -1,0 +1,263 @@
+"""What the files of a stack say beside what is kept of every header: elements that alternate from slice to slice.
+
+Two volumes half a gap apart sort into one even stack.  Anything may tell them apart: a time, the contrast medium, an
+acquisition number that only one of them has, an element of the vendor's own.  So the headers of the one stack that is
+to be read are read once more, whole, and every element whose values come back in a fixed order along the stack is
+found: ABAB, ABCABC, AABB.  Within one volume values stay, run on, or change here and there.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from clrecon.dicom.headers.slice_header import SliceHeader
+from clrecon.dicom.parse.elements import CorruptFileError, NotDicomError, read_elements
+from clrecon.dicom.stack.numbers import median
+
+__all__ = ["Alternation", "alternate_places", "find_alternation"]
+
+FEWEST_SLICES = 6
+SMALLEST_VOLUME = 3
+LONGEST_PERIOD = 8
+PERIODS = 3
+"""The order of values has to come back so often: by chance, 6 slices that stand for one another do."""
+MOST_TOGETHER = 2
+"""Slices of one volume side by side; more are slabs, which one volume may be scanned in."""
+MOST_VALUES = 8
+"""An element with more values counts by heaps of numbers: the times of a first and a second pass."""
+MOST_HEAPS = 4
+LONGEST_VALUE = 64
+DENSER = 1.3
+"""Where two volumes overlap in part, slices lie this much closer together than beside it."""
+WINDOW, WINDOWS = 32, 3
+"""Of an even stack, which can only hold volumes that overlap from end to end, so many slices in so many places are
+looked at before all are."""
+FEWEST_NUMBERED = 12
+"""Of fewer slices InstanceNumber falls into two heaps by chance."""
+
+SERIES_UID, SOP_INSTANCE, INSTANCE_NUMBER = 0x0020000E, 0x00080018, 0x00200013
+NEVER = frozenset({SOP_INSTANCE, SERIES_UID, INSTANCE_NUMBER, 0x00200032, 0x00200037, 0x00201041})
+"""Names and places of single slices, which are looked at elsewhere."""
+PIXEL_GROUP, OVERLAY_GROUPS = 0x0028, range(0x5000, 0x6100)
+"""How the values of single slices are written: rescale, extremes, padding."""
+WINDOW_TAGS = frozenset({0x00281050, 0x00281051, 0x00281055})
+DOUBTFUL = WINDOW_TAGS | {
+    0x00080012,
+    0x00080013,
+    0x00181150,
+    0x00181151,
+    0x00181152,
+    0x00181153,
+    0x00181170,
+    0x00189330,
+    0x00189332,
+    0x00189345,
+}
+"""What may alternate within one volume: when a file was written, how it is to be shown, and tube current and exposure,
+which follow the patient.  Elements of vendors, whose meaning nobody knows, are as doubtful: the number of the detector
+row is one of them."""
+
+
+@dataclass(frozen=True)
+class Alternation:
+    """An element whose values alternate along a stack.
+
+    Attributes
+    ----------
+    tag : int
+        0 where it is no element of the headers that says so.
+    groups : tuple of tuple of int
+        The places, from 0, of each volume, in the order of the values.
+    certain : bool
+        It is the same within one volume.
+    heaps : bool
+        The groups are heaps of numbers, each slice with its own.
+    absent : int or None
+        Which group has no such element.
+    """
+
+    tag: int
+    groups: tuple[tuple[int, ...], ...]
+    certain: bool
+    heaps: bool = False
+    absent: int | None = None
+
+    @property
+    def name(self) -> str:
+        """Keyword of the element, or its tag."""
+        from pydicom.datadict import keyword_for_tag
+
+        private = (self.tag >> 16) % 2
+        known = "" if private else keyword_for_tag(self.tag)
+        return known or f"({self.tag >> 16:04X},{self.tag & 0xFFFF:04X})"
+
+
+def find_alternation(headers: Sequence[SliceHeader], even: bool) -> Alternation | None:
+    """Find an element that alternates along a stack; reads the headers of its files again.
+
+    Parameters
+    ----------
+    headers : sequence of SliceHeader
+        One at each place, in the order of the places.
+    even : bool
+        All gaps are equal: of a long stack only some windows are looked at first.
+
+    Returns
+    -------
+    Alternation or None
+        A certain one before a doubtful one.  None for multi-frame images too, whose frames share one header.
+    """
+    count = len(headers)
+    if count < FEWEST_SLICES or any(header.frames > 1 for header in headers):
+        return None
+    if even and count > WINDOW * WINDOWS:
+        starts = [(count - WINDOW) * place // (WINDOWS - 1) for place in range(WINDOWS)]
+        if not any(_find_in(headers[first : first + WINDOW]) for first in starts):
+            return None
+    return _find_in(headers)
+
+
+def alternate_places(count: int, period: int) -> Alternation:
+    """`count` slices in turn, for `period` volumes; two in pairs where that is 4: what no header says."""
+    if period == 4:
+        return Alternation(0, tuple(tuple(k for k in range(count) if k // 2 % 2 == half) for half in (0, 1)), False)
+    return Alternation(0, tuple(tuple(range(first, count, period)) for first in range(period)), False)
+
+
+def _find_in(headers: Sequence[SliceHeader]) -> Alternation | None:
+    gaps = [float(np.linalg.norm(np.subtract(b.position_mm, a.position_mm))) for a, b in pairwise(headers)]
+    doubtful = None
+    for tag, column in sorted(_read_columns(headers).items()):
+        for codes, heaps in _code(tag, column):
+            if not alternates(codes, gaps):
+                continue
+            groups = tuple(tuple(k for k, code in enumerate(codes) if code == one) for one in sorted(set(codes)))
+            certain = tag >> 16 & 1 == 0 and tag not in DOUBTFUL and tag != INSTANCE_NUMBER
+            absent = next((number for number, group in enumerate(groups) if column[group[0]] == b""), None)
+            found = Alternation(tag, groups, certain, heaps, absent)
+            if certain:
+                return found
+            doubtful = doubtful or found
+            break
+    return doubtful
+
+
+def _read_columns(headers: Sequence[SliceHeader]) -> dict[int, list[bytes]]:
+    """The values along the stack of each element that is not the same everywhere; empty where it is not there."""
+    first: dict[int, bytes] = {}
+    columns: dict[int, list[bytes]] = {}
+    for k, header in enumerate(headers):
+        values = _read_values(header)
+        first = values if k == 0 else first
+        if values != first:
+            for tag in values.keys() | first.keys():
+                if tag not in columns and values.get(tag) != first.get(tag):
+                    columns[tag] = [first.get(tag, b"")] * k
+        for tag, column in columns.items():
+            column.append(values.get(tag, b""))
+    return columns
+
+
+def _read_values(header: SliceHeader) -> dict[int, bytes]:
+    """What is compared of one file: nothing where it has changed since it was scanned, which its pixels will tell."""
+    try:
+        # What was taken by force is read as it was then; nothing else is read differently by it.
+        values = read_elements(header.file, None, force=True).values
+    except (OSError, CorruptFileError, NotDicomError):
+        return {}
+    return {tag: _shorten(raw.strip(b" \0")) for tag, raw in values.items() if _is_compared(tag)}
+
+
+def _shorten(raw: bytes) -> bytes:
+    """Vendors keep whole files in one element: of a long value only what tells it from others is kept."""
+    return raw if len(raw) <= LONGEST_VALUE else hash(raw).to_bytes(8, "little", signed=True) + b"..."
+
+
+def _is_compared(tag: int) -> bool:
+    group = tag >> 16
+    if tag == INSTANCE_NUMBER or tag in WINDOW_TAGS:
+        return True
+    return tag not in NEVER and group != PIXEL_GROUP and group not in OVERLAY_GROUPS and tag & 0xFFFF != 0
+
+
+def _code(tag: int, column: Sequence[bytes]) -> Iterator[tuple[list[int], bool]]:
+    """Ways to sort the slices by the values of one element: numbers of groups, and whether they are heaps."""
+    numbers = [_number(raw) for raw in column]
+    if tag == INSTANCE_NUMBER:
+        known = [number for number in numbers if number is not None]
+        if len(known) == len(column) >= FEWEST_NUMBERED:
+            middle = sorted(known)[len(known) // 2]
+            yield [int(number >= middle) for number in known], True
+        return
+    values = set(column)
+    if len(values) <= MOST_VALUES:
+        ranks = {raw: rank for rank, raw in enumerate(sorted(values, key=lambda raw: (_number(raw) or 0.0, raw)))}
+        yield [ranks[raw] for raw in column], False
+    if len(values) == 2:
+        return
+    if b"" in values:
+        yield [int(raw != b"") for raw in column], False
+        return
+    known = [number for number in numbers if number is not None]
+    if len(known) == len(column):
+        ordered = np.unique(known)
+        steps = np.argsort(-np.diff(ordered), kind="stable")
+        for heaps in range(2, min(MOST_HEAPS, len(ordered)) + 1):
+            yield np.searchsorted(np.sort(ordered[steps[: heaps - 1]]), known).tolist(), True
+
+
+def _number(raw: bytes) -> float | None:
+    try:
+        number = float(raw)
+    except ValueError:
+        return None
+    return number if np.isfinite(number) else None
+
+
+def alternates(codes: Sequence[int], gaps: Sequence[float]) -> bool:
+    """True where values come back in a fixed order, all along a stack or where its slices lie closer together.
+
+    Parameters
+    ----------
+    codes : sequence of int
+        A number for the value of each slice.
+    gaps : sequence of float
+        mm to the next slice; one fewer.
+    """
+    counts = Counter(codes)
+    if len(counts) < 2 or min(counts.values()) < SMALLEST_VOLUME:
+        return False
+    for period in range(2, LONGEST_PERIOD + 1):
+        for first, last in _runs([one == other for one, other in zip(codes, codes[period:], strict=False)]):
+            end = last + period
+            if end - first < max(PERIODS * period, FEWEST_SLICES) or len(set(codes[first:end])) < 2:
+                continue
+            slabs = any(len(set(codes[k : k + MOST_TOGETHER + 1])) == 1 for k in range(first, end - MOST_TOGETHER))
+            if not slabs and _spans(codes, gaps, first, end):
+                return True
+    return False
+
+
+def _spans(codes: Sequence[int], gaps: Sequence[float], first: int, end: int) -> bool:
+    """True where nothing but one volume lies before `first` and from `end` on, and its slices farther apart."""
+    left, right = codes[:first], codes[end:]
+    if len(left) <= 1 and len(right) <= 1:
+        return True
+    beside = [*gaps[: max(first - 1, 0)], *gaps[end:]]
+    alone = len(set(left)) <= 1 and len(set(right)) <= 1
+    return alone and bool(beside) and median(beside) >= DENSER * median(gaps[first : end - 1])
+
+
+def _runs(flags: Sequence[bool]) -> Iterator[tuple[int, int]]:
+    """First places and ends of the runs of true flags."""
+    start = 0
+    for place, flag in enumerate([*flags, False]):
+        if not flag:
+            if place > start:
+                yield start, place
+            start = place + 1

@@ -1,0 +1,316 @@
+"""The geometry gate: slices in, one affine with its residual out, or the reasons why there is none.
+
+The position of a slice is its ImagePositionPatient and nothing else.  Slices are sorted by the projection of the
+position on the normal n = X x Y (row direction x column direction), so index space is always right-handed.  The
+affine is the least-squares line through all positions: its slice step is a full vector, a tilted gantry is an exact
+shear, and the rounding of positions averages out.  Where the positions are farther from that line than rounding
+takes them, each slice keeps its own.
+
+Source: DICOM PS3.3 C.7.6.2.1.1.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clrecon.dicom.headers.slice_header import SliceHeader
+from clrecon.dicom.stack.directions import ORIENTATION_EXACT, ORIENTATION_LIMIT, measure_directions
+from clrecon.dicom.stack.holes import Holes, find_holes
+from clrecon.dicom.stack.numbers import median
+from clrecon.geometry import compose_affine, tilt_degrees
+from clrecon.system.text import join_names
+from clrecon.system.wording import name_parameter
+
+__all__ = ["Line", "Stack", "group_places", "measure_stack", "measure_stated_gap"]
+
+Float64Array = NDArray[np.float64]
+
+POSITION_TOLERANCE_MM = 0.01
+POSITION_TOLERANCE_GAPS = 0.01
+"""A residual up to the larger of 0.01 mm and 1 % of the gap is rounding and no unevenness."""
+DUPLICATE_MM = 1e-3
+TILT_REPORT_DEG = 0.05
+STATED_GAP_TOLERANCE = 0.01
+PIXEL_SPACING_TOLERANCE = 1e-5
+
+
+@dataclass(frozen=True)
+class Line:
+    """Evenly spaced places fitted to the slices, and how far the slices are from them. None: there is one slice.
+
+    Attributes
+    ----------
+    step, origin : ndarray, shape (3,), float64
+        LPS mm, by least squares.
+    gap_min_mm, gap_max_mm, gap_median_mm : float
+        Along the normal.
+    residual_max_mm, residual_rms_mm : float
+        Distance of the positions from their places.
+    tolerance_mm : float
+        Largest residual that is rounding.
+    worst_slice : int
+        Where the residual is largest.
+    uneven : bool
+        The residual is over the tolerance: the slices are placed one by one, and the line is only nominal.
+    """
+
+    step: Float64Array | None = None
+    origin: Float64Array | None = None
+    gap_min_mm: float | None = None
+    gap_max_mm: float | None = None
+    gap_median_mm: float | None = None
+    residual_max_mm: float | None = None
+    residual_rms_mm: float | None = None
+    tolerance_mm: float | None = None
+    worst_slice: int = 0
+    uneven: bool | None = None
+
+
+@dataclass(frozen=True)
+class Stack:
+    """The measured geometry of one stack of slices.
+
+    Attributes
+    ----------
+    slices : tuple of SliceHeader
+        Sorted by ascending position along the normal.
+    positions_mm : ndarray, shape (n, 3), float64
+        LPS mm.
+    distances_mm : ndarray, shape (n,), float64
+        Positions along the normal.
+    affine : ndarray, shape (4, 4), float64, or None
+        Index (i, j, k) to LPS mm; None where there is a problem.
+    line : Line
+    tilt_deg : float or None
+        None where there is no affine.
+    problems, warnings : tuple of str
+        A stack with problems is refused.
+    missing : int
+        Slices that are missing, counted by the usual gap; allowed, or one of the problems.
+    """
+
+    slices: tuple[SliceHeader, ...]
+    positions_mm: Float64Array
+    distances_mm: Float64Array
+    affine: Float64Array | None
+    line: Line
+    tilt_deg: float | None
+    problems: tuple[str, ...]
+    warnings: tuple[str, ...]
+    missing: int = 0
+
+    @property
+    def slice_positions(self) -> Float64Array | None:
+        """Positions of the slices where they do not lie on the affine, None where they do."""
+        return self.positions_mm if self.line.uneven else None
+
+
+def measure_stack(headers: Sequence[SliceHeader], allow_gaps: bool = False) -> Stack:
+    """Sort slices, find what is wrong with them, and fit the affine.
+
+    Parameters
+    ----------
+    headers : sequence of SliceHeader
+        At least one, and no more than one at each place.
+    allow_gaps : bool
+        Missing slices are a warning and no problem.
+
+    Returns
+    -------
+    Stack
+        Never raises for bad geometry: what is wrong stands in ``problems``.
+    """
+    problems = find_mixed_values(headers)
+    warnings: list[str] = []
+    row, column = _mean_directions(headers, problems, warnings)
+    normal = _cross(row, column)
+    slices, positions, distances = sort_slices(headers, normal)
+    affine: Float64Array | None = None
+    line, holes = Line(), Holes()
+    if len(slices) == 1:
+        problems.append("a single slice cannot make a surface")
+    else:
+        line, holes = measure_line(positions, distances), find_holes(distances)
+        if holes.places and allow_gaps:
+            warnings.append(f"{holes.describe()}: what is there is placed exactly, surfaces bridge the gap")
+        elif holes.places:
+            where = holes.describe([header.name for header in slices])
+            problems.append(f"{where}; find them, or take what is there with {name_parameter('allow_gaps', True)}")
+        if line.uneven and not problems:
+            warnings.append(_describe_unevenness(distances, line))
+        if not problems:
+            assert line.step is not None and line.origin is not None
+            affine = compose_affine(row * slices[0].di_mm, column * slices[0].dj_mm, line.step, line.origin)
+        warnings += _describe_stated_gap(measure_stated_gap(slices, positions, line.gap_median_mm))
+    tilt = None if affine is None else tilt_degrees(affine)
+    aside = _measure_sideways(positions, distances) if line.uneven else 0.0
+    if affine is not None and aside > (line.tolerance_mm or 0.0):
+        warnings.append(f"slices are shifted sideways, up to {aside:.3f} mm off a straight line: placed as they say")
+    elif tilt is not None and tilt > TILT_REPORT_DEG:
+        warnings.append(f"gantry tilt {tilt:.2f} degrees: kept exactly, as a shear")
+    return Stack(slices, positions, distances, affine, line, tilt, tuple(problems), tuple(warnings), holes.missing)
+
+
+def measure_line(positions: Float64Array, distances: Float64Array) -> Line:
+    """Fit evenly spaced places to sorted positions (n, 3), n >= 2, and measure gaps and residuals."""
+    gaps = np.diff(distances)
+    usual = median(gaps)
+    step, origin = fit_line(positions)
+    residuals = np.linalg.norm(positions - (origin + np.arange(len(positions))[:, None] * step), axis=1)
+    tolerance = max(POSITION_TOLERANCE_MM, POSITION_TOLERANCE_GAPS * usual)
+    return Line(
+        step=step,
+        origin=origin,
+        gap_min_mm=float(gaps.min()),
+        gap_max_mm=float(gaps.max()),
+        gap_median_mm=usual,
+        residual_max_mm=float(residuals.max()),
+        residual_rms_mm=float(np.sqrt(np.mean(residuals**2))),
+        tolerance_mm=tolerance,
+        worst_slice=int(residuals.argmax()),
+        uneven=bool(residuals.max() > tolerance),
+    )
+
+
+def _measure_sideways(positions: Float64Array, distances: Float64Array) -> float:
+    """Largest distance in mm of positions (n, 3) from a straight line that advances with the sorted distances."""
+    along = distances - distances.mean()
+    moved = positions - positions.mean(axis=0)
+    slope = along @ moved / np.sum(along**2)
+    return float(np.linalg.norm(moved - along[:, None] * slope, axis=1).max())
+
+
+def _describe_unevenness(distances: Float64Array, line: Line) -> str:
+    return (
+        f"slices are unevenly spaced: gaps {line.gap_min_mm:.3f} to {line.gap_max_mm:.3f} mm (usual "
+        f"{line.gap_median_mm:.3f} mm), up to {line.residual_max_mm:.3f} mm from even positions (taken as even up to "
+        f"{line.tolerance_mm:.3f} mm), worst at {distances[line.worst_slice]:.2f} mm: each slice is placed at its own "
+        "position, the affine is only nominal"
+    )
+
+
+def sort_slices(
+    headers: Sequence[SliceHeader], normal: Float64Array
+) -> tuple[tuple[SliceHeader, ...], Float64Array, Float64Array]:
+    """Sort by projection on the normal; returns the slices, their positions (n, 3) and projections (n,) in mm."""
+    positions = np.array([header.position_mm for header in headers], dtype=np.float64)
+    distances = positions @ normal
+    order = sorted(range(len(headers)), key=lambda index: (distances[index], str(headers[index].file)))
+    return tuple(headers[index] for index in order), positions[order], distances[order]
+
+
+def fit_line(positions: Float64Array) -> tuple[Float64Array, Float64Array]:
+    """Least-squares step and origin (LPS mm) of positions (n, 3) that are numbered 0 to n - 1, n >= 2."""
+    k = np.arange(len(positions), dtype=np.float64)
+    centre, mean = k.mean(), positions.mean(axis=0)
+    step = (k - centre) @ (positions - mean) / np.sum((k - centre) ** 2)
+    return step, mean - centre * step
+
+
+def find_mixed_values(headers: Sequence[SliceHeader]) -> list[str]:
+    """Describe values that must be one and the same over a stack and are not, naming the odd slices."""
+    checks: tuple[tuple[str, Callable[[SliceHeader], object], Callable[[SliceHeader], str]], ...] = (
+        ("Columns x Rows", lambda h: (h.columns, h.rows), lambda h: f"{h.columns} x {h.rows}"),
+        (
+            "FrameOfReferenceUID",
+            lambda h: h.frame_of_reference,
+            lambda h: "another" if h.frame_of_reference else "no",
+        ),
+        ("StudyInstanceUID", lambda h: h.series.study, lambda h: "another" if h.series.study else "no"),
+    )
+    found = []
+    for title, key, show in checks:
+        counts = Counter(key(header) for header in headers)
+        if len(counts) > 1:
+            usual = counts.most_common(1)[0][0]
+            odd = [header for header in headers if key(header) != usual]
+            found.append(f"{title} differ within the series: {show(odd[0])} in {join_names(h.name for h in odd)}")
+    patients = Counter(header.patient_hash for header in headers if header.patient_hash is not None)
+    if len(patients) > 1:
+        usual = patients.most_common(1)[0][0]
+        odd = [header for header in headers if header.patient_hash not in (usual, None)]
+        found.append(f"PatientID differs within the series: another in {join_names(h.name for h in odd)}")
+    di, dj = median([header.di_mm for header in headers]), median([header.dj_mm for header in headers])
+    allowed = PIXEL_SPACING_TOLERANCE * min(di, dj)
+    odd = [header for header in headers if max(abs(header.di_mm - di), abs(header.dj_mm - dj)) > allowed]
+    if odd:
+        found.append(
+            f"PixelSpacing differs within the series: {odd[0].dj_mm:g}\\{odd[0].di_mm:g} mm against "
+            f"{dj:g}\\{di:g} mm in {join_names(h.name for h in odd)}"
+        )
+    return found
+
+
+def _mean_directions(
+    headers: Sequence[SliceHeader], problems: list[str], warnings: list[str]
+) -> tuple[Float64Array, Float64Array]:
+    """Mean row and column directions, orthonormal; appends what is wrong with them."""
+    directions = measure_directions(headers)
+    off = directions.deviation
+    if off > ORIENTATION_LIMIT:
+        problems.append(
+            f"{headers[int(directions.deviations.argmax())].name}: ImageOrientationPatient (0020,0037) is off unit "
+            f"length or right angle by {off:.2g} (allowed {ORIENTATION_LIMIT:g})"
+        )
+    elif off > ORIENTATION_EXACT:
+        warnings.append(f"ImageOrientationPatient is off unit length or right angle by {off:.2g}: made orthonormal")
+    if directions.spread_rad > directions.spread_allowed_rad:
+        problems.append(
+            f"ImageOrientationPatient differs within the series by {np.degrees(directions.spread_rad):.3f} degrees: "
+            f"{headers[int(directions.angles_rad.argmax())].name}"
+        )
+    return directions.row, directions.column
+
+
+def group_places(headers: Sequence[SliceHeader]) -> list[list[SliceHeader]]:
+    """The slices at each place, in the order of the places; slices closer than `DUPLICATE_MM` are at one.
+
+    Where the directions are wrong there are no places to compare: each slice is at its own.
+    """
+    problems: list[str] = []
+    row, column = _mean_directions(headers, problems, [])
+    if problems:
+        return [[header] for header in headers]
+    slices, _, distances = sort_slices(headers, _cross(row, column))
+    places: list[list[SliceHeader]] = []
+    last = -np.inf
+    for header, distance in zip(slices, distances.tolist(), strict=True):
+        if distance - last >= DUPLICATE_MM:
+            places.append([])
+            last = distance
+        places[-1].append(header)
+    return places
+
+
+def _cross(row: Float64Array, column: Float64Array) -> Float64Array:
+    """Vector product of two vectors (3,): a tenth of the time of numpy's, of which there are two a series."""
+    (a, b, c), (x, y, z) = row.tolist(), column.tolist()
+    return np.array((b * z - c * y, c * x - a * z, a * y - b * x))
+
+
+def measure_stated_gap(
+    slices: Sequence[SliceHeader], positions: Float64Array, usual: float | None
+) -> tuple[float, float, float] | None:
+    """SpacingBetweenSlices, the usual distance of the positions (n, 3), and by which share of it the two differ.
+
+    Scanners state the distance along the normal or, tilted, along the table: the nearer one counts.  None where it is
+    not stated or there is no distance.
+    """
+    stated = next((h.stated_gap_mm for h in slices if h.stated_gap_mm is not None), None)
+    if stated is None or not usual:
+        return None
+    along_table = median(np.linalg.norm(np.diff(positions, axis=0), axis=1))
+    measured = min((usual, along_table), key=lambda length: abs(stated - length))
+    return stated, measured, abs(stated - measured) / measured
+
+
+def _describe_stated_gap(found: tuple[float, float, float] | None) -> list[str]:
+    if found is None or found[2] <= STATED_GAP_TOLERANCE:
+        return []
+    stated, measured, _ = found
+    return [f"SpacingBetweenSlices says {stated:g} mm, the positions say {measured:.4g} mm: the positions are used"]

@@ -1,0 +1,115 @@
+"""How the slices of a stack lie, as plain figures for the certificate and the listing."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clrecon.dicom.headers.slice_header import SliceHeader
+from clrecon.dicom.stack.fit import POSITION_TOLERANCE_GAPS, POSITION_TOLERANCE_MM, Stack
+from clrecon.dicom.stack.numbers import median
+from clrecon.geometry import is_left_handed, slice_normal
+
+__all__ = [
+    "describe_orientation",
+    "describe_thickness",
+    "measure_extent",
+    "median_thickness",
+    "summarise_gaps",
+]
+
+Float64Array = NDArray[np.float64]
+
+
+def describe_orientation(affine: Float64Array) -> dict[str, Any]:
+    """Directions of index space in the patient.
+
+    Returns
+    -------
+    dict
+        ``row``, ``column``, ``normal``: unit vectors in LPS along i, along j, and row x column.  ``axes``: for i, j and
+        the normal, the letter of the patient direction nearest to it (L left, R right, P posterior, A anterior,
+        S superior, I inferior).  ``off_axis_deg``: angle between the normal and the nearest patient axis.
+        ``right_handed``: the determinant of the affine is above zero.
+    """
+    row, column = (affine[:3, axis] / np.linalg.norm(affine[:3, axis]) for axis in (0, 1))
+    normal = slice_normal(affine)
+    directions = np.stack((row, column, normal))
+    weights = np.abs(directions)
+    axes = max(itertools.permutations(range(3)), key=lambda order: weights[range(3), order].sum())
+    letters = ["LPS"[axis] if directions[place, axis] > 0 else "RAI"[axis] for place, axis in enumerate(axes)]
+    return {
+        "row": row.tolist(),
+        "column": column.tolist(),
+        "normal": normal.tolist(),
+        "axes": "".join(letters),
+        "off_axis_deg": float(np.degrees(np.arctan2(np.linalg.norm(np.delete(normal, axes[2])), weights[2, axes[2]]))),
+        "right_handed": not is_left_handed(affine),
+    }
+
+
+def measure_extent(stack: Stack) -> list[float] | None:
+    """Size in mm of the box of whole voxels along rows, columns and the slice normal; None where a gap is unknown."""
+    first, usual = stack.slices[0], stack.line.gap_median_mm
+    if usual is None:
+        return None
+    along_normal = float(stack.distances_mm[-1] - stack.distances_mm[0]) + usual
+    return [first.columns * first.di_mm, first.rows * first.dj_mm, along_normal]
+
+
+def summarise_gaps(distances: Float64Array) -> list[dict[str, Any]]:
+    """Runs of equal gaps between sorted positions (mm along the normal), in order.
+
+    Returns
+    -------
+    list of dict
+        ``count`` gaps of ``gap_mm``, their mean; a gap belongs to a run as long as it equals the first of it within
+        the tolerance of an even stack.
+    """
+    runs: list[list[float]] = []
+    for gap in np.diff(distances).tolist():
+        if runs and abs(gap - runs[-1][0]) <= max(POSITION_TOLERANCE_MM, POSITION_TOLERANCE_GAPS * runs[-1][0]):
+            runs[-1].append(gap)
+        else:
+            runs.append([gap])
+    return [{"count": len(run), "gap_mm": sum(run) / len(run)} for run in runs]
+
+
+def median_thickness(headers: Sequence[SliceHeader]) -> float | None:
+    """The middle of the SliceThickness values that are above zero, mm; None without one."""
+    known = sorted(_thicknesses(headers))
+    return known[len(known) // 2] if known else None
+
+
+def _thicknesses(headers: Sequence[SliceHeader]) -> list[float]:
+    return [h.slice_thickness_mm for h in headers if h.slice_thickness_mm is not None and h.slice_thickness_mm > 0.0]
+
+
+def describe_thickness(headers: Sequence[SliceHeader], distances: Float64Array) -> dict[str, Any] | None:
+    """SliceThickness against the distances of the slices along the normal.
+
+    Returns
+    -------
+    dict or None
+        ``min_mm``, ``max_mm``, ``median_mm`` of the thickness; ``overlap_mm``: ``min``, ``max`` and ``median`` of what
+        neighbouring slices share, (t_k + t_k+1) / 2 less their distance, below zero where tissue between them was
+        not measured; ``overlap_percent``: its median in percent of the median distance.  None unless every slice
+        states a thickness and there are two slices.
+    """
+    thickness = np.array(_thicknesses(headers))
+    if len(thickness) != len(headers) or len(headers) < 2:
+        return None
+    gaps = np.diff(distances)
+    overlap = (thickness[1:] + thickness[:-1]) / 2.0 - gaps
+    middle, usual = median(overlap), median(gaps)
+    return {
+        "min_mm": float(thickness.min()),
+        "max_mm": float(thickness.max()),
+        "median_mm": median(thickness),
+        "overlap_mm": {"min": float(overlap.min()), "max": float(overlap.max()), "median": middle},
+        "overlap_percent": 100.0 * middle / usual if usual > 0.0 else None,
+    }

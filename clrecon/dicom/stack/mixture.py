@@ -1,0 +1,126 @@
+"""One stack or several: slices of more than one volume that lie between each other, and what differs along a stack.
+
+Two reconstructions half a gap apart, or two acquisitions that overlap, share no place; sorted by position they look
+like one stack, evenly spaced or not, that alternates between two volumes.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Mapping, Sequence
+
+import numpy as np
+
+from clrecon.dicom.headers.slice_header import SliceHeader
+
+__all__ = ["describe_differences", "find_mixture", "values_of"]
+
+CERTAIN = (
+    "TemporalPositionIndex",
+    "TemporalPositionIdentifier",
+    "NominalPercentageOfCardiacPhase",
+    "NominalPercentageOfRespiratoryPhase",
+    "StackID",
+    "ConvolutionKernel",
+    "KVP",
+)
+"""What is one and the same over a volume."""
+POSSIBLE = ("AcquisitionNumber", "FrameAcquisitionNumber", "AcquisitionTime", "ImageType")
+"""What may change from rotation to rotation, or from file to file, of one volume: it parts only what is uneven together
+and even apart."""
+SMALLEST_VOLUME = 3
+EVEN = 0.05
+"""Share by which gaps differ within what counts as even here."""
+THICKNESS_TOLERANCE = 0.01
+ALTERNATING = ("AcquisitionNumber", "FrameAcquisitionNumber")
+
+
+def values_of(header: SliceHeader, keywords: Sequence[str]) -> tuple[str, ...]:
+    """The values that tell phases apart, empty where there is none."""
+    own = dict(header.phase)
+    return tuple(own.get(keyword, "") for keyword in keywords)
+
+
+def find_mixture(
+    headers: Sequence[SliceHeader],
+) -> tuple[tuple[str, ...], Mapping[tuple[str, ...], Sequence[SliceHeader]]] | None:
+    """Find the element that parts a stack into volumes whose slices lie between each other.
+
+    Parameters
+    ----------
+    headers : sequence of SliceHeader
+        One at each place, in the order of the places.
+
+    Returns
+    -------
+    (keywords, groups) or None
+        The slices by their value of the keyword: each group has at least three slices and all have a value.
+    """
+    for keyword, values in _values_along(headers, (*CERTAIN, *POSSIBLE)):
+        groups = _find_interleaved(values, headers)
+        if groups and (keyword in CERTAIN or not _is_even(headers) and all(map(_is_even, groups.values()))):
+            return (keyword,), groups
+    return None
+
+
+def _values_along(headers: Sequence[SliceHeader], keywords: Sequence[str]) -> Iterator[tuple[str, list[str]]]:
+    """Keywords that are not the same in all slices, and their values."""
+    own = [dict(header.phase) for header in headers]
+    for keyword in keywords:
+        values = [one.get(keyword, "") for one in own]
+        if len(set(values)) > 1:
+            yield keyword, values
+
+
+def _find_interleaved(
+    values: Sequence[str], headers: Sequence[SliceHeader]
+) -> dict[tuple[str, ...], list[SliceHeader]]:
+    """The slices by their values, where these come back after others; empty where they do not."""
+    changes = sum(one != other for one, other in zip(values, values[1:], strict=False))
+    groups: dict[tuple[str, ...], list[SliceHeader]] = defaultdict(list)
+    for value, header in zip(values, headers, strict=True):
+        groups[(value,)].append(header)
+    if changes < len(groups) or ("",) in groups or min(map(len, groups.values())) < SMALLEST_VOLUME:
+        return {}
+    return groups
+
+
+def _is_even(headers: Sequence[SliceHeader]) -> bool:
+    steps = np.linalg.norm(np.diff(np.array([header.position_mm for header in headers]), axis=0), axis=1)
+    return float(np.ptp(steps)) <= EVEN * float(steps.min())
+
+
+def describe_differences(headers: Sequence[SliceHeader]) -> Iterator[tuple[str, Callable[[SliceHeader], bool]]]:
+    """What differs between the slices of a stack that should be alike, and which slices have not the first one's.
+
+    Parameters
+    ----------
+    headers : sequence of SliceHeader
+        In the order of their places.
+
+    Yields
+    ------
+    (text, is_so)
+        Without the values.
+    """
+    first = headers[0]
+    for keyword, values in _values_along(headers, ("KVP", *ALTERNATING)):
+        if keyword == "KVP":
+            text = "KVP differs along the stack: maybe parts of several volumes"
+        elif _find_interleaved(values, headers):
+            text = f"{keyword} alternates along the stack: maybe several volumes between each other"
+        else:
+            continue
+        yield text, lambda h, k=(keyword,): values_of(h, k) != values_of(first, k)  # type: ignore[misc]
+    stated = [thickness for thickness in map(_thickness, headers) if thickness > 0.0]
+    usual = stated[0] if stated else 0.0
+
+    def is_other(header: SliceHeader) -> bool:
+        return _thickness(header) > 0.0 and abs(_thickness(header) - usual) > THICKNESS_TOLERANCE * usual
+
+    if any(map(is_other, headers)):
+        yield "SliceThickness differs along the stack", is_other
+
+
+def _thickness(header: SliceHeader) -> float:
+    return header.slice_thickness_mm or 0.0
