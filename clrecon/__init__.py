@@ -34,11 +34,11 @@ if TYPE_CHECKING:
     from clrecon.mesh.refine.decimation import decimate_mesh
     from clrecon.mesh.refine.smoothing import smooth_mesh
     from clrecon.opencl import Device
-    from clrecon.operators.isosurface import SurfaceExtractor, extract_isosurface, extract_isosurfaces
-    from clrecon.operators.label_masks import extract_label_masks
-    from clrecon.operators.labels import extract_labels
-    from clrecon.operators.reformat import cut_slice, reformat_curve
-    from clrecon.operators.renderer import VolumeRenderer, render
+    from clrecon.operators.rays.render import VolumeRenderer, render
+    from clrecon.operators.reformat.cut import cut_slice, reformat_curve
+    from clrecon.operators.surface.extract import SurfaceExtractor, extract_isosurface, extract_isosurfaces
+    from clrecon.operators.surface.label_masks import extract_label_masks
+    from clrecon.operators.surface.labels import extract_labels
     from clrecon.reading import list_series, read_volume
     from clrecon.rendering import Lighting, Rendering, TransferFunction, load_transfer_function
     from clrecon.rendering.movies.movie import turntable_cameras, write_animation
@@ -105,19 +105,19 @@ _HOMES = {
     "OutputError": "clrecon.errors",
     "RefusedInputError": "clrecon.errors",
     "Rendering": "clrecon.rendering",
-    "SurfaceExtractor": "clrecon.operators.isosurface",
+    "SurfaceExtractor": "clrecon.operators.surface.extract",
     "TransferFunction": "clrecon.rendering",
     "UsageError": "clrecon.errors",
     "Volume": "clrecon.geometry",
-    "VolumeRenderer": "clrecon.operators.renderer",
+    "VolumeRenderer": "clrecon.operators.rays.render",
     "choose_iso_value": "clrecon.anatomy.iso_choice",
     "compare_meshes": "clrecon.mesh.compare.distances",
-    "cut_slice": "clrecon.operators.reformat",
+    "cut_slice": "clrecon.operators.reformat.cut",
     "decimate_mesh": "clrecon.mesh.refine.decimation",
-    "extract_isosurface": "clrecon.operators.isosurface",
-    "extract_isosurfaces": "clrecon.operators.isosurface",
-    "extract_label_masks": "clrecon.operators.label_masks",
-    "extract_labels": "clrecon.operators.labels",
+    "extract_isosurface": "clrecon.operators.surface.extract",
+    "extract_isosurfaces": "clrecon.operators.surface.extract",
+    "extract_label_masks": "clrecon.operators.surface.label_masks",
+    "extract_labels": "clrecon.operators.surface.labels",
     "find_spine_line": "clrecon.anatomy.spine_line",
     "list_series": "clrecon.reading",
     "load_transfer_function": "clrecon.rendering",
@@ -125,9 +125,9 @@ _HOMES = {
     "read_curve_points": "clrecon.rendering.views.centre_line_files",
     "read_labels": "clrecon.labels",
     "read_volume": "clrecon.reading",
-    "reformat_curve": "clrecon.operators.reformat",
+    "reformat_curve": "clrecon.operators.reformat.cut",
     "remove_table": "clrecon.anatomy.body",
-    "render": "clrecon.operators.renderer",
+    "render": "clrecon.operators.rays.render",
     "smooth_mesh": "clrecon.mesh.refine.smoothing",
     "turntable_cameras": "clrecon.rendering.movies.movie",
     "write_animation": "clrecon.rendering.movies.movie",

@@ -1,7 +1,7 @@
 /* Where in its segments the samples of a pixel lie, for rays whose samples must not line up.
  *
  * The mixer is lowbias32 (C. Wellons 2018, "Prospecting for hash functions"), once over y and once over x with that;
- * clrecon/reference/rays.py gives the same bits. */
+ * clrecon/reference/rays/rays.py gives the same bits. */
 #ifndef CLRECON_JITTER_H
 #define CLRECON_JITTER_H
 

@@ -7,7 +7,7 @@
  * by its bit in the case, never by its height.
  *
  * References: Nielson and Hamann 1991 (faces); Chernyaev 1995 (interiors); Grosso 2016 (the waist of a tunnel).
- * Derivation and twin: clrecon/reference/trilinear_table.py and trilinear.py. */
+ * Derivation and twin: clrecon/reference/surface/trilinear_table.py and trilinear.py. */
 #ifndef CLRECON_TRILINEAR_CELL_H
 #define CLRECON_TRILINEAR_CELL_H
 

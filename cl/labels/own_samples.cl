@@ -1,6 +1,6 @@
 /* Which samples are inside of which label: the label says where to look, HU say what is dense.
  *
- * The rules are our own; clrecon/reference/labels.py states them.
+ * The rules are our own; clrecon/reference/surface/labels.py states them.
  *
  * Passes
  *   1. own_samples      per sample the label that it is inside of, or 0

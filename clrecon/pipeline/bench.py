@@ -183,7 +183,7 @@ class _OwnRuns:
     """Surfaces on one device, and what they say of themselves."""
 
     def __init__(self, device: Device, volume: Volume, hu: float):
-        from clrecon.operators.isosurface import extract_isosurface
+        from clrecon.operators.surface.extract import extract_isosurface
 
         self._extract = lambda: extract_isosurface(volume, hu, device, closed=False)
         self.reports: list[dict[str, Any]] = []
@@ -263,7 +263,7 @@ def _time_warm(own: _OwnRuns, volume: Volume, level: float, runs: int) -> tuple[
 
 def _time_resident(device: Device, volume: Volume, hu: float, runs: int) -> dict[str, float] | None:
     """Spread of surfaces at iso values that are new to a volume on the device; None where there is only one."""
-    from clrecon.operators.isosurface import SurfaceExtractor
+    from clrecon.operators.surface.extract import SurfaceExtractor
 
     seconds = []
     with SurfaceExtractor(volume, device) as extractor:

@@ -107,7 +107,7 @@ def check_sphere(device: Device) -> dict[str, Any]:
     import numpy as np
 
     from clrecon.geometry import Volume
-    from clrecon.operators.isosurface import extract_isosurface
+    from clrecon.operators.surface.extract import extract_isosurface
     from clrecon.phantom import PhantomSettings, make_phantom
 
     settings = PhantomSettings(

@@ -42,12 +42,12 @@ class LabelChoice:
     wanted : tuple of str or int
         Numbers or names; empty means all that have a surface.
     grow_mm : float, optional
-        See `clrecon.operators.labels.extract_labels`.
+        See `clrecon.operators.surface.labels.extract_labels`.
     solid : bool
         Fill what is less dense within a label.
     surface : {"hu", "mask"}
-        HU place the vertices (`clrecon.operators.labels.extract_labels`), or each label has its own surface
-        (`clrecon.operators.label_masks.extract_label_masks`).
+        HU place the vertices (`clrecon.operators.surface.labels.extract_labels`), or each label has its own surface
+        (`clrecon.operators.surface.label_masks.extract_label_masks`).
 
     Raises
     ------
@@ -111,10 +111,10 @@ def extract_label_surfaces(
     Raises
     ------
     NoSurfaceError, UsageError, RefusedInputError, DeviceError
-        As `clrecon.operators.labels.extract_labels`.
+        As `clrecon.operators.surface.labels.extract_labels`.
     """
     from clrecon.labels import file_suffixes
-    from clrecon.operators.labels import extract_labels
+    from clrecon.operators.surface.labels import extract_labels
 
     found: list[tuple[Surface, int, Mesh]] = []
     numbers = [labels.find(label) for label in choice.wanted] or labels.numbers
@@ -150,7 +150,7 @@ def _extract_masks(
 ) -> dict[int, Mesh]:
     """Each label's own surface, on the map's own grid; the map must lie on the scan all the same."""
     from clrecon.labels.resample import check_together
-    from clrecon.operators.label_masks import extract_label_masks
+    from clrecon.operators.surface.label_masks import extract_label_masks
 
     shares = check_together(labels, volume)
     meshes = extract_label_masks(

@@ -25,8 +25,8 @@ def _prepare(chosen: Future[Device], prepare: Callable[[Device], None]) -> None:
 
 def prepare_surfaces(device: Device, components: bool, topology: str, inside: str = "above") -> None:
     """Build the kernels that find surfaces of this topology and, where asked for, components."""
-    from clrecon.operators.components import prepare_components
-    from clrecon.operators.isosurface import prepare_isosurface
+    from clrecon.operators.primitives.union_find import prepare_components
+    from clrecon.operators.surface.extract import prepare_isosurface
 
     prepare_isosurface(device, topology=topology, inside=inside)
     if components:

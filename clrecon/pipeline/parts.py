@@ -152,7 +152,7 @@ def extract_surfaces(
     NoSurfaceError
         One of the iso values crosses nothing.
     """
-    from clrecon.operators.isosurface import extract_isosurfaces
+    from clrecon.operators.surface.extract import extract_isosurfaces
 
     levels = [surface.iso_value for surface in surfaces if surface.iso_value is not None]
     return extract_isosurfaces(
@@ -202,7 +202,7 @@ def _select_parts(surface: Surface, mesh: Mesh, settings: MeshSettings, device: 
     from clrecon.geometry import frame_from_lps
     from clrecon.mesh import select_components, split_components
     from clrecon.mesh.connectivity import label_components as find_labels
-    from clrecon.operators.components import label_components
+    from clrecon.operators.primitives.union_find import label_components
 
     limits = (settings.keep_largest, settings.min_volume_ml)
     seeds = [(frame_from_lps(settings.space).T @ seed).tolist() for seed in settings.seeds]

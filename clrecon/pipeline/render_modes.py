@@ -52,7 +52,7 @@ def find_misplaced(mode: str, given: set[str]) -> str | None:
     given : set of str
         Names of settings that differ from what they are without being asked for, and of files of `PictureFiles`.
     """
-    from clrecon.operators.renderer import KNOWN_IN  # numpy: not wanted before a job starts
+    from clrecon.operators.rays.render import KNOWN_IN  # numpy: not wanted before a job starts
 
     for setting in _CHECKED:
         modes = _MODES_OF.get(setting) or KNOWN_IN[_RENDERER_NAMES.get(setting, setting)]

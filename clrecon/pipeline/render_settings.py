@@ -115,9 +115,9 @@ class RenderSettings:
     caption : str, optional
         Drawn into the pictures.
     thickness, combine, offset_mm
-        Of slices, see `clrecon.operators.reformat.cut_slice`.
+        Of slices, see `clrecon.operators.reformat.cut.cut_slice`.
     slices, slice_opacity
-        Of slices in space, see `clrecon.operators.slice_overlay.overlay_slices`.
+        Of slices in space, see `clrecon.operators.rays.slices.overlay_slices`.
     curve : str, optional
         File with the centre line, or "auto": the spinal canal, which mode cpr also takes without one.
     cpr : {"straightened", "stretched"}
@@ -293,7 +293,7 @@ class RenderSettings:
         """HU of the surface, None in other modes."""
         if self.mode_used != "surface":
             return None
-        from clrecon.operators.renderer import DEFAULT_ISO_VALUE
+        from clrecon.operators.rays.render import DEFAULT_ISO_VALUE
 
         return DEFAULT_ISO_VALUE if self.iso_value is None else self.iso_value
 

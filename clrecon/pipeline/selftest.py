@@ -13,14 +13,14 @@ from clrecon.errors import ClreconError, DeviceError
 from clrecon.geometry import Volume
 from clrecon.labels import LabelMap
 from clrecon.opencl import Device, download, upload
-from clrecon.operators.compaction import compact, exclusive_scan
-from clrecon.operators.components import label_components
-from clrecon.operators.isosurface import extract_isosurface
-from clrecon.operators.labels import extract_labels
-from clrecon.reference import compaction as compaction_twin
-from clrecon.reference import components as components_twin
-from clrecon.reference import isosurface as isosurface_twin
-from clrecon.reference import labels as label_twin
+from clrecon.operators.primitives.compaction import compact, exclusive_scan
+from clrecon.operators.primitives.union_find import label_components
+from clrecon.operators.surface.extract import extract_isosurface
+from clrecon.operators.surface.labels import extract_labels
+from clrecon.reference.primitives import compaction as compaction_twin
+from clrecon.reference.primitives import union_find as components_twin
+from clrecon.reference.surface import extract as isosurface_twin
+from clrecon.reference.surface import labels as label_twin
 
 __all__ = ["run_selftest"]
 

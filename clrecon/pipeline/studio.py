@@ -26,7 +26,7 @@ SHARED_OPTIONS = (
     "ray_step", "clip", "jitter", "color", "shadows", "depth_cue", "slices", "slice_opacity", "offset_mm", "thickness",
     "combine", "cpr",
 )  # fmt: skip
-"""Options of `clrecon.operators.renderer.render` that are settings of the same name."""
+"""Options of `clrecon.operators.rays.render.render` that are settings of the same name."""
 
 
 def read_function(named: str | None) -> TransferFunction | None:
@@ -161,7 +161,7 @@ class Studio:
         return self._render(camera=camera, size=self._settings.size_used)
 
     def _render(self, **place: Any) -> Rendering:
-        from clrecon.operators.renderer import KNOWN_IN, VolumeRenderer
+        from clrecon.operators.rays.render import KNOWN_IN, VolumeRenderer
 
         settings = self._settings
         if self._renderer is None:

@@ -28,7 +28,7 @@ def first_own(volume: Any, hu: float, device: str, threads: int) -> dict[str, An
     import pyopencl  # noqa: F401
 
     from clrecon.opencl import choose_device
-    from clrecon.operators.isosurface import extract_isosurface
+    from clrecon.operators.surface.extract import extract_isosurface
 
     start = time.perf_counter()
     chosen = choose_device(device)
@@ -98,7 +98,7 @@ def small_volume(volume: Any) -> Any:
 def memory_own(volume: Any, hu: float, device: str, threads: int) -> dict[str, Any]:
     """Resident memory around one extraction by a process that has done a small one."""
     from clrecon.opencl import choose_device
-    from clrecon.operators.isosurface import extract_isosurface
+    from clrecon.operators.surface.extract import extract_isosurface
 
     chosen = choose_device(device)
     extract_isosurface(small_volume(volume), 50, chosen, closed=False)

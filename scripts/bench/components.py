@@ -26,8 +26,8 @@ def measure_components(job: Job) -> dict[str, Any]:
 
     from clrecon.mesh import connectivity
     from clrecon.opencl import Stopwatch
-    from clrecon.operators.components import label_components
-    from clrecon.operators.isosurface import extract_isosurface
+    from clrecon.operators.primitives.union_find import label_components
+    from clrecon.operators.surface.extract import extract_isosurface
 
     volume = job.input.volume()
     mesh = extract_isosurface(volume, job.hu, job.device)

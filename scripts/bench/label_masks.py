@@ -23,7 +23,7 @@ def measure_label_masks(job: Job) -> dict[str, Any]:
     is near dense voxels.  The peer makes one mesh of all labels; its triangles say which two they lie between.
     """
     from clrecon.labels import LabelMap
-    from clrecon.operators.label_masks import extract_label_masks
+    from clrecon.operators.surface.label_masks import extract_label_masks
 
     figures: dict[str, Any] = {"ratios": {}, "sides": {}, "labels": {}}
     for name, voxels in _make_maps(job).items():

@@ -28,7 +28,7 @@ def measure_labels(job: Job) -> dict[str, Any]:
     from scipy.ndimage import maximum_filter
 
     from clrecon.labels import LabelMap
-    from clrecon.operators.labels import extract_labels
+    from clrecon.operators.surface.labels import extract_labels
 
     volume = job.input.volume()
     nk = volume.voxels.shape[0]

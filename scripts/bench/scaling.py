@@ -87,7 +87,7 @@ def _time_points(job: Job, points: Sequence[tuple[Any, float]]) -> list[dict[str
     An untimed run of the same point comes before each timed one, so that memory of its size is at hand: else every
     point would pay for pages that its neighbours do not need.
     """
-    from clrecon.operators.isosurface import extract_isosurface
+    from clrecon.operators.surface.extract import extract_isosurface
 
     sides: list[tuple[OwnSide, PeerSide, Any, float, list[float], list[float]]] = []
     for volume, hu in points:
@@ -124,7 +124,7 @@ def _fit(found: Sequence[dict[str, Any]], over: str) -> dict[str, dict[str, floa
 def measure_scaling(job: Job) -> dict[str, Any]:
     """The first n slices of the input at the iso value; then iso values over 149 slices at most."""
     from clrecon.geometry import Volume
-    from clrecon.operators.isosurface import prepare_isosurface
+    from clrecon.operators.surface.extract import prepare_isosurface
 
     volume = job.input.volume()
     prepare_isosurface(job.device, volume.voxels.dtype)

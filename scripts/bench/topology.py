@@ -14,7 +14,7 @@ __all__ = ["measure_topology"]
 @case("topology", "surfaces with the topology of the trilinear field, against the default's")
 def measure_topology(job: Job) -> dict[str, Any]:
     """Host volume to host mesh in one process, kernels built; the "peer" is the default, so ratios are below 1."""
-    from clrecon.operators.isosurface import extract_isosurface
+    from clrecon.operators.surface.extract import extract_isosurface
 
     volume = job.input.volume()
     meshes: dict[str, Any] = {}

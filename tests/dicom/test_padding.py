@@ -12,7 +12,7 @@ from dicom_series import Plan, set_values, write_series
 from clrecon.dicom import read_volume
 from clrecon.dicom.pixels.padding import PaddingMasks, pack_mask
 from clrecon.geometry import AIR_HU
-from clrecon.reference.isosurface import extract_isosurface
+from clrecon.reference.surface.extract import extract_isosurface
 
 SHAPE = (6, 40, 40)
 CENTRE, RADIUS = 19.5, 18.0

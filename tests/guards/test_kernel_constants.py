@@ -8,24 +8,24 @@ from importlib import import_module
 import pytest
 from house import PACKAGE, ROOT
 
-from clrecon.operators.label_masks import SAMPLES_PER_FLAGS
-from clrecon.operators.sheets import COMBINATIONS
+from clrecon.operators.reformat.sample import COMBINATIONS
+from clrecon.operators.surface.label_masks import SAMPLES_PER_FLAGS
 
 PAIRS = [
     ("clrecon.labels.occupancy.REACH", "labels/occupancy.h", "REACH"),
-    ("clrecon.operators.bricks.BRICK", "bricks/bricks.h", "BRICK"),
-    ("clrecon.operators.compaction.COMPACT_WORDS", "compaction/compact.cl", "COMPACT_WORDS"),
-    ("clrecon.operators.compaction.SCAN_PER_ITEM", "compaction/scan.cl", "SCAN_PER_ITEM"),
-    ("clrecon.operators.composite.GRADIENT_NODES", "render/composite.cl", "GRADIENT_NODES"),
-    ("clrecon.operators.composite.NODES", "render/steep_segments.h", "NODES"),
-    ("clrecon.operators.pictures.HIGHLIGHTS", "include/phong.h", "HIGHLIGHTS"),
-    ("clrecon.operators.project.AIR_HU", "render/project.cl", "AIR_HU"),
-    ("clrecon.operators.ray_view.BOX_ROW", "include/view.h", "VIEW_BOX_LOW"),
-    ("clrecon.operators.ray_view.TILE", "include/view.h", "TILE"),
-    ("clrecon.operators.resident.BRICK_CELLS", "include/leap.h", "BRICK_CELLS"),
-    ("clrecon.operators.resident.FARTHEST", "include/leap.h", "FARTHEST"),
-    ("clrecon.operators.resident.ROWS_AT_ONCE", "render/occupancy.cl", "ROWS_AT_ONCE"),
-    ("clrecon.operators.slice_overlay.NODES", "render/slices.cl", "BINS"),
+    ("clrecon.operators.resident.bricks.BRICK", "bricks/bricks.h", "BRICK"),
+    ("clrecon.operators.primitives.compaction.COMPACT_WORDS", "compaction/compact.cl", "COMPACT_WORDS"),
+    ("clrecon.operators.primitives.compaction.SCAN_PER_ITEM", "compaction/scan.cl", "SCAN_PER_ITEM"),
+    ("clrecon.operators.rays.composite.GRADIENT_NODES", "render/composite.cl", "GRADIENT_NODES"),
+    ("clrecon.operators.rays.composite.NODES", "render/steep_segments.h", "NODES"),
+    ("clrecon.operators.rays.buffers.HIGHLIGHTS", "include/phong.h", "HIGHLIGHTS"),
+    ("clrecon.operators.rays.project.AIR_HU", "render/project.cl", "AIR_HU"),
+    ("clrecon.operators.rays.ray_view.BOX_ROW", "include/view.h", "VIEW_BOX_LOW"),
+    ("clrecon.operators.rays.ray_view.TILE", "include/view.h", "TILE"),
+    ("clrecon.operators.resident.volume.BRICK_CELLS", "include/leap.h", "BRICK_CELLS"),
+    ("clrecon.operators.resident.volume.FARTHEST", "include/leap.h", "FARTHEST"),
+    ("clrecon.operators.resident.volume.ROWS_AT_ONCE", "render/occupancy.cl", "ROWS_AT_ONCE"),
+    ("clrecon.operators.rays.slices.NODES", "render/slices.cl", "BINS"),
     ("clrecon.rendering.looks.steepness.DENSE", "render/steep_segments.h", "DENSE"),
     ("clrecon.rendering.looks.steepness.PARTS", "render/steep_segments.h", "PARTS"),
     ("clrecon.rendering.looks.steepness.STEEP", "render/steep_segments.h", "STEEP"),
@@ -67,8 +67,8 @@ def test_flags_of_strips_are_words_of_the_kernel() -> None:
 
 def test_every_constant_that_names_a_kernel_file_is_compared() -> None:
     known = {name for name, _, _ in PAIRS} | {
-        "clrecon.operators.sheets.COMBINATIONS",
-        "clrecon.operators.label_masks.SAMPLES_PER_FLAGS",
+        "clrecon.operators.reformat.sample.COMBINATIONS",
+        "clrecon.operators.surface.label_masks.SAMPLES_PER_FLAGS",
     }
     found = {
         f"{'.'.join(path.relative_to(ROOT).with_suffix('').parts)}.{name}"

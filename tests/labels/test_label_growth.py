@@ -12,8 +12,8 @@ from clrecon.errors import UsageError
 from clrecon.geometry import Volume, compose_affine
 from clrecon.labels.growth import Growth
 from clrecon.mesh import Mesh
-from clrecon.reference.isosurface import extract_isosurface
-from clrecon.reference.labels import extract_label, find_solid, own_labels
+from clrecon.reference.surface.extract import extract_isosurface
+from clrecon.reference.surface.labels import extract_label, find_solid, own_labels
 
 CENTER = np.array((0.31, -0.17, 0.23))
 

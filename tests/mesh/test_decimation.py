@@ -16,7 +16,7 @@ from clrecon.mesh.refine.clusters import Clusters
 from clrecon.mesh.refine.decimation import _collapse, _mend, decimate_mesh
 from clrecon.mesh.refine.deviation import Deviation
 from clrecon.mesh.refine.smoothing import smooth_mesh
-from clrecon.reference.isosurface import extract_isosurface
+from clrecon.reference.surface.extract import extract_isosurface
 
 pytestmark = pytest.mark.unit
 

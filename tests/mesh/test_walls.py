@@ -12,7 +12,7 @@ from clrecon.mesh import Mesh
 from clrecon.mesh.compare.walls import Walls, judge_components, judge_walls, looks_like_bone, normals_of, sample_walls
 from clrecon.mesh.connectivity import label_components
 from clrecon.phantom import KINDS, PhantomSettings, make_phantom
-from clrecon.reference.isosurface import extract_isosurface
+from clrecon.reference.surface.extract import extract_isosurface
 
 AFFINE = np.diag((1.0, 1.0, 1.5, 1.0))
 SHAPE = (24, 40, 48)

@@ -92,7 +92,7 @@ def test_the_next_process_takes_the_binary(device, monkeypatch):
 
 def test_binaries_compute_what_sources_do(device, monkeypatch):
     from clrecon.opencl import upload
-    from clrecon.operators.compaction import compact
+    from clrecon.operators.primitives.compaction import compact
 
     mask = np.random.default_rng(0).integers(0, 2**32, 1000, dtype=np.uint32)
     for _ in range(2):

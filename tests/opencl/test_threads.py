@@ -8,7 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 
 from clrecon.geometry import Volume
-from clrecon.operators.isosurface import extract_isosurface
+from clrecon.operators.surface.extract import extract_isosurface
 
 
 def test_threads_do_not_mix_their_arguments(device):

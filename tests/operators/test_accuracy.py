@@ -7,8 +7,8 @@ import pytest
 import tolerances
 
 from clrecon.geometry import Volume, compose_affine
-from clrecon.operators.isosurface import extract_isosurface
-from clrecon.reference import isosurface as twin
+from clrecon.operators.surface.extract import extract_isosurface
+from clrecon.reference.surface import extract as twin
 
 
 def rotation(*degrees: float) -> np.ndarray:

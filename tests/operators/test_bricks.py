@@ -9,9 +9,9 @@ from variants import VOXEL_TYPES
 
 from clrecon.geometry import Volume
 from clrecon.opencl import download, upload
-from clrecon.operators.bricks import compare_bricks, measure_bricks
-from clrecon.operators.isosurface import SurfaceExtractor, extract_isosurface
-from clrecon.reference import bricks as twin
+from clrecon.operators.resident.bricks import compare_bricks, measure_bricks
+from clrecon.operators.surface.extract import SurfaceExtractor, extract_isosurface
+from clrecon.reference.resident import bricks as twin
 
 SHAPES = [(1, 1, 1), (3, 9, 7), (8, 8, 8), (9, 7, 8), (17, 16, 33), (8, 9, 100)]
 

@@ -8,8 +8,8 @@ import pytest
 from clrecon.errors import UsageError
 from clrecon.opencl import download, upload
 from clrecon.opencl.context import GROUP_SIZE
-from clrecon.operators.compaction import SCAN_PER_ITEM, compact, exclusive_scan
-from clrecon.reference import compaction as twin
+from clrecon.operators.primitives.compaction import SCAN_PER_ITEM, compact, exclusive_scan
+from clrecon.reference.primitives import compaction as twin
 
 BLOCK = GROUP_SIZE * SCAN_PER_ITEM
 BORDERS = (SCAN_PER_ITEM, GROUP_SIZE, BLOCK, BLOCK * GROUP_SIZE)

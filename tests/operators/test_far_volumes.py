@@ -13,9 +13,9 @@ from clrecon.geometry import Volume
 from clrecon.geometry.precision import FAR_MM, find_vertex_origin, float32_step
 from clrecon.labels import LabelMap
 from clrecon.mesh import Mesh
-from clrecon.operators.isosurface import extract_isosurface
-from clrecon.operators.labels import extract_labels
-from clrecon.reference import isosurface as twin
+from clrecon.operators.surface.extract import extract_isosurface
+from clrecon.operators.surface.labels import extract_labels
+from clrecon.reference.surface import extract as twin
 
 OBLIQUE = np.array([[0.5, 0.05, 0.1, -12.0], [-0.05, 0.7, 0.3, -14.0], [0.0, 0.1, 1.25, -19.0], [0, 0, 0, 1.0]])
 FAR = np.array([1e5, -1e5, 5e4])

@@ -11,10 +11,11 @@ from variants import VOXEL_TYPES
 
 from clrecon.errors import DeviceError, NoSurfaceError, UsageError
 from clrecon.geometry import Volume, compose_affine, field
-from clrecon.operators import isosurface, marching_cubes
-from clrecon.operators.isosurface import SurfaceExtractor, extract_isosurface, extract_isosurfaces
+from clrecon.operators.surface import extract as isosurface
+from clrecon.operators.surface import marching_cubes
+from clrecon.operators.surface.extract import SurfaceExtractor, extract_isosurface, extract_isosurfaces
 from clrecon.pipeline.selftest import run_selftest
-from clrecon.reference import isosurface as twin
+from clrecon.reference.surface import extract as twin
 
 
 @pytest.mark.parametrize("closed", [True, False])

@@ -9,9 +9,9 @@ import clrecon
 from clrecon.errors import DeviceError, DeviceMemoryError, UsageError
 from clrecon.geometry import Volume
 from clrecon.mesh import connectivity
-from clrecon.operators import components
-from clrecon.operators.components import label_components
-from clrecon.reference import components as twin
+from clrecon.operators.primitives import union_find as components
+from clrecon.operators.primitives.union_find import label_components
+from clrecon.reference.primitives import union_find as twin
 
 AFFINE = np.diag((0.5, 0.7, 2.5, 1.0))
 

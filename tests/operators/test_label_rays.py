@@ -9,8 +9,8 @@ from ray_scenes import STEPS, centre_of, look, make_volume, positions, premultip
 
 from clrecon.geometry import Volume
 from clrecon.labels import LabelMap
-from clrecon.operators.resident import ResidentVolume
-from clrecon.operators.surface_rays import cast_surface
+from clrecon.operators.rays.surface import cast_surface
+from clrecon.operators.resident.volume import ResidentVolume
 from clrecon.rendering import Lighting, Rendering
 from clrecon.rendering.looks.label_style import LabelStyle
 from clrecon.rendering.views.camera import Camera

@@ -10,9 +10,9 @@ from scipy import ndimage
 
 from clrecon.geometry import Volume
 from clrecon.opencl import Stopwatch, download, upload
-from clrecon.operators import composite
-from clrecon.operators.composite import MainWay
-from clrecon.operators.resident import FARTHEST, LeapMap, ResidentVolume
+from clrecon.operators.rays import composite
+from clrecon.operators.rays.composite import MainWay
+from clrecon.operators.resident.volume import FARTHEST, LeapMap, ResidentVolume
 from clrecon.rendering.views.camera import Camera
 
 

@@ -60,7 +60,7 @@ REFUSED = {
 
 @pytest.mark.parametrize("name", REFUSED)
 def test_what_cannot_be_is_refused_in_one_line(device, name):
-    from clrecon.operators.renderer import render
+    from clrecon.operators.rays.render import render
 
     settings, words = REFUSED[name]
     volume = even_volume(blobs, "even", 8.0, np.int16)
@@ -73,7 +73,7 @@ def test_what_cannot_be_is_refused_in_one_line(device, name):
 
 @pytest.mark.parametrize("what", [None, np.zeros((4, 4, 4)), "folder"])
 def test_what_is_no_volume_is_refused(device, what):
-    from clrecon.operators.renderer import render
+    from clrecon.operators.rays.render import render
 
     with pytest.raises(UsageError, match="[Vv]olume"):
         render(what, size=(8, 8), device=device)
@@ -81,7 +81,7 @@ def test_what_is_no_volume_is_refused(device, what):
 
 def test_voxels_that_are_no_numbers_are_refused_or_not_seen(device):
     """NaN must neither end in a driver nor spread over pixels whose rays do not meet it."""
-    from clrecon.operators.renderer import render
+    from clrecon.operators.rays.render import render
 
     volume = even_volume(lambda p: np.zeros(len(p)), "even", 12.0)
     voxels = volume.voxels.copy()

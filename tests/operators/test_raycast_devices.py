@@ -26,7 +26,7 @@ from variants import all_but
 
 from clrecon.geometry import Volume
 from clrecon.opencl.sources import read_kernel_source
-from clrecon.reference.rays import hash_pixels, jitter_pixels
+from clrecon.reference.rays.rays import hash_pixels, jitter_pixels
 from clrecon.rendering import UNSHADED, Lighting, TransferFunction
 from clrecon.rendering.views.camera import Camera
 from clrecon.rendering.views.clip import Clip

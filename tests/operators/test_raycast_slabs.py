@@ -16,7 +16,7 @@ from raycast_scenes import (
 )
 from soft_function import SOFT
 
-from clrecon.reference.raycast import MODES
+from clrecon.reference.rays.render import MODES
 from clrecon.rendering import Lighting
 
 pytestmark = pytest.mark.skipif(not DEVICE_RENDERS, reason="the raycaster of devices is not there")

@@ -12,9 +12,9 @@ from variants import VOXEL_TYPES
 from clrecon.errors import DeviceError, UsageError
 from clrecon.geometry import Volume
 from clrecon.opencl import kernel_files, upload
-from clrecon.operators.reformat import cut_slice, reformat_curve
-from clrecon.operators.sheets import prepare_reformat, sample_sheet
-from clrecon.reference.reformat import reformat_sheet
+from clrecon.operators.reformat.cut import cut_slice, reformat_curve
+from clrecon.operators.reformat.sample import prepare_reformat, sample_sheet
+from clrecon.reference.reformat.cut import reformat_sheet
 from clrecon.rendering.views.camera import Camera
 from clrecon.rendering.views.plane import find_plane, plane_sheet, slab_samples
 

@@ -12,7 +12,7 @@ import clrecon
 from clrecon.errors import DeviceError, UsageError
 from clrecon.geometry import Volume
 from clrecon.opencl import launching
-from clrecon.operators.resident import entry_slice
+from clrecon.operators.resident.volume import entry_slice
 from clrecon.rendering import TransferFunction
 from clrecon.rendering.views.camera import Camera
 from clrecon.rendering.views.clip import Clip

@@ -12,9 +12,10 @@ from surface_volumes import MIRRORED, OBLIQUE, random_volume, smooth_volume
 from clrecon.errors import DeviceError, DeviceMemoryError, UsageError
 from clrecon.geometry import Volume
 from clrecon.geometry.iso_rule import choose_iso_rule
-from clrecon.operators import isosurface, marching_cubes
-from clrecon.operators.isosurface import SurfaceExtractor, extract_isosurface
-from clrecon.operators.slabs import SampleGrid, Slab, plan_slabs
+from clrecon.operators.resident.slabs import SampleGrid, Slab, plan_slabs
+from clrecon.operators.surface import extract as isosurface
+from clrecon.operators.surface import marching_cubes
+from clrecon.operators.surface.extract import SurfaceExtractor, extract_isosurface
 
 
 @pytest.mark.parametrize("closed", [True, False])

@@ -9,8 +9,8 @@ from ray_scenes import GRIDS, blobs, centre_of, look, make_volume, premultiplied
 
 from clrecon.errors import DeviceError, UsageError
 from clrecon.geometry import Volume
-from clrecon.operators.slice_overlay import choose_slices, overlay_slices
-from clrecon.reference.slice_overlay import overlay_slices as overlay_twin
+from clrecon.operators.rays.slices import choose_slices, overlay_slices
+from clrecon.reference.rays.slices import overlay_slices as overlay_twin
 from clrecon.rendering import TransferFunction
 from clrecon.rendering.views.camera import Camera
 from clrecon.rendering.views.clip import Clip

@@ -10,10 +10,10 @@ from variants import all_but
 
 from clrecon.errors import DeviceError, UsageError
 from clrecon.geometry import Volume
-from clrecon.operators.isosurface import extract_isosurface
-from clrecon.operators.resident import ResidentVolume
-from clrecon.operators.surface_rays import cast_surface
-from clrecon.reference.surface_rays import cast_surface as cast_twin
+from clrecon.operators.rays.surface import cast_surface
+from clrecon.operators.resident.volume import ResidentVolume
+from clrecon.operators.surface.extract import extract_isosurface
+from clrecon.reference.rays.surface import cast_surface as cast_twin
 from clrecon.rendering import Lighting, Rendering
 from clrecon.rendering.views.camera import Camera
 from clrecon.rendering.views.clip import Clip

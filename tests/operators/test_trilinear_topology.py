@@ -11,9 +11,9 @@ from variants import VOXEL_TYPES
 from clrecon.errors import UsageError
 from clrecon.geometry import Volume, compose_affine
 from clrecon.geometry.iso_rule import choose_iso_rule
-from clrecon.operators.isosurface import SurfaceExtractor, extract_isosurface
-from clrecon.reference import isosurface as twin
-from clrecon.reference.trilinear_table import find_states
+from clrecon.operators.surface.extract import SurfaceExtractor, extract_isosurface
+from clrecon.reference.surface import extract as twin
+from clrecon.reference.surface.trilinear_table import find_states
 
 
 def extract(volume, iso_value, device, **options):

@@ -123,7 +123,7 @@ class FakeExtractor:
 
 
 def test_no_iso_value_of_a_resident_volume_comes_twice(monkeypatch: pytest.MonkeyPatch) -> None:
-    from clrecon.operators import isosurface
+    from clrecon.operators.surface import extract as isosurface
 
     monkeypatch.setattr(isosurface, "SurfaceExtractor", FakeExtractor)
     nothing: Any = None

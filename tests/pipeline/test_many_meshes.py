@@ -146,7 +146,7 @@ def test_components_that_do_not_fit_the_device_are_found_all_the_same(
     def refuse(*_: Any, **__: Any) -> Any:
         raise DeviceMemoryError("the components of the mesh cannot be found: too large")
 
-    monkeypatch.setattr("clrecon.operators.components.label_components", refuse)
+    monkeypatch.setattr("clrecon.operators.primitives.union_find.label_components", refuse)
     report = run(tmp_path, device, iso_value=200.0, split=True)
     assert report["meshes"] == on_device["meshes"]
     assert report["warnings"][1:] == [

@@ -11,7 +11,7 @@ from scipy import ndimage
 
 from clrecon.anatomy.body import remove_table
 from clrecon.geometry import Volume
-from clrecon.operators.renderer import VolumeRenderer
+from clrecon.operators.rays.render import VolumeRenderer
 from clrecon.pipeline.render_report import find_emptiness
 from clrecon.rendering import PRESETS, Rendering
 

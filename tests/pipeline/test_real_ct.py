@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 
 from clrecon.dicom import read_volume
 from clrecon.geometry import AIR_HU, Volume
-from clrecon.operators.isosurface import extract_isosurface
+from clrecon.operators.surface.extract import extract_isosurface
 from clrecon.pipeline.mesh import make_mesh
 from clrecon.pipeline.settings import MeshSettings
 

@@ -12,7 +12,7 @@ from clrecon.mesh.connectivity import label_components
 from clrecon.pipeline.bone import find_bone, warn_of_walls
 from clrecon.pipeline.parts import Part, Surface
 from clrecon.pipeline.settings import MeshSettings
-from clrecon.reference.isosurface import extract_isosurface
+from clrecon.reference.surface.extract import extract_isosurface
 
 
 @pytest.mark.parametrize("without_table", [False, True])

@@ -8,7 +8,7 @@ from itertools import product
 import numpy as np
 import pytest
 
-from clrecon.reference.case_table import CORNERS, EDGES, MAX_TRIANGLES, case_loops, case_table, pack_case_table
+from clrecon.reference.surface.case_table import CORNERS, EDGES, MAX_TRIANGLES, case_loops, case_table, pack_case_table
 
 FACES = [frozenset(c for c in range(8) if CORNERS[c][axis] == side) for axis in range(3) for side in (0, 1)]
 MIDDLES = np.array([(np.array(CORNERS[low]) + CORNERS[high]) / 2 for _, low, high in EDGES])

@@ -11,8 +11,8 @@ from scipy.ndimage import map_coordinates
 from clrecon.errors import UsageError
 from clrecon.geometry import Volume
 from clrecon.geometry.iso_rule import slice_normal_matrices
-from clrecon.reference.raycast import TABLE_NODES, cast_rays, look_up, shade
-from clrecon.reference.rays import box_of, find_interval, hash_pixels, jitter_pixels, sample_field, voxel_gradients
+from clrecon.reference.rays.rays import box_of, find_interval, hash_pixels, jitter_pixels, sample_field, voxel_gradients
+from clrecon.reference.rays.render import TABLE_NODES, cast_rays, look_up, shade
 from clrecon.rendering import Lighting, TransferFunction
 from clrecon.rendering.views.camera import Camera
 from clrecon.rendering.views.clip import Clip

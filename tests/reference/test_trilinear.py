@@ -15,10 +15,10 @@ from trilinear_truth import find_topology
 from clrecon.geometry import Volume
 from clrecon.geometry.iso_rule import choose_iso_rule
 from clrecon.mesh import Mesh
-from clrecon.reference.case_table import CORNERS, EDGES, FACES, find_ambiguous_faces
-from clrecon.reference.isosurface import extract_isosurface
-from clrecon.reference.trilinear import decide_faces, find_row, place_cell_vertices, scale_heights
-from clrecon.reference.trilinear_table import CELL_VERTEX, cell_state, find_regions, find_states
+from clrecon.reference.surface.case_table import CORNERS, EDGES, FACES, find_ambiguous_faces
+from clrecon.reference.surface.extract import extract_isosurface
+from clrecon.reference.surface.trilinear import decide_faces, find_row, place_cell_vertices, scale_heights
+from clrecon.reference.surface.trilinear_table import CELL_VERTEX, cell_state, find_regions, find_states
 
 MARGIN = np.full(3, 1e-4)
 MOST_DRAWINGS = 2000

@@ -6,7 +6,7 @@ from collections import Counter
 
 import pytest
 
-from clrecon.reference.case_table import (
+from clrecon.reference.surface.case_table import (
     CORNERS,
     EDGES,
     FACES,
@@ -15,7 +15,7 @@ from clrecon.reference.case_table import (
     case_table,
     find_ambiguous_faces,
 )
-from clrecon.reference.trilinear_table import (
+from clrecon.reference.surface.trilinear_table import (
     CELL_VERTEX,
     MAX_TRILINEAR_TRIANGLES,
     cell_state,

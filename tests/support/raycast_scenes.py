@@ -13,15 +13,15 @@ import pytest
 from dicom_series import rotation
 
 from clrecon.geometry import Volume
-from clrecon.reference.raycast import cast_rays
-from clrecon.reference.surface_rays import cast_surface
+from clrecon.reference.rays.render import cast_rays
+from clrecon.reference.rays.surface import cast_surface
 from clrecon.rendering import UNSHADED, Lighting, TransferFunction
 from clrecon.rendering.views.camera import Camera
 
 TURN = rotation((15.0, -25.0, 40.0))
 PLACE = np.array([40.0, -90.0, -600.0])
 DEVICE_FILES = {"dvr": "composite.cl", "surface": "surface.cl"}
-DEVICE_RENDERS = importlib.util.find_spec("clrecon.operators.renderer") is not None
+DEVICE_RENDERS = importlib.util.find_spec("clrecon.operators.rays.render") is not None
 
 STEPS = {
     "even": np.diag([0.9, 0.9, 0.9]),
@@ -193,7 +193,7 @@ class DeviceCaster:
         lighting: Lighting = UNSHADED,
         **settings: Any,
     ) -> Shot:
-        from clrecon.operators.renderer import render
+        from clrecon.operators.rays.render import render
 
         if mode == "dvr":
             settings |= {"transfer_function": transfer_function, "lighting": lighting}

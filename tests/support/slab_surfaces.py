@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from clrecon.geometry.iso_rule import choose_iso_rule
-from clrecon.operators.isosurface import SurfaceExtractor
+from clrecon.operators.surface.extract import SurfaceExtractor
 
 
 def extract_in_slabs(volume, iso_value, device, slices, closed=True):

@@ -1,0 +1,1 @@
+"""Scans, compaction and union-find: what other operators are made of."""

@@ -1,0 +1,213 @@
+"""Connected components of a triangle mesh: the host side of cl/components/union_find.cl."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from clrecon.errors import DeviceError, DeviceMemoryError, UsageError
+from clrecon.opencl import (
+    Device,
+    Program,
+    Stopwatch,
+    allocate,
+    describe_shortage,
+    download,
+    launch,
+    load_program,
+    memory_limits,
+    upload,
+)
+from clrecon.operators.primitives.compaction import LARGEST_SCAN, Compacted, compact, exclusive_scan, prepare_scan
+
+__all__ = ["label_components", "prepare_components"]
+
+LARGEST_MESH = 2**32 - 1
+"""Triangles that 32 bits can count."""
+
+MOST_PASSES = 1000
+"""Far more than 2^31 vertices can need: 62 rounds of at most 11 passes each."""
+
+
+def prepare_components(device: Device) -> Program:
+    """Build the kernels, so that a later `label_components` need not wait for them.
+
+    Raises
+    ------
+    DeviceError
+        The driver's compiler refuses.
+    """
+    prepare_scan(device)
+    load_program(device, "compaction/compact.cl")
+    return load_program(device, "components/union_find.cl")
+
+
+def label_components(
+    device: Device,
+    triangles: ArrayLike,
+    vertex_count: int,
+    *,
+    memory: int | None = None,
+    stopwatch: Stopwatch | None = None,
+) -> tuple[int, NDArray[np.int64]]:
+    """Number the components of a mesh: triangles that share a vertex belong to one.
+
+    Parameters
+    ----------
+    device : Device
+    triangles : array_like, shape (m, 3), uint32
+        Indices of vertices.
+    vertex_count : int
+    memory : int, optional
+        Bytes that may be taken on the device; None is all of its memory.
+    stopwatch : Stopwatch, optional
+        Where the time of the kernels goes.
+
+    Returns
+    -------
+    count : int
+        Number of components; vertices that no triangle uses are none.
+    labels : ndarray, shape (vertex_count,), int64
+        Component of each vertex, numbered in order of the first vertex; -1 for unused vertices.  The same on every
+        device, and what `clrecon.mesh.connectivity.label_components` returns.
+
+    Raises
+    ------
+    UsageError
+        A triangle refers to a vertex that is not there, or there are more than 2^31 vertices or 2^32 - 1 triangles.
+    DeviceMemoryError
+        The device has no room for the mesh and its labels.
+    DeviceError
+        The device fails or computes wrongly.
+    """
+    faces = np.ascontiguousarray(triangles, dtype=np.uint32).reshape(-1, 3)
+    _check_mesh(faces, vertex_count)
+    if len(faces) == 0:
+        return 0, np.full(vertex_count, -1, dtype=np.int64)
+    search = _Search(device, faces, vertex_count, memory, stopwatch)
+    labels_d, spare_d = search.find_roots()
+    search.run("flag_roots", vertex_count, labels_d, spare_d)
+    roots = exclusive_scan(device, spare_d, vertex_count, stopwatch=stopwatch)
+    numbers_d = allocate(device, 4 * vertex_count)
+    search.run("number_components", vertex_count, labels_d, roots.offsets_d, numbers_d)
+    numbers = download(device, np.empty(vertex_count, dtype=np.int32), numbers_d)
+    return roots.total, numbers.astype(np.int64)
+
+
+def _check_mesh(triangles: NDArray[np.uint32], vertex_count: int) -> None:
+    if not 0 <= vertex_count <= LARGEST_SCAN or len(triangles) > LARGEST_MESH:
+        raise UsageError(
+            f"a mesh of {vertex_count:,} vertices and {len(triangles):,} triangles:"
+            f" components are found in up to {LARGEST_SCAN:,} and {LARGEST_MESH:,}"
+        )
+    if triangles.size and int(triangles.max()) >= vertex_count:
+        raise UsageError(f"a triangle refers to vertex {int(triangles.max())}, the mesh has {vertex_count} vertices")
+
+
+class _Search:
+    """The rounds of cl/components/union_find.cl: two buffers of labels, one read and one written, and flags."""
+
+    def __init__(
+        self,
+        device: Device,
+        triangles: NDArray[np.uint32],
+        vertex_count: int,
+        memory: int | None,
+        stopwatch: Stopwatch | None,
+    ):
+        self._device, self._stopwatch = device, stopwatch
+        self._limits = memory_limits(device, memory)
+        self._faces, self._vertices = len(triangles), vertex_count
+        labels = 4 * vertex_count
+        self._buffers = {"triangles": triangles.nbytes, "labels": labels, "labels of the round before": labels}
+        self._check_budget({"mixed triangles": 4 * self._faces, "roots of the first round": labels})
+        self._check_budget({"component offsets": labels, "component numbers": labels})
+        self._program = prepare_components(device)
+        self._faces_d = upload(device, triangles)
+        self._labels_d, self._other_d, self._flags_d = (allocate(device, size) for size in (labels, labels, 8))
+        self._passes = 0
+
+    def _check_budget(self, more: dict[str, int]) -> None:
+        shortage = describe_shortage(self._limits, {**self._buffers, **more})
+        if shortage:
+            raise DeviceMemoryError(f"the components of the mesh cannot be found: {shortage}")
+
+    def run(self, kernel: str, items: int, *arguments: Any) -> None:
+        """Launch a kernel over as many items as its argument after the buffers says."""
+        launch(self._device, self._program[kernel], items, *arguments, np.uint32(items), stopwatch=self._stopwatch)
+
+    def find_roots(self) -> tuple[Any, Any]:
+        """Go through all rounds.
+
+        Returns
+        -------
+        labels_d, spare_d : buffer, (n,) uint32
+            Labels whose labels are roots, and a buffer that is free.
+        """
+        self.run("clear_labels", self._vertices, self._other_d, self._flags_d)
+        self.run("hook_corners", self._faces, self._faces_d, self._other_d)
+        self._jump("jump_labels", self._vertices)
+        labels_d, spare_d = self._labels_d, self._other_d
+        mixed = self._list("mark_mixed", self._faces, self._faces_d, labels_d)
+        if mixed.count:
+            roots = self._join_roots(mixed)
+            if self._labels_d is not labels_d:
+                self.run("copy_roots", roots.count, roots.positions_d, self._labels_d, labels_d)
+        return labels_d, spare_d
+
+    def _join_roots(self, mixed: Compacted) -> Compacted:
+        """All rounds after the first, on the roots that it left; returns these.  No other label changes any more."""
+        self._check_budget({"roots of mixed triangles": 16 * mixed.count})
+        roots = self._list("mark_roots", self._vertices, self._labels_d)
+        corners_d = allocate(self._device, 12 * mixed.count)
+        self.run("gather_roots", mixed.count, self._faces_d, mixed.positions_d, self._labels_d, corners_d)
+        # Roots are their own label in both buffers, and other labels lead to the same root, if not in one step.
+        while self._hook(corners_d, mixed.count):
+            self._jump("jump_roots", roots.count, roots.positions_d)
+        return roots
+
+    def _hook(self, corners_d: Any, count: int) -> bool:
+        """Hook roots to others; says whether there were any."""
+        number = self._next_pass()
+        launch(
+            self._device, self._program["hook_roots"], count,
+            corners_d, self._labels_d, self._other_d, self._flags_d, np.uint32(count), number,
+            stopwatch=self._stopwatch,
+        )  # fmt: skip
+        return bool(self._read_flags()[1] == number)
+
+    def _jump(self, kernel: str, items: int, *listed_d: Any) -> None:
+        """Passes of jumps, from `_other_d` to `_labels_d` and back, until all labels in `_labels_d` are roots."""
+        while True:
+            number = self._next_pass()
+            launch(
+                self._device, self._program[kernel], items,
+                *listed_d, self._other_d, self._labels_d, self._flags_d, np.uint32(items), number,
+                stopwatch=self._stopwatch,
+            )  # fmt: skip
+            if self._read_flags()[0] != number:
+                return
+            self._labels_d, self._other_d = self._other_d, self._labels_d
+
+    def _next_pass(self) -> np.uint32:
+        self._passes += 1
+        if self._passes > MOST_PASSES:
+            raise DeviceError(
+                f"{self._device.label} has not found the components after {MOST_PASSES} passes: it computes wrongly,"
+                " see `clrecon selftest` and try another device"
+            )
+        return np.uint32(self._passes)
+
+    def _read_flags(self) -> NDArray[np.uint32]:
+        return download(self._device, np.empty(2, dtype=np.uint32), self._flags_d)
+
+    def _list(self, kernel: str, size: int, *inputs_d: Any) -> Compacted:
+        """The elements that a kernel marks in a bit mask of `size` bits."""
+        words = -(-size // 32)
+        mask_d = allocate(self._device, 4 * words)
+        launch(
+            self._device, self._program[kernel], words, *inputs_d, mask_d, np.uint32(size), stopwatch=self._stopwatch
+        )
+        return compact(self._device, mask_d, words, stopwatch=self._stopwatch)

@@ -1,0 +1,1 @@
+"""Pictures along rays: volume rendering, projections, surfaces, slices in space."""

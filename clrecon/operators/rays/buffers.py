@@ -1,0 +1,83 @@
+"""Pictures on a device: their buffers, and what every ray caster is launched with."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clrecon.opencl import Device, allocate, download, empty_output
+from clrecon.operators.rays.ray_view import TILE
+from clrecon.rendering import Lighting
+from clrecon.rendering.looks.colors import find_color
+
+__all__ = ["HIGHLIGHTS", "PictureBuffers", "count_queues", "highlight_table"]
+
+HIGHLIGHTS = 1024
+"""Entries of the table of highlights, as in cl/include/phong.h."""
+
+
+def highlight_table(lighting: Lighting) -> NDArray[np.float32]:
+    """Specular light (HIGHLIGHTS,), float32, at cosines evenly from 0 to 1."""
+    return (lighting.specular * np.linspace(0.0, 1.0, HIGHLIGHTS) ** lighting.specular_power).astype(np.float32)
+
+
+def count_queues(device: Device) -> int:
+    """Parts that a driver cuts a launch into; neighbouring tiles go to different ones: all have as much work."""
+    return max(1, device.compute_units) if device.type == "cpu" else 1
+
+
+class PictureBuffers:
+    """The picture that kernels write, slab by slab.
+
+    Attributes
+    ----------
+    image_d : buffer, (h, w, 4) uint8
+    depths_d, means_d : buffer, (h, w) float32
+        First hit and expected depth, or a value in place of the latter.
+    states_d : buffer, (h, w, 8) float32
+        What a slab leaves to the next; one entry where there is only one.
+    background : ndarray, shape (4,), float32
+        Red, green, blue, and 1, or 0 for none.
+    """
+
+    def __init__(
+        self, device: Device, size: tuple[int, int], background: str | Sequence[float] | None, several_slabs: bool
+    ):
+        width, height = size
+        self.device = device
+        self.size = size
+        self.image, self.image_d = empty_output(device, (height, width, 4), np.uint8)
+        self.depths, self.depths_d = empty_output(device, (height, width), np.float32)
+        self.means, self.means_d = empty_output(device, (height, width), np.float32)
+        self.states_d: Any = allocate(device, 32 * width * height if several_slabs else 32)
+        self.background = np.zeros(4, np.float32)
+        if background is not None:
+            self.background[:] = *find_color(background), 1.0
+
+    @staticmethod
+    def needs(size: tuple[int, int]) -> tuple[dict[str, int], dict[str, int]]:
+        """Bytes of a picture on the device, and of what comes with more than one slab."""
+        pixels = size[0] * size[1]
+        return {"picture": 12 * pixels}, {"states of the rays": 32 * pixels}
+
+    def items(self, queues: int, lanes: int) -> int:
+        """Work-items of a launch, each with `lanes` pixels."""
+        return -(-self.tiles // queues) * queues * (TILE * TILE // lanes)
+
+    @property
+    def tiles(self) -> int:
+        """Tiles of the picture."""
+        width, height = self.size
+        return -(-width // TILE) * -(-height // TILE)
+
+    def download(self) -> tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.float32]]:
+        """Wait, and return image, depths and means."""
+        device = self.device
+        return (
+            download(device, self.image, self.image_d),
+            download(device, self.depths, self.depths_d),
+            download(device, self.means, self.means_d),
+        )

@@ -1,0 +1,261 @@
+"""Volume rendering through a transfer function: the host's side of cl/render/composite.cl."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clrecon.geometry.iso_rule import takes_parts
+from clrecon.labels.resample import ResampledLabels
+from clrecon.opencl import (
+    Device,
+    Stopwatch,
+    allocate,
+    launch,
+    upload,
+)
+from clrecon.operators.rays.buffers import PictureBuffers, count_queues, highlight_table
+from clrecon.operators.rays.ray_view import RayView
+from clrecon.operators.resident.frame import FieldFrame
+from clrecon.operators.resident.volume import FARTHEST, LeapMap, RaySlab, ResidentVolume, pad_slices
+from clrecon.operators.resident.voxel_types import label_variants
+from clrecon.rendering import Lighting, TransferFunction
+from clrecon.rendering.looks.label_style import LabelStyle
+from clrecon.rendering.looks.steepness import PARTS, Steepness
+from clrecon.rendering.views.camera import Camera
+
+__all__ = ["NODES", "TransferTables", "composite_slab"]
+
+NODES = 4096
+"""Entries of a transfer function's table, as in cl/render/steep_segments.h."""
+
+GRADIENT_NODES = 256
+"""Entries of its table of factors by magnitude of the gradient."""
+
+LEAST_DRIFT = 0.02
+"""Bricks aside for each brick ahead that rays drift: with less they stay in a row of bricks for long."""
+
+LOWEST_LOG = -1000.0
+"""log2 of what an opaque sample lets through: 0 in float32, and no infinity that a length of 0 would make NaN."""
+
+
+@dataclass(frozen=True)
+class TransferTables:
+    """A transfer function for one ray step.
+
+    Attributes
+    ----------
+    colors_d : buffer, (NODES,) int32
+        Red, green and blue, 10 bits each.
+    opacities_d : buffer, (NODES,) float32
+        Over one ray step.
+    clears_d : buffer, (NODES,) float32
+        What one of `PARTS` parts of it lets through.
+    changes_d : buffer, (NODES,) float32
+        How much the opacity over one ray step changes up to each node, up or down.
+    shown : ndarray, shape (NODES,), bool
+    steepness : Steepness
+        Of `opacities_d`.
+    low, scale : float
+        Nearest node to v: ``floor((v - low) * scale + 0.5)``.
+    factors_d : buffer, (GRADIENT_NODES,) float32
+        On the opacity, by magnitude of the gradient times `factor_scale`; counts where it is `weighed`.
+    steps_per_unit : float
+        Ray steps in the unit distance.
+    """
+
+    colors_d: Any
+    opacities_d: Any
+    clears_d: Any
+    changes_d: Any
+    factors_d: Any
+    shown: NDArray[np.bool_]
+    low: float
+    scale: float
+    steepness: Steepness
+    factor_scale: float
+    steps_per_unit: float
+    weighed: bool
+
+    @property
+    def shown_ends(self) -> tuple[np.int32, np.int32]:
+        """First and last node with opacity; (NODES, -1) without one."""
+        shown = np.flatnonzero(self.shown)
+        return (np.int32(shown[0]), np.int32(shown[-1])) if len(shown) else (np.int32(NODES), np.int32(-1))
+
+    @property
+    def is_one_sided(self) -> bool:
+        """True where all nodes that show something are the first ones, or the last ones."""
+        return int(np.count_nonzero(np.diff(self.shown.astype(np.int8)))) <= 1
+
+    @classmethod
+    def of(cls, device: Device, function: TransferFunction, ray_step: float) -> TransferTables:
+        """Tables of `function` for samples every `ray_step` mm."""
+        low, high = function.range_hu
+        table = function.table(low, high, NODES)
+        with np.errstate(divide="ignore"):
+            let_through = np.log2(1.0 - table[:, 3].astype(np.float64)) * (ray_step / function.unit_distance)
+        let_through = np.maximum(let_through, LOWEST_LOG)
+        red, green, blue = np.rint(1023.0 * table[:, :3].T).astype(np.int32)
+        colors = red << 20 | green << 10 | blue
+        opacities = (-np.expm1(let_through * np.log(2.0))).astype(np.float32)
+        clears = np.exp2(let_through / PARTS).astype(np.float32)
+        scale = (NODES - 1) / (high - low)
+        steepness = Steepness.of(opacities, scale)
+        shown = opacities > 0.0
+        factors = np.ones(GRADIENT_NODES, np.float32)
+        top = 1.0
+        if function.gradient_opacity is not None:
+            top = max(float(function.gradient_opacity[-1, 0]), 1.0)
+            factors = function.gradient_table(top, GRADIENT_NODES)
+        return cls(
+            upload(device, colors), upload(device, opacities), upload(device, clears),
+            upload(device, steepness.changes.astype(np.float32)), upload(device, factors), shown, low,
+            scale, steepness, (GRADIENT_NODES - 1) / top, function.unit_distance / ray_step,
+            function.gradient_opacity is not None,
+        )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class MainWay:
+    """The direction that most rays of a picture have among the bricks of a slab.
+
+    Attributes
+    ----------
+    axis : int
+        0, 1 or 2 for i, j or k.
+    ahead : int
+        1 or -1: the direction along it.
+    eye : ndarray, shape (4,), float32
+        The camera in bricks, and 1; or the direction of all rays in bricks, 1 along `axis`, and 0.
+    aside : float
+        Bricks off the camera, or aside for each brick ahead, from which on rays count as drifting aside.
+    """
+
+    axis: int
+    ahead: int
+    eye: NDArray[np.float32]
+    aside: float
+
+    @classmethod
+    def of(cls, resident: ResidentVolume, slab: RaySlab, camera: Camera) -> MainWay:
+        """That of the ray in the middle."""
+        frame, cells = FieldFrame.of(resident.volume), np.array(slab.brick_cells, np.float64)
+        forward = frame.matrix @ camera.basis().forward / cells
+        axis = int(np.argmax(np.abs(forward)))
+        ahead = 1 if forward[axis] > 0.0 else -1
+        if camera.is_parallel:
+            eye, aside = np.append(forward / np.abs(forward).max(), 0.0), LEAST_DRIFT
+        else:
+            place = (frame.places(np.array([camera.position]))[0] - (0.0, 0.0, slab.first_k)) / cells
+            nearest = -place[axis] if ahead > 0 else place[axis] - slab.bricks[axis]  # brick on the way
+            eye, aside = np.append(place, 1.0), max(LEAST_DRIFT * nearest, 0.5)
+        return cls(axis, ahead, eye.astype(np.float32), aside)
+
+    @property
+    def arguments(self) -> tuple[Any, ...]:
+        """How kernels are told of it."""
+        return np.int32(self.axis), np.int32(self.ahead), self.eye, np.float32(self.aside)
+
+
+def composite_slab(
+    resident: ResidentVolume,
+    slab: RaySlab,
+    view: RayView,
+    tables: TransferTables,
+    leaps: LeapMap,
+    lighting: Lighting,
+    jitter: bool,
+    labels: ResampledLabels | None,
+    style: LabelStyle | None,
+    output: PictureBuffers,
+    stopwatch: Stopwatch,
+) -> None:
+    """Blend one slab into a picture, and wait.
+
+    Parameters
+    ----------
+    view : RayView
+        With the slab's focus.
+    leaps : LeapMap
+        Of this slab, for the transfer function of `tables`.
+    labels : ResampledLabels, optional
+        On the grid of the volume, and how its labels look.
+    style : LabelStyle, optional
+    output : PictureBuffers
+        Holds what earlier slabs left.
+    """
+    device = resident.device
+    variants = {"GRADIENT_OPACITY": "1"} if tables.weighed else {}
+    if tables.steepness.is_steep and takes_parts(resident.volume, view.ray_step):
+        variants |= {"TAKES_PARTS": "1"}
+    label_tables: tuple[Any, ...] = ()
+    if labels is not None and style is not None:
+        variants |= {"LABELS": "1", **label_variants(labels.voxels.dtype)}
+        held = pad_slices(labels.voxels[slab.first_k : slab.end_k])
+        label_tables = (upload(device, held), upload(device, style.table))
+    program = resident.program("render/composite.cl", **variants)
+    lanes = int(device.kernel_variants["LANES"])
+    width, height = view.size
+    queues = count_queues(device)
+    last = np.array([n - 1 for n in resident.volume.shape_ijk] + [0], dtype=np.float32)
+    with stopwatch.running(device):  # to its end: CPU devices read the arrays of the host that end here
+        entries_d = _enter_tiles(resident, slab, view, leaps, output, stopwatch)
+        way = MainWay.of(resident, slab, view.camera)
+        ways_d = _look_ahead(resident, slab, way, leaps, stopwatch)
+        launch(
+            device, program["composite_rays"], output.items(queues, lanes),
+            slab.voxels_d, ways_d, tables.colors_d, tables.opacities_d, tables.clears_d, tables.changes_d,
+            tables.factors_d,
+            upload(device, highlight_table(lighting)), entries_d, upload(device, view.table), output.states_d,
+            output.image_d, output.depths_d, output.means_d, output.background, last, resident.stack.slope,
+            np.int32(slab.shape_ijk[0]), np.int32(slab.shape_ijk[1]), np.int32(slab.first_k), np.int32(slab.end_k),
+            np.float32(slab.low_k), np.float32(slab.high_k), *slab.brick_arguments,
+            np.float32(tables.low), np.float32(tables.scale), *tables.shown_ends,
+            np.float32(tables.steepness.narrow), np.int32(tables.steepness.has_dense), np.int32(tables.is_one_sided),
+            np.float32(tables.factor_scale),
+            np.float32(tables.steps_per_unit), np.uint32(width), np.uint32(height),
+            np.uint32(view.planes), np.int32(not view.camera.is_parallel), np.int32(lighting.shades), np.int32(jitter),
+            np.int32(slab.stage), np.uint32(queues), *way.arguments, *label_tables, *resident.stack.arguments,
+            stopwatch=stopwatch,
+        )  # fmt: skip
+
+
+def _enter_tiles(
+    resident: ResidentVolume,
+    slab: RaySlab,
+    view: RayView,
+    leaps: LeapMap,
+    output: PictureBuffers,
+    stopwatch: Stopwatch,
+) -> Any:
+    """For each tile the way in mm before which none of its rays meets anything, on the device."""
+    device = resident.device
+    lanes = int(device.kernel_variants["LANES"])
+    width, height = view.size
+    margin = math.ceil(min((resident.stack.index_steps(view.spread) / resident.brick_cells).max(), FARTHEST))
+    entries_d = allocate(device, 4 * output.tiles)
+    launch(
+        device, resident.program("render/tiles.cl")["enter_tiles"], -(-output.tiles // lanes),
+        leaps.distances_d, upload(device, view.widened()), entries_d,
+        resident.stack.slope, *slab.brick_arguments, np.int32(slab.first_k), np.int32(margin),
+        np.uint32(width), np.uint32(height), np.int32(not view.camera.is_parallel), *resident.stack.arguments,
+        stopwatch=stopwatch,
+    )  # fmt: skip
+    return entries_d
+
+
+def _look_ahead(resident: ResidentVolume, slab: RaySlab, way: MainWay, leaps: LeapMap, stopwatch: Stopwatch) -> Any:
+    """For each brick how far nothing shows around it, and ahead of it along the main way, on the device."""
+    bricks = slab.bricks
+    count = math.prod(bricks)
+    ways_d = allocate(resident.device, count)
+    launch(
+        resident.device, resident.program("render/occupancy.cl")["look_ahead"], count // bricks[way.axis],
+        leaps.distances_d, ways_d, *(np.int32(n) for n in bricks), *way.arguments, stopwatch=stopwatch,
+    )  # fmt: skip
+    return ways_d

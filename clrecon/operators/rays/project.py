@@ -1,0 +1,49 @@
+"""Projections of a volume along rays: the host's side of cl/render/project.cl."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from clrecon.opencl import Stopwatch, launch, upload
+from clrecon.operators.rays.buffers import PictureBuffers, count_queues
+from clrecon.operators.rays.ray_view import RayView
+from clrecon.operators.resident.volume import RaySlab, ResidentVolume
+
+__all__ = ["AIR_HU", "PROJECTIONS", "project_slab"]
+
+AIR_HU = -1000.0
+"""Attenuates nothing, as in cl/render/project.cl: lower values are padding, or what a mask left."""
+
+PROJECTIONS = {"mip": 0, "minip": 1, "mean": 2, "drr": 3}
+"""What the kernel calls them."""
+
+
+def project_slab(
+    resident: ResidentVolume,
+    slab: RaySlab,
+    view: RayView,
+    mode: str,
+    output: PictureBuffers,
+    stopwatch: Stopwatch,
+) -> None:
+    """Take one slab into a projection; `output.means_d` gets the values.
+
+    Parameters
+    ----------
+    mode : {"mip", "minip", "mean", "drr"}
+    """
+    variants = {"LEAST_VALUE": f"({AIR_HU:g})"} if mode == "drr" else {}
+    device = resident.device
+    width, height = view.size
+    queues, lanes = count_queues(device), int(device.kernel_variants["LANES"])
+    last = np.array([n - 1 for n in resident.volume.shape_ijk] + [0], dtype=np.float32)
+    launch(
+        device, resident.program("render/project.cl", **variants)["project_rays"], output.items(queues, lanes),
+        slab.voxels_d, resident.measure(slab, stopwatch), upload(device, view.table), output.states_d,
+        output.depths_d, output.means_d, last,
+        np.int32(slab.shape_ijk[0]), np.int32(slab.shape_ijk[1]), np.int32(slab.first_k), np.int32(slab.end_k),
+        np.float32(slab.low_k), np.float32(slab.high_k), *slab.brick_arguments,
+        np.uint32(width), np.uint32(height), np.uint32(view.planes), np.int32(not view.camera.is_parallel),
+        np.int32(PROJECTIONS[mode]), np.int32(slab.stage), np.uint32(queues), *resident.stack.arguments,
+        stopwatch=stopwatch,
+    )  # fmt: skip

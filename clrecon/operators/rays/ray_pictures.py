@@ -1,0 +1,156 @@
+"""Pictures by sampling rays: volume rendering and projections, from slab to slab."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clrecon.geometry.affine import Float64Array
+from clrecon.labels.resample import resample_labels
+from clrecon.opencl import Stopwatch
+from clrecon.operators.rays.buffers import PictureBuffers
+from clrecon.operators.rays.composite import TransferTables, composite_slab
+from clrecon.operators.rays.project import PROJECTIONS, project_slab
+from clrecon.operators.rays.ray_view import RayView
+from clrecon.operators.resident.frame import volume_box
+from clrecon.operators.resident.volume import RaySlab, ResidentVolume, entry_slice
+from clrecon.rendering import Lighting, Rendering, TransferFunction
+from clrecon.rendering.looks.label_style import LabelStyle
+from clrecon.rendering.looks.window import choose_water_window, choose_window, grey_image
+from clrecon.rendering.views.camera import Camera
+from clrecon.rendering.views.clip import Clip
+
+__all__ = ["RayPicture", "take_picture"]
+
+
+@dataclass(frozen=True)
+class RayPicture:
+    """What is asked for.
+
+    Attributes
+    ----------
+    mode : {"dvr", "mip", "minip", "mean", "drr"}
+    camera : Camera
+    size : (width, height)
+    ray_step : float
+        mm.
+    function : TransferFunction
+        Of volume rendering.
+    lighting : Lighting
+    window : (low, high) or None
+        HU, in drr mm of water, that are black and white in projections; None chooses by what there is.
+    clip : Clip or None
+    background : colour or None
+        None leaves the picture transparent where nothing is.
+    jitter : bool
+    style : LabelStyle or None
+        Of volume rendering.
+    """
+
+    mode: str
+    camera: Camera
+    size: tuple[int, int]
+    ray_step: float
+    function: TransferFunction
+    lighting: Lighting
+    window: tuple[float, float] | None = None
+    clip: Clip | None = None
+    background: str | Sequence[float] | None = None
+    jitter: bool = False
+    style: LabelStyle | None = None
+
+
+def take_picture(resident: ResidentVolume, picture: RayPicture, tables: TransferTables | None) -> Rendering:
+    """Take one picture of a volume on a device.
+
+    Parameters
+    ----------
+    tables : TransferTables, optional
+        Those of the picture's transfer function and ray step; projections need none.
+
+    Raises
+    ------
+    DeviceError
+        Not enough memory, or the device fails.
+    RefusedInputError
+        The labels do not lie on the volume.
+    """
+    return _Job(resident, picture, tables).run()
+
+
+class _Job:
+    def __init__(self, resident: ResidentVolume, picture: RayPicture, tables: TransferTables | None):
+        self.resident, self.picture, self.tables = resident, picture, tables
+        self.labels = None if picture.style is None else resample_labels(picture.style.labels, resident.volume)
+        self.stopwatch = Stopwatch()
+        self.box = volume_box(resident.volume)
+        self.planes = None if picture.clip is None else picture.clip.planes
+
+    def run(self) -> Rendering:
+        """Go through the slabs and collect the picture."""
+        resident, picture, stopwatch = self.resident, self.picture, self.stopwatch
+        device = resident.device
+        beside = 0 if self.labels is None else self.labels.voxels.itemsize
+        slices = resident.plan(*PictureBuffers.needs(picture.size), beside=beside)
+        several = slices < resident.volume.shape_ijk[2]
+        output = PictureBuffers(device, picture.size, picture.background, several)
+        slabs = 0
+        for slab in resident.slabs(slices, entry_slice(resident.volume, picture.camera), stopwatch):
+            slabs += 1
+            if self.tables is None:
+                with stopwatch.running(device):  # to its end: CPU devices read the arrays of the host
+                    project_slab(resident, slab, self._view(self.box), picture.mode, output, stopwatch)
+            else:
+                self._composite(slab, self.tables, output)
+        with stopwatch.timed("download"):
+            image, depths, means = output.download()
+        report = {
+            "mode": picture.mode,
+            "device": device.label,
+            "driver": device.driver,
+            "ray_step_mm": picture.ray_step,
+            "slabs": slabs,
+            "seconds": dict(stopwatch.seconds),
+            "kernel_seconds": dict(stopwatch.by_kernel),
+            "warnings": [] if self.labels is None else list(self.labels.warnings),
+        }
+        if picture.mode in PROJECTIONS:
+            return self._finish_projection(means, depths, report)
+        report["unit_distance_mm"] = picture.function.unit_distance
+        return Rendering(image, depths, means, picture.camera, None, picture.mode, report)
+
+    def _composite(self, slab: RaySlab, tables: TransferTables, output: PictureBuffers) -> None:
+        picture, stopwatch = self.picture, self.stopwatch
+        key = (picture.function, picture.ray_step)
+        with stopwatch.running(self.resident.device):
+            leaps = self.resident.find_leaps(slab, key, tables.shown, tables.low, tables.scale, stopwatch)
+        nothing = (self.box[1], self.box[1])
+        view = self._view(nothing if leaps.box is None else leaps.box)
+        composite_slab(
+            self.resident, slab, view, tables, leaps, picture.lighting, picture.jitter, self.labels, picture.style,
+            output, stopwatch,
+        )  # fmt: skip
+
+    def _finish_projection(
+        self, values: NDArray[np.float32], depths: NDArray[np.float32], report: dict[str, Any]
+    ) -> Rendering:
+        picture = self.picture
+        is_water = picture.mode == "drr"
+        window = picture.window or (choose_water_window if is_water else choose_window)(values)
+        report["window_mm_water" if is_water else "window_hu"] = list(window)
+        image = grey_image(values, window)
+        if is_water:
+            image[values <= 0.0, 3] = 0  # nothing attenuates there, within the volume or beside it
+        made = Rendering(image, depths, depths.copy(), picture.camera, values, picture.mode, report)
+        return made if picture.background is None else made.with_background(picture.background)
+
+    def _view(self, focus: tuple[Float64Array, Float64Array]) -> RayView:
+        picture = self.picture
+        return RayView.of(
+            self.resident.volume, picture.camera, picture.size, picture.ray_step,
+            lighting=picture.lighting, planes=self.planes, box=self.box, focus=focus,
+        )  # fmt: skip

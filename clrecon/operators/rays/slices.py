@@ -1,0 +1,283 @@
+"""Slices of a volume drawn in space where they lie: the host's side of cl/render/slices.cl."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clrecon.errors import UsageError
+from clrecon.geometry import Volume
+from clrecon.geometry.affine import Float64Array
+from clrecon.opencl import (
+    Device,
+    Stopwatch,
+    check_budget,
+    describe_shortage,
+    launch,
+    load_program,
+    memory_limits,
+    upload,
+)
+from clrecon.operators.rays.buffers import PictureBuffers, count_queues
+from clrecon.operators.rays.ray_view import RayView
+from clrecon.operators.resident.frame import FieldFrame, volume_box
+from clrecon.operators.resident.voxel_types import voxel_variants
+from clrecon.rendering import Rendering, TransferFunction
+from clrecon.rendering.looks.window import checked_window
+from clrecon.rendering.views.camera import Camera
+from clrecon.rendering.views.clip import Clip
+
+__all__ = ["DEFAULT_OPACITY", "LOWEST_SHOWN_HU", "choose_slices", "overlay_slices"]
+
+DEFAULT_COUNT = 12
+"""Slices that are shown where none are named: enough to see the body, few enough to see each of them."""
+
+DEFAULT_OPACITY = 0.5
+"""Of a slice: the front ones are bright, and the third still shows an eighth of its light."""
+
+LOWEST_SHOWN_HU = -300.0
+"""Below is air, lung and most of what lies around a patient: transparent, so that the slices behind are seen."""
+
+DEFAULT_WINDOW = (-300.0, 400.0)
+"""HU that are black and white, where neither a window nor a transfer function is given: soft tissue and bone."""
+
+NODES = 4096
+"""Entries of the table of colours, as in cl/render/slices.cl."""
+
+EDGE_ON = 1e-3
+"""Cosine between a parallel view and the slices' normal below which nothing of them is seen."""
+
+
+def choose_slices(volume: Volume, slices: int | Sequence[int] | None = None) -> list[int]:
+    """Numbers k of the slices to show, ascending.
+
+    Parameters
+    ----------
+    volume : Volume
+    slices : int or sequence of int, optional
+        Every so manyeth slice, from the first on; or those named.  None is about twelve, evenly.
+
+    Raises
+    ------
+    UsageError
+        Not such numbers, none, twice the same, or slices that the volume has not.
+    """
+    nk = volume.shape_ijk[2]
+    if slices is None:
+        count = min(nk, DEFAULT_COUNT)
+        return np.unique(np.rint(np.linspace(0, nk - 1, count)).astype(int)).tolist()
+    if isinstance(slices, (int, np.integer)) and not isinstance(slices, bool):
+        if slices < 1:
+            raise UsageError(f"every {slices}th slice cannot be shown: give 1 or more, or a list of slices")
+        return list(range(0, nk, int(slices)))
+    try:
+        numbers = np.asarray(slices)
+    except (TypeError, ValueError):
+        numbers = np.empty(0)
+    if numbers.ndim != 1 or not len(numbers) or numbers.dtype.kind not in "iu":
+        raise UsageError(f"slices are a number (every n-th) or a list of whole numbers k, not {slices!r}")
+    chosen = sorted(numbers.tolist())
+    if chosen[0] < 0 or chosen[-1] >= nk:
+        outside = chosen[0] if chosen[0] < 0 else chosen[-1]
+        raise UsageError(f"slice {outside} is not there: the volume has slices 0 to {nk - 1}")
+    if len(set(chosen)) < len(chosen):
+        raise UsageError(f"slices are named twice: {slices!r}")
+    return chosen
+
+
+def overlay_slices(
+    volume: Volume,
+    device: Device,
+    camera: Camera,
+    size: tuple[int, int],
+    *,
+    slices: int | Sequence[int] | None = None,
+    opacity: float = DEFAULT_OPACITY,
+    lowest_hu: float = LOWEST_SHOWN_HU,
+    window: Sequence[float] | None = None,
+    transfer_function: TransferFunction | None = None,
+    clip: Clip | None = None,
+    background: str | Sequence[float] | None = None,
+    memory: int | None = None,
+) -> Rendering:
+    """Show slices of a volume in space, each translucent at its own place: sheared and uneven stacks too.
+
+    Only the slices that are shown go to the device, in parts where they do not fit together.
+
+    Parameters
+    ----------
+    volume : Volume
+    device : Device
+    camera : Camera
+    size : (width, height)
+    slices : int or sequence of int, optional
+        See `choose_slices`.
+    opacity : float
+        Of each slice, above 0 to 1.
+    lowest_hu : float
+        What is below is transparent.
+    window : (low, high), optional
+        HU that are black and white.
+    transfer_function : TransferFunction, optional
+        Its colours in place of grey; its opacity plays no part.
+    clip : Clip, optional
+    background : str or (float, float, float), optional
+        None leaves the picture transparent where nothing is.
+    memory : int, optional
+        Bytes that may be taken on the device.
+
+    Returns
+    -------
+    Rendering
+        ``depth`` is that of the first slice that shows there.
+
+    Raises
+    ------
+    UsageError
+        As `choose_slices`; an opacity that is none; a window and a transfer function.
+    DeviceError
+        Not even one slice fits the device.
+    """
+    chosen = choose_slices(volume, slices)
+    look = _Look.of(opacity, lowest_hu, window, transfer_function)
+    needs, extra = PictureBuffers.needs(size)
+    at_once = _plan_parts(volume, device, len(chosen), needs, extra, memory)
+    order = _sort_slices(volume, camera, chosen)
+    parts = [order[first : first + at_once] for first in range(0, len(order), at_once)]
+    output = PictureBuffers(device, size, background, len(parts) > 1)
+    stopwatch = Stopwatch()
+    box = volume_box(volume)
+    view = RayView.of(volume, camera, size, 1.0, planes=None if clip is None else clip.planes, box=box, focus=box)
+    for number, part in enumerate(parts):
+        stage = (number == 0) + 2 * (number == len(parts) - 1)
+        _draw(volume, device, part, look, view, stage, output, stopwatch)
+    with stopwatch.timed("download"):
+        image, depths, means = output.download()
+    report = {
+        "mode": "slices",
+        "device": device.label,
+        "driver": device.driver,
+        "slices": chosen,
+        "slice_opacity": look.opacity,
+        "lowest_shown_hu": look.lowest,
+        "seconds": dict(stopwatch.seconds),
+        "kernel_seconds": dict(stopwatch.by_kernel),
+        "warnings": _warn(volume, camera),
+    }
+    return Rendering(image, depths, means, camera, None, "slices", report)
+
+
+@dataclass(frozen=True)
+class _Look:
+    """Colours (NODES, 4) float32 by value; the nearest node to v is ``floor((v - low) * scale + 0.5)``."""
+
+    opacity: float
+    lowest: float
+    colors: NDArray[np.float32]
+    low: float
+    scale: float
+
+    @classmethod
+    def of(
+        cls,
+        opacity: float,
+        lowest_hu: float,
+        window: Sequence[float] | None,
+        function: TransferFunction | None,
+    ) -> _Look:
+        share, lowest = _number(opacity), _number(lowest_hu)
+        if not 0.0 < share <= 1.0:
+            raise UsageError(f"the opacity of a slice lies above 0 and up to 1, not at {opacity!r}")
+        if math.isnan(lowest):
+            raise UsageError(f"the lowest HU that slices show is a number, not {lowest_hu!r}")
+        if function is not None and window is not None:
+            raise UsageError("slices are coloured by a window or by a transfer function, not by both")
+        if function is not None:
+            low, high = function.range_hu
+            colors = function.table(low, high, NODES)
+        else:
+            low, high = DEFAULT_WINDOW if window is None else checked_window(window)
+            colors = np.repeat(np.linspace(0.0, 1.0, NODES)[:, None], 4, axis=1).astype(np.float32)
+        return cls(share, lowest, colors, low, (NODES - 1) / (high - low))
+
+
+def _number(value: float) -> float:
+    try:
+        return float(value)
+    except (TypeError, ValueError):
+        return math.nan
+
+
+def _plan_parts(
+    volume: Volume, device: Device, count: int, needs: dict[str, int], extra: dict[str, int], memory: int | None
+) -> int:
+    """Slices that go to the device together."""
+    ni, nj, _ = volume.shape_ijk
+    one = ni * nj * int(volume.voxels.dtype.itemsize)
+    limits = memory_limits(device, memory)
+    if not describe_shortage(limits, {"slices": count * one, **needs}):
+        return count
+    check_budget(device, {"slice": one, **needs, **extra}, memory)
+    left = limits.total_bytes - sum(needs.values()) - sum(extra.values())
+    return min(count, max(1, min(left, limits.buffer_bytes) // one))
+
+
+def _sort_slices(volume: Volume, camera: Camera, chosen: Sequence[int]) -> list[int]:
+    """Slices in the order in which rays cross them.
+
+    All rays cross them in one order: parallel ones go up, or down, together; those from a camera go away from its
+    height, whichever way.
+    """
+    heights = _heights(volume, volume.slice_origins()[list(chosen)])
+    if camera.is_parallel:
+        along = heights * np.sign(_heights(volume, camera.basis().forward[None])[0] or 1.0)
+    else:
+        along = np.abs(heights - _heights(volume, np.array([camera.position]))[0])
+    return [chosen[n] for n in np.argsort(along, kind="stable")]
+
+
+def _heights(volume: Volume, points: Float64Array) -> Float64Array:
+    normal = np.cross(volume.affine[:3, 0], volume.affine[:3, 1])
+    return np.asarray(points @ (normal / np.linalg.norm(normal)), dtype=np.float64)
+
+
+def _warn(volume: Volume, camera: Camera) -> list[str]:
+    if not camera.is_parallel or abs(_heights(volume, camera.basis().forward[None])[0]) > EDGE_ON:
+        return []
+    return ["the slices are seen edge-on and do not show: look from another side, such as 30,30, or in perspective"]
+
+
+def _draw(
+    volume: Volume,
+    device: Device,
+    part: Sequence[int],
+    look: _Look,
+    view: RayView,
+    stage: int,
+    output: PictureBuffers,
+    stopwatch: Stopwatch,
+) -> None:
+    """Draw slices in the order given, and wait."""
+    places = np.zeros((len(part), 4), np.float32)
+    places[:, :3] = FieldFrame.of(volume).places(volume.slice_origins()[list(part)])
+    with stopwatch.timed("upload"):
+        slices = np.ascontiguousarray(volume.voxels[list(part)])
+        slices_d = upload(device, slices)
+    ni, nj, _ = volume.shape_ijk
+    width, height = view.size
+    queues = count_queues(device)
+    program = load_program(device, "render/slices.cl", voxel_variants(volume.voxels.dtype))
+    with stopwatch.running(device):  # to its end: CPU devices read the array of the host
+        launch(
+            device, program["overlay_slices"], output.items(queues, 1),
+            slices_d, upload(device, places), upload(device, look.colors), upload(device, view.table), output.states_d,
+            output.image_d, output.depths_d, output.means_d, output.background,
+            np.int32(ni), np.int32(nj), np.int32(len(part)), np.float32(look.low), np.float32(look.scale),
+            np.float32(look.opacity), np.float32(look.lowest), np.uint32(width), np.uint32(height),
+            np.uint32(view.planes), np.int32(not view.camera.is_parallel), np.int32(stage), np.uint32(queues),
+            stopwatch=stopwatch,
+        )  # fmt: skip

@@ -1,0 +1,296 @@
+"""Pictures of an iso surface without a mesh: the host's side of cl/render/surface.cl."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clrecon.errors import DeviceError, UsageError
+from clrecon.geometry import Volume
+from clrecon.geometry.affine import Float64Array
+from clrecon.geometry.iso_rule import IsoRule, ValueRange, choose_iso_rule
+from clrecon.labels import resample_labels
+from clrecon.opencl import Stopwatch, launch, memory_limits, upload
+from clrecon.operators.rays.buffers import PictureBuffers, count_queues, highlight_table
+from clrecon.operators.rays.ray_view import RayView
+from clrecon.operators.resident.frame import FieldFrame, enclose
+from clrecon.operators.resident.volume import LeapMap, RaySlab, ResidentVolume, entry_slice, pad_slices
+from clrecon.operators.resident.voxel_types import label_variants
+from clrecon.rendering import Lighting, Rendering
+from clrecon.rendering.looks.colors import find_color
+from clrecon.rendering.looks.label_style import LabelStyle
+from clrecon.rendering.views.camera import Camera, box_corners
+from clrecon.rendering.views.clip import Clip
+
+__all__ = ["SURFACE_COLOR", "cast_surface"]
+
+SURFACE_COLOR = "bone"
+"""Of a surface without labels."""
+
+CLOSED_BORDER = 1.0
+"""Index steps beyond the outermost voxel centres within which the closed field falls to outside."""
+
+
+def cast_surface(
+    resident: ResidentVolume,
+    iso_value: float,
+    camera: Camera,
+    size: tuple[int, int],
+    ray_step: float,
+    *,
+    lighting: Lighting | None = None,
+    clip: Clip | None = None,
+    color: str | Sequence[float] = SURFACE_COLOR,
+    background: str | Sequence[float] | None = None,
+    shadows: bool = False,
+    depth_cue: float = 0.0,
+    style: LabelStyle | None = None,
+    values: ValueRange | None = None,
+) -> Rendering:
+    """Show where the field first reaches an iso value along each ray.
+
+    The field is that of the closed mesh of `extract_isosurface`, so that depths are those of the mesh: surrounded by a
+    layer of outside, its surface at the level of `clrecon.geometry.iso_rule.IsoRule`.  Between the first sample that is
+    inside and the one before, the surface is found to 1e-3 of a step.  A ray that begins inside has its hit at once: on
+    a clip plane with the plane's normal, so that cut bone is flat; at a camera in there with the ray's direction.
+
+    Parameters
+    ----------
+    resident : ResidentVolume
+    iso_value : float
+        HU; inside is ``>= iso_value``.
+    camera : Camera
+    size : (width, height)
+    ray_step : float
+        mm between samples.  Where the volume goes through in slabs, at most one slice.
+    lighting : Lighting, optional
+    clip : Clip, optional
+    color : str or (float, float, float)
+        Of the surface, see `clrecon.rendering.looks.colors.find_color`.
+    background : str or (float, float, float), optional
+        None leaves the picture transparent where nothing is hit.
+    shadows : bool
+        A hit from which the way to the fixed light meets anything inside, a ray step on or further, has ambient light
+        alone; what is translucent by `style` lets its share through.
+    depth_cue : float
+        Share of the brightness, 0 to 1, that is lost from the nearest corner of the volume to the farthest.
+    style : LabelStyle, optional
+        A hit in a label with opacity below 1 is blended and the ray goes on: out of the inside and to the next entry,
+        or into the next label.  The label of a hit is that of the nearest inside voxel of its cell that has one.
+    values : ValueRange, optional
+        Of the volume, where several iso values are shown.
+
+    Returns
+    -------
+    Rendering
+        ``depth`` is that of the first hit.
+
+    Raises
+    ------
+    UsageError
+        Shadows without a fixed light, a depth cue that is no share, or as `choose_iso_rule`.
+    NoSurfaceError
+        The volume holds values that have no surface.
+    RefusedInputError
+        The labels do not lie on the volume.
+    DeviceError
+        Not enough memory: for shadows the volume has to fit the device as a whole.
+    """
+    look = _Look.of(Lighting() if lighting is None else lighting, color, shadows, depth_cue)
+    rule = choose_iso_rule(resident.volume, iso_value, values=values)
+    job = _Job(resident, rule, look, camera, size, float(ray_step), clip, style)
+    return job.run(background)
+
+
+@dataclass(frozen=True)
+class _Look:
+    lighting: Lighting
+    color: Float64Array
+    shadows: bool
+    depth_cue: float
+
+    @classmethod
+    def of(cls, lighting: Lighting, color: str | Sequence[float], shadows: bool, depth_cue: float) -> _Look:
+        if shadows and lighting.direction is None:
+            raise UsageError(
+                "shadows need a light that stands still: with a light at the camera none is seen; give lighting a"
+                " direction, such as Lighting(direction=(0.5, -1, 1))"
+            )
+        try:
+            cue = float(depth_cue)
+        except (TypeError, ValueError):
+            cue = -1.0
+        if not 0.0 <= cue <= 1.0:
+            raise UsageError(f"the depth cue is a share of the brightness from 0 to 1, not {depth_cue!r}")
+        return cls(lighting, find_color(color), bool(shadows), cue)
+
+
+class _Job:
+    """One picture: from slab to slab."""
+
+    def __init__(
+        self,
+        resident: ResidentVolume,
+        rule: IsoRule,
+        look: _Look,
+        camera: Camera,
+        size: tuple[int, int],
+        ray_step: float,
+        clip: Clip | None,
+        style: LabelStyle | None,
+    ):
+        self.resident, self.rule, self.look = resident, rule, look
+        self.camera, self.size, self.ray_step = camera, size, ray_step
+        self.planes = np.empty((0, 4)) if clip is None else clip.planes
+        self.style = style
+        self.labels = None if style is None else resample_labels(style.labels, resident.volume)
+        self.stopwatch = Stopwatch()
+        self.frame = FieldFrame.of(resident.volume)
+
+    def run(self, background: str | Sequence[float] | None) -> Rendering:
+        resident, device, nk = self.resident, self.resident.device, self.resident.volume.shape_ijk[2]
+        beside = 0 if self.labels is None else self.labels.voxels.itemsize
+        slices = resident.plan(*PictureBuffers.needs(self.size), beside=beside)
+        warnings = [] if self.labels is None else list(self.labels.warnings)
+        if slices < nk:
+            if self.look.shadows:
+                raise DeviceError(
+                    f"shadows need the whole volume on the device, {slices} of its {nk} slices fit:"
+                    f" {memory_limits(device, resident.memory).describe()}; give more memory or leave the shadows out"
+                )
+            self._shorten_steps(warnings)
+        output = PictureBuffers(device, self.size, background, slices < nk)
+        slabs = 0
+        for slab in resident.slabs(slices, entry_slice(resident.volume, self.camera), self.stopwatch):
+            slabs += 1
+            self._trace(slab, output)
+        with self.stopwatch.timed("download"):
+            image, depths, means = output.download()
+        report = {
+            "mode": "surface",
+            "device": device.label,
+            "driver": device.driver,
+            "iso_value_hu": self.rule.iso_value,
+            "ray_step_mm": self.ray_step,
+            "slabs": slabs,
+            "seconds": dict(self.stopwatch.seconds),
+            "kernel_seconds": dict(self.stopwatch.by_kernel),
+            "warnings": warnings,
+        }
+        return Rendering(image, depths, means, self.camera, None, "surface", report)
+
+    def _shorten_steps(self, warnings: list[str]) -> None:
+        """A slab knows what lies up to a slice before it: steps are no longer than that."""
+        longest = 1.0 / _slices_per_mm(self.resident.volume)
+        if self.ray_step > longest:
+            warnings.append(
+                f"the volume goes through in slabs: the ray step is {longest:.3g} mm in place of {self.ray_step:.3g}"
+            )
+            self.ray_step = longest
+
+    def _trace(self, slab: RaySlab, output: PictureBuffers) -> None:
+        resident, rule, look = self.resident, self.rule, self.look
+        device, volume = resident.device, resident.volume
+        lanes, queues = int(device.kernel_variants["LANES"]), count_queues(device)
+        width, height = self.size
+        variants, tables = self._tables(slab)
+        low_k, high_k = _field_heights(volume, self.frame, (slab.low_k, slab.high_k))
+        last = [n - 1 for n in volume.shape_ijk]
+        with self.stopwatch.running(device):  # to its end: CPU devices read the arrays of the host
+            leaps = _find_leaps(resident, slab, rule.iso_level, self.stopwatch)
+            view = self._view(leaps)
+            launch(
+                device, resident.program("render/surface.cl", **variants)["trace_surface"], output.items(queues, lanes),
+                slab.voxels_d, leaps.distances_d, upload(device, view.table), *tables,
+                upload(device, highlight_table(look.lighting)), output.states_d, output.image_d, output.depths_d,
+                output.means_d, output.background, _float4(*last), resident.stack.slope,
+                np.int32(slab.shape_ijk[0]), np.int32(slab.shape_ijk[1]), np.int32(slab.first_k), np.int32(slab.end_k),
+                np.float32(low_k), np.float32(high_k), *slab.brick_arguments, np.float32(rule.iso_level),
+                np.float32(rule.outside), _float4(*look.color), self._light_step(), self._cue(), np.uint32(width),
+                np.uint32(height), np.uint32(view.planes), np.int32(not self.camera.is_parallel), np.int32(slab.stage),
+                np.uint32(queues), *resident.stack.arguments, stopwatch=self.stopwatch,
+            )  # fmt: skip
+
+    def _tables(self, slab: RaySlab) -> tuple[dict[str, str], list[Any]]:
+        """Variants of the kernel, and the buffers between view and highlights that belong to them."""
+        device = self.resident.device
+        normals = np.zeros((max(1, len(self.planes)), 4), np.float32)
+        normals[: len(self.planes), :3] = self.planes[:, :3]
+        variants: dict[str, str] = {}
+        tables = [upload(device, normals)]
+        if self.labels is not None and self.style is not None:
+            variants = {"LABELS": "1", **label_variants(self.labels.voxels.dtype)}
+            held = pad_slices(self.labels.voxels[slab.first_k : slab.end_k])
+            tables += [upload(device, held), upload(device, self.style.table)]
+        return variants, tables
+
+    def _view(self, leaps: LeapMap) -> RayView:
+        volume = self.resident.volume
+        last = np.array(volume.shape_ijk) - 1.0
+        box = enclose(volume, np.full(3, -CLOSED_BORDER), last + CLOSED_BORDER)
+        focus = (box[1], box[1])
+        if leaps.box is not None:
+            margin = np.full(3, CLOSED_BORDER)
+            if volume.uneven:  # a slice more in field coordinates, wherever it lies
+                aside = np.abs(np.diff(self.frame.places(volume.slice_origins(border=1)), axis=0)).max(axis=0)
+                margin = np.array([CLOSED_BORDER, CLOSED_BORDER, 0.0]) + aside
+            focus = leaps.box[0] - margin, leaps.box[1] + margin
+        return RayView.of(
+            volume, self.camera, self.size, self.ray_step,
+            lighting=self.look.lighting, planes=self.planes, box=box, focus=focus,
+        )  # fmt: skip
+
+    def _light_step(self) -> NDArray[np.float32]:
+        """Field coordinates per mm towards the fixed light, and whether it throws shadows."""
+        if self.look.lighting.direction is None:
+            return _float4()
+        light = np.array(self.look.lighting.direction)
+        return _float4(*(self.frame.matrix @ (light / np.linalg.norm(light))), float(self.look.shadows))
+
+    def _cue(self) -> NDArray[np.float32]:
+        """Depth of full brightness, 1 / mm from there to the farthest corner, and what is lost there."""
+        if not self.look.depth_cue:
+            return _float4()
+        corners = box_corners(self.resident.volume) - self.camera.position
+        if self.camera.is_parallel:
+            depths = corners @ self.camera.basis().forward
+        else:
+            depths = np.linalg.norm(corners, axis=1)
+        return _float4(depths.min(), 1.0 / max(float(np.ptp(depths)), 1e-6), self.look.depth_cue)
+
+
+def _float4(*numbers: float) -> NDArray[np.float32]:
+    vector = np.zeros(4, np.float32)
+    vector[: len(numbers)] = numbers
+    return vector
+
+
+def _find_leaps(resident: ResidentVolume, slab: RaySlab, level: float, stopwatch: Stopwatch) -> LeapMap:
+    """Which bricks reach the level.
+
+    Of the two nodes that a value can be nearest to, the second shows: from half a `unit` above `low` on, which is the
+    level.  Marking takes a hundredth of it off, far more than float32 may be wrong by.
+    """
+    unit = max(1e-3 * abs(level), 1e-6)
+    return resident.find_leaps(
+        slab, ("surface", level), np.array([False, True]), level - 0.5 * unit, 1.0 / unit, stopwatch
+    )
+
+
+def _field_heights(volume: Volume, frame: FieldFrame, ks: Sequence[float]) -> list[float]:
+    """Third field coordinates of slices; infinite ones stay."""
+    if not volume.uneven:
+        return list(ks)
+    return [float(frame.places(volume.ijk_to_lps([(0.0, 0.0, k)]))[0, 2]) if np.isfinite(k) else float(k) for k in ks]
+
+
+def _slices_per_mm(volume: Volume) -> float:
+    """The most slices that a ray crosses in a mm."""
+    origins = volume.slice_origins(border=1)
+    normal = np.cross(volume.affine[:3, 0], volume.affine[:3, 1])
+    gaps = np.abs(np.diff(origins @ (normal / np.linalg.norm(normal))))
+    return float(1.0 / gaps.min())

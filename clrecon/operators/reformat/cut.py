@@ -1,0 +1,343 @@
+"""Slices through a volume in any direction, and curved reformations along a centre line."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from clrecon.anatomy.spine_line import find_spine_line
+from clrecon.errors import UsageError
+from clrecon.geometry import Volume
+from clrecon.geometry.affine import Float64Array
+from clrecon.opencl import Device, Stopwatch, check_memory, choose_device
+from clrecon.operators.reformat.sample import Reformation, sample_sheet
+from clrecon.rendering import Rendering
+from clrecon.rendering.looks.colors import is_transparent
+from clrecon.rendering.looks.window import BONE_WINDOW, checked_window, grey_image
+from clrecon.rendering.views.camera import Camera
+from clrecon.rendering.views.centre_line import Curve
+from clrecon.rendering.views.curved import CurvedSheet, straightened_sheet, stretched_length, stretched_sheet
+from clrecon.rendering.views.directions import checked_size, find_up, find_view
+from clrecon.rendering.views.plane import Sheet, find_plane, finest_step, plane_sheet, positive_mm, slab_samples
+from clrecon.system.progress import Progress
+
+__all__ = ["CURVED_KINDS", "cut_slice", "reformat_curve"]
+
+CURVED_KINDS = ("straightened", "stretched")
+
+DEFAULT_SIZE = (1024, 1024)
+
+WHOLE_SHARE = 0.85
+"""Of the height of a volume; where the spine was found over less, that is said."""
+
+DEFAULT_WIDTH_MM = 120.0
+"""Width of a curved reformation where neither size nor width is given: a vertebra with what lies around it."""
+
+
+class _Job:
+    """What the two kinds of pictures share: the device, how samples are combined, the picture and its report."""
+
+    def __init__(
+        self,
+        volume: Volume,
+        device: Device | str | int | None,
+        thickness: float,
+        combine: str,
+        window: Sequence[float] | None,
+        memory: int | None,
+    ):
+        if not isinstance(volume, Volume):
+            raise UsageError(f"a slice needs a Volume, not {type(volume).__name__}: clrecon.Volume(voxels, affine)")
+        check_memory(memory)
+        self.volume, self.memory, self.combine = volume, memory, combine
+        self.samples = slab_samples(volume, thickness)
+        self.thickness = float(thickness)
+        self.window = checked_window(BONE_WINDOW if window is None else window)
+        self.device = choose_device(device)
+        self.stopwatch = Stopwatch()
+
+    def sample(self, sheet: Sheet, voxels_d: Any, progress: Progress | None) -> Reformation:
+        return sample_sheet(
+            self.device, self.volume, sheet, self.samples, self.combine,
+            memory=self.memory, voxels_d=voxels_d, stopwatch=self.stopwatch, progress=progress,
+        )  # fmt: skip
+
+    def describe(self, made: Reformation, pixel_mm: float) -> dict[str, Any]:
+        return {
+            "pixel_mm": pixel_mm,
+            "thickness_mm": self.thickness,
+            "combine": self.combine if self.samples.intervals else None,
+            "samples_a_pixel": self.samples.intervals + 1,
+            "sample_step_mm": self.samples.step if self.samples.intervals else None,
+            "window_hu": list(self.window),
+            "device": self.device.label,
+            "driver": self.device.driver,
+            "slabs": made.slabs,
+            "device_bytes": made.device_bytes,
+            "seconds": dict(self.stopwatch.seconds),
+            "kernel_seconds": dict(self.stopwatch.by_kernel),
+            "warnings": [],
+        }
+
+
+def cut_slice(
+    volume: Volume,
+    plane: Camera | str | Sequence[float] = "axial",
+    size: Sequence[int] = DEFAULT_SIZE,
+    device: Device | str | int | None = None,
+    *,
+    zoom: float = 1.0,
+    up: str | ArrayLike | None = None,
+    pixel_mm: float | None = None,
+    offset_mm: float = 0.0,
+    thickness: float = 0.0,
+    combine: str = "mean",
+    window: Sequence[float] | None = None,
+    background: str | Sequence[float] = "black",
+    memory: int | None = None,
+    progress: Progress | None = None,
+    voxels_d: Any = None,
+) -> Rendering:
+    """Cut a slice through a volume, in any direction and as thick as wanted (oblique multiplanar reformation).
+
+    Values are those of the trilinear field between voxel centres, through the full affine (shear included) or the
+    positions of all slices where they are uneven; voxels that a pixel meets exactly come out unchanged.
+
+    Parameters
+    ----------
+    volume : Volume
+    plane : Camera, str or (float, float)
+        A camera: the plane through its focal point across its view.  A name: axial, coronal, sagittal through the
+        middle of the volume, as radiologists look at them, or a view as in `Camera.fit`.
+    size : (int, int)
+        Width and height of the picture, pixels.
+    device : Device, str or int, optional
+        See `clrecon.device`.
+    zoom, up, pixel_mm
+        Of a plane by name, see `clrecon.rendering.views.plane.find_plane`.
+    offset_mm : float
+        Moves the plane along the view, away from the camera.
+    thickness : float
+        Mm of the slab around the plane whose samples are combined, half of it to either side; 0 is the plane alone.
+        Samples are at most half the smallest distance of voxels apart, see `clrecon.rendering.views.plane.SlabSamples`.
+    combine : {"mean", "max", "min"}
+        Of the samples that lie within the volume.
+    window : (low, high), optional
+        HU that are black and white; default -450 to 1050, a window for bone.
+    background : str or colour
+        Where there is nothing of the volume; "transparent" leaves opacity 0 there.
+    memory : int, optional
+        Bytes that may be taken on the device; a volume that needs more goes through in slabs.
+    progress : callable, optional
+        Called as ``progress("slabs", slices done, all slices)``.
+    voxels_d : buffer, (nk, nj, ni), optional
+        The volume, where it is on the device already.
+
+    Returns
+    -------
+    Rendering
+        ``values`` in HU, NaN outside of the volume; ``camera`` parallel with its focal point in the plane, ``depth``
+        the plane's distance from it.
+
+    Raises
+    ------
+    UsageError
+        Unknown plane, impossible numbers, or a plane that misses the volume.
+    DeviceError
+        No device, two slices and the picture do not fit it, or it fails.
+    """
+    job = _Job(volume, device, thickness, combine, window, memory)
+    width, height = checked_size(size)
+    if isinstance(plane, Camera):
+        if pixel_mm is not None or zoom != 1.0 or up is not None:
+            raise UsageError("zoom, up and the size of pixels are those of the camera: leave them out, or the camera")
+        camera = plane
+    else:
+        camera = find_plane(volume, plane, (width, height), zoom=zoom, up=up, pixel_mm=pixel_mm)
+    sheet, camera = plane_sheet(camera, (width, height), offset_mm)
+    made = job.sample(sheet, voxels_d, progress)
+    there = ~np.isnan(made.values)
+    if not there.any():
+        raise UsageError(_describe_miss(volume, camera))
+    depth = np.where(there, np.float32(camera.distance), np.float32(np.nan))
+    report = job.describe(made, camera.pixel_mm((width, height))) | _describe_plane(camera)
+    image = grey_image(made.values, job.window)
+    seen = Rendering(image, depth, depth.copy(), camera, made.values, mode="slice", report=report)
+    return seen if is_transparent(background) else seen.with_background(background)
+
+
+def _describe_plane(camera: Camera) -> dict[str, Any]:
+    right, up, forward = camera.basis()
+    return {
+        "plane": {
+            "point_lps_mm": list(camera.focal_point),
+            "normal_lps": forward.tolist(),
+            "right_lps": right.tolist(),
+            "up_lps": up.tolist(),
+        }
+    }
+
+
+def _describe_miss(volume: Volume, camera: Camera) -> str:
+    from clrecon.rendering.views.camera import box_corners
+
+    along = (box_corners(volume) - camera.focal_point) @ camera.basis().forward
+    if along.min() > 0.0 or along.max() < 0.0:
+        return (
+            f"the slice misses the volume, which lies {along.min():.1f} to {along.max():.1f} mm further along the view:"
+            " choose an offset between"
+        )
+    return "the picture shows nothing of the volume: look at its place, or make it larger"
+
+
+def reformat_curve(
+    volume: Volume,
+    curve: Curve | ArrayLike | str = "spine",
+    kind: str = "straightened",
+    size: Sequence[int] | None = None,
+    device: Device | str | int | None = None,
+    *,
+    view: str | Sequence[float] = "left",
+    up: str | ArrayLike | None = None,
+    angle: float = 0.0,
+    pixel_mm: float | None = None,
+    width_mm: float | None = None,
+    thickness: float = 0.0,
+    combine: str = "mean",
+    window: Sequence[float] | None = None,
+    background: str | Sequence[float] = "black",
+    memory: int | None = None,
+    progress: Progress | None = None,
+    voxels_d: Any = None,
+) -> Rendering:
+    """Curved planar reformation: a picture along a centre line, from its upper end to its lower.
+
+    Parameters
+    ----------
+    volume : Volume
+    curve : Curve, array_like of shape (n, 3), or "spine"
+        Points of the centre line in LPS mm, all within the volume; a smooth curve is laid through them.  "spine" looks
+        for the spinal canal, see `clrecon.anatomy.spine_line`.
+    kind : {"straightened", "stretched"}
+        Straightened: the centre line is a straight line down the picture, each row lies across it.  Stretched: rows
+        keep one direction in the patient, the picture is the surface that they make, unrolled; all lengths within
+        that surface are kept.  See `clrecon.rendering.views.curved`.
+    size : (int, int), optional
+        Width and height of the picture; default: as many pixels as the curve is long, and `width_mm`.
+    device : Device, str or int, optional
+        See `clrecon.device`.
+    view, up : str or direction
+        The side that one looks from, as in `Camera.fit`, says which direction runs to the right and which end of the
+        curve is at the top: left (a sagittal picture of the spine, the front at the left), anterior (a coronal one).
+    angle : float
+        Degrees by which the rows of a straightened picture are turned about the centre line.
+    pixel_mm : float, optional
+        Side of a pixel; default: the curve fills the height of `size`, else the smallest distance of voxels.
+    width_mm : float, optional
+        Width of the picture where no `size` is given; default 120 mm.
+    thickness, combine, window, background, memory, progress, voxels_d
+        As in `cut_slice`; the slab lies across the picture.
+
+    Returns
+    -------
+    Rendering
+        ``values`` in HU, NaN outside of the volume and beyond the ends of the curve; no camera and no depths.
+        ``report["curve"]`` has the length, the arc length of each row and the column of the centre line in it.
+
+    Raises
+    ------
+    UsageError
+        Points that are none, too few or outside of the volume, an unknown kind or view, impossible numbers, a curve
+        that runs along the rows.
+    RefusedInputError
+        No spine that one could be sure of.
+    DeviceError
+        No device, two slices and the picture do not fit it, or it fails.
+    """
+    job = _Job(volume, device, thickness, combine, window, memory)
+    if not isinstance(kind, str) or kind not in CURVED_KINDS:
+        raise UsageError(f"a curved reformation is {' or '.join(CURVED_KINDS)}, not {kind!r}")
+    if not np.isfinite(angle) or (angle != 0.0 and kind == "stretched"):
+        raise UsageError(f"the angle turns straightened pictures, in degrees: not {angle!r} in a {kind} one")
+    line, found = _find_line(volume, curve)
+    across, top = _find_directions(view, up)
+    turned = bool((line.points[-1] - line.points[0]) @ top > 0.0)
+    line = line.reversed() if turned else line
+    length = line.length if kind == "straightened" else stretched_length(line, across)
+    (width, height), pixel = _fit_picture(volume, length, size, pixel_mm, width_mm)
+    if kind == "straightened":
+        curved = straightened_sheet(line, across, (width, height), pixel, float(angle))
+    else:
+        curved = stretched_sheet(line, across, (width, height), pixel)
+    made = job.sample(curved.sheet, voxels_d, progress)
+    made.values[np.isnan(curved.arc)] = np.nan
+    nowhere = np.full((height, width), np.nan, np.float32)
+    report = job.describe(made, pixel) | {"curve": _describe_curve(line, curved, kind, across, turned)}
+    report["curve"] |= {"angle_deg": float(angle), "found": found}
+    if found is not None and found["height_mm"] < WHOLE_SHARE * found["searched_mm"]:
+        report["warnings"].append(
+            f"the spine was found over {found['height_mm']:.0f} mm of the {found['searched_mm']:.0f} mm of the volume"
+        )
+    image = grey_image(made.values, job.window)
+    seen = Rendering(image, nowhere, nowhere.copy(), None, made.values, mode="cpr", report=report)
+    return seen if is_transparent(background) else seen.with_background(background)
+
+
+def _find_line(volume: Volume, curve: Curve | ArrayLike | str) -> tuple[Curve, dict[str, Any] | None]:
+    """The centre line, and what is known of it where it was looked for."""
+    if isinstance(curve, str):
+        if curve != "spine":
+            raise UsageError(f"a centre line is its points in LPS mm, or 'spine' to look for it: not {curve!r}")
+        spine = find_spine_line(volume)
+        known = {"height_mm": spine.height_mm, "searched_mm": spine.searched_mm, "sure_share": spine.sure_share}
+        return Curve(spine.points), known | {"points_lps_mm": spine.points.round(3).tolist()}
+    line = curve if isinstance(curve, Curve) else Curve(curve)
+    line.check_within(volume)
+    return line, None
+
+
+def _find_directions(view: str | Sequence[float], up: str | ArrayLike | None) -> tuple[Float64Array, Float64Array]:
+    """Directions in LPS to the right and to the top of a view."""
+    towards, default_up = find_view(view)
+    camera = Camera(tuple(towards), (0.0, 0.0, 0.0), tuple(default_up if up is None else find_up(up)), 30.0)
+    right, top, _ = camera.basis()
+    return right, top
+
+
+def _fit_picture(
+    volume: Volume, length: float, size: Sequence[int] | None, pixel_mm: float | None, width_mm: float | None
+) -> tuple[tuple[int, int], float]:
+    if pixel_mm is not None:
+        pixel = positive_mm("the size of a pixel", pixel_mm)
+    elif size is not None:
+        pixel = length / checked_size(size)[1]
+    else:
+        pixel = finest_step(volume)
+    if size is not None:
+        if width_mm is not None:
+            raise UsageError("the width of a picture is given by its size or in mm, not by both")
+        return checked_size(size), pixel
+    width = positive_mm("the width of the picture", DEFAULT_WIDTH_MM if width_mm is None else width_mm)
+    return checked_size((max(round(width / pixel), 1), max(round(length / pixel), 1))), pixel
+
+
+def _describe_curve(line: Curve, curved: CurvedSheet, kind: str, across: Float64Array, turned: bool) -> dict[str, Any]:
+    radius = line.smallest_radius()
+    return {
+        "kind": kind,
+        "across_lps": across.tolist(),
+        "points": len(line.points),
+        "length_mm": line.length,
+        "smallest_radius_mm": radius if np.isfinite(radius) else None,
+        "reversed": turned,
+        "arc_mm": _rounded(curved.arc),
+        "column": _rounded(curved.columns),
+    }
+
+
+def _rounded(values: NDArray[Any]) -> list[float | None]:
+    """Values for JSON, None where there is none."""
+    return [None if np.isnan(value) else round(float(value), 4) for value in values]

@@ -1,0 +1,142 @@
+"""Ranges of the bricks of a volume: measured once, they spare every later pass the bricks that it need not look at."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from clrecon.opencl import (
+    Device,
+    Program,
+    Stopwatch,
+    allocate,
+    launch,
+    load_program,
+)
+from clrecon.operators.resident.voxel_types import voxel_variants
+
+__all__ = ["BRICK", "BrickRanges", "BrickStates", "compare_bricks", "measure_bricks", "prepare_bricks"]
+
+BRICK = 8
+"""Voxels along each side of a brick, as in cl/bricks/bricks.h."""
+
+
+@dataclass(frozen=True)
+class BrickRanges:
+    """Lowest and highest value of every brick, on the device.
+
+    Attributes
+    ----------
+    ranges_d : buffer, (bk, bj, bi, 2) of the voxels' type
+    shape : (bi, bj, bk)
+    dtype : dtype of the voxels
+    """
+
+    ranges_d: Any
+    shape: tuple[int, int, int]
+    dtype: np.dtype[Any]
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes on the device."""
+        bi, bj, bk = self.shape
+        return 2 * bi * bj * bk * int(self.dtype.itemsize)
+
+
+@dataclass(frozen=True)
+class BrickStates:
+    """How words of 32 samples compare with an iso value, for all rows of voxels of a row of bricks.
+
+    Attributes
+    ----------
+    states_d : buffer, (bk, bj, words) uint8
+    extents_d : buffer, (bk, bj, 2) uint16
+    """
+
+    states_d: Any
+    extents_d: Any
+
+
+def prepare_bricks(device: Device, dtype: np.dtype[Any]) -> Program:
+    """Build the kernels for volumes of `dtype`."""
+    return load_program(device, "bricks/ranges.cl", voxel_variants(dtype))
+
+
+def measure_bricks(
+    device: Device,
+    voxels_d: Any,
+    shape_ijk: tuple[int, int, int],
+    dtype: np.dtype[Any],
+    *,
+    stopwatch: Stopwatch | None = None,
+) -> BrickRanges:
+    """Find the lowest and highest value of each brick of 8 x 8 x 8 voxels.
+
+    Parameters
+    ----------
+    device : Device
+    voxels_d : buffer, (nk, nj, ni) of `dtype`, without NaN
+    shape_ijk : (ni, nj, nk)
+    dtype : dtype
+    stopwatch : Stopwatch, optional
+
+    Returns
+    -------
+    BrickRanges
+        Bricks at the upper ends of the volume may be smaller.
+
+    Raises
+    ------
+    DeviceError
+        The device fails.
+    """
+    bi, bj, bk = (-(-n // BRICK) for n in shape_ijk)
+    ranges_d = allocate(device, 2 * bi * bj * bk * dtype.itemsize)
+    launch(
+        device, prepare_bricks(device, dtype)["measure_bricks"], bi * bj * bk,
+        voxels_d, ranges_d, *(np.int32(n) for n in shape_ijk), *(np.uint32(n) for n in (bi, bj, bk)),
+        stopwatch=stopwatch,
+    )  # fmt: skip
+    return BrickRanges(ranges_d, (bi, bj, bk), dtype)
+
+
+def compare_bricks(
+    device: Device,
+    ranges: BrickRanges,
+    level: Any,
+    ni: int,
+    border: int,
+    *,
+    stopwatch: Stopwatch | None = None,
+) -> BrickStates:
+    """Say of each word of 32 samples what its bricks say: all outside (0), all inside (1) or mixed (2).
+
+    Parameters
+    ----------
+    device : Device
+    ranges : BrickRanges
+    level : scalar of the voxels' type
+        Lowest inside value.
+    ni : int
+        Voxels a row.
+    border : int
+        Word w begins at voxel ``32 * w - border``, and there are samples up to ``ni - 1 + border``.  Those beyond the
+        volume do not count.
+    stopwatch : Stopwatch, optional
+
+    Returns
+    -------
+    BrickStates
+        With the extent of each row of bricks: the first word that is not all outside, and the one after the last.
+    """
+    _, bj, bk = ranges.shape
+    words = -(-(ni + 2 * border) // 32)
+    states_d, extents_d = allocate(device, words * bj * bk), allocate(device, 4 * bj * bk)
+    launch(
+        device, prepare_bricks(device, ranges.dtype)["compare_bricks"], bj * bk,
+        ranges.ranges_d, states_d, extents_d, level, np.int32(ni), np.int32(border), np.uint32(words),
+        np.uint32(bj * bk), stopwatch=stopwatch,
+    )  # fmt: skip
+    return BrickStates(states_d, extents_d)

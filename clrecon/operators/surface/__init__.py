@@ -1,0 +1,1 @@
+"""Surfaces at an iso value, of labels and of their masks."""

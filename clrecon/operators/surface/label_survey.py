@@ -1,0 +1,85 @@
+"""Survey a label map: where each label lies, and how many of its voxels' faces it shares with others.
+
+The host side of cl/labels/survey.cl; without room on the device for the whole map, numpy does it here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import DTypeLike, NDArray
+
+from clrecon.labels import LabelMap
+from clrecon.labels.enclosed import count_faces
+from clrecon.labels.solid import Box, find_boxes
+from clrecon.opencl import (
+    Device,
+    Program,
+    Stopwatch,
+    allocate,
+    describe_shortage,
+    download,
+    launch,
+    load_program,
+    memory_limits,
+    upload,
+)
+from clrecon.operators.resident.voxel_types import label_variants
+
+__all__ = ["prepare_survey", "survey_labels"]
+
+
+def prepare_survey(device: Device, label_dtype: DTypeLike = np.uint8) -> Program:
+    """Build the kernels for labels of this type.
+
+    Raises
+    ------
+    DeviceError
+        The driver's compiler refuses.
+    """
+    return load_program(device, "labels/survey.cl", label_variants(label_dtype))
+
+
+def survey_labels(
+    labels: LabelMap, device: Device, memory: int | None, stopwatch: Stopwatch
+) -> tuple[dict[int, Box], NDArray[np.integer[Any]]]:
+    """The box (k, j, i) of each label and the samples around it, and the table of `count_faces`.
+
+    Parameters
+    ----------
+    labels : LabelMap
+        With one label at least.
+    memory : int, optional
+        Bytes that may be taken on the device; None is all that it has.
+    """
+    voxels, size = labels.voxels, labels.numbers[-1] + 1
+    boxes, faces = np.empty((size, 6), np.int32), np.zeros((size, 2), np.uint32)
+    touch = len(labels.numbers) > 1
+    needs = {"labels": voxels.nbytes, "boxes": boxes.nbytes, "faces": faces.nbytes}
+    if describe_shortage(memory_limits(device, memory), needs):
+        return find_boxes(voxels, labels.numbers, (0, 0, 0)), count_faces(voxels) if touch else faces
+    with stopwatch.timed("build"):
+        program = prepare_survey(device, voxels.dtype)
+    with stopwatch.timed("upload"):
+        map_d = upload(device, voxels)
+    boxes_d, faces_d = allocate(device, boxes.nbytes), allocate(device, faces.nbytes)
+    ni, nj, nk = labels.shape_ijk
+    grid = [np.int32(n) for n in (ni, nj, nk)]
+    with stopwatch.running(device):
+        launch(device, program["clear_survey"], size, boxes_d, faces_d, np.uint32(size), stopwatch=stopwatch)
+        launch(device, program["find_boxes"], nj * nk, map_d, boxes_d, *grid, stopwatch=stopwatch)
+        if touch:
+            launch(device, program["count_faces"], nj * nk, map_d, faces_d, *grid, stopwatch=stopwatch)
+    return _widen(download(device, boxes, boxes_d), labels.numbers, (ni, nj, nk)), download(device, faces, faces_d)
+
+
+def _widen(table: NDArray[np.int32], numbers: Sequence[int], shape_ijk: tuple[int, int, int]) -> dict[int, Box]:
+    """The boxes of a table of lowest and highest i, j, k, one sample wider each way within the map."""
+    boxes: dict[int, Box] = {}
+    for number in numbers:
+        low, high = np.maximum(table[number, :3] - 1, 0), np.minimum(table[number, 3:] + 2, shape_ijk)
+        i, j, k = (slice(int(begin), int(end)) for begin, end in zip(low, high, strict=True))
+        boxes[number] = (k, j, i)
+    return boxes

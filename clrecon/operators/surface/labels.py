@@ -1,0 +1,376 @@
+"""Extract the surfaces of labels: the label picks the cells, HU place the vertices.
+
+The host side of cl/labels/own_samples.cl; counting and writing are those of cl/isosurface/marching_cubes.cl.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import DTypeLike
+
+from clrecon.errors import NoSurfaceError, UsageError
+from clrecon.geometry import Volume
+from clrecon.geometry.iso_rule import IsoRule, choose_iso_rule
+from clrecon.geometry.precision import describe_far
+from clrecon.labels import LabelMap, ResampledLabels, resample_labels
+from clrecon.labels.growth import Growth
+from clrecon.labels.solid import Box, fill_solid, find_boxes
+from clrecon.labels.volumes import count_ml, label_ml, slice_voxel_ml
+from clrecon.mesh import Mesh
+from clrecon.opencl import (
+    Device,
+    Program,
+    Stopwatch,
+    allocate,
+    check_budget,
+    choose_device,
+    describe_shortage,
+    download,
+    launch,
+    load_program,
+    memory_limits,
+    upload,
+)
+from clrecon.opencl.quirks import cache_warnings
+from clrecon.operators.resident.slabs import SampleGrid, Slab
+from clrecon.operators.resident.voxel_types import label_variants, voxel_variants
+from clrecon.operators.surface import marching_cubes
+from clrecon.operators.surface.extract import Part, voxel_level
+from clrecon.operators.surface.marching_cubes import Classified, Placement
+from clrecon.system.progress import Progress
+
+__all__ = ["Window", "choose_numbers", "extract_labels", "prepare_labels"]
+
+SPARE_SLICES = 3
+"""Beyond the label's box: the far end of a crossed edge, what its gradient needs, and the last slices of the mask."""
+
+
+@dataclass(frozen=True)
+class _Held:
+    """The slices of a volume that the device holds, and what is inside of which label in them."""
+
+    first: int
+    end: int
+    voxels_d: Any
+    inside_d: Any
+
+
+@dataclass(frozen=True)
+class Window(Slab):
+    """The slices of the sample grid that hold one label and a layer around it, of what the device holds."""
+
+    held: tuple[int, int] = (0, 0)
+
+    @property
+    def voxel_slices(self) -> tuple[int, int]:
+        """First and end of the slices of the volume that the device holds."""
+        return self.held
+
+
+def prepare_labels(
+    device: Device, dtype: DTypeLike = np.int16, label_dtype: DTypeLike = np.uint8, uneven: bool = False
+) -> tuple[Program, Program]:
+    """Build the kernels for volumes and labels of these types: those that find what is inside, those of the surface.
+
+    Raises
+    ------
+    DeviceError
+        The driver's compiler refuses.
+    """
+    variants = {**voxel_variants(dtype), **label_variants(label_dtype)}
+    own = load_program(device, "labels/own_samples.cl", variants)
+    return own, marching_cubes.prepare_marching_cubes(device, dtype, label_dtype, uneven)
+
+
+def choose_numbers(labels: LabelMap, numbers: Sequence[int | str] | None) -> tuple[int, ...]:
+    """The numbers of the labels that are asked for, each once; all that are there where none are named."""
+    if numbers is None:
+        return labels.numbers
+    chosen = tuple(dict.fromkeys(labels.find(number) for number in numbers))
+    if not chosen:
+        raise UsageError("choose at least one label")
+    return chosen
+
+
+class _Run:
+    """One extraction: what is common to its labels."""
+
+    def __init__(
+        self, volume: Volume, taken: ResampledLabels, rule: IsoRule, growth: Growth, device: Device, solid: bool
+    ):
+        self.volume = volume
+        self.labels = taken.voxels
+        self.rule = rule
+        self.growth = growth
+        self.device = device
+        self.solid = solid
+        self.stopwatch = Stopwatch()
+        self.groups = 1
+        self.share_by_hu = 1.0  # of the vertices of the label that was extracted last
+        self.device_bytes: dict[str, int] = {}
+        self.grid = SampleGrid(volume, rule)
+        self.level = voxel_level(device, volume, rule)
+        self.placement = Placement.of(volume, rule.border)
+        with self.stopwatch.timed("build"):
+            self.own, self.surface = prepare_labels(device, volume.voxels.dtype, taken.voxels.dtype, volume.uneven)
+
+    def slices_for(self, boxes: dict[int, Box]) -> tuple[int, int]:
+        """First and end of the slices of the volume that these labels need."""
+        spare = SPARE_SLICES + self.growth.reach[2]  # labels that are not asked for grow too
+        first = max(0, min(box[0].start for box in boxes.values()) - spare)
+        return first, min(self.volume.shape_ijk[2], max(box[0].stop for box in boxes.values()) + spare)
+
+    def needs(self, first: int, end: int) -> dict[str, int]:
+        """Bytes on the device while what is inside is found in these slices."""
+        samples = self.volume.voxels[first:end].size
+        size = samples * self.labels.itemsize
+        return {"volume": samples * self.volume.voxels.itemsize, "labels": size, "inside": size}
+
+    def group(self, boxes: dict[int, Box], memory: int | None) -> list[dict[int, Box]]:
+        """All labels at once where their slices fit the device, else one by one: the meshes are the same."""
+        room = memory_limits(self.device, memory)
+        needs = self.needs(*self.slices_for(boxes))
+        scratch = max(sum(self.window(box, (0, 0)).scratch().values()) for box in boxes.values())
+        if not describe_shortage(room, {**needs, "scratch": min(scratch, room.buffer_bytes)}):
+            return [boxes]
+        return [{number: box} for number, box in boxes.items()]
+
+    def find_inside(self, boxes: dict[int, Box], memory: int | None) -> _Held:
+        """Upload the slices that the labels need, and find what is inside of which label."""
+        device, stopwatch = self.device, self.stopwatch
+        first, end = self.slices_for(boxes)
+        check_budget(device, self.needs(first, end), memory)
+        labels = self.labels[first:end]
+        near = np.concatenate([self.growth.offsets, self.growth.shells[:, None]], axis=1)
+        with stopwatch.timed("upload"):
+            voxels_d = upload(device, self.volume.voxels[first:end])
+            labels_d = upload(device, labels)
+            near_d = upload(device, near if len(near) else np.zeros((1, 4), np.int32))
+        inside_d = allocate(device, labels.nbytes)
+        with stopwatch.running(device):
+            launch(
+                device, self.own["own_samples"], labels.size, voxels_d, labels_d, near_d, inside_d, self.level,
+                *(np.int32(n) for n in labels.shape[::-1]), np.int32(len(near)),
+                stopwatch=stopwatch,
+            )  # fmt: skip
+        if self.solid:
+            inside_d = self._fill(boxes, first, end, inside_d)
+        return _Held(first, end, voxels_d, inside_d)
+
+    def _fill(self, boxes: dict[int, Box], first: int, end: int, inside_d: Any) -> Any:
+        """What is inside with the labels made solid, on the device again."""
+        inside = np.zeros(self.labels.shape, dtype=self.labels.dtype)
+        part = inside[first:end]
+        with self.stopwatch.timed("download"):
+            download(self.device, part, inside_d)
+        for number, box in boxes.items():
+            fill_solid(inside, self.labels, number, box, self.rule.closed)
+        with self.stopwatch.timed("upload"):
+            return upload(self.device, part)
+
+    def window(self, box: Box, held: tuple[int, int]) -> Window:
+        """The slices of the sample grid around a label's box."""
+        return Window(self.grid, box[0].start, box[0].stop + 2 * self.rule.border, held)
+
+    def extract_one(self, held: _Held, number: int, box: Box, memory: int | None) -> Part | None:
+        """Positions, normals and triangles of one label, None where nothing is inside of it."""
+        device, stopwatch = self.device, self.stopwatch
+        window = self.window(box, (held.first, held.end))
+        needs = {**self.needs(held.first, held.end), **window.scratch()}
+        check_budget(device, needs, memory)
+        mask_d = allocate(device, 4 * window.mask_rows * self.grid.words)
+        half_way_d = allocate(device, 4)
+        classified = Classified(mask_d, allocate(device, 4 * window.mask_rows))
+        with stopwatch.running(device):
+            launch(
+                device, self.own["classify_label"], window.mask_rows,
+                held.inside_d, mask_d, classified.row_extents_d, half_way_d, np.uint32(number),
+                *marching_cubes.volume_scalars(window), np.uint32(window.mask_slices), np.int32(self.grid.words),
+                stopwatch=stopwatch,
+            )  # fmt: skip
+            counted = marching_cubes.count(device, window, self.surface, classified, stopwatch)
+        if counted.triangles == 0:
+            return None
+        output = counted.output()
+        check_budget(device, {**needs, **output}, memory)
+        scratch = window.scratch()
+        self.device_bytes = {
+            "volume": sum(needs.values()) - sum(scratch.values()),
+            "scratch": sum(scratch.values()),
+            "output": sum(output.values()),
+        }
+        part = marching_cubes.emit(
+            device, window, self.surface, held.voxels_d, classified, counted, self.placement, 0, stopwatch,
+            (held.inside_d, np.uint32(number), half_way_d),
+        )  # fmt: skip
+        half_way = int(download(device, np.empty(1, np.uint32), half_way_d)[0])
+        self.share_by_hu = 1.0 - half_way / counted.vertices
+        return part
+
+    def describe(self) -> dict[str, Any]:
+        """What the reports of all labels have in common."""
+        rule = self.rule
+        return {
+            **rule.as_report(),
+            "surface": "hu",
+            "mask_level": None,
+            "closed_at_border": rule.closed,
+            "outside_hu": rule.outside if rule.closed else None,
+            "affine_ijk_to_lps_mm": self.volume.affine.tolist(),
+            "certificate": self.volume.report,
+            "device": self.device.label,
+            "driver": self.device.driver,
+            "slabs": self.groups,
+            "device_bytes": self.device_bytes,
+            "grow_mm": self.growth.grow_mm,
+            "solid": self.solid,
+            "seconds": dict(self.stopwatch.seconds),
+            "kernel_seconds": dict(self.stopwatch.by_kernel),
+            "warnings": [
+                *cache_warnings(),
+                *describe_far(self.volume),
+                *_warn_of_uneven_growth(self.volume, self.growth),
+            ],
+        }
+
+
+def _warn_of_uneven_growth(volume: Volume, growth: Growth) -> list[str]:
+    """Offsets to the samples around are one table for all slices, so growth takes the slices as evenly spaced."""
+    if not volume.uneven or not len(growth.offsets):
+        return []
+    steps = np.linalg.norm(np.diff(volume.slice_origins(), axis=0), axis=1)
+    return [
+        f"the slices are unevenly spaced ({steps.min():.3f} to {steps.max():.3f} mm): the growth of the labels takes"
+        f" {volume.spacing[2]:.3f} mm from one to the next everywhere"
+    ]
+
+
+def _refuse_label(volume: Volume, taken: ResampledLabels, label: str, number: int, rule: IsoRule) -> NoSurfaceError:
+    mask = taken.voxels == number
+    if not mask.any():
+        return NoSurfaceError(f"label {label} has no voxel in the CT: it lies outside")
+    hu = volume.voxels[mask]
+    return NoSurfaceError(
+        f"no surface of label {label} at {rule.iso_value:g} HU: its voxels run from {float(hu.min()):g} to"
+        f" {float(hu.max()):g} HU"
+    )
+
+
+def extract_labels(
+    volume: Volume,
+    labels: LabelMap,
+    iso_value: float,
+    device: Device | str | int | None = None,
+    *,
+    numbers: Sequence[int | str] | None = None,
+    grow_mm: float | None = None,
+    closed: bool = True,
+    solid: bool = False,
+    memory: int | None = None,
+    progress: Progress | None = None,
+) -> dict[int, Mesh]:
+    """Extract the iso surface of a volume label by label: the label picks the cells, HU place the vertices.
+
+    A voxel is inside of a label when it is dense (`iso_value` or more) and the label owns it: by the map, or, without
+    a label there, as the nearest one within the growth.  Between a dense voxel of the label and one that is neither
+    dense nor of any label the vertex is that of `extract_isosurface`, bit for bit.  Elsewhere (the border of two
+    labels, dense voxels beyond the growth) it lies half way.  Every mesh is closed and manifold; two labels share the
+    vertices of their border, bit for bit.
+
+    Parameters
+    ----------
+    volume : Volume
+    labels : LabelMap
+        On any grid, see `clrecon.labels.resample_labels`.
+    iso_value : float
+        HU.
+    device : Device, str or int, optional
+        See `clrecon.device`; None is the best of the machine.
+    numbers : sequence of int or str, optional
+        Labels to extract, as `LabelMap.find` takes them; each must have a surface.  None: all that have one.
+    grow_mm : float, optional
+        None is one voxel each way, the 26 neighbours.
+    closed : bool
+        As `extract_isosurface`.
+    solid : bool
+        Fill what is less dense within a label, see `clrecon.labels.solid`.
+    memory : int, optional
+        Bytes that may be taken on the device; None is all that it has.  Where the slices of all labels do not fit
+        together, the labels go through one by one; the meshes are the same.
+    progress : callable, optional
+        Called as ``progress("labels", done, total)``.
+
+    Returns
+    -------
+    dict of int to Mesh
+        In the order asked for, else ascending.  `Mesh.report` has, beside what `extract_isosurface` says, ``label``,
+        ``label_name``, ``label_inside_share`` (of the labelled voxels, in the volume), ``label_ml`` (volume of its
+        voxels, on the map's own grid), ``label_taken_ml`` (the same on the grid of the volume),
+        ``vertices_by_hu_share``, ``grow_mm`` and ``solid``.
+
+    Raises
+    ------
+    NoSurfaceError
+        A label that was asked for, or every label, has no dense voxel; the message gives the range of its HU.
+    UsageError
+        Not a Volume and a LabelMap, an unknown label, or as `extract_isosurface`.
+    RefusedInputError
+        The labels do not lie on the volume.
+    DeviceError
+        As `extract_isosurface`.
+    """
+    taken = resample_labels(labels, volume)
+    chosen = choose_numbers(labels, numbers)
+    rule = choose_iso_rule(volume, iso_value, closed)
+    marching_cubes.check_row(volume.shape_ijk[0])
+    growth = Growth.of(volume, grow_mm)
+    boxes = find_boxes(taken.voxels, chosen, growth.reach)
+    names = {number: f"{number} {labels.name(number)}" for number in chosen}
+    voxel_ml = slice_voxel_ml(volume)
+    missing = [number for number in chosen if number not in boxes]
+    if missing and numbers is not None:
+        raise _refuse_label(volume, taken, names[missing[0]], missing[0], rule)
+    run = _Run(volume, taken, rule, growth, choose_device(device), solid)
+    meshes: dict[int, Mesh] = {}
+    groups = run.group(boxes, memory) if boxes else []
+    run.groups = len(groups)
+    for group in groups:
+        held = run.find_inside(group, memory)
+        for number, box in group.items():
+            if progress is not None:
+                progress("labels", len(meshes), len(boxes))
+            part = run.extract_one(held, number, box, memory)
+            if part is None:
+                if numbers is not None:
+                    raise _refuse_label(volume, taken, names[number], number, rule)
+                continue
+            report = {
+                **run.describe(),
+                "label": number,
+                "label_name": labels.name(number),
+                "label_inside_share": taken.inside[number],
+                "label_ml": label_ml(labels, number),
+                "label_taken_ml": count_ml(taken.voxels, number, box, voxel_ml),
+                "vertices_by_hu_share": run.share_by_hu,
+            }
+            report["warnings"] += _warn(taken, report)
+            positions, normals, triangles = part
+            meshes[number] = Mesh(run.placement.to_lps(positions), triangles, normals, report)
+            run.stopwatch = Stopwatch()  # what is common to all labels counts for the first
+    if not meshes:
+        raise NoSurfaceError(f"no label has a voxel of {rule.iso_value:g} HU or more in the CT")
+    return meshes
+
+
+def _warn(taken: ResampledLabels, report: dict[str, Any]) -> list[str]:
+    warnings = list(taken.warnings)
+    if report["label_inside_share"] < 1.0:
+        share = 100.0 * (1.0 - report["label_inside_share"])
+        warnings.append(
+            f"{share:.3g} % of label {report['label']} lie outside the CT: its surface ends where the CT does"
+        )
+    return warnings

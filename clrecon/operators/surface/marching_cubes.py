@@ -1,0 +1,393 @@
+"""The passes of cl/isosurface/marching_cubes.cl on one slab of a volume."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import DTypeLike, NDArray
+
+from clrecon.errors import DeviceError, DeviceMemoryError, UsageError
+from clrecon.geometry import Volume
+from clrecon.geometry.iso_rule import layer_margins, layer_normal_matrices, slice_normal_matrices, vertex_margin
+from clrecon.geometry.precision import find_vertex_origin
+from clrecon.opencl import (
+    Device,
+    Program,
+    Stopwatch,
+    allocate,
+    download,
+    empty_output,
+    launch,
+    load_program,
+    upload,
+)
+from clrecon.operators.primitives.compaction import exclusive_scan, prepare_scan
+from clrecon.operators.resident.bricks import BrickStates
+from clrecon.operators.resident.slabs import Slab
+from clrecon.operators.resident.voxel_types import label_variants, voxel_variants
+from clrecon.operators.surface.trilinear import CellVertices, count_cells, emit_cells
+
+__all__ = [
+    "Classified",
+    "Counted",
+    "Emission",
+    "Placement",
+    "check_row",
+    "classify",
+    "count",
+    "emit",
+    "prepare_marching_cubes",
+    "volume_scalars",
+]
+
+LONGEST_ROW = 13_000
+"""Samples a row: places in a row are 16-bit numbers, and a cell has at most 5 triangles."""
+
+
+def check_row(ni: int) -> None:
+    """Refuse rows that are too long.
+
+    Raises
+    ------
+    UsageError
+    """
+    if ni + 2 > LONGEST_ROW:
+        raise UsageError(f"the volume has {ni:,} columns, {LONGEST_ROW - 2:,} are supported")
+
+
+@dataclass(frozen=True)
+class Classified:
+    """What `classify` leaves on the device of one slab."""
+
+    mask_d: Any
+    row_extents_d: Any
+
+
+@dataclass(frozen=True)
+class Counted:
+    """What `count` leaves on the device of one slab, and the totals of the slab's own rows.
+
+    `cells` is there where the topology is that of the trilinear field.
+    """
+
+    row_offsets_d: Any
+    word_vertices_d: Any
+    word_triangles_d: Any
+    active_words_d: Any
+    vertices: int
+    triangles: int
+    active_words: int
+    cells: CellVertices | None = None
+
+    def output(self) -> dict[str, int]:
+        """Bytes of the slab's mesh."""
+        return {"vertices": 24 * self.vertices, "triangles": 12 * self.triangles}
+
+
+def prepare_marching_cubes(
+    device: Device,
+    dtype: DTypeLike,
+    labels: DTypeLike | None = None,
+    uneven: bool = False,
+    inside: str = "above",
+    *,
+    masks: bool = False,
+) -> Program:
+    """Build the kernels for volumes of `dtype`; with `labels`, their type, those whose emit_vertices takes labels.
+
+    With `uneven` those for volumes whose slices no affine places; `inside` as `IsoRule.inside`; with `masks` those for
+    labels' own surfaces, whose volumes are occupancies.
+
+    Raises
+    ------
+    DeviceError
+        The driver's compiler refuses.
+    """
+    prepare_scan(device)
+    variants = {**voxel_variants(dtype), **device.kernel_variants}
+    if inside == "between":
+        variants["RANGE"] = "1"
+    if labels is None:
+        _load_classify(device, dtype, inside)
+    else:
+        variants.update({"MASKS" if masks else "LABELS": "1"}, **label_variants(labels))
+    if uneven:
+        variants["UNEVEN"] = "1"
+    return load_program(device, "isosurface/marching_cubes.cl", variants)
+
+
+def _load_classify(device: Device, dtype: DTypeLike, inside: str = "above") -> Program:
+    own = {"above": {}, "below": {"BORDER_INSIDE": "1"}, "between": {"RANGE": "1"}}[inside]
+    variants = {**voxel_variants(dtype), **device.kernel_variants, **own}
+    return load_program(device, "isosurface/classify.cl", variants)
+
+
+def _pad4(rows: NDArray[np.float64]) -> NDArray[np.float32]:
+    """Rows of three as rows of four float32, for float4."""
+    padded = np.zeros((*rows.shape[:-1], 4), dtype=np.float32)
+    padded[..., :3] = rows
+    return padded
+
+
+def _split(values: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Split into a part of 12 significant bits and the rest: 12-bit parts times whole numbers < 4096 are exact."""
+    mantissa, exponent = np.frexp(values)
+    head = np.ldexp(np.round(np.ldexp(mantissa, 12)), exponent - 12)
+    return head, values - head
+
+
+@dataclass(frozen=True)
+class Placement:
+    """Where the samples of a grid are in mm, as emit_vertices takes it.
+
+    Attributes
+    ----------
+    slice_frames : ndarray, shape (gk, 9, 4), float32
+    steps : ndarray, shape (4, 4), float32
+    margin : ndarray, shape (4,), float32
+    origin : ndarray, shape (3,), float64, or None
+        What the device's positions are relative to, see `find_vertex_origin`.
+    """
+
+    slice_frames: NDArray[np.float32]
+    steps: NDArray[np.float32]
+    margin: NDArray[np.float32]
+    origin: NDArray[np.float64] | None = None
+
+    @classmethod
+    def of(cls, volume: Volume, border: int) -> Placement:
+        """Compose the tables for a volume with `border` layers of outside.
+
+        Raises
+        ------
+        UsageError
+            The volume is too large for float32.
+        """
+        origins = volume.slice_origins(border + 1)[1:]
+        origin = find_vertex_origin(volume)
+        if origin is not None:
+            origins = origins - origin
+        head, rest = origins[:-1].astype(np.float32), origins[:-1] - origins[:-1].astype(np.float32)
+        parts = [head.astype(np.float64)[:, None], rest[:, None], np.diff(origins, axis=0)[:, None]]
+        normals = slice_normal_matrices(volume, border), layer_normal_matrices(volume, border)
+        frames = _pad4(np.concatenate([*parts, *normals], axis=1))
+        frames[:, 2, 3] = layer_margins(volume, border)
+        steps = _pad4(np.stack([part for step in (0, 1) for part in _split(volume.affine[:3, step])]))
+        return cls(frames, steps, _pad4(vertex_margin(volume, border)), origin)
+
+    def to_lps(self, positions: NDArray[np.float32]) -> NDArray[np.floating]:
+        """Positions as the device computes them to LPS mm: themselves, but float64 in a volume far from the origin."""
+        return positions if self.origin is None else positions + self.origin
+
+
+def volume_scalars(slab: Slab) -> tuple[Any, ...]:
+    """ni, nj, nk, border, first_slice, first_sample_slice: how every pass is told where the slab lies."""
+    shape, border = slab.grid.volume.shape_ijk, slab.grid.rule.border
+    return tuple(np.int32(n) for n in (*shape, border, slab.voxel_slices[0], slab.first))
+
+
+def classify(
+    device: Device,
+    slab: Slab,
+    voxels_d: Any,
+    levels: Sequence[Any],
+    stopwatch: Stopwatch,
+    bricks: BrickStates | None = None,
+) -> Classified:
+    """Pass 1: which samples of the slab are inside; of a rule that encloses what is below, those that are not.
+
+    Parameters
+    ----------
+    voxels_d : buffer
+        The slices ``slab.voxel_slices`` of the volume.
+    levels : sequence of scalars of the voxels' type
+        Lowest inside value and, of a range, the highest.
+    bricks : BrickStates, optional
+        How the bricks of the volume compare with the only level, where the slab is all of it.
+    """
+    program = _load_classify(device, slab.grid.volume.voxels.dtype, slab.grid.rule.inside)
+    mask_d = allocate(device, 4 * slab.mask_rows * slab.grid.words)
+    row_extents_d = allocate(device, 4 * slab.mask_rows)
+    if bricks is not None:
+        shape, border = slab.grid.volume.shape_ijk, slab.grid.rule.border
+        launch(
+            device, program["classify_bricks"], slab.mask_rows,
+            bricks.states_d, bricks.extents_d, voxels_d, mask_d, row_extents_d, *levels,
+            *(np.int32(n) for n in (*shape, border, slab.grid.words)), stopwatch=stopwatch,
+        )  # fmt: skip
+        return Classified(mask_d, row_extents_d)
+    launch(
+        device, program["classify_samples"], slab.mask_rows,
+        voxels_d, mask_d, row_extents_d, *levels, *volume_scalars(slab), np.uint32(slab.mask_slices),
+        np.int32(slab.grid.words), stopwatch=stopwatch,
+    )  # fmt: skip
+    return Classified(mask_d, row_extents_d)
+
+
+def count(
+    device: Device,
+    slab: Slab,
+    program: Program,
+    classified: Classified,
+    stopwatch: Stopwatch,
+    voxels_d: Any = None,
+) -> Counted:
+    """Passes 2 to 4: how many vertices and triangles, where those of each word begin, and which words have any.
+
+    Parameters
+    ----------
+    voxels_d : buffer, optional
+        The slices ``slab.voxel_slices`` of the volume; needed for the topology of the trilinear field.
+
+    Raises
+    ------
+    DeviceMemoryError
+        The slab has more than 32 bits can number.
+    DeviceError
+        The device fails.
+    """
+    grid, rows = slab.grid, slab.counted_rows
+    gi, gj, _ = grid.shape
+    own_rows, counted_rows, flag_words = np.uint32(slab.rows), np.uint32(rows), np.uint32(grid.flag_words)
+    row_counts_d = allocate(device, 12 * rows)
+    word_vertices_d, word_triangles_d = (allocate(device, 2 * rows * grid.words) for _ in range(2))
+    flags_d = allocate(device, 4 * rows * grid.flag_words)
+    launch(
+        device, program["count_rows"], rows,
+        classified.mask_d, classified.row_extents_d, row_counts_d, flags_d, word_vertices_d, word_triangles_d,
+        np.uint32(gi), np.uint32(gj), np.uint32(slab.mask_slices), np.uint32(grid.words), flag_words, counted_rows,
+        stopwatch=stopwatch,
+    )  # fmt: skip
+    cells = None
+    if grid.rule.topology == "trilinear":
+        cells = count_cells(
+            device, slab, voxels_d, classified.mask_d, flags_d, row_counts_d, word_triangles_d, stopwatch
+        )
+    scanned = exclusive_scan(device, row_counts_d, 3 * rows, in_place=True, stopwatch=stopwatch)
+    if scanned.total >= 2**32:
+        raise DeviceMemoryError(
+            f"a slab of {slab.slices} slices has {scanned.total:,} vertices and triangles: more than 32 bits can number"
+        )
+    totals_d = allocate(device, 12)
+    launch(
+        device, program["total_counts"], 1,
+        scanned.offsets_d, scanned.total_d, totals_d, own_rows, counted_rows, stopwatch=stopwatch,
+    )  # fmt: skip
+    vertices, triangles, active = (int(n) for n in download(device, np.empty(3, np.uint32), totals_d))
+    active_words_d = allocate(device, 4 * active)
+    launch(
+        device, program["list_words"], slab.rows,
+        flags_d, scanned.offsets_d, active_words_d, own_rows, counted_rows, flag_words, np.uint32(grid.row_shift),
+        stopwatch=stopwatch,
+    )  # fmt: skip
+    offsets_d = scanned.offsets_d
+    return Counted(offsets_d, word_vertices_d, word_triangles_d, active_words_d, vertices, triangles, active, cells)
+
+
+def too_many(vertices: int, triangles: int) -> DeviceError:
+    """The error for a surface whose vertices or triangles 32 bits cannot number."""
+    return DeviceError(
+        f"the surface has {vertices:,} vertices and {triangles:,} triangles:"
+        " more than 32 bits can number; choose another iso value or a part of the volume"
+    )
+
+
+class Emission:
+    """Passes 3 and 4: the mesh of a slab, on the device until it is downloaded.
+
+    Parameters
+    ----------
+    voxels_d : buffer
+        The slices ``slab.voxel_slices`` of the volume.
+    """
+
+    def __init__(
+        self, device: Device, slab: Slab, program: Program, voxels_d: Any, classified: Classified, counted: Counted,
+        placement: Placement, stopwatch: Stopwatch,
+    ):  # fmt: skip
+        self._device, self._slab, self._program, self._stopwatch = device, slab, program, stopwatch
+        self._voxels_d, self._classified, self._counted, self._placement = voxels_d, classified, counted, placement
+        self.frames_d = upload(device, placement.slice_frames[slab.first : slab.first + slab.mask_slices])
+        self.steps_d = upload(device, placement.steps)
+        self._positions, self.positions_d = empty_output(device, (counted.vertices, 3), np.float32)
+        self._normals, self.normals_d = empty_output(device, (counted.vertices, 3), np.float32)
+        self._triangles, self.triangles_d = empty_output(device, (counted.triangles, 3), np.uint32)
+        self._packing = (np.uint32(slab.grid.words), np.uint32(slab.grid.row_shift), np.uint32(counted.active_words))
+        self._items = -(-counted.active_words // int(device.kernel_variants["WORDS_PER_ITEM"]))
+
+    def vertices(self, iso_level: float, label_arguments: tuple[Any, ...] = ()) -> None:
+        """Launch what writes positions and normals; it may be done again at another level.
+
+        `label_arguments` is what emit_vertices takes more in a program that was built with labels.
+        """
+        if not self._counted.vertices:
+            return
+        slab, counted, rule = self._slab, self._counted, self._slab.grid.rule
+        value = np.float32 if slab.grid.volume.voxels.dtype.kind == "f" else np.int32
+        upper = () if rule.upper_level is None else (np.float32(rule.upper_level), np.float32(rule.highest_inside))
+        launch(
+            self._device, self._program["emit_vertices"], self._items,
+            self._voxels_d, self._classified.mask_d, counted.active_words_d, counted.row_offsets_d,
+            counted.word_vertices_d, self.frames_d, self.steps_d, self.positions_d, self.normals_d,
+            np.float32(iso_level), value(rule.outside), np.float32(rule.value_scale), self._placement.margin,
+            *volume_scalars(slab), np.uint32(slab.mask_slices), *self._packing, *label_arguments, *upper,
+            stopwatch=self._stopwatch,
+        )  # fmt: skip
+
+    def triangles(self, first_vertex: int = 0) -> None:
+        """Launch what writes triangles; `first_vertex` is how many vertices all slabs before have."""
+        if not self._counted.triangles:
+            return
+        slab, counted = self._slab, self._counted
+        gi, gj, _ = slab.grid.shape
+        launch(
+            self._device, self._program["emit_triangles"], self._items,
+            self._classified.mask_d, counted.active_words_d, counted.row_offsets_d, counted.word_vertices_d,
+            counted.word_triangles_d, self.triangles_d, np.uint32(first_vertex), np.uint32(slab.counted_rows),
+            np.uint32(gi), np.uint32(gj), np.uint32(slab.mask_slices), *self._packing,
+            np.int32(slab.grid.winds_backwards),
+            stopwatch=self._stopwatch,
+        )  # fmt: skip
+
+    def download(self) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.uint32]]:
+        """Positions, normals and triangles, here."""
+        with self._stopwatch.timed("download"):
+            for array, array_d in (
+                (self._positions, self.positions_d),
+                (self._normals, self.normals_d),
+                (self._triangles, self.triangles_d),
+            ):
+                download(self._device, array, array_d)
+        if self._slab.grid.rule.inside == "below":
+            np.negative(self._normals, out=self._normals)
+        return self._positions, self._normals, self._triangles
+
+
+def emit(
+    device: Device,
+    slab: Slab,
+    program: Program,
+    voxels_d: Any,
+    classified: Classified,
+    counted: Counted,
+    placement: Placement,
+    first_vertex: int,
+    stopwatch: Stopwatch,
+    label_arguments: tuple[Any, ...] = (),
+) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.uint32]]:
+    """Passes 3 and 4 at once: positions, normals and triangles of the slab, see `Emission`."""
+    emission = Emission(device, slab, program, voxels_d, classified, counted, placement, stopwatch)
+    with stopwatch.running(device):
+        emission.vertices(slab.grid.rule.iso_level, label_arguments)
+        if counted.cells is not None:
+            emit_cells(
+                device, slab, voxels_d, classified.mask_d, counted,
+                (emission.frames_d, emission.steps_d, placement.margin),
+                (emission.positions_d, emission.normals_d, emission.triangles_d), first_vertex, stopwatch,
+            )  # fmt: skip
+        else:
+            emission.triangles(first_vertex)
+    return emission.download()

@@ -1,0 +1,41 @@
+"""Twin of `clrecon.operators.primitives.union_find`."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["label_components"]
+
+
+def label_components(triangles: NDArray[np.uint32], vertex_count: int) -> tuple[int, NDArray[np.int64]]:
+    """Number the components of a mesh by label propagation.
+
+    Every vertex takes the smallest label in any of its triangles, until no label changes: the label of a component
+    is then its smallest vertex.
+
+    Parameters
+    ----------
+    triangles : ndarray, shape (m, 3), uint32
+    vertex_count : int
+
+    Returns
+    -------
+    count : int
+        Number of components; vertices that no triangle uses are none.
+    labels : ndarray, shape (vertex_count,), int64
+        Component of each vertex, numbered in order of the first vertex; -1 for unused vertices.
+    """
+    roots = np.arange(vertex_count)
+    while True:
+        before = roots.copy()
+        least = roots[triangles].min(axis=1)
+        for corner in range(3):
+            np.minimum.at(roots, triangles[:, corner], least)
+        if np.array_equal(roots, before):
+            break
+    used = np.zeros(vertex_count, dtype=bool)
+    used[triangles.reshape(-1)] = True
+    is_root = used & (roots == np.arange(vertex_count))
+    number = np.cumsum(is_root) - 1
+    return int(np.count_nonzero(is_root)), np.where(used, number[roots], -1).astype(np.int64)

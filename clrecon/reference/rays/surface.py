@@ -1,0 +1,151 @@
+"""Twin of mode surface: the first place of each ray where the closed field reaches an iso value, shaded.
+
+The field is the one that `clrecon.operators.surface.extract` takes its closed mesh from: surrounded by a layer of
+outside, its surface at the level of `clrecon.geometry.iso_rule.IsoRule`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clrecon.geometry import Volume
+from clrecon.geometry.affine import Float64Array
+from clrecon.geometry.iso_rule import choose_iso_rule, slice_normal_matrices
+from clrecon.reference.rays.rays import Planes, box_of, find_interval, sample_field, voxel_gradients
+from clrecon.reference.rays.render import RayPicture, shade
+from clrecon.rendering import Lighting
+from clrecon.rendering.views.camera import Camera
+
+__all__ = ["cast_surface"]
+
+HALVINGS = 10
+"""Of a step: the hit is known to 1e-3 of it."""
+
+
+class _ClosedField:
+    """The field with a layer of outside around it, at places in LPS."""
+
+    def __init__(self, volume: Volume, iso_value: float):
+        rule = choose_iso_rule(volume, iso_value)
+        voxels = volume.voxels.astype(np.float64)
+        self.volume, self.level, self.outside = volume, rule.iso_level, rule.outside
+        self.closed = np.pad(voxels, 1, constant_values=rule.outside)
+        wider = np.pad(voxels, 2, constant_values=rule.outside)
+        matrices = slice_normal_matrices(volume, 2)
+        self.gradients = voxel_gradients(wider, matrices)[1:-1, 1:-1, 1:-1]
+        self.last = np.array(volume.shape_ijk) - 1.0
+
+    def inside(self, points: Float64Array) -> NDArray[np.bool_]:
+        """Which LPS points (n, 3) are inside; nothing beyond the layer of outside is."""
+        ijk = self.volume.lps_to_ijk(points)
+        there = ((ijk >= -1.0) & (ijk <= self.last + 1.0)).all(axis=1)
+        return there & (sample_field(self.closed, ijk + 1.0) >= self.level)
+
+    def gradient(self, points: Float64Array) -> Float64Array:
+        return sample_field(self.gradients, self.volume.lps_to_ijk(points) + 1.0)
+
+
+def cast_surface(
+    volume: Volume,
+    iso_value: float,
+    camera: Camera,
+    size: Sequence[int],
+    ray_step: float | None = None,
+    lighting: Lighting | None = None,
+    clip: Planes | None = None,
+    colour: tuple[float, float, float] = (1.0, 1.0, 1.0),
+    shadows: bool = False,
+) -> RayPicture:
+    """Find the surface along the ray of each pixel.
+
+    Samples lie `ray_step` apart from where the ray enters the closed volume, the last where it leaves; between the
+    first inside and the one before it the surface is found by bisection.  A ray that begins inside, behind a clip plane
+    or at a camera in there, has its hit at once: on the clip plane the cap's normal is the plane's, at a camera it is
+    the ray's own direction.
+
+    Parameters
+    ----------
+    volume : Volume
+    iso_value : float
+        HU.
+    camera : Camera
+    size : (int, int)
+        Width and height of the picture.
+    ray_step : float, optional
+        Mm; default half the smallest spacing.
+    lighting : Lighting, optional
+        None leaves the colour as it is.
+    clip : Clip, optional
+    colour : (float, float, float)
+        Red, green, blue of the surface, 0 to 1.
+    shadows : bool
+        A hit from which a ray towards a fixed light meets anything inside, from one step on and within what the clip
+        planes leave, has ambient light alone.
+
+    Returns
+    -------
+    RayPicture
+        Both depths are that of the hit; no values.
+
+    Raises
+    ------
+    UsageError, NoSurfaceError
+        As `clrecon.geometry.iso_rule.choose_iso_rule`.
+    """
+    step = 0.5 * min(volume.spacing) if ray_step is None else float(ray_step)
+    field, box = _ClosedField(volume, iso_value), box_of(volume, border=1.0)
+    origins, directions = (rays.reshape(-1, 3) for rays in camera.rays(size))
+    nearest = -np.inf if camera.is_parallel else 0.0
+    t_in, t_out, entered_by = find_interval(origins, directions, box, clip, nearest)
+    hit, at_once = _first_inside(field, origins, directions, t_in, t_out, step)
+    found = np.flatnonzero(~np.isnan(hit))
+    points = origins[found] + hit[found, None] * directions[found]
+    normals = field.gradient(points)
+    for n in np.flatnonzero(at_once[found]):
+        plane = entered_by[found[n]]
+        normals[n] = directions[found[n]] if plane < 0 else clip.planes[plane, :3]  # type: ignore[union-attr]
+    colours = np.broadcast_to(np.array(colour, dtype=np.float64), points.shape)
+    if lighting is not None:
+        lit = np.ones(len(found))
+        if shadows and lighting.direction is not None:
+            light = np.array(lighting.direction, dtype=np.float64)
+            towards = np.broadcast_to(light / np.linalg.norm(light), points.shape)
+            _, far, _ = find_interval(points, towards, box, clip)
+            blocked, _ = _first_inside(field, points, towards, np.full(len(found), step), far, step)
+            lit = np.where(np.isnan(blocked), 1.0, 0.0)
+        colours = shade(colours, normals, directions[found], lighting, lit)
+    rgba = np.zeros((len(origins), 4))
+    rgba[found] = np.column_stack([colours, np.ones(len(found))])
+    width, height = size
+    depth = hit.reshape(height, width)
+    return RayPicture(rgba.reshape(height, width, 4), depth, depth.copy(), np.full((height, width), np.nan))
+
+
+def _first_inside(
+    field: _ClosedField,
+    origins: Float64Array,
+    directions: Float64Array,
+    t_in: Float64Array,
+    t_out: Float64Array,
+    step: float,
+) -> tuple[Float64Array, NDArray[np.bool_]]:
+    """Where rays first are inside, mm or NaN, and which of them begin so."""
+    hit = np.full(len(origins), np.nan)
+    at_once = np.zeros(len(origins), dtype=bool)
+    steps = np.where(t_out > t_in, np.ceil((t_out - t_in) / step), -1.0)
+    for number in range(int(steps.max(initial=-1.0)) + 1):
+        ray = np.flatnonzero((number <= steps) & np.isnan(hit))
+        t = np.minimum(t_in[ray] + number * step, t_out[ray])
+        inside = field.inside(origins[ray] + t[:, None] * directions[ray])
+        ray, high = ray[inside], t[inside]
+        low = high if number == 0 else t_in[ray] + (number - 1) * step
+        at_once[ray] = number == 0
+        for _ in range(HALVINGS if number else 0):
+            middle = 0.5 * (low + high)
+            inside = field.inside(origins[ray] + middle[:, None] * directions[ray])
+            low, high = np.where(inside, low, middle), np.where(inside, middle, high)
+        hit[ray] = high
+    return hit, at_once

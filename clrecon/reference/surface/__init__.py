@@ -1,0 +1,1 @@
+"""Twins of `clrecon.operators.surface`, and the derivation of their tables."""

@@ -1,0 +1,182 @@
+"""Twin of `clrecon.operators.surface.label_masks`: a label's own surface from its smoothed mask, in plain numpy."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clrecon.geometry import Volume
+from clrecon.geometry.iso_rule import IsoRule
+from clrecon.labels.enclosed import Borders, choose_levels, count_faces, find_enclosed, level_biases
+from clrecon.labels.occupancy import FULL, KEEP, REACH, next_level
+from clrecon.reference.surface.extract import (
+    CrossedEdges,
+    Surface,
+    build_surface,
+    edge_margins,
+    find_crossed_edges,
+    gradients,
+)
+
+__all__ = ["choose_enclosed", "choose_level", "extract_label_mask", "find_occupancy"]
+
+WEIGHTS = (1, 4, 6, 4, 1)
+"""Two rounds of [1 2 1]."""
+
+
+def find_occupancy(mask: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """The occupancy of each sample, 0 to 4096; beyond the map its outermost samples go on."""
+    sums = mask.astype(np.int64)
+    for axis in range(3):
+        padded = np.pad(sums, [(REACH * (a == axis), REACH * (a == axis)) for a in range(3)], mode="edge")
+        parts = [np.take(padded, range(n, n + mask.shape[axis]), axis=axis) for n in range(len(WEIGHTS))]
+        sums = sum((weight * part for weight, part in zip(WEIGHTS, parts, strict=True)), np.zeros_like(sums))
+    return sums
+
+
+def extract_label_mask(
+    labels: NDArray[Any],
+    affine: NDArray[np.float64],
+    number: int,
+    level: int,
+    *,
+    closed: bool = True,
+    enclosed: Mapping[int, int] | None = None,
+) -> Surface:
+    """Extract one label's own surface at one level.
+
+    The samples that carry the label are inside, whatever the occupancy is.  On an edge from such a sample to one
+
+    - without a label the vertex lies where the label's occupancy crosses the level, ends on the wrong side of it
+      counting as one step on their own side; where the other labels are no less dense at the label's end than at the
+      far one (they lie alongside, not across a gap) the occupancy of all labels counts in place of the label's;
+    - with another label it lies where both lead by as much: by how much the number of a sample leads there over
+      that of the edge's other end, at least by 1; an enclosed label leads by as much more as its level is
+      lower than the other's, or than `START` where that has none;
+    - beyond the map it lies half way.
+
+    No vertex comes nearer to a sample than `KEEP` of its edge.
+
+    Parameters
+    ----------
+    labels : ndarray, shape (nk, nj, ni)
+    affine : ndarray, shape (4, 4)
+    number : int
+    level : int
+        1 to `FULL` - 1.
+    closed : bool
+        The surface is closed at the border of the map.
+    enclosed : dict of int to int, optional
+        The levels of labels that others enclose, see `choose_enclosed`.
+
+    Returns
+    -------
+    vertices, normals, triangles
+        As `clrecon.reference.surface.extract.extract_isosurface`.
+    """
+    volume, border = Volume(labels, affine), int(closed)
+    rule = IsoRule(0.5, FULL // 2, FULL / 2, 0.0, closed)
+    inside = np.pad(labels == number, border)
+    edges = find_crossed_edges(inside)
+    within = np.pad(np.ones(labels.shape, dtype=bool), border)
+    leads_out = ~(within[edges.near] & within[edges.far])
+    grown = np.pad(labels.astype(np.int64), border, mode="edge")
+
+    own = (FULL // 4096) * find_occupancy(labels == number)
+    everyone = (FULL // 4096) * find_occupancy(labels != 0)
+    values = [np.pad(field, border, mode="edge") for field in (own, everyone)]
+    slopes = [
+        np.pad(gradients(np.pad(field.astype(np.float64), 1, mode="edge"), False), [(border, border)] * 3 + [(0, 0)])
+        for field in (own, everyone)
+    ]
+    starts = inside[edges.near]
+    others, next_others = ((values[1] - values[0])[ends] for ends in (edges.near, edges.far))
+    alongside = ((others | next_others) != 0) & np.where(starts, others >= next_others, next_others >= others)
+    value, next_value = (np.where(alongside, values[1][e], values[0][e]) for e in (edges.near, edges.far))
+    value = np.where(starts, np.maximum(value, level + 1), np.minimum(value, level - 1))
+    next_value = np.where(starts, np.minimum(next_value, level - 1), np.maximum(next_value, level + 1))
+    t = (level - value) / (next_value - value)
+
+    between = ~leads_out & (grown[edges.near] != 0) & (grown[edges.far] != 0)
+    biases = level_biases(dict(enclosed or {}), int(labels.max()) + 1)[grown]
+    before = biases[edges.near] - biases[edges.far]
+    lead, next_lead = (np.maximum(lead, 1) for lead in _find_leads(labels, own, edges, inside, grown, border))
+    value, next_value = np.maximum(lead + before, 1), np.maximum(next_lead - before, 1)
+    t[between] = (value / (value + next_value))[between]
+    t[leads_out] = 0.5
+    keep = np.maximum(edge_margins(volume, rule, edges), KEEP)
+    t = np.clip(t, keep, 1.0 - keep)
+
+    takes = (alongside & ~between)[:, None]
+    slope, next_slope = (np.where(takes, slopes[1][e], slopes[0][e]) for e in (edges.near, edges.far))
+    slope, next_slope = (1.0 - t[:, None]) * slope, t[:, None] * next_slope
+    slope[leads_out] = next_slope[leads_out] = 0.0
+    return build_surface(volume, rule, inside, edges, t, slope, next_slope)
+
+
+def _find_leads(
+    labels: NDArray[Any],
+    own: NDArray[np.int64],
+    edges: CrossedEdges,
+    inside: NDArray[np.bool_],
+    grown: NDArray[np.int64],
+    border: int,
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """By how much the number of either end of each edge leads there over that of the other one.
+
+    `own` is the occupancy of the label whose samples are `inside`, `grown` has the number of each sample of the grid.
+    """
+    starts = inside[edges.near]
+    other = np.where(starts, grown[edges.far], grown[edges.near])
+    leads = np.zeros((2, len(other)), np.int64)
+    values = np.pad(own, border, mode="edge")
+    for number in np.unique(other):
+        among = other == number
+        rival = np.pad((FULL // 4096) * find_occupancy(labels == number), border, mode="edge")
+        for place, ends in enumerate((edges.near, edges.far)):
+            leads[place][among] = (values - rival)[ends][among]
+    return np.where(starts, leads[0], -leads[0]), np.where(starts, -leads[1], leads[1])
+
+
+def _volume_mm3(vertices: NDArray[np.float64], triangles: NDArray[np.uint32]) -> float:
+    corners = (vertices - vertices.mean(axis=0))[triangles]
+    return float(np.einsum("ni,ni->", corners[:, 0], np.cross(corners[:, 1], corners[:, 2]))) / 6.0
+
+
+def choose_enclosed(labels: NDArray[Any], affine: NDArray[np.float64]) -> dict[int, int]:
+    """The levels of the labels that others enclose, at which each encloses the volume of its voxels."""
+    numbers = find_enclosed(labels, count_faces(labels))
+    if not numbers:
+        return {}
+    voxel_mm3 = abs(np.linalg.det(affine[:3, :3]))
+
+    def measure(levels: dict[int, int]) -> dict[int, float]:
+        found = {}
+        for number, level in levels.items():
+            vertices, _, triangles = extract_label_mask(labels, affine, number, level, enclosed=levels)
+            found[number] = _volume_mm3(vertices, triangles) / voxel_mm3
+        return found
+
+    return choose_levels(Borders.of(labels, numbers), measure)
+
+
+def choose_level(
+    labels: NDArray[Any],
+    affine: NDArray[np.float64],
+    number: int,
+    enclosed: Mapping[int, int] | None = None,
+) -> int:
+    """The level at which the mesh of a label encloses the volume of its voxels; `enclosed` as `extract_label_mask`."""
+    if enclosed and number in enclosed:
+        return enclosed[number]
+    wanted = np.count_nonzero(labels == number) * abs(np.linalg.det(affine[:3, :3]))
+    tried: list[tuple[int, float]] = []
+    level = next_level(tried, wanted, -1.0)
+    while all(level != earlier for earlier, _ in tried):
+        vertices, _, triangles = extract_label_mask(labels, affine, number, level, enclosed=enclosed)
+        tried.append((level, _volume_mm3(vertices, triangles)))
+        level = next_level(tried, wanted, -wanted / FULL)
+    return level
