@@ -160,7 +160,7 @@ def _report_error(error: BaseException, console: Console, debug: bool) -> int:
         known = ClreconError(f"unexpected error ({type(error).__name__}: {str(error)[:300]}){hint}")
     console.error(str(known))
     try:
-        from clrecon.pipeline.report import error_as_dict
+        from clrecon.jobs.shared.report import error_as_dict
 
         console.result(error_as_dict(known))
     except OutputError:

@@ -86,7 +86,7 @@ class Console:
     def result(self, value: dict[str, Any]) -> None:
         """Print the JSON object; nothing without ``--json``."""
         if self.as_json and not self.has_result:
-            from clrecon.pipeline.report import to_json
+            from clrecon.jobs.shared.report import to_json
 
             self.has_result = True
             self._to_stdout(to_json(value))
@@ -101,7 +101,7 @@ class Console:
         self._to_stderr(f"clrecon: error: {printable(text)}")
 
     def progress(self, stage: str, done: int = 0, total: int = 0) -> None:
-        """Show what a job is doing, see `clrecon.pipeline.progress`."""
+        """Show what a job is doing, see `clrecon.jobs.progress`."""
         if self.verbose and stage != self._stage:
             elapsed = time.perf_counter() - self._start
             self._to_stderr(f"clrecon: {elapsed:6.2f} s  {_STAGES.get(stage, stage)}")

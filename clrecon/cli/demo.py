@@ -25,7 +25,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace, console: Console) -> int:
     """Run the command; returns the exit code."""
-    from clrecon.pipeline.demo import DEMO_FOLDER, make_demo
+    from clrecon.jobs.demo import DEMO_FOLDER, make_demo
 
     outcome = make_demo(options.output or DEMO_FOLDER, options.device, progress=console.progress)
     console.result(outcome)

@@ -21,7 +21,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace, console: Console) -> int:
     """Run the command; returns the exit code."""
-    from clrecon.pipeline.devices import survey_devices
+    from clrecon.jobs.devices import survey_devices
 
     survey, problem = survey_devices(options.device)
     console.result(survey)

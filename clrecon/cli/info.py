@@ -32,7 +32,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace, console: Console) -> int:
     """Run the command; returns the exit code."""
-    from clrecon.pipeline.info import describe_input
+    from clrecon.jobs.info import describe_input
 
     found = describe_input(
         options.input,

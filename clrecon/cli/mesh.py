@@ -21,7 +21,7 @@ from clrecon.cli.refinement import (
     finish_with_gates,
     refinement_settings,
 )
-from clrecon.pipeline.presets import DEFAULT_PRESET, PRESETS
+from clrecon.jobs.mesh.presets import DEFAULT_PRESET, PRESETS
 
 __all__ = ["add_arguments", "describe_mesh", "describe_volume", "run"]
 
@@ -131,9 +131,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace, console: Console) -> int:
     """Run the command; returns the exit code."""
-    from clrecon.pipeline.mesh import make_mesh
-    from clrecon.pipeline.purposes import settings_for
-    from clrecon.pipeline.settings import MeshSettings
+    from clrecon.jobs.mesh.job import make_mesh
+    from clrecon.jobs.mesh.purposes import settings_for
+    from clrecon.jobs.mesh.settings import MeshSettings
 
     given = dict(
         **options.hu,
@@ -253,7 +253,7 @@ def _describe_parts(meshes: list[dict[str, Any]]) -> list[str]:
 
 
 def _describe_files(output: str, report: dict[str, Any]) -> str:
-    from clrecon.pipeline.outputs import name_outputs
+    from clrecon.jobs.shared.outputs import name_outputs
 
     paths = name_outputs(output, [mesh["name"] or "" for mesh in report["meshes"]])
     names = [printable(str(path)) for path in (paths[0], paths[-1])]

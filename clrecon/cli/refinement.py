@@ -6,7 +6,7 @@ import argparse
 from typing import Any
 
 from clrecon.cli.console import Console
-from clrecon.pipeline.purposes import PURPOSES, Purpose
+from clrecon.jobs.mesh.purposes import PURPOSES, Purpose
 
 __all__ = [
     "GATE_FAILED",
@@ -156,7 +156,7 @@ def finish_with_gates(report: dict[str, Any], console: Console, strict: bool) ->
     With `strict` the gates that failed, of the volume and of the meshes, are errors: they are printed with ``--quiet``
     and ``--json`` too.  Not so `GATES_OF_AFFINE`: that the slices are uneven is a warning.
     """
-    from clrecon.pipeline.refinement import warn_of_gates
+    from clrecon.jobs.mesh.refinement import warn_of_gates
 
     gates = [gate for gate in report["volume"].get("gates", ()) if gate["name"] not in GATES_OF_AFFINE]
     of_volume = [{"mesh": "volume", **gate} for gate in gates]

@@ -19,7 +19,7 @@ from clrecon.cli.render_options import (
     add_region,
     render_settings,
 )
-from clrecon.pipeline.render_modes import MODES
+from clrecon.jobs.render.modes import MODES
 
 __all__ = ["add_arguments", "run"]
 
@@ -36,7 +36,7 @@ examples:
 
 
 def _epilog() -> str:
-    from clrecon.pipeline.render_settings import describe_presets  # numpy: not wanted by other commands
+    from clrecon.jobs.render.settings import describe_presets  # numpy: not wanted by other commands
 
     described = describe_presets()
     width = max(map(len, (*MODES, *described)))
@@ -82,9 +82,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace, console: Console) -> int:
     """Run the command; returns the exit code."""
-    from clrecon.pipeline.pictures import PictureFiles
-    from clrecon.pipeline.render import make_pictures
-    from clrecon.pipeline.render_settings import RenderSettings
+    from clrecon.jobs.render.files import PictureFiles
+    from clrecon.jobs.render.job import make_pictures
+    from clrecon.jobs.render.settings import RenderSettings
 
     files = PictureFiles(options.output, options.depth, options.values, options.turntable, options.report)
     settings = RenderSettings(
@@ -144,7 +144,7 @@ def _describe_picture(picture: dict[str, Any]) -> str:
 
 
 def _describe_files(report: dict[str, Any], files: Any) -> list[str]:
-    from clrecon.pipeline.pictures import path_of
+    from clrecon.jobs.render.files import path_of
 
     lines = []
     for what, path in (("output", files.picture), ("depth_output", files.depth), ("values_output", files.values)):

@@ -19,10 +19,10 @@ from clrecon.cli.render_values import (
     parse_window,
 )
 from clrecon.errors import UsageError
-from clrecon.pipeline.render_modes import MODES, VIEWS
+from clrecon.jobs.render.modes import MODES, VIEWS
 
 if TYPE_CHECKING:
-    from clrecon.pipeline.render_settings import LabelLook, Turntable
+    from clrecon.jobs.render.settings import LabelLook, Turntable
 
 __all__ = [
     "add_camera",
@@ -213,7 +213,7 @@ def label_look(options: argparse.Namespace) -> LabelLook | None:
         An option that means something with a label map only.
     """
     if options.labels is not None:
-        from clrecon.pipeline.render_settings import LabelLook
+        from clrecon.jobs.render.settings import LabelLook
 
         return LabelLook(options.labels, dict(options.label_color), dict(options.label_opacity))
     for option, given in (("--label-color", options.label_color), ("--label-opacity", options.label_opacity)):
@@ -233,7 +233,7 @@ def turntable(options: argparse.Namespace) -> Turntable | None:
     given = {name: getattr(options, name) for name in ("frames", "fps", "degrees")}
     given = {name: value for name, value in given.items() if value is not None}
     if options.turntable is not None:
-        from clrecon.pipeline.render_settings import Turntable
+        from clrecon.jobs.render.settings import Turntable
 
         return Turntable(**given)
     if given:

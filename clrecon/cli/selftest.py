@@ -19,7 +19,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace, console: Console) -> int:
     """Run the command; returns the exit code."""
-    from clrecon.pipeline.devices import run_device_selftest
+    from clrecon.jobs.devices import run_device_selftest
 
     outcome = run_device_selftest(options.device, progress=console.progress)
     console.result(outcome)

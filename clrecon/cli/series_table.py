@@ -64,7 +64,7 @@ def render_listing(listing: dict[str, Any], certificate: Sequence[tuple[str, str
     Parameters
     ----------
     listing : dict
-        See `clrecon.pipeline.info.InputListing`.
+        See `clrecon.jobs.info.InputListing`.
     certificate : sequence of (str, str)
         Words for the series that was judged, see `clrecon.cli.certificate`.
 

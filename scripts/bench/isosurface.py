@@ -69,7 +69,7 @@ class PeerSide:
     """Runs vtkFlyingEdges3D."""
 
     def __init__(self, volume: Any, threads: int):
-        from clrecon.pipeline.peer import FlyingEdges
+        from clrecon.jobs.bench.peer import FlyingEdges
 
         self._peer = FlyingEdges(volume, threads)
         self._volume = volume

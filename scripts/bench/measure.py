@@ -13,8 +13,8 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from clrecon.pipeline.machine import free_cores, processor_name, usable_cores
-from clrecon.pipeline.pairs import alternate, spread, summarise
+from clrecon.jobs.bench.machine import free_cores, processor_name, usable_cores
+from clrecon.jobs.bench.pairs import alternate, spread, summarise
 from clrecon.version import package_version
 
 __all__ = [
@@ -136,7 +136,7 @@ def _revision() -> str | None:
 
 def write_json(path: Path, result: dict[str, Any]) -> None:
     """Keep a result, readable and stable under diff."""
-    from clrecon.pipeline.report import to_json
+    from clrecon.jobs.shared.report import to_json
 
     plain = json.loads(to_json(result))
     path.parent.mkdir(parents=True, exist_ok=True)

@@ -263,7 +263,7 @@ def test_selftest_passes(device: Any, capsys: pytest.CaptureFixture[str]) -> Non
 def test_selftest_that_fails_exits_5(
     device: Any, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from clrecon.pipeline import selftest
+    from clrecon.jobs import selftest
 
     wrong = [{"operator": "compact", "passed": False, "detail": "wrong positions", "seconds": 0.1}]
     monkeypatch.setattr(selftest, "run_selftest", lambda chosen: iter(wrong))

@@ -14,8 +14,8 @@ import pytest
 from clrecon.cli.levels import parse_hu
 from clrecon.cli.main import main
 from clrecon.errors import UsageError
-from clrecon.pipeline.labels import LabelChoice
-from clrecon.pipeline.settings import MeshSettings
+from clrecon.jobs.mesh.labels import LabelChoice
+from clrecon.jobs.mesh.settings import MeshSettings
 
 
 @pytest.fixture(scope="module")

@@ -38,7 +38,7 @@ def test_no_layer_imports_one_that_imports_it() -> None:
         ("clrecon.cli.main", "from clrecon.geometry import Volume", "may not import clrecon.geometry"),
         ("clrecon.mesh.quality", "import scipy.spatial", "scipy at module level"),
         ("clrecon.reference.surface.extract", "def f():\n    import pyopencl", "may not import pyopencl"),
-        ("clrecon.pipeline.mesh", "try:\n    import pyvista\nexcept ImportError:\n    pass", "pyvista at module level"),
+        ("clrecon.jobs.mesh.job", "try:\n    import pyvista\nexcept ImportError:\n    pass", "pyvista at module level"),
         ("clrecon.novelty.thing", "", "not in the table"),
         ("clrecon.errors", "import numpy", "numpy at module level"),
     ],
@@ -52,10 +52,10 @@ def test_a_wrong_import_is_found(module: str, source: str, expected: str) -> Non
 @pytest.mark.parametrize(
     ("module", "source"),
     [
-        ("clrecon.pipeline.selftest", "from clrecon.reference.surface import extract"),
+        ("clrecon.jobs.selftest", "from clrecon.reference.surface import extract"),
         ("clrecon.mesh.quality", "def f():\n    import scipy.spatial"),
         (
-            "clrecon.pipeline.mesh",
+            "clrecon.jobs.mesh.job",
             "from typing import TYPE_CHECKING\nif TYPE_CHECKING:\n    from clrecon.mesh import Mesh",
         ),
         ("clrecon.geometry.volume", "from .affine import apply_affine\nimport numpy.typing"),

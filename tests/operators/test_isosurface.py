@@ -11,10 +11,10 @@ from variants import VOXEL_TYPES
 
 from clrecon.errors import DeviceError, NoSurfaceError, UsageError
 from clrecon.geometry import Volume, compose_affine, field
+from clrecon.jobs.selftest import run_selftest
 from clrecon.operators.surface import extract as isosurface
 from clrecon.operators.surface import marching_cubes
 from clrecon.operators.surface.extract import SurfaceExtractor, extract_isosurface, extract_isosurfaces
-from clrecon.pipeline.selftest import run_selftest
 from clrecon.reference.surface import extract as twin
 
 

@@ -9,9 +9,10 @@ from typing import Any
 import pytest
 
 from clrecon.errors import DeviceError, NoSurfaceError, OutputError, UsageError
+from clrecon.jobs.bench import job as bench
+from clrecon.jobs.bench import peer
 from clrecon.opencl import choose_device
 from clrecon.phantom import PhantomSettings, write_phantom
-from clrecon.pipeline import bench, peer
 
 
 @pytest.fixture(scope="module")

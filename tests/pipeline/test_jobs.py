@@ -12,11 +12,11 @@ import tolerances
 from PIL import Image
 
 from clrecon.errors import DeviceError, NoSurfaceError, OutputError, UsageError
+from clrecon.jobs.demo import make_demo
+from clrecon.jobs.devices import survey_devices
+from clrecon.jobs.mesh.job import make_mesh
+from clrecon.jobs.mesh.settings import MeshSettings
 from clrecon.phantom import PhantomSettings, write_phantom
-from clrecon.pipeline.demo import make_demo
-from clrecon.pipeline.devices import survey_devices
-from clrecon.pipeline.mesh import make_mesh
-from clrecon.pipeline.settings import MeshSettings
 
 
 @pytest.fixture(scope="module")
@@ -72,7 +72,7 @@ def test_outputs_then_device_then_input(sphere: tuple[Path, dict[str, Any]], tmp
         make_mesh(nowhere, tmp_path / "a.stl", bad_device)
 
 
-@pytest.mark.parametrize("fails", ["clrecon.mesh.stage_mesh", "clrecon.pipeline.mesh.stage_report"])
+@pytest.mark.parametrize("fails", ["clrecon.mesh.stage_mesh", "clrecon.jobs.mesh.job.stage_report"])
 def test_a_failed_write_leaves_both_old_files(
     fails: str, device: Any, sphere: tuple[Path, dict[str, Any]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -10,9 +10,9 @@ import pytest
 
 from clrecon.errors import NoSurfaceError, UsageError
 from clrecon.geometry import Volume
-from clrecon.pipeline.labels import LabelChoice
-from clrecon.pipeline.mesh import make_mesh
-from clrecon.pipeline.settings import MeshSettings
+from clrecon.jobs.mesh.job import make_mesh
+from clrecon.jobs.mesh.labels import LabelChoice
+from clrecon.jobs.mesh.settings import MeshSettings
 
 AFFINE = np.diag((1.0, 1.0, 1.5, 1.0))
 HEART_ML, BONE_ML = 4 / 3 * np.pi * 12**3 / 1000, 4 / 3 * np.pi * 9**3 / 1000

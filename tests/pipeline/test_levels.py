@@ -14,9 +14,9 @@ import tolerances
 from clrecon.anatomy.iso_choice import half_iso_value
 from clrecon.errors import NoSurfaceError, UsageError
 from clrecon.geometry import Volume
-from clrecon.pipeline.levels import choose_level, describe_level
-from clrecon.pipeline.mesh import make_mesh
-from clrecon.pipeline.settings import MeshSettings
+from clrecon.jobs.mesh.job import make_mesh
+from clrecon.jobs.mesh.levels import choose_level, describe_level
+from clrecon.jobs.mesh.settings import MeshSettings
 
 
 def ball(bone: float = 1040.0, tissue: float = 40.0) -> Volume:

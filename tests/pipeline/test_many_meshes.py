@@ -11,9 +11,9 @@ import pytest
 
 from clrecon.errors import DeviceMemoryError, NoSurfaceError, OutputError, UsageError
 from clrecon.geometry import Volume
-from clrecon.pipeline import parts
-from clrecon.pipeline.mesh import make_mesh
-from clrecon.pipeline.settings import MeshSettings
+from clrecon.jobs.mesh import parts
+from clrecon.jobs.mesh.job import make_mesh
+from clrecon.jobs.mesh.settings import MeshSettings
 
 AFFINE = np.array([[0.5, 0.0, 0.0, -10.0], [0.0, 0.8, 0.0, 20.0], [0.0, 0.0, 2.0, -300.0], [0.0, 0.0, 0.0, 1.0]])
 SUMMED = ("vertices", "triangles", "components", "area_mm2", "volume_ml")

@@ -12,7 +12,7 @@ from dicom_series import Plan, write_series
 
 from clrecon.cli.main import main
 from clrecon.errors import UsageError
-from clrecon.pipeline.settings import MeshSettings
+from clrecon.jobs.mesh.settings import MeshSettings
 
 
 @pytest.fixture(scope="module")

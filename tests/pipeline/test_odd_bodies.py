@@ -11,12 +11,12 @@ from odd_bodies import BODIES, OddBodies, OddBody
 
 from clrecon.cli.refinement import describe_purposes
 from clrecon.errors import ClreconError, NoSurfaceError, RefusedInputError
-from clrecon.pipeline.mesh import make_mesh
-from clrecon.pipeline.pictures import PictureFiles
-from clrecon.pipeline.purposes import settings_for
-from clrecon.pipeline.render import make_pictures
-from clrecon.pipeline.render_settings import RenderSettings
-from clrecon.pipeline.settings import MeshSettings
+from clrecon.jobs.mesh.job import make_mesh
+from clrecon.jobs.mesh.purposes import settings_for
+from clrecon.jobs.mesh.settings import MeshSettings
+from clrecon.jobs.render.files import PictureFiles
+from clrecon.jobs.render.job import make_pictures
+from clrecon.jobs.render.settings import RenderSettings
 
 pytestmark = pytest.mark.first_device
 

@@ -11,8 +11,8 @@ from scipy import ndimage
 
 from clrecon.anatomy.body import remove_table
 from clrecon.geometry import Volume
+from clrecon.jobs.render.report import find_emptiness
 from clrecon.operators.rays.render import VolumeRenderer
-from clrecon.pipeline.render_report import find_emptiness
 from clrecon.rendering import PRESETS, Rendering
 
 pytestmark = pytest.mark.first_device

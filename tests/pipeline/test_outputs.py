@@ -11,14 +11,14 @@ from pathlib import Path
 import pytest
 
 from clrecon.errors import OutputError, UsageError
-from clrecon.pipeline.labels import LabelChoice
-from clrecon.pipeline.mesh import make_mesh
-from clrecon.pipeline.outputs import MOST_FILES, check_kept, check_outputs, commit_all, name_outputs
-from clrecon.pipeline.parts import first_names, plan_surfaces
-from clrecon.pipeline.pictures import PictureFiles
-from clrecon.pipeline.render import make_pictures
-from clrecon.pipeline.render_settings import LabelLook, RenderSettings
-from clrecon.pipeline.settings import MeshSettings
+from clrecon.jobs.mesh.job import make_mesh
+from clrecon.jobs.mesh.labels import LabelChoice
+from clrecon.jobs.mesh.parts import first_names, plan_surfaces
+from clrecon.jobs.mesh.settings import MeshSettings
+from clrecon.jobs.render.files import PictureFiles
+from clrecon.jobs.render.job import make_pictures
+from clrecon.jobs.render.settings import LabelLook, RenderSettings
+from clrecon.jobs.shared.outputs import MOST_FILES, check_kept, check_outputs, commit_all, name_outputs
 from clrecon.system.files import stage_file
 
 pytestmark = pytest.mark.unit

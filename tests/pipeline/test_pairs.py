@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from clrecon.pipeline.machine import free_cores, processor_name, usable_cores
-from clrecon.pipeline.pairs import FEWEST_PAIRS, alternate, spread, summarise
+from clrecon.jobs.bench.machine import free_cores, processor_name, usable_cores
+from clrecon.jobs.bench.pairs import FEWEST_PAIRS, alternate, spread, summarise
 
 
 class FakeTime:

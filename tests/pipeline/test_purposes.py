@@ -11,10 +11,10 @@ import pytest
 
 from clrecon.cli.main import main
 from clrecon.errors import UsageError
+from clrecon.jobs.mesh.labels import LabelChoice
+from clrecon.jobs.mesh.purposes import settings_for, warn_of_print
+from clrecon.jobs.mesh.settings import MeshSettings
 from clrecon.phantom import PhantomSettings, write_phantom
-from clrecon.pipeline.labels import LabelChoice
-from clrecon.pipeline.purposes import settings_for, warn_of_print
-from clrecon.pipeline.settings import MeshSettings
 
 
 def test_what_is_given_wins() -> None:

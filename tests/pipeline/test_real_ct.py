@@ -11,9 +11,9 @@ from scipy.spatial import cKDTree
 
 from clrecon.dicom import read_volume
 from clrecon.geometry import AIR_HU, Volume
+from clrecon.jobs.mesh.job import make_mesh
+from clrecon.jobs.mesh.settings import MeshSettings
 from clrecon.operators.surface.extract import extract_isosurface
-from clrecon.pipeline.mesh import make_mesh
-from clrecon.pipeline.settings import MeshSettings
 
 HU = 226
 

@@ -12,9 +12,9 @@ import tolerances
 
 from clrecon.cli.main import main
 from clrecon.errors import UsageError
+from clrecon.jobs.mesh.job import make_mesh
+from clrecon.jobs.mesh.settings import MeshSettings
 from clrecon.phantom import PhantomSettings, write_phantom
-from clrecon.pipeline.mesh import make_mesh
-from clrecon.pipeline.settings import MeshSettings
 
 SPACING = (0.5, 0.7, 1.0)
 

@@ -15,11 +15,11 @@ from contract_tables import names_in
 from PIL import Image
 
 from clrecon.errors import DeviceError, OutputError, RefusedInputError, UsageError
+from clrecon.jobs.render.files import PictureFiles, name_view, path_of
+from clrecon.jobs.render.job import make_pictures
+from clrecon.jobs.render.settings import LabelLook, RenderSettings, Turntable
+from clrecon.jobs.render.studio import read_function
 from clrecon.phantom import PhantomSettings, write_phantom
-from clrecon.pipeline.pictures import PictureFiles, name_view, path_of
-from clrecon.pipeline.render import make_pictures
-from clrecon.pipeline.render_settings import LabelLook, RenderSettings, Turntable
-from clrecon.pipeline.studio import read_function
 
 pytestmark = pytest.mark.first_device
 
@@ -129,14 +129,14 @@ def test_a_step_that_fails_leaves_the_old_files(
         raise OutputError("the disk is full")
 
     if fails == "second view":
-        from clrecon.pipeline.studio import Studio
+        from clrecon.jobs.render.studio import Studio
 
         real = Studio.take_view
         monkeypatch.setattr(Studio, "take_view", lambda studio, view: fail() if view == "right" else real(studio, view))
     else:
         home = {
             "encode_floats": "clrecon.rendering.pictures.image_files.encode_floats",
-            "stage_report": "clrecon.pipeline.render.stage_report",
+            "stage_report": "clrecon.jobs.render.job.stage_report",
             "stage_animation": "clrecon.rendering.movies.movie.stage_animation",
             "commit": "clrecon.system.files.StagedFile.commit",
         }[fails]
@@ -160,7 +160,7 @@ def test_a_folder_of_frames_waits_for_the_report(
 
     other = replace(settings, turntable=Turntable(3), views=("left",))
     with monkeypatch.context() as patch, pytest.raises(OutputError, match="full"):
-        patch.setattr("clrecon.pipeline.render.stage_report", fail)
+        patch.setattr("clrecon.jobs.render.job.stage_report", fail)
         make_pictures(sphere[0], PictureFiles(turntable=frames, report=tmp_path / "a.json"), other)
     assert {path.name: path.read_bytes() for path in frames.iterdir()} == older
     assert [path.name for path in tmp_path.iterdir()] == ["frames"]

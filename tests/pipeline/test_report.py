@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from clrecon.errors import OutputError, RefusedInputError
-from clrecon.pipeline.report import error_as_dict, peak_memory_bytes, platform_name, stage_report, to_json
+from clrecon.jobs.shared.report import error_as_dict, peak_memory_bytes, platform_name, stage_report, to_json
 
 
 def test_numpy_becomes_plain_and_nan_becomes_null() -> None:

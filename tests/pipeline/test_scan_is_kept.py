@@ -11,11 +11,11 @@ from dicom_series import Plan, write_series
 
 from clrecon.cli.main import main
 from clrecon.errors import ClreconError, OutputError, UsageError
-from clrecon.pipeline.bench import run_bench
-from clrecon.pipeline.mesh import make_mesh
-from clrecon.pipeline.pictures import PictureFiles
-from clrecon.pipeline.render import make_pictures
-from clrecon.pipeline.render_settings import RenderSettings, Turntable
+from clrecon.jobs.bench.job import run_bench
+from clrecon.jobs.mesh.job import make_mesh
+from clrecon.jobs.render.files import PictureFiles
+from clrecon.jobs.render.job import make_pictures
+from clrecon.jobs.render.settings import RenderSettings, Turntable
 from clrecon.system.files import replace_file
 
 DICOM_THERE = "a DICOM file is there, which is never replaced"

@@ -7,9 +7,9 @@ import math
 import pytest
 
 from clrecon.errors import UsageError
-from clrecon.pipeline.labels import LabelChoice
-from clrecon.pipeline.presets import DEFAULT_PRESET, PRESETS, find_preset
-from clrecon.pipeline.settings import MeshSettings
+from clrecon.jobs.mesh.labels import LabelChoice
+from clrecon.jobs.mesh.presets import DEFAULT_PRESET, PRESETS, find_preset
+from clrecon.jobs.mesh.settings import MeshSettings
 
 
 def test_bone_is_the_default() -> None:

@@ -7,11 +7,11 @@ import pytest
 
 from clrecon.geometry import Volume
 from clrecon.geometry.iso_rule import choose_iso_rule
+from clrecon.jobs.mesh.bone import find_bone, warn_of_walls
+from clrecon.jobs.mesh.parts import Part, Surface
+from clrecon.jobs.mesh.settings import MeshSettings
 from clrecon.mesh import Mesh
 from clrecon.mesh.connectivity import label_components
-from clrecon.pipeline.bone import find_bone, warn_of_walls
-from clrecon.pipeline.parts import Part, Surface
-from clrecon.pipeline.settings import MeshSettings
 from clrecon.reference.surface.extract import extract_isosurface
 
 

@@ -50,9 +50,9 @@ _layer("phantom", "system", "errors", "version", "geometry")
 _layer("rendering", "system", "errors", "version", "geometry", "labels")
 _layer("opencl", "errors", "system")
 _layer("operators", "system", "errors", "geometry", "anatomy", "labels", "mesh", "rendering", "opencl")
-_layer("pipeline", *(set(LEFT_OF) - {"__init__"}))
-_layer("viewer", "errors", "system", "geometry", "mesh", "rendering", "pipeline")
-_layer("cli", "errors", "system", "version", "pipeline", "viewer")
+_layer("jobs", *(set(LEFT_OF) - {"__init__"}))
+_layer("viewer", "errors", "system", "geometry", "mesh", "rendering", "jobs")
+_layer("cli", "errors", "system", "version", "jobs", "viewer")
 _layer("__main__", "cli")
 
 # Third-party packages: at module level (paid by whoever imports the layer), or only inside functions.
@@ -70,7 +70,7 @@ AT_MODULE_LEVEL: dict[str, frozenset[str]] = {
     "phantom": frozenset({"numpy", "pydicom"}),
     "opencl": frozenset({"numpy"}),
     "operators": frozenset({"numpy"}),
-    "pipeline": frozenset({"numpy"}),
+    "jobs": frozenset({"numpy"}),
     "viewer": frozenset({"numpy"}),
 }
 INSIDE_FUNCTIONS: dict[str, frozenset[str]] = {
@@ -86,7 +86,7 @@ INSIDE_FUNCTIONS: dict[str, frozenset[str]] = {
     "phantom": frozenset({"scipy"}),
     "opencl": frozenset({"pyopencl"}),
     "operators": frozenset({"pyopencl"}),
-    "pipeline": frozenset({"pyvista", "skimage", "vtkmodules"}),  # vtkmodules: flying edges, the peer of the bench
+    "jobs": frozenset({"pyvista", "skimage", "vtkmodules"}),  # vtkmodules: flying edges, the peer of the bench
     "viewer": frozenset({"pyvista", "vtk", "vtkmodules"}),
     "cli": frozenset({"rich"}),
 }

@@ -1,6 +1,6 @@
 """Rendering presets: transfer function, light, mode and window by what a picture shows.
 
-Not to be mixed up with the presets of iso values in `clrecon.pipeline.presets`: some have the same name, because they
+Not to be mixed up with the presets of iso values in `clrecon.jobs.mesh.presets`: some have the same name, because they
 show the same tissue, as a surface there and through opacities here.
 """
 

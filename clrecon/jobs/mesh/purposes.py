@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from clrecon.errors import UsageError
-from clrecon.pipeline.presets import HIGHEST_BONE_HU, LOWEST_BONE_HU
+from clrecon.jobs.mesh.presets import HIGHEST_BONE_HU, LOWEST_BONE_HU
 from clrecon.system.wording import name_parameter
 
 if TYPE_CHECKING:
@@ -112,7 +112,7 @@ def settings_for(name: str | None, given: dict[str, Any]) -> dict[str, Any]:
 
 def _at_levels_of_bone(given: dict[str, Any]) -> bool:
     """Whether all surfaces that these fields of `MeshSettings` ask for are iso surfaces at levels of bone."""
-    from clrecon.pipeline.settings import MeshSettings
+    from clrecon.jobs.mesh.settings import MeshSettings
 
     settings = MeshSettings(**given)
     if settings.labels is not None or settings.inside != "above":

@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from clrecon.errors import DeviceMemoryError, NoSurfaceError, UsageError
-from clrecon.pipeline.outputs import MOST_FILES
-from clrecon.pipeline.settings import MeshSettings, name_level
+from clrecon.jobs.mesh.settings import MeshSettings, name_level
+from clrecon.jobs.shared.outputs import MOST_FILES
 from clrecon.system.progress import Progress
 from clrecon.system.wording import name_parameter
 
@@ -177,7 +177,7 @@ def select_parts(surface: Surface, mesh: Mesh, settings: MeshSettings, device: D
     """
     if settings.purpose is None:
         return _select_parts(surface, mesh, settings, device, volume)
-    from clrecon.pipeline.purposes import measure_pieces
+    from clrecon.jobs.mesh.purposes import measure_pieces
 
     found = measure_pieces(mesh.vertices, mesh.triangles)
     parts = _select_parts(surface, mesh, settings, device, volume)
@@ -213,14 +213,14 @@ def _select_parts(surface: Surface, mesh: Mesh, settings: MeshSettings, device: 
         mesh.report.setdefault("warnings", []).append(f"{error}: they were found without it")
     among = None
     if settings.keep == "bone":
-        from clrecon.pipeline.bone import find_bone
+        from clrecon.jobs.mesh.bone import find_bone
 
         labelled = labelled or find_labels(mesh.triangles, mesh.vertex_count)
         among = find_bone(
             mesh, volume, surface, labelled, without_table=settings.remove_table, advice=_advice(settings)
         )
         if settings.purpose is not None:
-            from clrecon.pipeline.purposes import measure_pieces
+            from clrecon.jobs.mesh.purposes import measure_pieces
 
             other = mesh.triangles[~among[labelled[1][mesh.triangles[:, 0]]]]
             no_bone = measure_pieces(mesh.vertices, other)

@@ -6,12 +6,12 @@ import os
 from collections.abc import Callable, Iterable, Sequence
 from typing import TYPE_CHECKING, Any
 
-from clrecon.pipeline.labels import describe_label
-from clrecon.pipeline.levels import describe_level
-from clrecon.pipeline.parts import Part, Surface
-from clrecon.pipeline.presets import find_preset
-from clrecon.pipeline.report import platform_name
-from clrecon.pipeline.settings import MeshSettings
+from clrecon.jobs.mesh.labels import describe_label
+from clrecon.jobs.mesh.levels import describe_level
+from clrecon.jobs.mesh.parts import Part, Surface
+from clrecon.jobs.mesh.presets import find_preset
+from clrecon.jobs.mesh.settings import MeshSettings
+from clrecon.jobs.shared.report import platform_name
 from clrecon.version import package_version
 
 if TYPE_CHECKING:

@@ -7,10 +7,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from clrecon.errors import UsageError
-from clrecon.pipeline.checks import check_bone_loss, check_field_of_view, check_memory
-from clrecon.pipeline.labels import LabelChoice
-from clrecon.pipeline.presets import DEFAULT_PRESET, find_preset
-from clrecon.pipeline.purposes import find_purpose
+from clrecon.jobs.mesh.labels import LabelChoice
+from clrecon.jobs.mesh.presets import DEFAULT_PRESET, find_preset
+from clrecon.jobs.mesh.purposes import find_purpose
+from clrecon.jobs.shared.checks import check_bone_loss, check_field_of_view, check_memory
 
 __all__ = ["MeshSettings", "name_level"]
 
@@ -34,7 +34,7 @@ class MeshSettings:
     keep_outside : bool
         With `below`: leave the air round the patient in.
     preset : str, optional
-        Name of an iso value, see `clrecon.pipeline.presets`.  Neither of both means the preset "bone".
+        Name of an iso value, see `clrecon.jobs.mesh.presets`.  Neither of both means the preset "bone".
     half_way : "auto" or (bone, tissue), optional
         In place of an iso value: half way between the two materials, measured in the scan or given in HU.
     series : str or int, optional
@@ -69,7 +69,7 @@ class MeshSettings:
     split : bool
         One mesh a component, the largest first.
     labels : LabelChoice, optional
-        A label map: one mesh a label, see `clrecon.pipeline.labels`.
+        A label map: one mesh a label, see `clrecon.jobs.mesh.labels`.
     device : str, optional
         Name or index of an OpenCL device; None leaves the choice to `choose_device`.
     memory : int, optional
@@ -81,7 +81,7 @@ class MeshSettings:
     max_deviation_mm : float, optional
         Bound of each of both, mm; None: a quarter of the shortest voxel step.
     purpose : str, optional
-        What the mesh is for: more is measured.  It sets nothing here, see `clrecon.pipeline.purposes.settings_for`.
+        What the mesh is for: more is measured.  It sets nothing here, see `clrecon.jobs.mesh.purposes.settings_for`.
     strict : bool
         Measure whatever a gate needs, triangles that cut each other too.
 

@@ -9,8 +9,8 @@ from clrecon.system.wording import name_parameter
 
 if TYPE_CHECKING:
     from clrecon.geometry import Volume
-    from clrecon.pipeline.render_settings import RenderSettings
-    from clrecon.pipeline.settings import MeshSettings
+    from clrecon.jobs.mesh.settings import MeshSettings
+    from clrecon.jobs.render.settings import RenderSettings
 
 __all__ = ["leave_outside", "mask_volume"]
 

@@ -7,10 +7,10 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from clrecon.errors import NoSurfaceError, RefusedInputError, UsageError
-from clrecon.pipeline.levels import warn_of_contrast
-from clrecon.pipeline.parts import Bones, Part, Surface
-from clrecon.pipeline.presets import LOWEST_BONE_HU
-from clrecon.pipeline.settings import MeshSettings
+from clrecon.jobs.mesh.levels import warn_of_contrast
+from clrecon.jobs.mesh.parts import Bones, Part, Surface
+from clrecon.jobs.mesh.presets import LOWEST_BONE_HU
+from clrecon.jobs.mesh.settings import MeshSettings
 from clrecon.system.wording import name_parameter
 
 if TYPE_CHECKING:

@@ -8,8 +8,8 @@ from dataclasses import dataclass, field, fields
 from typing import TYPE_CHECKING
 
 from clrecon.errors import UsageError
-from clrecon.pipeline.checks import check_bone_loss, check_field_of_view, check_memory
-from clrecon.pipeline.render_modes import MODES, find_misplaced
+from clrecon.jobs.render.modes import MODES, find_misplaced
+from clrecon.jobs.shared.checks import check_bone_loss, check_field_of_view, check_memory
 from clrecon.system.wording import name_parameter
 
 if TYPE_CHECKING:
@@ -82,7 +82,7 @@ class RenderSettings:
     Parameters
     ----------
     mode : str, optional
-        One of `clrecon.pipeline.render_modes.MODES`; default: what `iso_value` (surface), `curve` (cpr) or the preset
+        One of `clrecon.jobs.render.modes.MODES`; default: what `iso_value` (surface), `curve` (cpr) or the preset
         ask for, else volume rendering.
     preset : str, optional
         See `clrecon.rendering.looks.presets`; default "bone" for volume rendering.
@@ -124,7 +124,7 @@ class RenderSettings:
     labels : LabelLook, optional
     turntable : Turntable, optional
     series, phase, allow_gaps, force, remove_table, allow_bone_loss, field_of_view, device, memory
-        As in `clrecon.pipeline.settings.MeshSettings`.
+        As in `clrecon.jobs.mesh.settings.MeshSettings`.
 
     Raises
     ------

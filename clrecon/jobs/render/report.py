@@ -6,17 +6,17 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
-from clrecon.pipeline.description import SKIN_HU
-from clrecon.pipeline.render_settings import LabelLook, RenderSettings
-from clrecon.pipeline.report import platform_name
+from clrecon.jobs.mesh.report import SKIN_HU
+from clrecon.jobs.render.settings import LabelLook, RenderSettings
+from clrecon.jobs.shared.report import platform_name
 from clrecon.system.wording import name_parameter
 from clrecon.version import package_version
 
 if TYPE_CHECKING:
     from clrecon.geometry import Volume
+    from clrecon.jobs.render.studio import Studio
     from clrecon.labels import LabelMap
     from clrecon.opencl import Device
-    from clrecon.pipeline.studio import Studio
     from clrecon.rendering import Rendering, TransferFunction
     from clrecon.rendering.views.camera import Camera
 

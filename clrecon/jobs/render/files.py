@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO
 
 from clrecon.errors import UsageError
-from clrecon.pipeline.outputs import check_distinct
-from clrecon.pipeline.render_modes import find_misplaced
-from clrecon.pipeline.render_settings import RenderSettings
+from clrecon.jobs.render.modes import find_misplaced
+from clrecon.jobs.render.settings import RenderSettings
+from clrecon.jobs.shared.outputs import check_distinct
 from clrecon.system.wording import name_parameter
 
 if TYPE_CHECKING:

@@ -6,12 +6,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from clrecon.errors import OutputError, UsageError
-from clrecon.pipeline.laps import Laps
-from clrecon.pipeline.mesh import make_mesh
-from clrecon.pipeline.pictures import PictureFiles
-from clrecon.pipeline.render import make_pictures
-from clrecon.pipeline.render_settings import RenderSettings
-from clrecon.pipeline.settings import MeshSettings
+from clrecon.jobs.mesh.job import make_mesh
+from clrecon.jobs.mesh.settings import MeshSettings
+from clrecon.jobs.render.files import PictureFiles
+from clrecon.jobs.render.job import make_pictures
+from clrecon.jobs.render.settings import RenderSettings
+from clrecon.jobs.shared.laps import Laps
 from clrecon.system.progress import Progress
 
 if TYPE_CHECKING:

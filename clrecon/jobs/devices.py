@@ -68,8 +68,8 @@ def run_device_selftest(name: str | None = None, *, progress: Progress | None = 
     DeviceError
         No such device, or it fails outside of a test.
     """
+    from clrecon.jobs.selftest import CHECKS, run_selftest
     from clrecon.opencl import choose_device
-    from clrecon.pipeline.selftest import CHECKS, run_selftest
 
     progress = progress or ignore_progress
     device = choose_device(name)

@@ -13,11 +13,11 @@ from clrecon.system.wording import name_parameter
 
 if TYPE_CHECKING:
     from clrecon.geometry import Volume
+    from clrecon.jobs.mesh.parts import Part, Surface
+    from clrecon.jobs.mesh.settings import MeshSettings
     from clrecon.labels import LabelMap
     from clrecon.mesh import Mesh
     from clrecon.opencl import Device
-    from clrecon.pipeline.parts import Part, Surface
-    from clrecon.pipeline.settings import MeshSettings
 
 __all__ = [
     "LabelChoice", "describe_label", "extract_label_surfaces", "judge_label_volumes", "open_labels",

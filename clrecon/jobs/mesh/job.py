@@ -8,18 +8,25 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from clrecon.pipeline.bone import judge_surfaces, warn_of_walls
-from clrecon.pipeline.description import describe_job, describe_part
-from clrecon.pipeline.labels import extract_label_surfaces, judge_label_volumes, open_labels
-from clrecon.pipeline.laps import Laps
-from clrecon.pipeline.levels import choose_level
-from clrecon.pipeline.masking import leave_outside, mask_volume
-from clrecon.pipeline.opening import DeviceOpening, prepare_surfaces
-from clrecon.pipeline.outputs import check_kept, check_outputs, commit_all, count_leftovers, name_outputs, stage_meshes
-from clrecon.pipeline.parts import check_levels, extract_surfaces, first_names, plan_surfaces, select_parts
-from clrecon.pipeline.refinement import describe_purposes, judge_parts, refine_surface, warn_of_gates
-from clrecon.pipeline.report import peak_memory_bytes, stage_report
-from clrecon.pipeline.settings import MeshSettings
+from clrecon.jobs.mesh.bone import judge_surfaces, warn_of_walls
+from clrecon.jobs.mesh.labels import extract_label_surfaces, judge_label_volumes, open_labels
+from clrecon.jobs.mesh.levels import choose_level
+from clrecon.jobs.mesh.parts import check_levels, extract_surfaces, first_names, plan_surfaces, select_parts
+from clrecon.jobs.mesh.refinement import describe_purposes, judge_parts, refine_surface, warn_of_gates
+from clrecon.jobs.mesh.report import describe_job, describe_part
+from clrecon.jobs.mesh.settings import MeshSettings
+from clrecon.jobs.shared.laps import Laps
+from clrecon.jobs.shared.masking import leave_outside, mask_volume
+from clrecon.jobs.shared.opening import DeviceOpening, prepare_surfaces
+from clrecon.jobs.shared.outputs import (
+    check_kept,
+    check_outputs,
+    commit_all,
+    count_leftovers,
+    name_outputs,
+    stage_meshes,
+)
+from clrecon.jobs.shared.report import peak_memory_bytes, stage_report
 from clrecon.system.progress import Progress, ignore_progress
 
 __all__ = ["make_mesh"]

@@ -9,7 +9,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
-from clrecon.pipeline.render_settings import SPINE, LabelLook, RenderSettings
+from clrecon.jobs.render.settings import SPINE, LabelLook, RenderSettings
 from clrecon.system.progress import Progress
 
 if TYPE_CHECKING:

@@ -39,7 +39,7 @@ def name_outputs(output: str | Path, names: Sequence[str], report_path: str | Pa
     ----------
     output : path
     names : sequence of str
-        One a mesh, see `clrecon.pipeline.parts.Part`.
+        One a mesh, see `clrecon.jobs.mesh.parts.Part`.
     report_path : path, optional
 
     Returns

@@ -9,12 +9,12 @@ from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
 from clrecon.errors import DeviceError, NoSurfaceError, UsageError
-from clrecon.pipeline.laps import Laps
-from clrecon.pipeline.machine import free_cores, processor_name, usable_cores
-from clrecon.pipeline.outputs import check_kept
-from clrecon.pipeline.pairs import alternate, spread, summarise
-from clrecon.pipeline.presets import DEFAULT_PRESET, find_preset
-from clrecon.pipeline.report import platform_name, stage_report
+from clrecon.jobs.bench.machine import free_cores, processor_name, usable_cores
+from clrecon.jobs.bench.pairs import alternate, spread, summarise
+from clrecon.jobs.mesh.presets import DEFAULT_PRESET, find_preset
+from clrecon.jobs.shared.laps import Laps
+from clrecon.jobs.shared.outputs import check_kept
+from clrecon.jobs.shared.report import platform_name, stage_report
 from clrecon.system.progress import Progress, ignore_progress
 from clrecon.version import package_version
 
@@ -233,7 +233,7 @@ def _measure_device(device: Device, volume: Volume, hu: float, runs: int) -> dic
 
 def _time_warm(own: _OwnRuns, volume: Volume, level: float, runs: int) -> tuple[dict[str, Any], dict[str, Any] | None]:
     """Spread of the warm runs and what flying edges took in turn; None where VTK is not installed."""
-    from clrecon.pipeline.peer import FlyingEdges
+    from clrecon.jobs.bench.peer import FlyingEdges
 
     try:
         flying_edges = FlyingEdges(volume, usable_cores())

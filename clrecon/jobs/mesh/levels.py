@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from clrecon.pipeline.presets import find_preset
-from clrecon.pipeline.settings import MeshSettings
+from clrecon.jobs.mesh.presets import find_preset
+from clrecon.jobs.mesh.settings import MeshSettings
 from clrecon.system.wording import name_parameter
 
 if TYPE_CHECKING:

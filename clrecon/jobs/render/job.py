@@ -9,15 +9,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from clrecon.errors import UsageError
-from clrecon.pipeline.laps import Laps
-from clrecon.pipeline.masking import mask_volume
-from clrecon.pipeline.opening import DeviceOpening
-from clrecon.pipeline.outputs import check_kept, commit_all
-from clrecon.pipeline.pictures import PictureFiles, check_pictures, format_of, name_view, stage_picture
-from clrecon.pipeline.render_report import describe_picture, describe_pictures, find_emptiness, warn_of_picture
-from clrecon.pipeline.render_settings import RenderSettings
-from clrecon.pipeline.report import peak_memory_bytes, stage_report
-from clrecon.pipeline.studio import Studio, read_curve, read_function, read_look
+from clrecon.jobs.render.files import PictureFiles, check_pictures, format_of, name_view, stage_picture
+from clrecon.jobs.render.report import describe_picture, describe_pictures, find_emptiness, warn_of_picture
+from clrecon.jobs.render.settings import RenderSettings
+from clrecon.jobs.render.studio import Studio, read_curve, read_function, read_look
+from clrecon.jobs.shared.laps import Laps
+from clrecon.jobs.shared.masking import mask_volume
+from clrecon.jobs.shared.opening import DeviceOpening
+from clrecon.jobs.shared.outputs import check_kept, commit_all
+from clrecon.jobs.shared.report import peak_memory_bytes, stage_report
 from clrecon.system.files import allow_open_files
 from clrecon.system.progress import Progress, ignore_progress
 
@@ -55,7 +55,7 @@ def make_pictures(
     Returns
     -------
     dict
-        The report, see `clrecon.pipeline.render_report.describe_pictures`; with ``seconds`` and
+        The report, see `clrecon.jobs.render.report.describe_pictures`; with ``seconds`` and
         ``peak_memory_bytes``.
 
     Raises

@@ -1,0 +1,1 @@
+"""What jobs have in common: checks, outputs, reports, masks."""
