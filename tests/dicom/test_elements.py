@@ -280,7 +280,7 @@ def test_headers_longer_than_what_is_read_first(tmp_path: Path, large: int) -> N
 def test_what_takes_long_to_load_is_loaded_only_where_it_is_needed(tmp_path: Path, syntax: str, careful: bool) -> None:
     write_series(tmp_path, Plan(syntax=syntax))
     code = "import sys, clrecon; clrecon.read_volume(sys.argv[1]); print([n in sys.modules for n in sys.argv[2:]])"
-    environment = {**os.environ, "PYTHONPATH": str(Path(elements.__file__).parents[2])}
+    environment = {**os.environ, "PYTHONPATH": str(Path(elements.__file__).parents[3])}
     done = subprocess.run(
         [sys.executable, "-c", code, str(tmp_path), "pydicom", "numpy.ma", "clrecon.anatomy.iso_choice"],
         capture_output=True,

@@ -13,7 +13,7 @@ from clrecon.rendering import DEFAULT_PRESET, PRESETS, UNSHADED, find_preset
 
 pytestmark = pytest.mark.unit
 
-DOCUMENT = Path(__file__).resolve().parents[2] / "docs" / "transfer_functions.md"
+DOCUMENT = Path(__file__).resolve().parents[3] / "docs" / "transfer_functions.md"
 NAMES = ["bone", "spine", "skin", "lung", "vessels", "muscle", "metal", "x-ray", "mip", "minip"]
 
 

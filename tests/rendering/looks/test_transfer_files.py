@@ -17,7 +17,7 @@ from clrecon.rendering import PRESETS, UNSHADED, Lighting, TransferFunction, loa
 
 pytestmark = pytest.mark.unit
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[3]
 
 OWN: dict[str, Any] = {
     "format": "clrecon transfer function",
