@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from clrecon.dicom.pixels import decoder_pool
 from clrecon.dicom.pixels.decoder_pool import DecoderError, DecoderPool
-from clrecon.dicom.pixels.voxels import decoder_pool
 
 PIXELS = np.arange(12 * 9, dtype=np.int16).reshape(12, 9)
 LINUX = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="how processes end is looked up in /proc")

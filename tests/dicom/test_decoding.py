@@ -39,11 +39,12 @@ from pydicom.encaps import encapsulate, encapsulate_extended
 from pydicom.uid import ExplicitVRBigEndian
 
 from clrecon.dicom import read_volume
+from clrecon.dicom.parse import encapsulated
 from clrecon.dicom.parse import transfer_syntaxes as codecs
 from clrecon.dicom.parse.elements import read_elements
 from clrecon.dicom.parse.values import WANTED_TAGS
+from clrecon.dicom.pixels import decoder_process, stored
 from clrecon.dicom.pixels.decoder_pool import DecoderPool
-from clrecon.dicom.pixels.voxels import decoder_process, encapsulated, stored
 from clrecon.errors import RefusedInputError
 
 

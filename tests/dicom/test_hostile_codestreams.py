@@ -25,8 +25,8 @@ from dicom_series import Plan, make_dataset, save_dataset, write_series
 from pydicom.encaps import encapsulate
 
 from clrecon.dicom import read_volume
+from clrecon.dicom.pixels import codestream
 from clrecon.dicom.pixels.stored import StoredPixels
-from clrecon.dicom.pixels.voxels import codestream
 from clrecon.errors import RefusedInputError
 
 

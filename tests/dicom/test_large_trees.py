@@ -18,8 +18,9 @@ from clrecon.dicom import list_series, read_volume
 from clrecon.dicom.headers import header
 from clrecon.dicom.parse import careful, plain
 from clrecon.dicom.parse.elements import PREFIX_BYTES, read_start
+from clrecon.dicom.series import disk, scan
 from clrecon.dicom.series.scan import CorruptFile, scan_path
-from clrecon.dicom.series.series import disk, group_series, scan
+from clrecon.dicom.series.series import group_series
 from clrecon.errors import RefusedInputError
 
 

@@ -10,7 +10,7 @@ from dicom_series import Plan, make_dataset, save_dataset, set_values, write_ser
 from pydicom.uid import MRImageStorage
 
 from clrecon.dicom import list_series, read_volume
-from clrecon.dicom.series.series import disk, scan
+from clrecon.dicom.series import disk, scan
 from clrecon.errors import NoDicomError, RefusedInputError
 
 CORRUPT = bytes(128) + b"DICM" + b"\xff" * 50

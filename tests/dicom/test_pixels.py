@@ -18,7 +18,7 @@ from stored_pixels import set_pixels
 from tolerances import AFFINE_MM
 
 from clrecon.dicom import list_series, read_volume
-from clrecon.dicom.pixels.voxels import stored
+from clrecon.dicom.pixels import stored
 from clrecon.errors import NoDicomError, RefusedInputError
 from clrecon.system import memory
 

@@ -13,7 +13,7 @@ from pydicom.encaps import encapsulate
 from pydicom.uid import RLELossless
 
 from clrecon.dicom import read_volume
-from clrecon.dicom.pixels.voxels import voxels as pixels
+from clrecon.dicom.pixels import voxels as pixels
 from clrecon.system import memory
 
 

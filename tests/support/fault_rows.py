@@ -1,7 +1,7 @@
 """The list of faults, rows 1 to 48: what each is, what is expected, and which tests hold it.
 
 A test whose own name begins with ``test_row_NN_`` is found by that; the others are listed here as "file::function",
-the file below tests/.  The guard is tests/guards/test_fault_list.py.
+the file below tests/.  The guard is guards/test_fault_list.py.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ ROWS: dict[int, tuple[str, tuple[str, ...]]] = {
     18: ("oblique or sagittal acquisition: the same in LPS", (TRAPS,)),
     19: (
         "coordinates of 1e5 mm: right to 1e-3 mm",
-        (TRAPS, "operators/test_far_volumes.py::test_vertices_lie_on_the_sphere_and_on_the_twin"),
+        (TRAPS, "operators/surface/test_far_volumes.py::test_vertices_lie_on_the_sphere_and_on_the_twin"),
     ),
     20: (
         "a single slice: refused",
@@ -109,16 +109,19 @@ ROWS: dict[int, tuple[str, tuple[str, ...]]] = {
         "iso value outside of the data: refused with the range, no empty file",
         (
             BAD_INPUT + "test_an_iso_value_above_all_voxels",
-            "operators/test_isosurface.py::test_an_iso_value_outside_the_data_is_refused_with_the_range",
+            "operators/surface/test_isosurface.py::test_an_iso_value_outside_the_data_is_refused_with_the_range",
         ),
     ),
     31: (
         "whole HU that equal the iso value: watertight",
-        ("operators/test_isosurface.py::test_random_integers_at_every_iso_value_are_sound",),
+        ("operators/surface/test_isosurface.py::test_random_integers_at_every_iso_value_are_sound",),
     ),
     32: (
         "constant volume, NaN, infinite voxels: refused",
-        (BAD_INPUT + "test_a_constant_volume", "geometry/test_field.py::test_values_that_are_not_finite_are_refused"),
+        (
+            BAD_INPUT + "test_a_constant_volume",
+            "geometry/test_iso_rule.py::test_values_that_are_not_finite_are_refused",
+        ),
     ),
     33: ("metal cut off at 3071 HU: told", ("dicom/test_doubtful_headers.py::test_saturated_metal_is_told",)),
     34: ("lossy compression: told", (PIXELS + "test_doubtful_values_are_kept_with_a_warning",)),

@@ -15,8 +15,8 @@ from pathlib import Path
 
 import pytest
 
-from clrecon import files
 from clrecon.errors import OutputError, UsageError
+from clrecon.system import files
 from clrecon.system.files import check_writable, replace_file
 
 pytestmark = [

@@ -13,8 +13,8 @@ from clrecon.labels import LabelMap
 from clrecon.opencl import upload
 from clrecon.operators.rays import composite
 from clrecon.operators.rays.render import VolumeRenderer, render
+from clrecon.operators.resident import volume as resident
 from clrecon.operators.resident.frame import volume_box
-from clrecon.operators.resident.volume import volume as resident
 from clrecon.rendering import UNSHADED, Rendering, TransferFunction
 from clrecon.rendering.views.camera import Camera
 from clrecon.rendering.views.clip import Clip

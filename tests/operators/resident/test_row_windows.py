@@ -13,7 +13,7 @@ from raycast_scenes import DeviceCaster, look, premultiplied
 from clrecon.geometry import Volume
 from clrecon.opencl.arrays import download, empty_output, upload
 from clrecon.opencl.sources import read_kernel_source
-from clrecon.operators.resident.volume import volume as resident
+from clrecon.operators.resident import volume as resident
 from clrecon.rendering import Lighting, TransferFunction
 
 FUNCTION = TransferFunction([(-300, 0.9, 0.2, 0.1, 0.0), (200, 1, 0.7, 0.4, 0.15), (900, 1, 1, 0.9, 0.6)])

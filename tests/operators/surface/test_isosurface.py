@@ -10,7 +10,7 @@ from surface_volumes import MIRRORED, OBLIQUE, SHAPES, assert_sound, random_volu
 from variants import VOXEL_TYPES
 
 from clrecon.errors import DeviceError, NoSurfaceError, UsageError
-from clrecon.geometry import Volume, compose_affine, field
+from clrecon.geometry import Volume, compose_affine, iso_rule
 from clrecon.jobs.selftest import run_selftest
 from clrecon.operators.surface import extract as isosurface
 from clrecon.operators.surface import marching_cubes
@@ -249,8 +249,8 @@ def test_several_iso_values_are_as_each_alone(device):
 def test_the_values_of_a_resident_volume_are_looked_at_once(device, dtype, monkeypatch):
     looks = []
     for name in ("data_range", "_lowest_value"):
-        true_look = getattr(field, name)
-        monkeypatch.setattr(field, name, lambda volume, look=true_look: looks.append(1) or look(volume))
+        true_look = getattr(iso_rule, name)
+        monkeypatch.setattr(iso_rule, name, lambda volume, look=true_look: looks.append(1) or look(volume))
     volume = Volume(smooth_volume().voxels.astype(dtype), OBLIQUE)
     with SurfaceExtractor(volume, device) as extractor:
         meshes = [extractor.extract(iso_value) for iso_value in (50, 100, 150)]
