@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 from clrecon.errors import UsageError
 
 if TYPE_CHECKING:
-    from clrecon.jobs.mesh.labels import LabelChoice
+    from clrecon.jobs.mesh.label_choice import LabelChoice
 
 __all__ = ["add_label_arguments", "describe_labels", "label_choice"]
 
@@ -46,7 +46,7 @@ def label_choice(options: argparse.Namespace) -> LabelChoice | None:
         An option that means something with a label map only.
     """
     if options.labels is not None:
-        from clrecon.jobs.mesh.labels import LabelChoice
+        from clrecon.jobs.mesh.label_choice import LabelChoice
 
         surface = "hu" if options.surface is None else options.surface.lower()
         return LabelChoice(options.labels, tuple(options.label or ()), options.grow, options.solid, surface)

@@ -131,8 +131,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace, console: Console) -> int:
     """Run the command; returns the exit code."""
+    from clrecon.jobs.mesh.for_purpose import settings_for
     from clrecon.jobs.mesh.job import make_mesh
-    from clrecon.jobs.mesh.purposes import settings_for
     from clrecon.jobs.mesh.settings import MeshSettings
 
     given = dict(

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any
 
 from clrecon.errors import NoSurfaceError, RefusedInputError, UsageError
 from clrecon.jobs.mesh.levels import warn_of_contrast
-from clrecon.jobs.mesh.parts import Bones, Part, Surface
 from clrecon.jobs.mesh.presets import LOWEST_BONE_HU
 from clrecon.jobs.mesh.settings import MeshSettings
+from clrecon.jobs.mesh.surfaces import Bones, Part, Surface
 from clrecon.system.wording import name_parameter
 
 if TYPE_CHECKING:

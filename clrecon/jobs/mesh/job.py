@@ -11,13 +11,15 @@ from typing import Any
 from clrecon.jobs.mesh.bone import judge_surfaces, warn_of_walls
 from clrecon.jobs.mesh.labels import extract_label_surfaces, judge_label_volumes, open_labels
 from clrecon.jobs.mesh.levels import choose_level
-from clrecon.jobs.mesh.parts import check_levels, extract_surfaces, first_names, plan_surfaces, select_parts
+from clrecon.jobs.mesh.parts import check_levels, extract_surfaces, first_names, select_parts
+from clrecon.jobs.mesh.prepare import leave_outside, prepare_surfaces
 from clrecon.jobs.mesh.refinement import describe_purposes, judge_parts, refine_surface, warn_of_gates
 from clrecon.jobs.mesh.report import describe_job, describe_part
 from clrecon.jobs.mesh.settings import MeshSettings
+from clrecon.jobs.mesh.surfaces import plan_surfaces
 from clrecon.jobs.shared.laps import Laps
-from clrecon.jobs.shared.masking import leave_outside, mask_volume
-from clrecon.jobs.shared.opening import DeviceOpening, prepare_surfaces
+from clrecon.jobs.shared.masking import mask_volume
+from clrecon.jobs.shared.opening import DeviceOpening
 from clrecon.jobs.shared.outputs import (
     check_kept,
     check_outputs,

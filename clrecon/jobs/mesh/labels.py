@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from pathlib import Path
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from clrecon.errors import UsageError
@@ -13,14 +12,15 @@ from clrecon.system.wording import name_parameter
 
 if TYPE_CHECKING:
     from clrecon.geometry import Volume
-    from clrecon.jobs.mesh.parts import Part, Surface
+    from clrecon.jobs.mesh.label_choice import LabelChoice
     from clrecon.jobs.mesh.settings import MeshSettings
+    from clrecon.jobs.mesh.surfaces import Part, Surface
     from clrecon.labels import LabelMap
     from clrecon.mesh import Mesh
     from clrecon.opencl import Device
 
 __all__ = [
-    "LabelChoice", "describe_label", "extract_label_surfaces", "judge_label_volumes", "open_labels",
+    "describe_label", "extract_label_surfaces", "judge_label_volumes", "open_labels",
 ]  # fmt: skip
 
 NAMES_SHOWN = 5
@@ -29,46 +29,6 @@ _FACTS = (
     "surface", "label_inside_share", "label_ml", "label_taken_ml", "vertices_by_hu_share", "mask_level", "grow_mm",
     "solid",
 )  # fmt: skip
-
-
-@dataclass(frozen=True)
-class LabelChoice:
-    """Which labels of which map become meshes, and how.
-
-    Parameters
-    ----------
-    path : path
-        NIfTI, NRRD or DICOM SEG.
-    wanted : tuple of str or int
-        Numbers or names; empty means all that have a surface.
-    grow_mm : float, optional
-        See `clrecon.operators.surface.labels.extract_labels`.
-    solid : bool
-        Fill what is less dense within a label.
-    surface : {"hu", "mask"}
-        HU place the vertices (`clrecon.operators.surface.labels.extract_labels`), or each label has its own surface
-        (`clrecon.operators.surface.label_masks.extract_label_masks`).
-
-    Raises
-    ------
-    UsageError
-        There is no such surface, or growth or filling by HU is asked for where HU play no part.
-    """
-
-    path: str | Path
-    wanted: tuple[str | int, ...] = ()
-    grow_mm: float | None = None
-    solid: bool = False
-    surface: str = "hu"
-
-    def __post_init__(self) -> None:
-        if self.surface not in ("hu", "mask"):
-            raise UsageError(f"labels have no surface {self.surface!r}: it is hu or mask")
-        if self.surface == "mask" and (self.solid or self.grow_mm is not None):
-            raise UsageError(
-                f"the surface of a mask is solid and does not grow: leave out {name_parameter('solid')} and"
-                f" {name_parameter('grow_mm')}"
-            )
 
 
 def open_labels(choice: LabelChoice | None) -> LabelMap | None:

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING
 
 from clrecon.errors import DeviceMemoryError, NoSurfaceError, UsageError
-from clrecon.jobs.mesh.settings import MeshSettings, name_level
+from clrecon.jobs.mesh.bone import find_bone
+from clrecon.jobs.mesh.settings import MeshSettings
+from clrecon.jobs.mesh.surfaces import Part, Surface
 from clrecon.jobs.shared.outputs import MOST_FILES
 from clrecon.system.progress import Progress
 from clrecon.system.wording import name_parameter
@@ -18,105 +19,11 @@ if TYPE_CHECKING:
     from clrecon.opencl import Device
 
 __all__ = [
-    "Bones",
-    "Part",
-    "Surface",
     "check_levels",
     "extract_surfaces",
     "first_names",
-    "plan_surfaces",
     "select_parts",
 ]
-
-
-@dataclass(frozen=True)
-class Surface:
-    """A surface that a job is to extract.
-
-    Attributes
-    ----------
-    name : str
-        What tells its files from those of the other surfaces, such as ``"200hu"``; empty where it is the only one.
-    iso_value : float or (float, float) or None
-        HU; or the two ends of a range; None: it is a label's own.
-    below : bool
-        It encloses what lies below the iso value.
-    label : str or int or None
-        Of the label map that picks its cells, where there is one.
-    """
-
-    name: str
-    iso_value: float | tuple[float, ...] | None
-    label: str | int | None = None
-    below: bool = False
-
-    def describe(self) -> str:
-        """What it encloses: ``200 HU``, ``100:300 HU``, ``below -400 HU``."""
-        if self.iso_value is None:
-            return "the mask"
-        return f"{'below ' if self.below else ''}{name_level(self.iso_value)} HU"
-
-    @property
-    def place(self) -> str:
-        """The same behind "surface": ``at 200 HU``, ``of what lies below -400 HU``."""
-        return f"of what lies {self.describe()}" if self.below else f"at {self.describe()}"
-
-
-class Bones(NamedTuple):
-    """Of a surface: its components, those that look like bone, and those that would but are rails of a table."""
-
-    components: int
-    bone: int
-    rails: int
-
-
-@dataclass
-class Part:
-    """A mesh that becomes a file of its own: a surface, or a component of one.
-
-    Attributes
-    ----------
-    surface : Surface
-    name : str
-        What stands between the stem of the output and its extension, such as ``"200hu_001"``; empty where the part
-        is the only one.
-    mesh : Mesh
-    quality : dict
-        What `Mesh.quality` says; empty where it was not measured.
-    facts : dict
-        More entries of its object in the report.
-    pieces : (dict, dict), optional
-        What the components of its surface enclose, as extracted and as kept; where the purpose asks for it.
-    bones : Bones, optional
-        How many of its components are bone, where it as a whole does not look like bone.
-    """
-
-    surface: Surface
-    name: str
-    mesh: Mesh
-    quality: dict[str, Any] = field(default_factory=dict)
-    facts: dict[str, Any] = field(default_factory=dict)
-    pieces: tuple[dict[str, float], dict[str, float]] | None = None
-    bones: Bones | None = None
-
-
-def plan_surfaces(levels: Sequence[float | tuple[float, ...]], below: bool = False) -> list[Surface]:
-    """One surface an iso value or range (HU), in their order; without any the one of a mask."""
-    if len(levels) < 2:
-        return [Surface("", levels[0] if levels else None, below=below)]
-    return [Surface(_name_surface(level, below), level, below=below) for level in levels]
-
-
-def _name_surface(level: float | tuple[float, ...], below: bool) -> str:
-    """``200hu``, ``100to300hu``, ``below-400hu``: what tells the files of surfaces apart."""
-    numbers = level if isinstance(level, tuple) else (level,)
-    return f"{'below' if below else ''}{'to'.join(map(_digits, numbers))}hu"
-
-
-def _digits(value: float) -> str:
-    """A number as it goes into a file name: all its digits, so that two numbers never look the same."""
-    text = repr(float(value) + 0.0)  # + 0.0: no "-0"
-    return text.removesuffix(".0")
 
 
 def check_levels(volume: Volume, surfaces: Sequence[Surface]) -> None:
@@ -177,7 +84,7 @@ def select_parts(surface: Surface, mesh: Mesh, settings: MeshSettings, device: D
     """
     if settings.purpose is None:
         return _select_parts(surface, mesh, settings, device, volume)
-    from clrecon.jobs.mesh.purposes import measure_pieces
+    from clrecon.jobs.mesh.print_facts import measure_pieces
 
     found = measure_pieces(mesh.vertices, mesh.triangles)
     parts = _select_parts(surface, mesh, settings, device, volume)
@@ -213,14 +120,12 @@ def _select_parts(surface: Surface, mesh: Mesh, settings: MeshSettings, device: 
         mesh.report.setdefault("warnings", []).append(f"{error}: they were found without it")
     among = None
     if settings.keep == "bone":
-        from clrecon.jobs.mesh.bone import find_bone
-
         labelled = labelled or find_labels(mesh.triangles, mesh.vertex_count)
         among = find_bone(
             mesh, volume, surface, labelled, without_table=settings.remove_table, advice=_advice(settings)
         )
         if settings.purpose is not None:
-            from clrecon.jobs.mesh.purposes import measure_pieces
+            from clrecon.jobs.mesh.print_facts import measure_pieces
 
             other = mesh.triangles[~among[labelled[1][mesh.triangles[:, 0]]]]
             no_bone = measure_pieces(mesh.vertices, other)

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-from clrecon.jobs.mesh.parts import Part
 from clrecon.jobs.mesh.settings import MeshSettings
+from clrecon.jobs.mesh.surfaces import Part
 from clrecon.system.progress import Progress, ignore_progress
 
 if TYPE_CHECKING:
@@ -97,7 +97,7 @@ def judge_parts(parts: Sequence[Part], volume: Volume, settings: MeshSettings) -
 
 def describe_purposes(parts: Sequence[Part]) -> list[str]:
     """Measure what the purpose of the meshes asks for, as ``print`` in the `facts` of each; returns warnings."""
-    from clrecon.jobs.mesh.purposes import describe_print, warn_of_print
+    from clrecon.jobs.mesh.print_facts import describe_print, warn_of_print
 
     warnings = []
     for part in parts:

@@ -8,10 +8,11 @@ from typing import TYPE_CHECKING, Any
 
 from clrecon.jobs.mesh.labels import describe_label
 from clrecon.jobs.mesh.levels import describe_level
-from clrecon.jobs.mesh.parts import Part, Surface
 from clrecon.jobs.mesh.presets import find_preset
 from clrecon.jobs.mesh.settings import MeshSettings
+from clrecon.jobs.mesh.surfaces import Part, Surface
 from clrecon.jobs.shared.report import platform_name
+from clrecon.jobs.shared.skin import SKIN_HU
 from clrecon.version import package_version
 
 if TYPE_CHECKING:
@@ -22,9 +23,6 @@ if TYPE_CHECKING:
     from clrecon.system.files import StagedFile
 
 __all__ = ["describe_job", "describe_part"]
-
-SKIN_HU = (-950.0, -200.0)
-"""Iso values between air and fat: the surface is the skin, and a head's a face."""
 
 _OF_ONE = ("quality", "walls", "iso_distance", "refinement", "print")
 """What stands at the top of the report too where there is one mesh."""

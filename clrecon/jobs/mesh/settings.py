@@ -1,4 +1,4 @@
-"""What a job may be told, checked when it is said."""
+"""Settings of the mesh job, validated on construction."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from clrecon.errors import UsageError
-from clrecon.jobs.mesh.labels import LabelChoice
+from clrecon.jobs.mesh.label_choice import LabelChoice
 from clrecon.jobs.mesh.presets import DEFAULT_PRESET, find_preset
 from clrecon.jobs.mesh.purposes import find_purpose
-from clrecon.jobs.shared.checks import check_bone_loss, check_field_of_view, check_memory
+from clrecon.jobs.shared.settings import InputSettings
 
 __all__ = ["MeshSettings", "name_level"]
 
@@ -21,7 +21,7 @@ def name_level(level: float | Sequence[float]) -> str:
 
 
 @dataclass(frozen=True)
-class MeshSettings:
+class MeshSettings(InputSettings):
     """How a mesh is made from a CT series.
 
     Parameters
@@ -37,20 +37,6 @@ class MeshSettings:
         Name of an iso value, see `clrecon.jobs.mesh.presets`.  Neither of both means the preset "bone".
     half_way : "auto" or (bone, tissue), optional
         In place of an iso value: half way between the two materials, measured in the scan or given in HU.
-    series : str or int, optional
-        Which series of the input; None leaves the choice to `read_volume`.
-    phase : int, optional
-        Which of its phases, where it has several.
-    allow_gaps : bool
-        Read a stack with missing slices.
-    remove_table : bool
-        Turn what is not the patient's body into air first, see `clrecon.anatomy.body.remove_table`.
-    allow_bone_loss : bool
-        Go on where this takes more than 2 % of the bone.
-    field_of_view : float or "auto", optional
-        Turn what lies further from the centre of the slices (mm) into air first; "auto": the circle that fits them.
-    force : bool
-        Read data sets without preamble or meta header.
     space : {"lps", "ras"}
         Patient frame of the written mesh.
     closed : bool
@@ -69,11 +55,7 @@ class MeshSettings:
     split : bool
         One mesh a component, the largest first.
     labels : LabelChoice, optional
-        A label map: one mesh a label, see `clrecon.jobs.mesh.labels`.
-    device : str, optional
-        Name or index of an OpenCL device; None leaves the choice to `choose_device`.
-    memory : int, optional
-        Bytes that may be taken on the device; None is all that it has.  What does not fit goes through in slabs.
+        A label map: one mesh a label, see `LabelChoice`.
     smooth : int, optional
         Iterations of smoothing, see `clrecon.mesh.smooth_mesh`; None: none.
     decimate : float, optional
@@ -81,9 +63,11 @@ class MeshSettings:
     max_deviation_mm : float, optional
         Bound of each of both, mm; None: a quarter of the shortest voxel step.
     purpose : str, optional
-        What the mesh is for: more is measured.  It sets nothing here, see `clrecon.jobs.mesh.purposes.settings_for`.
+        What the mesh is for: more is measured.  It sets nothing here, see `clrecon.jobs.mesh.for_purpose.settings_for`.
     strict : bool
         Measure whatever a gate needs, triangles that cut each other too.
+    **shared
+        See `clrecon.jobs.shared.settings.InputSettings`.
 
     Raises
     ------
@@ -96,13 +80,6 @@ class MeshSettings:
     keep_outside: bool = False
     preset: str | None = None
     half_way: str | Sequence[float] | None = None
-    series: str | int | None = None
-    phase: int | None = None
-    allow_gaps: bool = False
-    remove_table: bool = False
-    allow_bone_loss: bool = False
-    field_of_view: float | str | None = None
-    force: bool = False
     space: str = "lps"
     closed: bool = True
     topology: str = "separated"
@@ -112,8 +89,6 @@ class MeshSettings:
     seeds: Sequence[Sequence[float]] = ()
     split: bool = False
     labels: LabelChoice | None = None
-    device: str | None = None
-    memory: int | None = None
     smooth: int | None = None
     decimate: float | None = None
     max_deviation_mm: float | None = None
@@ -136,13 +111,11 @@ class MeshSettings:
             raise UsageError(f"the number of components to keep must be 1 or more, not {self.keep_largest}")
         if self.min_volume_ml is not None and not (math.isfinite(self.min_volume_ml) and self.min_volume_ml > 0):
             raise UsageError(f"the smallest volume to keep must be above 0 ml, not {self.min_volume_ml}")
-        check_memory(self.memory)
+        super().__post_init__()
         for seed in self.seeds:
             if len(seed) != 3 or not all(map(math.isfinite, seed)):
                 raise UsageError(f"a seed is a point of three numbers in mm, not {tuple(seed)}")
         self._check_refinement()
-        check_field_of_view(self.field_of_view)
-        check_bone_loss(self.remove_table, self.allow_bone_loss)
         from clrecon.geometry import frame_from_lps  # numpy: not wanted before a job starts
         from clrecon.geometry.iso_rule import check_topology
 

@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
-from clrecon.jobs.mesh.report import SKIN_HU
 from clrecon.jobs.render.settings import LabelLook, RenderSettings
 from clrecon.jobs.shared.report import platform_name
+from clrecon.jobs.shared.skin import SKIN_HU
 from clrecon.system.wording import name_parameter
 from clrecon.version import package_version
 

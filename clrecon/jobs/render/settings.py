@@ -1,4 +1,4 @@
-"""What a picture may be told, checked when it is said."""
+"""Settings of the render job, validated on construction."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from clrecon.errors import UsageError
 from clrecon.jobs.render.modes import MODES, find_misplaced
-from clrecon.jobs.shared.checks import check_bone_loss, check_field_of_view, check_memory
+from clrecon.jobs.shared.settings import InputSettings
 from clrecon.system.wording import name_parameter
 
 if TYPE_CHECKING:
@@ -76,7 +76,7 @@ class LabelLook:
 
 
 @dataclass(frozen=True)
-class RenderSettings:
+class RenderSettings(InputSettings):
     """How pictures are made from a CT series.
 
     Parameters
@@ -123,8 +123,8 @@ class RenderSettings:
     cpr : {"straightened", "stretched"}
     labels : LabelLook, optional
     turntable : Turntable, optional
-    series, phase, allow_gaps, force, remove_table, allow_bone_loss, field_of_view, device, memory
-        As in `clrecon.jobs.mesh.settings.MeshSettings`.
+    **shared
+        See `clrecon.jobs.shared.settings.InputSettings`.
 
     Raises
     ------
@@ -163,15 +163,6 @@ class RenderSettings:
     cpr: str | None = None
     labels: LabelLook | None = None
     turntable: Turntable | None = None
-    series: str | int | None = None
-    phase: int | None = None
-    allow_gaps: bool = False
-    force: bool = False
-    remove_table: bool = False
-    allow_bone_loss: bool = False
-    field_of_view: float | str | None = None
-    device: str | None = None
-    memory: int | None = None
 
     def __post_init__(self) -> None:
         self._check_looks()
@@ -182,9 +173,7 @@ class RenderSettings:
             raise UsageError(misplaced)
         self._check_place()
         self._check_mode()
-        check_memory(self.memory)
-        check_field_of_view(self.field_of_view)
-        check_bone_loss(self.remove_table, self.allow_bone_loss)
+        super().__post_init__()
 
     def _given(self) -> set[str]:
         """Names of the settings that are not what they are by default."""

@@ -4,18 +4,16 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+from clrecon.jobs.shared.settings import InputSettings
 from clrecon.system.progress import Progress
-from clrecon.system.wording import name_parameter
 
 if TYPE_CHECKING:
     from clrecon.geometry import Volume
-    from clrecon.jobs.mesh.settings import MeshSettings
-    from clrecon.jobs.render.settings import RenderSettings
 
-__all__ = ["leave_outside", "mask_volume"]
+__all__ = ["mask_volume"]
 
 
-def mask_volume(volume: Volume, settings: MeshSettings | RenderSettings, progress: Progress) -> Volume:
+def mask_volume(volume: Volume, settings: InputSettings, progress: Progress) -> Volume:
     """The volume with air outside of the field of view and of the body, as far as the settings ask for it.
 
     Raises
@@ -67,34 +65,3 @@ def _describe_cut(facts: dict[str, Any]) -> str:
     apart = facts["bone_voxels_apart"]
     whole = f", {apart:,} of them in pieces that lie outside whole" if apart else ""
     return f"; it cuts bone off: {100.0 * (1.0 - facts['bone_kept']):.3g} %, {lost:,} voxels above 300 HU{whole}"
-
-
-def leave_outside(volume: Volume, settings: MeshSettings, progress: Progress) -> Volume:
-    """The volume without the air round the patient, where the settings ask for what lies below an iso value.
-
-    Raises
-    ------
-    RefusedInputError
-        There is no body.
-    NoSurfaceError
-        All that lies below is outside of it.
-    """
-    if settings.below is None or settings.keep_outside:
-        return volume
-    from clrecon.anatomy.outside_air import leave_outside_air
-
-    progress("mask", 0, 0)
-    warnings = list(volume.report["warnings"])
-    volume = leave_outside_air(volume, [level for level in settings.levels if not isinstance(level, tuple)])
-    facts = volume.report["outside_air"]
-    warnings.append(
-        f"air outside of the body was left out: {facts['left_out_ml']:,.0f} ml, {facts['kept_ml']:,.1f} ml within it"
-        f" are kept ({name_parameter('keep_outside', True)} takes all)"
-    )
-    if facts["opening_mm2"] > 0.0:
-        warnings.append(
-            f"cavities are open to the outside and were cut there: {facts['opening_mm2']:,.0f} mm2 of cut, a flat end"
-            " of the surface at each opening (nostrils, mouth, ears, holes of a dry bone); look at it there"
-        )
-    volume.report["warnings"] = warnings
-    return volume

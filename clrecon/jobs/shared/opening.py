@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from clrecon.opencl import Device
 
-__all__ = ["DeviceOpening", "prepare_surfaces"]
+__all__ = ["DeviceOpening"]
 
 
 def _choose(name: str | int | Device | None) -> Device:
@@ -21,16 +21,6 @@ def _choose(name: str | int | Device | None) -> Device:
 
 def _prepare(chosen: Future[Device], prepare: Callable[[Device], None]) -> None:
     prepare(chosen.result())
-
-
-def prepare_surfaces(device: Device, components: bool, topology: str, inside: str = "above") -> None:
-    """Build the kernels that find surfaces of this topology and, where asked for, components."""
-    from clrecon.operators.primitives.union_find import prepare_components
-    from clrecon.operators.surface.extract import prepare_isosurface
-
-    prepare_isosurface(device, topology=topology, inside=inside)
-    if components:
-        prepare_components(device)
 
 
 class DeviceOpening:

@@ -11,7 +11,7 @@ import pytest
 from clrecon.errors import NoSurfaceError, UsageError
 from clrecon.geometry import Volume
 from clrecon.jobs.mesh.job import make_mesh
-from clrecon.jobs.mesh.labels import LabelChoice
+from clrecon.jobs.mesh.label_choice import LabelChoice
 from clrecon.jobs.mesh.settings import MeshSettings
 
 AFFINE = np.diag((1.0, 1.0, 1.5, 1.0))

@@ -11,8 +11,9 @@ import pytest
 
 from clrecon.cli.main import main
 from clrecon.errors import UsageError
-from clrecon.jobs.mesh.labels import LabelChoice
-from clrecon.jobs.mesh.purposes import settings_for, warn_of_print
+from clrecon.jobs.mesh.for_purpose import settings_for
+from clrecon.jobs.mesh.label_choice import LabelChoice
+from clrecon.jobs.mesh.print_facts import warn_of_print
 from clrecon.jobs.mesh.settings import MeshSettings
 from clrecon.phantom import PhantomSettings, write_phantom
 

@@ -7,7 +7,7 @@ import math
 import pytest
 
 from clrecon.errors import UsageError
-from clrecon.jobs.mesh.labels import LabelChoice
+from clrecon.jobs.mesh.label_choice import LabelChoice
 from clrecon.jobs.mesh.presets import DEFAULT_PRESET, PRESETS, find_preset
 from clrecon.jobs.mesh.settings import MeshSettings
 

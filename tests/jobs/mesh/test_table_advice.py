@@ -8,8 +8,8 @@ import pytest
 from clrecon.geometry import Volume
 from clrecon.geometry.iso_rule import choose_iso_rule
 from clrecon.jobs.mesh.bone import find_bone, warn_of_walls
-from clrecon.jobs.mesh.parts import Part, Surface
 from clrecon.jobs.mesh.settings import MeshSettings
+from clrecon.jobs.mesh.surfaces import Part, Surface
 from clrecon.mesh import Mesh
 from clrecon.mesh.connectivity import label_components
 from clrecon.reference.surface.extract import extract_isosurface

@@ -12,9 +12,10 @@ import pytest
 
 from clrecon.errors import OutputError, UsageError
 from clrecon.jobs.mesh.job import make_mesh
-from clrecon.jobs.mesh.labels import LabelChoice
-from clrecon.jobs.mesh.parts import first_names, plan_surfaces
+from clrecon.jobs.mesh.label_choice import LabelChoice
+from clrecon.jobs.mesh.parts import first_names
 from clrecon.jobs.mesh.settings import MeshSettings
+from clrecon.jobs.mesh.surfaces import plan_surfaces
 from clrecon.jobs.render.files import PictureFiles
 from clrecon.jobs.render.job import make_pictures
 from clrecon.jobs.render.settings import LabelLook, RenderSettings

@@ -1,0 +1,57 @@
+"""The settings that a purpose stands for, beside those that are given."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from clrecon.errors import UsageError
+from clrecon.jobs.mesh.presets import HIGHEST_BONE_HU, LOWEST_BONE_HU
+from clrecon.jobs.mesh.purposes import find_purpose
+from clrecon.jobs.mesh.settings import MeshSettings
+from clrecon.system.wording import name_parameter
+
+__all__ = ["settings_for"]
+
+
+def settings_for(name: str | None, given: dict[str, Any]) -> dict[str, Any]:
+    """The fields of `MeshSettings` that a purpose sets beside those that are given, which win.
+
+    Parameters
+    ----------
+    name : str, optional
+    given : dict
+        Fields; None, False and what is empty are not given.
+
+    Returns
+    -------
+    dict
+        The given fields, and ``purpose``.  Where components are chosen in another way none is left out for it, and bone
+        is told from other things only where all iso values are those of bone, from 100 to 1500 HU or ``"auto"``.
+
+    Raises
+    ------
+    UsageError
+        Unknown purpose, or a surface that is left open.
+    """
+    if name is None:
+        return dict(given)
+    fields = dict(find_purpose(name).settings)
+    if not given.get("closed", True):
+        raise UsageError(f"a surface for {name} is closed: leave {name_parameter('closed', False)} out")
+    if any(given.get(other) for other in ("seeds", "min_volume_ml", "split", "labels")):
+        del fields["keep_largest"]
+    chosen = any(given.get(other) for other in ("keep_largest", "seeds", "min_volume_ml"))
+    if chosen or not _at_levels_of_bone(given):
+        del fields["keep"]
+    taken = {field: value for field, value in fields.items() if not given.get(field)}
+    return {**given, **taken, "purpose": name}
+
+
+def _at_levels_of_bone(given: dict[str, Any]) -> bool:
+    """Whether all surfaces that these fields of `MeshSettings` ask for are iso surfaces at levels of bone."""
+    settings = MeshSettings(**given)
+    if settings.labels is not None or settings.inside != "above":
+        return False
+    levels = [float(level) for level in settings.levels if not isinstance(level, tuple)]
+    return all(math.isnan(level) or LOWEST_BONE_HU <= level <= HIGHEST_BONE_HU for level in levels)

@@ -1,0 +1,103 @@
+"""What a person who prints a mesh wants to know: size, walls, cavities, what was left out."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from clrecon.system.wording import name_parameter
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from clrecon.mesh import Mesh
+
+__all__ = ["describe_print", "measure_pieces", "warn_of_print"]
+
+THIN_MM = 1.0
+"""Walls below this break or are not printed at all by common printers (layers of 0.1 to 0.3 mm, nozzles of 0.4 mm)."""
+
+THIN_SHARE = 0.05
+"""Share of the surface with thin walls from which on it is said as a warning."""
+
+
+def measure_pieces(vertices: NDArray[np.floating], triangles: NDArray[np.uint32]) -> dict[str, float]:
+    """What the components of a surface enclose; `vertices` have shape (n, 3), in mm, `triangles` (m, 3).
+
+    Returns
+    -------
+    dict
+        ``pieces``, ``pieces_ml`` : components that enclose something, and how much
+        ``cavities``, ``cavities_ml`` : walls of cavities, and what they enclose
+    """
+    from clrecon.mesh.refine.shifts import measure_volumes
+    from clrecon.system.pieces import local_origin
+
+    found = measure_volumes(vertices - local_origin(vertices), triangles).mm3 / 1000.0
+    return {
+        "pieces": int((found > 0.0).sum()),
+        "pieces_ml": float(found[found > 0.0].sum()),
+        "cavities": int((found < 0.0).sum()),
+        "cavities_ml": float(-found[found < 0.0].sum()),
+    }
+
+
+def describe_print(mesh: Mesh, found: dict[str, float], kept: dict[str, float]) -> dict[str, Any]:
+    """What a person who prints a mesh wants to know: ``print`` of the report.
+
+    Parameters
+    ----------
+    mesh : Mesh
+        As it is written.
+    found, kept : dict
+        `measure_pieces` of the surface as it was extracted, and of what was kept of it.
+
+    Returns
+    -------
+    dict
+        ``size_mm`` : x, y, z of the box around it
+        ``wall`` : see `clrecon.mesh.compare.thickness.measure_walls`
+        ``left_out`` : pieces and cavities as in `measure_pieces`; cavities that are left out are filled; and
+        ``not_bone``, ``not_bone_ml``, the pieces whose walls are not like bone or that are crumbs, None where that was
+        not asked
+        ``pieces``, ``pieces_ml``, ``cavities``, ``cavities_ml`` : those that are in it
+    """
+    from clrecon.mesh.compare.thickness import measure_walls
+
+    size = mesh.vertices.max(axis=0).astype(float) - mesh.vertices.min(axis=0)
+    return {
+        "size_mm": size.tolist(),
+        "wall": measure_walls(mesh.vertices, mesh.triangles, THIN_MM),
+        "left_out": {
+            **{name: max(found[name] - kept[name], 0) for name in found},
+            **{name: mesh.report.get(name) for name in ("not_bone", "not_bone_ml")},
+        },
+        **kept,
+    }
+
+
+def warn_of_print(facts: dict[str, Any]) -> list[str]:
+    """Warnings of what `describe_print` says: thin walls, closed cavities, the wrong piece."""
+    warnings = []
+    wall, left_out = facts["wall"], facts["left_out"]
+    if wall["thin_share"] is not None and wall["thin_share"] > THIN_SHARE:
+        warnings.append(
+            f"{100 * wall['thin_share']:.0f} % of the surface has a wall below {wall['thin_mm']:g} mm, which can break"
+            f" or be lost in a print: lower {name_parameter('iso_value')}, or print it larger"
+        )
+    if facts["cavities"]:
+        warnings.append(
+            f"{facts['cavities']:,} closed cavities of {facts['cavities_ml']:.2g} ml together are in it: powder or"
+            f" resin stays in them; {name_parameter('keep_largest', 1)} fills them"
+        )
+    bone_told = left_out.get("not_bone") is not None
+    other_ml = left_out["pieces_ml"] - (left_out["not_bone_ml"] if bone_told else 0.0)
+    if other_ml > facts["pieces_ml"]:
+        away, seed = name_parameter("remove_table", True), name_parameter("seeds", "X,Y,Z")
+        table = "" if bone_told else f" The piece of largest area can be a table ({away});"
+        warnings.append(
+            f"{'bone that' if bone_told else 'what'} was left out encloses {other_ml:.3g} ml, more than the"
+            f" {facts['pieces_ml']:.3g} ml that were kept: is it the right piece?{table} {seed} keeps the one at a"
+            " point"
+        )
+    return warnings

@@ -1,0 +1,63 @@
+"""Settings that every job shares: which scan, what of it is left out, and on which device."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from clrecon.errors import UsageError
+
+__all__ = ["InputSettings"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class InputSettings:
+    """What is read, what of it is turned into air, and where it is computed.
+
+    Parameters
+    ----------
+    series : str or int, optional
+        Which series of the input; None leaves the choice to `read_volume`.
+    phase : int, optional
+        Which of its phases, where it has several.
+    allow_gaps : bool
+        Read a stack with missing slices.
+    force : bool
+        Read data sets without preamble or meta header.
+    remove_table : bool
+        Turn what is not the patient's body into air first, see `clrecon.anatomy.body.remove_table`.
+    allow_bone_loss : bool
+        Go on where this takes more than 2 % of the bone.
+    field_of_view : float or "auto", optional
+        Turn what lies further from the centre of the slices (mm) into air first; "auto": the circle that fits them.
+    device : str, optional
+        Name or index of an OpenCL device; None leaves the choice to `choose_device`.
+    memory : int, optional
+        Bytes that may be taken on the device; None is all that it has.  What does not fit goes through in slabs.
+
+    Raises
+    ------
+    UsageError
+        A value is impossible.
+    """
+
+    series: str | int | None = None
+    phase: int | None = None
+    allow_gaps: bool = False
+    force: bool = False
+    remove_table: bool = False
+    allow_bone_loss: bool = False
+    field_of_view: float | str | None = None
+    device: str | None = None
+    memory: int | None = None
+
+    def __post_init__(self) -> None:
+        if self.memory is not None and self.memory < 1:
+            raise UsageError(f"the memory that may be taken must be above 0 bytes, not {self.memory}")
+        if isinstance(self.field_of_view, str):
+            if self.field_of_view != "auto":
+                raise UsageError(f"the field of view is a radius in mm or auto, not {self.field_of_view!r}")
+        elif self.field_of_view is not None and not (math.isfinite(self.field_of_view) and self.field_of_view > 0.0):
+            raise UsageError(f"the radius of the field of view is a length in mm above 0, not {self.field_of_view:g}")
+        if self.allow_bone_loss and not self.remove_table:
+            raise UsageError("a loss of bone is allowed, but nothing takes any: ask for the removal of the table too")

@@ -1,0 +1,6 @@
+"""What shows the outside of the body, by which a patient can be known."""
+
+__all__ = ["SKIN_HU"]
+
+SKIN_HU = (-950.0, -200.0)
+"""Iso values between air and fat: the surface is the skin, and a head's a face."""
