@@ -13,7 +13,7 @@ from typing import Any, BinaryIO
 
 from clrecon.errors import OutputError
 from clrecon.exchange.content import Content, refuse_file
-from clrecon.exchange.polydata import make_polydata
+from clrecon.exchange.vtk import make_polydata
 
 __all__ = ["estimate", "verify", "write"]
 

@@ -224,15 +224,10 @@ class Mesh:
         UsageError
             The mesh fails `check`: VTK would crash on it.
         """
-        import pyvista
-
-        from clrecon.exchange.polydata import make_polydata
+        from clrecon.mesh.vtk import wrap_polydata
 
         self.check()
-        polydata = pyvista.wrap(make_polydata(self._vertices, self._triangles, self._normals))
-        polydata.field_data["SPACE"] = ["LPS"]
-        polydata.field_data["UNIT"] = ["mm"]
-        return polydata
+        return wrap_polydata(self._vertices, self._triangles, self._normals)
 
     def __repr__(self) -> str:
         normals = "" if self._normals is None else ", with normals"

@@ -14,7 +14,7 @@ import pytest
 from clrecon.cli.levels import parse_hu
 from clrecon.cli.main import main
 from clrecon.errors import UsageError
-from clrecon.jobs.mesh.labels import LabelChoice
+from clrecon.jobs.mesh.label_choice import LabelChoice
 from clrecon.jobs.mesh.settings import MeshSettings
 
 

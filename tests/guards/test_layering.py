@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import ast
+
 import pytest
-from house import LEFT_OF, find_layer_faults, layer_of, package_modules
+from house import LEFT_OF, ROOT, find_layer_faults, layer_of, package_modules, walk_imports
 
 
 def test_every_module_keeps_to_its_layer() -> None:
@@ -63,3 +65,29 @@ def test_a_wrong_import_is_found(module: str, source: str, expected: str) -> Non
 )
 def test_a_right_import_is_accepted(module: str, source: str) -> None:
     assert find_layer_faults(source, module) == []
+
+
+VTK_ELSEWHERE = {
+    "clrecon/exchange/vtp.py",  # VTK's own format, written by VTK
+    "clrecon/jobs/bench/peer.py",  # VTK as the peer that is timed
+}
+
+
+def imports_vtk(source: str) -> bool:
+    return any(
+        name.split(".")[0] in ("pyvista", "vtk", "vtkmodules")
+        for name, _, _ in walk_imports(ast.parse(source), "clrecon.room.module", False)
+    )
+
+
+def test_vtk_is_known_in_one_file_of_a_room() -> None:
+    found = {
+        path.relative_to(ROOT).as_posix()
+        for path in package_modules().values()
+        if imports_vtk(path.read_text(encoding="utf-8"))
+    }
+    others = {name for name in found if not name.endswith("/vtk.py") and not name.startswith("clrecon/viewer/")}
+    assert len(found) > 5
+    assert others == VTK_ELSEWHERE
+    assert imports_vtk("def f():\n    from vtkmodules.vtkCommonCore import vtkPoints")
+    assert not imports_vtk("from clrecon.exchange.vtk import make_polydata")

@@ -12,6 +12,7 @@ from clrecon.errors import NoSurfaceError, UsageError
 from clrecon.mesh.connectivity import order_by_number
 from clrecon.mesh.mesh import Mesh
 from clrecon.mesh.triangles import cross_product, cross_products
+from clrecon.mesh.vtk import CellLocator
 from clrecon.system.pieces import chunks, local_origin
 
 __all__ = [
@@ -82,7 +83,7 @@ def sample_surface_points(
 
 
 class SurfaceDistance:
-    """Exact distances from points to the nearest triangle of one surface, by `vtkStaticCellLocator`.
+    """Exact distances from points to the nearest triangle of one surface.
 
     Parameters
     ----------
@@ -91,30 +92,12 @@ class SurfaceDistance:
     """
 
     def __init__(self, vertices: NDArray[np.floating], triangles: NDArray[np.uint32]):
-        from vtkmodules.vtkCommonDataModel import vtkStaticCellLocator
-
-        from clrecon.exchange.polydata import make_polydata
-
         self._origin = local_origin(vertices)
-        self._polydata = make_polydata(vertices - self._origin, np.ascontiguousarray(triangles), None)
-        self._locator = vtkStaticCellLocator()
-        self._locator.SetDataSet(self._polydata)
-        self._locator.BuildLocator()
+        self._locator = CellLocator(vertices - self._origin, triangles)
 
     def __call__(self, points: Points) -> NDArray[np.float64]:
         """Distances in mm, shape (k,), from `points`, shape (k, 3), mm."""
-        from vtkmodules.vtkCommonCore import reference
-        from vtkmodules.vtkCommonDataModel import vtkGenericCell
-
-        closest = [0.0, 0.0, 0.0]
-        square: Any = reference(0.0)
-        others: tuple[Any, ...] = (vtkGenericCell(), reference(0), reference(0), square)
-        squares = np.empty(len(points))
-        find: Any = self._locator.FindClosestPoint
-        for row, point in enumerate((points - self._origin).tolist()):
-            find(point, closest, *others)
-            squares[row] = square.get()
-        return np.sqrt(squares)
+        return self._locator.distances(points - self._origin)
 
 
 class NearDistance:

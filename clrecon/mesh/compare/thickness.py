@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.mesh.compare.distances import sample_surface_points
+from clrecon.mesh.vtk import CellLocator
 from clrecon.system.pieces import local_origin
 
 __all__ = ["SAMPLES", "measure_walls", "wall_thickness"]
@@ -43,30 +44,14 @@ def wall_thickness(
     NoSurfaceError
         The surface has no area.
     """
-    from vtkmodules.vtkCommonCore import reference
-    from vtkmodules.vtkCommonDataModel import vtkStaticCellLocator
-
-    from clrecon.exchange.polydata import make_polydata
-
     origin = local_origin(vertices)
     near = vertices - origin
-    polydata = make_polydata(near, np.ascontiguousarray(triangles), None)
-    locator = vtkStaticCellLocator()
-    locator.SetDataSet(polydata)
-    locator.BuildLocator()
     points, rows = sample_surface_points(near, triangles, samples)
     a, b, c = near[triangles[rows]].transpose(1, 0, 2)
     normals = np.cross(b - a, c - a)
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     farthest = float(np.linalg.norm(near.max(axis=0) - near.min(axis=0))) + 1.0
-    starts, ends = points - _INWARD * normals, points - farthest * normals
-    hit = [0.0, 0.0, 0.0]
-    others: tuple[Any, ...] = (reference(0.0), hit, [0.0, 0.0, 0.0], reference(0), reference(0))
-    intersect: Any = locator.IntersectWithLine
-    found = np.full((samples, 3), np.nan)
-    for row, (start, end) in enumerate(zip(starts.tolist(), ends.tolist(), strict=True)):
-        if intersect(start, end, 1e-9, *others):
-            found[row] = hit
+    found = CellLocator(near, triangles).first_hits(points - _INWARD * normals, points - farthest * normals)
     return np.asarray(np.linalg.norm(found - points, axis=1))
 
 

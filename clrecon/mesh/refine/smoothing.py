@@ -7,7 +7,6 @@ component, and the vertices that are taken back where the surface would cut itse
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from clrecon.errors import UsageError
 from clrecon.exchange.coordinates import rounding_step
@@ -16,6 +15,7 @@ from clrecon.mesh.mesh import Mesh
 from clrecon.mesh.normals import vertex_normals
 from clrecon.mesh.refine.decimation import carry_on, check_refinement
 from clrecon.mesh.refine.shifts import measure_volumes, move_vertices, restore_volumes, shorten_steps
+from clrecon.mesh.vtk import smooth_windowed_sinc
 from clrecon.system.pieces import local_origin
 
 __all__ = ["smooth_mesh"]
@@ -63,7 +63,7 @@ def smooth_mesh(mesh: Mesh, iterations: int = 20, max_deviation_mm: float | None
     longest = max(bound - rounding_step(mesh.vertices), 0.5 * bound)
     origin = local_origin(mesh.vertices)
     before = mesh.vertices - origin
-    step = _windowed_sinc(before.astype(np.float32), mesh.triangles, iterations) - before
+    step = smooth_windowed_sinc(before.astype(np.float32), mesh.triangles, iterations, _PASS_BAND) - before
 
     edges = find_edges(mesh.triangles, mesh.vertex_count)
     step[edges.ends[:, edges.uses == 1]] = 0.0  # VTK smooths along the border all the same
@@ -78,23 +78,3 @@ def smooth_mesh(mesh: Mesh, iterations: int = 20, max_deviation_mm: float | None
         "vertices_taken_back": taken_back,
     }
     return Mesh(vertices, mesh.triangles, vertex_normals(vertices, mesh.triangles), carry_on(mesh, "smooth", said))
-
-
-def _windowed_sinc(
-    vertices: NDArray[np.float32], triangles: NDArray[np.uint32], iterations: int
-) -> NDArray[np.floating]:
-    from vtkmodules.util.numpy_support import vtk_to_numpy
-    from vtkmodules.vtkFiltersCore import vtkWindowedSincPolyDataFilter
-
-    from clrecon.exchange.polydata import make_polydata
-
-    smoother = vtkWindowedSincPolyDataFilter()
-    smoother.SetInputData(make_polydata(vertices, triangles, None))
-    smoother.SetNumberOfIterations(iterations)
-    smoother.SetPassBand(_PASS_BAND)
-    smoother.NormalizeCoordinatesOn()
-    smoother.NonManifoldSmoothingOn()
-    smoother.BoundarySmoothingOff()
-    smoother.FeatureEdgeSmoothingOff()
-    smoother.Update()
-    return vtk_to_numpy(smoother.GetOutput().GetPoints().GetData()).astype(np.float64)

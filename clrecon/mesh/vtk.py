@@ -1,0 +1,94 @@
+"""What of meshes VTK does: finding the nearest triangle, the first one on a line, smoothing; arrays in and out."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clrecon.exchange.vtk import make_polydata
+
+__all__ = ["CellLocator", "smooth_windowed_sinc", "wrap_polydata"]
+
+Points = NDArray[np.float64]
+
+LINE_TOLERANCE = 1e-9
+"""Of `vtkStaticCellLocator`, in its own units: how near to a line a triangle counts as hit."""
+
+
+class CellLocator:
+    """Triangles of one surface by place: `vtkStaticCellLocator`.
+
+    Parameters
+    ----------
+    vertices : ndarray, shape (n, 3), mm, near zero
+    triangles : ndarray, shape (m, 3), uint32, at least one
+    """
+
+    def __init__(self, vertices: NDArray[np.floating], triangles: NDArray[np.uint32]):
+        from vtkmodules.vtkCommonDataModel import vtkStaticCellLocator
+
+        self._polydata = make_polydata(vertices, np.ascontiguousarray(triangles), None)
+        self._locator = vtkStaticCellLocator()
+        self._locator.SetDataSet(self._polydata)
+        self._locator.BuildLocator()
+
+    def distances(self, points: Points) -> NDArray[np.float64]:
+        """Distances in mm, shape (k,), from `points`, shape (k, 3), to the nearest triangle."""
+        from vtkmodules.vtkCommonCore import reference
+        from vtkmodules.vtkCommonDataModel import vtkGenericCell
+
+        closest = [0.0, 0.0, 0.0]
+        square: Any = reference(0.0)
+        others: tuple[Any, ...] = (vtkGenericCell(), reference(0), reference(0), square)
+        squares = np.empty(len(points))
+        find: Any = self._locator.FindClosestPoint
+        for row, point in enumerate(points.tolist()):
+            find(point, closest, *others)
+            squares[row] = square.get()
+        return np.sqrt(squares)
+
+    def first_hits(self, starts: Points, ends: Points) -> Points:
+        """Where lines from `starts` to `ends`, shape (k, 3), first meet the surface; NaN where they do not."""
+        from vtkmodules.vtkCommonCore import reference
+
+        hit = [0.0, 0.0, 0.0]
+        others: tuple[Any, ...] = (reference(0.0), hit, [0.0, 0.0, 0.0], reference(0), reference(0))
+        intersect: Any = self._locator.IntersectWithLine
+        found = np.full((len(starts), 3), np.nan)
+        for row, (start, end) in enumerate(zip(starts.tolist(), ends.tolist(), strict=True)):
+            if intersect(start, end, LINE_TOLERANCE, *others):
+                found[row] = hit
+        return found
+
+
+def smooth_windowed_sinc(
+    vertices: NDArray[np.float32], triangles: NDArray[np.uint32], iterations: int, pass_band: float
+) -> NDArray[np.float64]:
+    """Vertices, shape (n, 3), float64, after `vtkWindowedSincPolyDataFilter` (Taubin, Zhang and Golub, 1996)."""
+    from vtkmodules.util.numpy_support import vtk_to_numpy
+    from vtkmodules.vtkFiltersCore import vtkWindowedSincPolyDataFilter
+
+    smoother = vtkWindowedSincPolyDataFilter()
+    smoother.SetInputData(make_polydata(vertices, triangles, None))
+    smoother.SetNumberOfIterations(iterations)
+    smoother.SetPassBand(pass_band)
+    smoother.NormalizeCoordinatesOn()
+    smoother.NonManifoldSmoothingOn()
+    smoother.BoundarySmoothingOff()
+    smoother.FeatureEdgeSmoothingOff()
+    smoother.Update()
+    return np.asarray(vtk_to_numpy(smoother.GetOutput().GetPoints().GetData()), dtype=np.float64)
+
+
+def wrap_polydata(
+    vertices: NDArray[np.floating], triangles: NDArray[np.uint32], normals: NDArray[np.float32] | None
+) -> Any:
+    """``pyvista.PolyData`` in LPS mm that shares the memory of vertices and normals; see `Mesh.to_pyvista`."""
+    import pyvista
+
+    polydata = pyvista.wrap(make_polydata(vertices, triangles, normals))
+    polydata.field_data["SPACE"] = ["LPS"]
+    polydata.field_data["UNIT"] = ["mm"]
+    return polydata
