@@ -13,7 +13,8 @@ from clrecon.mesh import Mesh
 from clrecon.mesh.compare.distances import SurfaceDistance
 from clrecon.mesh.intersections import count_self_intersections
 from clrecon.mesh.normals import vertex_normals
-from clrecon.mesh.refine.smoothing import _windowed_sinc, smooth_mesh
+from clrecon.mesh.refine.smoothing import _PASS_BAND, smooth_mesh
+from clrecon.mesh.vtk import smooth_windowed_sinc
 
 pytestmark = pytest.mark.unit
 
@@ -88,7 +89,7 @@ def test_sheets_that_nearly_touch_do_not_cut_each_other():
     mesh = Mesh(*sheets)
     assert count_self_intersections(mesh.vertices, mesh.triangles) == 0
     origin = mesh.vertices.min(axis=0)
-    free = _windowed_sinc((mesh.vertices - origin).astype(np.float32), mesh.triangles, 20)
+    free = smooth_windowed_sinc((mesh.vertices - origin).astype(np.float32), mesh.triangles, 20, _PASS_BAND)
     assert count_self_intersections(free, mesh.triangles) > 0
     smooth = smooth_mesh(mesh, 20, 1.0)
     assert count_self_intersections(smooth.vertices, smooth.triangles) == 0
