@@ -19,6 +19,19 @@ def test_every_module_keeps_to_its_layer() -> None:
     assert faults == []
 
 
+def test_no_layer_may_import_what_it_does_not() -> None:
+    used: dict[str, set[str]] = {layer: set() for layer in LEFT_OF}
+    for name, path in package_modules().items():
+        tree = ast.parse(path.read_text(encoding="utf-8"))
+        imported = {
+            layer_of(other)
+            for other, _, _ in walk_imports(tree, name, path.name == "__init__.py")
+            if other.split(".")[0] == "clrecon"
+        }
+        used[layer_of(name)] |= imported - {layer_of(name)}
+    assert {layer: set(allowed) for layer, allowed in LEFT_OF.items()} == used
+
+
 def test_every_folder_is_a_known_layer() -> None:
     assert {layer_of(name) for name in package_modules()} <= set(LEFT_OF)
 

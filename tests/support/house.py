@@ -18,42 +18,57 @@ def _layer(name: str, *allowed: str) -> None:
     LEFT_OF[name] = frozenset(allowed)
 
 
-_layer(
-    "__init__",
-    *(
-        "errors",
-        "version",
-        "geometry",
-        "anatomy",
-        "formats",
-        "reading",
-        "labels",
-        "mesh",
-        "rendering",
-        "opencl",
-        "operators",
-    ),
-)
 _layer("errors")
 _layer("version")
 _layer("system", "errors")
+_layer("opencl", "errors", "system")
 _layer("geometry", "errors", "system")
 _layer("anatomy", "errors", "system", "geometry")
-_layer("dicom", "system", "errors", "geometry")
-_layer("exchange", "errors", "version", "system", "geometry")
-_layer("mesh", "system", "errors", "version", "geometry", "anatomy", "exchange")
-_layer("formats", "system", "errors", "geometry", "anatomy", "dicom")
-_layer("reading", "system", "errors", "geometry", "dicom", "formats")
-_layer("labels", "system", "errors", "geometry", "dicom", "formats")
-_layer("reference", "system", "errors", "geometry", "labels", "rendering")
-_layer("phantom", "system", "errors", "version", "geometry")
-_layer("rendering", "system", "errors", "version", "geometry", "labels")
-_layer("opencl", "errors", "system")
-_layer("operators", "system", "errors", "geometry", "anatomy", "labels", "mesh", "rendering", "opencl")
-_layer("jobs", *(set(LEFT_OF) - {"__init__"}))
-_layer("viewer", "errors", "system", "geometry", "mesh", "rendering", "jobs")
-_layer("cli", "errors", "system", "version", "jobs", "viewer")
+_layer("exchange", "errors", "system", "geometry")
+_layer("dicom", "errors", "system", "geometry")
+_layer("formats", "errors", "system", "geometry", "dicom")
+_layer("reading", "errors", "system", "geometry", "dicom", "formats")
+_layer("labels", "errors", "system", "geometry", "dicom", "formats")
+_layer("mesh", "errors", "system", "geometry", "anatomy", "exchange")
+_layer("rendering", "errors", "version", "system", "geometry", "labels")
+_layer("phantom", "errors", "version", "system", "geometry")
+_layer("reference", "errors", "geometry", "labels", "rendering")
+_layer("operators", "errors", "system", "opencl", "geometry", "anatomy", "labels", "mesh", "rendering")
+_layer(
+    "jobs",
+    "errors",
+    "version",
+    "system",
+    "opencl",
+    "geometry",
+    "anatomy",
+    "exchange",
+    "dicom",
+    "formats",
+    "reading",
+    "labels",
+    "mesh",
+    "rendering",
+    "phantom",
+    "reference",
+    "operators",
+)
+_layer("viewer", "errors", "rendering")
+_layer("cli", "errors", "version", "system", "jobs")
 _layer("__main__", "cli")
+_layer(
+    "__init__",
+    "errors",
+    "version",
+    "opencl",
+    "geometry",
+    "anatomy",
+    "reading",
+    "labels",
+    "mesh",
+    "rendering",
+    "operators",
+)
 
 # Third-party packages: at module level (paid by whoever imports the layer), or only inside functions.
 AT_MODULE_LEVEL: dict[str, frozenset[str]] = {
