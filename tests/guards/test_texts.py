@@ -110,6 +110,23 @@ def test_files_are_short() -> None:
     assert {name: lines for name, lines in longest.items() if lines > 450} == {}
 
 
+def long_functions(source: str, limit: int = 80) -> list[str]:
+    """Functions of more than `limit` lines, the docstring among them."""
+    return [
+        node.name
+        for node in ast.walk(ast.parse(source))
+        if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef))
+        and (node.end_lineno or node.lineno) - node.lineno >= limit
+    ]
+
+
+def test_functions_are_short() -> None:
+    found = {path.name: names for path in project_files(".py") if (names := long_functions(path.read_text()))}
+    assert found == {}
+    assert long_functions("def f():\n" + "    x = 1\n" * 80) == ["f"]
+    assert long_functions("def f():\n" + "    x = 1\n" * 79) == []
+
+
 def run_check(root: Path) -> subprocess.CompletedProcess[str]:
     script = root / "scripts" / "derive_mc_tables.py"
     return subprocess.run([sys.executable, str(script), "--check"], capture_output=True, text=True)

@@ -159,21 +159,26 @@ def _read_frames(
     return headers
 
 
-def _validate(values: Values, series: SeriesIdentity, path: Path, name: str, *, frames: int = 1) -> SliceHeader:
-    elements = values.elements
-    reason = describe_undecodable(elements.transfer_syntax)
-    if reason:
-        raise ValueProblem(reason)
-    samples, photometric = values.unsigned("SamplesPerPixel", 1), values.word("PhotometricInterpretation")
+def _check_matrix(samples: int, photometric: str, rows: int, columns: int) -> None:
+    """Refuse colours, and pictures without pixels."""
     if samples != 1 or photometric not in ("MONOCHROME1", "MONOCHROME2"):
         found = photometric or "nothing"
         raise ValueProblem(
             f"PhotometricInterpretation (0028,0004) is {escape_text(found)} with {samples} samples: "
             "a CT slice is MONOCHROME2"
         )
-    rows, columns = values.unsigned("Rows"), values.unsigned("Columns")
     if rows == 0 or columns == 0:
         raise ValueProblem(f"Rows (0028,0010) x Columns (0028,0011) is {rows} x {columns}")
+
+
+def _validate(values: Values, series: SeriesIdentity, path: Path, name: str, *, frames: int = 1) -> SliceHeader:
+    elements = values.elements
+    reason = describe_undecodable(elements.transfer_syntax)
+    if reason:
+        raise ValueProblem(reason)
+    samples, photometric = values.unsigned("SamplesPerPixel", 1), values.word("PhotometricInterpretation")
+    rows, columns = values.unsigned("Rows"), values.unsigned("Columns")
+    _check_matrix(samples, photometric, rows, columns)
     float_pixels = elements.pixel_tag in FLOAT_PIXEL_BITS
     allocated, stored, high_bit, signed = _validate_float_bits(values) if float_pixels else _validate_bits(values)
     (dj, di), orientation, position = _validate_geometry(values)

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from clrecon.jobs.mesh.bone import judge_surfaces, warn_of_walls
 from clrecon.jobs.mesh.labels import extract_label_surfaces, judge_label_volumes, open_labels
@@ -16,7 +16,7 @@ from clrecon.jobs.mesh.prepare import leave_outside, prepare_surfaces
 from clrecon.jobs.mesh.refinement import describe_purposes, judge_parts, refine_surface, warn_of_gates
 from clrecon.jobs.mesh.report import describe_job, describe_part
 from clrecon.jobs.mesh.settings import MeshSettings
-from clrecon.jobs.mesh.surfaces import plan_surfaces
+from clrecon.jobs.mesh.surfaces import Part, Surface, plan_surfaces
 from clrecon.jobs.shared.laps import Laps
 from clrecon.jobs.shared.masking import mask_volume
 from clrecon.jobs.shared.opening import DeviceOpening
@@ -30,6 +30,13 @@ from clrecon.jobs.shared.outputs import (
 )
 from clrecon.jobs.shared.report import peak_memory_bytes, stage_report
 from clrecon.system.progress import Progress, ignore_progress
+
+if TYPE_CHECKING:
+    from clrecon.anatomy.iso_choice import IsoChoice
+    from clrecon.geometry import Volume
+    from clrecon.labels import LabelMap
+    from clrecon.mesh import Mesh
+    from clrecon.opencl import Device
 
 __all__ = ["make_mesh"]
 
@@ -87,6 +94,60 @@ def make_mesh(
     outputs = check_outputs(output, report_path, first_names(surfaces, settings.split))
     check_kept(outputs, source, None if settings.labels is None else settings.labels.path)
 
+    volume, labels, device = _open(source, settings, progress, watch)
+    volume = mask_volume(volume, settings, progress)
+    watch.lap("mask")
+    volume, surfaces, choice = _choose(volume, surfaces, settings, progress, watch)
+    surfaces, extracted = _extract(volume, surfaces, labels, device, settings, progress)
+    origins = [mesh.report for mesh in extracted]
+    watch.lap("surface")
+    parts = _select(volume, surfaces, extracted, device, settings, progress)
+    del extracted
+    paths = name_outputs(output, [part.name for part in parts], report_path)
+    judge_surfaces(parts, volume, settings)
+    watch.lap("select")
+
+    gates = _refine_and_measure(parts, volume, settings, measure or settings.strict, progress, watch)
+    purpose_warnings = describe_purposes(parts)
+    watch.lap("measure")
+
+    def compose(meshes: Sequence[dict[str, Any]]) -> dict[str, Any]:
+        report = describe_job(volume, parts, meshes, settings, device, choice)
+        report["warnings"] += _warn_of_leftovers(output, paths) if settings.split else []
+        report["warnings"] += warn_of_walls(parts, settings, choice)
+        report["gates"] = gates
+        report["warnings"] += purpose_warnings + warn_of_gates(gates)
+        report["seconds"] = _seconds(watch, origins)
+        report["peak_memory_bytes"] = peak_memory_bytes()
+        return report
+
+    progress("write", 0, 0)
+    return _write(parts, paths, report_path, settings.space, compose, watch)
+
+
+def _write(
+    parts: Sequence[Part],
+    paths: Sequence[str | Path],
+    report_path: str | Path | None,
+    space: str,
+    compose: Callable[[Sequence[dict[str, Any]]], dict[str, Any]],
+    watch: Laps,
+) -> dict[str, Any]:
+    """Write all files, the report composed of what is said of each mesh as the last one, and return the report."""
+    with ExitStack() as staged:  # all files are on the disk before any replaces an older one
+        files = stage_meshes(staged, [part.mesh for part in parts], paths, space)
+        watch.lap("write")
+        report = compose([describe_part(*each, space) for each in zip(parts, files, paths, strict=True)])
+        if report_path is not None:
+            files.append(staged.enter_context(stage_report(report_path, report)))
+        commit_all(files)
+    return report
+
+
+def _open(
+    source: str | Path, settings: MeshSettings, progress: Progress, watch: Laps
+) -> tuple[Volume, LabelMap | None, Device]:
+    """Read the input while the device opens and builds its kernels."""
     progress("device", 0, 0)
     prepare = partial(prepare_surfaces, components=settings.selects, topology=settings.topology, inside=settings.inside)
     with DeviceOpening(settings.device, prepare) as opening:
@@ -104,75 +165,77 @@ def make_mesh(
         watch.lap("read")
         device = opening.wait()
         watch.lap("device")
+    return volume, labels, device
 
-    volume = mask_volume(volume, settings, progress)
-    watch.lap("mask")
 
+def _choose(
+    volume: Volume, surfaces: list[Surface], settings: MeshSettings, progress: Progress, watch: Laps
+) -> tuple[Volume, list[Surface], IsoChoice | None]:
+    """The volume as it is extracted from, the surfaces in it, and how an iso value was chosen where none was given."""
     if settings.half_way == "auto":
         progress("choose", 0, 0)
     choice = choose_level(volume, settings)
     if choice is not None:
         surfaces = plan_surfaces([choice.iso_value])
     watch.lap("choose")
-
     check_levels(volume, surfaces)
     volume = leave_outside(volume, settings, progress)
     watch.lap("mask")
+    return volume, surfaces, choice
+
+
+def _extract(
+    volume: Volume,
+    surfaces: list[Surface],
+    labels: LabelMap | None,
+    device: Device,
+    settings: MeshSettings,
+    progress: Progress,
+) -> tuple[list[Surface], list[Mesh]]:
+    """The surfaces, those of labels among them, and a mesh each."""
     if labels is not None and settings.labels is not None:
-        surfaces, extracted = extract_label_surfaces(
-            volume, surfaces, labels, settings.labels, device, settings, progress
-        )
-    else:
-        extracted = extract_surfaces(volume, surfaces, device, settings, progress)
-    origins = [mesh.report for mesh in extracted]
-    watch.lap("surface")
+        return extract_label_surfaces(volume, surfaces, labels, settings.labels, device, settings, progress)
+    return surfaces, extract_surfaces(volume, surfaces, device, settings, progress)
+
+
+def _select(
+    volume: Volume,
+    surfaces: Sequence[Surface],
+    extracted: Sequence[Mesh],
+    device: Device,
+    settings: MeshSettings,
+    progress: Progress,
+) -> list[Part]:
+    """What of each surface is written."""
     if settings.selects:
         progress("select", 0, 0)
-    parts = [
+    return [
         part
         for surface, mesh in zip(surfaces, extracted, strict=True)
         for part in select_parts(surface, mesh, settings, device, volume)
     ]
-    del extracted
-    paths = name_outputs(output, [part.name for part in parts], report_path)
-    judge_surfaces(parts, volume, settings)
-    watch.lap("select")
 
+
+def _refine_and_measure(
+    parts: Sequence[Part], volume: Volume, settings: MeshSettings, measure: bool, progress: Progress, watch: Laps
+) -> list[dict[str, Any]]:
+    """Refine and measure each part as far as it is asked for; returns the gates."""
     if settings.refines:
         for part in parts:
             part.mesh = refine_surface(part.mesh, settings, progress)
         watch.lap("refine")
-
-    if measure or settings.strict:
+    if measure:
         for place, part in enumerate(parts):
             progress("measure", place, len(parts) if len(parts) > 1 else 0)
             part.quality = part.mesh.quality()
-    gates = judge_parts(parts, volume, settings) + judge_label_volumes(parts, settings.closed)
-    purpose_warnings = describe_purposes(parts)
-    watch.lap("measure")
+    return judge_parts(parts, volume, settings) + judge_label_volumes(parts, settings.closed)
 
-    progress("write", 0, 0)
-    with ExitStack() as staged:  # all files are on the disk before any replaces an older one
-        files = stage_meshes(staged, [part.mesh for part in parts], paths, settings.space)
-        watch.lap("write")
-        meshes = [
-            describe_part(part, file, path, settings.space)
-            for part, file, path in zip(parts, files, paths, strict=True)
-        ]
-        report = describe_job(volume, parts, meshes, settings, device, choice)
-        if settings.split and (leftovers := count_leftovers(output, paths)):
-            report["warnings"].append(
-                f"{leftovers:,} more numbered files of this name lie beside the new ones, from an earlier run"
-            )
-        report["warnings"] += warn_of_walls(parts, settings, choice)
-        report["gates"] = gates
-        report["warnings"] += purpose_warnings + warn_of_gates(gates)
-        report["seconds"] = _seconds(watch, origins)
-        report["peak_memory_bytes"] = peak_memory_bytes()
-        if report_path is not None:
-            files.append(staged.enter_context(stage_report(report_path, report)))
-        commit_all(files)
-    return report
+
+def _warn_of_leftovers(output: str | Path, paths: Sequence[str | Path]) -> list[str]:
+    leftovers = count_leftovers(output, paths)
+    if not leftovers:
+        return []
+    return [f"{leftovers:,} more numbered files of this name lie beside the new ones, from an earlier run"]
 
 
 def _seconds(watch: Laps, origins: Sequence[dict[str, Any]]) -> dict[str, float]:

@@ -103,7 +103,6 @@ def describe_job(
     warnings += level_warnings
     if any(_shows_skin(part.surface, settings) for part in parts):
         warnings.append("a surface of the skin can show a face: treat the file as one that identifies the patient")
-    of_surface = {part.surface: mesh for part, mesh in zip(parts, meshes, strict=True)}.values()
     report: dict[str, Any] = {
         "affine_ijk_to_lps_mm": volume.affine.tolist(),
         "iso_value_hu": _common(mesh["iso_value_hu"] for mesh in meshes),
@@ -114,16 +113,7 @@ def describe_job(
         "preset": settings.preset_used,
         "space": settings.space,
         "unit": "mm",
-        "vertices": sum(mesh["vertices"] for mesh in meshes),
-        "triangles": sum(mesh["triangles"] for mesh in meshes),
-        "closed": _unless_unknown(all, (mesh["closed"] for mesh in meshes)),
-        "manifold": _unless_unknown(all, (mesh["manifold"] for mesh in meshes)),
-        "components": _unless_unknown(sum, (mesh["components"] for mesh in meshes)),
-        "components_found": _unless_unknown(sum, (mesh["components_found"] for mesh in of_surface)),
-        "components_kept": _unless_unknown(sum, (mesh["components_kept"] for mesh in of_surface)),
-        "area_mm2": _unless_unknown(sum, (mesh["area_mm2"] for mesh in meshes)),
-        "volume_ml": _unless_unknown(sum, (mesh["volume_ml"] for mesh in meshes)),
-        "bounds_mm": _unless_unknown(_around, (mesh["bounds_mm"] for mesh in meshes)),
+        **_describe_all(parts, meshes),
         "closed_at_border": settings.closed,
         "topology": settings.topology,
         "keep": settings.keep,
@@ -151,6 +141,23 @@ def describe_job(
     if settings.preset_used is not None:
         report["preset_reason"] = find_preset(settings.preset_used).source
     return report
+
+
+def _describe_all(parts: Sequence[Part], meshes: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Sums over all meshes, and what holds for each of them."""
+    of_surface = {part.surface: mesh for part, mesh in zip(parts, meshes, strict=True)}.values()
+    return {
+        "vertices": sum(mesh["vertices"] for mesh in meshes),
+        "triangles": sum(mesh["triangles"] for mesh in meshes),
+        "closed": _unless_unknown(all, (mesh["closed"] for mesh in meshes)),
+        "manifold": _unless_unknown(all, (mesh["manifold"] for mesh in meshes)),
+        "components": _unless_unknown(sum, (mesh["components"] for mesh in meshes)),
+        "components_found": _unless_unknown(sum, (mesh["components_found"] for mesh in of_surface)),
+        "components_kept": _unless_unknown(sum, (mesh["components_kept"] for mesh in of_surface)),
+        "area_mm2": _unless_unknown(sum, (mesh["area_mm2"] for mesh in meshes)),
+        "volume_ml": _unless_unknown(sum, (mesh["volume_ml"] for mesh in meshes)),
+        "bounds_mm": _unless_unknown(_around, (mesh["bounds_mm"] for mesh in meshes)),
+    }
 
 
 def _shows_skin(surface: Surface, settings: MeshSettings) -> bool:

@@ -65,6 +65,20 @@ class _Job:
             memory=self.memory, voxels_d=voxels_d, stopwatch=self.stopwatch, progress=progress,
         )  # fmt: skip
 
+    def picture(
+        self,
+        made: Reformation,
+        depth: NDArray[np.float32],
+        camera: Camera | None,
+        mode: str,
+        report: dict[str, Any],
+        background: str | Sequence[float],
+    ) -> Rendering:
+        """What was sampled as a picture in grey, before its background."""
+        image = grey_image(made.values, self.window)
+        seen = Rendering(image, depth, depth.copy(), camera, made.values, mode=mode, report=report)
+        return seen if is_transparent(background) else seen.with_background(background)
+
     def describe(self, made: Reformation, pixel_mm: float) -> dict[str, Any]:
         return {
             "pixel_mm": pixel_mm,
@@ -150,23 +164,19 @@ def cut_slice(
         No device, two slices and the picture do not fit it, or it fails.
     """
     job = _Job(volume, device, thickness, combine, window, memory)
-    width, height = checked_size(size)
+    pixels = checked_size(size)
     if isinstance(plane, Camera):
         if pixel_mm is not None or zoom != 1.0 or up is not None:
             raise UsageError("zoom, up and the size of pixels are those of the camera: leave them out, or the camera")
-        camera = plane
     else:
-        camera = find_plane(volume, plane, (width, height), zoom=zoom, up=up, pixel_mm=pixel_mm)
-    sheet, camera = plane_sheet(camera, (width, height), offset_mm)
+        plane = find_plane(volume, plane, pixels, zoom=zoom, up=up, pixel_mm=pixel_mm)
+    sheet, camera = plane_sheet(plane, pixels, offset_mm)
     made = job.sample(sheet, voxels_d, progress)
-    there = ~np.isnan(made.values)
-    if not there.any():
+    if np.isnan(made.values).all():
         raise UsageError(_describe_miss(volume, camera))
-    depth = np.where(there, np.float32(camera.distance), np.float32(np.nan))
-    report = job.describe(made, camera.pixel_mm((width, height))) | _describe_plane(camera)
-    image = grey_image(made.values, job.window)
-    seen = Rendering(image, depth, depth.copy(), camera, made.values, mode="slice", report=report)
-    return seen if is_transparent(background) else seen.with_background(background)
+    depth = np.where(np.isnan(made.values), np.float32(np.nan), np.float32(camera.distance))
+    report = job.describe(made, camera.pixel_mm(pixels)) | _describe_plane(camera)
+    return job.picture(made, depth, camera, "slice", report, background)
 
 
 def _describe_plane(camera: Camera) -> dict[str, Any]:
@@ -258,32 +268,43 @@ def reformat_curve(
         No device, two slices and the picture do not fit it, or it fails.
     """
     job = _Job(volume, device, thickness, combine, window, memory)
-    if not isinstance(kind, str) or kind not in CURVED_KINDS:
-        raise UsageError(f"a curved reformation is {' or '.join(CURVED_KINDS)}, not {kind!r}")
-    if not np.isfinite(angle) or (angle != 0.0 and kind == "stretched"):
-        raise UsageError(f"the angle turns straightened pictures, in degrees: not {angle!r} in a {kind} one")
+    _check_kind(kind, angle)
     line, found = _find_line(volume, curve)
     across, top = _find_directions(view, up)
     turned = bool((line.points[-1] - line.points[0]) @ top > 0.0)
     line = line.reversed() if turned else line
     length = line.length if kind == "straightened" else stretched_length(line, across)
-    (width, height), pixel = _fit_picture(volume, length, size, pixel_mm, width_mm)
-    if kind == "straightened":
-        curved = straightened_sheet(line, across, (width, height), pixel, float(angle))
-    else:
-        curved = stretched_sheet(line, across, (width, height), pixel)
+    fitted, pixel = _fit_picture(volume, length, size, pixel_mm, width_mm)
+    curved = _lay_sheet(kind, line, across, fitted, pixel, float(angle))
     made = job.sample(curved.sheet, voxels_d, progress)
     made.values[np.isnan(curved.arc)] = np.nan
-    nowhere = np.full((height, width), np.nan, np.float32)
-    report = job.describe(made, pixel) | {"curve": _describe_curve(line, curved, kind, across, turned)}
-    report["curve"] |= {"angle_deg": float(angle), "found": found}
-    if found is not None and found["height_mm"] < WHOLE_SHARE * found["searched_mm"]:
-        report["warnings"].append(
-            f"the spine was found over {found['height_mm']:.0f} mm of the {found['searched_mm']:.0f} mm of the volume"
-        )
-    image = grey_image(made.values, job.window)
-    seen = Rendering(image, nowhere, nowhere.copy(), None, made.values, mode="cpr", report=report)
-    return seen if is_transparent(background) else seen.with_background(background)
+    said = _describe_curve(line, curved, kind, across, turned) | {"angle_deg": float(angle), "found": found}
+    report = job.describe(made, pixel) | {"curve": said}
+    report["warnings"] += _warn_of_part(found)
+    return job.picture(made, np.full(made.values.shape, np.nan, np.float32), None, "cpr", report, background)
+
+
+def _lay_sheet(
+    kind: str, line: Curve, across: Float64Array, size: tuple[int, int], pixel: float, angle: float
+) -> CurvedSheet:
+    if kind == "straightened":
+        return straightened_sheet(line, across, size, pixel, angle)
+    return stretched_sheet(line, across, size, pixel)
+
+
+def _warn_of_part(found: dict[str, Any] | None) -> list[str]:
+    """The warning where the spine was looked for, and found in a part of the volume alone."""
+    if found is None or found["height_mm"] >= WHOLE_SHARE * found["searched_mm"]:
+        return []
+    height, searched = found["height_mm"], found["searched_mm"]
+    return [f"the spine was found over {height:.0f} mm of the {searched:.0f} mm of the volume"]
+
+
+def _check_kind(kind: str, angle: float) -> None:
+    if not isinstance(kind, str) or kind not in CURVED_KINDS:
+        raise UsageError(f"a curved reformation is {' or '.join(CURVED_KINDS)}, not {kind!r}")
+    if not np.isfinite(angle) or (angle != 0.0 and kind == "stretched"):
+        raise UsageError(f"the angle turns straightened pictures, in degrees: not {angle!r} in a {kind} one")
 
 
 def _find_line(volume: Volume, curve: Curve | ArrayLike | str) -> tuple[Curve, dict[str, Any] | None]:

@@ -382,22 +382,17 @@ def extract_label_masks(
     if closed and faces[:, 1].any() and (enclosed := find_enclosed(labels.voxels, faces, everywhere)):
         run.keep_enclosed(enclosed, everywhere, memory)
     boxes = {number: everywhere[number] for number in chosen}
+    meshes: dict[int, Mesh] = {}
     groups = run.group(boxes, memory)
     run.groups = len(groups)
-    meshes: dict[int, Mesh] = {}
     for group in groups:
         held = run.hold(group, memory)
         for number, box in group.items():
             if progress is not None:
                 progress("labels", len(meshes), len(boxes))
             (positions, normals, triangles), level = run.extract_one(held, number, box, memory)
-            report = {
-                **run.describe(),
-                "label": number,
-                "label_name": labels.name(number),
-                "label_ml": label_ml(labels, number),
-                "mask_level": level / FULL,
-            }
+            own = {"label": number, "label_name": labels.name(number), "label_ml": label_ml(labels, number)}
+            report = {**run.describe(), **own, "mask_level": level / FULL}
             meshes[number] = Mesh(run.placement.to_lps(positions), triangles, normals, report)
             run.stopwatch = Stopwatch()  # what is common to all labels counts for the first
     return meshes

@@ -5,8 +5,9 @@ The host side of cl/labels/own_samples.cl; counting and writing are those of cl/
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -249,7 +250,10 @@ def _warn_of_uneven_growth(volume: Volume, growth: Growth) -> list[str]:
     ]
 
 
-def _refuse_label(volume: Volume, taken: ResampledLabels, label: str, number: int, rule: IsoRule) -> NoSurfaceError:
+def _refuse_label(
+    volume: Volume, taken: ResampledLabels, labels: LabelMap, rule: IsoRule, number: int
+) -> NoSurfaceError:
+    label = f"{number} {labels.name(number)}"
     mask = taken.voxels == number
     if not mask.any():
         return NoSurfaceError(f"label {label} has no voxel in the CT: it lies outside")
@@ -327,43 +331,63 @@ def extract_labels(
     chosen = choose_numbers(labels, numbers)
     rule = choose_iso_rule(volume, iso_value, closed)
     marching_cubes.check_row(volume.shape_ijk[0])
-    growth = Growth.of(volume, grow_mm)
-    boxes = find_boxes(taken.voxels, chosen, growth.reach)
-    names = {number: f"{number} {labels.name(number)}" for number in chosen}
-    voxel_ml = slice_voxel_ml(volume)
+    run = _Run(volume, taken, rule, Growth.of(volume, grow_mm), choose_device(device), solid)
+    boxes = find_boxes(taken.voxels, chosen, run.growth.reach)
+    refuse = None if numbers is None else partial(_refuse_label, volume, taken, labels, rule)
     missing = [number for number in chosen if number not in boxes]
-    if missing and numbers is not None:
-        raise _refuse_label(volume, taken, names[missing[0]], missing[0], rule)
-    run = _Run(volume, taken, rule, growth, choose_device(device), solid)
+    if missing and refuse is not None:
+        raise refuse(missing[0])
     meshes: dict[int, Mesh] = {}
+    for number, part in _extract_each(run, boxes, memory, refuse, progress):
+        report = {**run.describe(), **_describe_label(volume, labels, taken, number, boxes[number])}
+        meshes[number] = _as_mesh(run, taken, report, part)
+    if not meshes:
+        raise NoSurfaceError(f"no label has a voxel of {rule.iso_value:g} HU or more in the CT")
+    return meshes
+
+
+def _extract_each(
+    run: _Run,
+    boxes: dict[int, Box],
+    memory: int | None,
+    refuse: Callable[[int], NoSurfaceError] | None,
+    progress: Progress | None,
+) -> Iterator[tuple[int, Part]]:
+    """Labels and their surfaces, as many at once as the device has room for; what has none is left out, or refused."""
     groups = run.group(boxes, memory) if boxes else []
     run.groups = len(groups)
+    done = 0
     for group in groups:
         held = run.find_inside(group, memory)
         for number, box in group.items():
             if progress is not None:
-                progress("labels", len(meshes), len(boxes))
+                progress("labels", done, len(boxes))
             part = run.extract_one(held, number, box, memory)
-            if part is None:
-                if numbers is not None:
-                    raise _refuse_label(volume, taken, names[number], number, rule)
-                continue
-            report = {
-                **run.describe(),
-                "label": number,
-                "label_name": labels.name(number),
-                "label_inside_share": taken.inside[number],
-                "label_ml": label_ml(labels, number),
-                "label_taken_ml": count_ml(taken.voxels, number, box, voxel_ml),
-                "vertices_by_hu_share": run.share_by_hu,
-            }
-            report["warnings"] += _warn(taken, report)
-            positions, normals, triangles = part
-            meshes[number] = Mesh(run.placement.to_lps(positions), triangles, normals, report)
-            run.stopwatch = Stopwatch()  # what is common to all labels counts for the first
-    if not meshes:
-        raise NoSurfaceError(f"no label has a voxel of {rule.iso_value:g} HU or more in the CT")
-    return meshes
+            if part is not None:
+                done += 1
+                yield number, part
+            elif refuse is not None:
+                raise refuse(number)
+
+
+def _as_mesh(run: _Run, taken: ResampledLabels, report: dict[str, Any], part: Part) -> Mesh:
+    report["vertices_by_hu_share"] = run.share_by_hu
+    report["warnings"] += _warn(taken, report)
+    positions, normals, triangles = part
+    mesh = Mesh(run.placement.to_lps(positions), triangles, normals, report)
+    run.stopwatch = Stopwatch()  # what is common to all labels counts for the first
+    return mesh
+
+
+def _describe_label(volume: Volume, labels: LabelMap, taken: ResampledLabels, number: int, box: Box) -> dict[str, Any]:
+    """What is known of a label before its surface is there."""
+    return {
+        "label": number,
+        "label_name": labels.name(number),
+        "label_inside_share": taken.inside[number],
+        "label_ml": label_ml(labels, number),
+        "label_taken_ml": count_ml(taken.voxels, number, box, slice_voxel_ml(volume)),
+    }
 
 
 def _warn(taken: ResampledLabels, report: dict[str, Any]) -> list[str]:
