@@ -29,7 +29,7 @@ _DESTINATIONS = {
 
 def speaker_of(parser: argparse.ArgumentParser) -> Speaker:
     """Words for the parameters that a command has options for; the others are named as in Python."""
-    options = {action.dest: max(action.option_strings, key=len) for action in parser._actions if action.option_strings}
+    options = {action.dest: action.option_strings[0] for action in parser._actions if action.option_strings}
 
     def speak(parameter: str, value: object = None) -> str:
         option = options.get(parameter) or options.get(_DESTINATIONS.get(parameter, ""))

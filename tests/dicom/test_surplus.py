@@ -67,7 +67,7 @@ def test_zeros_behind_the_pixels_are_padding_and_said(tmp_path, syntax):
 def test_other_bytes_behind_the_pixels_are_refused_unless_forced(tmp_path, syntax):
     plan = write(tmp_path, add(bytes(40) + b"\1\0"), syntax)
     words = "IM0000: Pixel Data has 202 bytes, 10 x 8 x 16 bit take 160: more pixels than the header says"
-    check_refused(tmp_path, words, "--force")
+    check_refused(tmp_path, words, "force=True")
     assert any(words in problem for problem in list_series(tmp_path).series[0].problems)
     volume = read_volume(tmp_path, force=True)
     assert np.array_equal(volume.voxels, plan.hu())
@@ -196,7 +196,7 @@ def test_what_is_no_element_behind_the_pixels(tmp_path, syntax, fault):
 def test_zeros_behind_the_pixel_data_are_left_out_on_demand_only(tmp_path):
     plan = write(tmp_path)
     append(tmp_path, bytes(512))
-    check_refused(tmp_path, "IM0000: 512 zero bytes behind the pixel data", "--force")
+    check_refused(tmp_path, "IM0000: 512 zero bytes behind the pixel data", "force=True")
     volume = read_volume(tmp_path, force=True)
     assert np.array_equal(volume.voxels, plan.hu())
     assert "512 zero bytes behind the pixel data: left out on demand (all slices)" in volume.report["warnings"]

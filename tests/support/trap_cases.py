@@ -174,7 +174,7 @@ def _two_orientations(folder: Path, size: Size) -> Marks:
     return write_slices(folder, plan_for(size))
 
 
-@_case("three discs, each with its own angle", REFUSED, ("--series",))
+@_case("three discs, each with its own angle", REFUSED, ("one with series",))
 def _discs(folder: Path, size: Size) -> Marks:
     third = Size(size.slices // 3, size.rows, size.columns)
     for disc in (2, 1, 0):
@@ -226,7 +226,7 @@ def _two_spacings(folder: Path, size: Size) -> Marks:
     return marks
 
 
-@_case("two series of the same length", REFUSED, ("--series",), again={"series": 1}, again_words=("1 other series",))
+@_case("two series of the same length", REFUSED, ("one with series",), again={"series": 1}, again_words=("1 other series",))
 def _two_series(folder: Path, size: Size) -> Marks:
     marks = write_slices(folder, plan_for(size))
     other = plan_for(size, series=2, first_hu=FOREIGN_HU, origin=(40.0, 31.0, -300.0))
@@ -252,7 +252,7 @@ _copies("every slice twice, equal pixels", _another_image())
 
 
 def _phases(name: str, words: tuple[str, ...], **second: Any) -> None:
-    @_case(name, REFUSED, ("--phase", *words), again={"phase": 1})
+    @_case(name, REFUSED, ("one with phase", *words), again={"phase": 1})
     def write(folder: Path, size: Size) -> Marks:
         first = {keyword: value[0] for keyword, value in second.items()}
         last = {keyword: value[1] for keyword, value in second.items()}
@@ -278,7 +278,7 @@ def _one_differs(folder: Path, size: Size) -> Marks:
 @_case(
     "two phases, a slice of the second missing",
     REFUSED,
-    ("--phase",),
+    ("one with phase",),
     again={"phase": 1},
     again_words=("phase 1 of 2",),
 )
