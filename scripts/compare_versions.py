@@ -154,8 +154,9 @@ def _run(command: list[str], folder: Path) -> tuple[int, str, str]:
 
 
 def _still(text: str) -> str:
-    """`text` without the line of times and what progress wrote over."""
-    return re.sub(r"(?m)^time +\d.*\n", "", re.sub(r"[^\n]*\r", "", text))
+    """`text` without the line of times, the time of a frame and what progress wrote over."""
+    text = re.sub(r"(?m)^time +\d.*\n", "", re.sub(r"[^\n]*\r", "", text))
+    return re.sub(r"\b[\d.]+ s each\b", "N s each", text)
 
 
 def _pairs(old: tuple[int, str, str], new: tuple[int, str, str]) -> Iterator[tuple[Any, Any]]:
