@@ -226,7 +226,9 @@ def _two_spacings(folder: Path, size: Size) -> Marks:
     return marks
 
 
-@_case("two series of the same length", REFUSED, ("one with series",), again={"series": 1}, again_words=("1 other series",))
+@_case(
+    "two series of the same length", REFUSED, ("one with series",), again={"series": 1}, again_words=("1 other series",)
+)
 def _two_series(folder: Path, size: Size) -> Marks:
     marks = write_slices(folder, plan_for(size))
     other = plan_for(size, series=2, first_hu=FOREIGN_HU, origin=(40.0, 31.0, -300.0))

@@ -26,7 +26,9 @@ from trap_plan import (
 def _interleaved(name: str, keyword: str, first: Any, second: Any) -> None:
     """None leaves the element away."""
 
-    @add_case(f"{name}, interleaved", REFUSED, ("one with phase", "lie between each other", keyword), again={"phase": 1})
+    @add_case(
+        f"{name}, interleaved", REFUSED, ("one with phase", "lie between each other", keyword), again={"phase": 1}
+    )
     def write(folder: Path, size: Size) -> Marks:
         def change(ds: Dataset, k: int) -> None:
             value = (first, second)[k % 2]
