@@ -1,11 +1,11 @@
 #!/usr/bin/env python3
-"""Make .venv-test, then run ruff, mypy, the Oclgrind check (where oclgrind is installed) and the tests.
+"""Make .venv-test, then run ruff, codespell, mypy, the Oclgrind check (where oclgrind is installed) and the tests.
 
     python3 scripts/test.py [--fast] [PYTEST ARGUMENTS]
 
 --fast leaves out the tests marked slow and the Oclgrind check.  Everything else goes to pytest; without such arguments
-the whole suite runs in as many processes as there are cores, four at most.  The exit status is not 0 when any of the
-four fails, or when no test ran.  See CONTRIBUTING.md for the variables that choose devices.
+the whole suite runs in as many processes as there are cores, four at most.  The exit status is not 0 when any of them
+fails, or when no test ran.  See CONTRIBUTING.md for the variables that choose devices.
 """
 
 import os
@@ -66,6 +66,8 @@ def main() -> int:
     python = program_path(folder, "python")
     steps = {
         "ruff": [program_path(folder, "ruff"), "check", "."],
+        "format": [program_path(folder, "ruff"), "format", "--check", "--quiet", "."],
+        "codespell": [program_path(folder, "codespell"), "."],
         "mypy": [program_path(folder, "mypy")],
     }
     if not fast and (shutil.which("oclgrind") or os.environ.get("CLRECON_REQUIRE_OCLGRIND")):
