@@ -50,8 +50,8 @@ typedef struct {
     float t_in, t_out, focus_in, focus_out;
 } ray;
 
-/* Tile of pixel `index` in the order of tiles.  `queues` parts of that order take every so manieth tile each, for CPU drivers
- * that cut a launch into as many equal parts as there are cores. */
+/* Tile of pixel `index` in the order of tiles.  That order has `queues` parts, and part q holds tiles q, q + queues,
+ * q + 2 queues ...: CPU drivers cut a launch into as many equal parts as there are cores. */
 static inline uint find_tile(const uint index, const uint width, const uint height, const uint queues)
 {
     const uint tiles = (width + TILE - 1) / TILE * ((height + TILE - 1) / TILE);

@@ -11,18 +11,15 @@ __all__ = ["speaker_of"]
 _DESTINATIONS = {
     "clip_planes": "clip",
     "closed": "open",
-    "field_of_view": "fov",
-    "files": "labels",
     "grow_mm": "grow",
     "half_way": "hu",
     "iso_value": "hu",
-    "label_map": "labels",
     "min_volume_ml": "min_volume",
     "offset_mm": "offset",
+    "only": "label",
     "picture": "output",
     "seeds": "seed",
     "view_angle": "perspective",
-    "wanted": "label",
 }
 """Parameters whose option has another name, where the command has none of the parameter's own name."""
 
@@ -37,8 +34,7 @@ def speaker_of(parser: argparse.ArgumentParser) -> Speaker:
             return in_python(parameter, value)
         if value is None or value is True or (parameter == "closed" and value is False):
             return option
-        if parameter == "half_way":
-            return f"{option} {'auto' if value == 'auto' else 'half:' + str(value).strip('()').replace(', ', ',')}"
-        return f"{option} {str(value).strip('()').replace(', ', ',')}"
+        words = str(value).strip("()").replace(", ", ",")
+        return f"{option} {'half:' if parameter == 'half_way' and value != 'auto' else ''}{words}"
 
     return speak

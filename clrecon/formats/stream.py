@@ -1,8 +1,8 @@
 """Numbers out of a stream of bytes, slice by slice, within the memory that the file can account for.
 
-Headers are written by strangers: a small file may promise a huge array, or name a file that is none of its own.
-Nothing is taken before the promise was compared with the bytes that are there, and what is compressed is inflated one
-slice at a time.
+A header may be wrong or hostile: a small file can promise a huge array, or name any file of the machine.  No memory is
+taken before the promised size is compared with the bytes that are there, and compressed voxels are inflated slice by
+slice.
 """
 
 from __future__ import annotations

@@ -3,15 +3,23 @@
 from __future__ import annotations
 
 import ast
+import inspect
 import re
 from importlib import import_module
 
 import pytest
 from house import PACKAGE, ROOT
 
+import clrecon
 from clrecon.cli.common import Parser, add_common
 from clrecon.cli.main import COMMANDS
-from clrecon.cli.wording import speaker_of
+from clrecon.cli.wording import _DESTINATIONS, speaker_of
+from clrecon.jobs.mesh.label_choice import LabelChoice
+from clrecon.jobs.mesh.settings import MeshSettings
+from clrecon.jobs.render.files import PictureFiles
+from clrecon.jobs.render.modes import _CHECKED
+from clrecon.jobs.render.settings import RenderSettings
+from clrecon.jobs.shared.settings import InputSettings
 from clrecon.system.wording import in_python, name_parameter, spoken_by
 
 OPTION = re.compile(r"(?<![\w-])--[a-z][a-z-]*")
@@ -78,6 +86,19 @@ def test_every_parameter_that_the_library_names_has_an_option() -> None:
     named = {name for path in PACKAGE.rglob("*.py") for name in named_parameters(path.read_text(encoding="utf-8"))}
     assert len(named) > 10
     assert {name for name in named if all(speak(name, None) == name for speak in speakers)} == set()
+
+
+def test_every_parameter_that_the_library_names_is_one_of_its_own() -> None:
+    functions = [getattr(clrecon, name) for name in clrecon.__all__ if inspect.isroutine(getattr(clrecon, name))]
+    settings = (InputSettings, MeshSettings, RenderSettings, LabelChoice, PictureFiles)
+    known = {name for own in (*functions, *settings) for name in inspect.signature(own).parameters}
+    named = {name for path in PACKAGE.rglob("*.py") for name in named_parameters(path.read_text(encoding="utf-8"))}
+    assert named - known == set()
+
+
+def test_every_other_name_of_a_parameter_is_needed() -> None:
+    named = {name for path in PACKAGE.rglob("*.py") for name in named_parameters(path.read_text(encoding="utf-8"))}
+    assert set(_DESTINATIONS) - named - set(_CHECKED) == set()
 
 
 def test_no_option_is_named_outside_of_the_command_line() -> None:

@@ -54,7 +54,7 @@ class Scan:
     slices : list of SliceHeader
         Valid CT slices, in the order of their paths.
     others : list of OtherImage
-        DICOM objects that are none.
+        DICOM objects that are no CT slices.
     skipped : Counter
         Reason to number of files (or folders) that were passed over.
     corrupt : list of CorruptFile

@@ -59,12 +59,12 @@ def choose_slices(volume: Volume, slices: int | Sequence[int] | None = None) -> 
     ----------
     volume : Volume
     slices : int or sequence of int, optional
-        Every so manyeth slice, from the first on; or those named.  None is about twelve, evenly.
+        An int n: every n-th slice from the first.  A list: those slices.  None: about twelve, evenly spaced.
 
     Raises
     ------
     UsageError
-        Not such numbers, none, twice the same, or slices that the volume has not.
+        An int below 1, an empty list, a slice named twice, or one that the volume does not have.
     """
     nk = volume.shape_ijk[2]
     if slices is None:
@@ -138,7 +138,7 @@ def overlay_slices(
     Raises
     ------
     UsageError
-        As `choose_slices`; an opacity that is none; a window and a transfer function.
+        As `choose_slices`; an opacity outside of 0 to 1; both a window and a transfer function.
     DeviceError
         Not even one slice fits the device.
     """

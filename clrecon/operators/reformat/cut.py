@@ -260,8 +260,8 @@ def reformat_curve(
     Raises
     ------
     UsageError
-        Points that are none, too few or outside of the volume, an unknown kind or view, impossible numbers, a curve
-        that runs along the rows.
+        Points that are no numbers, too few or outside of the volume; an unknown kind or view; impossible numbers; a
+        curve that runs along the rows.
     RefusedInputError
         No spine that one could be sure of.
     DeviceError

@@ -29,7 +29,6 @@ from clrecon.opencl import (
     allocate,
     check_budget,
     choose_device,
-    describe_shortage,
     download,
     launch,
     load_program,
@@ -42,7 +41,7 @@ from clrecon.operators.resident.voxel_types import label_variants
 from clrecon.operators.surface import marching_cubes
 from clrecon.operators.surface.extract import Part
 from clrecon.operators.surface.label_survey import survey_labels
-from clrecon.operators.surface.labels import Window, choose_numbers
+from clrecon.operators.surface.labels import Window, choose_numbers, group_boxes
 from clrecon.operators.surface.marching_cubes import Classified, Counted, Placement
 from clrecon.system.progress import Progress
 
@@ -128,12 +127,8 @@ class _Run:
 
     def group(self, boxes: dict[int, Box], memory: int | None) -> list[dict[int, Box]]:
         """All labels at once where their slices fit the device, else one by one: the meshes are the same."""
-        room = memory_limits(self.device, memory)
         scratch = max(sum(self.window(box, (0, 0)).scratch().values()) for box in boxes.values())
-        needs = {**self.needs(*self.slices_for(boxes)), "scratch": min(scratch, room.buffer_bytes)}
-        if not describe_shortage(room, needs):
-            return [boxes]
-        return [{number: box} for number, box in boxes.items()]
+        return group_boxes(boxes, self.needs(*self.slices_for(boxes)), scratch, memory_limits(self.device, memory))
 
     def hold(self, boxes: dict[int, Box], memory: int | None) -> _Held:
         """Upload the slices that the labels need, and find the occupancy of all labels."""

@@ -24,6 +24,7 @@ from clrecon.labels.volumes import count_ml, label_ml, slice_voxel_ml
 from clrecon.mesh import Mesh
 from clrecon.opencl import (
     Device,
+    MemoryLimits,
     Program,
     Stopwatch,
     allocate,
@@ -44,7 +45,7 @@ from clrecon.operators.surface.extract import Part, voxel_level
 from clrecon.operators.surface.marching_cubes import Classified, Placement
 from clrecon.system.progress import Progress
 
-__all__ = ["Window", "choose_numbers", "extract_labels", "prepare_labels"]
+__all__ = ["Window", "choose_numbers", "extract_labels", "group_boxes", "prepare_labels"]
 
 SPARE_SLICES = 3
 """Beyond the label's box: the far end of a crossed edge, what its gradient needs, and the last slices of the mask."""
@@ -97,6 +98,13 @@ def choose_numbers(labels: LabelMap, numbers: Sequence[int | str] | None) -> tup
     return chosen
 
 
+def group_boxes(boxes: dict[int, Box], needs: dict[str, int], scratch: int, room: MemoryLimits) -> list[dict[int, Box]]:
+    """All labels at once where `needs`, and `scratch` as far as one buffer holds it, fit; else one by one."""
+    if not describe_shortage(room, {**needs, "scratch": min(scratch, room.buffer_bytes)}):
+        return [boxes]
+    return [{number: box} for number, box in boxes.items()]
+
+
 class _Run:
     """One extraction: what is common to its labels."""
 
@@ -133,12 +141,8 @@ class _Run:
 
     def group(self, boxes: dict[int, Box], memory: int | None) -> list[dict[int, Box]]:
         """All labels at once where their slices fit the device, else one by one: the meshes are the same."""
-        room = memory_limits(self.device, memory)
-        needs = self.needs(*self.slices_for(boxes))
         scratch = max(sum(self.window(box, (0, 0)).scratch().values()) for box in boxes.values())
-        if not describe_shortage(room, {**needs, "scratch": min(scratch, room.buffer_bytes)}):
-            return [boxes]
-        return [{number: box} for number, box in boxes.items()]
+        return group_boxes(boxes, self.needs(*self.slices_for(boxes)), scratch, memory_limits(self.device, memory))
 
     def find_inside(self, boxes: dict[int, Box], memory: int | None) -> _Held:
         """Upload the slices that the labels need, and find what is inside of which label."""

@@ -60,7 +60,7 @@ class LabelStyle:
         Raises
         ------
         UsageError
-            Not a label map, an unknown label or colour, an opacity that is none, or a label that is named twice.
+            Not a label map, an unknown label or colour, an opacity outside of 0 to 1, or a label named twice.
         """
         if not isinstance(labels, LabelMap):
             raise UsageError(f"labels are a LabelMap, see clrecon.read_labels, not {type(labels).__name__}")
