@@ -51,6 +51,16 @@ def run_steps(steps: dict[str, list[str]], environment: dict[str, str], beside: 
     return failed
 
 
+def quick_checks(folder: str) -> dict[str, list[str]]:
+    """Return the checks that take a second, as .pre-commit-config.yaml has them too, by name."""
+    ruff = program_path(folder, "ruff")
+    return {
+        "ruff": [ruff, "check", "."],
+        "format": [ruff, "format", "--check", "--quiet", "."],
+        "codespell": [program_path(folder, "codespell"), "."],
+    }
+
+
 def main() -> int:
     arguments = sys.argv[1:]
     if arguments[:1] in (["-h"], ["--help"]):
@@ -64,12 +74,7 @@ def main() -> int:
         print(error, file=sys.stderr)
         return 1
     python = program_path(folder, "python")
-    steps = {
-        "ruff": [program_path(folder, "ruff"), "check", "."],
-        "format": [program_path(folder, "ruff"), "format", "--check", "--quiet", "."],
-        "codespell": [program_path(folder, "codespell"), "."],
-        "mypy": [program_path(folder, "mypy")],
-    }
+    steps = {**quick_checks(folder), "mypy": [program_path(folder, "mypy")]}
     if not fast and (shutil.which("oclgrind") or os.environ.get("CLRECON_REQUIRE_OCLGRIND")):
         steps["oclgrind"] = [python, os.path.join("scripts", "check_oclgrind.py")]
     # Kernels are built on one core: much of the suite is that.  Each process has its part of the tests in their order,

@@ -80,6 +80,17 @@ def test_dependencies_resolve_on_every_system() -> None:
     assert markers["pyopencl"] == linux.replace("==", "!=").replace(" and ", " or ")
 
 
+def test_the_citation_is_of_this_version() -> None:
+    setup = read_setup()["metadata"]
+    lines = (ROOT / "CITATION.cff").read_text(encoding="utf-8").splitlines()
+    cited = dict(line.split(": ", 1) for line in lines if ": " in line and not line.startswith(" "))
+    names = ("version", "license", "abstract")
+    assert [cited[name].rstrip(".") for name in names] == [setup[name] for name in (*names[:2], "description")]
+    assert [line[4:] for line in lines if line.startswith("  - ") and "name" not in line] == [
+        word.strip() for word in setup["keywords"].split(",")
+    ]
+
+
 def build_wheel(tmp_path: Path) -> Path:
     """Build the wheel from a copy of the sources, without network."""
     source = tmp_path / "source"

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import re
+import runpy
 import shutil
 import subprocess
 import sys
@@ -98,6 +100,15 @@ def test_a_project_that_cannot_be_written_is_told_so(tmp_path: Path) -> None:
     done = start(project)
     assert done.returncode == 1
     assert "cannot be written" in done.stderr and "Traceback" not in done.stderr
+
+
+@posix_only
+def test_commits_are_checked_as_the_script_checks() -> None:
+    """The same programs with the same arguments, which .pre-commit-config.yaml cannot import."""
+    hooks = (ROOT / ".pre-commit-config.yaml").read_text(encoding="utf-8")
+    checks = runpy.run_path(str(ROOT / "scripts" / "test.py"))["quick_checks"](".venv-test")
+    assert re.findall(r"(?m)^ +- id: (.*)$", hooks) == list(checks)
+    assert re.findall(r"(?m)^ +entry: (.*)$", hooks) == [" ".join(command) for command in checks.values()]
 
 
 STAND_IN = """

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from house import ROOT, project_files
 
-TEXT_SUFFIXES = (".py", ".cl", ".h", ".md", ".cfg", ".toml", "run")
+TEXT_SUFFIXES = (".py", ".cl", ".h", ".md", ".cfg", ".toml", ".cff", ".yaml", "run")
 FORBIDDEN = {
     "a path of one machine": re.compile(r"(?<![\w.])/(?:home|root|Users|wor" + r"k|tmp/\w+)/"),
     "an unfinished mark": re.compile(r"\b(?:TO" + r"DO|FIX" + r"ME|XX" + r"X|HA" + r"CK)\b"),
