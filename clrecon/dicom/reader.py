@@ -86,7 +86,7 @@ def read_volume(
         *left,
     ]
     report = certify(chosen, stack, facts, scan, stack.affine, warnings, likeness)
-    return Volume(voxels, stack.affine, report, stack.slice_positions)
+    return Volume(voxels, stack.affine, report, stack.slice_positions, hu_range=(facts.hu_min, facts.hu_max))
 
 
 def _checked_phase(phase: int | None) -> int | None:

@@ -38,7 +38,8 @@ def read_grid(path: Path, kind: str, *, progress: Progress | None = None) -> Vol
     """
     grid = _open(path, kind)
     values = read_values(grid, progress)
-    return Volume(values.voxels, grid.affine, certify_grid(grid, values, _collect_warnings(grid, values)))
+    report = certify_grid(grid, values, _collect_warnings(grid, values))
+    return Volume(values.voxels, grid.affine, report, hu_range=(values.facts.hu_min, values.facts.hu_max))
 
 
 def _collect_warnings(grid: GridFile, values: GridValues | None) -> list[str]:

@@ -8,12 +8,16 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from clrecon.geometry.affine import Float64Array, apply_affine, column_spacing
+from clrecon.system.mapping import find_mapping
+from clrecon.system.messages import MappedArray, Message
 
 __all__ = ["Grid"]
 
 
-class Grid:
+class Grid(Message):
     """Voxels and their affine: the base of `Volume` and of `clrecon.labels.LabelMap`.
+
+    It pickles and copies as `clrecon.system.messages` says: memory-mapped voxels travel as their place in the file.
 
     Parameters
     ----------
@@ -25,9 +29,18 @@ class Grid:
 
     def __init__(self, voxels: NDArray[Any], affine: Float64Array):
         self._voxels = voxels
+        self._mapping = find_mapping(voxels)
         self._affine = affine
-        self._affine.flags.writeable = False
         self._inverse = np.asarray(np.linalg.inv(affine), dtype=np.float64)
+        self._affine.flags.writeable = self._inverse.flags.writeable = False
+
+    def __getstate__(self) -> dict[str, object]:
+        voxels = {} if self._mapping is None else {"_voxels": MappedArray(self._voxels, self._mapping)}
+        return {**super().__getstate__(), **voxels, "_mapping": None}
+
+    def __setstate__(self, state: dict[str, object]) -> None:
+        super().__setstate__(state)
+        self._mapping = find_mapping(self._voxels)
 
     @property
     def voxels(self) -> NDArray[Any]:

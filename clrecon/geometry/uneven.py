@@ -14,12 +14,13 @@ from numpy.typing import ArrayLike
 
 from clrecon.errors import UsageError
 from clrecon.geometry.affine import Float64Array, checked_points, slice_normal
+from clrecon.system.messages import Message
 
 __all__ = ["UnevenStack"]
 
 
 @dataclass(frozen=True)
-class UnevenStack:
+class UnevenStack(Message):
     """Positions of all slices, with the in-plane steps that they share.
 
     Attributes
@@ -60,8 +61,9 @@ class UnevenStack:
                 f"slice positions advance along the slice step of the affine, but from slice {k} to {k + 1} they go"
                 f" {gaps[k]:.4g} mm"
             )
-        table.flags.writeable = False
-        return cls(np.array(affine[:3, :2]), table, normal)
+        in_plane = np.array(affine[:3, :2])
+        table.flags.writeable = in_plane.flags.writeable = normal.flags.writeable = False
+        return cls(in_plane, table, normal)
 
     def origins_at(self, k: Float64Array) -> Float64Array:
         """Positions (n, 3) at slice coordinates (n,), fractions and places beyond the ends allowed."""

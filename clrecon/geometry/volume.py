@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from copy import deepcopy
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,6 @@ from clrecon.errors import UsageError
 from clrecon.geometry.affine import Float64Array, checked_affine, checked_points
 from clrecon.geometry.grid import Grid
 from clrecon.geometry.uneven import UnevenStack
-from clrecon.system.mapping import find_mapping
 
 __all__ = ["AIR_HU", "DEVICE_DTYPES", "Volume"]
 
@@ -57,11 +57,14 @@ def _as_array(voxels: ArrayLike) -> NDArray[Any]:
         raise UsageError(f"voxels are no array of numbers: {error}") from error
 
 
-def _value_range(values: NDArray[Any]) -> list[float] | None:
-    """Lowest and highest number; None where there is none."""
-    if values.dtype.kind == "f":
-        values = values[np.isfinite(values)]
-    return [float(values.min()), float(values.max())] if values.size else None
+def _value_range(voxels: NDArray[Any]) -> tuple[float, float] | None:
+    """Lowest and highest finite number, found slice by slice; None where there is none."""
+    low, high = np.inf, -np.inf
+    for layer in voxels:
+        values = layer[np.isfinite(layer)] if layer.dtype.kind == "f" else layer
+        if values.size:
+            low, high = min(low, float(values.min())), max(high, float(values.max()))
+    return (low, high) if low <= high else None
 
 
 class Volume(Grid):
@@ -80,6 +83,8 @@ class Volume(Grid):
     slice_positions : array_like, shape (nk, 3), optional
         LPS mm of voxel (0, 0, k), for slices that no affine places: between two of them k runs linearly, beyond the
         ends in the steps of the ends.  The third column of `affine` is then only nominal.
+    hu_range : (float, float), optional
+        Lowest and highest value, where the caller knows them; else the voxels are searched when they are asked for.
 
     Raises
     ------
@@ -94,6 +99,8 @@ class Volume(Grid):
         affine: ArrayLike,
         report: dict[str, Any] | None = None,
         slice_positions: ArrayLike | None = None,
+        *,
+        hu_range: tuple[float, float] | None = None,
     ):
         array = _as_array(voxels)
         if array.ndim != 3:
@@ -101,11 +108,17 @@ class Volume(Grid):
         if array.size == 0:
             raise UsageError(f"the volume is empty: its shape is {array.shape}")
         super().__init__(_device_ready(array), checked_affine(affine))
-        self._mapping = find_mapping(self._voxels)
         self._stack: UnevenStack | None = None
         if slice_positions is not None:
             self._stack = UnevenStack.of(self._affine, slice_positions, self._voxels.shape[0])
         self.report: dict[str, Any] = {"warnings": []} if report is None else report
+        if hu_range is not None:
+            self.hu_range = hu_range
+
+    @cached_property
+    def hu_range(self) -> tuple[float, float] | None:
+        """Lowest and highest finite value, None where there is none; of the voxels as they were at the first call."""
+        return _value_range(self._voxels)
 
     @property
     def affine(self) -> Float64Array:
@@ -170,7 +183,8 @@ class Volume(Grid):
         if report is None:
             report = deepcopy(self.report)
             if report.get("hu_range") is not None:
-                report["hu_range"] = _value_range(array)
+                found = _value_range(array)
+                report["hu_range"] = None if found is None else list(found)
         return Volume(array, self._affine, report, positions)
 
     def release_slices(self, first: int, end: int) -> None:

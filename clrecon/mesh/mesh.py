@@ -16,6 +16,7 @@ from clrecon.exchange.coordinates import as_stored
 from clrecon.exchange.formats import write_mesh
 from clrecon.geometry import frame_from_lps
 from clrecon.mesh.quality import measure_quality
+from clrecon.system.messages import Message
 
 __all__ = ["Mesh"]
 
@@ -57,7 +58,7 @@ def _describe_inside(ends: Sequence[float | None] | None) -> str | None:
     return f"below {ends[1]:.9g} HU" if ends[0] is None else f"{ends[0]:.9g} to {ends[1]:.9g} HU"
 
 
-class Mesh:
+class Mesh(Message):
     """An indexed triangle surface in the patient frame LPS, millimetres.
 
     Parameters

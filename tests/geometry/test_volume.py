@@ -120,3 +120,19 @@ def test_the_affine_cannot_be_changed_behind_the_inverse():
     with pytest.raises(ValueError, match="read-only"):
         volume.affine[0, 0] = 2.0
     assert volume.affine[0, 0] == 1.0
+
+
+def test_the_range_of_values_is_found_when_it_is_asked_for():
+    voxels = np.arange(24, dtype=np.int16).reshape(2, 3, 4) - 5
+    volume = Volume(voxels, np.eye(4), {"warnings": [], "hu_range": [0.0, 1.0]})
+    assert volume.hu_range == (-5.0, 18.0)
+    assert volume.with_voxels(voxels * 2).hu_range == (-10.0, 36.0)
+    assert volume.with_voxels(voxels * 2).report["hu_range"] == [-10.0, 36.0]
+    assert Volume(voxels, np.eye(4), hu_range=(-7.0, 99.0)).hu_range == (-7.0, 99.0)
+
+
+def test_the_range_of_values_leaves_out_what_is_no_number():
+    voxels = np.full((2, 3, 4), np.nan, np.float32)
+    assert Volume(voxels, np.eye(4)).hu_range is None
+    voxels[1, 2, 3], voxels[1, 0, 0] = 7.5, np.inf
+    assert Volume(voxels, np.eye(4)).hu_range == (7.5, 7.5)

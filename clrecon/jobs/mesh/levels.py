@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, Any
 
 from clrecon.jobs.mesh.presets import find_preset
@@ -47,7 +48,7 @@ def describe_level(
         reason = "as given" if preset is None else f"preset {preset}: {find_preset(preset).source}"
         return {"iso_value_reason": reason, "iso_value_choice": None}, []
     warnings = []
-    low, high = volume.report["hu_range"]
+    low, high = volume.hu_range or (math.nan, math.nan)
     for material, hu in (("bone", choice.bone_hu), ("tissue", choice.tissue_hu)):
         if choice.method == "half" and not low <= hu <= high:
             warnings.append(

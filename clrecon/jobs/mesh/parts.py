@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
@@ -34,7 +35,7 @@ def check_levels(volume: Volume, surfaces: Sequence[Surface]) -> None:
     NoSurfaceError
         One of them has.
     """
-    low, high = volume.report["hu_range"]
+    low, high = volume.hu_range or (math.nan, math.nan)
     for surface in surfaces:
         level = surface.iso_value
         if level is None:

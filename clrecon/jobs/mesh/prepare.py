@@ -40,7 +40,7 @@ def leave_outside(volume: Volume, settings: MeshSettings, progress: Progress) ->
     from clrecon.anatomy.outside_air import leave_outside_air
 
     progress("mask", 0, 0)
-    warnings = list(volume.report["warnings"])
+    warnings = list(volume.report.get("warnings", ()))
     volume = leave_outside_air(volume, [level for level in settings.levels if not isinstance(level, tuple)])
     facts = volume.report["outside_air"]
     warnings.append(

@@ -28,7 +28,7 @@ def mask_volume(volume: Volume, settings: InputSettings, progress: Progress) -> 
     from clrecon.anatomy.body import mask_field_of_view, remove_table
 
     progress("mask", 0, 0)
-    warnings = list(volume.report["warnings"])
+    warnings = list(volume.report.get("warnings", ()))
     if settings.field_of_view is not None:
         radius = settings.field_of_view
         volume = mask_field_of_view(volume, None if isinstance(radius, str) else radius)

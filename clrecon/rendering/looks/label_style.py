@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from clrecon.errors import UsageError
 from clrecon.labels import LabelMap
 from clrecon.rendering.looks.colors import find_color
+from clrecon.system.messages import Message
 
 __all__ = ["LabelStyle", "distinct_colors"]
 
@@ -23,7 +24,7 @@ GOLDEN_SHARE = 0.618034
 
 
 @dataclass(frozen=True)
-class LabelStyle:
+class LabelStyle(Message):
     """How the labels of a map look; what has no label, or is not named, looks as it does without.
 
     Attributes

@@ -13,6 +13,7 @@ from clrecon.errors import UsageError
 from clrecon.geometry.affine import Float64Array
 from clrecon.rendering.looks.lighting import Lighting
 from clrecon.rendering.looks.piecewise import check_ascending, check_share, evaluate_curve
+from clrecon.system.messages import Message
 
 __all__ = ["TransferFunction"]
 
@@ -44,7 +45,7 @@ def _numbers(what: str, form: str, rows: ArrayLike, width: int) -> Float64Array:
     return array
 
 
-class TransferFunction:
+class TransferFunction(Message):
     """Colour and opacity by HU, linear between points and constant beyond the first and the last.
 
     It cannot be changed once it is made: `scaled` and `shifted` return new ones.  Two are equal when they would give

@@ -9,12 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.rendering.views.camera import Camera
+from clrecon.system.messages import Message
 
 __all__ = ["PictureData"]
 
 
 @dataclass
-class PictureData:
+class PictureData(Message):
     """Pixels, depths and camera of a picture; see `clrecon.rendering.Rendering` for each attribute."""
 
     image: NDArray[np.uint8]

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 from clrecon.errors import UsageError
 from clrecon.geometry.affine import Float64Array
 from clrecon.geometry.volume import Volume
+from clrecon.system.messages import Message
 
 __all__ = ["Curve", "rotation_minimising_normals"]
 
@@ -29,7 +30,7 @@ def _gauss_nodes() -> tuple[Float64Array, Float64Array]:
     return 0.5 + 0.5 * nodes, 0.5 * weights
 
 
-class Curve:
+class Curve(Message):
     """A smooth curve through points, measured along its arc.
 
     A cubic spline (not-a-knot; a parabola through three points, a straight line through two) with the distances
@@ -46,6 +47,8 @@ class Curve:
     UsageError
         Not (n, 3) finite numbers, or fewer than two different points.
     """
+
+    _UNSENT = ("_spline", "_lengths")
 
     def __init__(self, points: ArrayLike):
         try:

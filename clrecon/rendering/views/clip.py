@@ -8,11 +8,12 @@ from numpy.typing import ArrayLike, NDArray
 from clrecon.errors import UsageError
 from clrecon.geometry.affine import Float64Array, checked_points
 from clrecon.rendering.views.directions import checked_vector
+from clrecon.system.messages import Message
 
 __all__ = ["Clip"]
 
 
-class Clip:
+class Clip(Message):
     """What lies on the inner side of every plane; without planes, everything.
 
     >>> Clip.box((-50, -50, 900), (50, 50, 1000)) & Clip.plane(point=(0, 0, 0), normal=(0, 1, 0))

@@ -16,14 +16,18 @@ from clrecon.errors import NoSurfaceError, UsageError
 from clrecon.geometry import Volume
 from clrecon.jobs.mesh.job import make_mesh
 from clrecon.jobs.mesh.levels import choose_level, describe_level
+from clrecon.jobs.mesh.parts import check_levels
 from clrecon.jobs.mesh.settings import MeshSettings
+from clrecon.jobs.mesh.surfaces import plan_surfaces
+from clrecon.jobs.shared.masking import mask_volume
+from clrecon.system.progress import ignore_progress
 
 
 def ball(bone: float = 1040.0, tissue: float = 40.0) -> Volume:
     distance = np.linalg.norm(np.indices((36, 36, 36)).reshape(3, -1).T - (17.7, 17.4, 18.1), axis=1) - 10.0
     field = tissue + (bone - tissue) * np.clip(0.5 - distance / 3.0, 0.0, 1.0).reshape(36, 36, 36)
     voxels = np.rint(field).astype(np.int16)
-    return Volume(voxels, np.eye(4), {"hu_range": [float(voxels.min()), float(voxels.max())], "warnings": []})
+    return Volume(voxels, np.eye(4))
 
 
 @pytest.fixture
@@ -115,3 +119,16 @@ def test_settings_with_two_materials() -> None:
 def test_impossible_materials_are_refused(settings: dict, words: str) -> None:
     with pytest.raises(UsageError, match=words):
         MeshSettings(**settings)
+
+
+@pytest.mark.parametrize("report", [None, {}])
+def test_steps_of_the_job_take_volumes_made_from_arrays(report: dict[str, Any] | None) -> None:
+    volume = Volume(np.arange(1000, dtype=np.int16).reshape(10, 10, 10), np.eye(4), report)
+    check_levels(volume, plan_surfaces([500.0]))
+    with pytest.raises(NoSurfaceError, match="every voxel is inside, the volume runs from 0 to 999 HU"):
+        check_levels(volume, plan_surfaces([0.0]))
+    settings = MeshSettings(half_way=(2000.0, 40.0))
+    warnings = describe_level(volume, settings, choose_level(volume, settings))[1]
+    assert "bone was given as 2000 HU, but the volume runs from 0 to 999 HU" in warnings[0]
+    masked = mask_volume(volume, MeshSettings(field_of_view=3.0), ignore_progress)
+    assert len(masked.report["warnings"]) == 1

@@ -1,0 +1,74 @@
+"""Messages: objects that travel to other processes and back, as those of a batch do, and lose nothing on the way.
+
+pickle makes writeable what was read-only; the read-only arrays of a `Message` are read-only in every copy too.  pickle
+also reads a memory-mapped file into memory; a `MappedArray` travels as its place in that file, which is mapped again,
+read-only, where the message arrives.  The file belongs to whoever mapped it and must stay until then; clrecon itself
+maps no files.  Where the file has been removed or replaced before the message leaves, and for mappings whose changes
+stay private (numpy's mode "c"), the values themselves travel.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clrecon.system.mapping import FilePlace, Mapping
+
+__all__ = ["MappedArray", "Message"]
+
+
+class Message:
+    """Base of classes with a ``__dict__`` whose objects pickle and copy as this module says."""
+
+    _UNSENT: ClassVar[tuple[str, ...]] = ()
+    """Attributes that are made anew when they are asked for."""
+
+    def __getstate__(self) -> dict[str, object]:
+        return {name: _pack(value) for name, value in vars(self).items() if name not in self._UNSENT}
+
+    def __setstate__(self, state: dict[str, object]) -> None:
+        unpacked = {name: value.array if isinstance(value, _Packed) else value for name, value in state.items()}
+        vars(self).update(unpacked)
+
+
+class _Packed:
+    """An array on its way that cannot be written; unpickled it is a plain array."""
+
+    def __init__(self, array: NDArray[Any]):
+        self.array = array
+
+    def __reduce__(self) -> tuple[Callable[..., NDArray[Any]], tuple[object, ...]]:
+        return _receive, (self.array, self.array.flags.writeable)
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> _Packed:
+        return _Packed(_receive(self.array.copy(), self.array.flags.writeable))
+
+
+class MappedArray(_Packed):
+    """An array in a memory-mapped file on its way.
+
+    A deep copy shares a mapping that cannot be written, and copies any other into memory.
+    """
+
+    def __init__(self, array: NDArray[Any], mapping: Mapping):
+        super().__init__(array)
+        self.mapping = mapping
+
+    def __reduce__(self) -> tuple[Callable[..., NDArray[Any]], tuple[object, ...]]:
+        place = self.mapping.place(self.array)
+        return super().__reduce__() if place is None else (FilePlace.open, (place,))
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> _Packed:
+        return super().__deepcopy__(memo) if self.mapping.writeable else self
+
+
+def _pack(value: object) -> object:
+    return _Packed(value) if isinstance(value, np.ndarray) and not value.flags.writeable else value
+
+
+def _receive(array: NDArray[Any], writeable: bool) -> NDArray[Any]:
+    array.flags.writeable = writeable
+    return array
