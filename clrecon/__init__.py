@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from clrecon.anatomy.iso_choice import choose_iso_value
     from clrecon.anatomy.spine_line import find_spine_line
     from clrecon.errors import (
+        Cancelled,
         ClreconError,
         DeviceError,
         NoDicomError,
@@ -50,6 +51,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "Camera",
+    "Cancelled",
     "Clip",
     "ClreconError",
     "DeviceError",
@@ -94,6 +96,7 @@ __all__ = [
 
 _HOMES = {
     "Camera": "clrecon.rendering.views.camera",
+    "Cancelled": "clrecon.errors",
     "Clip": "clrecon.rendering.views.clip",
     "ClreconError": "clrecon.errors",
     "DeviceError": "clrecon.errors",

@@ -15,6 +15,7 @@ __all__ = [
     "DeviceError",
     "DeviceMemoryError",
     "OutputError",
+    "Cancelled",
 ]
 
 
@@ -68,3 +69,19 @@ class OutputError(ClreconError):
     """The output cannot be written; an older file of that name is intact."""
 
     exit_code = 6
+
+
+class Cancelled(ClreconError):
+    """The caller wants no more: raised by a ``progress`` function, and passed on as it is.
+
+    >>> def progress(stage, done, total):
+    ...     if stop.is_set():
+    ...         raise clrecon.Cancelled
+
+    Nothing is written then, older files are intact, and memory of the device is given back.
+    """
+
+    exit_code = 130
+
+    def __init__(self, message: str = "cancelled"):
+        super().__init__(message)

@@ -96,7 +96,7 @@ def test_every_public_class_is_a_message_or_owns_a_device():
     assert public - errors - HELD_BY_A_DEVICE <= seen
 
 
-@pytest.mark.parametrize("name", [name for name in clrecon.__all__ if name.endswith("Error")])
+@pytest.mark.parametrize("name", [name for name in clrecon.__all__ if name.endswith("Error") or name == "Cancelled"])
 def test_errors_travel(name):
     error = travel(getattr(clrecon, name)("what, where, and what to do"))
     assert type(error) is getattr(clrecon, name)

@@ -121,8 +121,7 @@ def make_mesh(
         report["peak_memory_bytes"] = peak_memory_bytes()
         return report
 
-    progress("write", 0, 0)
-    return _write(parts, paths, report_path, settings.space, compose, watch)
+    return _write(parts, paths, report_path, settings.space, compose, watch, progress)
 
 
 def _write(
@@ -132,10 +131,11 @@ def _write(
     space: str,
     compose: Callable[[Sequence[dict[str, Any]]], dict[str, Any]],
     watch: Laps,
+    progress: Progress,
 ) -> dict[str, Any]:
     """Write all files, the report composed of what is said of each mesh as the last one, and return the report."""
     with ExitStack() as staged:  # all files are on the disk before any replaces an older one
-        files = stage_meshes(staged, [part.mesh for part in parts], paths, space)
+        files = stage_meshes(staged, [part.mesh for part in parts], paths, space, progress)
         watch.lap("write")
         report = compose([describe_part(*each, space) for each in zip(parts, files, paths, strict=True)])
         if report_path is not None:

@@ -7,6 +7,8 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from types import TracebackType
 from typing import TYPE_CHECKING
 
+from clrecon.errors import Cancelled
+
 if TYPE_CHECKING:
     from clrecon.opencl import Device
 
@@ -27,7 +29,7 @@ class DeviceOpening:
     """A device that is chosen, opened and given its kernels beside the work of a ``with`` block.
 
     The order of errors does not depend on which side is faster: where the block fails and the device is not there
-    either, the device's error is raised.
+    either, the device's error is raised.  Only what the caller has cancelled is cancelled, device or not.
 
     Parameters
     ----------
@@ -61,7 +63,7 @@ class DeviceOpening:
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
         try:
-            if isinstance(error, Exception):
+            if isinstance(error, Exception) and not isinstance(error, Cancelled):
                 self._chosen.result()
         finally:
             self._pool.shutdown(wait=True, cancel_futures=True)

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from clrecon.errors import ClreconError, OutputError, UsageError
+from clrecon.system.progress import Progress
 from clrecon.system.wording import name_parameter
 
 if TYPE_CHECKING:
@@ -185,7 +186,9 @@ def check_outputs(
     return outputs
 
 
-def stage_meshes(stack: ExitStack, meshes: Sequence[Mesh], paths: Sequence[str | Path], space: str) -> list[StagedFile]:
+def stage_meshes(
+    stack: ExitStack, meshes: Sequence[Mesh], paths: Sequence[str | Path], space: str, progress: Progress
+) -> list[StagedFile]:
     """Write all meshes under temporary names that `stack` removes unless they are committed.
 
     Raises
@@ -197,7 +200,11 @@ def stage_meshes(stack: ExitStack, meshes: Sequence[Mesh], paths: Sequence[str |
     from clrecon.system.files import allow_open_files
 
     allow_open_files(len(meshes))
-    return [stack.enter_context(stage_mesh(mesh, path, space)) for mesh, path in zip(meshes, paths, strict=True)]
+    staged: list[StagedFile] = []
+    for mesh, path in zip(meshes, paths, strict=True):
+        progress("write", len(staged), len(meshes) if len(meshes) > 1 else 0)
+        staged.append(stack.enter_context(stage_mesh(mesh, path, space)))
+    return staged
 
 
 def commit_all(files: Sequence[Staged]) -> None:

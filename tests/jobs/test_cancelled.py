@@ -1,0 +1,226 @@
+"""A progress function that raises `Cancelled` ends the work at once, with nothing half written and nothing held."""
+
+from __future__ import annotations
+
+import gc
+import threading
+import weakref
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import clrecon
+from clrecon.geometry import Volume
+from clrecon.jobs.mesh.job import make_mesh
+from clrecon.jobs.mesh.settings import MeshSettings
+from clrecon.jobs.render.files import PictureFiles
+from clrecon.jobs.render.job import make_pictures
+from clrecon.jobs.render.settings import RenderSettings, Turntable
+from clrecon.jobs.shared.opening import DeviceOpening
+from clrecon.labels import LabelMap
+from clrecon.phantom import PhantomSettings, write_phantom
+from clrecon.system.progress import Progress
+
+pytestmark = pytest.mark.first_device
+
+Calls = list[tuple[str, int, int]]
+
+
+@pytest.fixture(scope="module")
+def scan(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("cancelled") / "ct"
+    write_phantom(folder, PhantomSettings(kind="sphere", size=(44, 60), slices=31, spacing=(0.5, 0.7, 1.0)))
+    return folder
+
+
+def moments(work: Callable[[Progress], object]) -> Calls:
+    """The calls of progress of a whole run: of each stage the first, one in the middle, and the last."""
+    calls: Calls = []
+    work(lambda *call: calls.append(call))
+    chosen = []
+    for stage in dict.fromkeys(call[0] for call in calls):
+        own = [call for call in calls if call[0] == stage]
+        chosen += [own[0], own[len(own) // 2], own[-1]]
+    return list(dict.fromkeys(chosen))
+
+
+def cancel(work: Callable[[Progress], object], moment: tuple[str, int, int]) -> None:
+    """Run `work` until `moment`; what arrives must be the error that was raised there, not another in its place."""
+    raised = clrecon.Cancelled(f"enough at {moment}")
+    caller = threading.get_ident()
+
+    def progress(*call: Any) -> None:
+        assert threading.get_ident() == caller
+        if call == moment:
+            raise raised
+
+    try:
+        work(progress)
+    except clrecon.Cancelled as error:
+        assert error is raised
+        assert error.__cause__ is None
+        assert error.__context__ is None
+        error.__traceback__ = None  # whose frames hold what they worked on
+    else:
+        pytest.fail(f"went on after {moment}")
+
+
+class Buffers:
+    """The buffers on devices that somebody still holds."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch):
+        cl = pytest.importorskip("pyopencl")
+        made: list[weakref.ref[Any]] = []
+        self._made = made
+
+        class Counted(cl.Buffer):  # type: ignore[misc, name-defined]
+            def __init__(self, *given: Any, **named: Any):
+                super().__init__(*given, **named)
+                made.append(weakref.ref(self))
+
+        monkeypatch.setattr(cl, "Buffer", Counted)
+
+    @property
+    def made(self) -> int:
+        return len(self._made)
+
+    @property
+    def held(self) -> int:
+        gc.collect()
+        return sum(buffer() is not None for buffer in self._made)
+
+
+def old_files(folder: Path, *names: str) -> dict[str, bytes]:
+    for name in names:
+        (folder / name).write_bytes(b"old " + name.encode())
+    return {path.name: path.read_bytes() for path in folder.iterdir()}
+
+
+def there(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in folder.iterdir()}
+
+
+def test_reading(scan: Path) -> None:
+    found = moments(lambda progress: clrecon.read_volume(scan, progress=progress))
+    assert {stage for stage, _, _ in found} == {"scan", "read"}
+    for moment in found:
+        cancel(lambda progress: clrecon.read_volume(scan, progress=progress), moment)
+        cancel(lambda progress: clrecon.list_series(scan, pixels=True, progress=progress), moment)
+    assert [thread.name for thread in threading.enumerate() if thread.name.startswith("ThreadPool")] == []
+    assert clrecon.read_volume(scan).voxels.shape[0] == 31
+
+
+def test_a_mesh(scan: Path, device: Any, tmp_path: Path) -> None:
+    settings = MeshSettings(
+        iso_value=(100.0, 200.0), smooth=2, decimate=0.5, split=True, field_of_view=14.0, device=str(device.index)
+    )
+
+    def work(progress: Progress) -> object:
+        return make_mesh(scan, tmp_path / "a.stl", settings, report_path=tmp_path / "a.json", progress=progress)
+
+    found = moments(work)
+    stages = {stage for stage, _, _ in found}
+    assert stages == {
+        "device", "scan", "read", "mask", "build", "select", "smooth", "decimate", "compare", "measure", "write"
+    }  # fmt: skip
+    assert ("write", 1, 2) in found  # between the files
+    before = old_files(tmp_path, "a.stl", "a_100hu_001.stl", "a.json")
+    for moment in found:
+        cancel(work, moment)
+        assert there(tmp_path) == before
+
+
+def test_slabs_of_a_surface_and_its_buffers(device: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    voxels = np.zeros((40, 30, 30), np.int16)
+    voxels[5:35, 5:25, 5:25] = 1000
+    volume = Volume(voxels, np.eye(4))
+    memory = 120_000
+    whole = clrecon.extract_isosurface(volume, 500, device)
+    buffers = Buffers(monkeypatch)
+    kept = buffers.held
+    found = moments(lambda progress: clrecon.extract_isosurface(volume, 500, device, memory=memory, progress=progress))
+    assert len([moment for moment in found if moment[0] == "slabs"]) > 1
+    for moment in found:
+        before = buffers.made
+        cancel(
+            lambda progress: clrecon.extract_isosurface(volume, 500, device, memory=memory, progress=progress), moment
+        )
+        assert buffers.made > before or moment[0] == "build"
+        assert buffers.held == kept
+    with clrecon.SurfaceExtractor(volume, device, memory=memory) as extractor:
+        for moment in found:
+            cancel(lambda progress: extractor.extract(500, progress=progress), moment)
+        assert np.array_equal(extractor.extract(500).vertices, whole.vertices)  # it can be used again
+        assert buffers.held == kept
+    with clrecon.SurfaceExtractor(volume, device) as extractor:
+        extractor.extract(500)
+        assert buffers.held > kept  # the volume stays there
+    assert buffers.held == kept
+
+
+def test_slabs_of_a_slice(device: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    voxels = np.random.default_rng(0).integers(-1000, 1000, (60, 40, 40)).astype(np.int16)
+    volume = Volume(voxels, np.eye(4))
+    cut = {"size": (64, 64), "memory": 100_000}
+    clrecon.cut_slice(volume, "coronal", device=device, **cut)
+    buffers = Buffers(monkeypatch)
+    found = moments(lambda progress: clrecon.cut_slice(volume, "coronal", device=device, progress=progress, **cut))
+    assert len(found) > 1
+    for moment in found:
+        cancel(lambda progress: clrecon.cut_slice(volume, "coronal", device=device, progress=progress, **cut), moment)
+        assert buffers.held == 0
+
+
+@pytest.mark.parametrize("own", [False, True])
+def test_labels(own: bool, device: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    voxels = np.zeros((24, 24, 24), np.int16)
+    marks = np.zeros(voxels.shape, np.uint8)
+    for number, first in enumerate((2, 9, 16), start=1):
+        marks[first : first + 6, 4:20, 4:20] = number
+    voxels[marks > 0] = 1000
+    volume, labels = Volume(voxels, np.eye(4)), LabelMap(marks, np.eye(4))
+
+    def work(progress: Progress) -> object:
+        if own:
+            return clrecon.extract_label_masks(labels, device, progress=progress)
+        return clrecon.extract_labels(volume, labels, 500, device, progress=progress)
+
+    found = moments(work)
+    assert found == [("labels", 0, 3), ("labels", 1, 3), ("labels", 2, 3)]
+    buffers = Buffers(monkeypatch)
+    for moment in found:
+        cancel(work, moment)
+        assert buffers.held == 0
+    assert buffers.made > 0
+
+
+@pytest.mark.parametrize("name", ["a.apng", "a.gif", "a.mp4", "frames"])
+def test_a_turntable(name: str, scan: Path, device: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    settings = RenderSettings(
+        "mip", size=(32, 32), turntable=Turntable(frames=4), background="black", device=str(device.index)
+    )
+    files = PictureFiles(tmp_path / "still.png", turntable=tmp_path / name, report=tmp_path / "a.json")
+
+    def work(progress: Progress) -> object:
+        return make_pictures(scan, files, settings, progress=progress)
+
+    found = moments(work)
+    assert {stage for stage, _, _ in found} == {"device", "scan", "read", "render", "frames"}
+    for path in tmp_path.iterdir():  # the first run has shown that all of them are written
+        if path.is_file():
+            path.write_bytes(b"old")
+    before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+    buffers = Buffers(monkeypatch)
+    for moment in found:
+        cancel(work, moment)
+        assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
+        assert buffers.held == 0
+    assert buffers.made > 0
+
+
+def test_a_missing_device_does_not_take_the_place_of_cancelled() -> None:
+    with pytest.raises(clrecon.Cancelled, match="enough"), DeviceOpening("abacus", lambda device: None):
+        raise clrecon.Cancelled("enough")
