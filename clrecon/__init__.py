@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from clrecon.opencl import Device
     from clrecon.operators.rays.render import VolumeRenderer, render
     from clrecon.operators.reformat.cut import cut_slice, reformat_curve
+    from clrecon.operators.resident.device_volume import DeviceVolume
     from clrecon.operators.surface.extract import SurfaceExtractor, extract_isosurface, extract_isosurfaces
     from clrecon.operators.surface.label_masks import extract_label_masks
     from clrecon.operators.surface.labels import extract_labels
@@ -55,6 +56,7 @@ __all__ = [
     "Clip",
     "ClreconError",
     "DeviceError",
+    "DeviceVolume",
     "LabelMap",
     "Lighting",
     "Mesh",
@@ -100,6 +102,7 @@ _HOMES = {
     "Clip": "clrecon.rendering.views.clip",
     "ClreconError": "clrecon.errors",
     "DeviceError": "clrecon.errors",
+    "DeviceVolume": "clrecon.operators.resident.device_volume",
     "LabelMap": "clrecon.labels",
     "Lighting": "clrecon.rendering",
     "Mesh": "clrecon.mesh",

@@ -10,16 +10,17 @@
 #define FIRST_SEEN (1.0f / 255.0f) /* opacity that makes a first hit */
 #define NO_HIT (-MAXFLOAT)
 
-/* Parameters  slices   in   (count, nj, ni) the slices that are shown, in the order in which rays cross them
- *             places   in   (count) per slice x, y: what i and j are counted from there, in steps of a voxel; z: third
- *                           field coordinate
+/* Parameters  slices   in   (slices, nj, ni) all slices of the volume, or those that are shown
+ *             places   in   (count) for each slice that is shown, in the order in which rays cross them: x, y: what i and
+ *                           j are counted from there, in steps of a voxel; z: third field coordinate; w: its number in
+ *                           `slices`
  *             colors   in   (BINS) rgb by value
  *             view     in   see include/view.h
  *             states   in/out  (height, width, 2) float4: premultiplied rgba; t of the first hit, sum of w t, -, -
  *             image    out  (height, width) rgba
  *             depths means  out  (height, width) first hit and expected depth, mm; NaN where nothing is hit
  *             background    rgb, and 1 where it fills what the rays leave
- *             ni nj    of a slice;  count: slices
+ *             ni nj    of a slice;  count: slices that are shown
  *             bins_low bins_scale  nearest node to a value v: (v - bins_low) * bins_scale + 0.5
  *             opacity  of a slice;  lowest: values below are transparent
  *             stage    FIRST_SLAB and LAST_SLAB, see include/view.h
@@ -50,6 +51,7 @@ __kernel void overlay_slices(
     const int crossed = r.t_out > r.t_in && fabs(r.step.z) > 1e-12f ? count : 0;
     for (int n = 0; n < crossed; ++n) {
         const float4 place = places[n];
+        const int k = (int)place.w;
         const float t = (place.z - r.origin.z) / r.step.z;
         const float i = r.origin.x + t * r.step.x - place.x, j = r.origin.y + t * r.step.y - place.y;
         /* Half a voxel around the outermost centres belongs to them. */
@@ -59,10 +61,10 @@ __kernel void overlay_slices(
         const int low_i = (int)in_i, low_j = (int)in_j;
         const int high_i = min(low_i + 1, ni - 1), high_j = min(low_j + 1, nj - 1);
         const float part_i = in_i - (float)low_i, part_j = in_j - (float)low_j;
-        const float near_low = (float)slices[voxel_index(low_i, low_j, n, ni, nj)];
-        const float near_high = (float)slices[voxel_index(high_i, low_j, n, ni, nj)];
-        const float far_low = (float)slices[voxel_index(low_i, high_j, n, ni, nj)];
-        const float far_high = (float)slices[voxel_index(high_i, high_j, n, ni, nj)];
+        const float near_low = (float)slices[voxel_index(low_i, low_j, k, ni, nj)];
+        const float near_high = (float)slices[voxel_index(high_i, low_j, k, ni, nj)];
+        const float far_low = (float)slices[voxel_index(low_i, high_j, k, ni, nj)];
+        const float far_high = (float)slices[voxel_index(high_i, high_j, k, ni, nj)];
         const float near = near_low + part_i * (near_high - near_low);
         const float value = near + part_j * (far_low + part_i * (far_high - far_low) - near);
         if (!(value >= lowest))

@@ -5,13 +5,16 @@ from __future__ import annotations
 import numpy as np
 
 from clrecon.geometry.iso_rule import choose_iso_rule
-from clrecon.operators.surface.extract import SurfaceExtractor
+from clrecon.operators.resident.device_volume import DeviceVolume
+from clrecon.operators.surface.extract import extract_isosurface
+from clrecon.operators.surface.slabs import SampleGrid
 
 
-def extract_in_slabs(volume, iso_value, device, slices, closed=True):
-    extractor = SurfaceExtractor(volume, device)
-    extractor._use_smaller_slabs(choose_iso_rule(volume, iso_value, closed), slices)
-    return extractor.extract(iso_value, closed=closed)
+def extract_in_slabs(volume, iso_value, device, slices, closed=True, topology="separated", **options):
+    resident = DeviceVolume(volume, device)
+    rule = choose_iso_rule(volume, iso_value, closed, topology, **options)
+    resident.most_slices[SampleGrid(volume, rule).kind] = slices
+    return extract_isosurface(resident, iso_value, closed=closed, topology=topology, **options)
 
 
 def assert_same(mesh, expected) -> None:

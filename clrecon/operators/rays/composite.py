@@ -20,8 +20,9 @@ from clrecon.opencl import (
 )
 from clrecon.operators.rays.buffers import PictureBuffers, count_queues, highlight_table
 from clrecon.operators.rays.ray_view import RayView
+from clrecon.operators.rays.slabs import FARTHEST, LeapMap, RaySlab, slab_labels
+from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.operators.resident.frame import FieldFrame
-from clrecon.operators.resident.volume import FARTHEST, LeapMap, RaySlab, ResidentVolume, pad_slices
 from clrecon.operators.resident.voxel_types import label_variants
 from clrecon.rendering import Lighting, TransferFunction
 from clrecon.rendering.looks.label_style import LabelStyle
@@ -142,7 +143,7 @@ class MainWay:
     aside: float
 
     @classmethod
-    def of(cls, resident: ResidentVolume, slab: RaySlab, camera: Camera) -> MainWay:
+    def of(cls, resident: DeviceVolume, slab: RaySlab, camera: Camera) -> MainWay:
         """That of the ray in the middle."""
         frame, cells = FieldFrame.of(resident.volume), np.array(slab.brick_cells, np.float64)
         forward = frame.matrix @ camera.basis().forward / cells
@@ -163,7 +164,7 @@ class MainWay:
 
 
 def composite_slab(
-    resident: ResidentVolume,
+    resident: DeviceVolume,
     slab: RaySlab,
     view: RayView,
     tables: TransferTables,
@@ -196,8 +197,7 @@ def composite_slab(
     label_tables: tuple[Any, ...] = ()
     if labels is not None and style is not None:
         variants |= {"LABELS": "1", **label_variants(labels.voxels.dtype)}
-        held = pad_slices(labels.voxels[slab.first_k : slab.end_k])
-        label_tables = (upload(device, held), upload(device, style.table))
+        label_tables = (slab_labels(resident, slab, labels, stopwatch), upload(device, style.table))
     program = resident.program("render/composite.cl", **variants)
     lanes = int(device.kernel_variants["LANES"])
     width, height = view.size
@@ -226,7 +226,7 @@ def composite_slab(
 
 
 def _enter_tiles(
-    resident: ResidentVolume,
+    resident: DeviceVolume,
     slab: RaySlab,
     view: RayView,
     leaps: LeapMap,
@@ -237,7 +237,7 @@ def _enter_tiles(
     device = resident.device
     lanes = int(device.kernel_variants["LANES"])
     width, height = view.size
-    margin = math.ceil(min((resident.stack.index_steps(view.spread) / resident.brick_cells).max(), FARTHEST))
+    margin = math.ceil(min((resident.stack.index_steps(view.spread) / slab.brick_cells).max(), FARTHEST))
     entries_d = allocate(device, 4 * output.tiles)
     launch(
         device, resident.program("render/tiles.cl")["enter_tiles"], -(-output.tiles // lanes),
@@ -249,7 +249,7 @@ def _enter_tiles(
     return entries_d
 
 
-def _look_ahead(resident: ResidentVolume, slab: RaySlab, way: MainWay, leaps: LeapMap, stopwatch: Stopwatch) -> Any:
+def _look_ahead(resident: DeviceVolume, slab: RaySlab, way: MainWay, leaps: LeapMap, stopwatch: Stopwatch) -> Any:
     """For each brick how far nothing shows around it, and ahead of it along the main way, on the device."""
     bricks = slab.bricks
     count = math.prod(bricks)

@@ -6,8 +6,10 @@ import numpy as np
 
 from clrecon.opencl import Stopwatch, launch, upload
 from clrecon.operators.rays.buffers import PictureBuffers, count_queues
+from clrecon.operators.rays.leaps import measure_cells
 from clrecon.operators.rays.ray_view import RayView
-from clrecon.operators.resident.volume import RaySlab, ResidentVolume
+from clrecon.operators.rays.slabs import RaySlab
+from clrecon.operators.resident.device_volume import DeviceVolume
 
 __all__ = ["AIR_HU", "PROJECTIONS", "project_slab"]
 
@@ -19,7 +21,7 @@ PROJECTIONS = {"mip": 0, "minip": 1, "mean": 2, "drr": 3}
 
 
 def project_slab(
-    resident: ResidentVolume,
+    resident: DeviceVolume,
     slab: RaySlab,
     view: RayView,
     mode: str,
@@ -39,7 +41,7 @@ def project_slab(
     last = np.array([n - 1 for n in resident.volume.shape_ijk] + [0], dtype=np.float32)
     launch(
         device, resident.program("render/project.cl", **variants)["project_rays"], output.items(queues, lanes),
-        slab.voxels_d, resident.measure(slab, stopwatch), upload(device, view.table), output.states_d,
+        slab.voxels_d, measure_cells(resident, slab, stopwatch), upload(device, view.table), output.states_d,
         output.depths_d, output.means_d, last,
         np.int32(slab.shape_ijk[0]), np.int32(slab.shape_ijk[1]), np.int32(slab.first_k), np.int32(slab.end_k),
         np.float32(slab.low_k), np.float32(slab.high_k), *slab.brick_arguments,

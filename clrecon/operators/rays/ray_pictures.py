@@ -10,14 +10,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.geometry.affine import Float64Array
-from clrecon.labels.resample import resample_labels
 from clrecon.opencl import Stopwatch
 from clrecon.operators.rays.buffers import PictureBuffers
 from clrecon.operators.rays.composite import TransferTables, composite_slab
+from clrecon.operators.rays.leaps import find_leaps
 from clrecon.operators.rays.project import PROJECTIONS, project_slab
 from clrecon.operators.rays.ray_view import RayView
+from clrecon.operators.rays.slabs import RAYS, RaySlab, entry_slice, plan_ray_slabs, ray_slabs
+from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.operators.resident.frame import volume_box
-from clrecon.operators.resident.volume import RaySlab, ResidentVolume, entry_slice
 from clrecon.rendering import Lighting, Rendering, TransferFunction
 from clrecon.rendering.looks.label_style import LabelStyle
 from clrecon.rendering.looks.window import choose_water_window, choose_window, grey_image
@@ -64,13 +65,8 @@ class RayPicture:
     style: LabelStyle | None = None
 
 
-def take_picture(resident: ResidentVolume, picture: RayPicture, tables: TransferTables | None) -> Rendering:
+def take_picture(resident: DeviceVolume, picture: RayPicture) -> Rendering:
     """Take one picture of a volume on a device.
-
-    Parameters
-    ----------
-    tables : TransferTables, optional
-        Those of the picture's transfer function and ray step; projections need none.
 
     Raises
     ------
@@ -79,33 +75,38 @@ def take_picture(resident: ResidentVolume, picture: RayPicture, tables: Transfer
     RefusedInputError
         The labels do not lie on the volume.
     """
-    return _Job(resident, picture, tables).run()
+    return _Job(resident, picture).run()
 
 
 class _Job:
-    def __init__(self, resident: ResidentVolume, picture: RayPicture, tables: TransferTables | None):
-        self.resident, self.picture, self.tables = resident, picture, tables
-        self.labels = None if picture.style is None else resample_labels(picture.style.labels, resident.volume)
+    def __init__(self, resident: DeviceVolume, picture: RayPicture):
+        self.resident, self.picture = resident, picture
+        self.labels = None if picture.style is None else resident.bring(picture.style.labels)
+        self.warnings = [] if self.labels is None else list(self.labels.warnings)
         self.stopwatch = Stopwatch()
         self.box = volume_box(resident.volume)
         self.planes = None if picture.clip is None else picture.clip.planes
 
     def run(self) -> Rendering:
+        """Take the picture, in thinner slabs where the device has no room for what was planned."""
+        resident = self.resident
+        slices = plan_ray_slabs(resident, *PictureBuffers.needs(self.picture.size), self.labels)
+        return resident.halve(RAYS, slices, self._take, warnings=self.warnings)
+
+    def _take(self, slices: int) -> Rendering:
         """Go through the slabs and collect the picture."""
         resident, picture, stopwatch = self.resident, self.picture, self.stopwatch
         device = resident.device
-        beside = 0 if self.labels is None else self.labels.voxels.itemsize
-        slices = resident.plan(*PictureBuffers.needs(picture.size), beside=beside)
         several = slices < resident.volume.shape_ijk[2]
         output = PictureBuffers(device, picture.size, picture.background, several)
         slabs = 0
-        for slab in resident.slabs(slices, entry_slice(resident.volume, picture.camera), stopwatch):
+        for slab in ray_slabs(resident, slices, entry_slice(resident.volume, picture.camera), stopwatch):
             slabs += 1
-            if self.tables is None:
+            if picture.mode in PROJECTIONS:
                 with stopwatch.running(device):  # to its end: CPU devices read the arrays of the host
                     project_slab(resident, slab, self._view(self.box), picture.mode, output, stopwatch)
             else:
-                self._composite(slab, self.tables, output)
+                self._composite(slab, output)
         with stopwatch.timed("download"):
             image, depths, means = output.download()
         report = {
@@ -116,22 +117,23 @@ class _Job:
             "slabs": slabs,
             "seconds": dict(stopwatch.seconds),
             "kernel_seconds": dict(stopwatch.by_kernel),
-            "warnings": [] if self.labels is None else list(self.labels.warnings),
+            "warnings": list(self.warnings),
         }
         if picture.mode in PROJECTIONS:
             return self._finish_projection(means, depths, report)
         report["unit_distance_mm"] = picture.function.unit_distance
         return Rendering(image, depths, means, picture.camera, None, picture.mode, report)
 
-    def _composite(self, slab: RaySlab, tables: TransferTables, output: PictureBuffers) -> None:
-        picture, stopwatch = self.picture, self.stopwatch
+    def _composite(self, slab: RaySlab, output: PictureBuffers) -> None:
+        resident, picture, stopwatch = self.resident, self.picture, self.stopwatch
         key = (picture.function, picture.ray_step)
-        with stopwatch.running(self.resident.device):
-            leaps = self.resident.find_leaps(slab, key, tables.shown, tables.low, tables.scale, stopwatch)
+        tables = resident.keep("transfer function", key, 0, lambda: TransferTables.of(resident.device, *key))
+        with stopwatch.running(resident.device):
+            leaps = find_leaps(resident, slab, key, tables.shown, tables.low, tables.scale, stopwatch)
         nothing = (self.box[1], self.box[1])
         view = self._view(nothing if leaps.box is None else leaps.box)
         composite_slab(
-            self.resident, slab, view, tables, leaps, picture.lighting, picture.jitter, self.labels, picture.style,
+            resident, slab, view, tables, leaps, picture.lighting, picture.jitter, self.labels, picture.style,
             output, stopwatch,
         )  # fmt: skip
 

@@ -13,11 +13,10 @@ from numpy.typing import ArrayLike
 from clrecon.errors import UsageError
 from clrecon.geometry import Volume
 from clrecon.labels import LabelMap
-from clrecon.opencl import Device, check_memory, choose_device
-from clrecon.operators.rays.composite import TransferTables
+from clrecon.opencl import Device
 from clrecon.operators.rays.project import PROJECTIONS
 from clrecon.operators.rays.ray_pictures import RayPicture, take_picture
-from clrecon.operators.resident.volume import ResidentVolume
+from clrecon.operators.resident.device_volume import DeviceVolume, take_volume
 from clrecon.rendering import Lighting, Rendering, TransferFunction
 from clrecon.rendering.looks.colors import is_transparent
 from clrecon.rendering.looks.label_style import LabelStyle
@@ -82,8 +81,9 @@ class VolumeRenderer:
 
     Parameters
     ----------
-    volume : Volume
-        Its voxels must not change as long as the renderer is open.
+    volume : Volume or DeviceVolume
+        The voxels must not change as long as the renderer is open.  A `DeviceVolume` is used as it is, and has its
+        device and memory.
     device : Device, str or int, optional
         See `clrecon.device`; None is the best of the machine.
     memory : int, optional
@@ -97,17 +97,14 @@ class VolumeRenderer:
         There is no such device.
     """
 
-    def __init__(self, volume: Volume, device: Device | str | int | None = None, *, memory: int | None = None):
-        if not isinstance(volume, Volume):
-            raise UsageError(f"a picture needs a Volume, not {type(volume).__name__}: clrecon.Volume(voxels, affine)")
-        check_memory(memory)
-        if volume.voxels.dtype.kind == "f" and not np.isfinite(volume.voxels).all():
+    def __init__(
+        self, volume: Volume | DeviceVolume, device: Device | str | int | None = None, *, memory: int | None = None
+    ):
+        self._resident, self._is_own = take_volume(volume, device, memory, "a picture")
+        self.volume, self.device = self._resident.volume, self._resident.device
+        voxels = self.volume.voxels
+        if voxels.dtype.kind == "f" and not np.isfinite(voxels).all():
             raise UsageError("the voxels hold NaN or infinite values: fill them first, for CT with -1024")
-        self.volume = volume
-        self.device = choose_device(device)
-        self.memory = memory
-        self._resident = ResidentVolume(volume, self.device, memory)
-        self._tables: dict[tuple[TransferFunction, float, Any], TransferTables] = {}
 
     def __enter__(self) -> VolumeRenderer:
         return self
@@ -118,9 +115,9 @@ class VolumeRenderer:
         self.close()
 
     def close(self) -> None:
-        """Free the volume on the device."""
-        self._resident.close()
-        self._tables = {}
+        """Free the volume on the device; a `DeviceVolume` that was given stays as it is."""
+        if self._is_own:
+            self._resident.close()
 
     def render(
         self,
@@ -178,8 +175,7 @@ class VolumeRenderer:
             _choose_window(None if mode == "drr" else preset, options), options.get("clip"), ground,
             _is_set(options, "jitter"), _label_style(options),
         )  # fmt: skip
-        tables = None if mode in PROJECTIONS else self._transfer_tables(function, step)
-        return take_picture(self._resident, picture, tables)
+        return take_picture(self._resident, picture)
 
     def _surface(
         self,
@@ -209,9 +205,9 @@ class VolumeRenderer:
         from clrecon.operators.rays.slices import DEFAULT_OPACITY, overlay_slices
 
         return overlay_slices(
-            self.volume, self.device, camera, size, slices=options.get("slices"),
+            self._resident, camera, size, slices=options.get("slices"),
             opacity=_given(options, "slice_opacity", DEFAULT_OPACITY), window=options.get("window"),
-            transfer_function=function, clip=options.get("clip"), background=background, memory=self.memory,
+            transfer_function=function, clip=options.get("clip"), background=background,
         )  # fmt: skip
 
     def _cut(
@@ -229,7 +225,7 @@ class VolumeRenderer:
 
         own: dict[str, Any] = {} if camera is not None else {"zoom": zoom, "up": up}
         return cut_slice(
-            self.volume, view if camera is None else camera, size, self.device,
+            self._resident, view if camera is None else camera, size,
             offset_mm=_given(options, "offset_mm", 0.0), **own, **self._slab_options(background, preset, options),
         )  # fmt: skip
 
@@ -246,7 +242,7 @@ class VolumeRenderer:
 
         curve: ArrayLike | str = _given(options, "curve", "spine")
         return reformat_curve(
-            self.volume, curve, _given(options, "cpr", "straightened"), size, self.device,
+            self._resident, curve, _given(options, "cpr", "straightened"), size,
             view=view, up=up, **self._slab_options(background, preset, options),
         )  # fmt: skip
 
@@ -258,7 +254,6 @@ class VolumeRenderer:
             "combine": _given(options, "combine", "mean"),
             "window": _choose_window(preset, options),
             "background": background,
-            "memory": self.memory,
         }
 
     def _checked_step(self, ray_step: float | None) -> float:
@@ -277,14 +272,6 @@ class VolumeRenderer:
             f"the ray step is a length in mm, at least {finest:.3g} in this volume (a hundredth of its smallest"
             f" spacing, and {MOST_STEPS:,} through its diagonal), not {ray_step!r}"
         )
-
-    def _transfer_tables(self, function: TransferFunction, ray_step: float) -> TransferTables:
-        key = (function, ray_step, self.device.context)
-        tables = self._tables.get(key)
-        if tables is None:
-            tables = TransferTables.of(self.device, function, ray_step)
-            self._tables = {key: tables}  # replaced as a whole: other threads may be looking
-        return tables
 
 
 def _choose_mode(mode: str | None, preset: str | None, function: TransferFunction | None) -> str:
@@ -345,7 +332,7 @@ def _label_style(options: Mapping[str, Any]) -> LabelStyle | None:
 
 
 def render(
-    volume: Volume,
+    volume: Volume | DeviceVolume,
     mode: str | None = None,
     preset: str | None = None,
     transfer_function: TransferFunction | None = None,

@@ -13,17 +13,15 @@ from clrecon.errors import UsageError
 from clrecon.geometry import Volume
 from clrecon.geometry.affine import Float64Array
 from clrecon.opencl import (
-    Device,
     Stopwatch,
     check_budget,
-    describe_shortage,
     launch,
     load_program,
-    memory_limits,
     upload,
 )
 from clrecon.operators.rays.buffers import PictureBuffers, count_queues
 from clrecon.operators.rays.ray_view import RayView
+from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.operators.resident.frame import FieldFrame, volume_box
 from clrecon.operators.resident.voxel_types import voxel_variants
 from clrecon.rendering import Rendering, TransferFunction
@@ -47,6 +45,9 @@ DEFAULT_WINDOW = (-300.0, 400.0)
 
 NODES = 4096
 """Entries of the table of colours, as in cl/render/slices.cl."""
+
+SLICES = "slices in space"
+"""What parts are planned for."""
 
 EDGE_ON = 1e-3
 """Cosine between a parallel view and the slices' normal below which nothing of them is seen."""
@@ -90,8 +91,7 @@ def choose_slices(volume: Volume, slices: int | Sequence[int] | None = None) -> 
 
 
 def overlay_slices(
-    volume: Volume,
-    device: Device,
+    resident: DeviceVolume,
     camera: Camera,
     size: tuple[int, int],
     *,
@@ -102,16 +102,15 @@ def overlay_slices(
     transfer_function: TransferFunction | None = None,
     clip: Clip | None = None,
     background: str | Sequence[float] | None = None,
-    memory: int | None = None,
 ) -> Rendering:
     """Show slices of a volume in space, each translucent at its own place: sheared and uneven stacks too.
 
-    Only the slices that are shown go to the device, in parts where they do not fit together.
+    A volume that is on the device already is read there.  Else only the slices that are shown are uploaded, in parts
+    where they do not fit together.
 
     Parameters
     ----------
-    volume : Volume
-    device : Device
+    resident : DeviceVolume
     camera : Camera
     size : (width, height)
     slices : int or sequence of int, optional
@@ -127,8 +126,6 @@ def overlay_slices(
     clip : Clip, optional
     background : str or (float, float, float), optional
         None leaves the picture transparent where nothing is.
-    memory : int, optional
-        Bytes that may be taken on the device.
 
     Returns
     -------
@@ -142,33 +139,10 @@ def overlay_slices(
     DeviceError
         Not even one slice fits the device.
     """
-    chosen = choose_slices(volume, slices)
+    chosen = choose_slices(resident.volume, slices)
     look = _Look.of(opacity, lowest_hu, window, transfer_function)
-    needs, extra = PictureBuffers.needs(size)
-    at_once = _plan_parts(volume, device, len(chosen), needs, extra, memory)
-    order = _sort_slices(volume, camera, chosen)
-    parts = [order[first : first + at_once] for first in range(0, len(order), at_once)]
-    output = PictureBuffers(device, size, background, len(parts) > 1)
-    stopwatch = Stopwatch()
-    box = volume_box(volume)
-    view = RayView.of(volume, camera, size, 1.0, planes=None if clip is None else clip.planes, box=box, focus=box)
-    for number, part in enumerate(parts):
-        stage = (number == 0) + 2 * (number == len(parts) - 1)
-        _draw(volume, device, part, look, view, stage, output, stopwatch)
-    with stopwatch.timed("download"):
-        image, depths, means = output.download()
-    report = {
-        "mode": "slices",
-        "device": device.label,
-        "driver": device.driver,
-        "slices": chosen,
-        "slice_opacity": look.opacity,
-        "lowest_shown_hu": look.lowest,
-        "seconds": dict(stopwatch.seconds),
-        "kernel_seconds": dict(stopwatch.by_kernel),
-        "warnings": _warn(volume, camera),
-    }
-    return Rendering(image, depths, means, camera, None, "slices", report)
+    job = _Overlay(resident, camera, size, chosen, look, clip)
+    return job.run(background)
 
 
 @dataclass(frozen=True)
@@ -212,20 +186,6 @@ def _number(value: float) -> float:
         return math.nan
 
 
-def _plan_parts(
-    volume: Volume, device: Device, count: int, needs: dict[str, int], extra: dict[str, int], memory: int | None
-) -> int:
-    """Slices that go to the device together."""
-    ni, nj, _ = volume.shape_ijk
-    one = ni * nj * int(volume.voxels.dtype.itemsize)
-    limits = memory_limits(device, memory)
-    if not describe_shortage(limits, {"slices": count * one, **needs}):
-        return count
-    check_budget(device, {"slice": one, **needs, **extra}, memory)
-    left = limits.total_bytes - sum(needs.values()) - sum(extra.values())
-    return min(count, max(1, min(left, limits.buffer_bytes) // one))
-
-
 def _sort_slices(volume: Volume, camera: Camera, chosen: Sequence[int]) -> list[int]:
     """Slices in the order in which rays cross them.
 
@@ -251,33 +211,84 @@ def _warn(volume: Volume, camera: Camera) -> list[str]:
     return ["the slices are seen edge-on and do not show: look from another side, such as 30,30, or in perspective"]
 
 
-def _draw(
-    volume: Volume,
-    device: Device,
-    part: Sequence[int],
-    look: _Look,
-    view: RayView,
-    stage: int,
-    output: PictureBuffers,
-    stopwatch: Stopwatch,
-) -> None:
-    """Draw slices in the order given, and wait."""
-    places = np.zeros((len(part), 4), np.float32)
-    places[:, :3] = FieldFrame.of(volume).places(volume.slice_origins()[list(part)])
-    with stopwatch.timed("upload"):
-        slices = np.ascontiguousarray(volume.voxels[list(part)])
-        slices_d = upload(device, slices)
-    ni, nj, _ = volume.shape_ijk
-    width, height = view.size
-    queues = count_queues(device)
-    program = load_program(device, "render/slices.cl", voxel_variants(volume.voxels.dtype))
-    with stopwatch.running(device):  # to its end: CPU devices read the array of the host
-        launch(
-            device, program["overlay_slices"], output.items(queues, 1),
-            slices_d, upload(device, places), upload(device, look.colors), upload(device, view.table), output.states_d,
-            output.image_d, output.depths_d, output.means_d, output.background,
-            np.int32(ni), np.int32(nj), np.int32(len(part)), np.float32(look.low), np.float32(look.scale),
-            np.float32(look.opacity), np.float32(look.lowest), np.uint32(width), np.uint32(height),
-            np.uint32(view.planes), np.int32(not view.camera.is_parallel), np.int32(stage), np.uint32(queues),
-            stopwatch=stopwatch,
-        )  # fmt: skip
+class _Overlay:
+    """One picture: from part to part of the slices, in the order in which rays cross them."""
+
+    def __init__(
+        self,
+        resident: DeviceVolume,
+        camera: Camera,
+        size: tuple[int, int],
+        chosen: list[int],
+        look: _Look,
+        clip: Clip | None,
+    ):
+        self.resident, self.chosen, self.look = resident, chosen, look
+        self.order = _sort_slices(resident.volume, camera, chosen)
+        box = volume_box(resident.volume)
+        planes = None if clip is None else clip.planes
+        self.view = RayView.of(resident.volume, camera, size, 1.0, planes=planes, box=box, focus=box)
+        self.stopwatch = Stopwatch()
+        self.warnings = _warn(resident.volume, camera)
+
+    def run(self, background: str | Sequence[float] | None) -> Rendering:
+        """Take the picture, with fewer slices at a time where the device has no room for what was planned."""
+        resident, count = self.resident, len(self.chosen)
+        picture, states = PictureBuffers.needs(self.view.size)
+
+        def needs(slices: int) -> dict[str, int]:
+            own = {"slices": slices * resident.slice_bytes, **picture}
+            return own if slices == count else {**own, **states}
+
+        slices = count if resident.is_held else resident.plan(SLICES, count, needs)
+        if slices == 0:
+            check_budget(resident.device, needs(1), resident.memory)
+        return resident.halve(
+            SLICES, max(slices, 1), lambda slices: self._take(slices, background), warnings=self.warnings
+        )
+
+    def _take(self, slices: int, background: str | Sequence[float] | None) -> Rendering:
+        stopwatch, device = self.stopwatch, self.resident.device
+        parts = [self.order[first : first + slices] for first in range(0, len(self.order), slices)]
+        output = PictureBuffers(device, self.view.size, background, len(parts) > 1)
+        for number, part in enumerate(parts):
+            self._draw(part, (number == 0) + 2 * (number == len(parts) - 1), output)
+        with stopwatch.timed("download"):
+            image, depths, means = output.download()
+        report = {
+            "mode": "slices",
+            "device": device.label,
+            "driver": device.driver,
+            "slices": self.chosen,
+            "slice_opacity": self.look.opacity,
+            "lowest_shown_hu": self.look.lowest,
+            "seconds": dict(stopwatch.seconds),
+            "kernel_seconds": dict(stopwatch.by_kernel),
+            "warnings": self.warnings,
+        }
+        return Rendering(image, depths, means, self.view.camera, None, "slices", report)
+
+    def _draw(self, part: Sequence[int], stage: int, output: PictureBuffers) -> None:
+        """Draw slices in the order given, and wait."""
+        resident, look, view, stopwatch = self.resident, self.look, self.view, self.stopwatch
+        device, volume = resident.device, resident.volume
+        places = np.zeros((len(part), 4), np.float32)
+        places[:, :3] = FieldFrame.of(volume).places(volume.slice_origins()[list(part)])
+        if resident.is_held:
+            slices_d, places[:, 3] = resident.whole(stopwatch), part
+        else:
+            slices_d, places[:, 3] = resident.upload(volume.voxels[list(part)], stopwatch), range(len(part))
+        ni, nj, _ = volume.shape_ijk
+        width, height = view.size
+        queues = count_queues(device)
+        program = load_program(device, "render/slices.cl", voxel_variants(volume.voxels.dtype))
+        with stopwatch.running(device):  # to its end: CPU devices read the array of the host
+            launch(
+                device, program["overlay_slices"], output.items(queues, 1),
+                slices_d, upload(device, places), upload(device, look.colors), upload(device, view.table),
+                output.states_d, output.image_d, output.depths_d, output.means_d, output.background,
+                np.int32(ni), np.int32(nj), np.int32(len(part)), np.float32(look.low), np.float32(look.scale),
+                np.float32(look.opacity), np.float32(look.lowest), np.uint32(width), np.uint32(height),
+                np.uint32(view.planes), np.int32(not view.camera.is_parallel), np.int32(stage), np.uint32(queues),
+                stopwatch=stopwatch,
+            )  # fmt: skip

@@ -12,13 +12,14 @@ from numpy.typing import NDArray
 from clrecon.errors import DeviceError, UsageError
 from clrecon.geometry import Volume
 from clrecon.geometry.affine import Float64Array
-from clrecon.geometry.iso_rule import IsoRule, ValueRange, choose_iso_rule
-from clrecon.labels import resample_labels
+from clrecon.geometry.iso_rule import IsoRule, choose_iso_rule
 from clrecon.opencl import Stopwatch, launch, memory_limits, upload
 from clrecon.operators.rays.buffers import PictureBuffers, count_queues, highlight_table
+from clrecon.operators.rays.leaps import find_leaps
 from clrecon.operators.rays.ray_view import RayView
+from clrecon.operators.rays.slabs import RAYS, LeapMap, RaySlab, entry_slice, plan_ray_slabs, ray_slabs, slab_labels
+from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.operators.resident.frame import FieldFrame, enclose
-from clrecon.operators.resident.volume import LeapMap, RaySlab, ResidentVolume, entry_slice, pad_slices
 from clrecon.operators.resident.voxel_types import label_variants
 from clrecon.rendering import Lighting, Rendering
 from clrecon.rendering.looks.colors import find_color
@@ -36,7 +37,7 @@ CLOSED_BORDER = 1.0
 
 
 def cast_surface(
-    resident: ResidentVolume,
+    resident: DeviceVolume,
     iso_value: float,
     camera: Camera,
     size: tuple[int, int],
@@ -49,7 +50,6 @@ def cast_surface(
     shadows: bool = False,
     depth_cue: float = 0.0,
     style: LabelStyle | None = None,
-    values: ValueRange | None = None,
 ) -> Rendering:
     """Show where the field first reaches an iso value along each ray.
 
@@ -60,7 +60,7 @@ def cast_surface(
 
     Parameters
     ----------
-    resident : ResidentVolume
+    resident : DeviceVolume
     iso_value : float
         HU; inside is ``>= iso_value``.
     camera : Camera
@@ -81,8 +81,6 @@ def cast_surface(
     style : LabelStyle, optional
         A hit in a label with opacity below 1 is blended and the ray goes on: out of the inside and to the next entry,
         or into the next label.  The label of a hit is that of the nearest inside voxel of its cell that has one.
-    values : ValueRange, optional
-        Of the volume, where several iso values are shown.
 
     Returns
     -------
@@ -101,7 +99,7 @@ def cast_surface(
         Not enough memory: for shadows the volume has to fit the device as a whole.
     """
     look = _Look.of(Lighting() if lighting is None else lighting, color, shadows, depth_cue)
-    rule = choose_iso_rule(resident.volume, iso_value, values=values)
+    rule = choose_iso_rule(resident.volume, iso_value, values=resident.values)
     job = _Job(resident, rule, look, camera, size, float(ray_step), clip, style)
     return job.run(background)
 
@@ -134,7 +132,7 @@ class _Job:
 
     def __init__(
         self,
-        resident: ResidentVolume,
+        resident: DeviceVolume,
         rule: IsoRule,
         look: _Look,
         camera: Camera,
@@ -147,25 +145,28 @@ class _Job:
         self.camera, self.size, self.ray_step = camera, size, ray_step
         self.planes = np.empty((0, 4)) if clip is None else clip.planes
         self.style = style
-        self.labels = None if style is None else resample_labels(style.labels, resident.volume)
+        self.labels = None if style is None else resident.bring(style.labels)
+        self.warnings = [] if self.labels is None else list(self.labels.warnings)
         self.stopwatch = Stopwatch()
         self.frame = FieldFrame.of(resident.volume)
 
     def run(self, background: str | Sequence[float] | None) -> Rendering:
+        """Take the picture, in thinner slabs where the device has no room for what was planned."""
+        slices = plan_ray_slabs(self.resident, *PictureBuffers.needs(self.size), self.labels)
+        return self.resident.halve(RAYS, slices, lambda slices: self._take(slices, background), warnings=self.warnings)
+
+    def _take(self, slices: int, background: str | Sequence[float] | None) -> Rendering:
         resident, device, nk = self.resident, self.resident.device, self.resident.volume.shape_ijk[2]
-        beside = 0 if self.labels is None else self.labels.voxels.itemsize
-        slices = resident.plan(*PictureBuffers.needs(self.size), beside=beside)
-        warnings = [] if self.labels is None else list(self.labels.warnings)
         if slices < nk:
             if self.look.shadows:
                 raise DeviceError(
                     f"shadows need the whole volume on the device, {slices} of its {nk} slices fit:"
                     f" {memory_limits(device, resident.memory).describe()}; give more memory or leave the shadows out"
                 )
-            self._shorten_steps(warnings)
+            self._shorten_steps(self.warnings)
         output = PictureBuffers(device, self.size, background, slices < nk)
         slabs = 0
-        for slab in resident.slabs(slices, entry_slice(resident.volume, self.camera), self.stopwatch):
+        for slab in ray_slabs(resident, slices, entry_slice(resident.volume, self.camera), self.stopwatch):
             slabs += 1
             self._trace(slab, output)
         with self.stopwatch.timed("download"):
@@ -179,7 +180,7 @@ class _Job:
             "slabs": slabs,
             "seconds": dict(self.stopwatch.seconds),
             "kernel_seconds": dict(self.stopwatch.by_kernel),
-            "warnings": warnings,
+            "warnings": list(self.warnings),
         }
         return Rendering(image, depths, means, self.camera, None, "surface", report)
 
@@ -224,8 +225,9 @@ class _Job:
         tables = [upload(device, normals)]
         if self.labels is not None and self.style is not None:
             variants = {"LABELS": "1", **label_variants(self.labels.voxels.dtype)}
-            held = pad_slices(self.labels.voxels[slab.first_k : slab.end_k])
-            tables += [upload(device, held), upload(device, self.style.table)]
+            tables += [
+                slab_labels(self.resident, slab, self.labels, self.stopwatch), upload(device, self.style.table),
+            ]  # fmt: skip
         return variants, tables
 
     def _view(self, leaps: LeapMap) -> RayView:
@@ -269,15 +271,15 @@ def _float4(*numbers: float) -> NDArray[np.float32]:
     return vector
 
 
-def _find_leaps(resident: ResidentVolume, slab: RaySlab, level: float, stopwatch: Stopwatch) -> LeapMap:
+def _find_leaps(resident: DeviceVolume, slab: RaySlab, level: float, stopwatch: Stopwatch) -> LeapMap:
     """Which bricks reach the level.
 
     Of the two nodes that a value can be nearest to, the second shows: from half a `unit` above `low` on, which is the
     level.  Marking takes a hundredth of it off, far more than float32 may be wrong by.
     """
     unit = max(1e-3 * abs(level), 1e-6)
-    return resident.find_leaps(
-        slab, ("surface", level), np.array([False, True]), level - 0.5 * unit, 1.0 / unit, stopwatch
+    return find_leaps(
+        resident, slab, ("surface", level), np.array([False, True]), level - 0.5 * unit, 1.0 / unit, stopwatch
     )
 
 

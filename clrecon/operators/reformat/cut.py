@@ -12,8 +12,9 @@ from clrecon.anatomy.spine_line import find_spine_line
 from clrecon.errors import UsageError
 from clrecon.geometry import Volume
 from clrecon.geometry.affine import Float64Array
-from clrecon.opencl import Device, Stopwatch, check_memory, choose_device
+from clrecon.opencl import Device, Stopwatch
 from clrecon.operators.reformat.sample import Reformation, sample_sheet
+from clrecon.operators.resident.device_volume import DeviceVolume, open_volume
 from clrecon.rendering import Rendering
 from clrecon.rendering.looks.colors import is_transparent
 from clrecon.rendering.looks.window import BONE_WINDOW, checked_window, grey_image
@@ -42,27 +43,23 @@ class _Job:
 
     def __init__(
         self,
-        volume: Volume,
-        device: Device | str | int | None,
+        resident: DeviceVolume,
         thickness: float,
         combine: str,
         window: Sequence[float] | None,
-        memory: int | None,
+        progress: Progress | None,
     ):
-        if not isinstance(volume, Volume):
-            raise UsageError(f"a slice needs a Volume, not {type(volume).__name__}: clrecon.Volume(voxels, affine)")
-        check_memory(memory)
-        self.volume, self.memory, self.combine = volume, memory, combine
-        self.samples = slab_samples(volume, thickness)
+        self.resident, self.combine, self.progress = resident, combine, progress
+        self.samples = slab_samples(resident.volume, thickness)
         self.thickness = float(thickness)
         self.window = checked_window(BONE_WINDOW if window is None else window)
-        self.device = choose_device(device)
         self.stopwatch = Stopwatch()
+        self.warnings: list[str] = []
 
-    def sample(self, sheet: Sheet, voxels_d: Any, progress: Progress | None) -> Reformation:
+    def sample(self, sheet: Sheet) -> Reformation:
         return sample_sheet(
-            self.device, self.volume, sheet, self.samples, self.combine,
-            memory=self.memory, voxels_d=voxels_d, stopwatch=self.stopwatch, progress=progress,
+            self.resident, sheet, self.samples, self.combine,
+            stopwatch=self.stopwatch, progress=self.progress, warnings=self.warnings,
         )  # fmt: skip
 
     def picture(
@@ -87,18 +84,18 @@ class _Job:
             "samples_a_pixel": self.samples.intervals + 1,
             "sample_step_mm": self.samples.step if self.samples.intervals else None,
             "window_hu": list(self.window),
-            "device": self.device.label,
-            "driver": self.device.driver,
+            "device": self.resident.device.label,
+            "driver": self.resident.device.driver,
             "slabs": made.slabs,
             "device_bytes": made.device_bytes,
             "seconds": dict(self.stopwatch.seconds),
             "kernel_seconds": dict(self.stopwatch.by_kernel),
-            "warnings": [],
+            "warnings": self.warnings,
         }
 
 
 def cut_slice(
-    volume: Volume,
+    volume: Volume | DeviceVolume,
     plane: Camera | str | Sequence[float] = "axial",
     size: Sequence[int] = DEFAULT_SIZE,
     device: Device | str | int | None = None,
@@ -113,7 +110,6 @@ def cut_slice(
     background: str | Sequence[float] = "black",
     memory: int | None = None,
     progress: Progress | None = None,
-    voxels_d: Any = None,
 ) -> Rendering:
     """Cut a slice through a volume, in any direction and as thick as wanted (oblique multiplanar reformation).
 
@@ -122,7 +118,8 @@ def cut_slice(
 
     Parameters
     ----------
-    volume : Volume
+    volume : Volume or DeviceVolume
+        A `DeviceVolume` is used as it is, and has its device and memory.
     plane : Camera, str or (float, float)
         A camera: the plane through its focal point across its view.  A name: axial, coronal, sagittal through the
         middle of the volume, as radiologists look at them, or a view as in `Camera.fit`.
@@ -147,8 +144,6 @@ def cut_slice(
         Bytes that may be taken on the device; a volume that needs more goes through in slabs.
     progress : callable, optional
         Called as ``progress("slabs", slices done, all slices)``.
-    voxels_d : buffer, (nk, nj, ni), optional
-        The volume, where it is on the device already.
 
     Returns
     -------
@@ -163,17 +158,17 @@ def cut_slice(
     DeviceError
         No device, two slices and the picture do not fit it, or it fails.
     """
-    job = _Job(volume, device, thickness, combine, window, memory)
     pixels = checked_size(size)
-    if isinstance(plane, Camera):
-        if pixel_mm is not None or zoom != 1.0 or up is not None:
+    with open_volume(volume, device, memory, "a slice") as resident:
+        job = _Job(resident, thickness, combine, window, progress)
+        if not isinstance(plane, Camera):
+            plane = find_plane(resident.volume, plane, pixels, zoom=zoom, up=up, pixel_mm=pixel_mm)
+        elif pixel_mm is not None or zoom != 1.0 or up is not None:
             raise UsageError("zoom, up and the size of pixels are those of the camera: leave them out, or the camera")
-    else:
-        plane = find_plane(volume, plane, pixels, zoom=zoom, up=up, pixel_mm=pixel_mm)
-    sheet, camera = plane_sheet(plane, pixels, offset_mm)
-    made = job.sample(sheet, voxels_d, progress)
-    if np.isnan(made.values).all():
-        raise UsageError(_describe_miss(volume, camera))
+        sheet, camera = plane_sheet(plane, pixels, offset_mm)
+        made = job.sample(sheet)
+        if np.isnan(made.values).all():
+            raise UsageError(_describe_miss(resident.volume, camera))
     depth = np.where(np.isnan(made.values), np.float32(np.nan), np.float32(camera.distance))
     report = job.describe(made, camera.pixel_mm(pixels)) | _describe_plane(camera)
     return job.picture(made, depth, camera, "slice", report, background)
@@ -204,7 +199,7 @@ def _describe_miss(volume: Volume, camera: Camera) -> str:
 
 
 def reformat_curve(
-    volume: Volume,
+    volume: Volume | DeviceVolume,
     curve: Curve | ArrayLike | str = "spine",
     kind: str = "straightened",
     size: Sequence[int] | None = None,
@@ -221,13 +216,12 @@ def reformat_curve(
     background: str | Sequence[float] = "black",
     memory: int | None = None,
     progress: Progress | None = None,
-    voxels_d: Any = None,
 ) -> Rendering:
     """Curved planar reformation: a picture along a centre line, from its upper end to its lower.
 
     Parameters
     ----------
-    volume : Volume
+    volume : Volume or DeviceVolume
     curve : Curve, array_like of shape (n, 3), or "spine"
         Points of the centre line in LPS mm, all within the volume; a smooth curve is laid through them.  "spine" looks
         for the spinal canal, see `clrecon.anatomy.spine_line`.
@@ -248,7 +242,7 @@ def reformat_curve(
         Side of a pixel; default: the curve fills the height of `size`, else the smallest distance of voxels.
     width_mm : float, optional
         Width of the picture where no `size` is given; default 120 mm.
-    thickness, combine, window, background, memory, progress, voxels_d
+    thickness, combine, window, background, memory, progress
         As in `cut_slice`; the slab lies across the picture.
 
     Returns
@@ -267,16 +261,17 @@ def reformat_curve(
     DeviceError
         No device, two slices and the picture do not fit it, or it fails.
     """
-    job = _Job(volume, device, thickness, combine, window, memory)
     _check_kind(kind, angle)
-    line, found = _find_line(volume, curve)
-    across, top = _find_directions(view, up)
-    turned = bool((line.points[-1] - line.points[0]) @ top > 0.0)
-    line = line.reversed() if turned else line
-    length = line.length if kind == "straightened" else stretched_length(line, across)
-    fitted, pixel = _fit_picture(volume, length, size, pixel_mm, width_mm)
-    curved = _lay_sheet(kind, line, across, fitted, pixel, float(angle))
-    made = job.sample(curved.sheet, voxels_d, progress)
+    with open_volume(volume, device, memory, "a slice") as resident:
+        job = _Job(resident, thickness, combine, window, progress)
+        line, found = _find_line(resident.volume, curve)
+        across, top = _find_directions(view, up)
+        turned = bool((line.points[-1] - line.points[0]) @ top > 0.0)
+        line = line.reversed() if turned else line
+        length = line.length if kind == "straightened" else stretched_length(line, across)
+        fitted, pixel = _fit_picture(resident.volume, length, size, pixel_mm, width_mm)
+        curved = _lay_sheet(kind, line, across, fitted, pixel, float(angle))
+        made = job.sample(curved.sheet)
     made.values[np.isnan(curved.arc)] = np.nan
     said = _describe_curve(line, curved, kind, across, turned) | {"angle_deg": float(angle), "found": found}
     report = job.describe(made, pixel) | {"curve": said}

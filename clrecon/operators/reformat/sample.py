@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from clrecon.errors import DeviceError, DeviceMemoryError, UsageError
+from clrecon.errors import DeviceError, UsageError
 from clrecon.geometry import Volume, slice_normal
 from clrecon.geometry.affine import Float64Array
 from clrecon.opencl import (
@@ -20,9 +20,9 @@ from clrecon.opencl import (
     download,
     launch,
     load_program,
-    memory_limits,
     upload,
 )
+from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.operators.resident.voxel_types import voxel_variants
 from clrecon.rendering.views.plane import Sheet, SlabSamples
 from clrecon.system.progress import Progress
@@ -34,6 +34,9 @@ COMBINATIONS = ("mean", "max", "min")
 
 SAMPLES_A_LAUNCH = 1 << 23
 """Keeps launches short: systems stop those that hold a display's GPU for seconds."""
+
+SHEETS = "slices"
+"""What slabs are planned for."""
 
 FARTHEST = 2.0**30
 """Index steps, or mm, from the volume that fixed point can hold."""
@@ -119,49 +122,48 @@ def _place_rows(volume: Volume, sheet: Sheet, samples: SlabSamples) -> _Places:
 class _Run:
     """One reformation: all rows through one part of the volume after the other."""
 
-    def __init__(
-        self, device: Device, volume: Volume, sheet: Sheet, samples: SlabSamples, combine: int, stopwatch: Stopwatch
-    ):
-        self.device, self.volume, self.sheet, self.samples = device, volume, sheet, samples
+    def __init__(self, resident: DeviceVolume, sheet: Sheet, samples: SlabSamples, combine: int, stopwatch: Stopwatch):
+        self.resident, self.sheet, self.samples = resident, sheet, samples
+        self.device, self.volume = resident.device, resident.volume
         self.combine, self.stopwatch = combine, stopwatch
-        self.places = _place_rows(volume, sheet, samples)
-        with stopwatch.timed("build"):
-            self.program = prepare_reformat(device, volume.voxels.dtype, volume.uneven)
+        self.places = _place_rows(self.volume, sheet, samples)
+        self.slices = self.places.end - self.places.first
+        self.takes_whole = False
 
     def needs(self, slices: int) -> dict[str, int]:
         """Bytes of every buffer, with so many slices of the volume on the device."""
-        ni, nj, _ = self.volume.shape_ijk
         pixels = self.sheet.width * self.sheet.height
         return {
-            "volume": slices * ni * nj * int(self.volume.voxels.dtype.itemsize),
+            "volume": slices * self.resident.slice_bytes,
             "rows": self.places.rows.nbytes + self.places.slices.nbytes,
             "values": 4 * pixels,
             "weights": 4 * pixels,
         }
 
-    def plan(self, memory: int | None) -> int:
-        """Slices that go to the device at a time.
+    def plan(self) -> int:
+        """Slices that go to the device at a time; all of the volume where that pays.
 
         Raises
         ------
         DeviceError
             Not even two slices fit.
         """
-        limits = memory_limits(self.device, memory)
-        wanted = self.places.end - self.places.first
-        if not describe_shortage(limits, self.needs(wanted)):
-            return wanted
-        fewest = self.needs(min(2, wanted))
-        shortage = describe_shortage(limits, fewest)
-        if shortage:
+        resident, nk = self.resident, self.volume.shape_ijk[2]
+        self.takes_whole = resident.pays_whole(self.slices) and resident.plan(SHEETS, nk, self.needs) == nk
+        if self.takes_whole:
+            return nk
+        slices = resident.plan(SHEETS, self.slices, self.needs)
+        if slices < min(2, self.slices):
+            shortage = describe_shortage(resident.limits, self.needs(min(2, self.slices)))
             raise DeviceError(f"two slices at a time are too much: {shortage}; give more memory or a smaller picture")
-        one = self.needs(1)["volume"]
-        others = sum(fewest.values()) - fewest["volume"]
-        return int(min(limits.buffer_bytes, limits.total_bytes - others) // one)
+        return slices
 
-    def all_slabs(self, slices: int, resident_d: Any, progress: Progress | None) -> Reformation:
+    def all_slabs(self, slices: int, progress: Progress | None) -> Reformation:
         """Take the samples of `slices` slices at a time; each slab but the last repeats its upper one."""
         places, shape = self.places, (self.sheet.height, self.sheet.width)
+        takes_whole = self.takes_whole and slices == self.volume.shape_ijk[2]
+        with self.stopwatch.timed("build"):
+            program = prepare_reformat(self.device, self.resident.dtype, self.volume.uneven)
         rows_d, slices_d = upload(self.device, places.rows), upload(self.device, places.slices)
         values_d, weights_d = (
             allocate(self.device, 4 * shape[0] * shape[1]),
@@ -169,22 +171,21 @@ class _Run:
         )
         count, own_first = 0, places.first
         while count == 0 or own_first < places.end:
-            held_end = places.end if resident_d is not None else min(own_first + slices, places.end)
+            held_end = places.end if takes_whole else min(own_first + slices, places.end)
             own_end = held_end if held_end == places.end else held_end - 1
-            with self.stopwatch.timed("upload"):
-                part = self.volume.voxels[own_first:held_end]
-                voxels_d = upload(self.device, part) if resident_d is None else resident_d
-            first_k = own_first if resident_d is None else 0
+            if takes_whole:
+                voxels_d, first_k = self.resident.whole(self.stopwatch), 0
+            else:
+                voxels_d, first_k = self.resident.part(own_first, held_end, self.stopwatch), own_first
             with self.stopwatch.running(self.device):
                 self._launch_rows(
-                    (voxels_d, rows_d, slices_d, values_d, weights_d),
+                    program, (voxels_d, rows_d, slices_d, values_d, weights_d),
                     [np.int32(n) for n in (first_k, own_first, own_end)], np.int32(count == 0),
                 )  # fmt: skip
-            if resident_d is None:
-                self.volume.release_slices(own_first, held_end)
+            self.volume.release_slices(own_first, held_end)
             count, own_first = count + 1, own_end
             if progress is not None:
-                progress("slabs", own_end - places.first, places.end - places.first)
+                progress("slabs", own_end - places.first, self.slices)
         with self.stopwatch.timed("download"):
             values = download(self.device, np.empty(shape, np.float32), values_d)
             weights = download(self.device, np.empty(shape, np.float32), weights_d)
@@ -192,53 +193,49 @@ class _Run:
         if COMBINATIONS[self.combine] == "mean":
             values = values / np.where(empty, np.float32(1.0), weights)
         values[empty] = np.nan
-        held = 0 if resident_d is not None else min(slices, places.end - places.first)
-        return Reformation(values, places.end - places.first, count, sum(self.needs(held).values()))
+        held = slices if takes_whole else min(slices, self.slices)
+        return Reformation(values, self.slices, count, sum(self.needs(held).values()))
 
-    def _launch_rows(self, buffers: tuple[Any, ...], part: list[Any], fresh: Any) -> None:
+    def _launch_rows(self, program: Program, buffers: tuple[Any, ...], part: list[Any], fresh: Any) -> None:
         height, width = self.sheet.height, self.sheet.width
         rows = max(1, SAMPLES_A_LAUNCH // (width * (self.samples.intervals + 1)))
         for first in range(0, height, rows):
             count = min(rows, height - first)
             launch(
-                self.device, self.program["reformat_rows"], count * width, *buffers,
+                self.device, program["reformat_rows"], count * width, *buffers,
                 *(np.uint32(n) for n in (first, count, width)), *(np.int32(n) for n in self.volume.shape_ijk), *part,
                 np.int32(self.samples.intervals), np.int32(self.combine), fresh, stopwatch=self.stopwatch,
             )  # fmt: skip
 
 
 def sample_sheet(
-    device: Device,
-    volume: Volume,
+    resident: DeviceVolume,
     sheet: Sheet,
     samples: SlabSamples,
     combine: str = "mean",
     *,
-    memory: int | None = None,
-    voxels_d: Any = None,
     stopwatch: Stopwatch | None = None,
     progress: Progress | None = None,
+    warnings: list[str] | None = None,
 ) -> Reformation:
     """Values of all pixels of a sheet: the trilinear field, combined through a slab.
 
-    Only slices that the sheet meets go to the device; where they do not fit, some at a time.  Single samples, `max`
-    and `min` are then the same bit for bit, means to the rounding of their sums.
+    A volume that is on the device already is read there.  Else only the slices that the sheet meets are uploaded;
+    where they do not fit, some at a time.  Single samples, `max` and `min` are then the same bit for bit, means to the
+    rounding of their sums.
 
     Parameters
     ----------
-    device : Device
-    volume : Volume
+    resident : DeviceVolume
     sheet : Sheet
     samples : SlabSamples
     combine : {"mean", "max", "min"}
         Of the samples of a pixel that lie within the volume.
-    memory : int, optional
-        Bytes that may be taken on the device; None is all of its memory.
-    voxels_d : buffer, (nk, nj, ni), optional
-        The whole volume, where it is on the device already; it does not count as `memory`.
     stopwatch : Stopwatch, optional
     progress : callable, optional
         Called as ``progress("slabs", slices done, all slices)``.
+    warnings : list of str, optional
+        Gets a line for each time that the device had no room for what was planned.
 
     Raises
     ------
@@ -249,12 +246,9 @@ def sample_sheet(
     """
     if not isinstance(combine, str) or combine not in COMBINATIONS:
         raise UsageError(f"the samples of a slab are combined by one of {', '.join(COMBINATIONS)}, not {combine!r}")
-    run = _Run(device, volume, sheet, samples, COMBINATIONS.index(combine), stopwatch or Stopwatch())
-    slices = run.plan(memory) if voxels_d is None else volume.shape_ijk[2]
-    while True:
-        try:
-            return run.all_slabs(slices, voxels_d, progress)
-        except DeviceMemoryError:
-            if slices <= 2 or voxels_d is not None:
-                raise
-            slices = max(2, slices // 2)
+    run = _Run(resident, sheet, samples, COMBINATIONS.index(combine), stopwatch or Stopwatch())
+    slices = run.plan()
+    fewest = min(2, slices)
+    return resident.halve(
+        SHEETS, slices, lambda slices: run.all_slabs(slices, progress), fewest=fewest, warnings=warnings
+    )

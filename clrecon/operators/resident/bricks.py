@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,7 +18,7 @@ from clrecon.opencl import (
 )
 from clrecon.operators.resident.voxel_types import voxel_variants
 
-__all__ = ["BRICK", "BrickRanges", "BrickStates", "compare_bricks", "measure_bricks", "prepare_bricks"]
+__all__ = ["BRICK", "BrickRanges", "BrickStates", "brick_bytes", "compare_bricks", "measure_bricks", "prepare_bricks"]
 
 BRICK = 8
 """Voxels along each side of a brick, as in cl/bricks/bricks.h."""
@@ -38,12 +39,6 @@ class BrickRanges:
     shape: tuple[int, int, int]
     dtype: np.dtype[Any]
 
-    @property
-    def nbytes(self) -> int:
-        """Bytes on the device."""
-        bi, bj, bk = self.shape
-        return 2 * bi * bj * bk * int(self.dtype.itemsize)
-
 
 @dataclass(frozen=True)
 class BrickStates:
@@ -57,6 +52,11 @@ class BrickStates:
 
     states_d: Any
     extents_d: Any
+
+
+def brick_bytes(shape_ijk: tuple[int, int, int], dtype: np.dtype[Any]) -> int:
+    """Bytes on the device of the ranges of a volume's bricks."""
+    return 2 * math.prod(-(-n // BRICK) for n in shape_ijk) * int(dtype.itemsize)
 
 
 def prepare_bricks(device: Device, dtype: np.dtype[Any]) -> Program:
@@ -93,7 +93,7 @@ def measure_bricks(
         The device fails.
     """
     bi, bj, bk = (-(-n // BRICK) for n in shape_ijk)
-    ranges_d = allocate(device, 2 * bi * bj * bk * dtype.itemsize)
+    ranges_d = allocate(device, brick_bytes(shape_ijk, dtype))
     launch(
         device, prepare_bricks(device, dtype)["measure_bricks"], bi * bj * bk,
         voxels_d, ranges_d, *(np.int32(n) for n in shape_ijk), *(np.uint32(n) for n in (bi, bj, bk)),

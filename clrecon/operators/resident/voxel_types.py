@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import DTypeLike
 
-__all__ = ["label_variants", "voxel_variants"]
+from clrecon.opencl import Device
+
+__all__ = ["label_variants", "ray_variants", "voxel_variants"]
 
 _NAMES = {
     "int8": "char", "uint8": "uchar", "int16": "short", "uint16": "ushort", "int32": "int", "float32": "float",
@@ -21,3 +25,9 @@ def voxel_variants(dtype: DTypeLike) -> dict[str, str]:
 def label_variants(dtype: DTypeLike) -> dict[str, str]:
     """``-D`` definition of LABEL, see cl/labels/label_type.h."""
     return {"LABEL": _NAMES[np.dtype(dtype).name]}
+
+
+def ray_variants(device: Device, dtype: np.dtype[Any]) -> dict[str, str]:
+    """``-D`` definitions for kernels that sample volumes of `dtype` along rays."""
+    lanes = {"LANES": device.kernel_variants["LANES"]}
+    return {**voxel_variants(dtype), **lanes, "VOXEL_IS_SHORT": str(int(dtype == np.int16))}

@@ -4,109 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from types import TracebackType
-from typing import Any
 
-import numpy as np
-from numpy.typing import DTypeLike, NDArray
-
-from clrecon.errors import ClreconError, DeviceError, DeviceMemoryError, NoSurfaceError, UsageError
+from clrecon.errors import NoSurfaceError, UsageError
 from clrecon.geometry import Volume
-from clrecon.geometry.iso_rule import IsoRule, Level, ValueRange, check_topology, choose_iso_rule, data_range
-from clrecon.geometry.precision import describe_far
+from clrecon.geometry.iso_rule import IsoRule, Level, check_topology, choose_iso_rule
 from clrecon.mesh import Mesh
-from clrecon.opencl import (
-    Device,
-    Program,
-    Stopwatch,
-    check_memory,
-    choose_device,
-    describe_shortage,
-    memory_limits,
-    result_pages,
-    upload,
-)
-from clrecon.opencl.quirks import cache_warnings
-from clrecon.operators.resident.bricks import BrickRanges, BrickStates, compare_bricks, measure_bricks
-from clrecon.operators.resident.slabs import SampleGrid, Slab, plan_slabs
+from clrecon.opencl import Device
+from clrecon.operators.resident.device_volume import DeviceVolume, take_volume
 from clrecon.operators.surface import marching_cubes
-from clrecon.operators.surface.marching_cubes import Counted, Placement
-from clrecon.operators.surface.trilinear import check_row, prepare_trilinear
+from clrecon.operators.surface.extraction import Extraction, prepare_isosurface
+from clrecon.operators.surface.marching_cubes import Placement
+from clrecon.operators.surface.slabs import SampleGrid, Slab, plan_slabs
+from clrecon.operators.surface.trilinear import check_row
 from clrecon.system.progress import Progress
 
-__all__ = [
-    "Part",
-    "SurfaceExtractor",
-    "extract_isosurface",
-    "extract_isosurfaces",
-    "prepare_isosurface",
-    "voxel_level",
-]
-
-
-Part = tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.uint32]]
-"""Positions, normals and triangles of one slab."""
-
-
-def _refuse_level(device: Device, volume: Volume, rule: IsoRule) -> ClreconError:
-    low, high = data_range(volume)
-    runs = f"the volume runs from {low:g} to {high:g} HU"
-    if rule.inside == "between":
-        marked = sum(int(np.count_nonzero(rule.mark_inside(voxels))) for voxels in volume.voxels)
-        if 0 < marked < volume.voxels.size or (marked and rule.closed):
-            return _refuse_device(device, rule, runs)
-        how_many = "every" if marked else "no"
-        return NoSurfaceError(f"no surface of {rule.describe()}: {how_many} voxel lies within, {runs}")
-    if low < rule.lowest_inside <= high:
-        return _refuse_device(device, rule, runs)
-    where = "above" if rule.lowest_inside > high else "at or below the lowest of"
-    return NoSurfaceError(f"no surface {rule.describe_place()}: {runs}, the iso value lies {where} that range")
-
-
-def _refuse_device(device: Device, rule: IsoRule, runs: str) -> DeviceError:
-    return DeviceError(
-        f"{device.label} found no surface {rule.describe_place()} although {runs}: it computes wrongly,"
-        " see `clrecon selftest` and try another device"
-    )
-
-
-def voxel_level(device: Device, volume: Volume, rule: IsoRule) -> Any:
-    """The lowest inside value as a scalar of the voxels' own type."""
-    dtype = volume.voxels.dtype
-    if dtype.kind == "f":
-        return np.float32(rule.lowest_inside)
-    limits = np.iinfo(dtype)
-    if rule.lowest_inside > limits.max:
-        raise _refuse_level(device, volume, rule)
-    return dtype.type(max(rule.lowest_inside, limits.min))
-
-
-def _voxel_levels(device: Device, volume: Volume, rule: IsoRule) -> tuple[Any, ...]:
-    """The same and, of a range, the highest inside value."""
-    level, highest, dtype = voxel_level(device, volume, rule), rule.highest_inside, volume.voxels.dtype
-    if highest is None:
-        return (level,)
-    if dtype.kind == "f":
-        return level, np.float32(highest)
-    limits = np.iinfo(dtype)
-    if highest < max(rule.lowest_inside, limits.min):
-        raise _refuse_level(device, volume, rule)
-    return level, dtype.type(min(highest, limits.max))
-
-
-def _join(parts: list[Part]) -> Part:
-    """The parts of all slabs behind each other; each is freed as soon as it is copied."""
-    if len(parts) == 1:
-        return parts[0]
-    joined: list[NDArray[Any]] = []
-    for which in range(3):
-        rows = sum(len(part[which]) for part in parts)
-        joined.append(result_pages.empty((rows, 3), parts[0][which].dtype))
-    filled = [0, 0, 0]
-    while parts:
-        for which, array in enumerate(parts.pop(0)):
-            joined[which][filled[which] : filled[which] + len(array)] = array
-            filled[which] += len(array)
-    return joined[0], joined[1], joined[2]
+__all__ = ["SurfaceExtractor", "extract_isosurface", "extract_isosurfaces", "prepare_isosurface"]
 
 
 class SurfaceExtractor:
@@ -117,10 +29,10 @@ class SurfaceExtractor:
 
     Parameters
     ----------
-    volume : Volume
-        Its voxels must not change as long as the extractor is open.
+    volume : Volume or DeviceVolume
+        The voxels must not change as long as the extractor is open.  A `DeviceVolume` is used as it is.
     device : Device, str or int, optional
-        See `clrecon.device`; None is the best of the machine.
+        See `clrecon.device`; None is the best of the machine.  A `DeviceVolume` has its own.
     memory : int, optional
         Bytes that may be taken on the device for the volume, what is computed from it, and the mesh; None is all that
         the device has.  The finished mesh lies in the computer's memory and does not count.
@@ -133,19 +45,12 @@ class SurfaceExtractor:
         There is no such device.
     """
 
-    def __init__(self, volume: Volume, device: Device | str | int | None = None, *, memory: int | None = None):
-        if not isinstance(volume, Volume):
-            raise UsageError(f"a surface needs a Volume, not {type(volume).__name__}: clrecon.Volume(voxels, affine)")
-        check_memory(memory)
-        marching_cubes.check_row(volume.shape_ijk[0])
-        self.volume = volume
-        self.device = choose_device(device)
-        self.memory = memory
-        self._values = ValueRange(volume)
-        self._resident_d: Any = None
-        self._bricks: BrickRanges | None = None
-        self._extractions = 0
-        self._slices: dict[tuple[int, str], int] = {}
+    def __init__(
+        self, volume: Volume | DeviceVolume, device: Device | str | int | None = None, *, memory: int | None = None
+    ):
+        self._resident, self._is_own = take_volume(volume, device, memory, "a surface")
+        self.volume, self.device = self._resident.volume, self._resident.device
+        marching_cubes.check_row(self.volume.shape_ijk[0])
         self._placements: dict[int, Placement] = {}
 
     def __enter__(self) -> SurfaceExtractor:
@@ -157,8 +62,9 @@ class SurfaceExtractor:
         self.close()
 
     def close(self) -> None:
-        """Free the volume on the device."""
-        self._resident_d = self._bricks = None
+        """Free the volume on the device; a `DeviceVolume` that was given stays as it is."""
+        if self._is_own:
+            self._resident.close()
 
     def forecast(self, *, closed: bool = True, topology: str = "separated") -> dict[str, int]:
         """What an extraction will take, before anything is computed.
@@ -176,7 +82,7 @@ class SurfaceExtractor:
         """
         check_topology(topology)
         grid = SampleGrid(self.volume, IsoRule(0.0, 0, 0.0, 0.0, closed, topology=topology))
-        slices = self._plan(grid)
+        slices = plan_slabs(grid, self._resident)
         slab = Slab(grid, 0, slices)
         return {
             "slabs": -(-grid.shape[2] // slices),
@@ -195,30 +101,23 @@ class SurfaceExtractor:
         progress: Progress | None = None,
     ) -> Mesh:
         """Extract the surface at one iso value, or of one range, see `extract_isosurface`."""
-        stopwatch = Stopwatch()
-        rule = choose_iso_rule(self.volume, iso_value, closed, topology, below=below, values=self._values)
-        grid = SampleGrid(self.volume, rule)
+        resident, volume = self._resident, self.volume
+        rule = choose_iso_rule(volume, iso_value, closed, topology, below=below, values=resident.values)
+        grid = SampleGrid(volume, rule)
         if topology == "trilinear":
-            check_row(self.volume)
+            check_row(volume)
         if min(grid.shape) < 2:
             raise NoSurfaceError(f"an open volume of {grid.shape} voxels has no cells: leave it closed")
-        run = _Run(self, grid, stopwatch, _voxel_levels(self.device, self.volume, rule), self._placement(grid))
+        run = Extraction(resident, grid, self._placement(grid))
         if progress is not None:
             progress("build", 0, 1)
-        with stopwatch.timed("build"):
-            prepare_isosurface(self.device, self.volume.voxels.dtype, topology, self.volume.uneven, rule.inside)
+        with run.stopwatch.timed("build"):
+            prepare_isosurface(self.device, volume.voxels.dtype, topology, volume.uneven, rule.inside)
         if progress is not None:
             progress("build", 1, 1)
-        self._extractions += 1
-        positions, normals, triangles = run.all_slabs(self._plan(grid), progress)
+        positions, normals, triangles = run.run(plan_slabs(grid, resident), progress)
         report = run.describe(len(positions), len(triangles))
         return Mesh(run.placement.to_lps(positions), triangles, normals, report)
-
-    def _plan(self, grid: SampleGrid) -> int:
-        key = grid.rule.border, grid.rule.topology
-        if key not in self._slices:
-            self._slices[key] = plan_slabs(grid, self.device, self.memory)
-        return self._slices[key]
 
     def _placement(self, grid: SampleGrid) -> Placement:
         border = grid.rule.border
@@ -226,163 +125,9 @@ class SurfaceExtractor:
             self._placements[border] = Placement.of(self.volume, border)
         return self._placements[border]
 
-    def _upload(self, slab: Slab) -> Any:
-        """The slices of the volume that the slab reads; all of them stay on the device once they are there."""
-        if not slab.is_whole:
-            self._resident_d = self._bricks = None
-            first, end = slab.voxel_slices
-            return upload(self.device, self.volume.voxels[first:end])
-        if self._resident_d is None:
-            self._resident_d = upload(self.device, self.volume.voxels)
-        return self._resident_d
-
-    def _compare_bricks(self, slab: Slab, levels: tuple[Any, ...], stopwatch: Stopwatch) -> BrickStates | None:
-        """How the bricks of a resident volume compare with the only level; None before it pays to measure them.
-
-        Measuring takes as long as the first pass over the volume, so a single extraction does without.  So do ranges
-        and what lies below a level: all voxels are read for them.
-        """
-        if not slab.is_whole or self._extractions < 2 or slab.grid.rule.inside != "above":
-            return None
-        if self._bricks is None:
-            volume = self.volume
-            self._bricks = measure_bricks(
-                self.device, self._resident_d, volume.shape_ijk, volume.voxels.dtype, stopwatch=stopwatch
-            )
-        ni, border = self.volume.shape_ijk[0], slab.grid.rule.border
-        return compare_bricks(self.device, self._bricks, levels[0], ni, border, stopwatch=stopwatch)
-
-    def _use_smaller_slabs(self, rule: IsoRule, slices: int) -> None:
-        """Remember that slabs of more slices do not go through."""
-        self._resident_d = self._bricks = None
-        self._slices[rule.border, rule.topology] = slices
-
-
-class _Run:
-    """One extraction: from slab to slab, with fewer slices a slab when the device has no room for more."""
-
-    def __init__(
-        self,
-        extractor: SurfaceExtractor,
-        grid: SampleGrid,
-        stopwatch: Stopwatch,
-        levels: tuple[Any, ...],
-        placement: Placement,
-    ):
-        self.extractor = extractor
-        self.device = extractor.device
-        self.grid = grid
-        self.stopwatch = stopwatch
-        self.levels = levels
-        self.placement = placement
-        self.slabs = 0
-        self.largest = {"volume": 0, "scratch": 0, "output": 0}
-        self.warnings: list[str] = []
-
-    def all_slabs(self, slices: int, progress: Progress | None) -> Part:
-        """Go through the grid, `slices` at a time."""
-        gk = self.grid.shape[2]
-        parts: list[Part] = []
-        first = vertices = triangles = 0
-        while first < gk:
-            slab = Slab(self.grid, first, min(first + slices, gk))
-            try:
-                part = self._one_slab(slab, vertices)
-            except DeviceMemoryError as error:
-                if slab.slices == 1:
-                    raise
-                slices = -(-slab.slices // 2)
-                self.extractor._use_smaller_slabs(self.grid.rule, slices)
-                self.warnings.append(f"{error}: continued with slabs of {slices} slices")
-                continue
-            parts.append(part)
-            vertices, triangles = vertices + len(part[0]), triangles + len(part[2])
-            if max(vertices, triangles) >= 2**32:
-                raise marching_cubes.too_many(vertices, triangles)
-            self.slabs += 1
-            first = slab.end
-            if progress is not None and (first < gk or self.slabs > 1):
-                progress("slabs", first, gk)
-        if triangles == 0:
-            raise _refuse_level(self.device, self.grid.volume, self.grid.rule)
-        try:
-            return _join(parts)
-        except MemoryError as error:
-            raise DeviceError(f"the mesh does not fit the memory of this computer: {error}") from error
-
-    def _one_slab(self, slab: Slab, first_vertex: int) -> Part:
-        device, stopwatch = self.device, self.stopwatch
-        volume, inside = self.grid.volume, self.grid.rule.inside
-        program = prepare_isosurface(device, volume.voxels.dtype, uneven=volume.uneven, inside=inside)
-        with stopwatch.timed("upload"):
-            voxels_d = self.extractor._upload(slab)
-        with stopwatch.running(device):
-            bricks = self.extractor._compare_bricks(slab, self.levels, stopwatch)
-            classified = marching_cubes.classify(device, slab, voxels_d, self.levels, stopwatch, bricks)
-            counted = marching_cubes.count(device, slab, program, classified, stopwatch, voxels_d)
-        self._check_output(slab, counted)
-        part = marching_cubes.emit(
-            device, slab, program, voxels_d, classified, counted, self.placement, first_vertex, stopwatch
-        )
-        self.grid.volume.release_slices(*slab.voxel_slices)
-        return part
-
-    def _check_output(self, slab: Slab, counted: Counted) -> None:
-        """Refuse a slab whose mesh does not fit beside the rest; note what the slab takes."""
-        needs = slab.needs(counted.output())
-        needs["active words"] = 4 * counted.active_words
-        if slab.is_whole and self.extractor._bricks is not None:
-            needs["brick ranges"] = self.extractor._bricks.nbytes
-        shortage = describe_shortage(memory_limits(self.device, self.extractor.memory), needs)
-        if shortage:
-            raise DeviceMemoryError(shortage)
-        output, volume = sum(counted.output().values()), needs["volume"]
-        for what, size in (("volume", volume), ("output", output), ("scratch", sum(needs.values()) - volume - output)):
-            self.largest[what] = max(self.largest[what], size)
-
-    def describe(self, vertices: int, triangles: int) -> dict[str, Any]:
-        """The report of a mesh: how it was made, free of patient data."""
-        rule = self.grid.rule
-        return {
-            **rule.as_report(),
-            "closed_at_border": rule.closed,
-            "topology": rule.topology,
-            "outside_hu": rule.outside if rule.closed else None,
-            "affine_ijk_to_lps_mm": self.grid.volume.affine.tolist(),
-            "certificate": self.grid.volume.report,
-            "device": self.device.label,
-            "driver": self.device.driver,
-            "slabs": self.slabs,
-            "device_bytes": dict(self.largest),
-            "seconds": dict(self.stopwatch.seconds),
-            "kernel_seconds": dict(self.stopwatch.by_kernel),
-            "warnings": [*cache_warnings(), *describe_far(self.grid.volume), *self.warnings],
-        }
-
-
-def prepare_isosurface(
-    device: Device,
-    dtype: DTypeLike = np.int16,
-    topology: str = "separated",
-    uneven: bool = False,
-    inside: str = "above",
-) -> Program:
-    """Build the kernels for volumes of `dtype`, so that a later `extract_isosurface` with `topology` need not wait.
-
-    With `uneven` those for volumes whose slices no affine places; `inside` as `IsoRule.inside`.
-
-    Raises
-    ------
-    DeviceError
-        The driver's compiler refuses.
-    """
-    if topology == "trilinear":
-        prepare_trilinear(device, dtype)
-    return marching_cubes.prepare_marching_cubes(device, dtype, uneven=uneven, inside=inside)
-
 
 def extract_isosurface(
-    volume: Volume,
+    volume: Volume | DeviceVolume,
     iso_value: Level,
     device: Device | str | int | None = None,
     *,
@@ -406,8 +151,9 @@ def extract_isosurface(
 
     Parameters
     ----------
-    volume : Volume
-        Its voxels may be a memory-mapped file larger than the memory of the computer.
+    volume : Volume or DeviceVolume
+        Its voxels may be a memory-mapped file larger than the memory of the computer.  A `DeviceVolume` is used as it
+        is, and has its device and memory.
     iso_value : float or (float, float)
         HU; or the two ends of a range.  Inside of a range are the voxels from its lower to its upper end, both
         included; the surface lies where the values cross the end that they cross: at 100 to 300 and integer voxels
@@ -462,7 +208,7 @@ def extract_isosurface(
 
 
 def extract_isosurfaces(
-    volume: Volume,
+    volume: Volume | DeviceVolume,
     iso_values: Sequence[Level],
     device: Device | str | int | None = None,
     *,

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import DTypeLike
 
-from clrecon.errors import RefusedInputError, UsageError
+from clrecon.errors import DeviceMemoryError, RefusedInputError, UsageError
 from clrecon.geometry import Volume
 from clrecon.geometry.iso_rule import IsoRule
 from clrecon.geometry.precision import describe_far
@@ -36,13 +36,14 @@ from clrecon.opencl import (
     upload,
 )
 from clrecon.opencl.quirks import cache_warnings
-from clrecon.operators.resident.slabs import SampleGrid
 from clrecon.operators.resident.voxel_types import label_variants
 from clrecon.operators.surface import marching_cubes
-from clrecon.operators.surface.extract import Part
+from clrecon.operators.surface.extraction import Part
+from clrecon.operators.surface.label_groups import each_label, group_boxes
 from clrecon.operators.surface.label_survey import survey_labels
-from clrecon.operators.surface.labels import Window, choose_numbers, group_boxes
+from clrecon.operators.surface.labels import Window, choose_numbers
 from clrecon.operators.surface.marching_cubes import Classified, Counted, Placement
+from clrecon.operators.surface.slabs import SampleGrid
 from clrecon.system.progress import Progress
 
 __all__ = ["extract_label_masks", "prepare_label_masks"]
@@ -83,9 +84,10 @@ class _Held:
 class _Run:
     """One extraction: what is common to its labels."""
 
-    def __init__(self, labels: LabelMap, device: Device, closed: bool):
+    def __init__(self, labels: LabelMap, device: Device, memory: int | None, closed: bool):
         self.labels = labels
         self.device = device
+        self.memory = memory
         self.stopwatch = Stopwatch()
         self.groups = 1
         self.device_bytes: dict[str, int] = {}
@@ -95,9 +97,12 @@ class _Run:
         frames[:, 2, 3] = np.maximum(frames[:, 2, 3], KEEP)
         self.placement = replace(placement, slice_frames=frames, margin=np.maximum(placement.margin, np.float32(KEEP)))
         self.levels: dict[int, int] = {}
-        self.biases_d = upload(device, level_biases({}, labels.numbers[-1] + 1))
+        self.warnings: list[str] = []
+
+    def programs(self) -> tuple[Program, Program]:
+        """The kernels, see `prepare_label_masks`."""
         with self.stopwatch.timed("build"):
-            self.own, self.surface = prepare_label_masks(device, labels.voxels.dtype)
+            return prepare_label_masks(self.device, self.labels.voxels.dtype)
 
     @property
     def has_neighbours(self) -> bool:
@@ -125,16 +130,16 @@ class _Run:
         ni, nj, _ = self.labels.shape_ijk
         return 8 * -(-ni // SAMPLES_PER_FLAGS) * nj * slices
 
-    def group(self, boxes: dict[int, Box], memory: int | None) -> list[dict[int, Box]]:
+    def group(self, boxes: dict[int, Box]) -> list[dict[int, Box]]:
         """All labels at once where their slices fit the device, else one by one: the meshes are the same."""
         scratch = max(sum(self.window(box, (0, 0)).scratch().values()) for box in boxes.values())
-        return group_boxes(boxes, self.needs(*self.slices_for(boxes)), scratch, memory_limits(self.device, memory))
+        return group_boxes(boxes, self.needs(*self.slices_for(boxes)), scratch, memory_limits(self.device, self.memory))
 
-    def hold(self, boxes: dict[int, Box], memory: int | None) -> _Held:
+    def hold(self, boxes: dict[int, Box]) -> _Held:
         """Upload the slices that the labels need, and find the occupancy of all labels."""
         device = self.device
         first, end = self.slices_for(boxes)
-        check_budget(device, self.needs(first, end), memory)
+        check_budget(device, self.needs(first, end), self.memory)
         with self.stopwatch.timed("upload"):
             map_d = upload(device, self.labels.voxels[first:end])
         samples = self.labels.voxels[first:end].size
@@ -162,13 +167,13 @@ class _Run:
         row_k = max(held.first, begin_k - REACH), min(held.end, end_k + REACH)
         slices = row_k[1] - row_k[0]
         launch(
-            self.device, self.own["smooth_rows"], slices * (row_j[1] - row_j[0]),
+            self.device, self.programs()[0]["smooth_rows"], slices * (row_j[1] - row_j[0]),
             held.map_d, held.rows_d, held.strips_d, np.uint32(number),
             *(np.int32(n) for n in (ni, nj, *along_i, *row_j, row_k[0] - held.first)), np.uint32(slices),
             stopwatch=self.stopwatch,
         )  # fmt: skip
         launch(
-            self.device, self.own["smooth_across"], (end_k - begin_k) * (end_j - begin_j),
+            self.device, self.programs()[0]["smooth_across"], (end_k - begin_k) * (end_j - begin_j),
             held.rows_d, held.strips_d, occupancy_d, *(np.int32(n) for n in (ni, nj, nk, *along_i, begin_j, end_j)),
             np.int32(held.first), np.int32(begin_k), np.uint32(end_k - begin_k), stopwatch=self.stopwatch,
         )  # fmt: skip
@@ -177,49 +182,52 @@ class _Run:
         """The slices of the sample grid around a label's box."""
         return Window(self.grid, box[0].start, box[0].stop + 2 * self.grid.rule.border, held)
 
-    def keep_enclosed(self, numbers: Sequence[int], boxes: dict[int, Box], memory: int | None) -> None:
+    def keep_enclosed(self, numbers: Sequence[int], boxes: dict[int, Box]) -> None:
         """Find the levels of labels that others enclose: they are the same whichever labels are asked for."""
         own = {number: boxes[number] for number in numbers}
-        groups = self.group(own, memory)
-        held = [self.hold(groups[0], memory)] if len(groups) == 1 else []
+        try:
+            self._measure_enclosed(self.group(own), own)
+        except DeviceMemoryError as error:
+            self.warnings.append(f"{error}: continued with one label at a time")
+            self._measure_enclosed([{number: box} for number, box in own.items()], own)
+
+    def _measure_enclosed(self, groups: list[dict[int, Box]], boxes: dict[int, Box]) -> None:
+        held = [self.hold(groups[0])] if len(groups) == 1 else []
         voxel_mm3 = abs(np.linalg.det(self.labels.affine[:3, :3]))
 
         def measure(levels: dict[int, int]) -> dict[int, float]:
-            self._take_levels(levels)
+            self.levels = levels
             found = {}
             for group in groups:
-                there = held[0] if held else self.hold(group, memory)
+                there = held[0] if held else self.hold(group)
                 for number, box in group.items():
-                    started = self._start_one(there, number, box, memory)
+                    started = self._start_one(there, number, box)
                     found[number] = started.enclosed_mm3(levels[number]) / voxel_mm3
             return found
 
-        self._take_levels(choose_levels(Borders.of(self.labels.voxels, numbers, boxes), measure))
+        self.levels = choose_levels(Borders.of(self.labels.voxels, list(boxes), boxes), measure)
 
-    def _take_levels(self, levels: dict[int, int]) -> None:
-        self.levels = levels
-        self.biases_d = upload(self.device, level_biases(levels, self.labels.numbers[-1] + 1))
-
-    def _start_one(self, held: _Held, number: int, box: Box, memory: int | None) -> _Started:
+    def _start_one(self, held: _Held, number: int, box: Box) -> _Started:
         """All of a label's mesh but its vertices, which depend on levels."""
         device, stopwatch = self.device, self.stopwatch
+        own, surface = self.programs()
         window = self.window(box, (held.first, held.end))
         needs = {**self.needs(held.first, held.end), **window.scratch()}
-        check_budget(device, needs, memory)
+        check_budget(device, needs, self.memory)
         mask_d = allocate(device, 4 * window.mask_rows * self.grid.words)
         classified = Classified(mask_d, allocate(device, 4 * window.mask_rows))
         with stopwatch.running(device):
             self._smooth(held, number, box, held.occupancy_d)
             launch(
-                device, self.own["classify_mask"], window.mask_rows,
+                device, own["classify_mask"], window.mask_rows,
                 held.map_d, mask_d, classified.row_extents_d, np.uint32(number),
                 np.int32(box[1].start), np.int32(box[1].stop),
                 *marching_cubes.volume_scalars(window), np.uint32(window.mask_slices), np.int32(self.grid.words),
                 stopwatch=stopwatch,
             )  # fmt: skip
-            counted = marching_cubes.count(device, window, self.surface, classified, stopwatch)
+            counted = marching_cubes.count(device, window, surface, classified, stopwatch)
         output = counted.output()
-        check_budget(device, {**needs, **output}, memory)
+        check_budget(device, {**needs, **output}, self.memory)
         scratch = window.scratch()
         self.device_bytes = {
             "volume": sum(needs.values()) - sum(scratch.values()),
@@ -227,15 +235,15 @@ class _Run:
             "output": sum(output.values()),
         }
         emission = marching_cubes.Emission(
-            device, window, self.surface, held.occupancy_d, classified, counted, self.placement, stopwatch
+            device, window, surface, held.occupancy_d, classified, counted, self.placement, stopwatch
         )
         with stopwatch.running(device):
             emission.triangles()
         return _Started(self, held, number, box, counted, emission)
 
-    def extract_one(self, held: _Held, number: int, box: Box, memory: int | None) -> tuple[Part, int]:
+    def extract_one(self, held: _Held, number: int, box: Box) -> tuple[Part, int]:
         """Positions, normals and triangles of one label, and the level that places them."""
-        started = self._start_one(held, number, box, memory)
+        started = self._start_one(held, number, box)
         level = self.levels.get(number)
         if level is None:
             return started.keep_volume(1000.0 * label_ml(self.labels, number), self.grid.rule.closed)
@@ -254,7 +262,7 @@ class _Run:
             "device_bytes": self.device_bytes,
             "seconds": dict(self.stopwatch.seconds),
             "kernel_seconds": dict(self.stopwatch.by_kernel),
-            "warnings": [*cache_warnings(), *describe_far(self.grid.volume), *self.labels.warnings],
+            "warnings": [*cache_warnings(), *describe_far(self.grid.volume), *self.labels.warnings, *self.warnings],
         }
 
 
@@ -271,7 +279,8 @@ class _Started:
 
     def place(self, level: int) -> None:
         """Write the vertices, as they are at this level."""
-        arguments = (self.held.map_d, np.uint32(self.number), self.held.occupied_d, self.run.biases_d)
+        biases_d = upload(self.run.device, level_biases(self.run.levels, self.run.labels.numbers[-1] + 1))
+        arguments = (self.held.map_d, np.uint32(self.number), self.held.occupied_d, biases_d)
         with self.run.stopwatch.running(self.run.device):
             self.emission.vertices(level, arguments)
 
@@ -289,8 +298,9 @@ class _Started:
         sums_d = allocate(device, sums.nbytes)
         with stopwatch.running(device):
             launch(
-                device, self.run.own["sum_volumes"], len(sums), self.emission.positions_d, self.emission.triangles_d,
-                sums_d, centre, np.uint32(triangles), np.uint32(TRIANGLES_PER_SUM), stopwatch=stopwatch,
+                device, self.run.programs()[0]["sum_volumes"], len(sums),
+                self.emission.positions_d, self.emission.triangles_d, sums_d, centre, np.uint32(triangles),
+                np.uint32(TRIANGLES_PER_SUM), stopwatch=stopwatch,
             )  # fmt: skip
         return float(download(device, sums, sums_d).sum(dtype=np.float64)) / 6.0
 
@@ -372,22 +382,23 @@ def extract_label_masks(
         raise RefusedInputError("the label map is empty: no voxel has a label")
     marching_cubes.check_row(labels.shape_ijk[0])
     chosen = choose_numbers(labels, numbers)
-    run = _Run(labels, choose_device(device), closed)
+    run = _Run(labels, choose_device(device), memory, closed)
     everywhere, faces = survey_labels(labels, run.device, memory, run.stopwatch)
     if closed and faces[:, 1].any() and (enclosed := find_enclosed(labels.voxels, faces, everywhere)):
-        run.keep_enclosed(enclosed, everywhere, memory)
+        run.keep_enclosed(enclosed, everywhere)
     boxes = {number: everywhere[number] for number in chosen}
     meshes: dict[int, Mesh] = {}
-    groups = run.group(boxes, memory)
+    groups = run.group(boxes)
     run.groups = len(groups)
-    for group in groups:
-        held = run.hold(group, memory)
-        for number, box in group.items():
-            if progress is not None:
-                progress("labels", len(meshes), len(boxes))
-            (positions, normals, triangles), level = run.extract_one(held, number, box, memory)
-            own = {"label": number, "label_name": labels.name(number), "label_ml": label_ml(labels, number)}
-            report = {**run.describe(), **own, "mask_level": level / FULL}
-            meshes[number] = Mesh(run.placement.to_lps(positions), triangles, normals, report)
-            run.stopwatch = Stopwatch()  # what is common to all labels counts for the first
+
+    def extract(held: _Held, number: int, box: Box) -> tuple[Part, int]:
+        if progress is not None:
+            progress("labels", len(meshes), len(boxes))
+        return run.extract_one(held, number, box)
+
+    for number, ((positions, normals, triangles), level) in each_label(groups, run.hold, extract, run.warnings):
+        own = {"label": number, "label_name": labels.name(number), "label_ml": label_ml(labels, number)}
+        report = {**run.describe(), **own, "mask_level": level / FULL}
+        meshes[number] = Mesh(run.placement.to_lps(positions), triangles, normals, report)
+        run.stopwatch = Stopwatch()  # what is common to all labels counts for the first
     return meshes

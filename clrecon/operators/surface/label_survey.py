@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
+from clrecon.errors import DeviceMemoryError
 from clrecon.labels import LabelMap
 from clrecon.labels.enclosed import count_faces
 from clrecon.labels.solid import Box, find_boxes
@@ -54,12 +55,28 @@ def survey_labels(
     memory : int, optional
         Bytes that may be taken on the device; None is all that it has.
     """
+    try:
+        surveyed = _survey(labels, device, memory, stopwatch)
+    except DeviceMemoryError:
+        surveyed = None  # what the device had no room for is done here
+    if surveyed is not None:
+        return surveyed
+    voxels, size = labels.voxels, labels.numbers[-1] + 1
+    none = np.zeros((size, 2), np.uint32)
+    faces = count_faces(voxels) if len(labels.numbers) > 1 else none
+    return find_boxes(voxels, labels.numbers, (0, 0, 0)), faces
+
+
+def _survey(
+    labels: LabelMap, device: Device, memory: int | None, stopwatch: Stopwatch
+) -> tuple[dict[int, Box], NDArray[np.integer[Any]]] | None:
+    """The same by the device; None where it has no room."""
     voxels, size = labels.voxels, labels.numbers[-1] + 1
     boxes, faces = np.empty((size, 6), np.int32), np.zeros((size, 2), np.uint32)
     touch = len(labels.numbers) > 1
     needs = {"labels": voxels.nbytes, "boxes": boxes.nbytes, "faces": faces.nbytes}
     if describe_shortage(memory_limits(device, memory), needs):
-        return find_boxes(voxels, labels.numbers, (0, 0, 0)), count_faces(voxels) if touch else faces
+        return None
     with stopwatch.timed("build"):
         program = prepare_survey(device, voxels.dtype)
     with stopwatch.timed("upload"):

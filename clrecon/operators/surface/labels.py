@@ -17,35 +17,34 @@ from clrecon.errors import NoSurfaceError, UsageError
 from clrecon.geometry import Volume
 from clrecon.geometry.iso_rule import IsoRule, choose_iso_rule
 from clrecon.geometry.precision import describe_far
-from clrecon.labels import LabelMap, ResampledLabels, resample_labels
+from clrecon.labels import LabelMap, ResampledLabels
 from clrecon.labels.growth import Growth
 from clrecon.labels.solid import Box, fill_solid, find_boxes
 from clrecon.labels.volumes import count_ml, label_ml, slice_voxel_ml
 from clrecon.mesh import Mesh
 from clrecon.opencl import (
     Device,
-    MemoryLimits,
     Program,
     Stopwatch,
     allocate,
     check_budget,
-    choose_device,
     describe_shortage,
     download,
     launch,
     load_program,
-    memory_limits,
     upload,
 )
 from clrecon.opencl.quirks import cache_warnings
-from clrecon.operators.resident.slabs import SampleGrid, Slab
+from clrecon.operators.resident.device_volume import DeviceVolume, open_volume
 from clrecon.operators.resident.voxel_types import label_variants, voxel_variants
 from clrecon.operators.surface import marching_cubes
-from clrecon.operators.surface.extract import Part, voxel_level
+from clrecon.operators.surface.extraction import Part, voxel_level
+from clrecon.operators.surface.label_groups import each_label, group_boxes
 from clrecon.operators.surface.marching_cubes import Classified, Placement
+from clrecon.operators.surface.slabs import SampleGrid, Slab
 from clrecon.system.progress import Progress
 
-__all__ = ["Window", "choose_numbers", "extract_labels", "group_boxes", "prepare_labels"]
+__all__ = ["Window", "choose_numbers", "extract_labels", "prepare_labels"]
 
 SPARE_SLICES = 3
 """Beyond the label's box: the far end of a crossed edge, what its gradient needs, and the last slices of the mask."""
@@ -98,19 +97,12 @@ def choose_numbers(labels: LabelMap, numbers: Sequence[int | str] | None) -> tup
     return chosen
 
 
-def group_boxes(boxes: dict[int, Box], needs: dict[str, int], scratch: int, room: MemoryLimits) -> list[dict[int, Box]]:
-    """All labels at once where `needs`, and `scratch` as far as one buffer holds it, fit; else one by one."""
-    if not describe_shortage(room, {**needs, "scratch": min(scratch, room.buffer_bytes)}):
-        return [boxes]
-    return [{number: box} for number, box in boxes.items()]
-
-
 class _Run:
     """One extraction: what is common to its labels."""
 
-    def __init__(
-        self, volume: Volume, taken: ResampledLabels, rule: IsoRule, growth: Growth, device: Device, solid: bool
-    ):
+    def __init__(self, resident: DeviceVolume, taken: ResampledLabels, rule: IsoRule, growth: Growth, solid: bool):
+        volume, device = resident.volume, resident.device
+        self.resident = resident
         self.volume = volume
         self.labels = taken.voxels
         self.rule = rule
@@ -124,11 +116,17 @@ class _Run:
         self.grid = SampleGrid(volume, rule)
         self.level = voxel_level(device, volume, rule)
         self.placement = Placement.of(volume, rule.border)
+        self.warnings: list[str] = []
+
+    def programs(self) -> tuple[Program, Program]:
+        """The kernels, see `prepare_labels`."""
         with self.stopwatch.timed("build"):
-            self.own, self.surface = prepare_labels(device, volume.voxels.dtype, taken.voxels.dtype, volume.uneven)
+            return prepare_labels(self.device, self.resident.dtype, self.labels.dtype, self.volume.uneven)
 
     def slices_for(self, boxes: dict[int, Box]) -> tuple[int, int]:
-        """First and end of the slices of the volume that these labels need."""
+        """First and end of the slices of the volume that these labels need; all where they are on the device."""
+        if self.resident.is_held and self._fits_whole():
+            return 0, self.volume.shape_ijk[2]
         spare = SPARE_SLICES + self.growth.reach[2]  # labels that are not asked for grow too
         first = max(0, min(box[0].start for box in boxes.values()) - spare)
         return first, min(self.volume.shape_ijk[2], max(box[0].stop for box in boxes.values()) + spare)
@@ -139,26 +137,32 @@ class _Run:
         size = samples * self.labels.itemsize
         return {"volume": samples * self.volume.voxels.itemsize, "labels": size, "inside": size}
 
-    def group(self, boxes: dict[int, Box], memory: int | None) -> list[dict[int, Box]]:
+    def _fits_whole(self) -> bool:
+        needs = self.needs(0, self.volume.shape_ijk[2])
+        return not describe_shortage(self.resident.limits, needs | {"mesh": sum(needs.values()) // 2})
+
+    def group(self, boxes: dict[int, Box]) -> list[dict[int, Box]]:
         """All labels at once where their slices fit the device, else one by one: the meshes are the same."""
         scratch = max(sum(self.window(box, (0, 0)).scratch().values()) for box in boxes.values())
-        return group_boxes(boxes, self.needs(*self.slices_for(boxes)), scratch, memory_limits(self.device, memory))
+        return group_boxes(boxes, self.needs(*self.slices_for(boxes)), scratch, self.resident.limits)
 
-    def find_inside(self, boxes: dict[int, Box], memory: int | None) -> _Held:
+    def find_inside(self, boxes: dict[int, Box]) -> _Held:
         """Upload the slices that the labels need, and find what is inside of which label."""
-        device, stopwatch = self.device, self.stopwatch
+        device, stopwatch, resident = self.device, self.stopwatch, self.resident
         first, end = self.slices_for(boxes)
-        check_budget(device, self.needs(first, end), memory)
+        check_budget(device, self.needs(first, end), resident.memory)
+        own, _ = self.programs()
+        is_whole = end - first == self.volume.shape_ijk[2] and resident.is_held
+        voxels_d = resident.whole(stopwatch) if is_whole else resident.part(first, end, stopwatch)
         labels = self.labels[first:end]
         near = np.concatenate([self.growth.offsets, self.growth.shells[:, None]], axis=1)
         with stopwatch.timed("upload"):
-            voxels_d = upload(device, self.volume.voxels[first:end])
             labels_d = upload(device, labels)
             near_d = upload(device, near if len(near) else np.zeros((1, 4), np.int32))
         inside_d = allocate(device, labels.nbytes)
         with stopwatch.running(device):
             launch(
-                device, self.own["own_samples"], labels.size, voxels_d, labels_d, near_d, inside_d, self.level,
+                device, own["own_samples"], labels.size, voxels_d, labels_d, near_d, inside_d, self.level,
                 *(np.int32(n) for n in labels.shape[::-1]), np.int32(len(near)),
                 stopwatch=stopwatch,
             )  # fmt: skip
@@ -181,9 +185,10 @@ class _Run:
         """The slices of the sample grid around a label's box."""
         return Window(self.grid, box[0].start, box[0].stop + 2 * self.rule.border, held)
 
-    def extract_one(self, held: _Held, number: int, box: Box, memory: int | None) -> Part | None:
+    def extract_one(self, held: _Held, number: int, box: Box) -> Part | None:
         """Positions, normals and triangles of one label, None where nothing is inside of it."""
-        device, stopwatch = self.device, self.stopwatch
+        device, stopwatch, memory = self.device, self.stopwatch, self.resident.memory
+        own, surface = self.programs()
         window = self.window(box, (held.first, held.end))
         needs = {**self.needs(held.first, held.end), **window.scratch()}
         check_budget(device, needs, memory)
@@ -192,12 +197,12 @@ class _Run:
         classified = Classified(mask_d, allocate(device, 4 * window.mask_rows))
         with stopwatch.running(device):
             launch(
-                device, self.own["classify_label"], window.mask_rows,
+                device, own["classify_label"], window.mask_rows,
                 held.inside_d, mask_d, classified.row_extents_d, half_way_d, np.uint32(number),
                 *marching_cubes.volume_scalars(window), np.uint32(window.mask_slices), np.int32(self.grid.words),
                 stopwatch=stopwatch,
             )  # fmt: skip
-            counted = marching_cubes.count(device, window, self.surface, classified, stopwatch)
+            counted = marching_cubes.count(device, window, surface, classified, stopwatch)
         if counted.triangles == 0:
             return None
         output = counted.output()
@@ -209,7 +214,7 @@ class _Run:
             "output": sum(output.values()),
         }
         part = marching_cubes.emit(
-            device, window, self.surface, held.voxels_d, classified, counted, self.placement, 0, stopwatch,
+            device, window, surface, held.voxels_d, classified, counted, self.placement, 0, stopwatch,
             (held.inside_d, np.uint32(number), half_way_d),
         )  # fmt: skip
         half_way = int(download(device, np.empty(1, np.uint32), half_way_d)[0])
@@ -239,6 +244,7 @@ class _Run:
                 *cache_warnings(),
                 *describe_far(self.volume),
                 *_warn_of_uneven_growth(self.volume, self.growth),
+                *self.warnings,
             ],
         }
 
@@ -269,7 +275,7 @@ def _refuse_label(
 
 
 def extract_labels(
-    volume: Volume,
+    volume: Volume | DeviceVolume,
     labels: LabelMap,
     iso_value: float,
     device: Device | str | int | None = None,
@@ -291,7 +297,8 @@ def extract_labels(
 
     Parameters
     ----------
-    volume : Volume
+    volume : Volume or DeviceVolume
+        A `DeviceVolume` is used as it is, and has its device and memory.
     labels : LabelMap
         On any grid, see `clrecon.labels.resample_labels`.
     iso_value : float
@@ -331,47 +338,60 @@ def extract_labels(
     DeviceError
         As `extract_isosurface`.
     """
-    taken = resample_labels(labels, volume)
+    with open_volume(volume, device, memory, "a surface of a label") as resident:
+        taken = resident.bring(labels)
+        rule = choose_iso_rule(resident.volume, iso_value, closed, values=resident.values)
+        marching_cubes.check_row(resident.volume.shape_ijk[0])
+        run = _Run(resident, taken, rule, Growth.of(resident.volume, grow_mm), solid)
+        meshes = _make_meshes(run, labels, taken, numbers, progress)
+    if not meshes:
+        raise NoSurfaceError(f"no label has a voxel of {rule.iso_value:g} HU or more in the CT")
+    return meshes
+
+
+def _make_meshes(
+    run: _Run,
+    labels: LabelMap,
+    taken: ResampledLabels,
+    numbers: Sequence[int | str] | None,
+    progress: Progress | None,
+) -> dict[int, Mesh]:
+    """The meshes of labels that have one; a label that was named must."""
     chosen = choose_numbers(labels, numbers)
-    rule = choose_iso_rule(volume, iso_value, closed)
-    marching_cubes.check_row(volume.shape_ijk[0])
-    run = _Run(volume, taken, rule, Growth.of(volume, grow_mm), choose_device(device), solid)
     boxes = find_boxes(taken.voxels, chosen, run.growth.reach)
-    refuse = None if numbers is None else partial(_refuse_label, volume, taken, labels, rule)
+    refuse = None if numbers is None else partial(_refuse_label, run.volume, taken, labels, run.rule)
     missing = [number for number in chosen if number not in boxes]
     if missing and refuse is not None:
         raise refuse(missing[0])
     meshes: dict[int, Mesh] = {}
-    for number, part in _extract_each(run, boxes, memory, refuse, progress):
-        report = {**run.describe(), **_describe_label(volume, labels, taken, number, boxes[number])}
+    for number, part in _extract_each(run, boxes, refuse, progress):
+        report = {**run.describe(), **_describe_label(run.volume, labels, taken, number, boxes[number])}
         meshes[number] = _as_mesh(run, taken, report, part)
-    if not meshes:
-        raise NoSurfaceError(f"no label has a voxel of {rule.iso_value:g} HU or more in the CT")
     return meshes
 
 
 def _extract_each(
     run: _Run,
     boxes: dict[int, Box],
-    memory: int | None,
     refuse: Callable[[int], NoSurfaceError] | None,
     progress: Progress | None,
 ) -> Iterator[tuple[int, Part]]:
     """Labels and their surfaces, as many at once as the device has room for; what has none is left out, or refused."""
-    groups = run.group(boxes, memory) if boxes else []
+    groups = run.group(boxes) if boxes else []
     run.groups = len(groups)
     done = 0
-    for group in groups:
-        held = run.find_inside(group, memory)
-        for number, box in group.items():
-            if progress is not None:
-                progress("labels", done, len(boxes))
-            part = run.extract_one(held, number, box, memory)
-            if part is not None:
-                done += 1
-                yield number, part
-            elif refuse is not None:
-                raise refuse(number)
+
+    def extract(held: _Held, number: int, box: Box) -> Part | None:
+        if progress is not None:
+            progress("labels", done, len(boxes))
+        return run.extract_one(held, number, box)
+
+    for number, part in each_label(groups, run.find_inside, extract, run.warnings):
+        if part is not None:
+            done += 1
+            yield number, part
+        elif refuse is not None:
+            raise refuse(number)
 
 
 def _as_mesh(run: _Run, taken: ResampledLabels, report: dict[str, Any], part: Part) -> Mesh:

@@ -26,8 +26,8 @@ from clrecon.opencl import (
 )
 from clrecon.operators.primitives.compaction import exclusive_scan, prepare_scan
 from clrecon.operators.resident.bricks import BrickStates
-from clrecon.operators.resident.slabs import Slab
 from clrecon.operators.resident.voxel_types import label_variants, voxel_variants
+from clrecon.operators.surface.slabs import Slab
 from clrecon.operators.surface.trilinear import CellVertices, count_cells, emit_cells
 
 __all__ = [

@@ -19,8 +19,8 @@ from clrecon.opencl import (
     load_program,
 )
 from clrecon.operators.primitives.compaction import exclusive_scan
-from clrecon.operators.resident.slabs import Slab
 from clrecon.operators.resident.voxel_types import voxel_variants
+from clrecon.operators.surface.slabs import Slab
 
 __all__ = ["LONGEST_ROW", "CellVertices", "check_row", "count_cells", "emit_cells", "prepare_trilinear"]
 

@@ -10,7 +10,7 @@ from ray_scenes import STEPS, centre_of, look, make_volume, positions, premultip
 from clrecon.geometry import Volume
 from clrecon.labels import LabelMap
 from clrecon.operators.rays.surface import cast_surface
-from clrecon.operators.resident.volume import ResidentVolume
+from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.rendering import Lighting, Rendering
 from clrecon.rendering.looks.label_style import LabelStyle
 from clrecon.rendering.views.camera import Camera
@@ -28,7 +28,7 @@ def cast(
     device, volume: Volume, camera: Camera, style: LabelStyle | None, memory=None, size=SIZE, **settings
 ) -> Rendering:
     settings = {"lighting": UNLIT, "color": "white", **settings}
-    resident = ResidentVolume(volume, device, memory)
+    resident = DeviceVolume(volume, device, memory=memory)
     return cast_surface(resident, 300.0, camera, size, 0.5 * min(volume.spacing), style=style, **settings)
 
 

@@ -12,14 +12,16 @@ from clrecon.geometry import Volume
 from clrecon.opencl import Stopwatch, download, upload
 from clrecon.operators.rays import composite
 from clrecon.operators.rays.composite import MainWay
-from clrecon.operators.resident.volume import FARTHEST, LeapMap, ResidentVolume
+from clrecon.operators.rays.leaps import find_leaps
+from clrecon.operators.rays.slabs import FARTHEST, LeapMap, ray_slabs
+from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.rendering.views.camera import Camera
 
 
 def look(device, shape, distances, way: MainWay):
     """What the kernel says of a volume without anything in it, with these distances in place of its own."""
-    resident, stopwatch = ResidentVolume(Volume(np.zeros(shape, np.int16), np.eye(4)), device), Stopwatch()
-    slab = next(resident.slabs(shape[0], np.inf, stopwatch))
+    resident, stopwatch = DeviceVolume(Volume(np.zeros(shape, np.int16), np.eye(4)), device), Stopwatch()
+    slab = next(ray_slabs(resident, shape[0], np.inf, stopwatch))
     with stopwatch.running(device):
         ways_d = composite._look_ahead(resident, slab, way, LeapMap(upload(device, distances), None), stopwatch)
         return download(device, np.empty_like(distances), ways_d)
@@ -72,14 +74,14 @@ def test_distances_are_those_of_a_chessboard(device, shape):
     voxels = np.zeros(shape, np.int16)
     for _ in range(3):
         voxels[tuple(rng.integers(0, shape))] = 1000
-    resident, stopwatch = ResidentVolume(Volume(voxels, np.eye(4)), device), Stopwatch()
-    slab = next(resident.slabs(shape[0], np.inf, stopwatch))
+    resident, stopwatch = DeviceVolume(Volume(voxels, np.eye(4)), device), Stopwatch()
+    slab = next(ray_slabs(resident, shape[0], np.inf, stopwatch))
     counts = slab.bricks[::-1]
     bright = np.zeros(counts, bool)
     for brick in np.ndindex(counts):  # cells of a brick end at the voxels that the next one begins with
         bright[brick] = (voxels[tuple(slice(4 * n, 4 * n + 5) for n in brick)] > 500).any()
     with stopwatch.running(device):
-        leaps = resident.find_leaps(slab, "key", np.arange(100) > 50, 0.0, 0.1, stopwatch)
+        leaps = find_leaps(resident, slab, "key", np.arange(100) > 50, 0.0, 0.1, stopwatch)
         found = download(device, np.empty(counts, np.uint8), leaps.distances_d)
     truth = ndimage.distance_transform_cdt(~bright, "chessboard")
     assert np.array_equal(found, np.minimum(truth, FARTHEST))
@@ -91,8 +93,8 @@ def test_distances_are_those_of_a_chessboard(device, shape):
 
 def test_the_main_way_is_that_of_the_ray_in_the_middle(device):
     volume = Volume(np.zeros((20, 40, 30), np.int16), np.diag([1.0, -2.0, 3.0, 1.0]))
-    resident = ResidentVolume(volume, device)
-    slab = next(resident.slabs(20, np.inf, Stopwatch()))
+    resident = DeviceVolume(volume, device)
+    slab = next(ray_slabs(resident, 20, np.inf, Stopwatch()))
     assert slab.brick_cells == (4, 4, 2)
     from_the_front = Camera((15.0, -400.0, 30.0), (15.0, 0.0, 30.0), (0.0, 0.0, 1.0), parallel_scale=50.0)
     way = MainWay.of(resident, slab, from_the_front)

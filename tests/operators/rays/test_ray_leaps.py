@@ -11,9 +11,9 @@ from clrecon.errors import UsageError
 from clrecon.geometry import Volume
 from clrecon.labels import LabelMap
 from clrecon.opencl import upload
-from clrecon.operators.rays import composite
+from clrecon.operators.rays import composite, ray_pictures, slabs
 from clrecon.operators.rays.render import VolumeRenderer, render
-from clrecon.operators.resident import volume as resident
+from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.operators.resident.frame import volume_box
 from clrecon.rendering import UNSHADED, Rendering, TransferFunction
 from clrecon.rendering.views.camera import Camera
@@ -34,15 +34,15 @@ def take(volume: Volume, device, camera: Camera, **settings) -> Rendering:
 def take_every_sample(monkeypatch, *arguments, **settings) -> Rendering:
     """The same with all bricks shown from the first sample on."""
 
-    def show_all(self, slab, *_):
+    def show_all(resident, slab, *_):
         bi, bj, bk = slab.bricks
-        return resident.LeapMap(upload(self.device, np.zeros((bk, bj, bi), np.uint8)), volume_box(self.volume))
+        return slabs.LeapMap(upload(resident.device, np.zeros((bk, bj, bi), np.uint8)), volume_box(resident.volume))
 
     def enter_at_once(resident, slab, view, leaps, output, stopwatch):
         return upload(resident.device, np.full(output.tiles, -np.inf, np.float32))
 
     with monkeypatch.context() as patch:
-        patch.setattr(resident.ResidentVolume, "find_leaps", show_all)
+        patch.setattr(ray_pictures, "find_leaps", show_all)
         patch.setattr(composite, "_enter_tiles", enter_at_once)
         return take(*arguments, **settings)
 
@@ -179,7 +179,7 @@ def test_slabs_in_the_order_of_rays_that_run_almost_along_the_slices(device, mon
     camera = Camera((7.5, -50.0, 31.5 - 69.5 * tilt), (7.5, 19.5, 31.5), (0.0, 0.0, 1.0), parallel_scale=32.0)
     settings = {"size": (8, 64), "ray_step": 0.5}  # rows at whole k
     whole = take(volume, device, camera, **settings)
-    monkeypatch.setattr(resident.ResidentVolume, "plan", lambda *_, **__: 8)
+    monkeypatch.setattr(ray_pictures, "plan_ray_slabs", lambda *_, **__: 8)
     parts = take(volume, device, camera, **settings)
     assert parts.report["slabs"] == 8
     assert_same(parts, whole)
@@ -203,8 +203,8 @@ def test_volumes_of_more_voxels_than_an_int_counts_go_through_in_slabs(device, m
     """Of samples that are taken at once places are ints from the first of them on."""
     volume = scattered(np.random.default_rng(3), uneven=False)
     ni, nj, nk = volume.shape_ijk
-    monkeypatch.setattr(resident, "MOST_VOXELS", ni * nj * (nk // 2 + 6))
-    found = resident.ResidentVolume(volume, device).plan({}, {})
+    monkeypatch.setattr(slabs, "MOST_VOXELS", ni * nj * (nk // 2 + 6))
+    found = slabs.plan_ray_slabs(DeviceVolume(volume, device), {}, {})
     held = nk if int(device.kernel_variants["LANES"]) == 1 else nk // 2 + 1
     assert found == held
 

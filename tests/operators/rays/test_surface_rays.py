@@ -11,7 +11,7 @@ from variants import all_but
 from clrecon.errors import DeviceError, UsageError
 from clrecon.geometry import Volume
 from clrecon.operators.rays.surface import cast_surface
-from clrecon.operators.resident.volume import ResidentVolume
+from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.operators.surface.extract import extract_isosurface
 from clrecon.reference.rays.surface import cast_surface as cast_twin
 from clrecon.rendering import Lighting, Rendering
@@ -28,7 +28,7 @@ RADIUS = 7.0
 def cast(device, volume: Volume, iso_value: float, camera: Camera, size=SIZE, memory=None, **settings) -> Rendering:
     step = settings.pop("ray_step", 0.5 * min(volume.spacing))
     settings = {"lighting": UNLIT, "color": "white", **settings}
-    return cast_surface(ResidentVolume(volume, device, memory), iso_value, camera, size, step, **settings)
+    return cast_surface(DeviceVolume(volume, device, memory=memory), iso_value, camera, size, step, **settings)
 
 
 def ball(points: np.ndarray) -> np.ndarray:

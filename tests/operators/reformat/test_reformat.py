@@ -11,9 +11,10 @@ from variants import VOXEL_TYPES
 
 from clrecon.errors import DeviceError, UsageError
 from clrecon.geometry import Volume
-from clrecon.opencl import kernel_files, upload
+from clrecon.opencl import Stopwatch, kernel_files
 from clrecon.operators.reformat.cut import cut_slice, reformat_curve
 from clrecon.operators.reformat.sample import prepare_reformat, sample_sheet
+from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.reference.reformat.cut import reformat_sheet
 from clrecon.rendering.views.camera import Camera
 from clrecon.rendering.views.plane import find_plane, plane_sheet, slab_samples
@@ -172,7 +173,7 @@ def test_the_device_equals_its_twin(device, name, dtype):
         sheet, _ = plane_sheet(find_plane(volume, view, (31, 33)), (31, 33), 0.1)
         samples = slab_samples(volume, thickness)
         expected = reformat_sheet(volume, sheet, samples, combine)
-        made = sample_sheet(device, volume, sheet, samples, combine)
+        made = sample_sheet(DeviceVolume(volume, device), sheet, samples, combine)
         assert np.array_equal(np.isnan(made.values), np.isnan(expected))
         assert np.nanmax(np.abs(made.values - expected)) <= tolerances.TWIN_SLICE_HU
         assert (~np.isnan(expected)).any()
@@ -184,21 +185,21 @@ def test_volumes_that_do_not_fit_go_through_in_slabs(device, name, combine):
     volume = VOLUMES[name]("float32")
     sheet, _ = plane_sheet(find_plane(volume, (20.0, 30.0), (23, 17)), (23, 17))
     samples = slab_samples(volume, 3.0 if combine != "mean" else 0.0)
-    whole = sample_sheet(device, volume, sheet, samples, combine)
+    whole = sample_sheet(DeviceVolume(volume, device), sheet, samples, combine)
     one = 4 * volume.voxels[0].size
     others = whole.device_bytes - whole.slices * one
     assert whole.slices >= 4
     for slices in (2, 3, 4):
-        parts = sample_sheet(device, volume, sheet, samples, combine, memory=others + slices * one)
+        parts = sample_sheet(DeviceVolume(volume, device, memory=others + slices * one), sheet, samples, combine)
         assert parts.slabs == 1 + -(-(whole.slices - slices) // (slices - 1))
         assert np.array_equal(parts.values, whole.values, equal_nan=True)
     thick = slab_samples(volume, 5.0)
-    mean = sample_sheet(device, volume, sheet, thick, "mean", memory=others + 2 * one)
+    mean = sample_sheet(DeviceVolume(volume, device, memory=others + 2 * one), sheet, thick, "mean")
     truth = reformat_sheet(volume, sheet, thick, "mean")
     assert np.array_equal(np.isnan(mean.values), np.isnan(truth))
     assert np.nanmax(np.abs(mean.values - truth)) <= tolerances.TWIN_SLICE_HU
     with pytest.raises(DeviceError, match="two slices at a time are too much"):
-        sample_sheet(device, volume, sheet, samples, combine, memory=others + 2 * one - 1)
+        sample_sheet(DeviceVolume(volume, device, memory=others + 2 * one - 1), sheet, samples, combine)
 
 
 def test_only_slices_that_are_met_are_taken(device):
@@ -210,8 +211,10 @@ def test_only_slices_that_are_met_are_taken(device):
 def test_a_volume_on_the_device_is_used_as_it_is(device):
     volume = VOLUMES["sheared"]("int16")
     expected = cut_slice(volume, (20.0, 30.0), (31, 20), device, thickness=2.0)
-    resident_d = upload(device, volume.voxels)
-    made = cut_slice(volume, (20.0, 30.0), (31, 20), device, thickness=2.0, voxels_d=resident_d)
+    with DeviceVolume(volume, device) as resident:
+        resident.whole(Stopwatch())
+        made = cut_slice(resident, (20.0, 30.0), (31, 20), thickness=2.0)
+        assert resident.uploaded_bytes == volume.voxels.nbytes
     assert np.array_equal(made.values, expected.values, equal_nan=True)
 
 
@@ -257,7 +260,7 @@ def test_reformations_stay_within_their_buffers(device):
         volume = VOLUMES[name]("int16")
         sheet, _ = plane_sheet(find_plane(volume, (20.0, 30.0), (9, 8)), (9, 8))
         samples = slab_samples(volume, 2.0)
-        made = sample_sheet(device, volume, sheet, samples, "mean")
+        made = sample_sheet(DeviceVolume(volume, device), sheet, samples, "mean")
         truth = reformat_sheet(volume, sheet, samples, "mean")
         assert np.nanmax(np.abs(made.values - truth)) <= tolerances.TWIN_SLICE_HU
     line = [(0.0, 0.0, 0.5), (2.0, 1.0, 4.0)]

@@ -12,7 +12,7 @@ from variants import VOXEL_TYPES
 from clrecon.errors import DeviceError, NoSurfaceError, UsageError
 from clrecon.geometry import Volume, compose_affine, iso_rule
 from clrecon.jobs.selftest import run_selftest
-from clrecon.operators.surface import extract as isosurface
+from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.operators.surface import marching_cubes
 from clrecon.operators.surface.extract import SurfaceExtractor, extract_isosurface, extract_isosurfaces
 from clrecon.reference.surface import extract as twin
@@ -259,14 +259,12 @@ def test_the_values_of_a_resident_volume_are_looked_at_once(device, dtype, monke
     assert np.array_equal(meshes[1].vertices, extract_isosurface(volume, 100, device).vertices)
 
 
-def test_the_volume_is_uploaded_once(device, monkeypatch):
-    uploads = []
-    true_upload = isosurface.upload
-    monkeypatch.setattr(isosurface, "upload", lambda *arguments: uploads.append(1) or true_upload(*arguments))
-    with SurfaceExtractor(smooth_volume(), device) as extractor:
+def test_the_volume_is_uploaded_once(device):
+    volume = smooth_volume()
+    with DeviceVolume(volume, device) as resident, SurfaceExtractor(resident) as extractor:
         for iso_value in (50, 100, 150):
             extractor.extract(iso_value)
-    assert len(uploads) == 1
+        assert resident.uploaded_bytes == volume.voxels.nbytes
 
 
 def test_the_report_says_how_the_mesh_was_made(device):

@@ -12,6 +12,8 @@ from clrecon.geometry import Volume
 from clrecon.geometry.iso_rule import choose_iso_rule
 from clrecon.labels import LabelMap, resample_labels
 from clrecon.labels.growth import Growth
+from clrecon.operators.resident import device_volume
+from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.operators.surface import labels as operator
 from clrecon.operators.surface.extract import extract_isosurface
 from clrecon.operators.surface.labels import extract_labels
@@ -102,8 +104,8 @@ def test_growth_is_that_of_the_twin_to_the_last_sample(device, grow_mm):
             growth = Growth.of(volume, grow_mm)
             rule = choose_iso_rule(volume, 3)
             taken = resample_labels(LabelMap(labels, affine), volume)
-            run = operator._Run(volume, taken, rule, growth, device, False)
-            held = run.find_inside({1: tuple(slice(0, n) for n in shape)}, None)
+            run = operator._Run(DeviceVolume(volume, device), taken, rule, growth, False)
+            held = run.find_inside({1: tuple(slice(0, n) for n in shape)})
             inside = operator.download(device, np.empty_like(taken.voxels), held.inside_d)
             assert np.array_equal(inside, twin.find_solid(volume, labels, 3, grow_mm=grow_mm))
 
@@ -157,9 +159,9 @@ def test_labels_that_do_not_fit_together_go_through_one_by_one(device, monkeypat
     volume, labels = random_volume(shape), np.zeros(shape, np.uint16)
     labels[:6], labels[28:31], labels[55:] = 3, 7, 9
     expected = extract_labels(volume, LabelMap(labels, OBLIQUE), 3, device, solid=True)
-    uploads = []
-    true_upload = operator.upload
-    monkeypatch.setattr(operator, "upload", lambda d, a: uploads.append(a.shape) or true_upload(d, a))
+    uploads, true_upload = [], operator.upload
+    for module in (operator, device_volume):
+        monkeypatch.setattr(module, "upload", lambda d, a: uploads.append(a.shape) or true_upload(d, a))
     meshes = extract_labels(volume, LabelMap(labels, OBLIQUE), 3, device, solid=True, memory=500_000)
     assert sum(len(shape) == 3 and shape[1:] == (40, 40) for shape in uploads) == 9  # three for each label
     for number, mesh in meshes.items():

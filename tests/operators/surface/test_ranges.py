@@ -5,13 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import tolerances
-from slab_surfaces import assert_same
+from slab_surfaces import assert_same, extract_in_slabs
 from surface_volumes import MIRRORED, OBLIQUE, SHAPES, assert_sound, random_volume, smooth_volume
 from variants import VOXEL_TYPES
 
 from clrecon.errors import DeviceError, NoSurfaceError, UsageError
 from clrecon.geometry import Volume
-from clrecon.geometry.iso_rule import choose_iso_rule
 from clrecon.mesh.compare.iso_distance import measure_iso_distance, rule_of_report
 from clrecon.operators.surface import marching_cubes
 from clrecon.operators.surface.extract import SurfaceExtractor, extract_isosurface
@@ -136,9 +135,7 @@ def test_slabs_of_any_thickness_give_the_same_mesh(device, dtype, level, options
     volume = random_volume((9, 7, 40), dtype, affine=MIRRORED if dtype == "uint8" else OBLIQUE)
     expected = extract_isosurface(volume, level, device, **options)
     for slices in (1, 2, 3, 5):
-        extractor = SurfaceExtractor(volume, device)
-        extractor._use_smaller_slabs(choose_iso_rule(volume, level, **options), slices)
-        mesh = extractor.extract(level, **options)
+        mesh = extract_in_slabs(volume, level, device, slices, **options)
         assert mesh.report["slabs"] == -(-11 // slices)
         assert_same(mesh, expected)
 

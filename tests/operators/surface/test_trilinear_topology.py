@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import tolerances
+from slab_surfaces import extract_in_slabs
 from surface_volumes import MIRRORED, OBLIQUE, SHAPES, assert_sound, random_volume, smooth_volume
 from variants import VOXEL_TYPES
 
@@ -149,9 +150,7 @@ def test_slabs_give_the_same_mesh(device, closed):
     volume = random_volume((9, 7, 40), high=1000, affine=MIRRORED)
     expected = extract(volume, 500, device, closed=closed)
     for slices in (1, 2, 3, 5):
-        with SurfaceExtractor(volume, device) as extractor:
-            extractor._use_smaller_slabs(choose_iso_rule(volume, 500, closed, "trilinear"), slices)
-            mesh = extractor.extract(500, closed=closed, topology="trilinear")
+        mesh = extract_in_slabs(volume, 500, device, slices, closed, "trilinear")
         assert mesh.report["slabs"] > 1
         assert np.array_equal(mesh.triangles, expected.triangles)
         assert np.array_equal(mesh.vertices, expected.vertices)

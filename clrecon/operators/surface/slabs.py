@@ -9,9 +9,12 @@ from functools import cached_property
 from clrecon.errors import DeviceError
 from clrecon.geometry import Volume, is_left_handed
 from clrecon.geometry.iso_rule import IsoRule
-from clrecon.opencl import Device, describe_shortage, memory_limits
+from clrecon.operators.resident.device_volume import DeviceVolume
 
-__all__ = ["SampleGrid", "Slab", "plan_slabs"]
+__all__ = ["BRICKS", "SampleGrid", "Slab", "plan_slabs"]
+
+BRICKS = "brick ranges"
+"""What surfaces keep of a whole volume."""
 
 
 @dataclass(frozen=True)
@@ -32,6 +35,11 @@ class SampleGrid:
         """(gi, gj, gk) samples."""
         gi, gj, gk = (n + 2 * self.rule.border for n in self.volume.shape_ijk)
         return gi, gj, gk
+
+    @property
+    def kind(self) -> str:
+        """Grids of one kind need the same memory."""
+        return f"{self.rule.topology} surface with a border of {self.rule.border}"
 
     @property
     def words(self) -> int:
@@ -135,15 +143,13 @@ MOST_WORDS = 2**32
 """Words of a slab are numbered in 32 bits, of which the place in the row takes `SampleGrid.row_shift`."""
 
 
-def plan_slabs(grid: SampleGrid, device: Device, memory: int | None = None) -> int:
+def plan_slabs(grid: SampleGrid, resident: DeviceVolume) -> int:
     """Slices a slab: all of them where the whole grid fits the device, else as many as fit.
 
     Parameters
     ----------
     grid : SampleGrid
-    device : Device
-    memory : int, optional
-        Bytes that may be taken on the device; None is all of its memory.
+    resident : DeviceVolume
 
     Raises
     ------
@@ -151,26 +157,22 @@ def plan_slabs(grid: SampleGrid, device: Device, memory: int | None = None) -> i
         Not even one slice with its neighbours fits; the message has what it needs and what there is.
     """
     gk = grid.shape[2]
-    limits = memory_limits(device, memory)
+    limits = resident.limits
+    mesh_bytes = min(limits.total_bytes // OUTPUT_SHARE, limits.buffer_bytes)
 
-    def fits(slices: int, share: int) -> bool:
+    def needs(slices: int) -> dict[str, int]:
         # A slab in the middle of the grid: no other of as many slices needs more.
         first = max(0, min(2, gk - slices))
-        slab = Slab(grid, first, first + slices)
-        needs = slab.needs({"mesh": min(limits.total_bytes // share, limits.buffer_bytes)} if share else None)
-        return (slab.mask_rows << grid.row_shift) < MOST_WORDS and not describe_shortage(limits, needs)
+        return Slab(grid, first, first + slices).needs({} if slices == gk else {"mesh": mesh_bytes})
 
-    if fits(gk, 0):
-        return gk
-    if not fits(1, OUTPUT_SHARE):
-        first = max(0, min(2, gk - 1))
-        needs = Slab(grid, first, first + 1).needs()
+    # A slab classifies two slices more than it owns.
+    most_mask_slices = (MOST_WORDS - 1) // (grid.shape[1] << grid.row_shift)
+    most = None if gk <= most_mask_slices else most_mask_slices - 2
+    slices = resident.plan(grid.kind, gk, needs, own=(BRICKS,), most=most)
+    if slices == 0:
+        shortest = Slab(grid, max(0, min(2, gk - 1)), max(0, min(2, gk - 1)) + 1).needs()
         raise DeviceError(
-            f"one slice with its neighbours needs {sum(needs.values()):,} bytes, and room for its mesh:"
+            f"one slice with its neighbours needs {sum(shortest.values()):,} bytes, and room for its mesh:"
             f" {limits.describe()}; {'use another device' if limits.asked_bytes is None else 'allow more'}"
         )
-    low, high = 1, gk  # fits, does not
-    while high - low > 1:
-        middle = (low + high) // 2
-        low, high = (middle, high) if fits(middle, OUTPUT_SHARE) else (low, middle)
-    return low
+    return slices

@@ -12,10 +12,12 @@ from surface_volumes import MIRRORED, OBLIQUE, random_volume, smooth_volume
 from clrecon.errors import DeviceError, DeviceMemoryError, UsageError
 from clrecon.geometry import Volume
 from clrecon.geometry.iso_rule import choose_iso_rule
-from clrecon.operators.resident.slabs import SampleGrid, Slab, plan_slabs
+from clrecon.operators.resident import device_volume
+from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.operators.surface import extract as isosurface
 from clrecon.operators.surface import marching_cubes
 from clrecon.operators.surface.extract import SurfaceExtractor, extract_isosurface
+from clrecon.operators.surface.slabs import SampleGrid, Slab, plan_slabs
 
 
 @pytest.mark.parametrize("closed", [True, False])
@@ -89,7 +91,7 @@ def test_the_forecast_is_what_then_happens(device):
 
 
 def test_a_budget_for_less_than_a_slice_is_refused_before_anything_is_allocated(device, monkeypatch):
-    monkeypatch.setattr(isosurface, "upload", lambda *_: pytest.fail("allocated"))
+    monkeypatch.setattr(device_volume, "upload", lambda *_: pytest.fail("allocated"))
     with pytest.raises(DeviceError, match=r"one slice with its neighbours needs [0-9,]+ bytes.*10,000 bytes are allow"):
         extract_isosurface(smooth_volume((40, 60, 70)), 100, device, memory=10_000)
 
@@ -171,17 +173,20 @@ def test_vertices_of_all_slabs_together_must_fit_32_bits(device, monkeypatch):
         extract_in_slabs(random_volume((9, 6, 7)), 3, device, 3)
 
 
-def test_too_many_words_for_32_bits_make_slabs_too():
+def test_too_many_words_for_32_bits_make_slabs_too(device):
     class Tall:
         shape_ijk = (40, 2**12, 2**16)
         voxels = np.zeros((1, 1, 1), np.int16)
 
     class Huge:
         label, memory_bytes, max_allocation_bytes = "a large device", 2**45, 2**44
+        context = None
 
     volume = random_volume((2, 2, 2))
     grid = SampleGrid(Tall(), choose_iso_rule(volume, 3))
-    slices = plan_slabs(grid, Huge())
+    resident = DeviceVolume(volume, device)
+    resident.device = Huge()
+    slices = plan_slabs(grid, resident)
     assert 1 < slices < 2**16
     assert Slab(grid, 2, 2 + slices).mask_rows << grid.row_shift < 2**32
     assert Slab(grid, 2, 3 + slices).mask_rows << grid.row_shift >= 2**32

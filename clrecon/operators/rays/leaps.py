@@ -1,0 +1,103 @@
+"""How far a ray may leap: which bricks of a slab show something, and how far the next one is."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clrecon.geometry import Volume
+from clrecon.geometry.affine import Float64Array
+from clrecon.opencl import Stopwatch, allocate, download, launch, upload
+from clrecon.operators.rays.slabs import LeapMap, RaySlab
+from clrecon.operators.resident.device_volume import DeviceVolume
+from clrecon.operators.resident.frame import BOX_BORDER, enclose
+
+__all__ = ["find_leaps", "measure_cells"]
+
+ROWS_AT_ONCE = 4
+"""Rows of bricks that a work-item takes, as in cl/render/occupancy.cl."""
+
+
+def measure_cells(resident: DeviceVolume, slab: RaySlab, stopwatch: Stopwatch) -> Any:
+    """Lowest and highest value that samples in each brick of a slab can have, (bk, bj, bi, 2), on the device."""
+    if slab.ranges_d is None:
+        bi, bj, bk = slab.bricks
+        slab.ranges_d = allocate(resident.device, 2 * bi * bj * bk * resident.dtype.itemsize)
+        launch(
+            resident.device, resident.program("render/occupancy.cl")["measure_cells"], bi * bj * bk,
+            slab.voxels_d, slab.ranges_d, *(np.int32(n) for n in slab.shape_ijk),
+            *(np.uint32(n) for n in (bi, bj, bk)), np.int32(slab.brick_cells[2]), stopwatch=stopwatch,
+        )  # fmt: skip
+    return slab.ranges_d
+
+
+def find_leaps(
+    resident: DeviceVolume,
+    slab: RaySlab,
+    key: Any,
+    shown: NDArray[np.bool_],
+    low: float,
+    scale: float,
+    stopwatch: Stopwatch,
+) -> LeapMap:
+    """The leap map for values that show, or the one that was made for `key` before.
+
+    Parameters
+    ----------
+    key : hashable
+        What `shown` follows from.
+    shown : ndarray, shape (nodes,), bool
+        Which nodes of a table of values show anything.
+    low, scale : float
+        Nearest node to a value v: ``floor((v - low) * scale + 0.5)``, within the table.
+    """
+    known = slab.maps.get(key)
+    if known is not None:
+        return known
+    ranges_d = measure_cells(resident, slab, stopwatch)
+    device, program = resident.device, resident.program("render/occupancy.cl")
+    bi, bj, bk = slab.bricks
+    bricks = bi * bj * bk
+    counts_d = upload(device, np.concatenate([[0], np.cumsum(shown)]).astype(np.int32))
+    from_d, to_d = allocate(device, bricks), allocate(device, bricks)
+    launch(
+        device, program["mark_bricks"], bricks,
+        ranges_d, counts_d, from_d, np.float32(low), np.float32(scale), np.int32(len(shown)), np.uint32(bricks),
+        stopwatch=stopwatch,
+    )  # fmt: skip
+    launch(
+        device, program["spread_in_rows"], -(-bj * bk // ROWS_AT_ONCE),
+        from_d, to_d, np.int32(bi), np.uint32(bj * bk), stopwatch=stopwatch,
+    )  # fmt: skip
+    for outer, count, stride in ((bk, bj, bi), (1, bk, bi * bj)):
+        from_d, to_d = to_d, from_d
+        chunks = -(-stride // 16)
+        items = outer * count * chunks
+        launch(
+            device, program["spread_along"], items,
+            from_d, to_d, np.int32(count), np.int32(stride), np.int32(chunks), np.uint32(items),
+            stopwatch=stopwatch,
+        )  # fmt: skip
+    from_d = to_d
+    slab.maps.clear()  # one a slab: a map is made in some milliseconds
+    marked = download(device, np.empty((bk, bj, bi), np.uint8), from_d) == 0
+    made = slab.maps[key] = LeapMap(from_d, _find_box(resident.volume, marked, slab))
+    return made
+
+
+def _find_box(volume: Volume, marked: NDArray[np.bool_], slab: RaySlab) -> tuple[Float64Array, Float64Array] | None:
+    ends = []
+    across = np.any(marked, axis=0)
+    each = np.any(across, axis=0), np.any(across, axis=1), np.any(marked, axis=(1, 2))
+    for along, cells in zip(each, slab.brick_cells, strict=True):
+        where = np.flatnonzero(along)
+        if not len(where):
+            return None
+        ends.append((where[0] * cells, (where[-1] + 1) * cells))
+    low, high = np.array(ends, dtype=np.float64).T
+    low[2] += slab.first_k
+    high[2] += slab.first_k
+    # Cells at the ends reach to the border of the volume.
+    return enclose(volume, low - BOX_BORDER, high + BOX_BORDER)

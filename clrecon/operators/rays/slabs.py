@@ -1,0 +1,250 @@
+"""Slabs of a volume for rays, and what their bricks hold: which show something, and how far the next one is."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clrecon.geometry import Volume, slice_normal
+from clrecon.geometry.affine import Float64Array
+from clrecon.labels import ResampledLabels
+from clrecon.opencl import Stopwatch, check_budget, upload
+from clrecon.operators.resident.device_volume import DeviceVolume
+from clrecon.rendering.views.camera import Camera
+
+__all__ = [
+    "BRICK_CELLS",
+    "FARTHEST",
+    "RAYS",
+    "LeapMap",
+    "RaySlab",
+    "choose_brick_cells",
+    "entry_slice",
+    "pad_slices",
+    "plan_ray_slabs",
+    "ray_slabs",
+    "slab_labels",
+]
+
+BRICK_CELLS = 4
+"""Cells of a brick along i and j, as in cl/include/leap.h."""
+
+FARTHEST = 15
+"""Bricks that a leap goes at most, as in cl/include/leap.h: with that as its margin none is left."""
+
+
+def choose_brick_cells(volume: Volume) -> tuple[int, int, int]:
+    """Cells of a brick along i, j and k: fewer along k where slices lie farther apart than voxels in them."""
+    di, dj, dk = volume.spacing
+    across = dk / max(di, dj)
+    return BRICK_CELLS, BRICK_CELLS, 1 if across >= 3.0 else 2 if across >= 1.5 else BRICK_CELLS
+
+
+OVERLAP = 2
+"""Slices that a slab holds beyond its own at either side: those that cells and gradients at its ends read."""
+
+MOST_VOXELS = (1 << 31) - 1
+"""Of a slab, where kernels take several samples at once: what they differ by in their places is an int."""
+
+RAYS = "rays"
+"""What slabs are planned for."""
+
+_BRICKS, _LABELS = "bricks for rays", "labels for rays"
+"""What is kept of a whole volume."""
+
+
+def entry_slice(volume: Volume, camera: Camera) -> float:
+    """Slice coordinate that the rays of a picture come from, see `ray_slabs`; infinite for parallel rays."""
+    if camera.is_parallel:  # however far back they begin, in a view along the slices too
+        normal = slice_normal(volume.affine)
+        rate = float(normal @ camera.basis().forward) * float(normal @ volume.affine[:3, 2])
+        return -np.inf if rate > 0.0 else np.inf
+    return float(volume.lps_to_ijk([camera.position])[0, 2])
+
+
+@dataclass
+class LeapMap:
+    """Which bricks of a slab show something, and how far the next one is.
+
+    Attributes
+    ----------
+    distances_d : buffer, (bk, bj, bi) uint8
+        Chebyshev distance in bricks, 0 where something shows.
+    box : (low, high) or None
+        Field coordinates of the part of the volume that all bricks with something lie in; None where there is none.
+    """
+
+    distances_d: Any
+    box: tuple[Float64Array, Float64Array] | None
+
+
+@dataclass
+class RaySlab:
+    """Slices ``first_k`` to ``end_k - 1`` of a volume on the device, at least two along each axis.
+
+    Attributes
+    ----------
+    voxels_d : buffer, (end_k - first_k, nj, ni)
+    shape_ijk : (ni, nj, slices) of the buffer
+    low_k, high_k : float
+        Samples with ``low_k <= k < high_k`` are this slab's.
+    stage : int
+        Bit 0: the first slab that a picture goes through, bit 1: the last.
+    ranges_d : buffer, optional
+        See `clrecon.operators.rays.leaps.measure_cells`.
+    maps : dict of LeapMap
+        By what they were made for.
+    """
+
+    voxels_d: Any
+    shape_ijk: tuple[int, int, int]
+    first_k: int
+    low_k: float
+    high_k: float
+    brick_cells: tuple[int, int, int]
+    stage: int = 3
+    ranges_d: Any = None
+    maps: dict[Any, LeapMap] = field(default_factory=dict)
+
+    @property
+    def is_whole(self) -> bool:
+        """The slab is all of the volume."""
+        return self.stage == 3
+
+    @property
+    def bricks(self) -> tuple[int, int, int]:
+        """(bi, bj, bk)."""
+        bi, bj, bk = (max(1, -(-(n - 1) // c)) for n, c in zip(self.shape_ijk, self.brick_cells, strict=True))
+        return bi, bj, bk
+
+    @property
+    def brick_arguments(self) -> tuple[np.int32, ...]:
+        """How kernels are told of bricks: (bi, bj, bk), and cells of each along k."""
+        return tuple(np.int32(n) for n in (*self.bricks, self.brick_cells[2]))
+
+    @property
+    def end_k(self) -> int:
+        """The slice after the last of the buffer."""
+        return self.first_k + self.shape_ijk[2]
+
+
+def pad_slices(voxels: NDArray[Any]) -> NDArray[Any]:
+    """Voxels with every axis of length 1 doubled: a cell needs two, and the field is the same."""
+    for axis, length in enumerate(voxels.shape):
+        if length == 1:
+            voxels = np.repeat(voxels, 2, axis=axis)
+    return voxels
+
+
+def plan_ray_slabs(
+    resident: DeviceVolume, others: Mapping[str, int], extra: Mapping[str, int], labels: ResampledLabels | None = None
+) -> int:
+    """Slices a slab, all where everything fits.
+
+    Parameters
+    ----------
+    resident : DeviceVolume
+    others, extra : mapping of str to int
+        Bytes of what else is on the device, and of what comes with more than one slab.
+    labels : ResampledLabels, optional
+        That go through with the voxels.
+
+    Raises
+    ------
+    DeviceError
+        Not even the smallest slab fits.
+    """
+    ni, nj, nk = resident.volume.shape_ijk
+    cells, size = choose_brick_cells(resident.volume), resident.dtype.itemsize
+
+    def needs(slices: int) -> dict[str, int]:
+        held = nk if slices >= nk else slices + 2 * OVERLAP + 1
+        shape = max(2, ni), max(2, nj), max(2, held)
+        bricks, samples = math.prod(-(-n // c) for n, c in zip(shape, cells, strict=True)), math.prod(shape)
+        beside = {} if labels is None else {"labels": samples * labels.voxels.itemsize}
+        rest = {} if slices >= nk else extra
+        return {"volume": samples * size, "bricks": bricks * (2 * size + 4), **beside, **others, **rest}
+
+    most = None
+    if int(resident.device.kernel_variants["LANES"]) > 1:
+        most = MOST_VOXELS // (max(2, ni) * max(2, nj))
+        most = most if nk <= most else most - 2 * OVERLAP - 1
+    slices = resident.plan(RAYS, nk, needs, own=(_BRICKS, _LABELS), most=most)
+    if slices == 0:
+        check_budget(resident.device, needs(1), resident.memory)
+    return max(slices, 1)
+
+
+def ray_slabs(resident: DeviceVolume, slices: int, entry_k: float, stopwatch: Stopwatch) -> Iterator[RaySlab]:
+    """The volume in slabs of `slices` slices, from the one that the rays come from on.
+
+    Parameters
+    ----------
+    slices : int
+        As `plan_ray_slabs` says.
+    entry_k : float
+        Slice coordinate of the camera: each ray goes away from it, so slabs are taken by their distance from it.
+        Infinite: from that end on.
+    """
+    nk = resident.volume.shape_ijk[2]
+    if slices >= nk:
+        yield _whole_slab(resident, stopwatch)
+        return
+    parts = [(first, min(first + slices, nk)) for first in range(0, nk, slices)]
+    if np.isfinite(entry_k):
+        parts.sort(key=lambda part: max(part[0] - entry_k, entry_k - part[1], 0.0))
+    elif entry_k > 0.0:
+        parts.reverse()
+    cells = choose_brick_cells(resident.volume)
+    for number, (first, end) in enumerate(parts):
+        low, high = (-np.inf if first == 0 else first), (np.inf if end == nk else end)
+        held_first, held_end = max(first - OVERLAP, 0), min(end + OVERLAP + 1, nk)
+        voxels_d, shape = _upload_part(resident, held_first, held_end, stopwatch)
+        stage = (number == 0) + 2 * (number == len(parts) - 1)
+        yield RaySlab(voxels_d, shape, held_first, low, high, cells, stage)
+        resident.volume.release_slices(first, end)
+
+
+def slab_labels(resident: DeviceVolume, slab: RaySlab, labels: ResampledLabels, stopwatch: Stopwatch) -> Any:
+    """The labels of a slab's voxels on the device; those of a whole volume stay there."""
+
+    def make() -> Any:
+        with stopwatch.timed("upload"):
+            return upload(resident.device, pad_slices(labels.voxels[slab.first_k : slab.end_k]))
+
+    if not slab.is_whole:
+        return make()
+    # The labels are kept too: as long as they are, nothing else has their place in memory.
+    return resident.keep(_LABELS, id(labels), labels.voxels.nbytes, lambda: (labels, make()))[1]
+
+
+def _whole_slab(resident: DeviceVolume, stopwatch: Stopwatch) -> RaySlab:
+    """The only slab of a volume that fits; its bricks and their ranges stay with the voxels."""
+
+    def make() -> RaySlab:
+        voxels = resident.volume.voxels
+        padded = pad_slices(voxels)
+        voxels_d = resident.whole(stopwatch) if padded is voxels else resident.upload(padded, stopwatch)
+        nk, nj, ni = padded.shape
+        return RaySlab(voxels_d, (ni, nj, nk), 0, -np.inf, np.inf, choose_brick_cells(resident.volume))
+
+    ni, nj, nk = (max(2, n) for n in resident.volume.shape_ijk)
+    cells = choose_brick_cells(resident.volume)
+    bricks = math.prod(-(-n // c) for n, c in zip((ni, nj, nk), cells, strict=True))
+    return resident.keep(_BRICKS, None, bricks * (2 * resident.dtype.itemsize + 4), make)
+
+
+def _upload_part(
+    resident: DeviceVolume, first: int, end: int, stopwatch: Stopwatch
+) -> tuple[Any, tuple[int, int, int]]:
+    voxels = resident.volume.voxels[first:end]
+    padded = pad_slices(voxels)
+    nk, nj, ni = padded.shape
+    if padded is voxels:
+        return resident.part(first, end, stopwatch), (ni, nj, nk)
+    return resident.upload(padded, stopwatch), (ni, nj, nk)

@@ -1,0 +1,355 @@
+"""`DeviceVolume`: a volume on a device, shared by the surfaces, pictures and slices that are made of it."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Hashable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from types import TracebackType
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clrecon.errors import DeviceMemoryError, UsageError
+from clrecon.geometry import Volume
+from clrecon.geometry.iso_rule import ValueRange
+from clrecon.labels import LabelMap, ResampledLabels, resample_labels
+from clrecon.opencl import (
+    Device,
+    MemoryLimits,
+    Program,
+    Stopwatch,
+    check_memory,
+    choose_device,
+    describe_shortage,
+    load_program,
+    memory_limits,
+    upload,
+)
+from clrecon.operators.resident.stack_table import StackTable
+from clrecon.operators.resident.voxel_types import ray_variants
+
+__all__ = ["DeviceVolume", "open_volume", "take_volume"]
+
+Made = TypeVar("Made")
+
+
+@dataclass(frozen=True)
+class _Kept:
+    of: Hashable
+    value: Any
+    nbytes: int
+
+
+class DeviceVolume:
+    """A volume on a device: uploaded once, and used by every operator that it is given to.
+
+    The voxels go to the device when they are first needed.  Where they do not fit as a whole, beside what an operator
+    needs, that operator takes them in slabs.  The results are the same.  Use it as a context manager, or `close` it.
+
+    Parameters
+    ----------
+    volume : Volume
+        Its voxels must not change as long as this is open.
+    device : Device, str or int, optional
+        See `clrecon.device`; None is the best of the machine.
+    memory : int, optional
+        Bytes that may be taken on the device, by the volume and by all that is made of it at a time; None is all that
+        the device has.
+
+    Attributes
+    ----------
+    volume : Volume
+    device : Device
+    memory : int or None
+    uploaded_bytes : int
+        Voxels that went to the device so far, in bytes.  CPU devices read the computer's own memory: nothing is copied.
+    values : ValueRange
+        Of the voxels.
+    most_slices : dict of str to int
+        Slices a slab that went through where more did not, by what they were for.
+
+    Raises
+    ------
+    UsageError
+        `volume` is no Volume, or `memory` no number of bytes.
+    DeviceError
+        There is no such device.
+
+    Examples
+    --------
+    >>> with clrecon.DeviceVolume(volume) as resident:  # doctest: +SKIP
+    ...     mesh = clrecon.extract_isosurface(resident, 200)
+    ...     picture = clrecon.render(resident, preset="bone")
+    ...     axial = clrecon.cut_slice(resident, "axial")
+    """
+
+    def __init__(self, volume: Volume, device: Device | str | int | None = None, *, memory: int | None = None):
+        if not isinstance(volume, Volume):
+            raise UsageError(f"a DeviceVolume is made of a Volume, not {type(volume).__name__}")
+        check_memory(memory)
+        self.volume = volume
+        self.device = choose_device(device)
+        self.memory = memory
+        self.uploaded_bytes = 0
+        self.values = ValueRange(volume)
+        self._lock = threading.RLock()
+        self._context: Any = None
+        self._whole_d: Any = None
+        self._kept: dict[str, _Kept] = {}
+        self._taken: tuple[LabelMap, ResampledLabels] | None = None
+        self._part_bytes = 0
+        self.most_slices: dict[str, int] = {}
+
+    def __enter__(self) -> DeviceVolume:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Free all that is on the device.  What is asked for later is uploaded again."""
+        self.release()
+        self._taken = None
+
+    # What is on the device
+
+    @property
+    def dtype(self) -> np.dtype[Any]:
+        """Type of the voxels."""
+        return self.volume.voxels.dtype
+
+    @property
+    def is_held(self) -> bool:
+        """All voxels are on the device."""
+        self._check_context()
+        return self._whole_d is not None
+
+    def whole(self, stopwatch: Stopwatch) -> Any:
+        """All voxels on the device, (nk, nj, ni); they stay there."""
+        with self._lock:
+            self._check_context()
+            if self._whole_d is None:
+                self._whole_d = self.upload(self.volume.voxels, stopwatch)
+            return self._whole_d
+
+    def part(self, first: int, end: int, stopwatch: Stopwatch) -> Any:
+        """Slices `first` to ``end - 1`` on the device, in place of all else that is there."""
+        with self._lock:
+            self._whole_d = None
+            self._kept = {key: kept for key, kept in self._kept.items() if not kept.nbytes}
+        part_d = self.upload(self.volume.voxels[first:end], stopwatch)
+        self._part_bytes += self.volume.voxels[first:end].nbytes
+        return part_d
+
+    def pays_whole(self, slices: int) -> bool:
+        """Whether to take all voxels where `slices` of them are needed: with those of before it would be as many."""
+        return self.is_held or self._part_bytes + slices * self.slice_bytes >= self.volume.voxels.nbytes
+
+    @property
+    def slice_bytes(self) -> int:
+        """Bytes of a slice."""
+        ni, nj, _ = self.volume.shape_ijk
+        return ni * nj * int(self.dtype.itemsize)
+
+    def upload(self, voxels: NDArray[Any], stopwatch: Stopwatch) -> Any:
+        """Voxels of this volume, in whatever order and number, on the device."""
+        with stopwatch.timed("upload"):
+            voxels_d = upload(self.device, voxels)
+        self.uploaded_bytes += voxels.nbytes
+        return voxels_d
+
+    def keep(self, what: str, of: Hashable, nbytes: int, make: Callable[[], Made]) -> Made:
+        """What an operator has made and will want again, on the device: one thing of each kind.
+
+        It is dropped when it is asked for of something else, with the voxels, or where another operator needs the room.
+
+        Parameters
+        ----------
+        what : str
+            The kind, for messages about memory.
+        of : hashable
+            What it follows from, beside the volume.
+        nbytes : int
+            Bytes that it takes on the device; 0 for small tables, which stay when the voxels go.
+        make : callable
+            Makes it.
+        """
+        with self._lock:
+            self._check_context()
+            kept = self._kept.get(what)
+            if kept is None or kept.of != of:
+                self._kept.pop(what, None)
+                kept = self._kept[what] = _Kept(of, make(), nbytes)
+            made: Made = kept.value
+            return made
+
+    def kept_bytes(self, what: str) -> int:
+        """Bytes on the device of what is kept of a kind; 0 where nothing is."""
+        kept = self._kept.get(what)
+        return 0 if kept is None else kept.nbytes
+
+    @property
+    def stack(self) -> StackTable:
+        """Where the slices lie, on the device."""
+        return self.keep("places of the slices", None, 0, lambda: StackTable.of(self.volume, self.device))
+
+    def program(self, name: str, **variants: str) -> Program:
+        """Build a kernel file that samples this volume along rays."""
+        own = {"UNEVEN": "1"} if self.volume.uneven else {}
+        return load_program(self.device, name, {**ray_variants(self.device, self.dtype), **own, **variants})
+
+    def release(self) -> None:
+        """Free all that is on the device."""
+        with self._lock:
+            self._whole_d = None
+            self._kept = {}
+
+    def _check_context(self) -> None:
+        """Forget what was on a device that failed: it is lost."""
+        context = self.device.context
+        if self._context is not context:
+            self.release()
+            self._context = context
+
+    # Labels
+
+    def bring(self, labels: LabelMap) -> ResampledLabels:
+        """A label map on the grid of the volume, see `resample_labels`; the last one is kept."""
+        with self._lock:
+            if self._taken is None or self._taken[0] is not labels:
+                self._taken = labels, resample_labels(labels, self.volume)
+            return self._taken[1]
+
+    # Slabs
+
+    @property
+    def limits(self) -> MemoryLimits:
+        """What may be taken on the device."""
+        return memory_limits(self.device, self.memory)
+
+    def plan(
+        self,
+        what: str,
+        total: int,
+        needs: Callable[[int], Mapping[str, int]],
+        *,
+        own: tuple[str, ...] = (),
+        most: int | None = None,
+    ) -> int:
+        """How many slices go through the device together: `total` where that fits, else as many as fit, or 0.
+
+        Parameters
+        ----------
+        what : str
+            What the slabs are for.  Where thinner ones had to be taken for it before, see `halve`, they are again.
+        total : int
+            Slices of the volume, or of a grid of samples around it.
+        needs : callable
+            Bytes of every buffer with so many slices, by what it is.
+        own : tuple of str
+            Kinds of what `needs` counts already; all else that is kept comes on top, and goes where it is in the way.
+        most : int, optional
+            Slices that kernels can take together.
+        """
+        limits = self.limits
+        most = min(total if most is None else most, self.most_slices.get(what, total))
+
+        def fits(slices: int, beside: Mapping[str, int]) -> bool:
+            return slices <= most and not describe_shortage(limits, {**needs(slices), **beside})
+
+        others = {key: kept.nbytes for key, kept in self._kept.items() if key not in own and kept.nbytes}
+        if fits(total, others):
+            return total
+        with self._lock:
+            self._kept = {key: kept for key, kept in self._kept.items() if key in own}
+        if fits(total, {}):
+            return total
+        low, high = 0, total
+        while high - low > 1:
+            middle = (low + high) // 2
+            low, high = (middle, high) if fits(middle, {}) else (low, middle)
+        return low
+
+    def halve(
+        self,
+        what: str,
+        slices: int,
+        attempt: Callable[[int], Made],
+        *,
+        fewest: int = 1,
+        warnings: list[str] | None = None,
+    ) -> Made:
+        """Try with `slices` slices a slab, and with half as many for as long as the device has no room.
+
+        Parameters
+        ----------
+        what : str
+            As in `plan`.
+        slices : int
+            As `plan` says.
+        attempt : callable
+            Called with the slices a slab.  All that it has on the device it makes itself: what was there is gone.
+        fewest : int
+            Slices below which it is not tried again.
+        warnings : list of str, optional
+            Gets a line for each time.
+
+        Raises
+        ------
+        DeviceMemoryError
+            Slabs of `fewest` slices do not go through either.
+        """
+        is_last = False
+        while True:
+            try:
+                return attempt(slices)
+            except DeviceMemoryError as error:
+                self.release()
+                if is_last:
+                    raise
+                is_last = slices <= fewest  # once more, with nothing else on the device
+                slices = self.most_slices[what] = max(fewest, -(-slices // 2))
+                if warnings is not None:
+                    warnings.append(f"{error}: continued with slabs of {slices} slices")
+
+
+@contextmanager
+def open_volume(
+    volume: Volume | DeviceVolume, device: Device | str | int | None, memory: int | None, what: str
+) -> Iterator[DeviceVolume]:
+    """A volume on its device: one that is open already, or a new one that is closed at the end.
+
+    Parameters
+    ----------
+    what : str
+        What is to be made of it, for messages, such as "a slice".
+
+    Raises
+    ------
+    UsageError
+        Neither a Volume nor a DeviceVolume, or a device or memory for a DeviceVolume, which has its own.
+    """
+    made, is_new = take_volume(volume, device, memory, what)
+    try:
+        yield made
+    finally:
+        if is_new:
+            made.close()
+
+
+def take_volume(
+    volume: Volume | DeviceVolume, device: Device | str | int | None, memory: int | None, what: str
+) -> tuple[DeviceVolume, bool]:
+    """The same without an end, and whether it is new."""
+    if isinstance(volume, DeviceVolume):
+        if device is not None or memory is not None:
+            raise UsageError("a DeviceVolume has its device and its memory already: leave out device and memory")
+        return volume, False
+    if not isinstance(volume, Volume):
+        raise UsageError(f"{what} needs a Volume, not {type(volume).__name__}: clrecon.Volume(voxels, affine)")
+    return DeviceVolume(volume, device, memory=memory), True

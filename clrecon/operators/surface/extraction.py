@@ -1,0 +1,224 @@
+"""One extraction of an iso surface: from slab to slab of a volume on a device."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import DTypeLike, NDArray
+
+from clrecon.errors import ClreconError, DeviceError, DeviceMemoryError, NoSurfaceError
+from clrecon.geometry import Volume
+from clrecon.geometry.iso_rule import IsoRule, data_range
+from clrecon.geometry.precision import describe_far
+from clrecon.opencl import Device, Program, Stopwatch, describe_shortage, result_pages
+from clrecon.opencl.quirks import cache_warnings
+from clrecon.operators.resident.bricks import BrickStates, brick_bytes, compare_bricks, measure_bricks
+from clrecon.operators.resident.device_volume import DeviceVolume
+from clrecon.operators.surface import marching_cubes
+from clrecon.operators.surface.marching_cubes import Counted, Placement
+from clrecon.operators.surface.slabs import BRICKS, SampleGrid, Slab
+from clrecon.operators.surface.trilinear import prepare_trilinear
+from clrecon.system.progress import Progress
+
+__all__ = ["Extraction", "Part", "prepare_isosurface", "voxel_level"]
+
+Part = tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.uint32]]
+"""Positions, normals and triangles of one slab."""
+
+
+def _refuse_level(device: Device, volume: Volume, rule: IsoRule) -> ClreconError:
+    low, high = data_range(volume)
+    runs = f"the volume runs from {low:g} to {high:g} HU"
+    if rule.inside == "between":
+        marked = sum(int(np.count_nonzero(rule.mark_inside(voxels))) for voxels in volume.voxels)
+        if 0 < marked < volume.voxels.size or (marked and rule.closed):
+            return _refuse_device(device, rule, runs)
+        how_many = "every" if marked else "no"
+        return NoSurfaceError(f"no surface of {rule.describe()}: {how_many} voxel lies within, {runs}")
+    if low < rule.lowest_inside <= high:
+        return _refuse_device(device, rule, runs)
+    where = "above" if rule.lowest_inside > high else "at or below the lowest of"
+    return NoSurfaceError(f"no surface {rule.describe_place()}: {runs}, the iso value lies {where} that range")
+
+
+def _refuse_device(device: Device, rule: IsoRule, runs: str) -> DeviceError:
+    return DeviceError(
+        f"{device.label} found no surface {rule.describe_place()} although {runs}: it computes wrongly,"
+        " see `clrecon selftest` and try another device"
+    )
+
+
+def voxel_level(device: Device, volume: Volume, rule: IsoRule) -> Any:
+    """The lowest inside value as a scalar of the voxels' own type."""
+    dtype = volume.voxels.dtype
+    if dtype.kind == "f":
+        return np.float32(rule.lowest_inside)
+    limits = np.iinfo(dtype)
+    if rule.lowest_inside > limits.max:
+        raise _refuse_level(device, volume, rule)
+    return dtype.type(max(rule.lowest_inside, limits.min))
+
+
+def _voxel_levels(device: Device, volume: Volume, rule: IsoRule) -> tuple[Any, ...]:
+    """The same and, of a range, the highest inside value."""
+    level, highest, dtype = voxel_level(device, volume, rule), rule.highest_inside, volume.voxels.dtype
+    if highest is None:
+        return (level,)
+    if dtype.kind == "f":
+        return level, np.float32(highest)
+    limits = np.iinfo(dtype)
+    if highest < max(rule.lowest_inside, limits.min):
+        raise _refuse_level(device, volume, rule)
+    return level, dtype.type(min(highest, limits.max))
+
+
+def _join(parts: list[Part]) -> Part:
+    """The parts of all slabs behind each other; each is freed as soon as it is copied."""
+    if len(parts) == 1:
+        return parts[0]
+    joined: list[NDArray[Any]] = []
+    for which in range(3):
+        rows = sum(len(part[which]) for part in parts)
+        joined.append(result_pages.empty((rows, 3), parts[0][which].dtype))
+    filled = [0, 0, 0]
+    while parts:
+        for which, array in enumerate(parts.pop(0)):
+            joined[which][filled[which] : filled[which] + len(array)] = array
+            filled[which] += len(array)
+    return joined[0], joined[1], joined[2]
+
+
+class Extraction:
+    """One extraction: from slab to slab, with fewer slices a slab when the device has no room for more."""
+
+    def __init__(self, resident: DeviceVolume, grid: SampleGrid, placement: Placement):
+        self.resident = resident
+        self.device = resident.device
+        self.grid = grid
+        self.placement = placement
+        self.was_held = resident.is_held
+        self.levels = _voxel_levels(resident.device, resident.volume, grid.rule)
+        self.stopwatch = Stopwatch()
+        self.slabs = self.first = self.vertices = self.triangles = 0
+        self.parts: list[Part] = []
+        self.largest = {"volume": 0, "scratch": 0, "output": 0}
+        self.warnings: list[str] = []
+
+    def run(self, slices: int, progress: Progress | None) -> Part:
+        """Go through the grid, `slices` at a time or fewer."""
+        self.resident.halve(
+            self.grid.kind, slices, lambda slices: self._go_on(slices, progress), warnings=self.warnings
+        )
+        if self.triangles == 0:
+            raise _refuse_level(self.device, self.grid.volume, self.grid.rule)
+        try:
+            return _join(self.parts)
+        except MemoryError as error:
+            raise DeviceError(f"the mesh does not fit the memory of this computer: {error}") from error
+
+    def _go_on(self, slices: int, progress: Progress | None) -> None:
+        """From the first slice that is not done to the last."""
+        gk = self.grid.shape[2]
+        while self.first < gk:
+            slab = Slab(self.grid, self.first, min(self.first + slices, gk))
+            part = self._one_slab(slab)
+            self.parts.append(part)
+            self.vertices, self.triangles = self.vertices + len(part[0]), self.triangles + len(part[2])
+            if max(self.vertices, self.triangles) >= 2**32:
+                raise marching_cubes.too_many(self.vertices, self.triangles)
+            self.slabs += 1
+            self.first = slab.end
+            if progress is not None and (slab.end < gk or self.slabs > 1):
+                progress("slabs", slab.end, gk)
+
+    def _one_slab(self, slab: Slab) -> Part:
+        device, stopwatch = self.device, self.stopwatch
+        volume, inside = self.grid.volume, self.grid.rule.inside
+        program = prepare_isosurface(device, volume.voxels.dtype, uneven=volume.uneven, inside=inside)
+        voxels_d = self.resident.whole(stopwatch) if slab.is_whole else self._upload_part(slab)
+        with stopwatch.running(device):
+            bricks = self._compare_bricks(slab, voxels_d)
+            classified = marching_cubes.classify(device, slab, voxels_d, self.levels, stopwatch, bricks)
+            counted = marching_cubes.count(device, slab, program, classified, stopwatch, voxels_d)
+        self._check_output(slab, counted)
+        part = marching_cubes.emit(
+            device, slab, program, voxels_d, classified, counted, self.placement, self.vertices, stopwatch
+        )
+        self.grid.volume.release_slices(*slab.voxel_slices)
+        return part
+
+    def _upload_part(self, slab: Slab) -> Any:
+        return self.resident.part(*slab.voxel_slices, self.stopwatch)
+
+    def _compare_bricks(self, slab: Slab, voxels_d: Any) -> BrickStates | None:
+        """How the bricks of a whole volume compare with the only level; None before it pays to measure them.
+
+        Measuring takes as long as the first pass over the volume, so the first use of a volume does without.  So do
+        ranges and what lies below a level: all voxels are read for them.
+        """
+        if not slab.is_whole or not self.was_held or slab.grid.rule.inside != "above":
+            return None
+        volume, stopwatch = self.grid.volume, self.stopwatch
+        ranges = self.resident.keep(
+            BRICKS, None, brick_bytes(volume.shape_ijk, volume.voxels.dtype),
+            lambda: measure_bricks(
+                self.device, voxels_d, volume.shape_ijk, volume.voxels.dtype, stopwatch=stopwatch
+            ),
+        )  # fmt: skip
+        ni, border = volume.shape_ijk[0], slab.grid.rule.border
+        return compare_bricks(self.device, ranges, self.levels[0], ni, border, stopwatch=stopwatch)
+
+    def _check_output(self, slab: Slab, counted: Counted) -> None:
+        """Refuse a slab whose mesh does not fit beside the rest; note what the slab takes."""
+        needs = slab.needs(counted.output())
+        needs["active words"] = 4 * counted.active_words
+        kept = self.resident.kept_bytes(BRICKS)
+        if slab.is_whole and kept:
+            needs[BRICKS] = kept
+        shortage = describe_shortage(self.resident.limits, needs)
+        if shortage:
+            raise DeviceMemoryError(shortage)
+        output, volume = sum(counted.output().values()), needs["volume"]
+        for what, size in (("volume", volume), ("output", output), ("scratch", sum(needs.values()) - volume - output)):
+            self.largest[what] = max(self.largest[what], size)
+
+    def describe(self, vertices: int, triangles: int) -> dict[str, Any]:
+        """The report of a mesh: how it was made, free of patient data."""
+        rule = self.grid.rule
+        return {
+            **rule.as_report(),
+            "closed_at_border": rule.closed,
+            "topology": rule.topology,
+            "outside_hu": rule.outside if rule.closed else None,
+            "affine_ijk_to_lps_mm": self.grid.volume.affine.tolist(),
+            "certificate": self.grid.volume.report,
+            "device": self.device.label,
+            "driver": self.device.driver,
+            "slabs": self.slabs,
+            "device_bytes": dict(self.largest),
+            "seconds": dict(self.stopwatch.seconds),
+            "kernel_seconds": dict(self.stopwatch.by_kernel),
+            "warnings": [*cache_warnings(), *describe_far(self.grid.volume), *self.warnings],
+        }
+
+
+def prepare_isosurface(
+    device: Device,
+    dtype: DTypeLike = np.int16,
+    topology: str = "separated",
+    uneven: bool = False,
+    inside: str = "above",
+) -> Program:
+    """Build the kernels for volumes of `dtype`, so that a later `extract_isosurface` with `topology` need not wait.
+
+    With `uneven` those for volumes whose slices no affine places; `inside` as `IsoRule.inside`.
+
+    Raises
+    ------
+    DeviceError
+        The driver's compiler refuses.
+    """
+    if topology == "trilinear":
+        prepare_trilinear(device, dtype)
+    return marching_cubes.prepare_marching_cubes(device, dtype, uneven=uneven, inside=inside)

@@ -1,0 +1,238 @@
+"""One volume on a device for surfaces, pictures, slices and labels: shared, lost with the device, or taken in slabs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import tolerances
+from surface_volumes import OBLIQUE, smooth_volume
+
+import clrecon
+from clrecon.errors import DeviceError, DeviceMemoryError, UsageError
+from clrecon.labels import LabelMap, resample
+from clrecon.operators.resident.device_volume import DeviceVolume
+
+SIZE = (24, 20)
+
+
+@pytest.fixture(scope="module")
+def volume():
+    return smooth_volume((22, 26, 45))
+
+
+@pytest.fixture(scope="module")
+def labels(volume):
+    numbers = np.zeros(volume.voxels.shape, np.uint8)
+    numbers[3:12, 4:20, 5:30], numbers[12:20, 4:20, 5:30] = 1, 2
+    return LabelMap(numbers, volume.affine)
+
+
+def centre_line(volume):
+    ni, nj, nk = volume.shape_ijk
+    return volume.ijk_to_lps([(ni / 2, nj / 2, k) for k in np.linspace(1, nk - 2, 6)])
+
+
+def values(picture) -> list[np.ndarray]:
+    return [picture.image, picture.depth] + ([] if picture.values is None else [picture.values])
+
+
+def mesh_arrays(*meshes) -> list[np.ndarray]:
+    return [array for mesh in meshes for array in (mesh.vertices, mesh.triangles, mesh.normals)]
+
+
+WORK: dict[str, Callable] = {
+    "surface": lambda v, _: mesh_arrays(clrecon.extract_isosurface(v, 100)),
+    "trilinear": lambda v, _: mesh_arrays(clrecon.extract_isosurface(v, 100, topology="trilinear")),
+    "range": lambda v, _: mesh_arrays(clrecon.extract_isosurface(v, (50, 200))),
+    "labels": lambda v, labels: mesh_arrays(*clrecon.extract_labels(v, labels, 100).values()),
+    "dvr": lambda v, _: values(clrecon.render(v, preset="muscle", size=SIZE)),
+    "dvr labels": lambda v, labels: values(clrecon.render(v, preset="muscle", labels=labels, size=SIZE)),
+    "mip": lambda v, _: values(clrecon.render(v, "mip", size=SIZE)),
+    "drr": lambda v, _: values(clrecon.render(v, "drr", size=SIZE)),
+    "ray surface": lambda v, labels: values(clrecon.render(v, "surface", iso_value=100, labels=labels, size=SIZE)),
+    "slices": lambda v, _: values(clrecon.render(v, "slices", size=SIZE, view=(20, 30))),
+    "slice": lambda v, _: values(clrecon.cut_slice(v, "coronal", SIZE)),
+    "thick slice": lambda v, _: values(clrecon.cut_slice(v, (20, 30), SIZE, thickness=4.0, combine="max")),
+    "cpr": lambda v, _: values(clrecon.reformat_curve(v, centre_line(v.volume), size=SIZE)),
+}
+PICTURES = {"dvr", "dvr labels", "ray surface", "drr", "slices"}
+"""Where rays go through slabs, float32 sums may round otherwise."""
+
+
+def assert_equal(found, expected, work: str) -> None:
+    for one, other in zip(found, expected, strict=True):
+        if work in PICTURES and one.dtype == np.uint8:
+            assert np.abs(one.astype(int) - other.astype(int)).max() <= tolerances.RAY_SAME_255
+        elif work in PICTURES:
+            assert np.allclose(one, other, rtol=1e-5, atol=1e-3, equal_nan=True)
+        else:
+            assert np.array_equal(one, other, equal_nan=one.dtype.kind == "f")
+
+
+class Failing:
+    """Counts buffers and launches, and lets the n-th of one kind fail as drivers do."""
+
+    def __init__(self, monkeypatch, kind: str, fails: int):
+        import pyopencl as cl
+
+        from clrecon.opencl import arrays
+
+        self.kind, self.fails, self.counts = kind, fails, {"buffer": 0, "launch": 0}
+        true_buffer, true_call = arrays._make_buffer, cl.Kernel.__call__
+
+        def make_buffer(device, flags, size, host=None):
+            if self._is_due("buffer"):
+                raise DeviceMemoryError(f"{size:,} bytes cannot be had on {device.label}: injected")
+            return true_buffer(device, flags, size, host)
+
+        def call(kernel, *arguments, **options):
+            if self._is_due("launch"):
+                raise cl.MemoryError("injected")
+            return true_call(kernel, *arguments, **options)
+
+        monkeypatch.setattr(arrays, "_make_buffer", make_buffer)
+        monkeypatch.setattr(cl.Kernel, "__call__", call)
+
+    def _is_due(self, kind: str) -> bool:
+        self.counts[kind] += 1
+        return self.kind == kind and self.counts[kind] == self.fails
+
+
+@pytest.mark.parametrize("kind", ["buffer", "launch"])
+@pytest.mark.parametrize("work", WORK)
+def test_whatever_buffer_or_launch_fails_the_result_is_the_same(device, volume, labels, monkeypatch, work, kind):
+    with monkeypatch.context() as patch, DeviceVolume(volume, device) as resident:
+        counted = Failing(patch, kind, 0)
+        expected = WORK[work](resident, labels)
+    count = counted.counts[kind]
+    assert count > 0
+    for fails in range(1, count + 1, max(1, count // 12)):
+        with monkeypatch.context() as patch, DeviceVolume(volume, device) as resident:
+            failing = Failing(patch, kind, fails)
+            found = WORK[work](resident, labels)
+            assert failing.counts[kind] > fails
+        assert_equal(found, expected, work)
+
+
+def test_a_failure_is_said_in_the_report(device, volume, monkeypatch):
+    with DeviceVolume(volume, device) as resident:
+        for fails, make in (
+            (1, lambda: clrecon.render(resident, "mip", size=SIZE)),
+            (1, lambda: clrecon.cut_slice(resident, "coronal", SIZE)),
+            (2, lambda: clrecon.extract_isosurface(resident, 100)),
+        ):
+            resident.close()
+            with monkeypatch.context() as patch:
+                Failing(patch, "buffer", fails)
+                warnings = make().report["warnings"]
+            assert any("injected: continued with slabs of" in warning for warning in warnings)
+
+
+def test_a_device_without_any_room_is_an_error_in_the_end(device, volume, labels, monkeypatch):
+    from clrecon.opencl import arrays
+
+    def no_room(device, flags, size, host=None):
+        raise DeviceMemoryError("no room for 1 byte")
+
+    for work, do in WORK.items():
+        with DeviceVolume(volume, device) as resident, monkeypatch.context() as patch:
+            patch.setattr(arrays, "_make_buffer", no_room)
+            with pytest.raises(DeviceError, match="no room for 1 byte"):
+                do(resident, labels)
+            assert resident.uploaded_bytes == 0, work
+
+
+def test_a_mesh_a_rendering_and_three_slices_upload_the_volume_once(device, volume):
+    with DeviceVolume(volume, device) as resident:
+        clrecon.extract_isosurface(resident, 100)
+        clrecon.render(resident, preset="muscle", size=SIZE)
+        for plane in ("axial", "coronal", "sagittal"):
+            clrecon.cut_slice(resident, plane, SIZE)
+        clrecon.reformat_curve(resident, centre_line(volume), size=SIZE)
+        clrecon.render(resident, "slices", size=SIZE)
+        assert resident.uploaded_bytes == volume.voxels.nbytes
+
+
+def test_slices_alone_upload_what_they_meet_and_not_more_than_twice_the_volume(device, volume):
+    with DeviceVolume(volume, device) as resident:
+        clrecon.cut_slice(resident, "axial", SIZE)
+        assert resident.uploaded_bytes < volume.voxels.nbytes / 2
+        for offset in np.linspace(-8.0, 8.0, 40):
+            clrecon.cut_slice(resident, "axial", SIZE, offset_mm=offset)
+        assert resident.uploaded_bytes <= 2 * volume.voxels.nbytes
+        assert resident.is_held
+
+
+@pytest.mark.parametrize("work", WORK)
+def test_a_shared_volume_gives_what_one_of_its_own_does(device, volume, labels, work):
+    with DeviceVolume(volume, device) as own:
+        expected = WORK[work](own, labels)
+    with DeviceVolume(volume, device) as shared:
+        for other in WORK.values():
+            other(shared, labels)
+        assert_equal(WORK[work](shared, labels), expected, "exact")
+
+
+def test_a_turntable_of_labels_brings_the_map_to_the_grid_once(device, volume, monkeypatch):
+    coarse = LabelMap(np.ones((6, 8, 12), np.uint8), volume.affine @ np.diag([3.5, 3.0, 3.5, 1.0]))
+    calls = []
+    true_take = resample._take_nearest
+    monkeypatch.setattr(resample, "_take_nearest", lambda *both: calls.append(1) or true_take(*both))
+    with clrecon.VolumeRenderer(volume, device) as renderer:
+        for azimuth in range(0, 360, 60):
+            renderer.render(preset="muscle", labels=coarse, view=(azimuth, 0), size=SIZE)
+    assert len(calls) == 1
+
+
+def test_what_is_kept_makes_room_for_what_is_needed(device, volume):
+    """Enough memory for any of them alone, not for what all would like to keep."""
+    voxels = volume.voxels.nbytes
+    with DeviceVolume(volume, device, memory=3 * voxels) as resident:
+        first = clrecon.extract_isosurface(resident, 100)
+        clrecon.render(resident, preset="muscle", size=SIZE)
+        again = clrecon.extract_isosurface(resident, 100)
+        assert resident.uploaded_bytes >= voxels
+    assert np.array_equal(first.vertices, again.vertices)
+
+
+def test_a_device_volume_has_its_own_device_and_memory(device, volume):
+    with DeviceVolume(volume, device) as resident:
+        for call in (
+            lambda: clrecon.extract_isosurface(resident, 100, device=device),
+            lambda: clrecon.render(resident, memory=10**9),
+            lambda: clrecon.VolumeRenderer(resident, device),
+            lambda: clrecon.SurfaceExtractor(resident, memory=10**9),
+            lambda: clrecon.cut_slice(resident, device=device),
+        ):
+            with pytest.raises(UsageError, match="has its device and its memory already"):
+                call()
+    for wrong in (None, volume.voxels):
+        with pytest.raises(UsageError, match="made of a Volume"):
+            DeviceVolume(wrong, device)
+    with pytest.raises(UsageError, match="whole number of bytes"):
+        DeviceVolume(volume, device, memory=0)
+
+
+def test_renderers_and_extractors_leave_a_volume_that_was_given_on_the_device(device, volume):
+    with DeviceVolume(volume, device) as resident:
+        with clrecon.SurfaceExtractor(resident) as extractor:
+            extractor.extract(100)
+        with clrecon.VolumeRenderer(resident) as renderer:
+            renderer.render("mip", size=SIZE)
+        assert resident.is_held
+    assert not resident.is_held
+
+
+def test_labels_beside_others_are_not_mixed_up(device, volume, labels):
+    swapped = LabelMap(np.where(labels.voxels == 1, 2, np.where(labels.voxels == 2, 1, 0)).astype(np.uint8), OBLIQUE)
+    colors = {1: (1.0, 0.0, 0.0), 2: (0.0, 0.0, 1.0)}
+    with clrecon.VolumeRenderer(volume, device) as renderer:
+        looks = [
+            renderer.render(preset="muscle", labels=which, label_colors=colors, size=SIZE)
+            for which in (labels, swapped, labels, swapped)
+        ]
+    seen = [look.image for look in looks]
+    assert np.array_equal(seen[0], seen[2]) and np.array_equal(seen[1], seen[3])
+    assert not np.array_equal(seen[0], seen[1])
