@@ -382,9 +382,13 @@ def extract_label_masks(
         raise RefusedInputError("the label map is empty: no voxel has a label")
     marching_cubes.check_row(labels.shape_ijk[0])
     chosen = choose_numbers(labels, numbers)
-    run = _Run(labels, choose_device(device), memory, closed)
-    everywhere, faces = survey_labels(labels, run.device, memory, run.stopwatch)
-    if closed and faces[:, 1].any() and (enclosed := find_enclosed(labels.voxels, faces, everywhere)):
+    return _make_meshes(_Run(labels, choose_device(device), memory, closed), chosen, progress)
+
+
+def _make_meshes(run: _Run, chosen: Sequence[int], progress: Progress | None) -> dict[int, Mesh]:
+    labels = run.labels
+    everywhere, faces = survey_labels(labels, run.device, run.memory, run.stopwatch)
+    if run.grid.rule.closed and faces[:, 1].any() and (enclosed := find_enclosed(labels.voxels, faces, everywhere)):
         run.keep_enclosed(enclosed, everywhere)
     boxes = {number: everywhere[number] for number in chosen}
     meshes: dict[int, Mesh] = {}
