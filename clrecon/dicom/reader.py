@@ -22,11 +22,14 @@ from clrecon.dicom.series.scan import BARE_DATA_SET, Scan, scan_path
 from clrecon.dicom.series.series import Series, group_series
 from clrecon.errors import NoDicomError, RefusedInputError, UsageError
 from clrecon.geometry import Volume
+from clrecon.system.log import get_logger, log_warnings
 from clrecon.system.progress import Progress
 from clrecon.system.text import escape_text, join_names
 from clrecon.system.wording import name_parameter
 
 __all__ = ["list_series", "read_volume"]
+
+log = get_logger(__name__)
 
 
 def read_volume(
@@ -86,6 +89,8 @@ def read_volume(
         *left,
     ]
     report = certify(chosen, stack, facts, scan, stack.affine, warnings, likeness)
+    log.info("series %d of %d read: %s voxels %s", chosen.number, len(found), voxels.shape[::-1], voxels.dtype)
+    log_warnings(log, report["warnings"])
     return Volume(voxels, stack.affine, report, stack.slice_positions, hu_range=(facts.hu_min, facts.hu_max))
 
 
@@ -200,7 +205,9 @@ def _scan_and_group(path: str | os.PathLike[str], progress: Progress | None, for
         bare = sum(suspect.reason.startswith(BARE_DATA_SET) for suspect in scan.suspects)
         hint += f"; {bare} like {BARE_DATA_SET} ({describe_way_out()})" if bare else ""
         raise NoDicomError(f"no DICOM images in {shown}: {looked}{hint}")
-    return scan, group_series(scan)
+    found = group_series(scan)
+    log.debug("%d files: %d slices in %d series, skipped %s", scan.files, len(scan.slices), len(found), scan.skipped)
+    return scan, found
 
 
 def _describe_refusal(series: Series) -> str:

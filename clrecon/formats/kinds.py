@@ -9,7 +9,7 @@ from clrecon.formats.grid_file import GridFile, Purpose
 from clrecon.formats.metaimage import is_metaimage, open_metaimage
 from clrecon.formats.nifti import is_nifti, open_nifti
 from clrecon.formats.nrrd import is_nrrd, open_nrrd
-from clrecon.system.files import open_regular
+from clrecon.system.regular_files import open_regular
 
 __all__ = ["open_grid", "tell_kind"]
 

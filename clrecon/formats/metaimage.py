@@ -24,7 +24,7 @@ from clrecon.formats.extras import import_extra
 from clrecon.formats.grid_file import GridFile, Purpose
 from clrecon.formats.stream import VoxelBytes, file_beside
 from clrecon.geometry.affine import Float64Array, checked_affine
-from clrecon.system.files import open_regular
+from clrecon.system.regular_files import open_regular
 from clrecon.system.text import escape_text
 
 __all__ = ["is_metaimage", "open_metaimage"]

@@ -23,7 +23,7 @@ from clrecon.formats.grid_file import GridFile, Purpose
 from clrecon.formats.stream import VoxelBytes, file_beside, read_bytes
 from clrecon.geometry.affine import Float64Array, checked_affine
 from clrecon.geometry.frames import lps_affine_from_ras
-from clrecon.system.files import open_regular
+from clrecon.system.regular_files import open_regular
 from clrecon.system.text import escape_text
 
 __all__ = ["is_nifti", "nifti_affine", "open_nifti"]

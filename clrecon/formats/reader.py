@@ -12,10 +12,13 @@ from clrecon.formats.grid_file import VOLUME, GridFile
 from clrecon.formats.kinds import open_grid
 from clrecon.formats.values import GridValues, read_values
 from clrecon.geometry import Volume
+from clrecon.system.log import get_logger, log_warnings
 from clrecon.system.progress import Progress
 from clrecon.system.text import escape_text
 
 __all__ = ["list_grid", "read_grid"]
+
+log = get_logger(__name__)
 
 
 def read_grid(path: Path, kind: str, *, progress: Progress | None = None) -> Volume:
@@ -39,6 +42,8 @@ def read_grid(path: Path, kind: str, *, progress: Progress | None = None) -> Vol
     grid = _open(path, kind)
     values = read_values(grid, progress)
     report = certify_grid(grid, values, _collect_warnings(grid, values))
+    log.info("%s file read: %s voxels %s", grid.kind, grid.shape_ijk, values.voxels.dtype)
+    log_warnings(log, report["warnings"])
     return Volume(values.voxels, grid.affine, report, hu_range=(values.facts.hu_min, values.facts.hu_max))
 
 

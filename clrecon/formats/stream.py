@@ -18,7 +18,7 @@ from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Any, BinaryIO, cast
 
 from clrecon.errors import RefusedInputError
-from clrecon.system.files import open_regular
+from clrecon.system.regular_files import open_regular
 from clrecon.system.text import escape_text
 
 __all__ = ["LARGEST_GRID", "VoxelBytes", "check_end", "check_size", "file_beside", "read_bytes"]

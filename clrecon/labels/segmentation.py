@@ -24,7 +24,7 @@ from clrecon.labels.frames import FrameStack, place_frames
 from clrecon.labels.label_map import LabelMap
 from clrecon.labels.overlap import Painter
 from clrecon.labels.stream import empty_labels
-from clrecon.system.files import open_regular
+from clrecon.system.regular_files import open_regular
 from clrecon.system.text import escape_text, hash_uid
 
 __all__ = ["read_segmentation"]

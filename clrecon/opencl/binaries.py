@@ -16,7 +16,11 @@ from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 
+from clrecon.system.log import get_logger
+
 __all__ = ["binary_key", "read_binary", "store_binary"]
+
+log = get_logger(__name__)
 
 _MAGIC = b"clrecon kernels 1\n"
 _MOST_FILES = 64
@@ -56,7 +60,10 @@ def read_binary(key: str) -> bytes | None:
     except OSError:
         return None
     head, binary = content[: len(_MAGIC) + 32], content[len(_MAGIC) + 32 :]
-    return binary if head == _MAGIC + hashlib.sha256(binary).digest() else None
+    if head != _MAGIC + hashlib.sha256(binary).digest():
+        log.info("a kept binary is damaged: it is built anew and replaced")
+        return None
+    return binary
 
 
 def store_binary(key: str, binary: bytes) -> None:

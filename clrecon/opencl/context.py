@@ -11,8 +11,11 @@ from typing import Any
 from clrecon.errors import DeviceError, DeviceMemoryError
 from clrecon.opencl import quirks
 from clrecon.opencl.unknown_cpu import NameOfCpu, has_unknown_cpu
+from clrecon.system.log import get_logger
 
 __all__ = ["GROUP_SIZE", "Device", "describe_error"]
+
+log = get_logger(__name__)
 
 GROUP_SIZE = 64
 """A whole wavefront of every GPU, and small enough to give a CPU's cores equal shares."""
@@ -150,6 +153,7 @@ class Device:
                     self._context = cl.Context([self.cl_device])
                 except (cl.Error, LookupError) as error:
                     raise DeviceError(f"device {self.label} cannot be opened: {describe_error(error)}") from error
+                log.info("device opened: %s, %s, driver %s", self.label, self.version, self.driver)
             return self._context
 
     @property
@@ -179,6 +183,7 @@ class Device:
         with self.lock:
             self._context = self._queue = None
             self.programs.clear()
+        log.info("%s on %s: %s; its context is given up", what, self.label, describe_error(error))
         kind = DeviceMemoryError if isinstance(error, quirks.import_pyopencl().MemoryError) else DeviceError
         return kind(f"{what} on {self.label}: {describe_error(error)}")
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 import warnings
 from collections.abc import Mapping
 from contextlib import suppress
@@ -9,11 +10,14 @@ from typing import Any
 
 from clrecon.errors import DeviceError
 from clrecon.opencl.binaries import binary_key, read_binary, store_binary
-from clrecon.opencl.context import Device
+from clrecon.opencl.context import Device, describe_error
 from clrecon.opencl.quirks import import_pyopencl
 from clrecon.opencl.sources import read_kernel_source
+from clrecon.system.log import get_logger
 
 __all__ = ["Program", "load_program"]
+
+log = get_logger(__name__)
 
 
 class Program:
@@ -59,18 +63,19 @@ def load_program(device: Device, name: str, variants: Mapping[str, str] | None =
 
 
 def _build(device: Device, name: str, options: tuple[str, ...]) -> Program:
-    source = read_kernel_source(name)
+    source, start = read_kernel_source(name), time.perf_counter()
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # a compiler's chatter about code that builds
-            built = _build_from_binary(device, source, options) if device.keeps_binaries else None
-            if built is None:
-                built = _build_from_source(device, source, options)
+            kept = _build_from_binary(device, source, options) if device.keeps_binaries else None
+            built = _build_from_source(device, source, options) if kept is None else kept
             program = Program(name, built)
     except (import_pyopencl().Error, RuntimeError, OSError) as error:  # OSError: the driver's or pyopencl's cache
         raise DeviceError(f"cl/{name} does not build on {device.label}: {_first_complaint(str(error))}") from error
     if not program.kernel_names:
         raise DeviceError(f"cl/{name} has no kernel on {device.label}: its cache is damaged, empty it")
+    origin = "source" if kept is None else "a kept binary"
+    log.debug("cl/%s %s built from %s in %.3f s", name, options, origin, time.perf_counter() - start)
     return program
 
 
@@ -99,7 +104,8 @@ def _build_from_binary(device: Device, source: str, options: tuple[str, ...]) ->
         return None
     try:
         return cl.Program(device.context, [device.cl_device], [binary]).build([*_STANDARD, *options])
-    except (cl.Error, RuntimeError):
+    except (cl.Error, RuntimeError) as error:
+        log.info("a kept binary is refused by the driver (%s): it is built anew and replaced", describe_error(error))
         return None
 
 

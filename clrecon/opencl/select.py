@@ -11,9 +11,12 @@ from typing import Any
 from clrecon.errors import DeviceError
 from clrecon.opencl import quirks
 from clrecon.opencl.context import Device, describe_error
+from clrecon.system.log import get_logger
 from clrecon.system.wording import name_parameter
 
 __all__ = ["choose_device", "driver_advice", "list_devices", "list_platforms"]
+
+log = get_logger(__name__)
 
 
 def driver_advice() -> str:
@@ -136,6 +139,12 @@ def choose_device(name: str | int | Device | None = None) -> Device:
     """
     if isinstance(name, Device):
         return name
+    chosen = _choose(name)
+    log.debug("device %d chosen of %d: %s", chosen.index, len(list_devices()), chosen.label)
+    return chosen
+
+
+def _choose(name: str | int | None) -> Device:
     devices = list_devices()
     if not devices:
         trouble = "".join(f" ({text})" for text in quirks.cache_warnings())

@@ -26,8 +26,8 @@ from clrecon.phantom.scene_plans import plan_scene
 from clrecon.phantom.scenes import CEILING_HU, DENSE_HU, LabelArray, describe_parts, draw_scene
 from clrecon.phantom.settings import CENTRE_LPS_MM, KINDS, PhantomSettings, Placement, place_slices
 from clrecon.phantom.spine import draw_spine
-from clrecon.system.files import read_regular
 from clrecon.system.progress import Progress
+from clrecon.system.regular_files import read_regular
 from clrecon.version import package_version
 
 __all__ = ["SPINE_ISO_HU", "TRUTH_NAME", "label_materials", "make_phantom", "write_phantom"]

@@ -1,4 +1,4 @@
-"""Files that are read are regular ones, and those that are written are found whole, the new one or the old one.
+"""Files that are written are found whole, the new one or the old one.
 
 A file is written to a temporary one in the same folder (created exclusively, readable by the owner only, with a
 random name), flushed to the disk, checked, and only then renamed over the target.  Whatever goes wrong before the
@@ -25,6 +25,8 @@ from pathlib import Path
 from typing import BinaryIO, Protocol
 
 from clrecon.errors import OutputError
+from clrecon.system.log import get_logger
+from clrecon.system.regular_files import open_regular
 
 if sys.platform != "win32":
     import fcntl
@@ -37,13 +39,13 @@ __all__ = [
     "final_mode",
     "hold_interrupts",
     "is_dicom",
-    "open_regular",
-    "read_regular",
     "replace_file",
     "stage_file",
     "system_errors",
     "temporary_folder",
 ]
+
+log = get_logger(__name__)
 
 _FILES_OF_OTHERS = 200
 """Open files that a job has beside those that it writes: libraries, drivers, their caches."""
@@ -52,9 +54,6 @@ _TEMPORARY = re.compile(r"\.clrecon-[0-9a-f]{16}\.(?:tmp|folder)")
 
 _own_names: set[str] = set()
 """Temporary files and folders that this process is writing: with a thousand, looking at each every time would cost."""
-
-# A pipe or device put in the place of a file must not make the reader wait for a writer.
-_READ = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_CLOEXEC", 0) | getattr(os, "O_BINARY", 0)
 
 _ADVICE = {
     errno.ENOSPC: "the disk is full: free some space or choose another folder",
@@ -76,30 +75,6 @@ _KINDS: tuple[tuple[Callable[[int], bool], str], ...] = (
     (stat.S_ISBLK, "a block device: only regular files are written"),
     (stat.S_ISCHR, "a character device: only regular files are written"),
 )
-
-
-def open_regular(path: str | os.PathLike[str], buffering: int = -1) -> BinaryIO:
-    """Open a file for reading, as ``open(path, "rb", buffering)`` does, if it is a regular one.
-
-    Raises
-    ------
-    OSError
-        It cannot be opened, or is a folder, FIFO, socket or device, which is not waited for.
-    """
-    descriptor = os.open(path, _READ)
-    if stat.S_ISREG(os.fstat(descriptor).st_mode):
-        return os.fdopen(descriptor, "rb", buffering)
-    os.close(descriptor)
-    raise OSError(errno.EINVAL, "it is no regular file")
-
-
-def read_regular(path: str | os.PathLike[str], limit: int) -> bytes:
-    """Read a regular file of `limit` bytes at most; raises OSError as `open_regular` does, or where it is larger."""
-    with open_regular(path) as stream:
-        data = stream.read(limit + 1)
-    if len(data) > limit:
-        raise OSError(errno.EFBIG, f"it is larger than {limit:,} bytes")
-    return data
 
 
 def replace_file(
@@ -175,6 +150,7 @@ class StagedFile:
                 self._stream.close()  # an open file cannot be renamed there
             os.replace(self._temporary, self._target)
         _sync_folder(self._target.parent)
+        log.info("file written: %d bytes", self.size)
 
 
 @contextlib.contextmanager
@@ -433,6 +409,7 @@ def _sweep(folder: Path) -> None:
                         shutil.rmtree(temporary, ignore_errors=True)
                     else:
                         temporary.unlink()
+                    log.info("what a process that has ended left unfinished was removed")
             finally:
                 os.close(descriptor)
 

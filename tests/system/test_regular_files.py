@@ -16,7 +16,7 @@ from clrecon.phantom import PhantomSettings, write_phantom
 from clrecon.reading import list_series, read_volume
 from clrecon.rendering import load_transfer_function
 from clrecon.rendering.views.centre_line_files import LARGEST_BYTES, read_curve_points
-from clrecon.system.files import open_regular, read_regular
+from clrecon.system.regular_files import open_regular, read_regular
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="FIFOs and devices of POSIX")
 
@@ -84,7 +84,9 @@ def test_a_phantom_does_not_wait_for_its_truth(tmp_path):
 
 
 OWN = {
-    "system/files.py": "the helper itself",
+    "system/files.py": "locks of folders",
+    "system/mapping.py": "maps a file that it has looked at",
+    "system/regular_files.py": "the helper itself",
     "cli/console.py": "the null device",
     "dicom/pixels/decoder_pool.py": "pipes to its own processes",
     "dicom/pixels/decoder_process.py": "its own pipes and memory",

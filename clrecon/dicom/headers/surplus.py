@@ -23,7 +23,7 @@ from clrecon.dicom.parse.sequences import LONG_VRS, skip_sequence
 from clrecon.dicom.parse.transfer_syntaxes import is_encapsulated
 from clrecon.dicom.parse.values import ValueProblem
 from clrecon.errors import RefusedInputError
-from clrecon.system.files import open_regular
+from clrecon.system.regular_files import open_regular
 from clrecon.system.wording import name_parameter
 
 __all__ = ["check_surplus"]

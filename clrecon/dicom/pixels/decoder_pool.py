@@ -25,9 +25,12 @@ from numpy.typing import NDArray
 
 from clrecon.dicom.pixels.decoder_process import DONE, FAILED, NO_DECODER, NO_MEMORY, READY, REPLY
 from clrecon.errors import RefusedInputError
+from clrecon.system.log import get_logger
 from clrecon.system.text import escape_text
 
 __all__ = ["DecoderError", "DecoderPool"]
+
+log = get_logger(__name__)
 
 SCRIPT = Path(__file__).with_name("decoder_process.py")
 
@@ -211,6 +214,7 @@ class DecoderPool:
                 "cannot be decoded: the process for it does not start "
                 f"({worker.why or f'exit code {code}'}); uncompressed images need none"
             )
+        log.info("a decoder process was given up with exit code %s", code)
         if worker.overdue or -code in _OUT_OF_TIME:
             return f"take longer than {self.seconds:g} s to decode"
         if not ended_itself:

@@ -25,7 +25,7 @@ from clrecon.dicom.parse.transfer_syntaxes import choose_decoder, is_encapsulate
 from clrecon.dicom.pixels.codestream import Codestream, read_codestream
 from clrecon.dicom.pixels.decoder_pool import DecoderError, DecoderPool
 from clrecon.errors import RefusedInputError
-from clrecon.system.files import open_regular
+from clrecon.system.regular_files import open_regular
 
 __all__ = ["StoredPixels"]
 

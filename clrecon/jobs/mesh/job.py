@@ -29,6 +29,7 @@ from clrecon.jobs.shared.outputs import (
     stage_meshes,
 )
 from clrecon.jobs.shared.report import peak_memory_bytes, stage_report
+from clrecon.system.log import get_logger, log_warnings
 from clrecon.system.progress import Progress, ignore_progress
 
 if TYPE_CHECKING:
@@ -39,6 +40,8 @@ if TYPE_CHECKING:
     from clrecon.opencl import Device
 
 __all__ = ["make_mesh"]
+
+log = get_logger(__name__)
 
 _DEVICE_PARTS = ("upload", "build", "kernels", "download")
 
@@ -71,8 +74,7 @@ def make_mesh(
     report_path : path, optional
         Where the report goes as JSON.
     measure : bool, optional
-        Measure the meshes (area, volume, components, manifold or not).  It costs time; without it those entries of
-        the report are None.  Default: when there is a `report_path`.
+        Measure the meshes, which costs time; without it those entries are None.  Default: with a `report_path`.
     progress : callable, optional
         ``progress(stage, done, total)``.
 
@@ -121,7 +123,17 @@ def make_mesh(
         report["peak_memory_bytes"] = peak_memory_bytes()
         return report
 
-    return _write(parts, paths, report_path, settings.space, compose, watch, progress)
+    report = _write(parts, paths, report_path, settings.space, compose, watch, progress)
+    _log(report, volume)
+    return report
+
+
+def _log(report: dict[str, Any], volume: Volume) -> None:
+    log_warnings(log, report["warnings"], volume.report.get("warnings", ()))
+    log.info(
+        "%d meshes made, %d triangles, %d slabs, on %s in %.3f s",
+        *(len(report["meshes"]), report["triangles"], report["slabs"], report["device"], report["seconds"]["total"]),
+    )
 
 
 def _write(

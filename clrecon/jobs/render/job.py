@@ -19,6 +19,7 @@ from clrecon.jobs.shared.opening import DeviceOpening
 from clrecon.jobs.shared.outputs import check_kept, commit_all
 from clrecon.jobs.shared.report import peak_memory_bytes, stage_report
 from clrecon.system.files import allow_open_files
+from clrecon.system.log import get_logger, log_warnings
 from clrecon.system.progress import Progress, ignore_progress
 
 if TYPE_CHECKING:
@@ -28,6 +29,8 @@ if TYPE_CHECKING:
     from clrecon.system.files import Staged
 
 __all__ = ["make_pictures"]
+
+log = get_logger(__name__)
 
 
 def make_pictures(
@@ -94,6 +97,8 @@ def make_pictures(
         if files.report is not None:
             written.append(staged.enter_context(stage_report(files.report, report)))
         commit_all(written)
+    log_warnings(log, report["warnings"], volume.report.get("warnings", ()))
+    log.info("%d files of pictures made on %s in %.3f s", len(written), device.label, watch.total())
     return report
 
 

@@ -4,7 +4,11 @@ from __future__ import annotations
 
 from time import perf_counter
 
+from clrecon.system.log import get_logger
+
 __all__ = ["Laps"]
+
+log = get_logger(__name__)
 
 
 class Laps:
@@ -20,6 +24,7 @@ class Laps:
         elapsed = now - self._lap
         self._lap = now
         self.seconds[part] = self.seconds.get(part, 0.0) + elapsed
+        log.debug("%s: %.3f s", part, elapsed)
         return elapsed
 
     def total(self) -> float:

@@ -130,7 +130,7 @@ def _find_voxels(path: str | Path) -> Path | None:
 
 def _is_bare_data_set(path: str | Path) -> bool:
     from clrecon.dicom.parse.forced import restore_start
-    from clrecon.system.files import open_regular
+    from clrecon.system.regular_files import open_regular
 
     try:
         with open_regular(path) as stream:

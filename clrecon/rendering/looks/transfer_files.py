@@ -23,7 +23,7 @@ from clrecon.rendering.looks.slicer_files import (
 )
 from clrecon.rendering.looks.transfer_function import TransferFunction
 from clrecon.rendering.looks.transfer_text import FORMAT, VERSION
-from clrecon.system.files import read_regular
+from clrecon.system.regular_files import read_regular
 
 __all__ = ["load_transfer_function"]
 

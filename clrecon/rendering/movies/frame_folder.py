@@ -13,8 +13,11 @@ from numpy.typing import NDArray
 
 from clrecon.errors import OutputError, UsageError
 from clrecon.system.files import final_mode, hold_interrupts, is_dicom, system_errors, temporary_folder
+from clrecon.system.log import get_logger
 
 __all__ = ["check_frame_folder", "stage_frame_folder"]
+
+log = get_logger(__name__)
 
 _FRAME = re.compile(r"frame_[0-9]{4,}\.png")
 
@@ -80,6 +83,7 @@ class StagedFolder:
         """
         with system_errors(self._path), hold_interrupts():
             _swap(self._made, self._folder)
+        log.info("folder of frames written: %d bytes", self.size)
 
 
 @contextlib.contextmanager

@@ -10,7 +10,7 @@ import numpy as np
 
 from clrecon.errors import RefusedInputError, UsageError
 from clrecon.geometry.affine import Float64Array
-from clrecon.system.files import read_regular
+from clrecon.system.regular_files import read_regular
 from clrecon.system.text import escape_text
 
 __all__ = ["read_curve_points"]
