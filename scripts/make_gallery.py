@@ -54,7 +54,7 @@ def draw_beside_vtk(renderer: clrecon.VolumeRenderer) -> np.ndarray:
     camera = clrecon.Camera.fit(volume, "25,10", 1.2, size=BESIDE)
     step = 0.5 * min(volume.spacing)
     light = replace(bone.lighting, soft_gradient=0.0)  # as VTK's
-    ours = renderer.render("dvr", "bone", camera=camera, size=BESIDE, ray_step=step, lighting=light).image[..., :3]
+    ours = renderer.render(preset="bone", camera=camera, size=BESIDE, ray_step=step, lighting=light).image[..., :3]
     scene = scene_of(volume, camera, bone.transfer_function, light, size=BESIDE, ray_step=step)
     peer = FixedPointPeer(volume.voxels, scene, threads=1)
     peer.first_frame()
@@ -77,7 +77,7 @@ def main() -> None:
     volume = clrecon.read_volume(sys.argv[1])
     fine = 0.25 * min(volume.spacing)
     with clrecon.VolumeRenderer(volume) as renderer:
-        bone = renderer.render("dvr", "bone", view="25,10", size=(760, 400), zoom=1.1, ray_step=fine)
+        bone = renderer.render(preset="bone", view="25,10", size=(760, 400), zoom=1.1, ray_step=fine)
         bone.annotated(letters=True, scale_bar=True).save(folder / "render-bone.png")
         modes = Image.fromarray(draw_modes(renderer, fine))
         modes.convert("P", palette=Image.Palette.ADAPTIVE, colors=255).save(folder / "render-modes.png", optimize=True)

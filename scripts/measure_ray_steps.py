@@ -41,14 +41,14 @@ def main() -> None:
         raise SystemExit(__doc__)
     volume = clrecon.read_volume(sys.argv[1])
     step = 0.5 * min(volume.spacing)
-    with clrecon.VolumeRenderer(volume, sys.argv[2] if len(sys.argv) == 3 else None) as renderer:
+    with clrecon.VolumeRenderer(volume, device=sys.argv[2] if len(sys.argv) == 3 else None) as renderer:
         for name, preset in PRESETS.items():
             if preset.mode != "dvr":
                 continue
             found = []
             for view in VIEWS:
                 pictures = [
-                    renderer.render("dvr", name, view=view, size=SIZE, ray_step=ray_step).image
+                    renderer.render(preset=name, view=view, size=SIZE, ray_step=ray_step).image
                     for ray_step in (step, step / FINER)
                 ]
                 found.append("{:.4f} whole {:.4f} shown".format(*compare(*pictures)))

@@ -6,7 +6,7 @@ import argparse
 import re
 import sys
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from typing import Any, NoReturn
 
 from clrecon.cli.console import Console
@@ -21,6 +21,7 @@ __all__ = [
     "add_memory",
     "guard",
     "megabytes",
+    "pick",
     "table",
 ]
 
@@ -76,6 +77,11 @@ def add_common(parser: argparse.ArgumentParser) -> None:
     loudness.add_argument("-q", "--quiet", action="store_true", help="print errors only")
     loudness.add_argument("-v", "--verbose", action="store_true", help="print more, and each stage on stderr")
     group.add_argument("--debug", action="store_true", help="print the traceback of an error")
+
+
+def pick(options: argparse.Namespace, names: Collection[str]) -> dict[str, Any]:
+    """Options by the names of the settings that they are."""
+    return {name: value for name, value in vars(options).items() if name in names}
 
 
 def add_device(parser: argparse._ActionsContainer) -> None:

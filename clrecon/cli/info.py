@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import argparse
 
+from clrecon.cli.common import pick
 from clrecon.cli.console import Console
-from clrecon.cli.reading import add_reading, reading_settings
+from clrecon.cli.reading import add_reading
 
 __all__ = ["add_arguments", "run"]
 
@@ -36,9 +37,7 @@ def run(options: argparse.Namespace, console: Console) -> int:
 
     found = describe_input(
         options.input,
-        **reading_settings(options),
-        pixels=options.pixels,
-        strict=options.strict,
+        **pick(options, ("series", "phase", "allow_gaps", "force", "pixels", "strict")),
         progress=console.progress,
     )
     console.result(found.listing)

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import argparse
-from typing import Any
 
-__all__ = ["add_masking", "masking_settings"]
+__all__ = ["add_masking"]
 
 
 def add_masking(parser: argparse.ArgumentParser) -> None:
@@ -23,6 +22,7 @@ def add_masking(parser: argparse.ArgumentParser) -> None:
     )
     group.add_argument(
         "--fov",
+        dest="field_of_view",
         nargs="?",
         const="auto",
         default=None,
@@ -38,12 +38,3 @@ def _parse_radius(text: str) -> float | str:
         return text if text == "auto" else float(text)
     except ValueError:
         raise argparse.ArgumentTypeError(f"{text!r} is no radius in mm") from None
-
-
-def masking_settings(options: argparse.Namespace) -> dict[str, Any]:
-    """Entries of `MeshSettings`."""
-    return {
-        "remove_table": options.remove_table,
-        "allow_bone_loss": options.allow_bone_loss,
-        "field_of_view": options.fov,
-    }

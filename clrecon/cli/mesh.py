@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import argparse
+from dataclasses import fields
 from typing import Any
 
-from clrecon.cli.common import add_device, add_memory, megabytes
+from clrecon.cli.common import add_device, add_memory, megabytes, pick
 from clrecon.cli.console import Console, printable
 from clrecon.cli.labels import add_label_arguments, describe_labels, label_choice
 from clrecon.cli.levels import LEVELS_HELP, parse_hu, parse_levels
-from clrecon.cli.masking import add_masking, masking_settings
+from clrecon.cli.masking import add_masking
 from clrecon.cli.points import parse_point
-from clrecon.cli.reading import add_reading, reading_settings
+from clrecon.cli.reading import add_reading
 from clrecon.cli.refinement import (
     add_purpose,
     add_refinement,
@@ -19,7 +20,6 @@ from clrecon.cli.refinement import (
     describe_purposes,
     describe_refinement,
     finish_with_gates,
-    refinement_settings,
 )
 from clrecon.jobs.mesh.presets import DEFAULT_PRESET, PRESETS
 
@@ -89,28 +89,39 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help=f"iso value by tissue, one of: {', '.join(PRESETS)} (default: {DEFAULT_PRESET})",
     )
     surface.add_argument("--keep-outside", action="store_true", help="with --below: leave the air round the patient in")
-    surface.add_argument("--space", default="lps", metavar="lps|ras", help="patient frame of the mesh (default: lps)")
+    surface.add_argument(
+        "--space", type=str.lower, default="lps", metavar="lps|ras", help="patient frame of the mesh (default: lps)"
+    )
     surface.add_argument(
         "--topology",
+        type=str.lower,
         default="separated",
         metavar="T",
         help="what is done where the voxels leave open which of them are joined: separated keeps them apart (default),"
         " trilinear joins those that the trilinear interpolation joins",
     )
-    surface.add_argument("--open", action="store_true", help="leave the surface open at the border of the volume")
+    surface.add_argument(
+        "--open", dest="closed", action="store_false", help="leave the surface open at the border of the volume"
+    )
     components = parser.add_argument_group("components")
     components.add_argument(
         "--keep",
+        type=str.lower,
         metavar="bone",
         help="bone: keep the components whose walls look like bone, not heart and vessels with contrast medium, nor a"
         " table",
     )
     components.add_argument("--keep-largest", type=int, metavar="N", help="keep the N largest components only")
     components.add_argument(
-        "--min-volume", type=float, metavar="ML", help="keep components of at least ML millilitres only"
+        "--min-volume",
+        dest="min_volume_ml",
+        type=float,
+        metavar="ML",
+        help="keep components of at least ML millilitres only",
     )
     components.add_argument(
         "--seed",
+        dest="seeds",
         type=parse_point,
         metavar="X,Y,Z",
         action="append",
@@ -135,26 +146,8 @@ def run(options: argparse.Namespace, console: Console) -> int:
     from clrecon.jobs.mesh.job import make_mesh
     from clrecon.jobs.mesh.settings import MeshSettings
 
-    given = dict(
-        **options.hu,
-        below=options.below,
-        keep_outside=options.keep_outside,
-        preset=options.preset,
-        **reading_settings(options),
-        space=options.space.lower(),
-        closed=not options.open,
-        topology=options.topology.lower(),
-        keep=None if options.keep is None else options.keep.lower(),
-        keep_largest=options.keep_largest,
-        min_volume_ml=options.min_volume,
-        seeds=options.seed,
-        split=options.split,
-        labels=label_choice(options),
-        device=options.device,
-        memory=options.memory,
-        **masking_settings(options),
-        **refinement_settings(options),
-    )
+    names = {own.name for own in fields(MeshSettings)} - {"purpose"}
+    given = {**pick(options, names), **options.hu, "labels": label_choice(options)}
     settings = MeshSettings(**settings_for(options.purpose, given))
     report = make_mesh(
         options.input,

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import argparse
-from typing import Any
 
-__all__ = ["add_reading", "reading_settings"]
+__all__ = ["add_reading"]
 
 
 def add_reading(parser: argparse.ArgumentParser) -> None:
@@ -31,8 +30,3 @@ def add_reading(parser: argparse.ArgumentParser) -> None:
         help="read data sets without preamble or meta header too, their encoding guessed; leave out what is left"
         " over behind the pixels",
     )
-
-
-def reading_settings(options: argparse.Namespace) -> dict[str, Any]:
-    """What `add_reading` was given, as keywords of the settings."""
-    return {"series": options.series, "phase": options.phase, "allow_gaps": options.allow_gaps, "force": options.force}

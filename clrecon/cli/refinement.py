@@ -16,7 +16,6 @@ __all__ = [
     "describe_purposes",
     "describe_refinement",
     "finish_with_gates",
-    "refinement_settings",
 ]
 
 GATE_FAILED = 8
@@ -44,6 +43,7 @@ def add_refinement(parser: argparse.ArgumentParser) -> None:
     )
     group.add_argument(
         "--max-deviation",
+        dest="max_deviation_mm",
         type=float,
         metavar="MM",
         help="smoothing and decimation each move nothing further (default: a quarter of the shortest voxel step)",
@@ -69,16 +69,6 @@ def add_purpose(parser: argparse._ActionsContainer) -> None:
         help="what the mesh is for, with the settings that this takes (others given beside it win); "
         + "; ".join(map(_describe_purpose, PURPOSES.values())),
     )
-
-
-def refinement_settings(options: argparse.Namespace) -> dict[str, Any]:
-    """The fields of `MeshSettings` that these options set."""
-    return {
-        "smooth": options.smooth,
-        "decimate": options.decimate,
-        "max_deviation_mm": options.max_deviation,
-        "strict": options.strict,
-    }
 
 
 def describe_refinement(meshes: list[dict[str, Any]]) -> list[str]:

@@ -7,9 +7,9 @@ from typing import Any
 
 from clrecon.cli.common import add_device, add_memory, megabytes
 from clrecon.cli.console import Console, printable
-from clrecon.cli.masking import add_masking, masking_settings
+from clrecon.cli.masking import add_masking
 from clrecon.cli.mesh import describe_volume
-from clrecon.cli.reading import add_reading, reading_settings
+from clrecon.cli.reading import add_reading
 from clrecon.cli.render_options import (
     add_camera,
     add_curve,
@@ -19,7 +19,7 @@ from clrecon.cli.render_options import (
     add_region,
     render_settings,
 )
-from clrecon.jobs.render.modes import MODES
+from clrecon.jobs.render.settings import describe_modes, describe_presets
 
 __all__ = ["add_arguments", "run"]
 
@@ -36,17 +36,15 @@ examples:
 
 
 def _epilog() -> str:
-    from clrecon.jobs.render.settings import describe_presets  # numpy: not wanted by other commands
-
-    described = describe_presets()
-    width = max(map(len, (*MODES, *described)))
+    modes, presets = describe_modes(), describe_presets()
+    width = max(map(len, (*modes, *presets)))
     return "\n".join(
         (
             "modes:",
-            *(f"  {name:<{width}}  {text}" for name, text in MODES.items()),
+            *(f"  {name:<{width}}  {text}" for name, text in modes.items()),
             "",
             "presets:",
-            *(f"  {name:<{width}}  {text}" for name, text in described.items()),
+            *(f"  {name:<{width}}  {text}" for name, text in presets.items()),
             "",
             "The patient's left is at the right of an anterior view. Every file is written as a whole or not at all.",
             "",
@@ -84,17 +82,9 @@ def run(options: argparse.Namespace, console: Console) -> int:
     """Run the command; returns the exit code."""
     from clrecon.jobs.render.files import PictureFiles
     from clrecon.jobs.render.job import make_pictures
-    from clrecon.jobs.render.settings import RenderSettings
 
     files = PictureFiles(options.output, options.depth, options.values, options.turntable, options.report)
-    settings = RenderSettings(
-        **render_settings(options),
-        **reading_settings(options),
-        **masking_settings(options),
-        device=options.device,
-        memory=options.memory,
-    )
-    report = make_pictures(options.input, files, settings, progress=console.progress)
+    report = make_pictures(options.input, files, render_settings(options), progress=console.progress)
     console.result(report)
     for line in describe_report(report):
         console.say(line)

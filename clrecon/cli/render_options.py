@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from clrecon.cli.common import pick
 from clrecon.cli.render_values import (
     parse_clip_box,
     parse_clip_plane,
@@ -19,10 +20,7 @@ from clrecon.cli.render_values import (
     parse_window,
 )
 from clrecon.errors import UsageError
-from clrecon.jobs.render.modes import MODES, VIEWS
-
-if TYPE_CHECKING:
-    from clrecon.jobs.render.settings import LabelLook, Turntable
+from clrecon.jobs.render.settings import VIEWS, LabelLook, RenderSettings, Turntable, describe_modes
 
 __all__ = [
     "add_camera",
@@ -38,27 +36,28 @@ __all__ = [
 
 _FRAMES, _FPS, _DEGREES, _ANGLE = 100, 25.0, 360.0, 30.0
 
-_SETTINGS = (
-    "mode", "preset", "transfer_function", "window", "up", "zoom", "size", "ray_step", "light", "shadows", "jitter",
-    "clip_box", "background", "color", "depth_cue", "slices", "slice_opacity", "letters", "scale_bar", "caption",
-    "thickness", "combine", "curve", "cpr",
-)  # fmt: skip
-"""Options that are settings of the same name."""
-
 
 def _add_repeated(
-    group: argparse._ArgumentGroup, option: str, parse: Callable[[str], Any], metavar: str, text: str
+    group: argparse._ArgumentGroup,
+    option: str,
+    parse: Callable[[str], Any],
+    metavar: str,
+    text: str,
+    dest: str | None = None,
 ) -> None:
     """Add an option that may be given again; what is given makes a list."""
+    dest = dest or option.removeprefix("--").replace("-", "_")
     group.add_argument(
-        option, type=parse, metavar=metavar, action="append", default=[], help=f"{text}; may be given again"
+        option, dest=dest, type=parse, metavar=metavar, action="append", default=[], help=f"{text}; may be given again"
     )
 
 
 def add_looks(parser: argparse.ArgumentParser) -> None:
     """Add what a picture shows, and in which colours."""
     group = parser.add_argument_group("what is shown")
-    group.add_argument("--mode", metavar="M", help=f"one of: {', '.join(MODES)} (default: what the other options ask)")
+    group.add_argument(
+        "--mode", metavar="M", help=f"one of: {', '.join(describe_modes())} (default: what the other options ask)"
+    )
     group.add_argument("--preset", metavar="NAME", help="colours, opacities, light and mode by tissue (default: bone)")
     group.add_argument(
         "--transfer-function",
@@ -67,6 +66,7 @@ def add_looks(parser: argparse.ArgumentParser) -> None:
     )
     group.add_argument(
         "--iso",
+        "--hu",
         dest="iso_value",
         type=float,
         metavar="HU",
@@ -115,6 +115,7 @@ def add_camera(parser: argparse.ArgumentParser) -> None:
     )
     group.add_argument(
         "--perspective",
+        dest="view_angle",
         type=float,
         nargs="?",
         const=_ANGLE,
@@ -139,17 +140,17 @@ def add_region(parser: argparse.ArgumentParser) -> None:
     )
     _add_repeated(
         group, "--clip", parse_clip_plane, "PX,PY,PZ,NX,NY,NZ",
-        "keep the side of a plane through a point that a normal points to",
+        "keep the side of a plane through a point that a normal points to", dest="clip_planes",
     )  # fmt: skip
 
 
 def add_curve(parser: argparse.ArgumentParser) -> None:
     """Add the options of slices, in space and alone, and of curved reformations."""
     group = parser.add_argument_group("slices and curved reformations")
-    group.add_argument("--thickness", type=float, default=0.0, metavar="MM", help="of the slab (default: 0, a plane)")
+    group.add_argument("--thickness", type=float, metavar="MM", help="of the slab (default: 0, a plane)")
     group.add_argument("--combine", metavar="HOW", help="mean, max or min of a slab (default: mean)")
     group.add_argument(
-        "--offset", type=float, default=0.0, metavar="MM", help="move the slice away from the camera by so much"
+        "--offset", dest="offset_mm", type=float, metavar="MM", help="move the slice away from the camera by so much"
     )
     group.add_argument(
         "--slices",
@@ -190,18 +191,22 @@ def add_motion(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--degrees", type=float, metavar="D", help=f"how far, to the left (default: {_DEGREES:g})")
 
 
-def render_settings(options: argparse.Namespace) -> dict[str, Any]:
-    """What the options above say, as keywords of `RenderSettings`."""
-    return {
-        **{name: getattr(options, name) for name in _SETTINGS},
-        "iso_value": options.iso_value,
+def render_settings(options: argparse.Namespace) -> RenderSettings:
+    """What the options of the command say.
+
+    Raises
+    ------
+    UsageError
+        As `RenderSettings.of`.
+    """
+    given = pick(options, RenderSettings.keywords()) | {
         "views": tuple(view for views in options.view for view in views),
-        "view_angle": options.perspective,
-        "clip_planes": tuple(options.clip),
-        "offset_mm": options.offset,
+        "thickness": options.thickness or None,  # of 0 it means nothing in any mode
+        "offset_mm": options.offset_mm or None,
         "labels": label_look(options),
         "turntable": turntable(options),
     }
+    return RenderSettings.of(**given)
 
 
 def label_look(options: argparse.Namespace) -> LabelLook | None:
@@ -213,8 +218,6 @@ def label_look(options: argparse.Namespace) -> LabelLook | None:
         An option that means something with a label map only.
     """
     if options.labels is not None:
-        from clrecon.jobs.render.settings import LabelLook
-
         return LabelLook(options.labels, dict(options.label_color), dict(options.label_opacity))
     for option, given in (("--label-color", options.label_color), ("--label-opacity", options.label_opacity)):
         if given:
@@ -233,8 +236,6 @@ def turntable(options: argparse.Namespace) -> Turntable | None:
     given = {name: getattr(options, name) for name in ("frames", "fps", "degrees")}
     given = {name: value for name, value in given.items() if value is not None}
     if options.turntable is not None:
-        from clrecon.jobs.render.settings import Turntable
-
         return Turntable(**given)
     if given:
         raise UsageError(f"--{next(iter(given))} says how a picture moves: name it with --turntable OUT")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import math
 
-from clrecon.jobs.render.modes import VIEWS
+from clrecon.jobs.render.settings import VIEWS
 
 __all__ = [
     "parse_clip_box",

@@ -9,17 +9,12 @@ from clrecon.system.wording import Speaker, in_python
 __all__ = ["speaker_of"]
 
 _DESTINATIONS = {
-    "clip_planes": "clip",
-    "closed": "open",
+    "direction": "light",
     "grow_mm": "grow",
     "half_way": "hu",
     "iso_value": "hu",
-    "min_volume_ml": "min_volume",
-    "offset_mm": "offset",
     "only": "label",
     "picture": "output",
-    "seeds": "seed",
-    "view_angle": "perspective",
 }
 """Parameters whose option has another name, where the command has none of the parameter's own name."""
 

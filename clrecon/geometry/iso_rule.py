@@ -41,6 +41,7 @@ __all__ = [
     "Level",
     "ValueRange",
     "check_topology",
+    "checked_iso_value",
     "choose_iso_rule",
     "data_range",
     "layer_margins",
@@ -320,10 +321,10 @@ def _power_of_two_over(largest: float) -> float:
 def _checked_level(level: Level, below: bool) -> tuple[float, float | None]:
     """The iso value, or the two ends of a range."""
     if isinstance(level, str | int | float) or np.ndim(level) == 0:
-        return _checked_iso_value(level), None  # type: ignore[arg-type]
+        return checked_iso_value(level), None  # type: ignore[arg-type]
     if len(level) != 2:
         raise UsageError(f"a range of HU has two ends, not {tuple(level)}")
-    low, high = (_checked_iso_value(end) for end in level)
+    low, high = (checked_iso_value(end) for end in level)
     if low >= high:
         raise UsageError(f"the range {low:g} to {high:g} HU holds nothing: give its lower end first")
     if below:
@@ -331,7 +332,8 @@ def _checked_level(level: Level, below: bool) -> tuple[float, float | None]:
     return low, high
 
 
-def _checked_iso_value(iso_value: float) -> float:
+def checked_iso_value(iso_value: float) -> float:
+    """An iso value as float; a `UsageError` where it is no finite number that float32 holds."""
     try:
         number = float(iso_value)
     except (TypeError, ValueError) as error:

@@ -92,7 +92,7 @@ def make_demo(
 
 
 def _look(device: str) -> RenderSettings:
-    return RenderSettings(preset="bone", views=["25,10"], ray_step=0.25, letters=True, scale_bar=True, device=device)
+    return RenderSettings.of(preset="bone", views=["25,10"], ray_step=0.25, letters=True, scale_bar=True, device=device)
 
 
 def check_sphere(device: Device) -> dict[str, Any]:

@@ -177,7 +177,7 @@ def measure_warm(job: Job) -> dict[str, Any]:
     volume = job.input.volume()
     shots = make_shots(volume)
     figures: dict[str, Any] = {"ratios": {}, "sides": {}, "ssim": {}, **describe_pictures(shots)}
-    with clrecon.VolumeRenderer(volume, job.device) as renderer:
+    with clrecon.VolumeRenderer(volume, device=job.device) as renderer:
         for shot in shots:
             peer = FixedPointPeer(volume.voxels, shot.scene(volume), job.peer_threads)
             peer.first_frame()
@@ -228,7 +228,7 @@ def measure_first(job: Job) -> dict[str, Any]:
     for shot in shots:
 
         def draw(shot: Shot = shot) -> Any:
-            with clrecon.VolumeRenderer(volume, job.device) as renderer:
+            with clrecon.VolumeRenderer(volume, device=job.device) as renderer:
                 return renderer.render(**shot.options())
 
         peer = FixedPointPeer(volume.voxels, shot.scene(volume), job.peer_threads)
@@ -248,7 +248,7 @@ def measure_gpu_mapper(job: Job) -> dict[str, Any]:
     volume = job.input.volume()
     shots = make_shots(volume)
     figures: dict[str, Any] = {"ratios": {}, "sides": {}, "ssim": {}, **describe_pictures(shots)}
-    with clrecon.VolumeRenderer(volume, job.device) as renderer:
+    with clrecon.VolumeRenderer(volume, device=job.device) as renderer:
         for shot in shots:
             with GpuPeer(volume.voxels, shot.scene(volume)) as peer:
                 first = peer.first_frame()

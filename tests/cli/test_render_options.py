@@ -28,8 +28,8 @@ def parser() -> argparse.ArgumentParser:
 def test_what_may_be_given_again_makes_a_list(name: str, parser: argparse.ArgumentParser) -> None:
     texts, values = GIVEN_TWICE[name]
     option = f"--{name.replace('_', '-')}"
+    (action,) = (action for action in parser._actions if option in action.option_strings)
     options = parser.parse_args([part for text in texts for part in (option, text)])
-    assert getattr(options, name) == values
-    assert getattr(parser.parse_args([]), name) == []  # a parser keeps nothing from the last time
-    help_of = {action.dest: action.help for action in parser._actions}
-    assert str(help_of[name]).endswith("; may be given again")
+    assert getattr(options, action.dest) == values
+    assert getattr(parser.parse_args([]), action.dest) == []  # a parser keeps nothing from the last time
+    assert str(action.help).endswith("; may be given again")

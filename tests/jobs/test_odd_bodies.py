@@ -144,14 +144,14 @@ def test_a_seed_in_bone_keeps_bone(odd: OddBodies, device: Any, tmp_path: Path, 
 
 @pytest.mark.parametrize("name", SPINELESS)
 def test_no_spine_is_found_where_there_is_none(odd: OddBodies, device: Any, tmp_path: Path, name: str) -> None:
-    settings = RenderSettings(curve="auto", device=str(device.index), size=(40, 40))
+    settings = RenderSettings.of(curve="auto", device=str(device.index), size=(40, 40))
     with pytest.raises(RefusedInputError, match="spine|canal"):
         make_pictures(odd.series(name), PictureFiles(picture=str(tmp_path / "spine.png")), settings)
     assert not list(tmp_path.iterdir())
 
 
 def test_a_trunk_has_a_spine(odd: OddBodies, device: Any, tmp_path: Path) -> None:
-    settings = RenderSettings(curve="auto", device=str(device.index), size=(40, 40))
+    settings = RenderSettings.of(curve="auto", device=str(device.index), size=(40, 40))
     report = make_pictures(odd.series("contrast"), PictureFiles(picture=str(tmp_path / "spine.png")), settings)
     (picture,) = report["pictures"]
     assert picture["curve"] and (tmp_path / "spine.png").stat().st_size > 200
@@ -159,7 +159,7 @@ def test_a_trunk_has_a_spine(odd: OddBodies, device: Any, tmp_path: Path) -> Non
 
 @pytest.mark.parametrize("name", BONY)
 def test_pictures_say_what_was_left_out(odd: OddBodies, device: Any, tmp_path: Path, name: str) -> None:
-    settings = RenderSettings(preset="bone", remove_table=True, device=str(device.index), size=(48, 40))
+    settings = RenderSettings.of(preset="bone", remove_table=True, device=str(device.index), size=(48, 40))
     report = make_pictures(odd.series(name), PictureFiles(picture=str(tmp_path / "bone.png")), settings)
     assert report["volume"]["remove_table"]["bone_kept"] >= 0.98
     assert any("of them dense (table, blankets)" in warning for warning in report["warnings"])

@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO
 
 from clrecon.errors import UsageError
-from clrecon.jobs.render.modes import find_misplaced
 from clrecon.jobs.render.settings import RenderSettings
 from clrecon.jobs.shared.outputs import check_distinct
+from clrecon.rendering.pictures.modes import check_known
 from clrecon.system.wording import name_parameter
 
 if TYPE_CHECKING:
@@ -113,10 +113,9 @@ def check_pictures(files: PictureFiles, settings: RenderSettings) -> list[tuple[
 
     load_pillow()
     check_caption(settings.caption)
-    given = {name for name in ("depth", "values") if getattr(files, name) is not None}
-    misplaced = find_misplaced(settings.mode_used, given)
-    if misplaced:
-        raise UsageError(misplaced)
+    for name in ("depth", "values"):
+        if getattr(files, name) is not None:
+            check_known(settings.mode, name)
     if settings.background == "transparent":
         picture = "" if files.picture is None else format_of(files.picture)
         turntable = "" if files.turntable is None else animation_kind(files.turntable)[1:]

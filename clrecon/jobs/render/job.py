@@ -109,9 +109,9 @@ def _prepare(device: Device, settings: RenderSettings) -> None:
     from clrecon.geometry import Volume
 
     nothing = Volume(np.zeros((2, 2, 2), np.int16), np.eye(4))
-    mode = "slice" if settings.mode_used == "cpr" else settings.mode_used  # the same kernel, and no curve is needed
-    with Studio(nothing, device, RenderSettings(mode, size=(8, 8), iso_value=0.0 if mode == "surface" else None),
-                progress=ignore_progress) as studio:  # fmt: skip
+    mode = "slice" if settings.mode == "cpr" else settings.mode  # the same kernel, and no curve is needed
+    small = RenderSettings.of(mode, size=(8, 8), iso_value=0.0 if mode == "surface" else None)
+    with Studio(nothing, device, small, progress=ignore_progress) as studio:
         studio.take_view("anterior")
 
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 from clrecon.jobs.render.settings import LabelLook, RenderSettings
 from clrecon.jobs.shared.report import platform_name
 from clrecon.jobs.shared.skin import SKIN_HU
+from clrecon.rendering.pictures.styles import CurveCut, PlaneCut, Style, SurfaceLook, VolumeLook
 from clrecon.system.wording import name_parameter
 from clrecon.version import package_version
 
@@ -126,26 +127,27 @@ def describe_pictures(
     """
     certificate = dict(volume.report)
     warnings = [str(text) for text in certificate.pop("warnings", [])] + studio.warnings
-    if _shows_skin(settings, studio.function):
+    if _shows_skin(studio.style):
         warnings.append(FACE_WARNING)
-    lighting = studio.lighting
-    clip = settings.clip
+    style, lighting = studio.style, studio.lighting
+    clip = getattr(style, "clip", None)
+    surface = style if isinstance(style, SurfaceLook) else None
     return {
         "affine_ijk_to_lps_mm": volume.affine.tolist(),
-        "mode": settings.mode_used,
+        "mode": style.mode,
         "preset": settings.preset_used,
         "transfer_function": _describe_function(studio.function),
-        "iso_value_hu": settings.iso_value_used,
-        "color": settings.color,
-        "depth_cue": settings.depth_cue,
+        "iso_value_hu": surface and surface.iso_value,
+        "color": surface and surface.color,
+        "depth_cue": surface and surface.depth_cue,
         "lighting": None if lighting is None else asdict(lighting),
-        "shadows": settings.shadows,
-        "jitter": settings.jitter,
+        "shadows": getattr(style, "shadows", False),
+        "jitter": getattr(style, "jitter", False),
         "background": settings.background,
         "clip_planes_lps_mm": [] if clip is None else clip.planes.tolist(),
-        "thickness_mm": settings.thickness if settings.mode_used in ("slice", "cpr") else None,
-        "combine": (settings.combine or "mean") if settings.thickness else None,
-        "offset_mm": settings.offset_mm if settings.mode_used == "slice" else None,
+        "thickness_mm": style.thickness if isinstance(style, PlaneCut | CurveCut) else None,
+        "combine": style.combine if isinstance(style, PlaneCut | CurveCut) and style.thickness else None,
+        "offset_mm": style.offset_mm if isinstance(style, PlaneCut) else None,
         "labels": _describe_labels(settings.labels, studio.labels),
         "pictures": list(pictures),
         "turntable": turntable,
@@ -187,15 +189,15 @@ def _describe_labels(look: LabelLook | None, labels: LabelMap | None) -> list[di
     ]
 
 
-def _shows_skin(settings: RenderSettings, function: TransferFunction | None) -> bool:
+def _shows_skin(style: Style) -> bool:
     """True where something between air and fat is not transparent: the picture shows the outside of the body."""
     import numpy as np
 
-    if settings.iso_value_used is not None:
-        return SKIN_HU[0] <= settings.iso_value_used <= SKIN_HU[1]
-    if settings.mode_used != "dvr" or function is None:
+    if isinstance(style, SurfaceLook):
+        return SKIN_HU[0] <= style.iso_value <= SKIN_HU[1]
+    if not isinstance(style, VolumeLook):
         return False
-    return bool((function(np.linspace(*SKIN_HU, 751))[:, 3] > 0.0).any())
+    return bool((style.function(np.linspace(*SKIN_HU, 751))[:, 3] > 0.0).any())
 
 
 def _range(values: Any) -> list[float] | None:

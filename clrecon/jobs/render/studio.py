@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from contextlib import ExitStack
-from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
-from clrecon.jobs.render.settings import SPINE, LabelLook, RenderSettings
+from clrecon.jobs.render.settings import SPINES, LabelLook, RenderSettings
+from clrecon.rendering.looks.presets import find_preset
+from clrecon.rendering.pictures.styles import SPINE, CurveCut, SlicesInSpace, Style, SurfaceLook, VolumeLook
 from clrecon.system.progress import Progress
 
 if TYPE_CHECKING:
@@ -21,12 +21,6 @@ if TYPE_CHECKING:
     from clrecon.rendering.views.camera import Camera
 
 __all__ = ["Studio", "read_curve", "read_function", "read_look"]
-
-SHARED_OPTIONS = (
-    "ray_step", "clip", "jitter", "color", "shadows", "depth_cue", "slices", "slice_opacity", "offset_mm", "thickness",
-    "combine", "cpr",
-)  # fmt: skip
-"""Options of `clrecon.operators.rays.render.render` that are settings of the same name."""
 
 
 def read_function(named: str | None) -> TransferFunction | None:
@@ -55,7 +49,7 @@ def read_curve(named: str | None) -> Float64Array | None:
     UsageError, RefusedInputError
         As `clrecon.rendering.views.centre_line_files.read_curve_points`.
     """
-    if named is None or named == SPINE:
+    if named is None or named in SPINES:
         return None
     from clrecon.rendering.views.centre_line_files import read_curve_points
 
@@ -108,19 +102,12 @@ class Studio:
         progress: Progress,
     ):
         self._volume, self._device, self._settings = volume, device, settings
-        self._curve, self.labels, self._progress = curve, labels, progress
+        self.labels, self._progress = labels, progress
+        self.style = settings.style_with(function, curve, labels)
+        self.function = _shown_function(settings, self.style) if function is None else function
         self.warnings: list[str] = []
         self._stack = ExitStack()
         self._renderer: Any = None
-        preset = None
-        if settings.preset_used is not None:
-            from clrecon.rendering.looks.presets import find_preset
-
-            preset = find_preset(settings.preset_used)
-        self.function = preset.transfer_function if function is None and preset is not None else function
-        self.window: Sequence[float] | None = settings.window
-        if self.window is None and preset is not None:
-            self.window = preset.window
 
     def __enter__(self) -> Studio:
         return self
@@ -133,26 +120,14 @@ class Studio:
     @property
     def lighting(self) -> Lighting | None:
         """The light that shaded pictures have, None in modes without."""
-        from clrecon.rendering import Lighting
-        from clrecon.rendering.looks.lighting import UNSHADED
-
-        settings = self._settings
-        if settings.mode_used not in ("dvr", "surface"):
-            return None
-        made_for = None if settings.mode_used == "surface" or self.function is None else self.function.lighting
-        light = made_for or Lighting()
-        if settings.light is None:
-            return light
-        if settings.light == "none":
-            return UNSHADED
-        return replace(light if light.shades else Lighting(), direction=settings.light_direction())
+        return self.style.light if isinstance(self.style, VolumeLook | SurfaceLook) else None
 
     def take_view(self, view: str) -> Rendering:
         """The picture of one of the views, with what is drawn into it."""
         settings = self._settings
-        if settings.mode_used != "cpr":
+        if not isinstance(self.style, CurveCut):
             return self.take(settings.camera(self._volume, view))
-        if self._curve is None:
+        if self.style.curve == SPINE:
             self._progress("curve", 0, 0)
         return self._render(view=view, up=settings.up, size=settings.size)
 
@@ -161,33 +136,21 @@ class Studio:
         return self._render(camera=camera, size=self._settings.size_used)
 
     def _render(self, **place: Any) -> Rendering:
-        from clrecon.operators.rays.render import KNOWN_IN, VolumeRenderer
+        from clrecon.operators.rays.render import VolumeRenderer
 
         settings = self._settings
         if self._renderer is None:
             self._renderer = self._stack.enter_context(
-                VolumeRenderer(self._volume, self._device, memory=settings.memory)
+                VolumeRenderer(self._volume, device=self._device, memory=settings.memory)
             )
-        mode = settings.mode_used
-        known = {name: value for name, value in self._options().items() if mode in KNOWN_IN[name]}
-        picture: Rendering = self._renderer.render(mode, background=settings.background, **place, **known)
+        picture: Rendering = self._renderer.render(self.style, background=settings.background, **place)
         return picture.annotated(letters=settings.letters, scale_bar=settings.scale_bar, caption=settings.caption)
 
-    def _options(self) -> dict[str, Any]:
-        """Options that mean something in some modes only."""
-        settings = self._settings
-        options: dict[str, Any] = {name: getattr(settings, name) for name in SHARED_OPTIONS}
-        window = None if settings.mode_used == "slices" and self.function is not None else self.window
-        options.update(
-            transfer_function=self.function,
-            window=window,
-            lighting=self.lighting,
-            curve=self._curve,
-            iso_value=settings.iso_value_used,
-        )
-        if self.labels is not None and settings.labels is not None:
-            look = settings.labels
-            plain = not (look.colors or look.opacities)  # then every label has a colour of its own
-            options.update(labels=self.labels, label_colors=None if plain else dict(look.colors))
-            options.update(label_opacity=dict(look.opacities))
-        return options
+
+def _shown_function(settings: RenderSettings, style: Style) -> TransferFunction | None:
+    """The transfer function of a style, or of the preset that it was made from."""
+    if settings.preset_used is not None:
+        return find_preset(settings.preset_used).transfer_function
+    if isinstance(style, VolumeLook):
+        return style.function
+    return style.transfer_function if isinstance(style, SlicesInSpace) else None

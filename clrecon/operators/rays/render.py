@@ -3,74 +3,47 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from types import TracebackType
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from clrecon.errors import UsageError
 from clrecon.geometry import Volume
-from clrecon.labels import LabelMap
 from clrecon.opencl import Device
-from clrecon.operators.rays.project import PROJECTIONS
 from clrecon.operators.rays.ray_pictures import RayPicture, take_picture
+from clrecon.operators.rays.slices import overlay_slices
+from clrecon.operators.rays.surface import SURFACE_COLOR, cast_surface
+from clrecon.operators.reformat.cut import cut_slice, reformat_curve
 from clrecon.operators.resident.device_volume import DeviceVolume, take_volume
-from clrecon.rendering import Lighting, Rendering, TransferFunction
+from clrecon.rendering import Lighting, Rendering
 from clrecon.rendering.looks.colors import is_transparent
-from clrecon.rendering.looks.label_style import LabelStyle
 from clrecon.rendering.looks.presets import DEFAULT_PRESET, find_preset
-from clrecon.rendering.looks.window import checked_window
+from clrecon.rendering.pictures.modes import check_known, find_style
+from clrecon.rendering.pictures.styles import (
+    CurveCut,
+    PlaneCut,
+    Projection,
+    SlicesInSpace,
+    Style,
+    SurfaceLook,
+    VolumeLook,
+)
 from clrecon.rendering.views.camera import Camera, box_corners
-from clrecon.rendering.views.clip import Clip
 from clrecon.rendering.views.directions import checked_size
+from clrecon.system.progress import Progress
 
-__all__ = ["MODES", "VolumeRenderer", "render"]
-
-MODES = ("dvr", "mip", "minip", "mean", "drr", "surface", "slices", "slice", "cpr")
-"""Kinds of pictures."""
+__all__ = ["VolumeRenderer", "render"]
 
 DEFAULT_SIZE = (1024, 1024)
 DEFAULT_VIEW = "anterior"
-DEFAULT_ISO_VALUE = 200.0
-"""HU of surfaces: bone, thin cortex of vertebrae with it."""
 
 SMALLEST_STEP = 0.01
 """Ray steps below this share of the smallest spacing add time and nothing else."""
 
 MOST_STEPS = 1 << 15
 """Ray steps through the diagonal of a volume: float32 counts them, and Mesa's llvmpipe ends loops after 65535 turns."""
-
-_LABELLED = ("dvr", "surface")
-_CUT = ("slice", "cpr")
-_RAYS = ("dvr", "mip", "minip", "mean", "drr", "surface", "slices")
-
-KNOWN_IN: dict[str, tuple[str, ...]] = {
-    "transfer_function": ("dvr", *PROJECTIONS, "slices"),  # part of the look that all pictures of a series share
-    "lighting": _RAYS,
-    "window": (*PROJECTIONS, "slices", *_CUT),
-    "ray_step": ("dvr", *PROJECTIONS, "surface"),
-    "zoom": (*_RAYS, "slice"),
-    "view_angle": _RAYS,
-    "clip": _RAYS,
-    "jitter": ("dvr",),
-    "iso_value": ("surface",),
-    "color": ("surface",),
-    "shadows": ("surface",),
-    "depth_cue": ("surface",),
-    "labels": _LABELLED,
-    "label_colors": _LABELLED,
-    "label_opacity": _LABELLED,
-    "slices": ("slices",),
-    "slice_opacity": ("slices",),
-    "offset_mm": ("slice",),
-    "thickness": _CUT,
-    "combine": _CUT,
-    "curve": ("cpr",),
-    "cpr": ("cpr",),
-}
-"""Options that mean something in some modes only."""
 
 
 class VolumeRenderer:
@@ -98,7 +71,7 @@ class VolumeRenderer:
     """
 
     def __init__(
-        self, volume: Volume | DeviceVolume, device: Device | str | int | None = None, *, memory: int | None = None
+        self, volume: Volume | DeviceVolume, *, device: Device | str | int | None = None, memory: int | None = None
     ):
         self._resident, self._is_own = take_volume(volume, device, memory, "a picture")
         self.volume, self.device = self._resident.volume, self._resident.device
@@ -121,140 +94,101 @@ class VolumeRenderer:
 
     def render(
         self,
-        mode: str | None = None,
-        preset: str | None = None,
-        transfer_function: TransferFunction | None = None,
+        style: Style | str | None = None,
+        *,
         camera: Camera | None = None,
         view: str | Sequence[float] | None = None,
-        size: Sequence[int] | None = None,
-        ray_step: float | None = None,
-        *,
         up: str | Sequence[float] | None = None,
         zoom: float | None = None,
         view_angle: float | None = None,
+        size: Sequence[int] | None = None,
         background: str | Sequence[float] = "black",
-        **options: Any,
+        progress: Progress | None = None,
+        **look: object,
     ) -> Rendering:
         """Make one picture, see `render`."""
-        if not (mode is None or isinstance(mode, str)):
-            raise UsageError(f"there is no mode {mode!r:.60}: it is one of {', '.join(MODES)}")
-        if size is not None or mode != "cpr":
-            size = checked_size(DEFAULT_SIZE if size is None else size)
-        for what, value, kind in (
-            ("camera", camera, Camera), ("lighting", options.get("lighting"), Lighting),
-            ("clip", options.get("clip"), Clip), ("transfer function", transfer_function, TransferFunction),
-            ("labels", options.get("labels"), LabelMap),
-        ):  # fmt: skip
-            if not (value is None or isinstance(value, kind)):
-                raise UsageError(f"the {what} of a picture is a {kind.__name__} or None, not {type(value).__name__}")
-        mode = _choose_mode(mode, preset, transfer_function)
-        given = {"transfer_function": transfer_function, "ray_step": ray_step, "zoom": zoom, "view_angle": view_angle}
-        _check_options(mode, given | options)
+        style = find_style(style, look)
+        if not (camera is None or isinstance(camera, Camera)):
+            raise UsageError(f"the camera of a picture is a Camera or None, not {type(camera).__name__}")
+        for keyword, value in (("zoom", zoom), ("view_angle", view_angle)):
+            if value is not None:
+                check_known(style.mode, keyword)
         if camera is not None:
-            if mode == "cpr":
+            if isinstance(style, CurveCut):
                 raise UsageError("a curved reformation has no camera: view and up say which way one looks at it")
             _check_alone(view=view, up=up, zoom=zoom, view_angle=view_angle)
-        view, zoom = DEFAULT_VIEW if view is None else view, 1.0 if zoom is None else zoom
-        if mode == "cpr":
-            return self._reformat(view, size, up, background, preset, options)
-        assert size is not None
-        if mode == "slice":
-            return self._cut(camera, view, size, zoom, up, background, preset, options)
-        if camera is None:
-            camera = Camera.fit(self.volume, view, zoom, up=up, view_angle=view_angle, size=size)
+        place = _Place(camera, DEFAULT_VIEW if view is None else view, up, 1.0 if zoom is None else zoom, view_angle)
+        if isinstance(style, CurveCut):
+            return self._reformat(style, place, size, background, progress)
+        size = checked_size(DEFAULT_SIZE if size is None else size)
+        if isinstance(style, PlaneCut):
+            return self._cut(style, place, size, background, progress)
+        camera = place.camera_for(self.volume, size)
         ground = None if is_transparent(background) else background
-        step = self._checked_step(ray_step)
-        if mode == "surface":
-            return self._surface(camera, size, step, ground, options)
-        if mode == "slices":
-            return self._overlay(camera, size, transfer_function, ground, options)
-        chosen = find_preset(DEFAULT_PRESET if preset is None else preset)
-        function = chosen.transfer_function if transfer_function is None else transfer_function
+        if isinstance(style, SurfaceLook):
+            return self._surface(style, camera, size, ground)
+        if isinstance(style, SlicesInSpace):
+            return overlay_slices(self._resident, camera, size, background=ground, **style.parameters())
+        assert isinstance(style, VolumeLook | Projection)
+        return self._sample(style, camera, size, ground)
+
+    def _sample(
+        self,
+        style: VolumeLook | Projection,
+        camera: Camera,
+        size: tuple[int, int],
+        background: str | Sequence[float] | None,
+    ) -> Rendering:
+        """Volume rendering, or a projection."""
+        step = self._checked_step(style.ray_step)
+        if isinstance(style, Projection):
+            unseen = find_preset(DEFAULT_PRESET).transfer_function
+            picture = RayPicture(
+                style.kind, camera, size, step, unseen, Lighting(), style.window, style.clip, background
+            )
+            return take_picture(self._resident, picture)
+        function = style.function
         picture = RayPicture(
-            mode, camera, size, step, function, options.get("lighting") or function.lighting or Lighting(),
-            _choose_window(None if mode == "drr" else preset, options), options.get("clip"), ground,
-            _is_set(options, "jitter"), _label_style(options),
+            style.mode, camera, size, step, function, style.light, None,
+            style.clip, background, style.jitter, style.label_style,
         )  # fmt: skip
         return take_picture(self._resident, picture)
 
     def _surface(
-        self,
-        camera: Camera,
-        size: tuple[int, int],
-        step: float,
-        background: str | Sequence[float] | None,
-        options: Mapping[str, Any],
+        self, style: SurfaceLook, camera: Camera, size: tuple[int, int], background: str | Sequence[float] | None
     ) -> Rendering:
-        from clrecon.operators.rays.surface import SURFACE_COLOR, cast_surface
-
         return cast_surface(
-            self._resident, _given(options, "iso_value", DEFAULT_ISO_VALUE), camera, size, step,
-            lighting=options.get("lighting"), clip=options.get("clip"), color=_given(options, "color", SURFACE_COLOR),
-            background=background, shadows=_is_set(options, "shadows"), depth_cue=_given(options, "depth_cue", 0.0),
-            style=_label_style(options),
-        )  # fmt: skip
-
-    def _overlay(
-        self,
-        camera: Camera,
-        size: tuple[int, int],
-        function: TransferFunction | None,
-        background: str | Sequence[float] | None,
-        options: Mapping[str, Any],
-    ) -> Rendering:
-        from clrecon.operators.rays.slices import DEFAULT_OPACITY, overlay_slices
-
-        return overlay_slices(
-            self._resident, camera, size, slices=options.get("slices"),
-            opacity=_given(options, "slice_opacity", DEFAULT_OPACITY), window=options.get("window"),
-            transfer_function=function, clip=options.get("clip"), background=background,
+            self._resident, style.iso_value, camera, size, self._checked_step(style.ray_step),
+            lighting=style.lighting, clip=style.clip, color=SURFACE_COLOR if style.color is None else style.color,
+            background=background, shadows=style.shadows, depth_cue=style.depth_cue or 0.0, style=style.label_style,
         )  # fmt: skip
 
     def _cut(
         self,
-        camera: Camera | None,
-        view: str | Sequence[float],
+        style: PlaneCut,
+        place: _Place,
         size: tuple[int, int],
-        zoom: float,
-        up: str | Sequence[float] | None,
         background: str | Sequence[float],
-        preset: str | None,
-        options: Mapping[str, Any],
+        progress: Progress | None,
     ) -> Rendering:
-        from clrecon.operators.reformat.cut import cut_slice
-
-        own: dict[str, Any] = {} if camera is not None else {"zoom": zoom, "up": up}
+        own: dict[str, Any] = {} if place.camera is not None else {"zoom": place.zoom, "up": place.up}
         return cut_slice(
-            self._resident, view if camera is None else camera, size,
-            offset_mm=_given(options, "offset_mm", 0.0), **own, **self._slab_options(background, preset, options),
+            self._resident, place.camera or place.view, size,
+            background=background, progress=progress, **own, **style.parameters(),
         )  # fmt: skip
 
     def _reformat(
         self,
-        view: str | Sequence[float],
+        style: CurveCut,
+        place: _Place,
         size: Sequence[int] | None,
-        up: str | Sequence[float] | None,
         background: str | Sequence[float],
-        preset: str | None,
-        options: Mapping[str, Any],
+        progress: Progress | None,
     ) -> Rendering:
-        from clrecon.operators.reformat.cut import reformat_curve
-
-        curve: ArrayLike | str = _given(options, "curve", "spine")
         return reformat_curve(
-            self._resident, curve, _given(options, "cpr", "straightened"), size,
-            view=view, up=up, **self._slab_options(background, preset, options),
+            self._resident, size=size, view=place.view, up=place.up, background=background, progress=progress,
+            **style.parameters(),
         )  # fmt: skip
-
-    def _slab_options(
-        self, background: str | Sequence[float], preset: str | None, options: Mapping[str, Any]
-    ) -> dict[str, Any]:
-        return {
-            "thickness": _given(options, "thickness", 0.0),
-            "combine": _given(options, "combine", "mean"),
-            "window": _choose_window(preset, options),
-            "background": background,
-        }
 
     def _checked_step(self, ray_step: float | None) -> float:
         smallest = min(self.volume.spacing)
@@ -274,25 +208,20 @@ class VolumeRenderer:
         )
 
 
-def _choose_mode(mode: str | None, preset: str | None, function: TransferFunction | None) -> str:
-    """The mode that is asked for, or the preset's own."""
-    if function is not None and preset is not None:
-        raise UsageError(f"a picture has a preset ({preset}) or a transfer function, not both")
-    chosen = find_preset(DEFAULT_PRESET if preset is None else preset)
-    if mode is None:
-        return chosen.mode if function is None else "dvr"
-    if mode not in MODES:
-        raise UsageError(f"there is no mode {mode!r}: it is one of {', '.join(MODES)}")
-    return mode
+class _Place(NamedTuple):
+    """Where a picture is taken from, as it was said."""
 
+    camera: Camera | None
+    view: str | Sequence[float]
+    up: str | Sequence[float] | None
+    zoom: float
+    view_angle: float | None
 
-def _check_options(mode: str, given: Mapping[str, Any]) -> None:
-    """Refuse options that do not exist, or mean nothing in a mode."""
-    for name, value in given.items():
-        if name not in KNOWN_IN:
-            raise UsageError(f"a picture has no option {name!r}: it is one of {', '.join(KNOWN_IN)}")
-        if value is not None and value is not False and mode not in KNOWN_IN[name]:
-            raise UsageError(f"{name} means nothing in mode {mode}: it belongs to {', '.join(KNOWN_IN[name])}")
+    def camera_for(self, volume: Volume, size: tuple[int, int]) -> Camera:
+        """The camera that is given, or the one that the rest makes."""
+        if self.camera is not None:
+            return self.camera
+        return Camera.fit(volume, self.view, self.zoom, up=self.up, view_angle=self.view_angle, size=size)
 
 
 def _check_alone(**placing: Any) -> None:
@@ -303,90 +232,52 @@ def _check_alone(**placing: Any) -> None:
         raise UsageError(f"a camera says by itself where a picture is taken from: leave out {them}, or the camera")
 
 
-def _given(options: Mapping[str, Any], name: str, default: Any) -> Any:
-    value = options.get(name)
-    return default if value is None else value
-
-
-def _is_set(options: Mapping[str, Any], name: str) -> bool:
-    value = _given(options, name, False)
-    if not isinstance(value, (bool, np.bool_)):
-        raise UsageError(f"{name} is True or False, not {value!r:.60}")
-    return bool(value)
-
-
-def _choose_window(preset: str | None, options: Mapping[str, Any]) -> tuple[float, float] | None:
-    window = options.get("window")
-    if window is not None:
-        return checked_window(window)
-    return None if preset is None else find_preset(preset).window
-
-
-def _label_style(options: Mapping[str, Any]) -> LabelStyle | None:
-    if options.get("labels") is None:
-        for name in ("label_colors", "label_opacity"):
-            if options.get(name) is not None:
-                raise UsageError(f"{name} says how labels look: give the labels too")
-        return None
-    return LabelStyle.of(options["labels"], options.get("label_colors"), options.get("label_opacity"))
-
-
 def render(
     volume: Volume | DeviceVolume,
-    mode: str | None = None,
-    preset: str | None = None,
-    transfer_function: TransferFunction | None = None,
+    style: Style | str | None = None,
+    *,
     camera: Camera | None = None,
     view: str | Sequence[float] | None = None,
+    up: str | Sequence[float] | None = None,
+    zoom: float | None = None,
+    view_angle: float | None = None,
     size: Sequence[int] | None = None,
-    ray_step: float | None = None,
+    background: str | Sequence[float] = "black",
     device: Device | str | int | None = None,
-    *,
     memory: int | None = None,
-    **options: Any,
+    progress: Progress | None = None,
+    **look: object,
 ) -> Rendering:
     """Make a picture of a volume.
+
+    >>> render(volume, SurfaceLook(300, color="orange"), view="left", size=(800, 600))
+    >>> render(volume, preset="spine", view=(30, 15))
+    >>> render(volume, "mip", window=(0, 1000))
 
     Parameters
     ----------
     volume : Volume
-    mode : {"dvr", "mip", "minip", "mean", "drr", "surface", "slices", "slice", "cpr"}, optional
-        Volume rendering, highest, lowest or mean value along each ray, radiograph (the water that attenuates as much),
-        shaded surface at an iso value, slices in space, a plane through the volume, curved planar reformation.  Default
-        is the preset's, or "dvr".
-    preset : str, optional
-        See `clrecon.rendering.looks.presets`; default "bone".
-    transfer_function : TransferFunction, optional
-        In place of a preset.
+    style : Style or str, optional
+        What the picture shows: a `VolumeLook`, `Projection`, `SurfaceLook`, `SlicesInSpace`, `PlaneCut` or `CurveCut`;
+        or the name of a mode, see `clrecon.rendering.pictures.modes.MODES`.  Default: volume rendering of bone.
     camera : Camera, optional
         In place of `view`, `up`, `zoom` and `view_angle`, which are refused beside it.
     view : str or (azimuth, elevation), optional
-        Default "anterior".  See `Camera.fit`, which also takes `up`, `zoom` and `view_angle`.
+        Where the camera stands, default "anterior"; `up`, `zoom` and `view_angle` go with it, see `Camera.fit`.  A
+        plane knows axial, coronal and sagittal too.
     size : (width, height), optional
-        Pixels; default 1024 x 1024, and what the curve needs in "cpr".
-    ray_step : float, optional
-        mm between samples; default half the smallest spacing.
+        Pixels; default 1024 x 1024, and for a `CurveCut` what the curve needs.
+    background : str or (float, float, float)
+        Colour behind what is shown, or "transparent".
     device : Device, str or int, optional
         See `clrecon.device`.
     memory : int, optional
         Bytes that may be taken on the device; default all that it has.
-    **options
-        ``background``, a colour or "transparent"; and by mode (others refuse them):
-
-        dvr, surface: ``lighting``; ``labels``, a `LabelMap`, with ``label_colors`` and ``label_opacity``, mappings of
-        label to colour and to a factor on the opacity.  dvr: ``jitter``, samples at random places of their segments.
-
-        surface: ``iso_value`` in HU (default 200), ``color``, ``shadows`` (they need a fixed light), ``depth_cue``.
-
-        mip, minip, mean, slices, slice, cpr: ``window``, HU that are black and white; default the 1st to the 99th
-        percentile in projections, -450 to 1050 HU else.  drr: ``window`` in mm of water; default the 1st to the 99th
-        percentile of the rays that meet the body.
-
-        slices: ``slices``, how many or which, ``slice_opacity``.  slice, cpr: ``thickness`` in mm with ``combine``
-        ("mean", "max", "min").  slice: ``offset_mm`` along the view.  cpr: ``curve``, points (n, 3) in LPS mm (default:
-        the spinal canal, found), ``cpr`` ("straightened", "stretched").
-
-        All but slice and cpr: ``clip``, a `Clip`.
+    progress : callable, optional
+        ``progress(stage, done, total)``, called as slabs are finished.
+    **look
+        In place of a style: ``mode``, ``preset`` and fields of the mode's style, see
+        `clrecon.rendering.pictures.modes.make_style`.
 
     Returns
     -------
@@ -401,5 +292,8 @@ def render(
     DeviceError
         No device, not enough memory, or the device fails.
     """
-    with VolumeRenderer(volume, device, memory=memory) as renderer:
-        return renderer.render(mode, preset, transfer_function, camera, view, size, ray_step, **options)
+    with VolumeRenderer(volume, device=device, memory=memory) as renderer:
+        return renderer.render(
+            style, camera=camera, view=view, up=up, zoom=zoom, view_angle=view_angle, size=size,
+            background=background, progress=progress, **look,
+        )  # fmt: skip

@@ -23,6 +23,8 @@ __all__ = [
     "PLANES",
     "Sheet",
     "SlabSamples",
+    "checked_offset",
+    "checked_thickness",
     "find_plane",
     "finest_step",
     "plane_sheet",
@@ -115,12 +117,7 @@ def slab_samples(volume: Volume, thickness: float) -> SlabSamples:
     UsageError
         The thickness is negative, not finite or absurd.
     """
-    try:
-        size = float(thickness)
-    except (TypeError, ValueError):
-        size = np.nan
-    if not 0.0 <= size < np.inf:
-        raise UsageError(f"the thickness of a slice is a length in mm, 0 for a plane without one, not {thickness!r}")
+    size = checked_thickness(thickness)
     if size == 0.0:
         return SlabSamples(0, 0.0)
     finest = finest_step(volume)
@@ -189,6 +186,41 @@ def _triple(vector: Float64Array) -> tuple[float, float, float]:
     return float(vector[0]), float(vector[1]), float(vector[2])
 
 
+def _number(value: float) -> float:
+    try:
+        return float(value)
+    except (TypeError, ValueError, OverflowError):
+        return np.nan
+
+
+def checked_thickness(thickness: float) -> float:
+    """The thickness of a slice in mm as float.
+
+    Raises
+    ------
+    UsageError
+        It is negative or not finite.
+    """
+    size = _number(thickness)
+    if not 0.0 <= size < np.inf:
+        raise UsageError(f"the thickness of a slice is a length in mm, 0 for a plane without one, not {thickness!r}")
+    return size
+
+
+def checked_offset(offset_mm: float) -> float:
+    """The offset of a slice along the view, mm, as float.
+
+    Raises
+    ------
+    UsageError
+        It is not finite.
+    """
+    offset = _number(offset_mm)
+    if not np.isfinite(offset):
+        raise UsageError(f"the offset of a slice is a length in mm, not {offset_mm!r}")
+    return offset
+
+
 def positive_mm(what: str, value: float) -> float:
     """Return a length in mm as float.
 
@@ -197,10 +229,7 @@ def positive_mm(what: str, value: float) -> float:
     UsageError
         It is none; the message begins with `what`.
     """
-    try:
-        number = float(value)
-    except (TypeError, ValueError):
-        number = np.nan
+    number = _number(value)
     if not 0.0 < number < np.inf:
         raise UsageError(f"{what} is a length in mm, not {value!r}")
     return number
@@ -230,15 +259,9 @@ def plane_sheet(camera: Camera, size: Sequence[int], offset_mm: float = 0.0) -> 
         The size is not one, or the offset is not finite.
     """
     width, height = checked_size(size)
-    try:
-        offset = float(offset_mm)
-    except (TypeError, ValueError, OverflowError):
-        offset = np.nan
-    if not np.isfinite(offset):
-        raise UsageError(f"the offset of a slice is a length in mm, not {offset_mm!r}")
     right, up, forward = camera.basis()
     pixel = camera.pixel_mm(size)
-    shift = offset * forward
+    shift = checked_offset(offset_mm) * forward
     centre = np.add(camera.focal_point, shift)
     position = np.add(camera.position, shift)
     own = Camera(_triple(position), _triple(centre), camera.up, parallel_scale=0.5 * height * pixel)

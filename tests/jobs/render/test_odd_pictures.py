@@ -29,7 +29,7 @@ RAILS_ALIKE = 0.6
 
 def draw(volume: Volume, device: Any) -> dict[str, Rendering]:
     """A small picture from the front with each preset."""
-    with VolumeRenderer(volume, device) as renderer:
+    with VolumeRenderer(volume, device=device) as renderer:
         return {name: renderer.render(preset=name, view="anterior", size=(64, 64)) for name in PRESETS}
 
 

@@ -20,6 +20,7 @@ from clrecon.jobs.render.job import make_pictures
 from clrecon.jobs.render.settings import LabelLook, RenderSettings, Turntable
 from clrecon.jobs.render.studio import read_function
 from clrecon.phantom import PhantomSettings, write_phantom
+from clrecon.rendering.pictures.styles import Projection
 
 pytestmark = pytest.mark.first_device
 
@@ -42,7 +43,7 @@ def test_a_sphere_is_a_disc_of_its_size_from_every_side(
     folder, truth = sphere
     surface = truth["surface"]
     files = PictureFiles(tmp_path / "a.png", depth=tmp_path / "d.npy", report=tmp_path / "r.json")
-    settings = RenderSettings(views=("anterior", "left", "40,-25"), size=SIZE, device=str(device.index))
+    settings = RenderSettings.of(views=("anterior", "left", "40,-25"), size=SIZE, device=str(device.index))
     report = make_pictures(folder, files, settings)
     assert json.loads((tmp_path / "r.json").read_text()) == json.loads(json.dumps(report))
     for picture in report["pictures"]:
@@ -61,7 +62,7 @@ def test_views_have_scales_of_their_own_until_zoom_makes_them_one(
     mode: str, device: Any, sphere: tuple[Path, dict[str, Any]], tmp_path: Path
 ) -> None:
     files = PictureFiles(tmp_path / "a.png")
-    settings = RenderSettings(mode, views=("anterior", "left", "superior"), size=SIZE, device=str(device.index))
+    settings = RenderSettings.of(mode, views=("anterior", "left", "superior"), size=SIZE, device=str(device.index))
     fitted = {made["view"]: made["pixel_mm"] for made in make_pictures(sphere[0], files, settings)["pictures"]}
     largest = max(fitted.values())
     assert min(fitted.values()) < 0.95 * largest
@@ -72,7 +73,7 @@ def test_views_have_scales_of_their_own_until_zoom_makes_them_one(
 
 def test_the_report_is_what_the_contract_says(device: Any, sphere: tuple[Path, dict[str, Any]], tmp_path: Path) -> None:
     files = PictureFiles(tmp_path / "a.png", turntable=tmp_path / "frames", depth=tmp_path / "a.npy")
-    settings = RenderSettings(
+    settings = RenderSettings.of(
         "mip", window=(-100, 100), size=SIZE, turntable=Turntable(2), device=str(device.index), memory=10**9
     )
     report = make_pictures(sphere[0], files, settings)
@@ -92,7 +93,7 @@ def test_the_report_is_what_the_contract_says(device: Any, sphere: tuple[Path, d
 def test_progress_and_order_of_work(device: Any, sphere: tuple[Path, dict[str, Any]], tmp_path: Path) -> None:
     stages: list[tuple[str, int, int]] = []
     files = PictureFiles(tmp_path / "a.png", turntable=tmp_path / "a.gif")
-    settings = RenderSettings(size=SIZE, turntable=Turntable(3, 10.0, 90.0), device=str(device.index))
+    settings = RenderSettings.of(size=SIZE, turntable=Turntable(3, 10.0, 90.0), device=str(device.index))
     make_pictures(sphere[0], files, settings, progress=lambda *step: stages.append(step))
     assert list(dict.fromkeys(stage for stage, _, _ in stages)) == ["device", "scan", "read", "render", "frames"]
     assert [step for step in stages if step[0] == "frames"] == [("frames", done, 3) for done in range(4)]
@@ -100,13 +101,13 @@ def test_progress_and_order_of_work(device: Any, sphere: tuple[Path, dict[str, A
 
 def test_outputs_then_files_then_device_then_input(tmp_path: Path) -> None:
     nowhere = tmp_path / "nowhere"
-    bad = RenderSettings(device="abacus", transfer_function=str(tmp_path / "none.json"))
+    bad = RenderSettings.of(device="abacus", transfer_function=str(tmp_path / "none.json"))
     with pytest.raises(OutputError, match="nowhere"):
         make_pictures(nowhere, PictureFiles(nowhere / "a.png"), bad)
     with pytest.raises(UsageError, match="none.json"):
         make_pictures(nowhere, PictureFiles(tmp_path / "a.png"), bad)
     with pytest.raises(DeviceError, match="abacus|no OpenCL device"):
-        make_pictures(nowhere, PictureFiles(tmp_path / "a.png"), RenderSettings(device="abacus"))
+        make_pictures(nowhere, PictureFiles(tmp_path / "a.png"), RenderSettings.of(device="abacus"))
     assert list(tmp_path.iterdir()) == []
 
 
@@ -121,7 +122,7 @@ def test_a_step_that_fails_leaves_the_old_files(
     moving = None if fails == "second view" else tmp_path / "a.gif"
     stem = "a" if fails == "second view" else "a_left"
     files = PictureFiles(tmp_path / f"{stem}.png", tmp_path / f"{stem}.npy", None, moving, tmp_path / "a.json")
-    settings = RenderSettings(
+    settings = RenderSettings.of(
         views=views, size=SIZE, turntable=Turntable(2) if moving else None, device=str(device.index)
     )
 
@@ -151,7 +152,7 @@ def test_a_folder_of_frames_waits_for_the_report(
     device: Any, sphere: tuple[Path, dict[str, Any]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     frames = tmp_path / "frames"
-    settings = RenderSettings(size=SIZE, turntable=Turntable(2), device=str(device.index))
+    settings = RenderSettings.of(size=SIZE, turntable=Turntable(2), device=str(device.index))
     make_pictures(sphere[0], PictureFiles(turntable=frames), settings)
     older = {path.name: path.read_bytes() for path in frames.iterdir()}
 
@@ -170,7 +171,7 @@ def test_a_folder_of_frames_waits_for_the_report(
 
 
 def test_the_report_calls_a_folder_a_folder(device: Any, sphere: tuple[Path, dict[str, Any]], tmp_path: Path) -> None:
-    settings = RenderSettings(size=SIZE, turntable=Turntable(2), background="transparent", device=str(device.index))
+    settings = RenderSettings.of(size=SIZE, turntable=Turntable(2), background="transparent", device=str(device.index))
     made = make_pictures(sphere[0], PictureFiles(turntable=f"{tmp_path}/v1.2/"), settings)
     again = make_pictures(sphere[0], PictureFiles(turntable=tmp_path / "v1.2"), settings)
     assert [report["turntable"]["output"]["format"] for report in (made, again)] == ["folder", "folder"]
@@ -185,7 +186,7 @@ def test_many_views_raise_the_limit_of_open_files(
     import resource
 
     limits = resource.getrlimit(resource.RLIMIT_NOFILE)
-    settings = RenderSettings(views=[f"{angle},0" for angle in range(60)], size=(8, 8), device=str(device.index))
+    settings = RenderSettings.of(views=[f"{angle},0" for angle in range(60)], size=(8, 8), device=str(device.index))
     with open(os.devnull) as file:
         resource.setrlimit(resource.RLIMIT_NOFILE, (file.fileno() + 30, limits[1]))
     try:
@@ -199,7 +200,7 @@ def test_nothing_else_goes_into_the_folder_of_frames(tmp_path: Path) -> None:
     (tmp_path / "frames").mkdir()
     files = PictureFiles(turntable=tmp_path / "frames", report=tmp_path / "frames" / "a.json")
     with pytest.raises(UsageError, match="the report cannot lie in .*frames, which holds frames and nothing else"):
-        make_pictures(tmp_path / "nowhere", files, RenderSettings(turntable=Turntable(2)))
+        make_pictures(tmp_path / "nowhere", files, RenderSettings.of(turntable=Turntable(2)))
     assert list((tmp_path / "frames").iterdir()) == []
 
 
@@ -208,7 +209,7 @@ def test_a_volume_in_slabs_is_the_same_picture(
 ) -> None:
     found = []
     for memory in (None, 130_000):
-        settings = RenderSettings(size=SIZE, views=("30,20",), device=str(device.index), memory=memory)
+        settings = RenderSettings.of(size=SIZE, views=("30,20",), device=str(device.index), memory=memory)
         report = make_pictures(sphere[0], PictureFiles(tmp_path / "a.png"), settings)
         found.append((report["pictures"][0]["slabs"], np.asarray(Image.open(tmp_path / "a.png")).astype(int)))
     assert found[0][0] == 1 < found[1][0]
@@ -218,7 +219,7 @@ def test_a_volume_in_slabs_is_the_same_picture(
 def test_an_x_ray_is_a_sum_in_mm_of_water(device: Any, sphere: tuple[Path, dict[str, Any]], tmp_path: Path) -> None:
     """The window runs over the rays that meet the body, and is in mm of water where it is given too."""
     files = PictureFiles(tmp_path / "a.png", values=tmp_path / "v.npy")
-    settings = RenderSettings(preset="x-ray", size=SIZE, device=str(device.index))
+    settings = RenderSettings.of(preset="x-ray", size=SIZE, device=str(device.index))
     report = make_pictures(sphere[0], files, settings)
     picture, values = report["pictures"][0], np.load(tmp_path / "v.npy")
     most = float(values.max())
@@ -226,7 +227,8 @@ def test_an_x_ray_is_a_sum_in_mm_of_water(device: Any, sphere: tuple[Path, dict[
     assert picture["values_mm_water"] == [0.0, pytest.approx(most)]
     low, high = picture["window_mm_water"]
     assert 0.05 * most < low < high <= most
-    told = make_pictures(sphere[0], files, replace(settings, window=(0.0, 2.0 * most)))["pictures"][0]
+    windowed = replace(settings, style=Projection("drr", window=(0.0, 2.0 * most)))
+    told = make_pictures(sphere[0], files, windowed)["pictures"][0]
     assert told["window_mm_water"] == [0.0, pytest.approx(2.0 * most)]
     assert np.asarray(Image.open(tmp_path / "a.png").convert("L")).max() in (127, 128)
 
@@ -246,15 +248,15 @@ def test_an_x_ray_is_a_sum_in_mm_of_water(device: Any, sphere: tuple[Path, dict[
 def test_a_picture_of_nothing_says_so(
     device: Any, sphere: tuple[Path, dict[str, Any]], tmp_path: Path, settings: dict[str, Any], words: str
 ) -> None:
-    looks = RenderSettings(size=SIZE, device=str(device.index), **settings)
+    looks = RenderSettings.of(size=SIZE, device=str(device.index), **settings)
     report = make_pictures(sphere[0], PictureFiles(tmp_path / "a.png"), looks)
     assert [text for text in report["warnings"] if re.search(words, text)]
-    if looks.mode_used != "slice":
+    if looks.mode != "slice":
         turning = replace(looks, turntable=Turntable(2))
         report = make_pictures(sphere[0], PictureFiles(turntable=tmp_path / "b.gif"), turning)
         assert [text for text in report["warnings"] if re.search(words, text)]
     fine = make_pictures(
-        sphere[0], PictureFiles(tmp_path / "a.png"), RenderSettings(size=SIZE, device=str(device.index))
+        sphere[0], PictureFiles(tmp_path / "a.png"), RenderSettings.of(size=SIZE, device=str(device.index))
     )
     assert not [text for text in fine["warnings"] if "picture is" in text or "nothing" in text]
 
@@ -266,13 +268,13 @@ def test_names_of_views() -> None:
 
 
 def test_what_the_mode_is() -> None:
-    assert [settings.mode_used for settings in (
-        RenderSettings(), RenderSettings(preset="x-ray"), RenderSettings(iso_value=0.0), RenderSettings(curve="auto"),
-        RenderSettings(preset="x-ray", mode="dvr"),
+    assert [settings.mode for settings in (
+        RenderSettings.of(), RenderSettings.of(preset="x-ray"), RenderSettings.of(iso_value=0.0),
+        RenderSettings.of(curve="auto"), RenderSettings.of(preset="x-ray", mode="dvr"),
     )] == ["dvr", "drr", "surface", "cpr", "dvr"]  # fmt: skip
-    assert (RenderSettings().preset_used, RenderSettings("mip").preset_used) == ("bone", None)
-    assert (RenderSettings("slice").views_used, RenderSettings().views_used) == (("axial",), ("anterior",))
-    assert RenderSettings(clip_box=(-1, 1, -2, 2, 0, float("inf"))).clip is not None
+    assert (RenderSettings.of().preset_used, RenderSettings.of("mip").preset_used) == ("bone", None)
+    assert (RenderSettings.of("slice").views_used, RenderSettings.of().views_used) == (("axial",), ("anterior",))
+    assert RenderSettings.of(clip_box=(-1, 1, -2, 2, 0, float("inf"))).style.clip is not None
 
 
 @pytest.mark.parametrize(
@@ -295,7 +297,7 @@ def test_what_the_mode_is() -> None:
 )
 def test_impossible_settings_are_refused(wrong: dict[str, Any], words: str) -> None:
     with pytest.raises(UsageError, match=words):
-        RenderSettings(**wrong)
+        RenderSettings.of(**wrong)
 
 
 def test_impossible_labels_are_refused() -> None:

@@ -129,15 +129,15 @@ def test_a_report_replaces_no_file_that_is_read(tmp_path: Path, monkeypatch: pyt
         with pytest.raises(UsageError, match="would replace a file that is read"):
             make_mesh("ct.nrrd", "a.stl", MeshSettings(labels=LabelChoice("labels.nrrd")), report_path=report)
     for report, settings in {
-        "ct.nrrd": RenderSettings(),
-        "tf.json": RenderSettings(transfer_function="tf.json:bone"),
-        "line.json": RenderSettings(curve="line.json"),
-        "labels.nrrd": RenderSettings(labels=LabelLook("labels.nrrd")),
+        "ct.nrrd": RenderSettings.of(),
+        "tf.json": RenderSettings.of(transfer_function="tf.json:bone"),
+        "line.json": RenderSettings.of(curve="line.json"),
+        "labels.nrrd": RenderSettings.of(labels=LabelLook("labels.nrrd")),
     }.items():
         with pytest.raises(UsageError, match="would replace a file that is read"):
             make_pictures("ct.nrrd", PictureFiles("a.png", report=report), settings)
     assert {path.read_bytes() for path in tmp_path.iterdir()} == {b"mine"} and len(list(tmp_path.iterdir())) == 5
-    check_kept([("the report", "auto")], "ct.nrrd", *RenderSettings(curve="auto").files_read)
+    check_kept([("the report", "auto")], "ct.nrrd", *RenderSettings.of(curve="auto").files_read)
     check_kept([("the report", None)], "ct.nrrd")
 
 

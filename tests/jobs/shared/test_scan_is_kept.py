@@ -48,7 +48,7 @@ def lead(how: str, slice_file: Path, name: str) -> str:
 
 def jobs(path: str) -> dict[str, object]:
     """Every output of every job in the place `path`, which is asked for by its extension."""
-    turntable = RenderSettings(turntable=Turntable(frames=2))
+    turntable = RenderSettings.of(turntable=Turntable(frames=2))
     return {
         ".stl": [lambda: make_mesh("ct", path)],
         ".json": [
@@ -59,7 +59,7 @@ def jobs(path: str) -> dict[str, object]:
         ".png": [lambda: make_pictures("ct", PictureFiles(path))],
         ".npy": [
             lambda: make_pictures("ct", PictureFiles("a.png", depth=path)),
-            lambda: make_pictures("ct", PictureFiles("a.png", values=path), RenderSettings(mode="mip")),
+            lambda: make_pictures("ct", PictureFiles("a.png", values=path), RenderSettings.of(mode="mip")),
         ],
         ".gif": [lambda: make_pictures("ct", PictureFiles(turntable=path), turntable)],
     }[Path(path).suffix]
@@ -119,7 +119,7 @@ def test_a_folder_of_frames_that_is_the_scan(scan, tmp_path, folder):
     frames.mkdir()
     for number, file in enumerate(sorted(scan.iterdir())):
         (frames / f"frame_{number:04d}.png").write_bytes(file.read_bytes())
-    settings = RenderSettings(turntable=Turntable(frames=2))
+    settings = RenderSettings.of(turntable=Turntable(frames=2))
     with pytest.raises(ClreconError, match="holds other things|DICOM files are there|would replace"):
         make_pictures("frames", PictureFiles(turntable=str(tmp_path / folder)), settings)
     assert len(list(frames.iterdir())) == 4

@@ -189,7 +189,7 @@ def test_labels_of_a_single_slice_stay_until_the_picture_is_made(device):
     """A single slice is doubled on its way to the device: CPU devices read the copy in place."""
     labels = LabelMap(np.ones((1, 1100, 1100), np.uint8), np.eye(4))
     volume = Volume(np.full((1, 1100, 1100), 1000, np.int16), np.eye(4))
-    with VolumeRenderer(volume, device) as renderer:
+    with VolumeRenderer(volume, device=device) as renderer:
         for _ in range(4):
             picture = renderer.render(
                 transfer_function=BRIGHT, labels=labels, label_colors={1: (0.0, 0.0, 1.0)}, view="superior",

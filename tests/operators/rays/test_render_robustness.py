@@ -132,7 +132,7 @@ def test_slabs_come_in_the_order_of_the_rays_wherever_a_parallel_camera_is(devic
 def test_after_a_failure_the_next_picture_is_made_on_a_fresh_device(device, monkeypatch, mode):
     import pyopencl as cl
 
-    with clrecon.VolumeRenderer(body(), device) as renderer:
+    with clrecon.VolumeRenderer(body(), device=device) as renderer:
         good = renderer.render(mode, size=SIZE, view=(20, 30)).image
         lost = renderer.device.context
 
@@ -171,7 +171,7 @@ def test_a_device_that_is_too_small_is_named(device, monkeypatch):
 
 def test_pictures_stay_what_they_were(device):
     """Their pages are lent from a pool, and later pictures of the same size come from the same pool."""
-    with clrecon.VolumeRenderer(body(), device) as renderer:
+    with clrecon.VolumeRenderer(body(), device=device) as renderer:
         kept = renderer.render("mip", size=(640, 512), view=(10, 20))
         copies = [array.copy() for array in (kept.image, kept.depth, kept.values)]
         for azimuth in range(4):
@@ -183,7 +183,7 @@ def test_pictures_stay_what_they_were(device):
 
 def test_threads_share_a_renderer(device):
     functions = [HARD, HARD.shifted(100.0), HARD.shifted(300.0)]
-    with clrecon.VolumeRenderer(body(), device) as renderer:
+    with clrecon.VolumeRenderer(body(), device=device) as renderer:
         alone = [renderer.render(transfer_function=f, size=SIZE, jitter=True).image for f in functions]
         wrong: list[object] = []
 

@@ -180,7 +180,7 @@ def test_a_turntable_of_labels_brings_the_map_to_the_grid_once(device, volume, m
     calls = []
     true_take = resample._take_nearest
     monkeypatch.setattr(resample, "_take_nearest", lambda *both: calls.append(1) or true_take(*both))
-    with clrecon.VolumeRenderer(volume, device) as renderer:
+    with clrecon.VolumeRenderer(volume, device=device) as renderer:
         for azimuth in range(0, 360, 60):
             renderer.render(preset="muscle", labels=coarse, view=(azimuth, 0), size=SIZE)
     assert len(calls) == 1
@@ -202,7 +202,7 @@ def test_a_device_volume_has_its_own_device_and_memory(device, volume):
         for call in (
             lambda: clrecon.extract_isosurface(resident, 100, device=device),
             lambda: clrecon.render(resident, memory=10**9),
-            lambda: clrecon.VolumeRenderer(resident, device),
+            lambda: clrecon.VolumeRenderer(resident, device=device),
             lambda: clrecon.SurfaceExtractor(resident, memory=10**9),
             lambda: clrecon.cut_slice(resident, device=device),
         ):
@@ -228,7 +228,7 @@ def test_renderers_and_extractors_leave_a_volume_that_was_given_on_the_device(de
 def test_labels_beside_others_are_not_mixed_up(device, volume, labels):
     swapped = LabelMap(np.where(labels.voxels == 1, 2, np.where(labels.voxels == 2, 1, 0)).astype(np.uint8), OBLIQUE)
     colors = {1: (1.0, 0.0, 0.0), 2: (0.0, 0.0, 1.0)}
-    with clrecon.VolumeRenderer(volume, device) as renderer:
+    with clrecon.VolumeRenderer(volume, device=device) as renderer:
         looks = [
             renderer.render(preset="muscle", labels=which, label_colors=colors, size=SIZE)
             for which in (labels, swapped, labels, swapped)

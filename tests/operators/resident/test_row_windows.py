@@ -156,7 +156,7 @@ for guard in (first - size, first + size):
 volume = Volume(voxels, np.diag([0.7, 0.7, 0.8, 1.0]))
 assert volume.voxels.ctypes.data == first
 seen = 0
-with clrecon.VolumeRenderer(volume, int(sys.argv[1])) as renderer:
+with clrecon.VolumeRenderer(volume, device=int(sys.argv[1])) as renderer:
     for view in ("anterior", "superior", "left", "3,2", "183,88"):
         for angle in (None, 30.0):
             seen += int((renderer.render(preset="bone", view=view, view_angle=angle, size=(160, 120)).image > 0).sum())

@@ -1,0 +1,114 @@
+"""Every style makes its picture, and keywords make the same one byte for byte."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+import clrecon
+from clrecon import (
+    CurveCut,
+    LabelMap,
+    Lighting,
+    PlaneCut,
+    Projection,
+    SlicesInSpace,
+    Style,
+    SurfaceLook,
+    TransferFunction,
+    UsageError,
+    VolumeLook,
+    VolumeRenderer,
+)
+from clrecon.geometry import Volume
+from clrecon.rendering.pictures.modes import MODES
+
+pytestmark = [pytest.mark.opencl, pytest.mark.first_device]
+
+SIZE = (40, 32)
+GLASS = TransferFunction([(0, 1, 1, 1, 0.1), (500, 1, 0.5, 0, 0.4)])
+LINE = [(5.0, -8.0, 35.0), (8.0, -6.0, 45.0), (5.0, -8.0, 60.0)]
+SIDE = Lighting(direction=(1.0, -1.0, 1.0))
+AFFINE = np.array([[1.1, 0, 0, -10], [0, 0.9, 0, -20], [0, 0, 2.0, 30], [0, 0, 0, 1]])
+
+
+def body() -> Volume:
+    voxels = np.full((20, 30, 34), -1000, np.int16)
+    inner = voxels[3:-3, 5:-5, 6:-6]
+    inner[...] = np.random.default_rng(3).integers(-200, 1500, inner.shape)
+    return Volume(voxels, AFFINE)
+
+
+def labels() -> LabelMap:
+    voxels = np.zeros((20, 30, 34), np.uint8)
+    voxels[5:10, 8:15, 8:20], voxels[10:15, 8:15, 8:20] = 1, 2
+    return LabelMap(voxels, AFFINE, {1: "L1", 2: "L2"})
+
+
+LABELS = labels()
+SAME: dict[str, tuple[Style, dict[str, Any]]] = {
+    "preset": (VolumeLook("skin"), {"preset": "skin"}),
+    "function": (VolumeLook(GLASS, jitter=True, ray_step=0.7), {"transfer_function": GLASS, "jitter": True,
+                                                                "ray_step": 0.7}),
+    "labels": (
+        VolumeLook(labels=LABELS, label_colors={"L1": "red"}, label_opacity={2: 0.2}, lighting=SIDE),
+        {"labels": LABELS, "label_colors": {"L1": "red"}, "label_opacity": {2: 0.2}, "lighting": SIDE},
+    ),
+    "mip": (Projection("mip", window=(-100, 900)), {"mode": "mip", "window": (-100, 900)}),
+    "minip": (Projection("minip"), {"mode": "minip"}),
+    "mean": (Projection("mean", ray_step=1.0), {"mode": "mean", "ray_step": 1.0}),
+    "drr": (Projection("drr"), {"preset": "x-ray"}),
+    "surface": (
+        SurfaceLook(300, color="red", depth_cue=0.4, shadows=True, lighting=SIDE),
+        {"iso_value": 300, "color": "red", "depth_cue": 0.4, "shadows": True, "lighting": SIDE},
+    ),
+    "slices": (SlicesInSpace([7, 3], opacity=0.9), {"mode": "slices", "slices": [7, 3], "slice_opacity": 0.9}),
+    "slice": (
+        PlaneCut(offset_mm=2.5, thickness=5.0, combine="max", window=(0, 900)),
+        {"mode": "slice", "offset_mm": 2.5, "thickness": 5, "combine": "max", "window": (0, 900)},
+    ),
+    "cpr": (CurveCut(LINE, kind="stretched"), {"curve": LINE, "cpr": "stretched"}),
+}  # fmt: skip
+
+
+def test_every_mode_is_drawn() -> None:
+    assert {style.mode for style, _ in SAME.values()} == set(MODES)
+
+
+@pytest.mark.parametrize("name", SAME)
+def test_a_style_and_keywords_make_the_same_picture(device: Any, name: str) -> None:
+    style, look = SAME[name]
+    place: dict[str, Any] = {"view": (20, 30), "size": SIZE}
+    with VolumeRenderer(body(), device=device) as renderer:
+        first, second = renderer.render(style, **place), renderer.render(**look, **place)
+    third = clrecon.render(body(), style, device=device, **place)
+    assert first.mode == style.mode and first.size == SIZE
+    assert first.image[..., :3].any()
+    for other in (second, third):
+        for array in ("image", "depth", "expected_depth", "values"):
+            one, two = getattr(first, array), getattr(other, array)
+            assert (one is None and two is None) or one.tobytes() == two.tobytes()
+
+
+def test_other_fields_of_cuts_are_used(device: Any) -> None:
+    with VolumeRenderer(body(), device=device) as renderer:
+        assert renderer.render(PlaneCut(pixel_mm=0.7), size=SIZE).pixel_mm == pytest.approx(0.7)
+        assert renderer.render(CurveCut(LINE, width_mm=20.0, pixel_mm=0.5), view="left").size[0] == 40
+        straight, turned = (renderer.render(CurveCut(LINE, angle=angle), view="left").values for angle in (0.0, 45.0))
+    assert straight is not None and turned is not None and not np.array_equal(straight, turned, equal_nan=True)
+
+
+def test_what_a_style_does_not_say_is_checked_beside_it(device: Any) -> None:
+    with VolumeRenderer(body(), device=device) as renderer:
+        with pytest.raises(UsageError, match="leave out color, or the style"):
+            renderer.render(SurfaceLook(), color="red")
+        with pytest.raises(UsageError, match="view_angle means nothing in mode slice"):
+            renderer.render(PlaneCut(), view_angle=20.0)
+        with pytest.raises(UsageError, match="a curved reformation has no camera"):
+            renderer.render(CurveCut(LINE), camera=clrecon.Camera.fit(renderer.volume))
+        with pytest.raises(UsageError, match="ray step is a length in mm, at least"):
+            renderer.render(VolumeLook(ray_step=1e-4), size=SIZE)
+        with pytest.raises(UsageError, match="slices 0 to 19"):
+            renderer.render(SlicesInSpace([20]), size=SIZE)
