@@ -29,7 +29,7 @@
 
 /* Follow the labels from one, JUMPS times or until a root. */
 static inline uint follow_labels(
-    __global const uint *restrict labels, uint label, __global uint *flags, const uint pass)
+    __global const uint *restrict labels, uint label, __global uint *flags, const uint pass_number)
 {
     uint next = labels[label];
     for (int jump = 0; jump < JUMPS && next != label; ++jump) {
@@ -37,7 +37,7 @@ static inline uint follow_labels(
         next = labels[label];
     }
     if (next != label)
-        flags[0] = pass;
+        flags[0] = pass_number;
     return label;
 }
 
@@ -82,13 +82,13 @@ __kernel void hook_corners(__global const uint *restrict triangles, __global uin
  * Guarantees  a chain of c links becomes one of at most ceil(c / (JUMPS + 1)); all who write the flag write the same */
 __kernel void jump_labels(
     __global const uint *restrict labels, __global uint *restrict jumped, __global uint *flags, const uint n,
-    const uint pass)
+    const uint pass_number)
 {
     const uint vertex = get_global_id(0);
     if (vertex >= n)
         return;
     const uint label = labels[vertex];
-    jumped[vertex] = label == UNUSED ? UNUSED : follow_labels(labels, label, flags, pass);
+    jumped[vertex] = label == UNUSED ? UNUSED : follow_labels(labels, label, flags, pass_number);
 }
 
 /* Parameters  triangles  in   (m, 3)
@@ -154,14 +154,13 @@ __kernel void gather_roots(
 /* Parameters  corners  in      (count, 3) roots of the first round, as gathered
  *             labels   in      (n,) of these all roots
  *             hooked   in/out  (n,) of these that are roots now as labels; then each the smallest in a triangle with it
- *             flags    out     [1]: the round where a root was hooked, else as it was
- *             count    mixed triangles
- *             round    counts from 1
+ *             flags    out     [1]: pass_number where a root was hooked, else as it was
+ *             count    mixed triangles;  pass_number counts from 1
  * Launch      as gather_roots
  * Guarantees  all who write the flag write the same; without it every triangle lies in one component */
 __kernel void hook_roots(
     __global const uint *restrict corners, __global const uint *restrict labels, __global uint *hooked,
-    __global uint *flags, const uint count, const uint round)
+    __global uint *flags, const uint count, const uint pass_number)
 {
     const uint place = get_global_id(0);
     if (place >= count)
@@ -178,7 +177,7 @@ __kernel void hook_roots(
         atomic_min(hooked + b, least);
     if (c != least)
         atomic_min(hooked + c, least);
-    flags[1] = round;
+    flags[1] = pass_number;
 }
 
 /* As jump_labels, for the vertices of a list.
@@ -192,11 +191,11 @@ __kernel void hook_roots(
  * Launch      global = count rounded up by the host, any local */
 __kernel void jump_roots(
     __global const uint *restrict roots, __global const uint *restrict labels, __global uint *restrict jumped,
-    __global uint *flags, const uint count, const uint pass)
+    __global uint *flags, const uint count, const uint pass_number)
 {
     const uint place = get_global_id(0);
     if (place < count)
-        jumped[roots[place]] = follow_labels(labels, labels[roots[place]], flags, pass);
+        jumped[roots[place]] = follow_labels(labels, labels[roots[place]], flags, pass_number);
 }
 
 /* Parameters  roots   in   (count,)

@@ -101,12 +101,13 @@ static inline int4 step_in_rows(
     return distance;
 }
 
-/* Parameters  from   in   (rows, bi) 0 or FARTHEST
- *             to     out  (rows, bi) distance along the row
+/* Parameters  distances  in   (rows, bi) 0 or FARTHEST
+ *             spread     out  (rows, bi) distance along the row
+ *             rows
  * Launch      global = rows / ROWS_AT_ONCE rounded up by the host, any local
  * Guarantees  every distance is written, none above FARTHEST */
 __kernel void spread_in_rows(
-    __global const uchar *restrict from, __global uchar *restrict to, const int bi, const uint rows)
+    __global const uchar *restrict distances, __global uchar *restrict spread, const int bi, const uint rows)
 {
     const uint first = (uint)get_global_id(0) * ROWS_AT_ONCE;
     if (first >= rows)
@@ -118,18 +119,18 @@ __kernel void spread_in_rows(
         * (ulong)bi;
     int4 distance = FARTHEST;
     for (int i = 0; i < bi; ++i)
-        distance = step_in_rows(from, to, begin, i, distance);
+        distance = step_in_rows(distances, spread, begin, i, distance);
     for (int i = bi - 1; i >= 0; --i)
-        distance = step_in_rows(to, to, begin, i, distance);
+        distance = step_in_rows(spread, spread, begin, i, distance);
 }
 
-/* Parameters  from   in   (outer, count, stride) distances so far
- *             to     out  the same with what lies along the middle axis
+/* Parameters  distances  in   (outer, count, stride) distances so far
+ *             spread     out  the same with what lies along the middle axis
  *             chunks of 16 bricks that cover `stride`;  items: outer * count * chunks
  * Launch      global = items rounded up by the host, any local
- * Guarantees  to = min along the axis of max(distance along it, from) */
+ * Guarantees  spread = min along the axis of max(distance along it, distances) */
 __kernel void spread_along(
-    __global const uchar *restrict from, __global uchar *restrict to, const int count, const int stride,
+    __global const uchar *restrict distances, __global uchar *restrict spread, const int count, const int stride,
     const int chunks, const uint items)
 {
     const uint item = get_global_id(0);
@@ -141,34 +142,34 @@ __kernel void spread_along(
     if (stride >= 16) {
         /* The last chunk takes the last 16: some of them twice. */
         const size_t here = row + min(first, stride - 16);
-        uchar16 best = BYTES(from + here);
+        uchar16 best = BYTES(distances + here);
         for (int way = 1; way < FARTHEST; ++way) {
             const ulong2 further_off = as_ulong2(best > (uchar16)((uchar)way));
             if ((further_off.x | further_off.y) == 0)
                 break;
             uchar16 near = (uchar16)((uchar)FARTHEST);
             if (way <= line)
-                near = BYTES(from + here - (size_t)way * stride);
+                near = BYTES(distances + here - (size_t)way * stride);
             if (line + way < count) {
-                const uchar16 further = BYTES(from + here + (size_t)way * stride);
+                const uchar16 further = BYTES(distances + here + (size_t)way * stride);
                 near = LESSER(near, further);
             }
             near = GREATER(near, (uchar16)((uchar)way));
             best = LESSER(best, near);
         }
-        *(__global some_bytes *)(to + here) = best;
+        *(__global some_bytes *)(spread + here) = best;
         return;
     }
     for (int at = 0; at < stride; ++at) {
         const size_t here = row + at;
-        int best = from[here];
+        int best = distances[here];
         for (int way = 1; way < best; ++way) {
             if (way <= line)
-                best = min(best, max(way, (int)from[here - (size_t)way * stride]));
+                best = min(best, max(way, (int)distances[here - (size_t)way * stride]));
             if (line + way < count)
-                best = min(best, max(way, (int)from[here + (size_t)way * stride]));
+                best = min(best, max(way, (int)distances[here + (size_t)way * stride]));
         }
-        to[here] = (uchar)best;
+        spread[here] = (uchar)best;
     }
 }
 

@@ -8,12 +8,13 @@ from clrecon.opencl.context import Device
 from clrecon.opencl.launching import Stopwatch, launch
 from clrecon.opencl.memory import MemoryLimits, check_budget, check_memory, describe_shortage, memory_limits
 from clrecon.opencl.pages import result_pages
-from clrecon.opencl.program import Program, load_program
+from clrecon.opencl.program import Kernel, Program, load_program
 from clrecon.opencl.select import choose_device, list_devices, list_platforms
 from clrecon.opencl.sources import kernel_files, read_kernel_source
 
 __all__ = [
     "Device",
+    "Kernel",
     "MemoryLimits",
     "Program",
     "Stopwatch",

@@ -8,6 +8,7 @@ from contextlib import contextmanager, suppress
 from typing import Any
 
 from clrecon.opencl.context import Device
+from clrecon.opencl.program import Kernel
 from clrecon.opencl.quirks import import_pyopencl
 
 __all__ = ["Stopwatch", "launch"]
@@ -90,37 +91,44 @@ def finish(device: Device) -> None:
 
 def launch(
     device: Device,
-    kernel: Any,
+    kernel: Kernel,
     items: int,
-    *arguments: Any,
+    /,
+    *,
     stopwatch: Stopwatch | None = None,
+    **arguments: Any,
 ) -> None:
     """Enqueue `kernel` over at least `items` work-items.
 
     Parameters
     ----------
     device : Device
-    kernel : pyopencl.Kernel
+    kernel : Kernel
+        Of a program, see `load_program`.
     items : int
         Work-items; rounded up to whole groups of `Device.group_size`, so kernels check their bounds first.
-    *arguments
-        Buffers and numpy scalars, in the kernel's order.
     stopwatch : Stopwatch, optional
         Where the time goes.
+    **arguments
+        The kernel's arguments, by the names that its source gives them: buffers, numbers, and four numbers for a
+        float4.  Numbers are converted to the types that the source says.
 
     Raises
     ------
+    TypeError
+        An argument is missing, or is none of the kernel's, or its value does not fit it.
     DeviceError
         The driver refuses; the message names the kernel and the sizes.
     """
     cl = import_pyopencl()
     group = device.group_size
     rounded = -(-items // group) * group
+    values = kernel.order(arguments)
     try:
         with device.lock:
-            event = kernel(device.queue, (rounded,), (group,), *arguments)
+            event = kernel.enqueue(device.queue, rounded, group, values)
     except cl.Error as error:
-        what = f"kernel {kernel.function_name} ({rounded:,} items in groups of {group}) failed"
+        what = f"kernel {kernel.name} ({rounded:,} items in groups of {group}) failed"
         raise device.fail(what, error) from error
     if stopwatch is not None:
-        stopwatch.record(kernel.function_name, event, arguments)
+        stopwatch.record(kernel.name, event, values)

@@ -4,30 +4,148 @@ from __future__ import annotations
 
 import time
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from typing import Any
+
+import numpy as np
 
 from clrecon.errors import DeviceError
 from clrecon.opencl.binaries import binary_key, read_binary, store_binary
 from clrecon.opencl.context import Device, describe_error
 from clrecon.opencl.quirks import import_pyopencl
+from clrecon.opencl.signatures import KernelArgument, definitions_of, find_signatures
 from clrecon.opencl.sources import read_kernel_source
 from clrecon.system.log import get_logger
 
-__all__ = ["Program", "load_program"]
+__all__ = ["Kernel", "Program", "load_program"]
 
 log = get_logger(__name__)
+
+_TYPES: dict[str, Any] = {
+    "char": np.int8, "uchar": np.uint8, "short": np.int16, "ushort": np.uint16, "int": np.int32, "uint": np.uint32,
+    "long": np.int64, "ulong": np.uint64, "float": np.float32, "float4": np.dtype("V16"),
+}  # fmt: skip
+
+LAUNCHES_BEFORE_TYPES = 8
+"""Launches after which pyopencl is told the types of a kernel's arguments: it then writes code that sets all of them in
+2 us, not 4 us each, but the writing takes as long as some launches, which a process with few of them should not wait
+for."""
+
+
+def _take_buffer(value: Any) -> Any:
+    if isinstance(value, import_pyopencl().Buffer):
+        return value
+    raise TypeError(f"{value!r} is no buffer")
+
+
+def _take_whole(kind: Any) -> Callable[[Any], Any]:
+    low, high = int(np.iinfo(kind).min), int(np.iinfo(kind).max)
+
+    def take(value: Any) -> Any:
+        if low <= value <= high:
+            number = kind(value)
+            if value.__class__ is int or number == value:  # to compare takes as long as to convert
+                return number
+        raise ValueError(f"{value!r} is no {kind.__name__}")
+
+    return take
+
+
+def _take_float4(numbers: Any) -> Any:
+    if numbers.__class__ is np.ndarray and numbers.dtype == np.float32 and numbers.shape == (4,):
+        return numbers
+    vector = np.ascontiguousarray(numbers, np.float32)
+    if vector.shape != (4,):
+        raise ValueError(f"4 numbers are a float4, not an array of shape {vector.shape}")
+    return vector
+
+
+class Kernel:
+    """A kernel of a built program, and what it is called with.
+
+    Attributes
+    ----------
+    name : str
+    arguments : tuple of KernelArgument
+        In the kernel's order.
+    cl_kernel : pyopencl.Kernel
+    """
+
+    def __init__(self, cl_kernel: Any, arguments: tuple[KernelArgument, ...]):
+        self.cl_kernel = cl_kernel
+        self.name: str = cl_kernel.function_name
+        self.arguments = arguments
+        if cl_kernel.num_args != len(arguments):
+            raise AssertionError(f"{self.name} has {cl_kernel.num_args} arguments, its source names {len(arguments)}")
+        self._names = tuple(argument.name for argument in arguments)
+        self._expected = frozenset(self._names)
+        self._takers = tuple((argument.name, _taker(argument)) for argument in arguments)
+        self._launches = 0
+
+    def enqueue(self, queue: Any, items: int, group: int, values: tuple[Any, ...]) -> Any:
+        """Launch the kernel over so many items with what `order` returned; the lock of the device is held."""
+        self._launches += 1
+        if self._launches == LAUNCHES_BEFORE_TYPES:
+            types = [None if argument.is_buffer else _TYPES[argument.type] for argument in self.arguments]
+            self.cl_kernel.set_scalar_arg_dtypes(types)
+        return self.cl_kernel(queue, (items,), (group,), *values)
+
+    def order(self, values: Mapping[str, Any]) -> tuple[Any, ...]:
+        """The arguments as the driver takes them: in the kernel's order, numbers in its types.
+
+        Parameters
+        ----------
+        values : mapping of str to buffer, number or four numbers
+            One for each argument, by name.
+
+        Raises
+        ------
+        TypeError
+            A name is missing or not one of the kernel's, or a value cannot be what its argument is.
+        """
+        if values.keys() != self._expected:
+            raise TypeError(self._describe_difference(values))
+        try:
+            return tuple([take(values[name]) for name, take in self._takers])
+        except (TypeError, ValueError, OverflowError) as error:
+            raise TypeError(self._describe_misfits(values)) from error
+
+    def _describe_difference(self, values: Mapping[str, Any]) -> str:
+        missing = [name for name in self._names if name not in values]
+        surplus = [name for name in values if name not in self._expected]
+        parts = [f"{what} {', '.join(names)}" for what, names in (("without", missing), ("with", surplus)) if names]
+        return f"kernel {self.name} is launched {' and '.join(parts)}: it takes {', '.join(self._names)}"
+
+    def _describe_misfits(self, values: Mapping[str, Any]) -> str:
+        wrong = []
+        for argument, (name, take) in zip(self.arguments, self._takers, strict=True):
+            try:
+                take(values[name])
+            except (TypeError, ValueError, OverflowError):
+                kind = "a buffer" if argument.is_buffer else argument.type
+                wrong.append(f"{name} is {kind}, not {values[name]!r}")
+        return f"kernel {self.name}: {'; '.join(wrong)}"
+
+
+def _taker(argument: KernelArgument) -> Callable[[Any], Any]:
+    if argument.is_buffer:
+        return _take_buffer
+    if argument.type == "float4":
+        return _take_float4
+    kind = _TYPES[argument.type]
+    return np.float32 if kind is np.float32 else _take_whole(kind)
 
 
 class Program:
     """A built kernel file; ``program["name"]`` is one of its kernels."""
 
-    def __init__(self, name: str, cl_program: Any):
+    def __init__(self, name: str, cl_program: Any, signatures: Mapping[str, tuple[KernelArgument, ...]]):
         self.name = name
-        self._kernels = {kernel.function_name: kernel for kernel in cl_program.all_kernels()}
+        built = {kernel.function_name: kernel for kernel in cl_program.all_kernels()}
+        self._kernels = {kernel: Kernel(built[kernel], signatures[kernel]) for kernel in built}
 
-    def __getitem__(self, kernel: str) -> Any:
+    def __getitem__(self, kernel: str) -> Kernel:
         return self._kernels[kernel]
 
     @property
@@ -69,7 +187,7 @@ def _build(device: Device, name: str, options: tuple[str, ...]) -> Program:
             warnings.simplefilter("ignore")  # a compiler's chatter about code that builds
             kept = _build_from_binary(device, source, options) if device.keeps_binaries else None
             built = _build_from_source(device, source, options) if kept is None else kept
-            program = Program(name, built)
+            program = Program(name, built, find_signatures(source, definitions_of(options)))
     except (import_pyopencl().Error, RuntimeError, OSError) as error:  # OSError: the driver's or pyopencl's cache
         raise DeviceError(f"cl/{name} does not build on {device.label}: {_first_complaint(str(error))}") from error
     if not program.kernel_names:

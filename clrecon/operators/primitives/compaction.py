@@ -91,13 +91,16 @@ def exclusive_scan(
     blocks = -(-n // (SCAN_PER_ITEM * device.group_size))
     sums_d, block_offsets_d, total_d = (allocate(device, 4 * blocks), allocate(device, 4 * blocks), allocate(device, 8))
     offsets_d = counts_d if in_place else allocate(device, 4 * n)
-    size, items = np.uint32(n), blocks * device.group_size
-    launch(device, scan["sum_blocks"], items, counts_d, sums_d, size, stopwatch=stopwatch)
+    items = blocks * device.group_size
+    launch(device, scan["sum_blocks"], items, stopwatch=stopwatch, counts=counts_d, block_sums=sums_d, n=n)
     launch(
-        device, scan["scan_block_sums"], device.group_size,
-        sums_d, block_offsets_d, total_d, np.uint32(blocks), stopwatch=stopwatch,
+        device, scan["scan_block_sums"], device.group_size, stopwatch=stopwatch,
+        block_sums=sums_d, block_offsets=block_offsets_d, total=total_d, blocks=blocks,
     )  # fmt: skip
-    launch(device, scan["scan_blocks"], items, counts_d, block_offsets_d, offsets_d, size, stopwatch=stopwatch)
+    launch(
+        device, scan["scan_blocks"], items, stopwatch=stopwatch,
+        counts=counts_d, block_offsets=block_offsets_d, offsets=offsets_d, n=n,
+    )  # fmt: skip
     total = download(device, np.empty(1, dtype=np.uint64), total_d)
     return Scanned(offsets_d, total_d, int(total[0]))
 
@@ -130,12 +133,13 @@ def compact(device: Device, mask_d: Any, words: int, *, stopwatch: Stopwatch | N
     program = load_program(device, "compaction/compact.cl")
     chunks = -(-words // COMPACT_WORDS)
     counts_d = allocate(device, 4 * chunks)
-    size = np.uint32(words)
-    launch(device, program["count_set_bits"], chunks, mask_d, counts_d, size, stopwatch=stopwatch)
+    launch(
+        device, program["count_set_bits"], chunks, stopwatch=stopwatch, mask=mask_d, counts=counts_d, words=words
+    )  # fmt: skip
     scanned = exclusive_scan(device, counts_d, chunks, stopwatch=stopwatch)
     positions_d = allocate(device, 4 * scanned.total)
     launch(
-        device, program["list_set_bits"], chunks,
-        mask_d, scanned.offsets_d, positions_d, size, stopwatch=stopwatch,
+        device, program["list_set_bits"], chunks, stopwatch=stopwatch,
+        mask=mask_d, offsets=scanned.offsets_d, positions=positions_d, words=words,
     )  # fmt: skip
     return Compacted(positions_d, scanned.total)

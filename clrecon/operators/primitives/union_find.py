@@ -88,10 +88,12 @@ def label_components(
         return 0, np.full(vertex_count, -1, dtype=np.int64)
     search = _Search(device, faces, vertex_count, memory, stopwatch)
     labels_d, spare_d = search.find_roots()
-    search.run("flag_roots", vertex_count, labels_d, spare_d)
+    search.run("flag_roots", vertex_count, labels=labels_d, roots=spare_d, n=vertex_count)
     roots = exclusive_scan(device, spare_d, vertex_count, stopwatch=stopwatch)
     numbers_d = allocate(device, 4 * vertex_count)
-    search.run("number_components", vertex_count, labels_d, roots.offsets_d, numbers_d)
+    search.run(
+        "number_components", vertex_count, labels=labels_d, offsets=roots.offsets_d, numbers=numbers_d, n=vertex_count
+    )
     numbers = download(device, np.empty(vertex_count, dtype=np.int32), numbers_d)
     return roots.total, numbers.astype(np.int64)
 
@@ -134,9 +136,9 @@ class _Search:
         if shortage:
             raise DeviceMemoryError(f"the components of the mesh cannot be found: {shortage}")
 
-    def run(self, kernel: str, items: int, *arguments: Any) -> None:
-        """Launch a kernel over as many items as its argument after the buffers says."""
-        launch(self._device, self._program[kernel], items, *arguments, np.uint32(items), stopwatch=self._stopwatch)
+    def run(self, kernel: str, items: int, **arguments: Any) -> None:
+        """Launch a kernel over so many items."""
+        launch(self._device, self._program[kernel], items, stopwatch=self._stopwatch, **arguments)
 
     def find_roots(self) -> tuple[Any, Any]:
         """Go through all rounds.
@@ -146,68 +148,72 @@ class _Search:
         labels_d, spare_d : buffer, (n,) uint32
             Labels whose labels are roots, and a buffer that is free.
         """
-        self.run("clear_labels", self._vertices, self._other_d, self._flags_d)
-        self.run("hook_corners", self._faces, self._faces_d, self._other_d)
-        self._jump("jump_labels", self._vertices)
+        self.run("clear_labels", self._vertices, labels=self._other_d, flags=self._flags_d, n=self._vertices)
+        self.run("hook_corners", self._faces, triangles=self._faces_d, labels=self._other_d, m=self._faces)
+        self._jump("jump_labels", self._vertices, n=self._vertices)
         labels_d, spare_d = self._labels_d, self._other_d
-        mixed = self._list("mark_mixed", self._faces, self._faces_d, labels_d)
+        mixed = self._list("mark_mixed", self._faces, triangles=self._faces_d, labels=labels_d, m=self._faces)
         if mixed.count:
             roots = self._join_roots(mixed)
             if self._labels_d is not labels_d:
-                self.run("copy_roots", roots.count, roots.positions_d, self._labels_d, labels_d)
+                self.run(
+                    "copy_roots", roots.count,
+                    roots=roots.positions_d, labels=self._labels_d, copy=labels_d, count=roots.count,
+                )  # fmt: skip
         return labels_d, spare_d
 
     def _join_roots(self, mixed: Compacted) -> Compacted:
         """All rounds after the first, on the roots that it left; returns these.  No other label changes any more."""
         self._check_budget({"roots of mixed triangles": 16 * mixed.count})
-        roots = self._list("mark_roots", self._vertices, self._labels_d)
+        roots = self._list("mark_roots", self._vertices, labels=self._labels_d, n=self._vertices)
         corners_d = allocate(self._device, 12 * mixed.count)
-        self.run("gather_roots", mixed.count, self._faces_d, mixed.positions_d, self._labels_d, corners_d)
+        self.run(
+            "gather_roots", mixed.count,
+            triangles=self._faces_d, mixed=mixed.positions_d, labels=self._labels_d, corners=corners_d,
+            count=mixed.count,
+        )  # fmt: skip
         # Roots are their own label in both buffers, and other labels lead to the same root, if not in one step.
         while self._hook(corners_d, mixed.count):
-            self._jump("jump_roots", roots.count, roots.positions_d)
+            self._jump("jump_roots", roots.count, roots=roots.positions_d, count=roots.count)
         return roots
 
     def _hook(self, corners_d: Any, count: int) -> bool:
         """Hook roots to others; says whether there were any."""
         number = self._next_pass()
-        launch(
-            self._device, self._program["hook_roots"], count,
-            corners_d, self._labels_d, self._other_d, self._flags_d, np.uint32(count), number,
-            stopwatch=self._stopwatch,
+        self.run(
+            "hook_roots", count,
+            corners=corners_d, labels=self._labels_d, hooked=self._other_d, flags=self._flags_d, count=count,
+            pass_number=number,
         )  # fmt: skip
         return bool(self._read_flags()[1] == number)
 
-    def _jump(self, kernel: str, items: int, *listed_d: Any) -> None:
+    def _jump(self, kernel: str, items: int, **listed: Any) -> None:
         """Passes of jumps, from `_other_d` to `_labels_d` and back, until all labels in `_labels_d` are roots."""
         while True:
             number = self._next_pass()
-            launch(
-                self._device, self._program[kernel], items,
-                *listed_d, self._other_d, self._labels_d, self._flags_d, np.uint32(items), number,
-                stopwatch=self._stopwatch,
+            self.run(
+                kernel, items,
+                labels=self._other_d, jumped=self._labels_d, flags=self._flags_d, pass_number=number, **listed,
             )  # fmt: skip
             if self._read_flags()[0] != number:
                 return
             self._labels_d, self._other_d = self._other_d, self._labels_d
 
-    def _next_pass(self) -> np.uint32:
+    def _next_pass(self) -> int:
         self._passes += 1
         if self._passes > MOST_PASSES:
             raise DeviceError(
                 f"{self._device.label} has not found the components after {MOST_PASSES} passes: it computes wrongly,"
                 " see `clrecon selftest` and try another device"
             )
-        return np.uint32(self._passes)
+        return self._passes
 
     def _read_flags(self) -> NDArray[np.uint32]:
         return download(self._device, np.empty(2, dtype=np.uint32), self._flags_d)
 
-    def _list(self, kernel: str, size: int, *inputs_d: Any) -> Compacted:
+    def _list(self, kernel: str, size: int, **inputs: Any) -> Compacted:
         """The elements that a kernel marks in a bit mask of `size` bits."""
         words = -(-size // 32)
         mask_d = allocate(self._device, 4 * words)
-        launch(
-            self._device, self._program[kernel], words, *inputs_d, mask_d, np.uint32(size), stopwatch=self._stopwatch
-        )
+        self.run(kernel, words, mask=mask_d, **inputs)
         return compact(self._device, mask_d, words, stopwatch=self._stopwatch)

@@ -57,6 +57,17 @@ class PictureBuffers:
         if background is not None:
             self.background[:] = *find_color(background), 1.0
 
+    @property
+    def arguments(self) -> dict[str, Any]:
+        """How kernels that blend are told of the picture."""
+        return {
+            "states": self.states_d,
+            "image": self.image_d,
+            "depths": self.depths_d,
+            "means": self.means_d,
+            "background": self.background,
+        }
+
     @staticmethod
     def needs(size: tuple[int, int]) -> tuple[dict[str, int], dict[str, int]]:
         """Bytes of a picture on the device, and of what comes with more than one slab."""

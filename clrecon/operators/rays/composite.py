@@ -83,15 +83,36 @@ class TransferTables:
     weighed: bool
 
     @property
-    def shown_ends(self) -> tuple[np.int32, np.int32]:
+    def shown_ends(self) -> tuple[int, int]:
         """First and last node with opacity; (NODES, -1) without one."""
         shown = np.flatnonzero(self.shown)
-        return (np.int32(shown[0]), np.int32(shown[-1])) if len(shown) else (np.int32(NODES), np.int32(-1))
+        return (int(shown[0]), int(shown[-1])) if len(shown) else (NODES, -1)
 
     @property
     def is_one_sided(self) -> bool:
         """True where all nodes that show something are the first ones, or the last ones."""
         return int(np.count_nonzero(np.diff(self.shown.astype(np.int8)))) <= 1
+
+    @property
+    def arguments(self) -> dict[str, Any]:
+        """How the kernel is told of them."""
+        first_shown, last_shown = self.shown_ends
+        return {
+            "colors": self.colors_d,
+            "opacities": self.opacities_d,
+            "clears": self.clears_d,
+            "changes": self.changes_d,
+            "factors": self.factors_d,
+            "low": self.low,
+            "scale": self.scale,
+            "first_shown": first_shown,
+            "last_shown": last_shown,
+            "narrow": self.steepness.narrow,
+            "has_dense": self.steepness.has_dense,
+            "one_sided": self.is_one_sided,
+            "factor_scale": self.factor_scale,
+            "steps_per_unit": self.steps_per_unit,
+        }
 
     @classmethod
     def of(cls, device: Device, function: TransferFunction, ray_step: float) -> TransferTables:
@@ -158,9 +179,9 @@ class MainWay:
         return cls(axis, ahead, eye.astype(np.float32), aside)
 
     @property
-    def arguments(self) -> tuple[Any, ...]:
+    def arguments(self) -> dict[str, Any]:
         """How kernels are told of it."""
-        return np.int32(self.axis), np.int32(self.ahead), self.eye, np.float32(self.aside)
+        return {"main_axis": self.axis, "ahead": self.ahead, "eye": self.eye, "aside": self.aside}
 
 
 def composite_slab(
@@ -194,13 +215,15 @@ def composite_slab(
     variants = {"GRADIENT_OPACITY": "1"} if tables.weighed else {}
     if tables.steepness.is_steep and takes_parts(resident.volume, view.ray_step):
         variants |= {"TAKES_PARTS": "1"}
-    label_tables: tuple[Any, ...] = ()
+    label_tables: dict[str, Any] = {}
     if labels is not None and style is not None:
         variants |= {"LABELS": "1", **label_variants(labels.voxels.dtype)}
-        label_tables = (slab_labels(resident, slab, labels, stopwatch), upload(device, style.table))
+        label_tables = {
+            "labels": slab_labels(resident, slab, labels, stopwatch),
+            "label_colors": upload(device, style.table),
+        }
     program = resident.program("render/composite.cl", **variants)
     lanes = int(device.kernel_variants["LANES"])
-    width, height = view.size
     queues = count_queues(device)
     last = np.array([n - 1 for n in resident.volume.shape_ijk] + [0], dtype=np.float32)
     with stopwatch.running(device):  # to its end: CPU devices read the arrays of the host that end here
@@ -208,20 +231,11 @@ def composite_slab(
         way = MainWay.of(resident, slab, view.camera)
         ways_d = _look_ahead(resident, slab, way, leaps, stopwatch)
         launch(
-            device, program["composite_rays"], output.items(queues, lanes),
-            slab.voxels_d, ways_d, tables.colors_d, tables.opacities_d, tables.clears_d, tables.changes_d,
-            tables.factors_d,
-            upload(device, highlight_table(lighting)), entries_d, upload(device, view.table), output.states_d,
-            output.image_d, output.depths_d, output.means_d, output.background, last, resident.stack.slope,
-            np.int32(slab.shape_ijk[0]), np.int32(slab.shape_ijk[1]), np.int32(slab.first_k), np.int32(slab.end_k),
-            np.float32(slab.low_k), np.float32(slab.high_k), *slab.brick_arguments,
-            np.float32(tables.low), np.float32(tables.scale), *tables.shown_ends,
-            np.float32(tables.steepness.narrow), np.int32(tables.steepness.has_dense), np.int32(tables.is_one_sided),
-            np.float32(tables.factor_scale),
-            np.float32(tables.steps_per_unit), np.uint32(width), np.uint32(height),
-            np.uint32(view.planes), np.int32(not view.camera.is_parallel), np.int32(lighting.shades), np.int32(jitter),
-            np.int32(slab.stage), np.uint32(queues), *way.arguments, *label_tables, *resident.stack.arguments,
-            stopwatch=stopwatch,
+            device, program["composite_rays"], output.items(queues, lanes), stopwatch=stopwatch,
+            ways=ways_d, entries=entries_d, highlights=upload(device, highlight_table(lighting)),
+            view=upload(device, view.table), last_place=last, slope=resident.stack.slope, shaded=lighting.shades,
+            jitter=jitter, queues=queues, **slab.arguments, **tables.arguments, **output.arguments, **view.arguments,
+            **way.arguments, **label_tables, **resident.stack.arguments,
         )  # fmt: skip
 
 
@@ -237,25 +251,25 @@ def _enter_tiles(
     device = resident.device
     lanes = int(device.kernel_variants["LANES"])
     width, height = view.size
+    camera = view.camera
     margin = math.ceil(min((resident.stack.index_steps(view.spread) / slab.brick_cells).max(), FARTHEST))
     entries_d = allocate(device, 4 * output.tiles)
     launch(
-        device, resident.program("render/tiles.cl")["enter_tiles"], -(-output.tiles // lanes),
-        leaps.distances_d, upload(device, view.widened()), entries_d,
-        resident.stack.slope, *slab.brick_arguments, np.int32(slab.first_k), np.int32(margin),
-        np.uint32(width), np.uint32(height), np.int32(not view.camera.is_parallel), *resident.stack.arguments,
-        stopwatch=stopwatch,
+        device, resident.program("render/tiles.cl")["enter_tiles"], -(-output.tiles // lanes), stopwatch=stopwatch,
+        leaps=leaps.distances_d, view=upload(device, view.widened()), entries=entries_d, slope=resident.stack.slope,
+        first_k=slab.first_k, margin=margin, width=width, height=height, perspective=not camera.is_parallel,
+        **slab.brick_arguments, **resident.stack.arguments,
     )  # fmt: skip
     return entries_d
 
 
 def _look_ahead(resident: DeviceVolume, slab: RaySlab, way: MainWay, leaps: LeapMap, stopwatch: Stopwatch) -> Any:
     """For each brick how far nothing shows around it, and ahead of it along the main way, on the device."""
-    bricks = slab.bricks
+    bi, bj, bk = bricks = slab.bricks
     count = math.prod(bricks)
     ways_d = allocate(resident.device, count)
     launch(
         resident.device, resident.program("render/occupancy.cl")["look_ahead"], count // bricks[way.axis],
-        leaps.distances_d, ways_d, *(np.int32(n) for n in bricks), *way.arguments, stopwatch=stopwatch,
+        stopwatch=stopwatch, distances=leaps.distances_d, ways=ways_d, bi=bi, bj=bj, bk=bk, **way.arguments,
     )  # fmt: skip
     return ways_d

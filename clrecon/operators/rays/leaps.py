@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -23,12 +24,11 @@ ROWS_AT_ONCE = 4
 def measure_cells(resident: DeviceVolume, slab: RaySlab, stopwatch: Stopwatch) -> Any:
     """Lowest and highest value that samples in each brick of a slab can have, (bk, bj, bi, 2), on the device."""
     if slab.ranges_d is None:
-        bi, bj, bk = slab.bricks
-        slab.ranges_d = allocate(resident.device, 2 * bi * bj * bk * resident.dtype.itemsize)
+        bricks, (ni, nj, nk) = math.prod(slab.bricks), slab.shape_ijk
+        slab.ranges_d = allocate(resident.device, 2 * bricks * resident.dtype.itemsize)
         launch(
-            resident.device, resident.program("render/occupancy.cl")["measure_cells"], bi * bj * bk,
-            slab.voxels_d, slab.ranges_d, *(np.int32(n) for n in slab.shape_ijk),
-            *(np.uint32(n) for n in (bi, bj, bk)), np.int32(slab.brick_cells[2]), stopwatch=stopwatch,
+            resident.device, resident.program("render/occupancy.cl")["measure_cells"], bricks, stopwatch=stopwatch,
+            voxels=slab.voxels_d, ranges=slab.ranges_d, ni=ni, nj=nj, nk=nk, **slab.brick_arguments,
         )  # fmt: skip
     return slab.ranges_d
 
@@ -63,22 +63,21 @@ def find_leaps(
     counts_d = upload(device, np.concatenate([[0], np.cumsum(shown)]).astype(np.int32))
     from_d, to_d = allocate(device, bricks), allocate(device, bricks)
     launch(
-        device, program["mark_bricks"], bricks,
-        ranges_d, counts_d, from_d, np.float32(low), np.float32(scale), np.int32(len(shown)), np.uint32(bricks),
-        stopwatch=stopwatch,
+        device, program["mark_bricks"], bricks, stopwatch=stopwatch,
+        ranges=ranges_d, shown=counts_d, distances=from_d, bins_low=low, bins_scale=scale, bins=len(shown),
+        bricks=bricks,
     )  # fmt: skip
     launch(
-        device, program["spread_in_rows"], -(-bj * bk // ROWS_AT_ONCE),
-        from_d, to_d, np.int32(bi), np.uint32(bj * bk), stopwatch=stopwatch,
+        device, program["spread_in_rows"], -(-bj * bk // ROWS_AT_ONCE), stopwatch=stopwatch,
+        distances=from_d, spread=to_d, bi=bi, rows=bj * bk,
     )  # fmt: skip
     for outer, count, stride in ((bk, bj, bi), (1, bk, bi * bj)):
         from_d, to_d = to_d, from_d
         chunks = -(-stride // 16)
         items = outer * count * chunks
         launch(
-            device, program["spread_along"], items,
-            from_d, to_d, np.int32(count), np.int32(stride), np.int32(chunks), np.uint32(items),
-            stopwatch=stopwatch,
+            device, program["spread_along"], items, stopwatch=stopwatch,
+            distances=from_d, spread=to_d, count=count, stride=stride, chunks=chunks, items=items,
         )  # fmt: skip
     from_d = to_d
     slab.maps.clear()  # one a slab: a map is made in some milliseconds

@@ -36,16 +36,11 @@ def project_slab(
     """
     variants = {"LEAST_VALUE": f"({AIR_HU:g})"} if mode == "drr" else {}
     device = resident.device
-    width, height = view.size
     queues, lanes = count_queues(device), int(device.kernel_variants["LANES"])
     last = np.array([n - 1 for n in resident.volume.shape_ijk] + [0], dtype=np.float32)
     launch(
         device, resident.program("render/project.cl", **variants)["project_rays"], output.items(queues, lanes),
-        slab.voxels_d, measure_cells(resident, slab, stopwatch), upload(device, view.table), output.states_d,
-        output.depths_d, output.means_d, last,
-        np.int32(slab.shape_ijk[0]), np.int32(slab.shape_ijk[1]), np.int32(slab.first_k), np.int32(slab.end_k),
-        np.float32(slab.low_k), np.float32(slab.high_k), *slab.brick_arguments,
-        np.uint32(width), np.uint32(height), np.uint32(view.planes), np.int32(not view.camera.is_parallel),
-        np.int32(PROJECTIONS[mode]), np.int32(slab.stage), np.uint32(queues), *resident.stack.arguments,
-        stopwatch=stopwatch,
+        stopwatch=stopwatch, ranges=measure_cells(resident, slab, stopwatch), view=upload(device, view.table),
+        states=output.states_d, depths=output.depths_d, values=output.means_d, last_place=last,
+        which=PROJECTIONS[mode], queues=queues, **slab.arguments, **view.arguments, **resident.stack.arguments,
     )  # fmt: skip

@@ -51,6 +51,17 @@ class RayView:
     planes: int
     spread: Float64Array
 
+    @property
+    def arguments(self) -> dict[str, int]:
+        """How kernels are told of the picture and what cuts its rays; the table goes to the device by itself."""
+        width, height = self.size
+        return {
+            "width": width,
+            "height": height,
+            "planes": self.planes,
+            "perspective": int(not self.camera.is_parallel),
+        }
+
     @classmethod
     def of(
         cls,

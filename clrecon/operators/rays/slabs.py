@@ -123,9 +123,25 @@ class RaySlab:
         return bi, bj, bk
 
     @property
-    def brick_arguments(self) -> tuple[np.int32, ...]:
-        """How kernels are told of bricks: (bi, bj, bk), and cells of each along k."""
-        return tuple(np.int32(n) for n in (*self.bricks, self.brick_cells[2]))
+    def brick_arguments(self) -> dict[str, int]:
+        """How kernels are told of bricks: their numbers, and cells of each along k."""
+        bi, bj, bk = self.bricks
+        return {"bi": bi, "bj": bj, "bk": bk, "cells_k": self.brick_cells[2]}
+
+    @property
+    def arguments(self) -> dict[str, Any]:
+        """How kernels that follow rays are told of the slab."""
+        return {
+            "voxels": self.voxels_d,
+            "ni": self.shape_ijk[0],
+            "nj": self.shape_ijk[1],
+            "first_k": self.first_k,
+            "end_k": self.end_k,
+            "slab_low": self.low_k,
+            "slab_high": self.high_k,
+            "stage": self.stage,
+            **self.brick_arguments,
+        }
 
     @property
     def end_k(self) -> int:

@@ -279,16 +279,13 @@ class _Overlay:
         else:
             slices_d, places[:, 3] = resident.upload(volume.voxels[list(part)], stopwatch), range(len(part))
         ni, nj, _ = volume.shape_ijk
-        width, height = view.size
         queues = count_queues(device)
         program = load_program(device, "render/slices.cl", voxel_variants(volume.voxels.dtype))
         with stopwatch.running(device):  # to its end: CPU devices read the array of the host
             launch(
-                device, program["overlay_slices"], output.items(queues, 1),
-                slices_d, upload(device, places), upload(device, look.colors), upload(device, view.table),
-                output.states_d, output.image_d, output.depths_d, output.means_d, output.background,
-                np.int32(ni), np.int32(nj), np.int32(len(part)), np.float32(look.low), np.float32(look.scale),
-                np.float32(look.opacity), np.float32(look.lowest), np.uint32(width), np.uint32(height),
-                np.uint32(view.planes), np.int32(not view.camera.is_parallel), np.int32(stage), np.uint32(queues),
-                stopwatch=stopwatch,
+                device, program["overlay_slices"], output.items(queues, 1), stopwatch=stopwatch,
+                slices=slices_d, places=upload(device, places), colors=upload(device, look.colors),
+                view=upload(device, view.table), ni=ni, nj=nj, count=len(part), bins_low=look.low,
+                bins_scale=look.scale, opacity=look.opacity, lowest=look.lowest, stage=stage, queues=queues,
+                **output.arguments, **view.arguments,
             )  # fmt: skip

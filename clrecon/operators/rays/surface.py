@@ -197,7 +197,6 @@ class _Job:
         resident, rule, look = self.resident, self.rule, self.look
         device, volume = resident.device, resident.volume
         lanes, queues = int(device.kernel_variants["LANES"]), count_queues(device)
-        width, height = self.size
         variants, tables = self._tables(slab)
         low_k, high_k = _field_heights(volume, self.frame, (slab.low_k, slab.high_k))
         last = [n - 1 for n in volume.shape_ijk]
@@ -206,28 +205,27 @@ class _Job:
             view = self._view(leaps)
             launch(
                 device, resident.program("render/surface.cl", **variants)["trace_surface"], output.items(queues, lanes),
-                slab.voxels_d, leaps.distances_d, upload(device, view.table), *tables,
-                upload(device, highlight_table(look.lighting)), output.states_d, output.image_d, output.depths_d,
-                output.means_d, output.background, _float4(*last), resident.stack.slope,
-                np.int32(slab.shape_ijk[0]), np.int32(slab.shape_ijk[1]), np.int32(slab.first_k), np.int32(slab.end_k),
-                np.float32(low_k), np.float32(high_k), *slab.brick_arguments, np.float32(rule.iso_level),
-                np.float32(rule.outside), _float4(*look.color), self._light_step(), self._cue(), np.uint32(width),
-                np.uint32(height), np.uint32(view.planes), np.int32(not self.camera.is_parallel), np.int32(slab.stage),
-                np.uint32(queues), *resident.stack.arguments, stopwatch=self.stopwatch,
+                stopwatch=self.stopwatch, leaps=leaps.distances_d, view=upload(device, view.table),
+                highlights=upload(device, highlight_table(look.lighting)), last_place=_float4(*last),
+                slope=resident.stack.slope, level=rule.iso_level, outside=rule.outside, color=_float4(*look.color),
+                light_step=self._light_step(), cue=self._cue(), queues=queues,
+                **{**slab.arguments, "slab_low": low_k, "slab_high": high_k},
+                **tables, **output.arguments, **view.arguments, **resident.stack.arguments,
             )  # fmt: skip
 
-    def _tables(self, slab: RaySlab) -> tuple[dict[str, str], list[Any]]:
-        """Variants of the kernel, and the buffers between view and highlights that belong to them."""
+    def _tables(self, slab: RaySlab) -> tuple[dict[str, str], dict[str, Any]]:
+        """Variants of the kernel, and the tables of clip planes and labels, as it takes them."""
         device = self.resident.device
         normals = np.zeros((max(1, len(self.planes)), 4), np.float32)
         normals[: len(self.planes), :3] = self.planes[:, :3]
         variants: dict[str, str] = {}
-        tables = [upload(device, normals)]
+        tables = {"normals": upload(device, normals)}
         if self.labels is not None and self.style is not None:
             variants = {"LABELS": "1", **label_variants(self.labels.voxels.dtype)}
-            tables += [
-                slab_labels(self.resident, slab, self.labels, self.stopwatch), upload(device, self.style.table),
-            ]  # fmt: skip
+            tables |= {
+                "labels": slab_labels(self.resident, slab, self.labels, self.stopwatch),
+                "label_colors": upload(device, self.style.table),
+            }
         return variants, tables
 
     def _view(self, leaps: LeapMap) -> RayView:

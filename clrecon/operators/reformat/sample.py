@@ -179,8 +179,8 @@ class _Run:
                 voxels_d, first_k = self.resident.part(own_first, held_end, self.stopwatch), own_first
             with self.stopwatch.running(self.device):
                 self._launch_rows(
-                    program, (voxels_d, rows_d, slices_d, values_d, weights_d),
-                    [np.int32(n) for n in (first_k, own_first, own_end)], np.int32(count == 0),
+                    program, voxels=voxels_d, rows=rows_d, slices=slices_d, values=values_d, weights=weights_d,
+                    first_k=first_k, own_first=own_first, own_end=own_end, fresh=count == 0,
                 )  # fmt: skip
             self.volume.release_slices(own_first, held_end)
             count, own_first = count + 1, own_end
@@ -196,15 +196,17 @@ class _Run:
         held = slices if takes_whole else min(slices, self.slices)
         return Reformation(values, self.slices, count, sum(self.needs(held).values()))
 
-    def _launch_rows(self, program: Program, buffers: tuple[Any, ...], part: list[Any], fresh: Any) -> None:
+    def _launch_rows(self, program: Program, **part: Any) -> None:
+        """Launch the kernel for all rows; `part` is what it takes besides rows and sizes."""
         height, width = self.sheet.height, self.sheet.width
+        ni, nj, nk = self.volume.shape_ijk
         rows = max(1, SAMPLES_A_LAUNCH // (width * (self.samples.intervals + 1)))
         for first in range(0, height, rows):
             count = min(rows, height - first)
             launch(
-                self.device, program["reformat_rows"], count * width, *buffers,
-                *(np.uint32(n) for n in (first, count, width)), *(np.int32(n) for n in self.volume.shape_ijk), *part,
-                np.int32(self.samples.intervals), np.int32(self.combine), fresh, stopwatch=self.stopwatch,
+                self.device, program["reformat_rows"], count * width, stopwatch=self.stopwatch,
+                first_row=first, row_count=count, width=width, ni=ni, nj=nj, nk=nk,
+                intervals=self.samples.intervals, combine=self.combine, **part,
             )  # fmt: skip
 
 

@@ -92,12 +92,12 @@ def measure_bricks(
     DeviceError
         The device fails.
     """
+    ni, nj, nk = shape_ijk
     bi, bj, bk = (-(-n // BRICK) for n in shape_ijk)
     ranges_d = allocate(device, brick_bytes(shape_ijk, dtype))
     launch(
-        device, prepare_bricks(device, dtype)["measure_bricks"], bi * bj * bk,
-        voxels_d, ranges_d, *(np.int32(n) for n in shape_ijk), *(np.uint32(n) for n in (bi, bj, bk)),
-        stopwatch=stopwatch,
+        device, prepare_bricks(device, dtype)["measure_bricks"], bi * bj * bk, stopwatch=stopwatch,
+        voxels=voxels_d, ranges=ranges_d, ni=ni, nj=nj, nk=nk, bi=bi, bj=bj, bk=bk,
     )  # fmt: skip
     return BrickRanges(ranges_d, (bi, bj, bk), dtype)
 
@@ -135,8 +135,8 @@ def compare_bricks(
     words = -(-(ni + 2 * border) // 32)
     states_d, extents_d = allocate(device, words * bj * bk), allocate(device, 4 * bj * bk)
     launch(
-        device, prepare_bricks(device, ranges.dtype)["compare_bricks"], bj * bk,
-        ranges.ranges_d, states_d, extents_d, level, np.int32(ni), np.int32(border), np.uint32(words),
-        np.uint32(bj * bk), stopwatch=stopwatch,
+        device, prepare_bricks(device, ranges.dtype)["compare_bricks"], bj * bk, stopwatch=stopwatch,
+        ranges=ranges.ranges_d, states=states_d, extents=extents_d, level=level, ni=ni, border=border, words=words,
+        rows=bj * bk,
     )  # fmt: skip
     return BrickStates(states_d, extents_d)

@@ -26,13 +26,13 @@ class StackTable:
 
     Attributes
     ----------
-    arguments : tuple
-        The last arguments of kernels with STACK_PARAMETERS; none for even volumes.
+    arguments : dict of str to buffer or number
+        The arguments of kernels with STACK_PARAMETERS; none for even volumes.
     slope : ndarray, shape (4,), float32
         Largest number of index steps along i, j and k that a mm of height makes.
     """
 
-    arguments: tuple[Any, ...]
+    arguments: dict[str, Any]
     slope: NDArray[np.float32]
 
     @classmethod
@@ -40,7 +40,7 @@ class StackTable:
         """The table of a volume, on the device."""
         slope = np.zeros(4, np.float32)
         if not volume.uneven:
-            return cls((), slope)
+            return cls({}, slope)
         nk = volume.shape_ijk[2]
         places = FieldFrame.of(volume).places(volume.slice_origins())
         heights = places[:, 2]
@@ -57,7 +57,13 @@ class StackTable:
         layers = np.clip(np.searchsorted(heights, starts, side="right") - 1, 0, nk - 2).astype(np.int32)
         slope[:2] = np.abs(np.diff(places[:, :2], axis=0) / gaps[:, None]).max(axis=0)
         slope[2] = 1.0 / gaps.min()
-        arguments = (upload(device, table), upload(device, layers), np.float32(per_mm), np.int32(count), np.int32(nk))
+        arguments = {
+            "stack_slices": upload(device, table),
+            "stack_layers": upload(device, layers),
+            "layers_per_mm": per_mm,
+            "layer_count": count,
+            "stack_nk": nk,
+        }
         return cls(arguments, slope)
 
     def index_steps(self, apart: Float64Array) -> Float64Array:

@@ -162,20 +162,22 @@ class _Run:
         inner = [
             (max(0, part.start - REACH), min(n, part.stop + REACH)) for part, n in zip(box, (nk, nj, ni), strict=True)
         ]
-        (begin_k, end_k), (begin_j, end_j), along_i = inner
+        (begin_k, end_k), (begin_j, end_j), (begin_i, end_i) = inner
         row_j = max(0, begin_j - REACH), min(nj, end_j + REACH)
         row_k = max(held.first, begin_k - REACH), min(held.end, end_k + REACH)
         slices = row_k[1] - row_k[0]
         launch(
-            self.device, self.programs()[0]["smooth_rows"], slices * (row_j[1] - row_j[0]),
-            held.map_d, held.rows_d, held.strips_d, np.uint32(number),
-            *(np.int32(n) for n in (ni, nj, *along_i, *row_j, row_k[0] - held.first)), np.uint32(slices),
-            stopwatch=self.stopwatch,
+            self.device, self.programs()[0]["smooth_rows"], slices * (row_j[1] - row_j[0]), stopwatch=self.stopwatch,
+            map=held.map_d, rows=held.rows_d, strips=held.strips_d, label=number, ni=ni, nj=nj,
+            begin_i=begin_i, end_i=end_i, begin_j=row_j[0], end_j=row_j[1], begin_slice=row_k[0] - held.first,
+            slices=slices,
         )  # fmt: skip
         launch(
             self.device, self.programs()[0]["smooth_across"], (end_k - begin_k) * (end_j - begin_j),
-            held.rows_d, held.strips_d, occupancy_d, *(np.int32(n) for n in (ni, nj, nk, *along_i, begin_j, end_j)),
-            np.int32(held.first), np.int32(begin_k), np.uint32(end_k - begin_k), stopwatch=self.stopwatch,
+            stopwatch=self.stopwatch,
+            rows=held.rows_d, strips=held.strips_d, occupancy=occupancy_d, ni=ni, nj=nj, nk=nk,
+            begin_i=begin_i, end_i=end_i, begin_j=begin_j, end_j=end_j, first_row_slice=held.first,
+            first_slice=begin_k, slices=end_k - begin_k,
         )  # fmt: skip
 
     def window(self, box: Box, held: tuple[int, int]) -> Window:
@@ -219,11 +221,9 @@ class _Run:
         with stopwatch.running(device):
             self._smooth(held, number, box, held.occupancy_d)
             launch(
-                device, own["classify_mask"], window.mask_rows,
-                held.map_d, mask_d, classified.row_extents_d, np.uint32(number),
-                np.int32(box[1].start), np.int32(box[1].stop),
-                *marching_cubes.volume_scalars(window), np.uint32(window.mask_slices), np.int32(self.grid.words),
-                stopwatch=stopwatch,
+                device, own["classify_mask"], window.mask_rows, stopwatch=stopwatch,
+                map=held.map_d, mask=mask_d, row_extents=classified.row_extents_d, label=number,
+                begin_j=box[1].start, end_j=box[1].stop, **window.arguments,
             )  # fmt: skip
             counted = marching_cubes.count(device, window, surface, classified, stopwatch)
         output = counted.output()
@@ -279,10 +279,10 @@ class _Started:
 
     def place(self, level: int) -> None:
         """Write the vertices, as they are at this level."""
+        held = self.held
         biases_d = upload(self.run.device, level_biases(self.run.levels, self.run.labels.numbers[-1] + 1))
-        arguments = (self.held.map_d, np.uint32(self.number), self.held.occupied_d, biases_d)
         with self.run.stopwatch.running(self.run.device):
-            self.emission.vertices(level, arguments)
+            self.emission.vertices(level, map=held.map_d, label=self.number, occupied=held.occupied_d, biases=biases_d)
 
     def enclosed_mm3(self, level: int) -> float:
         """What the mesh encloses at a level: sums of some hundred triangles on the device, all of them here."""
@@ -298,9 +298,9 @@ class _Started:
         sums_d = allocate(device, sums.nbytes)
         with stopwatch.running(device):
             launch(
-                device, self.run.programs()[0]["sum_volumes"], len(sums),
-                self.emission.positions_d, self.emission.triangles_d, sums_d, centre, np.uint32(triangles),
-                np.uint32(TRIANGLES_PER_SUM), stopwatch=stopwatch,
+                device, self.run.programs()[0]["sum_volumes"], len(sums), stopwatch=stopwatch,
+                positions=self.emission.positions_d, triangles=self.emission.triangles_d, sums=sums_d, centre=centre,
+                triangle_count=triangles, triangles_per_sum=TRIANGLES_PER_SUM,
             )  # fmt: skip
         return float(download(device, sums, sums_d).sum(dtype=np.float64)) / 6.0
 

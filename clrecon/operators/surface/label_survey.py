@@ -83,12 +83,12 @@ def _survey(
         map_d = upload(device, voxels)
     boxes_d, faces_d = allocate(device, boxes.nbytes), allocate(device, faces.nbytes)
     ni, nj, nk = labels.shape_ijk
-    grid = [np.int32(n) for n in (ni, nj, nk)]
+    grid: dict[str, Any] = {"map": map_d, "ni": ni, "nj": nj, "nk": nk}
     with stopwatch.running(device):
-        launch(device, program["clear_survey"], size, boxes_d, faces_d, np.uint32(size), stopwatch=stopwatch)
-        launch(device, program["find_boxes"], nj * nk, map_d, boxes_d, *grid, stopwatch=stopwatch)
+        launch(device, program["clear_survey"], size, stopwatch=stopwatch, boxes=boxes_d, faces=faces_d, labels=size)
+        launch(device, program["find_boxes"], nj * nk, stopwatch=stopwatch, boxes=boxes_d, **grid)
         if touch:
-            launch(device, program["count_faces"], nj * nk, map_d, faces_d, *grid, stopwatch=stopwatch)
+            launch(device, program["count_faces"], nj * nk, stopwatch=stopwatch, faces=faces_d, **grid)
     return _widen(download(device, boxes, boxes_d), labels.numbers, (ni, nj, nk)), download(device, faces, faces_d)
 
 

@@ -162,9 +162,9 @@ class _Run:
         inside_d = allocate(device, labels.nbytes)
         with stopwatch.running(device):
             launch(
-                device, own["own_samples"], labels.size, voxels_d, labels_d, near_d, inside_d, self.level,
-                *(np.int32(n) for n in labels.shape[::-1]), np.int32(len(near)),
-                stopwatch=stopwatch,
+                device, own["own_samples"], labels.size, stopwatch=stopwatch,
+                voxels=voxels_d, labels=labels_d, near=near_d, inside=inside_d, level=self.level,
+                nk=labels.shape[0], nj=labels.shape[1], ni=labels.shape[2], offsets=len(near),
             )  # fmt: skip
         if self.solid:
             inside_d = self._fill(boxes, first, end, inside_d)
@@ -197,10 +197,9 @@ class _Run:
         classified = Classified(mask_d, allocate(device, 4 * window.mask_rows))
         with stopwatch.running(device):
             launch(
-                device, own["classify_label"], window.mask_rows,
-                held.inside_d, mask_d, classified.row_extents_d, half_way_d, np.uint32(number),
-                *marching_cubes.volume_scalars(window), np.uint32(window.mask_slices), np.int32(self.grid.words),
-                stopwatch=stopwatch,
+                device, own["classify_label"], window.mask_rows, stopwatch=stopwatch,
+                inside=held.inside_d, mask=mask_d, row_extents=classified.row_extents_d, half_way_count=half_way_d,
+                label=number, **window.arguments,
             )  # fmt: skip
             counted = marching_cubes.count(device, window, surface, classified, stopwatch)
         if counted.triangles == 0:
@@ -215,7 +214,7 @@ class _Run:
         }
         part = marching_cubes.emit(
             device, window, surface, held.voxels_d, classified, counted, self.placement, 0, stopwatch,
-            (held.inside_d, np.uint32(number), half_way_d),
+            {"inside": held.inside_d, "label": number, "half_way_count": half_way_d},
         )  # fmt: skip
         half_way = int(download(device, np.empty(1, np.uint32), half_way_d)[0])
         self.share_by_hu = 1.0 - half_way / counted.vertices

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -40,7 +40,6 @@ __all__ = [
     "count",
     "emit",
     "prepare_marching_cubes",
-    "volume_scalars",
 ]
 
 LONGEST_ROW = 13_000
@@ -183,12 +182,6 @@ class Placement:
         return positions if self.origin is None else positions + self.origin
 
 
-def volume_scalars(slab: Slab) -> tuple[Any, ...]:
-    """ni, nj, nk, border, first_slice, first_sample_slice: how every pass is told where the slab lies."""
-    shape, border = slab.grid.volume.shape_ijk, slab.grid.rule.border
-    return tuple(np.int32(n) for n in (*shape, border, slab.voxel_slices[0], slab.first))
-
-
 def classify(
     device: Device,
     slab: Slab,
@@ -212,17 +205,17 @@ def classify(
     mask_d = allocate(device, 4 * slab.mask_rows * slab.grid.words)
     row_extents_d = allocate(device, 4 * slab.mask_rows)
     if bricks is not None:
-        shape, border = slab.grid.volume.shape_ijk, slab.grid.rule.border
+        (ni, nj, nk), border = slab.grid.volume.shape_ijk, slab.grid.rule.border
         launch(
-            device, program["classify_bricks"], slab.mask_rows,
-            bricks.states_d, bricks.extents_d, voxels_d, mask_d, row_extents_d, *levels,
-            *(np.int32(n) for n in (*shape, border, slab.grid.words)), stopwatch=stopwatch,
+            device, program["classify_bricks"], slab.mask_rows, stopwatch=stopwatch,
+            word_states=bricks.states_d, word_extents=bricks.extents_d, voxels=voxels_d, mask=mask_d,
+            row_extents=row_extents_d, level=levels[0], ni=ni, nj=nj, nk=nk, border=border, words=slab.grid.words,
         )  # fmt: skip
         return Classified(mask_d, row_extents_d)
+    bounds = {"level": levels[0]} if len(levels) == 1 else {"level": levels[0], "highest": levels[1]}
     launch(
-        device, program["classify_samples"], slab.mask_rows,
-        voxels_d, mask_d, row_extents_d, *levels, *volume_scalars(slab), np.uint32(slab.mask_slices),
-        np.int32(slab.grid.words), stopwatch=stopwatch,
+        device, program["classify_samples"], slab.mask_rows, stopwatch=stopwatch,
+        voxels=voxels_d, mask=mask_d, row_extents=row_extents_d, **bounds, **slab.arguments,
     )  # fmt: skip
     return Classified(mask_d, row_extents_d)
 
@@ -251,15 +244,14 @@ def count(
     """
     grid, rows = slab.grid, slab.counted_rows
     gi, gj, _ = grid.shape
-    own_rows, counted_rows, flag_words = np.uint32(slab.rows), np.uint32(rows), np.uint32(grid.flag_words)
     row_counts_d = allocate(device, 12 * rows)
     word_vertices_d, word_triangles_d = (allocate(device, 2 * rows * grid.words) for _ in range(2))
     flags_d = allocate(device, 4 * rows * grid.flag_words)
     launch(
-        device, program["count_rows"], rows,
-        classified.mask_d, classified.row_extents_d, row_counts_d, flags_d, word_vertices_d, word_triangles_d,
-        np.uint32(gi), np.uint32(gj), np.uint32(slab.mask_slices), np.uint32(grid.words), flag_words, counted_rows,
-        stopwatch=stopwatch,
+        device, program["count_rows"], rows, stopwatch=stopwatch,
+        mask=classified.mask_d, row_extents=classified.row_extents_d, row_counts=row_counts_d,
+        words_with_work=flags_d, word_vertices=word_vertices_d, word_triangles=word_triangles_d,
+        gi=gi, gj=gj, gk=slab.mask_slices, words=grid.words, flag_words=grid.flag_words, rows_to_count=rows,
     )  # fmt: skip
     cells = None
     if grid.rule.topology == "trilinear":
@@ -273,15 +265,15 @@ def count(
         )
     totals_d = allocate(device, 12)
     launch(
-        device, program["total_counts"], 1,
-        scanned.offsets_d, scanned.total_d, totals_d, own_rows, counted_rows, stopwatch=stopwatch,
+        device, program["total_counts"], 1, stopwatch=stopwatch,
+        row_offsets=scanned.offsets_d, total=scanned.total_d, totals=totals_d, rows=slab.rows, rows_to_count=rows,
     )  # fmt: skip
     vertices, triangles, active = (int(n) for n in download(device, np.empty(3, np.uint32), totals_d))
     active_words_d = allocate(device, 4 * active)
     launch(
-        device, program["list_words"], slab.rows,
-        flags_d, scanned.offsets_d, active_words_d, own_rows, counted_rows, flag_words, np.uint32(grid.row_shift),
-        stopwatch=stopwatch,
+        device, program["list_words"], slab.rows, stopwatch=stopwatch,
+        words_with_work=flags_d, row_offsets=scanned.offsets_d, active_words=active_words_d, rows=slab.rows,
+        rows_to_count=rows, flag_words=grid.flag_words, row_shift=grid.row_shift,
     )  # fmt: skip
     offsets_d = scanned.offsets_d
     return Counted(offsets_d, word_vertices_d, word_triangles_d, active_words_d, vertices, triangles, active, cells)
@@ -315,27 +307,36 @@ class Emission:
         self._positions, self.positions_d = empty_output(device, (counted.vertices, 3), np.float32)
         self._normals, self.normals_d = empty_output(device, (counted.vertices, 3), np.float32)
         self._triangles, self.triangles_d = empty_output(device, (counted.triangles, 3), np.uint32)
-        self._packing = (np.uint32(slab.grid.words), np.uint32(slab.grid.row_shift), np.uint32(counted.active_words))
+        self._common = {
+            "mask": classified.mask_d,
+            "active_words": counted.active_words_d,
+            "row_offsets": counted.row_offsets_d,
+            "word_vertices": counted.word_vertices_d,
+            "row_shift": slab.grid.row_shift,
+            "active": counted.active_words,
+        }
         self._items = -(-counted.active_words // int(device.kernel_variants["WORDS_PER_ITEM"]))
 
-    def vertices(self, iso_level: float, label_arguments: tuple[Any, ...] = ()) -> None:
+    def vertices(self, iso_level: float, **label_arguments: Any) -> None:
         """Launch what writes positions and normals; it may be done again at another level.
 
         `label_arguments` is what emit_vertices takes more in a program that was built with labels.
         """
         if not self._counted.vertices:
             return
-        slab, counted, rule = self._slab, self._counted, self._slab.grid.rule
-        value = np.float32 if slab.grid.volume.voxels.dtype.kind == "f" else np.int32
-        upper = () if rule.upper_level is None else (np.float32(rule.upper_level), np.float32(rule.highest_inside))
+        rule = self._slab.grid.rule
+        upper = {} if rule.upper_level is None else {"upper_level": rule.upper_level, "highest": rule.highest_inside}
         launch(
-            self._device, self._program["emit_vertices"], self._items,
-            self._voxels_d, self._classified.mask_d, counted.active_words_d, counted.row_offsets_d,
-            counted.word_vertices_d, self.frames_d, self.steps_d, self.positions_d, self.normals_d,
-            np.float32(iso_level), value(rule.outside), np.float32(rule.value_scale), self._placement.margin,
-            *volume_scalars(slab), np.uint32(slab.mask_slices), *self._packing, *label_arguments, *upper,
-            stopwatch=self._stopwatch,
+            self._device, self._program["emit_vertices"], self._items, stopwatch=self._stopwatch,
+            voxels=self._voxels_d, **self.tables, positions=self.positions_d, normals=self.normals_d,
+            iso_level=iso_level, outside=rule.outside, value_scale=rule.value_scale,
+            **self._slab.arguments, **self._common, **label_arguments, **upper,
         )  # fmt: skip
+
+    @property
+    def tables(self) -> dict[str, Any]:
+        """How kernels that write vertices are told where the samples are in mm."""
+        return {"slice_frames": self.frames_d, "steps": self.steps_d, "margin": self._placement.margin}
 
     def triangles(self, first_vertex: int = 0) -> None:
         """Launch what writes triangles; `first_vertex` is how many vertices all slabs before have."""
@@ -344,13 +345,16 @@ class Emission:
         slab, counted = self._slab, self._counted
         gi, gj, _ = slab.grid.shape
         launch(
-            self._device, self._program["emit_triangles"], self._items,
-            self._classified.mask_d, counted.active_words_d, counted.row_offsets_d, counted.word_vertices_d,
-            counted.word_triangles_d, self.triangles_d, np.uint32(first_vertex), np.uint32(slab.counted_rows),
-            np.uint32(gi), np.uint32(gj), np.uint32(slab.mask_slices), *self._packing,
-            np.int32(slab.grid.winds_backwards),
-            stopwatch=self._stopwatch,
+            self._device, self._program["emit_triangles"], self._items, stopwatch=self._stopwatch,
+            word_triangles=counted.word_triangles_d, triangles=self.triangles_d, first_vertex=first_vertex,
+            rows_to_count=slab.counted_rows, gi=gi, gj=gj, gk=slab.mask_slices, words=slab.grid.words,
+            mirrored=slab.grid.winds_backwards, **self._common,
         )  # fmt: skip
+
+    @property
+    def output(self) -> dict[str, Any]:
+        """The buffers of the mesh."""
+        return {"positions": self.positions_d, "normals": self.normals_d, "triangles": self.triangles_d}
 
     def download(self) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.uint32]]:
         """Positions, normals and triangles, here."""
@@ -376,17 +380,16 @@ def emit(
     placement: Placement,
     first_vertex: int,
     stopwatch: Stopwatch,
-    label_arguments: tuple[Any, ...] = (),
+    label_arguments: Mapping[str, Any] | None = None,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.uint32]]:
     """Passes 3 and 4 at once: positions, normals and triangles of the slab, see `Emission`."""
     emission = Emission(device, slab, program, voxels_d, classified, counted, placement, stopwatch)
     with stopwatch.running(device):
-        emission.vertices(slab.grid.rule.iso_level, label_arguments)
+        emission.vertices(slab.grid.rule.iso_level, **(label_arguments or {}))
         if counted.cells is not None:
             emit_cells(
-                device, slab, voxels_d, classified.mask_d, counted,
-                (emission.frames_d, emission.steps_d, placement.margin),
-                (emission.positions_d, emission.normals_d, emission.triangles_d), first_vertex, stopwatch,
+                device, slab, voxels_d, classified.mask_d, counted, emission.tables, emission.output, first_vertex,
+                stopwatch,
             )  # fmt: skip
         else:
             emission.triangles(first_vertex)

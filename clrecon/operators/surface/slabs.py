@@ -110,6 +110,21 @@ class Slab:
         border, nk = self.grid.rule.border, self.grid.volume.shape_ijk[2]
         return max(self.first - border - 1, 0), min(self.end - border + 2, nk)
 
+    @property
+    def arguments(self) -> dict[str, int]:
+        """How kernels are told where the slab lies."""
+        (ni, nj, nk), rule = self.grid.volume.shape_ijk, self.grid.rule
+        return {
+            "ni": ni,
+            "nj": nj,
+            "nk": nk,
+            "border": rule.border,
+            "first_slice": self.voxel_slices[0],
+            "first_sample_slice": self.first,
+            "gk": self.mask_slices,
+            "words": self.grid.words,
+        }
+
     def scratch(self) -> dict[str, int]:
         """Bytes of every buffer between the volume and the mesh, by what it is; at most."""
         counted_words = self.counted_rows * self.grid.words

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
 from numpy.typing import DTypeLike
 
 from clrecon.errors import UsageError
@@ -62,13 +61,10 @@ def check_row(volume: Volume) -> None:
         )
 
 
-def _field_scalars(slab: Slab) -> tuple[Any, ...]:
+def _field_arguments(slab: Slab) -> dict[str, Any]:
     """Level, outside, and where the slab lies: how every pass is told about the field."""
-    volume, rule = slab.grid.volume, slab.grid.rule
-    value = np.float32 if volume.voxels.dtype.kind == "f" else np.int32
-    place = (*volume.shape_ijk, rule.border, slab.voxel_slices[0], slab.first)
-    sizes = (np.uint32(slab.mask_slices), np.uint32(slab.grid.words))
-    return (np.float32(rule.iso_level), value(rule.outside), *(np.int32(n) for n in place), *sizes)
+    rule = slab.grid.rule
+    return {"iso_level": rule.iso_level, "outside": rule.outside, **slab.arguments}
 
 
 def count_cells(
@@ -93,16 +89,16 @@ def count_cells(
     word_places_d = allocate(device, 2 * slab.rows * grid.words)
     program = prepare_trilinear(device, grid.volume.voxels.dtype)
     launch(
-        device, program["count_cells"], rows,
-        voxels_d, mask_d, flags_d, row_counts_d, word_triangles_d, row_vertices_d, word_places_d,
-        *_field_scalars(slab), np.uint32(grid.flag_words), np.uint32(slab.rows), np.uint32(rows),
-        stopwatch=stopwatch,
+        device, program["count_cells"], rows, stopwatch=stopwatch,
+        voxels=voxels_d, mask=mask_d, words_with_work=flags_d, row_counts=row_counts_d,
+        word_triangles=word_triangles_d, row_cell_vertices=row_vertices_d, word_cell_vertices=word_places_d,
+        flag_words=grid.flag_words, own_rows=slab.rows, rows_to_count=rows, **_field_arguments(slab),
     )  # fmt: skip
     scanned = exclusive_scan(device, row_vertices_d, rows, stopwatch=stopwatch)
     slices = rows // grid.shape[1]
     launch(
-        device, program["make_room"], slices,
-        row_counts_d, scanned.offsets_d, np.uint32(grid.shape[1]), np.uint32(slices), stopwatch=stopwatch,
+        device, program["make_room"], slices, stopwatch=stopwatch,
+        row_counts=row_counts_d, cell_vertex_offsets=scanned.offsets_d, gj=grid.shape[1], slices=slices,
     )  # fmt: skip
     return CellVertices(scanned.offsets_d, word_places_d, scanned.total)
 
@@ -113,8 +109,8 @@ def emit_cells(
     voxels_d: Any,
     mask_d: Any,
     counted: Any,
-    tables: tuple[Any, Any, Any],
-    output: tuple[Any, Any, Any],
+    tables: dict[str, Any],
+    output: dict[str, Any],
     first_vertex: int,
     stopwatch: Stopwatch,
 ) -> None:
@@ -124,30 +120,36 @@ def emit_cells(
     ----------
     counted : marching_cubes.Counted
         With `cells`.
-    tables : slice frames (buffer), steps (buffer), margin (float4)
-        As emit_vertices takes them.
-    output : positions, normals, triangles (buffers)
+    tables : dict
+        ``slice_frames``, ``steps`` and ``margin``, as emit_vertices takes them.
+    output : dict
+        The buffers ``positions``, ``normals`` and ``triangles``.
     first_vertex : int
         Vertices of all slabs before.
     """
     program = prepare_trilinear(device, slab.grid.volume.voxels.dtype)
     cells: CellVertices = counted.cells
-    positions_d, normals_d, triangles_d = output
     active = counted.active_words
-    mirrored = np.int32(slab.grid.winds_backwards)
-    packing = (*_field_scalars(slab), np.uint32(slab.grid.row_shift), np.uint32(active))
-    common = (voxels_d, mask_d, counted.active_words_d, counted.row_offsets_d)
+    common = {
+        "voxels": voxels_d,
+        "mask": mask_d,
+        "active_words": counted.active_words_d,
+        "row_offsets": counted.row_offsets_d,
+        "cell_vertex_offsets": cells.offsets_d,
+        "word_cell_vertices": cells.word_places_d,
+        "row_shift": slab.grid.row_shift,
+        "active": active,
+        **_field_arguments(slab),
+    }
     if counted.triangles:
         launch(
-            device, program["emit_cell_triangles"], active,
-            *common, cells.offsets_d,
-            counted.word_vertices_d, counted.word_triangles_d, cells.word_places_d,
-            triangles_d, np.uint32(first_vertex), np.uint32(slab.counted_rows), mirrored, *packing,
-            stopwatch=stopwatch,
+            device, program["emit_cell_triangles"], active, stopwatch=stopwatch,
+            word_vertices=counted.word_vertices_d, word_triangles=counted.word_triangles_d,
+            triangles=output["triangles"], first_vertex=first_vertex, rows_to_count=slab.counted_rows,
+            mirrored=slab.grid.winds_backwards, **common,
         )  # fmt: skip
     if cells.total:
         launch(
-            device, program["emit_cell_vertices"], active,
-            *common, cells.offsets_d, cells.word_places_d, *tables, positions_d, normals_d, *packing,
-            stopwatch=stopwatch,
+            device, program["emit_cell_vertices"], active, stopwatch=stopwatch,
+            positions=output["positions"], normals=output["normals"], **tables, **common,
         )  # fmt: skip

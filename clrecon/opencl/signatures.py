@@ -1,0 +1,159 @@
+"""The arguments of each kernel in a source: names and types, in order.
+
+Drivers know the names only for programs that were built from source with an option for it, and some never do.  The
+source is always at hand, also where a program comes from a binary, so the names are read from it.  The reader follows
+the preprocessor directives that kernel files use and replaces types that are macros (VOXEL).  It does not know what a
+compiler defines itself (__AVX2__): conditions on that may not change the arguments of a kernel.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache
+
+__all__ = ["KernelArgument", "definitions_of", "find_signatures"]
+
+_COMMENT = re.compile(r"/\*.*?(?:\*/|\Z)|//[^\n]*", re.DOTALL)
+_DIRECTIVE = re.compile(r"^[ \t]*#[ \t]*(\w+)[ \t]*(.*)", re.MULTILINE)
+_DEFINE = re.compile(r"(\w+)(\(?)[ \t]*(.*)", re.DOTALL)
+_DEFINED = re.compile(r"\bdefined\s*(?:\(\s*(\w+)\s*\)|(\w+))")
+_WORD = re.compile(r"\b[A-Za-z_]\w*\b")
+_KERNEL = re.compile(r"__kernel\b(?:\s*__attribute__\s*\(\(.*?\)\))?\s+void\s+(\w+)\s*\(([^()]*)\)\s*\{")
+_LONGEST_HEAD = 8000  # characters from __kernel to the body, comments counted
+_QUALIFIERS = {"const", "restrict", "volatile", "unsigned", "__global", "__constant", "__local", "__private"}
+
+
+@dataclass(frozen=True)
+class KernelArgument:
+    """One argument of a kernel.
+
+    Attributes
+    ----------
+    name : str
+    type : str
+        As in OpenCL C, such as ``"int"`` or ``"float4"``; of a buffer that of its elements.
+    is_buffer : bool
+    """
+
+    name: str
+    type: str
+    is_buffer: bool
+
+
+def definitions_of(options: tuple[str, ...]) -> dict[str, str]:
+    """Macros that the options of a build define, with their values."""
+    given = (option[2:].partition("=") for option in options if option.startswith("-D"))
+    return {name: value if equals else "1" for name, equals, value in given}
+
+
+def _strip_comments(text: str) -> str:
+    return _COMMENT.sub(" ", text) if "/" in text else text
+
+
+@cache
+def _split_source(source: str) -> tuple[tuple[str, str, str], ...]:
+    """Pieces of a source: a directive, what it says, and the text from there to the next one."""
+    text = source.replace("\\\n", " ")
+    pieces = [("", "", 0)]
+    ends = []
+    for match in _DIRECTIVE.finditer(text):
+        ends.append(match.start())
+        pieces.append((match[1], _strip_comments(match[2]).strip(), match.end()))
+    ends.append(len(text))
+    return tuple((name, rest, text[begin:end]) for (name, rest, begin), end in zip(pieces, ends, strict=True))
+
+
+def find_signatures(source: str, definitions: Mapping[str, str]) -> dict[str, tuple[KernelArgument, ...]]:
+    """The arguments of all kernels of a source.
+
+    Parameters
+    ----------
+    source : str
+        With its includes, as `clrecon.opencl.sources.read_kernel_source` gives it.
+    definitions : mapping of str to str
+        Macros that the options of the build define.
+
+    Raises
+    ------
+    ValueError
+        A directive or an argument is written in a way that this reader does not know.
+    """
+    macros, text = _preprocess(source, definitions)
+    signatures = {}
+    at = text.find("__kernel")
+    while at >= 0:  # comments are long: they are taken out only here
+        match = _KERNEL.match(_strip_comments(text[at : at + _LONGEST_HEAD]))
+        if match is not None:
+            signatures[match[1]] = _arguments(_expand(match[2], macros))
+        at = text.find("__kernel", at + 1)
+    return signatures
+
+
+def _preprocess(source: str, definitions: Mapping[str, str]) -> tuple[dict[str, str], str]:
+    """Macros without parameters at the end of a source, and its text that the conditions leave."""
+    macros, kept = dict(definitions), []
+    states: list[tuple[bool, bool]] = []  # of each open condition: whether its branch counts, and whether one has
+    for name, rest, text in _split_source(source):
+        if name in ("if", "ifdef", "ifndef"):
+            outside = not states or states[-1][0]
+            holds = outside and _holds(name, rest, macros)
+            states.append((holds, holds or not outside))
+        elif name in ("elif", "else"):
+            _, done = states.pop()
+            holds = not done and (name == "else" or _holds("if", rest, macros))
+            states.append((holds, holds or done))
+        elif name == "endif":
+            states.pop()
+        elif name in ("define", "undef") and (not states or states[-1][0]):
+            _define(name, rest, macros)
+        elif name not in ("", "define", "undef", "line", "pragma", "error"):
+            raise ValueError(f"#{name} {rest}")
+        if not states or states[-1][0]:
+            kept.append(text)
+    return macros, "".join(kept)
+
+
+def _define(directive: str, rest: str, macros: dict[str, str]) -> None:
+    match = _DEFINE.match(rest)
+    if match is None:
+        raise ValueError(f"#{directive} {rest}")
+    if directive == "undef":
+        macros.pop(match[1], None)
+    elif not match[2] or rest[match.end(1)] == " ":  # a macro with parameters names no argument
+        macros[match[1]] = rest[match.end(1) :].strip()
+
+
+def _holds(directive: str, condition: str, macros: Mapping[str, str]) -> bool:
+    if directive != "if":
+        return (condition in macros) == (directive == "ifdef")
+    text = _DEFINED.sub(lambda match: str(int((match[1] or match[2]) in macros)), condition)
+    text = _WORD.sub("0", _expand(text, macros))
+    if not re.fullmatch(r"[0-9()<>=!&|+\-*/% ]*", text) or re.search(r"[0-9] *\(", text):
+        raise ValueError(f"#if {condition}")
+    text = text.replace("&&", " and ").replace("||", " or ")
+    try:
+        return bool(eval(re.sub(r"!(?!=)", " not ", text), {"__builtins__": {}}))
+    except SyntaxError as error:
+        raise ValueError(f"#if {condition}") from error
+
+
+def _expand(text: str, macros: Mapping[str, str]) -> str:
+    """Replace macros, and what they name."""
+    for _ in range(10):
+        expanded = _WORD.sub(lambda match: macros.get(match[0], match[0]), text)
+        if expanded == text:
+            return text
+        text = expanded
+    raise ValueError(f"macros that name themselves: {text}")
+
+
+def _arguments(text: str) -> tuple[KernelArgument, ...]:
+    arguments = []
+    for part in text.split(","):
+        words = [word for word in _WORD.findall(part) if word not in _QUALIFIERS]
+        if len(words) != 2:
+            raise ValueError(f"an argument of a kernel is a type and a name, not {part.strip()!r}")
+        arguments.append(KernelArgument(words[1], words[0], "*" in part))
+    return tuple(arguments)
