@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from clrecon.anatomy.body_cells import Cells, Mask, grow, measure_cells
 from clrecon.anatomy.dense_pieces import BONE_KEPT, DensePieces, find_dense_pieces, judge_bone, judge_circle
 from clrecon.errors import RefusedInputError, UsageError
+from clrecon.geometry.certificate import amend
 from clrecon.geometry.volume import AIR_HU, Volume
 
 __all__ = ["find_body", "find_unmeasured", "mask_field_of_view", "remove_table"]
@@ -89,7 +90,7 @@ def remove_table(volume: Volume, *, allow_bone_loss: bool = False) -> Volume:
         return np.asarray(~np.repeat(np.repeat(body[k // step[2]], step[1], 0), step[0], 1)[:nj, :ni])
 
     masked = _turn_into_air(volume, outside, "remove_table", {"body_share": round(float(body.mean()), 4), **bone})
-    masked.report["gates"] = [*masked.report.get("gates", []), gate]
+    masked.report = amend(masked.report, gates=[*masked.report.get("gates", []), gate])
     return masked
 
 
@@ -133,7 +134,7 @@ def mask_field_of_view(volume: Volume, radius_mm: float | None = None) -> Volume
     bone, gate = judge_circle(cells, ~mask[middle])
     masked = _turn_into_air(volume, lambda k: mask, "field_of_view", {"radius_mm": round(radius, 3), **bone})
     if radius_mm is None:
-        masked.report["gates"] = [*masked.report.get("gates", []), gate]
+        masked.report = amend(masked.report, gates=[*masked.report.get("gates", []), gate])
     return masked
 
 
@@ -152,7 +153,7 @@ def _turn_into_air(volume: Volume, outside: Callable[[int], Mask], name: str, sa
     facts = {"voxels_removed": removed, "dense_voxels_removed": dense, "removed_share": round(share, 4), **said}
     facts["air_hu"] = float(air)
     masked = volume.with_voxels(voxels)
-    masked.report[name] = facts
+    masked.report = amend(masked.report, **{name: facts})
     return masked
 
 

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from clrecon.anatomy.body import MARGIN_MM, TISSUE_HU, find_body, find_unmeasured
 from clrecon.errors import NoSurfaceError, RefusedInputError
+from clrecon.geometry.certificate import amend
 from clrecon.geometry.volume import AIR_HU, Volume
 from clrecon.system.wording import name_parameter
 
@@ -86,12 +87,13 @@ def leave_outside_air(volume: Volume, levels: Sequence[float]) -> Volume:
             f" ({name_parameter('keep_outside', True)} takes them)"
         )
     changed = volume.with_voxels(voxels)
-    changed.report["outside_air"] = {
+    facts = {
         "left_out_ml": round(left_out_ml, 3),
         "kept_ml": round(kept_ml, 3),
         "opening_mm2": round(opening, 1),
         "filled_hu": float(filled),
     }
+    changed.report = amend(changed.report, outside_air=facts)
     return changed
 
 

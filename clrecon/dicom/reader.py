@@ -8,7 +8,6 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from clrecon.dicom.parse.containers import advise_on
 from clrecon.dicom.parse.forced import describe_way_out
@@ -22,6 +21,7 @@ from clrecon.dicom.series.scan import BARE_DATA_SET, Scan, scan_path
 from clrecon.dicom.series.series import Series, group_series
 from clrecon.errors import NoDicomError, RefusedInputError, UsageError
 from clrecon.geometry import Volume
+from clrecon.geometry.certificate import Certificate
 from clrecon.system.log import get_logger, log_warnings
 from clrecon.system.progress import Progress
 from clrecon.system.text import escape_text, join_names
@@ -90,7 +90,7 @@ def read_volume(
     ]
     report = certify(chosen, stack, facts, scan, stack.affine, warnings, likeness)
     log.info("series %d of %d read: %s voxels %s", chosen.number, len(found), voxels.shape[::-1], voxels.dtype)
-    log_warnings(log, report["warnings"])
+    log_warnings(log, report.warnings)
     return Volume(voxels, stack.affine, report, stack.slice_positions, hu_range=(facts.hu_min, facts.hu_max))
 
 
@@ -151,14 +151,14 @@ def list_series(
             certificate = _certify_chosen(judged, scan, warnings, pixels, progress)
         entries = [describe_series(one, collect_series_warnings(one)) for one in found]
         if certificate is not None:  # its pixels may say more than its headers
-            own = [text for text in certificate["warnings"] if text not in warnings]
+            own = [text for text in certificate.warnings if text not in warnings]
             entries = [replace(entry, warnings=own) if entry.number == number else entry for entry in entries]
     return SeriesListing(entries, number, dict(scan.skipped), warnings, certificate, refusal)
 
 
 def _certify_chosen(
     series: Series, scan: Scan, notes: Sequence[str], pixels: bool, progress: Progress | None
-) -> dict[str, Any] | None:
+) -> Certificate | None:
     """The certificate of one series, None without a valid header; `notes` are the warnings about what is beside it."""
     stack = series.stack
     if stack is None or series.kind == "other":

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 from clrecon.dicom.series.gates import PADDING_SHARE, judge_figures, judge_steps, list_odd_values
 from clrecon.dicom.stack.layout import describe_orientation
 from clrecon.formats.grid_file import GridFile
 from clrecon.formats.values import GridValues
 from clrecon.geometry.affine import column_spacing, slice_normal, tilt_degrees
+from clrecon.geometry.certificate import Certificate
 from clrecon.system.gates import Gate, at_most, none_of, unmeasured
 
 __all__ = ["MODALITY", "certify_grid", "collect_header_warnings", "collect_value_warnings"]
@@ -41,7 +41,7 @@ def judge_spacing(grid: GridFile) -> Gate:
     return judge_steps(pixels, gap)
 
 
-def certify_grid(grid: GridFile, values: GridValues | None, warnings: Sequence[str]) -> dict[str, Any]:
+def certify_grid(grid: GridFile, values: GridValues | None, warnings: Sequence[str]) -> Certificate:
     """Build the report of a volume.
 
     Parameters
@@ -53,50 +53,32 @@ def certify_grid(grid: GridFile, values: GridValues | None, warnings: Sequence[s
 
     Returns
     -------
-    dict
-        JSON types only; the same entries as those of a DICOM volume, None where such a file does not say.
+    Certificate
     """
     facts = None if values is None else values.facts
     spacing = column_spacing(grid.affine)
     gap = abs(float(slice_normal(grid.affine) @ grid.affine[:3, 2]))
     ni, nj, nk = grid.shape_ijk
-    return {
-        "format": grid.kind,
-        "series": {"number": 1, "uid_hash": None, "modality": MODALITY},
-        "phase": None,
-        "slices": nk,
-        "slices_missing": 0,
-        "dropped": {},
-        "shape_ijk": [ni, nj, nk],
-        "spacing_mm": list(spacing),
-        "extent_mm": [ni * spacing[0], nj * spacing[1], nk * gap],
-        "affine_ijk_to_lps_mm": grid.affine.tolist(),
-        "orientation": describe_orientation(grid.affine),
-        "patient_position": None,
-        "tilt_deg": tilt_degrees(grid.affine),
-        "grid_residual_max_mm": None,
-        "grid_residual_rms_mm": None,
-        "grid_tolerance_mm": None,
-        "gap_mm": {"min": gap, "max": gap, "median": gap},
-        "uneven": False,
-        "gap_runs": None,
-        "slice_positions_mm": None,
-        "slice_thickness_mm": None,
-        "thickness": None,
-        "stated_gap_mm": None,
-        "frame_of_reference_hash": None,
-        "transfer_syntaxes": [],
-        "transfer_syntax_names": [f"{grid.kind}, {grid.dtype.name}"],
-        "lossy": False,
-        "rescale": {"slope": [grid.slope] * 2, "intercept": [grid.intercept] * 2, "type": None},
-        "padding_share": None if facts is None else facts.padding_share,
-        "padding_hu": None if facts is None else facts.padding_hu,
-        "hu_range": None if facts is None else [facts.hu_min, facts.hu_max],
-        "files": {"found": 1, "used": 1, "skipped": {}},
-        "gates": judge_grid(grid, values),
-        "warnings": list(warnings),
-        "problems": [],
-    }
+    return Certificate(
+        format=grid.kind,
+        series={"number": 1, "uid_hash": None, "modality": MODALITY},
+        slices=nk,
+        shape_ijk=[ni, nj, nk],
+        spacing_mm=list(spacing),
+        extent_mm=[ni * spacing[0], nj * spacing[1], nk * gap],
+        affine_ijk_to_lps_mm=grid.affine.tolist(),
+        orientation=describe_orientation(grid.affine),
+        tilt_deg=tilt_degrees(grid.affine),
+        gap_mm={"min": gap, "max": gap, "median": gap},
+        transfer_syntax_names=[f"{grid.kind}, {grid.dtype.name}"],
+        rescale={"slope": [grid.slope] * 2, "intercept": [grid.intercept] * 2, "type": None},
+        padding_share=None if facts is None else facts.padding_share,
+        padding_hu=None if facts is None else facts.padding_hu,
+        hu_range=None if facts is None else [facts.hu_min, facts.hu_max],
+        files={"found": 1, "used": 1, "skipped": {}},
+        gates=judge_grid(grid, values),
+        warnings=list(warnings),
+    )
 
 
 def judge_grid(grid: GridFile, values: GridValues | None) -> list[Gate]:

@@ -43,7 +43,7 @@ def read_grid(path: Path, kind: str, *, progress: Progress | None = None) -> Vol
     values = read_values(grid, progress)
     report = certify_grid(grid, values, _collect_warnings(grid, values))
     log.info("%s file read: %s voxels %s", grid.kind, grid.shape_ijk, values.voxels.dtype)
-    log_warnings(log, report["warnings"])
+    log_warnings(log, report.warnings)
     return Volume(values.voxels, grid.affine, report, hu_range=(values.facts.hu_min, values.facts.hu_max))
 
 

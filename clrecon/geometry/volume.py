@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from clrecon.errors import UsageError
 from clrecon.geometry.affine import Float64Array, checked_affine, checked_points
+from clrecon.geometry.certificate import Certificate, amend
 from clrecon.geometry.grid import Grid
 from clrecon.geometry.uneven import UnevenStack
 
@@ -79,7 +80,7 @@ class Volume(Grid):
     affine : array_like, shape (4, 4)
         Index (i, j, k) to LPS mm, see `clrecon.geometry.affine`.
     report : dict, optional
-        What is known of the origin and the quality of this volume (the certificate of `read_volume`).
+        What is known of the origin and the quality of this volume; `read_volume` gives a `Certificate`.
     slice_positions : array_like, shape (nk, 3), optional
         LPS mm of voxel (0, 0, k), for slices that no affine places: between two of them k runs linearly, beyond the
         ends in the steps of the ends.  The third column of `affine` is then only nominal.
@@ -114,6 +115,11 @@ class Volume(Grid):
         self.report: dict[str, Any] = {"warnings": []} if report is None else report
         if hu_range is not None:
             self.hu_range = hu_range
+
+    @property
+    def certificate(self) -> Certificate | None:
+        """The report of a volume that was read; None where the volume was made from arrays."""
+        return self.report if isinstance(self.report, Certificate) else None
 
     @cached_property
     def hu_range(self) -> tuple[float, float] | None:
@@ -180,12 +186,13 @@ class Volume(Grid):
         if array.shape != self._voxels.shape:
             raise UsageError(f"the voxels have shape {array.shape}, those of this volume {self._voxels.shape}")
         positions = None if self._stack is None else self.slice_origins()
-        if report is None:
-            report = deepcopy(self.report)
-            if report.get("hu_range") is not None:
-                found = _value_range(array)
-                report["hu_range"] = None if found is None else list(found)
-        return Volume(array, self._affine, report, positions)
+        if report is not None:
+            return Volume(array, self._affine, report, positions)
+        report, found = deepcopy(self.report), None
+        if report.get("hu_range") is not None:
+            found = _value_range(array)
+            report = amend(report, hu_range=None if found is None else list(found))
+        return Volume(array, self._affine, report, positions, hu_range=found)
 
     def release_slices(self, first: int, end: int) -> None:
         """Say that slices ``first`` to ``end - 1`` are not needed soon: those of a memory-mapped file leave memory.

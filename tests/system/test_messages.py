@@ -26,6 +26,7 @@ from clrecon.rendering.looks.label_style import LabelStyle
 from clrecon.rendering.views.camera import Camera
 from clrecon.rendering.views.centre_line import Curve
 from clrecon.rendering.views.clip import Clip
+from clrecon.system.gates import at_most
 
 VOXELS = np.arange(4 * 5 * 6, dtype=np.int16).reshape(4, 5, 6)
 AFFINE = np.array([[0.7, 0.1, 0.0, -25.0], [-0.1, 0.7, 0.2, -30.0], [0.0, 0.05, 2.5, -84.0], [0, 0, 0, 1.0]])
@@ -56,9 +57,10 @@ MESSAGES = {
     "render settings": RenderSettings(),
     "phantom settings": PhantomSettings(),
     "iso choice": half_iso_value(1000.0, 40.0),
+    "gate": at_most("gap", 1.0, 2.0, "mm", "a gap"),
     "listing": SeriesListing([ENTRY], 1, {}, [], {"slices": 4}, RefusedInputError("no")),
 }
-HELD_BY_A_DEVICE = {"SurfaceExtractor", "VolumeRenderer"}
+HELD_BY_A_DEVICE = {"DeviceVolume", "SurfaceExtractor", "VolumeRenderer"}
 """Public classes that are no messages: they own memory of a device."""
 
 

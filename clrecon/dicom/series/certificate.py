@@ -1,4 +1,4 @@
-"""The certificate: what is known of a volume's origin and geometry, as a dict without patient data.
+"""The certificate of a DICOM series: what is known of its origin and geometry, without patient data.
 
 People put names into file names and series descriptions: warnings and reports hold neither, but counts and positions.
 """
@@ -31,6 +31,7 @@ from clrecon.dicom.stack.layout import (
 from clrecon.dicom.stack.mixture import describe_differences
 from clrecon.errors import RefusedInputError
 from clrecon.geometry import column_spacing
+from clrecon.geometry.certificate import Certificate
 from clrecon.system.text import hash_uid
 
 __all__ = ["certify", "collect_scan_warnings", "collect_series_warnings"]
@@ -135,7 +136,7 @@ def certify(
     affine: NDArray[np.float64] | None,
     warnings: Sequence[str],
     likeness: Likeness | None = None,
-) -> dict[str, Any]:
+) -> Certificate:
     """Build the certificate of a series: the report of its volume, and what ``clrecon info`` shows.
 
     Parameters
@@ -153,72 +154,53 @@ def certify(
 
     Returns
     -------
-    dict
-        JSON types only, every name in docs/contract.md.  Lengths in mm, angles in degrees; ``hu_range`` is that of
-        the voxels as they are in the volume, padding (at ``padding_hu``) among them.
+    Certificate
     """
-    gates = judge_series(series, stack, facts, likeness)
-    unsaid = [gate["text"] for gate in gates if gate["name"] in SAID_BY_GATES and gate["ok"] is False]
-    return {
-        "format": "DICOM",
-        "series": {
-            "number": series.number,
-            "uid_hash": hash_uid(series.identity.uid),
-            "modality": series.identity.modality,
-        },
-        "phase": _describe_phase(series),
-        **_certify_places(stack, affine),
-        **_certify_values(stack.slices, facts),
-        "files": {"found": scan.files, "used": len({h.file for h in stack.slices}), "skipped": dict(scan.skipped)},
-        "dropped": series.dropped,
-        "gates": gates,
-        "warnings": [*warnings, *unsaid],
-        "problems": list(series.problems),
-    }
-
-
-def _certify_places(stack: Stack, affine: NDArray[np.float64] | None) -> dict[str, Any]:
-    """Where the slices lie, and how well that is known."""
     headers, first, line = stack.slices, stack.slices[0], stack.line
     stated = next((h.stated_gap_mm for h in headers if h.stated_gap_mm is not None), None)
     lay = {h.patient_position for h in headers}
-    return {
-        "slices": len(headers),
-        "slices_missing": stack.missing,
-        "shape_ijk": [first.columns, first.rows, len(headers)],
-        "spacing_mm": None if affine is None else list(column_spacing(affine)),
-        "extent_mm": None if affine is None else measure_extent(stack),
-        "affine_ijk_to_lps_mm": None if affine is None else affine.tolist(),
-        "orientation": None if affine is None else describe_orientation(affine),
-        "patient_position": (lay.pop() or None) if len(lay) == 1 else None,
-        "tilt_deg": stack.tilt_deg,
-        "grid_residual_max_mm": line.residual_max_mm,
-        "grid_residual_rms_mm": line.residual_rms_mm,
-        "grid_tolerance_mm": line.tolerance_mm,
-        "gap_mm": {"min": line.gap_min_mm, "max": line.gap_max_mm, "median": line.gap_median_mm},
-        "uneven": line.uneven,
-        "gap_runs": summarise_gaps(stack.distances_mm) if line.uneven else None,
-        "slice_positions_mm": stack.positions_mm.tolist() if line.uneven else None,
-        "slice_thickness_mm": median_thickness(headers),
-        "thickness": describe_thickness(headers, stack.distances_mm),
-        "stated_gap_mm": stated,
-        "frame_of_reference_hash": hash_uid(first.frame_of_reference),
-    }
-
-
-def _certify_values(headers: Sequence[SliceHeader], facts: PixelFacts | None) -> dict[str, Any]:
-    """What the voxels' values are."""
     slopes, intercepts = [h.slope for h in headers], [h.intercept for h in headers]
-    return {
-        "padding_share": None if facts is None else facts.padding_share,
-        "padding_hu": None if facts is None else facts.padding_hu,
-        "transfer_syntaxes": sorted({h.transfer_syntax for h in headers}),
-        "transfer_syntax_names": sorted({SYNTAX_NAMES[h.transfer_syntax] for h in headers}),
-        "lossy": any(h.lossy for h in headers),
-        "rescale": {
+    gates = judge_series(series, stack, facts, likeness)
+    unsaid = [gate.text for gate in gates if gate.name in SAID_BY_GATES and gate.ok is False]
+    identity = {"number": series.number, "uid_hash": hash_uid(series.identity.uid)}
+    return Certificate(
+        format="DICOM",
+        series={**identity, "modality": series.identity.modality},
+        phase=_describe_phase(series),
+        slices=len(headers),
+        slices_missing=stack.missing,
+        shape_ijk=[first.columns, first.rows, len(headers)],
+        spacing_mm=None if affine is None else list(column_spacing(affine)),
+        extent_mm=None if affine is None else measure_extent(stack),
+        affine_ijk_to_lps_mm=None if affine is None else affine.tolist(),
+        orientation=None if affine is None else describe_orientation(affine),
+        patient_position=(lay.pop() or None) if len(lay) == 1 else None,
+        tilt_deg=stack.tilt_deg,
+        grid_residual_max_mm=line.residual_max_mm,
+        grid_residual_rms_mm=line.residual_rms_mm,
+        grid_tolerance_mm=line.tolerance_mm,
+        gap_mm={"min": line.gap_min_mm, "max": line.gap_max_mm, "median": line.gap_median_mm},
+        uneven=line.uneven,
+        gap_runs=summarise_gaps(stack.distances_mm) if line.uneven else None,
+        slice_positions_mm=stack.positions_mm.tolist() if line.uneven else None,
+        slice_thickness_mm=median_thickness(headers),
+        thickness=describe_thickness(headers, stack.distances_mm),
+        stated_gap_mm=stated,
+        frame_of_reference_hash=hash_uid(first.frame_of_reference),
+        padding_share=None if facts is None else facts.padding_share,
+        padding_hu=None if facts is None else facts.padding_hu,
+        transfer_syntaxes=sorted({h.transfer_syntax for h in headers}),
+        transfer_syntax_names=sorted({SYNTAX_NAMES[h.transfer_syntax] for h in headers}),
+        lossy=any(h.lossy for h in headers),
+        rescale={
             "slope": [min(slopes), max(slopes)],
             "intercept": [min(intercepts), max(intercepts)],
             "type": headers[0].rescale_type or None,
         },
-        "hu_range": None if facts is None else [facts.hu_min, facts.hu_max],
-    }
+        hu_range=None if facts is None else [facts.hu_min, facts.hu_max],
+        files={"found": scan.files, "used": len({h.file for h in headers}), "skipped": dict(scan.skipped)},
+        dropped=series.dropped,
+        gates=gates,
+        warnings=[*warnings, *unsaid],
+        problems=list(series.problems),
+    )

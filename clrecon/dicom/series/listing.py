@@ -11,6 +11,7 @@ from clrecon.dicom.stack.fit import Stack
 from clrecon.dicom.stack.layout import measure_extent, median_thickness
 from clrecon.errors import ClreconError, RefusedInputError
 from clrecon.geometry import column_spacing
+from clrecon.geometry.certificate import Certificate
 from clrecon.system.text import hash_uid
 
 __all__ = ["SeriesEntry", "SeriesListing", "describe_series"]
@@ -88,8 +89,8 @@ class SeriesListing:
     skipped : dict of str to int
         Reason to number of files passed over.
     warnings : list of str
-    certificate : dict or None
-        Of the chosen series, in the form of ``volume.report``, also where it is refused; None where no series is
+    certificate : Certificate or None
+        Of the chosen series, as ``volume.report``, also where it is refused; None where no series is
         chosen or none of its slices has a valid header.
     refusal : ClreconError or None
         Why none is chosen; its text stands in `warnings` too.
@@ -99,7 +100,7 @@ class SeriesListing:
     chosen: int | None
     skipped: dict[str, int]
     warnings: list[str]
-    certificate: dict[str, Any] | None = None
+    certificate: Certificate | None = None
     refusal: ClreconError | None = None
 
 

@@ -38,6 +38,7 @@ def leave_outside(volume: Volume, settings: MeshSettings, progress: Progress) ->
     if settings.below is None or settings.keep_outside:
         return volume
     from clrecon.anatomy.outside_air import leave_outside_air
+    from clrecon.geometry.certificate import amend
 
     progress("mask", 0, 0)
     warnings = list(volume.report.get("warnings", ()))
@@ -52,5 +53,5 @@ def leave_outside(volume: Volume, settings: MeshSettings, progress: Progress) ->
             f"cavities are open to the outside and were cut there: {facts['opening_mm2']:,.0f} mm2 of cut, a flat end"
             " of the surface at each opening (nostrils, mouth, ears, holes of a dry bone); look at it there"
         )
-    volume.report["warnings"] = warnings
+    volume.report = amend(volume.report, warnings=warnings)
     return volume

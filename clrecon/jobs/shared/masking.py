@@ -26,6 +26,7 @@ def mask_volume(volume: Volume, settings: InputSettings, progress: Progress) -> 
     if settings.field_of_view is None and not settings.remove_table:
         return volume
     from clrecon.anatomy.body import mask_field_of_view, remove_table
+    from clrecon.geometry.certificate import amend
 
     progress("mask", 0, 0)
     warnings = list(volume.report.get("warnings", ()))
@@ -46,7 +47,7 @@ def mask_volume(volume: Volume, settings: InputSettings, progress: Progress) -> 
             f" {facts['dense_voxels_removed']:,} of them dense (table, blankets);{_describe_bone(facts)}"
             " look whether the body is whole"
         )
-    volume.report["warnings"] = warnings
+    volume.report = amend(volume.report, warnings=warnings)
     return volume
 
 

@@ -89,10 +89,8 @@ def judge_label_volume(mesh_ml: float | None, label_ml: float, advice: str = "",
     change = 100.0 * (mesh_ml / label_ml - 1.0)
     gate = at_most(name, abs(change), bound, "%", "volume of the mesh against that of the label")
     both = f"the mesh has {mesh_ml:,.3g} ml, the label {label_ml:,.3g} ml"
-    gate["text"] = f"{both} ({change:+.3g} %, at most {bound:g} % either way)"
-    if not gate["ok"] and advice:
-        gate["text"] += f": {advice}"
-    return gate
+    text = f"{both} ({change:+.3g} %, at most {bound:g} % either way)"
+    return gate.changed(text=text if gate.ok or not advice else f"{text}: {advice}")
 
 
 def _gates_of_quality(quality: dict[str, Any], closed: bool, outward: bool) -> Iterator[Gate]:

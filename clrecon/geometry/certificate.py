@@ -1,0 +1,140 @@
+"""`Certificate`: what is known of a volume's origin and geometry, without patient data."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
+from typing import Any
+
+from clrecon.system.gates import Gate
+from clrecon.system.records import Record
+
+__all__ = ["Certificate", "amend"]
+
+_ELSEWHERE = {"slices_missing": ("dropped",), "rescale": ("padding_share", "padding_hu")}
+"""In reports of files that are not DICOM these entries stand behind that one: as they always have, byte for byte."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Certificate(Record):
+    """What is known of a volume; ``volume.report`` where it was read.  See docs/contract.md and docs/certificate.md.
+
+    Lengths are mm, angles degrees.  None is what the file does not say, what is refused, or what only the pixels could
+    say where they were not read.
+
+    Attributes
+    ----------
+    format : str
+        "DICOM", or the kind of the file.
+    series : mapping
+        ``number``, ``uid_hash`` (None without an identifier) and ``modality``.
+    phase : mapping or None
+        ``number``, ``of``, ``keyword`` and ``value`` of the phase that was taken, where there are several.
+    slices, slices_missing : int
+    shape_ijk : list of int
+    spacing_mm : list of float or None
+    extent_mm : list of float or None
+        Size of the box of whole voxels along rows, columns and the slice normal.
+    affine_ijk_to_lps_mm : nested list (4, 4) or None
+    orientation : mapping or None
+        How the axes lie in the patient.
+    patient_position : str or None
+    tilt_deg : float or None
+    grid_residual_max_mm, grid_residual_rms_mm, grid_tolerance_mm : float or None
+        Distances of slice positions from the affine, and what is allowed.
+    gap_mm : mapping
+        ``min``, ``max`` and ``median`` distance of neighbouring slices along the normal.
+    uneven : bool or None
+    gap_runs : list or None
+        Runs of equal gaps, where they are uneven.
+    slice_positions_mm : nested list (slices, 3) or None
+        LPS mm, where slices are uneven.
+    slice_thickness_mm, stated_gap_mm : float or None
+        As the headers state them; they play no part in the geometry.
+    thickness : mapping or None
+        Thickness and overlap of the slices.
+    frame_of_reference_hash : str or None
+    padding_share : float or None
+        Share of the voxels that hold no measurement.
+    padding_hu : float or None
+        What they have in the volume.
+    transfer_syntaxes, transfer_syntax_names : list of str
+    lossy : bool
+    rescale : mapping
+        ``slope`` and ``intercept``, lowest and highest each, and ``type``.
+    hu_range : [float, float] or None
+        Of the voxels as they are in the volume, padding among them.
+    files : mapping
+        ``found``, ``used`` and ``skipped`` (reason to count).
+    dropped : mapping of str to int
+        Reason to number of slices left out.
+    gates : list of Gate
+    warnings, problems : list of str
+        Doubts, and reasons to refuse.
+    masked : mapping
+        What was turned into air since the volume was read, by what did it (``remove_table``, ``field_of_view``,
+        ``outside_air``); each stands among the entries by its own name.
+    """
+
+    format: str
+    series: Mapping[str, Any]
+    phase: Mapping[str, Any] | None = None
+    slices: int
+    slices_missing: int = 0
+    shape_ijk: list[int]
+    spacing_mm: list[float] | None
+    extent_mm: list[float] | None
+    affine_ijk_to_lps_mm: list[list[float]] | None
+    orientation: Mapping[str, Any] | None
+    patient_position: str | None = None
+    tilt_deg: float | None
+    grid_residual_max_mm: float | None = None
+    grid_residual_rms_mm: float | None = None
+    grid_tolerance_mm: float | None = None
+    gap_mm: Mapping[str, float | None]
+    uneven: bool | None = False
+    gap_runs: list[Any] | None = None
+    slice_positions_mm: list[list[float]] | None = None
+    slice_thickness_mm: float | None = None
+    thickness: Mapping[str, Any] | None = None
+    stated_gap_mm: float | None = None
+    frame_of_reference_hash: str | None = None
+    padding_share: float | None = None
+    padding_hu: float | None = None
+    transfer_syntaxes: list[str] = field(default_factory=list)
+    transfer_syntax_names: list[str]
+    lossy: bool = False
+    rescale: Mapping[str, Any]
+    hu_range: list[float] | None = None
+    files: Mapping[str, Any]
+    dropped: Mapping[str, int] = field(default_factory=dict)
+    gates: list[Gate]
+    warnings: list[str]
+    problems: list[str] = field(default_factory=list)
+    masked: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+
+    def _entries(self) -> dict[str, Any]:
+        entries = super()._entries()
+        masked = entries.pop("masked")
+        if self.format != "DICOM":
+            moved = {name: entries.pop(name) for names in _ELSEWHERE.values() for name in names}
+            order = [place for name in entries for place in (name, *_ELSEWHERE.get(name, ()))]
+            entries = {name: moved[name] if name in moved else entries[name] for name in order}
+        return {**entries, **masked}
+
+
+def amend(report: dict[str, Any], **changes: Any) -> dict[str, Any]:
+    """The report of a volume with some entries changed or added; a certificate stays one.
+
+    Parameters
+    ----------
+    report : dict
+        ``volume.report``.
+    **changes
+        Of a certificate: its fields, and what goes into `Certificate.masked`.
+    """
+    if not isinstance(report, Certificate):
+        return {**report, **changes}
+    own = {field.name for field in fields(report)}
+    masked = {**report.masked, **{name: value for name, value in changes.items() if name not in own}}
+    return report.changed(masked=masked, **{name: value for name, value in changes.items() if name in own})

@@ -1,0 +1,121 @@
+"""Records: dataclasses with typed fields that are still the dicts which they used to be."""
+
+from __future__ import annotations
+
+import copy
+import json
+from dataclasses import FrozenInstanceError, dataclass, fields, is_dataclass
+from importlib import import_module
+from typing import Any
+
+import pytest
+from house import package_modules
+
+from clrecon.geometry.certificate import Certificate, amend
+from clrecon.system.gates import Gate, at_most
+from clrecon.system.records import Record
+
+
+@dataclass(frozen=True, eq=False)
+class Pair(Record):
+    """For these tests."""
+
+    low: float
+    inner: Gate | None = None
+    told: str | None = None
+    _LEFT_OUT = ("told",)
+
+
+GATE = at_most("gap", 1.0, 2.0, "mm", "a gap")
+CERTIFICATE = Certificate(
+    format="DICOM", series={"number": 1}, slices=2, shape_ijk=[4, 3, 2], spacing_mm=[1.0] * 3, extent_mm=None,
+    affine_ijk_to_lps_mm=None, orientation=None, tilt_deg=0.0, gap_mm={"min": 1.0}, transfer_syntax_names=[],
+    rescale={}, files={}, gates=[GATE], warnings=["doubtful"],
+)  # fmt: skip
+
+
+def test_fields_are_entries_in_their_order() -> None:
+    pair = Pair(1.0, GATE)
+    assert pair.inner is pair["inner"] is GATE
+    assert list(pair) == ["low", "inner"]
+    assert list(Pair(1.0, None, "more")) == ["low", "inner", "told"]
+    assert pair == {"low": 1.0, "inner": dict(GATE)}
+    assert json.loads(json.dumps(pair)) == pair.as_dict()
+    assert {**pair, "more": 1} == dict(pair) | {"more": 1}
+    assert repr(GATE).startswith("Gate(name='gap', measured=1.0,")
+
+
+def test_a_record_cannot_be_changed_and_its_dict_can() -> None:
+    pair = Pair(1.0, GATE)
+    for change in (
+        lambda: pair.__setitem__("low", 2.0),
+        lambda: pair.update(low=2.0),
+        lambda: pair.pop("low"),
+        lambda: pair.setdefault("more", 1),
+        lambda: pair.__delitem__("low"),
+        lambda: pair.__ior__({"low": 2.0}),
+        pair.clear,
+        pair.popitem,
+    ):
+        with pytest.raises(TypeError, match=r"a Pair cannot be changed: as_dict\(\) gives a dict that can"):
+            change()
+    with pytest.raises(FrozenInstanceError):
+        pair.low = 2.0  # type: ignore[misc]
+    plain = pair.as_dict()
+    plain["inner"]["ok"] = "changed"
+    assert type(plain) is type(plain["inner"]) is dict
+    assert GATE.ok is True
+    assert pair.changed(low=3.0) == {"low": 3.0, "inner": GATE}
+
+
+@pytest.mark.parametrize("way", [copy.copy, copy.deepcopy])
+def test_copies_are_records(way: Any) -> None:
+    copied = way(CERTIFICATE)
+    assert type(copied) is Certificate
+    assert copied == CERTIFICATE
+    assert type(copied.gates[0]) is Gate
+    assert (copied.warnings is CERTIFICATE.warnings) is (way is copy.copy)
+
+
+def test_a_certificate_is_amended_by_field_and_by_mask() -> None:
+    masked = amend(CERTIFICATE, warnings=[], remove_table={"air_hu": -1000.0})
+    masked = amend(masked, field_of_view={"radius_mm": 9.0})
+    assert isinstance(masked, Certificate)
+    assert masked.warnings == [] == masked["warnings"]
+    assert list(masked)[-3:] == ["problems", "remove_table", "field_of_view"]
+    assert masked["field_of_view"] == masked.masked["field_of_view"] == {"radius_mm": 9.0}
+    assert CERTIFICATE.warnings == ["doubtful"]
+    assert "masked" not in masked
+    plain = {"warnings": ["own"]}
+    assert amend(plain, remove_table={}) == {"warnings": ["own"], "remove_table": {}}
+    assert plain == {"warnings": ["own"]}
+
+
+def test_the_entries_of_other_formats_keep_their_order() -> None:
+    other = CERTIFICATE.changed(format="NRRD")
+    assert set(other) == set(CERTIFICATE)
+    order = list(other)
+    assert order[order.index("slices_missing") + 1] == "dropped"
+    assert order[order.index("rescale") + 1 :][:3] == ["padding_share", "padding_hu", "hu_range"]
+    assert other == {**CERTIFICATE, "format": "NRRD"}
+
+
+def all_records() -> list[type[Record]]:
+    for name in package_modules():
+        if name.split(".")[1:2] not in (["cli"], ["__main__"]):
+            import_module(name)
+    found, new = [], [Record]
+    while new:
+        new = [kind for parent in new for kind in parent.__subclasses__() if kind.__module__.startswith("clrecon.")]
+        found += new
+    return found
+
+
+def test_every_record_compares_as_a_dict_and_documents_its_fields() -> None:
+    kinds = all_records()
+    assert {Certificate, Gate} <= set(kinds)
+    for kind in kinds:
+        assert kind.__eq__ is dict.__eq__, f"{kind.__name__} is made without eq=False"
+        if is_dataclass(kind):
+            missing = [field.name for field in fields(kind) if field.name not in (kind.__doc__ or "")]
+            assert missing == [], kind.__name__
