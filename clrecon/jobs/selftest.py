@@ -13,11 +13,13 @@ from clrecon.errors import ClreconError, DeviceError
 from clrecon.geometry import Volume
 from clrecon.labels import LabelMap
 from clrecon.opencl import Device, download, upload
-from clrecon.operators.primitives.compaction import compact, exclusive_scan
+from clrecon.operators.primitives.compact import compact
+from clrecon.operators.primitives.scan import exclusive_scan
 from clrecon.operators.primitives.union_find import label_components
 from clrecon.operators.surface.extract import extract_isosurface
 from clrecon.operators.surface.labels import extract_labels
-from clrecon.reference.primitives import compaction as compaction_twin
+from clrecon.reference.primitives import compact as compact_twin
+from clrecon.reference.primitives import scan as scan_twin
 from clrecon.reference.primitives import union_find as components_twin
 from clrecon.reference.surface import extract as isosurface_twin
 from clrecon.reference.surface import labels as label_twin
@@ -38,7 +40,7 @@ def _random_integers(shape: tuple[int, ...], dtype: str, high: int) -> NDArray[A
 def _check_scan(device: Device) -> str:
     for n in (1, 63, 64, 65, 1023, 1024, 1025, 70_001):
         counts = _random_integers((n,), "uint32", 9)
-        expected, total = compaction_twin.exclusive_scan(counts)
+        expected, total = scan_twin.exclusive_scan(counts)
         scanned = exclusive_scan(device, upload(device, counts), n)
         offsets = download(device, np.empty(n, dtype=np.uint32), scanned.offsets_d)
         if scanned.total != total or not np.array_equal(offsets, expected):
@@ -49,7 +51,7 @@ def _check_scan(device: Device) -> str:
 def _check_compaction(device: Device) -> str:
     for words in (1, 7, 8, 9, 513, 4001):
         mask = _random_integers((words,), "uint32", 2**32) & _random_integers((words,), "uint32", 2**31)
-        expected = compaction_twin.compact(mask)
+        expected = compact_twin.compact(mask)
         compacted = compact(device, upload(device, mask), words)
         positions = download(device, np.empty(compacted.count, dtype=np.uint32), compacted.positions_d)
         if not np.array_equal(positions, expected):

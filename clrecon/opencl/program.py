@@ -161,7 +161,7 @@ def load_program(device: Device, name: str, variants: Mapping[str, str] | None =
     ----------
     device : Device
     name : str
-        Such as ``"isosurface/marching_cubes.cl"``.
+        Such as ``"surface/marching_cubes.cl"``.
     variants : mapping of str to str, optional
         ``-D`` definitions; only for variants such as the element type, never for sizes.
 

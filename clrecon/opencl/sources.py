@@ -59,5 +59,5 @@ def _inline(name: str, seen: set[str]) -> list[str]:
 
 @cache
 def read_kernel_source(name: str) -> str:
-    """Return the text of kernel file `name` (such as ``"compaction/scan.cl"``) with its includes inlined."""
+    """Return the text of kernel file `name` (such as ``"primitives/scan.cl"``) with its includes inlined."""
     return "\n".join(_inline(name, {name})) + "\n"

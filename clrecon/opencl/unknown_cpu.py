@@ -27,7 +27,7 @@ CPU_NAMES: tuple[tuple[str, frozenset[str]], ...] = (
 )
 """LLVM's names of CPUs, no longer than `UNKNOWN`, and what each needs, in the words of /proc/cpuinfo; best first.
 
-The kernels ask the compiler for AVX-512 or AVX2 (`cl/include/window.h`): finer steps would gain nothing.
+The kernels ask the compiler for AVX-512 or AVX2 (`cl/rays/window.h`): finer steps would gain nothing.
 """
 
 _STRUCT_BYTES = 2048

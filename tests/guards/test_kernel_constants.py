@@ -12,23 +12,23 @@ from clrecon.operators.reformat.sample import COMBINATIONS
 from clrecon.operators.surface.label_masks import SAMPLES_PER_FLAGS
 
 PAIRS = [
-    ("clrecon.labels.occupancy.REACH", "labels/occupancy.h", "REACH"),
-    ("clrecon.operators.resident.bricks.BRICK", "bricks/bricks.h", "BRICK"),
-    ("clrecon.operators.primitives.compaction.COMPACT_WORDS", "compaction/compact.cl", "COMPACT_WORDS"),
-    ("clrecon.operators.primitives.compaction.SCAN_PER_ITEM", "compaction/scan.cl", "SCAN_PER_ITEM"),
-    ("clrecon.operators.rays.composite.GRADIENT_NODES", "render/composite.cl", "GRADIENT_NODES"),
-    ("clrecon.operators.rays.composite.NODES", "render/steep_segments.h", "NODES"),
-    ("clrecon.operators.rays.buffers.HIGHLIGHTS", "include/phong.h", "HIGHLIGHTS"),
-    ("clrecon.operators.rays.project.AIR_HU", "render/project.cl", "AIR_HU"),
-    ("clrecon.operators.rays.ray_view.BOX_ROW", "include/view.h", "VIEW_BOX_LOW"),
-    ("clrecon.operators.rays.ray_view.TILE", "include/view.h", "TILE"),
-    ("clrecon.operators.rays.slabs.BRICK_CELLS", "include/leap.h", "BRICK_CELLS"),
-    ("clrecon.operators.rays.slabs.FARTHEST", "include/leap.h", "FARTHEST"),
-    ("clrecon.operators.rays.leaps.ROWS_AT_ONCE", "render/occupancy.cl", "ROWS_AT_ONCE"),
-    ("clrecon.operators.rays.slices.NODES", "render/slices.cl", "BINS"),
-    ("clrecon.rendering.looks.steepness.DENSE", "render/steep_segments.h", "DENSE"),
-    ("clrecon.rendering.looks.steepness.PARTS", "render/steep_segments.h", "PARTS"),
-    ("clrecon.rendering.looks.steepness.STEEP", "render/steep_segments.h", "STEEP"),
+    ("clrecon.labels.occupancy.REACH", "surface/label_masks.h", "REACH"),
+    ("clrecon.operators.resident.bricks.BRICK", "include/bricks.h", "BRICK"),
+    ("clrecon.operators.primitives.compact.COMPACT_WORDS", "primitives/compact.cl", "COMPACT_WORDS"),
+    ("clrecon.operators.primitives.scan.SCAN_PER_ITEM", "primitives/scan.cl", "SCAN_PER_ITEM"),
+    ("clrecon.operators.rays.composite.GRADIENT_NODES", "rays/composite.cl", "GRADIENT_NODES"),
+    ("clrecon.operators.rays.composite.NODES", "rays/steep_segments.h", "NODES"),
+    ("clrecon.operators.rays.buffers.HIGHLIGHTS", "rays/phong.h", "HIGHLIGHTS"),
+    ("clrecon.operators.rays.project.AIR_HU", "rays/project.cl", "AIR_HU"),
+    ("clrecon.operators.rays.ray_view.BOX_ROW", "rays/view.h", "VIEW_BOX_LOW"),
+    ("clrecon.operators.rays.ray_view.TILE", "rays/view.h", "TILE"),
+    ("clrecon.operators.rays.slabs.BRICK_CELLS", "rays/leap.h", "BRICK_CELLS"),
+    ("clrecon.operators.rays.slabs.FARTHEST", "rays/leap.h", "FARTHEST"),
+    ("clrecon.operators.rays.leaps.ROWS_AT_ONCE", "rays/leaps.cl", "ROWS_AT_ONCE"),
+    ("clrecon.operators.rays.slices.NODES", "rays/slices.cl", "BINS"),
+    ("clrecon.rendering.looks.steepness.DENSE", "rays/steep_segments.h", "DENSE"),
+    ("clrecon.rendering.looks.steepness.PARTS", "rays/steep_segments.h", "PARTS"),
+    ("clrecon.rendering.looks.steepness.STEEP", "rays/steep_segments.h", "STEEP"),
 ]
 """Name in Python, kernel file below cl/, name there."""
 
@@ -55,13 +55,13 @@ def test_python_and_kernel_agree(python: str, file: str, macro: str) -> None:
 
 
 def test_combinations_have_the_numbers_of_the_kernel() -> None:
-    text = (ROOT / "cl/render/reformat.cl").read_text(encoding="utf-8")
+    text = (ROOT / "cl/reformat/sample.cl").read_text(encoding="utf-8")
     numbers = [macro_value(text, f"COMBINE_{name.upper()}") for name in COMBINATIONS]
     assert numbers == list(range(len(COMBINATIONS)))
 
 
 def test_flags_of_strips_are_words_of_the_kernel() -> None:
-    text = (ROOT / "cl/labels/occupancy.cl").read_text(encoding="utf-8")
+    text = (ROOT / "cl/surface/label_masks.cl").read_text(encoding="utf-8")
     assert SAMPLES_PER_FLAGS == 32 * macro_value(text, "STRIP")
 
 
@@ -84,5 +84,5 @@ def test_a_constant_that_drifted_would_be_seen() -> None:
     assert [macro_value(text, name) for name in ("PARTS", "AIR_HU", "STEEP")] == [8, -1000, 0.1]
     with pytest.raises(ValueError, match="not enough values"):
         macro_value(text, "BRICK")
-    assert listed_in('BRICK = 8\n"""Voxels along a side, as in cl/bricks/bricks.h."""\n') == {"BRICK"}
+    assert listed_in('BRICK = 8\n"""Voxels along a side, as in cl/include/bricks.h."""\n') == {"BRICK"}
     assert listed_in('BRICK = 8\n"""Voxels along a side."""\n') == set()

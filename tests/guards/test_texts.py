@@ -139,12 +139,12 @@ def test_generated_files_are_up_to_date() -> None:
 
 @pytest.mark.parametrize("changed", ["mc_tables.h", "trilinear_tables.h"])
 def test_a_changed_generated_file_is_found(tmp_path: Path, changed: str) -> None:
-    for name in ("scripts/derive_mc_tables.py", "cl/include/mc_tables.h", "cl/include/trilinear_tables.h"):
+    for name in ("scripts/derive_mc_tables.py", "cl/surface/mc_tables.h", "cl/surface/trilinear_tables.h"):
         target = tmp_path / name
         target.parent.mkdir(parents=True, exist_ok=True)
         target.write_text((ROOT / name).read_text())
     (tmp_path / "clrecon").symlink_to(ROOT / "clrecon")
     assert run_check(tmp_path).returncode == 0
-    header = tmp_path / "cl" / "include" / changed
+    header = tmp_path / "cl" / "surface" / changed
     header.write_text(header.read_text().replace("0x", "0X", 1))
     assert run_check(tmp_path).returncode == 1

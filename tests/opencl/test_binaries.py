@@ -86,13 +86,13 @@ def test_the_next_process_takes_the_binary(device, monkeypatch):
     monkeypatch.setattr(program, "_build_from_source", lambda *a: sources.append(1) or true_way(*a))
     for _ in range(3):
         monkeypatch.setattr(device, "programs", {})
-        assert load_program(device, "compaction/compact.cl").kernel_names == ["count_set_bits", "list_set_bits"]
+        assert load_program(device, "primitives/compact.cl").kernel_names == ["count_set_bits", "list_set_bits"]
     assert len(sources) == (1 if device.keeps_binaries else 3)
 
 
 def test_binaries_compute_what_sources_do(device, monkeypatch):
     from clrecon.opencl import upload
-    from clrecon.operators.primitives.compaction import compact
+    from clrecon.operators.primitives.compact import compact
 
     mask = np.random.default_rng(0).integers(0, 2**32, 1000, dtype=np.uint32)
     for _ in range(2):
@@ -104,13 +104,13 @@ def test_a_binary_that_the_driver_refuses_is_built_from_source(device, monkeypat
     if not device.keeps_binaries:
         pytest.skip("this driver's own cache is fast")
     options = ()
-    store_binary(program._key(device, read_kernel_source("compaction/compact.cl"), options), b"no program at all")
+    store_binary(program._key(device, read_kernel_source("primitives/compact.cl"), options), b"no program at all")
     monkeypatch.setattr(device, "programs", {})
-    assert load_program(device, "compaction/compact.cl").kernel_names == ["count_set_bits", "list_set_bits"]
+    assert load_program(device, "primitives/compact.cl").kernel_names == ["count_set_bits", "list_set_bits"]
 
 
 def test_a_program_without_kernels_is_an_error(device, monkeypatch):
     monkeypatch.setattr(program.Program, "kernel_names", [])
     monkeypatch.setattr(device, "programs", {})
     with pytest.raises(DeviceError, match="has no kernel"):
-        load_program(device, "compaction/compact.cl")
+        load_program(device, "primitives/compact.cl")

@@ -29,7 +29,7 @@ PASSED_BY_NAME_ALREADY = {"stopwatch"}
 
 
 def scan_program(device):
-    return load_program(device, "compaction/scan.cl", {"SCAN_GROUP": str(device.group_size)})
+    return load_program(device, "primitives/scan.cl", {"SCAN_GROUP": str(device.group_size)})
 
 
 def scan_buffers(device):
@@ -67,7 +67,7 @@ def test_a_wrong_argument_is_an_error_before_the_launch(device, change, message,
 
 def test_numbers_become_what_the_kernel_takes(device):
     """The driver is given four bytes, whatever a number was."""
-    kernel = load_program(device, "labels/occupancy.cl")["sum_volumes"]
+    kernel = load_program(device, "surface/label_masks.cl")["sum_volumes"]
     buffers = {name: allocate(device, 4) for name in ("positions", "triangles", "sums")}
     ordered = kernel.order({**buffers, "centre": [1, 2.5, 3, 0], "triangle_count": 7, "triangles_per_sum": np.int64(9)})
     assert ordered[3].dtype == np.float32

@@ -17,7 +17,7 @@ from clrecon.opencl import (
 
 def test_every_theme_is_found():
     names = kernel_files()
-    assert {name.split("/")[0] for name in names} >= {"compaction", "isosurface"}
+    assert {name.split("/")[0] for name in names} == {"primitives", "resident", "surface", "rays", "reformat"}
     assert all(name.endswith(".cl") for name in names)
 
 
@@ -31,7 +31,7 @@ def test_includes_are_inlined_once_with_line_marks(name):
 
 
 def test_line_marks_point_to_the_true_line():
-    name = "isosurface/marching_cubes.cl"
+    name = "surface/marching_cubes.cl"
     true = sources.kernel_root().joinpath(name).read_text().splitlines()
     file, line, seen = "", 0, 0
     for text in read_kernel_source(name).splitlines():
@@ -55,7 +55,7 @@ def test_every_file_builds_alone(name, device):
 
 @pytest.mark.parametrize("voxel", ["char", "uchar", "short", "ushort", "int", "float"])
 def test_every_voxel_type_builds(voxel, device):
-    program = load_program(device, "isosurface/marching_cubes.cl", {"VOXEL": voxel})
+    program = load_program(device, "surface/marching_cubes.cl", {"VOXEL": voxel})
     assert "emit_vertices" in program.kernel_names
 
 

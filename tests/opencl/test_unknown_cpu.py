@@ -155,6 +155,6 @@ def test_programs_get_what_tells_caches_apart(device, monkeypatch):
     seen = []
     monkeypatch.setattr(program, "_build", lambda device, name, options: seen.append(options))
     fresh = SimpleNamespace(build_options=("-DCPU_NAME=haswell",), lock=device.lock, programs={})
-    load_program(fresh, "compaction/compact.cl", {"B": "2", "A": "1"})
+    load_program(fresh, "primitives/compact.cl", {"B": "2", "A": "1"})
     assert seen == [("-DCPU_NAME=haswell", "-DA=1", "-DB=2")]
     assert bool(device.build_options) == has_unknown_cpu(device.platform, device.version)

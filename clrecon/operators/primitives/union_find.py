@@ -1,4 +1,4 @@
-"""Connected components of a triangle mesh: the host side of cl/components/union_find.cl."""
+"""Connected components of a triangle mesh: the host side of cl/primitives/union_find.cl."""
 
 from __future__ import annotations
 
@@ -20,7 +20,8 @@ from clrecon.opencl import (
     memory_limits,
     upload,
 )
-from clrecon.operators.primitives.compaction import LARGEST_SCAN, Compacted, compact, exclusive_scan, prepare_scan
+from clrecon.operators.primitives.compact import Compacted, compact, prepare_compact
+from clrecon.operators.primitives.scan import LARGEST_SCAN, exclusive_scan
 
 __all__ = ["label_components", "prepare_components"]
 
@@ -39,9 +40,8 @@ def prepare_components(device: Device) -> Program:
     DeviceError
         The driver's compiler refuses.
     """
-    prepare_scan(device)
-    load_program(device, "compaction/compact.cl")
-    return load_program(device, "components/union_find.cl")
+    prepare_compact(device)
+    return load_program(device, "primitives/union_find.cl")
 
 
 def label_components(
@@ -109,7 +109,7 @@ def _check_mesh(triangles: NDArray[np.uint32], vertex_count: int) -> None:
 
 
 class _Search:
-    """The rounds of cl/components/union_find.cl: two buffers of labels, one read and one written, and flags."""
+    """The rounds of cl/primitives/union_find.cl: two buffers of labels, one read and one written, and flags."""
 
     def __init__(
         self,

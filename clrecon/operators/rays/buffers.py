@@ -16,7 +16,7 @@ from clrecon.rendering.looks.colors import find_color
 __all__ = ["HIGHLIGHTS", "PictureBuffers", "count_queues", "highlight_table"]
 
 HIGHLIGHTS = 1024
-"""Entries of the table of highlights, as in cl/include/phong.h."""
+"""Entries of the table of highlights, as in cl/rays/phong.h."""
 
 
 def highlight_table(lighting: Lighting) -> NDArray[np.float32]:

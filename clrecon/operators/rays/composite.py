@@ -1,4 +1,4 @@
-"""Volume rendering through a transfer function: the host's side of cl/render/composite.cl."""
+"""Volume rendering through a transfer function: the host's side of cl/rays/composite.cl."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from clrecon.rendering.views.camera import Camera
 __all__ = ["NODES", "TransferTables", "composite_slab"]
 
 NODES = 4096
-"""Entries of a transfer function's table, as in cl/render/steep_segments.h."""
+"""Entries of a transfer function's table, as in cl/rays/steep_segments.h."""
 
 GRADIENT_NODES = 256
 """Entries of its table of factors by magnitude of the gradient."""
@@ -222,7 +222,7 @@ def composite_slab(
             "labels": slab_labels(resident, slab, labels, stopwatch),
             "label_colors": upload(device, style.table),
         }
-    program = resident.program("render/composite.cl", **variants)
+    program = resident.program("rays/composite.cl", **variants)
     lanes = int(device.kernel_variants["LANES"])
     queues = count_queues(device)
     last = np.array([n - 1 for n in resident.volume.shape_ijk] + [0], dtype=np.float32)
@@ -255,7 +255,7 @@ def _enter_tiles(
     margin = math.ceil(min((resident.stack.index_steps(view.spread) / slab.brick_cells).max(), FARTHEST))
     entries_d = allocate(device, 4 * output.tiles)
     launch(
-        device, resident.program("render/tiles.cl")["enter_tiles"], -(-output.tiles // lanes), stopwatch=stopwatch,
+        device, resident.program("rays/tiles.cl")["enter_tiles"], -(-output.tiles // lanes), stopwatch=stopwatch,
         leaps=leaps.distances_d, view=upload(device, view.widened()), entries=entries_d, slope=resident.stack.slope,
         first_k=slab.first_k, margin=margin, width=width, height=height, perspective=not camera.is_parallel,
         **slab.brick_arguments, **resident.stack.arguments,
@@ -269,7 +269,7 @@ def _look_ahead(resident: DeviceVolume, slab: RaySlab, way: MainWay, leaps: Leap
     count = math.prod(bricks)
     ways_d = allocate(resident.device, count)
     launch(
-        resident.device, resident.program("render/occupancy.cl")["look_ahead"], count // bricks[way.axis],
+        resident.device, resident.program("rays/leaps.cl")["look_ahead"], count // bricks[way.axis],
         stopwatch=stopwatch, distances=leaps.distances_d, ways=ways_d, bi=bi, bj=bj, bk=bk, **way.arguments,
     )  # fmt: skip
     return ways_d

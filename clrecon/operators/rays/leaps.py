@@ -18,7 +18,7 @@ from clrecon.operators.resident.frame import BOX_BORDER, enclose
 __all__ = ["find_leaps", "measure_cells"]
 
 ROWS_AT_ONCE = 4
-"""Rows of bricks that a work-item takes, as in cl/render/occupancy.cl."""
+"""Rows of bricks that a work-item takes, as in cl/rays/leaps.cl."""
 
 
 def measure_cells(resident: DeviceVolume, slab: RaySlab, stopwatch: Stopwatch) -> Any:
@@ -27,7 +27,7 @@ def measure_cells(resident: DeviceVolume, slab: RaySlab, stopwatch: Stopwatch) -
         bricks, (ni, nj, nk) = math.prod(slab.bricks), slab.shape_ijk
         slab.ranges_d = allocate(resident.device, 2 * bricks * resident.dtype.itemsize)
         launch(
-            resident.device, resident.program("render/occupancy.cl")["measure_cells"], bricks, stopwatch=stopwatch,
+            resident.device, resident.program("rays/leaps.cl")["measure_cells"], bricks, stopwatch=stopwatch,
             voxels=slab.voxels_d, ranges=slab.ranges_d, ni=ni, nj=nj, nk=nk, **slab.brick_arguments,
         )  # fmt: skip
     return slab.ranges_d
@@ -57,7 +57,7 @@ def find_leaps(
     if known is not None:
         return known
     ranges_d = measure_cells(resident, slab, stopwatch)
-    device, program = resident.device, resident.program("render/occupancy.cl")
+    device, program = resident.device, resident.program("rays/leaps.cl")
     bi, bj, bk = slab.bricks
     bricks = bi * bj * bk
     counts_d = upload(device, np.concatenate([[0], np.cumsum(shown)]).astype(np.int32))

@@ -1,4 +1,4 @@
-"""Projections of a volume along rays: the host's side of cl/render/project.cl."""
+"""Projections of a volume along rays: the host's side of cl/rays/project.cl."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from clrecon.operators.resident.device_volume import DeviceVolume
 __all__ = ["AIR_HU", "PROJECTIONS", "project_slab"]
 
 AIR_HU = -1000.0
-"""Attenuates nothing, as in cl/render/project.cl: lower values are padding, or what a mask left."""
+"""Attenuates nothing, as in cl/rays/project.cl: lower values are padding, or what a mask left."""
 
 PROJECTIONS = {"mip": 0, "minip": 1, "mean": 2, "drr": 3}
 """What the kernel calls them."""
@@ -39,7 +39,7 @@ def project_slab(
     queues, lanes = count_queues(device), int(device.kernel_variants["LANES"])
     last = np.array([n - 1 for n in resident.volume.shape_ijk] + [0], dtype=np.float32)
     launch(
-        device, resident.program("render/project.cl", **variants)["project_rays"], output.items(queues, lanes),
+        device, resident.program("rays/project.cl", **variants)["project_rays"], output.items(queues, lanes),
         stopwatch=stopwatch, ranges=measure_cells(resident, slab, stopwatch), view=upload(device, view.table),
         states=output.states_d, depths=output.depths_d, values=output.means_d, last_place=last,
         which=PROJECTIONS[mode], queues=queues, **slab.arguments, **view.arguments, **resident.stack.arguments,

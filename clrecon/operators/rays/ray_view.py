@@ -1,4 +1,4 @@
-"""The table of a picture's rays for the kernels, see cl/include/view.h."""
+"""The table of a picture's rays for the kernels, see cl/rays/view.h."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from clrecon.rendering.views.camera import Camera, box_corners
 __all__ = ["TILE", "RayView"]
 
 TILE = 8
-"""Pixels along each side of a tile, as in cl/include/view.h."""
+"""Pixels along each side of a tile, as in cl/rays/view.h."""
 
 BOX_ROW = 9
 """Row of the box in the table; its upper end and both of the focus follow."""

@@ -32,10 +32,10 @@ __all__ = [
 ]
 
 BRICK_CELLS = 4
-"""Cells of a brick along i and j, as in cl/include/leap.h."""
+"""Cells of a brick along i and j, as in cl/rays/leap.h."""
 
 FARTHEST = 15
-"""Bricks that a leap goes at most, as in cl/include/leap.h: with that as its margin none is left."""
+"""Bricks that a leap goes at most, as in cl/rays/leap.h: with that as its margin none is left."""
 
 
 def choose_brick_cells(volume: Volume) -> tuple[int, int, int]:

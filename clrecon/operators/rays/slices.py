@@ -1,4 +1,4 @@
-"""Slices of a volume drawn in space where they lie: the host's side of cl/render/slices.cl."""
+"""Slices of a volume drawn in space where they lie: the host's side of cl/rays/slices.cl."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ DEFAULT_WINDOW = (-300.0, 400.0)
 """HU that are black and white, where neither a window nor a transfer function is given: soft tissue and bone."""
 
 NODES = 4096
-"""Entries of the table of colours, as in cl/render/slices.cl."""
+"""Entries of the table of colours, as in cl/rays/slices.cl."""
 
 SLICES = "slices in space"
 """What parts are planned for."""
@@ -280,7 +280,7 @@ class _Overlay:
             slices_d, places[:, 3] = resident.upload(volume.voxels[list(part)], stopwatch), range(len(part))
         ni, nj, _ = volume.shape_ijk
         queues = count_queues(device)
-        program = load_program(device, "render/slices.cl", voxel_variants(volume.voxels.dtype))
+        program = load_program(device, "rays/slices.cl", voxel_variants(volume.voxels.dtype))
         with stopwatch.running(device):  # to its end: CPU devices read the array of the host
             launch(
                 device, program["overlay_slices"], output.items(queues, 1), stopwatch=stopwatch,

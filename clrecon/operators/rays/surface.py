@@ -1,4 +1,4 @@
-"""Pictures of an iso surface without a mesh: the host's side of cl/render/surface.cl."""
+"""Pictures of an iso surface without a mesh: the host's side of cl/rays/surface.cl."""
 
 from __future__ import annotations
 
@@ -204,7 +204,7 @@ class _Job:
             leaps = _find_leaps(resident, slab, rule.iso_level, self.stopwatch)
             view = self._view(leaps)
             launch(
-                device, resident.program("render/surface.cl", **variants)["trace_surface"], output.items(queues, lanes),
+                device, resident.program("rays/surface.cl", **variants)["trace_surface"], output.items(queues, lanes),
                 stopwatch=self.stopwatch, leaps=leaps.distances_d, view=upload(device, view.table),
                 highlights=upload(device, highlight_table(look.lighting)), last_place=_float4(*last),
                 slope=resident.stack.slope, level=rule.iso_level, outside=rule.outside, color=_float4(*look.color),

@@ -1,4 +1,4 @@
-"""Values of the pixels of a sheet: the host side of cl/render/reformat.cl."""
+"""Values of the pixels of a sheet: the host side of cl/reformat/sample.cl."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from clrecon.system.progress import Progress
 __all__ = ["COMBINATIONS", "Reformation", "prepare_reformat", "sample_sheet"]
 
 COMBINATIONS = ("mean", "max", "min")
-"""How the samples of a slab are combined, by their numbers in cl/render/reformat.cl."""
+"""How the samples of a slab are combined, by their numbers in cl/reformat/sample.cl."""
 
 SAMPLES_A_LAUNCH = 1 << 23
 """Keeps launches short: systems stop those that hold a display's GPU for seconds."""
@@ -72,7 +72,7 @@ def prepare_reformat(device: Device, dtype: DTypeLike = np.int16, uneven: bool =
     DeviceError
         The driver's compiler refuses.
     """
-    return load_program(device, "render/reformat.cl", {**voxel_variants(dtype), "UNEVEN": str(int(uneven))})
+    return load_program(device, "reformat/sample.cl", {**voxel_variants(dtype), "UNEVEN": str(int(uneven))})
 
 
 @dataclass(frozen=True)

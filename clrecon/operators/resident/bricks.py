@@ -21,7 +21,7 @@ from clrecon.operators.resident.voxel_types import voxel_variants
 __all__ = ["BRICK", "BrickRanges", "BrickStates", "brick_bytes", "compare_bricks", "measure_bricks", "prepare_bricks"]
 
 BRICK = 8
-"""Voxels along each side of a brick, as in cl/bricks/bricks.h."""
+"""Voxels along each side of a brick, as in cl/include/bricks.h."""
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ def brick_bytes(shape_ijk: tuple[int, int, int], dtype: np.dtype[Any]) -> int:
 
 def prepare_bricks(device: Device, dtype: np.dtype[Any]) -> Program:
     """Build the kernels for volumes of `dtype`."""
-    return load_program(device, "bricks/ranges.cl", voxel_variants(dtype))
+    return load_program(device, "resident/bricks.cl", voxel_variants(dtype))
 
 
 def measure_bricks(

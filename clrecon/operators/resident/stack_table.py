@@ -1,4 +1,4 @@
-"""The table of slices at places of their own for the kernels, see cl/include/stack.h."""
+"""The table of slices at places of their own for the kernels, see cl/rays/stack.h."""
 
 from __future__ import annotations
 

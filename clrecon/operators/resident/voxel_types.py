@@ -23,7 +23,7 @@ def voxel_variants(dtype: DTypeLike) -> dict[str, str]:
 
 
 def label_variants(dtype: DTypeLike) -> dict[str, str]:
-    """``-D`` definition of LABEL, see cl/labels/label_type.h."""
+    """``-D`` definition of LABEL, see cl/include/label_type.h."""
     return {"LABEL": _NAMES[np.dtype(dtype).name]}
 
 

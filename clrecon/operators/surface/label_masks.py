@@ -1,6 +1,6 @@
 """Extract labels' own surfaces: the mask says what is inside, its smoothed occupancy places the vertices.
 
-The host side of cl/labels/occupancy.cl; counting and writing are those of cl/isosurface/marching_cubes.cl.
+The host side of cl/surface/label_masks.cl; counting and writing are those of cl/surface/marching_cubes.cl.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ SPARE_SLICES = 3 + REACH
 
 TRIANGLES_PER_SUM = 256
 SAMPLES_PER_FLAGS = 32 * 16
-"""Of a row: 32 strips of 16 samples, as cl/labels/occupancy.cl."""
+"""Of a row: 32 strips of 16 samples, as cl/surface/label_masks.cl."""
 
 
 def prepare_label_masks(device: Device, label_dtype: DTypeLike = np.uint8) -> tuple[Program, Program]:
@@ -64,7 +64,9 @@ def prepare_label_masks(device: Device, label_dtype: DTypeLike = np.uint8) -> tu
     DeviceError
         The driver's compiler refuses.
     """
-    own = load_program(device, "labels/occupancy.cl", {"VOXEL": "short", "VALUE": "int", **label_variants(label_dtype)})
+    own = load_program(
+        device, "surface/label_masks.cl", {"VOXEL": "short", "VALUE": "int", **label_variants(label_dtype)}
+    )
     return own, marching_cubes.prepare_marching_cubes(device, np.int16, label_dtype, masks=True)
 
 

@@ -1,6 +1,6 @@
 """Survey a label map: where each label lies, and how many of its voxels' faces it shares with others.
 
-The host side of cl/labels/survey.cl; without room on the device for the whole map, numpy does it here.
+The host side of cl/surface/label_survey.cl; without room on the device for the whole map, numpy does it here.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ def prepare_survey(device: Device, label_dtype: DTypeLike = np.uint8) -> Program
     DeviceError
         The driver's compiler refuses.
     """
-    return load_program(device, "labels/survey.cl", label_variants(label_dtype))
+    return load_program(device, "surface/label_survey.cl", label_variants(label_dtype))
 
 
 def survey_labels(

@@ -1,6 +1,6 @@
 """Extract the surfaces of labels: the label picks the cells, HU place the vertices.
 
-The host side of cl/labels/own_samples.cl; counting and writing are those of cl/isosurface/marching_cubes.cl.
+The host side of cl/surface/labels.cl; counting and writing are those of cl/surface/marching_cubes.cl.
 """
 
 from __future__ import annotations
@@ -83,7 +83,7 @@ def prepare_labels(
         The driver's compiler refuses.
     """
     variants = {**voxel_variants(dtype), **label_variants(label_dtype)}
-    own = load_program(device, "labels/own_samples.cl", variants)
+    own = load_program(device, "surface/labels.cl", variants)
     return own, marching_cubes.prepare_marching_cubes(device, dtype, label_dtype, uneven)
 
 

@@ -1,4 +1,4 @@
-"""The passes of cl/isosurface/marching_cubes.cl on one slab of a volume."""
+"""The passes of cl/surface/marching_cubes.cl on one slab of a volume."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from clrecon.opencl import (
     load_program,
     upload,
 )
-from clrecon.operators.primitives.compaction import exclusive_scan, prepare_scan
+from clrecon.operators.primitives.scan import exclusive_scan, prepare_scan
 from clrecon.operators.resident.bricks import BrickStates
 from clrecon.operators.resident.voxel_types import label_variants, voxel_variants
 from clrecon.operators.surface.slabs import Slab
@@ -115,13 +115,13 @@ def prepare_marching_cubes(
         variants.update({"MASKS" if masks else "LABELS": "1"}, **label_variants(labels))
     if uneven:
         variants["UNEVEN"] = "1"
-    return load_program(device, "isosurface/marching_cubes.cl", variants)
+    return load_program(device, "surface/marching_cubes.cl", variants)
 
 
 def _load_classify(device: Device, dtype: DTypeLike, inside: str = "above") -> Program:
     own = {"above": {}, "below": {"BORDER_INSIDE": "1"}, "between": {"RANGE": "1"}}[inside]
     variants = {**voxel_variants(dtype), **device.kernel_variants, **own}
-    return load_program(device, "isosurface/classify.cl", variants)
+    return load_program(device, "surface/classify.cl", variants)
 
 
 def _pad4(rows: NDArray[np.float64]) -> NDArray[np.float32]:

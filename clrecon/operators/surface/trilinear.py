@@ -1,4 +1,4 @@
-"""The passes of cl/isosurface/trilinear.cl on one slab: ambiguous cells resolved as the trilinear field has them."""
+"""The passes of cl/surface/trilinear.cl on one slab: ambiguous cells resolved as the trilinear field has them."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from clrecon.opencl import (
     launch,
     load_program,
 )
-from clrecon.operators.primitives.compaction import exclusive_scan
+from clrecon.operators.primitives.scan import exclusive_scan
 from clrecon.operators.resident.voxel_types import voxel_variants
 from clrecon.operators.surface.slabs import Slab
 
@@ -44,7 +44,7 @@ def prepare_trilinear(device: Device, dtype: DTypeLike) -> Program:
     DeviceError
         The driver's compiler refuses.
     """
-    return load_program(device, "isosurface/trilinear.cl", voxel_variants(dtype))
+    return load_program(device, "surface/trilinear.cl", voxel_variants(dtype))
 
 
 def check_row(volume: Volume) -> None:

@@ -173,7 +173,7 @@ def voxel_gradients(voxels: NDArray, matrices: Float64Array) -> Float64Array:
 
 
 def hash_pixels(x: NDArray[np.integer], y: NDArray[np.integer]) -> NDArray[np.uint32]:
-    """A 32-bit hash of pixels; `hash_pixel` in cl/include/jitter.h gives the same bits.
+    """A 32-bit hash of pixels; `hash_pixel` in cl/rays/jitter.h gives the same bits.
 
     The mixer is lowbias32 (C. Wellons 2018, "Prospecting for hash functions"), once over y and once over x with that.
     """

@@ -1,4 +1,4 @@
-"""Twin of the cell decisions of cl/isosurface/trilinear.cl: what the trilinear field does inside one cell.
+"""Twin of the cell decisions of cl/surface/trilinear.cl: what the trilinear field does inside one cell.
 
 Everything is decided in whole numbers, so that every device and the two cells of a face come to the same answer.
 The heights of the corners above the iso level, rounded to float32 once, are scaled by a power of two to whole

@@ -15,7 +15,7 @@ SHAPE = (40, 10, 20)
 
 GREY = TransferFunction([(0, 0.5, 0.5, 0.5, 0.1), (200, 0.5, 0.5, 0.5, 0.1)], unit_distance=2.0)
 LABEL_TINT = 0.8
-"""Share of a label's colour, as in cl/include/label_color.h."""
+"""Share of a label's colour, as in cl/rays/label_color.h."""
 
 
 def block() -> tuple[Volume, LabelMap]:

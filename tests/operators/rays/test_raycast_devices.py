@@ -182,7 +182,7 @@ def test_jitter_has_the_same_bits_on_devices(device):
 
     width, height = 37, 19
     source = (
-        read_kernel_source("include/jitter.h")
+        read_kernel_source("rays/jitter.h")
         + """
     __kernel void jitter_all(__global uint *hashes, __global float *parts, const uint width) {
         const uint x = get_global_id(0), y = get_global_id(1);

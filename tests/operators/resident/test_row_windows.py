@@ -1,4 +1,4 @@
-"""Rows of voxels seen through a window (cl/include/window.h): pictures as with single loads, and no voxel more read."""
+"""Rows of voxels seen through a window (cl/rays/window.h): pictures as with single loads, and no voxel more read."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def noise_volume(shape: tuple[int, int, int]) -> Volume:
 def build_checks(device):
     import pyopencl
 
-    source = read_kernel_source("include/window.h") + CHECKS
+    source = read_kernel_source("rays/window.h") + CHECKS
     return pyopencl.Program(device.context, source).build(["-DLANES=8", "-DVOXEL_IS_SHORT=1"])
 
 

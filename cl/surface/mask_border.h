@@ -1,0 +1,93 @@
+/* Vertices of a label's own surface: where the occupancy of its mask, and of its neighbours', puts them (-D MASKS).
+ *
+ * A sample is inside of the label whose number it carries, so each crossed edge has one end in the label:
+ *
+ *   other end            the vertex lies where
+ *   without a label      the label's occupancy crosses its level; where other labels lie alongside, that of all labels
+ *   another label        both labels lead by as much, with the bias of each: the same point for both
+ *   beyond the map       half way: the map ends at the faces of its voxels
+ *
+ * Ends on the wrong side of the level count as just on their own side, so that a vertex stays on its edge. */
+#ifndef CLRECON_MASK_BORDER_H
+#define CLRECON_MASK_BORDER_H
+
+#include "include/label_type.h"
+#include "include/volume.h"
+#include "surface/label_masks.h"
+#include "surface/vertex_group.h"
+
+typedef struct {
+    __global const LABEL *map; /* slices as those of `occupied` */
+    volume_part occupied; /* occupancy of all labels together */
+    uint label;
+    int level;
+    __global const int *biases; /* by label: by how much it comes before others, in units of the occupancy */
+} mask_part;
+
+/* Index `at` of an axis of n samples, held within it; drivers call clamp() as a function. */
+static inline int hold_within(int at, int n)
+{
+    return at < 0 ? 0 : at >= n ? n - 1 : at;
+}
+
+/* By how much label `own`, that of sample (i, j, k), leads before `other` there, in units of the occupancy; 1 at least. */
+static inline int find_lead(const mask_part *masks, int i, int j, int k, uint own, uint other)
+{
+    const int ni = masks->occupied.ni, nj = masks->occupied.nj, nk = masks->occupied.nk;
+    const int before_2 = hold_within(i - 2, ni), before_1 = hold_within(i - 1, ni);
+    const int after_1 = hold_within(i + 1, ni), after_2 = hold_within(i + 2, ni);
+    int lead = 0;
+    for (int dk = -REACH; dk <= REACH; ++dk) {
+        const int k1 = hold_within(k + dk, nk) - masks->occupied.first_k;
+        for (int dj = -REACH; dj <= REACH; ++dj) {
+            __global const LABEL *row = masks->map + voxel_index(0, hold_within(j + dj, nj), k1, ni, nj);
+#define SIDE(at) ((row[at] == own) - (row[at] == other))
+            lead += weigh(dk) * weigh(dj)
+                * (SIDE(before_2) + SIDE(after_2) + 4 * (SIDE(before_1) + SIDE(after_1)) + 6 * SIDE(i));
+#undef SIDE
+        }
+    }
+    return lead > 0 ? FINENESS * lead : 1;
+}
+
+/* Give lane n of a gathered group, which holds the label's occupancy, the values and gradients that place its vertex. */
+static inline void gather_mask_border(
+    vertex_group *group, uint n, const mask_part *masks, int i, int j, int k, int axis, int inner)
+{
+    const volume_part *all = &masks->occupied;
+    const int i1 = i + (axis == 0), j1 = j + (axis == 1), k1 = k + (axis == 2), level = masks->level;
+    const int enters = i < 0 || j < 0 || k < 0, leaves = i1 >= all->ni || j1 >= all->nj || k1 >= all->nk;
+    if (enters || leaves) {
+        group->value[n] = level + (enters ? -1 : 1);
+        group->next_value[n] = level + (enters ? 1 : -1);
+        group->gradient_i[n] = group->gradient_j[n] = group->gradient_k[n] = 0;
+        group->next_gradient_i[n] = group->next_gradient_j[n] = group->next_gradient_k[n] = 0;
+        return;
+    }
+    const uint here = masks->map[voxel_index(i, j, k - all->first_k, all->ni, all->nj)];
+    const uint there = masks->map[voxel_index(i1, j1, k1 - all->first_k, all->ni, all->nj)];
+    const int begins = here == masks->label; /* the label is at the near end of the edge */
+    if (here != 0 && there != 0) {
+        const int before = masks->biases[here] - masks->biases[there];
+        const int lead = max(find_lead(masks, i, j, k, here, there) + before, 1);
+        const int next_lead = max(find_lead(masks, i1, j1, k1, there, here) - before, 1);
+        group->value[n] = level + (begins ? lead : -lead);
+        group->next_value[n] = level + (begins ? -next_lead : next_lead);
+        return;
+    }
+    const int others = all->voxels[voxel_index(i, j, k - all->first_k, all->ni, all->nj)] - group->value[n];
+    const int next_others
+        = all->voxels[voxel_index(i1, j1, k1 - all->first_k, all->ni, all->nj)] - group->next_value[n];
+    /* Others that are denser at the label's end lie alongside; across a gap they are denser at the far end. */
+    if ((others | next_others) != 0 && (begins ? others >= next_others : next_others >= others))
+        gather_vertex(group, n, all, i, j, k, axis, inner);
+    if (begins) {
+        group->value[n] = max(group->value[n], level + 1);
+        group->next_value[n] = min(group->next_value[n], level - 1);
+    } else {
+        group->value[n] = min(group->value[n], level - 1);
+        group->next_value[n] = max(group->next_value[n], level + 1);
+    }
+}
+
+#endif

@@ -1,0 +1,85 @@
+"""Exclusive scan, the sums of all counts before each: the host's side of cl/primitives/scan.cl."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from clrecon.errors import UsageError
+from clrecon.opencl import Device, Program, Stopwatch, allocate, download, launch, load_program
+
+__all__ = ["LARGEST_SCAN", "Scanned", "exclusive_scan", "prepare_scan"]
+
+SCAN_PER_ITEM = 16
+"""Elements a work-item of cl/primitives/scan.cl."""
+
+LARGEST_SCAN = 2**31
+
+
+@dataclass(frozen=True)
+class Scanned:
+    """Offsets on the device, (n,) uint32, and the exact total.  Offsets are modulo 2^32: check the total.
+
+    ``total_d`` is the total on the device, (1,) uint64.
+    """
+
+    offsets_d: Any
+    total_d: Any
+    total: int
+
+
+def prepare_scan(device: Device) -> None:
+    """Build the kernels of `exclusive_scan`."""
+    _load_scan(device)
+
+
+def _load_scan(device: Device) -> Program:
+    return load_program(device, "primitives/scan.cl", {"SCAN_GROUP": str(device.group_size)})
+
+
+def exclusive_scan(
+    device: Device, counts_d: Any, n: int, *, in_place: bool = False, stopwatch: Stopwatch | None = None
+) -> Scanned:
+    """Sum of all counts before each element.
+
+    Parameters
+    ----------
+    device : Device
+    counts_d : buffer, (n,) uint32
+    n : int
+        Elements, at least 1.
+    in_place : bool
+        The offsets take the place of the counts: no memory of their own.
+    stopwatch : Stopwatch, optional
+
+    Returns
+    -------
+    Scanned
+
+    Raises
+    ------
+    UsageError
+        `n` is out of range.
+    DeviceError
+        The device fails.
+    """
+    if not 1 <= n <= LARGEST_SCAN:
+        raise UsageError(f"{n:,} elements: a scan takes 1 to {LARGEST_SCAN:,}")
+    scan = _load_scan(device)
+    blocks = -(-n // (SCAN_PER_ITEM * device.group_size))
+    sums_d, block_offsets_d, total_d = (allocate(device, 4 * blocks), allocate(device, 4 * blocks), allocate(device, 8))
+    offsets_d = counts_d if in_place else allocate(device, 4 * n)
+    items = blocks * device.group_size
+    launch(device, scan["sum_blocks"], items, stopwatch=stopwatch, counts=counts_d, block_sums=sums_d, n=n)
+    launch(
+        device, scan["scan_block_sums"], device.group_size, stopwatch=stopwatch,
+        block_sums=sums_d, block_offsets=block_offsets_d, total=total_d, blocks=blocks,
+    )  # fmt: skip
+    launch(
+        device, scan["scan_blocks"], items, stopwatch=stopwatch,
+        counts=counts_d, block_offsets=block_offsets_d, offsets=offsets_d, n=n,
+    )  # fmt: skip
+    total = download(device, np.empty(1, dtype=np.uint64), total_d)
+    return Scanned(offsets_d, total_d, int(total[0]))

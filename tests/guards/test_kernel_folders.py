@@ -1,0 +1,83 @@
+"""cl/ mirrors clrecon/operators/: the kernels of operators/ROOM/NAME.py are in cl/ROOM/NAME.cl."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+from house import PACKAGE, ROOT
+
+from clrecon.opencl import kernel_files
+
+KERNELS = ROOT / "cl"
+OPERATORS = PACKAGE / "operators"
+
+LAUNCHED_BY = {"surface/classify.cl": "surface/marching_cubes.py", "rays/tiles.cl": "rays/composite.py"}
+"""Kernel files without an operator of their own: they have other variants, or fewer, than the rest of the operator."""
+
+_INCLUDE = re.compile(r'(?m)^\s*#\s*include\s+"([^"]+)"')
+
+
+def find_strays(kernels: list[str], operators: set[str]) -> list[str]:
+    """Kernel files that no operator of the same folder and name has."""
+    return [name for name in kernels if LAUNCHED_BY.get(name, name.replace(".cl", ".py")) not in operators]
+
+
+def find_themes(root: Path) -> dict[str, set[str]]:
+    """For each header the folders whose kernel files need it, over other headers too."""
+    themes: dict[str, set[str]] = {}
+
+    def follow(name: str, theme: str, seen: set[str]) -> None:
+        for header in _INCLUDE.findall((root / name).read_text(encoding="utf-8")):
+            if header not in seen:
+                seen.add(header)
+                themes.setdefault(header, set()).add(theme)
+                follow(header, theme, seen)
+
+    for path in root.rglob("*.cl"):
+        follow(path.relative_to(root).as_posix(), path.parent.name, set())
+    return themes
+
+
+def find_misplaced(themes: dict[str, set[str]]) -> dict[str, set[str]]:
+    """Headers of one folder that lie elsewhere, and shared ones that are not in include/."""
+    return {
+        header: folders
+        for header, folders in themes.items()
+        if header.split("/")[0] != (next(iter(folders)) if len(folders) == 1 else "include")
+    }
+
+
+def test_folders_are_those_of_the_operators() -> None:
+    folders = {path.name for path in KERNELS.iterdir() if path.is_dir() and any(path.iterdir())}
+    rooms = {path.name for path in OPERATORS.iterdir() if (path / "__init__.py").is_file()}
+    assert folders - {"include", "__pycache__"} == rooms
+
+
+def test_kernel_files_are_named_as_their_operators() -> None:
+    operators = {path.relative_to(OPERATORS).as_posix() for path in OPERATORS.rglob("*.py")}
+    assert len(kernel_files()) > 10
+    assert find_strays(kernel_files(), operators) == []
+    assert set(LAUNCHED_BY) <= set(kernel_files())
+    for kernel, operator in LAUNCHED_BY.items():
+        assert f'"{kernel}"' in (OPERATORS / operator).read_text(encoding="utf-8")
+
+
+def test_headers_lie_with_those_that_need_them() -> None:
+    themes = find_themes(KERNELS)
+    assert themes.keys() == {path.relative_to(KERNELS).as_posix() for path in KERNELS.rglob("*.h")}
+    assert find_misplaced(themes) == {}
+
+
+def test_these_guards_see_what_is_in_the_wrong_place(tmp_path: Path) -> None:
+    assert find_strays(["rays/cast.cl", "rays/composite.cl"], {"rays/composite.py"}) == ["rays/cast.cl"]
+    for name, text in (
+        ("rays/a.cl", '#include "rays/near.h"\n#include "include/lone.h"\n'),
+        ("surface/b.cl", '#include "rays/near.h"\n'),
+        ("rays/near.h", '#include "include/far.h"\n'),
+        ("include/lone.h", ""),
+        ("include/far.h", ""),
+    ):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text(text)
+    assert find_misplaced(find_themes(tmp_path)) == {"rays/near.h": {"rays", "surface"}, "include/lone.h": {"rays"}}
