@@ -21,6 +21,7 @@ from clrecon.anatomy.dense_pieces import BONE_KEPT, DensePieces, find_dense_piec
 from clrecon.errors import RefusedInputError, UsageError
 from clrecon.geometry.certificate import amend
 from clrecon.geometry.volume import AIR_HU, Volume
+from clrecon.system.progress import Progress, ignore_progress
 
 __all__ = ["find_body", "find_unmeasured", "mask_field_of_view", "remove_table"]
 
@@ -48,7 +49,7 @@ MARGIN_MM = 3.0
 AIR_RANGE_HU = (-1100.0, -900.0)
 
 
-def remove_table(volume: Volume, *, allow_bone_loss: bool = False) -> Volume:
+def remove_table(volume: Volume, *, allow_bone_loss: bool = False, progress: Progress | None = None) -> Volume:
     """Turn everything outside of the patient's body into air: table, blankets, cables.
 
     Bone and all else within the body keep their values; so does a margin of 3 mm around it.  Dry specimens are kept
@@ -61,6 +62,8 @@ def remove_table(volume: Volume, *, allow_bone_loss: bool = False) -> Volume:
         A scan in HU.
     allow_bone_loss : bool
         Go on where less than 98 % of the bone stays; the gate ``bone_kept`` has failed then.
+    progress : callable, optional
+        Called as ``progress("mask", slices done, all slices)``.
 
     Returns
     -------
@@ -74,7 +77,10 @@ def remove_table(volume: Volume, *, allow_bone_loss: bool = False) -> Volume:
     RefusedInputError
         There is nothing thick and dense enough to be a body, and no bone; or the gate fails.
     """
+    progress = progress or ignore_progress
+    progress("mask", 0, len(volume.voxels))
     cells = measure_cells(volume)
+    progress("mask", 0, len(volume.voxels))
     body, pieces = _find_body(cells)
     bone, gate = judge_bone(cells, pieces, body)
     if gate["ok"] is False and not allow_bone_loss:
@@ -89,12 +95,13 @@ def remove_table(volume: Volume, *, allow_bone_loss: bool = False) -> Volume:
         nk, nj, ni = volume.voxels.shape
         return np.asarray(~np.repeat(np.repeat(body[k // step[2]], step[1], 0), step[0], 1)[:nj, :ni])
 
-    masked = _turn_into_air(volume, outside, "remove_table", {"body_share": round(float(body.mean()), 4), **bone})
+    said = {"body_share": round(float(body.mean()), 4), **bone}
+    masked = _turn_into_air(volume, outside, "remove_table", said, progress)
     masked.report = amend(masked.report, gates=[*masked.report.get("gates", []), gate])
     return masked
 
 
-def mask_field_of_view(volume: Volume, radius_mm: float | None = None) -> Volume:
+def mask_field_of_view(volume: Volume, radius_mm: float | None = None, *, progress: Progress | None = None) -> Volume:
     """Turn everything outside of a circle around the centre of the slices into air.
 
     Parameters
@@ -103,6 +110,8 @@ def mask_field_of_view(volume: Volume, radius_mm: float | None = None) -> Volume
         A scan in HU.
     radius_mm : float, optional
         Default: the largest circle that fits the slice, which is what scanners reconstruct.
+    progress : callable, optional
+        Called as ``progress("mask", slices done, all slices)``.
 
     Returns
     -------
@@ -127,18 +136,23 @@ def mask_field_of_view(volume: Volume, radius_mm: float | None = None) -> Volume
     mask = np.linalg.norm(steps @ volume.affine[:3, :2].T, axis=-1) > radius
     if mask.all():
         raise UsageError(f"a field of view of {radius:g} mm holds no voxel: they are {di:.3g} x {dj:.3g} mm")
+    progress = progress or ignore_progress
+    progress("mask", 0, len(volume.voxels))
     cells = measure_cells(volume)
     si, sj, _ = cells.step
     _, cj, ci = cells.mean.shape
     middle = np.ix_(np.minimum(np.arange(cj) * sj + sj // 2, nj - 1), np.minimum(np.arange(ci) * si + si // 2, ni - 1))
     bone, gate = judge_circle(cells, ~mask[middle])
-    masked = _turn_into_air(volume, lambda k: mask, "field_of_view", {"radius_mm": round(radius, 3), **bone})
+    said = {"radius_mm": round(radius, 3), **bone}
+    masked = _turn_into_air(volume, lambda k: mask, "field_of_view", said, progress)
     if radius_mm is None:
         masked.report = amend(masked.report, gates=[*masked.report.get("gates", []), gate])
     return masked
 
 
-def _turn_into_air(volume: Volume, outside: Callable[[int], Mask], name: str, said: dict[str, Any]) -> Volume:
+def _turn_into_air(
+    volume: Volume, outside: Callable[[int], Mask], name: str, said: dict[str, Any], progress: Progress
+) -> Volume:
     """Give the voxels outside the value that air has there; `outside` gives the mask of a slice."""
     voxels = np.array(volume.voxels)
     removed = dense = 0
@@ -149,6 +163,7 @@ def _turn_into_air(volume: Volume, outside: Callable[[int], Mask], name: str, sa
         dense += int(np.count_nonzero(layer[mask] > TISSUE_HU))
         layer[mask] = air
         volume.release_slices(k, k + 1)
+        progress("mask", k + 1, len(voxels))
     share = removed / voxels.size
     facts = {"voxels_removed": removed, "dense_voxels_removed": dense, "removed_share": round(share, 4), **said}
     facts["air_hu"] = float(air)

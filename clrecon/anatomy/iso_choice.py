@@ -31,6 +31,7 @@ from numpy.typing import NDArray
 from clrecon.anatomy.bone_edges import Background, BoneEdges, leave_contrast_medium, measure_edges
 from clrecon.errors import NoSurfaceError, UsageError
 from clrecon.geometry.volume import AIR_HU, Volume
+from clrecon.system.progress import Progress, ignore_progress
 from clrecon.system.wording import name_parameter
 
 __all__ = ["CONTRAST_SAID", "IsoChoice", "choose_iso_value", "half_iso_value"]
@@ -147,7 +148,7 @@ def half_iso_value(bone_hu: float, tissue_hu: float) -> IsoChoice:
     return IsoChoice(tissue + (bone - tissue) / 2.0, bone, tissue, "half", reason)
 
 
-def choose_iso_value(volume: Volume) -> IsoChoice:
+def choose_iso_value(volume: Volume, *, progress: Progress | None = None) -> IsoChoice:
     """Measure bone and the tissue beside it, and choose the iso value half way between them.
 
     Bone in soft tissue, or, where the scan shows no soft tissue, a specimen in air.  Deterministic; looks at about
@@ -158,6 +159,8 @@ def choose_iso_value(volume: Volume) -> IsoChoice:
     ----------
     volume : Volume
         Voxels in HU.
+    progress : callable, optional
+        Called as ``progress("choose", steps done, 3)``.
 
     Returns
     -------
@@ -168,14 +171,19 @@ def choose_iso_value(volume: Volume) -> IsoChoice:
     NoSurfaceError
         There are no two materials: neither soft tissue nor air has a mode, or no bone rises from it.
     """
+    progress = progress or ignore_progress
+    progress("choose", 0, 3)
     voxels = volume.voxels
     count = max(FEWEST_SLICES, SAMPLED_VOXELS // (voxels.shape[1] * voxels.shape[2]))
     slice_step = -(-voxels.shape[0] // count)
     sampled = range((voxels.shape[0] - 1) % slice_step // 2, voxels.shape[0], slice_step)
     histogram = _leave_padding(_count_values(voxels, sampled), voxels[0].size * len(sampled), volume.report)
     background = _find_background(histogram)
+    progress("choose", 1, 3)
     edges = measure_edges(voxels, sampled, background)
+    progress("choose", 2, 3)
     edges, left_out, flat_share = leave_contrast_medium(edges)
+    progress("choose", 3, 3)
     bone, tissue = _median(edges.bone, edges.contrast), _median(edges.tissue, edges.contrast)
     least = max(SEED_ABOVE_TISSUE_HU, LEAST_CONTRAST_SIGMAS * background.noise)
     if len(edges.bone) < FEWEST_EDGES or bone - tissue < least:

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from clrecon.errors import RefusedInputError
 from clrecon.geometry.affine import Float64Array
 from clrecon.geometry.volume import Volume
+from clrecon.system.progress import Progress, ignore_progress
 
 __all__ = ["SpineLine", "find_spine_line"]
 
@@ -87,13 +88,15 @@ class _Cells:
         return max(1, round(mm / CELL_MM[2]) | 1)
 
 
-def find_spine_line(volume: Volume) -> SpineLine:
+def find_spine_line(volume: Volume, *, progress: Progress | None = None) -> SpineLine:
     """Find the middle of the spinal canal.
 
     Parameters
     ----------
     volume : Volume
         A scan in HU.
+    progress : callable, optional
+        Called as ``progress("curve", steps done, 3)``.
 
     Returns
     -------
@@ -104,13 +107,18 @@ def find_spine_line(volume: Volume) -> SpineLine:
     RefusedInputError
         Nowhere in the volume it is sure: the message says how much was found.
     """
+    progress = progress or ignore_progress
+    progress("curve", 0, 3)
     cells = _average_cells(volume)
+    progress("curve", 1, 3)
     traits = _find_traits(cells)
+    progress("curve", 2, 3)
     worth = (
         traits["body"] + traits["wall"] + 0.5 * traits["soft"] + traits["mirror"]
         - traits["filled"] - 0.5 * traits["beside"] - traits["behind"]
     )  # fmt: skip
     path = _best_path(np.clip(worth - WORTH, -WORST, None))
+    progress("curve", 3, 3)
     k, j, i = path.T
     sure = np.logical_and.reduce([traits[name][k, j, i] >= least for name, least in SURE.items()])
     begin, end = _longest_run(sure)

@@ -121,7 +121,7 @@ def check_sphere(device: Device) -> dict[str, Any]:
         point_spread_mm=0.0,
     )
     voxels, affine, truth = make_phantom(settings)
-    mesh = extract_isosurface(Volume(voxels, affine), truth["iso_value_hu"], device)
+    mesh = extract_isosurface(Volume(voxels, affine), truth["iso_value_hu"], device=device)
     quality = mesh.quality()
     surface = truth["surface"]
     distance = np.linalg.norm(mesh.vertices - np.array(surface["center_lps_mm"]), axis=1)

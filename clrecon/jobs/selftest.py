@@ -79,8 +79,8 @@ def _check_isosurface(device: Device) -> str:
     for shape, dtype, iso_value, closed, affine in cases:
         volume = Volume(_random_integers(shape, dtype, 6), affine)
         vertices, _, triangles = isosurface_twin.extract_isosurface(volume, iso_value, closed=closed)
-        mesh = extract_isosurface(volume, iso_value, device, closed=closed)
-        resolved = extract_isosurface(volume, iso_value, device, closed=closed, topology="trilinear")
+        mesh = extract_isosurface(volume, iso_value, device=device, closed=closed)
+        resolved = extract_isosurface(volume, iso_value, device=device, closed=closed, topology="trilinear")
         expected = isosurface_twin.extract_isosurface(volume, iso_value, closed=closed, topology="trilinear")[2]
         if not np.array_equal(mesh.triangles, triangles) or not np.array_equal(resolved.triangles, expected):
             raise DeviceError(f"wrong triangles for {dtype} voxels")
@@ -99,7 +99,7 @@ def _check_labels(device: Device) -> str:
         blocks = _random_integers((3, 3, 13), "uint16", 4).repeat(3, 0).repeat(3, 1).repeat(3, 2)[:7, :8, :37]
         numbers = (1, 2, 3)
         inside = label_twin.find_solid(volume, blocks, 3.0, closed=closed, solid=numbers if solid else ())
-        meshes = extract_labels(volume, LabelMap(blocks, OBLIQUE), 3.0, device, closed=closed, solid=solid)
+        meshes = extract_labels(volume, LabelMap(blocks, OBLIQUE), 3.0, device=device, closed=closed, solid=solid)
         for number in numbers:
             vertices, _, triangles = label_twin.extract_label(volume, inside, number, 3.0, closed=closed)
             if number not in meshes or not np.array_equal(meshes[number].triangles, triangles):

@@ -18,6 +18,7 @@ from clrecon.formats.grid_file import GridFile
 from clrecon.labels.label_map import LabelMap
 from clrecon.labels.overlap import Painter
 from clrecon.labels.stream import empty_labels, iterate_labels
+from clrecon.system.progress import Progress, ignore_progress
 
 __all__ = ["read_grid_labels"]
 
@@ -36,7 +37,9 @@ class _Segment:
     value: int
 
 
-def read_grid_labels(grid: GridFile, only: tuple[str | int, ...] | None = None) -> LabelMap:
+def read_grid_labels(
+    grid: GridFile, only: tuple[str | int, ...] | None = None, progress: Progress = ignore_progress
+) -> LabelMap:
     """Read a label map or a segmentation.
 
     Parameters
@@ -44,6 +47,8 @@ def read_grid_labels(grid: GridFile, only: tuple[str | int, ...] | None = None) 
     grid : GridFile
     only : tuple of str or int, optional
         The labels that are wanted: others may overlap.
+    progress : callable
+        Called as ``progress("read", slices done, all slices)``.
 
     Raises
     ------
@@ -58,16 +63,21 @@ def read_grid_labels(grid: GridFile, only: tuple[str | int, ...] | None = None) 
     ni, nj, nk = grid.shape_ijk
     voxels = empty_labels(grid.name, (nk, nj, ni))
     if grid.layers > 1:
-        return _merge_layers(grid, voxels, segments, only)
+        return _merge_layers(grid, voxels, segments, only, progress)
     for k, plane in enumerate(iterate_labels(grid)):
         if plane.any():
             voxels[k] = plane
+        progress("read", k + 1, nk)
     names = {segment.number: segment.name for segment in segments} or _read_names(grid.extension)
     return LabelMap(voxels, grid.affine, names, warnings=grid.warnings)
 
 
 def _merge_layers(
-    grid: GridFile, voxels: NDArray[Any], segments: Iterable[_Segment], only: tuple[str | int, ...] | None
+    grid: GridFile,
+    voxels: NDArray[Any],
+    segments: Iterable[_Segment],
+    only: tuple[str | int, ...] | None,
+    progress: Progress,
 ) -> LabelMap:
     """One map of segments that are stored in layers; numbers that layers share are given anew."""
     segments = list(segments)
@@ -78,6 +88,7 @@ def _merge_layers(
     for k, stack in enumerate(iterate_labels(grid)):
         for segment in sorted(segments, key=lambda s: in_order[s.number]):
             painter.paint(k, segment.number, stack[..., segment.layer] == segment.value)
+        progress("read", k + 1, len(voxels))
     return painter.finish(grid.affine, warnings=grid.warnings)
 
 

@@ -12,12 +12,15 @@ from clrecon.labels.grids import read_grid_labels
 from clrecon.labels.label_map import LabelMap
 from clrecon.labels.overlap import check_wanted
 from clrecon.labels.segmentation import read_segmentation
+from clrecon.system.progress import Progress, ignore_progress
 from clrecon.system.text import escape_text
 
 __all__ = ["read_labels"]
 
 
-def read_labels(path: str | Path, only: Sequence[str | int] | None = None) -> LabelMap:
+def read_labels(
+    path: str | Path, only: Sequence[str | int] | None = None, *, progress: Progress | None = None
+) -> LabelMap:
     """Read a label map: NIfTI (.nii, .nii.gz), NRRD and 3D Slicer's .seg.nrrd, MetaImage, or DICOM SEG.
 
     The kind is told from the content.  NIfTI and NRRD need the extra ``clrecon[labels]``, MetaImage
@@ -29,6 +32,8 @@ def read_labels(path: str | Path, only: Sequence[str | int] | None = None) -> La
     only : sequence of str or int, optional
         The labels that are wanted, as `LabelMap.find` takes them.  It matters for files whose segments overlap:
         those that are wanted may not overlap each other, and take what they share with others.
+    progress : callable, optional
+        Called as ``progress("read", done, total)``: slices, in DICOM SEG frames.
 
     Returns
     -------
@@ -58,9 +63,9 @@ def read_labels(path: str | Path, only: Sequence[str | int] | None = None) -> La
                 f"{name} is no label map that can be read: NIfTI, NRRD, MetaImage and DICOM SEG are"
             )
         if kind == "DICOM":
-            labels = read_segmentation(path, wanted)
+            labels = read_segmentation(path, wanted, progress or ignore_progress)
         else:
-            labels = read_grid_labels(open_grid(path, kind, LABEL_MAP), wanted)
+            labels = read_grid_labels(open_grid(path, kind, LABEL_MAP), wanted, progress or ignore_progress)
     except OSError as error:
         raise RefusedInputError(f"{escape_text(path.name)} cannot be read: {error.strerror or error}") from error
     if not labels.numbers:

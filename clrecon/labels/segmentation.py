@@ -24,6 +24,7 @@ from clrecon.labels.frames import FrameStack, place_frames
 from clrecon.labels.label_map import LabelMap
 from clrecon.labels.overlap import Painter
 from clrecon.labels.stream import empty_labels
+from clrecon.system.progress import Progress, ignore_progress
 from clrecon.system.regular_files import open_regular
 from clrecon.system.text import escape_text, hash_uid
 
@@ -60,7 +61,9 @@ class _Layout:
     bits: int
 
 
-def read_segmentation(path: Path, only: tuple[str | int, ...] | None = None) -> LabelMap:
+def read_segmentation(
+    path: Path, only: tuple[str | int, ...] | None = None, progress: Progress = ignore_progress
+) -> LabelMap:
     """Read a DICOM SEG of binary segments or of a label map.
 
     Parameters
@@ -68,6 +71,8 @@ def read_segmentation(path: Path, only: tuple[str | int, ...] | None = None) -> 
     path : Path
     only : tuple of str or int, optional
         The segments that are wanted: others may overlap.
+    progress : callable
+        Called as ``progress("read", frames done, all frames)``.
 
     Raises
     ------
@@ -79,10 +84,10 @@ def read_segmentation(path: Path, only: tuple[str | int, ...] | None = None) -> 
     """
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # pydicom's quote the file unescaped
-        return _read(path, escape_text(path.name), only)
+        return _read(path, escape_text(path.name), only, progress)
 
 
-def _read(path: Path, name: str, only: tuple[str | int, ...] | None) -> LabelMap:
+def _read(path: Path, name: str, only: tuple[str | int, ...] | None, progress: Progress) -> LabelMap:
     dataset = _parse(path, name)
     try:
         layout = _read_layout(dataset, name, path.stat().st_size)
@@ -104,10 +109,14 @@ def _read(path: Path, name: str, only: tuple[str | int, ...] | None) -> LabelMap
     if numbers is None:
         for frame, k in enumerate(stack.places):
             voxels[k] = pixels.read(frame)
+            progress("read", frame + 1, layout.frames)
         return LabelMap(voxels, stack.affine, segments, frame_of_reference_hash=frame_hash)
-    return _paint(pixels, numbers, stack, Painter(name, voxels, segments, only)).finish(
-        stack.affine, frame_of_reference_hash=frame_hash
-    )
+    painter = Painter(name, voxels, segments, only)
+    order = {number: place for place, number in enumerate(painter.order)}
+    for done, (frame, k) in enumerate(_frames_in_order(numbers, stack, order, pixels), start=1):
+        painter.paint(k, numbers[frame], pixels.read(frame).astype(bool))
+        progress("read", done, layout.frames)
+    return painter.finish(stack.affine, frame_of_reference_hash=frame_hash)
 
 
 def _first_line(error: Exception) -> str:
@@ -225,13 +234,6 @@ class _FramePixels:
             return np.frombuffer(bytes(planes), f"<u{layout.bits // 8}", self._items)
         except Exception as error:
             raise RefusedInputError(f"{self._name} has a corrupt RLE frame: {_first_line(error)}") from error
-
-
-def _paint(pixels: _FramePixels, numbers: list[int], stack: FrameStack, painter: Painter) -> Painter:
-    order = {number: place for place, number in enumerate(painter.order)}
-    for frame, k in _frames_in_order(numbers, stack, order, pixels):
-        painter.paint(k, numbers[frame], pixels.read(frame).astype(bool))
-    return painter
 
 
 def _frames_in_order(

@@ -34,7 +34,7 @@ def first_own(volume: Any, hu: float, device: str, threads: int) -> dict[str, An
     chosen = choose_device(device)
     _ = chosen.queue
     opened = time.perf_counter()
-    mesh = extract_isosurface(volume, hu, chosen, closed=False)
+    mesh = extract_isosurface(volume, hu, device=chosen, closed=False)
     done = time.perf_counter()
     return {
         "seconds": done - start,
@@ -101,11 +101,11 @@ def memory_own(volume: Any, hu: float, device: str, threads: int) -> dict[str, A
     from clrecon.operators.surface.extract import extract_isosurface
 
     chosen = choose_device(device)
-    extract_isosurface(small_volume(volume), 50, chosen, closed=False)
+    extract_isosurface(small_volume(volume), 50, device=chosen, closed=False)
     kept: list[Any] = []
 
     def run() -> int:
-        kept.append(extract_isosurface(volume, hu, chosen, closed=False))
+        kept.append(extract_isosurface(volume, hu, device=chosen, closed=False))
         mesh = kept[0]
         return int(mesh.vertices.nbytes + mesh.normals.nbytes + mesh.triangles.nbytes)
 

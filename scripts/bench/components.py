@@ -30,7 +30,7 @@ def measure_components(job: Job) -> dict[str, Any]:
     from clrecon.operators.surface.extract import extract_isosurface
 
     volume = job.input.volume()
-    mesh = extract_isosurface(volume, job.hu, job.device)
+    mesh = extract_isosurface(volume, job.hu, device=job.device)
     triangles, vertices = mesh.triangles, mesh.vertex_count
     mask = volume.voxels >= job.hu
     corners = ndimage.generate_binary_structure(3, 3)

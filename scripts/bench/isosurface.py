@@ -175,7 +175,7 @@ def measure_cold(job: Job) -> dict[str, Any]:
     prepare_isosurface(job.device, volume.voxels.dtype)
 
     def make_own() -> OwnSide:
-        return OwnSide(lambda hu: extract_isosurface(volume, hu, job.device, closed=False))
+        return OwnSide(lambda hu: extract_isosurface(volume, hu, device=job.device, closed=False))
 
     figures = compare_sides(job, make_own, volume, lambda: repeat(job.hu), fresh=True)
     side = figures["sides"]["all_threads"]
@@ -197,7 +197,7 @@ def measure_resident(job: Job) -> dict[str, Any]:
 
     volume = job.input.volume()
     prepare_isosurface(job.device, volume.voxels.dtype)
-    with SurfaceExtractor(volume, job.device) as extractor:
+    with SurfaceExtractor(volume, device=job.device) as extractor:
 
         def make_own() -> OwnSide:
             return OwnSide(lambda hu: extractor.extract(hu, closed=False))

@@ -29,7 +29,7 @@ def measure_label_masks(job: Job) -> dict[str, Any]:
     for name, voxels in _make_maps(job).items():
         labels = LabelMap(voxels, job.input.volume().affine)
         peer = _peer(labels, job.peer_threads)
-        meshes = extract_label_masks(labels, job.device)
+        meshes = extract_label_masks(labels, device=job.device)
         theirs = _volumes_ml(labels, *peer())
         figures["labels"][name] = [
             {
@@ -42,7 +42,7 @@ def measure_label_masks(job: Job) -> dict[str, Any]:
             for number, mesh in meshes.items()
         ]
         ours, other = alternate(
-            lambda labels=labels: _seconds(lambda: extract_label_masks(labels, job.device)),  # type: ignore[misc]
+            lambda labels=labels: _seconds(lambda: extract_label_masks(labels, device=job.device)),  # type: ignore[misc]
             lambda peer=peer: _seconds(peer),  # type: ignore[misc]
             job.pairs,
             limit_s=job.limit_s / 2,

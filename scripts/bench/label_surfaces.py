@@ -36,13 +36,13 @@ def measure_labels(job: Job) -> dict[str, Any]:
     labels = np.where(maximum_filter(volume.voxels >= job.hu, 3), layer[:, None, None], 0).astype(np.uint8)
     label_map = LabelMap(labels, volume.affine)
     peers = _peers(volume, labels, job.hu, job.peer_threads)
-    meshes = extract_labels(volume, label_map, job.hu, job.device)
+    meshes = extract_labels(volume, label_map, job.hu, device=job.device)
     figures: dict[str, Any] = {"ratios": {}, "sides": {}, "peer_triangles": {}}
     figures["triangles"] = sum(len(mesh.triangles) for mesh in meshes.values())
     for name, peer in peers.items():
         figures["peer_triangles"][name] = peer()
         ours, theirs = alternate(
-            lambda: _seconds(lambda: extract_labels(volume, label_map, job.hu, job.device)),
+            lambda: _seconds(lambda: extract_labels(volume, label_map, job.hu, device=job.device)),
             lambda peer=peer: _seconds(peer),  # type: ignore[misc]
             job.pairs,
             limit_s=job.limit_s / len(peers),

@@ -24,7 +24,7 @@ def measure_refinement(job: Job) -> dict[str, Any]:
     """
     import clrecon
 
-    mesh = clrecon.extract_isosurface(job.input.volume(), job.hu, job.device)
+    mesh = clrecon.extract_isosurface(job.input.volume(), job.hu, device=job.device)
     small = clrecon.decimate_mesh(mesh, SHARE)
     reached = small.report["refinement"]["decimate"]["reached"]
     peer_small = _decimate(mesh, reached)

@@ -21,7 +21,7 @@ def measure_topology(job: Job) -> dict[str, Any]:
 
     def run(topology: str) -> float:
         start = time.perf_counter()
-        meshes[topology] = extract_isosurface(volume, job.hu, job.device, topology=topology)
+        meshes[topology] = extract_isosurface(volume, job.hu, device=job.device, topology=topology)
         return time.perf_counter() - start
 
     ours, theirs = alternate(lambda: run("trilinear"), lambda: run("separated"), job.pairs, limit_s=job.limit_s)

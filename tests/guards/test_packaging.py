@@ -124,7 +124,7 @@ def test_the_wheel_works_from_another_folder(tmp_path: Path) -> None:
     names = set(zipfile.ZipFile(wheel).namelist())
     kernels = {f"clrecon/{path.relative_to(ROOT).as_posix()}" for path in project_files(".cl", ".h")}
     assert kernels and kernels <= names
-    assert "clrecon/py.typed" in names
+    assert {"clrecon/py.typed", "clrecon/__init__.pyi"} <= set(names)
     assert not any(name.startswith(("tests/", "scripts/", "cl/")) for name in names)
 
     scripts = install_alone(wheel, tmp_path / "environment")

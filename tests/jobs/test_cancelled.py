@@ -138,24 +138,27 @@ def test_slabs_of_a_surface_and_its_buffers(device: Any, monkeypatch: pytest.Mon
     voxels[5:35, 5:25, 5:25] = 1000
     volume = Volume(voxels, np.eye(4))
     memory = 120_000
-    whole = clrecon.extract_isosurface(volume, 500, device)
+    whole = clrecon.extract_isosurface(volume, 500, device=device)
     buffers = Buffers(monkeypatch)
     kept = buffers.held
-    found = moments(lambda progress: clrecon.extract_isosurface(volume, 500, device, memory=memory, progress=progress))
+    found = moments(
+        lambda progress: clrecon.extract_isosurface(volume, 500, device=device, memory=memory, progress=progress)
+    )
     assert len([moment for moment in found if moment[0] == "slabs"]) > 1
     for moment in found:
         before = buffers.made
         cancel(
-            lambda progress: clrecon.extract_isosurface(volume, 500, device, memory=memory, progress=progress), moment
+            lambda progress: clrecon.extract_isosurface(volume, 500, device=device, memory=memory, progress=progress),
+            moment,
         )
         assert buffers.made > before or moment[0] == "build"
         assert buffers.held == kept
-    with clrecon.SurfaceExtractor(volume, device, memory=memory) as extractor:
+    with clrecon.SurfaceExtractor(volume, device=device, memory=memory) as extractor:
         for moment in found:
             cancel(lambda progress: extractor.extract(500, progress=progress), moment)
         assert np.array_equal(extractor.extract(500).vertices, whole.vertices)  # it can be used again
         assert buffers.held == kept
-    with clrecon.SurfaceExtractor(volume, device) as extractor:
+    with clrecon.SurfaceExtractor(volume, device=device) as extractor:
         extractor.extract(500)
         assert buffers.held > kept  # the volume stays there
     assert buffers.held == kept
@@ -185,8 +188,8 @@ def test_labels(own: bool, device: Any, monkeypatch: pytest.MonkeyPatch) -> None
 
     def work(progress: Progress) -> object:
         if own:
-            return clrecon.extract_label_masks(labels, device, progress=progress)
-        return clrecon.extract_labels(volume, labels, 500, device, progress=progress)
+            return clrecon.extract_label_masks(labels, device=device, progress=progress)
+        return clrecon.extract_labels(volume, labels, 500, device=device, progress=progress)
 
     found = moments(work)
     assert found == [("labels", 0, 3), ("labels", 1, 3), ("labels", 2, 3)]
@@ -199,7 +202,7 @@ def test_labels(own: bool, device: Any, monkeypatch: pytest.MonkeyPatch) -> None
 
 @pytest.mark.parametrize("name", ["a.apng", "a.gif", "a.mp4", "frames"])
 def test_a_turntable(name: str, scan: Path, device: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    settings = RenderSettings(
+    settings = RenderSettings.of(
         "mip", size=(32, 32), turntable=Turntable(frames=4), background="black", device=str(device.index)
     )
     files = PictureFiles(tmp_path / "still.png", turntable=tmp_path / name, report=tmp_path / "a.json")

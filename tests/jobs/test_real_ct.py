@@ -69,7 +69,9 @@ def test_real_series_mesh_like_vtk_in_the_true_place(real_data, device, tmp_path
 def test_real_ct_stays_sound_with_the_topology_of_the_trilinear_field(real_data, device):
     """Few cells differ: the two surfaces have nearly the same triangles and volume."""
     volume = read_volume(real_data / "thoracic_0p8mm")
-    meshes = [extract_isosurface(volume, HU, device, topology=topology) for topology in ("separated", "trilinear")]
+    meshes = [
+        extract_isosurface(volume, HU, device=device, topology=topology) for topology in ("separated", "trilinear")
+    ]
     default, resolved = (mesh.quality() for mesh in meshes)
     assert resolved["closed"] and resolved["manifold"] and resolved["zero_area_faces"] == 0
     assert resolved["euler_number"] != default["euler_number"]

@@ -16,7 +16,7 @@ import json, sys
 import numpy as np
 import clrecon
 voxels = np.random.default_rng(0).integers(0, 6, (4, 5, 6)).astype(np.int16)
-mesh = clrecon.extract_isosurface(clrecon.Volume(voxels, np.eye(4)), 3, int(sys.argv[1]))
+mesh = clrecon.extract_isosurface(clrecon.Volume(voxels, np.eye(4)), 3, device=int(sys.argv[1]))
 print(json.dumps([len(mesh.triangles), mesh.report["warnings"]]))
 """
 

@@ -16,12 +16,12 @@ def test_threads_do_not_mix_their_arguments(device):
         Volume(np.random.default_rng(seed).integers(0, 6, (4 + seed, 5, 20 + 7 * seed)).astype(np.int16), np.eye(4))
         for seed in range(4)
     ]
-    expected = [extract_isosurface(volume, 3, device) for volume in volumes]
+    expected = [extract_isosurface(volume, 3, device=device) for volume in volumes]
     interval = sys.getswitchinterval()
     sys.setswitchinterval(1e-6)
     try:
         with ThreadPoolExecutor(4) as pool:
-            found = list(pool.map(lambda n: (n, extract_isosurface(volumes[n % 4], 3, device)), range(60)))
+            found = list(pool.map(lambda n: (n, extract_isosurface(volumes[n % 4], 3, device=device)), range(60)))
     finally:
         sys.setswitchinterval(interval)
     for n, mesh in found:

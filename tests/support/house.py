@@ -108,12 +108,12 @@ INSIDE_FUNCTIONS: dict[str, frozenset[str]] = {
 
 
 def package_modules() -> dict[str, Path]:
-    """Dotted name -> file of every module of clrecon/."""
+    """Dotted name -> file of every module of clrecon/; ``clrecon.__init__`` is the stub with the public names."""
     modules = {}
     for path in sorted(PACKAGE.rglob("*.py")):
         parts = path.relative_to(ROOT).with_suffix("").parts
         modules[".".join(parts[:-1] if parts[-1] == "__init__" else parts)] = path
-    return modules
+    return modules | {"clrecon.__init__": PACKAGE / "__init__.pyi"}
 
 
 def project_files(*suffixes: str) -> list[Path]:

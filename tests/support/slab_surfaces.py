@@ -11,7 +11,7 @@ from clrecon.operators.surface.slabs import SampleGrid
 
 
 def extract_in_slabs(volume, iso_value, device, slices, closed=True, topology="separated", **options):
-    resident = DeviceVolume(volume, device)
+    resident = DeviceVolume(volume, device=device)
     rule = choose_iso_rule(volume, iso_value, closed, topology, **options)
     resident.most_slices[SampleGrid(volume, rule).kind] = slices
     return extract_isosurface(resident, iso_value, closed=closed, topology=topology, **options)

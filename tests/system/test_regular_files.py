@@ -101,6 +101,7 @@ OWN = {
     "exchange/stl.py": "what it has just written",
     "exchange/threemf.py": "what it has just written",
     "exchange/vtp.py": "what it has just written",
+    "__init__.py": "its own list of names",
     "opencl/unknown_cpu.py": "the system",
     "jobs/bench/machine.py": "the system",
     "rendering/movies/frame_folder.py": "new frames",

@@ -185,7 +185,7 @@ class _OwnRuns:
     def __init__(self, device: Device, volume: Volume, hu: float):
         from clrecon.operators.surface.extract import extract_isosurface
 
-        self._extract = lambda: extract_isosurface(volume, hu, device, closed=False)
+        self._extract = lambda: extract_isosurface(volume, hu, device=device, closed=False)
         self.reports: list[dict[str, Any]] = []
         self.counts = (0, 0)
 
@@ -266,7 +266,7 @@ def _time_resident(device: Device, volume: Volume, hu: float, runs: int) -> dict
     from clrecon.operators.surface.extract import SurfaceExtractor
 
     seconds = []
-    with SurfaceExtractor(volume, device) as extractor:
+    with SurfaceExtractor(volume, device=device) as extractor:
         extractor.extract(hu, closed=False)
         for number in range(runs):
             # Whole HU up and down in turn, so that no value comes twice and all stay close to the one asked for.

@@ -184,9 +184,7 @@ def _choose(
     volume: Volume, surfaces: list[Surface], settings: MeshSettings, progress: Progress, watch: Laps
 ) -> tuple[Volume, list[Surface], IsoChoice | None]:
     """The volume as it is extracted from, the surfaces in it, and how an iso value was chosen where none was given."""
-    if settings.half_way == "auto":
-        progress("choose", 0, 0)
-    choice = choose_level(volume, settings)
+    choice = choose_level(volume, settings, progress)
     if choice is not None:
         surfaces = plan_surfaces([choice.iso_value])
     watch.lap("choose")

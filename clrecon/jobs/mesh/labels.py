@@ -87,7 +87,7 @@ def extract_label_surfaces(
         if isinstance(surface.iso_value, tuple):  # refused with the settings
             raise UsageError(f"labels take one iso value, not {surface.describe()}")
         meshes = extract_labels(
-            volume, labels, surface.iso_value, device, numbers=choice.wanted or None, grow_mm=choice.grow_mm,
+            volume, labels, surface.iso_value, device=device, numbers=choice.wanted or None, grow_mm=choice.grow_mm,
             closed=settings.closed, solid=choice.solid, memory=settings.memory, progress=progress,
         )  # fmt: skip
         found += [(surface, number, mesh) for number, mesh in meshes.items()]
@@ -114,7 +114,12 @@ def _extract_masks(
 
     shares = check_together(labels, volume)
     meshes = extract_label_masks(
-        labels, device, numbers=choice.wanted or None, closed=settings.closed, memory=settings.memory, progress=progress
+        labels,
+        device=device,
+        numbers=choice.wanted or None,
+        closed=settings.closed,
+        memory=settings.memory,
+        progress=progress,
     )
     for number, mesh in meshes.items():
         mesh.report |= {

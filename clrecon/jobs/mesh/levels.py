@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from clrecon.jobs.mesh.presets import find_preset
 from clrecon.jobs.mesh.settings import MeshSettings
+from clrecon.system.progress import Progress, ignore_progress
 from clrecon.system.wording import name_parameter
 
 if TYPE_CHECKING:
@@ -20,7 +21,7 @@ THICK_SLICES_MM = 2.5
 slices of 2 mm the level is as good as the best, with 3 mm it loses walls (docs/iso_value.md)."""
 
 
-def choose_level(volume: Volume, settings: MeshSettings) -> IsoChoice | None:
+def choose_level(volume: Volume, settings: MeshSettings, progress: Progress = ignore_progress) -> IsoChoice | None:
     """The iso value half way between two materials, measured or given; None where the settings name levels.
 
     Raises
@@ -33,7 +34,7 @@ def choose_level(volume: Volume, settings: MeshSettings) -> IsoChoice | None:
     if settings.half_way is None:
         return None
     if isinstance(settings.half_way, str):
-        return choose_iso_value(volume)
+        return choose_iso_value(volume, progress=progress)
     return half_iso_value(*settings.half_way)
 
 

@@ -66,7 +66,7 @@ def extract_surfaces(
     return extract_isosurfaces(
         volume,
         levels,
-        device,
+        device=device,
         closed=settings.closed,
         topology=settings.topology,
         below=settings.below is not None,

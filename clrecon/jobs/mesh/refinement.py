@@ -33,14 +33,11 @@ def refine_surface(mesh: Mesh, settings: MeshSettings, progress: Progress = igno
 
     raw = mesh
     if settings.smooth is not None:
-        progress("smooth", 0, 0)
-        mesh = smooth_mesh(mesh, settings.smooth, settings.max_deviation_mm)
+        mesh = smooth_mesh(mesh, settings.smooth, settings.max_deviation_mm, progress=progress)
     if settings.decimate is not None:
-        progress("decimate", 0, 0)
-        mesh = decimate_mesh(mesh, settings.decimate, settings.max_deviation_mm)
-    progress("compare", 0, 0)
+        mesh = decimate_mesh(mesh, settings.decimate, settings.max_deviation_mm, progress=progress)
     mesh.report["refinement"] |= {
-        "deviation": compare_meshes(mesh, raw),
+        "deviation": compare_meshes(mesh, raw, progress=progress),
         "voxel_mm": default_deviation(raw) / BOUND_VOXEL,
     }
     return mesh

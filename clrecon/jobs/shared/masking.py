@@ -28,11 +28,10 @@ def mask_volume(volume: Volume, settings: InputSettings, progress: Progress) -> 
     from clrecon.anatomy.body import mask_field_of_view, remove_table
     from clrecon.geometry.certificate import amend
 
-    progress("mask", 0, 0)
     warnings = list(volume.report.get("warnings", ()))
     if settings.field_of_view is not None:
         radius = settings.field_of_view
-        volume = mask_field_of_view(volume, None if isinstance(radius, str) else radius)
+        volume = mask_field_of_view(volume, None if isinstance(radius, str) else radius, progress=progress)
         facts = volume.report["field_of_view"]
         warnings.append(
             f"outside of {facts['radius_mm']:.4g} mm around the centre of the slices is air now:"
@@ -40,7 +39,7 @@ def mask_volume(volume: Volume, settings: InputSettings, progress: Progress) -> 
             + _describe_cut(facts)
         )
     if settings.remove_table:
-        volume = remove_table(volume, allow_bone_loss=settings.allow_bone_loss)
+        volume = remove_table(volume, allow_bone_loss=settings.allow_bone_loss, progress=progress)
         facts = volume.report["remove_table"]
         warnings.append(
             f"outside of the body is air now: {100.0 * facts['removed_share']:.3g} % of the voxels,"

@@ -14,6 +14,7 @@ from clrecon.mesh.mesh import Mesh
 from clrecon.mesh.triangles import cross_product, cross_products
 from clrecon.mesh.vtk import CellLocator
 from clrecon.system.pieces import chunks, local_origin
+from clrecon.system.progress import Progress, ignore_progress
 
 __all__ = [
     "SAMPLES",
@@ -261,7 +262,9 @@ def _enclosed_ml(mesh: Mesh, origin: NDArray[np.float64]) -> float:
     return six / 6000.0
 
 
-def compare_meshes(mesh: Mesh, reference: Mesh, samples: int = SAMPLES) -> dict[str, Any]:
+def compare_meshes(
+    mesh: Mesh, reference: Mesh, samples: int = SAMPLES, *, progress: Progress | None = None
+) -> dict[str, Any]:
     """Measure how far two surfaces lie apart.
 
     Points that cover each surface evenly by area are measured to the nearest triangle of the other.
@@ -271,6 +274,8 @@ def compare_meshes(mesh: Mesh, reference: Mesh, samples: int = SAMPLES) -> dict[
     mesh, reference : Mesh
     samples : int
         Points on each of them.
+    progress : callable, optional
+        Called as ``progress("compare", sides done, 2)``.
 
     Returns
     -------
@@ -295,9 +300,12 @@ def compare_meshes(mesh: Mesh, reference: Mesh, samples: int = SAMPLES) -> dict[
     mesh.check()
     reference.check()
     sides = []
-    for one, other in ((mesh, reference), (reference, mesh)):
+    progress = progress or ignore_progress
+    for side, (one, other) in enumerate(((mesh, reference), (reference, mesh))):
+        progress("compare", side, 2)
         points = sample_surface(one.vertices, one.triangles, samples)
         sides.append(summarise_distances(SurfaceDistance(other.vertices, other.triangles)(points)))
+    progress("compare", 2, 2)
     origin = local_origin(reference.vertices)
     volume, wanted = _enclosed_ml(mesh, origin), _enclosed_ml(reference, origin)
     return {

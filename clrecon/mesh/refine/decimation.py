@@ -7,6 +7,7 @@ result would leave either, the place is taken back, and what is left is tried ag
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -20,6 +21,7 @@ from clrecon.mesh.refine.clusters import Clusters
 from clrecon.mesh.refine.deviation import Deviation
 from clrecon.mesh.refine.shifts import measure_volumes, move_vertices, restore_volumes
 from clrecon.system.pieces import local_origin
+from clrecon.system.progress import Progress
 
 __all__ = ["BOUND_VOXEL", "carry_on", "check_refinement", "decimate_mesh", "default_deviation"]
 
@@ -89,7 +91,9 @@ def carry_on(mesh: Mesh, name: str, said: dict[str, Any]) -> dict[str, Any]:
     return {**mesh.report, "refinement": {**mesh.report.get("refinement", {}), name: said}}
 
 
-def decimate_mesh(mesh: Mesh, fraction: float, max_deviation_mm: float | None = None) -> Mesh:
+def decimate_mesh(
+    mesh: Mesh, fraction: float, max_deviation_mm: float | None = None, *, progress: Progress | None = None
+) -> Mesh:
     """Take triangles away by collapsing edges in order of their quadric error (Garland and Heckbert 1997).
 
     fast-simplification chooses the collapses and stops where the error reaches the bound.  Collapses whose result
@@ -105,6 +109,8 @@ def decimate_mesh(mesh: Mesh, fraction: float, max_deviation_mm: float | None = 
     max_deviation_mm : float, optional
         No vertex and no middle of an edge or a triangle of either surface lies further from the other.  Default:
         `default_deviation`.
+    progress : callable, optional
+        Called as ``progress("decimate", triangles taken away, all that are to go)``, several times a round.
 
     Returns
     -------
@@ -131,15 +137,23 @@ def decimate_mesh(mesh: Mesh, fraction: float, max_deviation_mm: float | None = 
     wanted = (1.0 - fraction) * mesh.triangle_count
     nearly = wanted * (1.0 + _SHARE_SLACK) + 2
     left, rounds, taken_back = mesh.triangle_count, 0, 0
+
+    def tell() -> None:
+        if progress is not None:
+            to_go = math.ceil(mesh.triangle_count - wanted)
+            progress("decimate", min(mesh.triangle_count - left, to_go), to_go)
+
     while left > nearly and rounds < _ROUNDS:
+        tell()
         _collapse(clusters, wanted / left, bound)
         collapsed = clusters.collapsed_count
-        _mend(clusters, deviation)
+        _mend(clusters, deviation, tell)
         taken_back += collapsed - clusters.collapsed_count
         rounds += 1
         before, left = left, len(clusters.faces())
         if left > (1.0 - _LEAST_GAIN) * before:
             break
+    tell()
     vertices, triangles = _with_volumes(clusters, mesh, origin, longest)
     said = {
         "fraction": fraction,
@@ -164,9 +178,10 @@ def _with_volumes(
     return move_vertices(as_stored(places + origin), triangles, step)[0], triangles
 
 
-def _mend(clusters: Clusters, deviation: Deviation) -> None:
+def _mend(clusters: Clusters, deviation: Deviation, tell: Callable[[], None] = lambda: None) -> None:
     """Undo clusters until the surface is sound and within the bound; what is cheap and changes most comes first."""
     for _ in range(_TRIES):
+        tell()
         if clusters.undo(clusters.find_faults()):
             continue
         if clusters.undo(clusters.find_far(deviation)):

@@ -17,6 +17,7 @@ from clrecon.mesh.refine.decimation import carry_on, check_refinement
 from clrecon.mesh.refine.shifts import measure_volumes, move_vertices, restore_volumes, shorten_steps
 from clrecon.mesh.vtk import smooth_windowed_sinc
 from clrecon.system.pieces import local_origin
+from clrecon.system.progress import Progress, ignore_progress
 
 __all__ = ["smooth_mesh"]
 
@@ -25,7 +26,9 @@ _PASS_BAND = 0.1
 at the 95th percentile; half as wide a band loses more than 0.5 % of volume."""
 
 
-def smooth_mesh(mesh: Mesh, iterations: int = 20, max_deviation_mm: float | None = None) -> Mesh:
+def smooth_mesh(
+    mesh: Mesh, iterations: int = 20, max_deviation_mm: float | None = None, *, progress: Progress | None = None
+) -> Mesh:
     """Smooth a surface with a windowed sinc filter (Taubin, Zhang and Golub 1996), which hardly shrinks it.
 
     A vertex that the filter takes further than the bound goes only so far along its way.  Each closed component then
@@ -41,6 +44,8 @@ def smooth_mesh(mesh: Mesh, iterations: int = 20, max_deviation_mm: float | None
         No point of the result lies further from the given surface, and no point of that further from the result:
         the triangles are the same and no corner moves further, so neither does any point between them.
         Default: `default_deviation`.
+    progress : callable, optional
+        Called as ``progress("smooth", steps done, all steps)``.
 
     Returns
     -------
@@ -58,6 +63,8 @@ def smooth_mesh(mesh: Mesh, iterations: int = 20, max_deviation_mm: float | None
     """
     if isinstance(iterations, float) or not 1 <= iterations <= 1000:
         raise UsageError(f"smoothing takes from 1 to 1000 iterations, not {iterations}")
+    progress = progress or ignore_progress
+    progress("smooth", 0, 3)
     bound = check_refinement(mesh, max_deviation_mm)
     # Both surfaces are kept rounded, each coordinate by half a step at most.
     longest = max(bound - rounding_step(mesh.vertices), 0.5 * bound)
@@ -65,12 +72,15 @@ def smooth_mesh(mesh: Mesh, iterations: int = 20, max_deviation_mm: float | None
     before = mesh.vertices - origin
     step = smooth_windowed_sinc(before.astype(np.float32), mesh.triangles, iterations, _PASS_BAND) - before
 
+    progress("smooth", 1, 3)
     edges = find_edges(mesh.triangles, mesh.vertex_count)
     step[edges.ends[:, edges.uses == 1]] = 0.0  # VTK smooths along the border all the same
     held = shorten_steps(step, longest)
     volumes = measure_volumes(before, mesh.triangles)
     restore_volumes(before, step, mesh.triangles, volumes.labels, volumes, longest)
+    progress("smooth", 2, 3)
     vertices, taken_back = move_vertices(mesh.vertices, mesh.triangles, step)
+    progress("smooth", 3, 3)
     said = {
         "iterations": iterations,
         "max_deviation_mm": bound,

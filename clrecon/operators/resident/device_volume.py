@@ -86,7 +86,7 @@ class DeviceVolume:
     ...     axial = clrecon.cut_slice(resident, "axial")
     """
 
-    def __init__(self, volume: Volume, device: Device | str | int | None = None, *, memory: int | None = None):
+    def __init__(self, volume: Volume, *, device: Device | str | int | None = None, memory: int | None = None):
         if not isinstance(volume, Volume):
             raise UsageError(f"a DeviceVolume is made of a Volume, not {type(volume).__name__}")
         check_memory(memory)
@@ -352,4 +352,4 @@ def take_volume(
         return volume, False
     if not isinstance(volume, Volume):
         raise UsageError(f"{what} needs a Volume, not {type(volume).__name__}: clrecon.Volume(voxels, affine)")
-    return DeviceVolume(volume, device, memory=memory), True
+    return DeviceVolume(volume, device=device, memory=memory), True

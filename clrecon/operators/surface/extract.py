@@ -46,7 +46,7 @@ class SurfaceExtractor:
     """
 
     def __init__(
-        self, volume: Volume | DeviceVolume, device: Device | str | int | None = None, *, memory: int | None = None
+        self, volume: Volume | DeviceVolume, *, device: Device | str | int | None = None, memory: int | None = None
     ):
         self._resident, self._is_own = take_volume(volume, device, memory, "a surface")
         self.volume, self.device = self._resident.volume, self._resident.device
@@ -129,8 +129,8 @@ class SurfaceExtractor:
 def extract_isosurface(
     volume: Volume | DeviceVolume,
     iso_value: Level,
-    device: Device | str | int | None = None,
     *,
+    device: Device | str | int | None = None,
     closed: bool = True,
     topology: str = "separated",
     below: bool = False,
@@ -203,15 +203,15 @@ def extract_isosurface(
     Lorensen and Cline 1987; Schroeder, Maynard and Geveci 2015; for "trilinear" Nielson and Hamann 1991, Chernyaev
     1995 and Grosso 2016.
     """
-    with SurfaceExtractor(volume, device, memory=memory) as extractor:
+    with SurfaceExtractor(volume, device=device, memory=memory) as extractor:
         return extractor.extract(iso_value, closed=closed, topology=topology, below=below, progress=progress)
 
 
 def extract_isosurfaces(
     volume: Volume | DeviceVolume,
     iso_values: Sequence[Level],
-    device: Device | str | int | None = None,
     *,
+    device: Device | str | int | None = None,
     closed: bool = True,
     topology: str = "separated",
     below: bool = False,
@@ -232,7 +232,7 @@ def extract_isosurfaces(
     """
     if len(iso_values) == 0:
         raise UsageError("no iso value is given")
-    with SurfaceExtractor(volume, device, memory=memory) as extractor:
+    with SurfaceExtractor(volume, device=device, memory=memory) as extractor:
         return [
             extractor.extract(iso_value, closed=closed, topology=topology, below=below, progress=progress)
             for iso_value in iso_values

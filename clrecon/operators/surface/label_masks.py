@@ -325,8 +325,8 @@ class _Started:
 
 def extract_label_masks(
     labels: LabelMap,
-    device: Device | str | int | None = None,
     *,
+    device: Device | str | int | None = None,
     numbers: Sequence[int | str] | None = None,
     closed: bool = True,
     memory: int | None = None,

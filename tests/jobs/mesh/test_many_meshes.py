@@ -205,9 +205,9 @@ def test_surfaces_are_those_of_each_iso_value_alone(device: Any) -> None:
 
     voxels = np.random.default_rng(5).integers(0, 9, (9, 10, 33)).astype(np.int16)
     volume = Volume(voxels, AFFINE)
-    meshes = clrecon.extract_isosurfaces(volume, [6, 2, 3.5], device, closed=False)
+    meshes = clrecon.extract_isosurfaces(volume, [6, 2, 3.5], device=device, closed=False)
     for mesh, level in zip(meshes, (6, 2, 3.5), strict=True):
-        alone = clrecon.extract_isosurface(volume, level, device, closed=False)
+        alone = clrecon.extract_isosurface(volume, level, device=device, closed=False)
         assert mesh.report["iso_value_hu"] == level
         np.testing.assert_array_equal(mesh.vertices, alone.vertices)
         np.testing.assert_array_equal(mesh.triangles, alone.triangles)

@@ -99,7 +99,7 @@ def test_the_order_of_triangles_does_not_matter(device):
 @pytest.mark.parametrize("density", [0.03, 0.2, 0.5])
 def test_noisy_surfaces_equal_scipy(device, density):
     voxels = (np.random.default_rng(11).random((20, 33, 40)) < density).astype(np.int16)
-    mesh = clrecon.extract_isosurface(Volume(voxels, AFFINE), 1, device)
+    mesh = clrecon.extract_isosurface(Volume(voxels, AFFINE), 1, device=device)
     check_equal(device, mesh.triangles, mesh.vertex_count, connectivity.label_components)
 
 
@@ -107,7 +107,7 @@ def test_sheets_of_one_cell_stay_apart(device):
     """Two voxels across the diagonal of a cell share its cells and no vertex: one component of cells, two surfaces."""
     voxels = np.zeros((4, 4, 4), np.int16)
     voxels[1, 1, 1] = voxels[2, 2, 2] = 10
-    mesh = clrecon.extract_isosurface(Volume(voxels, np.eye(4)), 5, device)
+    mesh = clrecon.extract_isosurface(Volume(voxels, np.eye(4)), 5, device=device)
     assert label_components(device, mesh.triangles, mesh.vertex_count)[0] == 2
 
 
@@ -154,7 +154,7 @@ def test_too_little_memory_is_said_before_it_is_taken(device, monkeypatch):
 
 def test_real_ct_equals_scipy(device, real_data):
     volume = clrecon.read_volume(real_data / "thoracic_0p8mm")
-    mesh = clrecon.extract_isosurface(volume, 226, device)
+    mesh = clrecon.extract_isosurface(volume, 226, device=device)
     count, labels = label_components(device, mesh.triangles, mesh.vertex_count)
     expected_count, expected = connectivity.label_components(mesh.triangles, mesh.vertex_count)
     assert count == expected_count > 1000

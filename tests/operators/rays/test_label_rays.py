@@ -28,7 +28,7 @@ def cast(
     device, volume: Volume, camera: Camera, style: LabelStyle | None, memory=None, size=SIZE, **settings
 ) -> Rendering:
     settings = {"lighting": UNLIT, "color": "white", **settings}
-    resident = DeviceVolume(volume, device, memory=memory)
+    resident = DeviceVolume(volume, device=device, memory=memory)
     return cast_surface(resident, 300.0, camera, size, 0.5 * min(volume.spacing), style=style, **settings)
 
 

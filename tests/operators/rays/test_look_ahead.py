@@ -20,7 +20,7 @@ from clrecon.rendering.views.camera import Camera
 
 def look(device, shape, distances, way: MainWay):
     """What the kernel says of a volume without anything in it, with these distances in place of its own."""
-    resident, stopwatch = DeviceVolume(Volume(np.zeros(shape, np.int16), np.eye(4)), device), Stopwatch()
+    resident, stopwatch = DeviceVolume(Volume(np.zeros(shape, np.int16), np.eye(4)), device=device), Stopwatch()
     slab = next(ray_slabs(resident, shape[0], np.inf, stopwatch))
     with stopwatch.running(device):
         ways_d = composite._look_ahead(resident, slab, way, LeapMap(upload(device, distances), None), stopwatch)
@@ -74,7 +74,7 @@ def test_distances_are_those_of_a_chessboard(device, shape):
     voxels = np.zeros(shape, np.int16)
     for _ in range(3):
         voxels[tuple(rng.integers(0, shape))] = 1000
-    resident, stopwatch = DeviceVolume(Volume(voxels, np.eye(4)), device), Stopwatch()
+    resident, stopwatch = DeviceVolume(Volume(voxels, np.eye(4)), device=device), Stopwatch()
     slab = next(ray_slabs(resident, shape[0], np.inf, stopwatch))
     counts = slab.bricks[::-1]
     bright = np.zeros(counts, bool)
@@ -93,7 +93,7 @@ def test_distances_are_those_of_a_chessboard(device, shape):
 
 def test_the_main_way_is_that_of_the_ray_in_the_middle(device):
     volume = Volume(np.zeros((20, 40, 30), np.int16), np.diag([1.0, -2.0, 3.0, 1.0]))
-    resident = DeviceVolume(volume, device)
+    resident = DeviceVolume(volume, device=device)
     slab = next(ray_slabs(resident, 20, np.inf, Stopwatch()))
     assert slab.brick_cells == (4, 4, 2)
     from_the_front = Camera((15.0, -400.0, 30.0), (15.0, 0.0, 30.0), (0.0, 0.0, 1.0), parallel_scale=50.0)

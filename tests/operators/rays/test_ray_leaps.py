@@ -204,7 +204,7 @@ def test_volumes_of_more_voxels_than_an_int_counts_go_through_in_slabs(device, m
     volume = scattered(np.random.default_rng(3), uneven=False)
     ni, nj, nk = volume.shape_ijk
     monkeypatch.setattr(slabs, "MOST_VOXELS", ni * nj * (nk // 2 + 6))
-    found = slabs.plan_ray_slabs(DeviceVolume(volume, device), {}, {})
+    found = slabs.plan_ray_slabs(DeviceVolume(volume, device=device), {}, {})
     held = nk if int(device.kernel_variants["LANES"]) == 1 else nk // 2 + 1
     assert found == held
 

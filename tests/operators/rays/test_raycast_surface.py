@@ -77,7 +77,7 @@ def mesh_depths(cast, volume: Volume, iso_value: float, camera: Camera, size) ->
     if isinstance(cast, TwinCaster):
         vertices, _, triangles = extract_twin(volume, iso_value)
     else:
-        mesh = extract_isosurface(volume, iso_value, cast.device)
+        mesh = extract_isosurface(volume, iso_value, device=cast.device)
         vertices, triangles = mesh.vertices, mesh.triangles
     surface = pyvista.PolyData.from_regular_faces(np.asarray(vertices, np.float64), triangles.astype(np.int64))
     origins, directions = camera.rays(size)

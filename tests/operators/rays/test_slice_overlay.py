@@ -26,7 +26,7 @@ def grey(hu: np.ndarray) -> np.ndarray:
 
 def assert_twin(device, volume, camera, slices, clip=None, opacity=0.4, lowest=-300.0, **settings):
     found = overlay_slices(
-        DeviceVolume(volume, device), camera, SIZE,
+        DeviceVolume(volume, device=device), camera, SIZE,
         slices=slices, opacity=opacity, lowest_hu=lowest, window=WINDOW, clip=clip, **settings,
     )  # fmt: skip
     planes = None if clip is None else clip.planes
@@ -66,7 +66,7 @@ def test_a_camera_between_the_slices_sees_them_on_both_sides(device):
 def test_a_few_slices_under_the_simulator(device):
     volume = make_volume(blobs, "sheared", 6.0, np.int16)
     camera = look(volume, (0.4, 0.8, -0.7), 5.0)
-    found = overlay_slices(DeviceVolume(volume, device), camera, (12, 9), slices=[0, 2, 4], window=WINDOW)
+    found = overlay_slices(DeviceVolume(volume, device=device), camera, (12, 9), slices=[0, 2, 4], window=WINDOW)
     rgba, _ = overlay_twin(volume, camera, (12, 9), [0, 2, 4], 0.5, -300.0, grey)
     assert (np.abs(premultiplied(found.image) - 255.0 * rgba).max(axis=-1) <= 2.0).mean() > 0.95
 
@@ -81,13 +81,13 @@ def test_a_marked_voxel_is_where_the_camera_projects_it(device, grid, perspectiv
     volume = volume.with_voxels(voxels)
     camera, size = look(volume, (0.2, 0.5, 0.9), 12.0, perspective), (160, 160)
     pixels, depths = camera.project(volume.ijk_to_lps([(i, j, k)]), size)
-    found = overlay_slices(DeviceVolume(volume, device), camera, size, slices=[0, k, k + 1], opacity=0.7)
+    found = overlay_slices(DeviceVolume(volume, device=device), camera, size, slices=[0, k, k + 1], opacity=0.7)
     x, y = pixels[0]
     assert found.image[int(y), int(x), 3] == round(0.7 * 255)
     assert abs(found.depth[int(y), int(x)] - depths[0]) < camera.pixel_mm(size)
     shown = np.argwhere(found.image[..., 3] > 0)
     assert np.abs(shown.mean(axis=0)[::-1] + 0.5 - pixels[0]).max() < 1.0  # a patch around it, and nothing else
-    others = overlay_slices(DeviceVolume(volume, device), camera, size, slices=[0, k + 2])
+    others = overlay_slices(DeviceVolume(volume, device=device), camera, size, slices=[0, k + 2])
     assert not others.image.any() and np.isnan(others.depth).all()
 
 
@@ -96,10 +96,12 @@ def test_opacity_adds_up_and_front_hides_back(device):
     volume = Volume(voxels, np.diag([1.0, 1.0, 2.0, 1.0]))
     above, below = (look(volume, (0.0, 0.01, z), 4.0) for z in (-1.0, 1.0))
     settings = {"window": (0.0, 700.0), "lowest_hu": -1000.0}
-    found = overlay_slices(DeviceVolume(volume, device), above, (8, 8), slices=[1, 3, 6], opacity=0.25, **settings)
+    found = overlay_slices(
+        DeviceVolume(volume, device=device), above, (8, 8), slices=[1, 3, 6], opacity=0.25, **settings
+    )
     assert (found.image[..., 3] == round(255 * (1.0 - 0.75**3))).all()
     hidden = [
-        overlay_slices(DeviceVolume(volume, device), camera, (8, 8), slices=3, opacity=1.0, **settings)
+        overlay_slices(DeviceVolume(volume, device=device), camera, (8, 8), slices=3, opacity=1.0, **settings)
         for camera in (above, below)
     ]
     assert (hidden[0].image[..., 0] == round(255 * 600 / 700)).all()  # slices 0, 3 and 6, from the head: 6
@@ -111,7 +113,7 @@ def test_colours_of_a_transfer_function(device):
     volume = make_volume(lambda p: np.full(len(p), 150.0), "even", 8.0, np.int16)
     function = TransferFunction([(0, 1, 0, 0, 0), (300, 0, 1, 0, 0)])
     found = overlay_slices(
-        DeviceVolume(volume, device),
+        DeviceVolume(volume, device=device),
         look(volume, (0.0, 0.1, -1.0), 2.0),
         (4, 4),
         slices=[4],
@@ -124,21 +126,23 @@ def test_colours_of_a_transfer_function(device):
 def test_parts_that_fit_the_memory_give_the_same_picture(device):
     volume = make_volume(blobs, "oblique", 26.0, np.int16)
     camera, slices, size = look(volume, (0.4, 0.8, -0.7), 14.0, True), list(range(0, 20, 2)), (16, 12)
-    whole = overlay_slices(DeviceVolume(volume, device), camera, size, slices=slices)
+    whole = overlay_slices(DeviceVolume(volume, device=device), camera, size, slices=slices)
     picture, one = 44 * size[0] * size[1], volume.voxels[0].nbytes
     assert picture + 3 * one < 10 * one
-    parts = overlay_slices(DeviceVolume(volume, device, memory=picture + 3 * one), camera, size, slices=slices)
+    parts = overlay_slices(DeviceVolume(volume, device=device, memory=picture + 3 * one), camera, size, slices=slices)
     assert np.array_equal(whole.image, parts.image)
     assert np.array_equal(whole.depth, parts.depth, equal_nan=True)
     with pytest.raises(DeviceError, match="slice"):
-        overlay_slices(DeviceVolume(volume, device, memory=picture), camera, size, slices=slices)
+        overlay_slices(DeviceVolume(volume, device=device, memory=picture), camera, size, slices=slices)
 
 
 def test_slices_that_are_seen_edge_on_say_so(device):
     volume = make_volume(blobs, "even", 8.0, np.int16)
     camera = Camera.fit(volume, "anterior")
-    assert "edge-on" in overlay_slices(DeviceVolume(volume, device), camera, (8, 8)).report["warnings"][0]
-    assert not overlay_slices(DeviceVolume(volume, device), Camera.fit(volume, (30, 20)), (8, 8)).report["warnings"]
+    assert "edge-on" in overlay_slices(DeviceVolume(volume, device=device), camera, (8, 8)).report["warnings"][0]
+    assert not overlay_slices(DeviceVolume(volume, device=device), Camera.fit(volume, (30, 20)), (8, 8)).report[
+        "warnings"
+    ]
 
 
 def test_slices_are_chosen_evenly_or_by_number():
@@ -168,4 +172,4 @@ def test_slices_are_chosen_evenly_or_by_number():
 def test_bad_input_is_refused(device, wrong, says):
     volume = make_volume(blobs, "even", 8.0, np.int16)
     with pytest.raises(UsageError, match=says):
-        overlay_slices(DeviceVolume(volume, device), Camera.fit(volume), (8, 8), **wrong)
+        overlay_slices(DeviceVolume(volume, device=device), Camera.fit(volume), (8, 8), **wrong)

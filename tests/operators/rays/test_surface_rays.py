@@ -28,7 +28,7 @@ RADIUS = 7.0
 def cast(device, volume: Volume, iso_value: float, camera: Camera, size=SIZE, memory=None, **settings) -> Rendering:
     step = settings.pop("ray_step", 0.5 * min(volume.spacing))
     settings = {"lighting": UNLIT, "color": "white", **settings}
-    return cast_surface(DeviceVolume(volume, device, memory=memory), iso_value, camera, size, step, **settings)
+    return cast_surface(DeviceVolume(volume, device=device, memory=memory), iso_value, camera, size, step, **settings)
 
 
 def ball(points: np.ndarray) -> np.ndarray:
@@ -135,7 +135,7 @@ def test_depths_are_those_of_the_extracted_mesh_caps_included(device, grid):
     volume, size = make_volume(blobs, grid, 12.0, np.int16), (24, 20)
     camera = look(volume, (0.5, 1.0, 0.4), 7.0, perspective=True)
     found = cast(device, volume, 100.0, camera, size, ray_step=0.1)
-    mesh = extract_isosurface(volume, 100.0, device)
+    mesh = extract_isosurface(volume, 100.0, device=device)
     surface = pyvista.PolyData.from_regular_faces(mesh.vertices.astype(np.float64), mesh.triangles.astype(np.int64))
     origins, directions = camera.rays(size)
     away = []

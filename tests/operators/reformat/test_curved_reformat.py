@@ -66,13 +66,13 @@ def test_a_bent_tube_stands_straight_and_is_as_wide_and_long_as_it_is(device, gr
     volume = list(grids())[grid]
     distance, way = coordinates(volume)
     tube = volume.with_voxels((100.0 * (TUBE - distance)).astype(np.float32))
-    seen = reformat_curve(tube, centre_line(), kind, (60, 150), device, view="anterior")
+    seen = reformat_curve(tube, centre_line(), kind, (60, 150), device=device, view="anterior")
     pixel = seen.report["pixel_mm"]
     assert 150 * pixel == pytest.approx(BEND * TURN, rel=tolerances.TUBE_ARC)
     assert seen.report["curve"]["length_mm"] == pytest.approx(BEND * TURN, rel=tolerances.TUBE_ARC)
     assert seen.report["curve"]["reversed"] and seen.camera is None and np.isnan(seen.depth).all()
     assert np.abs(edges(seen.values, pixel) - (-TUBE, TUBE)).max() <= tolerances.TUBE_EDGE_MM
-    marked = reformat_curve(volume.with_voxels(way.astype(np.float32)), centre_line(), kind, (60, 150), device,
+    marked = reformat_curve(volume.with_voxels(way.astype(np.float32)), centre_line(), kind, (60, 150), device=device,
                             view="anterior")  # fmt: skip
     truth = (np.arange(150) + 0.5) * pixel
     assert np.abs(marked.values[:, 30] - truth).max() <= tolerances.TUBE_ARC * BEND * TURN
@@ -100,8 +100,8 @@ def test_both_ends_and_sides_are_where_they_belong(device):
             for view, column, axis in [("left", 1, 1), ("anterior", 0, 0), ("right", 1, -1), ("posterior", 0, -1)]:
                 across = volume.with_voxels(places[..., column].astype(np.float32))
                 upward = volume.with_voxels(places[..., 2].astype(np.float32))
-                right = reformat_curve(across, points, kind, (8, 12), device, view=view).values
-                up = reformat_curve(upward, points, kind, (8, 12), device, view=view).values
+                right = reformat_curve(across, points, kind, (8, 12), device=device, view=view).values
+                up = reformat_curve(upward, points, kind, (8, 12), device=device, view=view).values
                 assert np.sign(right[6, 7] - right[6, 0]) == (1 if axis >= 0 else -1)
                 assert up[0, 4] > up[11, 4]
 
@@ -113,8 +113,8 @@ def test_a_slab_lies_across_the_picture(device):
     volume = Volume(voxels, np.eye(4))
     line = [(20.0, 20.0, 2.0), (20.0, 20.0, 38.0)]
     for kind in ("straightened", "stretched"):
-        thick = reformat_curve(volume, line, kind, (21, 36), device, thickness=6.0, combine="max", pixel_mm=1.0)
-        thin = reformat_curve(volume, line, kind, (21, 36), device, pixel_mm=1.0)
+        thick = reformat_curve(volume, line, kind, (21, 36), device=device, thickness=6.0, combine="max", pixel_mm=1.0)
+        thin = reformat_curve(volume, line, kind, (21, 36), device=device, pixel_mm=1.0)
         assert (thick.values[:, 10] == 500).all() and thick.values.max() == 500
         assert thin.values.max() == 0
 
@@ -123,7 +123,7 @@ def test_the_device_equals_its_twin(device):
     volume = list(grids())[1]
     values = np.random.default_rng(4).integers(0, 100, volume.voxels.shape).astype(np.int16)
     volume = volume.with_voxels(values)
-    seen = reformat_curve(volume, centre_line(), "straightened", (30, 50), device, view="left", thickness=2.0)
+    seen = reformat_curve(volume, centre_line(), "straightened", (30, 50), device=device, view="left", thickness=2.0)
     curve = Curve(centre_line()[::-1])
     made = straightened_sheet(curve, np.array([0.0, 1.0, 0.0]), (30, 50), curve.length / 50)
     expected = reformat_sheet(volume, made.sheet, slab_samples(volume, 2.0))

@@ -54,7 +54,7 @@ def even_volume(dtype="int16", angles=(0.0, 0.0, 0.0), spacing=(0.7, 0.7, 2.5), 
 def test_where_a_pixel_is_a_voxel_it_has_its_value(device, dtype, angles, shear):
     volume = even_volume(dtype, angles, shear=shear)
     for k in range(6):
-        cut = cut_slice(volume, camera_of_slice(volume, k), (11, 8), device)
+        cut = cut_slice(volume, camera_of_slice(volume, k), (11, 8), device=device)
         assert np.array_equal(cut.values, volume.voxels[k].astype(np.float32))
 
 
@@ -67,7 +67,7 @@ def test_the_other_axes_and_the_letters_of_anatomy(device):
     for name, size in places.items():
         camera = find_plane(volume, name, size, pixel_mm=1.0)
         shift = (middle - camera.focal_point) @ camera.basis().forward
-        cut = cut_slice(volume, name, size, device, pixel_mm=1.0, offset_mm=float(shift))
+        cut = cut_slice(volume, name, size, device=device, pixel_mm=1.0, offset_mm=float(shift))
         assert np.array_equal(cut.values, voxels[name])
         assert cut.report["pixel_mm"] == 1.0 and cut.mode == "slice"
 
@@ -80,7 +80,7 @@ def test_oblique_planes_through_a_linear_field_are_exact(device, make):
     field = (empty.ijk_to_lps(np.stack([i, j, k], axis=1)) - empty.affine[:3, 3]) @ slope
     volume = empty.with_voxels(field.reshape(6, 5, 4).astype(np.float32))
     for view in ((30.0, 20.0), "left", (-110.0, -45.0)):
-        cut = cut_slice(volume, view, (80, 60), device, offset_mm=0.2)
+        cut = cut_slice(volume, view, (80, 60), device=device, offset_mm=0.2)
         origins, directions = cut.camera.rays((80, 60))
         points = origins + cut.depth[..., None] * directions
         inner = np.isfinite(cut.depth)
@@ -97,18 +97,18 @@ def test_slabs_along_an_axis_are_those_of_numpy(device, combine):
     slices = volume.voxels[2:7].astype(np.float64)
     weighted = (slices[1:] + slices[:-1]).sum(axis=0) / 8.0  # the integral of what is linear between slices
     truth = {"mean": weighted, "max": slices.max(axis=0), "min": slices.min(axis=0)}[combine]
-    cut = cut_slice(volume, camera_of_slice(volume, 4), (11, 8), device, thickness=4 * 0.7, combine=combine)
+    cut = cut_slice(volume, camera_of_slice(volume, 4), (11, 8), device=device, thickness=4 * 0.7, combine=combine)
     assert cut.report["samples_a_pixel"] >= 9 and cut.report["sample_step_mm"] <= 0.35 + 1e-12
     assert np.abs(cut.values - truth).max() <= (tolerances.SLAB_MEAN_HU if combine == "mean" else 0.0)
 
 
 def test_samples_beyond_the_volume_do_not_count(device):
     volume = Volume(np.full((3, 8, 8), 70, np.int16), np.eye(4))
-    cut = cut_slice(volume, "axial", (12, 8), device, pixel_mm=1.0, thickness=20.0, background="transparent")
+    cut = cut_slice(volume, "axial", (12, 8), device=device, pixel_mm=1.0, thickness=20.0, background="transparent")
     assert np.abs(cut.values[:, 2:10] - 70.0).max() <= tolerances.SLAB_MEAN_HU
     assert np.isnan(cut.values[:, :2]).all() and np.isnan(cut.values[:, 10:]).all()
     assert (cut.image[:, 2:10, 3] == 255).all() and (cut.image[:, :2, 3] == 0).all()
-    plain = cut_slice(volume, "axial", (12, 8), device, pixel_mm=1.0, thickness=20.0, background="white")
+    plain = cut_slice(volume, "axial", (12, 8), device=device, pixel_mm=1.0, thickness=20.0, background="white")
     assert (plain.image[..., 3] == 255).all() and (plain.image[:, :2, :3] == 255).all()
 
 
@@ -116,7 +116,7 @@ def test_voxels_without_weight_are_not_looked_at(device):
     voxels = random_voxels((5, 4, 4), "float32")
     voxels[3], voxels[2, 1], voxels[2, :, 2] = np.nan, np.nan, np.nan
     volume = Volume(voxels, np.eye(4))
-    cut = cut_slice(volume, camera_of_slice(volume, 2), (4, 4), device)
+    cut = cut_slice(volume, camera_of_slice(volume, 2), (4, 4), device=device)
     assert np.array_equal(cut.values, voxels[2], equal_nan=True) and np.isfinite(cut.values).sum() == 9
 
 
@@ -135,7 +135,7 @@ def test_an_oblique_slice_equals_that_of_simpleitk(device):
     grid.SetSpacing(volume.spacing)
     grid.SetOrigin(volume.affine[:3, 3].tolist())
     grid.SetDirection((volume.affine[:3, :3] / volume.spacing).ravel().tolist())
-    cut = cut_slice(volume, (25.0, 40.0), (60, 50), device, zoom=1.5, offset_mm=0.7)
+    cut = cut_slice(volume, (25.0, 40.0), (60, 50), device=device, zoom=1.5, offset_mm=0.7)
     right, up, forward = cut.camera.basis()
     pixel = cut.report["pixel_mm"]
     first = cut.camera.focal_point + pixel * (-29.5 * right + 24.5 * up)
@@ -173,7 +173,7 @@ def test_the_device_equals_its_twin(device, name, dtype):
         sheet, _ = plane_sheet(find_plane(volume, view, (31, 33)), (31, 33), 0.1)
         samples = slab_samples(volume, thickness)
         expected = reformat_sheet(volume, sheet, samples, combine)
-        made = sample_sheet(DeviceVolume(volume, device), sheet, samples, combine)
+        made = sample_sheet(DeviceVolume(volume, device=device), sheet, samples, combine)
         assert np.array_equal(np.isnan(made.values), np.isnan(expected))
         assert np.nanmax(np.abs(made.values - expected)) <= tolerances.TWIN_SLICE_HU
         assert (~np.isnan(expected)).any()
@@ -185,33 +185,33 @@ def test_volumes_that_do_not_fit_go_through_in_slabs(device, name, combine):
     volume = VOLUMES[name]("float32")
     sheet, _ = plane_sheet(find_plane(volume, (20.0, 30.0), (23, 17)), (23, 17))
     samples = slab_samples(volume, 3.0 if combine != "mean" else 0.0)
-    whole = sample_sheet(DeviceVolume(volume, device), sheet, samples, combine)
+    whole = sample_sheet(DeviceVolume(volume, device=device), sheet, samples, combine)
     one = 4 * volume.voxels[0].size
     others = whole.device_bytes - whole.slices * one
     assert whole.slices >= 4
     for slices in (2, 3, 4):
-        parts = sample_sheet(DeviceVolume(volume, device, memory=others + slices * one), sheet, samples, combine)
+        parts = sample_sheet(DeviceVolume(volume, device=device, memory=others + slices * one), sheet, samples, combine)
         assert parts.slabs == 1 + -(-(whole.slices - slices) // (slices - 1))
         assert np.array_equal(parts.values, whole.values, equal_nan=True)
     thick = slab_samples(volume, 5.0)
-    mean = sample_sheet(DeviceVolume(volume, device, memory=others + 2 * one), sheet, thick, "mean")
+    mean = sample_sheet(DeviceVolume(volume, device=device, memory=others + 2 * one), sheet, thick, "mean")
     truth = reformat_sheet(volume, sheet, thick, "mean")
     assert np.array_equal(np.isnan(mean.values), np.isnan(truth))
     assert np.nanmax(np.abs(mean.values - truth)) <= tolerances.TWIN_SLICE_HU
     with pytest.raises(DeviceError, match="two slices at a time are too much"):
-        sample_sheet(DeviceVolume(volume, device, memory=others + 2 * one - 1), sheet, samples, combine)
+        sample_sheet(DeviceVolume(volume, device=device, memory=others + 2 * one - 1), sheet, samples, combine)
 
 
 def test_only_slices_that_are_met_are_taken(device):
     volume = Volume(random_voxels((50, 8, 8)), np.eye(4))
-    cut = cut_slice(volume, "axial", (8, 8), device, pixel_mm=1.0, memory=8000)
+    cut = cut_slice(volume, "axial", (8, 8), device=device, pixel_mm=1.0, memory=8000)
     assert cut.report["device_bytes"] <= 8000 and cut.report["slabs"] == 1
 
 
 def test_a_volume_on_the_device_is_used_as_it_is(device):
     volume = VOLUMES["sheared"]("int16")
-    expected = cut_slice(volume, (20.0, 30.0), (31, 20), device, thickness=2.0)
-    with DeviceVolume(volume, device) as resident:
+    expected = cut_slice(volume, (20.0, 30.0), (31, 20), device=device, thickness=2.0)
+    with DeviceVolume(volume, device=device) as resident:
         resident.whole(Stopwatch())
         made = cut_slice(resident, (20.0, 30.0), (31, 20), thickness=2.0)
         assert resident.uploaded_bytes == volume.voxels.nbytes
@@ -220,7 +220,7 @@ def test_a_volume_on_the_device_is_used_as_it_is(device):
 
 def test_the_picture_runs_over_its_window(device):
     volume = Volume(np.arange(4, dtype=np.int16).reshape(1, 1, 4) * 100, np.eye(4))
-    cut = cut_slice(volume, "axial", (4, 1), device, pixel_mm=1.0, window=(100, 300))
+    cut = cut_slice(volume, "axial", (4, 1), device=device, pixel_mm=1.0, window=(100, 300))
     assert cut.image[0, :, 0].tolist() == [0, 0, 128, 255]
     assert cut.report["window_hu"] == [100.0, 300.0]
 
@@ -260,9 +260,11 @@ def test_reformations_stay_within_their_buffers(device):
         volume = VOLUMES[name]("int16")
         sheet, _ = plane_sheet(find_plane(volume, (20.0, 30.0), (9, 8)), (9, 8))
         samples = slab_samples(volume, 2.0)
-        made = sample_sheet(DeviceVolume(volume, device), sheet, samples, "mean")
+        made = sample_sheet(DeviceVolume(volume, device=device), sheet, samples, "mean")
         truth = reformat_sheet(volume, sheet, samples, "mean")
         assert np.nanmax(np.abs(made.values - truth)) <= tolerances.TWIN_SLICE_HU
     line = [(0.0, 0.0, 0.5), (2.0, 1.0, 4.0)]
-    bent = reformat_curve(Volume(random_voxels((6, 5, 4)), np.eye(4)), line, "stretched", (7, 9), device, view="left")
+    bent = reformat_curve(
+        Volume(random_voxels((6, 5, 4)), np.eye(4)), line, "stretched", (7, 9), device=device, view="left"
+    )
     assert np.isfinite(bent.values).any()

@@ -43,17 +43,17 @@ def test_the_surface_is_the_same_with_and_without(device, shape, dtype, closed):
     voxels = np.kron(blocks, np.ones((6, 6, 6)))[tuple(slice(n) for n in shape)].astype(dtype)
     voxels[random.integers(0, 50, shape) == 0] = 2
     volume = Volume(voxels, OBLIQUE)
-    with SurfaceExtractor(volume, device) as extractor:
+    with SurfaceExtractor(volume, device=device) as extractor:
         for iso_value in (1, 2, 3, 1.5):
             mesh = extractor.extract(iso_value, closed=closed)
-            expected = extract_isosurface(volume, iso_value, device, closed=closed)
+            expected = extract_isosurface(volume, iso_value, device=device, closed=closed)
             assert np.array_equal(mesh.triangles, expected.triangles)
             assert np.array_equal(mesh.vertices, expected.vertices)
         assert "classify_bricks" in mesh.report["kernel_seconds"]
 
 
 def test_a_single_extraction_measures_no_bricks(device):
-    kernels = extract_isosurface(smooth_volume(), 100, device).report["kernel_seconds"]
+    kernels = extract_isosurface(smooth_volume(), 100, device=device).report["kernel_seconds"]
     assert "classify_samples" in kernels and "measure_bricks" not in kernels
 
 
@@ -61,6 +61,6 @@ def test_a_single_extraction_measures_no_bricks(device):
 def test_bricks_stay_within_their_buffers(device):
     for shape in [(9, 10, 33), (3, 9, 7)]:
         volume = random_volume(shape)
-        with SurfaceExtractor(volume, device) as extractor:
+        with SurfaceExtractor(volume, device=device) as extractor:
             first, second = extractor.extract(3), extractor.extract(3)
         assert np.array_equal(first.triangles, second.triangles)

@@ -103,13 +103,13 @@ class Failing:
 @pytest.mark.parametrize("kind", ["buffer", "launch"])
 @pytest.mark.parametrize("work", WORK)
 def test_whatever_buffer_or_launch_fails_the_result_is_the_same(device, volume, labels, monkeypatch, work, kind):
-    with monkeypatch.context() as patch, DeviceVolume(volume, device) as resident:
+    with monkeypatch.context() as patch, DeviceVolume(volume, device=device) as resident:
         counted = Failing(patch, kind, 0)
         expected = WORK[work](resident, labels)
     count = counted.counts[kind]
     assert count > 0
     for fails in range(1, count + 1, max(1, count // 12)):
-        with monkeypatch.context() as patch, DeviceVolume(volume, device) as resident:
+        with monkeypatch.context() as patch, DeviceVolume(volume, device=device) as resident:
             failing = Failing(patch, kind, fails)
             found = WORK[work](resident, labels)
             assert failing.counts[kind] > fails
@@ -117,7 +117,7 @@ def test_whatever_buffer_or_launch_fails_the_result_is_the_same(device, volume, 
 
 
 def test_a_failure_is_said_in_the_report(device, volume, monkeypatch):
-    with DeviceVolume(volume, device) as resident:
+    with DeviceVolume(volume, device=device) as resident:
         for fails, make in (
             (1, lambda: clrecon.render(resident, "mip", size=SIZE)),
             (1, lambda: clrecon.cut_slice(resident, "coronal", SIZE)),
@@ -137,7 +137,7 @@ def test_a_device_without_any_room_is_an_error_in_the_end(device, volume, labels
         raise DeviceMemoryError("no room for 1 byte")
 
     for work, do in WORK.items():
-        with DeviceVolume(volume, device) as resident, monkeypatch.context() as patch:
+        with DeviceVolume(volume, device=device) as resident, monkeypatch.context() as patch:
             patch.setattr(arrays, "_make_buffer", no_room)
             with pytest.raises(DeviceError, match="no room for 1 byte"):
                 do(resident, labels)
@@ -145,7 +145,7 @@ def test_a_device_without_any_room_is_an_error_in_the_end(device, volume, labels
 
 
 def test_a_mesh_a_rendering_and_three_slices_upload_the_volume_once(device, volume):
-    with DeviceVolume(volume, device) as resident:
+    with DeviceVolume(volume, device=device) as resident:
         clrecon.extract_isosurface(resident, 100)
         clrecon.render(resident, preset="muscle", size=SIZE)
         for plane in ("axial", "coronal", "sagittal"):
@@ -156,7 +156,7 @@ def test_a_mesh_a_rendering_and_three_slices_upload_the_volume_once(device, volu
 
 
 def test_slices_alone_upload_what_they_meet_and_not_more_than_twice_the_volume(device, volume):
-    with DeviceVolume(volume, device) as resident:
+    with DeviceVolume(volume, device=device) as resident:
         clrecon.cut_slice(resident, "axial", SIZE)
         assert resident.uploaded_bytes < volume.voxels.nbytes / 2
         for offset in np.linspace(-8.0, 8.0, 40):
@@ -167,9 +167,9 @@ def test_slices_alone_upload_what_they_meet_and_not_more_than_twice_the_volume(d
 
 @pytest.mark.parametrize("work", WORK)
 def test_a_shared_volume_gives_what_one_of_its_own_does(device, volume, labels, work):
-    with DeviceVolume(volume, device) as own:
+    with DeviceVolume(volume, device=device) as own:
         expected = WORK[work](own, labels)
-    with DeviceVolume(volume, device) as shared:
+    with DeviceVolume(volume, device=device) as shared:
         for other in WORK.values():
             other(shared, labels)
         assert_equal(WORK[work](shared, labels), expected, "exact")
@@ -189,7 +189,7 @@ def test_a_turntable_of_labels_brings_the_map_to_the_grid_once(device, volume, m
 def test_what_is_kept_makes_room_for_what_is_needed(device, volume):
     """Enough memory for any of them alone, not for what all would like to keep."""
     voxels = volume.voxels.nbytes
-    with DeviceVolume(volume, device, memory=3 * voxels) as resident:
+    with DeviceVolume(volume, device=device, memory=3 * voxels) as resident:
         first = clrecon.extract_isosurface(resident, 100)
         clrecon.render(resident, preset="muscle", size=SIZE)
         again = clrecon.extract_isosurface(resident, 100)
@@ -198,7 +198,7 @@ def test_what_is_kept_makes_room_for_what_is_needed(device, volume):
 
 
 def test_a_device_volume_has_its_own_device_and_memory(device, volume):
-    with DeviceVolume(volume, device) as resident:
+    with DeviceVolume(volume, device=device) as resident:
         for call in (
             lambda: clrecon.extract_isosurface(resident, 100, device=device),
             lambda: clrecon.render(resident, memory=10**9),
@@ -210,13 +210,13 @@ def test_a_device_volume_has_its_own_device_and_memory(device, volume):
                 call()
     for wrong in (None, volume.voxels):
         with pytest.raises(UsageError, match="made of a Volume"):
-            DeviceVolume(wrong, device)
+            DeviceVolume(wrong, device=device)
     with pytest.raises(UsageError, match="whole number of bytes"):
-        DeviceVolume(volume, device, memory=0)
+        DeviceVolume(volume, device=device, memory=0)
 
 
 def test_renderers_and_extractors_leave_a_volume_that_was_given_on_the_device(device, volume):
-    with DeviceVolume(volume, device) as resident:
+    with DeviceVolume(volume, device=device) as resident:
         with clrecon.SurfaceExtractor(resident) as extractor:
             extractor.extract(100)
         with clrecon.VolumeRenderer(resident) as renderer:

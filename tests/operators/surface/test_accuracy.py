@@ -57,7 +57,7 @@ def test_sphere_from_its_distance_field(device, grid):
     steps = make_grid(grid)
     voxel = largest_edge(steps)
     radius = 5.0 * voxel
-    mesh = extract_isosurface(sample(lambda p: radius - np.linalg.norm(p, axis=1), steps, radius), 0.0, device)
+    mesh = extract_isosurface(sample(lambda p: radius - np.linalg.norm(p, axis=1), steps, radius), 0.0, device=device)
     error = np.linalg.norm(points_around_center(mesh), axis=1) - radius
     assert np.abs(error).max() <= tolerances.SPHERE_DISTANCE_FIELD_VOXEL * voxel
     quality = mesh.quality()
@@ -71,7 +71,7 @@ def test_the_error_is_of_second_order(device):
     errors = []
     for refine in (1, 2, 4):
         steps = make_grid("oblique") / refine
-        mesh = extract_isosurface(sample(lambda p: 8.0 - np.linalg.norm(p, axis=1), steps, 8.0), 0.0, device)
+        mesh = extract_isosurface(sample(lambda p: 8.0 - np.linalg.norm(p, axis=1), steps, 8.0), 0.0, device=device)
         errors.append(np.sqrt(np.mean((np.linalg.norm(points_around_center(mesh), axis=1) - 8.0) ** 2)))
     assert errors[0] / errors[1] == pytest.approx(4.0, rel=0.15)
     assert errors[1] / errors[2] == pytest.approx(4.0, rel=0.15)
@@ -87,7 +87,7 @@ def test_torus_has_its_genus_area_and_volume(device, grid):
         local = points @ turn
         return minor - np.hypot(np.hypot(local[:, 0], local[:, 1]) - major, local[:, 2])
 
-    quality = extract_isosurface(sample(distance, steps, major + minor), 0.0, device).quality()
+    quality = extract_isosurface(sample(distance, steps, major + minor), 0.0, device=device).quality()
     assert quality["closed"] and quality["genus"] == 1
     assert quality["volume_ml"] == pytest.approx(2 * np.pi**2 * major * minor**2 / 1000, rel=0.02)
     assert quality["area_mm2"] == pytest.approx(4 * np.pi**2 * major * minor, rel=0.02)
@@ -103,7 +103,7 @@ def test_cylinder_has_its_area_and_volume(device, grid):
         local = points @ turn
         return np.minimum(radius - np.hypot(local[:, 0], local[:, 1]), length / 2 - np.abs(local[:, 2]))
 
-    quality = extract_isosurface(sample(distance, steps, np.hypot(radius, length / 2)), 0.0, device).quality()
+    quality = extract_isosurface(sample(distance, steps, np.hypot(radius, length / 2)), 0.0, device=device).quality()
     assert quality["closed"] and quality["genus"] == 0
     assert quality["volume_ml"] == pytest.approx(np.pi * radius**2 * length / 1000, rel=0.02)
     assert quality["area_mm2"] == pytest.approx(2 * np.pi * radius * (radius + length), rel=0.03)
@@ -120,7 +120,7 @@ def test_planes_of_a_linear_field_are_flat(device, grid, angles):
     off = np.abs((vertices - (-120.0, 340.0, -846.0) - (0.31, -0.17, 0.23)) @ normal - 0.123)
     assert off.max() <= margin
     assert np.abs(np.abs(normals @ normal) - 1.0).max() < 1e-6
-    mesh = extract_isosurface(volume, 0.0, device, closed=False)
+    mesh = extract_isosurface(volume, 0.0, device=device, closed=False)
     off = np.abs(points_around_center(mesh) @ normal - 0.123)
     assert off.max() <= margin + tolerances.float32_unit(mesh.vertices)
     assert np.abs(mesh.normals @ normal + 1.0).max() < 1e-5  # towards lower values
@@ -134,7 +134,7 @@ def test_a_partial_volume_sphere_is_right_to_a_fraction_of_a_voxel(device):
     inside = (x * x + y * y + z * z < radius**2).reshape(n, fine, n, fine, n, fine).mean(axis=(1, 3, 5))
     voxels = np.rint(-1000 + 2000 * inside).astype(np.int16)
     volume = Volume(voxels, compose_affine((1, 0, 0), (0, 1, 0), (0, 0, 1), np.full(3, -(n - 1) / 2)))
-    error = np.linalg.norm(extract_isosurface(volume, 0, device).vertices - center, axis=1) - radius
+    error = np.linalg.norm(extract_isosurface(volume, 0, device=device).vertices - center, axis=1) - radius
     assert np.sqrt(np.mean(error**2)) <= tolerances.SPHERE_PARTIAL_VOLUME_RMS_VOXEL
     assert np.abs(error).max() <= tolerances.SPHERE_PARTIAL_VOLUME_MAX_VOXEL
 

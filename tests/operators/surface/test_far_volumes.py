@@ -36,8 +36,8 @@ def make_sphere(shift=(0.0, 0.0, 0.0), dtype="int16") -> Volume:
 @pytest.mark.parametrize("topology", ["separated", "trilinear"])
 @pytest.mark.parametrize("shift", [FAR, (0.0, 5000.0, 0.0), (-8e5, 3.25, 1e6)], ids=str)
 def test_vertices_are_those_at_the_origin_and_the_shift(device, shift, topology):
-    near = extract_isosurface(make_sphere(), 0.5, device, topology=topology)
-    far = extract_isosurface(make_sphere(shift), 0.5, device, topology=topology)
+    near = extract_isosurface(make_sphere(), 0.5, device=device, topology=topology)
+    far = extract_isosurface(make_sphere(shift), 0.5, device=device, topology=topology)
     assert (near.vertices.dtype, far.vertices.dtype) == (np.float32, np.float64)
     assert np.array_equal(near.triangles, far.triangles)
     assert np.array_equal(near.normals, far.normals)
@@ -48,7 +48,7 @@ def test_vertices_are_those_at_the_origin_and_the_shift(device, shift, topology)
 
 def test_vertices_lie_on_the_sphere_and_on_the_twin(device):
     volume = make_sphere(FAR, "float32")
-    mesh = extract_isosurface(volume, 0.0, device)
+    mesh = extract_isosurface(volume, 0.0, device=device)
     centre = volume.ijk_to_lps(CENTRE_IJK[None])[0]
     radius = np.linalg.norm(mesh.vertices - centre, axis=1)
     assert np.abs(radius - RADIUS_MM).max() <= tolerances.SPHERE_DISTANCE_FIELD_VOXEL * max(volume.spacing)
@@ -60,8 +60,8 @@ def test_vertices_lie_on_the_sphere_and_on_the_twin(device):
 
 def test_slabs_give_the_same_mesh(device):
     volume = make_sphere(FAR)
-    whole = extract_isosurface(volume, 0.5, device)
-    with clrecon.SurfaceExtractor(volume, device, memory=140_000) as extractor:
+    whole = extract_isosurface(volume, 0.5, device=device)
+    with clrecon.SurfaceExtractor(volume, device=device, memory=140_000) as extractor:
         assert extractor.forecast()["slabs"] > 1
         parts = extractor.extract(0.5)
     assert np.array_equal(whole.vertices, parts.vertices) and np.array_equal(whole.triangles, parts.triangles)
@@ -70,8 +70,8 @@ def test_slabs_give_the_same_mesh(device):
 def test_labels_are_as_exact(device):
     volume, near = make_sphere(FAR), make_sphere()
     numbers = (volume.voxels > -500).astype(np.uint8)
-    far_label = extract_labels(volume, LabelMap(numbers, volume.affine), 1, device)[1]
-    near_label = extract_labels(near, LabelMap(numbers, near.affine), 1, device)[1]
+    far_label = extract_labels(volume, LabelMap(numbers, volume.affine), 1, device=device)[1]
+    near_label = extract_labels(near, LabelMap(numbers, near.affine), 1, device=device)[1]
     assert far_label.vertices.dtype == np.float64
     assert np.abs(far_label.vertices - FAR - near_label.vertices).max() <= tolerances.FAR_VERTEX_MM
 
@@ -84,14 +84,14 @@ def test_the_bound_is_where_steps_of_float32_pass_it(device):
     above = make_sphere((0.0, 0.0, FAR_MM))
     assert find_vertex_origin(below) is None and find_vertex_origin(above) is not None
     assert float32_step(FAR_MM - 1.0) < 2.5e-4 < float32_step(FAR_MM)
-    assert extract_isosurface(below, 0.5, device).vertices.dtype == np.float32
-    assert extract_isosurface(above, 0.5, device).vertices.dtype == np.float64
+    assert extract_isosurface(below, 0.5, device=device).vertices.dtype == np.float32
+    assert extract_isosurface(above, 0.5, device=device).vertices.dtype == np.float64
     origin = find_vertex_origin(above)
     assert np.array_equal(origin, np.rint(origin))  # whole mm: adding it is exact to 1e-11 mm
 
 
 def test_what_is_measured_and_refined_agrees(device):
-    near, far = (extract_isosurface(make_sphere(shift), 0.5, device) for shift in ((0, 0, 0), FAR))
+    near, far = (extract_isosurface(make_sphere(shift), 0.5, device=device) for shift in ((0, 0, 0), FAR))
     for one, other in ((near, far), *([(clrecon.decimate_mesh(clrecon.smooth_mesh(m), 0.7) for m in (near, far))])):
         assert other.vertices.dtype == np.float64
         expected, found = one.quality(), other.quality()

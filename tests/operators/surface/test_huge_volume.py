@@ -24,9 +24,9 @@ def peak_kib():
 path, device, budget = sys.argv[1], sys.argv[2], int(sys.argv[3])
 volume = clrecon.Volume(np.load(path, mmap_mode="r"), np.diag((0.2, 0.2, 0.2, 1.0)))
 small = clrecon.Volume(np.arange(1000, dtype=np.int16).reshape(10, 10, 10), np.eye(4))
-clrecon.extract_isosurface(small, 500, device)  # drivers and kernels are loaded
+clrecon.extract_isosurface(small, 500, device=device)  # drivers and kernels are loaded
 before = peak_kib()
-mesh = clrecon.extract_isosurface(volume, 500, device, memory=budget)
+mesh = clrecon.extract_isosurface(volume, 500, device=device, memory=budget)
 quality = mesh.quality()
 print(json.dumps({"grown_mib": (peak_kib() - before) / 1024, "slabs": mesh.report["slabs"],
                   "volume_ml": quality["volume_ml"], "closed": quality["closed"], "components": quality["components"]}))

@@ -23,7 +23,7 @@ from clrecon.reference.surface import extract as twin
 def test_device_equals_twin_at_word_borders(device, shape, closed):
     volume = random_volume(shape)
     vertices, normals, triangles = twin.extract_isosurface(volume, 3, closed=closed)
-    mesh = extract_isosurface(volume, 3, device, closed=closed)
+    mesh = extract_isosurface(volume, 3, device=device, closed=closed)
     assert np.array_equal(mesh.triangles, triangles)
     assert np.abs(volume.lps_to_ijk(mesh.vertices) - volume.lps_to_ijk(vertices)).max() <= tolerances.TWIN_VERTEX_VOXEL
     assert np.abs(mesh.normals - normals).max() <= tolerances.TWIN_NORMAL
@@ -35,7 +35,7 @@ def test_device_equals_twin_for_every_voxel_type(device, dtype, affine):
     volume = random_volume((6, 7, 37), dtype, high=100, affine=affine)
     for iso_value in (1, 40, 40.5, 99):
         vertices, normals, triangles = twin.extract_isosurface(volume, iso_value)
-        mesh = extract_isosurface(volume, iso_value, device)
+        mesh = extract_isosurface(volume, iso_value, device=device)
         assert np.array_equal(mesh.triangles, triangles)
         assert np.abs(mesh.vertices - vertices).max() <= tolerances.float32_unit(mesh.vertices)
         assert np.abs(mesh.normals - normals).max() <= tolerances.TWIN_NORMAL
@@ -48,7 +48,7 @@ def test_vertices_are_rounded_once(device, shape):
     awkward[3] = OBLIQUE[3]
     volume = random_volume(shape, affine=awkward)
     vertices = twin.extract_isosurface(volume, 3)[0]
-    error = np.abs(extract_isosurface(volume, 3, device).vertices - vertices).max()
+    error = np.abs(extract_isosurface(volume, 3, device=device).vertices - vertices).max()
     assert error <= tolerances.VERTEX_ROUNDING_UNITS * tolerances.float32_unit(vertices)
 
 
@@ -57,7 +57,7 @@ def test_checkerboards_have_the_normals_of_their_edges(device):
     k, j, i = np.indices((5, 6, 34))
     for voxels in ((i + j + k) % 2, i % 2, k % 2):
         volume = Volume(voxels.astype(np.int16), OBLIQUE)
-        mesh = extract_isosurface(volume, 1, device)
+        mesh = extract_isosurface(volume, 1, device=device)
         assert np.allclose(np.linalg.norm(mesh.normals, axis=1), 1.0, atol=1e-5)
         assert np.abs(mesh.normals - twin.extract_isosurface(volume, 1)[1]).max() <= tolerances.TWIN_NORMAL
 
@@ -65,8 +65,10 @@ def test_checkerboards_have_the_normals_of_their_edges(device):
 @pytest.mark.parametrize("scale", [1e-20, 1e-6, 1e6, 1e29])
 def test_the_scale_of_float_values_does_not_matter(device, scale):
     voxels = smooth_volume((9, 10, 40)).voxels.astype(np.float32)
-    expected = extract_isosurface(Volume(voxels, OBLIQUE), 100.0, device, closed=False)
-    mesh = extract_isosurface(Volume(voxels / 1000 * np.float32(scale), OBLIQUE), 0.1 * scale, device, closed=False)
+    expected = extract_isosurface(Volume(voxels, OBLIQUE), 100.0, device=device, closed=False)
+    mesh = extract_isosurface(
+        Volume(voxels / 1000 * np.float32(scale), OBLIQUE), 0.1 * scale, device=device, closed=False
+    )
     assert np.array_equal(mesh.triangles, expected.triangles)
     assert np.abs(mesh.normals - expected.normals).max() < 1e-3
     assert np.abs(mesh.vertices - expected.vertices).max() < 1e-3
@@ -77,7 +79,7 @@ def test_random_integers_at_every_iso_value_are_sound(device, high):
     for seed, shape in enumerate([(7, 9, 11), (5, 4, 35)]):
         volume = random_volume(shape, high=high, seed=seed)
         for iso_value in range(1, high):
-            assert_sound(extract_isosurface(volume, iso_value, device))
+            assert_sound(extract_isosurface(volume, iso_value, device=device))
 
 
 @pytest.mark.parametrize("high", [4096, 65536])
@@ -86,17 +88,17 @@ def test_steep_integers_far_from_the_origin_are_sound(device, high):
     affine = compose_affine((0.3, 0, 0), (0, 0.3, 0), (0, 0, 0.5), (-900, 900, 1800))
     volume = random_volume((9, 11, 40), "uint16", high, affine)
     for iso_value in (1, 2, high // 2, int(volume.voxels.max())):
-        assert_sound(extract_isosurface(volume, iso_value, device))
+        assert_sound(extract_isosurface(volume, iso_value, device=device))
 
 
 def test_floats_that_equal_the_iso_value_are_sound(device):
-    assert_sound(extract_isosurface(random_volume((7, 8, 40), "float32", 4), 2.0, device))
+    assert_sound(extract_isosurface(random_volume((7, 8, 40), "float32", 4), 2.0, device=device))
 
 
 @pytest.mark.parametrize("shape", [(1, 1, 1), (1, 5, 7), (4, 1, 40), (3, 4, 1), (2, 2, 2), (9, 10, 33)])
 def test_a_volume_that_is_all_inside_is_a_closed_box(device, shape):
     volume = Volume(np.full(shape, 700, np.int16), OBLIQUE)
-    mesh = extract_isosurface(volume, 300, device)
+    mesh = extract_isosurface(volume, 300, device=device)
     assert_sound(mesh)
     assert mesh.quality()["euler_number"] == 2
     low, high = volume.lps_to_ijk(mesh.vertices).min(axis=0), volume.lps_to_ijk(mesh.vertices).max(axis=0)
@@ -107,15 +109,15 @@ def test_a_volume_that_is_all_inside_is_a_closed_box(device, shape):
 def test_an_object_that_leaves_the_volume_is_closed_or_left_open(device):
     voxels = np.zeros((9, 9, 9), np.int16)
     voxels[:, 3:6, 3:6] = 100
-    closed = extract_isosurface(Volume(voxels, OBLIQUE), 50, device).quality()
-    opened = extract_isosurface(Volume(voxels, OBLIQUE), 50, device, closed=False).quality()
+    closed = extract_isosurface(Volume(voxels, OBLIQUE), 50, device=device).quality()
+    opened = extract_isosurface(Volume(voxels, OBLIQUE), 50, device=device, closed=False).quality()
     assert closed["closed"] and closed["boundary_edges"] == 0
     assert not opened["closed"] and opened["boundary_edges"] > 0 and opened["nonmanifold_edges"] == 0
 
 
 def test_the_order_is_the_same_on_every_run(device):
     volume = smooth_volume()
-    first, second = (extract_isosurface(volume, 100, device) for _ in range(2))
+    first, second = (extract_isosurface(volume, 100, device=device) for _ in range(2))
     assert np.array_equal(first.triangles, second.triangles)
     assert np.array_equal(first.vertices, second.vertices)
     assert np.array_equal(first.normals, second.normals)
@@ -123,7 +125,7 @@ def test_the_order_is_the_same_on_every_run(device):
 
 def test_normals_look_the_way_the_faces_do(device):
     for affine in (OBLIQUE, MIRRORED):
-        mesh = extract_isosurface(smooth_volume(affine=affine), 100, device)
+        mesh = extract_isosurface(smooth_volume(affine=affine), 100, device=device)
         corners = mesh.vertices.astype(np.float64)[mesh.triangles]
         faces = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         along = np.einsum("ij,ij->i", faces, mesh.normals.astype(np.float64)[mesh.triangles].sum(axis=1))
@@ -133,7 +135,7 @@ def test_normals_look_the_way_the_faces_do(device):
 
 def test_flips_and_permutations_of_the_index_axes_give_the_same_surface(device):
     volume = smooth_volume()
-    expected = extract_isosurface(volume, 100, device)
+    expected = extract_isosurface(volume, 100, device=device)
     tree = cKDTree(expected.vertices)
     for axes in [(0, 1, 2), (2, 1, 0), (1, 2, 0)]:
         for flipped in [(), (0,), (1, 2)]:
@@ -142,7 +144,7 @@ def test_flips_and_permutations_of_the_index_axes_give_the_same_surface(device):
             for axis in flipped:  # array axis a is index axis 2 - a
                 ijk[2 - axis, 2 - axis], ijk[2 - axis, 3] = -1.0, volume.voxels.shape[axis] - 1.0
             order = np.eye(4)[[*(2 - np.argsort(axes)[::-1]), 3]]
-            mesh = extract_isosurface(Volume(voxels, volume.affine @ ijk @ order), 100, device)
+            mesh = extract_isosurface(Volume(voxels, volume.affine @ ijk @ order), 100, device=device)
             assert len(mesh.vertices) == len(expected.vertices)
             assert tree.query(mesh.vertices)[0].max() <= tolerances.FRAME_MM
             assert mesh.quality()["volume_ml"] == pytest.approx(expected.quality()["volume_ml"], rel=1e-3)
@@ -152,7 +154,7 @@ def test_scikit_image_finds_the_same_points(device):
     from skimage.measure import marching_cubes
 
     volume = smooth_volume()
-    mesh = extract_isosurface(volume, 100, device)
+    mesh = extract_isosurface(volume, 100, device=device)
     padded = np.pad(volume.voxels, 1, constant_values=int(mesh.report["outside_hu"])).astype(np.float32)
     points, faces, _, _ = marching_cubes(padded, 99.5, method="lorensen")
     expected = volume.ijk_to_lps(points[:, ::-1] - 1.0)
@@ -164,7 +166,7 @@ def test_scikit_image_finds_the_same_points(device):
 def test_flying_edges_finds_the_same_points_and_as_many_triangles(device):
     pyvista = pytest.importorskip("pyvista")
     volume = smooth_volume()
-    mesh = extract_isosurface(volume, 100, device, closed=False)
+    mesh = extract_isosurface(volume, 100, device=device, closed=False)
     image = pyvista.ImageData(dimensions=volume.shape_ijk)
     image["hu"] = volume.voxels.ravel()
     contour = image.contour([99.5], method="flying_edges")
@@ -187,21 +189,21 @@ def _area(points, faces) -> float:
 def test_an_iso_value_outside_the_data_is_refused_with_the_range(device, iso_value, closed, where):
     volume = random_volume((5, 6, 7))
     with pytest.raises(NoSurfaceError, match=f"runs from 0 to 5 HU, the iso value lies {where}"):
-        extract_isosurface(volume, iso_value, device, closed=closed)
+        extract_isosurface(volume, iso_value, device=device, closed=closed)
 
 
 def test_values_that_cannot_be_used_are_refused(device):
     with pytest.raises(UsageError, match="finite"):
-        extract_isosurface(random_volume((3, 4, 5)), float("nan"), device)
+        extract_isosurface(random_volume((3, 4, 5)), float("nan"), device=device)
     with pytest.raises(NoSurfaceError, match="no cells"):
-        extract_isosurface(random_volume((1, 4, 5)), 3, device, closed=False)
+        extract_isosurface(random_volume((1, 4, 5)), 3, device=device, closed=False)
     with pytest.raises(UsageError, match="13,999 columns"):
-        extract_isosurface(Volume(np.zeros((1, 1, 13_999), np.int8), np.eye(4)), 1, device)
+        extract_isosurface(Volume(np.zeros((1, 1, 13_999), np.int8), np.eye(4)), 1, device=device)
 
 
 def test_only_volumes_have_surfaces(device):
     with pytest.raises(UsageError, match=r"needs a Volume, not ndarray: clrecon.Volume\(voxels, affine\)"):
-        extract_isosurface(np.zeros((3, 4, 5)), 1, device)
+        extract_isosurface(np.zeros((3, 4, 5)), 1, device=device)
 
 
 def test_a_device_that_finds_nothing_is_not_believed(device, monkeypatch):
@@ -214,7 +216,7 @@ def test_a_device_that_finds_nothing_is_not_believed(device, monkeypatch):
 
     monkeypatch.setattr(marching_cubes, "classify", find_nothing)
     with pytest.raises(DeviceError, match="it computes wrongly"):
-        extract_isosurface(random_volume((5, 6, 7)), 3, device)
+        extract_isosurface(random_volume((5, 6, 7)), 3, device=device)
     outcomes = {result["operator"]: result["passed"] for result in run_selftest(device)}
     assert [operator for operator, passed in outcomes.items() if not passed] == ["extract_isosurface"]
 
@@ -226,7 +228,7 @@ def test_every_variant_of_the_kernels_gives_the_same_mesh(device, lanes, words, 
     vertices, normals, triangles = twin.extract_isosurface(volume, 100)
     variants = {**device.kernel_variants, "LANES": lanes, "WORDS_PER_ITEM": words}
     monkeypatch.setattr(device, "kernel_variants", variants)
-    mesh = extract_isosurface(volume, 100, device)
+    mesh = extract_isosurface(volume, 100, device=device)
     assert np.array_equal(mesh.triangles, triangles)
     assert np.abs(mesh.vertices - vertices).max() <= tolerances.float32_unit(mesh.vertices)
     assert np.abs(mesh.normals - normals).max() <= tolerances.TWIN_NORMAL
@@ -234,15 +236,15 @@ def test_every_variant_of_the_kernels_gives_the_same_mesh(device, lanes, words, 
 
 def test_several_iso_values_are_as_each_alone(device):
     volume = smooth_volume()
-    meshes = extract_isosurfaces(volume, [100, -50.5, 100], device)
+    meshes = extract_isosurfaces(volume, [100, -50.5, 100], device=device)
     for mesh, iso_value in zip(meshes, [100, -50.5, 100], strict=True):
-        alone = extract_isosurface(volume, iso_value, device)
+        alone = extract_isosurface(volume, iso_value, device=device)
         assert mesh.report["iso_value_hu"] == iso_value
         assert np.array_equal(mesh.vertices, alone.vertices)
         assert np.array_equal(mesh.normals, alone.normals)
         assert np.array_equal(mesh.triangles, alone.triangles)
     with pytest.raises(UsageError, match="no iso value"):
-        extract_isosurfaces(volume, [], device)
+        extract_isosurfaces(volume, [], device=device)
 
 
 @pytest.mark.parametrize("dtype", ["int16", "int32", "float32"])
@@ -252,23 +254,23 @@ def test_the_values_of_a_resident_volume_are_looked_at_once(device, dtype, monke
         true_look = getattr(iso_rule, name)
         monkeypatch.setattr(iso_rule, name, lambda volume, look=true_look: looks.append(1) or look(volume))
     volume = Volume(smooth_volume().voxels.astype(dtype), OBLIQUE)
-    with SurfaceExtractor(volume, device) as extractor:
+    with SurfaceExtractor(volume, device=device) as extractor:
         meshes = [extractor.extract(iso_value) for iso_value in (50, 100, 150)]
     assert len(looks) == (2 if dtype == "int32" else 1)
     monkeypatch.undo()
-    assert np.array_equal(meshes[1].vertices, extract_isosurface(volume, 100, device).vertices)
+    assert np.array_equal(meshes[1].vertices, extract_isosurface(volume, 100, device=device).vertices)
 
 
 def test_the_volume_is_uploaded_once(device):
     volume = smooth_volume()
-    with DeviceVolume(volume, device) as resident, SurfaceExtractor(resident) as extractor:
+    with DeviceVolume(volume, device=device) as resident, SurfaceExtractor(resident) as extractor:
         for iso_value in (50, 100, 150):
             extractor.extract(iso_value)
         assert resident.uploaded_bytes == volume.voxels.nbytes
 
 
 def test_the_report_says_how_the_mesh_was_made(device):
-    mesh = extract_isosurface(random_volume((5, 6, 7)), 3, device)
+    mesh = extract_isosurface(random_volume((5, 6, 7)), 3, device=device)
     assert mesh.report["iso_value_hu"] == 3.0
     assert mesh.report["iso_level_hu"] == 2.5
     assert mesh.report["affine_ijk_to_lps_mm"] == OBLIQUE.tolist()
@@ -284,5 +286,5 @@ def test_every_pass_on_a_small_volume(device):
     """Small enough for a checking simulator: whole words, a word's rest, and rows shorter than a word."""
     for shape in [(3, 4, 33), (2, 3, 5)]:
         volume = random_volume(shape)
-        mesh = extract_isosurface(volume, 3, device)
+        mesh = extract_isosurface(volume, 3, device=device)
         assert np.array_equal(mesh.triangles, twin.extract_isosurface(volume, 3)[2])

@@ -65,7 +65,7 @@ def test_device_equals_twin(device, shape, closed):
         pytest.skip("an open map of one layer has no cells")
     affine = MIRRORED if shape[0] % 2 else OBLIQUE
     labels = random_labels(shape)
-    meshes = extract_label_masks(LabelMap(labels, affine), device, closed=closed)
+    meshes = extract_label_masks(LabelMap(labels, affine), device=device, closed=closed)
     enclosed = enclosed_levels(labels, meshes) if closed else {}
     assert tuple(meshes) == tuple(np.unique(labels[labels > 0]))
     for number, mesh in meshes.items():
@@ -85,14 +85,14 @@ def test_the_level_is_that_of_the_twin(device):
     labels = np.zeros((14, 15, 34), np.uint8)
     labels[:, :, 2:16][mask_of((14, 15, 14), 5.2)] = 1
     labels[:, :, 15:29][mask_of((14, 15, 14), 4.4)] = 2
-    meshes = extract_label_masks(LabelMap(labels, OBLIQUE), device)
+    meshes = extract_label_masks(LabelMap(labels, OBLIQUE), device=device)
     for number, mesh in meshes.items():  # sums of float32 may end on the other side of a whole number
         assert abs(mesh.report["mask_level"] * FULL - twin.choose_level(labels, OBLIQUE, number)) <= 2
 
 
 def test_the_levels_of_enclosed_labels_are_those_of_the_twin(device):
     labels = np.where(mask_of((12, 13, 14), 3.0), 2, mask_of((12, 13, 14), 5.2)).astype(np.uint8)
-    meshes = extract_label_masks(LabelMap(labels, OBLIQUE), device)
+    meshes = extract_label_masks(LabelMap(labels, OBLIQUE), device=device)
     levels = twin.choose_enclosed(labels, OBLIQUE)
     assert set(levels) == {1, 2}
     for number, mesh in meshes.items():
@@ -110,7 +110,7 @@ def test_boxes_are_those_of_the_voxels(device):
 def test_every_voxel_of_the_mask_is_inside_and_no_other(device):
     """Each edge between a voxel of the label and one without carries one vertex, within half a voxel of their face."""
     labels = random_labels((9, 8, 40))
-    for number, mesh in extract_label_masks(LabelMap(labels, np.eye(4)), device).items():
+    for number, mesh in extract_label_masks(LabelMap(labels, np.eye(4)), device=device).items():
         mask = np.pad(labels == number, 1)
         faces = []
         for axis in range(3):
@@ -126,7 +126,7 @@ def test_every_voxel_of_the_mask_is_inside_and_no_other(device):
 @pytest.mark.parametrize("radius", [3.2, 6.4, 12.1])
 def test_a_sphere_has_its_volume_and_no_steps(device, radius):
     labels = mask_of((29, 30, 31), radius).astype(np.uint8)
-    mesh = extract_label_masks(LabelMap(labels, np.eye(4)), device)[1]
+    mesh = extract_label_masks(LabelMap(labels, np.eye(4)), device=device)[1]
     assert abs(volume_share(mesh)) <= tolerances.MASK_VOLUME
     assert assert_sound(mesh)["components"] == 1
     centre = ((np.array(labels.shape) - 1) / 2 + (0.31, -0.17, 0.08))[::-1]
@@ -153,7 +153,7 @@ def test_surface_nets_are_smaller_bodies(device):
     nets.Update()
     points = vtk_to_numpy(nets.GetOutput().GetPoints().GetData())
     triangles = vtk_to_numpy(nets.GetOutput().GetPolys().GetConnectivityArray()).reshape(-1, 3).astype(np.uint32)
-    mesh = extract_label_masks(LabelMap(labels, np.eye(4)), device)[1]
+    mesh = extract_label_masks(LabelMap(labels, np.eye(4)), device=device)[1]
     theirs = 1000.0 * abs(enclosed_ml(points, triangles)) / np.count_nonzero(labels) - 1.0
     assert abs(volume_share(mesh)) < 0.1 * abs(theirs)
     distance, _ = cKDTree(points).query(mesh.vertices)
@@ -163,7 +163,7 @@ def test_surface_nets_are_smaller_bodies(device):
 def test_a_tilted_plane_has_no_steps(device):
     k, j, i = np.indices((24, 40, 40))
     labels = (k - 12 <= 0.2 * (i - 20) + 0.37 * (j - 20)).astype(np.uint8)
-    mesh = extract_label_masks(LabelMap(labels, np.eye(4)), device)[1]
+    mesh = extract_label_masks(LabelMap(labels, np.eye(4)), device=device)[1]
     inner = (np.abs(mesh.vertices[:, :2] - 20) < 12).all(axis=1) & (np.abs(mesh.vertices[:, 2] - 12) < 9)
     normal = np.array([-0.2, -0.37, 1.0]) / np.linalg.norm([0.2, 0.37, 1.0])
     angles = np.degrees(np.arccos(np.clip(mesh.normals[inner] @ normal, -1, 1)))
@@ -176,7 +176,7 @@ def test_a_tilted_plane_has_no_steps(device):
 def test_volumes_are_kept_on_any_grid(device, affine):
     labels = mask_of((17, 24, 26), 7.3).astype(np.uint8)
     labels[mask_of((17, 24, 26), 3.0)] = 2
-    for mesh in extract_label_masks(LabelMap(labels, affine), device, numbers=[1]).values():
+    for mesh in extract_label_masks(LabelMap(labels, affine), device=device, numbers=[1]).values():
         assert abs(volume_share(mesh)) <= tolerances.MASK_VOLUME
         assert_sound(mesh)
 
@@ -188,20 +188,20 @@ def test_thin_parts_and_single_voxels_are_not_lost(device):
     labels[9, 10, 30] = 3  # a voxel
     labels[2:9, 2:9, 25:32] = 4
     labels[5, 5, 32:38] = 4  # a body with a thread
-    for number, mesh in extract_label_masks(LabelMap(labels, OBLIQUE), device).items():
+    for number, mesh in extract_label_masks(LabelMap(labels, OBLIQUE), device=device).items():
         assert assert_sound(mesh)["components"] == 1, number
         assert abs(volume_share(mesh)) <= tolerances.MASK_VOLUME_THIN, number
 
 
 def test_the_end_of_the_map_is_flat(device):
     labels = np.ones((4, 5, 6), np.uint8)
-    mesh = extract_label_masks(LabelMap(labels, np.eye(4)), device)[1]
+    mesh = extract_label_masks(LabelMap(labels, np.eye(4)), device=device)[1]
     assert_sound(mesh)
     low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
     assert np.array_equal(low, [-0.5] * 3) and np.array_equal(high, [5.5, 4.5, 3.5])
     half = np.zeros((8, 20, 20), np.uint8)
     half[:, 5:15, 5:15] = 1  # a beam through all slices: its sides stay straight up to the ends
-    mesh = extract_label_masks(LabelMap(half, np.eye(4)), device)[1]
+    mesh = extract_label_masks(LabelMap(half, np.eye(4)), device=device)[1]
     sides = [mesh.vertices[np.abs(mesh.vertices[:, 2] - k) < 1e-4] for k in (0, 4, 7)]
     for side in sides[1:]:
         assert np.abs(np.sort(side[:, :2], axis=0) - np.sort(sides[0][:, :2], axis=0)).max() < 1e-4
@@ -232,7 +232,7 @@ def test_touching_labels_share_their_border(device):
     labels = np.zeros(shape, np.uint8)
     labels[5:16, 6:18, 4:20] = 1
     labels[5:16, 6:18, 20:33] = 2
-    meshes = extract_label_masks(LabelMap(labels, OBLIQUE), device)
+    meshes = extract_label_masks(LabelMap(labels, OBLIQUE), device=device)
     shared = {row.tobytes() for row in meshes[1].vertices} & {row.tobytes() for row in meshes[2].vertices}
     assert len(shared) == 11 * 12
     pairs, edges = cancelled_pairs(meshes.values())
@@ -247,7 +247,7 @@ def test_a_curved_border_is_shared_to_the_last_triangle(device):
     shape = (26, 28, 40)
     inner = mask_of(shape, 8.0)
     labels = np.where(inner, 2, mask_of(shape, 12.0)).astype(np.uint8)
-    meshes = extract_label_masks(LabelMap(labels, OBLIQUE), device)
+    meshes = extract_label_masks(LabelMap(labels, OBLIQUE), device=device)
     pairs, edges = cancelled_pairs(meshes.values())
     assert pairs == len(meshes[2].triangles)  # all of the inner label
     assert all(edges.get((b, a), 0) == count for (a, b), count in edges.items())
@@ -258,12 +258,12 @@ def test_a_label_that_another_encloses_keeps_its_volume(device, radius):
     """5 % short of it at the middle between both, with a radius of 8 voxels."""
     shape = (26, 28, 40)
     labels = np.where(mask_of(shape, radius), 2, mask_of(shape, 12.0)).astype(np.uint8)
-    meshes = extract_label_masks(LabelMap(labels, OBLIQUE), device)
+    meshes = extract_label_masks(LabelMap(labels, OBLIQUE), device=device)
     for mesh in meshes.values():
         assert abs(volume_share(mesh)) <= tolerances.MASK_VOLUME
         assert_sound(mesh)
     assert meshes[2].report["mask_level"] < meshes[1].report["mask_level"] - 0.05
-    alone = extract_label_masks(LabelMap(labels, OBLIQUE), device, numbers=[2])[2]
+    alone = extract_label_masks(LabelMap(labels, OBLIQUE), device=device, numbers=[2])[2]
     assert np.array_equal(alone.vertices, meshes[2].vertices)
 
 
@@ -278,7 +278,7 @@ def cells_of(shape, count, kept=1.0) -> np.ndarray:
 def test_cells_that_enclose_each_other_keep_their_volumes(device):
     labels = cells_of((24, 30, 36), 30, kept=0.6)
     assert (count_faces(labels)[:, 1] > count_faces(labels)[:, 0]).sum() >= 5
-    for mesh in extract_label_masks(LabelMap(labels, MIRRORED), device).values():
+    for mesh in extract_label_masks(LabelMap(labels, MIRRORED), device=device).values():
         assert abs(volume_share(mesh)) <= tolerances.MASK_VOLUME
         assert_sound(mesh)
 
@@ -287,7 +287,7 @@ def test_cells_that_fill_a_map_lack_the_same_share(device):
     """What notches between three of them take, no level brings back."""
     shares = [
         volume_share(mesh)
-        for mesh in extract_label_masks(LabelMap(cells_of((20, 24, 28), 8), OBLIQUE), device).values()
+        for mesh in extract_label_masks(LabelMap(cells_of((20, 24, 28), 8), OBLIQUE), device=device).values()
     ]
     assert -tolerances.MASK_VOLUME_FILLED < min(shares) and max(shares) < 0
     assert np.ptp(shares) <= tolerances.MASK_VOLUME
@@ -297,13 +297,13 @@ def test_no_groove_runs_along_the_border_and_gaps_stay_open(device):
     shape = (16, 30, 40)
     labels = np.zeros(shape, np.uint8)
     labels[:8, :, :20], labels[:8, :, 20:] = 1, 2
-    meshes = extract_label_masks(LabelMap(labels, np.eye(4)), device)
+    meshes = extract_label_masks(LabelMap(labels, np.eye(4)), device=device)
     for mesh in meshes.values():
         top = mesh.vertices[mesh.vertices[:, 2] > 7.001]
         assert np.ptp(top[:, 2]) < 0.02
     labels[:] = 0
     labels[:8, 2:-2, 2:-2], labels[9:, 2:-2, 2:-2] = 1, 2  # one voxel of nothing between them
-    meshes = extract_label_masks(LabelMap(labels, np.eye(4)), device)
+    meshes = extract_label_masks(LabelMap(labels, np.eye(4)), device=device)
     inner = [mesh.vertices[(np.abs(mesh.vertices[:, :2] - (19.5, 14.5)) < 8).all(axis=1)] for mesh in meshes.values()]
     gap = inner[1][:, 2][inner[1][:, 2] < 10].min() - inner[0][:, 2].max()
     assert 0.7 < gap < 1.3
@@ -311,9 +311,9 @@ def test_no_groove_runs_along_the_border_and_gaps_stay_open(device):
 
 def test_one_label_alone_is_the_same_as_among_others(device):
     labels = random_labels((20, 9, 40), numbers=(0, 0, 3, 7, 9))
-    together = extract_label_masks(LabelMap(labels, OBLIQUE), device)
+    together = extract_label_masks(LabelMap(labels, OBLIQUE), device=device)
     for number in (7, 9):
-        alone = extract_label_masks(LabelMap(labels, OBLIQUE), device, numbers=[number])[number]
+        alone = extract_label_masks(LabelMap(labels, OBLIQUE), device=device, numbers=[number])[number]
         assert np.array_equal(alone.vertices, together[number].vertices)
         assert np.array_equal(alone.normals, together[number].normals)
         assert np.array_equal(alone.triangles, together[number].triangles)
@@ -322,25 +322,25 @@ def test_one_label_alone_is_the_same_as_among_others(device):
 def test_labels_that_do_not_fit_together_go_through_one_by_one(device):
     labels = np.zeros((60, 40, 40), np.uint16)
     labels[:6], labels[28:31], labels[55:] = 3, 7, 9
-    expected = extract_label_masks(LabelMap(labels, OBLIQUE), device)
-    meshes = extract_label_masks(LabelMap(labels, OBLIQUE), device, memory=600_000)
+    expected = extract_label_masks(LabelMap(labels, OBLIQUE), device=device)
+    meshes = extract_label_masks(LabelMap(labels, OBLIQUE), device=device, memory=600_000)
     for number, mesh in meshes.items():
         assert mesh.report["slabs"] == 3 and sum(mesh.report["device_bytes"].values()) <= 600_000
         assert expected[number].report["slabs"] == 1
         assert np.array_equal(mesh.vertices, expected[number].vertices)
         assert np.array_equal(mesh.triangles, expected[number].triangles)
     with pytest.raises(DeviceError, match="are allowed on"):
-        extract_label_masks(LabelMap(labels, OBLIQUE), device, memory=50_000)
+        extract_label_masks(LabelMap(labels, OBLIQUE), device=device, memory=50_000)
 
 
 @pytest.mark.first_device  # the same lines as without labels, which every device builds with "1", "1"
 @pytest.mark.parametrize(("lanes", "words"), [("1", "1"), ("8", "3")])
 def test_every_variant_of_the_kernels_gives_the_same_meshes(device, lanes, words, monkeypatch):
     labels = random_labels((6, 7, 75), numbers=(0, 0, 3, 7)).astype(np.uint8)
-    expected = extract_label_masks(LabelMap(labels, MIRRORED), device)
+    expected = extract_label_masks(LabelMap(labels, MIRRORED), device=device)
     variants = {**device.kernel_variants, "LANES": lanes, "WORDS_PER_ITEM": words}
     monkeypatch.setattr(device, "kernel_variants", variants)
-    for number, mesh in extract_label_masks(LabelMap(labels, MIRRORED), device).items():
+    for number, mesh in extract_label_masks(LabelMap(labels, MIRRORED), device=device).items():
         assert np.array_equal(mesh.triangles, expected[number].triangles)
         assert np.abs(mesh.vertices - expected[number].vertices).max() <= tolerances.TWIN_VERTEX_VOXEL
 
@@ -348,7 +348,7 @@ def test_every_variant_of_the_kernels_gives_the_same_meshes(device, lanes, words
 def test_the_report_says_what_was_done(device):
     labels = mask_of((9, 9, 9), 3.0).astype(np.uint8)
     label_map = LabelMap(labels, np.diag([1.0, 1.0, 2.0, 1.0]), {1: "lung"}, warnings=["doubtful"])
-    mesh = extract_label_masks(label_map, device, numbers=["lung"])[1]
+    mesh = extract_label_masks(label_map, device=device, numbers=["lung"])[1]
     assert mesh.report["label"] == 1 and mesh.report["label_name"] == "lung" and mesh.report["surface"] == "mask"
     assert mesh.report["label_ml"] == pytest.approx(np.count_nonzero(labels) * 0.002)
     assert 0.3 < mesh.report["mask_level"] < 0.5
@@ -359,16 +359,16 @@ def test_the_report_says_what_was_done(device):
 def test_what_cannot_be_is_refused(device):
     labels = LabelMap(np.ones((2, 3, 4), np.uint8), np.eye(4))
     with pytest.raises(UsageError, match="need a LabelMap"):
-        extract_label_masks(labels.voxels, device)
+        extract_label_masks(labels.voxels, device=device)
     with pytest.raises(RefusedInputError, match="the label map is empty"):
-        extract_label_masks(LabelMap(np.zeros((2, 3, 4), np.uint8), np.eye(4)), device)
+        extract_label_masks(LabelMap(np.zeros((2, 3, 4), np.uint8), np.eye(4)), device=device)
     with pytest.raises(UsageError, match="label '9' is not in the label map"):
-        extract_label_masks(labels, device, numbers=[9])
+        extract_label_masks(labels, device=device, numbers=[9])
 
 
 @pytest.mark.oclgrind
 def test_every_pass_on_a_small_map(device):
     labels = random_labels((4, 4, 37))
-    for number, mesh in extract_label_masks(LabelMap(labels, OBLIQUE), device).items():
+    for number, mesh in extract_label_masks(LabelMap(labels, OBLIQUE), device=device).items():
         level = round(mesh.report["mask_level"] * FULL)
         assert np.array_equal(mesh.triangles, twin.extract_label_mask(labels, OBLIQUE, number, level)[2])

@@ -63,7 +63,9 @@ def test_device_equals_twin(device, shape, solid, closed):
     volume, labels = random_volume(shape), random_labels(shape)
     numbers = (3, 7, 300)
     inside = twin.find_solid(volume, labels, 3, grow_mm=1.2, closed=closed, solid=numbers if solid else ())
-    meshes = extract_labels(volume, LabelMap(labels, OBLIQUE), 3, device, grow_mm=1.2, closed=closed, solid=solid)
+    meshes = extract_labels(
+        volume, LabelMap(labels, OBLIQUE), 3, device=device, grow_mm=1.2, closed=closed, solid=solid
+    )
     assert tuple(meshes) == numbers
     for number, mesh in meshes.items():
         assert_equals_twin(mesh, volume, inside, number, 3, closed)
@@ -78,7 +80,7 @@ def test_device_equals_twin_for_every_voxel_type(device, dtype):
     volume, labels = random_volume(shape, dtype, MIRRORED, high=100), random_labels(shape)
     for iso_value in (40, 40.3):
         inside = twin.find_solid(volume, labels, iso_value)
-        for number, mesh in extract_labels(volume, LabelMap(labels, MIRRORED), iso_value, device).items():
+        for number, mesh in extract_labels(volume, LabelMap(labels, MIRRORED), iso_value, device=device).items():
             assert_equals_twin(mesh, volume, inside, number, iso_value)
 
 
@@ -91,7 +93,7 @@ def test_every_variant_of_the_kernels_gives_the_same_meshes(device, lanes, words
     variants = {**device.kernel_variants, "LANES": lanes, "WORDS_PER_ITEM": words}
     monkeypatch.setattr(device, "kernel_variants", variants)
     label_map = LabelMap(labels.astype(np.uint8 if max(numbers) < 256 else np.uint16), MIRRORED)
-    for number, mesh in extract_labels(volume, label_map, 3, device).items():
+    for number, mesh in extract_labels(volume, label_map, 3, device=device).items():
         assert_equals_twin(mesh, volume, inside, number, 3)
 
 
@@ -104,7 +106,7 @@ def test_growth_is_that_of_the_twin_to_the_last_sample(device, grow_mm):
             growth = Growth.of(volume, grow_mm)
             rule = choose_iso_rule(volume, 3)
             taken = resample_labels(LabelMap(labels, affine), volume)
-            run = operator._Run(DeviceVolume(volume, device), taken, rule, growth, False)
+            run = operator._Run(DeviceVolume(volume, device=device), taken, rule, growth, False)
             held = run.find_inside({1: tuple(slice(0, n) for n in shape)})
             inside = operator.download(device, np.empty_like(taken.voxels), held.inside_d)
             assert np.array_equal(inside, twin.find_solid(volume, labels, 3, grow_mm=grow_mm))
@@ -113,7 +115,7 @@ def test_growth_is_that_of_the_twin_to_the_last_sample(device, grow_mm):
 def test_labels_are_closed_manifold_and_share_their_border(device):
     shape = (12, 13, 40)
     volume, labels = random_volume(shape, high=9), random_labels(shape)
-    meshes = extract_labels(volume, LabelMap(labels, OBLIQUE), 2.3, device)
+    meshes = extract_labels(volume, LabelMap(labels, OBLIQUE), 2.3, device=device)
     points = {}
     for number, mesh in meshes.items():
         quality = mesh.quality()
@@ -134,9 +136,9 @@ def test_one_label_alone_is_the_same_as_among_others(device):
     shape = (20, 9, 40)
     volume, labels = random_volume(shape), np.zeros(shape, np.uint16)
     labels[2:6], labels[6:13, 2:], labels[15:] = 3, 7, 9
-    together = extract_labels(volume, LabelMap(labels, OBLIQUE), 3, device)
+    together = extract_labels(volume, LabelMap(labels, OBLIQUE), 3, device=device)
     for number in (7, 9):
-        alone = extract_labels(volume, LabelMap(labels, OBLIQUE), 3, device, numbers=[number])[number]
+        alone = extract_labels(volume, LabelMap(labels, OBLIQUE), 3, device=device, numbers=[number])[number]
         assert np.array_equal(alone.vertices, together[number].vertices)
         assert np.array_equal(alone.normals, together[number].normals)
         assert np.array_equal(alone.triangles, together[number].triangles)
@@ -146,8 +148,8 @@ def test_a_label_of_everything_is_the_plain_surface(device):
     for closed in (True, False):
         volume = random_volume((9, 8, 45))
         labels = LabelMap(np.ones(volume.voxels.shape, np.uint8), OBLIQUE)
-        plain = extract_isosurface(volume, 3, device, closed=closed)
-        mesh = extract_labels(volume, labels, 3, device, closed=closed)[1]
+        plain = extract_isosurface(volume, 3, device=device, closed=closed)
+        mesh = extract_labels(volume, labels, 3, device=device, closed=closed)[1]
         assert np.array_equal(mesh.vertices, plain.vertices)
         assert np.array_equal(mesh.normals, plain.normals)
         assert np.array_equal(mesh.triangles, plain.triangles)
@@ -158,11 +160,11 @@ def test_labels_that_do_not_fit_together_go_through_one_by_one(device, monkeypat
     shape = (60, 40, 40)
     volume, labels = random_volume(shape), np.zeros(shape, np.uint16)
     labels[:6], labels[28:31], labels[55:] = 3, 7, 9
-    expected = extract_labels(volume, LabelMap(labels, OBLIQUE), 3, device, solid=True)
+    expected = extract_labels(volume, LabelMap(labels, OBLIQUE), 3, device=device, solid=True)
     uploads, true_upload = [], operator.upload
     for module in (operator, device_volume):
         monkeypatch.setattr(module, "upload", lambda d, a: uploads.append(a.shape) or true_upload(d, a))
-    meshes = extract_labels(volume, LabelMap(labels, OBLIQUE), 3, device, solid=True, memory=500_000)
+    meshes = extract_labels(volume, LabelMap(labels, OBLIQUE), 3, device=device, solid=True, memory=500_000)
     assert sum(len(shape) == 3 and shape[1:] == (40, 40) for shape in uploads) == 9  # three for each label
     for number, mesh in meshes.items():
         assert mesh.report["slabs"] == 3 and sum(mesh.report["device_bytes"].values()) <= 500_000
@@ -171,21 +173,21 @@ def test_labels_that_do_not_fit_together_go_through_one_by_one(device, monkeypat
         assert np.array_equal(mesh.normals, expected[number].normals)
         assert np.array_equal(mesh.triangles, expected[number].triangles)
     with pytest.raises(DeviceError, match="are allowed on"):
-        extract_labels(volume, LabelMap(labels, OBLIQUE), 3, device, memory=50_000)
+        extract_labels(volume, LabelMap(labels, OBLIQUE), 3, device=device, memory=50_000)
 
 
 def test_labels_on_another_grid_are_the_same_where_it_covers_the_volume(device):
     volume, labels = random_volume((6, 7, 33)), random_labels((6, 7, 33))
     turned = OBLIQUE @ np.array([[0, 0, 1, 0], [0, -1, 0, 6], [1, 0, 0, 0], [0, 0, 0, 1.0]])
-    expected = extract_labels(volume, LabelMap(labels, OBLIQUE), 3, device)
-    meshes = extract_labels(volume, LabelMap(labels[:, ::-1].transpose(2, 1, 0), turned), 3, device)
+    expected = extract_labels(volume, LabelMap(labels, OBLIQUE), 3, device=device)
+    meshes = extract_labels(volume, LabelMap(labels[:, ::-1].transpose(2, 1, 0), turned), 3, device=device)
     assert all(np.array_equal(meshes[n].vertices, expected[n].vertices) for n in expected)
 
 
 def test_the_report_says_what_was_done(device):
     volume, labels = random_volume((5, 7, 9)), random_labels((5, 7, 9))
     label_map = LabelMap(labels, OBLIQUE, {3: "vertebrae_T12"}, warnings=["doubtful"])
-    mesh = extract_labels(volume, label_map, 3, device, numbers=["T12"])[3]
+    mesh = extract_labels(volume, label_map, 3, device=device, numbers=["T12"])[3]
     assert mesh.report["label"] == 3 and mesh.report["label_name"] == "vertebrae_T12"
     assert mesh.report["label_inside_share"] == 1.0 and mesh.report["solid"] is False
     assert mesh.report["grow_mm"] is None
@@ -198,7 +200,7 @@ def test_a_label_that_leaves_the_volume_is_said(device):
     volume = random_volume((5, 7, 9))
     shifted = OBLIQUE.copy()
     shifted[:, 3] = OBLIQUE @ (0, 0, 3, 1)
-    mesh = extract_labels(volume, LabelMap(np.full((5, 7, 9), 2), shifted), 3, device)[2]
+    mesh = extract_labels(volume, LabelMap(np.full((5, 7, 9), 2), shifted), 3, device=device)[2]
     assert "60 % of label 2 lie outside the CT" in mesh.report["warnings"][-1]
     assert mesh.quality()["closed"]
 
@@ -208,35 +210,35 @@ def test_labels_without_a_surface_are_refused_or_left_out(device):
     labels[0], labels[3:] = 2, 5
     volume.voxels[:3] = 1
     label_map = LabelMap(labels, OBLIQUE, {2: "liver"})
-    assert tuple(extract_labels(volume, label_map, 3, device)) == (5,)
+    assert tuple(extract_labels(volume, label_map, 3, device=device)) == (5,)
     with pytest.raises(NoSurfaceError, match="no surface of label 2 liver at 3 HU: its voxels run from 1 to 1 HU"):
-        extract_labels(volume, label_map, 3, device, numbers=[5, 2])
+        extract_labels(volume, label_map, 3, device=device, numbers=[5, 2])
     with pytest.raises(NoSurfaceError, match="no label has a voxel of 6 HU or more"):
-        extract_labels(volume, label_map, 6, device)
+        extract_labels(volume, label_map, 6, device=device)
     with pytest.raises(UsageError, match="label '9' is not in the label map; there are: 2 liver, 5 label_5"):
-        extract_labels(volume, label_map, 3, device, numbers=[9])
+        extract_labels(volume, label_map, 3, device=device, numbers=[9])
     with pytest.raises(UsageError, match="at least one label"):
-        extract_labels(volume, label_map, 3, device, numbers=[])
+        extract_labels(volume, label_map, 3, device=device, numbers=[])
     far = OBLIQUE.copy()
     far[0, 3] += 1000
     with pytest.raises(RefusedInputError, match="0 % of the labels"):
-        extract_labels(volume, LabelMap(labels, far), 3, device)
+        extract_labels(volume, LabelMap(labels, far), 3, device=device)
 
 
 def test_a_label_outside_the_volume_is_refused_when_asked_for(device):
     volume, labels = random_volume((5, 7, 9)), np.zeros((10, 7, 9), np.uint8)
     labels[:5], labels[8:] = 2, 4
     label_map = LabelMap(labels, OBLIQUE)
-    assert tuple(extract_labels(volume, label_map, 3, device)) == (2,)
+    assert tuple(extract_labels(volume, label_map, 3, device=device)) == (2,)
     with pytest.raises(NoSurfaceError, match="label 4 label_4 has no voxel in the CT: it lies outside"):
-        extract_labels(volume, label_map, 3, device, numbers=[4])
+        extract_labels(volume, label_map, 3, device=device, numbers=[4])
 
 
 @pytest.mark.oclgrind
 def test_every_pass_on_a_small_volume(device):
     volume, labels = random_volume((4, 4, 33)), random_labels((4, 4, 33))
     inside = twin.find_solid(volume, labels, 3, grow_mm=1.2)
-    for number, mesh in extract_labels(volume, LabelMap(labels, OBLIQUE), 3, device, grow_mm=1.2).items():
+    for number, mesh in extract_labels(volume, LabelMap(labels, OBLIQUE), 3, device=device, grow_mm=1.2).items():
         assert np.array_equal(mesh.triangles, twin.extract_label(volume, inside, number, 3)[2])
 
 
@@ -246,7 +248,7 @@ def test_a_label_without_growth_between_other_slices(device):
     volume, labels = random_volume((12, 4, 33)), np.zeros((12, 4, 33), np.uint16)
     labels[4:6] = 3
     inside = twin.find_solid(volume, labels, 3, grow_mm=0)
-    mesh = extract_labels(volume, LabelMap(labels, OBLIQUE), 3, device, grow_mm=0)[3]
+    mesh = extract_labels(volume, LabelMap(labels, OBLIQUE), 3, device=device, grow_mm=0)[3]
     assert np.array_equal(mesh.triangles, twin.extract_label(volume, inside, 3, 3)[2])
 
 
@@ -257,7 +259,8 @@ def test_a_real_vertebra_is_sound(device, real_data):
     folder = real_data / "thoracolumbar_labels"
     volume, labels = read_volume(folder / "ct_2mm_jpeg2000"), read_labels(folder / "ct_2mm_labels.nii.gz")
     hollow, full = (
-        extract_labels(volume, labels, 200, device, numbers=["T12", "T11"], solid=solid) for solid in (False, True)
+        extract_labels(volume, labels, 200, device=device, numbers=["T12", "T11"], solid=solid)
+        for solid in (False, True)
     )
     for mesh in (*hollow.values(), *full.values()):
         assert mesh.quality()["closed"] and mesh.quality()["manifold"]

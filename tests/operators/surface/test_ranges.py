@@ -23,7 +23,7 @@ CASES = [((30, 60), {}), ((30.5, 60.2), {}), ((-5, 40), {}), ((50, 300_000), {})
 
 def assert_equals_twin(volume, level, device, **options) -> None:
     vertices, normals, triangles = twin.extract_isosurface(volume, level, **options)
-    mesh = extract_isosurface(volume, level, device, **options)
+    mesh = extract_isosurface(volume, level, device=device, **options)
     assert np.array_equal(mesh.triangles, triangles)
     assert np.abs(volume.lps_to_ijk(mesh.vertices) - volume.lps_to_ijk(vertices)).max() <= tolerances.TWIN_VERTEX_VOXEL
     assert np.abs(mesh.normals - normals).max() <= tolerances.TWIN_CELL_NORMAL
@@ -61,24 +61,24 @@ def test_random_integers_in_every_range_are_sound(device, high):
     for seed, shape in enumerate([(7, 9, 11), (5, 4, 35)]):
         volume = random_volume(shape, high=high, seed=seed)
         for low in range(1, high):
-            assert_sound(extract_isosurface(volume, low, device, below=True))
-            assert_sound(extract_isosurface(volume, low, device, below=True, topology="trilinear"))
-            assert_sound(extract_isosurface(volume, (low - 0.5, low + 0.5), device))
-            assert_sound(extract_isosurface(volume, (low, low + 1), device))
+            assert_sound(extract_isosurface(volume, low, device=device, below=True))
+            assert_sound(extract_isosurface(volume, low, device=device, below=True, topology="trilinear"))
+            assert_sound(extract_isosurface(volume, (low - 0.5, low + 0.5), device=device))
+            assert_sound(extract_isosurface(volume, (low, low + 1), device=device))
 
 
 def test_random_floats_in_ranges_are_sound(device):
     volume = random_volume((7, 8, 40), "float32", 4)
     for low, high in [(1.0, 2.0), (0.5, 2.0), (1.0, 2.5), (0.0, 1.0)]:
-        assert_sound(extract_isosurface(volume, (low, high), device))
+        assert_sound(extract_isosurface(volume, (low, high), device=device))
 
 
 @pytest.mark.parametrize("dtype", ["int16", "float32"])
 @pytest.mark.parametrize("topology", ["separated", "trilinear"])
 def test_below_is_the_surface_of_the_iso_value_turned_round(device, dtype, topology):
     volume = random_volume((7, 9, 40), dtype, high=50)
-    above = extract_isosurface(volume, 20, device, closed=False, topology=topology)
-    below = extract_isosurface(volume, 20, device, closed=False, topology=topology, below=True)
+    above = extract_isosurface(volume, 20, device=device, closed=False, topology=topology)
+    below = extract_isosurface(volume, 20, device=device, closed=False, topology=topology, below=True)
     assert np.array_equal(below.vertices, above.vertices)
     assert np.array_equal(below.triangles, above.triangles[:, ::-1])
     assert np.array_equal(below.normals, -above.normals)
@@ -87,9 +87,9 @@ def test_below_is_the_surface_of_the_iso_value_turned_round(device, dtype, topol
 def test_a_range_has_the_vertices_of_both_its_ends(device):
     """In a smooth field no edge jumps across the range, so it has all of them."""
     volume = smooth_volume()
-    mesh = extract_isosurface(volume, (-200, 400), device, closed=False)
-    lower = extract_isosurface(volume, -200, device, closed=False)
-    upper = extract_isosurface(volume, 401, device, closed=False)
+    mesh = extract_isosurface(volume, (-200, 400), device=device, closed=False)
+    lower = extract_isosurface(volume, -200, device=device, closed=False)
+    upper = extract_isosurface(volume, 401, device=device, closed=False)
     jumping = len(rows_of(lower.vertices) | rows_of(upper.vertices)) - len(rows_of(mesh.vertices))
     assert rows_of(mesh.vertices) <= rows_of(lower.vertices) | rows_of(upper.vertices)
     assert jumping == 0
@@ -103,14 +103,14 @@ def test_an_edge_crosses_the_end_that_its_outer_voxel_lies_beyond(device):
     """Also where the inner voxel is nearer the other end: 110 of 100 to 300 beside 500, and beside 0."""
     voxels = np.zeros((3, 3, 5), np.int16)
     voxels[1, 1] = (0, 0, 110, 500, 500)
-    mesh = extract_isosurface(Volume(voxels, np.eye(4)), (100, 300), device)
+    mesh = extract_isosurface(Volume(voxels, np.eye(4)), (100, 300), device=device)
     along = mesh.vertices[(mesh.vertices[:, 1:] == 1.0).all(axis=1), 0]
     assert sorted(along) == pytest.approx([1.0 + 99.5 / 110.0, 2.0 + (300.5 - 110.0) / 390.0], abs=1e-6)
 
 
 def test_a_shell_between_two_spheres_has_their_volume(device):
     volume = ball(12.0)  # values are the depth under the surface of radius 12
-    found = extract_isosurface(volume, (2.0, 7.0), device).quality()
+    found = extract_isosurface(volume, (2.0, 7.0), device=device).quality()
     assert found["components"] == 2
     assert found["outward"]
     truth = 4.0 / 3.0 * np.pi * (10.0**3 - 5.0**3) * 0.7 * 0.5 * 0.9 / 1000.0
@@ -122,8 +122,10 @@ def test_what_is_below_and_what_is_above_fill_the_box(device, dtype):
     field = 100.0 * np.maximum(ball(10.0).voxels, -2.0)
     volume = Volume(field.astype(dtype), np.diag((0.7, 0.5, 0.9, 1.0)))
     empty = volume.with_voxels(np.full_like(volume.voxels, -200))
-    parts = [extract_isosurface(volume, 100, device, below=below).quality()["volume_ml"] for below in (False, True)]
-    box = extract_isosurface(empty, 100, device, below=True).quality()["volume_ml"]
+    parts = [
+        extract_isosurface(volume, 100, device=device, below=below).quality()["volume_ml"] for below in (False, True)
+    ]
+    box = extract_isosurface(empty, 100, device=device, below=True).quality()["volume_ml"]
     assert sum(parts) == pytest.approx(box, rel=1e-5)
     steps = 33**3 * 0.7 * 0.5 * 0.9 / 1000.0
     assert box == pytest.approx(steps, rel=2e-3)  # half a voxel beyond the last ones, edges and corners cut off
@@ -133,7 +135,7 @@ def test_what_is_below_and_what_is_above_fill_the_box(device, dtype):
 @pytest.mark.parametrize("dtype", ["int16", "uint8", "float32"])
 def test_slabs_of_any_thickness_give_the_same_mesh(device, dtype, level, options):
     volume = random_volume((9, 7, 40), dtype, affine=MIRRORED if dtype == "uint8" else OBLIQUE)
-    expected = extract_isosurface(volume, level, device, **options)
+    expected = extract_isosurface(volume, level, device=device, **options)
     for slices in (1, 2, 3, 5):
         mesh = extract_in_slabs(volume, level, device, slices, **options)
         assert mesh.report["slabs"] == -(-11 // slices)
@@ -152,9 +154,11 @@ def test_uneven_slices_equal_the_twin(device):
 def test_a_resident_volume_gives_the_same_in_any_order(device):
     volume = smooth_volume()
     asked = [(100, {}), ((-50, 120), {}), (-50, {"below": True}), (100, {}), ((-50, 120), {})]
-    with SurfaceExtractor(volume, device) as extractor:
+    with SurfaceExtractor(volume, device=device) as extractor:
         for level, options in asked:
-            assert_same(extractor.extract(level, **options), extract_isosurface(volume, level, device, **options))
+            assert_same(
+                extractor.extract(level, **options), extract_isosurface(volume, level, device=device, **options)
+            )
 
 
 @pytest.mark.first_device
@@ -167,10 +171,10 @@ def test_the_variant_of_gpus_gives_the_same_mesh(device, monkeypatch):
 
 def test_the_scale_of_float_values_does_not_matter(device):
     voxels = smooth_volume((9, 10, 40)).voxels.astype(np.float32)
-    expected = extract_isosurface(Volume(voxels, OBLIQUE), (-100.0, 100.0), device)
-    scaled = extract_isosurface(Volume(voxels * np.float32(2.0**80), OBLIQUE), (-100 * 2.0**80, 100 * 2.0**80), device,
-                                closed=False)  # fmt: skip
-    opened = extract_isosurface(Volume(voxels, OBLIQUE), (-100.0, 100.0), device, closed=False)
+    expected = extract_isosurface(Volume(voxels, OBLIQUE), (-100.0, 100.0), device=device)
+    large = Volume(voxels * np.float32(2.0**80), OBLIQUE)
+    scaled = extract_isosurface(large, (-100 * 2.0**80, 100 * 2.0**80), device=device, closed=False)
+    opened = extract_isosurface(Volume(voxels, OBLIQUE), (-100.0, 100.0), device=device, closed=False)
     assert np.array_equal(scaled.vertices, opened.vertices)
     assert np.abs(scaled.normals - opened.normals).max() < 1e-5
     assert expected.triangle_count > opened.triangle_count
@@ -179,7 +183,7 @@ def test_the_scale_of_float_values_does_not_matter(device):
 @pytest.mark.parametrize(("level", "options"), [((-100, 150), {}), (100, {"below": True})])
 def test_distances_are_those_to_the_nearer_end(device, level, options):
     volume = smooth_volume()
-    mesh = extract_isosurface(volume, level, device, **options)
+    mesh = extract_isosurface(volume, level, device=device, **options)
     found = measure_iso_distance(mesh, volume, rule_of_report(mesh.report))
     assert found["vertices_voxel"]["max"] < 1e-3
     assert found["not_found"] < 0.01 * found["samples"]["centres"]
@@ -198,21 +202,21 @@ def test_distances_are_those_to_the_nearer_end(device, level, options):
 )
 def test_what_is_no_range_is_refused(device, level, options, said):
     with pytest.raises(UsageError, match=said):
-        extract_isosurface(random_volume((3, 4, 5), high=500), level, device, **options)
+        extract_isosurface(random_volume((3, 4, 5), high=500), level, device=device, **options)
 
 
 def test_a_range_that_holds_nothing_says_the_range_of_the_data(device):
     volume = random_volume((5, 6, 7))
     for level in [(8, 9), (-9, -8), (3.2, 3.8), (40_000, 50_000)]:
         with pytest.raises(NoSurfaceError, match="no voxel lies within, the volume runs from 0 to 5 HU"):
-            extract_isosurface(volume, level, device)
+            extract_isosurface(volume, level, device=device)
     with pytest.raises(NoSurfaceError, match="every voxel lies within"):
-        extract_isosurface(volume, (0, 5), device, closed=False)
-    assert_sound(extract_isosurface(volume, (0, 5), device))
+        extract_isosurface(volume, (0, 5), device=device, closed=False)
+    assert_sound(extract_isosurface(volume, (0, 5), device=device))
     with pytest.raises(NoSurfaceError, match="no surface of what lies below 0 HU"):
-        extract_isosurface(volume, 0, device, below=True)
+        extract_isosurface(volume, 0, device=device, below=True)
     with pytest.raises(UsageError, match="are one float32 number"):
-        extract_isosurface(random_volume((3, 4, 5), "float32"), (1.0, 1.0 + 1e-12), device)
+        extract_isosurface(random_volume((3, 4, 5), "float32"), (1.0, 1.0 + 1e-12), device=device)
 
 
 def test_a_device_that_finds_nothing_is_not_believed(device, monkeypatch):
@@ -223,7 +227,7 @@ def test_a_device_that_finds_nothing_is_not_believed(device, monkeypatch):
 
     monkeypatch.setattr(marching_cubes, "classify", find_nothing)
     with pytest.raises(DeviceError, match="it computes wrongly"):
-        extract_isosurface(random_volume((5, 6, 7)), (2, 3), device)
+        extract_isosurface(random_volume((5, 6, 7)), (2, 3), device=device)
 
 
 def test_the_report_says_what_is_inside(device):
@@ -235,7 +239,7 @@ def test_the_report_says_what_is_inside(device):
         ((2, 3), {}, ("between", [2.0, 3.0], [1.5, 3.5], None, None)),
     ]
     for level, options, facts in expected:
-        report = extract_isosurface(volume, level, device, **options).report
+        report = extract_isosurface(volume, level, device=device, **options).report
         assert tuple(report[name] for name in names) == facts
 
 

@@ -25,7 +25,7 @@ from clrecon.operators.surface.slabs import SampleGrid, Slab, plan_slabs
 @pytest.mark.parametrize("shape", [(9, 7, 40), (2, 3, 70), (20, 9, 33)])
 def test_slabs_of_any_thickness_give_the_same_mesh(device, shape, dtype, closed):
     volume = random_volume(shape, dtype, affine=MIRRORED if dtype == "uint8" else OBLIQUE)
-    expected = extract_isosurface(volume, 3, device, closed=closed)
+    expected = extract_isosurface(volume, 3, device=device, closed=closed)
     for slices in (1, 2, 3, 5):
         mesh = extract_in_slabs(volume, 3, device, slices, closed)
         assert mesh.report["slabs"] == -(-(shape[0] + 2 * closed) // slices)
@@ -34,35 +34,35 @@ def test_slabs_of_any_thickness_give_the_same_mesh(device, shape, dtype, closed)
 
 def test_a_single_slice_goes_through_in_slabs_of_one(device):
     volume = random_volume((1, 6, 40))
-    assert_same(extract_in_slabs(volume, 3, device, 1), extract_isosurface(volume, 3, device))
+    assert_same(extract_in_slabs(volume, 3, device, 1), extract_isosurface(volume, 3, device=device))
 
 
 def test_a_resident_volume_can_be_asked_for_a_surface_that_does_not_fit_as_a_whole(device, monkeypatch):
     """An open surface fits, a closed one needs a little more: in slabs, and not from the wrong slices."""
     volume = smooth_volume()
-    with SurfaceExtractor(volume, device) as extractor:
+    with SurfaceExtractor(volume, device=device) as extractor:
         extractor.extract(100, closed=False)
         monkeypatch.setattr(isosurface, "plan_slabs", lambda *_: 4)
         mesh = extractor.extract(100)
         assert mesh.report["slabs"] > 1
         again = extractor.extract(100, closed=False)
     monkeypatch.undo()
-    assert_same(mesh, extract_isosurface(volume, 100, device))
-    assert_same(again, extract_isosurface(volume, 100, device, closed=False))
+    assert_same(mesh, extract_isosurface(volume, 100, device=device))
+    assert_same(again, extract_isosurface(volume, 100, device=device, closed=False))
 
 
 def test_empty_slabs_in_between_do_no_harm(device):
     voxels = np.zeros((30, 8, 40), np.int16)
     voxels[3:6, 2:5, 5:9] = voxels[20:24, 3:6, 20:36] = 100
     volume = Volume(voxels, OBLIQUE)
-    assert_same(extract_in_slabs(volume, 50, device, 4), extract_isosurface(volume, 50, device))
+    assert_same(extract_in_slabs(volume, 50, device, 4), extract_isosurface(volume, 50, device=device))
 
 
 def test_a_budget_makes_slabs(device):
     volume = smooth_volume((40, 60, 70))
-    expected = extract_isosurface(volume, 100, device)
+    expected = extract_isosurface(volume, 100, device=device)
     memory = volume.voxels.nbytes // 2
-    mesh = extract_isosurface(volume, 100, device, memory=memory)
+    mesh = extract_isosurface(volume, 100, device=device, memory=memory)
     assert mesh.report["slabs"] > 2
     assert sum(mesh.report["device_bytes"].values()) <= memory
     assert_same(mesh, expected)
@@ -70,9 +70,9 @@ def test_a_budget_makes_slabs(device):
 
 def test_the_limits_of_the_device_make_slabs(device, monkeypatch):
     volume = smooth_volume((40, 60, 70))
-    expected = extract_isosurface(volume, 100, device)
+    expected = extract_isosurface(volume, 100, device=device)
     monkeypatch.setattr(device, "max_allocation_bytes", volume.voxels.nbytes // 3)
-    mesh = extract_isosurface(volume, 100, device)
+    mesh = extract_isosurface(volume, 100, device=device)
     assert mesh.report["slabs"] >= 3
     assert_same(mesh, expected)
 
@@ -80,7 +80,7 @@ def test_the_limits_of_the_device_make_slabs(device, monkeypatch):
 def test_the_forecast_is_what_then_happens(device):
     k, j, i = np.indices((40, 60, 70))
     volume = Volume((1000 - 100 * np.hypot(np.hypot(k - 20, j - 30), i - 35)).astype(np.int16), OBLIQUE)
-    with SurfaceExtractor(volume, device, memory=volume.voxels.nbytes // 2) as extractor:
+    with SurfaceExtractor(volume, device=device, memory=volume.voxels.nbytes // 2) as extractor:
         forecast = extractor.forecast()
         mesh = extractor.extract(700)
     assert forecast["slabs"] > 1
@@ -93,13 +93,13 @@ def test_the_forecast_is_what_then_happens(device):
 def test_a_budget_for_less_than_a_slice_is_refused_before_anything_is_allocated(device, monkeypatch):
     monkeypatch.setattr(device_volume, "upload", lambda *_: pytest.fail("allocated"))
     with pytest.raises(DeviceError, match=r"one slice with its neighbours needs [0-9,]+ bytes.*10,000 bytes are allow"):
-        extract_isosurface(smooth_volume((40, 60, 70)), 100, device, memory=10_000)
+        extract_isosurface(smooth_volume((40, 60, 70)), 100, device=device, memory=10_000)
 
 
 @pytest.mark.parametrize("memory", [0, -1, 1.5, "2", True])
 def test_a_budget_is_a_number_of_bytes(device, memory):
     with pytest.raises(UsageError, match="whole number of bytes"):
-        extract_isosurface(smooth_volume(), 100, device, memory=memory)
+        extract_isosurface(smooth_volume(), 100, device=device, memory=memory)
 
 
 def test_a_mesh_over_the_budget_halves_the_slab(device):
@@ -107,17 +107,17 @@ def test_a_mesh_over_the_budget_halves_the_slab(device):
     volume = random_volume((24, 40, 64), high=2)
     grid = SampleGrid(volume, choose_iso_rule(volume, 1))
     memory = 4 * sum(Slab(grid, 0, 24).needs().values())
-    mesh = extract_isosurface(volume, 1, device, memory=memory)
+    mesh = extract_isosurface(volume, 1, device=device, memory=memory)
     assert mesh.report["slabs"] > 1
     assert any("continued with slabs of" in warning for warning in mesh.report["warnings"])
-    assert_same(mesh, extract_isosurface(volume, 1, device))
+    assert_same(mesh, extract_isosurface(volume, 1, device=device))
 
 
 @pytest.mark.parametrize("fails", [1, 2, 5])
 def test_memory_that_runs_out_late_halves_the_slab(device, monkeypatch, fails):
     """The driver says at the n-th allocation that there is no more: smaller slabs, a warning, the same mesh."""
     volume = smooth_volume((24, 30, 40))
-    expected = extract_isosurface(volume, 100, device)
+    expected = extract_isosurface(volume, 100, device=device)
     true_allocate, calls = marching_cubes.allocate, []
 
     def allocate(*arguments):
@@ -127,7 +127,7 @@ def test_memory_that_runs_out_late_halves_the_slab(device, monkeypatch, fails):
         return true_allocate(*arguments)
 
     monkeypatch.setattr(marching_cubes, "allocate", allocate)
-    mesh = extract_isosurface(volume, 100, device)
+    mesh = extract_isosurface(volume, 100, device=device)
     assert mesh.report["slabs"] == 2
     assert mesh.report["warnings"][-1] == "no room for 1 byte: continued with slabs of 13 slices"
     assert_same(mesh, expected)
@@ -139,7 +139,7 @@ def test_memory_that_never_suffices_is_an_error_in_the_end(device, monkeypatch):
 
     monkeypatch.setattr(marching_cubes, "allocate", allocate)
     with pytest.raises(DeviceError, match="no room for 1 byte"):
-        extract_isosurface(smooth_volume((9, 10, 11)), 100, device)
+        extract_isosurface(smooth_volume((9, 10, 11)), 100, device=device)
 
 
 def test_counts_over_32_bits_are_refused(device, monkeypatch):
@@ -151,7 +151,7 @@ def test_counts_over_32_bits_are_refused(device, monkeypatch):
 
     monkeypatch.setattr(marching_cubes, "exclusive_scan", scan)
     with pytest.raises(DeviceError, match="more than 32 bits can number"):
-        extract_isosurface(random_volume((5, 6, 7)), 3, device)
+        extract_isosurface(random_volume((5, 6, 7)), 3, device=device)
 
 
 def test_vertices_of_all_slabs_together_must_fit_32_bits(device, monkeypatch):
@@ -184,7 +184,7 @@ def test_too_many_words_for_32_bits_make_slabs_too(device):
 
     volume = random_volume((2, 2, 2))
     grid = SampleGrid(Tall(), choose_iso_rule(volume, 3))
-    resident = DeviceVolume(volume, device)
+    resident = DeviceVolume(volume, device=device)
     resident.device = Huge()
     slices = plan_slabs(grid, resident)
     assert 1 < slices < 2**16
@@ -196,13 +196,13 @@ def test_a_mapped_file_goes_through_and_leaves_memory(device, tmp_path):
     volume = smooth_volume((23, 64, 128))
     np.save(tmp_path / "voxels.npy", volume.voxels)
     mapped = Volume(np.load(tmp_path / "voxels.npy", mmap_mode="r"), volume.affine)
-    assert_same(extract_in_slabs(mapped, 100, device, 5), extract_isosurface(volume, 100, device))
+    assert_same(extract_in_slabs(mapped, 100, device, 5), extract_isosurface(volume, 100, device=device))
 
 
 @pytest.mark.oclgrind
 def test_slabs_stay_within_their_buffers(device):
     volume = random_volume((5, 4, 40))
     for closed in (True, False):
-        expected = extract_isosurface(volume, 3, device, closed=closed)
+        expected = extract_isosurface(volume, 3, device=device, closed=closed)
         for slices in (1, 2):
             assert_same(extract_in_slabs(volume, 3, device, slices, closed), expected)

@@ -18,7 +18,7 @@ from clrecon.reference.surface.trilinear_table import find_states
 
 
 def extract(volume, iso_value, device, **options):
-    return extract_isosurface(volume, iso_value, device, topology="trilinear", **options)
+    return extract_isosurface(volume, iso_value, device=device, topology="trilinear", **options)
 
 
 def assert_equals_twin(volume, iso_value, device, closed=True) -> None:
@@ -74,7 +74,7 @@ def test_every_state_of_a_cell_equals_the_twin(device):
     rule = choose_iso_rule(volume, 1e-6, topology="trilinear")
     assert rule.topology == "trilinear"
     assert_equals_twin(volume, 1e-6, device)
-    more = extract(volume, 1e-6, device).vertex_count - extract_isosurface(volume, 1e-6, device).vertex_count
+    more = extract(volume, 1e-6, device).vertex_count - extract_isosurface(volume, 1e-6, device=device).vertex_count
     assert more > 300
 
 
@@ -102,7 +102,7 @@ def test_samples_and_saddles_at_the_level_are_sound(device):
 def test_a_surface_without_ambiguous_cells_stays_as_it_is(device):
     k, j, i = np.indices((9, 10, 11))
     volume = Volume((100 - 9 * np.sqrt((i - 5.1) ** 2 + (j - 4.6) ** 2 + (k - 4.2) ** 2)).astype(np.float32), OBLIQUE)
-    expected, mesh = extract_isosurface(volume, 70, device), extract(volume, 70, device)
+    expected, mesh = extract_isosurface(volume, 70, device=device), extract(volume, 70, device)
     assert np.array_equal(mesh.triangles, expected.triangles)
     assert np.array_equal(mesh.vertices, expected.vertices)
     assert np.array_equal(mesh.normals, expected.normals)
@@ -114,7 +114,7 @@ def test_two_corners_that_a_saddle_joins_make_one_part(device):
     volume = Volume(voxels, OBLIQUE)
     for iso_value, parts in ((40, 1), (60, 2)):  # the saddle between them is at 50
         assert extract(volume, iso_value, device).quality()["components"] == parts
-        assert extract_isosurface(volume, iso_value, device).quality()["components"] == 2
+        assert extract_isosurface(volume, iso_value, device=device).quality()["components"] == 2
 
 
 def test_two_corners_across_a_cell_are_joined_by_a_tunnel(device):
@@ -124,7 +124,7 @@ def test_two_corners_across_a_cell_are_joined_by_a_tunnel(device):
     quality = extract(volume, 3.9, device).quality()
     assert (quality["components"], quality["genus"]) == (1, 0)
     assert extract(volume, 4.4, device).quality()["components"] == 2
-    assert extract_isosurface(volume, 3.9, device).quality()["components"] == 2
+    assert extract_isosurface(volume, 3.9, device=device).quality()["components"] == 2
 
 
 def test_normals_look_the_way_the_faces_do(device):
@@ -158,7 +158,7 @@ def test_slabs_give_the_same_mesh(device, closed):
 
 
 def test_the_forecast_holds_what_the_topology_takes(device):
-    with SurfaceExtractor(smooth_volume(), device) as extractor:
+    with SurfaceExtractor(smooth_volume(), device=device) as extractor:
         more = extractor.forecast(topology="trilinear")["scratch_bytes"] - extractor.forecast()["scratch_bytes"]
         mesh = extractor.extract(100, topology="trilinear")
     assert more > 0
@@ -167,7 +167,7 @@ def test_the_forecast_holds_what_the_topology_takes(device):
 
 def test_what_cannot_be_resolved_is_refused(device):
     with pytest.raises(UsageError, match="no topology 'manifold': it is one of separated, trilinear"):
-        extract_isosurface(random_volume((3, 3, 3)), 3, device, topology="manifold")
+        extract_isosurface(random_volume((3, 3, 3)), 3, device=device, topology="manifold")
     wide = Volume(np.zeros((1, 2, 3000), np.int8), np.eye(4))
     with pytest.raises(UsageError, match="3,000 columns: the topology trilinear supports 2,968"):
         extract(wide, 1, device)

@@ -46,7 +46,7 @@ def centre_of(volume: Volume) -> np.ndarray:
 def test_a_sphere_keeps_its_shape_through_a_change_of_feed(device):
     radius = 10.0
     volume = make_volume(lambda p: radius - np.linalg.norm(p, axis=1), (66, 50))
-    mesh = extract_isosurface(volume, 0.0, device)
+    mesh = extract_isosurface(volume, 0.0, device=device)
     away = mesh.vertices - centre_of(volume)
     assert np.abs(np.linalg.norm(away, axis=1) - radius).max() <= tolerances.SPHERE_DISTANCE_FIELD_VOXEL * max(GAPS)
     quality = mesh.quality()
@@ -54,7 +54,7 @@ def test_a_sphere_keeps_its_shape_through_a_change_of_feed(device):
     exact = 4 / 3 * np.pi * radius**3 / 1000
     assert exact * 0.96 < quality["volume_ml"] < exact
     nominal = Volume(volume.voxels, volume.affine)  # the check can fail: evenly spaced slices distort it
-    wrong = extract_isosurface(nominal, 0.0, device).vertices - nominal.ijk_to_lps(
+    wrong = extract_isosurface(nominal, 0.0, device=device).vertices - nominal.ijk_to_lps(
         [(np.array(volume.shape_ijk) - 1) / 2]
     )
     assert np.abs(np.linalg.norm(wrong, axis=1) - radius).max() > 0.5
@@ -64,7 +64,7 @@ def test_a_sphere_keeps_its_shape_through_a_change_of_feed(device):
 def test_random_cells_go_through_within_their_bounds(device):
     rng = np.random.default_rng(13)
     volume = make_volume(lambda p: rng.integers(-500, 500, len(p)), (4, 9), GAPS[7:11], dtype=np.int16)
-    mesh = extract_isosurface(volume, 25, device, topology="trilinear")
+    mesh = extract_isosurface(volume, 25, device=device, topology="trilinear")
     vertices, _, triangles = extract_twin(volume, 25, topology="trilinear")
     assert np.array_equal(mesh.triangles, triangles)
     assert np.abs(mesh.vertices - vertices).max() <= tolerances.TWIN_VERTEX_VOXEL * min(volume.spacing)
@@ -75,7 +75,7 @@ def test_planes_have_their_places_and_normals_everywhere(device, topology):
     slope = TURN @ np.array([0.35, -0.2, 0.9])
     slope /= np.linalg.norm(slope)
     volume = make_volume(lambda p: -(p @ slope))
-    mesh = extract_isosurface(volume, 0.0, device, closed=False, topology=topology)
+    mesh = extract_isosurface(volume, 0.0, device=device, closed=False, topology=topology)
     assert np.abs((mesh.vertices - centre_of(volume)) @ slope).max() <= tolerances.LINEAR_FIELD_MM
     assert np.abs(mesh.normals - slope).max() <= tolerances.LINEAR_FIELD_NORMAL
 
@@ -86,7 +86,7 @@ def test_planes_have_their_places_and_normals_everywhere(device, topology):
 def test_the_device_gives_what_the_twin_gives(device, topology, closed, dtype):
     rng = np.random.default_rng(11)
     volume = make_volume(lambda p: rng.integers(-500, 500, len(p)), (9, 11), GAPS[5:15], dtype=dtype)
-    mesh = extract_isosurface(volume, 25, device, closed=closed, topology=topology)
+    mesh = extract_isosurface(volume, 25, device=device, closed=closed, topology=topology)
     vertices, normals, triangles = extract_twin(volume, 25, closed=closed, topology=topology)
     assert np.array_equal(mesh.triangles, triangles)
     assert np.abs(mesh.vertices - vertices).max() <= tolerances.TWIN_VERTEX_VOXEL * min(volume.spacing)
@@ -102,7 +102,7 @@ def test_a_thin_layer_does_not_move_the_surface_in_others(device):
     volume = make_volume(lambda p: -(p @ slope), gaps=THIN, noise=0.0)
     for share in (0.01, 0.99):
         across = (volume.slice_origins()[5] * (1 - share) + volume.slice_origins()[6] * share) @ slope
-        mesh = extract_isosurface(volume, float(centre_of(volume) @ slope - across), device, closed=False)
+        mesh = extract_isosurface(volume, float(centre_of(volume) @ slope - across), device=device, closed=False)
         assert np.abs(mesh.vertices @ slope - across).max() <= tolerances.LINEAR_FIELD_MM
 
 
@@ -110,7 +110,7 @@ def test_a_thin_layer_does_not_move_the_surface_in_others(device):
 def test_the_twin_has_a_thin_layer_too(device, topology):
     rng = np.random.default_rng(12)
     volume = make_volume(lambda p: rng.integers(-500, 500, len(p)), (9, 11), THIN[5:15], noise=0.0)
-    mesh = extract_isosurface(volume, 25, device, topology=topology)
+    mesh = extract_isosurface(volume, 25, device=device, topology=topology)
     vertices, _, triangles = extract_twin(volume, 25, topology=topology)
     assert np.array_equal(mesh.triangles, triangles)
     assert np.abs(mesh.vertices - vertices).max() <= tolerances.TWIN_VERTEX_VOXEL * min(volume.spacing)
@@ -121,7 +121,7 @@ def test_slabs_give_the_same_surface_bit_for_bit(device):
     rng = np.random.default_rng(12)
     shape, gaps = ((4, 9), GAPS[7:11]) if device.is_simulator else ((9, 70), GAPS[5:15])
     volume = make_volume(lambda p: rng.integers(-500, 500, len(p)), shape, gaps, dtype=np.int16)
-    whole = extract_isosurface(volume, 10, device)
+    whole = extract_isosurface(volume, 10, device=device)
     for slices in (1, 2, 3):
         assert_same(extract_in_slabs(volume, 10, device, slices), whole)
 
@@ -143,7 +143,7 @@ def test_distances_to_the_surface_are_right_in_every_layer():
 def test_labels_lie_where_the_slices_lie(device):
     radius = 7.0
     volume = make_volume(lambda p: 40.0 * (radius - np.linalg.norm(p, axis=1)), (60, 50), dtype=np.int16)
-    plain = extract_isosurface(volume, 0, device)
+    plain = extract_isosurface(volume, 0, device=device)
     # The map is finer than the gaps and even: it is brought to the slices by their own places.
     affine = np.diag([0.4, 0.4, 0.4, 1.0])
     affine[:3, 3] = centre_of(volume) - 0.4 * 30

@@ -1,0 +1,54 @@
+"""The public names of clrecon and where they are: the one list, for type checkers, editors and `clrecon` itself."""
+
+from clrecon.anatomy.body import mask_field_of_view as mask_field_of_view
+from clrecon.anatomy.body import remove_table as remove_table
+from clrecon.anatomy.iso_choice import choose_iso_value as choose_iso_value
+from clrecon.anatomy.spine_line import find_spine_line as find_spine_line
+from clrecon.errors import Cancelled as Cancelled
+from clrecon.errors import ClreconError as ClreconError
+from clrecon.errors import DeviceError as DeviceError
+from clrecon.errors import NoDicomError as NoDicomError
+from clrecon.errors import NoSurfaceError as NoSurfaceError
+from clrecon.errors import OutputError as OutputError
+from clrecon.errors import RefusedInputError as RefusedInputError
+from clrecon.errors import UsageError as UsageError
+from clrecon.geometry import Volume as Volume
+from clrecon.labels import LabelMap as LabelMap
+from clrecon.labels import read_labels as read_labels
+from clrecon.mesh import Mesh as Mesh
+from clrecon.mesh.compare.distances import compare_meshes as compare_meshes
+from clrecon.mesh.refine.decimation import decimate_mesh as decimate_mesh
+from clrecon.mesh.refine.smoothing import smooth_mesh as smooth_mesh
+from clrecon.opencl import choose_device, list_devices
+from clrecon.operators.rays.render import VolumeRenderer as VolumeRenderer
+from clrecon.operators.rays.render import render as render
+from clrecon.operators.reformat.cut import cut_slice as cut_slice
+from clrecon.operators.reformat.cut import reformat_curve as reformat_curve
+from clrecon.operators.resident.device_volume import DeviceVolume as DeviceVolume
+from clrecon.operators.surface.extract import SurfaceExtractor as SurfaceExtractor
+from clrecon.operators.surface.extract import extract_isosurface as extract_isosurface
+from clrecon.operators.surface.extract import extract_isosurfaces as extract_isosurfaces
+from clrecon.operators.surface.label_masks import extract_label_masks as extract_label_masks
+from clrecon.operators.surface.labels import extract_labels as extract_labels
+from clrecon.reading import list_series as list_series
+from clrecon.reading import read_volume as read_volume
+from clrecon.rendering import Lighting as Lighting
+from clrecon.rendering import Rendering as Rendering
+from clrecon.rendering import TransferFunction as TransferFunction
+from clrecon.rendering import load_transfer_function as load_transfer_function
+from clrecon.rendering.movies.movie import turntable_cameras as turntable_cameras
+from clrecon.rendering.movies.movie import write_animation as write_animation
+from clrecon.rendering.pictures.styles import CurveCut as CurveCut
+from clrecon.rendering.pictures.styles import PlaneCut as PlaneCut
+from clrecon.rendering.pictures.styles import Projection as Projection
+from clrecon.rendering.pictures.styles import SlicesInSpace as SlicesInSpace
+from clrecon.rendering.pictures.styles import Style as Style
+from clrecon.rendering.pictures.styles import SurfaceLook as SurfaceLook
+from clrecon.rendering.pictures.styles import VolumeLook as VolumeLook
+from clrecon.rendering.views.camera import Camera as Camera
+from clrecon.rendering.views.centre_line_files import read_curve_points as read_curve_points
+from clrecon.rendering.views.clip import Clip as Clip
+
+__version__: str
+device = choose_device
+devices = list_devices

@@ -1,0 +1,77 @@
+"""What takes long without a device tells how far it is, never goes back, and ends where it is told to."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from label_files import make_labels, write_nifti
+from sample_meshes import torus
+
+import clrecon
+from clrecon.geometry import Volume
+from clrecon.mesh import Mesh
+from clrecon.phantom import PhantomSettings, make_phantom
+from clrecon.system.progress import Progress
+
+Work = Callable[..., Any]
+
+
+@pytest.fixture(scope="module")
+def works(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[str, Work]]:
+    """By name: the stage that is told, and the work, which takes `progress`."""
+    voxels, affine, _ = make_phantom(PhantomSettings(size=(160, 144), slices=60, spacing=(1.9, 1.8, 2.5)))
+    volume = Volume(voxels, affine)
+    vertices, triangles = torus(60, 32)
+    mesh = Mesh(vertices, triangles, None, {"affine_ijk_to_lps_mm": np.eye(4).tolist()})
+    other = Mesh(vertices + 0.1, triangles, None, {})
+    labels = write_nifti(tmp_path_factory.mktemp("labels") / "labels.nii", make_labels(), np.eye(4))
+    return {
+        "choose_iso_value": ("choose", lambda **own: clrecon.choose_iso_value(volume, **own)),
+        "find_spine_line": ("curve", lambda **own: clrecon.find_spine_line(volume, **own)),
+        "mask_field_of_view": ("mask", lambda **own: clrecon.mask_field_of_view(volume, 90.0, **own)),
+        "remove_table": ("mask", lambda **own: clrecon.remove_table(volume, **own)),
+        "smooth_mesh": ("smooth", lambda **own: clrecon.smooth_mesh(mesh, 5, **own)),
+        "decimate_mesh": ("decimate", lambda **own: clrecon.decimate_mesh(mesh, 0.5, **own)),
+        "compare_meshes": ("compare", lambda **own: clrecon.compare_meshes(mesh, other, 2000, **own)),
+        "read_labels": ("read", lambda **own: clrecon.read_labels(labels, **own)),
+    }
+
+
+NAMES = (
+    "choose_iso_value", "find_spine_line", "mask_field_of_view", "remove_table", "smooth_mesh", "decimate_mesh",
+    "compare_meshes", "read_labels",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_progress_is_told_and_changes_nothing(works: dict[str, tuple[str, Work]], name: str) -> None:
+    stage, work = works[name]
+    calls: list[tuple[str, int, int]] = []
+    result = work(progress=lambda *call: calls.append(call))
+    assert {call[0] for call in calls} == {stage}
+    done, totals = [call[1] for call in calls], {call[2] for call in calls}
+    assert done == sorted(done) and len(set(done)) > 1 and len(totals) == 1
+    assert done[-1] == totals.pop()
+    alone = work()
+    for array in ("voxels", "vertices", "points"):
+        if hasattr(result, array):
+            assert np.array_equal(getattr(result, array), getattr(alone, array))
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_what_progress_raises_ends_the_work(works: dict[str, tuple[str, Work]], name: str) -> None:
+    told: list[int] = []
+    raised = clrecon.Cancelled("enough")
+
+    def progress(stage: str, done: int, total: int) -> None:
+        told.append(done)
+        if len(told) == 2:
+            raise raised
+
+    takes: Progress = progress
+    with pytest.raises(clrecon.Cancelled) as error:
+        works[name][1](progress=takes)
+    assert error.value is raised and len(told) == 2
