@@ -9,7 +9,7 @@ import pytest
 from house import PACKAGE, ROOT
 
 from clrecon.operators.reformat.sample import COMBINATIONS
-from clrecon.operators.surface.label_masks import SAMPLES_PER_FLAGS
+from clrecon.operators.surface.mask_extraction import SAMPLES_PER_FLAGS
 
 PAIRS = [
     ("clrecon.labels.occupancy.REACH", "surface/label_masks.h", "REACH"),
@@ -68,7 +68,7 @@ def test_flags_of_strips_are_words_of_the_kernel() -> None:
 def test_every_constant_that_names_a_kernel_file_is_compared() -> None:
     known = {name for name, _, _ in PAIRS} | {
         "clrecon.operators.reformat.sample.COMBINATIONS",
-        "clrecon.operators.surface.label_masks.SAMPLES_PER_FLAGS",
+        "clrecon.operators.surface.mask_extraction.SAMPLES_PER_FLAGS",
     }
     found = {
         f"{'.'.join(path.relative_to(ROOT).with_suffix('').parts)}.{name}"

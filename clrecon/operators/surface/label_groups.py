@@ -2,17 +2,42 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from typing import TypeVar
 
-from clrecon.errors import DeviceMemoryError
+from clrecon.errors import DeviceMemoryError, UsageError
+from clrecon.labels import LabelMap
 from clrecon.labels.solid import Box
 from clrecon.opencl import MemoryLimits, describe_shortage
+from clrecon.operators.surface.slabs import Slab
 
-__all__ = ["each_label", "group_boxes"]
+__all__ = ["Window", "choose_numbers", "each_label", "group_boxes"]
 
 Held = TypeVar("Held")
 Made = TypeVar("Made")
+
+
+@dataclass(frozen=True)
+class Window(Slab):
+    """The slices of the sample grid that hold one label and a layer around it, of what the device holds."""
+
+    held: tuple[int, int] = (0, 0)
+
+    @property
+    def voxel_slices(self) -> tuple[int, int]:
+        """First and end of the slices of the volume that the device holds."""
+        return self.held
+
+
+def choose_numbers(labels: LabelMap, numbers: Sequence[int | str] | None) -> tuple[int, ...]:
+    """The numbers of the labels that are asked for, each once; all that are there where none are named."""
+    if numbers is None:
+        return labels.numbers
+    chosen = tuple(dict.fromkeys(labels.find(number) for number in numbers))
+    if not chosen:
+        raise UsageError("choose at least one label")
+    return chosen
 
 
 def group_boxes(boxes: dict[int, Box], needs: dict[str, int], scratch: int, room: MemoryLimits) -> list[dict[int, Box]]:

@@ -1,326 +1,29 @@
-"""Extract labels' own surfaces: the mask says what is inside, its smoothed occupancy places the vertices.
-
-The host side of cl/surface/label_masks.cl; counting and writing are those of cl/surface/marching_cubes.cl.
-"""
+"""Extract labels' own surfaces: the mask says what is inside, its smoothed occupancy places the vertices."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import Any
 
-import numpy as np
-from numpy.typing import DTypeLike
-
-from clrecon.errors import DeviceMemoryError, RefusedInputError, UsageError
-from clrecon.geometry import Volume
-from clrecon.geometry.iso_rule import IsoRule
-from clrecon.geometry.precision import describe_far
+from clrecon.errors import RefusedInputError, UsageError
 from clrecon.labels import LabelMap
-from clrecon.labels.enclosed import FACES_PER_AREA, Borders, choose_levels, find_enclosed, level_biases
-from clrecon.labels.occupancy import FULL, KEEP, REACH, STEEPNESS, next_level
+from clrecon.labels.enclosed import find_enclosed
+from clrecon.labels.occupancy import FULL
 from clrecon.labels.solid import Box
 from clrecon.labels.volumes import label_ml
 from clrecon.mesh import Mesh
 from clrecon.opencl import (
     Device,
-    Program,
     Stopwatch,
-    allocate,
-    check_budget,
     choose_device,
-    download,
-    launch,
-    load_program,
-    memory_limits,
-    upload,
 )
-from clrecon.opencl.quirks import cache_warnings
-from clrecon.operators.resident.voxel_types import label_variants
 from clrecon.operators.surface import marching_cubes
 from clrecon.operators.surface.extraction import Part
-from clrecon.operators.surface.label_groups import each_label, group_boxes
+from clrecon.operators.surface.label_groups import choose_numbers, each_label
 from clrecon.operators.surface.label_survey import survey_labels
-from clrecon.operators.surface.labels import Window, choose_numbers
-from clrecon.operators.surface.marching_cubes import Classified, Counted, Placement
-from clrecon.operators.surface.slabs import SampleGrid
+from clrecon.operators.surface.mask_extraction import HeldMap, MaskExtraction, prepare_label_masks
 from clrecon.system.progress import Progress
 
 __all__ = ["extract_label_masks", "prepare_label_masks"]
-
-SPARE_SLICES = 3 + REACH
-"""Beyond the label's box: slices of the mask, gradients, and what their occupancy needs."""
-
-TRIANGLES_PER_SUM = 256
-SAMPLES_PER_FLAGS = 32 * 16
-"""Of a row: 32 strips of 16 samples, as cl/surface/label_masks.cl."""
-
-
-def prepare_label_masks(device: Device, label_dtype: DTypeLike = np.uint8) -> tuple[Program, Program]:
-    """Build the kernels for labels of this type: those of the occupancy, those of the surface.
-
-    Raises
-    ------
-    DeviceError
-        The driver's compiler refuses.
-    """
-    own = load_program(
-        device, "surface/label_masks.cl", {"VOXEL": "short", "VALUE": "int", **label_variants(label_dtype)}
-    )
-    return own, marching_cubes.prepare_marching_cubes(device, np.int16, label_dtype, masks=True)
-
-
-@dataclass(frozen=True)
-class _Held:
-    """Slices of a map on the device, and room for what is computed from them."""
-
-    first: int
-    end: int
-    map_d: Any
-    rows_d: Any
-    strips_d: Any
-    occupancy_d: Any
-    occupied_d: Any
-
-
-class _Run:
-    """One extraction: what is common to its labels."""
-
-    def __init__(self, labels: LabelMap, device: Device, memory: int | None, closed: bool):
-        self.labels = labels
-        self.device = device
-        self.memory = memory
-        self.stopwatch = Stopwatch()
-        self.groups = 1
-        self.device_bytes: dict[str, int] = {}
-        self.grid = SampleGrid(Volume(labels.voxels, labels.affine), IsoRule(0.5, FULL // 2, FULL / 2, 0.0, closed))
-        placement = Placement.of(self.grid.volume, self.grid.rule.border)
-        frames = placement.slice_frames.copy()
-        frames[:, 2, 3] = np.maximum(frames[:, 2, 3], KEEP)
-        self.placement = replace(placement, slice_frames=frames, margin=np.maximum(placement.margin, np.float32(KEEP)))
-        self.levels: dict[int, int] = {}
-        self.warnings: list[str] = []
-
-    def programs(self) -> tuple[Program, Program]:
-        """The kernels, see `prepare_label_masks`."""
-        with self.stopwatch.timed("build"):
-            return prepare_label_masks(self.device, self.labels.voxels.dtype)
-
-    @property
-    def has_neighbours(self) -> bool:
-        """More than one label is there: two may touch."""
-        return len(self.labels.numbers) > 1
-
-    def slices_for(self, boxes: dict[int, Box]) -> tuple[int, int]:
-        """First and end of the slices of the map that these labels need."""
-        first = max(0, min(box[0].start for box in boxes.values()) - SPARE_SLICES)
-        return first, min(self.labels.shape_ijk[2], max(box[0].stop for box in boxes.values()) + SPARE_SLICES)
-
-    def needs(self, first: int, end: int) -> dict[str, int]:
-        """Bytes on the device for these slices."""
-        samples = self.labels.voxels[first:end].size
-        return {
-            "labels": samples * self.labels.voxels.itemsize,
-            "row sums": 2 * samples,
-            "strips": self.strip_bytes(end - first),
-            "occupancy": 2 * samples,
-            "occupancy of all labels": 2 * samples * self.has_neighbours,
-        }
-
-    def strip_bytes(self, slices: int) -> int:
-        """Bytes of two flags for each 16 samples of a row."""
-        ni, nj, _ = self.labels.shape_ijk
-        return 8 * -(-ni // SAMPLES_PER_FLAGS) * nj * slices
-
-    def group(self, boxes: dict[int, Box]) -> list[dict[int, Box]]:
-        """All labels at once where their slices fit the device, else one by one: the meshes are the same."""
-        scratch = max(sum(self.window(box, (0, 0)).scratch().values()) for box in boxes.values())
-        return group_boxes(boxes, self.needs(*self.slices_for(boxes)), scratch, memory_limits(self.device, self.memory))
-
-    def hold(self, boxes: dict[int, Box]) -> _Held:
-        """Upload the slices that the labels need, and find the occupancy of all labels."""
-        device = self.device
-        first, end = self.slices_for(boxes)
-        check_budget(device, self.needs(first, end), self.memory)
-        with self.stopwatch.timed("upload"):
-            map_d = upload(device, self.labels.voxels[first:end])
-        samples = self.labels.voxels[first:end].size
-        rows_d, occupancy_d = allocate(device, 2 * samples), allocate(device, 2 * samples)
-        occupied_d = allocate(device, 2 * samples) if self.has_neighbours else occupancy_d
-        strips_d = allocate(device, self.strip_bytes(end - first))
-        held = _Held(first, end, map_d, rows_d, strips_d, occupancy_d, occupied_d)
-        if self.has_neighbours:
-            around = tuple(
-                slice(min(box[axis].start for box in boxes.values()), max(box[axis].stop for box in boxes.values()))
-                for axis in range(3)
-            )
-            with self.stopwatch.running(device):
-                self._smooth(held, 0, around, occupied_d)  # type: ignore[arg-type]
-        return held
-
-    def _smooth(self, held: _Held, number: int, box: Box, occupancy_d: Any) -> None:
-        """The occupancy of a label (0: of all) in a box and REACH samples around, which are what gradients need."""
-        ni, nj, nk = self.labels.shape_ijk
-        inner = [
-            (max(0, part.start - REACH), min(n, part.stop + REACH)) for part, n in zip(box, (nk, nj, ni), strict=True)
-        ]
-        (begin_k, end_k), (begin_j, end_j), (begin_i, end_i) = inner
-        row_j = max(0, begin_j - REACH), min(nj, end_j + REACH)
-        row_k = max(held.first, begin_k - REACH), min(held.end, end_k + REACH)
-        slices = row_k[1] - row_k[0]
-        launch(
-            self.device, self.programs()[0]["smooth_rows"], slices * (row_j[1] - row_j[0]), stopwatch=self.stopwatch,
-            map=held.map_d, rows=held.rows_d, strips=held.strips_d, label=number, ni=ni, nj=nj,
-            begin_i=begin_i, end_i=end_i, begin_j=row_j[0], end_j=row_j[1], begin_slice=row_k[0] - held.first,
-            slices=slices,
-        )  # fmt: skip
-        launch(
-            self.device, self.programs()[0]["smooth_across"], (end_k - begin_k) * (end_j - begin_j),
-            stopwatch=self.stopwatch,
-            rows=held.rows_d, strips=held.strips_d, occupancy=occupancy_d, ni=ni, nj=nj, nk=nk,
-            begin_i=begin_i, end_i=end_i, begin_j=begin_j, end_j=end_j, first_row_slice=held.first,
-            first_slice=begin_k, slices=end_k - begin_k,
-        )  # fmt: skip
-
-    def window(self, box: Box, held: tuple[int, int]) -> Window:
-        """The slices of the sample grid around a label's box."""
-        return Window(self.grid, box[0].start, box[0].stop + 2 * self.grid.rule.border, held)
-
-    def keep_enclosed(self, numbers: Sequence[int], boxes: dict[int, Box]) -> None:
-        """Find the levels of labels that others enclose: they are the same whichever labels are asked for."""
-        own = {number: boxes[number] for number in numbers}
-        try:
-            self._measure_enclosed(self.group(own), own)
-        except DeviceMemoryError as error:
-            self.warnings.append(f"{error}: continued with one label at a time")
-            self._measure_enclosed([{number: box} for number, box in own.items()], own)
-
-    def _measure_enclosed(self, groups: list[dict[int, Box]], boxes: dict[int, Box]) -> None:
-        held = [self.hold(groups[0])] if len(groups) == 1 else []
-        voxel_mm3 = abs(np.linalg.det(self.labels.affine[:3, :3]))
-
-        def measure(levels: dict[int, int]) -> dict[int, float]:
-            self.levels = levels
-            found = {}
-            for group in groups:
-                there = held[0] if held else self.hold(group)
-                for number, box in group.items():
-                    started = self._start_one(there, number, box)
-                    found[number] = started.enclosed_mm3(levels[number]) / voxel_mm3
-            return found
-
-        self.levels = choose_levels(Borders.of(self.labels.voxels, list(boxes), boxes), measure)
-
-    def _start_one(self, held: _Held, number: int, box: Box) -> _Started:
-        """All of a label's mesh but its vertices, which depend on levels."""
-        device, stopwatch = self.device, self.stopwatch
-        own, surface = self.programs()
-        window = self.window(box, (held.first, held.end))
-        needs = {**self.needs(held.first, held.end), **window.scratch()}
-        check_budget(device, needs, self.memory)
-        mask_d = allocate(device, 4 * window.mask_rows * self.grid.words)
-        classified = Classified(mask_d, allocate(device, 4 * window.mask_rows))
-        with stopwatch.running(device):
-            self._smooth(held, number, box, held.occupancy_d)
-            launch(
-                device, own["classify_mask"], window.mask_rows, stopwatch=stopwatch,
-                map=held.map_d, mask=mask_d, row_extents=classified.row_extents_d, label=number,
-                begin_j=box[1].start, end_j=box[1].stop, **window.arguments,
-            )  # fmt: skip
-            counted = marching_cubes.count(device, window, surface, classified, stopwatch)
-        output = counted.output()
-        check_budget(device, {**needs, **output}, self.memory)
-        scratch = window.scratch()
-        self.device_bytes = {
-            "volume": sum(needs.values()) - sum(scratch.values()),
-            "scratch": sum(scratch.values()),
-            "output": sum(output.values()),
-        }
-        emission = marching_cubes.Emission(
-            device, window, surface, held.occupancy_d, classified, counted, self.placement, stopwatch
-        )
-        with stopwatch.running(device):
-            emission.triangles()
-        return _Started(self, held, number, box, counted, emission)
-
-    def extract_one(self, held: _Held, number: int, box: Box) -> tuple[Part, int]:
-        """Positions, normals and triangles of one label, and the level that places them."""
-        started = self._start_one(held, number, box)
-        level = self.levels.get(number)
-        if level is None:
-            return started.keep_volume(1000.0 * label_ml(self.labels, number), self.grid.rule.closed)
-        started.place(level)
-        return started.emission.download(), level
-
-    def describe(self) -> dict[str, Any]:
-        """What the reports of all labels have in common."""
-        return {
-            "surface": "mask",
-            "closed_at_border": self.grid.rule.closed,
-            "affine_ijk_to_lps_mm": self.labels.affine.tolist(),
-            "device": self.device.label,
-            "driver": self.device.driver,
-            "slabs": self.groups,
-            "device_bytes": self.device_bytes,
-            "seconds": dict(self.stopwatch.seconds),
-            "kernel_seconds": dict(self.stopwatch.by_kernel),
-            "warnings": [*cache_warnings(), *describe_far(self.grid.volume), *self.labels.warnings, *self.warnings],
-        }
-
-
-@dataclass(frozen=True)
-class _Started:
-    """A label's mesh on the device, whose vertices are placed at one level after the other."""
-
-    run: _Run
-    held: _Held
-    number: int
-    box: Box
-    counted: Counted
-    emission: marching_cubes.Emission
-
-    def place(self, level: int) -> None:
-        """Write the vertices, as they are at this level."""
-        held = self.held
-        biases_d = upload(self.run.device, level_biases(self.run.levels, self.run.labels.numbers[-1] + 1))
-        with self.run.stopwatch.running(self.run.device):
-            self.emission.vertices(level, map=held.map_d, label=self.number, occupied=held.occupied_d, biases=biases_d)
-
-    def enclosed_mm3(self, level: int) -> float:
-        """What the mesh encloses at a level: sums of some hundred triangles on the device, all of them here."""
-        self.place(level)
-        device, stopwatch, placement = self.run.device, self.run.stopwatch, self.run.placement
-        middle = [[(part.start + part.stop - 1) / 2 for part in self.box[::-1]]]
-        centre = np.zeros(4, np.float32)
-        centre[:3] = self.run.labels.ijk_to_lps(middle)[0]
-        if placement.origin is not None:
-            centre[:3] = self.run.labels.ijk_to_lps(middle)[0] - placement.origin
-        triangles = self.counted.triangles
-        sums = np.empty(-(-triangles // TRIANGLES_PER_SUM), np.float32)
-        sums_d = allocate(device, sums.nbytes)
-        with stopwatch.running(device):
-            launch(
-                device, self.run.programs()[0]["sum_volumes"], len(sums), stopwatch=stopwatch,
-                positions=self.emission.positions_d, triangles=self.emission.triangles_d, sums=sums_d, centre=centre,
-                triangle_count=triangles, triangles_per_sum=TRIANGLES_PER_SUM,
-            )  # fmt: skip
-        return float(download(device, sums, sums_d).sum(dtype=np.float64)) / 6.0
-
-    def keep_volume(self, wanted: float, closed: bool) -> tuple[Part, int]:
-        """Try levels until the mesh has the volume of the label's voxels, mm3, as near as a level brings it."""
-        # Every crossed edge carries a voxel's face; faces of all directions are about 1.5 times the area.
-        area_voxels = self.counted.vertices / FACES_PER_AREA
-        mm3_per_level = -area_voxels * abs(np.linalg.det(self.run.labels.affine[:3, :3])) / (STEEPNESS * FULL)
-        tried: list[tuple[int, float]] = []
-        level = next_level(tried, wanted, mm3_per_level)
-        while closed and all(level != earlier for earlier, _ in tried):
-            tried.append((level, self.enclosed_mm3(level)))
-            following = next_level(tried, wanted, mm3_per_level)
-            if following == level:
-                return self.emission.download(), level
-            level = following
-        self.place(level)
-        return self.emission.download(), level
 
 
 def extract_label_masks(
@@ -384,10 +87,10 @@ def extract_label_masks(
         raise RefusedInputError("the label map is empty: no voxel has a label")
     marching_cubes.check_row(labels.shape_ijk[0])
     chosen = choose_numbers(labels, numbers)
-    return _make_meshes(_Run(labels, choose_device(device), memory, closed), chosen, progress)
+    return _make_meshes(MaskExtraction(labels, choose_device(device), memory, closed), chosen, progress)
 
 
-def _make_meshes(run: _Run, chosen: Sequence[int], progress: Progress | None) -> dict[int, Mesh]:
+def _make_meshes(run: MaskExtraction, chosen: Sequence[int], progress: Progress | None) -> dict[int, Mesh]:
     labels = run.labels
     everywhere, faces = survey_labels(labels, run.device, run.memory, run.stopwatch)
     if run.grid.rule.closed and faces[:, 1].any() and (enclosed := find_enclosed(labels.voxels, faces, everywhere)):
@@ -397,7 +100,7 @@ def _make_meshes(run: _Run, chosen: Sequence[int], progress: Progress | None) ->
     groups = run.group(boxes)
     run.groups = len(groups)
 
-    def extract(held: _Held, number: int, box: Box) -> tuple[Part, int]:
+    def extract(held: HeldMap, number: int, box: Box) -> tuple[Part, int]:
         if progress is not None:
             progress("labels", len(meshes), len(boxes))
         return run.extract_one(held, number, box)

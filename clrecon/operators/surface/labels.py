@@ -1,262 +1,31 @@
-"""Extract the surfaces of labels: the label picks the cells, HU place the vertices.
-
-The host side of cl/surface/labels.cl; counting and writing are those of cl/surface/marching_cubes.cl.
-"""
+"""Extract the surfaces of labels: the label picks the cells, HU place the vertices."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
-import numpy as np
-from numpy.typing import DTypeLike
-
-from clrecon.errors import NoSurfaceError, UsageError
+from clrecon.errors import NoSurfaceError
 from clrecon.geometry import Volume
 from clrecon.geometry.iso_rule import IsoRule, choose_iso_rule
-from clrecon.geometry.precision import describe_far
 from clrecon.labels import LabelMap, ResampledLabels
 from clrecon.labels.growth import Growth
-from clrecon.labels.solid import Box, fill_solid, find_boxes
+from clrecon.labels.solid import Box, find_boxes
 from clrecon.labels.volumes import count_ml, label_ml, slice_voxel_ml
 from clrecon.mesh import Mesh
 from clrecon.opencl import (
     Device,
-    Program,
     Stopwatch,
-    allocate,
-    check_budget,
-    describe_shortage,
-    download,
-    launch,
-    load_program,
-    upload,
 )
-from clrecon.opencl.quirks import cache_warnings
 from clrecon.operators.resident.device_volume import DeviceVolume, open_volume
-from clrecon.operators.resident.voxel_types import label_variants, voxel_variants
 from clrecon.operators.surface import marching_cubes
-from clrecon.operators.surface.extraction import Part, voxel_level
-from clrecon.operators.surface.label_groups import each_label, group_boxes
-from clrecon.operators.surface.marching_cubes import Classified, Placement
-from clrecon.operators.surface.slabs import SampleGrid, Slab
+from clrecon.operators.surface.extraction import Part
+from clrecon.operators.surface.label_extraction import HeldSlices, LabelExtraction, prepare_labels
+from clrecon.operators.surface.label_groups import choose_numbers, each_label
 from clrecon.system.progress import Progress
 
-__all__ = ["Window", "choose_numbers", "extract_labels", "prepare_labels"]
-
-SPARE_SLICES = 3
-"""Beyond the label's box: the far end of a crossed edge, what its gradient needs, and the last slices of the mask."""
-
-
-@dataclass(frozen=True)
-class _Held:
-    """The slices of a volume that the device holds, and what is inside of which label in them."""
-
-    first: int
-    end: int
-    voxels_d: Any
-    inside_d: Any
-
-
-@dataclass(frozen=True)
-class Window(Slab):
-    """The slices of the sample grid that hold one label and a layer around it, of what the device holds."""
-
-    held: tuple[int, int] = (0, 0)
-
-    @property
-    def voxel_slices(self) -> tuple[int, int]:
-        """First and end of the slices of the volume that the device holds."""
-        return self.held
-
-
-def prepare_labels(
-    device: Device, dtype: DTypeLike = np.int16, label_dtype: DTypeLike = np.uint8, uneven: bool = False
-) -> tuple[Program, Program]:
-    """Build the kernels for volumes and labels of these types: those that find what is inside, those of the surface.
-
-    Raises
-    ------
-    DeviceError
-        The driver's compiler refuses.
-    """
-    variants = {**voxel_variants(dtype), **label_variants(label_dtype)}
-    own = load_program(device, "surface/labels.cl", variants)
-    return own, marching_cubes.prepare_marching_cubes(device, dtype, label_dtype, uneven)
-
-
-def choose_numbers(labels: LabelMap, numbers: Sequence[int | str] | None) -> tuple[int, ...]:
-    """The numbers of the labels that are asked for, each once; all that are there where none are named."""
-    if numbers is None:
-        return labels.numbers
-    chosen = tuple(dict.fromkeys(labels.find(number) for number in numbers))
-    if not chosen:
-        raise UsageError("choose at least one label")
-    return chosen
-
-
-class _Run:
-    """One extraction: what is common to its labels."""
-
-    def __init__(self, resident: DeviceVolume, taken: ResampledLabels, rule: IsoRule, growth: Growth, solid: bool):
-        volume, device = resident.volume, resident.device
-        self.resident = resident
-        self.volume = volume
-        self.labels = taken.voxels
-        self.rule = rule
-        self.growth = growth
-        self.device = device
-        self.solid = solid
-        self.stopwatch = Stopwatch()
-        self.groups = 1
-        self.share_by_hu = 1.0  # of the vertices of the label that was extracted last
-        self.device_bytes: dict[str, int] = {}
-        self.grid = SampleGrid(volume, rule)
-        self.level = voxel_level(device, volume, rule)
-        self.placement = Placement.of(volume, rule.border)
-        self.warnings: list[str] = []
-
-    def programs(self) -> tuple[Program, Program]:
-        """The kernels, see `prepare_labels`."""
-        with self.stopwatch.timed("build"):
-            return prepare_labels(self.device, self.resident.dtype, self.labels.dtype, self.volume.uneven)
-
-    def slices_for(self, boxes: dict[int, Box]) -> tuple[int, int]:
-        """First and end of the slices of the volume that these labels need; all where they are on the device."""
-        if self.resident.is_held and self._fits_whole():
-            return 0, self.volume.shape_ijk[2]
-        spare = SPARE_SLICES + self.growth.reach[2]  # labels that are not asked for grow too
-        first = max(0, min(box[0].start for box in boxes.values()) - spare)
-        return first, min(self.volume.shape_ijk[2], max(box[0].stop for box in boxes.values()) + spare)
-
-    def needs(self, first: int, end: int) -> dict[str, int]:
-        """Bytes on the device while what is inside is found in these slices."""
-        samples = self.volume.voxels[first:end].size
-        size = samples * self.labels.itemsize
-        return {"volume": samples * self.volume.voxels.itemsize, "labels": size, "inside": size}
-
-    def _fits_whole(self) -> bool:
-        needs = self.needs(0, self.volume.shape_ijk[2])
-        return not describe_shortage(self.resident.limits, needs | {"mesh": sum(needs.values()) // 2})
-
-    def group(self, boxes: dict[int, Box]) -> list[dict[int, Box]]:
-        """All labels at once where their slices fit the device, else one by one: the meshes are the same."""
-        scratch = max(sum(self.window(box, (0, 0)).scratch().values()) for box in boxes.values())
-        return group_boxes(boxes, self.needs(*self.slices_for(boxes)), scratch, self.resident.limits)
-
-    def find_inside(self, boxes: dict[int, Box]) -> _Held:
-        """Upload the slices that the labels need, and find what is inside of which label."""
-        device, stopwatch, resident = self.device, self.stopwatch, self.resident
-        first, end = self.slices_for(boxes)
-        check_budget(device, self.needs(first, end), resident.memory)
-        own, _ = self.programs()
-        is_whole = end - first == self.volume.shape_ijk[2] and resident.is_held
-        voxels_d = resident.whole(stopwatch) if is_whole else resident.part(first, end, stopwatch)
-        labels = self.labels[first:end]
-        near = np.concatenate([self.growth.offsets, self.growth.shells[:, None]], axis=1)
-        with stopwatch.timed("upload"):
-            labels_d = upload(device, labels)
-            near_d = upload(device, near if len(near) else np.zeros((1, 4), np.int32))
-        inside_d = allocate(device, labels.nbytes)
-        with stopwatch.running(device):
-            launch(
-                device, own["own_samples"], labels.size, stopwatch=stopwatch,
-                voxels=voxels_d, labels=labels_d, near=near_d, inside=inside_d, level=self.level,
-                nk=labels.shape[0], nj=labels.shape[1], ni=labels.shape[2], offsets=len(near),
-            )  # fmt: skip
-        if self.solid:
-            inside_d = self._fill(boxes, first, end, inside_d)
-        return _Held(first, end, voxels_d, inside_d)
-
-    def _fill(self, boxes: dict[int, Box], first: int, end: int, inside_d: Any) -> Any:
-        """What is inside with the labels made solid, on the device again."""
-        inside = np.zeros(self.labels.shape, dtype=self.labels.dtype)
-        part = inside[first:end]
-        with self.stopwatch.timed("download"):
-            download(self.device, part, inside_d)
-        for number, box in boxes.items():
-            fill_solid(inside, self.labels, number, box, self.rule.closed)
-        with self.stopwatch.timed("upload"):
-            return upload(self.device, part)
-
-    def window(self, box: Box, held: tuple[int, int]) -> Window:
-        """The slices of the sample grid around a label's box."""
-        return Window(self.grid, box[0].start, box[0].stop + 2 * self.rule.border, held)
-
-    def extract_one(self, held: _Held, number: int, box: Box) -> Part | None:
-        """Positions, normals and triangles of one label, None where nothing is inside of it."""
-        device, stopwatch, memory = self.device, self.stopwatch, self.resident.memory
-        own, surface = self.programs()
-        window = self.window(box, (held.first, held.end))
-        needs = {**self.needs(held.first, held.end), **window.scratch()}
-        check_budget(device, needs, memory)
-        mask_d = allocate(device, 4 * window.mask_rows * self.grid.words)
-        half_way_d = allocate(device, 4)
-        classified = Classified(mask_d, allocate(device, 4 * window.mask_rows))
-        with stopwatch.running(device):
-            launch(
-                device, own["classify_label"], window.mask_rows, stopwatch=stopwatch,
-                inside=held.inside_d, mask=mask_d, row_extents=classified.row_extents_d, half_way_count=half_way_d,
-                label=number, **window.arguments,
-            )  # fmt: skip
-            counted = marching_cubes.count(device, window, surface, classified, stopwatch)
-        if counted.triangles == 0:
-            return None
-        output = counted.output()
-        check_budget(device, {**needs, **output}, memory)
-        scratch = window.scratch()
-        self.device_bytes = {
-            "volume": sum(needs.values()) - sum(scratch.values()),
-            "scratch": sum(scratch.values()),
-            "output": sum(output.values()),
-        }
-        part = marching_cubes.emit(
-            device, window, surface, held.voxels_d, classified, counted, self.placement, 0, stopwatch,
-            {"inside": held.inside_d, "label": number, "half_way_count": half_way_d},
-        )  # fmt: skip
-        half_way = int(download(device, np.empty(1, np.uint32), half_way_d)[0])
-        self.share_by_hu = 1.0 - half_way / counted.vertices
-        return part
-
-    def describe(self) -> dict[str, Any]:
-        """What the reports of all labels have in common."""
-        rule = self.rule
-        return {
-            **rule.as_report(),
-            "surface": "hu",
-            "mask_level": None,
-            "closed_at_border": rule.closed,
-            "outside_hu": rule.outside if rule.closed else None,
-            "affine_ijk_to_lps_mm": self.volume.affine.tolist(),
-            "certificate": self.volume.report,
-            "device": self.device.label,
-            "driver": self.device.driver,
-            "slabs": self.groups,
-            "device_bytes": self.device_bytes,
-            "grow_mm": self.growth.grow_mm,
-            "solid": self.solid,
-            "seconds": dict(self.stopwatch.seconds),
-            "kernel_seconds": dict(self.stopwatch.by_kernel),
-            "warnings": [
-                *cache_warnings(),
-                *describe_far(self.volume),
-                *_warn_of_uneven_growth(self.volume, self.growth),
-                *self.warnings,
-            ],
-        }
-
-
-def _warn_of_uneven_growth(volume: Volume, growth: Growth) -> list[str]:
-    """Offsets to the samples around are one table for all slices, so growth takes the slices as evenly spaced."""
-    if not volume.uneven or not len(growth.offsets):
-        return []
-    steps = np.linalg.norm(np.diff(volume.slice_origins(), axis=0), axis=1)
-    return [
-        f"the slices are unevenly spaced ({steps.min():.3f} to {steps.max():.3f} mm): the growth of the labels takes"
-        f" {volume.spacing[2]:.3f} mm from one to the next everywhere"
-    ]
+__all__ = ["extract_labels", "prepare_labels"]
 
 
 def _refuse_label(
@@ -341,7 +110,7 @@ def extract_labels(
         taken = resident.bring(labels)
         rule = choose_iso_rule(resident.volume, iso_value, closed, values=resident.values)
         marching_cubes.check_row(resident.volume.shape_ijk[0])
-        run = _Run(resident, taken, rule, Growth.of(resident.volume, grow_mm), solid)
+        run = LabelExtraction(resident, taken, rule, Growth.of(resident.volume, grow_mm), solid)
         meshes = _make_meshes(run, labels, taken, numbers, progress)
     if not meshes:
         raise NoSurfaceError(f"no label has a voxel of {rule.iso_value:g} HU or more in the CT")
@@ -349,7 +118,7 @@ def extract_labels(
 
 
 def _make_meshes(
-    run: _Run,
+    run: LabelExtraction,
     labels: LabelMap,
     taken: ResampledLabels,
     numbers: Sequence[int | str] | None,
@@ -370,7 +139,7 @@ def _make_meshes(
 
 
 def _extract_each(
-    run: _Run,
+    run: LabelExtraction,
     boxes: dict[int, Box],
     refuse: Callable[[int], NoSurfaceError] | None,
     progress: Progress | None,
@@ -380,7 +149,7 @@ def _extract_each(
     run.groups = len(groups)
     done = 0
 
-    def extract(held: _Held, number: int, box: Box) -> Part | None:
+    def extract(held: HeldSlices, number: int, box: Box) -> Part | None:
         if progress is not None:
             progress("labels", done, len(boxes))
         return run.extract_one(held, number, box)
@@ -393,7 +162,7 @@ def _extract_each(
             raise refuse(number)
 
 
-def _as_mesh(run: _Run, taken: ResampledLabels, report: dict[str, Any], part: Part) -> Mesh:
+def _as_mesh(run: LabelExtraction, taken: ResampledLabels, report: dict[str, Any], part: Part) -> Mesh:
     report["vertices_by_hu_share"] = run.share_by_hu
     report["warnings"] += _warn(taken, report)
     positions, normals, triangles = part

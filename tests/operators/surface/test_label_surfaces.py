@@ -14,7 +14,7 @@ from clrecon.labels import LabelMap, resample_labels
 from clrecon.labels.growth import Growth
 from clrecon.operators.resident import device_volume
 from clrecon.operators.resident.device_volume import DeviceVolume
-from clrecon.operators.surface import labels as operator
+from clrecon.operators.surface import label_extraction as operator
 from clrecon.operators.surface.extract import extract_isosurface
 from clrecon.operators.surface.labels import extract_labels
 from clrecon.reference.surface import labels as twin
@@ -106,7 +106,7 @@ def test_growth_is_that_of_the_twin_to_the_last_sample(device, grow_mm):
             growth = Growth.of(volume, grow_mm)
             rule = choose_iso_rule(volume, 3)
             taken = resample_labels(LabelMap(labels, affine), volume)
-            run = operator._Run(DeviceVolume(volume, device=device), taken, rule, growth, False)
+            run = operator.LabelExtraction(DeviceVolume(volume, device=device), taken, rule, growth, False)
             held = run.find_inside({1: tuple(slice(0, n) for n in shape)})
             inside = operator.download(device, np.empty_like(taken.voxels), held.inside_d)
             assert np.array_equal(inside, twin.find_solid(volume, labels, 3, grow_mm=grow_mm))
