@@ -11,7 +11,7 @@ from collections.abc import Sequence
 __all__ = ["FULL", "KEEP", "LEVELS", "REACH", "START", "STEEPNESS", "VOLUME_SHARE", "next_level"]
 
 REACH = 2
-"""Samples each way, as REACH of cl/surface/label_masks.h."""
+"""Samples each way that count; the kernels have the same number, in cl/surface/label_masks.h."""
 
 FULL = 4 * 16**3
 """The occupancy of a sample deep in a label, as whole numbers count it: levels are as fine as these."""

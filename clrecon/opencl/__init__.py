@@ -10,7 +10,7 @@ from clrecon.opencl.memory import MemoryLimits, check_budget, check_memory, desc
 from clrecon.opencl.pages import result_pages
 from clrecon.opencl.program import Kernel, Program, load_program
 from clrecon.opencl.select import choose_device, list_devices, list_platforms
-from clrecon.opencl.sources import kernel_files, read_kernel_source
+from clrecon.opencl.sources import kernel_constant, kernel_files, kernel_number, read_kernel_source
 
 __all__ = [
     "Device",
@@ -25,7 +25,9 @@ __all__ = [
     "describe_shortage",
     "download",
     "empty_output",
+    "kernel_constant",
     "kernel_files",
+    "kernel_number",
     "launch",
     "list_devices",
     "list_platforms",

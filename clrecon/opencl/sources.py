@@ -15,9 +15,10 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from importlib.abc import Traversable  # importlib.resources.abc from Python 3.11 on
 
-__all__ = ["kernel_files", "kernel_root", "read_kernel_source"]
+__all__ = ["kernel_constant", "kernel_files", "kernel_number", "kernel_root", "read_kernel_source"]
 
 _KNOWN_HEADER = "include/volume.h"
+_NUMBER = re.compile(r"(?m)^#define (\w+) +\(?(-?[0-9.]+)f?\)?(?= |$)")
 _INCLUDE = re.compile(r'^\s*#\s*include\s+"([^"]+)"\s*$')
 
 
@@ -61,3 +62,42 @@ def _inline(name: str, seen: set[str]) -> list[str]:
 def read_kernel_source(name: str) -> str:
     """Return the text of kernel file `name` (such as ``"primitives/scan.cl"``) with its includes inlined."""
     return "\n".join(_inline(name, {name})) + "\n"
+
+
+@cache
+def _numbers(name: str) -> dict[str, set[str]]:
+    """Every number that a kernel file defines; variants may define one differently."""
+    found: dict[str, set[str]] = {}
+    for macro, number in _NUMBER.findall(kernel_root().joinpath(name).read_text(encoding="utf-8")):
+        found.setdefault(macro, set()).add(number)
+    return found
+
+
+def kernel_number(name: str, macro: str) -> float:
+    """Return the number that a kernel file or header defines as `macro`: its one place.
+
+    Parameters
+    ----------
+    name : str
+        Such as ``"rays/project.cl"``.
+    macro : str
+        Such as ``"AIR_HU"``, of a line ``#define AIR_HU (-1000.0f)``.
+
+    Raises
+    ------
+    KeyError
+        The file defines no such number, or several.
+    """
+    numbers = _numbers(name).get(macro, set())
+    if len(numbers) != 1:
+        there = f"several numbers {macro}: {', '.join(sorted(numbers))}" if numbers else f"no number {macro}"
+        raise KeyError(f"cl/{name} defines {there}")
+    return float(next(iter(numbers)))
+
+
+def kernel_constant(name: str, macro: str) -> int:
+    """Return the whole number that a kernel file or header defines as `macro`, see `kernel_number`."""
+    number = kernel_number(name, macro)
+    if not number.is_integer():
+        raise ValueError(f"{macro} of cl/{name} is {number}, no whole number")
+    return int(number)

@@ -1,88 +1,99 @@
-"""A number that Python and the kernels both know has one value: each pair is listed here and compared."""
+"""A number that Python and the kernels both know is written once: Python reads it from the kernel's source.
+
+Rooms that may not import the layer of OpenCL write theirs a second time; they are listed here and compared.
+"""
 
 from __future__ import annotations
 
 import re
+import subprocess
+import sys
 from importlib import import_module
 
 import pytest
 from house import PACKAGE, ROOT
 
+from clrecon.opencl import kernel_constant, kernel_number
+from clrecon.operators.rays.project import PROJECTIONS
 from clrecon.operators.reformat.sample import COMBINATIONS
-from clrecon.operators.surface.mask_extraction import SAMPLES_PER_FLAGS
 
 PAIRS = [
     ("clrecon.labels.occupancy.REACH", "surface/label_masks.h", "REACH"),
-    ("clrecon.operators.resident.bricks.BRICK", "include/bricks.h", "BRICK"),
-    ("clrecon.operators.primitives.compact.COMPACT_WORDS", "primitives/compact.cl", "COMPACT_WORDS"),
-    ("clrecon.operators.primitives.scan.SCAN_PER_ITEM", "primitives/scan.cl", "SCAN_PER_ITEM"),
-    ("clrecon.operators.rays.composite.GRADIENT_NODES", "rays/composite.cl", "GRADIENT_NODES"),
-    ("clrecon.operators.rays.composite.NODES", "rays/steep_segments.h", "NODES"),
-    ("clrecon.operators.rays.buffers.HIGHLIGHTS", "rays/phong.h", "HIGHLIGHTS"),
-    ("clrecon.operators.rays.project.AIR_HU", "rays/project.cl", "AIR_HU"),
-    ("clrecon.operators.rays.ray_view.BOX_ROW", "rays/view.h", "VIEW_BOX_LOW"),
-    ("clrecon.operators.rays.ray_view.TILE", "rays/view.h", "TILE"),
-    ("clrecon.operators.rays.slabs.BRICK_CELLS", "rays/leap.h", "BRICK_CELLS"),
-    ("clrecon.operators.rays.slabs.FARTHEST", "rays/leap.h", "FARTHEST"),
-    ("clrecon.operators.rays.leaps.ROWS_AT_ONCE", "rays/leaps.cl", "ROWS_AT_ONCE"),
-    ("clrecon.operators.rays.slices.NODES", "rays/slices.cl", "BINS"),
     ("clrecon.rendering.looks.steepness.DENSE", "rays/steep_segments.h", "DENSE"),
     ("clrecon.rendering.looks.steepness.PARTS", "rays/steep_segments.h", "PARTS"),
     ("clrecon.rendering.looks.steepness.STEEP", "rays/steep_segments.h", "STEEP"),
 ]
-"""Name in Python, kernel file below cl/, name there."""
+"""Name in Python, kernel file below cl/, name there: of rooms without OpenCL."""
 
-_DOCUMENTED = re.compile(r'(?m)^([A-Z][A-Z_]*)\b[^\n]*= [^\n]*\n"""[^"]*\bcl/[\w/]+\.(?:cl|h)\b')
-"""A constant whose docstring names a kernel file."""
-
-
-def macro_value(text: str, name: str) -> float:
-    """The number that ``#define name`` stands for in the source of a kernel file."""
-    (value,) = re.findall(rf"(?m)^#define {name} +\(?(-?[0-9.]+)f?\)?(?= |$)", text)
-    return float(value)
+_WRITTEN = re.compile(r'(?m)^([A-Z][A-Z_]*)\b[^\n]*= -?[0-9(][^\n]*\n"""[^"]*\bcl/[\w/]+\.(?:cl|h)\b')
+"""A constant that is a number, and whose docstring names a kernel file."""
 
 
-def listed_in(source: str) -> set[str]:
-    """Constants of a module that say that a kernel file has them too."""
-    return set(_DOCUMENTED.findall(source))
+def written_twice(source: str) -> set[str]:
+    """Constants of a module that are written there, and say that a kernel file has them too."""
+    return set(_WRITTEN.findall(source))
 
 
 @pytest.mark.parametrize(("python", "file", "macro"), PAIRS)
 def test_python_and_kernel_agree(python: str, file: str, macro: str) -> None:
     module, _, name = python.rpartition(".")
-    kernel = macro_value((ROOT / "cl" / file).read_text(encoding="utf-8"), macro)
-    assert kernel == getattr(import_module(module), name)
+    assert kernel_number(file, macro) == getattr(import_module(module), name)
 
 
-def test_combinations_have_the_numbers_of_the_kernel() -> None:
-    text = (ROOT / "cl/reformat/sample.cl").read_text(encoding="utf-8")
-    numbers = [macro_value(text, f"COMBINE_{name.upper()}") for name in COMBINATIONS]
-    assert numbers == list(range(len(COMBINATIONS)))
-
-
-def test_flags_of_strips_are_words_of_the_kernel() -> None:
-    text = (ROOT / "cl/surface/label_masks.cl").read_text(encoding="utf-8")
-    assert SAMPLES_PER_FLAGS == 32 * macro_value(text, "STRIP")
-
-
-def test_every_constant_that_names_a_kernel_file_is_compared() -> None:
-    known = {name for name, _, _ in PAIRS} | {
-        "clrecon.operators.reformat.sample.COMBINATIONS",
-        "clrecon.operators.surface.mask_extraction.SAMPLES_PER_FLAGS",
-    }
+def test_no_other_constant_is_written_twice() -> None:
+    known = {name for name, _, _ in PAIRS}
     found = {
         f"{'.'.join(path.relative_to(ROOT).with_suffix('').parts)}.{name}"
         for path in PACKAGE.rglob("*.py")
-        for name in listed_in(path.read_text(encoding="utf-8"))
+        for name in written_twice(path.read_text(encoding="utf-8"))
     }
-    assert len(found) > 10
     assert found - known == set()
 
 
-def test_a_constant_that_drifted_would_be_seen() -> None:
-    text = "#define OTHER 3\n#define PARTS 8 /* of a segment */\n#define AIR_HU (-1000.0f)\n#define STEEP 0.1f\n"
-    assert [macro_value(text, name) for name in ("PARTS", "AIR_HU", "STEEP")] == [8, -1000, 0.1]
-    with pytest.raises(ValueError, match="not enough values"):
-        macro_value(text, "BRICK")
-    assert listed_in('BRICK = 8\n"""Voxels along a side, as in cl/include/bricks.h."""\n') == {"BRICK"}
-    assert listed_in('BRICK = 8\n"""Voxels along a side."""\n') == set()
+def test_no_comment_says_as_in_a_kernel_file() -> None:
+    said = [
+        path.name for path in PACKAGE.rglob("*.py") if re.search(r"as in cl/\w+/\w+\.(cl|h)", path.read_text("utf-8"))
+    ]
+    assert said == []
+
+
+def test_modes_and_combinations_have_numbers_of_their_own() -> None:
+    assert sorted(COMBINATIONS.values()) == [0, 1, 2]
+    assert sorted(PROJECTIONS.values()) == [0, 1, 2, 3]
+
+
+def test_numbers_are_read_as_the_compiler_reads_them() -> None:
+    assert kernel_constant("rays/leap.h", "BRICK_CELLS") == 4
+    assert isinstance(kernel_constant("rays/leap.h", "BRICK_CELLS"), int)
+    assert kernel_number("rays/project.cl", "AIR_HU") == -1000.0
+    assert kernel_number("rays/project.cl", "WATER_PER_HU") == 0.001
+    with pytest.raises(KeyError, match=r"cl/rays/leap.h defines no number NODES"):
+        kernel_constant("rays/leap.h", "NODES")
+    with pytest.raises(KeyError, match="NO_HIT"):
+        kernel_number("rays/surface.cl", "NO_HIT")
+    with pytest.raises(ValueError, match="no whole number"):
+        kernel_constant("rays/project.cl", "WATER_PER_HU")
+
+
+def test_a_number_that_depends_on_the_variant_is_refused(tmp_path, monkeypatch) -> None:
+    (tmp_path / "rays").mkdir()
+    (tmp_path / "rays/a.h").write_text("#ifdef WIDE\n#define LENGTH 8\n#else\n#define LENGTH 4 /* narrow */\n#endif\n")
+    monkeypatch.setattr("clrecon.opencl.sources.kernel_root", lambda: tmp_path)
+    with pytest.raises(KeyError, match="several numbers LENGTH: 4, 8"):
+        kernel_number("rays/a.h", "LENGTH")
+
+
+def test_importing_clrecon_reads_no_kernel_file() -> None:
+    code = (
+        "import sys, clrecon, clrecon.cli.main;"
+        "sources = sys.modules.get('clrecon.opencl.sources');"
+        "print(sources._numbers.cache_info().misses if sources else 0)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "0"
+
+
+def test_a_constant_that_is_written_twice_would_be_seen() -> None:
+    assert written_twice('BRICK = 8\n"""Voxels along a side, see cl/include/bricks.h."""\n') == {"BRICK"}
+    assert written_twice('BRICK = 8\n"""Voxels along a side."""\n') == set()
+    assert written_twice('BRICK = kernel_constant("a.h", "B")\n"""Voxels, see cl/include/bricks.h."""\n') == set()

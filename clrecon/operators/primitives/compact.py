@@ -6,15 +6,15 @@ from dataclasses import dataclass
 from typing import Any
 
 from clrecon.errors import UsageError
-from clrecon.opencl import Device, Program, Stopwatch, allocate, launch, load_program
+from clrecon.opencl import Device, Program, Stopwatch, allocate, kernel_constant, launch, load_program
 from clrecon.operators.primitives.scan import exclusive_scan, prepare_scan
 
 __all__ = ["Compacted", "compact", "prepare_compact"]
 
 LARGEST_MASK = 2**27
 
-COMPACT_WORDS = 8
-"""Words a work-item of cl/primitives/compact.cl."""
+COMPACT_WORDS = kernel_constant("primitives/compact.cl", "COMPACT_WORDS")
+"""Words a work-item."""
 
 
 @dataclass(frozen=True)

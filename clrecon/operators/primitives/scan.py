@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 
 from clrecon.errors import UsageError
-from clrecon.opencl import Device, Program, Stopwatch, allocate, download, launch, load_program
+from clrecon.opencl import Device, Program, Stopwatch, allocate, download, kernel_constant, launch, load_program
 
 __all__ = ["LARGEST_SCAN", "Scanned", "exclusive_scan", "prepare_scan"]
 
-SCAN_PER_ITEM = 16
-"""Elements a work-item of cl/primitives/scan.cl."""
+SCAN_PER_ITEM = kernel_constant("primitives/scan.cl", "SCAN_PER_ITEM")
+"""Elements a work-item."""
 
 LARGEST_SCAN = 2**31
 

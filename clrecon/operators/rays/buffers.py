@@ -8,15 +8,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clrecon.opencl import Device, allocate, download, empty_output
+from clrecon.opencl import Device, allocate, download, empty_output, kernel_constant
 from clrecon.operators.rays.ray_view import TILE
 from clrecon.rendering import Lighting
 from clrecon.rendering.looks.colors import find_color
 
 __all__ = ["HIGHLIGHTS", "PictureBuffers", "count_queues", "highlight_table"]
 
-HIGHLIGHTS = 1024
-"""Entries of the table of highlights, as in cl/rays/phong.h."""
+HIGHLIGHTS = kernel_constant("rays/phong.h", "HIGHLIGHTS")
+"""Entries of the table of highlights."""
 
 
 def highlight_table(lighting: Lighting) -> NDArray[np.float32]:

@@ -11,13 +11,7 @@ from numpy.typing import NDArray
 
 from clrecon.geometry.iso_rule import takes_parts
 from clrecon.labels.resample import ResampledLabels
-from clrecon.opencl import (
-    Device,
-    Stopwatch,
-    allocate,
-    launch,
-    upload,
-)
+from clrecon.opencl import Device, Stopwatch, allocate, kernel_constant, launch, upload
 from clrecon.operators.rays.buffers import PictureBuffers, count_queues, highlight_table
 from clrecon.operators.rays.ray_view import RayView
 from clrecon.operators.rays.slabs import FARTHEST, LeapMap, RaySlab, slab_labels
@@ -31,10 +25,10 @@ from clrecon.rendering.views.camera import Camera
 
 __all__ = ["NODES", "TransferTables", "composite_slab"]
 
-NODES = 4096
-"""Entries of a transfer function's table, as in cl/rays/steep_segments.h."""
+NODES = kernel_constant("rays/steep_segments.h", "NODES")
+"""Entries of a transfer function's table."""
 
-GRADIENT_NODES = 256
+GRADIENT_NODES = kernel_constant("rays/composite.cl", "GRADIENT_NODES")
 """Entries of its table of factors by magnitude of the gradient."""
 
 LEAST_DRIFT = 0.02

@@ -10,15 +10,15 @@ from numpy.typing import NDArray
 
 from clrecon.geometry import Volume
 from clrecon.geometry.affine import Float64Array
-from clrecon.opencl import Stopwatch, allocate, download, launch, upload
+from clrecon.opencl import Stopwatch, allocate, download, kernel_constant, launch, upload
 from clrecon.operators.rays.slabs import LeapMap, RaySlab
 from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.operators.resident.frame import BOX_BORDER, enclose
 
 __all__ = ["find_leaps", "measure_cells"]
 
-ROWS_AT_ONCE = 4
-"""Rows of bricks that a work-item takes, as in cl/rays/leaps.cl."""
+ROWS_AT_ONCE = kernel_constant("rays/leaps.cl", "ROWS_AT_ONCE")
+"""Rows of bricks that a work-item takes."""
 
 
 def measure_cells(resident: DeviceVolume, slab: RaySlab, stopwatch: Stopwatch) -> Any:

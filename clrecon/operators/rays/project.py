@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from clrecon.opencl import Stopwatch, launch, upload
+from clrecon.opencl import Stopwatch, kernel_constant, kernel_number, launch, upload
 from clrecon.operators.rays.buffers import PictureBuffers, count_queues
 from clrecon.operators.rays.leaps import measure_cells
 from clrecon.operators.rays.ray_view import RayView
@@ -13,10 +13,13 @@ from clrecon.operators.resident.device_volume import DeviceVolume
 
 __all__ = ["AIR_HU", "PROJECTIONS", "project_slab"]
 
-AIR_HU = -1000.0
-"""Attenuates nothing, as in cl/rays/project.cl: lower values are padding, or what a mask left."""
+AIR_HU = kernel_number("rays/project.cl", "AIR_HU")
+"""Attenuates nothing: lower values are padding, or what a mask left."""
 
-PROJECTIONS = {"mip": 0, "minip": 1, "mean": 2, "drr": 3}
+PROJECTIONS = {
+    mode: kernel_constant("rays/project.cl", macro)
+    for mode, macro in {"mip": "HIGHEST", "minip": "LOWEST", "mean": "MEAN", "drr": "RADIOGRAPH"}.items()
+}
 """What the kernel calls them."""
 
 

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from clrecon.geometry import Volume, normal_matrix
 from clrecon.geometry.affine import Float64Array
+from clrecon.opencl import kernel_constant
 from clrecon.operators.resident.frame import FieldFrame
 from clrecon.rendering import Lighting
 from clrecon.rendering.looks.lighting import LEAST_SOFT_GRADIENT
@@ -17,10 +18,10 @@ from clrecon.rendering.views.camera import Camera, box_corners
 
 __all__ = ["TILE", "RayView"]
 
-TILE = 8
-"""Pixels along each side of a tile, as in cl/rays/view.h."""
+TILE = kernel_constant("rays/view.h", "TILE")
+"""Pixels along each side of a tile."""
 
-BOX_ROW = 9
+BOX_ROW = kernel_constant("rays/view.h", "VIEW_BOX_LOW")
 """Row of the box in the table; its upper end and both of the focus follow."""
 
 ENDLESS = 1e30

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from clrecon.geometry import Volume, slice_normal
 from clrecon.geometry.affine import Float64Array
 from clrecon.labels import ResampledLabels
-from clrecon.opencl import Stopwatch, check_budget, upload
+from clrecon.opencl import Stopwatch, check_budget, kernel_constant, upload
 from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.rendering.views.camera import Camera
 
@@ -31,11 +31,11 @@ __all__ = [
     "slab_labels",
 ]
 
-BRICK_CELLS = 4
-"""Cells of a brick along i and j, as in cl/rays/leap.h."""
+BRICK_CELLS = kernel_constant("rays/leap.h", "BRICK_CELLS")
+"""Cells of a brick along i and j."""
 
-FARTHEST = 15
-"""Bricks that a leap goes at most, as in cl/rays/leap.h: with that as its margin none is left."""
+FARTHEST = kernel_constant("rays/leap.h", "FARTHEST")
+"""Bricks that a leap goes at most: with that as its margin none is left."""
 
 
 def choose_brick_cells(volume: Volume) -> tuple[int, int, int]:

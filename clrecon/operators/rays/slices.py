@@ -12,13 +12,7 @@ from numpy.typing import NDArray
 from clrecon.errors import UsageError
 from clrecon.geometry import Volume
 from clrecon.geometry.affine import Float64Array
-from clrecon.opencl import (
-    Stopwatch,
-    check_budget,
-    launch,
-    load_program,
-    upload,
-)
+from clrecon.opencl import Stopwatch, check_budget, kernel_constant, launch, load_program, upload
 from clrecon.operators.rays.buffers import PictureBuffers, count_queues
 from clrecon.operators.rays.ray_view import RayView
 from clrecon.operators.resident.device_volume import DeviceVolume
@@ -43,8 +37,8 @@ LOWEST_SHOWN_HU = -300.0
 DEFAULT_WINDOW = (-300.0, 400.0)
 """HU that are black and white, where neither a window nor a transfer function is given: soft tissue and bone."""
 
-NODES = 4096
-"""Entries of the table of colours, as in cl/rays/slices.cl."""
+NODES = kernel_constant("rays/slices.cl", "BINS")
+"""Entries of the table of colours."""
 
 SLICES = "slices in space"
 """What parts are planned for."""

@@ -18,6 +18,7 @@ from clrecon.opencl import (
     allocate,
     describe_shortage,
     download,
+    kernel_constant,
     launch,
     load_program,
     upload,
@@ -29,8 +30,10 @@ from clrecon.system.progress import Progress
 
 __all__ = ["COMBINATIONS", "Reformation", "prepare_reformat", "sample_sheet"]
 
-COMBINATIONS = ("mean", "max", "min")
-"""How the samples of a slab are combined, by their numbers in cl/reformat/sample.cl."""
+COMBINATIONS = {
+    name: kernel_constant("reformat/sample.cl", f"COMBINE_{name.upper()}") for name in ("mean", "max", "min")
+}
+"""How the samples of a slab are combined: the kernel's numbers."""
 
 SAMPLES_A_LAUNCH = 1 << 23
 """Keeps launches short: systems stop those that hold a display's GPU for seconds."""
@@ -122,7 +125,7 @@ def _place_rows(volume: Volume, sheet: Sheet, samples: SlabSamples) -> _Places:
 class _Run:
     """One reformation: all rows through one part of the volume after the other."""
 
-    def __init__(self, resident: DeviceVolume, sheet: Sheet, samples: SlabSamples, combine: int, stopwatch: Stopwatch):
+    def __init__(self, resident: DeviceVolume, sheet: Sheet, samples: SlabSamples, combine: str, stopwatch: Stopwatch):
         self.resident, self.sheet, self.samples = resident, sheet, samples
         self.device, self.volume = resident.device, resident.volume
         self.combine, self.stopwatch = combine, stopwatch
@@ -190,7 +193,7 @@ class _Run:
             values = download(self.device, np.empty(shape, np.float32), values_d)
             weights = download(self.device, np.empty(shape, np.float32), weights_d)
         empty = weights == 0.0
-        if COMBINATIONS[self.combine] == "mean":
+        if self.combine == "mean":
             values = values / np.where(empty, np.float32(1.0), weights)
         values[empty] = np.nan
         held = slices if takes_whole else min(slices, self.slices)
@@ -206,7 +209,7 @@ class _Run:
             launch(
                 self.device, program["reformat_rows"], count * width, stopwatch=self.stopwatch,
                 first_row=first, row_count=count, width=width, ni=ni, nj=nj, nk=nk,
-                intervals=self.samples.intervals, combine=self.combine, **part,
+                intervals=self.samples.intervals, combine=COMBINATIONS[self.combine], **part,
             )  # fmt: skip
 
 
@@ -248,7 +251,7 @@ def sample_sheet(
     """
     if not isinstance(combine, str) or combine not in COMBINATIONS:
         raise UsageError(f"the samples of a slab are combined by one of {', '.join(COMBINATIONS)}, not {combine!r}")
-    run = _Run(resident, sheet, samples, COMBINATIONS.index(combine), stopwatch or Stopwatch())
+    run = _Run(resident, sheet, samples, combine, stopwatch or Stopwatch())
     slices = run.plan()
     fewest = min(2, slices)
     return resident.halve(

@@ -28,6 +28,7 @@ from clrecon.opencl import (
     allocate,
     check_budget,
     download,
+    kernel_constant,
     launch,
     load_program,
     memory_limits,
@@ -47,8 +48,8 @@ SPARE_SLICES = 3 + REACH
 """Beyond the label's box: slices of the mask, gradients, and what their occupancy needs."""
 
 TRIANGLES_PER_SUM = 256
-SAMPLES_PER_FLAGS = 32 * 16
-"""Of a row: 32 strips of 16 samples, as cl/surface/label_masks.cl."""
+SAMPLES_PER_FLAGS = 32 * kernel_constant("surface/label_masks.cl", "STRIP")
+"""Samples of a row that one word of flags tells of: 32 strips."""
 
 
 def prepare_label_masks(device: Device, label_dtype: DTypeLike = np.uint8) -> tuple[Program, Program]:

@@ -9,14 +9,15 @@ from numpy.typing import NDArray
 
 __all__ = ["DENSE", "PARTS", "STEEP", "STEEP_HU", "Steepness"]
 
+# The kernels have these three numbers too, in cl/rays/steep_segments.h; a test compares them.
 PARTS = 4
-"""Of a segment where the transfer function is steep, as in cl/rays/steep_segments.h."""
+"""Of a segment where the transfer function is steep."""
 
 STEEP = 0.1
-"""Opacity that comes or goes within a ray step where it is steep, as in cl/rays/steep_segments.h."""
+"""Opacity that comes or goes within a ray step where it is steep."""
 
 DENSE = 0.7
-"""Opacity of a ray step of which only the front is seen, as in cl/rays/steep_segments.h."""
+"""Opacity of a ray step of which only the front is seen."""
 
 STEEP_HU = 50.0
 """Where it takes more HU, segments in parts are no better than their samples alone, and cost time."""
