@@ -1,4 +1,4 @@
-"""Arrays that begin with a page of memory."""
+"""Arrays that begin at the start of a memory page."""
 
 from __future__ import annotations
 
@@ -13,14 +13,15 @@ __all__ = ["aligned_empty"]
 
 
 def aligned_empty(shape: Sequence[int], dtype: DTypeLike) -> NDArray[Any]:
-    """Return an uninitialised C-contiguous array whose first value is the first of a page.
+    """Return an uninitialised C-contiguous array that begins at the start of a memory page.
 
-    CPU drivers use such an array in place (Intel's copies any other), and kernels may read it as vectors.
+    CPU drivers use the memory of such an array directly (Intel's copies any other array), and kernels may read it as
+    vectors.
 
     Raises
     ------
     MemoryError
-        The system does not give that much.
+        The system does not provide that much memory.
     """
     dtype = np.dtype(dtype)
     size = int(np.prod(shape, dtype=object)) * dtype.itemsize

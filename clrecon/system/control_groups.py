@@ -1,4 +1,4 @@
-"""Memory that is free in the container or service that this process runs in (Linux control groups)."""
+"""Memory that this process may still take in its container or service (Linux control groups)."""
 
 from __future__ import annotations
 
@@ -8,25 +8,25 @@ from pathlib import Path
 
 __all__ = ["free_bytes_of_container"]
 
-_FILES = {  # of a control group: limit, use, and the field of memory.stat that can be given back
+_FILES = {  # Of a version of control groups: the files of limit and use, and the reclaimable field of memory.stat.
     2: ("memory.max", "memory.current", "inactive_file"),
     1: ("memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file"),
 }
 
 
 def free_bytes_of_container(proc: Path, groups: Path) -> float:
-    """Memory that can be taken before this process is killed for it; infinite where nothing limits it.
+    """Return the bytes that this process may still take before it is killed; infinity without a limit.
 
     Parameters
     ----------
     proc, groups : Path
-        Where the system tells of processes and of control groups: ``/proc`` and ``/sys/fs/cgroup``.
+        Folders of processes and of control groups: ``/proc`` and ``/sys/fs/cgroup``.
     """
     return min(_group_bytes(proc, groups), default=math.inf)
 
 
 def _group_bytes(proc: Path, groups: Path) -> Iterator[int]:
-    """What is free in the control group of this process and in those around it."""
+    """Free bytes in the control group of this process and in each group around it."""
     try:
         lines = (proc / "self" / "cgroup").read_text(encoding="utf-8", errors="replace").splitlines()
     except OSError:
@@ -41,7 +41,7 @@ def _group_bytes(proc: Path, groups: Path) -> Iterator[int]:
         else:
             continue
         own = root / path.lstrip("/")
-        for folder in (own, *own.parents):  # a container may see its own group as the root
+        for folder in (own, *own.parents):  # A container may see its own group as the root.
             free = _free_in(folder, *_FILES[version])
             if free is not None:
                 yield free
@@ -55,4 +55,4 @@ def _free_in(folder: Path, limit: str, used: str, reclaimable: str) -> int | Non
         fields = dict(line.split() for line in (folder / "memory.stat").read_text().splitlines())
         return max(free + int(fields.get(reclaimable, 0)), 0)
     except (OSError, ValueError):
-        return None  # no limit ("max"), or no such group
+        return None  # no limit ("max"), or no group of this name

@@ -1,9 +1,9 @@
 """Files that are written are found whole, the new one or the old one.
 
-A file is written to a temporary one in the same folder (created exclusively, readable by the owner only, with a
-random name), flushed to the disk, checked, and only then renamed over the target.  Whatever goes wrong before the
-rename, `KeyboardInterrupt` included, removes the temporary file and leaves an older target as it was.  A process
-that is killed cannot clean up: what it left is removed by the next one that writes into the same folder.
+A file is written to a temporary one in the same folder (created exclusively, readable by the owner only, with a random
+name), flushed to the disk, checked, and only then renamed over the target.  After any failure before the rename,
+`KeyboardInterrupt` included, the temporary file is removed and an older target is unchanged.  A killed process cannot
+clean up: the next process that writes into the same folder removes its temporary files.
 
 A target that is a symbolic link is followed: the file that it points to is replaced and the link stays.
 """
@@ -48,12 +48,13 @@ __all__ = [
 log = get_logger(__name__)
 
 _FILES_OF_OTHERS = 200
-"""Open files that a job has beside those that it writes: libraries, drivers, their caches."""
+"""Number of files kept free for libraries, drivers and their caches, beside the files that a job writes."""
 
 _TEMPORARY = re.compile(r"\.clrecon-[0-9a-f]{16}\.(?:tmp|folder)")
 
 _own_names: set[str] = set()
-"""Temporary files and folders that this process is writing: with a thousand, looking at each every time would cost."""
+"""Names of the temporary files and folders that this process is writing.  They are not examined: with a thousand of
+them that would be slow."""
 
 _ADVICE = {
     errno.ENOSPC: "the disk is full: free some space or choose another folder",
@@ -94,9 +95,9 @@ def replace_file(
     write : callable
         Gets a binary stream, open for writing, and writes the contents.
     verify : callable, optional
-        Gets the path of the finished temporary file and raises `OutputError` if it is not what it should be.
+        Gets the path of the finished temporary file and raises `OutputError` if its contents are wrong.
     expected_bytes : int, optional
-        What the file is going to need; checked against the free space before anything is written.
+        Expected size of the file; checked against the free space before anything is written.
 
     Returns
     -------
@@ -115,13 +116,13 @@ def replace_file(
 
 
 class Staged(Protocol):
-    """What is finished under a temporary name: a file, or a folder of them."""
+    """A finished file, or a folder of finished files, that still has a temporary name."""
 
     size: int
-    """Bytes."""
+    """Size in bytes."""
 
     def commit(self) -> None:
-        """Put it in its place."""
+        """Put it in the place of its target."""
 
 
 class StagedFile:
@@ -143,11 +144,11 @@ class StagedFile:
         Raises
         ------
         OutputError
-            The system refuses; an older target is intact.
+            The system refuses to rename; an older target is intact.
         """
         with system_errors(self._path):
             if sys.platform == "win32":
-                self._stream.close()  # an open file cannot be renamed there
+                self._stream.close()  # Windows cannot rename an open file.
             os.replace(self._temporary, self._target)
         _sync_folder(self._target.parent)
         log.info("file written: %d bytes", self.size)
@@ -163,8 +164,8 @@ def stage_file(
 ) -> Iterator[StagedFile]:
     """Write a file under a temporary name; `StagedFile.commit` in the ``with`` block puts it in place.
 
-    For files that belong together: stage all of them, then commit one after the other.  What is not committed is
-    removed at the end of the block.  Parameters and errors as in `replace_file`.
+    For files that belong together: stage all of them, then commit one after the other.  Files that are not committed
+    are removed at the end of the block.  Parameters and errors as in `replace_file`.
     """
     target = _checked_target(path)
     with contextlib.ExitStack() as stack:
@@ -183,16 +184,17 @@ def stage_file(
             if verify is not None:
                 verify(temporary)
             if sys.platform != "win32":
-                with contextlib.suppress(PermissionError):  # some network file systems keep the mode to themselves
+                with contextlib.suppress(PermissionError):  # Some network file systems do not let the mode be changed.
                     os.fchmod(stream.fileno(), mode)
         yield StagedFile(path, temporary, target, stream, size)
 
 
 @contextlib.contextmanager
 def hold_interrupts() -> Iterator[None]:
-    """Keep Ctrl-C, and other signals that this process handles, waiting until the ``with`` block is done.
+    """Hold back Ctrl-C, and other signals that this process handles, until the ``with`` block is done.
 
-    For the moment in which files that belong together are put into their places.  Other threads are never interrupted.
+    For the moment in which several files are put into their places together.  Python interrupts the main thread only,
+    so other threads need nothing of this.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
@@ -212,8 +214,8 @@ def hold_interrupts() -> Iterator[None]:
 
 
 def allow_open_files(count: int) -> None:
-    """Raise the limit of open files of this process, as far as the system lets it, so that `count` can be staged."""
-    if sys.platform == "win32":  # 8192 there
+    """Raise the limit of open files of this process, as far as the system allows, for `count` staged files."""
+    if sys.platform == "win32":  # Windows: 8192 at most
         return
     import resource
 
@@ -222,12 +224,12 @@ def allow_open_files(count: int) -> None:
     if hard != resource.RLIM_INFINITY:
         wanted = min(wanted, hard)
     if soft != resource.RLIM_INFINITY and soft < wanted:
-        with contextlib.suppress(OSError, ValueError):  # what is too few shows when the file is opened
+        with contextlib.suppress(OSError, ValueError):  # A limit that stays too low shows when a file is opened.
             resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
 
 
 def check_writable(path: str | os.PathLike[str], *, expected_bytes: int = 0) -> None:
-    """Raise `OutputError` if `replace_file` to this path is bound to fail: for a look before hours of work.
+    """Raise `OutputError` if `replace_file` to this path would surely fail: a check before hours of work.
 
     Creates an empty temporary file beside the target and removes it at once; the target is not touched.
 
@@ -235,7 +237,7 @@ def check_writable(path: str | os.PathLike[str], *, expected_bytes: int = 0) -> 
     ----------
     path : str or path
     expected_bytes : int, optional
-        What the file is going to need, as far as it is known.
+        Expected size of the file, if it is known.
     """
     target = _checked_target(path)
     with system_errors(path):
@@ -245,13 +247,13 @@ def check_writable(path: str | os.PathLike[str], *, expected_bytes: int = 0) -> 
 
 
 def _shown(path: str | os.PathLike[str]) -> str:
-    """The path as it goes into a message: one line, nothing that steers a terminal."""
+    """Return the path as a message shows it: one line without terminal control characters."""
     return "".join(c if c.isprintable() else repr(c)[1:-1] for c in os.fspath(path))
 
 
 @contextlib.contextmanager
 def system_errors(path: str | os.PathLike[str]) -> Iterator[None]:
-    """Turn errors of the system into one line that names the target and what to do."""
+    """Turn errors of the system into one line that names the target and says what to do."""
     try:
         yield
     except OSError as error:
@@ -260,7 +262,7 @@ def system_errors(path: str | os.PathLike[str]) -> Iterator[None]:
 
 
 def _checked_target(path: str | os.PathLike[str]) -> Path:
-    """Resolve symbolic links and return the file to replace, after checking that it may be replaced."""
+    """Resolve symbolic links and return the path to replace, after checking that it may be replaced."""
     text = os.fspath(path)
     if "\0" in text:
         raise OutputError(f"cannot write {_shown(path)}: the name holds a null character")
@@ -288,7 +290,7 @@ def _checked_target(path: str | os.PathLike[str]) -> Path:
 
 
 def is_dicom(path: str | os.PathLike[str]) -> bool:
-    """True for a file with the mark of DICOM: what was measured cannot be made again."""
+    """True for a file with the mark of DICOM: measured data are not overwritten, they cannot be made again."""
     try:
         with open_regular(path, 0) as stream:
             return stream.read(132)[128:] == b"DICM"
@@ -298,7 +300,7 @@ def is_dicom(path: str | os.PathLike[str]) -> bool:
 
 def _check_space(path: str | os.PathLike[str], folder: Path, expected_bytes: int) -> None:
     usage = shutil.disk_usage(folder)
-    # Some network file systems do not tell and report a size of 0.
+    # Some network file systems do not tell their free space and report 0 bytes.
     if usage.total and expected_bytes > usage.free:
         raise OutputError(
             f"cannot write {_shown(path)}: it needs about {expected_bytes / 1e6:.1f} MB and "
@@ -307,11 +309,12 @@ def _check_space(path: str | os.PathLike[str], folder: Path, expected_bytes: int
 
 
 def final_mode(target: Path, new: int = 0o666) -> int:
-    """Permissions for what is finished: those of what it replaces, else of `new` what the umask allows."""
+    """Return the permissions of a finished file: those of the file that it replaces, else `new` as the umask allows."""
     try:
         return stat.S_IMODE(os.stat(target).st_mode) & 0o777
     except FileNotFoundError:
-        # The umask can only be read by setting it; a file that another thread makes meanwhile is the stricter.
+        # The umask can only be read by setting it.  Meanwhile it is strict, so a file that another thread makes then is
+        # too private, never too open.
         umask = os.umask(0o077)
         os.umask(umask)
         return new & ~umask
@@ -319,7 +322,7 @@ def final_mode(target: Path, new: int = 0o666) -> int:
 
 @contextlib.contextmanager
 def _temporary_file(folder: Path) -> Iterator[tuple[Path, BinaryIO]]:
-    """Create a file exclusively, for the owner only, and remove it in the end unless it was renamed."""
+    """Create a file exclusively, readable by the owner only, and remove it at the end unless it was renamed."""
     flags = os.O_RDWR | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0) | getattr(os, "O_NOFOLLOW", 0)
     while True:
         temporary = folder / f".clrecon-{secrets.token_hex(8)}.tmp"
@@ -331,7 +334,7 @@ def _temporary_file(folder: Path) -> Iterator[tuple[Path, BinaryIO]]:
                 try:
                     yield temporary, stream
                 except BaseException:
-                    with contextlib.suppress(OSError):  # what waits in the buffer fails as the first error did
+                    with contextlib.suppress(OSError):  # closing writes the buffer and may fail again
                         stream.close()
                     raise
                 return
@@ -343,9 +346,9 @@ def _temporary_file(folder: Path) -> Iterator[tuple[Path, BinaryIO]]:
 
 @contextlib.contextmanager
 def temporary_folder(parent: Path) -> Iterator[Path]:
-    """Make a folder with a random name, for the owner only, and remove it in the end unless it was renamed.
+    """Make a folder with a random name, for the owner only, and remove it at the end unless it was renamed.
 
-    As with files, those of processes that are dead are removed by the next one that writes into `parent`.
+    Folders of dead processes are removed by the next process that writes into `parent`, as files are.
     """
     _sweep(parent)
     with contextlib.ExitStack() as stack:
@@ -361,7 +364,7 @@ def temporary_folder(parent: Path) -> Iterator[Path]:
 
 
 def _lock_folder(stack: contextlib.ExitStack, made: Path) -> bool:
-    """Lock a folder that was just made until `stack` closes; False when another process was about to sweep it."""
+    """Lock a new folder until `stack` closes; False when another process was about to remove it in `_sweep`."""
     try:
         descriptor = os.open(made, os.O_RDONLY | getattr(os, "O_NOFOLLOW", 0))
     except FileNotFoundError:
@@ -377,26 +380,26 @@ def _lock_folder(stack: contextlib.ExitStack, made: Path) -> bool:
 
 
 def _lock_new(stream: BinaryIO) -> bool:
-    """Lock a file that was just created against `_sweep`; False when another process was about to sweep it."""
+    """Lock a new file against `_sweep`; False when another process was about to remove it."""
     if sys.platform != "win32":
         try:
             fcntl.flock(stream.fileno(), fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             return False
         except OSError:
-            return True  # a file system without locks: nobody can lock, so nobody can sweep
+            return True  # A file system without locks: no file can be locked, so `_sweep` removes nothing.
     return os.fstat(stream.fileno()).st_nlink > 0
 
 
 def _sweep(folder: Path) -> None:
-    """Remove temporary files and folders of dead processes: those of our pattern that nobody has locked."""
+    """Remove temporary files and folders of dead processes: names of our pattern that no process has locked."""
     if sys.platform == "win32":
         return
     with os.scandir(folder) as entries:
         names = [entry.name for entry in entries if _TEMPORARY.fullmatch(entry.name) and entry.name not in _own_names]
     for name in names:
         temporary = folder / name
-        # Vanished meanwhile, someone else's, or locked by a living process: none of our business.
+        # Vanished meanwhile, owned by another user, or locked by a living process: left alone.
         with contextlib.suppress(OSError):
             is_folder = name.endswith(".folder")
             access = os.O_RDONLY | os.O_DIRECTORY if is_folder else os.O_RDWR
@@ -415,7 +418,9 @@ def _sweep(folder: Path) -> None:
 
 
 def _sync_folder(folder: Path) -> None:
-    """Make the rename itself durable, where the system can; the file is whole either way."""
+    """Write the rename itself to the disk, where the system can.  Without this the file is still either the old or the
+    new one.
+    """
     if sys.platform == "win32":
         return
     with contextlib.suppress(OSError):

@@ -1,6 +1,6 @@
-"""Gates as data: a figure, the bound that it is held against, and whether it keeps it.
+"""Gates as data: a measured figure, its bound, and whether the figure keeps the bound.
 
-Meshes and volumes are judged in the same form, so that one reader of reports understands both.
+Gates of meshes and of volumes have the same form, so one reader of reports understands both.
 """
 
 from __future__ import annotations
@@ -41,34 +41,34 @@ class Gate(Record):
 
 
 def none_of(name: str, count: int, what: str, ok: bool | None = None) -> Gate:
-    """There is none of something; `ok` where something else than the count decides."""
+    """Gate: a count must be 0. Where `ok` is given, it decides instead of the count."""
     ok = count == 0 if ok is None else ok
     return Gate(name, count, 0, None, bool(ok), f"{what}: {count}, none allowed")
 
 
 def is_true(name: str, flag: bool, what: str) -> Gate:
-    """A statement holds."""
+    """Gate: a statement must be true."""
     says = what if flag else f"does not hold: {what}"
     return Gate(name, bool(flag), True, None, bool(flag), says)
 
 
 def at_most(name: str, measured: float, bound: float, unit: str | None, what: str) -> Gate:
-    """A figure is no larger than its bound."""
+    """Gate: a figure must not be larger than its bound."""
     text = f"{what}: {measured:.3g}{' ' * bool(unit)}{unit or ''}, at most {bound:g}"
     return Gate(name, measured, bound, unit, measured <= bound, text)
 
 
 def at_least(name: str, measured: float, bound: float, unit: str | None, what: str) -> Gate:
-    """A figure is no smaller than its bound."""
+    """Gate: a figure must not be smaller than its bound."""
     text = f"{what}: {measured:.4g}{' ' * bool(unit)}{unit or ''}, at least {bound:g}"
     return Gate(name, measured, bound, unit, measured >= bound, text)
 
 
 def unmeasured(name: str, bound: float | bool, unit: str | None, why: str) -> Gate:
-    """What this gate asks for was not looked at, or there is nothing to look at."""
+    """Gate whose figure was not measured, or for which there is nothing to measure."""
     return Gate(name, None, bound, unit, None, why)
 
 
 def failed_gates(gates: Iterable[Mapping[str, Any]]) -> list[str]:
-    """One line for each gate that was measured and not kept."""
+    """Return one line for each gate that was measured and not kept."""
     return [f"gate {gate['name']} failed: {gate['text']}" for gate in gates if gate["ok"] is False]

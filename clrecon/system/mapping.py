@@ -1,4 +1,4 @@
-"""Voxels in a memory-mapped file: which of their pages stay in memory, and where in the file they are."""
+"""Voxels in a memory-mapped file: releasing their pages from memory, and finding their place in the file."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ __all__ = ["FilePlace", "Mapping", "find_mapping"]
 
 @dataclass(frozen=True)
 class FilePlace:
-    """A C-contiguous array in a file, and what the file was when the array was there.
+    """The place of a C-contiguous array in a file, and the state of the file at that time.
 
     Attributes
     ----------
@@ -46,7 +46,7 @@ class FilePlace:
         Raises
         ------
         RefusedInputError
-            The file is not there, cannot be read, or is not what it was.
+            The file does not exist, cannot be read, or has changed since.
         """
         what = f"voxels were sent as a place in the file {self.path}"
         try:
@@ -66,17 +66,17 @@ class FilePlace:
 
 @dataclass(frozen=True)
 class Mapping:
-    """A file mapping.
+    """A memory mapping of a file.
 
     Attributes
     ----------
     file : mmap
     address : int
-        Of its first byte in memory.
+        Address of its first byte in memory.
     path : str or None
-        Of the file, where it is known.
+        Path of the file, if it is known.
     start : int
-        Byte of the file that the mapping begins with.
+        Offset in the file at which the mapping begins, bytes.
     identity : (int, int) or None
         Device and number of the file when the mapping was found: another file may take its name later.
     writeable : bool
@@ -92,7 +92,7 @@ class Mapping:
     def release(self, part: NDArray[Any]) -> None:
         """Let the whole pages of `part`, a C-contiguous view of the mapping, leave memory.
 
-        They stay in the system's file cache as long as it has room, and are read again when they are used.
+        They stay in the system's file cache while it has room, and are read again when they are used.
         """
         begin = part.ctypes.data - self.address
         first = -(-begin // mmap.PAGESIZE) * mmap.PAGESIZE
@@ -101,12 +101,13 @@ class Mapping:
             self.file.madvise(mmap.MADV_DONTNEED, first, end - first)
 
     def place(self, part: NDArray[Any]) -> FilePlace | None:
-        """Where `part`, a C-contiguous view of the mapping, is in the file; what was changed is written there first.
+        """Return where `part`, a C-contiguous view of the mapping, is in the file; changes are written to the file
+        first.
 
         Returns
         -------
         FilePlace or None
-            None where the name leads to the mapped file no more.
+            None where the path no longer names the mapped file.
         """
         if self.path is None or self.identity is None:
             return None
@@ -125,7 +126,7 @@ class Mapping:
 def find_mapping(array: NDArray[Any]) -> Mapping | None:
     """Return the file mapping that `array` is a view of, None where its values are ordinary memory.
 
-    Only a `numpy.memmap` that is shared with its file is taken: what was written to any other mapping would be lost.
+    Only a `numpy.memmap` that is shared with its file is accepted: changes to any other mapping would be lost.
     """
     owner: Any = array
     while isinstance(owner, np.ndarray):
@@ -145,6 +146,6 @@ def _describe(owner: np.memmap[Any, Any], file: mmap.mmap) -> Mapping:
             identity = found.st_dev, found.st_ino
         except OSError:  # removed since it was mapped
             path = None
-    start = owner.offset - owner.offset % mmap.ALLOCATIONGRANULARITY  # where numpy lets the mapping begin
+    start = owner.offset - owner.offset % mmap.ALLOCATIONGRANULARITY  # numpy maps from a multiple of this
     address = np.frombuffer(file, np.uint8, 1).ctypes.data
     return Mapping(file, address, path, start, identity, owner.mode != "r")

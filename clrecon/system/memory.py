@@ -1,4 +1,4 @@
-"""Memory for voxels: asked for before it is taken, so that a small file cannot fill the computer."""
+"""Memory for voxels, checked before it is taken: a small file that claims huge dimensions cannot fill the computer."""
 
 from __future__ import annotations
 
@@ -18,13 +18,14 @@ from clrecon.system.control_groups import free_bytes_of_container
 __all__ = ["allocate_voxels", "available_memory_bytes", "physical_memory_bytes"]
 
 MEMORY_SHARE = 0.9
-"""Of the memory that is free; the rest is for what is computed beside the volume."""
+"""Share of the free memory that voxels may take; the rest is for what is computed beside the volume."""
 
 
 def available_memory_bytes(proc: Path = Path("/proc"), groups: Path = Path("/sys/fs/cgroup")) -> float:
-    """Memory that can be taken without swapping; all that there is, or infinity, where the system does not tell.
+    """Return the bytes that can be taken without swapping: all memory, or infinity, where the system does not tell.
 
-    Linux tells a container the memory of the whole computer, and ends what takes more than the container has.
+    Linux shows a container the memory of the whole computer, but kills a process that exceeds the container's own
+    limit; the smaller of both counts.
     """
     container = free_bytes_of_container(proc, groups)
     try:
@@ -38,7 +39,7 @@ def available_memory_bytes(proc: Path = Path("/proc"), groups: Path = Path("/sys
 
 
 def physical_memory_bytes() -> float:
-    """Memory of this computer, infinite where the system does not tell (Windows)."""
+    """Return the memory of this computer in bytes; infinity where the system does not tell (Windows)."""
     try:
         return float(os.sysconf("SC_PHYS_PAGES")) * os.sysconf("SC_PAGE_SIZE")
     except (AttributeError, OSError, ValueError):
@@ -53,12 +54,12 @@ def allocate_voxels(shape: Sequence[int], dtype: DTypeLike, name: str = "") -> N
     shape : (nk, nj, ni)
     dtype : numpy type
     name : str
-        Of the file, for the message.
+        Name of the file, for the message.
 
     Raises
     ------
     RefusedInputError
-        It does not fit into the memory that is free.
+        The array does not fit into the free memory.
     """
     needed = math.prod(shape) * np.dtype(dtype).itemsize
     available = available_memory_bytes()

@@ -1,10 +1,10 @@
-"""Messages: objects that travel to other processes and back, as those of a batch do, and lose nothing on the way.
+"""Messages: objects that can be sent to other processes, as those of a batch are, without losing anything.
 
-pickle makes writeable what was read-only; the read-only arrays of a `Message` are read-only in every copy too.  pickle
-also reads a memory-mapped file into memory; a `MappedArray` travels as its place in that file, which is mapped again,
-read-only, where the message arrives.  The file belongs to whoever mapped it and must stay until then; clrecon itself
-maps no files.  Where the file has been removed or replaced before the message leaves, and for mappings whose changes
-stay private (numpy's mode "c"), the values themselves travel.
+pickle makes read-only arrays writeable; the read-only arrays of a `Message` stay read-only in every copy.  pickle also
+reads a memory-mapped file into memory; a `MappedArray` is sent as its place in the file, which the receiver maps again,
+read-only.  The file belongs to whoever mapped it and must exist until then; clrecon itself maps no files.  The values
+themselves are sent where the file has been removed or replaced before the message is sent, and for mappings whose
+changes stay private (numpy's mode "c").
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ class Message:
     """Base of classes with a ``__dict__`` whose objects pickle and copy as this module says."""
 
     _UNSENT: ClassVar[tuple[str, ...]] = ()
-    """Attributes that are made anew when they are asked for."""
+    """Names of attributes that are not sent; they are computed again when they are asked for."""
 
     def __getstate__(self) -> dict[str, object]:
         return {name: _pack(value) for name, value in vars(self).items() if name not in self._UNSENT}
@@ -35,7 +35,7 @@ class Message:
 
 
 class _Packed:
-    """An array on its way that cannot be written; unpickled it is a plain array."""
+    """A read-only array while it is being sent; unpickled it is a plain array."""
 
     def __init__(self, array: NDArray[Any]):
         self.array = array
@@ -48,9 +48,9 @@ class _Packed:
 
 
 class MappedArray(_Packed):
-    """An array in a memory-mapped file on its way.
+    """An array in a memory-mapped file while it is being sent.
 
-    A deep copy shares a mapping that cannot be written, and copies any other into memory.
+    A deep copy shares a read-only mapping, and copies any other into memory.
     """
 
     def __init__(self, array: NDArray[Any], mapping: Mapping):

@@ -1,4 +1,4 @@
-"""Long arrays in pieces that stay in the processor's cache, and coordinates near zero."""
+"""Work on long arrays in pieces that fit the processor's cache, and coordinates that are small numbers."""
 
 from __future__ import annotations
 
@@ -10,19 +10,19 @@ from numpy.typing import NDArray
 __all__ = ["CHUNK", "chunks", "local_origin"]
 
 CHUNK = 1 << 14
-"""Triangles a piece: 16384 of them take about 2 MB in float64; 32 times as many took 1.5 times as long."""
+"""Triangles in a piece.  These take about 2 MB in float64; pieces 32 times as long took 1.5 times the time."""
 
 
 def chunks(count: int, size: int = CHUNK) -> Iterator[slice]:
-    """Slices that cover ``range(count)`` in order."""
+    """Return slices that cover ``range(count)`` in order."""
     for start in range(0, count, size):
         yield slice(start, min(start + size, count))
 
 
 def local_origin(vertices: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Centre of the bounds, shape (3,), float64.
+    """Return the centre of the bounds, shape (3,), float64.
 
-    Patient coordinates can be far from zero; products of them would lose the digits that a volume needs.
+    Patient coordinates can be far from zero.  Products of them would lose the digits that a volume integral needs.
     """
     if len(vertices) == 0:
         return np.zeros(3)

@@ -1,4 +1,4 @@
-"""How work that takes long tells what it is doing."""
+"""Progress of long work: the type of the functions that receive it."""
 
 from __future__ import annotations
 
@@ -15,4 +15,4 @@ and reaches the caller as it is; `clrecon.errors.Cancelled` is there for that.
 
 
 def ignore_progress(stage: str, done: int = 0, total: int = 0) -> None:
-    """Take a step of progress and do nothing with it."""
+    """A progress function that does nothing."""

@@ -14,12 +14,12 @@ _READ = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_CLOEXEC", 0)
 
 
 def open_regular(path: str | os.PathLike[str], buffering: int = -1) -> BinaryIO:
-    """Open a file for reading, as ``open(path, "rb", buffering)`` does, if it is a regular one.
+    """Open a regular file for reading, as ``open(path, "rb", buffering)`` does.
 
     Raises
     ------
     OSError
-        It cannot be opened, or is a folder, FIFO, socket or device, which is not waited for.
+        It cannot be opened, or is a folder, FIFO, socket or device; these are refused without waiting.
     """
     descriptor = os.open(path, _READ)
     if stat.S_ISREG(os.fstat(descriptor).st_mode):
@@ -29,7 +29,7 @@ def open_regular(path: str | os.PathLike[str], buffering: int = -1) -> BinaryIO:
 
 
 def read_regular(path: str | os.PathLike[str], limit: int) -> bytes:
-    """Read a regular file of `limit` bytes at most; raises OSError as `open_regular` does, or where it is larger."""
+    """Read a regular file of at most `limit` bytes; raises OSError for a larger one, and as `open_regular` does."""
     with open_regular(path) as stream:
         data = stream.read(limit + 1)
     if len(data) > limit:

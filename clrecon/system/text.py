@@ -25,7 +25,7 @@ def escape_text(text: str, limit: int = TEXT_LIMIT) -> str:
 
 @lru_cache(1024)
 def hash_uid(uid: str) -> str | None:
-    """First 16 hexadecimal digits of the SHA-256 of a UID: names a series without giving its identifier away.
+    """Return the first 16 hexadecimal digits of the SHA-256 of a UID: a name that does not reveal the UID.
 
     None for an empty UID.
     """
@@ -35,7 +35,7 @@ def hash_uid(uid: str) -> str | None:
 
 
 def join_names(names: Iterable[object]) -> str:
-    """Names for a message, the first few and then a count; only those that are shown are made into text."""
+    """Join the first few names for a message, then a count; only the names that are shown are converted to text."""
     names = list(names)
     shown = ", ".join(map(str, names[:NAMES_SHOWN]))
     return shown if len(names) <= NAMES_SHOWN else f"{shown} and {len(names) - NAMES_SHOWN} more"

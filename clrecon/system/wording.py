@@ -1,9 +1,9 @@
-"""How a message names a parameter: as Python does, or as the command line that runs.
+"""The words by which a message names a parameter: Python's, or those of the command line when it runs.
 
 >>> name_parameter("keep_largest", "N")
 'keep_largest=N'
 
-On the command line the same call gives the option of the command that runs: see `clrecon.cli.wording`.
+On the command line the same call returns the option of the running command: see `clrecon.cli.wording`.
 """
 
 from __future__ import annotations
@@ -14,11 +14,11 @@ from contextlib import contextmanager
 __all__ = ["Speaker", "in_python", "name_parameter", "spoken_by"]
 
 Speaker = Callable[[str, object], str]
-"""Takes a parameter and its value (None for the parameter alone), gives the words."""
+"""Function that takes a parameter and its value (None for the parameter alone) and returns the words."""
 
 
 def in_python(parameter: str, value: object = None) -> str:
-    """The words of a caller in Python; capital letters stand for a value: ``N``, ``(BONE, TISSUE)``."""
+    """Return the words for a caller in Python; capital letters stand for a value: ``N``, ``(BONE, TISSUE)``."""
     if value is None:
         return parameter
     placeholder = isinstance(value, str) and value == value.upper()
@@ -29,7 +29,7 @@ _speaker: Speaker = in_python
 
 
 def name_parameter(parameter: str, value: object = None) -> str:
-    """Name a parameter, and a value of it, in the words of who runs clrecon.
+    """Name a parameter, with a value if one is given, in Python's words or those of the command line.
 
     Parameters
     ----------
@@ -43,7 +43,7 @@ def name_parameter(parameter: str, value: object = None) -> str:
 
 @contextmanager
 def spoken_by(speaker: Speaker) -> Iterator[None]:
-    """Let `speaker` name parameters within a block; messages of other threads are worded alike meanwhile."""
+    """Let `speaker` name parameters within a block; messages of other threads change with it during that time."""
     global _speaker
     before, _speaker = _speaker, speaker
     try:
