@@ -1,4 +1,4 @@
-"""Pure numpy: affines, patient frames and the `Volume` that carries them."""
+"""Where a voxel is: affines, patient frames, grids and volumes; numpy alone."""
 
 from clrecon.geometry.affine import (
     apply_affine,

@@ -1,4 +1,4 @@
-"""The affine from voxel indices (i, j, k) to patient millimetres, and what can be read off it.
+"""The affine from voxel indices (i, j, k) to patient millimetres, and the spacing, normal and tilt that follow from it.
 
 An affine is always a 4x4 float64 array that maps column vectors (i, j, k, 1) to (x, y, z, 1) in LPS mm:
 its columns are the step from one column of a slice to the next, from one row to the next, from one slice to
@@ -28,7 +28,7 @@ __all__ = [
 ]
 
 Float64Array = NDArray[np.float64]
-"""What every function here takes and gives."""
+"""The type of the arrays that the functions here take and return."""
 
 
 def compose_affine(i_step: ArrayLike, j_step: ArrayLike, k_step: ArrayLike, origin: ArrayLike) -> Float64Array:
@@ -97,12 +97,12 @@ def apply_affine(affine: Float64Array, points: ArrayLike) -> Float64Array:
 
 
 def checked_points(points: ArrayLike) -> Float64Array:
-    """Return points (n, 3) as float64 after checking that they are.
+    """Return points (n, 3) as float64 after checking their shape.
 
     Raises
     ------
     UsageError
-        They are not.
+        They do not have this shape, or are no numbers.
     """
     try:
         checked = np.asarray(points, dtype=np.float64)

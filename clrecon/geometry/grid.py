@@ -1,4 +1,4 @@
-"""`Grid`: what everything has that is an array of voxels and the affine that places them."""
+"""`Grid`: an array of voxels and the affine that places them, the base of volumes and label maps."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ __all__ = ["Grid"]
 
 
 class Grid(Message):
-    """Voxels and their affine: the base of `Volume` and of `clrecon.labels.LabelMap`.
+    """Voxels and their affine: the base class of `Volume` and of `clrecon.labels.LabelMap`.
 
-    It pickles and copies as `clrecon.system.messages` says: memory-mapped voxels travel as their place in the file.
+    It pickles and copies as `clrecon.system.messages` says: memory-mapped voxels are sent as their place in the file.
 
     Parameters
     ----------
     voxels : ndarray, shape (nk, nj, ni)
-        Checked by the class that is made.
+        Checked by the subclass.
     affine : ndarray, shape (4, 4), float64
         Index (i, j, k) to LPS mm, checked too; it becomes read-only.
     """

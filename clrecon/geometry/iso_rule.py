@@ -1,7 +1,6 @@
-"""The scalar field of a volume, as every surface operator sees it.
+"""The iso rule: which samples of a volume are inside, where the surface lies, and what the border is closed with.
 
-What is inside, where between two samples the surface lies, and what is beyond the volume's border: stated once,
-for the device operators and their numpy twins alike.
+The device operators and their numpy twins all use this one statement of the rule.
 """
 
 from __future__ import annotations
@@ -21,19 +20,19 @@ from clrecon.geometry.precision import find_vertex_origin, float32_step, largest
 from clrecon.geometry.volume import AIR_HU, Volume
 
 LARGEST_INTEGER = 2**23
-"""Integer voxels are interpolated in float32, which holds halves of integers up to here."""
+"""Integer voxels are interpolated in float32, which holds multiples of 0.5 exactly up to here."""
 
 LOWEST_OUTSIDE = -(2**30)
-"""Differences between integer voxels and what is outside of them stay within 32 bits."""
+"""Lowest value beyond the border: differences from integer voxels stay within 32 bits."""
 
 LARGEST_FLOAT = 1e30
-"""Differences of float voxels up to here, and their squares after scaling, stay within float32."""
+"""Largest float voxel: differences, and their squares after scaling, stay within float32."""
 
 TOPOLOGIES = ("separated", "trilinear")
-"""What is done where the corners of a cell do not say which of them are joined, see `IsoRule.topology`."""
+"""How inside samples are joined where the corners of a cell leave it open; see `IsoRule.topology`."""
 
 Level = float | Sequence[float]
-"""An iso value, or the two ends of a range: HU."""
+"""An iso value, or the two ends of a range, HU."""
 
 __all__ = [
     "TOPOLOGIES",
@@ -59,7 +58,7 @@ class IsoRule:
     Attributes
     ----------
     iso_value : float
-        As asked for, HU; of a range its lower end.
+        As asked for, HU; for a range its lower end.
     lowest_inside : int or float
         A sample is inside when its value is >= this.  For integer voxels the lowest integer >= the iso value.
     iso_level : float
@@ -68,22 +67,23 @@ class IsoRule:
     outside : float
         The value beyond the border of a closed volume: the lowest value of the volume, but not below `AIR_HU`.
     closed : bool
-        The volume is surrounded by `outside`; else the surface ends open at the border.
+        True: the volume is surrounded by `outside`.  False: the surface ends open at the border.
     value_scale : float
-        Power of two that takes the values of float voxels to 1 or below; 1 for integers, which need none.
+        Power of two by which float voxels are multiplied, so that none exceeds 1; 1 for integer voxels.
     topology : {"separated", "trilinear"}
         Inside samples that only meet across a face or through a cell are kept apart, or joined where the trilinear
         interpolation of the samples joins them.
     inside : {"above", "below", "between"}
-        What the surface encloses: the samples from `lowest_inside` on; the others, in which case it is the surface
-        of "above" turned round, and `outside` lies above the level; or those of a range.
+        The samples that the surface encloses.  "above": those >= `lowest_inside`. "below": the others; the surface is
+        that of "above" turned round, and `outside` lies above the level.  "between": those of a range.
     upper_value : float or None
-        Of a range the upper end as asked for, HU; it belongs to the range.
+        For a range: the upper end as asked for, HU, which belongs to the range.
     highest_inside : int, float or None
-        Of a range: a sample is inside up to this value.  For integer voxels the highest integer <= the upper end.
+        For a range: a sample is inside when its value is also <= this.  For integer voxels the highest integer <= the
+        upper end.
     upper_level : float or None
-        Of a range: where the surface lies between an inside sample and one above the range.  For integer voxels and
-        an integer end k it is k + 0.5.
+        For a range: where the surface lies between an inside sample and one above the range.  For integer voxels and an
+        integer end k it is k + 0.5.
     """
 
     iso_value: float
@@ -100,33 +100,33 @@ class IsoRule:
 
     @property
     def border(self) -> int:
-        """Layers of outside around the volume: 1 when closed, else 0."""
+        """Layers of samples with the value `outside` around the volume: 1 when closed, else 0."""
         return int(self.closed)
 
     @property
     def levels(self) -> tuple[float, ...]:
-        """Every level at which the surface may lie: one, or the two of a range."""
+        """Every level at which the surface may lie: one, or two for a range."""
         return (self.iso_level,) if self.upper_level is None else (self.iso_level, self.upper_level)
 
     def mark_inside(self, values: NDArray[Any]) -> NDArray[np.bool_]:
-        """Which of these values are inside."""
+        """Mark the values that are inside."""
         if self.inside == "below":
             return values < self.lowest_inside
         marked = values >= self.lowest_inside
         return marked if self.highest_inside is None else marked & (values <= self.highest_inside)
 
     def describe(self) -> str:
-        """What is asked for, in words: ``200 HU``, ``below -400 HU``, ``100 to 300 HU``."""
+        """Describe what is asked for: ``200 HU``, ``below -400 HU``, ``100 to 300 HU``."""
         if self.upper_value is not None:
             return f"{self.iso_value:g} to {self.upper_value:g} HU"
         return f"{'below ' if self.inside == 'below' else ''}{self.iso_value:g} HU"
 
     def describe_place(self) -> str:
-        """The same behind "surface": ``at 200 HU``, ``of what lies below -400 HU``."""
+        """Describe the same for use after the word "surface": ``at 200 HU``, ``of what lies below -400 HU``."""
         return f"of what lies {self.describe()}" if self.inside == "below" else f"at {self.describe()}"
 
     def as_report(self) -> dict[str, Any]:
-        """Entries of a mesh's report: what is inside, and where the surface lies, HU.
+        """Return the entries of a mesh's report: what is inside, and where the surface lies, HU.
 
         ``iso_value_hu`` and ``iso_level_hu`` are None for a range; ``inside_hu`` and ``inside_levels_hu`` are
         ``[low, high]``, None for the end that is open.
@@ -148,7 +148,7 @@ class IsoRule:
 
 
 def data_range(volume: Volume) -> tuple[float, float]:
-    """Lowest and highest value of the volume.
+    """Return the lowest and the highest value of the volume.
 
     Raises
     ------
@@ -158,7 +158,7 @@ def data_range(volume: Volume) -> tuple[float, float]:
     low, high = math.inf, -math.inf
     for k, voxels in enumerate(volume.voxels):
         lowest, highest = float(voxels.min()), float(voxels.max())
-        if math.isnan(lowest):  # numpy's min and max are NaN where one value is
+        if math.isnan(lowest):  # numpy's min and max are NaN if any value is NaN.
             raise NoSurfaceError(f"slice {k} of the volume holds NaN: it has no iso surface")
         low, high = min(low, lowest), max(high, highest)
         volume.release_slices(k, k + 1)
@@ -166,7 +166,7 @@ def data_range(volume: Volume) -> tuple[float, float]:
 
 
 def _lowest_value(volume: Volume) -> float:
-    """Lowest value of the volume, or `AIR_HU` as soon as a slice reaches it: what is below does not matter."""
+    """Return the lowest value of the volume, or `AIR_HU` as soon as a slice reaches it: lower values do not matter."""
     low = math.inf
     for k, voxels in enumerate(volume.voxels):
         low = min(low, float(voxels.min()))
@@ -177,12 +177,12 @@ def _lowest_value(volume: Volume) -> float:
 
 
 class ValueRange:
-    """What of a volume's values an iso rule depends on, each found when it is first asked for and then kept.
+    """The range of a volume's values, as an iso rule needs it; each figure is found when first asked for and then kept.
 
     Parameters
     ----------
     volume : Volume
-        Its voxels must not change any more.
+        Its voxels must not change afterwards.
     """
 
     def __init__(self, volume: Volume):
@@ -221,13 +221,13 @@ def choose_iso_rule(
     below : bool
         A sample is inside when its value is < `iso_value`: the same surface, turned round.
     values : ValueRange, optional
-        Of this volume, where it is asked for more than one iso value.
+        Those of this volume; given where several rules for one volume are chosen.
 
     Raises
     ------
     UsageError
-        `iso_value` is no finite number nor a range of two, there is no such topology, it does not go with a range, or
-        values are too large to be interpolated in float32.
+        `iso_value` is neither a finite number nor a range of two; the topology is unknown or cannot be used with a
+        range; or values are too large to be interpolated in float32.
     NoSurfaceError
         Float voxels that hold NaN or infinite values.
     """
@@ -264,7 +264,7 @@ def choose_iso_rule(
 
 
 def _end_range(rule: IsoRule, upper_value: float, dtype: DTypeLike) -> IsoRule:
-    """The rule of a range: what is below its upper end, and that end itself, is inside."""
+    """Turn a rule into that of a range: samples above its upper end are no longer inside, the end itself is."""
     if np.dtype(dtype).kind == "f":
         upper_level = float(np.float32(upper_value))
         highest_inside: int | float = upper_level
@@ -279,11 +279,11 @@ def _end_range(rule: IsoRule, upper_value: float, dtype: DTypeLike) -> IsoRule:
 
 
 def _choose_outside(rule: IsoRule, low: float, dtype: DTypeLike) -> float:
-    """The value beyond the border: `low`, which is the lowest of the volume or air, or what takes its part.
+    """Return the value beyond the border: `low` (the lowest value of the volume, or air), or a value in its place.
 
-    Where that is inside (everything is, or the level lies below air), a value beyond the level.  For what lies below
-    an iso value, as far above the level as `low` is below: the surface of air ends half way to the border.  Always of
-    the voxels' own kind.
+    It must not be inside.  Where `low` is inside (everything is, or the level lies below air), it is a value beyond the
+    level.  For surfaces of what lies below an iso value it lies as far above the level as `low` lies below, so that the
+    surface of air ends half way to the border.  It can be written in the type of the voxels.
     """
     level, is_float = rule.iso_level, np.dtype(dtype).kind == "f"
     least = max(0.5, abs(level) * 2.0**-20)
@@ -298,7 +298,7 @@ def _choose_outside(rule: IsoRule, low: float, dtype: DTypeLike) -> float:
 
 
 def check_topology(topology: str, ranged: bool = False) -> None:
-    """Refuse what is none of `TOPOLOGIES`, and the one that knows no range.
+    """Refuse an unknown topology, and "trilinear" for a range.
 
     Raises
     ------
@@ -313,13 +313,13 @@ def check_topology(topology: str, ranged: bool = False) -> None:
 
 
 def _power_of_two_over(largest: float) -> float:
-    """A power of two that takes `largest` to 1 or below, as far as float32 has one."""
+    """Return a power of two that scales `largest` to 1 or below, as far as float32 reaches."""
     _, exponent = math.frexp(largest)
     return 2.0 ** min(max(-exponent, -126), 126)
 
 
 def _checked_level(level: Level, below: bool) -> tuple[float, float | None]:
-    """The iso value, or the two ends of a range."""
+    """Check the iso value, or the two ends of a range, and return them."""
     if isinstance(level, str | int | float) or np.ndim(level) == 0:
         return checked_iso_value(level), None  # type: ignore[arg-type]
     if len(level) != 2:
@@ -346,20 +346,20 @@ def checked_iso_value(iso_value: float) -> float:
 
 
 LARGEST_MARGIN = 0.25
-"""Steps; beyond it a vertex could not say any more where on its edge it lies."""
+"""Largest margin, in index steps; beyond it a vertex no longer tells where on its edge it lies."""
 
 
 def vertex_margin(volume: Volume, border: int) -> NDArray[np.float64]:
     """Smallest distance of a vertex from a sample along i, j, k, in index steps.
 
-    Vertices are float32 millimetres from `find_vertex_origin`: two that lie closer to one sample than a few units in
-    the last place of the volume's largest coordinate could fall together, and a triangle between them would have no
-    area.  Four units are kept; a vertex that belongs closer to a sample is moved by less than that.
+    Vertices are float32 millimetres from `find_vertex_origin`.  Two vertices near one sample could be rounded to the
+    same point, and a triangle between them would have no area.  So each stays at least four units in the last place of
+    the volume's largest coordinate away from the sample; a vertex that belongs closer is moved by less than that.
 
     Returns
     -------
     ndarray, shape (3,), float64
-        Typically 2e-4 of a step: eight times the rounding of the coordinates themselves.  Along k that of the thinnest
+        Typically 2e-4 of a step, eight times the rounding error of the coordinates.  Along k the margin of the thinnest
         layer, see `layer_margins`.
 
     Raises
@@ -380,9 +380,10 @@ def vertex_margin(volume: Volume, border: int) -> NDArray[np.float64]:
 
 
 def layer_margins(volume: Volume, border: int) -> NDArray[np.float64]:
-    """Smallest distance of a vertex from a sample along k, for each layer of cells, in its own steps.
+    """Smallest distance of a vertex from a sample along k, for each layer of cells, in steps of that layer.
 
-    The margin of a layer of some micrometres would be tenths of a millimetre in the others.
+    Each layer has its own: the margin of a layer a few micrometres thick would be tenths of a millimetre in a thick
+    one.
 
     Returns
     -------
@@ -396,16 +397,16 @@ def layer_margins(volume: Volume, border: int) -> NDArray[np.float64]:
 
 
 def _largest_and_unit(volume: Volume, border: int) -> tuple[float, float]:
-    """Largest coordinate that a vertex can have, in mm from where they are counted from, and its float32 step."""
+    """Return the largest coordinate of a vertex, mm from the vertex origin, and the float32 step at that coordinate."""
     largest = largest_coordinate(volume, find_vertex_origin(volume), border)
     return largest, float32_step(largest)
 
 
 def slice_normal_matrices(volume: Volume, border: int) -> NDArray[np.float64]:
-    """For each slice from ``-border`` to ``nk - 1 + border`` the matrix from gradients per step to gradients per mm.
+    """Return for each slice from ``-border`` to ``nk - 1 + border`` the matrix from gradients per step to those per mm.
 
-    Gradients are central differences, so the step along k is the mean of the steps to both neighbours: exact for a
-    linear field, however the slices lie.
+    Gradients are central differences, so the step along k is the mean of the steps to both neighbours.  This is exact
+    for a linear field, even with uneven slices.
 
     Returns
     -------
@@ -416,7 +417,7 @@ def slice_normal_matrices(volume: Volume, border: int) -> NDArray[np.float64]:
 
 
 def layer_normal_matrices(volume: Volume, border: int) -> NDArray[np.float64]:
-    """The same for the layers of cells from ``-border`` to ``nk - 1 + border``, each up to the next slice.
+    """Return the same matrices for the layers of cells, each between slice k and k + 1, k from ``-border``.
 
     Gradients are those of the trilinear field within a cell, per step of that cell.
 
@@ -429,9 +430,10 @@ def layer_normal_matrices(volume: Volume, border: int) -> NDArray[np.float64]:
 
 
 def takes_parts(volume: Volume, ray_step: float) -> bool:
-    """True where steps of `ray_step` mm go from cell to cell and leave none out: no index changes by more than 1.
+    """True where ray steps of `ray_step` mm pass through every cell on their way: no index changes by more than 1.
 
-    Between such samples values are nearly linear, so that a volume rendering may take their segments in parts.
+    Between two samples of this kind the values are nearly linear, so volume rendering may divide the segment between
+    them into parts.
     """
     steps_per_mm = np.linalg.norm(layer_normal_matrices(volume, border=0), axis=1)
     return bool(ray_step * steps_per_mm.max() <= 1.0)

@@ -1,8 +1,8 @@
-"""How far from the origin float32 millimetres will do, and what is done beyond.
+"""How far from the origin float32 millimetres are precise enough, and what is done beyond.
 
-A table far from the origin of the frame, or a frame of another machine, puts patients tens of metres away: float32
-comes in steps of 8e-3 mm at 1e5 mm.  There vertices are computed relative to a point near the volume's centre, where
-float32 is fine, and get the rest in float64.
+A table far from the origin of the frame, or the frame of another machine, can put patients tens of metres away: at 1e5
+mm the step of float32 is 8e-3 mm.  Vertices of such volumes are computed in float32 relative to a point near the
+volume's centre, and that point is added in float64.
 """
 
 from __future__ import annotations
@@ -20,7 +20,8 @@ if TYPE_CHECKING:
 __all__ = ["FAR_MM", "describe_far", "find_vertex_origin", "float32_step", "is_far", "largest_coordinate"]
 
 FAR_MM = 4096.0
-"""Below, steps of float32 are 2.4e-4 mm at most; from here on they are 4.9e-4 mm and more."""
+"""Coordinates from here on count as far.  Below, the step of float32 is at most 2.4e-4 mm; from here on it is 4.9e-4 mm
+or more."""
 
 
 def is_far(points: NDArray[np.floating]) -> bool:
@@ -43,7 +44,7 @@ def largest_coordinate(volume: Volume, origin: Float64Array | None = None, borde
 
 
 def describe_far(volume: Volume) -> list[str]:
-    """The warning that goes with `find_vertex_origin`; none for a volume that is near."""
+    """Return the warning that goes with `find_vertex_origin`; no warning for a volume that is near."""
     largest = largest_coordinate(volume)
     if largest < FAR_MM:
         return []
@@ -54,7 +55,7 @@ def describe_far(volume: Volume) -> list[str]:
 
 
 def find_vertex_origin(volume: Volume) -> Float64Array | None:
-    """The point in LPS mm that float32 vertices of a volume are counted from; None: from the origin of the frame.
+    """Return the point in LPS mm that float32 vertices of a volume are counted from; None for the origin of the frame.
 
     Returns
     -------

@@ -1,4 +1,4 @@
-"""Regular grids around grids that are sheared or uneven, and their values there."""
+"""Regular grids that enclose sheared or uneven grids, and resampling onto them."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from clrecon.geometry.grid import Grid
 __all__ = ["RegularGrid", "regular_grid", "resample_grid", "shear_degrees"]
 
 ON_GRID = 1e-6
-"""Steps; a volume that ends this near to a point of the regular grid needs no further one."""
+"""Tolerance in steps: a volume that ends this near to a point of the regular grid needs no further point."""
 
 
 class RegularGrid(NamedTuple):
@@ -39,7 +39,7 @@ def shear_degrees(affine: Float64Array) -> float:
 
 
 def regular_grid(grid: Grid, origins: Float64Array) -> RegularGrid:
-    """The smallest regular grid around all voxel centres of a grid.
+    """Return the smallest regular grid that encloses all voxel centres of a grid.
 
     i runs as in the grid, j within the plane of the slices, k along their normal; the step of k is the mean distance
     of the slices along it.  Where a volume is sheared but even, the planes of the grid are those of its slices.
@@ -64,7 +64,7 @@ def regular_grid(grid: Grid, origins: Float64Array) -> RegularGrid:
 
 
 def resample_grid(grid: Grid, regular: RegularGrid, air: float) -> NDArray[Any]:
-    """Values of a grid (trilinear) at the points of a regular one, plane by plane; `air` beyond its voxels.
+    """Resample a grid (trilinear) at the points of a regular one, plane by plane; `air` beyond its voxels.
 
     Returns
     -------
@@ -88,7 +88,7 @@ def resample_grid(grid: Grid, regular: RegularGrid, air: float) -> NDArray[Any]:
 
 
 def _slice_at(grid: Grid, k: float) -> NDArray[np.float32]:
-    """The slice at a fraction of an index, shape (nj, ni); the outer ones beyond the ends."""
+    """Return the slice at a fractional index, shape (nj, ni); beyond the ends the outermost slice."""
     k = min(max(k, 0.0), grid.voxels.shape[0] - 1.0)
     below = int(k)
     values = grid.voxels[below].astype(np.float32)

@@ -1,8 +1,8 @@
-"""Slices at places of their own: the map between indices and millimetres where no affine places them all.
+"""Uneven stacks: the map between indices and millimetres for slices that no single affine places.
 
-Rows and columns run in the same directions in every slice, so slice k is the plane through its own position, and
-between slices k and k + 1 every point moves along the step from one position to the next: a map that is linear in
-each layer, continuous across slices, and exact at every voxel.
+Rows and columns run in the same directions in every slice, and slice k is the plane through its own position.  Between
+slices k and k + 1 every point moves along the step from one position to the next.  So the map is linear in each layer,
+continuous across slices, and exact at every voxel.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ class UnevenStack(Message):
     in_plane : ndarray, shape (3, 2), float64
         Steps along i and j, mm.
     positions : ndarray, shape (nk, 3), float64
-        Voxel (0, 0, k), LPS mm.
+        Centre of voxel (0, 0, k), LPS mm.
     normal : ndarray, shape (3,), float64
-        Unit, towards larger k.
+        Unit length, towards larger k.
     """
 
     in_plane: Float64Array
@@ -39,12 +39,13 @@ class UnevenStack(Message):
 
     @classmethod
     def of(cls, affine: Float64Array, positions: ArrayLike, slices: int) -> UnevenStack:
-        """Check positions against an affine, which gives the in-plane steps and the side that k runs to.
+        """Check positions against an affine, which gives the in-plane steps and the direction of growing k.
 
         Raises
         ------
         UsageError
-            Not one finite position a slice, fewer than two, or they do not all advance to the affine's side.
+            There is not one finite position for each slice, there are fewer than two, or a position does not advance in
+            the affine's direction.
         """
         table = np.array(checked_points(positions))
         if len(table) != slices or slices < 2:
@@ -66,17 +67,17 @@ class UnevenStack(Message):
         return cls(in_plane, table, normal)
 
     def origins_at(self, k: Float64Array) -> Float64Array:
-        """Positions (n, 3) at slice coordinates (n,), fractions and places beyond the ends allowed."""
+        """Return positions (n, 3) at slice coordinates (n,); fractions and coordinates beyond the ends are allowed."""
         layer = np.clip(np.floor(k).astype(np.int64), 0, len(self.positions) - 2)
         part = (k - layer)[:, None]
         return self.positions[layer] * (1.0 - part) + self.positions[layer + 1] * part
 
     def ijk_to_lps(self, points: Float64Array) -> Float64Array:
-        """Index coordinates (n, 3) to LPS mm (n, 3)."""
+        """Map index coordinates (n, 3) to LPS mm (n, 3)."""
         return self.origins_at(points[:, 2]) + points[:, :2] @ self.in_plane.T
 
     def lps_to_ijk(self, points: Float64Array) -> Float64Array:
-        """LPS mm (n, 3) to index coordinates (n, 3)."""
+        """Map LPS mm (n, 3) to index coordinates (n, 3)."""
         heights = self.positions @ self.normal
         wanted = points @ self.normal
         layer = np.clip(np.searchsorted(heights, wanted, side="right") - 1, 0, len(heights) - 2)

@@ -19,15 +19,17 @@ from clrecon.geometry.uneven import UnevenStack
 __all__ = ["AIR_HU", "DEVICE_DTYPES", "Volume"]
 
 AIR_HU = -1024
-"""HU given to voxels that hold no measurement (padding).  The floor of the 12-bit CT number scale: air is
--1000 HU, and a floor below it stays outside of every surface of something that is denser than air."""
+"""HU given to voxels that hold no measurement (padding): the floor of the 12-bit CT number scale.  Air is -1000 HU, so
+a lower value stays outside every surface of something denser than air."""
 
 DEVICE_DTYPES = tuple(np.dtype(name) for name in ("int8", "uint8", "int16", "uint16", "int32", "float32"))
-"""Voxel types that go to a device as they are; everything else is converted once, when a Volume is made."""
+"""Voxel types that go to a device unchanged; others are converted once, when a Volume is made."""
 
 
 def _device_ready(voxels: NDArray[Any]) -> NDArray[Any]:
-    """Return `voxels` C-contiguous in native byte order and in one of `DEVICE_DTYPES`; refuse what goes beyond."""
+    """Return `voxels` C-contiguous, in native byte order and in one of `DEVICE_DTYPES`; refuse values outside its
+    range.
+    """
     dtype = voxels.dtype.newbyteorder("=")
     if dtype == np.bool_:
         dtype = np.dtype(np.uint8)
@@ -59,7 +61,7 @@ def _as_array(voxels: ArrayLike) -> NDArray[Any]:
 
 
 def _value_range(voxels: NDArray[Any]) -> tuple[float, float] | None:
-    """Lowest and highest finite number, found slice by slice; None where there is none."""
+    """Return the lowest and highest finite number, found slice by slice; None where no number is finite."""
     low, high = np.inf, -np.inf
     for layer in voxels:
         values = layer[np.isfinite(layer)] if layer.dtype.kind == "f" else layer
@@ -82,16 +84,16 @@ class Volume(Grid):
     report : dict, optional
         What is known of the origin and the quality of this volume; `read_volume` gives a `Certificate`.
     slice_positions : array_like, shape (nk, 3), optional
-        LPS mm of voxel (0, 0, k), for slices that no affine places: between two of them k runs linearly, beyond the
-        ends in the steps of the ends.  The third column of `affine` is then only nominal.
+        LPS mm of voxel (0, 0, k), for slices that no single affine places.  Between two slices k runs linearly, beyond
+        the ends in the steps of the ends.  The third column of `affine` is then only nominal.
     hu_range : (float, float), optional
-        Lowest and highest value, where the caller knows them; else the voxels are searched when they are asked for.
+        Lowest and highest value, if the caller knows them; else they are found when first asked for.
 
     Raises
     ------
     UsageError
         `voxels` is not three-dimensional, empty, or of a type that cannot be used; `affine` is not an affine;
-        `slice_positions` are no such stack.
+        `slice_positions` do not match the affine.
     """
 
     def __init__(
@@ -123,7 +125,7 @@ class Volume(Grid):
 
     @cached_property
     def hu_range(self) -> tuple[float, float] | None:
-        """Lowest and highest finite value, None where there is none; of the voxels as they were at the first call."""
+        """Lowest and highest finite value, as found at the first call; None where no value is finite."""
         return _value_range(self._voxels)
 
     @property
@@ -133,7 +135,7 @@ class Volume(Grid):
 
     @property
     def uneven(self) -> bool:
-        """True when the slices lie where `slice_origins` says and not on the affine's even steps."""
+        """True when the slices lie where `slice_origins` says and not at the affine's even steps."""
         return self._stack is not None
 
     def ijk_to_lps(self, points: ArrayLike) -> Float64Array:
@@ -154,7 +156,7 @@ class Volume(Grid):
         Parameters
         ----------
         border : int
-            Slices to go on beyond either end, in the steps of the ends.
+            Number of further positions beyond either end, in the steps of the ends.
 
         Returns
         -------
@@ -168,8 +170,8 @@ class Volume(Grid):
     def with_voxels(self, voxels: ArrayLike, report: dict[str, Any] | None = None) -> Volume:
         """Return a volume with other values at the same places.
 
-        ``hu_range`` of the copied report is that of the new values.  What else it says of voxels, such as
-        ``padding_share`` and ``padding_hu``, is of the series as it was read.
+        ``hu_range`` of the copied report is that of the new values.  Its other entries about voxels, such as
+        ``padding_share`` and ``padding_hu``, still describe the series as it was read.
 
         Parameters
         ----------
@@ -195,9 +197,9 @@ class Volume(Grid):
         return Volume(array, self._affine, report, positions, hu_range=found)
 
     def release_slices(self, first: int, end: int) -> None:
-        """Say that slices ``first`` to ``end - 1`` are not needed soon: those of a memory-mapped file leave memory.
+        """Let slices ``first`` to ``end - 1`` of a memory-mapped volume leave memory, because they are not needed soon.
 
-        Without effect on other volumes, and on none on what the voxels are: they are read again when they are used.
+        The values stay the same: the slices are read again when they are used.  Other volumes are not affected.
         """
         if self._mapping is not None:
             self._mapping.release(self._voxels[first:end])
@@ -216,9 +218,9 @@ class Volume(Grid):
         Parameters
         ----------
         resample : bool
-            A volume that is sheared or unevenly spaced, which no image can hold, is resampled (trilinear) to a regular
-            grid of the same spacing around all its voxels; what lies beyond them is `AIR_HU`.  A field array
-            ``RESAMPLED`` says so.  Other volumes stay as they are.
+            A sheared or unevenly spaced volume, which no image can hold, is resampled (trilinear) to a regular grid of
+            the same spacing around all its voxels; points beyond the voxels are `AIR_HU`.  A field array ``RESAMPLED``
+            says so.  Other volumes stay as they are.
 
         Raises
         ------

@@ -1,11 +1,12 @@
-"""A volume as ``pyvista.ImageData``: the one place that knows what VTK makes of an image's axes.
+"""A volume as ``pyvista.ImageData``: how VTK treats an image's axes is handled here alone.
 
 ``vtkImageData`` places its points by an origin, a spacing for each axis and a direction matrix: axes at right angles
-and even steps.  What else VTK does with such an image, as tried with VTK 9.7:
+and even steps.  Further behaviour of VTK, as tried with VTK 9.7:
 
-- It turns what it contours in an image of left-handed axes inside out, and its volume mappers show nothing of it.  The
-  slices of such volumes are given in reverse order: the axes are right-handed then and every voxel stays where it is.
-- ``vtkFlyingEdges3D`` (pyvista's ``method="flying_edges"``) and the volume mapper for GPUs look at the direction;
+- Contours of an image with left-handed axes come out with the inside outside, and volume mappers show nothing of it.
+  Such volumes are passed with their slices in reverse order: the axes are then right-handed, and every voxel stays
+  where it is.
+- ``vtkFlyingEdges3D`` (pyvista's ``method="flying_edges"``) and the volume mapper for GPUs use the direction matrix;
   ``vtkContourFilter``, which is pyvista's default, and the fixed-point volume mapper do not.
 """
 
@@ -24,12 +25,12 @@ from clrecon.geometry.regular import regular_grid, resample_grid, shear_degrees
 __all__ = ["make_image_data"]
 
 LARGEST_SHEAR_DEGREES = 0.01
-"""Axes this near to right angles count as such: directions of headers are rounded.  The image keeps them as they are,
-so that its points are those of the volume."""
+"""Axes this near to right angles count as rectangular, because directions in headers are rounded.  The image gets the
+affine's own axes, so its points are those of the volume."""
 
 
 def make_image_data(grid: Grid, origins: Float64Array, uneven: bool, resample: bool, air: float) -> Any:
-    """See `Volume.to_pyvista`.
+    """Make the image of `Volume.to_pyvista`.
 
     Parameters
     ----------
@@ -37,10 +38,10 @@ def make_image_data(grid: Grid, origins: Float64Array, uneven: bool, resample: b
     origins : ndarray, shape (nk, 3)
         LPS mm of voxel (0, 0, k) of each slice.
     uneven : bool
-        They lie elsewhere than the affine says.
+        The slices lie elsewhere than the affine says.
     resample : bool
     air : float
-        Value of what lies beyond the voxels of a resampled volume.
+        Value of the points beyond the voxels of a resampled volume.
     """
     import pyvista
 
@@ -62,7 +63,7 @@ def make_image_data(grid: Grid, origins: Float64Array, uneven: bool, resample: b
         )
     steps = np.linalg.norm(affine[:3, :3], axis=0)
     image = pyvista.ImageData(dimensions=values.shape[::-1], spacing=tuple(steps), origin=tuple(affine[:3, 3]))
-    image.SetDirectionMatrix(*(affine[:3, :3] / steps).ravel())  # pyvista has a property for it from 0.45 on
+    image.SetDirectionMatrix(*(affine[:3, :3] / steps).ravel())  # pyvista has a property for it since 0.45
     image.point_data["HU"] = values.reshape(-1)
     image.set_active_scalars("HU")
     for name, text in {"SPACE": "LPS", "UNIT": "mm", **notes}.items():
@@ -71,7 +72,7 @@ def make_image_data(grid: Grid, origins: Float64Array, uneven: bool, resample: b
 
 
 def _fault_of(grid: Grid, origins: Float64Array, uneven: bool) -> str | None:
-    """Why an image cannot hold this volume as it is; None where it can."""
+    """Return why an image cannot hold this volume as it is; None where it can."""
     if uneven:
         gaps = np.linalg.norm(np.diff(origins, axis=0), axis=1)
         return f"the slices of this volume are uneven ({gaps.min():.4g} to {gaps.max():.4g} mm apart)"
@@ -80,7 +81,9 @@ def _fault_of(grid: Grid, origins: Float64Array, uneven: bool) -> str | None:
 
 
 def _reversed(grid: Grid) -> tuple[Float64Array, NDArray[Any]]:
-    """The affine that counts slices from the last one, and the voxels so (a copy: VTK knows no backward steps)."""
+    """Return the affine that counts slices from the last one, and the voxels in that order (a copy: VTK needs positive
+    steps).
+    """
     affine = grid.affine.copy()
     affine[:3, 3] += (grid.voxels.shape[0] - 1) * affine[:3, 2]
     affine[:3, 2] *= -1.0

@@ -41,7 +41,7 @@ class Gate(Record):
 
 
 def none_of(name: str, count: int, what: str, ok: bool | None = None) -> Gate:
-    """Gate: a count must be 0. Where `ok` is given, it decides instead of the count."""
+    """Gate: a count must be 0.  Where `ok` is given, it decides instead of the count."""
     ok = count == 0 if ok is None else ok
     return Gate(name, count, 0, None, bool(ok), f"{what}: {count}, none allowed")
 
