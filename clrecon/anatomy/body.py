@@ -1,10 +1,10 @@
-"""What of a scan is the patient: the body without table and blankets, the circle that was reconstructed.
+"""The patient's body in a scan: found without table and blankets, or cut out by the circle that was reconstructed.
 
-The body is found on a grid of about 2 mm: dense cells, and the cavities that they enclose (lungs, bowel, sinuses),
-are opened slice by slice so that plates (table tops, shells, straps) come off, and the pieces told apart in three
-dimensions.  Everything thick is kept, arms and legs too; thin parts that hang on it (ears, nose, fingers) come back
-unless they are as long as a table.  What is outside becomes air, with a margin of untouched voxels around the body,
-so that the skin's own edge is as it was measured.
+The body is found on a grid of cells of about 2 mm.  Dense cells, and the cavities that they enclose (lungs, bowel,
+sinuses), are opened slice by slice (morphological opening), which removes plates: table tops, shells, straps.  The
+remaining pieces are separated in three dimensions.  Every thick piece is kept, arms and legs too; thin parts that hang
+on it (ears, nose, fingers) are added again unless they are as long as a table.  Everything else becomes air.  A margin
+around the body stays untouched, so that the edge of the skin is as it was measured.
 """
 
 from __future__ import annotations
@@ -26,35 +26,37 @@ from clrecon.system.progress import Progress, ignore_progress
 __all__ = ["find_body", "find_unmeasured", "mask_field_of_view", "remove_table"]
 
 TISSUE_HU = -300.0
-"""Between a blanket or foam and fat."""
+"""Cells above this are tissue: the value lies between that of blankets or foam and that of fat."""
 OPENING_MM = 7.0
-"""Half the thickness of what comes off: table tops and shells have 2 to 12 mm."""
+"""Half the thickness of plates that the opening removes: table tops and shells have 2 to 12 mm."""
 THICK_MM = 11.0
-"""A piece beside the body is kept when a circle of this radius fits into it: a hand, not a strap or an edge."""
+"""A piece beside the body is kept when a circle of this radius fits into it: into a hand, not into a strap or edge."""
 LONG_MM = 100.0
 """Thin parts that hang on the body are kept when they are shorter than this: an ear, not a table."""
 SMALL_MM2 = 2500.0
-"""Enclosed regions of a slice up to this size are filled: bowel gas, sinuses, the airways."""
+"""Largest area of an enclosed region of a slice that is always filled: bowel gas, sinuses, the airways."""
 LUNG_WALL, AIR_WALL = 0.2, 0.7
-"""Share of the wall that must be thick, of lung and of larger regions of air."""
+"""Least share of a cavity's wall that must be thick tissue: for lung, and for larger regions of air."""
 LUNG_HU, MOST_AIR = -950.0, 0.2
-"""Lung has fewer cells below this than that share; air, foam and blankets have more."""
+"""A region is lung when less than the share `MOST_AIR` of its cells is below `LUNG_HU`; air, foam and blankets have
+more."""
 FOAM_HU, FOAM_WALL, FOAM_MM = -900.0, 0.3, 10.0
-"""Foam of a trough that fits a body closely is no lung: most of it is below this, no more of its wall is thick, and it
-is nowhere thicker than twice this.  Lung in three scans is thicker, and has thicker walls or more HU."""
+"""Foam that fits a body closely is not lung.  A region is foam when most of it is below `FOAM_HU`, at most the share
+`FOAM_WALL` of its wall is thick, and it is nowhere thicker than 2 `FOAM_MM`.  The lungs of three scans are thicker, and
+have thicker walls or more HU."""
 FEWEST_UNMEASURED = 16
-"""Cells beside each other that have one value: fewer have it by chance."""
+"""Least number of connected cells of one value that count as unmeasured; smaller groups occur by chance."""
 MARGIN_MM = 3.0
-"""Untouched voxels around the body: the blurred edge of the skin."""
+"""Width of the untouched margin around the body: it contains the blurred edge of the skin."""
 AIR_RANGE_HU = (-1100.0, -900.0)
 
 
 def remove_table(volume: Volume, *, allow_bone_loss: bool = False, progress: Progress | None = None) -> Volume:
-    """Turn everything outside of the patient's body into air: table, blankets, cables.
+    """Turn everything outside the patient's body into air: table, blankets, cables.
 
     Bone and all else within the body keep their values; so does a margin of 3 mm around it.  Dry specimens are kept
-    whole, see `clrecon.anatomy.dense_pieces`.  The result is meant to be looked at: a part of the table that lies
-    within the margin stays.
+    whole, see `clrecon.anatomy.dense_pieces`.  Look at the result: a part of the table that lies within the margin
+    stays.
 
     Parameters
     ----------
@@ -68,14 +70,14 @@ def remove_table(volume: Volume, *, allow_bone_loss: bool = False, progress: Pro
     Returns
     -------
     Volume
-        The same places; ``report["remove_table"]`` has ``voxels_removed``, ``dense_voxels_removed`` (above -300 HU),
-        ``removed_share`` (of all voxels), ``body_share``, ``air_hu`` and what `judge_bone` says of bone;
+        A volume with the same places; ``report["remove_table"]`` has ``voxels_removed``, ``dense_voxels_removed``
+        (above -300 HU), ``removed_share`` (of all voxels), ``body_share``, ``air_hu`` and the facts of `judge_bone`;
         ``report["gates"]`` has the gate ``bone_kept`` too.
 
     Raises
     ------
     RefusedInputError
-        There is nothing thick and dense enough to be a body, and no bone; or the gate fails.
+        Nothing is thick and dense enough to be a body, and there is no bone; or the gate fails.
     """
     progress = progress or ignore_progress
     progress("mask", 0, len(volume.voxels))
@@ -116,14 +118,15 @@ def mask_field_of_view(volume: Volume, radius_mm: float | None = None, *, progre
     Returns
     -------
     Volume
-        The same places; ``report["field_of_view"]`` has ``radius_mm``, ``voxels_removed``, ``dense_voxels_removed``
-        (above -300 HU), ``removed_share``, ``air_hu`` and what `judge_circle` says of bone.  Without a radius
-        ``report["gates"]`` has the gate ``bone_in_circle``: a circle that was not chosen should cut no bone.
+        A volume with the same places; ``report["field_of_view"]`` has ``radius_mm``, ``voxels_removed``,
+        ``dense_voxels_removed`` (above -300 HU), ``removed_share``, ``air_hu`` and the facts of `judge_circle`.
+        Without a radius ``report["gates"]`` has the gate ``bone_in_circle``: a circle that was not chosen should cut no
+        bone.
 
     Raises
     ------
     UsageError
-        The radius is no length above 0, or so short that no voxel is left.
+        The radius is not a number above 0, or so short that no voxel is left.
     """
     _, nj, ni = volume.voxels.shape
     di, dj, _ = volume.spacing
@@ -153,7 +156,7 @@ def mask_field_of_view(volume: Volume, radius_mm: float | None = None, *, progre
 def _turn_into_air(
     volume: Volume, outside: Callable[[int], Mask], name: str, said: dict[str, Any], progress: Progress
 ) -> Volume:
-    """Give the voxels outside the value that air has there; `outside` gives the mask of a slice."""
+    """Give the voxels outside the value of the air there; `outside` returns the mask of a slice."""
     voxels = np.array(volume.voxels)
     removed = dense = 0
     air = _air_level(volume, outside)
@@ -173,7 +176,9 @@ def _turn_into_air(
 
 
 def _air_level(volume: Volume, outside: Callable[[int], Mask]) -> Any:
-    """The median of the air outside, so that no iso value shows where the mask ends; `AIR_HU` where there is none."""
+    """Return the median of the air outside, so that no surface appears where the mask ends; `AIR_HU` without air
+    outside.
+    """
     low, high = AIR_RANGE_HU
     found = []
     for k in range(0, volume.voxels.shape[0], -(-volume.voxels.shape[0] // 16)):
@@ -194,7 +199,7 @@ def find_body(volume: Volume) -> tuple[Mask, tuple[int, int, int]]:
     body : ndarray, shape (ck, cj, ci), bool
         One entry a cell of ``step`` voxels.
     step : (int, int, int)
-        Voxels of a cell along i, j, k.
+        Number of voxels of a cell along i, j, k.
 
     Raises
     ------
@@ -206,7 +211,7 @@ def find_body(volume: Volume) -> tuple[Mask, tuple[int, int, int]]:
 
 
 def _find_body(cells: Cells) -> tuple[Mask, DensePieces]:
-    """The body with its margin, and what was decided on all that is as dense as bone."""
+    """Find the body with its margin, and decide on all pieces as dense as bone."""
     from scipy import ndimage
 
     across = cells.across
@@ -228,7 +233,7 @@ def _find_body(cells: Cells) -> tuple[Mask, DensePieces]:
 
 
 def _thick_parts(tissue: Mask, across: float) -> Mask:
-    """The largest piece that is left after opening, and others that are thick; all False where nothing is left."""
+    """Return the largest piece left after opening, and the others that are thick; all False if nothing is left."""
     from scipy import ndimage
 
     core = grow(tissue, -OPENING_MM / across)
@@ -244,11 +249,11 @@ def _thick_parts(tissue: Mask, across: float) -> Mask:
 
 
 def _find_cavities(cells: NDArray[np.float32], tissue: Mask, thick: Mask, across: float) -> Mask:
-    """Lungs, bowel, sinuses: what is not dense but belongs to the body, slice by slice.
+    """Find lungs, bowel and sinuses, slice by slice: cells that are not dense but belong to the body.
 
-    Lung is denser than air and has thick tissue beside it; the border of the scan may cut it open.  Air counts where
-    dense cells enclose it and it is small, or nearly all of its wall is thick: the inside of a table has thin shells
-    around it, the gap between back and table has one on one side.
+    Lung is denser than air and has thick tissue beside it; it may touch the border of the scan.  Air counts where dense
+    cells enclose it and it is small, or where nearly all of its wall is thick.  So the inside of a table does not count
+    (its wall is thin shells), nor the gap between back and table (one side of its wall is the thin table top).
     """
     from scipy import ndimage
 
@@ -278,7 +283,9 @@ def _find_cavities(cells: NDArray[np.float32], tissue: Mask, thick: Mask, across
 
 
 def find_unmeasured(cells: NDArray[Any]) -> Mask:
-    """Cells, or voxels, of one value from the corners of a slice on: padding, or air without noise."""
+    """Mark unmeasured cells or voxels: regions of one value that begin at the corners of a slice (padding, air without
+    noise).
+    """
     from scipy import ndimage
 
     found = np.zeros(cells.shape, dtype=bool)
@@ -296,7 +303,7 @@ def find_unmeasured(cells: NDArray[Any]) -> Mask:
 
 
 def _thin_parts(tissue: Mask, body: Mask, cell_mm: tuple[float, float, float]) -> Mask:
-    """What is dense, hangs on the body and is not long."""
+    """Find dense parts that touch the body and are not long."""
     from scipy import ndimage
 
     near = ndimage.binary_dilation(body, ndimage.generate_binary_structure(3, 1))

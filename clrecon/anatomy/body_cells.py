@@ -1,4 +1,6 @@
-"""The coarse grid that the body is found on: cells of about 2 mm, and how much in each is as dense as bone."""
+"""The coarse grid on which the body is found: cells of about 2 mm, each with its mean HU and its number of dense
+voxels.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +17,7 @@ __all__ = ["DENSE_HU", "HARD_HU", "Cells", "Mask", "grow", "measure_cells"]
 Mask = NDArray[np.bool_]
 
 CELL_MM = 2.0
-"""Size of the cells, where voxels are not larger."""
+"""Size of the cells; a cell has at least one voxel."""
 DENSE_HU = 300.0
 """Bone has voxels above this; plastic and carbon fibre may have them too."""
 HARD_HU = 600.0
@@ -24,16 +26,16 @@ HARD_HU = 600.0
 
 @dataclass(frozen=True)
 class Cells:
-    """What is known of the voxels, cell by cell.
+    """Figures of the voxels in each cell.
 
     Attributes
     ----------
     mean : ndarray, shape (ck, cj, ci), float32
-        HU; the cells at the far ends are smaller.
+        Mean HU; cells at the far ends may hold fewer voxels.
     dense, hard : ndarray, shape (ck, cj, ci), uint16
-        Voxels above `DENSE_HU` and above `HARD_HU`.
+        Number of voxels above `DENSE_HU` and above `HARD_HU`.
     step : (int, int, int)
-        Voxels of a cell along i, j, k.
+        Number of voxels of a cell along i, j, k.
     size_mm : (float, float, float)
         Lengths of a cell along i, j, k.
     """
@@ -46,17 +48,17 @@ class Cells:
 
     @property
     def voxel_ml(self) -> float:
-        """Room of a voxel, ml, of slices that are as far from each other as `size_mm` says."""
+        """Volume of a voxel, ml, for slices spaced as `size_mm` says."""
         return math.prod(self.size_mm) / math.prod(self.step) / 1000.0
 
     @property
     def across(self) -> float:
-        """Length of a cell in the slice, mm."""
+        """Length of a cell within the slice, mm."""
         return math.sqrt(self.size_mm[0] * self.size_mm[1])
 
 
 def measure_cells(volume: Volume) -> Cells:
-    """Go through the voxels once, slab by slab."""
+    """Compute the cells, reading the voxels once, slab by slab."""
     nk, nj, ni = volume.voxels.shape
     si, sj, sk = (max(1, round(CELL_MM / length)) for length in volume.spacing)
     rows, columns = np.arange(0, nj, sj), np.arange(0, ni, si)
@@ -68,7 +70,7 @@ def measure_cells(volume: Volume) -> Cells:
         slab = volume.voxels[first:end]
         total = slab.sum(axis=0, dtype=np.float32)
         mean[place] = np.add.reduceat(np.add.reduceat(total, rows, axis=0), columns, axis=1) / (end - first)
-        # few voxels are dense: counting them one by one costs less than sums over all
+        # Few voxels are dense: counting them one by one costs less than sums over all voxels.
         _, j, i = np.nonzero(slab > DENSE_HU)
         if len(i):
             cell = (j // sj) * shape[2] + i // si
@@ -84,11 +86,14 @@ def measure_cells(volume: Volume) -> Cells:
 
 
 def grow(mask: Mask, cells: float) -> Mask:
-    """Dilate (or, below 0, erode) slice by slice by so many cells: an octagon, cross and square in turn."""
+    """Dilate slice by slice by `cells` cells, or erode where `cells` is below 0.
+
+    Cross and square alternate, so a point grows to an octagon.
+    """
     from scipy import ndimage
 
     change = ndimage.binary_dilation if cells > 0 else ndimage.binary_erosion
     for turn in range(max(1, round(abs(cells)))):
         shape = ndimage.generate_binary_structure(2, 1 + turn % 2)[None]
-        mask = change(mask, shape, border_value=cells < 0)  # the border of the scan erodes nothing
+        mask = change(mask, shape, border_value=cells < 0)  # the border erodes nothing
     return mask

@@ -1,4 +1,4 @@
-"""Edges of bone in the slices of a scan: the plateaus on both sides, read from walks up and down from each edge."""
+"""Edges of bone in the slices of a scan: the plateau on each side, found by a walk uphill and a walk downhill."""
 
 from __future__ import annotations
 
@@ -14,26 +14,28 @@ __all__ = ["Background", "BoneEdges", "leave_contrast_medium", "measure_edges"]
 FloatArray = NDArray[Any]
 
 METAL_HU = 2000
-"""Cortical bone ends here; above are enamel and metal."""
+"""Highest value of cortical bone; enamel and metal are above."""
 CONTRAST_MEDIUM_HU = 600
-"""Vessels and organs with contrast medium stay below."""
+"""Vessels and organs with contrast medium stay below this value."""
 
 REACH = 8
-"""Steps of a walk at most: a blur of 2 voxels reaches its plateau."""
+"""Longest walk in steps: at a blur of 2 voxels it reaches the plateau."""
 FLAT = 4
-"""So many steps beyond the maximum a vessel stays flat; cortex falls off into marrow."""
+"""A plateau is flat when the values stay level for this many steps beyond the maximum.  Vessels do; cortex falls off
+into marrow."""
 FLAT_SIGMAS = 3.5
 LARGEST_FLAT_SHARE = 0.75
-"""When more of the contrast than this ends in flat plateaus, these are the bone (a homogeneous body)."""
+"""When more than this share of the contrast ends in flat plateaus, these are bone (a homogeneous body)."""
 MOST_EDGES = 200_000
-"""Edges of one slice and axis at most, so that memory stays bounded in noise."""
+"""Largest number of edges taken from one slice and axis, so that noise cannot use up the memory."""
 LEAST_BONE_SHARE = 0.2
-"""Of all edges at least so many end below metal: a lone implant has some, where it is touched in passing."""
+"""Least share of the edges that must end below metal.  A lone implant has some of these: its rim is blurred."""
 
 
 @dataclass(frozen=True)
 class Background:
-    """What bone lies in: its mode and width, where bone begins, and what the low side of an edge may be (HU)."""
+    """The material that bone lies in: its mode and width, where bone begins, and the range of an edge's low side, HU.
+    """
 
     name: str
     mode: float
@@ -61,26 +63,27 @@ class BoneEdges:
 
 
 def measure_edges(voxels: NDArray[Any], sampled: range, background: Background) -> BoneEdges:
-    """Plateaus on both sides of the edges of bone in the sampled slices, along rows and along columns."""
+    """Measure the plateaus on both sides of the edges of bone in the sampled slices, along rows and along columns."""
     found = []
     for k in sampled:
         padded = np.pad(np.asarray(voxels[k]), REACH + FLAT, mode="edge")
-        with np.errstate(invalid="ignore"):  # infinities beside each other
+        with np.errstate(invalid="ignore"):  # two infinite neighbours
             found += [_measure_slice(padded, axis, background) for axis in (0, 1)]
     every = BoneEdges(*(np.concatenate(parts) for parts in zip(*found, strict=True)))
     edges = every.where((every.tissue >= background.lowest) & (every.tissue <= background.highest))
     bone = edges.where(edges.bone <= METAL_HU)
-    # the blurred rim of metal is no bone
+    # These edges are the blurred rim of metal, not bone.
     return bone if len(bone.bone) >= LEAST_BONE_SHARE * len(edges.bone) else bone.where(bone.bone < -math.inf)
 
 
 def _measure_slice(padded: NDArray[Any], axis: int, background: Background) -> tuple[NDArray[Any], ...]:
-    """Bone, tissue, steepest step and flatness of the edges of one slice along one axis.
+    """Measure bone, tissue, steepest step and flatness of the edges of one slice along one axis.
 
     Parameters
     ----------
     padded : ndarray, shape (nj + 2 p, ni + 2 p)
-        The slice, its border values continued by p = `REACH` + `FLAT`: walks end there by themselves.
+        The slice with its border values continued by p = `REACH` + `FLAT` voxels, where every walk ends because values
+        are constant.
     axis : {0, 1}
         Along the columns (j) or along the rows (i).
     background : Background
@@ -91,7 +94,7 @@ def _measure_slice(padded: NDArray[Any], axis: int, background: Background) -> t
     along, across = (padded.shape[1], 1) if axis == 0 else (1, padded.shape[1])
     first = inside[inner]
     last = np.roll(inside, -1, axis)[inner]
-    crossing = np.flatnonzero(first != last)  # the border is continued: no crossing into it
+    crossing = np.flatnonzero(first != last)  # border values are continued: no crossing
     crossing = crossing[:: max(1, -(-len(crossing) // MOST_EDGES))]
     rows, columns = np.divmod(crossing, first.shape[1])
     low = (rows + border) * padded.shape[1] + columns + border
@@ -106,7 +109,7 @@ def _measure_slice(padded: NDArray[Any], axis: int, background: Background) -> t
     uphill = high - low
     step = values(high) - values(low)
     sideways = values(high + across) + values(low + across) - values(high - across) - values(low - across)
-    # a lone voxel of noise has no neighbour beside or behind it
+    # A lone voxel of noise has no neighbour beside or behind it that is also bone.
     borne_out = flat_inside[high + across] | flat_inside[high - across] | flat_inside[high + uphill]
     kept = borne_out & (step >= 0.25 * np.abs(sideways))
     high, low, uphill, step = high[kept], low[kept], uphill[kept], step[kept]
@@ -123,7 +126,7 @@ def _measure_slice(padded: NDArray[Any], axis: int, background: Background) -> t
 def _walk(
     values: NDArray[Any], start: NDArray[np.intp], step: NDArray[np.intp], falling: bool = False
 ) -> tuple[NDArray[np.intp], NDArray[np.float32]]:
-    """From each start by `step` as long as the values rise (or fall): where that ends, and the steepest step on it."""
+    """Walk from each start by `step` while the values rise (or fall); return the end and the steepest step."""
     end, steepest = start.copy(), np.zeros(len(start), dtype=np.float32)
     walking = np.arange(len(start))
     for _ in range(REACH):
@@ -140,7 +143,7 @@ def _walk(
 
 
 def leave_contrast_medium(edges: BoneEdges) -> tuple[BoneEdges, float, float]:
-    """Leave out edges into flat, faint plateaus, unless most are.
+    """Leave out edges that end in flat, faint plateaus (contrast medium), unless most edges do.
 
     Returns
     -------
@@ -148,7 +151,7 @@ def leave_contrast_medium(edges: BoneEdges) -> tuple[BoneEdges, float, float]:
     float
         Share of the contrast that was left out.
     float
-        Share that is flat and faint, left out or not.
+        Share of the contrast that is flat and faint, left out or not.
     """
     total = edges.contrast.sum()
     share = float(edges.contrast[edges.flat].sum() / total) if total else 0.0

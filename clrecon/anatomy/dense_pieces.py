@@ -1,15 +1,15 @@
-"""Pieces as dense as bone: which of them belong to the body, which are equipment, and what share of the bone stays.
+"""Pieces as dense as bone: which belong to the body, which are equipment, and what share of the bone stays.
 
 A piece is a connected component of cells that hold voxels above `DENSE_HU`.  Three facts tell bone from a table:
 
 - Plastic and carbon fibre have next to no voxels above `HARD_HU`; bone has, teeth and metal too.
 - A table moves through the scanner along the step of the slices, so its cross section is the same in all of them:
-  its columns of cells are full from the first slice to the last.  Bones taper and bend.
+  columns of its cells are filled from the first slice to the last.  Bones taper and bend.
 - Plates and rails are thin.
 
-A patient is wrapped in soft tissue, of which there is more than of bone; a dry specimen has none.  Of a patient a
-piece is kept where most of it lies within the body, and a piece beside it that is large enough to be a second body.
-Of a specimen every piece is kept that is no table.
+A patient has more soft tissue than bone; a dry specimen has no soft tissue.  In the scan of a patient a piece is kept
+if most of it lies within the body, or if it is large enough to be a second body.  In the scan of a specimen every piece
+is kept that is not a table.
 """
 
 from __future__ import annotations
@@ -29,43 +29,49 @@ __all__ = ["BONE_KEPT", "DensePieces", "find_dense_pieces", "judge_bone", "judge
 Float64Array = NDArray[np.float64]
 
 BONE_KEPT = 0.98
-"""Least share of the bone that stays; below it what was found is not the body."""
+"""Least share of the bone that must stay; if less stays, the body was not found."""
 HARD_SHARE = 0.005
-"""Pieces of bone have at least this share of hard voxels, tables none; a thin cortex in coarse voxels has 0.02."""
+"""Least share of hard voxels in a piece of bone.  Tables have no hard voxels; a thin cortex in coarse voxels has a
+share of 0.02."""
 SOLID_HU = 200.0
-"""Cells with this mean are bone; noise lifts single voxels over any bound."""
+"""Cells with a higher mean are bone.  The mean is used because noise lifts single voxels over any bound."""
 SOFT_PER_SOLID = 0.5
-"""Cells of soft tissue for one cell of bone: patients have 2 and more (a head), dry specimens below 0.1."""
+"""Cells of soft tissue for each cell of bone; dry specimens have fewer.  Patients have 2 or more (a head), dry
+specimens less than 0.1."""
 STRAIGHT_SHARE = 0.95
-"""A column of cells is of a table when this share of it is dense enough."""
+"""A column of cells belongs to a table when at least this share of it is dense enough."""
 STRAIGHT_MM = 60.0
-"""In shorter scans bones are as straight as a table."""
+"""Least height of a scan in which tables are looked for; in shorter scans bones are as straight as a table."""
 UNIFORM_HU = 100.0
-"""Largest deviation of the HU along a table: noise and shadows.  The cortex of a bone changes its thickness."""
+"""Largest standard deviation of the HU along a table, from noise and shadows.  The cortex of a bone varies more in
+thickness."""
 RAIL_MM = 10.0
-"""Thickness up to which what is straight, uniform and hard is a rail or a plate; shafts of long bones are thicker."""
+"""Largest thickness of a rail or a plate, among pieces that are straight, uniform and hard; shafts of long bones are
+thicker."""
 CABLE_MM, CABLE_ML = 5.0, 3.0
-"""A hard piece beside a patient is a cable when it is no thicker than this and takes no more room."""
+"""A hard piece beside a patient is a cable when its thickness and its volume are both at most these."""
 BODY_ML = 10.0
-"""A hard piece beside a patient is another body when it takes this much room, with what it encloses in a slice."""
+"""A hard piece beside a patient is a second body when its volume, with the regions that it encloses in each slice, is
+at least this."""
 LONG_MM = 150.0
-"""Thin pieces without hard voxels beside a specimen, and thin plates, are equipment when they are longer than this."""
+"""Thin pieces without hard voxels beside a specimen, and wide thin plates, are equipment from this length on."""
 GROWTH_MM = 6.0
-"""What is less dense and hangs on a bone of a specimen belongs to it as far as this."""
+"""Less dense tissue that touches a bone of a specimen belongs to the bone up to this distance."""
 INSIDE, HARD_INSIDE = 0.5, 0.25
-"""A piece belongs to a patient with this share of it within the body; where it is hard, with less."""
+"""Least share of a piece that lies within the body if the piece belongs to the patient; for hard pieces the second,
+lower value."""
 
 
 @dataclass(frozen=True)
 class DensePieces:
-    """What was decided.
+    """Decision on all dense pieces.
 
     Attributes
     ----------
     specimen : bool
         The scan shows dry bone without soft tissue.
     added : ndarray, shape (ck, cj, ci), bool
-        Cells that belong to the body beside those that were found by their thickness.
+        Cells that belong to the body in addition to those found by their thickness.
     counted : ndarray, shape (ck, cj, ci), bool
         Dense cells that count as bone.
     """
@@ -77,7 +83,7 @@ class DensePieces:
 
 @dataclass(frozen=True)
 class _Pieces:
-    """Connected components, with the voxels of each; entry 0 is what is in none."""
+    """Connected components, with the number of voxels of each; entry 0 is for cells in no component."""
 
     labels: NDArray[np.int32]
     dense: Float64Array
@@ -85,12 +91,12 @@ class _Pieces:
 
     @property
     def is_hard(self) -> Mask:
-        """Pieces of bone or metal; all of them where none is hard, which then tells nothing."""
+        """Pieces of bone or metal.  If no piece is hard, hardness tells nothing and all pieces count."""
         hard = (self.hard >= HARD_SHARE * self.dense) & (self.dense > 0)
         return np.asarray(hard if hard.any() else self.dense > 0)
 
     def share_in(self, cells: Cells, mask: Mask) -> Float64Array:
-        """Share of the dense voxels of each that lies in the mask."""
+        """Return for each piece the share of its dense voxels that lies in the mask."""
         within = np.bincount(self.labels[mask], weights=cells.dense[mask], minlength=len(self.dense))
         return np.asarray(within / np.maximum(self.dense, 1.0))
 
@@ -109,23 +115,23 @@ def _label(cells: Cells, mask: Mask) -> _Pieces:
 
 
 def _sum_by(labels: NDArray[np.int32], of: NDArray[Any], count: int) -> Float64Array:
-    """Sum for each label; 0 for label 0."""
+    """Return the sum for each label; 0 for label 0."""
     labelled = labels > 0
     return np.bincount(labels[labelled], weights=of[labelled], minlength=count + 1).astype(np.float64)
 
 
 def find_dense_pieces(cells: Cells, tissue: Mask, thick: Mask, body: Mask) -> DensePieces:
-    """Decide on every dense piece.
+    """Decide for every dense piece whether it belongs to the body and whether it counts as bone.
 
     Parameters
     ----------
     cells : Cells
     tissue : ndarray, shape (ck, cj, ci), bool
-        Cells that are no air.
+        Cells that are not air.
     thick : ndarray, shape (ck, cj, ci), bool
-        Of these the thick ones.
+        The thick cells among these.
     body : ndarray, shape (ck, cj, ci), bool
-        What was found by its thickness, without margin; all False where there is nothing.
+        Cells found by their thickness, without margin; all False if there are none.
     """
     from scipy import ndimage
 
@@ -136,10 +142,11 @@ def find_dense_pieces(cells: Cells, tissue: Mask, thick: Mask, body: Mask) -> De
 
 
 def _of_patient(cells: Cells, tissue: Mask, body: Mask) -> DensePieces:
-    """Pieces that lie for the most part in the body are added; hard ones that reach into it count.
+    """Decide for the scan of a patient.
 
-    A hard piece apart from the body counts too, unless it is a cable, and a large one is added: a second body.  What is
-    as straight as a table is one.
+    Pieces that lie mostly within the body are added.  Hard pieces that partly reach into it count as bone.  A hard
+    piece apart from the body counts too, unless it is a cable or as straight as a table.  A large piece of this kind is
+    also added, as a second body.
     """
     pieces = _label(cells, cells.dense > 0)
     hard = pieces.is_hard
@@ -158,7 +165,9 @@ def _of_patient(cells: Cells, tissue: Mask, body: Mask) -> DensePieces:
 
 
 def _of_specimen(cells: Cells, tissue: Mask, body: Mask) -> DensePieces:
-    """All pieces are added and count but tables: straight plates and rails, long thin pieces without hard voxels."""
+    """Decide for a specimen: all pieces are added and count, except straight plates, rails and long thin pieces that
+    are not hard.
+    """
     table = tissue & _straight_plates(cells, tissue)
     pieces = _label(cells, (cells.dense > 0) & ~table)
     kept = pieces.is_hard
@@ -170,7 +179,7 @@ def _of_specimen(cells: Cells, tissue: Mask, body: Mask) -> DensePieces:
 
 
 def _with_edges(cells: Cells, bone: Mask, tissue: Mask) -> Mask:
-    """Dry bone and what is less dense and hangs on it."""
+    """Return dry bone and the less dense cells that touch it."""
     from scipy import ndimage
 
     rounds = max(1, round(GROWTH_MM / cells.across))
@@ -178,10 +187,10 @@ def _with_edges(cells: Cells, bone: Mask, tissue: Mask) -> Mask:
 
 
 def _straight_plates(cells: Cells, tissue: Mask) -> Mask:
-    """Columns of the slice, shape (cj, ci), that plates and rails fill from the first slice to the last.
+    """Return the columns, shape (cj, ci), that plates and rails fill from the first slice to the last.
 
-    Columns without hard voxels are taken as they are.  Those with them may be of a shaft that lies on the table: they
-    count where they make up a rail or a wide plate of one HU from end to end.
+    Columns without hard voxels are accepted at once.  Columns with hard voxels may belong to the shaft of a bone that
+    lies on the table: they count only where they form a rail or a wide plate of uniform HU from end to end.
     """
     from scipy import ndimage
 
@@ -210,14 +219,14 @@ def _diagonal(box: tuple[slice, ...], size_mm: tuple[float, ...]) -> float:
 
 
 def _lengths(cells: Cells, pieces: _Pieces) -> Float64Array:
-    """Diagonal of the box of each piece, mm."""
+    """Return the diagonal of the bounding box of each piece, mm."""
     from scipy import ndimage
 
     return np.array([0.0, *(_diagonal(box, cells.size_mm[::-1]) for box in ndimage.find_objects(pieces.labels))])
 
 
 def _depth(mask: Mask, size_mm: tuple[float, ...]) -> Float64Array:
-    """About the thickness at each cell of a mask, mm: twice the way out of it, less one cell."""
+    """Estimate the thickness at each cell of a mask, mm: twice the distance to the outside, less one cell."""
     from scipy import ndimage
 
     way = ndimage.distance_transform_edt(np.pad(mask, 1), sampling=size_mm)
@@ -225,7 +234,7 @@ def _depth(mask: Mask, size_mm: tuple[float, ...]) -> Float64Array:
 
 
 def _thickness(cells: Cells, pieces: _Pieces, chosen: Mask) -> Float64Array:
-    """Thickness of each chosen piece where it is thickest, mm; 0 of others."""
+    """Return the largest thickness of each chosen piece, mm; 0 for the others."""
     from scipy import ndimage
 
     thickest = np.zeros(len(chosen))
@@ -237,7 +246,7 @@ def _thickness(cells: Cells, pieces: _Pieces, chosen: Mask) -> Float64Array:
 
 
 def _room(cells: Cells, pieces: _Pieces, chosen: Mask) -> Float64Array:
-    """Room of each chosen piece with what it encloses in a slice, ml; 0 of others."""
+    """Return the volume of each chosen piece with the regions that it encloses in each slice, ml; 0 for the others."""
     from scipy import ndimage
 
     room = np.zeros(len(chosen))
@@ -249,7 +258,7 @@ def _room(cells: Cells, pieces: _Pieces, chosen: Mask) -> Float64Array:
 
 
 def judge_bone(cells: Cells, pieces: DensePieces, kept: Mask) -> tuple[dict[str, Any], Gate]:
-    """Count the dense voxels that stay.
+    """Count the dense voxels that stay, and judge the share of bone among them.
 
     Parameters
     ----------
@@ -261,8 +270,8 @@ def judge_bone(cells: Cells, pieces: DensePieces, kept: Mask) -> tuple[dict[str,
     Returns
     -------
     facts : dict
-        ``specimen``, ``bone_voxels`` (above 300 HU, that count), ``bone_voxels_removed``, ``bone_kept`` (share, None
-        without any), ``other_voxels_removed`` (above 300 HU, of what is no bone: tables, cables).
+        ``specimen``, ``bone_voxels`` (above 300 HU, in pieces that count), ``bone_voxels_removed``, ``bone_kept``
+        (share, None without any), ``other_voxels_removed`` (above 300 HU, in tables and cables).
     gate : dict
         ``bone_kept``, at least `BONE_KEPT`.
     """
@@ -284,7 +293,7 @@ def judge_bone(cells: Cells, pieces: DensePieces, kept: Mask) -> tuple[dict[str,
 
 
 def judge_circle(cells: Cells, inside: Mask) -> tuple[dict[str, Any], Gate]:
-    """Count what bone a circle cuts, to a cell.
+    """Count the voxels of bone that a circle cuts off, with the precision of a cell.
 
     Parameters
     ----------

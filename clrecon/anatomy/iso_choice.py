@@ -1,9 +1,9 @@
 """The iso value half way between bone and the tissue beside it, measured in the scan itself.
 
-A scanner blurs every edge, and of all levels only the one half way between the two plateaus leaves the edge where it
-is: 20 % of the step off it the surface moves by about half a voxel at a blur of 0.8 voxel.  Bone has no plateau of
-its own in the histogram of a body (marrow, thin cortex and contrast medium fill the same numbers), so the plateaus
-are read where they matter, at the edges:
+A scanner blurs every edge.  Only the level half way between the two plateaus leaves the edge in its place: a level that
+is off by 20 % of the step moves the surface by about half a voxel, at a blur of 0.8 voxel.  Bone has no peak of its own
+in the histogram of a body, because marrow, thin cortex and contrast medium have the same values.  So the plateaus are
+measured at the edges:
 
 1. The histogram of evenly spread slices gives the soft-tissue mode and its noise.  Padding, air, table and fat lie
    elsewhere and do not move it.
@@ -39,31 +39,31 @@ __all__ = ["CONTRAST_SAID", "IsoChoice", "choose_iso_value", "half_iso_value"]
 Float64Array = NDArray[np.float64]
 
 SAMPLED_VOXELS = 8_400_000
-"""About so many voxels are looked at: 32 slices of 512 x 512."""
+"""Approximate number of voxels that are examined: 32 slices of 512 x 512."""
 FEWEST_SLICES = 8
 
 LOWEST_HU, HIGHEST_HU = AIR_HU + 1, 3071
-"""What the histogram counts: above the padding, up to the end of the 12-bit scale."""
+"""The values that the histogram counts: from just above the padding to the end of the 12-bit scale."""
 SMOOTHING_HU = 8.0
 SOFT_TISSUE_HU = (-30, 150)
-"""Where muscle, organs, blood and water have their mode."""
+"""Range in which muscle, organs, blood and water have their mode."""
 FAT_HU = (-150, -31)
-"""Where fat has it, the background of what shows no other soft tissue."""
+"""Range in which fat has its mode: the background of scans that show no other soft tissue."""
 AIR_MODE_HU = -700
 """Modes below this are air."""
 
 SEED_ABOVE_TISSUE_HU = 100
-"""Bone begins so far above the soft-tissue mode at least: discs, clots and organs end below."""
+"""Least distance of bone from the soft-tissue mode: discs, clots and organs end below."""
 SEED_SIGMAS = 4.0
 WIDEST_MODE_HU = 150.0
-"""More noise than this hides the tissues; a ramp between two materials looks wider still."""
+"""Widest accepted mode: more noise than this hides the tissues, and a ramp between two materials looks wider still."""
 SPECIMEN_SEED_HU = 150
-"""Where a specimen in air begins."""
+"""Lowest value of bone in a specimen that lies in air."""
 FAT_BELOW_TISSUE_HU = 250
-"""The low side of an edge is soft tissue or fat: not further below the mode than this."""
+"""The low side of an edge is soft tissue or fat: at most this far below the mode."""
 
 CONTRAST_SAID = 0.05
-"""Share of the contrast in flat plateaus that is said; scans without contrast medium have up to 0.02."""
+"""Least share of the contrast in flat plateaus that is reported; scans without contrast medium have up to 0.02."""
 FEWEST_EDGES = 64
 LEAST_CONTRAST_SIGMAS = 6.0
 
@@ -75,7 +75,7 @@ def _describe_way_out() -> str:
 
 @dataclass(frozen=True)
 class IsoChoice:
-    """An iso value half way between two materials, with what speaks for it.
+    """An iso value half way between two materials, with the measurements behind it.
 
     Attributes
     ----------
@@ -84,15 +84,15 @@ class IsoChoice:
     bone_hu, tissue_hu : float
         The plateaus on both sides of the edge of bone, HU.
     method : {"auto", "half"}
-        Measured, or given.
+        "auto": measured.  "half": computed from given plateaus.
     reason : str
-        One line for people.
+        The choice in words, one line.
     background : {"soft tissue", "air"} or None
-        What the bone lies in; None where the materials were given, as for all that follows.
+        The material that the bone lies in.  This and all that follows is None where the plateaus were given.
     background_mode_hu, noise_hu : float or None
         The mode of the background in the histogram and its width, HU.
     edges : int or None
-        Edges measured.
+        Number of edges measured.
     spread_hu : float or None
         Half the interquartile range of the half-way levels of single edges.
     steepness_hu_per_voxel : float or None
@@ -104,9 +104,10 @@ class IsoChoice:
     contrast_medium_share : float or None
         Share of the contrast left out because it ends in a flat plateau below `CONTRAST_MEDIUM_HU`.
     flat_share : float or None
-        The same share before it was decided: more than three quarters are not left out but taken for bone.
+        Share of the contrast in flat plateaus before that decision: where it is above three quarters they are not left
+        out but taken for bone.
     slices, slice_step : int or None
-        Slices looked at and the distance from one to the next.
+        Number of slices examined, and the distance from one to the next in slices.
     """
 
     iso_value: float
@@ -132,7 +133,7 @@ class IsoChoice:
 
 
 def half_iso_value(bone_hu: float, tissue_hu: float) -> IsoChoice:
-    """Return the iso value half way between two materials that are known.
+    """Return the iso value half way between two materials of known HU.
 
     Raises
     ------
@@ -151,9 +152,9 @@ def half_iso_value(bone_hu: float, tissue_hu: float) -> IsoChoice:
 def choose_iso_value(volume: Volume, *, progress: Progress | None = None) -> IsoChoice:
     """Measure bone and the tissue beside it, and choose the iso value half way between them.
 
-    Bone in soft tissue, or, where the scan shows no soft tissue, a specimen in air.  Deterministic; looks at about
-    8 million voxels in evenly spread slices, one slice in memory at a time (a memory-mapped volume stays on the disk).
-    The measured errors, against other methods, are in ``docs/iso_value.md``.
+    Measures bone in soft tissue; where the scan shows no soft tissue, a specimen in air.  Deterministic.  Examines
+    about 8 million voxels in evenly spread slices, with one slice in memory at a time (a memory-mapped volume stays on
+    the disk).  The measured errors, against other methods, are in ``docs/iso_value.md``.
 
     Parameters
     ----------
@@ -169,7 +170,7 @@ def choose_iso_value(volume: Volume, *, progress: Progress | None = None) -> Iso
     Raises
     ------
     NoSurfaceError
-        There are no two materials: neither soft tissue nor air has a mode, or no bone rises from it.
+        Two materials were not found: neither soft tissue nor air has a mode, or no bone rises from it.
     """
     progress = progress or ignore_progress
     progress("choose", 0, 3)
@@ -192,7 +193,9 @@ def choose_iso_value(volume: Volume, *, progress: Progress | None = None) -> Iso
 
 
 def _describe(background: Background, edges: BoneEdges, flat: tuple[float, float], sampled: range) -> IsoChoice:
-    """The choice that the edges make, with its figures; `flat` are the shares left out and found."""
+    """Make the choice that follows from the edges; `flat` holds the shares of contrast that were left out and that were
+    flat.
+    """
     left_out, flat_share = flat
     bone, tissue = _median(edges.bone, edges.contrast), _median(edges.tissue, edges.contrast)
     iso_value = float(math.floor((bone + tissue) / 2.0 + 0.5))
@@ -237,7 +240,9 @@ def _no_bone(background: Background, edges: BoneEdges, histogram: Float64Array, 
 
 
 def _count_values(voxels: NDArray[Any], sampled: range) -> Float64Array:
-    """Voxels of each whole HU from `LOWEST_HU` to `HIGHEST_HU`; what is below is padding, what is above counts last."""
+    """Count the voxels of each whole HU from `LOWEST_HU` on.  Lower values are padding; higher than `HIGHEST_HU` count
+    as that.
+    """
     low = LOWEST_HU - 1
     counts = np.zeros(HIGHEST_HU - low + 1, dtype=np.int64)
     for k in sampled:
@@ -251,7 +256,7 @@ def _count_values(voxels: NDArray[Any], sampled: range) -> Float64Array:
 
 
 def _leave_padding(histogram: Float64Array, counted: int, report: dict[str, Any]) -> Float64Array:
-    """The histogram without the padding that was filled with air: as one value it would hide the noise of the air."""
+    """Remove padding that was filled with air from the histogram: its single value would hide the noise of the air."""
     value, share = report.get("padding_hu"), report.get("padding_share")
     if value is not None and share is not None and LOWEST_HU <= value <= HIGHEST_HU:
         place = int(np.rint(value)) - LOWEST_HU
@@ -267,11 +272,11 @@ def _smooth(histogram: Float64Array) -> Float64Array:
 
 
 def _find_mode(smooth: Float64Array, low: int, high: int) -> tuple[float, float] | None:
-    """Highest local maximum of the smoothed histogram between two HU, and its width: mode and sigma in HU.
+    """Find the highest peak of the smoothed histogram between two HU; return its mode and its width (sigma), HU.
 
-    None where there is none that stands out twofold over what lies 250 to 500 HU below and 200 to 400 HU above, and is
-    no wider than `WIDEST_MODE_HU`: the ramp of an edge between air and bone runs through all values alike.  The width
-    is that of the upper side, where no fat is, at 61 % of the height, less the smoothing.
+    None where no peak is twice as high as the mean of the values 250 to 500 HU below and 200 to 400 HU above it, or the
+    peak is wider than `WIDEST_MODE_HU`: the ramp of an edge between air and bone has all values alike.  The width is
+    measured on the upper side, where there is no fat, at 61 % of the height (one sigma), less the smoothing.
     """
     at = np.arange(max(low - LOWEST_HU, 1), min(high - LOWEST_HU, len(smooth) - 2) + 1)
     peaks = at[(smooth[at] > smooth[at - 1]) & (smooth[at] >= smooth[at + 1])]
@@ -289,7 +294,7 @@ def _find_mode(smooth: Float64Array, low: int, high: int) -> tuple[float, float]
 
 
 def _find_background(histogram: Float64Array) -> Background:
-    """Soft tissue, or the air round a specimen."""
+    """Find the background: soft tissue, or the air around a specimen."""
     smooth = _smooth(histogram)
     tissue = _find_mode(smooth, *SOFT_TISSUE_HU) or _find_mode(smooth, *FAT_HU)
     if tissue is not None:
@@ -313,7 +318,7 @@ def _find_background(histogram: Float64Array) -> Background:
 
 
 def _median(values: NDArray[Any], weights: NDArray[Any], share: float = 0.5) -> float:
-    """Weighted quantile; 0 of nothing."""
+    """Return the weighted median; 0 for an empty array."""
     if not len(values):
         return 0.0
     order = np.argsort(values, kind="stable")

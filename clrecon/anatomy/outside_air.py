@@ -1,7 +1,7 @@
-"""What below an iso value is air round the patient, and what is lung, airway, sinus or bowel gas.
+"""Voxels below an iso value: which are air around the patient, and which are lung, airway, sinus or bowel gas.
 
-The body (`clrecon.anatomy.body`) says what is outside: its cavities belong to it.  Where an airway is open to the
-outside, at nostrils or mouth, it is cut a little under the skin, and the area of the cut is said.
+The body (`clrecon.anatomy.body`) tells what is outside: its cavities belong to it.  An airway that is open to the
+outside, at nostrils or mouth, is cut a little under the skin, and the area of the cut is reported.
 """
 
 from __future__ import annotations
@@ -24,15 +24,15 @@ __all__ = ["leave_outside_air"]
 Mask = NDArray[np.bool_]
 
 SKIN_MM = 2.0
-"""Air less deep than this under the outline of the body is outside: folds of the skin, the steps of the outline."""
+"""Air less deep than this under the outline of the body is outside: folds of the skin, steps of the outline."""
 DEEP_MM = 5.0
-"""Air that is joined to the outside is a cavity of the body where it reaches so far under `SKIN_MM`."""
+"""Air that is connected to the outside is a cavity of the body if it reaches this far below `SKIN_MM`."""
 OPEN_MM = 12.0
-"""Slices in which an airway is open (parted lips) are closed as their neighbours are, up to this height."""
+"""Slices in which an airway is open (parted lips) get the outline of the slices above and below, up to this height."""
 
 
 def leave_outside_air(volume: Volume, levels: Sequence[float]) -> Volume:
-    """Lift the air round the patient above iso values, so that it is not among what lies below them.
+    """Raise the air around the patient above the iso values, so that no surface of air includes it.
 
     Parameters
     ----------
@@ -44,16 +44,17 @@ def leave_outside_air(volume: Volume, levels: Sequence[float]) -> Volume:
     Returns
     -------
     Volume
-        The same places.  Air outside has a value so far above the highest level that a surface between it and air of
-        the body lies half way.  ``report["outside_air"]`` has ``left_out_ml``, ``kept_ml`` (below the highest level),
-        ``opening_mm2`` (area in which measured air of both meets) and ``filled_hu`` (the value).
+        A volume with the same places.  Air outside gets a value as far above the highest level as air is below it, so
+        that a surface between it and air of the body lies half way.  ``report["outside_air"]`` has ``left_out_ml``,
+        ``kept_ml`` (below the highest level), ``opening_mm2`` (area where the two kinds of air meet, as far as it was
+        measured) and ``filled_hu`` (the new value).
 
     Raises
     ------
     RefusedInputError
-        There is no body.
+        No body was found.
     NoSurfaceError
-        All that lies below the levels is outside.
+        All voxels below the levels are outside.
     """
     level = min(max(levels), TISSUE_HU)
     try:
@@ -64,7 +65,8 @@ def leave_outside_air(volume: Volume, levels: Sequence[float]) -> Volume:
     body = _close_along_k(body, int(OPEN_MM / (2.0 * step[2] * volume.spacing[2])))
     across = math.sqrt(step[0] * volume.spacing[0] * step[1] * volume.spacing[1])
     unmeasured = find_unmeasured(volume.voxels)
-    # A lung that the circle of the reconstruction cuts reaches up to it: what was not measured takes nothing away.
+    # A lung that is cut by the circle of the reconstruction reaches up to it: unmeasured voxels must not shrink the
+    # body.
     inner = _shrink(body | unmeasured[:: step[2], :: step[1], :: step[0]], (MARGIN_MM + SKIN_MM) / across)
     deep = _to_voxels(_shrink(body, (MARGIN_MM + SKIN_MM + DEEP_MM) / across, border=False), step, volume)
     within = _to_voxels(inner, step, volume)
@@ -98,7 +100,7 @@ def leave_outside_air(volume: Volume, levels: Sequence[float]) -> Volume:
 
 
 def _find_cavities(air: Mask, within: Mask, deep: Mask) -> Mask:
-    """Air within the outline that is either not joined to the air outside, or reaches deep."""
+    """Find air within the outline that is either not connected to the air outside, or reaches deep."""
     from scipy import ndimage
 
     pieces, count = ndimage.label(air & within)
@@ -115,7 +117,7 @@ def _find_cavities(air: Mask, within: Mask, deep: Mask) -> Mask:
 
 
 def _touching_mm2(kept: Mask, outside: Mask, volume: Volume) -> float:
-    """Area of the faces between voxels of one and of the other."""
+    """Return the area of the faces between the voxels of two masks, mm2."""
     steps = volume.affine[:3, :3].T
     areas = [float(np.linalg.norm(np.cross(steps[(axis + 1) % 3], steps[(axis + 2) % 3]))) for axis in (2, 1, 0)]
     total = 0.0
@@ -126,14 +128,14 @@ def _touching_mm2(kept: Mask, outside: Mask, volume: Volume) -> float:
 
 
 def _millilitres(mask: Mask, volume: Volume) -> float:
-    """Volume of the voxels of a mask; a slice reaches half way to its neighbours."""
+    """Return the volume of the voxels of a mask, ml; a slice reaches half way to its neighbours."""
     steps = np.gradient(volume.slice_origins(border=1), axis=0)[1:-1]
     across = np.cross(volume.affine[:3, 0], volume.affine[:3, 1])
     return float(np.count_nonzero(mask, axis=(1, 2)) @ np.abs(steps @ across)) / 1000.0
 
 
 def _neighbours() -> Iterator[tuple[Any, Any]]:
-    """Of the pairs of neighbours along k, j and i the lower and the upper ones."""
+    """Yield for k, j and i the subscripts of the lower and of the upper voxel of each pair of neighbours."""
     for axis in range(3):
         low, high = [slice(None)] * 3, [slice(None)] * 3
         low[axis], high[axis] = slice(None, -1), slice(1, None)
@@ -141,7 +143,7 @@ def _neighbours() -> Iterator[tuple[Any, Any]]:
 
 
 def _shrink(mask: Mask, cells: float, border: bool = True) -> Mask:
-    """Erode slice by slice; what is beyond the border of the scan erodes nothing unless `border` is False."""
+    """Erode slice by slice; the border of the scan erodes too where `border` is False."""
     from scipy import ndimage
 
     for turn in range(max(1, round(cells))):
@@ -151,7 +153,7 @@ def _shrink(mask: Mask, cells: float, border: bool = True) -> Mask:
 
 
 def _close_along_k(mask: Mask, reach: int) -> Mask:
-    """What is inside both above and below, at most so many slices away, is inside."""
+    """Close gaps along k: a voxel is inside when voxels above and below, at most `reach` slices away, are inside."""
     from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
     size, around = 2 * reach + 1, ((reach, reach), (0, 0), (0, 0))
@@ -169,7 +171,7 @@ def _to_voxels(cells: Mask, step: tuple[int, int, int], volume: Volume) -> Mask:
 
 
 def _value_above(level: float, dtype: np.dtype[Any]) -> Any:
-    """As far above a level as air lies below it, as far as the type has it."""
+    """Return a value as far above a level as air lies below it, within the range of the type."""
     value = level + max(level - AIR_HU, 1.0)
     if dtype.kind == "f":
         return dtype.type(value)

@@ -1,12 +1,13 @@
-"""Find the spinal canal: a centre line of the vertebral column for curved reformations.
+"""The spinal canal: a centre line of the vertebral column for curved reformations.
 
-In slices across the patient every place is asked how much it is like the middle of the spinal canal: soft, closed in
-by cortical bone in all directions (over 24 mm of height, so that arches close the gaps between them), a vertebral body
-in front, nothing but muscle behind, and the left the mirror of the right.  The path through the slices on which most
-of that is found, by dynamic programming, is the canal where it is found for long enough; elsewhere nothing is said.
-Each slice's place is then moved to the middle of the space that the bone encloses, and the line is smoothed.
+In slices across the patient every place is compared with what the middle of the spinal canal looks like.  It is soft.
+Cortical bone encloses it in all directions (within 24 mm of height, so that arches close the gaps between them).  There
+is a vertebral body in front and nothing but muscle behind, and the left mirrors the right.  Dynamic programming finds
+the path through the slices that agrees best.  The path is the canal where it agrees over enough height; elsewhere
+nothing is reported.  Each slice's point is then moved to the middle of the space that the bone encloses, and the line
+is smoothed.
 
-It is meant for the thoracic and lumbar spine of an adult, in a scan whose directions are those of the patient.
+The search is meant for the thoracic and lumbar spine of an adult, in a scan whose axes are those of the patient.
 """
 
 from __future__ import annotations
@@ -27,27 +28,27 @@ __all__ = ["SpineLine", "find_spine_line"]
 Field = NDArray[np.float32]
 
 CELL_MM = (2.5, 2.5, 4.0)
-"""Cells of the grid along x, y, z that the canal is found on."""
+"""Size along x, y, z of the cells in which the canal is searched."""
 CANAL_RADIUS, BODY_RADIUS = 5.0, 10.0
 RING_MM = (8.0, 10.0, 12.0, 14.0, 16.0)
-"""Distances from the middle of the canal at which its wall may lie."""
+"""Distances from the middle of the canal at which its wall is looked for."""
 SHELL_MM = (12.0, 15.0, 18.0, 21.0, 24.0)
-"""The same of a vertebral body."""
+"""Distances from the middle of a vertebral body at which its wall is looked for."""
 BODY_AHEAD_MM = (20.0, 24.0, 28.0)
-"""From the middle of the canal to that of the body."""
+"""Distances from the middle of the canal to the middle of the vertebral body."""
 DIRECTIONS = 16
 WORTH = 2.2
-"""Of a place that counts neither for the path nor against it, of about 3.2 that the canal has."""
+"""Score that counts neither for nor against the path; the canal has about 3.2."""
 WORST = 0.6
-"""What a slice may count against the path at most: one slice with an artefact does not end it."""
+"""Most that a slice counts against the path, so that one slice with an artefact does not end it."""
 BEND_COST = 0.05
 DEEPER_AHEAD = 1.2
-"""The body is deeper in front of the canal than behind it, at least so many times."""
+"""The body is at least this many times deeper in front of the canal than behind it."""
 SHORTEST_MM = 35.0
 SURE = {"wall": 0.75, "mirror": 0.55, "body": 0.25, "soft": 0.6}
-"""A slice is sure where it has all of these."""
+"""A slice is sure when each of its traits is at least this."""
 GAP_MM = 12.0
-"""Slices without it between sure ones: an artefact, or a vertebra that looks different."""
+"""Largest gap between sure slices: an artefact, or a vertebra that looks different."""
 SMOOTH_MM = 12.0
 POINT_STEP_MM = 15.0
 
@@ -61,7 +62,7 @@ class SpineLine:
     points : ndarray, shape (n, 3), float64
         LPS mm, from the head downwards, about 10 mm apart.
     sure_share : float
-        Share of the slices of the line that look like a spine in every respect.
+        Share of the slices of the line whose traits all reach `SURE`.
     searched_mm : float
         Height of the volume; the line may be shorter.
     """
@@ -72,19 +73,19 @@ class SpineLine:
 
     @property
     def height_mm(self) -> float:
-        """From the lower to the upper end along the body axis."""
+        """Distance between the lower and the upper end along the body axis, mm."""
         return float(self.points[0, 2] - self.points[-1, 2])
 
 
 @dataclass(frozen=True)
 class _Cells:
-    """HU (nz, ny, nx) of cells along the patient's axes, the upper slices last, and the centre of the first cell."""
+    """HU (nz, ny, nx) of cells along the patient's axes, uppermost slice last, and the centre of the first cell."""
 
     values: Field
     origin: Float64Array
 
     def heights(self, mm: float) -> int:
-        """Cells of a window of `mm` along z: odd."""
+        """Return the height of a window of `mm` along z in cells, an odd number."""
         return max(1, round(mm / CELL_MM[2]) | 1)
 
 
@@ -105,7 +106,7 @@ def find_spine_line(volume: Volume, *, progress: Progress | None = None) -> Spin
     Raises
     ------
     RefusedInputError
-        Nowhere in the volume it is sure: the message says how much was found.
+        No part of the volume surely shows a spine; the message says how much was found.
     """
     progress = progress or ignore_progress
     progress("curve", 0, 3)
@@ -138,8 +139,10 @@ def find_spine_line(volume: Volume, *, progress: Progress | None = None) -> Spin
 
 
 def _depths(cells: _Cells, path: NDArray[np.int64]) -> tuple[float, float | None]:
-    """Medians of the mm of tissue in front of a path and behind it; None behind where the volume ends within it."""
-    thick = _disc_mean((cells.values > -300.0).astype(np.float32), BODY_RADIUS) > 0.6  # not the table
+    """Return the median depth of tissue in front of a path and behind it, mm; None behind where the volume ends within
+    it.
+    """
+    thick = _disc_mean((cells.values > -300.0).astype(np.float32), BODY_RADIUS) > 0.6  # the table is thinner
     k, j, i = path.T
     rows = thick[k, :, i]
     ends = rows.shape[1] - 1 - rows[:, ::-1].argmax(axis=1)
@@ -150,7 +153,7 @@ def _depths(cells: _Cells, path: NDArray[np.int64]) -> tuple[float, float | None
 
 
 def _longest_run(sure: NDArray[np.bool_]) -> tuple[int, int]:
-    """First and end of the longest run of sure slices; gaps up to `GAP_MM` between them do not part it."""
+    """Return the first and the end of the longest run of sure slices; gaps up to `GAP_MM` do not divide a run."""
     best, begin, last = (0, 0), None, 0
     for k in np.flatnonzero(sure):
         if begin is None or (k - last - 1) * CELL_MM[2] > GAP_MM:
@@ -162,7 +165,7 @@ def _longest_run(sure: NDArray[np.bool_]) -> tuple[int, int]:
 
 
 def _average_cells(volume: Volume) -> _Cells:
-    """Mean values of blocks of voxels of about the size of a cell, interpolated at the cells."""
+    """Average the voxels in blocks of about a cell, then interpolate at the cells."""
     from scipy.ndimage import map_coordinates
 
     size = np.array(volume.shape_ijk)
@@ -195,7 +198,7 @@ def _average_cells(volume: Volume) -> _Cells:
 
 
 def _shifted(field: Field, right: float, back: float) -> Field:
-    """The field `right` and `back` mm further in each slice; 0 beyond its ends."""
+    """Shift the field so that each cell has the value `right` and `back` mm further in its slice; 0 beyond the ends."""
     dx, dy = round(right / CELL_MM[0]), round(back / CELL_MM[1])
     moved = np.zeros_like(field)
     ny, nx = field.shape[1:]
@@ -206,7 +209,7 @@ def _shifted(field: Field, right: float, back: float) -> Field:
 
 
 def _disc_mean(field: Field, radius: float) -> Field:
-    """Mean within `radius` mm in each slice."""
+    """Return the mean within `radius` mm in each slice."""
     from scipy.ndimage import convolve
 
     reach = int(np.ceil(radius / CELL_MM[0]))
@@ -216,7 +219,7 @@ def _disc_mean(field: Field, radius: float) -> Field:
 
 
 def _enclosed(bone: Field, distances: tuple[float, ...]) -> Field:
-    """Share of the directions in which bone stands at one of the distances."""
+    """Return the share of the directions in which bone stands at one of the distances."""
     sums = np.zeros_like(bone)
     for angle in np.arange(DIRECTIONS) * (2.0 * np.pi / DIRECTIONS):
         wall = np.zeros_like(bone)
@@ -227,7 +230,7 @@ def _enclosed(bone: Field, distances: tuple[float, ...]) -> Field:
 
 
 def _cortex(cells: _Cells, height: float) -> Field:
-    """Dense bone anywhere within `height` mm along z, 0 to 1."""
+    """Return the density of cortical bone, 0 to 1: the largest within `height` mm along z."""
     from scipy.ndimage import maximum_filter1d
 
     cortex = np.clip((cells.values - 170.0) / 130.0, 0.0, 1.0)
@@ -235,7 +238,7 @@ def _cortex(cells: _Cells, height: float) -> Field:
 
 
 def _find_traits(cells: _Cells) -> dict[str, Field]:
-    """How far each cell is like the middle of the spinal canal, 0 to 1 each, by trait."""
+    """Measure how much each cell is like the middle of the spinal canal: a field of 0 to 1 for each trait."""
     from scipy.ndimage import maximum_filter, uniform_filter1d
 
     values = cells.values
@@ -259,7 +262,7 @@ def _find_traits(cells: _Cells) -> dict[str, Field]:
 
 
 def _mirrored(cells: _Cells, wanted: NDArray[np.bool_]) -> Field:
-    """Correlation of the left with the mirrored right, 40 mm aside, 44 mm to the front and 36 to the back."""
+    """Correlate the left with the mirrored right: 40 mm to the sides, 44 mm to the front and 36 mm to the back."""
     from scipy.ndimage import uniform_filter, uniform_filter1d
 
     smooth = uniform_filter1d(np.clip(cells.values, -300.0, 500.0), cells.heights(9.0), axis=0, mode="nearest")
@@ -282,9 +285,11 @@ def _mirrored(cells: _Cells, wanted: NDArray[np.bool_]) -> Field:
 
 
 def _best_path(gain: Field) -> NDArray[np.int64]:
-    """Cells (n, 3) as (k, j, i), one a slice, at most one cell aside from slice to slice, with the highest sum.
+    """Return the path with the highest sum: cells (n, 3) as (k, j, i), one a slice, at most one cell aside from slice
+    to slice.
 
-    It begins and ends where it is best: what counts against it lies between what counts for it.
+    It begins and ends where the sum is best, so that slices that count against it lie only between slices that count
+    for it.
     """
     steps = [(dy, dx) for dy in (-1, 0, 1) for dx in (-1, 0, 1)]
     sums = gain[0].copy()
@@ -314,7 +319,9 @@ def _best_path(gain: Field) -> NDArray[np.int64]:
 
 
 def _centre_points(cells: _Cells, path: NDArray[np.int64]) -> Float64Array:
-    """The middle of what the bone encloses in each slice of a path, smoothed, from the upper end to the lower."""
+    """Return the middle of the space that bone encloses in each slice of a path, smoothed, from the upper end to the
+    lower.
+    """
     from scipy.ndimage import gaussian_filter1d
 
     bone = _cortex(cells, 16.0)
@@ -328,7 +335,7 @@ def _centre_points(cells: _Cells, path: NDArray[np.int64]) -> Float64Array:
             if weight.sum() > 0.0:
                 moved = np.array([(weight * y).sum(), (weight * x).sum()]) / weight.sum()
                 middles[n] += np.clip(moved - middles[n], -1.0, 1.0)
-    # Beyond its ends the line goes on point-symmetrically: smoothing does not bend it there.
+    # The line continues beyond its ends by point symmetry, so that smoothing does not bend it there.
     beyond = min(len(middles) - 1, round(4.0 * SMOOTH_MM / CELL_MM[2]))
     longer = np.pad(middles, ((beyond, beyond), (0, 0)), mode="reflect", reflect_type="odd")
     smooth = gaussian_filter1d(longer, SMOOTH_MM / CELL_MM[2], axis=0, mode="nearest")[beyond:][: len(middles)]
