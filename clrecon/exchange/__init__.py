@@ -1,1 +1,1 @@
-"""Files of meshes that are written: one module a format, chosen by the extension of the file."""
+"""Mesh files: writers, one module for each format, chosen by the extension of the file."""

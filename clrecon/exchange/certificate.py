@@ -1,8 +1,8 @@
 """The certificate of the volume that a mesh was made of, as short lines for the comments of its file.
 
-One fact a line: a name, a blank, the value, such as ``tilt_deg 12.5``.  Numbers have nine significant digits, so that
-a line of the same volume is the same in every file.  Only the names below ever get into a file.  A report can be
-anything that a caller made up: what has another form is left out, and texts become one line of plain ASCII.
+Each line holds one fact: name, blank, value, for example ``tilt_deg 12.5``.  Numbers have nine significant digits, so
+that the lines of one volume are the same in every file.  Only the names below are written to a file.  A caller can put
+anything into a report, so entries of another form are left out, and texts become one line of plain ASCII.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from typing import Any
 __all__ = ["LINE_LENGTH", "certificate_lines"]
 
 LINE_LENGTH = 256
-"""Readers of PLY keep comments in buffers of fixed size: 1024 bytes in one that is widely used."""
+"""Longest line.  Readers of PLY keep comments in buffers of fixed size; a widely used one has 1024 bytes."""
 WARNINGS_WRITTEN = 20
 RUNS_WRITTEN = 12
 _NUMBERS = (
@@ -31,7 +31,7 @@ _AXES = re.compile(r"[LRPASI]{3}")
 
 
 def certificate_lines(report: Mapping[str, Any]) -> tuple[str, ...]:
-    """The lines for a file.
+    """Return the lines for a file.
 
     Parameters
     ----------
@@ -42,7 +42,7 @@ def certificate_lines(report: Mapping[str, Any]) -> tuple[str, ...]:
     -------
     tuple of str
         At most `LINE_LENGTH` printable ASCII characters each, none of them ``=``: readers look for ``SPACE=`` anywhere.
-        Empty where nothing is known.
+        Empty if nothing is known.
     """
     return tuple(_plain(line) for line in (*_facts(report), *_faults(report)))
 
@@ -93,7 +93,7 @@ def _mapping(value: Any) -> Mapping[Any, Any]:
 
 
 def _line(name: str, pairs: Iterable[tuple[str, Any]]) -> Iterator[str]:
-    """One line of numbers, each with the word before it; none where one of them is no number."""
+    """Return one line of numbers, each after its word; no line if one of the values is not a number."""
     words = [name]
     for word, value in pairs:
         if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):

@@ -1,4 +1,4 @@
-"""What a writer gets: a mesh in the frame in which it is written, and what may be said about it."""
+"""The input of a writer: a mesh in the frame in which it is written, and the facts that the file may contain."""
 
 from __future__ import annotations
 
@@ -31,9 +31,9 @@ class Content:
     affine : ndarray, shape (4, 4), float64, or None
         Index (i, j, k) of the volume to LPS mm, whatever `space` is.
     inside : str or None
-        What the surface encloses, where that is not what lies from the iso value on: "below -400 HU".
+        The values that the surface encloses, for example "below -400 HU"; None for those from the iso value on.
     certificate : tuple of str
-        What is known of the volume, see `clrecon.exchange.certificate`; one printable ASCII line each.
+        Facts about the volume, see `clrecon.exchange.certificate`; one printable ASCII line each.
     """
 
     vertices: NDArray[np.floating]
@@ -48,17 +48,17 @@ class Content:
 
     @property
     def is_double(self) -> bool:
-        """Coordinates need more digits than float32 has."""
+        """True where coordinates need more digits than float32 has."""
         return self.vertices.dtype == np.float64
 
     @property
     def number(self) -> str:
-        """How text formats write a coordinate: so many digits give back the same float32, or 1e-9 mm at 1e5 mm."""
+        """Format of a coordinate in text files: enough digits to get back the same float32, or 1e-9 mm at 1e5 mm."""
         return "%.15g" if self.is_double else "%.9g"
 
     @property
     def remarks(self) -> list[str]:
-        """The facts for formats that have comments: space, unit and, when known, iso value and certificate."""
+        """Facts for formats that have comments: space, unit and, if known, iso value and certificate."""
         remarks = [f"SPACE={self.space}", "UNIT=mm"]
         if self.iso_value_hu is not None:
             remarks.append(f"ISO_VALUE_HU={self.iso_value_hu:.9g}")
@@ -68,7 +68,7 @@ class Content:
 
 
 class Writable(Protocol):
-    """What can be written: a `Mesh`."""
+    """Protocol of an object that can be written: a `Mesh`."""
 
     @property
     def triangle_count(self) -> int: ...
@@ -79,7 +79,7 @@ class Writable(Protocol):
 
 
 def refuse_file(words: str, found: object, expected: object) -> OutputError:
-    """The error for a file that does not read back as it was written."""
+    """Return the error for a file whose contents differ from what was written."""
     return OutputError(
         f"the file did not arrive on the disk as it was written: {found} {words}, {expected} expected; "
         "an older file is intact, check the disk and try again"

@@ -1,4 +1,4 @@
-"""The type that coordinates of vertices are kept in."""
+"""The storage type of vertex coordinates: float32 near the origin, float64 far from it."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _MOST_STEPS_APART = 64
 
 
 def as_stored(points: NDArray[Any]) -> NDArray[np.floating]:
-    """Coordinates as a `Mesh` keeps them.
+    """Convert coordinates to the type in which a `Mesh` keeps them.
 
     Parameters
     ----------
@@ -33,7 +33,7 @@ def as_stored(points: NDArray[Any]) -> NDArray[np.floating]:
 
 
 def rounding_step(vertices: NDArray[np.floating]) -> float:
-    """Length in mm of the steps that coordinates of vertices have been rounded to.
+    """Return the step, in mm, to which coordinates of vertices have been rounded.
 
     Parameters
     ----------
@@ -53,9 +53,10 @@ def rounding_step(vertices: NDArray[np.floating]) -> float:
 
 
 def find_coincident(vertices: NDArray[np.floating]) -> NDArray[np.int64]:
-    """Find the vertices that lie at the place of another one.
+    """Find the vertices that coincide with another vertex.
 
-    Files without an index, such as STL, join these when they are read: what is closed by index can then be open.
+    When a file without indices, such as STL, is read, these are joined: a surface that is closed by index can then be
+    open.
 
     Parameters
     ----------
@@ -66,10 +67,10 @@ def find_coincident(vertices: NDArray[np.floating]) -> NDArray[np.int64]:
     ndarray, shape (k,), int64
         All vertices of each such place, in order of the place's coordinates.
     """
-    # Scrambled coordinates, as in count_duplicate_faces: only vertices whose sums are equal are compared in full.
+    # Sums of scrambled coordinates, as in count_duplicate_faces: only vertices with equal sums are compared in full.
     mixed = np.zeros(len(vertices), dtype=np.uint64)
     for column in vertices.T:
-        bits = (column + column.dtype.type(0)).view(f"u{column.dtype.itemsize}")  # + 0: -0 is 0
+        bits = (column + column.dtype.type(0)).view(f"u{column.dtype.itemsize}")  # + 0 turns -0 into 0
         mixed = (mixed ^ bits) * np.uint64(0x9E3779B97F4A7C15)
         mixed ^= mixed >> np.uint64(29)
     ordered = np.sort(mixed)
@@ -83,7 +84,7 @@ def find_coincident(vertices: NDArray[np.floating]) -> NDArray[np.int64]:
 
 
 def rounded_apart(vertices: NDArray[np.floating]) -> NDArray[np.float32]:
-    """Vertices in float32 of which no two lie at one place, unless they did before.
+    """Round vertices to float32 so that no two coincide unless they did before.
 
     Parameters
     ----------
@@ -92,7 +93,7 @@ def rounded_apart(vertices: NDArray[np.floating]) -> NDArray[np.float32]:
     Returns
     -------
     ndarray, shape (n, 3), float32
-        The nearest ones; where several vertices meet in one, all but the first go on by steps of float32.
+        The nearest values; where several vertices round to one place, all but the first are moved by steps of float32.
     """
     rounded = vertices.astype(np.float32)
     if vertices.dtype == np.float32:

@@ -1,8 +1,8 @@
-"""Mesh files: one module a format, chosen by the extension of the file.
+"""Mesh files: one module for each format, chosen by the extension of the file.
 
-A writer says how many bytes it is going to need, writes to a binary stream, and reads back what it wrote.  VTP is
-written by VTK; why the others are written here and not by a library stands in each module: headers, comments and
-matrices that say frame and unit, a full disk that must be noticed, time and memory.
+A writer estimates the size of the file, writes to a binary stream, and reads the file back.  VTP is written by VTK. The
+other formats are written here and not by a library; each module says why: headers, comments and matrices that name
+frame and unit, a full disk that must be noticed, time and memory.
 
 The same mesh gives the same bytes every time.  No file holds patient data, a date or a path.
 """
@@ -36,18 +36,18 @@ __all__ = ["FORMATS", "MeshFormat", "check_format", "describe_rounding", "stage_
 
 @dataclass(frozen=True)
 class MeshFormat:
-    """A file format.
+    """A file format of meshes.
 
     Attributes
     ----------
     estimate : callable
-        About how many bytes the file is going to have; exact for STL, PLY and GLB, rather too few for the others.
+        Estimates the size of the file in bytes; exact for STL, PLY and GLB, rather too small for the others.
     write : callable
         Writes the contents to a stream.
     verify : callable
         Reads the file back and raises `OutputError` unless sizes and counts are those of the contents.
     most_bytes : int
-        Largest file that the format, or what reads it, can handle.
+        Largest file that the format, or common readers of it, can handle.
     """
 
     estimate: Callable[[Content], int]
@@ -76,7 +76,7 @@ def check_format(path: str | os.PathLike[str]) -> str:
     Raises
     ------
     UsageError
-        The extension is missing or stands for no format that is written.
+        The extension is missing, or no writer has it.
     """
     try:
         extension = os.path.splitext(os.fspath(path))[1].lower()
@@ -89,7 +89,7 @@ def check_format(path: str | os.PathLike[str]) -> str:
 
 
 def describe_rounding(mesh: Writable, extension: str) -> list[str]:
-    """The warning for a format that cannot hold the vertices as exactly as the mesh does; none for the others."""
+    """Return the warning for a format that rounds the vertices more than the mesh does; no warning for the others."""
     if extension != ".stl" or mesh.vertices.dtype == np.float32:
         return []
     step = float32_step(float(np.abs(mesh.vertices).max()))

@@ -1,14 +1,14 @@
 """GLB, the binary glTF 2.0 (Khronos): one mesh, one node, no textures.
 
-The buffer holds the vertices in patient millimetres as they are, so that nothing is lost (far from the origin, where
-float32 is too coarse, less the centre of their bounds, which the matrix adds); the matrix of the node takes them to
-what glTF prescribes: metres, right-handed, Y up, the front facing +Z, which is
+The buffer holds the vertices in patient millimetres without change, so that nothing is lost.  Far from the origin,
+where float32 is too coarse, the centre of their bounds is subtracted, and the matrix adds it again.  The matrix of the
+node maps them to the frame that glTF prescribes (metres, right-handed, Y up, the front facing +Z):
 
     (X, Y, Z) = 0.001 (L, S, -P)
 
-the head up and the face towards the viewer.  It is a rotation times a scale, so that the winding stays.
-``asset.extras`` has the matrix back (column-major, as glTF writes matrices), the frame, the unit and the
-certificate.  Own code because this matrix and the extras are the point, and it is a page.
+The head is up and the face is towards the viewer.  The matrix is a rotation times a scale, which keeps the winding.
+``asset.extras`` has the inverse matrix (column-major, as glTF writes matrices), the frame, the unit and the
+certificate.  Own code, because this matrix and the extras matter most and the format takes only a page.
 """
 
 from __future__ import annotations
@@ -40,16 +40,16 @@ def _column_major(rotation: np.ndarray, scale: float, origin: np.ndarray | None 
     matrix[:3, :3] = scale * rotation
     if origin is not None:
         matrix[:3, 3] = matrix[:3, :3] @ origin
-    return [float(value) + 0.0 for value in matrix.T.ravel()]  # + 0.0: no -0
+    return [float(value) + 0.0 for value in matrix.T.ravel()]  # + 0.0 turns -0 into 0
 
 
 def _origin(content: Content) -> np.ndarray:
-    """What the vertices in the buffer are relative to, mm."""
+    """Return the point that the vertices in the buffer are relative to, mm."""
     return np.rint(local_origin(content.vertices)) if content.is_double else np.zeros(3)
 
 
 def _positions(content: Content) -> np.ndarray:
-    """The vertices as the buffer has them, float32."""
+    """Return the vertices of the buffer, float32."""
     vertices = content.vertices - _origin(content) if content.is_double else content.vertices
     return np.ascontiguousarray(vertices, dtype="<f4")
 
@@ -98,7 +98,7 @@ def _document(content: Content) -> dict[str, Any]:
         "scenes": [{"nodes": [0]}],
         "nodes": [{"name": "surface", "mesh": 0, "matrix": _column_major(rotation, _METRES_PER_MM, _origin(content))}],
         "meshes": [{"name": "surface", "primitives": [primitive]}],
-        # Seen from both sides: a surface that is open at the border of the scan shows its inside.
+        # Visible from both sides: a surface that is open at the border of the scan shows its inside.
         "materials": [{"name": "bone", "doubleSided": True, "pbrMetallicRoughness": material}],
         "buffers": [{"byteLength": start + 4 * indices}],
         "bufferViews": views,
@@ -117,12 +117,12 @@ def _binary_length(content: Content) -> int:
 
 
 def estimate(content: Content) -> int:
-    """Size of the file in bytes, exactly."""
+    """Return the exact size of the file in bytes."""
     return 12 + 8 + len(_json_chunk(content)) + 8 + _binary_length(content)
 
 
 def write(stream: BinaryIO, content: Content) -> None:
-    """Write header, JSON chunk and binary chunk; all parts are multiples of four bytes as they are."""
+    """Write header, JSON chunk and binary chunk; each part is a multiple of four bytes long without padding."""
     text = _json_chunk(content)
     stream.write(struct.pack("<4sII", b"glTF", 2, 20 + len(text) + 8 + _binary_length(content)))
     stream.write(struct.pack("<I4s", len(text), _JSON_CHUNK) + text)

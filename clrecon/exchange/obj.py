@@ -1,7 +1,8 @@
 """Wavefront OBJ, text, with the frame, the unit, the iso value and the certificate in comments.
 
 Own code because vtkOBJWriter has no comments and reports success on a full disk, and trimesh builds the text in memory.
-Coordinates have nine digits, which give back the same float32, fifteen far from the origin; normals have six decimals.
+Coordinates have nine digits, enough to get back the same float32, and fifteen far from the origin; normals have six
+decimals.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ def _header(content: Content) -> bytes:
 
 
 def estimate(content: Content) -> int:
-    """Size of the file in bytes, about."""
+    """Estimate the size of the file in bytes."""
     digits = len(str(len(content.vertices)))
     head = len(_header(content))
     if content.normals is None:
@@ -37,7 +38,7 @@ def write(stream: BinaryIO, content: Content) -> None:
     """Write vertices, normals (if there are any) and faces; indices count from 1."""
     stream.write(_header(content))
     line = f"v {content.number} {content.number} {content.number}\n"
-    # One % over many lines takes two thirds of the time of one a line.
+    # One % for many lines takes two thirds of the time of one % for each line.
     for where in chunks(len(content.vertices), _CHUNK):
         rows = content.vertices[where]
         stream.write((line * len(rows) % tuple(rows.ravel().tolist())).encode("ascii"))
@@ -70,7 +71,8 @@ def verify(path: Path, content: Content) -> None:
         tail = b"\n"
         while piece := stream.read(_PIECE):
             for words, (mark, _) in expected.items():
-                # A mark across the border of two pieces is counted once: all but one of its bytes are carried over.
+                # A pattern may cross the border of two pieces: all of its bytes but one are carried over, so it is
+                # counted once.
                 counts[words] += (tail[-(len(mark) - 1) :] + piece).count(mark)
             tail = piece[-3:]
     for words, (_, count) in expected.items():

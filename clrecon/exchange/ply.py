@@ -1,7 +1,7 @@
 """Binary little-endian PLY with the frame, the unit, the iso value and the certificate in comments.
 
-Own code because vtkPLYWriter reports success on a full disk, and trimesh has no comments.
-Indices are declared ``int`` and not ``uint``, which is what every reader knows: at most 2**31 vertices.
+Own code because vtkPLYWriter reports success on a full disk, and trimesh has no comments.  Indices are declared ``int``
+and not ``uint``, because every reader knows ``int``: at most 2**31 vertices.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ def _vertex(content: Content) -> np.dtype[Any]:
 
 
 def estimate(content: Content) -> int:
-    """Size of the file in bytes, exactly."""
+    """Return the exact size of the file in bytes."""
     rows = _vertex(content).itemsize * len(content.vertices)
     return len(_header(content)) + rows + _FACE.itemsize * len(content.triangles)
 

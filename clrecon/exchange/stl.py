@@ -23,11 +23,11 @@ __all__ = ["estimate", "verify", "write"]
 
 _HEAD = 84
 _FACET_BYTES = 50
-"""Normal, three corners and two unused bytes."""
+"""Bytes of a facet: normal, three corners and two unused bytes."""
 _CHUNK = 1 << 14
-"""Facets a piece: what a piece needs stays in the processor's cache."""
+"""Facets in a piece, so that its data stay in the processor's cache."""
 _AHEAD = 4
-"""Pieces that may be packed before they are written: bounds the memory."""
+"""Number of pieces that may be packed before they are written, which bounds the memory."""
 
 
 def _header(content: Content) -> bytes:
@@ -35,17 +35,17 @@ def _header(content: Content) -> bytes:
 
 
 def estimate(content: Content) -> int:
-    """Size of the file in bytes, exactly."""
+    """Return the exact size of the file in bytes."""
     return _HEAD + _FACET_BYTES * len(content.triangles)
 
 
 def write(stream: BinaryIO, content: Content) -> None:
-    """Write facets with unit normals from their corners; the normal of a facet without area is zero."""
+    """Write facets with unit normals computed from their corners; the normal of a facet without area is zero."""
     stream.write(_header(content) + struct.pack("<I", len(content.triangles)))
-    # Readers join vertices at one place: where rounding brings vertices together the surface would be open.
+    # Readers join vertices that coincide: where rounding brings vertices together, the surface would become open.
     vertices = rounded_apart(content.vertices)
     coordinates = [np.ascontiguousarray(vertices[:, axis]) for axis in range(3)]
-    with ThreadPoolExecutor(max_workers=2) as pool:  # numpy works outside the interpreter's lock
+    with ThreadPoolExecutor(max_workers=2) as pool:  # numpy releases the interpreter's lock here
         waiting: deque[Future[bytearray]] = deque()
         for start in range(0, len(content.triangles), _CHUNK):
             waiting.append(pool.submit(_pack_facets, coordinates, content.triangles[start : start + _CHUNK]))
@@ -56,7 +56,7 @@ def write(stream: BinaryIO, content: Content) -> None:
 
 
 def _pack_facets(coordinates: list[NDArray[np.float32]], triangles: NDArray[np.uint32]) -> bytearray:
-    """The bytes of one piece of facets.  All arithmetic is on whole columns: twice as fast as on rows of three."""
+    """Return the bytes of one piece of facets.  All arithmetic is on whole columns: twice as fast as on rows."""
     a, b, c = (
         [axis.take(corner) for axis in coordinates] for corner in np.ascontiguousarray(triangles.T)
     )  # corners, each as x, y, z
@@ -67,7 +67,7 @@ def _pack_facets(coordinates: list[NDArray[np.float32]], triangles: NDArray[np.u
     length[length == 0.0] = 1.0
     zero = np.float32(0)
     packed = bytearray(_FACET_BYTES * len(triangles))
-    for place, column in enumerate([*(part / length + zero for part in normal), *a, *b, *c]):  # + 0: no -0
+    for place, column in enumerate([*(part / length + zero for part in normal), *a, *b, *c]):  # + 0 turns -0 into 0
         np.ndarray(len(triangles), "<f4", packed, 4 * place, (_FACET_BYTES,))[:] = column
     return packed
 

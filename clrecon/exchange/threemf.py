@@ -1,7 +1,7 @@
 """3MF (3MF Consortium, core specification 1.2): a ZIP with the surface as XML, unit millimetre, no normals.
 
-Own code because trimesh keeps the whole document in memory and needs two more libraries for it, and VTK has no 3MF.
-The entries of the ZIP carry 1980-01-01, the earliest date that it can express, which is what `ZipFile.open` gives.
+Own code because trimesh keeps the whole document in memory and needs two more libraries for it, and VTK has no 3MF. The
+entries of the ZIP are dated 1980-01-01, the earliest date of the format, which `ZipFile.open` sets.
 """
 
 from __future__ import annotations
@@ -41,24 +41,24 @@ def _vertex(content: Content) -> str:
 
 
 def estimate(content: Content) -> int:
-    """Size of the file in bytes, rather too small: surfaces shrink to a sixth or a fifth."""
+    """Estimate the size of the file in bytes, rather too small: the XML of surfaces shrinks to a sixth or a fifth."""
     return _unpacked(content) // 7
 
 
 def _unpacked(content: Content) -> int:
-    """Size of the XML in bytes, a little too much."""
+    """Estimate the size of the XML in bytes, a little too large."""
     digits = len(str(len(content.vertices)))
     vertex = len(_vertex(content)) + (45 if content.is_double else 27)
     return 2048 + vertex * len(content.vertices) + (len(_TRIANGLE) + 3 * digits) * len(content.triangles)
 
 
 def write(stream: BinaryIO, content: Content) -> None:
-    """Write the package; level 1 packs to 21 % in 0.4 of the time in which level 6 packs to 17 %."""
+    """Write the package.  Level 1 packs to 21 %, in 0.4 of the time in which level 6 packs to 17 %."""
     with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as package:
         for name, text in _SMALL_PARTS.items():
             with package.open(name, "w") as part:
                 part.write(text.encode("ascii"))
-        # The 64-bit extension of ZIP only where it must be: not every reader knows it.
+        # The 64-bit extension of ZIP is used only where it is needed, because some readers do not know it.
         with package.open(_MODEL, "w", force_zip64=_unpacked(content) > zipfile.ZIP64_LIMIT) as model:
             model.write(_opening(content).encode("ascii"))
             vertex = _vertex(content)
@@ -85,7 +85,7 @@ def _opening(content: Content) -> str:
 
 
 def _description(content: Content) -> str:
-    """The remarks, the certificate a line each, with what XML reserves as entities."""
+    """Return the remarks and the certificate, one fact a line, with reserved characters of XML as entities."""
     remarks = content.remarks
     known = len(remarks) - len(content.certificate)
     lines = [" ".join(remarks[:known]), *remarks[known:]]
@@ -93,14 +93,14 @@ def _description(content: Content) -> str:
 
 
 def verify(path: Path, content: Content) -> None:
-    """Unpack the finished file, which checks its sums, and count."""
+    """Unpack the finished file, which verifies its checksums, and count its elements."""
     vertices = triangles = 0
     tail = b""
     try:
         with zipfile.ZipFile(path) as package, package.open(_MODEL) as model:
             while piece := model.read(_PIECE):
                 piece = tail + piece
-                # Only whole lines are counted; the rest goes to the next piece.
+                # Only whole lines are counted; the rest is carried over to the next piece.
                 cut = piece.rfind(b"\n") + 1
                 vertices += piece.count(b"<vertex ", 0, cut)
                 triangles += piece.count(b"<triangle ", 0, cut)

@@ -1,4 +1,4 @@
-"""From arrays to ``vtkPolyData``: the one place that knows how VTK wants them."""
+"""Arrays to ``vtkPolyData``: VTK's layout of points and triangles is handled here alone."""
 
 from __future__ import annotations
 

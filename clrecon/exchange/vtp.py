@@ -1,8 +1,8 @@
 """VTP, the XML PolyData of VTK, written by VTK: raw binary data after the XML, with 64-bit headers.
 
-VTK writes to a string and the string to our stream: left to itself it leaves a truncated file on a full disk.  The
+VTK writes to a string, which is then written to our stream: VTK itself leaves a truncated file on a full disk.  The
 field arrays ``SPACE``, ``UNIT``, ``ISO_VALUE_HU``, ``AFFINE_IJK_TO_LPS_MM`` (16 numbers, row by row) and
-``CERTIFICATE`` (one text a fact) say what the coordinates are; 3D Slicer reads ``SPACE``.
+``CERTIFICATE`` (one text for each fact) tell what the coordinates are; 3D Slicer reads ``SPACE``.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ _END = b"</VTKFile>"
 
 
 def estimate(content: Content) -> int:
-    """Size of the data in the file in bytes, without the XML: three indices and an offset a triangle."""
+    """Return the size of the data in bytes, without the XML: three indices and an offset for each triangle."""
     normals = 0 if content.normals is None else content.normals.nbytes
     return content.vertices.nbytes + normals + 16 * len(content.triangles)
 
@@ -44,7 +44,7 @@ def write(stream: BinaryIO, content: Content) -> None:
     if writer.Write() != 1:
         raise OutputError(f"VTK could not write the surface, its error code is {writer.GetErrorCode()}")
     text = writer.GetOutputString()
-    # VTK's Python gives str where the bytes happen to be UTF-8, bytes where they are not.
+    # VTK's Python returns str if the bytes happen to be UTF-8, else bytes.
     stream.write(text.encode("utf-8") if isinstance(text, str) else text)
 
 
