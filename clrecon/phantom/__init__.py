@@ -1,4 +1,5 @@
-"""Phantoms with a known truth: analytic bodies, a believable spine and odd bodies, as voxels or as a DICOM CT series.
+"""Phantoms, CT series with known surfaces: analytic bodies, a realistic spine and unusual bodies, as voxels or as a
+DICOM CT series.
 
 The names are loaded when first used, so that importing this package costs nothing.
 """

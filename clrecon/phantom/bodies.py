@@ -1,4 +1,4 @@
-"""The analytic shape of a phantom: chosen to fit its field of view, off centre by part of a voxel."""
+"""The analytic body of a phantom, sized for its field of view, with its centre a part of a voxel off the middle."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from clrecon.phantom.shapes import Body, Box, Cylinder, Sphere, Torus
 __all__ = ["choose_body"]
 
 AXIS_LPS = (0.36, -0.48, 0.8)
-"""Axis of torus, cylinder and slab: unit length, along no axis of the patient or of usual slices."""
+"""Axis of torus, cylinder and slab: unit length, parallel to no axis of the patient or of usual slices."""
 
 _MARGIN_STEPS = 1.5
 """Steps of background kept between the body and the faces of the volume."""

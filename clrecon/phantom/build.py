@@ -1,6 +1,6 @@
 """Make a phantom: voxels, affine and truth, in memory or as a DICOM series beside its truth.json.
 
-A scene has a label map of its materials beside it too.
+A scene also gets a label map of its materials.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ __all__ = ["SPINE_ISO_HU", "TRUTH_NAME", "label_materials", "make_phantom", "wri
 
 TRUTH_NAME = "truth.json"
 LARGEST_TRUTH = 1 << 28
-"""Bytes; of a series of thousands of slices it has some MiB."""
+"""Largest truth.json that is read, in bytes; that of a series of thousands of slices has some MiB."""
 MATERIALS_NAME = "materials.nrrd"
 
 SPINE_ISO_HU = 226.0
@@ -45,7 +45,7 @@ _OURS = re.compile(r"IM\d{4}\.dcm|truth\.json|materials\.nrrd")
 
 
 def _describe_spine(anatomy: Anatomy, affine: NDArray[np.float64], settings: PhantomSettings) -> dict[str, Any]:
-    """Where the parts are, LPS mm, and which of them lie in the volume."""
+    """Describe where the parts are, LPS mm, and which of them lie in the volume."""
     inverse = np.linalg.inv(affine)
     extents = np.array(settings.shape_kji[::-1])
 
@@ -159,7 +159,7 @@ def make_phantom(
 
 
 def label_materials(settings: PhantomSettings) -> LabelArray:
-    """Say of what each voxel of a scene is, to the voxel: the truth beside the voxels of `make_phantom`.
+    """Label each voxel of a scene with its material; this is the truth for the voxels of `make_phantom`.
 
     Parameters
     ----------
@@ -169,12 +169,12 @@ def label_materials(settings: PhantomSettings) -> LabelArray:
     Returns
     -------
     ndarray, shape (nk, nj, ni), uint8
-        Place in `clrecon.phantom.MATERIALS`, see ``parts`` of the truth.
+        Index in `clrecon.phantom.MATERIALS`, see ``parts`` of the truth.
 
     Raises
     ------
     UsageError
-        The kind is no scene.
+        The kind is not a scene.
     """
     if not KINDS[settings.kind].is_scene:
         raise UsageError(f"a {settings.kind} is no scene of materials: its truth is a surface or a list of levels")
@@ -219,7 +219,7 @@ def _check_replaceable(folder: Path) -> None:
 def _put_in_place(finished: Path, folder: Path) -> None:
     """Rename the finished folder over `folder`; an earlier phantom is put back when that fails.
 
-    When it succeeds the earlier phantom stays beside `finished`, in the temporary folder that the caller removes.
+    After success the earlier phantom lies beside `finished`, in the temporary folder that the caller removes.
     """
     if not folder.exists():
         finished.rename(folder)
@@ -236,10 +236,10 @@ def _put_in_place(finished: Path, folder: Path) -> None:
 def write_phantom(
     out_folder: str | Path, settings: PhantomSettings, progress: Progress | None = None
 ) -> dict[str, Any]:
-    """Write a phantom as a DICOM CT series with a truth.json, a scene with the label map materials.nrrd too.
+    """Write a phantom as a DICOM CT series with a truth.json; a scene also with the label map materials.nrrd.
 
     The series is written into a temporary folder beside `out_folder`, read back, and then renamed: `out_folder` is
-    complete or untouched.
+    either complete or untouched.
 
     Parameters
     ----------

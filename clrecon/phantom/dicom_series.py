@@ -1,4 +1,4 @@
-"""Write a phantom as a DICOM CT series: one file a slice, fixed dates, UIDs derived from the settings.
+"""Write a phantom as a DICOM CT series: one file for each slice, fixed dates, UIDs derived from the settings.
 
 Source: DICOM PS3.3 A.3 (CT Image IOD), C.7.6.2 (Image Plane), C.8.2.1 (CT Image), PS3.10 chapter 7 (File Meta).
 """
@@ -25,7 +25,7 @@ __all__ = ["RESCALE_INTERCEPT", "slice_file_name", "write_series"]
 RESCALE_INTERCEPT = -1024
 CT_IMAGE_STORAGE = "1.2.840.10008.5.1.4.1.1.2"
 _TRANSFER_SYNTAXES = {"explicit": "1.2.840.10008.1.2.1", "implicit": "1.2.840.10008.1.2"}
-# phantoms made twice must be equal byte for byte, so no clock
+# No clock: phantoms made twice must be equal byte for byte.
 _DATE, _TIME = "20200101", "120000"
 
 
@@ -42,7 +42,7 @@ def _make_uid(settings: PhantomSettings, *what: str) -> str:
 
 
 def _make_headers(settings: PhantomSettings, placement: Placement) -> Iterator[FileDataset]:
-    """Yield one dataset a slice, complete but for the pixels."""
+    """Yield one dataset for each slice, complete except for the pixels."""
     from pydicom.dataset import FileDataset, FileMetaDataset
     from pydicom.uid import PYDICOM_IMPLEMENTATION_UID, UID
 
@@ -84,7 +84,7 @@ def _make_headers(settings: PhantomSettings, placement: Placement) -> Iterator[F
 
 
 def _check_written(path: Path, header: Any, stored: NDArray[np.int16]) -> None:
-    """Read a file back and compare what places and fills it."""
+    """Read a file back and compare the attributes that place it and its pixels."""
     from pydicom import dcmread
 
     back = dcmread(path)
@@ -107,7 +107,7 @@ def write_series(
     placement: Placement,
     progress: Progress | None = None,
 ) -> None:
-    """Write one file a slice into an existing folder and read each back.
+    """Write one file for each slice into an existing folder and read each back.
 
     Parameters
     ----------

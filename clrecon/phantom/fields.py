@@ -1,4 +1,4 @@
-"""Small signed-distance vocabulary of the spine phantom: float32 arrays in mm, positive inside.
+"""Signed distances to simple shapes, for the spine phantom: float32 arrays in mm, positive inside.
 
 Ellipses and stretched capsules give first-order distances (exact on the surface, approximate away from it), which
 is what a partial-volume ramp of about one voxel needs.  Smooth union after I. Quilez' polynomial smooth minimum.
@@ -18,7 +18,7 @@ Point = tuple[float, float, float]
 
 
 def coverage(distance: Field, ramp_mm: float) -> Field:
-    """Share of a voxel inside: a linear ramp `ramp_mm` wide, centred on the surface."""
+    """Return the share of a voxel that lies inside: a linear ramp `ramp_mm` wide, centred on the surface."""
     share = distance * np.float32(1.0 / ramp_mm)
     share += np.float32(0.5)
     return np.clip(share, 0.0, 1.0, out=share)
@@ -41,7 +41,7 @@ def ellipse(x: Field, y: Field, half_x: float | Field, half_y: float | Field) ->
     u, v = x / half_x, y / half_y
     radius = np.sqrt(u * u + v * v)
     slope = np.sqrt((u / half_x) ** 2 + (v / half_y) ** 2)
-    # at the very centre radius / slope is 0 / 0: the distance there is about the smaller half axis
+    # At the very centre radius / slope is 0 / 0; the distance there is about the smaller half axis.
     return np.asarray((1.0 - radius) * (radius + 1e-3) / (slope + 1e-3 / np.minimum(half_x, half_y)), dtype=np.float32)
 
 

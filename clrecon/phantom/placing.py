@@ -1,4 +1,4 @@
-"""Pieces of a phantom on its grid: each with a frame and a box of its own, drawn only where that box meets a slice."""
+"""Pieces of a phantom on its grid: each has its own frame and box, and is drawn only in slices that meet the box."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Float64Array = NDArray[np.float64]
 
 
 class Piece:
-    """A piece with a box of its own: drawn only where that box meets a slice."""
+    """A piece with its own box, drawn only in slices that meet the box."""
 
     def __init__(self, center: Float64Array, axes: Float64Array, low: Float64Array, high: Float64Array):
         self.center, self.axes = center, axes
@@ -23,7 +23,7 @@ class Piece:
 
 
 class Window:
-    """The part of a slice in which a piece lies, and coordinates there."""
+    """The part of a slice in which a piece lies, with the coordinates there."""
 
     def __init__(self, region: tuple[slice, slice], local: Float64Array, k: float):
         self.region = region
@@ -35,7 +35,7 @@ class Window:
 
 
 def _local_affine(affine: Float64Array, center: Float64Array, axes: Float64Array) -> Float64Array:
-    """Index to the local frame of a part."""
+    """Return the affine from indices to the local frame of a part."""
     local = np.eye(4)
     local[:3, :3] = axes @ affine[:3, :3]
     local[:3, 3] = axes @ (affine[:3, 3] - center)
@@ -58,16 +58,16 @@ class PlacedPiece:
         self.local = _local_affine(affine, part.center, part.axes)
 
     def meets(self, k: int) -> bool:
-        """Whether slice k can hold some of the part."""
+        """True where slice k can hold some of the part."""
         rows, columns = self.region
         return bool(self.low[2] <= k < self.high[2]) and rows.start < rows.stop and columns.start < columns.stop
 
     def window(self, k: float) -> Window:
-        """Coordinates on the (sub-)slice k."""
+        """Return the window of the part, with its coordinates, in (sub-)slice k."""
         return Window(self.region, self.local, k)
 
 
 def paint(canvas: Field, region: tuple[slice, slice], share: Field, hu: float | Field) -> None:
-    """Blend `hu` into a region of a slice, by the share of each voxel that it takes."""
+    """Blend `hu` into a region of a slice; the weight is the share of each voxel that lies in the part."""
     view = canvas[region]
     view += share * (hu - view)

@@ -28,7 +28,7 @@ _SIZES = {
     "disc": (4.0, 4.5, 6.5, 8.0, 10.5, 10.0),
     "canal_half_width": (9.0, 8.5, 11.0, 11.5, 12.0, 13.0),
     "canal_half_depth": (7.5, 7.5, 8.0, 8.5, 8.5, 8.5),
-    # lean of the upward axis to the posterior: thoracic kyphosis, lumbar lordosis
+    # Lean of the upward axis towards the posterior: thoracic kyphosis, lumbar lordosis.
     "lean_degrees": (-20.0, -4.0, 10.0, 9.0, 1.0, -17.0),
 }
 
@@ -89,7 +89,7 @@ class Rib:
 
 @dataclass(frozen=True)
 class Anatomy:
-    """Everything that is drawn.
+    """All parts of the spine phantom.
 
     Attributes
     ----------
@@ -120,12 +120,12 @@ class Anatomy:
     absent: list[str]
 
     def level_z(self, name: str) -> float:
-        """z of a level's body centre."""
+        """Return z of the centre of a level's vertebral body."""
         return float(next(v.center[2] for v in self.vertebrae if v.name == name))
 
 
 def _frame(lean: float, roll: float) -> Float64Array:
-    """Rows: local left, posterior, superior after a lean about x and a small roll about y, in radians."""
+    """Return the rows local left, posterior and superior after a lean about x and a small roll about y, in radians."""
     superior = np.array((math.sin(roll), math.sin(lean), 0.0))
     superior[2] = math.sqrt(1.0 - superior @ superior)
     left = np.array((1.0, 0.0, 0.0)) - superior[0] * superior
@@ -136,7 +136,7 @@ def _frame(lean: float, roll: float) -> Float64Array:
 def _trabecular_waves(generator: np.random.Generator, steps_mm: Float64Array) -> Float64Array:
     """Plane waves of 2 to 6 mm, mostly across the vertical trabeculae, with unit variance before sampling.
 
-    Each wave is damped as the average over a voxel damps it, so coarse voxels show less texture, not aliases.
+    Each wave is damped as averaging over a voxel would damp it, so that coarse voxels show less texture and no aliases.
     """
     count = 14
     direction = generator.normal(size=(count, 3)) * (1.0, 1.0, 0.5)
@@ -148,7 +148,7 @@ def _trabecular_waves(generator: np.random.Generator, steps_mm: Float64Array) ->
 
 
 def _plan_rib(vertebra: Vertebra, side: int, half_width: float, half_depth: float) -> Rib:
-    """Chain of points from the costovertebral joint round the chest wall, sloping down to the front."""
+    """Return the points of a rib from the costovertebral joint round the chest wall, sloping down to the front."""
     number = int(vertebra.name[1:])
     side_name = "left" if side > 0 else "right"
     wall_x, wall_y = half_width - 24.0, half_depth - 21.0
@@ -233,7 +233,7 @@ def plan_anatomy(field_of_view_mm: tuple[float, float, float], steps_mm: Float64
         if vertebra.name[0] == "T" and (vertebra.name, side) != ("T12", 1)
     ]
     z = centres[:, 2] / 100.0
-    # on the skin of the left flank, or as far left as a small field of view lets it be seen
+    # On the skin of the left flank, or as far left as a small field of view still shows.
     left = min(half_width + 1.0, 0.42 * field_of_view_mm[0])
     marker_y = 0.0 if left < half_width else half_depth * 0.1
     return Anatomy(

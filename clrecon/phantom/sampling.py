@@ -51,7 +51,7 @@ def _checked_shape(shape_kji: tuple[int, int, int]) -> tuple[int, int, int]:
 def _index_box(
     bounds_mm: Float64Array, affine: Float64Array, shape: tuple[int, int, int], margin_mm: float
 ) -> tuple[slice, slice, slice]:
-    """Slices (k, j, i) of all voxels whose centre may lie within `margin_mm` of the box `bounds_mm`."""
+    """Return slices (k, j, i) that hold all voxels whose centre may lie within `margin_mm` of the box `bounds_mm`."""
     if not np.isfinite(bounds_mm).all():
         return slice(0, shape[0]), slice(0, shape[1]), slice(0, shape[2])
     corners = np.array(list(itertools.product(*(bounds_mm + np.array(((-margin_mm,), (margin_mm,)))).T)))
@@ -67,7 +67,7 @@ def _slab_thickness(k: slice, j: slice, i: slice) -> int:
 
 
 def _centres(affine: Float64Array, k: slice, j: slice, i: slice) -> Float64Array:
-    """LPS mm of the voxel centres of a box of indices, shape (nk * nj * ni, 3), i fastest."""
+    """Return LPS mm of the voxel centres in a box of indices, shape (nk * nj * ni, 3), i fastest."""
     grid = np.meshgrid(*(np.arange(axis.start, axis.stop) for axis in (k, j, i)), indexing="ij")
     return apply_affine(affine, np.stack([axis.ravel() for axis in reversed(grid)], axis=1))
 
@@ -107,10 +107,10 @@ def sample_distance(
 
 
 def _boundary_coverage(body: Body, points: Float64Array, steps: Float64Array, subsamples: int) -> Float64Array:
-    """Share of each voxel's parallelepiped inside `body`, from subsamples**3 cells a voxel.
+    """Return the share of each voxel's parallelepiped inside `body`, computed from subsamples**3 cells in a voxel.
 
-    Every cell counts by a linear ramp as wide as the cell is along the gradient of the distance, so that the share
-    is continuous in the position of the surface and a plane gives no steps of 1/subsamples.
+    Each cell contributes by a linear ramp as wide as the cell is along the gradient of the distance.  So the share is
+    continuous in the position of the surface, and a plane gives no steps of 1/subsamples.
     """
     delta = 0.25 * float(np.linalg.norm(steps, axis=0).min())
     gradient = np.stack(
@@ -121,7 +121,7 @@ def _boundary_coverage(body: Body, points: Float64Array, steps: Float64Array, su
         axis=1,
     )
     cell = np.abs(gradient @ steps) / subsamples
-    # a box average of a plane has the variance of three uniform steps: the ramp of the same variance
+    # Averaging a plane over a box has the variance of three uniform distributions; the ramp gets the same variance.
     ramp = np.maximum(np.sqrt((cell**2).sum(axis=1)), 1e-9)
     centred = (np.arange(subsamples) + 0.5) / subsamples - 0.5
     total = np.zeros(len(points))
@@ -161,7 +161,7 @@ def sample_occupancy(
     if subsamples < 1:
         raise UsageError(f"subsamples must be at least 1, got {subsamples}")
     steps = matrix[:3, :3]
-    # half the longest diagonal: a surface farther away from the centre cannot cut the voxel
+    # Half the longest diagonal: a surface farther from the centre cannot cut the voxel.
     reach = max(float(np.linalg.norm(steps @ np.array(signs))) for signs in itertools.product((-0.5, 0.5), repeat=3))
     share = np.zeros(shape, dtype=np.float32)
     box_k, j, i = _index_box(body.bounds_mm, matrix, shape, reach)
@@ -180,13 +180,13 @@ def sample_occupancy(
 
 
 def _gaussian_weights(sigma: float) -> Float64Array:
-    """Half of a normalised Gaussian, from the centre outwards, cut at four sigma."""
+    """Return half of a normalised Gaussian, from the centre outwards, cut off at four sigma."""
     weights = np.exp(-0.5 * (np.arange(int(4.0 * sigma + 0.5) + 1) / max(sigma, 1e-9)) ** 2)
     return weights / (weights[0] + 2.0 * weights[1:].sum())
 
 
 def _blur_axis(field: Float32Array, sigma: float, axis: int) -> Float32Array:
-    """Gaussian along one axis, sigma in steps, the edge value continued outside."""
+    """Blur along one axis with a Gaussian, sigma in steps; the edge value is continued outside."""
     weights = _gaussian_weights(sigma)
     radius, extent = len(weights) - 1, field.shape[axis]
     if radius == 0:

@@ -1,4 +1,4 @@
-"""The table of scenes: kind to plan."""
+"""The table from the kind of a scene to the function that plans it."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ PLANS: dict[str, Callable[[], Plan]] = {
     "water": plan_water,
     "empty": plan_nothing,
 }
-"""One for each kind of `clrecon.phantom.settings.KINDS` that is a scene."""
+"""The planning function of each kind of `clrecon.phantom.settings.KINDS` that is a scene."""
 
 
 def plan_scene(settings: PhantomSettings) -> list[Part]:
-    """All parts of the scene that the settings ask for, the table first: what lies on it is painted over it."""
+    """Plan all parts of the scene in the order of painting: the table first, then the body that lies on it."""
     plan = PLANS[settings.kind]()
     table = lay_under(plan, settings.table_used, settings.table_gap_mm, settings.prone)
     return [*table, *plan.parts]

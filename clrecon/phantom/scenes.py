@@ -1,4 +1,4 @@
-"""Scenes: bodies made of many parts, each of one material, drawn in HU with a label of the material for every voxel.
+"""Scenes: bodies made of many parts, each of one material, drawn in HU, with a material label for every voxel.
 
 The parts are painted in order, later ones over earlier ones, in mm about the centre of the volume.  Axes are the
 patient's: x to the left, y to the posterior, z to the superior.
@@ -27,13 +27,13 @@ LabelArray = NDArray[np.uint8]
 Point = tuple[float, float, float]
 
 MATERIALS = ("air", "tissue", "bone", "contrast", "metal", "water", "table")
-"""Materials of the parts; the label of a voxel is the place in this row."""
+"""Materials of the parts; the label of a voxel is the index in this tuple."""
 
 AIR_HU = -1000.0
 CEILING_HU = 3071
-"""Highest value of 12 stored bits with the intercept -1024: metal ends there."""
+"""Highest value of 12 stored bits with the intercept -1024; metal is cut off there."""
 DENSE_HU = 300.0
-"""Voxels above it are counted for each material."""
+"""Voxels above this are counted for each material."""
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ class Part:
     axes: Float64Array = field(default_factory=lambda: np.eye(3))
 
     def distance_at(self, x: Field, y: Field, z: Field) -> Field:
-        """Distance to the surface at points in mm about the centre of the volume."""
+        """Return the distance to the surface at points in mm about the centre of the volume."""
         from_center = [at - np.float32(origin) for at, origin in zip((x, y, z), self.center, strict=True)]
         local = (sum(np.float32(c) * at for c, at in zip(axis, from_center, strict=True)) for axis in self.axes)
         return np.asarray(self.distance(*local), dtype=np.float32)
@@ -73,7 +73,7 @@ class Part:
 
 @dataclass(frozen=True)
 class Plan:
-    """The parts of a body in order, and the y of its front and of its back, where a table may lie.
+    """The parts of a body in order, with the y of its front and back surfaces, against which a table may lie.
 
     `rest` is the middle (x, z) of the head, for a head rest.
     """
@@ -106,7 +106,7 @@ def draw_scene(
     voxels : ndarray, shape (nk, nj, ni), float32
         HU.
     labels : ndarray, shape (nk, nj, ni), uint8
-        Place in `MATERIALS` of the part that holds the centre of each voxel.
+        Index in `MATERIALS` of the part that holds the centre of each voxel.
     """
     shape = settings.shape_kji
     grid = affine.copy()
@@ -142,7 +142,7 @@ def _distance(part: Part, at: Window) -> Field:
 
 
 def describe_parts(voxels: NDArray[np.int16], labels: LabelArray, affine: Float64Array) -> dict[str, dict[str, float]]:
-    """For each material that is there: its label, its voxels, its volume and how many of its voxels are dense."""
+    """Describe each material that is present: its label, voxels, volume and number of dense voxels."""
     voxel_ml = abs(float(np.linalg.det(affine[:3, :3]))) / 1000.0
     found = {}
     for label, material in enumerate(MATERIALS):

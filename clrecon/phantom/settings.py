@@ -33,14 +33,14 @@ Float64Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Kind:
-    """What kind of phantom there is, and what its settings are where they are not given."""
+    """A kind of phantom: its description, and its default settings."""
 
     said: str
     spacing: tuple[float, float, float] = (1.0, 1.0, 1.25)
     noise: float = 0.0
     point_spread_mm: float = 0.0
     table: str | None = None
-    """Of a kind that lies on a table; None: an analytic shape, which lies on nothing."""
+    """Table under bodies of this kind; None for an analytic shape, which lies on nothing."""
     is_scene: bool = False
 
 
@@ -64,13 +64,13 @@ KINDS = {
     "water": _scene("cylinder of water in an acrylic shell", (1.0, 1.0, 1.5)),
     "empty": _scene("a table with nothing on it", (1.7, 1.7, 2.0), "curved"),
 }
-"""Each kind with what it shows and its defaults."""
+"""Every kind with its description and defaults."""
 
 TABLE_NAMES = ("none", "flat", "curved", "headrest")
-"""Tables that a body may lie on; without a name a spine lies on a curved couch of its own."""
+"""Tables that a body may lie on.  If none is named, a spine lies on a curved couch of its own."""
 
 CENTRE_LPS_MM = (-3.5, -142.25, -418.75)
-"""Centre of the volume: away from zero, as on a real couch, so that a lost origin shows."""
+"""Centre of the volume, away from zero as on a real couch, so that an origin lost by a program shows."""
 
 
 def parse_size(text: str) -> tuple[int, int]:
@@ -79,7 +79,7 @@ def parse_size(text: str) -> tuple[int, int]:
     Raises
     ------
     UsageError
-        Anything else.
+        `text` has another form.
     """
     parts = text.lower().split("x")
     if len(parts) > 2 or not all(part.strip().isdecimal() for part in parts):
@@ -93,7 +93,7 @@ def format_decimal(value: float) -> str:
     Raises
     ------
     UsageError
-        Not finite.
+        The number is not finite.
     """
     if not math.isfinite(value):
         raise UsageError(f"{value} cannot be written as a decimal string")
@@ -138,15 +138,15 @@ class PhantomSettings:
         Same settings and seed give the same bytes; another seed moves the shape by part of a voxel, and gives other
         noise and texture.
     inside_hu, outside_hu : float
-        HU of an analytic shape and of what surrounds it (not used by other kinds).
+        HU of an analytic shape and of its surroundings (not used by other kinds).
     radius_mm : float, optional
         Sphere radius, torus centre-line radius, cylinder radius, or half the thickness of the plane's slab.
         Default: a part of the field of view.
     table : {"none", "flat", "curved", "headrest"}, optional
-        What the body lies on; default: nothing, the spine's own couch, a curved table for the kind ``empty``.  Not
-        for analytic shapes.
+        Table that the body lies on; default: nothing, the spine's own couch, a curved table for the kind ``empty``.
+        Not for analytic shapes.
     table_gap_mm : float
-        Between body and table: 0 touches, below 0 the body sinks in.  The spine's own couch takes no account of it.
+        Gap between body and table: at 0 they touch, below 0 the body sinks in.  The spine's own couch ignores it.
     prone : bool
         The patient lies on the face: the table is at the front, and the image's rows and columns are turned by half a
         turn about z, as a scanner does it (PatientPosition HFP).
@@ -184,7 +184,7 @@ class PhantomSettings:
         for name in ("spacing", "noise", "point_spread_mm"):
             if getattr(self, name) is None:
                 object.__setattr__(self, name, getattr(KINDS[self.kind], name))
-        # tuples whatever came (a list from a command line): equal settings compare and describe equal
+        # Lists (from a command line) become tuples, so that equal settings compare and describe equal.
         for name, length in (("size", 2), ("spacing", 3), ("oblique", 3)):
             value = tuple(getattr(self, name))
             if len(value) != length:
@@ -224,7 +224,7 @@ class PhantomSettings:
 
     @property
     def table_used(self) -> str:
-        """Name of the table: the given one, else that of the kind; ``own`` for the couch that the spine has."""
+        """Name of the table: the given one, else that of the kind; ``own`` for the spine's own couch."""
         return self.table or KINDS[self.kind].table or "none"
 
     @property
@@ -235,7 +235,7 @@ class PhantomSettings:
     def as_dict(self) -> dict[str, Any]:
         """All settings as plain JSON types; `table`, `table_gap_mm` and `prone` where they are not the default.
 
-        UIDs are made of these texts: those of a phantom of an earlier version stay.
+        UIDs are derived from these texts, so the defaults are left out: phantoms of earlier versions keep their UIDs.
         """
         plain = {
             name: list(value) if isinstance(value, tuple) else value for name, value in dataclasses.asdict(self).items()
@@ -258,7 +258,7 @@ def _check_number(name: str, value: Any, low: float, high: float, unit: str) -> 
 
 @dataclass(frozen=True)
 class Placement:
-    """Where the slices lie, in the decimal strings of the files and as the affine that these mean.
+    """Where the slices lie: the decimal strings of the files, and the affine that these strings give.
 
     Attributes
     ----------
@@ -283,7 +283,7 @@ class Placement:
 
 
 def _rotation(oblique: tuple[float, float, float]) -> Float64Array:
-    """Rotation about x, then y, then z, degrees."""
+    """Return the rotation about x, then y, then z, degrees."""
     matrix = np.eye(3)
     for axis, angle in enumerate(oblique):
         c, s = math.cos(math.radians(angle)), math.sin(math.radians(angle))

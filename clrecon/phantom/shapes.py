@@ -21,7 +21,7 @@ Float64Array = NDArray[np.float64]
 
 
 class Body(Protocol):
-    """A solid that knows its exact surface."""
+    """A solid with an exact signed distance."""
 
     def signed_distance(self, points_mm: ArrayLike) -> Float64Array:
         """Distance in mm to the surface, positive inside; points (n, 3) LPS mm, result (n,) float64."""
@@ -77,7 +77,7 @@ def _points(points_mm: ArrayLike) -> Float64Array:
 
 
 def _box_distance(excess: Float64Array) -> Float64Array:
-    """Signed distance, positive inside, from (n, m) distances by which points exceed m orthogonal limits."""
+    """Return the signed distance, positive inside, from (n, m) signed excesses over m orthogonal limits."""
     outside = np.linalg.norm(np.maximum(excess, 0.0), axis=1)
     return -(outside + np.minimum(excess.max(axis=1), 0.0))
 

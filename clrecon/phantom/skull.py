@@ -1,4 +1,4 @@
-"""Plans of a head: a dry skull, a specimen with air inside and outside, and the same with soft tissue."""
+"""Plans of a head: a dry skull (a specimen with air inside and outside), and the same skull with soft tissue."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ VAULT = (71.0, 90.0, 68.0)
 """Half axes of the vault, mm."""
 VAULT_Z = 10.0
 FLOOR_Z = -42.0
-"""Of the base of the skull, below the middle of the vault."""
+"""z of the base of the skull, mm, relative to the middle of the vault."""
 
 
 def _wall(x: Field, y: Field, z: Field) -> Field:
-    """Thickness of the vault: 3 mm at the temples, 8 mm at forehead and occiput."""
+    """Return the thickness of the vault: 3 mm at the temples, 8 mm at forehead and occiput."""
     return np.float32(3.0) + np.float32(5.0) * np.clip(np.abs(y) / np.float32(VAULT[1]), 0.0, 1.0)
 
 
@@ -33,12 +33,12 @@ def _above_floor(x: Field, y: Field, z: Field) -> Field:
 
 
 def _depth_in_vault(x: Field, y: Field, z: Field) -> Field:
-    """Distance to the inner surface of the vault, above 0 within it."""
+    """Return the distance to the inner surface of the vault, positive within it."""
     return np.asarray(ellipsoid(x, y, z, VAULT) - _wall(x, y, z), dtype=np.float32)
 
 
 def _depth_in_diploe(x: Field, y: Field, z: Field) -> Field:
-    """Above 0 between the two tables, 1.2 mm each, where the wall is thick enough to have a space between."""
+    """Return a distance positive in the diploe, which lies between two tables of 1.2 mm where the wall is thick."""
     outer = ellipsoid(x, y, z, VAULT)
     wall = _wall(x, y, z)
     between = np.minimum(outer - np.float32(1.2), wall - np.float32(1.2) - outer)
@@ -46,7 +46,7 @@ def _depth_in_diploe(x: Field, y: Field, z: Field) -> Field:
 
 
 def _vault(material: str, hu: float) -> list[Part]:
-    """The vault: compact bone, diploe between its two tables, and what it holds."""
+    """Plan the vault: compact bone, the diploe between its two tables, and the contents."""
     whole = ball("bone", COMPACT_HU, (0.0, 0.0, VAULT_Z), VAULT)
     layers = (
         whole,
@@ -57,7 +57,7 @@ def _vault(material: str, hu: float) -> list[Part]:
 
 
 def _base() -> list[Part]:
-    """The floor of the skull with the great hole, and the two petrous pyramids."""
+    """Plan the floor of the skull with the foramen magnum, and the two petrous pyramids."""
     level = VAULT_Z + FLOOR_Z
     plate = column("bone", COMPACT_HU, (0.0, 4.0), (52.0, 66.0), (level - 5.0, level + 2.0))
     hole = column("bone", COMPACT_HU, (0.0, 36.0), (15.0, 17.0), (level - 9.0, level + 9.0)).distance
@@ -70,7 +70,7 @@ def _base() -> list[Part]:
 
 
 def _face(inside_material: str, inside_hu: float) -> list[Part]:
-    """Orbits, maxilla with its sinuses, cheek bones, teeth and a mandible that touches nothing."""
+    """Plan orbits, maxilla with its sinuses, cheek bones, teeth and a mandible that touches no other bone."""
     level = VAULT_Z + FLOOR_Z
     parts: list[Part] = []
     for side in (1.0, -1.0):
@@ -96,13 +96,13 @@ def _face(inside_material: str, inside_hu: float) -> list[Part]:
 
 
 def plan_dry_skull() -> Plan:
-    """A macerated skull: thin dense bowl with its base and face, air inside and outside, no soft tissue."""
+    """Plan a macerated skull: a thin dense vault with base and face, air inside and outside, no soft tissue."""
     parts = [*_vault("air", AIR_HU), *_base(), *_face("air", AIR_HU)]
     return Plan(parts, front=-92.0, back=VAULT[1], rest=(0.0, VAULT_Z))
 
 
 def plan_head() -> Plan:
-    """The same skull in soft tissue: scalp, face, brain, eyes, neck, and air in sinuses, nose and throat."""
+    """Plan the same skull in soft tissue: scalp, face, brain, eyes, neck, and air in sinuses, nose and throat."""
     level = VAULT_Z + FLOOR_Z
     skin = tuple(half + 7.0 for half in VAULT)
     soft = [

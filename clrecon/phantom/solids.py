@@ -1,4 +1,4 @@
-"""Solids that scenes are made of: balls, rods, columns, bent plates, and what is cut from them."""
+"""Solids that scenes are made of: balls, rods, columns, boxes, and parts cut from them."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ Distance = Callable[[Field, Field, Field], Field]
 
 
 def ball(material: str, hu: float, center: Point, half: Point) -> Part:
-    """Ellipsoid with the half axes `half`."""
+    """Make an ellipsoid with the half axes `half`."""
     low = (-half[0], -half[1], -half[2])
     return Part(material, hu, lambda x, y, z: ellipsoid(x, y, z, half), low, half, center)
 
 
 def rod(material: str, hu: float, a: Point, b: Point, radius_a: float, radius_b: float | None = None) -> Part:
-    """Rod with round ends from `a` to `b`."""
+    """Make a rod with round ends from `a` to `b`."""
     end = radius_a if radius_b is None else radius_b
     wide = max(radius_a, end)
     low, high = np.minimum(a, b) - wide, np.maximum(a, b) + wide
@@ -42,7 +42,7 @@ def column(
     half: tuple[float, float],
     z: tuple[float, float] = (-1e4, 1e4),
 ) -> Part:
-    """Elliptic column along z between two heights; by default without an end."""
+    """Make an elliptic column along z between two heights; by default without ends."""
 
     def distance(x: Field, y: Field, height: Field) -> Field:
         ends = np.minimum(height - np.float32(z[0]), np.float32(z[1]) - height)
@@ -52,7 +52,7 @@ def column(
 
 
 def box(material: str, hu: float, low: Point, high: Point) -> Part:
-    """Box along the axes."""
+    """Make a box along the axes."""
     half = tuple((b - a) / 2.0 for a, b in zip(low, high, strict=True))
     middle = tuple((b + a) / 2.0 for a, b in zip(low, high, strict=True))
 
@@ -67,6 +67,6 @@ def box(material: str, hu: float, low: Point, high: Point) -> Part:
 
 
 def cut(part: Part, keep: Distance) -> Part:
-    """What of `part` lies where `keep`, in the part's own frame, is above 0."""
+    """Cut a part: keep the points where `keep`, in the part's own frame, is above 0."""
     whole = part.distance
     return dataclasses.replace(part, distance=lambda x, y, z: np.minimum(whole(x, y, z), keep(x, y, z)))

@@ -40,7 +40,7 @@ MARKER_HU = 2200.0
 
 
 class _Scene:
-    """All bone parts of an anatomy, placed on one grid."""
+    """All bone parts of a spine plan, placed on one grid."""
 
     def __init__(self, anatomy: Anatomy, affine: Float64Array, shape_kji: tuple[int, int, int], ramp_mm: float):
         self.anatomy, self.ramp = anatomy, ramp_mm
@@ -73,7 +73,7 @@ class _Scene:
                 at = placed.window(k)
                 wall = ellipse(at.x, at.y, disc.half_width, disc.half_depth)
                 inside = np.minimum(wall, np.float32(disc.half_length) - np.abs(at.z))
-                # fibrous ring a little denser than the nucleus
+                # The fibrous ring is a little denser than the nucleus.
                 ring = np.float32(DISC_HU) + np.float32(14.0) * coverage(8.0 - wall, 8.0)
                 paint(canvas, placed.region, coverage(inside, self.ramp), ring)
         self._draw_ribs(canvas, scratch, slice_k, k)
@@ -86,7 +86,7 @@ class _Scene:
             paint(canvas, at.region, coverage(ball, self.ramp), MARKER_HU)
 
     def _draw_ribs(self, canvas: Field, scratch: Field, slice_k: int, k: float) -> None:
-        """All ribs as one union, so that the joints of the rods do not show."""
+        """Draw all ribs as one union, so that the joints of the rods do not show."""
         active = [(a, b, placed) for a, b, placed in self.rib_rods if placed.meets(slice_k)]
         if not active:
             return
@@ -142,7 +142,7 @@ def draw_spine(
         The plan, in mm about `CENTRE_LPS_MM`.
     """
     shape = settings.shape_kji
-    # the plan lives about the centre of the volume
+    # The plan's origin is the centre of the volume.
     grid = affine.copy()
     grid[:3, 3] -= CENTRE_LPS_MM
     di, dj, dk = column_spacing(affine)
@@ -169,7 +169,7 @@ def draw_spine(
         if subslices > 1:
             voxels[k] /= np.float32(subslices)
 
-    # one thread: the pieces are small, and threads lose more on the interpreter lock than they win
+    # One thread: the pieces are small, and threads lose more time to the interpreter lock than they gain.
     for k in range(shape[0]):
         draw(k)
         if progress is not None:

@@ -1,8 +1,8 @@
-"""Tables that bodies lie on: sandwich plates and a head rest, of thin dense shells round foam.
+"""Tables that bodies lie on: plates and a head rest, made of thin dense shells around foam.
 
-Each is drawn under a body at y = 0, y downwards; `lay_under` puts it under the back, or under the front of one who lies
-prone.  HU and thickness are round figures of carbon fibre (100 to 400 HU, 1.5 to 4 mm) round foam (-930 HU); the flat
-one has metal rails as some have.
+Each table is planned for a body that ends at y = 0, y downwards; `lay_under` moves it under the back, or under the
+front of a prone patient.  HU and thickness are round figures of carbon fibre (100 to 400 HU, 1.5 to 4 mm) around foam
+(-930 HU).  The flat table has metal rails, as some real tables have.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ Distance = Callable[[Field, Field, Field], Field]
 
 
 def _sandwich(outline: Distance, thickness: float, hu: float, half_width: float, height: float) -> list[Part]:
-    """A shell `thickness` mm thick round foam, endless along z; it reaches from `height` above 0 to 60 mm below."""
+    """Make a shell `thickness` mm thick around foam, endless along z, from `height` above 0 to 60 mm below."""
     low, high = (-half_width, -height, -ENDLESS), (half_width, 60.0, ENDLESS)
     return [
         Part("table", hu, outline, low, high),
@@ -32,7 +32,7 @@ def _sandwich(outline: Distance, thickness: float, hu: float, half_width: float,
 
 
 def _flat(plan: Plan) -> list[Part]:
-    """A plate 24 mm thick and 420 mm wide, with a metal rail along either edge."""
+    """Make a plate 24 mm thick and 420 mm wide, with a metal rail along either edge."""
 
     def outline(x: Field, y: Field, z: Field) -> Field:
         return np.minimum(np.minimum(y, 24.0 - y), np.float32(210.0) - np.abs(x))
@@ -45,7 +45,7 @@ def _flat(plan: Plan) -> list[Part]:
 
 
 def _curved(plan: Plan) -> list[Part]:
-    """A trough 18 mm thick, an arc of 260 mm radius, 400 mm wide."""
+    """Make a trough 18 mm thick: an arc of 260 mm radius, 400 mm wide."""
 
     def outline(x: Field, y: Field, z: Field) -> Field:
         radius = np.sqrt(x * x + (y + np.float32(260.0)) ** 2) - np.float32(260.0)
@@ -55,7 +55,7 @@ def _curved(plan: Plan) -> list[Part]:
 
 
 def _head_rest(plan: Plan) -> list[Part]:
-    """A bowl of 4 mm that hugs the head on a foam cushion, and a bar along z that carries it."""
+    """Make a bowl of 4 mm close around the head on a foam cushion, and a bar along z that carries it."""
     x0, z0 = plan.rest
     high = np.float32(95.0)  # radius of the bowl
 
@@ -91,16 +91,16 @@ TABLES: dict[str, Callable[[Plan], list[Part]]] = {
 
 
 def lay_under(plan: Plan, table: str, gap_mm: float, prone: bool) -> list[Part]:
-    """The parts of a table `gap_mm` under a body: under its back, or under its front when it lies prone.
+    """Make the parts of a table `gap_mm` under a body: under its back, or under its front when it lies prone.
 
     Parameters
     ----------
     plan : Plan
-        Of the body.
+        Plan of the body.
     table : str
         One of `TABLES`.
     gap_mm : float
-        Between body and table; 0 touches, below 0 sinks in.
+        Gap between body and table: at 0 they touch, below 0 the body sinks in.
     prone : bool
 
     Returns

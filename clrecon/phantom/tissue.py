@@ -1,4 +1,4 @@
-"""Soft tissue, lungs, vessels and couch of the spine phantom: what surrounds the bones, in HU."""
+"""Soft tissue, lungs, vessels and couch of the spine phantom: everything around the bones, in HU."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def _blend(canvas: Field, share: Field, hu: float) -> None:
 
 
 def _draw_couch(canvas: Field, anatomy: Anatomy, x: Field, y: Field, ramp: float) -> None:
-    """A curved carbon couch under the back: a thin shell round foam, endless along z; `y` runs downwards."""
+    """Draw a curved carbon couch under the back: a thin shell around foam, endless along z; `y` runs downwards."""
     top = y - np.float32(anatomy.half_depth + 2.0)
     bowed = top + np.float32(0.16 / anatomy.half_width) * x * x
     shell = np.minimum(np.minimum(bowed, 32.0 - top), np.float32(0.95 * anatomy.half_width) - np.abs(x))
@@ -44,11 +44,11 @@ def _draw_couch(canvas: Field, anatomy: Anatomy, x: Field, y: Field, ramp: float
 
 
 def _draw_wall(canvas: Field, anatomy: Anatomy, x: Field, y: Field, ramp: float) -> Field:
-    """Skin, fat and muscle; returns the distance into the body cavity."""
+    """Draw skin, fat and muscle; return the distance into the body cavity."""
     skin = ellipse(x, y, anatomy.half_width, anatomy.half_depth)
     _blend(canvas, coverage(skin, ramp), SKIN_HU)
     _blend(canvas, coverage(skin - np.float32(1.8), ramp), FAT_HU)
-    # more fat on the flanks and the belly than over the ribs of the back
+    # The flanks and the belly have more fat than the ribs of the back.
     fat = np.float32(11.0) - np.float32(3.0) * np.clip(y / np.float32(anatomy.half_depth), -1.0, 1.0)
     muscle = skin - fat
     _blend(canvas, coverage(muscle, ramp), MUSCLE_HU)
@@ -58,11 +58,11 @@ def _draw_wall(canvas: Field, anatomy: Anatomy, x: Field, y: Field, ramp: float)
 def _draw_organs(
     canvas: Field, anatomy: Anatomy, cavity: Field, x: Field, y: Field, z: Field, ramp: float, seed: int
 ) -> Field:
-    """Abdominal organs in fat and, above the diaphragm, lungs; returns the distance into the lungs."""
+    """Draw abdominal organs in fat and, above the diaphragm, lungs; return the distance into the lungs."""
     wide, deep = anatomy.half_width - 28.0, anatomy.half_depth - 28.0
     low = np.float32(anatomy.level_z("L1"))
     _blend(canvas, coverage(cavity, ramp), FAT_HU + 8.0)
-    # domes: highest over the middle of each half of the chest
+    # The domes of the diaphragm are highest over the middle of each half of the chest.
     half = np.abs(x) - np.float32(0.5 * wide)
     dome = low + np.float32(62.0) * np.maximum(
         1.0 - (half / np.float32(0.62 * wide)) ** 2 - (y / np.float32(1.05 * deep)) ** 2, -0.2
@@ -91,18 +91,18 @@ def _draw_organs(
     organ((0.70 * wide, 0.22 * deep, mid - 4.0), (0.24 * wide, 0.42 * deep, 44.0), SPLEEN_HU)
     spine_y = anatomy.vertebrae[13].center[1]
     for side in (1.0, -1.0):
-        # the right kidney lies lower, under the liver
+        # The right kidney lies lower, under the liver.
         organ((side * 56.0, spine_y + 8.0, kidney + 8.0 * side), (23.0, 19.0, 50.0), KIDNEY_HU)
 
     mediastinum = ellipse(x - np.float32(6.0), y + np.float32(0.25 * deep), 0.34 * wide + 6.0, 0.85 * deep)
-    # heart and great vessels as one, in a rim of fat
+    # Heart and great vessels are one piece, in a rim of fat.
     _blend(canvas, coverage(np.minimum(np.minimum(mediastinum - np.float32(4.0), above), cavity), ramp), BLOOD_HU)
     lung = np.minimum(np.minimum(cavity + np.float32(9.0), above), -mediastinum)
     return lung
 
 
 _BAND = 24000
-"""Pixels drawn at once: temporaries that stay in the cache, and below the size at which memory is mapped anew."""
+"""Pixels drawn at once: temporaries stay in the cache, and below the size at which the system maps memory anew."""
 
 
 def draw_tissue(
@@ -119,9 +119,9 @@ def draw_tissue(
         Width of an interface, mm.
     seed : int
     table : sequence of Part, optional
-        What the body lies on; None: a couch of its own.
+        Table that the body lies on; None: a couch of its own.
     prone : bool
-        That couch is under the front.
+        True: that couch is under the front.
 
     Returns
     -------
@@ -141,7 +141,7 @@ def draw_tissue(
 
 
 def _draw_band(canvas: Field, anatomy: Anatomy, x: Field, y: Field, z: Field, ramp: float, seed: int) -> None:
-    """Draw onto `canvas`, which holds air and the couch."""
+    """Draw onto `canvas`, which already holds air and the couch."""
     cavity = _draw_wall(canvas, anatomy, x, y, ramp)
     lung = _draw_organs(canvas, anatomy, cavity, x, y, z, ramp, seed)
 
@@ -151,13 +151,13 @@ def _draw_band(canvas: Field, anatomy: Anatomy, x: Field, y: Field, z: Field, ra
         for curve in (anatomy.curve_x, anatomy.curve_y)
     )
     from_x, from_y = x - spine_x, y - spine_y
-    # muscle round the column, before the lungs so that these keep clear of it
+    # muscle round the column, before the lungs, so that they do not reach into it
     column = ellipse(from_x, from_y - np.float32(34.0), 66.0, 37.0)
     front = ellipse(from_x, from_y, 29.0, 27.0)
     lung = np.minimum(lung, -np.maximum(column, front))
     _blend(canvas, coverage(np.minimum(column, cavity + np.float32(13.0)), ramp), MUSCLE_HU)
     _blend(canvas, coverage(lung, ramp), LUNG_HU)
-    # fat planes: under the skin between the muscle bellies, and beside the transverse processes
+    # Planes of fat: under the skin between the muscle bellies, and beside the transverse processes.
     cleft = np.minimum(3.0 - np.abs(from_x), from_y - 56.0)
     _blend(canvas, coverage(np.minimum(cleft, cavity + np.float32(13.0)), ramp), FAT_HU)
     belly = np.abs(ellipse(np.abs(from_x) - np.float32(27.0), from_y - np.float32(42.0), 25.0, 17.0))
@@ -171,7 +171,7 @@ def _draw_band(canvas: Field, anatomy: Anatomy, x: Field, y: Field, z: Field, ra
     fat_round = ellipse(from_x - np.float32(2.0), from_y + np.float32(29.0), 34.0, 14.0)
     _blend(canvas, coverage(np.minimum(fat_round, -lung), ramp), FAT_HU + 20.0)
     aorta = ellipse(from_x - np.float32(13.0), from_y + np.float32(29.0), 10.0, 10.0)
-    # plaques: spots of the left and rear wall, here and there along the vessel
+    # Plaques: spots of the left and rear wall, at intervals along the vessel.
     plaque = (
         1.1
         - np.abs(aorta - np.float32(1.0))

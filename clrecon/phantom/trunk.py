@@ -1,4 +1,4 @@
-"""Plans of limbs, specimens, a pelvis with metal, a trunk with contrast medium, water, and nothing at all."""
+"""Plans of limbs, specimens, a pelvis with metal, a trunk with contrast medium, a water cylinder, and no body."""
 
 from __future__ import annotations
 
@@ -21,11 +21,13 @@ MARROW_HU = -60.0
 MUSCLE_HU = 55.0
 FAT_HU = -100.0
 METAL_HU = 8000.0
-"""Far above the ceiling of 12 bits: cut there when it is stored."""
+"""Far above the highest 12-bit value, so that it is cut off when stored."""
 
 
 def _leg(x: float, y: float, size: float) -> list[Part]:
-    """A lower leg without end, `size` times a large one: skin and fat, muscle, tibia and fibula as tubes."""
+    """Plan a lower leg without ends, `size` times that of a large person: skin and fat, muscle, tibia and fibula as
+    tubes.
+    """
 
     def bone(dx: float, dy: float, radius: float, wall: float) -> list[Part]:
         lean = 12.0 * size
@@ -42,17 +44,17 @@ def _leg(x: float, y: float, size: float) -> list[Part]:
 
 
 def plan_limb() -> Plan:
-    """One lower leg, off the centre of the field of view."""
+    """Plan one lower leg, off the centre of the field of view."""
     return Plan(_leg(38.0, -14.0, 0.95), front=-67.0, back=39.0)
 
 
 def plan_pair() -> Plan:
-    """Two legs of two sizes beside each other, air between them."""
+    """Plan two legs of two sizes beside each other with air between them."""
     return Plan([*_leg(56.0, 0.0, 0.95), *_leg(-52.0, 17.0, 0.65)], front=-53.0, back=53.0)
 
 
 def _vertebra(vertebra: Vertebra, center: np.ndarray, axes: np.ndarray, marrow_hu: float) -> list[Part]:
-    """Cortex and marrow of a vertebra that lies anywhere."""
+    """Plan cortex and marrow of a vertebra at any place and angle."""
     low, high = local_bounds(vertebra)
     at = (float(center[0]), float(center[1]), float(center[2]))
 
@@ -60,7 +62,7 @@ def _vertebra(vertebra: Vertebra, center: np.ndarray, axes: np.ndarray, marrow_h
         return vertebra_distance(vertebra, x, y, z)
 
     def marrow(x: Field, y: Field, z: Field) -> Field:
-        # thicker cortex behind the body
+        # The cortex is thicker behind the body.
         arch = coverage(y - np.float32(vertebra.depth / 2.0 + 1.0), 6.0)
         return np.asarray(bone(x, y, z) - np.float32(1.0) - np.float32(0.6) * arch, dtype=np.float32)
 
@@ -68,7 +70,7 @@ def _vertebra(vertebra: Vertebra, center: np.ndarray, axes: np.ndarray, marrow_h
 
 
 def plan_bones() -> Plan:
-    """Macerated bones that lie apart: three vertebrae, a rib and a shaft, air between and in them."""
+    """Plan separate macerated bones: three vertebrae, a rib and a shaft, with air between and in them."""
     levels = {v.name: v for v in plan_anatomy((256.0, 256.0, 300.0), np.eye(3), 0).vertebrae}
     parts: list[Part] = []
     for name, x, z, turn in (("L3", -56.0, 34.0, 0.0), ("L1", 52.0, 30.0, 40.0), ("T8", 50.0, -42.0, -70.0)):
@@ -85,13 +87,13 @@ def plan_bones() -> Plan:
 
 
 def _trunk(width: float, depth: float) -> list[Part]:
-    """Skin and fat, muscle wall, and fat round the organs: columns without end, half axes given."""
+    """Plan skin and fat, muscle wall, and fat around the organs: columns without ends of the given half axes."""
     layers = ((0.0, 20.0), (2.0, FAT_HU), (16.0, MUSCLE_HU), (30.0, FAT_HU))
     return [column("tissue", hu, (0.0, 0.0), (width - at, depth - at)) for at, hu in layers]
 
 
 def _bent_plate(center: tuple[float, float, float], half: tuple[float, float, float], side: float) -> list[Part]:
-    """Iliac wing: a piece of the wall of an ellipsoid, 8 mm thick, spongy inside."""
+    """Plan an iliac wing: a piece of the wall of an ellipsoid, 8 mm thick, spongy inside."""
 
     def keep(x: Field, y: Field, z: Field) -> Field:
         return np.minimum(np.float32(side) * x - np.float32(0.25 * half[0]), z + np.float32(0.55 * half[2]))
@@ -108,7 +110,7 @@ def _bent_plate(center: tuple[float, float, float], half: tuple[float, float, fl
 
 
 def plan_pelvis() -> Plan:
-    """Pelvis with metal: a hip prosthesis on the left, a screw through the right sacroiliac joint."""
+    """Plan a pelvis with metal: a hip prosthesis on the left, a screw through the right sacroiliac joint."""
     parts = [*_trunk(172.0, 112.0), ball("tissue", 12.0, (0.0, -30.0, -30.0), (42.0, 36.0, 34.0))]
     parts += [ball("bone", 700.0, (0.0, 52.0, 46.0), (52.0, 26.0, 56.0))]
     parts += [ball("bone", 180.0, (0.0, 52.0, 46.0), (49.5, 23.5, 53.5))]
@@ -137,7 +139,7 @@ def plan_pelvis() -> Plan:
 
 
 def plan_contrast() -> Plan:
-    """A trunk full of contrast medium: heart, aorta and kidneys brighter and larger than the spine behind them."""
+    """Plan a trunk full of contrast medium: heart, aorta and kidneys brighter and larger than the spine behind them."""
     anatomy = plan_anatomy((360.0, 300.0, 400.0), np.eye(3), 0)
     width, depth = anatomy.half_width, anatomy.half_depth
     parts = _trunk(width, depth)
@@ -149,7 +151,7 @@ def plan_contrast() -> Plan:
     for disc in anatomy.discs:
         half, ends = (disc.half_width, disc.half_depth), (-disc.half_length, disc.half_length)
         core = column("tissue", 92.0, (0.0, 0.0), half, ends)
-        # under the vertebrae: painted before them
+        # painted before the vertebrae, which cover them
         parts.insert(7, dataclasses.replace(core, center=_point(disc.center), axes=disc.axes))
     for rib in anatomy.ribs:
         chain = [_point(point) for point in rib.points]
@@ -173,11 +175,11 @@ def _point(vector: np.ndarray) -> tuple[float, float, float]:
 
 
 def plan_water() -> Plan:
-    """A cylinder of water, 200 mm across, in an acrylic shell of 6 mm."""
+    """Plan a cylinder of water, 200 mm across, in an acrylic shell of 6 mm."""
     wall = column("water", 120.0, (0.0, 0.0), (106.0, 106.0), (-70.0, 70.0))
     return Plan([wall, column("water", 0.0, (0.0, 0.0), (100.0, 100.0), (-64.0, 64.0))], front=-106.0, back=106.0)
 
 
 def plan_nothing() -> Plan:
-    """No body: what is left is the table."""
+    """Plan no body: only the table remains."""
     return Plan([], front=-40.0, back=40.0)

@@ -11,7 +11,7 @@ __all__ = ["canal_distance", "local_bounds", "vertebra_distance"]
 
 
 def local_bounds(vertebra: Vertebra) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
-    """Lowest and highest corner, local mm, of a box that holds the whole vertebra."""
+    """Return the lowest and highest corner, local mm, of a box that holds the whole vertebra."""
     side = max(vertebra.width / 2.0 + 24.0, vertebra.canal_half_width + 26.0)
     back = vertebra.depth / 2.0 + 2.0 * vertebra.canal_half_depth + 40.0
     below = -1.45 * vertebra.height - 4.0
@@ -19,13 +19,13 @@ def local_bounds(vertebra: Vertebra) -> tuple[tuple[float, float, float], tuple[
 
 
 def canal_distance(vertebra: Vertebra, x: Field, y: Field) -> Field:
-    """Distance to the wall of the spinal canal, positive inside the canal."""
+    """Return the distance to the wall of the spinal canal, positive inside the canal."""
     center_y = vertebra.depth / 2.0 + vertebra.canal_half_depth - 0.8
     return ellipse(x, y - np.float32(center_y), vertebra.canal_half_width, vertebra.canal_half_depth)
 
 
 def _body_distance(vertebra: Vertebra, x: Field, y: Field, z: Field) -> Field:
-    """Waisted elliptic cylinder with slightly hollow endplates and a flattened back."""
+    """Return the distance to a waisted elliptic cylinder with slightly hollow endplates and a flattened back."""
     half_x, half_y, half_z = vertebra.width / 2.0, vertebra.depth / 2.0, vertebra.height / 2.0
     level = np.minimum(np.abs(z) / np.float32(half_z), 1.2)
     # 9 % waist at mid height, a small lip at the rims
@@ -43,7 +43,9 @@ def _mix(thoracic: tuple[float, ...], lumbar: tuple[float, ...], share: float) -
 
 
 def _arch_distance(vertebra: Vertebra, x: Field, y: Field, z: Field) -> Field:
-    """Pedicles, articular processes, laminae, transverse and spinous processes; both sides at once by |x|."""
+    """Return the distance to pedicles, articular processes, laminae, transverse and spinous processes; |x| serves both
+    sides.
+    """
     side = np.abs(x)
     wide, deep, high = vertebra.canal_half_width, vertebra.canal_half_depth, vertebra.height
     middle = vertebra.depth / 2.0 + deep
@@ -98,7 +100,7 @@ def _arch_distance(vertebra: Vertebra, x: Field, y: Field, z: Field) -> Field:
 
 
 def vertebra_distance(vertebra: Vertebra, x: Field, y: Field, z: Field) -> Field:
-    """Distance to the outer surface of the bone, mm, positive inside; x, y, z are local mm.
+    """Return the distance to the outer surface of the bone, mm, positive inside; x, y, z are local mm.
 
     Returns
     -------
