@@ -1,4 +1,4 @@
-"""Files with a grid of numbers and an affine that are not DICOM: NIfTI, NRRD and MetaImage."""
+"""Files other than DICOM that hold a grid of numbers and an affine: NIfTI, NRRD and MetaImage."""
 
 from clrecon.formats.grid_file import LABEL_MAP, VOLUME, GridFile
 from clrecon.formats.kinds import open_grid, tell_kind

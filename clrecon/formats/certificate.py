@@ -1,4 +1,6 @@
-"""The certificate of a volume that is not from DICOM: entries of `clrecon.dicom.series.certificate`, where known."""
+"""The certificate of a volume that is not from DICOM: those entries of `clrecon.dicom.series.certificate` that are
+known.
+"""
 
 from __future__ import annotations
 
@@ -19,14 +21,14 @@ NOT_DICOM = "not DICOM: position, spacing and the meaning of the values are as t
 
 
 def collect_header_warnings(grid: GridFile) -> list[str]:
-    """Warnings about a grid file, before its voxels are read."""
+    """Return warnings about a grid file that are known before its voxels are read."""
     spacing = judge_spacing(grid)
     unusual = [f"{spacing['text']}: maybe the file has other units than it says"] if spacing["ok"] is False else []
     return [NOT_DICOM, *grid.warnings, *unusual]
 
 
 def collect_value_warnings(values: GridValues) -> list[str]:
-    """Warnings about what was read, beside those of the voxels of any volume."""
+    """Return warnings about the values that were read, in addition to those for the voxels of any volume."""
     warnings = [*values.warnings, *values.doubts]
     if values.likeness is not None and values.likeness.is_mixed:
         warnings.append(str(values.likeness))
@@ -36,7 +38,7 @@ def collect_value_warnings(values: GridValues) -> list[str]:
 
 
 def judge_spacing(grid: GridFile) -> Gate:
-    """The gate ``plausible_spacing``: axes may be in any order, the longest step is that of the slices."""
+    """Judge the gate ``plausible_spacing``.  Axes may be in any order; the longest step counts as that of the slices."""
     *pixels, gap = sorted(column_spacing(grid.affine))
     return judge_steps(pixels, gap)
 
@@ -48,7 +50,7 @@ def certify_grid(grid: GridFile, values: GridValues | None, warnings: Sequence[s
     ----------
     grid : GridFile
     values : GridValues or None
-        None: the voxels were not read, and what only they can say is None.
+        None: the voxels were not read, and entries that depend on them are None.
     warnings : sequence of str
 
     Returns
@@ -82,9 +84,10 @@ def certify_grid(grid: GridFile, values: GridValues | None, warnings: Sequence[s
 
 
 def judge_grid(grid: GridFile, values: GridValues | None) -> list[Gate]:
-    """Hold a grid against the gates of a DICOM volume that mean something for it, and against its own header.
+    """Judge a grid by the gates of a DICOM volume that apply to it, and by its own header.
 
-    That the values are HU can be doubted, never shown: that gate fails or is not measured.
+    No file of this kind says that its values are HU. So the gate ``hu_known`` fails where they surely are not, and else
+    counts as not measured.
     """
     doubtful = "values that cannot be HU, or hardly"
     share = "share of voxels without a measurement (padding)"

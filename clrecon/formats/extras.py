@@ -19,7 +19,7 @@ def import_extra(module: str, purpose: Purpose) -> Any:
     Raises
     ------
     UsageError
-        It is not installed; the message says how to get it.
+        It is not installed; the message says how to install it.
     """
     try:
         return import_module(module)

@@ -1,4 +1,4 @@
-"""`GridFile`: what the header of a file says of its voxels, in our words and frames, before any of them is read."""
+"""`GridFile`: the header of a file in our words and frame (LPS), before any voxel is read."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ __all__ = ["LABEL_MAP", "VOLUME", "GridFile", "Purpose"]
 
 @dataclass(frozen=True)
 class Purpose:
-    """What a file is read as, for messages: the noun, and the extra that brings what reads it."""
+    """The purpose of reading a file, for messages: its noun, and the extra that installs the reader."""
 
     noun: str
     extra: str
@@ -35,33 +35,33 @@ class GridFile:
     Attributes
     ----------
     name : str
-        Of the file, for messages on the terminal; never for reports.
+        Name of the file, for messages on the terminal; it is never written to reports.
     purpose : Purpose
     kind : str
         "NIfTI-1", "NIfTI-2", "NRRD" or "MetaImage".
     shape_ijk : tuple of int
         (ni, nj, nk).
     layers : int
-        Numbers a voxel, side by side in the file; 1 but for layered label maps.
+        Numbers of one voxel, side by side in the file; 1 except for layered label maps.
     dtype : dtype
-        As stored, with its byte order.
+        Type as stored, with its byte order.
     slope, intercept : float
-        A number means ``stored * slope + intercept``.
+        The value of a stored number is ``stored * slope + intercept``.
     affine : ndarray, shape (4, 4), float64
         Index (i, j, k) to LPS mm.
     voxel_bytes : VoxelBytes
         Where the numbers are.
     warnings : tuple of str
-        What was doubtful in the header; no names.
+        Doubtful points of the header; they contain no names.
     extension : bytes
-        What stands between the header and the voxels (NIfTI).
+        The bytes between the header and the voxels (NIfTI).
     fields : mapping
         All fields of the header (NRRD).
 
     Raises
     ------
     RefusedInputError
-        Sizes that are impossible, or that the file cannot hold.
+        The sizes are impossible, or the file cannot hold them.
     """
 
     name: str
@@ -84,17 +84,11 @@ class GridFile:
 
     @property
     def scaled(self) -> bool:
-        """True when the stored numbers are not what they mean."""
+        """True when the stored numbers have to be scaled to get the values."""
         return (self.slope, self.intercept) != (1.0, 0.0)
 
     def iterate_slices(self) -> Iterator[NDArray[Any]]:
-        """Yield the slices in the order of k as they are stored, shape (nj, ni), of layers (nj, ni, layers); read-only.
-
-        Raises
-        ------
-        RefusedInputError
-            The data end early or are corrupt; the slice is named.
-        """
+        """Yield the stored slices in the order of k, shape (nj, ni), with layers (nj, ni, layers); read-only."""
         ni, nj, nk = self.shape_ijk
         shape = (nj, ni) if self.layers == 1 else (nj, ni, self.layers)
         count = nj * ni * self.layers * self.dtype.itemsize
@@ -108,5 +102,5 @@ class GridFile:
             raise RefusedInputError(f"{self.name} cannot be read: {error.strerror or error}") from error
 
     def place(self, k: int) -> str:
-        """Slice `k` for messages."""
+        """Describe slice `k` for messages."""
         return f"slice {k + 1} of {self.shape_ijk[2]}"

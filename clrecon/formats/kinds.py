@@ -1,4 +1,4 @@
-"""What kind of file it is, told from its first bytes: names are not trusted."""
+"""The kind of a file, found from its first bytes; its name is not trusted."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ _START_BYTES = 512
 
 
 def tell_kind(path: Path) -> str | None:
-    """The kind of a file: "DICOM", "NIfTI", "NRRD", "MetaImage", or None.
+    """Return the kind of a file: "DICOM", "NIfTI", "NRRD", "MetaImage", or None.
 
     Raises
     ------
     OSError
-        It cannot be read.
+        The file cannot be read.
     """
     with open_regular(path) as file:
         start = file.read(_START_BYTES)
-    if start[128:132] == b"DICM":  # what stands before it may look like anything
+    if start[128:132] == b"DICM":  # the 128 bytes before it may look like any format
         return "DICOM"
     if is_nifti(_inflate(start)):
         return "NIfTI"
@@ -36,7 +36,7 @@ def tell_kind(path: Path) -> str | None:
 
 
 def _inflate(start: bytes) -> bytes:
-    """The first bytes, inflated where they are gzip."""
+    """Return the first bytes, inflated if they are gzip."""
     if start[:2] != b"\x1f\x8b":
         return start
     try:
@@ -53,7 +53,7 @@ def open_grid(path: Path, kind: str, purpose: Purpose) -> GridFile:
     UsageError
         A package is missing.
     RefusedInputError
-        The file is not what it is to be read as, cut, corrupt, or does not say where it lies.
+        The file is of the wrong kind, cut off or corrupt, or does not say where its voxels lie in space.
     """
     opener = {"NIfTI": open_nifti, "NRRD": open_nrrd, "MetaImage": open_metaimage}[kind]
     return opener(path, purpose)

@@ -1,11 +1,12 @@
 """MetaImage: .mha, and .mhd with the voxels in one file beside it.
 
-SimpleITK, whose own format this is, says what the header means; it is asked only after every field that counts was
-checked here, and it never reads the voxels.  Both for a reason, seen with SimpleITK 2.5: a header that says NDims =
-100000 ends the process (a write beyond an array), one without a position is placed at the origin, and damaged
-compressed voxels come back as numbers, with nothing but a line on standard error.
+SimpleITK, the reference reader of this format, interprets the header, but only after every important field was checked
+here; and it never reads the voxels.  The reasons were seen with SimpleITK 2.5.  A header with NDims = 100000 ends the
+process (a write beyond an array).  A header without a position is placed at the origin.  Damaged compressed voxels come
+back as numbers, with only a line on standard error.
 
-Its frame is LPS mm.  AnatomicalOrientation is for people; what counts are TransformMatrix, Offset and ElementSpacing.
+Its frame is LPS mm.  AnatomicalOrientation only informs people; the affine comes from TransformMatrix, Offset and
+ElementSpacing.
 
 Source: the MetaIO documentation (itk.org/Wiki/MetaIO/Documentation) and ITK's MetaImageIO.
 """
@@ -31,17 +32,17 @@ __all__ = ["is_metaimage", "open_metaimage"]
 
 LARGEST_HEADER = 2**20
 LONGEST_KEY, LONGEST_VALUE = 100, 4000
-"""Bytes; MetaIO keeps keys in 255 bytes and values in 32 KiB."""
+"""Longest accepted key and value in bytes; MetaIO has 255 bytes for keys and 32 KiB for values."""
 
 MM_PER_UNIT = {"": 1.0, "?": 1.0, "mm": 1.0, "cm": 10.0, "um": 0.001}
-"""Of DistanceUnits: not said (read as mm, as everybody does), mm, cm, micron."""
+"""Millimetres of each value of DistanceUnits: missing or unknown (read as mm, as other programs do), mm, cm, micron."""
 
 SAME_FIELD = {
     "Offset": ("Offset", "Position", "Origin"),
     "TransformMatrix": ("TransformMatrix", "Rotation", "Orientation"),
     "ByteOrderMSB": ("BinaryDataByteOrderMSB", "ElementByteOrderMSB"),
 }
-"""Names that mean one thing."""
+"""Different names of the same field."""
 
 PLAIN = {
     "HeaderSize": 0.0,
@@ -49,7 +50,7 @@ PLAIN = {
     "ElementToIntensityFunctionSlope": 1.0,
     "ElementToIntensityFunctionOffset": 0.0,
 }
-"""Fields that may say this and nothing else."""
+"""Fields that must have this value."""
 
 ELEMENT_TYPES = (
     *(f"MET_{sign}{size}" for sign in ("", "U") for size in ("CHAR", "SHORT", "INT", "LONG", "LONG_LONG")),
@@ -98,7 +99,7 @@ def open_metaimage(path: Path, purpose: Purpose) -> GridFile:
 
 
 def _read_fields(path: Path, name: str) -> tuple[dict[str, str], int]:
-    """The fields up to ElementDataFile, which is the last, and the byte after it."""
+    """Read the fields up to ElementDataFile, which is the last, and the offset of the byte after it."""
     with open_regular(path) as file:
         start = file.read(LARGEST_HEADER)
     fields: dict[str, str] = {}
@@ -129,7 +130,7 @@ class _Header:
         self.warnings: list[str] = []
 
     def check(self) -> None:
-        """Refuse what is not one grid of real numbers with a position.
+        """Refuse a header unless it describes one grid of real numbers with a position.
 
         Raises
         ------
@@ -170,7 +171,7 @@ class _Header:
             self.warnings.append("the byte order is not said (BinaryDataByteOrderMSB): little endian is taken")
 
     def wrong(self, key: str, expected: str) -> RefusedInputError:
-        """The refusal of a field."""
+        """Return the refusal of a field."""
         used = self._name_of(key)
         if used is None:
             return RefusedInputError(f"{self.name} is no usable MetaImage: {key} is missing, expected {expected}")
@@ -178,21 +179,21 @@ class _Header:
         return RefusedInputError(f"{self.name} is no usable MetaImage: {used} is '{shown}', expected {expected}")
 
     def _name_of(self, key: str) -> str | None:
-        """The name under which a field is there."""
+        """Return the name under which a field is present."""
         used = [other for other in SAME_FIELD.get(key, (key,)) if other in self.fields]
         if len(used) > 1:
             raise RefusedInputError(f"{self.name} has a corrupt MetaImage header: it says {used[0]} and {used[1]}")
         return used[0] if used else None
 
     def text(self, key: str, default: str | None = None) -> str:
-        """The value of a field."""
+        """Return the value of a field."""
         used = self._name_of(key)
         if used is None and default is None:
             raise self.wrong(key, "a value")
         return str(default) if used is None else self.fields[used]
 
     def numbers(self, key: str, count: int) -> list[float]:
-        """Exactly `count` finite numbers."""
+        """Return exactly `count` finite numbers."""
         expected = "a finite number" if count == 1 else f"{count} finite numbers"
         if self._name_of(key) is None:
             raise self.wrong(key, expected + (": it does not say where it lies" * (count > 1 and key != "DimSize")))
@@ -205,7 +206,7 @@ class _Header:
         return numbers
 
     def flag(self, key: str, default: bool) -> bool:
-        """True or False."""
+        """Return True or False."""
         value = self.text(key, str(default)).lower()
         if value not in ("true", "t", "1", "false", "f", "0"):
             raise self.wrong(key, "True or False")
@@ -213,11 +214,11 @@ class _Header:
 
     @property
     def big_endian(self) -> bool:
-        """The byte order of the voxels."""
+        """True where the voxels are big-endian."""
         return self.flag("ByteOrderMSB", False)
 
     def data_file(self, path: Path) -> Path:
-        """The one file beside the header that holds the voxels."""
+        """Return the one file beside the header that holds the voxels."""
         named = self.fields["ElementDataFile"]
         if not named or named.upper().split()[0] == "LIST" or "%" in named:
             raise self.wrong("ElementDataFile", "LOCAL or one file, not several")
@@ -225,10 +226,10 @@ class _Header:
 
 
 def _ask_library(path: Path, header: _Header) -> tuple[tuple[int, int, int], np.dtype[Any], Float64Array]:
-    """Shape (ni, nj, nk), type and affine, as SimpleITK understands the header."""
+    """Return shape (ni, nj, nk), type and affine, as SimpleITK understands the header."""
     sitk = import_extra("SimpleITK", header.purpose)
     reader = sitk.ImageFileReader()
-    reader.SetImageIO("MetaImageIO")  # no other reader is let near the file
+    reader.SetImageIO("MetaImageIO")  # SimpleITK may use its MetaImage reader only.
     reader.SetFileName(str(path))
     try:
         reader.ReadImageInformation()
@@ -256,4 +257,4 @@ _PIXELS = {
     "sitkInt8": "i1", "sitkUInt8": "u1", "sitkInt16": "i2", "sitkUInt16": "u2", "sitkInt32": "i4", "sitkUInt32": "u4",
     "sitkInt64": "i8", "sitkUInt64": "u8", "sitkFloat32": "f4", "sitkFloat64": "f8",
 }  # fmt: skip
-"""Names that SimpleITK has for the types of voxels."""
+"""Names of voxel types in SimpleITK."""

@@ -1,7 +1,7 @@
 """NIfTI-1 and NIfTI-2 (.nii, .nii.gz, and pairs of .hdr and .img).
 
-nibabel parses the header; the voxels are read slice by slice.  NIfTI's frame is RAS mm, and this is where it ends:
-`nifti_affine` gives LPS.
+nibabel parses the header; the voxels are read slice by slice.  NIfTI's frame is RAS mm; `nifti_affine` converts it to
+LPS, and no other module sees it.
 
 Source: the NIfTI-1 and NIfTI-2 definitions (nifti1.h, nifti2.h).
 """
@@ -29,25 +29,26 @@ from clrecon.system.text import escape_text
 __all__ = ["is_nifti", "nifti_affine", "open_nifti"]
 
 LARGEST_HEADER = 2**24
-"""Bytes before the voxels; extensions of label maps have some 10,000."""
+"""Most bytes before the voxels; extensions of label maps have some 10,000."""
 
 MM_PER_UNIT = {0: 1.0, 1: 1000.0, 2: 1.0, 3: 0.001}
-"""Code of the spatial unit: unknown (read as mm, as everybody does), metre, mm, micron."""
+"""Millimetres of each code of the spatial unit: unknown (read as mm, as other programs do), metre, mm, micron."""
 
 AFFINES_DIFFER_MM = 0.1
-"""sform and qform that are this far apart at a corner are said to disagree: quaternions are float32."""
+"""Distance at a corner from which sform and qform count as different; the quaternions of a qform are only float32."""
 
 SPACINGS_DIFFER = 0.01
-"""Of the longest step; ITK takes the spacing from pixdim, others from the sform."""
+"""Difference, as a share of the longest step, from which spacings count as different: ITK takes the spacing from
+pixdim, others from the sform."""
 
 _FIRST = (b"\x5c\x01\0\0", b"\0\0\x01\x5c")
 _SECOND = (b"\x1c\x02\0\0", b"\0\0\x02\x1c")
-"""The size of the header, 348 or 540, which both begin with; little and big endian."""
+"""First four bytes of NIfTI-1 (`_FIRST`) and NIfTI-2: the size of the header, 348 or 540, in little and big endian."""
 
 
 @dataclass(frozen=True)
 class _Header:
-    """What stands before the voxels: nibabel's header, its size, whether they are in a file of their own, where."""
+    """The header: nibabel's object, its size, whether the voxels are in another file, and in which."""
 
     parsed: Any
     size: int
@@ -69,7 +70,7 @@ def open_nifti(path: Path, purpose: Purpose) -> GridFile:
     UsageError
         nibabel is not installed.
     RefusedInputError
-        The file is cut or corrupt, not placed, has colours, or more than three axes.
+        The file is cut off or corrupt, says no place in space, holds colours, or has more than three axes.
     """
     name = escape_text(path.name)
     with open_regular(path) as file:
@@ -106,7 +107,7 @@ def _is_gzip(file: BinaryIO) -> bool:
 
 
 def _header_errors(purpose: Purpose) -> type[Exception]:
-    """What nibabel raises about headers."""
+    """Turn errors that nibabel raises about headers into refusals."""
     return import_extra("nibabel", purpose).spatialimages.HeaderDataError  # type: ignore[no-any-return]
 
 
@@ -131,7 +132,7 @@ def _read_header(stream: BinaryIO, name: str, purpose: Purpose) -> _Header:
 
 
 def _find_voxels(path: Path, compressed: bool, header: _Header) -> VoxelBytes:
-    """In the file itself; of a pair in the .img (or .img.gz) of the same name."""
+    """Find the voxels: in the file itself, or for a pair in the .img (or .img.gz) of the same name."""
     if header.paired:
         match = re.fullmatch(r"(.*)\.hdr(\.gz)?", path.name, re.IGNORECASE | re.DOTALL)
         if match is None:
@@ -150,7 +151,7 @@ def _find_voxels(path: Path, compressed: bool, header: _Header) -> VoxelBytes:
 
 
 def _shape(header: Any, name: str, purpose: Purpose) -> tuple[int, int, int]:
-    """(ni, nj, nk); further axes of one are none."""
+    """Return (ni, nj, nk); further axes of length one are ignored."""
     shape = tuple(int(n) for n in header.get_data_shape())
     while len(shape) > 3 and shape[-1] == 1:
         shape = shape[:-1]
@@ -171,26 +172,26 @@ def _dtype(header: Any, name: str, purpose: Purpose) -> np.dtype[Any]:
 
 
 def nifti_affine(header: Any, shape: tuple[int, int, int], name: str) -> tuple[Float64Array, list[str]]:
-    """The affine of a NIfTI header, from RAS to LPS: the sform, else the qform.
+    """Return the affine of a NIfTI header, converted from RAS to LPS: the sform, else the qform.
 
     Parameters
     ----------
     header : nibabel.Nifti1Header or Nifti2Header
     shape : (ni, nj, nk)
     name : str
-        Of the file, for messages.
+        Name of the file, for messages.
 
     Returns
     -------
     affine : ndarray, shape (4, 4), float64
         Index (i, j, k) to LPS mm.
     warnings : list of str
-        Where sform and qform, or the affine and pixdim, disagree.
+        Disagreements of sform and qform, or of the affine and pixdim.
 
     Raises
     ------
     RefusedInputError
-        Neither of both, or it is no affine.
+        The header has neither form, or the form is not an affine.
     """
     sform, qform = (_coded(header, which) for which in ("sform", "qform"))
     chosen = sform if sform is not None else qform
@@ -223,5 +224,5 @@ def nifti_affine(header: Any, shape: tuple[int, int, int], name: str) -> tuple[F
 
 
 def _coded(header: Any, which: str) -> Any:
-    """The sform or qform, None where its code is 0."""
+    """Return the sform or qform, None where its code is 0."""
     return getattr(header, f"get_{which}")(coded=True)[0]

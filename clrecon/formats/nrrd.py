@@ -1,7 +1,7 @@
 """NRRD (.nrrd), header and voxels in one file.
 
-pynrrd parses the header; the voxels are read slice by slice.  A header that points to data in other files is refused:
-such paths could name anything.
+pynrrd parses the header; the voxels are read slice by slice.  A header that points to data in other files is refused: a
+path in a header could name any file.
 
 Source: the NRRD format definition (teem.sourceforge.net/nrrd/format.html).
 """
@@ -33,7 +33,7 @@ LPS_FROM_SPACE = {
     "right-anterior-superior": (-1.0, -1.0, 1.0), "ras": (-1.0, -1.0, 1.0),
     "left-anterior-superior": (1.0, -1.0, 1.0), "las": (1.0, -1.0, 1.0),
 }  # fmt: skip
-"""Signs that take a frame that NRRD knows by name to LPS."""
+"""Signs that turn each named frame of NRRD into LPS."""
 
 MM_PER_UNIT = {
     **dict.fromkeys(("", "mm", "millimeter", "millimeters", "millimetre", "millimetres"), 1.0),
@@ -41,7 +41,7 @@ MM_PER_UNIT = {
     **dict.fromkeys(("m", "meter", "meters", "metre", "metres"), 1000.0),
     **dict.fromkeys(("um", "\u00b5m", "\u03bcm", "micron", "microns", "micrometer", "micrometers"), 0.001),
 }
-"""Of "space units"; without one mm, as everybody reads it."""
+"""Millimetres of each value of "space units"; mm where it is missing, as other programs read it."""
 
 TYPES = {
     **dict.fromkeys(("signed char", "int8", "int8_t"), "i1"),
@@ -70,7 +70,8 @@ def open_nrrd(path: Path, purpose: Purpose) -> GridFile:
     UsageError
         pynrrd is not installed.
     RefusedInputError
-        The file is cut or corrupt, not placed, or has more than three axes (label maps: and a list of layers).
+        The file is cut off or corrupt, says no place in space, or has more than three axes (label maps: more than three
+        axes and a list of layers).
     """
     name = escape_text(path.name)
     with open_regular(path) as file:
@@ -122,7 +123,7 @@ def _warnings(header: dict[str, Any]) -> tuple[str, ...]:
 
 
 def _sizes(header: dict[str, Any], name: str, purpose: Purpose) -> tuple[int, tuple[int, int, int]]:
-    """Layers, and (ni, nj, nk): an axis of one beside the three that lie in space is none."""
+    """Return the number of layers, and (ni, nj, nk); a further axis of length one without a direction is ignored."""
     try:
         sizes = tuple(int(n) for n in header["sizes"])
         kinds = [str(kind).lower() for kind in header.get("kinds", ["domain"] * len(sizes))]
@@ -144,14 +145,14 @@ def _sizes(header: dict[str, Any], name: str, purpose: Purpose) -> tuple[int, tu
 
 
 def _space_axes(header: dict[str, Any], count: int) -> list[int]:
-    """The axes that have a direction; all of them where nothing is said."""
+    """Return the axes that have a direction; all axes where none has one."""
     try:
         directions: NDArray[np.float64] = np.asarray(header["space directions"], dtype=np.float64)
         if directions.ndim != 2 or len(directions) != count:
             return list(range(count))
         return [axis for axis, step in enumerate(directions) if not np.isnan(step).all()]
     except (KeyError, TypeError, ValueError):
-        return list(range(count))  # `nrrd_affine` says what is wrong
+        return list(range(count))  # `nrrd_affine` reports the error
 
 
 def _dtype(header: dict[str, Any], name: str, purpose: Purpose) -> np.dtype[Any]:
@@ -168,14 +169,14 @@ def _dtype(header: dict[str, Any], name: str, purpose: Purpose) -> np.dtype[Any]
 
 
 def nrrd_affine(header: dict[str, Any], name: str) -> Float64Array:
-    """The affine of a NRRD header, from the frame that it names to LPS.
+    """Return the affine of a NRRD header, converted from the frame that it names to LPS.
 
     Parameters
     ----------
     header : dict
-        As `nrrd.read_header` gives it.
+        As `nrrd.read_header` returns it.
     name : str
-        Of the file, for messages.
+        Name of the file, for messages.
 
     Returns
     -------
@@ -185,7 +186,8 @@ def nrrd_affine(header: dict[str, Any], name: str) -> Float64Array:
     Raises
     ------
     RefusedInputError
-        No frame or one without a known direction, unknown units, no directions or origin, or they are no affine.
+        The frame is missing or not known, the units are unknown, directions or origin are missing, or they give no
+        affine.
     """
     space = str(header.get("space", "")).strip().lower()
     if space not in LPS_FROM_SPACE:
@@ -211,7 +213,7 @@ def nrrd_affine(header: dict[str, Any], name: str) -> Float64Array:
 
 
 def _unit_scale(header: dict[str, Any], name: str) -> NDArray[np.float64]:
-    """Millimetres of one unit of each axis of the frame."""
+    """Return the millimetres of one unit of each axis of the frame."""
     units = header.get("space units") or ["mm"] * 3
     scales = [MM_PER_UNIT.get(str(unit).strip(' "').lower()) for unit in units]
     if len(scales) != 3 or None in scales:

@@ -1,4 +1,4 @@
-"""`read_grid` and `list_grid`: one file that is not DICOM as a volume, and as a listing."""
+"""`read_grid` reads a volume from one file that is not DICOM; `list_grid` lists it."""
 
 from __future__ import annotations
 
@@ -28,16 +28,16 @@ def read_grid(path: Path, kind: str, *, progress: Progress | None = None) -> Vol
     ----------
     path : Path
     kind : {"NIfTI", "NRRD", "MetaImage"}
-        As `clrecon.formats.kinds.tell_kind` says.
+        As `clrecon.formats.kinds.tell_kind` returns it.
     progress : callable, optional
         Called as ``progress("read", done, total)``.
 
     Raises
     ------
     UsageError
-        A package is missing; the message names the extra that brings it.
+        A package is missing; the message names the extra that installs it.
     RefusedInputError
-        The file is cut or corrupt, no volume of real numbers, or does not say where it lies.
+        The file is cut off or corrupt, is not a volume of real numbers, or does not say where its voxels lie in space.
     """
     grid = _open(path, kind)
     values = read_values(grid, progress)
@@ -62,7 +62,7 @@ def list_grid(path: Path, kind: str, *, pixels: bool = False, progress: Progress
     path, kind, progress
         As in `read_grid`.
     pixels : bool
-        Read the voxels too, for what only they can say; without it only the header is read.
+        True: read the voxels too, for the entries that depend on them.  False: read only the header.
 
     Raises
     ------

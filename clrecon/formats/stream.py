@@ -1,4 +1,4 @@
-"""Numbers out of a stream of bytes, slice by slice, within the memory that the file can account for.
+"""Numbers read from a stream of bytes, slice by slice, taking no more memory than the size of the file justifies.
 
 A header may be wrong or hostile: a small file can promise a huge array, or name any file of the machine.  No memory is
 taken before the promised size is compared with the bytes that are there, and compressed voxels are inflated slice by
@@ -24,33 +24,33 @@ from clrecon.system.text import escape_text
 __all__ = ["LARGEST_GRID", "VoxelBytes", "check_end", "check_size", "file_beside", "read_bytes"]
 
 DEFLATE_RATIO = 1032
-"""Deflate cannot shrink anything further than this (zlib's technical note)."""
+"""Highest compression ratio of Deflate (zlib's technical note)."""
 
 LARGEST_GRID = 2**32
-"""Voxels; 1000 slices of 2048 x 2048."""
+"""Most voxels of a grid: 1000 slices of 2048 x 2048."""
 
 LARGEST_SLICE_BYTES = 2**28
-"""As they are stored: slices are inflated one at a time."""
+"""Most stored bytes of a slice; slices are inflated one at a time."""
 
 LARGEST_SURPLUS = 4096
-"""Bytes after the last number: some writers fill up a block."""
+"""Most bytes that may follow the last number: some writers fill up a block."""
 
 _CHUNK = 2**18
 
 
 @dataclass(frozen=True)
 class VoxelBytes:
-    """Where the numbers of a grid are.
+    """The place of a grid's numbers in a file.
 
     Attributes
     ----------
     path : Path
-        The file itself, or the one that its header names.
+        The file itself, or the file that its header names.
     offset : int
-        Bytes before them in the file, where what is compressed begins.
+        Bytes in the file before the numbers, or before their compressed stream.
     packing : {"raw", "gzip", "zlib"}
     skip : int
-        Inflated bytes before them.
+        Inflated bytes before the numbers.
     """
 
     path: Path
@@ -60,7 +60,7 @@ class VoxelBytes:
 
     @property
     def compressed(self) -> bool:
-        """The numbers are deflated."""
+        """True when the numbers are compressed."""
         return self.packing != "raw"
 
     @property
@@ -70,7 +70,7 @@ class VoxelBytes:
 
     @contextmanager
     def open(self, name: str) -> Iterator[BinaryIO]:
-        """The stream of the numbers, from the first one on; `name` for messages."""
+        """Open the stream at the first number; `name` is for messages."""
         with open_regular(self.path) as file:
             file.seek(self.offset)
             stream: BinaryIO = file
@@ -83,28 +83,28 @@ class VoxelBytes:
 
 
 class ZlibFile(io.RawIOBase):
-    """What a zlib stream inflates to; at its end its checksum is compared."""
+    """The inflated bytes of a zlib stream; its checksum is compared at the end."""
 
     def __init__(self, file: BinaryIO):
         super().__init__()
         self._file, self._inflater = file, zlib.decompressobj()
 
     def readable(self) -> bool:
-        """Always."""
+        """Always True."""
         return True
 
     def readinto(self, buffer: Any) -> int:
-        """Fill `buffer` as far as one step inflates; 0 at the end.
+        """Fill `buffer` with what one step inflates; return the number of bytes, 0 at the end.
 
         Raises
         ------
         EOFError
             The stream ends before its own end.
         zlib.error
-            It is corrupt.
+            The stream is corrupt.
         """
         target = memoryview(buffer).cast("B")
-        while len(target) and not self._inflater.eof:  # a limit of 0 bytes would be none
+        while len(target) and not self._inflater.eof:  # 0 would mean no limit
             packed = self._inflater.unconsumed_tail or self._file.read(_CHUNK)
             part = self._inflater.decompress(packed, len(target))
             if part:
@@ -116,19 +116,19 @@ class ZlibFile(io.RawIOBase):
 
 
 def check_size(name: str, shape: tuple[int, ...], item_bytes: int, file_bytes: int, compressed: bool) -> None:
-    """Compare what a header promises with what the file can hold.
+    """Compare the size that a header promises with what the file can hold.
 
     Parameters
     ----------
     name : str
-        Of the file.
+        Name of the file.
     shape : tuple of int
     item_bytes : int
-        Bytes a number.
+        Bytes of one number.
     file_bytes : int
         Size of the file.
     compressed : bool
-        The data are deflated.
+        True: the data are compressed.
 
     Raises
     ------
@@ -155,12 +155,12 @@ def check_size(name: str, shape: tuple[int, ...], item_bytes: int, file_bytes: i
 
 
 def read_bytes(stream: BinaryIO, count: int, name: str, where: str) -> bytes:
-    """Exactly `count` bytes of a stream, which may be compressed.
+    """Read exactly `count` bytes of a stream, which may be compressed.
 
     Raises
     ------
     RefusedInputError
-        The stream ends before, or is corrupt.
+        The stream ends earlier, or is corrupt.
     """
     parts, missing = [], count
     try:
@@ -176,13 +176,13 @@ def read_bytes(stream: BinaryIO, count: int, name: str, where: str) -> bytes:
 
 
 def check_end(stream: BinaryIO, name: str) -> None:
-    """Read to the end of the data, where the checksum of what is compressed is.
+    """Read to the end of the data, where the checksum of a compressed stream is.
 
     Raises
     ------
     RefusedInputError
-        It is wrong, or a good deal follows the last number: damaged data inflate to more as often as to less, and a
-        header with a damaged size promises less.
+        The checksum is wrong, or many bytes follow the last number: damaged data may inflate to more than was promised,
+        and a header with a damaged size may promise too little.
     """
     found = 0
     try:
@@ -195,12 +195,12 @@ def check_end(stream: BinaryIO, name: str) -> None:
 
 
 def file_beside(header: Path, named: str) -> Path:
-    """The file of voxels that a header names: in the folder of the header or below it.
+    """Return the file of voxels that a header names, in the folder of the header or below it.
 
     Raises
     ------
     RefusedInputError
-        It lies, or a link leads, elsewhere; it is not there, or no regular file.
+        The file lies elsewhere, also by a link; it does not exist; or it is not a regular file.
     """
     name, shown = escape_text(header.name), escape_text(named)
     paths = (PurePosixPath(named), PureWindowsPath(named))

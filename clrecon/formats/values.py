@@ -1,9 +1,9 @@
 """The values of a grid file as voxels of a volume, and doubts whether they are HU.
 
-One rule for every type that is stored: values that are whole numbers, all of them, are whole HU (int16 where every one
-fits, else int32), whatever they are stored as; anything else is float32.  So a CT is the same volume, and gives the
-same mesh, whether it comes from DICOM or from a file that somebody saved it into as float64.  The type is found out on
-the way, in one pass: the volume is widened when a slice asks for more.
+One rule holds for every stored type.  If all values are whole numbers, the volume is int16 where all fit, else int32.
+Otherwise it is float32.  So a CT gives the same volume and the same mesh from DICOM and from a file in which it was
+saved as float64.  The type is found in the one pass that reads the values: the volume is converted to a wider type when
+a slice needs it.
 """
 
 from __future__ import annotations
@@ -27,19 +27,21 @@ from clrecon.system.wording import name_parameter
 __all__ = ["GridValues", "read_values"]
 
 LADDER = (np.dtype(np.int16), np.dtype(np.int32), np.dtype(np.float32))
-"""Types of a volume, each wider than the one before."""
+"""Types of a volume, from the narrowest to the widest."""
 
 MOST_LABELS = 256
-"""Different whole numbers: label maps have up to some 120, 8-bit images 256, a CT some thousand."""
+"""Most different whole numbers of what is probably not a CT: label maps have up to about 120, 8-bit images 256, a CT
+some thousand."""
 LARGEST_LABEL = 65_535
 
 LEAST_SPAN = 100.0
-"""From air to soft tissue are 1000 HU; normalised values span 1, standardised ones some 10."""
+"""Least range of HU in a CT.  Air and soft tissue differ by 1000 HU; normalised values span 1, standardised ones about
+10."""
 
 
 @dataclass(frozen=True)
 class GridValues:
-    """Voxels (nk, nj, ni) int16, int32 or float32, what was seen in them, warnings, and why they may not be HU.
+    """Voxels (nk, nj, ni) int16, int32 or float32, with facts about them, warnings, and reasons why they may not be HU.
 
     `likeness` is that of the slices along the axis of the longest step; None where there are too few.
     """
@@ -52,7 +54,7 @@ class GridValues:
 
 
 def read_values(grid: GridFile, progress: Progress | None = None) -> GridValues:
-    """Read the voxels of a grid file, scaled as it says.
+    """Read the voxels of a grid file, scaled as its header says.
 
     NaN, which resampling writes where there was no image, becomes `AIR_HU` with a warning.
 
@@ -65,8 +67,8 @@ def read_values(grid: GridFile, progress: Progress | None = None) -> GridValues:
     Raises
     ------
     RefusedInputError
-        The data are cut or corrupt, hold infinity, whole numbers beyond 32 bits or nothing but NaN; the volume does
-        not fit into memory.
+        The data are cut off or corrupt; they hold infinity, whole numbers beyond 32 bits, or only NaN; or the volume
+        does not fit into memory.
     """
     filling = _Filling(grid)
     for k, stored in enumerate(grid.iterate_slices()):
@@ -81,12 +83,12 @@ class _Filling:
 
     def __init__(self, grid: GridFile):
         self._grid = grid
-        self._step = 0  # of the ladder
+        self._step = 0  # index into LADDER
         self._voxels = allocate_voxels(grid.shape_ijk[::-1], LADDER[0], grid.name)
         self._holes, self._low, self._high = 0, np.inf, -np.inf
 
     def add(self, k: int, stored: NDArray[Any]) -> None:
-        """Take slice `k` as it is stored."""
+        """Add slice `k` as it is stored."""
         values = _scale(stored, self._grid)
         holes = np.isnan(values) if values.dtype.kind == "f" else None
         if holes is not None and holes.any():
@@ -99,10 +101,10 @@ class _Filling:
             low, high = measured.min().item(), measured.max().item()
             self._low, self._high = min(self._low, low), max(self._high, high)
             self._widen(k, self._step_for(k, measured, low, high))
-        np.copyto(self._voxels[k], values, casting="unsafe")  # the step holds them all
+        np.copyto(self._voxels[k], values, casting="unsafe")  # the type holds all these values
 
     def _step_for(self, k: int, measured: NDArray[Any], low: float, high: float) -> int:
-        """The first step of the ladder that holds these values, not below the one that is reached."""
+        """Return the index of the first type that holds these values, not below the current one."""
         grid = self._grid
         if not abs(low) + abs(high) < np.inf:
             raise RefusedInputError(f"{grid.name} is corrupt: {grid.place(k)} holds infinity, which is no CT number")
@@ -123,14 +125,14 @@ class _Filling:
         return 2
 
     def _widen(self, k: int, step: int) -> None:
-        """Go up the ladder with the first `k` slices."""
+        """Change to a wider type, and copy the first `k` slices."""
         if step > self._step:
             narrow, self._step = self._voxels, step
             self._voxels = allocate_voxels(self._grid.shape_ijk[::-1], LADDER[step], self._grid.name)
             self._voxels[:k] = narrow[:k]
 
     def finish(self) -> GridValues:
-        """What has been read."""
+        """Return the volume with the facts about it."""
         voxels, low, high = self._voxels, self._low, self._high
         if self._holes == voxels.size:
             raise RefusedInputError(f"{self._grid.name} holds no values: all of its voxels are NaN")
@@ -145,14 +147,16 @@ class _Filling:
 
 
 def _judge_likeness(voxels: NDArray[Any], grid: GridFile) -> Likeness | None:
-    """Of the slices as they were most likely measured: a file may have its axes in any order, slices lie farthest."""
+    """Judge the likeness of neighbouring slices along the axis of the longest step, which most likely was that of the
+    scan.
+    """
     spacing = column_spacing(grid.affine)
-    axis = max((2, 1, 0), key=lambda place: round(spacing[place], 4))  # equal steps: the last one
+    axis = max((2, 1, 0), key=lambda place: round(spacing[place], 4))  # equal steps: the last axis
     return judge_slices(np.moveaxis(voxels, 2 - axis, 0), tilt_degrees(grid.affine))
 
 
 def _scale(stored: NDArray[Any], grid: GridFile) -> NDArray[Any]:
-    """``stored * slope + intercept``: exact for whole numbers, else in float64."""
+    """Compute ``stored * slope + intercept``: exactly for whole numbers, else in float64."""
     if not grid.scaled:
         return stored
     slope, intercept = grid.slope, grid.intercept
@@ -164,7 +168,7 @@ def _scale(stored: NDArray[Any], grid: GridFile) -> NDArray[Any]:
 
 
 def _doubts(voxels: NDArray[Any], low: float, high: float) -> list[str]:
-    """Why the values may not be HU; `low` and `high` are those that were measured."""
+    """Return reasons why the values may not be HU; `low` and `high` are the extremes of the measured values."""
     span = f"the values run from {low:.5g} to {high:.5g}"
     if low >= 0 and voxels.dtype.kind == "i" and high <= LARGEST_LABEL:
         seen = np.zeros(int(high) + 1, dtype=bool)
