@@ -1,7 +1,7 @@
-"""Labels that others enclose: which they are, and the levels at which all of them keep their volumes.
+"""Labels that other labels enclose: which they are, and the levels at which all of them keep their volumes.
 
-Such a label has little or no free surface to keep its volume with, so its level moves its borders too, and with them
-the volumes of its neighbours: the levels of all of them are looked for together.
+A label of this kind has little or no free surface.  Its level also moves the borders that it shares with its
+neighbours, and changes their volumes.  So the levels of all of them are found together.
 """
 
 from __future__ import annotations
@@ -18,19 +18,22 @@ from clrecon.labels.occupancy import FULL, LEVELS, START, STEEPNESS, VOLUME_SHAR
 __all__ = ["FACES_PER_AREA", "Borders", "choose_levels", "count_faces", "find_enclosed", "level_biases"]
 
 FACES_PER_AREA = 1.5
-"""Faces of the voxels at a border, of all directions, for each voxel face of its area."""
+"""Mean number of voxel faces at a border for one face's area of the border, over all directions."""
 
 MOST_SWEEPS = 16
-"""Three or four do; labels of some voxels, whose vertices come to the ends of their edges, need more."""
+"""Most rounds of the search.  Three or four are enough, but tiny labels, whose vertices reach the ends of their edges,
+need more."""
 
 DRIFT = 1e-4
-"""Part of the diagonal that is added to it: where enclosed labels fill a whole map, their levels have no zero."""
+"""Share by which the diagonal is increased: where enclosed labels fill a whole map, the equations would have no unique
+solution."""
 
 
 def count_faces(labels: NDArray[Any]) -> NDArray[np.int64]:
-    """Faces of each label's voxels, shape (highest number + 1, 2): towards voxels without a label, towards others'.
+    """Count the faces of each label's voxels, shape (highest number + 1, 2): towards no label, and towards other
+    labels.
 
-    The ends of the map count as neither.
+    Faces at the ends of the map are in neither column.
     """
     faces = np.zeros((int(labels.max(initial=0)) + 1, 2), np.int64)
     for axis in range(3):
@@ -45,7 +48,7 @@ def count_faces(labels: NDArray[Any]) -> NDArray[np.int64]:
 def find_enclosed(
     labels: NDArray[Any], faces: NDArray[Any], boxes: Mapping[int, tuple[slice, ...]] | None = None
 ) -> tuple[int, ...]:
-    """The labels that share more faces with others than they have free, and those that touch them.
+    """Return the labels that share more faces with other labels than they have free, and the labels that touch them.
 
     Parameters
     ----------
@@ -53,7 +56,7 @@ def find_enclosed(
     faces : ndarray
         The table of `count_faces`.
     boxes : dict of int to 3 slices, optional
-        Of each label and the samples around it; None: the whole map.
+        Box of each label and the samples around it; None: the whole map.
     """
     enclosed = np.flatnonzero(faces[:, 1] > faces[:, 0])
     involved = set(enclosed.tolist())
@@ -64,7 +67,7 @@ def find_enclosed(
 
 
 def _count_between(part: NDArray[Any], number: int) -> NDArray[np.int64]:
-    """Faces between the samples of a label and those of each other number, by that number."""
+    """Count the faces between the samples of a label and those of each other number, indexed by that number."""
     faces = np.zeros(int(part.max()) + 1, np.int64)
     for axis in range(3):
         size = part.shape[axis]
@@ -75,9 +78,9 @@ def _count_between(part: NDArray[Any], number: int) -> NDArray[np.int64]:
 
 
 def level_biases(levels: dict[int, int], size: int) -> NDArray[np.int32]:
-    """By how much each label comes before others where they touch, shape (size,), in units of the occupancy.
+    """Return the lead of each label over others where they touch, shape (size,), in units of the occupancy.
 
-    A label that is not in `levels` has none: its borders are those of the level `START`.
+    A label that is not in `levels` has no lead: its borders are those of the level `START`.
     """
     biases = np.zeros(size, np.int32)
     for number, level in levels.items():
@@ -93,13 +96,13 @@ class Borders:
     ----------
     numbers : tuple of int
     voxels : ndarray, shape (n,)
-        Voxels of each label.
+        Number of voxels of each label.
     slopes : scipy.sparse array, shape (n, n)
-        Voxels that label `row` loses for a step of the level of label `column`.
+        Number of voxels that label `row` loses when the level of label `column` rises by one.
     parts : ndarray, shape (n,)
-        Labels that touch each other, over others too, have the same number.
+        Number of the group of each label; labels that touch, directly or through others, form a group.
     filled : ndarray, shape (n,)
-        Labels of a part that nothing but the end of the map bounds.
+        True for labels of a group that is bounded by the ends of the map alone.
     """
 
     numbers: tuple[int, ...]
@@ -126,7 +129,7 @@ class Borders:
             counts.append(float(np.count_nonzero(part == number)))
             faces = _count_between(part, number)
             outlets.append(faces[0] + faces[1:][table[1 : len(faces)] < 0].sum() > 0)
-            shared = faces[1:].sum()  # the lead of one label before another rises twice as fast as an occupancy
+            shared = faces[1:].sum()  # a lead over another label moves a border as a level twice as large
             entries.append((row, row, (1.0 + DRIFT) * step * (faces[0] + 0.5 * shared)))
             for other in np.flatnonzero(faces):
                 if other != 0 and table[other] >= 0:
@@ -138,7 +141,10 @@ class Borders:
         return cls(tuple(numbers), np.array(counts), slopes, parts, ~open_parts[parts])
 
     def share_rest(self, short: NDArray[np.float64]) -> NDArray[np.float64]:
-        """What labels are short of, without what all of those lack that fill a whole map: nothing can bring it."""
+        """Return the volumes that labels lack, less an equal share for labels of groups that fill a whole map.
+
+        No levels can bring a group of this kind more volume in total.
+        """
         weights = np.where(self.filled, self.voxels, 0.0)
         rest = np.bincount(self.parts, np.where(self.filled, short, 0.0))
         share = rest / np.maximum(np.bincount(self.parts, weights), 1.0)
@@ -146,13 +152,13 @@ class Borders:
 
 
 def choose_levels(borders: Borders, measure: Callable[[dict[int, int]], dict[int, float]]) -> dict[int, int]:
-    """The levels at which enclosed labels have the volumes of their voxels, as near as levels bring them.
+    """Choose the levels at which enclosed labels have, as nearly as possible, the volumes of their voxels.
 
     Parameters
     ----------
     borders : Borders
     measure : callable
-        From the levels of all of them to the volumes of their meshes, in voxels.
+        Function from the levels of all these labels to the volumes of their meshes, in voxels.
     """
     from scipy.sparse.linalg import spsolve
 

@@ -1,6 +1,6 @@
-"""Where the frames of a DICOM SEG lie: one even stack, with holes where no frame was written.
+"""The stack that the frames of a DICOM SEG form: evenly spaced slices, with holes where no frame was written.
 
-Writers leave out frames without a labelled pixel, so a hole is a slice without labels, not a fault.
+Writers leave out frames without a labelled pixel, so a hole is a slice without labels, not an error.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from clrecon.geometry.affine import Float64Array, checked_affine, compose_affine
 __all__ = ["FrameStack", "place_frames"]
 
 DIRECTIONS_DIFFER = 1e-4
-"""Entries of direction cosines; the gate of a CT series allows as much between slices."""
+"""Largest difference between direction cosines; the gate of a CT series allows as much between slices."""
 
 SAME_PLACE_MM = 1e-3
 OFF_GRID_MM = 0.05
@@ -28,14 +28,14 @@ MOST_SLICES = 100_000
 
 @dataclass(frozen=True)
 class FrameStack:
-    """The stack that frames form.
+    """The evenly spaced stack that frames form.
 
     Attributes
     ----------
     affine : ndarray, shape (4, 4), float64
         Index (i, j, k) to LPS mm.
     places : list of int
-        Slice k of each frame.
+        Slice index k of each frame.
     slices : int
     """
 
@@ -68,14 +68,14 @@ def place_frames(shared: Any, groups: list[Any], name: str) -> FrameStack:
     groups : list of pydicom.Dataset
         Per-frame functional groups.
     name : str
-        Of the file, for messages.
+        Name of the file, for messages.
 
     Raises
     ------
     RefusedInputError
-        Frames differ in direction or spacing, or do not lie evenly.
+        Frames differ in direction or spacing, or are not evenly spaced.
     ValueError, AttributeError, KeyError
-        A position, direction or spacing is missing or no numbers.
+        A position, direction or spacing is missing or not made of numbers.
     """
     directions = np.stack(
         [_numbers(_group(shared, g, "PlaneOrientationSequence").ImageOrientationPatient, 6) for g in groups]
@@ -103,7 +103,7 @@ def place_frames(shared: Any, groups: list[Any], name: str) -> FrameStack:
 def _fit_stack(
     positions: NDArray[np.float64], normal: NDArray[np.float64], stated_mm: float | None, name: str
 ) -> tuple[NDArray[np.float64], list[int], NDArray[np.float64]]:
-    """Slice step, slice of each frame, and position of slice 0."""
+    """Return the slice step, the slice index of each frame, and the position of slice 0."""
     along = positions @ normal
     heights = np.sort(along)
     gaps = np.diff(heights)
@@ -113,14 +113,14 @@ def _fit_stack(
         return normal * (stated_mm if usable and stated_mm else 1.0), [0] * len(positions), positions[0]
     gap = float(gaps.min())
     if usable and stated_mm and abs(gap / stated_mm - round(gap / stated_mm)) * stated_mm <= OFF_GRID_MM:
-        gap = gap / max(1, round(gap / stated_mm))  # holes everywhere: no two frames are neighbours
+        gap = gap / max(1, round(gap / stated_mm))  # no two frames are neighbours
     if (heights[-1] - heights[0]) / gap > MOST_SLICES:
         raise RefusedInputError(
             f"the frames of {name} lie {gap:g} mm apart over {np.ptp(heights):g} mm: too many slices"
         )
     lowest = positions[int(np.argmin(along))]
     places = np.rint((along - heights[0]) / gap).astype(np.int64)
-    # A line through all positions: the smallest gap alone carries its rounding all the way up.
+    # Fit a line through all positions: the rounding error of the smallest gap alone would add up over the stack.
     for _ in range(2):
         design = np.stack([np.ones(len(places)), places], axis=1)
         (origin, step), *_ = np.linalg.lstsq(design, positions, rcond=None)

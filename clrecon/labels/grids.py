@@ -1,4 +1,4 @@
-"""Label maps out of grid files: NIfTI with a label table, NRRD with 3D Slicer's segments and layers, MetaImage.
+"""Label maps from grid files: NIfTI with a label table, NRRD with 3D Slicer's segments and layers, MetaImage.
 
 Source: 3D Slicer's segmentation file format; the label table of Caret and Connectome Workbench.
 """
@@ -46,16 +46,16 @@ def read_grid_labels(
     ----------
     grid : GridFile
     only : tuple of str or int, optional
-        The labels that are wanted: others may overlap.
+        The labels that are wanted; only the other labels may overlap.
     progress : callable
         Called as ``progress("read", slices done, all slices)``.
 
     Raises
     ------
     UsageError
-        A wanted label is not there.
+        A wanted label does not exist.
     RefusedInputError
-        The file is cut or corrupt, no label map, or segments overlap.
+        The file is cut off or corrupt, is not a label map, or has segments that overlap.
     """
     segments = _read_segments(grid.fields, grid.name)
     if grid.layers > 1 and not segments:
@@ -79,7 +79,7 @@ def _merge_layers(
     only: tuple[str | int, ...] | None,
     progress: Progress,
 ) -> LabelMap:
-    """One map of segments that are stored in layers; numbers that layers share are given anew."""
+    """Merge segments that are stored in layers into one map; numbers that several layers use are renumbered."""
     segments = list(segments)
     if len({segment.number for segment in segments}) < len(segments):
         segments = [_Segment(n, s.name, s.layer, s.value) for n, s in enumerate(segments, start=1)]
@@ -93,7 +93,7 @@ def _merge_layers(
 
 
 def _read_segments(fields: Mapping[str, Any], name: str) -> list[_Segment]:
-    """The segments that the header of a .seg.nrrd names, in their order."""
+    """Return the segments that the header of a .seg.nrrd names, in their order."""
     segments = []
     numbers = sorted({int(m[1]) for field in fields if (m := re.fullmatch(r"Segment([0-9]{1,5})_LabelValue", field))})
     for n in numbers:
@@ -106,7 +106,9 @@ def _read_segments(fields: Mapping[str, Any], name: str) -> list[_Segment]:
 
 
 def _read_names(extension: bytes) -> dict[int, str]:
-    """Names in a label table as Caret, Connectome Workbench and TotalSegmentator write it into the header of NIfTI."""
+    """Return the names of a label table as Caret, Connectome Workbench and TotalSegmentator write it into a NIfTI
+    header.
+    """
     names = {}
     for match in _LABEL.finditer(extension):
         text = (match[2] or match[3] or b"").decode("utf-8", "replace")

@@ -1,4 +1,4 @@
-"""Which samples lie around a sample, nearest first: how labels grow, on host and device alike."""
+"""Growth of labels: the samples around a sample, nearest first, for host and device alike."""
 
 from __future__ import annotations
 
@@ -16,21 +16,21 @@ __all__ = ["Growth"]
 
 MOST_OFFSETS = 5000
 SAME_DISTANCE = 1e-6
-"""Relative; offsets whose lengths differ by rounding alone are equally near."""
+"""Relative difference; offsets whose lengths differ by less, by rounding alone, are equally near."""
 
 
 @dataclass(frozen=True)
 class Growth:
-    """How far labels grow.
+    """The growth of labels on one grid.
 
     Attributes
     ----------
     grow_mm : float or None
-        None: one voxel each way.
+        Distance of growth; None: one voxel in each direction.
     offsets : ndarray, shape (n, 3), int32
         (di, dj, dk) to the samples around, without (0, 0, 0), nearest in mm first, shear included.
     shells : ndarray, shape (n,), int32
-        From 0; equal for offsets of equal length.
+        Shell numbers from 0; offsets of equal length have the same.
     """
 
     grow_mm: float | None
@@ -39,12 +39,12 @@ class Growth:
 
     @classmethod
     def of(cls, volume: Volume, grow_mm: float | None) -> Growth:
-        """The growth by `grow_mm` on the grid of a volume.
+        """Make the growth by `grow_mm` on the grid of a volume.
 
         Raises
         ------
         UsageError
-            `grow_mm` is no number, negative, or so large that whole bones would be swallowed.
+            `grow_mm` is not a number, negative, or so large that a label would cover whole bones beside it.
         """
         steps = volume.affine[:3, :3]
         if grow_mm is None:
@@ -57,7 +57,7 @@ class Growth:
 
     @property
     def reach(self) -> tuple[int, int, int]:
-        """Samples along i, j, k."""
+        """Largest offset along i, j, k in samples."""
         i, j, k = np.abs(self.offsets).max(axis=0, initial=0)
         return int(i), int(j), int(k)
 
@@ -85,7 +85,7 @@ def _offsets_within(reach: tuple[Any, ...]) -> NDArray[np.int32]:
 
 
 def _sort(offsets: NDArray[np.int32], steps: NDArray[np.float64]) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-    """Offsets by length, and their shells; within a shell in the order of the indices, whatever rounding does."""
+    """Sort offsets by length and number their shells; within a shell they are in index order, whatever rounding does."""
     lengths = np.linalg.norm(offsets @ steps.T, axis=1)
     order = np.argsort(lengths, kind="stable")
     offsets, lengths = offsets[order], lengths[order]

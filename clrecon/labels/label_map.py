@@ -1,4 +1,4 @@
-"""`LabelMap`: one whole number a voxel, the affine that places it, and what the numbers are called."""
+"""`LabelMap`: one whole number for each voxel, the affine that places the voxels, and the names of the numbers."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from clrecon.labels.names import check_name, find_number
 __all__ = ["LARGEST_NUMBER", "LabelMap"]
 
 LARGEST_NUMBER = 65_535
-"""Label numbers go to a device as 16 bits."""
+"""Largest label number; numbers go to a device as 16 bits."""
 
 
 class LabelMap(Grid):
-    """Whole numbers that say to which structure a voxel belongs; 0 is none.
+    """Whole numbers that tell to which structure each voxel belongs; 0 is no structure.
 
     ``voxels`` are uint8 or uint16.
 
@@ -30,18 +30,19 @@ class LabelMap(Grid):
     voxels : array_like, shape (nk, nj, ni)
         Whole numbers from 0 to 65,535, indexed ``voxels[k, j, i]``.
     affine : array_like, shape (4, 4)
-        Index (i, j, k) to LPS mm, as that of a `Volume`; of another grid than the volume's where need be.
+        Index (i, j, k) to LPS mm, as for a `Volume`; the grid may differ from that of the volume.
     names : mapping of int to str, optional
-        What the numbers are called; a number without a name is called ``label_N``.
+        Names of the numbers; a number without a name is called ``label_N``.
     frame_of_reference_hash : str, optional
-        Of the frame of reference that the file names (DICOM SEG), as in the report of a volume.
+        Hash of the frame of reference that the file names (DICOM SEG), as in the report of a volume.
     warnings : sequence of str, optional
-        What was doubtful in the file.
+        Doubtful points of the file.
 
     Raises
     ------
     UsageError
-        Not three axes, empty, no whole numbers, numbers out of range; no affine; a name that is no text.
+        `voxels` has not three axes, is empty, or holds other values than whole numbers in range; `affine` is not an
+        affine; or a name is not text.
     """
 
     def __init__(
@@ -60,7 +61,7 @@ class LabelMap(Grid):
 
     @cached_property
     def counts(self) -> dict[int, int]:
-        """How many voxels each number has, of the numbers that are there (0 is none of them)."""
+        """Number of voxels of each label number that occurs, without 0."""
         total = np.zeros(int(self._voxels.max()) + 1, dtype=np.int64)
         for plane in self._voxels:
             counted = np.bincount(plane.ravel())
@@ -69,20 +70,20 @@ class LabelMap(Grid):
 
     @property
     def numbers(self) -> tuple[int, ...]:
-        """The numbers that are there, ascending, without 0."""
+        """The numbers that occur, ascending, without 0."""
         return tuple(self.counts)
 
     @property
     def names(self) -> dict[int, str]:
-        """Number to name: of every number that is there, and of every one that the file names."""
+        """Name of each number that occurs, and of each that the file names."""
         return {number: self.name(number) for number in sorted({*self.counts, *self._names} - {0})}
 
     def name(self, number: int) -> str:
-        """What `number` is called, ``label_N`` where the file does not say."""
+        """Return the name of `number`, ``label_N`` where the file gives none."""
         return self._names.get(number) or f"label_{number}"
 
     def find(self, label: str | int) -> int:
-        """The number of a label.
+        """Return the number of a label.
 
         Parameters
         ----------
@@ -92,7 +93,8 @@ class LabelMap(Grid):
         Raises
         ------
         UsageError
-            None or several are called so, or no voxel has it; the message lists what is there.
+            No label or several labels have this name, or no voxel has the label; the message lists the labels of the
+            map.
         """
         return find_number(label, self.names, self.counts)
 

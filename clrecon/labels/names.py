@@ -1,6 +1,6 @@
-"""Names of labels: found again however they are written, and made safe for file names.
+"""Names of labels: found in any spelling, and made safe for messages and file names.
 
-Names come from files that strangers wrote: in messages they are escaped, in file names they are letters and digits.
+Names come from files that strangers wrote.  In messages they are escaped, in file names they are letters and digits.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ LABELS_LISTED = 60
 
 
 def check_name(name: str) -> str:
-    """A name in one printable line of limited length.
+    """Return a name as one printable line of limited length.
 
     Raises
     ------
     UsageError
-        It is no text.
+        The name is not text.
     """
     if not isinstance(name, str):
         raise UsageError(f"the name of a label is text, not {type(name).__name__}")
@@ -32,7 +32,7 @@ def check_name(name: str) -> str:
 
 
 def list_labels(names: Mapping[int, str], numbers: Collection[int]) -> str:
-    """``27 vertebrae_L5, 28 vertebrae_L4``: the labels that are there, for a message."""
+    """Return the labels that occur for a message: ``27 vertebrae_L5, 28 vertebrae_L4``."""
     shown = [f"{number} {names[number]}" for number in sorted(numbers)][:LABELS_LISTED]
     more = len(numbers) - len(shown)
     return (", ".join(shown) or "none") + (f" and {more} more" if more > 0 else "")
@@ -43,19 +43,20 @@ def _parts(name: str) -> list[str]:
 
 
 def find_number(label: str | int, names: Mapping[int, str], present: Collection[int]) -> int:
-    """The number of `label`: its number, else its name, else the one name that has it as a part.
+    """Return the number of `label`: a number itself, else the exact name, else the only name that contains it as a
+    part.
 
     Parameters
     ----------
     label : str or int
     names : mapping of int to str
     present : collection of int
-        Numbers that voxels have.
+        Numbers that occur in voxels.
 
     Raises
     ------
     UsageError
-        None or several are called so, or no voxel has it; the message lists what is there.
+        No label or several labels have this name, or no voxel has the label; the message lists the labels that occur.
     """
     text = str(label).strip()
     wanted = text.casefold()
@@ -78,7 +79,7 @@ def find_number(label: str | int, names: Mapping[int, str], present: Collection[
 
 
 def label_suffix(name: str) -> str:
-    """A name as part of a file name: letters, digits, dot, hyphen and underscore, at most 40.
+    """Return a name as part of a file name: letters, digits, dot, hyphen and underscore, at most 40.
 
     Dots and hyphens at either end are taken off; a name without any letter or digit gives ``label``.
     """
@@ -87,10 +88,10 @@ def label_suffix(name: str) -> str:
 
 
 def file_suffixes(names: Mapping[int, str]) -> dict[int, str]:
-    """`label_suffix` of each name; where two would be one file, also on systems that ignore case, with the number."""
+    """Return `label_suffix` of each name, with the number added where two files would have one name (ignoring case)."""
     suffixes = {number: label_suffix(name) for number, name in names.items()}
     found = Counter(suffix.casefold() for suffix in suffixes.values())
     unique = {n: s if found[s.casefold()] == 1 else f"{s}_{n}" for n, s in suffixes.items()}
-    if len({suffix.casefold() for suffix in unique.values()}) < len(unique):  # a name that looks like such a pair
+    if len({suffix.casefold() for suffix in unique.values()}) < len(unique):  # a suffix with number is also a name
         return {number: f"label_{number}" for number in names}
     return unique

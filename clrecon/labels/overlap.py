@@ -1,4 +1,4 @@
-"""Segments that are stored one by one become one map: where two of them claim a voxel, it is said or settled."""
+"""Segments that are stored separately become one map; an overlap is either refused or settled by a rule."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ __all__ = ["Painter", "check_wanted"]
 class Painter:
     """Writes segments into one map.
 
-    Without `only` no two segments may overlap.  With it those that are wanted may not overlap each other; of the
-    others they take what they share, and among the others the lowest number does.
+    Without `only` no two segments may overlap.  With `only`, the wanted segments may not overlap each other.  A voxel
+    of a wanted and another segment goes to the wanted one; a voxel of several others goes to the lowest number.
 
     Parameters
     ----------
@@ -37,9 +37,9 @@ class Painter:
     Raises
     ------
     UsageError
-        A wanted label is not there.
+        A wanted label does not exist.
     RefusedInputError
-        Numbers that are no label numbers.
+        A number is not a possible label number.
     """
 
     def __init__(self, file: str, voxels: NDArray[Any], names: Mapping[int, str], only: tuple[str | int, ...] | None):
@@ -52,13 +52,13 @@ class Painter:
         self._wanted = sorted(names if only is None else {find_number(label, shown, names) for label in only})
         others = sorted(set(names) - set(self._wanted), reverse=True)
         self.order = [*others, *self._wanted]
-        """Numbers in the order in which they have to be painted."""
+        """Segment numbers in the order in which they have to be painted."""
         self._is_wanted = np.zeros(LARGEST_NUMBER + 1, dtype=bool)
         self._is_wanted[self._wanted] = True
         self._shared: dict[tuple[int, int], int] = {}
 
     def paint(self, k: int, number: int, mask: NDArray[np.bool_]) -> None:
-        """Give the voxels of slice `k` where `mask` (nj, ni) is true to `number`."""
+        """Write `number` into the voxels of slice `k` where `mask` (nj, ni) is true."""
         plane = self._voxels[k]
         if self._is_wanted[number]:
             before = plane[mask]
@@ -69,12 +69,12 @@ class Painter:
         plane[mask] = number
 
     def finish(self, affine: Float64Array, **options: Any) -> LabelMap:
-        """The map.
+        """Return the map.
 
         Raises
         ------
         RefusedInputError
-            Segments overlap that may not.
+            Segments overlap that may not overlap.
         """
         if self._shared:
             (a, b), count = max(self._shared.items(), key=lambda item: item[1])
@@ -87,12 +87,12 @@ class Painter:
 
 
 def check_wanted(only: str | int | Iterable[str | int] | None) -> tuple[str | int, ...] | None:
-    """`only` as a tuple, None where nothing is said.
+    """Return `only` as a tuple; None stays None.
 
     Raises
     ------
     UsageError
-        A label that is neither number nor text.
+        A label is neither a number nor text.
     """
     if only is None:
         return None

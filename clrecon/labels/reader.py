@@ -1,4 +1,4 @@
-"""`read_labels`: one door for every kind of file with labels."""
+"""`read_labels`: reads every kind of file with labels."""
 
 from __future__ import annotations
 
@@ -30,8 +30,9 @@ def read_labels(
     ----------
     path : path
     only : sequence of str or int, optional
-        The labels that are wanted, as `LabelMap.find` takes them.  It matters for files whose segments overlap:
-        those that are wanted may not overlap each other, and take what they share with others.
+        The labels that are wanted, as `LabelMap.find` takes them.  This matters for files whose segments overlap:
+        wanted segments may not overlap each other, and voxels that they share with other segments go to the wanted
+        ones.
     progress : callable, optional
         Called as ``progress("read", done, total)``: slices, in DICOM SEG frames.
 
@@ -43,10 +44,10 @@ def read_labels(
     Raises
     ------
     UsageError
-        There is no such file, a package is missing, or a wanted segment is not there.
+        The file does not exist, a package is missing, or a wanted segment does not exist.
     RefusedInputError
-        The file is no label map (CT images, probabilities, negative numbers, four axes), cut or corrupt, does not
-        say where it lies, or segments overlap.
+        The file is not a label map (CT images, probabilities, negative numbers, four axes), is cut off or corrupt, does
+        not say where it lies in space, or has segments that overlap.
     """
     wanted = check_wanted(only)
     path = Path(path)

@@ -1,4 +1,4 @@
-"""Labels on the grid of a volume: the nearest label in mm, the same numbers where the grids are the same."""
+"""Labels on the grid of a volume: each voxel gets the nearest label in mm; labels on the same grid stay unchanged."""
 
 from __future__ import annotations
 
@@ -16,13 +16,14 @@ from clrecon.labels.label_map import LabelMap
 __all__ = ["LEAST_SHARE_INSIDE", "ResampledLabels", "check_together", "resample_labels"]
 
 LEAST_SHARE_INSIDE = 0.01
-"""Of the labelled voxels.  A whole body's labels on a scan of one joint have more; those of another scan have not."""
+"""Least share of the labelled voxels inside the volume.  The labels of a whole body have a larger share in a scan of
+one joint; labels of another scan have less."""
 
 ON_GRID = 0.01
-"""Index steps: grids are the same when no voxel is further off than this."""
+"""Tolerance in index steps: grids are the same when no voxel is further off than this."""
 
 TIES = 1e-6
-"""Index steps; half-way between two labels the lower index wins, whatever rounding does."""
+"""Tolerance in index steps: half-way between two labels the lower index wins, independent of rounding."""
 
 
 @dataclass(frozen=True)
@@ -32,9 +33,9 @@ class ResampledLabels:
     Attributes
     ----------
     voxels : ndarray, shape (nk, nj, ni), uint8 or uint16
-        On the grid of the volume; not to be changed, it may be the map's own array.
+        On the grid of the volume.  Do not change it: it may be the map's own array.
     exact : bool
-        Every voxel of the volume lies on one of the map (or outside of it): nothing was chosen by distance.
+        True: every voxel of the volume coincides with a voxel of the map or lies outside the map.
     inside : dict of int to float
         For each number its share of labelled voxels that lie inside the volume, 0 to 1.
     warnings : tuple of str
@@ -47,10 +48,10 @@ class ResampledLabels:
 
 
 def resample_labels(labels: LabelMap, volume: Volume) -> ResampledLabels:
-    """Bring a label map to the grid of a volume: for each voxel the label whose centre is nearest, in mm.
+    """Resample a label map to the grid of a volume: for each voxel the label whose centre is nearest, in mm.
 
-    "Nearest" is along the axes of the label grid, as nearest-neighbour interpolation is everywhere: the voxel of the
-    map that contains the centre.
+    "Nearest" is meant along the axes of the label grid, as usual for nearest-neighbour interpolation: it is the voxel
+    of the map that contains the centre.
 
     Parameters
     ----------
@@ -60,9 +61,9 @@ def resample_labels(labels: LabelMap, volume: Volume) -> ResampledLabels:
     Raises
     ------
     RefusedInputError
-        The map says that it belongs to another frame of reference, or less than 1 % of it lies inside the volume.
+        The map names another frame of reference, or less than 1 % of it lies inside the volume.
     UsageError
-        Not a LabelMap and a Volume.
+        The arguments are not a LabelMap and a Volume.
     """
     if not isinstance(labels, LabelMap) or not isinstance(volume, Volume):
         raise UsageError("a label map is brought to a volume: resample_labels(LabelMap, Volume)")
@@ -73,7 +74,7 @@ def resample_labels(labels: LabelMap, volume: Volume) -> ResampledLabels:
 
 
 def check_together(labels: LabelMap, volume: Volume) -> dict[int, float]:
-    """Refuse a label map that cannot be of this scan.
+    """Refuse a label map that cannot belong to this scan.
 
     Returns
     -------
@@ -83,7 +84,7 @@ def check_together(labels: LabelMap, volume: Volume) -> dict[int, float]:
     Raises
     ------
     RefusedInputError
-        It is empty, says that it belongs to another frame of reference, or less than 1 % of it lies inside the volume.
+        The map is empty, names another frame of reference, or less than 1 % of it lies inside the volume.
     """
     if not labels.numbers:
         raise RefusedInputError("the label map is empty: no voxel has a label")
@@ -103,13 +104,14 @@ def _check_frame_of_reference(labels: LabelMap, volume: Volume) -> None:
 
 
 def _take_aligned(labels: LabelMap, volume: Volume) -> NDArray[Any] | None:
-    """The labels where the grids are one, but for the way the axes run and where they end; None where they are not.
+    """Return the labels if both grids have the same voxel places, else None; the directions and ends of the axes may
+    differ.
 
-    Not copied when it is the same array.
+    The array is not copied if it needs no change.
     """
     inverse = np.asarray(np.linalg.inv(labels.affine), dtype=np.float64)
     starts = apply_affine(inverse, volume.slice_origins())
-    steps = inverse[:3, :3] @ volume.affine[:3, :3]  # columns: steps in the map for one along i, j, k of the volume
+    steps = inverse[:3, :3] @ volume.affine[:3, :3]  # columns: steps in the map per step along i, j, k
     whole = np.rint(steps).astype(np.int64)
     origin = np.rint(starts[0]).astype(np.int64)
     size = np.array(volume.shape_ijk)
@@ -119,7 +121,7 @@ def _take_aligned(labels: LabelMap, volume: Volume) -> NDArray[Any] | None:
     off_slices = np.abs(starts - origin - np.arange(len(starts))[:, None] * whole[:, 2])
     if (off + off_slices).max() > ON_GRID:
         return None
-    axes = [int(np.flatnonzero(whole[:, b])[0]) for b in range(3)]  # of the map, for i, j, k of the volume
+    axes = [int(np.flatnonzero(whole[:, b])[0]) for b in range(3)]  # axes of the map for i, j, k of the volume
     view = labels.voxels.transpose([2 - axes[b] for b in (2, 1, 0)])
     source, target = [], []
     for b in (2, 1, 0):
@@ -138,13 +140,13 @@ def _take_aligned(labels: LabelMap, volume: Volume) -> NDArray[Any] | None:
 
 
 def _take_nearest(labels: LabelMap, volume: Volume) -> tuple[NDArray[Any], bool]:
-    """Slice by slice: a slice of the volume is a plane in the map, flat along i and j."""
+    """Take the nearest labels slice by slice: a slice of the volume is a plane in the map, linear along i and j."""
     ni, nj, nk = volume.shape_ijk
     inverse = np.asarray(np.linalg.inv(labels.affine), dtype=np.float64)
     starts = apply_affine(inverse, volume.slice_origins())
     i_step, j_step = inverse[:3, :3] @ volume.affine[:3, 0], inverse[:3, :3] @ volume.affine[:3, 1]
     along = np.arange(ni)[:, None] * i_step, np.arange(nj)[:, None] * j_step
-    # An axis of the map that only i, or only j, moves along needs one index a column, or a row.
+    # A map axis that only i (or only j) moves along needs one index for each column (or row).
     separable = [bool(np.ptp(along[0][:, a]) <= ON_GRID or np.ptp(along[1][:, a]) <= ON_GRID) for a in range(3)]
     taken = np.zeros((nk, nj, ni), dtype=labels.voxels.dtype)
     exact = True
@@ -165,7 +167,7 @@ def _take_nearest(labels: LabelMap, volume: Volume) -> tuple[NDArray[Any], bool]
 
 
 def _shares_inside(labels: LabelMap, volume: Volume) -> dict[int, float]:
-    """For each label the share of its voxels whose centres lie inside the volume's outermost voxels."""
+    """Return for each label the share of its voxels whose centres lie inside the volume's outermost voxels."""
     upper = np.array(volume.shape_ijk) - 0.5
     corners = volume.lps_to_ijk(apply_affine(labels.affine, _corners(labels)))
     if (corners >= -0.5).all() and (corners <= upper).all():
@@ -195,12 +197,12 @@ def _check_overlap(labels: LabelMap, volume: Volume, shares: dict[int, float]) -
 
 
 def _corners(grid: LabelMap | Volume) -> list[tuple[int, ...]]:
-    """Index coordinates of the eight outermost voxels."""
+    """Return the index coordinates of the eight outermost voxels."""
     return list(product(*((0, n - 1) for n in grid.shape_ijk)))
 
 
 def _extent(grid: LabelMap | Volume) -> str:
-    """``x -250..249, y ..., z ... mm``: the corners' range."""
+    """Describe the range of the corners: ``x -250..249, y ..., z ... mm``."""
     points = apply_affine(grid.affine, _corners(grid))
     low, high = points.min(axis=0), points.max(axis=0)
     return ", ".join(f"{axis} {a:.0f} to {b:.0f}" for axis, a, b in zip("xyz", low, high, strict=True)) + " mm"

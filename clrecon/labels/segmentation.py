@@ -47,12 +47,12 @@ _ONCE: Schema = {
     0x52009229: _PLACE,
     0x52009230: _PLACE,
 }
-"""What places and names the segments."""
+"""Elements that give the places and names of segments; each may occur only once."""
 
 
 @dataclass(frozen=True)
 class _Layout:
-    """What the header of a SEG says of its frames."""
+    """The frames of a SEG as its header describes them."""
 
     kind: str
     rows: int
@@ -70,20 +70,20 @@ def read_segmentation(
     ----------
     path : Path
     only : tuple of str or int, optional
-        The segments that are wanted: others may overlap.
+        The segments that are wanted; only the other segments may overlap.
     progress : callable
         Called as ``progress("read", frames done, all frames)``.
 
     Raises
     ------
     UsageError
-        A wanted segment is not there.
+        A wanted segment does not exist.
     RefusedInputError
-        No SEG, fractional segments, frames that form no even stack, segments that overlap, corrupt, or compressed
-        with anything but RLE.
+        The file is not a SEG or is corrupt, has fractional segments, frames that form no evenly spaced stack or
+        segments that overlap, or is compressed other than by RLE.
     """
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # pydicom's quote the file unescaped
+        warnings.simplefilter("ignore")  # pydicom's messages quote the file unescaped
         return _read(path, escape_text(path.name), only, progress)
 
 
@@ -102,7 +102,7 @@ def _read(path: Path, name: str, only: tuple[str | int, ...] | None, progress: P
         pixels = _FramePixels(dataset, layout, name)
     except ClreconError:
         raise
-    except Exception as error:  # pydicom raises whatever a corrupt value leads to
+    except Exception as error:  # pydicom raises many error types for corrupt values
         raise RefusedInputError(f"{name} is no usable DICOM SEG: {_first_line(error)}") from error
     frame_hash = hash_uid(frame_of_reference)
     voxels = empty_labels(name, (stack.slices, layout.rows, layout.columns))
@@ -152,7 +152,7 @@ def _parse(path: Path, name: str) -> Any:
 
 
 def _check_elements(data: bytes, name: str, implicit: bool) -> None:
-    """Refuse elements that stand twice with two values: pydicom keeps the last of them without a word."""
+    """Refuse elements that occur twice with two values: pydicom silently keeps the last one."""
     if len(data) > LARGEST_BYTES:
         raise RefusedInputError(f"{name} is larger than {LARGEST_BYTES:,} bytes: no segmentation is read from it")
     try:
@@ -176,7 +176,8 @@ def _read_layout(dataset: Any, name: str, file_bytes: int) -> _Layout:
     if layout.bits not in ((1, 8) if kind == "BINARY" else (8, 16)) or not 0 < layout.frames <= MOST_FRAMES:
         raise RefusedInputError(f"{name} is corrupt: {layout.frames} frames of {layout.bits} bits a pixel")
     compressed = dataset.file_meta.TransferSyntaxUID == RLE_LOSSLESS
-    # RLE writes two bytes for up to 128 and at least a header of 64 bytes a frame: never more than 64 to 1.
+    # RLE writes two bytes for up to 128, and a header of 64 bytes or more for each frame: it never shrinks more than 64
+    # to 1.
     held = file_bytes * (8 if layout.bits == 1 else 1) * (64 if compressed else 1)
     shape = (layout.columns, layout.rows, layout.frames)
     check_size(name, shape, max(1, layout.bits // 8), held, compressed=False)
@@ -191,7 +192,7 @@ def _segment_of(group: Any, shared: Any) -> int:
 
 
 class _FramePixels:
-    """The pixels of one frame after the other."""
+    """Reads the pixels of the frames one after the other."""
 
     def __init__(self, dataset: Any, layout: _Layout, name: str):
         self._layout, self._name = layout, name
@@ -211,7 +212,7 @@ class _FramePixels:
             )
 
     def read(self, frame: int) -> NDArray[Any]:
-        """Frame `frame`, counted from 0, shape (rows, columns), uint8 or uint16."""
+        """Return frame `frame`, counted from 0, shape (rows, columns), uint8 or uint16."""
         layout = self._layout
         if self._fragments is not None:
             plane = self._decode(self._fragments[frame])

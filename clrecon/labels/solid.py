@@ -1,4 +1,4 @@
-"""Fill what lies within a label and is less dense than its surface: marrow, and holes in the mask."""
+"""Filling of labels: parts inside a label that are less dense than its surface (marrow), and holes in the mask."""
 
 from __future__ import annotations
 
@@ -13,7 +13,9 @@ Box = tuple[slice, slice, slice]
 
 
 def find_boxes(labels: NDArray[Any], numbers: tuple[int, ...], reach: tuple[int, int, int]) -> dict[int, Box]:
-    """The box (k, j, i) of each number's samples, grown by `reach` (i, j, k) samples and one more, within the grid."""
+    """Find the box (k, j, i) of each number's samples, grown by `reach` (i, j, k) samples and one more, within the
+    grid.
+    """
     from scipy.ndimage import find_objects
 
     found = find_objects(labels, max_label=max(numbers, default=0))
@@ -31,31 +33,32 @@ def find_boxes(labels: NDArray[Any], numbers: tuple[int, ...], reach: tuple[int,
 def fill_solid(solid: NDArray[Any], labels: NDArray[Any], number: int, box: Box, closed: bool) -> int:
     """Make the inside of one label solid, in place.
 
-    What is not inside of the label already is, when one of these holds:
+    A sample becomes inside of the label when one of these is true:
 
     - It is deep in the mask: all 26 neighbours carry the label too.  (The volume's end is no border of the mask.)
-    - It carries the label, and no way that is three samples wide leads to it from outside.
-    - It carries no label, and no way at all leads to it from outside.
+    - It carries the label, and no path three samples wide leads to it from outside.
+    - It carries no label, and no path at all leads to it from outside.
 
-    A way is a chain of face neighbours of which none is inside or deep.  So in the outermost layer of the mask HU
-    decide, as far as the outside comes in: they place the outer surface.  Pores of the cortex do not let it in.
+    A path is a chain of face neighbours of which none is inside or deep.  So where the outside reaches the outermost
+    layer of the mask, the HU decide there: they place the outer surface.  Pores of the cortex are too narrow for a
+    path.
 
     Parameters
     ----------
     solid : ndarray, shape (nk, nj, ni)
-        For each sample the label that it is inside of, 0 for none; changed.
+        For each sample the label that it is inside of, 0 for none; changed in place.
     labels : ndarray, shape (nk, nj, ni)
         The mask, not grown.
     number : int
     box : 3 slices
-        Of the label and what surrounds it by at least one sample, as `find_boxes` gives it.
+        Box of the label and at least one sample around it, as `find_boxes` returns it.
     closed : bool
-        Beyond the border of the volume is outside.
+        True: everything beyond the border of the volume is outside.
 
     Returns
     -------
     int
-        Samples that were filled.
+        Number of samples that were filled.
     """
     from scipy.ndimage import binary_dilation, binary_erosion
 
@@ -76,7 +79,7 @@ def fill_solid(solid: NDArray[Any], labels: NDArray[Any], number: int, box: Box,
 
 
 def _close_ends(passable: NDArray[np.bool_], box: Box, shape: tuple[int, ...]) -> None:
-    """The way out leads through the sides of the box, but not where the volume itself ends."""
+    """Block the sides of the box where the volume itself ends: no path from outside begins there."""
     for axis, (part, size) in enumerate(zip(box, shape, strict=True)):
         for side, at_end in ((0, part.start == 0), (-1, part.stop == size)):
             if at_end:
@@ -84,7 +87,7 @@ def _close_ends(passable: NDArray[np.bool_], box: Box, shape: tuple[int, ...]) -
 
 
 def _reach_from_faces(passable: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """What can be reached from the sides of the box through face neighbours."""
+    """Mark the samples that can be reached from the sides of the box through face neighbours."""
     from scipy.ndimage import label as find_components
 
     components, count = find_components(passable)

@@ -1,4 +1,4 @@
-"""Label numbers out of the slices of a file, within the memory of this computer."""
+"""Label numbers read from the slices of a file, within the memory of this computer."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ __all__ = ["empty_labels", "iterate_labels"]
 
 
 def empty_labels(name: str, shape: tuple[int, int, int]) -> NDArray[np.uint16]:
-    """Zeros of `shape` that take memory where something else is written, or a refusal where there is none for them."""
+    """Return zeros of `shape` that take memory only where they are written; refuse a shape too large for the memory."""
     size = 2 * prod(shape)
     try:
         if size <= physical_memory_bytes():
@@ -36,7 +36,7 @@ def iterate_labels(grid: GridFile) -> Iterator[NDArray[np.uint16]]:
     Raises
     ------
     RefusedInputError
-        The data end early, or hold fractions, negative or too large numbers; the slice is named.
+        The data end early, or hold fractions, negative or too large numbers; the message names the slice.
     """
     for k, stored in enumerate(grid.iterate_slices()):
         numbers = stored * grid.slope + grid.intercept if grid.scaled else stored
@@ -46,7 +46,7 @@ def iterate_labels(grid: GridFile) -> Iterator[NDArray[np.uint16]]:
 def _as_labels(stored: NDArray[Any], name: str, where: str) -> NDArray[Any]:
     if stored.dtype.kind == "f":
         with np.errstate(invalid="ignore"):
-            broken = ~(stored == np.floor(stored))  # NaN and infinity among them: infinity is caught below
+            broken = ~(stored == np.floor(stored))  # NaN and infinity give warnings; both are refused below
         if broken.any():
             raise RefusedInputError(
                 f"{name} is not a label map: {where} holds {float(stored[broken][0]):g}; labels are whole numbers,"

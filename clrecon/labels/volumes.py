@@ -1,4 +1,4 @@
-"""How much room a label has: its voxels, each as large as its own slice makes it."""
+"""Volumes of labels in ml: the sum over their voxels, each as large as the spacing of its own slice makes it."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ MM3_PER_ML = 1000.0
 
 
 def slice_voxel_ml(volume: Volume) -> NDArray[np.float64]:
-    """The volume of one voxel of each slice, shape (nk,), ml.
+    """Return the volume of one voxel of each slice, shape (nk,), ml.
 
-    A slice reaches half way to both of its neighbours along the normal, the end slices as far outward as inward: shear
+    A slice reaches half way to both of its neighbours along the normal, the end slices as far outward as inward.  Shear
     moves slices within their planes and changes no volume.
     """
     area = float(np.linalg.norm(np.cross(volume.affine[:3, 0], volume.affine[:3, 1])))
@@ -29,19 +29,19 @@ def slice_voxel_ml(volume: Volume) -> NDArray[np.float64]:
 
 
 def label_ml(labels: LabelMap, number: int) -> float:
-    """The volume of a label on the map's own grid, ml."""
+    """Return the volume of a label on the map's own grid, ml."""
     return labels.counts.get(number, 0) * abs(float(np.linalg.det(labels.affine[:3, :3]))) / MM3_PER_ML
 
 
 def count_ml(voxels: NDArray[Any], number: int, box: Box, voxel_ml: NDArray[np.float64]) -> float:
-    """The volume of the voxels of a grid that carry `number`, ml.
+    """Return the volume of the voxels of a grid that carry `number`, ml.
 
     Parameters
     ----------
     voxels : ndarray, shape (nk, nj, ni)
     number : int
     box : 3 slices
-        Of (k, j, i), around all of its voxels.
+        Slices along k, j, i, around all voxels of the label.
     voxel_ml : ndarray, shape (nk,)
         See `slice_voxel_ml`.
     """
