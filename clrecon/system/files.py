@@ -1,4 +1,4 @@
-"""Files that are written are found whole, the new one or the old one.
+"""Safe writing: a reader always finds the whole old file or the whole new file.
 
 A file is written to a temporary one in the same folder (created exclusively, readable by the owner only, with a random
 name), flushed to the disk, checked, and only then renamed over the target.  After any failure before the rename,

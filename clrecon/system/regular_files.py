@@ -1,4 +1,4 @@
-"""Files that are read are regular ones: no pipe, device or folder, which a reader might wait for."""
+"""Safe reading: only regular files are opened, no pipes or devices, for which a reader might wait without end."""
 
 from __future__ import annotations
 
