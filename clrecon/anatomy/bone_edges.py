@@ -34,7 +34,7 @@ LEAST_BONE_SHARE = 0.2
 
 @dataclass(frozen=True)
 class Background:
-    """The material that bone lies in: its mode and width, where bone begins, and the range of an edge's low side, HU."""
+    """The material that bone lies in: its mode and width, where bone begins, and the range of the low side, HU."""
 
     name: str
     mode: float

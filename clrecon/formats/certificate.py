@@ -38,7 +38,7 @@ def collect_value_warnings(values: GridValues) -> list[str]:
 
 
 def judge_spacing(grid: GridFile) -> Gate:
-    """Judge the gate ``plausible_spacing``.  Axes may be in any order; the longest step counts as that of the slices."""
+    """Judge the gate ``plausible_spacing``.  Axes may be in any order; the longest step is that of the slices."""
     *pixels, gap = sorted(column_spacing(grid.affine))
     return judge_steps(pixels, gap)
 

@@ -85,7 +85,7 @@ def _offsets_within(reach: tuple[Any, ...]) -> NDArray[np.int32]:
 
 
 def _sort(offsets: NDArray[np.int32], steps: NDArray[np.float64]) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-    """Sort offsets by length and number their shells; within a shell they are in index order, whatever rounding does."""
+    """Sort offsets by length and number their shells; within a shell they keep index order despite rounding."""
     lengths = np.linalg.norm(offsets @ steps.T, axis=1)
     order = np.argsort(lengths, kind="stable")
     offsets, lengths = offsets[order], lengths[order]
