@@ -1,4 +1,4 @@
-"""DICOM in: CT images, single slices or multi-frame, become a `clrecon.geometry.Volume` in HU and LPS mm."""
+"""Reading of DICOM: CT images, single slices or multi-frame, become a `clrecon.geometry.Volume` in HU and LPS mm."""
 
 from clrecon.dicom.reader import list_series, read_volume
 from clrecon.dicom.series.listing import SeriesEntry, SeriesListing

@@ -1,4 +1,4 @@
-"""`read_volume` and `list_series`: the two doors of this package."""
+"""`read_volume` and `list_series`: the two public functions of this package."""
 
 from __future__ import annotations
 
@@ -61,11 +61,11 @@ def read_volume(
     Raises
     ------
     NoDicomError
-        Nothing there, no DICOM, or no CT.
+        There is nothing at the path, no DICOM, or no CT.
     RefusedInputError
-        Corrupt files, or geometry or pixels that cannot be trusted; names files and figures.
+        Files are corrupt, or geometry or pixels cannot be trusted; the message names files and figures.
     UsageError
-        `series` names none or several; there is no such `phase`; `path` is empty or no path.
+        `series` matches no series or several; the `phase` does not exist; `path` is empty or not a path.
 
     Notes
     -----
@@ -110,15 +110,15 @@ def list_series(
     pixels: bool = False,
     progress: Progress | None = None,
 ) -> SeriesListing:
-    """List the series at a path, with the geometry of each, what is wrong with it, and the certificate of one.
+    """List the series at a path, with the geometry and problems of each, and the certificate of the chosen one.
 
     Parameters
     ----------
     path, series, phase, allow_gaps, force, progress
-        As in `read_volume`, which would read what is chosen here.
+        As in `read_volume`, which would read the series chosen here.
     pixels : bool
-        Read the pixels of the chosen series too, for what only they can say: padding, range of HU, saturation.
-        Without it only headers are read.
+        True: also read the pixels of the chosen series, for padding, range of HU and saturation.  False: read only
+        headers.
 
     Returns
     -------
@@ -127,11 +127,11 @@ def list_series(
     Raises
     ------
     NoDicomError
-        Nothing there or no DICOM.
+        There is nothing at the path, or no DICOM.
     RefusedInputError
         All DICOM files are corrupt, or with `pixels` those of the chosen series cannot be read.
     UsageError
-        `series` names none or several; there is no such `phase`; `path` is empty or no path.
+        `series` matches no series or several; the `phase` does not exist; `path` is empty or not a path.
     """
     phase = _checked_phase(phase)
     with _quiet_warnings():
@@ -150,7 +150,7 @@ def list_series(
             found = [judged if one is chosen else one for one in found]
             certificate = _certify_chosen(judged, scan, warnings, pixels, progress)
         entries = [describe_series(one, collect_series_warnings(one)) for one in found]
-        if certificate is not None:  # its pixels may say more than its headers
+        if certificate is not None:  # its pixels may show more than its headers
             own = [text for text in certificate.warnings if text not in warnings]
             entries = [replace(entry, warnings=own) if entry.number == number else entry for entry in entries]
     return SeriesListing(entries, number, dict(scan.skipped), warnings, certificate, refusal)
@@ -159,7 +159,7 @@ def list_series(
 def _certify_chosen(
     series: Series, scan: Scan, notes: Sequence[str], pixels: bool, progress: Progress | None
 ) -> Certificate | None:
-    """The certificate of one series, None without a valid header; `notes` are the warnings about what is beside it."""
+    """Return the certificate of one series, None without a valid header; `notes` are warnings about the other files."""
     stack = series.stack
     if stack is None or series.kind == "other":
         return None
@@ -178,7 +178,7 @@ def _describe_likeness(likeness: Likeness | None) -> list[str]:
 
 @contextmanager
 def _quiet_warnings() -> Iterator[None]:
-    """Keep the parser's Python warnings off standard error: what matters is in our own checks and report."""
+    """Keep the parser's Python warnings off standard error: our own checks and report cover all that matters."""
     with python_warnings.catch_warnings():
         python_warnings.simplefilter("ignore")
         yield

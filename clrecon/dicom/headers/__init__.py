@@ -1,1 +1,1 @@
-"""Elements of a file to the headers of its slices."""
+"""Headers: the elements of a file become the headers of its slices."""

@@ -1,4 +1,4 @@
-"""Concatenations: one multi-frame image written as several files, of which none may be missing.
+"""Concatenations: one multi-frame image written as several files, all of which must be present.
 
 Source: DICOM PS3.3 C.7.6.16.1.1.
 """
@@ -14,7 +14,7 @@ __all__ = ["CONCATENATION_TAGS", "Concatenation", "read_concatenation"]
 
 UID, PART, PARTS, FIRST_FRAME = 0x00209161, 0x00209162, 0x00209163, 0x00209228
 CONCATENATION_TAGS = (UID, PART, PARTS, FIRST_FRAME)
-"""ConcatenationUID, InConcatenationNumber, InConcatenationTotalNumber, ConcatenationFrameOffsetNumber."""
+"""The tags of ConcatenationUID, InConcatenationNumber, InConcatenationTotalNumber, ConcatenationFrameOffsetNumber."""
 
 
 @dataclass(frozen=True)
@@ -24,11 +24,11 @@ class Concatenation:
     Attributes
     ----------
     uid : str
-        Only to compare.
+        Used only for comparison.
     part, parts : int, int or None
         InConcatenationNumber, from 1, and InConcatenationTotalNumber.
     first_frame, frames : int or None, int
-        ConcatenationFrameOffsetNumber, and the frames of this file.
+        ConcatenationFrameOffsetNumber, and the number of frames in this file.
     """
 
     uid: str
@@ -39,7 +39,7 @@ class Concatenation:
 
 
 def read_concatenation(top: Item, frames: int, little: bool) -> Concatenation | None:
-    """Read the place of a file in its concatenation from its top level; None where it is in none."""
+    """Read the place of a file in its concatenation from its top level; None where it belongs to none."""
     uid = decode_text(top.values.get(UID, b""))
     if not uid:
         return None

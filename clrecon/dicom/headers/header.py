@@ -1,7 +1,7 @@
-"""From the raw elements of a file to validated slice headers: the strict gate between the parser and the geometry.
+"""Validated slice headers from the raw elements of a file: strict checks between the parser and the geometry.
 
-No value of a file gets past this module unchecked: numbers are finite, in the right count and within a plausible
-range, or there is a problem that names the file and the tag.
+No value of a file gets past this module unchecked: numbers are finite, in the right count and within a plausible range,
+or a problem names the file and the tag.
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ SECONDARY_CAPTURE = "1.2.840.10008.5.1.4.1.1.7"
 DICOMDIR_CLASS = "1.2.840.10008.1.3.10"
 
 DERIVED_WORDS = frozenset("MPR MIP MINIP MAXIP AIP PROJECTION REFORMATTED CPR CURVED VRT SSD".split())
-"""Words of ImageType that, beside DERIVED, mean computed images: other planes, projections, renderings."""
+"""Words of ImageType that, together with DERIVED, mark computed images: other planes, projections, renderings."""
 
 PATIENT_POSITIONS = frozenset("HFP HFS HFDR HFDL FFDR FFDL FFP FFS LFP LFS RFP RFS AFDR AFDL PFDR PFDL".split())
-"""Defined terms of PatientPosition (PS3.3 C.7.3.1.1.2); anything else is free text and goes nowhere."""
+"""Defined terms of PatientPosition (PS3.3 C.7.3.1.1.2); other values are free text and are dropped."""
 
 FLOAT_PIXEL_BITS = {0x7FE00008: 32, 0x7FE00009: 64}
 """Float and Double Float Pixel Data: BitsAllocated (PS3.3 C.7.6.24, C.7.6.25)."""
@@ -42,7 +42,7 @@ RESCALE_SLOPE = (1e-6, 1e6)
 RESCALE_INTERCEPT_LIMIT = 1e9
 
 
-# The slices of a series share what they have in common: a tree of 100,000 files stays small in memory.
+# The slices of a series share equal values, so that a tree of 100,000 files needs little memory.
 _share_identity = lru_cache(1024)(SeriesIdentity)
 
 
@@ -66,13 +66,14 @@ def read_headers(
     Returns
     -------
     list of SliceHeader, OtherImage or None
-        One slice, or one a frame; None for a DICOMDIR, which only lists what is on the disk anyway.
+        One header for the slice, or one for each frame; None for a DICOMDIR, which only lists files that are found
+        anyway.
 
     Raises
     ------
     NotDicomError, CorruptFileError, OSError
-        As `read_elements`; also corrupt is a CT image that ends before its pixel data, or goes on behind it with
-        what is no element.
+        As `read_elements`. A CT image is also corrupt when it ends before its pixel data, or when the bytes after them
+        are not elements.
     """
     elements = read_elements(path, WANTED_TAGS, start, force)
     values = Values(elements)
@@ -131,7 +132,7 @@ def _check_single_frame(values: Values, sop_class: str) -> None:
 def _read_frames(
     elements: DicomElements, series: SeriesIdentity, path: Path, name: str, force: bool
 ) -> list[SliceHeader] | OtherImage:
-    """One header a frame of an enhanced image, or the first thing that is wrong with it."""
+    """Read one header for each frame of an enhanced image, or return the first problem."""
     frames, place = 1, name
     headers: list[SliceHeader] = []
     said: tuple[str, ...] = ()
@@ -160,7 +161,7 @@ def _read_frames(
 
 
 def _check_matrix(samples: int, photometric: str, rows: int, columns: int) -> None:
-    """Refuse colours, and pictures without pixels."""
+    """Refuse colour images, and images without pixels."""
     if samples != 1 or photometric not in ("MONOCHROME1", "MONOCHROME2"):
         found = photometric or "nothing"
         raise ValueProblem(
@@ -251,7 +252,7 @@ def _validate(values: Values, series: SeriesIdentity, path: Path, name: str, *, 
 
 
 def _validate_geometry(values: Values) -> tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...]]:
-    """PixelSpacing (row, column), ImageOrientationPatient and ImagePositionPatient, within sane limits."""
+    """Check PixelSpacing (row, column), ImageOrientationPatient and ImagePositionPatient against plausible limits."""
     spacing = values.decimals("PixelSpacing", 2)
     low, high = PIXEL_SPACING_MM
     if not all(low <= length <= high for length in spacing):
@@ -266,7 +267,7 @@ def _validate_geometry(values: Values) -> tuple[tuple[float, ...], tuple[float, 
 
 
 def _validate_rescale(values: Values) -> tuple[float, float]:
-    """RescaleSlope and RescaleIntercept; 1 and 0 where they are missing, which the certificate warns of."""
+    """Check RescaleSlope and RescaleIntercept; 1 and 0 if they are missing, which the certificate warns of."""
     slope = values.decimals("RescaleSlope", 1)[0] if "RescaleSlope" in values else 1.0
     intercept = values.decimals("RescaleIntercept", 1)[0] if "RescaleIntercept" in values else 0.0
     if not RESCALE_SLOPE[0] <= abs(slope) <= RESCALE_SLOPE[1]:
@@ -295,7 +296,7 @@ def _validate_bits(values: Values) -> tuple[int, int, int, bool]:
 
 
 def _validate_float_bits(values: Values) -> tuple[int, int, int, bool]:
-    """Float pixels fill their cells, are signed, and the standard gives them no rescale (PS3.3 C.7.6.24)."""
+    """Check float pixels: all bits are used, they are signed, and the standard defines no rescale (PS3.3 C.7.6.24)."""
     bits = FLOAT_PIXEL_BITS[values.elements.pixel_tag or 0]
     if values.unsigned("BitsAllocated") != bits:
         raise values.wrong("BitsAllocated", f"{bits} for float pixels of this width")

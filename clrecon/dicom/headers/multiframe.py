@@ -1,10 +1,10 @@
-"""From a multi-frame CT image to the elements of each of its frames, as if each were a file of its own.
+"""Multi-frame CT images: the elements of each frame, as if the frame were a file of its own.
 
-What a classic image says at its top level, an enhanced one says in functional groups: shared by all frames or for
-each of them.  The wanted values of the groups are laid over those of the top level, so that one set of checks
-(`clrecon.dicom.headers.header`) stands over slices and frames alike.  A frame's place is its Plane Position alone:
-the order of the frames, In-Stack Position Number and Dimension Index Values play no part in the geometry, they only
-help to tell frames at the same place apart.
+A classic image has its elements at the top level.  An enhanced image has them in functional groups, shared by all
+frames or for each frame.  The wanted values of the groups replace those of the top level, so that slices and frames
+pass the same checks (`clrecon.dicom.headers.header`). A frame's place comes from its Plane Position alone.  The order
+of the frames, In-Stack Position Number and Dimension Index Values are not used for the geometry; they only help to
+distinguish frames at the same place.
 
 Source: DICOM PS3.3 A.38 (Enhanced CT), A.70 (Legacy Converted Enhanced CT), C.7.6.16 (functional groups), C.7.6.17
 (dimensions), C.8.15 (Enhanced CT).
@@ -54,14 +54,14 @@ RESCALE = (RESCALE_INTERCEPT, RESCALE_SLOPE, RESCALE_TYPE)
 LOSSY = 0x00282110
 REAL_SLOPE, REAL_INTERCEPT, REAL_UNITS, CODE_VALUE = 0x00409225, 0x00409224, 0x004008EA, 0x00080100
 CALIBRATING = (PLANE_POSITION, PLANE_ORIENTATION, PIXEL_MEASURES, PIXEL_VALUE_TRANSFORMATION, REAL_WORLD_VALUES)
-HU_CODES = ("[hnsf'U]", "HU")  # UCUM
+HU_CODES = ("[hnsf'U]", "HU")  # codes of UCUM
 GEOMETRY = (0x00200032, 0x00200037, 0x00280030, 0x00180050, 0x00180088)
 """ImagePositionPatient, ImageOrientationPatient, PixelSpacing, SliceThickness, SpacingBetweenSlices: at the top level
-of a multi-frame image these have no place and no meaning."""
+of a multi-frame image they have no meaning."""
 
 PLACE_POINTERS = (0x00200032, 0x00200037, 0x00209057, 0x00201041, 0x00209113, 0x00209116, 0x00200013)
-"""Dimensions that only number the places: position, orientation, InStackPositionNumber, SliceLocation; and the files
-that a converter had before it, InstanceNumber."""
+"""Dimensions that only number the places: position, orientation, InStackPositionNumber, SliceLocation; and
+InstanceNumber, which numbers the files that a converter read."""
 
 
 def _wanted(*tags: int) -> Schema:
@@ -84,8 +84,8 @@ _MACROS: dict[int, Schema] = {
     0x00189325: _wanted(0x00180060),  # CTXRayDetailsSequence: KVP
 }
 _MAPPING: Schema = {REAL_SLOPE: None, REAL_INTERCEPT: None, REAL_UNITS: _wanted(CODE_VALUE)}
-# What a classic image said outside of the macros: when and how it was taken, padding, and rescale where a converter
-# did not move it; nothing of the geometry and nothing of the form of the pixels.
+# Elements of a classic image that no macro holds: time and manner of acquisition, padding, and rescale where a
+# converter did not move it.  The geometry and the form of the pixels are not among them.
 _UNASSIGNED = _wanted(
     0x00080022, 0x00080023, 0x00080032, 0x00080033, 0x00180060, 0x00181060, 0x00181210, 0x00200012, 0x00200100,
     0x00280120, 0x00280121, *RESCALE, LOSSY,
@@ -113,9 +113,9 @@ class Groups:
     ----------
     shared : Item
     frames : list of Item
-        One a frame.
+        One for each frame.
     dimensions : tuple of (int, str)
-        Place in DimensionIndexValues and name of the dimensions that are not a place in the patient.
+        Index in DimensionIndexValues and name of each dimension that is not a place in the patient.
     concatenation : Concatenation or None
     warnings : tuple of str
     """
@@ -129,17 +129,17 @@ class Groups:
 
 @dataclass(frozen=True)
 class Frame:
-    """One frame as a classic image would have it.
+    """One frame in the form of a classic image.
 
     Attributes
     ----------
     elements : DicomElements
-        Those of the file, the values of the frame's groups laid over them.
+        Elements of the file, replaced by the values of the frame's groups.
     phase : tuple of (str, str)
         Keyword and value, see `SliceHeader`.
     warnings : tuple of str
     problem : ValueProblem or None
-        What is wrong with its groups; the elements are not to be used then.
+        The problem of its groups; if there is one, do not use the elements.
     """
 
     elements: DicomElements
@@ -149,19 +149,19 @@ class Frame:
 
 
 def read_groups(path: Path, elements: DicomElements) -> Groups:
-    """Read the functional groups of a multi-frame image, of which the elements of the top level are known.
+    """Read the functional groups of a multi-frame image, given the elements of its top level.
 
     Parameters
     ----------
     path : Path
     elements : DicomElements
-        Those of the top level, with NumberOfFrames; there is pixel data.
+        Elements of the top level, with NumberOfFrames; the file has pixel data.
 
     Raises
     ------
     ValueProblem
-        NumberOfFrames is no sane number, the groups are missing, not as many as the frames, or cannot be parsed;
-        the file has no meta header.
+        NumberOfFrames is implausible; the groups are missing, do not match the number of frames, or cannot be parsed;
+        or the file has no meta header.
     OSError
         The file cannot be read.
     """
@@ -208,8 +208,8 @@ def read_groups(path: Path, elements: DicomElements) -> Groups:
 def split_frames(elements: DicomElements, groups: Groups) -> Iterator[Frame]:
     """Give each frame the elements that a classic image of it would have.
 
-    Of one value at several places the first of these is taken: macro of the frame, shared macro, unassigned
-    attributes of the frame, shared ones, top level.
+    Where a value is given at several places, the first of these is used: macro of the frame, shared macro, unassigned
+    attributes of the frame, shared unassigned attributes, top level.
 
     Yields
     ------
@@ -226,9 +226,9 @@ def split_frames(elements: DicomElements, groups: Groups) -> Iterator[Frame]:
             _lay_over(frame, groups.shared.sequences.get(UNASSIGNED_SHARED, []))
             _lay_over(frame, item.sequences.get(UNASSIGNED_FRAME, []))
             if PIXEL_VALUE_TRANSFORMATION in macros:
-                for tag in RESCALE:  # a slope of the macro is not to meet an intercept from elsewhere
+                for tag in RESCALE:  # slope and intercept must come from the same place
                     frame.values.pop(tag, None)
-            if elements.values.get(LOSSY):  # what is lossy for the file is so for its frames
+            if elements.values.get(LOSSY):  # a lossy file has lossy frames
                 frame.values[LOSSY] = max(elements.values[LOSSY], frame.values[LOSSY])
             _lay_over(frame, (items[0] for tag, items in macros.items() if tag != REAL_WORLD_VALUES))
             _take_times(frame)
@@ -241,7 +241,7 @@ def split_frames(elements: DicomElements, groups: Groups) -> Iterator[Frame]:
 
 
 def _merge_macros(shared: Item, frame: Item) -> dict[int, list[Item]]:
-    """The macros of one frame that are not empty; refuses those that are there twice and do not agree."""
+    """Return the macros of one frame that are not empty; refuse macros that occur twice and differ."""
     macros: dict[int, list[Item]] = {}
     for source in (shared, frame):
         for tag, items in source.sequences.items():
@@ -262,7 +262,7 @@ def _lay_over(frame: DicomElements, items: Iterable[Item]) -> None:
 
 
 def _take_times(frame: DicomElements) -> None:
-    """When a frame was taken goes to where a slice has it: date and time apart."""
+    """Write the time of a frame to the elements that a slice has for it: date and time separately."""
     for tag in (FRAME_ACQUISITION_TIME, FRAME_REFERENCE_TIME):
         found = re.match(rb"(\d{8})(\d{2,6}(?:\.\d{1,6})?)", frame.values.get(tag, b""))
         if found is not None:
@@ -272,7 +272,7 @@ def _take_times(frame: DicomElements) -> None:
 
 
 def _check_frame_type(frame: DicomElements, warnings: list[str]) -> None:
-    """FrameType takes the place of ImageType; frames that are no plane, or no measured HU, are refused or warned of."""
+    """Use FrameType as ImageType; refuse frames that are not planes; refuse or warn of values not measured as HU."""
     values = frame.values
     if FRAME_TYPE in values:
         values[IMAGE_TYPE], frame.vrs[IMAGE_TYPE] = values.pop(FRAME_TYPE), frame.vrs.pop(FRAME_TYPE)
@@ -293,7 +293,7 @@ def _check_frame_type(frame: DicomElements, warnings: list[str]) -> None:
 
 
 def _take_real_world_values(frame: DicomElements, mappings: list[Item], warnings: list[str]) -> None:
-    """Take the mapping to HU for the rescale, where there is none or it leads to something else."""
+    """Use the real-world mapping to HU as the rescale, if there is no rescale or it gives other values."""
     kind = _words(frame.values.get(RESCALE_TYPE))[0]
     if RESCALE_SLOPE in frame.values and kind in ("", "HU"):
         return
@@ -346,20 +346,20 @@ def _name_dimensions(dimensions: list[Item], little: bool) -> Iterator[tuple[int
 
 
 def _read_header_bytes(path: Path, elements: DicomElements) -> tuple[bytes, int]:
-    """The data set up to its pixel data, and where in these bytes it starts."""
+    """Return the data set up to its pixel data, and the offset in these bytes where it starts."""
     if elements.pixel_offset > HEADER_BYTES_LIMIT:
         raise ValueProblem(f"a header of {elements.pixel_offset} bytes, no more than {HEADER_BYTES_LIMIT} are read")
     with open_regular(path) as file:
         if elements.inflate_from >= 0:
             file.seek(elements.inflate_from)
-            deflated = file.read(2 * elements.pixel_offset + 1024)  # what does not shrink grows by 5 bytes in 16 KiB
+            deflated = file.read(2 * elements.pixel_offset + 1024)  # incompressible data grow by 5 bytes in 16 KiB
             return zlib.decompressobj(-zlib.MAX_WBITS).decompress(deflated, elements.pixel_offset), 0
         data = file.read(elements.pixel_offset)
     return data, find_data_set(data)
 
 
 def find_data_set(data: bytes) -> int:
-    """The byte behind the file meta elements."""
+    """Return the offset of the byte after the file meta elements."""
     start = META_START
     while data[start : start + 2] == b"\x02\0":  # file meta elements: explicit VR little endian
         long = data[start + 4 : start + 6] in (b"OB", b"UN", b"OW", b"SQ", b"UT")
@@ -369,5 +369,5 @@ def find_data_set(data: bytes) -> int:
 
 
 def _words(raw: bytes | None) -> list[str]:
-    """The values of a code string, at least one."""
+    """Return the values of a code string, at least one."""
     return [word.strip(" ") for word in decode_text(raw or b"").upper().split("\\")]

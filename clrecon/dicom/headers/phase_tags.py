@@ -1,4 +1,4 @@
-"""Elements that tell the phases of one series apart: several volumes at one place."""
+"""Elements that distinguish the phases of one series: several volumes at one place."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ FRAME_PHASES = (
     ("StackID", 0x00209056, ""),
     ("FrameAcquisitionNumber", 0x00209156, "H"),
 )
-"""What the functional groups have to tell frames at the same place apart, the most telling first; "" is text."""
+"""Elements of functional groups that distinguish frames at the same place, the most specific first; "" marks text."""
 
 SLICE_PHASES = (
     "TemporalPositionIdentifier",
@@ -29,4 +29,4 @@ SLICE_PHASES = (
     "ContentTime",
 )
 PHASE_KEYWORDS = (*(keyword for keyword, _, _ in FRAME_PHASES), *SLICE_PHASES)
-"""What tells the phases of one series apart, the most telling first: what only frames say, then what slices say."""
+"""Elements that distinguish the phases of a series, the most specific first: those of frames, then of slices."""

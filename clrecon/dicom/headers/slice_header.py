@@ -1,4 +1,4 @@
-"""`SliceHeader`: what is known of one CT slice before its pixels are read, as the geometry and the reader take it."""
+"""`SliceHeader`: the facts about one CT slice before its pixels are read, for the geometry and the reader."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ __all__ = ["OtherImage", "SeriesIdentity", "SliceHeader"]
 
 @dataclass(frozen=True, slots=True)
 class SeriesIdentity:
-    """What a file says of its series: UID, number (None where missing), description, modality, UID of the study."""
+    """A series as a file names it: UID, number (None if missing), description, modality, UID of the study."""
 
     uid: str
     number: int | None
@@ -23,16 +23,16 @@ class SeriesIdentity:
 
 @dataclass(frozen=True, slots=True)
 class OtherImage:
-    """A DICOM object that cannot be a slice, and why.
+    """A DICOM object that cannot be a slice, and the reason.
 
     Attributes
     ----------
     frames : int
-        Functional groups of frames that it holds, 1 where it has none.
+        Number of per-frame functional groups, 1 where it has none.
     kind : {"broken", "capture", "other"}
-        A CT image with a wrong header; a secondary capture; anything that is no CT.
+        "broken": a CT image with a wrong header.  "capture": a secondary capture.  "other": any other object.
     problem : str
-        One line; names the file and the tag where there is one.
+        One line, which names the file and, if there is one, the tag.
     """
 
     series: SeriesIdentity
@@ -43,23 +43,23 @@ class OtherImage:
     problem: str
 
 
-@dataclass(frozen=True, slots=True, eq=False, repr=False)  # both would be written at every start of the program
+@dataclass(frozen=True, slots=True, eq=False, repr=False)  # both take time at every start of the program
 class SliceHeader:
-    """Everything that is known of one CT slice before its pixels are read. All values are validated.
+    """All facts about one CT slice before its pixels are read.  All values are validated.
 
     Attributes
     ----------
     file, name : Path, str
-        Where it is; base name, escaped for messages, with the number of the frame (from 1) where there are several.
+        Path of the file; its base name, escaped for messages, with the frame number (from 1) where there are several.
     frame, frames : int
-        Which frame of the file it is, from 0, and how many the file holds.
+        Frame index in the file, from 0, and number of frames in the file.
     localizer : bool
-        ImageType says LOCALIZER.
+        True: ImageType contains LOCALIZER.
     concatenation : Concatenation or None
-        Of which part of a concatenation it is.
+        The part of a concatenation that the slice belongs to.
     phase : tuple of (str, str)
-        Keyword and value of what may tell this slice from another one at the same place: see
-        `clrecon.dicom.headers.phase_tags.PHASE_KEYWORDS`; the most telling first.
+        Keyword and value of the elements that can distinguish this slice from others at the same place, the most
+        specific first: see `clrecon.dicom.headers.phase_tags.PHASE_KEYWORDS`.
     rows, columns : int
     row_cosines, column_cosines : tuple of 3 float
         ImageOrientationPatient as stored.
@@ -76,12 +76,12 @@ class SliceHeader:
     slope, intercept : float
         1 and 0 where the file has none, see `has_slope` and `has_intercept`.
     patient_hash : str or None
-        Only to compare: it goes into no message and no report.
+        Used only for comparison, never written to messages or reports.
     pixel_offset, pixel_length, inflate_from, file_bytes : int
         See `DicomElements`.
     warnings : tuple of str
     patient_position : str
-        How the patient lay in the scanner, such as HFS; empty where it is not one of `PATIENT_POSITIONS`.
+        Position of the patient in the scanner, for example HFS; empty if it is not one of `PATIENT_POSITIONS`.
     derived : tuple of str
         The `DERIVED_WORDS` of a derived image; empty for an image that was measured.
     """

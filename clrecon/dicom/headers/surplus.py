@@ -1,9 +1,9 @@
-"""What a file holds beyond the pixels that its header promises: padding, further elements, or the trace of damage.
+"""Surplus bytes beyond the pixels that a header promises: padding, further elements, or a sign of damage.
 
-A header with one column less than there are shears the picture, and a transfer that took the file for text (each LF
-became CRLF) moves all pixels behind the first one: both leave bytes over, and nothing else tells.  So bytes that are
-left over have to say what they are.  Zeros within the pixel data are padding, which some scanners write; behind the
-pixel data stand elements with rising tags, (FFFC,FFFC) the last of them, or nothing (DICOM PS3.5 7.1, PS3.10 7.2).
+A header with one column too few shears the picture.  A transfer as text (each LF became CRLF) moves all pixels after
+the first LF.  Surplus bytes are the only sign of both faults, so they must be explained.  Zeros within the pixel data
+are padding, which some scanners write.  After the pixel data there may be elements with rising tags, the last of them
+(FFFC,FFFC), or nothing (DICOM PS3.5 7.1, PS3.10 7.2).
 """
 
 from __future__ import annotations
@@ -30,19 +30,19 @@ __all__ = ["check_surplus"]
 
 PADDING_TAG = 0xFFFCFFFC
 INFLATED_LIMIT = 1 << 30
-"""Bytes of one data set that are inflated at most."""
+"""Most bytes of one data set that are inflated."""
 LOOKED_AT_BYTES = 16 * 2**20
-"""Of a sequence without length, or of a deflated data set behind its pixels."""
+"""Most bytes that are examined of a sequence without length, or of a deflated data set after its pixels."""
 MOST_PADDING_BYTES = 64 * 2**20
-"""More zeros are none, and more of a picture is not looked at: a sparse file holds them without end."""
+"""Longest padding of zeros, and most bytes of pixels that are examined: a sparse file can hold zeros without end."""
 MOST_ELEMENTS = 10_000
 SHEARED = 0.98
-"""Rows are so much more alike with another count of columns.  Noise alone makes no difference."""
+"""Ratio of row differences below which another number of columns explains the pixels better.  Noise gives 1."""
 _CHUNK = 2**20
 
 
 def check_surplus(elements: DicomElements, header: SliceHeader, force: bool = False) -> tuple[str, ...]:
-    """Look at what is left over in a file with uncompressed pixels.
+    """Examine the surplus bytes of a file with uncompressed pixels.
 
     Parameters
     ----------
@@ -50,7 +50,7 @@ def check_surplus(elements: DicomElements, header: SliceHeader, force: bool = Fa
     header : SliceHeader
         The file's only or first slice; the file holds its pixels.
     force : bool
-        Take what is no padding for padding.
+        True: accept surplus bytes other than zeros as padding.
 
     Returns
     -------
@@ -60,16 +60,16 @@ def check_surplus(elements: DicomElements, header: SliceHeader, force: bool = Fa
     Raises
     ------
     ValueProblem
-        More pixels than Rows, Columns, bits and frames say.
+        There are more pixels than Rows, Columns, bits and frames say.
     CorruptFileError
-        What follows the pixel data is no element.
+        The bytes after the pixel data are not elements.
     OSError
         The file cannot be read.
     """
     if is_encapsulated(header.transfer_syntax):
         return _check_encapsulated(elements, header, force)
     expected = header.frames * header.pixel_bytes
-    length = expected + expected % 2  # of an odd count one byte of padding is the rule
+    length = expected + expected % 2  # after an odd count the standard asks for one padding byte
     end = header.pixel_offset + header.pixel_length
     if header.pixel_length in (expected, length) and end == header.file_bytes and header.inflate_from < 0:
         return ()
@@ -78,11 +78,11 @@ def check_surplus(elements: DicomElements, header: SliceHeader, force: bool = Fa
         file: BinaryIO = opened
         if header.inflate_from >= 0:
             if header.pixel_offset + expected > INFLATED_LIMIT:
-                return ()  # reading refuses it
+                return ()  # reading refuses this
             inflated = _inflate(file, header.inflate_from, header.pixel_offset + expected)
             file, size = io.BytesIO(inflated), len(inflated)
             if size < header.pixel_offset + expected:
-                return ()  # it is cut, which reading says
+                return ()  # the file is cut off, which reading reports
         warnings = []
         if header.pixel_length > length:
             warnings.append(_judge_excess(file, header, expected, min(end, size) - header.pixel_offset, force))
@@ -96,12 +96,12 @@ def _check_encapsulated(elements: DicomElements, header: SliceHeader, force: boo
         try:
             end = find_end(file, header.pixel_offset, header.file_bytes)
         except RefusedInputError:
-            return ()  # cut or damaged, which reading says
+            return ()  # cut off or damaged, which reading reports
         return tuple(_judge_tail(file, elements, end, header.file_bytes, force)) if end < header.file_bytes else ()
 
 
 def _judge_excess(file: BinaryIO, header: SliceHeader, expected: int, found: int, force: bool) -> str:
-    """More bytes in the pixel data than its pixels take."""
+    """Judge pixel data that are longer than their pixels."""
     frames = f"{header.frames} x " if header.frames > 1 else ""
     counts = (
         f"Pixel Data has {header.pixel_length} bytes, {frames}{header.columns} x {header.rows} x "
@@ -122,7 +122,7 @@ def _judge_excess(file: BinaryIO, header: SliceHeader, expected: int, found: int
 
 
 def _is_zero(file: BinaryIO, place: int, count: int) -> bool:
-    """True for bytes of 0; of more than `MOST_PADDING_BYTES` nobody looks whether they are."""
+    """True for bytes of 0; False for more than `MOST_PADDING_BYTES`, which are not examined."""
     if count > MOST_PADDING_BYTES:
         return False
     file.seek(place)
@@ -135,7 +135,9 @@ def _is_zero(file: BinaryIO, place: int, count: int) -> bool:
 
 
 def _find_hidden_columns(file: BinaryIO, header: SliceHeader, found: int) -> int:
-    """Columns that the pixels of the first frame show by themselves, where the bytes would do for more; else 0."""
+    """Return the number of columns that the first frame's pixels suggest, if the bytes suffice for more columns; else
+    0.
+    """
     item = header.bits_allocated // 8
     columns, rest = divmod(found, header.frames * header.rows * item)
     if rest or columns <= header.columns or header.rows < 2:
@@ -153,13 +155,13 @@ def _find_hidden_columns(file: BinaryIO, header: SliceHeader, found: int) -> int
 
 
 def _measure_steps(picture: NDArray[np.float64]) -> float:
-    """Mean size of the steps between rows; of float pixels some may be no numbers."""
+    """Return the mean difference between rows; float pixels may hold NaN."""
     with np.errstate(all="ignore"):
         return float(np.mean(np.abs(np.diff(picture, axis=0))))
 
 
 def _judge_tail(file: BinaryIO, elements: DicomElements, end: int, size: int, force: bool) -> list[str]:
-    """Bytes behind the pixel data, `end` to `size`."""
+    """Judge the bytes after the pixel data, from `end` to `size`."""
     if _is_zero(file, end, size - end):
         counts = f"{size - end} zero bytes behind the pixel data"
         if not force:
@@ -176,12 +178,12 @@ def _judge_tail(file: BinaryIO, elements: DicomElements, end: int, size: int, fo
 
 
 def _check_tail(file: BinaryIO, start: int, size: int, *, implicit: bool, little_endian: bool) -> None:
-    """Walk over what stands behind the pixel data, from `start` to the end of the file at `size`.
+    """Walk over the bytes after the pixel data, from `start` to the end of the file at `size`.
 
     Raises
     ------
     CorruptFileError
-        It is no row of elements with rising tags.
+        They are not elements with rising tags.
     OSError
         The file cannot be read.
     """
@@ -211,7 +213,7 @@ def _check_tail(file: BinaryIO, start: int, size: int, *, implicit: bool, little
 
 
 def _read_head(head: bytes, implicit: bool, little: bool) -> tuple[int, int, int]:
-    """Tag and length of an element, and bytes of its head; the tag is 0 where the bytes are no head."""
+    """Return tag and length of an element, and the size of its head; the tag is 0 where the bytes are not a head."""
     order = "<" if little else ">"
     group, element = struct.unpack(order + "HH", head[:4])
     tag = group << 16 | element
@@ -225,14 +227,14 @@ def _read_head(head: bytes, implicit: bool, little: bool) -> tuple[int, int, int
 
 
 def _was_sent_as_text(file: BinaryIO, start: int, size: int) -> bool:
-    """True where every LF follows a CR, of which one of 256 does by chance."""
+    """True where every LF follows a CR; in random data one of 256 does."""
     file.seek(start)
     data = file.read(min(size - start, _CHUNK))
     return data.count(b"\n") > 8 and data.count(b"\n") == data.count(b"\r\n")
 
 
 def _inflate(file: BinaryIO, start: int, needed: int) -> bytes:
-    """A deflated data set, `needed` bytes of it and `LOOKED_AT_BYTES` more at most."""
+    """Inflate a deflated data set: `needed` bytes of it and at most `LOOKED_AT_BYTES` more."""
     file.seek(start)
     inflater = zlib.decompressobj(-zlib.MAX_WBITS)
     inflated = bytearray()

@@ -1,1 +1,1 @@
-"""Bytes of a file to elements and their values."""
+"""Parsing: the bytes of a file become elements and their values."""

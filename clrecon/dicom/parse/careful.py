@@ -1,7 +1,7 @@
-"""The careful parser: pydicom's element generator over any file, however odd, with every way it can fail caught.
+"""The careful parser: pydicom's element generator for files of any form, with all of its errors caught.
 
-The plain parser leaves to it whatever is not in plain order.  pydicom is imported at the first call: most series never
-need it.
+It gets all files that the plain parser cannot handle.  pydicom is imported at the first call: most series never need
+it.
 """
 
 from __future__ import annotations
@@ -30,13 +30,13 @@ __all__ = ["parse_carefully"]
 INFLATE_STEP = 1 << 18
 META_TAGS = (MEDIA_CLASS, TRANSFER_SYNTAX)
 DESCRIPTIVE_TAGS = (0x00080005, 0x0008103E)
-"""SpecificCharacterSet and SeriesDescription: a label, in which two values spoil nothing that is measured."""
+"""SpecificCharacterSet and SeriesDescription.  They only describe, so two different values in one file do no harm."""
 
 READ_LIMIT = 4 * 1024 * 1024
-"""Bytes that are read of one file at most; what is stepped over by its length does not count.
+"""Most bytes that are read of one file; values that are skipped by their length do not count.
 
-pydicom makes objects of all that sequences of undefined length hold, in 50 times their size and within seconds a MiB,
-and looks for the end of other such values in all that follows.
+pydicom turns everything inside sequences of undefined length into objects, which takes 50 times the memory and seconds
+for each MiB. For other values of undefined length it searches the whole rest of the file for the end.
 """
 
 
@@ -65,25 +65,25 @@ def parse_carefully(file: BinaryIO, size: int, wanted: tuple[int, ...] | None) -
         raise CorruptFileError("sequences are nested too deep") from error
     except Exception as error:
         if isinstance(error, OSError) and error.errno is not None:
-            raise  # of the disk; the parser's own, for a sequence that is cut, have no number
+            raise  # errors of the disk have a number; those of the parser, for a cut sequence, have none
         # The parser meets hostile bytes here and may fail in any way; all of them mean the same to us.
         raise CorruptFileError(f"cannot be parsed ({type(error).__name__})") from error
 
 
 class _MeteredFile:
-    """A file of which no more than `READ_LIMIT` bytes are read."""
+    """A file of which at most `READ_LIMIT` bytes are read."""
 
     def __init__(self, file: BinaryIO):
         self.seek, self.tell = file.seek, file.tell
         self._read, self._left = file.read, READ_LIMIT
 
     def read(self, count: int) -> bytes:
-        """As that of the file.
+        """Read as the file does.
 
         Raises
         ------
         CorruptFileError
-            The limit is passed.
+            The limit is exceeded.
         """
         self._left -= count
         if self._left < 0:
@@ -132,10 +132,10 @@ def _parse_file(file: BinaryIO, size: int, wanted: tuple[int, ...] | None) -> Di
 def _collect(
     file: BinaryIO, *, implicit: bool, little: bool, last_group: int | None, wanted: tuple[int, ...] | None
 ) -> tuple[dict[int, bytes], dict[int, str | None], list[str]]:
-    """Read elements up to the end of `last_group`, or up to the pixel data; the file is left standing there.
+    """Read elements up to the end of `last_group`, or up to the pixel data; the file position is left there.
 
-    Returns values, their VRs, and what is odd about their order.  pydicom's data sets keep the last of two elements
-    of one tag without a word: here they are met one by one.
+    Returns values, their VRs, and remarks about their order.  pydicom's data sets silently keep the last of two
+    elements of one tag; here each element is seen.
     """
     from pydicom.filereader import data_element_generator
 
@@ -164,10 +164,10 @@ def _collect(
 
 
 class _Order:
-    """Watches over elements that stand twice, or after one of a higher tag (PS3.5 7.1 has neither).
+    """Watches for elements that occur twice, or after an element of a higher tag (PS3.5 7.1 allows neither).
 
-    Which of two values was meant nobody can tell: where it may change a result the file is corrupt.  The same value
-    twice, or in another place than it should be, is what it is.
+    Of two different values nobody can tell which was meant: where this could change a result, the file is corrupt.  The
+    same value twice, or a value in a wrong place, gives only a remark.
     """
 
     def __init__(self) -> None:
@@ -176,12 +176,12 @@ class _Order:
         self._last = 0
 
     def add(self, tag: int, value: bytes) -> None:
-        """Take the next element.
+        """Add the next element.
 
         Raises
         ------
         CorruptFileError
-            It was there before, with another value.
+            The element occurred before, with another value.
         """
         from pydicom.datadict import keyword_for_tag
 
@@ -201,7 +201,9 @@ class _Order:
 
 
 def _looks_implicit(file: BinaryIO, start: int) -> bool | None:
-    """Tell the encoding from the first element: explicit VR has two capital letters there. None at the end."""
+    """Tell the encoding from the first element: explicit VR has two capital letters there.  None at the end of the
+    data.
+    """
     head = file.read(6)
     file.seek(start)
     if len(head) < 6:
@@ -217,7 +219,7 @@ def _inflate_header(file: BinaryIO) -> bytes:
         try:
             deflated = inflater.unconsumed_tail or file.read(INFLATE_STEP)
         except CorruptFileError:
-            break  # as much as is read of a file: what there is may do
+            break  # the limit is that of other files; data up to it are used
         if not deflated:
             break
         inflated += inflater.decompress(deflated, READ_LIMIT - len(inflated))

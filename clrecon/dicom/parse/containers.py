@@ -1,4 +1,4 @@
-"""What a file that is no DICOM is, told from its first bytes, so that a message can say what to do about it."""
+"""File types other than DICOM, told from their first bytes, so that a message can say what to do."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Iterable
 
 __all__ = ["advise_on", "describe_container"]
 
-# First bytes, the most telling first.
+# First bytes of each type, the longest and surest first.
 _STARTS = (
     (b"PK\x03\x04", "zip archive"),
     (b"PK\x05\x06", "zip archive"),
@@ -40,7 +40,7 @@ _GRIDS = frozenset(("NRRD volume", "MetaImage volume", "NIfTI volume"))
 
 
 def describe_container(start: bytes) -> str:
-    """Name the kind of a file by its first bytes (262 or more tell all); empty where they say nothing."""
+    """Name the type of a file by its first bytes (262 bytes suffice for all); empty if they are unknown."""
     for mark, kind in _STARTS:
         if start.startswith(mark):
             return kind
@@ -49,7 +49,7 @@ def describe_container(start: bytes) -> str:
 
 
 def advise_on(kinds: Iterable[str]) -> str:
-    """What to do about files of these kinds; empty where there is nothing to be said."""
+    """Return advice about files of these types; empty if there is none."""
     kinds = set(kinds)
     packed, grids = sorted(_PACKED & kinds), sorted(_GRIDS & kinds)
     advice = [f"unpack each {' and '.join(packed)} and name the folder"] if packed else []

@@ -1,8 +1,8 @@
-"""From the bytes of one file to its raw data elements, values still undecoded, and the place of its pixel data.
+"""The raw data elements of one file, with undecoded values, and the place of its pixel data.
 
 Only the start of a file is read: the first `PREFIX_BYTES` hold the header of nearly every CT image.  The plain parser
-walks over it by lengths; whatever it leaves open is parsed with pydicom, from the file where need be.  No value is
-converted here, because pydicom lets wrong ones through (text, NaN, the wrong count) without an error.
+walks over it by lengths.  Files that it cannot handle are parsed with pydicom.  No value is converted here, because
+pydicom accepts wrong values (text, NaN, the wrong count) without an error.
 """
 
 from __future__ import annotations
@@ -32,17 +32,17 @@ __all__ = [
 
 PREFIX_BYTES = 16 * 1024
 LONG_PREFIX_BYTES = 256 * 1024
-"""Read at once where the first prefix does not hold the whole header: large private elements, many frames."""
+"""Bytes read at once where the first prefix does not hold the whole header: large private elements, many frames."""
 RESTORED_LIMIT = 16 * 1024 * 1024
-"""Bytes of a file without its start in which its header has to end."""
+"""For a file without its standard start: the header must end within this many bytes."""
 LONGEST_PREFIX_BYTES = (16 * 2**20, 256 * 2**20)
-"""And where that one does not either: contours, segments and other objects that are nearly all header."""
-# A pipe or device put in the place of a listed file must not make the reader wait for a writer.
+"""Bytes read where that is not enough either: contours, segments and other objects that are nearly all header."""
+# A pipe or device in the place of a listed file must not make the reader wait for a writer.
 _OPEN_FLAGS = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_CLOEXEC", 0) | getattr(os, "O_BINARY", 0)
 
 
 class FileStart(NamedTuple):
-    """The first bytes of a file, `PREFIX_BYTES` at most, and how many it has."""
+    """The first bytes of a file, at most `PREFIX_BYTES`, and the size of the file."""
 
     prefix: bytes
     size: int
@@ -54,7 +54,7 @@ def read_start(path: str | Path, limit: int = PREFIX_BYTES) -> FileStart:
     Raises
     ------
     OSError
-        Cannot be opened or read, or is no regular file.
+        The file cannot be opened or read, or is not a regular file.
     """
     descriptor = os.open(path, _OPEN_FLAGS)
     try:
@@ -82,18 +82,18 @@ def read_elements(
     wanted : tuple of int or None
         Tags to keep; None keeps all whose length is defined.
     start : FileStart, optional
-        What `read_start` gave for this file, so that it is not read twice.
+        The result of `read_start` for this file, so that it is not read twice.
     force : bool
-        Read a data set without preamble or meta header too.
+        True: also read a data set without preamble or meta header.
 
     Raises
     ------
     NotDicomError
-        No "DICM" behind the preamble.
+        There is no "DICM" after the preamble.
     CorruptFileError
-        Cannot be parsed.
+        The file cannot be parsed.
     OSError
-        Cannot be opened or read.
+        The file cannot be opened or read.
     """
     prefix, size = start or read_start(path)
     restored = restore_start(prefix)
@@ -112,7 +112,7 @@ def read_elements(
 
 
 def _read_restored(path: Path, restored: Start, size: int, wanted: tuple[int, ...] | None) -> DicomElements:
-    """Read a file as if it had the start that it lacks; all places are those of the file itself."""
+    """Read a file as if it had the standard start that it lacks; all offsets are those of the file itself."""
     with open_regular(path) as file:
         file.seek(restored.skip)
         data = restored.head + file.read(RESTORED_LIMIT)
@@ -140,7 +140,7 @@ def _read_marked(path: Path, prefix: bytes, size: int, wanted: tuple[int, ...] |
     try:
         elements = parse_carefully(io.BytesIO(prefix), size, wanted)
     except CorruptFileError:
-        elements = None  # most likely an element that reaches over the end of the prefix
+        elements = None  # most likely an element that extends beyond the prefix
     if elements is not None and elements.pixel_tag is not None:
         return elements
     for limit in LONGEST_PREFIX_BYTES:

@@ -1,8 +1,8 @@
-"""Where the frames of compressed pixel data lie in a file (DICOM PS3.5 A.4).
+"""The places of the frames of compressed pixel data in a file (DICOM PS3.5 A.4).
 
-Pixel data is a row of items: first the basic offset table, which may be empty, then fragments.  The items are walked
-once a file.  An extended offset table (7FE0,0001) is not needed: it is allowed only where every frame is one fragment
-(PS3.3 C.7.6.3.1.8), and then the fragments say it all.
+Pixel data is a sequence of items: first the basic offset table, which may be empty, then fragments.  They are walked
+once for each file.  An extended offset table (7FE0,0001) is not needed: it is allowed only where every frame is one
+fragment (PS3.3 C.7.6.3.1.8), and then the fragments alone tell the frames.
 """
 
 from __future__ import annotations
@@ -16,14 +16,14 @@ from clrecon.errors import RefusedInputError
 __all__ = ["Pieces", "find_end", "find_frames", "read_pieces"]
 
 Pieces = list[tuple[int, int]]
-"""First byte in the file and count of bytes of each fragment of a frame."""
+"""For each fragment of a frame: offset of its first byte in the file, and number of bytes."""
 
 MAX_FRAGMENTS = 1_000_000
 FRAGMENTS_PER_FRAME = 1000
-"""At most, on the whole: writers make one, or one of some KiB each."""
+"""Highest mean number of fragments in a frame: writers make one, or pieces of some KiB."""
 _ITEM, _END = (0xFFFE, 0xE000), (0xFFFE, 0xE0DD)
 _STARTS = (b"\xff\xd8\xff", b"\xff\x4f\xff\x51", b"\0\0\0\x0cjP")
-"""First bytes of JPEG and JPEG-LS, JPEG 2000, and JP2."""
+"""First bytes of the codestreams: JPEG and JPEG-LS, JPEG 2000, and JP2."""
 
 
 def find_frames(file: BinaryIO, start: int, file_bytes: int, frames: int, transfer_syntax: str) -> list[Pieces]:
@@ -34,11 +34,11 @@ def find_frames(file: BinaryIO, start: int, file_bytes: int, frames: int, transf
     file : binary file
         Buffered, opened for reading.
     start : int
-        Byte of the first item.
+        Offset of the first item, bytes.
     file_bytes : int
         Size of the file.
     frames : int
-        How many the header says there are.
+        Number of frames according to the header.
     transfer_syntax : str
 
     Raises
@@ -70,7 +70,7 @@ def find_frames(file: BinaryIO, start: int, file_bytes: int, frames: int, transf
 
 
 def find_end(file: BinaryIO, start: int, file_bytes: int) -> int:
-    """The byte behind the compressed pixel data; parameters and errors as those of `find_frames`."""
+    """Return the offset of the byte after the compressed pixel data; parameters and errors as for `find_frames`."""
     return _walk_items(file, start, file_bytes, MAX_FRAGMENTS)[2]
 
 
@@ -80,9 +80,9 @@ def read_pieces(file: BinaryIO, pieces: Pieces) -> bytes:
 
 
 def _walk_items(file: BinaryIO, start: int, file_bytes: int, most: int) -> tuple[tuple[int, int], Pieces, int]:
-    """Offset table, fragments, and the place behind them.
+    """Return the offset table, the fragments, and the offset of the byte after them.
 
-    A codestream that is cut still decodes to an image, so that must be known here.
+    A cut codestream still decodes to an image, so a cut must be noticed here.
     """
     items: Pieces = []
     place = start
@@ -108,7 +108,7 @@ def _walk_items(file: BinaryIO, start: int, file_bytes: int, most: int) -> tuple
 
 
 def _firsts_by_table(file: BinaryIO, table: tuple[int, int], fragments: Pieces, frames: int) -> list[int]:
-    """Number of the first fragment of each frame by the basic offset table; empty where that does not fit."""
+    """Return the index of the first fragment of each frame by the basic offset table; empty if that does not fit."""
     place, length = table
     if length != 4 * frames:
         return []

@@ -1,9 +1,9 @@
-"""Data sets without preamble or meta header: the start that they lack, guessed.
+"""Data sets without preamble or meta header: the missing start is guessed.
 
 DICOM files begin with a preamble, the mark "DICM" and a meta header that names the transfer syntax (PS3.10 7.1).
-Network dumps and old archives hold bare data sets; then the encoding has to be guessed, which is done only when a
-user asks for it.  Without a transfer syntax implicit VR little endian is the rule (PS3.5 10.1); explicit VR shows by
-the two capital letters behind the first tag.
+Network dumps and old archives hold bare data sets; their encoding has to be guessed, which is done only when a user
+asks for it.  Without a transfer syntax, implicit VR little endian is the default (PS3.5 10.1); explicit VR shows two
+capital letters after the first tag.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ MARK_END = 132  # 128 bytes of preamble, then "DICM"
 PREAMBLE = bytes(128) + b"DICM"
 FIRST_GROUP = 0x0008
 FIRST_LENGTH_LIMIT = 1024
-"""The first elements of a data set are short: group length, character set, type, date."""
+"""Longest first element: data sets begin with short ones, such as group length, character set, type or date."""
 ENCODINGS = {
     "1.2.840.10008.1.2": "implicit VR little endian",
     "1.2.840.10008.1.2.1": "explicit VR little endian",
@@ -36,7 +36,7 @@ PROGRAMS = {
 
 
 class Start(NamedTuple):
-    """What stands in place of the first `skip` bytes of a file, and one line that says so."""
+    """The bytes that stand for the first `skip` bytes of a file, and a one-line remark about them."""
 
     head: bytes
     skip: int
@@ -44,12 +44,12 @@ class Start(NamedTuple):
 
 
 def describe_way_out() -> str:
-    """What can be done about a data set whose encoding stands nowhere."""
+    """Say what can be done about a data set whose encoding is not recorded."""
     return f"{name_parameter('force', True)} guesses it"
 
 
 def find_program(start: bytes) -> str:
-    """Kind of the program that the first bytes of a file begin; empty for none.
+    """Return the kind of program that a file begins with; empty for none.
 
     A file may be a DICOM image and a program at once: the preamble is free for any use (PS3.10 7.1).
     """
@@ -57,7 +57,7 @@ def find_program(start: bytes) -> str:
 
 
 def restore_start(data: bytes) -> Start | None:
-    """The standard start of a file that has none.
+    """Return the standard start for a file that has none.
 
     Parameters
     ----------
@@ -67,7 +67,7 @@ def restore_start(data: bytes) -> Start | None:
     Returns
     -------
     Start or None
-        None where the file has a meta header behind its preamble, or does not begin as a data set does.
+        None where the file has a meta header after its preamble, or does not begin like a data set.
     """
     marked = data[128:MARK_END] == b"DICM"
     skip = MARK_END if marked else 4 if data[:4] == b"DICM" else 0
@@ -82,7 +82,7 @@ def restore_start(data: bytes) -> Start | None:
 
 
 def _guess_syntax(head: bytes) -> str | None:
-    """Transfer syntax of a data set that begins with these 8 bytes; None where none begins like that."""
+    """Return the transfer syntax of a data set that begins with these 8 bytes; None if they cannot begin one."""
     if len(head) < 8:
         return None
     explicit = all(0x41 <= letter <= 0x5A for letter in head[4:6])

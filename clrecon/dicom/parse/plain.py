@@ -1,10 +1,10 @@
-"""The plain parser: the header of a file in plain order, by nothing but lengths, many times as fast as the careful one.
+"""The plain parser: reads headers of usual form by the lengths of their elements alone, many times as fast as the
+careful one.
 
-Plain is: little endian, encoded as the transfer syntax says, known value representations, no length that leads past
-the bytes at hand, sequences of undefined length that hold clean items, wanted elements in rising order and once each,
-and pixel data at the end.  Anything else is
-not judged here: the answer is None, and `careful` decides.  What this module does answer is what `careful` answers;
-the tests hold the two together on mutated files.
+The usual form is: little endian, encoded as the transfer syntax says, known value representations, no length beyond the
+bytes at hand, sequences of undefined length with well-formed items, each wanted element once and in rising order, and
+pixel data at the end.  For any other form the result is None, and `careful` decides.  The results of this module equal
+those of `careful`; tests compare both on mutated files.
 """
 
 from __future__ import annotations
@@ -33,9 +33,9 @@ __all__ = ["parse_plainly"]
 SHORT_VRS = {name.encode(): name for name in "AE AS AT CS DA DS DT FD FL IS LO LT PN SH SL SS ST TM UI UL US".split()}
 """Value representations with a length of 16 bits in explicit VR."""
 LONG_VRS = {name.encode(): name for name in "OB OD OF OL OV OW SQ SV UC UN UR UT UV".split()}
-"""Those with 32 bits, behind two reserved bytes."""
+"""Value representations with a length of 32 bits, after two reserved bytes."""
 
-# Tags are compared as they lie in the file, read as one 32-bit number: the group in the lower half.
+# Tags are compared as stored in the file, read as one 32-bit number: the group is the lower half.
 _ITEM, _ITEM_END, _SEQUENCE_END = 0xE000FFFE, 0xE00DFFFE, 0xE0DDFFFE
 _CHARACTER_SET = 0x00050008
 _PIXEL_GROUP = 0x7FE0
@@ -54,14 +54,14 @@ SEQUENCE_TAGS = frozenset(
     52009230
     """.split()
 )
-"""Sequences that CT headers hold: in implicit VR an undefined length alone does not tell a sequence."""
+"""Sequences that occur in CT headers.  In implicit VR an undefined length alone does not prove a sequence."""
 _SEQUENCE_KEYS = frozenset((tag & 0xFFFF) << 16 | tag >> 16 for tag in SEQUENCE_TAGS)
 DEEPEST = 8
 CHARACTER_SET = 0x00080005
 _known_character_sets = re.compile(
     rb"(ISO_IR \d{1,3}|ISO 2022 IR \d{1,3}|GB18030|GBK)?(\\ISO 2022 IR \d{1,3})* ?"
 ).fullmatch
-"""pydicom looks up any other name among Python's codecs, which may fail."""
+"""Names that pydicom knows; it looks up others among Python's codecs, which may fail."""
 
 _explicit_head = struct.Struct("<L2sH").unpack_from
 _implicit_head = struct.Struct("<LL").unpack_from
@@ -69,11 +69,11 @@ _long_length = struct.Struct("<L").unpack_from
 
 
 class _NotPlainError(Exception):
-    """Left to the careful parser."""
+    """The file is left to the careful parser."""
 
 
 class _Everything(dict[int, int]):
-    """Any element, but for those of undefined length: stands in place of a table of wanted tags."""
+    """A table of wanted tags that contains every element except those of undefined length."""
 
     def __contains__(self, key: object) -> bool:
         return True
@@ -97,7 +97,7 @@ def parse_plainly(data: bytes, size: int, wanted: tuple[int, ...] | None) -> Dic
     Returns
     -------
     DicomElements or None
-        None where the header is not in plain order, or its end is not in `data`.
+        None where the header has another form, or its end is not in `data`.
     """
     try:
         return _parse(data, size, wanted)
@@ -111,7 +111,7 @@ def _parse(data: bytes, size: int, wanted: tuple[int, ...] | None) -> DicomEleme
     if not transfer_syntax or transfer_syntax in (DEFLATED, EXPLICIT_BIG):
         return None
     implicit = transfer_syntax == IMPLICIT_LITTLE
-    # Explicit VR has two capital letters behind the first tag.  The explicit walk ends at anything else.
+    # Explicit VR has two capital letters after the first tag.  The explicit walk ends at anything else.
     if implicit and 0x41 <= data[start + 4] <= 0x5A and 0x41 <= data[start + 5] <= 0x5A:
         return None
     vrs: dict[int, str | None]
@@ -141,7 +141,7 @@ def _parse(data: bytes, size: int, wanted: tuple[int, ...] | None) -> DicomEleme
 
 @lru_cache(maxsize=8)
 def _keys(tags: tuple[int, ...] | None) -> dict[int, int]:
-    """Tags as they lie in the file to tags."""
+    """Map tags as stored in the file to tags."""
     if tags is None:
         return _Everything()
     return {(tag & 0xFFFF) << 16 | tag >> 16: tag for tag in tags}
@@ -150,9 +150,9 @@ def _keys(tags: tuple[int, ...] | None) -> dict[int, int]:
 def _walk_explicit(
     data: bytes, place: int, wanted: dict[int, int], meta: bool = False
 ) -> tuple[dict[int, bytes], dict[int, str | None], int]:
-    """Walk to the pixel data, or behind the meta header; returns values, their VRs and the place of the end.
+    """Walk to the pixel data, or to the end of the meta header; return values, their VRs and the offset of the end.
 
-    A value that ends behind `data` is noticed at the head of the next element.
+    A value that ends beyond `data` is noticed at the head of the next element.
     """
     values: dict[int, bytes] = {}
     vrs: dict[int, str | None] = {}
@@ -193,7 +193,7 @@ def _walk_explicit(
 
 
 def _walk_implicit(data: bytes, place: int, wanted: dict[int, int]) -> tuple[dict[int, bytes], int]:
-    """As `_walk_explicit`, of a data set in implicit VR."""
+    """Do the same as `_walk_explicit` for a data set in implicit VR."""
     values: dict[int, bytes] = {}
     last = 0
     while True:
@@ -218,13 +218,13 @@ def _walk_implicit(data: bytes, place: int, wanted: dict[int, int]) -> tuple[dic
 
 
 def _is_sequence(data: bytes, place: int, key: int) -> bool:
-    """True where an element of undefined length in implicit VR is surely a sequence."""
-    private = key & 1  # the group is odd
+    """True where an element of undefined length in implicit VR is certainly a sequence."""
+    private = key & 1  # private: the group is odd
     return key in _SEQUENCE_KEYS or bool(private) and _long_length(data, place)[0] == _ITEM
 
 
 def _skip_items(data: bytes, place: int, implicit: bool, levels: int) -> int:
-    """Walk over the items of a sequence of undefined length; returns the place behind its delimiter."""
+    """Walk over the items of a sequence of undefined length; return the offset after its delimiter."""
     if not levels:
         raise _NotPlainError
     while True:
@@ -239,7 +239,7 @@ def _skip_items(data: bytes, place: int, implicit: bool, levels: int) -> int:
 
 
 def _skip_elements(data: bytes, place: int, end: int | None, implicit: bool, levels: int) -> int:
-    """Walk over the elements of an item, to `end` or to its delimiter; returns the place behind it."""
+    """Walk over the elements of an item, to `end` or to its delimiter; return the offset after it."""
     while end is None or place < end:
         key, length = _implicit_head(data, place)
         if key == _ITEM_END and length == 0 and end is None:

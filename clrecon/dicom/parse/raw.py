@@ -1,4 +1,4 @@
-"""What the two parsers of a file's bytes, the plain and the careful one, agree on."""
+"""Types and helpers that the plain and the careful parser share."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ PIXEL_VRS = (b"OB", b"OW", b"OF", b"OD", b"OL", b"OV", b"UN")
 
 
 class NotDicomError(RefusedInputError):
-    """The file is no DICOM file: no "DICM" at byte 128.
+    """The file is not a DICOM file: there is no "DICM" at byte 128.
 
     Attributes
     ----------
@@ -50,10 +50,10 @@ class DicomElements(NamedTuple):
     values : dict of int to bytes
         Tag to undecoded value, of the wanted tags that are present and not empty.
     vrs : dict of int to str or None
-        Their value representations; None in implicit VR.
+        Value representations of these elements; None in implicit VR.
     little_endian : bool
     encoding_differs : bool
-        Implicit VR where the transfer syntax says explicit, or the other way round; parsed as found.
+        True: implicit VR where the transfer syntax says explicit, or explicit where it says implicit; parsed as found.
     pixel_tag : int or None
         None where the file ends without pixel data.
     pixel_offset, pixel_length : int
@@ -62,10 +62,10 @@ class DicomElements(NamedTuple):
     pixel_vr : str
         Empty in implicit VR.
     inflate_from : int
-        Byte of the file where the deflated data set starts, -1 where it is not deflated.
+        Offset in the file of the deflated data set, -1 where it is not deflated.
     file_bytes : int
     remarks : tuple of str
-        What is odd about the start of the file.
+        Unusual points of the start of the file.
     restored : bool
         The file lacks the start of a DICOM file.
     """
@@ -88,7 +88,7 @@ class DicomElements(NamedTuple):
 
 @lru_cache(64)
 def decode_uid(value: bytes | None) -> str:
-    """A UID without its padding."""
+    """Decode a UID without its padding."""
     return (value or b"").rstrip(b"\0 ").decode("ascii", "replace")
 
 
@@ -103,9 +103,9 @@ def read_pixel_head(head: bytes, start: int, implicit: bool, little: bool) -> tu
     Returns
     -------
     tag : int or None
-        None where it is another element, or the end.
+        None where this is another element, or the end.
     offset, length : int
-        Of the value; the length is -1 where it is undefined.
+        Place and length of the value; the length is -1 where it is undefined.
     vr : str
         Empty in implicit VR.
 
@@ -120,7 +120,7 @@ def read_pixel_head(head: bytes, start: int, implicit: bool, little: bool) -> tu
     tag = group << 16 | element
     if tag not in PIXEL_TAGS:
         return None, -1, 0, ""
-    # Implicit VR has the length in these bytes; no even length reads as one of the two-letter names.
+    # Implicit VR has the length in these bytes; no even length looks like one of the two-letter names.
     vr = head[4:6]
     if vr in PIXEL_VRS and len(head) == 12:
         length, offset, name = struct.unpack(order + "L", head[8:12])[0], start + 12, vr.decode("ascii")

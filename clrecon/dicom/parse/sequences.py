@@ -1,8 +1,8 @@
-"""The items of nested sequences as raw values, for the tags that a schema names and no others.
+"""Raw values of the items of nested sequences, only for the tags that a schema names.
 
 pydicom reads sequences by recursion and makes a data set of every item: slow for thousands of frames, and a nest of
-some hundred levels ends in a RecursionError.  This walk knows what is wanted, steps over everything else by its
-length, and is bounded in depth and in items.
+some hundred levels ends in a RecursionError.  This walk reads only wanted elements, skips all others by their length,
+and is limited in depth and in number of items.
 
 Source: DICOM PS3.5 7.5 (nesting of data sets), 6.2.2 (UN holds implicit VR little endian).
 """
@@ -19,7 +19,7 @@ from clrecon.dicom.parse.values import ValueProblem
 __all__ = ["LONG_VRS", "Item", "Schema", "decode_number", "name_tag", "read_sequences", "skip_sequence"]
 
 Schema = Mapping[int, Any]
-"""Wanted tag to None for a value, to the schema of its items for a sequence."""
+"""Maps a wanted tag to None for a value, or to the schema of its items for a sequence."""
 
 DEPTH_LIMIT = 64
 PIXEL_GROUP = 0x7FE00000
@@ -31,17 +31,17 @@ VR_NAMES = {name.encode(): name for name in "AE AS AT CS DA DS DT FD FL IS LO SH
 
 @dataclass(slots=True)
 class Item:
-    """What is wanted of one item (or of the whole data set).
+    """The wanted elements of one item (or of the whole data set).
 
     Attributes
     ----------
     values : dict of int to bytes
         Tag to undecoded value, of those that are not empty.
     vrs : dict of int to str or None
-        Their value representations; None in implicit VR.
+        Value representations of these elements; None in implicit VR.
     sequences : dict of int to list of Item
     repeated : set of int
-        Of the whole data set alone: wanted tags that stand twice in one of its items, with the same value.
+        For the whole data set only: wanted tags that occur twice in one of its items, with the same value.
     """
 
     values: dict[int, bytes] = field(default_factory=dict)
@@ -77,7 +77,7 @@ def read_sequences(
     Parameters
     ----------
     data : bytes
-        Holds the data set from `start` on; may end within its pixel data.
+        Bytes that hold the data set from `start` on; may end within its pixel data.
     start : int
     schema : Schema
     implicit, little_endian : bool
@@ -88,8 +88,8 @@ def read_sequences(
     Raises
     ------
     ValueProblem
-        A length reaches over its container, a sequence is nested too deep or holds too many items; a wanted sequence
-        stands twice in one data set, or a wanted value with another one.
+        A length exceeds its container, a sequence is nested too deep or holds too many items; a wanted sequence occurs
+        twice in one data set, or a wanted value twice with different contents.
     """
     walk = _Walk(data, items_limit)
     top, _ = walk.read_data_set(start, len(data), schema, _make_encoding(implicit, little_endian), "", top=True)
@@ -98,12 +98,12 @@ def read_sequences(
 
 
 def skip_sequence(data: bytes, *, implicit: bool, little_endian: bool) -> int:
-    """Bytes of a sequence of undefined length from its first item to behind its end.
+    """Return the bytes of a sequence of undefined length, from its first item to the end of its delimiter.
 
     Raises
     ------
     ValueProblem
-        It does not end within `data`, holds something else than items, or is nested too deep.
+        The sequence does not end within `data`, holds something other than items, or is nested too deep.
     """
     return _Walk(data, 0).skip(0, len(data), _make_encoding(implicit, little_endian))
 
@@ -116,7 +116,7 @@ class _Walk:
         self.repeated: set[int] = set()
 
     def read_head(self, place: int, end: int, encoding: _Encoding) -> tuple[int, bytes, int, int]:
-        """Tag, VR (empty in implicit VR), length, and where the value starts."""
+        """Return tag, VR (empty in implicit VR), length, and the offset of the value."""
         if place + 8 > end:
             raise ValueProblem("a sequence ends within the head of an element")
         if encoding.implicit:
@@ -137,7 +137,7 @@ class _Walk:
     def read_data_set(
         self, place: int, end: int, schema: Schema, encoding: _Encoding, where: str, *, top: bool = False
     ) -> tuple[Item, int]:
-        """Read the elements up to `end`, or to the delimiter of an item; returns what follows them, too."""
+        """Read the elements up to `end`, or to the delimiter of an item; also return the offset after them."""
         item = Item()
         seen: dict[int, bytes] = {}
         while place < end:
@@ -170,7 +170,7 @@ class _Walk:
         return item, place
 
     def compare(self, seen: dict[int, bytes], tag: int, value: bytes, where: str) -> None:
-        """Compare a value with what its item held of that tag before: of two nobody can tell which was meant."""
+        """Refuse a second, different value of a tag in one item: nobody can tell which was meant."""
         if tag not in seen:
             seen[tag] = value
         elif seen[tag] == value:
@@ -182,7 +182,7 @@ class _Walk:
     def read_items(
         self, place: int, end: int, length: int, schema: Schema, encoding: _Encoding, where: str
     ) -> tuple[list[Item], int]:
-        """Read the items of a sequence; returns what follows it, too."""
+        """Read the items of a sequence; also return the offset after it."""
         delimited = length == UNDEFINED_LENGTH
         stop = end if delimited else place + length
         if stop > end:
@@ -217,7 +217,7 @@ class _Walk:
         return group << 16 | element, b"", length, place + 8
 
     def skip(self, place: int, end: int, encoding: _Encoding) -> int:
-        """Step over a sequence of undefined length; returns what follows it."""
+        """Skip a sequence of undefined length; return the offset after it."""
         open_parts: list[tuple[bool, _Encoding]] = [(True, encoding)]  # is it a sequence (or an item of one), encoding
         while open_parts:
             in_sequence, inside = open_parts[-1]
@@ -243,7 +243,7 @@ class _Walk:
 
 
 def decode_number(raw: bytes, form: str, little_endian: bool) -> float | int | None:
-    """Decode one binary number in a format of `struct`; None where the bytes are not as many as it takes."""
+    """Decode one binary number in a format of `struct`; None if the number of bytes does not fit."""
     layout = ("<" if little_endian else ">") + form
     return struct.unpack(layout, raw)[0] if len(raw) == struct.calcsize(layout) else None
 

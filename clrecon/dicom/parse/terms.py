@@ -5,7 +5,7 @@ from __future__ import annotations
 __all__ = ["MODALITIES", "OTHER_TERM", "RESCALE_TYPES", "name_term"]
 
 RESCALE_TYPES = frozenset("HU HU_MOD OD US MGML Z_EFF ED EDW PCT".split())
-"""RescaleType (PS3.3 C.11.1.1.2)."""
+"""Defined terms of RescaleType (PS3.3 C.11.1.1.2)."""
 
 MODALITIES = frozenset(
     """
@@ -15,11 +15,11 @@ MODALITIES = frozenset(
     SM SMR SR SRF ST STAIN TEXTUREMAP TG TH US VA VF VM XA XAPROTOCOL XC
     """.split()
 )
-"""Modality, retired ones too (PS3.3 C.7.3.1.1.1)."""
+"""Defined terms of Modality, with retired ones (PS3.3 C.7.3.1.1.1)."""
 
 OTHER_TERM = "other"
 
 
 def name_term(term: str, defined: frozenset[str]) -> str:
-    """The term itself where it is defined or empty, else `OTHER_TERM`: free text may be anybody's name."""
+    """Return the term itself if it is defined or empty, else `OTHER_TERM`: free text could be a person's name."""
     return term if term in defined or not term else OTHER_TERM

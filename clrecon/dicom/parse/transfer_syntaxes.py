@@ -1,9 +1,9 @@
-"""Transfer syntaxes: which ones are read, and by which decoder.
+"""Transfer syntaxes that can be read, and the decoder of each.
 
-All decoders are under permissive licences; they run in a process of their own (see `decoder_pool`).  JPEG baseline,
+All decoders are under permissive licences; they run in a process of their own (see `decoder_pool`). JPEG baseline,
 extended and the retired lossy JPEGs are refused: a CT image has 12 bits or more (DICOM PS3.3 C.8.2.1.1), so baseline
-JPEG of one is never legal, and what is stored under the names of the others is 8-bit data as often as not.  A wrong
-surface is worse than none.
+JPEG of a CT image is never legal, and data stored under the names of the others often have 8 bits.  A wrong surface is
+worse than no surface.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ NATIVE_SYNTAXES = ("1.2.840.10008.1.2", "1.2.840.10008.1.2.1", "1.2.840.10008.1.
 _JPEG = "1.2.840.10008.1.2.4."
 JPEG_LOSSLESS = (_JPEG + "57", _JPEG + "70")
 JPEG_LS = (_JPEG + "80", _JPEG + "81")
-JPEG_2000 = tuple(_JPEG + part for part in ("90", "91", "201", "202", "203"))  # 201 on: high throughput
+JPEG_2000 = tuple(_JPEG + part for part in ("90", "91", "201", "202", "203"))  # from 201: High-Throughput
 RLE = "1.2.840.10008.1.2.5"
 
-# transfer syntax: (name in `decoder_process` and package, the first that is installed is taken; what to install).
-# All of them give the same values: the choice is one of speed.
+# For each transfer syntax: (name in `decoder_process`, package) in order of preference, and what to install.  The first
+# installed decoder is used.  All give the same values; they differ in speed.
 _DECODERS = {
     **dict.fromkeys(JPEG_LOSSLESS, ((("imagecodecs jpeg", "imagecodecs"),), "imagecodecs")),
     **dict.fromkeys(JPEG_LS, ((("jpeg_ls", "jpeg_ls"), ("imagecodecs jpeg_ls", "imagecodecs")), "pyjpegls")),
@@ -50,13 +50,13 @@ SYNTAX_NAMES = {
     _JPEG + "203": "High-Throughput JPEG 2000 Image Compression",
     RLE: "RLE Lossless",
 }
-"""All that are read.  pydicom knows them too, but takes a quarter of a second to load."""
+"""Names of all transfer syntaxes that can be read.  pydicom knows them too, but takes a quarter of a second to load."""
 
 _OTHER_NAMES = {
     "1.2.840.113619.5.2": "implicit VR big endian, private to GE",
     "1.2.840.10008.1.2.8.1": "Deflated Image Frame Compression",
 }
-"""What the dictionary of pydicom has no name for."""
+"""Names that pydicom's dictionary lacks."""
 
 
 def is_encapsulated(transfer_syntax: str) -> bool:
@@ -65,7 +65,7 @@ def is_encapsulated(transfer_syntax: str) -> bool:
 
 
 def describe_undecodable(transfer_syntax: str) -> str:
-    """Say why pixels of this transfer syntax cannot be read; empty where they can."""
+    """Say why pixels of this transfer syntax cannot be read; empty if they can."""
     if transfer_syntax in NATIVE_SYNTAXES or transfer_syntax in _DECODERS:
         return ""
     from pydicom.config import IGNORE
@@ -78,12 +78,12 @@ def describe_undecodable(transfer_syntax: str) -> str:
 
 
 def choose_decoder(transfer_syntax: str) -> str:
-    """Name of the decoder for a compressed transfer syntax, one of `decoder_process.DECODERS`.
+    """Return the name of the decoder for a compressed transfer syntax, one of `decoder_process.DECODERS`.
 
     Raises
     ------
     RefusedInputError
-        None is installed; names the transfer syntax and what to install.
+        No decoder is installed; the message names the transfer syntax and what to install.
     """
     reason = describe_undecodable(transfer_syntax)
     if reason:

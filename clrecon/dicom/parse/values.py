@@ -1,7 +1,7 @@
 """Typed and checked access to the raw values of one file.
 
-pydicom turns "1,5", "nan" or a wrong count of numbers into something without an error; here a decimal string is a
-finite number with a decimal point, in the count that is asked for, or a `ValueProblem` that names the tag.
+pydicom converts "1,5", "nan" or a wrong count of numbers without an error.  Here a decimal string must be the requested
+count of finite numbers with a decimal point; else a `ValueProblem` names the tag.
 """
 
 from __future__ import annotations
@@ -70,20 +70,21 @@ _DECIMAL = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
 
 _TEXT_VRS = frozenset("AE AS CS DA DS DT IS LO LT PN SH ST TM UC UI UR UT".split())
 
-# The slices of a series repeat most values byte for byte: what is known is neither checked nor stored again.
+# The slices of a series repeat most values byte for byte: results are cached, so they are neither checked nor stored
+# again.
 _KNOWN_VALUES = 2048
-_KNOWN_BYTES = 128  # longer values are decoded each time: what is kept must stay small
+_KNOWN_BYTES = 128  # longer values are decoded each time, to keep the cache small
 
 
 def decode_text(raw: bytes) -> str:
-    """Text without its padding: spaces, and NUL at its end alone, which elsewhere stands in place of a character."""
+    """Decode text without padding: spaces, and NUL at the end.  Inside the text NUL stands for a lost character."""
     return raw.decode("latin-1").rstrip(" \0").lstrip(" ")
 
 
 def _decode_decimals(raw: bytes) -> tuple[float, ...]:
-    """Finite numbers with a decimal point, separated by backslashes; empty where one of them is none.
+    """Decode finite numbers with a decimal point, separated by backslashes; empty if one of them is malformed.
 
-    NUL is padding behind the last number and nowhere else: in place of a minus sign it would turn the number round.
+    NUL is accepted as padding after the last number only: in the place of a minus sign it would change the sign.
     """
     parts = [part.strip(" ") for part in raw.rstrip(b"\0").decode("latin-1").split("\\")]
     if not all(map(_DECIMAL.fullmatch, parts)):
@@ -121,7 +122,7 @@ class Values:
     Attributes
     ----------
     warnings : list of str
-        What is doubtful in the numbers that were asked for.
+        Doubtful points of the numbers that were asked for.
     """
 
     def __init__(self, elements: DicomElements):
@@ -151,14 +152,14 @@ class Values:
         return _known_text(raw) if len(raw) <= _KNOWN_BYTES else decode_text(raw)
 
     def word(self, keyword: str) -> str:
-        """The text as one safe line."""
+        """Return the text as one safe line."""
         raw = self.elements.values.get(_TAGS[keyword])
         if raw is None:
             return ""
         return _known_word(raw) if len(raw) <= _KNOWN_BYTES else escape_text(decode_text(raw))
 
     def pairs(self, keywords: tuple[str, ...]) -> tuple[tuple[str, str], ...]:
-        """Keyword and value, as `word` gives it, of those that are there."""
+        """Return keyword and value, as `word` returns it, of the elements that exist."""
         return _share_pairs(*((keyword, word) for keyword in keywords if (word := self.word(keyword))))
 
     def decimals(self, keyword: str, count: int) -> tuple[float, ...]:
@@ -183,10 +184,10 @@ class Values:
         return int.from_bytes(raw, self.byte_order)
 
     def padding(self, bits_allocated: int, bits_stored: int, signed: bool) -> tuple[int, int] | None:
-        """Range of stored padding values.
+        """Return the range of stored padding values.
 
-        Writers give these with the VR of the other signedness too, so the bits are read again in the pixel
-        representation: US 63536 in signed 16-bit pixels is -2000, and so is US 2096 in those of 12 stored bits.
+        Some writers give these values with the VR of the other signedness, so the bits are read again in the pixel
+        representation: US 63536 in signed 16-bit pixels is -2000, and US 2096 in pixels of 12 stored bits is -2000 too.
         """
         bounds = []
         for keyword in ("PixelPaddingValue", "PixelPaddingRangeLimit"):
@@ -208,7 +209,7 @@ class Values:
         return (min(bounds), max(bounds)) if bounds else None
 
     def float_padding(self, bits: int) -> tuple[float, float] | None:
-        """Range of padding values of float pixels, NaN where that is the padding (PS3.3 C.7.6.24.1)."""
+        """Return the range of padding values of float pixels, NaN where that is the padding (PS3.3 C.7.6.24.1)."""
         prefix, form = ("Double", "d") if bits == 64 else ("", "f")
         bounds = []
         for keyword in (f"{prefix}FloatPixelPaddingValue", f"{prefix}FloatPixelPaddingRangeLimit"):
@@ -221,7 +222,7 @@ class Values:
         return (min(bounds), max(bounds)) if bounds else None
 
     def description(self) -> str:
-        """SeriesDescription in its character set, one safe line."""
+        """Return SeriesDescription, decoded by its character set, as one safe line."""
         raw = self.elements.values.get(_TAGS["SeriesDescription"], b"").strip(b" \0")
         charset = self.text("SpecificCharacterSet")
         if raw.isascii() and b"\x1b" not in raw or not charset:
@@ -231,7 +232,7 @@ class Values:
         try:
             decoded = decode_bytes(raw, convert_encodings(charset.split("\\")), set())
         except (LookupError, ValueError, TypeError, AttributeError):
-            decoded = raw.decode("latin-1")  # a wrong character set spoils a label, not the image
+            decoded = raw.decode("latin-1")  # a wrong character set spoils the text, not the image
         return escape_text(decoded)
 
 

@@ -1,1 +1,1 @@
-"""Stored pixels of slices to voxels in HU."""
+"""Pixels: the stored values of slices become voxels in HU."""

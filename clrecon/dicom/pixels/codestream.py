@@ -1,4 +1,4 @@
-"""What a compressed frame says of itself, read before a decoder sees it: kind, size, bits, sign.
+"""The head of a compressed frame, read before a decoder sees it: format, size, bits, sign.
 
 Sources: JPEG ITU-T T.81 B.2.2, JPEG-LS T.87 C.2.2, JPEG 2000 T.800 A.5.1 and I.2.2, RLE DICOM PS3.5 annex G.
 """
@@ -15,31 +15,32 @@ __all__ = ["Codestream", "read_codestream"]
 
 RLE_HEAD_BYTES = 64
 RLE_BEST_RATIO = 64
-"""A run of PackBits is two bytes for at most 128."""
+"""Highest compression ratio of RLE: a run of PackBits is two bytes for at most 128."""
 
 LARGE_FRAME_BYTES = 64 * 2**20
 LARGE_FRAME_RATIO = 1000
-"""Larger frames (over 5,792 x 5,792 of 16 bits) that unfold to more than this are bombs; small ones may be all air."""
+"""Highest accepted ratio of large frames (over 5,792 x 5,792 of 16 bits); beyond it they are taken for attacks.  Small
+frames may be all air."""
 
 _END_MARK = b"\xff\xd9"
 _END_SEARCHED_BYTES = 64
 _JP2_START = b"\0\0\0\x0cjP  \r\n\x87\n"
 _J2K_START = b"\xff\x4f\xff\x51"
 _LOSSLESS_FRAME, _LS_FRAME = 0xC3, 0xF7
-_NO_FRAMES = (0xC4, 0xC8, 0xCC)  # within the range of starts of frame, but tables
+_NO_FRAMES = (0xC4, 0xC8, 0xCC)  # tables, though within the range of starts of frame
 
 
 @dataclass(frozen=True)
 class Codestream:
-    """A compressed frame and what its head says.
+    """A compressed frame and the facts in its head.
 
     Attributes
     ----------
     data : bytes
-        Without what may stand around the codestream.
+        The codestream alone, without a container around it.
     rows, columns, bits : int
     signed : bool or None
-        None where the format does not say.
+        None where the format does not tell.
     """
 
     data: bytes
@@ -50,28 +51,28 @@ class Codestream:
 
     @property
     def dtype(self) -> str:
-        """The type that decoders give it, in native byte order."""
+        """The type that decoders return, in native byte order."""
         width = 1 if self.bits <= 8 else 2 if self.bits <= 16 else 4
         return f"{'i' if self.signed else 'u'}{width}"
 
 
 def read_codestream(data: bytes, transfer_syntax: str, rows: int, columns: int, bits_allocated: int) -> Codestream:
-    """Read the head of a frame and hold it against what the header says of the image.
+    """Read the head of a frame and compare it with the header of the image.
 
     Parameters
     ----------
     data : bytes
-        One frame; bytes behind its end mark are allowed.
+        One frame; bytes after its end mark are allowed.
     transfer_syntax : str
-        A compressed one that `codecs` knows.
+        A compressed transfer syntax.
     rows, columns, bits_allocated : int
         From the header.
 
     Raises
     ------
     RefusedInputError
-        Another format, size, number of components or depth, a frame that is cut, or one that unfolds beyond
-        all measure.  The message names no file.
+        The frame has another format, size, number of components or depth, is cut off, or would become implausibly
+        large.  The message names no file.
     """
     if transfer_syntax == RLE:
         frame = _read_rle(data, rows, columns, bits_allocated)
@@ -97,7 +98,7 @@ def read_codestream(data: bytes, transfer_syntax: str, rows: int, columns: int, 
 
 
 def _read_rle(data: bytes, rows: int, columns: int, bits_allocated: int) -> Codestream:
-    """The head has no size; what can be known is whether the segments fit the frame and the image."""
+    """Check RLE.  Its head gives no size, only whether the segments fit the frame and the image."""
     if len(data) < RLE_HEAD_BYTES:
         raise RefusedInputError("the compressed frame is shorter than the head of an RLE frame")
     count, *offsets = struct.unpack("<16L", data[:RLE_HEAD_BYTES])
@@ -118,7 +119,7 @@ def _read_jpeg_2000(data: bytes) -> Codestream:
         data = _unwrap_jp2(data)
     if not data.startswith(_J2K_START) or len(data) < 45:
         raise RefusedInputError("the compressed frame is no JPEG 2000 codestream")
-    # Behind SOC and the SIZ marker: Lsiz, Rsiz, the image's and tiles' sizes and places, the count of components.
+    # After SOC and the SIZ marker: Lsiz, Rsiz, the sizes and offsets of image and tiles, the number of components.
     width, height, left, top = struct.unpack(">4L", data[8:24])
     components, depth, step_x, step_y = struct.unpack(">H3B", data[40:45])
     _check_components(components)
@@ -129,7 +130,7 @@ def _read_jpeg_2000(data: bytes) -> Codestream:
 
 
 def _unwrap_jp2(data: bytes) -> bytes:
-    """The codestream within a JP2 file, which some writers put into DICOM against its rules."""
+    """Return the codestream in a JP2 file, which some writers put into DICOM against its rules."""
     place = 0
     while place + 8 <= len(data):
         length, kind = struct.unpack(">L4s", data[place : place + 8])
@@ -170,6 +171,6 @@ def _check_components(count: int) -> None:
 
 
 def _check_end(data: bytes) -> None:
-    """Decoders make an image out of half a codestream without a word; the end mark cannot stand within the data."""
+    """Check the end mark, which cannot occur in the data: decoders silently make an image of half a codestream."""
     if _END_MARK not in data[-_END_SEARCHED_BYTES:]:
         raise RefusedInputError("truncated: the compressed frame has no end mark")

@@ -1,8 +1,8 @@
 """Decoding of compressed frames in processes of their own, with limits on time and memory.
 
-Each thread that decodes gets a process (see `decoder_process`), which lives as long as the pool.  One that crashes,
-hangs or wants too much memory is ended and becomes an error for the one file; there is no decoding in this process to
-fall back on.  Frames and pixels go through pipes: nothing is left behind when either side is killed.
+Each decoding thread gets a process (see `decoder_process`), which lives as long as the pool.  A process that crashes,
+hangs or wants too much memory is ended, and the one file gets an error.  Nothing is ever decoded in this process
+itself.  Frames and pixels go through pipes, so nothing is left behind when either side is killed.
 """
 
 from __future__ import annotations
@@ -37,19 +37,21 @@ SCRIPT = Path(__file__).with_name("decoder_process.py")
 START_SECONDS = 120.0
 FRAME_SECONDS = 60.0
 SECONDS_PER_MIB = 1.0
-"""A frame may take `FRAME_SECONDS`, and this much more for each MiB of its pixels: a hundred times what it needs."""
+"""Time limit of a frame: `FRAME_SECONDS`, and this much more for each MiB of its pixels, a hundred times the usual
+time."""
 
 STOPPED_SECONDS = 2.0
-"""When this process itself stood still for longer (Ctrl-Z, a laptop that sleeps), the decoders did too."""
+"""When this process stood still for longer (Ctrl-Z, a sleeping laptop), the decoders did too, and their time starts
+again."""
 
 FRAME_MEMORY_BYTES = 256 * 2**20
 MEMORY_PER_PIXEL_BYTE = 32
-"""A decoder may take `FRAME_MEMORY_BYTES`, and this much more for each byte of pixels; OpenJPEG takes about 10."""
+"""Memory limit of a decoder: `FRAME_MEMORY_BYTES`, and this much more for each byte of pixels; OpenJPEG takes 10."""
 
 ENVIRONMENT = {
-    # One thread each: there are as many processes as cores, and every idle thread costs memory and time.
+    # One thread each: there are as many processes as cores, and each idle thread costs memory and time.
     **dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1"),
-    # Memory of one frame serves the next (glibc): giving it back each time takes longer than to decode RLE.
+    # Memory of one frame is kept for the next (glibc): returning it each time takes longer than decoding RLE.
     **dict.fromkeys(("MALLOC_MMAP_THRESHOLD_", "MALLOC_TRIM_THRESHOLD_"), str(1 << 28)),
     "MALLOC_TOP_PAD_": str(1 << 24),
 }
@@ -59,7 +61,7 @@ _OUT_OF_TIME = tuple(getattr(signal, name, None) for name in ("SIGXCPU", "SIGALR
 
 
 class DecoderError(RefusedInputError):
-    """A frame that does not decode, or no process to decode it in. The message names no file."""
+    """A frame that cannot be decoded, or no process to decode it in.  The message names no file."""
 
 
 class DecoderPool:
@@ -110,15 +112,15 @@ class DecoderPool:
         data : bytes
             One codestream.
         decoder : str
-            One of those that the pool was made for.
+            One of the names that the pool was made for.
         out : ndarray, shape (rows, columns), C-contiguous
-            The pixels, in the type that the decoder gives for this codestream.
+            Receives the pixels, in the type that the decoder returns for this codestream.
 
         Raises
         ------
         DecoderError
-            The frame does not decode, or to another shape or width; the decoder crashes or takes more time or
-            memory than it may; the process cannot be started.
+            The frame cannot be decoded, or has another shape or width; the decoder crashes or exceeds its time or
+            memory; or the process cannot be started.
         """
         request = {
             "decoder": decoder,
@@ -138,7 +140,7 @@ class DecoderPool:
         with self._lock:
             if not worker.overdue:
                 self._idle.append(worker)
-        if worker.overdue:  # the frame came in the very moment that its time was up
+        if worker.overdue:  # the frame arrived at the moment its time was over
             self._bury(worker)
         if status == NO_MEMORY:
             raise DecoderError(f"need more than {self.memory_bytes // 2**20} MiB of memory to decode")
@@ -146,7 +148,7 @@ class DecoderPool:
             raise DecoderError(f"do not decode ({text})")
 
     def kill(self) -> None:
-        """End all processes at once; frames that are being decoded in other threads become errors."""
+        """End all processes at once; frames that are being decoded in other threads raise errors."""
         self._stopping.set()
         with self._lock:
             workers = list(self._workers)
@@ -159,7 +161,7 @@ class DecoderPool:
         with self._lock:
             workers, self._workers, self._idle = self._workers, [], []
         for worker in workers:
-            # It has nothing to lose, and its input may stay open in a process that was forked meanwhile.
+            # It has no state to lose, and a process that was forked meanwhile may keep its input open.
             worker.process.kill()
         for worker in workers:
             worker.wait()
@@ -186,7 +188,7 @@ class DecoderPool:
             return worker
 
     def _watch(self) -> None:
-        """End processes that take too long: the one way that works on every system with every decoder."""
+        """End processes that take too long: this works on every system and with every decoder."""
         interval, before = min(0.5, self.seconds / 4), time.monotonic()
         while not self._stopping.wait(interval):
             now = time.monotonic()
@@ -201,7 +203,7 @@ class DecoderPool:
             before = now
 
     def _bury(self, worker: _Worker) -> str:
-        """Take a process that is dead or of no use out of the pool; say what became of it."""
+        """Remove a dead or useless process from the pool; return what happened to it."""
         ended_itself = worker.wait()
         with self._lock:
             if worker in self._workers:
@@ -223,7 +225,7 @@ class DecoderPool:
 
 
 class _WorkerEndedError(Exception):
-    """The process has ended, or answers in a way that makes it useless."""
+    """The process has ended, or its answers make it useless."""
 
 
 class _Worker:
@@ -241,7 +243,7 @@ class _Worker:
             self._output, replies = _open_pipe(ours, theirs)
             number = -1
             if sys.platform.startswith("linux"):
-                # Of this pipe we hold the other end: the system tells the process when we are gone (see `end_with`).
+                # We hold the other end of this pipe: the system tells the process when we have ended (see `end_with`).
                 number = _open_pipe(theirs, ours)[0].fileno()
             try:
                 self.process = subprocess.Popen(
@@ -263,7 +265,7 @@ class _Worker:
         self._settings = {"path": path, "decoders": decoders, "seconds": seconds, "memory_bytes": memory_bytes}
 
     def ask(self, request: dict[str, Any], data: bytes, out: NDArray[Any], seconds: float) -> tuple[int, str]:
-        """Have one frame decoded into `out`; status and, where it is not `DONE`, a text."""
+        """Have one frame decoded into `out`; return the status and, if it is not `DONE`, a text."""
         try:
             if not self.ready:
                 self._write(json.dumps(self._settings).encode() + b"\n")
@@ -289,7 +291,9 @@ class _Worker:
         return status, text
 
     def wait(self) -> bool:
-        """Wait for its end, kill it where that takes long, and close the pipes; False when it had to be killed."""
+        """Wait for the end of the process, kill it if that takes long, and close the pipes; False when it had to be
+        killed.
+        """
         self._input.close()
         try:
             self.process.wait(2.0)
@@ -328,7 +332,7 @@ class _Worker:
 
 
 def _open_pipe(reader: ExitStack, writer: ExitStack) -> tuple[FileIO, FileIO]:
-    """A pipe whose ends belong to these, beyond the numbers 0 to 2, which are free where a program closed them."""
+    """Open a pipe whose descriptors are above 2, even if the program has closed its standard streams."""
     numbers = os.pipe()
     read, write = (open(_lift(number), mode, 0) for number, mode in zip(numbers, ("rb", "wb"), strict=True))
     return reader.enter_context(read), writer.enter_context(write)  # type: ignore[arg-type, return-value]
@@ -345,12 +349,13 @@ def _lift(number: int) -> int:
 
 
 def _find_modules() -> list[str]:
-    """Where the process looks for modules: as here, but not in the current folder, which may hold anybody's files.
+    """Return the folders where the process looks for modules: ours without the current folder, which may hold any
+    files.
 
-    It does count where numpy itself comes from it.
+    The current folder is included if numpy itself comes from it.
     """
     try:
         here = {os.getcwd()} - {str(Path(np.__file__).parents[1])}
     except OSError:
-        here = set()  # it was deleted
+        here = set()  # the folder was deleted
     return [entry for entry in sys.path if isinstance(entry, str) and os.path.isabs(entry) and entry not in here]

@@ -1,11 +1,13 @@
 """The process that decodes compressed frames.  `decoder_pool` runs this file as a script; clrecon never imports it.
 
-Decoders are C code that meets hostile bytes: here they may crash, hang or ask for all memory, and only this process
-ends.  It imports numpy and the decoders in use, not clrecon and not pydicom, so that it starts in a tenth of a second.
+Decoders are C code that may get malicious bytes.  Here they may crash, hang or ask for all memory, and only this
+process ends.  It imports numpy and the decoders in use, not clrecon and not pydicom, so that it starts in a tenth of a
+second.
 
-It reads from standard input one line of JSON with settings, and then requests: a line of JSON, and as many bytes of
-compressed frame as it says.  To standard output goes for each a status, a count and as many bytes: the pixels in C
-order, or a text that says what is wrong.  This process ends with its input, and with its parent: see `end_with`.
+Standard input starts with one line of JSON with settings.  Then come requests: a line of JSON, followed by the number
+of bytes of the compressed frame that it states.  For each request, standard output gets a status, a count and that many
+bytes: the pixels in C order, or a text with the error.  This process ends when its input ends or its parent does: see
+`end_with`.
 """
 
 from __future__ import annotations
@@ -21,25 +23,25 @@ from collections.abc import Callable
 from typing import Any, BinaryIO
 
 REPLY = "<BQ"
-"""Status and count of the bytes that follow."""
+"""Format of a reply's head: status, and number of bytes that follow."""
 
 READY, DONE, FAILED, NO_MEMORY, NO_DECODER = range(5)
 
 SIZE_WITHOUT_PROC = 1 << 30
-"""Address space that is taken as used where the system does not say, in bytes: more than imports need."""
+"""Address space, in bytes, that is assumed to be in use where the system does not tell: more than the imports need."""
 
 Decoder = Callable[[bytes, dict[str, Any]], Any]
 
 
 def decode_by_openjpeg(data: bytes, request: dict[str, Any]) -> Any:
-    """JPEG 2000, high throughput too."""
+    """Decode JPEG 2000, High-Throughput JPEG 2000 too."""
     from openjpeg import decode
 
     return decode(data, 0)
 
 
 def decode_by_jpeg_ls(data: bytes, request: dict[str, Any]) -> Any:
-    """JPEG-LS."""
+    """Decode JPEG-LS."""
     import numpy as np
     from jpeg_ls import decode_pixel_data
 
@@ -49,7 +51,7 @@ def decode_by_jpeg_ls(data: bytes, request: dict[str, Any]) -> Any:
 
 
 def decode_by_rle(data: bytes, request: dict[str, Any]) -> Any:
-    """DICOM's own run length encoding."""
+    """Decode DICOM's own run length encoding."""
     import numpy as np
     from rle.rle import decode_frame
 
@@ -59,27 +61,27 @@ def decode_by_rle(data: bytes, request: dict[str, Any]) -> Any:
 
 
 def decode_by_imagecodecs_jpeg(data: bytes, request: dict[str, Any]) -> Any:
-    """JPEG lossless, by libjpeg-turbo."""
+    """Decode JPEG lossless by libjpeg-turbo."""
     from imagecodecs import jpeg8_decode
 
     return jpeg8_decode(data)
 
 
 def decode_by_imagecodecs_jpeg_ls(data: bytes, request: dict[str, Any]) -> Any:
-    """JPEG-LS, as `decode_by_jpeg_ls`."""
+    """Decode JPEG-LS, as `decode_by_jpeg_ls` does."""
     from imagecodecs import jpegls_decode
 
     return jpegls_decode(data)
 
 
 def decode_by_imagecodecs_jpeg_2000(data: bytes, request: dict[str, Any]) -> Any:
-    """JPEG 2000, as `decode_by_openjpeg`."""
+    """Decode JPEG 2000, as `decode_by_openjpeg` does."""
     from imagecodecs import jpeg2k_decode
 
     return jpeg2k_decode(data)
 
 
-# What a decoder needs is imported at the start: before the limit on memory, and where its lack can be told.
+# Decoders import at the start: before memory is limited, and where a missing package can be reported.
 DECODERS: dict[str, tuple[Decoder, tuple[str, ...]]] = {
     "openjpeg": (decode_by_openjpeg, ("openjpeg",)),
     "jpeg_ls": (decode_by_jpeg_ls, ("jpeg_ls",)),
@@ -91,7 +93,7 @@ DECODERS: dict[str, tuple[Decoder, tuple[str, ...]]] = {
 
 
 def load_decoder(name: str) -> Decoder:
-    """Find a decoder by its name, or by MODULE:FUNCTION, and import what it needs."""
+    """Find a decoder by its name, or by MODULE:FUNCTION, and import the packages that it needs."""
     if ":" in name:
         module, _, function = name.partition(":")
         return getattr(importlib.import_module(module), function)
@@ -102,7 +104,7 @@ def load_decoder(name: str) -> Decoder:
 
 
 def take_standard_output() -> BinaryIO:
-    """Return standard output under another number; what decoders print goes nowhere."""
+    """Move standard output to another descriptor and return it; output that decoders print is discarded."""
     sink = os.fdopen(os.dup(1), "wb", buffering=0)
     nowhere = os.open(os.devnull, os.O_WRONLY)
     os.dup2(nowhere, 1)
@@ -121,7 +123,7 @@ def send(sink: BinaryIO, status: int, body: Any = b"") -> None:
 
 
 def limit_memory(more_bytes: int) -> None:
-    """Allow `more_bytes` of address space beyond what the imports took, and no core files, where the system can."""
+    """Allow `more_bytes` of address space beyond the use after the imports, and no core files, where the system can."""
     try:
         import resource
     except ImportError:
@@ -135,13 +137,13 @@ def limit_memory(more_bytes: int) -> None:
         try:
             resource.setrlimit(what, (limit, limit))
         except (OSError, ValueError):
-            pass  # a stricter one is set, or the system (macOS) does not know this limit
+            pass  # a stricter limit is set, or the system (macOS) does not know this one
 
 
 def limit_time(seconds: float, orphan: bool) -> None:
-    """End this process when the next frame takes longer. The parent does so too; this holds without it.
+    """End this process when the next frame takes too long.  The parent does so too; this works without the parent.
 
-    Where an orphan lives on, the clock on the wall counts too: a decoder may wait for nothing.
+    The wall clock also counts, because the decoder of an orphaned process may wait for ever.
     """
     try:
         import resource
@@ -156,9 +158,10 @@ def limit_time(seconds: float, orphan: bool) -> None:
 
 
 def end_with(lifeline: int) -> None:
-    """Have the system end this process (SIGIO) when the other end of a pipe closes: when the parent is gone.
+    """Let the system end this process (by SIGIO) when the other end of a pipe closes, that is when the parent has
+    ended.
 
-    That works in the midst of a decoder too.  Where there is no such pipe the alarm ends an orphan.
+    This works even while a decoder runs.  Where the system has no such signal, the alarm ends an orphan.
     """
     if lifeline < 0:
         return
@@ -170,7 +173,7 @@ def end_with(lifeline: int) -> None:
     poll = select.poll()
     poll.register(lifeline)
     if poll.poll(0):
-        os._exit(1)  # it went before we asked
+        os._exit(1)  # it ended before we asked
 
 
 def answer(decoder: Decoder, data: bytes, request: dict[str, Any]) -> tuple[int, Any]:
@@ -186,14 +189,14 @@ def answer(decoder: Decoder, data: bytes, request: dict[str, Any]) -> tuple[int,
     except MemoryError:
         return NO_MEMORY, b""
     except Exception as error:
-        # Decoders fail in any way on hostile bytes; all of them mean that this frame is not to be had.
+        # Decoders raise any error on malicious bytes; each means that this frame cannot be decoded.
         return FAILED, f"{type(error).__name__}: {error}".encode("ascii", "replace")[:200]
 
 
 def main() -> None:
-    """Serve until standard input ends."""
+    """Answer requests until standard input ends."""
     if hasattr(signal, "SIGINT"):
-        signal.signal(signal.SIGINT, signal.SIG_IGN)  # a terminal sends it to all; the parent decides
+        signal.signal(signal.SIGINT, signal.SIG_IGN)  # a terminal sends Ctrl-C to all processes; the parent decides
     lifeline = int(sys.argv[1])
     end_with(lifeline)
     source, sink = sys.stdin.buffer, take_standard_output()
@@ -216,7 +219,7 @@ def main() -> None:
         limit_time(settings["seconds"], lifeline < 0)
         status, body = answer(decoders[request["decoder"]], data, request)
         if hasattr(signal, "alarm"):
-            signal.alarm(0)  # the next frame may be long in coming
+            signal.alarm(0)  # the next frame may take long to arrive
         send(sink, status, body)
         del data, body
 
@@ -225,5 +228,5 @@ if __name__ == "__main__":
     try:
         main()
     except BrokenPipeError:
-        pass  # the parent is gone
+        pass  # the parent has ended
     os._exit(0)

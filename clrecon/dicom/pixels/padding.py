@@ -1,10 +1,10 @@
-"""Padding: voxels that hold no measurement, filled with the air that was measured beside them.
+"""Padding, the voxels without a measurement: they are filled with the value of the air measured beside them.
 
-A surface between padding and measured air shows the reconstruction circle as a tube.  It appears at every iso value
-between the two, so that no fixed value is safe: air is -1000 HU on paper, -970 to -1010 HU in scans.  Of all values
-the median of the air beside the padding parts fewest of its neighbours from it, whatever the iso value: none where
-air has no noise, else no more than noise parts from noise.  Where the body reaches the circle it still meets air there
-and stays closed.
+Padding and measured air of different value would have a surface between them: the reconstruction circle as a tube, at
+every iso value between the two.  So no fixed value is safe: air is -1000 HU in theory, but -970 to -1010 HU in scans.
+The median of the air beside the padding separates the fewest neighbours from it, at every iso value: none where air has
+no noise, else no more than noise separates anyway.  Where the body reaches the circle it still meets air there, so its
+surface stays closed.
 """
 
 from __future__ import annotations
@@ -21,19 +21,19 @@ from clrecon.geometry import AIR_HU
 __all__ = ["PaddingMasks", "pack_mask"]
 
 AIR_RANGE_HU = (-1100, -900)
-"""What counts as air beside the padding.  The table and a blanket are denser; noise goes beyond at both ends alike."""
+"""Range of air beside the padding.  The table and a blanket are denser; noise exceeds both ends alike."""
 SAMPLED_SLICES = 16
-"""So many slices, evenly spread, give some thousand voxels beside the padding."""
+"""Number of evenly spread slices that are sampled; they give some thousand voxels beside the padding."""
 
 KEPT_MASKS = 16
-"""Masks are unpacked for so many slices at once; most scans have the same in all slices."""
+"""Masks of this many slices stay unpacked; most scans have the same mask in all slices."""
 
 Map = Callable[[Callable[[int], Any], Iterable[int]], Iterable[Any]]
-"""`map`, or that of a pool."""
+"""The function `map`, or that of a thread pool."""
 
 
 def pack_mask(mask: NDArray[np.bool_]) -> tuple[bytes, int]:
-    """A mask of padding in a bit a voxel, and how many voxels it has."""
+    """Return a mask of padding with one bit for each voxel, and its number of voxels."""
     return np.packbits(mask).tobytes(), int(np.count_nonzero(mask))
 
 
@@ -42,13 +42,7 @@ def _unpack_mask(shape: tuple[int, int], bits: bytes) -> NDArray[np.bool_]:
 
 
 class PaddingMasks:
-    """Where a volume that is being read has padding, slice by slice.
-
-    Parameters
-    ----------
-    voxels : ndarray, shape (nk, nj, ni)
-        The volume, in HU once it is read; what stands in its padding does not matter.
-    """
+    """The padding of a volume that is being read, slice by slice."""
 
     def __init__(self, voxels: NDArray[Any]):
         self._voxels = voxels
@@ -58,23 +52,23 @@ class PaddingMasks:
         self._mask = lru_cache(KEPT_MASKS)(partial(_unpack_mask, voxels.shape[1:]))
 
     def add(self, k: int, packed: tuple[bytes, int] | None) -> None:
-        """Note the padding of slice `k`, as `pack_mask` gives it; None where it has none."""
+        """Record the padding of slice `k`, as `pack_mask` returns it; None if the slice has none."""
         if packed is not None:
             bits, self._counts[k] = packed
-            self._packed[k] = self._distinct.setdefault(bits, bits)  # one that others have takes no memory
+            self._packed[k] = self._distinct.setdefault(bits, bits)  # equal masks share their memory
 
     @property
     def count(self) -> int:
-        """Voxels that are padding."""
+        """Number of voxels that are padding."""
         return sum(self._counts.values())
 
     def fill(self, run: Map = map) -> float | None:
-        """Give all padding the value of the air beside it, or `AIR_HU` where no air lies beside it.
+        """Set all padding to the value of the air beside it, or to `AIR_HU` where there is no air beside it.
 
         Parameters
         ----------
         run : callable
-            Where slices go through at once: the ``map`` of a pool.
+            Processes several slices at once: the ``map`` of a pool.
 
         Returns
         -------
@@ -96,7 +90,7 @@ class PaddingMasks:
         return float(value)
 
     def _air_beside(self, k: int) -> NDArray[Any]:
-        """Measured air next to the padding of a slice, in rows and columns."""
+        """Return measured air next to the padding of a slice, in rows and columns."""
         mask = self._mask(self._packed[k])
         beside = np.zeros_like(mask)
         beside[1:] |= mask[:-1]

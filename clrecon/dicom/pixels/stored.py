@@ -1,7 +1,7 @@
-"""Stored pixel values of slices, as they lie in the files: plain, deflated or compressed, one frame or many a file.
+"""Stored pixel values of slices as in the files: plain, deflated or compressed, one frame or many in a file.
 
-Only the bytes of the frame are read.  What is known of a whole file (where its compressed frames lie, its inflated
-data set) is found once and kept while the volume is read.
+Only the bytes of the frame are read.  Facts about a whole file (the places of its compressed frames, its inflated data
+set) are found once and kept while the volume is read.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ __all__ = ["StoredPixels"]
 INFLATE_STEP = 1 << 20
 
 COMPRESSED_RATIO, COMPRESSED_EXTRA_BYTES = 4, 1 << 20
-"""Bytes of a compressed frame are at most so many times those of its pixels, and these."""
+"""A compressed frame has at most this many times the bytes of its pixels, plus these bytes."""
 
 Known = TypeVar("Known")
 
@@ -43,17 +43,17 @@ class StoredPixels:
     Parameters
     ----------
     slices : sequence of SliceHeader
-        Of one size.
+        All of one size.
 
     Raises
     ------
     RefusedInputError
-        A decoder that they need is not installed.
+        A decoder that the slices need is not installed.
 
     Attributes
     ----------
     compressed : bool
-        Some of them are.
+        True: some of the slices are compressed.
     """
 
     def __init__(self, slices: Sequence[SliceHeader]):
@@ -72,7 +72,7 @@ class StoredPixels:
         self._pool.close()
 
     def stop(self) -> None:
-        """End decoding at once; calls of `load` in other threads raise."""
+        """End decoding at once; calls of `load` in other threads raise errors."""
         self._pool.kill()
 
     def load(self, header: SliceHeader, out: NDArray[Any]) -> NDArray[Any]:
@@ -92,7 +92,7 @@ class StoredPixels:
         Raises
         ------
         RefusedInputError
-            The file cannot be read, is cut short, or does not decode; the message names it.
+            The file cannot be read, is cut off, or cannot be decoded; the message names it.
         """
         dtype = stored_dtype(header.float_pixels, header.signed, header.bits_allocated)
         fits = out.dtype.itemsize == dtype.itemsize and (out.dtype.kind == "f") == (dtype.kind == "f")
@@ -148,7 +148,7 @@ class StoredPixels:
         stored[...] = np.frombuffer(inflated, stored.dtype, stored.size, first).reshape(stored.shape)
 
     def _know(self, known: dict[Path, Known], header: SliceHeader, find: Callable[[], Known]) -> Known:
-        """What is known of a file, found by the first thread that asks where there will be others."""
+        """Return the facts about a file; the first thread that asks finds them if other threads will ask too."""
         if header.frames == 1:
             return find()
         with self._locks[header.file]:
@@ -159,7 +159,7 @@ class StoredPixels:
 
 @cache
 def stored_dtype(floating: bool, signed: bool, bits_allocated: int) -> np.dtype[Any]:
-    """The type of stored values, in native byte order."""
+    """Return the type of stored values, in native byte order."""
     return np.dtype(f"{'f' if floating else 'i' if signed else 'u'}{bits_allocated // 8}")
 
 
@@ -174,16 +174,16 @@ def _read_into(file: Any, stored: NDArray[Any]) -> None:
 
 
 def _check_compressed_bytes(found: int, pixel_bytes: int) -> None:
-    """Compression that fails makes an image a little larger, no more."""
+    """Refuse a frame of too many bytes: a failing compression makes an image only a little larger."""
     most = COMPRESSED_RATIO * pixel_bytes + COMPRESSED_EXTRA_BYTES
     if found > most:
         raise RefusedInputError(f"the compressed frame has {found} bytes for {pixel_bytes} of pixels, {most} at most")
 
 
 def _inflate_data_set(header: SliceHeader, needed: int) -> bytes:
-    """The first `needed` bytes of a deflated data set, or what there is of them; memory is bounded by `needed`.
+    """Return the first `needed` bytes of a deflated data set, or those that exist; memory is bounded by `needed`.
 
-    zlib bounds its output itself and has no state that grows, so this needs no process of its own.
+    zlib bounds its output and its state does not grow, so no separate process is needed.
     """
     if needed > INFLATED_LIMIT:
         raise RefusedInputError(f"deflated image of {needed} bytes, no more than {INFLATED_LIMIT} are inflated")
@@ -205,9 +205,10 @@ def _inflate_data_set(header: SliceHeader, needed: int) -> bytes:
 def _settle_sign(header: SliceHeader, frame: Codestream, decoded: NDArray[Any]) -> None:
     """Give decoded values, in place, the sign that the header declares.
 
-    A codestream of fewer bits than its memory cell, and of another sign than the header's or of none, holds the bits
-    of a value without its sign, or the other way round.  From BitsStored on the bits tell it all, and unused ones are
-    dropped later.  With less than BitsStored there are two readings: they agree as long as the highest bit is 0.
+    A codestream may have fewer bits than its memory cell, and another sign than the header or none.  Its values then
+    have bits without their sign, or the other way round.  From BitsStored bits on the value is certain, and unused bits
+    are dropped later.  With fewer than BitsStored bits there are two readings, which agree as long as the highest bit
+    is 0.
     """
     if frame.signed is None and not header.signed or frame.signed == header.signed:
         return
@@ -223,6 +224,6 @@ def _settle_sign(header: SliceHeader, frame: Codestream, decoded: NDArray[Any]) 
 
 
 def count_readers(slices: int, most: int) -> int:
-    """Threads to read with: as many as this process may use cores."""
+    """Return the number of reading threads: the number of cores that this process may use."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     return max(1, min(most, cores, slices))

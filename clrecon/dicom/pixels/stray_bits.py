@@ -1,7 +1,7 @@
 """Bits of stored values above HighBit: the sign, an overlay, or part of the value after all.
 
-The standard says what they may hold (PS3.5 8.1.1): a sign that goes on, or overlays, which old files keep there.  They
-are cut off; where they were part of the value, because BitsStored is too small, its HU wrap around: metal turns to air.
+By the standard they hold the extended sign or, in old files, overlays (PS3.5 8.1.1). They are cut off.  Where they were
+part of the value, because BitsStored is too small, the HU wrap around: metal turns into air.
 """
 
 from __future__ import annotations
@@ -18,22 +18,22 @@ from clrecon.dicom.parse.elements import CorruptFileError, NotDicomError, read_e
 __all__ = ["StrayBits", "describe_stray_bits", "find_stray_bits"]
 
 OVERLAY_BITS = tuple(0x60000102 + (group << 16) for group in range(0, 32, 2))
-"""OverlayBitPosition of the 16 overlays that an image may have."""
+"""The tags OverlayBitPosition of the 16 overlays that an image may have."""
 
 
 class StrayBits(NamedTuple):
-    """What was found in one slice, before its bits are cut.
+    """Figures about the bits of one slice before they are cut.
 
     Attributes
     ----------
     odd : int
-        Values with bits above HighBit that are no sign and no overlay.
+        Number of values with bits above HighBit that are neither sign nor overlay.
     plain : int
-        Values that are negative if HighBit is their sign, and have none above it.
+        Number of values that are negative if HighBit is their sign, but have no bits above it.
     signs : bool
-        There are values whose sign goes on to the highest bit: beside these plain ones are large, not negative.
+        True: some values have their sign extended to the highest bit, so the plain ones are large and not negative.
     example : tuple of two int, optional
-        The first odd or, without, the first plain value, as it is stored and as it is read.
+        The first odd value, else the first plain one, as stored and as read.
     """
 
     odd: int = 0
@@ -43,7 +43,7 @@ class StrayBits(NamedTuple):
 
 
 def find_stray_bits(header: SliceHeader, stored: NDArray[Any], left_out: NDArray[np.bool_] | None) -> StrayBits | None:
-    """Look at the stored values of a slice, (rows, columns), as they lie in the file.
+    """Examine the stored values of a slice, (rows, columns), as they are in the file.
 
     Parameters
     ----------
@@ -55,7 +55,7 @@ def find_stray_bits(header: SliceHeader, stored: NDArray[Any], left_out: NDArray
     Returns
     -------
     StrayBits or None
-        None where there is no bit that could be stray.
+        None where no bit can be stray.
     """
     spare = header.bits_allocated - 1 - header.high_bit
     if header.float_pixels or spare == 0:
@@ -90,7 +90,9 @@ def find_stray_bits(header: SliceHeader, stored: NDArray[Any], left_out: NDArray
 
 
 def _read_overlay_bits(header: SliceHeader) -> list[int]:
-    """Bits of the stored values that hold overlays, as the header says; 0 is an overlay with data of its own."""
+    """Return the bits of the stored values that hold overlays by the header; position 0 is an overlay with its own
+    data.
+    """
     try:
         values = read_elements(header.file, OVERLAY_BITS, force=True).values
     except (OSError, CorruptFileError, NotDicomError):
@@ -100,7 +102,7 @@ def _read_overlay_bits(header: SliceHeader) -> list[int]:
 
 
 def describe_stray_bits(found: Iterable[StrayBits | None], headers: Iterable[SliceHeader]) -> tuple[int, str]:
-    """How many values of a stack lost bits that were theirs, and one line that says so; 0 and nothing without any."""
+    """Return how many values of a stack lost bits of their own, and one line about it; 0 and "" if there are none."""
     pairs = [(one, header) for one, header in zip(found, headers, strict=True) if one is not None]
     signs = any(one.signs for one, _ in pairs)
     counts = [one.odd + (one.plain if signs else 0) for one, _ in pairs]

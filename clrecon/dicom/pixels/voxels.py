@@ -1,10 +1,10 @@
 """Pixels of a stack to HU voxels, read in parallel straight into the volume.
 
-Order of the steps for every slice, each in the one place where it is right: stored bits, padding (a stored value,
-found before rescale), sign extension, rescale by the slice's own slope and intercept, padding to air (`padding`).
-Integer HU stay integers: int16 where every value fits, else int32; other slopes give float32.  Integer steps run in
-the memory of the volume in modular arithmetic, which is exact because the result is known to fit beforehand.
-Float pixel data are HU as they are (float32, from 64 bits too): the standard gives them no rescale (PS3.3 C.7.6.24).
+The steps for every slice, which are correct only in this order: stored bits, padding (a stored value, found before
+rescale), sign extension, rescale by the slice's own slope and intercept, padding to air (`padding`). Integer HU stay
+integers: int16 where every value fits, else int32; other slopes give float32. Integer steps run in the memory of the
+volume in modular arithmetic, which is exact because the result is known to fit beforehand.  Float pixel data are HU as
+they are (float32, from 64 bits too): the standard gives them no rescale (PS3.3 C.7.6.24).
 """
 
 from __future__ import annotations
@@ -31,27 +31,27 @@ __all__ = ["PixelFacts", "read_voxels"]
 MAX_READERS = 8
 MAX_DECODERS = 32
 DECODER_WORTH_BYTES = 4 << 20
-"""Of pixels: they take about as long to decode as a process takes to start."""
+"""Least bytes of pixels for one more decoder: they take about as long to decode as a process takes to start."""
 FLOAT_LIMIT = 1e9
-"""HU beyond this are none; float32 and every later step hold it."""
+"""Larger values are not HU; float32 and every later step can hold this value."""
 
 
 @dataclass(frozen=True)
 class PixelFacts:
-    """What was seen in the pixels.
+    """Figures of the pixels that were read.
 
     Attributes
     ----------
     padding_share : float
-        Of the voxels, 0 to 1.
+        Share of the voxels, 0 to 1.
     hu_min, hu_max : float
         Lowest and highest HU of the volume, padding included.
     padding_hu : float or None
-        What padding was filled with; None where there is none.
+        HU that padding was filled with; None without padding.
     stray : int
-        Values that lost bits of theirs, see `clrecon.dicom.pixels.stray_bits`.
+        Number of values that lost bits of their own, see `clrecon.dicom.pixels.stray_bits`.
     stray_text : str
-        What is to be said of them; empty where there are none.
+        One line about these values; empty if there are none.
     """
 
     padding_share: float
@@ -63,7 +63,7 @@ class PixelFacts:
 
 
 class _SliceFacts(NamedTuple):
-    """What was seen in one slice: its padding, packed, its lowest and highest measured HU, and bits that are odd."""
+    """Figures of one slice: its padding, packed, its lowest and highest measured HU, and unusual bits."""
 
     padding: tuple[bytes, int] | None
     low: float
@@ -72,7 +72,7 @@ class _SliceFacts(NamedTuple):
 
 
 class _RangeError(Exception):
-    """The HU of a slice do not fit the type of the volume; a wider one is taken."""
+    """The HU of a slice do not fit the type of the volume; a wider type is then used."""
 
 
 def read_voxels(
@@ -87,7 +87,7 @@ def read_voxels(
     progress : callable, optional
         Called as ``progress("read", done, total)``.
     source : StoredPixels, optional
-        One that is open for these slices and stays so; without it the call has its own.
+        An open source for these slices, which stays open; without it the call opens its own.
 
     Returns
     -------
@@ -98,12 +98,12 @@ def read_voxels(
     Raises
     ------
     RefusedInputError
-        A file is cut short, cannot be read or decoded, or the volume does not fit into memory.
+        A file is cut off, cannot be read or decoded, or the volume does not fit into memory.
     """
     integral = all(
         float(h.slope).is_integer() and float(h.intercept).is_integer() and not h.float_pixels for h in slices
     )
-    # A missing decoder shows here, before anything is allocated.
+    # A missing decoder shows here, before memory is allocated.
     with StoredPixels(slices) if source is None else nullcontext(source) as source:
         for dtype in (np.int16, np.int32) if integral else (np.float32,):
             voxels = allocate_voxels((len(slices), slices[0].rows, slices[0].columns), dtype)
@@ -133,7 +133,7 @@ def _fill_volume(
                 if progress is not None:
                     progress("read", done, len(slices))
         except _RangeError:
-            pool.shutdown(cancel_futures=True)  # the decoders are needed once more
+            pool.shutdown(cancel_futures=True)  # the decoders are needed again
             raise
         except BaseException:
             source.stop()
@@ -150,7 +150,7 @@ def _fill_slice(source: StoredPixels, header: SliceHeader, out: NDArray[Any]) ->
     """Read one slice into `out`."""
     stored = source.load(header, out)
     whole_cell = header.padding is not None and not header.float_pixels and not _fits_stored_bits(header)
-    padding = _find_padding(header, stored) if whole_cell else None  # the value fills unused bits too
+    padding = _find_padding(header, stored) if whole_cell else None  # padding may fill unused bits too
     stray = None
     if not header.float_pixels:
         stray = find_stray_bits(header, stored, padding)
@@ -161,7 +161,7 @@ def _fill_slice(source: StoredPixels, header: SliceHeader, out: NDArray[Any]) ->
     if padding is not None and packed is not None:
         if packed[1] == padding.size:
             return _SliceFacts(packed, np.inf, -np.inf, stray)
-        # A measured value in its place counts for nothing: one pass less over the slice.
+        # A measured value at this place does not matter: this saves one pass over the slice.
         np.copyto(stored, stored.flat[padding.argmin()], where=padding)
     low, high = stored.min(), stored.max()
     if header.float_pixels and not (abs(low) <= FLOAT_LIMIT and abs(high) <= FLOAT_LIMIT):
@@ -183,7 +183,7 @@ def _fill_slice(source: StoredPixels, header: SliceHeader, out: NDArray[Any]) ->
 def _rescale_integers(
     header: SliceHeader, stored: NDArray[Any], out: NDArray[Any], hu_low: float, hu_high: float
 ) -> None:
-    """Rescale in the memory of the volume, modulo its width: exact, because the result fits."""
+    """Rescale in the memory of the volume, modulo its width: this is exact, because the result fits."""
     if not (_fits_dtype(int(hu_low), out.dtype) and _fits_dtype(int(hu_high), out.dtype)):
         raise _RangeError
     if not np.may_share_memory(stored, out):
@@ -200,7 +200,7 @@ def _fits_dtype(value: int, dtype: np.dtype[Any]) -> bool:
 
 
 def _describe_unfit(stored: NDArray[Any]) -> str:
-    """Count what is no HU in float pixels."""
+    """Count values of float pixels that cannot be HU."""
     nan = int(np.count_nonzero(np.isnan(stored)))
     infinite = int(np.count_nonzero(np.isinf(stored)))
     if nan or infinite:
@@ -209,7 +209,7 @@ def _describe_unfit(stored: NDArray[Any]) -> str:
 
 
 def _extend_sign(header: SliceHeader, stored: NDArray[Any]) -> None:
-    """Drop the bits around the stored ones (overlays live there) and extend the sign, in place."""
+    """Drop the bits around the stored ones (overlays may be there) and extend the sign, in place."""
     if header.bits_stored == header.bits_allocated:
         return
     np.left_shift(stored, header.bits_allocated - 1 - header.high_bit, out=stored)
@@ -225,7 +225,7 @@ def _fits_stored_bits(header: SliceHeader) -> bool:
 
 
 def _find_padding(header: SliceHeader, stored: NDArray[Any]) -> NDArray[np.bool_] | None:
-    """Mask of the padding; None where there is none."""
+    """Return the mask of the padding; None without padding."""
     assert header.padding is not None
     low, high = header.padding
     if header.float_pixels:

@@ -1,1 +1,1 @@
-"""Files to series, and what is known of them."""
+"""Series: files are grouped into series, and each gets its certificate."""

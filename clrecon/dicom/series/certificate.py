@@ -1,6 +1,7 @@
-"""The certificate of a DICOM series: what is known of its origin and geometry, without patient data.
+"""The certificate of a DICOM series: the facts about its origin and geometry, without patient data.
 
-People put names into file names and series descriptions: warnings and reports hold neither, but counts and positions.
+People put names into file names and series descriptions: warnings and reports contain neither, only counts and
+positions.
 """
 
 from __future__ import annotations
@@ -37,11 +38,11 @@ from clrecon.system.text import hash_uid
 __all__ = ["certify", "collect_scan_warnings", "collect_series_warnings"]
 
 SAID_BY_GATES = ("padding_share", "stored_bits", "plausible_spacing", "gap_thickness", "plausible_hu")
-"""Gates whose text is a warning where they fail; of the others a warning says more."""
+"""Gates whose text becomes a warning when they fail; for the other gates a separate warning says more."""
 
 
 def collect_scan_warnings(scan: Scan) -> list[str]:
-    """Warnings about files that were passed over although they claim to be DICOM, or could not be looked at."""
+    """Return warnings about files that claim to be DICOM but were passed over, or that could not be examined."""
     warnings = []
     if scan.skipped["corrupt"]:
         warnings.append(f"{scan.skipped['corrupt']} corrupt file{'s' * (scan.skipped['corrupt'] > 1)} skipped")
@@ -53,7 +54,7 @@ def collect_scan_warnings(scan: Scan) -> list[str]:
 
 
 def collect_series_warnings(series: Series) -> list[str]:
-    """Warnings about one series, from its headers and its geometry."""
+    """Return warnings about one series, from its headers and its geometry."""
     if series.stack is None or series.kind == "other":
         return []
     headers = series.stack.slices
@@ -86,7 +87,7 @@ def collect_series_warnings(series: Series) -> list[str]:
 
 
 def _describe_what_was_left(series: Series) -> list[str]:
-    """Copies, the other phases of a series, and reconstructions that are not of one kind."""
+    """Describe copies, the other phases of a series, and mixed reconstructions."""
     try:
         places = series.places
     except RefusedInputError:
@@ -120,7 +121,7 @@ def _describe_phase(series: Series) -> dict[str, Any] | None:
 
 
 def _place(stack: Stack, is_so: Callable[[SliceHeader], bool]) -> str:
-    """Which slices, by count and position along the normal: their file names may hold the patient's."""
+    """Describe slices by count and position along the normal; their file names may contain the patient's name."""
     positions = [place for header, place in zip(stack.slices, stack.distances_mm, strict=True) if is_so(header)]
     if len(positions) == len(stack.slices):
         return "all slices"
@@ -142,15 +143,15 @@ def certify(
     Parameters
     ----------
     series, stack : Series, Stack
-        What was read, or would be.
+        The series that was or would be read, and its stack.
     facts : PixelFacts or None
-        None: the pixels were not read, and what only they can say is None.
+        None: the pixels were not read, and entries that depend on them are None.
     scan : Scan
     affine : ndarray, shape (4, 4), or None
         None: the series is refused.
     warnings : sequence of str
     likeness : Likeness or None
-        Of the slices; None: the pixels were not read, or there are too few.
+        Likeness of the slices; None: the pixels were not read, or there are too few slices.
 
     Returns
     -------

@@ -1,4 +1,4 @@
-"""Which of the series found is read: the one that is named, or the one usable CT stack with most slices."""
+"""The choice of the series to read: the one that is named, or the usable CT stack with the most slices."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ def choose_series(found: Sequence[Series], wanted: int | str | None = None) -> S
     Raises
     ------
     UsageError
-        `wanted` names none or several; lists what is there.
+        `wanted` matches no series or several; the message lists the series.
     NoDicomError
-        There is no CT series, or the one named is none.
+        There is no CT series, or the one that is named is not CT.
     RefusedInputError
         Several usable CT stacks, or only unusable ones, have the same, largest number of slices; there is no
         stack; or there are stacks of several patients.
@@ -52,7 +52,7 @@ def choose_series(found: Sequence[Series], wanted: int | str | None = None) -> S
 
 
 def _check_one_patient(ct: Sequence[Series]) -> None:
-    """Of several patients none is the one that was meant because it has more slices."""
+    """Refuse to choose among several patients: having more slices does not make a patient the right one."""
     stacks = [series for series in ct if series.kind == "stack" and series.count > 1]
     patients = {series.patient for series in stacks if series.patient}
     if len(patients) > 1:
@@ -84,7 +84,7 @@ def _take_largest(candidates: Sequence[Series]) -> Series:
     most = max(counts)
     largest = [series for series, count in zip(stacks, counts, strict=True) if count == most]
     if len(largest) == 1:
-        return largest[0]  # a fault does not pass it over: read_volume refuses it
+        return largest[0]  # a fault does not exclude the series: read_volume refuses it
     usable = [series for series in largest if not series.problems]
     if len(usable) == 1:
         return usable[0]
@@ -100,7 +100,7 @@ def _take_largest(candidates: Sequence[Series]) -> Series:
 
 
 def describe_left(found: Sequence[Series], chosen: Series) -> list[str]:
-    """Warn of the series that were not chosen, and which of the larger ones cannot be used."""
+    """Warn about the series that were not chosen, and about larger ones that cannot be used."""
     left = [series for series in found if series is not chosen]
     if not left:
         return []
@@ -112,7 +112,7 @@ def describe_left(found: Sequence[Series], chosen: Series) -> list[str]:
 
 
 def _describe_other_planes(left: Sequence[Series], chosen: Series) -> list[str]:
-    """Warn of slices that were split off the chosen stack: lost at its end they leave no hole."""
+    """Warn about slices that were split off the chosen stack: missing at its end they leave no hole."""
     parts = [one for one in left if one.kind == "stack" and one.headers and one.key == chosen.key]
     if not parts or not chosen.headers:
         return []

@@ -1,10 +1,10 @@
-"""Reading many small things from a disk that may be slow or hang.
+"""Reading folders and starts of many files from a disk that may be slow or hang.
 
 The calls that can hang (listing a folder, opening a file, reading its start) run in threads of their own, for two
-reasons.  A network drive that does not answer cannot be interrupted, neither by us nor with Ctrl-C: the caller waits
-beside it instead, says after `NOTICE_S` what it waits for, and gives up after `GIVE_UP_S` with an error that names
-it; the threads are daemons, so that one that hangs does not hold up the end of the process.  And where a file takes
-longer than `SLOW_FILE_S`, it is the way to the disk that takes so long: then several threads wait at once.  On a warm
+reasons.  A network drive that does not answer cannot be interrupted, neither by us nor with Ctrl-C: so the caller waits
+in another thread, reports after `NOTICE_S` what it waits for, and gives up after `GIVE_UP_S` with an error that names
+it.  The threads are daemons, so that a hanging one does not delay the end of the process.  And where a file takes
+longer than `SLOW_FILE_S`, the delay lies in the connection to the disk: then several threads wait at once.  On a warm
 cache one thread is fastest, since the parser beside it needs the interpreter's lock.
 """
 
@@ -34,7 +34,7 @@ MOST_THREADS = 16
 
 
 class DiskReader:
-    """Reads beside the caller; for use in a ``with`` statement.
+    """Reads in separate threads while the caller waits; for use in a ``with`` statement.
 
     Parameters
     ----------
@@ -44,7 +44,7 @@ class DiskReader:
     Attributes
     ----------
     touched : str
-        Path of what was read last; told where it hangs.
+        Path that was read last, for the message when it hangs.
     """
 
     def __init__(self, progress: Progress | None = None):
@@ -69,18 +69,18 @@ class DiskReader:
         Raises
         ------
         RefusedInputError
-            No answer for `GIVE_UP_S`.
+            The disk did not answer for `GIVE_UP_S`.
         """
         result: T = self._run_all([job])[0]
         return result
 
     def read_starts(self, files: Sequence[str]) -> Iterator[FileStart | OSError]:
-        """Yield the start of every file, or why it cannot be read, in their order; `CHUNK` files are held at a time.
+        """Yield the start of every file, or the error of reading it, in order; `CHUNK` files are held at a time.
 
         Raises
         ------
         RefusedInputError
-            No answer for `GIVE_UP_S`.
+            The disk did not answer for `GIVE_UP_S`.
         """
         for first in range(0, len(files), CHUNK):
             self._place = (first, len(files))
@@ -117,7 +117,7 @@ class DiskReader:
             number, job = task
             try:
                 self._done.put((number, job(), None))
-            except BaseException as error:  # raised again beside the caller
+            except BaseException as error:  # raised again in the caller's thread
                 self._done.put((number, None, error))
 
     def _run_all(self, jobs: Sequence[Callable[[], Any]]) -> list[Any]:

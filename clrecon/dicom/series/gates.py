@@ -1,7 +1,7 @@
-"""What a CT series must fulfil to be measured on: named gates, in the form of `clrecon.system.gates`.
+"""The gates of a CT series: conditions that it must meet before it is used for measurements, as `clrecon.system.gates`.
 
-A gate is a fact that moves a surface in the patient or changes its level, and that a user of the mesh could not see.
-Everything else that is odd is a warning alone; docs/certificate.md says which is which, and why.
+A gate covers a fact that moves a surface in the patient or changes its level, without the user of the mesh seeing it.
+Everything else that is unusual gives only a warning; docs/certificate.md lists both, with the reasons.
 """
 
 from __future__ import annotations
@@ -32,38 +32,39 @@ from clrecon.system.gates import Gate, at_most, none_of, unmeasured
 __all__ = ["PADDING_SHARE", "judge_figures", "judge_series", "judge_steps", "list_odd_values"]
 
 PADDING_SHARE = 0.75
-"""A circle in its square leaves 0.21 as padding, a 500 mm circle in a field of 800 mm 0.69; above that most of what
-was measured is likely to be masked by a wrong PixelPaddingValue."""
+"""Largest share of padding.  A circle in its square leaves 0.21, a 500 mm circle in a field of 800 mm 0.69; above that
+a wrong PixelPaddingValue probably masks measured voxels."""
 
 
 PIXEL_MM = (0.005, 10.0)
-"""From the finest micro-CT in use to attenuation maps of PET and SPECT."""
+"""Range of pixel sizes: from the finest micro-CT in use to attenuation maps of PET and SPECT."""
 GAP_MM = (0.005, 50.0)
 GAP_THICKNESSES = 2.0
-"""More between the slices that was not measured than was: a high-resolution lung scan has 10, and no surface."""
+"""Largest gap in units of the slice thickness.  Beyond it more is left out than measured: a high-resolution lung scan
+has 10, and no usable surface."""
 SLOPES, INTERCEPTS = (1e-3, 100.0), (-40_000.0, 40_000.0)
-"""Scanners write 1, some fractions of it or a few; below 0 bone is dark.  Stored 16-bit values in the middle of their
-range need an intercept of 32768."""
+"""Ranges of slope and intercept.  Scanners write the slope 1, a fraction of 1 or a few; below 0 bone would be dark.
+Stored 16-bit values in the middle of their range need an intercept of 32768."""
 LOWEST_HU, DENSEST_HU = (-10_000.0, 1000.0), (-900.0, 70_000.0)
-"""Padding that nobody declared goes down to -8192; a cut out of bone has spongy parts.  Less dense than
--900 is air alone; 16 bits end at 65535."""
+"""Ranges of the lowest and the densest voxel.  Undeclared padding goes down to -8192; a cut-out of bone has spongy
+parts.  A densest voxel below -900 is air; 16 bits end at 65535."""
 STRAY = "values beyond the stored bits"
 
 
 def judge_series(
     series: Series, stack: Stack | None, facts: PixelFacts | None = None, likeness: Likeness | None = None
 ) -> list[Gate]:
-    """Hold a series against the gates.
+    """Judge a series by the gates.
 
     Parameters
     ----------
     series : Series
     stack : Stack or None
-        Its slices as they are, or would be, read.
+        Its slices as they are or would be read.
     facts : PixelFacts, optional
-        Of its pixels; without them the gates on pixels are not measured.
+        Figures of its pixels; without them the gates on pixels are not measured.
     likeness : Likeness, optional
-        Of its slices; None where they are too few, or too small, as well.
+        Likeness of its slices; also None where they are too few or too small.
 
     Returns
     -------
@@ -120,7 +121,9 @@ def _judge_spacing(stack: Stack) -> Gate:
 
 
 def judge_steps(pixels_mm: Sequence[float], gap_mm: float | None) -> Gate:
-    """Pixels and gaps of a size that scanners have: a mesh a thousand times too large looks like any other."""
+    """Judge whether pixels and gaps have sizes of real scanners: a mesh a thousand times too large looks like any
+    other.
+    """
     (low, high), (gap_low, gap_high) = PIXEL_MM, GAP_MM
     odd = [f"pixels of {mm:g} mm" for mm in sorted(set(pixels_mm)) if not low <= mm <= high]
     if gap_mm is not None and not gap_low <= gap_mm <= gap_high:
@@ -130,7 +133,7 @@ def judge_steps(pixels_mm: Sequence[float], gap_mm: float | None) -> Gate:
 
 
 def _judge_thickness(stack: Stack) -> Gate:
-    """Gaps against SliceThickness: how much of the tissue was measured at all."""
+    """Compare gaps with SliceThickness: how much of the tissue was measured."""
     what = "largest gap between slices as a multiple of SliceThickness; above 1 the tissue between was not measured"
     thickness = np.array([header.slice_thickness_mm or 0.0 for header in stack.slices])
     if (thickness <= 0.0).any():
@@ -144,7 +147,7 @@ def _judge_thickness(stack: Stack) -> Gate:
 
 
 def _judge_hu(headers: Sequence[SliceHeader], facts: PixelFacts | None) -> Gate:
-    """Rescale, air and the densest voxel as CT has them; without pixels rescale alone."""
+    """Judge whether rescale, lowest and densest voxel are those of a CT; without pixels the rescale alone."""
     odd = []
     for name, values, (low, high) in (
         ("RescaleSlope", [header.slope for header in headers], SLOPES),
@@ -157,7 +160,7 @@ def _judge_hu(headers: Sequence[SliceHeader], facts: PixelFacts | None) -> Gate:
 
 
 def list_odd_values(facts: PixelFacts) -> list[str]:
-    """The lowest and the densest voxel, where no CT has such a one."""
+    """Return the lowest and the densest voxel if they lie outside the range of every CT."""
     return [
         f"{name} voxel {value:g} HU, expected {low:g} to {high:g}"
         for name, value, (low, high) in (("lowest", facts.hu_min, LOWEST_HU), ("densest", facts.hu_max, DENSEST_HU))
@@ -166,13 +169,15 @@ def list_odd_values(facts: PixelFacts) -> list[str]:
 
 
 def judge_figures(odd: Sequence[str]) -> Gate:
-    """The gate ``plausible_hu``, of the figures that are odd."""
+    """Judge the gate ``plausible_hu``, given the unusual figures."""
     what = "figures of HU that no CT has"
     return none_of("plausible_hu", len(odd), f"{what} ({'; '.join(odd)})" if odd else what)
 
 
 def _judge_one_volume(series: Series, likeness: Likeness | None) -> Gate:
-    """Neighbours that are less alike than slices farther apart, and what alternates from slice to slice."""
+    """Judge whether neighbours differ more than slices farther apart, and whether an element alternates from slice to
+    slice.
+    """
     doubts = 0 if series.stack is None or series.find_doubt() == "" else 1
     what = "signs of several volumes between each other: a header that alternates, neighbours less alike than others"
     if likeness is None and not doubts:
@@ -184,12 +189,12 @@ def _count_doubled(series: Series) -> int:
     try:
         places = series.places
     except RefusedInputError:
-        return 0  # the pixels cannot be compared: a reason to refuse it, which is counted already
+        return 0  # the pixels cannot be compared: already counted as a reason for refusal
     return len(places.headers) - len(group_places(places.headers)) if places.problem else 0
 
 
 def _judge_stated_gap(stack: Stack) -> Gate:
-    """SpacingBetweenSlices against the positions: the one trace that is left when every second slice is gone."""
+    """Compare SpacingBetweenSlices with the positions: the only sign that every second slice is missing."""
     what, bound = "SpacingBetweenSlices differs from the positions by", 100.0 * STATED_GAP_TOLERANCE
     found = measure_stated_gap(stack.slices, stack.positions_mm, stack.line.gap_median_mm)
     if found is None:

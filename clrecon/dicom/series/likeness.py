@@ -1,9 +1,10 @@
-"""Are neighbouring slices alike?  Two volumes between each other show in the pixels where no header tells them apart.
+"""Likeness of neighbouring slices: the pixels show two interleaved volumes that no header distinguishes.
 
-Within one volume slices differ the more the farther apart they lie.  Where the slices of two volumes alternate, each
-differs more from its neighbours than from the next but one, which is of its own volume; of three volumes, more than
-from the third; where two alternate in pairs, more than from the fourth.  Squares of differences are compared: those of
-means of some pixels, so that noise counts for little, over the whole picture and in small parts of it.
+Within one volume, slices differ the more the farther apart they are.  Where the slices of two volumes alternate, each
+slice differs more from its neighbours than from the next but one, which is of its own volume.  With three volumes it
+differs more than from the third slice, and with two volumes in pairs more than from the fourth.  Squares of differences
+are compared, over the whole picture and in small parts of it.  They are taken between means of several pixels, which
+reduces noise.
 """
 
 from __future__ import annotations
@@ -22,43 +23,45 @@ from clrecon.dicom.stack.fit import TILT_REPORT_DEG, Stack
 __all__ = ["Likeness", "judge_likeness", "judge_slices", "measure_likeness"]
 
 LEAST_LIKENESS = 1.25
-"""Differences from neighbours over those from the slice one period on, from which slices of several volumes lie between
-each other.  Four real scans, taken whole and by every 2nd, 3rd and 4th slice: at most 0.58, for periods of 3 and 4 at
+"""Ratio of the differences from neighbours to those from the slice one period on; from this ratio on slices belong to
+several volumes.  Four real scans, whole and with every 2nd, 3rd and 4th slice: at most 0.58, for periods of 3 and 4 at
 most 0.74 and 0.82; water with noise: 0.99, 1.06, 1.12."""
 PART_LIKENESS = 2.0
-"""The same in the part of the picture where it is most, with period 2.  Those scans: at most 1.47 (slices 17 mm apart),
-at most 0.89 where they are nearer.  A part need not hold much of anything: water with noise 1.01."""
+"""The same ratio in the part of the picture where it is largest, with period 2. Those scans: at most 1.47 (slices 17 mm
+apart), at most 0.89 where slices are nearer.  The content of a part matters little: water with noise 1.01."""
 PERIODS = (2, 3, 4)
 MOST_ALIKE, LEAST_ALIKE = 12, 4
-"""So many slices in a row must all be so, or as many as there are, and no fewer."""
+"""Number of consecutive slices that must all reach it; of fewer slices all, but at least the second number."""
 LEAST_ALIKE_PART = 6
 HU_RANGE = (-1000, 2000)
-"""What lies beyond is padding and metal.  Sums over a cell fit 16 bits."""
+"""Values are limited to this range; beyond are padding and metal.  Sums over a cell then fit 16 bits."""
 CELL, FINE_CELL, COARSE_CELLS = 4, 2, 32
-"""Pixels along the sides of what is averaged: `CELL` where that gives `COARSE_CELLS` cells a side, else fewer."""
+"""Pixels along the side of a cell that is averaged: `CELL` where that gives `COARSE_CELLS` cells along a side, else
+fewer."""
 FEWEST_CELLS = 64
-"""Of a picture with fewer, differences are chance."""
+"""Least number of cells; in smaller pictures differences are due to chance."""
 PART = 8
-"""Cells along the sides of a part."""
+"""Cells along the side of a part of the picture."""
 NOISE_HU2, PART_NOISE_HU2 = 1.0, 25.0
-"""Squares of differences below these are taken as these: pictures without noise are alike by chance."""
+"""Lower limits of squared differences: pictures without noise are alike by chance."""
 READERS = 4
 WINDOW, WINDOWS = 32, 3
-"""Of an even stack with more, so many slices in so many places: volumes between each other are so from end to end."""
+"""Number of slices in a window, and windows examined, in an evenly spaced stack with more slices: interleaved volumes
+are interleaved from end to end."""
 
 
 @dataclass(frozen=True)
 class Likeness:
-    """How much more slices differ from their neighbours than from one farther on.
+    """Ratio of the differences from neighbours to those from a slice farther on.
 
     Attributes
     ----------
     period : int
-        Slices from one to the one that it is most like.
+        Number of slices from one slice to the most similar one.
     whole : float
-        Of the whole picture; over 1 where neighbours are less alike.
+        Ratio over the whole picture; above 1 where neighbours are less alike.
     part : float or None
-        Of the part of the picture where it is most; None where it was not looked at.
+        Ratio in the part of the picture where it is largest; None where parts were not examined.
     """
 
     period: int
@@ -67,12 +70,12 @@ class Likeness:
 
     @property
     def suspicion(self) -> float:
-        """The larger of the two figures, each over its bound: above 1 several volumes lie between each other."""
+        """The larger of the two ratios, each divided by its bound: above 1 several volumes are interleaved."""
         return max(self.whole / LEAST_LIKENESS, (self.part or 0.0) / PART_LIKENESS)
 
     @property
     def is_mixed(self) -> bool:
-        """Several volumes lie between each other."""
+        """True where several volumes are interleaved."""
         return self.suspicion > 1.0
 
     def __str__(self) -> str:
@@ -88,12 +91,14 @@ class Likeness:
 
 
 def judge_likeness(voxels: NDArray[Any], stack: Stack) -> Likeness | None:
-    """`measure_likeness` of a stack that was read, voxels (nk, nj, ni); of a long one where it is most suspicious."""
+    """Apply `measure_likeness` to a stack that was read, voxels (nk, nj, ni); to a long one where it is most
+    suspicious.
+    """
     return judge_slices(voxels, stack.tilt_deg, uneven=stack.line.uneven)
 
 
 def judge_slices(voxels: NDArray[Any], tilt_deg: float | None, *, uneven: bool | None = False) -> Likeness | None:
-    """The same of slices (n, rows, columns) along any axis of a grid; None for the tilt: not known."""
+    """Do the same for slices (n, rows, columns) along any axis of a grid; None for an unknown tilt."""
     parts = tilt_deg is not None and tilt_deg <= TILT_REPORT_DEG
     count = len(voxels)
     if uneven or count <= WINDOW * WINDOWS:
@@ -104,16 +109,16 @@ def judge_slices(voxels: NDArray[Any], tilt_deg: float | None, *, uneven: bool |
 
 
 def measure_likeness(voxels: NDArray[Any], parts: bool = True) -> Likeness | None:
-    """Compare slices with their neighbours and with those some way on.
+    """Compare slices with their neighbours and with slices farther on.
 
     Parameters
     ----------
     voxels : ndarray, shape (nk, nj, ni)
         HU, one slice at each place, in the order of the places.
     parts : bool
-        Look at parts of the picture too.  Not where the gantry is tilted: scanners that measure several slices in one
-        turn then move those of one turn against each other, which shows in what does not change along the table (a
-        head holder) on real scans.
+        True: examine parts of the picture too.  Use False for a tilted gantry: scanners that measure several slices in
+        one turn shift the slices of a turn against each other, which shows in objects that do not change along the
+        table (a head holder) in real scans.
 
     Returns
     -------
@@ -144,7 +149,9 @@ def measure_likeness(voxels: NDArray[Any], parts: bool = True) -> Likeness | Non
 
 
 def _ratios(differences: Sequence[NDArray[np.float32]], noise: float) -> NDArray[np.float32]:
-    """For each stretch of `period` slices the largest mean difference of fewer steps over that of all its steps."""
+    """Return for each stretch of `period` slices the largest mean difference over fewer steps, divided by that over
+    `period` steps.
+    """
     period = len(differences)
     count = len(differences[-1])
     nearer = []
@@ -154,7 +161,7 @@ def _ratios(differences: Sequence[NDArray[np.float32]], noise: float) -> NDArray
 
 
 def _steadily(ratios: NDArray[np.float32]) -> NDArray[np.float32]:
-    """The largest ratio that `MOST_ALIKE` in a row reach, or as many as there are."""
+    """Return the largest ratio that `MOST_ALIKE` consecutive stretches reach, or all if there are fewer."""
     count = min(MOST_ALIKE, len(ratios))
     lowest = [np.min(ratios[first : first + count], axis=0) for first in range(len(ratios) - count + 1)]
     return np.asarray(np.max(lowest, axis=0))
@@ -165,7 +172,7 @@ def _square_differences(cells: NDArray[np.float32], step: int) -> NDArray[np.flo
 
 
 def _average_cells(voxels: NDArray[Any]) -> NDArray[np.float32]:
-    """Means of squares of pixels, (nk, rows, columns)."""
+    """Average squares of pixels of each slice, (nk, rows, columns)."""
     least = min(voxels.shape[1:])
     side = next((side for side in (CELL, FINE_CELL) if least >= side * COARSE_CELLS), 1)
     rows, columns = voxels.shape[1] // side, voxels.shape[2] // side
@@ -188,7 +195,7 @@ def _average_cells(voxels: NDArray[Any]) -> NDArray[np.float32]:
 
 
 def _average(pictures: NDArray[np.float32], side: int) -> NDArray[np.float32]:
-    """Means over squares of pictures (n, rows, columns), what is left over at the ends not among them."""
+    """Average over squares of pictures (n, rows, columns), leaving out the rest at the ends."""
     rows, columns = pictures.shape[1] // side, pictures.shape[2] // side
     cut = pictures[:, : rows * side, : columns * side].reshape(len(pictures), rows, side, columns, side)
     return cut.mean(axis=(2, 4))

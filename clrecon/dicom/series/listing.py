@@ -1,4 +1,4 @@
-"""What a listing says of each series, in JSON types."""
+"""Listing of series, in JSON types."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ class SeriesEntry:
     number : int
         From 1, the value that ``series=`` takes.
     patient, study : int or None
-        Which of the patients and studies that were found, from 1: their identifiers are nowhere.  None where the
-        files do not say.
+        Numbers of the patient and the study among those found, from 1; their identifiers are not given.  None where the
+        files do not tell.
     kind : {"stack", "localizer", "capture", "other"}
         Only stacks are read.
     phases : list of dict
         ``{"number", "keyword", "value", "slices"}`` of each volume, where slices share places; else empty.
     slices : int
-        Images in it; copies and all phases count.
+        Number of images, with copies and all phases.
     uid_hash : str or None
         First 16 hexadecimal digits of the SHA-256 of the SeriesInstanceUID, None where the files have none.
     shape_ijk, spacing_mm, affine_ijk_to_lps_mm, tilt_deg : list, list, nested list, float; or None
@@ -45,9 +45,9 @@ class SeriesEntry:
     extent_mm : list or None
         Size of the box of whole voxels along rows, columns and the slice normal.
     slice_thickness_mm : float or None
-        As stated; plays no part in the geometry.
+        As stated; not used for the geometry.
     dropped : dict of str to int
-        Reason to number of slices left out of the stack.
+        Maps a reason to the number of slices left out of the stack.
     """
 
     number: int
@@ -79,21 +79,21 @@ class SeriesEntry:
 
 @dataclass(frozen=True)
 class SeriesListing:
-    """What is at a path.
+    """The series at a path.
 
     Attributes
     ----------
     series : list of SeriesEntry
     chosen : int or None
-        Number of the series that `read_volume` takes for the same ``series``; None where it would not choose.
+        Number of the series that `read_volume` reads for the same ``series``; None where it would not choose.
     skipped : dict of str to int
-        Reason to number of files passed over.
+        Maps a reason to the number of files passed over.
     warnings : list of str
     certificate : Certificate or None
-        Of the chosen series, as ``volume.report``, also where it is refused; None where no series is
-        chosen or none of its slices has a valid header.
+        Certificate of the chosen series, as in ``volume.report``, even if the series is refused; None where no series
+        is chosen or none of its slices has a valid header.
     refusal : ClreconError or None
-        Why none is chosen; its text stands in `warnings` too.
+        The reason why no series is chosen; `warnings` contains its text too.
     """
 
     series: list[SeriesEntry]
@@ -139,7 +139,7 @@ def describe_series(series: Series, warnings: Iterable[str] = ()) -> SeriesEntry
 
 
 def _count_slices(series: Series, stack: Stack) -> int:
-    """Of the volume where it is known; of all that was found where it is refused."""
+    """Count the slices of the volume if it is known; of a refused series all slices found."""
     return len(series.headers) if series.problems else len(stack.slices)
 
 

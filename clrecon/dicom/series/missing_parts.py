@@ -1,4 +1,4 @@
-"""Files of a concatenation that are not there: lost at an end of the stack they would leave no hole."""
+"""Missing files of a concatenation: at an end of the stack they would leave no hole."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ __all__ = ["describe_missing_parts"]
 
 
 def describe_missing_parts(slices: Iterable[SliceHeader]) -> list[str]:
-    """Describe files of concatenations that are not there: lost at an end of the stack they would leave no hole.
+    """Describe missing files of concatenations: at an end of the stack they would leave no hole.
 
     Parameters
     ----------

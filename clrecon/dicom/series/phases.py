@@ -1,9 +1,9 @@
 """Several slices at one place: copies of each other, or the phases of a series that holds more than one volume.
 
-Copies are slices with the same pixels and the same geometry; one of them is kept.  What differs is told apart by an
-element of the headers (a temporal position, an acquisition, a time, a reconstruction kernel): the first one that
-parts the slices into stacks with one slice at each place.  Slices of several volumes may also lie between each other,
-none at the place of another: see `clrecon.dicom.stack.mixture`.  Nothing is ever chosen here.
+Copies are slices with the same pixels and the same geometry; one of them is kept.  Other slices at one place are
+distinguished by an element of the headers (a temporal position, an acquisition, a time, a reconstruction kernel): the
+first one that divides the slices into stacks with one slice at each place.  Slices of several volumes may also lie
+between each other at different places: see `clrecon.dicom.stack.mixture`. No phase is chosen here.
 """
 
 from __future__ import annotations
@@ -30,14 +30,14 @@ __all__ = ["Phase", "Places", "choose_phase", "describe_phases", "have_same_pixe
 PLACES_SHOWN = 4
 PHASES_SHOWN = 12
 SMALLEST_PHASE = 3
-"""More groups than there are slices at the fullest place are phases only if each has this many slices."""
+"""With more groups than slices at the fullest place, groups are phases only if each has this many slices."""
 TIME_KEYWORDS = ("AcquisitionTime", "ContentTime")
 DATE_KEYWORDS = ("AcquisitionDate", "ContentDate")
 HALF_A_DAY_S = 43_200.0
 SAME_POSITION_MM = 0.01
 SAME_SPACING = 1e-5
 SAME_DIRECTION = 1e-4
-"""What rounding does to the geometry of a copy: the tolerances of `clrecon.dicom.stack.fit`."""
+"""Tolerances for the geometry of copies, for rounding: those of `clrecon.dicom.stack.fit`."""
 RANK_KEYWORDS = (
     ("TemporalPositionIdentifier",),
     ("TriggerTime",),
@@ -55,9 +55,9 @@ class Phase:
     Attributes
     ----------
     number : int
-        From 1, what ``phase=`` takes.
+        From 1; the value that ``phase=`` takes.
     keyword, value : str
-        The element that tells the phases apart, and what it says of this one; times count from the first phase.
+        The element that distinguishes the phases, and its value for this phase; times count from the first phase.
     headers : tuple of SliceHeader
     """
 
@@ -73,22 +73,22 @@ class Phase:
 
 @dataclass(frozen=True)
 class Places:
-    """Slices sorted out by their places.
+    """Slices grouped by their places.
 
     Attributes
     ----------
     headers : tuple of SliceHeader
-        Without copies.
+        The slices without copies.
     copies : int
-        Slices that were left out as copies of others.
+        Number of slices that were left out as copies.
     phases : tuple of Phase
-        Empty where each place has one slice; None of them is chosen yet.
+        Empty where each place has one slice; none is chosen yet.
     problem : str
-        Why slices at one place can neither be left out nor told apart; empty where there is nothing to say.
+        Why slices at one place can neither be left out nor distinguished; empty if there is no problem.
     interleaved : bool
-        The phases share no place: the slices of one lie between those of another.
+        True: the phases share no place, and the slices of one lie between those of another.
     doubt : str
-        What alternates along the stack and may yet be one volume; empty where there is nothing to say.
+        Description of an alternation along the stack that may still be one volume; empty if there is none.
     """
 
     headers: tuple[SliceHeader, ...]
@@ -107,7 +107,7 @@ def sort_places(places: Sequence[Sequence[SliceHeader]], same: Callable[[SliceHe
     places : sequence of sequences of SliceHeader
         The slices at each place, in the order of the places.
     same : callable
-        True where two slices have the same pixels.
+        Function that is true for two slices with the same pixels.
     """
     sorted_out = [_sort_copies(slices, same) for slices in places]
     kept = [[copies[0] for copies in found] for found in sorted_out]
@@ -118,7 +118,7 @@ def sort_places(places: Sequence[Sequence[SliceHeader]], same: Callable[[SliceHe
         return Places(headers, count - len(headers), phases, interleaved=bool(phases))
     phases = _find_phases(sorted_out)
     if phases:
-        # A slice that two phases have alike (air, at the ends) is a copy and yet belongs to both.
+        # A slice that is equal in two phases (air, at the ends) is a copy, but belongs to both.
         headers = tuple(header for phase in phases for header in phase.headers)
         return Places(headers, count - len(headers), phases)
     crowded = [slices for slices in kept if len(slices) > 1]
@@ -134,12 +134,12 @@ def sort_places(places: Sequence[Sequence[SliceHeader]], same: Callable[[SliceHe
 
 
 def part_alternating(places: Places, found: Alternation) -> Places:
-    """The same slices as phases by what alternates along them, none at the place of another.
+    """Divide the same slices into phases by an alternation along them; the phases share no place.
 
     Parameters
     ----------
     places : Places
-        One slice at each place.
+        Places with one slice each.
     found : Alternation
     """
     members = [tuple(places.headers[k] for k in group) for group in found.groups]
@@ -151,7 +151,7 @@ def part_alternating(places: Places, found: Alternation) -> Places:
     elif found.name in PHASE_KEYWORDS:
         keyword = found.name
         shown = _show((keyword,), [values_of(headers[0], (keyword,)) for headers in members])
-    else:  # free text may hold anything
+    else:  # free text may contain anything
         shown = ["(none)" if number == found.absent else f"value {number + 1}" for number in range(len(members))]
         keyword = found.name
     phases = tuple(
@@ -164,7 +164,7 @@ def part_alternating(places: Places, found: Alternation) -> Places:
 def lie_alike(one: SliceHeader, other: SliceHeader) -> bool:
     """True when two slices at one place along the normal have the same geometry, in the same frame of reference.
 
-    The pixels of empty slices are alike wherever these lie.
+    This is needed because empty slices have equal pixels at every place.
     """
     return (
         one.frame_of_reference == other.frame_of_reference
@@ -185,7 +185,7 @@ def have_same_pixels(one: SliceHeader, other: SliceHeader, source: StoredPixels 
     Raises
     ------
     RefusedInputError
-        The pixels of one cannot be read.
+        The pixels of one slice cannot be read.
     """
     if (one.rows, one.columns) != (other.rows, other.columns):
         return False
@@ -195,7 +195,7 @@ def have_same_pixels(one: SliceHeader, other: SliceHeader, source: StoredPixels 
 def _sort_copies(
     slices: Sequence[SliceHeader], same: Callable[[SliceHeader, SliceHeader], bool]
 ) -> list[list[SliceHeader]]:
-    """The slices at one place, copies together."""
+    """Sort the slices at one place so that copies are together."""
     found: list[list[SliceHeader]] = []
     for header in slices:
         for copies in found:
@@ -208,7 +208,7 @@ def _sort_copies(
 
 
 def _find_phases(places: Sequence[Sequence[Sequence[SliceHeader]]]) -> tuple[Phase, ...]:
-    """Phases among slices sorted by place and there by what they are copies of."""
+    """Find phases among slices that are grouped by place, and at each place by copies."""
     kept = [[copies[0] for copies in found] for found in places]
     for keywords in _keyword_choices(kept):
         groups: dict[tuple[str, ...], list[SliceHeader]] = defaultdict(list)
@@ -227,7 +227,7 @@ def _find_phases(places: Sequence[Sequence[Sequence[SliceHeader]]]) -> tuple[Pha
 
 
 def _part(found: tuple[tuple[str, ...], Mapping[tuple[str, ...], Sequence[SliceHeader]]] | None) -> tuple[Phase, ...]:
-    """Phases of groups of slices by the values of keywords."""
+    """Make phases of groups of slices, by the values of keywords."""
     if found is None:
         return ()
     keywords, groups = found
@@ -240,7 +240,7 @@ def _part(found: tuple[tuple[str, ...], Mapping[tuple[str, ...], Sequence[SliceH
 
 
 def _keyword_choices(places: Sequence[Sequence[SliceHeader]]) -> Iterator[tuple[str, ...]]:
-    """Keywords that differ at some place, single ones first, then pairs; the most telling first."""
+    """Return the keywords that differ at some place, single ones first, then pairs; the most specific first."""
     present: dict[str, None] = dict.fromkeys(PHASE_KEYWORDS)
     differing: set[str] = set()
     for slices in places:
@@ -254,7 +254,9 @@ def _keyword_choices(places: Sequence[Sequence[SliceHeader]]) -> Iterator[tuple[
 
 
 def _rank_by_time(places: Sequence[Sequence[SliceHeader]]) -> tuple[Phase, ...]:
-    """Where every place was visited equally often and each visit has its time: the first visits, the second..."""
+    """Rank slices by time where every place was visited equally often and each visit has a time: first visits, second
+    visits...
+    """
     most = max(map(len, places))
     if any(len(slices) != most for slices in places):
         return ()
@@ -274,8 +276,8 @@ def _rank_by_time(places: Sequence[Sequence[SliceHeader]]) -> tuple[Phase, ...]:
 def _are_passes(values: Sequence[Sequence[tuple[str, ...]]], keywords: tuple[str, ...]) -> bool:
     """True when the n-th visits of all places were one pass: before any place was visited again.
 
-    Where scanning stopped for all visits of some places and went on to others, this holds for each stop.  The times
-    of reconstruction say nothing of stops.  Without a date, times around midnight have no order.
+    Where the table stopped at some places for all their visits before it moved on, this must hold for each stop.  Times
+    of reconstruction tell nothing about stops.  Without a date, times around midnight have no order.
     """
     if keywords in (("AcquisitionTime",), ("ContentTime",)):
         seconds = [_seconds(value[0]) or 0.0 for visits in values for value in visits]
@@ -293,7 +295,7 @@ def _are_passes(values: Sequence[Sequence[tuple[str, ...]]], keywords: tuple[str
 
 
 def _order(value: tuple[str, ...]) -> list[tuple[int, float, str]]:
-    """Numbers by size and before text."""
+    """Return a sort key: numbers by size, before text."""
     return [(0, number, "") if (number := _number(part)) is not None else (1, 0.0, part) for part in value]
 
 
@@ -306,7 +308,9 @@ def _number(text: str) -> float | None:
 
 
 def _show(keywords: Sequence[str], values: Sequence[tuple[str, ...]]) -> list[str]:
-    """Values for a listing: of dates and times, which may tell who it is, only what has passed since the first."""
+    """Return values for a listing; of dates and times, which may identify the patient, only the time since the first
+    one.
+    """
     columns = []
     for place, keyword in enumerate(keywords):
         column = [value[place] for value in values]
@@ -335,7 +339,7 @@ def _since_first(seconds: Sequence[float | None], unit: str) -> list[str]:
 
 
 def describe_phases(phases: Sequence[Phase], interleaved: bool = False) -> str:
-    """The problem of a series whose phases have not been chosen from."""
+    """Describe the problem of a series with several phases of which none was chosen."""
     shown = [str(phase) for phase in phases[:PHASES_SHOWN]]
     more = f" and {len(phases) - PHASES_SHOWN} more" if len(phases) > PHASES_SHOWN else ""
     where = "whose slices lie between each other" if interleaved else "at the same places"
@@ -343,12 +347,12 @@ def describe_phases(phases: Sequence[Phase], interleaved: bool = False) -> str:
 
 
 def choose_phase(phases: Sequence[Phase], wanted: int, interleaved: bool = False) -> Phase:
-    """The phase of that number; `interleaved` as in `Places`, for the message.
+    """Return the phase of that number; `interleaved` as in `Places`, for the message.
 
     Raises
     ------
     UsageError
-        There is none.
+        The phase does not exist.
     """
     for phase in phases:
         if phase.number == wanted:

@@ -1,9 +1,9 @@
-"""Are these values HU?  What the voxels themselves say, in a few milliseconds.
+"""Plausibility of HU: whether the voxels can be HU, judged by their values in a few milliseconds.
 
-Headers lie about rescale: an intercept that is missing or was applied twice shifts everything by 1024 HU, and no
-geometry check sees it.  The figures below are shares of a sample of the voxels; a warning needs air *and* soft tissue
-in the wrong places, 1000 HU apart, so that scans without air (a cropped spine) or without soft tissue (a dry bone)
-raise none.  A figure that is told is counted in all voxels.
+Headers may be wrong about rescale: an intercept that is missing or was applied twice shifts all values by 1024 HU, and
+no check of the geometry notices.  The figures below are shares of a sample of the voxels.  A warning needs air *and*
+soft tissue in the wrong places, 1000 HU apart, so that scans without air (a cropped spine) or without soft tissue (a
+dry bone) give none.  A figure that a warning states is counted in all voxels.
 """
 
 from __future__ import annotations
@@ -22,38 +22,38 @@ from clrecon.geometry import AIR_HU
 __all__ = ["collect_voxel_warnings"]
 
 CEILING_BITS = 12
-"""What most scanners measure with, also where more bits are stored: 3071 HU with intercept -1024."""
+"""Bits of most scanners, even where more bits are stored: 3071 HU with intercept -1024."""
 CEILING_HU = 3071
-"""Where no header says how values were stored."""
+"""Highest value where no header says how values were stored."""
 CEILING_VOXELS = 10
-"""As many voxels at the ceiling may be noise in dense bone."""
+"""Least number of voxels at the ceiling; fewer may be noise in dense bone."""
 
 CEILING_LEVELS, CEILING_SPIKE = 8, 10.0
-"""With values beyond a ceiling it is one where it has so many times the voxels of the values around it: what was cut
-off there and then interpolated, or put beside slices with more bits, goes beyond in a few voxels."""
+"""Values beyond a ceiling: it still counts as one if it has this many times the voxels of the values around it.  Values
+that were cut off there and then interpolated, or put beside slices with more bits, exceed it in a few voxels."""
 
 METAL_HU = 2000
-"""Cortical bone ends here."""
+"""Highest value of cortical bone."""
 
 SAMPLED_SLICES, SAMPLED_VOXELS = 16, 1 << 16
 LEAST_SAMPLE = 1000
-"""Of fewer voxels no share is stated."""
+"""Least number of sampled voxels for stating a share."""
 
 LOWEST_AIR_HU = -1100
-"""Noise reaches lower, but no value that many voxels have."""
+"""Noise may be lower, but no value that many voxels share."""
 LEAST_PADDING_SHARE = 0.01
 
 INTERCEPT_HU = 1024
 LEAST_SHARE = 0.02
-"""Of air and of soft tissue, for a shift to be stated.  Air is counted within 100 HU, soft tissue within 150."""
+"""Least share of air and soft tissue for reporting a shift.  Air counts within 100 HU, soft tissue within 150."""
 LEAST_RAW_HU = -300
-"""Stored values without their intercept are not negative; soft tissue and fat alone do not reach lower."""
+"""Stored values without their intercept are not negative; soft tissue and fat alone are not below this."""
 MOST_BEYOND = 0.002
-"""Share that may lie where a shifted scan has nothing: below air, or above what a shift leaves of bone."""
+"""Largest share in ranges that are empty in a shifted scan: below air, or above the shifted values of bone."""
 
 
 def collect_voxel_warnings(voxels: NDArray[Any], facts: PixelFacts, slices: Sequence[SliceHeader]) -> list[str]:
-    """Warnings about the HU that were read.
+    """Return warnings about the HU that were read.
 
     Parameters
     ----------
@@ -61,7 +61,7 @@ def collect_voxel_warnings(voxels: NDArray[Any], facts: PixelFacts, slices: Sequ
         HU.
     facts : PixelFacts
     slices : sequence of SliceHeader
-        In the order of k; empty where the file has no such headers.
+        In the order of k; empty for files other than DICOM.
 
     Raises
     ------
@@ -73,7 +73,7 @@ def collect_voxel_warnings(voxels: NDArray[Any], facts: PixelFacts, slices: Sequ
         raise RefusedInputError(f"all {voxels.size:,} voxels are {what}: the volume is constant and holds no image")
     warnings = _warn_of_saturation(voxels, facts, slices)
     if LOWEST_AIR_HU <= facts.hu_min < LEAST_RAW_HU and facts.padding_hu != AIR_HU:
-        return warnings  # a usual scan: nothing more is looked at
+        return warnings  # a usual scan: no further checks
     shares = _Shares.of(voxels, facts)
     if shares is None:
         return warnings
@@ -94,7 +94,7 @@ def _describe_shift(shift: int, what: str) -> str:
 
 
 def _warn_of_saturation(voxels: NDArray[Any], facts: PixelFacts, slices: Sequence[SliceHeader]) -> list[str]:
-    """Voxels at the highest value that the stored bits, or the 12 bits of the scanner, can express."""
+    """Warn of voxels at the highest value that the stored bits, or the 12 bits of the scanner, can express."""
     members: dict[tuple[float, int], list[int]] = {}
     if not slices and facts.hu_max >= CEILING_HU:
         members[float(CEILING_HU), CEILING_BITS] = list(range(len(voxels)))
@@ -108,7 +108,7 @@ def _warn_of_saturation(voxels: NDArray[Any], facts: PixelFacts, slices: Sequenc
     for (ceiling, bits), places in sorted(members.items()):
         slope = abs(slices[places[0]].slope) if slices else 1.0
         at, above, beside = np.sum([_count_near(voxels[k], ceiling, slope) for k in places], axis=0).tolist()
-        # Values that go on beyond were measured with more bits, unless so many have just this one.
+        # Values continue beyond: measured with more bits, unless a great many voxels have exactly this value.
         if at <= CEILING_VOXELS or above and at <= CEILING_SPIKE * beside / (2 * CEILING_LEVELS):
             continue
         what = "metal is saturated, its surface" if ceiling > METAL_HU else "dense bone is cut off, its surface"
@@ -118,7 +118,7 @@ def _warn_of_saturation(voxels: NDArray[Any], facts: PixelFacts, slices: Sequenc
 
 
 def _count_near(picture: NDArray[Any], ceiling: float, slope: float) -> tuple[int, int, int]:
-    """Voxels of a slice at the ceiling, above it, and on the `CEILING_LEVELS` next values to either side."""
+    """Count voxels of a slice at the ceiling, above it, and on the `CEILING_LEVELS` next values on either side."""
     near = picture[picture >= ceiling - (CEILING_LEVELS + 0.5) * slope]
     at = int(np.count_nonzero(near == ceiling))
     return (
@@ -129,40 +129,42 @@ def _count_near(picture: NDArray[Any], ceiling: float, slope: float) -> tuple[in
 
 
 class _Shares:
-    """A sample of the measured voxels, sorted; `between` gives the share in a range of HU."""
+    """A sorted sample of the measured voxels; `between` returns the share in a range of HU."""
 
     def __init__(self, values: NDArray[Any]):
         self.values = values
 
     @classmethod
     def of(cls, voxels: NDArray[Any], facts: PixelFacts) -> _Shares | None:
-        """None where the sample is too small for shares."""
+        """Take a sample; None where it is too small for shares."""
         slices = voxels[:: -(-voxels.shape[0] // SAMPLED_SLICES)]
         step = max(1, int((slices.size / SAMPLED_VOXELS) ** 0.5))
         values = slices[:, ::step, ::step].ravel()
         if facts.padding_hu is not None:
-            values = values[values != facts.padding_hu]  # measured air of this value goes with it
+            values = values[values != facts.padding_hu]  # measured air of this value is left out too
         return cls(np.sort(values)) if len(values) >= LEAST_SAMPLE else None
 
     def between(self, low: float, high: float) -> float:
-        """Share with ``low <= HU < high``."""
+        """Return the share with ``low <= HU < high``."""
         first, end = np.searchsorted(self.values, (low, high))
         return float(end - first) / len(self.values)
 
     def fits(self, shift: int) -> bool:
-        """Air and soft tissue where a scan has them whose HU are off by `shift`; less between them than tissue."""
+        """True if air and soft tissue lie where a shift of the HU by `shift` puts them, with less between them than
+        tissue.
+        """
         air = self.between(shift - 1100, shift - 900)
         tissue = self.between(shift - 150, shift + 150)
         return min(air, tissue) >= LEAST_SHARE and self.between(shift - 800, shift - 300) < tissue
 
     def is_specimen(self) -> bool:
-        """Dense bone in air, with padding of one value: what looks like soft tissue and air 1024 HU too low."""
+        """True for dense bone in air with padding of one value: it looks like soft tissue and air 1024 HU too low."""
         found = self.commonest_below(LOWEST_AIR_HU)
         padded = found is not None and found[1] > 0.9 * self.between(-np.inf, LOWEST_AIR_HU)
         return padded and self.between(500, np.inf) >= MOST_BEYOND
 
     def commonest_below(self, limit: float) -> tuple[float, float] | None:
-        """The value that most of the voxels below `limit` have, and its share of all."""
+        """Return the most frequent value below `limit`, and its share of all voxels."""
         low = self.values[: np.searchsorted(self.values, limit)]
         if not len(low):
             return None
@@ -171,9 +173,9 @@ class _Shares:
 
 
 def _warn_of_padding(shares: _Shares, voxels: NDArray[Any]) -> list[str]:
-    """One value far below air that many voxels have, without being declared as padding.
+    """Warn of one value far below air that many voxels have, without being declared as padding.
 
-    The sample says which value it is; how many have it is counted in all voxels.
+    The value is found in the sample; its voxels are counted in the whole volume.
     """
     found = shares.commonest_below(LOWEST_AIR_HU)
     if found is None or found[1] < LEAST_PADDING_SHARE:

@@ -1,9 +1,9 @@
-"""Files that are no DICOM, and whether one of them may be what is left of a slice.
+"""Remains of slices: files that are not DICOM but may be what is left of a lost slice.
 
 A slice lost at an end of a stack leaves no hole.  Its file often remains: empty, blank, packed, or with a damaged
-start, under a name without suffix as media have it.  So what lies beside slices is held against them: a name that
-numbers on as theirs do, a size as theirs, bytes of a DICOM header.  A licence, a viewer, a list or a preview has none
-of these.
+start, under a name without suffix as usual on CDs.  So other files beside slices are compared with them: a name that
+continues their numbering, their size, bytes of a DICOM header.  A licence, a viewer, a list or a preview has none of
+these.
 """
 
 from __future__ import annotations
@@ -26,16 +26,16 @@ DAMAGED_MARK = "DICOM by its header, but without the mark at byte 128"
 DAMAGED_START = "holds a DICOM header, but not where it should be"
 EMPTY, TEXT, UNKNOWN = "empty", "text", "no DICOM"
 SIZE_BYTES = 256
-"""Headers of slices differ by a few digits: a file is as large as a slice up to this."""
+"""Largest difference in size from a slice: headers of slices differ by a few digits."""
 FEWEST_RANDOM_NAMES = 3
 META_WITHIN = 1024
-"""Bytes in which a meta header begins, whose file lost or gained some before it."""
+"""A damaged file may have lost or gained bytes before its meta header; the header begins within this many bytes."""
 
 _META_ELEMENT = re.compile(rb"\x02\0[\0-\x16]\0(UL|UI|OB|SH|AE)")
 _SYNTAX_OR_CLASS = re.compile(rb"\x02\0[\x02\x03\x10]\0UI")
 _DIGITS = re.compile(r"\d+")
 _RANDOM = (re.compile(r"[0-9A-Z_]{6,}"), re.compile(r"[0-9a-f-]{6,}"))
-"""Alphabets of names that writers draw or count with letters, such as IM00001B."""
+"""Alphabets of names that writers choose at random or count with letters, for example IM00001B."""
 _ADDED = frozenset("gz bz2 xz zst zip 7z part partial crdownload tmp bad".split())
 """Suffixes that packers and broken transfers add to a name."""
 _PACKED = ("gzip file", "bzip2 file", "xz file", "zstd file", "zip archive", "7z archive")
@@ -43,7 +43,7 @@ _OF_THE_SYSTEM = frozenset(("thumbs.db", "ehthumbs.db", "desktop.ini"))
 
 
 class Stranger(NamedTuple):
-    """A file that is no DICOM: its path, its size in bytes, and what its first bytes are."""
+    """A file that is not DICOM: its path, its size in bytes, and a description of its first bytes."""
 
     file: str
     size: int
@@ -79,12 +79,12 @@ class _Slices:
 
 
 def _pattern(name: str) -> str:
-    """A name with a mark for every number in it."""
+    """Return a name with a mark in place of every number."""
     return _DIGITS.sub("#", name)
 
 
 def describe_start(start: bytes) -> str:
-    """What a file is by its first bytes, which lack the mark of DICOM.
+    """Describe a file by its first bytes, which lack the mark of DICOM.
 
     Parameters
     ----------
@@ -106,7 +106,7 @@ def describe_start(start: bytes) -> str:
 
 
 def find_remains(strangers: Sequence[Stranger], slices: Iterable[tuple[str, int]]) -> list[tuple[Path, str]]:
-    """Find the files that may be what is left of a slice.
+    """Find the files that may be remains of a slice.
 
     Parameters
     ----------
@@ -117,12 +117,12 @@ def find_remains(strangers: Sequence[Stranger], slices: Iterable[tuple[str, int]
     Returns
     -------
     list of (Path, str)
-        File, and why; the reasons hold no names.
+        Each file with the reason; the reasons contain no names.
     """
     if not strangers:
         return []
     folders: dict[str, _Slices] = defaultdict(_Slices)
-    paths: set[str] = set()  # of the slices: name and folder, as patterns
+    paths: set[str] = set()  # of the slices: patterns of names and folders
     for file, size in slices:
         folder, _, name = file.rpartition(os.sep)
         known = folders[folder]
@@ -149,7 +149,7 @@ def _judge(stranger: Stranger, folders: dict[str, _Slices], paths: set[str]) -> 
         path = f"{_pattern(os.path.basename(folder))}/{_pattern(whole)}"
         alike = "#" in path and path in paths
     elif added and whole in known.names:
-        return ""  # a copy of a slice that is there
+        return ""  # a copy of a slice that exists
     else:
         alike = known.has_name_like(whole)
     if alike and (not added or stranger.what in (EMPTY, UNKNOWN, *_PACKED) or stranger.what.startswith("blank")):

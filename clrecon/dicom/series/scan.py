@@ -1,9 +1,9 @@
-"""Walk a folder, or take one file, and read the header of every DICOM file in it.
+"""Scan of a folder or file: the header of every DICOM file in it is read.
 
-Names, extensions and DICOMDIR files play no part in what is read; they only make a file that is no DICOM a suspect of
-being what is left of one (`remains`).  Nothing but regular files inside the folder is opened: devices,
-pipes and links are skipped and counted (a link into the folder is met again at its own place; a link out of it is
-none of our business).
+Names, extensions and DICOMDIR files do not decide what is read.  They only make a file that is not DICOM a suspect of
+being the remains of a slice (`remains`). Only regular files inside the folder are opened.  Devices, pipes and links are
+skipped and counted: the target of a link into the folder is found at its own place, and a link out of it is not
+followed.
 """
 
 from __future__ import annotations
@@ -31,12 +31,12 @@ PROGRESS_STEPS = 1000
 BLANK_START = bytes(128) + b"DICM"
 BARE_DATA_SET = "a data set without preamble"
 APPLE_DOUBLE = b"\x00\x05\x16\x07"
-"""Start of the "._NAME" files that macOS puts beside the files of a foreign disk."""
+"""Start of the "._NAME" files that macOS creates beside files on foreign disks."""
 
 
 @dataclass(frozen=True)
 class CorruptFile:
-    """A file, or a folder, that may be or hold a DICOM image and is not readable as such."""
+    """A file or folder that may be or contain a DICOM image but cannot be read as such."""
 
     file: Path
     reason: str
@@ -47,24 +47,24 @@ class CorruptFile:
 
 @dataclass
 class Scan:
-    """What is in a folder.
+    """The contents of a folder.
 
     Attributes
     ----------
     slices : list of SliceHeader
         Valid CT slices, in the order of their paths.
     others : list of OtherImage
-        DICOM objects that are no CT slices.
+        DICOM objects that are not CT slices.
     skipped : Counter
-        Reason to number of files (or folders) that were passed over.
+        Maps a reason to the number of files (or folders) passed over.
     corrupt : list of CorruptFile
-        Files that say they are DICOM and cannot be parsed; files and folders that cannot be read at all.
+        Files that claim to be DICOM but cannot be parsed; files and folders that cannot be read at all.
     suspects : list of CorruptFile
-        Files that are no DICOM by their content, but look like what is left of one.
+        Files that are not DICOM by their content, but look like remains of a slice.
     strangers : list of Stranger
-        All others that are no DICOM.
+        All other files that are not DICOM.
     files : int
-        Regular files looked at.
+        Number of regular files examined.
     """
 
     slices: list[SliceHeader] = field(default_factory=list)
@@ -87,7 +87,7 @@ def scan_path(path: Path, progress: Progress | None = None, force: bool = False)
         Called as ``progress("scan", done, total)``, about `PROGRESS_STEPS` times in all, and as
         ``progress("no answer yet from NAME", done, total)`` where the disk hangs.
     force : bool
-        Take data sets without preamble or meta header too.
+        True: also accept data sets without preamble or meta header.
 
     Raises
     ------
@@ -148,7 +148,7 @@ def _take_file(file: str, start: FileStart | OSError, scan: Scan, force: bool) -
 
 
 def _suspect(file: str, start: bytes) -> str:
-    """Say why a file without the mark of DICOM may be what is left of an image; empty where nothing says so."""
+    """Say why a file without the mark of DICOM may be the remains of an image; empty without a reason."""
     name = os.path.basename(file)
     if name.startswith("._") and start.startswith(APPLE_DOUBLE):
         return ""
@@ -160,7 +160,7 @@ def _suspect(file: str, start: bytes) -> str:
 
 
 def _list_files(path: Path, scan: Scan, disk: DiskReader) -> list[str]:
-    """List the regular files at `path`, sorted, and count what was passed over."""
+    """List the regular files at `path`, sorted, and count those that are passed over."""
     disk.touched = str(path)
     try:
         if path.is_file():

@@ -1,4 +1,4 @@
-"""Slices to series: group and number."""
+"""Series: slices are grouped into series, which are numbered."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ __all__ = ["Series", "group_series"]
 
 PROBLEMS_SHOWN = 3
 SLICE_MODALITIES = ("MR", "NM", "PT")
-"""Other modalities whose files are slices: a corrupt file among them is one of theirs."""
+"""Other modalities whose files are slices: a corrupt file among them probably is one too."""
 
 
 @dataclass
@@ -42,23 +42,23 @@ class Series:
     Attributes
     ----------
     kind : {"stack", "localizer", "capture", "other"}
-        Only stacks are ever chosen; "other" is no CT.
+        Only stacks are ever chosen; "other" is not CT.
     headers : list of SliceHeader
         Valid slices, unsorted.
     others : list of OtherImage
         Its files that cannot be slices.
     corrupt : list of CorruptFile
-        Files and folders that cannot be read and may be, or hold, slices of it.
+        Files and folders that cannot be read and may be or contain slices of it.
     lost : list of str
-        What is known to be missing although it leaves no hole: files of concatenations.
+        Descriptions of missing files that leave no hole: parts of concatenations.
     number : int
         Place in the listing, from 1.
     patient, study : int
-        Which of the patients, and of the studies, in what was scanned, from 1; 0 where the files do not say.
+        Numbers of the patient and the study among those scanned, from 1; 0 where the files do not tell.
     phase : int, optional
-        Which of its phases is wanted.
+        Number of the wanted phase.
     allow_gaps : bool
-        Missing slices are a warning and no problem.
+        True: missing slices give a warning and are not a problem.
     """
 
     identity: SeriesIdentity
@@ -75,23 +75,17 @@ class Series:
 
     @property
     def count(self) -> int:
-        """Slices, the frames of multi-frame images among them."""
+        """Number of slices, counting the frames of multi-frame images."""
         return len(self.headers) + sum(image.frames for image in self.others)
 
     @property
     def key(self) -> str:
-        """What all parts of one series share."""
+        """The identification that all parts of one series share."""
         return _group_key((self.headers or self.others)[0])
 
     @cached_property
     def places(self) -> Places:
-        """The slices without copies, and the phases among them; compares pixels where slices share a place.
-
-        Raises
-        ------
-        RefusedInputError
-            Pixels that have to be compared cannot be read.
-        """
+        """The slices without copies, and the phases among them; pixels are compared where slices share a place."""
         if self.kind != "stack" or len(self.headers) < 2:
             return Places(tuple(self.headers))
         places = group_places(self.headers)
@@ -102,7 +96,7 @@ class Series:
 
     @cached_property
     def stack(self) -> Stack | None:
-        """The measured geometry, of the wanted phase where there are several; None without a valid slice."""
+        """The measured geometry, of the wanted phase if there are several; None without a valid slice."""
         if not self.headers:
             return None
         if self.kind != "stack":
@@ -110,7 +104,7 @@ class Series:
         try:
             places = self.places
         except RefusedInputError:
-            return measure_stack(self.headers[:1])  # `problems` says why
+            return measure_stack(self.headers[:1])  # `problems` tells why
         headers = places.headers
         if places.phases:
             headers = choose_phase(places.phases, self.phase or 1).headers
@@ -119,7 +113,7 @@ class Series:
         return measure_stack(headers, self.allow_gaps)
 
     def find_doubt(self) -> str:
-        """What alternates along the stack and may yet be one volume; empty where there is nothing to say."""
+        """Describe an alternation along the stack that may still be one volume; empty if there is none."""
         try:
             return self.places.doubt
         except RefusedInputError:
@@ -127,7 +121,7 @@ class Series:
 
     @property
     def dropped(self) -> dict[str, int]:
-        """Reason to number of slices that are not in the stack although their headers are valid."""
+        """Map a reason to the number of slices that are not in the stack although their headers are valid."""
         try:
             places = self.places
         except RefusedInputError:
@@ -138,27 +132,28 @@ class Series:
         return {reason: count for reason, count in counts.items() if count}
 
     def choose(self, phase: int | None = None, allow_gaps: bool = False) -> Series:
-        """The same series with a phase chosen and gaps allowed, and looked at more closely.
+        """Return the series with a phase chosen and gaps allowed, after a closer examination.
 
-        Volumes between each other are found by whatever alternates in the headers, which are read once more for it;
-        where that may be so within one volume, or a phase is asked for that no header tells, by the pixels as well.
+        Interleaved volumes are found by any element that alternates in the headers, which are read again for this.
+        Where the alternation may occur within one volume, or a phase is wanted that no header distinguishes, the pixels
+        are compared as well.
 
         Raises
         ------
         UsageError
-            It has no such phase.
+            The series has no phase of this number.
         """
         chosen = replace(self, phase=phase, allow_gaps=allow_gaps)
         try:
             chosen.__dict__["places"] = self._part_further(self.places, phase)
         except RefusedInputError:
-            return chosen  # its `problems` say why
+            return chosen  # its `problems` tell why
         if phase is not None and (phase != 1 or chosen.places.phases):
             choose_phase(chosen.places.phases, phase, chosen.places.interleaved)
         return chosen
 
     def _part_further(self, places: Places, phase: int | None) -> Places:
-        """Phases by what alternates along a stack with one slice at each place."""
+        """Return phases by an alternation along a stack with one slice at each place."""
         if self.kind != "stack" or self.others or places.phases or places.problem or len(places.headers) < 2:
             return places
         stack = measure_stack(places.headers, allow_gaps=True)
@@ -180,7 +175,7 @@ class Series:
 
     @cached_property
     def problems(self) -> list[str]:
-        """Why this series is refused; empty where it is usable."""
+        """Reasons why this series is refused; empty if it is usable."""
         if self.kind == "other":
             return [f"modality {self.identity.modality} is not CT"]
         texts = [image.problem for image in self.others]
@@ -196,7 +191,7 @@ class Series:
             )
         if not texts:
             problems += self.lost
-        # Bad files leave holes, which would only hide the cause.
+        # Bad files leave holes, whose message would only hide the cause.
         if self.kind == "stack" and not texts:
             problems += self._find_stack_problems()
         return problems
@@ -213,11 +208,11 @@ class Series:
         return list(self.stack.problems) if self.stack is not None else []
 
     def describe(self) -> str:
-        """One line for a message on the terminal."""
+        """Describe the series in one line for a message on the terminal."""
         return f"{self.number}: {self.identity.modality} '{self.identity.description}', {self._describe_count()}"
 
     def describe_without_text(self) -> str:
-        """One line for a warning: without the description, since people type names into it."""
+        """Describe the series in one line for a warning, without the description, since people type names into it."""
         return f"{self.number}: {self.identity.modality} {hash_uid(self.identity.uid)}, {self._describe_count()}"
 
     def _describe_count(self) -> str:
@@ -226,11 +221,11 @@ class Series:
 
 
 def group_series(scan: Scan) -> list[Series]:
-    """Group what was scanned into numbered series.
+    """Group scanned files into numbered series.
 
     One SeriesInstanceUID (where it was removed: one folder) gives one `Series`, or several where it mixes planes,
     localizers or secondary captures with a stack.  Numbers follow (SeriesNumber, SeriesInstanceUID, larger part first)
-    and so do not depend on names.
+    so they do not depend on file names.
     """
     slices: dict[str, list[SliceHeader]] = defaultdict(list)
     others: dict[str, list[OtherImage]] = defaultdict(list)
@@ -265,7 +260,7 @@ def group_series(scan: Scan) -> list[Series]:
 
 
 def _number_patients_and_studies(found: Sequence[Series]) -> None:
-    """Tell patients and studies apart by numbers in the order of the listing: a hash of a short ID can be undone."""
+    """Number patients and studies in the order of the listing: a hash of a short ID could be reversed."""
     patients: dict[str, int] = {}
     studies: dict[str, int] = {}
     for series in found:
@@ -283,18 +278,18 @@ def _blame_corrupt_files(found: Sequence[Series], scan: Scan) -> None:
     suspect may belong to a stack with slices in its folder, or to one whose slices lie in several folders where its
     own folder holds no slices at all.
     """
-    holders: dict[Path, set[str]] = defaultdict(set)  # folder to the series, by UID, with slices in it
+    holders: dict[Path, set[str]] = defaultdict(set)  # from folder to the series, by UID, with slices in it
     for series in found:
         if series.kind == "capture" or series.kind == "other" and series.identity.modality not in SLICE_MODALITIES:
             continue
         images: list[SliceHeader | OtherImage] = [*series.headers, *series.others]
         for image in images:
             holders[image.file.parent].add(_group_key(image))
-    folders: dict[str, list[Path]] = defaultdict(list)  # and the other way round
+    folders: dict[str, list[Path]] = defaultdict(list)  # from series to the folders with its slices
     for folder, keys in holders.items():
         for key in keys:
             folders[key].append(folder)
-    # Every file is looked at once and lists are shared: 10,000 series may stand beside as many bad files.
+    # Every file is handled once and lists are shared, because 10,000 series may come with as many bad files.
     corrupt, loose_corrupt = _sort_by_holder(scan.corrupt, holders)
     suspects, loose_suspects = _sort_by_holder(scan.suspects, holders)
     for series in found:
@@ -309,7 +304,7 @@ def _blame_corrupt_files(found: Sequence[Series], scan: Scan) -> None:
 def _sort_by_holder(
     files: Sequence[CorruptFile], holders: Mapping[Path, object]
 ) -> tuple[dict[Path, list[CorruptFile]], list[CorruptFile]]:
-    """Part files by the folders that hold slices; the second are those in no such folder."""
+    """Divide files by whether their folder holds slices; the second list is of files in other folders."""
     held: dict[Path, list[CorruptFile]] = defaultdict(list)
     loose: list[CorruptFile] = []
     for file in files:
@@ -319,7 +314,7 @@ def _sort_by_holder(
 
 
 def _group_key(image: SliceHeader | OtherImage) -> str:
-    """What the images of one series share: without a UID their folder, and the number where there is one."""
+    """Return the key that images of one series share: the UID, else the folder with the number if there is one."""
     return image.series.uid or f"{image.series.number} {image.file.parent}"
 
 
@@ -329,7 +324,7 @@ def _listing_key(series: Series) -> tuple[bool, int, str]:
 
 
 def _split_slices(headers: Sequence[SliceHeader]) -> list[Series]:
-    """Part the slices of one SeriesInstanceUID by plane, localizers first."""
+    """Divide the slices of one SeriesInstanceUID by plane, localizers first."""
     planes = Planes()
     parts: list[Series] = []
     known: dict[tuple[float, ...], Series] = {}

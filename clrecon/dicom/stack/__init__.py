@@ -1,1 +1,1 @@
-"""Headers of slices to a stack with an affine."""
+"""Stacks: the headers of slices become a stack with an affine."""

@@ -1,9 +1,9 @@
-"""What the files of a stack say beside what is kept of every header: elements that alternate from slice to slice.
+"""Alternating elements: elements of the files of a stack whose values alternate from slice to slice.
 
-Two volumes half a gap apart sort into one even stack.  Anything may tell them apart: a time, the contrast medium, an
-acquisition number that only one of them has, an element of the vendor's own.  So the headers of the one stack that is
-to be read are read once more, whole, and every element whose values come back in a fixed order along the stack is
-found: ABAB, ABCABC, AABB.  Within one volume values stay, run on, or change here and there.
+Two volumes half a gap apart sort into one evenly spaced stack.  Any element may distinguish them: a time, the contrast
+medium, an acquisition number that only one of them has, a private element.  So all headers of the stack to be read are
+read again completely.  Every element whose values repeat in a fixed order along the stack is found: ABAB, ABCABC, AABB.
+Within one volume values stay, count on, or change at single places.
 """
 
 from __future__ import annotations
@@ -25,26 +25,26 @@ FEWEST_SLICES = 6
 SMALLEST_VOLUME = 3
 LONGEST_PERIOD = 8
 PERIODS = 3
-"""The order of values has to come back so often: by chance, 6 slices that stand for one another do."""
+"""The order of values has to repeat this often: by chance, 6 interchangeable slices show it."""
 MOST_TOGETHER = 2
-"""Slices of one volume side by side; more are slabs, which one volume may be scanned in."""
+"""Largest number of neighbouring slices of one volume; more are parts in which one volume may be scanned."""
 MOST_VALUES = 8
-"""An element with more values counts by heaps of numbers: the times of a first and a second pass."""
+"""An element with more values is judged by heaps: groups of close numbers, such as the times of two passes."""
 MOST_HEAPS = 4
 LONGEST_VALUE = 64
 DENSER = 1.3
-"""Where two volumes overlap in part, slices lie this much closer together than beside it."""
+"""Where two volumes overlap in part, slices are this many times closer together than elsewhere."""
 WINDOW, WINDOWS = 32, 3
-"""Of an even stack, which can only hold volumes that overlap from end to end, so many slices in so many places are
-looked at before all are."""
+"""Windows of an evenly spaced stack, and slices in each, that are examined before all slices are: it can only hold
+volumes that overlap from end to end."""
 FEWEST_NUMBERED = 12
-"""Of fewer slices InstanceNumber falls into two heaps by chance."""
+"""With fewer slices, InstanceNumber forms two heaps by chance."""
 
 SERIES_UID, SOP_INSTANCE, INSTANCE_NUMBER = 0x0020000E, 0x00080018, 0x00200013
 NEVER = frozenset({SOP_INSTANCE, SERIES_UID, INSTANCE_NUMBER, 0x00200032, 0x00200037, 0x00201041})
-"""Names and places of single slices, which are looked at elsewhere."""
+"""Identifiers and places of single slices, which are examined elsewhere."""
 PIXEL_GROUP, OVERLAY_GROUPS = 0x0028, range(0x5000, 0x6100)
-"""How the values of single slices are written: rescale, extremes, padding."""
+"""Groups of elements that describe the stored values of single slices: rescale, extremes, padding, overlays."""
 WINDOW_TAGS = frozenset({0x00281050, 0x00281051, 0x00281055})
 DOUBTFUL = WINDOW_TAGS | {
     0x00080012,
@@ -58,9 +58,9 @@ DOUBTFUL = WINDOW_TAGS | {
     0x00189332,
     0x00189345,
 }
-"""What may alternate within one volume: when a file was written, how it is to be shown, and tube current and exposure,
-which follow the patient.  Elements of vendors, whose meaning nobody knows, are as doubtful: the number of the detector
-row is one of them."""
+"""Elements that may alternate within one volume: when a file was written, how it is to be displayed, and tube current
+and exposure, which follow the patient.  Private elements, whose meaning is unknown, are equally doubtful: the number of
+the detector row is one of them."""
 
 
 @dataclass(frozen=True)
@@ -70,15 +70,15 @@ class Alternation:
     Attributes
     ----------
     tag : int
-        0 where it is no element of the headers that says so.
+        0 where the groups do not come from an element.
     groups : tuple of tuple of int
         The places, from 0, of each volume, in the order of the values.
     certain : bool
-        It is the same within one volume.
+        True: the element is constant within one volume.
     heaps : bool
-        The groups are heaps of numbers, each slice with its own.
+        True: the groups are heaps of close numbers, and each slice has its own number.
     absent : int or None
-        Which group has no such element.
+        The group that lacks the element.
     """
 
     tag: int
@@ -103,9 +103,9 @@ def find_alternation(headers: Sequence[SliceHeader], even: bool) -> Alternation 
     Parameters
     ----------
     headers : sequence of SliceHeader
-        One at each place, in the order of the places.
+        One slice for each place, in the order of the places.
     even : bool
-        All gaps are equal: of a long stack only some windows are looked at first.
+        True: all gaps are equal, so in a long stack only some windows are examined first.
 
     Returns
     -------
@@ -123,7 +123,9 @@ def find_alternation(headers: Sequence[SliceHeader], even: bool) -> Alternation 
 
 
 def alternate_places(count: int, period: int) -> Alternation:
-    """`count` slices in turn, for `period` volumes; two in pairs where that is 4: what no header says."""
+    """Deal `count` slices in turn to `period` volumes, for period 4 in pairs to two volumes: groups that no header
+    shows.
+    """
     if period == 4:
         return Alternation(0, tuple(tuple(k for k in range(count) if k // 2 % 2 == half) for half in (0, 1)), False)
     return Alternation(0, tuple(tuple(range(first, count, period)) for first in range(period)), False)
@@ -148,7 +150,7 @@ def _find_in(headers: Sequence[SliceHeader]) -> Alternation | None:
 
 
 def _read_columns(headers: Sequence[SliceHeader]) -> dict[int, list[bytes]]:
-    """The values along the stack of each element that is not the same everywhere; empty where it is not there."""
+    """Return the values along the stack of each element that is not constant; empty where a slice lacks the element."""
     first: dict[int, bytes] = {}
     columns: dict[int, list[bytes]] = {}
     for k, header in enumerate(headers):
@@ -164,9 +166,11 @@ def _read_columns(headers: Sequence[SliceHeader]) -> dict[int, list[bytes]]:
 
 
 def _read_values(header: SliceHeader) -> dict[int, bytes]:
-    """What is compared of one file: nothing where it has changed since it was scanned, which its pixels will tell."""
+    """Read the elements of one file that are compared: none if it has changed since the scan, which reading its pixels
+    reports.
+    """
     try:
-        # What was taken by force is read as it was then; nothing else is read differently by it.
+        # A file that needed `force` is read with it again; for other files it changes nothing.
         values = read_elements(header.file, None, force=True).values
     except (OSError, CorruptFileError, NotDicomError):
         return {}
@@ -174,7 +178,7 @@ def _read_values(header: SliceHeader) -> dict[int, bytes]:
 
 
 def _shorten(raw: bytes) -> bytes:
-    """Vendors keep whole files in one element: of a long value only what tells it from others is kept."""
+    """Shorten a long value to what distinguishes it from others: vendors keep whole files in one element."""
     return raw if len(raw) <= LONGEST_VALUE else hash(raw).to_bytes(8, "little", signed=True) + b"..."
 
 
@@ -186,7 +190,7 @@ def _is_compared(tag: int) -> bool:
 
 
 def _code(tag: int, column: Sequence[bytes]) -> Iterator[tuple[list[int], bool]]:
-    """Ways to sort the slices by the values of one element: numbers of groups, and whether they are heaps."""
+    """Return the ways to group the slices by the values of one element: group numbers, and whether these are heaps."""
     numbers = [_number(raw) for raw in column]
     if tag == INSTANCE_NUMBER:
         known = [number for number in numbers if number is not None]
@@ -220,14 +224,14 @@ def _number(raw: bytes) -> float | None:
 
 
 def alternates(codes: Sequence[int], gaps: Sequence[float]) -> bool:
-    """True where values come back in a fixed order, all along a stack or where its slices lie closer together.
+    """True where values repeat in a fixed order, along the whole stack or where its slices are closer together.
 
     Parameters
     ----------
     codes : sequence of int
         A number for the value of each slice.
     gaps : sequence of float
-        mm to the next slice; one fewer.
+        Distances to the next slice, mm; one fewer than slices.
     """
     counts = Counter(codes)
     if len(counts) < 2 or min(counts.values()) < SMALLEST_VOLUME:
@@ -244,7 +248,7 @@ def alternates(codes: Sequence[int], gaps: Sequence[float]) -> bool:
 
 
 def _spans(codes: Sequence[int], gaps: Sequence[float], first: int, end: int) -> bool:
-    """True where nothing but one volume lies before `first` and from `end` on, and its slices farther apart."""
+    """True where only one volume lies before `first` and from `end` on, and its slices are farther apart."""
     left, right = codes[:first], codes[end:]
     if len(left) <= 1 and len(right) <= 1:
         return True
@@ -254,7 +258,7 @@ def _spans(codes: Sequence[int], gaps: Sequence[float], first: int, end: int) ->
 
 
 def _runs(flags: Sequence[bool]) -> Iterator[tuple[int, int]]:
-    """First places and ends of the runs of true flags."""
+    """Return first index and end of each run of true flags."""
     start = 0
     for place, flag in enumerate([*flags, False]):
         if not flag:

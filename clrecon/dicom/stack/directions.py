@@ -1,4 +1,4 @@
-"""The directions of rows and columns that the slices of a stack share, and how far each slice is from them."""
+"""The directions of rows and columns that the slices of a stack share, and the deviation of each slice."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ __all__ = ["ORIENTATION_EXACT", "ORIENTATION_LIMIT", "ORIENTATION_SPREAD_RAD", "
 Float64Array = NDArray[np.float64]
 
 ORIENTATION_EXACT = 1e-4
-"""Deviation from unit length and right angle that is taken silently (rounding of the stored numbers)."""
+"""Deviation from unit length and right angle that is accepted without a warning (rounding of stored numbers)."""
 ORIENTATION_LIMIT = 1e-3
-"""Deviation up to which the directions are made orthonormal, with a warning; refused above."""
+"""Deviation up to which the directions are made orthonormal, with a warning; larger ones are refused."""
 ORIENTATION_SPREAD_RAD = 1e-4
-"""Angle by which the directions of single slices may differ from the mean: 0.03 mm over 300 mm."""
+"""Largest angle between the directions of a slice and the mean: 0.03 mm over 300 mm."""
 
 
 @dataclass(frozen=True)
@@ -29,11 +29,11 @@ class Directions:
     Attributes
     ----------
     row, column : ndarray, shape (3,), float64
-        Orthonormal, LPS; the first two axes, only to sort by, where a slice is beyond `ORIENTATION_LIMIT`.
+        Orthonormal, LPS.  Where a slice exceeds `ORIENTATION_LIMIT`, x and y, used only for sorting.
     deviations : ndarray, shape (n,), float64
-        Of each slice's stored directions from unit length and right angle.
+        Deviation of each slice's stored directions from unit length and right angle.
     angles_rad : ndarray, shape (n,), float64
-        Between those of each slice and the mean; NaN where there is no mean.
+        Angle between the directions of each slice and the mean; NaN where there is no mean.
     """
 
     row: Float64Array
@@ -53,12 +53,14 @@ class Directions:
 
     @property
     def spread_allowed_rad(self) -> float:
-        """Skew is taken out of every slice alike and is no difference between them."""
+        """Largest allowed angle: skew is removed from every slice alike, so it does not count as a difference between
+        slices.
+        """
         return ORIENTATION_SPREAD_RAD + self.deviation
 
 
 def measure_directions(headers: Sequence[SliceHeader]) -> Directions:
-    """Measure ImageOrientationPatient (0020,0037) over at least one slice."""
+    """Measure ImageOrientationPatient (0020,0037) of one or more slices."""
     stored = np.array([(*h.row_cosines, *h.column_cosines) for h in headers], dtype=np.float64).reshape(-1, 2, 3)
     lengths = np.linalg.norm(stored, axis=2)
     skew = np.abs(np.sum(stored[:, 0] * stored[:, 1], axis=1))
@@ -72,7 +74,7 @@ def measure_directions(headers: Sequence[SliceHeader]) -> Directions:
 
 
 def _orthonormalise(row: Float64Array, column: Float64Array) -> tuple[Float64Array, Float64Array]:
-    """Nearest orthonormal pair: both directions move by the same angle. Left alone where already exact."""
+    """Return the nearest orthonormal pair, both directions turned by the same angle; an exact pair stays as it is."""
     row, column = row / np.linalg.norm(row), column / np.linalg.norm(column)
     if abs(row @ column) > 1e-9:
         bisector, across = row + column, row - column

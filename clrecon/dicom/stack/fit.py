@@ -1,10 +1,10 @@
-"""The geometry gate: slices in, one affine with its residual out, or the reasons why there is none.
+"""The geometry of a stack: one affine with its residual, or the reasons why the slices have none.
 
-The position of a slice is its ImagePositionPatient and nothing else.  Slices are sorted by the projection of the
-position on the normal n = X x Y (row direction x column direction), so index space is always right-handed.  The
-affine is the least-squares line through all positions: its slice step is a full vector, a tilted gantry is an exact
-shear, and the rounding of positions averages out.  Where the positions are farther from that line than rounding
-takes them, each slice keeps its own.
+The position of a slice is its ImagePositionPatient alone.  Slices are sorted by the projection of the position on the
+normal n = X x Y (row direction x column direction), so index space is always right-handed.  The affine is the
+least-squares line through all positions: its slice step is a full vector, a tilted gantry is an exact shear, and the
+rounding of positions averages out.  Where positions deviate from that line by more than rounding does, each slice keeps
+its own position.
 
 Source: DICOM PS3.3 C.7.6.2.1.1.
 """
@@ -32,7 +32,7 @@ Float64Array = NDArray[np.float64]
 
 POSITION_TOLERANCE_MM = 0.01
 POSITION_TOLERANCE_GAPS = 0.01
-"""A residual up to the larger of 0.01 mm and 1 % of the gap is rounding and no unevenness."""
+"""A residual up to 1 % of the gap (or 0.01 mm if larger) is due to rounding and does not make a stack uneven."""
 DUPLICATE_MM = 1e-3
 TILT_REPORT_DEG = 0.05
 STATED_GAP_TOLERANCE = 0.01
@@ -41,22 +41,23 @@ PIXEL_SPACING_TOLERANCE = 1e-5
 
 @dataclass(frozen=True)
 class Line:
-    """Evenly spaced places fitted to the slices, and how far the slices are from them. None: there is one slice.
+    """Evenly spaced places fitted to the slices, and the distances of the slices from them.  Figures are None for one
+    slice.
 
     Attributes
     ----------
     step, origin : ndarray, shape (3,), float64
         LPS mm, by least squares.
     gap_min_mm, gap_max_mm, gap_median_mm : float
-        Along the normal.
+        Distances of neighbours along the normal.
     residual_max_mm, residual_rms_mm : float
         Distance of the positions from their places.
     tolerance_mm : float
-        Largest residual that is rounding.
+        Largest residual that counts as rounding.
     worst_slice : int
-        Where the residual is largest.
+        Index of the slice with the largest residual.
     uneven : bool
-        The residual is over the tolerance: the slices are placed one by one, and the line is only nominal.
+        True: the residual exceeds the tolerance, so slices keep their own positions and the line is only nominal.
     """
 
     step: Float64Array | None = None
@@ -84,14 +85,14 @@ class Stack:
     distances_mm : ndarray, shape (n,), float64
         Positions along the normal.
     affine : ndarray, shape (4, 4), float64, or None
-        Index (i, j, k) to LPS mm; None where there is a problem.
+        Index (i, j, k) to LPS mm; None for a stack with problems.
     line : Line
     tilt_deg : float or None
         None where there is no affine.
     problems, warnings : tuple of str
         A stack with problems is refused.
     missing : int
-        Slices that are missing, counted by the usual gap; allowed, or one of the problems.
+        Number of missing slices, computed from the usual gap; they are either allowed or one of the problems.
     """
 
     slices: tuple[SliceHeader, ...]
@@ -106,24 +107,24 @@ class Stack:
 
     @property
     def slice_positions(self) -> Float64Array | None:
-        """Positions of the slices where they do not lie on the affine, None where they do."""
+        """Positions of the slices where they deviate from the affine, else None."""
         return self.positions_mm if self.line.uneven else None
 
 
 def measure_stack(headers: Sequence[SliceHeader], allow_gaps: bool = False) -> Stack:
-    """Sort slices, find what is wrong with them, and fit the affine.
+    """Sort slices, find their problems, and fit the affine.
 
     Parameters
     ----------
     headers : sequence of SliceHeader
-        At least one, and no more than one at each place.
+        One or more, with at most one slice at each place.
     allow_gaps : bool
-        Missing slices are a warning and no problem.
+        True: missing slices give a warning and are not a problem.
 
     Returns
     -------
     Stack
-        Never raises for bad geometry: what is wrong stands in ``problems``.
+        Bad geometry raises no error; it is described in ``problems``.
     """
     problems = find_mixed_values(headers)
     warnings: list[str] = []
@@ -197,7 +198,7 @@ def _describe_unevenness(distances: Float64Array, line: Line) -> str:
 def sort_slices(
     headers: Sequence[SliceHeader], normal: Float64Array
 ) -> tuple[tuple[SliceHeader, ...], Float64Array, Float64Array]:
-    """Sort by projection on the normal; returns the slices, their positions (n, 3) and projections (n,) in mm."""
+    """Sort by projection on the normal; return the slices, their positions (n, 3) and projections (n,) in mm."""
     positions = np.array([header.position_mm for header in headers], dtype=np.float64)
     distances = positions @ normal
     order = sorted(range(len(headers)), key=lambda index: (distances[index], str(headers[index].file)))
@@ -205,7 +206,7 @@ def sort_slices(
 
 
 def fit_line(positions: Float64Array) -> tuple[Float64Array, Float64Array]:
-    """Least-squares step and origin (LPS mm) of positions (n, 3) that are numbered 0 to n - 1, n >= 2."""
+    """Fit step and origin (LPS mm) by least squares to positions (n, 3) that are numbered 0 to n - 1, n >= 2."""
     k = np.arange(len(positions), dtype=np.float64)
     centre, mean = k.mean(), positions.mean(axis=0)
     step = (k - centre) @ (positions - mean) / np.sum((k - centre) ** 2)
@@ -213,7 +214,7 @@ def fit_line(positions: Float64Array) -> tuple[Float64Array, Float64Array]:
 
 
 def find_mixed_values(headers: Sequence[SliceHeader]) -> list[str]:
-    """Describe values that must be one and the same over a stack and are not, naming the odd slices."""
+    """Describe values that must be equal over a stack but are not, naming the differing slices."""
     checks: tuple[tuple[str, Callable[[SliceHeader], object], Callable[[SliceHeader], str]], ...] = (
         ("Columns x Rows", lambda h: (h.columns, h.rows), lambda h: f"{h.columns} x {h.rows}"),
         (
@@ -249,7 +250,7 @@ def find_mixed_values(headers: Sequence[SliceHeader]) -> list[str]:
 def _mean_directions(
     headers: Sequence[SliceHeader], problems: list[str], warnings: list[str]
 ) -> tuple[Float64Array, Float64Array]:
-    """Mean row and column directions, orthonormal; appends what is wrong with them."""
+    """Return mean row and column directions, orthonormal; append problems of the directions."""
     directions = measure_directions(headers)
     off = directions.deviation
     if off > ORIENTATION_LIMIT:
@@ -268,9 +269,9 @@ def _mean_directions(
 
 
 def group_places(headers: Sequence[SliceHeader]) -> list[list[SliceHeader]]:
-    """The slices at each place, in the order of the places; slices closer than `DUPLICATE_MM` are at one.
+    """Group the slices by place, in the order of the places; slices closer than `DUPLICATE_MM` share one place.
 
-    Where the directions are wrong there are no places to compare: each slice is at its own.
+    Where the directions are wrong, places cannot be compared: each slice gets its own.
     """
     problems: list[str] = []
     row, column = _mean_directions(headers, problems, [])
@@ -288,7 +289,7 @@ def group_places(headers: Sequence[SliceHeader]) -> list[list[SliceHeader]]:
 
 
 def _cross(row: Float64Array, column: Float64Array) -> Float64Array:
-    """Vector product of two vectors (3,): a tenth of the time of numpy's, of which there are two a series."""
+    """Return the cross product of two vectors (3,), in a tenth of numpy's time."""
     (a, b, c), (x, y, z) = row.tolist(), column.tolist()
     return np.array((b * z - c * y, c * x - a * z, a * y - b * x))
 
@@ -296,10 +297,10 @@ def _cross(row: Float64Array, column: Float64Array) -> Float64Array:
 def measure_stated_gap(
     slices: Sequence[SliceHeader], positions: Float64Array, usual: float | None
 ) -> tuple[float, float, float] | None:
-    """SpacingBetweenSlices, the usual distance of the positions (n, 3), and by which share of it the two differ.
+    """Return SpacingBetweenSlices, the usual distance of the positions (n, 3), and the relative difference of the two.
 
-    Scanners state the distance along the normal or, tilted, along the table: the nearer one counts.  None where it is
-    not stated or there is no distance.
+    Scanners state the distance along the normal or, with a tilted gantry, along the table: the nearer one is compared.
+    None where no spacing is stated or no distance exists.
     """
     stated = next((h.stated_gap_mm for h in slices if h.stated_gap_mm is not None), None)
     if stated is None or not usual:

@@ -1,4 +1,4 @@
-"""Missing slices: gaps in a stack that are too wide."""
+"""Missing slices: gaps in a stack that are too wide for their neighbours."""
 
 from __future__ import annotations
 
@@ -15,10 +15,11 @@ Float64Array = NDArray[np.float64]
 MISSING_RATIO = 1.5
 RUN_LENGTH = 3
 RUN_TOLERANCE = 0.05
-"""A gap over 1.5 times the usual one means missing slices, unless it is one of at least 3 gaps in a row that are
-equal within 5 %: a change of feed is a run, a hole is not.  The usual gap is the smaller of the two in the middle
-where their count is even, so that as many holes as whole gaps do not pass for the usual; beside such a run it is that
-of the run (the coarser of two), so that a hole where the feed is fine is seen however coarse it is elsewhere."""
+"""A gap over 1.5 times the usual gap means missing slices, unless it belongs to a run: at least 3 consecutive gaps that
+are equal within 5 %. A run is a change of feed, a hole is not.  The usual gap is the median, with an even count the
+smaller of the two in the middle, so that equally many holes and whole gaps do not make the holes usual.  Beside a run
+the usual gap is that of the run (of two runs, the coarser), so that a hole where the feed is fine is found however
+coarse it is elsewhere."""
 PLACES_SHOWN = 4
 
 
@@ -32,9 +33,9 @@ class Holes:
         The gap k lies between the slices k and k + 1.
     gaps_mm : tuple of float
     ends_mm : tuple of (float, float)
-        Where along the normal the slices before and after lie.
+        Positions along the normal of the slices before and after the gap.
     usual_mm : tuple of float
-        The gap that each would have without a hole.
+        The gap that would be there without a hole.
     """
 
     places: tuple[int, ...] = ()
@@ -44,14 +45,14 @@ class Holes:
 
     @property
     def missing(self) -> int:
-        """Slices that would fill the gaps, at the usual distance."""
+        """Number of slices that would fill the gaps at the usual distance."""
         return sum(self._counts())
 
     def _counts(self) -> list[int]:
         return [max(round(gap / usual) - 1, 1) for gap, usual in zip(self.gaps_mm, self.usual_mm, strict=True)]
 
     def describe(self, names: Sequence[str] = ()) -> str:
-        """Say where they are; with the names of all slices also between which."""
+        """Describe where the holes are; given the names of all slices, also between which slices."""
         texts = []
         columns = (self.places, self.gaps_mm, self.ends_mm, self.usual_mm, self._counts())
         for k, gap, (low, high), usual, count in zip(*columns, strict=True):
@@ -64,15 +65,15 @@ class Holes:
 
 
 def find_holes(distances: Float64Array) -> Holes:
-    """Find missing slices among sorted positions (n,) along the normal; two slices alone have none."""
+    """Find missing slices among sorted positions (n,) along the normal; with only two slices there are none."""
     gaps = np.diff(distances)
     if len(gaps) < 2:
         return Holes()
     if gaps.max() <= MISSING_RATIO * gaps.min():
-        return Holes()  # as nearly always
+        return Holes()  # the usual case
     usual = float(np.sort(gaps)[(len(gaps) - 1) // 2])
     if usual <= 0.0:
-        return Holes()  # only where the directions are no directions
+        return Holes()  # only where the directions are wrong
     in_run = _find_runs(gaps)
     runs = np.flatnonzero(in_run)
     wide, usuals = [], []
@@ -87,7 +88,7 @@ def find_holes(distances: Float64Array) -> Holes:
 
 
 def _find_runs(gaps: Float64Array) -> NDArray[np.bool_]:
-    """Which gaps are one of at least `RUN_LENGTH` consecutive gaps that equal them within `RUN_TOLERANCE`."""
+    """Mark gaps in runs: at least `RUN_LENGTH` consecutive gaps that are equal within `RUN_TOLERANCE`."""
     in_run = np.zeros(len(gaps), dtype=bool)
     for place, gap in enumerate(gaps.tolist()):
         low, high = max(place - RUN_LENGTH + 1, 0), min(place + RUN_LENGTH, len(gaps))

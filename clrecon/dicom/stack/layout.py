@@ -1,4 +1,4 @@
-"""How the slices of a stack lie, as plain figures for the certificate and the listing."""
+"""The layout of a stack as plain figures for the certificate and the listing: directions, extent, gaps, thickness."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ Float64Array = NDArray[np.float64]
 
 
 def describe_orientation(affine: Float64Array) -> dict[str, Any]:
-    """Directions of index space in the patient.
+    """Describe the directions of index space in the patient.
 
     Returns
     -------
@@ -53,7 +53,7 @@ def describe_orientation(affine: Float64Array) -> dict[str, Any]:
 
 
 def measure_extent(stack: Stack) -> list[float] | None:
-    """Size in mm of the box of whole voxels along rows, columns and the slice normal; None where a gap is unknown."""
+    """Return the size in mm of the box of whole voxels along rows, columns and normal; None for an unknown gap."""
     first, usual = stack.slices[0], stack.line.gap_median_mm
     if usual is None:
         return None
@@ -62,7 +62,7 @@ def measure_extent(stack: Stack) -> list[float] | None:
 
 
 def summarise_gaps(distances: Float64Array) -> list[dict[str, Any]]:
-    """Runs of equal gaps between sorted positions (mm along the normal), in order.
+    """Return the runs of equal gaps between sorted positions (mm along the normal), in order.
 
     Returns
     -------
@@ -80,7 +80,7 @@ def summarise_gaps(distances: Float64Array) -> list[dict[str, Any]]:
 
 
 def median_thickness(headers: Sequence[SliceHeader]) -> float | None:
-    """The middle of the SliceThickness values that are above zero, mm; None without one."""
+    """Return the median of the SliceThickness values above zero, mm; None if there are none."""
     known = sorted(_thicknesses(headers))
     return known[len(known) // 2] if known else None
 
@@ -90,7 +90,7 @@ def _thicknesses(headers: Sequence[SliceHeader]) -> list[float]:
 
 
 def describe_thickness(headers: Sequence[SliceHeader], distances: Float64Array) -> dict[str, Any] | None:
-    """SliceThickness against the distances of the slices along the normal.
+    """Compare SliceThickness with the distances of the slices along the normal.
 
     Returns
     -------

@@ -1,7 +1,7 @@
-"""One stack or several: slices of more than one volume that lie between each other, and what differs along a stack.
+"""Mixtures: slices of several volumes that lie between each other, and differences along a stack.
 
-Two reconstructions half a gap apart, or two acquisitions that overlap, share no place; sorted by position they look
-like one stack, evenly spaced or not, that alternates between two volumes.
+Two reconstructions half a gap apart, or two acquisitions that overlap, share no place.  Sorted by position they look
+like one stack that alternates between two volumes, evenly spaced or not.
 """
 
 from __future__ import annotations
@@ -24,19 +24,19 @@ CERTAIN = (
     "ConvolutionKernel",
     "KVP",
 )
-"""What is one and the same over a volume."""
+"""Elements that are constant within a volume."""
 POSSIBLE = ("AcquisitionNumber", "FrameAcquisitionNumber", "AcquisitionTime", "ImageType")
-"""What may change from rotation to rotation, or from file to file, of one volume: it parts only what is uneven together
-and even apart."""
+"""Elements that may change within one volume, from rotation to rotation or from file to file.  They divide a stack only
+if it is uneven as a whole and each part is even."""
 SMALLEST_VOLUME = 3
 EVEN = 0.05
-"""Share by which gaps differ within what counts as even here."""
+"""Relative difference up to which gaps count as equal here."""
 THICKNESS_TOLERANCE = 0.01
 ALTERNATING = ("AcquisitionNumber", "FrameAcquisitionNumber")
 
 
 def values_of(header: SliceHeader, keywords: Sequence[str]) -> tuple[str, ...]:
-    """The values that tell phases apart, empty where there is none."""
+    """Return the values that distinguish phases; empty if there are none."""
     own = dict(header.phase)
     return tuple(own.get(keyword, "") for keyword in keywords)
 
@@ -44,12 +44,12 @@ def values_of(header: SliceHeader, keywords: Sequence[str]) -> tuple[str, ...]:
 def find_mixture(
     headers: Sequence[SliceHeader],
 ) -> tuple[tuple[str, ...], Mapping[tuple[str, ...], Sequence[SliceHeader]]] | None:
-    """Find the element that parts a stack into volumes whose slices lie between each other.
+    """Find the element that divides a stack into volumes whose slices lie between each other.
 
     Parameters
     ----------
     headers : sequence of SliceHeader
-        One at each place, in the order of the places.
+        One slice for each place, in the order of the places.
 
     Returns
     -------
@@ -64,7 +64,7 @@ def find_mixture(
 
 
 def _values_along(headers: Sequence[SliceHeader], keywords: Sequence[str]) -> Iterator[tuple[str, list[str]]]:
-    """Keywords that are not the same in all slices, and their values."""
+    """Return the keywords whose values differ along the slices, with these values."""
     own = [dict(header.phase) for header in headers]
     for keyword in keywords:
         values = [one.get(keyword, "") for one in own]
@@ -75,7 +75,7 @@ def _values_along(headers: Sequence[SliceHeader], keywords: Sequence[str]) -> It
 def _find_interleaved(
     values: Sequence[str], headers: Sequence[SliceHeader]
 ) -> dict[tuple[str, ...], list[SliceHeader]]:
-    """The slices by their values, where these come back after others; empty where they do not."""
+    """Group the slices by their values if these come back after others; empty if they do not."""
     changes = sum(one != other for one, other in zip(values, values[1:], strict=False))
     groups: dict[tuple[str, ...], list[SliceHeader]] = defaultdict(list)
     for value, header in zip(values, headers, strict=True):
@@ -91,7 +91,7 @@ def _is_even(headers: Sequence[SliceHeader]) -> bool:
 
 
 def describe_differences(headers: Sequence[SliceHeader]) -> Iterator[tuple[str, Callable[[SliceHeader], bool]]]:
-    """What differs between the slices of a stack that should be alike, and which slices have not the first one's.
+    """Describe values that differ within a stack but should be equal, and the slices that differ from the first one.
 
     Parameters
     ----------
@@ -101,7 +101,7 @@ def describe_differences(headers: Sequence[SliceHeader]) -> Iterator[tuple[str, 
     Yields
     ------
     (text, is_so)
-        Without the values.
+        Keywords and slices, without the values.
     """
     first = headers[0]
     for keyword, values in _values_along(headers, ("KVP", *ALTERNATING)):

@@ -1,4 +1,4 @@
-"""Numbers about numbers."""
+"""A fast median for short sequences."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ __all__ = ["median"]
 
 
 def median(values: Sequence[float] | NDArray[Any]) -> float:
-    """As `numpy.median` of at least one value.
+    """Return the same as `numpy.median` of one or more values.
 
-    That one loads numpy's masked arrays, 10 ms at every start of the program, and is slow on the few values of a stack.
+    `numpy.median` loads numpy's masked arrays, 10 ms at every start of the program, and is slow for few values.
     """
     ordered = np.sort(values)
     middle = len(ordered) // 2

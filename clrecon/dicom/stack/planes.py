@@ -1,4 +1,4 @@
-"""Which slices of a series lie in one plane, as far as a stack is concerned."""
+"""Planes of a series: slices with nearly equal directions belong to one stack."""
 
 from __future__ import annotations
 
@@ -9,14 +9,15 @@ from collections import defaultdict
 __all__ = ["SPLIT_ANGLE_RAD", "Planes"]
 
 SPLIT_ANGLE_RAD = math.radians(1.0)
-"""Slices of one SeriesInstanceUID whose directions differ by more are separate stacks (a localizer, another plane);
-below, they are one stack with a fault that the gate names."""
+"""Slices of one SeriesInstanceUID whose directions differ by more are separate stacks (a localizer, another plane).
+With smaller differences they are one stack, and the gate reports the difference."""
 
 
 class Planes:
-    """Pairs of directions, numbered as they come; those within `SPLIT_ANGLE_RAD` of an earlier one have its number.
+    """Pairs of directions, numbered in the order of arrival; pairs within `SPLIT_ANGLE_RAD` of an earlier one get its
+    number.
 
-    A series may have as many planes as files: beyond the first few they are looked up by cells of that size.
+    A series may have as many planes as files: beyond the first few they are looked up in a grid of cells of that size.
     """
 
     FEW = 4
@@ -26,7 +27,7 @@ class Planes:
         self._cells: dict[tuple[int, ...], list[int]] = defaultdict(list)
 
     def find(self, plane: tuple[float, ...]) -> int:
-        """The number of the first plane near `plane`, which is added where there is none."""
+        """Return the number of the first plane near `plane`, which is added if there is none."""
         for number, known in enumerate(self._planes[: self.FEW]):
             if _are_near(known, plane):
                 return number
