@@ -126,9 +126,9 @@ def check_sphere(device: Device) -> dict[str, Any]:
     surface = truth["surface"]
     distance = np.linalg.norm(mesh.vertices - np.array(surface["center_lps_mm"]), axis=1)
     return {
-        "volume_ml": quality["volume_ml"],
+        "volume_ml": quality.volume_ml,
         "true_volume_ml": surface["volume_ml"],
-        "area_mm2": quality["area_mm2"],
+        "area_mm2": quality.area_mm2,
         "true_area_mm2": surface["area_mm2"],
         "radius_error_max_mm": float(np.abs(distance - surface["radius_mm"]).max()),
         "spacing_mm": truth["spacing_mm"],

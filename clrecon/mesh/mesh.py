@@ -15,7 +15,7 @@ from clrecon.exchange.content import Content
 from clrecon.exchange.coordinates import as_stored
 from clrecon.exchange.formats import write_mesh
 from clrecon.geometry import frame_from_lps
-from clrecon.mesh.quality import measure_quality
+from clrecon.mesh.quality import MeshQuality, measure_quality
 from clrecon.system.messages import Message
 
 __all__ = ["Mesh"]
@@ -180,8 +180,8 @@ class Mesh(Message):
             inside=_describe_inside(self.report.get("inside_hu")),
         )
 
-    def quality(self) -> dict[str, Any]:
-        """Measure the mesh, see `clrecon.mesh.measure_quality` for the entries."""
+    def quality(self) -> MeshQuality:
+        """Measure the mesh: is it closed, how large, what is wrong with it."""
         return measure_quality(self._vertices, self._triangles)
 
     def save(self, path: str | os.PathLike[str], space: str = "lps") -> int:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,11 +19,80 @@ from clrecon.mesh.connectivity import (
 )
 from clrecon.mesh.triangles import corner_edges, cross_product
 from clrecon.system.pieces import local_origin
+from clrecon.system.records import Record
 
-__all__ = ["measure_quality"]
+__all__ = ["MeshQuality", "measure_quality"]
 
 
-def measure_quality(vertices: NDArray[np.floating], triangles: NDArray[np.uint32]) -> dict[str, Any]:
+@dataclass(frozen=True, eq=False, kw_only=True)
+class MeshQuality(Record):
+    """The figures of a triangle surface.
+
+    Attributes
+    ----------
+    vertices, triangles : int
+    closed : bool
+        There are triangles and every edge is in exactly two, also when vertices at one place are joined, as readers of
+        STL do.
+    manifold : bool
+        No edge in more than two faces, no two faces along an edge in one direction, the faces around every vertex one
+        fan, no face with a vertex twice.
+    oriented : bool
+        No two faces run along an edge in the same direction.
+    boundary_edges, nonmanifold_edges : int
+        Edges in one face, in more than two.
+    nonmanifold_vertices : int
+        Vertices whose faces fall apart into several fans.
+    coincident_vertices : int
+        Used vertices at the place of another one.
+    open_edges_by_place : int
+        Edges that are not in exactly two faces once such vertices are joined.
+    components : int
+        Parts that share no vertex.
+    euler_number : int
+        Used vertices - edges + faces.
+    genus : int or None
+        Handles of all parts together; None if not closed and manifold.
+    zero_area_faces, duplicate_faces, unused_vertices : int
+    shortest_edge_mm : float or None
+        None without edges.
+    area_mm2 : float
+    volume_ml : float
+        Enclosed volume, signed: cavities count negative, a surface turned inside out is negative as a whole.  Means
+        nothing unless `closed`: it is then relative to the centre of the bounds.
+    outward : bool
+        The volume is positive.
+    bounds_mm : [[x, y, z], [x, y, z]] or None
+        Lowest and highest corner; None without vertices.
+    self_intersections : int or None
+        Pairs of triangles that cut each other; None where nobody has looked for them, as here.
+    """
+
+    vertices: int
+    triangles: int
+    closed: bool
+    manifold: bool
+    oriented: bool
+    boundary_edges: int
+    nonmanifold_edges: int
+    nonmanifold_vertices: int
+    coincident_vertices: int
+    open_edges_by_place: int
+    components: int
+    euler_number: int
+    genus: int | None
+    zero_area_faces: int
+    duplicate_faces: int
+    unused_vertices: int
+    shortest_edge_mm: float | None
+    area_mm2: float
+    volume_ml: float
+    outward: bool
+    bounds_mm: list[list[float]] | None
+    self_intersections: int | None = None
+
+
+def measure_quality(vertices: NDArray[np.floating], triangles: NDArray[np.uint32]) -> MeshQuality:
     """Measure a triangle surface.
 
     Parameters
@@ -35,27 +104,7 @@ def measure_quality(vertices: NDArray[np.floating], triangles: NDArray[np.uint32
 
     Returns
     -------
-    dict
-        ``vertices``, ``triangles`` : int
-        ``closed`` : bool, there are triangles and every edge is in exactly two, also when vertices at one place are
-        joined, as readers of STL do
-        ``manifold`` : bool, no edge in more than two faces, no two faces along an edge in one direction, the faces
-        around every vertex one fan, no face with a vertex twice
-        ``oriented`` : bool, no two faces run along an edge in the same direction
-        ``boundary_edges``, ``nonmanifold_edges`` : int, edges in one face, in more than two
-        ``nonmanifold_vertices`` : int, vertices whose faces fall apart into several fans
-        ``coincident_vertices`` : int, used vertices at the place of another one
-        ``open_edges_by_place`` : int, edges that are not in exactly two faces once such vertices are joined
-        ``components`` : int, parts that share no vertex
-        ``euler_number`` : int, used vertices - edges + faces
-        ``genus`` : int or None, handles of all parts together; None if not closed and manifold
-        ``zero_area_faces``, ``duplicate_faces``, ``unused_vertices`` : int
-        ``shortest_edge_mm`` : float or None, None without edges
-        ``area_mm2`` : float
-        ``volume_ml`` : float, enclosed volume, signed: cavities count negative, a surface turned inside out is
-        negative as a whole.  Means nothing unless ``closed``: it is then relative to the centre of the bounds
-        ``outward`` : bool, the volume is positive
-        ``bounds_mm`` : [[x, y, z], [x, y, z]], lowest and highest corner; None without vertices
+    MeshQuality
 
     Raises
     ------
@@ -77,29 +126,29 @@ def measure_quality(vertices: NDArray[np.floating], triangles: NDArray[np.uint32
     closed = triangle_count > 0 and edges.boundary == 0 and edges.nonmanifold == 0 and open_by_place == 0
     manifold = triangle_count > 0 and edges.nonmanifold == 0 and edges.oriented and split_vertices == 0 and loops == 0
     area, volume, zero_area, shortest = _measure_triangles(vertices, triangles)
-    return {
-        "vertices": vertex_count,
-        "triangles": triangle_count,
-        "closed": closed,
-        "manifold": manifold,
-        "oriented": edges.oriented,
-        "boundary_edges": edges.boundary,
-        "nonmanifold_edges": edges.nonmanifold,
-        "nonmanifold_vertices": split_vertices,
-        "coincident_vertices": coincident,
-        "open_edges_by_place": open_by_place,
-        "components": components,
-        "euler_number": euler_number,
-        "genus": components - euler_number // 2 if closed and manifold else None,
-        "zero_area_faces": zero_area,
-        "duplicate_faces": count_duplicate_faces(triangles, vertex_count, opposite),
-        "unused_vertices": unused,
-        "shortest_edge_mm": shortest,
-        "area_mm2": area,
-        "volume_ml": volume / 1000.0,
-        "outward": volume > 0.0,
-        "bounds_mm": [vertices.min(axis=0).tolist(), vertices.max(axis=0).tolist()] if vertex_count else None,
-    }
+    return MeshQuality(
+        vertices=vertex_count,
+        triangles=triangle_count,
+        closed=closed,
+        manifold=manifold,
+        oriented=edges.oriented,
+        boundary_edges=edges.boundary,
+        nonmanifold_edges=edges.nonmanifold,
+        nonmanifold_vertices=split_vertices,
+        coincident_vertices=coincident,
+        open_edges_by_place=open_by_place,
+        components=components,
+        euler_number=euler_number,
+        genus=components - euler_number // 2 if closed and manifold else None,
+        zero_area_faces=zero_area,
+        duplicate_faces=count_duplicate_faces(triangles, vertex_count, opposite),
+        unused_vertices=unused,
+        shortest_edge_mm=shortest,
+        area_mm2=area,
+        volume_ml=volume / 1000.0,
+        outward=volume > 0.0,
+        bounds_mm=[vertices.min(axis=0).tolist(), vertices.max(axis=0).tolist()] if vertex_count else None,
+    )
 
 
 def _count_by_place(

@@ -11,6 +11,7 @@ from pydicom.uid import DeflatedExplicitVRLittleEndian, RLELossless
 
 from clrecon.dicom import read_volume
 from clrecon.errors import RefusedInputError, UsageError
+from clrecon.geometry.certificate import amend
 from clrecon.labels import read_labels, resample_labels
 
 pytest.importorskip("highdicom")
@@ -92,7 +93,7 @@ def test_labels_of_another_frame_of_reference_are_refused(tmp_path):
     labels = read_labels(write_seg(tmp_path / "a.dcm", masks(), ct_slices()))
     volume = ct_volume(tmp_path)
     assert labels.frame_of_reference_hash == volume.report["frame_of_reference_hash"]
-    volume.report["frame_of_reference_hash"] = "0" * 16
+    volume.report = amend(volume.report, frame_of_reference_hash="0" * 16)
     with pytest.raises(RefusedInputError, match="belongs to frame of reference"):
         resample_labels(labels, volume)
 

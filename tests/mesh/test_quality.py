@@ -54,6 +54,7 @@ def test_box_far_from_the_origin():
         "volume_ml": pytest.approx(0.033, rel=tolerances.MESH_VOLUME),
         "outward": True,
         "bounds_mm": [FAR.tolist(), (FAR + (2.0, 3.0, 5.5)).tolist()],
+        "self_intersections": None,
     }
 
 

@@ -73,12 +73,12 @@ def judge_parts(parts: Sequence[Part], volume: Volume, settings: MeshSettings) -
     for part in parts:
         mesh, refinement = part.mesh, part.mesh.report.get("refinement")
         iso_distance = None
-        if part.quality:
+        if part.quality is not None:
             rule = None if part.surface.label is not None else rule_of_report(mesh.report)
             iso_distance = None if rule is None else measure_iso_distance(mesh, volume, rule)
-            part.quality["self_intersections"] = (
-                count_self_intersections(mesh.vertices, mesh.triangles) if settings.strict else None
-            )
+            if settings.strict:
+                crossing = count_self_intersections(mesh.vertices, mesh.triangles)
+                part.quality = part.quality.changed(self_intersections=crossing)
         found = judge_mesh(
             part.quality,
             closed=settings.closed,

@@ -37,7 +37,8 @@ def describe_part(part: Part, file: StagedFile, output: str | os.PathLike[str], 
     lowest and the highest corner in the patient frame `space`, also for formats that store another frame
     (GLB: metres, Y up).  What was not measured is None.
     """
-    quality, origin = part.quality, part.mesh.report
+    quality: dict[str, Any] = part.quality or {}
+    origin = part.mesh.report
     return {
         "name": part.name or None,
         "label": part.surface.label,

@@ -10,6 +10,7 @@ from clrecon.jobs.mesh.settings import name_level
 
 if TYPE_CHECKING:
     from clrecon.mesh import Mesh
+    from clrecon.mesh.quality import MeshQuality
 
 __all__ = ["Bones", "Part", "Surface", "plan_surfaces"]
 
@@ -66,8 +67,8 @@ class Part:
         What stands between the stem of the output and its extension, such as ``"200hu_001"``; empty where the part
         is the only one.
     mesh : Mesh
-    quality : dict
-        What `Mesh.quality` says; empty where it was not measured.
+    quality : MeshQuality, optional
+        Where it was measured.
     facts : dict
         More entries of its object in the report.
     pieces : (dict, dict), optional
@@ -79,7 +80,7 @@ class Part:
     surface: Surface
     name: str
     mesh: Mesh
-    quality: dict[str, Any] = field(default_factory=dict)
+    quality: MeshQuality | None = None
     facts: dict[str, Any] = field(default_factory=dict)
     pieces: tuple[dict[str, float], dict[str, float]] | None = None
     bones: Bones | None = None

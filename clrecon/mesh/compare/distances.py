@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,9 +15,12 @@ from clrecon.mesh.triangles import cross_product, cross_products
 from clrecon.mesh.vtk import CellLocator
 from clrecon.system.pieces import chunks, local_origin
 from clrecon.system.progress import Progress, ignore_progress
+from clrecon.system.records import Record
 
 __all__ = [
     "SAMPLES",
+    "DistanceSummary",
+    "MeshDistance",
     "NearDistance",
     "SurfaceDistance",
     "compare_meshes",
@@ -244,14 +247,53 @@ def triangle_distances(points: Columns, a: Columns, b: Columns, c: Columns) -> N
     return shortest
 
 
-def summarise_distances(distances: NDArray[np.float64]) -> dict[str, float]:
-    """``mean``, ``rms``, ``p95`` and ``max``, in the unit of `distances`."""
-    return {
-        "mean": float(distances.mean()),
-        "rms": float(np.sqrt(np.mean(distances * distances))),
-        "p95": float(np.percentile(distances, 95)),
-        "max": float(distances.max()),
-    }
+@dataclass(frozen=True, eq=False)
+class DistanceSummary(Record):
+    """What many distances come to: `mean`, `rms`, 95th percentile `p95`, and `max`, in their unit."""
+
+    mean: float
+    rms: float
+    p95: float
+    max: float
+
+
+def summarise_distances(distances: NDArray[np.float64]) -> DistanceSummary:
+    """Sum up distances, shape (n,), at least one."""
+    return DistanceSummary(
+        float(distances.mean()),
+        float(np.sqrt(np.mean(distances * distances))),
+        float(np.percentile(distances, 95)),
+        float(distances.max()),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class MeshDistance(Record):
+    """How far two surfaces lie apart.
+
+    Attributes
+    ----------
+    hd95_mm : float
+        The larger of the two 95th percentiles (robust Hausdorff distance).
+    assd_mm : float
+        Mean of both sides (average symmetric surface distance).
+    max_mm : float
+        Largest distance found; what lies between the points can be a little further.
+    to_reference_mm, from_reference_mm : DistanceSummary
+        Of each side.
+    volume_change_percent : float or None
+        Enclosed volume against that of the reference; None where that is zero, and without meaning for open surfaces.
+    samples : int
+        Points on each of them.
+    """
+
+    hd95_mm: float
+    assd_mm: float
+    max_mm: float
+    to_reference_mm: DistanceSummary
+    from_reference_mm: DistanceSummary
+    volume_change_percent: float | None
+    samples: int
 
 
 def _enclosed_ml(mesh: Mesh, origin: NDArray[np.float64]) -> float:
@@ -264,7 +306,7 @@ def _enclosed_ml(mesh: Mesh, origin: NDArray[np.float64]) -> float:
 
 def compare_meshes(
     mesh: Mesh, reference: Mesh, samples: int = SAMPLES, *, progress: Progress | None = None
-) -> dict[str, Any]:
+) -> MeshDistance:
     """Measure how far two surfaces lie apart.
 
     Points that cover each surface evenly by area are measured to the nearest triangle of the other.
@@ -279,14 +321,7 @@ def compare_meshes(
 
     Returns
     -------
-    dict
-        ``hd95_mm`` : the larger of the two 95th percentiles (robust Hausdorff distance)
-        ``assd_mm`` : mean of both sides (average symmetric surface distance)
-        ``max_mm`` : largest distance found; what lies between the points can be a little further
-        ``to_reference_mm``, ``from_reference_mm`` : ``{"mean", "rms", "p95", "max"}`` of each side
-        ``volume_change_percent`` : enclosed volume against that of `reference`; None where that is zero, and without
-        meaning for open surfaces
-        ``samples`` : int
+    MeshDistance
 
     Raises
     ------
@@ -308,12 +343,12 @@ def compare_meshes(
     progress("compare", 2, 2)
     origin = local_origin(reference.vertices)
     volume, wanted = _enclosed_ml(mesh, origin), _enclosed_ml(reference, origin)
-    return {
-        "hd95_mm": max(side["p95"] for side in sides),
-        "assd_mm": 0.5 * (sides[0]["mean"] + sides[1]["mean"]),
-        "max_mm": max(side["max"] for side in sides),
-        "to_reference_mm": sides[0],
-        "from_reference_mm": sides[1],
-        "volume_change_percent": 100.0 * (volume - wanted) / abs(wanted) if wanted else None,
-        "samples": samples,
-    }
+    return MeshDistance(
+        hd95_mm=max(side.p95 for side in sides),
+        assd_mm=0.5 * (sides[0].mean + sides[1].mean),
+        max_mm=max(side.max for side in sides),
+        to_reference_mm=sides[0],
+        from_reference_mm=sides[1],
+        volume_change_percent=100.0 * (volume - wanted) / abs(wanted) if wanted else None,
+        samples=samples,
+    )

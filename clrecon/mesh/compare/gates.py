@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 from clrecon.system.gates import Gate, at_most, failed_gates, is_true, none_of, unmeasured
@@ -27,12 +27,12 @@ it lies above thin cortex (3 mm, 200 to 226 HU); hollow ones by -32 to -80 %, so
 
 
 def judge_mesh(
-    quality: dict[str, Any] | None = None,
+    quality: Mapping[str, Any] | None = None,
     *,
     closed: bool = True,
     outward: bool = True,
-    iso_distance: dict[str, Any] | None = None,
-    deviation: dict[str, Any] | None = None,
+    iso_distance: Mapping[str, Any] | None = None,
+    deviation: Mapping[str, Any] | None = None,
     voxel_mm: float | None = None,
 ) -> list[Gate]:
     """Hold measures of a mesh against the gates.
@@ -55,9 +55,7 @@ def judge_mesh(
 
     Returns
     -------
-    list of dict
-        ``name``, ``measured`` (None: not measured), ``bound``, ``unit`` (None for counts), ``ok`` (None: not
-        measured) and ``text``, one line.
+    list of Gate
     """
     gates: list[Gate] = []
     if quality:
@@ -93,7 +91,7 @@ def judge_label_volume(mesh_ml: float | None, label_ml: float, advice: str = "",
     return gate.changed(text=text if gate.ok or not advice else f"{text}: {advice}")
 
 
-def _gates_of_quality(quality: dict[str, Any], closed: bool, outward: bool) -> Iterator[Gate]:
+def _gates_of_quality(quality: Mapping[str, Any], closed: bool, outward: bool) -> Iterator[Gate]:
     sheets = quality["nonmanifold_edges"] + quality["nonmanifold_vertices"]
     if closed:
         if quality["boundary_edges"] or not quality["open_edges_by_place"]:
@@ -114,7 +112,7 @@ def _gates_of_quality(quality: dict[str, Any], closed: bool, outward: bool) -> I
         yield none_of("self_intersections", intersections, "pairs of triangles that cut each other")
 
 
-def _gates_of_iso_distance(iso_distance: dict[str, Any]) -> Iterator[Gate]:
+def _gates_of_iso_distance(iso_distance: Mapping[str, Any]) -> Iterator[Gate]:
     what = "vertices and centres of triangles from which no trilinear iso surface was reached"
     yield none_of("iso_distance_found", iso_distance["not_found"], what)
     what = "distance of the vertices from the trilinear iso surface"
@@ -127,7 +125,7 @@ def _gates_of_iso_distance(iso_distance: dict[str, Any]) -> Iterator[Gate]:
             yield unmeasured(f"iso_distance_{name}", bound, "voxel", f"{what}: none was reached")
 
 
-def _gates_of_deviation(deviation: dict[str, Any], voxel_mm: float, closed: bool) -> Iterator[Gate]:
+def _gates_of_deviation(deviation: Mapping[str, Any], voxel_mm: float, closed: bool) -> Iterator[Gate]:
     p95, mean = deviation["hd95_mm"] / voxel_mm, deviation["assd_mm"] / voxel_mm
     what = "distance from the surface before smoothing and decimation"
     yield at_most("deviation_p95", p95, DEVIATION_P95_VOXEL, "voxel", f"{what}, 95 % of it")

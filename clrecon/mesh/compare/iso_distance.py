@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -9,12 +11,14 @@ from numpy.typing import NDArray
 
 from clrecon.geometry import Volume
 from clrecon.geometry.iso_rule import IsoRule, layer_normal_matrices
-from clrecon.mesh.compare.distances import summarise_distances
+from clrecon.mesh.compare.distances import DistanceSummary, summarise_distances
 from clrecon.mesh.mesh import Mesh
 from clrecon.system.pieces import chunks
+from clrecon.system.records import Record
 
 __all__ = [
     "SAMPLES",
+    "IsoDistance",
     "distances_to_iso_surface",
     "measure_iso_distance",
     "rule_of_report",
@@ -213,7 +217,34 @@ def _distances_along_lines(volume: Volume, rule: IsoRule, level: float, points: 
     return distances
 
 
-def measure_iso_distance(mesh: Mesh, volume: Volume, rule: IsoRule, samples: int = SAMPLES) -> dict[str, Any]:
+@dataclass(frozen=True, eq=False)
+class IsoDistance(Record):
+    """How far a mesh lies from the trilinear iso surface.
+
+    Attributes
+    ----------
+    voxel_mm : float
+        Shortest voxel step.
+    samples : mapping
+        ``vertices`` and ``centres`` that were measured.
+    not_found : int
+        Points from which no surface was reached; the figures are of the others.
+    vertices_mm, centres_mm : DistanceSummary or None
+        None where none was found.
+    vertices_voxel, centres_voxel : DistanceSummary or None
+        The same in units of `voxel_mm`.
+    """
+
+    voxel_mm: float
+    samples: Mapping[str, int]
+    not_found: int
+    vertices_mm: DistanceSummary | None
+    vertices_voxel: DistanceSummary | None
+    centres_mm: DistanceSummary | None
+    centres_voxel: DistanceSummary | None
+
+
+def measure_iso_distance(mesh: Mesh, volume: Volume, rule: IsoRule, samples: int = SAMPLES) -> IsoDistance:
     """Measure how far vertices and centres of triangles lie from the trilinear iso surface.
 
     The vertices of an extracted surface lie on it, up to the rounding of float32; the centres show what flat
@@ -232,24 +263,18 @@ def measure_iso_distance(mesh: Mesh, volume: Volume, rule: IsoRule, samples: int
 
     Returns
     -------
-    dict
-        ``vertices_mm``, ``centres_mm`` : ``{"mean", "rms", "p95", "max"}``, or None where none was found
-        ``vertices_voxel``, ``centres_voxel`` : the same in units of the shortest voxel step
-        ``voxel_mm`` : that step
-        ``samples`` : ``{"vertices", "centres"}``, points measured
-        ``not_found`` : int, points from which no surface was reached; the figures above are of the others
+    IsoDistance
     """
     voxel = smallest_voxel_mm(volume)
     vertices = mesh.vertices[:: -(-mesh.vertex_count // samples) or 1].astype(np.float64)
     triangles = mesh.triangles[:: -(-mesh.triangle_count // samples) or 1]
     centres = mesh.vertices[triangles].mean(axis=1, dtype=np.float64)
-    result: dict[str, Any] = {"voxel_mm": voxel, "samples": {}, "not_found": 0}
-    for name, points in (("vertices", vertices), ("centres", centres)):
+    not_found, summaries = 0, []
+    for points in (vertices, centres):
         distances = distances_to_iso_surface(volume, rule, points)
         found = distances[np.isfinite(distances)]
+        not_found += len(points) - len(found)
         summary = summarise_distances(found) if len(found) else None
-        result[f"{name}_mm"] = summary
-        result[f"{name}_voxel"] = summary and {part: value / voxel for part, value in summary.items()}
-        result["samples"][name] = len(points)
-        result["not_found"] += len(points) - len(found)
-    return result
+        in_voxels = None if summary is None else DistanceSummary(*(value / voxel for value in summary.values()))
+        summaries += [summary, in_voxels]
+    return IsoDistance(voxel, {"vertices": len(vertices), "centres": len(centres)}, not_found, *summaries)
