@@ -6,6 +6,7 @@ The kind is told from the content of the file; its name is not trusted.
 from __future__ import annotations
 
 import os
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,11 +18,39 @@ if TYPE_CHECKING:
     from clrecon.geometry import Volume
     from clrecon.system.progress import Progress
 
-__all__ = ["list_series", "read_volume"]
+__all__ = ["Selection", "list_series", "read_selected", "read_volume"]
 
 _OTHER_FORMATS = ("NIfTI", "NRRD", "MetaImage")
 _NAMES = (".nii", ".nii.gz", ".hdr", ".img", ".img.gz", ".nrrd", ".nhdr", ".mha", ".mhd")
 """Ends of names of these formats: for messages alone."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Selection:
+    """What is chosen of an input.
+
+    Parameters
+    ----------
+    series : str or int, optional
+        Which series of the input; None leaves the choice to `read_volume`.
+    phase : int, optional
+        Which of its phases, where it has several.
+    allow_gaps : bool
+        Read a stack with missing slices.
+    force : bool
+        Read data sets without preamble or meta header.
+    """
+
+    series: int | str | None = None
+    phase: int | None = None
+    allow_gaps: bool = False
+    force: bool = False
+
+
+def read_selected(path: str | os.PathLike[str], selection: Selection, *, progress: Progress | None = None) -> Volume:
+    """Read what a selection says, see `read_volume`."""
+    chosen = {field.name: getattr(selection, field.name) for field in fields(Selection)}
+    return read_volume(path, **chosen, progress=progress)
 
 
 def read_volume(

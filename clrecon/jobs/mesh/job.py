@@ -14,7 +14,7 @@ from clrecon.jobs.mesh.levels import choose_level
 from clrecon.jobs.mesh.parts import check_levels, extract_surfaces, first_names, select_parts
 from clrecon.jobs.mesh.prepare import leave_outside, prepare_surfaces
 from clrecon.jobs.mesh.refinement import describe_purposes, judge_parts, refine_surface, warn_of_gates
-from clrecon.jobs.mesh.report import describe_job, describe_part
+from clrecon.jobs.mesh.report import MeshReport, describe_job, describe_part
 from clrecon.jobs.mesh.settings import MeshSettings
 from clrecon.jobs.mesh.surfaces import Part, Surface, plan_surfaces
 from clrecon.jobs.shared.laps import Laps
@@ -28,7 +28,8 @@ from clrecon.jobs.shared.outputs import (
     name_outputs,
     stage_meshes,
 )
-from clrecon.jobs.shared.report import peak_memory_bytes, stage_report
+from clrecon.jobs.shared.report import stage_report
+from clrecon.reading import read_selected
 from clrecon.system.log import get_logger, log_warnings
 from clrecon.system.progress import Progress, ignore_progress
 
@@ -54,7 +55,7 @@ def make_mesh(
     report_path: str | Path | None = None,
     measure: bool | None = None,
     progress: Progress | None = None,
-) -> dict[str, Any]:
+) -> MeshReport:
     """Read a CT series, extract its surfaces, select what is asked for, measure and write it.
 
     One mesh is written to `output`.  Several, of several iso values or split into components, get a name between
@@ -80,8 +81,7 @@ def make_mesh(
 
     Returns
     -------
-    dict
-        The report, see `describe_job`; with ``seconds`` and ``peak_memory_bytes``.
+    MeshReport
 
     Raises
     ------
@@ -113,26 +113,24 @@ def make_mesh(
     purpose_warnings = describe_purposes(parts)
     watch.lap("measure")
 
-    def compose(meshes: Sequence[dict[str, Any]]) -> dict[str, Any]:
-        report = describe_job(volume, parts, meshes, settings, device, choice)
-        report["warnings"] += _warn_of_leftovers(output, paths) if settings.split else []
-        report["warnings"] += warn_of_walls(parts, settings, choice)
-        report["gates"] = gates
-        report["warnings"] += purpose_warnings + warn_of_gates(gates)
-        report["seconds"] = _seconds(watch, origins)
-        report["peak_memory_bytes"] = peak_memory_bytes()
-        return report
+    def compose(meshes: Sequence[dict[str, Any]]) -> MeshReport:
+        warnings = _warn_of_leftovers(output, paths) if settings.split else []
+        warnings += warn_of_walls(parts, settings, choice) + purpose_warnings + warn_of_gates(gates)
+        seconds = _seconds(watch, origins)
+        return describe_job(
+            volume, parts, meshes, settings, device, choice, gates=gates, warnings=warnings, seconds=seconds
+        )
 
     report = _write(parts, paths, report_path, settings.space, compose, watch, progress)
     _log(report, volume)
     return report
 
 
-def _log(report: dict[str, Any], volume: Volume) -> None:
-    log_warnings(log, report["warnings"], volume.report.get("warnings", ()))
+def _log(report: MeshReport, volume: Volume) -> None:
+    log_warnings(log, report.warnings, volume.report.get("warnings", ()))
     log.info(
         "%d meshes made, %d triangles, %d slabs, on %s in %.3f s",
-        *(len(report["meshes"]), report["triangles"], report["slabs"], report["device"], report["seconds"]["total"]),
+        *(len(report.meshes), report.triangles, report.slabs, report.device, report.seconds["total"]),
     )
 
 
@@ -141,10 +139,10 @@ def _write(
     paths: Sequence[str | Path],
     report_path: str | Path | None,
     space: str,
-    compose: Callable[[Sequence[dict[str, Any]]], dict[str, Any]],
+    compose: Callable[[Sequence[dict[str, Any]]], MeshReport],
     watch: Laps,
     progress: Progress,
-) -> dict[str, Any]:
+) -> MeshReport:
     """Write all files, the report composed of what is said of each mesh as the last one, and return the report."""
     with ExitStack() as staged:  # all files are on the disk before any replaces an older one
         files = stage_meshes(staged, [part.mesh for part in parts], paths, space, progress)
@@ -163,17 +161,8 @@ def _open(
     progress("device", 0, 0)
     prepare = partial(prepare_surfaces, components=settings.selects, topology=settings.topology, inside=settings.inside)
     with DeviceOpening(settings.device, prepare) as opening:
-        from clrecon.reading import read_volume
-
         labels = open_labels(settings.labels)
-        volume = read_volume(
-            source,
-            settings.series,
-            phase=settings.phase,
-            allow_gaps=settings.allow_gaps,
-            force=settings.force,
-            progress=progress,
-        )
+        volume = read_selected(source, settings, progress=progress)
         watch.lap("read")
         device = opening.wait()
         watch.lap("device")

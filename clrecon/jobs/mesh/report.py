@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from clrecon.jobs.mesh.labels import describe_label
@@ -11,7 +12,8 @@ from clrecon.jobs.mesh.levels import describe_level
 from clrecon.jobs.mesh.presets import find_preset
 from clrecon.jobs.mesh.settings import MeshSettings
 from clrecon.jobs.mesh.surfaces import Part, Surface
-from clrecon.jobs.shared.report import platform_name
+from clrecon.jobs.shared.report import peak_memory_bytes, platform_name
+from clrecon.jobs.shared.run_report import RunReport
 from clrecon.jobs.shared.skin import SKIN_HU
 from clrecon.version import package_version
 
@@ -22,7 +24,7 @@ if TYPE_CHECKING:
     from clrecon.opencl import Device
     from clrecon.system.files import StagedFile
 
-__all__ = ["describe_job", "describe_part"]
+__all__ = ["MeshReport", "describe_job", "describe_part"]
 
 _OF_ONE = ("quality", "walls", "iso_distance", "refinement", "print")
 """What stands at the top of the report too where there is one mesh."""
@@ -65,15 +67,110 @@ def describe_part(part: Part, file: StagedFile, output: str | os.PathLike[str], 
     }
 
 
+@dataclass(frozen=True, eq=False, kw_only=True)
+class MeshReport(RunReport):
+    """What a mesh job has made, beside what every `RunReport` says; the entries are explained in docs/contract.md.
+
+    With one mesh, its entries stand here too.  With several, sums do (components of one surface that are written one by
+    one were found together, and count once), `bounds_mm` is the box around all, `closed` and `manifold` hold where they
+    hold for each, and what differs or cannot be summed is None.
+
+    Attributes
+    ----------
+    iso_value_hu, iso_level_hu : float or None
+        As asked for, and where the surface lies.
+    inside, inside_hu, inside_levels_hu, outside_hu
+        What the surfaces enclose, and the value beyond the border of the volume.
+    iso_value_reason, iso_value_choice, preset, preset_reason
+        Where the iso value comes from: in words, the `IsoChoice` without its value, the preset and its source.
+    space, unit : str
+    vertices, triangles, components, components_found, components_kept : int or None
+    closed, manifold : bool or None
+    area_mm2, volume_ml : float or None
+    bounds_mm : [[x, y, z], [x, y, z]] or None
+    closed_at_border, topology, keep, keep_largest, min_volume_ml, seeds_mm, split, purpose
+        The settings.
+    slabs : int
+        Most of a surface.
+    device_bytes : mapping of str to int
+        Most that was taken on the device, by what it is.
+    quality, walls, iso_distance, refinement, print : mapping or None
+        Of the only mesh.
+    meshes : list of mapping
+        One a file, see `describe_part`.
+    output : mapping
+        ``format`` and ``bytes`` of all files.
+    gates : list of mapping
+        `Gate`, each with ``mesh``, the name of its part or None.
+    """
+
+    _LEFT_OUT = ("preset_reason",)
+
+    affine_ijk_to_lps_mm: list[list[float]]
+    iso_value_hu: float | None
+    iso_level_hu: float | None
+    inside: str | None
+    inside_hu: list[float | None] | None
+    inside_levels_hu: list[float | None] | None
+    outside_hu: float | None
+    iso_value_reason: str
+    iso_value_choice: Mapping[str, Any] | None
+    preset: str | None
+    space: str
+    unit: str = "mm"
+    vertices: int
+    triangles: int
+    closed: bool | None
+    manifold: bool | None
+    components: int | None
+    components_found: int | None
+    components_kept: int | None
+    area_mm2: float | None
+    volume_ml: float | None
+    bounds_mm: list[list[float]] | None
+    closed_at_border: bool
+    topology: str
+    keep: str | None
+    keep_largest: int | None
+    min_volume_ml: float | None
+    seeds_mm: list[list[float]]
+    split: bool
+    purpose: str | None
+    device: str
+    driver: str
+    memory_allowed_bytes: int | None
+    slabs: int
+    device_bytes: Mapping[str, int]
+    version: str
+    platform: str
+    warnings: list[str]
+    volume: Mapping[str, Any]
+    quality: Mapping[str, Any] | None
+    walls: Mapping[str, Any] | None
+    iso_distance: Mapping[str, Any] | None
+    refinement: Mapping[str, Any] | None
+    print: Mapping[str, Any] | None
+    meshes: list[dict[str, Any]]
+    output: Mapping[str, Any]
+    preset_reason: str | None
+    gates: list[dict[str, Any]]
+    seconds: Mapping[str, float]
+    peak_memory_bytes: int | None
+
+
 def describe_job(
     volume: Volume,
     parts: Sequence[Part],
     meshes: Sequence[dict[str, Any]],
     settings: MeshSettings,
     device: Device,
-    choice: IsoChoice | None = None,
-) -> dict[str, Any]:
-    """Compose the report of a job, all but times and memory.
+    choice: IsoChoice | None,
+    *,
+    gates: list[dict[str, Any]],
+    warnings: Sequence[str],
+    seconds: Mapping[str, float],
+) -> MeshReport:
+    """Compose the report of a job.
 
     Parameters
     ----------
@@ -83,65 +180,68 @@ def describe_job(
         What `describe_part` says of each.
     settings : MeshSettings
     device : Device
-    choice : IsoChoice, optional
+    choice : IsoChoice or None
         Where the iso value came from when it was neither given nor a preset.
-
-    Returns
-    -------
-    dict
-        With one mesh, its entries stand at the top too.  With several, sums do (components of one surface that are
-        written one by one were found together, and count once), ``bounds_mm`` is the box around all, ``closed``
-        and ``manifold`` hold where they hold for each, and what differs or cannot be summed is None.
+    gates : list of dict
+    warnings : sequence of str
+        Of the job; those of the volume and the meshes come before them.
+    seconds : mapping
     """
-    from clrecon.exchange.formats import describe_rounding
-
     certificate = dict(volume.report)
-    warnings = [str(text) for text in certificate.pop("warnings", [])]
-    for part, mesh in zip(parts, meshes, strict=True):
-        warnings += [str(text) for text in part.mesh.report.get("warnings", [])]
-        warnings += describe_rounding(part.mesh, f".{mesh['output']['format']}")
+    told = [*certificate.pop("warnings", []), *_warn_of_meshes(parts, meshes)]
     level, level_warnings = describe_level(volume, settings, choice)
-    warnings += level_warnings
+    told += level_warnings
     if any(_shows_skin(part.surface, settings) for part in parts):
-        warnings.append("a surface of the skin can show a face: treat the file as one that identifies the patient")
-    report: dict[str, Any] = {
-        "affine_ijk_to_lps_mm": volume.affine.tolist(),
-        "iso_value_hu": _common(mesh["iso_value_hu"] for mesh in meshes),
-        "iso_level_hu": _common(mesh["iso_level_hu"] for mesh in meshes),
-        **{name: _common(mesh[name] for mesh in meshes) for name in ("inside", "inside_hu", "inside_levels_hu")},
-        "outside_hu": _common(part.mesh.report.get("outside_hu") for part in parts),
+        told.append("a surface of the skin can show a face: treat the file as one that identifies the patient")
+    common = ("iso_value_hu", "iso_level_hu", "inside", "inside_hu", "inside_levels_hu")
+    preset = settings.preset_used
+    of_one: dict[str, Any] = {name: meshes[0][name] if len(meshes) == 1 else None for name in _OF_ONE}
+    return MeshReport(
+        affine_ijk_to_lps_mm=volume.affine.tolist(),
+        **{name: _common(mesh[name] for mesh in meshes) for name in common},
+        outside_hu=_common(part.mesh.report.get("outside_hu") for part in parts),
         **level,
-        "preset": settings.preset_used,
-        "space": settings.space,
-        "unit": "mm",
+        preset=preset,
+        space=settings.space,
         **_describe_all(parts, meshes),
-        "closed_at_border": settings.closed,
-        "topology": settings.topology,
-        "keep": settings.keep,
-        "keep_largest": settings.keep_largest,
-        "min_volume_ml": settings.min_volume_ml,
-        "seeds_mm": [[float(value) for value in seed] for seed in settings.seeds],
-        "split": settings.split,
-        "purpose": settings.purpose,
-        "device": device.label,
-        "driver": device.driver,
-        "memory_allowed_bytes": settings.memory,
-        "slabs": max((part.mesh.report.get("slabs", 1) for part in parts), default=1),
-        "device_bytes": _largest(part.mesh.report.get("device_bytes", {}) for part in parts),
-        "version": package_version(),
-        "platform": platform_name(),
-        "warnings": list(dict.fromkeys(warnings)),
-        "volume": certificate,
-        **{name: meshes[0][name] if len(meshes) == 1 else None for name in _OF_ONE},
-        "meshes": list(meshes),
-        "output": {
+        closed_at_border=settings.closed,
+        topology=settings.topology,
+        keep=settings.keep,
+        keep_largest=settings.keep_largest,
+        min_volume_ml=settings.min_volume_ml,
+        seeds_mm=[[float(value) for value in seed] for seed in settings.seeds],
+        split=settings.split,
+        purpose=settings.purpose,
+        device=device.label,
+        driver=device.driver,
+        memory_allowed_bytes=settings.memory,
+        slabs=max((part.mesh.report.get("slabs", 1) for part in parts), default=1),
+        device_bytes=_largest(part.mesh.report.get("device_bytes", {}) for part in parts),
+        version=package_version(),
+        platform=platform_name(),
+        warnings=[*dict.fromkeys(map(str, told)), *warnings],
+        volume=certificate,
+        **of_one,
+        meshes=list(meshes),
+        output={
             "format": meshes[0]["output"]["format"],
             "bytes": sum(mesh["output"]["bytes"] for mesh in meshes),
         },
-    }
-    if settings.preset_used is not None:
-        report["preset_reason"] = find_preset(settings.preset_used).source
-    return report
+        preset_reason=None if preset is None else find_preset(preset).source,
+        gates=gates,
+        seconds=seconds,
+        peak_memory_bytes=peak_memory_bytes(),
+    )
+
+
+def _warn_of_meshes(parts: Sequence[Part], meshes: Sequence[dict[str, Any]]) -> list[str]:
+    from clrecon.exchange.formats import describe_rounding
+
+    warnings = []
+    for part, mesh in zip(parts, meshes, strict=True):
+        warnings += part.mesh.report.get("warnings", [])
+        warnings += describe_rounding(part.mesh, f".{mesh['output']['format']}")
+    return warnings
 
 
 def _describe_all(parts: Sequence[Part], meshes: Sequence[dict[str, Any]]) -> dict[str, Any]:

@@ -18,6 +18,7 @@ from clrecon.jobs.shared.masking import mask_volume
 from clrecon.jobs.shared.opening import DeviceOpening
 from clrecon.jobs.shared.outputs import check_kept, commit_all
 from clrecon.jobs.shared.report import peak_memory_bytes, stage_report
+from clrecon.reading import read_selected
 from clrecon.system.files import allow_open_files
 from clrecon.system.log import get_logger, log_warnings
 from clrecon.system.progress import Progress, ignore_progress
@@ -79,7 +80,7 @@ def make_pictures(
     progress("device", 0, 0)
     with DeviceOpening(settings.device, partial(_prepare, settings=settings)) as opening:
         labels = read_look(settings.labels)
-        volume = _read(source, settings, progress)
+        volume = read_selected(source, settings, progress=progress)
         watch.lap("read")
         device = opening.wait()
         watch.lap("device")
@@ -113,19 +114,6 @@ def _prepare(device: Device, settings: RenderSettings) -> None:
     small = RenderSettings.of(mode, size=(8, 8), iso_value=0.0 if mode == "surface" else None)
     with Studio(nothing, device, small, progress=ignore_progress) as studio:
         studio.take_view("anterior")
-
-
-def _read(source: str | Path, settings: RenderSettings, progress: Progress) -> Volume:
-    from clrecon.reading import read_volume
-
-    return read_volume(
-        source,
-        settings.series,
-        phase=settings.phase,
-        allow_gaps=settings.allow_gaps,
-        force=settings.force,
-        progress=progress,
-    )
 
 
 def _take_views(

@@ -6,24 +6,19 @@ import math
 from dataclasses import dataclass
 
 from clrecon.errors import UsageError
+from clrecon.reading import Selection
 
 __all__ = ["InputSettings"]
 
 
 @dataclass(frozen=True, kw_only=True)
-class InputSettings:
+class InputSettings(Selection):
     """What is read, what of it is turned into air, and where it is computed.
 
     Parameters
     ----------
-    series : str or int, optional
-        Which series of the input; None leaves the choice to `read_volume`.
-    phase : int, optional
-        Which of its phases, where it has several.
-    allow_gaps : bool
-        Read a stack with missing slices.
-    force : bool
-        Read data sets without preamble or meta header.
+    series, phase, allow_gaps, force
+        See `clrecon.reading.Selection`.
     remove_table : bool
         Turn what is not the patient's body into air first, see `clrecon.anatomy.body.remove_table`.
     allow_bone_loss : bool
@@ -41,10 +36,6 @@ class InputSettings:
         A value is impossible.
     """
 
-    series: str | int | None = None
-    phase: int | None = None
-    allow_gaps: bool = False
-    force: bool = False
     remove_table: bool = False
     allow_bone_loss: bool = False
     field_of_view: float | str | None = None
