@@ -10,14 +10,20 @@ from typing import TYPE_CHECKING, Any
 
 from clrecon.errors import UsageError
 from clrecon.jobs.render.files import PictureFiles, check_pictures, format_of, name_view, stage_picture
-from clrecon.jobs.render.report import describe_picture, describe_pictures, find_emptiness, warn_of_picture
+from clrecon.jobs.render.report import (
+    PictureReport,
+    describe_picture,
+    describe_pictures,
+    find_emptiness,
+    warn_of_picture,
+)
 from clrecon.jobs.render.settings import RenderSettings
 from clrecon.jobs.render.studio import Studio, read_curve, read_function, read_look
 from clrecon.jobs.shared.laps import Laps
 from clrecon.jobs.shared.masking import mask_volume
 from clrecon.jobs.shared.opening import DeviceOpening
 from clrecon.jobs.shared.outputs import check_kept, commit_all
-from clrecon.jobs.shared.report import peak_memory_bytes, stage_report
+from clrecon.jobs.shared.report import stage_report
 from clrecon.reading import read_selected
 from clrecon.system.files import allow_open_files
 from clrecon.system.log import get_logger, log_warnings
@@ -40,7 +46,7 @@ def make_pictures(
     settings: RenderSettings | None = None,
     *,
     progress: Progress | None = None,
-) -> dict[str, Any]:
+) -> PictureReport:
     """Read a CT series and take the pictures that are asked for.
 
     Outputs that cannot be written are refused first, then files that say how (transfer function, centre line), then a
@@ -58,9 +64,7 @@ def make_pictures(
 
     Returns
     -------
-    dict
-        The report, see `clrecon.jobs.render.report.describe_pictures`; with ``seconds`` and
-        ``peak_memory_bytes``.
+    PictureReport
 
     Raises
     ------
@@ -92,13 +96,11 @@ def make_pictures(
         pictures, written = _take_views(studio, settings, files, staged, watch, progress)
         turntable, moving = _turn(studio, volume, settings, files, staged, watch, progress)
         written += moving
-        report = describe_pictures(volume, settings, studio, device, pictures, turntable)
-        report["seconds"] = _seconds(watch)
-        report["peak_memory_bytes"] = peak_memory_bytes()
+        report = describe_pictures(volume, settings, studio, device, pictures, turntable, _seconds(watch))
         if files.report is not None:
             written.append(staged.enter_context(stage_report(files.report, report)))
         commit_all(written)
-    log_warnings(log, report["warnings"], volume.report.get("warnings", ()))
+    log_warnings(log, report.warnings, volume.report.get("warnings", ()))
     log.info("%d files of pictures made on %s in %.3f s", len(written), device.label, watch.total())
     return report
 

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import asdict
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
 from clrecon.jobs.render.settings import LabelLook, RenderSettings
-from clrecon.jobs.shared.report import platform_name
+from clrecon.jobs.shared.report import peak_memory_bytes, platform_name
+from clrecon.jobs.shared.run_report import RunReport
 from clrecon.jobs.shared.skin import SKIN_HU
 from clrecon.rendering.pictures.styles import CurveCut, PlaneCut, Style, SurfaceLook, VolumeLook
 from clrecon.system.wording import name_parameter
@@ -21,7 +22,14 @@ if TYPE_CHECKING:
     from clrecon.rendering import Rendering, TransferFunction
     from clrecon.rendering.views.camera import Camera
 
-__all__ = ["describe_camera", "describe_picture", "describe_pictures", "find_emptiness", "warn_of_picture"]
+__all__ = [
+    "PictureReport",
+    "describe_camera",
+    "describe_picture",
+    "describe_pictures",
+    "find_emptiness",
+    "warn_of_picture",
+]
 
 FACE_WARNING = "a picture of the skin can show a face: treat the file as one that identifies the patient"
 
@@ -104,6 +112,59 @@ def warn_of_picture(picture: Rendering) -> list[str]:
     return warnings
 
 
+@dataclass(frozen=True, eq=False, kw_only=True)
+class PictureReport(RunReport):
+    """What a picture job has made, beside what every `RunReport` says; the entries are explained in docs/contract.md.
+
+    Attributes
+    ----------
+    mode : str
+    preset : str or None
+    transfer_function, lighting : mapping or None
+        As they were used.
+    iso_value_hu, color, depth_cue
+        Of a surface, else None.
+    shadows, jitter : bool
+    background : str or None
+    clip_planes_lps_mm : nested list (n, 4)
+    thickness_mm, combine, offset_mm
+        Of slices and reformations, else None.
+    labels : list of mapping or None
+        Those that look different.
+    pictures : list of mapping
+        See `describe_picture`, with the files.
+    turntable : mapping or None
+    """
+
+    affine_ijk_to_lps_mm: list[list[float]]
+    mode: str
+    preset: str | None
+    transfer_function: Mapping[str, Any] | None
+    iso_value_hu: float | None
+    color: Any
+    depth_cue: float | None
+    lighting: Mapping[str, Any] | None
+    shadows: bool
+    jitter: bool
+    background: Any
+    clip_planes_lps_mm: list[list[float]]
+    thickness_mm: float | None
+    combine: str | None
+    offset_mm: float | None
+    labels: list[dict[str, Any]] | None
+    pictures: list[dict[str, Any]]
+    turntable: Mapping[str, Any] | None
+    device: str
+    driver: str
+    memory_allowed_bytes: int | None
+    version: str
+    platform: str
+    warnings: list[str]
+    volume: Mapping[str, Any]
+    seconds: Mapping[str, float]
+    peak_memory_bytes: int | None
+
+
 def describe_pictures(
     volume: Volume,
     settings: RenderSettings,
@@ -111,8 +172,9 @@ def describe_pictures(
     device: Device,
     pictures: Sequence[dict[str, Any]],
     turntable: dict[str, Any] | None,
-) -> dict[str, Any]:
-    """Compose the report of a job, all but times and memory.
+    seconds: Mapping[str, float],
+) -> PictureReport:
+    """Compose the report of a job.
 
     Parameters
     ----------
@@ -124,6 +186,7 @@ def describe_pictures(
     pictures : sequence of dict
         What `describe_picture` says of each, and its files.
     turntable : dict, optional
+    seconds : mapping
     """
     certificate = dict(volume.report)
     warnings = [str(text) for text in certificate.pop("warnings", [])] + studio.warnings
@@ -132,33 +195,35 @@ def describe_pictures(
     style, lighting = studio.style, studio.lighting
     clip = getattr(style, "clip", None)
     surface = style if isinstance(style, SurfaceLook) else None
-    return {
-        "affine_ijk_to_lps_mm": volume.affine.tolist(),
-        "mode": style.mode,
-        "preset": settings.preset_used,
-        "transfer_function": _describe_function(studio.function),
-        "iso_value_hu": surface and surface.iso_value,
-        "color": surface and surface.color,
-        "depth_cue": surface and surface.depth_cue,
-        "lighting": None if lighting is None else asdict(lighting),
-        "shadows": getattr(style, "shadows", False),
-        "jitter": getattr(style, "jitter", False),
-        "background": settings.background,
-        "clip_planes_lps_mm": [] if clip is None else clip.planes.tolist(),
-        "thickness_mm": style.thickness if isinstance(style, PlaneCut | CurveCut) else None,
-        "combine": style.combine if isinstance(style, PlaneCut | CurveCut) and style.thickness else None,
-        "offset_mm": style.offset_mm if isinstance(style, PlaneCut) else None,
-        "labels": _describe_labels(settings.labels, studio.labels),
-        "pictures": list(pictures),
-        "turntable": turntable,
-        "device": device.label,
-        "driver": device.driver,
-        "memory_allowed_bytes": settings.memory,
-        "version": package_version(),
-        "platform": platform_name(),
-        "warnings": list(dict.fromkeys(warnings)),
-        "volume": certificate,
-    }
+    return PictureReport(
+        affine_ijk_to_lps_mm=volume.affine.tolist(),
+        mode=style.mode,
+        preset=settings.preset_used,
+        transfer_function=_describe_function(studio.function),
+        iso_value_hu=None if surface is None else surface.iso_value,
+        color=None if surface is None else surface.color,
+        depth_cue=None if surface is None else surface.depth_cue,
+        lighting=None if lighting is None else asdict(lighting),
+        shadows=getattr(style, "shadows", False),
+        jitter=getattr(style, "jitter", False),
+        background=settings.background,
+        clip_planes_lps_mm=[] if clip is None else clip.planes.tolist(),
+        thickness_mm=style.thickness if isinstance(style, PlaneCut | CurveCut) else None,
+        combine=style.combine if isinstance(style, PlaneCut | CurveCut) and style.thickness else None,
+        offset_mm=style.offset_mm if isinstance(style, PlaneCut) else None,
+        labels=_describe_labels(settings.labels, studio.labels),
+        pictures=list(pictures),
+        turntable=turntable,
+        device=device.label,
+        driver=device.driver,
+        memory_allowed_bytes=settings.memory,
+        version=package_version(),
+        platform=platform_name(),
+        warnings=list(dict.fromkeys(warnings)),
+        volume=certificate,
+        seconds=seconds,
+        peak_memory_bytes=peak_memory_bytes(),
+    )
 
 
 def _describe_function(function: TransferFunction | None) -> dict[str, Any] | None:
