@@ -60,12 +60,6 @@ MESSAGES = {
         [(0, 1, 1, 1, 0), (200, 1, 0.9, 0.8, 1)], gradient_opacity=[(0, 0.5), (9, 1)]
     ),
     "rendering": Rendering(np.zeros((2, 3, 4), np.uint8), EMPTY, EMPTY, CAMERA, report={"seconds": {"read": 0.5}}),
-    "volume look": clrecon.VolumeLook(labels=LABELS, label_colors={"bone": "red"}, clip=Clip.box((0, 0, 0), (9, 9, 9))),
-    "projection": clrecon.Projection("mean", window=(0.0, 400.0)),
-    "surface look": clrecon.SurfaceLook(250.0, color="white"),
-    "slices in space": clrecon.SlicesInSpace([1, 2]),
-    "plane cut": clrecon.PlaneCut(thickness=3.0),
-    "curve cut": clrecon.CurveCut(CURVE),
     "mesh settings": MeshSettings(iso_value=(200.0, (300.0, 400.0)), labels=None, device=0),
     "label choice": LabelChoice("labels.nii", ("bone",)),
     "render settings": RenderSettings(),
