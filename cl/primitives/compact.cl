@@ -3,6 +3,11 @@
  * Reference: Billeter, Olsson, Assarsson 2009, "Efficient stream compaction on wide SIMD many-core
  * architectures" (count, scan, write); here on packed bits, so that counting is popcount.
  *
+ *      mask       word 0: 0x80000005      word 1: 0x00000002      bit b of word w is position 32 w + b
+ *      counts     3                       1                       with COMPACT_WORDS = 1
+ *      offsets    0                       3
+ *      positions  0, 2, 31                33
+ *
  * Passes
  *   1. count_set_bits   the number of set bits of each chunk of COMPACT_WORDS words
  *      (exclusive scan of these counts: scan.cl)

@@ -3,6 +3,13 @@
  * Reference: Blelloch 1990, "Prefix sums and their applications"; the three launches are the classic
  * reduce-then-scan order, which needs no forward progress between work-groups and so runs on any device.
  *
+ * With SCAN_GROUP = 2 and SCAN_PER_ITEM = 2, so blocks of 4:
+ *
+ *      counts           3  1 | 0  2 || 5  0 | 1  1 || 2          | elements of an item    || of a block, a work-group
+ *      block_sums             6     ||      7      || 2          1. sum_blocks
+ *      block_offsets          0     ||      6      || 13         2. scan_block_sums, total = 15
+ *      offsets          0  3 | 4  4 || 6 11 |11 12 || 13         3. scan_blocks
+ *
  * Passes
  *   1. sum_blocks          the sum of each block of SCAN_BLOCK elements
  *   2. scan_block_sums     one work-group: exclusive scan of the block sums in 64 bits, and the total

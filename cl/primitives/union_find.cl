@@ -18,9 +18,29 @@
  *      of all other vertices stay, and are roots of the first round; copy_roots brings both together
  *   5. flag_roots, scan.cl, number_components
  *
- * No item waits for another, no array is read by one item while another writes it except by atomics, and a minimum
- * does not depend on the order: the outcome is the same on every device.  The root of a component is its smallest
- * vertex. */
+ * Triangles (4, 5, 8), (5, 8, 9), (1, 2, 9) and (9, 12, 13), each arrow from a vertex to its label:
+ *
+ *      hook_corners      1 <- 2, 9     9 <- 12, 13     4 <- 5, 8        9 has 1, the least of its triangles' corners
+ *      jump_labels       1 <- 2, 9, 12, 13             4 <- 5, 8        all labels are roots; (5, 8, 9) is mixed
+ *      hook_roots        1 <- 4
+ *      copy_roots        1 <- 2, 9, 12, 13, 4          4 <- 5, 8        the label of each label is a root
+ *
+ * Races.  No item waits for another: what a launch writes is read by the next one, which the queue begins after it.
+ * Within a launch, by what items write:
+ *
+ *   their own word     clear_labels, jump_labels, mark_mixed, mark_roots, gather_roots, flag_roots, number_components:
+ *                      one word of the output an item, or three (gather_roots); the item of vertex 0 clears the flags
+ *                      too.  jump_roots and copy_roots write the word of a root, from a list that has each root once.
+ *                      What they read, no item writes: jumps go from one buffer of labels to the other.
+ *   labels by minimum  hook_corners: items whose triangles share a vertex write its label.  hook_roots: items whose
+ *                      triangles share a root write that root's label.  All do so by atomic_min() and none reads these
+ *                      labels, so each ends as the least of what was there and what all items brought, in any order.
+ *   a flag             jump_labels, jump_roots, hook_roots: several items write flags[0], or flags[1], all of them the
+ *                      number of this pass, and none reads it: whichever is last, it is the same word.
+ *
+ * In one launch of hook_roots b may be hooked to a while c is hooked to b.  No circle can come of it: a label is never
+ * above its vertex, and roots are hooked to smaller ones only.  So the labels after a launch follow from those before
+ * it and from nothing else: the outcome is the same on every device.  A component's root is its smallest vertex. */
 #define UNUSED 0xffffffffu
 
 #ifndef JUMPS
@@ -77,7 +97,7 @@ __kernel void hook_corners(__global const uint *restrict triangles, __global uin
  *             jumped  out  (n,) the label of the label ..., JUMPS times or until it is a root
  *             flags   out  [0]: the pass where a label is not yet a root, else as it was
  *             n       vertices
- *             pass    counts from 1
+ *             pass_number    counts from 1
  * Launch      as clear_labels
  * Guarantees  a chain of c links becomes one of at most ceil(c / (JUMPS + 1)); all who write the flag write the same */
 __kernel void jump_labels(
@@ -187,7 +207,7 @@ __kernel void hook_roots(
  *             jumped  out  (n,) of listed roots
  *             flags   out  [0], as in jump_labels
  *             count   listed roots
- *             pass    counts from 1
+ *             pass_number    counts from 1
  * Launch      global = count rounded up by the host, any local */
 __kernel void jump_roots(
     __global const uint *restrict roots, __global const uint *restrict labels, __global uint *restrict jumped,

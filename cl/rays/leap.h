@@ -1,4 +1,14 @@
-/* A map of how far around nothing shows, and leaps along rays with it. */
+/* A map of how far around nothing shows, and leaps along rays with it.
+ *
+ * Distances of bricks to the nearest that shows something (0), in one plane of the map:
+ *
+ *      +---------+
+ *      | 3  3  3 | 3  3  3
+ *      | 3 [2] 2 | 2  2  2       A ray in brick [2] leaps to the face of the box around: of all bricks less than 2 off,
+ *      | 3  2  1 | 1  1  2       from brick - 1 to brick + 1 along each axis.  None of them shows anything.
+ *      +---------+
+ *        3  2  1   0  1  2
+ *        3  2  1   1  1  2 */
 #ifndef CLRECON_LEAP_H
 #define CLRECON_LEAP_H
 

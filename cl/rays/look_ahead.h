@@ -1,7 +1,12 @@
 /* Leaps along rows of bricks that show nothing, in the direction that most of a picture's rays have.
  *
  * Near what shows the cubes of rays/leap.h are small; ahead the way is often free for long.  Rays drift aside as they
- * go on: with a brick's row also those beside it must be empty, on the side that rays through it drift to. */
+ * go on: with a brick's row also those beside it must be empty, on the side that rays through it drift to.
+ *
+ *      main axis -->                                  an entry of the map of ways, bit by bit
+ *      beside     .  .  .  .  #   # shows something   7 ............. 4   3 ............. 0
+ *      own row    o  .  .  .  .  #                    AHEAD_OF()          DISTANCE_OF(), see rays/leap.h
+ *                 4  3  2  1  0  0   AHEAD_OF() of the own row: bricks that are free, the own one counted */
 #ifndef CLRECON_LOOK_AHEAD_H
 #define CLRECON_LOOK_AHEAD_H
 

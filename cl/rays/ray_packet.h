@@ -1,4 +1,9 @@
-/* Rays of LANES pixels at once, see start_ray() in rays/view.h. */
+/* Rays of LANES pixels at once, see start_ray() in rays/view.h.
+ *
+ *      tiles, and with 2 queues      a tile: 8 x 8 pixels      a packet with LANES = 8: a row of the tile,
+ *      in the order of items         0  1  2 ...  7            pixels x to x + 7 of one row of the picture:
+ *      0  3  1                       8  9 10 ... 15            lanes 0, 1, 2 ... 7 of each `floats`;
+ *      4  2  5                       ...                       with LANES = 1 one pixel */
 #ifndef CLRECON_RAY_PACKET_H
 #define CLRECON_RAY_PACKET_H
 

@@ -4,6 +4,13 @@
  * kernel makes planes, stretched and straightened reformations (Kanitsar et al. 2002, "CPR - Curved Planar
  * Reformation").  Places are in fixed point, see reformat/trilinear_sample.h.
  *
+ *      m = intervals        .   .   .   .   .   .       sample m of pixel x of a row lies at
+ *                           .   .   .   .   .   .         place + x * step + (m - intervals / 2) * depth
+ *      m = intervals / 2    o---o---o---o---o---o  ->   with the nine numbers of the row: place, step and depth
+ *                           .   .   .   .   .   .
+ *      m = 0                .   .   .   .   .   .
+ *                         x 0   1   2   3   4   5
+ *
  * Passes
  *   1. reformat_rows    once for each part of the volume that the device holds, for some rows at a time */
 #include "reformat/trilinear_sample.h"

@@ -2,7 +2,15 @@
  *
  * A cell's 12 edges are owned by the samples of four rows (y, z) around its row of cells: the number of an edge is
  * that of the first vertex of its owner's word, plus the vertices that the owners before it have, plus the owner's own
- * before the edge. */
+ * before the edge.
+ *
+ *      y0z1 ---- y1z1      The four rows, seen along i: y0z0 is row (j, k) of samples, y1z0 row (j + 1, k),
+ *       |          |       y0z1 row (j, k + 1) and y1z1 row (j + 1, k + 1).
+ *      y0z0 ---- y1z0
+ *
+ *      owner, bit b of the word       0          1        2          3        4
+ *      its crossed edges              x          -        x, z       y        x, y, z
+ *      their vertices, from `first`   +0                  +1, +2     +3       +4, +5, +6 */
 #ifndef CLRECON_CELL_NUMBERS_H
 #define CLRECON_CELL_NUMBERS_H
 

@@ -3,6 +3,22 @@
  * References: Lorensen and Cline 1987 (marching cubes); Schroeder, Maynard, Geveci 2015, "Flying Edges" (edges
  * owned by samples, counting before writing); the packing of the inside test to one bit a sample is our own.
  *
+ * A cell, with the numbers of its corners in brackets and those of its edges on them:
+ *
+ *          (6)-------3-------(7)
+ *          /|                /|             bits 0, 1, 2 of a corner's number are its x, y, z
+ *         6 |               7 |             edges 0 to 3 run along x, 4 to 7 along y, 8 to 11 along z
+ *        /  10             /  11            bit b of the cell's case: corner b is inside
+ *      (4)-------2-------(5)  |
+ *       |   |             |   |
+ *       |  (2)-----1------|--(3)            k, z    j, y
+ *       8  /              9  /              |      /
+ *       | 4               | 5               |    /
+ *       |/                |/                |  /
+ *      (0)-------0-------(1)                |/______ i, x
+ *
+ * Sample (i, j, k) is corner 0 of cell (i, j, k), and owns edges 0, 4 and 8.
+ *
  * Passes
  *      (one bit a sample, inside or not; per row the words that hold any: cl/surface/classify.cl)
  *   1. count_rows         per row: vertices, triangles and words with work; per word its place in the row

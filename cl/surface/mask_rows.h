@@ -4,6 +4,16 @@
  * (border = 1), of gi x gj x gk samples.  A row (j, k) is `words` 32-bit words: bit b of word w says whether
  * sample i = 32 w + b is inside.  Bits beyond the row are 0.
  *
+ *      row (j, k)    word 0         word 1                 word words - 1
+ *      bit           31 ....... 0   31 ....... 0     ...   31 ......... 0
+ *      sample i      31 ....... 0   63 ...... 32
+ *
+ *      window of w   63 ............. 32   31 .............. 0
+ *                    bits of word w + 1    bits of word w
+ *
+ * Beside the mask a row has its extent, the first word with a bit set and the one after the last; a flag word has bit
+ * w % 32 of entry w / 32 set where word w has work; and the list of active words says row << row_shift | w.
+ *
  * A window is a word with its successor above it, in 64 bits: what is asked about samples 0..32 of the word can
  * be answered from it without a special case at the word's end. */
 #ifndef CLRECON_MASK_ROWS_H

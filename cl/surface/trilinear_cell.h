@@ -6,6 +6,19 @@
  * eight.  Voxels of 8 and 16 bits at an iso level between integers lose nothing.  Whether a corner is inside is said
  * by its bit in the case, never by its height.
  *
+ * Corners and edges are numbered as in surface/marching_cubes.cl.  Face 2 axis is the lower one across an axis, face
+ * 2 axis + 1 the upper one.  The two ways of an ambiguous face, whose inside corners (*) lie on a diagonal:
+ *
+ *      d---/----c*         d----\---c*       u and v are the axes after the face's own, in turn: b lies along u
+ *      |  /     |          |     \  |        from a, and d along v
+ *      | /      |          |      \ |
+ *      |/       |          |       \|
+ *      /        /          \        \
+ *      |       /|          |\       |
+ *      |      / |          | \      |
+ *      a*----/--b          a*-\-----b
+ *      joined: a c > b d   apart             in sizes of the corners' heights
+ *
  * References: Nielson and Hamann 1991 (faces); Chernyaev 1995 (interiors); Grosso 2016 (the waist of a tunnel).
  * Derivation and twin: clrecon/reference/surface/trilinear_table.py and trilinear.py. */
 #ifndef CLRECON_TRILINEAR_CELL_H
