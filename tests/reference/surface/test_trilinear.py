@@ -10,7 +10,7 @@ from itertools import permutations, product
 import numpy as np
 import pytest
 import tolerances
-from trilinear_truth import find_topology
+from trilinear_truth import count_euler, find_topology
 
 from clrecon.geometry import Volume
 from clrecon.geometry.iso_rule import choose_iso_rule
@@ -81,6 +81,16 @@ def expected_numbers(case: int, heights) -> tuple[int, int, int, int]:
         inside, outside = inside - tunnel.inside, outside - (not tunnel.inside)
         eulers = [euler - 1 for euler in eulers]
     return inside, outside, eulers[0], eulers[1]
+
+
+@pytest.mark.parametrize("connectivity", [1, 3])
+def test_euler_numbers_are_those_of_scikit_image(connectivity):
+    from skimage.measure import euler_number
+
+    rng = np.random.default_rng(12)
+    for share in np.linspace(0.0, 1.0, 21):
+        solid = rng.random(rng.integers(1, 12, 3)) < share
+        assert count_euler(solid, connectivity) == euler_number(solid, connectivity=connectivity)
 
 
 def compare_cells(seed: int, count: int) -> Counter:
@@ -260,7 +270,7 @@ def compare_volumes(seeds) -> Counter:
     for seed in seeds:
         volume = draw_volume(seed)
         rule = choose_iso_rule(volume, 0)
-        heights = np.pad(volume.voxels.astype(np.float64), 2, constant_values=rule.outside) - rule.iso_level
+        heights = np.pad(volume.voxels.astype(np.float64), 1, constant_values=rule.outside) - rule.iso_level
         truth = find_topology(heights, (8, 11, 16, 23, 32))
         if truth is None:
             found["unclear"] += 1
