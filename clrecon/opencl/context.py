@@ -63,7 +63,8 @@ class Device:
     shortcoming : str
         Why the device cannot be used; empty where it can.
     keeps_binaries : bool
-        Built programs are kept for the next process, see `clrecon.opencl.binaries`.
+        Built programs are kept for the next process, see `clrecon.opencl.binaries`; never where no folder for them
+        can be written, since PoCL builds a program a second time before it gives its binary.
     kernel_variants : dict of str to str
         ``-D`` definitions for kernels that are written for vectors, see `quirks.kernel_variants`.
     build_options : tuple of str
@@ -91,7 +92,7 @@ class Device:
         self.is_simulator: bool = quirks.is_simulator(self.platform)
         self.shares_host_memory: bool = quirks.shares_host_memory(self.platform, self.type)
         self.has_event_times: bool = quirks.has_event_times(self.platform)
-        self.keeps_binaries: bool = quirks.is_slow_from_its_cache(self.platform)
+        self.keeps_binaries: bool = quirks.is_slow_from_its_cache(self.platform) and not quirks.cache_warnings()
         self.kernel_variants: dict[str, str] = quirks.kernel_variants(self.platform, self.type)
         self.shortcoming: str = _find_shortcoming(cl_device)
         self.build_options: tuple[str, ...] = ()

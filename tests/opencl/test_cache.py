@@ -17,7 +17,8 @@ import numpy as np
 import clrecon
 voxels = np.random.default_rng(0).integers(0, 6, (4, 5, 6)).astype(np.int16)
 mesh = clrecon.extract_isosurface(clrecon.Volume(voxels, np.eye(4)), 3, device=int(sys.argv[1]))
-print(json.dumps([len(mesh.triangles), mesh.report["warnings"]]))
+kept = [device.keeps_binaries for device in clrecon.devices()]
+print(json.dumps([len(mesh.triangles), mesh.report["warnings"], kept]))
 """
 
 
@@ -28,8 +29,8 @@ def test_no_place_for_built_kernels(device, variables, tmp_path):
     command = [sys.executable, "-c", CODE, str(device.index)]
     done = subprocess.run(command, env=environment, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    triangles, warnings = json.loads(done.stdout)
-    assert triangles > 0
+    triangles, warnings, kept = json.loads(done.stdout)
+    assert triangles > 0 and not any(kept)
     assert warnings == ["the cache folder cannot be written: kernels are built anew by every process"]
     assert not list(tmp_path.iterdir())
 
