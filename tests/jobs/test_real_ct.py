@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,7 +12,7 @@ import tolerances
 from scipy.spatial import cKDTree
 
 from clrecon.dicom import read_volume
-from clrecon.geometry import AIR_HU, Volume
+from clrecon.geometry import AIR_HU
 from clrecon.jobs.mesh.job import make_mesh
 from clrecon.jobs.mesh.settings import MeshSettings
 from clrecon.operators.surface.extract import extract_isosurface
@@ -27,14 +29,17 @@ SERIES = [
 ]
 
 
-def contour_with_vtk(volume: Volume) -> tuple[np.ndarray, np.ndarray]:
-    """Flying edges over the same voxels in one layer of air, mapped through the same affine."""
+@cache
+def contour_with_vtk(folder: Path) -> tuple[np.ndarray, np.ndarray, cKDTree]:
+    """Flying edges over the same voxels in one layer of air, mapped through the same affine; once for all devices."""
+    volume = read_volume(folder)
     pyvista = pytest.importorskip("pyvista")
     padded = np.pad(volume.voxels, 1, constant_values=AIR_HU)
     image = pyvista.ImageData(dimensions=padded.shape[::-1], origin=(-1, -1, -1))
     image["hu"] = padded.ravel()
     contour = image.contour([HU - 0.5], method="flying_edges", compute_normals=False, compute_scalars=False)
-    return volume.ijk_to_lps(contour.points), contour.regular_faces
+    points = volume.ijk_to_lps(contour.points)
+    return points, contour.regular_faces, cKDTree(points)
 
 
 def enclosed_ml(points: np.ndarray, faces: np.ndarray) -> float:
@@ -54,12 +59,11 @@ def test_real_series_mesh_like_vtk_in_the_true_place(real_data, device, tmp_path
     assert np.abs(np.array(report["affine_ijk_to_lps_mm"]) - expected_affine).max() < 1e-5
     assert report["closed"] and report["manifold"]
 
-    volume = read_volume(real_data / folder)
-    points, faces = contour_with_vtk(volume)
+    points, faces, points_tree = contour_with_vtk(real_data / folder)
     written = trimesh.load_mesh(output, process=False)
     vertices = np.unique(written.vertices, axis=0)
     voxel = min(spacing)
-    both_ways = [cKDTree(points).query(vertices)[0], cKDTree(vertices).query(points)[0]]
+    both_ways = [points_tree.query(vertices)[0], cKDTree(vertices).query(points)[0]]
     for distances in both_ways:  # vertex to vertex: no less than to the surface
         assert np.percentile(distances, 95) <= tolerances.VTK_SURFACE_HD95_VOXEL * voxel
     assert report["triangles"] == len(faces)

@@ -231,6 +231,7 @@ def test_a_peer_that_dies_is_an_error(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.first_device  # other devices are measured in one process, and a process is given any device alike
 def test_surfaces_of_fresh_processes_are_measured(device: Any, tmp_path: Path) -> None:
     kept = run_cases(["isosurface-first-call", "memory"], "cube32", device, tmp_path)
     first = kept["isosurface-first-call"]
