@@ -38,6 +38,7 @@ def find_devices() -> tuple[list[Any], str]:
     try:
         from clrecon.errors import DeviceError
         from clrecon.opencl import list_devices
+        from clrecon.opencl.quirks import is_software_gpu, kernel_variants
     except ImportError as error:
         return [], f"the device layer cannot be imported: {error}"
     try:
@@ -48,6 +49,10 @@ def find_devices() -> tuple[list[Any], str]:
         # PoCL builds every kernel once more before it gives a binary away, for groups of any size: half of all its
         # building.  The processes of commands keep binaries, and so do tests/opencl/test_binaries.py.
         device.keeps_binaries = False
+        # llvmpipe makes vectors of work-items itself, and takes three times as long to build kernels that are written
+        # with vectors.  It runs the variant of GPUs, as no other device here does; `users_kernels` gives its own back.
+        if is_software_gpu(device.name):
+            device.kernel_variants = kernel_variants(device.platform, "gpu")
     devices = [device for device in found if is_set("CLRECON_TEST_SIMULATORS") or not device.is_simulator]
     wanted = os.environ.get("CLRECON_TEST_DEVICE", "").strip().lower()
     if wanted:
@@ -136,6 +141,14 @@ def device(request: pytest.FixtureRequest) -> Any:
             pytest.fail(f"CLRECON_REQUIRE_DEVICE is set: {request.param}")
         pytest.skip(request.param)
     return request.param
+
+
+@pytest.fixture
+def users_kernels(device: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The variant of the kernels that users of this device get: that of the tests is another one on llvmpipe."""
+    from clrecon.opencl.quirks import kernel_variants
+
+    monkeypatch.setattr(device, "kernel_variants", kernel_variants(device.platform, device.type))
 
 
 @pytest.fixture(scope="session")

@@ -100,6 +100,7 @@ def test_the_kernel_is_its_twin(device, name):
     assert_alike(cast(device, volume, 100.0, **settings), truth)
 
 
+@pytest.mark.usefixtures("users_kernels")
 @pytest.mark.parametrize("name", all_but(SCENES, *SCENES.keys() - {"soft"}))
 def test_one_sample_at_a_time_gives_the_same(device, name, monkeypatch):
     volume, settings = scene(name)
