@@ -1,4 +1,4 @@
-"""Surface meshes in patient millimetres: measure them and select their parts.
+"""Surface meshes in patient millimetres: the `Mesh` itself, measures of it, and selection of its parts.
 
 Smoothing and decimation (`clrecon.mesh.refine`) and distances and gates (`clrecon.mesh.compare`) are imported by those
 who use them; files are in `clrecon.exchange`.

@@ -1,4 +1,4 @@
-"""Keep the parts of a surface that matter, together or one by one, and drop the crumbs."""
+"""Selection of the components of a surface, together or one by one; small crumbs are dropped."""
 
 from __future__ import annotations
 
@@ -21,33 +21,33 @@ from clrecon.system.wording import name_parameter
 __all__ = ["Labelled", "select_components", "split_components"]
 
 Labelled = tuple[int, NDArray[np.int64]]
-"""What `label_components` returns: the number of components, and that of each vertex."""
+"""The result of `label_components`: the number of components, and the component of each vertex."""
 
 
 SEED_REACH_MM = 20.0
-"""Farther than this from any surface a seed is a mistake: the middle of a lumbar vertebral body (about 50 x 35 x 30 mm)
-lies 15 mm from its wall."""
+"""Largest distance of a seed from a surface; farther seeds are mistakes.  The middle of a lumbar vertebral body (about
+50 x 35 x 30 mm) lies 15 mm from its wall."""
 
 
 _ROUNDING_OF_AREA = 4.0
-"""Two components are of equal area when they differ by less than this, times the rounding step of the coordinates,
-times the square root of the area.  Rounding moves each vertex on its own: the area changes by about 0.3 of that
+"""Two components have equal area when they differ by less than this factor times the rounding step of the coordinates
+times the square root of the area.  Rounding moves each vertex independently and changes the area by about 0.3 of that
 product, by up to 1 where triangles are long and thin."""
 
 
 @dataclass(frozen=True)
 class _Chosen:
-    """Components of a mesh and which of them are kept.
+    """Components of a mesh, and which of them are kept.
 
     Attributes
     ----------
     label_of_vertex, label_of_triangle : ndarray, int64
         Number of the component; -1 for vertices that no triangle uses.
     ranked : ndarray, shape (count,), int64
-        Components from the largest area to the smallest, see `_rank`; in their own order where no rank was asked for.
+        Components from the largest area to the smallest, see `_rank`; in their own order if no rank was asked for.
     keep : ndarray, shape (count,), bool
     facts : dict
-        What the report of the outcome says of it.
+        Entries for the report of the result.
     """
 
     label_of_vertex: NDArray[np.int64]
@@ -68,8 +68,8 @@ def select_components(
 ) -> Mesh:
     """Keep the largest components of a surface, or those at given points.
 
-    Small components (`min_volume_ml`) are dropped first, then those that are nearest to no seed, then all but the
-    largest of the rest (`keep_largest`).  Components are ranked by area, not by volume: a part that is open at the
+    First, small components (`min_volume_ml`) are dropped, then those that are not nearest to a seed, then all but the
+    largest of the rest (`keep_largest`). Components are ranked by area, not by volume: a part that is open at the
     border of the scan encloses nothing, and the wall of a cavity has a negative volume.  The wall of a cavity is a
     component of its own; where it is dropped, the cavity is filled.
 
@@ -77,32 +77,32 @@ def select_components(
     ----------
     mesh : Mesh
     keep_largest : int, optional
-        Keep so many components, those of largest area.  Of components whose areas differ by no more than the
-        rounding of the coordinates explains the first in the mesh is kept.
+        Keep this number of components, those of largest area.  If areas are equal within the rounding of the
+        coordinates, the first component in the mesh is kept.
     min_volume_ml : float, optional
-        Keep components that enclose at least so much, whatever the sign.  What an open component encloses is
+        Keep components that enclose at least this volume, regardless of sign.  The volume of an open component is
         measured as if its rim were joined to the mean of its corners.
     seeds : sequence of (x, y, z)
         Keep the components whose surface lies nearest to one of these points, LPS mm.
     labelled : (int, ndarray), optional
-        What `label_components` returns for this mesh, where it is known already (a device finds it sooner).
+        Result of `label_components` for this mesh, if it is already known (a device finds it faster).
     among : ndarray, shape (count,), bool, optional
-        Of the components of `labelled`, those that may be kept.
+        True for components of `labelled` that may be kept.
 
     Returns
     -------
     Mesh
-        Vertices and triangles keep their order, normals and report come along; the mesh itself when nothing is
-        dropped.  Its report has ``components_found`` and ``components_kept``, and with seeds
-        ``seed_distances_mm``: how far the surface lies from each.
+        Vertices and triangles keep their order, normals and report are taken over; the mesh itself when nothing is
+        dropped.  Its report has ``components_found`` and ``components_kept``, and with seeds ``seed_distances_mm``: how
+        far the surface lies from each.
 
     Raises
     ------
     UsageError
-        `keep_largest` below 1, `min_volume_ml` negative or not a number, or a seed that is no point or farther than
-        20 mm from every component.
+        `keep_largest` below 1, `min_volume_ml` negative or not a number, or a seed is not a point, or farther than 20
+        mm from every component.
     NoSurfaceError
-        The mesh is empty or no component is large enough; the message has the largest.
+        The mesh is empty or no component is large enough; the message states the largest.
     """
     chosen = _choose(mesh, keep_largest, min_volume_ml, seeds, labelled, among)
     if chosen.keep.all():
@@ -121,7 +121,7 @@ def split_components(
     among: NDArray[np.bool_] | None = None,
     most: int | None = None,
 ) -> list[Mesh]:
-    """Take a surface apart into its components.
+    """Split a surface into its components.
 
     Parameters
     ----------
@@ -133,8 +133,8 @@ def split_components(
     Returns
     -------
     list of Mesh
-        One a component, the largest area first (of equal ones the first).  Vertices and triangles keep their order,
-        normals and report come along.
+        One mesh for each component, the largest area first (the first of equal ones). Vertices and triangles keep their
+        order, normals and report are taken over.
 
     Raises
     ------
@@ -168,7 +168,7 @@ def split_components(
 
 
 def _group(ranks: NDArray[np.int64], count: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Stable order by rank, and where in it each rank from 0 to `count` begins."""
+    """Return the stable order by rank, and the index in it at which each rank from 0 to `count` begins."""
     order = np.argsort(ranks, kind="stable")
     return order, np.searchsorted(ranks[order], np.arange(count + 1))
 
@@ -185,7 +185,7 @@ def _choose(
 ) -> _Chosen:
     """Find the components and decide which are kept; parameters and errors as in `select_components`.
 
-    Areas are measured where the decision or `rank` needs them, and are else zeros.
+    Areas are measured only if the decision or `rank` needs them, else they are zeros.
     """
     if keep_largest is not None and (isinstance(keep_largest, float) or keep_largest < 1):
         raise UsageError(f"keep_largest is a whole number from 1, not {keep_largest}")
@@ -207,8 +207,8 @@ def _choose(
     ranked = _rank(areas, rounding_step(mesh.vertices)) if rank or keep_largest is not None else np.arange(count)
     keep = np.ones(count, dtype=bool) if among is None else np.array(among, dtype=bool)
     if min_volume_ml is not None:
-        # Rounding moves no vertex further than half a step along each axis, and the volume by no more than the area
-        # times that way: a component of exactly the least volume is kept wherever it lies.
+        # Rounding moves a vertex by at most half a step along each axis, and so changes the volume by at most the area
+        # times that distance: a component of exactly the least volume is kept wherever it lies.
         way = 0.5 * math.sqrt(3.0) * rounding_step(mesh.vertices)
         candidates = keep.copy()
         keep &= volumes + way * areas / 1000.0 >= min_volume_ml
@@ -229,14 +229,14 @@ def _choose(
 def _rank(areas: NDArray[np.float64], step: float) -> NDArray[np.int64]:
     """Components from the largest area to the smallest, those of equal area in their own order.
 
-    Equal are those whose area differs from that of the first of their group by no more than rounding explains.
+    Areas are equal when they differ from the first of their group by no more than rounding explains.
 
     Parameters
     ----------
     areas : ndarray, shape (count,), float64
         mm2.
     step : float
-        mm, of the coordinates: `rounding_step`.
+        Rounding step of the coordinates, mm: `rounding_step`.
     """
     ranked = np.argsort(-areas, kind="stable")
     falling = areas[ranked]
@@ -254,7 +254,7 @@ def _rank(areas: NDArray[np.float64], step: float) -> NDArray[np.int64]:
 def _find_at_seeds(
     mesh: Mesh, label_of_triangle: NDArray[np.int64], keep: NDArray[np.bool_], seeds: Sequence[Sequence[float]]
 ) -> tuple[NDArray[np.bool_], list[float]]:
-    """The components of `keep` that are nearest to a seed, and how far each seed lies from its own."""
+    """Find the components of `keep` that are nearest to a seed, and the distance of each seed from its component."""
     rows = np.flatnonzero(keep[label_of_triangle])
     triangles = mesh.triangles if len(rows) == mesh.triangle_count else mesh.triangles[rows]
     found = np.zeros_like(keep)
@@ -278,14 +278,14 @@ def _find_at_seeds(
 def _measure_components(
     mesh: Mesh, label_of_triangle: NDArray[np.int64], count: int, *, areas: bool, volumes: bool
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Area in mm2 and enclosed volume in ml, without sign, of each component; zeros where that is not wanted."""
+    """Measure area in mm2 and enclosed volume in ml, without sign, of each component; zeros where not wanted."""
     twice_area = np.zeros(count)
     six_volumes = np.zeros(count)
     cross_sum = np.zeros((3, count))
     corner_sum = np.zeros((3, count))
     if not areas and not volumes:
         return twice_area, six_volumes
-    # Every piece adds to all components: where these are many, larger pieces keep that from taking the time.
+    # Every piece adds to all components: with many components, larger pieces save time.
     size = max(CHUNK, count)
     for where, corner, cross in cross_products(mesh.vertices, mesh.triangles, local_origin(mesh.vertices), size):
         label = label_of_triangle[where]
@@ -296,8 +296,8 @@ def _measure_components(
             for axis in range(3):
                 cross_sum[axis] += np.bincount(label, cross[axis], count)
                 corner_sum[axis] += np.bincount(label, corner[axis], count)
-    # From the common origin to one within each component: of no effect on closed ones, where the sum of the cross
-    # products is zero.
+    # From the common origin to one within each component.  This changes nothing for closed components, whose cross
+    # products sum to zero.
     centre = corner_sum / np.bincount(label_of_triangle, minlength=count)
     six_volumes -= np.einsum("ij,ij->j", centre, cross_sum)
     return twice_area / 2.0, np.abs(six_volumes) / 6000.0

@@ -1,7 +1,7 @@
-"""How triangles hang together: edges, fans around vertices, components.  Counts only, no coordinates.
+"""Connectivity of triangles: edges, fans around vertices, components; from indices alone, without coordinates.
 
-Words: half-edge h = 3 * f + i runs from corner i of triangle f to the next corner; the corner that it starts from
-has the same number.  Two half-edges are opposite when they run along one edge in contrary directions.
+Half-edge h = 3 * f + i runs from corner i of triangle f to the next corner; the corner that it starts from has the same
+number.  Two half-edges are opposite when they run along one edge in opposite directions.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ __all__ = [
 ]
 
 _MOST_STEPS = 64
-"""Faces around a vertex that are counted one after the other; vertices with more take the general way."""
+"""Most faces around a vertex that are counted one after the other; vertices with more take the general way."""
 
 IntArray = NDArray[np.integer]
 
@@ -43,7 +43,7 @@ class Edges:
     half_edges : ndarray, int32 or int64
         All half-edges, those of one edge side by side, first those that run to the higher vertex number.
     first : ndarray, int64, shape (count,)
-        Where in `half_edges` the ones of an edge begin.
+        Index in `half_edges` at which those of an edge begin.
     ends : ndarray, uint32, shape (2, count)
         Lower and higher vertex number of each edge; edges are in order of the lower, then of the higher one.
     """
@@ -67,13 +67,13 @@ def _index_type(size: int) -> type[np.integer]:
 
 
 def order_by_number(numbers: IntArray, size: int) -> IntArray:
-    """Stable order of whole numbers from 0 to ``size - 1``, like ``argsort(kind="stable")``.
+    """Return the stable order of whole numbers from 0 to ``size - 1``, like ``argsort(kind="stable")``.
 
-    Turning a sparse matrix from rows to columns is a counting sort: linear in time, and on meshes, whose numbers are
+    Converting a sparse matrix from rows to columns is a counting sort: linear in time, and on meshes, whose numbers are
     mostly in order already, several times as fast as sorting by comparison.
     """
     count = len(numbers)
-    if size > 8 * count + 1024:  # counting would spend its time on numbers that do not occur
+    if size > 8 * count + 1024:  # counting would waste time on numbers that do not occur
         return np.argsort(numbers, kind="stable")
     from scipy.sparse import csr_array
 
@@ -83,14 +83,14 @@ def order_by_number(numbers: IntArray, size: int) -> IntArray:
 
 
 def find_edges(triangles: NDArray[np.uint32], vertex_count: int) -> Edges:
-    """Bring the half-edges of each edge together."""
+    """Group the half-edges by edge."""
     start = triangles.reshape(-1)
     end = triangles[:, (1, 2, 0)].reshape(-1)
     upward = start < end
     half_edges = np.concatenate([np.flatnonzero(upward), np.flatnonzero(start > end)])
     half_edges = half_edges.astype(_index_type(len(start)), copy=False)
     low, high = np.minimum(start, end), np.maximum(start, end)
-    for ends in (high, low):  # least significant number first: every sort keeps the order of the ones before
+    for ends in (high, low):  # Least significant number first: each sort keeps the order of the earlier ones.
         half_edges = half_edges[order_by_number(ends[half_edges], vertex_count)]
     low, high, upward = low[half_edges], high[half_edges], upward[half_edges]
     same = low[1:] == low[:-1]
@@ -110,9 +110,9 @@ def find_edges(triangles: NDArray[np.uint32], vertex_count: int) -> Edges:
 
 
 def opposite_half_edges(triangles: NDArray[np.uint32], edges: Edges) -> IntArray | None:
-    """The half-edge on the other side of each half-edge, shape (3 * m,).
+    """Return the half-edge on the other side of each half-edge, shape (3 * m,).
 
-    None unless every edge has two faces that run along it in contrary directions and no face has a vertex twice.
+    None unless every edge has two faces that run along it in opposite directions and no face has a vertex twice.
     """
     clean = edges.oriented and edges.boundary == 0 and edges.nonmanifold == 0
     if not clean or len(edges.half_edges) != triangles.size:
@@ -127,7 +127,7 @@ def opposite_half_edges(triangles: NDArray[np.uint32], edges: Edges) -> IntArray
 def find_split_vertices(
     triangles: NDArray[np.uint32], vertex_count: int, edges: Edges, opposite: IntArray | None = None
 ) -> IntArray:
-    """Find the vertices whose faces fall apart into several fans, such as the waist of an hourglass.
+    """Find the vertices whose faces form several fans, for example the waist of an hourglass.
 
     Parameters
     ----------
@@ -135,7 +135,7 @@ def find_split_vertices(
     vertex_count : int
     edges : Edges
     opposite : ndarray, optional
-        Result of `opposite_half_edges`: the faces around each vertex are then counted by going round it once.
+        Result of `opposite_half_edges`; with it the faces around each vertex are counted by going round it once.
     """
     corners = triangles.reshape(-1)
     degree = np.bincount(corners, minlength=vertex_count)
@@ -159,7 +159,7 @@ def find_split_vertices(
 
 
 def _find_split_vertices_of_any_mesh(corners: NDArray[np.uint32], vertex_count: int, edges: Edges) -> IntArray:
-    """Join the corners of one vertex whose faces share an edge: what stays apart is another fan."""
+    """Join the corners of a vertex whose faces share an edge: each remaining group is a fan."""
     same_edge = np.ones(max(len(edges.half_edges) - 1, 0), dtype=bool)
     same_edge[edges.first[1:] - 1] = False
     pairs = np.flatnonzero(same_edge)
@@ -183,19 +183,19 @@ def _find_split_vertices_of_any_mesh(corners: NDArray[np.uint32], vertex_count: 
 def label_components(
     triangles: NDArray[np.uint32], vertex_count: int, edges: Edges | None = None
 ) -> tuple[int, NDArray[np.int64]]:
-    """Number the components: triangles that share a vertex belong to one.
+    """Number the components: triangles that share a vertex belong to one component.
 
     Parameters
     ----------
     triangles : ndarray, shape (m, 3), uint32
     vertex_count : int
     edges : Edges, optional
-        Where they are known already it takes a third of the time.
+        If they are already known, labelling takes a third of the time.
 
     Returns
     -------
     count : int
-        Number of components; vertices that no triangle uses are none.
+        Number of components, not counting vertices that no triangle uses.
     labels : ndarray, shape (vertex_count,), int64
         Component of each vertex, numbered in order of the first vertex; -1 for unused vertices.
     """
@@ -216,7 +216,7 @@ def label_components(
 
 
 def _connect_edges(edges: Edges, vertex_count: int) -> tuple[int, NDArray[np.int64]]:
-    """Connected components over edges, which are the rows of a sparse matrix as they are."""
+    """Find connected components over edges, which already are the rows of a sparse matrix."""
     from scipy.sparse import csr_array
     from scipy.sparse.csgraph import connected_components
 
@@ -230,23 +230,23 @@ def _connect_edges(edges: Edges, vertex_count: int) -> tuple[int, NDArray[np.int
 
 
 def _connect(one: NDArray[np.integer], other: NDArray[np.integer], size: int) -> tuple[int, NDArray[np.int64]]:
-    """Connected components of an undirected graph with `size` nodes, numbered in order of the first node."""
+    """Find the connected components of an undirected graph with `size` nodes, numbered in order of the first node."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 
     index_type = _index_type(size)
-    # bool: entries that come twice are joined by "or"; as numbers they could add up to 0
+    # bool: duplicate entries are combined by "or"; as numbers their sum could be 0
     links = (np.ones(len(one), dtype=bool), (one.astype(index_type), other.astype(index_type)))
     count, labels = connected_components(coo_matrix(links, shape=(size, size)).tocsr(), directed=False)
     return int(count), labels.astype(np.int64)
 
 
 def count_duplicate_faces(triangles: NDArray[np.uint32], vertex_count: int, opposite: IntArray | None = None) -> int:
-    """Count the triangles that have the three vertices of an earlier one, in whatever order.
+    """Count the triangles that have the three vertices of an earlier one, in any order.
 
-    Where every edge has two faces (`opposite` is given, see `opposite_half_edges`) such triangles have each other on
-    all three sides.  Else sums of scrambled vertex numbers (splitmix64, Steele, Lea and Flood 2014) do not depend on
-    the order; only triangles whose sums are equal are compared in full.
+    Where every edge has two faces (`opposite` is given, see `opposite_half_edges`), two triangles with the same
+    vertices are neighbours on all three sides.  Else sums of scrambled vertex numbers are compared, which do not depend
+    on the order (splitmix64, Steele, Lea and Flood 2014); only triangles with equal sums are compared in full.
     """
     if opposite is not None:
         return len(find_faces_back_to_back(opposite)) // 2
@@ -265,6 +265,6 @@ def count_duplicate_faces(triangles: NDArray[np.uint32], vertex_count: int, oppo
 
 
 def find_faces_back_to_back(opposite: IntArray) -> IntArray:
-    """Find the triangles that have one and the same triangle beyond all three edges: a body without volume."""
+    """Find the triangles that have the same single triangle beyond all three edges: a body without volume."""
     beyond = opposite.reshape(-1, 3) // 3
     return np.flatnonzero((beyond[:, 0] == beyond[:, 1]) & (beyond[:, 0] == beyond[:, 2]))

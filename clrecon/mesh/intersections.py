@@ -1,4 +1,4 @@
-"""Triangles of a surface that cut each other."""
+"""Self-intersections: triangles of a surface that cut each other."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from clrecon.system.pieces import chunks, local_origin
 __all__ = ["count_self_intersections", "find_beside", "find_self_intersections"]
 
 _CELLS_A_TRIANGLE = 8
-"""On average at most; the cells grow until it holds."""
+"""Largest mean number of cells for a triangle; cells are enlarged until it holds."""
 
 _PIECE = 1 << 14
 
 _FEW = 0.05
-"""Share of triangles up to which it pays to look for what lies around them."""
+"""Share of changed triangles up to which it is faster to search only around them."""
 
 Float64Array = NDArray[np.float64]
 Pairs = tuple[NDArray[np.int64], NDArray[np.int64]]
@@ -33,15 +33,15 @@ def find_self_intersections(
 ) -> NDArray[np.int64]:
     """Find the pairs of triangles that cut each other.
 
-    Two triangles cut each other when an edge of one goes through the inside of the other (Moeller 1997 for the
-    general case).  Pairs that share a vertex are not looked at, and pairs that touch or lie in one plane do not count.
+    Two triangles cut each other when an edge of one passes through the inside of the other (Moeller 1997 for the
+    general case). Pairs that share a vertex are not examined, and pairs that touch or lie in one plane do not count.
 
     Parameters
     ----------
     vertices : ndarray, shape (n, 3), mm
     triangles : ndarray, shape (m, 3), uint32
     changed : ndarray, shape (m,), bool, optional
-        Only pairs with one of these are looked at.
+        Only pairs with one of these are examined.
 
     Returns
     -------
@@ -76,7 +76,7 @@ def find_self_intersections(
 def find_beside(
     vertices: NDArray[np.floating], triangles: NDArray[np.uint32], changed: NDArray[np.bool_]
 ) -> NDArray[np.bool_]:
-    """Find the triangles that can touch one of those that have changed, and these themselves.
+    """Find the changed triangles and those that can touch one of them.
 
     Parameters
     ----------
@@ -101,7 +101,7 @@ def find_beside(
 
 
 def _neighbours(low: Float64Array, high: Float64Array) -> Iterator[Pairs]:
-    """Pairs of triangles whose boxes, shape (3, m), meet a common cell of a grid, each pair once."""
+    """Find pairs of triangles whose boxes, shape (3, m), share a cell of a grid, each pair once."""
     start = low.min(axis=1)[:, None]
     size = 1.5 * float(np.median((high - low).max(axis=0))) or 1.0
     while True:
@@ -125,7 +125,7 @@ def _neighbours(low: Float64Array, high: Float64Array) -> Iterator[Pairs]:
         for where in chunks(len(places), 1 << 16):
             here = places[where]
             one, other = triangle.take(here), triangle.take(here + step)
-            # Of the cells that both meet, one holds the lowest corner of what their boxes have in common.
+            # Of the cells that both share, exactly one holds the lowest corner of the intersection of their boxes.
             for axis in range(3):
                 both = np.maximum(first[axis].take(one), first[axis].take(other))
                 once = both == cell[axis].take(here)
@@ -134,7 +134,7 @@ def _neighbours(low: Float64Array, high: Float64Array) -> Iterator[Pairs]:
 
 
 def _enter_into_cells(first: NDArray[np.int32], last: NDArray[np.int32]) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
-    """All cells that each triangle's box, shape (3, m), meets: triangle, shape (e,), and cell, shape (3, e)."""
+    """List all cells that each triangle's box, shape (3, m), meets: triangle, shape (e,), and cell, shape (3, e)."""
     span = last - first + 1
     count = span.prod(axis=0, dtype=np.int64)
     triangle = np.repeat(np.arange(first.shape[1]), count)
@@ -148,12 +148,12 @@ def _enter_into_cells(first: NDArray[np.int32], last: NDArray[np.int32]) -> tupl
 
 
 def _cut(one: Float64Array, other: Float64Array) -> NDArray[np.bool_]:
-    """Does an edge of one triangle go through the inside of the other; corners have shape (3, k, 3)."""
+    """True where an edge of one triangle passes through the inside of the other; corners have shape (3, k, 3)."""
     found = np.zeros(one.shape[1], dtype=bool)
     rows = np.arange(one.shape[1])
     for _ in range(2):
         sides = np.stack([_volume(other[0], other[1], other[2], corner) for corner in one])
-        # What lies on one side of the other's plane is cut by none of its edges either.
+        # A triangle wholly on one side of the other's plane cannot have edges that cut the other.
         astride = (sides > 0.0).any(axis=0) & (sides < 0.0).any(axis=0)
         rows, one, other, sides = rows[astride], one[:, astride], other[:, astride], sides[:, astride]
         for a, b in ((0, 1), (1, 2), (2, 0)):
@@ -167,6 +167,6 @@ def _cut(one: Float64Array, other: Float64Array) -> NDArray[np.bool_]:
 
 
 def _volume(a: Float64Array, b: Float64Array, c: Float64Array, d: Float64Array) -> Float64Array:
-    """Six times the signed volume of a tetrahedron."""
+    """Return six times the signed volume of a tetrahedron."""
     (px, py, pz), (qx, qy, qz), (rx, ry, rz) = ((corner - a).T for corner in (b, c, d))
     return px * (qy * rz - qz * ry) + py * (qz * rx - qx * rz) + pz * (qx * ry - qy * rx)

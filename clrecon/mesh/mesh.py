@@ -43,7 +43,7 @@ def _as_indices(values: ArrayLike) -> NDArray[np.uint32]:
     array = _rows_of_three(values, "triangles")
     if array.size and array.dtype.kind not in "iu":
         raise UsageError(f"triangles hold indices of vertices (integers), these are {array.dtype}")
-    # Only other types can hold what uint32 cannot; those from a device are uint32 already and are not looked at.
+    # Only other types can hold values that uint32 cannot; arrays from a device are uint32 and need no check.
     if array.size and array.dtype != np.uint32:
         low, high = int(array.min()), int(array.max())
         if low < 0 or high >= _MOST_VERTICES:
@@ -52,7 +52,7 @@ def _as_indices(values: ArrayLike) -> NDArray[np.uint32]:
 
 
 def _describe_inside(ends: Sequence[float | None] | None) -> str | None:
-    """What lies within these ends, None where the upper one is open."""
+    """Describe the values within these ends; None where the upper end is open."""
     if ends is None or ends[1] is None:
         return None
     return f"below {ends[1]:.9g} HU" if ends[0] is None else f"{ends[0]:.9g} to {ends[1]:.9g} HU"
@@ -71,15 +71,15 @@ class Mesh(Message):
     normals : array_like, shape (n, 3), optional
         Unit vectors at the vertices that point outward, LPS; kept as float32.
     report : dict, optional
-        What is known of the origin of this mesh, free of patient data: ``iso_value_hu``, ``affine_ijk_to_lps_mm``,
-        ``certificate`` (the report of the volume), device, times.  The writers put the first three into the formats
-        that have a place for them.
+        Facts about the origin of this mesh, without patient data: ``iso_value_hu``, ``affine_ijk_to_lps_mm``,
+        ``certificate`` (the report of the volume), device, times.  The first three are written to the formats that have
+        a place for them.
 
     Raises
     ------
     UsageError
-        A shape or type that cannot be used, or as many normals as vertices are not given.  Whether every index
-        has a vertex is not looked at here but by `check`.
+        A shape or type cannot be used, or the number of normals is not that of the vertices.  Whether every index has a
+        vertex is checked by `check`, not here.
     """
 
     def __init__(
@@ -126,12 +126,12 @@ class Mesh(Message):
         return len(self._triangles)
 
     def check(self) -> None:
-        """Look at every number: indices have a vertex, coordinates and normals are finite.
+        """Check every number: indices have a vertex, coordinates and normals are finite.
 
         Raises
         ------
         UsageError
-            With the first number that is wrong.
+            A number is wrong; the message names the first one.
         """
         if self.triangle_count and int(self._triangles.max()) >= self.vertex_count:
             raise UsageError(
@@ -148,7 +148,7 @@ class Mesh(Message):
         Parameters
         ----------
         space : {"lps", "ras"}
-            Going to RAS negates x and y: a half turn, so that the winding of the triangles stays.
+            RAS negates x and y, which is a half turn: the winding of the triangles stays.
 
         Returns
         -------
@@ -158,12 +158,12 @@ class Mesh(Message):
         signs = np.diag(frame_from_lps(space)).astype(np.float32)
         if space.lower() == "lps":
             return self._vertices, self._normals
-        # Adding 0 turns -0 into 0, which text formats would show.
+        # Adding 0 turns -0 into 0; text formats would show -0.
         vertices = self._vertices * signs + np.float32(0)
         return vertices, None if self._normals is None else self._normals * signs + np.float32(0)
 
     def describe(self, space: str) -> Content:
-        """What goes into a file of the mesh in `space`; from `report` nothing else ever does."""
+        """Return the contents of a file of the mesh in `space`; nothing else of `report` is ever written."""
         vertices, normals = self.in_space(space)
         iso_value = self.report.get("iso_value_hu")
         affine = self.report.get("affine_ijk_to_lps_mm")
@@ -185,18 +185,18 @@ class Mesh(Message):
         return measure_quality(self._vertices, self._triangles)
 
     def save(self, path: str | os.PathLike[str], space: str = "lps") -> int:
-        """Write the mesh to a file whose extension says the format.
+        """Write the mesh to a file; its extension gives the format.
 
-        STL (binary), PLY (binary), OBJ, GLB, VTP and 3MF.  The file is complete or not there at all, and an older
-        one of that name is replaced in one step.  It holds no patient data, date or path.
+        STL (binary), PLY (binary), OBJ, GLB, VTP and 3MF.  The file is either complete or absent, and an older file of
+        that name is replaced in one step.  It holds no patient data, date or path.
 
         Parameters
         ----------
         path : str or path
             ``.stl``, ``.ply``, ``.obj``, ``.glb``, ``.vtp`` or ``.3mf``, upper or lower case.
         space : {"lps", "ras"}
-            Patient frame of the coordinates; the file says which it is.  Units are mm; GLB carries a node matrix
-            that takes them to the metres, Y up, of glTF.  STL holds float32 only, the others keep float64 vertices.
+            Patient frame of the coordinates; the file names it.  Units are mm; a node matrix in GLB maps them to the
+            metres, Y up, of glTF.  STL holds only float32, the other formats keep float64 vertices.
 
         Returns
         -------
@@ -217,8 +217,8 @@ class Mesh(Message):
     def to_pyvista(self) -> Any:
         """Return the mesh as ``pyvista.PolyData`` in LPS mm, sharing the memory of vertices and normals.
 
-        The normals are the active point normals, named ``Normals``; the field arrays ``SPACE`` and ``UNIT`` say
-        what the coordinates are.
+        The normals are the active point normals, named ``Normals``; the field arrays ``SPACE`` and ``UNIT`` name their
+        frame and unit.
 
         Raises
         ------

@@ -1,4 +1,4 @@
-"""The triangle of a surface that lies nearest to a point."""
+"""The nearest triangle of a surface to a point."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ Points = NDArray[np.float64]
 def find_nearest_triangle(
     vertices: NDArray[np.floating], triangles: NDArray[np.uint32], point: NDArray[np.float64]
 ) -> tuple[int, float]:
-    """Find the triangle that lies nearest to a point.
+    """Find the triangle nearest to a point.
 
-    The box around a triangle is never farther than the triangle and its nearest corner never nearer: only triangles
-    whose box is nearer than the nearest corner of all are looked at exactly.
+    The box around a triangle is never farther away than the triangle, and its nearest corner is never nearer.  So only
+    triangles whose box is nearer than the nearest of all corners are measured exactly.
 
     Parameters
     ----------
@@ -59,7 +59,9 @@ def find_nearest_triangle(
 
 
 def _distances_from_origin(a: Points, b: Points, c: Points) -> NDArray[np.float64]:
-    """Distance of the origin from each triangle (a, b, c), corners of shape (k, 3): its face, or one of its edges."""
+    """Return the distance of the origin from each triangle (a, b, c), corners of shape (k, 3): from its face or an
+    edge.
+    """
     edges = np.minimum(np.minimum(_distances_to_edge(a, b), _distances_to_edge(b, c)), _distances_to_edge(c, a))
     normal = np.cross(b - a, c - a)
     above = [np.einsum("ij,ij->i", normal, np.cross(p, q)) for p, q in ((a, b), (b, c), (c, a))]

@@ -1,4 +1,4 @@
-"""Normals of vertices from the faces around them."""
+"""Normals of vertices, computed from the faces around them."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ __all__ = ["vertex_normals"]
 
 
 def vertex_normals(vertices: NDArray[np.floating], triangles: NDArray[np.uint32]) -> NDArray[np.float32]:
-    """Mean of the face normals, weighted by the angle of each face at the vertex.
+    """Return the mean of the face normals, weighted by the angle of each face at the vertex.
 
-    Such normals do not depend on how the surface is cut into triangles (Thuermer and Wuethrich 1998).
+    These normals do not depend on how the surface is divided into triangles (Thuermer and Wuethrich 1998).
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Is this surface fit to be printed, planned on and measured?  The figures behind the answer."""
+"""Quality of a surface: the figures that tell whether it can be printed, used for planning and measured."""
 
 from __future__ import annotations
 
@@ -109,7 +109,7 @@ def measure_quality(vertices: NDArray[np.floating], triangles: NDArray[np.uint32
     Raises
     ------
     UsageError
-        A triangle refers to a vertex that is not there.
+        A triangle refers to a vertex that does not exist.
     """
     vertex_count, triangle_count = len(vertices), len(triangles)
     if triangle_count and int(triangles.max()) >= vertex_count:
@@ -154,11 +154,11 @@ def measure_quality(vertices: NDArray[np.floating], triangles: NDArray[np.uint32
 def _count_by_place(
     vertices: NDArray[np.floating], triangles: NDArray[np.uint32], used: NDArray[np.bool_], edges: Edges
 ) -> tuple[int, int]:
-    """Used vertices at the place of another, and edges that are not in two faces once these are joined."""
+    """Count used vertices that coincide with another, and edges that are not in two faces after these are joined."""
     coincident = find_coincident(vertices)
     coincident = coincident[used[coincident]]
     places, first, number = np.unique(vertices[coincident], axis=0, return_index=True, return_inverse=True)
-    if len(places) == len(coincident):  # what they share a place with is not used
+    if len(places) == len(coincident):  # the vertices that they coincide with are not used
         return 0, edges.boundary + edges.nonmanifold
     joined = np.arange(len(vertices), dtype=np.uint32)
     joined[coincident] = coincident[first][number.reshape(-1)]
@@ -171,7 +171,7 @@ def _count_by_place(
 def _measure_triangles(
     vertices: NDArray[np.floating], triangles: NDArray[np.uint32]
 ) -> tuple[float, float, int, float | None]:
-    """Area in mm2, signed volume in mm3, number of triangles without area, shortest edge in mm."""
+    """Measure area in mm2, signed volume in mm3, number of triangles without area, shortest edge in mm."""
     twice_area = six_volumes = 0.0
     zero_area = 0
     shortest = np.inf

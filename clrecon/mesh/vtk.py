@@ -1,4 +1,4 @@
-"""What of meshes VTK does: finding the nearest triangle, the first one on a line, smoothing; arrays in and out."""
+"""VTK's work on meshes: finding the nearest triangle, the first one on a line, smoothing; arrays in and out."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ __all__ = ["CellLocator", "smooth_windowed_sinc", "wrap_polydata"]
 Points = NDArray[np.float64]
 
 LINE_TOLERANCE = 1e-9
-"""Of `vtkStaticCellLocator`, in its own units: how near to a line a triangle counts as hit."""
+"""Tolerance of `vtkStaticCellLocator`, in its own units: distance from a line at which a triangle counts as hit."""
 
 
 class CellLocator:
-    """Triangles of one surface by place: `vtkStaticCellLocator`.
+    """Search for triangles of a surface by place, with `vtkStaticCellLocator`.
 
     Parameters
     ----------
@@ -35,7 +35,7 @@ class CellLocator:
         self._locator.BuildLocator()
 
     def distances(self, points: Points) -> NDArray[np.float64]:
-        """Distances in mm, shape (k,), from `points`, shape (k, 3), to the nearest triangle."""
+        """Return distances in mm, shape (k,), from `points`, shape (k, 3), to the nearest triangle."""
         from vtkmodules.vtkCommonCore import reference
         from vtkmodules.vtkCommonDataModel import vtkGenericCell
 
@@ -50,7 +50,7 @@ class CellLocator:
         return np.sqrt(squares)
 
     def first_hits(self, starts: Points, ends: Points) -> Points:
-        """Where lines from `starts` to `ends`, shape (k, 3), first meet the surface; NaN where they do not."""
+        """Return where lines from `starts` to `ends`, shape (k, 3), first meet the surface; NaN where they do not."""
         from vtkmodules.vtkCommonCore import reference
 
         hit = [0.0, 0.0, 0.0]
@@ -66,7 +66,7 @@ class CellLocator:
 def smooth_windowed_sinc(
     vertices: NDArray[np.float32], triangles: NDArray[np.uint32], iterations: int, pass_band: float
 ) -> NDArray[np.float64]:
-    """Vertices, shape (n, 3), float64, after `vtkWindowedSincPolyDataFilter` (Taubin, Zhang and Golub, 1996)."""
+    """Return vertices, shape (n, 3), float64, after `vtkWindowedSincPolyDataFilter` (Taubin, Zhang and Golub 1996)."""
     from vtkmodules.util.numpy_support import vtk_to_numpy
     from vtkmodules.vtkFiltersCore import vtkWindowedSincPolyDataFilter
 

@@ -1,1 +1,1 @@
-"""How far meshes lie from each other, from their scan and from what they were, and the gates on it."""
+"""Distances of meshes from each other, from their scan and from an earlier state, and the gates on them."""

@@ -1,4 +1,4 @@
-"""How far two surfaces lie apart: exact distances from points of one to the triangles of the other."""
+"""Distances between two surfaces: exact distances from points of one to the triangles of the other."""
 
 from __future__ import annotations
 
@@ -31,10 +31,10 @@ __all__ = [
 ]
 
 SAMPLES = 50_000
-"""Points a side: the 95th percentile then stands on the 2500 largest distances."""
+"""Points on each surface, so that the 95th percentile is based on the 2500 largest distances."""
 
 _PIECE = 1 << 13
-"""Points a piece: with six triangles each they take about 8 MB."""
+"""Points in a piece: with six triangles each they take about 8 MB."""
 
 _STEPS_U, _STEPS_V = 0.7548776662466927, 0.5698402909980532
 """Powers of the inverse of the plastic number: the two-dimensional low-discrepancy sequence R2 (Roberts 2018)."""
@@ -45,7 +45,7 @@ Columns = NDArray[np.float64]
 
 
 def sample_surface(vertices: NDArray[np.floating], triangles: NDArray[np.uint32], count: int = SAMPLES) -> Points:
-    """Points that cover a surface evenly by area, the same ones every time.
+    """Return points that cover a surface evenly by area, the same points at every call.
 
     Parameters
     ----------
@@ -87,7 +87,7 @@ def sample_surface_points(
 
 
 class SurfaceDistance:
-    """Exact distances from points to the nearest triangle of one surface.
+    """Exact distances from points to the nearest triangle of a surface.
 
     Parameters
     ----------
@@ -105,10 +105,10 @@ class SurfaceDistance:
 
 
 class NearDistance:
-    """Distances from points to a surface where a vertex of it is known to be near each point.
+    """Distances from points to a surface, where a vertex of the surface near each point is known.
 
-    Where a triangle around that vertex is near enough, its distance is the answer: never less than the distance to the
-    surface.  Only for the other points all triangles are searched, and the answer is exact.
+    If a triangle around that vertex is near enough, its distance is returned; it is never less than the distance to the
+    surface.  For the other points all triangles are searched, and the result is exact.
 
     Parameters
     ----------
@@ -125,7 +125,8 @@ class NearDistance:
         self._exact: SurfaceDistance | None = None
 
     def __call__(self, points: Points, near: NDArray[np.integer], limit: float) -> NDArray[np.float64]:
-        """Distances in mm, shape (k,): not exact up to the limit, where the length of a perpendicular is enough.
+        """Return distances in mm, shape (k,); up to `limit` they may be too large, as only nearby triangles are
+        examined.
 
         Parameters
         ----------
@@ -145,7 +146,8 @@ class NearDistance:
     def find_within(
         self, points: Points, near: NDArray[np.integer], limit: float
     ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-        """Distances from the triangles around one vertex alone, and their rows; up to the limit as `__call__` says.
+        """Return distances to the triangles around one vertex only, and the rows of these; up to `limit` as for
+        `__call__`.
 
         Parameters
         ----------
@@ -159,13 +161,14 @@ class NearDistance:
         return found, rows
 
     def find_around(self, points: Points, near: NDArray[np.integer]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-        """Distances from the triangles around some vertices alone: infinite, and row -1, where there is none.
+        """Return distances to the triangles around some vertices only; infinity and row -1 where there are no
+        triangles.
 
         Parameters
         ----------
         points : ndarray, shape (k, 3), float64, mm
         near : ndarray, shape (k, v), int
-            Vertices for each point.
+            Several vertices for each point.
         """
         found, rows = self._around(points, near[:, 0], triangle_distances)
         for others in near.T[1:]:
@@ -175,7 +178,7 @@ class NearDistance:
         return found, rows
 
     def from_triangles(self, points: Points, rows: NDArray[np.integer]) -> NDArray[np.float64]:
-        """Distances in mm, shape (k,), of each of the points from one triangle."""
+        """Return the distance in mm of each of the points from one triangle, shape (k,)."""
         found = np.empty(len(points))
         for where in chunks(len(points), 4 * _PIECE):
             found[where] = triangle_distances(points[where].T, *self._corners(rows[where]))
@@ -183,14 +186,14 @@ class NearDistance:
 
     def _corners(self, rows: NDArray[np.integer]) -> tuple[Columns, Columns, Columns]:
         a, b, c = self._triangles[rows].T.astype(np.intp)
-        # "clip" saves the check of every index, which costs more than the look-up; triangles have been checked.
+        # "clip" avoids checking each index, which takes longer than the look-up; the triangles have been checked.
         one, two, three = (self._columns.take(corner, axis=1, mode="clip") for corner in (a, b, c))
         return one, two, three
 
     def _around(
         self, points: Points, near: NDArray[np.integer], measure: Callable[..., NDArray[np.float64]]
     ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-        """The least of a measure of the triangles around the vertices that are near, and their rows."""
+        """Return the smallest value of a measure among the triangles around the vertices, and the rows of these."""
         found, rows = np.full(len(points), np.inf), np.full(len(points), -1)
         for where in chunks(len(points), _PIECE):
             first = self._begin[near[where]]
@@ -203,18 +206,18 @@ class NearDistance:
             some = count > 0
             if some.any():
                 found[where][some] = np.minimum.reduceat(length, start[some])
-                shortest = np.flatnonzero(length == found[where][pair])[::-1]  # backwards: of equal ones the first
+                shortest = np.flatnonzero(length == found[where][pair])[::-1]  # backwards: the first of equals wins
                 rows[where][pair[shortest]] = row[shortest]
         return found, rows
 
 
 def _perpendicular(points: Columns, a: Columns, b: Columns, c: Columns) -> NDArray[np.float64]:
-    """Length of the perpendicular from each point to its triangle, infinite where the foot is outside of it."""
+    """Return the length of the perpendicular from each point to its triangle, infinity where its foot lies outside."""
     b, c, points = b - a, c - a, points - a
     cross = cross_product(b, c)
     square = np.einsum("ij,ij->j", cross, cross)
     with np.errstate(divide="ignore", invalid="ignore"):
-        # Barycentric coordinates by volumes over the face's own (Ericson 2005, section 3.4).
+        # Barycentric coordinates by volumes relative to that of the face (Ericson 2005, section 3.4).
         u = np.einsum("ij,ij->j", cross_product(points, c), cross) / square
         v = np.einsum("ij,ij->j", cross_product(b, points), cross) / square
         length = np.abs(np.einsum("ij,ij->j", points, cross)) / np.sqrt(square)
@@ -222,12 +225,12 @@ def _perpendicular(points: Columns, a: Columns, b: Columns, c: Columns) -> NDArr
 
 
 def triangle_distances(points: Columns, a: Columns, b: Columns, c: Columns) -> NDArray[np.float64]:
-    """Distance of each point from its triangle: the length of the perpendicular, or to the nearest edge.
+    """Return the distance of each point from its triangle: to the face by the perpendicular, else to the nearest edge.
 
     Parameters
     ----------
     points, a, b, c : ndarray, shape (3, k), float64, mm
-        Points and corners, one row each for x, y, z.
+        Points and corners of the triangles, one row each for x, y, z.
 
     Returns
     -------
@@ -309,7 +312,7 @@ def compare_meshes(
 ) -> MeshDistance:
     """Measure how far two surfaces lie apart.
 
-    Points that cover each surface evenly by area are measured to the nearest triangle of the other.
+    Distances are measured from points that cover each surface evenly by area to the nearest triangle of the other.
 
     Parameters
     ----------

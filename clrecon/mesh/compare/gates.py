@@ -1,4 +1,4 @@
-"""What a surface must fulfil to be printed and planned on: named gates, as data."""
+"""Gates of a surface that is to be printed or used for planning: conditions that it must meet, as data."""
 
 from __future__ import annotations
 
@@ -13,17 +13,19 @@ __all__ = [
 ]  # fmt: skip
 
 DEVIATION_P95_VOXEL = 0.25
-"""Of the shortest voxel step, for 95 % of the surface."""
+"""Bound for 95 % of the surface, in shortest voxel steps."""
 
 DEVIATION_MEAN_VOXEL = 0.1
 VOLUME_CHANGE_PERCENT = 0.5
 MASK_VOLUME_PERCENT = 1.0
-"""Of the label's own volume, for its own surface: 0.03 % as extracted, what a refinement may change on top."""
+"""Bound for the label's own surface, in percent of the label's volume.  Extraction alone changes 0.03 %; the rest is
+for refinement."""
 
 LABEL_VOLUME_PERCENT = 15.0
-"""Of the label's own volume.  Masks of whole vertebrae that a network drew and their solid surfaces, which HU place,
-differ by -7 to +11 % where the iso value fits the bone (150 to 226 HU at 2 mm, 150 HU at 3 mm), by -14 to -29 % where
-it lies above thin cortex (3 mm, 200 to 226 HU); hollow ones by -32 to -80 %, soft tissue by up to -100 %."""
+"""Bound for a surface placed by HU, in percent of the label's volume.  Solid surfaces of whole vertebrae differ from
+masks of a neural network by -7 to +11 % where the iso value fits the bone (150 to 226 HU at 2 mm, 150 HU at 3 mm), and
+by -14 to -29 % where it lies above thin cortex (3 mm, 200 to 226 HU). Hollow surfaces differ by -32 to -80 %, soft
+tissue by up to -100 %."""
 
 
 def judge_mesh(
@@ -35,21 +37,21 @@ def judge_mesh(
     deviation: Mapping[str, Any] | None = None,
     voxel_mm: float | None = None,
 ) -> list[Gate]:
-    """Hold measures of a mesh against the gates.
+    """Judge the measures of a mesh by the gates.
 
     Parameters
     ----------
     quality : dict, optional
-        Of `measure_quality`: gates of the mesh itself.
+        Result of `measure_quality`, for the gates of the mesh itself.
     closed : bool
-        The surface was to be closed.  One that was left open at the border of the scan has no gates on closedness,
+        True: the surface should be closed.  A surface left open at the border of the scan has no gates on closedness,
         outside and volume.
     outward : bool
-        It was to enclose a volume above zero.  The wall of a cavity by itself does not.
+        True: the surface should enclose a volume above zero, unlike the wall of a cavity by itself.
     iso_distance : dict, optional
-        Of `measure_iso_distance`: gates on the vertices.
+        Result of `measure_iso_distance`, for the gates on the vertices.
     deviation : dict, optional
-        Of `compare_meshes` with the surface before smoothing and decimation: gates on what these have changed.
+        Result of `compare_meshes` with the surface before smoothing and decimation, for the gates on their changes.
     voxel_mm : float, optional
         Shortest voxel step, the unit of the bounds; needed with `deviation`.
 
@@ -68,18 +70,18 @@ def judge_mesh(
 
 
 def judge_label_volume(mesh_ml: float | None, label_ml: float, advice: str = "", *, by_hu: bool = True) -> Gate:
-    """Hold the volume of a label's mesh against that of its voxels.
+    """Compare the volume of a label's mesh with that of its voxels.
 
     Parameters
     ----------
     mesh_ml : float or None
-        None: the mesh encloses none, it is open at the border of the scan.
+        None: the mesh is open at the border of the scan and encloses no volume.
     label_ml : float
-        Above 0.
+        Volume of the label's voxels, above 0.
     advice : str
-        What to do where they differ by more than the bound.
+        Advice for the message where they differ by more than the bound.
     by_hu : bool
-        HU place the surface; else it is the label's own, which is to have its volume.
+        True: HU place the surface.  False: it is the label's own surface, which should have the label's volume.
     """
     name, bound = "label_volume", LABEL_VOLUME_PERCENT if by_hu else MASK_VOLUME_PERCENT
     if mesh_ml is None:

@@ -1,4 +1,4 @@
-"""How far a mesh lies from the surface that the voxels themselves have: the trilinear iso surface."""
+"""Distance of a mesh from the trilinear iso surface of the voxels that it was made from."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ __all__ = [
 ]
 
 SAMPLES = 100_000
-"""Points at most; larger meshes are measured at every n-th vertex and triangle."""
+"""Most points; larger meshes are measured at every n-th vertex and triangle."""
 
 _STEPS = 12
 _ON_THE_SURFACE = 1e-3
-"""mm by which a last step may still move a point that counts as found."""
+"""A point is found when a last step would move it by at most this, in mm."""
 
 _LINE_STEPS = 16
-"""Parts of the way to a voxel on the other side of the level."""
+"""Number of parts of the line to a voxel on the other side of the level."""
 
 _PIECE = 1 << 15
 _CORNERS = [np.array([corner & 1, corner >> 1 & 1, corner >> 2]) for corner in range(8)]
@@ -44,17 +44,17 @@ Float64Array = NDArray[np.float64]
 
 
 def smallest_voxel_mm(volume: Volume) -> float:
-    """Shortest of the three voxel steps: the unit of every bound that is given in voxels."""
+    """Return the shortest of the three voxel steps: the unit of every bound that is given in voxels."""
     return float(min(volume.spacing))
 
 
 def rule_of_report(report: dict[str, Any]) -> IsoRule | None:
-    """The rule that a mesh was extracted with, as far as distances need it; None for what is no iso surface.
+    """Return the iso rule of a mesh, as far as distances need it; None for a mesh that is not an iso surface.
 
     Parameters
     ----------
     report : dict
-        Of a mesh: ``iso_level_hu`` or ``inside_levels_hu``, ``outside_hu``, ``closed_at_border``.
+        Report of a mesh: ``iso_level_hu`` or ``inside_levels_hu``, ``outside_hu``, ``closed_at_border``.
     """
     ends = report.get("inside_levels_hu") or [report.get("iso_level_hu")]
     levels = [float(level) for level in ends if level is not None]
@@ -67,14 +67,14 @@ def rule_of_report(report: dict[str, Any]) -> IsoRule | None:
 
 
 def trilinear_field(volume: Volume, rule: IsoRule, ijk: Float64Array) -> tuple[Float64Array, Float64Array]:
-    """Value and gradient of the trilinear field.
+    """Return value and gradient of the trilinear field.
 
     Parameters
     ----------
     volume : Volume
     rule : IsoRule
-        Says what is beyond the border: `outside` of a closed volume; an open one ends, and points beyond it are taken
-        to its border.
+        Gives the value beyond the border: `outside` for a closed volume.  For an open one, points beyond the border are
+        moved to it.
     ijk : ndarray, shape (n, 3), float64
         Index coordinates.
 
@@ -82,7 +82,7 @@ def trilinear_field(volume: Volume, rule: IsoRule, ijk: Float64Array) -> tuple[F
     -------
     value : ndarray, shape (n,), float64, HU
     gradient : ndarray, shape (n, 3), float64
-        HU a step along i, j, k.
+        HU per step along i, j, k.
     """
     value = np.zeros(len(ijk))
     gradient = np.zeros((len(ijk), 3))
@@ -98,7 +98,7 @@ def trilinear_field(volume: Volume, rule: IsoRule, ijk: Float64Array) -> tuple[F
 
 
 def trilinear_values(volume: Volume, rule: IsoRule, ijk: Float64Array) -> Float64Array:
-    """The values of `trilinear_field` alone, sooner."""
+    """Return only the values of `trilinear_field`, in less time."""
     value = np.zeros(len(ijk))
     cell, t = _split_cells(volume, rule, ijk)
     for bits in _CORNERS:
@@ -107,7 +107,7 @@ def trilinear_values(volume: Volume, rule: IsoRule, ijk: Float64Array) -> Float6
 
 
 def _split_cells(volume: Volume, rule: IsoRule, ijk: Float64Array) -> tuple[NDArray[np.int64], Float64Array]:
-    """The lowest corner of the cell of each point, and where in it the point lies."""
+    """Return the lowest corner of each point's cell, and the position of the point in it."""
     size = np.array(volume.shape_ijk)
     low = -rule.border
     point = np.clip(ijk, low, size - 1 + rule.border)
@@ -116,7 +116,7 @@ def _split_cells(volume: Volume, rule: IsoRule, ijk: Float64Array) -> tuple[NDAr
 
 
 def _samples(volume: Volume, rule: IsoRule, ijk: NDArray[np.int64]) -> Float64Array:
-    """Voxels as float64, `outside` beyond the border."""
+    """Return voxels as float64, `outside` beyond the border."""
     last = np.array(volume.shape_ijk) - 1
     within = np.clip(ijk, 0, last)
     i, j, k = within.T
@@ -127,26 +127,26 @@ def _samples(volume: Volume, rule: IsoRule, ijk: NDArray[np.int64]) -> Float64Ar
 
 
 def distances_to_iso_surface(volume: Volume, rule: IsoRule, points: Float64Array) -> Float64Array:
-    """Distances of points near the trilinear iso surface from it, by Newton steps along the gradient.
+    """Measure the distances of points from a near trilinear iso surface, by Newton steps along the gradient.
 
-    The surface of a range is that of both its ends: the nearer one counts.
+    The surface of a range consists of the surfaces of both ends: the nearer one counts.
 
-    Where the field is flat, or steps across a crease go to and fro, the surface is looked for on the way to the voxels
-    around.  A step is residual over gradient, at most half a voxel long, in mm through the affine of the slice, so that
-    sheared and unevenly spaced stacks are right too.  The answer is the way to a point of the surface: never less
-    than the distance itself, and equal to it where the surface is smooth.
+    Where the field is flat, or steps alternate across a crease, the surface is searched along lines to the surrounding
+    voxels.  A step is residual over gradient, at most half a voxel long, in mm through the affine of the slice, so it
+    is also correct for sheared and unevenly spaced stacks.  The result is the distance to a point of the surface: never
+    less than the true distance, and equal to it where the surface is smooth.
 
     Parameters
     ----------
     volume : Volume
     rule : IsoRule
-        Gives the levels and what is beyond the border.
+        Gives the levels and the value beyond the border.
     points : ndarray, shape (n, 3), float64, LPS mm
 
     Returns
     -------
     ndarray, shape (n,), float64, mm
-        NaN where no surface was found: neither along the gradient nor on the way to the voxels around.
+        NaN where no surface was found, neither along the gradient nor along lines to the surrounding voxels.
     """
     distances = _distances_to_level(volume, rule, rule.iso_level, points)
     for level in rule.levels[1:]:
@@ -186,10 +186,10 @@ def _distances_to_level(volume: Volume, rule: IsoRule, level: float, points: Flo
 
 
 def _distances_along_lines(volume: Volume, rule: IsoRule, level: float, points: Float64Array) -> Float64Array:
-    """Way to the level along straight lines to the voxels around; NaN where these lie on the same side as the point.
+    """Return distances to the level along lines to the surrounding voxels; NaN where all lie on the point's side.
 
-    A trilinear field has its extremes at the corners of the cells: where the level runs through the cell of a point or
-    one beside it, one of the 64 voxels around lies on the other side, and the line to it meets the level.
+    A trilinear field has its extremes at the corners of the cells.  So if the level passes through the cell of a point
+    or a neighbouring cell, one of the 64 surrounding voxels lies on the other side, and the line to it meets the level.
     """
     corners = np.array([[i, j, k] for i in range(-1, 3) for j in range(-1, 3) for k in range(-1, 3)], float)
     distances = np.full(len(points), np.nan)
@@ -247,8 +247,8 @@ class IsoDistance(Record):
 def measure_iso_distance(mesh: Mesh, volume: Volume, rule: IsoRule, samples: int = SAMPLES) -> IsoDistance:
     """Measure how far vertices and centres of triangles lie from the trilinear iso surface.
 
-    The vertices of an extracted surface lie on it, up to the rounding of float32; the centres show what flat
-    triangles leave out.  After smoothing and decimation both say what that has cost.
+    The vertices of an extracted surface lie on it, up to the rounding of float32; the centres show the error of flat
+    triangles.  After smoothing and decimation both show the error that these have added.
 
     Parameters
     ----------
@@ -259,7 +259,7 @@ def measure_iso_distance(mesh: Mesh, volume: Volume, rule: IsoRule, samples: int
     rule : IsoRule
         The mesh was made with it, see `clrecon.geometry.iso_rule.choose_iso_rule`.
     samples : int
-        Vertices and triangles that are looked at, at most: every n-th.
+        Most vertices and triangles that are measured; of more, every n-th.
 
     Returns
     -------

@@ -1,4 +1,4 @@
-"""How thick the walls of a closed surface are."""
+"""Thickness of the walls of a closed surface."""
 
 from __future__ import annotations
 
@@ -14,24 +14,24 @@ from clrecon.system.pieces import local_origin
 __all__ = ["SAMPLES", "measure_walls", "wall_thickness"]
 
 SAMPLES = 20_000
-"""Points on the surface: the 5th percentile then stands on the 1000 thinnest places."""
+"""Points on the surface, so that the 5th percentile is based on the 1000 thinnest places."""
 
 _INWARD = 1e-3
-"""mm below the surface where a ray begins, so that it does not meet the triangle that it comes from."""
+"""Depth below the surface, mm, at which a ray begins, so that it does not meet its own triangle."""
 
 
 def wall_thickness(
     vertices: NDArray[np.floating], triangles: NDArray[np.uint32], samples: int = SAMPLES
 ) -> NDArray[np.float64]:
-    """Thickness of the wall at points that cover a surface evenly by area, the same ones every time.
+    """Measure the wall thickness at points that cover a surface evenly by area, the same points at every call.
 
-    From each point a ray goes inward, straight against the normal of its triangle, to the first triangle that it meets.
+    From each point a ray goes inward, against the normal of its triangle, to the first triangle that it meets.
 
     Parameters
     ----------
     vertices : ndarray, shape (n, 3), mm
     triangles : ndarray, shape (m, 3), uint32
-        Of a closed surface, outward.
+        Triangles of a closed surface, facing outward.
     samples : int
 
     Returns
@@ -63,16 +63,16 @@ def measure_walls(
     Parameters
     ----------
     vertices, triangles, samples
-        As there.
+        As for `wall_thickness`.
     thin_mm : float
-        What counts as thin.
+        Walls below this are thin.
 
     Returns
     -------
     dict
-        ``min_mm``, ``p5_mm``, ``median_mm`` : float or None, None where no ray met anything
-        ``thin_mm`` : float, and ``thin_share`` : float or None, share of the surface whose wall is thinner
-        ``samples``, ``not_measured`` : int, points, and those whose ray met nothing
+        ``min_mm``, ``p5_mm``, ``median_mm`` : float or None, None where no ray met a triangle ``thin_mm`` : float, and
+        ``thin_share`` : float or None, share of the surface whose wall is thinner ``samples``, ``not_measured`` : int,
+        number of points, and of those whose ray met nothing
     """
     thickness = wall_thickness(vertices, triangles, samples)
     measured = thickness[np.isfinite(thickness)]

@@ -1,9 +1,9 @@
-"""What a surface is the wall of, told by the HU beneath it: bone, contrast medium, metal.
+"""The material below a surface, told by its HU: bone, contrast medium, metal.
 
-Bone has a compact wall: within some millimetres under its surface values rise to 600 HU and more somewhere on every
-bone, and they vary from place to place.  Heart and vessels with contrast medium are of one value that stays below, and
-go on with it beneath the surface.  Thin shells of a table reach neither.  Within a voxel everything is even: in voxels
-of more than 1 mm depths are counted in voxels.  Figures are in docs/iso_value.md.
+Bone has a compact wall: within a few millimetres below its surface, values rise to 600 HU and more at some places of
+every bone, and they vary from place to place.  Heart and vessels with contrast medium have one lower value, which
+continues below the surface.  Thin shells of a table have neither property.  Values hardly vary within a voxel, so for
+voxels larger than 1 mm depths are counted in voxels.  Figures are in docs/iso_value.md.
 """
 
 from __future__ import annotations
@@ -36,33 +36,34 @@ __all__ = [
 ]
 
 COMPACT_HU = 600.0
-"""Compact bone reaches it under its surface; contrast medium in heart and vessels stays below."""
+"""Compact bone reaches this below its surface; contrast medium in heart and vessels does not."""
 METAL_HU = 2000.0
 WALL_MM = (0.0, 0.5, 1.0, 1.5, 2.0, 2.5, 3.0)
-"""Depths along the inward normal: the wall is the highest value there.  To 1.5 voxels where that is deeper."""
+"""Depths along the inward normal; the wall is the highest value at these depths.  They extend to 1.5 voxels if that is
+deeper."""
 FLAT_MM, FLAT_HU = (1.5, 2.0, 2.5, 3.0, 3.5, 4.0), 120.0
-"""A wall is flat where it has ended at these depths, in voxels where they are of more than 1 mm along the normal:
-values there differ by no more."""
+"""A wall is flat where the values at these depths, below the wall, differ by at most `FLAT_HU`. Depths are in voxels
+where these are larger than 1 mm along the normal."""
 NEAR_MM, NEAR_STEPS = 15.0, 5.0
-"""Bone has compact walls somewhere within this distance, or so many voxels, of every place: coarse ones blur most."""
+"""Bone has a compact wall within this distance, or this number of voxels, of every place; coarse voxels blur most."""
 LEAST_COMPACT = 0.05
 FAINT_HU, FAINT_SPREAD_HU = 500.0, 200.0
-"""Thin bone whose walls are blurred away: the densest places reach this, and stand out from the rest by so much.
-Vessels of 400 HU and table shells have one value, to 140 HU."""
+"""Thin bone whose walls are blurred away: its densest places reach the first value, and exceed the median by the
+second.  Vessels of 400 HU and table shells have one value, within 140 HU."""
 LEAST_FLAT = 0.05
 MOST_SAMPLES = 8_000
 MOST_COMPONENT_SAMPLES = 500
 FEWEST_VERTICES = 150
-"""A component of fewer is a crumb, and not told."""
+"""Least number of vertices of a component that is judged; smaller ones are crumbs."""
 RAIL_SECTIONS = 8
-"""Parts of the scan, along its slices, in which the cross section of a rail is compared."""
+"""Number of parts of the scan, along its slices, in which the cross section of a rail is compared."""
 RAIL_SHIFT_MM = 1.0
-"""Sides of a rail move by no more than this, or half a voxel, from part to part: noise and shadows."""
+"""Sides of a rail differ by at most this, or half a voxel, from part to part, because of noise and shadows."""
 
 
 @dataclass(frozen=True)
 class Walls:
-    """What lies beneath some vertices of a surface; shapes (n,).
+    """Values below some vertices of a surface; shapes (n,).
 
     Attributes
     ----------
@@ -70,9 +71,9 @@ class Walls:
     wall : ndarray, HU
         Highest value at the depths `WALL_MM`.
     flat : ndarray, bool
-        Beneath it is of one value, below `COMPACT_HU` and inside all the way to the last depth.
+        True: values below the wall are equal, below `COMPACT_HU`, and inside down to the last depth.
     near_mm : float
-        How far off a compact wall may be.
+        Largest distance of a compact wall.
     """
 
     points: NDArray[np.float64]
@@ -81,20 +82,20 @@ class Walls:
     near_mm: float = NEAR_MM
 
     def where(self, rows: slice) -> Walls:
-        """Those of some of the vertices."""
+        """Return the walls of some of the vertices."""
         return Walls(self.points[rows], self.wall[rows], self.flat[rows], self.near_mm)
 
 
 def sample_walls(vertices: NDArray[np.floating], normals: NDArray[np.floating], volume: Volume, rule: IsoRule) -> Walls:
-    """Look beneath vertices of a surface, along their normals.
+    """Sample values below the vertices of a surface, along their normals.
 
     Parameters
     ----------
     vertices, normals : ndarray, shape (n, 3)
-        Of a mesh that was extracted from `volume`, LPS mm.
+        Vertices and normals of a mesh that was extracted from `volume`, LPS mm.
     volume : Volume
     rule : IsoRule
-        The mesh was made with it.
+        The rule that the mesh was made with.
     """
     points, inward = vertices.astype(np.float64), -normals.astype(np.float64)
     longer = np.maximum(_step_along(inward, volume), 1.0)
@@ -111,24 +112,24 @@ def sample_walls(vertices: NDArray[np.floating], normals: NDArray[np.floating], 
 
 
 def _step_along(directions: NDArray[np.float64], volume: Volume) -> NDArray[np.float64]:
-    """Way in mm along unit vectors (n, 3) from one plane of voxels to the next, of the axis that they cross soonest."""
+    """Return the way in mm along unit vectors (n, 3) from one plane of voxels to the next, for the axis crossed
+    soonest.
+    """
     steps = directions @ np.linalg.inv(volume.affine[:3, :3]).T
     return np.asarray(1.0 / np.maximum(np.abs(steps).max(axis=1), 1e-9))
 
 
 def judge_walls(walls: Walls) -> dict[str, Any]:
-    """What a surface looks like.
+    """Judge the material of a surface by its walls.
 
     Returns
     -------
     dict
         ``looks_like`` : "bone", "faint bone", "metal", "contrast medium" (or another even body) or "no bone" (a thin
-        shell of a table, noise)
-        ``compact_share`` : of the surface, how much has a wall of `COMPACT_HU` or more
-        ``contrast_share`` : how much is flat beneath and has no compact wall within about ``near_mm``
-        ``metal_share`` : how much has a wall above `METAL_HU`
-        ``wall_hu`` : ``{"median", "p90", "p99"}`` of the walls
-        ``samples`` : int, vertices looked at
+        shell of a table, noise) ``compact_share`` : share of the surface with a wall of `COMPACT_HU` or more
+        ``contrast_share`` : share that is flat below and has no compact wall within about ``near_mm`` ``metal_share`` :
+        share with a wall above `METAL_HU` ``wall_hu`` : ``{"median", "p90", "p99"}`` of the walls ``samples`` : int,
+        number of vertices sampled
     """
     median, p90, p99 = (float(value) for value in np.percentile(walls.wall, (50, 90, 99)))
     compact = walls.wall >= COMPACT_HU
@@ -154,14 +155,14 @@ def judge_walls(walls: Walls) -> dict[str, Any]:
 
 
 def looks_like_bone(judged: dict[str, Any] | None) -> bool:
-    """The surface is that of bone, faint or not."""
+    """True where the surface is that of bone, faint or not."""
     return judged is not None and judged["looks_like"] in ("bone", "faint bone")
 
 
 def judge_components(
     mesh: Mesh, volume: Volume, rule: IsoRule, count: int, label_of_vertex: NDArray[np.int64]
 ) -> list[dict[str, Any] | None]:
-    """The same for each component of a surface; None for crumbs of less than `FEWEST_VERTICES`.
+    """Judge each component of a surface; None for crumbs of less than `FEWEST_VERTICES`.
 
     Parameters
     ----------
@@ -192,10 +193,10 @@ def judge_components(
 def find_rails(
     mesh: Mesh, volume: Volume, label_of_vertex: NDArray[np.int64], chosen: NDArray[np.bool_]
 ) -> NDArray[np.bool_]:
-    """Which of the chosen components are rails of a table: thin, and the same in all slices.
+    """Find which of the chosen components are rails of a table: thin, and equal in all slices.
 
     A table moves through the scanner along the step of the slices; bones taper and bend, and shafts are thicker than
-    `RAIL_MM`.  In scans shorter than `STRAIGHT_MM` bones are as straight, and nothing is found.
+    `RAIL_MM`. In scans shorter than `STRAIGHT_MM` bones are just as straight, so nothing is found.
 
     Parameters
     ----------
@@ -205,7 +206,7 @@ def find_rails(
     label_of_vertex : ndarray, shape (n,), int64
         The component of each vertex, below 0 for none.
     chosen : ndarray, shape (count,), bool
-        Components to look at.
+        Components that are examined.
 
     Returns
     -------
@@ -224,7 +225,7 @@ def find_rails(
 
 
 def is_straight(points: NDArray[np.float64], volume: Volume) -> bool:
-    """Points (n, 3), LPS mm, of a surface lie between the same sides from the first slice to the last."""
+    """True where points (n, 3) of a surface, LPS mm, keep the same sides from the first slice to the last."""
     last = volume.shape_ijk[2] - 1
     if last * volume.spacing[2] < STRAIGHT_MM:
         return False
@@ -232,7 +233,7 @@ def is_straight(points: NDArray[np.float64], volume: Volume) -> bool:
 
 
 def _is_rail(points: NDArray[np.float64], spacing: tuple[float, float, float], last: int) -> bool:
-    """The same cross section, and a thin one, from the first slice to the last; points in index coordinates."""
+    """True for a cross section that is thin and equal from the first slice to the last; points in index coordinates."""
     width = _measure_section(points, spacing, last)
     return width is not None and bool((width - spacing[:2]).min() <= RAIL_MM)  # it is blurred by about a voxel
 
@@ -240,11 +241,11 @@ def _is_rail(points: NDArray[np.float64], spacing: tuple[float, float, float], l
 def _measure_section(
     points: NDArray[np.float64], spacing: tuple[float, float, float], last: int
 ) -> NDArray[np.float64] | None:
-    """Width and height, mm, of what is the same in all slices; None where it is not."""
+    """Return width and height, mm, of a cross section that is equal in all slices; None where it is not."""
     k = points[:, 2]
     if k.min() > 1.0 or k.max() < last - 1.0:
         return None
-    within = (k >= 1.0) & (k <= last - 1.0)  # without what closes the surface at the border of the scan
+    within = (k >= 1.0) & (k <= last - 1.0)  # without the faces that close the surface at the border of the scan
     section = ((k[within] - 1.0) * (RAIL_SECTIONS / max(last - 2.0, 1.0))).astype(int).clip(0, RAIL_SECTIONS - 1)
     across = points[within, :2] * spacing[:2]
     if np.bincount(section, minlength=RAIL_SECTIONS).min() == 0:
@@ -257,12 +258,12 @@ def _measure_section(
 
 
 def normals_of(mesh: Mesh) -> NDArray[np.float32]:
-    """The normals of a mesh.
+    """Return the normals of a mesh.
 
     Raises
     ------
     UsageError
-        It has none.
+        The mesh has no normals.
     """
     if mesh.normals is None:
         raise UsageError("walls are looked for along normals: the mesh has none")
@@ -270,7 +271,7 @@ def normals_of(mesh: Mesh) -> NDArray[np.float32]:
 
 
 def _is_near(points: NDArray[np.float64], marked: NDArray[np.bool_], size_mm: float) -> NDArray[np.bool_]:
-    """Points with a marked one in their cell of `size_mm` or in one of the 26 around it."""
+    """Mark points that have a marked one in their own cell of `size_mm` or in one of the 26 neighbours."""
     cells = np.floor((points - points.min(axis=0)) / size_mm).astype(np.int64) + 1
     sizes = cells.max(axis=0) + 2
     strides = np.array([sizes[1] * sizes[2], sizes[2], 1])
@@ -281,7 +282,7 @@ def _is_near(points: NDArray[np.float64], marked: NDArray[np.bool_], size_mm: fl
 
 
 def lie_near_line(points: NDArray[np.floating], line: NDArray[np.float64], distance: float) -> NDArray[np.bool_]:
-    """Which points lie nearer than `distance` to a line through points (n, 3), all in mm."""
+    """Mark the points nearer than `distance` to a line through points (n, 3), all in mm."""
     near = np.zeros(len(points), dtype=bool)
     for start, end in zip(line[:-1], line[1:], strict=True):
         way = end - start

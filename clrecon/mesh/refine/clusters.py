@@ -1,4 +1,4 @@
-"""Vertices of a mesh brought together into clusters, and taken apart again where that has done harm."""
+"""Clusters of vertices: vertices of a mesh are merged, and separated again where that did harm."""
 
 from __future__ import annotations
 
@@ -25,18 +25,18 @@ IntArray = NDArray[np.integer]
 
 
 class Clusters:
-    """A mesh whose vertices are brought together: the surface is the given one with vertices renamed.
+    """A mesh with merged vertices: its surface is the given one with vertices renamed.
 
-    Every edge collapse renames one vertex to another and drops the triangles that have both.  The end of many of
-    them is a name for each vertex and a place for each name.  Collapses come in rounds; a cluster is undone by giving
-    its vertices the names and places that they had before the last round.
+    Every edge collapse renames one vertex to another and drops the triangles that have both.  The result of many
+    collapses is a name for each vertex and a place for each name.  Collapses come in rounds; a cluster is undone by
+    giving its vertices the names and places that they had before the last round.
 
     Parameters
     ----------
     vertices : ndarray, shape (n, 3), float64, mm, relative to `origin`
     triangles : ndarray, shape (m, 3), uint32
     origin : ndarray, shape (3,), float64, mm
-        Places are kept rounded as a `Mesh` stores them, with this added.
+        Places are rounded as a `Mesh` stores them after this is added.
     """
 
     def __init__(self, vertices: Float64Array, triangles: NDArray[np.uint32], origin: Float64Array):
@@ -44,30 +44,30 @@ class Clusters:
         self._names, self._places = np.arange(len(vertices)), self._rounded(vertices)
         self._before = self._names, self._places
         self._components = label_components(triangles, len(vertices))
-        # For each triangle as it was those whose faces show that it lies within the bound; -1 where that is not known.
+        # For each original triangle, faces that show that it lies within the bound (witnesses); -1 where none is known.
         itself = np.where(self._is_face(triangles), np.arange(len(triangles), dtype=np.int32), np.int32(-1))
         self._witnesses = np.repeat(itself[None], WITNESSES, axis=0)
         self._witnesses_before = self._witnesses
-        # Vertices whose name or place is new since the surface was last looked at for cuts and for distances.
+        # Vertices whose name or place has changed since the surface was last examined for cuts and for distances.
         self._new_to_cuts, self._new_to_distances = (np.zeros(len(vertices), dtype=bool) for _ in range(2))
 
     def _rounded(self, places: Float64Array) -> Float64Array:
         return as_stored(places + self._origin).astype(np.float64) - self._origin
 
     def collapse(self, collapses: IntArray, points: Float64Array, faces: IntArray) -> None:
-        """Make a round of collapses.
+        """Apply a round of collapses.
 
         Parameters
         ----------
         collapses : ndarray, shape (c, 2)
-            In each the second vertex of the present `surface` went into the first, which goes on.
+            In each, the second vertex of the present `surface` is merged into the first, which remains.
         points, faces : ndarray
-            The mesh after; its vertices are those that go on and have faces, in their order.
+            The mesh afterwards; its vertices are those that remain and have faces, in their order.
 
         Raises
         ------
         RuntimeError
-            The mesh after is not what the collapses say.
+            The mesh afterwards does not match the collapses.
         """
         standing = self.standing()
         into = np.arange(len(standing))
@@ -86,7 +86,7 @@ class Clusters:
         number[going_on] = np.arange(len(going_on))
         if len(going_on) != len(points) or not np.array_equal(number[left], faces):
             raise RuntimeError("the collapses that fast-simplification lists do not lead to its result")
-        # A vertex that nothing went into stays where it is.
+        # A vertex that none was merged into keeps its place.
         gained = np.bincount(rename, minlength=len(names))[going_on] > 1
         places[going_on[gained]] = self._rounded(points[gained])
         self._before, self._witnesses_before = (self._names, self._places), self._witnesses.copy()
@@ -97,17 +97,17 @@ class Clusters:
 
     @property
     def collapsed_count(self) -> int:
-        """Number of vertices that have gone into another."""
+        """Number of vertices that were merged into another."""
         return int(np.count_nonzero(self._names != np.arange(len(self._names))))
 
     @property
     def names(self) -> IntArray:
-        """For each vertex the one that stands for its cluster, shape (n,)."""
+        """For each vertex the one that represents its cluster, shape (n,)."""
         return self._names
 
     @property
     def places(self) -> Float64Array:
-        """Where the vertices that stand for a cluster lie, shape (n, 3), relative to the origin; of others not used."""
+        """Places of the vertices that represent a cluster, shape (n, 3), relative to the origin; others are unused."""
         return self._places
 
     def faces(self) -> NDArray[np.uint32]:
@@ -124,7 +124,7 @@ class Clusters:
         return (a != b) & (b != c) & (c != a)
 
     def standing(self) -> IntArray:
-        """The vertices that stand for a cluster and have faces, in their order."""
+        """The vertices that represent a cluster and have faces, in their order."""
         used = np.zeros(len(self._names), dtype=bool)
         used[self.faces().reshape(-1)] = True
         return np.flatnonzero(used)
@@ -137,7 +137,7 @@ class Clusters:
         return self._places[standing], number[faces]
 
     def undo(self, names: IntArray) -> int:
-        """Take these clusters apart; returns how many vertices that has moved or brought back."""
+        """Undo these clusters; return the number of vertices that moved or reappeared."""
         marked = np.zeros(len(self._names), dtype=bool)
         marked[names] = True
         moved = marked[self._names] & self._has_moved()
@@ -150,22 +150,22 @@ class Clusters:
         return int(np.count_nonzero(moved))
 
     def _has_moved(self) -> NDArray[np.bool_]:
-        """Vertices whose name, or the place of it, is another than before the last round."""
+        """Mark vertices whose name, or the place of it, changed in the last round."""
         names_before, places_before = self._before
         x, y, z = (self._places != places_before).T
         return np.asarray((self._names != names_before) | (x | y | z)[self._names])
 
     def find_faults(self) -> IntArray:
-        """Names of clusters that have spoilt the surface.
+        """Find the names of clusters that have spoilt the surface.
 
-        At edges and vertices that are not manifold, at faces without area or doubled, at places that two vertices
-        share, and of components of which nothing is left or that have come apart.
+        These are clusters at non-manifold edges and vertices, at faces without area or doubled, at places that two
+        vertices share, and of components that have vanished or come apart.
         """
         faces = self.faces()
         size = len(self._names)
         edges = find_edges(faces, size)
         faults = []
-        if not edges.oriented:  # as is every mesh with three faces at an edge
+        if not edges.oriented:  # as every mesh with three faces at an edge is
             upward = (faces.reshape(-1) < faces[:, (1, 2, 0)].reshape(-1))[edges.half_edges]
             ups = np.add.reduceat(upward, edges.first, dtype=np.int64)
             faults += list(edges.ends[:, (ups > 1) | (edges.uses - ups > 1)])
@@ -173,14 +173,14 @@ class Clusters:
         if opposite is not None:
             faults.append(faces[find_faces_back_to_back(opposite)].reshape(-1))
         split = find_split_vertices(faces, size, edges, opposite)
-        # The waist can be a vertex that stands for itself alone: what touches it twice is a cluster beside it.
+        # The waist can be a vertex without a cluster: the cluster beside it touches it twice.
         faults += [split, faces[np.isin(faces, split).any(axis=1)].reshape(-1) if len(split) else split]
-        if not any(map(len, faults)):  # the rest can only be told, or costs less, when these are gone
+        if not any(map(len, faults)):  # the other faults can only be found, or cost less, after these are repaired
             faults += [self._find_lost(faces, edges), *self._find_flat(faces), self._find_coincident()]
         return np.unique(np.concatenate(faults).astype(np.int64))
 
     def _find_lost(self, faces: NDArray[np.uint32], edges: Edges) -> IntArray:
-        """Names of components without a face, and of all but the largest part of those that have come apart."""
+        """Find names of components without a face, and of all but the largest part of those that came apart."""
         count, labels = self._components
         now, parts = label_components(faces, len(self._names), edges)
         part_size = np.bincount(parts[faces[:, 0]], minlength=now)
@@ -192,27 +192,27 @@ class Clusters:
         largest[found] = order[first]
         part = parts[self._names]
         lost = (labels >= 0) & ((part < 0) | (largest[labels] != part))
-        # With what lies around: a part that has come apart can consist of vertices that all stand for themselves.
+        # With their surroundings: a part that has come apart can consist of vertices without clusters.
         return np.unique(self._names[self._triangles[lost[self._triangles].any(axis=1)]])
 
     def _stored(self) -> NDArray[np.floating]:
         return as_stored(self._places + self._origin)
 
     def _find_flat(self, faces: NDArray[np.uint32]) -> list[NDArray[np.uint32]]:
-        """Corners of faces without area once coordinates are rounded."""
+        """Find corners of faces without area after coordinates are rounded."""
         pieces = cross_products(self._stored(), faces, np.zeros(3))
         return [faces[where][~cross.any(axis=0)].reshape(-1) for where, _, cross in pieces]
 
     def _find_coincident(self) -> IntArray:
-        """Names that have come to lie at one place once coordinates are rounded."""
+        """Find names that coincide after coordinates are rounded."""
         standing = self.standing()
         return standing[find_coincident(as_stored(self._places[standing] + self._origin))]
 
     def find_crossing(self) -> IntArray:
-        """Names of clusters at faces that cut each other once coordinates are rounded.
+        """Find names of clusters at faces that cut each other after coordinates are rounded.
 
-        Only faces that have changed since the last call, and are not as they were before the round, are looked at, with
-        what lies around them.
+        Only faces that changed since the last call, and differ from those before the round, are examined with their
+        surroundings.
         """
         named = self._names.astype(np.uint32)[self._triangles]
         is_face = self._is_face(named)
@@ -225,15 +225,15 @@ class Clusters:
         return np.unique(faces[find_self_intersections(stored, faces, changed[near])])
 
     def find_far(self, deviation: Deviation) -> IntArray:
-        """Names of clusters where the surface has moved too far, or from where a part of it has gone too far.
+        """Find names of clusters where either surface is too far from the other.
 
-        Only what has changed since the last call and since before the round is looked at: what lay within the bound
-        before the round does so again where it was undone.
+        Only faces that changed since the last call and since before the round are examined: where a change is undone,
+        the surface is again within the bound.
 
         Parameters
         ----------
         deviation : Deviation
-            The surface as it was, with the same triangles, and the bound.
+            The original surface, with the same triangles, and the bound.
         """
         named = self._names.astype(np.uint32)[self._triangles]
         is_face = self._is_face(named)
@@ -252,7 +252,8 @@ class Clusters:
 
         now = named[is_face & new & differs]
         away = now[deviation.are_far(self._places, now)]
-        # One that is as it was before the round comes within the bound again when what it was near to comes back.
+        # A triangle that is again as before the round is within the bound again when its former neighbours are back
+        # too.
         left_behind = rows[is_left_behind]
         left_alone = self._witnesses_before[:, left_behind[~differs[left_behind]]]
         found = named[left_behind], away, named[left_alone[left_alone >= 0]]
@@ -260,13 +261,13 @@ class Clusters:
 
 
 def _any_corner(flags: NDArray[np.bool_], triangles: IntArray) -> NDArray[np.bool_]:
-    """Which triangles, shape (m, 3), have a corner whose flag is set."""
+    """Mark triangles, shape (m, 3), that have a corner whose flag is set."""
     a, b, c = triangles.T
     return np.asarray(flags[a] | flags[b] | flags[c])
 
 
 def _any_witness(flags: NDArray[np.bool_], witnesses: IntArray) -> NDArray[np.bool_]:
-    """Which triangles have a witness, shape (7, m), whose flag is set, or none."""
+    """Mark triangles with a witness, shape (7, m), whose flag is set, or without witness."""
     found = witnesses[0] < 0
     for rows in witnesses:
         found |= flags[rows]

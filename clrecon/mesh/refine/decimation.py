@@ -1,7 +1,7 @@
-"""Fewer triangles, within a bound in mm of the surface as it was.
+"""Decimation: fewer triangles, within a bound in mm of the original surface.
 
-fast-simplification chooses which edges are collapsed.  What is added here is the bound and the topology: where the
-result would leave either, the place is taken back, and what is left is tried again.
+fast-simplification chooses which edges are collapsed.  This module adds the bound and the topology: places where the
+result would violate them are undone, and further collapses are tried.
 """
 
 from __future__ import annotations
@@ -26,32 +26,33 @@ from clrecon.system.progress import Progress
 __all__ = ["BOUND_VOXEL", "carry_on", "check_refinement", "decimate_mesh", "default_deviation"]
 
 BOUND_VOXEL = 0.25
-"""Bound where none is given, in the shortest voxel step: with it a mean of 0.1 voxel is kept as well."""
+"""Default bound in shortest voxel steps; a mean of 0.1 voxel is then kept too."""
 
 _AGGRESSIVENESS = 3.0
-"""How fast fast-simplification lets its error grow.  With the bound 2 to 7 give the same surface, 3 is fastest."""
+"""How fast fast-simplification lets its error grow.  With the bound, 2 to 7 give the same surface, and 3 is fastest."""
 
 _LAST_ITERATION = 99
 _ERROR_OVER_BOUND = 4.0
-"""Largest quadric error of a round, in squares of the bound.  It sums the squared distances to all planes that meet in
-a vertex, dozens of them: with 16 as much is taken away in the end, but three times as much has to be taken back."""
+"""Largest quadric error of a round, in squares of the bound.  The error sums the squared distances to dozens of planes
+that meet in a vertex.  With 16 as many triangles disappear in the end, but three times as many collapses must be
+undone."""
 
 _TRIES = 200
-"""Of mending, at most; each undoes something, on CT 3 to 8 are needed."""
+"""Most attempts to repair a round; each undoes some clusters, and CT needs 3 to 8."""
 
 _ROUNDS = 12
 _LEAST_GAIN = 0.15
-"""Rounds of collapses go on while one takes away more than this share of the triangles that are left."""
+"""Rounds of collapses continue while each removes more than this share of the triangles."""
 
 _SHARE_SLACK = 0.005
-"""Of the triangles that are to be left: so many more count as reached."""
+"""The wanted number of triangles counts as reached when it is exceeded by this share or less."""
 
 _SHARE_FOR_VOLUME = 0.1
-"""Of the bound, kept for the shift that gives components their volume back."""
+"""Share of the bound that is kept for the shift that restores the volume of components."""
 
 
 def default_deviation(mesh: Mesh) -> float:
-    """The bound in mm where none is given: a quarter of the shortest voxel step that the mesh was made from.
+    """Return the default bound in mm: a quarter of the shortest voxel step that the mesh was made from.
 
     Raises
     ------
@@ -66,12 +67,12 @@ def default_deviation(mesh: Mesh) -> float:
 
 
 def check_refinement(mesh: Mesh, max_deviation_mm: float | None) -> float:
-    """Check a mesh that is to be refined; returns the bound in mm.
+    """Check a mesh before refinement and return the bound in mm.
 
     Raises
     ------
     UsageError
-        The bound is no length, or the mesh is too large or fails its check.
+        The bound is not a length, or the mesh is too large or fails its check.
     NoSurfaceError
         The mesh is empty.
     """
@@ -87,42 +88,42 @@ def check_refinement(mesh: Mesh, max_deviation_mm: float | None) -> float:
 
 
 def carry_on(mesh: Mesh, name: str, said: dict[str, Any]) -> dict[str, Any]:
-    """The report of a mesh with one more entry in ``refinement``."""
+    """Return the report of a mesh with one more entry in ``refinement``."""
     return {**mesh.report, "refinement": {**mesh.report.get("refinement", {}), name: said}}
 
 
 def decimate_mesh(
     mesh: Mesh, fraction: float, max_deviation_mm: float | None = None, *, progress: Progress | None = None
 ) -> Mesh:
-    """Take triangles away by collapsing edges in order of their quadric error (Garland and Heckbert 1997).
+    """Remove triangles by collapsing edges in order of their quadric error (Garland and Heckbert 1997).
 
-    fast-simplification chooses the collapses and stops where the error reaches the bound.  Collapses whose result
-    lies further away than the bound, is not manifold, has faces without area, cuts itself or has lost a component are
-    then undone, so that a closed and manifold surface stays one and keeps all its components.  What that leaves is
-    tried again in more rounds, until the share is reached or hardly anything more is won within the bound.
+    fast-simplification chooses the collapses and stops where the error reaches the bound.  Collapses are then undone
+    where the result exceeds the bound, is not manifold, has faces without area, cuts itself or has lost a component.
+    So a closed and manifold surface stays closed and manifold, and keeps all its components.  Further rounds follow
+    until the share is reached or hardly any more triangles can be removed within the bound.
 
     Parameters
     ----------
     mesh : Mesh
     fraction : float
-        Share of the triangles to take away, above 0 and below 1.  Less goes where the bound says so.
+        Share of the triangles to remove, above 0 and below 1. The bound may allow only less.
     max_deviation_mm : float, optional
-        No vertex and no middle of an edge or a triangle of either surface lies further from the other.  Default:
-        `default_deviation`.
+        No vertex and no middle of an edge or a triangle of either surface lies farther than this from the other.
+        Default: `default_deviation`.
     progress : callable, optional
-        Called as ``progress("decimate", triangles taken away, all that are to go)``, several times a round.
+        Called as ``progress("decimate", triangles removed, triangles to remove)``, several times in a round.
 
     Returns
     -------
     Mesh
-        Normals from the faces; the report goes on, with ``refinement["decimate"]``: ``fraction`` (asked for),
+        Normals from the faces; the report is taken over, with ``refinement["decimate"]``: ``fraction`` (asked for),
         ``reached``, ``ended_by`` (``"share"`` or ``"bound"``), ``rounds``, ``max_deviation_mm``, ``triangles_before``,
         ``vertices_taken_back``.
 
     Raises
     ------
     UsageError
-        A value that cannot be used, or no bound and a mesh that does not say its voxel size.
+        A value cannot be used, or there is neither a bound nor a voxel size in the report of the mesh.
     NoSurfaceError
         The mesh is empty.
     """
@@ -131,7 +132,7 @@ def decimate_mesh(
     bound = check_refinement(mesh, max_deviation_mm)
     origin = local_origin(mesh.vertices)
     clusters = Clusters(mesh.vertices - origin, mesh.triangles, origin)
-    # Both surfaces are kept rounded, each coordinate by half a step at most.
+    # Both surfaces are stored rounded, each coordinate by at most half a step.
     longest = max(_SHARE_FOR_VOLUME * bound - rounding_step(mesh.vertices), 0.0)
     deviation = Deviation(mesh.vertices - origin, mesh.triangles, (1.0 - _SHARE_FOR_VOLUME) * bound)
     wanted = (1.0 - fraction) * mesh.triangle_count
@@ -170,7 +171,7 @@ def decimate_mesh(
 def _with_volumes(
     clusters: Clusters, mesh: Mesh, origin: NDArray[np.float64], longest: float
 ) -> tuple[NDArray[np.floating], NDArray[np.uint32]]:
-    """The surface of clusters as it is stored, each closed component with the volume it had in the mesh."""
+    """Return the surface of clusters as it is stored, each closed component with its original volume."""
     places, triangles = clusters.surface()
     wanted = measure_volumes(mesh.vertices - origin, mesh.triangles)
     step = np.zeros_like(places)
@@ -179,7 +180,7 @@ def _with_volumes(
 
 
 def _mend(clusters: Clusters, deviation: Deviation, tell: Callable[[], None] = lambda: None) -> None:
-    """Undo clusters until the surface is sound and within the bound; what is cheap and changes most comes first."""
+    """Undo clusters until the surface is sound and within the bound; cheap checks with large effect come first."""
     for _ in range(_TRIES):
         tell()
         if clusters.undo(clusters.find_faults()):
@@ -191,10 +192,11 @@ def _mend(clusters: Clusters, deviation: Deviation, tell: Callable[[], None] = l
 
 
 def _collapse(clusters: Clusters, left_share: float, bound: float) -> None:
-    """One round of fast-simplification on the present surface, of whose triangles `left_share` is to be left."""
+    """Make one round of fast-simplification on the present surface, leaving `left_share` of its triangles."""
     from fast_simplification import simplify
 
-    # In iteration i it collapses edges of an error up to 1e-9 * (i + 3)**agg: scaled, the last is the bound's.
+    # In iteration i it collapses edges of an error up to 1e-9 * (i + 3)**agg.  Coordinates are scaled so that the last
+    # iteration reaches the bound's error.
     largest_error = 1e-9 * (_LAST_ITERATION + 3) ** _AGGRESSIVENESS
     scale = math.sqrt(largest_error / _ERROR_OVER_BOUND) / bound
     vertices, triangles = clusters.surface()

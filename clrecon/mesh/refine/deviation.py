@@ -1,4 +1,4 @@
-"""Is a decimated surface within a bound of the surface as it was, and that within the bound of it?"""
+"""Deviation: whether a decimated surface and the original are within a bound of each other."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from clrecon.mesh.compare.distances import NearDistance
 __all__ = ["WITNESSES", "Deviation"]
 
 WITNESSES = 7
-"""Faces that can be needed to show that a triangle is within the bound: for its corners, its middle and its edges."""
+"""Most faces that are needed to show that a triangle is within the bound: for its corners, its middle and its edges."""
 
 _MOST_STEPS = 12
-"""Parts of an edge of the surface as it is now that are looked at, at most."""
+"""Most parts into which an edge of the present surface is divided for points."""
 
 _MANY = 10_000
-"""Points from which on it pays to start threads."""
+"""Least number of points for which threads are faster."""
 
 _MIDDLES = np.array([[1, 1, 1], [1, 1, 0], [0, 1, 1], [1, 0, 1]]) / [[3], [2], [2], [2]]
 """Barycentric coordinates of the middle of a triangle and of its edges."""
@@ -26,7 +26,7 @@ IntArray = NDArray[np.integer]
 
 
 class Deviation:
-    """The surface as it was, and the bound.
+    """The original surface, and the bound.
 
     Parameters
     ----------
@@ -46,9 +46,9 @@ class Deviation:
         self._step = float(np.sqrt(np.einsum("nia,nia->ni", edges, edges)).mean())
 
     def can_be_far(self, rows: IntArray, names: IntArray, places: Float64Array) -> NDArray[np.bool_]:
-        """Which of these triangles are no more what they were, or have a corner that has moved further than the bound.
+        """Mark triangles that have changed, or have a corner that moved farther than the bound.
 
-        Of the others no point has moved further than the corners.
+        In the others no point has moved farther than the corners.
 
         Parameters
         ----------
@@ -70,28 +70,29 @@ class Deviation:
     def is_far_from(
         self, rows: IntArray, names: IntArray, places: Float64Array, faces: NDArray[np.uint32]
     ) -> tuple[NDArray[np.bool_], IntArray]:
-        """Which triangles of the surface as it was lie further than the bound from the surface as it is now.
+        """Mark triangles of the original surface that lie farther than the bound from the present surface.
 
-        The distance from one triangle is a convex function: where the corners all lie within the bound of one triangle,
-        so does every point between them.  Of the others, which lie across an edge, the middle and the middles of the
-        edges are looked at.  Distances are from the triangles around the names of the corners alone, which is the part
-        of the surface that has come from this triangle: never less than from the surface.
+        The distance from one triangle is a convex function: if all corners lie within the bound of one triangle, so
+        does every point between them.  Of the other triangles, which lie across an edge, the middle and the middles of
+        the edges are measured.  Distances are measured only to the triangles around the names of the corners, the part
+        of the surface that came from this triangle.  They are never less than those to the whole surface.
 
         Parameters
         ----------
         rows : ndarray, shape (k,), int
-            Triangles to look at.
+            Triangles to examine.
         names : ndarray, shape (n,), int
-            For each vertex one of the surface as it is now that is near.
+            For each vertex a near vertex of the present surface.
         places : ndarray, shape (n, 3), float64, mm
         faces : ndarray, shape (f, 3), uint32
-            The surface as it is now.
+            The present surface.
 
         Returns
         -------
         far : ndarray, shape (k,), bool
         witnesses : ndarray, shape (7, k), int
-            Rows of `faces` that show that a triangle is within: as long as these stay, it is.  -1 where it is not.
+            Rows of `faces` that show that a triangle is within the bound; it is so as long as these faces stay.  -1
+            where it is not.
         """
         now = NearDistance(places, faces)
         triangles = self._triangles[rows]
@@ -103,7 +104,7 @@ class Deviation:
         far = np.asarray((length > self._bound)[number].any(axis=1))
         beside = nearest[number]
         witnesses = np.concatenate([beside.T, np.repeat(beside[:, :1].T, WITNESSES - 3, axis=0)])
-        # The middle of the triangle and of its edges, from the faces that are nearest to the corners, then from all.
+        # The middle of the triangle and of its edges: first to the faces nearest to the corners, then to all.
         rest = np.flatnonzero(~far)
         rest = rest[~self._are_within(now, self._vertices[triangles[rest]], beside[rest])]
         points = np.einsum("wi,nia->wna", _MIDDLES, self._vertices[triangles[rest]]).reshape(-1, 3)
@@ -119,7 +120,7 @@ class Deviation:
         return far, witnesses
 
     def _are_within(self, now: NearDistance, corners: Float64Array, nearest: IntArray) -> NDArray[np.bool_]:
-        """Whether one of the faces that are nearest to the corners, shape (k, 3), is within the bound of all three."""
+        """True where one of the faces nearest to the corners, shape (k, 3), is within the bound of all three."""
         within = (nearest[:, 0] == nearest[:, 1]) & (nearest[:, 1] == nearest[:, 2])
         for one, others in ((0, (1, 2)), (1, (2, 0)), (2, (0, 1))):
             rest = np.flatnonzero(~within)
@@ -132,10 +133,10 @@ class Deviation:
         return within
 
     def are_far(self, places: Float64Array, faces: NDArray[np.uint32]) -> NDArray[np.bool_]:
-        """Which triangles of the surface as it is now have a point that was looked at further than the bound.
+        """Mark triangles of the present surface that have a tested point farther than the bound.
 
-        Looked at are the corners, the middle, and points of a lattice no further apart than two mean edges of the
-        surface as it was; the middle of each edge is one of them.
+        Tested are the corners, the middle, and points of a lattice with steps of at most two mean edges of the original
+        surface; the middle of each edge is one of them.
 
         Parameters
         ----------
@@ -165,7 +166,7 @@ class Deviation:
         return far | self._find_far_within(places[faces], ~far)
 
     def _find_far_within(self, corners: Float64Array, look_at: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """Which edges, shape (n, 2, 3), or triangles, shape (n, 3, 3), have a point inside that lies too far."""
+        """Mark edges, shape (n, 2, 3), or triangles, shape (n, 3, 3), that have a point inside that is too far away."""
         sides = corners - np.roll(corners, 1, axis=1)
         longest = np.sqrt(np.einsum("nia,nia->in", sides, sides).max(axis=0))
         steps = np.clip(2 * np.ceil(longest / (4.0 * self._step)), 2, _MOST_STEPS).astype(int)
@@ -184,7 +185,7 @@ class Deviation:
 
 
 def _inner_weights(steps: int, corners: int) -> Float64Array:
-    """Barycentric coordinates of a lattice inside of an edge (2 corners) or a triangle (3), and of its middle."""
+    """Return barycentric coordinates of a lattice inside an edge (2 corners) or a triangle (3), and of its middle."""
     axes = np.meshgrid(*[np.arange(1, steps)] * (corners - 1), indexing="ij")
     lattice = np.stack([axis.reshape(-1) for axis in axes], axis=1)
     last = steps - lattice.sum(axis=1, keepdims=True)

@@ -1,4 +1,4 @@
-"""Small shifts of vertices: that give components their volume back, and that spoil nothing."""
+"""Small shifts of vertices: to restore the volume of components, and without spoiling the surface."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from clrecon.mesh.triangles import cross_products
 __all__ = ["Volumes", "measure_volumes", "move_vertices", "restore_volumes", "shorten_steps"]
 
 _VOLUME_STEPS = 4
-"""Newton steps along the normals; the first leaves about a hundredth of what is missing."""
+"""Newton steps along the normals; the first leaves about a hundredth of the missing volume."""
 
 _ROUNDS = 40
-"""Of taking back, at most; each halves steps or widens the place, on CT 2 to 5 are needed."""
+"""Most rounds of taking steps back; each halves steps or widens the place, and CT needs 2 to 5."""
 
 _SMALLEST_SHARE = 0.2
-"""Of a step that is taken back by halves; what is shorter is taken back whole."""
+"""Least share of a step after halving; a step that would be shorter is not made at all."""
 
 _ROUNDS_OF_ITS_OWN = 3
-"""After so many rounds the vertices around an offending place are taken back too."""
+"""After this many rounds the vertices around an offending place are taken back too."""
 
 Float64Array = NDArray[np.float64]
 IntArray = NDArray[np.integer]
@@ -32,14 +32,14 @@ IntArray = NDArray[np.integer]
 
 @dataclass(frozen=True)
 class Volumes:
-    """Components of a surface, and what they enclose.
+    """Components of a surface, and the volumes that they enclose.
 
     Attributes
     ----------
     labels : ndarray, shape (n,), int64
         Component of each vertex; -1 for vertices that no triangle uses.
     mm3 : ndarray, shape (count,), float64
-        Enclosed volume, negative for walls of cavities; of open components without meaning.
+        Enclosed volume, negative for walls of cavities; meaningless for open components.
     is_open : ndarray, shape (count,), bool
     """
 
@@ -67,17 +67,17 @@ def restore_volumes(
 ) -> None:
     """Change steps so that each closed component gets the volume it had, by a shift along the normals.
 
-    Thin sheets lose a large share of their volume by a small shift: 6 % of a thin-walled bone at voxels of 3 mm were
-    0.03 voxel.
+    A small shift is a large share of the volume of a thin sheet: in a thin-walled bone at voxels of 3 mm, 6 % of the
+    volume were 0.03 voxel.
 
     Parameters
     ----------
     vertices : ndarray, shape (n, 3), float64, mm
     step : ndarray, shape (n, 3), float64, mm
-        Changed in place; none becomes longer than `longest`.
+        Changed in place; no step becomes longer than `longest`.
     triangles : ndarray, shape (m, 3), uint32
     labels : ndarray, shape (n,), int64
-        Which component of `wanted` each vertex belongs to, -1 for none.
+        Component of `wanted` that each vertex belongs to, -1 for none.
     wanted : Volumes
     longest : float
         mm.
@@ -97,7 +97,7 @@ def restore_volumes(
 def _volumes(
     vertices: Float64Array, triangles: NDArray[np.uint32], labels: NDArray[np.int64], count: int
 ) -> tuple[Float64Array, Float64Array]:
-    """Volume of each component in mm3, and its gradient by the places of the vertices, shape (3, n), mm2."""
+    """Return the volume of each component in mm3, and its gradient by the places of the vertices, shape (3, n), mm2."""
     volumes = np.zeros(count)
     cross_of = np.empty((3, len(triangles)))
     for where, corner, cross in cross_products(vertices, triangles, np.zeros(3), max(count, 1 << 14)):
@@ -111,7 +111,7 @@ def _volumes(
 
 
 def shorten_steps(step: Float64Array, longest: float) -> int:
-    """Shorten steps, shape (n, 3), to `longest` mm, in place; returns how many were longer."""
+    """Shorten steps, shape (n, 3), to `longest` mm, in place; return how many were longer."""
     length = np.sqrt(np.einsum("na,na->n", step, step))
     far = np.flatnonzero(length > longest)
     step[far] *= (longest / length[far])[:, None]
@@ -121,7 +121,7 @@ def shorten_steps(step: Float64Array, longest: float) -> int:
 def move_vertices(
     vertices: NDArray[np.floating], triangles: NDArray[np.uint32], step: Float64Array
 ) -> tuple[NDArray[np.floating], int]:
-    """Move vertices, but less or not where triangles would cut each other, lose their area or share a place.
+    """Move vertices, but by less or not at all where triangles would cut, lose their area or share a place.
 
     Parameters
     ----------
@@ -132,9 +132,9 @@ def move_vertices(
     Returns
     -------
     vertices : ndarray, shape (n, 3)
-        As stored.  What was spoilt before may still be.
+        Vertices as stored.  Faults that existed before may remain.
     taken_back : int
-        Vertices that have not gone all the way.
+        Number of vertices that were not moved by the full step.
     """
     share = np.ones(len(vertices))
     moved = as_stored(vertices + step)
@@ -160,7 +160,7 @@ def move_vertices(
 def _find_spoilt(
     vertices: NDArray[np.floating], triangles: NDArray[np.uint32], look_at: NDArray[np.bool_]
 ) -> NDArray[np.int64]:
-    """Vertices of triangles without area, of triangles that cut each other, and of those at one place."""
+    """Find vertices of triangles without area, of triangles that cut each other, and vertices that coincide."""
     flat = [
         where.start + np.flatnonzero(~cross.any(axis=0))
         for where, _, cross in cross_products(vertices, triangles, np.zeros(3))

@@ -1,7 +1,7 @@
-"""Smoothing within a bound in mm of the surface as it was, with its volume and without cuts.
+"""Smoothing within a bound in mm of the original surface, which keeps its volume and makes no cuts.
 
-VTK's windowed sinc filter says where the vertices want to go.  What is added here is the bound, the volume of each
-component, and the vertices that are taken back where the surface would cut itself.
+VTK's windowed sinc filter gives the new places of the vertices.  This module adds the bound, the volume of each
+component, and takes vertices back where the surface would cut itself.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from clrecon.system.progress import Progress, ignore_progress
 __all__ = ["smooth_mesh"]
 
 _PASS_BAND = 0.1
-"""Of the windowed sinc filter.  On CT at 0.7 mm and 20 iterations the surface moves 0.05 voxel in the mean and 0.15
-at the 95th percentile; half as wide a band loses more than 0.5 % of volume."""
+"""Pass band of the windowed sinc filter.  On CT at 0.7 mm and 20 iterations the surface moves by a mean of 0.05 voxel
+and by 0.15 at the 95th percentile; half the pass band loses more than 0.5 % of the volume."""
 
 
 def smooth_mesh(
@@ -31,33 +31,33 @@ def smooth_mesh(
 ) -> Mesh:
     """Smooth a surface with a windowed sinc filter (Taubin, Zhang and Golub 1996), which hardly shrinks it.
 
-    A vertex that the filter takes further than the bound goes only so far along its way.  Each closed component then
-    gets its volume back by a shift along the normals, still within the bound.  Where triangles would cut each other,
-    lose their area or come to lie on one another, steps are halved or not made.  Vertices at an open border stay.
+    A vertex that the filter moves farther than the bound stops at the bound.  Each closed component then gets its
+    volume back by a shift along the normals, still within the bound.  Where triangles would cut each other, lose their
+    area or coincide, steps are halved or not made.  Vertices at an open border stay.
 
     Parameters
     ----------
     mesh : Mesh
     iterations : int
-        Degree of the filter; more smooth more.
+        Degree of the filter; a higher one smooths more.
     max_deviation_mm : float, optional
-        No point of the result lies further from the given surface, and no point of that further from the result:
-        the triangles are the same and no corner moves further, so neither does any point between them.
-        Default: `default_deviation`.
+        No point of the result lies farther than this from the given surface, and no point of that from the result: the
+        triangles are the same and no corner moves farther, so no point between them does.  Default:
+        `default_deviation`.
     progress : callable, optional
         Called as ``progress("smooth", steps done, all steps)``.
 
     Returns
     -------
     Mesh
-        The same triangles; normals from the faces; the report goes on, with ``refinement["smooth"]``:
-        ``iterations``, ``max_deviation_mm``, ``vertices_held_back`` (by the bound), ``vertices_taken_back`` (from
-        cuts and faces without area).
+        The same triangles; normals from the faces; the report is taken over, with ``refinement["smooth"]``:
+        ``iterations``, ``max_deviation_mm``, ``vertices_held_back`` (by the bound), ``vertices_taken_back`` (from cuts
+        and faces without area).
 
     Raises
     ------
     UsageError
-        A value that cannot be used, or no bound and a mesh that does not say its voxel size.
+        A value cannot be used, or there is neither a bound nor a voxel size in the report of the mesh.
     NoSurfaceError
         The mesh is empty.
     """
@@ -66,7 +66,7 @@ def smooth_mesh(
     progress = progress or ignore_progress
     progress("smooth", 0, 3)
     bound = check_refinement(mesh, max_deviation_mm)
-    # Both surfaces are kept rounded, each coordinate by half a step at most.
+    # Both surfaces are stored rounded, each coordinate by at most half a step.
     longest = max(bound - rounding_step(mesh.vertices), 0.5 * bound)
     origin = local_origin(mesh.vertices)
     before = mesh.vertices - origin
@@ -74,7 +74,7 @@ def smooth_mesh(
 
     progress("smooth", 1, 3)
     edges = find_edges(mesh.triangles, mesh.vertex_count)
-    step[edges.ends[:, edges.uses == 1]] = 0.0  # VTK smooths along the border all the same
+    step[edges.ends[:, edges.uses == 1]] = 0.0  # VTK smooths along the border as well
     held = shorten_steps(step, longest)
     volumes = measure_volumes(before, mesh.triangles)
     restore_volumes(before, step, mesh.triangles, volumes.labels, volumes, longest)
