@@ -31,14 +31,14 @@ def add_rendering(
     Parameters
     ----------
     plotter : pyvista.Plotter
-        Its scene in LPS mm.
+        Plotter of a scene in LPS mm.
     rendering : Rendering
     form : {"points", "plane"}
         See `Rendering.to_pyvista`.  Points are as large as the pixels of a picture that is as high as the window.
     move_camera : bool
-        Put the plotter's camera where the picture was taken from.
+        True: give the plotter the camera of the picture.
     options
-        For `Rendering.to_pyvista`: `expected`, `distance`.
+        Options of `Rendering.to_pyvista`: `expected`, `distance`.
 
     Returns
     -------
@@ -47,7 +47,7 @@ def add_rendering(
     Raises
     ------
     UsageError
-        As of `Rendering.to_pyvista`.
+        As in `Rendering.to_pyvista`.
     """
     data = rendering_to_pyvista(rendering, form, **options)
     style = {}
@@ -62,22 +62,22 @@ def add_rendering(
 
 
 def merge_scene(plotter: Any, rendering: Rendering) -> Rendering:
-    """Draw the scene of a plotter as the picture's camera sees it, and put both together by their depths.
+    """Draw the scene of a plotter with the picture's camera, and combine both by their depths.
 
-    Each pixel of the picture is one layer at its expected depth, each of the scene one at its nearest surface: what
-    covers what is right wherever the nearer one is opaque.  The plotter keeps the picture's camera.
+    Each pixel of the picture is one layer at its expected depth, each pixel of the scene one at its nearest surface.
+    The order is right wherever the nearer layer is opaque.  The plotter keeps the picture's camera.
 
     Parameters
     ----------
     plotter : pyvista.Plotter
-        Its scene in LPS mm, its window as large as the picture; off screen, or shown already.
+        Plotter of a scene in LPS mm, with a window as large as the picture; off screen, or already shown.
     rendering : Rendering
         With a transparent background.
 
     Returns
     -------
     Rendering
-        With a transparent background still, and depths of both.
+        With a transparent background and the depths of both.
 
     Raises
     ------
@@ -104,13 +104,13 @@ def _place_camera(plotter: Any, camera: Camera) -> None:
 
 
 def _draw(plotter: Any, camera: Camera) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
-    """Colours with opacity and depths along the rays, mm, NaN where nothing is."""
+    """Return colours with opacity, and depths along the rays in mm, NaN where there is nothing."""
     renderer, window = plotter.renderer, plotter.render_window
     background, gradient = renderer.GetBackground(), renderer.GetGradientBackground()
     samples = window.GetMultiSamples()
     actors = [actor for actor in renderer.actors.values() if hasattr(actor, "GetForceOpaque")]
     translucent = [actor for actor in actors if not actor.GetForceOpaque()]
-    # VTK blends with the background's colour even where that is transparent: before black colours are times opacity.
+    # VTK blends with the background's colour even if it is transparent; with black, colours are multiplied by opacity.
     renderer.SetBackground(0.0, 0.0, 0.0)
     renderer.SetGradientBackground(False)
     try:

@@ -1,1 +1,1 @@
-"""What a picture shows in which colours: transfer functions, lighting, presets, windows."""
+"""Looks: colours and opacities of pictures, by transfer functions, lighting, presets and windows."""

@@ -29,11 +29,11 @@ COLORS = {
     "navy": "000080",
     "bone": "e3dac9",
 }
-"""Names that are known, with red, green and blue."""
+"""Known names of colours, with red, green and blue in hexadecimal."""
 
 
 def is_transparent(background: Any) -> bool:
-    """True for the name of no background."""
+    """True for the name that means no background."""
     return isinstance(background, str) and background == "transparent"
 
 
@@ -52,7 +52,7 @@ def find_color(color: str | Sequence[float]) -> Float64Array:
     Raises
     ------
     UsageError
-        None of these; the message lists the names.
+        `color` is none of these; the message lists the names.
     """
     if isinstance(color, str):
         text = color.strip().lower()

@@ -1,4 +1,4 @@
-"""Reading JSON that a stranger wrote: every refusal names the field and its place."""
+"""Strict reading of JSON from unknown sources: every refusal names the field and its place."""
 
 from __future__ import annotations
 
@@ -31,13 +31,13 @@ def parse_json(text: str) -> Any:
     Raises
     ------
     RefusedInputError
-        With line and column where the syntax is wrong.
+        The text is not strict JSON; the message has line and column of a syntax error.
     """
     try:
         return json.loads(text, parse_constant=_refuse_constant, object_pairs_hook=_unique)
     except json.JSONDecodeError as error:
         raise RefusedInputError(f"line {error.lineno}, column {error.colno}: no JSON: {error.msg}") from None
-    except ValueError as error:  # the hooks above, or a whole number of thousands of digits
+    except ValueError as error:  # raised by the hooks above, or by a whole number of thousands of digits
         raise RefusedInputError(f"no JSON: {str(error)[:200]}") from None
     except RecursionError:
         raise RefusedInputError("no JSON that can be read: nested too deep") from None
@@ -54,7 +54,7 @@ def _show(value: Any) -> str:
 def take_object(
     value: Any, where: str, known: Collection[str] | None = None, needed: Collection[str] = ()
 ) -> dict[str, Any]:
-    """An object; with `known`, no other field may be in it."""
+    """Return an object; if `known` is given, refuse other fields."""
     if not isinstance(value, dict):
         raise RefusedInputError(f"{where} is {_show(value)}, not an object")
     unknown = [key for key in value if known is not None and key not in known]
@@ -69,7 +69,7 @@ def take_object(
 
 
 def take_list(value: Any, where: str) -> list[Any]:
-    """A list with something in it."""
+    """Return a list that is not empty."""
     if not isinstance(value, list) or not value:
         raise RefusedInputError(
             f"{where} is {'empty' if value == [] else _show(value)}, not a list with something in it"
@@ -78,7 +78,7 @@ def take_list(value: Any, where: str) -> list[Any]:
 
 
 def take_number(value: Any, where: str) -> float:
-    """A finite number."""
+    """Return a finite number."""
     try:
         number = float(value) if isinstance(value, (int, float)) and not isinstance(value, bool) else math.nan
     except OverflowError:
@@ -89,14 +89,14 @@ def take_number(value: Any, where: str) -> float:
 
 
 def take_text(value: Any, where: str) -> str:
-    """A text."""
+    """Return a text."""
     if not isinstance(value, str):
         raise RefusedInputError(f"{where} is {_show(value)}, not a text")
     return value
 
 
 def take_color(value: Any, where: str) -> tuple[float, float, float]:
-    """Red, green, blue: three numbers, or a text ``#rrggbb``."""
+    """Return red, green, blue from three numbers or from a text ``#rrggbb``."""
     if isinstance(value, str) and len(value) == 7 and value[0] == "#":
         try:
             digits = bytes.fromhex(value[1:])

@@ -17,21 +17,21 @@ from clrecon.system.messages import Message
 __all__ = ["LabelStyle", "distinct_colors"]
 
 NO_COLOR = (-1.0, -1.0, -1.0)
-"""In the table: the colour that is there without labels."""
+"""Colour in the table that means: keep the colour of the picture without labels."""
 
 GOLDEN_SHARE = 0.618034
-"""Of the circle of hues, from one colour to the next: however many are taken, they lie apart."""
+"""Step from one hue to the next, as a share of the circle: any number of colours made with it stay distinct."""
 
 
 @dataclass(frozen=True)
 class LabelStyle(Message):
-    """How the labels of a map look; what has no label, or is not named, looks as it does without.
+    """The look of the labels of a map; voxels without a label, and labels that are not named, keep their look.
 
     Attributes
     ----------
     labels : LabelMap
     table : ndarray, shape (largest number + 1, 4), float32
-        Red, green, blue and opacity by number, 0 to 1; red below 0 keeps the colour that is there without labels.
+        Red, green, blue and opacity by number, 0 to 1; red below 0 keeps the colour of the picture without labels.
     """
 
     labels: LabelMap
@@ -53,7 +53,7 @@ class LabelStyle(Message):
         labels : LabelMap
         colors : mapping of label to colour, optional
             Labels by number or name as `LabelMap.find` takes them, colours as `find_color` does.  Labels that are not
-            named keep the colour of the picture; without any mapping every label has a colour of its own, see
+            named keep the colour of the picture; without a mapping every label gets its own colour, see
             `distinct_colors`.
         opacity : mapping of label to float, optional
             0 to 1: a factor on the opacity; labels that are not named keep theirs.
@@ -61,7 +61,8 @@ class LabelStyle(Message):
         Raises
         ------
         UsageError
-            Not a label map, an unknown label or colour, an opacity outside of 0 to 1, or a label named twice.
+            `labels` is not a label map, a label or colour is unknown, an opacity is outside 0 to 1, or a label is named
+            twice.
         """
         if not isinstance(labels, LabelMap):
             raise UsageError(f"labels are a LabelMap, see clrecon.read_labels, not {type(labels).__name__}")
@@ -78,7 +79,7 @@ class LabelStyle(Message):
 
     @property
     def is_opaque(self) -> bool:
-        """True when no label lets anything through."""
+        """True when all labels have full opacity."""
         return bool((self.table[:, 3] >= 1.0).all())
 
 
@@ -107,7 +108,7 @@ def _check_opacity(name: str, factor: float) -> float:
 
 
 def distinct_colors(count: int) -> NDArray[np.float64]:
-    """Colours (count, 3) from 0 to 1 that lie apart in hue; the first ones are the same for every `count`."""
+    """Return colours (count, 3) from 0 to 1 with distinct hues; the first ones are the same for every `count`."""
     hues = (0.08 + GOLDEN_SHARE * np.arange(count)) % 1.0
     bright = (0.95, 0.8)
     colors = [colorsys.hsv_to_rgb(hue, 0.55 + 0.2 * (n % 3 == 1), bright[n % 2]) for n, hue in enumerate(hues)]

@@ -1,4 +1,4 @@
-"""Light on shaded pictures, after Phong 1975, "Illumination for computer generated pictures"."""
+"""Lighting of shaded pictures, after Phong 1975, "Illumination for computer generated pictures"."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from clrecon.errors import UsageError
 __all__ = ["LEAST_SOFT_GRADIENT", "UNSHADED", "Lighting"]
 
 LEAST_SOFT_GRADIENT = 0.01
-"""HU per mm: what float32 leaves of differences where the field is flat is a hundredth of it."""
+"""Least gradient in HU per mm that is shaded; rounding errors of float32 in a flat field are a hundredth of it."""
 
 
 def _number(name: str, value: Any, low: float, high: float) -> float:
@@ -28,15 +28,15 @@ def _number(name: str, value: Any, low: float, high: float) -> float:
 
 @dataclass(frozen=True)
 class Lighting:
-    """How a surface with unit normal n, seen from v and lit from l, takes its colour c.
+    """The colour of a surface with unit normal n and colour c, seen from direction v and lit from direction l.
 
     ``c * (ambient + diffuse * n . l) + specular * (n . h) ** specular_power`` with h halfway between l and v, and n
-    turned to v; where n . l is not above 0 only the ambient light is left.  Colours beyond 1 are cut.  Ambient 1
-    without diffuse and specular light is no shading (`UNSHADED`).
+    turned towards v.  Where n . l is not above 0, only the ambient light remains.  Colours above 1 become 1. Ambient 1
+    without diffuse and specular light means no shading (`UNSHADED`).
 
-    In volume rendering n is the direction of the gradient, which says little where the gradient g is small: in the
-    middle of thin bone, and in noise.  There the light fades, with ``s = |g|^2 / (|g|^2 + soft_gradient^2)``, from
-    Phong's (s = 1) to all of the diffuse and none of the specular light (s = 0).
+    In volume rendering n is the direction of the gradient g.  It is unreliable where g is small: in the middle of thin
+    bone, and in noise.  There the light changes, with ``s = |g|^2 / (|g|^2 + soft_gradient^2)``, from Phong's formula
+    (s = 1) to full diffuse and no specular light (s = 0).
 
     Attributes
     ----------
@@ -45,16 +45,15 @@ class Lighting:
     specular_power : float
         Sharpness of the highlight, 1 to 128.
     soft_gradient : float
-        HU per mm, 0 to 10,000: the gradient that has half of its shading in volume rendering; 0 shades all alike
-        but what is flat (`LEAST_SOFT_GRADIENT`).
+        HU per mm, 0 to 10,000: the gradient that gets half of its shading in volume rendering; 0 shades all gradients
+        alike, except in flat fields (`LEAST_SOFT_GRADIENT`).
     direction : (float, float, float) or None
-        From the patient towards a light that stays where it is, LPS, kept as a unit vector; None is a light at the
-        camera.
+        Direction from the patient towards a fixed light, LPS, kept as a unit vector; None is a light at the camera.
 
     Raises
     ------
     UsageError
-        A number beyond its range, or a direction that is not three finite numbers or has no length.
+        A number is out of range, or the direction is not three finite numbers or has no length.
     """
 
     ambient: float = 0.2
@@ -82,15 +81,15 @@ class Lighting:
             raise UsageError(
                 f"the direction of a light is three finite numbers in LPS that are not all 0, not {direction!r}"
             )
-        vector = vector / np.abs(vector).max()  # lengths of 1e200 and 1e-200 keep their direction
+        vector = vector / np.abs(vector).max()  # very long and very short vectors (1e200, 1e-200) keep their direction
         x, y, z = (vector / np.linalg.norm(vector)).tolist()
         return x, y, z
 
     @property
     def shades(self) -> bool:
-        """False where the normal plays no part, so that nobody needs to compute it."""
+        """False where the normal has no effect and need not be computed."""
         return self.diffuse > 0.0 or self.specular > 0.0
 
 
 UNSHADED = Lighting(ambient=1.0, diffuse=0.0, specular=0.0, specular_power=1.0)
-"""Colours as the transfer function says, without any light."""
+"""Shows the colours of the transfer function itself, without light."""

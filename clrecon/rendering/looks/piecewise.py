@@ -1,4 +1,4 @@
-"""Piecewise linear functions with steps, as transfer functions are made of.
+"""Piecewise linear functions with steps, the parts of transfer functions.
 
 A curve is `positions` (n,), ascending, and `values` (n, k), both float64; two points at one position are a step, where
 the second counts from that position on.  Beyond its ends a curve is constant.
@@ -14,16 +14,16 @@ from clrecon.geometry.affine import Float64Array
 __all__ = ["check_ascending", "check_share", "evaluate_curve", "merge_curves", "straighten_curve"]
 
 STRAIGHT_PARTS = 32
-"""Straight parts in place of a bent one: at most 0.003 of its rise off."""
+"""Number of straight parts that replace a bent one; the error is at most 0.003 of its rise."""
 
 
 def check_ascending(what: str, unit: str, positions: Float64Array) -> None:
-    """Refuse positions (n,) that go back, and more than two in one place.
+    """Refuse positions (n,) that descend, and more than two at one place.
 
     Raises
     ------
     UsageError
-        With the two numbers and their place; points are counted from 1.
+        The message has the two numbers and their place; points are counted from 1.
     """
     back = np.flatnonzero(np.diff(positions) < 0)
     if back.size:
@@ -52,29 +52,31 @@ def check_share(what: str, value: float, at: int, advice: str = "") -> None:
 
 
 def evaluate_curve(positions: Float64Array, values: Float64Array, at: Float64Array, left: bool = False) -> Float64Array:
-    """Values (..., k) of a curve at positions (...,); `left` takes a step's first point where it is."""
-    if left:  # in the mirror it is the second one
+    """Return values (..., k) of a curve at positions (...,); with `left`, a step has the value of its first point."""
+    if left:  # mirrored, it is the second point
         positions, values, at = -positions[::-1], values[::-1], -at
-    # np.interp takes the last of equal positions: it looks for the place with positions[n] <= at < positions[n + 1].
+    # np.interp uses the last of equal positions: it searches the place with positions[n] <= at < positions[n + 1].
     return np.stack([np.interp(at, positions, column) for column in values.T], axis=-1)
 
 
 def merge_curves(first: tuple[Float64Array, Float64Array], second: tuple[Float64Array, Float64Array]) -> Float64Array:
-    """Points (n, 1 + k + l) of two curves over the same axis: position, values of the first, values of the second."""
+    """Merge two curves over the same axis into points (n, 1 + k + l): position, values of the first, of the second."""
     steps = {at for positions, _ in (first, second) for at in positions[1:][positions[1:] == positions[:-1]].tolist()}
     rows = []
     for position in np.unique(np.concatenate([first[0], second[0]])):
         at = np.array([position])
-        # Elsewhere both sides are equal but for rounding.
+        # Elsewhere both sides are equal except for rounding.
         for left in (True, False) if float(position) in steps else (False,):
             rows.append(np.concatenate([at, evaluate_curve(*first, at, left)[0], evaluate_curve(*second, at, left)[0]]))
     return np.array(rows)
 
 
 def _bend(sharpness: float) -> tuple[Float64Array, Float64Array]:
-    """Shares of the way and of the rise at which to break a bent way, half way up at 0.5: vtkPiecewiseFunction.
+    """Return shares of the way and of the rise at which a bent part (vtkPiecewiseFunction) is broken into straight
+    ones.
 
-    Breaks are spread over VTK's own parameter s, so that they are dense where the way is steep, and towards its ends.
+    The rise is one half at 0.5. Breaks are evenly spaced in VTK's own parameter s, so they are dense where the way is
+    steep, and towards its ends.
     """
     t = np.arange(1, STRAIGHT_PARTS) / STRAIGHT_PARTS
     s = np.where(t < 0.5, 2.0 * t * t, 1.0 - 2.0 * (1.0 - t) ** 2)
@@ -87,10 +89,10 @@ def _bend(sharpness: float) -> tuple[Float64Array, Float64Array]:
 def straighten_curve(
     positions: Float64Array, values: Float64Array, midpoints: Float64Array, sharpness: Float64Array, steps: bool
 ) -> tuple[Float64Array, Float64Array]:
-    """A curve from VTK's nodes: `midpoints` and `sharpness` (n,) bend the way from each node to the next one.
+    """Make a curve from VTK's nodes: `midpoints` and `sharpness` (n,) bend the part from each node to the next one.
 
-    Straight to the midpoint and on where sharpness is below 0.01, else `STRAIGHT_PARTS` straight parts; with `steps`
-    (VTK's colours, not its opacities) a step at the midpoint above 0.99.
+    Where sharpness is below 0.01, straight to the midpoint and straight on; else `STRAIGHT_PARTS` straight parts.  With
+    `steps` (VTK's colours, not its opacities) there is a step at the midpoint above 0.99.
     """
     out_positions, out_values = [positions[:1]], [values[:1]]
     for n in range(positions.size - 1):

@@ -1,7 +1,7 @@
-"""Rendering presets: transfer function, light, mode and window by what a picture shows.
+"""Rendering presets: transfer function, light, mode and window for pictures of one tissue.
 
-Not to be mixed up with the presets of iso values in `clrecon.jobs.mesh.presets`: some have the same name, because they
-show the same tissue, as a surface there and through opacities here.
+Do not confuse them with the presets of iso values in `clrecon.jobs.mesh.presets`. Some have the same name, because they
+show the same tissue: there as a surface, here through opacities.
 """
 
 from __future__ import annotations
@@ -19,20 +19,20 @@ DEFAULT_PRESET = "bone"
 
 @dataclass(frozen=True)
 class Preset:
-    """How a picture is made that shows one thing well.
+    """A way to make a picture that shows one tissue well.
 
     Attributes
     ----------
     name : str
     mode : str
-        The mode that it is made for: "dvr", "mip", "minip" or "drr".  A picture takes it unless told another one, so
+        The mode that it is made for: "dvr", "mip", "minip" or "drr". It is used unless the caller names another one, so
         that ``x-ray`` alone gives a radiograph.
     transfer_function : TransferFunction
-        With its `lighting`; used in "dvr".
+        Transfer function with its `lighting`; used in "dvr".
     window : (float, float) or None
-        HU of black and of white in projections (of "drr" there is none); None lets the picture's own values decide.
+        HU of black and of white in projections ("drr" has none); None: chosen from the picture's own values.
     source : str
-        Where the ranges come from.
+        Origin of the ranges.
     """
 
     name: str
@@ -43,16 +43,16 @@ class Preset:
 
     @property
     def description(self) -> str:
-        """What the picture shows, one line."""
+        """One line about what the picture shows."""
         return self.transfer_function.description
 
     @property
     def lighting(self) -> Lighting:
-        """The light that it is made for; `UNSHADED` has no shading."""
+        """The light that it is made for; `UNSHADED` for no shading."""
         return self.transfer_function.lighting or UNSHADED
 
 
-# Colours of what CT shows, as anatomical atlases print them.
+# Colours of tissues, as in printed anatomical atlases.
 _BLOOD = (0.50, 0.13, 0.10)
 _MUSCLE = (0.70, 0.30, 0.24)
 _FAT = (0.92, 0.82, 0.62)
@@ -64,7 +64,8 @@ _DENSE = (1.00, 0.99, 0.95)
 _STEEL = (0.72, 0.80, 0.90)
 
 SOFT_GRADIENT = 25.0
-"""HU per mm.  Surfaces of bone have 100 to 1000, noise of 10 HU in voxels of 0.7 mm 10 to 15."""
+"""`Lighting.soft_gradient` for bone, HU per mm.  Surfaces of bone have 100 to 1000; noise of 10 HU in voxels of 0.7 mm
+has 10 to 15."""
 
 _MATT = Lighting(ambient=0.25, diffuse=0.85, specular=0.15, specular_power=12.0, soft_gradient=SOFT_GRADIENT)
 _SOFT = replace(_MATT, soft_gradient=0.3 * SOFT_GRADIENT)  # where muscle meets fat are 30 to 100 HU per mm
@@ -235,7 +236,7 @@ def find_preset(name: str) -> Preset:
     Raises
     ------
     UsageError
-        There is none; the message lists what there is.
+        There is no preset of this name; the message lists all names.
     """
     try:
         return PRESETS[name]

@@ -1,7 +1,8 @@
 """Volume properties of 3D Slicer (.vp, .vp.json, presets.xml and scenes) and opacity maps of ParaView (.json).
 
-Slicer documents its formats in its developer guide, "Volume rendering".  Each function returns the names of what a text
-holds, and for each a function that makes the parameters of a `TransferFunction`: one that is not wanted may be faulty.
+Slicer documents its formats in its developer guide, "Volume rendering". Each function returns the names in a text, and
+for each a function that makes the parameters of a `TransferFunction`. So faulty entries do no harm if they are not
+wanted.
   All of them raise `RefusedInputError` with the place in the file.
 """
 
@@ -23,10 +24,11 @@ from clrecon.rendering.looks.vtk import curve_from_nodes, gradient_points
 __all__ = ["Entry", "read_paraview_json", "read_slicer_json", "read_slicer_text", "read_slicer_xml"]
 
 Entry = tuple[str, Callable[[], dict[str, Any]]]
-"""A name, empty where there is none, and what makes the parameters."""
+"""A name, empty where the file has none, and the function that makes the parameters."""
 
 GRADIENT_VOXEL_MM = 1.0
-"""VTK's gradients are in HU per voxel; a file does not say of what size, so they are taken as HU per mm."""
+"""Voxel size for gradients: VTK's are in HU per voxel, of a size that a file does not state, so they are taken as HU
+per mm."""
 
 _LINES = (
     "interpolation", "shade", "diffuse", "ambient", "specular", "specularPower", "scalarOpacity", "gradientOpacity",
@@ -45,7 +47,9 @@ def _number(text: str, what: str) -> float:
 
 
 def _nodes(text: str, what: str, width: int) -> Float64Array:
-    """Nodes (n, width + 2) of ``COUNT X VALUES X VALUES ...``, with VTK's midpoint and sharpness of a straight way."""
+    """Return nodes (n, width + 2) of ``COUNT X VALUES X VALUES ...``, with VTK's midpoint and sharpness of a straight
+    part.
+    """
     words = text.split()
     numbers = np.array([_number(word, f"number {n + 1} of {what}") for n, word in enumerate(words)])
     if not numbers.size or numbers[0] != numbers.size - 1 or (numbers.size - 1) % width or numbers.size == 1:
@@ -57,7 +61,9 @@ def _nodes(text: str, what: str, width: int) -> Float64Array:
 
 
 def _parameters(texts: Mapping[str, str], place: Callable[[str], str]) -> dict[str, Any]:
-    """Parameters from the words that .vp lines and XML attributes share; `place` says where a field is."""
+    """Make the parameters from the words that .vp lines and XML attributes share; `place` describes the place of a
+    field.
+    """
 
     def number(name: str, default: float) -> float:
         text = texts.get(name, "").strip()
@@ -74,7 +80,7 @@ def _parameters(texts: Mapping[str, str], place: Callable[[str], str]) -> dict[s
         gradient = gradient_points(curve_from_nodes(what, _nodes(texts["gradientOpacity"], what, 2)), GRADIENT_VOXEL_MM)
     lighting = UNSHADED
     if number("shade", 0.0) != 0.0:
-        # What VTK takes where nothing is said.
+        # VTK's default
         lighting = Lighting(
             number("ambient", 0.1), number("diffuse", 0.7), number("specular", 0.2), number("specularPower", 10.0)
         )
@@ -82,13 +88,15 @@ def _parameters(texts: Mapping[str, str], place: Callable[[str], str]) -> dict[s
 
 
 def read_slicer_text(text: str) -> list[Entry]:
-    """A .vp file: nine lines, of which one that is empty says nothing."""
+    """Read a .vp file: nine lines, of which empty ones mean the default."""
     lines = dict(zip(_LINES, text.splitlines(), strict=False))
     return [("", lambda: _parameters(lines, lambda name: f"line {_LINES.index(name) + 1} ({name})"))]
 
 
 def read_slicer_xml(data: bytes) -> list[Entry]:
-    """Every ``VolumeProperty`` of presets.xml or of a .mrml scene.  A DOCTYPE is refused: entities start there."""
+    """Read every ``VolumeProperty`` of presets.xml or of a .mrml scene.  A DOCTYPE is refused, because it can define
+    entities.
+    """
     parser = expat.ParserCreate()
     entries: list[Entry] = []
 
@@ -109,7 +117,7 @@ def read_slicer_xml(data: bytes) -> list[Entry]:
         parser.Parse(data, True)
     except expat.ExpatError as error:
         raise RefusedInputError(f"line {error.lineno}: no XML: {expat.errors.messages[error.code]}") from None
-    except (ValueError, LookupError) as error:  # an encoding that is not known
+    except (ValueError, LookupError) as error:  # unknown encoding
         raise RefusedInputError(f"no XML that can be read: {error}") from None
     if not entries:
         raise RefusedInputError("it has no VolumeProperty, as presets.xml of 3D Slicer has them")
@@ -173,7 +181,7 @@ def _name(value: Any, field: str) -> str:
 
 
 def read_slicer_json(value: Any) -> list[Entry]:
-    """A .vp.json file; of each property its first component."""
+    """Read a .vp.json file; of each property only the first component."""
     properties = take_list(value["volumeProperties"], "volumeProperties")
 
     def entry(n: int) -> Entry:
@@ -205,7 +213,7 @@ def _paraview_parameters(value: Any, where: str) -> dict[str, Any]:
 
 
 def read_paraview_json(value: list[Any]) -> list[Entry]:
-    """A list of ParaView's colour maps with opacities; positions are HU."""
+    """Read a list of ParaView's colour maps with opacities; positions are HU."""
 
     def entry(n: int) -> Entry:
         return _name(value[n], "Name"), lambda: _paraview_parameters(value[n], f"map {n + 1}")

@@ -1,4 +1,4 @@
-"""Where a transfer function is so steep that volume rendering takes its segments in parts."""
+"""Steepness of a transfer function: where it is steep, volume rendering divides its segments into parts."""
 
 from __future__ import annotations
 
@@ -20,23 +20,24 @@ DENSE = 0.7
 """Opacity of a ray step of which only the front is seen."""
 
 STEEP_HU = 50.0
-"""Where it takes more HU, segments in parts are no better than their samples alone, and cost time."""
+"""Widest range of HU for the change `STEEP`. Over wider ranges, parts are no better than the samples alone, and cost
+time."""
 
 
 @dataclass(frozen=True)
 class Steepness:
-    """How steep a table of opacities over one ray step is.
+    """The steepness of a table of opacities over one ray step.
 
     Attributes
     ----------
     changes : ndarray, shape (nodes,), float64
-        How much the opacity changes up to each node, up or down.
+        Sum of the changes of opacity, up and down, from the first node to each node.
     narrow : float
-        Nodes within which it changes by no more than `STEEP`.
+        Number of nodes within which the opacity changes by at most `STEEP`.
     has_dense : bool
-        Whether it is above `DENSE` anywhere.
+        True: the opacity is above `DENSE` somewhere.
     is_steep : bool
-        Whether it changes by more than `STEEP` within `STEEP_HU`.
+        True: the opacity changes by more than `STEEP` within `STEEP_HU` somewhere.
     """
 
     changes: NDArray[np.float64]
@@ -46,11 +47,11 @@ class Steepness:
 
     @classmethod
     def of(cls, opacities: NDArray[np.float32], nodes_per_hu: float) -> Steepness:
-        """That of opacities (nodes,) over one ray step."""
+        """Compute the steepness of opacities (nodes,) over one ray step."""
         changes = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(opacities.astype(np.float64))))])
         ends = np.searchsorted(changes, changes + STEEP, side="right")
         reached = ends < len(changes)
         apart = (ends - np.arange(len(changes)))[reached]
-        # Values that far apart may be rounded to nodes that are one more.
+        # Values this far apart may be rounded to nodes that are one more apart.
         narrow = float(max(apart.min() - 1, 0)) if len(apart) else float(len(changes))
         return cls(changes, narrow, bool((opacities > DENSE).any()), narrow <= STEEP_HU * nodes_per_hu)

@@ -1,4 +1,4 @@
-"""`load_transfer_function`: one door for files with transfer functions.
+"""`load_transfer_function`: reads every kind of file with transfer functions.
 
 Our own form is JSON, described in docs/transfer_functions.md.
 """
@@ -38,28 +38,29 @@ _LIGHT = ("ambient", "diffuse", "specular", "specular_power", "soft_gradient", "
 def load_transfer_function(path: str | os.PathLike[str], name: str | None = None) -> TransferFunction:
     """Read a transfer function: clrecon's JSON, 3D Slicer's .vp, .vp.json, presets.xml and .mrml, ParaView's .json.
 
-    The kind is told from the content.  Files of Slicer keep no unit distance but in .vp.json; it is 1 mm, as in
-    Slicer.  Their gradient opacity is in HU per voxel and taken as HU per mm; where it is 1 throughout, as in all
-    presets of Slicer, there is none.
+    The kind is told from the content.  Of Slicer's files only .vp.json keeps a unit distance; for the others it is 1
+    mm, as in Slicer.  Their gradient opacity is in HU per voxel and is taken as HU per mm; where it is 1 everywhere, as
+    in all presets of Slicer, it is left out.
 
     Parameters
     ----------
     path : path
     name : str, optional
-        Which one of a file with several: its name in any case, or its number from 1.  A file with one needs none.
+        Name (in any case) or number (from 1) of the wanted function in a file with several.
 
     Returns
     -------
     TransferFunction
-        With the light of the file (`UNSHADED` where its shading is off; None where the form knows of no light).
+        With the light of the file (`UNSHADED` where its shading is off; None where the format has no light).
 
     Raises
     ------
     UsageError
-        There is no such file, or not that name in it, or none was given for several; the message lists them.
+        The file does not exist, does not contain the name, or holds several functions and no name was given; the
+        message lists the names.
     RefusedInputError
-        It is no regular file, larger than a megabyte, of no known form, or something in it is wrong; the message
-        says the file, the field and its place.
+        The file is not a regular file, is larger than a megabyte, has an unknown format, or contains an error; the
+        message has the file, the field and its place.
     """
     shown = repr(Path(path).name[:200])
     try:
@@ -77,7 +78,7 @@ def load_transfer_function(path: str | os.PathLike[str], name: str | None = None
 
 
 class _Choice(UsageError):
-    """What the caller asked for is wrong, not the file."""
+    """The caller's choice is wrong, not the file."""
 
 
 def _read(path: Path, shown: str) -> bytes:

@@ -18,13 +18,15 @@ from clrecon.system.messages import Message
 __all__ = ["TransferFunction"]
 
 UNIT_LIMIT_MM = 1e9
-"""Of the unit distance, and one by it: float32 holds what a ray step makes of them."""
+"""Largest unit distance in mm; its inverse is the smallest.  float32 can hold all values that a ray step computes from
+them."""
 
 HU_LIMIT = 1e6
-"""Far beyond any scale of CT values; float32 still tells whole HU apart there."""
+"""Largest HU, far beyond any scale of CT values; float32 still distinguishes whole HU there."""
 
 END_STEP_HU = 1.0
-"""How far `TransferFunction.range_hu` goes beyond a step at its end, so that both of its sides are within."""
+"""Distance by which `TransferFunction.range_hu` extends beyond a step at its end, so that both sides of it are
+included."""
 
 COLUMNS = ("red", "green", "blue", "opacity")
 
@@ -48,8 +50,8 @@ def _numbers(what: str, form: str, rows: ArrayLike, width: int) -> Float64Array:
 class TransferFunction(Message):
     """Colour and opacity by HU, linear between points and constant beyond the first and the last.
 
-    It cannot be changed once it is made: `scaled` and `shifted` return new ones.  Two are equal when they would give
-    the same picture, whatever their names.
+    It is immutable: `scaled` and `shifted` return new ones.  Two are equal when they give the same picture, even if
+    their names differ.
 
     Parameters
     ----------
@@ -57,21 +59,21 @@ class TransferFunction(Message):
         At least one.  HU ascends; two points at one HU are a step, where the second counts from that HU on.  Colours
         and opacity 0 to 1.
     unit_distance : float
-        Way in mm through which a sample's opacity is what the points say (VTK's ScalarOpacityUnitDistance): over
-        d mm it is ``1 - (1 - opacity) ** (d / unit_distance)``.
+        Distance in mm for which the opacities of the points hold (VTK's ScalarOpacityUnitDistance): over d mm the
+        opacity is ``1 - (1 - opacity) ** (d / unit_distance)``.
     gradient_opacity : sequence of (HU per mm, factor), optional
         Factor on the opacity by magnitude of the gradient, 0 to 1, linear between points, with steps as above (Levoy
         1988, "Display of surfaces from volume data").
     lighting : Lighting, optional
-        The light that it was made for; None leaves it to the picture.
+        The light that it was made for; None: the picture's own.
     name, description : str
 
     Raises
     ------
     UsageError
-        No points, not five numbers each, not finite, HU going back, more than two points at one HU or HU beyond a
-        million, colours or opacities outside of 0..1, a unit distance that is not positive; the same for the gradient
-        opacity.  The message names the point, counted from 1.
+        There are no points; points are not five finite numbers each; HU descend, exceed a million, or are shared by
+        more than two points; colours or opacities are outside 0..1; the unit distance is not positive; or the gradient
+        opacity has a fault of these kinds.  The message names the point, counted from 1.
     """
 
     def __init__(
@@ -128,17 +130,17 @@ class TransferFunction(Message):
 
     @property
     def points(self) -> Float64Array:
-        """HU, red, green, blue, opacity of each point (n, 5), float64, read-only."""
+        """HU, red, green, blue and opacity of each point (n, 5), float64, read-only."""
         return self._points
 
     @property
     def unit_distance(self) -> float:
-        """Way in mm through which the opacities hold."""
+        """Distance in mm for which the opacities hold."""
         return self._unit_distance
 
     @property
     def gradient_opacity(self) -> Float64Array | None:
-        """HU per mm and factor of each point (m, 2), float64, read-only; None leaves opacities as they are."""
+        """HU per mm and factor of each point (m, 2), float64, read-only; None without gradient opacity."""
         return self._gradient_opacity
 
     @property
@@ -148,19 +150,20 @@ class TransferFunction(Message):
 
     @property
     def name(self) -> str:
-        """What it is called; may be empty."""
+        """Its name; may be empty."""
         return self._name
 
     @property
     def description(self) -> str:
-        """What it shows; may be empty."""
+        """One line about what it shows; may be empty."""
         return self._description
 
     @property
     def range_hu(self) -> tuple[float, float]:
-        """HU beyond which nothing changes: of the first and of the last point, and `END_STEP_HU` more beyond a step.
+        """HU beyond which the function is constant: those of the first and the last point, and `END_STEP_HU` more at a
+        step.
 
-        The first of them is always the lower one.
+        The first is always lower than the second.
         """
         hu = self._points[:, 0]
         low, high = float(hu[0]), float(hu[-1])
@@ -171,28 +174,33 @@ class TransferFunction(Message):
         )
 
     def __call__(self, hu: ArrayLike) -> Float64Array:
-        """Red, green, blue and opacity (..., 4), float64, at HU values (...,); a step has its second point's."""
+        """Return red, green, blue and opacity (..., 4), float64, at HU values (...,); at a step those of its second
+        point.
+        """
         return evaluate_curve(self._points[:, 0], self._points[:, 1:], np.asarray(hu, dtype=np.float64))
 
     def table(self, low: float, high: float, nodes: int) -> NDArray[np.float32]:
-        """Red, green, blue, opacity (nodes, 4), float32, at `nodes` HU evenly from low to high, both included.
+        """Return red, green, blue, opacity (nodes, 4), float32, at `nodes` evenly spaced HU from low to high, both
+        included.
 
         Raises
         ------
         UsageError
-            Fewer than two nodes, or not two finite HU of which the second is no lower.
+            There are fewer than two nodes, or `low` and `high` are not finite or descend.
         """
         return self(_nodes(low, high, nodes)).astype(np.float32)
 
     def gradient_factor(self, magnitude: ArrayLike) -> Float64Array:
-        """Factor on the opacity (...,), float64, at magnitudes of the gradient (...,) in HU per mm; 1 without any."""
+        """Return the factor on the opacity (...,), float64, at magnitudes of the gradient (...,) in HU per mm; 1
+        without one.
+        """
         at = np.asarray(magnitude, dtype=np.float64)
         if self._gradient_opacity is None:
             return np.ones(at.shape)
         return evaluate_curve(self._gradient_opacity[:, 0], self._gradient_opacity[:, 1:], at)[..., 0]
 
     def gradient_table(self, high: float, nodes: int) -> NDArray[np.float32]:
-        """`gradient_factor` (nodes,), float32, at `nodes` magnitudes evenly from 0 to high HU per mm, both included.
+        """Return `gradient_factor` (nodes,), float32, at `nodes` evenly spaced magnitudes from 0 to `high` HU per mm.
 
         Raises
         ------
@@ -202,12 +210,12 @@ class TransferFunction(Message):
         return self.gradient_factor(_nodes(0.0, high, nodes)).astype(np.float32)
 
     def changed(self, **changes: Any) -> TransferFunction:
-        """Return the same with other parameters, named as at its making."""
+        """Return a copy with other parameters, named as in the constructor."""
         own = {name: getattr(self, name) for name in ("points", "unit_distance", "gradient_opacity", "lighting")}
         return TransferFunction(**{**own, "name": self._name, "description": self._description, **changes})
 
     def scaled(self, opacity: float) -> TransferFunction:
-        """Return the same with every opacity times `opacity`, at most 1.
+        """Return a copy with every opacity multiplied by `opacity`, at most 1.
 
         Raises
         ------
@@ -221,12 +229,12 @@ class TransferFunction(Message):
         return self.changed(points=points)
 
     def shifted(self, hu: float) -> TransferFunction:
-        """Return the same, every point `hu` HU further up.
+        """Return a copy with every point moved up by `hu`.
 
         Raises
         ------
         UsageError
-            Beyond a million HU.
+            A point would be beyond a million HU.
         """
         points = self._points.copy()
         points[:, 0] += hu
@@ -234,19 +242,19 @@ class TransferFunction(Message):
 
     @classmethod
     def from_window(cls, low: float, high: float, **parameters: Any) -> TransferFunction:
-        """Return grey from black at `low` HU to white at `high` HU, opacity alike: a window for projections.
+        """Return a window for projections: grey from black at `low` HU to white at `high` HU, with opacity from 0 to 1.
 
         Parameters
         ----------
         low, high : float
             HU.  A `low` above `high` makes the lowest HU white (and opaque).
         **parameters
-            What `TransferFunction` takes beside the points.
+            Further parameters of `TransferFunction`.
 
         Raises
         ------
         UsageError
-            Both are equal or not finite.
+            `low` and `high` are equal or not finite.
         """
         if low == high:
             raise UsageError(f"a window needs two different HU, not {low:g} twice")
@@ -257,7 +265,7 @@ class TransferFunction(Message):
     def from_pyvista(
         cls, cmap: Any, opacity: Any, clim: tuple[float, float], *, unit_distance: float = 1.0, **parameters: Any
     ) -> TransferFunction:
-        """Return what `pyvista.Plotter.add_volume` makes of a colour map, an opacity and limits in HU.
+        """Return the function that `pyvista.Plotter.add_volume` makes of a colour map, an opacity and limits in HU.
 
         Parameters
         ----------
@@ -269,14 +277,14 @@ class TransferFunction(Message):
         clim : (float, float)
             HU of the first and of the last colour.
         unit_distance : float
-            mm; pyvista's ``opacity_unit_distance``, which it takes from the size of the volume unless told.
+            mm; pyvista's ``opacity_unit_distance``, whose default there depends on the size of the volume.
         **parameters
-            What `TransferFunction` takes besides.
+            Further parameters of `TransferFunction`.
 
         Raises
         ------
         UsageError
-            pyvista does not know them.
+            pyvista does not know the colour map or the opacity.
         """
         from clrecon.rendering.looks.vtk import points_from_pyvista
 
@@ -284,20 +292,20 @@ class TransferFunction(Message):
 
     @classmethod
     def from_vtk(cls, volume_property: Any, *, voxel_mm: float = 1.0, **parameters: Any) -> TransferFunction:
-        """Return what a vtkVolumeProperty (or pyvista's) says of the first component: colours, opacities, light.
+        """Return the function of the first component of a vtkVolumeProperty (or pyvista's): colours, opacities, light.
 
         Parameters
         ----------
         volume_property : vtkVolumeProperty or pyvista.VolumeProperty
         voxel_mm : float
-            VTK takes gradients in HU per this length, the mean of the three spacings of its volume.
+            Length in mm of VTK's unit of gradients: the mean of the three spacings of its volume.
         **parameters
-            What `TransferFunction` takes beside what the property says.
+            Further parameters of `TransferFunction`.
 
         Raises
         ------
         UsageError
-            It holds no colours or opacities, or some that are out of range.
+            It has no colours or opacities, or some are out of range.
         """
         from clrecon.rendering.looks.vtk import parameters_from_vtk
 
@@ -306,8 +314,7 @@ class TransferFunction(Message):
     def to_vtk(self, *, voxel_mm: float = 1.0) -> Any:
         """Return a vtkVolumeProperty: colours, opacities, unit distance, light (`Lighting()` where it has none).
 
-        A light with a direction has no place in it, nor one that fades with the gradient.  `voxel_mm` as in
-        `from_vtk`.
+        It cannot hold a light with a direction or one that fades with the gradient.  `voxel_mm` as in `from_vtk`.
         """
         from clrecon.rendering.looks.vtk import property_to_vtk
 
@@ -319,7 +326,7 @@ class TransferFunction(Message):
         Raises
         ------
         OutputError
-            It cannot be written; an older file of that name is intact.
+            The file cannot be written; an older file of that name is intact.
         """
         from clrecon.rendering.looks.transfer_text import transfer_text
         from clrecon.system.files import replace_file

@@ -15,12 +15,12 @@ VERSION = 1
 def transfer_text(
     head: Mapping[str, Any], points: Sequence[Sequence[float]], gradient_opacity: Sequence[Sequence[float]] | None
 ) -> str:
-    """Write a transfer function as text; reading it gives the same, to the bit.
+    """Return a transfer function as text; reading it gives the same function, bit for bit.
 
     Parameters
     ----------
     head : mapping
-        Name, description, unit distance and lighting as the form names them.
+        Name, description, unit distance and lighting, by the names of the format.
     points : sequence of (hu, red, green, blue, opacity)
     gradient_opacity : sequence of (HU per mm, factor), or None
     """

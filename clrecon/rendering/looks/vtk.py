@@ -16,24 +16,24 @@ from clrecon.rendering.looks.piecewise import merge_curves, straighten_curve
 __all__ = ["curve_from_nodes", "parameters_from_vtk", "points_from_pyvista", "property_to_vtk"]
 
 STEP_HU = 1e-4
-"""Nodes nearer than this are a step: programs that cannot keep two at one place move one by a rounding unit."""
+"""Nodes nearer than this form a step: programs that cannot keep two nodes at one place move one by a rounding unit."""
 
 COLORS_A_PART = 64
-"""Straight parts between two nodes in place of a way through another colour space than RGB."""
+"""Number of straight parts between two nodes that replace a way through a colour space other than RGB."""
 
 
 def curve_from_nodes(
     what: str, nodes: Iterable[ArrayLike], clamped: bool = True, steps: bool = False
 ) -> tuple[Float64Array, Float64Array]:
-    """A curve from VTK's nodes, each (position, values..., midpoint, sharpness).
+    """Make a curve from VTK's nodes, each (position, values..., midpoint, sharpness).
 
-    Nodes that lie within `STEP_HU` are one step, of which the first and the last count.  Without `clamped` the
-    function is 0 beyond its ends; `steps` as in `straighten_curve`.
+    Nodes within `STEP_HU` form one step, of which the first and the last node are used.  Without `clamped` the function
+    is 0 beyond its ends; `steps` as in `straighten_curve`.
 
     Raises
     ------
     UsageError
-        No nodes, or their positions go back.
+        There are no nodes, or their positions descend.
     """
     rows = np.array(list(nodes), dtype=np.float64)
     if rows.size == 0:
@@ -71,7 +71,7 @@ def _opacity_curve(what: str, function: Any) -> tuple[Float64Array, Float64Array
 
 
 def _color_curve(function: Any) -> tuple[Float64Array, Float64Array]:
-    """Colours of a vtkColorTransferFunction; ways through HSV, Lab and others as many straight parts through RGB."""
+    """Return the colours of a vtkColorTransferFunction; ways through HSV, Lab etc. become straight parts in RGB."""
     what, nodes = "its colour function", _nodes(function, 6)
     if function.GetColorSpace() != 0:  # VTK_CTF_RGB
         positions = np.unique([node[0] for node in nodes])
@@ -90,7 +90,7 @@ def _check_voxel(voxel_mm: float) -> None:
 
 
 def parameters_from_vtk(volume_property: Any, voxel_mm: float) -> dict[str, Any]:
-    """Parameters of `TransferFunction` from a vtkVolumeProperty: see `TransferFunction.from_vtk`."""
+    """Return the parameters of `TransferFunction` from a vtkVolumeProperty: see `TransferFunction.from_vtk`."""
     _check_voxel(voxel_mm)
     try:
         if volume_property.GetColorChannels(0) == 1:
@@ -100,7 +100,7 @@ def parameters_from_vtk(volume_property: Any, voxel_mm: float) -> dict[str, Any]
             colors = _color_curve(volume_property.GetRGBTransferFunction(0))
         opacity = _opacity_curve("its scalar opacity", volume_property.GetScalarOpacity(0))
         gradient = None
-        # VTK makes an empty or constant function where there is none.
+        # Asked for a missing function, VTK makes an empty or constant one.
         if not volume_property.GetDisableGradientOpacity(0):
             function = volume_property.GetGradientOpacity(0)
             gradient = gradient_points(_opacity_curve("its gradient opacity", function), voxel_mm)
@@ -124,7 +124,9 @@ def parameters_from_vtk(volume_property: Any, voxel_mm: float) -> dict[str, Any]
 
 
 def gradient_points(curve: tuple[Float64Array, Float64Array], voxel_mm: float) -> Float64Array | None:
-    """Points of a gradient opacity in HU per mm from a curve in HU per `voxel_mm`; None where it is 1 throughout."""
+    """Return the points of a gradient opacity in HU per mm from a curve in HU per `voxel_mm`; None if it is 1
+    everywhere.
+    """
     positions, factors = curve
     if np.all(factors == 1.0):
         return None
@@ -132,7 +134,7 @@ def gradient_points(curve: tuple[Float64Array, Float64Array], voxel_mm: float) -
 
 
 def _separate_steps(positions: Float64Array) -> list[float]:
-    """Positions of which no two are equal: VTK keeps one node at a place."""
+    """Return positions that are all different: VTK keeps one node at a place."""
     apart = positions.copy()
     step = np.flatnonzero(positions[1:] == positions[:-1])
     apart[step] = np.nextafter(positions[step], -np.inf)
@@ -140,7 +142,7 @@ def _separate_steps(positions: Float64Array) -> list[float]:
 
 
 def property_to_vtk(function: Any, voxel_mm: float) -> Any:
-    """A vtkVolumeProperty from a `TransferFunction`: see `TransferFunction.to_vtk`."""
+    """Make a vtkVolumeProperty from a `TransferFunction`: see `TransferFunction.to_vtk`."""
     _check_voxel(voxel_mm)
     from vtkmodules.vtkCommonDataModel import vtkPiecewiseFunction
     from vtkmodules.vtkRenderingCore import vtkColorTransferFunction, vtkVolumeProperty
@@ -174,7 +176,7 @@ def property_to_vtk(function: Any, voxel_mm: float) -> Any:
 
 
 def points_from_pyvista(cmap: Any, opacity: Any, clim: tuple[float, float]) -> Float64Array:
-    """Points of `TransferFunction` from pyvista's lookup table: see `TransferFunction.from_pyvista`."""
+    """Return the points of `TransferFunction` from pyvista's lookup table: see `TransferFunction.from_pyvista`."""
     import pyvista
 
     limits = np.asarray(clim, dtype=np.float64)
@@ -187,7 +189,7 @@ def points_from_pyvista(cmap: Any, opacity: Any, clim: tuple[float, float]) -> F
     try:
         table = pyvista.LookupTable()
         table.apply_cmap(cmap, 256)
-        # One for each colour is taken as it is, and then goes up to 255.
+        # One opacity for each colour is used without change; it then goes up to 255.
         exact = not isinstance(opacity, (str, float, int)) and opacity.size == table.n_values
         table.apply_opacity(opacity * 255.0 if exact else opacity)
         table.scalar_range = limits.tolist()

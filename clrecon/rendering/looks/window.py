@@ -1,4 +1,4 @@
-"""Windows: the range of HU that a grey picture runs from black to white over."""
+"""Windows: the ranges of HU that grey pictures show from black to white."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ from clrecon.errors import UsageError
 __all__ = ["BODY_SHARE", "BONE_WINDOW", "checked_window", "choose_water_window", "choose_window", "grey_image"]
 
 BONE_WINDOW = (-450.0, 1050.0)
-"""Level 300, width 1500 HU: marrow, cortex and soft tissue apart from each other."""
+"""Level 300, width 1500 HU: distinguishes marrow, cortex and soft tissue."""
 
 BODY_SHARE = 0.05
-"""Of the most water along a ray: rays with less meet air, a table or the fold of a blanket, and no body."""
+"""Least share of the most water along a ray; rays with less meet air, a table or the fold of a blanket, but no body."""
 
 
 def checked_window(window: Sequence[float]) -> tuple[float, float]:
-    """Low and high end of a window in HU after checking that they are.
+    """Check a window and return its low and high end.
 
     Raises
     ------
     UsageError
-        Not two finite numbers, the lower one first.
+        The window is not two finite numbers with the lower one first.
     """
     try:
         low, high = (float(end) for end in window)
@@ -37,19 +37,19 @@ def checked_window(window: Sequence[float]) -> tuple[float, float]:
 
 
 def grey_image(values: NDArray[Any], window: Sequence[float]) -> NDArray[np.uint8]:
-    """Grey picture of values.
+    """Turn values into a grey picture.
 
     Parameters
     ----------
     values : ndarray, shape (h, w), float
-        HU, NaN where there is nothing.
+        HU, NaN for empty pixels.
     window : (low, high)
         HU that are black and white; linear between.
 
     Returns
     -------
     ndarray, shape (h, w, 4), uint8
-        Opacity 255, and 0 where there is nothing.
+        Opacity 255, and 0 for empty pixels.
     """
     low, high = checked_window(window)
     there = ~np.isnan(values)
@@ -61,7 +61,7 @@ def grey_image(values: NDArray[Any], window: Sequence[float]) -> NDArray[np.uint
 
 
 def choose_window(values: NDArray[Any]) -> tuple[float, float]:
-    """A window from the 1st to the 99th percentile of the values that are there, at least 1 HU wide."""
+    """Choose a window from the 1st to the 99th percentile of the finite values, at least 1 HU wide."""
     there = values[np.isfinite(values)]
     if not len(there):
         return BONE_WINDOW
@@ -70,13 +70,13 @@ def choose_window(values: NDArray[Any]) -> tuple[float, float]:
 
 
 def choose_water_window(values: NDArray[Any]) -> tuple[float, float]:
-    """A window from the 1st to the 99th percentile of the rays of a radiograph that meet the body.
+    """Choose a window from the 1st to the 99th percentile of the rays of a radiograph that meet the body.
 
     Parameters
     ----------
     values : ndarray, float
-        Mm of water, see `clrecon.rendering.Rendering.values`.  Rays with less than `BODY_SHARE` of the most do not
-        count.  Where all that do have the same, black is nothing at all.
+        Mm of water, see `clrecon.rendering.Rendering.values`. Rays with less than `BODY_SHARE` of the largest value do
+        not count.  If all others have the same value, black is 0.
     """
     most = float(values.max(initial=0.0))
     if not most > 0.0:

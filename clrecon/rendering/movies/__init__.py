@@ -1,1 +1,1 @@
-"""Pictures that move: cameras that turn, and their files."""
+"""Movies: turning cameras, and files of moving pictures."""

@@ -1,7 +1,7 @@
 """GIF and APNG frame by frame.
 
-Pillow writes both, but holds all frames until the last has come.  Here Pillow compresses each frame as a picture of
-its own, and its compressed blocks are put into the moving one: the memory of one frame is enough.
+Pillow writes both, but holds all frames in memory until the end.  Here Pillow compresses each frame as a separate
+picture, whose compressed blocks are copied into the moving picture: the memory of one frame suffices.
 
 Sources: CompuServe, Graphics Interchange Format, version 89a; W3C, Portable Network Graphics, third edition.
 """
@@ -24,7 +24,7 @@ _REPEAT_FOR_EVER = b"\x21\xff\x0bNETSCAPE2.0\x03\x01\x00\x00\x00"
 
 
 def write_gif(stream: BinaryIO, frames: Iterator[NDArray[np.uint8]], fps: float) -> None:
-    """Write frames (h, w, 3), each with the 256 colours that suit it best."""
+    """Write frames (h, w, 3), each with its own best 256 colours."""
     from clrecon.rendering.pictures.pillow import load_pillow
 
     load_pillow()
@@ -33,7 +33,7 @@ def write_gif(stream: BinaryIO, frames: Iterator[NDArray[np.uint8]], fps: float)
     stream.write(b"GIF89a" + struct.pack("<HHBBB", width, height, 0x70, 0, 0) + _REPEAT_FOR_EVER)
     shown = 0
     for number, frame in enumerate(chain([first], frames)):
-        # Hundredths of a second, so spread that the whole is as long as it should be.
+        # Durations in hundredths of a second, rounded so that the total is right.
         delay = round(100.0 * (number + 1) / fps) - shown
         shown += delay
         palette, blocks = _gif_picture(frame)
@@ -46,7 +46,7 @@ def write_gif(stream: BinaryIO, frames: Iterator[NDArray[np.uint8]], fps: float)
 
 
 def _gif_picture(frame: NDArray[np.uint8]) -> tuple[bytes, bytes]:
-    """Palette, and the compressed pixels: what follows the last image descriptor of a GIF of one picture."""
+    """Return the palette and the compressed pixels: everything after the last image descriptor of a one-picture GIF."""
     from PIL import Image
 
     picture = Image.fromarray(frame)
@@ -61,7 +61,7 @@ def _gif_picture(frame: NDArray[np.uint8]) -> tuple[bytes, bytes]:
     if flags & 0x80:
         palette = content[at : at + (3 << ((flags & 7) + 1))]
         at += len(palette)
-    while content[at] == 0x21:  # extensions: label, then blocks that say their length, up to an empty one
+    while content[at] == 0x21:  # extensions: a label, then blocks with their length, up to an empty block
         at += 2
         while content[at]:
             at += content[at] + 1
@@ -76,7 +76,7 @@ def _gif_picture(frame: NDArray[np.uint8]) -> tuple[bytes, bytes]:
 
 
 def write_apng(stream: BinaryIO, frames: Iterator[NDArray[np.uint8]], fps: float) -> None:
-    """Write frames (h, w, 3 or 4) without loss; `stream` must be able to go back: the count of frames comes first."""
+    """Write frames (h, w, 3 or 4) without loss; `stream` must be seekable, as the number of frames comes first."""
     from clrecon.rendering.pictures.pillow import load_pillow
 
     load_pillow()

@@ -1,4 +1,4 @@
-"""A folder of frames, which appears as a whole: made under another name beside its place and renamed."""
+"""Folders of frames that appear as a whole: made under a temporary name beside their place, then renamed."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ _FRAME = re.compile(r"frame_[0-9]{4,}\.png")
 
 
 def check_frame_folder(path: str | os.PathLike[str]) -> Path:
-    """Return the folder that is going to be made or replaced.
+    """Return the folder that will be made or replaced.
 
     Raises
     ------
     UsageError
-        It is there and holds more than frames of an earlier run, or is the current folder.
+        The folder holds more than frames of an earlier run, or is the current folder.
     OutputError
-        It is no folder or cannot be replaced, or what it is to stand in is missing or cannot be written to.
+        The path is not a folder or cannot be replaced, or its parent folder is missing or cannot be written to.
     """
     folder = Path(os.path.realpath(path))
     with system_errors(path):
@@ -45,7 +45,7 @@ def check_frame_folder(path: str | os.PathLike[str]) -> Path:
                 )
             if any(is_dicom(entry.path) for entry in os.scandir(folder)):
                 raise OutputError(f"cannot write {path}: DICOM files are there, which are never replaced")
-            if os.path.samefile(folder, os.curdir):  # whoever stands in it would stand in what was removed
+            if os.path.samefile(folder, os.curdir):  # a process in this folder would then be in a removed one
                 raise UsageError(f"the frames replace the folder {path}, which is the current one: name one in it")
             if os.path.ismount(folder):
                 raise OutputError(f"cannot write {path}: a disk is mounted there, name a folder in it for the frames")
@@ -66,7 +66,7 @@ class StagedFolder:
     Attributes
     ----------
     size : int
-        Bytes of its files together.
+        Total size of its files in bytes.
     """
 
     def __init__(self, path: str | os.PathLike[str], made: Path, folder: Path, size: int):
@@ -74,7 +74,7 @@ class StagedFolder:
         self.size = size
 
     def commit(self) -> None:
-        """Put the folder into its place; frames of an earlier run are removed at the end of the ``with`` block.
+        """Move the folder to its place; frames of an earlier run are removed at the end of the ``with`` block.
 
         Raises
         ------
@@ -90,8 +90,8 @@ class StagedFolder:
 def stage_frame_folder(frames: Iterator[NDArray[np.uint8]], path: str | os.PathLike[str]) -> Iterator[StagedFolder]:
     """Write frames (h, w, 3 or 4) as frame_0000.png, ... into a folder under a temporary name.
 
-    `StagedFolder.commit` in the ``with`` block puts it in place; a folder that is not committed is removed at the end
-    of the block.
+    `StagedFolder.commit` in the ``with`` block moves it to its place; a folder that is not committed is removed at the
+    end of the block.
     """
     from clrecon.rendering.pictures.pillow import load_pillow
 
@@ -114,7 +114,7 @@ def stage_frame_folder(frames: Iterator[NDArray[np.uint8]], path: str | os.PathL
 
 
 def _swap(made: Path, folder: Path) -> None:
-    """Put `made` into the place of `folder`; frames of an earlier run get the temporary name, to be removed with it."""
+    """Put `made` in the place of `folder`; an earlier folder gets the temporary name and is removed with it."""
     older = made.with_suffix(".older")
     try:
         if folder.exists():

@@ -1,7 +1,7 @@
-"""Moving pictures: the cameras of a turntable, and frames one after the other to a file or a folder.
+"""Moving pictures: the cameras of a turntable, and the writing of frames to a file or a folder.
 
-Frames are taken from an iterator and written as they come, so that a thousand of them need the memory of one.  Before
-the first is asked for, everything is checked that can be: the name, the place, the encoder.
+Frames are taken from an iterator and written one by one, so that a thousand need the memory of one.  The name, the
+place and the encoder are checked before the first frame is computed.
 """
 
 from __future__ import annotations
@@ -33,29 +33,30 @@ __all__ = [
 ]
 
 ANIMATIONS = (".mp4", ".gif", ".apng")
-"""Extensions of moving pictures; a name without one is a folder of PNG files."""
+"""Extensions of moving pictures; a name without extension is a folder of PNG files."""
 
 MOST_FRAMES = 10_000
-"""More are a slip of the keyboard: five minutes at 30 a second."""
+"""Most frames: five minutes at 30 frames per second.  More are a typing error."""
 
 FASTEST = {".mp4": 120.0, ".gif": 50.0, ".apng": 120.0, "": 120.0}
-"""Frames a second; GIF counts hundredths of a second, and browsers slow down what is below two of them."""
+"""Most frames per second.  GIF counts hundredths of a second; browsers slow down frames shorter than two."""
 
 SLOWEST = 0.1
-"""Frames a second."""
+"""Fewest frames per second."""
 
 
 def turntable_cameras(camera: Camera, frames: int, degrees: float = 360.0) -> list[Camera]:
-    """Cameras around the focal point, about the axis of the body and towards the patient's left.
+    """Return cameras around the focal point, turning about the axis of the body towards the patient's left.
 
     Parameters
     ----------
     camera : Camera
-        The first one.
+        The first camera.
     frames : int
-        How many.
+        Number of cameras.
     degrees : float
-        Whole turns end one step before the first camera, so that the motion can be repeated; other angles end there.
+        Total angle.  Whole turns end one step before the first camera, so that the movie can be repeated; other angles
+        end exactly there.
 
     Raises
     ------
@@ -72,21 +73,24 @@ def turntable_cameras(camera: Camera, frames: int, degrees: float = 360.0) -> li
 
 
 def animation_kind(path: str | os.PathLike[str]) -> str:
-    """Extension of a moving picture in lower case, empty for a folder: without one, with a slash, or there as one."""
+    """Return the extension of a moving picture in lower case; empty for a folder: no extension, a final slash, or a
+    folder.
+    """
     text = os.fspath(path)
     is_folder = text.endswith(tuple(filter(None, (os.sep, os.altsep)))) or os.path.isdir(text)
     return "" if is_folder else os.path.splitext(text)[1].lower()
 
 
 def check_animation(path: str | os.PathLike[str], fps: float = 25.0) -> str:
-    """Refuse what cannot be written, before any frame is computed.
+    """Refuse a moving picture that cannot be written, before a frame is computed.
 
     Parameters
     ----------
     path : str or path
-        ``.mp4``, ``.gif``, ``.apng``, or a folder: a name without extension, with a slash at its end, or that is one.
+        ``.mp4``, ``.gif``, ``.apng``, or a folder: a name without extension, a name that ends with a slash, or an
+        existing folder.
     fps : float
-        Frames a second.
+        Frames per second.
 
     Returns
     -------
@@ -96,7 +100,7 @@ def check_animation(path: str | os.PathLike[str], fps: float = 25.0) -> str:
     Raises
     ------
     UsageError
-        Another extension, no encoder, a folder that holds other things, or an impossible `fps`.
+        The extension is unknown, there is no encoder, the folder contains other files, or `fps` is out of range.
     OutputError
         The place cannot be written to.
     """
@@ -141,15 +145,15 @@ def write_animation(
     Parameters
     ----------
     frames : iterable of Rendering or of ndarray, shape (h, w, 3) or (h, w, 4), uint8
-        All of one size.  It is asked for the next frame when the one before has been written.
+        Frames of one size.  The next frame is requested after the one before has been written.
     path : str or path
-        See `check_animation`.  MP4 is H.264 (BT.709, quality 18), an odd side made even by repeating its last row or
-        column.  GIF has a palette a frame, dithered after Floyd and Steinberg, and repeats, as does APNG, which keeps
-        every colour and the opacity.  A folder gets frame_0000.png, frame_0001.png, ...
+        See `check_animation`. MP4 is H.264 (BT.709, quality 18), an odd side made even by repeating its last row or
+        column.  GIF has a palette for each frame, dithered after Floyd and Steinberg, and repeats.  APNG repeats too,
+        and keeps every colour and the opacity.  A folder gets frame_0000.png, frame_0001.png, ...
     fps : float
-        Frames a second.
+        Frames per second.
     total : int
-        How many are to come, for `progress`.
+        Number of frames, for `progress`.
     progress : callable, optional
         Called as ``progress("frames", done, total)``.
 
@@ -161,7 +165,8 @@ def write_animation(
     Raises
     ------
     UsageError
-        As in `check_animation`; no frame, frames of several sizes, or opacity that the format would lose.
+        As in `check_animation`; or there is no frame, frames differ in size, or have opacity that the format would
+        lose.
     OutputError
         The file cannot be written; an older one is intact.
     """
@@ -179,10 +184,10 @@ def stage_animation(
     total: int = 0,
     progress: Progress | None = None,
 ) -> Iterator[Staged]:
-    """Write a moving picture under a temporary name; ``commit`` of what is yielded puts it in place.
+    """Write a moving picture under a temporary name; ``commit`` of the yielded object moves it to its place.
 
-    For files that belong together: stage all of them, then commit one after the other.  What is not committed is
-    removed at the end of the block.  Parameters and errors as in `write_animation`.
+    For files that belong together: stage all of them, then commit one after the other.  Files that are not committed
+    are removed at the end of the block.  Parameters and errors as in `write_animation`.
     """
     extension = check_animation(path, fps)
     checked = _checked_frames(frames, extension, total, progress)
@@ -209,7 +214,7 @@ def stage_animation(
 def _checked_frames(
     frames: Iterable[Rendering | NDArray[np.uint8]], extension: str, total: int, progress: Progress | None
 ) -> Iterator[NDArray[np.uint8]]:
-    """Frames as arrays (h, w, 3 or 4), the formats without opacity get three channels; says how many are done."""
+    """Yield frames as arrays (h, w, 3 or 4), with three channels for formats without opacity; report progress."""
     shape: tuple[int, ...] | None = None
     done = 0
     for frame in frames:

@@ -1,6 +1,6 @@
-"""MP4 through ffmpeg, the program: frames go in through a pipe, the file comes out in a temporary folder.
+"""MP4 by the program ffmpeg: it gets frames through a pipe, and writes the file to a temporary folder.
 
-H.264 in yuv420p is what every browser and every slide program plays.
+Every browser and every slide program plays H.264 in yuv420p.
 """
 
 from __future__ import annotations
@@ -24,19 +24,19 @@ from clrecon.errors import OutputError, UsageError
 __all__ = ["find_encoder", "write_video"]
 
 QUALITY = 18
-"""x264's constant rate factor: at 18 nobody sees the loss."""
+"""x264's constant rate factor; at 18 the loss is not visible."""
 
 INSTALL = "pip install 'clrecon[motion]', or put an ffmpeg with libx264 on the PATH"
 
 
 @lru_cache(maxsize=1)
 def find_encoder() -> str:
-    """The ffmpeg to call: that of imageio-ffmpeg, else the one on the PATH.
+    """Return the ffmpeg to call: that of imageio-ffmpeg, else the one on the PATH.
 
     Raises
     ------
     UsageError
-        There is none, or it cannot make H.264; the message says what to install.
+        There is no ffmpeg, or it cannot make H.264; the message says what to install.
     """
     program = _find_ffmpeg()
     if program is None:
@@ -55,7 +55,7 @@ def _find_ffmpeg() -> str | None:
         import imageio_ffmpeg
 
         return str(imageio_ffmpeg.get_ffmpeg_exe())
-    except (ImportError, RuntimeError):  # not installed; installed without a program for this system
+    except (ImportError, RuntimeError):  # not installed, or installed without a program for this system
         return shutil.which("ffmpeg")
 
 
@@ -98,7 +98,7 @@ def write_video(stream: BinaryIO, frames: Iterator[NDArray[np.uint8]], fps: floa
 
 
 def _start(command: list[str], log: BinaryIO) -> subprocess.Popen[bytes]:
-    # A session of its own: Ctrl-C is ours to handle, else the encoder ends first and blames a broken pipe.
+    # A session of its own: we handle Ctrl-C; otherwise the encoder would end first and we would see a broken pipe.
     return subprocess.Popen(
         command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=log, start_new_session=os.name == "posix"
     )
@@ -106,7 +106,8 @@ def _start(command: list[str], log: BinaryIO) -> subprocess.Popen[bytes]:
 
 def _command(program: str, size: tuple[int, int], fps: float, path: Path) -> list[str]:
     width, height = size
-    # The matrix is named and applied: ffmpeg takes BT.601 by itself, and players take BT.709 for large pictures.
+    # The colour matrix is both applied and named: ffmpeg's default is BT.601, but players assume BT.709 for large
+    # pictures.
     colours = "scale=out_range=tv:out_color_matrix=bt709:flags=lanczos+accurate_rnd,format=yuv420p"
     return [
         *(program, "-hide_banner", "-loglevel", "error", "-nostdin", "-y"),

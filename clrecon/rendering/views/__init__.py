@@ -1,1 +1,1 @@
-"""Where a picture is taken from: cameras, clipping, planes and centre lines."""
+"""Views: cameras, clipping, planes and centre lines of pictures."""

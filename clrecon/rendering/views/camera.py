@@ -1,4 +1,4 @@
-"""`Camera`: from where, in which direction and how large a picture is taken, in LPS mm and with VTK's meanings."""
+"""`Camera`: position, direction and scale of a picture, in LPS mm and with VTK's meanings."""
 
 from __future__ import annotations
 
@@ -20,13 +20,14 @@ DEFAULT_VIEW_ANGLE = 30.0
 """Degrees from the bottom to the top of a perspective picture, as in VTK."""
 
 FIT_MARGIN = 1.02
-"""Room that a fitted picture leaves around a volume."""
+"""Factor by which a fitted picture is larger than the volume."""
 
 TURN_STEP = 5
-"""Degrees between the directions in which a turning camera is tried."""
+"""Step in degrees between the tested directions of a turning camera."""
 
 RADII_AWAY = 2.0
-"""Where a parallel camera is put, in radii of the volume: outside of it, and near, so that depths keep their digits."""
+"""Distance of a parallel camera from the centre, in radii of the volume: outside it, but near, so that depths keep
+their digits."""
 
 
 class CameraBasis(NamedTuple):
@@ -38,7 +39,7 @@ class CameraBasis(NamedTuple):
 
 
 FARTHEST_MM = 1e9
-"""What float32 coordinates of a device can be far from a volume, and no patient is."""
+"""Largest distance from a volume for float32 coordinates on a device; no patient is so large."""
 
 
 def box_corners(volume: Grid) -> Float64Array:
@@ -51,8 +52,8 @@ def box_corners(volume: Grid) -> Float64Array:
     Returns
     -------
     ndarray, shape (n, 3), float64
-        LPS mm; the first and the last four are those of the whole box, and between them stand those of every slice
-        where the slices are uneven: all that is in the box lies in the convex hull of these points.
+        LPS mm.  The first and the last four are those of the whole box; for uneven slices, those of every slice are
+        between them.  The volume lies in the convex hull of these points.
     """
     ni, nj, nk = volume.shape_ijk
     inner = np.arange(nk) if getattr(volume, "uneven", False) else np.empty(0)
@@ -62,7 +63,7 @@ def box_corners(volume: Grid) -> Float64Array:
 
 @dataclass(frozen=True)
 class Camera:
-    """Where a picture is taken from.
+    """The view of a picture.
 
     Attributes
     ----------
@@ -70,20 +71,20 @@ class Camera:
         LPS mm.  Depths are measured from here: along the ray of each pixel in a perspective picture, and from the
         plane through here across the view direction in a parallel one.
     focal_point : (float, float, float)
-        LPS mm, in the middle of the picture.
+        LPS mm; appears in the middle of the picture.
     up : (float, float, float)
         Direction in LPS that points to the top of the picture; need not be perpendicular to the view.
     view_angle : float or None
-        Degrees from the bottom to the top of a perspective picture; None where `parallel_scale` is given, and 30
-        where neither is.
+        Degrees from the bottom to the top of a perspective picture; None if `parallel_scale` is given, 30 if neither
+        is.
     parallel_scale : float or None
-        Half the height of a parallel picture in mm; None makes it a perspective one.
+        Half the height of a parallel picture in mm; None for a perspective one.
 
     Raises
     ------
     UsageError
-        Not three finite numbers each, position and focal point in one place, `up` along the view, an angle beyond
-        0.001 to 179 degrees, a scale that is not positive, or both of them.
+        A vector is not three finite numbers; position and focal point coincide; `up` is along the view; the angle is
+        outside 0.001 to 179 degrees; the scale is not positive; or both angle and scale are given.
     """
 
     position: tuple[float, float, float]
@@ -130,26 +131,28 @@ class Camera:
         size: Sequence[int] = (1024, 1024),
         turning: bool = False,
     ) -> Camera:
-        """Look at the middle of a volume from a side of the patient, so that all of it just fits into the picture.
+        """Return a camera that looks at the middle of a volume from a side of the patient, so that the volume just
+        fits.
 
         Parameters
         ----------
         volume : Volume or Grid
-            Sheared and uneven ones too.
+            May be sheared or uneven.
         view : str or (float, float)
-            anterior, posterior, left, right, superior, inferior: where the camera stands; or azimuth and elevation in
-            degrees, as a pair or as text ``"AZ,EL"``, see `clrecon.rendering.views.directions.find_view`.
+            anterior, posterior, left, right, superior, inferior: the side where the camera stands; or azimuth and
+            elevation in degrees, as a pair or as text ``"AZ,EL"``, see `clrecon.rendering.views.directions.find_view`.
         zoom : float
             2 shows everything twice as large, see `zoomed`.
         up : str or array_like, shape (3,), optional
             Side of the patient (by the names above), or a direction in LPS, at the top of the picture; default:
             superior, and anterior in views along the body.
         view_angle : float, optional
-            Makes a perspective camera of so many degrees; default: a parallel one.
+            View angle in degrees of a perspective camera; default: a parallel camera.
         size : (int, int)
             Width and height of the picture.
         turning : bool
-            Leave room for the volume to stay whole while the camera orbits about the axis of the body.
+            True: leave enough room that the volume stays inside the picture while the camera orbits about the axis of
+            the body.
 
         Raises
         ------
@@ -171,7 +174,9 @@ class Camera:
         return cls(_triple(position), _triple(middle), _triple(up_lps), view_angle, scale).zoomed(zoom)
 
     def _room_for(self, points: Float64Array, aspect: float) -> float:
-        """Parallel scale, or distance of a perspective camera, at which points about the focal point fit."""
+        """Return the parallel scale, or the distance of a perspective camera, at which points about the focal point
+        fit.
+        """
         right, up, forward = self.basis()
         across = np.maximum(np.abs(points @ up), np.abs(points @ right) / aspect) * FIT_MARGIN
         if self.is_parallel:
@@ -180,21 +185,23 @@ class Camera:
 
     @classmethod
     def from_pyvista(cls, source: Any, size: Sequence[int] | None = None) -> Camera:
-        """Take the camera of a PyVista plotter, a PyVista camera or a VTK camera, see `clrecon.rendering.views.vtk`.
+        """Return the camera of a PyVista plotter, a PyVista camera or a VTK camera, see `clrecon.rendering.views.vtk`.
 
         Parameters
         ----------
         source : pyvista.Plotter, pyvista.Camera or vtkCamera
-            Its scene in LPS mm.
+            Camera or plotter of a scene in LPS mm.
         size : (int, int), optional
-            Of the picture, for cameras whose view angle is the horizontal one; default: the plotter's window.
+            Size of the picture, for cameras whose view angle is the horizontal one; default: the plotter's window.
         """
         from clrecon.rendering.views.vtk import parameters_from_vtk
 
         return cls(**parameters_from_vtk(source, size))
 
     def to_pyvista(self) -> Any:
-        """A `pyvista.Camera` that sees the same, for a scene in LPS mm: ``plotter.camera = camera.to_pyvista()``."""
+        """Return a `pyvista.Camera` with the same view, for a scene in LPS mm: ``plotter.camera =
+        camera.to_pyvista()``.
+        """
         from clrecon.rendering.views.vtk import make_pyvista_camera
 
         return make_pyvista_camera(self.position, self.focal_point, self.up, self.view_angle, self.parallel_scale)
@@ -206,7 +213,7 @@ class Camera:
 
     @property
     def distance(self) -> float:
-        """From position to focal point, mm."""
+        """Distance from position to focal point, mm."""
         return float(np.linalg.norm(np.subtract(self.focal_point, self.position)))
 
     def basis(self) -> CameraBasis:
@@ -215,14 +222,14 @@ class Camera:
         Raises
         ------
         UsageError
-            Position and focal point are in one place, or `up` runs along the view.
+            Position and focal point coincide, or `up` is along the view.
         """
         forward = np.subtract(self.focal_point, self.position)
         length = np.linalg.norm(forward)
         if length < 1e-6:
             raise UsageError("position and focal point of a camera lie in one place: there is no direction to look in")
         forward /= length
-        up = np.array(self.up) / max(np.abs(self.up).max(), 1e-12)  # so that 1e200 has a length
+        up = np.array(self.up) / max(np.abs(self.up).max(), 1e-12)  # a vector of 1e200 still gets a length
         size = np.linalg.norm(up)
         right = np.cross(forward, up)
         if size < 1e-12 or np.linalg.norm(right) < 1e-6 * size:
@@ -231,14 +238,14 @@ class Camera:
         return CameraBasis(right, np.cross(right, forward), forward)
 
     def half_height(self) -> float:
-        """Half the height of the picture: mm, or for perspective mm per mm of distance along the view."""
+        """Half the height of the picture: in mm, or for perspective in mm per mm of distance along the view."""
         if self.parallel_scale is not None:
             return self.parallel_scale
         assert self.view_angle is not None
         return float(np.tan(np.radians(0.5 * self.view_angle)))
 
     def pixel_mm(self, size: Sequence[int]) -> float:
-        """Side of a pixel in mm: everywhere in a parallel picture, at the focal point in a perspective one.
+        """Return the side of a pixel in mm: everywhere in a parallel picture, at the focal point in a perspective one.
 
         Parameters
         ----------
@@ -249,7 +256,7 @@ class Camera:
         return 2.0 * self.half_height() * (1.0 if self.is_parallel else self.distance) / height
 
     def rays(self, size: Sequence[int]) -> tuple[Float64Array, Float64Array]:
-        """The ray of each pixel, through its centre (x + 0.5, y + 0.5).
+        """Return the ray of each pixel, through its centre (x + 0.5, y + 0.5).
 
         Parameters
         ----------
@@ -274,7 +281,7 @@ class Camera:
         return np.broadcast_to(self.position, offsets.shape).copy(), directions
 
     def project(self, points: ArrayLike, size: Sequence[int]) -> tuple[Float64Array, Float64Array]:
-        """Where points appear in the picture; the inverse of `rays`.
+        """Return where points appear in the picture; the inverse of `rays`.
 
         Parameters
         ----------
@@ -286,8 +293,8 @@ class Camera:
         Returns
         -------
         pixels : ndarray, shape (n, 2), float64
-            x to the right and y down from the top left corner of the picture, so that the first pixel's centre is
-            (0.5, 0.5); NaN for points that a perspective camera has beside it or behind it.
+            x to the right and y down from the top left corner of the picture, so that the first pixel's centre is (0.5,
+            0.5); NaN for points beside or behind a perspective camera.
         depths : ndarray, shape (n,), float64
             Mm along the ray, negative behind a parallel camera; NaN as above.
         """
@@ -306,7 +313,7 @@ class Camera:
         return np.column_stack([x, y]), depths
 
     def orbit(self, azimuth: float, elevation: float = 0.0) -> Camera:
-        """Turn the camera around its focal point, as `fit` counts angles.
+        """Return a camera turned around the focal point; angles are counted as in `fit`.
 
         Parameters
         ----------
@@ -318,7 +325,7 @@ class Camera:
         Returns
         -------
         Camera
-            As far from the focal point; its `up` has turned with it.
+            At the same distance from the focal point; `up` has turned with it.
         """
         if not np.isfinite([_number(azimuth), _number(elevation)]).all():
             raise UsageError(f"a camera orbits by finite angles in degrees, not by {azimuth!r} and {elevation!r}")
@@ -327,12 +334,12 @@ class Camera:
         return replace(self, position=_triple(self.focal_point + offset), up=_triple(turn @ self.up))
 
     def zoomed(self, zoom: float) -> Camera:
-        """Show everything `zoom` times as large, from the same place: in less height or at a narrower angle.
+        """Return a camera at the same place that shows everything `zoom` times as large.
 
         Raises
         ------
         UsageError
-            `zoom` is not positive, or makes an angle that no camera has.
+            `zoom` is not positive, or gives an angle out of range.
         """
         factor = _number(zoom)
         if not (0.0 < factor < np.inf):
@@ -350,7 +357,7 @@ def _triple(vector: Float64Array) -> tuple[float, float, float]:
 
 
 def _number(value: Any) -> float:
-    """`value` as a float, NaN for what is none."""
+    """Return `value` as a float, NaN if it is not a number."""
     try:
         return float(value)
     except (TypeError, ValueError):
@@ -358,7 +365,7 @@ def _number(value: Any) -> float:
 
 
 def _rotation(axis: ArrayLike, degrees: float) -> Float64Array:
-    """Right-handed turn about a unit axis, shape (3, 3) (Rodrigues 1840)."""
+    """Return the right-handed rotation about a unit axis, shape (3, 3) (Rodrigues 1840)."""
     x, y, z = np.asarray(axis, dtype=np.float64)
     cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
     radians = np.radians(degrees)

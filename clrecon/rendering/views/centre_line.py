@@ -1,4 +1,4 @@
-"""Centre lines: a smooth curve through points in mm, by arc length, with frames that do not twist."""
+"""Centre lines: a smooth curve through points in mm, parametrised by arc length, with frames that do not twist."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from clrecon.system.messages import Message
 __all__ = ["Curve", "rotation_minimising_normals"]
 
 SAME_PLACE_MM = 1e-6
-"""Points as near as this to the one before are one with it."""
+"""Distance up to which a point counts as the same as the one before."""
 
 PIECES = 64
-"""Parts of each span between two points whose length is integrated."""
+"""Number of parts of each span between two points over which the length is integrated."""
 
 FARTHEST_MM = 1e6
-"""Coordinates beyond a kilometre are a mistake."""
+"""Largest coordinate; more than a kilometre is a mistake."""
 
 
 def _gauss_nodes() -> tuple[Float64Array, Float64Array]:
@@ -31,7 +31,7 @@ def _gauss_nodes() -> tuple[Float64Array, Float64Array]:
 
 
 class Curve(Message):
-    """A smooth curve through points, measured along its arc.
+    """A smooth curve through points, parametrised by arc length.
 
     A cubic spline (not-a-knot; a parabola through three points, a straight line through two) with the distances
     between the points as its parameter.  Its length is integrated (Gauss and Legendre, 5 nodes in each of 64 parts of
@@ -40,12 +40,12 @@ class Curve(Message):
     Parameters
     ----------
     points : array_like, shape (n, 3)
-        LPS mm, in order along the curve; repeated ones count once.
+        LPS mm, in order along the curve; repeated points count once.
 
     Raises
     ------
     UsageError
-        Not (n, 3) finite numbers, or fewer than two different points.
+        Points are not (n, 3) finite numbers, or fewer than two are different.
     """
 
     _UNSENT = ("_spline", "_lengths")
@@ -76,7 +76,7 @@ class Curve(Message):
 
     @cached_property
     def _lengths(self) -> tuple[Float64Array, Float64Array, Float64Array]:
-        """Parameters of the ends of all parts, their arc lengths, and the lengths a step of the parameter there."""
+        """Compute the parameters of the ends of all parts, their arc lengths, and the derivatives of length there."""
         knots = self._spline.x
         shares = np.arange(PIECES) / PIECES
         ends = np.append((knots[:-1, None] + shares * np.diff(knots)[:, None]).ravel(), knots[-1])
@@ -92,13 +92,13 @@ class Curve(Message):
         return float(self._lengths[1][-1])
 
     def parameters(self, arc: ArrayLike) -> Float64Array:
-        """Parameters of the spline at arc lengths (n,) in mm, from 0 to `length`."""
+        """Return the parameters of the spline at arc lengths (n,) in mm, from 0 to `length`."""
         ends, lengths, speeds = self._lengths
         wanted = np.clip(np.asarray(arc, dtype=np.float64), 0.0, lengths[-1])
         part = np.clip(np.searchsorted(lengths, wanted, side="right") - 1, 0, len(ends) - 2)
         found = ends[part] + (wanted - lengths[part]) / speeds[part]
         nodes, weights = _gauss_nodes()
-        for _ in range(3):  # Newton, on the integral from the begin of the part
+        for _ in range(3):  # Newton's method on the integral from the start of the part
             way = found - ends[part]
             passed = np.linalg.norm(self._spline(ends[part][:, None] + way[:, None] * nodes, 1), axis=-1) @ weights
             speed = np.linalg.norm(self._spline(found, 1), axis=-1)
@@ -106,16 +106,16 @@ class Curve(Message):
         return np.asarray(np.clip(found, ends[0], ends[-1]))
 
     def at(self, arc: ArrayLike) -> Float64Array:
-        """Places (n, 3) in LPS mm at arc lengths (n,) in mm."""
+        """Return places (n, 3) in LPS mm at arc lengths (n,) in mm."""
         return np.asarray(self._spline(self.parameters(arc)))
 
     def tangents(self, arc: ArrayLike) -> Float64Array:
-        """Unit tangents (n, 3) at arc lengths (n,)."""
+        """Return unit tangents (n, 3) at arc lengths (n,)."""
         along = self._spline(self.parameters(arc), 1)
         return np.asarray(along / np.linalg.norm(along, axis=1, keepdims=True))
 
     def smallest_radius(self) -> float:
-        """Smallest radius of curvature in mm, infinite for a straight line."""
+        """Return the smallest radius of curvature in mm, infinite for a straight line."""
         ends = self._lengths[0]
         first, second = self._spline(ends, 1), self._spline(ends, 2)
         bend = np.linalg.norm(np.cross(first, second), axis=1)
@@ -124,7 +124,7 @@ class Curve(Message):
             return float((speed**3 / np.where(bend > 1e-12 * speed**3, bend, 0.0)).min())
 
     def reversed(self) -> Curve:
-        """The same curve from its last point to its first."""
+        """Return the same curve from its last point to its first."""
         return Curve(self.points[::-1])
 
     def check_within(self, volume: Volume) -> None:
@@ -133,7 +133,7 @@ class Curve(Message):
         Raises
         ------
         UsageError
-            One does not; the message has its number, its place and the box.
+            A point lies outside; the message has its number, its place and the box.
         """
         ijk = volume.lps_to_ijk(self.points)
         outside = np.flatnonzero(((ijk < -0.5 - 1e-6) | (ijk > np.array(volume.shape_ijk) - 0.5 + 1e-6)).any(axis=1))
@@ -154,19 +154,19 @@ def _describe(point: ArrayLike) -> str:
 
 
 def rotation_minimising_normals(places: Float64Array, tangents: Float64Array, first: ArrayLike) -> Float64Array:
-    """Normals along a curve that turn no more around it than they must, so that nothing twists.
+    """Return normals along a curve that rotate around it as little as possible, so that frames do not twist.
 
-    Double reflection: Wang, Juettler, Zheng and Liu 2008, "Computation of rotation minimizing frames", fourth order in
-    the distance of the places.
+    Method: double reflection (Wang, Juettler, Zheng and Liu 2008, "Computation of rotation minimizing frames"), of
+    fourth order in the distance of the places.
 
     Parameters
     ----------
     places : ndarray, shape (n, 3)
-        Along the curve.
+        Places along the curve.
     tangents : ndarray, shape (n, 3)
         Unit.
     first : array_like, shape (3,)
-        Direction of the first normal; its part along the tangent does not count.
+        Direction of the first normal; its component along the tangent is ignored.
 
     Returns
     -------
@@ -176,7 +176,7 @@ def rotation_minimising_normals(places: Float64Array, tangents: Float64Array, fi
     Raises
     ------
     UsageError
-        `first` runs along the first tangent.
+        `first` is parallel to the first tangent.
     """
     normals = np.empty_like(places)
     start = np.asarray(first, dtype=np.float64)

@@ -1,4 +1,4 @@
-"""Points of a centre line from files: text, CSV, JSON, and the markups of 3D Slicer."""
+"""Files with points of a centre line: text, CSV, JSON, and the markups of 3D Slicer."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from clrecon.system.text import escape_text
 __all__ = ["read_curve_points"]
 
 LARGEST_BYTES = 1 << 24
-"""A longer file holds something else than a centre line."""
+"""Largest file in bytes; a larger one is not a centre line."""
 
 MARKUP_SPACES = {"LPS": "lps", "RAS": "ras", "1": "lps", "0": "ras"}
-"""How 3D Slicer writes the frame of its points."""
+"""The values by which 3D Slicer names the frame of its points."""
 
 
 def read_curve_points(path: str | Path, space: str | None = None) -> Float64Array:
@@ -28,12 +28,12 @@ def read_curve_points(path: str | Path, space: str | None = None) -> Float64Arra
     Parameters
     ----------
     path : str or Path
-        ``.mrk.json`` and ``.fcsv`` are markups of 3D Slicer, which say their frame; ``.json`` is a list of [x, y, z],
-        or an object with "points" and "space"; all else is text, one point a line, numbers separated by blanks,
-        commas or semicolons.  A text may begin with a line of names, of which x, y and z count; lines with # are
-        comments.
+        ``.mrk.json`` and ``.fcsv`` are markups of 3D Slicer, which name their frame; ``.json`` is a list of [x, y, z],
+        or an object with "points" and "space"; any other file is text with one point on a line, numbers separated by
+        blanks, commas or semicolons.  A text may begin with a line of column names, of which x, y and z are used; lines
+        with # are comments.
     space : {"lps", "ras"}, optional
-        Frame of points whose file does not say it; default LPS.
+        Frame of the points if the file does not name it; default LPS.
 
     Returns
     -------
@@ -43,9 +43,9 @@ def read_curve_points(path: str | Path, space: str | None = None) -> Float64Arra
     Raises
     ------
     UsageError
-        There is no such file; unknown frame, or not the one that the file says.
+        The file does not exist, or the frame is unknown or differs from that of the file.
     RefusedInputError
-        The file cannot be read, or is not what its name says; the message has the line or the point.
+        The file cannot be read, or its contents do not fit its extension; the message has the line or the point.
     """
     if space is not None and space not in ("lps", "ras"):
         raise UsageError(f"points are in the frame lps or ras, not {space!r}")
@@ -132,7 +132,7 @@ def _find_columns(where: str, names: list[str]) -> list[int]:
 
 
 def _read_fcsv(name: str, text: str) -> tuple[list[list[float]], str | None]:
-    """Comments say the frame; then lines of ``id,x,y,z,...``."""
+    """Read comments, which name the frame, and then lines of ``id,x,y,z,...``."""
     said: str | None = None
     rows: list[list[float]] = []
     for number, line in enumerate(text.splitlines(), start=1):
@@ -192,5 +192,5 @@ def _read_markups(name: str, markups: Any) -> tuple[list[list[float]], str]:
         raise RefusedInputError(f"{name} holds a markup without controlPoints")
     placed = [
         (at, point) for at, point in enumerate(points) if point.get("positionStatus", "defined") == "defined"
-    ]  # others wait to be placed, and have no place yet
+    ]  # points without position have not been placed yet
     return [_json_point(name, at, point.get("position")) for at, point in placed], said

@@ -14,20 +14,20 @@ __all__ = ["Clip"]
 
 
 class Clip(Message):
-    """What lies on the inner side of every plane; without planes, everything.
+    """The part of space on the inner side of every plane; without planes, all of space.
 
     >>> Clip.box((-50, -50, 900), (50, 50, 1000)) & Clip.plane(point=(0, 0, 0), normal=(0, 1, 0))
 
     Parameters
     ----------
     planes : array_like, shape (n, 4)
-        Normal and offset each: kept is a point p in LPS mm where ``normal . p >= offset``.  Normals of any length
-        are taken and made unit vectors, the offset with them.
+        Normal and offset of each plane: a point p in LPS mm is kept where ``normal . p >= offset``. Normals may have
+        any length; they are scaled to unit vectors, and the offsets with them.
 
     Raises
     ------
     UsageError
-        Not n times four finite numbers, or a normal of length 0.
+        The planes are not n times four finite numbers, or a normal has length 0.
     """
 
     def __init__(self, planes: ArrayLike = ()):
@@ -44,7 +44,7 @@ class Clip(Message):
         lengths = largest * np.linalg.norm(table[:, :3] / np.maximum(largest, 1e-12), axis=1, keepdims=True)
         if len(table) and lengths.min() < 1e-12:
             raise UsageError(f"clip plane {int(lengths.argmin())} has a normal of length 0: it has no inner side")
-        self._planes: Float64Array = table / lengths + 0.0  # no -0.0: equal clips have equal bytes
+        self._planes: Float64Array = table / lengths + 0.0  # no -0.0, so that equal clips have equal bytes
         self._planes.flags.writeable = False
 
     @classmethod
@@ -80,9 +80,9 @@ class Clip(Message):
         Parameters
         ----------
         point : array_like, shape (3,)
-            On the plane, LPS mm.
+            A point of the plane, LPS mm.
         normal : array_like, shape (3,)
-            Of any length but 0.
+            Vector of any length except 0.
 
         Raises
         ------
@@ -99,12 +99,12 @@ class Clip(Message):
         return self._planes
 
     def contains(self, points: ArrayLike) -> NDArray[np.bool_]:
-        """Which points (n, 3), LPS mm, are kept: shape (n,), bool."""
+        """Return which points (n, 3), LPS mm, are kept: shape (n,), bool."""
         heights = checked_points(points) @ self._planes[:, :3].T
         return np.asarray((heights >= self._planes[:, 3]).all(axis=1))
 
     def __and__(self, other: Clip) -> Clip:
-        """Keep what both keep."""
+        """Keep only points that both keep."""
         if not isinstance(other, Clip):
             return NotImplemented
         return Clip(np.vstack([self._planes, other._planes]))

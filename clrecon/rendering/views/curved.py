@@ -1,12 +1,12 @@
 """The sheets of curved planar reformations: stretched and straightened, after Kanitsar et al. 2002.
 
 A *stretched* picture unrolls a cylinder: the surface that a straight line of one direction sweeps when it moves along
-the centre line.  Nothing is distorted in it: every length within that surface is kept, along the centre line, across
-it and aslant; the centre line itself is drawn as the curve that it is when seen on the unrolled surface.
+the centre line.  It distorts nothing: every length within that surface is kept, along the centre line, across it and in
+between.  The centre line itself appears as a curve on the unrolled surface.
 
 A *straightened* picture shows the centre line as a straight vertical line: each row is a line across it, in a frame
-that is carried along without twisting.  Lengths are kept along the centre line and in every row; at a distance d from
-a line that bends with radius r what lies towards the middle of the bend is drawn 1 / (1 - d / r) times as long.
+that does not twist along the line.  Lengths are kept along the centre line and in every row.  At a distance d from a
+line that bends with radius r, lengths along the line towards the centre of the bend are stretched by 1 / (1 - d / r).
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ from clrecon.rendering.views.plane import Sheet
 __all__ = ["CurvedSheet", "FRAME_STEP_MM", "straightened_sheet", "stretched_sheet"]
 
 FRAME_STEP_MM = 0.25
-"""Distance of the places that frames and projected lengths are carried along, where pixels are not smaller."""
+"""Largest distance between places at which frames and projected lengths are computed; less for small pixels."""
 
 
 @dataclass(frozen=True)
 class CurvedSheet:
-    """A sheet along a curve.
+    """The sheet of a picture along a curve.
 
     Attributes
     ----------
@@ -45,7 +45,7 @@ class CurvedSheet:
 
 
 def _row_places(length: float, height: int, pixel: float) -> Float64Array:
-    """Distances of the rows' centres from the begin of a curve that is in the middle of the picture."""
+    """Return the positions of the row centres along a curve that is in the middle of the picture."""
     return np.asarray(0.5 * length + (np.arange(height) + 0.5 - 0.5 * height) * pixel, dtype=np.float64)
 
 
@@ -65,15 +65,15 @@ def _unit(vectors: Float64Array) -> Float64Array:
 def straightened_sheet(
     curve: Curve, across: Float64Array, size: tuple[int, int], pixel: float, angle: float = 0.0
 ) -> CurvedSheet:
-    """Rows across a curve, which is a straight line down the middle of the picture.
+    """Make a sheet whose rows cross a curve, which becomes a straight line down the middle of the picture.
 
     Parameters
     ----------
     curve : Curve
-        From the top of the picture to its bottom.
+        The curve from the top of the picture to its bottom.
     across : ndarray, shape (3,)
-        Direction in LPS that the rows keep to as well as a frame without twist can: on the mean along the curve they
-        turn neither to one side of it nor to the other.
+        Direction in LPS that the rows follow as well as a frame without twist allows: the mean of their rotation from
+        it, along the curve, is zero.
     size : (w, h)
     pixel : float
         mm.
@@ -83,7 +83,7 @@ def straightened_sheet(
     Raises
     ------
     UsageError
-        The curve runs along `across` all the way.
+        The curve is parallel to `across` everywhere.
     """
     width, height = size
     arcs = _fine_arcs(curve.length, pixel)
@@ -113,12 +113,12 @@ def straightened_sheet(
 
 
 def stretched_sheet(curve: Curve, across: Float64Array, size: tuple[int, int], pixel: float) -> CurvedSheet:
-    """Rows along one direction, through a curve, at equal distances on the surface that they make.
+    """Make a sheet of parallel rows through a curve, at equal distances on the surface that the rows form.
 
     Parameters
     ----------
     curve : Curve
-        From the top of the picture to its bottom.
+        The curve from the top of the picture to its bottom.
     across : ndarray, shape (3,)
         Direction of all rows, LPS.
     size : (w, h)
@@ -128,7 +128,7 @@ def stretched_sheet(curve: Curve, across: Float64Array, size: tuple[int, int], p
     Raises
     ------
     UsageError
-        The curve turns back or runs along `across` somewhere: its surface would fold.
+        The curve turns back or is parallel to `across` somewhere: its surface would fold.
     """
     width, height = size
     direction = _unit(np.asarray(across, dtype=np.float64))
@@ -142,7 +142,7 @@ def stretched_sheet(curve: Curve, across: Float64Array, size: tuple[int, int], p
             f"the centre line runs along the rows of the stretched picture {at:.1f} mm after its begin: take another"
             " view, or straighten it"
         )
-    # Simpson's rule on each step: the speed between two places is measured too.
+    # Simpson's rule on each step, with the speed in the middle of the step too.
     between = curve.tangents(0.5 * (arcs[1:] + arcs[:-1]))
     middle_speed = np.linalg.norm(between - (between @ direction)[:, None] * direction, axis=1)
     way = np.concatenate([[0.0], np.cumsum(np.diff(arcs) * (speed[:-1] + 4.0 * middle_speed + speed[1:]) / 6.0)])
@@ -161,7 +161,7 @@ def stretched_sheet(curve: Curve, across: Float64Array, size: tuple[int, int], p
 
 
 def stretched_length(curve: Curve, across: Float64Array) -> float:
-    """Height in mm of a stretched picture of the whole curve."""
+    """Return the height in mm of a stretched picture of the whole curve."""
     arcs = _fine_arcs(curve.length, FRAME_STEP_MM)
     flow = curve.tangents(0.5 * (arcs[1:] + arcs[:-1]))
     direction = _unit(np.asarray(across, dtype=np.float64))

@@ -20,10 +20,10 @@ DIRECTIONS: dict[str, tuple[float, float, float]] = {
     "superior": (0.0, 0.0, 1.0),
     "inferior": (0.0, 0.0, -1.0),
 }
-"""Unit vectors in LPS, from the middle of the patient to each side; a view of that name is taken from there."""
+"""Unit vectors in LPS, from the middle of the patient to each side; the view of that name is taken from there."""
 
 LARGEST_SIDE = 16384
-"""Pixels along a side of a picture: more is a slip of the keyboard."""
+"""Largest number of pixels along a side of a picture; more is a typing error."""
 
 
 def checked_vector(what: str, value: ArrayLike) -> tuple[float, float, float]:
@@ -32,7 +32,7 @@ def checked_vector(what: str, value: ArrayLike) -> tuple[float, float, float]:
     Raises
     ------
     UsageError
-        They are not; the message begins with `what`.
+        They are not three finite numbers; the message begins with `what`.
     """
     try:
         array = np.asarray(value, dtype=np.float64)
@@ -49,7 +49,7 @@ def checked_size(size: Sequence[int]) -> tuple[int, int]:
     Raises
     ------
     UsageError
-        Not two whole numbers from 1 to `LARGEST_SIDE`.
+        The size is not two whole numbers from 1 to `LARGEST_SIDE`.
     """
     try:
         width, height = size
@@ -62,7 +62,7 @@ def checked_size(size: Sequence[int]) -> tuple[int, int]:
 
 
 def find_view(view: str | Sequence[float]) -> tuple[Float64Array, Float64Array]:
-    """Where a view is taken from, and what is at its top.
+    """Return the direction from which a view is taken, and the direction at its top.
 
     Parameters
     ----------
@@ -79,7 +79,7 @@ def find_view(view: str | Sequence[float]) -> tuple[Float64Array, Float64Array]:
     Raises
     ------
     UsageError
-        No such view; the message lists those that there are.
+        The view is unknown; the message lists all names.
     """
     named = DIRECTIONS.get(view.strip().lower()) if isinstance(view, str) else None
     if named is not None:
@@ -94,12 +94,12 @@ def find_view(view: str | Sequence[float]) -> tuple[Float64Array, Float64Array]:
 
 
 def find_up(up: str | ArrayLike) -> Float64Array:
-    """Direction in LPS for the top of a picture, from a name of `DIRECTIONS` or three numbers.
+    """Return the direction in LPS for the top of a picture, from a name of `DIRECTIONS` or three numbers.
 
     Raises
     ------
     UsageError
-        Neither of them.
+        `up` is neither of these.
     """
     if isinstance(up, str):
         named = DIRECTIONS.get(up.strip().lower())
@@ -110,7 +110,7 @@ def find_up(up: str | ArrayLike) -> Float64Array:
 
 
 def _turned_anterior(azimuth: float) -> Float64Array:
-    """The anterior direction, turned by `azimuth` degrees to the left; exact at quarter turns."""
+    """Return the anterior direction, turned by `azimuth` degrees to the left; exact at quarter turns."""
     quarters, rest = divmod(azimuth, 90.0)
     sine, cosine = np.sin(np.radians(rest)), np.cos(np.radians(rest))
     for _ in range(int(quarters) % 4):

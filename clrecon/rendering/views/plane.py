@@ -1,8 +1,8 @@
 """`Sheet`: where each pixel of a reformation lies in the patient, for planes and for curved ones alike.
 
-Every row of such a picture is a straight line: it has an origin, a step from one pixel to the next and a normal that
-a slab is measured along.  A plane has the same step and normal in every row; a curved reformation turns them along
-its centre line.
+Every row of such a picture is a straight line: it has an origin, a step from one pixel to the next, and a normal along
+which a thick slice is sampled.  A plane has the same step and normal in every row; a curved reformation turns them
+along its centre line.
 """
 
 from __future__ import annotations
@@ -33,10 +33,10 @@ __all__ = [
 ]
 
 MOST_SAMPLES = 65536
-"""Samples through a slab: beyond that its thickness is a mistake."""
+"""Most samples through a thick slice; more mean that its thickness is a mistake."""
 
 THIN_LAYER = 0.25
-"""Layers of an uneven stack thinner than this share of a pixel of the slices make no samples denser."""
+"""Layers of an uneven stack thinner than this share of a slice's pixel do not make the samples denser."""
 
 
 @dataclass(frozen=True)
@@ -48,11 +48,11 @@ class Sheet:
     origins : ndarray, shape (h, 3), float64
         Centre of the first pixel of each row.
     steps : ndarray, shape (h, 3), float64
-        From one pixel of a row to the next, mm.
+        Step from one pixel of a row to the next, mm.
     normals : ndarray, shape (h, 3), float64
-        Unit; into the picture.  A slab is measured along them.
+        Unit vectors into the picture, along which a thick slice is sampled.
     width : int
-        Pixels a row.
+        Number of pixels in a row.
     """
 
     origins: Float64Array
@@ -62,22 +62,22 @@ class Sheet:
 
     @property
     def height(self) -> int:
-        """Rows."""
+        """Number of rows."""
         return len(self.origins)
 
     def points(self, rows: slice = slice(None), depth: float = 0.0) -> Float64Array:
-        """Centres of the pixels of `rows`, `depth` mm into the picture, (rows, w, 3) in LPS mm."""
+        """Return the centres of the pixels of `rows`, `depth` mm into the picture, (rows, w, 3) in LPS mm."""
         first = self.origins[rows] + depth * self.normals[rows]
         return np.asarray(first[:, None] + np.arange(self.width)[:, None] * self.steps[rows][:, None])
 
 
 @dataclass(frozen=True)
 class SlabSamples:
-    """Samples along the normal of a slab: at ``(m - intervals / 2) * step`` mm for m from 0 to `intervals`.
+    """Samples of a thick slice along its normal: at ``(m - intervals / 2) * step`` mm for m from 0 to `intervals`.
 
-    `intervals` is even, so one of them lies on the sheet itself; 0 where there is no slab.  A mean weighs the two ends
-    half (trapezoids): along straight rows of voxels that is the integral of their interpolation wherever the samples
-    lie on the voxels and half way between.
+    `intervals` is even, so that one sample lies on the sheet itself; 0 for a thin slice.  A mean gives the two ends
+    half weight (trapezoidal rule). Along straight rows of voxels this is the exact integral of their interpolation if
+    the samples lie on the voxels and half way between.
     """
 
     intervals: int
@@ -85,12 +85,12 @@ class SlabSamples:
 
     @property
     def offsets(self) -> Float64Array:
-        """Mm along the normal, (intervals + 1,)."""
+        """Positions in mm along the normal, (intervals + 1,)."""
         return np.asarray((np.arange(self.intervals + 1) - self.intervals // 2) * self.step, dtype=np.float64)
 
     @property
     def weights(self) -> Float64Array:
-        """Weights of a mean, (intervals + 1,)."""
+        """Weights of the samples in a mean, (intervals + 1,)."""
         weights: Float64Array = np.ones(self.intervals + 1, np.float64)
         if self.intervals:
             weights[[0, -1]] = 0.5
@@ -98,7 +98,9 @@ class SlabSamples:
 
 
 def finest_step(volume: Volume) -> float:
-    """Smallest distance in mm between neighbouring planes of voxel centres, of the three families of them."""
+    """Return the smallest distance in mm between neighbouring planes of voxel centres, over the three families of
+    planes.
+    """
     columns = volume.affine[:3, :3]
     if not volume.uneven:
         return float(1.0 / np.linalg.norm(np.linalg.inv(columns), axis=1).max())
@@ -110,12 +112,12 @@ def finest_step(volume: Volume) -> float:
 
 
 def slab_samples(volume: Volume, thickness: float) -> SlabSamples:
-    """Samples through a slab of `thickness` mm, at most half the smallest distance of voxels apart.
+    """Place samples through a thick slice of `thickness` mm, at most half the smallest voxel distance apart.
 
     Raises
     ------
     UsageError
-        The thickness is negative, not finite or absurd.
+        The thickness is negative, not finite or implausibly large.
     """
     size = checked_thickness(thickness)
     if size == 0.0:
@@ -129,7 +131,7 @@ def slab_samples(volume: Volume, thickness: float) -> SlabSamples:
 
 
 PLANES = {"axial": "inferior", "coronal": "anterior", "sagittal": "left"}
-"""The planes of anatomy, and the views that show them as radiologists do: the patient's left is at the right of axial
+"""The anatomical planes, and the views that show them as radiologists do: the patient's left is at the right of axial
 and coronal slices, the front at the left of sagittal ones."""
 
 
@@ -142,7 +144,7 @@ def find_plane(
     up: str | ArrayLike | None = None,
     pixel_mm: float | None = None,
 ) -> Camera:
-    """A parallel camera for a slice through the middle of a volume.
+    """Return a parallel camera for a slice through the middle of a volume.
 
     Parameters
     ----------
@@ -157,7 +159,7 @@ def find_plane(
     up : str or array_like, shape (3,), optional
         As in `Camera.fit`.
     pixel_mm : float, optional
-        Side of a pixel, in place of what fits.
+        Side of a pixel; default: so that the box fits.
 
     Raises
     ------
@@ -194,7 +196,7 @@ def _number(value: float) -> float:
 
 
 def checked_thickness(thickness: float) -> float:
-    """The thickness of a slice in mm as float.
+    """Check the thickness of a slice in mm and return it as a float.
 
     Raises
     ------
@@ -208,7 +210,7 @@ def checked_thickness(thickness: float) -> float:
 
 
 def checked_offset(offset_mm: float) -> float:
-    """The offset of a slice along the view, mm, as float.
+    """Check the offset of a slice along the view, mm, and return it as a float.
 
     Raises
     ------
@@ -222,12 +224,12 @@ def checked_offset(offset_mm: float) -> float:
 
 
 def positive_mm(what: str, value: float) -> float:
-    """Return a length in mm as float.
+    """Check a length in mm and return it as a float.
 
     Raises
     ------
     UsageError
-        It is none; the message begins with `what`.
+        It is not a length above 0; the message begins with `what`.
     """
     number = _number(value)
     if not 0.0 < number < np.inf:
@@ -236,12 +238,12 @@ def positive_mm(what: str, value: float) -> float:
 
 
 def plane_sheet(camera: Camera, size: Sequence[int], offset_mm: float = 0.0) -> tuple[Sheet, Camera]:
-    """The plane through a camera's focal point across its view.
+    """Make the plane through a camera's focal point across its view.
 
     Parameters
     ----------
     camera : Camera
-        Of a perspective one its scale at the focal point counts.
+        For a perspective camera its scale at the focal point is used.
     size : (w, h)
         Pixels.
     offset_mm : float
@@ -251,12 +253,12 @@ def plane_sheet(camera: Camera, size: Sequence[int], offset_mm: float = 0.0) -> 
     -------
     sheet : Sheet
     camera : Camera
-        Parallel, with its focal point in the plane: each ray of it meets the sheet in its own pixel.
+        A parallel camera with its focal point in the plane: each of its rays meets the sheet in its own pixel.
 
     Raises
     ------
     UsageError
-        The size is not one, or the offset is not finite.
+        The size is not possible, or the offset is not finite.
     """
     width, height = checked_size(size)
     right, up, forward = camera.basis()

@@ -1,6 +1,6 @@
 """Cameras of VTK, and PyVista's among them, as the parameters of a `Camera` and back.
 
-A camera of VTK has conditions that ours does not have: they are refused.
+VTK cameras have properties that a `Camera` has not; cameras that use them are refused.
 """
 
 from __future__ import annotations
@@ -18,17 +18,17 @@ __all__ = ["make_pyvista_camera", "parameters_from_vtk"]
 Point = Sequence[float]
 
 NEAR_AND_FAR = (0.01, 100.0)
-"""Clipping range of a PyVista camera in distances to its focal point, until the scene sets its own: VTK's default
-ends at 1000 mm, which is in the midst of a patient."""
+"""Clipping range of a PyVista camera in distances to its focal point, until the scene sets its own.  VTK's default ends
+at 1000 mm, in the middle of a patient."""
 
 
 def parameters_from_vtk(source: Any, size: Sequence[int] | None = None) -> dict[str, Any]:
-    """Parameters of the `Camera` that sees what a VTK or PyVista camera, or the camera of a plotter, sees.
+    """Return the parameters of the `Camera` with the same view as a VTK or PyVista camera, or the camera of a plotter.
 
     Parameters
     ----------
     source : vtkCamera, pyvista.Camera or pyvista.Plotter
-        In LPS mm.
+        Camera or plotter of a scene in LPS mm.
     size : (int, int), optional
         Width and height of the picture, needed where the view angle is the horizontal one; default: those of the
         plotter's window.
@@ -36,7 +36,7 @@ def parameters_from_vtk(source: Any, size: Sequence[int] | None = None) -> dict[
     Raises
     ------
     UsageError
-        No camera, or one with a transform, shear, window centre or off-axis projection, which a `Camera` has not.
+        The source is not a camera, or has a transform, shear, window centre or off-axis projection.
     """
     camera = getattr(source, "camera", source)
     if not hasattr(camera, "GetFocalPoint"):
@@ -58,7 +58,7 @@ def parameters_from_vtk(source: Any, size: Sequence[int] | None = None) -> dict[
 def make_pyvista_camera(
     position: Point, focal_point: Point, up: Point, view_angle: float | None, parallel_scale: float | None
 ) -> Any:
-    """A `pyvista.Camera` from the parameters of a `Camera`; its view angle is the vertical one."""
+    """Make a `pyvista.Camera` from the parameters of a `Camera`; its view angle is the vertical one."""
     import pyvista
 
     made = pyvista.Camera()
@@ -66,7 +66,7 @@ def make_pyvista_camera(
     made.SetPosition(*position)
     made.SetFocalPoint(*focal_point)
     made.SetViewUp(*up)
-    made.parallel_projection = parallel_scale is not None  # its own flag beside VTK's
+    made.parallel_projection = parallel_scale is not None  # PyVista has its own flag in addition to VTK's
     if parallel_scale is not None:
         made.SetParallelScale(parallel_scale)
     else:
