@@ -32,7 +32,7 @@ class MeshQuality(Record):
     ----------
     vertices, triangles : int
     closed : bool
-        There are triangles and every edge is in exactly two, also when vertices at one place are joined, as readers of
+        There are triangles and every edge is in exactly two, also after coincident vertices are joined, as readers of
         STL do.
     manifold : bool
         No edge in more than two faces, no two faces along an edge in one direction, the faces around every vertex one
@@ -42,11 +42,11 @@ class MeshQuality(Record):
     boundary_edges, nonmanifold_edges : int
         Edges in one face, in more than two.
     nonmanifold_vertices : int
-        Vertices whose faces fall apart into several fans.
+        Vertices whose faces form several fans.
     coincident_vertices : int
-        Used vertices at the place of another one.
+        Used vertices that coincide with another one.
     open_edges_by_place : int
-        Edges that are not in exactly two faces once such vertices are joined.
+        Edges that are not in exactly two faces after coincident vertices are joined.
     components : int
         Parts that share no vertex.
     euler_number : int

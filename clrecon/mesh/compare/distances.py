@@ -287,7 +287,7 @@ class MeshDistance(Record):
     volume_change_percent : float or None
         Enclosed volume against that of the reference; None where that is zero, and without meaning for open surfaces.
     samples : int
-        Points on each of them.
+        Number of points on each surface.
     """
 
     hd95_mm: float
@@ -318,7 +318,7 @@ def compare_meshes(
     ----------
     mesh, reference : Mesh
     samples : int
-        Points on each of them.
+        Number of points on each surface.
     progress : callable, optional
         Called as ``progress("compare", sides done, 2)``.
 

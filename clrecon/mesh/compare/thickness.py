@@ -70,9 +70,9 @@ def measure_walls(
     Returns
     -------
     dict
-        ``min_mm``, ``p5_mm``, ``median_mm`` : float or None, None where no ray met a triangle ``thin_mm`` : float, and
-        ``thin_share`` : float or None, share of the surface whose wall is thinner ``samples``, ``not_measured`` : int,
-        number of points, and of those whose ray met nothing
+        ``min_mm``, ``p5_mm``, ``median_mm`` : float or None, None where no ray met a triangle
+        ``thin_mm`` : float, and ``thin_share`` : float or None, share of the surface whose wall is thinner
+        ``samples``, ``not_measured`` : int, number of points, and of those whose ray met nothing
     """
     thickness = wall_thickness(vertices, triangles, samples)
     measured = thickness[np.isfinite(thickness)]

@@ -126,10 +126,12 @@ def judge_walls(walls: Walls) -> dict[str, Any]:
     -------
     dict
         ``looks_like`` : "bone", "faint bone", "metal", "contrast medium" (or another even body) or "no bone" (a thin
-        shell of a table, noise) ``compact_share`` : share of the surface with a wall of `COMPACT_HU` or more
-        ``contrast_share`` : share that is flat below and has no compact wall within about ``near_mm`` ``metal_share`` :
-        share with a wall above `METAL_HU` ``wall_hu`` : ``{"median", "p90", "p99"}`` of the walls ``samples`` : int,
-        number of vertices sampled
+        shell of a table, noise)
+        ``compact_share`` : share of the surface with a wall of `COMPACT_HU` or more
+        ``contrast_share`` : share that is flat below and has no compact wall within about ``near_mm``
+        ``metal_share`` : share with a wall above `METAL_HU`
+        ``wall_hu`` : ``{"median", "p90", "p99"}`` of the walls
+        ``samples`` : int, number of vertices sampled
     """
     median, p90, p99 = (float(value) for value in np.percentile(walls.wall, (50, 90, 99)))
     compact = walls.wall >= COMPACT_HU

@@ -11,13 +11,13 @@ __all__ = ["DENSE", "PARTS", "STEEP", "STEEP_HU", "Steepness"]
 
 # The kernels have these three numbers too, in cl/rays/steep_segments.h; a test compares them.
 PARTS = 4
-"""Of a segment where the transfer function is steep."""
+"""Number of parts of a segment where the transfer function is steep."""
 
 STEEP = 0.1
-"""Opacity that comes or goes within a ray step where it is steep."""
+"""Change of opacity within a ray step from which on it is steep."""
 
 DENSE = 0.7
-"""Opacity of a ray step of which only the front is seen."""
+"""Opacity of a ray step from which on only its front is visible."""
 
 STEEP_HU = 50.0
 """Widest range of HU for the change `STEEP`. Over wider ranges, parts are no better than the samples alone, and cost
