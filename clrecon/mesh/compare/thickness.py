@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 from clrecon.mesh.compare.distances import sample_surface_points
 from clrecon.mesh.vtk import CellLocator
 from clrecon.system.pieces import local_origin
+from clrecon.system.records import Record
 
-__all__ = ["SAMPLES", "measure_walls", "wall_thickness"]
+__all__ = ["SAMPLES", "WallFigures", "measure_walls", "wall_thickness"]
 
 SAMPLES = 20_000
 """Points on the surface, so that the 5th percentile is based on the 1000 thinnest places."""
@@ -55,9 +56,33 @@ def wall_thickness(
     return np.asarray(np.linalg.norm(found - points, axis=1))
 
 
+@dataclass(frozen=True, eq=False)
+class WallFigures(Record):
+    """How thick the walls of a surface are.
+
+    Attributes
+    ----------
+    min_mm, p5_mm, median_mm : float or None
+        None where no ray met anything.
+    thin_share : float or None
+        Share of the surface whose wall is below `thin_mm`.
+    thin_mm : float
+    samples, not_measured : int
+        Points, and those whose ray met nothing.
+    """
+
+    min_mm: float | None
+    p5_mm: float | None
+    median_mm: float | None
+    thin_share: float | None
+    thin_mm: float
+    samples: int
+    not_measured: int
+
+
 def measure_walls(
     vertices: NDArray[np.floating], triangles: NDArray[np.uint32], thin_mm: float, samples: int = SAMPLES
-) -> dict[str, Any]:
+) -> WallFigures:
     """Summarise `wall_thickness`.
 
     Parameters
@@ -69,19 +94,13 @@ def measure_walls(
 
     Returns
     -------
-    dict
-        ``min_mm``, ``p5_mm``, ``median_mm`` : float or None, None where no ray met a triangle
-        ``thin_mm`` : float, and ``thin_share`` : float or None, share of the surface whose wall is thinner
-        ``samples``, ``not_measured`` : int, number of points, and of those whose ray met nothing
+    WallFigures
     """
     thickness = wall_thickness(vertices, triangles, samples)
     measured = thickness[np.isfinite(thickness)]
-    figures: dict[str, Any] = dict.fromkeys(("min_mm", "p5_mm", "median_mm", "thin_share"))
-    if len(measured):
-        figures = {
-            "min_mm": float(measured.min()),
-            "p5_mm": float(np.percentile(measured, 5)),
-            "median_mm": float(np.median(measured)),
-            "thin_share": float(np.mean(measured < thin_mm)),
-        }
-    return {**figures, "thin_mm": thin_mm, "samples": samples, "not_measured": samples - len(measured)}
+    missed = samples - len(measured)
+    if not len(measured):
+        return WallFigures(None, None, None, None, thin_mm, samples, missed)
+    p5, median = float(np.percentile(measured, 5)), float(np.median(measured))
+    share = float(np.mean(measured < thin_mm))
+    return WallFigures(float(measured.min()), p5, median, share, thin_mm, samples, missed)

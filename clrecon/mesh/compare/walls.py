@@ -8,9 +8,8 @@ voxels larger than 1 mm depths are counted in voxels.  Figures are in docs/iso_v
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,9 +20,11 @@ from clrecon.geometry import Volume
 from clrecon.geometry.iso_rule import IsoRule
 from clrecon.mesh.compare.iso_distance import trilinear_values
 from clrecon.mesh.mesh import Mesh
+from clrecon.system.records import Record
 
 __all__ = [
     "MOST_SAMPLES",
+    "WallLook",
     "Walls",
     "find_rails",
     "is_straight",
@@ -119,19 +120,41 @@ def _step_along(directions: NDArray[np.float64], volume: Volume) -> NDArray[np.f
     return np.asarray(1.0 / np.maximum(np.abs(steps).max(axis=1), 1e-9))
 
 
-def judge_walls(walls: Walls) -> dict[str, Any]:
+@dataclass(frozen=True, eq=False)
+class WallLook(Record):
+    """What a surface looks like, by what lies beneath it.
+
+    Attributes
+    ----------
+    looks_like : str
+        "bone", "faint bone", "metal", "contrast medium" (or another even body) or "no bone" (a thin shell of a table,
+        noise).
+    compact_share : float
+        Share of the surface that has a wall of `COMPACT_HU` or more.
+    contrast_share : float
+        Share that is flat beneath and has no compact wall within about ``near_mm``.
+    metal_share : float
+        Share that has a wall above `METAL_HU`.
+    wall_hu : mapping
+        ``median``, ``p90`` and ``p99`` of the walls.
+    samples : int
+        Vertices looked at.
+    """
+
+    looks_like: str
+    compact_share: float
+    contrast_share: float
+    metal_share: float
+    wall_hu: Mapping[str, float]
+    samples: int
+
+
+def judge_walls(walls: Walls) -> WallLook:
     """Judge the material of a surface by its walls.
 
     Returns
     -------
-    dict
-        ``looks_like`` : "bone", "faint bone", "metal", "contrast medium" (or another even body) or "no bone" (a thin
-        shell of a table, noise)
-        ``compact_share`` : share of the surface with a wall of `COMPACT_HU` or more
-        ``contrast_share`` : share that is flat below and has no compact wall within about ``near_mm``
-        ``metal_share`` : share with a wall above `METAL_HU`
-        ``wall_hu`` : ``{"median", "p90", "p99"}`` of the walls
-        ``samples`` : int, number of vertices sampled
+    WallLook
     """
     median, p90, p99 = (float(value) for value in np.percentile(walls.wall, (50, 90, 99)))
     compact = walls.wall >= COMPACT_HU
@@ -146,25 +169,25 @@ def judge_walls(walls: Walls) -> dict[str, Any]:
         looks_like = "faint bone"
     else:
         looks_like = "contrast medium" if contrast_share >= LEAST_FLAT else "no bone"
-    return {
-        "looks_like": looks_like,
-        "compact_share": round(compact_share, 4),
-        "contrast_share": round(contrast_share, 4),
-        "metal_share": round(metal_share, 4),
-        "wall_hu": {"median": round(median, 1), "p90": round(p90, 1), "p99": round(p99, 1)},
-        "samples": len(walls.wall),
-    }
+    return WallLook(
+        looks_like,
+        round(compact_share, 4),
+        round(contrast_share, 4),
+        round(metal_share, 4),
+        {"median": round(median, 1), "p90": round(p90, 1), "p99": round(p99, 1)},
+        len(walls.wall),
+    )
 
 
-def looks_like_bone(judged: dict[str, Any] | None) -> bool:
-    """True where the surface is that of bone, faint or not."""
-    return judged is not None and judged["looks_like"] in ("bone", "faint bone")
+def looks_like_bone(judged: WallLook | None) -> bool:
+    """The surface is that of bone, faint or not."""
+    return judged is not None and judged.looks_like in ("bone", "faint bone")
 
 
 def judge_components(
     mesh: Mesh, volume: Volume, rule: IsoRule, count: int, label_of_vertex: NDArray[np.int64]
-) -> list[dict[str, Any] | None]:
-    """Judge each component of a surface; None for crumbs of less than `FEWEST_VERTICES`.
+) -> list[WallLook | None]:
+    """The same for each component of a surface; None for crumbs of less than `FEWEST_VERTICES`.
 
     Parameters
     ----------
@@ -180,7 +203,7 @@ def judge_components(
     sizes = np.diff(ends)
     told = np.flatnonzero(sizes >= FEWEST_VERTICES)
     chosen = [order[ends[one] : ends[one + 1] : -(-sizes[one] // MOST_COMPONENT_SAMPLES)] for one in told]
-    judged: list[dict[str, Any] | None] = [None] * count
+    judged: list[WallLook | None] = [None] * count
     if len(told) == 0:
         return judged
     rows = np.concatenate(chosen)
