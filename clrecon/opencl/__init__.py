@@ -1,6 +1,6 @@
-"""OpenCL and nothing else: devices and their memory, kernel sources and programs, arrays and launches.
+"""OpenCL: devices and their memory, kernel sources and programs, arrays and launches.
 
-The only room that finds drivers, and the only one that knows where the kernel files are.
+Only this package searches for drivers and knows where the kernel files are.
 """
 
 from clrecon.opencl.arrays import allocate, download, empty_output, upload

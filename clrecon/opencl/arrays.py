@@ -1,4 +1,4 @@
-"""Arrays on a device.  On a CPU device they are numpy's own memory and nothing is copied."""
+"""Arrays on a device.  On a CPU device they use numpy's memory without a copy."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ __all__ = ["allocate", "download", "empty_output", "upload"]
 
 
 SHARED_BYTES = 1 << 20
-"""Arrays below this are copied to the device even where it could use them in place."""
+"""Arrays smaller than this are copied to the device even if it could use them in place."""
 
 
 def _make_buffer(device: Device, flags: Any, size: int, host: NDArray[Any] | None = None) -> Any:
@@ -33,16 +33,16 @@ def allocate(device: Device, size: int) -> Any:
     """Return a buffer of `size` bytes (at least 4, since OpenCL has no empty buffers)."""
     cl = import_pyopencl()
     if device.shares_host_memory and size >= SHARED_BYTES:
-        return empty_output(device, (size,), np.uint8)[1]  # pages that an earlier call has used
+        return empty_output(device, (size,), np.uint8)[1]  # pages that an earlier call has already used
     return _make_buffer(device, cl.mem_flags.READ_WRITE, max(size, 4))
 
 
 def upload(device: Device, array: NDArray[Any]) -> Any:
-    """Return a read-only buffer with the contents of `array`, which must stay unchanged as long as it is used."""
+    """Return a read-only buffer with the contents of `array`, which must not change while the buffer is used."""
     cl = import_pyopencl()
     array = np.ascontiguousarray(array)
     flags = cl.mem_flags.READ_ONLY
-    # float4 and its like need addresses that numpy does not promise: small tables are copied.
+    # float4 and similar types need an alignment that numpy does not guarantee: small tables are copied.
     if device.shares_host_memory and array.nbytes >= SHARED_BYTES:
         return _make_buffer(device, flags | cl.mem_flags.USE_HOST_PTR, array.nbytes, array)
     return _make_buffer(device, flags | cl.mem_flags.COPY_HOST_PTR, array.nbytes, array)
@@ -61,7 +61,7 @@ def empty_output(device: Device, shape: tuple[int, ...], dtype: DTypeLike) -> tu
 
 
 def download(device: Device, array: NDArray[Any], array_d: Any, offset: int = 0) -> NDArray[Any]:
-    """Wait for the device and return `array` with what it wrote to `array_d` from byte `offset` on.
+    """Wait for the device and return `array` with the contents of `array_d` from byte `offset` on.
 
     Raises
     ------
@@ -73,7 +73,7 @@ def download(device: Device, array: NDArray[Any], array_d: Any, offset: int = 0)
         return array
     try:
         if array_d.flags & cl.mem_flags.USE_HOST_PTR:
-            # A map makes the host memory current; on CPU drivers it moves nothing.
+            # Mapping makes the host memory current; on CPU drivers it moves no data.
             mapped, _ = cl.enqueue_map_buffer(
                 device.queue, array_d, cl.map_flags.READ, offset, array.shape, array.dtype, is_blocking=True
             )

@@ -1,10 +1,11 @@
-"""Built programs in the user's cache folder, for drivers that take long to find theirs.
+"""Built programs in the user's cache folder, for drivers whose own cache is slow.
 
-PoCL keeps what it has built, but reads the whole source through its compiler's preprocessor to look for it: 25 ms a
-program.  From the binary that it gives, the same program is there in 2 ms.
+PoCL keeps built programs, but to find one it runs its compiler's preprocessor over the whole source: 25 ms for each
+program.  From the binary that it returns, the same program is made in 2 ms.
 
-A file is named by a hash of all that the binary depends on, and holds a hash of itself: one that was cut or changed is
-built anew.  Like the driver's own cache the folder is the user's alone, since what is in it will be run.
+A file is named by a hash of everything that the binary depends on, and contains a hash of itself: a program is built
+again if its file was cut or changed.  Like the driver's own cache, the folder belongs to the user alone, since its
+contents are executed.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ _MOST_FILES = 64
 
 
 def binary_key(*parts: str) -> str:
-    """Hash of everything that a binary depends on: device, driver, options, source."""
+    """Return a hash of everything that a binary depends on: device, driver, options, source."""
     digest = hashlib.sha256()
     for part in parts:
         digest.update(str(len(part)).encode() + b":" + part.encode())
@@ -40,8 +41,8 @@ def _folder() -> Path:
 
 
 def _is_private(folder: Path) -> bool:
-    """True when nobody else can put a file there."""
-    if not hasattr(os, "getuid"):  # Windows: the profile folder is the user's own
+    """True when no other user can put a file there."""
+    if not hasattr(os, "getuid"):  # Windows: the profile folder belongs to the user
         return folder.is_dir()
     try:
         state = folder.stat()
@@ -67,9 +68,9 @@ def read_binary(key: str) -> bytes | None:
 
 
 def store_binary(key: str, binary: bytes) -> None:
-    """Keep `binary` under `key`, as a whole or not at all; the oldest go when there are many.
+    """Keep `binary` under `key`, as a whole or not at all; the oldest binaries are removed when there are many.
 
-    A folder that cannot be written is no error: the program is there, and the next process builds it again.
+    A folder that cannot be written gives no error: this process has the program, and the next one builds it again.
     """
     folder = _folder()
     with suppress(OSError):

@@ -1,4 +1,4 @@
-"""`Device`: one OpenCL device with its context, its queue and what is known of it."""
+"""`Device`: one OpenCL device with its context, its queue and its properties."""
 
 from __future__ import annotations
 
@@ -18,22 +18,22 @@ __all__ = ["GROUP_SIZE", "Device", "describe_error"]
 log = get_logger(__name__)
 
 GROUP_SIZE = 64
-"""A whole wavefront of every GPU, and small enough to give a CPU's cores equal shares."""
+"""Work-group size: a whole wavefront of every GPU, and small enough to give a CPU's cores equal shares."""
 
 
 def describe_error(error: Exception) -> str:
-    """First line of what a driver said."""
+    """Return the first line of a driver's error."""
     text = str(error).strip() or type(error).__name__
     return text.splitlines()[0]
 
 
 def _version_numbers(text: str) -> tuple[int, ...]:
-    """The numbers of a version, so that 10 comes after 9."""
+    """Return the numbers of a version, so that 10 comes after 9."""
     return tuple(int(number) for number in re.findall(r"[0-9]+", text))
 
 
 def _find_shortcoming(cl_device: Any) -> str:
-    """Why clrecon cannot work on a device, empty where it can."""
+    """Return why clrecon cannot work on a device, empty if it can."""
     numbers = _version_numbers(cl_device.version)[:2]
     if not cl_device.available:
         return "it is not available"
@@ -52,7 +52,7 @@ class Device:
     Attributes
     ----------
     index : int
-        Place in `list_devices`, the number that chooses it.
+        Index in `list_devices`; this number chooses the device.
     name, platform, type, version, driver : str
         `type` is "gpu", "accelerator", "cpu" or "custom"; `platform` is the platform's name.
     memory_bytes, max_allocation_bytes : int
@@ -61,14 +61,15 @@ class Device:
     is_simulator : bool
         A checking simulator such as Oclgrind: used only when it is named.
     shortcoming : str
-        Why the device cannot be used; empty where it can.
+        Why the device cannot be used; empty if it can.
     keeps_binaries : bool
         Built programs are kept for the next process, see `clrecon.opencl.binaries`; never where no folder for them
         can be written, since PoCL builds a program a second time before it gives its binary.
     kernel_variants : dict of str to str
         ``-D`` definitions for kernels that are written for vectors, see `quirks.kernel_variants`.
     build_options : tuple of str
-        For every program: tells apart, in caches that computers share, what the driver does not.
+        Options for every program.  In caches that several computers share, they distinguish CPUs that the driver does
+        not.
     lock : threading.RLock
         Held while a kernel gets its arguments and is enqueued: kernels are shared between threads.
     """
@@ -127,7 +128,7 @@ class Device:
 
     @property
     def group_size(self) -> int:
-        """Work-group size of all launches: 64, or what the device allows where that is less (Apple's CPU: 1)."""
+        """Work-group size of all launches: 64, or less where the device allows less (Apple's CPU: 1)."""
         return min(GROUP_SIZE, self.max_work_group_size)
 
     @property
@@ -172,7 +173,7 @@ class Device:
             return self._queue
 
     def _refuse_fork(self) -> None:
-        """Refuse to work for a process that was forked off: drivers' threads are not there, it would wait forever."""
+        """Refuse to work in a forked process: the driver's threads do not exist there, so it would wait for ever."""
         if self._process != os.getpid():
             raise DeviceError(
                 f"{self.label} was opened by the process that this one was forked from, which no driver survives: start"
@@ -180,7 +181,7 @@ class Device:
             )
 
     def fail(self, what: str, error: Exception) -> DeviceError:
-        """Return the error for a failed call, and forget context and queue: a lost device needs fresh ones."""
+        """Return the error for a failed call, and drop context and queue: a lost device needs new ones."""
         with self.lock:
             self._context = self._queue = None
             self.programs.clear()
@@ -189,7 +190,7 @@ class Device:
         return kind(f"{what} on {self.label}: {describe_error(error)}")
 
     def describe(self) -> dict[str, Any]:
-        """Facts for listings and reports."""
+        """Properties for listings and reports."""
         return {
             "index": self.index,
             "name": self.name,

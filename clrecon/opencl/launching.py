@@ -1,4 +1,4 @@
-"""Launch kernels with rounded-up sizes, and add up what they cost."""
+"""Launches of kernels with rounded-up sizes, and the time that they take."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ __all__ = ["Stopwatch", "launch"]
 class Stopwatch:
     """Wall seconds by part (upload, build, kernels, download) and device seconds by kernel.
 
-    Drivers compile, or fetch from their cache, when a kernel is first launched.  The part "kernels" is therefore
-    what the device itself reports from start to end of each kernel, and the rest of the wall time of a
-    ``running`` block is counted as "build".  Where a driver's event times say nothing, all of it is "kernels".
+    Drivers compile a kernel, or read it from their cache, at its first launch.  So the part "kernels" is the time that
+    the device reports from start to end of each kernel, and the rest of the wall time of a ``running`` block is
+    "build". Where a driver's event times are useless, all of it is "kernels".
     """
 
     def __init__(self) -> None:
@@ -37,21 +37,21 @@ class Stopwatch:
             self.seconds[part] += time.perf_counter() - start
 
     def record(self, kernel: str, event: Any, arguments: tuple[Any, ...] = ()) -> None:
-        """Keep the event of a launch, and what the kernel reads and writes, until it is over.
+        """Keep the event of a launch, and the buffers that the kernel uses, until it is over.
 
-        A CPU device works in numpy's own memory: what nobody refers to any more would be given back under its hands.
+        A CPU device works in numpy's own memory, which would be freed during the launch if no reference were kept.
         """
         self._events.append((kernel, event, arguments))
 
     @contextmanager
     def running(self, device: Device) -> Iterator[None]:
-        """Time a block that launches kernels, and wait for them at its end, however it ends."""
+        """Time a block that launches kernels, and wait for them at its end, also after an error."""
         start = time.perf_counter()
         queue = device.queue
         try:
             yield
         except BaseException:
-            with suppress(import_pyopencl().Error):  # a lost device has nothing left that works
+            with suppress(import_pyopencl().Error):  # nothing works on a lost device
                 queue.finish()
             self._events.clear()
             raise
@@ -62,7 +62,7 @@ class Stopwatch:
         for kernel, event, _ in self._events:
             try:
                 spent = 1e-9 * (event.profile.end - event.profile.start)
-            except import_pyopencl().Error:  # a driver without times: the mesh is good all the same
+            except import_pyopencl().Error:  # a driver without event times: the mesh is still right
                 has_times = False
                 break
             self.by_kernel[kernel] = self.by_kernel.get(kernel, 0.0) + spent
@@ -104,19 +104,19 @@ def launch(
     ----------
     device : Device
     kernel : Kernel
-        Of a program, see `load_program`.
+        Kernel of a program, see `load_program`.
     items : int
-        Work-items; rounded up to whole groups of `Device.group_size`, so kernels check their bounds first.
+        Number of work-items; rounded up to whole groups of `Device.group_size`, so kernels check their bounds first.
     stopwatch : Stopwatch, optional
-        Where the time goes.
+        Records the time.
     **arguments
-        The kernel's arguments, by the names that its source gives them: buffers, numbers, and four numbers for a
-        float4.  Numbers are converted to the types that the source says.
+        The kernel's arguments, by their names in its source: buffers, numbers, and four numbers for a float4. Numbers
+        are converted to the types in the source.
 
     Raises
     ------
     TypeError
-        An argument is missing, or is none of the kernel's, or its value does not fit it.
+        An argument is missing or unknown, or its value does not fit its type.
     DeviceError
         The driver refuses; the message names the kernel and the sizes.
     """

@@ -1,4 +1,4 @@
-"""The memory budget: everything an operator needs is summed and compared before anything is allocated."""
+"""The memory budget: all buffers of an operator are summed and compared with the device before any is allocated."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ def _mib(size: int, up: bool = False) -> str:
 
 @dataclass(frozen=True)
 class MemoryLimits:
-    """What may be taken on a device.
+    """The memory that may be taken on a device.
 
     Attributes
     ----------
     label : str
-        The device, for messages.
+        Name of the device, for messages.
     device_bytes, device_buffer_bytes : int
-        What it has for all buffers together, and for the largest single one.
+        Memory of the device for all buffers together, and for the largest single one.
     asked_bytes : int, optional
-        What the user allows, where that is less.
+        Bytes that the user allows, if less.
     """
 
     label: str
@@ -39,28 +39,28 @@ class MemoryLimits:
 
     @property
     def total_bytes(self) -> int:
-        """What all buffers together may take."""
+        """Bytes that all buffers together may take."""
         return self.device_bytes if self.asked_bytes is None else self.asked_bytes
 
     @property
     def buffer_bytes(self) -> int:
-        """What a single buffer may take."""
+        """Bytes that a single buffer may take."""
         return min(self.device_buffer_bytes, self.total_bytes)
 
     def device_fits(self, buffers: Mapping[str, int]) -> bool:
-        """Whether the device has room for `buffers`, whatever the user allows of it."""
+        """True where the device has room for `buffers`, regardless of the user's limit."""
         sizes = buffers.values()
         return sum(sizes) <= self.device_bytes and max(sizes, default=0) <= self.device_buffer_bytes
 
     def describe(self) -> str:
-        """What there is, for messages."""
+        """Describe the available memory for messages."""
         if self.asked_bytes is not None:
             return f"{_mib(self.asked_bytes)} are allowed on {self.label} by {name_parameter('memory')}"
         return f"{self.label} has {_mib(self.device_bytes)}, at most {_mib(self.device_buffer_bytes)} in one buffer"
 
 
 def check_memory(memory: int | None) -> None:
-    """Refuse what is no number of bytes that may be taken on a device; None is all of its memory.
+    """Refuse a value that is not a byte count of at least 1; None stands for all memory of the device.
 
     Raises
     ------
@@ -71,14 +71,14 @@ def check_memory(memory: int | None) -> None:
 
 
 def memory_limits(device: Device, memory: int | None = None) -> MemoryLimits:
-    """The device's own limits, or `memory` bytes where that is less."""
+    """Return the device's own limits, or `memory` bytes if that is less."""
     asked = int(memory) if memory is not None and memory < device.memory_bytes else None
     largest = min(device.max_allocation_bytes, device.memory_bytes)
     return MemoryLimits(device.label, device.memory_bytes, largest, asked)
 
 
 def describe_shortage(limits: MemoryLimits, buffers: Mapping[str, int]) -> str:
-    """Why `buffers` do not fit together or one of them not alone; empty where they do."""
+    """Return why `buffers` do not fit together, or one of them does not fit alone; empty if they fit."""
     for what, size in buffers.items():
         if size > limits.device_buffer_bytes:
             most = _mib(limits.device_buffer_bytes)
@@ -87,7 +87,7 @@ def describe_shortage(limits: MemoryLimits, buffers: Mapping[str, int]) -> str:
     if total <= limits.total_bytes:
         return ""
     if not limits.device_fits(buffers):
-        limits = replace(limits, asked_bytes=None)  # allowing more would not help
+        limits = replace(limits, asked_bytes=None)  # a higher limit would not help
     parts = ", ".join(f"{what} {_mib(size)}" for what, size in buffers.items())
     return f"this needs {_mib(total, up=True)} on the device ({parts}): {limits.describe()}"
 
@@ -99,7 +99,7 @@ def check_budget(device: Device, buffers: Mapping[str, int], memory: int | None 
     ----------
     device : Device
     buffers : mapping of str to int
-        Bytes of every buffer that lives at the same time, by what it is.
+        Bytes of all buffers that exist at the same time, by description.
     memory : int, optional
         Bytes that may be taken on the device; None is all of its memory.
 
@@ -111,7 +111,7 @@ def check_budget(device: Device, buffers: Mapping[str, int], memory: int | None 
     Raises
     ------
     DeviceError
-        A buffer is over the device's largest allocation, or the sum is over its memory, or over what is allowed of it.
+        A buffer exceeds the device's largest allocation, or the sum exceeds its memory or the user's limit.
     """
     limits = memory_limits(device, memory)
     shortage = describe_shortage(limits, buffers)

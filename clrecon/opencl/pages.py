@@ -1,8 +1,8 @@
-"""Memory for results that is used again.
+"""Memory for results, used again for later results.
 
-A page that a process has never touched is found and cleared by the system when a kernel first writes to it: for the
-mesh of a CT series this takes as long as computing it.  Arrays made here give their pages back when the last view
-of them is gone, and a later result of the same process writes to them at once.
+When a kernel first writes to a new page, the system has to find and clear it.  For the mesh of a CT series this takes
+as long as computing the mesh.  Arrays made here return their pages when their last view is gone, and a later result of
+the same process uses them without that delay.
 """
 
 from __future__ import annotations
@@ -19,16 +19,16 @@ from numpy.typing import DTypeLike, NDArray
 __all__ = ["PagePool", "result_pages"]
 
 BLOCK_BYTES = 1 << 21
-"""Blocks are whole multiples of this, the size of a huge page on most systems."""
+"""Block sizes are multiples of this, the size of a huge page on most systems."""
 
 SMALLEST_BYTES = 1 << 20
-"""Smaller results come from numpy: the allocator of the C library keeps such pages itself."""
+"""Smaller results come from numpy: the allocator of the C library keeps those pages itself."""
 
 SPARE_BYTES = 1 << 28
-"""Unused pages kept for the next result; what is beyond goes back to the system."""
+"""Most bytes of unused pages that are kept for the next result; more go back to the system."""
 
 LARGEST_WASTE = 2
-"""A spare block serves a request only if it is at most so many times as large."""
+"""A spare block serves a request only if it is at most this many times as large."""
 
 
 _PRIVATE: dict[str, int] = (
@@ -37,36 +37,36 @@ _PRIVATE: dict[str, int] = (
 
 
 class _Loan(np.ndarray[Any, np.dtype[Any]]):
-    """The array that a block is lent as: views of it keep it alive, and its end says that the block is free."""
+    """The array as which a block is lent: its views keep it alive, and when it is gone the block is free."""
 
 
 class PagePool:
-    """Blocks of memory that are lent as numpy arrays and come back by themselves.
+    """Blocks of memory that are lent as numpy arrays and return automatically.
 
     Parameters
     ----------
     spare_bytes : int
-        How much unused memory is kept at most.
+        Most bytes of unused memory that are kept.
     """
 
     def __init__(self, spare_bytes: int = SPARE_BYTES):
         self._spare_bytes = spare_bytes
         self._spare: list[mmap.mmap] = []
-        self._lock = threading.RLock()  # a loan can end, by garbage collection, while its thread holds the lock
+        self._lock = threading.RLock()  # a loan can end, by garbage collection, while its own thread holds the lock
 
     @property
     def spare_bytes(self) -> int:
-        """Bytes that wait for the next result."""
+        """Bytes that are free for the next result."""
         with self._lock:
             return sum(map(len, self._spare))
 
     def empty(self, shape: Sequence[int], dtype: DTypeLike) -> NDArray[Any]:
-        """Return an uninitialised array, C-contiguous, at an address that suits every vector type.
+        """Return an uninitialised array, C-contiguous, aligned for every vector type.
 
         Raises
         ------
         MemoryError
-            The system does not give that much.
+            The system does not provide that much memory.
         """
         dtype = np.dtype(dtype)
         count = int(np.prod(shape, dtype=object))
@@ -74,7 +74,8 @@ class PagePool:
         if size < SMALLEST_BYTES:
             return np.empty(shape, dtype)
         block = self._take(size)
-        # Made on the block itself: a view then refers to the loan, where numpy would pass over a loan that is a view.
+        # Made directly on the block: views then refer to the loan.  If the loan were a view itself, numpy would skip
+        # it.
         loan = _Loan(tuple(shape), dtype, buffer=block)
         weakref.finalize(loan, self._give_back, block).atexit = False
         return loan.view(np.ndarray)
@@ -101,7 +102,7 @@ class PagePool:
         with self._lock:
             self._spare.append(block)
             while sum(map(len, self._spare)) > self._spare_bytes:
-                self._spare.pop(0)  # unmapped once nothing refers to it
+                self._spare.pop(0)  # unmapped when nothing refers to it
 
     def clear(self) -> None:
         """Give all spare memory back to the system."""

@@ -1,4 +1,4 @@
-"""Build kernel files for a device, and keep what was built."""
+"""Kernel files built for a device; built programs are kept."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ _TYPES: dict[str, Any] = {
 }  # fmt: skip
 
 LAUNCHES_BEFORE_TYPES = 8
-"""Launches after which pyopencl is told the types of a kernel's arguments: it then writes code that sets all of them in
-2 us, not 4 us each, but the writing takes as long as some launches, which a process with few of them should not wait
-for."""
+"""Number of launches after which pyopencl is told the types of a kernel's arguments.  It then writes code that sets all
+of them in 2 us, not 4 us each.  Writing takes as long as several launches, which a process with few launches should not
+wait for."""
 
 
 def _take_buffer(value: Any) -> Any:
@@ -45,7 +45,7 @@ def _take_whole(kind: Any) -> Callable[[Any], Any]:
     def take(value: Any) -> Any:
         if low <= value <= high:
             number = kind(value)
-            if value.__class__ is int or number == value:  # to compare takes as long as to convert
+            if value.__class__ is int or number == value:  # comparing takes as long as converting
                 return number
         raise ValueError(f"{value!r} is no {kind.__name__}")
 
@@ -62,7 +62,7 @@ def _take_float4(numbers: Any) -> Any:
 
 
 class Kernel:
-    """A kernel of a built program, and what it is called with.
+    """A kernel of a built program, with its arguments.
 
     Attributes
     ----------
@@ -84,7 +84,9 @@ class Kernel:
         self._launches = 0
 
     def enqueue(self, queue: Any, items: int, group: int, values: tuple[Any, ...]) -> Any:
-        """Launch the kernel over so many items with what `order` returned; the lock of the device is held."""
+        """Launch the kernel over `items` work-items with the result of `order`; the caller holds the lock of the
+        device.
+        """
         self._launches += 1
         if self._launches == LAUNCHES_BEFORE_TYPES:
             types = [None if argument.is_buffer else _TYPES[argument.type] for argument in self.arguments]
@@ -92,7 +94,7 @@ class Kernel:
         return self.cl_kernel(queue, (items,), (group,), *values)
 
     def order(self, values: Mapping[str, Any]) -> tuple[Any, ...]:
-        """The arguments as the driver takes them: in the kernel's order, numbers in its types.
+        """Return the arguments as the driver takes them: in the kernel's order, with numbers in its types.
 
         Parameters
         ----------
@@ -102,7 +104,7 @@ class Kernel:
         Raises
         ------
         TypeError
-            A name is missing or not one of the kernel's, or a value cannot be what its argument is.
+            A name is missing or unknown, or a value does not fit its argument.
         """
         if values.keys() != self._expected:
             raise TypeError(self._describe_difference(values))
@@ -161,7 +163,7 @@ def load_program(device: Device, name: str, variants: Mapping[str, str] | None =
     ----------
     device : Device
     name : str
-        Such as ``"surface/marching_cubes.cl"``.
+        For example ``"surface/marching_cubes.cl"``.
     variants : mapping of str to str, optional
         ``-D`` definitions; only for variants such as the element type, never for sizes.
 
@@ -184,11 +186,11 @@ def _build(device: Device, name: str, options: tuple[str, ...]) -> Program:
     source, start = read_kernel_source(name), time.perf_counter()
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # a compiler's chatter about code that builds
+            warnings.simplefilter("ignore")  # a compiler's remarks about code that builds
             kept = _build_from_binary(device, source, options) if device.keeps_binaries else None
             built = _build_from_source(device, source, options) if kept is None else kept
             program = Program(name, built, find_signatures(source, definitions_of(options)))
-    except (import_pyopencl().Error, RuntimeError, OSError) as error:  # OSError: the driver's or pyopencl's cache
+    except (import_pyopencl().Error, RuntimeError, OSError) as error:  # OSError: from a cache
         raise DeviceError(f"cl/{name} does not build on {device.label}: {_first_complaint(str(error))}") from error
     if not program.kernel_names:
         raise DeviceError(f"cl/{name} has no kernel on {device.label}: its cache is damaged, empty it")
@@ -215,7 +217,9 @@ def _build_from_source(device: Device, source: str, options: tuple[str, ...]) ->
 
 
 def _build_from_binary(device: Device, source: str, options: tuple[str, ...]) -> Any:
-    """The program from the binary that an earlier process kept; None where there is none or the driver refuses it."""
+    """Build the program from the binary that an earlier process kept; None without a binary, or if the driver refuses
+    it.
+    """
     cl = import_pyopencl()
     binary = read_binary(_key(device, source, options))
     if binary is None:
@@ -228,7 +232,7 @@ def _build_from_binary(device: Device, source: str, options: tuple[str, ...]) ->
 
 
 def _first_complaint(log: str) -> str:
-    """The first line of a build log that says what is wrong, with its place in our files if there is one."""
+    """Return the first line of a build log with an error, with its place in our files if there is one."""
     lines = [line.strip() for line in log.splitlines() if line.strip()]
     complaints = [line for line in lines if "error:" in line.lower()]
     placed = [line for line in complaints if ".cl:" in line or ".h:" in line]

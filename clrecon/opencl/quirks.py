@@ -1,6 +1,6 @@
-"""Every exception that a driver or pyopencl needs, each with its reason, in this one place.
+"""Quirks: every exception that a driver or pyopencl needs, each with its reason.
 
-One has a file of its own: `clrecon.opencl.unknown_cpu`.
+One has its own file: `clrecon.opencl.unknown_cpu`.
 """
 
 from __future__ import annotations
@@ -27,16 +27,17 @@ __all__ = [
 ]
 
 SIMULATOR_PLATFORMS = ("oclgrind",)
-"""Simulators claim to be fast devices (Oclgrind: CPU, GPU and accelerator at once) and are 1000 times slower."""
+"""Platforms of simulators, which claim to be fast devices (Oclgrind: CPU, GPU and accelerator at once) and are 1000
+times slower."""
 
 _NO_CACHES = {"PYOPENCL_NO_CACHE": "1", "MESA_SHADER_CACHE_DISABLE": "true", "MESA_GLSL_CACHE_DISABLE": "true"}
-"""Where nothing can be kept.  Mesa (before 22.1 under the last name) writes its cache from a thread of its own, even
-into a folder that is being removed.  PoCL cannot do without one."""
+"""Environment that switches caches off where no folder can be written.  Mesa (before 22.1 under the last name) writes
+its cache from a thread of its own, even into a folder that is being removed.  PoCL cannot do without a cache."""
 
 
 @cache
 def import_pyopencl() -> Any:
-    """Import pyopencl once its environment is safe.
+    """Import pyopencl after its environment has been made safe.
 
     pyopencl 2026.1 reads PYOPENCL_CACHE_FAILURE_FATAL without a default when its binary cache cannot be used
     (read-only home, Oclgrind): the KeyError then hides the cause.
@@ -60,7 +61,7 @@ def _is_usable(folder: Path) -> bool:
 
 
 def _remove_tree(folder: str) -> None:
-    """Remove a folder into which threads of a driver may still be writing: another file fails the removal of one."""
+    """Remove a folder into which threads of a driver may still be writing, so that a first attempt may fail."""
     for pause in (0.0, 0.01, 0.03, 0.1, 0.3):
         time.sleep(pause)
         shutil.rmtree(folder, ignore_errors=True)
@@ -70,10 +71,10 @@ def _remove_tree(folder: str) -> None:
 
 @cache
 def cache_warnings() -> tuple[str, ...]:
-    """See to it that drivers can keep built kernels; what to tell the user when they cannot.
+    """Make sure that drivers can keep built kernels; return warnings for the user if they cannot.
 
-    Without a folder to write to (no HOME, a read-only one, a full disk) PoCL shows no device at all and pyopencl
-    fails while it is imported.  They then get a folder of their own that ends with the process.
+    Without a writable folder (no HOME, a read-only one, a full disk) PoCL shows no device at all and pyopencl fails to
+    import.  They then get a temporary folder that is removed at the end of the process.
     """
     home = Path(os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache"))
     pocl = os.environ.get("POCL_CACHE_DIR")
@@ -94,7 +95,7 @@ def is_simulator(platform_name: str) -> bool:
 
 
 def is_slow_from_its_cache(platform_name: str) -> bool:
-    """True for PoCL: it preprocesses the whole source, builtins included, to find what it has built already."""
+    """True for PoCL: to find a built program it preprocesses the whole source, builtins included."""
     return "portable computing language" in platform_name.lower()
 
 
@@ -113,16 +114,16 @@ def shares_host_memory(platform_name: str, device_type: str) -> bool:
 
 
 def has_event_times(platform_name: str) -> bool:
-    """False where profiling events say nothing: rusticl of Mesa 22 reports some nanoseconds for any kernel."""
+    """False where profiling events are useless: rusticl of Mesa 22 reports some nanoseconds for any kernel."""
     return "rusticl" not in platform_name.lower()
 
 
 def kernel_variants(platform_name: str, device_type: str) -> dict[str, str]:
-    """Definitions for kernels with code of their own for CPUs, whose compilers do not make vectors of work-items.
+    """Return definitions for kernels with special code for CPUs, whose compilers do not turn work-items into vectors.
 
-    LANES is the length of their vectors: 8 is one AVX register, and half of one with AVX-512 or two of NEON cost
-    little.  WORDS_PER_ITEM is how many neighbouring words of a mask a work-item takes, so that its vectors are full.
-    OpenCL's prefetch() does nothing in PoCL; the builtin of its compiler, clang, does.
+    LANES is the length of their vectors: 8 is one AVX register; half an AVX-512 register or two NEON registers cost
+    little.  WORDS_PER_ITEM is the number of neighbouring words of a mask for each work-item, so that its vectors are
+    full.  OpenCL's prefetch() has no effect in PoCL; the builtin of its compiler, clang, has.
     """
     if device_type != "cpu" or is_simulator(platform_name):
         return {"LANES": "1", "WORDS_PER_ITEM": "1"}

@@ -20,7 +20,7 @@ log = get_logger(__name__)
 
 
 def driver_advice() -> str:
-    """One sentence on how to get an OpenCL driver on this system."""
+    """Return one sentence on how to get an OpenCL driver on this system."""
     system = platform.system()
     if system == "Linux":
         if platform.machine() == "x86_64":
@@ -34,20 +34,20 @@ def driver_advice() -> str:
 
 
 def _find_platforms() -> list[Any]:
-    """All pyopencl platforms; an empty list where there is no driver."""
+    """Return all pyopencl platforms; an empty list without a driver."""
     try:
         cl = quirks.import_pyopencl()
     except ImportError as error:
         raise DeviceError(f"pyopencl cannot be imported ({error}): reinstall clrecon") from error
     try:
         return list(cl.get_platforms())
-    except cl.Error:  # PLATFORM_NOT_FOUND_KHR: the loader is there, no driver is
+    except cl.Error:  # PLATFORM_NOT_FOUND_KHR: a loader exists, but no driver
         return []
 
 
 @lru_cache(maxsize=1)
 def _discover() -> tuple[tuple[tuple[str, str, str], ...], tuple[Device, ...]]:
-    """((name, version, note) of each platform, all devices), found once a process."""
+    """Return (name, version, note) of each platform and all devices; they are searched once in a process."""
     platforms: list[tuple[str, str, str]] = []
     devices: list[Device] = []
     for cl_platform in _find_platforms():
@@ -70,12 +70,12 @@ def _discover() -> tuple[tuple[tuple[str, str, str], ...], tuple[Device, ...]]:
 
 
 def list_platforms() -> list[dict[str, str]]:
-    """Name, version and a note of every OpenCL platform, also of those without a device."""
+    """Return name, version and a note of every OpenCL platform, also of those without a device."""
     return [{"name": name, "version": version, "note": note} for name, version, note in _discover()[0]]
 
 
 def list_devices() -> list[Device]:
-    """Every OpenCL device of the machine, simulators included, in the order of the drivers.
+    """Return every OpenCL device of the machine, simulators included, in the order of the drivers.
 
     Returns
     -------
@@ -98,7 +98,7 @@ def _list_for_message(devices: list[Device]) -> str:
 
 
 def _match(devices: list[Device], wanted: str) -> list[Device]:
-    """Devices that `wanted` names: by index, by type, or by a part of the platform's or device's name."""
+    """Return devices that match `wanted`: by index, by type, or by a part of the platform's or device's name."""
     if re.fullmatch("[0-9]+", wanted):
         return [device for device in devices if device.index == int(wanted)]
     wanted = wanted.lower()
@@ -109,7 +109,7 @@ def _match(devices: list[Device], wanted: str) -> list[Device]:
 
 
 def _named_by_pyopencl(cl: Any, devices: list[Device]) -> list[Device]:
-    """The device that PYOPENCL_CTX asks for, in pyopencl's own notation."""
+    """Return the device that PYOPENCL_CTX asks for, in pyopencl's own notation."""
     try:
         asked = cl.create_some_context(interactive=False).devices
     except Exception as error:  # pyopencl raises RuntimeError, IndexError or its own errors here
@@ -123,10 +123,10 @@ def choose_device(name: str | int | Device | None = None) -> Device:
     Parameters
     ----------
     name : str, int or Device, optional
-        Index as `list_devices` counts, "cpu" or "gpu", or a part of the name of a device or platform; of several
-        that match the best is taken.  None or "auto": what CLRECON_DEVICE says, else PYOPENCL_CTX, else the best
-        of all: GPUs before accelerators before CPUs before software rasterisers, then by memory.  A simulator is
-        used only when it is named.
+        Index as `list_devices` counts, "cpu" or "gpu", or a part of the name of a device or platform; if several match,
+        the best is used.  None or "auto": the device named by CLRECON_DEVICE, else by PYOPENCL_CTX, else the best of
+        all: GPUs before accelerators before CPUs before software rasterisers, then by memory.  A simulator is used only
+        when it is named.
 
     Returns
     -------
@@ -135,7 +135,7 @@ def choose_device(name: str | int | Device | None = None) -> Device:
     Raises
     ------
     DeviceError
-        No driver, no device, or none of that name (the message lists what is there).
+        There is no driver, no device, or no device of that name (the message lists all devices).
     """
     if isinstance(name, Device):
         return name

@@ -21,7 +21,7 @@ _DEFINE = re.compile(r"(\w+)(\(?)[ \t]*(.*)", re.DOTALL)
 _DEFINED = re.compile(r"\bdefined\s*(?:\(\s*(\w+)\s*\)|(\w+))")
 _WORD = re.compile(r"\b[A-Za-z_]\w*\b")
 _KERNEL = re.compile(r"__kernel\b(?:\s*__attribute__\s*\(\(.*?\)\))?\s+void\s+(\w+)\s*\(([^()]*)\)\s*\{")
-_LONGEST_HEAD = 8000  # characters from __kernel to the body, comments counted
+_LONGEST_HEAD = 8000  # from __kernel to the body, with comments
 _QUALIFIERS = {"const", "restrict", "volatile", "unsigned", "__global", "__constant", "__local", "__private"}
 
 
@@ -33,7 +33,7 @@ class KernelArgument:
     ----------
     name : str
     type : str
-        As in OpenCL C, such as ``"int"`` or ``"float4"``; of a buffer that of its elements.
+        Type in OpenCL C, for example ``"int"`` or ``"float4"``; for a buffer the type of its elements.
     is_buffer : bool
     """
 
@@ -43,7 +43,7 @@ class KernelArgument:
 
 
 def definitions_of(options: tuple[str, ...]) -> dict[str, str]:
-    """Macros that the options of a build define, with their values."""
+    """Return the macros that the options of a build define, with their values."""
     given = (option[2:].partition("=") for option in options if option.startswith("-D"))
     return {name: value if equals else "1" for name, equals, value in given}
 
@@ -54,7 +54,7 @@ def _strip_comments(text: str) -> str:
 
 @cache
 def _split_source(source: str) -> tuple[tuple[str, str, str], ...]:
-    """Pieces of a source: a directive, what it says, and the text from there to the next one."""
+    """Split a source into pieces: a directive, its text, and the text from there to the next directive."""
     text = source.replace("\\\n", " ")
     pieces = [("", "", 0)]
     ends = []
@@ -66,12 +66,12 @@ def _split_source(source: str) -> tuple[tuple[str, str, str], ...]:
 
 
 def find_signatures(source: str, definitions: Mapping[str, str]) -> dict[str, tuple[KernelArgument, ...]]:
-    """The arguments of all kernels of a source.
+    """Return the arguments of all kernels of a source.
 
     Parameters
     ----------
     source : str
-        With its includes, as `clrecon.opencl.sources.read_kernel_source` gives it.
+        Text with its includes, as `clrecon.opencl.sources.read_kernel_source` returns it.
     definitions : mapping of str to str
         Macros that the options of the build define.
 
@@ -83,7 +83,7 @@ def find_signatures(source: str, definitions: Mapping[str, str]) -> dict[str, tu
     macros, text = _preprocess(source, definitions)
     signatures = {}
     at = text.find("__kernel")
-    while at >= 0:  # comments are long: they are taken out only here
+    while at >= 0:  # comments are long, so they are removed only here
         match = _KERNEL.match(_strip_comments(text[at : at + _LONGEST_HEAD]))
         if match is not None:
             signatures[match[1]] = _arguments(_expand(match[2], macros))
@@ -92,9 +92,9 @@ def find_signatures(source: str, definitions: Mapping[str, str]) -> dict[str, tu
 
 
 def _preprocess(source: str, definitions: Mapping[str, str]) -> tuple[dict[str, str], str]:
-    """Macros without parameters at the end of a source, and its text that the conditions leave."""
+    """Return the macros without parameters at the end of a source, and the text that its conditions keep."""
     macros, kept = dict(definitions), []
-    states: list[tuple[bool, bool]] = []  # of each open condition: whether its branch counts, and whether one has
+    states: list[tuple[bool, bool]] = []  # for each open condition: is its branch kept, and was one kept before
     for name, rest, text in _split_source(source):
         if name in ("if", "ifdef", "ifndef"):
             outside = not states or states[-1][0]
@@ -121,7 +121,7 @@ def _define(directive: str, rest: str, macros: dict[str, str]) -> None:
         raise ValueError(f"#{directive} {rest}")
     if directive == "undef":
         macros.pop(match[1], None)
-    elif not match[2] or rest[match.end(1)] == " ":  # a macro with parameters names no argument
+    elif not match[2] or rest[match.end(1)] == " ":  # macros with parameters cannot name an argument
         macros[match[1]] = rest[match.end(1) :].strip()
 
 
@@ -140,7 +140,7 @@ def _holds(directive: str, condition: str, macros: Mapping[str, str]) -> bool:
 
 
 def _expand(text: str, macros: Mapping[str, str]) -> str:
-    """Replace macros, and what they name."""
+    """Replace macros, repeatedly."""
     for _ in range(10):
         expanded = _WORD.sub(lambda match: macros.get(match[0], match[0]), text)
         if expanded == text:

@@ -1,4 +1,4 @@
-"""The one place that knows where the kernel files are, and how their includes are resolved.
+"""Kernel files: where they are, and how their includes are resolved.
 
 Includes are inlined on the host, each file once, with ``#line`` marks: a compiler error then names the true file
 and line, no ``-I`` path with a space can break a driver, and the whole text is the key of every cache.

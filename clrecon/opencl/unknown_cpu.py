@@ -1,10 +1,10 @@
 """PoCL on a CPU that is newer than its compiler: name the nearest one that the compiler knows.
 
-The PoCL of PyPI (3.0, LLVM 14) asks LLVM for the name of the CPU, gets "generic" for any that came out after it
-(AMD's Zen 5, Intel since Meteor Lake), and clang then refuses that name: no kernel builds (pocl issue 1049).  PoCL 3.1
-takes the name from what the CPU can do.  There is no option for it before, so the same is done here from outside: the
-name is a string of 7 letters in memory of the driver, found beside the name of its target, and overwritten in its place
-before anything is built.  What is not found exactly so is left alone, and the device is called unusable.
+The PoCL of PyPI (3.0, LLVM 14) asks LLVM for the name of the CPU, gets "generic" for any that came out after it (AMD's
+Zen 5, Intel since Meteor Lake), and clang then refuses that name: no kernel builds (pocl issue 1049). PoCL 3.1 takes
+the name from what the CPU can do.  Earlier versions have no option for it, so this module does the same from outside.
+The name is a string of 7 letters in the driver's memory, beside the name of its target; it is overwritten there before
+a kernel is built.  If the strings are not found exactly so, nothing is changed, and the device is reported as unusable.
 """
 
 from __future__ import annotations
@@ -25,9 +25,8 @@ CPU_NAMES: tuple[tuple[str, frozenset[str]], ...] = (
     ("haswell", frozenset("avx2 bmi1 bmi2 abm f16c fma movbe popcnt".split())),
     ("x86-64", frozenset()),
 )
-"""LLVM's names of CPUs, no longer than `UNKNOWN`, and what each needs, in the words of /proc/cpuinfo; best first.
-
-The kernels ask the compiler for AVX-512 or AVX2 (`cl/rays/window.h`): finer steps would gain nothing.
+"""LLVM's names of CPUs, no longer than `UNKNOWN`, and the flags that each needs, as in /proc/cpuinfo; best first.  The
+kernels only distinguish AVX-512 and AVX2 (`cl/rays/window.h`), so more names would bring nothing.
 """
 
 _STRUCT_BYTES = 2048
@@ -35,7 +34,7 @@ _POINTER = struct.Struct("<Q")
 
 
 def has_unknown_cpu(platform_name: str, device_version: str) -> bool:
-    """True where PoCL says of a device on x86-64 Linux that its compiler does not know it."""
+    """True where PoCL reports, for a device on x86-64 Linux, that its compiler does not know it."""
     return (
         sys.platform == "linux"
         and platform.machine() == "x86_64"
@@ -45,19 +44,19 @@ def has_unknown_cpu(platform_name: str, device_version: str) -> bool:
 
 
 def choose_name(cpuinfo: str) -> str:
-    """The best of `CPU_NAMES` whose needs are among the flags of the text of /proc/cpuinfo."""
+    """Return the best of `CPU_NAMES` whose flags are all in the text of /proc/cpuinfo."""
     found = re.search(r"^flags\s*:(.*)$", cpuinfo, re.MULTILINE)
     flags = set(found.group(1).split()) if found else set()
     return next(name for name, needs in CPU_NAMES if needs <= flags)
 
 
 class NameOfCpu:
-    """Where a PoCL device keeps the name of its CPU, and the name to put there.
+    """The place where a PoCL device keeps the name of its CPU, and the name to write there.
 
     Parameters
     ----------
     address : int
-        Of the driver's structure of the device (its ``cl_device_id``).
+        Address of the driver's structure of the device (its ``cl_device_id``).
 
     Attributes
     ----------
@@ -67,7 +66,7 @@ class NameOfCpu:
     Raises
     ------
     LookupError
-        The name is not where it is expected, or memory cannot be looked at.
+        The name is not where it is expected, or memory cannot be read.
     """
 
     def __init__(self, address: int):
@@ -79,12 +78,12 @@ class NameOfCpu:
             raise LookupError(str(error)) from error
 
     def write(self) -> None:
-        """Put the name in its place, where it is not there yet.
+        """Write the name, if it is not there yet.
 
         Raises
         ------
         LookupError
-            The system refuses, or what is there is no longer the name of a CPU.
+            The system refuses, or the place no longer holds the name of a CPU.
         """
         try:
             with _Memory() as memory:
@@ -97,7 +96,9 @@ class NameOfCpu:
 
 
 class _Memory:
-    """Memory of this process through the system, which gives an error where a pointer would end the process."""
+    """Memory of this process, read through the system, which reports an error where a wrong pointer would end the
+    process.
+    """
 
     def __enter__(self) -> _Memory:
         self._file = os.open("/proc/self/mem", os.O_RDWR | os.O_CLOEXEC)
@@ -110,7 +111,7 @@ class _Memory:
         return os.pread(self._file, count, address)
 
     def read_text(self, address: int) -> bytes:
-        """The bytes up to a 0 at an address; empty where nothing is mapped there."""
+        """Return the bytes up to a 0 at an address; empty if nothing is mapped there."""
         try:
             return self.read(address, 32).split(b"\0", 1)[0]
         except (OSError, OverflowError):
@@ -122,7 +123,7 @@ class _Memory:
 
 
 def _find_name(memory: _Memory, address: int) -> int:
-    """Address of the one string of the structure that is a name of a CPU behind that of a target."""
+    """Return the address of the only string of the structure that is a CPU's name after a target's name."""
     names = (UNKNOWN, *(name.encode() for name, _ in CPU_NAMES))
     pointers = [place for (place,) in _POINTER.iter_unpack(_whole_words(memory.read(address, _STRUCT_BYTES)))]
     places = [

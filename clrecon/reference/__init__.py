@@ -1,1 +1,1 @@
-"""Slow, plain numpy twins of the device operators: the specification, the test and the debugger of each."""
+"""Reference: slow, plain numpy twins of the device operators, which specify, test and help to debug them."""

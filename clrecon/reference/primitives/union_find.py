@@ -22,7 +22,7 @@ def label_components(triangles: NDArray[np.uint32], vertex_count: int) -> tuple[
     Returns
     -------
     count : int
-        Number of components; vertices that no triangle uses are none.
+        Number of components, not counting vertices that no triangle uses.
     labels : ndarray, shape (vertex_count,), int64
         Component of each vertex, numbered in order of the first vertex; -1 for unused vertices.
     """

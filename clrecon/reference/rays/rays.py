@@ -1,4 +1,4 @@
-"""What all twins of rays share: where a ray runs through a volume, the field there, and jitter.
+"""Shared parts of the ray twins: the way of a ray through a volume, the field there, and jitter.
 
 Everything is float64 and vectorised over rays.  Rays are arrays (n, 3): origins in LPS mm and unit directions.
 """
@@ -26,18 +26,18 @@ __all__ = [
 
 
 class Planes(Protocol):
-    """What `clrecon.rendering.views.clip.Clip` has: unit normals and offsets (n, 4); normal . p >= offset is kept."""
+    """Form of `clrecon.rendering.views.clip.Clip`: unit normals and offsets (n, 4); kept is normal . p >= offset."""
 
     @property
     def planes(self) -> Float64Array: ...
 
 
 class Box:
-    """The volume's box as bounds on three linear functions of LPS: kept is low <= normals @ p <= high.
+    """The volume's box as bounds on three linear functions of LPS: inside is low <= normals @ p + offsets <= high.
 
-    Of an even stack these are its indices.  The slices of an uneven one may shift sideways from one to the next, so
-    no box holds exactly its voxels: the functions are then i and j counted in the plane of slice 0, with bounds around
-    all slices, and the height over slice 0.  A sample in that box may lie beside its slice: it is not there.
+    For an even stack the functions are its indices.  Slices of an uneven stack may shift sideways, so no box holds
+    exactly its voxels.  The functions are then i and j counted in the plane of slice 0, with bounds around all slices,
+    and the height over slice 0. Samples in that box but beside their slice are ignored.
 
     Attributes
     ----------
@@ -51,7 +51,7 @@ class Box:
 
 
 def box_of(volume: Volume, border: float = 0.5) -> Box:
-    """The box that runs `border` index steps beyond the outermost voxel centres."""
+    """Return the box that extends `border` index steps beyond the outermost voxel centres."""
     last = np.array(volume.shape_ijk, dtype=np.float64) - 1.0
     if not volume.uneven:
         inverse = np.linalg.inv(volume.affine)
@@ -78,7 +78,7 @@ def find_interval(
     clip: Planes | None = None,
     nearest: float = -np.inf,
 ) -> tuple[Float64Array, Float64Array, NDArray[np.int64]]:
-    """Where rays run through a box and what clip planes leave of it.
+    """Find the part of rays that lies in a box and within clip planes.
 
     Parameters
     ----------
@@ -86,14 +86,14 @@ def find_interval(
     box : Box
     clip : Clip, optional
     nearest : float
-        Nothing nearer than this counts, mm: 0 for rays that begin at a camera.
+        Start of the rays, mm: 0 for rays that begin at a camera.
 
     Returns
     -------
     t_in, t_out : ndarray, shape (n,), float64
         Mm along the ray; a ray that misses has ``t_out <= t_in``.
     entered_by : ndarray, shape (n,), int64
-        Number of the clip plane that the ray comes in through, -1 for a side of the box or the camera.
+        Number of the clip plane through which the ray enters, -1 for a side of the box or the camera.
     """
     planes = np.vstack(
         [
@@ -119,9 +119,10 @@ def find_interval(
 
 
 def sample_field(voxels: NDArray, ijk: Float64Array) -> Float64Array:
-    """Trilinear interpolation (n,) at index coordinates (n, 3); beyond the outermost centres the nearest has its value.
+    """Interpolate trilinearly (n,) at index coordinates (n, 3); beyond the outermost centres their value holds.
 
-    Along i, then j, then k, each ``low + part * (high - low)``: what is constant stays so to the last bit.
+    Along i, then j, then k, each ``low + part * (high - low)``, so that a constant field stays constant to the last
+    bit.
 
     Parameters
     ----------
@@ -147,15 +148,15 @@ def sample_field(voxels: NDArray, ijk: Float64Array) -> Float64Array:
 
 
 def voxel_gradients(voxels: NDArray, matrices: Float64Array) -> Float64Array:
-    """Gradient per mm at every voxel, to be interpolated between them.
+    """Compute the gradient per mm at every voxel; between voxels it is interpolated.
 
-    Central differences of voxels, half a one-sided one at the border (the index beyond it is clamped).
+    Central differences; at the border half a one-sided difference (the index beyond is clamped).
 
     Parameters
     ----------
     voxels : ndarray, shape (nk, nj, ni)
     matrices : ndarray, shape (nk, 3, 3), float64
-        Of each slice, from `clrecon.geometry.iso_rule.slice_normal_matrices`.
+        Matrix of each slice, from `clrecon.geometry.iso_rule.slice_normal_matrices`.
 
     Returns
     -------
@@ -175,7 +176,8 @@ def voxel_gradients(voxels: NDArray, matrices: Float64Array) -> Float64Array:
 def hash_pixels(x: NDArray[np.integer], y: NDArray[np.integer]) -> NDArray[np.uint32]:
     """A 32-bit hash of pixels; `hash_pixel` in cl/rays/jitter.h gives the same bits.
 
-    The mixer is lowbias32 (C. Wellons 2018, "Prospecting for hash functions"), once over y and once over x with that.
+    The mixer is lowbias32 (C. Wellons 2018, "Prospecting for hash functions"), first applied to y, then to x combined
+    with the result.
     """
     mixed = _mix(np.asarray(y).astype(np.uint32) + np.uint32(0x9E3779B9))
     return _mix(np.asarray(x).astype(np.uint32) + mixed)
@@ -188,6 +190,6 @@ def _mix(bits: NDArray[np.uint32]) -> NDArray[np.uint32]:
 
 
 def jitter_pixels(width: int, height: int) -> Float64Array:
-    """Where in its segments the samples of each pixel lie, shape (height, width): 0 to below 1, 24 bits."""
+    """Return the place of samples in their segments for each pixel, shape (height, width): 0 to below 1, 24 bits."""
     y, x = np.mgrid[:height, :width]
     return (hash_pixels(x, y) >> np.uint32(8)) * 2.0**-24

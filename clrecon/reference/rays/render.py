@@ -1,4 +1,4 @@
-"""Twin of the raycaster: dvr, mip, minip, mean and drr in plain numpy, in float64, a sample of all rays at a time.
+"""Twin of the raycaster: dvr, mip, minip, mean and drr in plain numpy, in float64, one sample of all rays at a time.
 
 References: Levoy 1988, "Display of surfaces from volume data" (compositing front to back, gradient opacity); Phong
 1975 (shading, see `clrecon.rendering.looks.lighting`).
@@ -27,40 +27,40 @@ __all__ = ["FLAT_GRADIENT", "MODES", "OPAQUE", "TABLE_NODES", "RayPicture", "cas
 MODES = ("dvr", "mip", "minip", "mean", "drr")
 
 AIR_HU = -1000.0
-"""Attenuates nothing; lower values, padding and what a mask left, count as this."""
+"""HU that attenuates nothing; lower values (padding, voxels removed by a mask) count as this."""
 
 TABLE_NODES = 4096
 """Entries of the table of a transfer function."""
 
 OPAQUE = 0.99
-"""A ray ends at the sample that makes it so opaque."""
+"""Opacity at which a ray ends."""
 
 VISIBLE = 1.0 / 255.0
-"""The first hit is the sample after which a ray is more opaque than this."""
+"""Opacity of a ray above which its current sample is the first hit."""
 
 FLAT_GRADIENT = 1e-6
-"""HU per mm; below, a gradient has no direction."""
+"""HU per mm; smaller gradients have no direction."""
 
 PART_SLACK = 1e-3
-"""Of a sample: a step that divides the distance of slice planes but for rounding divides it."""
+"""Tolerance as a share of a sample: a step that divides the distance of slice planes up to rounding divides it."""
 
 PLANE_SLACK = 1.0 / 4096.0
-"""Of a sample: a plane that lies before the first or behind the last place but for rounding lies within."""
+"""Tolerance as a share of a sample: a plane just outside the way of a ray, within rounding, counts as inside."""
 
 
 @dataclass
 class RayPicture:
-    """What rays bring back.
+    """The results of rays.
 
     Attributes
     ----------
     rgba : ndarray, shape (h, w, 4), float64
         Colours times opacity, and opacity; zero for modes that show values.
     depth : ndarray, shape (h, w), float64
-        First hit, mm along the ray; NaN where nothing is hit.  In mip and minip where the value first is; none in mean
-        and drr.
+        First hit, mm along the ray; NaN where nothing is hit.  In mip and minip the first place of the value; NaN in
+        mean and drr.
     expected_depth : ndarray, shape (h, w), float64
-        Mean depth weighted with what each sample adds to the opacity; that of the value in mip and minip.
+        Mean depth, weighted by the opacity that each sample adds; in mip and minip the depth of the value.
     values : ndarray, shape (h, w), float64
         HU in mip, minip and mean, NaN outside of the volume; in drr mm of water, 0 there; NaN everywhere in dvr.
     """
@@ -79,7 +79,7 @@ class RayPicture:
 
 
 class _Rays:
-    """The rays of a picture, one after the other, with their way through a volume."""
+    """The rays of a picture with their way through a volume."""
 
     def __init__(self, volume: Volume, camera: Camera, size: Sequence[int], clip: Planes | None):
         origins, directions = camera.rays(size)
@@ -91,7 +91,7 @@ class _Rays:
         self.last_ijk = np.array(volume.shape_ijk) - 1.0
 
     def places(self, ray: NDArray[np.int64], t: Float64Array) -> tuple[Float64Array, NDArray[np.bool_]]:
-        """Index coordinates at t of rays, and which of them lie in their slice (all of them in an even stack)."""
+        """Return index coordinates at t of rays, and which of them lie in their slice (all in an even stack)."""
         ijk = self.volume.lps_to_ijk(self.origins[ray] + t[:, None] * self.directions[ray])
         if not self.volume.uneven:
             return ijk, np.ones(len(ijk), dtype=bool)
@@ -112,11 +112,11 @@ def cast_rays(
 ) -> RayPicture:
     """Send a ray through each pixel.
 
-    The field is trilinear between voxel centres; half a voxel beyond the outermost ones has their values.  A ray is
-    cut into segments of `ray_step` from where it enters the volume or what the clip planes leave of it, the last
-    segment ends where it leaves; there is a sample in the middle of each segment, or with jitter at a part of it that
-    depends on the pixel alone.  A mean is the integral along the ray by its length.  A radiograph is the integral of
-    attenuation relative to water, of the field between voxels of max(HU, -1000) / 1000 + 1.
+    The field is trilinear between voxel centres; up to half a voxel beyond the outermost centres it has their values.
+    A ray is divided into segments of `ray_step` from where it enters the volume within the clip planes; the last
+    segment ends where it leaves.  Each segment has a sample in its middle, or with jitter at a place that depends on
+    the pixel alone.  A mean is the integral along the ray divided by its length.  A radiograph is the integral of
+    attenuation relative to water; its field interpolates max(HU, -1000) / 1000 + 1 between voxels.
 
     Parameters
     ----------
@@ -129,12 +129,13 @@ def cast_rays(
     ray_step : float, optional
         Mm; default half the smallest spacing.
     lighting : Lighting, optional
-        None leaves colours as they are.
+        None: no shading.
     clip : Clip, optional
     mode : {"dvr", "mip", "minip", "mean", "drr"}
-        Compositing; highest, lowest, mean value along the ray; water that attenuates as much as all along it.
+        Compositing; highest, lowest or mean value along the ray; thickness of water with the same attenuation as the
+        ray.
     jitter : bool
-        In dvr; extremes have their samples on slice planes, and integrals in the middles of segments.
+        Only in dvr: extremes have their samples on slice planes, and integrals in the middles of segments.
 
     Returns
     -------
@@ -143,7 +144,7 @@ def cast_rays(
     Raises
     ------
     UsageError
-        There is no such mode, or dvr without a transfer function.
+        The mode is unknown, or dvr has no transfer function.
     """
     if mode not in MODES:
         raise UsageError(f"there is no mode {mode!r}: it is one of {', '.join(MODES)}")
@@ -171,9 +172,9 @@ Found = tuple[Float64Array, Float64Array, Float64Array, Float64Array]
 
 
 def look_up(transfer_function: TransferFunction, hu: Float64Array) -> Float64Array:
-    """Red, green, blue, opacity (n, 4) as the device's table has them, float64 of float32.
+    """Return red, green, blue, opacity (n, 4) as in the device's table, float32 values as float64.
 
-    Of `TABLE_NODES` HU evenly over the function's range, both ends included, the nearest counts.
+    The nearest of `TABLE_NODES` evenly spaced HU is used, which cover the function's range with both ends.
     """
     low, high = transfer_function.range_hu
     nodes = transfer_function.table(low, high, TABLE_NODES).astype(np.float64)
@@ -189,12 +190,12 @@ def shade(
     lit: ArrayLike = 1.0,
     soft_gradient: float = 0.0,
 ) -> Float64Array:
-    """Phong's shading of colours (n, 3) with gradients (n, 3) as normals, seen along directions (n, 3).
+    """Shade colours (n, 3) after Phong with gradients (n, 3) as normals, seen along directions (n, 3).
 
-    Normals count as turned to the camera, and a fixed light lights only what faces it.  A gradient of no size has no
-    direction: its colour has all of the diffuse light and no highlight.  `lit` 0 is in shadow: ambient light alone.
-    With `soft_gradient` (HU per mm) directions of small gradients count less, see `clrecon.rendering.Lighting`.  What
-    goes beyond 1 is cut.
+    Normals are turned towards the camera, and a fixed light only lights surfaces that face it.  A zero gradient has no
+    direction: its colour gets full diffuse light and no highlight.  `lit` 0 means in shadow: only ambient light.  With
+    `soft_gradient` (HU per mm) directions of small gradients count less, see `clrecon.rendering.Lighting`. Colours
+    above 1 become 1.
     """
     magnitude = np.linalg.norm(gradients, axis=1)
     flat = magnitude < FLAT_GRADIENT
@@ -256,10 +257,10 @@ def _composite(
 
 
 class _SteepSegments:
-    """Segments in parts, where the transfer function is steep between their samples and those beside them.
+    """Divides segments into parts where the transfer function is steep between their sample and the neighbouring ones.
 
-    Values are those of a parabola through the three samples, no farther than the samples themselves; the parts are
-    blended, and what they show together is lit where it is seen on average.
+    Values in between come from a parabola through the three samples, limited to the range of the samples.  The parts
+    are blended, and their common colour is lit at their mean visible place.
     """
 
     def __init__(self, rays: _Rays, function: TransferFunction, step: float, part: Float64Array):
@@ -272,16 +273,16 @@ class _SteepSegments:
         self.is_there = self.steepness.is_steep and takes_parts(rays.volume, step)
         shown = np.flatnonzero(self.clear < 1.0)
         first, end = (int(shown[0]), int(shown[-1]) + 1) if len(shown) else (TABLE_NODES, -1)
-        # Values beyond the first and the last node count as these.
+        # Values beyond the first and the last node count as these nodes.
         self.first = -np.inf if first == 0 else float(first)
         self.last = np.inf if end == TABLE_NODES else float(end)
 
     def nodes(self, values: Float64Array) -> NDArray[np.int64]:
-        """Nodes of the table at values in nodes, fractions."""
+        """Convert values to fractional nodes of the table."""
         return np.clip(values, 0, TABLE_NODES - 1).astype(np.int64)
 
     def sample(self, number: float | Float64Array, ray: NDArray[np.int64]) -> Float64Array:
-        """Values of samples of rays, in nodes; beyond the last sample its own."""
+        """Return values of samples of rays, in nodes; after the last sample its own value."""
         rays, part = self.rays, self.part[ray]
         way = rays.t_out[ray] - rays.t_in[ray]
         last = np.ceil(way / self.step) - 1.0
@@ -294,7 +295,7 @@ class _SteepSegments:
         self, number: int, ray: NDArray[np.int64], t: Float64Array, length: Float64Array, values: Float64Array,
         opacity: Float64Array,
     ) -> tuple[Float64Array, Float64Array, Float64Array]:  # fmt: skip
-        """Places, values and opacities of segments `number`, whose samples have `values` and `opacity`."""
+        """Return places, values and opacities of segments `number`, whose samples have `values` and `opacity`."""
         here, after = (values - self.low) * self.scale + 0.5, self.sample(number + 1, ray)
         before = self.sample(number - 1 if number else -np.minimum(self.part[ray], 0.5), ray)
         if number == 0:
@@ -370,9 +371,9 @@ def _find_extreme(rays: _Rays, step: float, sign: float) -> Found:
 def _plane_samples(rays: _Rays, step: float) -> Iterator[tuple[NDArray[np.int64], Float64Array]]:
     """Yield sample by sample (ray numbers, t), on all slice planes of the index axis that the ray crosses fastest.
 
-    Between two planes lie as many samples more as `step` asks for; where no sample falls into the way through the
-    volume (a thin slab between clip planes) there is one in its middle.  Uneven stacks have samples in the middles of
-    segments, as everything else.
+    Between two planes there are additional samples as `step` requires.  Where no sample falls into the way through the
+    volume (a thin space between clip planes), there is one in the middle.  Uneven stacks have samples in the middles of
+    segments, as in other modes.
     """
     if rays.volume.uneven:
         yield from ((ray, t) for ray, t, _ in _segments(rays, step, np.full(rays.count, 0.5), np.zeros(rays.count)))

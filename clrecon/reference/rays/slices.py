@@ -24,7 +24,7 @@ def overlay_slices(
     colors: Callable[[Float64Array], Float64Array],
     clip: Float64Array | None = None,
 ) -> tuple[Float64Array, Float64Array]:
-    """Cross each ray with the planes of slices, from front to back.
+    """Find where each ray crosses the planes of slices, from front to back, and blend them.
 
     Parameters
     ----------
@@ -33,10 +33,10 @@ def overlay_slices(
     size : (width, height)
     slices : sequence of int
     opacity : float
-        Of a slice where its value is `lowest_hu` or more; elsewhere it is transparent.
+        Opacity of a slice where its value is `lowest_hu` or more; elsewhere it is transparent.
     lowest_hu : float
     colors : callable
-        Red, green and blue (n, 3) of HU (n,).
+        Function from HU (n,) to red, green and blue (n, 3).
     clip : ndarray, shape (n, 4), optional
         Half-spaces that are kept: ``normal . p >= offset``.
 
@@ -45,7 +45,7 @@ def overlay_slices(
     rgba : ndarray, shape (h, w, 4), float64
         Premultiplied.
     depth : ndarray, shape (h, w), float64
-        Mm to the first slice that shows; NaN where none does.
+        Mm to the first visible slice; NaN without one.
     """
     width, height = size
     origins, directions = (rays.reshape(-1, 3) for rays in camera.rays(size))
@@ -71,7 +71,7 @@ def overlay_slices(
 
 
 def _read_slices(volume: Volume, points: Float64Array, k: NDArray[np.int64]) -> tuple[Float64Array, NDArray[np.bool_]]:
-    """Bilinear values (n,) at points of slices k, and which of them lie in the slice or half a voxel around it."""
+    """Read bilinear values (n,) at points of slices k, and which points are in the slice or half a voxel around it."""
     ij = (points - volume.slice_origins()[k]) @ np.linalg.pinv(volume.affine[:3, :2]).T
     last = np.array(volume.shape_ijk[:2]) - 1
     inside = ((ij >= -0.5) & (ij <= last + 0.5)).all(axis=1)

@@ -22,11 +22,11 @@ from clrecon.rendering.views.camera import Camera
 __all__ = ["cast_surface"]
 
 HALVINGS = 10
-"""Of a step: the hit is known to 1e-3 of it."""
+"""Number of halvings of a step: the hit is then known to 1e-3 of it."""
 
 
 class _ClosedField:
-    """The field with a layer of outside around it, at places in LPS."""
+    """The field surrounded by a layer of outside, at places in LPS."""
 
     def __init__(self, volume: Volume, iso_value: float):
         rule = choose_iso_rule(volume, iso_value)
@@ -39,7 +39,7 @@ class _ClosedField:
         self.last = np.array(volume.shape_ijk) - 1.0
 
     def inside(self, points: Float64Array) -> NDArray[np.bool_]:
-        """Which LPS points (n, 3) are inside; nothing beyond the layer of outside is."""
+        """Return which LPS points (n, 3) are inside; nothing beyond the layer of outside is."""
         ijk = self.volume.lps_to_ijk(points)
         there = ((ijk >= -1.0) & (ijk <= self.last + 1.0)).all(axis=1)
         return there & (sample_field(self.closed, ijk + 1.0) >= self.level)
@@ -63,8 +63,8 @@ def cast_surface(
 
     Samples lie `ray_step` apart from where the ray enters the closed volume, the last where it leaves; between the
     first inside and the one before it the surface is found by bisection.  A ray that begins inside, behind a clip plane
-    or at a camera in there, has its hit at once: on the clip plane the cap's normal is the plane's, at a camera it is
-    the ray's own direction.
+    or at a camera inside, has its hit at once: on the clip plane the cap's normal is the plane's, at a camera it is the
+    ray's own direction.
 
     Parameters
     ----------
@@ -77,18 +77,18 @@ def cast_surface(
     ray_step : float, optional
         Mm; default half the smallest spacing.
     lighting : Lighting, optional
-        None leaves the colour as it is.
+        None: no shading.
     clip : Clip, optional
     colour : (float, float, float)
         Red, green, blue of the surface, 0 to 1.
     shadows : bool
-        A hit from which a ray towards a fixed light meets anything inside, from one step on and within what the clip
-        planes leave, has ambient light alone.
+        True: a hit has only ambient light if a ray from it towards a fixed light meets something inside, from one step
+        on and within the clip planes.
 
     Returns
     -------
     RayPicture
-        Both depths are that of the hit; no values.
+        Both depths are that of the hit; there are no values.
 
     Raises
     ------
@@ -132,7 +132,7 @@ def _first_inside(
     t_out: Float64Array,
     step: float,
 ) -> tuple[Float64Array, NDArray[np.bool_]]:
-    """Where rays first are inside, mm or NaN, and which of them begin so."""
+    """Return where rays are first inside, mm or NaN, and which of them begin inside."""
     hit = np.full(len(origins), np.nan)
     at_once = np.zeros(len(origins), dtype=bool)
     steps = np.where(t_out > t_in, np.ceil((t_out - t_in) / step), -1.0)

@@ -12,7 +12,7 @@ from clrecon.rendering.views.plane import Sheet, SlabSamples
 __all__ = ["EDGE", "is_inside", "reformat_sheet", "sample_field"]
 
 EDGE = 2.0**-20
-"""Index steps beyond the box of a volume that still belong to it: what rounding may add to a pixel on its face."""
+"""Index steps beyond the box of a volume that still count as inside: the rounding error of a pixel on a face."""
 
 
 def is_inside(volume: Volume, points: Float64Array) -> NDArray[np.bool_]:
@@ -24,7 +24,7 @@ def is_inside(volume: Volume, points: Float64Array) -> NDArray[np.bool_]:
 
 
 def sample_field(volume: Volume, points: Float64Array) -> Float64Array:
-    """Trilinear interpolation between voxel centres.
+    """Interpolate trilinearly between voxel centres.
 
     Parameters
     ----------
@@ -46,13 +46,13 @@ def sample_field(volume: Volume, points: Float64Array) -> Float64Array:
     for corner in np.ndindex(2, 2, 2):
         i, j, k = (np.where(upper, high[:, axis], low[:, axis]) for axis, upper in enumerate(corner))
         weight = np.prod(np.where(corner, part, 1.0 - part), axis=1)
-        # A voxel without weight is not looked at: it may be NaN.
+        # Voxels with weight 0 are ignored: they may be NaN.
         values += np.where(weight > 0.0, weight * volume.voxels[k, j, i].astype(np.float64), 0.0)
     return values
 
 
 def reformat_sheet(volume: Volume, sheet: Sheet, samples: SlabSamples, combine: str = "mean") -> Float64Array:
-    """Values of all pixels of a sheet.
+    """Compute the values of all pixels of a sheet.
 
     Parameters
     ----------
@@ -60,7 +60,7 @@ def reformat_sheet(volume: Volume, sheet: Sheet, samples: SlabSamples, combine: 
     sheet : Sheet
     samples : SlabSamples
     combine : {"mean", "max", "min"}
-        Of the samples of a pixel that lie within the volume.
+        How the samples of a pixel that lie within the volume are combined.
 
     Returns
     -------

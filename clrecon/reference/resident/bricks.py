@@ -11,7 +11,7 @@ __all__ = ["compare_bricks", "measure_bricks"]
 
 
 def measure_bricks(voxels: NDArray[Any], brick: int = 8) -> NDArray[Any]:
-    """Lowest and highest value of each brick.
+    """Return the lowest and highest value of each brick.
 
     Parameters
     ----------
@@ -34,7 +34,7 @@ def measure_bricks(voxels: NDArray[Any], brick: int = 8) -> NDArray[Any]:
 def compare_bricks(
     ranges: NDArray[Any], level: float, ni: int, border: int, brick: int = 8
 ) -> tuple[NDArray[np.uint8], NDArray[np.uint16]]:
-    """State of each word of samples and extent of each row of bricks, as the device operator gives them."""
+    """Return the state of each word of samples and the extent of each row of bricks, as the device operator does."""
     words = -(-(ni + 2 * border) // 32)
     states = np.zeros((*ranges.shape[:2], words), np.uint8)
     extents = np.zeros((*ranges.shape[:2], 2), np.uint16)

@@ -39,7 +39,7 @@ MAX_TRIANGLES = 5
 
 
 def _derive_edges() -> tuple[tuple[int, int, int], ...]:
-    """(axis, lower corner, upper corner) of each edge."""
+    """Return (axis, lower corner, upper corner) of each edge."""
     edges = []
     for axis in range(3):
         for corner in range(8):
@@ -54,7 +54,7 @@ _EDGE_OF_CORNERS = {frozenset((low, high)): number for number, (_, low, high) in
 
 
 def _derive_faces() -> tuple[tuple[int, ...], ...]:
-    """The corners of each face, counter-clockwise as seen from outside the cell."""
+    """Return the corners of each face, counter-clockwise as seen from outside the cell."""
     faces: list[tuple[int, ...]] = []
     for axis in range(3):
         u, v = 1 << (axis + 1) % 3, 1 << (axis + 2) % 3
@@ -72,7 +72,7 @@ FACES_OF_EDGE = tuple(
 
 
 def find_ambiguous_faces(case: int) -> list[int]:
-    """Return the faces of one case whose inside corners are two diagonal ones."""
+    """Return the faces of a case whose inside corners are two diagonal ones."""
     return [
         number
         for number, face in enumerate(FACES)
@@ -81,7 +81,7 @@ def find_ambiguous_faces(case: int) -> list[int]:
 
 
 def _face_segments(case: int, joined: int) -> dict[int, int]:
-    """Directed segments of one case: from the edge where a run of inside corners is entered to where it is left."""
+    """Return the directed segments of a case: from the edge where a run of inside corners begins to where it ends."""
     segments: dict[int, int] = {}
     for number, face in enumerate(FACES):
         starts, stops = [], []
@@ -101,7 +101,7 @@ def _face_segments(case: int, joined: int) -> dict[int, int]:
 
 
 def case_loops(case: int, joined: int = 0) -> list[list[int]]:
-    """Return the closed loops of edges of one case, each counter-clockwise as seen from outside (< iso value).
+    """Return the closed loops of edges of a case, each counter-clockwise as seen from outside (< iso value).
 
     Parameters
     ----------
@@ -125,7 +125,7 @@ Triangle = tuple[int, int, int]
 
 
 def _find_fans(loop: list[int]) -> list[list[Triangle]]:
-    """The ways to cut a loop into triangles from an apex whose chords lie in no face of the cell."""
+    """Return the ways to cut a loop into triangles from an apex whose chords lie in no face of the cell."""
     fans = []
     for turn in range(len(loop)):
         apex, *rest = loop[turn:] + loop[:turn]
@@ -139,13 +139,13 @@ _TWICE_MIDDLES = np.array([np.add(CORNERS[low], CORNERS[high]) for _, low, high 
 
 
 def _enclosed_volume(triangles: list[Triangle]) -> int:
-    """48 times the volume between triangles through the middles of their edges and the cell's corner 0."""
+    """Return 48 times the volume between triangles through the middles of their edges and the cell's corner 0."""
     a, b, c = (_TWICE_MIDDLES[[triangle[n] for triangle in triangles]] for n in range(3))
     return int(np.einsum("ij,ij->", a, np.cross(b, c)))
 
 
 def _volume_at_faces(case: int) -> int:
-    """48 times the volume between the inside parts of the cell's faces and the cell's corner 0."""
+    """Return 48 times the volume between the inside parts of the cell's faces and the cell's corner 0."""
     volume = 0
     for axis in range(3):
         inside = [corner for corner in range(8) if corner >> axis & 1 and case >> corner & 1]
@@ -160,26 +160,26 @@ _SAMPLES = 16
 
 @lru_cache(maxsize=1)
 def _corner_weights() -> NDArray[np.int64]:
-    """Trilinear weights (8, samples) of the corners at the middles of 16^3 parts of the cell, times 32^3."""
+    """Return the trilinear weights (8, samples) of the corners at the middles of 16^3 parts of the cell, times 32^3."""
     upper = 2 * np.arange(_SAMPLES) + 1
     weights = (2 * _SAMPLES - upper, upper)
     return np.array([np.einsum("i,j,k->ijk", weights[x], weights[y], weights[z]).ravel() for x, y, z in CORNERS])
 
 
 def _trilinear_volume(case: int) -> Fraction:
-    """Share of the cell where the trilinear field between corners of 0 (outside) and 1 (inside) is over 1/2."""
+    """Return the share of the cell where the trilinear field of corners 0 (outside) and 1 (inside) is over 1/2."""
     field = sum((_corner_weights()[corner] for corner in range(8) if case >> corner & 1), np.int64(0))
     half = (2 * _SAMPLES) ** 3 // 2
     return Fraction(int(np.sum(field > half) + np.sum(field >= half)), 2 * _SAMPLES**3)
 
 
 def _chords(triangles: list[Triangle]) -> list[tuple[int, ...]]:
-    """The triangles without their direction, in order: the same for a case and its complement cut alike."""
+    """Return the triangles without direction, sorted: a case and its complement that are cut alike give the same."""
     return sorted(tuple(sorted(triangle)) for triangle in triangles)
 
 
 def _choose_triangles(case: int) -> tuple[Triangle, ...]:
-    """The fans of a case by the rule at the head of this module; the first of equals."""
+    """Choose the fans of a case by the rule at the head of this module; the first of equal ones."""
     loops = case_loops(case)
     choices: list[list[Triangle]] = [
         [triangle for fan in fans for triangle in fan] for fans in product(*(_find_fans(loop) for loop in loops))
@@ -205,7 +205,7 @@ def case_table() -> tuple[tuple[Triangle, ...], ...]:
 
 
 def pack_case_table() -> NDArray[np.uint64]:
-    """Pack the table for the device: one 64-bit word a case.
+    """Pack the table for the device: one 64-bit word for each case.
 
     Returns
     -------

@@ -31,7 +31,7 @@ Surface = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.uint32]]
 
 
 def sample_grid(volume: Volume, rule: IsoRule, layers: int) -> NDArray[np.float64]:
-    """The samples as float64, grown by `layers` of outside (closed) or of the border's own values (open)."""
+    """Return the samples as float64, extended by `layers` of outside (closed) or of the border's own values (open)."""
     values = volume.voxels.astype(np.float64)
     if rule.closed:
         return np.pad(values, layers, constant_values=rule.outside)
@@ -39,7 +39,7 @@ def sample_grid(volume: Volume, rule: IsoRule, layers: int) -> NDArray[np.float6
 
 
 def gradients(field: NDArray[np.float64], closed: bool) -> NDArray[np.float64]:
-    """Gradient per index step (d/di, d/dj, d/dk) at every sample: central, one-sided at an open border.
+    """Return the gradient per index step (d/di, d/dj, d/dk) at every sample: central, one-sided at an open border.
 
     `field` has one more layer on every side than the result.
     """
@@ -60,7 +60,7 @@ def gradients(field: NDArray[np.float64], closed: bool) -> NDArray[np.float64]:
 
 
 def _find_cases(inside: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """Case of every cell, indexed (k, j, i)."""
+    """Return the case of every cell, indexed (k, j, i)."""
     gk, gj, gi = inside.shape
     cases = np.zeros((gk - 1, gj - 1, gi - 1), dtype=np.int64)
     for corner, (x, y, z) in enumerate(CORNERS):
@@ -69,14 +69,14 @@ def _find_cases(inside: NDArray[np.bool_]) -> NDArray[np.int64]:
 
 
 def _edge_vertex(numbers: NDArray[np.int64], cell: NDArray[np.int64], edge: int) -> int:
-    """Vertex on an edge of a cell; `numbers[k, j, i, axis]` is the vertex on the edge that a sample owns."""
+    """Return the vertex on an edge of a cell; `numbers[k, j, i, axis]` is the vertex on the edge that a sample owns."""
     axis, low, _ = EDGES[edge]
     k, j, i = cell + CORNERS[low][::-1]
     return int(numbers[k, j, i, axis])
 
 
 def _find_triangles(inside: NDArray[np.bool_], numbers: NDArray[np.int64]) -> NDArray[np.uint32]:
-    """Triangles of all cells by the case table, cell by cell."""
+    """Return the triangles of all cells by the case table, cell by cell."""
     cases = _find_cases(inside)
     triangles = [
         [_edge_vertex(numbers, cell, edge) for edge in triangle]
@@ -95,9 +95,10 @@ def _find_trilinear_triangles(
     heights: NDArray[np.float32],
     margins: NDArray[np.float64],
 ) -> tuple[NDArray[np.uint32], CellVertices]:
-    """Triangles as the trilinear field has them, and the vertices inside cells: cell (k, j, i), point, gradient.
+    """Return the triangles of the trilinear field, and the vertices inside cells: cell (k, j, i), point, gradient.
 
-    Vertices inside cells are numbered after those on edges, cell by cell.  `margins` (gk, 3) are those of each layer.
+    Vertices inside cells are numbered after those on edges, cell by cell.  `margins` (gk, 3) are the margins of each
+    layer.
     """
     cases = _find_cases(inside)
     triangles: list[list[int]] = []
@@ -137,9 +138,9 @@ def extract_isosurface(
     closed : bool
         Surround the volume with outside.
     topology : {"separated", "trilinear"}
-        Keep inside corners apart that only meet across a face or cell, or do as the trilinear field does.
+        Keep inside corners apart that only meet across a face or cell, or join them where the trilinear field does.
     below : bool
-        Inside is what lies below the iso value.
+        True: inside is below the iso value.
 
     Returns
     -------
@@ -153,7 +154,7 @@ def extract_isosurface(
         inside[[0, -1]] = inside[:, [0, -1]] = inside[:, :, [0, -1]] = False
     if not below:
         return extract_inside(volume, rule, inside)
-    # The surface round the others, turned: so it is the same one as that of the iso value, ambiguous cells too.
+    # The surface around the other samples, turned round: exactly that of the iso value, in ambiguous cells too.
     positions, normals, triangles = extract_inside(volume, rule, ~inside)
     return positions, -normals, triangles[:, ::-1].copy()
 
@@ -168,10 +169,10 @@ def extract_inside(
     volume : Volume
     rule : IsoRule
     inside : ndarray, shape (gk, gj, gi), bool
-        On the sample grid: the volume and its border.
+        Samples that are inside, on the sample grid: the volume and its border.
     hu_places : ndarray, shape (gk, gj, gi), bool, optional
-        Between two samples that have it the vertex lies where HU cross the iso level; elsewhere half way, with the
-        normal of the inside.  None: HU place every vertex.
+        Where both samples of an edge are marked, HU place the vertex at the iso level.  Elsewhere it lies half way, and
+        its normal follows `inside`. None: HU place every vertex.
 
     Returns
     -------
@@ -188,7 +189,7 @@ def extract_inside(
         half_way = ~(hu_places[edges.near] & hu_places[edges.far])
     change = np.where(half_way, 1.0, next_value - value)
     above = np.zeros(len(edges.axis), dtype=bool)
-    if rule.highest_inside is not None:  # the outside end lies above the range
+    if rule.highest_inside is not None:  # the outer end lies above the range
         above = np.maximum(value, next_value) > rule.highest_inside
     level = np.where(above, rule.upper_level or 0.0, rule.iso_level)
     t = np.where(half_way, 0.5, np.clip((level - value) / change, margin, 1.0 - margin))
@@ -197,7 +198,7 @@ def extract_inside(
         around = np.pad(inside.astype(np.float64), 1, mode="constant" if rule.closed else "edge")
         slopes = gradients(around, rule.closed)
         slope[half_way], next_slope[half_way] = slopes[edges.near][half_way], slopes[edges.far][half_way]
-    slope[above], next_slope[above] = -slope[above], -next_slope[above]  # from here on they point inwards
+    slope[above], next_slope[above] = -slope[above], -next_slope[above]  # gradients point inwards from here on
     return build_surface(volume, rule, inside, edges, t, slope, next_slope)
 
 
@@ -221,7 +222,7 @@ class CrossedEdges:
 
 
 def find_crossed_edges(inside: NDArray[np.bool_]) -> CrossedEdges:
-    """The crossed edges of a sample grid, shape (gk, gj, gi)."""
+    """Find the crossed edges of a sample grid, shape (gk, gj, gi)."""
     crossed = np.zeros((*inside.shape, 3), dtype=bool)
     crossed[:, :, :-1, 0] = inside[:, :, :-1] != inside[:, :, 1:]
     crossed[:, :-1, :, 1] = inside[:, :-1, :] != inside[:, 1:, :]
@@ -232,7 +233,7 @@ def find_crossed_edges(inside: NDArray[np.bool_]) -> CrossedEdges:
 
 
 def edge_margins(volume: Volume, rule: IsoRule, edges: CrossedEdges) -> NDArray[np.float64]:
-    """Smallest distance of each vertex from a sample, in steps, shape (n,)."""
+    """Return the smallest distance of each vertex from a sample, in steps, shape (n,)."""
     margins, layers = vertex_margin(volume, rule.border), layer_margins(volume, rule.border)
     return np.asarray(np.where(edges.axis == 2, layers[edges.near[0]], margins[edges.axis]))
 
@@ -251,10 +252,10 @@ def build_surface(
     Parameters
     ----------
     t : ndarray, shape (n,)
-        From the near end of each edge.
+        Position of each vertex on its edge, from the near end.
     slope, next_slope : ndarray, shape (n, 3)
-        The two ends' parts of the gradient at the vertex, per step along i, j, k; where their sum vanishes the edge
-        itself says which way is down.
+        Parts of the two ends in the gradient at the vertex, per step along i, j, k; where their sum vanishes, the
+        direction of the edge is used.
     """
     (k, j, i), (k1, j1, i1), axis, numbers = edges.near, edges.far, edges.axis, edges.numbers
     slope, next_slope = slope.copy(), next_slope.copy()
@@ -280,7 +281,7 @@ def build_surface(
         cell_up = np.einsum("nij,nj->ni", layer_normal_matrices(volume, rule.border)[ck], cell_slope)
         in_slice = cells[:, :0:-1] - rule.border + points[:, :2]
         placed = origins[ck] + in_slice @ volume.affine[:3, :2].T + points[:, 2:] * (origins[ck + 1] - origins[ck])
-        # Slice by slice: the vertices on edges, then those inside cells.
+        # Slice by slice: first the vertices on edges, then those inside cells.
         order = np.argsort(np.concatenate([k, ck]), kind="stable")
         triangles = np.argsort(order).astype(np.uint32)[triangles]
         positions, up = (np.concatenate(pair)[order] for pair in ((positions, placed), (up, cell_up)))

@@ -28,7 +28,7 @@ WEIGHTS = (1, 4, 6, 4, 1)
 
 
 def find_occupancy(mask: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """The occupancy of each sample, 0 to 4096; beyond the map its outermost samples go on."""
+    """Return the occupancy of each sample, 0 to 4096; beyond the map its outermost samples are repeated."""
     sums = mask.astype(np.int64)
     for axis in range(3):
         padded = np.pad(sums, [(REACH * (a == axis), REACH * (a == axis)) for a in range(3)], mode="edge")
@@ -48,15 +48,15 @@ def extract_label_mask(
 ) -> Surface:
     """Extract one label's own surface at one level.
 
-    The samples that carry the label are inside, whatever the occupancy is.  On an edge from such a sample to one
+    The samples that carry the label are inside, whatever their occupancy.  On an edge from an inside sample to one
 
-    - without a label the vertex lies where the label's occupancy crosses the level, ends on the wrong side of it
-      counting as one step on their own side; where the other labels are no less dense at the label's end than at the
-      far one (they lie alongside, not across a gap) the occupancy of all labels counts in place of the label's;
-    - with another label it lies where both lead by as much: by how much the number of a sample leads there over
-      that of the edge's other end, at least by 1; an enclosed label leads by as much more as its level is
-      lower than the other's, or than `START` where that has none;
-    - beyond the map it lies half way.
+    - without a label, the vertex lies where the label's occupancy crosses the level; an end on the wrong side of the
+      level counts as one step on its own side.  Where the occupancy of the other labels is not lower at the label's end
+      than at the far end (they lie alongside, not across a gap), that of all labels replaces the label's;
+    - with another label, it lies where the leads of both are equal.  The lead at an end is the occupancy of its own
+      number less that of the other end's number, at least 1. The lead of an enclosed label is larger by the amount by
+      which its level is lower than the other's (`START` if that has none);
+    - beyond the map, it lies half way.
 
     No vertex comes nearer to a sample than `KEEP` of its edge.
 
@@ -68,7 +68,7 @@ def extract_label_mask(
     level : int
         1 to `FULL` - 1.
     closed : bool
-        The surface is closed at the border of the map.
+        True: the surface is closed at the border of the map.
     enclosed : dict of int to int, optional
         The levels of labels that others enclose, see `choose_enclosed`.
 
@@ -125,7 +125,7 @@ def _find_leads(
     grown: NDArray[np.int64],
     border: int,
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """By how much the number of either end of each edge leads there over that of the other one.
+    """Return for each end of each edge the lead of its number over that of the other end.
 
     `own` is the occupancy of the label whose samples are `inside`, `grown` has the number of each sample of the grid.
     """
@@ -147,7 +147,7 @@ def _volume_mm3(vertices: NDArray[np.float64], triangles: NDArray[np.uint32]) ->
 
 
 def choose_enclosed(labels: NDArray[Any], affine: NDArray[np.float64]) -> dict[int, int]:
-    """The levels of the labels that others enclose, at which each encloses the volume of its voxels."""
+    """Choose the levels of enclosed labels, at which each mesh encloses the volume of the label's voxels."""
     numbers = find_enclosed(labels, count_faces(labels))
     if not numbers:
         return {}
@@ -169,7 +169,9 @@ def choose_level(
     number: int,
     enclosed: Mapping[int, int] | None = None,
 ) -> int:
-    """The level at which the mesh of a label encloses the volume of its voxels; `enclosed` as `extract_label_mask`."""
+    """Choose the level at which the mesh of a label encloses the volume of its voxels; `enclosed` as
+    `extract_label_mask`.
+    """
     if enclosed and number in enclosed:
         return enclosed[number]
     wanted = np.count_nonzero(labels == number) * abs(np.linalg.det(affine[:3, :3]))

@@ -22,11 +22,11 @@ def own_labels(labels: NDArray[Any], volume: Volume, grow_mm: float | None) -> N
     Parameters
     ----------
     labels : ndarray, shape (nk, nj, ni)
-        On the grid of the volume; 0 is none.
+        Labels on the grid of the volume; 0 is no label.
     volume : Volume
     grow_mm : float or None
-        A sample without a label belongs to the nearest label within so many mm, of equally near ones to the lowest;
-        None: to the nearest, in mm, among its 26 neighbours.
+        A sample without a label gets the nearest label within this distance in mm, the lowest of equally near ones.
+        None: the nearest, in mm, among its 26 neighbours.
 
     Returns
     -------
@@ -58,19 +58,7 @@ def find_solid(
     closed: bool = True,
     solid: tuple[int, ...] = (),
 ) -> NDArray[np.uint16]:
-    """For each sample the label that it is inside of: its owner where HU reach the iso value, 0 elsewhere.
-
-    Parameters
-    ----------
-    volume, labels, iso_value, grow_mm, closed
-        As `clrecon.operators.surface.labels.extract_labels`; `labels` on the grid of the volume.
-    solid : tuple of int
-        Labels whose cavities are filled.
-
-    Returns
-    -------
-    ndarray, shape (nk, nj, ni), uint16
-    """
+    """Return for each sample the label that it is inside of: its owner where HU reach the iso value, 0 elsewhere."""
     rule = choose_iso_rule(volume, iso_value, closed)
     labels = labels.astype(np.uint16)
     inside = np.where(volume.voxels >= rule.lowest_inside, own_labels(labels, volume, grow_mm), 0).astype(np.uint16)
@@ -84,15 +72,15 @@ def extract_label(
 ) -> Surface:
     """Extract the surface of one label of a small volume.
 
-    Where HU cross the iso level between a sample of the label and one of no label, the vertex lies there, as on the
-    plain surface.  Everywhere else (next to another label, or to samples of no label that are as dense) it lies half
-    way, and its normal follows the label, not HU.
+    Where HU cross the iso level between a sample of the label and one without a label, the vertex lies there, as on the
+    surface without labels.  Everywhere else (beside another label, or beside dense samples without a label) it lies
+    half way, and its normal follows the label, not HU.
 
     Parameters
     ----------
     volume : Volume
     inside : ndarray, shape (nk, nj, ni), uint16
-        As `find_solid` gives it.
+        Result of `find_solid`.
     number : int
     iso_value : float
         HU.

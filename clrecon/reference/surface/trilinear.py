@@ -1,10 +1,10 @@
-"""Twin of the cell decisions of cl/surface/trilinear.cl: what the trilinear field does inside one cell.
+"""Twin of the cell decisions of cl/surface/trilinear.cl: how the trilinear field joins corners inside a cell.
 
-Everything is decided in whole numbers, so that every device and the two cells of a face come to the same answer.
-The heights of the corners above the iso level, rounded to float32 once, are scaled by a power of two to whole
-numbers: to 30 bits for a face, by the largest of its four corners; to 18 bits for the interior, by the largest of
-the eight.  Voxels of 8 and 16 bits at an iso level between integers lose nothing by this.  Whether a corner is inside
-is said by its bit in the case, never by its height.
+All decisions use whole numbers, so that every device and both cells of a face decide alike.  The heights of the corners
+above the iso level, rounded to float32 once, are scaled by a power of two to whole numbers: to 30 bits for a face, by
+the largest of its four corners; to 18 bits for the interior, by the largest of the eight.  For voxels of 8 and 16 bits
+at an iso level between integers this is exact.  Whether a corner is inside is told by its bit in the case, never by its
+height.
 
 Face (Nielson and Hamann 1991): the diagonal corners a, c are joined when the bilinear field is of their sign at its
 saddle: ``a c > b d``.  A saddle at the level itself keeps the inside corners apart.
@@ -35,7 +35,7 @@ FACE_BITS = 30
 CELL_BITS = 18
 NEWTON_STEPS = 3
 FLAT_SQUARE = 2.0**24
-"""Squared gradient below which no step of Newton is taken: a 32nd of the largest height a step, or less."""
+"""Squared gradient below which no Newton step is taken: a 32nd of the largest height per step, or less."""
 
 
 def scale_heights(heights: Sequence[float], bits: int) -> list[int]:
@@ -77,7 +77,7 @@ class Parabola:
 
 
 def _columns(axis: int) -> tuple[int, int, int, int]:
-    """Lower corners of the four edges along an axis, counter-clockwise as seen from above."""
+    """Return the lower corners of the four edges along an axis, counter-clockwise as seen from above."""
     u, v = 1 << (axis + 1) % 3, 1 << (axis + 2) % 3
     return 0, u, u | v, v
 
@@ -92,13 +92,13 @@ def _find_parabola(values: Sequence[int], axis: int) -> Parabola:
 
 
 def _sign_values(case: int, heights: Sequence[float]) -> list[int]:
-    """The heights as whole numbers of `CELL_BITS` bits with the signs that the case says."""
+    """Return the heights as whole numbers of `CELL_BITS` bits with the signs of the case."""
     sizes = scale_heights(heights, CELL_BITS)
     return [size if case >> corner & 1 else -size for corner, size in enumerate(sizes)]
 
 
 def decide_interior(values: Sequence[int]) -> int | None:
-    """Return the code of the tunnel that the cell has if its faces allow one, None without.
+    """Return the code of the tunnel that the cell has if its faces allow one, else None.
 
     Parameters
     ----------
@@ -123,7 +123,7 @@ def decide_interior(values: Sequence[int]) -> int | None:
 
 
 def _find_diagonal(values: Sequence[int]) -> int:
-    """The diagonal 0 to 3 along which a tunnel runs: each axis says which of its columns are joined."""
+    """Find the diagonal 0 to 3 along which a tunnel runs: each axis tells which of its columns are joined."""
     corner = sum((_find_parabola(values, axis).a > 0) << axis for axis in range(3))
     return min(corner, 7 - corner)
 
@@ -142,7 +142,7 @@ def find_row(case: int, heights: Sequence[float]) -> Row:
 
 
 def _field_at(values: Sequence[int], point: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
-    """The trilinear field and its gradient per step at a point of the cell."""
+    """Return the trilinear field and its gradient per step at a point of the cell."""
     weights = np.array([[1.0 - p, p] for p in point])
     value, gradient = 0.0, np.zeros(3)
     for corner, upper in enumerate(CORNERS):
@@ -154,7 +154,7 @@ def _field_at(values: Sequence[int], point: NDArray[np.float64]) -> tuple[float,
 
 
 def _place_centre(row: Row, values: Sequence[int], margin: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The mean of the vertices around it, taken to the surface by some steps of Newton."""
+    """Return the mean of the surrounding vertices, moved to the surface by some Newton steps."""
     around = []
     for centre, edge, _ in row.triangles:
         if centre == CELL_VERTEX:
@@ -173,7 +173,7 @@ def _place_centre(row: Row, values: Sequence[int], margin: NDArray[np.float64]) 
 
 
 def _place_waist(row: Row, values: Sequence[int], margin: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The corners of the box between the roots of the three parabolas that lie on the surface.
+    """Return the corners, on the surface, of the box between the roots of the three parabolas.
 
     The box keeps a margin from the faces and is at least two margins wide.
     """
@@ -197,7 +197,7 @@ def place_cell_vertices(
     Parameters
     ----------
     row : Row
-        Of `find_row`.
+        Result of `find_row`.
     case : int
     heights : sequence of 8 float
         Values of the corners less the iso level, float32.
@@ -209,7 +209,7 @@ def place_cell_vertices(
     points : ndarray, shape (n, 3), float64
         In steps (x, y, z) from corner 0; n is `Row.cell_vertices`.
     gradients : ndarray, shape (n, 3), float64
-        Of the trilinear field there, per step and up to one factor; (1, 1, 1) where it vanishes.
+        Gradients of the trilinear field at the points, per step and up to a common factor; (1, 1, 1) where they vanish.
     """
     values = _sign_values(case, heights)
     if row.cell_vertices == 1:

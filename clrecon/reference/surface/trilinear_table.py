@@ -1,6 +1,6 @@
-"""Triangles of a cell whose ambiguous faces and interior are resolved as the trilinear field has them; derived.
+"""Triangles of a cell whose ambiguous faces and interior are resolved as in the trilinear field; derived, not typed.
 
-Cases, corners, edges and faces are those of `clrecon.reference.surface.case_table`.  What the case leaves open is
+Cases, corners, edges and faces are those of `clrecon.reference.surface.case_table`. The case leaves open:
 
 - each ambiguous face: whether its two diagonal inside corners are joined on it (the asymptotic decider), and
 - the interior: whether a tunnel runs through it.  Corners of one sign that the faces leave apart can be joined inside
@@ -8,7 +8,7 @@ Cases, corners, edges and faces are those of `clrecon.reference.surface.case_tab
 
 A tunnel runs along a diagonal of the cell, from corner p to corner 7 - p.  It joins two regions of one sign: whatever
 the axis, the cell's edge at p reaches the first and the edge at 7 - p the second, and between them lies one region of
-the other sign that the two remaining edges along that axis reach, and that goes round the diagonal, so that it holds
+the other sign that the two remaining edges along that axis reach, and that goes round the diagonal, so that it contains
 neither of its ends.  This gives 160 tunnels: those of the cases 4.2, 6.1.2, 7.4.2, 10.1.2, 12.1.2 and 13.5.2 of
 Chernyaev.
 
@@ -18,8 +18,8 @@ no such chords: they take a fan around one vertex inside the cell.  A tube is cu
 vertices inside the cell: the surface of every trilinear field with a tunnel holds a hexagon of straight lines along
 the axes, whose corners are six of the eight corners of a box, all but the two on the tunnel's diagonal.
 
-So no chord and no vertex of a cell lies in a face or is known to a neighbour, and surfaces are manifold whatever the
-decisions are, as long as both cells of a face decide it alike.
+So no chord and no inner vertex of a cell lies in a face or affects a neighbour.  Surfaces are manifold whatever the
+decisions are, as long as both cells of a face decide alike.
 
 References: Nielson and Hamann 1991 (faces); Chernyaev 1995 (interiors); Grosso 2016 (the hexagon).
 """
@@ -51,10 +51,10 @@ __all__ = [
 ]  # fmt: skip
 
 CELL_VERTEX = 12
-"""Numbers from here on in a triangle are vertices inside the cell; those below are edges."""
+"""Numbers in a triangle from here on are vertices inside the cell; lower numbers are edges."""
 
 MAX_TRILINEAR_TRIANGLES = 22
-"""Of a cell: case 13.5.2."""
+"""Most triangles of a cell: case 13.5.2."""
 
 Loop = tuple[int, ...]
 
@@ -66,11 +66,11 @@ class Tunnel:
     Attributes
     ----------
     inside : bool
-        It joins inside corners; else outside corners.
+        True: it joins inside corners; False: outside corners.
     diagonal : int
-        Its direction, from corner `diagonal` (0 to 3) to corner ``7 - diagonal``.
+        Direction of the tunnel, from corner `diagonal` (0 to 3) to corner ``7 - diagonal``.
     loops : tuple of two loops
-        What it ends at.
+        Loops at its two ends.
     """
 
     inside: bool
@@ -79,7 +79,7 @@ class Tunnel:
 
     @property
     def code(self) -> int:
-        """0 to 7, for tables."""
+        """Code of the tunnel, 0 to 7, for tables."""
         return int(self.inside) + 2 * self.diagonal
 
 
@@ -98,7 +98,7 @@ class Row:
 
 @dataclass(frozen=True)
 class CellState:
-    """A case with its faces decided: its row without a tunnel, and one for each tunnel it can have."""
+    """A case with decided faces: its row without a tunnel, and one row for each possible tunnel."""
 
     case: int
     joined: int
@@ -106,12 +106,12 @@ class CellState:
     tunnels: tuple[tuple[Tunnel, Row], ...]
 
     def row(self, code: int | None) -> Row:
-        """The row for the tunnel of that code; where the state cannot have it, and for None, the one without."""
+        """Return the row for the tunnel of that code; the row without a tunnel for None or an impossible tunnel."""
         return next((row for tunnel, row in self.tunnels if tunnel.code == code), self.plain)
 
 
 def ring_corners(diagonal: int) -> list[int]:
-    """Return the corners of the box that are a tunnel's vertices, in their order."""
+    """Return the corners of the box that are a tunnel's vertices, in order."""
     return [corner for corner in range(8) if corner not in (diagonal, 7 - diagonal)]
 
 
@@ -134,7 +134,7 @@ def find_regions(case: int, joined: int) -> list[int]:
 
 
 def _find_tunnels(case: int, joined: int) -> list[Tunnel]:
-    """The tunnels that one state can have, by the rule at the head of this module."""
+    """Return the tunnels that a state can have, by the rule at the head of this module."""
     region = find_regions(case, joined)
     inside = {corner: bool(case >> corner & 1) for corner in range(8)}
     loops = [tuple(loop) for loop in case_loops(case, joined)]
@@ -159,7 +159,7 @@ def _find_tunnels(case: int, joined: int) -> list[Tunnel]:
 
 
 def _loop_between(loops: list[Loop], region: list[int], a: int, b: int) -> Loop:
-    """The loop that divides regions a and b."""
+    """Return the loop that divides regions a and b."""
     found = [loop for loop in loops if {region[corner] for corner in EDGES[loop[0]][1:]} == {a, b}]
     (loop,) = found
     return loop
@@ -167,7 +167,7 @@ def _loop_between(loops: list[Loop], region: list[int], a: int, b: int) -> Loop:
 
 @cache
 def _cut_disc(loop: Loop) -> tuple[tuple[Triangle, ...], ...]:
-    """All ways to cut a loop into triangles by chords that lie in no face of the cell."""
+    """Return all ways to cut a loop into triangles by chords that lie in no face of the cell."""
     if len(loop) == 3:
         return ((loop,),)  # type: ignore[return-value]
     ways: list[tuple[Triangle, ...]] = []
@@ -185,7 +185,7 @@ def _cut_disc(loop: Loop) -> tuple[tuple[Triangle, ...], ...]:
 
 
 def _place(vertex: int, diagonal: int = 0) -> tuple[int, int, int]:
-    """Where a vertex lies in a model of the cell of 20 units: edges at their middles, a tunnel's box 6 units wide."""
+    """Return the place of a vertex in a model cell of 20 units: edges at their middles, a tunnel's box 6 units wide."""
     if vertex >= CELL_VERTEX:
         x, y, z = CORNERS[ring_corners(diagonal)[vertex - CELL_VERTEX]]
         return 7 + 6 * x, 7 + 6 * y, 7 + 6 * z
@@ -203,7 +203,7 @@ def _squared_chords(triangles: Iterable[Triangle]) -> int:
 
 
 def _known_discs(case: int) -> dict[Loop, tuple[Triangle, ...]]:
-    """The loops of a case and of its complement, turned round, with the triangles of the case table."""
+    """Return the loops of a case and of its complement, turned round, with the triangles of the case table."""
     known = {}
     for source, turned in ((255 - case, True), (case, False)):
         for loop in case_loops(source):
@@ -216,13 +216,13 @@ def _known_discs(case: int) -> dict[Loop, tuple[Triangle, ...]]:
 
 
 def _from_lowest(loop: list[int] | Loop) -> Loop:
-    """The loop, started at its lowest edge."""
+    """Return the loop, starting at its lowest edge."""
     start = loop.index(min(loop))
     return (*loop[start:], *loop[:start])
 
 
 def _fill_discs(case: int, loops: list[Loop]) -> Row:
-    """One disc for each loop."""
+    """Make one disc for each loop."""
     known = _known_discs(case)
     triangles: list[Triangle] = []
     cell_vertices = 0
@@ -238,13 +238,13 @@ def _fill_discs(case: int, loops: list[Loop]) -> Row:
 
 
 def _fill_strip(outer: Loop, inner: Loop, diagonal: int) -> tuple[int, tuple[Triangle, ...]]:
-    """The strip between two rings that run the same way round, with the shortest rungs, and their squared lengths."""
+    """Make the strip between rings of equal direction with the shortest rungs; return their squared lengths too."""
     back = inner[::-1]
     n, m = len(outer), len(inner)
     best: tuple[int, tuple[Triangle, ...]] | None = None
     for turn in range(m):
         ring = back[turn:] + back[:turn]
-        # Shortest way from rung (0, 0) to rung (n, m), where each step goes one further on one of the rings.
+        # Shortest path from rung (0, 0) to rung (n, m), where each step advances by one on one of the rings.
         ways: dict[tuple[int, int], tuple[int, tuple[Triangle, ...]]] = {(0, 0): (0, ())}
         for i, j in product(range(n + 1), range(m + 1)):
             a, b = outer[i % n], ring[-j % m]
@@ -264,7 +264,7 @@ def _fill_strip(outer: Loop, inner: Loop, diagonal: int) -> tuple[int, tuple[Tri
 
 
 def _fill_tunnel(case: int, loops: list[Loop], tunnel: Tunnel) -> Row:
-    """A tube between two loops, cut at the hexagon, and discs for the others."""
+    """Make a tube between two loops, cut at the hexagon, and discs for the other loops."""
     corners = ring_corners(tunnel.diagonal)
     around = [corners[0]]
     while len(around) < len(corners):
@@ -292,7 +292,7 @@ def cell_state(case: int, joined: int) -> CellState:
 
 
 def find_states(case: int) -> list[CellState]:
-    """Return all states of a case; bit n of the number of a state says whether its n-th ambiguous face joins."""
+    """Return all states of a case; bit n of a state's number tells whether its n-th ambiguous face joins."""
     faces = find_ambiguous_faces(case)
     return [
         cell_state(case, sum(1 << face for n, face in enumerate(faces) if number >> n & 1))
@@ -302,7 +302,7 @@ def find_states(case: int) -> list[CellState]:
 
 @dataclass(frozen=True)
 class PackedTables:
-    """The tables as the device has them.
+    """The tables in the form for the device.
 
     Attributes
     ----------
