@@ -1,1 +1,3 @@
-"""What clrecon computes on a device: ``operator(device, inputs..., parameters...)``; inputs are never modified."""
+"""Operators: computations on a device, called as ``operator(device, inputs..., parameters...)``. Inputs are never
+modified.
+"""

@@ -1,1 +1,1 @@
-"""Scans, compaction and union-find: what other operators are made of."""
+"""Primitives of other operators: scans, compaction and union-find."""

@@ -36,7 +36,7 @@ def _load_compact(device: Device) -> Program:
 
 
 def compact(device: Device, mask_d: Any, words: int, *, stopwatch: Stopwatch | None = None) -> Compacted:
-    """Positions of the set bits of a bit mask.
+    """Find the positions of the set bits of a bit mask.
 
     Parameters
     ----------
@@ -44,7 +44,7 @@ def compact(device: Device, mask_d: Any, words: int, *, stopwatch: Stopwatch | N
     mask_d : buffer, (words,) uint32
         Bit b of word w is position ``32 * w + b``.
     words : int
-        At least 1, at most 2^27, so that positions fit 32 bits.
+        Number of words, 1 to 2^27, so that positions fit 32 bits.
     stopwatch : Stopwatch, optional
 
     Returns

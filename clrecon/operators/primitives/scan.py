@@ -20,7 +20,7 @@ LARGEST_SCAN = 2**31
 
 @dataclass(frozen=True)
 class Scanned:
-    """Offsets on the device, (n,) uint32, and the exact total.  Offsets are modulo 2^32: check the total.
+    """Offsets on the device, (n,) uint32, and the exact total.  Offsets are modulo 2^32, so check the total.
 
     ``total_d`` is the total on the device, (1,) uint64.
     """
@@ -42,16 +42,16 @@ def _load_scan(device: Device) -> Program:
 def exclusive_scan(
     device: Device, counts_d: Any, n: int, *, in_place: bool = False, stopwatch: Stopwatch | None = None
 ) -> Scanned:
-    """Sum of all counts before each element.
+    """Compute the sum of all counts before each element.
 
     Parameters
     ----------
     device : Device
     counts_d : buffer, (n,) uint32
     n : int
-        Elements, at least 1.
+        Number of elements, at least 1.
     in_place : bool
-        The offsets take the place of the counts: no memory of their own.
+        True: the offsets overwrite the counts and need no memory of their own.
     stopwatch : Stopwatch, optional
 
     Returns

@@ -26,14 +26,14 @@ from clrecon.operators.primitives.scan import LARGEST_SCAN, exclusive_scan
 __all__ = ["label_components", "prepare_components"]
 
 LARGEST_MESH = 2**32 - 1
-"""Triangles that 32 bits can count."""
+"""Most triangles, so that 32 bits can count them."""
 
 MOST_PASSES = 1000
-"""Far more than 2^31 vertices can need: 62 rounds of at most 11 passes each."""
+"""Limit of passes, far above the need of 2^31 vertices: 62 rounds of at most 11 passes each."""
 
 
 def prepare_components(device: Device) -> Program:
-    """Build the kernels, so that a later `label_components` need not wait for them.
+    """Build the kernels now, so that a later `label_components` does not wait for them.
 
     Raises
     ------
@@ -63,20 +63,20 @@ def label_components(
     memory : int, optional
         Bytes that may be taken on the device; None is all of its memory.
     stopwatch : Stopwatch, optional
-        Where the time of the kernels goes.
+        Records the time of the kernels.
 
     Returns
     -------
     count : int
-        Number of components; vertices that no triangle uses are none.
+        Number of components, not counting vertices that no triangle uses.
     labels : ndarray, shape (vertex_count,), int64
-        Component of each vertex, numbered in order of the first vertex; -1 for unused vertices.  The same on every
-        device, and what `clrecon.mesh.connectivity.label_components` returns.
+        Component of each vertex, numbered in order of the first vertex; -1 for unused vertices.  Equal on every device,
+        and equal to the result of `clrecon.mesh.connectivity.label_components`.
 
     Raises
     ------
     UsageError
-        A triangle refers to a vertex that is not there, or there are more than 2^31 vertices or 2^32 - 1 triangles.
+        A triangle refers to a vertex that does not exist, or there are more than 2^31 vertices or 2^32 - 1 triangles.
     DeviceMemoryError
         The device has no room for the mesh and its labels.
     DeviceError
@@ -137,16 +137,16 @@ class _Search:
             raise DeviceMemoryError(f"the components of the mesh cannot be found: {shortage}")
 
     def run(self, kernel: str, items: int, **arguments: Any) -> None:
-        """Launch a kernel over so many items."""
+        """Launch a kernel over `items` work-items."""
         launch(self._device, self._program[kernel], items, stopwatch=self._stopwatch, **arguments)
 
     def find_roots(self) -> tuple[Any, Any]:
-        """Go through all rounds.
+        """Run all rounds.
 
         Returns
         -------
         labels_d, spare_d : buffer, (n,) uint32
-            Labels whose labels are roots, and a buffer that is free.
+            Labels that are all roots, and a free buffer.
         """
         self.run("clear_labels", self._vertices, labels=self._other_d, flags=self._flags_d, n=self._vertices)
         self.run("hook_corners", self._faces, triangles=self._faces_d, labels=self._other_d, m=self._faces)
@@ -163,22 +163,28 @@ class _Search:
         return labels_d, spare_d
 
     def _join_roots(self, mixed: Compacted) -> Compacted:
-        """All rounds after the first, on the roots that it left; returns these.  No other label changes any more."""
+        """Run all rounds after the first, on the roots that it left, and return these.  No other label changes any
+        more.
+        """
         self._check_budget({"roots of mixed triangles": 16 * mixed.count})
         roots = self._list("mark_roots", self._vertices, labels=self._labels_d, n=self._vertices)
         corners_d = allocate(self._device, 12 * mixed.count)
         self.run(
-            "gather_roots", mixed.count,
-            triangles=self._faces_d, mixed=mixed.positions_d, labels=self._labels_d, corners=corners_d,
+            "gather_roots",
+            mixed.count,
+            triangles=self._faces_d,
+            mixed=mixed.positions_d,
+            labels=self._labels_d,
+            corners=corners_d,
             count=mixed.count,
-        )  # fmt: skip
+        )  # Roots are their own label in both buffers; other labels lead to the same root, perhaps in several steps.
         # Roots are their own label in both buffers, and other labels lead to the same root, if not in one step.
         while self._hook(corners_d, mixed.count):
             self._jump("jump_roots", roots.count, roots=roots.positions_d, count=roots.count)
         return roots
 
     def _hook(self, corners_d: Any, count: int) -> bool:
-        """Hook roots to others; says whether there were any."""
+        """Hook roots to other roots; return whether there were any."""
         number = self._next_pass()
         self.run(
             "hook_roots", count,
@@ -188,7 +194,7 @@ class _Search:
         return bool(self._read_flags()[1] == number)
 
     def _jump(self, kernel: str, items: int, **listed: Any) -> None:
-        """Passes of jumps, from `_other_d` to `_labels_d` and back, until all labels in `_labels_d` are roots."""
+        """Run passes of jumps, from `_other_d` to `_labels_d` and back, until all labels in `_labels_d` are roots."""
         while True:
             number = self._next_pass()
             self.run(
@@ -212,7 +218,7 @@ class _Search:
         return download(self._device, np.empty(2, dtype=np.uint32), self._flags_d)
 
     def _list(self, kernel: str, size: int, **inputs: Any) -> Compacted:
-        """The elements that a kernel marks in a bit mask of `size` bits."""
+        """List the elements that a kernel marks in a bit mask of `size` bits."""
         words = -(-size // 32)
         mask_d = allocate(self._device, 4 * words)
         self.run(kernel, words, mask=mask_d, **inputs)

@@ -1,4 +1,4 @@
-"""Pictures on a device: their buffers, and what every ray caster is launched with."""
+"""Pictures on a device: their buffers, and the arguments that all ray casters share."""
 
 from __future__ import annotations
 
@@ -20,12 +20,14 @@ HIGHLIGHTS = kernel_constant("rays/phong.h", "HIGHLIGHTS")
 
 
 def highlight_table(lighting: Lighting) -> NDArray[np.float32]:
-    """Specular light (HIGHLIGHTS,), float32, at cosines evenly from 0 to 1."""
+    """Return the specular light (HIGHLIGHTS,), float32, at evenly spaced cosines from 0 to 1."""
     return (lighting.specular * np.linspace(0.0, 1.0, HIGHLIGHTS) ** lighting.specular_power).astype(np.float32)
 
 
 def count_queues(device: Device) -> int:
-    """Parts that a driver cuts a launch into; neighbouring tiles go to different ones: all have as much work."""
+    """Return the number of parts into which a driver divides a launch; neighbouring tiles go to different parts for
+    equal work.
+    """
     return max(1, device.compute_units) if device.type == "cpu" else 1
 
 
@@ -36,11 +38,11 @@ class PictureBuffers:
     ----------
     image_d : buffer, (h, w, 4) uint8
     depths_d, means_d : buffer, (h, w) float32
-        First hit and expected depth, or a value in place of the latter.
+        First hit, and expected depth or a value.
     states_d : buffer, (h, w, 8) float32
-        What a slab leaves to the next; one entry where there is only one.
+        State that a slab hands to the next slab; one entry if there is only one slab.
     background : ndarray, shape (4,), float32
-        Red, green, blue, and 1, or 0 for none.
+        Red, green, blue, and 1; the last is 0 without a background.
     """
 
     def __init__(
@@ -59,7 +61,7 @@ class PictureBuffers:
 
     @property
     def arguments(self) -> dict[str, Any]:
-        """How kernels that blend are told of the picture."""
+        """Arguments for kernels that blend."""
         return {
             "states": self.states_d,
             "image": self.image_d,
@@ -70,22 +72,22 @@ class PictureBuffers:
 
     @staticmethod
     def needs(size: tuple[int, int]) -> tuple[dict[str, int], dict[str, int]]:
-        """Bytes of a picture on the device, and of what comes with more than one slab."""
+        """Return the bytes of a picture on the device, and those that several slabs add."""
         pixels = size[0] * size[1]
         return {"picture": 12 * pixels}, {"states of the rays": 32 * pixels}
 
     def items(self, queues: int, lanes: int) -> int:
-        """Work-items of a launch, each with `lanes` pixels."""
+        """Return the number of work-items of a launch, each with `lanes` pixels."""
         return -(-self.tiles // queues) * queues * (TILE * TILE // lanes)
 
     @property
     def tiles(self) -> int:
-        """Tiles of the picture."""
+        """Number of tiles of the picture."""
         width, height = self.size
         return -(-width // TILE) * -(-height // TILE)
 
     def download(self) -> tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.float32]]:
-        """Wait, and return image, depths and means."""
+        """Wait for the device and return image, depths and means."""
         device = self.device
         return (
             download(device, self.image, self.image_d),

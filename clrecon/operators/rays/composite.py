@@ -29,38 +29,38 @@ NODES = kernel_constant("rays/steep_segments.h", "NODES")
 """Entries of a transfer function's table."""
 
 GRADIENT_NODES = kernel_constant("rays/composite.cl", "GRADIENT_NODES")
-"""Entries of its table of factors by magnitude of the gradient."""
+"""Entries of the table of opacity factors by magnitude of the gradient."""
 
 LEAST_DRIFT = 0.02
-"""Bricks aside for each brick ahead that rays drift: with less they stay in a row of bricks for long."""
+"""Rays that drift less than this many bricks to the side per brick ahead count as running straight along the row."""
 
 LOWEST_LOG = -1000.0
-"""log2 of what an opaque sample lets through: 0 in float32, and no infinity that a length of 0 would make NaN."""
+"""log2 of the transparency of an opaque sample: 0 in float32; infinity times a length of 0 would give NaN."""
 
 
 @dataclass(frozen=True)
 class TransferTables:
-    """A transfer function for one ray step.
+    """A transfer function in tables for one ray step.
 
     Attributes
     ----------
     colors_d : buffer, (NODES,) int32
         Red, green and blue, 10 bits each.
     opacities_d : buffer, (NODES,) float32
-        Over one ray step.
+        Opacities over one ray step.
     clears_d : buffer, (NODES,) float32
-        What one of `PARTS` parts of it lets through.
+        Transparency of one of the `PARTS` parts of a ray step.
     changes_d : buffer, (NODES,) float32
-        How much the opacity over one ray step changes up to each node, up or down.
+        Sum of the changes of the opacity, up and down, from the first node to each node.
     shown : ndarray, shape (NODES,), bool
     steepness : Steepness
-        Of `opacities_d`.
+        Steepness of `opacities_d`.
     low, scale : float
         Nearest node to v: ``floor((v - low) * scale + 0.5)``.
     factors_d : buffer, (GRADIENT_NODES,) float32
-        On the opacity, by magnitude of the gradient times `factor_scale`; counts where it is `weighed`.
+        Factors on the opacity, by magnitude of the gradient times `factor_scale`; used if it is `weighed`.
     steps_per_unit : float
-        Ray steps in the unit distance.
+        Number of ray steps in the unit distance.
     """
 
     colors_d: Any
@@ -78,18 +78,18 @@ class TransferTables:
 
     @property
     def shown_ends(self) -> tuple[int, int]:
-        """First and last node with opacity; (NODES, -1) without one."""
+        """First and last node with opacity; (NODES, -1) if all are transparent."""
         shown = np.flatnonzero(self.shown)
         return (int(shown[0]), int(shown[-1])) if len(shown) else (NODES, -1)
 
     @property
     def is_one_sided(self) -> bool:
-        """True where all nodes that show something are the first ones, or the last ones."""
+        """True where the visible nodes are the first ones of the table, or the last ones."""
         return int(np.count_nonzero(np.diff(self.shown.astype(np.int8)))) <= 1
 
     @property
     def arguments(self) -> dict[str, Any]:
-        """How the kernel is told of them."""
+        """Arguments for the kernel."""
         first_shown, last_shown = self.shown_ends
         return {
             "colors": self.colors_d,
@@ -110,7 +110,7 @@ class TransferTables:
 
     @classmethod
     def of(cls, device: Device, function: TransferFunction, ray_step: float) -> TransferTables:
-        """Tables of `function` for samples every `ray_step` mm."""
+        """Make the tables of `function` for samples every `ray_step` mm."""
         low, high = function.range_hu
         table = function.table(low, high, NODES)
         with np.errstate(divide="ignore"):
@@ -138,18 +138,18 @@ class TransferTables:
 
 @dataclass(frozen=True)
 class MainWay:
-    """The direction that most rays of a picture have among the bricks of a slab.
+    """The main direction of a picture's rays through the bricks of a slab.
 
     Attributes
     ----------
     axis : int
         0, 1 or 2 for i, j or k.
     ahead : int
-        1 or -1: the direction along it.
+        1 or -1: the direction along the axis.
     eye : ndarray, shape (4,), float32
         The camera in bricks, and 1; or the direction of all rays in bricks, 1 along `axis`, and 0.
     aside : float
-        Bricks off the camera, or aside for each brick ahead, from which on rays count as drifting aside.
+        Distance in bricks from the camera, or drift to the side per brick ahead, from which on rays count as drifting.
     """
 
     axis: int
@@ -159,7 +159,7 @@ class MainWay:
 
     @classmethod
     def of(cls, resident: DeviceVolume, slab: RaySlab, camera: Camera) -> MainWay:
-        """That of the ray in the middle."""
+        """Find the main way from the ray in the middle."""
         frame, cells = FieldFrame.of(resident.volume), np.array(slab.brick_cells, np.float64)
         forward = frame.matrix @ camera.basis().forward / cells
         axis = int(np.argmax(np.abs(forward)))
@@ -174,7 +174,7 @@ class MainWay:
 
     @property
     def arguments(self) -> dict[str, Any]:
-        """How kernels are told of it."""
+        """Arguments for kernels."""
         return {"main_axis": self.axis, "ahead": self.ahead, "eye": self.eye, "aside": self.aside}
 
 
@@ -200,10 +200,10 @@ def composite_slab(
     leaps : LeapMap
         Of this slab, for the transfer function of `tables`.
     labels : ResampledLabels, optional
-        On the grid of the volume, and how its labels look.
+        Labels on the grid of the volume.
     style : LabelStyle, optional
     output : PictureBuffers
-        Holds what earlier slabs left.
+        Picture with the results of earlier slabs.
     """
     device = resident.device
     variants = {"GRADIENT_OPACITY": "1"} if tables.weighed else {}
@@ -220,7 +220,7 @@ def composite_slab(
     lanes = int(device.kernel_variants["LANES"])
     queues = count_queues(device)
     last = np.array([n - 1 for n in resident.volume.shape_ijk] + [0], dtype=np.float32)
-    with stopwatch.running(device):  # to its end: CPU devices read the arrays of the host that end here
+    with stopwatch.running(device):  # wait: CPU devices read host arrays that are freed here
         entries_d = _enter_tiles(resident, slab, view, leaps, output, stopwatch)
         way = MainWay.of(resident, slab, view.camera)
         ways_d = _look_ahead(resident, slab, way, leaps, stopwatch)
@@ -241,7 +241,7 @@ def _enter_tiles(
     output: PictureBuffers,
     stopwatch: Stopwatch,
 ) -> Any:
-    """For each tile the way in mm before which none of its rays meets anything, on the device."""
+    """Return for each tile the distance in mm before which its rays meet nothing visible, on the device."""
     device = resident.device
     lanes = int(device.kernel_variants["LANES"])
     width, height = view.size
@@ -258,7 +258,7 @@ def _enter_tiles(
 
 
 def _look_ahead(resident: DeviceVolume, slab: RaySlab, way: MainWay, leaps: LeapMap, stopwatch: Stopwatch) -> Any:
-    """For each brick how far nothing shows around it, and ahead of it along the main way, on the device."""
+    """Return for each brick the empty distance around it, and ahead of it along the main way, on the device."""
     bi, bj, bk = bricks = slab.bricks
     count = math.prod(bricks)
     ways_d = allocate(resident.device, count)

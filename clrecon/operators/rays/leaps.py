@@ -1,4 +1,4 @@
-"""How far a ray may leap: which bricks of a slab show something, and how far the next one is."""
+"""Leaps of rays: which bricks of a slab show something, and the distance of the next one from each brick."""
 
 from __future__ import annotations
 
@@ -22,7 +22,9 @@ ROWS_AT_ONCE = kernel_constant("rays/leaps.cl", "ROWS_AT_ONCE")
 
 
 def measure_cells(resident: DeviceVolume, slab: RaySlab, stopwatch: Stopwatch) -> Any:
-    """Lowest and highest value that samples in each brick of a slab can have, (bk, bj, bi, 2), on the device."""
+    """Return the lowest and highest value that samples in each brick of a slab can have, (bk, bj, bi, 2), on the
+    device.
+    """
     if slab.ranges_d is None:
         bricks, (ni, nj, nk) = math.prod(slab.bricks), slab.shape_ijk
         slab.ranges_d = allocate(resident.device, 2 * bricks * resident.dtype.itemsize)
@@ -42,14 +44,14 @@ def find_leaps(
     scale: float,
     stopwatch: Stopwatch,
 ) -> LeapMap:
-    """The leap map for values that show, or the one that was made for `key` before.
+    """Return the leap map for visible values, or the map that was made for `key` before.
 
     Parameters
     ----------
     key : hashable
-        What `shown` follows from.
+        Identifies the source of `shown`.
     shown : ndarray, shape (nodes,), bool
-        Which nodes of a table of values show anything.
+        Which nodes of a table of values are visible.
     low, scale : float
         Nearest node to a value v: ``floor((v - low) * scale + 0.5)``, within the table.
     """
@@ -80,7 +82,7 @@ def find_leaps(
             distances=from_d, spread=to_d, count=count, stride=stride, chunks=chunks, items=items,
         )  # fmt: skip
     from_d = to_d
-    slab.maps.clear()  # one a slab: a map is made in some milliseconds
+    slab.maps.clear()  # one map for a slab: making it takes some milliseconds
     marked = download(device, np.empty((bk, bj, bi), np.uint8), from_d) == 0
     made = slab.maps[key] = LeapMap(from_d, _find_box(resident.volume, marked, slab))
     return made
@@ -98,5 +100,5 @@ def _find_box(volume: Volume, marked: NDArray[np.bool_], slab: RaySlab) -> tuple
     low, high = np.array(ends, dtype=np.float64).T
     low[2] += slab.first_k
     high[2] += slab.first_k
-    # Cells at the ends reach to the border of the volume.
+    # Bricks at the ends extend to the border of the volume.
     return enclose(volume, low - BOX_BORDER, high + BOX_BORDER)

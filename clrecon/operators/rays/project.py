@@ -20,7 +20,7 @@ PROJECTIONS = {
     mode: kernel_constant("rays/project.cl", macro)
     for mode, macro in {"mip": "HIGHEST", "minip": "LOWEST", "mean": "MEAN", "drr": "RADIOGRAPH"}.items()
 }
-"""What the kernel calls them."""
+"""Numbers of the modes in the kernel."""
 
 
 def project_slab(
@@ -31,7 +31,7 @@ def project_slab(
     output: PictureBuffers,
     stopwatch: Stopwatch,
 ) -> None:
-    """Take one slab into a projection; `output.means_d` gets the values.
+    """Add one slab to a projection; `output.means_d` receives the values.
 
     Parameters
     ----------

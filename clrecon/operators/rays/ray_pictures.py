@@ -30,7 +30,7 @@ __all__ = ["RayPicture", "take_picture"]
 
 @dataclass(frozen=True)
 class RayPicture:
-    """What is asked for.
+    """The description of a picture.
 
     Attributes
     ----------
@@ -43,10 +43,10 @@ class RayPicture:
         Of volume rendering.
     lighting : Lighting
     window : (low, high) or None
-        HU, in drr mm of water, that are black and white in projections; None chooses by what there is.
+        Values of black and white in projections, in HU (in drr mm of water); None: chosen from the values.
     clip : Clip or None
     background : colour or None
-        None leaves the picture transparent where nothing is.
+        None: transparent.
     jitter : bool
     style : LabelStyle or None
         Of volume rendering.
@@ -88,7 +88,7 @@ class _Job:
         self.planes = None if picture.clip is None else picture.clip.planes
 
     def run(self) -> Rendering:
-        """Take the picture, in thinner slabs where the device has no room for what was planned."""
+        """Take the picture, with thinner slabs if the device has no room for the planned ones."""
         resident = self.resident
         slices = plan_ray_slabs(resident, *PictureBuffers.needs(self.picture.size), self.labels)
         return resident.halve(RAYS, slices, self._take, warnings=self.warnings)
@@ -103,7 +103,7 @@ class _Job:
         for slab in ray_slabs(resident, slices, entry_slice(resident.volume, picture.camera), stopwatch):
             slabs += 1
             if picture.mode in PROJECTIONS:
-                with stopwatch.running(device):  # to its end: CPU devices read the arrays of the host
+                with stopwatch.running(device):  # wait: CPU devices read host arrays
                     project_slab(resident, slab, self._view(self.box), picture.mode, output, stopwatch)
             else:
                 self._composite(slab, output)
@@ -146,7 +146,7 @@ class _Job:
         report["window_mm_water" if is_water else "window_hu"] = list(window)
         image = grey_image(values, window)
         if is_water:
-            image[values <= 0.0, 3] = 0  # nothing attenuates there, within the volume or beside it
+            image[values <= 0.0, 3] = 0  # nothing attenuates there, inside the volume or beside it
         made = Rendering(image, depths, depths.copy(), picture.camera, values, picture.mode, report)
         return made if picture.background is None else made.with_background(picture.background)
 

@@ -25,12 +25,12 @@ BOX_ROW = kernel_constant("rays/view.h", "VIEW_BOX_LOW")
 """Row of the box in the table; its upper end and both of the focus follow."""
 
 ENDLESS = 1e30
-"""Offset of a clip plane that nothing comes near, in float32."""
+"""Offset of a clip plane that nothing reaches, in float32."""
 
 
 @dataclass(frozen=True)
 class RayView:
-    """Rays of a picture, ready for a device.
+    """The rays of a picture in the form for a device.
 
     Attributes
     ----------
@@ -40,9 +40,9 @@ class RayView:
         mm.
     table : ndarray, shape (rows, 4), float32
     planes : int
-        Clip planes among the rows.
+        Number of clip planes among the rows.
     spread : ndarray, shape (3,), float64
-        Field coordinates that the rays of a tile may be away from the one in its middle, and one ray step more.
+        Largest distance in field coordinates between a ray of a tile and the one in its middle, plus one ray step.
     """
 
     camera: Camera
@@ -54,7 +54,7 @@ class RayView:
 
     @property
     def arguments(self) -> dict[str, int]:
-        """How kernels are told of the picture and what cuts its rays; the table goes to the device by itself."""
+        """Arguments that describe the picture and its clip planes to kernels; the table is uploaded on its own."""
         width, height = self.size
         return {
             "width": width,
@@ -83,7 +83,7 @@ class RayView:
         planes : ndarray, shape (n, 4), float64
             Half-spaces in LPS mm that are kept: ``normal . p >= offset``.
         box, focus : (low, high), each ndarray, shape (3,), float64
-            Field coordinates of the volume, and of what can show in it.
+            Field coordinates of the volume, and of its visible part.
         """
         frame = FieldFrame.of(volume)
         right, up, forward = camera.basis()
@@ -131,7 +131,7 @@ class RayView:
         return cls(camera, size, ray_step, table.astype(np.float32), count, spread)
 
     def widened(self) -> NDArray[np.float32]:
-        """The table with the focus, larger by the spread on all sides, for its box, and without clip planes."""
+        """Return the table without clip planes, with the focus, enlarged by the spread on all sides, as its box."""
         table = self.table[: len(self.table) - self.planes].copy()
         table[BOX_ROW, :3] = table[BOX_ROW + 2, :3] - self.spread
         table[BOX_ROW + 1, :3] = table[BOX_ROW + 3, :3] + self.spread
@@ -139,13 +139,14 @@ class RayView:
 
 
 def _perspective_spread(camera: Camera, size: tuple[int, int], farthest: float) -> tuple[float, float]:
-    """How far, across the view and along it, rays of a tile are from the one in its middle, up to `farthest` mm away.
+    """Return the distance, across and along the view, of a tile's rays from its middle ray, up to `farthest` mm away.
 
-    Places that are as far along two rays differ by that distance times the difference of their unit directions, which
-    is at most that of the directions with length 1 along the view; along the view, times the sine of the angle to it.
+    Points at equal distance along two rays differ by that distance times the difference of the unit directions.  This
+    is at most the difference of the directions scaled to length 1 along the view; along the view, that times the sine
+    of the angle to it.
     """
     width, height = size
     pixel = 2.0 * camera.half_height() / height
-    edge = pixel * math.hypot(0.5 * width + TILE, 0.5 * height + TILE)  # tiles may go beyond the picture
+    edge = pixel * math.hypot(0.5 * width + TILE, 0.5 * height + TILE)  # tiles may extend beyond the picture
     across = math.sqrt(2.0) * 0.5 * (TILE - 1) * pixel * farthest
     return across, across * edge / math.hypot(1.0, edge)

@@ -1,4 +1,4 @@
-"""Pictures of a volume: one volume on a device, any number of pictures in any mode."""
+"""Rendering of a volume: one volume on a device, any number of pictures in any mode."""
 
 from __future__ import annotations
 
@@ -40,10 +40,11 @@ DEFAULT_SIZE = (1024, 1024)
 DEFAULT_VIEW = "anterior"
 
 SMALLEST_STEP = 0.01
-"""Ray steps below this share of the smallest spacing add time and nothing else."""
+"""Smallest ray step as a share of the smallest spacing; shorter steps only add time."""
 
 MOST_STEPS = 1 << 15
-"""Ray steps through the diagonal of a volume: float32 counts them, and Mesa's llvmpipe ends loops after 65535 turns."""
+"""Most ray steps through the diagonal of a volume: float32 counts them, and Mesa's llvmpipe ends loops after 65535
+turns."""
 
 
 class VolumeRenderer:
@@ -55,7 +56,7 @@ class VolumeRenderer:
     Parameters
     ----------
     volume : Volume or DeviceVolume
-        The voxels must not change as long as the renderer is open.  A `DeviceVolume` is used as it is, and has its
+        The voxels must not change as long as the renderer is open.  A `DeviceVolume` is used directly, with its own
         device and memory.
     device : Device, str or int, optional
         See `clrecon.device`; None is the best of the machine.
@@ -65,9 +66,9 @@ class VolumeRenderer:
     Raises
     ------
     UsageError
-        `volume` is no Volume or holds NaN, or `memory` is no number of bytes.
+        `volume` is not a Volume or holds NaN, or `memory` is not a number of bytes.
     DeviceError
-        There is no such device.
+        The device does not exist.
     """
 
     def __init__(
@@ -106,7 +107,7 @@ class VolumeRenderer:
         progress: Progress | None = None,
         **look: object,
     ) -> Rendering:
-        """Make one picture, see `render`."""
+        """Make one picture, see the function `render`."""
         style = find_style(style, look)
         if not (camera is None or isinstance(camera, Camera)):
             raise UsageError(f"the camera of a picture is a Camera or None, not {type(camera).__name__}")
@@ -201,7 +202,7 @@ class VolumeRenderer:
         except (TypeError, ValueError, OverflowError):
             step = math.nan
         if finest <= step < math.inf:
-            return min(step, 2.0 * diagonal)  # one sample, in the middle of what a ray crosses
+            return min(step, 2.0 * diagonal)  # one sample, in the middle of the way through the volume
         raise UsageError(
             f"the ray step is a length in mm, at least {finest:.3g} in this volume (a hundredth of its smallest"
             f" spacing, and {MOST_STEPS:,} through its diagonal), not {ray_step!r}"
@@ -209,7 +210,7 @@ class VolumeRenderer:
 
 
 class _Place(NamedTuple):
-    """Where a picture is taken from, as it was said."""
+    """The view of a picture as the caller described it."""
 
     camera: Camera | None
     view: str | Sequence[float]
@@ -218,14 +219,14 @@ class _Place(NamedTuple):
     view_angle: float | None
 
     def camera_for(self, volume: Volume, size: tuple[int, int]) -> Camera:
-        """The camera that is given, or the one that the rest makes."""
+        """Return the given camera, or one made from the other parameters."""
         if self.camera is not None:
             return self.camera
         return Camera.fit(volume, self.view, self.zoom, up=self.up, view_angle=self.view_angle, size=size)
 
 
 def _check_alone(**placing: Any) -> None:
-    """Refuse what places a camera beside a camera that is given."""
+    """Refuse parameters that place a camera if a camera is given."""
     given = [name for name, value in placing.items() if value is not None]
     if given:
         them = " and ".join(filter(None, (", ".join(given[:-1]), given[-1])))

@@ -1,4 +1,4 @@
-"""Slabs of a volume for rays, and what their bricks hold: which show something, and how far the next one is."""
+"""Slabs of a volume for rays, and their bricks: which show something, and how far the next one is."""
 
 from __future__ import annotations
 
@@ -39,28 +39,28 @@ FARTHEST = kernel_constant("rays/leap.h", "FARTHEST")
 
 
 def choose_brick_cells(volume: Volume) -> tuple[int, int, int]:
-    """Cells of a brick along i, j and k: fewer along k where slices lie farther apart than voxels in them."""
+    """Return the cells of a brick along i, j, k: fewer along k where slices are farther apart than voxels in them."""
     di, dj, dk = volume.spacing
     across = dk / max(di, dj)
     return BRICK_CELLS, BRICK_CELLS, 1 if across >= 3.0 else 2 if across >= 1.5 else BRICK_CELLS
 
 
 OVERLAP = 2
-"""Slices that a slab holds beyond its own at either side: those that cells and gradients at its ends read."""
+"""Slices that a slab holds beyond its own at either side; cells and gradients at its ends read them."""
 
 MOST_VOXELS = (1 << 31) - 1
-"""Of a slab, where kernels take several samples at once: what they differ by in their places is an int."""
+"""Most voxels of a slab in kernels that take several samples at once: the difference of their indices is an int."""
 
 RAYS = "rays"
-"""What slabs are planned for."""
+"""Purpose by which slabs are planned."""
 
 _BRICKS, _LABELS = "bricks for rays", "labels for rays"
-"""What is kept of a whole volume."""
+"""Names of the objects that are kept for a whole volume."""
 
 
 def entry_slice(volume: Volume, camera: Camera) -> float:
-    """Slice coordinate that the rays of a picture come from, see `ray_slabs`; infinite for parallel rays."""
-    if camera.is_parallel:  # however far back they begin, in a view along the slices too
+    """Return the slice coordinate where the rays of a picture come from, see `ray_slabs`; infinite if parallel."""
+    if camera.is_parallel:  # also in a view along the slices, where rays begin at any distance
         normal = slice_normal(volume.affine)
         rate = float(normal @ camera.basis().forward) * float(normal @ volume.affine[:3, 2])
         return -np.inf if rate > 0.0 else np.inf
@@ -69,14 +69,14 @@ def entry_slice(volume: Volume, camera: Camera) -> float:
 
 @dataclass
 class LeapMap:
-    """Which bricks of a slab show something, and how far the next one is.
+    """The bricks of a slab that show something, and the distance of the next one from each brick.
 
     Attributes
     ----------
     distances_d : buffer, (bk, bj, bi) uint8
-        Chebyshev distance in bricks, 0 where something shows.
+        Chebyshev distance in bricks, 0 for visible bricks.
     box : (low, high) or None
-        Field coordinates of the part of the volume that all bricks with something lie in; None where there is none.
+        Field coordinates of the box around all visible bricks; None if no brick is visible.
     """
 
     distances_d: Any
@@ -98,7 +98,7 @@ class RaySlab:
     ranges_d : buffer, optional
         See `clrecon.operators.rays.leaps.measure_cells`.
     maps : dict of LeapMap
-        By what they were made for.
+        Leap maps by their keys.
     """
 
     voxels_d: Any
@@ -113,24 +113,24 @@ class RaySlab:
 
     @property
     def is_whole(self) -> bool:
-        """The slab is all of the volume."""
+        """True where the slab is the whole volume."""
         return self.stage == 3
 
     @property
     def bricks(self) -> tuple[int, int, int]:
-        """(bi, bj, bk)."""
+        """Number of bricks (bi, bj, bk)."""
         bi, bj, bk = (max(1, -(-(n - 1) // c)) for n, c in zip(self.shape_ijk, self.brick_cells, strict=True))
         return bi, bj, bk
 
     @property
     def brick_arguments(self) -> dict[str, int]:
-        """How kernels are told of bricks: their numbers, and cells of each along k."""
+        """Arguments about bricks: their numbers, and the cells of each along k."""
         bi, bj, bk = self.bricks
         return {"bi": bi, "bj": bj, "bk": bk, "cells_k": self.brick_cells[2]}
 
     @property
     def arguments(self) -> dict[str, Any]:
-        """How kernels that follow rays are told of the slab."""
+        """Arguments about the slab for kernels that follow rays."""
         return {
             "voxels": self.voxels_d,
             "ni": self.shape_ijk[0],
@@ -145,12 +145,12 @@ class RaySlab:
 
     @property
     def end_k(self) -> int:
-        """The slice after the last of the buffer."""
+        """The slice after the last one of the buffer."""
         return self.first_k + self.shape_ijk[2]
 
 
 def pad_slices(voxels: NDArray[Any]) -> NDArray[Any]:
-    """Voxels with every axis of length 1 doubled: a cell needs two, and the field is the same."""
+    """Return voxels with every axis of length 1 doubled: a cell needs two, and the field stays the same."""
     for axis, length in enumerate(voxels.shape):
         if length == 1:
             voxels = np.repeat(voxels, 2, axis=axis)
@@ -160,15 +160,15 @@ def pad_slices(voxels: NDArray[Any]) -> NDArray[Any]:
 def plan_ray_slabs(
     resident: DeviceVolume, others: Mapping[str, int], extra: Mapping[str, int], labels: ResampledLabels | None = None
 ) -> int:
-    """Slices a slab, all where everything fits.
+    """Return the number of slices in a slab, all if everything fits.
 
     Parameters
     ----------
     resident : DeviceVolume
     others, extra : mapping of str to int
-        Bytes of what else is on the device, and of what comes with more than one slab.
+        Bytes of other buffers on the device, and of those needed only with more than one slab.
     labels : ResampledLabels, optional
-        That go through with the voxels.
+        Labels that are needed with the voxels.
 
     Raises
     ------
@@ -197,15 +197,15 @@ def plan_ray_slabs(
 
 
 def ray_slabs(resident: DeviceVolume, slices: int, entry_k: float, stopwatch: Stopwatch) -> Iterator[RaySlab]:
-    """The volume in slabs of `slices` slices, from the one that the rays come from on.
+    """Yield the volume in slabs of `slices` slices, starting where the rays come from.
 
     Parameters
     ----------
     slices : int
-        As `plan_ray_slabs` says.
+        Result of `plan_ray_slabs`.
     entry_k : float
-        Slice coordinate of the camera: each ray goes away from it, so slabs are taken by their distance from it.
-        Infinite: from that end on.
+        Slice coordinate of the camera.  Rays go away from it, so slabs are ordered by their distance from it.
+        Infinite: slabs begin at that end.
     """
     nk = resident.volume.shape_ijk[2]
     if slices >= nk:
@@ -227,7 +227,7 @@ def ray_slabs(resident: DeviceVolume, slices: int, entry_k: float, stopwatch: St
 
 
 def slab_labels(resident: DeviceVolume, slab: RaySlab, labels: ResampledLabels, stopwatch: Stopwatch) -> Any:
-    """The labels of a slab's voxels on the device; those of a whole volume stay there."""
+    """Return the labels of a slab's voxels on the device; those of a whole volume stay there."""
 
     def make() -> Any:
         with stopwatch.timed("upload"):
@@ -235,12 +235,12 @@ def slab_labels(resident: DeviceVolume, slab: RaySlab, labels: ResampledLabels, 
 
     if not slab.is_whole:
         return make()
-    # The labels are kept too: as long as they are, nothing else has their place in memory.
+    # The labels are kept too, so that no other array can get their address in the meantime.
     return resident.keep(_LABELS, id(labels), labels.voxels.nbytes, lambda: (labels, make()))[1]
 
 
 def _whole_slab(resident: DeviceVolume, stopwatch: Stopwatch) -> RaySlab:
-    """The only slab of a volume that fits; its bricks and their ranges stay with the voxels."""
+    """Return the only slab of a volume that fits; its bricks and their ranges stay on the device with the voxels."""
 
     def make() -> RaySlab:
         voxels = resident.volume.voxels

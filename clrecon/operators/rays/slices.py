@@ -1,4 +1,4 @@
-"""Slices of a volume drawn in space where they lie: the host's side of cl/rays/slices.cl."""
+"""Slices in space: slices of a volume drawn at their own places; the host's side of cl/rays/slices.cl."""
 
 from __future__ import annotations
 
@@ -26,29 +26,29 @@ from clrecon.rendering.views.clip import Clip
 __all__ = ["DEFAULT_OPACITY", "LOWEST_SHOWN_HU", "choose_slices", "overlay_slices"]
 
 DEFAULT_COUNT = 12
-"""Slices that are shown where none are named: enough to see the body, few enough to see each of them."""
+"""Number of slices shown by default: enough to see the body, few enough to see each slice."""
 
 DEFAULT_OPACITY = 0.5
-"""Of a slice: the front ones are bright, and the third still shows an eighth of its light."""
+"""Opacity of a slice: the front slices are bright, and the third still shows an eighth of its light."""
 
 LOWEST_SHOWN_HU = -300.0
-"""Below is air, lung and most of what lies around a patient: transparent, so that the slices behind are seen."""
+"""Lower values are transparent, so that the slices behind are visible: air, lung and most things around a patient."""
 
 DEFAULT_WINDOW = (-300.0, 400.0)
-"""HU that are black and white, where neither a window nor a transfer function is given: soft tissue and bone."""
+"""HU of black and white without a window or a transfer function: soft tissue and bone."""
 
 NODES = kernel_constant("rays/slices.cl", "BINS")
 """Entries of the table of colours."""
 
 SLICES = "slices in space"
-"""What parts are planned for."""
+"""Purpose by which parts are planned."""
 
 EDGE_ON = 1e-3
-"""Cosine between a parallel view and the slices' normal below which nothing of them is seen."""
+"""Cosine between a parallel view and the slices' normal below which the slices are invisible."""
 
 
 def choose_slices(volume: Volume, slices: int | Sequence[int] | None = None) -> list[int]:
-    """Numbers k of the slices to show, ascending.
+    """Return the numbers k of the slices to show, ascending.
 
     Parameters
     ----------
@@ -99,8 +99,8 @@ def overlay_slices(
 ) -> Rendering:
     """Show slices of a volume in space, each translucent at its own place: sheared and uneven stacks too.
 
-    A volume that is on the device already is read there.  Else only the slices that are shown are uploaded, in parts
-    where they do not fit together.
+    A volume that is already on the device is read there.  Else only the shown slices are uploaded, in parts if they do
+    not fit together.
 
     Parameters
     ----------
@@ -110,21 +110,21 @@ def overlay_slices(
     slices : int or sequence of int, optional
         See `choose_slices`.
     opacity : float
-        Of each slice, above 0 to 1.
+        Opacity of each slice, above 0 to 1.
     lowest_hu : float
-        What is below is transparent.
+        Lower values are transparent.
     window : (low, high), optional
         HU that are black and white.
     transfer_function : TransferFunction, optional
-        Its colours in place of grey; its opacity plays no part.
+        Gives colours in place of grey; its opacity is not used.
     clip : Clip, optional
     background : str or (float, float, float), optional
-        None leaves the picture transparent where nothing is.
+        None: transparent.
 
     Returns
     -------
     Rendering
-        ``depth`` is that of the first slice that shows there.
+        ``depth`` is that of the first visible slice.
 
     Raises
     ------
@@ -181,10 +181,10 @@ def _number(value: float) -> float:
 
 
 def _sort_slices(volume: Volume, camera: Camera, chosen: Sequence[int]) -> list[int]:
-    """Slices in the order in which rays cross them.
+    """Sort slices in the order in which rays cross them.
 
-    All rays cross them in one order: parallel ones go up, or down, together; those from a camera go away from its
-    height, whichever way.
+    All rays share one order: parallel rays go up or down together; rays from a camera go away from its height, up or
+    down.
     """
     heights = _heights(volume, volume.slice_origins()[list(chosen)])
     if camera.is_parallel:
@@ -206,7 +206,7 @@ def _warn(volume: Volume, camera: Camera) -> list[str]:
 
 
 class _Overlay:
-    """One picture: from part to part of the slices, in the order in which rays cross them."""
+    """One picture: part after part of the slices, in the order in which rays cross them."""
 
     def __init__(
         self,
@@ -226,7 +226,7 @@ class _Overlay:
         self.warnings = _warn(resident.volume, camera)
 
     def run(self, background: str | Sequence[float] | None) -> Rendering:
-        """Take the picture, with fewer slices at a time where the device has no room for what was planned."""
+        """Take the picture, with fewer slices at a time if the device has no room for the planned number."""
         resident, count = self.resident, len(self.chosen)
         picture, states = PictureBuffers.needs(self.view.size)
 
@@ -263,7 +263,7 @@ class _Overlay:
         return Rendering(image, depths, means, self.view.camera, None, "slices", report)
 
     def _draw(self, part: Sequence[int], stage: int, output: PictureBuffers) -> None:
-        """Draw slices in the order given, and wait."""
+        """Draw slices in the given order, and wait."""
         resident, look, view, stopwatch = self.resident, self.look, self.view, self.stopwatch
         device, volume = resident.device, resident.volume
         places = np.zeros((len(part), 4), np.float32)
@@ -275,7 +275,7 @@ class _Overlay:
         ni, nj, _ = volume.shape_ijk
         queues = count_queues(device)
         program = load_program(device, "rays/slices.cl", voxel_variants(volume.voxels.dtype))
-        with stopwatch.running(device):  # to its end: CPU devices read the array of the host
+        with stopwatch.running(device):  # wait: CPU devices read the host's array
             launch(
                 device, program["overlay_slices"], output.items(queues, 1), stopwatch=stopwatch,
                 slices=slices_d, places=upload(device, places), colors=upload(device, look.colors),

@@ -30,10 +30,10 @@ from clrecon.rendering.views.clip import Clip
 __all__ = ["SURFACE_COLOR", "cast_surface"]
 
 SURFACE_COLOR = "bone"
-"""Of a surface without labels."""
+"""Colour of a surface without labels."""
 
 CLOSED_BORDER = 1.0
-"""Index steps beyond the outermost voxel centres within which the closed field falls to outside."""
+"""Index steps beyond the outermost voxel centres within which the closed field falls to its outside value."""
 
 
 def cast_surface(
@@ -54,9 +54,9 @@ def cast_surface(
     """Show where the field first reaches an iso value along each ray.
 
     The field is that of the closed mesh of `extract_isosurface`, so that depths are those of the mesh: surrounded by a
-    layer of outside, its surface at the level of `clrecon.geometry.iso_rule.IsoRule`.  Between the first sample that is
+    layer of outside, its surface at the level of `clrecon.geometry.iso_rule.IsoRule`. Between the first sample that is
     inside and the one before, the surface is found to 1e-3 of a step.  A ray that begins inside has its hit at once: on
-    a clip plane with the plane's normal, so that cut bone is flat; at a camera in there with the ray's direction.
+    a clip plane with the plane's normal, so that cut bone is flat; at a camera inside, with the ray's direction.
 
     Parameters
     ----------
@@ -66,21 +66,21 @@ def cast_surface(
     camera : Camera
     size : (width, height)
     ray_step : float
-        mm between samples.  Where the volume goes through in slabs, at most one slice.
+        Distance of samples, mm.  If the volume is processed in slabs, at most one slice.
     lighting : Lighting, optional
     clip : Clip, optional
     color : str or (float, float, float)
-        Of the surface, see `clrecon.rendering.looks.colors.find_color`.
+        Colour of the surface, see `clrecon.rendering.looks.colors.find_color`.
     background : str or (float, float, float), optional
-        None leaves the picture transparent where nothing is hit.
+        None: transparent.
     shadows : bool
-        A hit from which the way to the fixed light meets anything inside, a ray step on or further, has ambient light
-        alone; what is translucent by `style` lets its share through.
+        True: a hit has only ambient light if the way from it to the fixed light meets something inside, one ray step
+        away or farther; labels that are translucent by `style` let their share through.
     depth_cue : float
         Share of the brightness, 0 to 1, that is lost from the nearest corner of the volume to the farthest.
     style : LabelStyle, optional
-        A hit in a label with opacity below 1 is blended and the ray goes on: out of the inside and to the next entry,
-        or into the next label.  The label of a hit is that of the nearest inside voxel of its cell that has one.
+        A hit in a label with opacity below 1 is blended, and the ray continues: out of the inside to the next entry, or
+        into the next label.  The label of a hit is that of the nearest inside voxel of its cell that has one.
 
     Returns
     -------
@@ -90,7 +90,7 @@ def cast_surface(
     Raises
     ------
     UsageError
-        Shadows without a fixed light, a depth cue that is no share, or as `choose_iso_rule`.
+        Shadows are asked for without a fixed light, the depth cue is not a share, or as `choose_iso_rule`.
     NoSurfaceError
         The volume holds values that have no surface.
     RefusedInputError
@@ -128,7 +128,7 @@ class _Look:
 
 
 class _Job:
-    """One picture: from slab to slab."""
+    """One picture, slab after slab."""
 
     def __init__(
         self,
@@ -151,7 +151,7 @@ class _Job:
         self.frame = FieldFrame.of(resident.volume)
 
     def run(self, background: str | Sequence[float] | None) -> Rendering:
-        """Take the picture, in thinner slabs where the device has no room for what was planned."""
+        """Take the picture, with thinner slabs if the device has no room for the planned ones."""
         slices = plan_ray_slabs(self.resident, *PictureBuffers.needs(self.size), self.labels)
         return self.resident.halve(RAYS, slices, lambda slices: self._take(slices, background), warnings=self.warnings)
 
@@ -185,7 +185,7 @@ class _Job:
         return Rendering(image, depths, means, self.camera, None, "surface", report)
 
     def _shorten_steps(self, warnings: list[str]) -> None:
-        """A slab knows what lies up to a slice before it: steps are no longer than that."""
+        """Limit the step to a slice, because a slab holds only one slice before its own."""
         longest = 1.0 / _slices_per_mm(self.resident.volume)
         if self.ray_step > longest:
             warnings.append(
@@ -200,7 +200,7 @@ class _Job:
         variants, tables = self._tables(slab)
         low_k, high_k = _field_heights(volume, self.frame, (slab.low_k, slab.high_k))
         last = [n - 1 for n in volume.shape_ijk]
-        with self.stopwatch.running(device):  # to its end: CPU devices read the arrays of the host
+        with self.stopwatch.running(device):  # wait: CPU devices read host arrays
             leaps = _find_leaps(resident, slab, rule.iso_level, self.stopwatch)
             view = self._view(leaps)
             launch(
@@ -214,7 +214,7 @@ class _Job:
             )  # fmt: skip
 
     def _tables(self, slab: RaySlab) -> tuple[dict[str, str], dict[str, Any]]:
-        """Variants of the kernel, and the tables of clip planes and labels, as it takes them."""
+        """Return variants of the kernel, and the tables of clip planes and labels for it."""
         device = self.resident.device
         normals = np.zeros((max(1, len(self.planes)), 4), np.float32)
         normals[: len(self.planes), :3] = self.planes[:, :3]
@@ -235,7 +235,7 @@ class _Job:
         focus = (box[1], box[1])
         if leaps.box is not None:
             margin = np.full(3, CLOSED_BORDER)
-            if volume.uneven:  # a slice more in field coordinates, wherever it lies
+            if volume.uneven:  # one slice more in field coordinates, at any height
                 aside = np.abs(np.diff(self.frame.places(volume.slice_origins(border=1)), axis=0)).max(axis=0)
                 margin = np.array([CLOSED_BORDER, CLOSED_BORDER, 0.0]) + aside
             focus = leaps.box[0] - margin, leaps.box[1] + margin
@@ -245,14 +245,14 @@ class _Job:
         )  # fmt: skip
 
     def _light_step(self) -> NDArray[np.float32]:
-        """Field coordinates per mm towards the fixed light, and whether it throws shadows."""
+        """Return field coordinates per mm towards the fixed light, and whether it throws shadows."""
         if self.look.lighting.direction is None:
             return _float4()
         light = np.array(self.look.lighting.direction)
         return _float4(*(self.frame.matrix @ (light / np.linalg.norm(light))), float(self.look.shadows))
 
     def _cue(self) -> NDArray[np.float32]:
-        """Depth of full brightness, 1 / mm from there to the farthest corner, and what is lost there."""
+        """Return the depth of full brightness, 1 / mm from it to the farthest corner, and the brightness lost there."""
         if not self.look.depth_cue:
             return _float4()
         corners = box_corners(self.resident.volume) - self.camera.position
@@ -270,10 +270,10 @@ def _float4(*numbers: float) -> NDArray[np.float32]:
 
 
 def _find_leaps(resident: DeviceVolume, slab: RaySlab, level: float, stopwatch: Stopwatch) -> LeapMap:
-    """Which bricks reach the level.
+    """Find the bricks that reach the level.
 
-    Of the two nodes that a value can be nearest to, the second shows: from half a `unit` above `low` on, which is the
-    level.  Marking takes a hundredth of it off, far more than float32 may be wrong by.
+    The table has two nodes, and the second is visible.  A value is nearest to it from half a `unit` above `low` on,
+    which is the level.  Marking subtracts a hundredth of a unit, far more than the errors of float32.
     """
     unit = max(1e-3 * abs(level), 1e-6)
     return find_leaps(
@@ -282,14 +282,14 @@ def _find_leaps(resident: DeviceVolume, slab: RaySlab, level: float, stopwatch: 
 
 
 def _field_heights(volume: Volume, frame: FieldFrame, ks: Sequence[float]) -> list[float]:
-    """Third field coordinates of slices; infinite ones stay."""
+    """Return the third field coordinates of slices; infinite ones stay infinite."""
     if not volume.uneven:
         return list(ks)
     return [float(frame.places(volume.ijk_to_lps([(0.0, 0.0, k)]))[0, 2]) if np.isfinite(k) else float(k) for k in ks]
 
 
 def _slices_per_mm(volume: Volume) -> float:
-    """The most slices that a ray crosses in a mm."""
+    """Return the most slices that a ray crosses in a mm."""
     origins = volume.slice_origins(border=1)
     normal = np.cross(volume.affine[:3, 0], volume.affine[:3, 1])
     gaps = np.abs(np.diff(origins @ (normal / np.linalg.norm(normal))))

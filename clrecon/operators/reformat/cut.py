@@ -32,14 +32,14 @@ CURVED_KINDS = ("straightened", "stretched")
 DEFAULT_SIZE = (1024, 1024)
 
 WHOLE_SHARE = 0.85
-"""Of the height of a volume; where the spine was found over less, that is said."""
+"""Share of the volume's height; if the spine was found over less, a warning says so."""
 
 DEFAULT_WIDTH_MM = 120.0
-"""Width of a curved reformation where neither size nor width is given: a vertebra with what lies around it."""
+"""Default width of a curved reformation without a size: a vertebra with its surroundings."""
 
 
 class _Job:
-    """What the two kinds of pictures share: the device, how samples are combined, the picture and its report."""
+    """The common part of both kinds of pictures: the device, how samples are combined, the picture and its report."""
 
     def __init__(
         self,
@@ -71,7 +71,7 @@ class _Job:
         report: dict[str, Any],
         background: str | Sequence[float],
     ) -> Rendering:
-        """What was sampled as a picture in grey, before its background."""
+        """Return the sampled values as a grey picture, before its background."""
         image = grey_image(made.values, self.window)
         seen = Rendering(image, depth, depth.copy(), camera, made.values, mode=mode, report=report)
         return seen if is_transparent(background) else seen.with_background(background)
@@ -119,7 +119,7 @@ def cut_slice(
     Parameters
     ----------
     volume : Volume or DeviceVolume
-        A `DeviceVolume` is used as it is, and has its device and memory.
+        A `DeviceVolume` is used directly, with its own device and memory.
     plane : Camera, str or (float, float)
         A camera: the plane through its focal point across its view.  A name: axial, coronal, sagittal through the
         middle of the volume, as radiologists look at them, or a view as in `Camera.fit`.
@@ -128,20 +128,21 @@ def cut_slice(
     device : Device, str or int, optional
         See `clrecon.device`.
     zoom, up, pixel_mm
-        Of a plane by name, see `clrecon.rendering.views.plane.find_plane`.
+        Options for a plane by name, see `clrecon.rendering.views.plane.find_plane`.
     offset_mm : float
         Moves the plane along the view, away from the camera.
     thickness : float
-        Mm of the slab around the plane whose samples are combined, half of it to either side; 0 is the plane alone.
-        Samples are at most half the smallest distance of voxels apart, see `clrecon.rendering.views.plane.SlabSamples`.
+        Thickness in mm of a thick slice, half of it on either side of the plane; its samples are combined.  0 is the
+        plane alone.  Samples are at most half the smallest distance of voxels apart, see
+        `clrecon.rendering.views.plane.SlabSamples`.
     combine : {"mean", "max", "min"}
-        Of the samples that lie within the volume.
+        How the samples within the volume are combined.
     window : (low, high), optional
         HU that are black and white; default -450 to 1050, a window for bone.
     background : str or colour
-        Where there is nothing of the volume; "transparent" leaves opacity 0 there.
+        Colour outside the volume; "transparent" gives opacity 0 there.
     memory : int, optional
-        Bytes that may be taken on the device; a volume that needs more goes through in slabs.
+        Bytes that may be taken on the device; a volume that needs more is processed in slabs.
     progress : callable, optional
         Called as ``progress("slabs", slices done, all slices)``.
 
@@ -223,19 +224,20 @@ def reformat_curve(
     ----------
     volume : Volume or DeviceVolume
     curve : Curve, array_like of shape (n, 3), or "spine"
-        Points of the centre line in LPS mm, all within the volume; a smooth curve is laid through them.  "spine" looks
-        for the spinal canal, see `clrecon.anatomy.spine_line`.
+        Points of the centre line in LPS mm, all within the volume; the curve is smooth.  "spine" searches for the
+        spinal canal, see `clrecon.anatomy.spine_line`.
     kind : {"straightened", "stretched"}
-        Straightened: the centre line is a straight line down the picture, each row lies across it.  Stretched: rows
-        keep one direction in the patient, the picture is the surface that they make, unrolled; all lengths within
-        that surface are kept.  See `clrecon.rendering.views.curved`.
+        Straightened: the centre line is a straight line down the picture, and each row crosses it.  Stretched: all rows
+        have one direction in the patient and form a surface, which the picture shows unrolled; all lengths within that
+        surface are kept.  See `clrecon.rendering.views.curved`.
     size : (int, int), optional
         Width and height of the picture; default: as many pixels as the curve is long, and `width_mm`.
     device : Device, str or int, optional
         See `clrecon.device`.
     view, up : str or direction
-        The side that one looks from, as in `Camera.fit`, says which direction runs to the right and which end of the
-        curve is at the top: left (a sagittal picture of the spine, the front at the left), anterior (a coronal one).
+        Side from which the patient is seen, as in `Camera.fit`. It gives the direction that runs to the right, and the
+        end of the curve at the top: left (a sagittal picture of the spine, the front at the left), anterior (a coronal
+        one).
     angle : float
         Degrees by which the rows of a straightened picture are turned about the centre line.
     pixel_mm : float, optional
@@ -243,7 +245,7 @@ def reformat_curve(
     width_mm : float, optional
         Width of the picture where no `size` is given; default 120 mm.
     thickness, combine, window, background, memory, progress
-        As in `cut_slice`; the slab lies across the picture.
+        As in `cut_slice`; a thick slice extends across the picture.
 
     Returns
     -------
@@ -254,10 +256,10 @@ def reformat_curve(
     Raises
     ------
     UsageError
-        Points that are no numbers, too few or outside of the volume; an unknown kind or view; impossible numbers; a
-        curve that runs along the rows.
+        Points are not numbers, too few or outside the volume; the kind or view is unknown; numbers are impossible; or
+        the curve is parallel to the rows.
     RefusedInputError
-        No spine that one could be sure of.
+        No part of the volume surely shows a spine.
     DeviceError
         No device, two slices and the picture do not fit it, or it fails.
     """
@@ -288,7 +290,7 @@ def _lay_sheet(
 
 
 def _warn_of_part(found: dict[str, Any] | None) -> list[str]:
-    """The warning where the spine was looked for, and found in a part of the volume alone."""
+    """Return the warning for a spine that was found in a part of the volume only."""
     if found is None or found["height_mm"] >= WHOLE_SHARE * found["searched_mm"]:
         return []
     height, searched = found["height_mm"], found["searched_mm"]
@@ -303,7 +305,7 @@ def _check_kind(kind: str, angle: float) -> None:
 
 
 def _find_line(volume: Volume, curve: Curve | ArrayLike | str) -> tuple[Curve, dict[str, Any] | None]:
-    """The centre line, and what is known of it where it was looked for."""
+    """Return the centre line, and the facts about it if it was searched for."""
     if isinstance(curve, str):
         if curve != "spine":
             raise UsageError(f"a centre line is its points in LPS mm, or 'spine' to look for it: not {curve!r}")
@@ -316,7 +318,7 @@ def _find_line(volume: Volume, curve: Curve | ArrayLike | str) -> tuple[Curve, d
 
 
 def _find_directions(view: str | Sequence[float], up: str | ArrayLike | None) -> tuple[Float64Array, Float64Array]:
-    """Directions in LPS to the right and to the top of a view."""
+    """Return the directions in LPS to the right and to the top of a view."""
     towards, default_up = find_view(view)
     camera = Camera(tuple(towards), (0.0, 0.0, 0.0), tuple(default_up if up is None else find_up(up)), 30.0)
     right, top, _ = camera.basis()
@@ -355,5 +357,5 @@ def _describe_curve(line: Curve, curved: CurvedSheet, kind: str, across: Float64
 
 
 def _rounded(values: NDArray[Any]) -> list[float | None]:
-    """Values for JSON, None where there is none."""
+    """Return values for JSON, None for NaN."""
     return [None if np.isnan(value) else round(float(value), 4) for value in values]

@@ -36,29 +36,29 @@ COMBINATIONS = {
 """How the samples of a slab are combined: the kernel's numbers."""
 
 SAMPLES_A_LAUNCH = 1 << 23
-"""Keeps launches short: systems stop those that hold a display's GPU for seconds."""
+"""Most samples of a launch, which keeps launches short: systems stop kernels that block a display's GPU for seconds."""
 
 SHEETS = "slices"
-"""What slabs are planned for."""
+"""Purpose by which slabs are planned."""
 
 FARTHEST = 2.0**30
-"""Index steps, or mm, from the volume that fixed point can hold."""
+"""Farthest place from the volume in index steps or mm, for fixed-point numbers."""
 
 
 @dataclass(frozen=True)
 class Reformation:
-    """Values of the pixels of a sheet, and how they were made.
+    """Values of the pixels of a sheet, and figures of their computation.
 
     Attributes
     ----------
     values : ndarray, shape (h, w), float32
         HU; NaN where no sample lies within the volume.
     slices : int
-        Slices of the volume that the sheet meets.
+        Number of slices of the volume that the sheet meets.
     slabs : int
-        Parts in which the volume went through the device.
+        Number of parts in which the volume was processed.
     device_bytes : int
-        Most that was taken on the device at a time.
+        Most bytes taken on the device at one time.
     """
 
     values: NDArray[np.float32]
@@ -80,7 +80,7 @@ def prepare_reformat(device: Device, dtype: DTypeLike = np.int16, uneven: bool =
 
 @dataclass(frozen=True)
 class _Places:
-    """A sheet in the coordinates of a volume, in fixed point: see the kernel's contract."""
+    """A sheet in fixed-point coordinates of a volume: see the kernel's contract."""
 
     rows: NDArray[np.int64]
     slices: NDArray[np.int64]
@@ -93,7 +93,7 @@ def _to_fixed(places: Float64Array) -> NDArray[np.int64]:
 
 
 def _place_rows(volume: Volume, sheet: Sheet, samples: SlabSamples) -> _Places:
-    """Map the rows of a sheet to coordinates of the volume, and find the slices that they meet."""
+    """Convert the rows of a sheet to coordinates of the volume, and find the slices that they meet."""
     if volume.uneven:
         heights_at = volume.slice_origins()
         normal = slice_normal(volume.affine)
@@ -123,7 +123,7 @@ def _place_rows(volume: Volume, sheet: Sheet, samples: SlabSamples) -> _Places:
 
 
 class _Run:
-    """One reformation: all rows through one part of the volume after the other."""
+    """One reformation: all rows through one part of the volume after another."""
 
     def __init__(self, resident: DeviceVolume, sheet: Sheet, samples: SlabSamples, combine: str, stopwatch: Stopwatch):
         self.resident, self.sheet, self.samples = resident, sheet, samples
@@ -134,7 +134,7 @@ class _Run:
         self.takes_whole = False
 
     def needs(self, slices: int) -> dict[str, int]:
-        """Bytes of every buffer, with so many slices of the volume on the device."""
+        """Return the bytes of every buffer, with `slices` slices of the volume on the device."""
         pixels = self.sheet.width * self.sheet.height
         return {
             "volume": slices * self.resident.slice_bytes,
@@ -144,7 +144,7 @@ class _Run:
         }
 
     def plan(self) -> int:
-        """Slices that go to the device at a time; all of the volume where that pays.
+        """Return the number of slices on the device at a time; all of the volume if that is worth it.
 
         Raises
         ------
@@ -162,7 +162,7 @@ class _Run:
         return slices
 
     def all_slabs(self, slices: int, progress: Progress | None) -> Reformation:
-        """Take the samples of `slices` slices at a time; each slab but the last repeats its upper one."""
+        """Take the samples of `slices` slices at a time; each slab repeats the last slice of the one before."""
         places, shape = self.places, (self.sheet.height, self.sheet.width)
         takes_whole = self.takes_whole and slices == self.volume.shape_ijk[2]
         with self.stopwatch.timed("build"):
@@ -200,7 +200,7 @@ class _Run:
         return Reformation(values, self.slices, count, sum(self.needs(held).values()))
 
     def _launch_rows(self, program: Program, **part: Any) -> None:
-        """Launch the kernel for all rows; `part` is what it takes besides rows and sizes."""
+        """Launch the kernel for all rows; `part` has its arguments other than rows and sizes."""
         height, width = self.sheet.height, self.sheet.width
         ni, nj, nk = self.volume.shape_ijk
         rows = max(1, SAMPLES_A_LAUNCH // (width * (self.samples.intervals + 1)))
@@ -223,11 +223,11 @@ def sample_sheet(
     progress: Progress | None = None,
     warnings: list[str] | None = None,
 ) -> Reformation:
-    """Values of all pixels of a sheet: the trilinear field, combined through a slab.
+    """Return the values of all pixels of a sheet: the trilinear field, combined through a thick slice.
 
-    A volume that is on the device already is read there.  Else only the slices that the sheet meets are uploaded;
-    where they do not fit, some at a time.  Single samples, `max` and `min` are then the same bit for bit, means to the
-    rounding of their sums.
+    A volume that is already on the device is read there.  Else only the slices that the sheet meets are uploaded, some
+    at a time if they do not fit.  Single samples, `max` and `min` are then equal bit for bit, means up to the rounding
+    of their sums.
 
     Parameters
     ----------
@@ -235,17 +235,17 @@ def sample_sheet(
     sheet : Sheet
     samples : SlabSamples
     combine : {"mean", "max", "min"}
-        Of the samples of a pixel that lie within the volume.
+        How the samples of a pixel within the volume are combined.
     stopwatch : Stopwatch, optional
     progress : callable, optional
         Called as ``progress("slabs", slices done, all slices)``.
     warnings : list of str, optional
-        Gets a line for each time that the device had no room for what was planned.
+        Gets a line each time that the device had no room for the planned slabs.
 
     Raises
     ------
     UsageError
-        `combine` is none of the three, or the sheet lies absurdly far away.
+        `combine` is unknown, or the sheet is implausibly far away.
     DeviceError
         Two slices and the picture do not fit the device, or it fails.
     """

@@ -1,1 +1,1 @@
-"""What of a volume stays on a device: voxels, slabs, bricks, tables of slices."""
+"""Resident data of a volume on a device: voxels, slabs, bricks, tables of slices."""

@@ -1,4 +1,4 @@
-"""Ranges of the bricks of a volume: measured once, they spare every later pass the bricks that it need not look at."""
+"""Ranges of the bricks of a volume: measured once, they let later passes skip most bricks."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ BRICK = kernel_constant("include/bricks.h", "BRICK")
 
 @dataclass(frozen=True)
 class BrickRanges:
-    """Lowest and highest value of every brick, on the device.
+    """The lowest and highest value of every brick, on the device.
 
     Attributes
     ----------
@@ -35,7 +35,7 @@ class BrickRanges:
 
 @dataclass(frozen=True)
 class BrickStates:
-    """How words of 32 samples compare with an iso value, for all rows of voxels of a row of bricks.
+    """The result of comparing words of 32 samples with an iso value, one row of words for each row of bricks.
 
     Attributes
     ----------
@@ -48,7 +48,7 @@ class BrickStates:
 
 
 def brick_bytes(shape_ijk: tuple[int, int, int], dtype: np.dtype[Any]) -> int:
-    """Bytes on the device of the ranges of a volume's bricks."""
+    """Return the bytes of the ranges of a volume's bricks on the device."""
     return 2 * math.prod(-(-n // BRICK) for n in shape_ijk) * int(dtype.itemsize)
 
 
@@ -104,7 +104,7 @@ def compare_bricks(
     *,
     stopwatch: Stopwatch | None = None,
 ) -> BrickStates:
-    """Say of each word of 32 samples what its bricks say: all outside (0), all inside (1) or mixed (2).
+    """Classify each word of 32 samples by its bricks: all outside (0), all inside (1) or mixed (2).
 
     Parameters
     ----------
@@ -113,10 +113,10 @@ def compare_bricks(
     level : scalar of the voxels' type
         Lowest inside value.
     ni : int
-        Voxels a row.
+        Number of voxels in a row.
     border : int
-        Word w begins at voxel ``32 * w - border``, and there are samples up to ``ni - 1 + border``.  Those beyond the
-        volume do not count.
+        Word w begins at voxel ``32 * w - border``, and there are samples up to ``ni - 1 + border``. Samples beyond the
+        volume are ignored.
     stopwatch : Stopwatch, optional
 
     Returns

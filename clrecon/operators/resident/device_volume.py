@@ -1,4 +1,4 @@
-"""`DeviceVolume`: a volume on a device, shared by the surfaces, pictures and slices that are made of it."""
+"""`DeviceVolume`: a volume on a device, shared by all surfaces, pictures and slices made of it."""
 
 from __future__ import annotations
 
@@ -46,18 +46,19 @@ class _Kept:
 class DeviceVolume:
     """A volume on a device: uploaded once, and used by every operator that it is given to.
 
-    The voxels go to the device when they are first needed.  Where they do not fit as a whole, beside what an operator
-    needs, that operator takes them in slabs.  The results are the same.  Use it as a context manager, or `close` it.
+    The voxels are uploaded when they are first needed.  If they do not fit as a whole beside an operator's other
+    buffers, that operator processes them in slabs.  The results are the same.  Use it as a context manager, or `close`
+    it.
 
     Parameters
     ----------
     volume : Volume
-        Its voxels must not change as long as this is open.
+        Its voxels must not change while this object is open.
     device : Device, str or int, optional
         See `clrecon.device`; None is the best of the machine.
     memory : int, optional
-        Bytes that may be taken on the device, by the volume and by all that is made of it at a time; None is all that
-        the device has.
+        Most bytes taken on the device at a time, by the volume and everything made of it; None: all memory of the
+        device.
 
     Attributes
     ----------
@@ -65,18 +66,18 @@ class DeviceVolume:
     device : Device
     memory : int or None
     uploaded_bytes : int
-        Voxels that went to the device so far, in bytes.  CPU devices read the computer's own memory: nothing is copied.
+        Bytes of voxels uploaded so far.  CPU devices read the computer's own memory: nothing is copied.
     values : ValueRange
-        Of the voxels.
+        Range of the voxels' values.
     most_slices : dict of str to int
-        Slices a slab that went through where more did not, by what they were for.
+        For each purpose, the number of slices in a slab that was processed after a larger slab had failed.
 
     Raises
     ------
     UsageError
-        `volume` is no Volume, or `memory` no number of bytes.
+        `volume` is not a Volume, or `memory` is not a number of bytes.
     DeviceError
-        There is no such device.
+        The device does not exist.
 
     Examples
     --------
@@ -112,11 +113,11 @@ class DeviceVolume:
         self.close()
 
     def close(self) -> None:
-        """Free all that is on the device.  What is asked for later is uploaded again."""
+        """Free everything on the device.  Objects that are asked for later are uploaded again."""
         self.release()
         self._taken = None
 
-    # What is on the device
+    # Data on the device
 
     @property
     def dtype(self) -> np.dtype[Any]:
@@ -125,12 +126,12 @@ class DeviceVolume:
 
     @property
     def is_held(self) -> bool:
-        """All voxels are on the device."""
+        """True where all voxels are on the device."""
         self._check_context()
         return self._whole_d is not None
 
     def whole(self, stopwatch: Stopwatch) -> Any:
-        """All voxels on the device, (nk, nj, ni); they stay there."""
+        """Return all voxels on the device, (nk, nj, ni); they stay there."""
         with self._lock:
             self._check_context()
             if self._whole_d is None:
@@ -138,7 +139,7 @@ class DeviceVolume:
             return self._whole_d
 
     def part(self, first: int, end: int, stopwatch: Stopwatch) -> Any:
-        """Slices `first` to ``end - 1`` on the device, in place of all else that is there."""
+        """Return slices `first` to ``end - 1`` on the device, replacing all other voxels there."""
         with self._lock:
             self._whole_d = None
             self._kept = {key: kept for key, kept in self._kept.items() if not kept.nbytes}
@@ -147,7 +148,7 @@ class DeviceVolume:
         return part_d
 
     def pays_whole(self, slices: int) -> bool:
-        """Whether to take all voxels where `slices` of them are needed: with those of before it would be as many."""
+        """True if all voxels should be uploaded for `slices` slices: with earlier uploads these are as many."""
         return self.is_held or self._part_bytes + slices * self.slice_bytes >= self.volume.voxels.nbytes
 
     @property
@@ -157,27 +158,29 @@ class DeviceVolume:
         return ni * nj * int(self.dtype.itemsize)
 
     def upload(self, voxels: NDArray[Any], stopwatch: Stopwatch) -> Any:
-        """Voxels of this volume, in whatever order and number, on the device."""
+        """Upload voxels of this volume, in any order and number."""
         with stopwatch.timed("upload"):
             voxels_d = upload(self.device, voxels)
         self.uploaded_bytes += voxels.nbytes
         return voxels_d
 
     def keep(self, what: str, of: Hashable, nbytes: int, make: Callable[[], Made]) -> Made:
-        """What an operator has made and will want again, on the device: one thing of each kind.
+        """Return an object that an operator has made and will need again, on the device; one object of each kind is
+        kept.
 
-        It is dropped when it is asked for of something else, with the voxels, or where another operator needs the room.
+        It is dropped when an object of the same kind for other inputs is asked for, when the voxels are dropped, or
+        when another operator needs the room.
 
         Parameters
         ----------
         what : str
-            The kind, for messages about memory.
+            Kind of the object, for messages about memory.
         of : hashable
-            What it follows from, beside the volume.
+            The inputs other than the volume.
         nbytes : int
-            Bytes that it takes on the device; 0 for small tables, which stay when the voxels go.
+            Its bytes on the device; 0 for small tables, which stay when the voxels are dropped.
         make : callable
-            Makes it.
+            Function that makes the object.
         """
         with self._lock:
             self._check_context()
@@ -189,13 +192,13 @@ class DeviceVolume:
             return made
 
     def kept_bytes(self, what: str) -> int:
-        """Bytes on the device of what is kept of a kind; 0 where nothing is."""
+        """Bytes on the device of the kept object of a kind; 0 without one."""
         kept = self._kept.get(what)
         return 0 if kept is None else kept.nbytes
 
     @property
     def stack(self) -> StackTable:
-        """Where the slices lie, on the device."""
+        """Table of the places of the slices, on the device."""
         return self.keep("places of the slices", None, 0, lambda: StackTable.of(self.volume, self.device))
 
     def program(self, name: str, **variants: str) -> Program:
@@ -204,13 +207,13 @@ class DeviceVolume:
         return load_program(self.device, name, {**ray_variants(self.device, self.dtype), **own, **variants})
 
     def release(self) -> None:
-        """Free all that is on the device."""
+        """Free everything on the device."""
         with self._lock:
             self._whole_d = None
             self._kept = {}
 
     def _check_context(self) -> None:
-        """Forget what was on a device that failed: it is lost."""
+        """Forget all data on a device that failed: they are lost."""
         context = self.device.context
         if self._context is not context:
             self.release()
@@ -219,7 +222,7 @@ class DeviceVolume:
     # Labels
 
     def bring(self, labels: LabelMap) -> ResampledLabels:
-        """A label map on the grid of the volume, see `resample_labels`; the last one is kept."""
+        """Return a label map on the grid of the volume, see `resample_labels`; the last one is kept."""
         with self._lock:
             if self._taken is None or self._taken[0] is not labels:
                 self._taken = labels, resample_labels(labels, self.volume)
@@ -229,7 +232,7 @@ class DeviceVolume:
 
     @property
     def limits(self) -> MemoryLimits:
-        """What may be taken on the device."""
+        """Limits of the memory on the device."""
         return memory_limits(self.device, self.memory)
 
     def plan(
@@ -241,20 +244,21 @@ class DeviceVolume:
         own: tuple[str, ...] = (),
         most: int | None = None,
     ) -> int:
-        """How many slices go through the device together: `total` where that fits, else as many as fit, or 0.
+        """Return the number of slices in a slab: `total` if all fit, else as many as fit, or 0.
 
         Parameters
         ----------
         what : str
-            What the slabs are for.  Where thinner ones had to be taken for it before, see `halve`, they are again.
+            Purpose of the slabs.  If thinner slabs were necessary for this purpose before, see `halve`, they are
+            planned again.
         total : int
             Slices of the volume, or of a grid of samples around it.
         needs : callable
-            Bytes of every buffer with so many slices, by what it is.
+            Function from a number of slices to the bytes of every buffer, by description.
         own : tuple of str
-            Kinds of what `needs` counts already; all else that is kept comes on top, and goes where it is in the way.
+            Kinds of kept objects that `needs` already counts; all others are added, and dropped if they are in the way.
         most : int, optional
-            Slices that kernels can take together.
+            Most slices that kernels can process together.
         """
         limits = self.limits
         most = min(total if most is None else most, self.most_slices.get(what, total))
@@ -284,25 +288,25 @@ class DeviceVolume:
         fewest: int = 1,
         warnings: list[str] | None = None,
     ) -> Made:
-        """Try with `slices` slices a slab, and with half as many for as long as the device has no room.
+        """Try with `slices` slices in a slab, then with half as many as long as the device has no room.
 
         Parameters
         ----------
         what : str
             As in `plan`.
         slices : int
-            As `plan` says.
+            Result of `plan`.
         attempt : callable
-            Called with the slices a slab.  All that it has on the device it makes itself: what was there is gone.
+            Called with the number of slices.  It must make all its buffers itself, because earlier ones are gone.
         fewest : int
-            Slices below which it is not tried again.
+            Fewest slices that are tried.
         warnings : list of str, optional
-            Gets a line for each time.
+            Gets a line for each halving.
 
         Raises
         ------
         DeviceMemoryError
-            Slabs of `fewest` slices do not go through either.
+            Slabs of `fewest` slices do not fit either.
         """
         is_last = False
         while True:
@@ -322,17 +326,18 @@ class DeviceVolume:
 def open_volume(
     volume: Volume | DeviceVolume, device: Device | str | int | None, memory: int | None, what: str
 ) -> Iterator[DeviceVolume]:
-    """A volume on its device: one that is open already, or a new one that is closed at the end.
+    """Yield a volume on its device: a given open one, or a new one that is closed at the end.
 
     Parameters
     ----------
     what : str
-        What is to be made of it, for messages, such as "a slice".
+        The purpose, for messages, for example "a slice".
 
     Raises
     ------
     UsageError
-        Neither a Volume nor a DeviceVolume, or a device or memory for a DeviceVolume, which has its own.
+        The volume is neither a Volume nor a DeviceVolume, or a device or memory is given for a DeviceVolume, which has
+        its own.
     """
     made, is_new = take_volume(volume, device, memory, what)
     try:
@@ -345,7 +350,7 @@ def open_volume(
 def take_volume(
     volume: Volume | DeviceVolume, device: Device | str | int | None, memory: int | None, what: str
 ) -> tuple[DeviceVolume, bool]:
-    """The same without an end, and whether it is new."""
+    """Return the same volume, which the caller closes, and whether it is new."""
     if isinstance(volume, DeviceVolume):
         if device is not None or memory is not None:
             raise UsageError("a DeviceVolume has its device and its memory already: leave out device and memory")

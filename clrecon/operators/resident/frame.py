@@ -13,12 +13,13 @@ from clrecon.geometry.affine import Float64Array
 __all__ = ["BOX_BORDER", "FieldFrame", "enclose", "volume_box"]
 
 BOX_BORDER = 0.5
-"""Voxels beyond the outermost voxel centres that belong to a volume."""
+"""Index steps beyond the outermost voxel centres that still belong to a volume."""
 
 
 @dataclass(frozen=True)
 class FieldFrame:
-    """LPS mm to field coordinates: indices, or for uneven slices indices in the plane of slice 0 and the height, mm.
+    """The map from LPS mm to field coordinates: indices; for uneven slices indices in the plane of slice 0, and height
+    in mm.
 
     Attributes
     ----------
@@ -32,7 +33,7 @@ class FieldFrame:
 
     @classmethod
     def of(cls, volume: Volume) -> FieldFrame:
-        """The frame of a volume."""
+        """Return the frame of a volume."""
         if volume.uneven:
             origin = volume.slice_origins()[0]
             normal = slice_normal(volume.affine)
@@ -44,22 +45,22 @@ class FieldFrame:
         return cls(inverse[:3, :3], inverse[:3, 3])
 
     def places(self, points: Float64Array) -> Float64Array:
-        """Field coordinates (n, 3) of LPS points (n, 3)."""
+        """Return the field coordinates (n, 3) of LPS points (n, 3)."""
         return points @ self.matrix.T + self.offset
 
     def planes(self, planes: Float64Array) -> Float64Array:
-        """Half-spaces (n, 4) ``normal . p >= offset`` of LPS in field coordinates."""
+        """Convert half-spaces (n, 4) of LPS, ``normal . p >= offset``, to field coordinates."""
         normals = planes[:, :3] @ np.linalg.inv(self.matrix)
         return np.column_stack([normals, planes[:, 3] + normals @ self.offset])
 
 
 def volume_box(volume: Volume) -> tuple[Float64Array, Float64Array]:
-    """Lowest and highest field coordinates of a volume, half a voxel beyond its outermost centres."""
+    """Return the lowest and highest field coordinates of a volume, half a voxel beyond its outermost centres."""
     return enclose(volume, np.full(3, -BOX_BORDER), np.array(volume.shape_ijk) - 1.0 + BOX_BORDER)
 
 
 def enclose(volume: Volume, low: Float64Array, high: Float64Array) -> tuple[Float64Array, Float64Array]:
-    """Lowest and highest field coordinates of what lies between two corners in voxel indices."""
+    """Return the lowest and highest field coordinates of the box between two corners in voxel indices."""
     if not volume.uneven:
         return low, high
     ks = {low[2], high[2], *range(math.ceil(low[2]), math.floor(high[2]) + 1)}

@@ -1,4 +1,4 @@
-"""The table of slices at places of their own for the kernels, see cl/rays/stack.h."""
+"""The table of uneven slices for kernels, see cl/rays/stack.h."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ from clrecon.operators.resident.frame import FieldFrame
 __all__ = ["StackTable"]
 
 MOST_LAYERS = 1 << 16
-"""Entries of the lookup by height; where gaps are smaller still, kernels go on from slice to slice."""
+"""Most entries of the lookup by height; with smaller gaps kernels continue from slice to slice."""
 
 
 @dataclass(frozen=True)
 class StackTable:
-    """Where each slice lies.
+    """The place of each slice.
 
     Attributes
     ----------
     arguments : dict of str to buffer or number
         The arguments of kernels with STACK_PARAMETERS; none for even volumes.
     slope : ndarray, shape (4,), float32
-        Largest number of index steps along i, j and k that a mm of height makes.
+        Largest number of index steps along i, j and k per mm of height.
     """
 
     arguments: dict[str, Any]
@@ -37,7 +37,7 @@ class StackTable:
 
     @classmethod
     def of(cls, volume: Volume, device: Device) -> StackTable:
-        """The table of a volume, on the device."""
+        """Make the table of a volume on the device."""
         slope = np.zeros(4, np.float32)
         if not volume.uneven:
             return cls({}, slope)
@@ -52,7 +52,7 @@ class StackTable:
         table[:, 1:, :3] = slice_normal_matrices(volume, border=0)
         count = int(min(np.ceil(heights[-1] / gaps.min()) + 1, MOST_LAYERS))
         per_mm = count / heights[-1]
-        # Half an entry lower: rounding in the kernel must not skip a slice.
+        # Half an entry lower, so that rounding in the kernel cannot skip a slice.
         starts = (np.arange(count) - 0.5) / per_mm
         layers = np.clip(np.searchsorted(heights, starts, side="right") - 1, 0, nk - 2).astype(np.int32)
         slope[:2] = np.abs(np.diff(places[:, :2], axis=0) / gaps[:, None]).max(axis=0)
@@ -67,9 +67,11 @@ class StackTable:
         return cls(arguments, slope)
 
     def index_steps(self, apart: Float64Array) -> Float64Array:
-        """Index steps (3,) that places `apart` (3,) in field coordinates, not negative, are apart at most."""
+        """Return the most index steps (3,) between places that differ by `apart` (3,) in field coordinates, not
+        negative.
+        """
         if not self.arguments:
             return apart
-        # What lies at another height lies aside as well.
+        # Places at another height are also shifted sideways.
         steps: Float64Array = np.array([apart[0], apart[1], 0.0]) + apart[2] * self.slope[:3]
         return steps

@@ -24,13 +24,13 @@ __all__ = ["SurfaceExtractor", "extract_isosurface", "extract_isosurfaces", "pre
 class SurfaceExtractor:
     """A volume on a device, from which surfaces are extracted at one iso value after the other.
 
-    The volume is uploaded once, where it fits the device as a whole; a larger one goes through slab by slab each time,
-    and gives the same mesh bit for bit.  Use it as a context manager, or `close` it.
+    The volume is uploaded once if it fits the device as a whole.  A larger one is processed slab by slab each time,
+    with the same mesh bit for bit.  Use it as a context manager, or `close` it.
 
     Parameters
     ----------
     volume : Volume or DeviceVolume
-        The voxels must not change as long as the extractor is open.  A `DeviceVolume` is used as it is.
+        The voxels must not change as long as the extractor is open.  A `DeviceVolume` is used directly.
     device : Device, str or int, optional
         See `clrecon.device`; None is the best of the machine.  A `DeviceVolume` has its own.
     memory : int, optional
@@ -40,9 +40,9 @@ class SurfaceExtractor:
     Raises
     ------
     UsageError
-        `volume` is no Volume, `memory` no number of bytes, or a row of the volume is too long.
+        `volume` is not a Volume, `memory` is not a number of bytes, or a row of the volume is too long.
     DeviceError
-        There is no such device.
+        The device does not exist.
     """
 
     def __init__(
@@ -67,13 +67,14 @@ class SurfaceExtractor:
             self._resident.close()
 
     def forecast(self, *, closed: bool = True, topology: str = "separated") -> dict[str, int]:
-        """What an extraction will take, before anything is computed.
+        """Estimate the memory of an extraction before anything is computed.
 
         Returns
         -------
         dict
             ``slabs``, ``slices_a_slab``; ``volume_bytes`` and ``scratch_bytes`` of the largest slab on the device, the
-            latter at most: it grows with the surface.  The mesh comes on top: 24 bytes a vertex, 12 a triangle.
+            latter is an upper bound, as it grows with the surface.  The mesh is added: 24 bytes for a vertex, 12 for a
+            triangle.
 
         Raises
         ------
@@ -139,26 +140,26 @@ def extract_isosurface(
 ) -> Mesh:
     """Extract the iso surface of a volume, as a closed manifold mesh in LPS mm.
 
-    Marching cubes with a derived, face-consistent case table and vertices shared between cells.  A voxel is
-    inside when its value is >= `iso_value`.  For integer voxels and an integer `iso_value` k the surface lies at
-    k - 0.5, between the integers, so no face is degenerate.  Vertices are mapped through the volume's affine,
-    shear included, once; they are right to one unit in the last place that float32 has for the volume's largest
-    coordinate (6e-5 mm at 1 m), but kept four such units off voxel centres.  From 4096 mm on they are computed
-    relative to the volume's centre and given as float64.
+    Marching cubes with a derived, face-consistent case table and vertices shared between cells.  A voxel is inside when
+    its value is >= `iso_value`. For integer voxels and an integer `iso_value` k the surface lies at k - 0.5, between
+    the integers, so no face is degenerate.  Vertices are mapped once through the volume's affine, shear included.  They
+    are exact to one unit in the last place of float32 at the volume's largest coordinate (6e-5 mm at 1 m), but stay
+    four of these units away from voxel centres.  From 4096 mm on they are computed relative to the volume's centre and
+    given as float64.
 
-    A volume of any size goes through: what does not fit the device is worked on slab by slab.  The mesh is the same
-    bit for bit.
+    A volume may have any size: if it does not fit the device, it is processed slab by slab.  The mesh is the same bit
+    for bit.
 
     Parameters
     ----------
     volume : Volume or DeviceVolume
-        Its voxels may be a memory-mapped file larger than the memory of the computer.  A `DeviceVolume` is used as it
-        is, and has its device and memory.
+        Its voxels may be a memory-mapped file larger than the memory of the computer.  A `DeviceVolume` is used
+        directly, with its own device and memory.
     iso_value : float or (float, float)
         HU; or the two ends of a range.  Inside of a range are the voxels from its lower to its upper end, both
-        included; the surface lies where the values cross the end that they cross: at 100 to 300 and integer voxels
-        at 99.5 and at 300.5, as those at the iso values 100 and 301 do.  What lies between two neighbouring voxels
-        below and above the range is no voxel of it, and has no surface.
+        included; the surface lies where the values cross the end that they cross: at 100 to 300 and integer voxels at
+        99.5 and at 300.5, as those at the iso values 100 and 301 do.  Between two neighbouring voxels, one below and
+        one above the range, there is no surface.
     device : Device, str or int, optional
         See `clrecon.device`; None is the best of the machine.
     closed : bool
@@ -166,13 +167,13 @@ def extract_isosurface(
         Beyond the border the field has the volume's lowest value, but not less than -1024 HU.
         False: the surface ends open at the outermost voxel centres.
     topology : {"separated", "trilinear"}
-        Where the corners of a cell do not say which of them are joined: "separated" keeps inside voxels apart that
-        only meet across a face; "trilinear" joins what the trilinear interpolation of the voxels joins, on faces
-        and inside cells, so that the surface has the components and tunnels of that field.  Few cells differ.
-        "trilinear" knows no range.
+        How corners are joined where the case of a cell leaves it open: "separated" keeps inside voxels apart that only
+        meet across a face; "trilinear" joins what the trilinear interpolation of the voxels joins, on faces and inside
+        cells, so that the surface has the components and tunnels of that field.  Few cells differ.  "trilinear" cannot
+        be used with a range.
     below : bool
-        Enclose what lies below the iso value: the same vertices and triangles, turned round.  Beyond the border the
-        field then lies as far above the level as it would lie below it otherwise, so that the surface is closed.
+        True: enclose the voxels below the iso value: the same vertices and triangles, turned round.  Beyond the border
+        the field then lies as far above the level as it would lie below it otherwise, so that the surface is closed.
     memory : int, optional
         Bytes that may be taken on the device, see `SurfaceExtractor`; None is all that it has.
     progress : callable, optional
@@ -218,7 +219,7 @@ def extract_isosurfaces(
     memory: int | None = None,
     progress: Progress | None = None,
 ) -> list[Mesh]:
-    """Extract the surfaces of a volume at several iso values or of several ranges; the volume is uploaded once.
+    """Extract surfaces of a volume at several iso values or of several ranges; the volume is uploaded once.
 
     Parameters
     ----------

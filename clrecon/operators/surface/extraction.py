@@ -1,4 +1,4 @@
-"""One extraction of an iso surface: from slab to slab of a volume on a device."""
+"""One extraction of an iso surface, slab by slab of a volume on a device."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def _refuse_device(device: Device, rule: IsoRule, runs: str) -> DeviceError:
 
 
 def voxel_level(device: Device, volume: Volume, rule: IsoRule) -> Any:
-    """The lowest inside value as a scalar of the voxels' own type."""
+    """Return the lowest inside value as a scalar of the voxels' type."""
     dtype = volume.voxels.dtype
     if dtype.kind == "f":
         return np.float32(rule.lowest_inside)
@@ -61,7 +61,7 @@ def voxel_level(device: Device, volume: Volume, rule: IsoRule) -> Any:
 
 
 def _voxel_levels(device: Device, volume: Volume, rule: IsoRule) -> tuple[Any, ...]:
-    """The same and, of a range, the highest inside value."""
+    """Return the same and, for a range, the highest inside value."""
     level, highest, dtype = voxel_level(device, volume, rule), rule.highest_inside, volume.voxels.dtype
     if highest is None:
         return (level,)
@@ -74,7 +74,7 @@ def _voxel_levels(device: Device, volume: Volume, rule: IsoRule) -> tuple[Any, .
 
 
 def _join(parts: list[Part]) -> Part:
-    """The parts of all slabs behind each other; each is freed as soon as it is copied."""
+    """Join the parts of all slabs; each part is freed as soon as it is copied."""
     if len(parts) == 1:
         return parts[0]
     joined: list[NDArray[Any]] = []
@@ -90,7 +90,7 @@ def _join(parts: list[Part]) -> Part:
 
 
 class Extraction:
-    """One extraction: from slab to slab, with fewer slices a slab when the device has no room for more."""
+    """One extraction, slab by slab, with fewer slices in a slab if the device has no room for more."""
 
     def __init__(self, resident: DeviceVolume, grid: SampleGrid, placement: Placement):
         self.resident = resident
@@ -106,7 +106,7 @@ class Extraction:
         self.warnings: list[str] = []
 
     def run(self, slices: int, progress: Progress | None) -> Part:
-        """Go through the grid, `slices` at a time or fewer."""
+        """Process the grid, `slices` at a time or fewer."""
         self.resident.halve(
             self.grid.kind, slices, lambda slices: self._go_on(slices, progress), warnings=self.warnings
         )
@@ -118,7 +118,7 @@ class Extraction:
             raise DeviceError(f"the mesh does not fit the memory of this computer: {error}") from error
 
     def _go_on(self, slices: int, progress: Progress | None) -> None:
-        """From the first slice that is not done to the last."""
+        """Process the slices that are not yet done."""
         gk = self.grid.shape[2]
         while self.first < gk:
             slab = Slab(self.grid, self.first, min(self.first + slices, gk))
@@ -152,10 +152,10 @@ class Extraction:
         return self.resident.part(*slab.voxel_slices, self.stopwatch)
 
     def _compare_bricks(self, slab: Slab, voxels_d: Any) -> BrickStates | None:
-        """How the bricks of a whole volume compare with the only level; None before it pays to measure them.
+        """Compare the bricks of a whole volume with the only level; None if measuring them is not worth it yet.
 
-        Measuring takes as long as the first pass over the volume, so the first use of a volume does without.  So do
-        ranges and what lies below a level: all voxels are read for them.
+        Measuring takes as long as the first pass over the volume, so the first surface of a volume is made without.  So
+        are surfaces of ranges and of values below a level: all voxels are read for them.
         """
         if not slab.is_whole or not self.was_held or slab.grid.rule.inside != "above":
             return None
@@ -170,7 +170,7 @@ class Extraction:
         return compare_bricks(self.device, ranges, self.levels[0], ni, border, stopwatch=stopwatch)
 
     def _check_output(self, slab: Slab, counted: Counted) -> None:
-        """Refuse a slab whose mesh does not fit beside the rest; note what the slab takes."""
+        """Refuse a slab whose mesh does not fit beside the other buffers; record the memory of the slab."""
         needs = slab.needs(counted.output())
         needs["active words"] = 4 * counted.active_words
         kept = self.resident.kept_bytes(BRICKS)
@@ -184,7 +184,7 @@ class Extraction:
             self.largest[what] = max(self.largest[what], size)
 
     def describe(self, vertices: int, triangles: int) -> dict[str, Any]:
-        """The report of a mesh: how it was made, free of patient data."""
+        """Return the report of a mesh: how it was made, without patient data."""
         rule = self.grid.rule
         return {
             **rule.as_report(),
@@ -210,9 +210,9 @@ def prepare_isosurface(
     uneven: bool = False,
     inside: str = "above",
 ) -> Program:
-    """Build the kernels for volumes of `dtype`, so that a later `extract_isosurface` with `topology` need not wait.
+    """Build the kernels for volumes of `dtype` now, so that a later `extract_isosurface` with `topology` does not wait.
 
-    With `uneven` those for volumes whose slices no affine places; `inside` as `IsoRule.inside`.
+    With `uneven`, for volumes with uneven slices; `inside` as in `IsoRule.inside`.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""One extraction of surfaces of labels: what is inside of which label, and the mesh of each.
+"""One extraction of surfaces of labels: which samples are inside of which label, and the mesh of each label.
 
 The host side of cl/surface/labels.cl; counting and writing are those of cl/surface/marching_cubes.cl.
 """
@@ -41,12 +41,12 @@ from clrecon.operators.surface.slabs import SampleGrid
 __all__ = ["HeldSlices", "LabelExtraction", "prepare_labels"]
 
 SPARE_SLICES = 3
-"""Beyond the label's box: the far end of a crossed edge, what its gradient needs, and the last slices of the mask."""
+"""Slices needed beyond a label's box: the far end of a crossed edge, its gradient, and the last slices of the mask."""
 
 
 @dataclass(frozen=True)
 class HeldSlices:
-    """The slices of a volume that the device holds, and what is inside of which label in them."""
+    """The slices of a volume on the device, with the label that each sample is inside of."""
 
     first: int
     end: int
@@ -70,7 +70,7 @@ def prepare_labels(
 
 
 class LabelExtraction:
-    """One extraction: what is common to its labels."""
+    """One extraction: the data that its labels share."""
 
     def __init__(self, resident: DeviceVolume, taken: ResampledLabels, rule: IsoRule, growth: Growth, solid: bool):
         volume, device = resident.volume, resident.device
@@ -96,15 +96,15 @@ class LabelExtraction:
             return prepare_labels(self.device, self.resident.dtype, self.labels.dtype, self.volume.uneven)
 
     def slices_for(self, boxes: dict[int, Box]) -> tuple[int, int]:
-        """First and end of the slices of the volume that these labels need; all where they are on the device."""
+        """Return first and end of the slices of the volume that these labels need; all if they are on the device."""
         if self.resident.is_held and self._fits_whole():
             return 0, self.volume.shape_ijk[2]
-        spare = SPARE_SLICES + self.growth.reach[2]  # labels that are not asked for grow too
+        spare = SPARE_SLICES + self.growth.reach[2]  # labels that were not asked for grow too
         first = max(0, min(box[0].start for box in boxes.values()) - spare)
         return first, min(self.volume.shape_ijk[2], max(box[0].stop for box in boxes.values()) + spare)
 
     def needs(self, first: int, end: int) -> dict[str, int]:
-        """Bytes on the device while what is inside is found in these slices."""
+        """Return the bytes on the device while inside samples are found in these slices."""
         samples = self.volume.voxels[first:end].size
         size = samples * self.labels.itemsize
         return {"volume": samples * self.volume.voxels.itemsize, "labels": size, "inside": size}
@@ -114,12 +114,12 @@ class LabelExtraction:
         return not describe_shortage(self.resident.limits, needs | {"mesh": sum(needs.values()) // 2})
 
     def group(self, boxes: dict[int, Box]) -> list[dict[int, Box]]:
-        """All labels at once where their slices fit the device, else one by one: the meshes are the same."""
+        """Group all labels together if their slices fit the device, else one by one: the meshes are the same."""
         scratch = max(sum(self.window(box, (0, 0)).scratch().values()) for box in boxes.values())
         return group_boxes(boxes, self.needs(*self.slices_for(boxes)), scratch, self.resident.limits)
 
     def find_inside(self, boxes: dict[int, Box]) -> HeldSlices:
-        """Upload the slices that the labels need, and find what is inside of which label."""
+        """Upload the slices that the labels need, and find which samples are inside of which label."""
         device, stopwatch, resident = self.device, self.stopwatch, self.resident
         first, end = self.slices_for(boxes)
         check_budget(device, self.needs(first, end), resident.memory)
@@ -143,7 +143,7 @@ class LabelExtraction:
         return HeldSlices(first, end, voxels_d, inside_d)
 
     def _fill(self, boxes: dict[int, Box], first: int, end: int, inside_d: Any) -> Any:
-        """What is inside with the labels made solid, on the device again."""
+        """Return the inside samples with the labels made solid, on the device again."""
         inside = np.zeros(self.labels.shape, dtype=self.labels.dtype)
         part = inside[first:end]
         with self.stopwatch.timed("download"):
@@ -154,11 +154,11 @@ class LabelExtraction:
             return upload(self.device, part)
 
     def window(self, box: Box, held: tuple[int, int]) -> Window:
-        """The slices of the sample grid around a label's box."""
+        """Return the slices of the sample grid around a label's box."""
         return Window(self.grid, box[0].start, box[0].stop + 2 * self.rule.border, held)
 
     def extract_one(self, held: HeldSlices, number: int, box: Box) -> Part | None:
-        """Positions, normals and triangles of one label, None where nothing is inside of it."""
+        """Return positions, normals and triangles of one label, None if no sample is inside of it."""
         device, stopwatch, memory = self.device, self.stopwatch, self.resident.memory
         own, surface = self.programs()
         window = self.window(box, (held.first, held.end))
@@ -193,7 +193,7 @@ class LabelExtraction:
         return part
 
     def describe(self) -> dict[str, Any]:
-        """What the reports of all labels have in common."""
+        """Return the report entries that all labels share."""
         rule = self.rule
         return {
             **rule.as_report(),
@@ -221,7 +221,7 @@ class LabelExtraction:
 
 
 def _warn_of_uneven_growth(volume: Volume, growth: Growth) -> list[str]:
-    """Offsets to the samples around are one table for all slices, so growth takes the slices as evenly spaced."""
+    """Warn of growth in uneven slices: the offsets to neighbours are one table, made for evenly spaced slices."""
     if not volume.uneven or not len(growth.offsets):
         return []
     steps = np.linalg.norm(np.diff(volume.slice_origins(), axis=0), axis=1)

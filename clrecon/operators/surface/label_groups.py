@@ -1,4 +1,4 @@
-"""Labels through a device: all at once where there is room, else one by one."""
+"""Groups of labels on a device: all at once if there is room, else one by one."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ Made = TypeVar("Made")
 
 @dataclass(frozen=True)
 class Window(Slab):
-    """The slices of the sample grid that hold one label and a layer around it, of what the device holds."""
+    """The slices of the sample grid that hold one label and a layer around it, among those on the device."""
 
     held: tuple[int, int] = (0, 0)
 
     @property
     def voxel_slices(self) -> tuple[int, int]:
-        """First and end of the slices of the volume that the device holds."""
+        """First and end of the slices of the volume on the device."""
         return self.held
 
 
 def choose_numbers(labels: LabelMap, numbers: Sequence[int | str] | None) -> tuple[int, ...]:
-    """The numbers of the labels that are asked for, each once; all that are there where none are named."""
+    """Return the numbers of the labels that are asked for, each once; all that occur if none are named."""
     if numbers is None:
         return labels.numbers
     chosen = tuple(dict.fromkeys(labels.find(number) for number in numbers))
@@ -41,7 +41,7 @@ def choose_numbers(labels: LabelMap, numbers: Sequence[int | str] | None) -> tup
 
 
 def group_boxes(boxes: dict[int, Box], needs: dict[str, int], scratch: int, room: MemoryLimits) -> list[dict[int, Box]]:
-    """All labels at once where `needs`, and `scratch` as far as one buffer holds it, fit; else one by one."""
+    """Group all labels together if `needs` fits, and `scratch` fits one buffer; else one by one."""
     if not describe_shortage(room, {**needs, "scratch": min(scratch, room.buffer_bytes)}):
         return [boxes]
     return [{number: box} for number, box in boxes.items()]
@@ -53,21 +53,21 @@ def each_label(
     extract: Callable[[Held, int, Box], Made],
     warnings: list[str],
 ) -> Iterator[tuple[int, Made]]:
-    """Labels and what is made of them, in their order.
+    """Yield labels with their results, in order.
 
-    Where the device has no room for a group, those of its labels that are not done go through one by one; a single
-    label is tried once more, with nothing else on the device.
+    If the device has no room for a group, its remaining labels are processed one by one; a single label is tried once
+    more, with nothing else on the device.
 
     Parameters
     ----------
     groups : list of dict of int to Box
-        Labels that go through together.
+        Labels that are processed together.
     hold : callable
-        Brings to the device what a group has in common.
+        Uploads the data that a group shares.
     extract : callable
-        Makes what is wanted of one label.
+        Makes the result of one label.
     warnings : list of str
-        Gets a line for each time that the device had no room.
+        Gets a line each time that the device had no room.
     """
     waiting, retried = list(groups), set[int]()
     while waiting:

@@ -1,4 +1,4 @@
-"""Extract labels' own surfaces: the mask says what is inside, its smoothed occupancy places the vertices."""
+"""Surfaces of label masks: the mask tells which samples are inside, its smoothed occupancy places the vertices."""
 
 from __future__ import annotations
 
@@ -35,14 +35,14 @@ def extract_label_masks(
     memory: int | None = None,
     progress: Progress | None = None,
 ) -> dict[int, Mesh]:
-    """Extract each label's own surface: that of its mask, without its steps and with its volume.
+    """Extract each label's own surface: that of its mask without the steps, with the volume of its voxels.
 
-    Every voxel of the label is inside of its mesh and no other voxel is, so nothing is lost and nothing joined: the
-    vertices move along the edges between the centres of neighbours that differ, and stay within half a voxel of their
-    common face.  Where on an edge they lie says the occupancy, the mask smoothed by two rounds of [1 2 1] / 4 along
-    each axis: at the level that gives the mesh the volume of the label's voxels; between two labels where both lead by
-    as much, which both take, bit for bit.  Where the map ends the mesh ends flat, at the faces of its voxels.  HU play
-    no part: bones, organs and air are all the same.
+    Every voxel of the label is inside of its mesh, and no other voxel is, so nothing is lost and nothing joined.
+    Vertices lie on the edges between the centres of differing neighbours, within half a voxel of their common face.
+    Their place on an edge comes from the occupancy: the mask smoothed by two rounds of [1 2 1] / 4 along each axis.  It
+    is where the occupancy crosses the level that gives the mesh the volume of the label's voxels; between two labels it
+    is where the leads of both are equal, and both meshes have the same vertices, bit for bit.  At the ends of the map
+    the mesh ends flat, at the faces of the voxels.  HU are not used, so bones, organs and air are all possible.
 
     Parameters
     ----------
@@ -51,12 +51,12 @@ def extract_label_masks(
     device : Device, str or int, optional
         See `clrecon.device`; None is the best of the machine.
     numbers : sequence of int or str, optional
-        Labels to extract, as `LabelMap.find` takes them.  None: all that are there.
+        Labels to extract, as `LabelMap.find` takes them.  None: all that occur.
     closed : bool
         Close the surface where it meets the border of the map.
     memory : int, optional
-        Bytes that may be taken on the device; None is all that it has.  Where the slices of all labels do not fit
-        together, the labels go through one by one; the meshes are the same.
+        Bytes that may be taken on the device; None is all that it has.  If the slices of all labels do not fit
+        together, the labels are processed one by one; the meshes are the same.
     progress : callable, optional
         Called as ``progress("labels", done, total)``.
 
@@ -70,7 +70,7 @@ def extract_label_masks(
     Raises
     ------
     UsageError
-        Not a LabelMap, an unknown label, or rows of the map are too long.
+        `labels` is not a LabelMap, a label is unknown, or rows of the map are too long.
     RefusedInputError
         The label map is empty.
     DeviceError
@@ -109,5 +109,5 @@ def _make_meshes(run: MaskExtraction, chosen: Sequence[int], progress: Progress 
         own = {"label": number, "label_name": labels.name(number), "label_ml": label_ml(labels, number)}
         report = {**run.describe(), **own, "mask_level": level / FULL}
         meshes[number] = Mesh(run.placement.to_lps(positions), triangles, normals, report)
-        run.stopwatch = Stopwatch()  # what is common to all labels counts for the first
+        run.stopwatch = Stopwatch()  # the time of common work counts for the first label
     return meshes

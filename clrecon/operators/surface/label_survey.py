@@ -1,6 +1,6 @@
-"""Survey a label map: where each label lies, and how many of its voxels' faces it shares with others.
+"""Survey of a label map: the box of each label, and the number of faces that its voxels share with other labels.
 
-The host side of cl/surface/label_survey.cl; without room on the device for the whole map, numpy does it here.
+The host side of cl/surface/label_survey.cl; if the device has no room for the whole map, numpy computes it.
 """
 
 from __future__ import annotations
@@ -46,19 +46,19 @@ def prepare_survey(device: Device, label_dtype: DTypeLike = np.uint8) -> Program
 def survey_labels(
     labels: LabelMap, device: Device, memory: int | None, stopwatch: Stopwatch
 ) -> tuple[dict[int, Box], NDArray[np.integer[Any]]]:
-    """The box (k, j, i) of each label and the samples around it, and the table of `count_faces`.
+    """Return the box (k, j, i) of each label and the samples around it, and the table of `count_faces`.
 
     Parameters
     ----------
     labels : LabelMap
-        With one label at least.
+        Label map with at least one label.
     memory : int, optional
         Bytes that may be taken on the device; None is all that it has.
     """
     try:
         surveyed = _survey(labels, device, memory, stopwatch)
     except DeviceMemoryError:
-        surveyed = None  # what the device had no room for is done here
+        surveyed = None  # without room on the device, numpy computes it
     if surveyed is not None:
         return surveyed
     voxels, size = labels.voxels, labels.numbers[-1] + 1
@@ -70,7 +70,7 @@ def survey_labels(
 def _survey(
     labels: LabelMap, device: Device, memory: int | None, stopwatch: Stopwatch
 ) -> tuple[dict[int, Box], NDArray[np.integer[Any]]] | None:
-    """The same by the device; None where it has no room."""
+    """Compute the same on the device; None if it has no room."""
     voxels, size = labels.voxels, labels.numbers[-1] + 1
     boxes, faces = np.empty((size, 6), np.int32), np.zeros((size, 2), np.uint32)
     touch = len(labels.numbers) > 1
@@ -93,7 +93,7 @@ def _survey(
 
 
 def _widen(table: NDArray[np.int32], numbers: Sequence[int], shape_ijk: tuple[int, int, int]) -> dict[int, Box]:
-    """The boxes of a table of lowest and highest i, j, k, one sample wider each way within the map."""
+    """Widen the boxes of a table of lowest and highest i, j, k by one sample each way, within the map."""
     boxes: dict[int, Box] = {}
     for number in numbers:
         low, high = np.maximum(table[number, :3] - 1, 0), np.minimum(table[number, 3:] + 2, shape_ijk)

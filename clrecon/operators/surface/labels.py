@@ -1,4 +1,4 @@
-"""Extract the surfaces of labels: the label picks the cells, HU place the vertices."""
+"""Iso surfaces of labels: the label selects the cells, HU place the vertices."""
 
 from __future__ import annotations
 
@@ -55,18 +55,18 @@ def extract_labels(
     memory: int | None = None,
     progress: Progress | None = None,
 ) -> dict[int, Mesh]:
-    """Extract the iso surface of a volume label by label: the label picks the cells, HU place the vertices.
+    """Extract the iso surface of a volume label by label: the label selects the cells, HU place the vertices.
 
-    A voxel is inside of a label when it is dense (`iso_value` or more) and the label owns it: by the map, or, without
-    a label there, as the nearest one within the growth.  Between a dense voxel of the label and one that is neither
-    dense nor of any label the vertex is that of `extract_isosurface`, bit for bit.  Elsewhere (the border of two
-    labels, dense voxels beyond the growth) it lies half way.  Every mesh is closed and manifold; two labels share the
-    vertices of their border, bit for bit.
+    A voxel is inside of a label when it is dense (`iso_value` or more) and belongs to the label: by the map, or, if it
+    has no label, because the label is the nearest one within the growth.  Between a dense voxel of the label and one
+    that is neither dense nor labelled, the vertex is that of `extract_isosurface`, bit for bit.  Elsewhere (the border
+    of two labels, dense voxels beyond the growth) it lies half way.  Every mesh is closed and manifold; two labels
+    share the vertices of their border, bit for bit.
 
     Parameters
     ----------
     volume : Volume or DeviceVolume
-        A `DeviceVolume` is used as it is, and has its device and memory.
+        A `DeviceVolume` is used directly, with its own device and memory.
     labels : LabelMap
         On any grid, see `clrecon.labels.resample_labels`.
     iso_value : float
@@ -76,14 +76,14 @@ def extract_labels(
     numbers : sequence of int or str, optional
         Labels to extract, as `LabelMap.find` takes them; each must have a surface.  None: all that have one.
     grow_mm : float, optional
-        None is one voxel each way, the 26 neighbours.
+        Distance of growth; None is one voxel each way, the 26 neighbours.
     closed : bool
         As `extract_isosurface`.
     solid : bool
-        Fill what is less dense within a label, see `clrecon.labels.solid`.
+        True: fill less dense parts within a label, see `clrecon.labels.solid`.
     memory : int, optional
-        Bytes that may be taken on the device; None is all that it has.  Where the slices of all labels do not fit
-        together, the labels go through one by one; the meshes are the same.
+        Bytes that may be taken on the device; None is all that it has.  If the slices of all labels do not fit
+        together, the labels are processed one by one; the meshes are the same.
     progress : callable, optional
         Called as ``progress("labels", done, total)``.
 
@@ -100,7 +100,7 @@ def extract_labels(
     NoSurfaceError
         A label that was asked for, or every label, has no dense voxel; the message gives the range of its HU.
     UsageError
-        Not a Volume and a LabelMap, an unknown label, or as `extract_isosurface`.
+        The arguments are not a Volume and a LabelMap, a label is unknown, or as `extract_isosurface`.
     RefusedInputError
         The labels do not lie on the volume.
     DeviceError
@@ -124,7 +124,7 @@ def _make_meshes(
     numbers: Sequence[int | str] | None,
     progress: Progress | None,
 ) -> dict[int, Mesh]:
-    """The meshes of labels that have one; a label that was named must."""
+    """Make the meshes of labels that have one; a label that was named must have one."""
     chosen = choose_numbers(labels, numbers)
     boxes = find_boxes(taken.voxels, chosen, run.growth.reach)
     refuse = None if numbers is None else partial(_refuse_label, run.volume, taken, labels, run.rule)
@@ -144,7 +144,9 @@ def _extract_each(
     refuse: Callable[[int], NoSurfaceError] | None,
     progress: Progress | None,
 ) -> Iterator[tuple[int, Part]]:
-    """Labels and their surfaces, as many at once as the device has room for; what has none is left out, or refused."""
+    """Yield labels with their surfaces, as many at once as fit the device; labels without surface are left out or
+    refused.
+    """
     groups = run.group(boxes) if boxes else []
     run.groups = len(groups)
     done = 0
@@ -167,12 +169,12 @@ def _as_mesh(run: LabelExtraction, taken: ResampledLabels, report: dict[str, Any
     report["warnings"] += _warn(taken, report)
     positions, normals, triangles = part
     mesh = Mesh(run.placement.to_lps(positions), triangles, normals, report)
-    run.stopwatch = Stopwatch()  # what is common to all labels counts for the first
+    run.stopwatch = Stopwatch()  # the time of common work counts for the first label
     return mesh
 
 
 def _describe_label(volume: Volume, labels: LabelMap, taken: ResampledLabels, number: int, box: Box) -> dict[str, Any]:
-    """What is known of a label before its surface is there."""
+    """Describe a label before its surface is known."""
     return {
         "label": number,
         "label_name": labels.name(number),

@@ -1,4 +1,4 @@
-"""The passes of cl/surface/marching_cubes.cl on one slab of a volume."""
+"""Marching cubes: the passes of cl/surface/marching_cubes.cl on one slab of a volume."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ __all__ = [
 ]
 
 LONGEST_ROW = 13_000
-"""Samples a row: places in a row are 16-bit numbers, and a cell has at most 5 triangles."""
+"""Most samples in a row: indices in a row have 16 bits, and a cell has up to 5 triangles."""
 
 
 def check_row(ni: int) -> None:
@@ -59,7 +59,7 @@ def check_row(ni: int) -> None:
 
 @dataclass(frozen=True)
 class Classified:
-    """What `classify` leaves on the device of one slab."""
+    """The results of `classify` for one slab, on the device."""
 
     mask_d: Any
     row_extents_d: Any
@@ -67,9 +67,9 @@ class Classified:
 
 @dataclass(frozen=True)
 class Counted:
-    """What `count` leaves on the device of one slab, and the totals of the slab's own rows.
+    """The results of `count` for one slab, on the device, and the totals of the slab's own rows.
 
-    `cells` is there where the topology is that of the trilinear field.
+    `cells` exists if the topology is that of the trilinear field.
     """
 
     row_offsets_d: Any
@@ -95,10 +95,10 @@ def prepare_marching_cubes(
     *,
     masks: bool = False,
 ) -> Program:
-    """Build the kernels for volumes of `dtype`; with `labels`, their type, those whose emit_vertices takes labels.
+    """Build the kernels for volumes of `dtype`; with `labels` (their type), those whose emit_vertices takes labels.
 
-    With `uneven` those for volumes whose slices no affine places; `inside` as `IsoRule.inside`; with `masks` those for
-    labels' own surfaces, whose volumes are occupancies.
+    With `uneven`, for volumes with uneven slices; `inside` as in `IsoRule.inside`; with `masks`, for surfaces of label
+    masks, whose volumes are occupancies.
 
     Raises
     ------
@@ -125,14 +125,14 @@ def _load_classify(device: Device, dtype: DTypeLike, inside: str = "above") -> P
 
 
 def _pad4(rows: NDArray[np.float64]) -> NDArray[np.float32]:
-    """Rows of three as rows of four float32, for float4."""
+    """Return rows of three as rows of four float32, for float4."""
     padded = np.zeros((*rows.shape[:-1], 4), dtype=np.float32)
     padded[..., :3] = rows
     return padded
 
 
 def _split(values: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Split into a part of 12 significant bits and the rest: 12-bit parts times whole numbers < 4096 are exact."""
+    """Split numbers into 12 significant bits and the rest: 12-bit parts times whole numbers < 4096 are exact."""
     mantissa, exponent = np.frexp(values)
     head = np.ldexp(np.round(np.ldexp(mantissa, 12)), exponent - 12)
     return head, values - head
@@ -140,7 +140,7 @@ def _split(values: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np
 
 @dataclass(frozen=True)
 class Placement:
-    """Where the samples of a grid are in mm, as emit_vertices takes it.
+    """The places of the samples of a grid in mm, in the form for emit_vertices.
 
     Attributes
     ----------
@@ -148,7 +148,7 @@ class Placement:
     steps : ndarray, shape (4, 4), float32
     margin : ndarray, shape (4,), float32
     origin : ndarray, shape (3,), float64, or None
-        What the device's positions are relative to, see `find_vertex_origin`.
+        Origin of the device's positions, see `find_vertex_origin`.
     """
 
     slice_frames: NDArray[np.float32]
@@ -158,7 +158,7 @@ class Placement:
 
     @classmethod
     def of(cls, volume: Volume, border: int) -> Placement:
-        """Compose the tables for a volume with `border` layers of outside.
+        """Make the tables for a volume with `border` layers of outside.
 
         Raises
         ------
@@ -178,7 +178,7 @@ class Placement:
         return cls(frames, steps, _pad4(vertex_margin(volume, border)), origin)
 
     def to_lps(self, positions: NDArray[np.float32]) -> NDArray[np.floating]:
-        """Positions as the device computes them to LPS mm: themselves, but float64 in a volume far from the origin."""
+        """Convert positions of the device to LPS mm: unchanged, but float64 in a volume far from the origin."""
         return positions if self.origin is None else positions + self.origin
 
 
@@ -190,16 +190,16 @@ def classify(
     stopwatch: Stopwatch,
     bricks: BrickStates | None = None,
 ) -> Classified:
-    """Pass 1: which samples of the slab are inside; of a rule that encloses what is below, those that are not.
+    """Pass 1: mark the samples of the slab that are inside; for a rule that encloses values below, those that are not.
 
     Parameters
     ----------
     voxels_d : buffer
-        The slices ``slab.voxel_slices`` of the volume.
+        Slices ``slab.voxel_slices`` of the volume.
     levels : sequence of scalars of the voxels' type
         Lowest inside value and, of a range, the highest.
     bricks : BrickStates, optional
-        How the bricks of the volume compare with the only level, where the slab is all of it.
+        The comparison of the volume's bricks with the only level, if the slab is the whole volume.
     """
     program = _load_classify(device, slab.grid.volume.voxels.dtype, slab.grid.rule.inside)
     mask_d = allocate(device, 4 * slab.mask_rows * slab.grid.words)
@@ -228,17 +228,17 @@ def count(
     stopwatch: Stopwatch,
     voxels_d: Any = None,
 ) -> Counted:
-    """Passes 2 to 4: how many vertices and triangles, where those of each word begin, and which words have any.
+    """Passes 2 to 4: count vertices and triangles, find where those of each word begin, and which words have any.
 
     Parameters
     ----------
     voxels_d : buffer, optional
-        The slices ``slab.voxel_slices`` of the volume; needed for the topology of the trilinear field.
+        Slices ``slab.voxel_slices`` of the volume; needed for the topology of the trilinear field.
 
     Raises
     ------
     DeviceMemoryError
-        The slab has more than 32 bits can number.
+        The slab has more vertices or triangles than 32 bits can number.
     DeviceError
         The device fails.
     """
@@ -280,7 +280,7 @@ def count(
 
 
 def too_many(vertices: int, triangles: int) -> DeviceError:
-    """The error for a surface whose vertices or triangles 32 bits cannot number."""
+    """Return the error for a surface whose vertices or triangles 32 bits cannot number."""
     return DeviceError(
         f"the surface has {vertices:,} vertices and {triangles:,} triangles:"
         " more than 32 bits can number; choose another iso value or a part of the volume"
@@ -293,7 +293,7 @@ class Emission:
     Parameters
     ----------
     voxels_d : buffer
-        The slices ``slab.voxel_slices`` of the volume.
+        Slices ``slab.voxel_slices`` of the volume.
     """
 
     def __init__(
@@ -318,9 +318,9 @@ class Emission:
         self._items = -(-counted.active_words // int(device.kernel_variants["WORDS_PER_ITEM"]))
 
     def vertices(self, iso_level: float, **label_arguments: Any) -> None:
-        """Launch what writes positions and normals; it may be done again at another level.
+        """Launch the writing of positions and normals; it may be repeated at another level.
 
-        `label_arguments` is what emit_vertices takes more in a program that was built with labels.
+        `label_arguments` are additional arguments of emit_vertices in a program that was built with labels.
         """
         if not self._counted.vertices:
             return
@@ -335,11 +335,11 @@ class Emission:
 
     @property
     def tables(self) -> dict[str, Any]:
-        """How kernels that write vertices are told where the samples are in mm."""
+        """Arguments with the places of samples in mm, for kernels that write vertices."""
         return {"slice_frames": self.frames_d, "steps": self.steps_d, "margin": self._placement.margin}
 
     def triangles(self, first_vertex: int = 0) -> None:
-        """Launch what writes triangles; `first_vertex` is how many vertices all slabs before have."""
+        """Launch the writing of triangles; `first_vertex` is the number of vertices of all earlier slabs."""
         if not self._counted.triangles:
             return
         slab, counted = self._slab, self._counted
@@ -357,7 +357,7 @@ class Emission:
         return {"positions": self.positions_d, "normals": self.normals_d, "triangles": self.triangles_d}
 
     def download(self) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.uint32]]:
-        """Positions, normals and triangles, here."""
+        """Download positions, normals and triangles."""
         with self._stopwatch.timed("download"):
             for array, array_d in (
                 (self._positions, self.positions_d),
@@ -382,7 +382,7 @@ def emit(
     stopwatch: Stopwatch,
     label_arguments: Mapping[str, Any] | None = None,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.uint32]]:
-    """Passes 3 and 4 at once: positions, normals and triangles of the slab, see `Emission`."""
+    """Run passes 3 and 4 together: positions, normals and triangles of the slab, see `Emission`."""
     emission = Emission(device, slab, program, voxels_d, classified, counted, placement, stopwatch)
     with stopwatch.running(device):
         emission.vertices(slab.grid.rule.iso_level, **(label_arguments or {}))

@@ -1,4 +1,5 @@
-"""One extraction of labels' own surfaces: the occupancy of each label, its mesh and the level that keeps its volume.
+"""One extraction of surfaces of label masks: the occupancy of each label, its mesh, and the level that keeps its
+volume.
 
 The host side of cl/surface/label_masks.cl; counting and writing are those of cl/surface/marching_cubes.cl.
 """
@@ -45,7 +46,7 @@ from clrecon.operators.surface.slabs import SampleGrid
 __all__ = ["HeldMap", "MaskExtraction", "prepare_label_masks"]
 
 SPARE_SLICES = 3 + REACH
-"""Beyond the label's box: slices of the mask, gradients, and what their occupancy needs."""
+"""Slices needed beyond a label's box: slices of the mask, gradients, and their occupancy."""
 
 TRIANGLES_PER_SUM = 256
 SAMPLES_PER_FLAGS = 32 * kernel_constant("surface/label_masks.cl", "STRIP")
@@ -53,7 +54,7 @@ SAMPLES_PER_FLAGS = 32 * kernel_constant("surface/label_masks.cl", "STRIP")
 
 
 def prepare_label_masks(device: Device, label_dtype: DTypeLike = np.uint8) -> tuple[Program, Program]:
-    """Build the kernels for labels of this type: those of the occupancy, those of the surface.
+    """Build the kernels for labels of this type: those of the occupancy and those of the surface.
 
     Raises
     ------
@@ -68,7 +69,7 @@ def prepare_label_masks(device: Device, label_dtype: DTypeLike = np.uint8) -> tu
 
 @dataclass(frozen=True)
 class HeldMap:
-    """Slices of a map on the device, and room for what is computed from them."""
+    """Slices of a map on the device, and room for the results computed from them."""
 
     first: int
     end: int
@@ -80,7 +81,7 @@ class HeldMap:
 
 
 class MaskExtraction:
-    """One extraction: what is common to its labels."""
+    """One extraction: the data that its labels share."""
 
     def __init__(self, labels: LabelMap, device: Device, memory: int | None, closed: bool):
         self.labels = labels
@@ -104,16 +105,16 @@ class MaskExtraction:
 
     @property
     def has_neighbours(self) -> bool:
-        """More than one label is there: two may touch."""
+        """True where there is more than one label, so that two may touch."""
         return len(self.labels.numbers) > 1
 
     def slices_for(self, boxes: dict[int, Box]) -> tuple[int, int]:
-        """First and end of the slices of the map that these labels need."""
+        """Return first and end of the slices of the map that these labels need."""
         first = max(0, min(box[0].start for box in boxes.values()) - SPARE_SLICES)
         return first, min(self.labels.shape_ijk[2], max(box[0].stop for box in boxes.values()) + SPARE_SLICES)
 
     def needs(self, first: int, end: int) -> dict[str, int]:
-        """Bytes on the device for these slices."""
+        """Return the bytes on the device for these slices."""
         samples = self.labels.voxels[first:end].size
         return {
             "labels": samples * self.labels.voxels.itemsize,
@@ -124,12 +125,12 @@ class MaskExtraction:
         }
 
     def strip_bytes(self, slices: int) -> int:
-        """Bytes of two flags for each 16 samples of a row."""
+        """Return the bytes of two flags for each 16 samples of a row."""
         ni, nj, _ = self.labels.shape_ijk
         return 8 * -(-ni // SAMPLES_PER_FLAGS) * nj * slices
 
     def group(self, boxes: dict[int, Box]) -> list[dict[int, Box]]:
-        """All labels at once where their slices fit the device, else one by one: the meshes are the same."""
+        """Group all labels together if their slices fit the device, else one by one: the meshes are the same."""
         scratch = max(sum(self.window(box, (0, 0)).scratch().values()) for box in boxes.values())
         return group_boxes(boxes, self.needs(*self.slices_for(boxes)), scratch, memory_limits(self.device, self.memory))
 
@@ -155,7 +156,7 @@ class MaskExtraction:
         return held
 
     def _smooth(self, held: HeldMap, number: int, box: Box, occupancy_d: Any) -> None:
-        """The occupancy of a label (0: of all) in a box and REACH samples around, which are what gradients need."""
+        """Smooth a label (0: all) to its occupancy in a box and REACH samples around it, which gradients need."""
         ni, nj, nk = self.labels.shape_ijk
         inner = [
             (max(0, part.start - REACH), min(n, part.stop + REACH)) for part, n in zip(box, (nk, nj, ni), strict=True)
@@ -179,11 +180,11 @@ class MaskExtraction:
         )  # fmt: skip
 
     def window(self, box: Box, held: tuple[int, int]) -> Window:
-        """The slices of the sample grid around a label's box."""
+        """Return the slices of the sample grid around a label's box."""
         return Window(self.grid, box[0].start, box[0].stop + 2 * self.grid.rule.border, held)
 
     def keep_enclosed(self, numbers: Sequence[int], boxes: dict[int, Box]) -> None:
-        """Find the levels of labels that others enclose: they are the same whichever labels are asked for."""
+        """Find the levels of enclosed labels, which do not depend on the labels that are asked for."""
         own = {number: boxes[number] for number in numbers}
         try:
             self._measure_enclosed(self.group(own), own)
@@ -208,7 +209,7 @@ class MaskExtraction:
         self.levels = choose_levels(Borders.of(self.labels.voxels, list(boxes), boxes), measure)
 
     def _start_one(self, held: HeldMap, number: int, box: Box) -> StartedMesh:
-        """All of a label's mesh but its vertices, which depend on levels."""
+        """Make all of a label's mesh except its vertices, which depend on levels."""
         device, stopwatch = self.device, self.stopwatch
         own, surface = self.programs()
         window = self.window(box, (held.first, held.end))
@@ -240,7 +241,7 @@ class MaskExtraction:
         return StartedMesh(self, held, number, box, counted, emission)
 
     def extract_one(self, held: HeldMap, number: int, box: Box) -> tuple[Part, int]:
-        """Positions, normals and triangles of one label, and the level that places them."""
+        """Return positions, normals and triangles of one label, and the level that places them."""
         started = self._start_one(held, number, box)
         level = self.levels.get(number)
         if level is None:
@@ -249,7 +250,7 @@ class MaskExtraction:
         return started.emission.download(), level
 
     def describe(self) -> dict[str, Any]:
-        """What the reports of all labels have in common."""
+        """Return the report entries that all labels share."""
         return {
             "surface": "mask",
             "closed_at_border": self.grid.rule.closed,
@@ -266,7 +267,7 @@ class MaskExtraction:
 
 @dataclass(frozen=True)
 class StartedMesh:
-    """A label's mesh on the device, whose vertices are placed at one level after the other."""
+    """A label's mesh on the device, whose vertices can be placed at several levels in turn."""
 
     run: MaskExtraction
     held: HeldMap
@@ -276,14 +277,16 @@ class StartedMesh:
     emission: marching_cubes.Emission
 
     def place(self, level: int) -> None:
-        """Write the vertices, as they are at this level."""
+        """Write the vertices at this level."""
         held = self.held
         biases_d = upload(self.run.device, level_biases(self.run.levels, self.run.labels.numbers[-1] + 1))
         with self.run.stopwatch.running(self.run.device):
             self.emission.vertices(level, map=held.map_d, label=self.number, occupied=held.occupied_d, biases=biases_d)
 
     def enclosed_mm3(self, level: int) -> float:
-        """What the mesh encloses at a level: sums of some hundred triangles on the device, all of them here."""
+        """Return the volume that the mesh encloses at a level: the device sums some hundred triangles at a time, the
+        host the rest.
+        """
         self.place(level)
         device, stopwatch, placement = self.run.device, self.run.stopwatch, self.run.placement
         middle = [[(part.start + part.stop - 1) / 2 for part in self.box[::-1]]]
@@ -303,8 +306,9 @@ class StartedMesh:
         return float(download(device, sums, sums_d).sum(dtype=np.float64)) / 6.0
 
     def keep_volume(self, wanted: float, closed: bool) -> tuple[Part, int]:
-        """Try levels until the mesh has the volume of the label's voxels, mm3, as near as a level brings it."""
-        # Every crossed edge carries a voxel's face; faces of all directions are about 1.5 times the area.
+        """Try levels until the mesh has, as nearly as possible, the volume of the label's voxels, mm3."""
+        # Every crossed edge belongs to a voxel's face; over all directions there are about 1.5 faces for one face's
+        # area.
         area_voxels = self.counted.vertices / FACES_PER_AREA
         mm3_per_level = -area_voxels * abs(np.linalg.det(self.run.labels.affine[:3, :3])) / (STEEPNESS * FULL)
         tried: list[tuple[int, float]] = []

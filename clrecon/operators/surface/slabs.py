@@ -1,4 +1,4 @@
-"""Slabs of the sample grid: which slices a part of a surface needs, and how many fit a device."""
+"""Slabs of the sample grid: the slices that a part of a surface needs, and how many fit a device."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from clrecon.operators.resident.device_volume import DeviceVolume
 __all__ = ["BRICKS", "SampleGrid", "Slab", "plan_slabs"]
 
 BRICKS = "brick ranges"
-"""What surfaces keep of a whole volume."""
+"""Name of the object that surfaces keep for a whole volume."""
 
 
 @dataclass(frozen=True)
 class SampleGrid:
-    """The samples of a volume with its border, and how the inside mask packs them.
+    """The samples of a volume with its border, and their packing in the inside mask.
 
     Attributes
     ----------
@@ -32,42 +32,44 @@ class SampleGrid:
 
     @cached_property
     def shape(self) -> tuple[int, int, int]:
-        """(gi, gj, gk) samples."""
+        """Number of samples (gi, gj, gk)."""
         gi, gj, gk = (n + 2 * self.rule.border for n in self.volume.shape_ijk)
         return gi, gj, gk
 
     @property
     def kind(self) -> str:
-        """Grids of one kind need the same memory."""
+        """Key of the grid: grids with the same key need the same memory."""
         return f"{self.rule.topology} surface with a border of {self.rule.border}"
 
     @property
     def words(self) -> int:
-        """32-bit words of the mask a row."""
+        """32-bit words of the mask in a row."""
         return -(-self.shape[0] // 32)
 
     @property
     def row_shift(self) -> int:
-        """A word's number is its row times 2^row_shift, plus its place in the row: a multiple of 32 words a row."""
+        """A word's number is its row times 2^row_shift plus its place in the row; rows have a multiple of 32 words."""
         return max(5, (self.words - 1).bit_length())
 
     @property
     def flag_words(self) -> int:
-        """32-bit words a row of one flag a word."""
+        """32-bit words in a row of one flag for each word."""
         return 1 << (self.row_shift - 5)
 
     @property
     def winds_backwards(self) -> bool:
-        """The winding of the case table is turned: in a left-handed volume, or to enclose what the mask leaves out."""
+        """True where the winding of the case table is reversed: in a left-handed volume, or to enclose values below the
+        level.
+        """
         return is_left_handed(self.volume.affine) != (self.rule.inside == "below")
 
 
 @dataclass(frozen=True)
 class Slab:
-    """Slices `first` to ``end - 1`` of a sample grid, with those around them that their part of a surface needs.
+    """Slices `first` to ``end - 1`` of a sample grid, with the neighbouring slices that their part of a surface needs.
 
-    The slab's rows own vertices on edges towards the slice `end`, whose vertices its triangles refer to and whose
-    owners look one slice further; gradients look one slice further at both ends.
+    The slab's rows own the vertices on edges towards slice `end`. Its triangles also refer to vertices of slice `end`,
+    whose owners need one slice more.  Gradients need one more slice at both ends.
     """
 
     grid: SampleGrid
@@ -81,7 +83,7 @@ class Slab:
 
     @property
     def is_whole(self) -> bool:
-        """The slab is all of the grid."""
+        """True where the slab is the whole grid."""
         return self.slices == self.grid.shape[2]
 
     @property
@@ -112,7 +114,7 @@ class Slab:
 
     @property
     def arguments(self) -> dict[str, int]:
-        """How kernels are told where the slab lies."""
+        """Arguments about the place of the slab, for kernels."""
         (ni, nj, nk), rule = self.grid.volume.shape_ijk, self.grid.rule
         return {
             "ni": ni,
@@ -126,7 +128,7 @@ class Slab:
         }
 
     def scratch(self) -> dict[str, int]:
-        """Bytes of every buffer between the volume and the mesh, by what it is; at most."""
+        """Return the most bytes of every buffer between the volume and the mesh, by description."""
         counted_words = self.counted_rows * self.grid.words
         cell_vertices = 8 * self.counted_rows + 2 * self.rows * self.grid.words
         return {
@@ -146,20 +148,20 @@ class Slab:
         return (end - first) * ni * nj * int(self.grid.volume.voxels.dtype.itemsize)
 
     def needs(self, output: Mapping[str, int] | None = None) -> dict[str, int]:
-        """Bytes of every buffer that lives at the same time."""
+        """Return the bytes of every buffer that exists at the same time."""
         return {"volume": self.volume_bytes(), **self.scratch(), **(output or {})}
 
 
 OUTPUT_SHARE = 8
-"""Where slabs are needed, an eighth of the memory is kept free for the mesh: bone takes less, noise more (a slab whose
-mesh does not fit is halved)."""
+"""With slabs, an eighth of the memory is kept free for the mesh.  Bone needs less, noise more; a slab whose mesh does
+not fit is halved."""
 
 MOST_WORDS = 2**32
-"""Words of a slab are numbered in 32 bits, of which the place in the row takes `SampleGrid.row_shift`."""
+"""Word numbers of a slab have 32 bits, of which the place in the row takes `SampleGrid.row_shift`."""
 
 
 def plan_slabs(grid: SampleGrid, resident: DeviceVolume) -> int:
-    """Slices a slab: all of them where the whole grid fits the device, else as many as fit.
+    """Return the number of slices in a slab: all if the whole grid fits the device, else as many as fit.
 
     Parameters
     ----------
@@ -169,18 +171,18 @@ def plan_slabs(grid: SampleGrid, resident: DeviceVolume) -> int:
     Raises
     ------
     DeviceError
-        Not even one slice with its neighbours fits; the message has what it needs and what there is.
+        Not even one slice with its neighbours fits; the message states the needed and the available memory.
     """
     gk = grid.shape[2]
     limits = resident.limits
     mesh_bytes = min(limits.total_bytes // OUTPUT_SHARE, limits.buffer_bytes)
 
     def needs(slices: int) -> dict[str, int]:
-        # A slab in the middle of the grid: no other of as many slices needs more.
+        # A slab in the middle of the grid: no other slab with as many slices needs more.
         first = max(0, min(2, gk - slices))
         return Slab(grid, first, first + slices).needs({} if slices == gk else {"mesh": mesh_bytes})
 
-    # A slab classifies two slices more than it owns.
+    # A slab classifies two more slices than it owns.
     most_mask_slices = (MOST_WORDS - 1) // (grid.shape[1] << grid.row_shift)
     most = None if gk <= most_mask_slices else most_mask_slices - 2
     slices = resident.plan(grid.kind, gk, needs, own=(BRICKS,), most=most)

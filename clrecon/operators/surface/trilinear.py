@@ -1,4 +1,6 @@
-"""The passes of cl/surface/trilinear.cl on one slab: ambiguous cells resolved as the trilinear field has them."""
+"""Trilinear topology: the passes of cl/surface/trilinear.cl on one slab, which resolve ambiguous cells by the trilinear
+field.
+"""
 
 from __future__ import annotations
 
@@ -24,12 +26,12 @@ from clrecon.operators.surface.slabs import Slab
 __all__ = ["LONGEST_ROW", "CellVertices", "check_row", "count_cells", "emit_cells", "prepare_trilinear"]
 
 LONGEST_ROW = 2_970
-"""Samples a row: places in a row are 16-bit numbers, and a cell has at most 22 triangles."""
+"""Most samples in a row: indices in a row have 16 bits, and a cell has up to 22 triangles."""
 
 
 @dataclass(frozen=True)
 class CellVertices:
-    """What `count_cells` leaves on the device: vertices inside cells before each row and word, and their total."""
+    """The results of `count_cells` on the device: vertices inside cells before each row and word, and their total."""
 
     offsets_d: Any
     word_places_d: Any
@@ -48,7 +50,7 @@ def prepare_trilinear(device: Device, dtype: DTypeLike) -> Program:
 
 
 def check_row(volume: Volume) -> None:
-    """Refuse a volume with rows that are too long.
+    """Refuse a volume whose rows are too long.
 
     Raises
     ------
@@ -62,7 +64,7 @@ def check_row(volume: Volume) -> None:
 
 
 def _field_arguments(slab: Slab) -> dict[str, Any]:
-    """Level, outside, and where the slab lies: how every pass is told about the field."""
+    """Return level, outside and place of the slab: the arguments about the field for every pass."""
     rule = slab.grid.rule
     return {"iso_level": rule.iso_level, "outside": rule.outside, **slab.arguments}
 
@@ -77,12 +79,12 @@ def count_cells(
     word_triangles_d: Any,
     stopwatch: Stopwatch,
 ) -> CellVertices:
-    """Count the triangles of the slab anew, in place, and the vertices inside cells, which follow those of each slice.
+    """Count the slab's triangles again, in place, and the vertices inside cells, which follow those of each slice.
 
     Parameters
     ----------
     flags_d, row_counts_d, word_triangles_d : buffers
-        What count_rows wrote: words with work, counts of each row, triangles of the row before each word.
+        Results of count_rows: words with work, counts of each row, triangles of the row before each word.
     """
     grid, rows = slab.grid, slab.counted_rows
     row_vertices_d = allocate(device, 4 * rows)
@@ -125,7 +127,7 @@ def emit_cells(
     output : dict
         The buffers ``positions``, ``normals`` and ``triangles``.
     first_vertex : int
-        Vertices of all slabs before.
+        Number of vertices of all earlier slabs.
     """
     program = prepare_trilinear(device, slab.grid.volume.voxels.dtype)
     cells: CellVertices = counted.cells
