@@ -18,7 +18,7 @@ from clrecon.operators.resident.frame import BOX_BORDER, enclose
 __all__ = ["find_leaps", "measure_cells"]
 
 ROWS_AT_ONCE = kernel_constant("rays/leaps.cl", "ROWS_AT_ONCE")
-"""Rows of bricks that a work-item takes."""
+"""Rows of bricks for each work-item."""
 
 
 def measure_cells(resident: DeviceVolume, slab: RaySlab, stopwatch: Stopwatch) -> Any:

@@ -35,7 +35,7 @@ BRICK_CELLS = kernel_constant("rays/leap.h", "BRICK_CELLS")
 """Cells of a brick along i and j."""
 
 FARTHEST = kernel_constant("rays/leap.h", "FARTHEST")
-"""Bricks that a leap goes at most: with that as its margin none is left."""
+"""Longest leap in bricks: with this distance as its margin, no brick is left to leap over."""
 
 
 def choose_brick_cells(volume: Volume) -> tuple[int, int, int]:
