@@ -14,8 +14,8 @@ from clrecon.errors import RefusedInputError, UsageError
 from clrecon.system.text import escape_text
 
 if TYPE_CHECKING:
-    from clrecon.dicom.series.listing import SeriesListing
     from clrecon.geometry import Volume
+    from clrecon.sources.listing import SeriesListing
     from clrecon.system.progress import Progress
 
 __all__ = ["Selection", "list_series", "read_selected", "read_volume"]

@@ -14,14 +14,15 @@ from clrecon.dicom.parse.forced import describe_way_out
 from clrecon.dicom.pixels.voxels import read_voxels
 from clrecon.dicom.series.certificate import certify, collect_scan_warnings, collect_series_warnings
 from clrecon.dicom.series.choice import choose_series, describe_left
-from clrecon.dicom.series.likeness import Likeness, judge_likeness
-from clrecon.dicom.series.listing import SeriesListing, describe_series
-from clrecon.dicom.series.plausibility import collect_voxel_warnings
+from clrecon.dicom.series.listing import describe_series
 from clrecon.dicom.series.scan import BARE_DATA_SET, Scan, scan_path
 from clrecon.dicom.series.series import Series, group_series
 from clrecon.errors import NoDicomError, RefusedInputError, UsageError
 from clrecon.geometry import Volume
 from clrecon.geometry.certificate import Certificate
+from clrecon.sources.likeness import Likeness, judge_slices
+from clrecon.sources.listing import SeriesListing
+from clrecon.sources.plausibility import collect_voxel_warnings
 from clrecon.system.log import get_logger, log_warnings
 from clrecon.system.progress import Progress
 from clrecon.system.text import escape_text, join_names
@@ -80,7 +81,7 @@ def read_volume(
         if chosen.problems or stack is None or stack.affine is None:
             raise RefusedInputError(_describe_refusal(chosen))
         voxels, facts = read_voxels(stack.slices, progress)
-        likeness = judge_likeness(voxels, stack)
+        likeness = judge_slices(voxels, stack.tilt_deg, uneven=stack.line.uneven)
     warnings = [
         *collect_series_warnings(chosen),
         *_describe_likeness(likeness),
@@ -167,7 +168,7 @@ def _certify_chosen(
     affine = None if series.problems else stack.affine
     if pixels and affine is not None:
         voxels, facts = read_voxels(stack.slices, progress)
-        likeness = judge_likeness(voxels, stack)
+        likeness = judge_slices(voxels, stack.tilt_deg, uneven=stack.line.uneven)
         warnings += [*_describe_likeness(likeness), *collect_voxel_warnings(voxels, facts, stack.slices)]
     return certify(series, stack, facts, scan, affine, [*warnings, *notes], likeness)
 

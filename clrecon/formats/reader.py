@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from clrecon.dicom.series.listing import SeriesEntry, SeriesListing
-from clrecon.dicom.series.plausibility import collect_voxel_warnings
 from clrecon.errors import RefusedInputError
 from clrecon.formats.certificate import MODALITY, certify_grid, collect_header_warnings, collect_value_warnings
 from clrecon.formats.grid_file import VOLUME, GridFile
 from clrecon.formats.kinds import open_grid
 from clrecon.formats.values import GridValues, read_values
 from clrecon.geometry import Volume
+from clrecon.sources.listing import SeriesEntry, SeriesListing
+from clrecon.sources.plausibility import collect_voxel_warnings
 from clrecon.system.log import get_logger, log_warnings
 from clrecon.system.progress import Progress
 from clrecon.system.text import escape_text

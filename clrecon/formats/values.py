@@ -14,12 +14,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clrecon.dicom.pixels.voxels import PixelFacts
-from clrecon.dicom.series.likeness import Likeness, judge_slices
 from clrecon.errors import RefusedInputError
 from clrecon.formats.grid_file import GridFile
 from clrecon.geometry import AIR_HU
 from clrecon.geometry.affine import column_spacing, tilt_degrees
+from clrecon.sources.facts import PixelFacts
+from clrecon.sources.likeness import Likeness, judge_slices
 from clrecon.system.memory import allocate_voxels
 from clrecon.system.progress import Progress
 from clrecon.system.wording import name_parameter

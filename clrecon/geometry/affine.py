@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from clrecon.errors import UsageError
 
 __all__ = [
+    "TILT_REPORT_DEG",
     "apply_affine",
     "checked_affine",
     "checked_points",
@@ -29,6 +30,9 @@ __all__ = [
 
 Float64Array = NDArray[np.float64]
 """The type of the arrays that the functions here take and return."""
+
+TILT_REPORT_DEG = 0.05
+"""Degrees of gantry tilt from which on it is reported."""
 
 
 def compose_affine(i_step: ArrayLike, j_step: ArrayLike, k_step: ArrayLike, origin: ArrayLike) -> Float64Array:

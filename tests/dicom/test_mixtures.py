@@ -8,9 +8,9 @@ import tolerances
 from dicom_series import Plan, write_series
 
 from clrecon.dicom import list_series, read_volume
-from clrecon.dicom.series.likeness import measure_likeness
 from clrecon.dicom.stack.attributes import alternates
 from clrecon.errors import RefusedInputError, UsageError
+from clrecon.sources.likeness import measure_likeness
 
 GAP = 1.25
 EACH = 12

@@ -25,9 +25,10 @@ _layer("opencl", "errors", "system")
 _layer("geometry", "errors", "system")
 _layer("anatomy", "errors", "system", "geometry")
 _layer("exchange", "errors", "system", "geometry")
-_layer("dicom", "errors", "system", "geometry")
-_layer("formats", "errors", "system", "geometry", "dicom")
-_layer("reading", "errors", "system", "geometry", "dicom", "formats")
+_layer("sources", "errors", "system", "geometry")
+_layer("dicom", "errors", "system", "geometry", "sources")
+_layer("formats", "errors", "system", "geometry", "sources")
+_layer("reading", "errors", "system", "geometry", "sources", "dicom", "formats")
 _layer("labels", "errors", "system", "geometry", "dicom", "formats")
 _layer("mesh", "errors", "system", "geometry", "anatomy", "exchange")
 _layer("rendering", "errors", "version", "system", "geometry", "labels")
@@ -77,6 +78,7 @@ AT_MODULE_LEVEL: dict[str, frozenset[str]] = {
     "anatomy": frozenset({"numpy"}),
     "dicom": frozenset({"numpy", "pydicom"}),
     "formats": frozenset({"numpy"}),
+    "sources": frozenset({"numpy"}),
     "labels": frozenset({"numpy"}),
     "mesh": frozenset({"numpy"}),
     "exchange": frozenset({"numpy"}),

@@ -12,7 +12,6 @@ import pytest
 
 import clrecon
 from clrecon.anatomy.iso_choice import half_iso_value
-from clrecon.dicom.series.listing import SeriesEntry, SeriesListing
 from clrecon.errors import RefusedInputError
 from clrecon.geometry import Volume
 from clrecon.jobs.mesh.label_choice import LabelChoice
@@ -34,6 +33,7 @@ from clrecon.rendering.pictures.styles import (
 from clrecon.rendering.views.camera import Camera
 from clrecon.rendering.views.centre_line import Curve
 from clrecon.rendering.views.clip import Clip
+from clrecon.sources.listing import SeriesEntry, SeriesListing
 from clrecon.system.gates import at_most
 
 VOXELS = np.arange(4 * 5 * 6, dtype=np.int16).reshape(4, 5, 6)

@@ -6,7 +6,6 @@ set) are found once and kept while the volume is read.
 
 from __future__ import annotations
 
-import os
 import sys
 import threading
 import zlib
@@ -221,9 +220,3 @@ def _settle_sign(header: SliceHeader, frame: Codestream, decoded: NDArray[Any]) 
             f"the compressed frame has {frame.bits} bits and {has}, the header says {header.bits_stored} bits "
             f"{'with' if header.signed else 'without'} one: values cannot be told from others"
         )
-
-
-def count_readers(slices: int, most: int) -> int:
-    """Return the number of reading threads: the number of cores that this process may use."""
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return max(1, min(most, cores, slices))

@@ -12,7 +12,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import nullcontext
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -20,13 +19,15 @@ from numpy.typing import NDArray
 
 from clrecon.dicom.headers.slice_header import SliceHeader
 from clrecon.dicom.pixels.padding import PaddingMasks, pack_mask
-from clrecon.dicom.pixels.stored import StoredPixels, count_readers
+from clrecon.dicom.pixels.stored import StoredPixels
 from clrecon.dicom.pixels.stray_bits import StrayBits, describe_stray_bits, find_stray_bits
 from clrecon.errors import RefusedInputError
+from clrecon.sources.facts import PixelFacts
 from clrecon.system.memory import allocate_voxels
 from clrecon.system.progress import Progress
+from clrecon.system.threads import count_readers
 
-__all__ = ["PixelFacts", "read_voxels"]
+__all__ = ["read_voxels"]
 
 MAX_READERS = 8
 MAX_DECODERS = 32
@@ -34,32 +35,6 @@ DECODER_WORTH_BYTES = 4 << 20
 """Least bytes of pixels for one more decoder: they take about as long to decode as a process takes to start."""
 FLOAT_LIMIT = 1e9
 """Larger values are not HU; float32 and every later step can hold this value."""
-
-
-@dataclass(frozen=True)
-class PixelFacts:
-    """Figures of the pixels that were read.
-
-    Attributes
-    ----------
-    padding_share : float
-        Share of the voxels, 0 to 1.
-    hu_min, hu_max : float
-        Lowest and highest HU of the volume, padding included.
-    padding_hu : float or None
-        HU that padding was filled with; None without padding.
-    stray : int
-        Number of values that lost bits of their own, see `clrecon.dicom.pixels.stray_bits`.
-    stray_text : str
-        One line about these values; empty if there are none.
-    """
-
-    padding_share: float
-    hu_min: float
-    hu_max: float
-    padding_hu: float | None = None
-    stray: int = 0
-    stray_text: str = ""
 
 
 class _SliceFacts(NamedTuple):

@@ -15,15 +15,12 @@ from numpy.typing import NDArray
 
 from clrecon.dicom.headers.slice_header import SliceHeader
 from clrecon.dicom.parse.transfer_syntaxes import SYNTAX_NAMES
-from clrecon.dicom.pixels.voxels import PixelFacts
 from clrecon.dicom.series.gates import judge_series
-from clrecon.dicom.series.likeness import Likeness
 from clrecon.dicom.series.phases import choose_phase
 from clrecon.dicom.series.scan import Scan
 from clrecon.dicom.series.series import Series
 from clrecon.dicom.stack.fit import Stack
 from clrecon.dicom.stack.layout import (
-    describe_orientation,
     describe_thickness,
     measure_extent,
     median_thickness,
@@ -33,6 +30,9 @@ from clrecon.dicom.stack.mixture import describe_differences
 from clrecon.errors import RefusedInputError
 from clrecon.geometry import column_spacing
 from clrecon.geometry.certificate import Certificate
+from clrecon.sources.facts import PixelFacts
+from clrecon.sources.likeness import Likeness
+from clrecon.sources.orientation import describe_orientation
 from clrecon.system.text import hash_uid
 
 __all__ = ["certify", "collect_scan_warnings", "collect_series_warnings"]

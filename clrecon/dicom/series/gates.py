@@ -11,8 +11,6 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from clrecon.dicom.headers.slice_header import SliceHeader
-from clrecon.dicom.pixels.voxels import PixelFacts
-from clrecon.dicom.series.likeness import Likeness
 from clrecon.dicom.series.series import Series
 from clrecon.dicom.stack.directions import (
     ORIENTATION_EXACT,
@@ -27,27 +25,19 @@ from clrecon.dicom.stack.fit import (
     measure_stated_gap,
 )
 from clrecon.errors import RefusedInputError
+from clrecon.sources.facts import PixelFacts
+from clrecon.sources.gates import PADDING_SHARE, judge_figures, judge_steps, list_odd_values
+from clrecon.sources.likeness import Likeness
 from clrecon.system.gates import Gate, at_most, none_of, unmeasured
 
-__all__ = ["PADDING_SHARE", "judge_figures", "judge_series", "judge_steps", "list_odd_values"]
+__all__ = ["judge_series"]
 
-PADDING_SHARE = 0.75
-"""Largest share of padding.  A circle in its square leaves 0.21, a 500 mm circle in a field of 800 mm 0.69; above that
-a wrong PixelPaddingValue probably masks measured voxels."""
-
-
-PIXEL_MM = (0.005, 10.0)
-"""Range of pixel sizes: from the finest micro-CT in use to attenuation maps of PET and SPECT."""
-GAP_MM = (0.005, 50.0)
 GAP_THICKNESSES = 2.0
 """Largest gap in units of the slice thickness.  Beyond it more is left out than measured: a high-resolution lung scan
 has 10, and no usable surface."""
 SLOPES, INTERCEPTS = (1e-3, 100.0), (-40_000.0, 40_000.0)
 """Ranges of slope and intercept.  Scanners write the slope 1, a fraction of 1 or a few; below 0 bone would be dark.
 Stored 16-bit values in the middle of their range need an intercept of 32768."""
-LOWEST_HU, DENSEST_HU = (-10_000.0, 1000.0), (-900.0, 70_000.0)
-"""Ranges of the lowest and the densest voxel.  Undeclared padding goes down to -8192; a cut-out of bone has spongy
-parts.  A densest voxel below -900 is air; 16 bits end at 65535."""
 STRAY = "values beyond the stored bits"
 
 
@@ -120,18 +110,6 @@ def _judge_spacing(stack: Stack) -> Gate:
     return judge_steps((first.di_mm, first.dj_mm), stack.line.gap_median_mm)
 
 
-def judge_steps(pixels_mm: Sequence[float], gap_mm: float | None) -> Gate:
-    """Judge whether pixels and gaps have sizes of real scanners: a mesh a thousand times too large looks like any
-    other.
-    """
-    (low, high), (gap_low, gap_high) = PIXEL_MM, GAP_MM
-    odd = [f"pixels of {mm:g} mm" for mm in sorted(set(pixels_mm)) if not low <= mm <= high]
-    if gap_mm is not None and not gap_low <= gap_mm <= gap_high:
-        odd.append(f"gaps of {gap_mm:g} mm")
-    what = f"spacings that no scanner has, outside of {low:g} to {high:g} mm, gaps up to {gap_high:g} mm"
-    return none_of("plausible_spacing", len(odd), f"{what} ({', '.join(odd)})" if odd else what)
-
-
 def _judge_thickness(stack: Stack) -> Gate:
     """Compare gaps with SliceThickness: how much of the tissue was measured."""
     what = "largest gap between slices as a multiple of SliceThickness; above 1 the tissue between was not measured"
@@ -157,21 +135,6 @@ def _judge_hu(headers: Sequence[SliceHeader], facts: PixelFacts | None) -> Gate:
     if facts is not None and facts.hu_min <= facts.hu_max and not _count_unknown(headers):
         odd += list_odd_values(facts)
     return judge_figures(odd)
-
-
-def list_odd_values(facts: PixelFacts) -> list[str]:
-    """Return the lowest and the densest voxel if they lie outside the range of every CT."""
-    return [
-        f"{name} voxel {value:g} HU, expected {low:g} to {high:g}"
-        for name, value, (low, high) in (("lowest", facts.hu_min, LOWEST_HU), ("densest", facts.hu_max, DENSEST_HU))
-        if not low <= value <= high
-    ]
-
-
-def judge_figures(odd: Sequence[str]) -> Gate:
-    """Judge the gate ``plausible_hu``, given the unusual figures."""
-    what = "figures of HU that no CT has"
-    return none_of("plausible_hu", len(odd), f"{what} ({'; '.join(odd)})" if odd else what)
 
 
 def _judge_one_volume(series: Series, likeness: Likeness | None) -> Gate:

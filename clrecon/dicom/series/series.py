@@ -11,7 +11,6 @@ from pathlib import Path
 from clrecon.dicom.headers.slice_header import OtherImage, SeriesIdentity, SliceHeader
 from clrecon.dicom.pixels.stored import StoredPixels
 from clrecon.dicom.pixels.voxels import read_voxels
-from clrecon.dicom.series.likeness import judge_likeness
 from clrecon.dicom.series.missing_parts import describe_missing_parts
 from clrecon.dicom.series.phases import (
     Places,
@@ -26,6 +25,7 @@ from clrecon.dicom.stack.attributes import alternate_places, find_alternation
 from clrecon.dicom.stack.fit import Stack, group_places, measure_stack
 from clrecon.dicom.stack.planes import Planes
 from clrecon.errors import RefusedInputError
+from clrecon.sources.likeness import judge_slices
 from clrecon.system.text import hash_uid, join_names
 
 __all__ = ["Series", "group_series"]
@@ -165,7 +165,7 @@ class Series:
             return part_alternating(places, found)
         if found is None and phase is None:
             return places
-        likeness = judge_likeness(read_voxels(stack.slices)[0], stack)
+        likeness = judge_slices(read_voxels(stack.slices)[0], stack.tilt_deg, uneven=stack.line.uneven)
         if likeness is not None and likeness.is_mixed:
             return part_alternating(places, found or alternate_places(len(stack.slices), likeness.period))
         if found is None:

@@ -23,6 +23,7 @@ from clrecon.dicom.stack.directions import ORIENTATION_EXACT, ORIENTATION_LIMIT,
 from clrecon.dicom.stack.holes import Holes, find_holes
 from clrecon.dicom.stack.numbers import median
 from clrecon.geometry import compose_affine, tilt_degrees
+from clrecon.geometry.affine import TILT_REPORT_DEG
 from clrecon.system.text import join_names
 from clrecon.system.wording import name_parameter
 
@@ -34,7 +35,6 @@ POSITION_TOLERANCE_MM = 0.01
 POSITION_TOLERANCE_GAPS = 0.01
 """A residual up to 1 % of the gap (or 0.01 mm if larger) is due to rounding and does not make a stack uneven."""
 DUPLICATE_MM = 1e-3
-TILT_REPORT_DEG = 0.05
 STATED_GAP_TOLERANCE = 0.01
 PIXEL_SPACING_TOLERANCE = 1e-5
 

@@ -9,17 +9,16 @@ dry bone) give none.  A figure that a warning states is counted in all voxels.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from clrecon.dicom.headers.slice_header import SliceHeader
-from clrecon.dicom.pixels.voxels import PixelFacts
 from clrecon.errors import RefusedInputError
 from clrecon.geometry import AIR_HU
+from clrecon.sources.facts import PixelFacts
 
-__all__ = ["collect_voxel_warnings"]
+__all__ = ["StoredValues", "collect_voxel_warnings"]
 
 CEILING_BITS = 12
 """Bits of most scanners, even where more bits are stored: 3071 HU with intercept -1024."""
@@ -52,7 +51,28 @@ MOST_BEYOND = 0.002
 """Largest share in ranges that are empty in a shifted scan: below air, or above the shifted values of bone."""
 
 
-def collect_voxel_warnings(voxels: NDArray[Any], facts: PixelFacts, slices: Sequence[SliceHeader]) -> list[str]:
+class StoredValues(Protocol):
+    """What a header says of the values of its slice.
+
+    Attributes
+    ----------
+    bits_stored : int
+    signed : bool
+    slope, intercept : float
+        Of the rescale to HU.
+    """
+
+    @property
+    def bits_stored(self) -> int: ...
+    @property
+    def signed(self) -> bool: ...
+    @property
+    def slope(self) -> float: ...
+    @property
+    def intercept(self) -> float: ...
+
+
+def collect_voxel_warnings(voxels: NDArray[Any], facts: PixelFacts, slices: Sequence[StoredValues]) -> list[str]:
     """Return warnings about the HU that were read.
 
     Parameters
@@ -60,7 +80,7 @@ def collect_voxel_warnings(voxels: NDArray[Any], facts: PixelFacts, slices: Sequ
     voxels : ndarray, shape (nk, nj, ni)
         HU.
     facts : PixelFacts
-    slices : sequence of SliceHeader
+    slices : sequence of StoredValues
         In the order of k; empty for files other than DICOM.
 
     Raises
@@ -93,7 +113,7 @@ def _describe_shift(shift: int, what: str) -> str:
     )
 
 
-def _warn_of_saturation(voxels: NDArray[Any], facts: PixelFacts, slices: Sequence[SliceHeader]) -> list[str]:
+def _warn_of_saturation(voxels: NDArray[Any], facts: PixelFacts, slices: Sequence[StoredValues]) -> list[str]:
     """Warn of voxels at the highest value that the stored bits, or the 12 bits of the scanner, can express."""
     members: dict[tuple[float, int], list[int]] = {}
     if not slices and facts.hu_max >= CEILING_HU:

@@ -17,10 +17,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clrecon.dicom.pixels.stored import count_readers
-from clrecon.dicom.stack.fit import TILT_REPORT_DEG, Stack
+from clrecon.geometry.affine import TILT_REPORT_DEG
+from clrecon.system.threads import count_readers
 
-__all__ = ["Likeness", "judge_likeness", "judge_slices", "measure_likeness"]
+__all__ = ["Likeness", "judge_slices", "measure_likeness"]
 
 LEAST_LIKENESS = 1.25
 """Ratio of the differences from neighbours to those from the slice one period on; from this ratio on slices belong to
@@ -90,15 +90,12 @@ class Likeness:
         )
 
 
-def judge_likeness(voxels: NDArray[Any], stack: Stack) -> Likeness | None:
-    """Apply `measure_likeness` to a stack that was read, voxels (nk, nj, ni); to a long one where it is most
-    suspicious.
-    """
-    return judge_slices(voxels, stack.tilt_deg, uneven=stack.line.uneven)
-
-
 def judge_slices(voxels: NDArray[Any], tilt_deg: float | None, *, uneven: bool | None = False) -> Likeness | None:
-    """Do the same for slices (n, rows, columns) along any axis of a grid; None for an unknown tilt."""
+    """Apply `measure_likeness` to slices (n, rows, columns) along any axis of a grid; to many where it is most
+    suspicious.
+
+    A tilt of None is an unknown one.
+    """
     parts = tilt_deg is not None and tilt_deg <= TILT_REPORT_DEG
     count = len(voxels)
     if uneven or count <= WINDOW * WINDOWS:

@@ -11,10 +11,10 @@ from dicom_series import Plan, set_values, write_series
 
 from clrecon.dicom import read_volume
 from clrecon.dicom.pixels.voxels import read_voxels
-from clrecon.dicom.series.plausibility import collect_voxel_warnings
 from clrecon.dicom.series.scan import scan_path
 from clrecon.dicom.series.series import group_series
 from clrecon.errors import RefusedInputError
+from clrecon.sources.plausibility import collect_voxel_warnings
 
 SHAPE = (6, 48, 48)
 

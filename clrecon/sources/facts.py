@@ -1,0 +1,33 @@
+"""What was seen in the voxels of an input while they were read."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+__all__ = ["PixelFacts"]
+
+
+@dataclass(frozen=True)
+class PixelFacts:
+    """Figures of the pixels that were read.
+
+    Attributes
+    ----------
+    padding_share : float
+        Share of the voxels, 0 to 1.
+    hu_min, hu_max : float
+        Lowest and highest HU of the volume, padding included.
+    padding_hu : float or None
+        HU that padding was filled with; None without padding.
+    stray : int
+        Number of values that lost bits of their own, see `clrecon.dicom.pixels.stray_bits`.
+    stray_text : str
+        One line about these values; empty if there are none.
+    """
+
+    padding_share: float
+    hu_min: float
+    hu_max: float
+    padding_hu: float | None = None
+    stray: int = 0
+    stray_text: str = ""

@@ -1,0 +1,98 @@
+"""What a listing of an input says of each series, in JSON types."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+from clrecon.errors import ClreconError
+from clrecon.geometry.certificate import Certificate
+
+__all__ = ["SeriesEntry", "SeriesListing"]
+
+
+@dataclass(frozen=True)
+class SeriesEntry:
+    """One line of a listing; `as_dict` is the documented machine-readable form.
+
+    Attributes
+    ----------
+    number : int
+        From 1, the value that ``series=`` takes.
+    patient, study : int or None
+        Numbers of the patient and the study among those found, from 1; their identifiers are not given.  None where the
+        files do not tell.
+    kind : {"stack", "localizer", "capture", "other"}
+        Only stacks are read.
+    phases : list of dict
+        ``{"number", "keyword", "value", "slices"}`` of each volume, where slices share places; else empty.
+    slices : int
+        Number of images, with copies and all phases.
+    uid_hash : str or None
+        First 16 hexadecimal digits of the SHA-256 of the SeriesInstanceUID, None where the files have none.
+    shape_ijk, spacing_mm, affine_ijk_to_lps_mm, tilt_deg : list, list, nested list, float; or None
+        None where the geometry is unknown or refused.
+    grid_residual_max_mm : float or None
+        Largest distance of a slice position from the affine.
+    gap_mm : dict
+        "min", "max" and "median" distance of neighbouring slices along the normal, None where unknown.
+    extent_mm : list or None
+        Size of the box of whole voxels along rows, columns and the slice normal.
+    slice_thickness_mm : float or None
+        As stated; not used for the geometry.
+    dropped : dict of str to int
+        Maps a reason to the number of slices left out of the stack.
+    """
+
+    number: int
+    uid_hash: str | None
+    description: str
+    modality: str
+    slices: int
+    shape_ijk: list[int] | None
+    spacing_mm: list[float] | None
+    affine_ijk_to_lps_mm: list[list[float]] | None
+    tilt_deg: float | None
+    grid_residual_max_mm: float | None
+    gap_mm: dict[str, float | None]
+    uneven: bool | None
+    warnings: list[str]
+    problems: list[str]
+    patient: int | None = None
+    study: int | None = None
+    kind: str = "stack"
+    phases: list[dict[str, Any]] = field(default_factory=list)
+    extent_mm: list[float] | None = None
+    slice_thickness_mm: float | None = None
+    dropped: dict[str, int] = field(default_factory=dict)
+
+    def as_dict(self) -> dict[str, Any]:
+        """The entry as a dict of JSON types."""
+        return asdict(self)
+
+
+@dataclass(frozen=True)
+class SeriesListing:
+    """The series at a path.
+
+    Attributes
+    ----------
+    series : list of SeriesEntry
+    chosen : int or None
+        Number of the series that `read_volume` reads for the same ``series``; None where it would not choose.
+    skipped : dict of str to int
+        Maps a reason to the number of files passed over.
+    warnings : list of str
+    certificate : Certificate or None
+        Certificate of the chosen series, as in ``volume.report``, even if the series is refused; None where no series
+        is chosen or none of its slices has a valid header.
+    refusal : ClreconError or None
+        The reason why no series is chosen; `warnings` contains its text too.
+    """
+
+    series: list[SeriesEntry]
+    chosen: int | None
+    skipped: dict[str, int]
+    warnings: list[str]
+    certificate: Certificate | None = None
+    refusal: ClreconError | None = None
