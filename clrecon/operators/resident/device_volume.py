@@ -7,7 +7,7 @@ from collections.abc import Callable, Hashable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from types import TracebackType
-from typing import Any, TypeVar
+from typing import Any, NoReturn, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,10 +30,13 @@ from clrecon.opencl import (
 )
 from clrecon.operators.resident.stack_table import StackTable
 from clrecon.operators.resident.voxel_types import ray_variants
+from clrecon.system.log import get_logger
 
 __all__ = ["DeviceVolume", "open_volume", "take_volume"]
 
 Made = TypeVar("Made")
+
+log = get_logger(__name__)
 
 
 @dataclass(frozen=True)
@@ -118,6 +121,10 @@ class DeviceVolume:
         self._taken = None
 
     # Data on the device
+
+    def __reduce__(self) -> NoReturn:
+        """Refuse to be pickled or copied: buffers stay with their process."""
+        raise TypeError("a DeviceVolume belongs to its process: send its volume, and make one there")
 
     @property
     def dtype(self) -> np.dtype[Any]:
@@ -318,6 +325,7 @@ class DeviceVolume:
                     raise
                 is_last = slices <= fewest  # once more, with nothing else on the device
                 slices = self.most_slices[what] = max(fewest, -(-slices // 2))
+                log.info("%s: no room on %s, continued with slabs of %d slices", what, self.device.label, slices)
                 if warnings is not None:
                     warnings.append(f"{error}: continued with slabs of {slices} slices")
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 from collections.abc import Callable
 
 import numpy as np
@@ -214,6 +215,19 @@ def test_a_device_volume_has_its_own_device_and_memory(device, volume):
             DeviceVolume(wrong, device=device)
     with pytest.raises(UsageError, match="whole number of bytes"):
         DeviceVolume(volume, device=device, memory=0)
+
+
+def test_halving_is_logged_and_buffers_are_not_pickled(device, volume, monkeypatch, caplog):
+    with (
+        DeviceVolume(volume, device=device) as resident,
+        monkeypatch.context() as patch,
+        caplog.at_level("INFO", "clrecon"),
+    ):
+        Failing(patch, "buffer", 1)
+        clrecon.render(resident, "mip", size=SIZE)
+        assert any("rays: no room on" in record.getMessage() for record in caplog.records)
+        with pytest.raises(TypeError, match="belongs to its process"):
+            pickle.dumps(resident)
 
 
 def test_renderers_and_extractors_leave_a_volume_that_was_given_on_the_device(device, volume):
