@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -14,59 +13,43 @@ from clrecon.opencl import Stopwatch
 from clrecon.operators.rays.buffers import PictureBuffers
 from clrecon.operators.rays.composite import TransferTables, composite_slab
 from clrecon.operators.rays.leaps import find_leaps
-from clrecon.operators.rays.project import PROJECTIONS, project_slab
+from clrecon.operators.rays.project import project_slab
 from clrecon.operators.rays.ray_view import RayView
 from clrecon.operators.rays.slabs import RAYS, RaySlab, entry_slice, plan_ray_slabs, ray_slabs
 from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.operators.resident.frame import volume_box
-from clrecon.rendering import Lighting, Rendering, TransferFunction
-from clrecon.rendering.looks.label_style import LabelStyle
+from clrecon.rendering import Lighting, Rendering
 from clrecon.rendering.looks.window import choose_water_window, choose_window, grey_image
+from clrecon.rendering.pictures.styles import Projection, VolumeLook
 from clrecon.rendering.views.camera import Camera
-from clrecon.rendering.views.clip import Clip
+from clrecon.system.progress import Progress, ignore_progress
 
-__all__ = ["RayPicture", "take_picture"]
+__all__ = ["take_picture"]
 
 
-@dataclass(frozen=True)
-class RayPicture:
-    """The description of a picture.
+def take_picture(
+    resident: DeviceVolume,
+    style: VolumeLook | Projection,
+    camera: Camera,
+    size: tuple[int, int],
+    ray_step: float,
+    background: str | Sequence[float] | None = None,
+    progress: Progress | None = None,
+) -> Rendering:
+    """Take one picture of a volume on a device.
 
-    Attributes
+    Parameters
     ----------
-    mode : {"dvr", "mip", "minip", "mean", "drr"}
+    resident : DeviceVolume
+    style : VolumeLook or Projection
     camera : Camera
     size : (width, height)
     ray_step : float
         mm.
-    function : TransferFunction
-        Of volume rendering.
-    lighting : Lighting
-    window : (low, high) or None
-        Values of black and white in projections, in HU (in drr mm of water); None: chosen from the values.
-    clip : Clip or None
-    background : colour or None
+    background : str or (float, float, float), optional
         None: transparent.
-    jitter : bool
-    style : LabelStyle or None
-        Of volume rendering.
-    """
-
-    mode: str
-    camera: Camera
-    size: tuple[int, int]
-    ray_step: float
-    function: TransferFunction
-    lighting: Lighting
-    window: tuple[float, float] | None = None
-    clip: Clip | None = None
-    background: str | Sequence[float] | None = None
-    jitter: bool = False
-    style: LabelStyle | None = None
-
-
-def take_picture(resident: DeviceVolume, picture: RayPicture) -> Rendering:
-    """Take one picture of a volume on a device.
+    progress : callable, optional
+        Called as ``progress("slabs", slices done, all slices)``.
 
     Raises
     ------
@@ -75,84 +58,95 @@ def take_picture(resident: DeviceVolume, picture: RayPicture) -> Rendering:
     RefusedInputError
         The labels do not lie on the volume.
     """
-    return _Job(resident, picture).run()
+    return _Job(resident, style, camera, size, ray_step, background, progress or ignore_progress).run()
 
 
 class _Job:
-    def __init__(self, resident: DeviceVolume, picture: RayPicture):
-        self.resident, self.picture = resident, picture
-        self.labels = None if picture.style is None else resident.bring(picture.style.labels)
+    def __init__(
+        self,
+        resident: DeviceVolume,
+        style: VolumeLook | Projection,
+        camera: Camera,
+        size: tuple[int, int],
+        ray_step: float,
+        background: str | Sequence[float] | None,
+        progress: Progress,
+    ):
+        self.resident, self.style, self.camera, self.size = resident, style, camera, size
+        self.ray_step, self.background, self.progress = ray_step, background, progress
+        label_style = style.label_style if isinstance(style, VolumeLook) else None
+        self.labels = None if label_style is None else resident.bring(label_style.labels)
         self.warnings = [] if self.labels is None else list(self.labels.warnings)
+        self.lighting = style.light if isinstance(style, VolumeLook) else Lighting()
         self.stopwatch = Stopwatch()
         self.box = volume_box(resident.volume)
-        self.planes = None if picture.clip is None else picture.clip.planes
+        self.planes = None if style.clip is None else style.clip.planes
 
     def run(self) -> Rendering:
         """Take the picture, with thinner slabs if the device has no room for the planned ones."""
         resident = self.resident
-        slices = plan_ray_slabs(resident, *PictureBuffers.needs(self.picture.size), self.labels)
+        slices = plan_ray_slabs(resident, *PictureBuffers.needs(self.size), self.labels)
         return resident.halve(RAYS, slices, self._take, warnings=self.warnings)
 
     def _take(self, slices: int) -> Rendering:
         """Go through the slabs and collect the picture."""
-        resident, picture, stopwatch = self.resident, self.picture, self.stopwatch
-        device = resident.device
-        several = slices < resident.volume.shape_ijk[2]
-        output = PictureBuffers(device, picture.size, picture.background, several)
+        resident, style, stopwatch = self.resident, self.style, self.stopwatch
+        device, nk = resident.device, resident.volume.shape_ijk[2]
+        output = PictureBuffers(device, self.size, self.background, slices < nk)
         slabs = 0
-        for slab in ray_slabs(resident, slices, entry_slice(resident.volume, picture.camera), stopwatch):
+        self.progress("slabs", 0, nk)
+        for slab in ray_slabs(resident, slices, entry_slice(resident.volume, self.camera), stopwatch):
             slabs += 1
-            if picture.mode in PROJECTIONS:
+            if isinstance(style, Projection):
                 with stopwatch.running(device):  # wait: CPU devices read host arrays
-                    project_slab(resident, slab, self._view(self.box), picture.mode, output, stopwatch)
+                    project_slab(resident, slab, self._view(self.box), style.kind, output, stopwatch)
             else:
-                self._composite(slab, output)
+                self._composite(slab, style, output)
+            self.progress("slabs", min(slabs * slices, nk), nk)
         with stopwatch.timed("download"):
             image, depths, means = output.download()
         report = {
-            "mode": picture.mode,
+            "mode": style.mode,
             "device": device.label,
             "driver": device.driver,
-            "ray_step_mm": picture.ray_step,
+            "ray_step_mm": self.ray_step,
             "slabs": slabs,
             "seconds": dict(stopwatch.seconds),
             "kernel_seconds": dict(stopwatch.by_kernel),
             "warnings": list(self.warnings),
         }
-        if picture.mode in PROJECTIONS:
-            return self._finish_projection(means, depths, report)
-        report["unit_distance_mm"] = picture.function.unit_distance
-        return Rendering(image, depths, means, picture.camera, None, picture.mode, report)
+        if isinstance(style, Projection):
+            return self._finish_projection(style, means, depths, report)
+        report["unit_distance_mm"] = style.function.unit_distance
+        return Rendering(image, depths, means, self.camera, None, style.mode, report)
 
-    def _composite(self, slab: RaySlab, output: PictureBuffers) -> None:
-        resident, picture, stopwatch = self.resident, self.picture, self.stopwatch
-        key = (picture.function, picture.ray_step)
+    def _composite(self, slab: RaySlab, style: VolumeLook, output: PictureBuffers) -> None:
+        resident, stopwatch = self.resident, self.stopwatch
+        key = (style.function, self.ray_step)
         tables = resident.keep("transfer function", key, 0, lambda: TransferTables.of(resident.device, *key))
         with stopwatch.running(resident.device):
             leaps = find_leaps(resident, slab, key, tables.shown, tables.low, tables.scale, stopwatch)
         nothing = (self.box[1], self.box[1])
         view = self._view(nothing if leaps.box is None else leaps.box)
         composite_slab(
-            resident, slab, view, tables, leaps, picture.lighting, picture.jitter, self.labels, picture.style,
+            resident, slab, view, tables, leaps, self.lighting, style.jitter, self.labels, style.label_style,
             output, stopwatch,
         )  # fmt: skip
 
     def _finish_projection(
-        self, values: NDArray[np.float32], depths: NDArray[np.float32], report: dict[str, Any]
+        self, style: Projection, values: NDArray[np.float32], depths: NDArray[np.float32], report: dict[str, Any]
     ) -> Rendering:
-        picture = self.picture
-        is_water = picture.mode == "drr"
-        window = picture.window or (choose_water_window if is_water else choose_window)(values)
+        is_water = style.kind == "drr"
+        window = style.window or (choose_water_window if is_water else choose_window)(values)
         report["window_mm_water" if is_water else "window_hu"] = list(window)
         image = grey_image(values, window)
         if is_water:
             image[values <= 0.0, 3] = 0  # nothing attenuates there, inside the volume or beside it
-        made = Rendering(image, depths, depths.copy(), picture.camera, values, picture.mode, report)
-        return made if picture.background is None else made.with_background(picture.background)
+        made = Rendering(image, depths, depths.copy(), self.camera, values, style.kind, report)
+        return made if self.background is None else made.with_background(self.background)
 
     def _view(self, focus: tuple[Float64Array, Float64Array]) -> RayView:
-        picture = self.picture
         return RayView.of(
-            self.resident.volume, picture.camera, picture.size, picture.ray_step,
-            lighting=picture.lighting, planes=self.planes, box=self.box, focus=focus,
+            self.resident.volume, self.camera, self.size, self.ray_step,
+            lighting=self.lighting, planes=self.planes, box=self.box, focus=focus,
         )  # fmt: skip

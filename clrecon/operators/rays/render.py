@@ -12,14 +12,13 @@ import numpy as np
 from clrecon.errors import UsageError
 from clrecon.geometry import Volume
 from clrecon.opencl import Device
-from clrecon.operators.rays.ray_pictures import RayPicture, take_picture
+from clrecon.operators.rays.ray_pictures import take_picture
 from clrecon.operators.rays.slices import overlay_slices
-from clrecon.operators.rays.surface import SURFACE_COLOR, cast_surface
+from clrecon.operators.rays.surface import cast_surface
 from clrecon.operators.reformat.cut import cut_slice, reformat_curve
 from clrecon.operators.resident.device_volume import DeviceVolume, take_volume
-from clrecon.rendering import Lighting, Rendering
+from clrecon.rendering import Rendering
 from clrecon.rendering.looks.colors import is_transparent
-from clrecon.rendering.looks.presets import DEFAULT_PRESET, find_preset
 from clrecon.rendering.pictures.modes import check_known, find_style
 from clrecon.rendering.pictures.styles import (
     CurveCut,
@@ -127,42 +126,13 @@ class VolumeRenderer:
         camera = place.camera_for(self.volume, size)
         ground = None if is_transparent(background) else background
         if isinstance(style, SurfaceLook):
-            return self._surface(style, camera, size, ground)
+            step = self._checked_step(style.ray_step)
+            return cast_surface(self._resident, style, camera, size, step, ground, progress)
         if isinstance(style, SlicesInSpace):
-            return overlay_slices(self._resident, camera, size, background=ground, **style.parameters())
+            return overlay_slices(self._resident, style, camera, size, ground, progress)
         assert isinstance(style, VolumeLook | Projection)
-        return self._sample(style, camera, size, ground)
-
-    def _sample(
-        self,
-        style: VolumeLook | Projection,
-        camera: Camera,
-        size: tuple[int, int],
-        background: str | Sequence[float] | None,
-    ) -> Rendering:
-        """Volume rendering, or a projection."""
         step = self._checked_step(style.ray_step)
-        if isinstance(style, Projection):
-            unseen = find_preset(DEFAULT_PRESET).transfer_function
-            picture = RayPicture(
-                style.kind, camera, size, step, unseen, Lighting(), style.window, style.clip, background
-            )
-            return take_picture(self._resident, picture)
-        function = style.function
-        picture = RayPicture(
-            style.mode, camera, size, step, function, style.light, None,
-            style.clip, background, style.jitter, style.label_style,
-        )  # fmt: skip
-        return take_picture(self._resident, picture)
-
-    def _surface(
-        self, style: SurfaceLook, camera: Camera, size: tuple[int, int], background: str | Sequence[float] | None
-    ) -> Rendering:
-        return cast_surface(
-            self._resident, style.iso_value, camera, size, self._checked_step(style.ray_step),
-            lighting=style.lighting, clip=style.clip, color=SURFACE_COLOR if style.color is None else style.color,
-            background=background, shadows=style.shadows, depth_cue=style.depth_cue or 0.0, style=style.label_style,
-        )  # fmt: skip
+        return take_picture(self._resident, style, camera, size, step, ground, progress)
 
     def _cut(
         self,

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,21 +17,15 @@ from clrecon.operators.rays.ray_view import RayView
 from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.operators.resident.frame import FieldFrame, volume_box
 from clrecon.operators.resident.voxel_types import voxel_variants
-from clrecon.rendering import Rendering, TransferFunction
-from clrecon.rendering.looks.window import checked_window
+from clrecon.rendering import Rendering
+from clrecon.rendering.pictures.styles import SlicesInSpace
 from clrecon.rendering.views.camera import Camera
-from clrecon.rendering.views.clip import Clip
+from clrecon.system.progress import Progress, ignore_progress
 
-__all__ = ["DEFAULT_OPACITY", "LOWEST_SHOWN_HU", "choose_slices", "overlay_slices"]
+__all__ = ["choose_slices", "overlay_slices"]
 
 DEFAULT_COUNT = 12
 """Number of slices shown by default: enough to see the body, few enough to see each slice."""
-
-DEFAULT_OPACITY = 0.5
-"""Opacity of a slice: the front slices are bright, and the third still shows an eighth of its light."""
-
-LOWEST_SHOWN_HU = -300.0
-"""Lower values are transparent, so that the slices behind are visible: air, lung and most things around a patient."""
 
 DEFAULT_WINDOW = (-300.0, 400.0)
 """HU of black and white without a window or a transfer function: soft tissue and bone."""
@@ -54,48 +47,32 @@ def choose_slices(volume: Volume, slices: int | Sequence[int] | None = None) -> 
     ----------
     volume : Volume
     slices : int or sequence of int, optional
-        An int n: every n-th slice from the first.  A list: those slices.  None: about twelve, evenly spaced.
+        As `SlicesInSpace.slices`.
 
     Raises
     ------
     UsageError
-        An int below 1, an empty list, a slice named twice, or one that the volume does not have.
+        One that the volume does not have.
     """
     nk = volume.shape_ijk[2]
     if slices is None:
         count = min(nk, DEFAULT_COUNT)
         return np.unique(np.rint(np.linspace(0, nk - 1, count)).astype(int)).tolist()
-    if isinstance(slices, (int, np.integer)) and not isinstance(slices, bool):
-        if slices < 1:
-            raise UsageError(f"every {slices}th slice cannot be shown: give 1 or more, or a list of slices")
-        return list(range(0, nk, int(slices)))
-    try:
-        numbers = np.asarray(slices)
-    except (TypeError, ValueError):
-        numbers = np.empty(0)
-    if numbers.ndim != 1 or not len(numbers) or numbers.dtype.kind not in "iu":
-        raise UsageError(f"slices are a number (every n-th) or a list of whole numbers k, not {slices!r}")
-    chosen = sorted(numbers.tolist())
-    if chosen[0] < 0 or chosen[-1] >= nk:
-        outside = chosen[0] if chosen[0] < 0 else chosen[-1]
-        raise UsageError(f"slice {outside} is not there: the volume has slices 0 to {nk - 1}")
-    if len(set(chosen)) < len(chosen):
-        raise UsageError(f"slices are named twice: {slices!r}")
-    return chosen
+    if isinstance(slices, int):
+        return list(range(0, nk, slices))
+    for k in slices:
+        if not 0 <= k < nk:
+            raise UsageError(f"slice {k} is not there: the volume has slices 0 to {nk - 1}")
+    return sorted(slices)
 
 
 def overlay_slices(
     resident: DeviceVolume,
+    style: SlicesInSpace,
     camera: Camera,
     size: tuple[int, int],
-    *,
-    slices: int | Sequence[int] | None = None,
-    opacity: float = DEFAULT_OPACITY,
-    lowest_hu: float = LOWEST_SHOWN_HU,
-    window: Sequence[float] | None = None,
-    transfer_function: TransferFunction | None = None,
-    clip: Clip | None = None,
     background: str | Sequence[float] | None = None,
+    progress: Progress | None = None,
 ) -> Rendering:
     """Show slices of a volume in space, each translucent at its own place: sheared and uneven stacks too.
 
@@ -105,21 +82,13 @@ def overlay_slices(
     Parameters
     ----------
     resident : DeviceVolume
+    style : SlicesInSpace
     camera : Camera
     size : (width, height)
-    slices : int or sequence of int, optional
-        See `choose_slices`.
-    opacity : float
-        Opacity of each slice, above 0 to 1.
-    lowest_hu : float
-        Lower values are transparent.
-    window : (low, high), optional
-        HU that are black and white.
-    transfer_function : TransferFunction, optional
-        Gives colours in place of grey; its opacity is not used.
-    clip : Clip, optional
     background : str or (float, float, float), optional
         None: transparent.
+    progress : callable, optional
+        Called as ``progress("slabs", slices done, all that are shown)``.
 
     Returns
     -------
@@ -129,55 +98,30 @@ def overlay_slices(
     Raises
     ------
     UsageError
-        As `choose_slices`; an opacity outside of 0 to 1; both a window and a transfer function.
+        As `choose_slices`.
     DeviceError
         Not even one slice fits the device.
     """
-    chosen = choose_slices(resident.volume, slices)
-    look = _Look.of(opacity, lowest_hu, window, transfer_function)
-    job = _Overlay(resident, camera, size, chosen, look, clip)
-    return job.run(background)
+    chosen = choose_slices(resident.volume, style.slices)
+    return _Overlay(resident, style, camera, size, chosen, progress or ignore_progress).run(background)
 
 
-@dataclass(frozen=True)
-class _Look:
+class _Colors(NamedTuple):
     """Colours (NODES, 4) float32 by value; the nearest node to v is ``floor((v - low) * scale + 0.5)``."""
 
-    opacity: float
-    lowest: float
-    colors: NDArray[np.float32]
+    table: NDArray[np.float32]
     low: float
     scale: float
 
     @classmethod
-    def of(
-        cls,
-        opacity: float,
-        lowest_hu: float,
-        window: Sequence[float] | None,
-        function: TransferFunction | None,
-    ) -> _Look:
-        share, lowest = _number(opacity), _number(lowest_hu)
-        if not 0.0 < share <= 1.0:
-            raise UsageError(f"the opacity of a slice lies above 0 and up to 1, not at {opacity!r}")
-        if math.isnan(lowest):
-            raise UsageError(f"the lowest HU that slices show is a number, not {lowest_hu!r}")
-        if function is not None and window is not None:
-            raise UsageError("slices are coloured by a window or by a transfer function, not by both")
-        if function is not None:
-            low, high = function.range_hu
-            colors = function.table(low, high, NODES)
+    def of(cls, style: SlicesInSpace) -> _Colors:
+        if style.transfer_function is not None:
+            low, high = style.transfer_function.range_hu
+            colors = style.transfer_function.table(low, high, NODES)
         else:
-            low, high = DEFAULT_WINDOW if window is None else checked_window(window)
+            low, high = DEFAULT_WINDOW if style.window is None else style.window
             colors = np.repeat(np.linspace(0.0, 1.0, NODES)[:, None], 4, axis=1).astype(np.float32)
-        return cls(share, lowest, colors, low, (NODES - 1) / (high - low))
-
-
-def _number(value: float) -> float:
-    try:
-        return float(value)
-    except (TypeError, ValueError):
-        return math.nan
+        return cls(colors, low, (NODES - 1) / (high - low))
 
 
 def _sort_slices(volume: Volume, camera: Camera, chosen: Sequence[int]) -> list[int]:
@@ -211,16 +155,17 @@ class _Overlay:
     def __init__(
         self,
         resident: DeviceVolume,
+        style: SlicesInSpace,
         camera: Camera,
         size: tuple[int, int],
         chosen: list[int],
-        look: _Look,
-        clip: Clip | None,
+        progress: Progress,
     ):
-        self.resident, self.chosen, self.look = resident, chosen, look
+        self.resident, self.chosen, self.style, self.progress = resident, chosen, style, progress
+        self.colors = _Colors.of(style)
         self.order = _sort_slices(resident.volume, camera, chosen)
         box = volume_box(resident.volume)
-        planes = None if clip is None else clip.planes
+        planes = None if style.clip is None else style.clip.planes
         self.view = RayView.of(resident.volume, camera, size, 1.0, planes=planes, box=box, focus=box)
         self.stopwatch = Stopwatch()
         self.warnings = _warn(resident.volume, camera)
@@ -245,8 +190,10 @@ class _Overlay:
         stopwatch, device = self.stopwatch, self.resident.device
         parts = [self.order[first : first + slices] for first in range(0, len(self.order), slices)]
         output = PictureBuffers(device, self.view.size, background, len(parts) > 1)
+        self.progress("slabs", 0, len(self.order))
         for number, part in enumerate(parts):
             self._draw(part, (number == 0) + 2 * (number == len(parts) - 1), output)
+            self.progress("slabs", min((number + 1) * slices, len(self.order)), len(self.order))
         with stopwatch.timed("download"):
             image, depths, means = output.download()
         report = {
@@ -254,8 +201,8 @@ class _Overlay:
             "device": device.label,
             "driver": device.driver,
             "slices": self.chosen,
-            "slice_opacity": self.look.opacity,
-            "lowest_shown_hu": self.look.lowest,
+            "slice_opacity": self.style.opacity,
+            "lowest_shown_hu": self.style.lowest_hu,
             "seconds": dict(stopwatch.seconds),
             "kernel_seconds": dict(stopwatch.by_kernel),
             "warnings": self.warnings,
@@ -264,7 +211,7 @@ class _Overlay:
 
     def _draw(self, part: Sequence[int], stage: int, output: PictureBuffers) -> None:
         """Draw slices in the given order, and wait."""
-        resident, look, view, stopwatch = self.resident, self.look, self.view, self.stopwatch
+        resident, style, colors, view, stopwatch = self.resident, self.style, self.colors, self.view, self.stopwatch
         device, volume = resident.device, resident.volume
         places = np.zeros((len(part), 4), np.float32)
         places[:, :3] = FieldFrame.of(volume).places(volume.slice_origins()[list(part)])
@@ -278,8 +225,8 @@ class _Overlay:
         with stopwatch.running(device):  # wait: CPU devices read the host's array
             launch(
                 device, program["overlay_slices"], output.items(queues, 1), stopwatch=stopwatch,
-                slices=slices_d, places=upload(device, places), colors=upload(device, look.colors),
-                view=upload(device, view.table), ni=ni, nj=nj, count=len(part), bins_low=look.low,
-                bins_scale=look.scale, opacity=look.opacity, lowest=look.lowest, stage=stage, queues=queues,
+                slices=slices_d, places=upload(device, places), colors=upload(device, colors.table),
+                view=upload(device, view.table), ni=ni, nj=nj, count=len(part), bins_low=colors.low,
+                bins_scale=colors.scale, opacity=style.opacity, lowest=style.lowest_hu, stage=stage, queues=queues,
                 **output.arguments, **view.arguments,
             )  # fmt: skip

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from clrecon.errors import DeviceError, UsageError
+from clrecon.errors import DeviceError
 from clrecon.geometry import Volume
-from clrecon.geometry.affine import Float64Array
 from clrecon.geometry.iso_rule import IsoRule, choose_iso_rule
 from clrecon.opencl import Stopwatch, launch, memory_limits, upload
 from clrecon.operators.rays.buffers import PictureBuffers, count_queues, highlight_table
@@ -21,16 +19,12 @@ from clrecon.operators.rays.slabs import RAYS, LeapMap, RaySlab, entry_slice, pl
 from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.operators.resident.frame import FieldFrame, enclose
 from clrecon.operators.resident.voxel_types import label_variants
-from clrecon.rendering import Lighting, Rendering
-from clrecon.rendering.looks.colors import find_color
-from clrecon.rendering.looks.label_style import LabelStyle
+from clrecon.rendering import Rendering
+from clrecon.rendering.pictures.styles import SurfaceLook
 from clrecon.rendering.views.camera import Camera, box_corners
-from clrecon.rendering.views.clip import Clip
+from clrecon.system.progress import Progress, ignore_progress
 
-__all__ = ["SURFACE_COLOR", "cast_surface"]
-
-SURFACE_COLOR = "bone"
-"""Colour of a surface without labels."""
+__all__ = ["cast_surface"]
 
 CLOSED_BORDER = 1.0
 """Index steps beyond the outermost voxel centres within which the closed field falls to its outside value."""
@@ -38,18 +32,12 @@ CLOSED_BORDER = 1.0
 
 def cast_surface(
     resident: DeviceVolume,
-    iso_value: float,
+    style: SurfaceLook,
     camera: Camera,
     size: tuple[int, int],
     ray_step: float,
-    *,
-    lighting: Lighting | None = None,
-    clip: Clip | None = None,
-    color: str | Sequence[float] = SURFACE_COLOR,
     background: str | Sequence[float] | None = None,
-    shadows: bool = False,
-    depth_cue: float = 0.0,
-    style: LabelStyle | None = None,
+    progress: Progress | None = None,
 ) -> Rendering:
     """Show where the field first reaches an iso value along each ray.
 
@@ -61,26 +49,19 @@ def cast_surface(
     Parameters
     ----------
     resident : DeviceVolume
-    iso_value : float
-        HU; inside is ``>= iso_value``.
+    style : SurfaceLook
+        With `shadows`, a hit has only ambient light if the way from it to the fixed light meets something inside, one
+        ray step away or farther; translucent labels let their share through.  A hit in a label with opacity below 1 is
+        blended, and the ray continues: out of the inside to the next entry, or into the next label.
+        The label of a hit is that of the nearest inside voxel of its cell that has one.
     camera : Camera
     size : (width, height)
     ray_step : float
         Distance of samples, mm.  If the volume is processed in slabs, at most one slice.
-    lighting : Lighting, optional
-    clip : Clip, optional
-    color : str or (float, float, float)
-        Colour of the surface, see `clrecon.rendering.looks.colors.find_color`.
     background : str or (float, float, float), optional
         None: transparent.
-    shadows : bool
-        True: a hit has only ambient light if the way from it to the fixed light meets something inside, one ray step
-        away or farther; labels that are translucent by `style` let their share through.
-    depth_cue : float
-        Share of the brightness, 0 to 1, that is lost from the nearest corner of the volume to the farthest.
-    style : LabelStyle, optional
-        A hit in a label with opacity below 1 is blended, and the ray continues: out of the inside to the next entry, or
-        into the next label.  The label of a hit is that of the nearest inside voxel of its cell that has one.
+    progress : callable, optional
+        Called as ``progress("slabs", slices done, all slices)``.
 
     Returns
     -------
@@ -90,7 +71,7 @@ def cast_surface(
     Raises
     ------
     UsageError
-        Shadows are asked for without a fixed light, the depth cue is not a share, or as `choose_iso_rule`.
+        As `choose_iso_rule`.
     NoSurfaceError
         The volume holds values that have no surface.
     RefusedInputError
@@ -98,33 +79,9 @@ def cast_surface(
     DeviceError
         Not enough memory: for shadows the volume has to fit the device as a whole.
     """
-    look = _Look.of(Lighting() if lighting is None else lighting, color, shadows, depth_cue)
-    rule = choose_iso_rule(resident.volume, iso_value, values=resident.values)
-    job = _Job(resident, rule, look, camera, size, float(ray_step), clip, style)
+    rule = choose_iso_rule(resident.volume, style.iso_value, values=resident.values)
+    job = _Job(resident, rule, style, camera, size, float(ray_step), progress or ignore_progress)
     return job.run(background)
-
-
-@dataclass(frozen=True)
-class _Look:
-    lighting: Lighting
-    color: Float64Array
-    shadows: bool
-    depth_cue: float
-
-    @classmethod
-    def of(cls, lighting: Lighting, color: str | Sequence[float], shadows: bool, depth_cue: float) -> _Look:
-        if shadows and lighting.direction is None:
-            raise UsageError(
-                "shadows need a light that stands still: with a light at the camera none is seen; give lighting a"
-                " direction, such as Lighting(direction=(0.5, -1, 1))"
-            )
-        try:
-            cue = float(depth_cue)
-        except (TypeError, ValueError):
-            cue = -1.0
-        if not 0.0 <= cue <= 1.0:
-            raise UsageError(f"the depth cue is a share of the brightness from 0 to 1, not {depth_cue!r}")
-        return cls(lighting, find_color(color), bool(shadows), cue)
 
 
 class _Job:
@@ -134,18 +91,17 @@ class _Job:
         self,
         resident: DeviceVolume,
         rule: IsoRule,
-        look: _Look,
+        style: SurfaceLook,
         camera: Camera,
         size: tuple[int, int],
         ray_step: float,
-        clip: Clip | None,
-        style: LabelStyle | None,
+        progress: Progress,
     ):
-        self.resident, self.rule, self.look = resident, rule, look
+        self.resident, self.rule, self.look, self.progress = resident, rule, style, progress
         self.camera, self.size, self.ray_step = camera, size, ray_step
-        self.planes = np.empty((0, 4)) if clip is None else clip.planes
-        self.style = style
-        self.labels = None if style is None else resident.bring(style.labels)
+        self.planes = np.empty((0, 4)) if style.clip is None else style.clip.planes
+        self.style = style.label_style
+        self.labels = None if self.style is None else resident.bring(self.style.labels)
         self.warnings = [] if self.labels is None else list(self.labels.warnings)
         self.stopwatch = Stopwatch()
         self.frame = FieldFrame.of(resident.volume)
@@ -166,9 +122,11 @@ class _Job:
             self._shorten_steps(self.warnings)
         output = PictureBuffers(device, self.size, background, slices < nk)
         slabs = 0
+        self.progress("slabs", 0, nk)
         for slab in ray_slabs(resident, slices, entry_slice(resident.volume, self.camera), self.stopwatch):
             slabs += 1
             self._trace(slab, output)
+            self.progress("slabs", min(slabs * slices, nk), nk)
         with self.stopwatch.timed("download"):
             image, depths, means = output.download()
         report = {
@@ -206,8 +164,8 @@ class _Job:
             launch(
                 device, resident.program("rays/surface.cl", **variants)["trace_surface"], output.items(queues, lanes),
                 stopwatch=self.stopwatch, leaps=leaps.distances_d, view=upload(device, view.table),
-                highlights=upload(device, highlight_table(look.lighting)), last_place=_float4(*last),
-                slope=resident.stack.slope, level=rule.iso_level, outside=rule.outside, color=_float4(*look.color),
+                highlights=upload(device, highlight_table(look.light)), last_place=_float4(*last),
+                slope=resident.stack.slope, level=rule.iso_level, outside=rule.outside, color=_float4(*look.rgb),
                 light_step=self._light_step(), cue=self._cue(), queues=queues,
                 **{**slab.arguments, "slab_low": low_k, "slab_high": high_k},
                 **tables, **output.arguments, **view.arguments, **resident.stack.arguments,
@@ -241,14 +199,14 @@ class _Job:
             focus = leaps.box[0] - margin, leaps.box[1] + margin
         return RayView.of(
             volume, self.camera, self.size, self.ray_step,
-            lighting=self.look.lighting, planes=self.planes, box=box, focus=focus,
+            lighting=self.look.light, planes=self.planes, box=box, focus=focus,
         )  # fmt: skip
 
     def _light_step(self) -> NDArray[np.float32]:
         """Return field coordinates per mm towards the fixed light, and whether it throws shadows."""
-        if self.look.lighting.direction is None:
+        if self.look.light.direction is None:
             return _float4()
-        light = np.array(self.look.lighting.direction)
+        light = np.array(self.look.light.direction)
         return _float4(*(self.frame.matrix @ (light / np.linalg.norm(light))), float(self.look.shadows))
 
     def _cue(self) -> NDArray[np.float32]:

@@ -17,17 +17,16 @@ from clrecon.operators.reformat.sample import Reformation, sample_sheet
 from clrecon.operators.resident.device_volume import DeviceVolume, open_volume
 from clrecon.rendering import Rendering
 from clrecon.rendering.looks.colors import is_transparent
-from clrecon.rendering.looks.window import BONE_WINDOW, checked_window, grey_image
+from clrecon.rendering.looks.window import BONE_WINDOW, grey_image
+from clrecon.rendering.pictures.styles import CurveCut, PlaneCut
 from clrecon.rendering.views.camera import Camera
 from clrecon.rendering.views.centre_line import Curve
 from clrecon.rendering.views.curved import CurvedSheet, straightened_sheet, stretched_length, stretched_sheet
 from clrecon.rendering.views.directions import checked_size, find_up, find_view
-from clrecon.rendering.views.plane import Sheet, find_plane, finest_step, plane_sheet, positive_mm, slab_samples
+from clrecon.rendering.views.plane import Sheet, find_plane, finest_step, plane_sheet, slab_samples
 from clrecon.system.progress import Progress
 
-__all__ = ["CURVED_KINDS", "cut_slice", "reformat_curve"]
-
-CURVED_KINDS = ("straightened", "stretched")
+__all__ = ["cut_slice", "reformat_curve"]
 
 DEFAULT_SIZE = (1024, 1024)
 
@@ -44,21 +43,18 @@ class _Job:
     def __init__(
         self,
         resident: DeviceVolume,
-        thickness: float,
-        combine: str,
-        window: Sequence[float] | None,
+        style: PlaneCut | CurveCut,
         progress: Progress | None,
     ):
-        self.resident, self.combine, self.progress = resident, combine, progress
-        self.samples = slab_samples(resident.volume, thickness)
-        self.thickness = float(thickness)
-        self.window = checked_window(BONE_WINDOW if window is None else window)
+        self.resident, self.style, self.progress = resident, style, progress
+        self.samples = slab_samples(resident.volume, style.thickness)
+        self.window = BONE_WINDOW if style.window is None else style.window
         self.stopwatch = Stopwatch()
         self.warnings: list[str] = []
 
     def sample(self, sheet: Sheet) -> Reformation:
         return sample_sheet(
-            self.resident, sheet, self.samples, self.combine,
+            self.resident, sheet, self.samples, self.style.combine,
             stopwatch=self.stopwatch, progress=self.progress, warnings=self.warnings,
         )  # fmt: skip
 
@@ -79,8 +75,8 @@ class _Job:
     def describe(self, made: Reformation, pixel_mm: float) -> dict[str, Any]:
         return {
             "pixel_mm": pixel_mm,
-            "thickness_mm": self.thickness,
-            "combine": self.combine if self.samples.intervals else None,
+            "thickness_mm": self.style.thickness,
+            "combine": self.style.combine if self.samples.intervals else None,
             "samples_a_pixel": self.samples.intervals + 1,
             "sample_step_mm": self.samples.step if self.samples.intervals else None,
             "window_hu": list(self.window),
@@ -160,13 +156,14 @@ def cut_slice(
         No device, two slices and the picture do not fit it, or it fails.
     """
     pixels = checked_size(size)
+    style = PlaneCut(thickness=thickness, combine=combine, window=window, pixel_mm=pixel_mm, offset_mm=offset_mm)
     with open_volume(volume, device, memory, "a slice") as resident:
-        job = _Job(resident, thickness, combine, window, progress)
+        job = _Job(resident, style, progress)
         if not isinstance(plane, Camera):
-            plane = find_plane(resident.volume, plane, pixels, zoom=zoom, up=up, pixel_mm=pixel_mm)
+            plane = find_plane(resident.volume, plane, pixels, zoom=zoom, up=up, pixel_mm=style.pixel_mm)
         elif pixel_mm is not None or zoom != 1.0 or up is not None:
             raise UsageError("zoom, up and the size of pixels are those of the camera: leave them out, or the camera")
-        sheet, camera = plane_sheet(plane, pixels, offset_mm)
+        sheet, camera = plane_sheet(plane, pixels, style.offset_mm)
         made = job.sample(sheet)
         if np.isnan(made.values).all():
             raise UsageError(_describe_miss(resident.volume, camera))
@@ -263,30 +260,33 @@ def reformat_curve(
     DeviceError
         No device, two slices and the picture do not fit it, or it fails.
     """
-    _check_kind(kind, angle)
+    style = CurveCut(curve, kind=kind, angle=angle, width_mm=width_mm, pixel_mm=pixel_mm,
+                     thickness=thickness, combine=combine, window=window)  # fmt: skip
     with open_volume(volume, device, memory, "a slice") as resident:
-        job = _Job(resident, thickness, combine, window, progress)
-        line, found = _find_line(resident.volume, curve)
+        job = _Job(resident, style, progress)
+        line, found = _find_line(resident.volume, style.curve, progress)
         across, top = _find_directions(view, up)
         turned = bool((line.points[-1] - line.points[0]) @ top > 0.0)
         line = line.reversed() if turned else line
-        length = line.length if kind == "straightened" else stretched_length(line, across)
-        fitted, pixel = _fit_picture(resident.volume, length, size, pixel_mm, width_mm)
-        curved = _lay_sheet(kind, line, across, fitted, pixel, float(angle))
+        curved, pixel = _lay_sheet(resident.volume, style, line, across, size)
         made = job.sample(curved.sheet)
     made.values[np.isnan(curved.arc)] = np.nan
-    said = _describe_curve(line, curved, kind, across, turned) | {"angle_deg": float(angle), "found": found}
+    said = _describe_curve(line, curved, kind, across, turned) | {"angle_deg": style.angle, "found": found}
     report = job.describe(made, pixel) | {"curve": said}
     report["warnings"] += _warn_of_part(found)
     return job.picture(made, np.full(made.values.shape, np.nan, np.float32), None, "cpr", report, background)
 
 
 def _lay_sheet(
-    kind: str, line: Curve, across: Float64Array, size: tuple[int, int], pixel: float, angle: float
-) -> CurvedSheet:
-    if kind == "straightened":
-        return straightened_sheet(line, across, size, pixel, angle)
-    return stretched_sheet(line, across, size, pixel)
+    volume: Volume, style: CurveCut, line: Curve, across: Float64Array, size: Sequence[int] | None
+) -> tuple[CurvedSheet, float]:
+    """Return the sheet along a curve, and the side of its pixels in mm."""
+    straight = style.kind == "straightened"
+    length = line.length if straight else stretched_length(line, across)
+    fitted, pixel = _fit_picture(volume, length, size, style)
+    if straight:
+        return straightened_sheet(line, across, fitted, pixel, style.angle), pixel
+    return stretched_sheet(line, across, fitted, pixel), pixel
 
 
 def _warn_of_part(found: dict[str, Any] | None) -> list[str]:
@@ -297,24 +297,16 @@ def _warn_of_part(found: dict[str, Any] | None) -> list[str]:
     return [f"the spine was found over {height:.0f} mm of the {searched:.0f} mm of the volume"]
 
 
-def _check_kind(kind: str, angle: float) -> None:
-    if not isinstance(kind, str) or kind not in CURVED_KINDS:
-        raise UsageError(f"a curved reformation is {' or '.join(CURVED_KINDS)}, not {kind!r}")
-    if not np.isfinite(angle) or (angle != 0.0 and kind == "stretched"):
-        raise UsageError(f"the angle turns straightened pictures, in degrees: not {angle!r} in a {kind} one")
-
-
-def _find_line(volume: Volume, curve: Curve | ArrayLike | str) -> tuple[Curve, dict[str, Any] | None]:
+def _find_line(
+    volume: Volume, curve: Curve | ArrayLike | str, progress: Progress | None
+) -> tuple[Curve, dict[str, Any] | None]:
     """Return the centre line, and the facts about it if it was searched for."""
-    if isinstance(curve, str):
-        if curve != "spine":
-            raise UsageError(f"a centre line is its points in LPS mm, or 'spine' to look for it: not {curve!r}")
-        spine = find_spine_line(volume)
-        known = {"height_mm": spine.height_mm, "searched_mm": spine.searched_mm, "sure_share": spine.sure_share}
-        return Curve(spine.points), known | {"points_lps_mm": spine.points.round(3).tolist()}
-    line = curve if isinstance(curve, Curve) else Curve(curve)
-    line.check_within(volume)
-    return line, None
+    if isinstance(curve, Curve):
+        curve.check_within(volume)
+        return curve, None
+    spine = find_spine_line(volume, progress=progress)
+    known = {"height_mm": spine.height_mm, "searched_mm": spine.searched_mm, "sure_share": spine.sure_share}
+    return Curve(spine.points), known | {"points_lps_mm": spine.points.round(3).tolist()}
 
 
 def _find_directions(view: str | Sequence[float], up: str | ArrayLike | None) -> tuple[Float64Array, Float64Array]:
@@ -326,19 +318,19 @@ def _find_directions(view: str | Sequence[float], up: str | ArrayLike | None) ->
 
 
 def _fit_picture(
-    volume: Volume, length: float, size: Sequence[int] | None, pixel_mm: float | None, width_mm: float | None
+    volume: Volume, length: float, size: Sequence[int] | None, style: CurveCut
 ) -> tuple[tuple[int, int], float]:
-    if pixel_mm is not None:
-        pixel = positive_mm("the size of a pixel", pixel_mm)
+    if style.pixel_mm is not None:
+        pixel = style.pixel_mm
     elif size is not None:
         pixel = length / checked_size(size)[1]
     else:
         pixel = finest_step(volume)
     if size is not None:
-        if width_mm is not None:
+        if style.width_mm is not None:
             raise UsageError("the width of a picture is given by its size or in mm, not by both")
         return checked_size(size), pixel
-    width = positive_mm("the width of the picture", DEFAULT_WIDTH_MM if width_mm is None else width_mm)
+    width = DEFAULT_WIDTH_MM if style.width_mm is None else style.width_mm
     return checked_size((max(round(width / pixel), 1), max(round(length / pixel), 1))), pixel
 
 

@@ -25,14 +25,13 @@ from clrecon.opencl import (
 )
 from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.operators.resident.voxel_types import voxel_variants
+from clrecon.rendering.pictures import styles
 from clrecon.rendering.views.plane import Sheet, SlabSamples
 from clrecon.system.progress import Progress
 
 __all__ = ["COMBINATIONS", "Reformation", "prepare_reformat", "sample_sheet"]
 
-COMBINATIONS = {
-    name: kernel_constant("reformat/sample.cl", f"COMBINE_{name.upper()}") for name in ("mean", "max", "min")
-}
+COMBINATIONS = {name: kernel_constant("reformat/sample.cl", f"COMBINE_{name.upper()}") for name in styles.COMBINATIONS}
 """How the samples of a slab are combined: the kernel's numbers."""
 
 SAMPLES_A_LAUNCH = 1 << 23

@@ -13,10 +13,10 @@ from dataclasses import KW_ONLY, dataclass, field, fields
 from functools import cached_property, partial
 from typing import Any, ClassVar, TypeVar, cast
 
-import numpy as np
 from numpy.typing import ArrayLike
 
 from clrecon.errors import UsageError
+from clrecon.geometry.affine import Float64Array
 from clrecon.geometry.iso_rule import checked_iso_value
 from clrecon.labels import LabelMap
 from clrecon.rendering.looks.colors import find_color
@@ -25,6 +25,8 @@ from clrecon.rendering.looks.lighting import Lighting
 from clrecon.rendering.looks.presets import DEFAULT_PRESET, find_preset
 from clrecon.rendering.looks.transfer_function import TransferFunction
 from clrecon.rendering.looks.window import checked_window
+from clrecon.rendering.pictures import style_checks as checks
+from clrecon.rendering.pictures.style_checks import SPINE
 from clrecon.rendering.views.centre_line import Curve
 from clrecon.rendering.views.clip import Clip
 from clrecon.rendering.views.plane import checked_offset, checked_thickness, positive_mm
@@ -52,11 +54,11 @@ PROJECTIONS = ("mip", "minip", "mean", "drr")
 COMBINATIONS = ("mean", "max", "min")
 CURVED_KINDS = ("straightened", "stretched")
 
-SPINE = "spine"
-"""As a curve: the spinal canal, found in the volume."""
-
 DEFAULT_ISO_VALUE = 200.0
 """HU of surfaces: bone, thin cortex of vertebrae with it."""
+
+DEFAULT_COLOR = "bone"
+"""Of surfaces without labels."""
 
 DEFAULT_OPACITY = 0.5
 """Of a slice in space: the front ones are bright, and the third still shows an eighth of its light."""
@@ -68,95 +70,6 @@ LOWEST_SHOWN_HU = -300.0
 def _field(default: Any, check: Callable[[Any], Any], keyword: str | None = None) -> Any:
     """A field whose values go through `check`; `keyword` is what `render` calls it, where that is another name."""
     return field(default=default, metadata={"check": check} | ({"keyword": keyword} if keyword else {}))
-
-
-def _instance(what: str, kind: type) -> Callable[[Any], Any]:
-    def check(value: Any) -> Any:
-        if isinstance(value, kind):
-            return value
-        raise UsageError(f"the {what} of a picture is a {kind.__name__} or None, not {type(value).__name__}")
-
-    return check
-
-
-def _one_of(names: Sequence[str], text: str) -> Callable[[Any], Any]:
-    def check(value: Any) -> Any:
-        if isinstance(value, str) and value in names:
-            return value
-        raise UsageError(f"{text}, not {value!r:.60}")
-
-    return check
-
-
-def _number(text: str, is_fine: Callable[[float], bool]) -> Callable[[Any], float]:
-    """A check of one number; `text` says what it is, and is followed by what was given."""
-
-    def check(value: Any) -> float:
-        try:
-            number = float(value)
-        except (TypeError, ValueError, OverflowError):
-            number = math.nan
-        if not math.isnan(number) and is_fine(number):
-            return number
-        shown = f"{value:g}" if isinstance(value, float) else f"{value!r:.60}"
-        raise UsageError(f"{text} {shown}")
-
-    return check
-
-
-def _flag(name: str, value: Any) -> bool:
-    if isinstance(value, (bool, np.bool_)):
-        return bool(value)
-    raise UsageError(f"{name} is True or False, not {value!r:.60}")
-
-
-def _color(value: Any) -> Any:
-    find_color(value)
-    return value
-
-
-def _preset_or_function(value: Any) -> Any:
-    if isinstance(value, str):
-        find_preset(value)
-        return value
-    return _instance("transfer function", TransferFunction)(value)
-
-
-def _curve(value: Any) -> Any:
-    if isinstance(value, str):
-        if value == SPINE:
-            return value
-        raise UsageError(f"a centre line is its points in LPS mm, or {SPINE!r} to look for it: not {value!r}")
-    return value if isinstance(value, Curve) else Curve(value)
-
-
-def _slices(value: Any) -> int | tuple[int, ...]:
-    if isinstance(value, (int, np.integer)) and not isinstance(value, bool):
-        if value < 1:
-            raise UsageError(f"every {value}th slice cannot be shown: give 1 or more, or a list of slices")
-        return int(value)
-    try:
-        numbers = np.asarray(value)
-    except (TypeError, ValueError):
-        numbers = np.empty(0)
-    if numbers.ndim != 1 or not len(numbers) or numbers.dtype.kind not in "iu":
-        raise UsageError(f"slices are a number (every n-th) or a list of whole numbers k, not {value!r:.60}")
-    chosen = tuple(sorted(numbers.tolist()))
-    if len(set(chosen)) < len(chosen):
-        raise UsageError(f"slices are named twice: {value!r:.60}")
-    return chosen
-
-
-def _mapping(what: str) -> Callable[[Any], Any]:
-    def check(value: Any) -> Any:
-        if isinstance(value, Mapping):
-            return dict(value)
-        raise UsageError(f"{what} of labels are a mapping such as {{'L2': ...}}, not {type(value).__name__}")
-
-    return check
-
-
-_ray_step = _number("the ray step is a length in mm above 0, not", lambda mm: 0.0 < mm < math.inf)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -191,12 +104,12 @@ class Style:
 class _Labelled(Style):
     """Styles in which labels can look different."""
 
-    lighting: Lighting | None = _field(None, _instance("lighting", Lighting))
-    ray_step: float | None = _field(None, _ray_step)
-    clip: Clip | None = _field(None, _instance("clip", Clip))
-    labels: LabelMap | None = _field(None, _instance("labels", LabelMap))
-    label_colors: _ByLabel[_Color] | None = _field(None, _mapping("colours"))
-    label_opacity: _ByLabel[float] | None = _field(None, _mapping("opacities"))
+    lighting: Lighting | None = _field(None, checks.instance_of("lighting", Lighting))
+    ray_step: float | None = _field(None, checks.ray_step)
+    clip: Clip | None = _field(None, checks.instance_of("clip", Clip))
+    labels: LabelMap | None = _field(None, checks.instance_of("labels", LabelMap))
+    label_colors: _ByLabel[_Color] | None = _field(None, checks.mapping("colours"))
+    label_opacity: _ByLabel[float] | None = _field(None, checks.mapping("opacities"))
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -246,9 +159,9 @@ class VolumeLook(_Labelled):
 
     _mode: ClassVar[str] = "dvr"
 
-    transfer_function: TransferFunction | str = _field(DEFAULT_PRESET, _preset_or_function)
+    transfer_function: TransferFunction | str = _field(DEFAULT_PRESET, checks.preset_or_function)
     _: KW_ONLY
-    jitter: bool = _field(False, partial(_flag, "jitter"))
+    jitter: bool = _field(False, partial(checks.flag, "jitter"))
 
     @property
     def function(self) -> TransferFunction:
@@ -278,11 +191,11 @@ class Projection(Style):
         The part of space that is shown.
     """
 
-    kind: str = _field("mip", _one_of(PROJECTIONS, f"a projection is one of {', '.join(PROJECTIONS)}"), "mode")
+    kind: str = _field("mip", checks.one_of(PROJECTIONS, f"a projection is one of {', '.join(PROJECTIONS)}"), "mode")
     _: KW_ONLY
-    window: tuple[float, float] | None = _field(None, checked_window)
-    ray_step: float | None = _field(None, _ray_step)
-    clip: Clip | None = _field(None, _instance("clip", Clip))
+    window: Sequence[float] | None = _field(None, checked_window)
+    ray_step: float | None = _field(None, checks.ray_step)
+    clip: Clip | None = _field(None, checks.instance_of("clip", Clip))
 
     @property
     def mode(self) -> str:
@@ -317,11 +230,17 @@ class SurfaceLook(_Labelled):
 
     iso_value: float = _field(DEFAULT_ISO_VALUE, checked_iso_value)
     _: KW_ONLY
-    color: _Color | None = _field(None, _color)
-    shadows: bool = _field(False, partial(_flag, "shadows"))
+    color: _Color | None = _field(None, checks.color)
+    shadows: bool = _field(False, partial(checks.flag, "shadows"))
     depth_cue: float | None = _field(
-        None, _number("the depth cue is a share of the brightness from 0 to 1, not", lambda share: 0.0 <= share <= 1.0)
+        None,
+        checks.number("the depth cue is a share of the brightness from 0 to 1, not", lambda share: 0.0 <= share <= 1.0),
     )
+
+    @property
+    def rgb(self) -> Float64Array:
+        """The colour, red, green and blue from 0 to 1."""
+        return find_color(DEFAULT_COLOR if self.color is None else self.color)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -355,19 +274,19 @@ class SlicesInSpace(Style):
 
     _mode: ClassVar[str] = "slices"
 
-    slices: int | Sequence[int] | None = _field(None, _slices)
+    slices: int | Sequence[int] | None = _field(None, checks.slices)
     _: KW_ONLY
     opacity: float = _field(
         DEFAULT_OPACITY,
-        _number("the opacity of a slice lies above 0 and up to 1, not at", lambda share: 0.0 < share <= 1.0),
+        checks.number("the opacity of a slice lies above 0 and up to 1, not at", lambda share: 0.0 < share <= 1.0),
         "slice_opacity",
     )
-    window: tuple[float, float] | None = _field(None, checked_window)
-    transfer_function: TransferFunction | None = _field(None, _instance("transfer function", TransferFunction))
+    window: Sequence[float] | None = _field(None, checked_window)
+    transfer_function: TransferFunction | None = _field(None, checks.instance_of("transfer function", TransferFunction))
     lowest_hu: float = _field(
-        LOWEST_SHOWN_HU, _number("the lowest HU that slices show is a number, not", lambda hu: True)
+        LOWEST_SHOWN_HU, checks.number("the lowest HU that slices show is a number, not", lambda hu: True)
     )
-    clip: Clip | None = _field(None, _instance("clip", Clip))
+    clip: Clip | None = _field(None, checks.instance_of("clip", Clip))
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -381,9 +300,9 @@ class _Cut(Style):
 
     thickness: float = _field(0.0, checked_thickness)
     combine: str = _field(
-        "mean", _one_of(COMBINATIONS, f"samples of a thick slice are combined by {', '.join(COMBINATIONS)}")
+        "mean", checks.one_of(COMBINATIONS, f"samples of a thick slice are combined by {', '.join(COMBINATIONS)}")
     )
-    window: tuple[float, float] | None = _field(None, checked_window)
+    window: Sequence[float] | None = _field(None, checked_window)
     pixel_mm: float | None = _field(None, partial(positive_mm, "the size of a pixel"))
 
 
@@ -433,12 +352,12 @@ class CurveCut(_Cut):
 
     _mode: ClassVar[str] = "cpr"
 
-    curve: Curve | ArrayLike | str = _field(SPINE, _curve)
+    curve: Curve | ArrayLike | str = _field(SPINE, checks.curve)
     _: KW_ONLY
     kind: str = _field(
-        "straightened", _one_of(CURVED_KINDS, f"a curved reformation is {' or '.join(CURVED_KINDS)}"), "cpr"
+        "straightened", checks.one_of(CURVED_KINDS, f"a curved reformation is {' or '.join(CURVED_KINDS)}"), "cpr"
     )
-    angle: float = _field(0.0, _number("the angle of a straightened picture is in degrees, not", math.isfinite))
+    angle: float = _field(0.0, checks.number("the angle of a straightened picture is in degrees, not", math.isfinite))
     width_mm: float | None = _field(None, partial(positive_mm, "the width of the picture"))
 
     def __post_init__(self) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 import tolerances
@@ -12,7 +14,7 @@ from clrecon.labels import LabelMap
 from clrecon.operators.rays.surface import cast_surface
 from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.rendering import Lighting, Rendering
-from clrecon.rendering.looks.label_style import LabelStyle
+from clrecon.rendering.pictures.styles import SurfaceLook
 from clrecon.rendering.views.camera import Camera
 from clrecon.rendering.views.clip import Clip
 
@@ -25,11 +27,15 @@ RED, BLUE = np.array([255.0, 0.0, 0.0]), np.array([0.0, 0.0, 255.0])
 
 
 def cast(
-    device, volume: Volume, camera: Camera, style: LabelStyle | None, memory=None, size=SIZE, **settings
+    device, volume: Volume, camera: Camera, labels: dict[str, Any] | None, memory=None, size=SIZE, **settings
 ) -> Rendering:
-    settings = {"lighting": UNLIT, "color": "white", **settings}
+    style = SurfaceLook(300.0, **{"lighting": UNLIT, "color": "white", **(labels or {}), **settings})
     resident = DeviceVolume(volume, device=device, memory=memory)
-    return cast_surface(resident, 300.0, camera, size, 0.5 * min(volume.spacing), style=style, **settings)
+    return cast_surface(resident, style, camera, size, 0.5 * min(volume.spacing))
+
+
+def labelled(labels: LabelMap, colors: dict | None = None, opacity: dict | None = None) -> dict[str, Any]:
+    return {"labels": labels, "label_colors": colors, "label_opacity": opacity}
 
 
 def two_balls(grid: str, gap: float = 2.0) -> tuple[Volume, LabelMap]:
@@ -67,7 +73,7 @@ def test_what_is_translucent_shows_what_is_behind(device, grid):
     assert both.sum() > 60
     colors = {"L1": "red", "L2": "blue"}
     for opacity, color in ((1.0, RED), (0.25, 0.25 * RED + 0.75 * BLUE), (0.0, BLUE)):
-        found = cast(device, volume, camera, LabelStyle.of(labels, colors, {"L1": opacity}))
+        found = cast(device, volume, camera, labelled(labels, colors, {"L1": opacity}))
         assert np.abs(found.image[both][:, :3] - color).max() <= 1.0 and (found.image[both][:, 3] == 255).all()
         near = back if opacity == 0.0 else front
         assert np.abs(found.depth - near)[both].max() <= tolerances.SURFACE_RAY_VOXEL * max(volume.spacing)
@@ -78,7 +84,7 @@ def test_what_is_translucent_shows_what_is_behind(device, grid):
 def test_it_is_translucent_where_nothing_is_behind(device):
     volume, labels = two_balls("even")
     camera = look(volume, (1.0, 0.0, 0.0), 12.0)
-    found = cast(device, volume, camera, LabelStyle.of(labels, {}, {"L1": 0.4}))
+    found = cast(device, volume, camera, labelled(labels, {}, {"L1": 0.4}))
     whole = cast(device, volume, camera, None)
     assert np.array_equal(np.isfinite(found.depth), np.isfinite(whole.depth))
     opacity, counts = np.unique(found.image[..., 3], return_counts=True)
@@ -90,7 +96,7 @@ def test_it_is_translucent_where_nothing_is_behind(device):
 def test_labels_that_touch_have_their_border(device):
     volume, labels = two_blocks()
     camera = look(volume, (0.0, 1.0, 0.0), 8.0)
-    style = LabelStyle.of(labels, {"L1": "red", "L2": "blue"}, {"L1": 0.0})
+    style = labelled(labels, {"L1": "red", "L2": "blue"}, {"L1": 0.0})
     found = cast(device, volume, camera, style, lighting=Lighting(0.2, 0.8, 0.0))
     # Rays run along +y: label 2 begins half way between rows 9 and 10; the camera is 150 mm before row 11.5.
     border = np.abs(found.depth - (150.0 + 9.5 - 11.5)) <= 0.5
@@ -105,8 +111,8 @@ def test_what_has_no_label_or_is_not_named_looks_as_it_does_without(device):
     volume, labels = two_blocks()
     camera = look(volume, (0.1, 1.0, -0.2), 10.0)
     plain = cast(device, volume, camera, None, color="bone")
-    assert np.array_equal(plain.image, cast(device, volume, camera, LabelStyle.of(labels, {}), color="bone").image)
-    red = cast(device, volume, camera, LabelStyle.of(labels, {1: "red"}), color="bone")
+    assert np.array_equal(plain.image, cast(device, volume, camera, labelled(labels, {}), color="bone").image)
+    red = cast(device, volume, camera, labelled(labels, {1: "red"}), color="bone")
     turned = (red.image != plain.image).any(axis=-1)
     assert 100 < turned.sum() < (plain.image[..., 3] > 0).sum() - 100
     assert (red.image[turned][:, :3] == (255, 0, 0)).all()
@@ -116,7 +122,7 @@ def test_labels_of_another_grid_are_brought_to_the_volume(device):
     volume, labels = two_blocks()
     coarse = LabelMap(labels.voxels[::2, ::2, ::2], np.diag([2.0, 2.0, 2.0, 1.0]), NAMES)
     camera, colors = look(volume, (0.1, 1.0, -0.2), 10.0), {"L1": "red", "L2": "blue"}
-    fine, rough = (cast(device, volume, camera, LabelStyle.of(which, colors)) for which in (labels, coarse))
+    fine, rough = (cast(device, volume, camera, labelled(which, colors)) for which in (labels, coarse))
     assert np.array_equal(fine.depth, rough.depth, equal_nan=True)
     assert (fine.image == rough.image).all(axis=-1).mean() > 0.8
 
@@ -126,7 +132,7 @@ def test_shadows_of_what_is_translucent_are_as_dark(device):
     camera = look(volume, (1.0, 1.0, 0.0), 12.0)
     light = Lighting(0.2, 0.8, 0.0, direction=(0.0, -1.0, 0.0))
     opaque, lit, half = (
-        cast(device, volume, camera, LabelStyle.of(labels, {}, {"L1": opacity}), lighting=light, shadows=shadows)
+        cast(device, volume, camera, labelled(labels, {}, {"L1": opacity}), lighting=light, shadows=shadows)
         for opacity, shadows in ((1.0, True), (1.0, False), (0.5, True))
     )
     dark = (opaque.image[..., 0] == 51) & (lit.image[..., 0] > 150)  # ambient alone, where the ball behind is in shadow
@@ -138,7 +144,7 @@ def test_shadows_of_what_is_translucent_are_as_dark(device):
 @pytest.mark.parametrize("towards", [(0.2, 0.3, 1.0), (0.1, 1.0, 0.2)])
 def test_slabs_give_the_picture_of_the_whole(device, towards):
     volume, labels = two_balls("oblique")
-    camera, style = look(volume, towards, 10.0, True), LabelStyle.of(labels, None, {"L1": 0.3, "L2": 0.6})
+    camera, style = look(volume, towards, 10.0, True), labelled(labels, None, {"L1": 0.3, "L2": 0.6})
     memory = 44 * SIZE[0] * SIZE[1] + volume.voxels.nbytes * 3 // 5
     whole = cast(device, volume, camera, style)
     parts = cast(device, volume, camera, style, memory)
@@ -151,7 +157,7 @@ def test_slabs_give_the_picture_of_the_whole(device, towards):
 @pytest.mark.oclgrind
 def test_a_small_picture_under_the_simulator(device):
     volume, labels = two_blocks()
-    style = LabelStyle.of(labels, None, {"L1": 0.3, "L2": 0.6})
+    style = labelled(labels, None, {"L1": 0.3, "L2": 0.6})
     clip = Clip.plane(centre_of(volume), (0.0, 0.5, 1.0))
     found = cast(
         device, volume, look(volume, (0.1, 1.0, -0.3), 8.0), style, size=(12, 9), clip=clip, shadows=True,

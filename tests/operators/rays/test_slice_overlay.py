@@ -9,10 +9,12 @@ from ray_scenes import GRIDS, blobs, centre_of, look, make_volume, premultiplied
 
 from clrecon.errors import DeviceError, UsageError
 from clrecon.geometry import Volume
-from clrecon.operators.rays.slices import choose_slices, overlay_slices
+from clrecon.operators.rays import slices as operator
+from clrecon.operators.rays.slices import choose_slices
 from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.reference.rays.slices import overlay_slices as overlay_twin
 from clrecon.rendering import TransferFunction
+from clrecon.rendering.pictures.styles import SlicesInSpace
 from clrecon.rendering.views.camera import Camera
 from clrecon.rendering.views.clip import Clip
 
@@ -22,6 +24,10 @@ WINDOW = (-500.0, 700.0)
 
 def grey(hu: np.ndarray) -> np.ndarray:
     return np.clip((hu - WINDOW[0]) / (WINDOW[1] - WINDOW[0]), 0.0, 1.0)[:, None].repeat(3, axis=1)
+
+
+def overlay_slices(resident, camera, size, *, background=None, **look):
+    return operator.overlay_slices(resident, SlicesInSpace(**look), camera, size, background)
 
 
 def assert_twin(device, volume, camera, slices, clip=None, opacity=0.4, lowest=-300.0, **settings):

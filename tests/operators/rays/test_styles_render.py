@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -23,6 +24,9 @@ from clrecon import (
     VolumeRenderer,
 )
 from clrecon.geometry import Volume
+from clrecon.operators.rays import project
+from clrecon.operators.reformat import sample
+from clrecon.rendering.pictures import styles
 from clrecon.rendering.pictures.modes import MODES
 
 pytestmark = [pytest.mark.opencl, pytest.mark.first_device]
@@ -112,3 +116,39 @@ def test_what_a_style_does_not_say_is_checked_beside_it(device: Any) -> None:
             renderer.render(VolumeLook(ray_step=1e-4), size=SIZE)
         with pytest.raises(UsageError, match="slices 0 to 19"):
             renderer.render(SlicesInSpace([20]), size=SIZE)
+
+
+@pytest.mark.parametrize("name", ["preset", "mip", "surface", "slices", "slice", "cpr"])
+def test_slabs_are_told_and_what_progress_raises_ends_the_picture(device: Any, name: str) -> None:
+    style = replace(SAME[name][0], shadows=False) if name == "surface" else SAME[name][0]
+    calls: list[tuple[str, int, int]] = []
+    place: dict[str, Any] = {"view": (20, 30), "size": SIZE, "device": device}
+    whole = clrecon.render(body(), style, **place, progress=lambda *call: calls.append(call))
+    assert whole.image[..., :3].any()
+    assert {stage for stage, _, _ in calls} == {"slabs"}
+    assert [done for _, done, _ in calls] == sorted(done for _, done, _ in calls)
+    assert calls[-1][1] == calls[-1][2] > 0
+
+    raised = clrecon.Cancelled("enough")
+
+    def progress(stage: str, done: int, total: int) -> None:
+        if done == total:
+            raise raised
+
+    with pytest.raises(clrecon.Cancelled) as error:
+        clrecon.render(body(), style, **place, progress=progress)
+    assert error.value is raised
+
+
+def test_a_picture_in_slabs_tells_each(device: Any) -> None:
+    calls: list[int] = []
+    made = clrecon.render(
+        body(), size=(8, 8), device=device, memory=30_000, progress=lambda stage, done, total: calls.append(done)
+    )
+    assert made.report["slabs"] == len(calls) - 1 > 1
+    assert calls == sorted(calls) and calls[-1] == 20
+
+
+def test_names_of_kinds_are_those_of_the_kernels() -> None:
+    assert tuple(project.PROJECTIONS) == styles.PROJECTIONS
+    assert tuple(sample.COMBINATIONS) == styles.COMBINATIONS

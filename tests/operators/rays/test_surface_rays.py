@@ -15,6 +15,7 @@ from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.operators.surface.extract import extract_isosurface
 from clrecon.reference.rays.surface import cast_surface as cast_twin
 from clrecon.rendering import Lighting, Rendering
+from clrecon.rendering.pictures.styles import SurfaceLook
 from clrecon.rendering.views.camera import Camera
 from clrecon.rendering.views.clip import Clip
 
@@ -27,8 +28,10 @@ RADIUS = 7.0
 
 def cast(device, volume: Volume, iso_value: float, camera: Camera, size=SIZE, memory=None, **settings) -> Rendering:
     step = settings.pop("ray_step", 0.5 * min(volume.spacing))
-    settings = {"lighting": UNLIT, "color": "white", **settings}
-    return cast_surface(DeviceVolume(volume, device=device, memory=memory), iso_value, camera, size, step, **settings)
+    background = settings.pop("background", None)
+    style = SurfaceLook(iso_value, **{"lighting": UNLIT, "color": "white", **settings})
+    resident = DeviceVolume(volume, device=device, memory=memory)
+    return cast_surface(resident, style, camera, size, step, background)
 
 
 def ball(points: np.ndarray) -> np.ndarray:

@@ -1,0 +1,132 @@
+"""Checks of the fields of styles, one place for each bound; a check returns the value in the form that is kept."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from clrecon.errors import UsageError
+from clrecon.rendering.looks.colors import find_color
+from clrecon.rendering.looks.presets import find_preset
+from clrecon.rendering.looks.transfer_function import TransferFunction
+from clrecon.rendering.views.centre_line import Curve
+
+__all__ = [
+    "SPINE",
+    "color",
+    "curve",
+    "flag",
+    "instance_of",
+    "mapping",
+    "number",
+    "one_of",
+    "preset_or_function",
+    "ray_step",
+    "slices",
+]
+
+SPINE = "spine"
+"""As a curve: the spinal canal, found in the volume."""
+
+
+def instance_of(what: str, kind: type) -> Callable[[Any], Any]:
+    """A check of the type."""
+
+    def check(value: Any) -> Any:
+        if isinstance(value, kind):
+            return value
+        raise UsageError(f"the {what} of a picture is a {kind.__name__} or None, not {type(value).__name__}")
+
+    return check
+
+
+def one_of(names: Sequence[str], text: str) -> Callable[[Any], Any]:
+    """A check of a name; `text` says which there are, and is followed by what was given."""
+
+    def check(value: Any) -> Any:
+        if isinstance(value, str) and value in names:
+            return value
+        raise UsageError(f"{text}, not {value!r:.60}")
+
+    return check
+
+
+def number(text: str, is_fine: Callable[[float], bool]) -> Callable[[Any], float]:
+    """A check of one number; `text` says what it is, and is followed by what was given."""
+
+    def check(value: Any) -> float:
+        try:
+            found = float(value)
+        except (TypeError, ValueError, OverflowError):
+            found = math.nan
+        if not math.isnan(found) and is_fine(found):
+            return found
+        shown = f"{value:g}" if isinstance(value, float) else f"{value!r:.60}"
+        raise UsageError(f"{text} {shown}")
+
+    return check
+
+
+def flag(name: str, value: Any) -> bool:
+    """True or False."""
+    if isinstance(value, (bool, np.bool_)):
+        return bool(value)
+    raise UsageError(f"{name} is True or False, not {value!r:.60}")
+
+
+def color(value: Any) -> Any:
+    """What `find_color` knows."""
+    find_color(value)
+    return value
+
+
+def preset_or_function(value: Any) -> Any:
+    """The name of a preset, or a transfer function."""
+    if isinstance(value, str):
+        find_preset(value)
+        return value
+    return instance_of("transfer function", TransferFunction)(value)
+
+
+def curve(value: Any) -> Any:
+    """A `Curve`, points that make one, or `SPINE`."""
+    if isinstance(value, str):
+        if value == SPINE:
+            return value
+        raise UsageError(f"a centre line is its points in LPS mm, or {SPINE!r} to look for it: not {value!r}")
+    return value if isinstance(value, Curve) else Curve(value)
+
+
+def slices(value: Any) -> int | tuple[int, ...]:
+    """An int above 0, or different whole numbers, ascending."""
+    if isinstance(value, (int, np.integer)) and not isinstance(value, bool):
+        if value < 1:
+            raise UsageError(f"every {value}th slice cannot be shown: give 1 or more, or a list of slices")
+        return int(value)
+    try:
+        numbers = np.asarray(value)
+    except (TypeError, ValueError):
+        numbers = np.empty(0)
+    if numbers.ndim != 1 or not len(numbers) or numbers.dtype.kind not in "iu":
+        raise UsageError(f"slices are a number (every n-th) or a list of whole numbers k, not {value!r:.60}")
+    chosen = tuple(sorted(numbers.tolist()))
+    if len(set(chosen)) < len(chosen):
+        raise UsageError(f"slices are named twice: {value!r:.60}")
+    return chosen
+
+
+def mapping(what: str) -> Callable[[Any], Any]:
+    """A check that something is said by label."""
+
+    def check(value: Any) -> Any:
+        if isinstance(value, Mapping):
+            return dict(value)
+        raise UsageError(f"{what} of labels are a mapping such as {{'L2': ...}}, not {type(value).__name__}")
+
+    return check
+
+
+ray_step = number("the ray step is a length in mm above 0, not", lambda mm: 0.0 < mm < math.inf)
