@@ -1,7 +1,7 @@
 """The errors that clrecon raises on purpose, each with the exit code of the command line.
 
-Every message is one line that says what is wrong, where, with which numbers, and what to do about it.
-Anything that is not a `ClreconError` and reaches a user is a fault of clrecon.
+Every message is one line that says what is wrong, where, with which numbers, and what to do about it.  Any other error
+that reaches a user is a fault of clrecon.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ class ClreconError(Exception):
     Attributes
     ----------
     exit_code : int
-        What ``clrecon`` exits with when this error ends a command.
+        Exit code of ``clrecon`` when this error ends a command.
     """
 
     exit_code = 1
@@ -62,7 +62,7 @@ class DeviceError(ClreconError):
 
 
 class DeviceMemoryError(DeviceError):
-    """The device has no room for something: less at a time may go through."""
+    """The device has no room: with less data at a time it may work."""
 
 
 class OutputError(ClreconError):
@@ -72,13 +72,13 @@ class OutputError(ClreconError):
 
 
 class Cancelled(ClreconError):
-    """The caller wants no more: raised by a ``progress`` function, and passed on as it is.
+    """The caller wants to stop: raised by a ``progress`` function, and passed on unchanged.
 
     >>> def progress(stage, done, total):
     ...     if stop.is_set():
     ...         raise clrecon.Cancelled
 
-    Nothing is written then, older files are intact, and memory of the device is given back.
+    After this error nothing is written, older files are intact, and memory of the device is free again.
     """
 
     exit_code = 130

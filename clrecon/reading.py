@@ -22,19 +22,19 @@ __all__ = ["Selection", "list_series", "read_selected", "read_volume"]
 
 _OTHER_FORMATS = ("NIfTI", "NRRD", "MetaImage")
 _NAMES = (".nii", ".nii.gz", ".hdr", ".img", ".img.gz", ".nrrd", ".nhdr", ".mha", ".mhd")
-"""Ends of names of these formats: for messages alone."""
+"""File extensions of these formats, only for messages."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Selection:
-    """What is chosen of an input.
+    """The part of an input that is read.
 
     Parameters
     ----------
     series : str or int, optional
-        Which series of the input; None leaves the choice to `read_volume`.
+        Series of the input; None leaves the choice to `read_volume`.
     phase : int, optional
-        Which of its phases, where it has several.
+        Number of the phase, if the series has several.
     allow_gaps : bool
         Read a stack with missing slices.
     force : bool
@@ -48,7 +48,7 @@ class Selection:
 
 
 def read_selected(path: str | os.PathLike[str], selection: Selection, *, progress: Progress | None = None) -> Volume:
-    """Read what a selection says, see `read_volume`."""
+    """Read the part of an input that a selection names, see `read_volume`."""
     chosen = {field.name: getattr(selection, field.name) for field in fields(Selection)}
     return read_volume(path, **chosen, progress=progress)
 
@@ -71,16 +71,15 @@ def read_volume(
         NIfTI (.nii, .nii.gz, .hdr with .img), NRRD (.nrrd), MetaImage (.mha, .mhd).  Those need the extra
         ``clrecon[volumes]``.  Told from the content.
     series : int or str, optional
-        Which series of a DICOM folder: its number in the listing (from 1), SeriesInstanceUID, its hash, or
-        description.  Default: the CT series with most slices, of several with as many the usable one; what was left
-        is said in the warnings.
+        Which series of a DICOM folder: its number in the listing (from 1), SeriesInstanceUID, its hash, or description.
+        Default: the CT series with most slices, of several with as many the usable one; the warnings name the others.
     phase : int, optional
         Number of the phase, where a series holds several volumes at the same places (`list_series` lists them).
     allow_gaps : bool
-        Read a stack with missing slices: what is there is placed exactly, with a warning.
+        True: read a stack with missing slices; the existing slices are placed exactly, with a warning.
     force : bool
-        Read data sets without preamble or meta header too, their encoding guessed, and leave out bytes that are left
-        over behind the pixels, with a warning each.
+        True: also read data sets without preamble or meta header, with a guessed encoding, and ignore surplus bytes
+        after the pixels; each gives a warning.
     progress : callable, optional
         Called as ``progress(stage, done, total)`` with stage "scan" or "read", or "no answer yet from NAME" where the
         disk hangs.
@@ -89,19 +88,19 @@ def read_volume(
     -------
     Volume
         ``voxels`` (nk, nj, ni) int16, int32 or float32; ``affine`` index (i, j, k) to LPS mm; ``report`` the
-        certificate.  Unevenly spaced slices keep their own positions (`Volume.uneven`).  Of files that are not DICOM
-        the values are what the file says (with its slope and intercept): whole numbers int16 or int32 whatever type
-        they are stored in, others float32, NaN -1024.
+        certificate.  Unevenly spaced slices keep their own positions (`Volume.uneven`). For files other than DICOM the
+        values are those of the file (with its slope and intercept): whole numbers of any stored type become int16 or
+        int32, others float32, NaN -1024.
 
     Raises
     ------
     NoDicomError
-        Nothing there, no DICOM, or no CT.
+        There is nothing at the path, no DICOM, or no CT.
     RefusedInputError
-        Corrupt files, or geometry or values that cannot be trusted; names files and figures.
+        Files are corrupt, or geometry or values cannot be trusted; the message names files and figures.
     UsageError
-        `series` names none or several; there is no such `phase`; an option for DICOM with another format; a missing
-        package; `path` is empty.
+        `series` matches no series or several; the `phase` does not exist; an option for DICOM is given with another
+        format; a package is missing; or `path` is empty.
     """
     kind = _tell_format(path)
     if kind is None:
@@ -124,19 +123,19 @@ def list_series(
     pixels: bool = False,
     progress: Progress | None = None,
 ) -> SeriesListing:
-    """List what `read_volume` can read at a path, with the certificate of what it would read.
+    """List everything at a path that `read_volume` can read, with the certificate of the part that it would read.
 
     Parameters
     ----------
     path, series, phase, allow_gaps, force, progress
         As in `read_volume`.
     pixels : bool
-        Read the voxels too, for what only they can say; without it only headers are read.
+        True: also read the voxels, for entries that depend on them.  False: read only headers.
 
     Returns
     -------
     SeriesListing
-        Of a file that is not DICOM one entry.
+        One entry for a file other than DICOM.
 
     Raises
     ------
@@ -164,12 +163,12 @@ def _refuse_options(kind: str, **options: Any) -> None:
 
 
 def _tell_format(path: str | os.PathLike[str]) -> str | None:
-    """One of the formats that are not DICOM; None leaves it, and what is wrong with it, to the DICOM reader."""
+    """Return the format of a file other than DICOM; None leaves the input and its errors to the DICOM reader."""
     try:
         file = Path(path)
-        if not os.fspath(path).strip() or not file.is_file():  # a folder, nothing there, a device
+        if not os.fspath(path).strip() or not file.is_file():  # a folder, a missing file, a device
             return None
-        from clrecon.formats import tell_kind  # which a folder has no need of
+        from clrecon.formats import tell_kind  # which a folder does not need
 
         kind = tell_kind(file)
     except (TypeError, ValueError, OSError):

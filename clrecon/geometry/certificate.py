@@ -1,4 +1,4 @@
-"""`Certificate`: what is known of a volume's origin and geometry, without patient data."""
+"""`Certificate`: the facts about a volume's origin and geometry, without patient data."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ _ELSEWHERE = {"slices_missing": ("dropped",), "rescale": ("padding_share", "padd
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Certificate(Record):
-    """What is known of a volume; ``volume.report`` where it was read.  See docs/contract.md and docs/certificate.md.
+    """The facts about a volume that was read: its ``volume.report``. See docs/contract.md and docs/certificate.md.
 
-    Lengths are mm, angles degrees.  None is what the file does not say, what is refused, or what only the pixels could
-    say where they were not read.
+    Lengths are mm, angles degrees.  None means that the file does not tell, that it was refused, or that only pixels
+    tell and they were not read.
 
     Attributes
     ----------
@@ -29,7 +29,7 @@ class Certificate(Record):
     series : mapping
         ``number``, ``uid_hash`` (None without an identifier) and ``modality``.
     phase : mapping or None
-        ``number``, ``of``, ``keyword`` and ``value`` of the phase that was taken, where there are several.
+        ``number``, ``of``, ``keyword`` and ``value`` of the phase that was read, if there are several.
     slices, slices_missing : int
     shape_ijk : list of int
     spacing_mm : list of float or None
@@ -37,11 +37,11 @@ class Certificate(Record):
         Size of the box of whole voxels along rows, columns and the slice normal.
     affine_ijk_to_lps_mm : nested list (4, 4) or None
     orientation : mapping or None
-        How the axes lie in the patient.
+        Directions of the axes in the patient.
     patient_position : str or None
     tilt_deg : float or None
     grid_residual_max_mm, grid_residual_rms_mm, grid_tolerance_mm : float or None
-        Distances of slice positions from the affine, and what is allowed.
+        Distances of slice positions from the affine, and their bound.
     gap_mm : mapping
         ``min``, ``max`` and ``median`` distance of neighbouring slices along the normal.
     uneven : bool or None
@@ -50,20 +50,20 @@ class Certificate(Record):
     slice_positions_mm : nested list (slices, 3) or None
         LPS mm, where slices are uneven.
     slice_thickness_mm, stated_gap_mm : float or None
-        As the headers state them; they play no part in the geometry.
+        As the headers state them; not used for the geometry.
     thickness : mapping or None
         Thickness and overlap of the slices.
     frame_of_reference_hash : str or None
     padding_share : float or None
         Share of the voxels that hold no measurement.
     padding_hu : float or None
-        What they have in the volume.
+        HU of these voxels in the volume.
     transfer_syntaxes, transfer_syntax_names : list of str
     lossy : bool
     rescale : mapping
         ``slope`` and ``intercept``, lowest and highest each, and ``type``.
     hu_range : [float, float] or None
-        Of the voxels as they are in the volume, padding among them.
+        Lowest and highest value in the volume, padding included.
     files : mapping
         ``found``, ``used`` and ``skipped`` (reason to count).
     dropped : mapping of str to int
@@ -72,8 +72,8 @@ class Certificate(Record):
     warnings, problems : list of str
         Doubts, and reasons to refuse.
     masked : mapping
-        What was turned into air since the volume was read, by what did it (``remove_table``, ``field_of_view``,
-        ``outside_air``); each stands among the entries by its own name.
+        Facts about parts that were turned into air after reading, by step (``remove_table``, ``field_of_view``,
+        ``outside_air``); each step is an entry of its own.
     """
 
     format: str
@@ -124,14 +124,14 @@ class Certificate(Record):
 
 
 def amend(report: dict[str, Any], **changes: Any) -> dict[str, Any]:
-    """The report of a volume with some entries changed or added; a certificate stays one.
+    """Return the report of a volume with some entries changed or added; a certificate stays a certificate.
 
     Parameters
     ----------
     report : dict
         ``volume.report``.
     **changes
-        Of a certificate: its fields, and what goes into `Certificate.masked`.
+        For a certificate: its fields, and entries of `Certificate.masked`.
     """
     if not isinstance(report, Certificate):
         return {**report, **changes}

@@ -47,7 +47,7 @@ def make_demo(
     Raises
     ------
     UsageError
-        The folder holds other things.
+        The folder contains other files.
     OutputError, DeviceError
     """
     from clrecon.opencl import choose_device
@@ -137,7 +137,7 @@ def check_sphere(device: Device) -> dict[str, Any]:
 
 
 def _prepare(folder: Path) -> None:
-    """Make the folder, or accept an empty one or that of an earlier demonstration."""
+    """Make the folder; accept an empty one or that of an earlier demonstration."""
     try:
         folder.mkdir(exist_ok=True)
         names = {entry.name for entry in folder.iterdir() if not entry.name.startswith(".clrecon-")}

@@ -1,4 +1,4 @@
-"""What OpenCL offers on this machine, and whether the operators work on it."""
+"""The OpenCL devices of this machine, and a test of the operators on one of them."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ def survey_devices(name: str | None = None) -> tuple[dict[str, Any], DeviceError
     Parameters
     ----------
     name : str, optional
-        What a job would be told as `device`.
+        Value of `device` for a job.
 
     Returns
     -------
@@ -66,7 +66,7 @@ def run_device_selftest(name: str | None = None, *, progress: Progress | None = 
     Raises
     ------
     DeviceError
-        No such device, or it fails outside of a test.
+        The device does not exist, or fails outside of a test.
     """
     from clrecon.jobs.selftest import CHECKS, run_selftest
     from clrecon.opencl import choose_device

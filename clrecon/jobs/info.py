@@ -1,4 +1,4 @@
-"""Which series an input holds, which one a job would use, and whether that one can be trusted."""
+"""The listing of an input: its series, the one that a job would use, and whether that one can be trusted."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ __all__ = ["InputListing", "describe_input"]
 
 
 class InputListing(NamedTuple):
-    """What an input holds.
+    """The listing of an input.
 
     Attributes
     ----------
     listing : dict
-        ``{"series": [...], "chosen": number or None, "certificate": {...} or None}``, see docs/contract.md.
-        ``chosen`` is what a job would use, None where it would refuse; ``certificate`` is that of the series that was
+        ``{"series": [...], "chosen": number or None, "certificate": {...} or None}``, see docs/contract.md.  ``chosen``
+        is the series that a job would use, None if it would refuse; ``certificate`` is that of the series that was
         judged, refused or not.
     notes : list of str
-        Files that were passed over, series that were left, why none is chosen.
+        Files that were passed over, series that were not chosen, and why none is chosen.
     problem : ClreconError or None
-        Why the command fails: no series at all can be used, the one asked for cannot, or a gate failed.
+        Why the command fails: no series can be used, the requested one cannot, or a gate failed.
     """
 
     listing: dict[str, Any]
@@ -58,7 +58,7 @@ def describe_input(
     pixels : bool
         Read the pixels of the series that is judged.
     strict : bool
-        A gate that fails is a problem, and so is that no series was chosen.
+        True: a failed gate is a problem, and so is a listing without a chosen series.
     progress : callable, optional
 
     Returns
@@ -88,7 +88,7 @@ def describe_input(
         notes.append(str(problem))
     if series is None and not strict and any(not entry["problems"] for entry in entries):
         return InputListing(listing, notes, None)
-    notes.pop()  # it is what the command ends with
+    notes.pop()  # the command ends with this problem
     return InputListing(listing, notes, problem)
 
 

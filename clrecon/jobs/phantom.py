@@ -11,7 +11,7 @@ __all__ = ["describe_kinds", "make_phantom"]
 
 
 def describe_kinds() -> dict[str, str]:
-    """Name of each kind of phantom, and what it shows."""
+    """Return the name of each kind of phantom, and its description."""
     from clrecon.phantom import KINDS
 
     return {name: kind.said for name, kind in KINDS.items()}
@@ -37,7 +37,7 @@ def make_phantom(output: str | Path, *, progress: Progress | None = None, **sett
     Raises
     ------
     UsageError, OutputError
-        Impossible settings; the folder cannot be written.
+        Settings are impossible, or the folder cannot be written.
     """
     from clrecon.phantom import PhantomSettings, parse_size, write_phantom
 

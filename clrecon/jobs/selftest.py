@@ -1,4 +1,4 @@
-"""Hold every operator against its numpy twin on the device that will be used, on small volumes."""
+"""The self-test: every operator is compared with its numpy twin on the device that will be used, on small volumes."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ from clrecon.reference.surface import labels as label_twin
 __all__ = ["run_selftest"]
 
 VERTEX_TOLERANCE_VOXEL = 1e-4
-"""Device against twin: float32 against float64, in units of the smallest voxel edge."""
+"""Largest difference of device (float32) and twin (float64), in units of the smallest voxel edge."""
 
 OBLIQUE = np.array([[0.7, 0.1, 0.05, -250.0], [-0.1, 0.5, 0.2, -300.0], [0.0, 0.05, 2.5, -846.0], [0.0, 0.0, 0.0, 1.0]])
-"""Anisotropic, oblique and sheared, far from the origin."""
+"""An affine that is anisotropic, oblique and sheared, far from the origin."""
 
 
 def _random_integers(shape: tuple[int, ...], dtype: str, high: int) -> NDArray[Any]:
@@ -120,7 +120,7 @@ CHECKS: tuple[tuple[str, Callable[[Device], str]], ...] = (
 
 
 def run_selftest(device: Device) -> Iterator[dict[str, Any]]:
-    """Check every operator on `device`, one result as soon as it is known.
+    """Check every operator on `device` and yield each result at once.
 
     Yields
     ------
@@ -132,7 +132,7 @@ def run_selftest(device: Device) -> Iterator[dict[str, Any]]:
         start = time.perf_counter()
         try:
             passed, detail = True, check(device)
-        except ClreconError as error:  # a device that computes wrongly can look like any of them
+        except ClreconError as error:  # a device that computes wrongly can raise any error
             passed, detail = False, str(error)
         yield {
             "operator": operator,

@@ -181,7 +181,7 @@ class Mesh(Message):
         )
 
     def quality(self) -> MeshQuality:
-        """Measure the mesh: is it closed, how large, what is wrong with it."""
+        """Measure the mesh: closedness, size and faults."""
         return measure_quality(self._vertices, self._triangles)
 
     def save(self, path: str | os.PathLike[str], space: str = "lps") -> int:

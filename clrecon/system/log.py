@@ -1,10 +1,10 @@
-"""What a batch may want to find later, in Python's own `logging` under the names of the modules: ``clrecon...``.
+"""Logging for batches, by Python's own `logging` under the names of the modules: ``clrecon...``.
 
-Silent unless the caller listens.  DEBUG: what was found and how long each stage took.  INFO: what was chosen, written,
-or done in another way than usual.  WARNING: only what the report says as a warning too.  No text holds names of files
-or anything else that people write: those may name a patient.
+Silent unless the caller listens.  DEBUG: findings, and the time of each stage.  INFO: choices, written files, and
+unusual ways of working.  WARNING: only the warnings of the report.  No text contains names of files or other text that
+people write: those may name a patient.
 
-To import `logging` takes milliseconds: only modules that are loaded for work have a logger, not `import clrecon` and
+Importing `logging` takes milliseconds: only modules that are loaded for work have a logger, not `import clrecon` and
 not the help of the command line.
 """
 
@@ -15,16 +15,16 @@ from collections.abc import Iterable
 
 __all__ = ["get_logger", "log_warnings"]
 
-logging.getLogger("clrecon").addHandler(logging.NullHandler())  # else Python writes warnings to stderr itself
+logging.getLogger("clrecon").addHandler(logging.NullHandler())  # otherwise Python writes warnings to stderr
 
 
 def get_logger(name: str) -> logging.Logger:
-    """The logger of a module, by its ``__name__``."""
+    """Return the logger of a module, given its ``__name__``."""
     return logging.getLogger(name)
 
 
 def log_warnings(log: logging.Logger, warnings: Iterable[str], known: Iterable[str] = ()) -> None:
-    """Say the warnings of a report; not those that are `known`, which the log has already."""
+    """Log the warnings of a report, except those that are `known`, which are already logged."""
     said = set(known)
     for text in warnings:
         if text not in said:

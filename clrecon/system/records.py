@@ -1,7 +1,7 @@
-"""Records: what was measured or done, as frozen dataclasses whose fields are typed, and the entries of JSON reports.
+"""Records: results as frozen dataclasses with typed fields, which are also the entries of JSON reports.
 
-A record is a dict too, which cannot be changed: code that took results for dicts (``quality["closed"]``,
-``json.dumps(report)``) goes on working until version 1.0.  `Record.as_dict` gives a dict that can be changed.
+A record is also a read-only dict: code that used results as dicts (``quality["closed"]``, ``json.dumps(report)``) works
+until version 1.0. `Record.as_dict` returns a dict that can be changed.
 """
 
 from __future__ import annotations
@@ -16,25 +16,25 @@ Own = TypeVar("Own", bound="Record")
 
 
 class Record(dict[str, Any]):
-    """Base of frozen dataclasses; they are made with ``eq=False``, since records compare as dicts do."""
+    """Base of frozen dataclasses; they are made with ``eq=False``, because records compare as dicts do."""
 
     _LEFT_OUT: ClassVar[tuple[str, ...]] = ()
-    """Fields that are no entries where they are None."""
+    """Names of fields that are left out of the entries where they are None."""
 
     def __post_init__(self) -> None:
         dict.update(self, self._entries())
 
     def _entries(self) -> dict[str, Any]:
-        """The entries, in their order: the fields."""
+        """The entries in their order: the fields."""
         own = _fields_of(self)
         return {name: value for name, value in own.items() if value is not None or name not in self._LEFT_OUT}
 
     def as_dict(self) -> dict[str, Any]:
-        """The entries as a dict of its own, records within it as dicts too: the form that reports have."""
+        """Return the entries as a new dict, with records inside as dicts too: the form of reports."""
         return {name: _as_plain(value) for name, value in self.items()}
 
     def changed(self: Own, **changes: Any) -> Own:
-        """The same with other values in some fields."""
+        """Return a copy with other values in some fields."""
         return replace(self, **changes)  # type: ignore[type-var]
 
     def __reduce__(self) -> tuple[Callable[..., Record], tuple[object, ...]]:

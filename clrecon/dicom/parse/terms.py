@@ -1,4 +1,4 @@
-"""Defined terms of the standard: what goes into warnings and reports in place of whatever a field holds."""
+"""Defined terms of the standard: only these go into warnings and reports, never other contents of a field."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""A scan to meshes in files."""
+"""The mesh job: a scan becomes mesh files."""

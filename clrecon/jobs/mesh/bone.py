@@ -1,4 +1,4 @@
-"""Which components of a surface are bone, and what is said where a surface is not."""
+"""Bone in surfaces: which components are bone, and the warnings for surfaces that are not."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ if TYPE_CHECKING:
 __all__ = ["find_bone", "judge_surfaces", "warn_of_walls"]
 
 CONTRAST_SHARE = 0.04
-"""Of a surface of bone, more than this that looks like contrast medium is said: spongy bone gives up to 0.03."""
+"""Share of a bone surface that looks like contrast medium and is reported from here on; spongy bone gives 0.03."""
 NAMES_SHOWN = 5
 SPINE_MM = 20.0
-"""The wall of the spinal canal lies nearer to its middle than this."""
+"""Largest distance of the wall of the spinal canal from its middle."""
 
 
 def find_bone(
@@ -41,14 +41,14 @@ def find_bone(
     without_table: bool = False,
     advice: str,
 ) -> NDArray[np.bool_]:
-    """Which components look like bone or, where none does, which one holds the spinal canal.
+    """Find the components that look like bone or, if none does, the one that holds the spinal canal.
 
     Parameters
     ----------
     mesh, volume, surface, labelled
         The components of `surface` in `volume`.
     without_table : bool
-        The table was taken out of the volume: it is not said what takes it out.
+        True: the table was already removed, so the message does not advise it.
 
     Returns
     -------
@@ -57,7 +57,7 @@ def find_bone(
     Raises
     ------
     NoSurfaceError
-        None is bone; the message has the figures of the largest, and the advice.
+        No component is bone; the message has the figures of the largest, and advice.
     """
     import numpy as np
 
@@ -104,7 +104,7 @@ def _describe_none(told: Sequence[dict[str, Any]], count: int, rails: int) -> st
 
 
 def _describe_rails(rails: int) -> str:
-    """Components that are dense as bone, and straight as the rails of a table."""
+    """Describe components that are dense as bone, and straight as the rails of a table."""
     many = "s are" if rails != 1 else " is"
     return f"{rails:,} component{many} as dense as bone but the same in all slices, as the rails of a table"
 
@@ -123,7 +123,7 @@ def _figures(judged: dict[str, Any]) -> str:
 
 
 def _holds_spine(mesh: Mesh, volume: Volume, count: int, labels: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """The component with the most vertices around the spinal canal, where one is found."""
+    """Return the component with the most vertices around the spinal canal, if the canal is found."""
     import numpy as np
 
     from clrecon.anatomy.spine_line import find_spine_line
@@ -143,7 +143,7 @@ def _holds_spine(mesh: Mesh, volume: Volume, count: int, labels: NDArray[np.int6
 
 
 def judge_surfaces(parts: Sequence[Part], volume: Volume, settings: MeshSettings) -> None:
-    """Note in the `facts` of each part what its walls look like: ``walls``, None for what is no surface of bone."""
+    """Store in the `facts` of each part the judgement of its walls: ``walls``, None for other surfaces than bone."""
     import numpy as np
 
     from clrecon.mesh.compare.iso_distance import rule_of_report
@@ -172,7 +172,7 @@ def judge_surfaces(parts: Sequence[Part], volume: Volume, settings: MeshSettings
 
 
 def _count_bones(mesh: Mesh, volume: Volume, rule: IsoRule) -> Bones:
-    """How many components of a surface that as a whole does not look like bone are bone after all."""
+    """Count the bone components of a surface that as a whole does not look like bone."""
     import numpy as np
 
     from clrecon.mesh.compare.walls import find_rails, judge_components, looks_like_bone
@@ -193,15 +193,15 @@ def _is_of_bone(surface: Surface, lowest: float) -> bool:
 
 
 def warn_of_walls(parts: Sequence[Part], settings: MeshSettings, choice: IsoChoice | None = None) -> list[str]:
-    """What is to be known where a surface that was to be bone is contrast medium, joined to it, or something else.
+    """Return warnings for a surface that should be bone but is contrast medium, joined to it, or something else.
 
     Parameters
     ----------
     parts : sequence of Part
-        Judged by `judge_surfaces`.
+        Parts that `judge_surfaces` has judged.
     settings : MeshSettings
     choice : IsoChoice, optional
-        How the iso value was chosen; what its edges say of contrast medium is said here too.
+        The choice of the iso value; warnings about contrast medium at its edges are included.
     """
     contrast = [] if choice is None else warn_of_contrast(choice)
     warnings = []
@@ -212,13 +212,13 @@ def warn_of_walls(parts: Sequence[Part], settings: MeshSettings, choice: IsoChoi
         elif own:
             boneless = _warn_of_no_bone(own[0], settings)
             if boneless and choice is not None and choice.contrast_medium_share:
-                contrast = []  # the same figures, with an advice that helps only where there is bone
+                contrast = []  # the same figures, with advice that helps only if there is bone
             warnings += boneless or _warn_of_whole(own[0], settings)
     return contrast + warnings
 
 
 def _warn_of_no_bone(part: Part, settings: MeshSettings) -> list[str]:
-    """What is said of a surface at a level of bone none of whose components is bone."""
+    """Return the warning for a surface at a level of bone without any bone component."""
     from clrecon.mesh.compare.walls import looks_like_bone
 
     if part.bones is None or part.bones.bone:
@@ -232,7 +232,7 @@ def _warn_of_no_bone(part: Part, settings: MeshSettings) -> list[str]:
 
 
 def _means_bone(settings: MeshSettings) -> bool:
-    """The surface was asked for as that of bone."""
+    """True where the surface was asked for as that of bone."""
     return settings.half_way == "auto" or settings.preset_used == "bone"
 
 

@@ -1,4 +1,4 @@
-"""The settings that a purpose stands for, beside those that are given."""
+"""Settings that follow from the purpose of a mesh, in addition to those that are given."""
 
 from __future__ import annotations
 
@@ -15,19 +15,20 @@ __all__ = ["settings_for"]
 
 
 def settings_for(name: str | None, given: dict[str, Any]) -> dict[str, Any]:
-    """The fields of `MeshSettings` that a purpose sets beside those that are given, which win.
+    """Return the fields of `MeshSettings` that a purpose sets, with the given fields, which win.
 
     Parameters
     ----------
     name : str, optional
     given : dict
-        Fields; None, False and what is empty are not given.
+        Fields; None, False and empty values count as not given.
 
     Returns
     -------
     dict
-        The given fields, and ``purpose``.  Where components are chosen in another way none is left out for it, and bone
-        is told from other things only where all iso values are those of bone, from 100 to 1500 HU or ``"auto"``.
+        The given fields, and ``purpose``. If components are chosen in another way, the purpose leaves none out.  Bone
+        is distinguished from other material only if all iso values are those of bone, from 100 to 1500 HU or
+        ``"auto"``.
 
     Raises
     ------
@@ -49,7 +50,7 @@ def settings_for(name: str | None, given: dict[str, Any]) -> dict[str, Any]:
 
 
 def _at_levels_of_bone(given: dict[str, Any]) -> bool:
-    """Whether all surfaces that these fields of `MeshSettings` ask for are iso surfaces at levels of bone."""
+    """True where all surfaces that these fields of `MeshSettings` ask for are iso surfaces at levels of bone."""
     settings = MeshSettings(**given)
     if settings.labels is not None or settings.inside != "above":
         return False

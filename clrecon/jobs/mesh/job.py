@@ -56,24 +56,24 @@ def make_mesh(
     measure: bool | None = None,
     progress: Progress | None = None,
 ) -> MeshReport:
-    """Read a CT series, extract its surfaces, select what is asked for, measure and write it.
+    """Read a CT series, extract its surfaces, select components, measure them and write them.
 
     One mesh is written to `output`.  Several, of several iso values or split into components, get a name between
     stem and extension: ``bone_200hu.stl``, ``bone_001.stl``, ``bone_200hu_001.stl``, ``bone_T12.stl``.
 
-    Outputs that cannot be written are refused first, then a device that is not there, then the input.  The device
-    is opened and its kernels are built while the input is read.
-    All files are written under temporary names, then renamed; the report comes last, as the commit mark.
+    Outputs that cannot be written are refused first, then a missing device, then the input.  The device is opened and
+    its kernels are built while the input is read.  All files are written under temporary names, then renamed; the
+    report comes last, as the commit mark.
 
     Parameters
     ----------
     source : path
         DICOM folder or file, or a file of another format, see `clrecon.reading.read_volume`.
     output : path
-        Mesh file; its extension says the format.
+        Mesh file; its extension gives the format.
     settings : MeshSettings, optional
     report_path : path, optional
-        Where the report goes as JSON.
+        File for the report as JSON.
     measure : bool, optional
         Measure the meshes, which costs time; without it those entries are None.  Default: with a `report_path`.
     progress : callable, optional
@@ -86,7 +86,7 @@ def make_mesh(
     Raises
     ------
     UsageError, OutputError, DeviceError, NoDicomError, RefusedInputError, NoSurfaceError
-        Nothing is written then, and older files are intact.
+        After an error nothing is written, and older files are intact.
     """
     settings = settings or MeshSettings()
     progress = progress or ignore_progress
@@ -143,8 +143,8 @@ def _write(
     watch: Laps,
     progress: Progress,
 ) -> MeshReport:
-    """Write all files, the report composed of what is said of each mesh as the last one, and return the report."""
-    with ExitStack() as staged:  # all files are on the disk before any replaces an older one
+    """Write all files, with the report of all meshes as the last one, and return the report."""
+    with ExitStack() as staged:  # all files are on the disk before the first replaces an older one
         files = stage_meshes(staged, [part.mesh for part in parts], paths, space, progress)
         watch.lap("write")
         report = compose([describe_part(*each, space) for each in zip(parts, files, paths, strict=True)])
@@ -172,7 +172,7 @@ def _open(
 def _choose(
     volume: Volume, surfaces: list[Surface], settings: MeshSettings, progress: Progress, watch: Laps
 ) -> tuple[Volume, list[Surface], IsoChoice | None]:
-    """The volume as it is extracted from, the surfaces in it, and how an iso value was chosen where none was given."""
+    """Return the volume for extraction, its surfaces, and the choice of the iso value if it was not given."""
     choice = choose_level(volume, settings, progress)
     if choice is not None:
         surfaces = plan_surfaces([choice.iso_value])
@@ -191,7 +191,7 @@ def _extract(
     settings: MeshSettings,
     progress: Progress,
 ) -> tuple[list[Surface], list[Mesh]]:
-    """The surfaces, those of labels among them, and a mesh each."""
+    """Extract the surfaces, those of labels included, with one mesh each."""
     if labels is not None and settings.labels is not None:
         return extract_label_surfaces(volume, surfaces, labels, settings.labels, device, settings, progress)
     return surfaces, extract_surfaces(volume, surfaces, device, settings, progress)
@@ -205,7 +205,7 @@ def _select(
     settings: MeshSettings,
     progress: Progress,
 ) -> list[Part]:
-    """What of each surface is written."""
+    """Select the components of each surface that are written."""
     if settings.selects:
         progress("select", 0, 0)
     return [
@@ -218,7 +218,7 @@ def _select(
 def _refine_and_measure(
     parts: Sequence[Part], volume: Volume, settings: MeshSettings, measure: bool, progress: Progress, watch: Laps
 ) -> list[dict[str, Any]]:
-    """Refine and measure each part as far as it is asked for; returns the gates."""
+    """Refine and measure each part as far as wanted; return the gates."""
     if settings.refines:
         for part in parts:
             part.mesh = refine_surface(part.mesh, settings, progress)
@@ -238,7 +238,7 @@ def _warn_of_leftovers(output: str | Path, paths: Sequence[str | Path]) -> list[
 
 
 def _seconds(watch: Laps, origins: Sequence[dict[str, Any]]) -> dict[str, float]:
-    """Seconds by part of the job; `origins` are the reports of the surfaces."""
+    """Return seconds by part of the job; `origins` are the reports of the surfaces."""
     measured = [origin.get("seconds", {}) for origin in origins]
     seconds = {"device": watch.seconds.get("device", 0.0), "read": watch.seconds.get("read", 0.0)}
     seconds.update({part: sum(float(own.get(part, 0.0)) for own in measured) for part in _DEVICE_PARTS})

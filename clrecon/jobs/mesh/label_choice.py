@@ -1,4 +1,4 @@
-"""Which labels become meshes, and how."""
+"""The choice of labels that become meshes, and the kind of their surfaces."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ __all__ = ["LabelChoice"]
 
 @dataclass(frozen=True)
 class LabelChoice:
-    """Which labels of which map become meshes, and how.
+    """The labels of a map that become meshes, and the kind of their surfaces.
 
     Parameters
     ----------
@@ -24,7 +24,7 @@ class LabelChoice:
     grow_mm : float, optional
         See `clrecon.operators.surface.labels.extract_labels`.
     solid : bool
-        Fill what is less dense within a label.
+        True: fill less dense parts within a label.
     surface : {"hu", "mask"}
         HU place the vertices (`clrecon.operators.surface.labels.extract_labels`), or each label has its own surface
         (`clrecon.operators.surface.label_masks.extract_label_masks`).
@@ -32,7 +32,7 @@ class LabelChoice:
     Raises
     ------
     UsageError
-        There is no such surface, or growth or filling by HU is asked for where HU play no part.
+        `surface` is unknown, or growth or filling by HU is asked for although HU are not used.
     """
 
     path: str | Path

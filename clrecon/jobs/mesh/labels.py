@@ -1,4 +1,4 @@
-"""Surfaces of labels in a mesh job: which labels, what their files are called, what the report says of them."""
+"""Surfaces of labels in a mesh job: their choice, their file names, and their entries in the report."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _FACTS = (
 
 
 def open_labels(choice: LabelChoice | None) -> LabelMap | None:
-    """Read the label map, None where the job has none.
+    """Read the label map, None if the job has none.
 
     Raises
     ------
@@ -55,17 +55,17 @@ def extract_label_surfaces(
     settings: MeshSettings,
     progress: Progress,
 ) -> tuple[list[Surface], list[Mesh]]:
-    """Extract each label at each iso value, or once where its own surface is asked for.
+    """Extract each label at each iso value, or only once if its own surface is asked for.
 
     Parameters
     ----------
     surfaces : sequence of Surface
-        One an iso value.
+        One for each iso value.
 
     Returns
     -------
     surfaces : list of Surface
-        One a label and iso value that has a surface; named by the label and, where there are several, the iso value.
+        One for each label and iso value with a surface; named by the label and, if there are several, the iso value.
     meshes : list of Mesh
 
     Raises
@@ -78,7 +78,7 @@ def extract_label_surfaces(
 
     found: list[tuple[Surface, int, Mesh]] = []
     numbers = [labels.find(label) for label in choice.wanted] or labels.numbers
-    suffixes = file_suffixes({number: labels.name(number) for number in numbers})  # reports hold no other names
+    suffixes = file_suffixes({number: labels.name(number) for number in numbers})  # reports contain no other names
     for surface in surfaces:
         if surface.iso_value is None:
             masks = _extract_masks(volume, labels, choice, device, settings, progress)
@@ -108,7 +108,7 @@ def extract_label_surfaces(
 def _extract_masks(
     volume: Volume, labels: LabelMap, choice: LabelChoice, device: Device, settings: MeshSettings, progress: Progress
 ) -> dict[int, Mesh]:
-    """Each label's own surface, on the map's own grid; the map must lie on the scan all the same."""
+    """Extract each label's own surface, on the map's own grid; the map must still lie on the scan."""
     from clrecon.labels.resample import check_together
     from clrecon.operators.surface.label_masks import extract_label_masks
 
@@ -137,14 +137,14 @@ def _extract_masks(
 
 
 def describe_label(origin: dict[str, Any]) -> dict[str, Any]:
-    """Entries of a mesh of a label in the report, from the mesh's own; none for other meshes."""
+    """Return the report entries of a label's mesh, taken from the mesh's own report; empty for other meshes."""
     if "label" not in origin:
         return {}
     return {"label_number": origin["label"], **{name: origin[name] for name in _FACTS}}
 
 
 def judge_label_volumes(parts: Sequence[Part], closed: bool) -> list[dict[str, Any]]:
-    """Hold the meshes of each label, all its components together, against the volume of its voxels in the CT.
+    """Compare the meshes of each label, all components together, with the volume of its voxels in the CT.
 
     `closed` says that surfaces are closed at the border of the scan.  Each part of a label gets ``label_mesh_ml`` among
     its `facts`.
@@ -152,7 +152,7 @@ def judge_label_volumes(parts: Sequence[Part], closed: bool) -> list[dict[str, A
     Returns
     -------
     list of dict
-        A gate a label and iso value, see `clrecon.mesh.compare.gates.judge_label_volume`.
+        A gate for each label and iso value, see `clrecon.mesh.compare.gates.judge_label_volume`.
     """
     from clrecon.mesh.compare.gates import judge_label_volume
     from clrecon.mesh.triangles import enclosed_ml
@@ -176,12 +176,12 @@ def judge_label_volumes(parts: Sequence[Part], closed: bool) -> list[dict[str, A
 
 
 def _ml_in_ct(origin: dict[str, Any]) -> float:
-    """The volume of the label's voxels that lie in the CT; where the centres of all lie outside, of what is taken."""
+    """Return the volume of the label's voxels that lie in the CT; if no centre does, that of the resampled voxels."""
     return float(origin["label_ml"] * origin["label_inside_share"] or origin["label_taken_ml"])
 
 
 def _advise(too_small: bool, origin: dict[str, Any]) -> str:
-    """What to do about a mesh that is much smaller, or larger, than its label."""
+    """Return advice about a mesh that is much smaller, or larger, than its label."""
     kept, found = origin.get("components_kept"), origin.get("components_found")
     if too_small and kept is not None and kept < found:
         return f"{kept} of its {found} components were kept"

@@ -1,4 +1,4 @@
-"""Which iso value a job uses where it was not given as a number, and what the report says about it."""
+"""The iso value of a job if it was not given as a number, and its entries in the report."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ if TYPE_CHECKING:
 __all__ = ["choose_level", "describe_level", "warn_of_contrast"]
 
 THICK_SLICES_MM = 2.5
-"""From here on thin walls across the slices lose so much that half way between the materials can be too high: with
-slices of 2 mm the level is as good as the best, with 3 mm it loses walls (docs/iso_value.md)."""
+"""From this spacing on, thin walls across the slices are blurred so much that the half-way level can be too high: with
+slices of 2 mm it is as good as the best, with 3 mm it loses walls (docs/iso_value.md)."""
 
 
 def choose_level(volume: Volume, settings: MeshSettings, progress: Progress = ignore_progress) -> IsoChoice | None:
-    """The iso value half way between two materials, measured or given; None where the settings name levels.
+    """Return the iso value half way between two materials, measured or given; None if the settings name levels.
 
     Raises
     ------
@@ -41,7 +41,7 @@ def choose_level(volume: Volume, settings: MeshSettings, progress: Progress = ig
 def describe_level(
     volume: Volume, settings: MeshSettings, choice: IsoChoice | None
 ) -> tuple[dict[str, Any], list[str]]:
-    """Entries of the report, and warnings."""
+    """Return the entries of the report, and warnings."""
     if not settings.follows_hu:
         return {"iso_value_reason": "none: the masks of the labels", "iso_value_choice": None}, []
     if choice is None:
@@ -65,7 +65,7 @@ def describe_level(
 
 
 def warn_of_contrast(choice: IsoChoice) -> list[str]:
-    """What the edges that an iso value was chosen by say of contrast medium."""
+    """Warn of contrast medium at the edges by which the iso value was chosen."""
     from clrecon.anatomy.iso_choice import CONTRAST_SAID
 
     if choice.flat_share is None or choice.flat_share < CONTRAST_SAID:

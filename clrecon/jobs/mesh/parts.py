@@ -1,4 +1,4 @@
-"""From a volume to the meshes of a job: surfaces, and the parts of them that become one file each."""
+"""The meshes of a job, made from a volume: surfaces, and the parts of them that become one file each."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ __all__ = [
 
 
 def check_levels(volume: Volume, surfaces: Sequence[Surface]) -> None:
-    """Refuse what has every voxel inside.
+    """Refuse levels at which every voxel is inside.
 
     Raises
     ------
     NoSurfaceError
-        One of them has.
+        All voxels are inside at one of the levels.
     """
     low, high = volume.hu_range or (math.nan, math.nan)
     for surface in surfaces:
@@ -53,7 +53,7 @@ def check_levels(volume: Volume, surfaces: Sequence[Surface]) -> None:
 def extract_surfaces(
     volume: Volume, surfaces: Sequence[Surface], device: Device, settings: MeshSettings, progress: Progress
 ) -> list[Mesh]:
-    """Extract all surfaces, one mesh each.
+    """Extract all surfaces with one mesh each.
 
     Raises
     ------
@@ -76,7 +76,7 @@ def extract_surfaces(
 
 
 def select_parts(surface: Surface, mesh: Mesh, settings: MeshSettings, device: Device, volume: Volume) -> list[Part]:
-    """Keep the components that the settings ask for, and measure what the purpose of the mesh asks for.
+    """Keep the components that the settings ask for, and measure what the purpose of the mesh needs.
 
     Raises
     ------
@@ -103,7 +103,7 @@ def _select_parts(surface: Surface, mesh: Mesh, settings: MeshSettings, device: 
     NoSurfaceError
         No component is large enough, or none is bone.
     UsageError
-        A seed is near no component, or more components are to be written one by one than anyone can want.
+        A seed is near no component, or more components are to be written one by one than is plausible.
     """
     if not settings.selects:
         return [Part(surface, surface.name, mesh)]
@@ -117,7 +117,7 @@ def _select_parts(surface: Surface, mesh: Mesh, settings: MeshSettings, device: 
     labelled = None
     try:
         labelled = label_components(device, mesh.triangles, mesh.vertex_count, memory=settings.memory)
-    except DeviceMemoryError as error:  # the outcome is the same, it only takes longer
+    except DeviceMemoryError as error:  # the result is the same, it only takes longer
         mesh.report.setdefault("warnings", []).append(f"{error}: they were found without it")
     among = None
     if settings.keep == "bone":
@@ -137,13 +137,13 @@ def _select_parts(surface: Surface, mesh: Mesh, settings: MeshSettings, device: 
             return [Part(surface, surface.name, kept)]
         pieces = split_components(mesh, *limits, seeds=seeds, labelled=labelled, among=among, most=MOST_FILES)
     except (NoSurfaceError, UsageError) as error:
-        label = "" if surface.label is None else f"{surface.label} "  # of several one is too small, or too far
+        label = "" if surface.label is None else f"{surface.label} "  # one of several is too small, or too far
         raise type(error)(f"{label}{surface.place}: {error}") from error
     return [Part(surface, _name_piece(surface, place), piece) for place, piece in enumerate(pieces, start=1)]
 
 
 def _advice(settings: MeshSettings) -> str:
-    """What to do where nothing is bone."""
+    """Return advice for a surface without bone."""
     if settings.purpose is None:
         return f"{name_parameter('keep_largest', 'N')} keeps by size"
     purpose, largest = name_parameter("purpose", settings.purpose), name_parameter("keep_largest", 1)
@@ -151,7 +151,7 @@ def _advice(settings: MeshSettings) -> str:
 
 
 def first_names(surfaces: Sequence[Surface], split: bool) -> list[str]:
-    """Name of the first part of each surface: what is known of the outputs before anything is extracted."""
+    """Return the name of the first part of each surface, as far as outputs are known before extraction."""
     return [_name_piece(surface, 1) if split else surface.name for surface in surfaces]
 
 

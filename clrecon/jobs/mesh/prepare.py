@@ -1,4 +1,4 @@
-"""What a mesh job needs before it extracts: kernels, and a volume without the air round the patient."""
+"""Preparation of a mesh job: its kernels, and a volume without the air around the patient."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ __all__ = ["leave_outside", "prepare_surfaces"]
 
 
 def prepare_surfaces(device: Device, components: bool, topology: str, inside: str = "above") -> None:
-    """Build the kernels that find surfaces of this topology and, where asked for, components."""
+    """Build the kernels for surfaces of this topology and, if wanted, for components."""
     from clrecon.operators.primitives.union_find import prepare_components
     from clrecon.operators.surface.extract import prepare_isosurface
 
@@ -26,14 +26,14 @@ def prepare_surfaces(device: Device, components: bool, topology: str, inside: st
 
 
 def leave_outside(volume: Volume, settings: MeshSettings, progress: Progress) -> Volume:
-    """The volume without the air round the patient, where the settings ask for what lies below an iso value.
+    """Return the volume without the air around the patient, if the settings ask for the values below an iso value.
 
     Raises
     ------
     RefusedInputError
-        There is no body.
+        No body was found.
     NoSurfaceError
-        All that lies below is outside of it.
+        All voxels below the iso value are outside of the body.
     """
     if settings.below is None or settings.keep_outside:
         return volume

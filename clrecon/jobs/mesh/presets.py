@@ -1,4 +1,4 @@
-"""Iso values by tissue."""
+"""Presets: iso values of tissues."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ class Preset:
     iso_value : float
         HU.
     description : str
-        What the surface shows, one line.
+        One line about the surface.
     source : str
-        Where the value comes from.
+        Origin of the value.
     """
 
     name: str
@@ -33,8 +33,7 @@ class Preset:
 DEFAULT_PRESET = "bone"
 
 LOWEST_BONE_HU, HIGHEST_BONE_HU = 100.0, 1500.0
-"""Iso values between these are those of bone: muscle and organs without contrast medium stay below, what lies above is
-enamel and metal."""
+"""Iso values of bone: muscle and organs without contrast medium are below, enamel and metal above."""
 
 _INVESALIUS = "InVesalius 3, lower bound of its preset"
 
@@ -67,7 +66,7 @@ def find_preset(name: str) -> Preset:
     Raises
     ------
     UsageError
-        There is none; the message lists what there is.
+        There is no preset of this name; the message lists all names.
     """
     try:
         return PRESETS[name]

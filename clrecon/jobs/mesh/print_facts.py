@@ -1,4 +1,4 @@
-"""What a person who prints a mesh wants to know: size, walls, cavities, what was left out."""
+"""Facts for people who print a mesh: size, walls, cavities, parts left out."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ if TYPE_CHECKING:
 __all__ = ["describe_print", "measure_pieces", "warn_of_print"]
 
 THIN_MM = 1.0
-"""Walls below this break or are not printed at all by common printers (layers of 0.1 to 0.3 mm, nozzles of 0.4 mm)."""
+"""Thinner walls break or are not printed at all by common printers (layers of 0.1 to 0.3 mm, nozzles of 0.4 mm)."""
 
 THIN_SHARE = 0.05
-"""Share of the surface with thin walls from which on it is said as a warning."""
+"""Share of the surface with thin walls from which on there is a warning."""
 
 
 def measure_pieces(vertices: NDArray[np.floating], triangles: NDArray[np.uint32]) -> dict[str, float]:
-    """What the components of a surface enclose; `vertices` have shape (n, 3), in mm, `triangles` (m, 3).
+    """Measure the volumes that components enclose; `vertices` have shape (n, 3), in mm, `triangles` (m, 3).
 
     Returns
     -------
@@ -43,12 +43,12 @@ def measure_pieces(vertices: NDArray[np.floating], triangles: NDArray[np.uint32]
 
 
 def describe_print(mesh: Mesh, found: dict[str, float], kept: dict[str, float]) -> dict[str, Any]:
-    """What a person who prints a mesh wants to know: ``print`` of the report.
+    """Return the facts for people who print a mesh: ``print`` of the report.
 
     Parameters
     ----------
     mesh : Mesh
-        As it is written.
+        The mesh as it is written.
     found, kept : dict
         `measure_pieces` of the surface as it was extracted, and of what was kept of it.
 
@@ -77,7 +77,7 @@ def describe_print(mesh: Mesh, found: dict[str, float], kept: dict[str, float]) 
 
 
 def warn_of_print(facts: dict[str, Any]) -> list[str]:
-    """Warnings of what `describe_print` says: thin walls, closed cavities, the wrong piece."""
+    """Return warnings about the facts of `describe_print`: thin walls, closed cavities, the wrong piece."""
     warnings = []
     wall, left_out = facts["wall"], facts["left_out"]
     if wall["thin_share"] is not None and wall["thin_share"] > THIN_SHARE:

@@ -1,4 +1,4 @@
-"""What a mesh is for: names that stand for settings."""
+"""Purposes of meshes: names that stand for settings."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class Purpose:
     ----------
     name : str
     settings : dict
-        Fields of `MeshSettings` that it sets where they are not given.
+        Fields of `MeshSettings` that it sets if they are not given.
     description : str
         One line.
     """
@@ -41,12 +41,12 @@ PURPOSES: dict[str, Purpose] = {
 
 
 def find_purpose(name: str) -> Purpose:
-    """The purpose of this name.
+    """Return the purpose of this name.
 
     Raises
     ------
     UsageError
-        There is none.
+        There is no purpose of this name.
     """
     if name not in PURPOSES:
         raise UsageError(f"a mesh can be for {', '.join(PURPOSES)}, not for {name!r}")

@@ -1,4 +1,4 @@
-"""Smoothing and decimation of one surface of a job, and the gates that it is held against."""
+"""Smoothing and decimation of the surfaces of a job, and the gates of its meshes."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ __all__ = ["describe_purposes", "judge_parts", "refine_surface", "warn_of_gates"
 
 
 def refine_surface(mesh: Mesh, settings: MeshSettings, progress: Progress = ignore_progress) -> Mesh:
-    """Smooth and decimate as the settings say; the mesh itself where they say neither.
+    """Smooth and decimate as the settings say; return the mesh itself if they ask for neither.
 
     Returns
     -------
@@ -44,17 +44,17 @@ def refine_surface(mesh: Mesh, settings: MeshSettings, progress: Progress = igno
 
 
 def judge_parts(parts: Sequence[Part], volume: Volume, settings: MeshSettings) -> list[dict[str, Any]]:
-    """Hold the parts of a job against the gates; what was found goes into the `facts` of each.
+    """Judge the parts of a job by the gates; the measures are stored in the `facts` of each.
 
     Parameters
     ----------
     parts : sequence of Part
-        As they are written, with what `Mesh.quality` says of them.  Where a part was not measured only the gates of a
-        refinement count.
+        Parts as they are written, with the result of `Mesh.quality`. A part that was not measured has only the gates of
+        refinement.
     volume : Volume
-        They were made from this.
+        The volume that they were made from.
     settings : MeshSettings
-        With `strict`, triangles that cut each other are looked for, which takes longer than all else.
+        With `strict`, triangles that cut each other are searched, which takes longer than everything else.
 
     Returns
     -------
@@ -93,7 +93,7 @@ def judge_parts(parts: Sequence[Part], volume: Volume, settings: MeshSettings) -
 
 
 def describe_purposes(parts: Sequence[Part]) -> list[str]:
-    """Measure what the purpose of the meshes asks for, as ``print`` in the `facts` of each; returns warnings."""
+    """Measure what the purpose of the meshes needs, as ``print`` in the `facts` of each; return warnings."""
     from clrecon.jobs.mesh.print_facts import describe_print, warn_of_print
 
     warnings = []
@@ -106,7 +106,7 @@ def describe_purposes(parts: Sequence[Part]) -> list[str]:
 
 
 def warn_of_gates(gates: Sequence[dict[str, Any]]) -> list[str]:
-    """One line for each gate that failed, with the name of its mesh where there are several."""
+    """Return one line for each failed gate, with the name of its mesh if there are several."""
     from clrecon.system.gates import failed_gates
 
     return [f"{gate['mesh']}: {line}" if gate["mesh"] else line for gate in gates for line in failed_gates([gate])]

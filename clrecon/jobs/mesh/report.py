@@ -1,4 +1,4 @@
-"""What the report of a mesh job says: of the whole job, and of each mesh."""
+"""The report of a mesh job: entries of the whole job, and of each mesh."""
 
 from __future__ import annotations
 
@@ -27,17 +27,17 @@ if TYPE_CHECKING:
 __all__ = ["MeshReport", "describe_job", "describe_part"]
 
 _OF_ONE = ("quality", "walls", "iso_distance", "refinement", "print")
-"""What stands at the top of the report too where there is one mesh."""
+"""Entries of a mesh that are also at the top of the report if there is only one mesh."""
 
 _SAID_ABOVE = ("vertices", "triangles", "closed", "manifold", "components", "area_mm2", "volume_ml", "bounds_mm")
 
 
 def describe_part(part: Part, file: StagedFile, output: str | os.PathLike[str], space: str) -> dict[str, Any]:
-    """One object of ``meshes``.
+    """Return one object of ``meshes``.
 
-    Lengths are mm, areas mm2, volumes ml (1 ml = 1000 mm3).  ``bounds_mm`` is ``[[x, y, z], [x, y, z]]``, the
-    lowest and the highest corner in the patient frame `space`, also for formats that store another frame
-    (GLB: metres, Y up).  What was not measured is None.
+    Lengths are mm, areas mm2, volumes ml (1 ml = 1000 mm3). ``bounds_mm`` is ``[[x, y, z], [x, y, z]]``, the lowest and
+    the highest corner in the patient frame `space`, also for formats that store another frame (GLB: metres, Y up).
+    Entries that were not measured are None.
     """
     quality: dict[str, Any] = part.quality or {}
     origin = part.mesh.report
@@ -69,20 +69,20 @@ def describe_part(part: Part, file: StagedFile, output: str | os.PathLike[str], 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class MeshReport(RunReport):
-    """What a mesh job has made, beside what every `RunReport` says; the entries are explained in docs/contract.md.
+    """The report of a mesh job: a `RunReport` with further entries, which docs/contract.md explains.
 
-    With one mesh, its entries stand here too.  With several, sums do (components of one surface that are written one by
-    one were found together, and count once), `bounds_mm` is the box around all, `closed` and `manifold` hold where they
-    hold for each, and what differs or cannot be summed is None.
+    With one mesh, its entries are here too.  With several, counts and sizes are sums (components of one surface that
+    are written one by one were found together, and count once), `bounds_mm` is the box around all, `closed` and
+    `manifold` are true if they are for each mesh, and entries that differ or cannot be summed are None.
 
     Attributes
     ----------
     iso_value_hu, iso_level_hu : float or None
-        As asked for, and where the surface lies.
+        The iso value as asked for, and the level of the surface.
     inside, inside_hu, inside_levels_hu, outside_hu
-        What the surfaces enclose, and the value beyond the border of the volume.
+        The values that the surfaces enclose, and the value beyond the border of the volume.
     iso_value_reason, iso_value_choice, preset, preset_reason
-        Where the iso value comes from: in words, the `IsoChoice` without its value, the preset and its source.
+        Origin of the iso value: in words, the `IsoChoice` without its value, the preset and its source.
     space, unit : str
     vertices, triangles, components, components_found, components_kept : int or None
     closed, manifold : bool or None
@@ -91,13 +91,13 @@ class MeshReport(RunReport):
     closed_at_border, topology, keep, keep_largest, min_volume_ml, seeds_mm, split, purpose
         The settings.
     slabs : int
-        Most of a surface.
+        Largest number for a surface.
     device_bytes : mapping of str to int
-        Most that was taken on the device, by what it is.
+        Most bytes taken on the device, by purpose.
     quality, walls, iso_distance, refinement, print : mapping or None
-        Of the only mesh.
+        Entries of the only mesh.
     meshes : list of mapping
-        One a file, see `describe_part`.
+        One for each file, see `describe_part`.
     output : mapping
         ``format`` and ``bytes`` of all files.
     gates : list of mapping
@@ -170,21 +170,21 @@ def describe_job(
     warnings: Sequence[str],
     seconds: Mapping[str, float],
 ) -> MeshReport:
-    """Compose the report of a job.
+    """Make the report of a job.
 
     Parameters
     ----------
     volume : Volume
     parts : sequence of Part
     meshes : sequence of dict
-        What `describe_part` says of each.
+        Result of `describe_part` for each part.
     settings : MeshSettings
     device : Device
     choice : IsoChoice or None
-        Where the iso value came from when it was neither given nor a preset.
+        The choice of the iso value if it was neither given nor a preset.
     gates : list of dict
     warnings : sequence of str
-        Of the job; those of the volume and the meshes come before them.
+        Warnings of the job; those of the volume and the meshes come before them.
     seconds : mapping
     """
     certificate = dict(volume.report)
@@ -245,7 +245,7 @@ def _warn_of_meshes(parts: Sequence[Part], meshes: Sequence[dict[str, Any]]) -> 
 
 
 def _describe_all(parts: Sequence[Part], meshes: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Sums over all meshes, and what holds for each of them."""
+    """Return sums over all meshes, and properties that are true for each."""
     of_surface = {part.surface: mesh for part, mesh in zip(parts, meshes, strict=True)}.values()
     return {
         "vertices": sum(mesh["vertices"] for mesh in meshes),
@@ -262,7 +262,7 @@ def _describe_all(parts: Sequence[Part], meshes: Sequence[dict[str, Any]]) -> di
 
 
 def _shows_skin(surface: Surface, settings: MeshSettings) -> bool:
-    """One of its levels lies between air and fat, and the outside of the body is not left out."""
+    """True where a level lies between air and fat, and the outside of the body is not left out."""
     if surface.label is not None or surface.iso_value is None or (surface.below and not settings.keep_outside):
         return False
     levels = surface.iso_value if isinstance(surface.iso_value, tuple) else (surface.iso_value,)
@@ -270,7 +270,7 @@ def _shows_skin(surface: Surface, settings: MeshSettings) -> bool:
 
 
 def _largest(taken: Iterable[dict[str, int]]) -> dict[str, int]:
-    """Of several surfaces, the most that one took, by what it is."""
+    """Return the most bytes that one of several surfaces took, by purpose."""
     largest: dict[str, int] = {}
     for own in taken:
         largest.update({what: max(size, largest.get(what, 0)) for what, size in own.items()})
@@ -293,12 +293,12 @@ def _around(boxes: list[list[list[float]]]) -> list[list[float]]:
 
 
 def _common(values: Iterable[Any]) -> Any:
-    """The value that all have, None where they differ."""
+    """Return the value that all have in common, None if they differ."""
     found = list(values)
     return found[0] if all(value == found[0] for value in found) else None
 
 
 def _unless_unknown(combine: Callable[[list[Any]], Any], values: Iterable[Any]) -> Any:
-    """`combine` of the values, None where one of them is."""
+    """Apply `combine` to the values; None if one of them is None."""
     found = list(values)
     return None if any(value is None for value in found) else combine(found)

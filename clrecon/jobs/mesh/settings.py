@@ -16,13 +16,13 @@ __all__ = ["MeshSettings", "name_level"]
 
 
 def name_level(level: float | Sequence[float]) -> str:
-    """An iso value or a range as it is written: ``200``, ``100:300``."""
+    """Write an iso value or a range as text: ``200``, ``100:300``."""
     return ":".join(f"{value:g}" for value in level) if isinstance(level, Sequence) else f"{level:g}"
 
 
 @dataclass(frozen=True)
 class MeshSettings(InputSettings):
-    """How a mesh is made from a CT series.
+    """Settings of the mesh job.
 
     Parameters
     ----------
@@ -30,11 +30,11 @@ class MeshSettings(InputSettings):
         HU; inside is ``>= iso_value``.  Several make one mesh each.  A pair in the sequence is a range, both ends
         included: ``((100, 300),)``.
     below : float or sequence of float, optional
-        In place of an iso value: inside is ``< below``, HU.  The air round the patient is left out.
+        In place of an iso value: inside is ``< below``, HU.  The air around the patient is left out.
     keep_outside : bool
-        With `below`: leave the air round the patient in.
+        With `below`: keep the air around the patient.
     preset : str, optional
-        Name of an iso value, see `clrecon.jobs.mesh.presets`.  Neither of both means the preset "bone".
+        Name of an iso value, see `clrecon.jobs.mesh.presets`. If neither is given, the preset is "bone".
     half_way : "auto" or (bone, tissue), optional
         In place of an iso value: half way between the two materials, measured in the scan or given in HU.
     space : {"lps", "ras"}
@@ -42,7 +42,7 @@ class MeshSettings(InputSettings):
     closed : bool
         Close the surface where it meets the border of the volume (outside is air).
     topology : {"separated", "trilinear"}
-        What is done where the voxels around a cell do not say which of them are joined, see `extract_isosurface`.
+        Rule where the voxels around a cell do not tell which of them are joined, see `extract_isosurface`.
     keep : "bone", optional
         Keep only components that look like bone, see `clrecon.mesh.compare.walls`.  With `keep_largest`: of these the
         largest.
@@ -53,19 +53,20 @@ class MeshSettings(InputSettings):
     seeds : sequence of (x, y, z)
         Keep only the components whose surface lies nearest to these points, in mm of the frame `space`.
     split : bool
-        One mesh a component, the largest first.
+        Write one mesh for each component, the largest first.
     labels : LabelChoice, optional
-        A label map: one mesh a label, see `LabelChoice`.
+        A label map: one mesh for each label, see `LabelChoice`.
     smooth : int, optional
         Iterations of smoothing, see `clrecon.mesh.smooth_mesh`; None: none.
     decimate : float, optional
-        Share of the triangles to take away, see `clrecon.mesh.decimate_mesh`; None: none.
+        Share of the triangles to remove, see `clrecon.mesh.decimate_mesh`; None: none.
     max_deviation_mm : float, optional
-        Bound of each of both, mm; None: a quarter of the shortest voxel step.
+        Bound of smoothing and of decimation, mm; None: a quarter of the shortest voxel step.
     purpose : str, optional
-        What the mesh is for: more is measured.  It sets nothing here, see `clrecon.jobs.mesh.for_purpose.settings_for`.
+        Purpose of the mesh, for which more is measured.  It sets nothing here, see
+        `clrecon.jobs.mesh.for_purpose.settings_for`.
     strict : bool
-        Measure whatever a gate needs, triangles that cut each other too.
+        Measure everything that a gate needs, triangles that cut each other included.
     **shared
         See `clrecon.jobs.shared.settings.InputSettings`.
 
@@ -116,7 +117,7 @@ class MeshSettings(InputSettings):
             if len(seed) != 3 or not all(map(math.isfinite, seed)):
                 raise UsageError(f"a seed is a point of three numbers in mm, not {tuple(seed)}")
         self._check_refinement()
-        from clrecon.geometry import frame_from_lps  # numpy: not wanted before a job starts
+        from clrecon.geometry import frame_from_lps  # numpy: not loaded before a job starts
         from clrecon.geometry.iso_rule import check_topology
 
         frame_from_lps(self.space)
@@ -127,7 +128,7 @@ class MeshSettings(InputSettings):
             raise UsageError(f"the topology {self.topology} follows HU: leave it out with labels, which pick the cells")
 
     def _check_masks(self) -> None:
-        """Labels' own surfaces do not depend on HU: what chooses or changes them would do nothing, in silence."""
+        """Refuse settings that have no effect on labels' own surfaces, which do not depend on HU."""
         if self.follows_hu:
             return
         levels = (self.iso_value, self.below, self.preset, self.half_way)
@@ -212,7 +213,7 @@ class MeshSettings(InputSettings):
 
     @property
     def levels(self) -> tuple[float | tuple[float, ...], ...]:
-        """The iso values or ranges in HU that are used, one a surface; NaN for what the scan has yet to give."""
+        """The iso values or ranges in HU, one for each surface; NaN for values that are measured in the scan."""
         if not self.follows_hu:
             return ()
         if self.below is not None:
@@ -231,30 +232,30 @@ class MeshSettings(InputSettings):
 
     @property
     def follows_hu(self) -> bool:
-        """HU place the surfaces; else they are labels' own."""
+        """True where HU place the surfaces; False for labels' own surfaces."""
         return self.labels is None or self.labels.surface == "hu"
 
     @property
     def inside(self) -> str:
-        """What the surfaces enclose, see `clrecon.geometry.iso_rule.IsoRule`; "between" where one is a range."""
+        """Values that the surfaces enclose, see `clrecon.geometry.iso_rule.IsoRule`; "between" if one is a range."""
         if self.below is not None:
             return "below"
         return "between" if any(isinstance(level, tuple) for level in self.levels) else "above"
 
     @property
     def refines(self) -> bool:
-        """The surface is smoothed or decimated."""
+        """True where the surface is smoothed or decimated."""
         return self.smooth is not None or self.decimate is not None
 
     @property
     def preset_used(self) -> str | None:
-        """Name of the preset behind `levels`, None where the value was given, is half way, or there is none."""
+        """Name of the preset behind `levels`; None if the value was given, is half way, or there is none."""
         named = any(given is not None for given in (self.iso_value, self.below, self.half_way))
         return None if named or not self.follows_hu else (self.preset or DEFAULT_PRESET)
 
     @property
     def selects(self) -> bool:
-        """Whether components are told apart."""
+        """True where components are selected."""
         if self.keep is not None:
             return True
         return self.split or bool(self.seeds) or self.keep_largest is not None or self.min_volume_ml is not None

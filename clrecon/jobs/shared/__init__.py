@@ -1,1 +1,1 @@
-"""What jobs have in common: checks, outputs, reports, masks."""
+"""The common parts of jobs: checks, outputs, reports, masks."""

@@ -1,4 +1,4 @@
-"""What the parts of a job take."""
+"""Times of the parts of a job."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class Laps:
         self.seconds: dict[str, float] = {}
 
     def lap(self, part: str) -> float:
-        """Book the time since the last lap on `part` and return it."""
+        """Add the time since the last lap to `part` and return it."""
         now = perf_counter()
         elapsed = now - self._lap
         self._lap = now

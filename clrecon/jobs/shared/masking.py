@@ -1,4 +1,4 @@
-"""What of the scan is left out before a surface or a picture is made: what is not the patient, what is not in view."""
+"""Masking of a scan before a surface or a picture is made: table and surroundings, and everything outside the view."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ __all__ = ["mask_volume"]
 
 
 def mask_volume(volume: Volume, settings: InputSettings, progress: Progress) -> Volume:
-    """The volume with air outside of the field of view and of the body, as far as the settings ask for it.
+    """Return the volume with air outside the field of view and the body, as the settings ask for it.
 
     Raises
     ------
@@ -58,7 +58,7 @@ def _describe_bone(facts: dict[str, Any]) -> str:
 
 
 def _describe_cut(facts: dict[str, Any]) -> str:
-    """What bone a circle has cut; nothing where it has cut none."""
+    """Describe the bone that a circle has cut off; no text if it has cut off none."""
     lost = facts["bone_voxels_removed"]
     if not lost:
         return ""

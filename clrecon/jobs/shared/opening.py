@@ -28,15 +28,15 @@ def _prepare(chosen: Future[Device], prepare: Callable[[Device], None]) -> None:
 class DeviceOpening:
     """A device that is chosen, opened and given its kernels beside the work of a ``with`` block.
 
-    The order of errors does not depend on which side is faster: where the block fails and the device is not there
-    either, the device's error is raised.  Only what the caller has cancelled is cancelled, device or not.
+    The order of errors does not depend on which side is faster: if both the block and the device fail, the device's
+    error is raised.  Only a cancellation by the caller is passed on in any case.
 
     Parameters
     ----------
     name : str, int, Device or None
         As `clrecon.device` takes it.
     prepare : callable
-        Builds the kernels on the device that it is given.
+        Function that builds the kernels on a device.
     """
 
     def __init__(self, name: str | int | Device | None, prepare: Callable[[Device], None]):
@@ -50,7 +50,7 @@ class DeviceOpening:
         Raises
         ------
         DeviceError
-            There is none of that name, it cannot be opened, or its compiler refuses.
+            There is no device of that name, it cannot be opened, or its compiler refuses.
         """
         device = self._chosen.result()
         self._prepared.result()

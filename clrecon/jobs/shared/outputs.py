@@ -1,4 +1,4 @@
-"""The files of a job: what they are called, and that none of them stands in the way of another."""
+"""The files of a job: their names, and checks that none of them replaces another or an input."""
 
 from __future__ import annotations
 
@@ -30,17 +30,17 @@ __all__ = [
 ]
 
 MOST_FILES = 1000
-"""Meshes a job.  More are crumbs that nobody opens, and every one of them keeps a file open until all are written."""
+"""Most meshes of a job.  More are useless crumbs, and each keeps a file open until all are written."""
 
 
 def name_outputs(output: str | Path, names: Sequence[str], report_path: str | Path | None = None) -> list[str | Path]:
-    """The files of several meshes: ``bone.stl`` and ``200hu`` make ``bone_200hu.stl``; an empty name changes nothing.
+    """Name the files of several meshes: ``bone.stl`` and ``200hu`` give ``bone_200hu.stl``; an empty name adds nothing.
 
     Parameters
     ----------
     output : path
     names : sequence of str
-        One a mesh, see `clrecon.jobs.mesh.parts.Part`.
+        One for each mesh, see `clrecon.jobs.mesh.parts.Part`.
     report_path : path, optional
 
     Returns
@@ -50,7 +50,8 @@ def name_outputs(output: str | Path, names: Sequence[str], report_path: str | Pa
     Raises
     ------
     UsageError
-        There are too many, a name is no part of a file name, or two of the files, the report among them, are one.
+        There are too many, a name cannot be part of a file name, or two of the files (the report included) are the
+        same.
     """
     if len(names) > MOST_FILES:
         raise UsageError(
@@ -69,12 +70,12 @@ def name_outputs(output: str | Path, names: Sequence[str], report_path: str | Pa
 
 
 def check_distinct(*owned: Sequence[tuple[str, str | Path]]) -> None:
-    """Refuse two outputs that are one file.
+    """Refuse two outputs that are the same file.
 
     Parameters
     ----------
     *owned : sequence of (str, path)
-        What a file is, and where it is going to be.
+        Description and path of each file.
 
     Raises
     ------
@@ -89,17 +90,17 @@ def check_distinct(*owned: Sequence[tuple[str, str | Path]]) -> None:
 
 
 def check_kept(outputs: Sequence[tuple[str, str | Path | None]], *inputs: str | Path | None) -> None:
-    """Refuse outputs in the place of files that the job reads, whatever name or link leads there.
+    """Refuse outputs that would replace files that the job reads, under any name or link.
 
-    A file with the mark of DICOM is replaced by no output (`clrecon.system.files`); here it is data sets without one,
-    files of other formats with those of their voxels, and files that say how.
+    Files with the mark of DICOM are never replaced (`clrecon.system.files`). This function protects data sets without
+    the mark, files of other formats with their voxel files, and files with settings.
 
     Parameters
     ----------
     outputs : sequence of (str, path or None)
-        What an output is, and where it is going to be: a file, or a folder that is replaced as a whole.
+        Description and path of an output: a file, or a folder that is replaced as a whole.
     *inputs : path or None
-        Files and folders that are read; None and "" are none.
+        Files and folders that are read; None and "" are ignored.
 
     Raises
     ------
@@ -118,14 +119,14 @@ def check_kept(outputs: Sequence[tuple[str, str | Path | None]], *inputs: str | 
 
 
 def _find_voxels(path: str | Path) -> Path | None:
-    """The file that a header names for its voxels; None where it is the same, or there is no such header."""
+    """Return the file that a header names for its voxels; None if it is the same file, or there is no header."""
     from clrecon.formats import VOLUME, open_grid, tell_kind
 
     try:
         kind = tell_kind(Path(path)) if os.path.isfile(path) else None
         return open_grid(Path(path), kind, VOLUME).voxel_bytes.path if kind and kind != "DICOM" else None
     except (ClreconError, OSError):
-        return None  # reading says what is wrong with it
+        return None  # reading reports the error
 
 
 def _is_bare_data_set(path: str | Path) -> bool:
@@ -142,7 +143,7 @@ def _is_bare_data_set(path: str | Path) -> bool:
 def count_leftovers(output: str | Path, paths: Sequence[str | Path]) -> int:
     """Count the numbered files of `output` that are not among `paths`: components of an earlier run that had more.
 
-    They are not this job's to remove, but whoever takes all files of that name would take them for its own.
+    The job must not remove them, but a user who takes all files of that name would mix them up with the new ones.
     """
     stem, extension = os.path.splitext(os.path.basename(output))
     numbered = re.compile(rf"{re.escape(stem)}(?:_.+)?_[0-9]{{3,}}{re.escape(extension)}")
@@ -153,7 +154,7 @@ def count_leftovers(output: str | Path, paths: Sequence[str | Path]) -> int:
 
 
 def _identity(path: str | Path) -> str:
-    """What two names of one file have in common, also where links lead there or upper case counts as lower case."""
+    """Return a key that is equal for two names of one file, also with links and on systems that ignore case."""
     return os.path.realpath(path).casefold()
 
 
@@ -165,14 +166,14 @@ def check_outputs(
     Returns
     -------
     list of (str, path)
-        What each of them is, and where it goes.
+        Description and path of each output.
 
     Raises
     ------
     UsageError
-        Unknown extension, or two outputs are one file.
+        An extension is unknown, or two outputs are the same file.
     OutputError
-        A folder is missing or cannot be written, or a target is no regular file, or a DICOM file.
+        A folder is missing or cannot be written, or a target is not a regular file, or is a DICOM file.
     """
     from clrecon.exchange.formats import check_format
     from clrecon.system.files import check_writable
@@ -208,7 +209,7 @@ def stage_meshes(
 
 
 def commit_all(files: Sequence[Staged]) -> None:
-    """Put staged files into their places, one after the other; Ctrl-C waits until all of them are there.
+    """Move staged files to their places, one after the other; Ctrl-C waits until all are there.
 
     Raises
     ------

@@ -1,6 +1,6 @@
 """Reports: strict JSON, written last.
 
-A report is the commit mark of a job: when it is there, everything that it speaks of is complete.
+The report is the commit mark of a job: when it exists, all files that it describes are complete.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ def to_json(value: Any, indent: int | None = 2) -> str:
     Raises
     ------
     TypeError
-        Something in `value` has no place in JSON.
+        `value` contains something that JSON cannot hold.
     """
     return json.dumps(_plain(value), indent=indent, allow_nan=False)
 
@@ -49,7 +49,7 @@ def _plain(value: Any) -> Any:
 
 
 def stage_report(path: str | Path, report: Mapping[str, Any]) -> AbstractContextManager[StagedFile]:
-    """Write `report` as JSON under a temporary name, to be committed after the files that it speaks of.
+    """Write `report` as JSON under a temporary name, to be committed after the files that it describes.
 
     Raises
     ------
@@ -67,19 +67,19 @@ def stage_report(path: str | Path, report: Mapping[str, Any]) -> AbstractContext
 
 
 def error_as_dict(error: ClreconError) -> dict[str, Any]:
-    """The JSON form of an error: ``{"error": {"kind", "exit_code", "message"}}``."""
+    """Return the JSON form of an error: ``{"error": {"kind", "exit_code", "message"}}``."""
     return {"error": {"kind": type(error).__name__, "exit_code": error.exit_code, "message": str(error)}}
 
 
 def platform_name() -> str:
-    """Operating system, machine and Python, without the name of the computer."""
+    """Return operating system, machine and Python, without the name of the computer."""
     import platform
 
     return f"{platform.system()} {platform.machine()}, Python {platform.python_version()}"
 
 
 def peak_memory_bytes() -> int | None:
-    """Largest resident memory of this process so far, None where the system does not tell."""
+    """Return the largest resident memory of this process so far, None if the system does not tell."""
     try:
         import resource
     except ImportError:  # Windows

@@ -1,4 +1,4 @@
-"""`RunReport`: what a job writes with ``report_path``, and gives back."""
+"""`RunReport`: the common part of all reports, which jobs return and write to ``report_path``."""
 
 from __future__ import annotations
 
@@ -11,22 +11,22 @@ __all__ = ["RunReport"]
 
 
 class RunReport(Record):
-    """What the reports of all jobs say; each is a dataclass with these fields among its own, in the order of its JSON.
+    """The entries that all reports share; each report is a dataclass with these fields and its own, in JSON order.
 
     Attributes
     ----------
     affine_ijk_to_lps_mm : nested list (4, 4)
     device, driver : str
     memory_allowed_bytes : int or None
-        What may be taken on the device; None: all of it.
+        Most bytes that may be taken on the device; None: all.
     version, platform : str
-        Of clrecon; system, machine and Python.
+        Version of clrecon; system, machine and Python.
     warnings : list of str
         Those of the volume first, each once.
     volume : mapping
         The `Certificate` of the volume without its warnings.
     seconds : mapping of str to float
-        By part of the job, with ``other`` and ``total``.
+        Seconds by part of the job, with ``other`` and ``total``.
     peak_memory_bytes : int or None
     """
 

@@ -1,4 +1,4 @@
-"""Settings that every job shares: which scan, what of it is left out, and on which device."""
+"""Settings that every job shares: which scan, which parts of it become air, and which device."""
 
 from __future__ import annotations
 
@@ -13,22 +13,23 @@ __all__ = ["InputSettings"]
 
 @dataclass(frozen=True, kw_only=True)
 class InputSettings(Selection):
-    """What is read, what of it is turned into air, and where it is computed.
+    """Settings of the input: what is read, which parts become air, and the device for the computation.
 
     Parameters
     ----------
     series, phase, allow_gaps, force
         See `clrecon.reading.Selection`.
     remove_table : bool
-        Turn what is not the patient's body into air first, see `clrecon.anatomy.body.remove_table`.
+        First turn everything except the patient's body into air, see `clrecon.anatomy.body.remove_table`.
     allow_bone_loss : bool
-        Go on where this takes more than 2 % of the bone.
+        Continue even if this removes more than 2 % of the bone.
     field_of_view : float or "auto", optional
-        Turn what lies further from the centre of the slices (mm) into air first; "auto": the circle that fits them.
+        First turn everything farther from the centre of the slices (mm) into air; "auto": the circle that fits them.
     device : str, optional
         Name or index of an OpenCL device; None leaves the choice to `choose_device`.
     memory : int, optional
-        Bytes that may be taken on the device; None is all that it has.  What does not fit goes through in slabs.
+        Bytes that may be taken on the device; None is all that it has.  A volume that does not fit is processed in
+        slabs.
 
     Raises
     ------

@@ -122,7 +122,7 @@ def _step_along(directions: NDArray[np.float64], volume: Volume) -> NDArray[np.f
 
 @dataclass(frozen=True, eq=False)
 class WallLook(Record):
-    """What a surface looks like, by what lies beneath it.
+    """The judgement of a surface by the values below it.
 
     Attributes
     ----------
@@ -180,14 +180,14 @@ def judge_walls(walls: Walls) -> WallLook:
 
 
 def looks_like_bone(judged: WallLook | None) -> bool:
-    """The surface is that of bone, faint or not."""
+    """True for a surface of bone, faint or not."""
     return judged is not None and judged.looks_like in ("bone", "faint bone")
 
 
 def judge_components(
     mesh: Mesh, volume: Volume, rule: IsoRule, count: int, label_of_vertex: NDArray[np.int64]
 ) -> list[WallLook | None]:
-    """The same for each component of a surface; None for crumbs of less than `FEWEST_VERTICES`.
+    """Judge each component of a surface; None for crumbs of less than `FEWEST_VERTICES`.
 
     Parameters
     ----------
