@@ -1,4 +1,4 @@
-/* Bricks of 8 x 8 x 8 voxels, and how what they hold compares with an iso value. */
+/* Bricks of 8 x 8 x 8 voxels, and the comparison of their values with an iso value. */
 #ifndef CLRECON_BRICKS_H
 #define CLRECON_BRICKS_H
 

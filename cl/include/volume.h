@@ -1,4 +1,4 @@
-/* The one index formula, and reading a voxel inside and beyond the border of a volume.
+/* The index formula of volumes, and reading of voxels inside and beyond the border.
  *
  * VOXEL is the element type of the volume (-D VOXEL=short ...): char, uchar, short, ushort, int or float.
  * VALUE is the type for values and their differences: int for integer voxels, else float. */

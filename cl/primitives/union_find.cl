@@ -13,7 +13,7 @@
  * Passes
  *   1. clear_labels, hook_corners   the first round, where every vertex is a root: no label need be read
  *   2. jump_labels                  labels of labels, until every label is a root (until `flags` says so)
- *   3. mark_mixed, mark_roots       what the other rounds are about, listed by compact.cl: a small part of the mesh
+ *   3. mark_mixed, mark_roots       triangles and roots for the other rounds, listed by compact.cl: few of the mesh
  *   4. gather_roots; then hook_roots and jump_roots on these lists alone, until no root hooks to another; the labels
  *      of all other vertices stay, and are roots of the first round; copy_roots brings both together
  *   5. flag_roots, scan.cl, number_components

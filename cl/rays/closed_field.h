@@ -1,4 +1,4 @@
-/* The field of a volume that is surrounded by a layer of outside, as closed surfaces are taken from.
+/* The closed field: a volume surrounded by a layer of `outside`, the field of closed surfaces.
  *
  * One index step beyond the outermost voxel centres the field has reached `outside`; in between it is linear. */
 #ifndef CLRECON_CLOSED_FIELD_H

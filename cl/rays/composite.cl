@@ -1,16 +1,16 @@
 /* Volume rendering: colours and opacities of a transfer function, blended from front to back along the rays.
  *
  * References: Levoy 1988, "Display of surfaces from volume data" (shading, opacity by gradient); Max 1995, "Optical
- * models for direct volume rendering" (opacity of a segment).  Empty space is leapt over with a map of Chebyshev
- * distances (Cohen and Sheffer 1994, "Proximity clouds") and of what lies ahead.
+ * models for direct volume rendering" (opacity of a segment).  Rays leap over empty space by a map of Chebyshev
+ * distances (Cohen and Sheffer 1994, "Proximity clouds") and of free bricks ahead.
  *
- * Where the transfer function is steep, segments are taken in parts, see steep_segments.h.  A variant of its own does
- * so: the samples beside each segment cost time, and functions without a steep place need none.
+ * Where the transfer function is steep, segments are divided into parts, see steep_segments.h.  This is a separate
+ * variant, because it needs the neighbouring samples of each segment, which cost time.
  *
- * A work-item has a packet of LANES neighbouring rays that go on together, sample by sample: they leap as far as all of
- * them may, and what they do next is decided once for all of them.
+ * A work-item has a packet of LANES neighbouring rays that advance together, sample by sample: they leap as far as all
+ * of them may, and each decision holds for all of them.
  *
- * -D UNEVEN             slices at places of their own
+ * -D UNEVEN             uneven slices
  * -D GRADIENT_OPACITY   opacity times a function of the gradient's magnitude
  * -D TAKES_PARTS=1      steep segments in parts; steps are so short that values are nearly linear between samples;
  *                       default 0, samples alone

@@ -1,6 +1,6 @@
 /* The trilinear field of a volume: values and gradients for LANES places at once.
  *
- * Half a voxel around the outermost voxel centres belongs to the volume and has the nearest centre's value. */
+ * The volume extends half a voxel beyond the outermost voxel centres; there the nearest centre's value holds. */
 #ifndef CLRECON_FIELD_H
 #define CLRECON_FIELD_H
 

@@ -1,4 +1,4 @@
-/* Slopes and light at a single place: for rays that stop at one. */
+/* Gradient and light at a single place, for rays that stop at a hit. */
 #ifndef CLRECON_HIT_H
 #define CLRECON_HIT_H
 

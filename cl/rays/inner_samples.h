@@ -1,4 +1,4 @@
-/* Which samples of a packet of rays lie so well within the volume that none needs clamping, see find_cells(). */
+/* Inner samples of a packet of rays: so far inside the volume that none needs clamping, see find_cells(). */
 #ifndef CLRECON_INNER_SAMPLES_H
 #define CLRECON_INNER_SAMPLES_H
 

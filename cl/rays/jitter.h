@@ -1,6 +1,6 @@
-/* Where in its segments the samples of a pixel lie, for rays whose samples must not line up.
+/* Jitter: the place of a pixel's samples in their segments, for rays whose samples must not line up.
  *
- * The mixer is lowbias32 (C. Wellons 2018, "Prospecting for hash functions"), once over y and once over x with that;
+ * The mixer is lowbias32 (C. Wellons 2018, "Prospecting for hash functions"), applied to y, then to x with the result;
  * clrecon/reference/rays/rays.py gives the same bits. */
 #ifndef CLRECON_JITTER_H
 #define CLRECON_JITTER_H

@@ -1,7 +1,7 @@
-/* What labels do to a picture: a colour and an opacity each, of the label of the nearest voxel.
+/* Labels in a picture: the colour and opacity of the label of the nearest voxel.
  *
- * The host's table has one float4 a label number: red, green, blue, opacity; red below 0 keeps the colour that is there
- * without labels.  Its first entry is that of no label. */
+ * The host's table has one float4 for each label number: red, green, blue, opacity; red below 0 keeps the colour of the
+ * picture without labels.  Its first entry is that of no label. */
 #ifndef CLRECON_LABEL_COLOR_H
 #define CLRECON_LABEL_COLOR_H
 

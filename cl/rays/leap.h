@@ -1,4 +1,4 @@
-/* A map of how far around nothing shows, and leaps along rays with it.
+/* Leaps of rays over empty space, by a map of the distance to the nearest visible brick.
  *
  * Distances of bricks to the nearest that shows something (0), in one plane of the map:
  *

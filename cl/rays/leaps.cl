@@ -1,11 +1,11 @@
-/* Where a transfer function shows anything: ranges of bricks of cells, and the distance to the next that shows.
+/* Visible bricks of a transfer function: ranges of bricks of cells, and the distance to the next visible brick.
  *
  * Passes
- *   1. measure_cells     once a volume: lowest and highest value that a sample in a brick can have
- *   2. mark_bricks       once a transfer function
+ *   1. measure_cells     once for a volume: lowest and highest value that a sample in a brick can have
+ *   2. mark_bricks       once for a transfer function
  *   3. spread_in_rows    along i, and
  *   4. spread_along      along j and along k: a separable Chebyshev distance transform
- *   5. look_ahead        once a picture: how far the way is free in the direction of its rays */
+ *   5. look_ahead        once for a picture: the free distance in the direction of its rays */
 #include "include/volume.h"
 #include "rays/leap.h"
 #include "rays/look_ahead.h"

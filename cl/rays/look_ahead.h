@@ -1,7 +1,7 @@
-/* Leaps along rows of bricks that show nothing, in the direction that most of a picture's rays have.
+/* Leaps along rows of empty bricks, in the direction of most of a picture's rays.
  *
- * Near what shows the cubes of rays/leap.h are small; ahead the way is often free for long.  Rays drift aside as they
- * go on: with a brick's row also those beside it must be empty, on the side that rays through it drift to.
+ * Near visible bricks the cubes of rays/leap.h are small, but ahead the way is often free for long.  Rays drift to the
+ * side on their way: not only a brick's row must be empty, but also the rows beside it, on the side of the drift.
  *
  *      main axis -->                                  an entry of the map of ways, bit by bit
  *      beside     .  .  .  .  #   # shows something   7 ............. 4   3 ............. 0

@@ -1,5 +1,5 @@
-/* Light on surfaces (Phong 1975, with Blinn's halfway vector).  Normals count as turned to the viewer, so that a light
- * at the camera lights both sides of a surface; a fixed light lights only what faces it, as VTK's do. */
+/* Light on surfaces (Phong 1975, with Blinn's halfway vector).  Normals are turned towards the viewer, so that a light
+ * at the camera lights both sides of a surface; a fixed light only lights surfaces that face it, as in VTK. */
 #ifndef CLRECON_PHONG_H
 #define CLRECON_PHONG_H
 

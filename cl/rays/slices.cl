@@ -1,8 +1,8 @@
 /* Slices of a volume in space: each drawn translucent at its own place, and blended from front to back.
  *
- * A ray crosses each slice plane once, so there is nothing to march through, and only the slices that are shown need
- * to be on the device.  All rays cross them in one order: of height for parallel rays, of distance from the camera's
- * height for those that begin at a camera. */
+ * A ray crosses each slice plane once, so no marching is needed, and only the shown slices have to be on the device.
+ * All rays cross the slices in the same order: by height for parallel rays, by distance from the camera's height for
+ * rays from a camera. */
 #include "include/volume.h"
 #include "rays/view.h"
 

@@ -1,4 +1,4 @@
-/* Slices at places of their own: from field coordinates, see rays/view.h, to voxel indices.
+/* Uneven slices: conversion of field coordinates, see rays/view.h, to voxel indices.
  *
  * -D UNEVEN: `slices` has 4 float4 a slice: height over slice 0 in mm, indices (i, j) by which its voxel (0, 0) lies
  * beside that of slice 0, 1 / height to the next slice; and three rows, see VIEW_NORMAL_X.  Without it field

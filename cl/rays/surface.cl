@@ -1,14 +1,14 @@
 /* Surfaces without a mesh: the first place of each ray where the field reaches the iso value, shaded.
  *
  * References: Phong 1975 (shading); Whitted 1980, "An improved illumination model for shaded display" (shadow rays);
- * Parker et al. 1998, "Interactive ray tracing for isosurface rendering".  What cannot reach the iso value is leapt
- * over (see rays/leap.h).  The field is the one that the closed mesh is taken from (see rays/closed_field.h).
+ * Parker et al. 1998, "Interactive ray tracing for isosurface rendering".  Rays leap over bricks that cannot reach the
+ * iso value (see rays/leap.h).  The field is that of the closed mesh (see rays/closed_field.h).
  *
  * A work-item has LANES neighbouring rays.  They leap together, as in cl/rays/composite.cl; where the level may be
- * reached, each goes on alone, takes LANES samples along its way at a time and looks for the first that is inside.
+ * reached, each continues alone, takes LANES samples along its way at a time and searches the first that is inside.
  *
- * -D UNEVEN   slices at places of their own
- * -D LABELS   labels with colours and opacities: through what is translucent the ray goes on */
+ * -D UNEVEN   uneven slices
+ * -D LABELS   labels with colours and opacities: a ray continues through translucent labels */
 #include "rays/hit.h"
 #include "rays/surface_lines.h"
 #include "rays/view.h"

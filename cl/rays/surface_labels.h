@@ -1,4 +1,4 @@
-/* Labels on the closed surface: whose a place on it is, and the way of a ray or of light through what is translucent. */
+/* Labels on the closed surface: the label of a place, and the way of rays and light through translucent labels. */
 #ifndef CLRECON_SURFACE_LABELS_H
 #define CLRECON_SURFACE_LABELS_H
 

@@ -1,4 +1,4 @@
-/* Samples along lines through the closed field, and where the first of them is inside. */
+/* Samples along lines through the closed field, and the place of the first one inside. */
 #ifndef CLRECON_SURFACE_LINES_H
 #define CLRECON_SURFACE_LINES_H
 

@@ -1,6 +1,6 @@
-/* Where the rays of a tile of pixels can first meet something that shows: found once for all of them.
+/* Start of the rays of a tile of pixels: the first place that may be visible, found once for all rays of the tile.
  *
- * The ray in the middle of the tile leaps, and the empty space around it must reach as far as the others are away. */
+ * The ray in the middle of the tile leaps, and the empty space around it must include the other rays. */
 #include "rays/leap.h"
 #include "rays/ray_packet.h"
 #include "rays/stack.h"

@@ -1,8 +1,8 @@
-/* A look through a window at a row of 16-bit voxels: what LANES places between them see, with one load and one shuffle
- * in place of a load for each lane.
+/* A window on a row of 16-bit voxels: LANES neighbouring places read it with one load and one shuffle, in place of a
+ * load for each lane.
  *
- * OpenCL's shuffle() goes through memory on CPU drivers, so this is made of what clang gives of x86 CPUs with AVX2 or
- * AVX-512: other compilers and other CPUs have no windows (HAS_WINDOWS 0), and every lane loads its own voxels. */
+ * OpenCL's shuffle() goes through memory on CPU drivers, so this uses clang's builtins for x86 CPUs with AVX2 or
+ * AVX-512.  Other compilers and CPUs have no windows (HAS_WINDOWS 0), and every lane loads its own voxels. */
 #ifndef CLRECON_WINDOW_H
 #define CLRECON_WINDOW_H
 

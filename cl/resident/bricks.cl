@@ -1,10 +1,10 @@
-/* Lowest and highest value of every brick of 8 x 8 x 8 voxels: what a later pass need not look at.
+/* Lowest and highest value of every brick of 8 x 8 x 8 voxels, which let later passes skip bricks.
  *
  * Reference: Wilhelms and Van Gelder 1992, "Octrees for faster isosurface generation"; here one level of bricks.
  *
  * Passes
- *   1. measure_bricks    once a volume
- *   2. compare_bricks    once an iso value: which words of samples are all inside, all outside, mixed */
+ *   1. measure_bricks    once for a volume
+ *   2. compare_bricks    once for an iso value: which words of samples are all inside, all outside, mixed */
 #include "include/bricks.h"
 #include "include/volume.h"
 

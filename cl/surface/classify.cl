@@ -1,4 +1,4 @@
-/* Which samples of a volume are inside, packed to one bit a sample: the first pass of every surface.
+/* The inside mask of a volume, one bit for each sample: the first pass of every surface.
  *
  * References: the packing is our own; skipping bricks by their ranges follows Wilhelms and Van Gelder 1992.
  *
@@ -7,7 +7,7 @@
  *   classify_bricks    from the voxels of mixed bricks alone, where the bricks of the whole volume are measured
  *
  * -D RANGE: inside are the voxels from `level` to `highest`, both included.
- * -D BORDER_INSIDE: the border counts as inside.  What is not inside is then enclosed by what is. */
+ * -D BORDER_INSIDE: the border counts as inside, so that inside samples enclose the others. */
 #include "include/bricks.h"
 #include "include/volume.h"
 #include "surface/mask_rows.h"

@@ -1,7 +1,7 @@
-/* Vertices of one label's surface: which of them HU place, and which lie half way (-D LABELS).
+/* Vertices of one label's surface: those placed by HU, and those half way (-D LABELS).
  *
- * Between a dense sample of the label and one that is neither dense nor of any label the vertex is that of the plain
- * surface.  Everywhere else it lies half way, and its normal is that of the field "inside of the label". */
+ * Between a dense sample of the label and one that is neither dense nor labelled, the vertex is that of the surface
+ * without labels.  Everywhere else it lies half way, and its normal is that of the field "inside of the label". */
 #ifndef CLRECON_LABEL_BORDER_H
 #define CLRECON_LABEL_BORDER_H
 

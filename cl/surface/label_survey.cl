@@ -1,4 +1,4 @@
-/* Survey of a label map: where each label lies, and which faces of its voxels it shares with others.
+/* Survey of a label map: the box of each label, and the number of faces that its voxels share with other labels.
  *
  * Passes
  *   1. clear_survey

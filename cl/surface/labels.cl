@@ -1,11 +1,11 @@
-/* Which samples are inside of which label: the label says where to look, HU say what is dense.
+/* Samples inside of labels: the label map tells to which label a sample belongs, HU tell whether it is dense.
  *
  * The rules are our own; clrecon/reference/surface/labels.py states them.
  *
  * Passes
- *   1. own_samples      per sample the label that it is inside of, or 0
- *      (where labels are made solid, the host fills their cavities in between)
- *   2. classify_label   per label one bit a sample, packed as cl/surface/classify.cl packs the plain surface */
+ *   1. own_samples      for each sample the label that it is inside of, or 0
+ *      (for solid labels, the host fills their cavities before the next pass)
+ *   2. classify_label   for each label one bit per sample, packed as in cl/surface/classify.cl */
 #include "include/label_type.h"
 #include "include/volume.h"
 

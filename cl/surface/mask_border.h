@@ -4,10 +4,10 @@
  *
  *   other end            the vertex lies where
  *   without a label      the label's occupancy crosses its level; where other labels lie alongside, that of all labels
- *   another label        both labels lead by as much, with the bias of each: the same point for both
+ *   another label        the leads of both labels, with their biases, are equal: the same point for both
  *   beyond the map       half way: the map ends at the faces of its voxels
  *
- * Ends on the wrong side of the level count as just on their own side, so that a vertex stays on its edge. */
+ * An end on the wrong side of the level counts as just on its own side, so that a vertex stays on its edge. */
 #ifndef CLRECON_MASK_BORDER_H
 #define CLRECON_MASK_BORDER_H
 

@@ -1,4 +1,4 @@
-/* Marching cubes whose ambiguous faces and cells are resolved as the trilinear field has them.
+/* Marching cubes whose ambiguous faces and cells are resolved as in the trilinear field.
  *
  * References: Nielson and Hamann 1991; Chernyaev 1995, "Marching Cubes 33"; Grosso 2016.
  *

@@ -1,10 +1,10 @@
-/* What the trilinear field does inside one cell: which row of trilinear_tables.h its triangles are.
+/* The decisions of the trilinear field inside a cell: they give the row of trilinear_tables.h with its triangles.
  *
- * Everything is decided in whole numbers, so that every device and the two cells of a face come to the same answer.
+ * All decisions use whole numbers, so that every device and both cells of a face decide alike.
  * Heights of the corners above the iso level are rounded to float once and scaled by a power of two to whole numbers:
  * to 30 bits for a face, by the largest of its four corners; to 18 bits for the interior, by the largest of the
- * eight.  Voxels of 8 and 16 bits at an iso level between integers lose nothing.  Whether a corner is inside is said
- * by its bit in the case, never by its height.
+ * eight.  For voxels of 8 and 16 bits at an iso level between integers this is exact.  Whether a corner is inside is
+ * told by its bit in the case, never by its height.
  *
  * Corners and edges are numbered as in surface/marching_cubes.cl.  Face 2 axis is the lower one across an axis, face
  * 2 axis + 1 the upper one.  The two ways of an ambiguous face, whose inside corners (*) lie on a diagonal:

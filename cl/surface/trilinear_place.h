@@ -1,4 +1,4 @@
-/* Where the vertices inside a cell lie, in steps from its corner 0, and the gradient of the trilinear field there. */
+/* Places of the vertices inside a cell, in steps from its corner 0, and the gradient of the trilinear field there. */
 #ifndef CLRECON_TRILINEAR_PLACE_H
 #define CLRECON_TRILINEAR_PLACE_H
 
