@@ -1,0 +1,64 @@
+"""The Python examples of README.md and docs/rendering.md run as they stand, on a small phantom."""
+
+from __future__ import annotations
+
+import re
+import textwrap
+from pathlib import Path
+
+import numpy as np
+import pytest
+from house import ROOT
+from label_files import write_nrrd
+
+import clrecon
+from clrecon.jobs.phantom import make_phantom
+
+SMALLER = {
+    '"CT_FOLDER"': '"ct"',
+    '"segmentation.nii.gz"': '"segmentation.seg.nrrd"',  # NIfTI has no names of labels, and the example asks for one
+    "clrecon.device(\"gpu\")": "clrecon.device()",
+    "size=(800, 800)": "size=(80, 80)",
+    "clrecon.Camera.fit(volume), 120)": "clrecon.Camera.fit(volume, size=(64, 64)), 2)",
+    "renderer.render(camera=camera)": "renderer.render(camera=camera, size=(64, 64))",
+}  # fmt: skip
+"""What the machine of a test has not, or what takes long, and what stands for it."""
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory) -> Path:
+    """A series, and a label map with the name that the example asks for."""
+    folder = tmp_path_factory.mktemp("examples")
+    make_phantom(folder / "ct", kind="spine", size=(64, 64), slices=48, spacing=(3.0, 3.0, 3.0))
+    volume = clrecon.read_volume(folder / "ct")
+    bone = (volume.voxels >= 226).astype(np.uint8)
+    header = {"Segment0_LabelValue": "1", "Segment0_Layer": "0", "Segment0_Name": "T12", "Segment0_ID": "a"}
+    write_nrrd(folder / "segmentation.seg.nrrd", bone, volume.affine, **header)
+    return folder
+
+
+@pytest.mark.first_device
+def test_the_example_of_the_readme_runs(folder, device, monkeypatch):
+    blocks = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(encoding="utf-8"), re.DOTALL)
+    assert len(blocks) == 1
+    source = blocks[0]
+    for text, other in SMALLER.items():
+        assert text in source, text
+        source = source.replace(text, other)
+    monkeypatch.chdir(folder)
+    monkeypatch.setenv("CLRECON_DEVICE", str(device.index))
+    made: dict = {}
+    exec(compile(source, "README.md", "exec"), made)
+    assert made["vertebra"].quality()["closed"] and made["front"].image[..., :3].any()
+    assert {"bone.stl", "spine.png", "bone.gif"} <= {path.name for path in folder.iterdir()}
+
+
+@pytest.mark.first_device
+def test_the_examples_of_styles_run(folder, device, monkeypatch):
+    text = (ROOT / "docs" / "rendering.md").read_text(encoding="utf-8")
+    block = re.search(r"(    bone = clrecon\.SurfaceLook.*?)\n\n", text, re.DOTALL)
+    assert block is not None
+    monkeypatch.setenv("CLRECON_DEVICE", str(device.index))
+    made = {"clrecon": clrecon, "volume": clrecon.read_volume(folder / "ct")}
+    exec(compile(textwrap.dedent(block[1]), "docs/rendering.md", "exec"), made)
+    assert all(made[name].image[..., :3].any() for name in ("picture", "front", "side", "chest", "spine"))
