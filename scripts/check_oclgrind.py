@@ -52,7 +52,8 @@ def run_under_oclgrind(command: list[str], uninitialized: bool = False) -> tuple
             "CLRECON_REQUIRE_PLATFORMS": "Oclgrind",
             "PYOPENCL_NO_CACHE": "1",
         }
-        environment.pop("PYOPENCL_CTX", None)
+        for name in ("PYOPENCL_CTX", "CLRECON_COVERAGE"):
+            environment.pop(name, None)
         wrapper = ["oclgrind", "--check-api", "--data-races", "--log", str(log)]
         if uninitialized:
             wrapper += ["--uninitialized", "--build-options", "-cl-opt-disable"]

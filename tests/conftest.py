@@ -12,6 +12,8 @@ CLRECON_REQUIRE_DEVICE=1
     No device is a failure, not a skip.
 CLRECON_REQUIRE_PLATFORMS
     Comma list of texts; each must be found in platform, version or driver of a device of its own.
+CLRECON_COVERAGE=1
+    Lines and branches of clrecon that the tests run are counted, see `coverage_figure`.
 CLRECON_REQUIRE_TESTS=1
     A session in which no test has run fails.
 """
@@ -20,6 +22,7 @@ from __future__ import annotations
 
 import os
 import signal
+import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -192,6 +195,30 @@ def interruptible() -> Iterator[None]:
 def project_root() -> Path:
     """The folder that holds setup.cfg."""
     return ROOT
+
+
+COVERAGE_DATA = pytest.StashKey["tempfile.TemporaryDirectory[str]"]()
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """With CLRECON_COVERAGE=1 the coverage is measured; before clrecon is imported for the first time."""
+    if not is_set("CLRECON_COVERAGE"):
+        return
+    from coverage_figure import CoverageFigure
+
+    worker: str | None = getattr(config, "workerinput", {}).get("workerid")
+    if worker is None:
+        config.stash[COVERAGE_DATA] = tempfile.TemporaryDirectory(prefix="clrecon-coverage-")
+        os.environ["CLRECON_COVERAGE_DATA"] = config.stash[COVERAGE_DATA].name
+    traces = worker or (None if getattr(config.option, "numprocesses", None) else "alone")
+    plugin = CoverageFigure(Path(os.environ["CLRECON_COVERAGE_DATA"]), traces, combines=worker is None)
+    config.pluginmanager.register(plugin)
+
+
+def pytest_unconfigure(config: pytest.Config) -> None:
+    if COVERAGE_DATA in config.stash:
+        config.stash[COVERAGE_DATA].cleanup()
+        del os.environ["CLRECON_COVERAGE_DATA"]
 
 
 class RanTests:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -31,7 +32,7 @@ def test_each_entry_needs_a_device_of_its_own(wanted: str, devices: list[SimpleN
     assert conftest.missing_platforms(wanted, devices) == missing
 
 
-def run_pytest(tmp_path: Path, test: str, **variables: str) -> subprocess.CompletedProcess[str]:
+def run_pytest(tmp_path: Path, test: str, *options: str, **variables: str) -> subprocess.CompletedProcess[str]:
     """Run pytest on one file with a copy of the conftest, away from this project."""
     (tmp_path / "conftest.py").write_text((ROOT / "tests" / "conftest.py").read_text())
     (tmp_path / "test_one.py").write_text(test)
@@ -46,9 +47,34 @@ def run_pytest(tmp_path: Path, test: str, **variables: str) -> subprocess.Comple
         "no:cacheprovider",
         "--rootdir",
         str(tmp_path),
+        *options,
         str(tmp_path),
     ]
     return subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)
+
+
+COVERED = """
+import pytest
+from clrecon.system import wording
+def test_quick():
+    assert wording
+@pytest.mark.slow
+def test_slow():
+    from clrecon.jobs import demo
+    assert demo
+"""
+
+
+@pytest.mark.parametrize("options", [[], ["-n", "2"]])
+def test_the_coverage_is_said_before_the_last_line(tmp_path: Path, options: list[str]) -> None:
+    (tmp_path / "pytest.ini").write_text("[pytest]\nmarkers = slow\n")
+    search = os.pathsep.join([str(ROOT / "tests" / "support"), str(ROOT)])
+    done = run_pytest(tmp_path, COVERED, *options, CLRECON_COVERAGE="1", PYTHONPATH=search)
+    assert done.returncode == 0, done.stdout + done.stderr
+    *_, said, last = done.stdout.splitlines()
+    figure = re.match(r"coverage of clrecon: (\d+\.\d) % of (\d+) lines and (\d+\.\d) % of \d+ branches", said)
+    assert figure and "2 passed" in last, done.stdout
+    assert 0.0 < float(figure[1]) < 50.0 and int(figure[2]) > 5000
 
 
 NO_DRIVER = "import clrecon.opencl\nclrecon.opencl.list_devices = lambda: []\n"
