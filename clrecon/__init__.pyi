@@ -49,6 +49,7 @@ from clrecon.rendering.views.camera import Camera as Camera
 from clrecon.rendering.views.centre_line_files import read_curve_points as read_curve_points
 from clrecon.rendering.views.clip import Clip as Clip
 
+__all__: list[str]
 __version__: str
 device = choose_device
 devices = list_devices

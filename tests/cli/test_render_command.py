@@ -298,7 +298,8 @@ def test_turntable_as_gif_and_as_folder(render: Renders) -> None:
     assert report["pictures"] == []
     assert report["turntable"]["output"] == {"format": "gif", "bytes": (render.folder / "a.gif").stat().st_size}
     assert (report["turntable"]["frames"], report["turntable"]["fps"]) == (3, 10.0)
-    assert Image.open(render.folder / "a.gif").n_frames == 3
+    picture: Any = Image.open(render.folder / "a.gif")
+    assert picture.n_frames == 3
     report = render("--turntable", render.folder / "frames", "--frames", "4")[1]
     names = sorted(path.name for path in (render.folder / "frames").iterdir())
     assert names == [f"frame_{number:04d}.png" for number in range(4)]

@@ -111,7 +111,8 @@ def test_thickness_that_leaves_tissue_unmeasured(tmp_path):
     ],
 )
 def test_directions_in_the_patient(steps, axes, right_handed, off_axis):
-    found = describe_orientation(compose_affine(*steps, (0, 0, 0)))
+    i_step, j_step, k_step = steps
+    found = describe_orientation(compose_affine(i_step, j_step, k_step, (0, 0, 0)))
     assert (found["axes"], found["right_handed"]) == (axes, right_handed)
     assert found["off_axis_deg"] == pytest.approx(off_axis)
 

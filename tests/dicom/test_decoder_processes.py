@@ -153,7 +153,8 @@ def test_processes_inherit_no_handles_and_leave_none(tmp_path):
 @LINUX
 def test_many_threads_have_a_process_each_and_all_end():
     with make_pool() as pool:
-        barrier, results = threading.Barrier(3), []
+        barrier = threading.Barrier(3)
+        results: list = []
 
         def work():
             barrier.wait()

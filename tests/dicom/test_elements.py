@@ -93,10 +93,10 @@ def test_mutated_files_give_the_same_or_nothing() -> None:
     dice = random.Random(46)
     taken = 0
     for _ in range(MUTATIONS):
-        data = bytearray(dice.choice(bases))
+        mutated = bytearray(dice.choice(bases))
         for _ in range(dice.choice((1, 1, 1, 2, 3, 6))):
-            mutate(data, dice)
-        taken += check_alike(bytes(data), len(data) + dice.choice((0, 5000)))
+            mutate(mutated, dice)
+        taken += check_alike(bytes(mutated), len(mutated) + dice.choice((0, 5000)))
     assert MUTATIONS // 10 < taken < MUTATIONS * 9 // 10
 
 

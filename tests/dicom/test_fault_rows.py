@@ -133,13 +133,22 @@ HOSTILE_TEXTS = {
 HOSTILE_FIELDS = "SeriesDescription SeriesInstanceUID StudyInstanceUID ConvolutionKernel PatientID RescaleType".split()
 
 
+def both(first, second):
+    """Two changes of a data set, one after the other."""
+
+    def change(ds, k):
+        first(ds, k)
+        second(ds, k)
+
+    return change
+
+
 @pytest.mark.parametrize("text", HOSTILE_TEXTS.values(), ids=HOSTILE_TEXTS)
 def test_row_45_hostile_texts_are_escaped_and_name_no_file(tmp_path, monkeypatch, capsys, text):
     folder, utf8 = tmp_path / "ct", set_values(SpecificCharacterSet="ISO_IR 192")
     monkeypatch.chdir(tmp_path)
     for keyword in HOSTILE_FIELDS:
-        spoil = set_raw(keyword, text)
-        write_series(folder / keyword, Plan(**PLAN), lambda ds, k, spoil=spoil: (spoil(ds, k), utf8(ds, k)))
+        write_series(folder / keyword, Plan(**PLAN), both(set_raw(keyword, text), utf8))
         told = json.dumps(read_volume(folder / keyword).report)
         entry = list_series(folder / keyword).series[0]
         for line in (*entry.warnings, *entry.problems, entry.description, entry.modality):

@@ -169,8 +169,8 @@ def test_hostile_metaimages_are_refused(tmp_path, key, value, message):
     if key == "ElementDataFile":
         path = write_metaimage(folder / "a.mha", make_ct(), ElementDataFile=value)
     elif value is not None:  # a new field goes before the last one
-        text, _, data = path.read_bytes().partition(b"ElementDataFile = LOCAL\n")
-        lines = [line for line in text.decode("latin-1").splitlines() if not line.startswith(f"{key} =")]
+        head, _, data = path.read_bytes().partition(b"ElementDataFile = LOCAL\n")
+        lines = [line for line in head.decode("latin-1").splitlines() if not line.startswith(f"{key} =")]
         text = "\n".join([*lines, f"{key} = {value}", "ElementDataFile = LOCAL\n"])
         path.write_bytes(text.encode("latin-1") + data)
     with pytest.raises(RefusedInputError, match=message):

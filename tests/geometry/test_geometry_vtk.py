@@ -26,7 +26,8 @@ RADIUS = 3.3
 
 
 def place(steps: np.ndarray) -> np.ndarray:
-    return compose_affine(*(steps * SPACING).T, ORIGIN)
+    i, j, k = (steps * SPACING).T
+    return compose_affine(i, j, k, ORIGIN)
 
 
 AFFINES = {

@@ -47,7 +47,7 @@ def test_help_loads_nothing_heavy(tmp_path: Path) -> None:
 
 
 def test_only_a_listing_that_is_shown_loads_rich(tmp_path: Path) -> None:
-    listing = {"series": [], "chosen": None, "certificate": None}
+    listing: dict[str, object] = {"series": [], "chosen": None, "certificate": None}
     show = f"from clrecon.cli import info, mesh, series_table; series_table.render_listing({listing}, [])"
     assert "rich" not in loaded_after("from clrecon.cli import info, mesh, series_table", tmp_path)
     assert "rich" in loaded_after(show, tmp_path)
@@ -77,6 +77,7 @@ def test_every_public_name_is_there(name: str) -> None:
 
 
 def test_an_unknown_name_is_an_attribute_error() -> None:
-    with pytest.raises(AttributeError, match="has no attribute 'read_volumes'"):
-        _ = clrecon.read_volumes
+    name = "read_volumes"
+    with pytest.raises(AttributeError, match=f"has no attribute '{name}'"):
+        getattr(clrecon, name)
     assert callable(clrecon.devices) and callable(clrecon.device)

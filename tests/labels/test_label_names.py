@@ -118,5 +118,6 @@ def test_files_that_are_no_label_maps_are_refused(tmp_path):
         read_labels(tmp_path / "c.nii")
     with pytest.raises(UsageError, match="is a folder"):
         read_labels(tmp_path)
+    wrong: list = [2.5]
     with pytest.raises(UsageError, match="by number or name"):
-        read_labels(tmp_path / "a.nii", [2.5])
+        read_labels(tmp_path / "a.nii", wrong)

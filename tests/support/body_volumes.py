@@ -13,12 +13,12 @@ AFFINE = np.array([[2.0, 0, 0, -200.0], [0, 1.8, 0.2, -150.0], [0, 0, 2.5, 10.0]
 X, Y = (np.arange(200) - 99.5)[None] * 2.0, (np.arange(170)[:, None] - 84.5) * 1.8
 
 
-def ellipse(x, y, a, b):
+def ellipse(x: float, y: float, a: float, b: float) -> np.ndarray:
     """Mask (rows, columns) of an ellipse, mm around the centre of the slice."""
     return ((X - x) / a) ** 2 + ((Y - y) / b) ** 2 <= 1.0
 
 
-def make_patient(lungs=False, arms=True, seed=1):
+def make_patient(lungs: bool = False, arms: bool = True, seed: int = 1) -> tuple[np.ndarray, np.ndarray]:
     """HU and the mask of the patient: body with spine and ribs, arms with bone, a gas bubble, an ear-like flap."""
     hu = np.full(SHAPE, -1000.0)
     body = ellipse(0, -10, 120, 75)
@@ -39,7 +39,7 @@ def make_patient(lungs=False, arms=True, seed=1):
     return hu + np.random.default_rng(seed).normal(0, 8, SHAPE), patient
 
 
-def add_table(hu, patient, gap=6.0):
+def add_table(hu: np.ndarray, patient: np.ndarray, gap: float = 6.0) -> np.ndarray:
     """A shell 4 mm thick below the patient, a blanket between, a foam core, a tray further down; returns its mask."""
     table = (abs(Y - (67 + gap)) < 2.2) | (abs(Y - (90 + gap)) < 2.2) | (abs(Y - 140) < 2.2)
     table = (table & (abs(X) < 180)) | ((abs(abs(X) - 180) < 2.2) & (Y > 67 + gap) & (Y < 90 + gap))
@@ -50,5 +50,5 @@ def add_table(hu, patient, gap=6.0):
     return table & ~patient
 
 
-def as_volume(hu):
+def as_volume(hu: np.ndarray) -> Volume:
     return Volume(np.rint(hu).astype(np.int16), AFFINE)

@@ -70,4 +70,4 @@ def make_enhanced(plan: Plan, order: Sequence[int] | None = None, slopes: Sequen
 def save_enhanced(
     path: Path, plan: Plan, order: Sequence[int] | None = None, slopes: Sequence[int] | None = None
 ) -> None:
-    save_dataset(make_enhanced(plan, order, slopes or getattr(plan, "slopes", (1,))), path)
+    save_dataset(make_enhanced(plan, order, slopes or tuple(getattr(plan, "slopes", (1,)))), path)

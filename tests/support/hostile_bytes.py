@@ -107,7 +107,7 @@ def _walk(
 ) -> int:
     start = file.tell()
     for element in data_element_generator(file, implicit, little, stop_when=stop):
-        value = getattr(element, "value_tell", None) or getattr(element, "file_tell", 0)
+        value = int(getattr(element, "value_tell", 0) or getattr(element, "file_tell", 0))
         long = not implicit and element.VR in ("OB", "OW", "OF", "OD", "OL", "OV", "SQ", "UN", "UC", "UR", "UT")
         head = value - (12 if long else 8)
         found.append((head, value, element.VR))

@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import DTypeLike
 
 OBLIQUE = np.array([[0.7, 0.1, 0.05, -25.0], [-0.1, 0.5, 0.2, -30.0], [0.0, 0.05, 2.5, -84.0], [0, 0, 0, 1.0]])
 """ijk to LPS mm: unequal steps, oblique and sheared."""
@@ -18,14 +22,22 @@ TABLE = (
 )
 
 
-def make_labels(shape=(4, 6, 7), seed=0, numbers=(0, 0, 2, 5)) -> np.ndarray:
+def make_labels(shape: Sequence[int] = (4, 6, 7), seed: int = 0, numbers: Sequence[int] = (0, 0, 2, 5)) -> np.ndarray:
     """voxels[k, j, i], uint8."""
     return np.random.default_rng(seed).choice(np.array(numbers, np.uint8), shape)
 
 
 def write_nifti(
-    path, voxels, affine=OBLIQUE, *, dtype=None, kind="Nifti1Image", extension=None, sform=True, qform=False
-):
+    path: Path,
+    voxels: np.ndarray,
+    affine: np.ndarray = OBLIQUE,
+    *,
+    dtype: DTypeLike | None = None,
+    kind: str = "Nifti1Image",
+    extension: bytes | None = None,
+    sform: bool = True,
+    qform: bool = False,
+) -> Path:
     """Write voxels[k, j, i] and an LPS affine as NIfTI, with nibabel."""
     import nibabel
 
@@ -42,7 +54,14 @@ def write_nifti(
     return path
 
 
-def write_nrrd(path, voxels, affine=OBLIQUE, *, space="left-posterior-superior", **header):
+def write_nrrd(
+    path: Path,
+    voxels: np.ndarray,
+    affine: np.ndarray = OBLIQUE,
+    *,
+    space: str = "left-posterior-superior",
+    **header: Any,
+) -> Path:
     """Write voxels[k, j, i] (or [k, j, i, layer]) and an LPS affine as NRRD, with pynrrd."""
     import nrrd
 
@@ -63,7 +82,15 @@ def write_nrrd(path, voxels, affine=OBLIQUE, *, space="left-posterior-superior",
     return path
 
 
-def write_seg(path, segments, ct, *, kind="BINARY", leave_out_empty=True, syntax=None):
+def write_seg(
+    path: Path,
+    segments: Sequence[tuple[str, np.ndarray]],
+    ct: Sequence[Any],
+    *,
+    kind: str = "BINARY",
+    leave_out_empty: bool = True,
+    syntax: str | None = None,
+) -> Path:
     """Write a DICOM SEG with highdicom.
 
     Parameters

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from clrecon.rendering import Rendering
@@ -11,7 +13,11 @@ PARALLEL = Camera((0, -300, 0), (0, 0, 0), (0, 0, 1), parallel_scale=100.0)
 PERSPECTIVE = Camera((0, -300, 0), (0, 0, 0), (0, 0, 1), view_angle=40.0)
 
 
-def make_picture(size=(120, 80), background=(0, 0, 0, 255), camera: Camera | None = PARALLEL) -> Rendering:
+def make_picture(
+    size: tuple[int, int] = (120, 80),
+    background: Sequence[int] = (0, 0, 0, 255),
+    camera: Camera | None = PARALLEL,
+) -> Rendering:
     """A disc of changing colour before a background, with depths where it is."""
     width, height = size
     y, x = np.mgrid[:height, :width]

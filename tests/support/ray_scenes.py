@@ -57,8 +57,8 @@ def make_volume(field: Field, grid: str, extent: float = 22.0, dtype: Any = np.f
         volume = Volume(np.zeros(shape, np.int8), affine, slice_positions=table)
     else:
         affine[:3, :3] = STEPS[grid]
-        shape = tuple(int(np.ceil(extent / step)) for step in np.linalg.norm(STEPS[grid], axis=0)[::-1])
-        volume = Volume(np.zeros(shape, np.int8), affine)
+        sizes = [int(np.ceil(extent / step)) for step in np.linalg.norm(STEPS[grid], axis=0)[::-1]]
+        volume = Volume(np.zeros(sizes, np.int8), affine)
     values = np.asarray(field(positions(volume).reshape(-1, 3)), dtype=np.float64).reshape(volume.voxels.shape)
     return volume.with_voxels((values if np.dtype(dtype).kind == "f" else np.rint(values)).astype(dtype))
 

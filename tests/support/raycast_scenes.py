@@ -58,7 +58,11 @@ def even_volume(field: Field, steps: str, extent: float, dtype: Any = np.float32
 
 
 def uneven_volume(
-    field: Field, shape: tuple[int, int] = (66, 52), gaps: Sequence[float] = GAPS, sideways: float = 0.3, noise=0.2
+    field: Field,
+    shape: tuple[int, int] = (66, 52),
+    gaps: Sequence[float] = GAPS,
+    sideways: float = 0.3,
+    noise: float = 0.2,
 ) -> Volume:
     """`field` in a turned stack whose slices lie unevenly, sheared along i and j, some `noise` mm beside a line."""
     heights = np.concatenate([[0.0], np.cumsum(gaps)])
@@ -97,6 +101,11 @@ def blobs(points: np.ndarray) -> np.ndarray:
     return 700.0 * np.sin(x) * np.cos(0.8 * y + 0.3) * np.cos(0.7 * z) + 500.0 * np.exp(-(x**2 + y**2 + z**2) / 9.0)
 
 
+def triple(values: Sequence[float] | np.ndarray) -> tuple[float, float, float]:
+    x, y, z = values
+    return x, y, z
+
+
 def look(
     volume: Volume,
     towards: Sequence[float],
@@ -111,8 +120,8 @@ def look(
     position = centre - distance * forward
     if perspective:
         angle = 2.0 * np.degrees(np.arctan(half_height / distance))
-        return Camera(tuple(position), tuple(centre), tuple(up), view_angle=angle)
-    return Camera(tuple(position), tuple(centre), tuple(up), parallel_scale=half_height)
+        return Camera(triple(position), triple(centre), triple(up), view_angle=angle)
+    return Camera(triple(position), triple(centre), triple(up), parallel_scale=half_height)
 
 
 def ways_through(
@@ -172,6 +181,7 @@ class TwinCaster:
         **settings: Any,
     ) -> Shot:
         if mode == "surface":
+            assert iso_value is not None
             picture = cast_surface(volume, iso_value, lighting=lighting, shadows=shadows, **settings)
         else:
             picture = cast_rays(volume, transfer_function, lighting=lighting, mode=mode, **settings)

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import Any
+
 import numpy as np
 
 Arrays = tuple[np.ndarray, np.ndarray]
@@ -10,7 +13,7 @@ CUBE_FACES = ((0, 2, 3, 1), (4, 5, 7, 6), (0, 1, 5, 4), (2, 6, 7, 3), (0, 4, 6, 
 """Corner number: bits 0, 1, 2 are x, y, z; each face is counter-clockwise from outside."""
 
 
-def box(low=(0.0, 0.0, 0.0), size=(1.0, 1.0, 1.0)) -> Arrays:
+def box(low: Sequence[float] = (0.0, 0.0, 0.0), size: Sequence[float] = (1.0, 1.0, 1.0)) -> Arrays:
     corners = np.array([[c & 1, c >> 1 & 1, c >> 2] for c in range(8)], dtype=np.float64)
     triangles = [[a, b, c] for a, b, c, d in CUBE_FACES] + [[a, c, d] for a, b, c, d in CUBE_FACES]
     return np.array(low) + corners * np.array(size), np.array(triangles)
@@ -22,7 +25,7 @@ def torus(rings: int = 15, sides: int = 8, major: float = 20.0, minor: float = 6
     radius = major + minor * np.cos(b)
     vertices = np.column_stack([radius * np.cos(a), radius * np.sin(a), minor * np.sin(b)])
 
-    def number(i, j):
+    def number(i: Any, j: Any) -> Any:
         return (i % rings * sides + j % sides).ravel()
 
     one, two, three, four = number(u, v), number(u + 1, v), number(u + 1, v + 1), number(u, v + 1)
@@ -70,7 +73,7 @@ def weld(mesh: Arrays) -> Arrays:
     return vertices, number.reshape(-1)[mesh[1]]
 
 
-def sphere(centre=(0.0, 0.0, 0.0), radius: float = 10.0, rounds: int = 2) -> Arrays:
+def sphere(centre: Sequence[float] = (0.0, 0.0, 0.0), radius: float = 10.0, rounds: int = 2) -> Arrays:
     """Octahedron, each triangle cut in four `rounds` times, corners pushed out to the sphere."""
     vertices = np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]], dtype=np.float64)
     upper = np.array([[0, 2, 4], [2, 1, 4], [1, 3, 4], [3, 0, 4]])

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from clrecon.geometry.iso_rule import choose_iso_rule
@@ -10,14 +12,22 @@ from clrecon.operators.surface.extract import extract_isosurface
 from clrecon.operators.surface.slabs import SampleGrid
 
 
-def extract_in_slabs(volume, iso_value, device, slices, closed=True, topology="separated", **options):
+def extract_in_slabs(
+    volume: Any,
+    iso_value: Any,
+    device: Any,
+    slices: int,
+    closed: bool = True,
+    topology: str = "separated",
+    **options: Any,
+) -> Any:
     resident = DeviceVolume(volume, device=device)
     rule = choose_iso_rule(volume, iso_value, closed, topology, **options)
     resident.most_slices[SampleGrid(volume, rule).kind] = slices
     return extract_isosurface(resident, iso_value, closed=closed, topology=topology, **options)
 
 
-def assert_same(mesh, expected) -> None:
+def assert_same(mesh: Any, expected: Any) -> None:
     assert np.array_equal(mesh.triangles, expected.triangles)
     assert np.array_equal(mesh.vertices, expected.vertices)
     assert np.array_equal(mesh.normals, expected.normals)

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import Any
+
 import numpy as np
+from numpy.typing import DTypeLike
 
 from clrecon.geometry import Volume
 
@@ -15,18 +19,20 @@ SHAPES = [(5, 7, 9), (4, 4, 30), (3, 5, 31), (3, 5, 32), (4, 3, 33), (2, 3, 63),
 """(nk, nj, ni) on both sides of a mask word (32 samples) and of a word of flags (1024 samples)."""
 
 
-def random_volume(shape, dtype="int16", high=6, affine=OBLIQUE, seed=0) -> Volume:
+def random_volume(
+    shape: Sequence[int], dtype: DTypeLike = "int16", high: int = 6, affine: np.ndarray = OBLIQUE, seed: int = 0
+) -> Volume:
     return Volume(np.random.default_rng(seed).integers(0, high, shape).astype(dtype), affine)
 
 
-def smooth_volume(shape=(23, 27, 45), affine=OBLIQUE, seed=1) -> Volume:
+def smooth_volume(shape: Sequence[int] = (23, 27, 45), affine: np.ndarray = OBLIQUE, seed: int = 1) -> Volume:
     from scipy.ndimage import gaussian_filter
 
     field = gaussian_filter(np.random.default_rng(seed).normal(size=shape), 2.0)
     return Volume((field / field.std() * 300).astype(np.int16), affine)
 
 
-def assert_sound(mesh) -> None:
+def assert_sound(mesh: Any) -> None:
     """Closed, manifold, outward, no zero-area face, every vertex used."""
     quality = mesh.quality()
     assert quality["closed"] and quality["manifold"]

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 
-def float32_unit(points) -> float:
+def float32_unit(points: ArrayLike) -> float:
     """One unit in the last place of the largest coordinate, in mm: what float32 vertices can hold."""
-    return float(np.spacing(np.float32(np.abs(points).max())))
+    return float(np.spacing(np.float32(np.abs(np.asarray(points)).max())))
 
 
 # --- geometry: maps ---

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import zlib
+from collections.abc import Callable, Sequence
+from pathlib import Path
 
 import numpy as np
 from label_files import OBLIQUE, write_nifti, write_nrrd
@@ -17,19 +19,19 @@ META_TYPES = {"i1": "CHAR", "u1": "UCHAR", "i2": "SHORT", "u2": "USHORT", "i4": 
               "i8": "LONG_LONG", "u8": "ULONG_LONG", "f4": "FLOAT", "f8": "DOUBLE"}  # fmt: skip
 
 
-def make_ct(shape=(4, 6, 7), seed=0, low=-1024, high=3000) -> np.ndarray:
+def make_ct(shape: Sequence[int] = (4, 6, 7), seed: int = 0, low: int = -1024, high: int = 3000) -> np.ndarray:
     """voxels[k, j, i], int16 HU."""
     return np.random.default_rng(seed).integers(low, high, shape).astype(np.int16)
 
 
-def metaimage_fields(voxels, affine=OBLIQUE, **fields) -> dict[str, str]:
+def metaimage_fields(voxels: np.ndarray, affine: np.ndarray = OBLIQUE, **fields: str | None) -> dict[str, str]:
     """The header of voxels[k, j, i] with an LPS affine; a field that is None is left out."""
 
-    def row(values):
+    def row(values: np.ndarray) -> str:
         return " ".join(repr(float(value)) for value in values)
 
     spacing = np.linalg.norm(affine[:3, :3], axis=0)
-    header = {
+    header: dict[str, str | None] = {
         "ObjectType": "Image",
         "NDims": "3",
         "BinaryData": "True",
@@ -43,12 +45,16 @@ def metaimage_fields(voxels, affine=OBLIQUE, **fields) -> dict[str, str]:
         "DimSize": " ".join(map(str, voxels.shape[::-1])),
         "ElementType": f"MET_{META_TYPES[voxels.dtype.str[1:]]}",
         "ElementDataFile": "LOCAL",
-    } | fields
+        **fields,
+    }
     last = "ElementDataFile"
-    return {key: header[key] for key in [*(key for key in header if key != last), last] if header[key] is not None}
+    order = [*(key for key in header if key != last), last]
+    return {key: value for key in order if (value := header[key]) is not None}
 
 
-def write_metaimage(path, voxels, affine=OBLIQUE, *, packed=False, **fields):
+def write_metaimage(
+    path: Path, voxels: np.ndarray, affine: np.ndarray = OBLIQUE, *, packed: bool = False, **fields: str | None
+) -> Path:
     """Write a MetaImage; voxels go into a file beside it where its name ends with .mhd."""
     data = np.ascontiguousarray(voxels).tobytes()
     data = zlib.compress(data) if packed else data
@@ -56,7 +62,7 @@ def write_metaimage(path, voxels, affine=OBLIQUE, *, packed=False, **fields):
     own = {"CompressedData": str(packed), "ElementDataFile": beside.name if beside else "LOCAL"}
     if packed:
         own["CompressedDataSize"] = str(len(data))
-    header = metaimage_fields(voxels, affine, **(own | fields))
+    header = metaimage_fields(voxels, affine, **{**own, **fields})
     text = "".join(f"{key} = {value}\n" for key, value in header.items()).encode("latin-1")
     path.write_bytes(text if beside else text + data)
     if beside:
@@ -64,7 +70,7 @@ def write_metaimage(path, voxels, affine=OBLIQUE, *, packed=False, **fields):
     return path
 
 
-WRITERS = {
+WRITERS: dict[str, Callable[..., Path]] = {
     "a.nii": write_nifti,
     "a.nii.gz": write_nifti,
     "two.nii": lambda *args: write_nifti(*args, kind="Nifti2Image"),

@@ -165,7 +165,7 @@ def test_limit_on_the_size_of_files(older, piece):
 
 
 def test_full_disk_is_foreseen(older):
-    calls = []
+    calls: list = []
     with pytest.raises(OutputError, match=r"needs about 1000000000.0 MB and [\d.]+ MB are free"):
         replace_file(older, calls.append, expected_bytes=10**15)
     with pytest.raises(OutputError, match="are free"):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import os
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -20,7 +21,7 @@ from clrecon.system.regular_files import open_regular, read_regular
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="FIFOs and devices of POSIX")
 
-READERS = {
+READERS: dict[str, Callable[..., object]] = {
     "volume": read_volume,
     "listing": list_series,
     "labels": read_labels,
@@ -118,7 +119,7 @@ def find_openings(text: str) -> int:
             continue
         name = node.func.id if isinstance(node.func, ast.Name) else getattr(node.func, "attr", "")
         method = isinstance(node.func, ast.Attribute)
-        owner = node.func.value.id if method and isinstance(node.func.value, ast.Name) else ""
+        owner = getattr(getattr(node.func, "value", None), "id", "")
         mode = any(isinstance(arg, ast.Constant) and arg.value in ("r", "rb", "w", "wb", "xb") for arg in node.args)
         count += name == "open" and (not method or owner == "os" or mode)
         count += method and name in ("read_text", "read_bytes", "fromfile", "memmap", "dcmread")

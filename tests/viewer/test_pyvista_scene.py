@@ -119,7 +119,7 @@ def test_a_translucent_mesh_keeps_its_colour_on_any_background(plotter, backgrou
 def test_what_cannot_be_merged_is_refused(plotter):
     plotter.add_mesh(pyvista.Sphere())
     with pytest.raises(UsageError, match="no projection"):
-        merge_scene(plotter, Rendering(*[np.zeros((2, 2))] * 3, camera=None))
+        merge_scene(plotter, Rendering(np.zeros((2, 2)), np.zeros((2, 2)), np.zeros((2, 2)), camera=None))
     two = pyvista.Plotter(off_screen=True, window_size=SIZE, shape=(1, 2))
     with pytest.raises(UsageError, match="several views"):
         merge_scene(two, ball(CAMERAS[0]))

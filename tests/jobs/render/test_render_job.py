@@ -20,7 +20,7 @@ from clrecon.jobs.render.job import make_pictures
 from clrecon.jobs.render.settings import LabelLook, RenderSettings, Turntable
 from clrecon.jobs.render.studio import read_function
 from clrecon.phantom import PhantomSettings, write_phantom
-from clrecon.rendering.pictures.styles import Projection
+from clrecon.rendering.pictures.styles import Projection, VolumeLook
 
 pytestmark = pytest.mark.first_device
 
@@ -274,7 +274,8 @@ def test_what_the_mode_is() -> None:
     )] == ["dvr", "drr", "surface", "cpr", "dvr"]  # fmt: skip
     assert (RenderSettings.of().preset_used, RenderSettings.of("mip").preset_used) == ("bone", None)
     assert (RenderSettings.of("slice").views_used, RenderSettings.of().views_used) == (("axial",), ("anterior",))
-    assert RenderSettings.of(clip_box=(-1, 1, -2, 2, 0, float("inf"))).style.clip is not None
+    style = RenderSettings.of(clip_box=(-1, 1, -2, 2, 0, float("inf"))).style
+    assert isinstance(style, VolumeLook) and style.clip is not None
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -46,10 +47,10 @@ def lead(how: str, slice_file: Path, name: str) -> str:
     return str(other)
 
 
-def jobs(path: str) -> dict[str, object]:
+def jobs(path: str) -> list[Callable[[], object]]:
     """Every output of every job in the place `path`, which is asked for by its extension."""
     turntable = RenderSettings.of(turntable=Turntable(frames=2))
-    return {
+    places: dict[str, list[Callable[[], object]]] = {
         ".stl": [lambda: make_mesh("ct", path)],
         ".json": [
             lambda: make_mesh("ct", "a.stl", report_path=path),
@@ -62,7 +63,8 @@ def jobs(path: str) -> dict[str, object]:
             lambda: make_pictures("ct", PictureFiles("a.png", values=path), RenderSettings.of(mode="mip")),
         ],
         ".gif": [lambda: make_pictures("ct", PictureFiles(turntable=path), turntable)],
-    }[Path(path).suffix]
+    }
+    return places[Path(path).suffix]
 
 
 @pytest.mark.parametrize("how", ["link", "link to a link", "hard link"])

@@ -10,6 +10,7 @@ from clrecon.mesh import Mesh
 from clrecon.mesh.compare.distances import compare_meshes
 from clrecon.mesh.compare.gates import failed_gates, judge_label_volume, judge_mesh
 from clrecon.mesh.triangles import enclosed_ml
+from clrecon.system.gates import Gate
 
 pytestmark = pytest.mark.unit
 
@@ -20,7 +21,7 @@ def failed(gates: list[dict]) -> set[str]:
     return {gate["name"] for gate in gates if gate["ok"] is False}
 
 
-def of(arrays: samples.Arrays, closed: bool = True) -> list[dict]:
+def of(arrays: samples.Arrays, closed: bool = True) -> list[Gate]:
     return judge_mesh(Mesh(*arrays).quality(), closed=closed)
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from raycast_scenes import DEVICE_RENDERS, blobs, even_volume
@@ -19,7 +21,7 @@ pytestmark = [
 AHEAD = Camera((0.0, -100.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 1.0), parallel_scale=20.0)
 FOG = TransferFunction([(-100, 1, 1, 1, 0.1), (100, 1, 1, 1, 0.1)])
 
-REFUSED = {
+REFUSED: dict[str, tuple[dict[str, Any], list[str]]] = {
     "no width": ({"size": (0, 10)}, ["size", "0"]),
     "negative": ({"size": (10, -4)}, ["size", "-4"]),
     "absurd size": ({"size": (2_000_000, 2_000_000)}, ["size", "2000000"]),
@@ -65,7 +67,7 @@ def test_what_cannot_be_is_refused_in_one_line(device, name):
     settings, words = REFUSED[name]
     volume = even_volume(blobs, "even", 8.0, np.int16)
     with pytest.raises(UsageError) as error:
-        render(volume, device=device, **{"size": (8, 8)} | settings)
+        render(volume, device=device, **{"size": (8, 8), **settings})
     message = str(error.value)
     assert "\n" not in message and len(message) < 400
     assert [word for word in words if word.lower() not in message.lower()] == []

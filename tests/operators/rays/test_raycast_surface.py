@@ -78,7 +78,7 @@ def mesh_depths(cast, volume: Volume, iso_value: float, camera: Camera, size) ->
         vertices, _, triangles = extract_twin(volume, iso_value)
     else:
         mesh = extract_isosurface(volume, iso_value, device=cast.device)
-        vertices, triangles = mesh.vertices, mesh.triangles
+        vertices, triangles = np.asarray(mesh.vertices, np.float64), mesh.triangles
     surface = pyvista.PolyData.from_regular_faces(np.asarray(vertices, np.float64), triangles.astype(np.int64))
     origins, directions = camera.rays(size)
     depth, cosine = np.full(origins.shape[:2], np.nan), np.zeros(origins.shape[:2])

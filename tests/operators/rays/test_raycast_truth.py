@@ -157,12 +157,16 @@ SIDES = {  # where the patient's left, front and head are in the picture: right 
 MARKERS = {"left": (9.0, 0.0, 0.0), "front": (0.0, -9.0, 0.0), "head": (0.0, 0.0, 9.0)}
 
 
+def moved(field, place):
+    return lambda points: field(points - place)
+
+
 @pytest.mark.parametrize("steps", ["even", "mirrored", "sheared"])
 @pytest.mark.parametrize("view", SIDES)
 def test_the_patient_is_the_right_way_round(cast, view, steps):
     for marker, side in SIDES[view].items():
         near = ball(3.0, 2.0)
-        volume = even_volume(lambda p, m=marker, near=near: near(p - MARKERS[m]), steps, 26.0, np.int16)
+        volume = even_volume(moved(near, MARKERS[marker]), steps, 26.0, np.int16)
         camera = Camera.fit(volume, view, size=(40, 40))
         values = cast(volume, "mip", camera=camera, size=(40, 40)).values
         y, x = np.argwhere(values > 800.0).mean(axis=0)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import threading
+from typing import Any
 
 import numpy as np
 import pytest
@@ -62,7 +63,7 @@ def test_what_float32_cannot_hold_is_refused(what):
 
 
 TWO = np.array([1.0, 2.0])
-REFUSED = {
+REFUSED: dict[str, dict[str, Any]] = {
     "offset": {"mode": "slice", "offset_mm": "x"},
     "offsets": {"mode": "slice", "offset_mm": TWO},
     "combine": {"mode": "slice", "combine": TWO},
@@ -173,11 +174,12 @@ def test_pictures_stay_what_they_were(device):
     """Their pages are lent from a pool, and later pictures of the same size come from the same pool."""
     with clrecon.VolumeRenderer(body(), device=device) as renderer:
         kept = renderer.render("mip", size=(640, 512), view=(10, 20))
-        copies = [array.copy() for array in (kept.image, kept.depth, kept.values)]
+        arrays: tuple[np.ndarray, ...] = (kept.image, kept.depth, kept.values)
+        copies = [array.copy() for array in arrays]
         for azimuth in range(4):
             renderer.render("dvr", size=(640, 512), view=(azimuth, 0))
     clrecon.render(body(), "surface", size=(640, 512), device=device)
-    for array, copy in zip((kept.image, kept.depth, kept.values), copies, strict=True):
+    for array, copy in zip(arrays, copies, strict=True):
         assert np.array_equal(array, copy, equal_nan=array.dtype.kind == "f")
 
 

@@ -73,7 +73,7 @@ def half_of(volume: Volume, size: tuple[int, int]) -> int:
     return 44 * size[0] * size[1] + volume.voxels.nbytes * 9 // 20
 
 
-SCENES = {
+SCENES: dict[str, tuple[str, type, dict]] = {
     "soft": ("anisotropic", np.int16, {"lighting": MATT}),
     "fixed light": ("oblique", np.float32, {"lighting": FIXED, "perspective": True}),
     "shadows": ("sheared", np.int16, {"lighting": FIXED, "shadows": True}),

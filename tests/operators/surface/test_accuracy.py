@@ -38,7 +38,8 @@ def sample(distance, steps: np.ndarray, half_extent: float, center=(0.31, -0.17,
     counts = [2 * int(np.ceil((half_extent + 0.5) * np.linalg.norm(row))) + 3 for row in normals]
     counts[1] += 1
     origin = np.array((-120.0, 340.0, -846.0)) - steps @ (np.array(counts) - 1) / 2
-    volume = Volume(np.zeros(counts[::-1], np.float32), compose_affine(*steps.T, origin))
+    i_step, j_step, k_step = steps.T
+    volume = Volume(np.zeros(counts[::-1], np.float32), compose_affine(i_step, j_step, k_step, origin))
     k, j, i = np.meshgrid(*(np.arange(n) for n in counts[::-1]), indexing="ij")
     points = volume.ijk_to_lps(np.stack([i, j, k], axis=-1).reshape(-1, 3)) - (-120.0, 340.0, -846.0) - center
     return Volume(distance(points).reshape(volume.voxels.shape), volume.affine)

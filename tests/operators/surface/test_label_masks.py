@@ -116,10 +116,10 @@ def test_every_voxel_of_the_mask_is_inside_and_no_other(device):
         for axis in range(3):
             crossed = np.argwhere(np.diff(mask, axis=axis))
             faces.append(crossed - 1 + 0.5 * (np.arange(3) == axis))
-        faces = np.concatenate(faces)[:, ::-1]
-        distance, nearest = cKDTree(faces).query(mesh.vertices)
-        assert len(mesh.vertices) == len(faces)
-        away = np.abs(mesh.vertices - faces[nearest])
+        centres = np.concatenate(faces)[:, ::-1]
+        distance, nearest = cKDTree(centres).query(mesh.vertices)
+        assert len(mesh.vertices) == len(centres)
+        away = np.abs(mesh.vertices - centres[nearest])
         assert distance.max() <= 0.5 - KEEP + 1e-4 and np.sort(away, axis=1)[:, 1].max() < 1e-4  # along the edge alone
 
 
@@ -214,7 +214,8 @@ def cancelled_pairs(meshes) -> tuple[int, dict[tuple[bytes, bytes], int]]:
         for triangle in mesh.vertices[mesh.triangles]:
             corners = [row.tobytes() for row in triangle]
             faces.setdefault(frozenset(corners), []).append(corners)
-    pairs, edges = 0, {}
+    pairs = 0
+    edges: dict = {}
     for same in faces.values():
         if len(same) == 2:
             pairs += 1

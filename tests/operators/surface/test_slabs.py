@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 import pytest
@@ -184,7 +185,7 @@ def test_too_many_words_for_32_bits_make_slabs_too(device):
 
     volume = random_volume((2, 2, 2))
     grid = SampleGrid(Tall(), choose_iso_rule(volume, 3))
-    resident = DeviceVolume(volume, device=device)
+    resident: Any = DeviceVolume(volume, device=device)
     resident.device = Huge()
     slices = plan_slabs(grid, resident)
     assert 1 < slices < 2**16

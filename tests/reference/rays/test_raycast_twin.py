@@ -60,7 +60,7 @@ def test_intervals_end_where_the_indices_do(steps):
     t = np.linspace(-60.0, 60.0, 1001)
     points = origins[:, None] + t[:, None] * directions[:, None]
     ijk = volume.lps_to_ijk(points.reshape(-1, 3)).reshape(*points.shape)
-    there = ((ijk >= -0.5) & (ijk <= np.array(volume.shape_ijk) - 0.5)).all(axis=-1)
+    there = np.asarray(((ijk >= -0.5) & (ijk <= np.array(volume.shape_ijk) - 0.5)).all(axis=-1))
     within = (t >= t_in[:, None]) & (t <= t_out[:, None])
     assert 0.01 < there.mean() and there.any(axis=1).mean() < 0.9
     if steps == "uneven":  # its box is the smallest around all slices

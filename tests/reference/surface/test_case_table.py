@@ -34,7 +34,7 @@ def test_loops_use_every_crossed_edge_once(case):
 
 def face_segments(case: int, face: frozenset) -> set:
     """Directed triangle edges of a case that lie in a face and are not shared inside the case."""
-    directed = Counter()
+    directed: Counter = Counter()
     for a, b, c in case_table()[case]:
         directed.update([(a, b), (b, c), (c, a)])
     on_face = {edge for edge in range(12) if {EDGES[edge][1], EDGES[edge][2]} <= face}
@@ -68,7 +68,7 @@ def edges_across(edge: int, axis: int) -> int:
 @pytest.mark.parametrize("case", range(256))
 def test_no_triangle_edge_inside_a_case_lies_in_a_face(case):
     """Else the neighbour could have the same chord, and the edge four triangles."""
-    directed = Counter()
+    directed: Counter = Counter()
     for a, b, c in case_table()[case]:
         directed.update([(a, b), (b, c), (c, a)])
     assert max(directed.values(), default=1) == 1

@@ -47,12 +47,12 @@ def test_all_states_and_tunnels_are_there():
 
 def test_the_tunnels_are_those_of_marching_cubes_33():
     """By inside or outside corners and the loops that the tube joins; each in all its positions."""
-    found = Counter()
+    found: Counter = Counter()
     for state, tunnel, _ in ROWS:
         if tunnel is not None:
             corners = min(state.case.bit_count(), 8 - state.case.bit_count())
             loops = len(case_loops(state.case, state.joined))
-            found[(corners, loops, *sorted(map(len, tunnel.loops)))] += 1
+            found[(corners, loops) + tuple(sorted(map(len, tunnel.loops)))] += 1
     expected = {"4.2": (2, 2, 3, 3), "6.1.2": (3, 2, 3, 4), "7.4.2": (3, 2, 3, 6), "10.1.2": (4, 2, 4, 4),
                 "12.1.2": (4, 2, 3, 5), "13.5.2": (4, 3, 3, 6)}  # fmt: skip
     sizes = {"4.2": 8, "6.1.2": 48, "7.4.2": 16, "10.1.2": 24, "12.1.2": 48, "13.5.2": 16}
@@ -61,7 +61,7 @@ def test_the_tunnels_are_those_of_marching_cubes_33():
 
 def test_the_rest_of_marching_cubes_33_is_there():
     """Loops of the states with ambiguous faces, by inside or outside corners and ambiguous faces."""
-    found = Counter()
+    found: Counter = Counter()
     for state in STATES:
         faces = len(find_ambiguous_faces(state.case))
         if faces:

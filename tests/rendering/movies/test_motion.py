@@ -194,7 +194,8 @@ def count_frames(path) -> int:
 def test_frames_are_written_as_they_come(tmp_path, name, request):
     if name.endswith("mp4"):
         request.getfixturevalue("encoder")
-    asked, told = [], []
+    asked: list = []
+    told: list = []
 
     def watched():
         for number, frame in enumerate(moving_frames(4)):

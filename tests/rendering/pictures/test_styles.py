@@ -30,7 +30,8 @@ LABELS = LabelMap(np.array([[[0, 1], [2, 2]]], np.uint8), np.eye(4), {1: "L1", 2
 TWO = np.array([1.0, 2.0])
 LINE = [(0.0, 0.0, 0.0), (0.0, 0.0, 9.0)]
 
-RAYS = {
+Wrong = dict[str, list[tuple[Any, str | None]]]
+RAYS: Wrong = {
     "ray_step": [
         (0.0, "ray step"),
         (-1.0, "above 0, not -1"),
@@ -40,20 +41,20 @@ RAYS = {
     ],
     "clip": [([(0, 0, 1, 0)], "the clip of a picture is a Clip or None, not list")],
 }
-LABELLED = {
+LABELLED: Wrong = {
     **RAYS,
     "lighting": [("head", "the lighting of a picture is a Lighting or None, not str")],
     "labels": [("labels.nii", "the labels of a picture is a LabelMap or None, not str")],
     "label_colors": [({1: "red"}, "give the labels too"), ("red", "colours of labels are a mapping")],
     "label_opacity": [({1: 0.5}, "give the labels too"), (0.5, "opacities of labels are a mapping")],
 }
-CUTS = {
+CUTS: Wrong = {
     "thickness": [(-1.0, "thickness of a slice"), (np.inf, "thickness"), (None, "thickness"), ("5 mm", "'5 mm'")],
     "combine": [("sum", "mean, max, min, not 'sum'"), (TWO, "combined by"), (None, "combined by")],
     "window": [((5, 5), "a window is its lowest and highest HU"), (100, "window")],
     "pixel_mm": [(0.0, "the size of a pixel is a length in mm"), ("1", None)],
 }
-WRONG: dict[type[Style], dict[str, list[tuple[Any, str | None]]]] = {
+WRONG: dict[type[Style], Wrong] = {
     VolumeLook: {
         **LABELLED,
         "transfer_function": [("bones", "unknown rendering preset 'bones'"), ([(0, 1, 1, 1, 1)], "not list")],
@@ -117,7 +118,8 @@ def test_what_cannot_be_is_refused_when_a_style_is_made(style: type[Style], name
 
 @pytest.mark.parametrize("style", WRONG)
 def test_styles_do_not_change_and_travel(style: type[Style]) -> None:
-    made = style(clip=Clip.box((0, 0, 0), (9, 9, 9))) if "clip" in WRONG[style] else style()
+    options: dict[str, Any] = {"clip": Clip.box((0, 0, 0), (9, 9, 9))} if "clip" in WRONG[style] else {}
+    made = style(**options)
     with pytest.raises(FrozenInstanceError):
         setattr(made, fields(style)[0].name, None)
     for other in (pickle.loads(pickle.dumps(made)), copy.deepcopy(made), replace(made)):

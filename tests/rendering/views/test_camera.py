@@ -91,7 +91,7 @@ def test_the_top_can_be_chosen():
 
 def in_picture(camera: Camera, volume: Volume, size) -> np.ndarray:
     pixels, _ = camera.project(box_corners(volume), size)
-    return ((pixels >= -1e-6) & (pixels <= np.array(size) + 1e-6)).all(axis=1)
+    return np.asarray(((pixels >= -1e-6) & (pixels <= np.array(size) + 1e-6)).all(axis=1))
 
 
 @pytest.mark.parametrize("size", [(400, 300), (300, 400), (512, 512)])
