@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import textwrap
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -59,6 +60,6 @@ def test_the_examples_of_styles_run(folder, device, monkeypatch):
     block = re.search(r"(    bone = clrecon\.SurfaceLook.*?)\n\n", text, re.DOTALL)
     assert block is not None
     monkeypatch.setenv("CLRECON_DEVICE", str(device.index))
-    made = {"clrecon": clrecon, "volume": clrecon.read_volume(folder / "ct")}
+    made: dict[str, Any] = {"clrecon": clrecon, "volume": clrecon.read_volume(folder / "ct")}
     exec(compile(textwrap.dedent(block[1]), "docs/rendering.md", "exec"), made)
     assert all(made[name].image[..., :3].any() for name in ("picture", "front", "side", "chest", "spine"))

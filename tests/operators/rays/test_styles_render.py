@@ -120,7 +120,8 @@ def test_what_a_style_does_not_say_is_checked_beside_it(device: Any) -> None:
 
 @pytest.mark.parametrize("name", ["preset", "mip", "surface", "slices", "slice", "cpr"])
 def test_slabs_are_told_and_what_progress_raises_ends_the_picture(device: Any, name: str) -> None:
-    style = replace(SAME[name][0], shadows=False) if name == "surface" else SAME[name][0]
+    style = SAME[name][0]
+    style = replace(style, shadows=False) if isinstance(style, clrecon.SurfaceLook) else style
     calls: list[tuple[str, int, int]] = []
     place: dict[str, Any] = {"view": (20, 30), "size": SIZE, "device": device}
     whole = clrecon.render(body(), style, **place, progress=lambda *call: calls.append(call))
