@@ -10,7 +10,8 @@
 
 /* -D LEAST_VALUE: voxels with lower values count as if they had this one, before anything is interpolated. */
 #ifdef LEAST_VALUE
-#define HOLD_FLOATS(values) greater(values, (floats)(LEAST_VALUE))
+/* Not greater(): Mesa 22.3 makes wrong code of `value > least ? value : least` with 16-bit voxels. */
+#define HOLD_FLOATS(values) choose((values) < (floats)(LEAST_VALUE), (floats)(LEAST_VALUE), values)
 #define HOLD_PAIRS(pairs) hold_pairs(pairs)
 #else
 #define HOLD_FLOATS(values) (values)

@@ -25,7 +25,6 @@ from soft_function import SOFT
 from variants import all_but
 
 from clrecon.geometry import Volume
-from clrecon.opencl.quirks import is_software_gpu
 from clrecon.opencl.sources import read_kernel_source
 from clrecon.reference.rays.rays import hash_pixels, jitter_pixels
 from clrecon.rendering import UNSHADED, Lighting, TransferFunction
@@ -118,10 +117,7 @@ def assert_alike(found: Any, expected: Any, mode: str) -> None:
 
 @renders
 @pytest.mark.parametrize("name", all_but(SCENES, "steep uneven"))  # half a minute on llvmpipe; "steep", "uneven" stay
-def test_the_kernel_is_its_twin(device, name, request):
-    if name == "drr" and is_software_gpu(device.name):
-        why = "one ray at a time, llvmpipe is off by up to 1.4 in 16 neighbouring pixels; PoCL is not"
-        request.applymarker(pytest.mark.xfail(reason=why, raises=AssertionError))
+def test_the_kernel_is_its_twin(device, name):
     volume, settings = SCENES[name]()
     assert_alike(DeviceCaster(device)(volume, **settings), TwinCaster()(volume, **settings), settings["mode"])
 
