@@ -1,1 +1,1 @@
-"""What comes out: pictures, what is drawn into them, their files, their place in scenes."""
+"""Pictures: their styles, annotations, files, and their place in scenes."""

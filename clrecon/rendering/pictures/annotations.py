@@ -1,4 +1,4 @@
-"""What is drawn into a picture on request: sides of the patient, a scale bar in mm, a line of text."""
+"""Annotations of a picture: letters for the sides of the patient, a scale bar in mm, a line of text."""
 
 from __future__ import annotations
 
@@ -19,20 +19,20 @@ if TYPE_CHECKING:
 __all__ = ["SMALLEST_SIDE", "annotate", "bar_length", "check_caption", "edge_letters", "orientation_letters"]
 
 SMALLEST_SIDE = 64
-"""Pixels; letters in smaller pictures cannot be read."""
+"""Smallest width and height in pixels; letters in smaller pictures cannot be read."""
 
 LEAST_SHARE = 0.05
-"""Component of a unit vector from which on its letter is shown: a turn by 3 degrees."""
+"""Smallest component of a unit vector that gets a letter: a turn by 3 degrees."""
 
 TEXT_SHARE, SMALLEST_TEXT = 1 / 28, 9.0
-"""Height of the text as a share of the shorter side, and in pixels at least."""
+"""Height of the text as a share of the shorter side, and the smallest height in pixels."""
 
 LONGEST_BAR_SHARE = 0.35
-"""Of the width.  Rounded down to 1, 2 or 5 x 10^n mm, a bar has at least 14 %."""
+"""Longest scale bar as a share of the width.  After rounding down to 1, 2 or 5 x 10^n mm it is at least 14 %."""
 
 
 class _Ink(NamedTuple):
-    """Grey of what is drawn, and of the outline that sets it off."""
+    """Grey of the annotations, and of the outline around them."""
 
     fill: int
     outline: int
@@ -44,13 +44,13 @@ def orientation_letters(direction: ArrayLike) -> str:
     Parameters
     ----------
     direction : array_like, shape (3,)
-        In LPS, any length.
+        A vector in LPS of any length.
 
     Returns
     -------
     str
-        L, R, P, A, S (superior, DICOM's H) and I (inferior, DICOM's F) of the components from the largest to the
-        smallest; components of less than 5 % are left out, and equal ones come in the order of x, y and z.
+        Letters L, R, P, A, S (superior, DICOM's H) and I (inferior, DICOM's F), one for each component, the largest
+        component first.  Components of less than 5 % get no letter; equal ones come in the order x, y, z.
 
     Notes
     -----
@@ -71,7 +71,7 @@ def edge_letters(camera: Camera) -> dict[str, str]:
 
 
 def bar_length(width_mm: float) -> float:
-    """The longest of 1, 2 and 5 x 10^n mm that is no longer than 35 % of a picture's width in mm."""
+    """Longest length of the form 1, 2 or 5 x 10^n mm within 35 % of a picture's width in mm."""
     longest = LONGEST_BAR_SHARE * width_mm * (1.0 + 1e-12)
     power = 10.0 ** np.floor(np.log10(longest))
     return float(max(step * power for step in (1.0, 2.0, 5.0) if step * power <= longest))
@@ -80,29 +80,30 @@ def bar_length(width_mm: float) -> float:
 def annotate(
     rendering: PictureData, *, letters: bool = False, scale_bar: bool = False, caption: str | None = None
 ) -> NDArray[np.uint8]:
-    """Draw into a picture.
+    """Draw annotations into a copy of a picture.
 
     Parameters
     ----------
     rendering : PictureData
         Not changed.
     letters : bool
-        The side of the patient that each edge looks to, see `orientation_letters`.
+        Mark each edge with the side of the patient in its direction, see `orientation_letters`.
     scale_bar : bool
-        A bar of a round length at the bottom left.  In a perspective picture it holds in the focal plane and says so.
+        Draw a bar of a round length at the bottom left.  In a perspective picture the bar is valid in the focal plane
+        only, and its text says so.
     caption : str, optional
-        One line at the top left; cut where the picture ends.
+        One line of text at the top left, cut at the edge of the picture.
 
     Returns
     -------
     ndarray, shape (h, w, 4), uint8
-        The image, opaque where something is drawn; that of the picture itself where nothing is.
+        The image, opaque under annotations.  Without any annotation it is the image of the picture itself.
 
     Raises
     ------
     UsageError
-        The picture is smaller than 64 x 64 pixels or too narrow for the text, or its directions or its pixel size
-        are not known (curved reformations), or the font lacks a character of the caption.
+        The picture is smaller than 64 x 64 pixels or too narrow for the text; its directions or its pixel size
+        are not known (curved reformations); or the font lacks a character of the caption.
     """
     check_caption(caption)
     if not (letters or scale_bar or caption):
@@ -127,17 +128,17 @@ def annotate(
 
 
 def check_caption(caption: str | None) -> None:
-    """Refuse a line of text with characters that the font does not have: they would be drawn as boxes.
+    """Refuse a caption with characters that the font lacks: they would be drawn as boxes.
 
     Raises
     ------
     UsageError
-        Names them.
+        The message names these characters.
     """
     if not caption:
         return
     font = load_font(4.0 * SMALLEST_TEXT)
-    box = bytes(font.getmask("\uffff"))  # no character: what the font draws instead of one that it lacks
+    box = bytes(font.getmask("\uffff"))  # not a character: the font draws its box for missing ones
     absent = [
         letter for letter in dict.fromkeys(caption) if letter.isprintable() and bytes(font.getmask(letter)) == box
     ]
@@ -146,7 +147,7 @@ def check_caption(caption: str | None) -> None:
 
 
 def _bar_of(rendering: PictureData) -> tuple[float, str]:
-    """Length of the bar in pixels, and what stands over it."""
+    """Return the length of the bar in pixels, and the text over it."""
     camera, pixel_mm, where = rendering.camera, rendering.pixel_mm, ""
     if camera is not None and not camera.is_parallel:
         pixel_mm, where = camera.pixel_mm(rendering.size), " (focal plane)"
@@ -157,7 +158,7 @@ def _bar_of(rendering: PictureData) -> tuple[float, str]:
 
 
 class _Page:
-    """A picture that is drawn on: everything as two masks, one of the outlines and one of what they surround."""
+    """A page for annotations: two masks, one for the strokes and one for the outlines around them."""
 
     def __init__(self, rendering: PictureData):
         load_pillow()
@@ -176,7 +177,7 @@ class _Page:
         self._boxes: list[tuple[float, float, float, float]] = []
 
     def draw_edge(self, edge: str, text: str) -> None:
-        """Letters in the middle of an edge."""
+        """Draw letters at the middle of an edge."""
         width, height = self._size
         gap = self._margin + self._stroke
         # Anchors of Pillow: left, middle, right; top, middle, baseline.  Capitals have no descender.
@@ -189,7 +190,7 @@ class _Page:
         self._write((x, y), text, anchor)
 
     def draw_bar(self, pixels: float, text: str) -> None:
-        """A bar whose filled part is `pixels` long, rounded to whole ones, with text over it."""
+        """Draw a bar with text over it; its filled part is `pixels` long, rounded to a whole number."""
         thickness = max(2, round(0.18 * self._font.size))
         left = self._margin + self._stroke
         end = left + max(1, round(pixels))
@@ -202,7 +203,7 @@ class _Page:
         self._write((left, bottom - over), text, "ls")
 
     def draw_caption(self, text: str) -> None:
-        """One line at the top left, as much of it as there is room for left of the letters of the top edge."""
+        """Draw one line at the top left, cut before the letters of the top edge."""
         line = "".join(character if character.isprintable() else " " for character in text)
         at = (self._margin + self._stroke, self._margin + self._stroke)
         ends = [left for left, top, _, _ in self._boxes if top < at[1] + self._font.size]
@@ -214,7 +215,7 @@ class _Page:
         self._write(at, line, "lt")
 
     def finish(self) -> np.ndarray:
-        """The picture with all that was drawn."""
+        """Return the image with all annotations."""
         from PIL import Image
 
         picture = self._picture
@@ -245,7 +246,7 @@ class _Page:
 
 
 def _choose_ink(rendering: PictureData) -> _Ink:
-    """White on what is dark or transparent, black on what is bright, judged by the border of the picture."""
+    """Choose white ink for a dark or transparent picture and black for a bright one; the border decides."""
     rim = max(1, round(0.08 * min(rendering.size)))
     inside = np.zeros(rendering.image.shape[:2], dtype=bool)
     inside[rim:-rim, rim:-rim] = True

@@ -1,4 +1,4 @@
-"""Files of one picture.  None holds patient data, a date or a path; the same picture gives the same bytes."""
+"""Files of one picture: no patient data, date or path in them; the same picture gives the same bytes."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ __all__ = [
 ]
 
 IMAGE_FORMATS = {".png": "PNG", ".jpg": "JPEG", ".jpeg": "JPEG", ".tif": "TIFF", ".tiff": "TIFF"}
-"""Extension to Pillow's name."""
+"""Pillow's name of the format, by extension."""
 
 FLOAT_FORMATS = (".npy", ".tif", ".tiff")
 
 _MOST_PER_METRE = 2**31 - 1
-"""Pixels per metre that PNG can say."""
+"""Largest number of pixels per metre in a PNG file."""
 
 
 def check_image_path(path: str | os.PathLike[str]) -> str:
@@ -41,19 +41,19 @@ def check_image_path(path: str | os.PathLike[str]) -> str:
     Raises
     ------
     UsageError
-        It is none of `IMAGE_FORMATS`.
+        The extension is not in `IMAGE_FORMATS`.
     """
     return _extension(path, tuple(IMAGE_FORMATS), "picture")
 
 
 def write_image(rendering: PictureData, path: str | os.PathLike[str], quality: int = 95) -> int:
-    """Write a picture; what `Rendering.save` does."""
+    """Write a picture to a file; see `Rendering.save`."""
     content = encode_image(rendering, check_image_path(path), quality)
     return _replace(path, content)
 
 
 def encode_image(rendering: PictureData, extension: str, quality: int = 95) -> bytes:
-    """Bytes of the file that `write_image` writes.
+    """Return the bytes of the file that `write_image` writes.
 
     Parameters
     ----------
@@ -61,12 +61,12 @@ def encode_image(rendering: PictureData, extension: str, quality: int = 95) -> b
     extension : str
         One of `IMAGE_FORMATS`.
     quality : int
-        Of JPEG, 1 to 100.
+        Quality of JPEG, 1 to 100.
 
     Raises
     ------
     UsageError
-        The format would lose the opacity.
+        The format cannot store the opacity of the picture.
     """
     load_pillow()
     from PIL import Image
@@ -80,7 +80,7 @@ def encode_image(rendering: PictureData, extension: str, quality: int = 95) -> b
         if not 1 <= quality <= 100:
             raise UsageError(f"the quality of a JPEG file lies between 1 and 100, not at {quality!r}")
         picture = picture.convert("RGB")
-        # No resolution: JFIF holds whole dots per inch, which is 1 % off at 0.5 mm.
+        # No resolution: JFIF stores whole dots per inch, an error of 1 % at 0.5 mm.
         options = {"quality": quality, "subsampling": 0}
     else:
         options.update(_resolution(rendering.pixel_mm))
@@ -94,7 +94,7 @@ def encode_image(rendering: PictureData, extension: str, quality: int = 95) -> b
 
 
 def write_floats(array: NDArray[np.float32], path: str | os.PathLike[str], pixel_mm: float | None = None) -> int:
-    """Write one float32 a pixel, NaN included, to a file of `FLOAT_FORMATS`.
+    """Write one float32 per pixel, NaN included, to a file with an extension of `FLOAT_FORMATS`.
 
     Parameters
     ----------
@@ -117,13 +117,13 @@ def check_float_path(path: str | os.PathLike[str]) -> str:
     Raises
     ------
     UsageError
-        It is none of `FLOAT_FORMATS`.
+        The extension is not in `FLOAT_FORMATS`.
     """
     return _extension(path, FLOAT_FORMATS, "depth or value")
 
 
 def encode_floats(array: NDArray[np.float32], extension: str, pixel_mm: float | None = None) -> bytes:
-    """Bytes of the file that `write_floats` writes; `extension` is one of `FLOAT_FORMATS`."""
+    """Return the bytes of the file that `write_floats` writes; `extension` is one of `FLOAT_FORMATS`."""
     floats = np.ascontiguousarray(array, dtype=np.float32)
     stream = BytesIO()
     if extension == ".npy":
@@ -155,7 +155,7 @@ def _replace(path: str | os.PathLike[str], content: bytes) -> int:
 
 
 def _resolution(pixel_mm: float | None) -> dict[str, Any]:
-    """Pillow's option for pixels of so many mm; PNG rounds it to whole pixels per metre, and has 32 bits for them."""
+    """Return Pillow's option for the size of a pixel in mm; PNG stores whole pixels per metre in 32 bits."""
     if pixel_mm is None or not 1.0 <= 1000.0 / pixel_mm <= _MOST_PER_METRE:
         return {}
     return {"dpi": (25.4 / pixel_mm, 25.4 / pixel_mm)}

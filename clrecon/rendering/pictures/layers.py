@@ -1,4 +1,4 @@
-"""A picture and a scene that one camera has seen, put together pixel by pixel, without PyVista or a screen."""
+"""Merging of a picture and a scene from the same camera, pixel by pixel, without PyVista or a screen."""
 
 from __future__ import annotations
 
@@ -14,29 +14,29 @@ __all__ = ["merge_layers"]
 
 
 def merge_layers(rendering: Rendering, colors: NDArray[np.uint8], depth: NDArray[np.floating]) -> Rendering:
-    """Put a picture and a scene that one camera has seen together: what is nearer covers what is further away.
+    """Merge a picture and a scene from the same camera: the nearer one covers the farther one.
 
-    Each pixel of the picture counts as one layer at its expected depth: a mesh within translucent tissue lies before
-    or behind all of it.
+    Each pixel of the picture is one layer at its expected depth.  A mesh within translucent tissue is therefore drawn
+    wholly before or wholly behind the tissue.
 
     Parameters
     ----------
     rendering : Rendering
-        With a transparent background.
+        The picture, with a transparent background.
     colors : ndarray, shape (h, w, 4), uint8
         The scene: red, green, blue and opacity, not premultiplied; row 0 is the top.
     depth : ndarray, shape (h, w), floating
-        Of the scene, in mm as in `Rendering.depth`; NaN where nothing is.
+        Depths of the scene in mm, as in `Rendering.depth`; NaN where the scene is empty.
 
     Returns
     -------
     Rendering
-        Both depths are those of picture and scene together; `values` is None.
+        The merged picture.  Both of its depths include the scene; `values` is None.
 
     Raises
     ------
     UsageError
-        Other sizes, or a picture whose background is a colour.
+        The sizes differ, or the background of the picture is a colour.
     """
     width, height = rendering.size
     if colors.shape != (height, width, 4) or depth.shape != (height, width):
@@ -44,7 +44,7 @@ def merge_layers(rendering: Rendering, colors: NDArray[np.uint8], depth: NDArray
             f"the picture has {width} x {height} pixels, the scene {colors.shape} colours and {depth.shape} depths"
         )
     nothing = np.isnan(rendering.expected_depth)
-    if (rendering.image[nothing, 3] == 255).any():  # a trace of opacity without a depth is no background
+    if (rendering.image[nothing, 3] == 255).any():  # little opacity without a depth: not yet a background
         raise UsageError("this picture has a coloured background, which hides the scene: use background='transparent'")
     of_picture = np.where(nothing, np.inf, rendering.expected_depth)
     of_scene = np.where(colors[..., 3] > 0, np.nan_to_num(depth, nan=np.inf), np.inf)
@@ -65,7 +65,7 @@ def merge_layers(rendering: Rendering, colors: NDArray[np.uint8], depth: NDArray
 
 
 def _blend(front: NDArray[np.uint8], back: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
-    """One picture over another, both with straight opacity, and what each adds (2, h, w), 0 to 1."""
+    """Blend one picture over another, both not premultiplied; also return their weights (2, h, w), 0 to 1."""
     opacity = front[..., 3] / 255.0
     shares = np.stack([opacity, (1.0 - opacity) * back[..., 3] / 255.0])
     sums = shares[0, ..., None] * front[..., :3] + shares[1, ..., None] * back[..., :3]
@@ -79,7 +79,7 @@ def _blend(front: NDArray[np.uint8], back: NDArray[np.uint8]) -> tuple[NDArray[n
 def _mean_way(
     shares: NDArray[np.float64], front: NDArray[np.floating], back: NDArray[np.floating]
 ) -> NDArray[np.floating]:
-    """Mean of two depths, weighted with what each layer adds; infinite where neither is there."""
+    """Mean of two depths, weighted with the share of each layer; infinite where both layers are empty."""
     ways = np.stack([front, back])
     weighted = (shares * np.where(np.isinf(ways), 0.0, ways)).sum(axis=0)
     return np.where(np.isinf(front), np.inf, weighted / np.maximum(shares.sum(axis=0), 1e-9))

@@ -1,4 +1,4 @@
-"""Modes: the names of the kinds of pictures, and the one place that turns names and keywords into a style."""
+"""Modes: the names of the kinds of pictures, and the styles that names and keywords stand for."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ __all__ = ["MODES", "Mode", "check_known", "choose_mode", "find_style", "keyword
 
 
 class Mode(NamedTuple):
-    """A kind of picture: the class of its styles, and what it shows."""
+    """A kind of picture: the class of its styles, and a description for people."""
 
     style: type[Style]
     description: str
@@ -54,33 +54,35 @@ _BESIDE = {
     "values": ("mip", "minip", "mean", "drr", "slice", "cpr"),
     "turntable": _RAYS,
 }
-"""What may be said beside the fields of a style, by mode: where the camera is, what a picture gives, and the look that
-the pictures of a series share, of which some show nothing."""
+"""Keywords that are not fields of a style, and the modes in which each is allowed.
+
+They place the camera, ask for further outputs, or set a look for several pictures.  Some modes accept a look without
+using it."""
 
 
 def keywords_of(mode: str) -> dict[str, str]:
-    """What `render` calls the fields of a mode's style: keyword to field.
+    """Keywords of `render` for a mode, each with the field of the style that it sets.
 
-    A field has the keyword of its name, but for `CurveCut.kind` (cpr), `SlicesInSpace.opacity` (slice_opacity) and
+    Keyword and field have the same name, except for `CurveCut.kind` (cpr), `SlicesInSpace.opacity` (slice_opacity) and
     `Projection.kind` (mode).
     """
     return {own.metadata.get("keyword", own.name): own.name for own in fields(MODES[mode].style)}
 
 
 def check_known(mode: str, keyword: str, called: str | None = None) -> None:
-    """Refuse a keyword that means nothing in a mode.
+    """Refuse a keyword that has no meaning in a mode.
 
     Parameters
     ----------
     mode : str
     keyword : str
     called : str, optional
-        The caller's own name for it, for the message.
+        Name of the keyword in the message, if the caller has another one.
 
     Raises
     ------
     UsageError
-        The message says where the keyword belongs.
+        The message names the modes that know the keyword.
     """
     modes = [name for name in MODES if keyword in keywords_of(name) or name in _BESIDE.get(keyword, ())]
     if mode not in modes:
@@ -89,15 +91,15 @@ def check_known(mode: str, keyword: str, called: str | None = None) -> None:
 
 
 def choose_mode(mode: str | None = None, preset: str | None = None, **look: object) -> str:
-    """The mode that names and keywords ask for: a name of `MODES`.
+    """Choose the mode that names and keywords ask for: a name of `MODES`.
 
-    Without `mode` an iso value asks for a surface, a curve for a curved reformation, a preset for its own mode, and all
-    else for volume rendering.
+    Without `mode` an iso value means a surface, a curve means a curved reformation, and a preset means its own mode.
+    The default is volume rendering.
 
     Raises
     ------
     UsageError
-        There is no such mode or preset.
+        The mode or the preset does not exist.
     """
     if mode is not None:
         if not isinstance(mode, str) or mode not in MODES:
@@ -111,7 +113,7 @@ def choose_mode(mode: str | None = None, preset: str | None = None, **look: obje
 
 
 def make_style(mode: str | None = None, preset: str | None = None, **look: object) -> Style:
-    """The style that names and keywords ask for.
+    """Make the style that names and keywords ask for.
 
     >>> make_style("surface", iso_value=300)
     SurfaceLook(iso_value=300.0, ...)
@@ -121,15 +123,15 @@ def make_style(mode: str | None = None, preset: str | None = None, **look: objec
     mode : str, optional
         A name of `MODES`; default: see `choose_mode`.
     preset : str, optional
-        See `clrecon.rendering.looks.presets`: its transfer function in volume rendering and in slices in space, its
-        window in the other modes that show HU.
+        Name of a preset, see `clrecon.rendering.looks.presets`.  Volume rendering and slices in space use its transfer
+        function, the other modes that show HU use its window.
     **look
-        Fields of the mode's style, see `keywords_of`.  None and False stand for the default.
+        Fields of the mode's style, see `keywords_of`.  None and False mean the default.
 
     Raises
     ------
     UsageError
-        An unknown mode, preset or keyword, one that means nothing in the mode, or as the style.
+        The mode, preset or keyword is unknown, the keyword has no meaning in the mode, or the style refuses a value.
     """
     given = {keyword: value for keyword, value in look.items() if value is not None and value is not False}
     mode = choose_mode(mode, preset, **given)
@@ -148,7 +150,7 @@ def make_style(mode: str | None = None, preset: str | None = None, **look: objec
             given["transfer_function"] = preset
         elif style is SlicesInSpace and "window" not in given:
             given["transfer_function"] = chosen.transfer_function
-        elif mode != "drr":  # whose window is in mm of water
+        elif mode != "drr":  # its window is in mm of water
             given.setdefault("window", chosen.window)
     names = keywords_of(mode)
     own = {names[keyword]: value for keyword, value in {**given, "mode": mode}.items() if keyword in names}
@@ -156,12 +158,12 @@ def make_style(mode: str | None = None, preset: str | None = None, **look: objec
 
 
 def find_style(style: Style | str | None, look: Mapping[str, object]) -> Style:
-    """A style as it is, or the one that a mode and keywords ask for.
+    """Return a given style unchanged, or make the one that a mode and keywords ask for.
 
     Raises
     ------
     UsageError
-        Keywords beside a style, or as `make_style`.
+        A style was given together with keywords, or `make_style` refuses the keywords.
     """
     if isinstance(style, Style):
         if look:

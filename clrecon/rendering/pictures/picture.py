@@ -24,17 +24,18 @@ class Rendering(PictureData):
     image : ndarray, shape (h, w, 4), uint8
         Red, green, blue and opacity, not premultiplied; row 0 is the top.
     depth : ndarray, shape (h, w), float32
-        Way along the ray to the first hit in mm, see `Camera.position`; NaN where nothing is hit.
+        Distance along the ray to the first hit in mm, see `Camera.position`; NaN where nothing is hit.
     expected_depth : ndarray, shape (h, w), float32
-        Mean way in mm of all that the pixel shows, weighted with what each sample adds to it; NaN where nothing is.
+        Mean distance in mm of all samples of the pixel, weighted with what each adds to the pixel; NaN in empty pixels.
     camera : Camera or None
-        None where the picture is no projection (curved reformations).
+        None for curved reformations, which no camera sees.
     values : ndarray, shape (h, w), float32, or None
-        HU of each pixel, for modes that show values (mip, minip, mean, slice, cpr); NaN outside of the volume.  In drr
-        the water in mm that attenuates as much as all that lies along the ray, 0 outside of the volume.
+        HU of each pixel in the modes mip, minip, mean, slice and cpr; NaN outside of the volume.  In drr the thickness
+        of water in mm that attenuates as much as the ray's path through the volume; 0 outside of the volume.  None in
+        other modes.
     mode : str
     report : dict
-        How it was made, free of patient data.  ``"pixel_mm"`` says the side of a pixel where no camera does.
+        How the picture was made, without patient data.  ``"pixel_mm"`` is the side of a pixel if there is no camera.
     """
 
     def __repr__(self) -> str:
@@ -42,7 +43,7 @@ class Rendering(PictureData):
         return f"<Rendering {self.mode}, {width} x {height} pixels, camera {self.camera}>"
 
     def with_background(self, color: str | Sequence[float]) -> Rendering:
-        """The same picture before a colour, opaque.
+        """Return the same picture, opaque, in front of a colour.
 
         Parameters
         ----------
@@ -52,7 +53,7 @@ class Rendering(PictureData):
         Returns
         -------
         Rendering
-            With an `image` of its own; it shares the other arrays.
+            A picture with its own `image`; the other arrays are shared.
         """
         from clrecon.rendering.looks.colors import find_color
 
@@ -64,7 +65,7 @@ class Rendering(PictureData):
         return replace(self, image=image)
 
     def annotated(self, *, letters: bool = False, scale_bar: bool = False, caption: str | None = None) -> Rendering:
-        """The same picture with sides of the patient, a scale bar or a line of text drawn in.
+        """Return the same picture with sides of the patient, a scale bar or a line of text.
 
         See `clrecon.rendering.pictures.annotations.annotate`.
         """
@@ -74,15 +75,15 @@ class Rendering(PictureData):
         return self if image is self.image else replace(self, image=image)
 
     def save(self, path: str | os.PathLike[str], *, quality: int = 95) -> int:
-        """Write the picture to a file whose extension says the format.
+        """Write the picture to a file; the extension chooses the format.
 
         Parameters
         ----------
         path : str or path
-            ``.png`` and ``.tif`` keep the opacity and say the mm of a pixel as resolution where the picture is
-            parallel; PNG also says how it was made.  ``.jpg`` takes opaque pictures alone.
+            ``.png`` and ``.tif`` keep the opacity; for parallel pictures they state the size of a pixel as resolution.
+            ``.png`` also states how the picture was made.  ``.jpg`` accepts opaque pictures only.
         quality : int
-            Of JPEG, 1 to 100.
+            Quality of JPEG, 1 to 100.
 
         Returns
         -------
@@ -92,9 +93,9 @@ class Rendering(PictureData):
         Raises
         ------
         UsageError
-            Another extension, or opacity that the format would lose.
+            The extension is unknown, or the format cannot store the opacity of the picture.
         OutputError
-            The file cannot be written; an older one of that name is intact.
+            The file cannot be written; an older file of that name is intact.
         """
         from clrecon.rendering.pictures.image_files import write_image
 
@@ -107,7 +108,7 @@ class Rendering(PictureData):
         ----------
         path : str or path
         expected : bool
-            `expected_depth` in its place.
+            Write `expected_depth` instead.
 
         Returns
         -------
@@ -124,7 +125,7 @@ class Rendering(PictureData):
         Raises
         ------
         UsageError
-            The mode has none.
+            The mode has no values.
         """
         from clrecon.rendering.pictures.image_files import write_floats
 
@@ -134,34 +135,34 @@ class Rendering(PictureData):
         return write_floats(self.values, path, self.pixel_mm)
 
     def to_pyvista(self, form: str = "points", *, expected: bool = False, distance: float | None = None) -> Any:
-        """Return the picture as something that a PyVista scene in LPS mm can hold beside meshes.
+        """Return the picture as a PyVista data set in LPS mm, for a scene with meshes.
 
         Show it with ``plotter.add_mesh(data, scalars="RGBA", rgba=True, lighting=False)``, or let
-        `clrecon.viewer.add_rendering` do it.  Field arrays ``SPACE`` and ``UNIT`` say what the coordinates are.
+        `clrecon.viewer.add_rendering` do it.  Field arrays ``SPACE`` and ``UNIT`` name the space and its unit.
 
         Parameters
         ----------
         form : {"points", "plane"}
-            ``"points"``: ``pyvista.PolyData`` with a point for each pixel that hits something, where its ray does,
-            with point data ``RGBA``, ``depth`` (mm) and, where there are `values`, ``HU``.
-            ``"plane"``: ``pyvista.ImageData`` with a cell for each pixel, across the view, with cell data ``RGBA``
-            and, where there are `values`, ``HU``; seen by the picture's camera it is the picture.
+            ``"points"``: ``pyvista.PolyData`` with a point at each hit of a ray.  Point data: ``RGBA``, ``depth`` (mm)
+            and, if there are `values`, ``HU``.
+            ``"plane"``: ``pyvista.ImageData`` across the view with a cell for each pixel.  Cell data: ``RGBA`` and, if
+            there are `values`, ``HU``.  From the picture's camera the plane looks like the picture.
         expected : bool
             Points at the expected depth, not at the first hit.
         distance : float, optional
-            Of the plane from the camera, mm along the view; default: through the focal point.
+            Distance of the plane from the camera, mm along the view; default: through the focal point.
 
         Raises
         ------
         UsageError
-            The picture has no camera, or hits nothing that could be points; no such form or distance.
+            The picture has no camera, there are no hits to make points of, or the form or distance is invalid.
         """
         from clrecon.rendering.pictures.vtk import rendering_to_pyvista
 
         return rendering_to_pyvista(self, form, expected=expected, distance=distance)
 
     def _repr_png_(self) -> bytes:
-        """What a notebook shows."""
+        """Return the PNG bytes that a notebook shows."""
         from clrecon.rendering.pictures.image_files import encode_image
 
         return encode_image(self, ".png")

@@ -1,4 +1,4 @@
-"""What a picture consists of: the plain values that `Rendering` writes, annotates and puts into scenes."""
+"""`PictureData`: the plain values of a picture, which `Rendering` writes, annotates and puts into scenes."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class PictureData(Message):
 
     @property
     def pixel_mm(self) -> float | None:
-        """Side of a pixel in mm where it is the same all over the picture, else None (perspective)."""
+        """Side of a pixel in mm; None if it varies within the picture (perspective)."""
         if self.camera is not None:
             return self.camera.pixel_mm(self.size) if self.camera.is_parallel else None
         told = self.report.get("pixel_mm")
@@ -41,5 +41,5 @@ class PictureData(Message):
 
     @property
     def is_opaque(self) -> bool:
-        """True when no pixel lets a background through."""
+        """True if no pixel is transparent, not even partly."""
         return bool((self.image[..., 3] == 255).all())

@@ -1,4 +1,4 @@
-"""The one door to Pillow, which reads and writes picture files and draws text."""
+"""Loading of Pillow, which reads and writes picture files and draws text."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ __all__ = ["load_font", "load_pillow"]
 def load_pillow() -> None:
     """Make ``from PIL import ...`` work from here on.
 
-    The command line hides Pillow from pydicom, which would load it without need, by an entry of None in
-    `sys.modules`; what makes a picture takes the entry away.  pydicom has been loaded without it by then.
+    The command line hides Pillow by an entry of None in `sys.modules`, because pydicom would load it without need.
+    This function removes the entry; pydicom is loaded by then.
 
     Raises
     ------
@@ -33,12 +33,12 @@ def load_pillow() -> None:
 
 
 def load_font(pixels: float) -> ImageFont.FreeTypeFont:
-    """Pillow's own scalable font, so many pixels high.
+    """Return Pillow's own scalable font, `pixels` high.
 
     Raises
     ------
     UsageError
-        This Pillow has no FreeType.
+        This build of Pillow lacks FreeType.
     """
     load_pillow()
     from PIL import ImageFont

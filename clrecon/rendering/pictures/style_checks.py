@@ -1,4 +1,4 @@
-"""Checks of the fields of styles, one place for each bound; a check returns the value in the form that is kept."""
+"""Checks of the fields of styles.  A check returns the value in its final form or refuses it."""
 
 from __future__ import annotations
 
@@ -29,11 +29,11 @@ __all__ = [
 ]
 
 SPINE = "spine"
-"""As a curve: the spinal canal, found in the volume."""
+"""Value of a curve that stands for the spinal canal, which is found in the volume."""
 
 
 def instance_of(what: str, kind: type) -> Callable[[Any], Any]:
-    """A check of the type."""
+    """Make a check of the type."""
 
     def check(value: Any) -> Any:
         if isinstance(value, kind):
@@ -44,7 +44,7 @@ def instance_of(what: str, kind: type) -> Callable[[Any], Any]:
 
 
 def one_of(names: Sequence[str], text: str) -> Callable[[Any], Any]:
-    """A check of a name; `text` says which there are, and is followed by what was given."""
+    """Make a check of a name; the message is `text`, which lists the names, and the given value."""
 
     def check(value: Any) -> Any:
         if isinstance(value, str) and value in names:
@@ -55,7 +55,7 @@ def one_of(names: Sequence[str], text: str) -> Callable[[Any], Any]:
 
 
 def number(text: str, is_fine: Callable[[float], bool]) -> Callable[[Any], float]:
-    """A check of one number; `text` says what it is, and is followed by what was given."""
+    """Make a check of one number; the message is `text`, which describes it, and the given value."""
 
     def check(value: Any) -> float:
         try:
@@ -71,20 +71,20 @@ def number(text: str, is_fine: Callable[[float], bool]) -> Callable[[Any], float
 
 
 def flag(name: str, value: Any) -> bool:
-    """True or False."""
+    """Check for True or False."""
     if isinstance(value, (bool, np.bool_)):
         return bool(value)
     raise UsageError(f"{name} is True or False, not {value!r:.60}")
 
 
 def color(value: Any) -> Any:
-    """What `find_color` knows."""
+    """Check for a colour that `find_color` knows."""
     find_color(value)
     return value
 
 
 def preset_or_function(value: Any) -> Any:
-    """The name of a preset, or a transfer function."""
+    """Check for the name of a preset, or a transfer function."""
     if isinstance(value, str):
         find_preset(value)
         return value
@@ -92,7 +92,7 @@ def preset_or_function(value: Any) -> Any:
 
 
 def curve(value: Any) -> Any:
-    """A `Curve`, points that make one, or `SPINE`."""
+    """Check for a `Curve`, points that make one, or `SPINE`."""
     if isinstance(value, str):
         if value == SPINE:
             return value
@@ -101,7 +101,7 @@ def curve(value: Any) -> Any:
 
 
 def slices(value: Any) -> int | tuple[int, ...]:
-    """An int above 0, or different whole numbers, ascending."""
+    """Check for an int above 0, or for different whole numbers; returns them in ascending order."""
     if isinstance(value, (int, np.integer)) and not isinstance(value, bool):
         if value < 1:
             raise UsageError(f"every {value}th slice cannot be shown: give 1 or more, or a list of slices")
@@ -119,7 +119,7 @@ def slices(value: Any) -> int | tuple[int, ...]:
 
 
 def mapping(what: str) -> Callable[[Any], Any]:
-    """A check that something is said by label."""
+    """Make a check for a mapping with labels as keys; `what` names the values in the message."""
 
     def check(value: Any) -> Any:
         if isinstance(value, Mapping):

@@ -1,8 +1,8 @@
-"""Styles: what a picture shows.  Each kind of picture has a class, whose fields are all that this kind takes.
+"""Styles: what a picture shows.  Each kind of picture has its own class with its own fields.
 
 >>> clrecon.render(volume, SurfaceLook(300, color="orange"), view="left")
 
-Where a picture is taken from, how large it is and what is behind it is no part of a style.
+Camera, size and background are not part of a style.
 """
 
 from __future__ import annotations
@@ -55,31 +55,31 @@ COMBINATIONS = ("mean", "max", "min")
 CURVED_KINDS = ("straightened", "stretched")
 
 DEFAULT_ISO_VALUE = 200.0
-"""HU of surfaces: bone, thin cortex of vertebrae with it."""
+"""Iso value of surfaces in HU: bone, including the thin cortex of vertebrae."""
 
 DEFAULT_COLOR = "bone"
-"""Of surfaces without labels."""
+"""Colour of surfaces without labels."""
 
 DEFAULT_OPACITY = 0.5
-"""Of a slice in space: the front ones are bright, and the third still shows an eighth of its light."""
+"""Opacity of a slice in space: the front slices are bright, and the third still gives an eighth of its light."""
 
 LOWEST_SHOWN_HU = -300.0
-"""Below is air, lung and most of what lies around a patient: transparent, so that the slices behind are seen."""
+"""HU below this are transparent: air, lung and most things around a patient, so that slices behind are visible."""
 
 
 def _field(default: Any, check: Callable[[Any], Any], keyword: str | None = None) -> Any:
-    """A field whose values go through `check`; `keyword` is what `render` calls it, where that is another name."""
+    """Declare a field with a check; `keyword` is its name in `render` if that differs."""
     return field(default=default, metadata={"check": check} | ({"keyword": keyword} if keyword else {}))
 
 
 @dataclass(frozen=True, kw_only=True)
 class Style:
-    """What all styles have in common: every field is checked when the style is made.
+    """Base of all styles: every field is checked on construction.
 
     Raises
     ------
     UsageError
-        A value is impossible, or two exclude each other; the message says what is possible.
+        A value is impossible, or two values exclude each other; the message says what is possible.
     """
 
     _mode: ClassVar[str]
@@ -96,13 +96,13 @@ class Style:
         return self._mode
 
     def parameters(self) -> dict[str, Any]:
-        """The fields by name, for a function that takes them."""
+        """The fields by name, as keyword arguments of a function."""
         return {own.name: getattr(self, own.name) for own in fields(self)}
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Labelled(Style):
-    """Styles in which labels can look different."""
+    """Base of styles in which labels can look different."""
 
     lighting: Lighting | None = _field(None, checks.instance_of("lighting", Lighting))
     ray_step: float | None = _field(None, checks.ray_step)
@@ -126,7 +126,7 @@ class _Labelled(Style):
 
     @cached_property
     def label_style(self) -> LabelStyle | None:
-        """Colour and opacity of each label, None where there are no labels."""
+        """Colour and opacity of each label, None without labels."""
         if self.labels is None:
             return None
         colors = cast("Mapping[int | str, _Color] | None", self.label_colors)
@@ -142,15 +142,15 @@ class VolumeLook(_Labelled):
     transfer_function : TransferFunction or str
         Colours and opacities by HU, or the name of a preset, see `clrecon.rendering.looks.presets`.
     lighting : Lighting, optional
-        Default: that of the transfer function, and where it has none ``Lighting()``.
+        Default: that of the transfer function, else ``Lighting()``.
     ray_step : float, optional
         mm between samples; default: half the smallest spacing of the volume.
     jitter : bool
-        Samples at random places of their steps: grain in place of rings.
+        Place each sample at random within its step: fine noise instead of rings.
     clip : Clip, optional
         The part of space that is shown.
     labels : LabelMap, optional
-        Labels that look different.
+        Labels that get a look of their own.
     label_colors : mapping of label to colour, optional
         Labels by number or name, see `clrecon.rendering.looks.label_style.LabelStyle.of`; default: a colour for each.
     label_opacity : mapping of label to float, optional
@@ -165,7 +165,7 @@ class VolumeLook(_Labelled):
 
     @property
     def function(self) -> TransferFunction:
-        """The transfer function, that of the preset where one is named."""
+        """The transfer function; for the name of a preset, that of the preset."""
         named = self.transfer_function
         return find_preset(named).transfer_function if isinstance(named, str) else named
 
@@ -181,10 +181,10 @@ class Projection(Style):
     Parameters
     ----------
     kind : {"mip", "minip", "mean", "drr"}
-        The highest, lowest or mean HU; or a radiograph: the water in mm that attenuates as much.
+        The highest, lowest or mean HU; "drr" is a radiograph: the thickness of water in mm with the same attenuation.
     window : (float, float), optional
-        HU, in "drr" mm of water, that are black and white; default: the 1st to the 99th percentile of the picture, in
-        "drr" of the rays that meet the body.
+        Values shown as black and white, in HU or (drr) mm of water; default: the 1st and the 99th percentile of the
+        picture, in "drr" of the rays that meet the body.
     ray_step : float, optional
         mm between samples; default: half the smallest spacing of the volume.
     clip : Clip, optional
@@ -204,7 +204,7 @@ class Projection(Style):
 
 @dataclass(frozen=True)
 class SurfaceLook(_Labelled):
-    """The surface of the closed mesh at an iso value, shaded, without a mesh.
+    """The shaded surface at an iso value: that of the closed mesh, but no mesh is made.
 
     Parameters
     ----------
@@ -213,15 +213,15 @@ class SurfaceLook(_Labelled):
     color : str or (float, float, float), optional
         See `clrecon.rendering.looks.colors.find_color`; default: "bone".
     shadows : bool
-        What something else hides from the light has ambient light alone.  Needs a light that stands still.
+        Parts that other parts hide from the light get ambient light only.  The light must have a fixed direction.
     depth_cue : float, optional
-        Share of the brightness, 0 to 1, that is lost from the nearest corner of the volume to the farthest.
+        Loss of brightness from the nearest corner of the volume to the farthest, a share from 0 to 1.
     lighting : Lighting, optional
         Default: ``Lighting()``.
     ray_step : float, optional
         mm between samples; default: half the smallest spacing of the volume.
     clip : Clip, optional
-        The part of space that is shown; what is cut is capped.
+        The part of space that is shown; cuts are capped.
     labels, label_colors, label_opacity
         As of `VolumeLook`.
     """
@@ -239,7 +239,7 @@ class SurfaceLook(_Labelled):
 
     @property
     def rgb(self) -> Float64Array:
-        """The colour, red, green and blue from 0 to 1."""
+        """The colour: red, green and blue, each from 0 to 1."""
         return find_color(DEFAULT_COLOR if self.color is None else self.color)
 
     def __post_init__(self) -> None:
@@ -254,20 +254,20 @@ class SurfaceLook(_Labelled):
 
 @dataclass(frozen=True)
 class SlicesInSpace(Style):
-    """Slices of the scan, translucent, each where it lies.
+    """Translucent slices of the scan, each at its place in space.
 
     Parameters
     ----------
     slices : int or sequence of int, optional
         An int n: every n-th slice from the first.  A list: those slices.  Default: about twelve, evenly spaced.
     opacity : float
-        Of each slice, above 0 to 1.
+        Opacity of each slice, above 0 and at most 1.
     window : (float, float), optional
-        HU that are black and white; default: -300 to 400.
+        HU shown as black and white; default: -300 to 400.
     transfer_function : TransferFunction, optional
-        Its colours in place of grey; its opacity plays no part.
+        Colours to use in place of grey; its opacity is ignored.
     lowest_hu : float
-        What is below is transparent.
+        HU below this are transparent.
     clip : Clip, optional
         The part of space that is shown.
     """
@@ -296,7 +296,7 @@ class SlicesInSpace(Style):
 
 @dataclass(frozen=True, kw_only=True)
 class _Cut(Style):
-    """Sheets through the volume, with samples across them."""
+    """Base of cuts through the volume; a thick one combines samples across it."""
 
     thickness: float = _field(0.0, checked_thickness)
     combine: str = _field(
@@ -308,20 +308,20 @@ class _Cut(Style):
 
 @dataclass(frozen=True)
 class PlaneCut(_Cut):
-    """A plane through the volume in any direction, as thick as wanted.
+    """A plane through the volume in any direction, or a thick slice around it.
 
     Parameters
     ----------
     offset_mm : float
-        Moves the plane along the view, away from the camera.
+        Distance by which the plane is moved along the view, away from the camera.
     thickness : float
-        mm of the thick slice around the plane whose samples are combined; 0 is the plane alone.
+        Thickness in mm of the thick slice around the plane; its samples are combined.  0: the plane alone.
     combine : {"mean", "max", "min"}
-        Of these samples.
+        Which value of the samples is shown.
     window : (float, float), optional
-        HU that are black and white; default: -450 to 1050, a window for bone.
+        HU shown as black and white; default: -450 to 1050, a window for bone.
     pixel_mm : float, optional
-        Side of a pixel; default: the volume fits the picture.
+        Side of a pixel; by default the volume fits the picture.
     """
 
     _mode: ClassVar[str] = "slice"
@@ -341,13 +341,13 @@ class CurveCut(_Cut):
     kind : {"straightened", "stretched"}
         See `clrecon.rendering.views.curved`.
     angle : float
-        Degrees by which the rows of a straightened picture are turned about the centre line.
+        Rotation of the rows of a straightened picture about the centre line, in degrees.
     width_mm : float, optional
-        Width of the picture where no size is given; default: 120 mm.
+        Width of the picture if no size is given; default: 120 mm.
     thickness, combine, window
         As of `PlaneCut`; the thick slice lies across the picture.
     pixel_mm : float, optional
-        Side of a pixel; default: the curve fills the height of the size, else the smallest distance of voxels.
+        Side of a pixel; by default the curve fills the height of the size; without a size it is the smallest spacing.
     """
 
     _mode: ClassVar[str] = "cpr"

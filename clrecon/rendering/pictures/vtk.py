@@ -1,7 +1,7 @@
-"""A picture as something that PyVista can show among meshes, in LPS mm.
+"""Pictures as PyVista data sets in LPS mm, to be shown among meshes.
 
-Two forms of a picture go into a scene: its points, each where the ray of its pixel first hits something, which stay
-right from every side, and a plane with the picture on it.
+There are two forms: points, one at the first hit of each ray, which are right from every side; and a plane with the
+picture on it.
 """
 
 from __future__ import annotations
