@@ -1,1 +1,1 @@
-"""A scan to pictures in files."""
+"""The render job: a scan becomes picture files."""

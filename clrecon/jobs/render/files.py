@@ -1,4 +1,4 @@
-"""The files of a picture job: what they are called, that they can be written, and writing them as a whole."""
+"""The files of a picture job: their names, early checks of the outputs, and writing under temporary names."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ OPAQUE_ONLY = (".jpg", ".jpeg", ".mp4", ".gif")
 
 @dataclass(frozen=True)
 class PictureFiles:
-    """Where the outputs of a job go; with several views each file of a picture gets a name of its own.
+    """Paths of the outputs of a job; with several views each picture gets its own file names.
 
     Parameters
     ----------
     picture : path, optional
         .png, .jpg or .tif.
     depth, values : path, optional
-        .npy or .tif: mm to the first hit, HU.
+        .npy or .tif, with the distances to the first hit in mm, and with HU.
     turntable : path, optional
         See `clrecon.rendering.movies.movie.check_animation`.
     report : path, optional
@@ -42,7 +42,7 @@ class PictureFiles:
     Raises
     ------
     UsageError
-        There is nothing to write, or depths and values without a picture.
+        There is nothing to write, or depths or values are asked for without a picture.
     """
 
     picture: str | Path | None = None
@@ -64,7 +64,7 @@ class PictureFiles:
 
 
 def name_view(view: str, views: Sequence[str]) -> str:
-    """What stands between the stem of a file and its extension: nothing for a single view.
+    """Name of a view between the stem of a file and its extension; empty for a single view.
 
     Returns
     -------
@@ -78,13 +78,13 @@ def name_view(view: str, views: Sequence[str]) -> str:
 
 
 def path_of(path: str | Path, name: str) -> str | Path:
-    """``out.png`` and ``left`` make ``out_left.png``; an empty name changes nothing."""
+    """Insert a name into a path: ``out.png`` and ``left`` give ``out_left.png``; an empty name changes nothing."""
     stem, extension = os.path.splitext(os.fspath(path))
     return f"{stem}_{name}{extension}" if name else path
 
 
 def format_of(path: str | Path) -> str:
-    """Extension of a file in lower case, without its dot; empty for a folder."""
+    """Return the extension of a file in lower case, without the dot; empty for a folder."""
     return os.path.splitext(os.fspath(path))[1].lower().lstrip(".")
 
 
@@ -94,16 +94,16 @@ def check_pictures(files: PictureFiles, settings: RenderSettings) -> list[tuple[
     Returns
     -------
     list of (str, path)
-        What each of them is, and where it goes.
+        A description of each output, and its path.
 
     Raises
     ------
     UsageError
-        An unknown extension, two outputs that are one file, or one in the folder of frames, a format that cannot hold
-        what is asked of it, no encoder for a moving picture, a caption that cannot be drawn, or Pillow is not
+        An extension is unknown, two outputs are the same file, an output lies in the folder of frames, a format cannot
+        store what is asked for, there is no encoder for a moving picture, a caption cannot be drawn, or Pillow is not
         installed.
     OutputError
-        A folder is missing or cannot be written to, or a target is no regular file.
+        A folder is missing or cannot be written to, or a target is not a regular file.
     """
     from clrecon.rendering.movies.movie import animation_kind, check_animation
     from clrecon.rendering.pictures.annotations import check_caption
@@ -143,7 +143,7 @@ def check_pictures(files: PictureFiles, settings: RenderSettings) -> list[tuple[
 
 
 def _check_outside(folder: str | Path, owned: Sequence[tuple[str, str | Path]]) -> None:
-    """Refuse files in the folder of frames, which is replaced as a whole."""
+    """Refuse files in the folder of frames, because that folder is replaced as a whole."""
     frames = Path(os.path.realpath(folder))
     for what, path in owned:
         if frames in Path(os.path.realpath(path)).parents:
@@ -153,17 +153,17 @@ def _check_outside(folder: str | Path, owned: Sequence[tuple[str, str | Path]]) 
 def stage_picture(
     stack: ExitStack, picture: Rendering, files: PictureFiles, name: str
 ) -> dict[str, tuple[str | Path, StagedFile]]:
-    """Write a picture, and its depths and values where they are asked for, under temporary names.
+    """Write a picture, and its depths and values if asked for, under temporary names.
 
     Returns
     -------
     dict
-        ``output`` and, where there is one, ``depth_output`` and ``values_output``: the path and the staged file.
+        ``output`` and, if asked for, ``depth_output`` and ``values_output``: each with its path and its staged file.
 
     Raises
     ------
     OutputError
-        One of them cannot be written; all older files are intact.
+        A file cannot be written; all older files are intact.
     """
     from clrecon.rendering.pictures.image_files import encode_floats, encode_image
     from clrecon.system.files import stage_file

@@ -1,4 +1,4 @@
-"""The picture job: a CT series in, pictures and moving pictures out, with their report."""
+"""The render job: from a CT series to pictures, moving pictures and their report."""
 
 from __future__ import annotations
 
@@ -49,9 +49,9 @@ def make_pictures(
 ) -> PictureReport:
     """Read a CT series and take the pictures that are asked for.
 
-    Outputs that cannot be written are refused first, then files that say how (transfer function, centre line), then a
-    device that is not there, then the input.  Pictures are written under temporary names and renamed when all are
-    done, the turntable among them; the report comes last, as the commit mark.
+    Checks come in this order: the outputs, the settings files (transfer function, centre line), the device, the input.
+    Pictures and turntable are written under temporary names and renamed when all are done.  The report is renamed
+    last: it marks that everything is complete.
 
     Parameters
     ----------
@@ -69,7 +69,7 @@ def make_pictures(
     Raises
     ------
     UsageError, OutputError, DeviceError, NoDicomError, RefusedInputError
-        No picture is written then, and older files are intact.
+        After any of these no picture is written, and older files are intact.
     """
     settings = settings or RenderSettings()
     progress = progress or ignore_progress
@@ -77,7 +77,7 @@ def make_pictures(
         raise UsageError("a turntable needs both: where it goes, and how it turns")
     watch = Laps()
     check_kept(check_pictures(files, settings), source, *settings.files_read)
-    allow_open_files(3 * len(settings.views_used) + 2)  # picture, depths and values of each view, turntable, report
+    allow_open_files(3 * len(settings.views_used) + 2)  # 3 for each view, turntable and report
     function = read_function(settings.transfer_function)
     curve = read_curve(settings.curve)
 
@@ -92,7 +92,7 @@ def make_pictures(
     watch.lap("mask")
 
     studio = Studio(volume, device, settings, function=function, curve=curve, labels=labels, progress=progress)
-    with studio, ExitStack() as staged:  # all files are on the disk before any replaces an older one
+    with studio, ExitStack() as staged:  # all files are on the disk before any of them replaces an older one
         pictures, written = _take_views(studio, settings, files, staged, watch, progress)
         turntable, moving = _turn(studio, volume, settings, files, staged, watch, progress)
         written += moving
@@ -106,7 +106,7 @@ def make_pictures(
 
 
 def _prepare(device: Device, settings: RenderSettings) -> None:
-    """Build the kernels for int16, by a small picture of nothing."""
+    """Build the kernels for int16 by taking a small picture of an empty volume."""
     import numpy as np
 
     from clrecon.geometry import Volume
@@ -126,7 +126,7 @@ def _take_views(
     watch: Laps,
     progress: Progress,
 ) -> tuple[list[dict[str, Any]], list[Staged]]:
-    """Take the picture of each view and write it under a temporary name; returns what the report says of them."""
+    """Take the picture of each view and write it under a temporary name; returns the report's entries of them."""
     pictures: list[dict[str, Any]] = []
     written: list[Staged] = []
     if files.picture is None:
@@ -155,7 +155,7 @@ def _turn(
     watch: Laps,
     progress: Progress,
 ) -> tuple[dict[str, Any] | None, list[Staged]]:
-    """Write the turntable, frame by frame and under a temporary name; returns what the report says of it."""
+    """Write the turntable frame by frame under a temporary name; returns the report's entry of it."""
     turn = settings.turntable
     if files.turntable is None or turn is None:
         return None, []
@@ -179,7 +179,7 @@ def _turn(
         stage_animation(frames(), files.turntable, turn.fps, total=turn.frames, progress=progress)
     )
     seconds = watch.lap("turntable")
-    studio.warnings += (empty or [])[:1]  # one frame with something in it is enough
+    studio.warnings += (empty or [])[:1]  # one frame that is not empty is enough
     described = {
         "frames": turn.frames,
         "fps": turn.fps,

@@ -1,4 +1,4 @@
-"""What the report of a picture job says: of the whole job, and of each picture."""
+"""The report of the render job: entries of the whole job, and of each picture."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ FACE_WARNING = "a picture of the skin can show a face: treat the file as one tha
 
 
 def describe_camera(camera: Camera | None) -> dict[str, Any] | None:
-    """A camera as `Camera` takes it, LPS mm; None where the picture is no projection."""
+    """Describe a camera by the arguments of `Camera`, LPS mm; None for a picture without a camera."""
     if camera is None:
         return None
     return {
@@ -48,7 +48,7 @@ def describe_camera(camera: Camera | None) -> dict[str, Any] | None:
 
 
 def describe_picture(picture: Rendering, name: str, view: str) -> dict[str, Any]:
-    """One object of ``pictures``, all but the files; ranges are None where there is nothing to be measured."""
+    """Make one entry of ``pictures``, without the files; ranges are None for a picture without values or hits."""
     import numpy as np
 
     made = picture.report
@@ -77,7 +77,7 @@ def describe_picture(picture: Rendering, name: str, view: str) -> dict[str, Any]
 
 
 def find_emptiness(picture: Rendering) -> str | None:
-    """Say why there is nothing to be seen in a picture; None where there is something."""
+    """Say why a picture is empty; None if it is not."""
     import numpy as np
 
     values = None if picture.values is None else picture.values[np.isfinite(picture.values)]
@@ -100,11 +100,11 @@ def find_emptiness(picture: Rendering) -> str | None:
 
 
 def warn_of_picture(picture: Rendering) -> list[str]:
-    """What is to be known of a picture before it is used."""
+    """Return warnings about a picture."""
     made = picture.report
     warnings = [str(text) for text in made.get("warnings", [])]
     empty = find_emptiness(picture)
-    if empty is not None and not warnings:  # slices that are seen edge-on say so themselves
+    if empty is not None and not warnings:  # slices seen edge-on have a warning of their own
         warnings.append(empty)
     found = (made.get("curve") or {}).get("found")
     if found is not None:
@@ -114,23 +114,23 @@ def warn_of_picture(picture: Rendering) -> list[str]:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class PictureReport(RunReport):
-    """What a picture job has made, beside what every `RunReport` says; the entries are explained in docs/contract.md.
+    """Report of a render job, in addition to the entries of every `RunReport`.  See docs/contract.md.
 
     Attributes
     ----------
     mode : str
     preset : str or None
     transfer_function, lighting : mapping or None
-        As they were used.
+        As they were used for the pictures.
     iso_value_hu, color, depth_cue
-        Of a surface, else None.
+        Settings of a surface; None in other modes.
     shadows, jitter : bool
     background : str or None
     clip_planes_lps_mm : nested list (n, 4)
     thickness_mm, combine, offset_mm
-        Of slices and reformations, else None.
+        Settings of slices and reformations; None in other modes.
     labels : list of mapping or None
-        Those that look different.
+        The labels with a look of their own.
     pictures : list of mapping
         See `describe_picture`, with the files.
     turntable : mapping or None
@@ -181,10 +181,10 @@ def describe_pictures(
     volume : Volume
     settings : RenderSettings
     studio : Studio
-        With the transfer function and the light that were used, and the warnings of its pictures.
+        The studio of the pictures: it knows their transfer function, light and warnings.
     device : Device
     pictures : sequence of dict
-        What `describe_picture` says of each, and its files.
+        The entry of each picture from `describe_picture`, with its files.
     turntable : dict, optional
     seconds : mapping
     """
@@ -238,7 +238,7 @@ def _describe_function(function: TransferFunction | None) -> dict[str, Any] | No
 
 
 def _describe_labels(look: LabelLook | None, labels: LabelMap | None) -> list[dict[str, Any]] | None:
-    """The labels that look different, called as files are: the map's own names can be anything."""
+    """Describe the labels with a look of their own, by names that files can have: the map's own can be anything."""
     if look is None or labels is None:
         return None
     from clrecon.labels import file_suffixes
@@ -255,7 +255,7 @@ def _describe_labels(look: LabelLook | None, labels: LabelMap | None) -> list[di
 
 
 def _shows_skin(style: Style) -> bool:
-    """True where something between air and fat is not transparent: the picture shows the outside of the body."""
+    """True if HU between air and fat are visible: the picture then shows the outside of the body."""
     import numpy as np
 
     if isinstance(style, SurfaceLook):

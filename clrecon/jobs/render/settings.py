@@ -38,27 +38,27 @@ __all__ = [
 
 DEFAULT_SIZE = (1024, 1024)
 DEFAULT_VIEWS = {"slice": "axial", "cpr": "left"}
-"""Of the modes that do not look at the patient from the front."""
+"""Default view of the modes whose default is not the view from the front."""
 SPINES = (SPINE, "auto")
-"""As a curve: the spinal canal, found in the scan."""
+"""Values of a curve that stand for the spinal canal, which is found in the scan."""
 VIEWS = tuple(DIRECTIONS)
 LIGHTS = ("head", "none")
 
 _CALLED = {"light": "lighting", "labels": "labels", "clip_box": "clip", "clip_planes": "clip"}
-"""Settings that make a field of the style: what they are called, and the field."""
+"""Settings that make a field of the style under another name: the name of the setting, and that of the field."""
 
 
 @dataclass(frozen=True)
 class Turntable:
-    """How a moving picture turns.
+    """Settings of a turntable, a moving picture of a turning volume.
 
     Parameters
     ----------
     frames : int
     fps : float
-        Frames a second.
+        Frames per second.
     degrees : float
-        From the first frame to the last, towards the patient's left.
+        Angle from the first frame to the last, towards the patient's left.
     """
 
     frames: int = 100
@@ -68,16 +68,16 @@ class Turntable:
 
 @dataclass(frozen=True)
 class LabelLook:
-    """Which labels look different.
+    """A label map and the look of its labels.
 
     Parameters
     ----------
     path : path
         NIfTI, NRRD, MetaImage or DICOM SEG.
     colors : mapping of str to str
-        Number or name of a label to a colour, see `clrecon.rendering.looks.colors.find_color`.
+        Colour by number or name of the label, see `clrecon.rendering.looks.colors.find_color`.
     opacities : mapping of str to float
-        The same to a factor on its opacity.
+        Factor on the opacity, by number or name of the label.
     """
 
     path: str
@@ -94,31 +94,32 @@ class LabelLook:
 
 @dataclass(frozen=True)
 class RenderSettings(InputSettings):
-    """How pictures are made from a CT series.
+    """Settings of the render job, which makes pictures from a CT series.
 
     Parameters
     ----------
     style : Style
-        What the pictures show, all but what the files below say: see `style_with`.
+        What the pictures show.  The files below add to it, see `style_with`.
     preset : str, optional
         The preset that the style was made from.
     transfer_function : str, optional
         ``FILE`` or ``FILE:NAME``, see `clrecon.rendering.looks.transfer_files.load_transfer_function`.
     curve : str, optional
-        File with the centre line; "spine" (or "auto"), as None, leaves it to the style.
+        File with the centre line; "spine" (or "auto") and None mean the curve of the style.
     labels : LabelLook, optional
     light : "head", "none", side of the patient or (x, y, z), optional
-        Where the light comes from: the camera, nowhere (colours as they are), or a direction in LPS from the patient.
-        Default: as the style and its transfer function have it.
+        Origin of the light: the camera, nowhere (no shading), or a direction in LPS as seen from the patient.  Default:
+        that of the style and its transfer function.
     views : sequence of str
-        One picture each, see `clrecon.rendering.views.camera.Camera.fit`; slices know axial, coronal and sagittal too.
+        One picture is taken per view, see `clrecon.rendering.views.camera.Camera.fit`.  Slices also know axial, coronal
+        and sagittal.
     up, zoom, size, view_angle
-        As in `Camera.fit`; without a size 1024 x 1024, and what the curve needs for a curved reformation.
+        As in `Camera.fit`.  The default size is 1024 x 1024; for a curved reformation it depends on the curve.
     background : str
         Colour, or "transparent".
     letters, scale_bar : bool
     caption : str, optional
-        Drawn into the pictures.
+        Text that is drawn into the pictures.
     turntable : Turntable, optional
     **shared
         See `clrecon.jobs.shared.settings.InputSettings`.
@@ -126,7 +127,7 @@ class RenderSettings(InputSettings):
     Raises
     ------
     UsageError
-        A value is impossible, means nothing in the mode, or two exclude each other.
+        A value is impossible or has no meaning in the mode, or two values exclude each other.
     """
 
     style: Style = VolumeLook()
@@ -156,25 +157,25 @@ class RenderSettings(InputSettings):
         clip_planes: Sequence[Sequence[float]] = (),
         **given: Any,
     ) -> RenderSettings:
-        """Settings by the words of `clrecon.rendering.pictures.modes.make_style`.
+        """Make settings from the keywords of `clrecon.rendering.pictures.modes.make_style`.
 
         Parameters
         ----------
         mode, preset : str, optional
         clip_box : (x0, x1, y0, y1, z0, z1), optional
-            What is kept, LPS mm; infinite numbers leave a side open.
+            Box that is kept, LPS mm; infinite numbers leave a side open.
         clip_planes : sequence of (px, py, pz, nx, ny, nz)
-            Point and normal each; the side of the normal is kept.
+            Planes by point and normal; the side to which the normal points is kept.
         **given
-            Fields of these settings, and of the mode's style.
+            Fields of `RenderSettings`, and of the mode's style.
 
         Raises
         ------
         UsageError
-            As `RenderSettings` and `make_style`.
+            `RenderSettings` or `make_style` refuses a value.
         """
         own = {name: given.pop(name) for name in [*given] if name in {each.name for each in fields(cls)}}
-        curve = None if own.get("curve") is None else SPINE  # files are read later: something stands in for them
+        curve = None if own.get("curve") is None else SPINE  # files are read later: placeholders until then
         function = None if own.get("transfer_function") is None else find_preset(DEFAULT_PRESET).transfer_function
         mode = choose_mode(mode, preset, curve=curve, **given)
         said = own | {"clip_box": clip_box, "clip_planes": tuple(clip_planes) or None}
@@ -192,7 +193,7 @@ class RenderSettings(InputSettings):
 
     @classmethod
     def keywords(cls) -> set[str]:
-        """The names that `of` takes; what labels look like is part of `labels`."""
+        """The keywords that `of` accepts; the looks of labels are part of `labels`."""
         look = {keyword for mode in MODES for keyword in keywords_of(mode)} - {"label_colors", "label_opacity"}
         return {own.name for own in fields(cls)} | look | {"preset", "clip_box", "clip_planes"}
 
@@ -208,7 +209,7 @@ class RenderSettings(InputSettings):
         super().__post_init__()
 
     def _check_place(self) -> None:
-        """Views, sizes and angles: by placing cameras before a volume of one voxel."""
+        """Check views, sizes and angles by placing cameras before a volume of one voxel."""
         checked_size(self.size_used)
         if (self.letters or self.scale_bar or self.caption) and min(self.size_used) < SMALLEST_SIDE:
             raise UsageError(
@@ -234,7 +235,7 @@ class RenderSettings(InputSettings):
 
     @property
     def preset_used(self) -> str | None:
-        """Name of the preset, None where the mode or a transfer function does without."""
+        """Name of the preset; None if the mode or a transfer function needs none."""
         if self.preset is not None or self.transfer_function is not None or not isinstance(self.style, VolumeLook):
             return self.preset
         named = self.style.transfer_function
@@ -246,12 +247,12 @@ class RenderSettings(InputSettings):
         curve: Float64Array | None = None,
         labels: LabelMap | None = None,
     ) -> Style:
-        """The style with what the files say, None where there is none, and with the light.
+        """Return the style with the light and the contents of the files; None stands for a file that was not given.
 
         Raises
         ------
         UsageError
-            As the style.
+            The style refuses a value.
         """
         style = self.style
         if function is not None and isinstance(style, VolumeLook | SlicesInSpace):
@@ -262,36 +263,36 @@ class RenderSettings(InputSettings):
         if curve is not None and isinstance(style, CurveCut):
             style = replace(style, curve=curve)
         if labels is not None and self.labels is not None and isinstance(style, VolumeLook | SurfaceLook):
-            plain = not (self.labels.colors or self.labels.opacities)  # then every label has a colour of its own
+            plain = not (self.labels.colors or self.labels.opacities)  # every label then has its own colour
             colors = None if plain else dict(self.labels.colors)
             style = replace(style, labels=labels, label_colors=colors, label_opacity=dict(self.labels.opacities))
         return style
 
     @property
     def views_used(self) -> tuple[str, ...]:
-        """The views that pictures are taken from."""
+        """The views of the pictures, defaults included."""
         return tuple(self.views) or (DEFAULT_VIEWS.get(self.mode, "anterior"),)
 
     @property
     def size_used(self) -> tuple[int, int]:
-        """Width and height in pixels; of a curved reformation without `size` they depend on the curve."""
+        """Width and height in pixels; for a curved reformation without `size` they depend on the curve."""
         return DEFAULT_SIZE if self.size is None else self.size
 
     @property
     def files_read(self) -> tuple[str, ...]:
-        """Files that say how, beside the scan."""
+        """Files that the job reads in addition to the scan."""
         function = self.transfer_function or ""
         curve = "" if self.curve in (None, *SPINES) else self.curve
         look = "" if self.labels is None else self.labels.path
         return tuple(path for path in (function, function.rpartition(":")[0], curve, look) if path)
 
     def camera(self, volume: Grid, view: str, turning: bool = False) -> Camera:
-        """The camera of one of the views; with `turning` the volume stays whole when the camera orbits.
+        """Place the camera of one view; with `turning` the whole volume stays in the picture while the camera orbits.
 
         Raises
         ------
         UsageError
-            As `Camera.fit`.
+            `Camera.fit` refuses a value.
         """
         if isinstance(self.style, PlaneCut):
             return find_plane(volume, view, self.size_used, zoom=self.zoom, up=self.up)  # type: ignore[arg-type]
@@ -304,12 +305,12 @@ _DEFAULTS = {own.name: own.default for own in fields(RenderSettings)}
 
 
 def _turn_light(light: str | Sequence[float], lighting: Lighting) -> Lighting:
-    """A lighting that comes from where a light is said to be.
+    """Return a lighting with its light at the given place.
 
     Raises
     ------
     UsageError
-        Neither one of `LIGHTS`, a side of the patient nor three numbers.
+        The place is not one of `LIGHTS`, nor a side of the patient, nor three numbers.
     """
     if light == "none":
         return UNSHADED
@@ -323,7 +324,7 @@ def _turn_light(light: str | Sequence[float], lighting: Lighting) -> Lighting:
 
 
 def _find_clip(box: Sequence[float] | None, planes: Sequence[Sequence[float]]) -> Clip | None:
-    """The part of space that a box and planes leave, None for all of it."""
+    """Return the part of space that a box and planes leave, None for all of it."""
     clip = Clip()
     if box is not None:
         if len(box) != 6:
@@ -337,10 +338,10 @@ def _find_clip(box: Sequence[float] | None, planes: Sequence[Sequence[float]]) -
 
 
 def describe_modes() -> dict[str, str]:
-    """Names of the modes of pictures, and what each shows."""
+    """Return the names of the modes, each with a description."""
     return {name: mode.description for name, mode in MODES.items()}
 
 
 def describe_presets() -> dict[str, str]:
-    """Names of the presets of pictures, and what each shows."""
+    """Return the names of the presets, each with a description."""
     return {preset.name: preset.description for preset in PRESETS.values()}

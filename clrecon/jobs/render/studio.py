@@ -1,4 +1,4 @@
-"""`Studio`: a volume on its device, and one way to take each kind of picture of it."""
+"""`Studio`: a volume on a device, of which it takes all kinds of pictures."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ __all__ = ["Studio", "read_curve", "read_function", "read_look"]
 
 
 def read_function(named: str | None) -> TransferFunction | None:
-    """Read the transfer function ``FILE`` or ``FILE:NAME``, None where there is none.
+    """Read the transfer function ``FILE`` or ``FILE:NAME``; None if no file is given.
 
     Raises
     ------
     UsageError, RefusedInputError
-        As `clrecon.rendering.looks.transfer_files.load_transfer_function`.
+        See `clrecon.rendering.looks.transfer_files.load_transfer_function`.
     """
     if named is None:
         return None
@@ -42,12 +42,12 @@ def read_function(named: str | None) -> TransferFunction | None:
 
 
 def read_curve(named: str | None) -> Float64Array | None:
-    """Read the points (n, 3) in LPS mm of a centre line, None where there is none or the scan has to give it.
+    """Read the points (n, 3) in LPS mm of a centre line; None if no file is given or the spinal canal is meant.
 
     Raises
     ------
     UsageError, RefusedInputError
-        As `clrecon.rendering.views.centre_line_files.read_curve_points`.
+        See `clrecon.rendering.views.centre_line_files.read_curve_points`.
     """
     if named is None or named in SPINES:
         return None
@@ -57,12 +57,12 @@ def read_curve(named: str | None) -> Float64Array | None:
 
 
 def read_look(look: LabelLook | None) -> LabelMap | None:
-    """Read the label map, None where there is none.
+    """Read the label map; None if no file is given.
 
     Raises
     ------
     UsageError, RefusedInputError
-        As `clrecon.labels.read_labels`; a label that it does not have is refused too.
+        See `clrecon.labels.read_labels`; a label that the map lacks is refused too.
     """
     if look is None:
         return None
@@ -75,7 +75,7 @@ def read_look(look: LabelLook | None) -> LabelMap | None:
 
 
 class Studio:
-    """Takes the pictures that settings ask for; a context manager that frees the device.
+    """Taker of the pictures that settings ask for; a context manager that frees the memory of the device.
 
     Parameters
     ----------
@@ -83,9 +83,9 @@ class Studio:
     device : Device
     settings : RenderSettings
     function : TransferFunction, optional
-        From a file; None leaves it to the preset.
+        Transfer function from a file; None means that of the preset.
     curve : ndarray, shape (n, 3), optional
-        LPS mm; of curved reformations, None is the spinal canal.
+        Centre line of curved reformations in LPS mm; None means that of the style.
     labels : LabelMap, optional
     progress : callable
     """
@@ -119,11 +119,11 @@ class Studio:
 
     @property
     def lighting(self) -> Lighting | None:
-        """The light that shaded pictures have, None in modes without."""
+        """The light of shaded pictures, None in modes without shading."""
         return self.style.light if isinstance(self.style, VolumeLook | SurfaceLook) else None
 
     def take_view(self, view: str) -> Rendering:
-        """The picture of one of the views, with what is drawn into it."""
+        """Take the picture of one view, with its annotations."""
         settings = self._settings
         if not isinstance(self.style, CurveCut):
             return self.take(settings.camera(self._volume, view))
@@ -132,7 +132,7 @@ class Studio:
         return self._render(view=view, up=settings.up, size=settings.size)
 
     def take(self, camera: Camera) -> Rendering:
-        """The picture of a camera."""
+        """Take the picture of a camera."""
         return self._render(camera=camera, size=self._settings.size_used)
 
     def _render(self, **place: Any) -> Rendering:
@@ -148,7 +148,7 @@ class Studio:
 
 
 def _shown_function(settings: RenderSettings, style: Style) -> TransferFunction | None:
-    """The transfer function of a style, or of the preset that it was made from."""
+    """Return the transfer function of a style, or that of the preset that the style was made from."""
     if settings.preset_used is not None:
         return find_preset(settings.preset_used).transfer_function
     if isinstance(style, VolumeLook):
