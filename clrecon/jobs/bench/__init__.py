@@ -1,1 +1,1 @@
-"""What the stages of a mesh cost, beside a peer."""
+"""The bench job: times of the stages from scan to mesh, beside those of a peer."""

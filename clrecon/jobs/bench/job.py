@@ -1,4 +1,4 @@
-"""How fast clrecon is on this computer and this scan, stage by stage, beside VTK's flying edges."""
+"""The bench job: the speed of clrecon on this computer and this scan, stage by stage, beside VTK's flying edges."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ DEFAULT_RUNS = 7
 MOST_RUNS = 1000
 PHANTOM_SIZE, PHANTOM_SLICES, PHANTOM_SPACING = (512, 512), 149, (0.7, 0.7, 1.0)
 BUSY_SHARE = 0.5
-"""Share of the cores that must be free; below it the times are not those of this computer."""
+"""Smallest share of free cores without a warning: with fewer, other programs distort the times."""
 
 
 def run_bench(
@@ -43,25 +43,25 @@ def run_bench(
     report_path: str | Path | None = None,
     progress: Progress | None = None,
 ) -> dict[str, Any]:
-    """Time the stages from a CT series to its surface on one device or on all of them.
+    """Time the stages from a CT series to its surface on one device or on all devices.
 
-    The surface is open at the border of the volume, as flying edges makes it, and both work on the same voxels at
-    the same level, in turn.
+    The surface is open at the border of the volume, like that of flying edges.  Both programs work in turn, on the same
+    voxels at the same level.
 
     Parameters
     ----------
     source : path, optional
         DICOM folder or file; None makes a phantom of the spine, 512 x 512 x 149 voxels.
     iso_value : float, optional
-        HU; default: that of the preset "bone", and the suggested one for the phantom.
+        HU; default: that of the preset "bone", for the phantom its suggested value.
     device : str, optional
-        As in `choose_device`; "all" is every device that can be used, one after the other, without simulators.
+        As in `choose_device`; "all" means every usable device except simulators, one after the other.
     runs : int
         Timed pairs of clrecon and flying edges, 1 to 1000.
     series : str, optional
-        Which series of `source`.
+        The series of `source` to read.
     report_path : path, optional
-        Where the result goes as JSON.
+        JSON file for the result.
     progress : callable, optional
         ``progress(stage, done, total)``.
 
@@ -74,7 +74,7 @@ def run_bench(
     Raises
     ------
     UsageError, OutputError, DeviceError, NoDicomError, RefusedInputError, NoSurfaceError
-        Wrong arguments, a report that cannot be written, no device, or none that works, an input without a surface.
+        The arguments are wrong, the report cannot be written, no device works, or the input has no surface.
     """
     progress = progress or ignore_progress
     _check_arguments(source, iso_value, runs, series)
@@ -126,11 +126,11 @@ def _choose_devices(name: str | None) -> list[Device]:
     if (name or "").strip().lower() != ALL_DEVICES:
         return [choose_device(name)]
     usable = [device for device in list_devices() if not device.is_simulator and not device.shortcoming]
-    return usable or [choose_device(None)]  # which says why there is none
+    return usable or [choose_device(None)]  # its error says why there is no device
 
 
 def _get_volume(source: str | Path | None, series: str | None, progress: Progress) -> tuple[Volume, float]:
-    """The volume, and the iso value that suits it."""
+    """Read or make the volume; also return its iso value."""
     if source is not None:
         from clrecon.reading import read_volume
 
@@ -156,12 +156,12 @@ def _describe_input(volume: Volume, is_phantom: bool) -> dict[str, Any]:
 def _measure_devices(
     devices: Sequence[Device], volume: Volume, hu: float, runs: int, progress: Progress
 ) -> list[dict[str, Any]]:
-    """One entry a device; a device that fails is an entry with its error, unless it is the only one.
+    """Return one entry per device; the entry of a device that fails has its error.
 
     Raises
     ------
     DeviceError
-        Every device failed.
+        All devices failed.
     """
     measured, first_error = [], None
     for number, device in enumerate(devices):
@@ -180,7 +180,7 @@ def _measure_devices(
 
 
 class _OwnRuns:
-    """Surfaces on one device, and what they say of themselves."""
+    """Runs of clrecon on one device, with the reports of their surfaces."""
 
     def __init__(self, device: Device, volume: Volume, hu: float):
         from clrecon.operators.surface.extract import extract_isosurface
@@ -190,7 +190,7 @@ class _OwnRuns:
         self.counts = (0, 0)
 
     def run(self) -> float:
-        """Wall seconds of one surface; the mesh is freed before this returns."""
+        """Extract one surface and return its wall seconds; the mesh is freed before the return."""
         start = perf_counter()
         mesh: Mesh = self._extract()
         seconds = perf_counter() - start
@@ -199,7 +199,7 @@ class _OwnRuns:
         return seconds
 
     def medians(self, name: str) -> dict[str, float]:
-        """Median by part of the warm runs."""
+        """Median seconds of each part over the warm runs."""
         warm = [report[name] for report in self.reports[1:]]
         return {part: spread([parts[part] for parts in warm])["median"] for part in warm[0]} if warm else {}
 
@@ -232,7 +232,7 @@ def _measure_device(device: Device, volume: Volume, hu: float, runs: int) -> dic
 
 
 def _time_warm(own: _OwnRuns, volume: Volume, level: float, runs: int) -> tuple[dict[str, Any], dict[str, Any] | None]:
-    """Spread of the warm runs and what flying edges took in turn; None where VTK is not installed."""
+    """Spreads of the warm runs and of flying edges, run in turn; the second is None if VTK is not installed."""
     from clrecon.jobs.bench.peer import FlyingEdges
 
     try:
@@ -262,19 +262,19 @@ def _time_warm(own: _OwnRuns, volume: Volume, level: float, runs: int) -> tuple[
 
 
 def _time_resident(device: Device, volume: Volume, hu: float, runs: int) -> dict[str, float] | None:
-    """Spread of surfaces at iso values that are new to a volume on the device; None where there is only one."""
+    """Spread of seconds at iso values that are new to a volume on the device; None if no other value has a surface."""
     from clrecon.operators.surface.extract import SurfaceExtractor
 
     seconds = []
     with SurfaceExtractor(volume, device=device) as extractor:
         extractor.extract(hu, closed=False)
         for number in range(runs):
-            # Whole HU up and down in turn, so that no value comes twice and all stay close to the one asked for.
+            # Steps of whole HU, up and down in turn: no value comes twice, and all stay close to `hu`.
             step = (number // 2 + 1) * (1 if number % 2 == 0 else -1)
             start = perf_counter()
             try:
                 extractor.extract(hu + step, closed=False)
-            except NoSurfaceError:  # at the end of what the scan holds
+            except NoSurfaceError:  # beyond the values of the scan
                 continue
             seconds.append(perf_counter() - start)
     return spread(seconds) if seconds else None

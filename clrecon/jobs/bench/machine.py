@@ -1,4 +1,4 @@
-"""What a reader of measured times must know of the computer, and nothing that names it."""
+"""Facts about the computer for readers of measured times, without anything that identifies it."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ _CPUINFO = Path("/proc/cpuinfo")
 
 
 def usable_cores() -> int:
-    """Cores that this process may use, which can be fewer than the computer has."""
+    """Number of cores that this process may use; the computer can have more."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
 
 
 def processor_name(cpuinfo: Path = _CPUINFO) -> str:
-    """The processor's model; where the system does not say it, its architecture."""
+    """Model of the processor, or its architecture if the system does not tell the model."""
     try:
         lines = cpuinfo.read_text(encoding="utf-8", errors="replace").splitlines()
     except OSError:  # not Linux
@@ -32,10 +32,10 @@ def processor_name(cpuinfo: Path = _CPUINFO) -> str:
 
 
 def free_cores(seconds: float = 0.2) -> float:
-    """How many cores are really free now: the work that threads do together, by what one does alone.
+    """Number of cores that are free now: the work of all threads together, divided by the work of one thread alone.
 
-    The threads make checksums of memory that fits the cache, so that bandwidth does not count.  Of cores that share
-    their units (hyperthreads) a quiet computer has about 0.6 each.
+    The threads compute checksums of memory that fits the cache, so that memory bandwidth has no influence.  On a quiet
+    computer a core that shares its units with another (hyperthreads) counts as about 0.6.
     """
     block = bytes(1 << 20)
 

@@ -1,4 +1,4 @@
-"""Time two programs beside each other: in turn, pair by pair, so that a machine's moods meet both."""
+"""Timing of two programs in turn, pair by pair, so that changes of the machine's speed affect both."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from typing import Any
 __all__ = ["FEWEST_PAIRS", "alternate", "spread", "summarise"]
 
 FEWEST_PAIRS = 3
-"""Pairs that are run whatever the time limit says: below it there is no spread."""
+"""Pairs that are run in spite of the time limit: fewer give no spread."""
 
 
 def spread(values: Sequence[float]) -> dict[str, float]:
-    """Median, quartiles, smallest and largest of at least one value.
+    """Median, quartiles, minimum and maximum of at least one value.
 
     Returns
     -------
@@ -37,25 +37,25 @@ def alternate(
     limit_s: float | None = None,
     clock: Callable[[], float] = perf_counter,
 ) -> tuple[list[float], list[float]]:
-    """Run two programs in turn; who is first changes with every pair, so that neither profits from its place.
+    """Run two programs in turn; their order changes with every pair, so that neither profits from its place.
 
     Parameters
     ----------
     candidate, peer : callable
-        Run once and return the seconds that count.
+        Functions that run once and return the seconds to compare.
     pairs : int
-        Timed runs of each.
+        Number of timed runs of each.
     warm : bool
-        Run each once beforehand, untimed.
+        Run each once before, untimed.
     limit_s : float, optional
-        Start no further pair when so much time is gone, the warm-up included; `FEWEST_PAIRS` are always run.
+        Start no further pair after so many seconds, warm-up included; `FEWEST_PAIRS` are always run.
     clock : callable
-        What the limit is measured with, seconds.
+        Clock for the limit, in seconds.
 
     Returns
     -------
     candidate_s, peer_s : list of float
-        Equally long.
+        Both of the same length.
     """
     start = clock()
     if warm:
@@ -75,12 +75,12 @@ def alternate(
 
 
 def summarise(ours: Sequence[float], theirs: Sequence[float]) -> dict[str, Any]:
-    """Spreads of both sides and of the ratios pair by pair (over 1: clrecon is faster).
+    """Spreads of both sides and of the ratio of each pair (above 1: clrecon is faster).
 
     Returns
     -------
     dict
-        ``pairs`` (int), ``clrecon_s``, ``peer_s`` and ``ratio``, each as `spread` has it.
+        ``pairs`` (int); ``clrecon_s``, ``peer_s`` and ``ratio``, each from `spread`.
     """
     ratios = [theirs_s / ours_s for ours_s, theirs_s in zip(ours, theirs, strict=True)]
     return {"pairs": len(ratios), "clrecon_s": spread(ours), "peer_s": spread(theirs), "ratio": spread(ratios)}

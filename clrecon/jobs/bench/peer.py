@@ -1,4 +1,4 @@
-"""The peer that surfaces are timed against: VTK's flying edges, set up as fast as it goes.
+"""The peer of surfaces: VTK's flying edges, with its fastest settings.
 
 References
 ----------
@@ -17,7 +17,7 @@ __all__ = ["FlyingEdges", "PeerRun"]
 
 
 class PeerRun(NamedTuple):
-    """One run: wall seconds of ``Update()``, and what came out."""
+    """One run: wall seconds of ``Update()``, and its output."""
 
     seconds: float
     vertices: int
@@ -25,11 +25,11 @@ class PeerRun(NamedTuple):
 
 
 class FlyingEdges:
-    """vtkFlyingEdges3D on the voxels of a volume, which it shares without a copy.
+    """vtkFlyingEdges3D on the voxels of a volume, shared without a copy.
 
-    Normals are on, scalars and gradients off, as in clrecon's surfaces.  VTK's wheels run sequentially unless told
-    otherwise.  Spacing and origin of the grid are set; its axes stay those of the patient, because VTK moves an
-    oblique surface in a second pass and clrecon does so on the way.
+    Normals are on, scalars and gradients off, as in clrecon's surfaces.  VTK's wheels run sequentially by
+    default.  Spacing and origin of the grid are set, its direction is not: VTK would turn an oblique surface in a
+    second pass, while clrecon does so in the same pass.
 
     Parameters
     ----------
@@ -62,9 +62,9 @@ class FlyingEdges:
         return str(vtkVersion.GetVTKVersion())
 
     def run(self, level: float, keep: list[Any] | None = None) -> PeerRun:
-        """Contour at `level` (HU, where the surface lies between two voxels) with a filter of its own.
+        """Contour at `level`, the HU of the surface between voxels, with a new filter.
 
-        The output is freed before this returns, unless there is a list to `keep` it.
+        The output is freed before the return, unless a list is given to `keep` it.
         """
         contour = self._make_filter(level)
         start = perf_counter()
