@@ -1,4 +1,4 @@
-"""``clrecon bench``: how fast it is here, stage by stage."""
+"""``clrecon bench``: the speed of clrecon on this computer, stage by stage."""
 
 from __future__ import annotations
 

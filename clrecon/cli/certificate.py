@@ -1,4 +1,4 @@
-"""The certificate of a series in words, for ``clrecon info``."""
+"""Description of a certificate in words, for ``clrecon info``."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ _LYING = {"S": "supine", "P": "prone", "DR": "on the right side", "DL": "on the 
 _RUNS_SHOWN = 6
 _OBLIQUE_DEG = 0.05
 _SAME = 0.01
-"""Lengths that differ by less than this share of a gap are one to the reader."""
+"""Lengths are shown as equal if they differ by less than this share of a gap."""
 _FINEST_MM = 0.001
 
 
 def describe_certificate(certificate: dict[str, Any] | None) -> list[tuple[str, str]]:
-    """Words for what is known of a series: (what, text) pairs, the gates last; none without a certificate."""
+    """Describe a series by its certificate: (subject, text) pairs, the gates last; no pairs without a certificate."""
     if certificate is None:
         return []
     return [*_describe_places(certificate), *_describe_values(certificate), *_describe_gates(certificate["gates"])]

@@ -1,4 +1,4 @@
-"""What every command shares: its options, how numbers are shown, and how it ends."""
+"""Shared parts of all commands: options, formats of numbers, and exit codes."""
 
 from __future__ import annotations
 
@@ -37,17 +37,17 @@ exit codes: 0 done; 1 unexpected error; 2 no usable DICOM or no surface; 3 wrong
 
 
 class Parser(argparse.ArgumentParser):
-    """argparse with errors as `UsageError`: one line, exit code 3."""
+    """An argparse parser whose errors are `UsageError`: one line, exit code 3."""
 
     def __init__(self, **options: object):
         options.setdefault("formatter_class", argparse.RawDescriptionHelpFormatter)
         super().__init__(allow_abbrev=False, **options)  # type: ignore[arg-type]
 
     def parse_known_args(self, args: Sequence[str] | None = None, namespace: Any = None) -> Any:  # type: ignore[override]
-        """As argparse does, but ``--seed -12,3,40`` is an option with its value, as ``--hu -12`` is."""
+        """Parse as argparse does, but also accept lists that begin with a minus, as in ``--seed -12,3,40``."""
         given = sys.argv[1:] if args is None else args
         options, unknown = super().parse_known_args(_join_negative_lists(given), namespace)
-        if unknown:  # said here, the hint names the command
+        if unknown:  # reported here, so that the hint names the command
             self.error(f"unrecognized arguments: {' '.join(unknown)}")
         return options, unknown
 
@@ -56,7 +56,7 @@ class Parser(argparse.ArgumentParser):
 
 
 def _join_negative_lists(arguments: Sequence[str]) -> list[str]:
-    """Write ``--option -1,2`` as ``--option=-1,2``: to argparse a list that begins with a minus is another option."""
+    """Write ``--option -1,2`` as ``--option=-1,2``: argparse takes a list that begins with a minus for an option."""
     joined: list[str] = []
     for place, argument in enumerate(arguments):
         if argument == "--":
@@ -80,7 +80,7 @@ def add_common(parser: argparse.ArgumentParser) -> None:
 
 
 def pick(options: argparse.Namespace, names: Collection[str]) -> dict[str, Any]:
-    """Options by the names of the settings that they are."""
+    """Pick the options with the given names, which are those of settings."""
     return {name: value for name, value in vars(options).items() if name in names}
 
 
@@ -114,7 +114,7 @@ def parse_size(text: str) -> int:
     Raises
     ------
     argparse.ArgumentTypeError
-        It is none.
+        The text is not an amount of memory.
     """
     match = _SIZE.fullmatch(text.strip())
     if match is None or (match[3] and not match[2]):
@@ -123,7 +123,7 @@ def parse_size(text: str) -> int:
 
 
 def guard(action: Callable[[], int], console: Console, debug: bool) -> int:
-    """Run `action` and turn whatever ends it into an exit code and at most one line on stderr.
+    """Run `action` and turn any error into an exit code and at most one line on stderr.
 
     Parameters
     ----------
@@ -170,12 +170,12 @@ def _report_error(error: BaseException, console: Console, debug: bool) -> int:
 
         console.result(error_as_dict(known))
     except OutputError:
-        pass  # the first error is the one to tell
+        pass  # only the first error is reported
     return known.exit_code
 
 
 def table(rows: Sequence[Sequence[object]], right: Sequence[int] = ()) -> list[str]:
-    """Lay out rows of cells in columns; the columns numbered in `right` are aligned to the right."""
+    """Lay out rows of cells in columns; `right` has the numbers of the columns that are aligned to the right."""
     cells = [[str(cell) for cell in row] for row in rows]
     widths = [max(len(cell) for cell in column) for column in zip(*cells, strict=True)]
     return [
@@ -188,7 +188,7 @@ def table(rows: Sequence[Sequence[object]], right: Sequence[int] = ()) -> list[s
 
 
 def megabytes(size: int) -> str:
-    """Bytes for people: ``12.3 MB`` (1 MB = 10^6 bytes)."""
+    """Format a number of bytes for people: ``12.3 MB`` (1 MB = 10^6 bytes)."""
     for unit, factor in (("GB", 1e9), ("MB", 1e6), ("kB", 1e3)):
         if size >= factor:
             return f"{size / factor:.1f} {unit}"

@@ -1,4 +1,4 @@
-"""What goes to the screen: results on stdout, all else on stderr."""
+"""The output of a command: results on stdout, everything else on stderr."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ _REDRAW_SECONDS = 0.1
 def printable(text: object) -> str:
     """Return `text` on one line, with control and direction characters as escapes.
 
-    Texts from DICOM files and file names can hold terminal sequences.
+    Texts from DICOM files and file names can contain terminal sequences.
     """
     return "".join(
         char if char.isprintable() and ord(char) not in _HIDDEN else char.encode("unicode_escape").decode("ascii")
@@ -50,7 +50,7 @@ def printable(text: object) -> str:
 
 
 class Console:
-    """Writes for one command.
+    """The output streams of one command.
 
     Parameters
     ----------
@@ -59,8 +59,8 @@ class Console:
 
     Notes
     -----
-    stdout: the result.  stderr: errors, warnings, progress; the moving line only where stderr is a terminal.
-    A reader that closes stdout early (``| head``) is no error.
+    stdout: the result.  stderr: errors, warnings, progress; the moving line only if stderr is a terminal.
+    It is not an error if a reader closes stdout early (``| head``).
     """
 
     def __init__(self, as_json: bool = False):
@@ -74,12 +74,12 @@ class Console:
         self._moving = is_terminal(sys.stderr)
 
     def set_loudness(self, quiet: bool, verbose: bool) -> None:
-        """`quiet`: errors only.  `verbose`: one plain line a stage on stderr instead of a moving one."""
+        """Set how much is printed.  `quiet`: errors only.  `verbose`: a plain line per stage, no moving line."""
         self.quiet, self.verbose = quiet, verbose
         self._moving = is_terminal(sys.stderr) and not quiet and not verbose
 
     def say(self, text: str = "") -> None:
-        """Print a line of the human result; nothing with ``--json`` or ``-q``."""
+        """Print a line of the result for people; nothing with ``--json`` or ``-q``."""
         if not self.as_json and not self.quiet:
             self._to_stdout(text)
 
@@ -92,16 +92,16 @@ class Console:
             self._to_stdout(to_json(value))
 
     def warn(self, text: str, with_json: bool = False) -> None:
-        """Print a warning; with ``--json`` only where the object has no place for it (`with_json`)."""
+        """Print a warning; with ``--json`` only if the JSON object has no place for it (`with_json`)."""
         if not self.quiet and (with_json or not self.as_json):
             self._to_stderr(f"clrecon: warning: {printable(text)}")
 
     def error(self, text: str) -> None:
-        """Print the one line that ends a command that failed."""
+        """Print the last line of a command that failed."""
         self._to_stderr(f"clrecon: error: {printable(text)}")
 
     def progress(self, stage: str, done: int = 0, total: int = 0) -> None:
-        """Show what a job is doing, see `clrecon.jobs.progress`."""
+        """Show the progress of a job, see `clrecon.system.progress`."""
         if self.verbose and stage != self._stage:
             elapsed = time.perf_counter() - self._start
             self._to_stderr(f"clrecon: {elapsed:6.2f} s  {_STAGES.get(stage, stage)}")
@@ -119,7 +119,7 @@ class Console:
             self._drawn = 0
 
     def finish(self) -> None:
-        """Remove the moving line and flush stdout, so that no failure is left for the end of the process.
+        """Remove the moving line and flush stdout, so that an error of stdout appears here, not at the end.
 
         Raises
         ------
@@ -166,12 +166,12 @@ def _write(stream: Any, text: str) -> None:
     try:
         stream.write(text)
         stream.flush()
-    except OSError:  # nobody can read it any more, and there is no other place to say so
+    except OSError:  # nobody reads the stream any more, and there is no other place for a message
         pass
 
 
 def _discard_stdout() -> None:
-    """Point file descriptor 1 to nowhere: Python flushes stdout once more when it ends."""
+    """Point file descriptor 1 to the null device: Python flushes stdout once more when it ends."""
     try:
         descriptor = sys.stdout.fileno()
     except (OSError, ValueError):
@@ -182,7 +182,7 @@ def _discard_stdout() -> None:
 
 
 def is_terminal(stream: Any) -> bool:
-    """True where somebody looks at `stream` who sees moving lines and styles."""
+    """True if `stream` is a terminal that can show moving lines and styles."""
     return stream is not None and stream.isatty() and os.environ.get("TERM") != "dumb"
 
 

@@ -1,4 +1,4 @@
-"""``clrecon demo``: what clrecon does, in seconds and without data."""
+"""``clrecon demo``: a demonstration that takes seconds and needs no data."""
 
 from __future__ import annotations
 

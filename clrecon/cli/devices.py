@@ -1,4 +1,4 @@
-"""``clrecon devices``: what OpenCL offers here."""
+"""``clrecon devices``: the OpenCL devices of this computer."""
 
 from __future__ import annotations
 

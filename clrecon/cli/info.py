@@ -1,4 +1,4 @@
-"""``clrecon info``: the series of an input."""
+"""``clrecon info``: the listing of an input, with its series."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The options of ``clrecon mesh`` for label maps, and what it says of their surfaces."""
+"""The options of ``clrecon mesh`` for label maps, and the description of the surfaces of labels."""
 
 from __future__ import annotations
 
@@ -38,12 +38,12 @@ def add_label_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def label_choice(options: argparse.Namespace) -> LabelChoice | None:
-    """What the options above ask for, None where there is no label map.
+    """Make the settings of labels from the options, None without a label map.
 
     Raises
     ------
     UsageError
-        An option that means something with a label map only.
+        An option was given that needs a label map.
     """
     if options.labels is not None:
         from clrecon.jobs.mesh.label_choice import LabelChoice
@@ -63,7 +63,7 @@ def label_choice(options: argparse.Namespace) -> LabelChoice | None:
 
 
 def describe_labels(meshes: list[dict[str, Any]]) -> list[str]:
-    """A line about the surfaces of labels, none where there are none."""
+    """Describe the surfaces of labels in a line; no line without labels."""
     labels = [mesh for mesh in meshes if mesh["label"] is not None]
     if not labels:
         return []
@@ -84,11 +84,11 @@ def describe_labels(meshes: list[dict[str, Any]]) -> list[str]:
 
 
 def _describe_volumes(labels: list[dict[str, Any]]) -> list[str]:
-    """The volumes of the meshes beside those of the voxels of their labels, all together."""
+    """Compare the total volume of the meshes with that of the voxels of their labels."""
     surfaces = {(mesh["label_number"], mesh["iso_value_hu"]): mesh for mesh in labels}.values()
     if any(mesh["label_mesh_ml"] is None for mesh in surfaces):
         return []
-    by_hu = labels[0]["surface"] == "hu"  # its own surface goes on beyond the CT
+    by_hu = labels[0]["surface"] == "hu"  # the surface of such a label continues beyond the CT
     label_ml = sum(mesh["label_ml"] * (mesh["label_inside_share"] if by_hu else 1.0) for mesh in surfaces)
     mesh_ml = sum(mesh["label_mesh_ml"] for mesh in surfaces)
     change = 100.0 * (mesh_ml / label_ml - 1.0)

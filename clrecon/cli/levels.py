@@ -1,4 +1,4 @@
-"""What ``--hu`` may say."""
+"""Values of ``--hu``."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def parse_hu(text: str) -> dict[str, Any]:
     Raises
     ------
     argparse.ArgumentTypeError
-        It is none of them.
+        The text is none of these.
     """
     if text == "auto":
         return {"half_way": "auto"}
@@ -35,7 +35,7 @@ def parse_hu(text: str) -> dict[str, Any]:
 
 
 def _parse_level(part: str, text: str) -> float | tuple[float, float]:
-    """A number, or the two ends of a range A:B."""
+    """Read a number, or the two ends of a range A:B."""
     if ":" not in part:
         return parse_levels(part, text)[0]
     ends = part.split(":")
@@ -49,12 +49,12 @@ def _parse_level(part: str, text: str) -> float | tuple[float, float]:
 
 
 def parse_levels(text: str, whole: str | None = None) -> tuple[float, ...]:
-    """Read one number, or several with commas between them; `whole` is what `text` is a part of.
+    """Read one number, or several with commas between them; `whole` is the full text of which `text` is a part.
 
     Raises
     ------
     argparse.ArgumentTypeError
-        Something in it is no number; the message says which part.
+        A part is not a number; the message names the part.
     """
     levels = []
     for part in text.split(","):

@@ -1,4 +1,4 @@
-"""Entry point of ``clrecon``: finds the command and imports only that."""
+"""Entry point of ``clrecon``: it imports only the module of the command that was called."""
 
 from __future__ import annotations
 
@@ -38,9 +38,10 @@ COMMANDS = {
 }
 
 UNUSED_MODULES = ("requests", "PIL")
-"""pydicom imports these where it finds them, to download test files and for colour profiles.  Reading needs neither,
-and they cost as much time as reading a series; ``None`` in `sys.modules` is "not installed".  What makes pictures
-takes Pillow out again when it starts: `clrecon.rendering.pictures.pillow`."""
+"""Modules that are hidden from pydicom, by ``None`` in `sys.modules`, which means "not installed".
+
+pydicom imports them if they are there, to download test files and for colour profiles.  Reading needs neither, and the
+import takes as long as reading a series.  `clrecon.rendering.pictures.pillow` makes Pillow available again."""
 
 DESCRIPTION = "Surfaces in patient millimetres from CT series, computed on any OpenCL device."
 
@@ -73,20 +74,20 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def run() -> None:
-    """Console script: run `main`, end the process with its exit code."""
+    """Run `main` and end the process with its exit code: the console script."""
     signal.signal(signal.SIGTERM, _interrupt)
-    if hasattr(signal, "SIGHUP") and signal.getsignal(signal.SIGHUP) == signal.SIG_DFL:  # nohup ignores it: so do we
+    if hasattr(signal, "SIGHUP") and signal.getsignal(signal.SIGHUP) == signal.SIG_DFL:  # not under nohup
         signal.signal(signal.SIGHUP, _interrupt)
     for name in UNUSED_MODULES:
         sys.modules.setdefault(name, None)  # type: ignore[arg-type]
     code = main()
     for stream in (sys.stdout, sys.stderr):
-        # None where the process was started without it; closed by its reader; `main` has said what there is to say.
+        # The stream is None (never opened) or its reader closed it; `main` has already printed everything.
         with contextlib.suppress(OSError, ValueError, AttributeError):
             stream.flush()
     atexit._run_exitfuncs()
-    # Every file is closed by now.  Freeing modules, drivers and voxels one by one takes the interpreter as long as
-    # extracting the surface; the system does it at once.
+    # Every file is closed by now.  The interpreter would free modules, drivers and voxels one by one, which takes as
+    # long as extracting the surface; the system frees all at once.
     os._exit(code)
 
 
@@ -123,14 +124,14 @@ def _dispatch(arguments: list[str], console: Console) -> int:
 
 
 def _escape_unencodable() -> None:
-    """Show what a stream's encoding lacks as escapes: a folder with an umlaut is no reason to fail."""
+    """Print characters that a stream's encoding lacks as escapes, so that a folder with an umlaut is not an error."""
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):
             stream.reconfigure(errors="backslashreplace")
 
 
 def _interrupt(number: int, frame: FrameType | None) -> None:
-    """SIGTERM and SIGHUP (a closed terminal) end a command like Ctrl-C, so that temporary files are removed."""
+    """End a command on SIGTERM and SIGHUP (a closed terminal) like on Ctrl-C, so that temporary files are removed."""
     raise KeyboardInterrupt
 
 

@@ -1,4 +1,4 @@
-"""Options that leave out what is not the patient."""
+"""Options that remove the table and other things around the patient."""
 
 from __future__ import annotations
 

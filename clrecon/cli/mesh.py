@@ -1,4 +1,4 @@
-"""``clrecon mesh``: a CT series in, a calibrated mesh out."""
+"""``clrecon mesh``: from a CT series to a calibrated mesh."""
 
 from __future__ import annotations
 
@@ -167,7 +167,7 @@ def run(options: argparse.Namespace, console: Console) -> int:
 
 
 def describe_mesh(report: dict[str, Any]) -> list[str]:
-    """The report for people: what was read, what came out, on which device, in which time."""
+    """Describe a report for people: the input, the meshes, the device, the time."""
     border = "closed" if report["closed_at_border"] else "open"
     return [
         f"input    {describe_volume(report['volume'])}",
@@ -184,7 +184,7 @@ def describe_mesh(report: dict[str, Any]) -> list[str]:
 
 
 def _describe_surfaces(report: dict[str, Any]) -> str:
-    """What the surfaces enclose, and why."""
+    """Describe what the surfaces enclose, and why."""
     inside = dict.fromkeys(tuple(mesh["inside_hu"] or ()) for mesh in report["meshes"])
     if () in inside:
         return "masks of labels, whatever their HU"
@@ -192,21 +192,21 @@ def _describe_surfaces(report: dict[str, Any]) -> str:
 
 
 def _describe_inside(low: float | None, high: float | None) -> str:
-    """What a surface encloses, as it is asked for."""
+    """Describe what a surface encloses, in the form of the option."""
     if high is None:
         return f"{low:g}"
     return f"below {high:g}" if low is None else f"{low:g}:{high:g}"
 
 
 def _describe_slabs(report: dict[str, Any]) -> str:
-    """In how many slabs, where the volume did not fit as a whole."""
+    """Give the number of slabs, if the volume did not fit as a whole."""
     if report["slabs"] == 1:
         return ""
     return f", {report['slabs']} slabs of at most {megabytes(sum(report['device_bytes'].values()))}"
 
 
 def _describe_choice(report: dict[str, Any]) -> str:
-    """Why this iso value, in a few words."""
+    """Give the reason for the iso value in a few words."""
     choice = report["iso_value_choice"]
     if choice is None:
         return f"preset {report['preset']}" if report["preset"] else "as given"
@@ -217,7 +217,7 @@ def _describe_choice(report: dict[str, Any]) -> str:
 
 
 def describe_volume(volume: dict[str, Any]) -> str:
-    """What was read, in one line, from the certificate of a report."""
+    """Describe the input in one line, from the certificate of a report."""
     parts = []
     if volume.get("shape_ijk"):
         ni, nj, nk = volume["shape_ijk"]
@@ -233,7 +233,7 @@ def describe_volume(volume: dict[str, Any]) -> str:
 
 
 def _describe_parts(meshes: list[dict[str, Any]]) -> list[str]:
-    """A line for each of several meshes, as long as they can be taken in at a glance."""
+    """Describe each of several meshes in a line; of many meshes only some."""
     if len(meshes) == 1:
         return []
     lines = []

@@ -1,4 +1,4 @@
-"""The options that say what is read of an input."""
+"""Options for reading an input: which part of it, and what is tolerated."""
 
 from __future__ import annotations
 

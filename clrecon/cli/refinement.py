@@ -1,4 +1,4 @@
-"""Options of smoothing, decimation and gates, and what is said of them."""
+"""Options of smoothing, decimation, purposes and gates, and the description of their results."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ __all__ = [
 ]
 
 GATE_FAILED = 8
-"""Exit code: everything is written, and ``--strict`` was asked for."""
+"""Exit code for a failed gate with ``--strict``; everything is written."""
 
 _ITERATIONS = 20
 
@@ -72,7 +72,7 @@ def add_purpose(parser: argparse._ActionsContainer) -> None:
 
 
 def describe_refinement(meshes: list[dict[str, Any]]) -> list[str]:
-    """What smoothing and decimation have changed: of one mesh, or the worst of several."""
+    """Describe the changes by smoothing and decimation: those of one mesh, or the largest of several."""
     found = [mesh["refinement"] for mesh in meshes if mesh["refinement"]]
     if not found:
         return []
@@ -94,7 +94,7 @@ def describe_refinement(meshes: list[dict[str, Any]]) -> list[str]:
 
 
 def _describe_decimation(found: dict[str, Any]) -> str:
-    """How much was taken away of what was asked for, and what ended it."""
+    """Describe how many triangles were removed, how many were asked for, and why decimation ended."""
     asked, reached = 100 * found["fraction"], 100 * found["reached"]
     if found["ended_by"] == "share":
         return f"{reached:.1f} % of the triangles taken away, as asked"
@@ -103,7 +103,7 @@ def _describe_decimation(found: dict[str, Any]) -> str:
 
 
 def _describe_purpose(purpose: Purpose) -> str:
-    """A purpose with the options that it stands for, as help of an option."""
+    """Describe a purpose by the options that it stands for; part of the help of ``--for``."""
     options = [
         f"--{field.replace('_', '-')}" + ("" if value is True else f" {value}")
         for field, value in purpose.settings.items()
@@ -112,7 +112,7 @@ def _describe_purpose(purpose: Purpose) -> str:
 
 
 def describe_purposes(meshes: list[dict[str, Any]]) -> list[str]:
-    """What a person who prints the mesh wants to know; of several the first."""
+    """Describe the facts that matter for printing the mesh; of several meshes only the first."""
     found = [mesh["print"] for mesh in meshes if mesh.get("print")]
     if not found:
         return []
@@ -137,14 +137,14 @@ def describe_purposes(meshes: list[dict[str, Any]]) -> list[str]:
 
 
 GATES_OF_AFFINE = ("grid_residual",)
-"""Gates of a scan that say whether its affine places every slice.  Meshes follow the position of each slice itself."""
+"""Gates for the fit of the affine to the slices.  Meshes do not need it: they use the position of each slice."""
 
 
 def finish_with_gates(report: dict[str, Any], console: Console, strict: bool) -> int:
     """Print the warnings of a report; returns the exit code.
 
-    With `strict` the gates that failed, of the volume and of the meshes, are errors: they are printed with ``--quiet``
-    and ``--json`` too.  Not so `GATES_OF_AFFINE`: that the slices are uneven is a warning.
+    With `strict` a failed gate of the volume or of a mesh is an error, which is printed even with ``--quiet`` and
+    ``--json``.  Exception: a failed gate of `GATES_OF_AFFINE` (uneven slices) stays a warning.
     """
     from clrecon.jobs.mesh.refinement import warn_of_gates
 

@@ -1,4 +1,4 @@
-"""``clrecon render``: a CT series in, pictures out."""
+"""``clrecon render``: from a CT series to pictures."""
 
 from __future__ import annotations
 
@@ -96,7 +96,7 @@ def run(options: argparse.Namespace, console: Console) -> int:
 
 
 def describe_report(report: dict[str, Any]) -> list[str]:
-    """The report for people: what was read, what it shows, on which device, in which time."""
+    """Describe a report for people: the input, the pictures, the device, the time."""
     return [
         f"input    {describe_volume(report['volume'])}",
         f"picture  {_describe_look(report)}",

@@ -1,4 +1,4 @@
-"""The options of ``clrecon render`` by what they are about, and the settings that they make."""
+"""The options of ``clrecon render`` by subject, and the settings made from them."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def _add_repeated(
     text: str,
     dest: str | None = None,
 ) -> None:
-    """Add an option that may be given again; what is given makes a list."""
+    """Add an option that can be repeated; its values make a list."""
     dest = dest or option.removeprefix("--").replace("-", "_")
     group.add_argument(
         option, dest=dest, type=parse, metavar=metavar, action="append", default=[], help=f"{text}; may be given again"
@@ -53,7 +53,7 @@ def _add_repeated(
 
 
 def add_looks(parser: argparse.ArgumentParser) -> None:
-    """Add what a picture shows, and in which colours."""
+    """Add the options for the content of a picture and its colours."""
     group = parser.add_argument_group("what is shown")
     group.add_argument(
         "--mode", metavar="M", help=f"one of: {', '.join(describe_modes())} (default: what the other options ask)"
@@ -99,7 +99,7 @@ def add_looks(parser: argparse.ArgumentParser) -> None:
 
 
 def add_camera(parser: argparse.ArgumentParser) -> None:
-    """Add where a picture is taken from, and what surrounds what it shows."""
+    """Add the options for camera, size, background and annotations."""
     group = parser.add_argument_group("camera and picture")
     _add_repeated(
         group, "--view", parse_views, "V[,V...]|AZ,EL",
@@ -133,7 +133,7 @@ def add_camera(parser: argparse.ArgumentParser) -> None:
 
 
 def add_region(parser: argparse.ArgumentParser) -> None:
-    """Add what part of space is shown."""
+    """Add the options for the part of space that is shown."""
     group = parser.add_argument_group("clipping, in mm of the patient (LPS)")
     group.add_argument(
         "--clip-box", type=parse_clip_box, metavar="X0,X1,Y0,Y1,Z0,Z1", help="keep a box; a side left empty is open"
@@ -145,7 +145,7 @@ def add_region(parser: argparse.ArgumentParser) -> None:
 
 
 def add_curve(parser: argparse.ArgumentParser) -> None:
-    """Add the options of slices, in space and alone, and of curved reformations."""
+    """Add the options of slices (in space or single) and of curved reformations."""
     group = parser.add_argument_group("slices and curved reformations")
     group.add_argument("--thickness", type=float, metavar="MM", help="of the slab (default: 0, a plane)")
     group.add_argument("--combine", metavar="HOW", help="mean, max or min of a slab (default: mean)")
@@ -169,7 +169,7 @@ def add_curve(parser: argparse.ArgumentParser) -> None:
 
 
 def add_labels(parser: argparse.ArgumentParser) -> None:
-    """Add labels that look different."""
+    """Add the options for labels with a look of their own."""
     group = parser.add_argument_group("labels")
     group.add_argument(
         "--labels", metavar="FILE", help="label map: NIfTI, NRRD (.seg.nrrd too), MetaImage or DICOM SEG"
@@ -181,7 +181,7 @@ def add_labels(parser: argparse.ArgumentParser) -> None:
 
 
 def add_motion(parser: argparse.ArgumentParser) -> None:
-    """Add the turntable."""
+    """Add the options of the turntable."""
     group = parser.add_argument_group("motion")
     group.add_argument(
         "--turntable", metavar="OUT", help="turn round the patient: .mp4, .gif, .apng, or a folder of PNG files"
@@ -192,16 +192,16 @@ def add_motion(parser: argparse.ArgumentParser) -> None:
 
 
 def render_settings(options: argparse.Namespace) -> RenderSettings:
-    """What the options of the command say.
+    """Make settings from the options of the command.
 
     Raises
     ------
     UsageError
-        As `RenderSettings.of`.
+        `RenderSettings.of` refuses a value.
     """
     given = pick(options, RenderSettings.keywords()) | {
         "views": tuple(view for views in options.view for view in views),
-        "thickness": options.thickness or None,  # of 0 it means nothing in any mode
+        "thickness": options.thickness or None,  # 0 is the same as no thickness
         "offset_mm": options.offset_mm or None,
         "labels": label_look(options),
         "turntable": turntable(options),
@@ -210,12 +210,12 @@ def render_settings(options: argparse.Namespace) -> RenderSettings:
 
 
 def label_look(options: argparse.Namespace) -> LabelLook | None:
-    """What the options of labels say, None without a label map.
+    """Make the settings of labels from the options, None without a label map.
 
     Raises
     ------
     UsageError
-        An option that means something with a label map only.
+        An option was given that needs a label map.
     """
     if options.labels is not None:
         return LabelLook(options.labels, dict(options.label_color), dict(options.label_opacity))
@@ -226,12 +226,12 @@ def label_look(options: argparse.Namespace) -> LabelLook | None:
 
 
 def turntable(options: argparse.Namespace) -> Turntable | None:
-    """What the options of motion say, None without any.
+    """Make the settings of the turntable from the options, None without a turntable.
 
     Raises
     ------
     UsageError
-        An option that means something with a turntable only.
+        An option was given that needs a turntable.
     """
     given = {name: getattr(options, name) for name in ("frames", "fps", "degrees")}
     given = {name: value for name, value in given.items() if value is not None}

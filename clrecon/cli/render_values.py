@@ -1,4 +1,4 @@
-"""What the options of ``clrecon render`` may say."""
+"""Values of the options of ``clrecon render``, read from their texts."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ __all__ = [
 
 
 def _numbers(text: str, count: int, form: str) -> tuple[float, ...]:
-    """So many numbers with commas between them."""
+    """Read a fixed number of numbers with commas between them."""
     try:
         values = tuple(float(part) for part in text.split(","))
     except ValueError:
@@ -73,7 +73,7 @@ def parse_window(text: str) -> tuple[float, ...]:
 
 
 def parse_clip_box(text: str) -> tuple[float, ...]:
-    """Read ``X0,X1,Y0,Y1,Z0,Z1`` in LPS mm; what is left empty is open."""
+    """Read ``X0,X1,Y0,Y1,Z0,Z1`` in LPS mm; an empty number leaves that side open."""
     parts = text.split(",")
     try:
         values = tuple(
@@ -94,7 +94,7 @@ def parse_clip_plane(text: str) -> tuple[float, ...]:
 
 
 def parse_slices(text: str) -> int | tuple[int, ...]:
-    """Read ``N``, every N-th slice, or ``K,K,...``: those numbers; a comma at the end makes a single number one."""
+    """Read ``N`` (every N-th slice) or ``K,K,...`` (the slices of these numbers); ``K,`` is a single slice."""
     try:
         numbers = tuple(int(part) for part in text.split(",") if part.strip())
     except ValueError:

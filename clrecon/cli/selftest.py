@@ -1,4 +1,4 @@
-"""``clrecon selftest``: every operator against its twin, on the device that would be used."""
+"""``clrecon selftest``: a comparison of every operator with its twin, on the device that jobs would use."""
 
 from __future__ import annotations
 

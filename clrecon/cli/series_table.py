@@ -1,8 +1,7 @@
-"""The listing of ``clrecon info`` on the screen: a table as wide as the terminal allows, what is wrong beneath it.
+"""The listing of ``clrecon info`` on the screen: a table that fits the terminal, with problems below it.
 
-Where stdout is no terminal the text is plain and as wide as it needs to be, so that nothing is cut or folded that a
-script looks for.  Texts from files are put into the table as plain text: nothing in them is markup or a terminal
-sequence.
+If stdout is not a terminal, the text is plain and as wide as necessary, so that nothing is cut or folded that a script
+looks for.  Texts from files are put into the table as plain text: they cannot act as markup or terminal sequences.
 """
 
 from __future__ import annotations
@@ -25,7 +24,7 @@ __all__ = ["render_listing"]
 
 _UNLIMITED = 100_000
 _FOLDED_WIDTH = 20
-"""The description is folded to this before a column is left out."""
+"""The description is folded to this width before a column is left out."""
 _BETWEEN = 2
 _LAST = float("inf")
 _NARROWEST = 20
@@ -33,7 +32,7 @@ _NARROWEST = 20
 
 @dataclass(frozen=True)
 class _Column:
-    """A column: its heading, the text of each row, and how readily it is left out (0: never)."""
+    """A column: its heading, the text of each row, and `left_out`: small numbers are left out first, 0 never."""
 
     heading: str
     cells: list[str]
@@ -43,7 +42,7 @@ class _Column:
 
     @property
     def width(self) -> int:
-        """Characters that it needs; cells that fold need no more than `_FOLDED_WIDTH`."""
+        """Width of the column in characters; a column that folds needs at most `_FOLDED_WIDTH`."""
         from rich.cells import cell_len
 
         longest = max((cell_len(cell) for cell in self.cells), default=0)
@@ -51,7 +50,7 @@ class _Column:
 
 
 class _Sink(io.StringIO):
-    """Where rich writes to: text in the encoding of stdout, which decides how lines are drawn."""
+    """The stream that rich writes to: text in the encoding of stdout, which decides how lines are drawn."""
 
     @property
     def encoding(self) -> str:  # type: ignore[override]
@@ -66,12 +65,12 @@ def render_listing(listing: dict[str, Any], certificate: Sequence[tuple[str, str
     listing : dict
         See `clrecon.jobs.info.InputListing`.
     certificate : sequence of (str, str)
-        Words for the series that was judged, see `clrecon.cli.certificate`.
+        Description of the series that was judged, see `clrecon.cli.certificate`.
 
     Returns
     -------
     list of str
-        Lines for stdout; with styles only where that is a terminal and ``NO_COLOR`` is not set.
+        Lines for stdout; with styles only if stdout is a terminal and ``NO_COLOR`` is not set.
     """
     terminal = is_terminal(sys.stdout)
     width = max(shutil.get_terminal_size().columns, _NARROWEST) if terminal else _UNLIMITED
@@ -92,9 +91,9 @@ def render_listing(listing: dict[str, Any], certificate: Sequence[tuple[str, str
 
 
 def _sort_by_patient(entries: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Where there are several patients or studies, the series of each stand together; unknown ones come last."""
+    """Group the series by patient and study if there are several; unknown ones come last."""
     owners = {entry["study"]: entry["patient"] for entry in entries if entry["study"] and entry["patient"]}
-    # Objects that are no CT do not say whose they are, but a study has one patient.
+    # The patient of objects other than CT is not read, but a study has one patient.
     known = [{**entry, "patient": entry["patient"] or owners.get(entry["study"])} for entry in entries]
     several = [key for key in ("patient", "study") if _are_several(known, key)]
     return sorted(known, key=lambda entry: (*(entry[key] or _LAST for key in several), entry["number"]))
@@ -105,7 +104,7 @@ def _are_several(entries: Sequence[dict[str, Any]], key: str) -> bool:
 
 
 def _columns(entries: Sequence[dict[str, Any]], chosen: int | None) -> Iterator[_Column]:
-    """All columns that say something, from left to right."""
+    """Make all columns that are not empty, from left to right."""
     yield _Column("", ["*" if entry["number"] == chosen else " " for entry in entries])
     yield _Column("series", [str(entry["number"]) for entry in entries], right=True)
     if _are_several(entries, "patient"):
@@ -129,7 +128,7 @@ def _columns(entries: Sequence[dict[str, Any]], chosen: int | None) -> Iterator[
 
 
 def _kind(entry: dict[str, Any]) -> str:
-    """The modality, and what it is where it is no stack of slices."""
+    """Return the modality, and the kind of object if it is not a stack of slices."""
     modality = printable(entry["modality"])
     return modality if entry["kind"] in ("stack", "other") else f"{modality} {entry['kind']}"
 
@@ -141,7 +140,7 @@ def _times(lengths: Sequence[float] | None, form: str) -> str:
 def _render_table(
     entries: Sequence[dict[str, Any]], chosen: int | None, width: int, styled: bool
 ) -> tuple[list[str], list[str]]:
-    """The lines of the table, and the headings of the columns that did not fit; a list where no table fits."""
+    """Return the lines of the table and the headings of columns that did not fit; a plain list if no table fits."""
     every = list(_columns(entries, chosen))
     columns = _choose_columns(every, width)
     if columns is None:
@@ -166,7 +165,7 @@ def _render_table(
 
 
 def _choose_columns(every: Sequence[_Column], width: int) -> list[_Column] | None:
-    """Those that fit, the dearest first; None where not even those fit that are never left out."""
+    """Choose the columns that fit, by importance; None if not even the necessary ones fit."""
     kept = [column for column in every if not column.left_out]
     free = width - sum(column.width for column in kept) - _BETWEEN * (len(kept) - 1)
     if free < 0:
@@ -206,7 +205,7 @@ def _make_table(columns: Sequence[_Column], entries: Sequence[dict[str, Any]], c
 
 
 def _render_list(columns: Sequence[_Column], width: int) -> list[str]:
-    """All that the table would say, one line a fact."""
+    """Write the contents of the table as a list, one fact a line."""
     lines = []
     for row, mark in enumerate(columns[0].cells):
         series, *facts = columns[1:]
@@ -218,7 +217,7 @@ def _render_list(columns: Sequence[_Column], width: int) -> list[str]:
 
 
 def _collect_texts(entries: Sequence[dict[str, Any]], place: str) -> Iterator[tuple[str, str]]:
-    """What is said of several series is said once: ``3, 5-9`` and the text."""
+    """Collect texts; a text of several series appears once, with their numbers: ``3, 5-9``."""
     numbers: dict[str, list[int]] = {}
     for entry in entries:
         for text in entry[place]:

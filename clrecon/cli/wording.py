@@ -1,4 +1,4 @@
-"""Parameters of the library in the words of the command line: the one place that translates them."""
+"""Names of the library's parameters as options of the command line."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ _DESTINATIONS = {
     "only": "label",
     "picture": "output",
 }
-"""Parameters whose option has another name, where the command has none of the parameter's own name."""
+"""Options of parameters by another name; used if the command has no option of the parameter's own name."""
 
 
 def speaker_of(parser: argparse.ArgumentParser) -> Speaker:
-    """Words for the parameters that a command has options for; the others are named as in Python."""
+    """Make a function that names parameters as options of a command; others keep their names in Python."""
     options = {action.dest: action.option_strings[0] for action in parser._actions if action.option_strings}
 
     def speak(parameter: str, value: object = None) -> str:
