@@ -1,9 +1,9 @@
-"""Make a virtual environment for this project once, and find it again at no cost (shared by run.py and test.py).
+"""The virtual environment of this project, made once and then found again (shared by run.py and test.py).
 
-An environment is finished when its stamp is there and says word for word what was installed: the text of
-setup.cfg and pyproject.toml, the Python, the folder and the extras.  Anything else (a changed file, another
-Python, an interrupted installation) makes it anew.  clrecon itself is installed editable, so that a changed
-source file needs no new installation.
+A finished environment has a stamp: a file with the text of setup.cfg and pyproject.toml, the Python, the folder and
+the extras.  If the stamp is missing or differs (a changed file, another Python, an interrupted installation), the
+environment is made again.  clrecon itself is installed editable, so that a changed source file needs no new
+installation.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ class SetupError(Exception):
 
 
 def program_path(folder: str, name: str) -> str:
-    """Path of program `name` in the environment `folder`."""
+    """Return the path of program `name` in the environment `folder`."""
     if os.name == "nt":
         return os.path.join(folder, "Scripts", name + ".exe")
     return os.path.join(folder, "bin", name)
@@ -42,7 +42,7 @@ def _wanted_stamp(extras: str) -> str:
 def _is_finished(folder: str, stamp: str, program: str) -> bool:
     try:
         with open(os.path.join(folder, _STAMP), encoding="utf-8") as file:
-            # exists() follows links: false as well when the Python that the environment was made from is gone
+            # exists() follows links: it is also false when the Python behind the environment is gone
             return (
                 file.read() == stamp
                 and os.path.exists(program_path(folder, "python"))
@@ -53,7 +53,7 @@ def _is_finished(folder: str, stamp: str, program: str) -> bool:
 
 
 def ensure_environment(name: str, extras: str = "", program: str = "clrecon") -> str:
-    """Return the folder of a finished environment, making it when it is not there.
+    """Return the folder of a finished environment; make it if it is missing.
 
     Parameters
     ----------
@@ -62,26 +62,26 @@ def ensure_environment(name: str, extras: str = "", program: str = "clrecon") ->
     extras : str
         Extras of setup.cfg to install, such as ``test,dev``.
     program : str
-        A program that the finished environment holds.
+        A program of the finished environment.
 
     Raises
     ------
     SetupError
-        No venv module, no write permission, or pip failed.
+        There is no venv module, writing is not permitted, or pip failed.
     """
     folder = os.path.join(ROOT, name)
     stamp = _wanted_stamp(extras)
     if _is_finished(folder, stamp, program):
         return folder
     with _locked(folder + ".lock"):
-        if not _is_finished(folder, stamp, program):  # another start may have made it while this one waited
+        if not _is_finished(folder, stamp, program):  # another process may have made it while this one waited
             _make(folder, stamp, extras)
     return folder
 
 
 @contextmanager
 def _locked(path: str) -> Iterator[None]:
-    """Hold the lock file `path`; the system lets go of it when its holder dies."""
+    """Hold the lock file `path`; the system releases it when the process dies."""
     try:
         file = open(path, "a+b")  # noqa: SIM115 (closed below)
     except OSError as error:
@@ -120,7 +120,7 @@ def _say(text: str) -> None:
 
 
 def _check_venv() -> None:
-    """Debian and its relatives split venv and ensurepip off Python."""
+    """Refuse a Python without venv or ensurepip, which Debian and its relatives package separately."""
     try:
         import ensurepip  # noqa: F401
         import venv  # noqa: F401
@@ -142,7 +142,7 @@ def _make(folder: str, stamp: str, extras: str) -> None:
         os.unlink(os.path.join(folder, _STAMP))
     except FileNotFoundError:
         pass
-    # -m venv in a process of its own: this one may itself run in an environment or without a writable home
+    # -m venv in a separate process: this one may run in an environment, or without a writable home
     made = subprocess.run([sys.executable, "-m", "venv", "--clear", folder], capture_output=True, text=True)
     if made.returncode:
         raise SetupError(f"python -m venv failed:\n{(made.stdout + made.stderr).strip()}")
@@ -159,14 +159,14 @@ def _make(folder: str, stamp: str, extras: str) -> None:
 
 
 def _last_words(log: str) -> list[str]:
-    """The errors in pip's output, else its last lines; a list of all versions ever published is cut."""
+    """Return the errors in pip's output, else its last lines; a long list of published versions is cut."""
     with open(log, encoding="utf-8") as file:
         lines = [line.rstrip()[:200] for line in file if line.strip()]
     return [line for line in lines if "error:" in line.lower()][-8:] or lines[-8:]
 
 
 def _run_logged(command: list[str], log: str) -> int:
-    """Run `command` with its output in the file `log`; a terminal sees one line of what is going on."""
+    """Run `command` with its output in the file `log`; a terminal shows one line of progress."""
     import subprocess
 
     shows = sys.stderr.isatty()

@@ -3,14 +3,14 @@
 
     python scripts/check_oclgrind.py [--uninitialized] [COMMAND ...]
 
-Oclgrind checks every memory access of every kernel and data races, but exits 0 whatever it finds: what counts is that
-its log is there and empty.  COMMAND replaces the tests (the guard of this script uses that).  Run it with the Python
+Oclgrind checks every memory access of every kernel and data races.  It always exits with 0, so this script checks that
+its log exists and is empty.  COMMAND replaces the tests (the guard of this script uses that).  Run it with the Python
 of an environment that has clrecon and its test extra (scripts/test.py does).
 
---uninitialized also reports uninitialised values, with the compiler's optimiser off.  It is a help in a search and
-not part of the gate: up to version 21.10 Oclgrind stops there at LLVM's instruction "freeze" (which the optimiser
-makes of a quotient and its remainder), takes halves of vectors (v.lo | v.hi) for uninitialised or crashes, and after
-a buffer is freed takes the end of a larger one that follows it for uninitialised.
+--uninitialized also reports uninitialised values, with the compiler's optimiser off.  It helps in a search but is not
+part of the gate, because Oclgrind up to version 21.10 has faults in this mode.  It stops at LLVM's instruction
+"freeze", which the optimiser makes of a quotient and its remainder.  It reports halves of vectors (v.lo | v.hi) or
+crashes on them.  After a buffer is freed, it reports the end of a larger buffer that takes its place.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ SHOWN_LINES = 60
 
 
 def default_command() -> list[str]:
-    """All tests marked ``oclgrind``: only the files that name the mark are read, since reading all takes long."""
+    """Command for all tests marked ``oclgrind``; only files that name the mark are collected, which saves time."""
     files = sorted(path for path in (ROOT / "tests").rglob("test_*.py") if "mark.oclgrind" in path.read_text("utf-8"))
     marked = [str(path.relative_to(ROOT)) for path in files]
     return [sys.executable, "-m", "pytest", "-q", "-m", "oclgrind", "-p", "no:cacheprovider", *marked]

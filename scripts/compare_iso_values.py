@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Ways to choose an iso value, on phantoms whose true surface is known; the table of docs/iso_value.md.
+"""Comparison of ways to choose an iso value, on phantoms with a known true surface; the table of docs/iso_value.md.
 
 Spheres (radius 10 voxels, 1040 in 40 HU): error of the level in HU, and of the mean radius in voxels against the
 surface at the true half-way level (540 HU).  Spines: the level, and the mean distance in mm from the true surface of
@@ -41,7 +41,7 @@ SPINES: dict[str, tuple[dict[str, Any], dict[str, float]]] = {
     "1 mm, blur 1 mm": ({"point_spread_mm": 1.0, "noise": 10.0}, {}),
     "slices 4.25 mm": ({"slices": 40, "spacing": (1.0, 1.0, 4.25), "point_spread_mm": 0.7, "noise": 15.0}, {}),
     "1 mm, contrast medium": ({}, {"BLOOD_HU": 300.0, "KIDNEY_HU": 180.0}),
-    # made after the method was settled
+    # made after the method was fixed
     "0.8 mm, slices 2 mm, tilt 12": (
         {
             "size": (320, 320),
@@ -64,7 +64,7 @@ SPINES: dict[str, tuple[dict[str, Any], dict[str, float]]] = {
 
 # --- ways to choose ---
 def _every_slice(volume: Volume) -> tuple[Array, Array]:
-    """Counts of each whole HU above the padding, and those HU."""
+    """Count the voxels of each whole HU above the padding; also return these HU."""
     counts = choice._count_values(volume.voxels, range(len(volume.voxels)))
     return counts, np.arange(len(counts)) + float(choice.LOWEST_HU)
 
@@ -83,7 +83,7 @@ def by_otsu(volume: Volume) -> float:
 
 
 def by_minimum_error(volume: Volume) -> float:
-    """Kittler and Illingworth 1986 on what lies above -200 HU."""
+    """Kittler and Illingworth 1986 on the voxels above -200 HU."""
     counts, hu = _every_slice(volume)
     counts, hu = counts[hu >= -200.0], hu[hu >= -200.0]
     w, m, s = np.cumsum(counts), np.cumsum(counts * hu), np.cumsum(counts * hu * hu)
@@ -115,7 +115,7 @@ def by_gradient(volume: Volume) -> float:
 
 
 def by_plain_edges(volume: Volume) -> float:
-    """The edges of "auto", but every edge counts the same and contrast medium is not left out."""
+    """The edges of "auto", but all with equal weight and with contrast medium included."""
     sampled = range(len(volume.voxels))
     edges = measure_edges(volume.voxels, sampled, choice._find_background(_every_slice(volume)[0]))
     return float((np.median(edges.bone) + np.median(edges.tissue)) / 2.0)
@@ -129,7 +129,7 @@ def by_preset(volume: Volume) -> float:
 
 
 def by_auto(volume: Volume) -> float:
-    """What clrecon does."""
+    """The method "auto" of clrecon."""
     return choice.choose_iso_value(volume).iso_value
 
 
@@ -146,7 +146,7 @@ METHODS: dict[str, Callable[[Volume], float]] = {
 
 # --- phantoms and their measure ---
 def make_sphere(blur: float, noise: float) -> Volume:
-    """A sphere off the grid's centre, partial volume, blurred, in tissue."""
+    """Make a sphere in tissue, off the grid's centre, with partial volume and blur."""
     from scipy.ndimage import gaussian_filter
 
     distance = _sphere_distance(np.indices((48, 48, 48)).reshape(3, -1).T)
@@ -161,7 +161,7 @@ def _sphere_distance(kji: Array) -> Array:
 
 
 def make_spine(settings: dict[str, Any], hu: dict[str, float]) -> tuple[Volume, Array]:
-    """A spine phantom and, of the same shape, the signed distance to the bone of its vertebrae in mm."""
+    """Make a spine phantom and, in an array of its shape, the signed distance to the bone of its vertebrae in mm."""
     from clrecon.phantom import PhantomSettings, add_noise, apply_point_spread, tissue
     from clrecon.phantom.settings import CENTRE_LPS_MM, place_slices
     from clrecon.phantom.spine import draw_spine
@@ -188,7 +188,7 @@ def make_spine(settings: dict[str, Any], hu: dict[str, float]) -> tuple[Volume, 
 
 
 def cross_level(field: Array, level: float) -> Array:
-    """Where grid edges cross `level`, linear interpolation; (n, 3) in index steps k, j, i."""
+    """Return the points (n, 3) in index steps k, j, i where grid edges cross `level`, linearly interpolated."""
     points = []
     for axis in range(3):
         moved = np.moveaxis(field, axis, -1).astype(np.float32)
@@ -207,7 +207,7 @@ class SpineError:
     def __init__(self, volume: Volume, distance: Array):
         self.steps = np.array(column_spacing(volume.affine))[::-1]
         self.truth = cross_level(distance, 0.0)[::5] * self.steps
-        self.field = np.where(distance < -6.0, np.float32(0.0), volume.voxels)  # the rest of the body is no bone
+        self.field = np.where(distance < -6.0, np.float32(0.0), volume.voxels)  # the rest of the body is not bone
 
     def __call__(self, level: float) -> float:
         from scipy.spatial import cKDTree

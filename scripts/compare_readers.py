@@ -1,13 +1,14 @@
 #!/usr/bin/env python3
-"""The trap matrix: where clrecon and other readers put the voxels of CT series that are easily placed wrongly.
+"""The trap matrix: where clrecon and other readers place the voxels of difficult CT series.
 
     python scripts/compare_readers.py [--table NAME] [--only TEXT] [--readers NAMES] [--json FILE] [--markdown]
 
-The table "places" has series whose voxels are easily placed wrongly, "doubts" those that look right and are not the
-volume that they seem.  Each cell is the largest distance in mm of a corner voxel of any slice from its true place, and
-S (silent), W (the reader warned) or R (it refused).  The cases are those of tests/support/trap_cases.py, written into a
-temporary folder.  Every reader runs with its defaults, in a process of its own for every case, with a time limit; one
-that is not installed gives n/a.  All of them: pip install SimpleITK highdicom dicom2nifti dicom-numpy dcm2niix nibabel.
+The table "places" has series whose voxels are easily placed wrongly.  The table "doubts" has series that look right but
+are not: a volume of them is wrong.  Each cell has the largest distance in mm of a corner voxel of any slice from its
+true place, and S (silent), W (the reader warned) or R (it refused).  The cases of tests/support/trap_cases.py are
+written into a temporary folder.  Every reader runs with its defaults, in a new process for every case, with a time
+limit.  A reader that is not installed gives n/a.
+All of them: pip install SimpleITK highdicom dicom2nifti dicom-numpy dcm2niix nibabel.
 """
 
 from __future__ import annotations
@@ -37,23 +38,23 @@ from reader_peers import READERS  # noqa: E402
 from trap_cases import CASES, FIELD_SIZE, Case, Marks, Size  # type: ignore[import-not-found]  # noqa: E402
 
 SILENT_MM = 0.01
-"""A voxel that is further off without a word is a silent fault (bold in the table)."""
+"""Largest error of a voxel in mm; a larger one without a warning is a silent fault (bold in the table)."""
 FAULTS = (AttributeError, IndexError, KeyError, NameError, OverflowError, TypeError, UnboundLocalError)
-"""Exceptions that mean a fault of a reader rather than a refusal."""
+"""Exceptions that mean a fault of a reader, not a refusal."""
 
 
 @dataclass
 class Cell:
-    """What one reader did with one case.
+    """Result of one reader for one case.
 
     Attributes
     ----------
     verdict : {"S", "W", "R", "crash", "timeout", "n/a"}
     error_mm : float or None
-        Largest distance of a mark from its place; None where no mark was read.
+        Largest distance of a mark from its place; None if no mark was read.
     shape : list of int or None
     notes : list of str
-        "mixed": images of something else are among the slices; "lost": share of the marks that are not there.
+        "mixed": other images are among the slices; "lost": share of the marks that are missing.
     told : str
         First warning, or the refusal.
     """
@@ -65,7 +66,7 @@ class Cell:
     told: str = ""
 
     def is_silent_fault(self, doubtful: bool = False) -> bool:
-        """A wrong volume without a word; of a `doubtful` series any volume is."""
+        """True for a wrong volume without a warning; every volume of a `doubtful` series is wrong."""
         if doubtful:
             return self.verdict == "S"
         doubts = [note for note in self.notes or [] if not note.startswith(("+", "4D"))]
@@ -81,8 +82,8 @@ class Cell:
 
 
 def is_installed(reader: str) -> str | None:
-    """Version of a reader, None where it is not installed."""
-    if reader == "clrecon":  # the one of this folder, installed or not
+    """Return the version of a reader, None if it is not installed."""
+    if reader == "clrecon":  # the clrecon of this folder, installed or not
         settings = configparser.ConfigParser()
         settings.read(ROOT / "setup.cfg")
         return settings["metadata"]["version"]
@@ -93,7 +94,7 @@ def is_installed(reader: str) -> str | None:
 
 
 def judge(found: dict[str, Any], truth: Marks) -> Cell:
-    """Hold what a child process read against the truth."""
+    """Compare the marks that a child process read with the true ones."""
     if "refused" in found:
         return Cell(found["verdict"], told=found["refused"])
     best = max(found["volumes"], key=lambda volume: np.isin(volume["hu"], truth.hu).sum())
@@ -110,7 +111,7 @@ def judge(found: dict[str, Any], truth: Marks) -> Cell:
         notes.append("mixed")
     lost = 1.0 - np.isin(truth.hu, hu).mean()
     if lost > 0.0 and truth.slices in best["shape"] and not best["notes"]:
-        notes, errors = ["HU wrong"], errors[:0]  # all slices are there, but which mark is which?
+        notes, errors = ["HU wrong"], errors[:0]  # all slices are there, but the marks cannot be told apart
     elif lost > 0.0:
         notes.append(f"{lost:.0%} lost")
     if np.isnan(errors).any():
@@ -176,7 +177,7 @@ def ask_reader(reader: str, folder: Path, truth: Marks, options: dict[str, Any],
 
 
 def ask_all(case: Case, size: Size, readers: Sequence[str], seconds: float) -> dict[str, Cell]:
-    """One row: the case is written once and read by every reader."""
+    """Fill one row: the case is written once and read by every reader."""
     with tempfile.TemporaryDirectory() as folder:
         truth = case.write(Path(folder), size)
         row = {reader: ask_reader(reader, Path(folder), truth, {}, seconds) for reader in readers}
@@ -190,7 +191,7 @@ def ask_all(case: Case, size: Size, readers: Sequence[str], seconds: float) -> d
 
 
 def is_doubtful(name: str) -> bool:
-    """A case that looks right and is not what it seems."""
+    """True for a case that looks right but is not."""
     return name in CASES and CASES[name].looks_right and not CASES[name].harmless
 
 
@@ -202,7 +203,7 @@ def describe_cell(cell: Cell, bold: bool, doubtful: bool = False) -> str:
 
 
 def make_table(rows: dict[str, dict[str, Cell]], readers: Sequence[str], markdown: bool) -> list[str]:
-    """Lines of the table, a line for each case."""
+    """Return the lines of the table, one for each case."""
     cells = [["case", *readers]]
     for name, row in rows.items():
         cells.append([name, *(describe_cell(row[reader], markdown, is_doubtful(name)) for reader in readers)])

@@ -1,14 +1,14 @@
 #!/usr/bin/env python3
-"""Run the same commands with two checkouts of clrecon and compare all that they write, byte for byte.
+"""Comparison of two checkouts of clrecon: the same commands are run with both, and all outputs compared byte for byte.
 
     python scripts/compare_versions.py OLD NEW [CT_FOLDER ...] [--labels FILE] [--device D] [--only TEXT] [--quick]
 
-OLD and NEW are folders of the project: `git worktree add ../old COMMIT` makes one.  Each runs with the environment in
-its own `.venv-test` or `.venv`, else one is made.  Without CT_FOLDER two phantoms are compared (a spine, and a skull
-that lies oblique with tilted slices); folders of real series come on top of them.
+OLD and NEW are folders of the project: `git worktree add ../old COMMIT` makes such a folder.  Each runs with the
+environment in its own `.venv-test` or `.venv`; a missing environment is made.  Two phantoms are always compared (a
+spine, and an oblique skull with tilted slices), and after them the series of each CT_FOLDER.
 
-Compared are exit codes, meshes, pictures, reports and what stands on the console.  Left out of reports are times, sizes
-of processes and caches: the names in VOLATILE.  The exit status is 0 when nothing differs, and 1 with a line for each
+Exit codes, meshes, pictures, reports and the text on the console are compared.  In reports, the names in VOLATILE are
+ignored, such as times and the size of a process.  The exit status is 0 when nothing differs, and 1 with a line for each
 difference.
 """
 
@@ -25,7 +25,7 @@ from pathlib import Path
 from typing import Any
 
 VOLATILE = frozenset({"seconds", "seconds_a_frame", "peak_memory_bytes", "version"})
-"""Names in reports whose values differ from run to run, or between versions by their nature."""
+"""Names in reports whose values differ between runs, or always differ between versions."""
 
 PHANTOMS = {
     "spine": ["--kind", "spine", "--size", "128x128", "--slices", "60", "--spacing", "1.4", "1.4", "2.0"],
@@ -100,7 +100,7 @@ def _parse() -> argparse.Namespace:
 
 
 def _program(checkout: Path) -> list[str]:
-    """How clrecon of a checkout is called."""
+    """Return the command that calls clrecon of a checkout."""
     for name in (".venv-test", ".venv"):
         python = checkout / name / ("Scripts/python.exe" if sys.platform == "win32" else "bin/python")
         if python.exists():
@@ -151,14 +151,14 @@ def _commands(folder: Path, labels: Path | None, device: str) -> Iterator[list[s
 
 
 def _run(command: list[str], folder: Path) -> tuple[int, str, str]:
-    """Exit code, stdout and stderr of a command that runs in `folder`, times and progress left out."""
+    """Run a command in `folder`; returns its exit code, stdout and stderr without times and progress."""
     folder.mkdir()
     done = subprocess.run(command, cwd=folder, capture_output=True, text=True, errors="replace")
     return done.returncode, _still(done.stdout), _still(done.stderr)
 
 
 def _still(text: str) -> str:
-    """`text` without the line of times, the time of a frame and what progress wrote over."""
+    """Return `text` without the line of times, the time of a frame and the lines of progress."""
     text = re.sub(r"(?m)^time +\d.*\n", "", re.sub(r"[^\n]*\r", "", text))
     return re.sub(r"\b[\d.]+ s each\b", "N s each", text)
 
@@ -173,7 +173,7 @@ def _pairs(old: tuple[int, str, str], new: tuple[int, str, str]) -> Iterator[tup
 
 
 def _compare_folders(old: Path, new: Path) -> list[str]:
-    """A line for each file that is not the same in both folders."""
+    """Return a line for each file that differs between the two folders."""
     names = [{path.relative_to(top).as_posix() for path in top.rglob("*") if path.is_file()} for top in (old, new)]
     found = [f"{name} is written by one side only" for name in sorted(names[0] ^ names[1])]
     for name in sorted(names[0] & names[1]):
@@ -189,7 +189,7 @@ def _compare_folders(old: Path, new: Path) -> list[str]:
 
 
 def differing_names(old: Any, new: Any, name: str = "") -> Iterator[str]:
-    """Names of a report whose values differ, with both values; those in VOLATILE are left out."""
+    """Return the names of a report whose values differ, with both values, except those in VOLATILE."""
     if isinstance(old, dict) and isinstance(new, dict):
         for key in [*old, *(key for key in new if key not in old)]:
             if key not in VOLATILE:

@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Write cl/surface/mc_tables.h and trilinear_tables.h from the derived tables; --check: say if they are up to date."""
+"""Write cl/surface/mc_tables.h and trilinear_tables.h from the derived tables; --check: test if they are current."""
 
 from __future__ import annotations
 

@@ -1,10 +1,10 @@
 #!/usr/bin/env python3
-"""Make the pictures of README and docs/rendering.md anew, from a phantom.
+"""Make the pictures of README and docs/rendering.md again, from a phantom.
 
     clrecon phantom SPINE --kind spine --size 512x512 --slices 149 --spacing 0.7 0.7 1.0
     python scripts/make_gallery.py SPINE docs/images
 
-The one beside VTK needs scikit-image too, and prints how alike the two are.
+The picture beside VTK's also needs scikit-image; the likeness of the two is printed.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ BESIDE = (495, 300)
 
 
 def draw_modes(renderer: clrecon.VolumeRenderer, ray_step: float) -> np.ndarray:
-    """Six modes, each with its name in a corner; (h, w, 3) uint8."""
+    """Draw six modes, each with its name in a corner; (h, w, 3) uint8."""
     light = clrecon.Lighting(direction=(-0.3, -1.0, 0.6))
     pictures: dict[str, dict[str, Any]] = {
         "dvr, preset spine": {"preset": "spine", "view": "35,15", "ray_step": ray_step, "zoom": 1.25},
@@ -45,7 +45,7 @@ def draw_modes(renderer: clrecon.VolumeRenderer, ray_step: float) -> np.ndarray:
 
 
 def draw_beside_vtk(renderer: clrecon.VolumeRenderer) -> np.ndarray:
-    """clrecon's picture, and that of VTK's fixed-point mapper with the same camera and functions."""
+    """Draw clrecon's picture, and that of VTK's fixed-point mapper with the same camera and functions."""
     from peers.vtk_fixed_point import FixedPointPeer
     from peers.vtk_stage import scene_of
     from skimage.metrics import structural_similarity
@@ -53,7 +53,7 @@ def draw_beside_vtk(renderer: clrecon.VolumeRenderer) -> np.ndarray:
     volume, bone = renderer.volume, find_preset("bone")
     camera = clrecon.Camera.fit(volume, "25,10", 1.2, size=BESIDE)
     step = 0.5 * min(volume.spacing)
-    light = replace(bone.lighting, soft_gradient=0.0)  # as VTK's
+    light = replace(bone.lighting, soft_gradient=0.0)  # as VTK does
     ours = renderer.render(preset="bone", camera=camera, size=BESIDE, ray_step=step, lighting=light).image[..., :3]
     scene = scene_of(volume, camera, bone.transfer_function, light, size=BESIDE, ray_step=step)
     peer = FixedPointPeer(volume.voxels, scene, threads=1)

@@ -1,10 +1,10 @@
 #!/usr/bin/env python3
-"""Measure how alike (SSIM) pictures of each preset by the default ray step are to those by one ten times finer.
+"""Measure the error of the default ray step: SSIM of each preset's pictures against pictures with a tenth of the step.
 
     python scripts/measure_ray_steps.py CT_FOLDER [DEVICE]
 
-Prints a line a preset: of the view from the front and of an oblique one the SSIM of the whole picture (grey values of 8
-bits) and that of its pixels in which something shows, without the background.  It needs scikit-image.
+Prints a line per preset, for the view from the front and for an oblique view.  Each view has two figures: the SSIM of
+the whole picture (grey values of 8 bits), and that of its pixels without the background.  It needs scikit-image.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ FINER = 10.0
 
 
 def compare(coarse: np.ndarray, fine: np.ndarray) -> tuple[float, float]:
-    """SSIM of the luminance of two pictures (h, w, 4), uint8: of all, and where either is not black."""
+    """SSIM of the luminance of two pictures (h, w, 4), uint8: of all pixels, and of those not black in both."""
     from skimage.metrics import structural_similarity
 
     grey = [np.rint(picture[..., :3] @ (0.2126, 0.7152, 0.0722)) for picture in (coarse, fine)]
@@ -36,7 +36,7 @@ def compare(coarse: np.ndarray, fine: np.ndarray) -> tuple[float, float]:
 
 
 def main() -> None:
-    """Print the figures of every preset for volume rendering."""
+    """Print the SSIM of every preset for volume rendering."""
     if len(sys.argv) not in (2, 3):
         raise SystemExit(__doc__)
     volume = clrecon.read_volume(sys.argv[1])

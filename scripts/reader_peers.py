@@ -1,8 +1,7 @@
-"""How each reader of CT series is asked for a volume; used by compare_readers.py, one child process a call.
+"""Readers of CT series, each behind one function; compare_readers.py runs every call in a child process.
 
-Every function takes a folder that holds one series and returns the volumes that the reader makes of it, as it makes
-them by default, and what there is to say of them.
-Libraries are imported inside the functions: each runs in a process of its own.
+A function takes a folder with one series.  It returns the volumes that the reader makes of it by default, with notes.
+Libraries are imported inside the functions, because each function runs in its own process.
 """
 
 from __future__ import annotations
@@ -19,13 +18,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 RESAMPLED = re.compile(r"(_Tilt|_Eq)(_\d+)?$")
-"""What dcm2niix adds to the names of images that it resampled; the raw one beside them is judged."""
+"""End of the names of images that dcm2niix resampled; the raw image beside them is judged."""
 RAS_TO_LPS = np.diag([-1.0, -1.0, 1.0, 1.0])
 
 
 @dataclass
 class Candidate:
-    """One volume that a reader made: voxels (i, j, k), its map of indices (n, 3) to LPS mm, notes for the table."""
+    """One volume that a reader made: voxels (i, j, k), its function from indices (n, 3) to LPS mm, notes."""
 
     voxels: NDArray[Any]
     ijk_to_lps: Callable[[NDArray[Any]], NDArray[np.float64]]
@@ -33,13 +32,13 @@ class Candidate:
 
 
 def by_affine(affine: NDArray[np.float64]) -> Callable[[NDArray[Any]], NDArray[np.float64]]:
-    """The map of a 4x4 affine."""
+    """Return the function from indices to LPS mm of a 4x4 affine."""
     return lambda ijk: ijk @ affine[:3, :3].T + affine[:3, 3]
 
 
 @dataclass
 class Reading:
-    """The volumes, and whether the reader said anything of its doubts by its own means."""
+    """The volumes of a reader, and its warnings."""
 
     candidates: list[Candidate]
     warnings: tuple[str, ...] = ()
@@ -74,7 +73,7 @@ def read_highdicom(folder: Path, options: dict[str, Any]) -> Reading:
         volume = highdicom.imread(files[0]).get_volume()
     else:
         volume = highdicom.get_volume_from_series([pydicom.dcmread(file) for file in files])
-    order = [2, 1, 0, 3]  # its indices run (slice, row, column)
+    order = [2, 1, 0, 3]  # the indices are (slice, row, column)
     return Reading([Candidate(volume.array.transpose(2, 1, 0), by_affine(np.array(volume.affine)[:, order]))])
 
 
@@ -133,4 +132,4 @@ READERS: dict[str, tuple[str, Callable[[Path, dict[str, Any]], Reading]]] = {
     "dicom-numpy": ("dicom-numpy", read_dicom_numpy),
     "dcm2niix": ("dcm2niix", read_dcm2niix),
 }
-"""Name in the table to (distribution on PyPI, how to read)."""
+"""Distribution on PyPI and reading function, by name in the table."""

@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
-"""Start clrecon from this folder: python3 scripts/run.py ARGUMENTS is the same as clrecon ARGUMENTS.
+"""Start clrecon from this folder: ``python3 scripts/run.py ARGUMENTS`` is the same as ``clrecon ARGUMENTS``.
 
-The first start makes .venv here and installs clrecon into it, with an OpenCL driver where PyPI has one.
+The first start makes .venv in this folder and installs clrecon into it, with an OpenCL driver if PyPI has one.
 """
 
 import os

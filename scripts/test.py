@@ -4,8 +4,8 @@
     python3 scripts/test.py [--fast] [PYTEST ARGUMENTS]
 
 --fast leaves out the tests marked slow and the Oclgrind check.  Everything else goes to pytest; without such arguments
-the whole suite runs in as many processes as there are cores, four at most.  The exit status is not 0 when any of them
-fails, or when no test ran.  See CONTRIBUTING.md for the variables that choose devices.
+the whole suite runs in as many processes as there are cores, four at most.  The exit status is not 0 if a step
+fails or no test ran.  See CONTRIBUTING.md for the variables that choose devices.
 """
 
 import os
@@ -27,7 +27,7 @@ MOST_PROCESSES = 4
 def run_steps(steps: dict[str, list[str]], environment: dict[str, str], beside: str) -> list[str]:
     """Run the steps in their order and return the names of those that failed.
 
-    The step `beside` uses one core: it runs from the beginning, and what it says is printed at its place.
+    The step `beside` uses one core: it runs in parallel from the beginning, and its output is printed in its turn.
     """
     failed = []
     with ExitStack() as early:
@@ -36,7 +36,7 @@ def run_steps(steps: dict[str, list[str]], environment: dict[str, str], beside: 
             process = early.enter_context(
                 subprocess.Popen(steps[beside], cwd=ROOT, env=environment, stdout=said, stderr=subprocess.STDOUT)
             )
-            early.callback(process.kill)  # where this program is interrupted; does nothing once it has ended
+            early.callback(process.kill)  # for an interrupted program; does nothing if the step has ended
         for name, command in steps.items():
             print(f"== {name}", flush=True)
             if name == beside:
@@ -52,7 +52,7 @@ def run_steps(steps: dict[str, list[str]], environment: dict[str, str], beside: 
 
 
 def quick_checks(folder: str) -> dict[str, list[str]]:
-    """Return the checks that take a second, as .pre-commit-config.yaml has them too, by name."""
+    """Return the checks that take a second, by name: the same as in .pre-commit-config.yaml."""
     ruff = program_path(folder, "ruff")
     return {
         "ruff": [ruff, "check", "."],
@@ -77,9 +77,9 @@ def main() -> int:
     steps = {**quick_checks(folder), "mypy": [program_path(folder, "mypy")]}
     if not fast and (shutil.which("oclgrind") or os.environ.get("CLRECON_REQUIRE_OCLGRIND")):
         steps["oclgrind"] = [python, os.path.join("scripts", "check_oclgrind.py")]
-    # Kernels are built on one core: much of the suite is that.  Each process has its part of the tests in their order,
-    # and one that is done takes half of what another has left: none waits for the longest file.  A process that
-    # crashes ends the run, as it does without others: pytest-xdist 3.8 waits for ever for what took its place.
+    # Much of the suite's time is the building of kernels, on one core.  Each process gets a part of the tests in order.
+    # A process that is done takes half of the rest of another, so that none waits for the longest file.  A process that
+    # crashes ends the run: pytest-xdist 3.8 would wait for ever for a process in its place.
     cores = min(os.cpu_count() or 1, MOST_PROCESSES)
     options = ["-n", str(cores), "--dist", "worksteal", "--max-worker-restart", "0"]
     spread = options if cores > 1 and not arguments else []
