@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Benches of clrecon beside its peers: run them, compare with a stored baseline, tabulate and plot.
+"""Benches of clrecon beside its peers: running, comparison with a stored baseline, tables and plots.
 
     bench.py list
     bench.py run CASE... [--input NAME]... [--device D]... --json DIR
@@ -7,9 +7,9 @@
     bench.py plot DIR -o ratios.png
     bench.py table DIR
 
-Candidate and peer alternate in one run on the same input; what counts is the median of the ratios of the pairs
-(over 1: clrecon is faster) and its quartiles.  Needs the extra `bench` (SimpleITK, matplotlib); VTK comes with
-pyvista.  Keep the machine quiet: the results say how many cores were really free.
+Candidate and peer alternate in one run on the same input.  The result is the median of the ratios of the pairs (above
+1: clrecon is faster) with quartiles.  Needs the extra `bench` (SimpleITK, matplotlib); VTK comes with
+pyvista.  Keep the machine quiet: the results state how many cores were free.
 """
 
 from __future__ import annotations
@@ -34,11 +34,11 @@ from clrecon.errors import ClreconError, UsageError  # noqa: E402
 from clrecon.jobs.bench.machine import usable_cores  # noqa: E402
 
 QUIET_SHARE = 0.85
-"""Below this share of free cores a warning says that the ratios are those of a busy machine."""
+"""Smallest share of free cores without a warning that the machine is busy."""
 
 
 def make_parser() -> argparse.ArgumentParser:
-    """All commands and their options."""
+    """Make the parser of all commands and their options."""
     import inputs
 
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -80,13 +80,13 @@ def make_parser() -> argparse.ArgumentParser:
 
 
 def default_work() -> Path:
-    """A folder of this user among the temporary ones; phantoms stay there for the next run."""
+    """Return the temporary folder of this user; phantoms stay there for the next run."""
     owner = os.getuid() if hasattr(os, "getuid") else os.environ.get("USERNAME", "")
     return Path(tempfile.gettempdir()) / f"clrecon-bench-{owner}"
 
 
 def choose_cases(names: list[str], cases: dict[str, Case]) -> list[Case]:
-    """The cases called for, each once."""
+    """Return the requested cases, each once."""
     unknown = [name for name in names if name not in cases and name != "all"]
     if unknown:
         raise UsageError(f"no case {', '.join(unknown)}: use {', '.join(cases)} or all")
@@ -94,7 +94,7 @@ def choose_cases(names: list[str], cases: dict[str, Case]) -> list[Case]:
 
 
 def choose_devices(names: list[str] | None) -> list[Any]:
-    """The devices called for; "all" is every usable one but simulators."""
+    """Return the requested devices; "all" means every usable device except simulators."""
     from clrecon.opencl import choose_device, list_devices
 
     if names and "all" in names:
@@ -103,7 +103,7 @@ def choose_devices(names: list[str] | None) -> list[Any]:
 
 
 def run_cases(options: argparse.Namespace) -> int:
-    """Measure every case on every input and device; 1 when one of them fails."""
+    """Measure every case on every input and device; returns 1 if one fails."""
     if options.pairs < 1 or options.peer_threads < 1:
         raise UsageError("--pairs and --peer-threads are 1 or more")
     cases = choose_cases(options.cases, load_cases())
@@ -130,7 +130,7 @@ def run_cases(options: argparse.Namespace) -> int:
 
 
 def complete(case: Case, job: Job, machine: dict[str, Any], figures: dict[str, Any]) -> dict[str, Any]:
-    """A result: what was measured, of what, on what."""
+    """Make a result: the measurements with case, input, device and machine."""
     return {
         "schema": SCHEMA,
         "case": case.name,
@@ -149,7 +149,7 @@ def complete(case: Case, job: Job, machine: dict[str, Any], figures: dict[str, A
 
 
 def keep(result: dict[str, Any], folder: Path | None) -> None:
-    """Print the ratios of a result and write it where a folder is given."""
+    """Print the ratios of a result, and write it if a folder is given."""
     for name, ratio in result["ratios"].items():
         side = result.get("sides", {}).get(name)
         times = f"  {seconds(side['clrecon_s']['median'])} : {seconds(side['peer_s']['median'])}" if side else ""
@@ -173,7 +173,7 @@ def keep(result: dict[str, Any], folder: Path | None) -> None:
 
 
 def draw(options: argparse.Namespace) -> int:
-    """Write the PNG files and name them."""
+    """Write the PNG files and print their names."""
     from plots import plot_ratios, plot_scaling
 
     results = pick(load_results(options.folder), options.case, options.ratio)
@@ -188,7 +188,7 @@ def draw(options: argparse.Namespace) -> int:
 
 
 def compare_folders(options: argparse.Namespace) -> int:
-    """Print what changed; 1 when a ratio fell, 2 when nothing can be compared."""
+    """Print the changes; returns 1 if a ratio fell, 2 if nothing can be compared."""
     changes, left_out = compare_results(load_results(options.baseline), load_results(options.new), options.percent)
     for text in left_out:
         print(text, file=sys.stderr)

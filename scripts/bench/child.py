@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""A fresh process for the cases that need one: child.py TASK VOXELS.npy AFFINE.npy HU DEVICE THREADS.
+"""Program for cases that need a fresh process: child.py TASK VOXELS.npy AFFINE.npy HU DEVICE THREADS.
 
 TASK is first-own, first-peer, memory-own or memory-peer.  Prints one JSON object.
 """
@@ -17,7 +17,7 @@ import numpy as np
 
 
 def load(voxels: str, affine: str) -> Any:
-    """The volume in memory, every page touched."""
+    """Load the volume into memory, with every page touched."""
     from clrecon.geometry import Volume
 
     return Volume(np.load(voxels), np.load(affine))
@@ -59,7 +59,7 @@ def first_peer(volume: Any, hu: float, device: str, threads: int) -> dict[str, A
 
 
 def resident_bytes(name: str) -> int | None:
-    """VmRSS (now) or VmHWM (peak) of this process; None where the system does not tell."""
+    """VmRSS (now) or VmHWM (peak) of this process; None if the system does not tell."""
     try:
         lines = Path("/proc/self/status").read_text().splitlines()
     except OSError:
@@ -69,7 +69,7 @@ def resident_bytes(name: str) -> int | None:
 
 
 def forget_peak() -> bool:
-    """Let VmHWM start anew from what is resident now."""
+    """Reset VmHWM to the memory that is resident now."""
     try:
         Path("/proc/self/clear_refs").write_text("5")
     except OSError:
@@ -78,7 +78,7 @@ def forget_peak() -> bool:
 
 
 def measure_peak(run: Any) -> dict[str, Any]:
-    """Resident bytes before a run and at its peak.  `run` returns the bytes of its outputs."""
+    """Measure the resident bytes before a run and at its peak; `run` returns the bytes of its outputs."""
     reset = forget_peak()
     before = resident_bytes("VmRSS")
     output = run()
@@ -87,7 +87,7 @@ def measure_peak(run: Any) -> dict[str, Any]:
 
 
 def small_volume(volume: Any) -> Any:
-    """A corner of a volume with a surface in it: warms everything up without its memory."""
+    """Return a corner of a volume with a surface in it, for a warm-up that needs little memory."""
     from clrecon.geometry import Volume
 
     voxels = np.zeros((16, 16, 16), dtype=volume.voxels.dtype)
@@ -96,7 +96,7 @@ def small_volume(volume: Any) -> Any:
 
 
 def memory_own(volume: Any, hu: float, device: str, threads: int) -> dict[str, Any]:
-    """Resident memory around one extraction by a process that has done a small one."""
+    """Measure the resident memory of one extraction, after a small one as warm-up."""
     from clrecon.opencl import choose_device
     from clrecon.operators.surface.extract import extract_isosurface
 
@@ -115,7 +115,7 @@ def memory_own(volume: Any, hu: float, device: str, threads: int) -> dict[str, A
 
 
 def memory_peer(volume: Any, hu: float, device: str, threads: int) -> dict[str, Any]:
-    """Resident memory around one run of flying edges; its output is counted as VTK stores it."""
+    """Measure the resident memory of one run of flying edges; its output is counted as VTK stores it."""
     from clrecon.geometry.iso_rule import choose_iso_rule
     from clrecon.jobs.bench.peer import FlyingEdges
 
@@ -138,7 +138,7 @@ TASKS = {"first-own": first_own, "first-peer": first_peer, "memory-own": memory_
 
 def main(task: str, voxels: str, affine: str, hu: str, device: str, threads: str) -> None:
     print(json.dumps(TASKS[task](load(voxels, affine), float(hu), device, int(threads))), flush=True)
-    os._exit(0)  # as `clrecon` ends: freeing memory and drivers piece by piece is no part of the work
+    os._exit(0)  # `clrecon` ends like this: freeing memory and drivers piece by piece is not part of the work
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Hold new results against a stored baseline."""
+"""Comparison of new results with a stored baseline."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ class Change:
     Attributes
     ----------
     fell : bool
-        The new median lies more than the allowed share below the lower quartile of the baseline, and its own upper
-        quartile lies below the baseline's median: a loss that neither spread explains.
+        True for a loss that neither spread explains: the new median lies more than the allowed share below the lower
+        quartile of the baseline, and the new upper quartile lies below the baseline's median.
     """
 
     key: Key
@@ -30,7 +30,7 @@ class Change:
 
     @property
     def share(self) -> float:
-        """New median over old."""
+        """New median divided by the old one."""
         return self.now["median"] / self.before["median"]
 
 
@@ -42,20 +42,20 @@ def has_fallen(before: dict[str, float], now: dict[str, float], percent: float) 
 def compare_results(
     baseline: dict[Key, dict[str, Any]], new: dict[Key, dict[str, Any]], percent: float
 ) -> tuple[list[Change], list[str]]:
-    """Compare what both hold.
+    """Compare the ratios that both sides have.
 
     Parameters
     ----------
     baseline, new : dict
-        As `results.load_results` gives them.
+        Results from `results.load_results`.
     percent : float
-        How far a ratio may fall below the spread of the baseline.
+        Allowed fall of a ratio below the spread of the baseline.
 
     Returns
     -------
     changes : list of Change
     left_out : list of str
-        What only one side holds, in words.
+        Descriptions of results that only one side has.
     """
     changes, left_out = [], []
     for key in sorted({*baseline, *new}):
@@ -77,7 +77,7 @@ def _ratio(ratio: dict[str, float]) -> str:
 
 
 def format_changes(changes: list[Change]) -> str:
-    """A table for people."""
+    """Make a table for people."""
     rows = [
         (*change.key, change.ratio, _ratio(change.before), _ratio(change.now), f"{change.share:.2f}",
          "FELL" if change.fell else "")

@@ -1,4 +1,4 @@
-"""Connected components of the surface on the device, beside what scipy and cc3d find on the mesh and on the mask."""
+"""Case of connected components: the surface on the device, beside scipy and cc3d on the mesh and on the mask."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ __all__ = ["measure_components"]
 
 @case("components", "components of the surface on the device, against scipy and cc3d")
 def measure_components(job: Job) -> dict[str, Any]:
-    """Mesh in host memory to a number for each vertex in host memory, upload and download included.
+    """Time the numbering of all vertices by component, from host memory to host memory.
 
-    Peers: scipy.sparse.csgraph on the same mesh, with the same outcome; scipy.ndimage.label and cc3d on the mask of
-    the voxels inside (faces, and faces to corners), which find the solids and not their surfaces: a cavity is no
-    component of theirs.  They get the mask as a gift.
+    Peers: scipy.sparse.csgraph on the same mesh, with the same result; scipy.ndimage.label and cc3d on the mask of the
+    voxels inside (neighbours by faces, and by faces to corners).  The last two find solids, not surfaces: a cavity is
+    not a component there.  The time to make the mask is not counted.
     """
     import cc3d
     import numpy as np

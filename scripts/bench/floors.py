@@ -1,10 +1,10 @@
-"""The physical floor: how long the machine takes to move the bytes that a surface must move.
+"""The physical floor of a surface: the time that the machine needs to move its bytes.
 
     bytes = 2 N f + m N / 8 + (24 V + 12 T) w
 
-N voxels of two bytes, f the share that is read (1 cold; warm the share of 8^3 bricks that the surface crosses), m
-transits of the one-bit mask (CPU 5: written with write-allocate, read three times; GPU 3), V vertices with normal, T
-triangles, w 2 on CPUs (write-allocate) and 1 on GPUs.
+N: voxels of two bytes.  f: share of them that is read, 1 cold, and warm the share of 8^3 bricks that the surface
+crosses.  m: passes over the one-bit mask, 5 on CPUs (written with write-allocate, read three times) and 3 on GPUs.
+V: vertices with normal.  T: triangles.  w: 2 on CPUs (write-allocate) and 1 on GPUs.
 """
 
 from __future__ import annotations
@@ -32,14 +32,14 @@ _COPY_BYTES = 1 << 28
 
 
 def floor_bytes(voxels: int, itemsize: int, vertices: int, triangles: int, is_cpu: bool, read_share: float = 1) -> int:
-    """Bytes that must move, see the head of this file."""
+    """Smallest number of bytes that must move, see the head of this file."""
     transits, writes = (5, 2) if is_cpu else (3, 1)
     output = (24 * vertices + 12 * triangles) * writes
     return round(itemsize * voxels * read_share + transits * voxels / 8 * read_share + output)
 
 
 def kernel_bytes(voxels: int, itemsize: int, vertices: int, triangles: int) -> dict[str, int]:
-    """Bytes that the heavy kernels must move at least, each input read once, by kernel."""
+    """Smallest number of bytes that each heavy kernel must move, with each input read once."""
     mask = voxels // 8
     return {
         "classify_samples": itemsize * voxels + mask,
@@ -50,17 +50,17 @@ def kernel_bytes(voxels: int, itemsize: int, vertices: int, triangles: int) -> d
 
 
 def usable_bandwidth(bandwidth: dict[str, float], device: Any) -> float:
-    """The best measured copy on a CPU; on another device its own."""
+    """Return the bandwidth of the best copy on a CPU; on another device that of its own copy."""
     return max(bandwidth.values()) if device.type == "cpu" else bandwidth["opencl"]
 
 
 def share_of_floor(moved: int, bandwidth: float, seconds: float) -> float | None:
-    """Per cent of a bandwidth (bytes read and written a second) that a run achieves; None without a time."""
+    """Return how many per cent of a bandwidth (bytes read and written a second) a run achieves; None without a time."""
     return 100.0 * moved / bandwidth / seconds if seconds > 0 else None
 
 
 def active_brick_share(voxels: NDArray[Any], lowest_inside: float) -> float:
-    """Share of the 8^3 bricks (over 9^3 samples: neighbours share a layer) that hold inside and outside."""
+    """Share of the 8^3 bricks with voxels inside and outside (each has 9^3 samples: neighbours share a layer)."""
     low = high = voxels
     for axis in range(3):
         starts = np.arange(0, max(voxels.shape[axis] - 1, 1), BRICK)
@@ -71,7 +71,7 @@ def active_brick_share(voxels: NDArray[Any], lowest_inside: float) -> float:
 
 
 def copy_bandwidth(device: Any) -> dict[str, float]:
-    """Bytes read plus bytes written a second of plain copies of 256 MiB, the best of five.
+    """Measure the bandwidth of copies of 256 MiB: bytes read plus bytes written a second, the best of five.
 
     ``numpy_1_thread``, ``numpy_all_threads`` and ``opencl`` (clEnqueueCopyBuffer on `device`).
     """

@@ -1,4 +1,4 @@
-"""What cases run on: made-up volumes by name, or CT folders.
+"""Inputs of cases: synthetic volumes by name, or CT folders.
 
 | name       | what                                                                    |
 |------------|-------------------------------------------------------------------------|
@@ -10,7 +10,7 @@
 | noiseN     | white noise in N x N x N voxels: the densest surface that there is      |
 | NAME=PATH  | CT folder, called NAME in the results; without NAME= the folder's name  |
 
-Phantoms are made once into the work folder.
+Phantoms are made once and kept in the work folder.
 """
 
 from __future__ import annotations
@@ -32,14 +32,14 @@ _SIZE = 512
 
 @dataclass(frozen=True)
 class BenchInput:
-    """A named input; `folder` is None for a made-up one."""
+    """A named input; `folder` is None for a synthetic one."""
 
     name: str
     work: Path
     folder: Path | None = None
 
     def arrays(self) -> tuple[Path, Path]:
-        """Paths of voxels (nk, nj, ni) and affine (4, 4) as .npy, made where they are not there."""
+        """Return the paths of voxels (nk, nj, ni) and affine (4, 4) as .npy; missing files are made."""
         self.work.mkdir(mode=0o700, parents=True, exist_ok=True)
         voxels, affine = self.work / f"{self.name}-voxels.npy", self.work / f"{self.name}-affine.npy"
         if self.folder is not None or not (voxels.is_file() and affine.is_file()):
@@ -106,7 +106,7 @@ class BenchInput:
 
 
 def _save(path: Path, array: Any) -> None:
-    """Save under another name first: an interrupted run leaves no half array behind."""
+    """Save under another name first, so that an interrupted run leaves no incomplete array."""
     half = path.with_name(f"half-{os.getpid()}-{path.name}")
     np.save(half, array)
     half.replace(path)
@@ -119,7 +119,7 @@ def _split(name: str) -> tuple[str, int]:
 
 
 def _phantom_settings(name: str) -> Any:
-    """Settings of the spine phantom behind a name; None for inputs that are made otherwise."""
+    """Return the settings of the spine phantom of a name; None for other inputs."""
     from clrecon.phantom import PhantomSettings
 
     kind, slices = _split(name)
@@ -140,7 +140,7 @@ def parse_input(text: str, work: Path) -> BenchInput:
     Raises
     ------
     UsageError
-        It is no made-up input and no folder.
+        The text is neither a synthetic input nor a folder.
     """
     from clrecon.errors import UsageError
 

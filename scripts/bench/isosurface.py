@@ -1,4 +1,4 @@
-"""Surfaces in one process, beside vtkFlyingEdges3D on the same array at the same level."""
+"""Cases of surfaces in one process, beside vtkFlyingEdges3D on the same array at the same level."""
 
 from __future__ import annotations
 
@@ -21,8 +21,9 @@ from registry import Job, case
 __all__ = ["LEVEL_STEPS", "OwnSide", "PeerSide", "measure_cold", "measure_resident"]
 
 LEVEL_STEPS = (0, 150, 40, 250, 80, 300, 20)
-"""HU above the iso value that `isosurface-resident` walks through; every round starts one HU higher, so that no iso
-value is ever asked for twice and nothing can be kept by value."""
+"""Steps of `isosurface-resident`, HU above the iso value; every round starts one HU higher.
+
+No iso value is used twice, so that no result can be cached."""
 
 PAGES = (
     "all_threads, sequential: the outputs of a call are freed before the next one, so that clrecon, the C library or"
@@ -31,7 +32,7 @@ PAGES = (
 
 
 class OwnSide:
-    """Runs clrecon and keeps what its meshes say."""
+    """Runs of clrecon, with the reports of its meshes."""
 
     def __init__(self, extract: Callable[[float], Any]):
         self._extract = extract
@@ -43,7 +44,7 @@ class OwnSide:
         self.device_bytes: dict[str, int] | None = None
 
     def run(self, hu: float) -> float:
-        """Seconds of one surface; the mesh is freed before this returns, unless there is a list to `keep` it."""
+        """Return the seconds of one surface; the mesh is freed afterwards, unless a list is given to `keep` it."""
         start = time.perf_counter()
         mesh = self.costs.measure(lambda: self._extract(hu))
         seconds = time.perf_counter() - start
@@ -66,7 +67,7 @@ class OwnSide:
 
 
 class PeerSide:
-    """Runs vtkFlyingEdges3D."""
+    """Runs of vtkFlyingEdges3D."""
 
     def __init__(self, volume: Any, threads: int):
         from clrecon.jobs.bench.peer import FlyingEdges
@@ -78,20 +79,20 @@ class PeerSide:
         self.counts: list[tuple[int, int]] = []
 
     def run(self, hu: float) -> float:
-        """Seconds of one surface at the level where clrecon puts it; the output is freed or kept as there."""
+        """Return the seconds of one surface at clrecon's level; the output is freed or kept as in `OwnSide`."""
         level = level_of(self._volume, hu)
         done = self.costs.measure(lambda: self._peer.run(level, self.keep))
         self.counts.append((done.vertices, done.triangles))
         return float(done.seconds)
 
     def describe(self) -> dict[str, Any]:
-        """What it is and what its runs cost."""
+        """Describe the peer and the costs of its runs."""
         name = f"vtkFlyingEdges3D {self._peer.version}, normals on, scalars and gradients off"
         return {"name": name, "threads": self._peer.threads, "cost": self.costs.describe()}
 
 
 def level_of(volume: Any, hu: float) -> float:
-    """Where the surface lies between two voxels: k - 0.5 for whole HU.  Asks one voxel: the caches stay as they are."""
+    """Return the HU of the surface between voxels: k - 0.5 for whole HU.  One voxel is read: the caches stay."""
     from clrecon.geometry import Volume
     from clrecon.geometry.iso_rule import choose_iso_rule
 
@@ -101,12 +102,12 @@ def level_of(volume: Any, hu: float) -> float:
 def describe_surface(
     job: Job, volume: Any, side: dict[str, Any], counts: tuple[int, int], seconds: float, read_share: float
 ) -> dict[str, Any]:
-    """Counts, rates, time by kernel, and the shares of the physical floor."""
+    """Describe surfaces: counts, rates, time by kernel, and shares of the physical floor."""
     bandwidth = copy_bandwidth(job.device)
     best = usable_bandwidth(bandwidth, job.device)
     shape = (volume.voxels.size, volume.voxels.itemsize, *counts)
     moved = floor_bytes(*shape, job.device.type == "cpu", read_share)
-    # Some drivers' event times say nothing: no time by kernel then.
+    # The event times of some drivers are useless: no time by kernel then.
     kernels = side["clrecon"]["kernel_seconds"] if job.device.has_event_times else {}
     return {
         "vertices": counts[0],
@@ -192,7 +193,7 @@ def walk_levels(hu: float) -> Iterator[float]:
 
 @case("isosurface-resident", "a new iso value on a volume that is on the device, against flying edges")
 def measure_resident(job: Job) -> dict[str, Any]:
-    """Both sides walk through the same iso values, none of them twice."""
+    """Time both sides at the same iso values, none of them twice."""
     from clrecon.operators.surface.extract import SurfaceExtractor, prepare_isosurface
 
     volume = job.input.volume()

@@ -1,4 +1,4 @@
-"""Labels' own surfaces, beside VTK's surface nets with as many rounds of smoothing as are usual."""
+"""Case of labels' own surfaces, beside VTK's surface nets with the usual number of smoothing rounds."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ AIR_HU = -400
 
 @case("label-masks", "labels' own surfaces with their volumes, against surface nets with 16 rounds of smoothing")
 def measure_label_masks(job: Job) -> dict[str, Any]:
-    """Label map in host memory to meshes in host memory, for one large label and for several that touch.
+    """Time meshes of a label map, from host memory to host memory, for one large label and for several that touch.
 
     The large label is the largest body of air within the patient, such as the lungs; the others are layers of all that
-    is near dense voxels.  The peer makes one mesh of all labels; its triangles say which two they lie between.
+    is near dense voxels.  The peer makes one mesh of all labels; each triangle has the two labels at its sides.
     """
     from clrecon.labels import LabelMap
     from clrecon.operators.surface.label_masks import extract_label_masks
@@ -73,7 +73,7 @@ def _make_maps(job: Job) -> dict[str, Any]:
 
 
 def _peer(labels: Any, threads: int) -> Callable[[], tuple[Any, Any, Any]]:
-    """What makes the peer's mesh: points, triangles and the two labels beside each."""
+    """Make the function of the peer's mesh: points, triangles, and the two labels beside each triangle."""
     import numpy as np
     from vtkmodules.util.numpy_support import numpy_to_vtk, vtk_to_numpy
     from vtkmodules.vtkCommonCore import vtkSMPTools
@@ -83,7 +83,7 @@ def _peer(labels: Any, threads: int) -> Callable[[], tuple[Any, Any, Any]]:
     vtkSMPTools.SetBackend("STDThread")
     vtkSMPTools.Initialize(threads)
 
-    padded = np.pad(labels.voxels, 1)  # without it the nets are open where the map ends
+    padded = np.pad(labels.voxels, 1)  # else the nets are open at the border of the map
 
     def run() -> tuple[Any, Any, Any]:
         image = vtkImageData()

@@ -1,4 +1,4 @@
-"""One mesh a label, beside VTK's ways to make them: from the mask, or from HU that were blanked beside the label."""
+"""Case of one mesh per label, beside VTK's ways: from the mask, or from HU with air outside of the label."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ LABELS = 8
     "labels", "one mesh a label, against surface nets and discrete flying edges on the mask, flying edges on blanked HU"
 )
 def measure_labels(job: Job) -> dict[str, Any]:
-    """Volume and label map in host memory to meshes in host memory, resampling of the labels included.
+    """Time meshes of labels, from host memory to host memory, resampling of the labels included.
 
-    The label map is made up: layers of all that is near dense voxels, on the grid of the volume.  Peers get labels on
+    The label map is synthetic: layers of all that is near dense voxels, on the grid of the volume.  Peers get labels on
     that grid.  Surface nets and discrete flying edges contour the mask and make its steps; the third peer gives
     air to all voxels of a label's box that do not carry it, and contours HU: borders lie where the mask ends.
     """
@@ -57,7 +57,7 @@ def measure_labels(job: Job) -> dict[str, Any]:
 
 
 def _peers(volume: Any, labels: Any, hu: float, threads: int) -> dict[str, Callable[[], int]]:
-    """Each makes the meshes of all labels and returns their triangles."""
+    """Return the peers: each makes the meshes of all labels and returns their triangles."""
     import numpy as np
     from scipy.ndimage import find_objects
     from vtkmodules.util.numpy_support import numpy_to_vtk

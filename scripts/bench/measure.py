@@ -1,4 +1,4 @@
-"""How benches measure: processes, page faults, cores that were really had, the machine and its bandwidth."""
+"""Measurements of benches: processes, page faults, cores in use, and facts about the machine."""
 
 from __future__ import annotations
 
@@ -33,12 +33,12 @@ _PACKAGES = ("numpy", "pyopencl", "vtk", "SimpleITK", "scipy", "connected-compon
 
 
 def run_program(command: Sequence[str], timeout_s: float = 600.0) -> tuple[float, str]:
-    """Run a program to its end; wall seconds of the whole process and what it printed.
+    """Run a program to its end; returns the wall seconds of the whole process and its output.
 
     Raises
     ------
     RuntimeError
-        It fails or takes longer than `timeout_s`.
+        The program fails or takes longer than `timeout_s`.
     """
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, (str(ROOT), os.environ.get("PYTHONPATH"))))}
     start = time.perf_counter()
@@ -53,14 +53,14 @@ def run_program(command: Sequence[str], timeout_s: float = 600.0) -> tuple[float
 
 
 class Costs:
-    """What runs of one side cost beside their seconds: page faults, and how many cores they really had."""
+    """Costs of the runs of one side besides seconds: page faults, and the number of cores in use."""
 
     def __init__(self) -> None:
         self.page_faults: list[int] = []
         self.cores_used: list[float] = []
 
     def measure(self, run: Callable[[], Any]) -> Any:
-        """Run, and keep what it cost."""
+        """Run a function and keep its costs."""
         before, start = _usage(), time.perf_counter()
         result = run()
         wall, after = time.perf_counter() - start, _usage()
@@ -69,12 +69,12 @@ class Costs:
         return result
 
     def describe(self) -> dict[str, float]:
-        """Medians of a run."""
+        """Return the medians over all runs."""
         return {"page_faults": spread(self.page_faults)["median"], "cores_used": spread(self.cores_used)["median"]}
 
 
 def _usage() -> tuple[int, float]:
-    """Page faults and processor seconds of this process so far (no faults where the system does not count)."""
+    """Page faults and processor seconds of this process so far (0 faults if the system does not count them)."""
     try:
         import resource
     except ImportError:  # Windows
@@ -90,7 +90,7 @@ def medians(runs: Sequence[dict[str, float]]) -> dict[str, float]:
 
 
 def describe_machine() -> dict[str, Any]:
-    """What a reader needs to place the figures."""
+    """Describe the machine and the versions, for readers of the figures."""
     versions = {"clrecon": package_version()}
     for name in _PACKAGES:
         try:
@@ -112,7 +112,7 @@ def describe_machine() -> dict[str, Any]:
 
 
 def _caches(folder: Path = Path("/sys/devices/system/cpu/cpu0/cache")) -> dict[str, str] | None:
-    """Size of each cache as the system says it; None where it does not."""
+    """Size of each cache as the system reports it; None if it does not."""
     caches = {}
     for entry in sorted(folder.glob("index*")):
         try:
@@ -124,7 +124,7 @@ def _caches(folder: Path = Path("/sys/devices/system/cpu/cpu0/cache")) -> dict[s
 
 
 def _revision() -> str | None:
-    """Git revision of the measured code, with a + when files differ from it."""
+    """Git revision of the measured code, with a + if files differ from it."""
     try:
         done = subprocess.run(
             ["git", "describe", "--always", "--dirty=+", "--exclude=*"], cwd=ROOT, capture_output=True, text=True
@@ -135,7 +135,7 @@ def _revision() -> str | None:
 
 
 def write_json(path: Path, result: dict[str, Any]) -> None:
-    """Keep a result, readable and stable under diff."""
+    """Write a result as JSON that is readable and stable under diff."""
     from clrecon.jobs.shared.report import to_json
 
     plain = json.loads(to_json(result))

@@ -1,4 +1,4 @@
-"""Results as PNG: bars of all ratios, and curves of how time grows."""
+"""Plots of results as PNG: bars of all ratios, and curves of time over size."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _UNITS = {"voxels": (1e-6, "million voxels"), "triangles": (1e-6, "million trian
 
 
 def plot_ratios(results: dict[Key, dict[str, Any]], path: Path) -> int:
-    """Draw one bar a ratio with its quartiles, grouped by case; returns the number of bars.
+    """Draw one bar per ratio with its quartiles, grouped by case; returns the number of bars.
 
     Raises
     ------

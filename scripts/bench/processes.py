@@ -15,7 +15,7 @@ __all__ = ["measure_first_call", "measure_main_job", "measure_memory"]
 
 
 class Child:
-    """Runs child.py and keeps what it printed."""
+    """Runs of child.py, with their outputs."""
 
     def __init__(self, job: Job, task: str, arrays: tuple[Path, Path]):
         facts = (task, *map(str, arrays), f"{job.hu!r}", str(job.device.index), str(job.peer_threads))
@@ -24,7 +24,7 @@ class Child:
         self.printed: list[dict[str, Any]] = []
 
     def run(self) -> float:
-        """Seconds that the child itself measured."""
+        """Run the child once; returns the seconds that it measured itself."""
         whole, text = run_program(self._command)
         self.wholes.append(whole)
         self.printed.append(json.loads(text))
@@ -35,7 +35,7 @@ class Child:
     "isosurface-first-call", "first surface of a fresh process, kernel cache warm, against the same with flying edges"
 )
 def measure_first_call(job: Job) -> dict[str, Any]:
-    """After the imports and with the volume in memory; opening the device counts, the imports do not."""
+    """Time the first call with the volume in memory; opening the device counts, imports do not."""
     arrays = job.input.arrays()
     own, peer = Child(job, "first-own", arrays), Child(job, "first-peer", arrays)
     ours, theirs = alternate(own.run, peer.run, job.pairs, limit_s=job.limit_s)
@@ -65,12 +65,12 @@ def _in_turn(child: Child) -> list[float]:
 
 MEMORY_RUNS = 3
 FEWEST_VOXELS = 1 << 22
-"""Below it the pages that libraries take by the way are as much as the scratch memory."""
+"""Smallest volume: in smaller ones the pages of libraries are as many as those of the scratch memory."""
 
 
 @case("memory", "scratch bytes a voxel beyond volume and output: as the operator sums it, and as the system saw it")
 def measure_memory(job: Job) -> dict[str, Any]:
-    """Peak of resident memory less what was resident before, less the output; fresh processes, a few of each."""
+    """Measure the scratch memory in fresh processes: peak of resident memory, less that before, less the output."""
     arrays = job.input.arrays()
     own, peer = Child(job, "memory-own", arrays), Child(job, "memory-peer", arrays)
     for _ in range(min(job.pairs, MEMORY_RUNS)):
@@ -109,7 +109,7 @@ def _count_voxels(path: Path) -> int:
 
 @case("main-job", "CT folder to STL file, whole processes, against SimpleITK, flying edges and vtkSTLWriter")
 def measure_main_job(job: Job) -> dict[str, Any]:
-    """Warm caches: one untimed run of each beforehand."""
+    """Time the whole job with warm caches: each side has one untimed run before."""
     folder = job.input.ct_folder()
     with tempfile.TemporaryDirectory(prefix="clrecon-bench-") as scratch:
         mesh, peer_mesh, report = (Path(scratch) / name for name in ("clrecon.stl", "peer.stl", "report.json"))

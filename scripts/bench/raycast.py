@@ -1,4 +1,4 @@
-"""Pictures in one process, beside VTK's volume mappers with the same camera, transfer function, light and ray step."""
+"""Cases of pictures, beside VTK's volume mappers with the same camera, transfer function, light and ray step."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ __all__ = ["Shot", "make_shots", "measure_first", "measure_gpu_mapper", "measure
 
 SIZE = (1024, 1024)
 ZOOM = 1.0
-"""The volume then fills the picture; at 1 there is room around it to turn in."""
+"""Zoom of all pictures, the default of `Camera.fit`."""
 VIEW_ANGLE = 30.0
 GPU_PAIRS = 3
-"""Of frames that take ten seconds and more."""
+"""Number of pairs with frames of ten seconds and more."""
 TIMED = {
     "clrecon": "VolumeRenderer.render: from the call to a picture (RGBA and depths) in the computer's memory",
     "fixed-point": "PerImageInitialization, PerVolumeInitialization, PerSubVolumeInitialization and RenderSubVolume"
@@ -31,7 +31,7 @@ TIMED = {
 
 @dataclass(frozen=True)
 class Shot:
-    """A camera by name, and all that both sides draw with."""
+    """A named camera, with everything that both sides draw with."""
 
     name: str
     camera: Any
@@ -40,7 +40,7 @@ class Shot:
     ray_step: float
 
     def options(self) -> dict[str, Any]:
-        """For `VolumeRenderer.render`."""
+        """Keyword arguments of `VolumeRenderer.render`."""
         return {
             "transfer_function": self.function,
             "camera": self.camera,
@@ -51,14 +51,14 @@ class Shot:
         }
 
     def scene(self, volume: Any) -> Any:
-        """For VTK."""
+        """The same as a scene for VTK."""
         from peers.vtk_stage import scene_of
 
         return scene_of(volume, self.camera, self.function, self.lighting, size=SIZE, ray_step=self.ray_step)
 
 
 def make_shots(volume: Any) -> list[Shot]:
-    """Anterior, in parallel and in perspective projection; preset bone, half the smallest spacing, shaded."""
+    """Make two shots from the front, parallel and perspective: preset bone, half the smallest spacing, shaded."""
     from clrecon.rendering.looks.presets import find_preset
     from clrecon.rendering.views.camera import Camera
 
@@ -75,7 +75,7 @@ def make_shots(volume: Any) -> list[Shot]:
 
 
 class OwnSide:
-    """Runs clrecon."""
+    """Runs of clrecon."""
 
     def __init__(self, draw: Callable[[], Any]):
         self._draw = draw
@@ -98,7 +98,7 @@ class OwnSide:
 
 
 class PeerSide:
-    """Runs a mapper of VTK."""
+    """Runs of a mapper of VTK."""
 
     def __init__(self, draw: Callable[[], float], **facts: Any):
         self._draw = draw
@@ -106,11 +106,11 @@ class PeerSide:
         self.costs = Costs()
 
     def run(self) -> float:
-        """Seconds of one picture, as the peer counts them."""
+        """Draw one picture; returns its seconds as the peer counts them."""
         return float(self.costs.measure(self._draw))
 
     def describe(self) -> dict[str, Any]:
-        """What it is and what its runs cost."""
+        """Describe the peer and the costs of its runs."""
         return {**self._facts, "cost": self.costs.describe()}
 
 
@@ -139,7 +139,7 @@ def likeness(ours: Any, theirs: Any) -> float:
 
 
 def keep_pictures(folder: Path | None, name: str, **pictures: Any) -> None:
-    """Write pictures as NAME-SIDE.png where a folder is given."""
+    """Write pictures as NAME-SIDE.png if a folder is given."""
     if folder is None:
         return
     from PIL import Image
@@ -169,7 +169,7 @@ def measure_likeness(job: Job, volume: Any, renderer: Any, shot: Shot, peer: Any
 
 @case("raycast-warm", "a further picture of a volume on the device, against VTK's fixed-point mapper with all cores")
 def measure_warm(job: Job) -> dict[str, Any]:
-    """Parallel and perspective, and what another transfer function costs."""
+    """Time warm pictures, parallel and in perspective, and the cost of another transfer function."""
     from peers.vtk_fixed_point import FixedPointPeer
 
     import clrecon
@@ -191,10 +191,10 @@ def measure_warm(job: Job) -> dict[str, Any]:
 
 
 def measure_change(renderer: Any, shot: Shot, pairs: int) -> dict[str, Any]:
-    """What a frame with another transfer function takes beyond one with the same: seconds, and per cent of a frame.
+    """Measure the additional time of a frame with another transfer function: seconds, and per cent of a frame.
 
-    The functions differ by a thousandth of a HU, so that their pictures cost the same; what counts is the time beside
-    the longest kernel, which casts the rays and whose moods would hide the rest.
+    The functions differ by a thousandth of a HU, so that their pictures cost the same.  The time of the longest kernel,
+    which casts the rays, is left out: its variation would hide the rest.
     """
     number = 0
 
@@ -217,7 +217,7 @@ def measure_change(renderer: Any, shot: Shot, pairs: int) -> dict[str, Any]:
 
 @case("raycast-first", "the first picture of a volume in memory, bricks included, against the fixed-point mapper")
 def measure_first(job: Job) -> dict[str, Any]:
-    """Each pair begins with a renderer and a mapper that have seen nothing; kernels are built."""
+    """Time first pictures: each pair has a new renderer and a new mapper; the kernels are already built."""
     from peers.vtk_fixed_point import FixedPointPeer
 
     import clrecon
@@ -240,7 +240,7 @@ def measure_first(job: Job) -> dict[str, Any]:
 
 @case("raycast-gpu-mapper", "a further picture against VTK's GPU mapper on the OpenGL that is there (Mesa's llvmpipe)")
 def measure_gpu_mapper(job: Job) -> dict[str, Any]:
-    """The mapper has a process of its own, which waits while clrecon draws."""
+    """Time pictures beside VTK's OpenGL mapper, whose process waits while clrecon draws."""
     from peers.vtk_gpu import GpuPeer
 
     import clrecon
@@ -263,7 +263,7 @@ def measure_gpu_mapper(job: Job) -> dict[str, Any]:
 
 
 def describe_pictures(shots: list[Shot]) -> dict[str, Any]:
-    """What was drawn and timed."""
+    """Describe what was drawn and timed."""
     return {
         "size": SIZE,
         "ray_step_mm": shots[0].ray_step,

@@ -26,10 +26,10 @@ RUNS = 3
 
 @case("reading", "CT folder to HU in memory: against pydicom's loop, SimpleITK and dcm2niix; warm file cache")
 def measure_reading(job: Job) -> dict[str, Any]:
-    """In one process after the imports (``..._warm``), and in a fresh process with its imports (``..._process``).
+    """Time the readers in one process after the imports (``..._warm``), and in fresh processes (``..._process``).
 
     dcm2niix is a program whose start costs next to nothing and which writes an uncompressed NIfTI file, to memory
-    where the system has such a folder.  It is held against `read_volume` in a running Python and against a whole
+    where the system has such a folder.  It is compared with `read_volume` in a running Python, and with a whole
     process that starts Python, loads numpy and reads.
     """
     folder = job.input.ct_folder()
@@ -73,7 +73,7 @@ def measure_reading(job: Job) -> dict[str, Any]:
 
 @case("scan-tree", "headers of 1,000, 10,000 and 100,000 files; at 1,000 against pydicom without pixels")
 def measure_scan_tree(job: Job) -> dict[str, Any]:
-    """A fresh process a run; seconds and growth of the resident memory for each file.  The input is not used."""
+    """Measure seconds and growth of resident memory per file, in fresh processes.  The input is not used."""
     points: list[dict[str, Any]] = []
     ratios, sides = {}, {}
     scan = _load_scan()
@@ -120,7 +120,7 @@ def _load_scan() -> Callable[[Path], Any]:
 
 
 def _read_headers(folder: Path) -> int:
-    """Headers with pydicom, no pixels, and no more tags than a stack needs."""
+    """Read headers with pydicom: no pixels, and only the tags that a stack needs."""
     import pydicom
 
     tags = ["SeriesInstanceUID", "ImagePositionPatient", "ImageOrientationPatient", "PixelSpacing", "Rows", "Columns"]
@@ -148,6 +148,6 @@ def _process(reader: str, folder: Path) -> Callable[[], float]:
 
 
 def _memory_folder() -> Path | None:
-    """A folder in memory, where the system has one."""
+    """Return a folder in memory if the system has one."""
     folder = Path("/dev/shm")
     return folder if folder.is_dir() else None

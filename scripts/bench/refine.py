@@ -1,4 +1,4 @@
-"""Smoothing, decimation and quality beside VTK, which has no bound in mm and measures less."""
+"""Case of smoothing, decimation and quality, beside VTK, which has no bound in mm and measures less."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from registry import Job, case
 __all__ = ["measure_refinement"]
 
 SHARE = 0.9
-"""Of the triangles that are to go."""
+"""Share of the triangles to remove."""
 
 
 @case("refine", "smoothing, decimation and quality of the surface, against VTK's filters, which have no bound")

@@ -1,4 +1,4 @@
-"""The list of cases.  A case joins with one line above its function:
+"""The list of cases.  A decorator adds a function to it:
 
     @case("components", "components of the surface on the device, against scipy and cc3d")
     def measure_components(job: Job) -> dict[str, Any]: ...
@@ -23,7 +23,7 @@ HERE = Path(__file__).resolve().parent
 
 @dataclass(frozen=True)
 class Job:
-    """What one case is run on, and how long it may take.
+    """Input, device and limits of one run of a case.
 
     Attributes
     ----------
@@ -53,7 +53,7 @@ class Job:
 
 @dataclass(frozen=True)
 class Case:
-    """A function that measures, and what it measures in one line.
+    """A function that measures, with its description in one line.
 
     The function returns a dict of plain JSON types.  Its ``"ratios"`` is a dict of name -> `spread` of the ratios
     peer / clrecon (over 1: clrecon is better): these are compared, plotted and tabulated.  Everything else is kept.

@@ -1,4 +1,4 @@
-"""Kept results: one JSON file a (case, input, device)."""
+"""Stored results: one JSON file per case, input and device."""
 
 from __future__ import annotations
 
@@ -25,17 +25,17 @@ def device_name(device: dict[str, Any]) -> str:
 
 
 def result_key(result: dict[str, Any]) -> Key:
-    """(case, input, device): what makes two results comparable."""
+    """Return (case, input, device), which two comparable results have in common."""
     return result["case"], result["input"]["name"], device_name(result["device"])
 
 
 def result_path(folder: Path, result: dict[str, Any]) -> Path:
-    """Where a result is kept."""
+    """Return the path of the file of a result."""
     return folder / ("-".join(result_key(result)) + ".json")
 
 
 def load_results(folder: Path) -> dict[Key, dict[str, Any]]:
-    """All results of a folder by key; files of another form are named on stderr and passed over.
+    """Load all results of a folder by key; other files are named on stderr and skipped.
 
     Raises
     ------
@@ -60,7 +60,7 @@ def load_results(folder: Path) -> dict[Key, dict[str, Any]]:
 def pick(
     results: dict[Key, dict[str, Any]], cases: list[str] | None = None, ratios: list[str] | None = None
 ) -> dict[Key, dict[str, Any]]:
-    """The results of some cases with some of their ratios; None is all.  Results without a ratio left stay out."""
+    """Pick results by cases and ratios; None means all.  Results without any such ratio are left out."""
     picked = {}
     for key, result in results.items():
         kept = {name: ratio for name, ratio in result["ratios"].items() if ratios is None or name in ratios}

@@ -1,4 +1,4 @@
-"""How time grows with the volume and with the surface: a line, or not."""
+"""Case of scaling: is time linear in the size of the volume and of the surface?"""
 
 from __future__ import annotations
 
@@ -39,13 +39,13 @@ def fit_line(x: Sequence[float], y: Sequence[float]) -> dict[str, float]:
 
 
 def choose_slices(slices: int, points: int = POINTS) -> list[int]:
-    """Evenly spread numbers of slices from 64 (or a quarter, where there are few) to all."""
+    """Choose evenly spread numbers of slices, from 64 (or a quarter of few slices) to all."""
     first = FEWEST_SLICES if slices >= 2 * FEWEST_SLICES else max(slices // 4, 2)
     return sorted({round(value) for value in np.linspace(first, slices, points)})
 
 
 def estimate_triangles(voxels: NDArray[Any], levels: Sequence[float]) -> list[float]:
-    """Triangles of each level: two for each edge of the grid that it crosses, counted in every nth pair of slices.
+    """Estimate the triangles of each level: two per crossed edge of the grid, counted in every n-th pair of slices.
 
     A surface has about twice as many triangles as vertices, and a vertex on every crossed edge.
     """
@@ -62,16 +62,16 @@ def estimate_triangles(voxels: NDArray[Any], levels: Sequence[float]) -> list[fl
 
 
 def choose_levels(voxels: NDArray[Any], points: int = POINTS, most: float = MOST_TRIANGLES) -> list[float]:
-    """Whole iso values whose surfaces go from sparse to dense in even steps of triangles, at most `most` of them.
+    """Choose whole iso values whose surfaces go from few to at most `most` triangles in even steps.
 
-    From 0 HU up, where a scan has its bones and, in the noise of a tissue, its densest surface.
+    They start at 0 HU: above lie the bones and, in the noise of a tissue, the densest surface.
     """
     sample = voxels[:: max(len(voxels) // 8, 1), ::4, ::4]
     low, high = max(float(sample.min()), 0.0), float(np.percentile(sample, 99.9))
     candidates = np.unique(np.rint(np.linspace(low, max(high, low + points), 96)))
     falling = candidates[::-1]
     counts = np.array(estimate_triangles(voxels, list(falling)))
-    # From sparse to dense: what the densest level so far has is passed on, so that counts only rise.
+    # From sparse to dense: the largest count so far replaces smaller ones, so that counts only rise.
     rising, first = np.unique(np.maximum.accumulate(counts), return_index=True)
     levels = falling[first]
     some = rising > 0
@@ -82,10 +82,10 @@ def choose_levels(voxels: NDArray[Any], points: int = POINTS, most: float = MOST
 
 
 def _time_points(job: Job, points: Sequence[tuple[Any, float]]) -> list[dict[str, Any]]:
-    """Both sides at each (volume, HU), in rounds over all points: a mood of the machine bends no curve.
+    """Time both sides at each (volume, HU), in rounds over all points, so that a slow spell affects all points alike.
 
-    An untimed run of the same point comes before each timed one, so that memory of its size is at hand: else every
-    point would pay for pages that its neighbours do not need.
+    Each timed run follows an untimed run of the same point, so that memory of its size is allocated: else each point
+    would also pay for pages that other points do not need.
     """
     from clrecon.operators.surface.extract import extract_isosurface
 
@@ -122,7 +122,7 @@ def _fit(found: Sequence[dict[str, Any]], over: str) -> dict[str, dict[str, floa
 
 @case("scaling", "time over the number of slices, and over the number of triangles from sparse to dense iso values")
 def measure_scaling(job: Job) -> dict[str, Any]:
-    """The first n slices of the input at the iso value; then iso values over 149 slices at most."""
+    """Time the first n slices of the input at the iso value; then several iso values on at most 149 slices."""
     from clrecon.geometry import Volume
     from clrecon.operators.surface.extract import prepare_isosurface
 

@@ -21,7 +21,7 @@ def markdown(head: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
 
 
 def seconds(value: float) -> str:
-    """Seconds with three significant digits, in ms below one second."""
+    """Write seconds with three significant digits, in ms below one second."""
     return f"{value:.3g} s" if value >= 1 else f"{1e3 * value:.3g} ms"
 
 
@@ -30,7 +30,7 @@ def _millions(count: Any) -> str:
 
 
 def _both_sides(result: dict[str, Any], ratio: str) -> tuple[str, str]:
-    """What clrecon and the peer took, in the unit of the ratio: seconds, bytes a voxel, or how linear they are."""
+    """Write the figures of clrecon and the peer in the unit of the ratio: seconds, bytes per voxel, or linearity."""
     side = result.get("sides", {}).get(ratio)
     if side:
         return seconds(side["clrecon_s"]["median"]), seconds(side["peer_s"]["median"])
@@ -44,7 +44,7 @@ def _both_sides(result: dict[str, Any], ratio: str) -> tuple[str, str]:
 
 
 def format_results(results: dict[Key, dict[str, Any]]) -> str:
-    """One row a ratio: medians of both sides, the median of the ratios and its quartiles."""
+    """Make a table with a row per ratio: medians of both sides, the median of the ratios and its quartiles."""
     rows = []
     for (name, given, device), result in sorted(results.items()):
         for ratio_name, ratio in result["ratios"].items():

@@ -1,4 +1,4 @@
-"""What the topology of the trilinear field costs, beside the default table."""
+"""Case of the topology of the trilinear field: its cost beside the default table."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ __all__ = ["measure_topology"]
 
 @case("topology", "surfaces with the topology of the trilinear field, against the default's")
 def measure_topology(job: Job) -> dict[str, Any]:
-    """Host volume to host mesh in one process, kernels built; the "peer" is the default, so ratios are below 1."""
+    """Time meshes from host to host with kernels built; the "peer" is the default table, so ratios are below 1."""
     from clrecon.operators.surface.extract import extract_isosurface
 
     volume = job.input.volume()

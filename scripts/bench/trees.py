@@ -1,4 +1,4 @@
-"""Large trees of small CT files, made fast: a folder a series, every file with a place and identifiers of its own."""
+"""Large trees of small CT files, made fast: a folder per series; every file has its own position and identifiers."""
 
 from __future__ import annotations
 

@@ -1,12 +1,12 @@
 #!/usr/bin/env python3
-"""Time two checkouts of clrecon with the same benches, in turn.
+"""Timing of two checkouts of clrecon with the same benches, in turn.
 
     versions.py OLD NEW CASE... [--input NAME]... [--device D]... [--rounds N] [--pairs N] --json DIR
 
 OLD and NEW are folders of the project, each with an environment in `.venv-test` or `.venv`.  A round runs the bench of
-OLD and that of NEW on the same input and device; which goes first changes from round to round.  The ratio of a round is
-that of the medians of clrecon's seconds, OLD over NEW: above 1, NEW is faster.  The peer's code does not change: its
-own ratio says how far the machine drifted.  The exit status is 1 where NEW is slower by more than both spreads explain.
+OLD and that of NEW on the same input and device; their order changes with every round.  The ratio of a round is that
+of the medians of clrecon's seconds, OLD over NEW: above 1, NEW is faster.  The peer's code does not change: its own
+ratio shows how far the machine drifted.  The exit status is 1 if NEW is slower by more than both spreads explain.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ SIDES = ("clrecon_s", "peer_s")
 
 
 def find_python(folder: Path) -> Path:
-    """The Python of a checkout's environment."""
+    """Return the Python of a checkout's environment."""
     for name in (".venv-test", ".venv"):
         python = folder / name / "bin" / "python"
         if python.exists():
@@ -40,7 +40,7 @@ def find_python(folder: Path) -> Path:
 
 
 def run_bench(folder: Path, case: str, given: str, device: str, options: argparse.Namespace) -> dict[str, Any]:
-    """The result of one case in one checkout."""
+    """Run one case in one checkout and return its result."""
     with tempfile.TemporaryDirectory() as results:
         command = [str(find_python(folder)), str(folder / "scripts" / "bench" / "bench.py"), "run", case]
         command += ["--input", given, "--device", device, "--pairs", str(options.pairs), "--limit", str(options.limit)]
@@ -53,13 +53,13 @@ def run_bench(folder: Path, case: str, given: str, device: str, options: argpars
 
 
 def describe(values: list[float]) -> dict[str, float]:
-    """Median and quartiles."""
+    """Write median and quartiles."""
     q1, median, q3 = np.percentile(values, (25, 50, 75)).tolist()
     return {"median": median, "q1": q1, "q3": q3}
 
 
 def compare(case: str, given: str, device: str, options: argparse.Namespace) -> dict[str, Any]:
-    """Rounds of one case, and the ratios that follow from them."""
+    """Run the rounds of one case and return their ratios."""
     folders = {"old": options.old.resolve(), "new": options.new.resolve()}
     rounds: list[dict[str, dict[str, dict[str, float]]]] = []
     last: dict[str, Any] = {}
@@ -90,7 +90,7 @@ def compare(case: str, given: str, device: str, options: argparse.Namespace) -> 
 
 
 def is_slower(ratio: dict[str, dict[str, float]]) -> bool:
-    """NEW took longer in three quarters of the rounds, and by more than the peer's own times drifted."""
+    """True if NEW took longer in three quarters of the rounds, and by more than the peer's own times drifted."""
     ours, peer = ratio["clrecon_s"], ratio["peer_s"]
     return ours["q3"] < 1.0 and ours["q3"] < peer["q1"]
 

@@ -16,14 +16,14 @@ from typing import Any
 
 
 def read_with_clrecon(folder: str) -> Any:
-    """The volume with all checks and its certificate."""
+    """Read the volume with all checks and its certificate."""
     import clrecon
 
     return clrecon.read_volume(folder).voxels
 
 
 def read_with_pydicom(folder: str) -> Any:
-    """The loop that everybody writes: read, sort by position, rescale, stack.  It checks nothing."""
+    """Read with the usual loop, which checks nothing: read, sort by position, rescale, stack."""
     import numpy as np
     import pydicom
 
@@ -36,13 +36,13 @@ def read_with_pydicom(folder: str) -> Any:
 
 
 def read_with_simpleitk(folder: str) -> Any:
-    """GDCM's sorter and ITK's reader; the array is a view, not a copy."""
+    """Read with GDCM's sorter and ITK's reader; the array is a view, not a copy."""
     import SimpleITK as sitk
 
     reader = sitk.ImageSeriesReader()
     reader.SetFileNames(reader.GetGDCMSeriesFileNames(folder))
     image = reader.Execute()
-    read_with_simpleitk.image = image  # type: ignore[attr-defined]  # the view does not keep it
+    read_with_simpleitk.image = image  # type: ignore[attr-defined]  # the view does not keep it alive
     return sitk.GetArrayViewFromImage(image)
 
 
@@ -54,7 +54,7 @@ READERS: dict[str, Callable[[str], Any]] = {
 
 
 def scan_tree(folder: str) -> dict[str, Any]:
-    """Scan and group a tree of headers; seconds, and growth of the resident memory up to its peak."""
+    """Scan and group a tree of headers; returns seconds, and the growth of resident memory up to its peak."""
     sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
     from child import forget_peak, resident_bytes
 

@@ -3,10 +3,10 @@
 Its rays are cast on processor threads into memory of its own, so the peer calls the parts of its ``Render`` up to
 there: no OpenGL context, no texture and no window take part.
 
-What remains different from clrecon's rays, by source (Rendering/Volume of VTK) and by trial: they run from outer voxel
-centre to outer voxel centre and are sampled in whole steps from the near plane; HU are rounded to integers before the
-transfer function; normals of voxels (in 16 bits) are shaded, and the shades interpolated, where clrecon shades the
-interpolated gradient; a voxel without a gradient gets ambient light alone; rays end at an opacity of 0.992.
+Differences from clrecon's rays, found in the source (Rendering/Volume of VTK) and by trial: rays run between the outer
+voxel centres; samples lie at whole steps from the near plane; HU are rounded to integers before the transfer function;
+normals of voxels (in 16 bits) are shaded and the shades interpolated, while clrecon shades the interpolated gradient; a
+voxel without a gradient gets ambient light only; rays end at an opacity of 0.992.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ class FixedPointPeer:
         self._stage = Stage(scene)
 
     def first_frame(self) -> float:
-        """Seconds of the first picture of a volume in memory, with a mapper that has seen nothing yet."""
+        """Seconds of the first picture of a volume in memory, with a new mapper."""
         from vtkmodules.vtkRenderingVolume import vtkFixedPointVolumeRayCastMapper
 
         start = perf_counter()
@@ -69,7 +69,7 @@ class FixedPointPeer:
         return perf_counter() - start
 
     def picture(self) -> NDArray[np.uint8]:
-        """The last picture before black, shape (h, w, 3), uint8; row 0 is the top."""
+        """The last picture on black, shape (h, w, 3), uint8; row 0 is the top."""
         image, scene = self._stage.mapper.GetRayCastImage(), self._stage.scene
         columns, rows = image.GetImageMemorySize()
         used, lines = image.GetImageInUseSize()

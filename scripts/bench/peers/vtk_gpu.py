@@ -1,7 +1,7 @@
 """The peer of pictures on OpenGL: vtkOpenGLGPUVolumeRayCastMapper, in a process of its own.
 
 It draws on whatever OpenGL the machine has (Mesa's llvmpipe where there is no GPU) into an off-screen window.  A
-context that cannot be made, or that dies, ends that process alone.  The process is ``python -m peers.vtk_gpu FOLDER``;
+context that cannot be made, or that dies, ends only that process.  The process is ``python -m peers.vtk_gpu FOLDER``;
 it answers each line of its input with one of JSON.
 """
 
@@ -34,12 +34,12 @@ class GpuPeer:
     Attributes
     ----------
     renderer : str
-        What OpenGL says that it runs on.
+        Name of the renderer as OpenGL reports it.
 
     Raises
     ------
     RuntimeError
-        No OpenGL, or the process dies.
+        There is no OpenGL, or the process dies.
     """
 
     name = "vtkOpenGLGPUVolumeRayCastMapper"
@@ -72,7 +72,7 @@ class GpuPeer:
         self.close()
 
     def first_frame(self) -> float:
-        """Seconds of the first picture of a volume in memory: upload, shader and picture; the context is there."""
+        """Seconds of the first picture of a volume in memory: upload, shader and picture; the context is ready."""
         return float(self._ask("first")["seconds"])
 
     def frame(self) -> float:
@@ -80,7 +80,7 @@ class GpuPeer:
         return float(self._ask("frame")["seconds"])
 
     def picture(self) -> NDArray[np.uint8]:
-        """The last picture before black, shape (h, w, 3), uint8; row 0 is the top."""
+        """The last picture on black, shape (h, w, 3), uint8; row 0 is the top."""
         self._ask("picture")
         return np.asarray(np.load(Path(self._folder.name) / "picture.npy"), dtype=np.uint8)
 

@@ -13,7 +13,7 @@ __all__ = ["Scene", "Stage", "scene_of", "vtk_version"]
 
 @dataclass(frozen=True)
 class Scene:
-    """What is drawn and how, in plain numbers.
+    """A scene in plain numbers: volume, look and camera.
 
     Attributes
     ----------
@@ -29,7 +29,7 @@ class Scene:
     position, focal_point, up : (x, y, z)
         Camera, LPS mm.
     view_angle, parallel_scale : float or None
-        One of them, with VTK's meanings.
+        One of the two is given; meanings as in VTK.
     width, height : int
         Pixels.
     """
@@ -96,7 +96,7 @@ def scene_of(
 
 
 class Stage:
-    """A window with a camera, and the volume that is put before it."""
+    """A window with a camera and a volume."""
 
     def __init__(self, scene: Scene):
         from vtkmodules.vtkRenderingCore import vtkRenderer, vtkRenderWindow
@@ -104,7 +104,7 @@ class Stage:
         self.scene = scene
         self.renderer = vtkRenderer()
         self.renderer.CreateLight()  # at the camera, as Render() does where there is none
-        # Of its own a light of VTK has no ambient part, and the fixed-point mapper then takes away the material's.
+        # By default a light of VTK has no ambient part, and the fixed-point mapper then drops the material's too.
         self.renderer.GetLights().GetItemAsObject(0).SetAmbientColor(1.0, 1.0, 1.0)
         self.window = vtkRenderWindow()
         self.window.SetOffScreenRendering(1)
@@ -115,7 +115,7 @@ class Stage:
         self.mapper: Any = None
 
     def load(self, voxels: NDArray[Any], mapper: Any) -> None:
-        """Put the voxels, which are shared, and a new mapper in place of what was there."""
+        """Replace voxels (shared, not copied) and mapper by new ones."""
         from vtkmodules.vtkRenderingCore import vtkVolume
 
         self.renderer.RemoveAllViewProps()
@@ -172,7 +172,7 @@ def _property_of(scene: Scene) -> Any:
 
     colour, opacity = vtkColorTransferFunction(), vtkPiecewiseFunction()
     for number, (hu, red, green, blue, alpha) in enumerate(scene.points):
-        # Of two points at one place VTK keeps the last: a step is put between two floats.
+        # VTK keeps only the last of two points at one place: a step is put between two neighbouring floats.
         place = hu + 1e-4 if number and scene.points[number - 1][0] == hu else hu
         colour.AddRGBPoint(place, red, green, blue)
         opacity.AddPoint(place, alpha)
