@@ -12,6 +12,7 @@ import shutil
 import time
 import warnings
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,7 @@ from hypothesis import strategies as st
 from clrecon.dicom import list_series, read_volume
 from clrecon.dicom import reader as reader_module
 from clrecon.errors import ClreconError
+from clrecon.geometry.certificate import Certificate
 
 SECONDS = float(os.environ.get("CLRECON_FUZZ_SECONDS", "60"))
 READ_LIMIT_S = 5.0
@@ -182,12 +184,13 @@ def test_the_campaign_sees_a_fault(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     check_folder(tmp_path / "ct")
     whole = reader_module.certify
 
-    def faulty(*args: Any, **kwargs: Any) -> dict[str, Any]:
+    def faulty(*args: Any, **kwargs: Any) -> Certificate:
         if fault == "exception":
             raise KeyError("made up")
         if fault == "memory":
             np.ones(MEMORY_LIMIT_BYTES // 4)
-        return {**whole(*args, **kwargs), "name": "SECRET^NAME" if fault == "report" else ""}
+        made = whole(*args, **kwargs)
+        return replace(made, warnings=[*made.warnings, "SECRET^NAME"]) if fault == "report" else made
 
     monkeypatch.setattr(reader_module, "certify", faulty)
     with pytest.raises((KeyError, AssertionError), match="made up|assert"):

@@ -61,13 +61,22 @@ def parse_carefully(file: BinaryIO, size: int, wanted: tuple[int, ...] | None) -
         return _parse_file(cast(BinaryIO, _MeteredFile(file)), size, wanted)
     except CorruptFileError:
         raise
-    except RecursionError as error:
-        raise CorruptFileError("sequences are nested too deep") from error
     except Exception as error:
+        if _is_of_recursion(error):
+            raise CorruptFileError("sequences are nested too deep") from error
         if isinstance(error, OSError) and error.errno is not None:
             raise  # errors of the disk have a number; those of the parser, for a cut sequence, have none
         # The parser meets hostile bytes here and may fail in any way; all of them mean the same to us.
         raise CorruptFileError(f"cannot be parsed ({type(error).__name__})") from error
+
+
+def _is_of_recursion(error: BaseException | None) -> bool:
+    """True for a RecursionError, and for an error that the parser made of one on its way up."""
+    while error is not None:
+        if isinstance(error, RecursionError):
+            return True
+        error = error.__context__
+    return False
 
 
 class _MeteredFile:

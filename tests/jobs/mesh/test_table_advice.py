@@ -11,6 +11,7 @@ from clrecon.jobs.mesh.bone import find_bone, warn_of_walls
 from clrecon.jobs.mesh.settings import MeshSettings
 from clrecon.jobs.mesh.surfaces import Part, Surface
 from clrecon.mesh import Mesh
+from clrecon.mesh.compare.walls import WallLook
 from clrecon.mesh.connectivity import label_components
 from clrecon.reference.surface.extract import extract_isosurface
 
@@ -34,7 +35,7 @@ def test_rails_that_are_left_out_say_so(without_table):
 
 @pytest.mark.parametrize("remove_table", [False, True])
 def test_what_is_even_beneath_may_be_a_table(remove_table):
-    walls = {"looks_like": "bone", "contrast_share": 0.1, "compact_share": 0.5}
+    walls = WallLook("bone", 0.5, 0.1, 0.0, {"median": 400.0, "p90": 900.0, "p99": 1200.0}, 1000)
     part = Part(Surface(300.0, ""), "", Mesh(np.zeros((3, 3), np.float32), np.zeros((0, 3), np.uint32)))
     part.facts["walls"] = walls
     (said,) = warn_of_walls([part], MeshSettings(keep="bone", remove_table=remove_table))
