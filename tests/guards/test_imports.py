@@ -81,3 +81,10 @@ def test_an_unknown_name_is_an_attribute_error() -> None:
     with pytest.raises(AttributeError, match=f"has no attribute '{name}'"):
         getattr(clrecon, name)
     assert callable(clrecon.devices) and callable(clrecon.device)
+
+
+def test_surfaces_load_no_label_maps_and_no_dicom(tmp_path: Path) -> None:
+    """Label maps load pydicom, a quarter of a second that a surface need not wait for."""
+    code = "import clrecon; clrecon.extract_isosurface, clrecon.SurfaceExtractor, clrecon.DeviceVolume"
+    loaded = loaded_after(code, tmp_path)
+    assert "numpy" in loaded and not loaded & {"pydicom", "scipy", "clrecon.labels", "clrecon.dicom"}

@@ -7,7 +7,7 @@ from collections.abc import Callable, Hashable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from types import TracebackType
-from typing import Any, NoReturn, TypeVar
+from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from clrecon.errors import DeviceMemoryError, UsageError
 from clrecon.geometry import Volume
 from clrecon.geometry.iso_rule import ValueRange
-from clrecon.labels import LabelMap, ResampledLabels, resample_labels
 from clrecon.opencl import (
     Device,
     MemoryLimits,
@@ -31,6 +30,9 @@ from clrecon.opencl import (
 from clrecon.operators.resident.stack_table import StackTable
 from clrecon.operators.resident.voxel_types import ray_variants
 from clrecon.system.log import get_logger
+
+if TYPE_CHECKING:  # label maps load pydicom, which surfaces need not wait for
+    from clrecon.labels import LabelMap, ResampledLabels
 
 __all__ = ["DeviceVolume", "open_volume", "take_volume"]
 
@@ -230,6 +232,8 @@ class DeviceVolume:
 
     def bring(self, labels: LabelMap) -> ResampledLabels:
         """Return a label map on the grid of the volume, see `resample_labels`; the last one is kept."""
+        from clrecon.labels import resample_labels
+
         with self._lock:
             if self._taken is None or self._taken[0] is not labels:
                 self._taken = labels, resample_labels(labels, self.volume)
