@@ -111,7 +111,7 @@ def main() -> int:
     slower = 0
     for device, given, case in itertools.product(options.device or ["0"], options.input or ["spine149"], options.cases):
         result = compare(case, given, device, options)
-        name = "-".join(["versions", case, result["input"]["name"], device_name(result["device"])])
+        name = "-".join([case, result["input"]["name"], device_name(result["device"])])
         write_json(options.json / f"{name}.json", result)
         for side, ratio in result["old_over_new"].items():
             ours, peer, flag = ratio["clrecon_s"], ratio["peer_s"], ""
