@@ -263,4 +263,5 @@ def _upload_part(
     nk, nj, ni = padded.shape
     if padded is voxels:
         return resident.part(first, end, stopwatch), (ni, nj, nk)
+    resident.make_way()
     return resident.upload(padded, stopwatch), (ni, nj, nk)

@@ -179,9 +179,13 @@ class _Overlay:
             own = {"slices": slices * resident.slice_bytes, **picture}
             return own if slices == count else {**own, **states}
 
+        if resident.is_held and resident.shortage({"volume": resident.volume.voxels.nbytes, **picture}):
+            resident.make_way()
         slices = count if resident.is_held else resident.plan(SLICES, count, needs)
         if slices == 0:
             check_budget(resident.device, needs(1), resident.memory)
+        if slices < count:
+            resident.make_way()
         return resident.halve(
             SLICES, max(slices, 1), lambda slices: self._take(slices, background), warnings=self.warnings
         )

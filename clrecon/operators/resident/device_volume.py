@@ -149,12 +149,16 @@ class DeviceVolume:
 
     def part(self, first: int, end: int, stopwatch: Stopwatch) -> Any:
         """Return slices `first` to ``end - 1`` on the device, replacing all other voxels there."""
-        with self._lock:
-            self._whole_d = None
-            self._kept = {key: kept for key, kept in self._kept.items() if not kept.nbytes}
+        self.make_way()
         part_d = self.upload(self.volume.voxels[first:end], stopwatch)
         self._part_bytes += self.volume.voxels[first:end].nbytes
         return part_d
+
+    def make_way(self) -> None:
+        """Drop the voxels on the device and everything made of them; small tables stay."""
+        with self._lock:
+            self._whole_d = None
+            self._kept = {what: kept for what, kept in self._kept.items() if not kept.nbytes}
 
     def pays_whole(self, slices: int) -> bool:
         """True if all voxels should be uploaded for `slices` slices: with earlier uploads these are as many."""
@@ -246,6 +250,24 @@ class DeviceVolume:
         """Limits of the memory on the device."""
         return memory_limits(self.device, self.memory)
 
+    def shortage(self, needs: Mapping[str, int], own: tuple[str, ...] = ()) -> str:
+        """Return why the device has no room for `needs`; empty if it has.
+
+        Parameters
+        ----------
+        needs : mapping of str to int
+            Bytes of all buffers that an operator uses at a time, the voxels among them, by description.
+        own : tuple of str
+            Kinds of kept objects that `needs` already counts; all others are added, and dropped if they are in the way.
+        """
+        with self._lock:
+            others = {what: kept.nbytes for what, kept in self._kept.items() if what not in own and kept.nbytes}
+            shortage = describe_shortage(self.limits, {**needs, **others})
+            if shortage and others:
+                self._kept = {what: kept for what, kept in self._kept.items() if what not in others}
+                shortage = describe_shortage(self.limits, needs)
+            return shortage
+
     def plan(
         self,
         what: str,
@@ -267,27 +289,19 @@ class DeviceVolume:
         needs : callable
             Function from a number of slices to the bytes of every buffer, by description.
         own : tuple of str
-            Kinds of kept objects that `needs` already counts; all others are added, and dropped if they are in the way.
+            As in `shortage`.
         most : int, optional
             Most slices that kernels can process together.
         """
         limits = self.limits
         most = min(total if most is None else most, self.most_slices.get(what, total))
-
-        def fits(slices: int, beside: Mapping[str, int]) -> bool:
-            return slices <= most and not describe_shortage(limits, {**needs(slices), **beside})
-
-        others = {key: kept.nbytes for key, kept in self._kept.items() if key not in own and kept.nbytes}
-        if fits(total, others):
+        if total <= most and not self.shortage(needs(total), own):
             return total
-        with self._lock:
-            self._kept = {key: kept for key, kept in self._kept.items() if key in own}
-        if fits(total, {}):
-            return total
-        low, high = 0, total
+        low, high = 0, total  # of parts nothing is kept: others are dropped when the first one comes
         while high - low > 1:
             middle = (low + high) // 2
-            low, high = (middle, high) if fits(middle, {}) else (low, middle)
+            fits = middle <= most and not describe_shortage(limits, needs(middle))
+            low, high = (middle, high) if fits else (low, middle)
         return low
 
     def halve(

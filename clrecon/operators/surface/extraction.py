@@ -11,7 +11,7 @@ from clrecon.errors import ClreconError, DeviceError, DeviceMemoryError, NoSurfa
 from clrecon.geometry import Volume
 from clrecon.geometry.iso_rule import IsoRule, data_range
 from clrecon.geometry.precision import describe_far
-from clrecon.opencl import Device, Program, Stopwatch, describe_shortage, result_pages
+from clrecon.opencl import Device, Program, Stopwatch, result_pages
 from clrecon.opencl.quirks import cache_warnings
 from clrecon.operators.resident.bricks import BrickStates, brick_bytes, compare_bricks, measure_bricks
 from clrecon.operators.resident.device_volume import DeviceVolume
@@ -176,7 +176,7 @@ class Extraction:
         kept = self.resident.kept_bytes(BRICKS)
         if slab.is_whole and kept:
             needs[BRICKS] = kept
-        shortage = describe_shortage(self.resident.limits, needs)
+        shortage = self.resident.shortage(needs, (BRICKS,))
         if shortage:
             raise DeviceMemoryError(shortage)
         output, volume = sum(counted.output().values()), needs["volume"]

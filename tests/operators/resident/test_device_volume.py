@@ -14,6 +14,8 @@ from variants import all_but
 import clrecon
 from clrecon.errors import DeviceError, DeviceMemoryError, UsageError
 from clrecon.labels import LabelMap, resample
+from clrecon.opencl import Stopwatch
+from clrecon.operators.rays.composite import TransferTables
 from clrecon.operators.resident.device_volume import DeviceVolume
 
 SIZE = (24, 20)
@@ -197,6 +199,41 @@ def test_what_is_kept_makes_room_for_what_is_needed(device, volume):
         again = clrecon.extract_isosurface(resident, 100)
         assert resident.uploaded_bytes >= voxels
     assert np.array_equal(first.vertices, again.vertices)
+
+
+def test_what_is_kept_counts_for_the_mesh_of_another_operator(device, volume):
+    """The mesh fits beside the volume, and not beside what ray pictures keep: that goes, and no slabs are needed."""
+    with DeviceVolume(volume, device=device) as alone:
+        needed = sum(clrecon.extract_isosurface(alone, 100).report["device_bytes"].values())
+    with DeviceVolume(volume, device=device, memory=needed + 64_000) as resident:
+        resident.whole(Stopwatch())
+        resident.keep("made up", None, 200_000, object)
+        mesh = clrecon.extract_isosurface(resident, 100)
+        assert mesh.report["slabs"] == 1 and not mesh.report["warnings"]
+        assert resident.kept_bytes("made up") == 0
+
+
+def test_tables_of_a_transfer_function_stay_from_picture_to_picture_in_slabs(device, volume, monkeypatch):
+    made = []
+    true_of = TransferTables.of
+    monkeypatch.setattr(TransferTables, "of", lambda *which: made.append(1) or true_of(*which))
+    memory = volume.voxels.nbytes // 2 + 48 * SIZE[0] * SIZE[1]
+    with clrecon.VolumeRenderer(volume, device=device, memory=memory) as renderer:
+        pictures = [renderer.render(preset="muscle", view=(azimuth, 0), size=SIZE) for azimuth in (0, 30, 60)]
+    assert all(picture.report["slabs"] > 1 for picture in pictures)
+    assert len(made) == 1
+
+
+def test_slices_in_space_keep_to_the_memory_where_the_volume_is_held(device, volume):
+    """Volume and picture do not fit together: the volume goes, and the slices that are shown come."""
+    size = (96, 80)
+    with DeviceVolume(volume, device=device) as resident:
+        expected = clrecon.render(resident, "slices", slices=[3, 9], size=size, view=(20, 30))
+    with DeviceVolume(volume, device=device, memory=volume.voxels.nbytes + 6 * size[0] * size[1]) as resident:
+        resident.whole(Stopwatch())
+        found = clrecon.render(resident, "slices", slices=[3, 9], size=size, view=(20, 30))
+        assert not resident.is_held
+    assert np.array_equal(found.image, expected.image)
 
 
 def test_a_device_volume_has_its_own_device_and_memory(device, volume):
