@@ -50,13 +50,14 @@ def survey_devices(name: str | None = None) -> tuple[dict[str, Any], DeviceError
 
 
 def run_device_selftest(name: str | None = None, *, progress: Progress | None = None) -> dict[str, Any]:
-    """Run every operator against its twin on a small volume.
+    """Compare every kernel with its twin, in a process of its own.
 
     Parameters
     ----------
     name : str, optional
         Device name or index.
     progress : callable, optional
+        Called as ``progress("selftest", checks done, all checks)``.
 
     Returns
     -------
@@ -66,16 +67,17 @@ def run_device_selftest(name: str | None = None, *, progress: Progress | None = 
     Raises
     ------
     DeviceError
-        The device does not exist, or fails outside of a test.
+        The device does not exist, or no process can be started.
     """
-    from clrecon.jobs.selftest import CHECKS, run_selftest
+    from clrecon.jobs.selftest.run import run_selftest
+    from clrecon.jobs.selftest.table import CHECKS
     from clrecon.opencl import choose_device
 
     progress = progress or ignore_progress
     device = choose_device(name)
     results: list[dict[str, Any]] = []
     progress("selftest", 0, len(CHECKS))
-    for result in run_selftest(device):
+    for result in run_selftest(device, CHECKS):
         results.append(result)
         progress("selftest", len(results), len(CHECKS))
     passed = bool(results) and all(result["passed"] for result in results)

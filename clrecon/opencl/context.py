@@ -6,6 +6,7 @@ import os
 import re
 import sys
 import threading
+from collections.abc import Callable
 from typing import Any
 
 from clrecon.errors import DeviceError, DeviceMemoryError
@@ -72,6 +73,9 @@ class Device:
         not.
     lock : threading.RLock
         Held while a kernel gets its arguments and is enqueued: kernels are shared between threads.
+    trace : callable or None
+        Told in words what is done, before a kernel file is built or a kernel is launched; each launch is then waited
+        for.  For the self-test, which has to say what a driver crashed in.
     """
 
     def __init__(self, index: int, cl_platform: Any, cl_device: Any):
@@ -101,6 +105,7 @@ class Device:
         if has_unknown_cpu(self.platform, self.version) and not self.shortcoming:
             self._name_cpu()
         self.lock = threading.RLock()
+        self.trace: Callable[[str], None] | None = None
         self.programs: dict[tuple[str, tuple[str, ...]], Any] = {}
         self._context: Any = None
         self._queue: Any = None

@@ -124,9 +124,13 @@ def launch(
     group = device.group_size
     rounded = -(-items // group) * group
     values = kernel.order(arguments)
+    if device.trace is not None:
+        device.trace(f"kernel {kernel.name} ({rounded:,} items)")
     try:
         with device.lock:
             event = kernel.enqueue(device.queue, rounded, group, values)
+        if device.trace is not None:
+            event.wait()  # what crashes or hangs is then the kernel that was told last
     except cl.Error as error:
         what = f"kernel {kernel.name} ({rounded:,} items in groups of {group}) failed"
         raise device.fail(what, error) from error

@@ -184,6 +184,8 @@ def load_program(device: Device, name: str, variants: Mapping[str, str] | None =
 
 def _build(device: Device, name: str, options: tuple[str, ...]) -> Program:
     source, start = read_kernel_source(name), time.perf_counter()
+    if device.trace is not None:
+        device.trace(f"the build of cl/{name}")
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # a compiler's remarks about code that builds

@@ -253,20 +253,27 @@ def test_no_driver_says_how_to_get_one(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_selftest_passes(device: Any, capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.first_device
+def test_selftest_passes(device: Any, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    """With the first checks of the table; all of them run in tests/jobs/selftest."""
+    from clrecon.jobs.selftest import table
+
+    monkeypatch.setattr(table, "CHECKS", table.CHECKS[:2])
     assert main(["selftest", "--json", "--device", str(device.index)]) == 0
     outcome = json.loads(capsys.readouterr().out)
     assert outcome["passed"] is True
-    assert "extract_isosurface" in [result["operator"] for result in outcome["operators"]]
+    assert [result["operator"] for result in outcome["operators"]] == ["exclusive_scan", "compact"]
+    assert all(set(result) == {"operator", "passed", "detail", "seconds"} for result in outcome["operators"])
 
 
+@pytest.mark.first_device
 def test_selftest_that_fails_exits_5(
     device: Any, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from clrecon.jobs import selftest
+    from clrecon.jobs.selftest import run
 
     wrong = [{"operator": "compact", "passed": False, "detail": "wrong positions", "seconds": 0.1}]
-    monkeypatch.setattr(selftest, "run_selftest", lambda chosen: iter(wrong))
+    monkeypatch.setattr(run, "run_selftest", lambda chosen, checks: iter(wrong))
     assert main(["selftest", "--device", str(device.index)]) == 5
     captured = capsys.readouterr()
     assert "FAIL  compact" in captured.out

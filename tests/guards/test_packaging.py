@@ -121,8 +121,8 @@ def install_alone(wheel: Path, folder: Path) -> Path:
 SELFTEST = """
 import sys, clrecon
 from clrecon.cli.main import main
-for device in clrecon.devices():
-    device.keeps_binaries = False  # as in all tests: half of the building
+from clrecon.jobs.selftest import table
+table.CHECKS = table.CHECKS[:5]  # a program is found, or it is not
 sys.exit(main(["selftest"]))
 """
 

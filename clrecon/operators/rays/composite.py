@@ -23,7 +23,7 @@ from clrecon.rendering.looks.label_style import LabelStyle
 from clrecon.rendering.looks.steepness import PARTS, Steepness
 from clrecon.rendering.views.camera import Camera
 
-__all__ = ["NODES", "TransferTables", "composite_slab"]
+__all__ = ["NODES", "MainWay", "TransferTables", "composite_slab", "enter_tiles", "look_ahead"]
 
 NODES = kernel_constant("rays/steep_segments.h", "NODES")
 """Entries of a transfer function's table."""
@@ -221,9 +221,9 @@ def composite_slab(
     queues = count_queues(device)
     last = np.array([n - 1 for n in resident.volume.shape_ijk] + [0], dtype=np.float32)
     with stopwatch.running(device):  # wait: CPU devices read host arrays that are freed here
-        entries_d = _enter_tiles(resident, slab, view, leaps, output, stopwatch)
+        entries_d = enter_tiles(resident, slab, view, leaps, output, stopwatch)
         way = MainWay.of(resident, slab, view.camera)
-        ways_d = _look_ahead(resident, slab, way, leaps, stopwatch)
+        ways_d = look_ahead(resident, slab, way, leaps, stopwatch)
         launch(
             device, program["composite_rays"], output.items(queues, lanes), stopwatch=stopwatch,
             ways=ways_d, entries=entries_d, highlights=upload(device, highlight_table(lighting)),
@@ -233,7 +233,7 @@ def composite_slab(
         )  # fmt: skip
 
 
-def _enter_tiles(
+def enter_tiles(
     resident: DeviceVolume,
     slab: RaySlab,
     view: RayView,
@@ -257,7 +257,7 @@ def _enter_tiles(
     return entries_d
 
 
-def _look_ahead(resident: DeviceVolume, slab: RaySlab, way: MainWay, leaps: LeapMap, stopwatch: Stopwatch) -> Any:
+def look_ahead(resident: DeviceVolume, slab: RaySlab, way: MainWay, leaps: LeapMap, stopwatch: Stopwatch) -> Any:
     """Return for each brick the empty distance around it, and ahead of it along the main way, on the device."""
     bi, bj, bk = bricks = slab.bricks
     count = math.prod(bricks)

@@ -29,6 +29,9 @@ __all__ = [
 Surface = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.uint32]]
 """Vertices (n, 3) and normals (n, 3), LPS mm, and triangles (m, 3)."""
 
+LARGEST_CASE = 8
+"""More than the triangles of any case."""
+
 
 def sample_grid(volume: Volume, rule: IsoRule, layers: int) -> NDArray[np.float64]:
     """Return the samples as float64, extended by `layers` of outside (closed) or of the border's own values (open)."""
@@ -68,6 +71,13 @@ def _find_cases(inside: NDArray[np.bool_]) -> NDArray[np.int64]:
     return cases
 
 
+def _edge_vertices(numbers: NDArray[np.int64], cells: NDArray[np.int64], edge: int) -> NDArray[np.int64]:
+    """Return the vertices on an edge of cells (n, 3)."""
+    axis, low, _ = EDGES[edge]
+    k, j, i = (cells + CORNERS[low][::-1]).T
+    return np.asarray(numbers[k, j, i, axis])
+
+
 def _edge_vertex(numbers: NDArray[np.int64], cell: NDArray[np.int64], edge: int) -> int:
     """Return the vertex on an edge of a cell; `numbers[k, j, i, axis]` is the vertex on the edge that a sample owns."""
     axis, low, _ = EDGES[edge]
@@ -76,14 +86,17 @@ def _edge_vertex(numbers: NDArray[np.int64], cell: NDArray[np.int64], edge: int)
 
 
 def _find_triangles(inside: NDArray[np.bool_], numbers: NDArray[np.int64]) -> NDArray[np.uint32]:
-    """Return the triangles of all cells by the case table, cell by cell."""
+    """Return the triangles of all cells by the case table, in the order of the cells."""
     cases = _find_cases(inside)
-    triangles = [
-        [_edge_vertex(numbers, cell, edge) for edge in triangle]
-        for cell in np.argwhere((cases != 0) & (cases != 255))
-        for triangle in case_table()[cases[tuple(cell)]]
-    ]
-    return np.array(triangles, dtype=np.uint32).reshape(-1, 3)
+    cells = np.argwhere((cases != 0) & (cases != 255))
+    case_of = cases[tuple(cells.T)]
+    found, order = [np.empty((0, 3), np.int64)], [np.empty(0, np.int64)]
+    for case in np.unique(case_of):
+        of_case = np.flatnonzero(case_of == case)
+        for number, triangle in enumerate(case_table()[case]):
+            found.append(np.stack([_edge_vertices(numbers, cells[of_case], edge) for edge in triangle], axis=1))
+            order.append(LARGEST_CASE * of_case + number)
+    return np.concatenate(found)[np.argsort(np.concatenate(order))].astype(np.uint32)
 
 
 CellVertices = tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]

@@ -23,7 +23,7 @@ def look(device, shape, distances, way: MainWay):
     resident, stopwatch = DeviceVolume(Volume(np.zeros(shape, np.int16), np.eye(4)), device=device), Stopwatch()
     slab = next(ray_slabs(resident, shape[0], np.inf, stopwatch))
     with stopwatch.running(device):
-        ways_d = composite._look_ahead(resident, slab, way, LeapMap(upload(device, distances), None), stopwatch)
+        ways_d = composite.look_ahead(resident, slab, way, LeapMap(upload(device, distances), None), stopwatch)
         return download(device, np.empty_like(distances), ways_d)
 
 

@@ -43,7 +43,7 @@ def take_every_sample(monkeypatch, *arguments, **settings) -> Rendering:
 
     with monkeypatch.context() as patch:
         patch.setattr(ray_pictures, "find_leaps", show_all)
-        patch.setattr(composite, "_enter_tiles", enter_at_once)
+        patch.setattr(composite, "enter_tiles", enter_at_once)
         return take(*arguments, **settings)
 
 

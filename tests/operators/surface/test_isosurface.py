@@ -11,7 +11,8 @@ from variants import VOXEL_TYPES
 
 from clrecon.errors import DeviceError, NoSurfaceError, UsageError
 from clrecon.geometry import Volume, compose_affine, iso_rule
-from clrecon.jobs.selftest import run_selftest
+from clrecon.jobs.selftest.child import run_check
+from clrecon.jobs.selftest.table import CHECKS
 from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.operators.surface import marching_cubes
 from clrecon.operators.surface.extract import SurfaceExtractor, extract_isosurface, extract_isosurfaces
@@ -217,8 +218,9 @@ def test_a_device_that_finds_nothing_is_not_believed(device, monkeypatch):
     monkeypatch.setattr(marching_cubes, "classify", find_nothing)
     with pytest.raises(DeviceError, match="it computes wrongly"):
         extract_isosurface(random_volume((5, 6, 7)), 3, device=device)
-    outcomes = {result["operator"]: result["passed"] for result in run_selftest(device)}
-    assert [operator for operator, passed in outcomes.items() if not passed] == ["extract_isosurface"]
+    check = next(check for check in CHECKS if check.name == "extract_isosurface")
+    outcome = run_check(device, check)
+    assert not outcome["passed"] and "it computes wrongly" in outcome["detail"]
 
 
 @pytest.mark.parametrize(("lanes", "words"), [("1", "1"), ("8", "3")])

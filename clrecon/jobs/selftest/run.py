@@ -1,0 +1,148 @@
+"""The self-test as a whole: its checks run in a process of their own, so that a driver that crashes or hangs becomes
+words.
+"""
+
+from __future__ import annotations
+
+import json
+import queue
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator, Sequence
+from typing import IO, Any
+
+from clrecon.errors import DeviceError
+from clrecon.jobs.selftest.check import Check
+from clrecon.opencl import Device
+
+__all__ = ["SILENT_SECONDS", "run_selftest"]
+
+COMMAND = ("-m", "clrecon.jobs.selftest.child")
+
+SILENT_SECONDS = 240.0
+"""Seconds without a line after which the process counts as hanging: far above the time to build the largest kernel."""
+
+
+def run_selftest(
+    device: Device, checks: Sequence[Check], *, silent_seconds: float = SILENT_SECONDS
+) -> Iterator[dict[str, Any]]:
+    """Run checks on `device` in a process of their own and yield each result at once.
+
+    After a crash the checks that are left run in a new process.  After a hang they count as failed: each of them would
+    take as long.
+
+    Parameters
+    ----------
+    device : Device
+    checks : sequence of Check
+    silent_seconds : float
+
+    Yields
+    ------
+    dict
+        As `clrecon.jobs.selftest.child.run_check`.
+
+    Raises
+    ------
+    DeviceError
+        No process can be started.
+    """
+    left = list(checks)
+    while left:
+        with _Child(device, left) as child:
+            for result in child.results(silent_seconds):
+                left = left[1:]
+                yield result
+            if not left:
+                return
+            words = child.describe_end()
+            yield _failed(left[0], words, child.seconds)
+            left = left[1:]
+            if child.hangs:
+                for check in left:
+                    yield _failed(check, "not run: the driver hangs", 0.0)
+                return
+
+
+def _failed(check: Check, detail: str, seconds: float) -> dict[str, Any]:
+    return {"operator": check.name, "passed": False, "detail": detail, "seconds": round(seconds, 3)}
+
+
+class _Child:
+    """The process, and what it said last."""
+
+    def __init__(self, device: Device, checks: Sequence[Check]):
+        self.hangs = False
+        self._doing = "its start"
+        self._since = time.perf_counter()
+        self._silent = 0.0
+        if getattr(sys, "frozen", False) or not sys.executable:
+            raise DeviceError("the self-test needs a Python interpreter to start, and this program has none")
+        try:
+            self._process = subprocess.Popen(
+                [sys.executable, *COMMAND],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.DEVNULL,
+                creationflags=getattr(subprocess, "CREATE_NO_WINDOW", 0),
+            )
+        except OSError as error:
+            raise DeviceError(f"no process can be started for the self-test: {error.strerror or error}") from error
+        assert self._process.stdin is not None and self._process.stdout is not None
+        request = {"device": device.index, "checks": [check.name for check in checks]}
+        try:
+            self._process.stdin.write(json.dumps(request).encode())
+            self._process.stdin.close()
+        except OSError:  # it has ended already: `results` tells
+            pass
+        self._lines: queue.Queue[bytes] = queue.Queue()
+        threading.Thread(target=self._read, args=(self._process.stdout,), daemon=True).start()
+
+    def __enter__(self) -> _Child:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._process.kill()
+        self._process.wait()
+
+    def _read(self, stream: IO[bytes]) -> None:
+        for line in stream:
+            self._lines.put(line)
+        self._lines.put(b"")
+
+    def results(self, silent_seconds: float) -> Iterator[dict[str, Any]]:
+        """Yield results until the process ends or hangs."""
+        while True:
+            try:
+                line = self._lines.get(timeout=silent_seconds)
+            except queue.Empty:
+                self.hangs, self._silent = True, silent_seconds
+                return
+            if not line:
+                self._process.wait()
+                return
+            told = json.loads(line)
+            if "operator" in told:
+                yield told
+            elif "check" in told:
+                self._doing, self._since = "the preparation of its data", time.perf_counter()
+            else:
+                self._doing = told["doing"]
+
+    @property
+    def seconds(self) -> float:
+        """Seconds since the last check began."""
+        return time.perf_counter() - self._since
+
+    def describe_end(self) -> str:
+        """Describe how the process ended, and in what."""
+        if self.hangs:
+            return f"the driver hangs: nothing for {self._silent:g} s in {self._doing}"
+        code = self._process.returncode
+        if code < 0:
+            name = signal.Signals(-code).name if -code in set(signal.Signals) else f"signal {-code}"
+            return f"the driver crashed with {name} in {self._doing}"
+        return f"the process of the test ended with exit code {code} in {self._doing}"

@@ -1,0 +1,118 @@
+"""Checks of iso surfaces: every way to mark samples, uneven slices, ranges, the topology of the trilinear field."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+from numpy.typing import NDArray
+
+from clrecon.geometry import Volume
+from clrecon.geometry.iso_rule import Level
+from clrecon.jobs.selftest.check import Check, require_close, require_equal
+from clrecon.jobs.selftest.scenes import MIRRORED, OBLIQUE, WIDE, noise, stack, waves
+from clrecon.mesh import Mesh
+from clrecon.opencl import Device
+from clrecon.operators.surface.extract import SurfaceExtractor
+from clrecon.reference.surface.extract import Surface
+from clrecon.reference.surface.extract import extract_isosurface as extract_twin
+
+__all__ = ["CHECKS", "MARCHING", "VERTEX_TOLERANCE_VOXEL", "compare_mesh"]
+
+VERTEX_TOLERANCE_VOXEL = 1e-4
+"""Largest difference of device (float32) and twin (float64), in units of the smallest voxel edge."""
+
+NORMAL_TOLERANCE = 2e-4
+"""Largest difference of unit vectors: near a saddle a gradient is a small difference of float32."""
+
+MARCHING = ("count_rows", "total_counts", "list_words", "emit_vertices", "emit_triangles")
+"""Kernels that every surface launches."""
+
+LONG = (532, 2, 6)
+"""Voxels (k, j, i) of more than 500 slices: one of the kernels works slice by slice."""
+
+
+def compare_mesh(volume: Volume, mesh: Mesh, expected: Surface, what: str) -> float:
+    """Refuse a mesh that is not its twin; return the largest distance of a vertex, in voxel edges."""
+    vertices, normals, triangles = expected
+    require_equal(mesh.triangles, triangles, f"triangles of {what}")
+    scale = 1.0 / min(volume.spacing)
+    allowed = VERTEX_TOLERANCE_VOXEL
+    away = require_close(scale * mesh.vertices, scale * vertices, allowed, f"vertices of {what}, in voxels")
+    assert mesh.normals is not None
+    require_close(mesh.normals, normals, NORMAL_TOLERANCE, f"normals of {what}")
+    return away
+
+
+def _compare(device: Device, volume: Volume, levels: tuple[Level, ...], what: str, **options: Any) -> float:
+    """Compare surfaces of a volume one after the other: from the second on, bricks of the volume are known."""
+    worst = 0.0
+    with SurfaceExtractor(volume, device=device) as extractor:
+        for number, level in enumerate(levels):
+            mesh = extractor.extract(level, **options)
+            words = f"{what}, surface {number + 1}" if len(levels) > 1 else what
+            worst = max(worst, compare_mesh(volume, mesh, extract_twin(volume, level, **options), words))
+    return worst
+
+
+def _check_first_and_second(device: Device) -> str:
+    worst = 0.0
+    for dtype, affine, closed in (("int16", OBLIQUE, True), ("float32", MIRRORED, False)):
+        volume = stack(waves(WIDE, dtype, -500.0, 500.0), affine)
+        worst = max(worst, _compare(device, volume, (30.5, -80.0), f"{dtype} voxels", closed=closed))
+    return f"4 surfaces: triangles equal, vertices within {worst:.1e} voxel"
+
+
+def _check_types(device: Device) -> str:
+    worst = 0.0
+    for dtype in ("int8", "uint8", "uint16", "int32"):
+        volume = stack(waves((130, 44, 7), dtype), OBLIQUE)
+        worst = max(worst, _compare(device, volume, (40.5, 61.0), f"{dtype} voxels"))
+    return f"8 surfaces of 4 types: triangles equal, vertices within {worst:.1e} voxel"
+
+
+def _check_variant(
+    device: Device, make: Callable[[tuple[int, int, int], str], NDArray[Any]], shape: tuple[int, int, int],
+    level: Level, uneven: bool = False, types: tuple[str, ...] = ("int16", "float32"), **options: Any,
+) -> str:  # fmt: skip
+    worst = 0.0
+    for dtype in types:
+        volume = stack(make(shape, dtype), OBLIQUE, uneven)
+        worst = max(worst, _compare(device, volume, (level,), f"{dtype} voxels", **options))
+    return f"{len(types)} surfaces: triangles equal, vertices within {worst:.1e} voxel"
+
+
+TRILINEAR = ("count_cells", "make_room", "emit_cell_triangles", "emit_cell_vertices")
+
+CHECKS = (
+    Check(
+        "extract_isosurface",
+        ("classify_samples", "classify_bricks", *MARCHING),
+        _check_first_and_second,
+    ),
+    Check("types of voxels", ("classify_samples", "classify_bricks", *MARCHING), _check_types),
+    Check(
+        "uneven slices",
+        ("classify_samples", *MARCHING),
+        partial(_check_variant, make=waves, shape=WIDE, level=30.0, uneven=True),
+        {"surface/marching_cubes.cl": ("UNEVEN",)},
+    ),
+    Check(
+        "ranges",
+        ("classify_samples", *MARCHING),
+        partial(_check_variant, make=waves, shape=WIDE, level=(30.0, 60.0)),
+        {"surface/classify.cl": ("RANGE",), "surface/marching_cubes.cl": ("RANGE",)},
+    ),
+    Check(
+        "below a level",
+        ("classify_samples", *MARCHING),
+        partial(_check_variant, make=waves, shape=WIDE, level=30.0, below=True),
+        {"surface/classify.cl": ("BORDER_INSIDE",)},
+    ),
+    Check(
+        "trilinear topology",
+        ("classify_samples", *(kernel for kernel in MARCHING if kernel != "emit_triangles"), *TRILINEAR),
+        partial(_check_variant, make=noise, shape=LONG, level=2.5, topology="trilinear"),
+    ),
+)  # fmt: skip

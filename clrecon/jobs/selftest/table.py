@@ -1,0 +1,23 @@
+"""The table of checks: the self-test, its guard and the mutation of kernels read it."""
+
+from __future__ import annotations
+
+from clrecon.jobs.selftest import labels, pictures, primitives, rays, reformat, resident, surface
+from clrecon.jobs.selftest.check import Check
+
+__all__ = ["CHECKS", "checks_of"]
+
+CHECKS: tuple[Check, ...] = (
+    *primitives.CHECKS,
+    *resident.CHECKS,
+    *surface.CHECKS,
+    *labels.CHECKS,
+    *rays.CHECKS,
+    *pictures.CHECKS,
+    *reformat.CHECKS,
+)
+
+
+def checks_of(kernel: str) -> list[Check]:
+    """Return the checks that cover a kernel, in the order of the table."""
+    return [check for check in CHECKS if kernel in check.kernels]
