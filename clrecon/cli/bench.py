@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
-from clrecon.cli.common import add_device, table
+from clrecon.cli.common import add_device, add_no_clobber, table
 from clrecon.cli.console import Console, printable
 
 __all__ = ["add_arguments", "run"]
@@ -30,6 +30,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_device(parser)
     parser.add_argument("--runs", type=int, default=_RUNS, metavar="N", help=f"timed pairs (default: {_RUNS})")
     parser.add_argument("--report", metavar="FILE", help="write the figures as JSON")
+    add_no_clobber(parser)
 
 
 def run(options: argparse.Namespace, console: Console) -> int:
@@ -43,6 +44,7 @@ def run(options: argparse.Namespace, console: Console) -> int:
         runs=options.runs,
         series=options.series,
         report_path=options.report,
+        no_clobber=options.no_clobber,
         progress=console.progress,
     )
     console.result(result)

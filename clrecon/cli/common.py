@@ -19,6 +19,7 @@ __all__ = [
     "add_common",
     "add_device",
     "add_memory",
+    "add_no_clobber",
     "guard",
     "megabytes",
     "pick",
@@ -26,6 +27,8 @@ __all__ = [
 ]
 
 INTERRUPTED = 130
+
+_LONG_WORD = re.compile(r"[^\s/\\]{300,}")
 
 _NEGATIVE_LIST = re.compile(r"-[0-9.]+(?:[eE][+-]?[0-9]+)?[,:]")
 
@@ -50,6 +53,14 @@ class Parser(argparse.ArgumentParser):
         if unknown:  # reported here, so that the hint names the command
             self.error(f"unrecognized arguments: {' '.join(unknown)}")
         return options, unknown
+
+    def _get_values(self, action: argparse.Action, arg_strings: list[str]) -> Any:  # type: ignore[override]
+        """Read ``--option=--`` as the value ``--``, as Python 3.13 does; before, argparse dropped it."""
+        if action.option_strings and arg_strings == ["--"]:
+            value = self._get_value(action, "--")
+            self._check_value(action, value)
+            return value
+        return super()._get_values(action, arg_strings)
 
     def error(self, message: str) -> NoReturn:
         raise UsageError(f"{message} (see: {self.prog} --help)")
@@ -84,6 +95,15 @@ def pick(options: argparse.Namespace, names: Collection[str]) -> dict[str, Any]:
     return {name: value for name, value in vars(options).items() if name in names}
 
 
+def add_no_clobber(parser: argparse._ActionsContainer) -> None:
+    """Add --no-clobber."""
+    parser.add_argument(
+        "--no-clobber",
+        action="store_true",
+        help="replace nothing: what exists of the files and folders to be written is an error, before any work",
+    )
+
+
 def add_device(parser: argparse._ActionsContainer) -> None:
     """Add --device."""
     parser.add_argument(
@@ -107,6 +127,8 @@ def add_memory(parser: argparse._ActionsContainer) -> None:
 
 _SIZE = re.compile(r"([0-9]+(?:\.[0-9]*)?) *([kmgt]?)(i?)b?", re.IGNORECASE)
 
+_MOST_MEMORY = 2.0**63
+
 
 def parse_size(text: str) -> int:
     """Read an amount of memory: a number with B, kB, MB, GB (powers of 1000), KiB, MiB or GiB (of 1024).
@@ -119,7 +141,10 @@ def parse_size(text: str) -> int:
     match = _SIZE.fullmatch(text.strip())
     if match is None or (match[3] and not match[2]):
         raise argparse.ArgumentTypeError(f"{text!r} is no amount of memory: write it as 500MB or 2GiB")
-    return int(float(match[1]) * (1024 if match[3] else 1000) ** " kmgt".index(match[2].lower() or " "))
+    size = float(match[1]) * (1024 if match[3] else 1000) ** " kmgt".index(match[2].lower() or " ")
+    if size >= _MOST_MEMORY:
+        raise argparse.ArgumentTypeError(f"{text!r} is more memory than there can be: write it as 500MB or 2GiB")
+    return int(size)
 
 
 def guard(action: Callable[[], int], console: Console, debug: bool) -> int:
@@ -164,6 +189,7 @@ def _report_error(error: BaseException, console: Console, debug: bool) -> int:
     else:
         hint = "" if debug else "; run again with --debug for details, and please report it"
         known = ClreconError(f"unexpected error ({type(error).__name__}: {str(error)[:300]}){hint}")
+    known = type(known)(_shorten(str(known)))
     console.error(str(known))
     try:
         from clrecon.jobs.shared.report import error_as_dict
@@ -172,6 +198,11 @@ def _report_error(error: BaseException, console: Console, debug: bool) -> int:
     except OutputError:
         pass  # only the first error is reported
     return known.exit_code
+
+
+def _shorten(message: str) -> str:
+    """Shorten words that are longer than any name of a file: a number of a thousand digits would bury the message."""
+    return _LONG_WORD.sub(lambda word: f"{word[0][:40]}... ({len(word[0]):,} characters)", message)
 
 
 def table(rows: Sequence[Sequence[object]], right: Sequence[int] = ()) -> list[str]:

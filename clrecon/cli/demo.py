@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
-from clrecon.cli.common import add_device
+from clrecon.cli.common import add_device, add_no_clobber
 from clrecon.cli.console import Console, printable
 from clrecon.cli.mesh import describe_mesh
 
@@ -21,13 +21,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("output", metavar="OUT", nargs="?", help="folder (default: clrecon-demo)")
     add_device(parser)
+    add_no_clobber(parser)
 
 
 def run(options: argparse.Namespace, console: Console) -> int:
     """Run the command; returns the exit code."""
     from clrecon.jobs.demo import DEMO_FOLDER, make_demo
 
-    outcome = make_demo(options.output or DEMO_FOLDER, options.device, progress=console.progress)
+    outcome = make_demo(
+        options.output or DEMO_FOLDER, options.device, no_clobber=options.no_clobber, progress=console.progress
+    )
     console.result(outcome)
     for line in _summary(outcome):
         console.say(line)

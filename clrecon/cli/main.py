@@ -16,6 +16,7 @@ from clrecon.cli.common import EXIT_CODES, Parser, guard
 from clrecon.cli.console import Console
 from clrecon.cli.wording import speaker_of
 from clrecon.errors import UsageError
+from clrecon.system.foreign_words import own_streams
 from clrecon.system.wording import spoken_by
 
 __all__ = ["main", "run"]
@@ -70,7 +71,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     flags = arguments[: arguments.index("--")] if "--" in arguments else arguments
     console = Console(as_json="--json" in flags)
     debug = "--debug" in flags
-    return guard(lambda: _dispatch(arguments, console), console, debug)
+    with own_streams(show=debug):
+        return guard(lambda: _dispatch(arguments, console), console, debug)
 
 
 def run() -> None:

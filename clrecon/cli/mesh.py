@@ -6,7 +6,7 @@ import argparse
 from dataclasses import fields
 from typing import Any
 
-from clrecon.cli.common import add_device, add_memory, megabytes, pick
+from clrecon.cli.common import add_device, add_memory, add_no_clobber, megabytes, pick
 from clrecon.cli.console import Console, printable
 from clrecon.cli.labels import add_label_arguments, describe_labels, label_choice
 from clrecon.cli.levels import LEVELS_HELP, parse_hu, parse_levels
@@ -137,6 +137,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_memory(device)
     checks = parser.add_argument_group("checks")
     add_strict(checks)
+    add_no_clobber(checks)
     checks.add_argument("--report", metavar="FILE", help="write affine, counts, quality, device and times as JSON")
 
 
@@ -154,6 +155,7 @@ def run(options: argparse.Namespace, console: Console) -> int:
         options.output,
         settings,
         report_path=options.report,
+        no_clobber=options.no_clobber,
         measure=bool(options.report or options.json or options.verbose),
         progress=console.progress,
     )

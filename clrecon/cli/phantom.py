@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
+from clrecon.cli.common import add_no_clobber
 from clrecon.cli.console import Console, printable
 
 __all__ = ["add_arguments", "run"]
@@ -44,6 +45,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--table-gap", dest="table_gap_mm", type=float, metavar="MM", help="between body and table")
     parser.add_argument("--prone", action="store_true", default=None, help="the patient lies on the face")
     parser.add_argument("--seed", type=int, metavar="N")
+    add_no_clobber(parser)
 
 
 def _list_kinds() -> str:
@@ -57,7 +59,7 @@ def run(options: argparse.Namespace, console: Console) -> int:
     from clrecon.jobs.phantom import make_phantom
 
     given: dict[str, Any] = {name: getattr(options, name) for name in _SETTINGS}
-    truth = make_phantom(options.output, progress=console.progress, **given)
+    truth = make_phantom(options.output, no_clobber=options.no_clobber, progress=console.progress, **given)
     console.result(truth)
     for line in _summary(truth, options.output):
         console.say(line)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
-from clrecon.cli.common import add_device, add_memory, megabytes
+from clrecon.cli.common import add_device, add_memory, add_no_clobber, megabytes
 from clrecon.cli.console import Console, printable
 from clrecon.cli.masking import add_masking
 from clrecon.cli.mesh import describe_volume
@@ -75,6 +75,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     device = parser.add_argument_group("device")
     add_device(device)
     add_memory(device)
+    add_no_clobber(device)
     device.add_argument("--report", metavar="FILE", help="write camera, settings, certificate, device, times as JSON")
 
 
@@ -84,7 +85,9 @@ def run(options: argparse.Namespace, console: Console) -> int:
     from clrecon.jobs.render.job import make_pictures
 
     files = PictureFiles(options.output, options.depth, options.values, options.turntable, options.report)
-    report = make_pictures(options.input, files, render_settings(options), progress=console.progress)
+    report = make_pictures(
+        options.input, files, render_settings(options), no_clobber=options.no_clobber, progress=console.progress
+    )
     console.result(report)
     for line in describe_report(report):
         console.say(line)

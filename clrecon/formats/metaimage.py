@@ -25,6 +25,7 @@ from clrecon.formats.extras import import_extra
 from clrecon.formats.grid_file import GridFile, Purpose
 from clrecon.formats.stream import VoxelBytes, file_beside
 from clrecon.geometry.affine import Float64Array, checked_affine
+from clrecon.system.foreign_words import hush
 from clrecon.system.regular_files import open_regular
 from clrecon.system.text import escape_text
 
@@ -232,7 +233,8 @@ def _ask_library(path: Path, header: _Header) -> tuple[tuple[int, int, int], np.
     reader.SetImageIO("MetaImageIO")  # SimpleITK may use its MetaImage reader only.
     reader.SetFileName(str(path))
     try:
-        reader.ReadImageInformation()
+        with hush():
+            reader.ReadImageInformation()
     except RuntimeError as error:
         raise RefusedInputError(f"{header.name} is no usable MetaImage: SimpleITK cannot read its header") from error
     kind = reader.GetPixelIDValue()

@@ -80,7 +80,8 @@ def open_nifti(path: Path, purpose: Purpose) -> GridFile:
         shape = _shape(header.parsed, name, purpose)
         dtype = _dtype(header.parsed, name, purpose)
         slope, intercept = header.parsed.get_slope_inter()
-        affine, warnings = nifti_affine(header.parsed, shape, name)
+        with np.errstate(over="ignore", invalid="ignore"):  # forms that are not finite are refused
+            affine, warnings = nifti_affine(header.parsed, shape, name)
     except (ValueError, TypeError, KeyError, OverflowError, _header_errors(purpose)) as error:
         if isinstance(error, UsageError):
             raise

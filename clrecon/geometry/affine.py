@@ -74,8 +74,10 @@ def checked_affine(affine: ArrayLike) -> Float64Array:
         raise UsageError("the affine holds NaN or infinite entries")
     if not np.array_equal(checked[3], (0.0, 0.0, 0.0, 1.0)):
         raise UsageError(f"the last row of an affine is (0, 0, 0, 1), this one has {checked[3].tolist()}")
-    lengths = np.linalg.norm(checked[:3, :3], axis=0)
-    if lengths.min() == 0.0 or abs(np.linalg.det(checked[:3, :3] / lengths)) < 1e-6:
+    with np.errstate(over="ignore", invalid="ignore"):
+        lengths = np.linalg.norm(checked[:3, :3], axis=0)
+        spans = lengths.min() > 0.0 and abs(np.linalg.det(checked[:3, :3] / lengths)) >= 1e-6
+    if not spans:
         raise UsageError("the affine is singular: its three steps do not span space")
     return checked
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,7 +13,18 @@ from clrecon.jobs.render.files import PictureFiles
 from clrecon.jobs.render.job import make_pictures
 from clrecon.jobs.render.settings import RenderSettings
 from clrecon.jobs.shared.laps import Laps
+from clrecon.system.files import hold_interrupts, temporary_folder
 from clrecon.system.progress import Progress
+from clrecon.system.targets import (
+    existing_stay,
+    final_mode,
+    keep_existing,
+    place_file,
+    place_folder,
+    refuse_existing,
+    resolve_target,
+    system_errors,
+)
 
 if TYPE_CHECKING:
     from clrecon.opencl import Device
@@ -26,7 +38,11 @@ _TILT_DEG, _OBLIQUE_DEG = 12.0, (10.0, -5.0, 30.0)
 
 
 def make_demo(
-    output: str | Path = DEMO_FOLDER, device: str | None = None, *, progress: Progress | None = None
+    output: str | Path = DEMO_FOLDER,
+    device: str | None = None,
+    *,
+    no_clobber: bool = False,
+    progress: Progress | None = None,
 ) -> dict[str, Any]:
     """Write a phantom CT series, a picture of it, its bone mesh and the report; check a sphere of known volume.
 
@@ -36,6 +52,8 @@ def make_demo(
         A new or empty folder, or one of an earlier demonstration, which is replaced.
     device : str, optional
         Name or index of an OpenCL device.
+    no_clobber : bool
+        True: a folder that holds anything stays and is an `OutputError`.
     progress : callable, optional
 
     Returns
@@ -49,14 +67,31 @@ def make_demo(
     UsageError
         The folder contains other files.
     OutputError, DeviceError
+        Nothing is written then, and an earlier demonstration is intact.
     """
     from clrecon.opencl import choose_device
+
+    folder = resolve_target(output)
+    with keep_existing(no_clobber):
+        _check_replaceable(folder, output)
+        chosen = choose_device(device)
+        with ExitStack() as stack:
+            with system_errors(output):
+                made = stack.enter_context(temporary_folder(folder if folder.exists() else folder.parent))
+            try:
+                outcome = _fill(made, chosen, progress)
+            except OutputError as error:
+                raise OutputError(str(error).replace(str(made), str(output))) from error
+            with hold_interrupts():
+                _put_in_place(made, folder, output)
+    return {"folder": str(output), **outcome}
+
+
+def _fill(folder: Path, chosen: Device, progress: Progress | None) -> dict[str, Any]:
+    """Write everything into a folder; returns the outcome."""
     from clrecon.phantom import PhantomSettings, write_phantom
 
     watch = Laps()
-    folder = Path(output)
-    _prepare(folder)
-    chosen = choose_device(device)
     settings = PhantomSettings(kind="spine", size=(256, 192), slices=110, spacing=(1.0, 1.0, 1.25))
     truth = write_phantom(folder / "ct", settings, progress=progress)
     watch.lap("phantom")
@@ -81,7 +116,6 @@ def make_demo(
     ]
     seconds = {**watch.seconds, "total": watch.total()}
     return {
-        "folder": str(output),
         "files": list(DEMO_FILES),
         "affine_error_mm": max(errors),
         "check": check,
@@ -136,16 +170,30 @@ def check_sphere(device: Device) -> dict[str, Any]:
     }
 
 
-def _prepare(folder: Path) -> None:
-    """Make the folder; accept an empty one or that of an earlier demonstration."""
+def _check_replaceable(folder: Path, output: str | Path) -> None:
+    """Accept a folder that is absent, empty, or that of an earlier demonstration, unless existing files are kept."""
     try:
-        folder.mkdir(exist_ok=True)
+        if not folder.parent.is_dir():
+            raise OutputError(f"cannot make {output}: the folder around it does not exist; make it first")
         names = {entry.name for entry in folder.iterdir() if not entry.name.startswith(".clrecon-")}
     except FileNotFoundError:
-        raise OutputError(f"cannot make {folder}: the folder around it does not exist; make it first") from None
+        return
     except OSError as error:
-        raise OutputError(f"cannot make the folder {folder}: {error.strerror or error}") from error
+        raise OutputError(f"cannot make the folder {output}: {error.strerror or error}") from error
+    refuse_existing(output, folder)
     foreign = sorted(names - set(DEMO_FILES))
     if foreign or (names and not (folder / "ct" / "truth.json").is_file()):
         example = (foreign or sorted(names))[0]
-        raise UsageError(f"{folder} holds something that is not of a demo ({example}): name a new or empty folder")
+        raise UsageError(f"{output} holds something that is not of a demo ({example}): name a new or empty folder")
+
+
+def _put_in_place(made: Path, folder: Path, output: str | Path) -> None:
+    """Move a finished demonstration to its place: as a folder, or file by file into a folder that is there."""
+    keep = existing_stay()
+    if not folder.exists():
+        made.chmod(final_mode(folder, 0o777))
+        place_folder(made, folder, output, keep=keep)
+        return
+    for name in DEMO_FILES:
+        place = place_folder if (made / name).is_dir() else place_file
+        place(made / name, folder / name, Path(output) / name, keep=keep)

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from clrecon.system.progress import Progress
+from clrecon.system.targets import keep_existing
 
 __all__ = ["describe_kinds", "make_phantom"]
 
@@ -17,13 +18,17 @@ def describe_kinds() -> dict[str, str]:
     return {name: kind.said for name, kind in KINDS.items()}
 
 
-def make_phantom(output: str | Path, *, progress: Progress | None = None, **settings: Any) -> dict[str, Any]:
+def make_phantom(
+    output: str | Path, *, no_clobber: bool = False, progress: Progress | None = None, **settings: Any
+) -> dict[str, Any]:
     """Write a phantom CT series with its truth.
 
     Parameters
     ----------
     output : path
         Folder for the DICOM files, ``truth.json`` and, of a scene, ``materials.nrrd``.
+    no_clobber : bool
+        True: a folder that holds anything stays and is an `OutputError`.
     progress : callable, optional
     **settings
         Fields of `clrecon.phantom.PhantomSettings`; those that are None keep their default.  ``size`` may be a
@@ -44,4 +49,5 @@ def make_phantom(output: str | Path, *, progress: Progress | None = None, **sett
     given = {name: value for name, value in settings.items() if value is not None}
     if isinstance(given.get("size"), str):
         given["size"] = parse_size(given["size"])
-    return write_phantom(output, PhantomSettings(**given), progress=progress)
+    with keep_existing(no_clobber):
+        return write_phantom(output, PhantomSettings(**given), progress=progress)

@@ -17,6 +17,7 @@ from clrecon.exchange.formats import write_mesh
 from clrecon.geometry import frame_from_lps
 from clrecon.mesh.quality import MeshQuality, measure_quality
 from clrecon.system.messages import Message
+from clrecon.system.targets import keep_existing
 
 __all__ = ["Mesh"]
 
@@ -184,7 +185,7 @@ class Mesh(Message):
         """Measure the mesh: closedness, size and faults."""
         return measure_quality(self._vertices, self._triangles)
 
-    def save(self, path: str | os.PathLike[str], space: str = "lps") -> int:
+    def save(self, path: str | os.PathLike[str], space: str = "lps", *, no_clobber: bool = False) -> int:
         """Write the mesh to a file; its extension gives the format.
 
         STL (binary), PLY (binary), OBJ, GLB, VTP and 3MF.  The file is either complete or absent, and an older file of
@@ -197,6 +198,8 @@ class Mesh(Message):
         space : {"lps", "ras"}
             Patient frame of the coordinates; the file names it.  Units are mm; a node matrix in GLB maps them to the
             metres, Y up, of glTF.  STL holds only float32, the other formats keep float64 vertices.
+        no_clobber : bool
+            True: a file of that name stays and is an `OutputError`.
 
         Returns
         -------
@@ -212,7 +215,8 @@ class Mesh(Message):
         OutputError
             The file cannot be written; an older one of that name is intact.
         """
-        return write_mesh(self, path, space)
+        with keep_existing(no_clobber):
+            return write_mesh(self, path, space)
 
     def to_pyvista(self) -> Any:
         """Return the mesh as ``pyvista.PolyData`` in LPS mm, sharing the memory of vertices and normals.

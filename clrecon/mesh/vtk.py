@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.exchange.vtk import make_polydata
+from clrecon.system.foreign_words import hush
 
 __all__ = ["CellLocator", "smooth_windowed_sinc", "wrap_polydata"]
 
@@ -78,7 +79,8 @@ def smooth_windowed_sinc(
     smoother.NonManifoldSmoothingOn()
     smoother.BoundarySmoothingOff()
     smoother.FeatureEdgeSmoothingOff()
-    smoother.Update()
+    with hush():  # it says so if few iterations leave it without its best offset
+        smoother.Update()
     return np.asarray(vtk_to_numpy(smoother.GetOutput().GetPoints().GetData()), dtype=np.float64)
 
 

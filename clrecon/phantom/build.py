@@ -7,8 +7,6 @@ from __future__ import annotations
 
 import json
 import re
-import shutil
-import tempfile
 from pathlib import Path
 from typing import Any
 
@@ -26,8 +24,10 @@ from clrecon.phantom.scene_plans import plan_scene
 from clrecon.phantom.scenes import CEILING_HU, DENSE_HU, LabelArray, describe_parts, draw_scene
 from clrecon.phantom.settings import CENTRE_LPS_MM, KINDS, PhantomSettings, Placement, place_slices
 from clrecon.phantom.spine import draw_spine
+from clrecon.system.files import temporary_folder
 from clrecon.system.progress import Progress
 from clrecon.system.regular_files import read_regular
+from clrecon.system.targets import existing_stay, place_folder, refuse_existing, resolve_target
 from clrecon.version import package_version
 
 __all__ = ["SPINE_ISO_HU", "TRUTH_NAME", "label_materials", "make_phantom", "write_phantom"]
@@ -216,23 +216,6 @@ def _check_replaceable(folder: Path) -> None:
         raise UsageError(f"{folder.name}/{TRUTH_NAME} is not of a phantom: give a new or empty folder")
 
 
-def _put_in_place(finished: Path, folder: Path) -> None:
-    """Rename the finished folder over `folder`; an earlier phantom is put back when that fails.
-
-    After success the earlier phantom lies beside `finished`, in the temporary folder that the caller removes.
-    """
-    if not folder.exists():
-        finished.rename(folder)
-        return
-    earlier = finished.with_name(finished.name + "-earlier")
-    folder.rename(earlier)
-    try:
-        finished.rename(folder)
-    except OSError:
-        earlier.rename(folder)
-        raise
-
-
 def write_phantom(
     out_folder: str | Path, settings: PhantomSettings, progress: Progress | None = None
 ) -> dict[str, Any]:
@@ -261,13 +244,13 @@ def write_phantom(
     OutputError
         The files cannot be written.
     """
-    folder = Path(out_folder).resolve()
+    folder = resolve_target(out_folder)
     try:
         _check_replaceable(folder)
+        refuse_existing(folder.name, folder)
         placement = place_slices(settings)
         voxels, truth, labels = _make(settings, placement, progress)
-        temporary = Path(tempfile.mkdtemp(prefix=".clrecon-", dir=folder.parent))
-        try:
+        with temporary_folder(folder.parent) as temporary:
             finished = temporary / "series"
             finished.mkdir()
             write_series(finished, voxels, settings, placement, progress)
@@ -275,9 +258,7 @@ def write_phantom(
             (finished / TRUTH_NAME).write_text(text, encoding="utf-8")
             if labels is not None:
                 write_label_map(finished / MATERIALS_NAME, labels, placement.affine)
-            _put_in_place(finished, folder)
-        finally:
-            shutil.rmtree(temporary, ignore_errors=True)
+            place_folder(finished, folder, folder.name, keep=existing_stay())
     except OSError as error:
         reason = error.strerror or type(error).__name__
         raise OutputError(f"the phantom cannot be written to {folder.name}: {reason}") from error

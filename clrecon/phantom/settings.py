@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import re
 from dataclasses import dataclass
 from typing import Any
 
@@ -82,7 +83,7 @@ def parse_size(text: str) -> tuple[int, int]:
         `text` has another form.
     """
     parts = text.lower().split("x")
-    if len(parts) > 2 or not all(part.strip().isdecimal() for part in parts):
+    if len(parts) > 2 or not all(re.fullmatch(r" *[0-9]{1,9} *", part) for part in parts):
         raise UsageError(f"size {text!r} is not understood: use columns or columns x rows, like 256 or 256x192")
     return int(parts[0]), int(parts[-1])
 

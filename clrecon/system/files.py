@@ -11,7 +11,6 @@ A target that is a symbolic link is followed: the file that it points to is repl
 from __future__ import annotations
 
 import contextlib
-import errno
 import os
 import re
 import secrets
@@ -26,7 +25,7 @@ from typing import BinaryIO, Protocol
 
 from clrecon.errors import OutputError
 from clrecon.system.log import get_logger
-from clrecon.system.regular_files import open_regular
+from clrecon.system.targets import checked_target, existing_stay, final_mode, place_file, shown_path, system_errors
 
 if sys.platform != "win32":
     import fcntl
@@ -36,12 +35,9 @@ __all__ = [
     "StagedFile",
     "allow_open_files",
     "check_writable",
-    "final_mode",
     "hold_interrupts",
-    "is_dicom",
     "replace_file",
     "stage_file",
-    "system_errors",
     "temporary_folder",
 ]
 
@@ -55,27 +51,6 @@ _TEMPORARY = re.compile(r"\.clrecon-[0-9a-f]{16}\.(?:tmp|folder)")
 _own_names: set[str] = set()
 """Names of the temporary files and folders that this process is writing.  They are not examined: with a thousand of
 them that would be slow."""
-
-_ADVICE = {
-    errno.ENOSPC: "the disk is full: free some space or choose another folder",
-    errno.EDQUOT: "the disk quota is used up: free some space or choose another folder",
-    errno.EFBIG: "the file grew beyond the largest size that is allowed here",
-    errno.EROFS: "the file system is read-only: choose another folder",
-    errno.EACCES: "permission denied: choose another folder or change its permissions",
-    errno.EPERM: "the system does not permit it: choose another folder",
-    errno.ENAMETOOLONG: "the name is too long: choose a shorter one",
-    errno.ELOOP: "it is a symbolic link that leads back to itself",
-    errno.ENOENT: "the folder vanished while the file was written",
-    errno.EMFILE: "too many files are open at once: write fewer, or raise the limit (ulimit -n)",
-}
-
-_KINDS: tuple[tuple[Callable[[int], bool], str], ...] = (
-    (stat.S_ISDIR, "a folder: name a file in it"),
-    (stat.S_ISFIFO, "a FIFO: only regular files are written"),
-    (stat.S_ISSOCK, "a socket: only regular files are written"),
-    (stat.S_ISBLK, "a block device: only regular files are written"),
-    (stat.S_ISCHR, "a character device: only regular files are written"),
-)
 
 
 def replace_file(
@@ -136,6 +111,7 @@ class StagedFile:
 
     def __init__(self, path: str | os.PathLike[str], temporary: Path, target: Path, stream: BinaryIO, size: int):
         self._path, self._temporary, self._target, self._stream = path, temporary, target, stream
+        self._keep = existing_stay()
         self.size = size
 
     def commit(self) -> None:
@@ -144,12 +120,12 @@ class StagedFile:
         Raises
         ------
         OutputError
-            The system refuses to rename; an older target is intact.
+            The system refuses to rename, or an existing file is kept; an older target is intact.
         """
-        with system_errors(self._path):
-            if sys.platform == "win32":
+        if sys.platform == "win32":
+            with system_errors(self._path):
                 self._stream.close()  # Windows cannot rename an open file.
-            os.replace(self._temporary, self._target)
+        place_file(self._temporary, self._target, self._path, keep=self._keep)
         _sync_folder(self._target.parent)
         log.info("file written: %d bytes", self.size)
 
@@ -167,7 +143,7 @@ def stage_file(
     For files that belong together: stage all of them, then commit one after the other.  Files that are not committed
     are removed at the end of the block.  Parameters and errors as in `replace_file`.
     """
-    target = _checked_target(path)
+    target = checked_target(path)
     with contextlib.ExitStack() as stack:
         with system_errors(path):
             _check_space(path, target.parent, expected_bytes)
@@ -180,7 +156,7 @@ def stage_file(
             os.fsync(stream.fileno())
             found = os.fstat(stream.fileno()).st_size
             if found != size:
-                raise OutputError(f"cannot write {_shown(path)}: {size} bytes written, {found} arrived on the disk")
+                raise OutputError(f"cannot write {shown_path(path)}: {size} bytes written, {found} arrived on the disk")
             if verify is not None:
                 verify(temporary)
             if sys.platform != "win32":
@@ -239,63 +215,11 @@ def check_writable(path: str | os.PathLike[str], *, expected_bytes: int = 0) -> 
     expected_bytes : int, optional
         Expected size of the file, if it is known.
     """
-    target = _checked_target(path)
+    target = checked_target(path)
     with system_errors(path):
         _check_space(path, target.parent, expected_bytes)
         with _temporary_file(target.parent):
             pass
-
-
-def _shown(path: str | os.PathLike[str]) -> str:
-    """Return the path as a message shows it: one line without terminal control characters."""
-    return "".join(c if c.isprintable() else repr(c)[1:-1] for c in os.fspath(path))
-
-
-@contextlib.contextmanager
-def system_errors(path: str | os.PathLike[str]) -> Iterator[None]:
-    """Turn errors of the system into one line that names the target and says what to do."""
-    try:
-        yield
-    except OSError as error:
-        reason = _ADVICE.get(error.errno or 0) or error.strerror or str(error) or type(error).__name__
-        raise OutputError(f"cannot write {_shown(path)}: {reason}") from error
-
-
-def _checked_target(path: str | os.PathLike[str]) -> Path:
-    """Resolve symbolic links and return the path to replace, after checking that it may be replaced."""
-    text = os.fspath(path)
-    if "\0" in text:
-        raise OutputError(f"cannot write {_shown(path)}: the name holds a null character")
-    with system_errors(path):
-        if not text or text.endswith(tuple(filter(None, (os.sep, os.altsep)))):
-            raise OutputError(f"cannot write {_shown(path)!r}: this names a folder, name a file in it")
-        target = Path(os.path.realpath(text))
-        folder = target.parent
-        if not folder.exists():
-            raise OutputError(f"cannot write {_shown(path)}: the folder {_shown(folder)} does not exist, make it first")
-        if not folder.is_dir():
-            raise OutputError(f"cannot write {_shown(path)}: {_shown(folder)} is not a folder")
-        try:
-            mode = os.stat(target).st_mode
-        except FileNotFoundError:
-            return target
-        for is_kind, words in _KINDS:
-            if is_kind(mode):
-                raise OutputError(f"cannot write {_shown(path)}: it is {words}")
-        if not os.access(target, os.W_OK):
-            raise OutputError(f"cannot write {_shown(path)}: the file is there and write-protected")
-        if is_dicom(target):
-            raise OutputError(f"cannot write {_shown(path)}: a DICOM file is there, which is never replaced")
-    return target
-
-
-def is_dicom(path: str | os.PathLike[str]) -> bool:
-    """True for a file with the mark of DICOM: measured data are not overwritten, they cannot be made again."""
-    try:
-        with open_regular(path, 0) as stream:
-            return stream.read(132)[128:] == b"DICM"
-    except OSError:
-        return False
 
 
 def _check_space(path: str | os.PathLike[str], folder: Path, expected_bytes: int) -> None:
@@ -303,21 +227,9 @@ def _check_space(path: str | os.PathLike[str], folder: Path, expected_bytes: int
     # Some network file systems do not tell their free space and report 0 bytes.
     if usage.total and expected_bytes > usage.free:
         raise OutputError(
-            f"cannot write {_shown(path)}: it needs about {expected_bytes / 1e6:.1f} MB and "
-            f"{usage.free / 1e6:.1f} MB are free in {_shown(folder)}"
+            f"cannot write {shown_path(path)}: it needs about {expected_bytes / 1e6:.1f} MB and "
+            f"{usage.free / 1e6:.1f} MB are free in {shown_path(folder)}"
         )
-
-
-def final_mode(target: Path, new: int = 0o666) -> int:
-    """Return the permissions of a finished file: those of the file that it replaces, else `new` as the umask allows."""
-    try:
-        return stat.S_IMODE(os.stat(target).st_mode) & 0o777
-    except FileNotFoundError:
-        # The umask can only be read by setting it.  Meanwhile it is strict, so a file that another thread makes then is
-        # too private, never too open.
-        umask = os.umask(0o077)
-        os.umask(umask)
-        return new & ~umask
 
 
 @contextlib.contextmanager

@@ -127,6 +127,27 @@ def test_demo_writes_and_replaces(device: Any, tmp_path: Path) -> None:
     assert check["radius_error_max_mm"] < 0.15 * max(check["spacing_mm"])
 
 
+@pytest.mark.parametrize("there", [False, True], ids=["no folder", "an empty folder"])
+def test_demo_without_a_device_or_room_leaves_nothing(
+    there: bool, device: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fill_the_disk(folder: Path, *_: Any) -> None:
+        (folder / "ct").mkdir()
+        (folder / "bone.stl").write_bytes(b"half")
+        raise OutputError(f"cannot write {folder / 'bone.stl'}: the disk is full")
+
+    folder = tmp_path / "demo"
+    if there:
+        folder.mkdir()
+    with pytest.raises(DeviceError):
+        make_demo(folder, "no such device")
+    monkeypatch.setattr("clrecon.jobs.demo._fill", fill_the_disk)
+    with pytest.raises(OutputError) as caught:
+        make_demo(folder, str(device.index))
+    assert str(caught.value) == f"cannot write {folder / 'bone.stl'}: the disk is full"
+    assert list(tmp_path.rglob("*")) == ([folder] if there else [])
+
+
 def test_demo_refuses_a_folder_of_others(tmp_path: Path) -> None:
     (tmp_path / "bone.stl").write_text("mine")
     with pytest.raises(UsageError, match="not of a demo"):

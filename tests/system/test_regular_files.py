@@ -86,6 +86,8 @@ def test_a_phantom_does_not_wait_for_its_truth(tmp_path):
 
 OWN = {
     "system/files.py": "locks of folders",
+    "system/foreign_words.py": "streams of a command",
+    "system/targets.py": "a name that is taken",
     "system/mapping.py": "maps a file that it has looked at",
     "system/regular_files.py": "the helper itself",
     "cli/console.py": "the null device",

@@ -16,6 +16,7 @@ from clrecon.jobs.shared.laps import Laps
 from clrecon.jobs.shared.outputs import check_kept
 from clrecon.jobs.shared.report import platform_name, stage_report
 from clrecon.system.progress import Progress, ignore_progress
+from clrecon.system.targets import keep_existing
 from clrecon.version import package_version
 
 if TYPE_CHECKING:
@@ -41,6 +42,7 @@ def run_bench(
     runs: int = DEFAULT_RUNS,
     series: str | None = None,
     report_path: str | Path | None = None,
+    no_clobber: bool = False,
     progress: Progress | None = None,
 ) -> dict[str, Any]:
     """Time the stages from a CT series to its surface on one device or on all devices.
@@ -62,6 +64,8 @@ def run_bench(
         The series of `source` to read.
     report_path : path, optional
         JSON file for the result.
+    no_clobber : bool
+        True: a report that exists stays and is an `OutputError`, before any work.
     progress : callable, optional
         ``progress(stage, done, total)``.
 
@@ -81,7 +85,8 @@ def run_bench(
     if report_path is not None:
         from clrecon.system.files import check_writable
 
-        check_writable(report_path)
+        with keep_existing(no_clobber):
+            check_writable(report_path)
         check_kept([("the report", report_path)], source)
     progress("device", 0, 0)
     devices = _choose_devices(device)
@@ -106,7 +111,7 @@ def run_bench(
     result["seconds"] = {**watch.seconds, "total": watch.total()}
     result["warnings"] = _collect_warnings(result, volume)
     if report_path is not None:
-        with stage_report(report_path, result) as staged:
+        with keep_existing(no_clobber), stage_report(report_path, result) as staged:
             staged.commit()
     return result
 

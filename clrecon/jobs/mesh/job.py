@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from clrecon.jobs.mesh.bone import judge_surfaces, warn_of_walls
-from clrecon.jobs.mesh.labels import extract_label_surfaces, judge_label_volumes, open_labels
+from clrecon.jobs.mesh.labels import extract_label_surfaces, judge_label_volumes, name_label_files, open_labels
 from clrecon.jobs.mesh.levels import choose_level
 from clrecon.jobs.mesh.parts import check_levels, extract_surfaces, first_names, select_parts
 from clrecon.jobs.mesh.prepare import leave_outside, prepare_surfaces
@@ -26,12 +26,15 @@ from clrecon.jobs.shared.outputs import (
     commit_all,
     count_leftovers,
     name_outputs,
+    refuse_files,
+    refuse_numbered,
     stage_meshes,
 )
 from clrecon.jobs.shared.report import stage_report
 from clrecon.reading import read_selected
 from clrecon.system.log import get_logger, log_warnings
 from clrecon.system.progress import Progress, ignore_progress
+from clrecon.system.targets import keep_existing
 
 if TYPE_CHECKING:
     from clrecon.anatomy.iso_choice import IsoChoice
@@ -54,6 +57,7 @@ def make_mesh(
     *,
     report_path: str | Path | None = None,
     measure: bool | None = None,
+    no_clobber: bool = False,
     progress: Progress | None = None,
 ) -> MeshReport:
     """Read a CT series, extract its surfaces, select components, measure them and write them.
@@ -76,6 +80,8 @@ def make_mesh(
         File for the report as JSON.
     measure : bool, optional
         Measure the meshes, which costs time; without it those entries are None.  Default: with a `report_path`.
+    no_clobber : bool
+        True: files that exist stay and are an `OutputError`, before any work where their names are known then.
     progress : callable, optional
         ``progress(stage, done, total)``.
 
@@ -93,10 +99,10 @@ def make_mesh(
     measure = report_path is not None if measure is None else measure
     watch = Laps()
     surfaces = plan_surfaces(settings.levels, below=settings.below is not None)
-    outputs = check_outputs(output, report_path, first_names(surfaces, settings.split))
-    check_kept(outputs, source, None if settings.labels is None else settings.labels.path)
+    with keep_existing(no_clobber):
+        _check_files(source, output, report_path, surfaces, settings)
 
-    volume, labels, device = _open(source, settings, progress, watch)
+    volume, labels, device = _open(source, output, surfaces, settings, no_clobber, progress, watch)
     volume = mask_volume(volume, settings, progress)
     watch.lap("mask")
     volume, surfaces, choice = _choose(volume, surfaces, settings, progress, watch)
@@ -108,7 +114,6 @@ def make_mesh(
     paths = name_outputs(output, [part.name for part in parts], report_path)
     judge_surfaces(parts, volume, settings)
     watch.lap("select")
-
     gates = _refine_and_measure(parts, volume, settings, measure or settings.strict, progress, watch)
     purpose_warnings = describe_purposes(parts)
     watch.lap("measure")
@@ -121,9 +126,24 @@ def make_mesh(
             volume, parts, meshes, settings, device, choice, gates=gates, warnings=warnings, seconds=seconds
         )
 
-    report = _write(parts, paths, report_path, settings.space, compose, watch, progress)
+    with keep_existing(no_clobber):
+        report = _write(parts, paths, report_path, settings.space, compose, watch, progress)
     _log(report, volume)
     return report
+
+
+def _check_files(
+    source: str | Path,
+    output: str | Path,
+    report_path: str | Path | None,
+    surfaces: Sequence[Surface],
+    settings: MeshSettings,
+) -> None:
+    """Refuse outputs that cannot be written or would replace an input."""
+    outputs = check_outputs(output, report_path, first_names(surfaces, settings.split))
+    if settings.split:
+        refuse_numbered(output)
+    check_kept(outputs, source, None if settings.labels is None else settings.labels.path)
 
 
 def _log(report: MeshReport, volume: Volume) -> None:
@@ -155,13 +175,21 @@ def _write(
 
 
 def _open(
-    source: str | Path, settings: MeshSettings, progress: Progress, watch: Laps
+    source: str | Path,
+    output: str | Path,
+    surfaces: Sequence[Surface],
+    settings: MeshSettings,
+    no_clobber: bool,
+    progress: Progress,
+    watch: Laps,
 ) -> tuple[Volume, LabelMap | None, Device]:
     """Read the input while the device opens and builds its kernels."""
     progress("device", 0, 0)
     prepare = partial(prepare_surfaces, components=settings.selects, topology=settings.topology, inside=settings.inside)
     with DeviceOpening(settings.device, prepare) as opening:
         labels = open_labels(settings.labels)
+        if labels is not None and settings.labels is not None and no_clobber:
+            refuse_files(name_outputs(output, name_label_files(labels, settings.labels, surfaces)))
         volume = read_selected(source, settings, progress=progress)
         watch.lap("read")
         device = opening.wait()

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from clrecon.opencl import Device
 
 __all__ = [
-    "describe_label", "extract_label_surfaces", "judge_label_volumes", "open_labels",
+    "describe_label", "extract_label_surfaces", "judge_label_volumes", "name_label_files", "open_labels",
 ]  # fmt: skip
 
 NAMES_SHOWN = 5
@@ -44,6 +44,16 @@ def open_labels(choice: LabelChoice | None) -> LabelMap | None:
     from clrecon.labels import read_labels
 
     return read_labels(choice.path, choice.wanted or None)
+
+
+def name_label_files(labels: LabelMap, choice: LabelChoice, surfaces: Sequence[Surface]) -> list[str]:
+    """Name the files of all wanted labels, each of which may turn out to have no surface; empty for one file."""
+    from clrecon.labels import file_suffixes
+
+    numbers = [labels.find(label) for label in choice.wanted] or labels.numbers
+    suffixes = file_suffixes({number: labels.name(number) for number in numbers})
+    names = ["_".join(filter(None, (suffix, each.name))) for suffix in suffixes.values() for each in surfaces]
+    return names if len(names) > 1 else []
 
 
 def extract_label_surfaces(

@@ -28,6 +28,7 @@ from clrecon.reading import read_selected
 from clrecon.system.files import allow_open_files
 from clrecon.system.log import get_logger, log_warnings
 from clrecon.system.progress import Progress, ignore_progress
+from clrecon.system.targets import keep_existing
 
 if TYPE_CHECKING:
     from clrecon.geometry import Volume
@@ -45,6 +46,7 @@ def make_pictures(
     files: PictureFiles,
     settings: RenderSettings | None = None,
     *,
+    no_clobber: bool = False,
     progress: Progress | None = None,
 ) -> PictureReport:
     """Read a CT series and take the pictures that are asked for.
@@ -59,6 +61,8 @@ def make_pictures(
         DICOM folder or file, or a file of another format, see `clrecon.reading.read_volume`.
     files : PictureFiles
     settings : RenderSettings, optional
+    no_clobber : bool
+        True: what exists stays and is an `OutputError`, before any work; an empty folder of frames is filled.
     progress : callable, optional
         ``progress(stage, done, total)``.
 
@@ -76,7 +80,9 @@ def make_pictures(
     if (files.turntable is None) != (settings.turntable is None):
         raise UsageError("a turntable needs both: where it goes, and how it turns")
     watch = Laps()
-    check_kept(check_pictures(files, settings), source, *settings.files_read)
+    with keep_existing(no_clobber):
+        outputs = check_pictures(files, settings)
+    check_kept(outputs, source, *settings.files_read)
     allow_open_files(3 * len(settings.views_used) + 2)  # 3 for each view, turntable and report
     function = read_function(settings.transfer_function)
     curve = read_curve(settings.curve)
@@ -92,7 +98,11 @@ def make_pictures(
     watch.lap("mask")
 
     studio = Studio(volume, device, settings, function=function, curve=curve, labels=labels, progress=progress)
-    with studio, ExitStack() as staged:  # all files are on the disk before any of them replaces an older one
+    with (
+        keep_existing(no_clobber),
+        studio,
+        ExitStack() as staged,
+    ):  # all files are on the disk before any of them replaces an older one
         pictures, written = _take_views(studio, settings, files, staged, watch, progress)
         turntable, moving = _turn(studio, volume, settings, files, staged, watch, progress)
         written += moving

@@ -111,7 +111,7 @@ def check_kept(outputs: Sequence[tuple[str, str | Path | None]], *inputs: str | 
     for what, path in there:
         inside = os.path.join(os.path.realpath(path), "")
         for one in read:
-            same = _identity(path) == _identity(one) or os.path.exists(one) and os.path.samefile(path, one)
+            same = os.path.exists(one) and (_identity(path) == _identity(one) or os.path.samefile(path, one))
             if same or os.path.isdir(path) and os.path.realpath(one).startswith(inside):
                 raise UsageError(f"{what} would replace a file that is read: {path}")
         if os.path.isfile(path) and _is_bare_data_set(path):
@@ -148,14 +148,35 @@ def count_leftovers(output: str | Path, paths: Sequence[str | Path]) -> int:
     stem, extension = os.path.splitext(os.path.basename(output))
     numbered = re.compile(rf"{re.escape(stem)}(?:_.+)?_[0-9]{{3,}}{re.escape(extension)}")
     own = {_identity(path) for path in paths}
-    folder = os.path.dirname(output) or "."
-    with os.scandir(folder) as entries:
+    with os.scandir(os.path.dirname(output) or ".") as entries:
         return sum(bool(numbered.fullmatch(entry.name)) and _identity(entry.path) not in own for entry in entries)
+
+
+def refuse_files(paths: Sequence[str | Path]) -> None:
+    """Raise `OutputError` if one of the files exists."""
+    from clrecon.system.targets import keep_existing, refuse_existing, resolve_target
+
+    with keep_existing():
+        for path in paths:
+            refuse_existing(path, resolve_target(path))
+
+
+def refuse_numbered(output: str | Path) -> None:
+    """Raise `OutputError` in a block of `keep_existing` if components of an earlier run have names of `output`."""
+    from clrecon.system.targets import existing_stay
+
+    if existing_stay() and (found := count_leftovers(output, [])):
+        raise OutputError(
+            f"{found:,} numbered files of {output} exist already and stay ({name_parameter('no_clobber', True)}):"
+            " name another"
+        )
 
 
 def _identity(path: str | Path) -> str:
     """Return a key that is equal for two names of one file, also with links and on systems that ignore case."""
-    return os.path.realpath(path).casefold()
+    from clrecon.system.targets import resolve_target
+
+    return str(resolve_target(path)).casefold()
 
 
 def check_outputs(

@@ -320,8 +320,10 @@ class TransferFunction(Message):
 
         return property_to_vtk(self, voxel_mm)
 
-    def save(self, path: Any) -> None:
+    def save(self, path: Any, *, no_clobber: bool = False) -> None:
         """Write it as JSON, as docs/transfer_functions.md says; `load_transfer_function` reads it.
+
+        With `no_clobber` a file of that name stays and is an error.
 
         Raises
         ------
@@ -330,6 +332,7 @@ class TransferFunction(Message):
         """
         from clrecon.rendering.looks.transfer_text import transfer_text
         from clrecon.system.files import replace_file
+        from clrecon.system.targets import keep_existing
 
         names = {"name": self.name, "description": self.description}
         head: dict[str, Any] = {key: text for key, text in names.items() if text}
@@ -339,7 +342,8 @@ class TransferFunction(Message):
         gradient = None if self.gradient_opacity is None else self.gradient_opacity.tolist()
         text = transfer_text(head, self.points.tolist(), gradient).encode("utf-8")
 
-        replace_file(path, lambda stream: stream.write(text))
+        with keep_existing(no_clobber):
+            replace_file(path, lambda stream: stream.write(text))
 
     def _key(self) -> tuple[Any, ...]:
         gradient = None if self._gradient_opacity is None else self._gradient_opacity.tolist()

@@ -12,8 +12,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.errors import OutputError, UsageError
-from clrecon.system.files import final_mode, hold_interrupts, is_dicom, system_errors, temporary_folder
+from clrecon.system.files import hold_interrupts, temporary_folder
 from clrecon.system.log import get_logger
+from clrecon.system.targets import (
+    existing_stay,
+    final_mode,
+    is_dicom,
+    place_folder,
+    refuse_existing,
+    resolve_target,
+    system_errors,
+)
 
 __all__ = ["check_frame_folder", "stage_frame_folder"]
 
@@ -32,11 +41,12 @@ def check_frame_folder(path: str | os.PathLike[str]) -> Path:
     OutputError
         The path is not a folder or cannot be replaced, or its parent folder is missing or cannot be written to.
     """
-    folder = Path(os.path.realpath(path))
+    folder = resolve_target(path)
     with system_errors(path):
         if folder.exists():
             if not folder.is_dir():
                 raise OutputError(f"cannot write {path}: it is a file, name a folder or use an extension")
+            refuse_existing(path, folder)
             others = [entry.name for entry in os.scandir(folder) if not _FRAME.fullmatch(entry.name)]
             if others:
                 raise UsageError(
@@ -71,6 +81,7 @@ class StagedFolder:
 
     def __init__(self, path: str | os.PathLike[str], made: Path, folder: Path, size: int):
         self._path, self._made, self._folder = path, made, folder
+        self._keep = existing_stay()
         self.size = size
 
     def commit(self) -> None:
@@ -79,10 +90,10 @@ class StagedFolder:
         Raises
         ------
         OutputError
-            The system refuses; an older folder is intact.
+            The system refuses, or an existing folder is kept; an older folder is intact.
         """
-        with system_errors(self._path), hold_interrupts():
-            _swap(self._made, self._folder)
+        with hold_interrupts():
+            place_folder(self._made, self._folder, self._path, keep=self._keep)
         log.info("folder of frames written: %d bytes", self.size)
 
 
@@ -111,15 +122,3 @@ def stage_frame_folder(frames: Iterator[NDArray[np.uint8]], path: str | os.PathL
                     size += stream.tell()
             made.chmod(final_mode(folder, 0o777))
         yield StagedFolder(path, made, folder, size)
-
-
-def _swap(made: Path, folder: Path) -> None:
-    """Put `made` in the place of `folder`; an earlier folder gets the temporary name and is removed with it."""
-    older = made.with_suffix(".older")
-    try:
-        if folder.exists():
-            folder.rename(older)
-        made.rename(folder)
-    finally:
-        if older.exists():
-            older.rename(made if folder.exists() else folder)

@@ -18,6 +18,7 @@ from clrecon.errors import UsageError
 from clrecon.rendering.views.camera import Camera
 from clrecon.system.files import Staged, check_writable, stage_file
 from clrecon.system.progress import Progress
+from clrecon.system.targets import keep_existing
 
 if TYPE_CHECKING:
     from clrecon.rendering.pictures.picture import Rendering
@@ -137,6 +138,7 @@ def write_animation(
     path: str | os.PathLike[str],
     fps: float = 25.0,
     *,
+    no_clobber: bool = False,
     total: int = 0,
     progress: Progress | None = None,
 ) -> int:
@@ -152,6 +154,8 @@ def write_animation(
         and keeps every colour and the opacity.  A folder gets frame_0000.png, frame_0001.png, ...
     fps : float
         Frames per second.
+    no_clobber : bool
+        True: what has that name stays and is an `OutputError`; an empty folder is filled.
     total : int
         Number of frames, for `progress`.
     progress : callable, optional
@@ -170,7 +174,10 @@ def write_animation(
     OutputError
         The file cannot be written; an older one is intact.
     """
-    with stage_animation(frames, path, fps, total=total, progress=progress) as staged:
+    with (
+        keep_existing(no_clobber),
+        stage_animation(frames, path, fps, total=total, progress=progress) as staged,
+    ):
         staged.commit()
     return staged.size
 

@@ -11,6 +11,7 @@ import numpy as np
 
 from clrecon.errors import UsageError
 from clrecon.rendering.pictures.picture_data import PictureData
+from clrecon.system.targets import keep_existing
 
 __all__ = ["Rendering"]
 
@@ -74,7 +75,7 @@ class Rendering(PictureData):
         image = annotate(self, letters=letters, scale_bar=scale_bar, caption=caption)
         return self if image is self.image else replace(self, image=image)
 
-    def save(self, path: str | os.PathLike[str], *, quality: int = 95) -> int:
+    def save(self, path: str | os.PathLike[str], *, quality: int = 95, no_clobber: bool = False) -> int:
         """Write the picture to a file; the extension chooses the format.
 
         Parameters
@@ -84,6 +85,8 @@ class Rendering(PictureData):
             ``.png`` also states how the picture was made.  ``.jpg`` accepts opaque pictures only.
         quality : int
             Quality of JPEG, 1 to 100.
+        no_clobber : bool
+            True: a file of that name stays and is an `OutputError`.
 
         Returns
         -------
@@ -99,9 +102,10 @@ class Rendering(PictureData):
         """
         from clrecon.rendering.pictures.image_files import write_image
 
-        return write_image(self, path, quality)
+        with keep_existing(no_clobber):
+            return write_image(self, path, quality)
 
-    def save_depth(self, path: str | os.PathLike[str], *, expected: bool = False) -> int:
+    def save_depth(self, path: str | os.PathLike[str], *, expected: bool = False, no_clobber: bool = False) -> int:
         """Write `depth` in mm to ``.npy`` or, as float32 with NaN, to ``.tif``.
 
         Parameters
@@ -109,6 +113,8 @@ class Rendering(PictureData):
         path : str or path
         expected : bool
             Write `expected_depth` instead.
+        no_clobber : bool
+            As in `save`.
 
         Returns
         -------
@@ -117,9 +123,10 @@ class Rendering(PictureData):
         """
         from clrecon.rendering.pictures.image_files import write_floats
 
-        return write_floats(self.expected_depth if expected else self.depth, path, self.pixel_mm)
+        with keep_existing(no_clobber):
+            return write_floats(self.expected_depth if expected else self.depth, path, self.pixel_mm)
 
-    def save_values(self, path: str | os.PathLike[str]) -> int:
+    def save_values(self, path: str | os.PathLike[str], *, no_clobber: bool = False) -> int:
         """Write `values` as `save_depth` writes depths.
 
         Raises
@@ -132,7 +139,8 @@ class Rendering(PictureData):
         if self.values is None:
             having = "mip, minip, mean, drr, slice and cpr"
             raise UsageError(f"a picture of mode {self.mode} has no values: {having} have them")
-        return write_floats(self.values, path, self.pixel_mm)
+        with keep_existing(no_clobber):
+            return write_floats(self.values, path, self.pixel_mm)
 
     def to_pyvista(self, form: str = "points", *, expected: bool = False, distance: float | None = None) -> Any:
         """Return the picture as a PyVista data set in LPS mm, for a scene with meshes.

@@ -91,7 +91,8 @@ class Clip(Message):
         """
         through = checked_vector("the point of a clip plane", point)
         inwards = checked_vector("the normal of a clip plane", normal)
-        return cls([(*inwards, float(np.dot(inwards, through)))])
+        with np.errstate(over="ignore", invalid="ignore"):  # an offset that is not finite is refused
+            return cls([(*inwards, float(np.dot(inwards, through)))])
 
     @property
     def planes(self) -> Float64Array:

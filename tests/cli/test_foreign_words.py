@@ -1,0 +1,95 @@
+"""Words of libraries stay off the result and out of the messages of a command."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import warnings
+from pathlib import Path
+from typing import Any
+
+import pytest
+from volume_files import make_ct, write_metaimage
+
+from clrecon.phantom import PhantomSettings, write_phantom
+from clrecon.system.foreign_words import hush, own_streams
+
+CLRECON = [sys.executable, "-m", "clrecon"]
+
+
+@pytest.fixture(scope="module")
+def sphere(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("words") / "ct"
+    write_phantom(folder, PhantomSettings(kind="sphere", size=(24, 24), slices=16))
+    return folder
+
+
+@pytest.mark.first_device
+def test_json_stands_alone_on_stdout(device: Any, sphere: Path, tmp_path: Path) -> None:
+    """One iteration leaves VTK's filter without its best offset, which it says on standard output."""
+    call = [*CLRECON, "mesh", str(sphere), "-o", "a.stl", "--smooth", "1", "--device", str(device.index)]
+    done = subprocess.run([*call, "--json"], cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 0 and json.loads(done.stdout)["refinement"] and done.stderr == ""
+    said = subprocess.run([*call, "-q", "--debug"], cwd=tmp_path, capture_output=True, text=True)
+    assert (said.returncode, said.stdout) == (0, "") and "optimal offset" in said.stderr  # still the case it is
+
+
+def test_a_library_that_writes_to_descriptor_1(tmp_path: Path) -> None:
+    code = (
+        "import os, sys; from clrecon.system.foreign_words import hush, own_streams\n"
+        "with own_streams(show='show' in sys.argv):\n"
+        "    os.write(1, b'foreign '); print('own')\n"
+        "    with hush(): os.write(1, b'hushed '); os.write(2, b'hushed ')\n"
+        "os.write(1, b'after ')"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert (done.stdout, done.stderr) == ("own\nafter ", "foreign ")
+    done = subprocess.run([sys.executable, "-c", code, "show"], capture_output=True, text=True)
+    assert (done.stdout, done.stderr) == ("own\nafter ", "foreign hushed hushed ")
+
+
+def test_streams_of_a_caller_are_left_alone(capfd: pytest.CaptureFixture[str]) -> None:
+    with hush():
+        os.write(1, b"mine")
+    assert capfd.readouterr().out == "mine"
+
+
+def test_warnings_of_libraries_are_left_out_and_logged(
+    capfd: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
+) -> None:
+    with caplog.at_level("INFO", "clrecon"), own_streams():
+        warnings.warn("a UID of 1.2.3", RuntimeWarning, stacklevel=1)
+    assert capfd.readouterr().err == ""
+    (line,) = caplog.messages
+    assert line.startswith("RuntimeWarning of a library in test_foreign_words.py, line ") and "1.2.3" not in line
+
+
+@pytest.mark.parametrize(
+    "fields",
+    [
+        {"ElementSize": "1 1"},
+        {"Color": "1 2"},
+        {"TransformMatrix": "1e300 0 0 0 1 0 0 0 1"},
+        {"CompressedDataSize": "z"},
+    ],
+    ids=lambda fields: next(iter(fields)),
+)
+def test_one_line_for_a_bad_metaimage(fields: dict[str, str], tmp_path: Path) -> None:
+    write_metaimage(tmp_path / "a.mha", make_ct(), **fields)
+    done = subprocess.run([*CLRECON, "info", "a.mha"], cwd=tmp_path, capture_output=True, text=True)
+    assert (done.returncode, done.stdout) == (4, "")
+    assert done.stderr.count("\n") == 1 and done.stderr.startswith("clrecon: error: a.mha ")
+
+
+def test_one_line_for_a_nifti_with_an_infinite_form(tmp_path: Path) -> None:
+    nibabel = pytest.importorskip("nibabel")
+    import numpy as np
+
+    header = nibabel.Nifti1Image(np.zeros((3, 4, 5), np.int16), np.eye(4)).header
+    header["sform_code"], header["srow_x"] = 1, [np.inf, np.inf, -np.inf, np.inf]
+    (tmp_path / "a.nii").write_bytes(header.binaryblock + bytes(4 + 120))
+    done = subprocess.run([*CLRECON, "info", "a.nii"], cwd=tmp_path, capture_output=True, text=True)
+    assert (done.returncode, done.stdout) == (4, "")
+    assert done.stderr.count("\n") == 1 and done.stderr.startswith("clrecon: error: a.nii ")

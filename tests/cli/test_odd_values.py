@@ -1,0 +1,83 @@
+"""Every option of every command with values that nobody should give: refused in words, or taken."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator
+from importlib import import_module
+from pathlib import Path
+
+import pytest
+
+from clrecon.cli.common import Parser, add_common
+from clrecon.cli.main import COMMANDS, main
+
+NINES = "9" * 400
+ODD = (
+    "", " ", "--", "-0", "-1", "nan", "-inf", "1e200", "1e-320", NINES, "9" * 5000, "x" * 5000, "\u0663", "\ud800",
+    "a\0b", "%s", ",", "1,nan,inf", "1e200,1e200,1e200", "2:1", "-inf:inf", "half:nan,1", "=a", "a=nan", f"{NINES}x1",
+    "1e308,-1e308,1e308,-1e308,1e308,-1e308", "--json",
+)  # fmt: skip
+
+INPUTS = {
+    "mesh": ("{there}/scan", "-o", "{nowhere}/bone.stl"),
+    "render": ("{there}/scan", "-o", "{nowhere}/bone.png"),
+    "info": ("{there}/scan",),
+    "phantom": ("{nowhere}/phantom",),
+    "bench": ("{there}/scan", "--report", "{nowhere}/bench.json"),
+    "demo": ("{nowhere}/demo",),
+}
+"""Arguments that end a command after its options were checked, before a device is opened: a folder that is missing."""
+
+_MOVIE = "--turntable={nowhere}/a.gif"
+BESIDE = {"--grow": "--labels={there}/a.nii", "--frames": _MOVIE, "--fps": _MOVIE, "--degrees": _MOVIE,
+          "--max-deviation": "--smooth"}  # fmt: skip
+"""Options without which others mean nothing."""
+
+
+def list_options(command: str) -> Iterator[argparse.Action]:
+    parser = Parser(prog=command)
+    import_module(COMMANDS[command].module).add_arguments(parser)
+    add_common(parser)
+    yield from (action for action in parser._actions if action.option_strings and action.nargs != 0)
+
+
+OPTIONS = [(command, action) for command in INPUTS for action in list_options(command)]
+
+
+def ways_to_say(action: argparse.Action, value: str) -> list[list[str]]:
+    name = action.option_strings[-1]
+    if isinstance(action.nargs, int):
+        return [[name, *[value] * action.nargs]]
+    return [[f"{name}={value}"]]
+
+
+@pytest.mark.parametrize(
+    ("command", "action"), OPTIONS, ids=[f"{command}{action.option_strings[-1]}" for command, action in OPTIONS]
+)
+def test_odd_values_are_no_unexpected_error(
+    command: str, action: argparse.Action, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "scan").mkdir()
+    places = {"there": str(tmp_path), "nowhere": str(tmp_path / "nowhere")}
+    beside = [BESIDE[action.option_strings[-1]]] if action.option_strings[-1] in BESIDE else []
+    base = [text.format(**places) for text in (*INPUTS[command], *beside)]
+    wrong = []
+    for value in ODD:
+        for said in ways_to_say(action, value):
+            code = main([command, *base, *said])
+            lines = capfd.readouterr().err.splitlines()
+            errors = [line for line in lines if line.startswith("clrecon: error: ")]
+            if code not in (2, 3, 4, 6) or len(lines) != 1 or errors != lines or len(lines[0]) > 1200:
+                wrong.append((value[:40], said[0][:40], code, [line[:200] for line in lines]))
+    assert wrong == []
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["scan"]
+
+
+@pytest.mark.parametrize("value", ["--", "---", "-", "--json"])
+def test_a_value_of_dashes_is_the_value(value: str) -> None:
+    parser = Parser(prog="clrecon")
+    parser.add_argument("--text")
+    parser.add_argument("--number", nargs="?", type=str.upper)
+    given = parser.parse_args([f"--text={value}", f"--number={value}"])
+    assert (given.text, given.number) == (value, value.upper())
