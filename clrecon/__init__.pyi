@@ -48,6 +48,7 @@ from clrecon.rendering.pictures.styles import VolumeLook as VolumeLook
 from clrecon.rendering.views.camera import Camera as Camera
 from clrecon.rendering.views.centre_line_files import read_curve_points as read_curve_points
 from clrecon.rendering.views.clip import Clip as Clip
+from clrecon.system.time_limit import time_limit as time_limit
 
 __all__: list[str]
 __version__: str

@@ -13,7 +13,10 @@ __all__ = [
     "UsageError",
     "RefusedInputError",
     "DeviceError",
+    "DeviceFailedError",
     "DeviceMemoryError",
+    "DeviceLostError",
+    "DeviceTimeoutError",
     "OutputError",
     "Cancelled",
 ]
@@ -61,8 +64,20 @@ class DeviceError(ClreconError):
     exit_code = 5
 
 
-class DeviceMemoryError(DeviceError):
+class DeviceFailedError(DeviceError):
+    """The device failed, or is too small for the work: another device may do it."""
+
+
+class DeviceMemoryError(DeviceFailedError):
     """The device has no room: with less data at a time it may work."""
+
+
+class DeviceLostError(DeviceFailedError):
+    """The device was lost in the middle of the work: with a fresh context it may work."""
+
+
+class DeviceTimeoutError(DeviceError):
+    """The device made no progress for longer than the time limit."""
 
 
 class OutputError(ClreconError):

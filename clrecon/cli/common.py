@@ -11,6 +11,7 @@ from typing import Any, NoReturn
 
 from clrecon.cli.console import Console
 from clrecon.errors import ClreconError, OutputError, UsageError
+from clrecon.system.time_limit import DEFAULT_SECONDS, check_time_limit
 
 __all__ = [
     "EXIT_CODES",
@@ -21,6 +22,7 @@ __all__ = [
     "add_memory",
     "add_no_clobber",
     "guard",
+    "has_hung_device",
     "megabytes",
     "pick",
     "table",
@@ -104,14 +106,37 @@ def add_no_clobber(parser: argparse._ActionsContainer) -> None:
     )
 
 
-def add_device(parser: argparse._ActionsContainer) -> None:
-    """Add --device."""
+def add_device(parser: argparse._ActionsContainer, computes: bool = True) -> None:
+    """Add --device, and --timeout where the command computes on it."""
     parser.add_argument(
         "--device",
         metavar="D",
         help='OpenCL device: an index of "clrecon devices", "cpu", "gpu" or a part of its name'
         " (default: CLRECON_DEVICE, else the best)",
     )
+    if computes:
+        parser.add_argument(
+            "--timeout",
+            type=_parse_seconds,
+            metavar="SECONDS",
+            help="give up (exit code 5) when the device has finished nothing for so long: a kernel has hung"
+            f" (default: {DEFAULT_SECONDS:g}; 0: never)",
+        )
+
+
+def _parse_seconds(text: str) -> float:
+    """Read the seconds of a time limit.
+
+    Raises
+    ------
+    argparse.ArgumentTypeError
+        The text is not a number from 0 on.
+    """
+    try:
+        check_time_limit(float(text))
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(f"{text!r} is no number of seconds from 0 on") from error
+    return float(text)
 
 
 def add_memory(parser: argparse._ActionsContainer) -> None:
@@ -167,12 +192,24 @@ def guard(action: Callable[[], int], console: Console, debug: bool) -> int:
         code = action()
     except (Exception, KeyboardInterrupt) as error:
         code = _report_error(error, console, debug)
+        if has_hung_device():
+            _unfreed.append(error)
     try:
         console.finish()
     except OutputError as error:
         console.error(str(error))
         return error.exit_code
     return code
+
+
+_unfreed: list[BaseException] = []
+"""Errors of a device that hangs: their frames hold buffers, and a driver may wait for the kernel to free one."""
+
+
+def has_hung_device() -> bool:
+    """True where a kernel still runs that nobody waits for any more; without a device nothing is imported for it."""
+    opencl = sys.modules.get("clrecon.opencl")
+    return opencl is not None and bool(opencl.has_hung_commands())
 
 
 def _report_error(error: BaseException, console: Console, debug: bool) -> int:

@@ -16,7 +16,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = (
         "The device marked * is the one that would be used. Simulators (Oclgrind) are used only when they are named."
     )
-    add_device(parser)
+    add_device(parser, computes=False)
 
 
 def run(options: argparse.Namespace, console: Console) -> int:

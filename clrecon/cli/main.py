@@ -7,16 +7,18 @@ import contextlib
 import os
 import signal
 import sys
+import threading
 from collections.abc import Sequence
 from importlib import import_module
 from types import FrameType
 from typing import NamedTuple
 
-from clrecon.cli.common import EXIT_CODES, Parser, guard
+from clrecon.cli.common import EXIT_CODES, Parser, guard, has_hung_device
 from clrecon.cli.console import Console
 from clrecon.cli.wording import speaker_of
 from clrecon.errors import UsageError
 from clrecon.system.foreign_words import own_streams
+from clrecon.system.time_limit import DEFAULT_SECONDS, time_limit
 from clrecon.system.wording import spoken_by
 
 __all__ = ["main", "run"]
@@ -43,6 +45,9 @@ UNUSED_MODULES = ("requests", "PIL")
 
 pydicom imports them if they are there, to download test files and for colour profiles.  Reading needs neither, and the
 import takes as long as reading a series.  `clrecon.rendering.pictures.pillow` makes Pillow available again."""
+
+_MOST_SECONDS_TO_END = 1.0
+"""Time for the removal of temporary folders after a kernel has hung."""
 
 DESCRIPTION = "Surfaces in patient millimetres from CT series, computed on any OpenCL device."
 
@@ -87,7 +92,12 @@ def run() -> None:
         # The stream is None (never opened) or its reader closed it; `main` has already printed everything.
         with contextlib.suppress(OSError, ValueError, AttributeError):
             stream.flush()
-    atexit._run_exitfuncs()
+    if has_hung_device():  # a driver may wait for the kernel when something is freed
+        ending = threading.Thread(target=atexit._run_exitfuncs, daemon=True)
+        ending.start()
+        ending.join(_MOST_SECONDS_TO_END)
+    else:
+        atexit._run_exitfuncs()
     # Every file is closed by now.  The interpreter would free modules, drivers and voxels one by one, which takes as
     # long as extracting the surface; the system frees all at once.
     os._exit(code)
@@ -121,7 +131,8 @@ def _dispatch(arguments: list[str], console: Console) -> int:
     if module is None or called is None:
         raise UsageError(f"no command given: use one of {', '.join(COMMANDS)} (see: clrecon --help)")
     console.set_loudness(quiet=options.quiet, verbose=options.verbose)
-    with spoken_by(speaker_of(commands.choices[called])):
+    limit = getattr(options, "timeout", None)
+    with spoken_by(speaker_of(commands.choices[called])), time_limit(DEFAULT_SECONDS if limit is None else limit):
         return int(module.run(options, console))
 
 

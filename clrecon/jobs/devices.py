@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import threading
 from typing import Any
 
 from clrecon.errors import DeviceError
 from clrecon.system.progress import Progress, ignore_progress
+from clrecon.system.time_limit import device_seconds
 
 __all__ = ["run_device_selftest", "survey_devices"]
 
@@ -77,7 +79,7 @@ def run_device_selftest(name: str | None = None, *, progress: Progress | None = 
     device = choose_device(name)
     results: list[dict[str, Any]] = []
     progress("selftest", 0, len(CHECKS))
-    for result in run_selftest(device, CHECKS):
+    for result in run_selftest(device, CHECKS, silent_seconds=min(device_seconds(), threading.TIMEOUT_MAX)):
         results.append(result)
         progress("selftest", len(results), len(CHECKS))
     passed = bool(results) and all(result["passed"] for result in results)

@@ -4,6 +4,7 @@ Only this package searches for drivers and knows where the kernel files are.
 """
 
 from clrecon.opencl.arrays import allocate, download, empty_output, upload
+from clrecon.opencl.commands import has_hung_commands, keep_for_hung_commands
 from clrecon.opencl.context import Device
 from clrecon.opencl.launching import Stopwatch, launch
 from clrecon.opencl.memory import MemoryLimits, check_budget, check_memory, describe_shortage, memory_limits
@@ -11,6 +12,7 @@ from clrecon.opencl.pages import result_pages
 from clrecon.opencl.program import Kernel, Program, load_program
 from clrecon.opencl.select import choose_device, list_devices, list_platforms
 from clrecon.opencl.sources import kernel_constant, kernel_files, kernel_number, read_kernel_source
+from clrecon.opencl.waiting import settle, wait
 
 __all__ = [
     "Device",
@@ -25,6 +27,8 @@ __all__ = [
     "describe_shortage",
     "download",
     "empty_output",
+    "has_hung_commands",
+    "keep_for_hung_commands",
     "kernel_constant",
     "kernel_files",
     "kernel_number",
@@ -35,5 +39,7 @@ __all__ = [
     "memory_limits",
     "read_kernel_source",
     "result_pages",
+    "settle",
     "upload",
+    "wait",
 ]

@@ -11,6 +11,7 @@ from clrecon.errors import DeviceMemoryError
 from clrecon.opencl.context import Device, describe_error
 from clrecon.opencl.pages import result_pages
 from clrecon.opencl.quirks import import_pyopencl
+from clrecon.opencl.waiting import wait
 
 __all__ = ["allocate", "download", "empty_output", "upload"]
 
@@ -71,17 +72,22 @@ def download(device: Device, array: NDArray[Any], array_d: Any, offset: int = 0)
     cl = import_pyopencl()
     if not array.nbytes:
         return array
+    what, queue = f"the transfer of {array.nbytes:,} bytes to the computer", device.queue
     try:
         if array_d.flags & cl.mem_flags.USE_HOST_PTR:
             # Mapping makes the host memory current; on CPU drivers it moves no data.
-            mapped, _ = cl.enqueue_map_buffer(
-                device.queue, array_d, cl.map_flags.READ, offset, array.shape, array.dtype, is_blocking=True
+            mapped, event = cl.enqueue_map_buffer(
+                queue, array_d, cl.map_flags.READ, offset, array.shape, array.dtype, is_blocking=False
             )
+            device.commands.add(what, event, queue, array, array_d, mapped)
+            wait(device)
             if mapped.ctypes.data != array.ctypes.data:
                 array[...] = mapped
-            mapped.base.release(device.queue)
+            mapped.base.release(queue)
         else:
-            cl.enqueue_copy(device.queue, array, array_d, src_offset=offset, is_blocking=True)
+            event = cl.enqueue_copy(queue, array, array_d, src_offset=offset, is_blocking=False)
+            device.commands.add(what, event, queue, array, array_d)
+            wait(device)
     except cl.Error as error:
         raise device.fail("reading failed", error) from error
     return array

@@ -9,8 +9,9 @@ import threading
 from collections.abc import Callable
 from typing import Any
 
-from clrecon.errors import DeviceError, DeviceMemoryError
+from clrecon.errors import DeviceError, DeviceFailedError, DeviceLostError, DeviceMemoryError
 from clrecon.opencl import quirks
+from clrecon.opencl.commands import Commands
 from clrecon.opencl.unknown_cpu import NameOfCpu, has_unknown_cpu
 from clrecon.system.log import get_logger
 
@@ -20,6 +21,29 @@ log = get_logger(__name__)
 
 GROUP_SIZE = 64
 """Work-group size: a whole wavefront of every GPU, and small enough to give a CPU's cores equal shares."""
+
+
+_NO_MEMORY = (-4, -5, -6)
+"""MEM_OBJECT_ALLOCATION_FAILURE, OUT_OF_RESOURCES, OUT_OF_HOST_MEMORY."""
+
+_LOST = (-2, -34, -36, -9999)
+"""DEVICE_NOT_AVAILABLE, INVALID_CONTEXT, INVALID_COMMAND_QUEUE, and what NVIDIA says after a fault of a kernel."""
+
+_LOST_LATE = (-5, *_LOST)
+"""OUT_OF_RESOURCES of a command that was accepted says that it was stopped, by a watchdog or a fault."""
+
+
+def _kind_of(error: Exception, is_late: bool) -> type[DeviceError]:
+    """Return the class of error for an error of the driver; `is_late`: it came while the device worked."""
+    try:
+        code = int(error.code)  # type: ignore[attr-defined]
+    except (AttributeError, IndexError, TypeError, ValueError):
+        code = 0
+    if code in (_LOST_LATE if is_late else _LOST):
+        return DeviceLostError
+    if code in _NO_MEMORY or isinstance(error, quirks.import_pyopencl().MemoryError):
+        return DeviceMemoryError
+    return DeviceFailedError
 
 
 def describe_error(error: Exception) -> str:
@@ -73,6 +97,8 @@ class Device:
         not.
     lock : threading.RLock
         Held while a kernel gets its arguments and is enqueued: kernels are shared between threads.
+    commands : Commands
+        What is in the queue; `clrecon.opencl.waiting` waits for it.
     trace : callable or None
         Told in words what is done, before a kernel file is built or a kernel is launched; each launch is then waited
         for.  For the self-test, which has to say what a driver crashed in.
@@ -105,6 +131,7 @@ class Device:
         if has_unknown_cpu(self.platform, self.version) and not self.shortcoming:
             self._name_cpu()
         self.lock = threading.RLock()
+        self.commands = Commands()
         self.trace: Callable[[str], None] | None = None
         self.programs: dict[tuple[str, tuple[str, ...]], Any] = {}
         self._context: Any = None
@@ -185,14 +212,28 @@ class Device:
                 " processes with multiprocessing.get_context('spawn'), or fork before the first use of a device"
             )
 
-    def fail(self, what: str, error: Exception) -> DeviceError:
-        """Return the error for a failed call, and drop context and queue: a lost device needs new ones."""
+    def give_up(self) -> None:
+        """Drop context and queue, so that the next use makes new ones; running commands keep what they use."""
         with self.lock:
+            self.commands.give_up(self._context, self._queue, dict(self.programs))
             self._context = self._queue = None
             self.programs.clear()
+
+    def fail(self, what: str, error: Exception, *, is_late: bool = False) -> DeviceError:
+        """Return the error for a failed call, and give the context up: a lost device needs a new one.
+
+        Parameters
+        ----------
+        what : str
+            What failed.
+        error : Exception
+            Error of the driver.
+        is_late : bool
+            The driver had accepted the command before.
+        """
+        self.give_up()
         log.info("%s on %s: %s; its context is given up", what, self.label, describe_error(error))
-        kind = DeviceMemoryError if isinstance(error, quirks.import_pyopencl().MemoryError) else DeviceError
-        return kind(f"{what} on {self.label}: {describe_error(error)}")
+        return _kind_of(error, is_late)(f"{what} on {self.label}: {describe_error(error)}")
 
     def describe(self) -> dict[str, Any]:
         """Properties for listings and reports."""

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from typing import Any
 
 from clrecon.opencl.context import Device
 from clrecon.opencl.program import Kernel
 from clrecon.opencl.quirks import import_pyopencl
+from clrecon.opencl.waiting import settle, wait
 
 __all__ = ["Stopwatch", "launch"]
 
@@ -25,7 +26,7 @@ class Stopwatch:
     def __init__(self) -> None:
         self.seconds: dict[str, float] = {"upload": 0.0, "build": 0.0, "kernels": 0.0, "download": 0.0}
         self.by_kernel: dict[str, float] = {}
-        self._events: list[tuple[str, Any, tuple[Any, ...]]] = []
+        self._events: list[tuple[str, Any]] = []
 
     @contextmanager
     def timed(self, part: str) -> Iterator[None]:
@@ -36,30 +37,29 @@ class Stopwatch:
         finally:
             self.seconds[part] += time.perf_counter() - start
 
-    def record(self, kernel: str, event: Any, arguments: tuple[Any, ...] = ()) -> None:
-        """Keep the event of a launch, and the buffers that the kernel uses, until it is over.
-
-        A CPU device works in numpy's own memory, which would be freed during the launch if no reference were kept.
-        """
-        self._events.append((kernel, event, arguments))
+    def record(self, kernel: str, event: Any) -> None:
+        """Keep the event of a launch until it is over."""
+        self._events.append((kernel, event))
 
     @contextmanager
     def running(self, device: Device) -> Iterator[None]:
         """Time a block that launches kernels, and wait for them at its end, also after an error."""
         start = time.perf_counter()
-        queue = device.queue
         try:
             yield
+        except BaseException as error:
+            self._events.clear()
+            settle(device, error)
+            raise
+        try:
+            wait(device)
         except BaseException:
-            with suppress(import_pyopencl().Error):  # nothing works on a lost device
-                queue.finish()
             self._events.clear()
             raise
-        finish(device)
         wall = time.perf_counter() - start
         busy = 0.0
         has_times = device.has_event_times
-        for kernel, event, _ in self._events:
+        for kernel, event in self._events:
             try:
                 spent = 1e-9 * (event.profile.end - event.profile.start)
             except import_pyopencl().Error:  # a driver without event times: the mesh is still right
@@ -72,21 +72,6 @@ class Stopwatch:
             busy = wall
         self.seconds["kernels"] += min(busy, wall)
         self.seconds["build"] += max(wall - busy, 0.0)
-
-
-def finish(device: Device) -> None:
-    """Wait until the queue is empty.
-
-    Raises
-    ------
-    DeviceError
-        A kernel failed.
-    """
-    cl = import_pyopencl()
-    try:
-        device.queue.finish()
-    except cl.Error as error:
-        raise device.fail("a kernel failed", error) from error
 
 
 def launch(
@@ -128,11 +113,13 @@ def launch(
         device.trace(f"kernel {kernel.name} ({rounded:,} items)")
     try:
         with device.lock:
-            event = kernel.enqueue(device.queue, rounded, group, values)
-        if device.trace is not None:
-            event.wait()  # what crashes or hangs is then the kernel that was told last
+            queue = device.queue
+            event = kernel.enqueue(queue, rounded, group, values)
+            device.commands.add(f"kernel {kernel.name}", event, queue, values)
     except cl.Error as error:
         what = f"kernel {kernel.name} ({rounded:,} items in groups of {group}) failed"
         raise device.fail(what, error) from error
+    if device.trace is not None:
+        wait(device)  # what crashes or hangs is then the kernel that was told last
     if stopwatch is not None:
-        stopwatch.record(kernel.name, event, values)
+        stopwatch.record(kernel.name, event)

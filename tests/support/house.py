@@ -61,6 +61,7 @@ _layer(
     "__init__",
     "errors",
     "version",
+    "system",
     "opencl",
     "geometry",
     "anatomy",

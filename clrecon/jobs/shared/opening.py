@@ -62,8 +62,9 @@ class DeviceOpening:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
+        is_interrupted = error is not None and not isinstance(error, Exception)  # nobody waits for a compiler then
         try:
             if isinstance(error, Exception) and not isinstance(error, Cancelled):
                 self._chosen.result()
         finally:
-            self._pool.shutdown(wait=True, cancel_futures=True)
+            self._pool.shutdown(wait=not is_interrupted, cancel_futures=True)

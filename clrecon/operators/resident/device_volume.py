@@ -23,8 +23,10 @@ from clrecon.opencl import (
     check_memory,
     choose_device,
     describe_shortage,
+    keep_for_hung_commands,
     load_program,
     memory_limits,
+    settle,
     upload,
 )
 from clrecon.operators.resident.stack_table import StackTable
@@ -222,6 +224,7 @@ class DeviceVolume:
     def release(self) -> None:
         """Free everything on the device."""
         with self._lock:
+            keep_for_hung_commands(self._whole_d, self._kept)
             self._whole_d = None
             self._kept = {}
 
@@ -338,6 +341,7 @@ class DeviceVolume:
             try:
                 return attempt(slices)
             except DeviceMemoryError as error:
+                settle(self.device, error)
                 self.release()
                 if is_last:
                     raise

@@ -1,0 +1,23 @@
+"""The time limit of devices: how it is given, and that it is given back."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from clrecon.errors import UsageError
+from clrecon.system.time_limit import DEFAULT_SECONDS, device_seconds, time_limit
+
+
+def test_time_limits():
+    assert device_seconds() == DEFAULT_SECONDS
+    with time_limit(3):
+        assert device_seconds() == 3.0
+        with time_limit(0):
+            assert device_seconds() == math.inf
+        assert device_seconds() == 3.0
+    assert device_seconds() == DEFAULT_SECONDS
+    for wrong in (-1, math.nan, "5", None, True):
+        with pytest.raises(UsageError, match="a time limit is a number of seconds"), time_limit(wrong):
+            pass
