@@ -28,6 +28,28 @@ def test_half_a_rescale_is_doubtful(tmp_path, change, shift, words):
     assert volume.report["warnings"] == [f"{words} (all slices)"]
 
 
+@pytest.mark.parametrize(
+    ("keyword", "value", "usual"),
+    [
+        ("RescaleIntercept", -24, "-1024"),
+        ("RescaleSlope", 2, "1"),
+        ("BitsStored", 12, "16"),
+        ("PixelRepresentation", 0, "1"),
+    ],
+)
+def test_coding_of_its_own_makes_a_slice_doubtful(tmp_path, keyword, value, usual):
+    write_series(tmp_path, change=set_values(2, **{keyword: value}))
+    told = read_volume(tmp_path).report["warnings"]
+    words = f"{keyword} is not {usual} as in the other slices: the HU may be wrong (1 of 7 slices, at -397.50 mm)"
+    assert told == [words]
+    assert words in list_series(tmp_path).series[0].warnings
+
+
+def test_slices_that_each_have_their_own_rescale_are_not_doubtful(tmp_path):
+    write_series(tmp_path, change=lambda ds, k: set_values(RescaleIntercept=-1024 - k)(ds, k))
+    assert read_volume(tmp_path).report["warnings"] == []
+
+
 @pytest.mark.parametrize("ending", ["", ".1", ".2", ".3", ".4"])
 def test_a_secondary_capture_with_a_position_is_refused(tmp_path, ending):
     sop_class = SecondaryCaptureImageStorage + ending

@@ -6,7 +6,7 @@ like one stack that alternates between two volumes, evenly spaced or not.
 
 from __future__ import annotations
 
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 
 import numpy as np
@@ -33,6 +33,15 @@ EVEN = 0.05
 """Relative difference up to which gaps count as equal here."""
 THICKNESS_TOLERANCE = 0.01
 ALTERNATING = ("AcquisitionNumber", "FrameAcquisitionNumber")
+CODING: dict[str, Callable[[SliceHeader], float]] = {
+    "RescaleSlope": lambda header: header.slope,
+    "RescaleIntercept": lambda header: header.intercept,
+    "BitsStored": lambda header: header.bits_stored,
+    "HighBit": lambda header: header.high_bit,
+    "PixelRepresentation": lambda header: header.signed,
+}
+"""Numbers that turn stored values into HU.  A slice may have its own, but then each has: where most agree, one that
+differs is doubtful."""
 
 
 def values_of(header: SliceHeader, keywords: Sequence[str]) -> tuple[str, ...]:
@@ -101,7 +110,7 @@ def describe_differences(headers: Sequence[SliceHeader]) -> Iterator[tuple[str, 
     Yields
     ------
     (text, is_so)
-        Keywords and slices, without the values.
+        Keywords and slices, without values that could tell of the patient.
     """
     first = headers[0]
     for keyword, values in _values_along(headers, ("KVP", *ALTERNATING)):
@@ -120,6 +129,11 @@ def describe_differences(headers: Sequence[SliceHeader]) -> Iterator[tuple[str, 
 
     if any(map(is_other, headers)):
         yield "SliceThickness differs along the stack", is_other
+    for keyword, number_of in CODING.items():
+        usual, count = Counter(map(number_of, headers)).most_common(1)[0]
+        if len(headers) / 2 < count < len(headers):
+            text = f"{keyword} is not {usual:g} as in the other slices: the HU may be wrong"
+            yield text, lambda h, number_of=number_of, usual=usual: number_of(h) != usual  # type: ignore[misc]
 
 
 def _thickness(header: SliceHeader) -> float:

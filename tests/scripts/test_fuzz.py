@@ -1,0 +1,176 @@
+"""Harmed input of every family for a while; and each kind of fault is one for the fuzzer.
+
+The time is that of the variable CLRECON_FUZZ_SECONDS (default 60); what is found is found again by its case.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+from collections import Counter
+from pathlib import Path
+
+import commands
+import fuzz
+import numpy as np
+import pytest
+import slices
+from fuzz import Campaign, Case, OneCase, Schedule, run_campaign
+from trials import FAULTS, MEMORY_LIMIT_BYTES, Answer, Judge, Outcome, Trial, WrongOutcome
+
+from clrecon.errors import RefusedInputError
+
+SECONDS = float(os.environ.get("CLRECON_FUZZ_SECONDS", "60"))
+UNHARMED = Answer({"voxels": "a"}, ("known",))
+
+
+@pytest.mark.fuzz
+def test_harmed_input_is_refused_or_told() -> None:
+    campaign = run_campaign(Schedule(list(fuzz.SHARES)), seconds=SECONDS, jobs=1)
+    assert [f"{case} {outcome.kind}: {outcome.trial}: {outcome.text}" for case, outcome in campaign.faults] == []
+    if SECONDS >= 30:
+        assert set(campaign.counts) == set(fuzz.SHARES)
+    assert campaign.total > 10 * SECONDS
+
+
+def judge(run, contradicted=True, limit_s=5.0):
+    return Judge().judge(Trial("a trial", run, UNHARMED, lambda answer: contradicted, limit_s)).kind
+
+
+def fail(error):
+    raise error
+
+
+def say(stream):
+    os.write(stream, b"libraries talk")
+    return UNHARMED
+
+
+def hoard():
+    np.ones(MEMORY_LIMIT_BYTES // 4)
+    return UNHARMED
+
+
+@pytest.mark.parametrize(
+    ("kind", "run"),
+    [
+        ("same", lambda: UNHARMED),
+        ("warned", lambda: Answer({"voxels": "b"}, ("known", "beware"))),
+        ("refused", lambda: fail(RefusedInputError("no"))),
+        ("silent", lambda: Answer({"voxels": "b"}, ("known",))),
+        ("silent", lambda: Answer({}, ())),
+        ("foreign", lambda: fail(KeyError("made up"))),
+        ("foreign", lambda: fail(RefusedInputError("two\nlines"))),
+        ("secret", lambda: Answer({"voxels": "a"}, (), "SECRET^NAME")),
+        ("secret", lambda: fail(RefusedInputError("of SECRET^NAME"))),
+        ("noise", lambda: say(1)),
+        ("noise", lambda: say(2)),
+        ("memory", hoard),
+        ("files", lambda: fail(WrongOutcome("files", "left behind"))),
+    ],
+)
+def test_outcomes_are_told_apart(kind, run) -> None:
+    assert judge(run) == kind
+
+
+def test_what_nothing_contradicts_is_no_fault() -> None:
+    assert judge(lambda: Answer({"voxels": "b"}), contradicted=False) == "agreed"
+
+
+def test_a_case_over_its_time_hangs() -> None:
+    assert judge(lambda: UNHARMED, limit_s=-1.0) == "hang"
+
+
+@pytest.mark.parametrize(
+    ("program", "kind", "words"),
+    [
+        ("import os; os.abort()", "crash", "SIGABRT"),
+        ("raise SystemExit('no such thing')", "crash", "no such thing"),
+        ("import time; time.sleep(60)", "hang", "over 1 s"),
+    ],
+)
+def test_a_worker_that_dies_or_hangs_is_a_fault(tmp_path, monkeypatch, program, kind, words) -> None:
+    (tmp_path / "worker.py").write_text(program)
+    monkeypatch.setattr(fuzz, "WORKER", tmp_path / "worker.py")
+    monkeypatch.setattr(fuzz, "START_LIMIT_S", 1.0)
+    campaign = run_campaign(OneCase(Case("values", 7)), seconds=30)
+    ((case, outcome),) = campaign.faults
+    assert str(case) == "values:7" and outcome.kind == kind and words in outcome.text
+    assert campaign.as_dict()["counts"] == {"values": {kind: 1}}
+
+
+def test_a_worker_is_replaced(tmp_path, monkeypatch) -> None:
+    answer = json.dumps(Outcome("same", "a trial").as_dict())
+    program = f"""
+import sys
+for line in sys.stdin:
+    assert line.split()[1] != "2"
+    print({answer!r}, flush=True)
+"""
+    (tmp_path / "worker.py").write_text(program)
+    monkeypatch.setattr(fuzz, "WORKER", tmp_path / "worker.py")
+    campaign = run_campaign(Schedule(["values"], 5), seconds=30)
+    assert campaign.counts == {"values": Counter(same=4, crash=1)}
+    assert [str(case) for case, _ in campaign.faults] == ["values:2"]
+    assert "same" in campaign.table() and all(kind in campaign.table() for kind in FAULTS)
+
+
+def test_families_share_the_time() -> None:
+    schedule = Schedule(["values", "environment"])
+    for _ in range(1000):
+        case = schedule.draw()
+        schedule.spend(case, 10.0 if case.family == "environment" else 0.1)
+    values, environment = schedule.spent["values"], schedule.spent["environment"]
+    assert values / environment == pytest.approx(fuzz.SHARES["values"] / fuzz.SHARES["environment"], rel=0.2)
+    assert Schedule(["values"], 0).draw() is None
+
+
+def test_a_case_is_made_again(tmp_path) -> None:
+    for trial in (slices.values_trial, slices.bytes_trial, slices.ends_trial):
+        words = {trial(20_000, tmp_path, random.Random("1")).words for _ in range(2)}
+        assert len(words) == 1
+
+
+def test_values_harm_one_element() -> None:
+    data = slices.series()[0]
+    harmed = slices.put(data, "RescaleIntercept", b"-24 ")
+    assert slices.value_in(data, "RescaleIntercept").strip() == b"-1024.0"
+    assert slices.value_in(harmed, "RescaleIntercept").strip() == b"-24"
+    assert slices.value_in(slices.put(data, "RescaleIntercept", None), "RescaleIntercept") == b""
+    assert slices.value_in(slices.put(data, "GantryDetectorTilt", b"12"), "GantryDetectorTilt") == b"12"
+
+
+@pytest.mark.parametrize(
+    ("given", "code", "out", "err", "kind"),
+    [
+        (["mesh"], -6, "", "", "crash"),
+        (["mesh"], 1, "", "clrecon: error: unexpected error (KeyError)", "foreign"),
+        (["mesh"], 3, "", "", "foreign"),
+        (["mesh"], 3, "", "clrecon: error: a\nclrecon: error: b\n", "foreign"),
+        (["mesh"], 0, "", "vtk says\n", "noise"),
+        (["mesh", "--json"], 0, "vtk says {}", "", "noise"),
+    ],
+)
+def test_calls_that_went_wrong(given, code, out, err, kind) -> None:
+    with pytest.raises(WrongOutcome) as caught:
+        commands.check_call(given, code, out, err)
+    assert caught.value.kind == kind
+
+
+@pytest.mark.parametrize(("code", "name"), [(3, "out.stl"), (0, ".out.stl.tmp")])
+def test_files_that_are_left(code, name) -> None:
+    with pytest.raises(WrongOutcome, match="left"):
+        commands.check_files(code, [Path(name)])
+    commands.check_files(0, [Path("out.stl")])
+
+
+def test_a_fault_is_the_exit_status(tmp_path, monkeypatch, capsys) -> None:
+    campaign = Campaign()
+    campaign.add(Case("values", 3), Outcome("silent", "a value", "slice 1"))
+    monkeypatch.setattr(fuzz, "run_campaign", lambda *args, **kwargs: campaign)
+    assert fuzz.main(["--seconds", "1", "--json", str(tmp_path / "found.json")]) == 1
+    assert "silent values:3 (a value)" in capsys.readouterr().out
+    assert json.loads((tmp_path / "found.json").read_text())["faults"][0]["case"] == "values:3"
+    monkeypatch.setattr(fuzz, "run_campaign", lambda *args, **kwargs: Campaign())
+    assert fuzz.main([]) == 0
