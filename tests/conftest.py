@@ -112,17 +112,16 @@ def first_of(devices: list[Any]) -> list[Any]:
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Leave out the parameters marked ``first_device`` on all other devices."""
+    """Leave out the parameters marked ``first_device`` on all other devices, and mark what else runs on these."""
     devices = Devices.found[0] if Devices.found else []
-    others = [device for device in devices if device not in first_of(devices)]
-    left_out = {
-        item
-        for item in items
-        if isinstance(item, pytest.Function)
-        and item.get_closest_marker("first_device")
-        and hasattr(item, "callspec")
-        and any(item.callspec.params.get("device") is device for device in others)
-    }
+    first, left_out = first_of(devices), set()
+    for item in items:
+        device = item.callspec.params.get("device") if hasattr(item, "callspec") else None
+        if device is None or device not in devices[1:]:
+            continue
+        item.add_marker("further_device")
+        if item.get_closest_marker("first_device") and device not in first:
+            left_out.add(item)
     items[:] = [item for item in items if item not in left_out]
 
 

@@ -155,6 +155,7 @@ def run_cases(names: list[str], given: str, device: Any, tmp_path: Path, *more: 
     return {result["case"]: result for result in kept}
 
 
+@pytest.mark.first_device
 def test_surfaces_in_one_process_are_measured(device: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(floors, "_COPY_BYTES", 1 << 20)
     kept = run_cases(["isosurface-cold", "isosurface-resident", "scaling"], "cube32", device, tmp_path)
@@ -181,6 +182,7 @@ def test_surfaces_in_one_process_are_measured(device: Any, tmp_path: Path, monke
     assert {"voxels", "triangles"} == set(kept["scaling"]["fits"])
 
 
+@pytest.mark.first_device
 def test_pictures_are_measured(device: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from PIL import Image
 
@@ -206,6 +208,7 @@ def test_pictures_are_measured(device: Any, tmp_path: Path, monkeypatch: pytest.
     assert np.asarray(Image.open(tmp_path / "seen" / seen[1])).mean() > 1.0
 
 
+@pytest.mark.first_device
 def test_the_mapper_on_opengl_is_measured(device: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from peers.vtk_gpu import GpuPeer
 

@@ -1,8 +1,9 @@
 """The coverage of clrecon by a session of pytest, in one line before pytest's own last line.
 
 Tracing costs a Python program a quarter of its time, or far more where one function is called a million times.  Tests
-marked ``slow`` or ``fuzz`` repeat what others do once, or stand for long searches: they are not traced, and neither are
-the processes that tests start.  The true coverage is therefore a little higher than the figure.
+marked ``slow`` or ``fuzz`` repeat what others do once, or stand for long searches, and tests on further devices repeat
+what those on the first one have run: they are not traced, and neither are the processes that tests start.  The true
+coverage is therefore a little higher than the figure.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ import coverage
 import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
-UNTRACED = ("slow", "fuzz")
+UNTRACED = ("slow", "fuzz", "further_device")
 
 
 def make_coverage(folder: Path, suffix: str | None = None) -> coverage.Coverage:
@@ -36,7 +37,7 @@ def read_figure(folder: Path) -> str:
     branches = 100 * totals["covered_branches"] / totals["num_branches"]
     return (
         f"coverage of clrecon: {lines:.1f} % of {totals['num_statements']} lines and {branches:.1f} % of"
-        f" {totals['num_branches']} branches (tests marked {' or '.join(UNTRACED)} and processes apart not counted)"
+        f" {totals['num_branches']} branches (slow and fuzz tests, further devices and processes apart not counted)"
     )
 
 
