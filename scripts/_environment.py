@@ -148,8 +148,7 @@ def _make(folder: str, stamp: str, extras: str) -> None:
         raise SetupError(f"python -m venv failed:\n{(made.stdout + made.stderr).strip()}")
     target = f"{ROOT}[{extras}]" if extras else ROOT
     command = [program_path(folder, "python"), "-m", "pip", "install", "--disable-pip-version-check", "--no-input"]
-    # Only a small part of what is installed is ever imported, and that is compiled then.
-    command += ["--progress-bar", "off", "--no-compile", "--editable", target]
+    command += ["--progress-bar", "off", "--editable", target]
     log = os.path.join(folder, _LOG)
     code = _run_logged(command, log)
     if code:

@@ -86,6 +86,8 @@ def main() -> int:
     # pytest comes last: its closing line is the closing line of this program
     steps["pytest"] = [python, "-m", "pytest", "-q", *spread, *(["-m", "not slow"] if fast else []), *arguments]
     environment = {**os.environ, "CLRECON_REQUIRE_TESTS": "1"}
+    # Hundreds of tests start a process that imports clrecon: it is compiled once, whatever the machine's habit.
+    environment.pop("PYTHONDONTWRITEBYTECODE", None)
     failed = run_steps(steps, environment, beside="oclgrind" if cores > 1 else "")
     if failed and failed != ["pytest"]:
         print(f"failed: {', '.join(failed)}", file=sys.stderr, flush=True)

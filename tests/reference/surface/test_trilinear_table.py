@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import functools
 from collections import Counter
+from typing import Any
 
 import pytest
 
@@ -18,6 +20,7 @@ from clrecon.reference.surface.case_table import (
 from clrecon.reference.surface.trilinear_table import (
     CELL_VERTEX,
     MAX_TRILINEAR_TRIANGLES,
+    CellState,
     cell_state,
     find_regions,
     find_states,
@@ -25,10 +28,18 @@ from clrecon.reference.surface.trilinear_table import (
     ring_corners,
 )
 
-STATES = [state for case in range(256) for state in find_states(case)]
-ROWS = [(state, None, state.plain) for state in STATES] + [
-    (state, tunnel, row) for state in STATES for tunnel, row in state.tunnels
-]
+
+@functools.cache
+def all_states() -> list[CellState]:
+    """Every case with every decision on its faces."""
+    return [state for case in range(256) for state in find_states(case)]
+
+
+@functools.cache
+def all_rows() -> list[Any]:
+    """(state, tunnel or None, row) of every row of the table."""
+    plain: list[Any] = [(state, None, state.plain) for state in all_states()]
+    return plain + [(state, tunnel, row) for state in all_states() for tunnel, row in state.tunnels]
 
 
 def directed_edges(triangles) -> Counter:
@@ -40,15 +51,15 @@ def loop_edges(loops) -> set:
 
 
 def test_all_states_and_tunnels_are_there():
-    assert len(STATES) == 656
-    assert len(ROWS) - len(STATES) == 160
-    assert max(len(row.triangles) for _, _, row in ROWS) == MAX_TRILINEAR_TRIANGLES
+    assert len(all_states()) == 656
+    assert len(all_rows()) - len(all_states()) == 160
+    assert max(len(row.triangles) for _, _, row in all_rows()) == MAX_TRILINEAR_TRIANGLES
 
 
 def test_the_tunnels_are_those_of_marching_cubes_33():
     """By inside or outside corners and the loops that the tube joins; each in all its positions."""
     found: Counter = Counter()
-    for state, tunnel, _ in ROWS:
+    for state, tunnel, _ in all_rows():
         if tunnel is not None:
             corners = min(state.case.bit_count(), 8 - state.case.bit_count())
             loops = len(case_loops(state.case, state.joined))
@@ -62,7 +73,7 @@ def test_the_tunnels_are_those_of_marching_cubes_33():
 def test_the_rest_of_marching_cubes_33_is_there():
     """Loops of the states with ambiguous faces, by inside or outside corners and ambiguous faces."""
     found: Counter = Counter()
-    for state in STATES:
+    for state in all_states():
         faces = len(find_ambiguous_faces(state.case))
         if faces:
             corners = min(state.case.bit_count(), 8 - state.case.bit_count())
@@ -81,7 +92,7 @@ def test_the_rest_of_marching_cubes_33_is_there():
 
 
 def test_every_row_fills_its_loops_and_nothing_else():
-    for state, _, row in ROWS:
+    for state, _, row in all_rows():
         directed = directed_edges(row.triangles)
         assert max(directed.values(), default=1) == 1
         free = {edge for edge in directed if edge[::-1] not in directed}
@@ -89,7 +100,7 @@ def test_every_row_fills_its_loops_and_nothing_else():
 
 
 def test_every_row_has_discs_and_at_most_one_tube():
-    for state, tunnel, row in ROWS:
+    for state, tunnel, row in all_rows():
         directed = directed_edges(row.triangles)
         vertices = {vertex for edge in directed for vertex in edge}
         assert len([v for v in vertices if v >= CELL_VERTEX]) == row.cell_vertices
@@ -99,7 +110,7 @@ def test_every_row_has_discs_and_at_most_one_tube():
 
 def test_no_chord_lies_in_a_face():
     """Else the neighbour could have the same chord, and the edge four triangles."""
-    for state, _, row in ROWS:
+    for state, _, row in all_rows():
         chords = set(directed_edges(row.triangles)) - loop_edges(case_loops(state.case, state.joined))
         for a, b in chords:
             if max(a, b) < CELL_VERTEX:
@@ -113,7 +124,7 @@ def test_neighbours_agree_on_every_face_that_they_decide_alike(axis):
     across = {EDGES.index((own, low, high)): EDGES.index((own, low | 1 << axis, high | 1 << axis))
               for own, low, high in EDGES if own != axis and not low >> axis & 1}  # fmt: skip
     seen: dict = {}
-    for state in STATES:
+    for state in all_states():
         segments = loop_edges(case_loops(state.case, state.joined))
         for face, turned in ((lower, True), (upper, False)):
             corners = [corner for corner in range(8) if CORNERS[corner][axis] == (face == upper)]
