@@ -1,0 +1,266 @@
+"""Mutations of kernels: every 7th work-item does nothing, items beyond number 500 do nothing, results are inverted.
+
+A result is inverted by its type: a number with a sign is negated; bits, counts, places and labels become their
+complement; a mark becomes the opposite mark, the least the greatest; triangles are wound the other way round.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from typing import NamedTuple
+
+from clrecon.opencl.sources import kernel_files, read_kernel_source
+
+__all__ = ["EQUIVALENT", "INVERSIONS", "Mutation", "all_mutations", "find_kernels"]
+
+SKIPS = {
+    "every 7th item": "get_global_id(0) % 7u == 3u",
+    "items beyond 500": "get_global_id(0) > 500u",
+}
+
+ONE_GROUP = "it is launched over one work-group of 64 items, whatever the data"
+ONE_ITEM = "its only work-item with something to do is the first"
+EQUIVALENT = {
+    ("scan_block_sums", "items beyond 500"): ONE_GROUP,
+    ("total_counts", "every 7th item"): ONE_ITEM,
+    ("total_counts", "items beyond 500"): ONE_ITEM,
+}
+"""Mutations that change nothing, with the reason."""
+
+BITS = (("row_mask[w] = bits;", "row_mask[w] = ~bits;"),)
+MARK = (("mask[word] = bits;", "mask[word] = ~bits;"),)
+IMAGE = ("= finish_color(", "= (uchar4)(255) - finish_color(")
+
+INVERSIONS: dict[str, dict[str, tuple[tuple[str, str], ...]]] = {
+    "count_set_bits": {"counts": (("= count;", "= 32u * COMPACT_WORDS - count;"),)},
+    "list_set_bits": {
+        "positions": (
+            ("= 32 * word + popcount((bits & -bits) - 1);", "= 32 * word + 31 - popcount((bits & -bits) - 1);"),
+        )
+    },
+    "sum_blocks": {"sums": (("= block;", "= ~block;"),)},
+    "scan_block_sums": {
+        "offsets": (("block_offsets[block] = offset;", "block_offsets[block] = ~offset;"),),
+        "total": (("total[0] = before;", "total[0] = ~before;"),),
+    },
+    "scan_blocks": {"offsets": (("offsets[index] = offset;", "offsets[index] = ~offset;"),)},
+    "clear_labels": {"labels": (("= UNUSED;", "= ~UNUSED;"),)},
+    "hook_corners": {"labels": (("min(corner.x, min(corner.y, corner.z))", "max(corner.x, max(corner.y, corner.z))"),)},
+    "jump_labels": {"labels": ((": follow_labels(", ": n - 1 - follow_labels("),)},
+    "mark_mixed": {"mask": MARK},
+    "mark_roots": {"mask": MARK},
+    "gather_roots": {
+        "corners": (
+            (
+                "(labels[corner.x], labels[corner.y], labels[corner.z])",
+                "(~labels[corner.x], ~labels[corner.y], ~labels[corner.z])",
+            ),
+        )
+    },
+    "hook_roots": {"labels": (("min(a, min(b, c))", "max(a, max(b, c))"),)},
+    "jump_roots": {"labels": (("= follow_labels(", "= ~follow_labels("),)},
+    "copy_roots": {"labels": (("= labels[roots[place]];", "= ~labels[roots[place]];"),)},
+    "flag_roots": {"marks": (("labels[vertex] == vertex", "labels[vertex] != vertex"),)},
+    "number_components": {
+        "numbers": (("numbers[vertex] = label == UNUSED ? -1 :", "numbers[vertex] = label == UNUSED ? 1 : -"),)
+    },
+    "measure_bricks": {
+        "ranges": (
+            ("range[0] = min(", "range[0] = (VOXEL)-min("),
+            ("range[1]\n        = max(", "range[1]\n        = (VOXEL)-max("),
+        )
+    },
+    "compare_bricks": {
+        "states": (
+            (
+                "all_outside ? BRICK_OUTSIDE : all_inside ? BRICK_INSIDE",
+                "all_outside ? BRICK_INSIDE : all_inside ? BRICK_OUTSIDE",
+            ),
+        ),
+        "extents": (("(ushort)end);", "(ushort)~end);"),),
+    },
+    "measure_cells": {"ranges": (("= lowest;", "= (VOXEL)-lowest;"), ("= highest;", "= (VOXEL)-highest;"))},
+    "mark_bricks": {"marks": (("? 0 : FARTHEST", "? FARTHEST : 0"),)},
+    "spread_in_rows": {
+        "distances": tuple((f"(uchar)distance.{c}", f"(uchar)(FARTHEST - distance.{c})") for c in "xyzw")
+    },
+    "spread_along": {
+        "distances": (
+            ("(spread + here) = best;", "(spread + here) = (uchar16)((uchar)FARTHEST) - best;"),
+            ("spread[here] = (uchar)best;", "spread[here] = (uchar)(FARTHEST - best);"),
+        )
+    },
+    "look_ahead": {"ways": (("(uchar)(free << 4 | own[0])", "(uchar)~(free << 4 | own[0])"),)},
+    "enter_tiles": {"entries": (("= entry_of[lane];", "= -entry_of[lane];"),)},
+    "composite_rays": {
+        "image": (("image[place] = finish_color(color", "image[place] = (uchar4)(255) - finish_color(color"),),
+        "depths": (("NAN : first_hit + offset_of", "NAN : -first_hit - offset_of"),),
+    },
+    "project_rays": {
+        "values": (
+            ("missed ? missing : which", "missed ? missing : -1.0f * (which"),
+            ("sign * lane_of[0][lane];", "sign * lane_of[0][lane]);"),
+        ),
+        "depths": (("NAN : lane_of[1][lane] + offset_of", "NAN : -lane_of[1][lane] - offset_of"),),
+    },
+    "trace_surface": {
+        "image": (("image[at_pixel] = finish_color(", "image[at_pixel] = (uchar4)(255) - finish_color("),),
+        "depths": (("NAN : seen->first_hit + offset", "NAN : -seen->first_hit - offset"),),
+    },
+    "overlay_slices": {
+        "image": (("= finish_color(", "= (uchar4)(255) - finish_color("),),
+        "depths": (("NAN : first_hit + r.offset", "NAN : -first_hit - r.offset"),),
+    },
+    "reformat_rows": {
+        "values": (("values[pixel] = value;", "values[pixel] = -value;"),),
+        "weights": (("weights[pixel] = weight;", "weights[pixel] = -weight;"),),
+    },
+    "classify_samples": {"mask": BITS},
+    "classify_bricks": {"mask": BITS},
+    "count_rows": {
+        "vertices": (("row_counts[row] = vertices;", "row_counts[row] = 99 * words - vertices;"),),
+        "triangles": (("= triangles;", "= 99 * words - triangles;"),),
+    },
+    "total_counts": {"totals": (("totals[which] = (", "totals[which] = -("),)},
+    "list_words": {"words": (("+ lowest_bit(flags);", "+ 31 - lowest_bit(flags);"),)},
+    "emit_vertices": {
+        "positions": (("store_triples(PLACE(x), PLACE(y), PLACE(z)", "store_triples(-PLACE(x), -PLACE(y), -PLACE(z)"),),
+        "normals": (
+            ("store_triples(x * scale, y * scale, z * scale", "store_triples(-x * scale, -y * scale, -z * scale"),
+        ),
+    },
+    "emit_triangles": {
+        "winding": (
+            ("= mirrored ? 8 : 0, last_shift = mirrored ? 0 : 8", "= mirrored ? 0 : 8, last_shift = mirrored ? 8 : 0"),
+        )
+    },
+    "count_cells": {
+        "triangles": (("row_counts[rows_to_count + row] += more;", "row_counts[rows_to_count + row] -= more;"),),
+        "vertices": (("row_cell_vertices[row] = vertices;", "row_cell_vertices[row] = 99 * words - vertices;"),),
+    },
+    "make_room": {"counts": (("] += cell", "] -= cell"),)},
+    "emit_cell_triangles": {
+        "winding": (
+            ("= mirrored ? 8 : 0, last_shift = mirrored ? 0 : 8", "= mirrored ? 0 : 8, last_shift = mirrored ? 8 : 0"),
+        )
+    },
+    "emit_cell_vertices": {
+        "positions": (("vstore3(place, vertex, positions)", "vstore3(-place, vertex, positions)"),),
+        "normals": (("vstore3(-up /", "vstore3(up /"),),
+    },
+    "own_samples": {"labels": (("(LABEL)owner;", "(LABEL)~owner;"),)},
+    "classify_label": {"mask": BITS},
+    "clear_survey": {
+        "boxes": (("= INT_MAX;", "= -INT_MAX;"), ("= INT_MIN;", "= INT_MAX;")),
+        "faces": (("faces[2 * item + 1] = 0;", "faces[2 * item + 1] = ~0u;"),),
+    },
+    "find_boxes": {
+        "boxes": tuple((f"atomic_min({box}", f"atomic_max({box}") for box in ("box, begin", "box + 1, j", "box + 2, k"))
+    },
+    "count_faces": {"faces": (("found->free);", "-found->free);"), ("found->shared);", "-found->shared);"))},
+    "smooth_rows": {"sums": (("convert_ushort16(sum), 0", "(ushort)WHOLE - convert_ushort16(sum), 0"),)},
+    "smooth_across": {"occupancy": (("as_short16(sum * (ushort)FINENESS)", "-as_short16(sum * (ushort)FINENESS)"),)},
+    "classify_mask": {"mask": BITS},
+    "sum_volumes": {"sums": (("sums[item] = sum;", "sums[item] = -sum;"),)},
+}
+"""For each kernel what it stores, and the texts of its file that are replaced to invert that."""
+
+
+class Mutation(NamedTuple):
+    """One mutation of one kernel."""
+
+    file: str
+    kernel: str
+    name: str
+
+    @property
+    def reason(self) -> str:
+        """Why it changes nothing; empty where it has to be caught."""
+        return EQUIVALENT.get((self.kernel, self.name), "")
+
+    def source(self) -> str:
+        """Return the text of the file with the mutation.
+
+        Raises
+        ------
+        ValueError
+            A text that is to be replaced is not there.
+        """
+        text = read_kernel_source(self.file)
+        if self.name in SKIPS:
+            return _skip(text, self.kernel, SKIPS[self.name])
+        return _invert(text, self.kernel, self.name.removeprefix("inverted "))
+
+    def key(self) -> str:
+        """Return a hash of the kernel with its mutation."""
+        return hashlib.sha256(f"{self.kernel}\n{self.name}\n{self.source()}".encode()).hexdigest()[:16]
+
+
+def find_kernels() -> dict[str, str]:
+    """Return the file of each kernel of cl/."""
+    found = {}
+    for file in kernel_files():
+        for kernel in re.findall(r"__kernel\b[^;{]*?\bvoid\s+(\w+)\s*\(", _without_comments(read_kernel_source(file))):
+            found[kernel] = file
+    return found
+
+
+def all_mutations() -> list[Mutation]:
+    """Return every mutation of every kernel, file by file."""
+    return [
+        Mutation(file, kernel, name)
+        for kernel, file in find_kernels().items()
+        for name in (*SKIPS, *(f"inverted {what}" for what in INVERSIONS.get(kernel, {})))
+    ]
+
+
+def _without_comments(text: str) -> str:
+    """Blank comments out; every place stays where it is."""
+    blank = re.compile(r"[^\n]")
+    return re.sub(r"/\*.*?\*/|//[^\n]*", lambda match: blank.sub(" ", match[0]), text, flags=re.DOTALL)
+
+
+def _close(text: str, at: int) -> int:
+    """Return the place of the bracket that closes the one at `at`."""
+    pairs = {"(": ")", "{": "}"}
+    opening, closing, depth = text[at], pairs[text[at]], 0
+    for place in range(at, len(text)):
+        depth += (text[place] == opening) - (text[place] == closing)
+        if depth == 0:
+            return place
+    raise ValueError(f"a {opening} is not closed")
+
+
+def _find_body(text: str, kernel: str) -> tuple[int, int]:
+    """Return the places of the braces around the body of a kernel."""
+    plain = _without_comments(text)
+    head = next(re.finditer(rf"\bvoid\s+{kernel}\s*\(", plain), None)
+    if head is None:
+        raise ValueError(f"no kernel {kernel}")
+    begin = plain.index("{", _close(plain, head.end() - 1))
+    return begin, _close(plain, begin)
+
+
+def _skip(text: str, kernel: str, condition: str) -> str:
+    """Let work-items do nothing: return at once, or with barriers in the way leave out what they would store."""
+    begin, end = _find_body(text, kernel)
+    body = text[begin + 1 : end]
+    if "barrier(" not in body:
+        return f"{text[: begin + 1]}\n    if ({condition})\n        return;{body}{text[end:]}"
+    stores = re.compile(r"(?m)^(\s*)(\w+\[.*\] [+]?= .*;)$")
+    return text[: begin + 1] + stores.sub(rf"\1if (!({condition})) \2", body) + text[end:]
+
+
+def _invert(text: str, kernel: str, what: str) -> str:
+    """Replace in the body of the kernel, or, where a text is not there, in the functions that it calls."""
+    for old, new in INVERSIONS[kernel][what]:
+        begin, end = _find_body(text, kernel)
+        body = text[begin:end]
+        if old in body:
+            text = text[:begin] + body.replace(old, new) + text[end:]
+        elif old in text:
+            text = text.replace(old, new)
+        else:
+            raise ValueError(f"{kernel}: {old!r} is not in its file")
+    return text
