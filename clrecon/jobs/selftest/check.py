@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from clrecon.errors import DeviceError
 from clrecon.opencl import Device
 
-__all__ = ["LEAST_ITEMS", "Check", "require_close", "require_equal", "require_share"]
+__all__ = ["LEAST_ITEMS", "Check", "require_close", "require_equal", "require_share", "require_whole"]
 
 LEAST_ITEMS = 501
 """Fewest work-items of a kernel in its check, where its data allow more: several work-groups on every device."""
@@ -94,6 +94,21 @@ def require_share(found: ArrayLike, expected: ArrayLike, allowed: float, share: 
             f"{what}: {int(wrong.sum()):,} of {one.size:,} are off, by up to {worst:.3g} ({allowed:g} is allowed)"
         )
     return float(away[~wrong].max(initial=0.0))
+
+
+def require_whole(report: Mapping[str, Any]) -> None:
+    """Refuse a result that was made in parts.
+
+    Wrong sums look like a lack of memory.  An operator then goes on with thinner slabs, perhaps so thin that a kernel's
+    fault does not show.
+
+    Raises
+    ------
+    DeviceError
+    """
+    words = [text for text in report["warnings"] if "continued with" in text]
+    if words or report.get("slabs", 1) != 1:
+        raise DeviceError(f"made in parts: {'; '.join(words) or 'the device has too little memory'}")
 
 
 def _describe_shape(array: np.ndarray[Any, Any]) -> str:

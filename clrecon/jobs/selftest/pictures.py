@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.geometry import Volume
-from clrecon.jobs.selftest.check import Check, require_close, require_equal, require_share
+from clrecon.jobs.selftest.check import Check, require_close, require_equal, require_share, require_whole
 from clrecon.jobs.selftest.scenes import OBLIQUE, blobs, centre_of, look_at
 from clrecon.labels import LabelMap
 from clrecon.opencl import Device
@@ -60,6 +60,7 @@ def _premultiplied(image: NDArray[np.uint8]) -> NDArray[np.float64]:
 
 def _compare(found: Rendering, image: NDArray[Any], depth: NDArray[Any], what: str) -> float:
     """Compare colours over black and depths, pixel by pixel."""
+    require_whole(found.report)
     both = np.isfinite(found.depth) & np.isfinite(depth)
     require_share(np.isfinite(found.depth), np.isfinite(depth), 0.0, EDGE_SHARE, f"hits of {what}")
     require_share(found.depth[both], depth[both], DEPTH_MM, 2.0 * EDGE_SHARE, f"depths of {what}, in mm")
@@ -112,6 +113,7 @@ def _check_composite_labels(device: Device) -> str:
             grey, lighting=UNSHADED, labels=labels, label_colors={3: "red"}, label_opacity={1: 0.25, 3: 0.5}
         )
         found = take_picture(DeviceVolume(volume, device=device), style, camera, SIZE, 0.3)
+        require_whole(found.report)
         column = np.arange(SIZE[0]) // 8 % 4
         factor = np.choose(column, (1.0, 0.25, 1.0, 0.5))
         opacity = 1.0 - (1.0 - 0.1 * factor) ** (10 * 0.5 / grey.unit_distance)
@@ -135,6 +137,7 @@ def _check_projections(device: Device, kinds: tuple[str, ...], uneven: bool) -> 
             found = take_picture(DeviceVolume(volume, device=device), style, camera, SIZE, step)
             twin = cast_rays(volume, None, camera, SIZE, step, None, clip, kind)
             what = f"{kind} of {dtype} voxels{' of uneven slices' * uneven}"
+            require_whole(found.report)
             assert found.values is not None
             worst = max(worst, require_share(found.values, twin.values, VALUE_HU, EDGE_SHARE, what))
             if kind in ("mip", "minip") and dtype != "uint8":  # 8 bits have several places of one value
@@ -168,6 +171,7 @@ def _check_surface_labels(device: Device) -> str:
             label_colors={1: "red", 2: "blue"}, label_opacity={3: 0.4},
         )  # fmt: skip
         found = cast_surface(DeviceVolume(volume, device=device), style, camera, SIZE, 0.2)
+        require_whole(found.report)
         column = np.arange(SIZE[0]) // 8 % 4
         colors = 255.0 * np.array([(1, 1, 1, 1), (1, 0, 0, 1), (0, 0, 1, 1), (0.4, 0.4, 0.4, 0.4)])
         inner = (np.arange(SIZE[0]) % 8 > 1) & (np.arange(SIZE[0]) % 8 < 6)

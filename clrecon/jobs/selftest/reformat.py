@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from functools import partial
 
-from clrecon.jobs.selftest.check import Check, require_close
+from clrecon.jobs.selftest.check import Check, require_close, require_whole
 from clrecon.jobs.selftest.scenes import OBLIQUE, random_integers, stack
 from clrecon.opencl import Device
 from clrecon.operators.reformat.sample import sample_sheet
@@ -31,6 +31,7 @@ def _check_sheets(device: Device, types: tuple[str, ...], uneven: bool) -> str:
             sheet, _ = plane_sheet(find_plane(volume, view, SIZE), SIZE, 0.1)
             samples = slab_samples(volume, thickness)
             made = sample_sheet(DeviceVolume(volume, device=device), sheet, samples, combine)
+            require_whole({"slabs": made.slabs, "warnings": ()})
             expected = reformat_sheet(volume, sheet, samples, combine)
             worst = max(worst, require_close(made.values, expected, VALUE_HU, f"slices of {dtype} voxels, in HU"))
     return f"{len(types) * len(PLANES)} slices of {SIZE[0]} x {SIZE[1]} pixels within {worst:.1e} HU"

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from clrecon.geometry import Volume
 from clrecon.geometry.iso_rule import Level
-from clrecon.jobs.selftest.check import Check, require_close, require_equal
+from clrecon.jobs.selftest.check import Check, require_close, require_equal, require_whole
 from clrecon.jobs.selftest.scenes import MIRRORED, OBLIQUE, WIDE, noise, stack, waves
 from clrecon.mesh import Mesh
 from clrecon.opencl import Device
@@ -36,6 +36,7 @@ LONG = (532, 2, 6)
 def compare_mesh(volume: Volume, mesh: Mesh, expected: Surface, what: str) -> float:
     """Refuse a mesh that is not its twin; return the largest distance of a vertex, in voxel edges."""
     vertices, normals, triangles = expected
+    require_whole(mesh.report)
     require_equal(mesh.triangles, triangles, f"triangles of {what}")
     scale = 1.0 / min(volume.spacing)
     allowed = VERTEX_TOLERANCE_VOXEL
