@@ -49,9 +49,6 @@ def find_devices() -> tuple[list[Any], str]:
     except DeviceError as error:
         return [], str(error)
     for device in found:
-        # PoCL builds every kernel once more before it gives a binary away, for groups of any size: half of all its
-        # building.  The processes of commands keep binaries, and so do tests/opencl/test_binaries.py.
-        device.keeps_binaries = False
         # llvmpipe makes vectors of work-items itself, and takes three times as long to build kernels that are written
         # with vectors.  It runs the variant of GPUs, as no other device here does; `users_kernels` gives its own back.
         if is_software_gpu(device.name):

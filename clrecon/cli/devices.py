@@ -25,6 +25,8 @@ def run(options: argparse.Namespace, console: Console) -> int:
 
     survey, problem = survey_devices(options.device)
     console.result(survey)
+    for warning in survey["warnings"]:
+        console.warn(warning)
     for line in _describe_survey(survey):
         console.say(line)
     if problem is not None:

@@ -23,6 +23,8 @@ def run(options: argparse.Namespace, console: Console) -> int:
 
     outcome = run_device_selftest(options.device, progress=console.progress)
     console.result(outcome)
+    for warning in outcome["warnings"]:
+        console.warn(warning)
     device = outcome["device"]
     name = printable(f"{device['name']} ({device['platform']}, driver {device['driver']})")
     console.say(f"device  {name}")

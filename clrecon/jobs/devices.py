@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Sequence
 from typing import Any
 
 from clrecon.errors import DeviceError
@@ -25,7 +26,7 @@ def survey_devices(name: str | None = None) -> tuple[dict[str, Any], DeviceError
     survey : dict
         ``{"platforms": [{"name", "version", "note"}], "devices": [{"index", "name", "platform", "type", "version",
         "driver", "memory_bytes", "max_allocation_bytes", "compute_units", "simulator", "chosen", ...}],
-        "chosen": index or None}``.
+        "chosen": index or None, "warnings": [text]}``.
     problem : DeviceError or None
         Why no device would be used.
 
@@ -34,19 +35,22 @@ def survey_devices(name: str | None = None) -> tuple[dict[str, Any], DeviceError
     DeviceError
         pyopencl itself cannot be imported.
     """
-    from clrecon.opencl import choose_device, list_devices, list_platforms
+    from clrecon.opencl import cache_warnings, choose_device, list_devices, list_platforms
 
     devices = list_devices()
     problem: DeviceError | None = None
     chosen: int | None = None
+    warnings: Sequence[str] = cache_warnings()
     try:
-        chosen = choose_device(name).index
+        device = choose_device(name)
+        chosen, warnings = device.index, device.warnings
     except DeviceError as error:
         problem = error
     survey = {
         "platforms": list_platforms(),
         "devices": [{**device.describe(), "chosen": device.index == chosen} for device in devices],
         "chosen": chosen,
+        "warnings": list(warnings),
     }
     return survey, problem
 
@@ -64,7 +68,8 @@ def run_device_selftest(name: str | None = None, *, progress: Progress | None = 
     Returns
     -------
     dict
-        ``{"device": {...}, "passed": bool, "operators": [{"operator", "passed", "detail", "seconds"}]}``.
+        ``{"device": {...}, "passed": bool, "operators": [{"operator", "passed", "detail", "seconds"}],
+        "warnings": [text]}``.
 
     Raises
     ------
@@ -83,4 +88,9 @@ def run_device_selftest(name: str | None = None, *, progress: Progress | None = 
         results.append(result)
         progress("selftest", len(results), len(CHECKS))
     passed = bool(results) and all(result["passed"] for result in results)
-    return {"device": device.describe(), "passed": passed, "operators": results}
+    return {
+        "device": device.describe(),
+        "passed": passed,
+        "operators": results,
+        "warnings": device.warnings,
+    }

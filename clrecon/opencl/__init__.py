@@ -4,6 +4,7 @@ Only this package searches for drivers and knows where the kernel files are.
 """
 
 from clrecon.opencl.arrays import allocate, download, empty_output, upload
+from clrecon.opencl.cache_folders import cache_warnings
 from clrecon.opencl.commands import has_hung_commands, keep_for_hung_commands
 from clrecon.opencl.context import Device
 from clrecon.opencl.launching import Stopwatch, launch
@@ -21,6 +22,7 @@ __all__ = [
     "Program",
     "Stopwatch",
     "allocate",
+    "cache_warnings",
     "check_budget",
     "check_memory",
     "choose_device",

@@ -1,11 +1,8 @@
-"""Built programs in the user's cache folder, for drivers whose own cache is slow.
+"""Built programs in the user's cache folder, for drivers that keep none.
 
-PoCL keeps built programs, but to find one it runs its compiler's preprocessor over the whole source: 25 ms for each
-program.  From the binary that it returns, the same program is made in 2 ms.
-
-A file is named by a hash of everything that the binary depends on, and contains a hash of itself: a program is built
-again if its file was cut or changed.  Like the driver's own cache, the folder belongs to the user alone, since its
-contents are executed.
+A file is named by a hash of everything that its binary depends on, and contains that name and a hash of name and
+binary together: a program is built again if its file was cut, changed, or takes the place of another.  The folder
+belongs to the user alone (`clrecon.opencl.cache_folders`), since its contents are executed.
 """
 
 from __future__ import annotations
@@ -17,14 +14,15 @@ from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 
+from clrecon.opencl.cache_folders import prepare_caches
 from clrecon.system.log import get_logger
 
 __all__ = ["binary_key", "read_binary", "store_binary"]
 
 log = get_logger(__name__)
 
-_MAGIC = b"clrecon kernels 1\n"
-_MOST_FILES = 64
+_MAGIC = b"clrecon kernels 2\n"
+_MOST_FILES = 512
 
 
 def binary_key(*parts: str) -> str:
@@ -35,33 +33,22 @@ def binary_key(*parts: str) -> str:
     return digest.hexdigest()
 
 
-def _folder() -> Path:
-    home = Path(os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache"))
-    return home / "clrecon" / "kernels"
-
-
-def _is_private(folder: Path) -> bool:
-    """True when no other user can put a file there."""
-    if not hasattr(os, "getuid"):  # Windows: the profile folder belongs to the user
-        return folder.is_dir()
-    try:
-        state = folder.stat()
-    except OSError:
-        return False
-    return state.st_uid == os.getuid() and not state.st_mode & 0o022
+def _head(key: str, binary: bytes) -> bytes:
+    name = key.encode()
+    return _MAGIC + name + hashlib.sha256(name + binary).digest()
 
 
 def read_binary(key: str) -> bytes | None:
     """Return the binary kept under `key`; None where there is none, or none that can be trusted."""
-    folder = _folder()
-    if not _is_private(folder):
+    folder = prepare_caches().binaries
+    if folder is None:
         return None
     try:
         content = (folder / key).read_bytes()
     except OSError:
         return None
-    head, binary = content[: len(_MAGIC) + 32], content[len(_MAGIC) + 32 :]
-    if head != _MAGIC + hashlib.sha256(binary).digest():
+    binary = content[len(_head(key, b"")) :]
+    if content != _head(key, binary) + binary:
         log.info("a kept binary is damaged: it is built anew and replaced")
         return None
     return binary
@@ -72,15 +59,14 @@ def store_binary(key: str, binary: bytes) -> None:
 
     A folder that cannot be written gives no error: this process has the program, and the next one builds it again.
     """
-    folder = _folder()
+    folder = prepare_caches().binaries
+    if folder is None:
+        return
     with suppress(OSError):
-        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-        if not _is_private(folder):
-            return
         handle, name = tempfile.mkstemp(prefix=".new-", dir=folder)
         try:
             with os.fdopen(handle, "wb") as file:
-                file.write(_MAGIC + hashlib.sha256(binary).digest() + binary)
+                file.write(_head(key, binary) + binary)
             os.replace(name, folder / key)
         except OSError:
             os.unlink(name)

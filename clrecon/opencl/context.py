@@ -7,11 +7,14 @@ import re
 import sys
 import threading
 from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from typing import Any
 
 from clrecon.errors import DeviceError, DeviceFailedError, DeviceLostError, DeviceMemoryError
 from clrecon.opencl import quirks
+from clrecon.opencl.cache_folders import cache_warnings
 from clrecon.opencl.commands import Commands
+from clrecon.opencl.known_good import KnownGood, known_good
 from clrecon.opencl.unknown_cpu import NameOfCpu, has_unknown_cpu
 from clrecon.system.log import get_logger
 
@@ -88,8 +91,9 @@ class Device:
     shortcoming : str
         Why the device cannot be used; empty if it can.
     keeps_binaries : bool
-        Built programs are kept for the next process, see `clrecon.opencl.binaries`; never where no folder for them
-        can be written, since PoCL builds a program a second time before it gives its binary.
+        Built programs are kept for the next process by `clrecon.opencl.binaries`: the driver keeps none.
+    known_good : KnownGood or None
+        The check of the programs that PoCL keeps; None for other drivers, and where nothing is kept.
     kernel_variants : dict of str to str
         ``-D`` definitions for kernels that are written for vectors, see `quirks.kernel_variants`.
     build_options : tuple of str
@@ -123,7 +127,9 @@ class Device:
         self.is_simulator: bool = quirks.is_simulator(self.platform)
         self.shares_host_memory: bool = quirks.shares_host_memory(self.platform, self.type)
         self.has_event_times: bool = quirks.has_event_times(self.platform)
-        self.keeps_binaries: bool = quirks.is_slow_from_its_cache(self.platform) and not quirks.cache_warnings()
+        self.keeps_binaries: bool = not quirks.keeps_programs(self.platform)
+        self.known_good: KnownGood | None = known_good() if quirks.is_pocl(self.platform) else None
+        self._remarks: list[str] = []
         self.kernel_variants: dict[str, str] = quirks.kernel_variants(self.platform, self.type)
         self.shortcoming: str = _find_shortcoming(cl_device)
         self.build_options: tuple[str, ...] = ()
@@ -149,6 +155,21 @@ class Device:
             )
         else:
             self.build_options = (f"-DCPU_NAME={self._cpu.name}",)
+
+    @property
+    def warnings(self) -> list[str]:
+        """What users of this device should know: caches that are not used, a simulator that nobody named."""
+        of_kernels = [] if self.known_good is None else self.known_good.warnings
+        return [*cache_warnings(), *self._remarks, *of_kernels]
+
+    def remark(self, text: str) -> None:
+        """Add one of the `warnings`."""
+        if text not in self._remarks:
+            self._remarks.append(text)
+
+    def checked_cache(self, key: str) -> AbstractContextManager[None]:
+        """Return the context in which the driver may look for program `key` in its cache."""
+        return nullcontext() if self.known_good is None else self.known_good.building(key)
 
     @property
     def score(self) -> tuple[int, int, tuple[int, ...], int]:

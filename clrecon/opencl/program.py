@@ -12,6 +12,7 @@ import numpy as np
 
 from clrecon.errors import DeviceError
 from clrecon.opencl.binaries import binary_key, read_binary, store_binary
+from clrecon.opencl.cache_folders import refuse_short_files
 from clrecon.opencl.context import Device, describe_error
 from clrecon.opencl.quirks import import_pyopencl
 from clrecon.opencl.signatures import KernelArgument, definitions_of, find_signatures
@@ -178,6 +179,8 @@ def load_program(device: Device, name: str, variants: Mapping[str, str] | None =
     with device.lock:
         if key not in device.programs:
             device.programs[key] = _build(device, name, options)
+        elif device.known_good is not None:
+            device.known_good.record_when_due()
         program: Program = device.programs[key]
         return program
 
@@ -186,8 +189,10 @@ def _build(device: Device, name: str, options: tuple[str, ...]) -> Program:
     source, start = read_kernel_source(name), time.perf_counter()
     if device.trace is not None:
         device.trace(f"the build of cl/{name}")
+    if device.known_good is not None:
+        refuse_short_files()
     try:
-        with warnings.catch_warnings():
+        with warnings.catch_warnings(), device.checked_cache(_key(device, source, options)):
             warnings.simplefilter("ignore")  # a compiler's remarks about code that builds
             kept = _build_from_binary(device, source, options) if device.keeps_binaries else None
             built = _build_from_source(device, source, options) if kept is None else kept
@@ -211,7 +216,9 @@ def _key(device: Device, source: str, options: tuple[str, ...]) -> str:
 
 def _build_from_source(device: Device, source: str, options: tuple[str, ...]) -> Any:
     cl = import_pyopencl()
-    built = cl.Program(device.context, source).build([*_STANDARD, *options])
+    # A program without its source: pyopencl keeps binaries beside pickles, and leaves a source that does not build in
+    # the temporary folder.
+    built = cl.Program(cl._cl._Program(device.context, source)).build([*_STANDARD, *options])
     if device.keeps_binaries:
         with suppress(cl.Error):
             store_binary(_key(device, source, options), built.binaries[0])

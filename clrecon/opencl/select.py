@@ -10,6 +10,7 @@ from typing import Any
 
 from clrecon.errors import DeviceError
 from clrecon.opencl import quirks
+from clrecon.opencl.cache_folders import cache_warnings
 from clrecon.opencl.context import Device, describe_error
 from clrecon.system.log import get_logger
 from clrecon.system.wording import name_parameter
@@ -17,6 +18,21 @@ from clrecon.system.wording import name_parameter
 __all__ = ["choose_device", "driver_advice", "list_devices", "list_platforms"]
 
 log = get_logger(__name__)
+
+
+LEAST_ADDRESS_SPACE = 1_000_000_000
+"""Address space, in bytes, below which no driver is loaded.  Two versions of PoCL take 0.83 GB before anything is
+built; with less they show no device, wait for ever, or end the process."""
+
+
+def _address_space() -> int | None:
+    """Return the limit of this process's address space in bytes; None without one."""
+    try:
+        import resource
+    except ImportError:  # Windows
+        return None
+    limit = resource.getrlimit(resource.RLIMIT_AS)[0]
+    return None if limit == resource.RLIM_INFINITY else limit
 
 
 def driver_advice() -> str:
@@ -39,6 +55,12 @@ def _find_platforms() -> list[Any]:
         cl = quirks.import_pyopencl()
     except ImportError as error:
         raise DeviceError(f"pyopencl cannot be imported ({error}): reinstall clrecon") from error
+    limit = _address_space()
+    if limit is not None and limit < LEAST_ADDRESS_SPACE:
+        raise DeviceError(
+            f"no OpenCL driver can be loaded for want of memory: this process may take {limit / 1e9:.2f} GB (ulimit"
+            f" -v), and drivers with their compilers take {LEAST_ADDRESS_SPACE / 1e9:.1f} GB: raise that limit"
+        )
     try:
         return list(cl.get_platforms())
     except cl.Error:  # PLATFORM_NOT_FOUND_KHR: a loader exists, but no driver
@@ -140,14 +162,29 @@ def choose_device(name: str | int | Device | None = None) -> Device:
     if isinstance(name, Device):
         return name
     chosen = _choose(name)
+    if chosen.is_simulator and not _is_named(chosen, name):
+        chosen.remark(
+            f"{chosen.label} is a simulator, a thousand times slower than a device: it was chosen without its name, by"
+            f" an index or PYOPENCL_CTX; name another with {name_parameter('device')}"
+        )
     log.debug("device %d chosen of %d: %s", chosen.index, len(list_devices()), chosen.label)
     return chosen
+
+
+def _is_named(device: Device, name: str | int | None) -> bool:
+    """True where the caller or a variable asks for a device by a part of its name, in place of an index."""
+    asked = [str(name or "").strip().lower(), os.environ.get("CLRECON_DEVICE", "").strip().lower()]
+    wanted = next((text for text in asked if text not in ("", "auto")), os.environ.get("PYOPENCL_CTX", "").lower())
+    return not re.fullmatch("[0-9]*", wanted) and wanted in f"{device.platform} {device.name}".lower()
 
 
 def _choose(name: str | int | None) -> Device:
     devices = list_devices()
     if not devices:
-        trouble = "".join(f" ({text})" for text in quirks.cache_warnings())
+        trouble = "".join(f" ({text})" for text in cache_warnings())
+        limit = _address_space()
+        if limit is not None:
+            trouble += f" (this process may take {limit / 1e9:.2f} GB of memory, ulimit -v: a driver may need more)"
         raise DeviceError(f"no OpenCL device found{trouble}: {driver_advice()}")
     wanted, source = ("", "") if name is None else (str(name).strip(), "device")
     if wanted.lower() in ("", "auto"):

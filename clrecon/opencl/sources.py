@@ -12,11 +12,14 @@ from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from clrecon.errors import DeviceError
+
 if TYPE_CHECKING:
     from importlib.abc import Traversable  # importlib.resources.abc from Python 3.11 on
 
 __all__ = ["kernel_constant", "kernel_files", "kernel_number", "kernel_root", "read_kernel_source"]
 
+_REINSTALL = "its installation is damaged, remove it and install it again (pip uninstall clrecon; pip install clrecon)"
 _KNOWN_HEADER = "include/volume.h"
 _NUMBER = re.compile(r"(?m)^#define (\w+) +\(?(-?[0-9.]+)f?\)?(?= |$)")
 _INCLUDE = re.compile(r'^\s*#\s*include\s+"([^"]+)"\s*$')
@@ -30,8 +33,18 @@ def kernel_root() -> Traversable:
     except ModuleNotFoundError:
         root = Path(__file__).resolve().parents[2] / "cl"
     if not root.joinpath(_KNOWN_HEADER).is_file():
-        raise AssertionError(f"clrecon is installed without its kernels: no {_KNOWN_HEADER}")
+        raise DeviceError(f"clrecon is installed without its kernels (no cl/{_KNOWN_HEADER}): {_REINSTALL}")
     return root
+
+
+def _read_file(name: str) -> str:
+    """Return the text of a kernel file or header."""
+    try:
+        return kernel_root().joinpath(name).read_text(encoding="utf-8")
+    except FileNotFoundError as error:
+        raise DeviceError(f"clrecon is installed without its kernel file cl/{name}: {_REINSTALL}") from error
+    except (OSError, UnicodeDecodeError) as error:
+        raise DeviceError(f"clrecon's kernel file cl/{name} cannot be read ({error}): {_REINSTALL}") from error
 
 
 def kernel_files() -> list[str]:
@@ -45,7 +58,7 @@ def kernel_files() -> list[str]:
 
 def _inline(name: str, seen: set[str]) -> list[str]:
     lines = [f'#line 1 "cl/{name}"']
-    for number, line in enumerate(kernel_root().joinpath(name).read_text(encoding="utf-8").splitlines(), start=1):
+    for number, line in enumerate(_read_file(name).splitlines(), start=1):
         match = _INCLUDE.match(line)
         if match is None:
             lines.append(line)
@@ -68,7 +81,7 @@ def read_kernel_source(name: str) -> str:
 def _numbers(name: str) -> dict[str, set[str]]:
     """Every number that a kernel file defines; variants may define one differently."""
     found: dict[str, set[str]] = {}
-    for macro, number in _NUMBER.findall(kernel_root().joinpath(name).read_text(encoding="utf-8")):
+    for macro, number in _NUMBER.findall(_read_file(name)):
         found.setdefault(macro, set()).add(number)
     return found
 

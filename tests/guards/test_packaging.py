@@ -119,7 +119,7 @@ def install_alone(wheel: Path, folder: Path) -> Path:
 
 
 SELFTEST = """
-import sys, clrecon
+import sys
 from clrecon.cli.main import main
 from clrecon.jobs.selftest import table
 table.CHECKS = table.CHECKS[:5]  # a program is found, or it is not

@@ -10,6 +10,7 @@ import pytest
 from clrecon.errors import DeviceError
 from clrecon.opencl import binaries, program, quirks
 from clrecon.opencl.binaries import binary_key, read_binary, store_binary
+from clrecon.opencl.cache_folders import make_private, prepare_caches
 from clrecon.opencl.program import load_program
 from clrecon.opencl.sources import read_kernel_source
 
@@ -18,23 +19,26 @@ KEY = binary_key("device", "source")
 
 @pytest.fixture(autouse=True)
 def own_cache(tmp_path, monkeypatch):
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    return tmp_path / "clrecon" / "kernels"
+    folder = tmp_path / "kernels"
+    make_private(folder)
+    caches = prepare_caches()._replace(binaries=folder)
+    monkeypatch.setattr(binaries, "prepare_caches", lambda: caches)
+    return folder
 
 
-@pytest.fixture(autouse=True)
-def as_for_users(request, monkeypatch):
-    """Binaries are kept: `find_devices` of the conftest turns that off for all other tests."""
-    if "device" in request.fixturenames:
-        device = request.getfixturevalue("device")
-        monkeypatch.setattr(device, "keeps_binaries", quirks.is_slow_from_its_cache(device.platform))
+@pytest.fixture
+def keeper(device, monkeypatch):
+    """A device whose driver keeps nothing: PoCL, whose binaries clrecon then keeps."""
+    if not quirks.is_pocl(device.platform):
+        pytest.skip("no driver here that gives and takes binaries")
+    monkeypatch.setattr(device, "keeps_binaries", True)
+    return device
 
 
 def test_what_was_stored_is_read(own_cache):
     assert read_binary(KEY) is None
     store_binary(KEY, b"program")
     assert read_binary(KEY) == b"program"
-    assert own_cache.stat().st_mode & 0o777 == 0o700
     assert [path.name for path in own_cache.iterdir()] == [KEY]
 
 
@@ -49,18 +53,36 @@ def test_a_damaged_file_is_not_trusted(own_cache, damage):
     assert read_binary(KEY) is None
 
 
-def test_a_folder_that_others_can_write_to_is_not_trusted(own_cache):
-    store_binary(KEY, b"program")
-    own_cache.chmod(0o770)
+def test_row_59_a_binary_in_the_place_of_another_is_not_trusted(own_cache):
+    """Whole, with a hash that is right, but of another source, device or driver."""
+    other = binary_key("other device", "source")
+    store_binary(other, b"program")
+    (own_cache / other).rename(own_cache / KEY)
     assert read_binary(KEY) is None
-    store_binary(binary_key("other"), b"program")
-    assert len(list(own_cache.iterdir())) == 1
+    store_binary(KEY, b"program")
+    assert read_binary(KEY) == b"program"
 
 
-def test_a_folder_that_cannot_be_made_is_no_error(own_cache):
-    own_cache.parent.write_text("a file where the folder should be")
+def test_without_a_folder_nothing_is_kept(own_cache, monkeypatch):
+    caches = prepare_caches()._replace(binaries=None)
+    monkeypatch.setattr(binaries, "prepare_caches", lambda: caches)
+    store_binary(KEY, b"program")
+    assert read_binary(KEY) is None and not list(own_cache.iterdir())
+
+
+def test_a_folder_that_vanished_is_no_error(own_cache):
+    own_cache.rmdir()
     store_binary(KEY, b"program")
     assert read_binary(KEY) is None
+
+
+def test_row_72_files_are_private_whatever_the_umask(own_cache):
+    before = os.umask(0)
+    try:
+        store_binary(KEY, b"program")
+    finally:
+        os.umask(before)
+    assert (own_cache / KEY).stat().st_mode & 0o777 == 0o600
 
 
 def test_the_oldest_go(own_cache, monkeypatch):
@@ -79,38 +101,40 @@ def test_the_oldest_go(own_cache, monkeypatch):
     ]
 
 
-def test_the_next_process_takes_the_binary(device, monkeypatch):
-    """Building from source once; then, with no program in memory, from the binary where the driver is slow."""
+@pytest.mark.first_device
+def test_the_next_process_takes_the_binary(keeper, monkeypatch):
+    """Building from source once; then, with no program in memory, from the binary."""
     sources = []
     true_way = program._build_from_source
     monkeypatch.setattr(program, "_build_from_source", lambda *a: sources.append(1) or true_way(*a))
     for _ in range(3):
-        monkeypatch.setattr(device, "programs", {})
-        assert load_program(device, "primitives/compact.cl").kernel_names == ["count_set_bits", "list_set_bits"]
-    assert len(sources) == (1 if device.keeps_binaries else 3)
+        monkeypatch.setattr(keeper, "programs", {})
+        assert load_program(keeper, "primitives/compact.cl").kernel_names == ["count_set_bits", "list_set_bits"]
+    assert len(sources) == 1
 
 
-def test_binaries_compute_what_sources_do(device, monkeypatch):
+@pytest.mark.first_device
+def test_binaries_compute_what_sources_do(keeper, monkeypatch):
     from clrecon.opencl import upload
     from clrecon.operators.primitives.compact import compact
 
     mask = np.random.default_rng(0).integers(0, 2**32, 1000, dtype=np.uint32)
     for _ in range(2):
-        monkeypatch.setattr(device, "programs", {})
-        assert compact(device, upload(device, mask), 1000).count == int(np.unpackbits(mask.view(np.uint8)).sum())
+        monkeypatch.setattr(keeper, "programs", {})
+        assert compact(keeper, upload(keeper, mask), 1000).count == int(np.unpackbits(mask.view(np.uint8)).sum())
 
 
-def test_a_binary_that_the_driver_refuses_is_built_from_source(device, monkeypatch):
-    if not device.keeps_binaries:
-        pytest.skip("this driver's own cache is fast")
+@pytest.mark.first_device
+def test_a_binary_that_the_driver_refuses_is_built_from_source(keeper, monkeypatch):
     options = ()
-    store_binary(program._key(device, read_kernel_source("primitives/compact.cl"), options), b"no program at all")
-    monkeypatch.setattr(device, "programs", {})
-    assert load_program(device, "primitives/compact.cl").kernel_names == ["count_set_bits", "list_set_bits"]
+    store_binary(program._key(keeper, read_kernel_source("primitives/compact.cl"), options), b"no program at all")
+    monkeypatch.setattr(keeper, "programs", {})
+    assert load_program(keeper, "primitives/compact.cl").kernel_names == ["count_set_bits", "list_set_bits"]
 
 
-def test_a_program_without_kernels_is_an_error(device, monkeypatch):
+@pytest.mark.first_device
+def test_a_program_without_kernels_is_an_error(keeper, monkeypatch):
     monkeypatch.setattr(program.Program, "kernel_names", [])
-    monkeypatch.setattr(device, "programs", {})
+    monkeypatch.setattr(keeper, "programs", {})
     with pytest.raises(DeviceError, match="has no kernel"):
-        load_program(device, "primitives/compact.cl")
+        load_program(keeper, "primitives/compact.cl")

@@ -21,6 +21,8 @@ class FakeDevice:
         self.max_allocation_bytes = memory // 4
         self.label = f"{name} ({platform})"
         self.shortcoming = ""
+        self.warnings: list[str] = []
+        self.remark = self.warnings.append
         rank = 0 if software else {"gpu": 3, "accelerator": 2, "cpu": 1}.get(kind, 0)
         self.score = (rank, memory, "1", -index)
 
@@ -78,6 +80,29 @@ def test_a_simulator_is_never_chosen_silently(machine, monkeypatch):
     assert choose_device("oclgrind").is_simulator
 
 
+@pytest.mark.parametrize(
+    ("wanted", "variables", "is_told"),
+    [
+        ("oclgrind", {}, False),
+        ("simulator", {}, False),
+        (None, {"CLRECON_DEVICE": "oclgrind"}, False),
+        (None, {"PYOPENCL_CTX": "oclgrind"}, False),
+        ("0", {}, True),
+        (0, {}, True),
+        (None, {"CLRECON_DEVICE": "0"}, True),
+        ("auto", {"PYOPENCL_CTX": "0"}, True),
+        (None, {"PYOPENCL_CTX": "0:0"}, True),
+    ],
+)
+def test_row_50_a_simulator_that_nobody_named_is_told(machine, wanted, variables, is_told, monkeypatch):
+    for name, text in variables.items():
+        monkeypatch.setenv(name, text)
+    monkeypatch.setattr(select, "_named_by_pyopencl", lambda cl, devices: devices[:1])
+    chosen = choose_device(wanted)
+    assert chosen.is_simulator
+    assert ["is a simulator" in text for text in chosen.warnings] == [True] * is_told
+
+
 def test_a_device_that_cannot_work_is_passed_over(machine):
     machine[3].shortcoming = "it has no compiler"
     assert choose_device().name == "Radeon"
@@ -106,6 +131,13 @@ def test_shortcomings_are_named(changed, says):
 def test_no_device_says_how_to_get_a_driver(monkeypatch):
     monkeypatch.setattr(select, "list_devices", lambda: [])
     with pytest.raises(DeviceError, match="no OpenCL device found: install"):
+        choose_device()
+
+
+def test_no_device_under_a_limit_of_memory_names_it(monkeypatch):
+    monkeypatch.setattr(select, "list_devices", list)
+    monkeypatch.setattr(select, "_address_space", lambda: 2_500_000_000)
+    with pytest.raises(DeviceError, match=r"this process may take 2\.50 GB of memory, ulimit -v"):
         choose_device()
 
 

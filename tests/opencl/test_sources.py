@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shutil
 
 import pytest
 
@@ -67,3 +68,21 @@ def test_a_compiler_error_names_the_true_file_and_line(device, monkeypatch):
     log = str(caught.value) + str(caught.value.__cause__)
     assert "missing_name" in log
     assert "theme/file.cl:3" in log
+
+
+@pytest.mark.parametrize("missing", ["primitives/compact.cl", "include/volume.h"])
+def test_row_52_a_missing_kernel_file_is_a_damaged_installation(missing, tmp_path, monkeypatch):
+    root = tmp_path / "cl"
+    shutil.copytree(str(sources.kernel_root()), root)
+    (root / missing).unlink()
+    monkeypatch.setattr(sources, "kernel_root", lambda: root)
+    name = missing if missing.endswith(".cl") else "surface/marching_cubes.cl"
+    with pytest.raises(DeviceError, match=f"without its kernel file cl/{missing}: its installation is damaged"):
+        sources.read_kernel_source.__wrapped__(name)
+
+
+def test_row_52_an_installation_without_kernels_is_damaged(tmp_path, monkeypatch):
+    monkeypatch.setattr(sources.resources, "files", lambda name: tmp_path)
+    with pytest.raises(DeviceError, match=r"without its kernels.*install it again") as caught:
+        sources.kernel_root.__wrapped__()
+    assert caught.value.exit_code == 5

@@ -109,7 +109,7 @@ def run_bench(
     result["devices"] = measured
     watch.lap("bench")
     result["seconds"] = {**watch.seconds, "total": watch.total()}
-    result["warnings"] = _collect_warnings(result, volume)
+    result["warnings"] = _collect_warnings(result, volume, devices)
     if report_path is not None:
         with keep_existing(no_clobber), stage_report(report_path, result) as staged:
             staged.commit()
@@ -285,8 +285,9 @@ def _time_resident(device: Device, volume: Volume, hu: float, runs: int) -> dict
     return spread(seconds) if seconds else None
 
 
-def _collect_warnings(result: dict[str, Any], volume: Volume) -> list[str]:
+def _collect_warnings(result: dict[str, Any], volume: Volume, devices: list[Device]) -> list[str]:
     warnings = [str(text) for text in volume.report.get("warnings", [])]
+    warnings += [text for device in devices for text in device.warnings]
     if result["free_cores"] < BUSY_SHARE * result["cores"]:
         warnings.append(
             f"only {result['free_cores']:.1f} of {result['cores']} cores are free: end other programs and run again"

@@ -150,7 +150,7 @@ def _take_views(
         own = stage_picture(staged, picture, files, name)
         outputs = {what: {"format": format_of(path), "bytes": file.size} for what, (path, file) in own.items()}
         pictures.append(describe_picture(picture, name, view) | outputs)
-        studio.warnings += warn_of_picture(picture)
+        studio.warnings += warn_of_picture(picture, studio.device.warnings)
         written += [file for _, file in own.values()]
         watch.lap("write")
     return pictures, written

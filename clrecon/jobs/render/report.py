@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -99,10 +99,10 @@ def find_emptiness(picture: Rendering) -> str | None:
     return f"all of the picture is {shade}: its {shown} {unit} lie beyond the window from {low:g} to {high:g}{air}"
 
 
-def warn_of_picture(picture: Rendering) -> list[str]:
-    """Return warnings about a picture."""
+def warn_of_picture(picture: Rendering, known: Collection[str] = ()) -> list[str]:
+    """Return warnings about a picture; those that are `known` are about its device."""
     made = picture.report
-    warnings = [str(text) for text in made.get("warnings", [])]
+    warnings = [str(text) for text in made.get("warnings", []) if text not in known]
     empty = find_emptiness(picture)
     if empty is not None and not warnings:  # slices seen edge-on have a warning of their own
         warnings.append(empty)
@@ -189,7 +189,7 @@ def describe_pictures(
     seconds : mapping
     """
     certificate = dict(volume.report)
-    warnings = [str(text) for text in certificate.pop("warnings", [])] + studio.warnings
+    warnings = [str(text) for text in certificate.pop("warnings", [])] + device.warnings + studio.warnings
     if _shows_skin(studio.style):
         warnings.append(FACE_WARNING)
     style, lighting = studio.style, studio.lighting

@@ -101,7 +101,7 @@ class Studio:
         labels: LabelMap | None = None,
         progress: Progress,
     ):
-        self._volume, self._device, self._settings = volume, device, settings
+        self._volume, self.device, self._settings = volume, device, settings
         self.labels, self._progress = labels, progress
         self.style = settings.style_with(function, curve, labels)
         self.function = _shown_function(settings, self.style) if function is None else function
@@ -141,7 +141,7 @@ class Studio:
         settings = self._settings
         if self._renderer is None:
             self._renderer = self._stack.enter_context(
-                VolumeRenderer(self._volume, device=self._device, memory=settings.memory)
+                VolumeRenderer(self._volume, device=self.device, memory=settings.memory)
             )
         picture: Rendering = self._renderer.render(self.style, background=settings.background, **place)
         return picture.annotated(letters=settings.letters, scale_bar=settings.scale_bar, caption=settings.caption)

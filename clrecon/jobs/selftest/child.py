@@ -1,7 +1,7 @@
 """The process of the self-test: it runs checks and writes a line of JSON for each thing that it does.
 
-Lines: ``{"check": name}`` before a check, ``{"doing": words}`` before a kernel is built or launched, and the result of
-the check as `run_check` returns it.
+Lines: ``{"check": name}`` before a check, ``{"doing": words}`` before a kernel is built or launched, ``{"warnings":
+texts}`` of the device after a check, and the result of the check as `run_check` returns it.
 """
 
 from __future__ import annotations
@@ -58,7 +58,11 @@ def main() -> None:
     for check in CHECKS:
         if check.name in request["checks"]:
             tell(check=check.name)
-            tell(**run_check(device, check))
+            result = run_check(device, check)
+            if device.known_good is not None:  # after its last result the process may be ended
+                device.known_good.record()
+            tell(warnings=device.warnings)
+            tell(**result)
 
 
 if __name__ == "__main__":

@@ -76,6 +76,7 @@ class _Child:
 
     def __init__(self, device: Device, checks: Sequence[Check]):
         self.hangs = False
+        self._device = device
         self._doing = "its start"
         self._since = time.perf_counter()
         self._silent = 0.0
@@ -127,6 +128,10 @@ class _Child:
             told = json.loads(line)
             if "operator" in told:
                 yield told
+            elif "warnings" in told:
+                for text in told["warnings"]:
+                    if text not in self._device.warnings:
+                        self._device.remark(text)
             elif "check" in told:
                 self._doing, self._since = "the preparation of its data", time.perf_counter()
             else:

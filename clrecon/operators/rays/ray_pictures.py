@@ -113,7 +113,7 @@ class _Job:
             "slabs": slabs,
             "seconds": dict(stopwatch.seconds),
             "kernel_seconds": dict(stopwatch.by_kernel),
-            "warnings": list(self.warnings),
+            "warnings": [*device.warnings, *self.warnings],
         }
         if isinstance(style, Projection):
             return self._finish_projection(style, means, depths, report)

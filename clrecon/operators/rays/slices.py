@@ -209,7 +209,7 @@ class _Overlay:
             "lowest_shown_hu": self.style.lowest_hu,
             "seconds": dict(stopwatch.seconds),
             "kernel_seconds": dict(stopwatch.by_kernel),
-            "warnings": self.warnings,
+            "warnings": [*device.warnings, *self.warnings],
         }
         return Rendering(image, depths, means, self.view.camera, None, "slices", report)
 

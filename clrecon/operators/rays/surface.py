@@ -138,7 +138,7 @@ class _Job:
             "slabs": slabs,
             "seconds": dict(self.stopwatch.seconds),
             "kernel_seconds": dict(self.stopwatch.by_kernel),
-            "warnings": list(self.warnings),
+            "warnings": [*device.warnings, *self.warnings],
         }
         return Rendering(image, depths, means, self.camera, None, "surface", report)
 

@@ -86,7 +86,7 @@ class _Job:
             "device_bytes": made.device_bytes,
             "seconds": dict(self.stopwatch.seconds),
             "kernel_seconds": dict(self.stopwatch.by_kernel),
-            "warnings": self.warnings,
+            "warnings": [*self.resident.device.warnings, *self.warnings],
         }
 
 

@@ -12,7 +12,6 @@ from clrecon.geometry import Volume
 from clrecon.geometry.iso_rule import IsoRule, data_range
 from clrecon.geometry.precision import describe_far
 from clrecon.opencl import Device, Program, Stopwatch, result_pages
-from clrecon.opencl.quirks import cache_warnings
 from clrecon.operators.resident.bricks import BrickStates, brick_bytes, compare_bricks, measure_bricks
 from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.operators.surface import marching_cubes
@@ -199,7 +198,7 @@ class Extraction:
             "device_bytes": dict(self.largest),
             "seconds": dict(self.stopwatch.seconds),
             "kernel_seconds": dict(self.stopwatch.by_kernel),
-            "warnings": [*cache_warnings(), *describe_far(self.grid.volume), *self.warnings],
+            "warnings": [*self.device.warnings, *describe_far(self.grid.volume), *self.warnings],
         }
 
 

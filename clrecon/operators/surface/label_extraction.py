@@ -29,7 +29,6 @@ from clrecon.opencl import (
     load_program,
     upload,
 )
-from clrecon.opencl.quirks import cache_warnings
 from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.operators.resident.voxel_types import label_variants, voxel_variants
 from clrecon.operators.surface import marching_cubes
@@ -212,7 +211,7 @@ class LabelExtraction:
             "seconds": dict(self.stopwatch.seconds),
             "kernel_seconds": dict(self.stopwatch.by_kernel),
             "warnings": [
-                *cache_warnings(),
+                *self.device.warnings,
                 *describe_far(self.volume),
                 *_warn_of_uneven_growth(self.volume, self.growth),
                 *self.warnings,

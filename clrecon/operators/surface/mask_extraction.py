@@ -35,7 +35,6 @@ from clrecon.opencl import (
     memory_limits,
     upload,
 )
-from clrecon.opencl.quirks import cache_warnings
 from clrecon.operators.resident.voxel_types import label_variants
 from clrecon.operators.surface import marching_cubes
 from clrecon.operators.surface.extraction import Part
@@ -261,7 +260,7 @@ class MaskExtraction:
             "device_bytes": self.device_bytes,
             "seconds": dict(self.stopwatch.seconds),
             "kernel_seconds": dict(self.stopwatch.by_kernel),
-            "warnings": [*cache_warnings(), *describe_far(self.grid.volume), *self.labels.warnings, *self.warnings],
+            "warnings": [*self.device.warnings, *describe_far(self.grid.volume), *self.labels.warnings, *self.warnings],
         }
 
 

@@ -91,6 +91,7 @@ for check in checks:
         time.sleep(60)
     if check == "exit":
         os._exit(7)
+    print(json.dumps({"warnings": ["a remark of the process"]}), flush=True)
     print(json.dumps({"operator": check, "passed": True, "detail": "", "seconds": 0.0}), flush=True)
 """
 
@@ -102,6 +103,7 @@ def test_row_57_a_driver_that_crashes_or_hangs_becomes_words(
     story = tmp_path / "story.py"
     story.write_text(STORY)
     monkeypatch.setattr(run, "COMMAND", (str(story),))
+    monkeypatch.setattr(device, "_remarks", [])
     names = ["first", "crash", "second", "exit", "third", "hang", "last"]
     outcomes = list(run_selftest(device, [check_named(name) for name in names], silent_seconds=1.5))
     assert [outcome["operator"] for outcome in outcomes] == names
@@ -110,4 +112,5 @@ def test_row_57_a_driver_that_crashes_or_hangs_becomes_words(
     assert words["crash"] == "the driver crashed with SIGSEGV in kernel of_crash (64 items)"
     assert words["exit"] == "the process of the test ended with exit code 7 in kernel of_exit (64 items)"
     assert words["hang"] == "the driver hangs: nothing for 1.5 s in kernel of_hang (64 items)"
+    assert device.warnings == ["a remark of the process"]
     assert words["last"] == "not run: the driver hangs"
