@@ -49,6 +49,7 @@ def find_devices() -> tuple[list[Any], str]:
     except DeviceError as error:
         return [], str(error)
     for device in found:
+        device.fault = ""  # passed: the check at its first use is tests/opencl/test_first_use.py's
         # llvmpipe makes vectors of work-items itself, and takes three times as long to build kernels that are written
         # with vectors.  It runs the variant of GPUs, as no other device here does; `users_kernels` gives its own back.
         if is_software_gpu(device.name):

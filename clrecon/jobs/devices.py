@@ -35,14 +35,14 @@ def survey_devices(name: str | None = None) -> tuple[dict[str, Any], DeviceError
     DeviceError
         pyopencl itself cannot be imported.
     """
-    from clrecon.opencl import cache_warnings, choose_device, list_devices, list_platforms
+    from clrecon.opencl import cache_warnings, choose_unchecked, list_devices, list_platforms
 
     devices = list_devices()
     problem: DeviceError | None = None
     chosen: int | None = None
     warnings: Sequence[str] = cache_warnings()
     try:
-        device = choose_device(name)
+        device = choose_unchecked(name)
         chosen, warnings = device.index, device.warnings
     except DeviceError as error:
         problem = error
@@ -78,10 +78,10 @@ def run_device_selftest(name: str | None = None, *, progress: Progress | None = 
     """
     from clrecon.jobs.selftest.run import run_selftest
     from clrecon.jobs.selftest.table import CHECKS
-    from clrecon.opencl import choose_device
+    from clrecon.opencl import choose_unchecked
 
     progress = progress or ignore_progress
-    device = choose_device(name)
+    device = choose_unchecked(name)
     results: list[dict[str, Any]] = []
     progress("selftest", 0, len(CHECKS))
     for result in run_selftest(device, CHECKS, silent_seconds=min(device_seconds(), threading.TIMEOUT_MAX)):

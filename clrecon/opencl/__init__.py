@@ -11,7 +11,7 @@ from clrecon.opencl.launching import Stopwatch, launch
 from clrecon.opencl.memory import MemoryLimits, check_budget, check_memory, describe_shortage, memory_limits
 from clrecon.opencl.pages import result_pages
 from clrecon.opencl.program import Kernel, Program, load_program
-from clrecon.opencl.select import choose_device, list_devices, list_platforms
+from clrecon.opencl.select import choose_device, choose_unchecked, list_devices, list_platforms
 from clrecon.opencl.sources import kernel_constant, kernel_files, kernel_number, read_kernel_source
 from clrecon.opencl.waiting import settle, wait
 
@@ -26,6 +26,7 @@ __all__ = [
     "check_budget",
     "check_memory",
     "choose_device",
+    "choose_unchecked",
     "describe_shortage",
     "download",
     "empty_output",

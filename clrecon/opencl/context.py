@@ -90,6 +90,8 @@ class Device:
         A checking simulator such as Oclgrind: used only when it is named.
     shortcoming : str
         Why the device cannot be used; empty if it can.
+    fault : str or None
+        What the check at first use found wrong, empty if nothing; None before the check.
     keeps_binaries : bool
         Built programs are kept for the next process by `clrecon.opencl.binaries`: the driver keeps none.
     known_good : KnownGood or None
@@ -127,6 +129,7 @@ class Device:
         self.is_simulator: bool = quirks.is_simulator(self.platform)
         self.shares_host_memory: bool = quirks.shares_host_memory(self.platform, self.type)
         self.has_event_times: bool = quirks.has_event_times(self.platform)
+        self.fault: str | None = None
         self.keeps_binaries: bool = not quirks.keeps_programs(self.platform)
         self.known_good: KnownGood | None = known_good() if quirks.is_pocl(self.platform) else None
         self._remarks: list[str] = []

@@ -12,10 +12,11 @@ from clrecon.errors import DeviceError
 from clrecon.opencl import quirks
 from clrecon.opencl.cache_folders import cache_warnings
 from clrecon.opencl.context import Device, describe_error
+from clrecon.opencl.first_use import find_fault
 from clrecon.system.log import get_logger
 from clrecon.system.wording import name_parameter
 
-__all__ = ["choose_device", "driver_advice", "list_devices", "list_platforms"]
+__all__ = ["choose_device", "choose_unchecked", "driver_advice", "list_devices", "list_platforms"]
 
 log = get_logger(__name__)
 
@@ -157,11 +158,13 @@ def choose_device(name: str | int | Device | None = None) -> Device:
     Raises
     ------
     DeviceError
-        There is no driver, no device, or no device of that name (the message lists all devices).
+        There is no driver, no device, or no device of that name (the message lists all devices); or the device fails
+        the check at its first use, and was named.
     """
     if isinstance(name, Device):
-        return name
-    chosen = _choose(name)
+        return _take_sound([name])
+    devices, is_automatic = _find_candidates(name)
+    chosen = _take_sound(devices if is_automatic else devices[:1])
     if chosen.is_simulator and not _is_named(chosen, name):
         chosen.remark(
             f"{chosen.label} is a simulator, a thousand times slower than a device: it was chosen without its name, by"
@@ -171,6 +174,27 @@ def choose_device(name: str | int | Device | None = None) -> Device:
     return chosen
 
 
+def choose_unchecked(name: str | int | None = None) -> Device:
+    """Choose as `choose_device` does, whether the device computes rightly or not; nothing runs on it."""
+    return _find_candidates(name)[0][0]
+
+
+def _take_sound(devices: list[Device]) -> Device:
+    """Return the first device that passes the check at its first use, with a warning that names those before it."""
+    passed_over: list[str] = []
+    for device in devices:
+        fault = find_fault(device)
+        if not fault:
+            for text in passed_over:
+                log.warning("%s", text)
+                device.remark(text)
+            return device
+        passed_over.append(f"{device.label} is not used, it computes wrongly: {fault}")
+    raise DeviceError(
+        f"{'; '.join(passed_over)}: update its driver or choose another device; `clrecon selftest` tests every kernel"
+    )
+
+
 def _is_named(device: Device, name: str | int | None) -> bool:
     """True where the caller or a variable asks for a device by a part of its name, in place of an index."""
     asked = [str(name or "").strip().lower(), os.environ.get("CLRECON_DEVICE", "").strip().lower()]
@@ -178,7 +202,8 @@ def _is_named(device: Device, name: str | int | None) -> bool:
     return not re.fullmatch("[0-9]*", wanted) and wanted in f"{device.platform} {device.name}".lower()
 
 
-def _choose(name: str | int | None) -> Device:
+def _find_candidates(name: str | int | None) -> tuple[list[Device], bool]:
+    """Return the devices that a name means, the best first, and whether no name was given."""
     devices = list_devices()
     if not devices:
         trouble = "".join(f" ({text})" for text in cache_warnings())
@@ -196,8 +221,9 @@ def _choose(name: str | int | None) -> Device:
         usable = [device for device in matches if not device.shortcoming]
         if not usable:
             raise DeviceError(f"device {matches[0].label} cannot be used: {matches[0].shortcoming}")
-        return max(usable, key=lambda device: (not device.is_simulator, device.score))
-    if os.environ.get("PYOPENCL_CTX"):
+        return sorted(usable, key=lambda device: (not device.is_simulator, device.score), reverse=True), False
+    is_named = bool(os.environ.get("PYOPENCL_CTX"))
+    if is_named:
         matches = _named_by_pyopencl(quirks.import_pyopencl(), devices)
     else:
         matches = [device for device in devices if not device.is_simulator and not device.shortcoming]
@@ -207,4 +233,4 @@ def _choose(name: str | int | None) -> Device:
             f" {name_parameter('device')}):"
             f" {driver_advice()}"
         )
-    return max(matches, key=lambda device: device.score)
+    return sorted(matches, key=lambda device: device.score, reverse=True), not is_named

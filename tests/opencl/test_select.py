@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from types import SimpleNamespace
 
@@ -20,7 +21,7 @@ class FakeDevice:
         self.memory_bytes, self.is_simulator = memory, simulator
         self.max_allocation_bytes = memory // 4
         self.label = f"{name} ({platform})"
-        self.shortcoming = ""
+        self.shortcoming = self.fault = ""
         self.warnings: list[str] = []
         self.remark = self.warnings.append
         rank = 0 if software else {"gpu": 3, "accelerator": 2, "cpu": 1}.get(kind, 0)
@@ -109,6 +110,26 @@ def test_a_device_that_cannot_work_is_passed_over(machine):
     assert choose_device("gpu").name == "Radeon"
     with pytest.raises(DeviceError, match="H200 .* cannot be used: it has no compiler"):
         choose_device("h200")
+
+
+def test_row_57_a_device_that_computes_wrongly_is_passed_over_or_refused(machine, monkeypatch):
+    machine[3].fault = "7 of 9 vertices of a ball lie beside it"
+    assert choose_device().name == "Radeon"
+    words = "H200 (NVIDIA CUDA) is not used, it computes wrongly: 7 of 9 vertices of a ball lie beside it"
+    assert machine[2].warnings == [words]
+    assert select.choose_unchecked().name == "H200"
+    for named in ("h200", "gpu", 3):
+        with pytest.raises(DeviceError, match=f"^{re.escape(words)}: update its driver or choose another") as caught:
+            choose_device(named)
+        assert caught.value.exit_code == 5
+    monkeypatch.setenv("CLRECON_DEVICE", "h200")
+    with pytest.raises(DeviceError, match="computes wrongly"):
+        choose_device()
+    monkeypatch.delenv("CLRECON_DEVICE")
+    for other in machine:
+        other.fault = "every normal of a ball points elsewhere"
+    with pytest.raises(DeviceError, match=r"^H200 .*; Radeon .*; pthread-Xeon .*; llvmpipe .*: update its driver"):
+        choose_device()
 
 
 @pytest.mark.parametrize(

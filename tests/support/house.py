@@ -21,7 +21,7 @@ def _layer(name: str, *allowed: str) -> None:
 _layer("errors")
 _layer("version")
 _layer("system", "errors")
-_layer("opencl", "errors", "system")
+_layer("opencl", "errors", "version", "system")
 _layer("geometry", "errors", "system")
 _layer("anatomy", "errors", "system", "geometry")
 _layer("exchange", "errors", "system", "geometry")

@@ -1,0 +1,119 @@
+"""The check of a device at its first use: what it finds, when it runs, and what is remembered."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from clrecon.errors import DeviceError
+from clrecon.geometry import Volume
+from clrecon.opencl import Device, first_use, program
+from clrecon.operators.first_use import check_ball
+from clrecon.operators.surface.extract import extract_isosurface
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "scripts"))
+
+from kernel_mutations import Mutation  # noqa: E402
+
+
+def test_row_57_a_device_that_computes_rightly_passes(device: Device) -> None:
+    assert check_ball(device) == ""
+
+
+@pytest.mark.first_device
+@pytest.mark.parametrize(
+    ("kernel", "name", "words"),
+    [
+        ("emit_vertices", "inverted positions", "vertices of a ball lie beside it"),
+        ("emit_vertices", "inverted normals", "normals of a ball point elsewhere"),
+        ("emit_triangles", "inverted winding", "encloses -0.999 of its volume"),
+    ],
+)
+def test_row_57_a_device_that_computes_wrongly_does_not(
+    device: Device, monkeypatch: pytest.MonkeyPatch, kernel: str, name: str, words: str
+) -> None:
+    mutation, original = Mutation("surface/marching_cubes.cl", kernel, name), program.read_kernel_source
+    source = mutation.source()
+    monkeypatch.setattr(program, "read_kernel_source", lambda file: source if file == mutation.file else original(file))
+    monkeypatch.setattr(device, "programs", {})
+    assert words in check_ball(device)
+
+
+class FakeDevice(SimpleNamespace):
+    """What the memory of the check looks at."""
+
+    def __init__(self, **changed: Any) -> None:
+        self.remarks: list[str] = []
+        known = {"platform": "P", "platform_version": "1", "driver": "2", "version": "3", "name": "N"}
+        super().__init__(
+            **known | {"fault": None, "is_simulator": False, "label": "N (P)", "build_options": ()} | changed,
+            kernel_variants={"LANES": "1"},
+            remark=self.remarks.append,
+        )
+
+
+@pytest.fixture
+def checked(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
+    """The devices that were checked; those named "wrong" fail.  Files of the cache are a dict."""
+    seen: list[Any] = []
+    files: dict[str, bytes] = {}
+
+    def check(device: Any) -> str:
+        seen.append(device)
+        assert first_use.find_fault(device) == ""  # what the check itself asks of the device
+        return "wrong sums" if device.name == "wrong" else ""
+
+    monkeypatch.setattr(first_use, "_check", [check])
+    monkeypatch.setattr(first_use, "read_binary", files.get)
+    monkeypatch.setattr(first_use, "store_binary", files.__setitem__)
+    return seen
+
+
+def test_row_57_the_check_runs_once_for_a_driver_a_device_and_a_version(
+    checked: list[Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first: Any = FakeDevice()
+    assert first_use.find_fault(first) == first_use.find_fault(first) == ""
+    assert checked == [first]
+    another_process: Any = FakeDevice()
+    assert first_use.find_fault(another_process) == "" and len(checked) == 1
+    for changed in ({"driver": "2.1"}, {"name": "M"}, {"platform_version": "1.1"}):
+        other: Any = FakeDevice(**changed)
+        assert first_use.find_fault(other) == "" and checked[-1] is other
+    monkeypatch.setattr(first_use, "package_version", lambda: "0.0")
+    assert first_use.find_fault(FakeDevice()) == "" and len(checked) == 5  # type: ignore[arg-type]
+
+
+def test_row_57_what_fails_is_not_remembered_for_the_next_process(checked: list[Any]) -> None:
+    for count in (1, 2):
+        wrong: Any = FakeDevice(name="wrong")
+        assert first_use.find_fault(wrong) == first_use.find_fault(wrong) == "wrong sums"
+        assert len(checked) == count
+
+
+def test_row_57_simulators_and_those_who_say_so_are_not_checked(
+    checked: list[Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    simulator: Any = FakeDevice(is_simulator=True)
+    assert first_use.find_fault(simulator) == ""
+    monkeypatch.setenv(first_use.VARIABLE, "off")
+    wrong: Any = FakeDevice(name="wrong")
+    assert first_use.find_fault(wrong) == "" and checked == []
+    assert wrong.remarks == [
+        "N (P) was not checked at its first use (CLRECON_DEVICE_CHECK=off): its results may be wrong"
+    ]
+
+
+@pytest.mark.first_device
+def test_row_57_operators_refuse_a_device_that_computes_wrongly(
+    device: Device, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(device, "fault", "wrong sums")
+    volume = Volume(np.arange(24, dtype=np.int16).reshape(2, 3, 4), np.eye(4))
+    with pytest.raises(DeviceError, match="is not used, it computes wrongly: wrong sums: update its driver"):
+        extract_isosurface(volume, 10.5, device=device)
