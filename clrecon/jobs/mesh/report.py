@@ -11,10 +11,9 @@ from clrecon.jobs.mesh.labels import describe_label
 from clrecon.jobs.mesh.levels import describe_level
 from clrecon.jobs.mesh.presets import find_preset
 from clrecon.jobs.mesh.settings import MeshSettings
-from clrecon.jobs.mesh.surfaces import Part, Surface
+from clrecon.jobs.mesh.surfaces import Part
 from clrecon.jobs.shared.report import peak_memory_bytes, platform_name
 from clrecon.jobs.shared.run_report import RunReport
-from clrecon.jobs.shared.skin import SKIN_HU
 from clrecon.version import package_version
 
 if TYPE_CHECKING:
@@ -191,8 +190,6 @@ def describe_job(
     told = [*certificate.pop("warnings", []), *_warn_of_meshes(parts, meshes)]
     level, level_warnings = describe_level(volume, settings, choice)
     told += level_warnings
-    if any(_shows_skin(part.surface, settings) for part in parts):
-        told.append("a surface of the skin can show a face: treat the file as one that identifies the patient")
     common = ("iso_value_hu", "iso_level_hu", "inside", "inside_hu", "inside_levels_hu")
     preset = settings.preset_used
     of_one: dict[str, Any] = {name: meshes[0][name] if len(meshes) == 1 else None for name in _OF_ONE}
@@ -259,14 +256,6 @@ def _describe_all(parts: Sequence[Part], meshes: Sequence[dict[str, Any]]) -> di
         "volume_ml": _unless_unknown(sum, (mesh["volume_ml"] for mesh in meshes)),
         "bounds_mm": _unless_unknown(_around, (mesh["bounds_mm"] for mesh in meshes)),
     }
-
-
-def _shows_skin(surface: Surface, settings: MeshSettings) -> bool:
-    """True where a level lies between air and fat, and the outside of the body is not left out."""
-    if surface.label is not None or surface.iso_value is None or (surface.below and not settings.keep_outside):
-        return False
-    levels = surface.iso_value if isinstance(surface.iso_value, tuple) else (surface.iso_value,)
-    return any(SKIN_HU[0] <= level <= SKIN_HU[1] for level in levels)
 
 
 def _largest(taken: Iterable[dict[str, int]]) -> dict[str, int]:

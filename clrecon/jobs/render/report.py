@@ -6,10 +6,10 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
+from clrecon.anatomy.head import SKIN_SEEN_HU, warn_of_face
 from clrecon.jobs.render.settings import LabelLook, RenderSettings
 from clrecon.jobs.shared.report import peak_memory_bytes, platform_name
 from clrecon.jobs.shared.run_report import RunReport
-from clrecon.jobs.shared.skin import SKIN_HU
 from clrecon.rendering.pictures.styles import CurveCut, PlaneCut, Style, SurfaceLook, VolumeLook
 from clrecon.system.wording import name_parameter
 from clrecon.version import package_version
@@ -30,8 +30,6 @@ __all__ = [
     "find_emptiness",
     "warn_of_picture",
 ]
-
-FACE_WARNING = "a picture of the skin can show a face: treat the file as one that identifies the patient"
 
 
 def describe_camera(camera: Camera | None) -> dict[str, Any] | None:
@@ -190,8 +188,7 @@ def describe_pictures(
     """
     certificate = dict(volume.report)
     warnings = [str(text) for text in certificate.pop("warnings", [])] + device.warnings + studio.warnings
-    if _shows_skin(studio.style):
-        warnings.append(FACE_WARNING)
+    warnings += warn_of_face(volume, _skin_shown(studio.style), "picture")
     style, lighting = studio.style, studio.lighting
     clip = getattr(style, "clip", None)
     surface = style if isinstance(style, SurfaceLook) else None
@@ -254,15 +251,17 @@ def _describe_labels(look: LabelLook | None, labels: LabelMap | None) -> list[di
     ]
 
 
-def _shows_skin(style: Style) -> bool:
-    """True if HU between air and fat are visible: the picture then shows the outside of the body."""
+def _skin_shown(style: Style) -> list[float]:
+    """Return the HU of the skin that a picture shows: the level of a surface, or where a volume is not transparent."""
     import numpy as np
 
     if isinstance(style, SurfaceLook):
-        return SKIN_HU[0] <= style.iso_value <= SKIN_HU[1]
+        return [style.iso_value]
     if not isinstance(style, VolumeLook):
-        return False
-    return bool((style.function(np.linspace(*SKIN_HU, 751))[:, 3] > 0.0).any())
+        return []
+    hu = np.arange(SKIN_SEEN_HU[0], SKIN_SEEN_HU[1] + 1.0)
+    shown = hu[style.function(hu)[:, 3] > 0.0]
+    return [float(shown[0]), float(shown[-1])] if len(shown) else []
 
 
 def _range(values: Any) -> list[float] | None:

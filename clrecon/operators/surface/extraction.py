@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
+from clrecon.anatomy.head import warn_of_face
 from clrecon.errors import ClreconError, DeviceError, DeviceMemoryError, NoSurfaceError
 from clrecon.geometry import Volume
 from clrecon.geometry.iso_rule import IsoRule, data_range
@@ -185,8 +186,9 @@ class Extraction:
     def describe(self, vertices: int, triangles: int) -> dict[str, Any]:
         """Return the report of a mesh: how it was made, without patient data."""
         rule = self.grid.rule
+        said = rule.as_report()
         return {
-            **rule.as_report(),
+            **said,
             "closed_at_border": rule.closed,
             "topology": rule.topology,
             "outside_hu": rule.outside if rule.closed else None,
@@ -198,7 +200,12 @@ class Extraction:
             "device_bytes": dict(self.largest),
             "seconds": dict(self.stopwatch.seconds),
             "kernel_seconds": dict(self.stopwatch.by_kernel),
-            "warnings": [*self.device.warnings, *describe_far(self.grid.volume), *self.warnings],
+            "warnings": [
+                *self.device.warnings,
+                *describe_far(self.grid.volume),
+                *warn_of_face(self.grid.volume, said["inside_hu"], "surface"),
+                *self.warnings,
+            ],
         }
 
 

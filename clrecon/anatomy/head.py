@@ -1,0 +1,145 @@
+"""Heads: whether a scan shows one, and the warning about surfaces and pictures of its skin.
+
+A face, and the whole outer surface of a head, identifies a patient (Chen et al. 2014; Mazura et al. 2012).  The vault
+of the skull is told from the scan itself: in slices across the body it is a closed ring of bone around a large area of
+soft tissue.  No other part of the body has one: the ring of a vertebra is small, and ribs and pelvis leave gaps.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from typing import TYPE_CHECKING, Any
+from weakref import WeakKeyDictionary
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clrecon.geometry.affine import column_spacing
+
+if TYPE_CHECKING:
+    from clrecon.geometry import Volume
+
+__all__ = ["SKIN_HU", "SKIN_SEEN_HU", "find_head", "shows_face", "warn_of_face"]
+
+SKIN_HU = (-950.0, 150.0)
+"""Levels between air and bone: the outermost surface is the skin."""
+
+SKIN_SEEN_HU = (-950.0, 100.0)
+"""HU that show the skin in a picture where they are not transparent; colours of bone may begin above."""
+
+CLEAR_SKIN_HU = (-950.0, -200.0)
+"""Levels between air and fat: nothing but skin.  Here a scan without a vault may be that of a face."""
+
+BONE_HU, AIR_HU = 220.0, -400.0
+SOFT_HU = (-10.0, 110.0)
+"""Median of what a vault encloses: brain has 20 to 45 HU, contrast medium and hardening add to it."""
+
+PIXEL_MM, SLICE_MM = 2.0, 5.0
+"""Steps of the coarse look."""
+
+VAULT_CM2, VAULT_MM = (35.0, 320.0), (60.0, 210.0)
+"""Area that a vault encloses in a slice, and its extents."""
+
+VAULT_SLICES_MM = 12.0
+"""Least height over which slices show the vault."""
+
+TRUNK_CM2 = 330.0
+"""Area of a slice of the body above which it is a trunk: the largest slice of a head has about 250."""
+
+CUT_SHARE = 0.75
+"""Share of the border of a slice that is body from which the body counts as cut all round."""
+
+_judged: WeakKeyDictionary[Any, bool | None] = WeakKeyDictionary()
+
+
+def warn_of_face(volume: Volume, values: Iterable[float | None], what: str) -> list[str]:
+    """Return the warning about a surface or picture that shows one of some HU, if that can be a face.
+
+    Parameters
+    ----------
+    volume : Volume
+    values : iterable of float or None
+        HU; None is ignored.
+    what : str
+        "surface" or "picture".
+    """
+    if not any(value is not None and shows_face(volume, value) for value in values):
+        return []
+    return [f"a {what} of the skin can show a face: treat the file as one that identifies the patient"]
+
+
+def shows_face(volume: Volume, hu: float) -> bool:
+    """Tell whether the outermost surface of a scan at a level can show a face.
+
+    False also where the air around the patient was left out (`clrecon.anatomy.outside_air`), and with it the skin.
+    """
+    if not SKIN_HU[0] <= hu <= SKIN_HU[1] or volume.report.get("outside_air") is not None:
+        return False
+    head = find_head(volume)
+    return CLEAR_SKIN_HU[0] <= hu <= CLEAR_SKIN_HU[1] if head is None else head
+
+
+def find_head(volume: Volume) -> bool | None:
+    """Tell whether a scan shows a head, from its voxels; the answer is kept for each volume.
+
+    Returns
+    -------
+    bool or None
+        True: slices show the vault of a skull.  False: every slice with a body shows that of a trunk, or one that
+        fills the slice, so that no skin shows.  None: neither, such as a leg, or a face without the vault.
+    """
+    try:
+        return _judged[volume]
+    except KeyError:
+        found = _judge(volume)
+        _judged[volume] = found
+        return found
+
+
+def _judge(volume: Volume) -> bool | None:
+    vault, trunk, bodies = 0.0, 0, 0
+    for plane, pixels_mm, step in _coarse_slices(volume):
+        vault += step * _has_vault(plane, pixels_mm)
+        area = float((plane > AIR_HU).sum()) * pixels_mm[0] * pixels_mm[1] / 100.0
+        border = np.concatenate([plane[0], plane[-1], plane[1:-1, 0], plane[1:-1, -1]])
+        bodies += area > 0.0
+        trunk += area >= TRUNK_CM2 or float((border > AIR_HU).mean()) >= CUT_SHARE
+    if vault >= VAULT_SLICES_MM:
+        return True
+    return False if bodies and trunk == bodies else None
+
+
+def _coarse_slices(volume: Volume) -> Iterator[tuple[NDArray[Any], tuple[float, float], float]]:
+    """Yield slices across the body, each pixel the highest of those that it stands for, with both their steps in mm."""
+    spacing = np.array(column_spacing(volume.affine))[::-1]  # of k, j, i
+    upwards = np.abs(volume.affine[2, :3])[::-1] / spacing
+    axis = int(np.argmax(upwards))
+    across = np.moveaxis(volume.voxels, axis, 0)
+    steps = np.delete(spacing, axis)
+    every = max(1, int(SLICE_MM / spacing[axis]))
+    blocks = [max(1, round(PIXEL_MM / step)) for step in steps]
+    for place in range(0, across.shape[0], every):
+        plane = across[place]
+        starts = [np.arange(0, extent, block) for extent, block in zip(plane.shape, blocks, strict=True)]
+        plane = np.maximum.reduceat(np.maximum.reduceat(plane, starts[0], axis=0), starts[1], axis=1)
+        yield plane, (blocks[0] * steps[0], blocks[1] * steps[1]), every * spacing[axis]
+
+
+def _has_vault(plane: NDArray[Any], pixels_mm: tuple[float, float]) -> bool:
+    """Tell whether bone encloses an area of soft tissue of the size of a vault."""
+    from scipy import ndimage
+
+    bone = plane >= BONE_HU
+    pixel_cm2 = pixels_mm[0] * pixels_mm[1] / 100.0
+    enclosed, count = ndimage.label(ndimage.binary_fill_holes(bone) & ~bone)
+    if count == 0:
+        return False
+    sizes = np.bincount(enclosed.ravel())[1:] * pixel_cm2
+    largest = int(np.argmax(sizes))
+    if not VAULT_CM2[0] <= sizes[largest] <= VAULT_CM2[1]:
+        return False
+    box = ndimage.find_objects(enclosed, max_label=largest + 1)[largest]
+    extents = [(part.stop - part.start) * step for part, step in zip(box, pixels_mm, strict=True)]
+    if min(extents) < VAULT_MM[0] or max(extents) > VAULT_MM[1]:
+        return False
+    return bool(SOFT_HU[0] <= float(np.median(plane[enclosed == largest + 1])) <= SOFT_HU[1])
