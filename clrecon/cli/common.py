@@ -19,6 +19,7 @@ __all__ = [
     "Parser",
     "add_common",
     "add_device",
+    "add_keep_ids",
     "add_memory",
     "add_no_clobber",
     "guard",
@@ -95,6 +96,16 @@ def add_common(parser: argparse.ArgumentParser) -> None:
 def pick(options: argparse.Namespace, names: Collection[str]) -> dict[str, Any]:
     """Pick the options with the given names, which are those of settings."""
     return {name: value for name, value in vars(options).items() if name in names}
+
+
+def add_keep_ids(parser: argparse._ActionsContainer) -> None:
+    """Add --keep-ids."""
+    parser.add_argument(
+        "--keep-ids",
+        action="store_true",
+        help="write hashes of the UIDs of series and frame of reference into what is written and printed, by which"
+        " outputs of one scan are told; never the UIDs",
+    )
 
 
 def add_no_clobber(parser: argparse._ActionsContainer) -> None:

@@ -6,7 +6,7 @@ import argparse
 from dataclasses import fields
 from typing import Any
 
-from clrecon.cli.common import add_device, add_memory, add_no_clobber, megabytes, pick
+from clrecon.cli.common import add_device, add_keep_ids, add_memory, add_no_clobber, megabytes, pick
 from clrecon.cli.console import Console, printable
 from clrecon.cli.labels import add_label_arguments, describe_labels, label_choice
 from clrecon.cli.levels import LEVELS_HELP, parse_hu, parse_levels
@@ -138,6 +138,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     checks = parser.add_argument_group("checks")
     add_strict(checks)
     add_no_clobber(checks)
+    add_keep_ids(checks)
     checks.add_argument("--report", metavar="FILE", help="write affine, counts, quality, device and times as JSON")
 
 

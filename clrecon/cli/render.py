@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
-from clrecon.cli.common import add_device, add_memory, add_no_clobber, megabytes
+from clrecon.cli.common import add_device, add_keep_ids, add_memory, add_no_clobber, megabytes
 from clrecon.cli.console import Console, printable
 from clrecon.cli.masking import add_masking
 from clrecon.cli.mesh import describe_volume
@@ -76,6 +76,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_device(device)
     add_memory(device)
     add_no_clobber(device)
+    add_keep_ids(device)
     device.add_argument("--report", metavar="FILE", help="write camera, settings, certificate, device, times as JSON")
 
 

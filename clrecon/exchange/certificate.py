@@ -30,13 +30,15 @@ _HASH = re.compile(r"[0-9a-f]{16}")
 _AXES = re.compile(r"[LRPASI]{3}")
 
 
-def certificate_lines(report: Mapping[str, Any]) -> tuple[str, ...]:
+def certificate_lines(report: Mapping[str, Any], *, keep_ids: bool = False) -> tuple[str, ...]:
     """Return the lines for a file.
 
     Parameters
     ----------
     report : mapping
         ``volume.report``, see docs/contract.md.
+    keep_ids : bool
+        True: with the hash of the frame of reference.
 
     Returns
     -------
@@ -44,10 +46,10 @@ def certificate_lines(report: Mapping[str, Any]) -> tuple[str, ...]:
         At most `LINE_LENGTH` printable ASCII characters each, none of them ``=``: readers look for ``SPACE=`` anywhere.
         Empty if nothing is known.
     """
-    return tuple(_plain(line) for line in (*_facts(report), *_faults(report)))
+    return tuple(_plain(line) for line in (*_facts(report, keep_ids), *_faults(report)))
 
 
-def _facts(report: Mapping[str, Any]) -> Iterator[str]:
+def _facts(report: Mapping[str, Any], keep_ids: bool) -> Iterator[str]:
     for name in _NUMBERS:
         yield from _line(name, [("", report.get(name))])
     gaps, dropped, runs = _mapping(report.get("gap_mm")), _mapping(report.get("dropped")), report.get("gap_runs")
@@ -70,7 +72,7 @@ def _facts(report: Mapping[str, Any]) -> Iterator[str]:
     if isinstance(affine, list) and len(affine) == 4 and all(isinstance(row, list) for row in affine):
         yield from _line("affine_ijk_to_lps_mm", [("", value) for row in affine for value in row])
     frame = report.get("frame_of_reference_hash")
-    if isinstance(frame, str) and _HASH.fullmatch(frame):
+    if keep_ids and isinstance(frame, str) and _HASH.fullmatch(frame):
         yield f"frame_of_reference {frame}"
 
 

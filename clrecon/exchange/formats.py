@@ -99,7 +99,7 @@ def describe_rounding(mesh: Writable, extension: str) -> list[str]:
     ]
 
 
-def write_mesh(mesh: Writable, path: str | os.PathLike[str], space: str = "lps") -> int:
+def write_mesh(mesh: Writable, path: str | os.PathLike[str], space: str = "lps", *, keep_ids: bool = False) -> int:
     """Write a mesh to a file; what `Mesh.save` does.
 
     Returns
@@ -107,17 +107,19 @@ def write_mesh(mesh: Writable, path: str | os.PathLike[str], space: str = "lps")
     int
         Size of the file in bytes.
     """
-    with stage_mesh(mesh, path, space) as staged:
+    with stage_mesh(mesh, path, space, keep_ids=keep_ids) as staged:
         staged.commit()
     return staged.size
 
 
-def stage_mesh(mesh: Writable, path: str | os.PathLike[str], space: str = "lps") -> AbstractContextManager[StagedFile]:
+def stage_mesh(
+    mesh: Writable, path: str | os.PathLike[str], space: str = "lps", *, keep_ids: bool = False
+) -> AbstractContextManager[StagedFile]:
     """Write a mesh under a temporary name, to be committed with other files; see `clrecon.system.files.stage_file`."""
     extension = check_format(path)
     chosen = FORMATS[extension]
     mesh.check()
-    content = mesh.describe(space)
+    content = mesh.describe(space, keep_ids=keep_ids)
     if mesh.triangle_count == 0:
         raise NoSurfaceError(f"the surface is empty: no {extension[1:].upper()} file is written")
     expected_bytes = chosen.estimate(content)

@@ -9,7 +9,7 @@ from typing import Any
 from clrecon.system.gates import Gate
 from clrecon.system.records import Record
 
-__all__ = ["Certificate", "amend"]
+__all__ = ["Certificate", "amend", "without_ids"]
 
 _ELSEWHERE = {"slices_missing": ("dropped",), "rescale": ("padding_share", "padding_hu")}
 """In reports of files that are not DICOM these entries stand behind that one: as they always have, byte for byte."""
@@ -121,6 +121,16 @@ class Certificate(Record):
             order = [place for name in entries for place in (name, *_ELSEWHERE.get(name, ()))]
             entries = {name: moved[name] if name in moved else entries[name] for name in order}
         return {**entries, **masked}
+
+
+def without_ids(report: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the entries of a ``volume.report`` with None for the hashes of its identifiers, as files get them."""
+    entries = dict(report)
+    if isinstance(entries.get("series"), Mapping):
+        entries["series"] = {**entries["series"], "uid_hash": None}
+    if entries.get("frame_of_reference_hash") is not None:
+        entries["frame_of_reference_hash"] = None
+    return entries
 
 
 def amend(report: dict[str, Any], **changes: Any) -> dict[str, Any]:

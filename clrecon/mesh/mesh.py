@@ -163,8 +163,11 @@ class Mesh(Message):
         vertices = self._vertices * signs + np.float32(0)
         return vertices, None if self._normals is None else self._normals * signs + np.float32(0)
 
-    def describe(self, space: str) -> Content:
-        """Return the contents of a file of the mesh in `space`; nothing else of `report` is ever written."""
+    def describe(self, space: str, *, keep_ids: bool = False) -> Content:
+        """Return the contents of a file of the mesh in `space`; nothing else of `report` is ever written.
+
+        Only with `keep_ids` they have the hash of the frame of reference.
+        """
         vertices, normals = self.in_space(space)
         iso_value = self.report.get("iso_value_hu")
         affine = self.report.get("affine_ijk_to_lps_mm")
@@ -177,7 +180,7 @@ class Mesh(Message):
             to_lps=frame_from_lps(space).T,
             iso_value_hu=None if iso_value is None else float(iso_value),
             affine=None if affine is None else np.array(affine, dtype=np.float64).reshape(4, 4),
-            certificate=certificate_lines(certificate) if isinstance(certificate, Mapping) else (),
+            certificate=certificate_lines(certificate, keep_ids=keep_ids) if isinstance(certificate, Mapping) else (),
             inside=_describe_inside(self.report.get("inside_hu")),
         )
 
@@ -185,7 +188,9 @@ class Mesh(Message):
         """Measure the mesh: closedness, size and faults."""
         return measure_quality(self._vertices, self._triangles)
 
-    def save(self, path: str | os.PathLike[str], space: str = "lps", *, no_clobber: bool = False) -> int:
+    def save(
+        self, path: str | os.PathLike[str], space: str = "lps", *, no_clobber: bool = False, keep_ids: bool = False
+    ) -> int:
         """Write the mesh to a file; its extension gives the format.
 
         STL (binary), PLY (binary), OBJ, GLB, VTP and 3MF.  The file is either complete or absent, and an older file of
@@ -200,6 +205,8 @@ class Mesh(Message):
             metres, Y up, of glTF.  STL holds only float32, the other formats keep float64 vertices.
         no_clobber : bool
             True: a file of that name stays and is an `OutputError`.
+        keep_ids : bool
+            True: the comments hold the hash of the frame of reference, by which files of one scan are told.
 
         Returns
         -------
@@ -216,7 +223,7 @@ class Mesh(Message):
             The file cannot be written; an older one of that name is intact.
         """
         with keep_existing(no_clobber):
-            return write_mesh(self, path, space)
+            return write_mesh(self, path, space, keep_ids=keep_ids)
 
     def to_pyvista(self) -> Any:
         """Return the mesh as ``pyvista.PolyData`` in LPS mm, sharing the memory of vertices and normals.

@@ -275,7 +275,7 @@ def test_the_example_of_the_document(
     assert printed[printed.index(words[0]) :] == words
     assert main(["mesh", "example", "-o", "torus.ply", "--device", str(device.index)]) == 0
     written = Path("torus.ply").read_bytes().split(b"end_header")[0].decode("ascii").splitlines()
-    assert len(comments) == 8 and [line for line in comments if line not in written] == []
+    assert len(comments) == 7 and [line for line in comments if line not in written] == []
 
 
 def test_mesh_strict_counts_the_gates_of_the_volume(

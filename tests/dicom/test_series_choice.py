@@ -59,7 +59,7 @@ def test_listing_is_the_contract(two_series):
 def test_the_largest_series_is_taken_and_the_rest_said(two_series):
     volume = read_volume(two_series)
     assert volume.report["series"] == {"number": 1, "uid_hash": hash_of(2), "modality": "CT"}
-    assert volume.report["warnings"] == [f"1 other series left: [2: CT {hash_of(5)}, 4 slices]"]
+    assert volume.report["warnings"] == ["1 other series left: [2: CT, 4 slices]"]
     assert volume.report["files"] == {"found": 11, "used": 7, "skipped": {}}
     assert list_series(two_series).warnings == volume.report["warnings"]
 
@@ -80,8 +80,9 @@ def test_unknown_or_vague_names_list_what_is_there(two_series, wanted, words):
     with pytest.raises(UsageError) as caught:
         read_volume(two_series, wanted)
     assert words in str(caught.value)
-    assert "[1: CT 'series 2', 7 slices, hash " in str(caught.value)
-    assert "[2: CT 'series 5', 4 slices, hash " in str(caught.value)
+    assert str(caught.value).endswith(
+        '; there are [1: CT, 7 slices], [2: CT, 4 slices] ("clrecon info" describes them)'
+    )
 
 
 def test_two_series_of_equal_size_need_a_choice(tmp_path):
@@ -104,7 +105,7 @@ def test_a_faulty_largest_series_is_not_passed_over(two_series):
         read_volume(two_series)
     smaller = read_volume(two_series, 2)
     assert smaller.voxels.shape == (4, 5, 6)
-    assert smaller.report["warnings"] == [f"1 other series left: [1: CT {hash_of(2)}, 7 slices, cannot be used]"]
+    assert smaller.report["warnings"] == ["1 other series left: [1: CT, 7 slices, cannot be used]"]
 
 
 def test_of_two_equal_series_the_usable_one_is_taken(tmp_path):
@@ -112,7 +113,7 @@ def test_of_two_equal_series_the_usable_one_is_taken(tmp_path):
     write_series(tmp_path, Plan(series=2, name="x{}".format))
     volume = read_volume(tmp_path)
     assert volume.report["series"]["uid_hash"] == hash_of(2)
-    assert volume.report["warnings"] == [f"1 other series left: [1: CT {hash_of(1)}, 7 slices, cannot be used]"]
+    assert volume.report["warnings"] == ["1 other series left: [1: CT, 7 slices, cannot be used]"]
     write_series(tmp_path, Plan(series=3, name="y{}".format))
     with pytest.raises(
         RefusedInputError, match=r"2 CT series have 7 slices each, choose one .*: \[2: .*\[3: "
@@ -141,7 +142,7 @@ def test_old_multi_frame_images_do_not_win_over_a_usable_stack(tmp_path, frames)
     save_dataset(ds, tmp_path / "many")
     volume = read_volume(tmp_path)
     assert np.array_equal(volume.voxels, plan.hu())
-    assert volume.report["warnings"] == [f"1 other series left: [2: CT {hash_of(2)}, 1 slice]"]
+    assert volume.report["warnings"] == ["1 other series left: [2: CT, 1 slice]"]
     with pytest.raises(RefusedInputError, match=f"many: multi-frame image of {frames} frames, SOP class"):
         read_volume(tmp_path, 2)
 
@@ -157,7 +158,7 @@ def test_a_localizer_in_the_series_is_parted(tmp_path, by_type):
     assert np.array_equal(volume.voxels, plan.hu())
     assert volume.spacing[2] == pytest.approx(1.25)
     kind = ", localizer" if by_type else ""
-    told = [f"1 other series left: [2: CT {hash_of(1)}, 1 slice{kind}]"]
+    told = [f"1 other series left: [2: CT, 1 slice{kind}]"]
     told += [] if by_type else ["1 slice of the series that is read left: in another plane, 90.0 degrees off"]
     assert volume.report["warnings"] == told
     assert read_volume(tmp_path, f"{ROOT}.1").report["slices"] == 7
@@ -242,7 +243,7 @@ def test_no_patient_data_and_no_folder_in_the_report(tmp_path):
         "RescaleType is 'US': the values are not HU (3 of 7 slices, the first at -397.50 mm)",
         "1 corrupt file skipped",
         "1 skipped: named like DICOM but is none",
-        f"1 other series left: [2: CT {hash_of(2)}, 3 slices]",
+        "1 other series left: [2: CT, 3 slices]",
     ]
 
 

@@ -107,7 +107,7 @@ def describe_left(found: Sequence[Series], chosen: Series) -> list[str]:
     lines = []
     for series in left:
         unusable = series.kind == "stack" and series.count >= chosen.count and series.problems
-        lines.append(f"[{series.describe_without_text()}{', cannot be used' if unusable else ''}]")
+        lines.append(f"[{series.describe()}{', cannot be used' if unusable else ''}]")
     return [f"{len(left)} other series left: {join_names(lines)}", *_describe_other_planes(left, chosen)]
 
 
@@ -136,4 +136,5 @@ def _describe_modalities(found: Sequence[Series]) -> str:
 
 
 def _list_lines(found: Sequence[Series]) -> str:
-    return join_names([f"[{series.describe()}, hash {hash_uid(series.identity.uid)}]" for series in found])
+    """List series for an error; what people typed into their headers is left to the listing."""
+    return join_names(f"[{series.describe()}]" for series in found) + ' ("clrecon info" describes them)'

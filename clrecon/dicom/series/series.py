@@ -26,7 +26,7 @@ from clrecon.dicom.stack.fit import Stack, group_places, measure_stack
 from clrecon.dicom.stack.planes import Planes
 from clrecon.errors import RefusedInputError
 from clrecon.sources.likeness import judge_slices
-from clrecon.system.text import hash_uid, join_names
+from clrecon.system.text import join_names
 
 __all__ = ["Series", "group_series"]
 
@@ -208,12 +208,8 @@ class Series:
         return list(self.stack.problems) if self.stack is not None else []
 
     def describe(self) -> str:
-        """Describe the series in one line for a message on the terminal."""
-        return f"{self.number}: {self.identity.modality} '{self.identity.description}', {self._describe_count()}"
-
-    def describe_without_text(self) -> str:
-        """Describe the series in one line for a warning, without the description, since people type names into it."""
-        return f"{self.number}: {self.identity.modality} {hash_uid(self.identity.uid)}, {self._describe_count()}"
+        """Describe the series in one line for a message, without its description, since people type names into it."""
+        return f"{self.number}: {self.identity.modality}, {self._describe_count()}"
 
     def _describe_count(self) -> str:
         kind = "" if self.kind in ("stack", "other") else f", {self.kind}"

@@ -127,7 +127,7 @@ def make_mesh(
         )
 
     with keep_existing(no_clobber):
-        report = _write(parts, paths, report_path, settings.space, compose, watch, progress)
+        report = _write(parts, paths, report_path, settings, compose, watch, progress)
     _log(report, volume)
     return report
 
@@ -158,16 +158,17 @@ def _write(
     parts: Sequence[Part],
     paths: Sequence[str | Path],
     report_path: str | Path | None,
-    space: str,
+    settings: MeshSettings,
     compose: Callable[[Sequence[dict[str, Any]]], MeshReport],
     watch: Laps,
     progress: Progress,
 ) -> MeshReport:
     """Write all files, with the report of all meshes as the last one, and return the report."""
     with ExitStack() as staged:  # all files are on the disk before the first replaces an older one
-        files = stage_meshes(staged, [part.mesh for part in parts], paths, space, progress)
+        meshes = [part.mesh for part in parts]
+        files = stage_meshes(staged, meshes, paths, settings.space, progress, keep_ids=settings.keep_ids)
         watch.lap("write")
-        report = compose([describe_part(*each, space) for each in zip(parts, files, paths, strict=True)])
+        report = compose([describe_part(*each, settings.space) for each in zip(parts, files, paths, strict=True)])
         if report_path is not None:
             files.append(staged.enter_context(stage_report(report_path, report)))
         commit_all(files)

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+from clrecon.geometry.certificate import without_ids
 from clrecon.jobs.mesh.labels import describe_label
 from clrecon.jobs.mesh.levels import describe_level
 from clrecon.jobs.mesh.presets import find_preset
@@ -186,7 +187,7 @@ def describe_job(
         Warnings of the job; those of the volume and the meshes come before them.
     seconds : mapping
     """
-    certificate = dict(volume.report)
+    certificate = dict(volume.report) if settings.keep_ids else without_ids(volume.report)
     told = [*certificate.pop("warnings", []), *_warn_of_meshes(parts, meshes)]
     level, level_warnings = describe_level(volume, settings, choice)
     told += level_warnings

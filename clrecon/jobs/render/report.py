@@ -7,6 +7,7 @@ from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
 from clrecon.anatomy.head import SKIN_SEEN_HU, warn_of_face
+from clrecon.geometry.certificate import without_ids
 from clrecon.jobs.render.settings import LabelLook, RenderSettings
 from clrecon.jobs.shared.report import peak_memory_bytes, platform_name
 from clrecon.jobs.shared.run_report import RunReport
@@ -186,7 +187,7 @@ def describe_pictures(
     turntable : dict, optional
     seconds : mapping
     """
-    certificate = dict(volume.report)
+    certificate = dict(volume.report) if settings.keep_ids else without_ids(volume.report)
     warnings = [str(text) for text in certificate.pop("warnings", [])] + device.warnings + studio.warnings
     warnings += warn_of_face(volume, _skin_shown(studio.style), "picture")
     style, lighting = studio.style, studio.lighting

@@ -209,7 +209,13 @@ def check_outputs(
 
 
 def stage_meshes(
-    stack: ExitStack, meshes: Sequence[Mesh], paths: Sequence[str | Path], space: str, progress: Progress
+    stack: ExitStack,
+    meshes: Sequence[Mesh],
+    paths: Sequence[str | Path],
+    space: str,
+    progress: Progress,
+    *,
+    keep_ids: bool = False,
 ) -> list[StagedFile]:
     """Write all meshes under temporary names that `stack` removes unless they are committed.
 
@@ -225,7 +231,7 @@ def stage_meshes(
     staged: list[StagedFile] = []
     for mesh, path in zip(meshes, paths, strict=True):
         progress("write", len(staged), len(meshes) if len(meshes) > 1 else 0)
-        staged.append(stack.enter_context(stage_mesh(mesh, path, space)))
+        staged.append(stack.enter_context(stage_mesh(mesh, path, space, keep_ids=keep_ids)))
     return staged
 
 

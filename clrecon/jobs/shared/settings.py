@@ -25,6 +25,8 @@ class InputSettings(Selection):
         Continue even if this removes more than 2 % of the bone.
     field_of_view : float or "auto", optional
         First turn everything farther from the centre of the slices (mm) into air; "auto": the circle that fits them.
+    keep_ids : bool
+        Write the hashes of the UIDs of series and frame of reference into reports and mesh files.
     device : str, optional
         Name or index of an OpenCL device; None leaves the choice to `choose_device`.
     memory : int, optional
@@ -40,6 +42,7 @@ class InputSettings(Selection):
     remove_table: bool = False
     allow_bone_loss: bool = False
     field_of_view: float | str | None = None
+    keep_ids: bool = False
     device: str | None = None
     memory: int | None = None
 

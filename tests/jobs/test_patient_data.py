@@ -1,0 +1,142 @@
+"""Nothing that clrecon writes or says names the patient; hashes of UIDs come where they are asked for."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import logging
+import re
+from pathlib import Path
+from typing import Any
+
+import pydicom
+import pytest
+from ct_files import write_series
+
+from clrecon.cli.main import main
+
+SECRETS = {
+    "PatientName": "Geheim^Jolanthe^Maria", "PatientID": "ID-4711-QX", "PatientBirthDate": "19500102",
+    "PatientAddress": "Rosengasse 7", "OtherPatientIDs": "OTHER-99-QX", "PatientComments": "weint nachts",
+    "AccessionNumber": "ACC-556-QX", "ReferringPhysicianName": "Zauber^Ignaz", "InstitutionName": "Klinik Nimmerland",
+    "StudyDescription": "Wirbel von Jolanthe", "SeriesDescription": "Knochen von Jolanthe", "StudyID": "STUDY-QX",
+    "ProtocolName": "Protokoll Jolanthe", "StationName": "ROEHRE-QX", "DeviceSerialNumber": "SERIAL-QX",
+    "StudyDate": "20190304", "SeriesDate": "20190305", "AcquisitionDate": "20190306", "ContentDate": "20190307",
+    "StudyInstanceUID": "1.2.276.4711.1", "FrameOfReferenceUID": "1.2.276.4711.3", "ImageComments": "Kommentar-QX",
+    "OperatorsName": "Knall^Olga",
+}  # fmt: skip
+SERIES_UID = "1.2.276.4711.2"
+WORDS = [
+    *(part for text in SECRETS.values() for part in re.split(r"\^", text)), "Jolanthe", "1.2.276.4711", "4711",
+]  # fmt: skip
+HASHES = [hashlib.sha256(uid.encode()).hexdigest()[:16] for uid in (SERIES_UID, SECRETS["FrameOfReferenceUID"])]
+
+
+@pytest.fixture(scope="module")
+def scan(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = write_series(tmp_path_factory.mktemp("patient") / "ct")
+    write_series(folder, number=2)
+    for place, path in enumerate(sorted(folder.iterdir())):
+        dataset = pydicom.dcmread(path)
+        number = dataset.SeriesNumber
+        for keyword, text in SECRETS.items():
+            setattr(dataset, keyword, text)
+        dataset.SeriesInstanceUID = SERIES_UID if number == 1 else f"{SERIES_UID}.2"
+        dataset.file_meta.MediaStorageSOPInstanceUID = dataset.SOPInstanceUID = f"{SERIES_UID}.{place + 7}"
+        dataset.file_meta.PrivateInformationCreatorUID = f"{SERIES_UID}.5"
+        dataset.file_meta.PrivateInformation = b"Jolanthe"
+        dataset.save_as(path)
+    return folder
+
+
+def find_words(folder: Path, *said: str) -> list[str]:
+    """Words of the patient, and hashes, in names and contents of files and in texts."""
+    files = [path for path in folder.rglob("*") if path.is_file()]
+    assert files or said
+    written = b"\n".join([path.name.encode() for path in files] + [path.read_bytes() for path in files])
+    return [word for word in (*WORDS, *HASHES) if word.encode() in written or any(word in text for text in said)]
+
+
+COMMANDS = {
+    **{
+        f"mesh .{kind}": f"mesh {{scan}} -o a.{kind} --hu 0 --report r.json"
+        for kind in ("stl", "ply", "obj", "glb", "vtp", "3mf")
+    },
+    "picture": "render {scan} -o a.png --depth d.tif --size 64 --letters --report r.json",
+    "movie": "render {scan} --turntable a.gif --frames 2 --size 32 --report r.json",
+    "bench": "bench {scan} --runs 1 --hu 0 --report r.json",
+}  # fmt: skip
+
+
+@pytest.mark.first_device
+@pytest.mark.parametrize("what", COMMANDS)
+def test_row_69_no_file_and_no_word_names_the_patient(
+    what: str,
+    device: Any,
+    scan: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    command = [*COMMANDS[what].format(scan=scan).split(), "--series", "1", "--device", str(device.index)]
+    monkeypatch.chdir(tmp_path)
+    with caplog.at_level(logging.DEBUG):
+        assert main([*command, "-v"]) == 0
+        people = capsys.readouterr()
+        assert main([*command, "--json"]) == 0
+    printed = capsys.readouterr()
+    assert find_words(tmp_path, people.out, people.err, printed.out, printed.err, caplog.text) == []
+    if what == "bench":
+        return
+    assert main([*command, "--json", "--keep-ids"]) == 0
+    report = json.loads(capsys.readouterr().out)["volume"]
+    assert [report["series"]["uid_hash"], report["frame_of_reference_hash"]] == HASHES
+    assert find_words(tmp_path) == HASHES
+    (tmp_path / "r.json").unlink()
+    in_comments = what.startswith("mesh") and what[-3:] != "stl"
+    packed = what.endswith("3mf")
+    assert find_words(tmp_path) == (HASHES[1:] if in_comments and not packed else [])
+    if packed:
+        import zipfile
+
+        with zipfile.ZipFile(tmp_path / "a.3mf") as archive:
+            assert HASHES[1].encode() in archive.read("3D/3dmodel.model")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code"),
+    [
+        (["--series", "no such text"], 3),
+        (["--series", "knochen von"], 3),  # which both have
+        (["--series", "1", "--phase", "9"], 3),
+        ([], 4),  # two of one size
+        (["--series", "1", "--labels", "{scan}/s1_000.dcm"], 4),
+    ],
+    ids=["none", "both", "phase", "choice", "labels"],
+)
+@pytest.mark.first_device
+def test_row_69_errors_name_a_series_by_its_number(
+    arguments: list[str], code: int, device: Any, scan: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    said = [argument.format(scan=scan) for argument in arguments]
+    command = ["mesh", str(scan), "-o", str(tmp_path / "a.stl"), "--device", str(device.index), *said]
+    assert main([*command, "--json"]) == code
+    told = capsys.readouterr()
+    assert find_words(tmp_path, told.out, told.err) == []
+    assert main([*command, "--debug"]) == code
+    told = capsys.readouterr()
+    assert "Traceback" in told.err and find_words(tmp_path, told.out, told.err) == []
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_row_69_info_describes_a_series_and_says_no_more(
+    scan: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["info", str(scan), "--series", "1", "--pixels"]) == 0
+    people = capsys.readouterr()
+    assert main(["info", str(scan), "--series", "1", "--json"]) == 0
+    printed = capsys.readouterr()
+    for told in (people.out, printed.out):
+        assert SECRETS["SeriesDescription"] in told and HASHES[0] in told
+        assert find_words(tmp_path, told.replace(SECRETS["SeriesDescription"], ""), people.err, printed.err) == HASHES
