@@ -70,7 +70,7 @@ def _checked(grow_mm: float, volume: Volume) -> float:
     if not (math.isfinite(number) and number >= 0.0):
         raise UsageError(f"labels grow by 0 mm or more, not {number:g}")
     di, dj, dk = volume.spacing
-    if 4 / 3 * math.pi * number**3 / (di * dj * dk) > MOST_OFFSETS:
+    if 4 / 3 * math.pi * number * number * number / (di * dj * dk) > MOST_OFFSETS:  # number**3 may overflow
         raise UsageError(
             f"labels cannot grow by {number:g} mm on voxels of {di:.3g} x {dj:.3g} x {dk:.3g} mm: growth mends the"
             " border of a mask, up to some ten voxels"

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from math import prod
 from pathlib import Path
 
-from clrecon.errors import RefusedInputError, UsageError
-from clrecon.formats.grid_file import LABEL_MAP
+from clrecon.errors import ClreconError, RefusedInputError, UsageError
+from clrecon.formats.grid_file import LABEL_MAP, GridFile
 from clrecon.formats.kinds import open_grid, tell_kind
+from clrecon.geometry.grid import Grid
 from clrecon.labels.grids import read_grid_labels
 from clrecon.labels.label_map import LabelMap
 from clrecon.labels.overlap import check_wanted
@@ -15,11 +17,21 @@ from clrecon.labels.segmentation import read_segmentation
 from clrecon.system.progress import Progress, ignore_progress
 from clrecon.system.text import escape_text
 
-__all__ = ["read_labels"]
+__all__ = ["is_large_map", "read_labels"]
+
+LARGE_BYTES = 2**29
+"""Stored bytes that take a second to unpack.  Zeros pack to a thousandth: a file of 33 MB can hold 34 GB."""
+
+MOST_TIMES = 8
+"""Most voxels of a large map for each voxel of its scan: twice as fine along each axis."""
 
 
 def read_labels(
-    path: str | Path, only: Sequence[str | int] | None = None, *, progress: Progress | None = None
+    path: str | Path,
+    only: Sequence[str | int] | None = None,
+    *,
+    volume: Grid | None = None,
+    progress: Progress | None = None,
 ) -> LabelMap:
     """Read a label map: NIfTI (.nii, .nii.gz), NRRD and 3D Slicer's .seg.nrrd, MetaImage, or DICOM SEG.
 
@@ -33,6 +45,8 @@ def read_labels(
         The labels that are wanted, as `LabelMap.find` takes them.  This matters for files whose segments overlap:
         wanted segments may not overlap each other, and voxels that they share with other segments go to the wanted
         ones.
+    volume : Volume, optional
+        The scan of the labels: a map that takes long to unpack is refused if it has many times as many voxels.
     progress : callable, optional
         Called as ``progress("read", done, total)``: slices, in DICOM SEG frames.
 
@@ -66,7 +80,10 @@ def read_labels(
         if kind == "DICOM":
             labels = read_segmentation(path, wanted, progress or ignore_progress)
         else:
-            labels = read_grid_labels(open_grid(path, kind, LABEL_MAP), wanted, progress or ignore_progress)
+            grid = open_grid(path, kind, LABEL_MAP)
+            if volume is not None:
+                _check_proportion(grid, volume)
+            labels = read_grid_labels(grid, wanted, progress or ignore_progress)
     except OSError as error:
         raise RefusedInputError(f"{escape_text(path.name)} cannot be read: {error.strerror or error}") from error
     if not labels.numbers:
@@ -74,3 +91,28 @@ def read_labels(
     for label in wanted or ():
         labels.find(label)
     return labels
+
+
+def is_large_map(path: str | Path) -> bool:
+    """Tell from its header whether a label map takes long to unpack, and is better held against its scan first."""
+    try:
+        kind = tell_kind(Path(path))
+        return kind not in (None, "DICOM") and _stored_bytes(open_grid(Path(path), str(kind), LABEL_MAP)) > LARGE_BYTES
+    except (ClreconError, OSError):  # told by `read_labels`
+        return False
+
+
+def _stored_bytes(grid: GridFile) -> int:
+    return prod(grid.shape_ijk) * grid.layers * grid.dtype.itemsize
+
+
+def _check_proportion(grid: GridFile, volume: Grid) -> None:
+    """Refuse a large map with many times the voxels of its scan, before it is unpacked."""
+    times = prod(grid.shape_ijk) / prod(volume.shape_ijk)
+    if _stored_bytes(grid) <= LARGE_BYTES or times <= MOST_TIMES:
+        return
+    shapes = [" x ".join(map(str, each.shape_ijk)) for each in (grid, volume)]
+    raise RefusedInputError(
+        f"{grid.name} has {shapes[0]} voxels, {times:,.0f} times as many as the scan ({shapes[1]}): it is not unpacked,"
+        f" up to {MOST_TIMES} times are; give labels on the grid of the scan"
+    )

@@ -116,7 +116,7 @@ def test_the_default_growth_is_one_voxel_each_way_nearest_in_mm_first():
     assert growth.shells.tolist() == [0] * 4 + [1] * 4 + [2] * 2 + [3] * 8 + [4] * 8
 
 
-@pytest.mark.parametrize("grow", [-1, float("nan"), float("inf"), 50, "much"])
+@pytest.mark.parametrize("grow", [-1, float("nan"), float("inf"), 50, 1e200, "much"])
 def test_impossible_growth_is_refused(grow):
     with pytest.raises(UsageError, match="labels (cannot )?grow by"):
         Growth.of(Volume(np.zeros((2, 2, 2), np.int16), np.eye(4)), grow)

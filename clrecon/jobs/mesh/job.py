@@ -17,6 +17,7 @@ from clrecon.jobs.mesh.refinement import describe_purposes, judge_parts, refine_
 from clrecon.jobs.mesh.report import MeshReport, describe_job, describe_part
 from clrecon.jobs.mesh.settings import MeshSettings
 from clrecon.jobs.mesh.surfaces import Part, Surface, plan_surfaces
+from clrecon.jobs.shared.labelled import read_with_labels
 from clrecon.jobs.shared.laps import Laps
 from clrecon.jobs.shared.masking import mask_volume
 from clrecon.jobs.shared.opening import DeviceOpening
@@ -186,12 +187,20 @@ def _open(
 ) -> tuple[Volume, LabelMap | None, Device]:
     """Read the input while the device opens and builds its kernels."""
     progress("device", 0, 0)
-    prepare = partial(prepare_surfaces, components=settings.selects, topology=settings.topology, inside=settings.inside)
-    with DeviceOpening(settings.device, prepare) as opening:
-        labels = open_labels(settings.labels)
+
+    def read_map(volume: Volume | None) -> LabelMap | None:
+        labels = open_labels(settings.labels, volume)
         if labels is not None and settings.labels is not None and no_clobber:
             refuse_files(name_outputs(output, name_label_files(labels, settings.labels, surfaces)))
-        volume = read_selected(source, settings, progress=progress)
+        return labels
+
+    prepare = partial(prepare_surfaces, components=settings.selects, topology=settings.topology, inside=settings.inside)
+    with DeviceOpening(settings.device, prepare) as opening:
+        volume, labels = read_with_labels(
+            partial(read_selected, source, settings, progress=progress),
+            None if settings.labels is None else settings.labels.path,
+            read_map,
+        )
         watch.lap("read")
         device = opening.wait()
         watch.lap("device")

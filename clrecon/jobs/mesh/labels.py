@@ -31,8 +31,8 @@ _FACTS = (
 )  # fmt: skip
 
 
-def open_labels(choice: LabelChoice | None) -> LabelMap | None:
-    """Read the label map, None if the job has none.
+def open_labels(choice: LabelChoice | None, volume: Volume | None = None) -> LabelMap | None:
+    """Read the label map, None if the job has none; with the scan, a large one is held against its grid first.
 
     Raises
     ------
@@ -43,7 +43,7 @@ def open_labels(choice: LabelChoice | None) -> LabelMap | None:
         return None
     from clrecon.labels import read_labels
 
-    return read_labels(choice.path, choice.wanted or None)
+    return read_labels(choice.path, choice.wanted or None, volume=volume)
 
 
 def name_label_files(labels: LabelMap, choice: LabelChoice, surfaces: Sequence[Surface]) -> list[str]:

@@ -19,6 +19,7 @@ from clrecon.jobs.render.report import (
 )
 from clrecon.jobs.render.settings import RenderSettings
 from clrecon.jobs.render.studio import Studio, read_curve, read_function, read_look
+from clrecon.jobs.shared.labelled import read_with_labels
 from clrecon.jobs.shared.laps import Laps
 from clrecon.jobs.shared.masking import mask_volume
 from clrecon.jobs.shared.opening import DeviceOpening
@@ -89,8 +90,11 @@ def make_pictures(
 
     progress("device", 0, 0)
     with DeviceOpening(settings.device, partial(_prepare, settings=settings)) as opening:
-        labels = read_look(settings.labels)
-        volume = read_selected(source, settings, progress=progress)
+        volume, labels = read_with_labels(
+            partial(read_selected, source, settings, progress=progress),
+            None if settings.labels is None else settings.labels.path,
+            partial(read_look, settings.labels),
+        )
         watch.lap("read")
         device = opening.wait()
         watch.lap("device")

@@ -56,8 +56,8 @@ def read_curve(named: str | None) -> Float64Array | None:
     return read_curve_points(named)
 
 
-def read_look(look: LabelLook | None) -> LabelMap | None:
-    """Read the label map; None if no file is given.
+def read_look(look: LabelLook | None, volume: Volume | None = None) -> LabelMap | None:
+    """Read the label map; None if no file is given.  With the scan, a large one is held against its grid first.
 
     Raises
     ------
@@ -68,7 +68,7 @@ def read_look(look: LabelLook | None) -> LabelMap | None:
         return None
     from clrecon.labels import read_labels
 
-    labels = read_labels(look.path)
+    labels = read_labels(look.path, volume=volume)
     for label in (*look.colors, *look.opacities):
         labels.find(label)
     return labels
