@@ -135,6 +135,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     device = parser.add_argument_group("device")
     add_device(device)
     add_memory(device)
+    _add_checks(parser)
+
+
+def _add_checks(parser: argparse.ArgumentParser) -> None:
     checks = parser.add_argument_group("checks")
     add_strict(checks)
     add_no_clobber(checks)
