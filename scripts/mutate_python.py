@@ -1,0 +1,390 @@
+#!/usr/bin/env python3
+"""Change the Python code in one place at a time, and count the changes that the tests of the same room notice.
+
+    python scripts/mutate_python.py [--rooms mesh,geometry] [--changes 200] [--seed 1] [--seconds S]
+                                    [--json FILE [--resume]]
+
+It needs the extras `test` and `mutation`.  A room is a folder of clrecon/ with its tests in the folder of that name in
+tests/.  The changes are made in a private copy of the project.  The tests of a room are traced once.  Each change is
+then tried with the tests that run the changed line, the shortest first, until one fails.  Tests marked slow or fuzz are
+left out.  A change that no test notices survives, unless `equivalent_changes.json` says why it changes nothing.  A line
+that none of the tests runs is a survivor too.
+
+With --resume, changes that FILE calls caught stay caught while their file is the same; survivors are tried again.
+The exit status is 1 if more than 5 % of the changes of a room survive.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+import os
+import resource
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+sys.path.insert(0, str(Path(__file__).parent))
+
+from python_changes import Change, Equivalent, choose_changes, read_equivalents, statement_lines  # noqa: E402
+
+ROOT = Path(__file__).resolve().parent.parent
+ROOMS = ("mesh", "geometry", "labels", "dicom", "operators")
+EQUIVALENTS = Path(__file__).with_name("equivalent_changes.json")
+MOST_SURVIVORS = 0.05
+TIMES_PLAIN, AND_SECONDS = 4.0, 10.0
+"""A change may make its tests this many times slower, and this much more; a change that takes longer is caught."""
+MEMORY_BYTES = 16 * 2**30
+"""Address space of a run: a change can ask for any amount of memory."""
+CHECKED_SECONDS = 20.0
+UNNOTICED = ("survived", "not run")
+
+
+class BrokenRoomError(Exception):
+    """The tests of a room fail without a change, or there are none."""
+
+
+@dataclass(frozen=True)
+class Trace:
+    """What the tests of a room run without a change.
+
+    Attributes
+    ----------
+    lines : dict
+        File below the root -> line -> tests, by their names in pytest.
+    seconds : dict
+        Test -> seconds.
+    start : float
+        Seconds before the first test.
+    """
+
+    lines: dict[str, dict[int, list[str]]]
+    seconds: dict[str, float]
+    start: float
+
+    @classmethod
+    def read(cls, path: Path) -> Trace:
+        """Read what the plugin has written."""
+        data = json.loads(path.read_text(encoding="utf-8"))
+        lines = {file: {int(line): tests for line, tests in rows.items()} for file, rows in data["lines"].items()}
+        return cls(lines, data["seconds"], data["start"])
+
+    def tests_of(self, file: str, lines: Sequence[int]) -> list[str]:
+        """Tests that run one of the lines, the shortest first.
+
+        A line that is run when its module is imported (a constant, a default) belongs to no test: then all tests that
+        run anything of this file.
+        """
+        rows = self.lines.get(file, {})
+        if any(line in rows and not rows[line] for line in lines):
+            lines = list(rows)
+        tests = {test for line in lines for test in rows.get(line, ())}
+        return sorted(tests, key=lambda test: (self.seconds[test], test))
+
+    def limit_s(self, tests: Sequence[str]) -> float:
+        """Seconds that these tests may take with a change."""
+        return TIMES_PLAIN * (self.start + sum(self.seconds[test] for test in tests)) + AND_SECONDS
+
+
+@dataclass
+class Copy:
+    """A private copy of a project, in which files are changed.
+
+    Attributes
+    ----------
+    root : Path
+        Folder of the copy.
+    package : str
+        Folder and name of the package in it.
+    """
+
+    root: Path
+    package: str = "clrecon"
+
+    @classmethod
+    def make(cls, project: Path, folder: Path, package: str = "clrecon") -> Copy:
+        """Copy a project without what git, environments and builds keep in it."""
+        ignored = shutil.ignore_patterns(".*", "__pycache__", "*.egg-info", "build", "dist", "clrecon-demo")
+        shutil.copytree(project, folder / "copy", ignore=ignored, symlinks=True)
+        return cls((folder / "copy").resolve(), package)
+
+    def environment(self, writes_bytecode: bool, **more: str) -> dict[str, str]:
+        """Variables of a run.  Bytecode is written by the traced run alone, in which nothing is changed."""
+        paths = [str(self.root), str(Path(__file__).parent)]
+        environment = {
+            **os.environ,
+            "PYTHONPATH": os.pathsep.join(paths),
+            "PYTHONPYCACHEPREFIX": str(self.root.parent / "bytecode"),
+            "PYTHONDONTWRITEBYTECODE": "" if writes_bytecode else "1",
+            "CLRECON_CHANGED_PACKAGE": self.package,
+            **more,
+        }
+        for name in ("CLRECON_COVERAGE", "CLRECON_REQUIRE_TESTS"):
+            environment.pop(name, None)
+        return environment
+
+    def run_tests(self, targets: Sequence[str], environment: dict[str, str], limit_s: float | None) -> tuple[int, str]:
+        """Run pytest in the copy; returns its exit status, or minus a signal, and its output."""
+        command = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "traced_tests", "-p", "no:cacheprovider"]
+        command += ["--tb=line", "-m", "not slow and not fuzz", f"--basetemp={self.root.parent / 'tests'}", *targets]
+        with tempfile.TemporaryFile() as said:
+            process = subprocess.Popen(
+                command,
+                cwd=self.root,
+                env=environment,
+                stdin=subprocess.DEVNULL,
+                stdout=said,
+                stderr=subprocess.STDOUT,
+                start_new_session=True,
+                preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_AS, (MEMORY_BYTES, MEMORY_BYTES)),
+            )
+            try:
+                code = process.wait(limit_s)
+            except subprocess.TimeoutExpired:
+                code = -signal.SIGALRM
+            finally:
+                end_group(process)
+            said.seek(0)
+            return code, said.read().decode(errors="replace")
+
+    def trace(self, room: str) -> Trace:
+        """Run the tests of a room without a change.
+
+        Raises
+        ------
+        BrokenRoomError
+            There are none, one fails, or one fails in another order.
+        """
+        target = self.root.parent / f"trace-{room}.json"
+        traced = {"CLRECON_TRACE_TO": str(target), "CLRECON_TRACED": str(self.root / self.package / room)}
+        code, said = self.run_tests([f"tests/{room}"], self.environment(True, **traced), None)
+        if code:
+            raise BrokenRoomError(f"the tests in tests/{room} fail without a change (status {code}):\n{said[-3000:]}")
+        trace = Trace.read(target)
+        self._check_order(room, trace)
+        return trace
+
+    def _check_order(self, room: str, trace: Trace) -> None:
+        """Run the shortest tests as for a change, but without one: their order alone must make none fail."""
+        tests, seconds = [], 0.0
+        for test in sorted(trace.seconds, key=lambda test: trace.seconds[test]):
+            seconds += trace.seconds[test]
+            if seconds > CHECKED_SECONDS:
+                break
+            tests.append(test)
+        code, said = self._run_chosen(tests, None)
+        if code:
+            raise BrokenRoomError(f"tests in tests/{room} fail in another order (status {code}):\n{said[-3000:]}")
+
+    def _run_chosen(self, tests: Sequence[str], limit_s: float | None) -> tuple[int, str]:
+        chosen = self.root.parent / "chosen.json"
+        chosen.write_text(json.dumps(tests), encoding="utf-8")
+        files = list(dict.fromkeys(test.partition("::")[0] for test in tests))
+        return self.run_tests(files, self.environment(False, CLRECON_RUN_ONLY=str(chosen)), limit_s)
+
+    def try_change(self, change: Change, trace: Trace) -> tuple[str, int]:
+        """Try a change with the tests that run its line.
+
+        Returns
+        -------
+        str, int
+            caught, time, crash, survived or not run; and the number of tests that run the line.
+        """
+        path = self.root / change.file
+        original, kept = path.read_bytes(), path.stat()
+        tests = trace.tests_of(change.file, statement_lines(original.decode(), change.line))
+        if not tests:
+            return "not run", 0
+        try:
+            path.write_text(change.text, encoding="utf-8")
+            # Bytecode of the unchanged file is told apart by size and time: the time is another one for certain.
+            os.utime(path, ns=(kept.st_atime_ns, kept.st_mtime_ns - 10**10))
+            code, _ = self._run_chosen(tests, trace.limit_s(tests))
+        finally:
+            path.write_bytes(original)
+            os.utime(path, ns=(kept.st_atime_ns, kept.st_mtime_ns))
+        if code == -signal.SIGALRM:
+            return "time", len(tests)
+        if code < 0:
+            return "crash", len(tests)
+        return "survived" if code in (0, 5) else "caught", len(tests)
+
+
+def end_group(process: subprocess.Popen[bytes]) -> None:
+    """End what a run of tests has left behind, the processes of its tests too."""
+    try:
+        os.killpg(process.pid, signal.SIGKILL)
+    except ProcessLookupError:
+        pass
+    process.wait()
+
+
+@dataclass
+class RoomResult:
+    """The changes of a room that were tried.
+
+    Attributes
+    ----------
+    rows : list of dict
+        A change as in `Change.as_dict`, with ``room``, ``outcome``, ``tests`` (that run the line), ``digest`` (of the
+        file without the change) and, for an equivalent change, ``why``.
+    """
+
+    room: str
+    rows: list[dict[str, Any]] = field(default_factory=list)
+
+    @property
+    def counts(self) -> Counter[str]:
+        """Number of changes by outcome."""
+        return Counter(row["outcome"] for row in self.rows)
+
+    @property
+    def survivors(self) -> list[dict[str, Any]]:
+        """Changes that no test noticed and that are not named as equivalent."""
+        return [row for row in self.rows if row["outcome"] in UNNOTICED]
+
+    @property
+    def is_good(self) -> bool:
+        """True if few enough survive."""
+        return len(self.survivors) <= MOST_SURVIVORS * len(self.rows)
+
+    def sentence(self) -> str:
+        """The result in a line."""
+        counts, tried = self.counts, len(self.rows)
+        caught = counts["caught"] + counts["time"] + counts["crash"]
+        return (
+            f"{self.room}: {tried} changes, {caught} caught ({counts['time']} by time, {counts['crash']} by a crash),"
+            f" {counts['equivalent']} equivalent, {len(self.survivors)} survive ({counts['not run']} of them in lines"
+            f" that no test of the room runs)"
+        )
+
+
+def room_texts(root: Path, package: str, room: str) -> dict[str, str]:
+    """Read the files of a room: path below the root -> text."""
+    files = sorted((root / package / room).rglob("*.py"))
+    return {path.relative_to(root).as_posix(): path.read_text(encoding="utf-8") for path in files}
+
+
+def digest(text: str) -> str:
+    """A short name of a text."""
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def try_room(
+    copy: Copy,
+    room: str,
+    changes: Sequence[Change],
+    *,
+    equivalents: Sequence[Equivalent] = (),
+    known: Sequence[dict[str, Any]] = (),
+    until: float = float("inf"),
+) -> Iterator[dict[str, Any]]:
+    """Try changes of a room one after the other.
+
+    Parameters
+    ----------
+    copy : Copy
+    room : str
+    changes : sequence of Change
+    equivalents : sequence of Equivalent
+        Changes that are not tried.
+    known : sequence of dict
+        Earlier rows; what was caught then is not tried again while its file is the same.
+    until : float
+        Time of `time.monotonic` after which no change is begun.
+
+    Yields
+    ------
+    dict
+        A row of `RoomResult`.
+
+    Raises
+    ------
+    BrokenRoomError
+        As `Copy.trace`.
+    """
+    earlier = {
+        (row["file"], row["digest"], row["operator"], row["occurrence"]): row
+        for row in known
+        if row["outcome"] not in (*UNNOTICED, "equivalent")
+    }
+    trace: Trace | None = None
+    digests = {file: digest(text) for file, text in room_texts(copy.root, copy.package, room).items()}
+    for change in changes:
+        row = {"room": room, **change.as_dict(), "digest": digests[change.file]}
+        found = earlier.get((change.file, row["digest"], change.operator, change.occurrence))
+        same = next((entry for entry in equivalents if entry.names(change)), None)
+        if same is not None:
+            yield {**row, "outcome": "equivalent", "tests": 0, "why": same.why}
+        elif found is not None:
+            yield {**row, "outcome": found["outcome"], "tests": found["tests"]}
+        elif time.monotonic() < until:
+            trace = trace or copy.trace(room)
+            outcome, tests = copy.try_change(change, trace)
+            yield {**row, "outcome": outcome, "tests": tests}
+
+
+def read_options(argv: Sequence[str] | None) -> argparse.Namespace:
+    """Read the command line."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("--rooms", default=",".join(ROOMS), help="comma list (default: %(default)s)")
+    parser.add_argument("--changes", type=int, default=200, metavar="N", help="for each room (default: %(default)s)")
+    parser.add_argument("--seed", default="1", help="text that decides the choice (default: %(default)s)")
+    parser.add_argument("--seconds", type=float, default=float("inf"), metavar="S", help="no change is begun later")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write every change and what came of it")
+    parser.add_argument("--resume", action="store_true", help="go on with what FILE says")
+    options = parser.parse_args(argv)
+    options.rooms = options.rooms.split(",")
+    for room in options.rooms:
+        if not (ROOT / "clrecon" / room).is_dir() or not (ROOT / "tests" / room).is_dir():
+            parser.error(f"no room {room!r}: it needs the folders clrecon/{room} and tests/{room}")
+    if options.changes < 1:
+        parser.error(f"--changes is a number from 1, not {options.changes}")
+    if options.resume and options.json is None:
+        parser.error("--resume needs --json FILE")
+    return options
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    options = read_options(argv)
+    until = time.monotonic() + options.seconds
+    known = json.loads(options.json.read_text("utf-8")) if options.resume and options.json.exists() else []
+    rest = [row for row in known if row["room"] not in options.rooms]
+    equivalents = read_equivalents(EQUIVALENTS)
+    results = []
+    with tempfile.TemporaryDirectory(prefix="clrecon-changes-") as folder:
+        copy = Copy.make(ROOT, Path(folder))
+        for room in options.rooms:
+            result = RoomResult(room)
+            results.append(result)
+            changes = choose_changes(room_texts(copy.root, copy.package, room), options.changes, options.seed)
+            try:
+                for row in try_room(copy, room, changes, equivalents=equivalents, known=known, until=until):
+                    result.rows.append(row)
+                    if row["outcome"] in UNNOTICED:
+                        print(f"{row['outcome']} ({row['tests']} tests): {row['file']}:{row['line']} {row['operator']}")
+                        print(f"    - {row['before']}\n    + {row['after']}", flush=True)
+                    if options.json:
+                        rows = [*rest, *(row for one in results for row in one.rows)]
+                        options.json.write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
+            except BrokenRoomError as error:
+                print(error, file=sys.stderr)
+                return 2
+            print(result.sentence(), flush=True)
+    return 0 if all(result.is_good for result in results) else 1
+
+
+if __name__ == "__main__":
+    try:
+        sys.exit(main())
+    except KeyboardInterrupt:
+        sys.exit(130)

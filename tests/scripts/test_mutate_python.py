@@ -1,0 +1,236 @@
+"""scripts/mutate_python.py counts changes of a small package by what its tests notice, and harms nothing.
+
+The changes are written here: cosmic-ray, which finds them in clrecon, is not part of the extra ``test``.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import mutate_python
+import pytest
+from mutate_python import BrokenRoomError, Copy, RoomResult, Trace, room_texts, try_room
+from python_changes import (
+    Change,
+    Equivalent,
+    choose_changes,
+    find_places,
+    make_change,
+    read_equivalents,
+    statement_lines,
+)
+
+ROOM = """from functools import cache
+
+SCALE = 2
+
+
+def area(width, height):
+    return SCALE * width * height
+
+
+def count(n):
+    while n > 0:
+        n -= 1
+    return n
+
+
+@cache
+def table():
+    return [1, 2]
+
+
+def untested(x):
+    return x + 1
+"""
+TESTS = """from functools import cache
+
+import pytest
+from toy.flat.shapes import area, count, table
+
+
+@cache
+def kept():
+    return table()
+
+
+@pytest.fixture(scope="module")
+def small():
+    return area(1, 1)
+
+
+def test_area():
+    assert area(1, 3) == 6
+
+
+def test_square_is_positive(small):
+    assert small > 0
+
+
+def test_small(small):
+    assert small == 2
+
+
+def test_count():
+    assert count(3) >= 0
+
+
+def test_first():
+    assert kept()
+
+
+def test_second():
+    assert kept()[1] == 2
+"""
+
+
+@pytest.fixture(scope="module")
+def project(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("project")
+    for name, text in {"toy/__init__.py": "", "toy/flat/__init__.py": "", "toy/flat/shapes.py": ROOM}.items():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_text(text)
+    (folder / "tests" / "flat").mkdir(parents=True)
+    (folder / "tests" / "flat" / "test_shapes.py").write_text(TESTS)
+    markers = "slow: long\n    fuzz: harmed"
+    (folder / "pytest.ini").write_text(f"[pytest]\nmarkers =\n    {markers}\n")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def copy(project: Path, tmp_path_factory: pytest.TempPathFactory) -> Copy:
+    return Copy.make(project, tmp_path_factory.mktemp("private"), "toy")
+
+
+@pytest.fixture(scope="module")
+def trace(copy: Copy) -> Trace:
+    return copy.trace("flat")
+
+
+def change(before: str, after: str) -> Change:
+    assert ROOM.count(before) == 1
+    line = ROOM[: ROOM.index(before)].count("\n") + 1
+    return Change("toy/flat/shapes.py", line, "by hand", line, before, after, ROOM.replace(before, after))
+
+
+MINUS = change("x + 1", "x - 1")
+EQUAL = change("while n > 0", "while n != 0")
+TIMES = change("* width *", "/ width *")
+
+
+def names(trace: Trace, changed: Change) -> set[str]:
+    lines = statement_lines(ROOM, changed.line)
+    return {test.partition("::test_")[2] for test in trace.tests_of(changed.file, lines)}
+
+
+def test_the_tests_of_a_line_are_found_through_fixtures_and_caches(trace: Trace) -> None:
+    assert names(trace, TIMES) == {"area", "square_is_positive", "small"}
+    assert names(trace, change("[1, 2]", "[1, 3]")) == {"first", "second"}
+    assert names(trace, EQUAL) == {"count"}
+    assert names(trace, MINUS) == set()
+    # A constant of the module belongs to every test of the file.
+    assert names(trace, change("SCALE = 2", "SCALE = 3")) == {
+        *("area", "square_is_positive", "small", "count", "first", "second")
+    }
+
+
+def test_short_tests_come_first_and_time_is_limited() -> None:
+    trace = Trace({"a.py": {3: ["x", "y"], 4: ["z"]}}, {"x": 2.0, "y": 0.5, "z": 1.0}, 1.5)
+    assert trace.tests_of("a.py", [3, 4, 5]) == ["y", "z", "x"]
+    assert trace.tests_of("b.py", [3]) == []
+    assert trace.limit_s(["x", "y"]) == 4 * (1.5 + 2.5) + 10
+
+
+@pytest.mark.parametrize(
+    ("changed", "outcome"),
+    [
+        (TIMES, "survived"),  # widths of 1 alone: of the same length as the file before
+        (change("width * height", "width + height"), "caught"),
+        (change("SCALE = 2", "SCALE = 3"), "caught"),
+        (change("[1, 2]", "[1, 3]"), "caught"),
+        (MINUS, "not run"),
+    ],
+)
+def test_a_change_is_noticed_or_not(copy: Copy, trace: Trace, changed: Change, outcome: str) -> None:
+    assert copy.try_change(changed, trace)[0] == outcome
+    assert room_texts(copy.root, "toy", "flat")["toy/flat/shapes.py"] == ROOM
+
+
+def test_a_change_that_never_ends_is_caught(copy: Copy, trace: Trace, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Trace, "limit_s", lambda self, tests: 3.0)
+    assert copy.try_change(change("n -= 1", "n += 1"), trace) == ("time", 1)
+
+
+def test_rows_are_kept_and_equivalent_changes_are_named(
+    copy: Copy, trace: Trace, project: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tried: list[Change] = []
+    monkeypatch.setattr(Copy, "trace", lambda self, room: trace)
+    monkeypatch.setattr(Copy, "try_change", lambda self, one, trace: tried.append(one) or ("caught", 1))
+    same = [Equivalent(EQUAL.file, EQUAL.before, EQUAL.after, "n never falls below 0")]
+    first = list(try_room(copy, "flat", [TIMES, EQUAL, MINUS], equivalents=same))
+    assert [row["outcome"] for row in first] == ["caught", "equivalent", "caught"]
+    assert tried == [TIMES, MINUS]
+    known = json.loads(json.dumps([first[0], {**first[2], "outcome": "survived"}]))
+    assert list(try_room(copy, "flat", [TIMES], known=known)) == [first[0]]
+    list(try_room(copy, "flat", [MINUS], known=known))
+    list(try_room(copy, "flat", [TIMES], known=[{**known[0], "digest": "of another file"}]))
+    assert tried == [TIMES, MINUS, MINUS, TIMES]
+    assert list(try_room(copy, "flat", [MINUS], until=0.0)) == []
+    assert (project / "toy" / "flat" / "shapes.py").read_text() == ROOM
+
+
+def test_more_than_one_in_twenty_is_too_much() -> None:
+    rows = [{"outcome": "caught"}] * 37 + [{"outcome": "equivalent"}, {"outcome": "time"}, {"outcome": "survived"}]
+    result = RoomResult("flat", rows)
+    assert result.is_good
+    assert RoomResult("flat", [*rows, {"outcome": "not run"}]).is_good
+    assert not RoomResult("flat", [*rows, {"outcome": "not run"}, {"outcome": "survived"}]).is_good
+    assert "40 changes, 38 caught (1 by time, 0 by a crash), 1 equivalent, 1 survive (0 of them" in result.sentence()
+
+
+def test_a_room_that_fails_without_a_change_is_refused(project: Path, tmp_path: Path) -> None:
+    copy = Copy.make(project, tmp_path, "toy")
+    (copy.root / "tests" / "flat" / "test_shapes.py").write_text("def test_it():\n    assert 1 == 2\n")
+    with pytest.raises(BrokenRoomError, match="fail without a change"):
+        copy.trace("flat")
+
+
+def test_the_lines_of_a_statement_are_those_before_its_body() -> None:
+    text = "if (a and\n    b):\n    c = [\n        1,\n        2,\n    ]\n    d = 3\n"
+    assert [list(statement_lines(text, line)) for line in (1, 2, 4, 7)] == [[1, 2], [1, 2], [3, 4, 5, 6], [7]]
+
+
+def test_equivalent_changes_are_of_lines_that_are_there() -> None:
+    for entry in read_equivalents(mutate_python.EQUIVALENTS):
+        lines = (mutate_python.ROOT / entry.file).read_text(encoding="utf-8").splitlines()
+        assert entry.before in " ".join(line.strip() for line in lines), entry
+        assert entry.before != entry.after and entry.why
+
+
+@pytest.mark.parametrize("words", [["--rooms", "nowhere"], ["--changes", "0"], ["--resume"]])
+def test_wrong_options_are_refused(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit, match="2"):
+        mutate_python.main(words)
+    assert words[0] in capsys.readouterr().err or "no room 'nowhere'" in capsys.readouterr().err
+
+
+def test_changes_are_chosen_by_the_seed() -> None:
+    pytest.importorskip("cosmic_ray", reason="it is in the extra mutation")
+    text = "def f(x: int | None = 1) -> int | str:\n    y: int | str = -x\n    return (x < 2) + y\n"
+    kinds = {place.operator.partition("_")[0] for place in find_places(text)}
+    assert kinds == {*("NumberReplacer", "ReplaceBinaryOperator", "ReplaceComparisonOperator", "ReplaceUnaryOperator")}
+    assert {place.start for place in find_places(text)} == {(1, 22), (2, 19), (3, 14), (3, 16), (3, 19)}
+    one, two = (choose_changes({"a.py": text}, 3, "1") for _ in range(2))
+    assert one == two and len({change.text for change in one}) == 3
+    assert len(choose_changes({"a.py": text}, 99, "1")) == 5
+    assert any(choose_changes({"a.py": text}, 3, str(seed)) != one for seed in range(5))
+
+
+def test_a_change_says_its_lines() -> None:
+    pytest.importorskip("cosmic_ray", reason="it is in the extra mutation")
+    text = "a = [\n    1,\n    x <= 2,\n]\n"
+    changes = [make_change("a.py", text, place) for place in find_places(text)]
+    found = {(one.line, one.before, one.after) for one in changes if one}
+    assert {(3, "x <= 2,", "x < 2,"), (2, "1,", "2,"), (2, "1,", "0,"), (3, "x <= 2,", "x <= 3,")} <= found
