@@ -47,7 +47,7 @@ def run_mutations(mutations: Sequence[Mutation], device: int) -> Iterator[tuple[
     mutation, result
         The result has ``caught`` (bool or None where it does not build), ``by`` (name of the check) and ``words``.
     """
-    left = list(mutations)
+    left, again = list(mutations), set()
     while left:
         with tempfile.TemporaryFile() as errors:
             child = subprocess.Popen(
@@ -59,7 +59,12 @@ def run_mutations(mutations: Sequence[Mutation], device: int) -> Iterator[tuple[
                 child.stdin.write(json.dumps(left).encode())
                 child.stdin.close()
                 for result in _answers(child):
-                    yield left.pop(0), result
+                    mutation = left.pop(0)
+                    if result["caught"] is None and mutation not in again:  # the driver may have lost a file by a kill
+                        again.add(mutation)
+                        left.append(mutation)
+                    else:
+                        yield mutation, result
                     if "end" in result:
                         break
             finally:

@@ -69,7 +69,7 @@ def make_demo(
     OutputError, DeviceError
         Nothing is written then, and an earlier demonstration is intact.
     """
-    from clrecon.opencl import choose_device
+    from clrecon.operators import choose_device
 
     folder = resolve_target(output)
     with keep_existing(no_clobber):

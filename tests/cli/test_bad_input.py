@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from ct_files import sphere_voxels, write_series
 
-import clrecon.opencl
 import clrecon.operators.surface.extract
 from clrecon.cli.main import main
 
@@ -20,7 +19,7 @@ PNG = bytes.fromhex("89504e470d0a1a0a0000000d49484452000000010000000108000000003
 @pytest.fixture
 def no_device_needed(monkeypatch: pytest.MonkeyPatch) -> None:
     """These inputs are refused before a device computes anything: any machine will do."""
-    monkeypatch.setattr(clrecon.opencl, "choose_device", lambda name=None: object())
+    monkeypatch.setattr(clrecon.operators, "choose_device", lambda name=None: object())
     monkeypatch.setattr(clrecon.operators.surface.extract, "prepare_isosurface", lambda device: None)
 
 

@@ -126,7 +126,8 @@ def _check_arguments(source: str | Path | None, iso_value: float | None, runs: i
 
 
 def _choose_devices(name: str | None) -> list[Device]:
-    from clrecon.opencl import choose_device, list_devices
+    from clrecon.opencl import list_devices
+    from clrecon.operators import choose_device
 
     if (name or "").strip().lower() != ALL_DEVICES:
         return [choose_device(name)]

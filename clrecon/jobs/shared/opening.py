@@ -16,8 +16,7 @@ __all__ = ["DeviceOpening"]
 
 
 def _choose(name: str | int | Device | None) -> Device:
-    import clrecon.operators  # noqa: F401  its check of a device at the first use counts from here on
-    from clrecon.opencl import choose_device
+    from clrecon.operators import choose_device
 
     return choose_device(name)
 
