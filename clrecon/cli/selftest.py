@@ -1,10 +1,11 @@
-"""``clrecon selftest``: a comparison of every operator with its twin, on the device that jobs would use."""
+"""``clrecon selftest``: a comparison of every kernel with its twin, on the device that jobs would use."""
 
 from __future__ import annotations
 
 import argparse
+from typing import Any
 
-from clrecon.cli.common import add_device, table
+from clrecon.cli.common import add_device
 from clrecon.cli.console import Console, printable
 from clrecon.errors import DeviceError
 
@@ -13,28 +14,35 @@ __all__ = ["add_arguments", "run"]
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of the command."""
-    parser.epilog = "Runs every operator on small volumes and compares with plain numpy. Exit code 5 when one differs."
+    parser.epilog = "Runs every kernel on small volumes and compares with plain numpy. Exit code 5 when one differs."
     add_device(parser)
 
 
 def run(options: argparse.Namespace, console: Console) -> int:
     """Run the command; returns the exit code."""
     from clrecon.jobs.devices import run_device_selftest
+    from clrecon.jobs.selftest.table import CHECKS
 
-    outcome = run_device_selftest(options.device, progress=console.progress)
+    width = max(len(check.name) for check in CHECKS)
+    told: list[dict[str, Any]] = []
+
+    def tell(device: dict[str, Any], result: dict[str, Any]) -> None:
+        if not told:
+            console.say(f"device  {_name(device)}")
+        told.append(result)
+        word, seconds = "pass" if result["passed"] else "FAIL", f"{result['seconds']:.2f} s"
+        console.say(f"{word}  {result['operator']:{width}}  {seconds:7}  {printable(result['detail'])}")
+
+    outcome = run_device_selftest(options.device, progress=console.progress, tell=tell)
     console.result(outcome)
     for warning in outcome["warnings"]:
         console.warn(warning)
-    device = outcome["device"]
-    name = printable(f"{device['name']} ({device['platform']}, driver {device['driver']})")
-    console.say(f"device  {name}")
-    rows = [
-        ("pass" if r["passed"] else "FAIL", r["operator"], f"{r['seconds']:.2f} s", printable(r["detail"]))
-        for r in outcome["operators"]
-    ]
-    for line in table(rows) if rows else []:
-        console.say(line)
     if not outcome["passed"]:
         failed = ", ".join(r["operator"] for r in outcome["operators"] if not r["passed"]) or "nothing was tested"
+        name = _name(outcome["device"])
         raise DeviceError(f"the self-test failed on {name}: {failed}; update its driver or choose another device")
     return 0
+
+
+def _name(device: dict[str, Any]) -> str:
+    return printable(f"{device['name']} ({device['platform']}, driver {device['driver']})")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from clrecon.errors import DeviceError
@@ -55,7 +55,12 @@ def survey_devices(name: str | None = None) -> tuple[dict[str, Any], DeviceError
     return survey, problem
 
 
-def run_device_selftest(name: str | None = None, *, progress: Progress | None = None) -> dict[str, Any]:
+def run_device_selftest(
+    name: str | None = None,
+    *,
+    progress: Progress | None = None,
+    tell: Callable[[dict[str, Any], dict[str, Any]], None] | None = None,
+) -> dict[str, Any]:
     """Compare every kernel with its twin, in a process of its own.
 
     Parameters
@@ -64,6 +69,8 @@ def run_device_selftest(name: str | None = None, *, progress: Progress | None = 
         Device name or index.
     progress : callable, optional
         Called as ``progress("selftest", checks done, all checks)``.
+    tell : callable, optional
+        Called with the device and each result, as they are returned, as soon as it is there.
 
     Returns
     -------
@@ -86,6 +93,8 @@ def run_device_selftest(name: str | None = None, *, progress: Progress | None = 
     progress("selftest", 0, len(CHECKS))
     for result in run_selftest(device, CHECKS, silent_seconds=min(device_seconds(), threading.TIMEOUT_MAX)):
         results.append(result)
+        if tell is not None:
+            tell(device.describe(), result)
         progress("selftest", len(results), len(CHECKS))
     passed = bool(results) and all(result["passed"] for result in results)
     return {

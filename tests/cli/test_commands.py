@@ -273,7 +273,7 @@ def test_selftest_that_fails_exits_5(
     from clrecon.jobs.selftest import run
 
     wrong = [{"operator": "compact", "passed": False, "detail": "wrong positions", "seconds": 0.1}]
-    monkeypatch.setattr(run, "run_selftest", lambda chosen, checks: iter(wrong))
+    monkeypatch.setattr(run, "run_selftest", lambda chosen, checks, **_: iter(wrong))
     assert main(["selftest", "--device", str(device.index)]) == 5
     captured = capsys.readouterr()
     assert "FAIL  compact" in captured.out
