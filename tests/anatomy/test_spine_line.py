@@ -8,7 +8,7 @@ import tolerances
 from dicom_series import rotation
 
 from clrecon import read_labels, read_volume
-from clrecon.anatomy.spine_line import find_spine_line
+from clrecon.anatomy.spine_line import _best_path, find_spine_line
 from clrecon.errors import RefusedInputError
 from clrecon.geometry import Volume
 from clrecon.phantom import PhantomSettings, make_phantom
@@ -52,6 +52,18 @@ def test_the_canal_of_the_phantom_is_found_over_its_whole_height(phantom):
     assert line.searched_mm == pytest.approx(60 * 2.5, abs=5.0) and line.height_mm >= 0.9 * line.searched_mm
     assert line.sure_share > 0.9 and np.all(np.diff(line.points[:, 2]) < 0.0)
     check_canal(line, canal)
+
+
+@pytest.mark.parametrize(
+    ("cell", "more", "bends"),
+    # Straight on is free, a step aside costs 0.05, and one across the corner that times the root of 2: 0.0707.
+    [((1, 2), 0.049, False), ((1, 2), 0.051, True), ((0, 0), 0.070, False), ((0, 0), 0.0715, True)],
+)
+def test_a_bend_costs_its_length(cell, more, bends):
+    gain = np.full((2, 3, 3), -1.0, np.float32)
+    gain[:, 1, 1] = 0.5
+    gain[1][cell] = 0.5 + more
+    assert _best_path(gain).tolist() == [[0, 1, 1], [1, *(cell if bends else (1, 1))]]
 
 
 def test_how_the_voxels_are_ordered_and_how_the_patient_lies_does_not_matter(phantom):

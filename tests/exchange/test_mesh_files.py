@@ -138,6 +138,15 @@ def test_stl_bytes(mesh, space, name, tmp_path):
     assert not facets["attribute"].any()
 
 
+def test_stl_normals_of_a_box_have_no_negative_zeros(tmp_path):
+    vertices, triangles = samples.box()
+    Mesh(vertices, triangles[:, [1, 2, 0]]).save(tmp_path / "box.stl")  # edges of -1 mm times 0 mm among them
+    facets = np.frombuffer((tmp_path / "box.stl").read_bytes()[84:], np.dtype([("f", "<f4", (4, 3)), ("rest", "<u2")]))
+    normals = np.zeros((6, 3), np.float32)
+    normals[range(6), [2, 2, 1, 1, 0, 0]] = [-1, 1] * 3  # as in CUBE_FACES
+    assert facets["f"][:, 0].tobytes() == np.concatenate([normals, normals]).tobytes()
+
+
 def test_stl_facet_without_area_has_no_normal(tmp_path):
     Mesh([[0, 0, 0], [1, 1, 1], [2, 2, 2]], [[0, 1, 2]]).save(tmp_path / "flat.stl")
     content = (tmp_path / "flat.stl").read_bytes()
@@ -193,6 +202,30 @@ def test_glb_document(mesh, space, tmp_path):
     if mesh.normals is not None:
         stored = np.frombuffer(content, "<f4", own.size, 28 + json_length + own.nbytes)
         np.testing.assert_array_equal(stored, mesh.in_space(space)[1].ravel())
+
+
+@pytest.mark.parametrize("has_normals", [True, False])
+def test_the_parts_of_a_glb_file_lie_one_after_the_other(has_normals, tmp_path):
+    vertices, triangles = samples.box()
+    Mesh(vertices, triangles, vertices - 0.5 if has_normals else None).save(tmp_path / "box.glb")
+    content = (tmp_path / "box.glb").read_bytes()
+    (json_length,) = struct.unpack("<I", content[12:16])
+    document = json.loads(content[20 : 20 + json_length])
+    # 8 vertices of three float32, as many normals, 12 triangles of three uint32: bytes, and the target of OpenGL.
+    parts = [(96, 34962), (96, 34962), (144, 34963)] if has_normals else [(96, 34962), (144, 34963)]
+    starts = np.cumsum([0] + [length for length, _ in parts]).tolist()
+    assert document["bufferViews"] == [
+        {"buffer": 0, "byteOffset": start, "byteLength": length, "target": target}
+        for start, (length, target) in zip(starts, parts, strict=False)
+    ]
+    assert document["buffers"] == [{"byteLength": starts[-1]}]
+    *coordinates, indices = (
+        (part["bufferView"], part["componentType"], part["count"], part["type"]) for part in document["accessors"]
+    )
+    assert coordinates == [(number, 5126, 8, "VEC3") for number in range(len(parts) - 1)]
+    assert indices == (len(parts) - 1, 5125, 36, "SCALAR")
+    size, kind = struct.unpack("<I4s", content[20 + json_length : 28 + json_length])
+    assert (size, kind, len(content)) == (starts[-1], b"BIN\0", 28 + json_length + starts[-1])
 
 
 def test_glb_stands_upright_and_faces_the_viewer(tmp_path):

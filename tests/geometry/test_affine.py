@@ -18,6 +18,7 @@ from clrecon.geometry import (
     tilt_degrees,
 )
 from clrecon.geometry.affine import checked_affine
+from clrecon.geometry.precision import largest_coordinate
 
 ROW = np.array([0.8, 0.6, 0.0])
 COLUMN = np.array([-0.36, 0.48, 0.8])
@@ -82,3 +83,14 @@ def test_points_must_come_as_n_by_3():
     volume = Volume(np.zeros((2, 3, 4), np.int16), np.eye(4))
     with pytest.raises(UsageError, match=r"\(n, 3\)"):
         volume.ijk_to_lps((1.0, 2.0, 3.0))
+
+
+@pytest.mark.parametrize("border", [0, 1, 2])
+@pytest.mark.parametrize("axis", [0, 1, 2])
+@pytest.mark.parametrize("side", [-1.0, 1.0])
+def test_the_largest_coordinate_is_that_of_the_outermost_layer(axis, border, side):
+    affine = np.diag((side * 2.0, side * 4.0, side * 8.0, 1.0))
+    affine[axis, 3] = -1000.0  # the other coordinates are small
+    first, last = -border, (4, 3, 2)[axis] - 1 + border
+    ends = [-1000.0 + side * (2.0, 4.0, 8.0)[axis] * n for n in (first, last)]
+    assert largest_coordinate(Volume(np.zeros((2, 3, 4), np.int16), affine), border=border) == max(np.abs(ends))

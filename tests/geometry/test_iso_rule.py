@@ -104,3 +104,34 @@ def test_the_margin_is_four_units_in_the_last_place():
         [[0.5, 0, 0, -800.0], [0, 0.25, 0, 0], [0, 0, 2.0, 0], [0, 0, 0, 1]]))  # fmt: skip
     unit = 2.0**-14  # float32 between 512 and 1024
     assert vertex_margin(volume, 1) == pytest.approx(np.array((8, 16, 2)) * unit)
+
+
+@pytest.mark.parametrize(
+    ("dtype", "lowest", "level", "highest", "upper"),
+    [("int16", 200, 199.5, 300, 300.5), ("float32", 200.0, 200.0, 300.0, 300.0)],
+)
+def test_a_range_has_two_ends(dtype, lowest, level, highest, upper):
+    rule = choose_iso_rule(make_volume(-1000, 900, dtype), [200, 300])
+    assert (rule.inside, rule.iso_value, rule.upper_value) == ("between", 200, 300)
+    assert (rule.lowest_inside, rule.iso_level, rule.highest_inside, rule.upper_level) == (
+        *(lowest, level, highest, upper),
+    )
+
+
+@pytest.mark.parametrize("level", [200, 200.0, np.int16(200), np.float32(200.0), np.array(200)])
+def test_a_number_of_any_kind_is_one_level(level):
+    assert choose_iso_rule(make_volume(-1000, 900), level) == choose_iso_rule(make_volume(-1000, 900), 200)
+
+
+@pytest.mark.parametrize(
+    ("level", "below", "words"),
+    [
+        ((200, 300, 400), False, "two ends, not .200, 300, 400."),
+        ((300, 200), False, "the range 300 to 200 HU holds nothing"),
+        ((200, 200), False, "the range 200 to 200 HU holds nothing"),
+        ((200, 300), True, "one iso value, not the range 200 to 300"),
+    ],
+)
+def test_ranges_that_are_none_are_refused(level, below, words):
+    with pytest.raises(UsageError, match=words):
+        choose_iso_rule(make_volume(-1000, 900), level, below=below)

@@ -8,7 +8,9 @@ import sample_meshes as samples
 
 from clrecon.errors import NoSurfaceError, UsageError
 from clrecon.mesh import Mesh, select_components, split_components
+from clrecon.mesh.components import _measure_components
 from clrecon.mesh.connectivity import label_components
+from clrecon.mesh.triangles import enclosed_ml
 
 pytestmark = pytest.mark.unit
 
@@ -27,6 +29,17 @@ def three_boxes() -> Mesh:
     shuffled = np.concatenate([vertices[order], [[0.0, 0.0, 0.0]]])
     normals = np.arange(75, dtype=np.float32).reshape(25, 3)
     return Mesh(shuffled, faces, normals, {"iso_value_hu": 250.0})
+
+
+@pytest.mark.parametrize("edge", [10.0, 20.0])
+def test_a_cube_of_10_mm_holds_a_millilitre(edge):
+    # Figures of cubes are exact in float64, whichever way they are summed up.
+    mesh = Mesh(*samples.box((1000, -2000, 500), (edge, edge, edge)))
+    volume_ml = (edge / 10.0) ** 3
+    assert enclosed_ml(mesh.vertices, mesh.triangles) == volume_ml
+    assert mesh.quality()["volume_ml"] == volume_ml
+    area_mm2, of_components = _measure_components(mesh, np.zeros(12, np.int64), 1, areas=True, volumes=True)
+    assert (area_mm2.tolist(), of_components.tolist()) == ([6.0 * edge**2], [volume_ml])
 
 
 def test_keep_largest_by_area():

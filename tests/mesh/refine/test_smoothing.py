@@ -13,6 +13,8 @@ from clrecon.mesh import Mesh
 from clrecon.mesh.compare.distances import SurfaceDistance
 from clrecon.mesh.intersections import count_self_intersections
 from clrecon.mesh.normals import vertex_normals
+from clrecon.mesh.refine.decimation import default_deviation
+from clrecon.mesh.refine.shifts import shorten_steps
 from clrecon.mesh.refine.smoothing import _PASS_BAND, smooth_mesh
 from clrecon.mesh.vtk import smooth_windowed_sinc
 
@@ -145,6 +147,19 @@ def test_the_default_bound_is_a_quarter_of_the_shortest_step():
         smooth_mesh(rough)
     rough.report["affine_ijk_to_lps_mm"] = np.diag([0.5, 0.4, 2.0, 1.0]).tolist()
     assert smooth_mesh(rough).report["refinement"]["smooth"]["max_deviation_mm"] == pytest.approx(0.1)
+
+
+def test_the_step_of_a_sheared_affine_is_the_length_of_a_column():
+    report = {"affine_ijk_to_lps_mm": [[0.3, 0, 0, 5], [0.4, 0.4, 0, 6], [0, 0, 2, 7], [0, 0, 0, 1]]}
+    assert default_deviation(Mesh(*samples.box(), None, report)) == 0.25 * 0.4  # the rows are 0.3, 0.57 and 2 long
+
+
+def test_steps_are_shortened_along_themselves():
+    step = np.array([[3.0, 4.0, 0.0], [0.0, -0.5, 0.0], [0.0, 0.0, -4.0], [0.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+    assert shorten_steps(step, 1.0) == 2
+    np.testing.assert_allclose(
+        step, [[0.6, 0.8, 0.0], [0.0, -0.5, 0.0], [0.0, 0.0, -1.0], [0.0, 0.0, 0.0], [0.0, 1.0, 0.0]], rtol=1e-15
+    )
 
 
 @pytest.mark.parametrize("iterations", [0, -1, 1001, 20.0])

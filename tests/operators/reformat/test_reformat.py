@@ -12,6 +12,7 @@ from variants import VOXEL_TYPES
 from clrecon.errors import DeviceError, UsageError
 from clrecon.geometry import Volume
 from clrecon.opencl import Stopwatch, kernel_files
+from clrecon.operators.rays.render import render
 from clrecon.operators.reformat.cut import cut_slice, reformat_curve
 from clrecon.operators.reformat.sample import prepare_reformat, sample_sheet
 from clrecon.operators.resident.device_volume import DeviceVolume
@@ -56,6 +57,13 @@ def test_where_a_pixel_is_a_voxel_it_has_its_value(device, dtype, angles, shear)
     for k in range(6):
         cut = cut_slice(volume, camera_of_slice(volume, k), (11, 8), device=device)
         assert np.array_equal(cut.values, volume.voxels[k].astype(np.float32))
+
+
+@pytest.mark.first_device
+def test_a_picture_has_1024_x_1024_pixels_unless_asked_otherwise(device):
+    volume = even_volume(shape=(2, 2, 2))
+    assert cut_slice(volume, "axial", device=device).image.shape[:2] == (1024, 1024)
+    assert render(volume, "slice", view="axial", device=device).image.shape[:2] == (1024, 1024)
 
 
 def test_the_other_axes_and_the_letters_of_anatomy(device):

@@ -184,6 +184,11 @@ def test_an_orbit_counts_angles_as_views_do():
         assert turned.parallel_scale == start.parallel_scale
 
 
+def test_a_picture_is_square_unless_asked_otherwise():
+    flat = box(size=(40, 50, 5))  # its width decides the scale
+    assert Camera.fit(flat) == Camera.fit(flat, size=(7, 7)) != Camera.fit(flat, size=(1025, 1024))
+
+
 def test_zoom_magnifies():
     for perspective in (None, 60.0):
         camera = Camera.fit(box(), view_angle=perspective, size=SIZE)
