@@ -156,14 +156,17 @@ def _annotations(tree: ast.Module) -> Iterator[ast.expr]:
             yield node.returns
 
 
-def _is_for_types(node: ast.AST) -> bool:
+def _is_left_out(node: ast.AST) -> bool:
+    """A block for type checkers, or ``strict=True`` of zip: an assertion that is never wrong in a right program."""
+    if isinstance(node, ast.keyword):
+        return node.arg == "strict"
     return isinstance(node, ast.If) and ast.unparse(node.test).endswith("TYPE_CHECKING")
 
 
-def _spans_of_types(text: str) -> list[tuple[Position, Position]]:
-    """Start and end of annotations and of blocks for type checkers: no program reads them."""
+def _spans_left_out(text: str) -> list[tuple[Position, Position]]:
+    """Start and end of annotations, which no program reads, and of `_is_left_out`."""
     tree = ast.parse(text)
-    nodes: list[Any] = [*_annotations(tree), *(node for node in ast.walk(tree) if _is_for_types(node))]
+    nodes: list[Any] = [*_annotations(tree), *(node for node in ast.walk(tree) if _is_left_out(node))]
     # ast counts columns in bytes: compared as such with a line of letters beyond ASCII, a place may be left out.
     return [((node.lineno, node.col_offset), (node.end_lineno, node.end_col_offset)) for node in nodes]
 
@@ -172,7 +175,7 @@ def find_places(text: str) -> list[Place]:
     """Find everything that can be changed in a file with the given text, in the order of the file."""
     from cosmic_ray.ast import ast_nodes, get_ast
 
-    left_out = _spans_of_types(text)
+    left_out = _spans_left_out(text)
     tree = list(ast_nodes(get_ast(text)))
     places = []
     for name, operator in _operators().items():

@@ -38,8 +38,9 @@ def test_a_cube_of_10_mm_holds_a_millilitre(edge):
     volume_ml = (edge / 10.0) ** 3
     assert enclosed_ml(mesh.vertices, mesh.triangles) == volume_ml
     assert mesh.quality()["volume_ml"] == volume_ml
-    area_mm2, of_components = _measure_components(mesh, np.zeros(12, np.int64), 1, areas=True, volumes=True)
-    assert (area_mm2.tolist(), of_components.tolist()) == ([6.0 * edge**2], [volume_ml])
+    for areas, volumes in ((True, True), (True, False), (False, True), (False, False)):
+        figures = _measure_components(mesh, np.zeros(12, np.int64), 1, areas=areas, volumes=volumes)
+        assert [part.tolist() for part in figures] == [[6.0 * edge**2 * areas], [volume_ml * volumes]]
 
 
 def test_keep_largest_by_area():

@@ -61,6 +61,7 @@ def test_box_far_from_the_origin():
 def test_torus_has_one_handle():
     quality = measure(samples.torus())
     assert figures(quality, "closed", "manifold", "euler_number", "genus", "components") == (True, True, 0, 1, 1)
+    assert {type(quality[name]) for name in ("euler_number", "genus", "components")} == {int}  # as in JSON: 1, not 1.0
     assert quality["volume_ml"] == pytest.approx(samples.torus_volume_ml(), rel=tolerances.MESH_VOLUME)
     # The triangles lie inside the torus (major 20, minor 6), less than a fifth of it is lost.
     exact = 2 * np.pi**2 * 20.0 * 6.0**2 / 1000.0

@@ -222,6 +222,7 @@ def test_changes_are_chosen_by_the_seed() -> None:
     kinds = {place.operator.partition("_")[0] for place in find_places(text)}
     assert kinds == {*("NumberReplacer", "ReplaceBinaryOperator", "ReplaceComparisonOperator", "ReplaceUnaryOperator")}
     assert {place.start for place in find_places(text)} == {(1, 22), (2, 19), (3, 14), (3, 16), (3, 19)}
+    assert find_places("for a, b in zip(c, d, strict=True):\n    pass\n")[-1].operator == "ZeroIterationForLoop"
     one, two = (choose_changes({"a.py": text}, 3, "1") for _ in range(2))
     assert one == two and len({change.text for change in one}) == 3
     assert len(choose_changes({"a.py": text}, 99, "1")) == 5

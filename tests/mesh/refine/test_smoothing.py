@@ -14,7 +14,7 @@ from clrecon.mesh.compare.distances import SurfaceDistance
 from clrecon.mesh.intersections import count_self_intersections
 from clrecon.mesh.normals import vertex_normals
 from clrecon.mesh.refine.decimation import default_deviation
-from clrecon.mesh.refine.shifts import shorten_steps
+from clrecon.mesh.refine.shifts import move_vertices, shorten_steps
 from clrecon.mesh.refine.smoothing import _PASS_BAND, smooth_mesh
 from clrecon.mesh.vtk import smooth_windowed_sinc
 
@@ -160,6 +160,16 @@ def test_steps_are_shortened_along_themselves():
     np.testing.assert_allclose(
         step, [[0.6, 0.8, 0.0], [0.0, -0.5, 0.0], [0.0, 0.0, -1.0], [0.0, 0.0, 0.0], [0.0, 1.0, 0.0]], rtol=1e-15
     )
+
+
+def test_only_vertices_at_a_fault_are_taken_back_at_first():
+    vertices, triangles = samples.box()
+    step = np.zeros((8, 3))
+    step[0] = (1.0, 0.0, 0.0)  # to the place of corner 1: two triangles lose their area
+    step[7] = 0.125
+    moved, taken_back = move_vertices(vertices.astype(np.float32), triangles.astype(np.uint32), step)
+    assert moved[0].tolist() == [0.5, 0.0, 0.0] and moved[7].tolist() == [1.125, 1.125, 1.125]
+    assert taken_back == 4  # the corners of these two triangles
 
 
 @pytest.mark.parametrize("iterations", [0, -1, 1001, 20.0])
