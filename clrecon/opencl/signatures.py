@@ -8,8 +8,10 @@ compiler defines itself (__AVX2__): conditions on that may not change the argume
 
 from __future__ import annotations
 
+import ast
+import operator
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cache
 
@@ -134,9 +136,41 @@ def _holds(directive: str, condition: str, macros: Mapping[str, str]) -> bool:
         raise ValueError(f"#if {condition}")
     text = text.replace("&&", " and ").replace("||", " or ")
     try:
-        return bool(eval(re.sub(r"!(?!=)", " not ", text), {"__builtins__": {}}))
-    except SyntaxError as error:
+        return bool(_number(ast.parse(re.sub(r"!(?!=)", " not ", text).strip(), mode="eval").body))
+    except (SyntaxError, KeyError) as error:
         raise ValueError(f"#if {condition}") from error
+
+
+_OPERATIONS: dict[type, Callable[[int, int], int]] = {
+    ast.Add: operator.add,
+    ast.Sub: operator.sub,
+    ast.Mult: operator.mul,
+    ast.Div: operator.floordiv,
+    ast.Mod: operator.mod,
+    ast.Eq: operator.eq,
+    ast.NotEq: operator.ne,
+    ast.Lt: operator.lt,
+    ast.LtE: operator.le,
+    ast.Gt: operator.gt,
+    ast.GtE: operator.ge,
+}
+
+
+def _number(node: ast.expr) -> int:
+    """Compute an expression of whole numbers."""
+    if isinstance(node, ast.Constant) and isinstance(node.value, int):
+        return node.value
+    if isinstance(node, ast.BoolOp):
+        holds = [_number(part) != 0 for part in node.values]
+        return int(all(holds) if isinstance(node.op, ast.And) else any(holds))
+    if isinstance(node, ast.UnaryOp):
+        value = _number(node.operand)
+        return int(not value) if isinstance(node.op, ast.Not) else -value
+    if isinstance(node, ast.BinOp):
+        return int(_OPERATIONS[type(node.op)](_number(node.left), _number(node.right)))
+    if isinstance(node, ast.Compare) and len(node.ops) == 1:
+        return int(_OPERATIONS[type(node.ops[0])](_number(node.left), _number(node.comparators[0])))
+    raise SyntaxError(ast.dump(node))
 
 
 def _expand(text: str, macros: Mapping[str, str]) -> str:

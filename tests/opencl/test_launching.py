@@ -182,10 +182,25 @@ def test_signatures_follow_the_preprocessor(options, expected):
 
 
 @pytest.mark.parametrize(
+    ("condition", "holds"),
+    [
+        ("1", True), ("0", False), ("SIZE", True), ("MISSING", False), ("!SIZE", False), ("!defined(MISSING)", True),
+        ("SIZE == 8 && 3 > 4", False), ("SIZE != 8 || 3 >= 3", True), ("-1 < 0", True), ("SIZE % 3 * 2 - 4", False),
+        ("(SIZE + 1) / 3 <= 3", True), ("7 / 2 == 3", True), ("defined SIZE && (MISSING || 1)", True),
+    ],
+)  # fmt: skip
+def test_conditions_are_those_of_c(condition, holds):
+    source = f"#if {condition}\n__kernel void work(const int a) {{}}\n#endif\n"
+    assert list(find_signatures(source, {"SIZE": "8"})) == (["work"] if holds else [])
+
+
+@pytest.mark.parametrize(
     "source",
     [
         "#if SIZE(3)\n#endif\n",
         "#if 1 +\n#endif\n",
+        "#if 1 < 2 < 3\n#endif\n",
+        "#if 2 ** 3\n#endif\n",
         "#warning this\n",
         "#define ONE TWO\n#define TWO ONE\n__kernel void work(const ONE a) {}\n",
         "__kernel void work(unsigned long long a) {}\n",

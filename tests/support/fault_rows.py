@@ -1,4 +1,4 @@
-"""The list of faults, rows 1 to 48: what each is, what is expected, and which tests hold it.
+"""The list of faults, rows 1 to 72: what each is, what is expected, and which tests hold it.
 
 A test whose own name begins with ``test_row_NN_`` is found by that; the others are listed here as "file::function",
 the file below tests/.  The guard is guards/test_fault_list.py.
@@ -12,6 +12,8 @@ PIXELS = "dicom/test_pixels.py::"
 SERIES = "dicom/test_series_choice.py::"
 HOSTILE = "dicom/test_hostile_files.py::"
 BAD_INPUT = "cli/test_bad_input.py::"
+FILES = "system/test_files.py::"
+SLABS = "operators/surface/test_slabs.py::"
 
 ROWS: dict[int, tuple[str, tuple[str, ...]]] = {
     1: ("row and column spacing differ: right", (TRAPS, GEOMETRY + "test_voxels_lie_where_they_were_written")),
@@ -170,4 +172,75 @@ ROWS: dict[int, tuple[str, tuple[str, ...]]] = {
     ),
     47: ("100,000 files, 10,000 series: headers only, bounded memory", ()),
     48: ("gz, zip, tar: bounded, or refused with what to do", ()),
+    49: (
+        "no platform or driver: refused with what to install",
+        (
+            "opencl/test_select.py::test_no_device_says_how_to_get_a_driver",
+            "cli/test_commands.py::test_no_driver_says_how_to_get_one",
+        ),
+    ),
+    50: ("a simulator such as Oclgrind: never chosen silently", ()),
+    51: ("no fp64, no images, small groups, 32-bit sizes, big endian: right, or refused in words", ()),
+    52: ("a kernel that does not build, a kernel file that is missing: refused with the log or the file", ()),
+    53: ("a volume above the memory of the device: slabs, the same bytes", ()),
+    54: ("an allocation or launch that fails late: halved, tried again, then the CPU, told", ()),
+    55: (
+        "2^31 triangles, counters that wrap: 64-bit counts, refused by budget",
+        (
+            "operators/primitives/test_compaction.py::test_a_total_beyond_32_bits_is_exact",
+            SLABS + "test_counts_over_32_bits_are_refused",
+            SLABS + "test_too_many_words_for_32_bits_make_slabs_too",
+        ),
+    ),
+    56: ("a kernel that hangs, a device that is lost: signals work, a time limit, a fresh context, then the CPU", ()),
+    57: ("a driver that computes wrongly: found by the self-test, the device is not chosen", ()),
+    58: (
+        "two processes on a device; a fork: right; told",
+        ("operators/rays/test_render_robustness.py::test_a_forked_process_is_told_so_and_does_not_wait_forever",),
+    ),
+    59: ("a kernel cache that is damaged, full, read-only, another user's: not used, told", ()),
+    60: ("order from atomics: every run writes the same bytes", ()),
+    61: (
+        "disk full, quota, EPERM, a folder, a name too long: refused, the older file intact",
+        (
+            FILES + "test_system_errors",
+            FILES + "test_full_disk_is_foreseen",
+            FILES + "test_limit_on_the_size_of_files",
+            "exchange/test_mesh_files.py::test_every_writer_notices_a_full_disk",
+        ),
+    ),
+    62: (
+        "SIGINT, SIGTERM, SIGKILL in the middle: the older file intact, temporary files removed by the next run",
+        (FILES + "test_process_that_is_stopped", "cli/test_process.py::test_an_interrupt_leaves_nothing"),
+    ),
+    63: ("the target exists: replaced as a whole; --no-clobber: refused before any work", ()),
+    64: ("two writers of one name: one whole file", (FILES + "test_many_writers_of_one_name",)),
+    66: (
+        "closed streams, no terminal: no traceback, plain progress",
+        (
+            "cli/test_closed_streams.py::test_closed_streams_keep_the_exit_code",
+            "cli/test_process.py::test_a_reader_that_leaves_early",
+        ),
+    ),
+    67: (
+        "an empty mesh; more faces or bytes than the format holds: refused",
+        (
+            "exchange/test_mesh_files.py::test_empty_mesh_writes_nothing",
+            "exchange/test_mesh_files.py::test_too_large_for_the_format",
+        ),
+    ),
+    68: (
+        "STL header: 80 bytes, never begins with solid, no patient data",
+        (
+            "exchange/test_mesh_files.py::test_stl_bytes",
+            "exchange/test_mesh_files.py::test_no_patient_data_and_no_path",
+        ),
+    ),
+    69: ("patient data in headers, comments, logs, names, cache: none; --keep-ids: hashed UIDs", ()),
+    70: ("a head whose face is plain: told", ()),
+    71: ("pickles, eval, yaml: never", ()),
+    72: ("decimal comma, time zone, umask 000: the same bytes, private folders", ()),
 }
+
+PENDING = {65: "one bad case of 100: there is no command for cohorts yet"}
+"""Rows without a test, and why."""

@@ -1,0 +1,98 @@
+"""Rows of the list of faults that are about whole processes: side by side, one after the other, in odd environments."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from clrecon.phantom import PhantomSettings, write_phantom
+
+UNEQUAL = {"seconds", "peak_memory_bytes"}
+
+
+@pytest.fixture(scope="module")
+def ct(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A small noisy spine, of which every run has to make the same."""
+    folder = tmp_path_factory.mktemp("ct") / "spine"
+    write_phantom(folder, PhantomSettings(kind="spine", size=(48, 48), slices=24, noise=20.0))
+    return folder
+
+
+def start(ct: Path, target: Path, device: Any, **variables: str) -> subprocess.Popen[str]:
+    """Make a mesh and a report in a process."""
+    command = [sys.executable, "-m", "clrecon", "mesh", str(ct), "-o", str(target), "--device", str(device.index)]
+    command += ["--report", str(target.with_suffix(".json")), "-q"]
+    return subprocess.Popen(
+        command,
+        env={**os.environ, **variables},
+        umask=int(variables.get("UMASK", "0o022"), 8),
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+def finish(process: subprocess.Popen[str]) -> None:
+    _, errors = process.communicate(timeout=300)
+    assert (process.returncode, errors) == (0, "")
+
+
+def make_targets(folder: Path, extension: str) -> list[Path]:
+    """Two files of one name, each in a folder of its own."""
+    targets = [folder / name / f"mesh{extension}" for name in ("first", "second")]
+    for target in targets:
+        target.parent.mkdir()
+    return targets
+
+
+def figures(value: Any) -> Any:
+    """A report without what differs from run to run."""
+    if isinstance(value, dict):
+        return {key: figures(own) for key, own in value.items() if key not in UNEQUAL}
+    return [figures(own) for own in value] if isinstance(value, list) else value
+
+
+def made(target: Path) -> tuple[str, Any]:
+    text = target.with_suffix(".json").read_text().replace(str(target.parent), "")
+    return hashlib.sha256(target.read_bytes()).hexdigest(), figures(json.loads(text))
+
+
+@pytest.mark.parametrize("extension", [".stl", pytest.param(".vtp", marks=pytest.mark.first_device)])
+def test_rows_60_and_72_every_run_writes_the_same_bytes(device, ct: Path, tmp_path: Path, extension: str) -> None:
+    plain, odd = make_targets(tmp_path, extension)
+    finish(start(ct, plain, device))
+    finish(
+        start(
+            ct,
+            odd,
+            device,
+            POCL_MAX_PTHREAD_COUNT="1",
+            LP_NUM_THREADS="1",
+            OMP_NUM_THREADS="1",
+            LC_ALL="de_DE.UTF-8",
+            LANG="de_DE.UTF-8",
+            TZ="Pacific/Kiritimati",
+            UMASK="0o000",
+            PYTHONHASHSEED="1",
+        )
+    )
+    assert made(plain) == made(odd)
+
+
+@pytest.mark.first_device
+def test_row_58_processes_share_a_device(device, ct: Path, tmp_path: Path) -> None:
+    """Both begin with an empty cache of kernels."""
+    cache = tmp_path / "cache"
+    cache.mkdir(mode=0o700)
+    variables = {"XDG_CACHE_HOME": str(cache), "POCL_CACHE_DIR": str(cache / "pocl")}
+    targets = make_targets(tmp_path, ".stl")
+    processes = [start(ct, target, device, **variables) for target in targets]
+    for process in processes:
+        finish(process)
+    assert made(targets[0]) == made(targets[1])
