@@ -9,6 +9,7 @@ import os
 from functools import cache
 from typing import Any
 
+from clrecon.errors import DeviceError
 from clrecon.opencl.cache_folders import prepare_caches
 
 __all__ = [
@@ -33,12 +34,23 @@ def import_pyopencl() -> Any:
     """Import pyopencl after its environment has been made safe.
 
     pyopencl 2026.1 reads PYOPENCL_CACHE_FAILURE_FATAL without a default when its binary cache cannot be used
-    (read-only home, Oclgrind): the KeyError then hides the cause.
+    (read-only home, Oclgrind): the KeyError then hides the cause.  It does not know what PYOPENCL_NO_CACHE set to
+    nothing means.
+
+    Raises
+    ------
+    DeviceError
+        PYOPENCL_NO_CACHE is no truth value.
     """
     os.environ.setdefault("PYOPENCL_CACHE_FAILURE_FATAL", "")
+    if not os.environ.get("PYOPENCL_NO_CACHE", "").strip():
+        os.environ.pop("PYOPENCL_NO_CACHE", None)
     prepare_caches()
-    import pyopencl
-
+    try:
+        import pyopencl
+    except ValueError as error:
+        told = os.environ.get("PYOPENCL_NO_CACHE", "")
+        raise DeviceError(f"PYOPENCL_NO_CACHE is {told!r}: unset it, or write 1 or 0 ({error})") from error
     return pyopencl
 
 

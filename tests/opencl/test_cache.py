@@ -249,3 +249,11 @@ def test_a_folder_that_a_driver_still_writes_to_is_removed(tmp_path):
         patch.setattr(cache_folders, "shutil", SimpleNamespace(rmtree=remove_all_but_a_newer_file))
         cache_folders._remove_tree(str(folder))
     assert len(removed) == 3 and not folder.exists()
+
+
+@pytest.mark.parametrize(("told", "says"), [("", ""), (" ", ""), ("1", ""), ("maybe", "PYOPENCL_NO_CACHE is 'maybe'")])
+def test_the_switch_of_pyopencl_for_its_cache(told, says, tmp_path):
+    code = "from clrecon.opencl.quirks import import_pyopencl; import_pyopencl()"
+    environment = environment_of(tmp_path, PYOPENCL_NO_CACHE=told)
+    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True)
+    assert (says in done.stderr) if says else (done.returncode, done.stderr) == (0, "")
