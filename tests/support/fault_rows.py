@@ -180,10 +180,22 @@ ROWS: dict[int, tuple[str, tuple[str, ...]]] = {
         ),
     ),
     50: ("a simulator such as Oclgrind: never chosen silently", ()),
-    51: ("no fp64, no images, small groups, 32-bit sizes, big endian: right, or refused in words", ()),
+    51: (
+        "no fp64, no images, small groups, 32-bit sizes, big endian: right, or refused in words",
+        (
+            "opencl/test_select.py::test_shortcomings_are_named",
+            "operators/primitives/test_compaction.py::test_devices_with_small_work_groups_get_the_same",
+        ),
+    ),
     52: ("a kernel that does not build, a kernel file that is missing: refused with the log or the file", ()),
-    53: ("a volume above the memory of the device: slabs, the same bytes", ()),
-    54: ("an allocation or launch that fails late: halved, tried again, then the CPU, told", ()),
+    53: (
+        "a volume above the memory of the device: slabs, the same bytes",
+        (SLABS + "test_slabs_of_any_thickness_give_the_same_mesh", SLABS + "test_the_limits_of_the_device_make_slabs"),
+    ),
+    54: (
+        "an allocation or launch that fails late: halved, tried again, then the CPU, told",
+        ("operators/resident/test_device_volume.py::test_whatever_buffer_or_launch_fails_the_result_is_the_same",),
+    ),
     55: (
         "2^31 triangles, counters that wrap: 64-bit counts, refused by budget",
         (
