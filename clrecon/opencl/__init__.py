@@ -13,6 +13,7 @@ from clrecon.opencl.pages import result_pages
 from clrecon.opencl.program import Kernel, Program, load_program
 from clrecon.opencl.select import choose_device, choose_unchecked, list_devices, list_platforms
 from clrecon.opencl.sources import kernel_constant, kernel_files, kernel_number, read_kernel_source
+from clrecon.opencl.stand_in import take_device, work_on
 from clrecon.opencl.waiting import settle, wait
 
 __all__ = [
@@ -43,6 +44,8 @@ __all__ = [
     "read_kernel_source",
     "result_pages",
     "settle",
+    "take_device",
     "upload",
     "wait",
+    "work_on",
 ]

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from clrecon.errors import DeviceMemoryError
-from clrecon.opencl.context import Device, describe_error
+from clrecon.errors import DeviceLostError, DeviceMemoryError
+from clrecon.opencl.context import Device, describe_error, kind_of_error
 from clrecon.opencl.pages import result_pages
 from clrecon.opencl.quirks import import_pyopencl
 from clrecon.opencl.waiting import wait
@@ -27,6 +27,8 @@ def _make_buffer(device: Device, flags: Any, size: int, host: NDArray[Any] | Non
             return cl.Buffer(device.context, flags, size)
         return cl.Buffer(device.context, flags, hostbuf=host)
     except cl.Error as error:
+        if kind_of_error(error) is DeviceLostError:
+            raise device.fail(f"{size:,} bytes were not given", error) from error
         raise DeviceMemoryError(f"{size:,} bytes cannot be had on {device.label}: {describe_error(error)}") from error
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import os
 import re
 import sys
@@ -18,7 +19,7 @@ from clrecon.opencl.known_good import KnownGood, known_good
 from clrecon.opencl.unknown_cpu import NameOfCpu, has_unknown_cpu
 from clrecon.system.log import get_logger
 
-__all__ = ["GROUP_SIZE", "Device", "describe_error"]
+__all__ = ["GROUP_SIZE", "Device", "describe_error", "kind_of_error"]
 
 log = get_logger(__name__)
 
@@ -36,7 +37,7 @@ _LOST_LATE = (-5, *_LOST)
 """OUT_OF_RESOURCES of a command that was accepted says that it was stopped, by a watchdog or a fault."""
 
 
-def _kind_of(error: Exception, is_late: bool) -> type[DeviceError]:
+def kind_of_error(error: Exception, is_late: bool = False) -> type[DeviceError]:
     """Return the class of error for an error of the driver; `is_late`: it came while the device worked."""
     try:
         code = int(error.code)  # type: ignore[attr-defined]
@@ -74,6 +75,13 @@ def _find_shortcoming(cl_device: Any) -> str:
     return ""
 
 
+class _Opened:
+    """Context and queue of a device, None before its first use."""
+
+    context: Any = None
+    queue: Any = None
+
+
 class Device:
     """An OpenCL device; context and queue are made at first use.
 
@@ -103,6 +111,11 @@ class Device:
         not.
     lock : threading.RLock
         Held while a kernel gets its arguments and is enqueued: kernels are shared between threads.
+    stand_in : Device or None
+        The CPU device that takes over if this one fails, see `clrecon.opencl.stand_in`; None for a device that was
+        named.
+    handed_over : list of str
+        The warning that says so, once it did.
     commands : Commands
         What is in the queue; `clrecon.opencl.waiting` waits for it.
     trace : callable or None
@@ -122,10 +135,11 @@ class Device:
         self.version: str = cl_device.version.strip()
         self.driver: str = cl_device.driver_version.strip()
         self.platform_version: str = cl_platform.version.strip()
-        self.memory_bytes: int = cl_device.global_mem_size
-        self.max_allocation_bytes: int = cl_device.max_mem_alloc_size
+        reach = (1 << cl_device.address_bits) - 1  # of a size_t in its kernels
+        self.memory_bytes: int = min(cl_device.global_mem_size, reach)
+        self.max_allocation_bytes: int = min(cl_device.max_mem_alloc_size, reach)
         self.compute_units: int = cl_device.max_compute_units
-        self.max_work_group_size: int = cl_device.max_work_group_size
+        self.max_work_group_size: int = min(cl_device.max_work_group_size, cl_device.max_work_item_sizes[0])
         self.is_simulator: bool = quirks.is_simulator(self.platform)
         self.shares_host_memory: bool = quirks.shares_host_memory(self.platform, self.type)
         self.has_event_times: bool = quirks.has_event_times(self.platform)
@@ -143,8 +157,9 @@ class Device:
         self.commands = Commands()
         self.trace: Callable[[str], None] | None = None
         self.programs: dict[tuple[str, tuple[str, ...]], Any] = {}
-        self._context: Any = None
-        self._queue: Any = None
+        self.stand_in: Device | None = None
+        self.handed_over: list[str] = []
+        self._opened = _Opened()
         self._process = os.getpid()
 
     def _name_cpu(self) -> None:
@@ -204,15 +219,15 @@ class Device:
         cl = quirks.import_pyopencl()
         self._refuse_fork()
         with self.lock:
-            if self._context is None:
+            if self._opened.context is None:
                 try:
                     if self._cpu is not None:
                         self._cpu.write()
-                    self._context = cl.Context([self.cl_device])
+                    self._opened.context = cl.Context([self.cl_device])
                 except (cl.Error, LookupError) as error:
-                    raise DeviceError(f"device {self.label} cannot be opened: {describe_error(error)}") from error
+                    raise DeviceFailedError(f"device {self.label} cannot be opened: {describe_error(error)}") from error
                 log.info("device opened: %s, %s, driver %s", self.label, self.version, self.driver)
-            return self._context
+            return self._opened.context
 
     @property
     def queue(self) -> Any:
@@ -220,13 +235,13 @@ class Device:
         cl = quirks.import_pyopencl()
         self._refuse_fork()
         with self.lock:
-            if self._queue is None:
+            if self._opened.queue is None:
                 try:
                     profiling = cl.command_queue_properties.PROFILING_ENABLE
-                    self._queue = cl.CommandQueue(self.context, properties=profiling)
+                    self._opened.queue = cl.CommandQueue(self.context, properties=profiling)
                 except cl.Error as error:
-                    raise DeviceError(f"device {self.label} gives no queue: {describe_error(error)}") from error
-            return self._queue
+                    raise DeviceFailedError(f"device {self.label} gives no queue: {describe_error(error)}") from error
+            return self._opened.queue
 
     def _refuse_fork(self) -> None:
         """Refuse to work in a forked process: the driver's threads do not exist there, so it would wait for ever."""
@@ -236,11 +251,27 @@ class Device:
                 " processes with multiprocessing.get_context('spawn'), or fork before the first use of a device"
             )
 
+    def with_stand_in(self, stand_in: Device) -> Device:
+        """Return the same device, opened only once for both, with a device that takes over if it fails."""
+        device = copy.copy(self)
+        device.stand_in, device.handed_over = stand_in, []
+        return device
+
+    @property
+    def current(self) -> Device:
+        """The device that works: this one, or the stand-in that took over."""
+        return self.stand_in if self.stand_in is not None and self.handed_over else self
+
+    def hand_over(self, warning: str) -> None:
+        """Let the stand-in take over."""
+        self.handed_over.append(warning)
+        log.warning("%s", warning)
+
     def give_up(self) -> None:
         """Drop context and queue, so that the next use makes new ones; running commands keep what they use."""
         with self.lock:
-            self.commands.give_up(self._context, self._queue, dict(self.programs))
-            self._context = self._queue = None
+            self.commands.give_up(self._opened.context, self._opened.queue, dict(self.programs))
+            self._opened.context = self._opened.queue = None
             self.programs.clear()
 
     def fail(self, what: str, error: Exception, *, is_late: bool = False) -> DeviceError:
@@ -257,7 +288,7 @@ class Device:
         """
         self.give_up()
         log.info("%s on %s: %s; its context is given up", what, self.label, describe_error(error))
-        return _kind_of(error, is_late)(f"{what} on {self.label}: {describe_error(error)}")
+        return kind_of_error(error, is_late)(f"{what} on {self.label}: {describe_error(error)}")
 
     def describe(self) -> dict[str, Any]:
         """Properties for listings and reports."""

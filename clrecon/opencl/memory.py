@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
-from clrecon.errors import DeviceError, UsageError
+from clrecon.errors import DeviceError, DeviceFailedError, DeviceMemoryError, UsageError
 from clrecon.opencl.context import Device
 from clrecon.system.wording import name_parameter
 
@@ -92,7 +92,9 @@ def describe_shortage(limits: MemoryLimits, buffers: Mapping[str, int]) -> str:
     return f"this needs {_mib(total, up=True)} on the device ({parts}): {limits.describe()}"
 
 
-def check_budget(device: Device, buffers: Mapping[str, int], memory: int | None = None) -> int:
+def check_budget(
+    device: Device, buffers: Mapping[str, int], memory: int | None = None, *, less_may_fit: bool = False
+) -> int:
     """Check that all `buffers` fit the device together and each alone.
 
     Parameters
@@ -102,6 +104,8 @@ def check_budget(device: Device, buffers: Mapping[str, int], memory: int | None 
         Bytes of all buffers that exist at the same time, by description.
     memory : int, optional
         Bytes that may be taken on the device; None is all of its memory.
+    less_may_fit : bool
+        The caller can do the work in smaller parts.
 
     Returns
     -------
@@ -111,12 +115,15 @@ def check_budget(device: Device, buffers: Mapping[str, int], memory: int | None 
     Raises
     ------
     DeviceError
-        A buffer exceeds the device's largest allocation, or the sum exceeds its memory or the user's limit.
+        A buffer exceeds the device's largest allocation, or the sum exceeds its memory or the user's limit.  It is a
+        `DeviceMemoryError` where less may fit, and a `DeviceFailedError` where another device may have room.
     """
     limits = memory_limits(device, memory)
     shortage = describe_shortage(limits, buffers)
     if shortage:
         if limits.device_fits(buffers):
-            raise DeviceError(f"{shortage}: allow that much or ask for less")
-        raise DeviceError(f"{shortage}: use a device with more memory or a smaller volume")
+            kind = DeviceMemoryError if less_may_fit else DeviceError
+            raise kind(f"{shortage}: allow that much or ask for less")
+        kind = DeviceMemoryError if less_may_fit else DeviceFailedError
+        raise kind(f"{shortage}: use a device with more memory or a smaller volume")
     return sum(buffers.values())

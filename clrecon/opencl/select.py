@@ -16,7 +16,7 @@ from clrecon.opencl.first_use import find_fault
 from clrecon.system.log import get_logger
 from clrecon.system.wording import name_parameter
 
-__all__ = ["choose_device", "choose_unchecked", "driver_advice", "list_devices", "list_platforms"]
+__all__ = ["choose_device", "choose_unchecked", "driver_advice", "find_candidates", "list_devices", "list_platforms"]
 
 log = get_logger(__name__)
 
@@ -163,7 +163,7 @@ def choose_device(name: str | int | Device | None = None) -> Device:
     """
     if isinstance(name, Device):
         return _take_sound([name])
-    devices, is_automatic = _find_candidates(name)
+    devices, is_automatic = find_candidates(name)
     chosen = _take_sound(devices if is_automatic else devices[:1])
     if chosen.is_simulator and not _is_named(chosen, name):
         chosen.remark(
@@ -176,7 +176,7 @@ def choose_device(name: str | int | Device | None = None) -> Device:
 
 def choose_unchecked(name: str | int | None = None) -> Device:
     """Choose as `choose_device` does, whether the device computes rightly or not; nothing runs on it."""
-    return _find_candidates(name)[0][0]
+    return find_candidates(name)[0][0]
 
 
 def _take_sound(devices: list[Device]) -> Device:
@@ -202,7 +202,7 @@ def _is_named(device: Device, name: str | int | None) -> bool:
     return not re.fullmatch("[0-9]*", wanted) and wanted in f"{device.platform} {device.name}".lower()
 
 
-def _find_candidates(name: str | int | None) -> tuple[list[Device], bool]:
+def find_candidates(name: str | int | None) -> tuple[list[Device], bool]:
     """Return the devices that a name means, the best first, and whether no name was given."""
     devices = list_devices()
     if not devices:

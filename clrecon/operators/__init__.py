@@ -2,10 +2,10 @@
 modified.
 """
 
-from clrecon.opencl import Device, choose_device
+from clrecon.opencl import Device, choose_device, take_device
 from clrecon.opencl.first_use import register
 
-__all__ = ["choose_device"]  # from here on it checks a device at its first use
+__all__ = ["choose_device", "take_device"]  # from here on they check a device at its first use
 
 
 def _check_device(device: Device) -> str:

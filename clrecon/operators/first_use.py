@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from clrecon.errors import ClreconError, DeviceMemoryError
+from clrecon.errors import ClreconError, DeviceMemoryError, DeviceTimeoutError
 from clrecon.geometry import Volume
 from clrecon.mesh import Mesh
 from clrecon.opencl import Device
@@ -52,6 +52,8 @@ def check_ball(device: Device) -> str:
         mesh = extract_isosurface(volume, 0.5, device=device)
         if mesh.report["slabs"] != 1:  # wrong sums look like a lack of memory
             return "a ball of 0.7 MB was made in parts"
+    except DeviceTimeoutError:
+        raise
     except DeviceMemoryError:
         return ""  # a device that is full is no wrong one: what follows meets the same
     except (ClreconError, ArithmeticError, LookupError, ValueError) as error:

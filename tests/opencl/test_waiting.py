@@ -14,6 +14,7 @@ from clrecon.errors import DeviceFailedError, DeviceLostError, DeviceMemoryError
 from clrecon.opencl import Stopwatch, allocate, download, launch, load_program, settle, upload, wait
 from clrecon.opencl import commands as commands_module
 from clrecon.opencl.commands import Commands, has_hung_commands
+from clrecon.opencl.context import _Opened
 from clrecon.opencl.quirks import import_pyopencl
 from clrecon.system.time_limit import time_limit
 
@@ -41,8 +42,7 @@ def own_commands(device, monkeypatch):
     """The device with commands of its own; its context stays, whatever fails."""
     wait(device)
     monkeypatch.setattr(device, "commands", Commands())
-    monkeypatch.setattr(device, "_context", None)
-    monkeypatch.setattr(device, "_queue", None)
+    monkeypatch.setattr(device, "_opened", _Opened())
     monkeypatch.setattr(device, "programs", {})
     yield
     commands_module._all.remove(device.commands)
@@ -101,7 +101,7 @@ def test_row_56_a_kernel_that_fails_on_the_device_is_an_error(device, status, ki
     with pytest.raises(kind, match=f"kernel .* failed on .*{words}") as caught:
         wait(device)
     assert type(caught.value) is kind
-    assert device._context is None
+    assert device._opened.context is None
     assert device.commands.last is None
 
 
@@ -135,13 +135,13 @@ def test_row_56_a_device_without_progress_is_an_error_that_names_the_kernel(devi
 def test_row_56_an_interrupt_keeps_the_context_of_a_device_that_ends_in_time(device, monkeypatch, is_short):
     event, context = Event(), object()
     device.commands.add("kernel one", event, QUEUE)
-    monkeypatch.setattr(device, "_context", context)
+    monkeypatch.setattr(device._opened, "context", context)
     monkeypatch.setattr("clrecon.opencl.waiting._watch", _interrupt)
     if is_short:
         threading.Timer(0.1, event.end).start()
     with pytest.raises(KeyboardInterrupt):
         wait(device)
-    assert (device._context is context) == is_short
+    assert (device._opened.context is context) == is_short
     assert has_hung_commands() == (not is_short)
     event.end()
 

@@ -56,7 +56,7 @@ def start_command(kernel: str, *arguments: str | Path, turns: int = TURNS) -> su
     """Start a command in which something spins before the first launch of `kernel`, and says so on stderr."""
     return subprocess.Popen(
         [sys.executable, "-c", _CHILD, str(turns), kernel, *map(str, arguments)],
-        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        env={**os.environ, "PYTHONPATH": str(ROOT), "CLRECON_DEVICE_CHECK": "off"},
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,

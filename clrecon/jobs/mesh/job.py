@@ -110,7 +110,7 @@ def make_mesh(
     surfaces, extracted = _extract(volume, surfaces, labels, device, settings, progress)
     origins = [mesh.report for mesh in extracted]
     watch.lap("surface")
-    parts = _select(volume, surfaces, extracted, device, settings, progress)
+    parts = _select(volume, surfaces, extracted, device.current, settings, progress)
     del extracted
     paths = name_outputs(output, [part.name for part in parts], report_path)
     judge_surfaces(parts, volume, settings)
@@ -124,7 +124,7 @@ def make_mesh(
         warnings += warn_of_walls(parts, settings, choice) + purpose_warnings + warn_of_gates(gates)
         seconds = _seconds(watch, origins)
         return describe_job(
-            volume, parts, meshes, settings, device, choice, gates=gates, warnings=warnings, seconds=seconds
+            volume, parts, meshes, settings, device.current, choice, gates=gates, warnings=warnings, seconds=seconds
         )
 
     with keep_existing(no_clobber):

@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from clrecon.errors import DeviceMemoryError, NoSurfaceError, UsageError
+from clrecon.errors import DeviceFailedError, NoSurfaceError, UsageError
 from clrecon.jobs.mesh.bone import find_bone
 from clrecon.jobs.mesh.settings import MeshSettings
 from clrecon.jobs.mesh.surfaces import Part, Surface
@@ -117,7 +117,7 @@ def _select_parts(surface: Surface, mesh: Mesh, settings: MeshSettings, device: 
     labelled = None
     try:
         labelled = label_components(device, mesh.triangles, mesh.vertex_count, memory=settings.memory)
-    except DeviceMemoryError as error:  # the result is the same, it only takes longer
+    except DeviceFailedError as error:  # the result is the same, it only takes longer
         mesh.report.setdefault("warnings", []).append(f"{error}: they were found without it")
     among = None
     if settings.keep == "bone":

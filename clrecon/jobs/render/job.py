@@ -110,6 +110,7 @@ def make_pictures(
         pictures, written = _take_views(studio, settings, files, staged, watch, progress)
         turntable, moving = _turn(studio, volume, settings, files, staged, watch, progress)
         written += moving
+        device = device.current
         report = describe_pictures(volume, settings, studio, device, pictures, turntable, _seconds(watch))
         if files.report is not None:
             written.append(staged.enter_context(stage_report(files.report, report)))

@@ -16,13 +16,15 @@ __all__ = ["DeviceOpening"]
 
 
 def _choose(name: str | int | Device | None) -> Device:
-    from clrecon.operators import choose_device
+    from clrecon.operators import take_device
 
-    return choose_device(name)
+    return take_device(name)
 
 
 def _prepare(chosen: Future[Device], prepare: Callable[[Device], None]) -> None:
-    prepare(chosen.result())
+    from clrecon.opencl import work_on
+
+    work_on(chosen.result(), lambda device, told: prepare(device))
 
 
 class DeviceOpening:
@@ -45,7 +47,7 @@ class DeviceOpening:
         self._prepared = self._pool.submit(_prepare, self._chosen, prepare)
 
     def wait(self) -> Device:
-        """Return the device, ready to work.
+        """Return the device, ready to work; its stand-in may have taken over.
 
         Raises
         ------

@@ -58,7 +58,13 @@ def take_picture(
     RefusedInputError
         The labels do not lie on the volume.
     """
-    return _Job(resident, style, camera, size, ray_step, background, progress or ignore_progress).run()
+
+    def take(told: list[str]) -> Rendering:
+        job = _Job(resident, style, camera, size, ray_step, background, progress or ignore_progress)
+        job.warnings[:0] = told
+        return job.run()
+
+    return resident.attempt(take)
 
 
 class _Job:

@@ -74,10 +74,15 @@ class VolumeRenderer:
         self, volume: Volume | DeviceVolume, *, device: Device | str | int | None = None, memory: int | None = None
     ):
         self._resident, self._is_own = take_volume(volume, device, memory, "a picture")
-        self.volume, self.device = self._resident.volume, self._resident.device
+        self.volume = self._resident.volume
         voxels = self.volume.voxels
         if voxels.dtype.kind == "f" and not np.isfinite(voxels).all():
             raise UsageError("the voxels hold NaN or infinite values: fill them first, for CT with -1024")
+
+    @property
+    def device(self) -> Device:
+        """The device that works."""
+        return self._resident.device
 
     def __enter__(self) -> VolumeRenderer:
         return self

@@ -103,7 +103,13 @@ def overlay_slices(
         Not even one slice fits the device.
     """
     chosen = choose_slices(resident.volume, style.slices)
-    return _Overlay(resident, style, camera, size, chosen, progress or ignore_progress).run(background)
+
+    def take(told: list[str]) -> Rendering:
+        overlay = _Overlay(resident, style, camera, size, chosen, progress or ignore_progress)
+        overlay.warnings[:0] = told
+        return overlay.run(background)
+
+    return resident.attempt(take)
 
 
 class _Colors(NamedTuple):

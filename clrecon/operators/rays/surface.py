@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clrecon.errors import DeviceError
+from clrecon.errors import DeviceError, DeviceFailedError
 from clrecon.geometry import Volume
 from clrecon.geometry.iso_rule import IsoRule, choose_iso_rule
 from clrecon.opencl import Stopwatch, launch, memory_limits, upload
@@ -80,8 +80,13 @@ def cast_surface(
         Not enough memory: for shadows the volume has to fit the device as a whole.
     """
     rule = choose_iso_rule(resident.volume, style.iso_value, values=resident.values)
-    job = _Job(resident, rule, style, camera, size, float(ray_step), progress or ignore_progress)
-    return job.run(background)
+
+    def take(told: list[str]) -> Rendering:
+        job = _Job(resident, rule, style, camera, size, float(ray_step), progress or ignore_progress)
+        job.warnings[:0] = told
+        return job.run(background)
+
+    return resident.attempt(take)
 
 
 class _Job:
@@ -115,9 +120,10 @@ class _Job:
         resident, device, nk = self.resident, self.resident.device, self.resident.volume.shape_ijk[2]
         if slices < nk:
             if self.look.shadows:
-                raise DeviceError(
+                limits = memory_limits(device, resident.memory)
+                raise (DeviceFailedError if limits.asked_bytes is None else DeviceError)(
                     f"shadows need the whole volume on the device, {slices} of its {nk} slices fit:"
-                    f" {memory_limits(device, resident.memory).describe()}; give more memory or leave the shadows out"
+                    f" {limits.describe()}; give more memory or leave the shadows out"
                 )
             self._shorten_steps(self.warnings)
         output = PictureBuffers(device, self.size, background, slices < nk)

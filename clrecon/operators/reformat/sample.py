@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from clrecon.errors import DeviceError, UsageError
+from clrecon.errors import DeviceError, DeviceFailedError, UsageError
 from clrecon.geometry import Volume, slice_normal
 from clrecon.geometry.affine import Float64Array
 from clrecon.opencl import (
@@ -157,7 +157,8 @@ class _Run:
         slices = resident.plan(SHEETS, self.slices, self.needs)
         if slices < min(2, self.slices):
             shortage = describe_shortage(resident.limits, self.needs(min(2, self.slices)))
-            raise DeviceError(f"two slices at a time are too much: {shortage}; give more memory or a smaller picture")
+            kind = DeviceFailedError if resident.limits.asked_bytes is None else DeviceError
+            raise kind(f"two slices at a time are too much: {shortage}; give more memory or a smaller picture")
         return slices
 
     def all_slabs(self, slices: int, progress: Progress | None) -> Reformation:
@@ -250,9 +251,15 @@ def sample_sheet(
     """
     if not isinstance(combine, str) or combine not in COMBINATIONS:
         raise UsageError(f"the samples of a slab are combined by one of {', '.join(COMBINATIONS)}, not {combine!r}")
-    run = _Run(resident, sheet, samples, combine, stopwatch or Stopwatch())
-    slices = run.plan()
-    fewest = min(2, slices)
-    return resident.halve(
-        SHEETS, slices, lambda slices: run.all_slabs(slices, progress), fewest=fewest, warnings=warnings
-    )
+
+    def take(told: list[str]) -> Reformation:
+        run = _Run(resident, sheet, samples, combine, stopwatch or Stopwatch())
+        slices = run.plan()
+        made = resident.halve(
+            SHEETS, slices, lambda slices: run.all_slabs(slices, progress), fewest=min(2, slices), warnings=told
+        )
+        if warnings is not None:
+            warnings.extend(told)
+        return made
+
+    return resident.attempt(take)

@@ -21,13 +21,14 @@ from clrecon.opencl import (
     Program,
     Stopwatch,
     check_memory,
-    choose_device,
     describe_shortage,
     keep_for_hung_commands,
     load_program,
     memory_limits,
     settle,
+    take_device,
     upload,
+    work_on,
 )
 from clrecon.operators.resident.stack_table import StackTable
 from clrecon.operators.resident.voxel_types import ray_variants
@@ -71,6 +72,7 @@ class DeviceVolume:
     ----------
     volume : Volume
     device : Device
+        Another one once the CPU device took over, see `attempt`.
     memory : int or None
     uploaded_bytes : int
         Bytes of voxels uploaded so far.  CPU devices read the computer's own memory: nothing is copied.
@@ -99,7 +101,8 @@ class DeviceVolume:
             raise UsageError(f"a DeviceVolume is made of a Volume, not {type(volume).__name__}")
         check_memory(memory)
         self.volume = volume
-        self.device = choose_device(device)
+        self._taken_device = take_device(device)
+        self.device = self._taken_device.current
         self.memory = memory
         self.uploaded_bytes = 0
         self.values = ValueRange(volume)
@@ -306,6 +309,30 @@ class DeviceVolume:
             fits = middle <= most and not describe_shortage(limits, needs(middle))
             low, high = (middle, high) if fits else (low, middle)
         return low
+
+    def attempt(self, work: Callable[[list[str]], Made]) -> Made:
+        """Do the work of an operator: once more if the device was lost, on the CPU device if it has no room or fails.
+
+        Parameters
+        ----------
+        work : callable
+            Called with warnings for its report.  It plans and makes everything anew each time, on `device`.
+
+        Raises
+        ------
+        DeviceError
+            The device failed, and no other takes over: it was named, or is a CPU device.
+        """
+
+        def on_device(device: Device, told: list[str]) -> Made:
+            with self._lock:
+                if device is not self.device:
+                    self.release()
+                    self.device = device
+                    self.most_slices.clear()
+            return work(told)
+
+        return work_on(self._taken_device, on_device)
 
     def halve(
         self,

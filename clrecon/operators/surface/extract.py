@@ -49,9 +49,14 @@ class SurfaceExtractor:
         self, volume: Volume | DeviceVolume, *, device: Device | str | int | None = None, memory: int | None = None
     ):
         self._resident, self._is_own = take_volume(volume, device, memory, "a surface")
-        self.volume, self.device = self._resident.volume, self._resident.device
+        self.volume = self._resident.volume
         marching_cubes.check_row(self.volume.shape_ijk[0])
         self._placements: dict[int, Placement] = {}
+
+    @property
+    def device(self) -> Device:
+        """The device that works."""
+        return self._resident.device
 
     def __enter__(self) -> SurfaceExtractor:
         return self
@@ -109,11 +114,16 @@ class SurfaceExtractor:
             check_row(volume)
         if min(grid.shape) < 2:
             raise NoSurfaceError(f"an open volume of {grid.shape} voxels has no cells: leave it closed")
+        return resident.attempt(lambda told: self._extract(grid, told, progress))
+
+    def _extract(self, grid: SampleGrid, told: list[str], progress: Progress | None) -> Mesh:
+        resident, volume, rule = self._resident, self.volume, grid.rule
         run = Extraction(resident, grid, self._placement(grid))
+        run.warnings += told
         if progress is not None:
             progress("build", 0, 1)
         with run.stopwatch.timed("build"):
-            prepare_isosurface(self.device, volume.voxels.dtype, topology, volume.uneven, rule.inside)
+            prepare_isosurface(self.device, volume.voxels.dtype, rule.topology, volume.uneven, rule.inside)
         if progress is not None:
             progress("build", 1, 1)
         positions, normals, triangles = run.run(plan_slabs(grid, resident), progress)

@@ -162,7 +162,7 @@ class LabelExtraction:
         own, surface = self.programs()
         window = self.window(box, (held.first, held.end))
         needs = {**self.needs(held.first, held.end), **window.scratch()}
-        check_budget(device, needs, memory)
+        check_budget(device, needs, memory, less_may_fit=True)
         mask_d = allocate(device, 4 * window.mask_rows * self.grid.words)
         half_way_d = allocate(device, 4)
         classified = Classified(mask_d, allocate(device, 4 * window.mask_rows))
@@ -176,7 +176,7 @@ class LabelExtraction:
         if counted.triangles == 0:
             return None
         output = counted.output()
-        check_budget(device, {**needs, **output}, memory)
+        check_budget(device, {**needs, **output}, memory, less_may_fit=True)
         scratch = window.scratch()
         self.device_bytes = {
             "volume": sum(needs.values()) - sum(scratch.values()),

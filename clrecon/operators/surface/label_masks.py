@@ -14,7 +14,8 @@ from clrecon.mesh import Mesh
 from clrecon.opencl import (
     Device,
     Stopwatch,
-    choose_device,
+    take_device,
+    work_on,
 )
 from clrecon.operators.surface import marching_cubes
 from clrecon.operators.surface.extraction import Part
@@ -87,7 +88,13 @@ def extract_label_masks(
         raise RefusedInputError("the label map is empty: no voxel has a label")
     marching_cubes.check_row(labels.shape_ijk[0])
     chosen = choose_numbers(labels, numbers)
-    return _make_meshes(MaskExtraction(labels, choose_device(device), memory, closed), chosen, progress)
+
+    def make(current: Device, told: list[str]) -> dict[int, Mesh]:
+        run = MaskExtraction(labels, current, memory, closed)
+        run.warnings += told
+        return _make_meshes(run, chosen, progress)
+
+    return work_on(take_device(device), make)
 
 
 def _make_meshes(run: MaskExtraction, chosen: Sequence[int], progress: Progress | None) -> dict[int, Mesh]:

@@ -110,8 +110,14 @@ def extract_labels(
         taken = resident.bring(labels)
         rule = choose_iso_rule(resident.volume, iso_value, closed, values=resident.values)
         marching_cubes.check_row(resident.volume.shape_ijk[0])
-        run = LabelExtraction(resident, taken, rule, Growth.of(resident.volume, grow_mm), solid)
-        meshes = _make_meshes(run, labels, taken, numbers, progress)
+        growth = Growth.of(resident.volume, grow_mm)
+
+        def make(told: list[str]) -> dict[int, Mesh]:
+            run = LabelExtraction(resident, taken, rule, growth, solid)
+            run.warnings += told
+            return _make_meshes(run, labels, taken, numbers, progress)
+
+        meshes = resident.attempt(make)
     if not meshes:
         raise NoSurfaceError(f"no label has a voxel of {rule.iso_value:g} HU or more in the CT")
     return meshes

@@ -213,7 +213,7 @@ class MaskExtraction:
         own, surface = self.programs()
         window = self.window(box, (held.first, held.end))
         needs = {**self.needs(held.first, held.end), **window.scratch()}
-        check_budget(device, needs, self.memory)
+        check_budget(device, needs, self.memory, less_may_fit=True)
         mask_d = allocate(device, 4 * window.mask_rows * self.grid.words)
         classified = Classified(mask_d, allocate(device, 4 * window.mask_rows))
         with stopwatch.running(device):
@@ -225,7 +225,7 @@ class MaskExtraction:
             )  # fmt: skip
             counted = marching_cubes.count(device, window, surface, classified, stopwatch)
         output = counted.output()
-        check_budget(device, {**needs, **output}, self.memory)
+        check_budget(device, {**needs, **output}, self.memory, less_may_fit=True)
         scratch = window.scratch()
         self.device_bytes = {
             "volume": sum(needs.values()) - sum(scratch.values()),

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 
-from clrecon.errors import DeviceError
+from clrecon.errors import DeviceError, DeviceFailedError
 from clrecon.geometry import Volume, is_left_handed
 from clrecon.geometry.iso_rule import IsoRule
 from clrecon.operators.resident.device_volume import DeviceVolume
@@ -188,7 +188,7 @@ def plan_slabs(grid: SampleGrid, resident: DeviceVolume) -> int:
     slices = resident.plan(grid.kind, gk, needs, own=(BRICKS,), most=most)
     if slices == 0:
         shortest = Slab(grid, max(0, min(2, gk - 1)), max(0, min(2, gk - 1)) + 1).needs()
-        raise DeviceError(
+        raise (DeviceFailedError if limits.asked_bytes is None else DeviceError)(
             f"one slice with its neighbours needs {sum(shortest.values()):,} bytes, and room for its mesh:"
             f" {limits.describe()}; {'use another device' if limits.asked_bytes is None else 'allow more'}"
         )

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import pickle
-from collections.abc import Callable
 
 import numpy as np
 import pytest
 import tolerances
+from device_work import SIZE, WORK, centre_line
+from failing_devices import Failing
 from surface_volumes import OBLIQUE, smooth_volume
 from variants import all_but
 
@@ -17,8 +18,6 @@ from clrecon.labels import LabelMap, resample
 from clrecon.opencl import Stopwatch
 from clrecon.operators.rays.composite import TransferTables
 from clrecon.operators.resident.device_volume import DeviceVolume
-
-SIZE = (24, 20)
 
 
 @pytest.fixture(scope="module")
@@ -33,34 +32,6 @@ def labels(volume):
     return LabelMap(numbers, volume.affine)
 
 
-def centre_line(volume):
-    ni, nj, nk = volume.shape_ijk
-    return volume.ijk_to_lps([(ni / 2, nj / 2, k) for k in np.linspace(1, nk - 2, 6)])
-
-
-def values(picture) -> list[np.ndarray]:
-    return [picture.image, picture.depth] + ([] if picture.values is None else [picture.values])
-
-
-def mesh_arrays(*meshes) -> list[np.ndarray]:
-    return [array for mesh in meshes for array in (mesh.vertices, mesh.triangles, mesh.normals)]
-
-
-WORK: dict[str, Callable] = {
-    "surface": lambda v, _: mesh_arrays(clrecon.extract_isosurface(v, 100)),
-    "trilinear": lambda v, _: mesh_arrays(clrecon.extract_isosurface(v, 100, topology="trilinear")),
-    "range": lambda v, _: mesh_arrays(clrecon.extract_isosurface(v, (50, 200))),
-    "labels": lambda v, labels: mesh_arrays(*clrecon.extract_labels(v, labels, 100).values()),
-    "dvr": lambda v, _: values(clrecon.render(v, preset="muscle", size=SIZE)),
-    "dvr labels": lambda v, labels: values(clrecon.render(v, preset="muscle", labels=labels, size=SIZE)),
-    "mip": lambda v, _: values(clrecon.render(v, "mip", size=SIZE)),
-    "drr": lambda v, _: values(clrecon.render(v, "drr", size=SIZE)),
-    "ray surface": lambda v, labels: values(clrecon.render(v, "surface", iso_value=100, labels=labels, size=SIZE)),
-    "slices": lambda v, _: values(clrecon.render(v, "slices", size=SIZE, view=(20, 30))),
-    "slice": lambda v, _: values(clrecon.cut_slice(v, "coronal", SIZE)),
-    "thick slice": lambda v, _: values(clrecon.cut_slice(v, (20, 30), SIZE, thickness=4.0, combine="max")),
-    "cpr": lambda v, _: values(clrecon.reformat_curve(v, centre_line(v.volume), size=SIZE)),
-}
 PICTURES = {"dvr", "dvr labels", "ray surface", "drr", "slices"}
 """Where rays go through slabs, float32 sums may round otherwise."""
 
@@ -73,35 +44,6 @@ def assert_equal(found, expected, work: str) -> None:
             assert np.allclose(one, other, rtol=1e-5, atol=1e-3, equal_nan=True)
         else:
             assert np.array_equal(one, other, equal_nan=one.dtype.kind == "f")
-
-
-class Failing:
-    """Counts buffers and launches, and lets the n-th of one kind fail as drivers do."""
-
-    def __init__(self, monkeypatch, kind: str, fails: int):
-        import pyopencl as cl
-
-        from clrecon.opencl import arrays
-
-        self.kind, self.fails, self.counts = kind, fails, {"buffer": 0, "launch": 0}
-        true_buffer, true_call = arrays._make_buffer, cl.Kernel.__call__
-
-        def make_buffer(device, flags, size, host=None):
-            if self._is_due("buffer"):
-                raise DeviceMemoryError(f"{size:,} bytes cannot be had on {device.label}: injected")
-            return true_buffer(device, flags, size, host)
-
-        def call(kernel, *arguments, **options):
-            if self._is_due("launch"):
-                raise cl.MemoryError("injected")
-            return true_call(kernel, *arguments, **options)
-
-        monkeypatch.setattr(arrays, "_make_buffer", make_buffer)
-        monkeypatch.setattr(cl.Kernel, "__call__", call)
-
-    def _is_due(self, kind: str) -> bool:
-        self.counts[kind] += 1
-        return self.kind == kind and self.counts[kind] == self.fails
 
 
 @pytest.mark.parametrize("kind", ["buffer", "launch"])

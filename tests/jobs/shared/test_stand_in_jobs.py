@@ -1,0 +1,70 @@
+"""Rows 54 and 56 in whole jobs: the report says which device did the work, and the files are those of that device."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from ct_files import write_series
+from failing_devices import Failing, lost_error, pretended_gpu
+
+from clrecon.cli.main import main
+
+pytestmark = pytest.mark.first_device
+
+NEVER_LAST = 1 << 30
+
+COMMANDS = {
+    "mesh": ("out.stl", ("--hu", "200", "--keep-largest", "1")),
+    "render": ("out.png", ("--size", "24", "--mode", "mip")),
+}
+
+
+@pytest.fixture
+def gpu(device, monkeypatch):
+    """The GPU that is chosen where no device is named, beside the CPU device."""
+    gpu = pretended_gpu(device)
+    gpu.stand_in = None
+    for place in ("select", "stand_in"):
+        monkeypatch.setattr(f"clrecon.opencl.{place}.list_devices", lambda: [device, gpu])
+    for variable in ("CLRECON_DEVICE", "PYOPENCL_CTX"):
+        monkeypatch.delenv(variable, raising=False)
+    return gpu
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+@pytest.mark.parametrize("first", [1, 2])
+def test_row_54_a_job_goes_on_on_the_cpu_device(device, gpu, tmp_path, capsys, monkeypatch, command, first):
+    output, options = COMMANDS[command]
+    write_series(tmp_path / "ct")
+    (tmp_path / "alone").mkdir()
+    arguments = [command, str(tmp_path / "ct"), *options]
+    assert main([*arguments, "-o", str(tmp_path / "alone" / output), "--device", str(device.index)]) == 0
+    capsys.readouterr()
+    with monkeypatch.context() as patch:
+        Failing(patch, "launch", first, NEVER_LAST, label=gpu.label)
+        report = tmp_path / "report.json"
+        assert main([*arguments, "-o", str(tmp_path / output), "--report", str(report)]) == 0
+    said = capsys.readouterr()
+    assert said.err.count(f"all was done on {device.label} instead of {gpu.label}") == 1
+    assert f'"device": "{device.label}"' in report.read_text()
+    assert f"all was done on {device.label}" in report.read_text()
+    assert (tmp_path / output).read_bytes() == (tmp_path / "alone" / output).read_bytes()
+
+
+def test_row_54_a_named_device_fails_with_the_number_of_the_cpu_device(device, gpu, tmp_path, capsys, monkeypatch):
+    write_series(tmp_path / "ct")
+    Failing(monkeypatch, "launch", 3, NEVER_LAST, label=gpu.label)
+    output: Path = tmp_path / "out.stl"
+    assert main(["mesh", str(tmp_path / "ct"), "-o", str(output), "--hu", "200", "--device", "gpu"]) == 5
+    assert f"; {device.label} may do it: --device {device.index}\n" in capsys.readouterr().err
+    assert not output.exists()
+
+
+def test_row_56_a_job_survives_the_loss_of_its_device(gpu, tmp_path, capsys, monkeypatch):
+    write_series(tmp_path / "ct")
+    Failing(monkeypatch, "launch", 3, label=gpu.label, error=lost_error())
+    assert main(["mesh", str(tmp_path / "ct"), "-o", str(tmp_path / "out.stl"), "--hu", "200"]) == 0
+    said = capsys.readouterr()
+    assert said.err.count("started again with a fresh context") == 1
+    assert gpu.label in said.out

@@ -1,0 +1,121 @@
+"""Row 51: devices that lack what most have. They compute the same bytes, or are refused in words."""
+
+from __future__ import annotations
+
+import re
+import sys
+
+import numpy as np
+import pytest
+from ct_files import write_series
+from device_work import WORK
+from surface_volumes import smooth_volume
+
+from clrecon.cli.main import main
+from clrecon.labels import LabelMap
+from clrecon.opencl import Device, choose_device, kernel_files, memory_limits, read_kernel_source
+from clrecon.operators.resident.device_volume import DeviceVolume
+
+pytestmark = pytest.mark.first_device
+
+BEYOND = {
+    "double precision": r"\bdouble\b|cl_khr_fp64",
+    "a constant of double precision": r"(?<![\w.])(?:\d+\.\d*(?:[eE][+-]?\d+)?|\d+[eE][+-]?\d+)(?![\w.])",
+    "images": r"\bimage[123]d\w*|\bsampler_t\b|\b(?:read|write)_image\w+",
+    "64-bit atomics": r"\batom_\w+|cl_khr_int64\w+",
+}
+
+
+def beyond_the_core(source: str) -> list[str]:
+    code = re.sub(r"/\*.*?\*/|//[^\n]*", "", source, flags=re.DOTALL)
+    return [what for what, pattern in BEYOND.items() if re.search(pattern, code)]
+
+
+@pytest.mark.parametrize("name", kernel_files())
+def test_row_51_kernels_need_no_fp64_and_no_images(name):
+    assert beyond_the_core(read_kernel_source(name)) == []
+
+
+@pytest.mark.parametrize(
+    "code", ["double a;", "x * 0.5", "x + 1e3", "__read_only image3d_t i", "sampler_t s", "atom_inc(a)"]
+)
+def test_what_kernels_must_not_need_is_found(code):
+    assert len(beyond_the_core(f"/* a */ {code}")) == 1
+
+
+class Lacking:
+    """A device of a driver with some properties replaced."""
+
+    def __init__(self, cl_device, **properties):
+        self._cl_device, self._properties = cl_device, properties
+
+    def __getattr__(self, name):
+        return self._properties[name] if name in self._properties else getattr(self._cl_device, name)
+
+
+def lacking(device: Device, **properties) -> Device:
+    return Device(device.index, device.cl_device.platform, Lacking(device.cl_device, **properties))
+
+
+def test_row_51_a_device_with_32_bit_sizes_has_at_most_4_gib(device):
+    poor = lacking(device, address_bits=32, global_mem_size=1 << 36, max_mem_alloc_size=1 << 35)
+    assert (poor.memory_bytes, poor.max_allocation_bytes) == ((1 << 32) - 1, (1 << 32) - 1)
+    assert memory_limits(poor).buffer_bytes < 1 << 32
+    assert lacking(device, address_bits=64, global_mem_size=1 << 36).memory_bytes == 1 << 36
+
+
+@pytest.mark.parametrize(
+    ("properties", "size"),
+    [
+        ({"max_work_group_size": 1}, 1),
+        ({"max_work_group_size": 4096, "max_work_item_sizes": [7, 1, 1]}, 7),
+        ({"max_work_group_size": 48, "max_work_item_sizes": [64, 64, 64]}, 48),
+        ({"max_work_group_size": 1024, "max_work_item_sizes": [1024, 1024, 64]}, 64),
+    ],
+)
+def test_row_51_groups_are_as_large_as_the_device_allows(device, properties, size):
+    assert lacking(device, **properties).group_size == size
+
+
+@pytest.fixture(scope="module")
+def volume():
+    return smooth_volume((12, 14, 21))
+
+
+@pytest.fixture(scope="module")
+def labels(volume):
+    numbers = np.zeros(volume.voxels.shape, np.uint8)
+    numbers[3:7, 4:12, 3:10], numbers[7:10, 4:12, 3:10] = 1, 2
+    return LabelMap(numbers, volume.affine)
+
+
+@pytest.mark.parametrize(("size", "works"), [(1, ("surface",)), (7, ("surface", "labels", "dvr", "slice"))])
+def test_row_51_small_groups_give_the_same_bytes(device, volume, labels, monkeypatch, size, works):
+    """Drivers build a kernel anew for each size of its groups, so not all kinds of work are tried with all."""
+    with DeviceVolume(volume, device=device) as resident:
+        expected = {work: WORK[work](resident, labels) for work in works}
+    monkeypatch.setattr(device, "max_work_group_size", size)
+    with DeviceVolume(volume, device=device) as resident:
+        found = {work: WORK[work](resident, labels) for work in works}
+    for work in works:
+        for one, other in zip(found[work], expected[work], strict=True):
+            assert np.array_equal(one, other, equal_nan=one.dtype.kind == "f"), work
+
+
+def test_row_51_a_device_of_the_other_byte_order_is_refused_in_a_line(device, tmp_path, capsys, monkeypatch):
+    other = lacking(device, endian_little=sys.byteorder != "little")
+    monkeypatch.setattr("clrecon.opencl.select.list_devices", lambda: [other])
+    monkeypatch.delenv("CLRECON_DEVICE", raising=False)
+    write_series(tmp_path / "ct")
+    assert main(["mesh", str(tmp_path / "ct"), "-o", str(tmp_path / "out.stl"), "--device", "cpu"]) == 5
+    said = capsys.readouterr().err
+    assert len(said.splitlines()) == 1
+    assert "cannot be used: its byte order is not that of this computer" in said
+    assert not (tmp_path / "out.stl").exists()
+
+
+def test_row_51_a_kernel_whose_groups_the_driver_refuses_is_an_error_in_a_line(device, volume, monkeypatch):
+    monkeypatch.setattr("clrecon.opencl.context.GROUP_SIZE", 1 << 20)
+    monkeypatch.setattr(device, "max_work_group_size", 1 << 20)
+    with pytest.raises(Exception, match=r"kernel \w+ \(.* in groups of .*\) failed on .*INVALID_WORK_GROUP_SIZE"):
+        WORK["mip"](DeviceVolume(volume, device=choose_device(device)), None)

@@ -1,0 +1,190 @@
+"""Rows 54 and 56: a device without room or lost in the middle; the CPU device takes over where no device was named."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from device_work import SIZE, WORK, mesh_arrays
+from failing_devices import Failing, lost_error, pretended_gpu
+from surface_volumes import smooth_volume
+from variants import all_but
+
+import clrecon
+from clrecon.errors import DeviceError, DeviceFailedError, DeviceMemoryError
+from clrecon.labels import LabelMap
+from clrecon.opencl import allocate, list_devices, take_device, work_on
+from clrecon.operators.resident.device_volume import DeviceVolume
+
+pytestmark = pytest.mark.first_device
+
+NEVER_LAST = 1 << 30
+
+
+@pytest.fixture(scope="module")
+def volume():
+    return smooth_volume((12, 14, 21))
+
+
+@pytest.fixture(scope="module")
+def labels(volume):
+    numbers = np.zeros(volume.voxels.shape, np.uint8)
+    numbers[3:7, 4:12, 3:10], numbers[7:10, 4:12, 3:10] = 1, 2
+    return LabelMap(numbers, volume.affine)
+
+
+@pytest.fixture
+def gpu(device):
+    return pretended_gpu(device)
+
+
+@pytest.mark.parametrize("kind", ["buffer", "launch"])
+@pytest.mark.parametrize("work", all_but(WORK, "ray surface"))
+def test_row_54_the_cpu_device_takes_over_from_any_buffer_or_launch_on(
+    device, gpu, volume, labels, monkeypatch, work, kind
+):
+    with DeviceVolume(volume, device=device) as resident:
+        expected = WORK[work](resident, labels)
+    with monkeypatch.context() as patch, DeviceVolume(volume, device=gpu) as resident:
+        counted = Failing(patch, kind, 0, label=gpu.label)
+        WORK[work](resident, labels)
+        assert resident.device is gpu
+    count = counted.counts[kind]
+    assert count > 0
+    firsts = {count // 2 + 1} if kind == "launch" else {1, count // 3 + 1, 2 * count // 3 + 1, count}
+    for first in sorted(firsts):
+        gpu = pretended_gpu(device)
+        with monkeypatch.context() as patch, DeviceVolume(volume, device=gpu) as resident:
+            Failing(patch, kind, first, NEVER_LAST, label=gpu.label)
+            found = WORK[work](resident, labels)
+            assert resident.device is device
+        for one, other in zip(found, expected, strict=True):
+            assert np.array_equal(one, other, equal_nan=one.dtype.kind == "f")
+
+
+def test_row_54_the_warning_names_both_devices_and_the_reason(device, volume, labels, monkeypatch):
+    makers: tuple[Callable, ...] = (
+        lambda gpu: clrecon.extract_isosurface(volume, 100, device=gpu).report,
+        lambda gpu: clrecon.extract_labels(volume, labels, 100, device=gpu)[1].report,
+        lambda gpu: clrecon.extract_label_masks(labels, device=gpu)[1].report,
+        lambda gpu: clrecon.render(volume, "mip", size=SIZE, device=gpu).report,
+        lambda gpu: clrecon.render(volume, "slices", size=SIZE, device=gpu).report,
+        lambda gpu: clrecon.cut_slice(volume, "coronal", SIZE, device=gpu).report,
+    )
+    for make in makers:
+        gpu = pretended_gpu(device)
+        with monkeypatch.context() as patch:
+            Failing(patch, "buffer", 3, NEVER_LAST, label=gpu.label)
+            report = make(gpu)
+        said = [text for text in report["warnings"] if "all was done on" in text]
+        assert len(said) == 1
+        assert said[0].endswith(f"injected: all was done on {device.label} instead of {gpu.label}")
+        assert report["device"] == device.label
+
+
+def test_row_54_masks_of_labels_are_the_same_on_the_cpu_device(device, labels, monkeypatch):
+    expected = mesh_arrays(*clrecon.extract_label_masks(labels, device=device).values())
+    gpu = pretended_gpu(device)
+    for kind in ("buffer", "launch"):
+        with monkeypatch.context() as patch:
+            Failing(patch, kind, 12, NEVER_LAST, label=gpu.label)
+            found = mesh_arrays(*clrecon.extract_label_masks(labels, device=gpu).values())
+        assert all(np.array_equal(one, other) for one, other in zip(found, expected, strict=True))
+
+
+SMALL_WORK: dict[str, Callable] = {
+    "surface": lambda volume, **where: clrecon.extract_isosurface(volume, 100, **where),
+    "mip": lambda volume, **where: clrecon.render(volume, "mip", size=SIZE, **where),
+    "slice": lambda volume, **where: clrecon.cut_slice(volume, "axial", SIZE, **where),
+}
+
+
+@pytest.mark.parametrize("work", SMALL_WORK)
+def test_row_54_a_device_that_is_too_small_for_one_slice_hands_over(device, gpu, volume, work):
+    gpu.memory_bytes = 500
+    assert SMALL_WORK[work](volume, device=gpu).report["device"] == device.label
+    gpu = pretended_gpu(device)
+    with pytest.raises(DeviceError, match="400 bytes"):  # of the user: no other device helps
+        SMALL_WORK[work](volume, device=gpu, memory=400)
+    assert gpu.handed_over == []
+
+
+def test_row_54_a_named_device_fails_and_names_the_cpu_device(device, gpu, volume, monkeypatch):
+    gpu.stand_in = None
+    Failing(monkeypatch, "buffer", 1, NEVER_LAST, label=gpu.label)
+    cpu = max((each for each in list_devices() if each.type == "cpu"), key=lambda each: each.score)
+    with pytest.raises(DeviceMemoryError, match="injected; .* may do it: device=") as caught:
+        clrecon.extract_isosurface(volume, 100, device=gpu)
+    assert str(caught.value).endswith(f"injected; {cpu.label} may do it: device={cpu.index}")
+
+
+def test_row_54_a_cpu_device_never_hands_over(device, volume, monkeypatch):
+    Failing(monkeypatch, "buffer", 1, NEVER_LAST)
+    with pytest.raises(DeviceMemoryError, match=r"injected$"):
+        clrecon.extract_isosurface(volume, 100, device=device)
+
+
+def test_row_54_only_a_device_that_nobody_named_has_a_stand_in(device, gpu, monkeypatch):
+    gpu.stand_in = None
+    monkeypatch.setattr("clrecon.opencl.select.list_devices", lambda: [device, gpu])
+    monkeypatch.setattr("clrecon.opencl.stand_in.list_devices", lambda: [device, gpu])
+    for variable in ("CLRECON_DEVICE", "PYOPENCL_CTX"):
+        monkeypatch.delenv(variable, raising=False)
+    for name in (None, "auto", "AUTO"):
+        taken = take_device(name)
+        assert (taken.label, taken.stand_in) == (gpu.label, device)
+        assert taken.context is gpu.context
+    for name in (gpu, "gpu", "pretended"):
+        assert take_device(name).stand_in is None
+    assert take_device(device.index).stand_in is None
+    monkeypatch.setenv("CLRECON_DEVICE", "gpu")
+    assert take_device(None).stand_in is None
+    monkeypatch.setenv("CLRECON_DEVICE", "cpu")
+    assert take_device(None) is device
+
+
+SEVERAL_LAUNCHES = ("surface", "labels", "dvr")
+
+
+@pytest.mark.parametrize("work", [*SEVERAL_LAUNCHES, "slices", "slice"])
+def test_row_56_a_lost_device_gets_a_fresh_context_once(device, gpu, volume, labels, monkeypatch, work):
+    with DeviceVolume(volume, device=gpu) as resident:
+        expected = WORK[work](resident, labels)
+        lost = gpu.context
+        resident.close()
+        with monkeypatch.context() as patch:
+            Failing(patch, "launch", 2 if work in SEVERAL_LAUNCHES else 1, label=gpu.label, error=lost_error())
+            found = WORK[work](resident, labels)
+        assert resident.device is gpu
+        assert gpu.context is not lost
+    assert all(np.array_equal(one, other, equal_nan=True) for one, other in zip(found, expected, strict=True))
+
+
+def test_row_56_a_device_that_is_lost_again_hands_over_to_the_cpu_device(device, gpu, volume, monkeypatch):
+    Failing(monkeypatch, "launch", 2, NEVER_LAST, label=gpu.label, error=lost_error())
+    report = clrecon.extract_isosurface(volume, 100, device=gpu).report
+    assert report["device"] == device.label
+    assert [text for text in report["warnings"] if "INVALID_COMMAND_QUEUE" in text and "all was done on" in text]
+
+
+def test_row_56_a_lost_device_is_told_in_the_report(device, gpu, volume, monkeypatch):
+    Failing(monkeypatch, "launch", 2, label=gpu.label, error=lost_error())
+    report = clrecon.extract_isosurface(volume, 100, device=gpu).report
+    assert report["device"] == gpu.label
+    assert [text for text in report["warnings"] if "started again with a fresh context" in text]
+
+
+def test_the_stand_in_is_asked_once(device, gpu):
+    asked = []
+
+    def work(current, told):
+        asked.append(current)
+        allocate(current, 16)
+        raise DeviceFailedError(f"{current.label} fails")
+
+    with pytest.raises(DeviceFailedError, match=f"^{re.escape(gpu.label)} fails$"):
+        work_on(gpu, work)
+    assert asked == [gpu, device]
+    assert gpu.handed_over == []

@@ -1,0 +1,80 @@
+"""Devices that fail: buffers and launches that break as those of drivers do, and a GPU that is none."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from clrecon.errors import DeviceMemoryError
+from clrecon.opencl import Device, arrays
+from clrecon.opencl.quirks import import_pyopencl
+
+__all__ = ["Failing", "lost_error", "pretended_gpu"]
+
+
+def pretended_gpu(device: Device) -> Device:
+    """Return a GPU with its own memory that computes on the same hardware, and has the CPU device as its stand-in."""
+    gpu = Device(device.index, device.cl_device.platform, device.cl_device)
+    gpu.name, gpu.type, gpu.shares_host_memory, gpu.keeps_binaries = "a pretended GPU", "gpu", False, False
+    gpu.kernel_variants = device.kernel_variants
+    return gpu.with_stand_in(device)
+
+
+def lost_error() -> Exception:
+    """Return the error of a driver whose device was lost."""
+    cl = import_pyopencl()
+
+    class Lost(cl.LogicError):  # type: ignore[misc, name-defined]
+        code = -36
+
+    return Lost("INVALID_COMMAND_QUEUE: injected")
+
+
+class Failing:
+    """Counts buffers and launches on a device, and lets some of one kind fail, from number `first` to `last`.
+
+    Parameters
+    ----------
+    kind : {"buffer", "launch"}
+    first, last : int
+        Numbers from 1; 0: none fails.
+    label : str, optional
+        Only of the device with this label; None: of all.
+    error : Exception, optional
+        That of launches; default: no memory.
+    """
+
+    def __init__(
+        self,
+        monkeypatch: pytest.MonkeyPatch,
+        kind: str,
+        first: int,
+        last: int | None = None,
+        *,
+        label: str | None = None,
+        error: Exception | None = None,
+    ):
+        cl = import_pyopencl()
+        self.kind, self.first, self.last = kind, first, first if last is None else last
+        self.counts = {"buffer": 0, "launch": 0}
+        true_buffer, true_enqueue = arrays._make_buffer, cl.Kernel.__call__
+        contexts: dict[Any, str] = {}
+
+        def make_buffer(device: Device, flags: Any, size: int, host: Any = None) -> Any:
+            contexts[device.context] = device.label
+            if label in (None, device.label) and self._is_due("buffer"):
+                raise DeviceMemoryError(f"{size:,} bytes cannot be had on {device.label}: injected")
+            return true_buffer(device, flags, size, host)
+
+        def call(kernel: Any, queue: Any, *arguments: Any, **options: Any) -> Any:
+            if label in (None, contexts.get(queue.context)) and self._is_due("launch"):
+                raise cl.MemoryError("injected") if error is None else error
+            return true_enqueue(kernel, queue, *arguments, **options)
+
+        monkeypatch.setattr(arrays, "_make_buffer", make_buffer)
+        monkeypatch.setattr(cl.Kernel, "__call__", call)
+
+    def _is_due(self, kind: str) -> bool:
+        self.counts[kind] += 1
+        return self.kind == kind and 0 < self.first <= self.counts[kind] <= self.last
