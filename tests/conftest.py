@@ -50,6 +50,9 @@ def find_devices() -> tuple[list[Any], str]:
         return [], str(error)
     for device in found:
         device.fault = ""  # passed: the check at its first use is tests/opencl/test_first_use.py's
+        if device.known_good is not None:  # an earlier session may have been killed
+            device.known_good.sweep()
+            device.known_good.warnings.clear()
         # llvmpipe makes vectors of work-items itself, and takes three times as long to build kernels that are written
         # with vectors.  It runs the variant of GPUs, as no other device here does; `users_kernels` gives its own back.
         if is_software_gpu(device.name):

@@ -82,13 +82,22 @@ class KnownGood:
         """Check what PoCL keeps of the program `key`, and note what it uses in the ``with`` block."""
         with self._lock:
             recorded = self._read(key)
-            self._check(recorded)
-            os.utime(self._handle if os.utime in os.supports_fd else self._folder / "in-use")
-            start = os.stat(self._folder / "in-use").st_mtime_ns
+            with suppress(OSError):  # a folder that was removed meanwhile holds nothing to check
+                self._check(recorded)
+            start = self._now()
             yield
-            self._used.setdefault(key, set()).update(self._find_used(recorded, start))
+            with suppress(OSError):
+                self._used.setdefault(key, set()).update(self._find_used(recorded, start))
             if not recorded:
                 self._due = time.perf_counter() + _SECONDS_BEFORE_RECORD
+
+    def forget(self, key: str) -> None:
+        """Remove what PoCL keeps of the program `key`, which turned out to be wrong."""
+        with self._lock:
+            for name in {*self._read(key), *self._used.pop(key, ())}:
+                shutil.rmtree(self._folder / name, ignore_errors=True)
+            with suppress(OSError):
+                (self._records / key).unlink()
 
     def record(self) -> None:
         """Write down the files of all programs that this process has used."""
@@ -114,8 +123,7 @@ class KnownGood:
                 self._warn(DAMAGED)
         strange = any(self._list(name) - files.keys() for name, files in recorded.items())
         if (strange or not recorded) and not self._is_swept:
-            self._is_swept = True
-            self._sweep()
+            self.sweep()
 
     def _is_intact(self, name: str, files: _Files) -> bool:
         for file, (size, changed, digest) in files.items():
@@ -131,8 +139,9 @@ class KnownGood:
                 return False
         return True
 
-    def _sweep(self) -> None:
+    def sweep(self) -> None:
         """Remove files without a record, unless another process may be building them."""
+        self._is_swept = True
         if not self._is_alone():
             return
         try:
@@ -156,6 +165,11 @@ class KnownGood:
                 with suppress(OSError):
                     os.unlink(self._folder / name)
             self._share()
+
+    def _now(self) -> int:
+        """Return the present time in ns, by the clock of the files."""
+        os.utime(self._handle if os.utime in os.supports_fd else self._folder / "in-use")
+        return os.fstat(self._handle).st_mtime_ns
 
     def _warn(self, text: str) -> None:
         if text not in self.warnings:

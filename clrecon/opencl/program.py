@@ -200,7 +200,9 @@ def _build(device: Device, name: str, options: tuple[str, ...]) -> Program:
     except (import_pyopencl().Error, RuntimeError, OSError) as error:  # OSError: from a cache
         raise DeviceError(f"cl/{name} does not build on {device.label}: {_first_complaint(str(error))}") from error
     if not program.kernel_names:
-        raise DeviceError(f"cl/{name} has no kernel on {device.label}: its cache is damaged, empty it")
+        if device.known_good is not None:
+            device.known_good.forget(_key(device, source, options))
+        raise DeviceError(f"cl/{name} has no kernel on {device.label}: its cache was damaged, run again")
     origin = "source" if kept is None else "a kept binary"
     log.debug("cl/%s %s built from %s in %.3f s", name, options, origin, time.perf_counter() - start)
     return program

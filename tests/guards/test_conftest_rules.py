@@ -105,7 +105,7 @@ import pytest
 from types import SimpleNamespace
 import clrecon.opencl
 names = ("CPU", "llvmpipe (LLVM 15.0.6, 256 bits)")
-same = {"platform": "p", "type": "cpu", "version": "", "driver": "", "is_simulator": False}
+same = {"platform": "p", "type": "cpu", "version": "", "driver": "", "is_simulator": False, "known_good": None}
 found = [SimpleNamespace(index=index, name=name, **same) for index, name in enumerate(names)]
 clrecon.opencl.list_devices = lambda: found
 @pytest.mark.parametrize("kind", ["int16", pytest.param("int8", marks=pytest.mark.first_device)])

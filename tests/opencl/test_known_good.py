@@ -184,6 +184,23 @@ def test_files_that_were_added_later_are_recorded_by_the_process_that_made_them(
     assert not build(store, tmp_path) and store.warnings == [UNFINISHED]
 
 
+def test_what_turned_out_wrong_is_forgotten(records, tmp_path):
+    store = records()
+    build(store, tmp_path)
+    store.record()
+    store.forget(KEY)
+    store.record()
+    store = records()
+    assert not build(store, tmp_path) and store.warnings == []
+
+
+def test_a_folder_that_is_removed_meanwhile_is_no_error(records, tmp_path):
+    store = records()
+    shutil.rmtree(tmp_path)
+    assert not build(store, tmp_path)
+    store.record()
+
+
 def test_what_another_process_is_building_stays(records, tmp_path):
     touch(tmp_path)
     (tmp_path / "tempfile_abc.so").write_bytes(b"")
