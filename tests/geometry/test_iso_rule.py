@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from uneven_volume import HEIGHTS, SIDEWAYS, uneven
 
 from clrecon.errors import NoSurfaceError, UsageError
 from clrecon.geometry import AIR_HU, Volume
-from clrecon.geometry.iso_rule import choose_iso_rule, vertex_margin
+from clrecon.geometry.iso_rule import choose_iso_rule, layer_margins, vertex_margin
 
 
 def make_volume(low: float, high: float, dtype: str = "int16") -> Volume:
@@ -135,3 +136,24 @@ def test_a_number_of_any_kind_is_one_level(level):
 def test_ranges_that_are_none_are_refused(level, below, words):
     with pytest.raises(UsageError, match=words):
         choose_iso_rule(make_volume(-1000, 900), level, below=below)
+
+
+@pytest.mark.parametrize("border", [0, 1])
+def test_each_layer_has_a_margin_of_four_steps_of_float32(border):
+    lengths = np.hypot(np.diff(HEIGHTS), 0.7 * np.diff(SIDEWAYS))  # columns are 0.7 mm apart
+    lengths = np.concatenate([lengths[:1]] * border + [lengths, lengths[-1:]] + [lengths[-1:]] * border)
+    # The largest coordinate is about 700 mm: from 512 to 1024 float32 comes in steps of 2^-14.
+    np.testing.assert_allclose(layer_margins(uneven(), border), 4.0 * 2.0**-14 / lengths, rtol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("level", "below", "inside"),
+    [
+        (200, False, [False, True, True, True, True]),
+        (200, True, [True, False, False, False, False]),
+        ([200, 300], False, [False, True, True, True, False]),
+    ],
+)
+def test_values_are_inside_up_to_the_ends(level, below, inside):
+    rule = choose_iso_rule(make_volume(-1000, 900), level, below=below)
+    assert rule.mark_inside(np.array([199, 200, 250, 300, 301])).tolist() == inside

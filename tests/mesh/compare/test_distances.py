@@ -104,3 +104,13 @@ def test_nothing_to_measure_is_refused():
         compare_meshes(Mesh([[0, 0, 0], [1, 1, 1]], [[0, 1, 1]]), plane)
     with pytest.raises(UsageError, match="at least 1 sample, not 0"):
         compare_meshes(plane, plane, samples=0)
+
+
+def test_the_triangles_around_each_of_several_vertices_count():
+    vertices, triangles = samples.box()
+    near = NearDistance(np.concatenate([vertices, [[5.0, 5.0, 5.0]]]), triangles)  # no triangle uses vertex 8
+    points = np.array([[3.0, 1.0, 1.0]] * 5)  # 2 mm from corner 7 and 3 mm from the face around corner 0
+    found, rows = near.find_around(points, np.array([[0, 7], [7, 0], [8, 7], [8, 8], [7, 8]]))
+    assert found.tolist() == [2.0, 2.0, 2.0, np.inf, 2.0]
+    assert (rows == -1).tolist() == [False, False, False, True, False]
+    assert all(7 in triangles[row] for row in rows[found == 2.0])
