@@ -10,7 +10,7 @@ from scipy.ndimage import binary_dilation, binary_erosion, distance_transform_ed
 
 from clrecon.errors import UsageError
 from clrecon.geometry import Volume, compose_affine
-from clrecon.labels.growth import Growth
+from clrecon.labels.growth import Growth, _checked
 from clrecon.mesh import Mesh
 from clrecon.reference.surface.extract import extract_isosurface
 from clrecon.reference.surface.labels import extract_label, find_solid, own_labels
@@ -226,3 +226,12 @@ def test_a_hole_at_the_end_of_the_volume_is_open_where_outside_is_beyond(closed,
     labels[8:13, 10:15, 10:15] = 0
     inside = find_solid(Volume(volume.voxels[:13], volume.affine), labels, 275, closed=closed, solid=(1,))
     assert np.count_nonzero(inside[8:13, 10:15, 10:15]) == filled
+
+
+@pytest.mark.parametrize("spacing", [(1.0, 1.0, 1.0), (0.5, 1.0, 2.0)])
+def test_growth_reaches_five_thousand_voxels(spacing):
+    volume = Volume(np.zeros((2, 2, 2), np.int16), np.diag((*spacing, 1.0)))
+    most = (5000.0 * 3.0 / (4.0 * np.pi)) ** (1.0 / 3.0)  # radius in mm of a ball of 5000 mm3
+    assert _checked(0.999 * most, volume) == 0.999 * most
+    with pytest.raises(UsageError, match="labels cannot grow by 10.6185 mm"):
+        _checked(1.001 * most, volume)

@@ -11,6 +11,7 @@ from label_files import OBLIQUE, make_labels
 from clrecon.errors import RefusedInputError, UsageError
 from clrecon.geometry import Volume
 from clrecon.labels import LabelMap, resample_labels
+from clrecon.labels.resample import _take_aligned
 
 VOXELS = make_labels((5, 7, 8))
 VOLUME = Volume(np.zeros((5, 7, 8), np.int16), OBLIQUE)
@@ -104,3 +105,21 @@ def test_an_empty_map_is_refused():
 def test_only_label_maps_and_volumes():
     with pytest.raises(UsageError, match="LabelMap, Volume"):
         resample_labels(VOXELS, VOLUME)
+
+
+def test_an_aligned_map_is_cut_out_and_the_same_grid_is_not_copied():
+    numbers = np.arange(60, dtype=np.int16).reshape(3, 4, 5)
+    labels = LabelMap(numbers, np.eye(4))
+
+    def taken(shape, shift):
+        affine = np.eye(4)
+        affine[:3, 3] = shift
+        return _take_aligned(labels, Volume(np.zeros(shape, np.int16), affine))
+
+    assert np.shares_memory(taken((3, 4, 5), (0, 0, 0)), labels.voxels)
+    np.testing.assert_array_equal(taken((2, 3, 4), (0, 0, 0)), numbers[:2, :3, :4])
+    np.testing.assert_array_equal(taken((2, 3, 4), (1, 1, 1)), numbers[1:, 1:, 1:])
+    np.testing.assert_array_equal(
+        taken((3, 4, 5), (0, 0, 1)), np.concatenate([numbers[1:], np.zeros_like(numbers[:1])])
+    )
+    assert taken((3, 4, 5), (0.5, 0, 0)) is None
