@@ -187,6 +187,7 @@ class KnownGood:
         try:
             fcntl.flock(self._handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError:
+            self._share()  # a lock that cannot be changed is lost
             return False
         return True
 

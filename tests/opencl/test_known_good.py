@@ -220,6 +220,18 @@ def test_what_another_process_is_building_stays(records, tmp_path):
     assert other._is_alone()
 
 
+@pytest.mark.skipif(sys.platform == "win32", reason="no locks of this kind")
+def test_a_process_that_asked_in_vain_still_counts(records, tmp_path):
+    """A lock that cannot be made exclusive is lost: it has to be taken again."""
+    first, second = records(), KnownGood(tmp_path)
+    try:
+        assert not second._is_alone()
+        assert not first._is_alone()
+    finally:
+        os.close(second._handle)
+    assert first._is_alone()
+
+
 def test_a_long_process_records_what_has_worked_for_some_seconds(records, tmp_path, monkeypatch):
     store = records()
     build(store, tmp_path)
