@@ -257,6 +257,8 @@ def run_campaign(schedule: Schedule | OneCase, *, seconds: float, seed: str = "1
                 campaign.add(worker.case, outcome)
                 if following is not None:
                     worker.give(following, seed)
+    except KeyboardInterrupt:
+        print("interrupted: what was run so far", file=sys.stderr)
     finally:
         for worker in workers:
             worker.process.kill()
