@@ -109,9 +109,9 @@ class _Filling:
         if not abs(low) + abs(high) < np.inf:
             raise RefusedInputError(f"{grid.name} is corrupt: {grid.place(k)} holds infinity, which is no CT number")
         whole = measured.dtype.kind != "f"
+        if not whole and max(abs(low), abs(high)) > float(np.finfo(np.float32).max):
+            raise RefusedInputError(f"{grid.name}: {grid.place(k)} goes from {low:g} to {high:g}, beyond float32")
         if not whole and (self._step == 2 or not np.array_equal(measured, np.rint(measured))):
-            if max(abs(low), abs(high)) > float(np.finfo(np.float32).max):
-                raise RefusedInputError(f"{grid.name}: {grid.place(k)} goes from {low:g} to {high:g}, beyond float32")
             return 2
         for step in range(self._step, 2):
             half = 1 << (8 * LADDER[step].itemsize - 1)

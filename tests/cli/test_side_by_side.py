@@ -40,7 +40,8 @@ def start(ct: Path, target: Path, device: Any, **variables: str) -> subprocess.P
 
 def finish(process: subprocess.Popen[str]) -> None:
     _, errors = process.communicate(timeout=300)
-    assert (process.returncode, errors) == (0, "")
+    own = [line for line in errors.splitlines() if not line.startswith("MESA: ")]  # a driver's own words
+    assert (process.returncode, own) == (0, [])
 
 
 def make_targets(folder: Path, extension: str) -> list[Path]:

@@ -167,6 +167,14 @@ def test_values_that_are_no_ct_numbers_are_refused(tmp_path, value, message, hol
         clrecon.read_volume(write_nrrd(tmp_path / "a.nrrd", voxels))
 
 
+def test_large_whole_numbers_are_refused_too(tmp_path):
+    """As numbers with a part: they were infinite voxels."""
+    voxels = make_ct().astype(np.float64)
+    voxels[2, 1, 1] = 1e300
+    with pytest.raises(RefusedInputError, match=r"slice 3 of 4 goes from .* beyond float32"):
+        clrecon.read_volume(write_nrrd(tmp_path / "a.nrrd", voxels))
+
+
 def test_nothing_but_nan_and_integers_beyond_32_bits_are_refused(tmp_path):
     with pytest.raises(RefusedInputError, match="all of its voxels are NaN"):
         clrecon.read_volume(write_nrrd(tmp_path / "a.nrrd", np.full((2, 3, 4), np.nan)))

@@ -80,7 +80,7 @@ def test_a_failed_write_leaves_both_old_files(
     mesh.write_bytes(b"old mesh")
     report.write_bytes(b"old report")
 
-    def fail(*_: Any) -> Any:
+    def fail(*_: Any, **__: Any) -> Any:
         raise OutputError("the disk is full")
 
     monkeypatch.setattr(fails, fail)

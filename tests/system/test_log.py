@@ -16,6 +16,7 @@ import clrecon
 from clrecon.jobs.mesh.job import make_mesh
 from clrecon.jobs.mesh.settings import MeshSettings
 from clrecon.opencl import binaries
+from clrecon.opencl.cache_folders import prepare_caches
 
 NAME = "Mueller^Hans"
 
@@ -53,12 +54,13 @@ def test_a_kept_binary_that_is_damaged_is_said(
     content: bytes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level(logging.INFO, "clrecon")
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    caches = prepare_caches()._replace(binaries=tmp_path)
+    monkeypatch.setattr(binaries, "prepare_caches", lambda: caches)
     assert binaries.read_binary("key") is None  # none is there: nothing to say
     binaries.store_binary("key", b"binary")
     assert binaries.read_binary("key") == b"binary"
     assert caplog.messages == []
-    (tmp_path / "clrecon" / "kernels" / "key").write_bytes(content)
+    (tmp_path / "key").write_bytes(content)
     assert binaries.read_binary("key") is None
     assert caplog.messages == ["a kept binary is damaged: it is built anew and replaced"]
 

@@ -97,6 +97,7 @@ OWN = {
     "system/control_groups.py": "the system",
     "system/memory.py": "the system",
     "opencl/binaries.py": "its own cache",
+    "opencl/known_good.py": "its own cache",
     "opencl/sources.py": "its own sources",
     "exchange/glb.py": "what it has just written",
     "exchange/obj.py": "what it has just written",
