@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 from dicom_series import Plan, make_dataset
-from hostile_bytes import Seed
+from hostile_bytes import Seed, apply_changes
 from label_files import make_labels, write_nifti, write_nrrd, write_seg
-from slices import answer_of, draw_change, harm
+from slices import answer_of, draw_change
 from trials import Answer, Trial, digest
 from volume_files import OBLIQUE, WRITERS, make_ct
 
@@ -135,7 +135,7 @@ def labels_trial(number: int, folder: Path, chance: random.Random) -> Trial:
     words = []
     if name.endswith(".dcm"):
         changes = [draw_change(chance) for _ in range(chance.randrange(1, 4))]
-        data = harm(Seed(name, data, (data,)), data, changes)
+        data = apply_changes(Seed(name, data, (data,)), data, changes)
         words = [f"{kind} {index} {what!r:.60}" for kind, index, what in changes]
     else:
         for _ in range(chance.randrange(1, 4)):

@@ -23,7 +23,7 @@ from hostile_bytes import (
     UIDS,
     VRS,
     Seed,
-    apply_change,
+    apply_changes,
     find_elements,
     make_phases,
     phantom_seeds,
@@ -213,7 +213,7 @@ def corpus() -> dict[str, Seed]:
 
 
 def draw_change(chance: random.Random) -> tuple[str, int, Any]:
-    """One change for `apply_change`."""
+    """One change for `apply_changes`."""
     kind = chance.choice(
         ["value", "value", "value", "raw value", "length", "vr", "tag", "insert", "delete", "copy", "to end", "cut"]
         + ["bytes", "bytes"]
@@ -250,15 +250,6 @@ def unharmed_seed(name: str) -> Answer:
             return Answer({})
 
 
-def harm(seed: Seed, data: bytes, changes: Sequence[tuple[str, int, Any]]) -> bytes:
-    """A file of the seed's series with changes; the element at an index is found anew for each."""
-    kin = Seed(seed.name, data, seed.series)
-    plain = kin.plain
-    for change in changes:
-        plain = apply_change(plain, find_elements(plain), *change)
-    return kin.pack(plain)
-
-
 def pixels_of(seed: Seed, data: bytes) -> bytes:
     """The bytes of the pixel data of an unharmed file."""
     plain = Seed(seed.name, data, seed.series).plain
@@ -284,7 +275,7 @@ def bytes_trial(number: int, folder: Path, chance: random.Random) -> Trial:
     files = list(seed.series)
     middle = len(files) // 2
     for k in range(len(files)) if scope == "all" else [middle]:
-        files[k] = harm(seed, files[k], changes)
+        files[k] = apply_changes(seed, files[k], changes)
     is_alone = scope == "alone" or len(files) == 1
     pixels = pixels_of(seed, seed.series[middle])
     kept = not is_alone and scope == "one" and holds(seed, files[middle], pixels)

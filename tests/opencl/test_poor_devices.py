@@ -8,11 +8,10 @@ import sys
 import numpy as np
 import pytest
 from ct_files import write_series
-from device_work import WORK
+from device_work import WORK, label_boxes
 from surface_volumes import smooth_volume
 
 from clrecon.cli.main import main
-from clrecon.labels import LabelMap
 from clrecon.opencl import Device, choose_device, kernel_files, memory_limits, read_kernel_source
 from clrecon.operators.resident.device_volume import DeviceVolume
 
@@ -84,9 +83,7 @@ def volume():
 
 @pytest.fixture(scope="module")
 def labels(volume):
-    numbers = np.zeros(volume.voxels.shape, np.uint8)
-    numbers[3:7, 4:12, 3:10], numbers[7:10, 4:12, 3:10] = 1, 2
-    return LabelMap(numbers, volume.affine)
+    return label_boxes(volume, np.s_[3:7, 4:12, 3:10], np.s_[7:10, 4:12, 3:10])
 
 
 @pytest.mark.parametrize(("size", "works"), [(1, ("surface",)), (7, ("surface", "labels", "dvr", "slice"))])

@@ -9,10 +9,11 @@ import numpy as np
 
 import clrecon
 from clrecon.geometry import Volume
+from clrecon.labels import LabelMap
 from clrecon.mesh import Mesh
 from clrecon.rendering import Rendering
 
-__all__ = ["SIZE", "WORK", "centre_line", "mesh_arrays"]
+__all__ = ["SIZE", "WORK", "centre_line", "label_boxes", "mesh_arrays"]
 
 SIZE = (24, 20)
 
@@ -20,6 +21,14 @@ SIZE = (24, 20)
 def centre_line(volume: Volume) -> Any:
     ni, nj, nk = volume.shape_ijk
     return volume.ijk_to_lps([(ni / 2, nj / 2, k) for k in np.linspace(1, nk - 2, 6)])
+
+
+def label_boxes(volume: Volume, *boxes: tuple[slice, ...]) -> LabelMap:
+    """Labels 1, 2 ... in boxes of voxels [k, j, i], on the grid of the volume."""
+    numbers = np.zeros(volume.voxels.shape, np.uint8)
+    for number, box in enumerate(boxes, start=1):
+        numbers[box] = number
+    return LabelMap(numbers, volume.affine)
 
 
 def values(picture: Rendering) -> list[Any]:

@@ -16,7 +16,6 @@ from typing import Any
 
 from dicom_series import Plan, make_dataset
 from enhanced_image import make_enhanced
-from hypothesis import strategies as st
 from pydicom.dataset import Dataset
 from pydicom.filereader import data_element_generator
 from pydicom.uid import (
@@ -244,22 +243,6 @@ BLOBS = [
     struct.pack("<HH2sH", 0x0009, 0x0010, b"LO", 3) + b"odd",
     b"\0" * 64, b"\xff" * 64,
 ]  # fmt: skip
-
-INDEX = st.integers(0, 10_000)
-CHANGES = st.one_of(
-    st.tuples(st.just("value"), INDEX, st.sampled_from(TEXTS + UIDS + NUMBERS)),
-    st.tuples(st.just("value"), INDEX, st.sampled_from(TEXTS + UIDS + NUMBERS)),
-    st.tuples(st.just("value"), INDEX, st.binary(max_size=12)),
-    st.tuples(st.just("raw value"), INDEX, st.sampled_from(NUMBERS) | st.binary(min_size=1, max_size=4)),
-    st.tuples(st.just("length"), INDEX, st.sampled_from(LENGTHS) | st.integers(-3, 3).map(lambda d: ("by", d))),
-    st.tuples(st.just("vr"), INDEX, st.sampled_from(VRS)),
-    st.tuples(st.just("tag"), INDEX, st.sampled_from(TAGS)),
-    st.tuples(st.just("insert"), INDEX, st.sampled_from(BLOBS)),
-    st.tuples(st.sampled_from(["delete", "copy", "to end"]), INDEX, INDEX),
-    st.tuples(st.just("cut"), INDEX, st.just(0)),
-    st.tuples(st.just("bytes"), INDEX, st.binary(min_size=1, max_size=8)),
-)  # fmt: skip
-CHANGE_LISTS = st.lists(CHANGES, min_size=1, max_size=4)
 
 
 def apply_changes(seed: Seed, data: bytes, changes: Sequence[tuple[str, int, Any]]) -> bytes:

@@ -18,17 +18,12 @@ from clrecon.errors import DeviceError
 from clrecon.jobs.selftest.check import Check
 from clrecon.opencl import Device
 
-__all__ = ["SILENT_SECONDS", "run_selftest"]
+__all__ = ["run_selftest"]
 
 COMMAND = ("-m", "clrecon.jobs.selftest.child")
 
-SILENT_SECONDS = 240.0
-"""Seconds without a line after which the process counts as hanging: far above the time to build the largest kernel."""
 
-
-def run_selftest(
-    device: Device, checks: Sequence[Check], *, silent_seconds: float = SILENT_SECONDS
-) -> Iterator[dict[str, Any]]:
+def run_selftest(device: Device, checks: Sequence[Check], *, silent_seconds: float) -> Iterator[dict[str, Any]]:
     """Run checks on `device` in a process of their own and yield each result at once.
 
     After a crash the checks that are left run in a new process.  After a hang they count as failed: each of them would
@@ -39,6 +34,7 @@ def run_selftest(
     device : Device
     checks : sequence of Check
     silent_seconds : float
+        Time without a line after which the process counts as hanging.
 
     Yields
     ------

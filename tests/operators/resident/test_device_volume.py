@@ -7,7 +7,7 @@ import pickle
 import numpy as np
 import pytest
 import tolerances
-from device_work import SIZE, WORK, centre_line
+from device_work import SIZE, WORK, centre_line, label_boxes
 from failing_devices import Failing
 from surface_volumes import OBLIQUE, smooth_volume
 
@@ -26,9 +26,7 @@ def volume():
 
 @pytest.fixture(scope="module")
 def labels(volume):
-    numbers = np.zeros(volume.voxels.shape, np.uint8)
-    numbers[3:12, 4:20, 5:30], numbers[12:20, 4:20, 5:30] = 1, 2
-    return LabelMap(numbers, volume.affine)
+    return label_boxes(volume, np.s_[3:12, 4:20, 5:30], np.s_[12:20, 4:20, 5:30])
 
 
 PICTURES = {"dvr", "dvr labels", "ray surface", "drr", "slices"}

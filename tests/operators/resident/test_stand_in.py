@@ -7,14 +7,13 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from device_work import SIZE, WORK, mesh_arrays
+from device_work import SIZE, WORK, label_boxes, mesh_arrays
 from failing_devices import Failing, lost_error, pretended_gpu
 from surface_volumes import smooth_volume
 from variants import all_but
 
 import clrecon
 from clrecon.errors import DeviceError, DeviceFailedError, DeviceMemoryError
-from clrecon.labels import LabelMap
 from clrecon.opencl import allocate, list_devices, take_device, work_on
 from clrecon.operators.resident.device_volume import DeviceVolume
 
@@ -30,9 +29,7 @@ def volume():
 
 @pytest.fixture(scope="module")
 def labels(volume):
-    numbers = np.zeros(volume.voxels.shape, np.uint8)
-    numbers[3:7, 4:12, 3:10], numbers[7:10, 4:12, 3:10] = 1, 2
-    return LabelMap(numbers, volume.affine)
+    return label_boxes(volume, np.s_[3:7, 4:12, 3:10], np.s_[7:10, 4:12, 3:10])
 
 
 @pytest.fixture
