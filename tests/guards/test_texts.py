@@ -14,6 +14,7 @@ from house import ROOT, project_files
 TEXT_SUFFIXES = (".py", ".cl", ".h", ".md", ".cfg", ".toml", ".cff", ".yaml", "run")
 FORBIDDEN = {
     "a path of one machine": re.compile(r"(?<![\w.])/(?:home|root|Users|wor" + r"k|tmp/\w+)/"),
+    "a mark of an unfinished merge": re.compile(r"^(?:<{7}|>{7})(?: |$)"),
     "an unfinished mark": re.compile(r"\b(?:TO" + r"DO|FIX" + r"ME|XX" + r"X|HA" + r"CK)\b"),
 }
 
@@ -100,7 +101,16 @@ def test_no_machine_paths_and_no_unfinished_marks() -> None:
     assert faults == []
 
 
-@pytest.mark.parametrize("line", ["x = 1  # TO" + "DO later", "open('/wor" + "k/main/a')", "see /ho" + "me/ann/x"])
+@pytest.mark.parametrize(
+    "line",
+    [
+        "x = 1  # TO" + "DO later",
+        "open('/wor" + "k/main/a')",
+        "see /ho" + "me/ann/x",
+        "<" * 7 + " HEAD",
+        ">" * 7 + " a1b2",
+    ],
+)
 def test_a_forbidden_line_is_found(line: str) -> None:
     assert len(find_forbidden(f"fine\n{line}\n")) == 1
 
