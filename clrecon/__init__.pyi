@@ -31,6 +31,8 @@ from clrecon.operators.surface.extract import extract_isosurface as extract_isos
 from clrecon.operators.surface.extract import extract_isosurfaces as extract_isosurfaces
 from clrecon.operators.surface.label_masks import extract_label_masks as extract_label_masks
 from clrecon.operators.surface.labels import extract_labels as extract_labels
+from clrecon.points import PointCloud as PointCloud
+from clrecon.points import PointStep as PointStep
 from clrecon.reading import list_series as list_series
 from clrecon.reading import read_volume as read_volume
 from clrecon.rendering import Lighting as Lighting

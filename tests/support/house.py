@@ -31,6 +31,7 @@ _layer("formats", "errors", "system", "geometry", "sources")
 _layer("reading", "errors", "system", "geometry", "sources", "dicom", "formats")
 _layer("labels", "errors", "system", "geometry", "dicom", "formats")
 _layer("mesh", "errors", "system", "geometry", "anatomy", "exchange")
+_layer("points", "errors", "system", "geometry", "exchange")
 _layer("rendering", "errors", "version", "system", "geometry", "labels")
 _layer("phantom", "errors", "version", "system", "geometry")
 _layer("reference", "errors", "geometry", "labels", "rendering")
@@ -68,6 +69,7 @@ _layer(
     "reading",
     "labels",
     "mesh",
+    "points",
     "rendering",
     "operators",
 )
@@ -82,6 +84,7 @@ AT_MODULE_LEVEL: dict[str, frozenset[str]] = {
     "sources": frozenset({"numpy"}),
     "labels": frozenset({"numpy"}),
     "mesh": frozenset({"numpy"}),
+    "points": frozenset({"numpy"}),
     "exchange": frozenset({"numpy"}),
     "reference": frozenset({"numpy"}),
     "rendering": frozenset({"numpy"}),

@@ -1,0 +1,198 @@
+"""`PointCloud`: points in LPS mm with what is known of each of them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, DTypeLike, NDArray
+
+from clrecon.errors import UsageError
+from clrecon.exchange.coordinates import as_stored
+from clrecon.geometry import frame_from_lps
+from clrecon.system.messages import Message
+
+__all__ = ["MOST_POINTS", "PointCloud"]
+
+MOST_POINTS = 2**31 - 1
+"""Most points of a cloud, so that their numbers fit a signed 32-bit integer."""
+
+
+def _rows(values: ArrayLike, name: str) -> NDArray[Any]:
+    array = np.asarray(values)
+    if array.size == 0 and array.ndim < 2:
+        array = array.reshape(0, 3)
+    if array.ndim != 2 or array.shape[1] != 3:
+        raise UsageError(f"{name} have shape (n, 3), these have {array.shape}")
+    if array.dtype.kind not in "fiu":
+        raise UsageError(f"{name} are numbers, these are {array.dtype}")
+    return array
+
+
+def _check_finite(points: NDArray[np.floating], name: str) -> None:
+    wrong = ~np.isfinite(points).all(axis=1)
+    if wrong.any():
+        raise UsageError(
+            f"{int(wrong.sum()):,} of {len(points):,} {name} are not finite, the first is number"
+            f" {int(np.flatnonzero(wrong)[0]):,}: remove them first"
+        )
+
+
+class PointCloud(Message):
+    """Points in the patient frame LPS, millimetres, with normals, HU, labels and voxel indices where they are known.
+
+    Parameters
+    ----------
+    points : array_like, shape (n, 3)
+        LPS mm, finite; kept as float32, without a copy when they are C-contiguous float32.  Others that reach 4096 mm
+        from the origin, where float32 would round them by more than 2e-4 mm, are kept as float64.
+    normals : array_like, shape (n, 3), optional
+        Unit vectors that point out of bone, LPS; kept as float32.
+    hu : array_like, shape (n,), optional
+        Hounsfield units; kept as float32.
+    labels : array_like, shape (n,), optional
+        Clusters or labels of a label map, whole numbers; -1 is noise.  Kept as int32.
+    ijk : array_like, shape (n, 3), optional
+        Voxel indices of points that are voxel centres; kept as int32.
+    report : dict, optional
+        Facts about the origin of this cloud, without patient data.  ``affine_ijk_to_lps_mm``, ``iso_value_hu`` and
+        ``certificate`` (the report of the volume) are written to the formats that have a place for them, as with a
+        `Mesh`.
+
+    Raises
+    ------
+    UsageError
+        A shape or type cannot be used, a coordinate is not finite, or an array has another length than `points`.
+    """
+
+    def __init__(
+        self,
+        points: ArrayLike,
+        normals: ArrayLike | None = None,
+        hu: ArrayLike | None = None,
+        labels: ArrayLike | None = None,
+        ijk: ArrayLike | None = None,
+        report: dict[str, Any] | None = None,
+    ):
+        self._points = as_stored(_rows(points, "points"))
+        if len(self._points) > MOST_POINTS:
+            raise UsageError(f"a cloud has at most {MOST_POINTS:,} points, this one has {len(self._points):,}")
+        _check_finite(self._points, "points")
+        self._normals = self._vectors(normals, "normals", np.float32)
+        if self._normals is not None:
+            _check_finite(self._normals, "normals")
+        self._hu = self._values(hu, "hu", np.float32, "fiu")
+        self._labels = self._values(labels, "labels", np.int32, "iu")
+        self._ijk = self._vectors(ijk, "ijk", np.int32)
+        self.report: dict[str, Any] = {} if report is None else report
+
+    def _vectors(self, values: ArrayLike | None, name: str, dtype: DTypeLike) -> NDArray[Any] | None:
+        if values is None:
+            return None
+        array = np.ascontiguousarray(_rows(values, name), dtype=dtype)
+        if len(array) != len(self._points):
+            raise UsageError(f"{len(array):,} {name} for {len(self._points):,} points: one a point is needed")
+        return array
+
+    def _values(self, values: ArrayLike | None, name: str, dtype: DTypeLike, kinds: str) -> NDArray[Any] | None:
+        if values is None:
+            return None
+        array = np.asarray(values)
+        if array.shape != (len(self._points),):
+            raise UsageError(f"{name} have shape ({len(self._points)},), one value a point; these have {array.shape}")
+        if array.size and array.dtype.kind not in kinds:
+            raise UsageError(f"{name} are {'numbers' if 'f' in kinds else 'whole numbers'}, these are {array.dtype}")
+        return np.ascontiguousarray(array, dtype=dtype)
+
+    @property
+    def points(self) -> NDArray[np.floating]:
+        """Positions in LPS mm, shape (n, 3), float32; float64 where they lie far from the origin."""
+        return self._points
+
+    @property
+    def normals(self) -> NDArray[np.float32] | None:
+        """Unit vectors out of bone, LPS, shape (n, 3), or None."""
+        return self._normals
+
+    @property
+    def hu(self) -> NDArray[np.float32] | None:
+        """Hounsfield units, shape (n,), or None."""
+        return self._hu
+
+    @property
+    def labels(self) -> NDArray[np.int32] | None:
+        """Cluster or label of each point, shape (n,), -1 for noise; or None."""
+        return self._labels
+
+    @property
+    def ijk(self) -> NDArray[np.int32] | None:
+        """Voxel indices, shape (n, 3), of points that are voxel centres; or None."""
+        return self._ijk
+
+    def __len__(self) -> int:
+        return len(self._points)
+
+    def __array__(self, dtype: DTypeLike | None = None, copy: bool | None = None) -> NDArray[Any]:
+        """Return the points as an array, for ``numpy.asarray(cloud)``."""
+        array = self._points if dtype is None else self._points.astype(dtype, copy=False)
+        return array.copy() if copy else array
+
+    def changed(self, **arrays: ArrayLike | None) -> PointCloud:
+        """Return a cloud with other `points`, `normals`, `hu`, `labels`, `ijk` or `report`; all else stays."""
+        own = {name: getattr(self, name) for name in ("points", "normals", "hu", "labels", "ijk", "report")}
+        unknown = arrays.keys() - own.keys()
+        if unknown:
+            raise UsageError(f"a cloud has no {sorted(unknown)[0]}: it has {', '.join(own)}")
+        return PointCloud(**{**own, "report": dict(self.report), **arrays})
+
+    def select(self, mask: ArrayLike) -> PointCloud:
+        """Return the cloud of some of the points.
+
+        Parameters
+        ----------
+        mask : array_like, shape (n,) bool, or (m,) of integers
+            Points to keep, or their numbers in the order wanted.
+
+        Raises
+        ------
+        UsageError
+            The mask does not fit the cloud.
+        """
+        chosen = np.asarray(mask)
+        if chosen.dtype == bool:
+            fits = chosen.shape == (len(self),)
+        else:
+            fits = chosen.ndim == 1 and (chosen.size == 0 or chosen.dtype.kind in "iu")
+            fits = fits and (chosen.size == 0 or (chosen.min() >= 0 and chosen.max() < len(self)))
+            chosen = chosen.astype(np.intp)
+        if not fits:
+            raise UsageError(
+                f"a selection of a cloud of {len(self):,} points is as many truth values or numbers of points below"
+                f" that, this is {chosen.dtype} of shape {chosen.shape}"
+            )
+        arrays = {name: getattr(self, name) for name in ("points", "normals", "hu", "labels", "ijk")}
+        return self.changed(**{name: values[chosen] for name, values in arrays.items() if values is not None})
+
+    def in_space(self, space: str) -> tuple[NDArray[np.floating], NDArray[np.float32] | None]:
+        """Return points and normals in another patient frame; the cloud itself is always LPS.
+
+        Parameters
+        ----------
+        space : {"lps", "ras"}
+            RAS negates x and y.
+
+        Returns
+        -------
+        points : ndarray, shape (n, 3), mm, of the type of `points`
+        normals : ndarray, shape (n, 3), float32, or None
+        """
+        signs = np.diag(frame_from_lps(space)).astype(np.float32)
+        if space.lower() == "lps":
+            return self._points, self._normals
+        # Adding 0 turns -0 into 0; text formats would show -0.
+        points = self._points * signs + np.float32(0)
+        return points, None if self._normals is None else self._normals * signs + np.float32(0)
+
+    def __repr__(self) -> str:
+        known = [name for name in ("normals", "hu", "labels", "ijk") if getattr(self, name) is not None]
+        return f"PointCloud({len(self)} points{', with ' if known else ''}{', '.join(known)}, LPS mm)"
