@@ -45,6 +45,11 @@ INVERSIONS: dict[str, dict[str, tuple[tuple[str, str], ...]]] = {
         "total": (("total[0] = before;", "total[0] = ~before;"),),
     },
     "scan_blocks": {"offsets": (("offsets[index] = offset;", "offsets[index] = ~offset;"),)},
+    "count_digits": {"counts": (("= histogram[digit];", "= ~histogram[digit];"),)},
+    "scatter_by_digit": {
+        "keys": (("sorted_keys[place] = key;", "sorted_keys[place] = ~key;"),),
+        "values": (("= numbered ? index : values[index];", "= ~(numbered ? index : values[index]);"),),
+    },
     "clear_labels": {"labels": (("= UNUSED;", "= ~UNUSED;"),)},
     "hook_corners": {"labels": (("min(corner.x, min(corner.y, corner.z))", "max(corner.x, max(corner.y, corner.z))"),)},
     "jump_labels": {"labels": ((": follow_labels(", ": n - 1 - follow_labels("),)},

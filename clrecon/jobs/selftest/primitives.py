@@ -1,4 +1,4 @@
-"""Checks of the primitives: scans, compaction, components."""
+"""Checks of the primitives: scans, compaction, sorting, components."""
 
 from __future__ import annotations
 
@@ -10,9 +10,11 @@ from clrecon.jobs.selftest.check import Check, require_equal
 from clrecon.jobs.selftest.scenes import random_integers
 from clrecon.opencl import Device, download, upload
 from clrecon.operators.primitives.compact import compact
+from clrecon.operators.primitives.radix_sort import radix_sort
 from clrecon.operators.primitives.scan import exclusive_scan
 from clrecon.operators.primitives.union_find import label_components
 from clrecon.reference.primitives import compact as compact_twin
+from clrecon.reference.primitives import radix_sort as sort_twin
 from clrecon.reference.primitives import scan as scan_twin
 from clrecon.reference.primitives import union_find as components_twin
 
@@ -43,6 +45,18 @@ def _check_compaction(device: Device) -> str:
     return "6 masks from 1 to 7,001 words equal"
 
 
+def _check_sort(device: Device) -> str:
+    for n, bits in ((1, 32), (4097, 11), (70_001, 9), (70_001, 32)):
+        keys = random_integers((n,), "uint32", 2**bits)
+        found = radix_sort(device, upload(device, keys), n, bits=bits)
+        expected, order = sort_twin.radix_sort(keys)
+        values = download(device, np.empty(n, np.uint32), found.values_d)
+        require_equal(values, order, f"order of {n:,} keys of {bits} bits")
+        sorted_keys = download(device, np.empty(n, np.uint32), found.keys_d)
+        require_equal(sorted_keys, expected, f"{n:,} sorted keys of {bits} bits")
+    return "4 arrays from 1 to 70,001 keys equal"
+
+
 def _check_components(device: Device) -> str:
     """Compare components of random triangles, and of a strip in random order: its labels take many passes."""
     for vertices, triangles in ((64, 30), (60_000, 25_000), (40_000, 45_000)):
@@ -66,6 +80,7 @@ def _require_components(
 CHECKS = (
     Check("exclusive_scan", ("sum_blocks", "scan_block_sums", "scan_blocks"), _check_scan),
     Check("compact", ("count_set_bits", "list_set_bits"), _check_compaction),
+    Check("radix_sort", ("count_digits", "scatter_by_digit"), _check_sort),
     Check(
         "label_components",
         (

@@ -1,1 +1,1 @@
-"""Primitives of other operators: scans, compaction and union-find."""
+"""Primitives of other operators: scans, compaction, sorting and union-find."""

@@ -1,0 +1,126 @@
+/* Stable sort of 32-bit keys with a 32-bit value each: least significant digit first.
+ *
+ * Reference: Zagha and Blelloch 1991, "Radix sort for vector multiprocessors": each worker counts the digits of its own
+ * chunk, and the offsets of a digit are in the order of the chunks, which keeps the sort stable.
+ *
+ * Keys of one digit of 2 bits, two chunks of four elements:
+ *
+ *      keys                2 0 3 0 | 1 2 0 3          values 0 1 2 3 | 4 5 6 7: the numbers of the elements
+ *      counts of digit 0   2       | 1                counts[digit][chunk], so that one scan gives all offsets
+ *                      1   0       | 1
+ *                      2   1       | 1
+ *                      3   1       | 1
+ *      offsets             0 2, 3 3, 4 5, 6 7
+ *      sorted values       1 3 | 6 || 4 || 0 | 5 || 2 | 7
+ *
+ * Passes, for each digit from the lowest
+ *   1. count_digits        digits of each chunk (then the exclusive scan of scan.cl)
+ *   2. scatter_by_digit    each element to its place
+ *
+ * A chunk is the work of one work-group.  With LANES 8, on a CPU, its first item does all of it in turn.  With LANES 1
+ * the items of a group take a row of RADIX_GROUP elements at a time: the rank of an element is the number of equal
+ * digits before it in the row. */
+#ifndef LANES
+#define LANES 1
+#endif
+#ifndef RADIX_GROUP
+#define RADIX_GROUP 64
+#endif
+#define RADIX_BITS 11
+#define RADIX_BINS 2048 /* 2^RADIX_BITS: 8 KB of local memory */
+#define NO_DIGIT 0xffffffffu
+
+/* Parameters  keys    in   (n,)
+ *             counts  out  (bins, chunks) number of keys with each digit in each chunk
+ *             n       elements;  shift: lowest bit of the digit;  bins: 2^bits of it, at most RADIX_BINS
+ *             per_chunk    elements of a chunk;  chunks = ceil(n / per_chunk)
+ * Launch      global = chunks * RADIX_GROUP, local = RADIX_GROUP
+ * Guarantees  every count is written */
+__kernel __attribute__((reqd_work_group_size(RADIX_GROUP, 1, 1)))
+void count_digits(
+    __global const uint *restrict keys, __global uint *restrict counts, const uint n, const uint shift,
+    const uint bins, const uint per_chunk, const uint chunks)
+{
+    __local uint histogram[RADIX_BINS];
+    const uint item = get_local_id(0), chunk = get_group_id(0);
+    const uint begin = chunk * per_chunk;
+    const uint end = begin + min(per_chunk, n - begin);
+#if LANES == 8
+    if (item == 0) {
+        for (uint digit = 0; digit < bins; ++digit)
+            histogram[digit] = 0;
+        for (uint index = begin; index < end; ++index)
+            ++histogram[keys[index] >> shift & (bins - 1)];
+        for (uint digit = 0; digit < bins; ++digit)
+            counts[(size_t)digit * chunks + chunk] = histogram[digit];
+    }
+#else
+    for (uint digit = item; digit < bins; digit += RADIX_GROUP)
+        histogram[digit] = 0;
+    barrier(CLK_LOCAL_MEM_FENCE);
+    for (uint index = begin + item; index < end; index += RADIX_GROUP)
+        atomic_inc(histogram + (keys[index] >> shift & (bins - 1)));
+    barrier(CLK_LOCAL_MEM_FENCE);
+    for (uint digit = item; digit < bins; digit += RADIX_GROUP)
+        counts[(size_t)digit * chunks + chunk] = histogram[digit];
+#endif
+}
+
+/* Parameters  keys           in   (n,)
+ *             values         in   (n,); not read where `numbered` is 1
+ *             offsets        in   (bins, chunks) exclusive scan of the counts
+ *             sorted_keys    out  (n,) by the digit, elements with equal digits in the order of the input
+ *             sorted_values  out  (n,) the value of each of them
+ *             numbered       1: the value of an element is its number
+ *             n shift bins per_chunk chunks    as in count_digits
+ * Launch      as count_digits
+ * Guarantees  every element is written once */
+__kernel __attribute__((reqd_work_group_size(RADIX_GROUP, 1, 1)))
+void scatter_by_digit(
+    __global const uint *restrict keys, __global const uint *restrict values, __global const uint *restrict offsets,
+    __global uint *restrict sorted_keys, __global uint *restrict sorted_values, const uint n, const uint shift,
+    const uint bins, const uint per_chunk, const uint chunks, const uint numbered)
+{
+    __local uint next[RADIX_BINS]; /* place of the next element with each digit */
+    const uint item = get_local_id(0), chunk = get_group_id(0);
+    const uint begin = chunk * per_chunk;
+    const uint end = begin + min(per_chunk, n - begin);
+#if LANES == 8
+    if (item == 0) {
+        for (uint digit = 0; digit < bins; ++digit)
+            next[digit] = offsets[(size_t)digit * chunks + chunk];
+        for (uint index = begin; index < end; ++index) {
+            const uint key = keys[index];
+            const uint place = next[key >> shift & (bins - 1)]++;
+            sorted_keys[place] = key;
+            sorted_values[place] = numbered ? index : values[index];
+        }
+    }
+#else
+    __local uint digits[RADIX_GROUP];
+    for (uint digit = item; digit < bins; digit += RADIX_GROUP)
+        next[digit] = offsets[(size_t)digit * chunks + chunk];
+    for (uint row = begin; row < end; row += RADIX_GROUP) {
+        const uint index = row + item;
+        const int inside = index < end;
+        const uint key = inside ? keys[index] : 0;
+        const uint digit = inside ? key >> shift & (bins - 1) : NO_DIGIT;
+        digits[item] = digit;
+        barrier(CLK_LOCAL_MEM_FENCE);
+        uint rank = 0, after = 0;
+        for (uint other = 0; other < RADIX_GROUP; ++other) {
+            const uint same = digits[other] == digit;
+            rank += same & (other < item);
+            after += same & (other > item);
+        }
+        const uint place = inside ? next[digit] + rank : 0;
+        barrier(CLK_LOCAL_MEM_FENCE);
+        if (inside && after == 0)
+            next[digit] = place + 1;
+        if (inside) {
+            sorted_keys[place] = key;
+            sorted_values[place] = numbered ? index : values[index];
+        }
+    }
+#endif
+}
