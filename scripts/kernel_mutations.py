@@ -167,6 +167,14 @@ INVERSIONS: dict[str, dict[str, tuple[tuple[str, str], ...]]] = {
     "smooth_rows": {"sums": (("convert_ushort16(sum), 0", "(ushort)WHOLE - convert_ushort16(sum), 0"),)},
     "smooth_across": {"occupancy": (("as_short16(sum * (ushort)FINENESS)", "-as_short16(sum * (ushort)FINENESS)"),)},
     "classify_mask": {"mask": BITS},
+    "clear_cells": {"mask": (("mask[word] = 0;", "mask[word] = ~0u;"),)},
+    "mark_cells": {"mask": (("1u << (cell.x & 31)", "~(1u << (cell.x & 31))"),)},
+    "count_marked": {"counts": (("= popcount(mask[word]);", "= 32 - popcount(mask[word]);"),)},
+    "number_points": {"keys": (("keys[point] = ", "keys[point] = ~"),)},
+    "gather_points": {
+        "points": (("= point.x;", "= -point.x;"), ("= point.y;", "= -point.y;"), ("= point.z;", "= -point.z;")),
+        "starts": (("starts[cell] = place;", "starts[cell] = ~place;"), ("= n;", "= ~n;")),
+    },
     "sum_volumes": {"sums": (("sums[item] = sum;", "sums[item] = -sum;"),)},
 }
 """For each kernel what it stores, and the texts of its file that are replaced to invert that."""

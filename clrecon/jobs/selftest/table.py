@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from clrecon.jobs.selftest import labels, pictures, primitives, rays, reformat, resident, surface
+from clrecon.jobs.selftest import labels, pictures, points, primitives, rays, reformat, resident, surface
 from clrecon.jobs.selftest.check import Check
 
 __all__ = ["CHECKS", "checks_of"]
@@ -15,6 +15,7 @@ CHECKS: tuple[Check, ...] = (
     *rays.CHECKS,
     *pictures.CHECKS,
     *reformat.CHECKS,
+    *points.CHECKS,
 )
 
 

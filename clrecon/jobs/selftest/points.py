@@ -1,0 +1,45 @@
+"""Checks of what is made of clouds of points: the grid."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clrecon.jobs.selftest.check import Check, require_equal
+from clrecon.opencl import Device, download
+from clrecon.operators.points.grid import make_grid
+from clrecon.reference.points import grid as grid_twin
+
+__all__ = ["CHECKS"]
+
+
+def _scattered(n: int) -> NDArray[np.float32]:
+    """Return points in a box of 60 x 40 x 30 mm, one in twenty of them twice."""
+    points = np.random.default_rng(23).random((n, 3), np.float32) * np.array([60, 40, 30], np.float32)
+    points[n // 2 : n // 2 + n // 20] = points[: n // 20]
+    return points
+
+
+def _check_grid(device: Device) -> str:
+    points = _scattered(20_000)
+    for edge in (0.5, 2.3):
+        made, twin = make_grid(device, points, edge), grid_twin.make_grid(points, edge)
+        what = f"of a grid of {edge} mm"
+        require_equal(made.cells, len(twin.starts) - 1, f"the number of cells {what}")
+        for name, buffer, expected in (
+            ("mask", made.mask_d, twin.mask),
+            ("ranks", made.ranks_d, twin.ranks),
+            ("starts", made.starts_d, twin.starts),
+            ("order", made.order_d, twin.order),
+            *zip("xyz", (made.x_d, made.y_d, made.z_d), twin.points.T, strict=True),
+        ):
+            found = download(device, np.empty(expected.shape, expected.dtype), buffer)
+            require_equal(found, expected, f"{name} {what}")
+    return "2 grids over 20,000 points equal"
+
+
+CHECKS = (
+    Check(
+        "grid of points", ("clear_cells", "mark_cells", "count_marked", "number_points", "gather_points"), _check_grid
+    ),
+)

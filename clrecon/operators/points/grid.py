@@ -1,0 +1,314 @@
+"""Grids over free points: points sorted by cubic cells; the host's side of cl/points/grid.cl."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from clrecon.errors import DeviceError, DeviceMemoryError, UsageError
+from clrecon.geometry.precision import is_far
+from clrecon.opencl import (
+    Device,
+    Program,
+    Stopwatch,
+    allocate,
+    describe_shortage,
+    kernel_constant,
+    kernel_number,
+    launch,
+    load_program,
+    memory_limits,
+    upload,
+    wait,
+)
+from clrecon.operators.primitives.radix_sort import prepare_sort, radix_sort, sort_bytes
+from clrecon.operators.primitives.scan import exclusive_scan
+
+__all__ = [
+    "CELL_ROUNDING",
+    "MOST_CELLS",
+    "MOST_CELLS_ALONG",
+    "GridPlan",
+    "PointGrid",
+    "fill_grid",
+    "make_grid",
+    "plan_grid",
+    "prepare_grid",
+]
+
+MARKED_TOGETHER = kernel_constant("points/grid.cl", "MARKED_TOGETHER")
+"""Points a work-item of mark_cells on a CPU."""
+
+MOST_CELLS = 2**31
+"""Most cells of a grid, with and without points."""
+
+MOST_CELLS_ALONG = 2**17
+"""Most cells along an axis: float32 then places a point to 0.03 of a cell."""
+
+CELL_ROUNDING = kernel_number("points/grid.h", "GRID_ROUNDING")
+"""A point may lie outside of its cell by this share of its distance from the grid's origin: float32 chose the cell."""
+
+_CHUNK = 256
+"""Points that numpy compares together: reductions of rows of three numbers are slow."""
+
+
+@dataclass(frozen=True, eq=False)
+class GridPlan:
+    """A grid before its points are sorted: all that is known without a device.
+
+    Attributes
+    ----------
+    points : ndarray, shape (n, 3), float32
+        mm relative to `base`.
+    base : ndarray, shape (3,), float64
+        LPS mm: whole millimetres near the centre of a far cloud, see `clrecon.geometry.precision`, else zeros.
+    corner : ndarray, shape (3,), float32
+        Corner of cell (0, 0, 0) relative to `base`: the lowest coordinates less 1e-3 of the edge.
+    edge : numpy.float32
+        Edge of the cells in mm.
+    shape : (nx, ny, nz)
+    """
+
+    points: NDArray[np.float32]
+    base: NDArray[np.float64]
+    corner: NDArray[np.float32]
+    edge: np.float32
+    shape: tuple[int, int, int]
+
+    @property
+    def words(self) -> int:
+        """Words of 32 cells in a row along x."""
+        return -(-self.shape[0] // 32)
+
+    @property
+    def total_words(self) -> int:
+        """Words of all rows."""
+        return self.words * self.shape[1] * self.shape[2]
+
+    def needs(self, device: Device) -> dict[str, int]:
+        """Return the bytes that `fill_grid` takes at most, by description; the grid itself is what it keeps of them."""
+        n = len(self.points)
+        sorting = 4 * n + sort_bytes(device, n, _bits(n))
+        gathering = 8 * n + 12 * n + 4 * (n + 1)
+        return {
+            "points": self.points.nbytes,
+            "sorted points": max(sorting, gathering),
+            "cells of the grid": 8 * self.total_words,
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class PointGrid:
+    """A grid over points on a device: cubic cells, the points sorted by cell; cl/points/grid.h shows how it is read.
+
+    Attributes
+    ----------
+    device : Device
+    n : int
+        Number of points.
+    edge : float
+        Edge of the cells in mm, a float32.
+    origin : ndarray, shape (3,), float64
+        LPS mm of the corner of cell (0, 0, 0).
+    base : ndarray, shape (3,), float64
+        LPS mm; coordinates on the device are relative to it.
+    shape : (nx, ny, nz)
+        Number of cells; at most 2^31 in all, and 2^17 along an axis.
+    words : int
+        Words of 32 cells in a row along x.
+    mask_d : buffer, (nz, ny, words) uint32
+        A bit for each cell with points.
+    ranks_d : buffer, (nz, ny, words) uint32
+        Number of cells with points before each word.
+    cells : int
+        Number of cells with points.
+    starts_d : buffer, (cells + 1,) uint32
+        First sorted point of each cell with points, then `n`.
+    order_d : buffer, (n,) uint32
+        Number of the point at each place of the sorted order; points of a cell are in the order of the input.
+    x_d, y_d, z_d : buffer, (n,) float32
+        Sorted coordinates in mm relative to `base`.
+    """
+
+    device: Device
+    n: int
+    edge: float
+    origin: NDArray[np.float64]
+    base: NDArray[np.float64]
+    shape: tuple[int, int, int]
+    words: int
+    mask_d: Any
+    ranks_d: Any
+    cells: int
+    starts_d: Any
+    order_d: Any
+    x_d: Any
+    y_d: Any
+    z_d: Any
+
+    @property
+    def origin_and_scale(self) -> tuple[float, float, float, float]:
+        """The float4 of kernels: the origin relative to `base`, and 1 / edge as float32."""
+        x, y, z = (float(value) for value in self.origin - self.base)
+        return x, y, z, float(np.float32(1.0) / np.float32(self.edge))
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of the grid on the device."""
+        return 16 * self.n + 4 * (self.cells + 1) + 8 * self.words * self.shape[1] * self.shape[2]
+
+
+def _bits(numbers: int) -> int:
+    """Return the bits of whole numbers below `numbers`."""
+    return max(numbers - 1, 0).bit_length()
+
+
+def _find_box(points: NDArray[np.floating]) -> NDArray[np.floating]:
+    """Return the lowest and the highest coordinates, shape (2, 3)."""
+    whole = len(points) // _CHUNK * _CHUNK
+    parts = [points[whole:]]
+    if whole:
+        rows = points[:whole].reshape(-1, 3 * _CHUNK)
+        parts = [*parts, rows.min(axis=0).reshape(-1, 3), rows.max(axis=0).reshape(-1, 3)]
+    corners = np.concatenate(parts)
+    return np.stack([corners.min(axis=0), corners.max(axis=0)])
+
+
+def plan_grid(points: ArrayLike, edge: float) -> GridPlan:
+    """Lay a grid over points.
+
+    Parameters
+    ----------
+    points : array_like, shape (n, 3), float32 or float64
+        LPS mm, or a `PointCloud`; at least one point.
+    edge : float
+        Edge of the cells in mm.
+
+    Raises
+    ------
+    UsageError
+        There is no point, a coordinate is not finite, or the cells are too small for the box of the points.
+    """
+    places = np.asarray(points)
+    if places.ndim != 2 or places.shape[1] != 3 or len(places) == 0:
+        raise UsageError(f"a grid is laid over points of shape (n, 3), at least one, not {places.shape}")
+    if not (np.isfinite(edge) and np.float32(edge) >= np.finfo(np.float32).tiny):
+        raise UsageError(f"cells of {edge:g} mm: their edge is a positive number of mm")
+    places = np.ascontiguousarray(places, dtype=None if places.dtype == np.float32 else np.float64)
+    box = _find_box(places)
+    if not np.isfinite(box).all():
+        wrong = int((~np.isfinite(places).all(axis=1)).sum())
+        raise UsageError(f"{wrong:,} of {len(places):,} points are not finite: remove them first")
+    base = np.rint(box.astype(np.float64).mean(axis=0)) if is_far(box) else np.zeros(3)
+    if places.dtype != np.float32 or base.any():
+        places, box = (places - base).astype(np.float32), (box - base).astype(np.float32)
+    cell = np.float32(edge)
+    corner = (box[0].astype(np.float64) - 1e-3 * float(cell)).astype(np.float32)
+    shape = _count_cells(box, corner, cell)
+    return GridPlan(places, base, corner, cell, shape)
+
+
+def _count_cells(box: NDArray[np.float32], corner: NDArray[np.float32], edge: np.float32) -> tuple[int, int, int]:
+    """Return the cells along each axis, counted as the kernels place points.
+
+    Raises
+    ------
+    UsageError
+        There are too many.
+    """
+    with np.errstate(over="ignore"):
+        last = np.floor((box[1] - corner) * (np.float32(1.0) / edge)).astype(np.float64)
+    counts = [int(min(value, 2.0**62)) + 1 for value in last]
+    if max(counts) > MOST_CELLS_ALONG or math.prod(counts) > MOST_CELLS:
+        size = " x ".join(f"{float(length):.6g}" for length in box[1].astype(np.float64) - box[0])
+        raise UsageError(
+            f"cells of {float(edge):.6g} mm: the box of the points, {size} mm, has"
+            f" {' x '.join(f'{count:,}' for count in counts)} of them, possible are {MOST_CELLS:,} in all and"
+            f" {MOST_CELLS_ALONG:,} along an axis: take larger cells, or remove points that lie far from all others"
+        )
+    return counts[0], counts[1], counts[2]
+
+
+def prepare_grid(device: Device) -> Program:
+    """Build the kernels of `make_grid`."""
+    prepare_sort(device)
+    return load_program(device, "points/grid.cl", {"LANES": device.kernel_variants["LANES"]})
+
+
+def make_grid(
+    device: Device, points: ArrayLike, edge: float, *, memory: int | None = None, stopwatch: Stopwatch | None = None
+) -> PointGrid:
+    """Sort points by the cubic cells of a grid: `plan_grid`, then `fill_grid`.
+
+    Parameters
+    ----------
+    device : Device
+    points : array_like, shape (n, 3), float32 or float64
+        LPS mm, or a `PointCloud`; at least one point.
+    edge : float
+        Edge of the cells in mm.
+    memory : int, optional
+        Bytes that may be taken on the device; None is all of its memory.
+    stopwatch : Stopwatch, optional
+
+    Returns
+    -------
+    PointGrid
+        Equal on every device, and to `clrecon.reference.points.grid.make_grid`.
+
+    Raises
+    ------
+    UsageError
+        As `plan_grid`.
+    DeviceMemoryError
+        The device has no room for the grid.
+    DeviceError
+        The device fails.
+    """
+    return fill_grid(device, plan_grid(points, edge), memory=memory, stopwatch=stopwatch)
+
+
+def fill_grid(
+    device: Device, plan: GridPlan, *, memory: int | None = None, stopwatch: Stopwatch | None = None
+) -> PointGrid:
+    """Sort the points of a plan by cells; see `make_grid`."""
+    shortage = describe_shortage(memory_limits(device, memory), plan.needs(device))
+    if shortage:
+        raise DeviceMemoryError(f"the points cannot be sorted by cells: {shortage}")
+    program, n, total = prepare_grid(device), len(plan.points), plan.total_words
+    (nx, ny, nz), words = plan.shape, plan.words
+    scale = np.float32(1.0) / plan.edge
+    where = {"origin": (*map(float, plan.corner), float(scale)), "n": n, "nx": nx, "ny": ny, "nz": nz, "words": words}
+    points_d, mask_d, ranks_d = upload(device, plan.points), allocate(device, 4 * total), allocate(device, 4 * total)
+
+    def run(kernel: str, items: int, **arguments: Any) -> None:
+        launch(device, program[kernel], items, stopwatch=stopwatch, **arguments)
+
+    run("clear_cells", total, mask=mask_d, total=total)
+    together = MARKED_TOGETHER if int(device.kernel_variants["LANES"]) > 1 else 1
+    run("mark_cells", -(-n // together), points=points_d, mask=mask_d, **where)
+    run("count_marked", total, mask=mask_d, counts=ranks_d, total=total)
+    cells = exclusive_scan(device, ranks_d, total, in_place=True, stopwatch=stopwatch).total
+    if not 1 <= cells <= n:
+        raise DeviceError(f"{device.label} computes wrongly: {n:,} points in {cells:,} cells")
+    keys_d = allocate(device, 4 * n)
+    run("number_points", n, points=points_d, mask=mask_d, ranks=ranks_d, keys=keys_d, **where)
+    by_cell = radix_sort(device, keys_d, n, bits=_bits(cells), stopwatch=stopwatch)
+    wait(device)  # what the sort used is free then
+    del keys_d
+    x_d, y_d, z_d = (allocate(device, 4 * n) for _ in range(3))
+    starts_d = allocate(device, 4 * (cells + 1))
+    run(
+        "gather_points", n,
+        points=points_d, keys=by_cell.keys_d, order=by_cell.values_d, x=x_d, y=y_d, z=z_d, starts=starts_d, n=n,
+        cells=cells,
+    )  # fmt: skip
+    origin = plan.base + plan.corner.astype(np.float64)
+    return PointGrid(
+        device, n, float(plan.edge), origin, plan.base, plan.shape, words, mask_d, ranks_d, cells, starts_d,
+        by_cell.values_d, x_d, y_d, z_d,
+    )  # fmt: skip
