@@ -43,6 +43,7 @@ from clrecon.rendering.movies.movie import turntable_cameras as turntable_camera
 from clrecon.rendering.movies.movie import write_animation as write_animation
 from clrecon.rendering.pictures.styles import CurveCut as CurveCut
 from clrecon.rendering.pictures.styles import PlaneCut as PlaneCut
+from clrecon.rendering.pictures.styles import PointLook as PointLook
 from clrecon.rendering.pictures.styles import Projection as Projection
 from clrecon.rendering.pictures.styles import SlicesInSpace as SlicesInSpace
 from clrecon.rendering.pictures.styles import Style as Style

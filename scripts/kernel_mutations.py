@@ -117,6 +117,16 @@ INVERSIONS: dict[str, dict[str, tuple[tuple[str, str], ...]]] = {
         "image": (("= finish_color(", "= (uchar4)(255) - finish_color("),),
         "depths": (("NAN : first_hit + r.offset", "NAN : -first_hit - r.offset"),),
     },
+    "clear_splats": {
+        "keys": (("keys[pixel] = EMPTY;", "keys[pixel] = 0u;"),),
+        "numbers": (("numbers[pixel] = EMPTY;", "numbers[pixel] = 0u;"),),
+    },
+    "splat_depths": {"keys": (("atomic_min(keys", "atomic_max(keys"),)},
+    "splat_numbers": {"numbers": (("first + (uint)point", "~(first + (uint)point)"),)},
+    "shade_splats": {
+        "image": (("= finish_color((float4)(color", "= (uchar4)(255) - finish_color((float4)(color"),),
+        "depths": (("? depth * length_of_ray : depth;", "? -depth * length_of_ray : -depth;"),),
+    },
     "reformat_rows": {
         "values": (("values[pixel] = value;", "values[pixel] = -value;"),),
         "weights": (("weights[pixel] = weight;", "weights[pixel] = -weight;"),),

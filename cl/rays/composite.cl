@@ -224,7 +224,7 @@ static inline void load_sights(__global const float4 *states, const int2 first_p
 /* Parameters  voxels   in   (slices, nj, ni)
  *             ways     in   (bk, bj, bi) how far nothing shows, see rays/look_ahead.h
  *             colors opacities clears changes factors  in  (NODES) each, (GRADIENT_NODES), see looks
- *             highlights in (HIGHLIGHTS) see rays/phong.h
+ *             highlights in (HIGHLIGHTS) see rays/shade.h
  *             entries  in   (tile rows, tile columns) t before which nothing shows, MAXFLOAT: nothing does
  *             view     in   see rays/view.h
  *             states   in/out  (height, width, 2) float4: premultiplied rgba; t of the first hit, sum of w t, -, -

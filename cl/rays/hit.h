@@ -4,6 +4,7 @@
 
 #include "rays/field.h"
 #include "rays/phong.h"
+#include "rays/shade.h"
 
 /* Differences per index step, interpolated within the slices below and above a place: central differences of voxels,
  * half a one-sided difference at the border.  Returns the share of the slice above. */
@@ -60,31 +61,11 @@ static inline float find_differences(const field *f, const float3 place, float4 
     return at_k - (float)k;
 }
 
-/* `color` of a surface with LPS gradient `gradient`, seen along unit vector `direction`; places without a gradient
- * keep ambient and diffuse light. */
+/* `color` of a surface with LPS gradient `gradient`, seen along unit vector `direction`, see rays/shade.h. */
 static inline float3 shade(__global const float4 *view, __global const float *highlights,
     const float3 color, const float3 gradient, const float3 direction)
 {
-    const float4 phong = view[VIEW_PHONG];
-    const float size = dot(gradient, gradient);
-    if (size < 1e-12f)
-        return min(color * (phong.x + phong.y), 1.0f);
-    const float4 fixed_light = view[VIEW_LIGHT];
-    const float3 normal = gradient * (1.0f / sqrt(size));
-    const float3 light = fixed_light.w > 0.0f ? fixed_light.xyz : -direction;
-    const float along = dot(normal, light);
-    if (along * dot(normal, direction) >= 0.0f)
-        return min(color * phong.x, 1.0f); /* light and viewer on different sides */
-    float highlight_angle = fabs(along);
-    const float diffuse = phong.y * highlight_angle;
-    if (fixed_light.w > 0.0f) {
-        const float3 middle = light - direction;
-        highlight_angle = fabs(dot(normal, middle)) / sqrt(max(dot(middle, middle), 1e-12f));
-    }
-    const float entry = min(highlight_angle, 1.0f) * (HIGHLIGHTS - 1);
-    const int at = min((int)entry, HIGHLIGHTS - 2);
-    const float highlight = highlights[at] + (entry - (float)at) * (highlights[at + 1] - highlights[at]);
-    return min(color * (phong.x + diffuse) + highlight, 1.0f);
+    return shade_place(view[VIEW_PHONG], view[VIEW_LIGHT], highlights, color, gradient, direction);
 }
 
 #endif

@@ -4,10 +4,9 @@
 #define CLRECON_PHONG_H
 
 #include "rays/field.h"
+#include "rays/shade.h"
 #include "rays/stack.h"
 #include "rays/view.h"
-
-#define HIGHLIGHTS 1024 /* entries of a table of specular * cosine ^ power: library powers take 0.2 us on CPU drivers */
 
 /* Highlight of LANES cosines of 0 to 1, and their squares: specular * cosine ^ power. */
 static inline floats find_highlight(

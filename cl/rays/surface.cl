@@ -248,7 +248,7 @@ static inline int pass_label(
  *             view     in   see rays/view.h; the box goes one index step beyond the outermost voxel centres
  *             normals  in   (planes) unit normals of the clip planes, LPS
  *             labels   in   (slices, nj, ni), label_colors (numbers) in: with LABELS alone, see rays/label_color.h
- *             highlights in (HIGHLIGHTS) see rays/phong.h
+ *             highlights in (HIGHLIGHTS) see rays/shade.h
  *             states   in/out  (height, width, 2) float4: premultiplied rgba; t of the first hit, sum of w t, label
  *                           that the ray passes through or OUT, -
  *             image    out  (height, width) rgba

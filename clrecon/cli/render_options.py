@@ -20,7 +20,7 @@ from clrecon.cli.render_values import (
     parse_window,
 )
 from clrecon.errors import UsageError
-from clrecon.jobs.render.settings import VIEWS, LabelLook, RenderSettings, Turntable, describe_modes
+from clrecon.jobs.render.settings import POINT_COLORS, VIEWS, LabelLook, RenderSettings, Turntable, describe_modes
 
 __all__ = [
     "add_camera",
@@ -72,7 +72,19 @@ def add_looks(parser: argparse.ArgumentParser) -> None:
         metavar="HU",
         help="iso value of mode surface, inside is HU and above (default: 200)",
     )
-    group.add_argument("--color", metavar="C", help="colour of a surface, such as orange or #ff8000 (default: bone)")
+    group.add_argument(
+        "--color",
+        metavar="C",
+        help="colour of a surface or of points, such as orange or #ff8000 (default: bone); of points also"
+        f" {', '.join(POINT_COLORS)} (default: label, else hu, where points have them)",
+    )
+    group.add_argument(
+        "--point-radius",
+        dest="radius_mm",
+        type=float,
+        metavar="MM",
+        help="of points, which are discs (default: their mean spacing)",
+    )
     group.add_argument(
         "--window",
         type=parse_window,
@@ -199,7 +211,10 @@ def render_settings(options: argparse.Namespace) -> RenderSettings:
     UsageError
         `RenderSettings.of` refuses a value.
     """
+    named = options.color in POINT_COLORS
     given = pick(options, RenderSettings.keywords()) | {
+        "color": None if named else options.color,
+        "color_by": options.color if named else None,
         "views": tuple(view for views in options.view for view in views),
         "thickness": options.thickness or None,  # 0 is the same as no thickness
         "offset_mm": options.offset_mm or None,

@@ -9,6 +9,7 @@ from clrecon.system.wording import Speaker, in_python
 __all__ = ["speaker_of"]
 
 _DESTINATIONS = {
+    "color_by": "color",
     "direction": "light",
     "grow_mm": "grow",
     "half_way": "hu",

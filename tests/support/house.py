@@ -35,7 +35,7 @@ _layer("points", "errors", "system", "geometry", "exchange")
 _layer("rendering", "errors", "version", "system", "geometry", "labels")
 _layer("phantom", "errors", "version", "system", "geometry")
 _layer("reference", "errors", "geometry", "labels", "rendering")
-_layer("operators", "errors", "system", "opencl", "geometry", "anatomy", "labels", "mesh", "rendering")
+_layer("operators", "errors", "system", "opencl", "geometry", "anatomy", "labels", "mesh", "points", "rendering")
 _layer(
     "jobs",
     "errors",

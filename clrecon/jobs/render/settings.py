@@ -20,7 +20,17 @@ from clrecon.rendering.looks.transfer_function import TransferFunction
 from clrecon.rendering.movies.movie import turntable_cameras
 from clrecon.rendering.pictures.annotations import SMALLEST_SIDE
 from clrecon.rendering.pictures.modes import MODES, check_known, choose_mode, keywords_of, make_style
-from clrecon.rendering.pictures.styles import SPINE, CurveCut, PlaneCut, SlicesInSpace, Style, SurfaceLook, VolumeLook
+from clrecon.rendering.pictures.styles import (
+    POINT_COLORS,
+    SPINE,
+    CurveCut,
+    PlaneCut,
+    PointLook,
+    SlicesInSpace,
+    Style,
+    SurfaceLook,
+    VolumeLook,
+)
 from clrecon.rendering.views.camera import Camera
 from clrecon.rendering.views.clip import Clip
 from clrecon.rendering.views.directions import DIRECTIONS, checked_size
@@ -29,6 +39,7 @@ from clrecon.rendering.views.plane import find_plane
 __all__ = [
     "DEFAULT_SIZE",
     "LabelLook",
+    "POINT_COLORS",
     "RenderSettings",
     "Turntable",
     "VIEWS",
@@ -257,7 +268,7 @@ class RenderSettings(InputSettings):
         style = self.style
         if function is not None and isinstance(style, VolumeLook | SlicesInSpace):
             style = replace(style, transfer_function=function)
-        if self.light is not None and isinstance(style, VolumeLook | SurfaceLook):
+        if self.light is not None and isinstance(style, VolumeLook | SurfaceLook | PointLook):
             made_for = style.function.lighting if isinstance(style, VolumeLook) else None
             style = replace(style, lighting=_turn_light(self.light, made_for or Lighting()))
         if curve is not None and isinstance(style, CurveCut):

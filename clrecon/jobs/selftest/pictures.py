@@ -15,10 +15,12 @@ from clrecon.labels import LabelMap
 from clrecon.opencl import Device
 from clrecon.operators.rays.ray_pictures import take_picture
 from clrecon.operators.rays.slices import overlay_slices
+from clrecon.operators.rays.splats import draw_splats
 from clrecon.operators.rays.surface import cast_surface
 from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.reference.rays.render import cast_rays
 from clrecon.reference.rays.slices import overlay_slices as overlay_twin
+from clrecon.reference.rays.splats import find_splats, shade_splats
 from clrecon.reference.rays.surface import cast_surface as surface_twin
 from clrecon.rendering import UNSHADED, Lighting, Rendering, TransferFunction
 from clrecon.rendering.pictures.styles import Projection, SlicesInSpace, SurfaceLook, VolumeLook
@@ -200,6 +202,27 @@ def _check_slices(device: Device) -> str:
     return f"3 pictures of {SIZE[0]} x {SIZE[1]} pixels within {worst:.1f} of 255"
 
 
+def _check_points(device: Device) -> str:
+    """Draw a ball of points, with normals and without: each pixel shows the point that the twin finds."""
+    rng, radius, worst = np.random.default_rng(25), 0.6, 0.0
+    normals = rng.normal(size=(3000, 3))
+    normals /= np.linalg.norm(normals, axis=1)[:, None]
+    points, colors = (6.0 * normals).astype(np.float32), rng.integers(0, 256, (3000, 4)).astype(np.uint8)
+    for perspective, own in ((False, None), (True, normals.astype(np.float32))):
+        scale = {"view_angle": 9.0} if perspective else {"parallel_scale": 7.0}
+        camera = Camera((-30.0, -80.0, 25.0), (0.3, 0.2, 0.1), (0.1, 0.2, 1.0), **scale)
+        found = draw_splats(device, points, colors, own, camera, SIZE, radius, lighting=FIXED)
+        require_equal(found.parts, 1, "parts of a cloud of 3,000 points")
+        depth, numbers = find_splats(points, camera, SIZE, radius)
+        apart = round(radius / camera.pixel_mm(SIZE))
+        rgba, far = shade_splats(depth, numbers, colors[:, :3] / 255.0, own, camera, FIXED, apart)
+        require_equal(found.image[..., 3] > 0, numbers >= 0, "pixels with a point")
+        require_close(found.depth, far, DEPTH_MM, "depths of points, in mm")
+        away = np.abs(_premultiplied(found.image) - 255.0 * rgba).max(axis=-1)
+        worst = max(worst, require_close(away, np.zeros_like(away), COLOR_255, "colours of points, of 255"))
+    return f"2 pictures of {SIZE[0]} x {SIZE[1]} pixels within {worst:.1f} of 255"
+
+
 PREPARED = ("measure_cells", "mark_bricks", "spread_in_rows", "spread_along")
 RENDERED = (*PREPARED, "enter_tiles", "look_ahead", "composite_rays")
 PROJECTED = ("measure_cells", "project_rays")
@@ -269,4 +292,5 @@ CHECKS = (
     _check("surfaces of uneven slices", TRACED, _check_surfaces, "UNEVEN", uneven=True),
     _check("labels on surfaces", TRACED, _check_surface_labels, "LABELS"),
     Check("slices in space", ("overlay_slices",), _check_slices),
+    Check("points as discs", ("clear_splats", "splat_depths", "splat_numbers", "shade_splats"), _check_points),
 )

@@ -15,7 +15,7 @@ from clrecon.rendering.looks.colors import find_color
 
 __all__ = ["HIGHLIGHTS", "PictureBuffers", "count_queues", "highlight_table"]
 
-HIGHLIGHTS = kernel_constant("rays/phong.h", "HIGHLIGHTS")
+HIGHLIGHTS = kernel_constant("rays/shade.h", "HIGHLIGHTS")
 """Entries of the table of highlights."""
 
 

@@ -11,18 +11,22 @@ import numpy as np
 
 from clrecon.errors import UsageError
 from clrecon.geometry import Volume
+from clrecon.geometry.grid import Grid
 from clrecon.opencl import Device
+from clrecon.operators.rays.point_pictures import PointPictures
 from clrecon.operators.rays.ray_pictures import take_picture
 from clrecon.operators.rays.slices import overlay_slices
 from clrecon.operators.rays.surface import cast_surface
 from clrecon.operators.reformat.cut import cut_slice, reformat_curve
 from clrecon.operators.resident.device_volume import DeviceVolume, take_volume
+from clrecon.points import PointCloud
 from clrecon.rendering import Rendering
 from clrecon.rendering.looks.colors import is_transparent
 from clrecon.rendering.pictures.modes import check_known, find_style
 from clrecon.rendering.pictures.styles import (
     CurveCut,
     PlaneCut,
+    PointLook,
     Projection,
     SlicesInSpace,
     Style,
@@ -113,16 +117,9 @@ class VolumeRenderer:
     ) -> Rendering:
         """Make one picture, see the function `render`."""
         style = find_style(style, look)
-        if not (camera is None or isinstance(camera, Camera)):
-            raise UsageError(f"the camera of a picture is a Camera or None, not {type(camera).__name__}")
-        for keyword, value in (("zoom", zoom), ("view_angle", view_angle)):
-            if value is not None:
-                check_known(style.mode, keyword)
-        if camera is not None:
-            if isinstance(style, CurveCut):
-                raise UsageError("a curved reformation has no camera: view and up say which way one looks at it")
-            _check_alone(view=view, up=up, zoom=zoom, view_angle=view_angle)
-        place = _Place(camera, DEFAULT_VIEW if view is None else view, up, 1.0 if zoom is None else zoom, view_angle)
+        if isinstance(style, PointLook):
+            raise UsageError("mode points shows a point cloud, and this is a volume: make a cloud of it first")
+        place = _Place.checked(style, camera, view, up, zoom, view_angle)
         if isinstance(style, CurveCut):
             return self._reformat(style, place, size, background, progress)
         size = checked_size(DEFAULT_SIZE if size is None else size)
@@ -193,7 +190,29 @@ class _Place(NamedTuple):
     zoom: float
     view_angle: float | None
 
-    def camera_for(self, volume: Volume, size: tuple[int, int]) -> Camera:
+    @classmethod
+    def checked(
+        cls,
+        style: Style,
+        camera: Camera | None,
+        view: str | Sequence[float] | None,
+        up: str | Sequence[float] | None,
+        zoom: float | None,
+        view_angle: float | None,
+    ) -> _Place:
+        """Refuse what has no meaning in the style's mode or beside a camera."""
+        if not (camera is None or isinstance(camera, Camera)):
+            raise UsageError(f"the camera of a picture is a Camera or None, not {type(camera).__name__}")
+        for keyword, value in (("zoom", zoom), ("view_angle", view_angle)):
+            if value is not None:
+                check_known(style.mode, keyword)
+        if camera is not None:
+            if isinstance(style, CurveCut):
+                raise UsageError("a curved reformation has no camera: view and up say which way one looks at it")
+            _check_alone(view=view, up=up, zoom=zoom, view_angle=view_angle)
+        return cls(camera, DEFAULT_VIEW if view is None else view, up, 1.0 if zoom is None else zoom, view_angle)
+
+    def camera_for(self, volume: Grid, size: tuple[int, int]) -> Camera:
         """Return the given camera, or one made from the other parameters."""
         if self.camera is not None:
             return self.camera
@@ -208,8 +227,31 @@ def _check_alone(**placing: Any) -> None:
         raise UsageError(f"a camera says by itself where a picture is taken from: leave out {them}, or the camera")
 
 
+def _render_cloud(
+    cloud: PointCloud,
+    style: Style | str | None,
+    device: Device | str | int | None,
+    memory: int | None,
+    size: Sequence[int] | None,
+    background: str | Sequence[float],
+    progress: Progress | None,
+    look: dict[str, object],
+    **placing: Any,
+) -> Rendering:
+    """Make a picture of a cloud, whose mode is points."""
+    named = "points" if style is None and "mode" not in look else style
+    chosen = find_style(named, look)
+    if not isinstance(chosen, PointLook):
+        raise UsageError(f"a point cloud is shown in mode points, not in mode {chosen.mode}")
+    place = _Place.checked(chosen, **placing)
+    size = checked_size(DEFAULT_SIZE if size is None else size)
+    with PointPictures(cloud, device=device, memory=memory) as pictures:
+        ground = None if is_transparent(background) else background
+        return pictures.take(chosen, place.camera_for(pictures.box, size), size, ground, progress)
+
+
 def render(
-    volume: Volume | DeviceVolume,
+    volume: Volume | DeviceVolume | PointCloud,
     style: Style | str | None = None,
     *,
     camera: Camera | None = None,
@@ -224,18 +266,20 @@ def render(
     progress: Progress | None = None,
     **look: object,
 ) -> Rendering:
-    """Make a picture of a volume.
+    """Make a picture of a volume or of a point cloud.
 
     >>> render(volume, SurfaceLook(300, color="orange"), view="left", size=(800, 600))
     >>> render(volume, preset="spine", view=(30, 15))
     >>> render(volume, "mip", window=(0, 1000))
+    >>> render(cloud, color_by="label", view="left")
 
     Parameters
     ----------
-    volume : Volume
+    volume : Volume, DeviceVolume or PointCloud
     style : Style or str, optional
-        What the picture shows: a `VolumeLook`, `Projection`, `SurfaceLook`, `SlicesInSpace`, `PlaneCut` or `CurveCut`;
-        or the name of a mode, see `clrecon.rendering.pictures.modes.MODES`.  Default: volume rendering of bone.
+        What the picture shows: a `VolumeLook`, `Projection`, `SurfaceLook`, `SlicesInSpace`, `PlaneCut` or `CurveCut`,
+        of a point cloud a `PointLook`; or the name of a mode, see `clrecon.rendering.pictures.modes.MODES`.  Default:
+        volume rendering of bone, and of a cloud its points.
     camera : Camera, optional
         In place of `view`, `up`, `zoom` and `view_angle`, which are refused beside it.
     view : str or (azimuth, elevation), optional
@@ -268,6 +312,11 @@ def render(
     DeviceError
         No device, not enough memory, or the device fails.
     """
+    if isinstance(volume, PointCloud):
+        return _render_cloud(
+            volume, style, device, memory, size, background, progress, look,
+            camera=camera, view=view, up=up, zoom=zoom, view_angle=view_angle,
+        )  # fmt: skip
     with VolumeRenderer(volume, device=device, memory=memory) as renderer:
         return renderer.render(
             style, camera=camera, view=view, up=up, zoom=zoom, view_angle=view_angle, size=size,

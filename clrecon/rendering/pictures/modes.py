@@ -11,6 +11,7 @@ from clrecon.rendering.looks.presets import find_preset
 from clrecon.rendering.pictures.styles import (
     CurveCut,
     PlaneCut,
+    PointLook,
     Projection,
     SlicesInSpace,
     Style,
@@ -39,20 +40,22 @@ MODES = {
     "slices": Mode(SlicesInSpace, "slices of the scan in space, translucent, each where it lies"),
     "slice": Mode(PlaneCut, "a plane through the volume in any direction, as thick as wanted"),
     "cpr": Mode(CurveCut, "curved planar reformation along a centre line"),
+    "points": Mode(PointLook, "the points of a cloud, coloured by HU, label or what was removed"),
 }
 
 _RAYS = ("dvr", "mip", "minip", "mean", "drr", "surface", "slices")
+_CAMERAS = (*_RAYS, "points")
 
 _BESIDE = {
-    "preset": tuple(mode for mode in MODES if mode != "surface"),
+    "preset": tuple(mode for mode in MODES if mode not in ("surface", "points")),
     "transfer_function": ("mip", "minip", "mean", "drr"),
     "lighting": ("mip", "minip", "mean", "drr", "slices"),
-    "zoom": (*_RAYS, "slice"),
-    "view_angle": _RAYS,
-    "letters": (*_RAYS, "slice"),
-    "depth": ("dvr", "mip", "minip", "surface", "slices", "slice"),
+    "zoom": (*_CAMERAS, "slice"),
+    "view_angle": _CAMERAS,
+    "letters": (*_CAMERAS, "slice"),
+    "depth": ("dvr", "mip", "minip", "surface", "slices", "slice", "points"),
     "values": ("mip", "minip", "mean", "drr", "slice", "cpr"),
-    "turntable": _RAYS,
+    "turntable": _CAMERAS,
 }
 """Keywords that are not fields of a style, and the modes in which each is allowed.
 
@@ -93,7 +96,8 @@ def check_known(mode: str, keyword: str, called: str | None = None) -> None:
 def choose_mode(mode: str | None = None, preset: str | None = None, **look: object) -> str:
     """Choose the mode that names and keywords ask for: a name of `MODES`.
 
-    Without `mode` an iso value means a surface, a curve means a curved reformation, and a preset means its own mode.
+    Without `mode` an iso value means a surface, a curve means a curved reformation, a radius of points or what they are
+    coloured by means points, and a preset means its own mode.
     The default is volume rendering.
 
     Raises
@@ -109,6 +113,8 @@ def choose_mode(mode: str | None = None, preset: str | None = None, **look: obje
         return "surface"
     if look.get("curve") is not None:
         return "cpr"
+    if look.get("color_by") is not None or look.get("radius_mm") is not None:
+        return "points"
     return "dvr" if preset is None else find_preset(preset).mode
 
 

@@ -78,7 +78,8 @@ SAME: dict[str, tuple[Style, dict[str, Any]]] = {
 
 
 def test_every_mode_is_drawn() -> None:
-    assert {style.mode for style, _ in SAME.values()} == set(MODES)
+    of_clouds = {"points"}  # tests/operators/rays/test_splats.py
+    assert {style.mode for style, _ in SAME.values()} == set(MODES) - of_clouds
 
 
 @pytest.mark.parametrize("name", SAME)

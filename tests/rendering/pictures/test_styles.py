@@ -17,6 +17,7 @@ from clrecon.rendering.pictures.modes import MODES, check_known, find_style, key
 from clrecon.rendering.pictures.styles import (
     CurveCut,
     PlaneCut,
+    PointLook,
     Projection,
     SlicesInSpace,
     Style,
@@ -81,6 +82,14 @@ WRONG: dict[type[Style], Wrong] = {
         "lowest_hu": [("air", "lowest HU"), (np.nan, "lowest HU")],
         "clip": RAYS["clip"],
     },
+    PointLook: {
+        "radius_mm": [(0.0, "the radius of points is a length in mm"), (np.nan, "radius"), (TWO, "radius")],
+        "color_by": [("depth", "one of hu, label, removed, not 'depth'"), (TWO, "coloured by")],
+        "color": [("octarine", "unknown colour 'octarine'"), (TWO, "colour")],
+        "window": [((5, 5), "window")],
+        "lighting": LABELLED["lighting"],
+        "clip": RAYS["clip"],
+    },
     PlaneCut: {**CUTS, "offset_mm": [(np.nan, "offset of a slice"), (np.inf, "offset"), (TWO, "offset")]},
     CurveCut: {
         **CUTS,
@@ -131,6 +140,11 @@ def test_two_that_exclude_each_other_are_refused() -> None:
         SlicesInSpace(window=(0, 9), transfer_function=GLASS)
     with pytest.raises(UsageError, match="angle turns straightened pictures"):
         CurveCut(LINE, kind="stretched", angle=5.0)
+    with pytest.raises(UsageError, match="one colour or are coloured by hu, not both"):
+        PointLook(color="red", color_by="hu")
+    for look in ({"color": "red"}, {"color_by": "label"}):
+        with pytest.raises(UsageError, match="colour the points by them"):
+            PointLook(window=(0, 1), **look)
     with pytest.raises(UsageError, match="label 2 L2 is named twice"):
         VolumeLook(labels=LABELS, label_colors={"L2": "red", 2: "blue"})
     with pytest.raises(UsageError, match="no label 'L9'|L9"):
@@ -178,6 +192,9 @@ ASKED: dict[str, tuple[dict[str, Any], Style]] = {
     "a plane": ({"mode": "slice", "offset_mm": 2.0, "combine": "max"}, PlaneCut(offset_mm=2.0, combine="max")),
     "a kind of curve": ({"mode": "cpr", "cpr": "stretched"}, CurveCut(kind="stretched")),
     "a curve": ({"curve": "spine"}, CurveCut()),
+    "points": ({"mode": "points", "window": (0, 9)}, PointLook(window=(0.0, 9.0))),
+    "a radius of points": ({"radius_mm": 2}, PointLook(radius_mm=2.0)),
+    "a colour of points": ({"color_by": "label"}, PointLook(color_by="label")),
     "the look of a series": (
         {"mode": "mean", "transfer_function": GLASS, "lighting": Lighting(), "shadows": False, "labels": None},
         Projection("mean"),

@@ -1,0 +1,278 @@
+"""Pictures of point clouds: one cloud on a device, any number of pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from types import TracebackType
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clrecon.errors import UsageError
+from clrecon.geometry.affine import Float64Array
+from clrecon.geometry.grid import Grid
+from clrecon.opencl import Device, Stopwatch, check_memory, take_device, work_on
+from clrecon.operators.rays.splats import LARGEST_DISC, draw_splats
+from clrecon.points import PointCloud
+from clrecon.points.spacing import mean_spacing
+from clrecon.rendering import Rendering
+from clrecon.rendering.looks.colors import find_color
+from clrecon.rendering.looks.label_style import distinct_colors
+from clrecon.rendering.looks.window import choose_window
+from clrecon.rendering.pictures.styles import PointLook
+from clrecon.rendering.views.camera import Camera
+from clrecon.system.progress import Progress
+
+__all__ = ["PointPictures", "cloud_box"]
+
+LONE_POINT_MM = 1.0
+"""Radius of the discs of clouds that have no spacing; of others it is their mean spacing, which leaves few gaps."""
+
+NOISE_COLOR, KEPT_COLOR, PLAIN_COLOR = "#707070", "#a0a0a0", "bone"
+
+MOST_NAMED = 24
+"""Most entries of a legend; those with the most points."""
+
+
+def cloud_box(cloud: PointCloud, margin: float = 0.0) -> Grid:
+    """Return the box of a cloud as a grid of one voxel, which `Camera.fit` places a camera for.
+
+    Parameters
+    ----------
+    cloud : PointCloud
+    margin : float
+        Mm that the box is larger on every side.
+
+    Raises
+    ------
+    UsageError
+        The cloud has no points.
+    """
+    if not len(cloud):
+        raise UsageError("the cloud has no points: there is nothing to show")
+    low, high = (np.asarray(end(axis=0), dtype=np.float64) for end in (cloud.points.min, cloud.points.max))
+    affine = np.diag([*np.maximum(high - low + 2.0 * margin, 1e-3), 1.0])
+    affine[:3, 3] = 0.5 * (low + high)
+    return Grid(np.zeros((1, 1, 1), np.int8), affine)
+
+
+class _Colors(NamedTuple):
+    """Colours (n, 4) uint8 of points, what they show, and what they mean."""
+
+    table: NDArray[np.uint8]
+    color_by: str
+    legend: list[dict[str, Any]]
+    left_out: int
+    window: tuple[float, float] | None
+
+
+class PointPictures:
+    """A cloud of points of which pictures are made one after the other.
+
+    Use it as a context manager, or `close` it.
+
+    Parameters
+    ----------
+    cloud : PointCloud
+        Its arrays must not change as long as this object is open.
+    device : Device, str or int, optional
+        See `clrecon.device`; None is the best of the machine.
+    memory : int, optional
+        Bytes that may be taken on the device; a cloud over it goes through in parts.
+
+    Raises
+    ------
+    UsageError
+        The cloud has no points, or `memory` is not a number of bytes.
+    DeviceError
+        The device does not exist.
+    """
+
+    def __init__(self, cloud: PointCloud, *, device: Device | str | int | None = None, memory: int | None = None):
+        check_memory(memory)
+        self.box = cloud_box(cloud)
+        self.cloud, self.memory = cloud, memory
+        self._device = take_device(device)
+        self._spacing: float | None = None
+        self._colors: tuple[PointLook, _Colors] | None = None
+        self._base: Float64Array | None = None
+        points = cloud.points
+        if points.dtype != np.float32:
+            self._base = np.rint(self.box.affine[:3, 3])
+            points = (points - self._base).astype(np.float32)
+        self._points: NDArray[np.float32] = points
+
+    def __enter__(self) -> PointPictures:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Free what was made for the pictures."""
+        self._colors = None
+
+    @property
+    def device(self) -> Device:
+        """The device that works."""
+        return self._device.current
+
+    def take(
+        self,
+        style: PointLook,
+        camera: Camera,
+        size: tuple[int, int],
+        background: str | Sequence[float] | None = None,
+        progress: Progress | None = None,
+    ) -> Rendering:
+        """Take one picture.
+
+        Parameters
+        ----------
+        style : PointLook
+        camera : Camera
+        size : (width, height)
+        background : str or (float, float, float), optional
+            None: transparent.
+        progress : callable, optional
+            Called as ``progress("points", done, total)``.
+
+        Raises
+        ------
+        UsageError
+            The cloud has not what it is to be coloured by, or discs cover too many pixels.
+        DeviceError
+            Not enough memory, or the device fails.
+        """
+        radius = self._radius(style)
+        colors = self._colors_of(style)
+        cloud, points = self.cloud, self._points
+        table, normals = colors.table, cloud.normals
+        if style.clip is not None:
+            kept = style.clip.contains(cloud.points)
+            points, table = points[kept], table[kept]
+            normals = None if normals is None else normals[kept]
+        stopwatch = Stopwatch()
+
+        def draw(device: Device, told: list[str]) -> Rendering:
+            found = draw_splats(
+                device, points, table, normals, camera, size, radius, base=self._base, lighting=style.light,
+                background=background, memory=self.memory, progress=progress, stopwatch=stopwatch,
+            )  # fmt: skip
+            report = {
+                "mode": "points",
+                "device": device.label,
+                "driver": device.driver,
+                "points": len(points),
+                "radius_mm": radius,
+                "color_by": colors.color_by,
+                "legend": colors.legend,
+                "legend_left_out": colors.left_out,
+                "window_hu": colors.window,
+                "shading": found.shading,
+                "slabs": found.parts,
+                "seconds": dict(stopwatch.seconds),
+                "kernel_seconds": dict(stopwatch.by_kernel),
+                "warnings": [*device.warnings, *told, *_warn_of_radius(radius, camera, size)],
+            }
+            return Rendering(found.image, found.depth, found.depth, camera, None, "points", report)
+
+        return work_on(self._device, draw)
+
+    def _radius(self, style: PointLook) -> float:
+        if style.radius_mm is not None:
+            return style.radius_mm
+        if self._spacing is None:
+            self._spacing = mean_spacing(self._points)
+        return self._spacing or LONE_POINT_MM
+
+    def _colors_of(self, style: PointLook) -> _Colors:
+        if self._colors is None or self._colors[0] != style:
+            self._colors = style, _color_points(self.cloud, style)
+        return self._colors[1]
+
+
+def _warn_of_radius(radius: float, camera: Camera, size: tuple[int, int]) -> list[str]:
+    pixels = radius / camera.pixel_mm(size)
+    if pixels <= LARGEST_DISC:
+        return []
+    return [
+        f"discs of {radius:.3g} mm are {pixels:.0f} pixels in radius: they are drawn with {LARGEST_DISC:g}, which is"
+        f" {radius * LARGEST_DISC / pixels:.3g} mm"
+    ]
+
+
+def _color_points(cloud: PointCloud, style: PointLook) -> _Colors:
+    """Choose the colour of each point.
+
+    Raises
+    ------
+    UsageError
+        The cloud has not what it is to be coloured by.
+    """
+    by = style.color_by
+    if by is None and style.color is None:
+        if cloud.labels is not None:
+            by = "label"
+        elif cloud.hu is not None and cloud.hu.min() < cloud.hu.max():
+            by = "hu"
+    if by in ("label", "removed"):
+        if cloud.labels is None:
+            raise UsageError(f"the cloud has no labels to colour it by: {by} needs them")
+        return _color_by_label(cloud, cloud.labels, by == "removed")
+    if by == "hu":
+        if cloud.hu is None:
+            raise UsageError("the cloud has no HU to colour it by")
+        window = choose_window(cloud.hu) if style.window is None else (float(style.window[0]), float(style.window[1]))
+        share = np.clip((cloud.hu - np.float32(window[0])) * np.float32(255.0 / (window[1] - window[0])), 0, 255)
+        grey = np.rint(share).astype(np.uint8)
+        return _Colors(_rows(grey, grey, grey), by, [], 0, window)
+    color = np.rint(255.0 * find_color(PLAIN_COLOR if style.color is None else style.color)).astype(np.uint8)
+    return _Colors(np.broadcast_to(np.append(color, np.uint8(255)), (len(cloud), 4)), "none", [], 0, None)
+
+
+def _rows(*channels: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    table = np.full((len(channels[0]), 4), 255, np.uint8)
+    for number, channel in enumerate(channels):
+        table[:, number] = channel
+    return table
+
+
+def _color_by_label(cloud: PointCloud, labels: NDArray[np.int32], removed: bool) -> _Colors:
+    """Colour points by label; with `removed` by the reason for which each was removed, 0 being those that are kept."""
+    numbers, places, counts = _count_labels(labels)
+    grey = numbers <= 0 if removed else numbers < 0
+    palette = np.tile(find_color(KEPT_COLOR if removed else NOISE_COLOR), (len(numbers), 1))
+    palette[~grey] = distinct_colors(int(np.count_nonzero(~grey)))
+    levels = np.rint(255.0 * palette).astype(np.uint8)
+    names: Mapping[Any, Any] = cloud.report.get("label_names") or {}
+    said = {-1: "noise"} if not removed else {0: "kept"}
+    order = sorted(np.argsort(-counts, kind="stable")[:MOST_NAMED].tolist())
+    legend = [
+        {
+            "label": int(numbers[place]),
+            "name": names.get(int(numbers[place])) or names.get(str(numbers[place])) or said.get(int(numbers[place])),
+            "color": "#" + bytes(levels[place]).hex(),
+            "points": int(counts[place]),
+        }
+        for place in order
+    ]
+    table = np.concatenate([levels, np.full((len(levels), 1), 255, np.uint8)], axis=1)
+    return _Colors(table[places], "removed" if removed else "label", legend, len(numbers) - len(order), None)
+
+
+def _count_labels(
+    labels: NDArray[np.int32],
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+    """Return the labels that occur, ascending, the place of each point's label among them, and their counts."""
+    low, high = int(labels.min()), int(labels.max())
+    if high - low > 1 << 24:
+        numbers, places, counts = np.unique(labels, return_inverse=True, return_counts=True)
+        return numbers.astype(np.int64), places.astype(np.int64), counts.astype(np.int64)
+    offsets = labels - np.int32(low)
+    by_number = np.bincount(offsets, minlength=high - low + 1)
+    there = by_number > 0
+    return np.flatnonzero(there) + low, (np.cumsum(there) - 1)[offsets], by_number[there]
