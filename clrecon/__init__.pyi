@@ -33,6 +33,7 @@ from clrecon.operators.surface.label_masks import extract_label_masks as extract
 from clrecon.operators.surface.labels import extract_labels as extract_labels
 from clrecon.points import PointCloud as PointCloud
 from clrecon.points import PointStep as PointStep
+from clrecon.points.reader import read_points as read_points
 from clrecon.reading import list_series as list_series
 from clrecon.reading import read_volume as read_volume
 from clrecon.rendering import Lighting as Lighting

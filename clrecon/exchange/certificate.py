@@ -10,12 +10,15 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterable, Iterator, Mapping
+from itertools import islice
 from typing import Any
 
-__all__ = ["LINE_LENGTH", "certificate_lines"]
+__all__ = ["LINES_READ", "LINE_LENGTH", "certificate_lines", "plain_lines"]
 
 LINE_LENGTH = 256
 """Longest line.  Readers of PLY keep comments in buffers of fixed size; a widely used one has 1024 bytes."""
+LINES_READ = 64
+"""Most lines that are taken over from a file: no certificate of ours has more."""
 WARNINGS_WRITTEN = 20
 RUNS_WRITTEN = 12
 _NUMBERS = (
@@ -47,6 +50,11 @@ def certificate_lines(report: Mapping[str, Any], *, keep_ids: bool = False) -> t
         Empty if nothing is known.
     """
     return tuple(_plain(line) for line in (*_facts(report, keep_ids), *_faults(report)))
+
+
+def plain_lines(lines: Iterable[object]) -> tuple[str, ...]:
+    """Return lines that a file had, at most `LINES_READ` of them, in the form that `certificate_lines` gives them."""
+    return tuple(_plain(str(line)) for line in islice(lines, LINES_READ))
 
 
 def _facts(report: Mapping[str, Any], keep_ids: bool) -> Iterator[str]:

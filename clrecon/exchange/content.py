@@ -1,27 +1,29 @@
-"""The input of a writer: a mesh in the frame in which it is written, and the facts that the file may contain."""
+"""The input of a writer: points in the frame in which they are written, and the facts that the file may contain."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.errors import OutputError
+from clrecon.exchange.certificate import certificate_lines, plain_lines
+from clrecon.geometry import frame_from_lps
 
-__all__ = ["Content", "Writable", "refuse_file"]
+__all__ = ["Content", "PointContent", "Writable", "describe_facts", "refuse_file"]
 
 
-@dataclass(frozen=True)
-class Content:
-    """A mesh as it goes into a file.
+@dataclass(frozen=True, kw_only=True)
+class PointContent:
+    """Points as they go into a file: those of a cloud, or the vertices of a mesh.
 
     Attributes
     ----------
     vertices : ndarray, shape (n, 3), float32, or float64 far from the origin
         mm in `space`.
-    triangles : ndarray, shape (m, 3), uint32
     normals : ndarray, shape (n, 3), float32, or None
     space : str
         ``LPS`` or ``RAS``.
@@ -34,10 +36,12 @@ class Content:
         The values that the surface encloses, for example "below -400 HU"; None for those from the iso value on.
     certificate : tuple of str
         Facts about the volume, see `clrecon.exchange.certificate`; one printable ASCII line each.
+    hu : ndarray, shape (n,), float32, or None
+    labels : ndarray, shape (n,), int32, or None
+    ijk : ndarray, shape (n, 3), int32, or None
     """
 
     vertices: NDArray[np.floating]
-    triangles: NDArray[np.uint32]
     normals: NDArray[np.float32] | None
     space: str
     to_lps: NDArray[np.float64]
@@ -45,6 +49,9 @@ class Content:
     affine: NDArray[np.float64] | None
     certificate: tuple[str, ...] = ()
     inside: str | None = None
+    hu: NDArray[np.float32] | None = None
+    labels: NDArray[np.int32] | None = None
+    ijk: NDArray[np.int32] | None = None
 
     @property
     def is_double(self) -> bool:
@@ -65,6 +72,60 @@ class Content:
         if self.inside is not None:
             remarks.append(f"INSIDE={self.inside}")
         return remarks + [f"CERTIFICATE {line}" for line in self.certificate]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Content(PointContent):
+    """A mesh as it goes into a file.
+
+    Attributes
+    ----------
+    triangles : ndarray, shape (m, 3), uint32
+    """
+
+    triangles: NDArray[np.uint32]
+
+
+def describe_facts(report: Mapping[str, Any], space: str, *, keep_ids: bool = False) -> dict[str, Any]:
+    """Return the entries of a `PointContent` that come from the report of a mesh or cloud and from the frame.
+
+    Nothing else of the report is ever written.
+
+    Parameters
+    ----------
+    report : mapping
+        ``iso_value_hu``, ``inside_hu``, ``affine_ijk_to_lps_mm``, and ``certificate`` (the report of a volume) or
+        ``certificate_lines`` (those of a file that was read).
+    space : {"lps", "ras"}
+    keep_ids : bool
+        True: with the hash of the frame of reference.
+
+    Raises
+    ------
+    UsageError
+        Unknown space.
+    """
+    iso_value, affine = report.get("iso_value_hu"), report.get("affine_ijk_to_lps_mm")
+    certificate, lines = report.get("certificate"), report.get("certificate_lines")
+    return {
+        "space": space.upper(),
+        "to_lps": frame_from_lps(space).T,
+        "iso_value_hu": None if iso_value is None else float(iso_value),
+        "affine": None if affine is None else np.array(affine, dtype=np.float64).reshape(4, 4),
+        "certificate": (
+            certificate_lines(certificate, keep_ids=keep_ids)
+            if isinstance(certificate, Mapping)
+            else plain_lines(lines if isinstance(lines, (list, tuple)) else ())
+        ),
+        "inside": _describe_inside(report.get("inside_hu")),
+    }
+
+
+def _describe_inside(ends: Sequence[float | None] | None) -> str | None:
+    """Describe the values within these ends; None where the upper end is open."""
+    if ends is None or ends[1] is None:
+        return None
+    return f"below {ends[1]:.9g} HU" if ends[0] is None else f"{ends[0]:.9g} to {ends[1]:.9g} HU"
 
 
 class Writable(Protocol):

@@ -1,8 +1,9 @@
 """Mesh files: one module for each format, chosen by the extension of the file.
 
-A writer estimates the size of the file, writes to a binary stream, and reads the file back.  VTP is written by VTK. The
-other formats are written here and not by a library; each module says why: headers, comments and matrices that name
-frame and unit, a full disk that must be noticed, time and memory.
+A writer estimates the size of the file (exactly for STL, PLY and GLB, rather too small for the others), writes to a
+binary stream, and reads the file back.  VTP is written by VTK.  The other formats are written here and not by a
+library; each module says why: headers, comments and matrices that name frame and unit, a full disk that must be
+noticed, time and memory.
 
 The same mesh gives the same bytes every time.  No file holds patient data, a date or a path.
 """
@@ -10,63 +11,27 @@ The same mesh gives the same bytes every time.  No file holds patient data, a da
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
-from pathlib import Path
-from typing import BinaryIO
 
 import numpy as np
 
-from clrecon.errors import NoSurfaceError, OutputError, UsageError
-from clrecon.exchange import (
-    glb,
-    obj,
-    ply,
-    stl,
-    threemf,
-    vtp,
-)
+from clrecon.errors import NoSurfaceError
+from clrecon.exchange import glb, obj, ply, stl, threemf, vtp
 from clrecon.exchange.content import Content, Writable
+from clrecon.exchange.file_format import FOUR_GIB, NO_LIMIT, FileFormat, find_extension, stage_content
 from clrecon.geometry.precision import float32_step
-from clrecon.system.files import StagedFile, stage_file
+from clrecon.system.files import StagedFile
 
-__all__ = ["FORMATS", "MeshFormat", "check_format", "describe_rounding", "stage_mesh", "write_mesh"]
-
-
-@dataclass(frozen=True)
-class MeshFormat:
-    """A file format of meshes.
-
-    Attributes
-    ----------
-    estimate : callable
-        Estimates the size of the file in bytes; exact for STL, PLY and GLB, rather too small for the others.
-    write : callable
-        Writes the contents to a stream.
-    verify : callable
-        Reads the file back and raises `OutputError` unless sizes and counts are those of the contents.
-    most_bytes : int
-        Largest file that the format, or common readers of it, can handle.
-    """
-
-    estimate: Callable[[Content], int]
-    write: Callable[[BinaryIO, Content], None]
-    verify: Callable[[Path, Content], None]
-    most_bytes: int
-
+__all__ = ["FORMATS", "check_format", "describe_rounding", "stage_mesh", "write_mesh"]
 
 # STL: the format could hold more, but many programs keep offsets in 32 bits.  GLB: its length field has 32 bits.
-_FOUR_GIB = 2**32 - 1
-_NO_LIMIT = 2**62
-
-FORMATS = {
-    ".stl": MeshFormat(stl.estimate, stl.write, stl.verify, _FOUR_GIB),
-    ".ply": MeshFormat(ply.estimate, ply.write, ply.verify, _NO_LIMIT),
-    ".obj": MeshFormat(obj.estimate, obj.write, obj.verify, _NO_LIMIT),
-    ".glb": MeshFormat(glb.estimate, glb.write, glb.verify, _FOUR_GIB),
-    ".vtp": MeshFormat(vtp.estimate, vtp.write, vtp.verify, _NO_LIMIT),
-    ".3mf": MeshFormat(threemf.estimate, threemf.write, threemf.verify, _NO_LIMIT),
+FORMATS: dict[str, FileFormat[Content]] = {
+    ".stl": FileFormat(stl.estimate, stl.write, stl.verify, FOUR_GIB),
+    ".ply": FileFormat(ply.estimate, ply.write, ply.verify, NO_LIMIT),
+    ".obj": FileFormat(obj.estimate, obj.write, obj.verify, NO_LIMIT),
+    ".glb": FileFormat(glb.estimate, glb.write, glb.verify, FOUR_GIB),
+    ".vtp": FileFormat(vtp.estimate, vtp.write, vtp.verify, NO_LIMIT),
+    ".3mf": FileFormat(threemf.estimate, threemf.write, threemf.verify, NO_LIMIT),
 }
 
 
@@ -78,14 +43,7 @@ def check_format(path: str | os.PathLike[str]) -> str:
     UsageError
         The extension is missing, or no writer has it.
     """
-    try:
-        extension = os.path.splitext(os.fspath(path))[1].lower()
-    except TypeError as error:
-        raise UsageError(f"a mesh file is named by a string or a path, not {type(path).__name__}") from error
-    if extension not in FORMATS:
-        found = f"the extension {extension!r}" if extension else "no extension"
-        raise UsageError(f"the name of the mesh file has {found}: use one of {', '.join(FORMATS)}")
-    return extension
+    return find_extension(path, FORMATS, "mesh")
 
 
 def describe_rounding(mesh: Writable, extension: str) -> list[str]:
@@ -122,15 +80,4 @@ def stage_mesh(
     content = mesh.describe(space, keep_ids=keep_ids)
     if mesh.triangle_count == 0:
         raise NoSurfaceError(f"the surface is empty: no {extension[1:].upper()} file is written")
-    expected_bytes = chosen.estimate(content)
-    if expected_bytes > chosen.most_bytes:
-        raise OutputError(
-            f"{mesh.triangle_count} triangles make a {extension[1:].upper()} file of about "
-            f"{expected_bytes / 2**30:.1f} GiB, at most 4 GiB can be read: write PLY or VTP"
-        )
-    return stage_file(
-        path,
-        lambda stream: chosen.write(stream, content),
-        lambda temporary: chosen.verify(temporary, content),
-        expected_bytes=expected_bytes,
-    )
+    return stage_content(content, path, chosen, f"{mesh.triangle_count} triangles", "PLY or VTP")

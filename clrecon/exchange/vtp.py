@@ -11,8 +11,11 @@ import re
 from pathlib import Path
 from typing import Any, BinaryIO
 
+import numpy as np
+from numpy.typing import NDArray
+
 from clrecon.errors import OutputError
-from clrecon.exchange.content import Content, refuse_file
+from clrecon.exchange.content import Content, PointContent, refuse_file
 from clrecon.exchange.vtk import make_polydata
 
 __all__ = ["estimate", "verify", "write"]
@@ -20,17 +23,18 @@ __all__ = ["estimate", "verify", "write"]
 _END = b"</VTKFile>"
 
 
-def estimate(content: Content) -> int:
-    """Return the size of the data in bytes, without the XML: three indices and an offset for each triangle."""
-    normals = 0 if content.normals is None else content.normals.nbytes
-    return content.vertices.nbytes + normals + 16 * len(content.triangles)
+def estimate(content: PointContent) -> int:
+    """Return the size of the data in bytes, without the XML: the indices and an offset for each triangle or point."""
+    arrays = (content.vertices, content.normals, content.hu, content.labels)
+    cells = 16 * len(content.triangles) if isinstance(content, Content) else 8 * len(content.vertices)
+    return sum(array.nbytes for array in arrays if array is not None) + cells
 
 
-def write(stream: BinaryIO, content: Content) -> None:
-    """Write the surface with its field arrays."""
+def write(stream: BinaryIO, content: PointContent) -> None:
+    """Write the surface or cloud with its field arrays."""
     from vtkmodules.vtkIOXML import vtkXMLPolyDataWriter
 
-    polydata = make_polydata(content.vertices, content.triangles, content.normals)
+    polydata = make_polydata(content.vertices, _triangles(content), content.normals, content.hu, content.labels)
     for array in _field_arrays(content):
         polydata.GetFieldData().AddArray(array)
     writer = vtkXMLPolyDataWriter()
@@ -42,13 +46,17 @@ def write(stream: BinaryIO, content: Content) -> None:
     writer.SetByteOrderToLittleEndian()
     writer.WriteToOutputStringOn()
     if writer.Write() != 1:
-        raise OutputError(f"VTK could not write the surface, its error code is {writer.GetErrorCode()}")
+        raise OutputError(f"VTK could not write the file, its error code is {writer.GetErrorCode()}")
     text = writer.GetOutputString()
     # VTK's Python returns str if the bytes happen to be UTF-8, else bytes.
     stream.write(text.encode("utf-8") if isinstance(text, str) else text)
 
 
-def _field_arrays(content: Content) -> list[Any]:
+def _triangles(content: PointContent) -> NDArray[np.uint32] | None:
+    return content.triangles if isinstance(content, Content) else None
+
+
+def _field_arrays(content: PointContent) -> list[Any]:
     from vtkmodules.vtkCommonCore import vtkDoubleArray, vtkStringArray
 
     arrays: list[Any] = []
@@ -75,13 +83,15 @@ def _field_arrays(content: Content) -> list[Any]:
     return arrays
 
 
-def verify(path: Path, content: Content) -> None:
+def verify(path: Path, content: PointContent) -> None:
     """Check the counts in the XML and the end of a finished file."""
     with path.open("rb") as stream:
         head = stream.read(8192).decode("latin-1")
         stream.seek(max(path.stat().st_size - 64, 0))
         end = stream.read()
-    for name, count in (("NumberOfPoints", len(content.vertices)), ("NumberOfPolys", len(content.triangles))):
+    points, triangles = len(content.vertices), _triangles(content)
+    cells = ("NumberOfVerts", points) if triangles is None else ("NumberOfPolys", len(triangles))
+    for name, count in (("NumberOfPoints", points), cells):
         match = re.search(rf'{name}="(\d+)"', head)
         if match is None or int(match[1]) != count:
             raise refuse_file(name, None if match is None else match[1], count)

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from clrecon.errors import UsageError
-from clrecon.exchange.certificate import certificate_lines
-from clrecon.exchange.content import Content
+from clrecon.exchange.content import Content, describe_facts
 from clrecon.exchange.coordinates import as_stored
 from clrecon.exchange.formats import write_mesh
 from clrecon.geometry import frame_from_lps
@@ -50,13 +48,6 @@ def _as_indices(values: ArrayLike) -> NDArray[np.uint32]:
         if low < 0 or high >= _MOST_VERTICES:
             raise UsageError(f"triangles hold indices from {low} to {high}: they must fit 32 bits without a sign")
     return np.ascontiguousarray(array, dtype=np.uint32)
-
-
-def _describe_inside(ends: Sequence[float | None] | None) -> str | None:
-    """Describe the values within these ends; None where the upper end is open."""
-    if ends is None or ends[1] is None:
-        return None
-    return f"below {ends[1]:.9g} HU" if ends[0] is None else f"{ends[0]:.9g} to {ends[1]:.9g} HU"
 
 
 class Mesh(Message):
@@ -169,20 +160,8 @@ class Mesh(Message):
         Only with `keep_ids` they have the hash of the frame of reference.
         """
         vertices, normals = self.in_space(space)
-        iso_value = self.report.get("iso_value_hu")
-        affine = self.report.get("affine_ijk_to_lps_mm")
-        certificate = self.report.get("certificate")
-        return Content(
-            vertices=vertices,
-            triangles=self.triangles,
-            normals=normals,
-            space=space.upper(),
-            to_lps=frame_from_lps(space).T,
-            iso_value_hu=None if iso_value is None else float(iso_value),
-            affine=None if affine is None else np.array(affine, dtype=np.float64).reshape(4, 4),
-            certificate=certificate_lines(certificate, keep_ids=keep_ids) if isinstance(certificate, Mapping) else (),
-            inside=_describe_inside(self.report.get("inside_hu")),
-        )
+        facts = describe_facts(self.report, space, keep_ids=keep_ids)
+        return Content(vertices=vertices, triangles=self.triangles, normals=normals, **facts)
 
     def quality(self) -> MeshQuality:
         """Measure the mesh: closedness, size and faults."""

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
-from typing import Any
+import os
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from clrecon.errors import UsageError
+from clrecon.exchange.clouds.formats import write_cloud
+from clrecon.exchange.content import PointContent, describe_facts
 from clrecon.exchange.coordinates import as_stored
 from clrecon.geometry import frame_from_lps
 from clrecon.system.messages import Message
+from clrecon.system.targets import keep_existing
 
 __all__ = ["MOST_POINTS", "PointCloud"]
 
@@ -192,6 +196,88 @@ class PointCloud(Message):
         # Adding 0 turns -0 into 0; text formats would show -0.
         points = self._points * signs + np.float32(0)
         return points, None if self._normals is None else self._normals * signs + np.float32(0)
+
+    def describe(self, space: str, *, keep_ids: bool = False) -> PointContent:
+        """Return the contents of a file of the cloud in `space`; nothing else of `report` is ever written.
+
+        Only with `keep_ids` they have the hash of the frame of reference.
+        """
+        points, normals = self.in_space(space)
+        facts = describe_facts(self.report, space, keep_ids=keep_ids)
+        return PointContent(vertices=points, normals=normals, hu=self._hu, labels=self._labels, ijk=self._ijk, **facts)
+
+    def save(
+        self, path: str | os.PathLike[str], space: str = "lps", *, no_clobber: bool = False, keep_ids: bool = False
+    ) -> int:
+        """Write the cloud to a file; its extension gives the format.
+
+        The file is either complete or absent, and an older file of that name is replaced in one step.  It holds no
+        patient data, date or path.  docs/clouds.md says what each format keeps.
+
+        Parameters
+        ----------
+        path : str or path
+            ``.ply``, ``.vtp``, ``.npz``, ``.xyz`` or ``.las`` (with the extra ``las``), upper or lower case.
+        space : {"lps", "ras"}
+            Patient frame of the coordinates in mm; the file names it.
+        no_clobber : bool
+            True: a file of that name stays and is an `OutputError`.
+        keep_ids : bool
+            True: the comments hold the hash of the frame of reference, by which files of one scan are told.
+
+        Returns
+        -------
+        int
+            Size of the file in bytes.
+
+        Raises
+        ------
+        UsageError
+            Unknown extension or space, or laspy is needed and not installed.
+        NoSurfaceError
+            The cloud has no point.
+        OutputError
+            The file cannot be written; an older one of that name is intact.
+        """
+        with keep_existing(no_clobber):
+            return write_cloud(self, path, space, keep_ids=keep_ids)
+
+    def to_pyvista(self) -> Any:
+        """Return the cloud as ``pyvista.PolyData`` in LPS mm, sharing the memory of the arrays.
+
+        Each point is a cell.  The point arrays are ``HU`` (the active scalars), ``label`` and ``Normals`` (the active
+        normals), those that are known; the field arrays ``SPACE`` and ``UNIT`` name frame and unit.
+        """
+        from clrecon.points.vtk import wrap_cloud
+
+        return wrap_cloud(self._points, self._normals, self._hu, self._labels)
+
+    def to_open3d(self) -> Any:
+        """Return the cloud as ``open3d.t.geometry.PointCloud`` in LPS mm, with copies of the arrays.
+
+        The attributes are ``positions``, ``normals``, ``hu`` (n, 1) and ``label`` (n, 1), those that are known;
+        ``to_legacy()`` of the result gives the class that has positions and normals alone.
+
+        Raises
+        ------
+        UsageError
+            open3d is not installed, or cannot be loaded.
+        """
+        try:
+            import open3d
+        except ImportError as error:
+            raise UsageError(f"open3d cannot be imported ({error}): pip install open3d") from error
+        columns = {
+            "positions": self._points,
+            "normals": self._normals,
+            "hu": None if self._hu is None else self._hu[:, None],
+            "label": None if self._labels is None else self._labels[:, None],
+        }
+        cloud, make_tensor = open3d.t.geometry.PointCloud(), cast(Any, open3d.core.Tensor)
+        for name, values in columns.items():
+            if values is not None:
+                cloud.point[name] = make_tensor(values)
+        return cloud
 
     def __repr__(self) -> str:
         known = [name for name in ("normals", "hu", "labels", "ijk") if getattr(self, name) is not None]

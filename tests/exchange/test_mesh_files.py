@@ -14,6 +14,7 @@ import tolerances
 
 from clrecon.errors import NoSurfaceError, OutputError, UsageError
 from clrecon.exchange import formats as writers
+from clrecon.exchange.file_format import FileFormat
 from clrecon.exchange.formats import FORMATS
 from clrecon.mesh import Mesh
 
@@ -328,7 +329,7 @@ def test_a_file_that_was_cut_or_belongs_to_another_mesh_is_found(mesh, extension
 def test_an_older_file_survives_a_failed_check(mesh, extension, tmp_path, monkeypatch):
     path = tmp_path / f"bone{extension}"
     path.write_bytes(b"older")
-    broken = writers.MeshFormat(
+    broken = FileFormat(
         FORMATS[extension].estimate,
         lambda stream, content: stream.write(b"x" * 200),
         FORMATS[extension].verify,
@@ -353,7 +354,7 @@ def test_estimate_is_about_right(extension, tmp_path):
 
 def test_too_large_for_the_format(mesh, tmp_path, monkeypatch):
     small = FORMATS[".stl"]
-    limited = writers.MeshFormat(small.estimate, small.write, small.verify, 5000)
+    limited = FileFormat(small.estimate, small.write, small.verify, 5000)
     monkeypatch.setitem(writers.FORMATS, ".stl", limited)
     with pytest.raises(OutputError, match=r"at most 4 GiB can be read: write PLY or VTP"):
         mesh.save(tmp_path / "bone.stl")

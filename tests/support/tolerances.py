@@ -14,6 +14,10 @@ def float32_unit(points: ArrayLike) -> float:
 # --- geometry: maps ---
 FLOAT64_PLACE_MM = 1e-9  # coordinates of some 1000 mm there and back in float64
 
+# --- files of clouds ---
+SIX_DIGITS_MM = 5.1e-3  # Open3D writes six digits into text: half of 1e-2 mm from 1000 mm on
+LAS_POINT_MM = 8.2e-5  # half a step of 1e-4 mm, and half a step of float32 at some 1000 mm
+
 # --- geometry: images of pyvista ---
 IMAGE_POINT_MM = 1e-9  # VTK places points by direction and spacing in float64
 IMAGE_SURFACE_MM = 1e-4  # float32 vertices some 200 mm from the origin, placed by another program: measured 2e-5

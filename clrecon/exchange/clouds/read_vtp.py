@@ -1,0 +1,244 @@
+"""VTP, the XML PolyData of VTK, of any program that writes it.
+
+Own code because VTK crashes on harmed files: it follows offsets and counts wherever they lead.  Arrays may be text,
+base64 or raw bytes after the XML, plain or packed by zlib (VTK's "XML file formats").  Several pieces become one cloud.
+"""
+
+from __future__ import annotations
+
+import binascii
+import re
+import zlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clrecon.errors import RefusedInputError
+from clrecon.exchange.clouds.raw_cloud import RawCloud, columns_of, say_cut
+from clrecon.system.regular_files import open_regular
+from clrecon.system.text import escape_text
+
+__all__ = ["read"]
+
+_TYPES = {
+    "Int8": "i1", "UInt8": "u1", "Int16": "i2", "UInt16": "u2", "Int32": "i4", "UInt32": "u4", "Int64": "i8",
+    "UInt64": "u8", "Float32": "f4", "Float64": "f8",
+}  # fmt: skip
+_ZLIB = "vtkZLibDataCompressor"
+_MOST_BLOCKS = 1 << 24
+_MOST_COMPONENTS = 64
+_LONGEST_TEXT = 1 << 20
+
+
+@dataclass
+class _Document:
+    root: ElementTree.Element
+    appended: bytes
+    base64: bool
+    order: str
+    header: np.dtype[Any]
+    packed: bool
+
+
+def read(path: Path) -> RawCloud:
+    """Read the points, the point arrays and the field arrays ``SPACE``, ``ISO_VALUE_HU`` and so on.
+
+    Raises
+    ------
+    RefusedInputError
+        The file is cut or corrupt, or packed by another method than zlib.
+    """
+    name = escape_text(path.name)
+    try:
+        with open_regular(path) as stream:
+            document = _parse(stream.read(), name)
+        return _collect(document, name)
+    except (OSError, ValueError, OverflowError, MemoryError, ElementTree.ParseError, zlib.error) as error:
+        raise say_cut(name, error) from error
+
+
+def _parse(data: bytes, name: str) -> _Document:
+    head, mark, tail = data.partition(b"<AppendedData")
+    if b"<!DOCTYPE" in head or b"<!ENTITY" in head:
+        raise ValueError("it declares a document type, which VTP has not")
+    start = tail.find(b"_") + 1
+    root = ElementTree.fromstring(head + b"</VTKFile>" if mark else head)
+    if root.tag != "VTKFile" or root.get("type") != "PolyData":
+        raise RefusedInputError(f"{name} holds '{escape_text(str(root.get('type')))}' of VTK: PolyData are read")
+    order = ">" if root.get("byte_order") == "BigEndian" else "<"
+    compressor = root.get("compressor")
+    if compressor not in (None, _ZLIB):
+        raise RefusedInputError(f"{name} is packed by {escape_text(str(compressor))}: write it with {_ZLIB}, or plain")
+    return _Document(
+        root,
+        tail[start:] if mark else b"",
+        b"base64" in tail[:start],
+        order,
+        np.dtype(order + ("u8" if root.get("header_type") == "UInt64" else "u4")),
+        compressor is not None,
+    )
+
+
+def _collect(document: _Document, name: str) -> RawCloud:
+    points, columns, left_out, normals = [], [], 0, None
+    for piece in document.root.iterfind("PolyData/Piece"):
+        count = _count(piece, "NumberOfPoints")
+        array = piece.find("Points/DataArray")
+        if count == 0 or array is None:
+            continue
+        points.append(_numbers(document, array, count, 3))
+        data = piece.find("PointData")
+        own = {}
+        for each in () if data is None else data.iterfind("DataArray"):
+            if each.get("type") in _TYPES:
+                own[each.get("Name", "")] = _numbers(document, each, count)
+        normals = normals or (None if data is None else data.get("Normals"))
+        columns.append(own)
+        left_out += sum(_count(piece, f"NumberOf{kind}") for kind in ("Lines", "Strips", "Polys"))
+    if not points:
+        raise RefusedInputError(f"{name} has no points")
+    texts, numbers = _fields(document)
+    affine, iso_value = numbers.get("AFFINE_IJK_TO_LPS_MM"), numbers.get("ISO_VALUE_HU")
+    return RawCloud(
+        "VTP",
+        np.concatenate(points),
+        _named(columns, normals),
+        space=next(iter(texts.get("SPACE", ())), None),
+        affine=affine.reshape(4, 4) if affine is not None and affine.size == 16 else None,
+        iso_value_hu=float(iso_value[0]) if iso_value is not None and iso_value.size == 1 else None,
+        certificate=texts.get("CERTIFICATE", ()),
+        warnings=[f"elements left out: {left_out:,} lines, strips and polygons"] if left_out else [],
+    )
+
+
+def _named(pieces: Sequence[dict[str, NDArray[Any]]], normals: str | None) -> dict[str, NDArray[Any]]:
+    """Join the arrays that all pieces have; one of several components becomes as many columns."""
+    columns: dict[str, NDArray[Any]] = {}
+    for own in pieces[0]:
+        if not all(own in piece and piece[own].shape[1] == pieces[0][own].shape[1] for piece in pieces):
+            continue
+        values = np.concatenate([piece[own] for piece in pieces])
+        width = values.shape[1]
+        if width == 1:
+            columns[own] = values[:, 0]
+        elif width == 3 and own == (normals or "Normals"):
+            columns |= columns_of(values, ("nx", "ny", "nz"))
+        else:
+            columns |= columns_of(values, [f"{own}:{place}" for place in range(width)])
+    return columns
+
+
+def _fields(document: _Document) -> tuple[dict[str, tuple[str, ...]], dict[str, NDArray[Any]]]:
+    texts: dict[str, tuple[str, ...]] = {}
+    numbers: dict[str, NDArray[Any]] = {}
+    for array in document.root.iterfind("PolyData/FieldData/*"):
+        own = array.get("Name", "")
+        count = _count(array, "NumberOfTuples")
+        if array.get("type") == "String":
+            data = _bytes(document, array)[:_LONGEST_TEXT]
+            texts[own] = tuple(text.decode("utf-8", "replace") for text in data.split(b"\0")[:count])
+        elif array.get("type") in _TYPES:
+            numbers[own] = _numbers(document, array, count).ravel()
+    return texts, numbers
+
+
+def _count(element: ElementTree.Element, attribute: str) -> int:
+    value = element.get(attribute, "0")
+    if not re.fullmatch(r"\d{1,15}", value):
+        raise ValueError(f"{attribute} is '{value}'")
+    return int(value)
+
+
+def _numbers(document: _Document, array: ElementTree.Element, count: int, width: int | None = None) -> NDArray[Any]:
+    """Return the values of a DataArray, shape (count, components)."""
+    components = _count(array, "NumberOfComponents") or 1
+    kind = _TYPES.get(array.get("type", ""))
+    if kind is None or components > _MOST_COMPONENTS or width not in (None, components):
+        raise ValueError(f"an array of {components} components of type '{array.get('type')}'")
+    if array.get("format") == "ascii":
+        values = np.array((array.text or "").split(), dtype=np.float64).astype(kind)
+    else:
+        data = _bytes(document, array)
+        values = np.frombuffer(data, dtype=document.order + kind).astype(kind)
+    if values.size != count * components:
+        raise ValueError(f"the array '{array.get('Name')}' has {values.size:,} numbers, {count * components:,} needed")
+    return values.reshape(count, components)
+
+
+def _bytes(document: _Document, array: ElementTree.Element) -> bytes:
+    """Return the bytes of an array."""
+    form = array.get("format")
+    if form == "ascii":
+        return bytes(int(word) for word in (array.text or "").split())
+    if form == "binary":
+        return _unpack(document, _From64((array.text or "").strip().encode("ascii")))
+    if form == "appended":
+        rest = memoryview(document.appended)[_count(array, "offset") :]
+        return _unpack(document, _From64(bytes(rest)) if document.base64 else _Raw(rest))
+    raise ValueError(f"an array of format '{form}'")
+
+
+class _Raw:
+    """Bytes as they are."""
+
+    def __init__(self, data: memoryview):
+        self._data, self._place = data, 0
+
+    def take(self, count: int) -> bytes:
+        """Return the next bytes."""
+        if count > len(self._data) - self._place:
+            raise ValueError(f"an array has {count:,} bytes and {len(self._data) - self._place:,} are there")
+        self._place += count
+        return bytes(self._data[self._place - count : self._place])
+
+    def end_part(self) -> None:
+        """End a part: nothing to do."""
+
+
+class _From64:
+    """Bytes in base64, in parts that each are padded to four characters."""
+
+    def __init__(self, text: bytes):
+        self._text, self._start, self._taken = text, 0, 0
+
+    def take(self, count: int) -> bytes:
+        """Return the next bytes of this part."""
+        first, last = self._taken // 3 * 4, -(-(self._taken + count) // 3) * 4
+        if last > len(self._text) - self._start:
+            raise ValueError(f"an array has {count:,} bytes and {len(self._text):,} characters are there")
+        data = binascii.a2b_base64(self._text[self._start + first : self._start + last])
+        skip = self._taken % 3
+        self._taken += count
+        if len(data) < skip + count:
+            raise ValueError("base64 ends early")
+        return data[skip : skip + count]
+
+    def end_part(self) -> None:
+        """Go on behind the padding."""
+        self._start += -(-self._taken // 3) * 4
+        self._taken = 0
+
+
+def _unpack(document: _Document, source: _Raw | _From64) -> bytes:
+    """Return an array's bytes: after their number, or packed in blocks after the numbers of their bytes."""
+    size = document.header.itemsize
+    if not document.packed:
+        return source.take(int(np.frombuffer(source.take(size), document.header)[0]))
+    blocks, block_bytes, last_bytes = map(int, np.frombuffer(source.take(3 * size), document.header))
+    if blocks > _MOST_BLOCKS:
+        raise ValueError(f"an array of {blocks:,} blocks")
+    packed = [int(length) for length in np.frombuffer(source.take(blocks * size), document.header)]
+    source.end_part()
+    parts = []
+    for number, length in enumerate(packed):
+        expected = last_bytes if last_bytes and number == blocks - 1 else block_bytes
+        inflater = zlib.decompressobj()
+        parts.append(inflater.decompress(source.take(length), expected + 1))
+        if len(parts[-1]) != expected:
+            raise ValueError(f"a block of {expected:,} bytes has {len(parts[-1]):,}")
+    return b"".join(parts)

@@ -1,0 +1,138 @@
+"""XYZ: text, a point a line, ``x y z hu``; the head names frame, unit, iso value, certificate and columns.
+
+Every program reads such a table; the lines of the head begin with ``#``.  Normals and labels have no place in it.
+"""
+
+from __future__ import annotations
+
+import io
+import re
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+
+from clrecon.errors import RefusedInputError
+from clrecon.exchange.clouds.raw_cloud import RawCloud, columns_of, read_remarks, say_cut
+from clrecon.exchange.content import PointContent, refuse_file
+from clrecon.system.pieces import chunks
+from clrecon.system.regular_files import open_regular
+from clrecon.system.text import escape_text
+
+__all__ = ["estimate", "read", "verify", "write"]
+
+_CHUNK = 1 << 14
+_PIECE = 1 << 22
+_LONGEST_HEAD = 1 << 10
+"""Most lines before the first point."""
+_LONGEST_LINE = 1 << 14
+"""Most characters of a line of the head, and of the first point."""
+
+
+def _header(content: PointContent) -> bytes:
+    columns = "x y z" if content.hu is None else "x y z hu"
+    return "".join(f"# {remark}\n" for remark in [*content.remarks, columns]).encode("ascii")
+
+
+def estimate(content: PointContent) -> int:
+    """Return the size of the file in bytes, rather too small: a number takes 2 to 13 characters and a blank."""
+    return len(_header(content)) + len(content.vertices) * (6 if content.hu is None else 8)
+
+
+def write(stream: BinaryIO, content: PointContent) -> None:
+    """Write the head and the points: nine digits, enough to get back the same float32, and fifteen far away."""
+    stream.write(_header(content))
+    form = " ".join([content.number] * 3 + ["%.9g"] * (content.hu is not None)) + "\n"
+    for where in chunks(len(content.vertices), _CHUNK):
+        rows = content.vertices[where]
+        if content.hu is not None:
+            rows = np.column_stack([rows, content.hu[where]])
+        stream.write((form * len(rows) % tuple(rows.ravel().tolist())).encode("ascii"))
+
+
+def verify(path: Path, content: PointContent) -> None:
+    """Check the head and count the lines of a finished file."""
+    header = _header(content)
+    with path.open("rb") as stream:
+        found = stream.read(len(header))
+        if found != header:
+            raise refuse_file("in the header", repr(found), repr(header))
+        lines, end = 0, b""
+        while piece := stream.read(_PIECE):
+            lines += piece.count(b"\n")
+            end = piece[-1:]
+    if lines != len(content.vertices):
+        raise refuse_file("points", lines, len(content.vertices))
+    if end != b"\n":
+        raise refuse_file("at the end", repr(end), "a line end")
+
+
+def read(path: Path) -> RawCloud:
+    """Read a table of numbers: three columns or more, parted by blanks, tabulators, commas or semicolons.
+
+    Lines that begin with ``#``, ``//`` or ``%`` are comments.  The last line before the first point names the columns
+    if it has a word for each of them, with or without a mark of a comment: ``//X Y Z scalar_HU``.  Columns
+    without names beyond the third are left out.
+
+    Raises
+    ------
+    RefusedInputError
+        The file is no such table; the message says where.
+    """
+    name = escape_text(path.name)
+    head: list[str] = []
+    try:
+        with open_regular(path) as binary, io.TextIOWrapper(binary, encoding="latin-1", newline=None) as stream:
+            first = stream.readline(_LONGEST_LINE)
+            while first and not _numbers_in(first):
+                head.append(first)
+                if len(head) > _LONGEST_HEAD:
+                    raise RefusedInputError(f"{name} is no table of points: {_LONGEST_HEAD:,} lines hold no numbers")
+                first = stream.readline(_LONGEST_LINE)
+            if not first:
+                raise RefusedInputError(f"{name} holds no line of numbers: a line of a point is 'x y z' or more")
+            count = _numbers_in(first)
+            if count < 3:
+                raise RefusedInputError(f"{name} has {count} numbers a line, a point has three at least")
+            mark = _delimiter(first)
+            rest = (line for part in ([first], stream) for line in part)
+            table = np.loadtxt(rest, comments="#", delimiter=mark, ndmin=2, dtype=np.float64)
+    except (ValueError, OSError, OverflowError, MemoryError) as error:
+        raise say_cut(name, error) from error
+    warnings = []
+    names = _column_names(head, count)
+    if names is None and count > 3:
+        warnings.append(f"columns 4 to {count} have no names in a line before the first point and are left out")
+    rows = table[:, 3:] if names else table[:, :0]
+    return RawCloud(
+        "XYZ",
+        table[:, :3],
+        columns_of(rows, names[3:] if names else ()),
+        warnings=warnings,
+        **read_remarks(line.lstrip("#/% \t") for line in head),
+    )
+
+
+def _delimiter(line: str) -> str | None:
+    return next((mark for mark in ";," if mark in line), None)
+
+
+def _words(line: str) -> list[str]:
+    return [word for word in re.split(r"[;,\s]+", line.strip()) if word]
+
+
+def _numbers_in(line: str) -> int:
+    """Return how many numbers a line holds; 0 if it has a word that is none."""
+    words = _words(line)
+    try:
+        for word in words:
+            float(word)
+    except ValueError:
+        return 0
+    return len(words)
+
+
+def _column_names(head: list[str], count: int) -> list[str] | None:
+    words = _words(head[-1].lstrip("#/% \t")) if head else []
+    fits = len(words) == count and [word.lower() for word in words[:3]] == ["x", "y", "z"]
+    return words if fits and len({word.lower() for word in words}) == count else None

@@ -1,0 +1,96 @@
+"""`read_points`: a cloud from a file, our own or that of another program."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from clrecon.errors import RefusedInputError, UsageError
+from clrecon.exchange.clouds.reader import read_raw_cloud
+from clrecon.geometry import SPACES, frame_from_lps
+from clrecon.points.cloud import MOST_POINTS, PointCloud
+from clrecon.system.log import get_logger, log_warnings
+from clrecon.system.text import escape_text
+
+__all__ = ["read_points"]
+
+log = get_logger(__name__)
+
+
+def read_points(path: str | os.PathLike[str], *, space: str | None = None) -> PointCloud:
+    """Read a cloud from a file.
+
+    Parameters
+    ----------
+    path : str or path
+        PLY (ASCII or binary), VTP, NPZ, LAS or a table of numbers (XYZ), told by its first bytes.  Units are mm.
+    space : {"lps", "ras"}, optional
+        Patient frame of coordinates that do not name theirs; None: LPS, which the report then calls assumed.
+
+    Returns
+    -------
+    PointCloud
+        In LPS mm, with the normals, HU and labels that the file has.  Entries of ``report["file"]``: ``kind``,
+        ``space``, ``space_from`` ("file", "argument" or "assumed"), ``points`` and ``warnings``, which name columns and
+        elements that were left out.  ``iso_value_hu``, ``affine_ijk_to_lps_mm`` and ``certificate_lines`` are there
+        where the file has them.
+
+    Raises
+    ------
+    UsageError
+        `space` is unknown, or is not the frame that the file names; or the file is LAS and laspy is not installed.
+    RefusedInputError
+        The file cannot be read, is cut or corrupt, has no points or points that are not finite.
+    """
+    asked = None if space is None else space.upper()
+    if asked is not None:
+        frame_from_lps(asked)
+    raw = read_raw_cloud(path)
+    name = escape_text(Path(path).name)
+    warnings = raw.warnings
+    named = None if raw.space is None else raw.space.upper()
+    if named is not None and named.lower() not in SPACES:
+        warnings.append(f"the file names the frame '{escape_text(named)}', which is not known")
+        named = None
+    if asked is not None and named is not None and asked != named:
+        raise UsageError(f"{name} says that its coordinates are {named}, {asked} was asked for: leave the space out")
+    used = named or asked or "LPS"
+    _check_points(raw.points, name)
+    points, normals = raw.points, raw.normals()
+    if used != "LPS":
+        signs = np.diag(frame_from_lps(used))
+        points = points * signs.astype(points.dtype if points.dtype.kind == "f" else np.float64)
+        normals = None if normals is None else normals * signs.astype(np.float32) + np.float32(0)
+    arrays = {"normals": normals, "hu": raw.hu(), "labels": raw.labels(), "ijk": raw.ijk()}
+    warnings += raw.unused()
+    facts: dict[str, Any] = {
+        "kind": raw.kind,
+        "space": used,
+        "space_from": "file" if named else "argument" if asked else "assumed",
+        "points": len(points),
+        "warnings": warnings,
+    }
+    report: dict[str, Any] = {"file": facts}
+    if raw.iso_value_hu is not None and np.isfinite(raw.iso_value_hu):
+        report["iso_value_hu"] = raw.iso_value_hu
+    if raw.affine is not None and np.isfinite(raw.affine).all():
+        report["affine_ijk_to_lps_mm"] = np.asarray(raw.affine, dtype=np.float64).tolist()
+    if raw.certificate:
+        report["certificate_lines"] = list(raw.certificate)
+    log.info("%s file read: %d points", raw.kind, len(points))
+    log_warnings(log, warnings)
+    return PointCloud(points, report=report, **arrays)
+
+
+def _check_points(points: np.ndarray, name: str) -> None:
+    if not 0 < len(points) <= MOST_POINTS:
+        raise RefusedInputError(f"{name} has {len(points):,} points: 1 to {MOST_POINTS:,} are read")
+    wrong = ~np.isfinite(points).all(axis=1)
+    if wrong.any():
+        raise RefusedInputError(
+            f"{int(wrong.sum()):,} of the {len(points):,} points of {name} are not finite, the first is number"
+            f" {int(np.flatnonzero(wrong)[0]):,}: remove them first"
+        )
