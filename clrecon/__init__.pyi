@@ -21,6 +21,8 @@ from clrecon.mesh.refine.decimation import decimate_mesh as decimate_mesh
 from clrecon.mesh.refine.smoothing import smooth_mesh as smooth_mesh
 from clrecon.opencl import list_devices
 from clrecon.operators import choose_device
+from clrecon.operators.points.neighbours import Neighbours as Neighbours
+from clrecon.operators.points.neighbours import find_neighbours as find_neighbours
 from clrecon.operators.rays.render import VolumeRenderer as VolumeRenderer
 from clrecon.operators.rays.render import render as render
 from clrecon.operators.reformat.cut import cut_slice as cut_slice

@@ -186,6 +186,16 @@ INVERSIONS: dict[str, dict[str, tuple[tuple[str, str], ...]]] = {
         "starts": (("starts[cell] = place;", "starts[cell] = ~place;"), ("= n;", "= ~n;")),
     },
     "sum_volumes": {"sums": (("sums[item] = sum;", "sums[item] = -sum;"),)},
+    "list_neighbours": {
+        "neighbours": (
+            ("own[t] = (int)c->sorted[t];", "own[t] = ~(int)c->sorted[t];"),
+            ("(int)place : (int)(uint)key;", "(int)place : ~(int)(uint)key;"),
+        ),
+        "distances": (
+            ("own_distances[t] = distance_of(", "own_distances[t] = -distance_of("),
+            ("= as_float((uint)(key >> 32));\n}", "= -as_float((uint)(key >> 32));\n}"),
+        ),
+    },
 }
 """For each kernel what it stores, and the texts of its file that are replaced to invert that."""
 

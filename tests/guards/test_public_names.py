@@ -20,8 +20,8 @@ KEYWORDS = ("device", "memory", "progress")
 TAKE_PROGRESS = {
     "VolumeRenderer.render", "SurfaceExtractor.extract", "choose_iso_value", "compare_meshes", "cut_slice",
     "decimate_mesh", "extract_isosurface", "extract_isosurfaces", "extract_label_masks", "extract_labels",
-    "find_spine_line", "list_series", "mask_field_of_view", "read_labels", "read_volume", "reformat_curve",
-    "remove_table", "render", "smooth_mesh", "write_animation",
+    "find_neighbours", "find_spine_line", "list_series", "mask_field_of_view", "read_labels", "read_volume",
+    "reformat_curve", "remove_table", "render", "smooth_mesh", "write_animation",
 }  # fmt: skip
 """What can take longer than a second."""
 

@@ -190,3 +190,6 @@ SPLAT_DEPTH_MM = 1e-4  # float32 sums of 60 mm, and their products with a slante
 SPLAT_COLOR_LEVELS = 1.01  # of 255: the table of highlights and the last rounding
 FAR_SPLAT_SHARE = 0.01  # pixels at rims of discs, whose points moved by a step of float32
 MEAN_SPACING = 0.15  # an estimate from cells of about four points: measured 0.08
+FILTER_TRUTH_SHARE = 0.1  # noise that is left on shapes of some 9,000 random points: seeds differ by 2 %
+FILTERED_PLANE_MM = 1e-5  # a plane without noise stays within the rounding of float32; measured 2e-6
+TREE_DISTANCE_STEPS = 4  # steps of float32: four roundings against a distance in float64; measured 1.5

@@ -1,4 +1,4 @@
-"""Checks of what is made of clouds of points: the grid."""
+"""Checks of what is made of clouds of points: the grid, the nearest points."""
 
 from __future__ import annotations
 
@@ -8,7 +8,9 @@ from numpy.typing import NDArray
 from clrecon.jobs.selftest.check import Check, require_equal
 from clrecon.opencl import Device, download
 from clrecon.operators.points.grid import make_grid
+from clrecon.operators.points.neighbours import find_neighbours
 from clrecon.reference.points import grid as grid_twin
+from clrecon.reference.points import neighbours as neighbours_twin
 
 __all__ = ["CHECKS"]
 
@@ -38,8 +40,25 @@ def _check_grid(device: Device) -> str:
     return "2 grids over 20,000 points equal"
 
 
+def _check_neighbours(device: Device) -> str:
+    """Compare neighbours of scattered points with far ones, a crowd and many at one place, and of a lattice."""
+    scattered = _scattered(12_000)
+    scattered[:500] *= 0.01
+    scattered[500:540] = scattered[0]
+    scattered[540:545] += np.float32(300.0)
+    lattice = np.argwhere(np.ones((20, 20, 20))).astype(np.float32)
+    many = _scattered(30_000)  # in some 15,000 cells, of which a work-item takes 16
+    for points, k in ((scattered, 16), (scattered, 5), (lattice, 16), (many, 2)):
+        found = find_neighbours(points, k, device=device)
+        indices, distances = neighbours_twin.find_neighbours(points, k)
+        require_equal(found.indices, indices, f"{k} nearest of {len(points):,} points")
+        require_equal(found.distances, distances, f"distances of the {k} nearest of {len(points):,} points")
+    return "2 to 16 neighbours of up to 30,000 points equal"
+
+
 CHECKS = (
     Check(
         "grid of points", ("clear_cells", "mark_cells", "count_marked", "number_points", "gather_points"), _check_grid
     ),
+    Check("nearest points", ("list_neighbours",), _check_neighbours),
 )

@@ -35,6 +35,7 @@ __all__ = [
     "GridPlan",
     "PointGrid",
     "fill_grid",
+    "find_box",
     "make_grid",
     "plan_grid",
     "prepare_grid",
@@ -167,7 +168,7 @@ def _bits(numbers: int) -> int:
     return max(numbers - 1, 0).bit_length()
 
 
-def _find_box(points: NDArray[np.floating]) -> NDArray[np.floating]:
+def find_box(points: NDArray[np.floating]) -> NDArray[np.floating]:
     """Return the lowest and the highest coordinates, shape (2, 3)."""
     whole = len(points) // _CHUNK * _CHUNK
     parts = [points[whole:]]
@@ -199,7 +200,7 @@ def plan_grid(points: ArrayLike, edge: float) -> GridPlan:
     if not (np.isfinite(edge) and np.float32(edge) >= np.finfo(np.float32).tiny):
         raise UsageError(f"cells of {edge:g} mm: their edge is a positive number of mm")
     places = np.ascontiguousarray(places, dtype=None if places.dtype == np.float32 else np.float64)
-    box = _find_box(places)
+    box = find_box(places)
     if not np.isfinite(box).all():
         wrong = int((~np.isfinite(places).all(axis=1)).sum())
         raise UsageError(f"{wrong:,} of {len(places):,} points are not finite: remove them first")

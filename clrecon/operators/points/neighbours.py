@@ -1,0 +1,349 @@
+"""The k nearest points of every point, exactly: the host's side of cl/points/neighbours.cl."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from clrecon.errors import DeviceMemoryError, UsageError
+from clrecon.opencl import (
+    Device,
+    Program,
+    Stopwatch,
+    check_memory,
+    describe_shortage,
+    download,
+    empty_output,
+    kernel_constant,
+    launch,
+    load_program,
+    memory_limits,
+    take_device,
+    work_on,
+)
+from clrecon.operators.points.cell_edge import choose_cell_edge
+from clrecon.operators.points.grid import GridPlan, PointGrid, fill_grid, plan_grid, prepare_grid
+from clrecon.points import PointCloud
+from clrecon.system.progress import Progress, ignore_progress
+
+__all__ = [
+    "MOST_NEIGHBOURS",
+    "NeighbourSearch",
+    "Neighbours",
+    "Part",
+    "check_neighbours",
+    "find_neighbours",
+    "prepare_neighbours",
+    "take_points",
+]
+
+BATCH_CELLS = kernel_constant("points/neighbours.cl", "BATCH_CELLS")
+"""Cells a work-item on a CPU."""
+
+MOST_NEIGHBOURS = kernel_constant("points/neighbours.cl", "MOST_NEIGHBOURS")
+"""Most neighbours of a point: three times as many candidates have room in the kernel."""
+
+PART_POINTS = 1 << 16
+"""Points of a launch on a CPU: their neighbours stay in its caches until the next kernel reads them."""
+
+PART_POINTS_OF_GPU = 1 << 20
+"""Points of a launch on a GPU, which needs many work-items and keeps each launch short."""
+
+MOST_PAIRS = 10**12
+"""Most pairs of points of one cell that may have to be compared: minutes to hours."""
+
+CROWDED = 4096
+"""Points in a cell from which on pairs are counted before the search."""
+
+ROUNDING = 1e-6
+"""Share of the largest distance and coordinate that the place of a cell's face may be wrong by: several roundings of
+float32."""
+
+
+@dataclass(frozen=True, eq=False)
+class Neighbours:
+    """The nearest points of each point.
+
+    Attributes
+    ----------
+    indices : ndarray, shape (n, k), int32
+        Numbers of the nearest points, ascending by (distance, number).  The point itself is the first one, unless a
+        point with a lower number is at the same place.
+    distances : ndarray, shape (n, k), float32
+        mm.
+    warnings : tuple of str
+        A line for fewer neighbours than were asked for.
+    """
+
+    indices: NDArray[np.int32]
+    distances: NDArray[np.float32]
+    warnings: tuple[str, ...] = ()
+
+
+class Part(NamedTuple):
+    """Cells that one launch takes, and the sorted points in them."""
+
+    first_cell: int
+    cell_count: int
+    first_place: int
+    place_count: int
+
+
+def prepare_neighbours(device: Device) -> Program:
+    """Build the kernels of `find_neighbours`.
+
+    Raises
+    ------
+    DeviceError
+        The driver's compiler refuses.
+    """
+    prepare_grid(device)
+    return load_program(device, "points/neighbours.cl", {"LANES": device.kernel_variants["LANES"]})
+
+
+def take_points(points: PointCloud | ArrayLike) -> NDArray[np.floating]:
+    """Return the points of a cloud, or an array of points after the checks of a cloud; not empty.
+
+    Raises
+    ------
+    UsageError
+        Points cannot be used, see `PointCloud`, or there is none.
+    """
+    cloud = points if isinstance(points, PointCloud) else PointCloud(points)
+    if len(cloud) == 0:
+        raise UsageError("the cloud is empty: there is no point whose neighbours could be found")
+    return cloud.points
+
+
+def check_neighbours(k: int, points: int, fewest: int = 1) -> tuple[int, tuple[str, ...]]:
+    """Return the number of neighbours that a cloud has for each point, at most `k`, and a warning if it is less.
+
+    Parameters
+    ----------
+    k : int
+        Neighbours that are asked for, the point itself among them.
+    points : int
+        Points of the cloud.
+    fewest : int
+        Fewest that may be asked for.
+
+    Raises
+    ------
+    UsageError
+        `k` is not a whole number from `fewest` to `MOST_NEIGHBOURS`.
+    """
+    if isinstance(k, bool) or not isinstance(k, (int, np.integer)) or not fewest <= k <= MOST_NEIGHBOURS:
+        raise UsageError(
+            f"k, the number of neighbours with the point itself, is a whole number from {fewest} to {MOST_NEIGHBOURS},"
+            f" not {k!r}"
+        )
+    if k <= points:
+        return int(k), ()
+    return points, (f"the cloud has {points:,} points: each has {points:,} neighbours, itself among them, not {k}",)
+
+
+class NeighbourSearch:
+    """A grid over points and the kernel that lists neighbours by it.
+
+    Parameters
+    ----------
+    device : Device
+    points : ndarray, shape (n, 3)
+        At least one, finite.
+    k : int
+        At most n.
+    needs : dict of str to int
+        Bytes of further buffers, for the forecast.
+    memory : int, optional
+    stopwatch : Stopwatch
+
+    Attributes
+    ----------
+    grid : PointGrid
+    parts : list of Part
+        All cells, in parts of some `PART_POINTS` points.
+
+    Raises
+    ------
+    UsageError
+        So many points lie in one cell that more than `MOST_PAIRS` pairs would be compared.
+    DeviceMemoryError
+        There is no room for all buffers.
+    """
+
+    def __init__(
+        self,
+        device: Device,
+        points: NDArray[np.floating],
+        k: int,
+        needs: dict[str, int],
+        memory: int | None,
+        stopwatch: Stopwatch,
+    ):
+        self.device, self.k, self._stopwatch = device, k, stopwatch
+        plan = plan_grid(points, choose_cell_edge(points, k))
+        self.forecast = {
+            **plan.needs(device),
+            "neighbours of a part": 4 * k * min(self._part_points, len(points)),
+            **needs,
+        }
+        shortage = describe_shortage(memory_limits(device, memory), self.forecast)
+        if shortage:
+            raise DeviceMemoryError(
+                f"the neighbours of {len(points):,} points cannot be found: {shortage}; fewer points need less"
+            )
+        with stopwatch.timed("build"):
+            self._program = prepare_neighbours(device)
+        with stopwatch.running(device):
+            self.grid = fill_grid(device, plan, memory=memory, stopwatch=stopwatch)
+        self._margin = _rounding_of(plan)
+        starts = download(device, np.empty(self.grid.cells + 1, np.uint32), self.grid.starts_d)
+        _check_pairs(self.grid, starts)
+        self.parts = _split(starts, self._part_points)
+
+    @property
+    def _part_points(self) -> int:
+        return PART_POINTS if int(self.device.kernel_variants["LANES"]) > 1 else PART_POINTS_OF_GPU
+
+    @property
+    def most_places(self) -> int:
+        """Points of the largest part."""
+        return max(part.place_count for part in self.parts)
+
+    @property
+    def coordinates(self) -> dict[str, Any]:
+        """The arguments x, y and z of kernels."""
+        return {"x": self.grid.x_d, "y": self.grid.y_d, "z": self.grid.z_d}
+
+    def _launch(self, part: Part, by_place: bool, neighbours_d: Any, distances_d: Any) -> None:
+        grid, one_lane = self.grid, int(self.device.kernel_variants["LANES"]) == 1
+        (nx, ny, nz), (x, y, z) = grid.shape, (float(value) for value in grid.origin - grid.base)
+        launch(
+            self.device, self._program["list_neighbours"],
+            part.place_count if one_lane else -(-part.cell_count // BATCH_CELLS), stopwatch=self._stopwatch,
+            mask=grid.mask_d, ranks=grid.ranks_d, starts=grid.starts_d, order=grid.order_d, **self.coordinates,
+            neighbours=neighbours_d, distances=distances_d, nx=nx, ny=ny, nz=nz, words=grid.words, cells=grid.cells,
+            points=grid.n, origin=(x, y, z, grid.edge), margin=self._margin, k=self.k, by_place=by_place,
+            **part._asdict(),
+        )  # fmt: skip
+
+    def list_places(self, part: Part, neighbours_d: Any) -> None:
+        """Write the neighbours of the points of a part, (place_count, k), as places in the sorted order."""
+        self._launch(part, True, neighbours_d, neighbours_d)
+
+    def list_numbers(self, part: Part, neighbours_d: Any, distances_d: Any) -> None:
+        """Write the neighbours of the points of a part as numbers, and their distances, to their rows of (n, k)."""
+        self._launch(part, False, neighbours_d, distances_d)
+
+    def each_part(self, stage: str, progress: Progress | None) -> Iterator[Part]:
+        """Yield the parts, and tell how many points are done."""
+        tell, done = progress or ignore_progress, 0
+        for part in self.parts:
+            with self._stopwatch.running(self.device):
+                yield part
+            done += part.place_count
+            tell(stage, done, self.grid.n)
+
+
+def _rounding_of(plan: GridPlan) -> float:
+    """Return a length in mm beyond the rounding of a cell's faces and of distances to them."""
+    extent = np.abs(plan.corner).max() + float(plan.edge) * max(plan.shape)
+    return ROUNDING * float(extent)
+
+
+def _split(starts: NDArray[np.uint32], points: int) -> list[Part]:
+    """Split cells in parts of about `points` points; a single cell is never split."""
+    cells, total = len(starts) - 1, int(starts[-1])
+    wanted = np.arange(points, total, points)
+    borders = np.unique(np.concatenate([[0], np.searchsorted(starts, wanted), [cells]])).astype(np.int64)
+    return [
+        Part(int(first), int(end - first), int(starts[first]), int(starts[end]) - int(starts[first]))
+        for first, end in zip(borders[:-1], borders[1:], strict=True)
+    ]
+
+
+def _check_pairs(grid: PointGrid, starts: NDArray[np.uint32]) -> None:
+    """Refuse clouds of which too many points lie in one cell, but not at one place."""
+    counts = np.diff(starts).astype(np.int64)
+    crowded = np.flatnonzero(counts > CROWDED)
+    pairs = int((counts[crowded] ** 2).sum())
+    if pairs <= MOST_PAIRS:
+        return
+    axes = [download(grid.device, np.empty(grid.n, np.float32), axis_d) for axis_d in (grid.x_d, grid.y_d, grid.z_d)]
+    for cell in crowded:
+        own = slice(int(starts[cell]), int(starts[cell + 1]))
+        if all(np.ptp(axis[own]) == 0.0 for axis in axes):
+            pairs -= int(counts[cell]) ** 2
+    if pairs > MOST_PAIRS:
+        raise UsageError(
+            f"{int(counts.max()):,} of {grid.n:,} points lie in one cell of {grid.edge:.3g} mm: {pairs:.1e} pairs would"
+            f" be compared, possible are {MOST_PAIRS:.0e}; remove points far from all others, or thin the cloud"
+        )
+
+
+def find_neighbours(
+    points: PointCloud | ArrayLike,
+    k: int = 16,
+    *,
+    device: Device | str | int | None = None,
+    memory: int | None = None,
+    progress: Progress | None = None,
+) -> Neighbours:
+    """Find the k nearest points of every point of a cloud.
+
+    Exact: the order is that of the distances in float32, and of the points' numbers where distances are equal.
+    Distances are ``sqrt(dx dx + dy dy + dz dz)`` of float32 coordinates; points from 4096 mm on are taken relative to a
+    whole number of mm near their centre.  The result has the same bits on every device.
+
+    Parameters
+    ----------
+    points : PointCloud or array_like, shape (n, 3)
+        mm; at least one point, all finite.
+    k : int
+        Number of neighbours, the point itself among them; 1 to 128.  A cloud of fewer points has as many, with a
+        warning.
+    device : Device, str or int, optional
+        See `clrecon.device`; None is the best of the machine.
+    memory : int, optional
+        Most bytes taken on the device; None is all that it has.
+    progress : callable, optional
+        Called as ``progress("neighbours", points done, all points)``.
+
+    Returns
+    -------
+    Neighbours
+
+    Raises
+    ------
+    UsageError
+        The cloud is empty or has coordinates that are not finite, `k` is out of range, or more than 1e12 pairs of
+        points of single cells would have to be compared.
+    DeviceMemoryError
+        The device has no room for the cloud and 8 k bytes a point.
+    DeviceError
+        The device fails.
+
+    Examples
+    --------
+    >>> near = clrecon.find_neighbours(cloud, k=8)  # doctest: +SKIP
+    >>> spacing = np.median(near.distances[:, 1])  # doctest: +SKIP
+    """
+    check_memory(memory)
+    places = take_points(points)
+    k, warnings = check_neighbours(k, len(places))
+
+    def work(device: Device, told: list[str]) -> Neighbours:
+        results = {"neighbours": 4 * k * len(places), "distances": 4 * k * len(places)}
+        search = NeighbourSearch(device, places, k, results, memory, Stopwatch())
+        indices, indices_d = empty_output(device, (len(places), k), np.int32)
+        distances, distances_d = empty_output(device, (len(places), k), np.float32)
+        for part in search.each_part("neighbours", progress):
+            search.list_numbers(part, indices_d, distances_d)
+        indices, distances = download(device, indices, indices_d), download(device, distances, distances_d)
+        return Neighbours(indices, distances, (*warnings, *told))
+
+    return work_on(take_device(device), work)
