@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -20,8 +19,6 @@ from clrecon.rendering.views.camera import Camera
 
 TURN = rotation((15.0, -25.0, 40.0))
 PLACE = np.array([40.0, -90.0, -600.0])
-DEVICE_FILES = {"dvr": "composite.cl", "surface": "surface.cl"}
-DEVICE_RENDERS = importlib.util.find_spec("clrecon.operators.rays.render") is not None
 
 STEPS = {
     "even": np.diag([0.9, 0.9, 0.9]),
@@ -214,14 +211,12 @@ class DeviceCaster:
         return Shot(found.image, found.depth, found.expected_depth, values)
 
 
-def casters(mode: str = "dvr") -> list[Any]:
-    """Parameters for a test: the twin, and every device where the raycaster has the mode."""
+def casters() -> list[Any]:
+    """Parameters for a test: the twin, and the device that truths are asked of."""
     devices, reason = conftest.Devices.get()
-    devices = conftest.first_of(devices)
-    found = [pytest.param(TwinCaster(), id="twin")]
-    if not DEVICE_RENDERS or not (conftest.ROOT / "cl" / "render" / DEVICE_FILES[mode]).exists():
-        return found
     if not devices and conftest.is_set("CLRECON_REQUIRE_DEVICE"):
         raise pytest.UsageError(f"CLRECON_REQUIRE_DEVICE is set: {reason}")
-    found += [pytest.param(DeviceCaster(device), id=conftest.device_id(device)) for device in devices]
-    return found
+    on_devices = [
+        pytest.param(DeviceCaster(device), id=conftest.device_id(device)) for device in conftest.first_of(devices)
+    ]
+    return [pytest.param(TwinCaster(), id="twin"), *on_devices]

@@ -6,17 +6,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from raycast_scenes import DEVICE_RENDERS, blobs, even_volume
+from raycast_scenes import blobs, even_volume
 
 from clrecon.errors import UsageError
 from clrecon.geometry import Volume
 from clrecon.rendering import TransferFunction
 from clrecon.rendering.views.camera import Camera
-
-pytestmark = [
-    pytest.mark.skipif(not DEVICE_RENDERS, reason="the raycaster of devices is not there"),
-    pytest.mark.first_device,
-]
 
 AHEAD = Camera((0.0, -100.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 1.0), parallel_scale=20.0)
 FOG = TransferFunction([(-100, 1, 1, 1, 0.1), (100, 1, 1, 1, 0.1)])

@@ -1,4 +1,4 @@
-"""The raycaster on every device against its numpy twin, against other devices, and against itself."""
+"""The raycaster against its numpy twin, on one device against others, and against itself."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 import tolerances
 from raycast_scenes import (
-    DEVICE_RENDERS,
     DeviceCaster,
     TwinCaster,
     ball,
@@ -22,7 +21,6 @@ from raycast_scenes import (
     uneven_volume,
 )
 from soft_function import SOFT
-from variants import all_but
 
 from clrecon.geometry import Volume
 from clrecon.opencl.sources import read_kernel_source
@@ -30,8 +28,6 @@ from clrecon.reference.rays.rays import hash_pixels, jitter_pixels
 from clrecon.rendering import UNSHADED, Lighting, TransferFunction
 from clrecon.rendering.views.camera import Camera
 from clrecon.rendering.views.clip import Clip
-
-renders = pytest.mark.skipif(not DEVICE_RENDERS, reason="the raycaster of devices is not there")
 
 SIZE = (64, 48)
 STEEP = TransferFunction([(-200, 0.8, 0.1, 0.1, 0), (100, 1, 0.6, 0.3, 0), (130, 1, 0.9, 0.7, 0.9), (800, 1, 1, 1, 1)])
@@ -115,14 +111,13 @@ def assert_alike(found: Any, expected: Any, mode: str) -> None:
             assert (away <= tolerances.RAY_TWIN_DEPTH_MM).mean() >= 1.0 - tolerances.RAY_TWIN_DEPTH_SHARE, name
 
 
-@renders
-@pytest.mark.parametrize("name", all_but(SCENES, "steep uneven"))  # half a minute on llvmpipe; "steep", "uneven" stay
+@pytest.mark.parametrize("name", SCENES)
 def test_the_kernel_is_its_twin(device, name):
     volume, settings = SCENES[name]()
     assert_alike(DeviceCaster(device)(volume, **settings), TwinCaster()(volume, **settings), settings["mode"])
 
 
-@renders
+@pytest.mark.every_device
 @pytest.mark.usefixtures("users_kernels")
 @pytest.mark.parametrize("name", ["soft", "mip", "drr"])
 def test_the_kernel_of_users_is_its_twin(device, name):
@@ -130,7 +125,7 @@ def test_the_kernel_of_users_is_its_twin(device, name):
     assert_alike(DeviceCaster(device)(volume, **settings), TwinCaster()(volume, **settings), settings["mode"])
 
 
-@renders
+@pytest.mark.every_device
 def test_flat_places_are_not_lit_by_rounding(device):
     """A mask of two values: where it is flat, differences of float32 are noise."""
     volume = even_volume(lambda p: np.where(np.abs(p).max(axis=1) < 7.0, 2613.0, -300.0), "oblique", 18.0, np.int16)
@@ -138,7 +133,6 @@ def test_flat_places_are_not_lit_by_rounding(device):
     assert_alike(DeviceCaster(device)(volume, **settings), TwinCaster()(volume, **settings), "dvr")
 
 
-@renders
 @pytest.mark.oclgrind
 @pytest.mark.parametrize(
     ("mode", "function", "even"),
@@ -168,7 +162,6 @@ def test_raycast_of_few_voxels_is_its_twin(device, mode, function, even):
         assert np.nanmax(np.abs(found.values - expected.values)) <= tolerances.RAY_TWIN_HU
 
 
-@renders
 @pytest.mark.parametrize("name", ["soft", "steep", "gradient opacity", "uneven", "mip", "mean", "drr"])
 def test_all_devices_give_one_picture(name):
     from skimage.metrics import structural_similarity
@@ -185,6 +178,7 @@ def test_all_devices_give_one_picture(name):
         assert_alike(other, first, settings["mode"])
 
 
+@pytest.mark.every_device
 def test_jitter_has_the_same_bits_on_devices(device):
     import pyopencl
 
@@ -213,14 +207,14 @@ def test_jitter_has_the_same_bits_on_devices(device):
     assert np.array_equal(parts, jitter_pixels(width, height))
 
 
-@renders
+@pytest.mark.every_device
 def test_two_pictures_of_one_camera_are_one(device):
     volume, settings = SCENES["steep"]()
     first, again = (DeviceCaster(device)(volume, **settings) for _ in range(2))
     assert np.array_equal(first.image, again.image) and np.array_equal(first.depth, again.depth, equal_nan=True)
 
 
-@renders
+@pytest.mark.every_device
 @pytest.mark.parametrize("size", [(1, 1), (1, 9), (8, 8), (9, 7), (65, 33)])
 def test_pictures_of_any_size_have_all_their_pixels(device, size):
     volume = even_volume(lambda p: np.zeros(len(p)), "oblique", 12.0, np.int16)

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import tolerances
 from raycast_scenes import (
-    DEVICE_RENDERS,
     DeviceCaster,
     blobs,
     even_volume,
@@ -18,8 +17,6 @@ from soft_function import SOFT
 
 from clrecon.reference.rays.render import MODES
 from clrecon.rendering import Lighting
-
-pytestmark = pytest.mark.skipif(not DEVICE_RENDERS, reason="the raycaster of devices is not there")
 
 
 @pytest.mark.parametrize("mode", MODES)

@@ -33,7 +33,7 @@ SLOPE /= np.linalg.norm(SLOPE)
 
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
     if "cast" in metafunc.fixturenames:
-        metafunc.parametrize("cast", casters("surface"))
+        metafunc.parametrize("cast", casters())
 
 
 def make(field, steps: str, extent: float) -> Volume:
