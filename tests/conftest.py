@@ -1,4 +1,4 @@
-"""Fixtures for all tests: the real data, and every OpenCL device of the machine.
+"""Fixtures for all tests: the real data, and the OpenCL devices of the machine.
 
 Variables
 ---------
@@ -6,6 +6,8 @@ CLRECON_TEST_DATA
     Folder of the real CT data, default ``../shared/data`` beside the project; tests over it skip where it is absent.
 CLRECON_TEST_DEVICE
     Only the devices of this index or with this text in platform or name; naming one that is not there is an error.
+CLRECON_TEST_EVERY_DEVICE=1
+    Every test with the fixture ``device`` runs on every device, not only those marked ``every_device``.
 CLRECON_TEST_SIMULATORS=1
     Simulators such as Oclgrind too.
 CLRECON_REQUIRE_DEVICE=1
@@ -108,28 +110,38 @@ class Devices:
 
 
 def first_of(devices: list[Any]) -> list[Any]:
-    """The first device, for tests marked ``first_device``; with CLRECON_TEST_EVERY_DEVICE=1 all."""
+    """The first device, for tests that are not for every one; with CLRECON_TEST_EVERY_DEVICE=1 all."""
     return devices if is_set("CLRECON_TEST_EVERY_DEVICE") else devices[:1]
 
 
+def is_for_every_device(node: pytest.Item | pytest.FunctionDefinition) -> bool:
+    """True for tests of what a driver makes of kernels; what a simulator watches is as small."""
+    return any(node.get_closest_marker(name) for name in ("every_device", "oclgrind"))
+
+
+@pytest.hookimpl(trylast=True)  # after pytest has brought together what runs on one device
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Leave out the parameters marked ``first_device`` on all other devices, and mark what else runs on these."""
+    """Choose the devices of parameters, mark what runs on a further one, and begin with what takes longest.
+
+    The first process gets the beginning of the list, and when it comes to the end the others take of its rest: a test
+    of a minute must not be the last.
+    """
     devices = Devices.found[0] if Devices.found else []
-    first, left_out = first_of(devices), set()
+    first, chosen = first_of(devices), []
     for item in items:
         device = item.callspec.params.get("device") if hasattr(item, "callspec") else None
-        if device is None or device not in devices[1:]:
-            continue
-        item.add_marker("further_device")
-        if item.get_closest_marker("first_device") and device not in first:
-            left_out.add(item)
-    items[:] = [item for item in items if item not in left_out]
+        if device in devices[1:]:
+            item.add_marker("further_device")
+            if item.get_closest_marker("first_device") and device not in first:
+                continue
+        chosen.append(item)
+    items[:] = sorted(chosen, key=lambda item: item.get_closest_marker("long") is None)
 
 
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
     if "device" in metafunc.fixturenames:
         devices, reason = Devices.get()
-        if metafunc.definition.get_closest_marker("first_device"):
+        if not is_for_every_device(metafunc.definition):
             devices = first_of(devices)
         parameters = devices or [pytest.param(reason, id="no-device")]
         ids = [device_id(device) for device in devices] or None
@@ -138,7 +150,7 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
 
 @pytest.fixture(scope="session")
 def device(request: pytest.FixtureRequest) -> Any:
-    """Every OpenCL device of the machine, one after the other."""
+    """The first OpenCL device of the machine; with the marks `every_device` and `oclgrind` one after the other."""
     if isinstance(request.param, str):
         if is_set("CLRECON_REQUIRE_DEVICE"):
             pytest.fail(f"CLRECON_REQUIRE_DEVICE is set: {request.param}")

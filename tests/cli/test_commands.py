@@ -35,6 +35,7 @@ def ct(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_series(tmp_path_factory.mktemp("cli") / "Scan von Größe 3")
 
 
+@pytest.mark.every_device
 @pytest.mark.parametrize("space", ["lps", "ras"])
 def test_mesh_writes_the_sphere_where_it_is(
     device: Any, space: str, ct: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
@@ -225,6 +226,7 @@ def test_two_series_and_the_choice(device: Any, tmp_path: Path, capsys: pytest.C
     assert "no series matches" in capsys.readouterr().err
 
 
+@pytest.mark.every_device
 def test_devices_lists_each(device: Any, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["devices", "--json", "--device", str(device.index)]) == 0
     survey = json.loads(capsys.readouterr().out)
@@ -253,7 +255,6 @@ def test_no_driver_says_how_to_get_one(
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.first_device
 def test_selftest_passes(device: Any, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     """With the first checks of the table; all of them run in tests/jobs/selftest."""
     from clrecon.jobs.selftest import table
@@ -266,7 +267,6 @@ def test_selftest_passes(device: Any, monkeypatch: pytest.MonkeyPatch, capsys: p
     assert all(set(result) == {"operator", "passed", "detail", "seconds"} for result in outcome["operators"])
 
 
-@pytest.mark.first_device
 def test_selftest_that_fails_exits_5(
     device: Any, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

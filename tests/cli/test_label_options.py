@@ -240,7 +240,6 @@ def test_what_cannot_be_with_masks_is_said_in_one_line(
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.first_device  # the gate is no work of the device
 def test_labels_that_miss_their_volume_fail_the_gate(
     device: Any, ct: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -14,8 +14,6 @@ from PIL import Image
 
 from clrecon.cli.main import main
 
-pytestmark = pytest.mark.first_device
-
 SHAPE_KJI = (17, 25, 31)
 BLOCK = (slice(11, 15), slice(3, 9), slice(22, 28))
 """A block (k, j, i) near the patient's head, front and left: no two views of it are alike."""

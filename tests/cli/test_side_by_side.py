@@ -64,7 +64,7 @@ def made(target: Path) -> tuple[str, Any]:
     return hashlib.sha256(target.read_bytes()).hexdigest(), figures(json.loads(text))
 
 
-@pytest.mark.parametrize("extension", [".stl", pytest.param(".vtp", marks=pytest.mark.first_device)])
+@pytest.mark.parametrize("extension", [".stl", ".vtp"])
 def test_rows_60_and_72_every_run_writes_the_same_bytes(device, ct: Path, tmp_path: Path, extension: str) -> None:
     plain, odd = make_targets(tmp_path, extension)
     finish(start(ct, plain, device))
@@ -86,7 +86,6 @@ def test_rows_60_and_72_every_run_writes_the_same_bytes(device, ct: Path, tmp_pa
     assert made(plain) == made(odd)
 
 
-@pytest.mark.first_device
 def test_row_58_processes_share_a_device(device, ct: Path, tmp_path: Path) -> None:
     """Both begin with an empty cache of kernels."""
     cache = tmp_path / "cache"

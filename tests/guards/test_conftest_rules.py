@@ -108,10 +108,13 @@ names = ("CPU", "llvmpipe (LLVM 15.0.6, 256 bits)")
 same = {"platform": "p", "type": "cpu", "version": "", "driver": "", "is_simulator": False, "known_good": None}
 found = [SimpleNamespace(index=index, name=name, **same) for index, name in enumerate(names)]
 clrecon.opencl.list_devices = lambda: found
+@pytest.mark.every_device
 @pytest.mark.parametrize("kind", ["int16", pytest.param("int8", marks=pytest.mark.first_device)])
 def test_kinds(device, kind):
     assert device in found
-@pytest.mark.first_device
+@pytest.mark.oclgrind
+def test_watched(device):
+    assert device in found
 def test_first(device):
     assert device is found[0]
 """
@@ -120,14 +123,29 @@ def test_first(device):
 @pytest.mark.parametrize(
     ("variables", "passed"),
     [
-        ({}, "4 passed"),  # one parameter on both devices, the other and the last test on the first
-        ({"CLRECON_TEST_EVERY_DEVICE": "1"}, "1 failed, 5 passed"),
-        ({"CLRECON_TEST_DEVICE": "0"}, "3 passed"),  # the 0 in the name of the other is no index
+        ({}, "6 passed"),  # one parameter and the test with a simulator on both devices, the rest on the first
+        ({"CLRECON_TEST_EVERY_DEVICE": "1"}, "1 failed, 7 passed"),
+        ({"CLRECON_TEST_DEVICE": "0"}, "4 passed"),  # the 0 in the name of the other is no index
     ],
 )
-def test_what_is_marked_runs_on_the_first_device(tmp_path: Path, variables: dict[str, str], passed: str) -> None:
+def test_what_is_for_every_device_runs_on_every_device(tmp_path: Path, variables: dict[str, str], passed: str) -> None:
     done = run_pytest(tmp_path, TWO_DEVICES, **variables)
     assert passed in done.stdout.splitlines()[-1], done.stdout + done.stderr
+
+
+LONG_AND_SHORT = """
+import pytest
+def test_short():
+    pass
+@pytest.mark.long
+def test_long():
+    pass
+"""
+
+
+def test_a_run_begins_with_what_takes_long(tmp_path: Path) -> None:
+    done = run_pytest(tmp_path, LONG_AND_SHORT, "-vv")
+    assert done.stdout.index("test_long PASSED") < done.stdout.index("test_short PASSED"), done.stdout + done.stderr
 
 
 def test_required_platforms_are_there(device: object) -> None:

@@ -38,7 +38,6 @@ def folder(tmp_path_factory) -> Path:
     return folder
 
 
-@pytest.mark.first_device
 def test_the_example_of_the_readme_runs(folder, device, monkeypatch):
     blocks = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(encoding="utf-8"), re.DOTALL)
     assert len(blocks) == 1
@@ -54,7 +53,6 @@ def test_the_example_of_the_readme_runs(folder, device, monkeypatch):
     assert {"bone.stl", "spine.png", "bone.gif"} <= {path.name for path in folder.iterdir()}
 
 
-@pytest.mark.first_device
 def test_the_examples_of_styles_run(folder, device, monkeypatch):
     text = (ROOT / "docs" / "rendering.md").read_text(encoding="utf-8")
     block = re.search(r"(    bone = clrecon\.SurfaceLook.*?)\n\n", text, re.DOTALL)

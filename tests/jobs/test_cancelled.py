@@ -24,8 +24,6 @@ from clrecon.labels import LabelMap
 from clrecon.phantom import PhantomSettings, write_phantom
 from clrecon.system.progress import Progress
 
-pytestmark = pytest.mark.first_device
-
 Calls = list[tuple[str, int, int]]
 
 

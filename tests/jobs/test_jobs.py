@@ -34,6 +34,7 @@ def sphere(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, An
     return folder, write_phantom(folder, settings)
 
 
+@pytest.mark.every_device
 def test_a_tilted_oblique_sphere_has_its_volume_and_place(
     device: Any, sphere: tuple[Path, dict[str, Any]], tmp_path: Path
 ) -> None:
@@ -107,7 +108,6 @@ def test_survey_says_why_no_device_is_used(device: Any) -> None:
     assert "abacus" in str(problem)
 
 
-@pytest.mark.first_device  # its mesh and its pictures are tested on every device in tests/operators
 def test_demo_writes_and_replaces(device: Any, tmp_path: Path) -> None:
     folder = tmp_path / "demo"
     first = make_demo(folder, str(device.index))

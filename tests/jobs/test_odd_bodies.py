@@ -18,8 +18,6 @@ from clrecon.jobs.render.files import PictureFiles
 from clrecon.jobs.render.job import make_pictures
 from clrecon.jobs.render.settings import RenderSettings
 
-pytestmark = pytest.mark.first_device
-
 BONY = [name for name in BODIES if name not in ("water", "empty")]
 SPINELESS = [name for name in BODIES if name != "contrast"]
 

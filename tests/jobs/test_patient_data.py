@@ -68,7 +68,6 @@ COMMANDS = {
 }  # fmt: skip
 
 
-@pytest.mark.first_device
 @pytest.mark.parametrize("what", COMMANDS)
 def test_row_69_no_file_and_no_word_names_the_patient(
     what: str,
@@ -115,7 +114,6 @@ def test_row_69_no_file_and_no_word_names_the_patient(
     ],
     ids=["none", "both", "phase", "choice", "labels"],
 )
-@pytest.mark.first_device
 def test_row_69_errors_name_a_series_by_its_number(
     arguments: list[str], code: int, device: Any, scan: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

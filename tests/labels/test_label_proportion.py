@@ -57,7 +57,6 @@ def test_zeros_are_not_unpacked(kind: str, zeros: dict[str, Path], monkeypatch: 
         clrecon.read_labels(zeros[kind], volume=scan)
 
 
-@pytest.mark.first_device
 @pytest.mark.parametrize("command", ["mesh", "render"])
 def test_commands_hold_large_maps_against_the_scan(
     command: str, device: Any, zeros: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]

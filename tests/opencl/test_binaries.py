@@ -101,7 +101,6 @@ def test_the_oldest_go(own_cache, monkeypatch):
     ]
 
 
-@pytest.mark.first_device
 def test_the_next_process_takes_the_binary(keeper, monkeypatch):
     """Building from source once; then, with no program in memory, from the binary."""
     sources = []
@@ -113,7 +112,6 @@ def test_the_next_process_takes_the_binary(keeper, monkeypatch):
     assert len(sources) == 1
 
 
-@pytest.mark.first_device
 def test_binaries_compute_what_sources_do(keeper, monkeypatch):
     from clrecon.opencl import upload
     from clrecon.operators.primitives.compact import compact
@@ -124,7 +122,6 @@ def test_binaries_compute_what_sources_do(keeper, monkeypatch):
         assert compact(keeper, upload(keeper, mask), 1000).count == int(np.unpackbits(mask.view(np.uint8)).sum())
 
 
-@pytest.mark.first_device
 def test_a_binary_that_the_driver_refuses_is_built_from_source(keeper, monkeypatch):
     options = ()
     store_binary(program._key(keeper, read_kernel_source("primitives/compact.cl"), options), b"no program at all")
@@ -132,7 +129,6 @@ def test_a_binary_that_the_driver_refuses_is_built_from_source(keeper, monkeypat
     assert load_program(keeper, "primitives/compact.cl").kernel_names == ["count_set_bits", "list_set_bits"]
 
 
-@pytest.mark.first_device
 def test_a_program_without_kernels_is_an_error(keeper, monkeypatch):
     monkeypatch.setattr(program.Program, "kernel_names", [])
     monkeypatch.setattr(keeper, "programs", {})

@@ -37,6 +37,7 @@ def environment_of(tmp_path, **variables):
     return {**environment, "TMPDIR": str(tmp_path), **variables}
 
 
+@pytest.mark.every_device
 @pytest.mark.parametrize(
     ("variables", "fault"),
     [
@@ -55,7 +56,6 @@ def test_row_59_no_place_for_built_kernels(device, variables, fault, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.first_device
 @pytest.mark.parametrize("command", ["devices", "render", "mesh"])
 def test_row_59_every_command_with_a_device_warns_once(command, device, tmp_path, phantom_folder):
     """The folder of pickles is refused; kernels are found as ever, so that nothing is built for this test."""
@@ -73,7 +73,6 @@ def test_row_59_every_command_with_a_device_warns_once(command, device, tmp_path
     assert done.stderr.count("XDG_CACHE_HOME/pytools can be written by other users") == 1, done.stderr
 
 
-@pytest.mark.first_device
 def test_row_59_reports_of_other_commands_and_pictures_have_the_warnings(device, monkeypatch):
     from clrecon.geometry import Volume
     from clrecon.jobs import devices
@@ -101,6 +100,7 @@ def phantom_folder(shared_folder):
     return folder
 
 
+@pytest.mark.every_device
 def test_a_cache_that_works_is_no_warning(device):
     assert cache_warnings() == () and device.warnings == []
 
@@ -224,7 +224,6 @@ def test_row_59_no_room_anywhere_is_an_error(fresh, monkeypatch):
         refuse_short_files()
 
 
-@pytest.mark.first_device
 @pytest.mark.parametrize("limit, says", [("-f 100", "files may have 0.10 MB here"), ("-v 500000", "want of memory")])
 def test_row_59_limits_of_the_process_are_named(limit, says, device, tmp_path):
     command = ["bash", "-c", f'ulimit {limit}; exec "$@"', "bash", sys.executable, "-c", CODE, str(device.index)]

@@ -74,13 +74,16 @@ def overwrite(folder):
 
 
 def swap(folder):
-    first, second = files_of(folder, ".bc")
+    first, second = (path for path in files_of(folder, ".bc") if path.name == "program.bc")
     content = first.read_bytes()
     first.write_bytes(second.read_bytes())
     second.write_bytes(content)
 
 
-@pytest.mark.parametrize("damage", [cut, empty, overwrite, swap])
+@pytest.mark.every_device
+@pytest.mark.parametrize(
+    "damage", [overwrite, *(pytest.param(damage, marks=pytest.mark.first_device) for damage in (cut, empty, swap))]
+)
 def test_row_59_damaged_kernels_are_built_anew(damage, device, built):
     damage(built)
     assert run_child(device, built) == [DAMAGED]
@@ -95,7 +98,6 @@ def test_row_59_what_a_dead_process_built_is_built_anew(device, built):
     assert run_child(device, built) == []
 
 
-@pytest.mark.first_device
 def test_row_59_a_process_that_dies_leaves_no_record(device, tmp_path):
     if not is_pocl(device.platform):
         pytest.skip("this driver does not end the process")

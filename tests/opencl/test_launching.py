@@ -37,6 +37,7 @@ def scan_buffers(device):
     return {"counts": upload(device, counts), "block_sums": allocate(device, 4), "n": 50}
 
 
+@pytest.mark.every_device
 def test_arguments_are_passed_by_name_in_any_order(device):
     buffers = scan_buffers(device)
     backwards = dict(reversed(buffers.items()))
@@ -65,6 +66,7 @@ def test_a_wrong_argument_is_an_error_before_the_launch(device, change, message,
         launch(device, kernel, device.group_size, **arguments)
 
 
+@pytest.mark.every_device
 def test_numbers_become_what_the_kernel_takes(device):
     """The driver is given four bytes, whatever a number was."""
     kernel = load_program(device, "surface/label_masks.cl")["sum_volumes"]
@@ -78,6 +80,7 @@ def test_numbers_become_what_the_kernel_takes(device):
         kernel.order({**buffers, "centre": [1, 2, 3], "triangle_count": 7, "triangles_per_sum": 9})
 
 
+@pytest.mark.every_device
 @pytest.mark.parametrize("dtype", VOXEL_TYPES)
 def test_the_hundredth_launch_gives_what_the_first_gives(device, dtype):
     """After some launches pyopencl is told the types of all arguments."""
@@ -99,7 +102,6 @@ def test_every_argument_can_be_named_in_python(name):
             assert not [name for name in names if keyword.iskeyword(name) or name in PASSED_BY_NAME_ALREADY], kernel
 
 
-@pytest.mark.first_device
 @pytest.mark.parametrize("options", VARIANTS, ids=lambda options: " ".join(options) or "plain")
 def test_names_and_types_are_those_that_the_compiler_knows(options, device):
     cl = import_pyopencl()

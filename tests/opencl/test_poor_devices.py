@@ -15,8 +15,6 @@ from clrecon.cli.main import main
 from clrecon.opencl import Device, choose_device, kernel_files, memory_limits, read_kernel_source
 from clrecon.operators.resident.device_volume import DeviceVolume
 
-pytestmark = pytest.mark.first_device
-
 BEYOND = {
     "double precision": r"\bdouble\b|cl_khr_fp64",
     "a constant of double precision": r"(?<![\w.])(?:\d+\.\d*(?:[eE][+-]?\d+)?|\d+[eE][+-]?\d+)(?![\w.])",

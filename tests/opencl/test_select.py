@@ -189,6 +189,7 @@ def test_the_budget_names_the_limit_that_is_in_the_way(machine):
             check_budget(cpu, huge, memory)
 
 
+@pytest.mark.every_device
 def test_devices_of_this_machine_describe_themselves(device):
     devices = list_devices()
     assert [d.index for d in devices] == list(range(len(devices)))

@@ -60,6 +60,7 @@ def test_every_voxel_type_builds(voxel, device):
     assert "emit_vertices" in program.kernel_names
 
 
+@pytest.mark.every_device
 def test_a_compiler_error_names_the_true_file_and_line(device, monkeypatch):
     text = '#line 1 "cl/theme/file.cl"\n__kernel void broken(__global int *a)\n{\n    a[0] = missing_name;\n}\n'
     monkeypatch.setattr("clrecon.opencl.program.read_kernel_source", lambda name: text)

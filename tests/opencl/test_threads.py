@@ -6,11 +6,13 @@ import sys
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
+import pytest
 
 from clrecon.geometry import Volume
 from clrecon.operators.surface.extract import extract_isosurface
 
 
+@pytest.mark.every_device
 def test_threads_do_not_mix_their_arguments(device):
     volumes = [
         Volume(np.random.default_rng(seed).integers(0, 6, (4 + seed, 5, 20 + 7 * seed)).astype(np.int16), np.eye(4))

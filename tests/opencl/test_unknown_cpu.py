@@ -121,7 +121,6 @@ def make_device(device: Device, address: int) -> Device:
 
 
 @linux_only
-@pytest.mark.first_device
 def test_a_device_whose_cpu_cannot_be_named_says_what_to_install(device, monkeypatch):
     monkeypatch.setattr(unknown_cpu.platform, "machine", lambda: "x86_64")
     made = Structure(b"nothing", b"of the kind")
@@ -133,7 +132,6 @@ def test_a_device_whose_cpu_cannot_be_named_says_what_to_install(device, monkeyp
 
 
 @linux_only
-@pytest.mark.first_device
 def test_a_device_names_its_cpu_when_it_is_opened_and_not_before(device, monkeypatch):
     monkeypatch.setattr(unknown_cpu.platform, "machine", lambda: "x86_64")
     made = Structure(b"x86_64-unknown-linux-gnu", UNKNOWN)
@@ -149,6 +147,7 @@ def test_a_device_names_its_cpu_when_it_is_opened_and_not_before(device, monkeyp
         _ = found.context
 
 
+@pytest.mark.every_device
 def test_programs_get_what_tells_caches_apart(device, monkeypatch):
     from clrecon.opencl import load_program, program
 

@@ -48,7 +48,7 @@ def own_commands(device, monkeypatch):
     commands_module._all.remove(device.commands)
 
 
-pytestmark = [pytest.mark.first_device, pytest.mark.usefixtures("own_commands")]
+pytestmark = pytest.mark.usefixtures("own_commands")
 
 
 def test_what_a_kernel_works_in_lives_until_it_is_over(device):

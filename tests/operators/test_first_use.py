@@ -21,11 +21,11 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "scripts"))
 from kernel_mutations import Mutation  # noqa: E402
 
 
+@pytest.mark.every_device
 def test_row_57_a_device_that_computes_rightly_passes(device: Device) -> None:
     assert check_ball(device) == ""
 
 
-@pytest.mark.first_device
 @pytest.mark.parametrize(
     ("kernel", "name", "words"),
     [
@@ -109,7 +109,6 @@ def test_row_57_simulators_and_those_who_say_so_are_not_checked(
     ]
 
 
-@pytest.mark.first_device
 def test_row_57_operators_refuse_a_device_that_computes_wrongly(
     device: Device, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -155,7 +155,6 @@ def run_cases(names: list[str], given: str, device: Any, tmp_path: Path, *more: 
     return {result["case"]: result for result in kept}
 
 
-@pytest.mark.first_device
 def test_surfaces_in_one_process_are_measured(device: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(floors, "_COPY_BYTES", 1 << 20)
     kept = run_cases(["isosurface-cold", "isosurface-resident", "scaling"], "cube32", device, tmp_path)
@@ -182,7 +181,6 @@ def test_surfaces_in_one_process_are_measured(device: Any, tmp_path: Path, monke
     assert {"voxels", "triangles"} == set(kept["scaling"]["fits"])
 
 
-@pytest.mark.first_device
 def test_pictures_are_measured(device: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from PIL import Image
 
@@ -208,7 +206,6 @@ def test_pictures_are_measured(device: Any, tmp_path: Path, monkeypatch: pytest.
     assert np.asarray(Image.open(tmp_path / "seen" / seen[1])).mean() > 1.0
 
 
-@pytest.mark.first_device
 def test_the_mapper_on_opengl_is_measured(device: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from peers.vtk_gpu import GpuPeer
 
@@ -234,7 +231,6 @@ def test_a_peer_that_dies_is_an_error(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.first_device  # other devices are measured in one process, and a process is given any device alike
 def test_surfaces_of_fresh_processes_are_measured(device: Any, tmp_path: Path) -> None:
     kept = run_cases(["isosurface-first-call", "memory"], "cube32", device, tmp_path)
     first = kept["isosurface-first-call"]

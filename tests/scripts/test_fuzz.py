@@ -26,6 +26,7 @@ UNHARMED = Answer({"voxels": "a"}, ("known",))
 
 
 @pytest.mark.fuzz
+@pytest.mark.long
 def test_harmed_input_is_refused_or_told() -> None:
     campaign = run_campaign(Schedule(list(fuzz.SHARES)), seconds=SECONDS, jobs=1)
     assert [f"{case} {outcome.kind}: {outcome.trial}: {outcome.text}" for case, outcome in campaign.faults] == []

@@ -32,7 +32,6 @@ def commit() -> str:
         return hashlib.sha256("".join(read_kernel_source(file) for file in kernel_files()).encode()).hexdigest()
 
 
-@pytest.mark.first_device
 def test_row_57_ten_broken_kernels_are_noticed(device: Device) -> None:
     drawn = random.Random(commit()).sample([m for m in all_mutations() if not m.reason], DRAWN)
     outcomes = {mutation: judge(mutation, result) for mutation, result in run_mutations(drawn, device.index)}

@@ -29,7 +29,6 @@ def scan(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.mark.first_device
 def test_a_job_says_what_a_batch_looks_for(
     device: Any, scan: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:

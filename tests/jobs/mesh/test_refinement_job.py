@@ -157,7 +157,6 @@ def test_impossible_settings(options: dict[str, Any], complaint: str) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.first_device  # refinement is no work of the device, and its mesh of this scan is compared with VTK's
 @pytest.mark.parametrize("folder", ["lumbar_4p25mm", "thoracolumbar_labels/ct_2mm_jpeg2000"])
 def test_real_surfaces_keep_every_gate(real_data: Path, device: Any, tmp_path: Path, folder: str) -> None:
     settings = MeshSettings(

@@ -15,8 +15,6 @@ from clrecon.jobs.render.report import find_emptiness
 from clrecon.operators.rays.render import VolumeRenderer
 from clrecon.rendering import PRESETS, Rendering
 
-pytestmark = pytest.mark.first_device
-
 DENSE = {"bone": 250.0, "vessels": 120.0, "metal": 250.0}
 """Presets for what is hard or filled, and from how many HU on they show it; in that for metal bone is glass."""
 SOLID = {"spine": -450.0, "skin": -450.0, "lung": -850.0, "muscle": -20.0}

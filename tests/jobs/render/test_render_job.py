@@ -22,8 +22,6 @@ from clrecon.jobs.render.studio import read_function
 from clrecon.phantom import PhantomSettings, write_phantom
 from clrecon.rendering.pictures.styles import Projection, VolumeLook
 
-pytestmark = pytest.mark.first_device
-
 SIZE = (48, 40)
 
 

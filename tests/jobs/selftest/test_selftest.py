@@ -33,10 +33,13 @@ def macros_of(device: Device) -> dict[str, set[str]]:
     return found
 
 
-@pytest.mark.first_device
+@pytest.mark.slow
+@pytest.mark.long
+@pytest.mark.every_device
 def test_row_57_every_check_passes_and_launches_what_it_declares(
     device: Device, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """So each kernel and each of its variants is compared with its twin on every device, whatever other tests do."""
     launched: dict[str, int] = {}
 
     def note(doing: str) -> None:
@@ -96,7 +99,6 @@ for check in checks:
 """
 
 
-@pytest.mark.first_device
 def test_row_57_a_driver_that_crashes_or_hangs_becomes_words(
     device: Device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -10,8 +10,6 @@ from failing_devices import Failing, lost_error, pretended_gpu
 
 from clrecon.cli.main import main
 
-pytestmark = pytest.mark.first_device
-
 NEVER_LAST = 1 << 30
 
 COMMANDS = {

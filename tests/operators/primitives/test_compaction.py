@@ -18,6 +18,7 @@ BORDERS = (SCAN_PER_ITEM, GROUP_SIZE, BLOCK, BLOCK * GROUP_SIZE)
 SIZES = sorted({1, *(border + step for border in BORDERS for step in (-1, 0, 1)), 200_003})
 
 
+@pytest.mark.every_device
 @pytest.mark.parametrize("n", SIZES)
 def test_scan_equals_its_twin(device, n):
     counts = np.random.default_rng(n).integers(0, 50, n).astype(np.uint32)
@@ -37,6 +38,7 @@ def test_a_scan_may_take_the_place_of_its_counts(device, n):
     assert np.array_equal(download(device, np.empty(n, np.uint32), again.offsets_d), expected)
 
 
+@pytest.mark.every_device
 @pytest.mark.parametrize("group", [1, 16])
 def test_devices_with_small_work_groups_get_the_same(device, group, monkeypatch):
     monkeypatch.setattr(device, "max_work_group_size", group)
@@ -47,6 +49,7 @@ def test_devices_with_small_work_groups_get_the_same(device, group, monkeypatch)
     assert np.array_equal(download(device, np.empty(counts.size, np.uint32), scanned.offsets_d), offsets)
 
 
+@pytest.mark.every_device
 def test_a_total_beyond_32_bits_is_exact(device):
     n = 70 * BLOCK + 3  # more blocks than a work-group has items
     counts = np.full(n, 2**21 - 1, np.uint32)  # a block still fits 32 bits
@@ -82,6 +85,7 @@ def test_the_twin_is_what_it_says():
     assert compact_twin.compact(np.array([0b101, 0, 1 << 31], np.uint32)).tolist() == [0, 2, 95]
 
 
+@pytest.mark.every_device
 @pytest.mark.parametrize("words", [1, 7, 8, 9, 63, 64, 65, 511, 512, 513, 40_001])
 @pytest.mark.parametrize("density", [0.0, 0.02, 0.5, 1.0])
 def test_compact_equals_its_twin(device, words, density):

@@ -36,6 +36,7 @@ def check_equal(device, triangles: np.ndarray, vertex_count: int, other=twin.lab
     np.testing.assert_array_equal(triangles, before)
 
 
+@pytest.mark.every_device
 @pytest.mark.parametrize("vertices", [1, 2, 31, 63, 64, 65, 1023, 1024, 1025])
 @pytest.mark.parametrize("share", [0.1, 0.35, 3.0])
 def test_random_triangles(device, vertices, share):
@@ -111,6 +112,7 @@ def test_sheets_of_one_cell_stay_apart(device):
     assert label_components(device, mesh.triangles, mesh.vertex_count)[0] == 2
 
 
+@pytest.mark.every_device
 @pytest.mark.parametrize("group", [1, 16])
 def test_devices_with_small_work_groups_get_the_same(device, group, monkeypatch):
     monkeypatch.setattr(device, "max_work_group_size", group)

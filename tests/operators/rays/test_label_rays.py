@@ -18,8 +18,6 @@ from clrecon.rendering.pictures.styles import SurfaceLook
 from clrecon.rendering.views.camera import Camera
 from clrecon.rendering.views.clip import Clip
 
-pytestmark = pytest.mark.first_device
-
 SIZE = (40, 36)
 UNLIT = Lighting(1.0, 0.0, 0.0)
 NAMES = {1: "vertebrae_L1", 2: "vertebrae_L2", 3: "rib_left_1"}

@@ -19,8 +19,6 @@ from clrecon.rendering import UNSHADED, Rendering, TransferFunction
 from clrecon.rendering.views.camera import Camera
 from clrecon.rendering.views.clip import Clip
 
-pytestmark = pytest.mark.first_device
-
 BRIGHT = TransferFunction([(400.0, 1.0, 1.0, 1.0, 0.0), (500.0, 1.0, 0.5, 0.2, 1.0)])
 
 

@@ -23,7 +23,7 @@ from peers.vtk_fixed_point import FixedPointPeer
 from peers.vtk_stage import scene_of
 from raycast import likeness
 
-pytestmark = [pytest.mark.opencl, pytest.mark.first_device]
+pytestmark = pytest.mark.opencl
 
 SIZE = (200, 200)
 BONE = find_preset("bone")

@@ -18,7 +18,7 @@ from clrecon.rendering import TransferFunction
 from clrecon.rendering.views.camera import Camera
 from clrecon.rendering.views.clip import Clip
 
-pytestmark = [pytest.mark.opencl, pytest.mark.first_device]
+pytestmark = pytest.mark.opencl
 
 SIZE = (16, 16)
 HARD = TransferFunction([(0, 1, 0, 0, 0.0), (200, 1, 1, 0, 0.6)])

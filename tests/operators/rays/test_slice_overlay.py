@@ -47,6 +47,7 @@ def assert_twin(device, volume, camera, slices, clip=None, opacity=0.4, lowest=-
     return found
 
 
+@pytest.mark.every_device
 @pytest.mark.parametrize("perspective", [False, True])
 @pytest.mark.parametrize("grid", GRIDS)
 def test_the_kernel_is_its_twin(device, grid, perspective):

@@ -29,7 +29,7 @@ from clrecon.operators.reformat import sample
 from clrecon.rendering.pictures import styles
 from clrecon.rendering.pictures.modes import MODES
 
-pytestmark = [pytest.mark.opencl, pytest.mark.first_device]
+pytestmark = pytest.mark.opencl
 
 SIZE = (40, 32)
 GLASS = TransferFunction([(0, 1, 1, 1, 0.1), (500, 1, 0.5, 0, 0.4)])

@@ -14,8 +14,6 @@ from clrecon.rendering.views.centre_line import Curve
 from clrecon.rendering.views.curved import straightened_sheet
 from clrecon.rendering.views.plane import slab_samples
 
-pytestmark = pytest.mark.first_device
-
 BEND, TUBE = 40.0, 7.0
 """Radius of the torus and of its tube, mm."""
 TURN = np.radians(110.0)

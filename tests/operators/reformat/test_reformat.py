@@ -59,7 +59,6 @@ def test_where_a_pixel_is_a_voxel_it_has_its_value(device, dtype, angles, shear)
         assert np.array_equal(cut.values, volume.voxels[k].astype(np.float32))
 
 
-@pytest.mark.first_device
 def test_a_picture_has_1024_x_1024_pixels_unless_asked_otherwise(device):
     volume = even_volume(shape=(2, 2, 2))
     assert cut_slice(volume, "axial", device=device).image.shape[:2] == (1024, 1024)
@@ -172,6 +171,7 @@ VOLUMES = {
 }
 
 
+@pytest.mark.every_device
 @pytest.mark.parametrize("name", VOLUMES)
 @pytest.mark.parametrize("dtype", ["int16", "uint8", "float32"])
 def test_the_device_equals_its_twin(device, name, dtype):

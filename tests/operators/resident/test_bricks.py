@@ -16,6 +16,7 @@ from clrecon.reference.resident import bricks as twin
 SHAPES = [(1, 1, 1), (3, 9, 7), (8, 8, 8), (9, 7, 8), (17, 16, 33), (8, 9, 100)]
 
 
+@pytest.mark.every_device
 @pytest.mark.parametrize("dtype", VOXEL_TYPES)
 @pytest.mark.parametrize("shape", SHAPES)
 def test_ranges_and_states_equal_those_of_the_twin(device, shape, dtype):

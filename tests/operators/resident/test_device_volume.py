@@ -43,7 +43,6 @@ def assert_equal(found, expected, work: str) -> None:
             assert np.array_equal(one, other, equal_nan=one.dtype.kind == "f")
 
 
-@pytest.mark.first_device  # failures are met in Python; what the kernels make is compared beside this
 @pytest.mark.parametrize("kind", ["buffer", "launch"])
 @pytest.mark.parametrize("work", WORK)
 def test_whatever_buffer_or_launch_fails_the_result_is_the_same(device, volume, labels, monkeypatch, work, kind):

@@ -63,6 +63,7 @@ def windows(device):
     return device
 
 
+@pytest.mark.every_device
 def test_compilers_for_avx2_make_windows(device):
     """PoCL's does, where it knows the CPU."""
     import pyopencl
@@ -75,6 +76,7 @@ def test_compilers_for_avx2_make_windows(device):
     assert makes_windows(device) == bool(download(device, found, found_d)[0])
 
 
+@pytest.mark.every_device
 def test_a_window_shows_every_pair_of_its_row(windows):
     rng = np.random.default_rng(2)
     row = np.concatenate([[-32768, 32767, -32768], rng.integers(-32768, 32768, 13)]).astype(np.int16)

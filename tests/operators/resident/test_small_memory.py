@@ -12,8 +12,6 @@ from surface_volumes import OBLIQUE, smooth_volume
 import clrecon
 from clrecon.labels import LabelMap
 
-pytestmark = pytest.mark.first_device
-
 SHAPE = (26, 30, 41)
 
 

@@ -10,14 +10,11 @@ import pytest
 from device_work import SIZE, WORK, label_boxes, mesh_arrays
 from failing_devices import Failing, lost_error, pretended_gpu
 from surface_volumes import smooth_volume
-from variants import all_but
 
 import clrecon
 from clrecon.errors import DeviceError, DeviceFailedError, DeviceMemoryError
 from clrecon.opencl import allocate, list_devices, take_device, work_on
 from clrecon.operators.resident.device_volume import DeviceVolume
-
-pytestmark = pytest.mark.first_device
 
 NEVER_LAST = 1 << 30
 
@@ -38,7 +35,7 @@ def gpu(device):
 
 
 @pytest.mark.parametrize("kind", ["buffer", "launch"])
-@pytest.mark.parametrize("work", all_but(WORK, "ray surface"))
+@pytest.mark.parametrize("work", WORK)
 def test_row_54_the_cpu_device_takes_over_from_any_buffer_or_launch_on(
     device, gpu, volume, labels, monkeypatch, work, kind
 ):

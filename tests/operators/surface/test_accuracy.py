@@ -10,6 +10,8 @@ from clrecon.geometry import Volume, compose_affine
 from clrecon.operators.surface.extract import extract_isosurface
 from clrecon.reference.surface import extract as twin
 
+pytestmark = pytest.mark.every_device
+
 
 def rotation(*degrees: float) -> np.ndarray:
     from scipy.spatial.transform import Rotation

@@ -46,6 +46,7 @@ def test_vertices_are_those_at_the_origin_and_the_shift(device, shift, topology)
     assert not [text for text in near.report["warnings"] if "float64" in text]
 
 
+@pytest.mark.every_device
 def test_vertices_lie_on_the_sphere_and_on_the_twin(device):
     volume = make_sphere(FAR, "float32")
     mesh = extract_isosurface(volume, 0.0, device=device)

@@ -34,7 +34,6 @@ print(json.dumps({"grown_mib": (peak_kib() - before) / 1024, "slabs": mesh.repor
 
 
 @pytest.mark.slow
-@pytest.mark.first_device
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="peak memory is read from /proc")
 def test_a_file_of_a_gigabyte_goes_through_a_small_budget(device, tmp_path):
     """Two balls of 50 voxels' radius in 1.2 GiB of air: a hole in the file, so that it takes no room on the disk."""

@@ -19,6 +19,7 @@ from clrecon.operators.surface.extract import SurfaceExtractor, extract_isosurfa
 from clrecon.reference.surface import extract as twin
 
 
+@pytest.mark.every_device
 @pytest.mark.parametrize("closed", [True, False])
 @pytest.mark.parametrize("shape", SHAPES)
 def test_device_equals_twin_at_word_borders(device, shape, closed):
@@ -42,6 +43,7 @@ def test_device_equals_twin_for_every_voxel_type(device, dtype, affine):
         assert np.abs(mesh.normals - normals).max() <= tolerances.TWIN_NORMAL
 
 
+@pytest.mark.every_device
 @pytest.mark.parametrize("shape", [(2, 700, 40), (2, 3, 1000), (9, 3, 40)])
 def test_vertices_are_rounded_once(device, shape):
     """Far from the origin and after many steps, a vertex is the float32 next to the true one, or its neighbour."""
@@ -75,6 +77,7 @@ def test_the_scale_of_float_values_does_not_matter(device, scale):
     assert np.abs(mesh.vertices - expected.vertices).max() < 1e-3
 
 
+@pytest.mark.every_device
 @pytest.mark.parametrize("high", [2, 3, 6, 12])
 def test_random_integers_at_every_iso_value_are_sound(device, high):
     for seed, shape in enumerate([(7, 9, 11), (5, 4, 35)]):
@@ -83,6 +86,7 @@ def test_random_integers_at_every_iso_value_are_sound(device, high):
             assert_sound(extract_isosurface(volume, iso_value, device=device))
 
 
+@pytest.mark.every_device
 @pytest.mark.parametrize("high", [4096, 65536])
 def test_steep_integers_far_from_the_origin_are_sound(device, high):
     """Vertices next to a sample would fall together in float32 millimetres without the margin."""
@@ -116,6 +120,7 @@ def test_an_object_that_leaves_the_volume_is_closed_or_left_open(device):
     assert not opened["closed"] and opened["boundary_edges"] > 0 and opened["nonmanifold_edges"] == 0
 
 
+@pytest.mark.every_device
 def test_the_order_is_the_same_on_every_run(device):
     volume = smooth_volume()
     first, second = (extract_isosurface(volume, 100, device=device) for _ in range(2))

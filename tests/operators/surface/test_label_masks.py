@@ -58,6 +58,7 @@ def assert_sound(mesh) -> dict:
     return quality
 
 
+@pytest.mark.every_device
 @pytest.mark.parametrize("closed", [True, False])
 @pytest.mark.parametrize("shape", SHAPES)
 def test_device_equals_twin(device, shape, closed):
@@ -334,7 +335,6 @@ def test_labels_that_do_not_fit_together_go_through_one_by_one(device):
         extract_label_masks(LabelMap(labels, OBLIQUE), device=device, memory=50_000)
 
 
-@pytest.mark.first_device  # the same lines as without labels, which every device builds with "1", "1"
 @pytest.mark.parametrize(("lanes", "words"), [("1", "1"), ("8", "3")])
 def test_every_variant_of_the_kernels_gives_the_same_meshes(device, lanes, words, monkeypatch):
     labels = random_labels((6, 7, 75), numbers=(0, 0, 3, 7)).astype(np.uint8)

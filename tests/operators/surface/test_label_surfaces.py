@@ -56,6 +56,7 @@ def count_half_way(volume, inside, number, iso_value) -> int:
     return half_way
 
 
+@pytest.mark.every_device
 @pytest.mark.parametrize("closed", [True, False])
 @pytest.mark.parametrize("solid", [False, True])
 @pytest.mark.parametrize("shape", SHAPES)
@@ -84,7 +85,6 @@ def test_device_equals_twin_for_every_voxel_type(device, dtype):
             assert_equals_twin(mesh, volume, inside, number, iso_value)
 
 
-@pytest.mark.first_device  # the same lines as without labels, which every device builds with "1", "1"
 @pytest.mark.parametrize(("lanes", "words"), [("1", "1"), ("8", "3")])
 @pytest.mark.parametrize("numbers", [(0, 0, 3, 7), (0, 0, 3, 300)], ids=["one-byte", "two-bytes"])
 def test_every_variant_of_the_kernels_gives_the_same_meshes(device, lanes, words, numbers, monkeypatch):
@@ -97,6 +97,7 @@ def test_every_variant_of_the_kernels_gives_the_same_meshes(device, lanes, words
         assert_equals_twin(mesh, volume, inside, number, 3)
 
 
+@pytest.mark.every_device
 @pytest.mark.parametrize("grow_mm", [None, 0.0, 0.6, 2.7, 5.3])
 def test_growth_is_that_of_the_twin_to_the_last_sample(device, grow_mm):
     """The buffer of the device is looked at itself: sizes on both sides of a work-group, ties of distance."""
@@ -144,6 +145,7 @@ def test_one_label_alone_is_the_same_as_among_others(device):
         assert np.array_equal(alone.triangles, together[number].triangles)
 
 
+@pytest.mark.every_device
 def test_a_label_of_everything_is_the_plain_surface(device):
     for closed in (True, False):
         volume = random_volume((9, 8, 45))
@@ -176,6 +178,7 @@ def test_labels_that_do_not_fit_together_go_through_one_by_one(device, monkeypat
         extract_labels(volume, LabelMap(labels, OBLIQUE), 3, device=device, memory=50_000)
 
 
+@pytest.mark.every_device
 def test_labels_on_another_grid_are_the_same_where_it_covers_the_volume(device):
     volume, labels = random_volume((6, 7, 33)), random_labels((6, 7, 33))
     turned = OBLIQUE @ np.array([[0, 0, 1, 0], [0, -1, 0, 6], [1, 0, 0, 0], [0, 0, 0, 1.0]])

@@ -48,6 +48,7 @@ def test_device_equals_twin_for_every_voxel_type(device, dtype, affine):
         assert_equals_twin(volume, level, device, **options)
 
 
+@pytest.mark.every_device
 @pytest.mark.parametrize("closed", [True, False])
 @pytest.mark.parametrize("shape", SHAPES)
 def test_device_equals_twin_at_word_borders(device, shape, closed):
@@ -142,6 +143,7 @@ def test_slabs_of_any_thickness_give_the_same_mesh(device, dtype, level, options
         assert_same(mesh, expected)
 
 
+@pytest.mark.every_device
 def test_uneven_slices_equal_the_twin(device):
     positions = np.array([0.0, 1.0, 1.4, 3.3, 4.0, 6.5])[:, None] * (0.1, 0.2, 0.9)
     affine = np.array([[0.7, 0, 0, 0], [0, 0.5, 0, 0], [0, 0, 1.3, 0], [0, 0, 0, 1.0]])
@@ -161,7 +163,6 @@ def test_a_resident_volume_gives_the_same_in_any_order(device):
             )
 
 
-@pytest.mark.first_device
 def test_the_variant_of_gpus_gives_the_same_mesh(device, monkeypatch):
     volume = smooth_volume((9, 11, 75), affine=MIRRORED)
     monkeypatch.setattr(device, "kernel_variants", {**device.kernel_variants, "LANES": "1", "WORDS_PER_ITEM": "1"})

@@ -59,6 +59,7 @@ def test_empty_slabs_in_between_do_no_harm(device):
     assert_same(extract_in_slabs(volume, 50, device, 4), extract_isosurface(volume, 50, device=device))
 
 
+@pytest.mark.every_device
 def test_a_budget_makes_slabs(device):
     volume = smooth_volume((40, 60, 70))
     expected = extract_isosurface(volume, 100, device=device)
@@ -193,6 +194,7 @@ def test_too_many_words_for_32_bits_make_slabs_too(device):
     assert Slab(grid, 2, 3 + slices).mask_rows << grid.row_shift >= 2**32
 
 
+@pytest.mark.every_device
 def test_a_mapped_file_goes_through_and_leaves_memory(device, tmp_path):
     volume = smooth_volume((23, 64, 128))
     np.save(tmp_path / "voxels.npy", volume.voxels)

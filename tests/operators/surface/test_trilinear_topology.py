@@ -78,6 +78,7 @@ def test_every_state_of_a_cell_equals_the_twin(device):
     assert more > 300
 
 
+@pytest.mark.every_device
 @pytest.mark.parametrize("high", [2, 3, 6, 100])
 def test_random_integers_are_sound(device, high):
     for seed, shape in enumerate([(7, 9, 11), (5, 4, 35)]):
@@ -137,6 +138,7 @@ def test_normals_look_the_way_the_faces_do(device):
         assert np.allclose(np.linalg.norm(mesh.normals, axis=1), 1.0, atol=1e-5)
 
 
+@pytest.mark.every_device
 def test_the_order_is_the_same_on_every_run(device):
     volume = random_volume((6, 9, 70), high=1000)
     first, second = (extract(volume, 500, device) for _ in range(2))

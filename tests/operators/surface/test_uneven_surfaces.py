@@ -80,6 +80,7 @@ def test_planes_have_their_places_and_normals_everywhere(device, topology):
     assert np.abs(mesh.normals - slope).max() <= tolerances.LINEAR_FIELD_NORMAL
 
 
+@pytest.mark.every_device
 @pytest.mark.parametrize("topology", ["separated", "trilinear"])
 @pytest.mark.parametrize("closed", [True, False])
 @pytest.mark.parametrize("dtype", [np.int16, np.float32])
