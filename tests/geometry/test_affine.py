@@ -13,6 +13,7 @@ from clrecon.geometry import (
     compose_affine,
     frame_from_lps,
     is_left_handed,
+    lps_affine_from_ras,
     normal_matrix,
     slice_normal,
     tilt_degrees,
@@ -64,6 +65,12 @@ def test_ras_negates_x_and_y_and_is_a_rotation():
         frame_from_lps("mri")
 
 
+def test_an_affine_to_ras_has_its_first_two_rows_negated():
+    affine = np.arange(1.0, 17.0).reshape(4, 4)
+    signs = np.array([[-1.0], [-1.0], [1.0], [1.0]])
+    assert np.array_equal(lps_affine_from_ras(affine.tolist()), affine * signs)
+
+
 @pytest.mark.parametrize(
     ("affine", "says"),
     [
@@ -76,6 +83,15 @@ def test_ras_negates_x_and_y_and_is_a_rotation():
 )
 def test_what_is_no_affine_is_refused(affine, says):
     with pytest.raises(UsageError, match=says):
+        checked_affine(affine)
+
+
+def test_three_steps_span_space_down_to_a_millionth():
+    affine = np.eye(4)
+    affine[0, 2], affine[2, 2] = 1.0, 1.01e-6
+    assert np.array_equal(checked_affine(affine), affine)
+    affine[2, 2] = 0.99e-6
+    with pytest.raises(UsageError, match="singular"):
         checked_affine(affine)
 
 

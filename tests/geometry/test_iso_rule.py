@@ -8,7 +8,7 @@ from uneven_volume import HEIGHTS, SIDEWAYS, uneven
 
 from clrecon.errors import NoSurfaceError, UsageError
 from clrecon.geometry import AIR_HU, Volume
-from clrecon.geometry.iso_rule import choose_iso_rule, layer_margins, vertex_margin
+from clrecon.geometry.iso_rule import ValueRange, choose_iso_rule, layer_margins, vertex_margin
 
 
 def make_volume(low: float, high: float, dtype: str = "int16") -> Volume:
@@ -58,11 +58,64 @@ def test_outside_differs_from_a_constant_volume_in_float32(value, dtype):
 
 
 @pytest.mark.parametrize(
+    ("level", "outside"),
+    [
+        # At 2^24 float32 comes in steps of 2: the share of 2^-20 is 16.
+        (2.0**24, 2.0**24 - 16.0),
+        (-(2.0**24), -(2.0**24) - 16.0),
+        (100.0, 99.5),
+    ],
+)
+def test_outside_lies_half_a_unit_or_a_share_of_the_level_below_it(level, outside):
+    volume = Volume(np.full((2, 2, 2), 2.0**24, np.float32), np.eye(4))
+    assert choose_iso_rule(volume, level).outside == outside
+
+
+@pytest.mark.parametrize(
+    ("dtype", "low", "level", "outside"),
+    [
+        ("float32", -1000, 200.25, 1400.5),
+        ("float32", 300, 200.0, 200.5),
+        ("int16", -1000, 200.25, 1401.0),
+        ("int16", -1000, 200, 1399.0),
+        ("int16", 300, 200, 200.0),
+    ],
+)
+def test_outside_of_what_lies_below_mirrors_the_lowest_value(dtype, low, level, outside):
+    assert choose_iso_rule(make_volume(low, 900, dtype), level, below=True).outside == outside
+
+
+@pytest.mark.parametrize(
+    ("level", "below", "outside"),
+    [(-(2**29), False, -(2**29) - 1), (-(2**31), False, -(2**30)), (2**29, True, 2**29), (2**31, True, 2**30)],
+)
+def test_outside_differs_from_integers_by_32_bits_at_most(level, below, outside):
+    assert choose_iso_rule(make_volume(-1000, 900), level, below=below).outside == outside
+
+
+@pytest.mark.parametrize(("figure", "slices"), [("ends", 3), ("lowest", 2)])
+def test_slices_are_released_one_by_one(monkeypatch, figure, slices):
+    released = []
+    monkeypatch.setattr(Volume, "release_slices", lambda self, first, end: released.append((first, end)))
+    voxels = np.zeros((3, 4, 5), np.int16)
+    voxels[2] = AIR_HU  # no lower value matters
+    getattr(ValueRange(Volume(voxels, np.eye(4))), figure)
+    assert released == [(k, k + 1) for k in range(slices)]
+
+
+@pytest.mark.parametrize(("value", "scale"), [(1.0, 0.5), (900.0, 2.0**-10), (1e-40, 2.0**126)])
+def test_floats_are_scaled_by_a_power_of_two_that_float32_holds(value, scale):
+    assert choose_iso_rule(Volume(np.full((2, 2, 2), value, np.float32), np.eye(4)), value).value_scale == scale
+    assert choose_iso_rule(make_volume(0, 900), 200).value_scale == 1.0
+
+
+@pytest.mark.parametrize(
     ("low", "high", "dtype", "iso_value"),
     [
         (0, 2**23, "int32", 5),
         (-(2**23), 0, "int32", -5),
         (0, 1e31, "float32", 5),
+        (-1e31, 0, "float32", 5),
         (0, 1, "float32", 1e31),
         (0, 9, "int16", -1e300),
     ],

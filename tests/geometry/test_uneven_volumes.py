@@ -90,3 +90,8 @@ def test_what_is_no_stack_is_refused(change, says):
     affine = uneven().affine
     with pytest.raises(UsageError, match=says):
         Volume(np.zeros((6, 5, 4), np.int16), affine, slice_positions=change(positions()))
+
+
+def test_a_volume_says_that_its_slices_are_uneven():
+    assert repr(uneven()) == "Volume(4 x 5 x 6 int16, spacing 0.5 x 0.7 x 1.822 mm, uneven slices)"
+    assert repr(Volume(np.zeros((2, 3, 4), np.uint8), np.eye(4))) == "Volume(4 x 3 x 2 uint8, spacing 1 x 1 x 1 mm)"

@@ -57,6 +57,14 @@ def test_other_types_are_converted_once(given, kept):
     assert np.array_equal(volume.voxels, voxels)
 
 
+def test_integers_are_kept_up_to_the_ends_of_32_bits():
+    ends = np.array([[[-(2**31), 2**31 - 1]]], np.int64)
+    assert Volume(ends, np.eye(4)).voxels.tolist() == ends.tolist()
+    for further in (ends - 1, ends + 1):
+        with pytest.raises(UsageError, match="32 bits"):
+            Volume(further, np.eye(4))
+
+
 def test_strided_voxels_are_made_contiguous():
     voxels = np.arange(120, dtype=np.int16).reshape(4, 5, 6)[::-1, :, ::2]
     volume = Volume(voxels, np.eye(4))

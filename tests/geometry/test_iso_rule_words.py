@@ -1,0 +1,45 @@
+"""What an iso rule says of itself: words for people, entries for reports, and what is taken where nothing is said."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from clrecon.geometry import Volume
+from clrecon.geometry.iso_rule import IsoRule, choose_iso_rule
+
+VOLUME = Volume(np.array([[[-1000, 900]]], np.int16), np.eye(4))
+
+
+@pytest.mark.parametrize(
+    ("level", "below", "words", "place"),
+    [
+        (200, False, "200 HU", "at 200 HU"),
+        (-400.5, True, "below -400.5 HU", "of what lies below -400.5 HU"),
+        ((100, 300), False, "100 to 300 HU", "at 100 to 300 HU"),
+    ],
+)
+def test_a_rule_says_what_is_asked_for(level, below, words, place):
+    rule = choose_iso_rule(VOLUME, level, below=below)
+    assert (rule.describe(), rule.describe_place()) == (words, place)
+
+
+@pytest.mark.parametrize(
+    ("level", "below", "expected"),
+    [
+        (200, False, (200, 199.5, "above", [200, None], [199.5, None])),
+        (200, True, (200, 199.5, "below", [None, 200], [None, 199.5])),
+        ((100, 300), False, (None, None, "between", [100, 300], [99.5, 300.5])),
+    ],
+)
+def test_a_report_names_both_ends_of_what_is_inside(level, below, expected):
+    report = choose_iso_rule(VOLUME, level, below=below).as_report()
+    assert list(report) == ["iso_value_hu", "iso_level_hu", "inside", "inside_hu", "inside_levels_hu"]
+    assert tuple(report.values()) == expected
+
+
+def test_a_rule_made_by_hand_scales_nothing_and_has_one_level():
+    rule = IsoRule(0.5, 1, 0.5, 0.0, True)
+    assert (rule.value_scale, rule.topology, rule.inside, rule.border) == (1.0, "separated", "above", 1)
+    assert rule.levels == (0.5,)
+    assert IsoRule(0.5, 1, 0.5, 0.0, False).border == 0
