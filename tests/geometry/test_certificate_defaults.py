@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import MISSING, fields
 
+import pytest
+
 from clrecon.geometry.certificate import Certificate, without_ids
 
 
@@ -18,6 +20,16 @@ def test_slices_are_even_and_none_is_missing_unless_said():
 
 def test_a_certificate_is_equal_to_the_dict_of_its_entries():
     assert bare() == {**bare()} and bare() != {**bare(), "slices": 1}
+    with pytest.raises(TypeError, match="unhashable type: 'Certificate'"):  # as a dict
+        hash(bare())
+
+
+@pytest.mark.parametrize(("kind", "moved"), [("DICOM", False), ("NRRD", True)])
+def test_entries_of_other_files_stand_where_they_always_have(kind, moved):
+    names = list(bare().changed(format=kind, masked={"more": {"a": 1}}))
+    assert (names[names.index("slices_missing") + 1] == "dropped") == moved
+    assert (names[names.index("rescale") + 1 :][:2] == ["padding_share", "padding_hu"]) == moved
+    assert sorted(names) == sorted({field.name for field in fields(Certificate)} - {"masked"} | {"more"})
 
 
 def test_files_get_no_hash_of_an_identifier():

@@ -61,6 +61,15 @@ def test_segments_lie_on_their_ct(tmp_path, kind, syntax, leave_out_empty):
         assert np.array_equal(taken.voxels == number, mask)
 
 
+@pytest.mark.parametrize("kind", ["BINARY", "LABELMAP"])
+def test_progress_counts_frames_from_the_first_to_the_last(tmp_path, kind):
+    told: list = []
+    path = write_seg(tmp_path / "a.dcm", masks(), ct_slices(), kind=kind)
+    read_labels(path, progress=lambda *step: told.append(step))
+    frames = pydicom.dcmread(path).NumberOfFrames
+    assert told == [("read", frame, frames) for frame in range(1, frames + 1)]
+
+
 def test_holes_between_frames_are_slices_without_labels(tmp_path):
     """No two frames are neighbours: their distance is not that of the slices."""
     mask = np.zeros(PLAN.shape, bool)

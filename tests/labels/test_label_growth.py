@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import tolerances
+from dicom_series import rotation
 from label_files import OBLIQUE
 from scipy.ndimage import binary_dilation, binary_erosion, distance_transform_edt
 
@@ -235,3 +236,17 @@ def test_growth_reaches_five_thousand_voxels(spacing):
     assert _checked(0.999 * most, volume) == 0.999 * most
     with pytest.raises(UsageError, match="labels cannot grow by 10.6185 mm"):
         _checked(1.001 * most, volume)
+
+
+@pytest.mark.parametrize("turned", [False, True])
+def test_neighbours_at_one_distance_form_one_shell_whatever_the_rounding(turned):
+    affine = np.diag((0.1, 0.1, 0.1, 1.0))
+    if turned:
+        affine[:3, :3] = rotation((10.0, 20.0, 30.0)) * 0.1
+    growth = Growth.of(Volume(np.zeros((2, 2, 2), np.int16), affine), None)
+    assert growth.shells.tolist() == [0] * 6 + [1] * 12 + [2] * 8
+    assert (growth.offsets**2).sum(axis=1).tolist() == [1] * 6 + [2] * 12 + [3] * 8
+    for shell in range(3):  # within a shell in the order of k, j, i
+        places = growth.offsets[growth.shells == shell][:, ::-1].tolist()
+        assert places == sorted(places)
+    assert growth.reach == (1, 1, 1)

@@ -239,3 +239,11 @@ def test_real_labels_have_their_volumes(real_data, file, volumes):
     voxel_ml = abs(np.linalg.det(labels.affine[:3, :3])) / 1000
     numbers = range(27, 33) if len(volumes) == 6 else range(16, 25)
     assert [labels.counts[n] * voxel_ml for n in numbers] == pytest.approx(volumes, abs=0.02)
+
+
+def test_marks_of_xml_are_read_outside_of_cdata_alone(tmp_path):
+    table = (
+        b'<Label Key="2" Red="0"> a &amp; b</Label><Label Key="5"><![CDATA[c &amp; d]]></Label><Label Key="6"></Label>'
+    )
+    labels = read_labels(write_nifti(tmp_path / "a.nii", make_labels(), extension=table))
+    assert labels.names == {2: "a & b", 5: "c &amp; d"}

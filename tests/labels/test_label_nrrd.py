@@ -8,6 +8,7 @@ from label_files import OBLIQUE, make_labels, write_nrrd
 
 from clrecon.errors import RefusedInputError, UsageError
 from clrecon.labels import read_labels
+from clrecon.labels.reader import is_large_map
 
 pytest.importorskip("nrrd")
 SPACES = ["left-posterior-superior", "right-anterior-superior", "left-anterior-superior"]
@@ -135,3 +136,19 @@ def test_without_pynrrd_the_extra_is_named(tmp_path, monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "nrrd", None)
     with pytest.raises(UsageError, match=r"needs the package pynrrd: pip install 'clrecon\[labels\]'"):
         read_labels(path)
+
+
+def test_progress_counts_slices_from_the_first_to_the_last(tmp_path):
+    voxels, fields = layered(False)
+    told: list = []
+    read_labels(write_nrrd(tmp_path / "a.nrrd", make_labels((3, 4, 5))), progress=lambda *step: told.append(step))
+    read_labels(write_nrrd(tmp_path / "a.seg.nrrd", voxels, **fields), progress=lambda *step: told.append(step))
+    assert told == [("read", 1, 3), ("read", 2, 3), ("read", 3, 3)] * 2
+
+
+def test_layers_count_where_a_map_is_called_large(tmp_path, monkeypatch):
+    voxels, fields = layered(False)  # 60 voxels in two layers
+    path = write_nrrd(tmp_path / "a.seg.nrrd", voxels.astype(np.int16), **fields)
+    for most, large in ((239, True), (240, False)):
+        monkeypatch.setattr("clrecon.labels.reader.LARGE_BYTES", most)
+        assert is_large_map(path) == large

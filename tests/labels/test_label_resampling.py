@@ -90,6 +90,25 @@ def test_how_much_of_each_label_is_inside_is_known():
     assert taken.inside == {3: 0.5, 4: 0.0}
 
 
+@pytest.mark.parametrize("axis", range(3))
+@pytest.mark.parametrize("side", [-1, 1])
+def test_what_lies_beyond_any_side_is_not_inside(axis, side):
+    moved = OBLIQUE.copy()
+    moved[:3, 3] += side * OBLIQUE[:3, axis]
+    size = VOXELS.shape[2 - axis]
+    taken = resample_labels(LabelMap(np.full(VOXELS.shape, 3, np.uint8), moved), VOLUME)
+    assert taken.inside == {3: pytest.approx((size - 1) / size, rel=1e-12)}
+
+
+def test_axes_that_run_into_one_are_not_aligned():
+    """Rows run along the diagonal of the map, and the slices lie a micrometre apart."""
+    affine = np.array([[1, 0, 0, 0], [1, 0, 1e-3, 0], [0, 1, 0, 0], [0, 0, 0, 1.0]])
+    labels = LabelMap(np.arange(27, dtype=np.uint8).reshape(3, 3, 3), np.eye(4))
+    assert _take_aligned(labels, Volume(np.zeros((2, 3, 3), np.int16), affine)) is None
+    across = np.array([[1, 1, 0, 0], [0, 1e-3, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1.0]])
+    assert _take_aligned(labels, Volume(np.zeros((2, 3, 3), np.int16), across)) is None
+
+
 def test_labels_of_another_place_are_refused_with_the_numbers():
     far = OBLIQUE.copy()
     far[:3, 3] += (0, 500, 0)

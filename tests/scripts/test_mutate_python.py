@@ -6,6 +6,8 @@ The changes are written here: cosmic-ray, which finds them in clrecon, is not pa
 from __future__ import annotations
 
 import json
+import signal
+from collections.abc import Iterator
 from pathlib import Path
 
 import mutate_python
@@ -20,6 +22,7 @@ from python_changes import (
     read_equivalents,
     statement_lines,
 )
+from warm_tests import Run, WarmTests
 
 ROOM = """from functools import cache
 
@@ -99,8 +102,10 @@ def project(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def copy(project: Path, tmp_path_factory: pytest.TempPathFactory) -> Copy:
-    return Copy.make(project, tmp_path_factory.mktemp("private"), "toy")
+def copy(project: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Copy]:
+    made = Copy.make(project, tmp_path_factory.mktemp("private"), "toy")
+    yield made
+    made.close()
 
 
 @pytest.fixture(scope="module")
@@ -140,6 +145,7 @@ def test_short_tests_come_first_and_time_is_limited() -> None:
     assert trace.tests_of("a.py", [3, 4, 5]) == ["y", "z", "x"]
     assert trace.tests_of("b.py", [3]) == []
     assert trace.limit_s(["x", "y"]) == 4 * (1.5 + 2.5) + 10
+    assert [trace.shortest("xyz", seconds) for seconds in (0.1, 1.4, 1.5, 3.5)] == [["y"], ["y"], ["y", "z"], [*"yzx"]]
 
 
 @pytest.mark.parametrize(
@@ -160,6 +166,42 @@ def test_a_change_is_noticed_or_not(copy: Copy, trace: Trace, changed: Change, o
 def test_a_change_that_never_ends_is_caught(copy: Copy, trace: Trace, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Trace, "limit_s", lambda self, tests: 3.0)
     assert copy.try_change(change("n -= 1", "n += 1"), trace) == ("time", 1)
+
+
+def test_a_change_that_waits_for_ever_is_not_known(copy: Copy, trace: Trace, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(mutate_python, "TIMES_WALL", 0.0)
+    monkeypatch.setattr(mutate_python, "AND_WALL_SECONDS", 1.0)
+    assert copy.try_change(change("n -= 1", "__import__('time').sleep(60.0)"), trace) == ("late", 1)
+
+
+def test_a_change_that_ends_the_process_is_caught(copy: Copy, trace: Trace) -> None:
+    assert copy.try_change(change("n -= 1", "__import__('os').abort()"), trace) == ("crash", 1)
+
+
+def test_later_tests_are_tried_when_the_first_pass(copy: Copy, trace: Trace, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(mutate_python, "FIRST_TESTS", 1)
+    assert copy.try_change(change("width * height", "width + height"), trace) == ("caught", 3)
+    assert copy.try_change(TIMES, trace) == ("survived", 3)
+
+
+def test_the_process_that_forks_has_imported_what_lies_outside(copy: Copy, trace: Trace, tmp_path: Path) -> None:
+    assert "pytest" in trace.modules and not any(name.startswith(("toy", "test_shapes")) for name in trace.modules)
+    (copy.root / "tests" / "flat" / "test_warm.py").write_text(
+        "import sys\n\nLOADED = {*sys.modules}\n\n\n"
+        "def test_it():\n    assert 'colorsys' in LOADED and 'wave' not in LOADED\n"
+    )
+    test = "tests/flat/test_warm.py::test_it"
+    warm = WarmTests(copy.root, copy.environment(False), ["colorsys", "no_such_module"])
+    try:
+        outcome = warm.run(Run([[test]], 60.0, 600.0, str(tmp_path / "tests"), str(tmp_path / "said.txt")))
+        assert outcome.status == 0, (tmp_path / "said.txt").read_text()
+        assert 0.0 < outcome.cpu_s < 60.0
+        warm.process.send_signal(signal.SIGKILL)
+        with pytest.raises(ChildProcessError, match="has ended"):
+            warm.run(Run([[test]], 60.0, 600.0, str(tmp_path / "tests"), str(tmp_path / "said.txt")))
+    finally:
+        warm.close()
+        (copy.root / "tests" / "flat" / "test_warm.py").unlink()
 
 
 def test_rows_are_kept_and_equivalent_changes_are_named(
@@ -235,3 +277,4 @@ def test_a_change_says_its_lines() -> None:
     changes = [make_change("a.py", text, place) for place in find_places(text)]
     found = {(one.line, one.before, one.after) for one in changes if one}
     assert {(3, "x <= 2,", "x < 2,"), (2, "1,", "2,"), (2, "1,", "0,"), (3, "x <= 2,", "x <= 3,")} <= found
+    assert choose_changes({"a.py": "@dataclass(frozen=True)\nclass A:\n    pass\n"}, 9, "1") == []

@@ -1,0 +1,55 @@
+"""Segments painted into one map: which numbers there may be, and which overlaps are told."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from clrecon.errors import RefusedInputError
+from clrecon.labels.overlap import Painter
+
+
+def painter(names, only=None):
+    return Painter("a.dcm", np.zeros((1, 1, 4), np.uint16), names, only)
+
+
+def mask(*voxels):
+    return np.array([[number in voxels for number in range(4)]])
+
+
+def test_the_largest_number_is_painted_and_no_further_one():
+    one = painter({65_535: "last"})
+    one.paint(0, 65_535, mask(2))
+    assert one.finish(np.eye(4)).counts == {65_535: 1}
+    for number in (0, 65_536):
+        with pytest.raises(RefusedInputError, match=f"a.dcm numbers a segment {number}: 1 to 65,535 are possible"):
+            painter({number: "x"})
+
+
+def test_the_pair_with_most_voxels_is_told_and_the_others_are_counted():
+    one = painter({1: "a", 2: "b", 3: "c"})
+    for number, voxels in ((1, (0, 1)), (2, (1,)), (3, (0, 1))):
+        one.paint(0, number, mask(*voxels))
+    # 1 and 2 share a voxel, 1 and 3, 2 and 3 too: the first of equal ones
+    with pytest.raises(RefusedInputError, match="overlap: 1 a and 2 b share 1 voxels, and 2 more pairs; choose"):
+        one.finish(np.eye(4))
+    two = painter({1: "a", 2: "b", 3: "c"})
+    for number, voxels in ((1, (0, 1, 2)), (2, (1,)), (3, (0, 2))):
+        two.paint(0, number, mask(*voxels))
+    with pytest.raises(RefusedInputError, match="overlap: 1 a and 3 c share 2 voxels, and 1 more pairs; choose"):
+        two.finish(np.eye(4))
+
+
+def test_pairs_are_counted_over_all_slices():
+    one = Painter("a.dcm", np.zeros((2, 1, 4), np.uint16), {1: "a", 2: "b"}, None)
+    for k in (0, 1):
+        one.paint(k, 1, mask(0, 1))
+        one.paint(k, 2, mask(1, 2))
+    with pytest.raises(RefusedInputError, match="1 a and 2 b share 2 voxels; choose"):
+        one.finish(np.eye(4))
+
+
+def test_wanted_segments_are_painted_last_and_the_others_by_falling_number():
+    names = dict.fromkeys((1, 2, 3, 4, 5), "")
+    assert painter(names).order == [1, 2, 3, 4, 5]
+    assert painter(names, (2, 4)).order == [5, 3, 1, 2, 4]
