@@ -5,10 +5,11 @@
                                     [--json FILE [--resume]]
 
 It needs the extras `test` and `mutation`.  A room is a folder of clrecon/ with its tests in the folder of that name in
-tests/.  The changes are made in a private copy of the project.  The tests of a room are traced once.  Each change is
-then tried with the tests that run the changed line, the shortest first, until one fails.  Tests marked slow or fuzz are
-left out.  A change that no test notices survives, unless `equivalent_changes.json` says why it changes nothing.  A line
-that none of the tests runs is a survivor too.
+tests/ and those of ROOM_TESTS.  The changes are made in a private copy of the project.  The tests of a room are traced
+once.  Each change is then tried with the tests that run the changed line, the shortest first, until one fails.  Tests
+marked slow or fuzz are left out, and so are the longest where all together would take more than a minute.  A change
+that no test notices survives, unless `equivalent_changes.json` says why it changes nothing.  A line that none of the
+tests runs is a survivor too.  Time is that of the processor: a busy machine makes no change look caught.
 
 With --resume, changes that FILE calls caught stay caught while their file is the same; survivors are tried again.
 The exit status is 1 if more than 5 % of the changes of a room survive.
@@ -20,33 +21,43 @@ import argparse
 import hashlib
 import json
 import os
-import resource
 import shutil
 import signal
 import subprocess
 import sys
 import tempfile
 import time
+from bisect import bisect_right
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
+from itertools import accumulate
 from pathlib import Path
 from typing import Any
 
 sys.path.insert(0, str(Path(__file__).parent))
 
 from python_changes import Change, Equivalent, choose_changes, read_equivalents, statement_lines  # noqa: E402
+from warm_tests import PYTEST_OPTIONS, Run, WarmTests  # noqa: E402
 
 ROOT = Path(__file__).resolve().parent.parent
 ROOMS = ("mesh", "geometry", "labels", "dicom", "operators")
 EQUIVALENTS = Path(__file__).with_name("equivalent_changes.json")
+ROOM_TESTS = {
+    "labels": ("tests/operators/surface/test_label_masks.py", "tests/operators/surface/test_label_surfaces.py"),
+}
+"""Further tests of a room: those of the only code that uses a part of it."""
 MOST_SURVIVORS = 0.05
 TIMES_PLAIN, AND_SECONDS = 4.0, 10.0
 """A change may make its tests this many times slower, and this much more; a change that takes longer is caught."""
-MEMORY_BYTES = 16 * 2**30
-"""Address space of a run: a change can ask for any amount of memory."""
+TIMES_WALL, AND_WALL_SECONDS = 20.0, 60.0
+"""Seconds after which a change is given up: so many times what its tests may take of the processor, and this more."""
+FIRST_TESTS = 5
+"""So many tests are tried before the files of the others are imported."""
+MOST_SECONDS = 60.0
+"""Traced seconds of the tests that a change is tried with."""
 CHECKED_SECONDS = 20.0
-UNNOTICED = ("survived", "not run")
+UNNOTICED = ("survived", "not run", "late")
 
 
 class BrokenRoomError(Exception):
@@ -62,24 +73,27 @@ class Trace:
     lines : dict
         File below the root -> line -> tests, by their names in pytest.
     seconds : dict
-        Test -> seconds.
+        Test -> processor time in seconds.
     start : float
-        Seconds before the first test.
+        Processor time before the first test, in seconds.
+    modules : list of str
+        Modules from outside of the project that the tests import.
     """
 
     lines: dict[str, dict[int, list[str]]]
     seconds: dict[str, float]
     start: float
+    modules: list[str] = field(default_factory=list)
 
     @classmethod
     def read(cls, path: Path) -> Trace:
         """Read what the plugin has written."""
         data = json.loads(path.read_text(encoding="utf-8"))
         lines = {file: {int(line): tests for line, tests in rows.items()} for file, rows in data["lines"].items()}
-        return cls(lines, data["seconds"], data["start"])
+        return cls(lines, data["seconds"], data["start"], data["modules"])
 
     def tests_of(self, file: str, lines: Sequence[int]) -> list[str]:
-        """Tests that run one of the lines, the shortest first.
+        """Tests that run one of the lines, the shortest first; as many as take MOST_SECONDS.
 
         A line that is run when its module is imported (a constant, a default) belongs to no test: then all tests that
         run anything of this file.
@@ -88,10 +102,16 @@ class Trace:
         if any(line in rows and not rows[line] for line in lines):
             lines = list(rows)
         tests = {test for line in lines for test in rows.get(line, ())}
-        return sorted(tests, key=lambda test: (self.seconds[test], test))
+        return self.shortest(tests, MOST_SECONDS)
+
+    def shortest(self, tests: Iterable[str], seconds: float) -> list[str]:
+        """The shortest of these tests, one at least, as many as together take no longer than some seconds."""
+        found = sorted(tests, key=lambda test: (self.seconds[test], test))
+        ends = list(accumulate(self.seconds[test] for test in found))
+        return found[: max(1, bisect_right(ends, seconds))]
 
     def limit_s(self, tests: Sequence[str]) -> float:
-        """Seconds that these tests may take with a change."""
+        """Processor time that these tests may take with a change, in seconds."""
         return TIMES_PLAIN * (self.start + sum(self.seconds[test] for test in tests)) + AND_SECONDS
 
 
@@ -105,10 +125,13 @@ class Copy:
         Folder of the copy.
     package : str
         Folder and name of the package in it.
+    warm : WarmTests, optional
+        The process that runs its tests, begun with the first change.
     """
 
     root: Path
     package: str = "clrecon"
+    warm: WarmTests | None = None
 
     @classmethod
     def make(cls, project: Path, folder: Path, package: str = "clrecon") -> Copy:
@@ -132,30 +155,6 @@ class Copy:
             environment.pop(name, None)
         return environment
 
-    def run_tests(self, targets: Sequence[str], environment: dict[str, str], limit_s: float | None) -> tuple[int, str]:
-        """Run pytest in the copy; returns its exit status, or minus a signal, and its output."""
-        command = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "traced_tests", "-p", "no:cacheprovider"]
-        command += ["--tb=line", "-m", "not slow and not fuzz", f"--basetemp={self.root.parent / 'tests'}", *targets]
-        with tempfile.TemporaryFile() as said:
-            process = subprocess.Popen(
-                command,
-                cwd=self.root,
-                env=environment,
-                stdin=subprocess.DEVNULL,
-                stdout=said,
-                stderr=subprocess.STDOUT,
-                start_new_session=True,
-                preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_AS, (MEMORY_BYTES, MEMORY_BYTES)),
-            )
-            try:
-                code = process.wait(limit_s)
-            except subprocess.TimeoutExpired:
-                code = -signal.SIGALRM
-            finally:
-                end_group(process)
-            said.seek(0)
-            return code, said.read().decode(errors="replace")
-
     def trace(self, room: str) -> Trace:
         """Run the tests of a room without a change.
 
@@ -166,30 +165,49 @@ class Copy:
         """
         target = self.root.parent / f"trace-{room}.json"
         traced = {"CLRECON_TRACE_TO": str(target), "CLRECON_TRACED": str(self.root / self.package / room)}
-        code, said = self.run_tests([f"tests/{room}"], self.environment(True, **traced), None)
-        if code:
-            raise BrokenRoomError(f"the tests in tests/{room} fail without a change (status {code}):\n{said[-3000:]}")
+        tests = [f"tests/{room}", *ROOM_TESTS.get(room, ())]
+        command = [sys.executable, "-m", "pytest", *PYTEST_OPTIONS, "-p", "traced_tests", *tests]
+        ended = subprocess.run(
+            [*command, f"--basetemp={self.root.parent / 'tests'}"],
+            cwd=self.root,
+            env=self.environment(True, **traced),
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            check=False,
+        )
+        if ended.returncode:
+            said = ended.stdout.decode(errors="replace")[-3000:]
+            raise BrokenRoomError(f"the tests in {tests} fail without a change (status {ended.returncode}):\n{said}")
         trace = Trace.read(target)
         self._check_order(room, trace)
         return trace
 
     def _check_order(self, room: str, trace: Trace) -> None:
-        """Run the shortest tests as for a change, but without one: their order alone must make none fail."""
-        tests, seconds = [], 0.0
-        for test in sorted(trace.seconds, key=lambda test: trace.seconds[test]):
-            seconds += trace.seconds[test]
-            if seconds > CHECKED_SECONDS:
-                break
-            tests.append(test)
-        code, said = self._run_chosen(tests, None)
-        if code:
-            raise BrokenRoomError(f"tests in tests/{room} fail in another order (status {code}):\n{said[-3000:]}")
+        """Run the shortest tests as for a change, but without one: neither order nor warm start must make one fail."""
+        status = self._run_chosen(trace.shortest(trace.seconds, CHECKED_SECONDS), trace)
+        if status:
+            said = self._said.read_text(errors="replace")[-3000:]
+            raise BrokenRoomError(f"tests of {room} fail in another order (status {status}):\n{said}")
 
-    def _run_chosen(self, tests: Sequence[str], limit_s: float | None) -> tuple[int, str]:
-        chosen = self.root.parent / "chosen.json"
-        chosen.write_text(json.dumps(tests), encoding="utf-8")
-        files = list(dict.fromkeys(test.partition("::")[0] for test in tests))
-        return self.run_tests(files, self.environment(False, CLRECON_RUN_ONLY=str(chosen)), limit_s)
+    @property
+    def _said(self) -> Path:
+        return self.root.parent / "said.txt"
+
+    def _run_chosen(self, tests: Sequence[str], trace: Trace) -> int:
+        """Run tests in a fork of a process that has imported what they need; returns `Outcome.status`."""
+        if self.warm is None:
+            self.warm = WarmTests(self.root, self.environment(False), trace.modules)
+        stages = [list(part) for part in (tests[:FIRST_TESTS], tests[FIRST_TESTS:]) if part]
+        limit_s = trace.limit_s(tests)
+        files = str(self.root.parent / "tests"), str(self._said)
+        return self.warm.run(Run(stages, limit_s, TIMES_WALL * limit_s + AND_WALL_SECONDS, *files)).status
+
+    def close(self) -> None:
+        """End the process that runs the tests."""
+        if self.warm is not None:
+            self.warm.close()
+            self.warm = None
 
     def try_change(self, change: Change, trace: Trace) -> tuple[str, int]:
         """Try a change with the tests that run its line.
@@ -197,7 +215,8 @@ class Copy:
         Returns
         -------
         str, int
-            caught, time, crash, survived or not run; and the number of tests that run the line.
+            caught, time, crash, survived, late (ended before its time on the processor was used up: nothing is known)
+            or not run; and the number of tests tried.
         """
         path = self.root / change.file
         original, kept = path.read_bytes(), path.stat()
@@ -208,24 +227,15 @@ class Copy:
             path.write_text(change.text, encoding="utf-8")
             # Bytecode of the unchanged file is told apart by size and time: the time is another one for certain.
             os.utime(path, ns=(kept.st_atime_ns, kept.st_mtime_ns - 10**10))
-            code, _ = self._run_chosen(tests, trace.limit_s(tests))
+            code = self._run_chosen(tests, trace)
         finally:
             path.write_bytes(original)
             os.utime(path, ns=(kept.st_atime_ns, kept.st_mtime_ns))
-        if code == -signal.SIGALRM:
-            return "time", len(tests)
+        if code in (-signal.SIGXCPU, -signal.SIGALRM):
+            return "time" if code == -signal.SIGXCPU else "late", len(tests)
         if code < 0:
             return "crash", len(tests)
         return "survived" if code in (0, 5) else "caught", len(tests)
-
-
-def end_group(process: subprocess.Popen[bytes]) -> None:
-    """End what a run of tests has left behind, the processes of its tests too."""
-    try:
-        os.killpg(process.pid, signal.SIGKILL)
-    except ProcessLookupError:
-        pass
-    process.wait()
 
 
 @dataclass
@@ -264,7 +274,7 @@ class RoomResult:
         return (
             f"{self.room}: {tried} changes, {caught} caught ({counts['time']} by time, {counts['crash']} by a crash),"
             f" {counts['equivalent']} equivalent, {len(self.survivors)} survive ({counts['not run']} of them in lines"
-            f" that no test of the room runs)"
+            f" that no test of the room runs, {counts['late']} ended early)"
         )
 
 
@@ -305,12 +315,7 @@ def try_room(
     Yields
     ------
     dict
-        A row of `RoomResult`.
-
-    Raises
-    ------
-    BrokenRoomError
-        As `Copy.trace`.
+        A row of `RoomResult`; errors are those of `Copy.trace`.
     """
     earlier = {
         (row["file"], row["digest"], row["operator"], row["occurrence"]): row
@@ -379,6 +384,8 @@ def main(argv: Sequence[str] | None = None) -> int:
             except BrokenRoomError as error:
                 print(error, file=sys.stderr)
                 return 2
+            finally:
+                copy.close()
             print(result.sentence(), flush=True)
     return 0 if all(result.is_good for result in results) else 1
 

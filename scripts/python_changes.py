@@ -189,7 +189,10 @@ def find_places(text: str) -> list[Place]:
 
 
 def make_change(file: str, text: str, place: Place) -> Change | None:
-    """Change a text in one place; None if it stays the same program or becomes none."""
+    """Change a text in one place; None if it stays the same program or becomes none.
+
+    None too for ``frozen=True`` of a dataclass: nothing assigns to its fields in a right program.
+    """
     from cosmic_ray.mutating import mutate_code
 
     changed = mutate_code(text, _operators()[place.operator], place.occurrence)
@@ -206,6 +209,8 @@ def make_change(file: str, text: str, place: Place) -> Change | None:
     first, last = rows[0], rows[-1]
     before = " ".join(line.strip() for line in old[first[1] : last[2]])
     after = " ".join(line.strip() for line in new[first[3] : last[4]])
+    if after.count("frozen=False") > before.count("frozen=False"):
+        return None
     return Change(file, first[1] + 1, place.operator, place.occurrence, before, after, changed)
 
 

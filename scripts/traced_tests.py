@@ -1,8 +1,7 @@
-"""Plugin of pytest for `mutate_python.py`: which tests run which lines, and a run of chosen tests in a given order.
+"""Plugin of pytest for `mutate_python.py`: which tests run which lines.
 
-With CLRECON_TRACE_TO the run is traced.  Each test is a context of coverage.  What a fixture of a wider scope runs
-counts for every test that uses the fixture, and the caches of functions in tests/ and in the room are emptied before
-each test: the order of tests decides neither.  With CLRECON_RUN_ONLY only the tests in that file are run.
+Each test is a context of coverage.  What a fixture of a wider scope runs counts for every test that uses the fixture,
+and the caches of functions in tests/ and in the room are emptied before each test: the order of tests decides neither.
 """
 
 from __future__ import annotations
@@ -13,7 +12,6 @@ import importlib.util
 import json
 import os
 import sys
-import time
 from collections.abc import Generator
 from pathlib import Path
 from typing import Any
@@ -28,7 +26,8 @@ class Tracer:
     Parameters
     ----------
     target : Path
-        File for the result: ``lines`` (file -> line -> tests), ``seconds`` (test -> s), ``start`` (s before the tests).
+        File for the result: ``lines`` (file -> line -> tests), ``seconds`` (test -> s), ``start`` (s before the first
+        test) and ``modules`` (imported from outside of the project).  All seconds are of the processor.
     sources : str
         Folder whose files are traced.
     """
@@ -40,7 +39,7 @@ class Tracer:
         self.coverage.set_option(
             "run:core", "ctrace"
         )  # the one of sys.monitoring sees a line in its first context alone
-        self.begun = time.monotonic()
+        self.begun = processor_seconds()
         self.start = 0.0
         self.seconds: dict[str, float] = {}
         self.skipped: set[str] = set()
@@ -56,7 +55,7 @@ class Tracer:
     @pytest.hookimpl(wrapper=True)
     def pytest_runtest_protocol(self, item: pytest.Item) -> Generator[None, object, object]:
         """Run a test in a context of its own, without what other tests have left in caches."""
-        self.start = self.start or time.monotonic() - self.begun
+        self.start = self.start or processor_seconds() - self.begun
         for name in getattr(item, "fixturenames", ()):
             self.users.setdefault(name, []).append(item.nodeid)
         for kept in gc.get_objects():
@@ -65,11 +64,11 @@ class Tracer:
                 if self.emptied & set(Path(getattr(module, "__file__", None) or os.sep).parents):
                     kept.cache_clear()
         self._switch(item.nodeid)
-        begun = time.monotonic()
+        begun = processor_seconds()
         try:
             return (yield)
         finally:
-            self.seconds[item.nodeid] = time.monotonic() - begun
+            self.seconds[item.nodeid] = processor_seconds() - begun
             self._switch("")
 
     @pytest.hookimpl(wrapper=True)
@@ -103,32 +102,31 @@ class Tracer:
                 tests = {test for context in contexts if context for test in self._tests_of(context)}
                 of_file[line] = sorted(tests - self.skipped)
         seconds = {test: value for test, value in self.seconds.items() if test not in self.skipped}
-        self.target.write_text(json.dumps({"lines": lines, "seconds": seconds, "start": self.start}))
+        result = {"lines": lines, "seconds": seconds, "start": self.start, "modules": outer_modules(self.root)}
+        self.target.write_text(json.dumps(result))
 
 
-class Chooser:
-    """Runs the tests of a list in its order.  A test that is no longer collected is left out."""
+def processor_seconds() -> float:
+    """Processor time of this process and of those that it has waited for, in seconds."""
+    return sum(os.times()[:4])
 
-    def __init__(self, wanted: list[str]):
-        self.order = {test: number for number, test in enumerate(wanted)}
 
-    @pytest.hookimpl(trylast=True)
-    def pytest_collection_modifyitems(self, items: list[pytest.Item]) -> None:
-        """Keep and sort."""
-        items[:] = sorted(
-            (item for item in items if item.nodeid in self.order), key=lambda item: self.order[item.nodeid]
-        )
+def outer_modules(root: Path) -> list[str]:
+    """Names of imported modules whose files lie neither in a folder nor beside this file, in the order of imports."""
+    own = {root, Path(__file__).parent}
+    return [
+        name
+        for name, module in list(sys.modules.items())
+        if name.partition(".")[0] not in ("__main__", "coverage")
+        and getattr(module, "__file__", None)
+        and not own & set(Path(module.__file__ or os.sep).parents)
+    ]
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Trace or choose, as the environment says; clrecon must be that of the copy."""
+    """Trace, if clrecon is that of the copy."""
     package = os.environ["CLRECON_CHANGED_PACKAGE"]
-    if "CLRECON_TRACE_TO" in os.environ:
-        tracer = Tracer(Path(os.environ["CLRECON_TRACE_TO"]), os.environ["CLRECON_TRACED"])
-        config.pluginmanager.register(tracer)
-    else:
-        wanted = json.loads(Path(os.environ["CLRECON_RUN_ONLY"]).read_text())
-        config.pluginmanager.register(Chooser(wanted))
+    config.pluginmanager.register(Tracer(Path(os.environ["CLRECON_TRACE_TO"]), os.environ["CLRECON_TRACED"]))
     found = importlib.util.find_spec(package)
     if found is None or Path.cwd() not in Path(found.origin or os.sep).parents:
         raise pytest.UsageError(f"{package} is not that of {Path.cwd()}: {found}")
