@@ -21,6 +21,8 @@ from clrecon.mesh.refine.decimation import decimate_mesh as decimate_mesh
 from clrecon.mesh.refine.smoothing import smooth_mesh as smooth_mesh
 from clrecon.opencl import list_devices
 from clrecon.operators import choose_device
+from clrecon.operators.points.clusters import Clustering as Clustering
+from clrecon.operators.points.clusters import cluster_points as cluster_points
 from clrecon.operators.points.neighbours import Neighbours as Neighbours
 from clrecon.operators.points.neighbours import find_neighbours as find_neighbours
 from clrecon.operators.rays.render import VolumeRenderer as VolumeRenderer
@@ -35,6 +37,7 @@ from clrecon.operators.surface.label_masks import extract_label_masks as extract
 from clrecon.operators.surface.labels import extract_labels as extract_labels
 from clrecon.points import PointCloud as PointCloud
 from clrecon.points import PointStep as PointStep
+from clrecon.points import keep_clusters as keep_clusters
 from clrecon.points.reader import read_points as read_points
 from clrecon.reading import list_series as list_series
 from clrecon.reading import read_volume as read_volume

@@ -185,6 +185,24 @@ INVERSIONS: dict[str, dict[str, tuple[tuple[str, str], ...]]] = {
         "points": (("= point.x;", "= -point.x;"), ("= point.y;", "= -point.y;"), ("= point.z;", "= -point.z;")),
         "starts": (("starts[cell] = place;", "starts[cell] = ~place;"), ("= n;", "= ~n;")),
     },
+    "clear_words": {"mask": (("mask[word] = 0;", "mask[word] = ~0u;"),)},
+    "set_bits": {"mask": (("1u << (voxel.x & 31)", "~(1u << (voxel.x & 31))"),)},
+    "find_extents": {"extents": (("(ushort)end);", "(ushort)~end);"),)},
+    "find_cores": {"mask": (("store_words(core,", "store_words(~core,"),)},
+    "count_core_runs": {
+        "runs": (("row_counts[row] = runs;", "row_counts[row] = 64 * words - runs;"),),
+        "points": (("= points;", "= 64 * words - points;"),),
+    },
+    "list_core_runs": {
+        "runs": (("(ushort2)((ushort)begin, (ushort)(column", "(ushort2)((ushort)~begin, (ushort)~(column"),)
+    },
+    "join_runs": {"labels": (("labels[run] = root;", "labels[run] = ~root;"),)},
+    "count_links": {"counts": (("row_links[row] = find", "row_links[row] = ~find"),)},
+    "list_links": {"links": (("(uint3)(a, b, b)", "(uint3)(~a, ~b, ~b)"),)},
+    "label_points": {
+        "labels": (("own + point + before, runs", "own + point, runs"), (", numbers[run]);", ", ~numbers[run]);"))
+    },
+    "flag_cores": {"flags": (("(core & rest & -rest) != 0", "(core & rest & -rest) == 0"),)},
     "sum_volumes": {"sums": (("sums[item] = sum;", "sums[item] = -sum;"),)},
     "list_neighbours": {
         "neighbours": (

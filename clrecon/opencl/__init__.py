@@ -3,7 +3,7 @@
 Only this package searches for drivers and knows where the kernel files are.
 """
 
-from clrecon.opencl.arrays import allocate, download, empty_output, upload
+from clrecon.opencl.arrays import allocate, copy_buffer, download, empty_output, upload
 from clrecon.opencl.cache_folders import cache_warnings
 from clrecon.opencl.commands import has_hung_commands, keep_for_hung_commands
 from clrecon.opencl.context import Device
@@ -28,6 +28,7 @@ __all__ = [
     "check_memory",
     "choose_device",
     "choose_unchecked",
+    "copy_buffer",
     "describe_shortage",
     "download",
     "empty_output",

@@ -13,7 +13,7 @@ from clrecon.opencl.pages import result_pages
 from clrecon.opencl.quirks import import_pyopencl
 from clrecon.opencl.waiting import wait
 
-__all__ = ["allocate", "download", "empty_output", "upload"]
+__all__ = ["allocate", "copy_buffer", "download", "empty_output", "upload"]
 
 
 SHARED_BYTES = 1 << 20
@@ -49,6 +49,24 @@ def upload(device: Device, array: NDArray[Any]) -> Any:
     if device.shares_host_memory and array.nbytes >= SHARED_BYTES:
         return _make_buffer(device, flags | cl.mem_flags.USE_HOST_PTR, array.nbytes, array)
     return _make_buffer(device, flags | cl.mem_flags.COPY_HOST_PTR, array.nbytes, array)
+
+
+def copy_buffer(device: Device, source_d: Any, target_d: Any, size: int, offset: int = 0) -> None:
+    """Copy the first `size` bytes of a buffer to another one on the same device, from byte `offset` of it on.
+
+    Raises
+    ------
+    DeviceError
+        The device failed.
+    """
+    cl = import_pyopencl()
+    try:
+        with device.lock:
+            queue = device.queue
+            event = cl.enqueue_copy(queue, target_d, source_d, byte_count=size, dst_offset=offset)
+            device.commands.add(f"the copy of {size:,} bytes", event, queue, source_d, target_d)
+    except cl.Error as error:
+        raise device.fail("copying failed", error) from error
 
 
 def empty_output(device: Device, shape: tuple[int, ...], dtype: DTypeLike) -> tuple[NDArray[Any], Any]:

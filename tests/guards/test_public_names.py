@@ -18,6 +18,7 @@ KEYWORDS = ("device", "memory", "progress")
 """What a call is computed with, not what it computes: never by position."""
 
 TAKE_PROGRESS = {
+    "cluster_points",
     "VolumeRenderer.render", "SurfaceExtractor.extract", "choose_iso_value", "compare_meshes", "cut_slice",
     "decimate_mesh", "extract_isosurface", "extract_isosurfaces", "extract_label_masks", "extract_labels",
     "find_neighbours", "find_spine_line", "list_series", "mask_field_of_view", "read_labels", "read_volume",

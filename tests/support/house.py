@@ -50,6 +50,7 @@ _layer(
     "reading",
     "labels",
     "mesh",
+    "points",
     "rendering",
     "phantom",
     "reference",

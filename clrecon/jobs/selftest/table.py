@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from clrecon.jobs.selftest import labels, pictures, points, primitives, rays, reformat, resident, surface
+from clrecon.jobs.selftest import clusters, labels, pictures, points, primitives, rays, reformat, resident, surface
 from clrecon.jobs.selftest.check import Check
 
 __all__ = ["CHECKS", "checks_of"]
@@ -16,6 +16,7 @@ CHECKS: tuple[Check, ...] = (
     *pictures.CHECKS,
     *reformat.CHECKS,
     *points.CHECKS,
+    *clusters.CHECKS,
 )
 
 

@@ -1,4 +1,4 @@
-"""Connected components of a triangle mesh: the host side of cl/primitives/union_find.cl."""
+"""Components of a triangle mesh, or of nodes joined in pairs: the host side of cl/primitives/union_find.cl."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from clrecon.opencl import (
 from clrecon.operators.primitives.compact import Compacted, compact, prepare_compact
 from clrecon.operators.primitives.scan import LARGEST_SCAN, exclusive_scan
 
-__all__ = ["label_components", "prepare_components"]
+__all__ = ["join_parts", "label_components", "prepare_components"]
 
 LARGEST_MESH = 2**32 - 1
 """Most triangles, so that 32 bits can count them."""
@@ -87,15 +87,56 @@ def label_components(
     if len(faces) == 0:
         return 0, np.full(vertex_count, -1, dtype=np.int64)
     search = _Search(device, faces, vertex_count, memory, stopwatch)
-    labels_d, spare_d = search.find_roots()
-    search.run("flag_roots", vertex_count, labels=labels_d, roots=spare_d, n=vertex_count)
-    roots = exclusive_scan(device, spare_d, vertex_count, stopwatch=stopwatch)
-    numbers_d = allocate(device, 4 * vertex_count)
-    search.run(
-        "number_components", vertex_count, labels=labels_d, offsets=roots.offsets_d, numbers=numbers_d, n=vertex_count
-    )
+    count, numbers_d = search.number(*search.find_roots(), vertex_count)
     numbers = download(device, np.empty(vertex_count, dtype=np.int32), numbers_d)
-    return roots.total, numbers.astype(np.int64)
+    return count, numbers.astype(np.int64)
+
+
+def join_parts(
+    device: Device,
+    labels_d: Any,
+    spare_d: Any,
+    n: int,
+    links_d: Any,
+    links: int,
+    *,
+    stopwatch: Stopwatch | None = None,
+) -> tuple[int, Any]:
+    """Number the components of nodes that are joined within parts already, once the parts are joined by pairs.
+
+    Parameters
+    ----------
+    device : Device
+    labels_d : buffer, (n,) uint32
+        The smallest node of each node's component within its part, a root; of a lone node its own number.  Overwritten.
+    spare_d : buffer, (n,) uint32
+        The same of roots; all else is arbitrary.  Overwritten.
+    n : int
+        Number of nodes, at least 1.
+    links_d : buffer, (links, 3) uint32
+        Pairs (a, b, b) of roots that belong together.
+    links : int
+        Number of pairs.
+    stopwatch : Stopwatch, optional
+
+    Returns
+    -------
+    count : int
+        Number of components, lone nodes counted.
+    numbers_d : buffer, (n,) int32
+        Component of each node, numbered in order of the first node.
+
+    Raises
+    ------
+    DeviceError
+        The device fails or computes wrongly.
+    """
+    rounds = _Rounds(device, stopwatch, labels_d, spare_d, n)
+    if links:
+        rounds.start()
+        rounds.join_roots(links_d, links)
+        rounds.unite(labels_d)
+    return rounds.number(labels_d, spare_d, n)
 
 
 def _check_mesh(triangles: NDArray[np.uint32], vertex_count: int) -> None:
@@ -108,80 +149,53 @@ def _check_mesh(triangles: NDArray[np.uint32], vertex_count: int) -> None:
         raise UsageError(f"a triangle refers to vertex {int(triangles.max())}, the mesh has {vertex_count} vertices")
 
 
-class _Search:
+class _Rounds:
     """The rounds of cl/primitives/union_find.cl: two buffers of labels, one read and one written, and flags."""
 
-    def __init__(
-        self,
-        device: Device,
-        triangles: NDArray[np.uint32],
-        vertex_count: int,
-        memory: int | None,
-        stopwatch: Stopwatch | None,
-    ):
+    def __init__(self, device: Device, stopwatch: Stopwatch | None, labels_d: Any, other_d: Any, nodes: int):
         self._device, self._stopwatch = device, stopwatch
-        self._limits = memory_limits(device, memory)
-        self._faces, self._vertices = len(triangles), vertex_count
-        labels = 4 * vertex_count
-        self._buffers = {"triangles": triangles.nbytes, "labels": labels, "labels of the round before": labels}
-        self._check_budget({"mixed triangles": 4 * self._faces, "roots of the first round": labels})
-        self._check_budget({"component offsets": labels, "component numbers": labels})
         self._program = prepare_components(device)
-        self._faces_d = upload(device, triangles)
-        self._labels_d, self._other_d, self._flags_d = (allocate(device, size) for size in (labels, labels, 8))
+        self._labels_d, self._other_d, self._nodes = labels_d, other_d, nodes
+        self._flags_d = allocate(device, 8)
+        self._roots: Compacted | None = None
         self._passes = 0
-
-    def _check_budget(self, more: dict[str, int]) -> None:
-        shortage = describe_shortage(self._limits, {**self._buffers, **more})
-        if shortage:
-            raise DeviceMemoryError(f"the components of the mesh cannot be found: {shortage}")
 
     def run(self, kernel: str, items: int, **arguments: Any) -> None:
         """Launch a kernel over `items` work-items."""
         launch(self._device, self._program[kernel], items, stopwatch=self._stopwatch, **arguments)
 
-    def find_roots(self) -> tuple[Any, Any]:
-        """Run all rounds.
+    def start(self) -> None:
+        """Clear the flags; the labels are there."""
+        self.run("clear_labels", 1, labels=allocate(self._device, 4), flags=self._flags_d, n=1)
+
+    def number(self, labels_d: Any, spare_d: Any, n: int) -> tuple[int, Any]:
+        """Number the components by their roots.
 
         Returns
         -------
-        labels_d, spare_d : buffer, (n,) uint32
-            Labels that are all roots, and a free buffer.
+        count : int
+        numbers_d : buffer, (n,) int32
         """
-        self.run("clear_labels", self._vertices, labels=self._other_d, flags=self._flags_d, n=self._vertices)
-        self.run("hook_corners", self._faces, triangles=self._faces_d, labels=self._other_d, m=self._faces)
-        self._jump("jump_labels", self._vertices, n=self._vertices)
-        labels_d, spare_d = self._labels_d, self._other_d
-        mixed = self._list("mark_mixed", self._faces, triangles=self._faces_d, labels=labels_d, m=self._faces)
-        if mixed.count:
-            roots = self._join_roots(mixed)
-            if self._labels_d is not labels_d:
-                self.run(
-                    "copy_roots", roots.count,
-                    roots=roots.positions_d, labels=self._labels_d, copy=labels_d, count=roots.count,
-                )  # fmt: skip
-        return labels_d, spare_d
+        self.run("flag_roots", n, labels=labels_d, roots=spare_d, n=n)
+        roots = exclusive_scan(self._device, spare_d, n, stopwatch=self._stopwatch)
+        numbers_d = allocate(self._device, 4 * n)
+        self.run("number_components", n, labels=labels_d, offsets=roots.offsets_d, numbers=numbers_d, n=n)
+        return roots.total, numbers_d
 
-    def _join_roots(self, mixed: Compacted) -> Compacted:
-        """Run all rounds after the first, on the roots that it left, and return these.  No other label changes any
-        more.
-        """
-        self._check_budget({"roots of mixed triangles": 16 * mixed.count})
-        roots = self._list("mark_roots", self._vertices, labels=self._labels_d, n=self._vertices)
-        corners_d = allocate(self._device, 12 * mixed.count)
-        self.run(
-            "gather_roots",
-            mixed.count,
-            triangles=self._faces_d,
-            mixed=mixed.positions_d,
-            labels=self._labels_d,
-            corners=corners_d,
-            count=mixed.count,
-        )  # Roots are their own label in both buffers; other labels lead to the same root, perhaps in several steps.
+    def join_roots(self, corners_d: Any, count: int) -> None:
+        """Run all rounds after the first, on the roots that it left.  No other label changes any more."""
+        self._roots = self.list_marked("mark_roots", self._nodes, labels=self._labels_d, n=self._nodes)
         # Roots are their own label in both buffers, and other labels lead to the same root, if not in one step.
-        while self._hook(corners_d, mixed.count):
-            self._jump("jump_roots", roots.count, roots=roots.positions_d, count=roots.count)
-        return roots
+        while self._hook(corners_d, count):
+            self.jump("jump_roots", self._roots.count, roots=self._roots.positions_d, count=self._roots.count)
+
+    def unite(self, labels_d: Any) -> None:
+        """Bring the labels of the roots to one buffer, in which the label of each label is then a root."""
+        if self._roots is not None and self._labels_d is not labels_d:
+            self.run(
+                "copy_roots", self._roots.count,
+                roots=self._roots.positions_d, labels=self._labels_d, copy=labels_d, count=self._roots.count,
+            )  # fmt: skip
 
     def _hook(self, corners_d: Any, count: int) -> bool:
         """Hook roots to other roots; return whether there were any."""
@@ -193,7 +207,7 @@ class _Search:
         )  # fmt: skip
         return bool(self._read_flags()[1] == number)
 
-    def _jump(self, kernel: str, items: int, **listed: Any) -> None:
+    def jump(self, kernel: str, items: int, **listed: Any) -> None:
         """Run passes of jumps, from `_other_d` to `_labels_d` and back, until all labels in `_labels_d` are roots."""
         while True:
             number = self._next_pass()
@@ -217,9 +231,61 @@ class _Search:
     def _read_flags(self) -> NDArray[np.uint32]:
         return download(self._device, np.empty(2, dtype=np.uint32), self._flags_d)
 
-    def _list(self, kernel: str, size: int, **inputs: Any) -> Compacted:
+    def list_marked(self, kernel: str, size: int, **inputs: Any) -> Compacted:
         """List the elements that a kernel marks in a bit mask of `size` bits."""
         words = -(-size // 32)
         mask_d = allocate(self._device, 4 * words)
         self.run(kernel, words, mask=mask_d, **inputs)
         return compact(self._device, mask_d, words, stopwatch=self._stopwatch)
+
+
+class _Search(_Rounds):
+    """The rounds on a mesh."""
+
+    def __init__(
+        self,
+        device: Device,
+        triangles: NDArray[np.uint32],
+        vertex_count: int,
+        memory: int | None,
+        stopwatch: Stopwatch | None,
+    ):
+        self._limits = memory_limits(device, memory)
+        self._faces, self._vertices = len(triangles), vertex_count
+        labels = 4 * vertex_count
+        self._buffers = {"triangles": triangles.nbytes, "labels": labels, "labels of the round before": labels}
+        self._check_budget({"mixed triangles": 4 * self._faces, "roots of the first round": labels})
+        self._check_budget({"component offsets": labels, "component numbers": labels})
+        prepare_components(device)
+        self._faces_d = upload(device, triangles)
+        super().__init__(device, stopwatch, allocate(device, labels), allocate(device, labels), vertex_count)
+
+    def _check_budget(self, more: dict[str, int]) -> None:
+        shortage = describe_shortage(self._limits, {**self._buffers, **more})
+        if shortage:
+            raise DeviceMemoryError(f"the components of the mesh cannot be found: {shortage}")
+
+    def find_roots(self) -> tuple[Any, Any]:
+        """Run all rounds.
+
+        Returns
+        -------
+        labels_d, spare_d : buffer, (n,) uint32
+            Labels whose labels are all roots, and a free buffer.
+        """
+        self.run("clear_labels", self._vertices, labels=self._other_d, flags=self._flags_d, n=self._vertices)
+        self.run("hook_corners", self._faces, triangles=self._faces_d, labels=self._other_d, m=self._faces)
+        self.jump("jump_labels", self._vertices, n=self._vertices)
+        labels_d, spare_d = self._labels_d, self._other_d
+        mixed = self.list_marked("mark_mixed", self._faces, triangles=self._faces_d, labels=labels_d, m=self._faces)
+        if mixed.count:
+            self._check_budget({"roots of mixed triangles": 16 * mixed.count})
+            corners_d = allocate(self._device, 12 * mixed.count)
+            self.run(
+                "gather_roots", mixed.count,
+                triangles=self._faces_d, mixed=mixed.positions_d, labels=labels_d, corners=corners_d,
+                count=mixed.count,
+            )  # fmt: skip
+            self.join_roots(corners_d, mixed.count)
+            self.unite(labels_d)
+        return labels_d, spare_d

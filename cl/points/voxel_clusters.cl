@@ -1,0 +1,347 @@
+/* DBSCAN of the set voxels of a bit mask: core voxels, clusters of neighbouring core voxels, labels of all set voxels.
+ *
+ * Reference: Ester, Kriegel, Sander and Xu 1996, "A density-based algorithm for discovering clusters"; neighbours on a
+ * lattice are the members of a stencil, and voxels are counted 32 at a time.
+ *
+ * Rows are numbered (j, k) -> k nj + j.  A row is `words` words of 32 voxels; behind its last voxel are as many words of
+ * zeros as the stencil reaches along i, and they stand before the next row too.  A stencil is a list of rows (dj, dk,
+ * lowest di, highest di), nearest first; `tables` says which part of the list is that of slice k.
+ *
+ * Passes
+ *   1. the mask comes from cl/surface/classify.cl, that of a list of voxels from band_mask.cl
+ *   2. find_cores    each word and its neighbours in 8 planes of bits: 32 counters of 8 bits side by side
+ *   3. count_core_runs   runs of core voxels along i, the nodes of the clusters, and points; then scan.cl
+ *   4. list_core_runs
+ *   5. join_runs     parts of the rows, each by one work-item: union-find without a second writer
+ *   6. count_links, list_links   pairs of nodes in different parts, joined by union_find.cl
+ *   7. label_points  core voxels by their run, other voxels by the runs near them
+ *
+ * Counters, for min_samples = 6, of a word of 4 voxels.  They begin at 8 - 6 = 2, and one that overflows is a core
+ * voxel, whatever its bits are afterwards:
+ *
+ *                    begin      + 1 1 0 1   + 1 1 0 1   + ... 6 words in all
+ *      plane 7 (4)   0 0 0 0      0 0 0 0     1 1 0 1
+ *      plane 6 (2)   1 1 1 1      1 1 1 1     0 0 1 0
+ *      plane 5 (1)   0 0 0 0      1 1 0 1     0 0 0 0
+ *
+ * Two runs [a, b] and [c, d] in rows that a stencil row joins are neighbours when c <= b + highest and d >= a + lowest.
+ * Widened runs overlap, so a run may be a neighbour of several runs before it and after it:
+ *
+ *      own row      ..###..##......    lowest -1, highest 1
+ *      widened      .#########.....    columns 1 to 5 and 5 to 8: both meet column 5
+ *      other row    .....#.........    is a neighbour of both: a sweep must not drop it after the first
+ *
+ * Races.  Each item writes words of its own alone: a block, a row, a part, a place in a list. */
+#include "points/bit_counters.h"
+#include "points/core_runs.h"
+
+/* Parameters  mask     in   (rows, words)
+ *             row_extents  in   (rows)
+ *             stencil  in   (m) rows of the stencils
+ *             tables   in   (nk) begin and end of the stencil of each slice
+ *             cores    out  (rows, words) set voxels with at least min_samples set voxels in their stencil
+ *             nj, nk   rows a slice, and slices;  words a row
+ *             item_words   words of a row for each item
+ *             planes   ceil(log2(min_samples)), 1 to 8
+ *             start    2^planes - min_samples
+ * Launch      global = nk nj ceil(words / item_words) rounded up by the host, any local
+ * Assumes     nk nj words < 2^31; the rows of a stencil end within the zeros behind a row
+ * Guarantees  every word is written */
+__kernel void find_cores(
+    __global const uint *restrict mask, __global const ushort2 *restrict row_extents,
+    __global const int4 *restrict stencil, __global const int2 *restrict tables, __global uint *restrict cores,
+    const int nj, const int nk, const int words, const int item_words, const int planes, const uint start)
+{
+    const uint item = get_global_id(0);
+    const int items_a_row = (words + item_words - 1) / item_words;
+    const int row = (int)(item / items_a_row);
+    if (row >= nj * nk)
+        return;
+    const int first = (int)(item % items_a_row) * item_words, last = min(first + item_words, words);
+    const int begin = clamp((int)row_extents[row].x, first, last), end = clamp((int)row_extents[row].y, begin, last);
+    __global uint *own_cores = cores + row * words;
+    for (int w = first; w < begin; ++w)
+        own_cores[w] = 0;
+    for (int w = end; w < last; ++w)
+        own_cores[w] = 0;
+    if (begin == end)
+        return;
+    const int total = nj * nk * words, j = row % nj, k = row / nj;
+    const int2 table = tables[k];
+    for (int w = begin; w < end; w += LANES) {
+        const word_lanes own = load_words(mask, row * words + w, total);
+        word_lanes core = (word_lanes)(0);
+        if (ANY_BIT(own)) {
+            bit_counters counters;
+            counters.p7 = (word_lanes)(FIRST_BIT(1));
+            counters.p6 = (word_lanes)(FIRST_BIT(2));
+            counters.p5 = (word_lanes)(FIRST_BIT(3));
+            counters.p4 = (word_lanes)(FIRST_BIT(4));
+            counters.p3 = (word_lanes)(FIRST_BIT(5));
+            counters.p2 = (word_lanes)(FIRST_BIT(6));
+            counters.p1 = (word_lanes)(FIRST_BIT(7));
+            counters.p0 = (word_lanes)(FIRST_BIT(8));
+            for (int which = table.x; which < table.y && ANY_BIT(own & ~core); ++which) {
+                const int4 near = stencil[which];
+                if (j + near.x < 0 || j + near.x >= nj || k + near.y < 0 || k + near.y >= nk)
+                    continue;
+                const int other = (row + near.y * nj + near.x) * words + w;
+                for (int di = near.z; di <= near.w; ++di)
+                    core |= add_bits(&counters, load_shifted(mask, other, di, total), planes);
+            }
+            core &= own;
+        }
+        store_words(core, own_cores + w, end - w);
+    }
+}
+
+/* Parameters  mask, cores  in   (rows, words)
+ *             row_extents  in   (rows) of the mask
+ *             row_counts   out  (2, rows + 1) runs of core voxels along i, and set voxels; 0 behind the last row
+ *             rows, words
+ *             lone         1 where eps is below the step along i: each core voxel is a run of its own
+ * Launch      global = rows + 1 rounded up by the host, any local
+ * Guarantees  every count is written */
+__kernel void count_core_runs(
+    __global const uint *restrict mask, __global const uint *restrict cores,
+    __global const ushort2 *restrict row_extents, __global uint *restrict row_counts, const uint rows, const int words,
+    const int lone)
+{
+    const uint row = get_global_id(0);
+    if (row > rows)
+        return;
+    const ushort2 extent = row < rows ? row_extents[row] : (ushort2)(0, 0);
+    const size_t at = (size_t)row * words;
+    uint runs = 0, points = 0, before = 0;
+    for (int w = extent.x; w < extent.y; ++w) {
+        const uint core = cores[at + w];
+        runs += popcount(lone ? core : core & ~(core << 1 | before));
+        points += popcount(mask[at + w]);
+        before = core >> 31;
+    }
+    row_counts[row] = runs;
+    row_counts[rows + 1 + row] = points;
+}
+
+/* Parameters  cores        in   (rows, words)
+ *             row_extents  in   (rows)
+ *             row_counts   in   (rows + 1) number of runs in all rows before
+ *             runs         out  (count) first and last column of each run, row by row
+ *             rows, words, lone  as count_core_runs
+ * Launch      global = rows rounded up by the host, any local
+ * Guarantees  every run is written */
+__kernel void list_core_runs(
+    __global const uint *restrict cores, __global const ushort2 *restrict row_extents,
+    __global const uint *restrict row_counts, __global ushort2 *restrict runs, const uint rows, const int words,
+    const int lone)
+{
+    const uint row = get_global_id(0);
+    if (row >= rows)
+        return;
+    const ushort2 extent = row_extents[row];
+    const size_t at = (size_t)row * words;
+    uint place = row_counts[row];
+    int begin = -1;
+    for (int w = extent.x; w < extent.y; ++w) {
+        const uint bits = cores[at + w];
+        const int column = 32 * w;
+        if (lone) {
+            for (uint rest = bits; rest != 0; rest &= rest - 1)
+                runs[place++] = (ushort2)((ushort)(column + popcount((rest & -rest) - 1)));
+            continue;
+        }
+        /* Bits that differ from the one before: runs begin and end there, in turn. */
+        uint changes = bits ^ (bits << 1 | (uint)(begin >= 0));
+        while (changes != 0) {
+            const int bit = popcount((changes & -changes) - 1);
+            if (begin < 0)
+                begin = column + bit;
+            else {
+                runs[place++] = (ushort2)((ushort)begin, (ushort)(column + bit - 1));
+                begin = -1;
+            }
+            changes &= changes - 1;
+        }
+    }
+    if (begin >= 0)
+        runs[place] = (ushort2)((ushort)begin, (ushort)(32 * extent.y - 1));
+}
+
+/* Parameters  runs        in       (count)
+ *             row_counts  in       (rows + 1) first run of each row, and `count`
+ *             stencil     in       (m) rows of the forward stencils
+ *             tables      in       (nk)
+ *             labels      out      (count) the smallest run of the part that a run is joined with
+ *             roots       out      (count) of roots their own number
+ *             nj, nk      rows a slice, and slices
+ *             part_rows   rows a part
+ *             spread      work-items for one part, of which the first does all
+ * Launch      global = ceil(rows / part_rows) spread rounded up by the host, any local
+ * Guarantees  every label is a root; runs of different parts have different labels */
+__kernel void join_runs(
+    __global const ushort2 *restrict runs, __global const uint *restrict row_counts,
+    __global const int4 *restrict stencil, __global const int2 *restrict tables, __global uint *labels,
+    __global uint *restrict roots, const int nj, const int nk, const uint part_rows, const uint spread)
+{
+    const uint item = get_global_id(0), rows = nj * nk;
+    const uint part = item / spread;
+    if (item % spread != 0 || part > (rows - 1) / part_rows)
+        return;
+    const uint first_row = part * part_rows, end_row = min(first_row + part_rows, rows);
+    const uint first_run = row_counts[first_row], end_run = row_counts[end_row];
+    for (uint run = first_run; run < end_run; ++run)
+        labels[run] = run;
+    for (uint row = first_row; row < end_row; ++row) {
+        const uint own_begin = row_counts[row], own_end = row_counts[row + 1];
+        if (own_begin == own_end)
+            continue;
+        const int j = row % nj, k = row / nj;
+        const int2 table = tables[k];
+        for (int which = table.x; which < table.y; ++which) {
+            const int4 near = stencil[which];
+            const uint other = row + near.y * nj + near.x;
+            if (j + near.x < 0 || j + near.x >= nj || k + near.y >= nk || other >= end_row)
+                continue;
+            uint first = row_counts[other];
+            const uint end = row_counts[other + 1];
+            for (uint own = own_begin; own < own_end && first < end; ++own) {
+                const int begin = (int)runs[own].x + near.z, last = (int)runs[own].y + near.w;
+                while (first < end && (int)runs[first].y < begin)
+                    ++first;
+                if (first == end || (int)runs[first].x > last)
+                    continue;
+                uint root = find_root(labels, own);
+                for (uint next = first; next < end && (int)runs[next].x <= last; ++next) {
+                    if (labels[next] == root)
+                        continue;
+                    const uint met = find_root(labels, next), least = min(root, met);
+                    labels[max(root, met)] = least;
+                    root = least;
+                }
+            }
+        }
+    }
+    for (uint run = first_run; run < end_run; ++run) {
+        const uint root = labels[labels[run]]; /* labels before this one are roots, and labels point there */
+        labels[run] = root;
+        if (root == run)
+            roots[run] = run;
+    }
+}
+
+/* Parameters  runs, row_counts, stencil, tables  in   as join_runs
+ *             labels      in   (count) all of them roots
+ *             row_links   out  (rows) pairs of runs of the row with runs of later parts, those of equal roots in
+ *                              succession once
+ *             nj, nk, part_rows  as join_runs
+ * Launch      global = rows rounded up by the host, any local
+ * Guarantees  every count is written */
+__kernel void count_links(
+    __global const ushort2 *restrict runs, __global const uint *restrict row_counts,
+    __global const int4 *restrict stencil, __global const int2 *restrict tables, __global const uint *restrict labels,
+    __global uint *restrict row_links, const int nj, const int nk, const uint part_rows)
+{
+    const uint row = get_global_id(0);
+    if (row >= nj * nk)
+        return;
+    const uint end_row = (row / part_rows + 1) * part_rows;
+    row_links[row] = find_links(runs, row_counts, stencil, tables, labels, 0, nj, nk, row, end_row);
+}
+
+/* Parameters  as count_links, but
+ *             row_links   in   (rows) pairs of all rows before
+ *             links       out  (m, 3) the pairs as triangles (a, b, b) of roots, for union_find.cl
+ * Launch      as count_links
+ * Guarantees  every pair is written */
+__kernel void list_links(
+    __global const ushort2 *restrict runs, __global const uint *restrict row_counts,
+    __global const int4 *restrict stencil, __global const int2 *restrict tables, __global const uint *restrict labels,
+    __global const uint *restrict row_links, __global uint *restrict links, const int nj, const int nk,
+    const uint part_rows)
+{
+    const uint row = get_global_id(0);
+    if (row >= nj * nk)
+        return;
+    const uint end_row = (row / part_rows + 1) * part_rows;
+    find_links(runs, row_counts, stencil, tables, labels, links + 3 * (size_t)row_links[row], nj, nk, row, end_row);
+}
+
+/* Parameters  mask, cores  in   (rows, words)
+ *             row_extents  in   (rows)
+ *             runs         in   (count)
+ *             row_counts   in   (2, rows + 1) first run of each row, and `count`; `count` and the points of all rows
+ *                               before
+ *             numbers      in   (count) cluster of each run
+ *             stencil      in   (m) rows of the stencils
+ *             tables       in   (nk)
+ *             labels       out  (points) cluster of each point, the lowest near a border point; -1 for noise
+ *             nj, nk       rows a slice, and slices;  words a row
+ * Launch      global = rows rounded up by the host, any local
+ * Guarantees  every label is written */
+__kernel void label_points(
+    __global const uint *restrict mask, __global const uint *restrict cores,
+    __global const ushort2 *restrict row_extents, __global const ushort2 *restrict runs,
+    __global const uint *restrict row_counts, __global const int *restrict numbers, __global const int4 *restrict stencil,
+    __global const int2 *restrict tables, __global int *restrict labels, const int nj, const int nk, const int words)
+{
+    const int row = get_global_id(0);
+    if (row >= nj * nk)
+        return;
+    const ushort2 extent = row_extents[row];
+    if (extent.x == extent.y)
+        return;
+    const int own_at = row * words;
+    __global int *own = labels + (row_counts[nj * nk + 1 + row] - row_counts[nj * nk]);
+    const uint end_run = row_counts[row + 1];
+    uint run = row_counts[row], point = 0, open = 0;
+    for (int w = extent.x; w < extent.y; ++w) {
+        const uint bits = mask[own_at + w], border = bits & ~cores[own_at + w];
+        for (; run < end_run && runs[run].x < 32 * (w + 1); ++run) {
+            const uint before = popcount(bits & ((1u << (runs[run].x & 31)) - 1));
+            fill_labels(own + point + before, runs[run].y - runs[run].x + 1, numbers[run]);
+        }
+        for (uint rest = border; rest != 0; rest &= rest - 1)
+            own[point + popcount(bits & ((rest & -rest) - 1))] = -1;
+        open |= border;
+        point += popcount(bits);
+    }
+    if (open == 0)
+        return;
+    const int j = row % nj, k = row / nj;
+    const int2 table = tables[k];
+    for (int which = table.x; which < table.y; ++which) {
+        const int4 near = stencil[which];
+        if (j + near.x < 0 || j + near.x >= nj || k + near.y < 0 || k + near.y >= nk)
+            continue;
+        const int other = row + near.y * nj + near.x;
+        const uint first = row_counts[other], end = row_counts[other + 1];
+        if (first != end)
+            label_borders(mask, cores, runs, numbers, own, near, own_at, other * words, first, end, extent,
+                nj * nk * words);
+    }
+}
+
+/* Parameters  mask, cores  in   (rows, words)
+ *             row_extents  in   (rows)
+ *             row_counts   in   (2, rows + 1), as label_points
+ *             flags        out  (points) 1 for core points, else 0
+ *             rows, words
+ * Launch      global = rows rounded up by the host, any local
+ * Guarantees  every flag is written */
+__kernel void flag_cores(
+    __global const uint *restrict mask, __global const uint *restrict cores,
+    __global const ushort2 *restrict row_extents, __global const uint *restrict row_counts,
+    __global uchar *restrict flags, const uint rows, const int words)
+{
+    const uint row = get_global_id(0);
+    if (row >= rows)
+        return;
+    const ushort2 extent = row_extents[row];
+    const size_t at = (size_t)row * words;
+    uint point = row_counts[rows + 1 + row] - row_counts[rows];
+    for (int w = extent.x; w < extent.y; ++w) {
+        const uint core = cores[at + w];
+        for (uint rest = mask[at + w]; rest != 0; rest &= rest - 1)
+            flags[point++] = (uchar)((core & rest & -rest) != 0);
+    }
+}

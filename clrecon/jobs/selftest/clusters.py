@@ -1,0 +1,84 @@
+"""Checks of clusters of voxels: masks of bands and of lists, and DBSCAN on even and uneven stacks."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clrecon.geometry import Volume
+from clrecon.jobs.selftest.check import Check, require_equal
+from clrecon.jobs.selftest.scenes import OBLIQUE, noise, stack
+from clrecon.opencl import Device, download
+from clrecon.operators.points.band_mask import VoxelMask, mark_band, mark_voxels
+from clrecon.operators.points.voxel_clusters import ClusterSearch, pad_for
+from clrecon.operators.resident.device_volume import DeviceVolume
+from clrecon.points.stencil import Lattice, make_stencil
+from clrecon.reference.points import clusters as twin
+
+__all__ = ["CHECKS"]
+
+SHAPE = (26, 41, 70)
+"""Voxels (k, j, i): more than 1,000 rows, and three words in each."""
+
+
+def _volume(uneven: bool) -> Volume:
+    """Return noise of which a third of the slices is dense, and the last ones sparse."""
+    voxels = noise(SHAPE, "int16", 100)
+    voxels[: SHAPE[0] // 3] += 30
+    voxels[-4:] -= 25
+    return stack(voxels, OBLIQUE, uneven)
+
+
+def _bits(device: Device, mask: VoxelMask) -> NDArray[np.bool_]:
+    ni, nj, nk = mask.shape_ijk
+    words = download(device, np.empty((nk, nj, mask.words), "<u4"), mask.mask_d)
+    return np.unpackbits(words.view(np.uint8), axis=2, bitorder="little").astype(bool)[..., :ni]
+
+
+def _check_masks(device: Device) -> str:
+    volume = _volume(False)
+    inside = (volume.voxels >= 75) & (volume.voxels <= 110)
+    inside[:, 7] = False
+    ijk = np.argwhere(inside)[:, ::-1].astype(np.int32)
+    listed = mark_voxels(device, np.random.default_rng(4).permutation(ijk), volume.shape_ijk, pad=1)
+    require_equal(_bits(device, listed), inside, "the mask of a list of voxels")
+    extents = download(device, np.empty((*SHAPE[:2], 2), np.uint16), listed.row_extents_d)
+    columns = inside.reshape(*SHAPE[:2], -1)
+    any_set = columns.any(axis=2)
+    first = np.where(any_set, columns.argmax(axis=2) // 32, 0)
+    last = np.where(any_set, (SHAPE[2] - 1 - columns[..., ::-1].argmax(axis=2)) // 32 + 1, 0)
+    require_equal(extents, np.stack([first, last], axis=2), "the extents of its rows")
+    return f"{len(ijk):,} voxels equal"
+
+
+def _check_clusters(device: Device) -> str:
+    said = []
+    for uneven, eps, samples in ((False, 1.2, 6), (True, 1.1, 4), (False, 0.75, 1), (True, 0.45, 2)):
+        volume = _volume(uneven)
+        stencil = make_stencil(Lattice.of(volume), eps)
+        with DeviceVolume(volume, device=device) as resident:
+            mask = mark_band(resident, (75.0, 110.0), pad=pad_for(stencil))
+            search = ClusterSearch(device, mask, stencil, samples)
+            labels, cores = search.label(), search.flag_cores()
+        ijk = np.argwhere((volume.voxels >= 75) & (volume.voxels <= 110))[:, ::-1]
+        count, expected, expected_cores = twin.cluster_points(volume.ijk_to_lps(ijk), eps, samples)
+        what = f"at eps {eps} mm and min_samples {samples}"
+        require_equal(search.count, count, f"the number of clusters {what}")
+        require_equal(cores, expected_cores, f"core points {what}")
+        require_equal(labels, expected, f"labels {what}")
+        said.append(count)
+    return f"{', '.join(map(str, said))} clusters equal"
+
+
+CHECKS = (
+    Check("masks of voxels", ("clear_words", "set_bits", "find_extents"), _check_masks),
+    Check(
+        "clusters of voxels",
+        (
+            "classify_samples", "find_cores", "count_core_runs", "list_core_runs", "join_runs", "count_links",
+            "list_links", "label_points", "flag_cores",
+        ),
+        _check_clusters,
+        {"surface/classify.cl": ("RANGE",)},
+    ),
+)  # fmt: skip

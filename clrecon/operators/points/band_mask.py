@@ -1,0 +1,285 @@
+"""Bit masks of voxels on a device: those of a band of HU, made slab by slab where need be, or those of a list."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, DTypeLike, NDArray
+
+from clrecon.errors import DeviceError, DeviceFailedError, NoSurfaceError, UsageError
+from clrecon.geometry import Volume
+from clrecon.opencl import Device, Program, Stopwatch, allocate, copy_buffer, launch, load_program, upload
+from clrecon.operators.resident.device_volume import DeviceVolume
+from clrecon.operators.resident.voxel_types import voxel_variants
+from clrecon.system.progress import Progress, ignore_progress
+from clrecon.system.wording import name_parameter
+
+__all__ = ["VoxelMask", "check_shape", "checked_band", "mark_band", "mark_voxels", "mask_bytes", "prepare_band_mask"]
+
+LONGEST_ROW = 65_535
+"""Most voxels in a row: columns of runs have 16 bits."""
+
+MOST_WORDS = 2**31 - 1
+"""Most words of a mask, so that their places fit a signed 32-bit integer."""
+
+BAND = "voxels of a band"
+"""Purpose by which slabs are planned."""
+
+
+@dataclass(frozen=True)
+class VoxelMask:
+    """One bit for each voxel of a volume, on a device.
+
+    Attributes
+    ----------
+    mask_d : buffer, (nk, nj, words) uint32
+        Bit b of word w is voxel i = 32 w + b.
+    row_extents_d : buffer, (nk, nj, 2) uint16
+        First word of a row with a bit set, and the one after the last; 0, 0 in rows without.
+    shape_ijk : (ni, nj, nk)
+    words : int
+        Words in a row, of which the last `pad` are zeros.
+    pad : int
+    """
+
+    mask_d: Any
+    row_extents_d: Any
+    shape_ijk: tuple[int, int, int]
+    words: int
+    pad: int
+
+    @property
+    def rows(self) -> int:
+        """Number of rows (j, k)."""
+        return self.shape_ijk[1] * self.shape_ijk[2]
+
+    def needs(self) -> dict[str, int]:
+        """Return the bytes of the buffers."""
+        return mask_bytes(self.shape_ijk, self.pad)
+
+
+def mask_bytes(shape_ijk: tuple[int, int, int], pad: int = 0) -> dict[str, int]:
+    """Return the bytes of a mask on the device, by description."""
+    ni, nj, nk = shape_ijk
+    return {"mask of the voxels": 4 * (-(-ni // 32) + pad) * nj * nk, "row extents": 4 * nj * nk}
+
+
+def checked_band(hu: ArrayLike) -> tuple[float, float]:
+    """Return the two ends of a band of HU, both included; infinity leaves an end open.
+
+    Raises
+    ------
+    UsageError
+        These are not two numbers, the lower one first.
+    """
+    try:
+        low, high = np.asarray(hu, dtype=np.float64).tolist()
+    except (TypeError, ValueError):
+        low = high = math.nan
+    if not low <= high:
+        raise UsageError(f"{name_parameter('hu')}: a band is two numbers in HU, the lower one first, not {hu!r}")
+    return low, high
+
+
+def check_shape(shape_ijk: tuple[int, int, int], pad: int = 0) -> None:
+    """Refuse volumes whose masks are too large.
+
+    Raises
+    ------
+    UsageError
+    """
+    ni, nj, nk = shape_ijk
+    words = -(-ni // 32) + pad
+    if ni > LONGEST_ROW or words * nj * nk > MOST_WORDS:
+        raise UsageError(
+            f"the volume has {ni:,} x {nj:,} x {nk:,} voxels: masks hold rows of up to {LONGEST_ROW:,}, and up to"
+            f" {MOST_WORDS:,} words of 32 voxels ({words * nj * nk:,} here)"
+        )
+
+
+def prepare_band_mask(device: Device, dtype: DTypeLike = np.int16) -> Program:
+    """Build the kernel for volumes of `dtype`.
+
+    Raises
+    ------
+    DeviceError
+        The driver's compiler refuses.
+    """
+    variants = {**voxel_variants(dtype), **device.kernel_variants, "RANGE": "1"}
+    return load_program(device, "surface/classify.cl", variants)
+
+
+def _bounds(volume: Volume, hu: tuple[float, float]) -> tuple[Any, Any]:
+    """Return the band's ends as scalars of the voxels' type: for whole numbers the first and last within.
+
+    Raises
+    ------
+    NoSurfaceError
+        The type has no value within.
+    """
+    dtype = volume.voxels.dtype
+    if dtype.kind == "f":
+        most = float(np.finfo(dtype).max)
+        return dtype.type(max(hu[0], -most)), dtype.type(min(hu[1], most))
+    limits = np.iinfo(dtype)
+    low, high = max(hu[0], float(limits.min)), min(hu[1], float(limits.max))
+    if math.ceil(low) > math.floor(high):
+        raise NoSurfaceError(f"no voxel can lie from {hu[0]:g} to {hu[1]:g} HU: voxels are {dtype}")
+    return dtype.type(math.ceil(low)), dtype.type(math.floor(high))
+
+
+def mark_band(
+    resident: DeviceVolume,
+    hu: tuple[float, float],
+    *,
+    pad: int = 0,
+    beside: Mapping[str, int] | None = None,
+    stopwatch: Stopwatch | None = None,
+    progress: Progress | None = None,
+) -> VoxelMask:
+    """Mark the voxels from ``hu[0]`` to ``hu[1]`` HU, both included; NaN lies in no band.
+
+    The mask is that of the whole volume.  Where its voxels do not fit beside it, they go to the device slab by slab.
+
+    Parameters
+    ----------
+    resident : DeviceVolume
+    hu : (float, float)
+        See `checked_band`.
+    pad : int
+        Words of zeros behind each row.
+    beside : mapping of str to int, optional
+        Bytes on the device that are taken already, or will be as long as voxels are there.
+    stopwatch : Stopwatch, optional
+    progress : callable, optional
+        Called as ``progress("mask", slices done, all slices)`` where there are several slabs.
+
+    Raises
+    ------
+    UsageError
+        The volume is too large, see `check_shape`.
+    NoSurfaceError
+        The type of the voxels has no value in the band.
+    DeviceError
+        Not even the mask and one slice fit the device, or it fails.
+    """
+    volume, stopwatch = resident.volume, stopwatch or Stopwatch()
+    check_shape(volume.shape_ijk, pad)
+    bounds = _bounds(volume, hu)
+    ni, nj, nk = volume.shape_ijk
+    words = -(-ni // 32) + pad
+    masks = {**mask_bytes(volume.shape_ijk, pad), **(beside or {})}
+
+    def needs(slices: int) -> dict[str, int]:
+        part = {f"{what} of a slab": size for what, size in mask_bytes((ni, nj, slices), pad).items()}
+        return {"volume": slices * resident.slice_bytes, **masks, **({} if slices == nk else part)}
+
+    slices = resident.plan(BAND, nk, needs)
+    if slices == 0:
+        limits = resident.limits
+        raise (DeviceFailedError if limits.asked_bytes is None else DeviceError)(
+            f"the mask of the voxels and one slice need {sum(needs(1).values()):,} bytes: {limits.describe()};"
+            f" {'use another device' if limits.asked_bytes is None else 'allow more'}"
+        )
+    run = _Marking(resident, bounds, words, pad, stopwatch, progress or ignore_progress)
+    return resident.halve(BAND, slices, run.mark)
+
+
+class _Marking:
+    """One mask, whatever the number of slices in a slab."""
+
+    def __init__(
+        self,
+        resident: DeviceVolume,
+        bounds: tuple[Any, Any],
+        words: int,
+        pad: int,
+        stopwatch: Stopwatch,
+        progress: Progress,
+    ):
+        self.resident, self.bounds, self.words, self.pad = resident, bounds, words, pad
+        self.stopwatch, self.progress = stopwatch, progress
+
+    def mark(self, slices: int) -> VoxelMask:
+        """Make the mask with so many slices in a slab."""
+        resident, device = self.resident, self.resident.device
+        ni, nj, nk = resident.volume.shape_ijk
+        mask_d, extents_d = allocate(device, 4 * self.words * nj * nk), allocate(device, 4 * nj * nk)
+        if slices == nk:
+            self._classify(resident.whole(self.stopwatch), mask_d, extents_d, nk)
+            return VoxelMask(mask_d, extents_d, (ni, nj, nk), self.words, self.pad)
+        resident.make_way()
+        part_d, part_extents_d = (allocate(device, size * nj * slices) for size in (4 * self.words, 4))
+        for first in range(0, nk, slices):
+            end = min(first + slices, nk)
+            voxels_d = resident.part(first, end, self.stopwatch)
+            with self.stopwatch.running(device):
+                self._classify(voxels_d, part_d, part_extents_d, end - first)
+                for source_d, target_d, size in (
+                    (part_d, mask_d, 4 * self.words * nj),
+                    (part_extents_d, extents_d, 4 * nj),
+                ):
+                    copy_buffer(device, source_d, target_d, size * (end - first), size * first)
+            resident.volume.release_slices(first, end)
+            self.progress("mask", end, nk)
+        return VoxelMask(mask_d, extents_d, (ni, nj, nk), self.words, self.pad)
+
+    def _classify(self, voxels_d: Any, mask_d: Any, extents_d: Any, slices: int) -> None:
+        volume = self.resident.volume
+        ni, nj, _ = volume.shape_ijk
+        launch(
+            self.resident.device, prepare_band_mask(self.resident.device, volume.voxels.dtype)["classify_samples"],
+            nj * slices, stopwatch=self.stopwatch, voxels=voxels_d, mask=mask_d, row_extents=extents_d,
+            level=self.bounds[0], highest=self.bounds[1], ni=ni, nj=nj, nk=slices, border=0, first_slice=0,
+            first_sample_slice=0, gk=slices, words=self.words,
+        )  # fmt: skip
+
+
+def mark_voxels(
+    device: Device,
+    ijk: NDArray[np.int32],
+    shape_ijk: tuple[int, int, int],
+    *,
+    pad: int = 0,
+    stopwatch: Stopwatch | None = None,
+) -> VoxelMask:
+    """Mark the voxels of a list.
+
+    Parameters
+    ----------
+    device : Device
+    ijk : ndarray, shape (n, 3), int32
+        Voxels within the volume.
+    shape_ijk : (ni, nj, nk)
+    pad : int
+        Words of zeros behind each row.
+    stopwatch : Stopwatch, optional
+
+    Raises
+    ------
+    UsageError
+        The volume is too large, see `check_shape`.
+    DeviceError
+        The device fails.
+    """
+    check_shape(shape_ijk, pad)
+    ni, nj, nk = shape_ijk
+    words, rows = -(-ni // 32) + pad, nj * nk
+    program = load_program(device, "points/band_mask.cl")
+    mask_d, extents_d = allocate(device, 4 * words * rows), allocate(device, 4 * rows)
+    launch(device, program["clear_words"], words * rows, stopwatch=stopwatch, mask=mask_d, n=words * rows)
+    if len(ijk):
+        ijk_d = upload(device, np.ascontiguousarray(ijk, np.int32))
+        launch(
+            device, program["set_bits"], len(ijk), stopwatch=stopwatch, ijk=ijk_d, mask=mask_d, n=len(ijk), nj=nj,
+            words=words,
+        )  # fmt: skip
+    launch(
+        device, program["find_extents"], rows, stopwatch=stopwatch, mask=mask_d, row_extents=extents_d, rows=rows,
+        words=words,
+    )  # fmt: skip
+    return VoxelMask(mask_d, extents_d, shape_ijk, words, pad)

@@ -1,0 +1,332 @@
+"""`cluster_points`: DBSCAN of clouds, of the voxels of a volume on its lattice, of others as free points."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from clrecon.errors import UsageError
+from clrecon.geometry import Volume
+from clrecon.geometry.affine import checked_affine
+from clrecon.opencl import Device, Stopwatch, check_memory, take_device, work_on
+from clrecon.operators.points.band_mask import checked_band, mark_band, mark_voxels, mask_bytes
+from clrecon.operators.points.voxel_clusters import ClusterSearch, checked_min_samples, pad_for, search_bytes
+from clrecon.operators.resident.device_volume import DeviceVolume, open_volume
+from clrecon.points import PointCloud, PointStep
+from clrecon.points.cluster_figures import measure_clusters
+from clrecon.points.keep import REPORTED
+from clrecon.points.stencil import Lattice, Stencil, checked_eps, make_stencil
+from clrecon.system.progress import Progress
+from clrecon.system.wording import name_parameter
+
+__all__ = ["Clustering", "cluster_points"]
+
+DEFAULT_MIN_SAMPLES = 6
+
+PLANE_PLUS_ONE = "plane+1"
+"""For min_samples: one more than the members of the stencil in a slice, so that a lone slice is noise."""
+
+WIDE_GAP = 1.5
+"""Slice gap in pixels above which ``plane+1`` takes much bone too."""
+
+PLACE_TOLERANCE_MM = 0.01
+"""Largest distance of a point from its voxel: float32 and files round by less."""
+
+
+@dataclass(frozen=True, eq=False)
+class Clustering(PointStep):
+    """The result of `cluster_points`: a `PointStep` that removes nothing.
+
+    Attributes
+    ----------
+    cores : ndarray, shape (n,), bool, or None
+        The core points.
+    """
+
+    cores: NDArray[np.bool_] | None = None
+
+
+def cluster_points(
+    cloud: PointCloud | Volume | DeviceVolume,
+    eps: float | None = None,
+    min_samples: int | str = DEFAULT_MIN_SAMPLES,
+    *,
+    hu: ArrayLike | None = None,
+    volume: Volume | DeviceVolume | None = None,
+    device: Device | str | int | None = None,
+    memory: int | None = None,
+    progress: Progress | None = None,
+) -> Clustering:
+    """Cluster points by density (DBSCAN), equal to scikit-learn label for label for points in the same order.
+
+    Points are core points when at least `min_samples` points lie within `eps`, themselves included.  Core points
+    within `eps` of each other belong to one cluster.  Clusters are numbered by their first core point; other points
+    near core points take the lowest number among these; all others are noise, -1.
+
+    Parameters
+    ----------
+    cloud : PointCloud, Volume or DeviceVolume
+        A cloud of voxel centres (with `ijk`), or a volume whose voxels in the band `hu` are clustered, in the order
+        k, j, i.
+    eps : float, optional
+        mm in the patient, a ball whatever the spacing.  Distances up to ``eps * (1 + 1e-6)`` are within.  By default
+        1.5 times the largest of the steps of the lattice: the pixels and the largest slice gap.
+    min_samples : int or "plane+1"
+        1 to 255; 1 gives connected components.  "plane+1" is one more than the members of the stencil in a slice: a
+        slice without bone above and below becomes noise.
+    hu : (float, float), optional
+        Band in HU, both ends included, for a volume.
+    volume : Volume or DeviceVolume, optional
+        The volume that a cloud comes from, for its lattice.  It is needed where slices are uneven; else the affine of
+        the cloud's report will do.
+    device : Device, str or int, optional
+        See `clrecon.device`; None is the best of the machine.  A `DeviceVolume` has its own.
+    memory : int, optional
+        Bytes that may be taken on the device; None is all that it has.
+    progress : callable, optional
+        Called as ``progress("mask", slices done, all slices)`` where the voxels go to the device slab by slab.
+
+    Returns
+    -------
+    Clustering
+        The cloud with labels, its core points, and in ``facts`` eps, min_samples, the members of the stencil (in its
+        slice and in all, fewest and most over the slices), the number of clusters, noise points and sheets, and the
+        figures of the largest clusters: points, centre, box, principal standard deviations, whether it is a sheet.
+
+    Raises
+    ------
+    UsageError
+        `eps`, `min_samples` or `hu` cannot be used, the points are no voxels of a known lattice, or there are none.
+    DeviceError
+        No device, no room for the masks, or the device fails.
+
+    References
+    ----------
+    Ester, Kriegel, Sander and Xu 1996.
+    """
+    check_memory(memory)
+    if eps is not None:
+        checked_eps(eps)
+    if isinstance(cloud, PointCloud):
+        if hu is not None:
+            raise UsageError(f"{name_parameter('hu')} says which voxels of a volume are points; a cloud has its points")
+        return _cluster_cloud(cloud, eps, min_samples, volume, device, memory)
+    if hu is None or volume is not None:
+        raise UsageError(f"clusters of a volume need {name_parameter('hu', 'LO,HI')} and no other volume")
+    band = checked_band(hu)
+    with open_volume(cloud, device, memory, "a search for clusters") as resident:
+        return resident.attempt(lambda told: _cluster_band(resident, band, eps, min_samples, told, progress))
+
+
+@dataclass(frozen=True)
+class _Request:
+    """What is looked for on one lattice."""
+
+    lattice: Lattice
+    eps: float
+    samples: int
+    stencil: Stencil
+    warnings: tuple[str, ...]
+
+    @classmethod
+    def of(cls, lattice: Lattice, eps: float | None, min_samples: int | str) -> _Request:
+        used = lattice.default_eps if eps is None else checked_eps(eps)
+        if not isinstance(min_samples, str):
+            checked_min_samples(min_samples)
+        stencil, warnings = make_stencil(lattice, used), []
+        if stencil.is_alone:
+            warnings.append(
+                f"eps {used:g} mm is below every step of the voxels (the smallest is {lattice.least_step:.4g} mm): no"
+                " point has a neighbour"
+            )
+        elif used * (1.0 + 1e-6) < lattice.largest_gap:
+            warnings.append(
+                f"eps {used:g} mm is below the largest slice gap of {lattice.largest_gap:.4g} mm: clusters end there,"
+                " and each slice is a sheet"
+            )
+        if min_samples == PLANE_PLUS_ONE:
+            samples = checked_min_samples(stencil.in_plane + 1)
+            if lattice.largest_gap > WIDE_GAP * lattice.pixel:
+                warnings.append(
+                    f"min_samples {PLANE_PLUS_ONE} ({samples}) takes much bone where slices are"
+                    f" {lattice.largest_gap / lattice.pixel:.1f} pixels apart (over {WIDE_GAP:g})"
+                )
+        elif isinstance(min_samples, str):
+            raise UsageError(f"min_samples is {min_samples!r}: a whole number, or {PLANE_PLUS_ONE}, is needed")
+        else:
+            samples = int(min_samples)
+        return cls(lattice, used, samples, stencil, tuple(warnings))
+
+    def describe(self, search: ClusterSearch) -> dict[str, Any]:
+        """Return the facts of parameters and counts."""
+        return {
+            "eps_mm": self.eps,
+            "min_samples": self.samples,
+            "stencil_members_in_plane": self.stencil.in_plane,
+            "stencil_members": list(self.stencil.members),
+            "clusters": search.count,
+            "device_bytes": search.device_bytes,
+        }
+
+    def finish(
+        self, cloud: PointCloud, labels: NDArray[np.int32], cores: NDArray[np.bool_], search: ClusterSearch,
+        stopwatch: Stopwatch, device: Device, told: list[str],
+    ) -> Clustering:  # fmt: skip
+        """Put the result together."""
+        labelled = cloud.changed(labels=labels)
+        figures = measure_clusters(labelled)
+        warnings = [*told, *self.warnings]
+        if self.samples > len(cloud):
+            warnings.append(f"{len(cloud):,} points are fewer than min_samples {self.samples}: all are noise")
+        facts = {
+            **self.describe(search),
+            "core_points": int(cores.sum()),
+            "noise_points": int((labels < 0).sum()),
+            "sheets": int(figures.sheets.sum()),
+            "largest_clusters": figures.as_dicts(REPORTED),
+            "device": device.label,
+            "kernel_seconds": dict(stopwatch.by_kernel),
+        }
+        removed = np.zeros(len(cloud), dtype=np.uint8)
+        return Clustering(labelled, removed, (), facts, tuple(warnings), cores)
+
+
+def _cluster_band(
+    resident: DeviceVolume,
+    band: tuple[float, float],
+    eps: float | None,
+    min_samples: int | str,
+    told: list[str],
+    progress: Progress | None,
+) -> Clustering:
+    volume, device, stopwatch = resident.volume, resident.device, Stopwatch()
+    request = _Request.of(Lattice.of(volume), eps, min_samples)
+    pad = pad_for(request.stencil)
+    masks = mask_bytes(volume.shape_ijk, pad)
+    own = search_bytes(masks, request.stencil, volume.shape_ijk[1] * volume.shape_ijk[2])
+    beside = {what: size for what, size in own.items() if what not in masks}
+    mask = mark_band(resident, band, pad=pad, beside=beside, stopwatch=stopwatch, progress=progress)
+    with stopwatch.running(device):
+        search = ClusterSearch(
+            device, mask, request.stencil, request.samples, memory=resident.memory, stopwatch=stopwatch
+        )
+        labels, cores = search.label(), search.flag_cores()
+    if not len(labels):
+        raise UsageError(f"no voxel lies from {band[0]:g} to {band[1]:g} HU: there is nothing to cluster")
+    return request.finish(_band_cloud(volume, band), labels, cores, search, stopwatch, device, told)
+
+
+def _band_cloud(volume: Volume, band: tuple[float, float]) -> PointCloud:
+    """Return the centres of the voxels in a band, in the order k, j, i."""
+    voxels = volume.voxels
+    kji = np.argwhere((voxels >= band[0]) & (voxels <= band[1]))
+    ijk = kji[:, ::-1]
+    report = {"affine_ijk_to_lps_mm": volume.affine.tolist(), "certificate": volume.report}
+    return PointCloud(volume.ijk_to_lps(ijk), hu=voxels[tuple(kji.T)], ijk=ijk, report=report)
+
+
+def _cluster_cloud(
+    cloud: PointCloud,
+    eps: float | None,
+    min_samples: int | str,
+    volume: Volume | DeviceVolume | None,
+    device: Device | str | int | None,
+    memory: int | None,
+) -> Clustering:
+    if not len(cloud):
+        raise UsageError("the cloud is empty: there is nothing to cluster")
+    if cloud.ijk is None:
+        raise UsageError("the points are no voxels (they have no ijk): clusters of free points are not supported yet")
+    order, ijk = _order_voxels(cloud.ijk)
+    lattice, first = _find_lattice(cloud, volume)
+    request = _Request.of(lattice, eps, min_samples)
+    taken = take_device(device) if not isinstance(volume, DeviceVolume) else volume.device
+
+    def work(current: Device, told: list[str]) -> Clustering:
+        stopwatch = Stopwatch()
+        with stopwatch.running(current):
+            mask = mark_voxels(
+                current, ijk - first, lattice.shape_ijk, pad=pad_for(request.stencil), stopwatch=stopwatch
+            )
+            search = ClusterSearch(current, mask, request.stencil, request.samples, memory=memory, stopwatch=stopwatch)
+            labels, cores = search.label(), search.flag_cores()
+            if order is not None:
+                labels, cores = _restore_order(search, labels, cores, order)
+        return request.finish(cloud, labels, cores, search, stopwatch, current, told)
+
+    return work_on(taken, work)
+
+
+def _order_voxels(ijk: NDArray[np.int32]) -> tuple[NDArray[np.int64] | None, NDArray[np.int32]]:
+    """Return the order k, j, i of voxels, None if they have it already, and the voxels in that order.
+
+    Raises
+    ------
+    UsageError
+        A voxel is there twice.
+    """
+    size = ijk.max(axis=0).astype(np.int64) - ijk.min(axis=0) + 1
+    own = (ijk - ijk.min(axis=0)).astype(np.int64)
+    places = (own[:, 2] * size[1] + own[:, 1]) * size[0] + own[:, 0]
+    order = None
+    if not (np.diff(places) > 0).all():
+        order = np.argsort(places, kind="stable")
+        ijk, places = ijk[order], places[order]
+    twice = int((np.diff(places) == 0).sum())
+    if twice:
+        raise UsageError(f"{twice:,} of {len(ijk):,} points have the voxel of another point: a voxel is one point")
+    return order, ijk
+
+
+def _restore_order(
+    search: ClusterSearch, labels: NDArray[np.int32], cores: NDArray[np.bool_], order: NDArray[np.int64]
+) -> tuple[NDArray[np.int32], NDArray[np.bool_]]:
+    """Return labels and core points in the order of the cloud, numbered by the first core point in that order."""
+    place = np.empty_like(order)
+    place[order] = np.arange(len(order))
+    mine, mine_cores = labels[place], cores[place]
+    clusters, firsts = np.unique(mine[mine_cores], return_index=True)
+    number = np.zeros(max(search.count, 1), np.int32)
+    number[clusters[np.argsort(firsts)]] = np.arange(len(clusters), dtype=np.int32)
+    if len(clusters):
+        mine = search.label(number[search.run_numbers()])[place]
+    return mine, mine_cores
+
+
+def _find_lattice(cloud: PointCloud, volume: Volume | DeviceVolume | None) -> tuple[Lattice, NDArray[np.int32]]:
+    """Return the lattice of a cloud's voxels, and the voxel that it begins with.
+
+    Raises
+    ------
+    UsageError
+        It is not known, or the points are not at their voxels.
+    """
+    assert cloud.ijk is not None
+    low, high = cloud.ijk.min(axis=0), cloud.ijk.max(axis=0)
+    if volume is not None:
+        own = volume.volume if isinstance(volume, DeviceVolume) else volume
+        if (low < 0).any() or (high >= own.shape_ijk).any():
+            raise UsageError(
+                f"the cloud's voxels run from {low.tolist()} to {high.tolist()}, the volume has {own.shape_ijk} voxels:"
+                " it is another volume"
+            )
+        places = own.ijk_to_lps(cloud.ijk)
+        lattice, first = Lattice.of(own), np.zeros(3, np.int32)
+    else:
+        affine = cloud.report.get("affine_ijk_to_lps_mm")
+        if affine is None:
+            raise UsageError("the cloud does not say where its voxels lie: give the volume that it comes from")
+        matrix = checked_affine(affine)
+        places = cloud.ijk @ matrix[:3, :3].T + matrix[:3, 3]
+        ni, nj, nk = (high - low + 1).tolist()
+        lattice, first = Lattice((ni, nj, nk), matrix), low
+    away = float(np.abs(places - cloud.points).max())
+    if away > PLACE_TOLERANCE_MM:
+        raise UsageError(
+            f"points lie up to {away:.3g} mm from their voxels"
+            + (": it is another volume" if volume is not None else ", as in uneven stacks: give the volume")
+        )
+    return lattice, first

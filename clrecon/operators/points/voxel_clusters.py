@@ -1,0 +1,299 @@
+"""DBSCAN of the set voxels of a mask on a device: the host side of cl/points/voxel_clusters.cl."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clrecon.errors import DeviceMemoryError, UsageError
+from clrecon.opencl import (
+    Device,
+    Program,
+    Stopwatch,
+    allocate,
+    describe_shortage,
+    download,
+    empty_output,
+    launch,
+    load_program,
+    memory_limits,
+    upload,
+)
+from clrecon.operators.points.band_mask import VoxelMask
+from clrecon.operators.primitives.scan import exclusive_scan, prepare_scan
+from clrecon.operators.primitives.union_find import join_parts, prepare_components
+from clrecon.points.stencil import Stencil
+
+__all__ = [
+    "MOST_SAMPLES",
+    "ClusterSearch",
+    "checked_min_samples",
+    "pad_for",
+    "prepare_voxel_clusters",
+    "search_bytes",
+]
+
+MOST_SAMPLES = 255
+"""Largest min_samples: counters have 8 bits."""
+
+PARTS_PER_CORE = 4
+"""Parts of the rows for each core of a CPU device, so that all cores are busy to the end."""
+
+LARGEST_WORK = 1e11
+"""Most visits of a row of the stencil at a row of the volume: some minutes."""
+
+
+def checked_min_samples(min_samples: int) -> int:
+    """Return `min_samples`.
+
+    Raises
+    ------
+    UsageError
+        It is not a whole number from 1 to 255.
+    """
+    whole = isinstance(min_samples, (int, np.integer)) and not isinstance(min_samples, bool)
+    if not whole or not 1 <= min_samples <= MOST_SAMPLES:
+        raise UsageError(
+            f"min_samples is {min_samples!r}: a core point has from 1 to {MOST_SAMPLES} points within"
+            " eps, itself included"
+        )
+    return int(min_samples)
+
+
+def pad_for(stencil: Stencil) -> int:
+    """Return the words of zeros that a mask needs behind each row for this stencil."""
+    return -(-stencil.reach // 32)
+
+
+def search_bytes(mask_bytes: dict[str, int], stencil: Stencil, rows: int) -> dict[str, int]:
+    """Return the bytes of what a search needs before it knows the number of points and runs, by description."""
+    mask, extents = mask_bytes.values()
+    return {
+        **mask_bytes,
+        "mask of core voxels": mask,
+        "counts of rows": 3 * extents,
+        "stencil": 2 * stencil.rows.nbytes + 2 * stencil.tables.nbytes,
+    }
+
+
+def prepare_voxel_clusters(device: Device) -> Program:
+    """Build the kernels of `ClusterSearch`.
+
+    Raises
+    ------
+    DeviceError
+        The driver's compiler refuses.
+    """
+    prepare_scan(device)
+    prepare_components(device)
+    return load_program(device, "points/voxel_clusters.cl", {"LANES": device.kernel_variants["LANES"]})
+
+
+@dataclass(frozen=True)
+class _Table:
+    rows_d: Any
+    tables_d: Any
+
+    @classmethod
+    def of(cls, device: Device, stencil: Stencil) -> _Table:
+        rows = stencil.rows if len(stencil.rows) else np.zeros((1, 4), np.int32)  # OpenCL has no empty buffers
+        return cls(upload(device, rows), upload(device, stencil.tables))
+
+    @property
+    def arguments(self) -> dict[str, Any]:
+        return {"stencil": self.rows_d, "tables": self.tables_d}
+
+
+class ClusterSearch:
+    """The clusters of the set voxels of a mask.
+
+    Parameters
+    ----------
+    device : Device
+    mask : VoxelMask
+        With `pad_for` words of zeros behind its rows.
+    stencil : Stencil
+        Of the same volume.
+    min_samples : int
+    memory : int, optional
+        Bytes that may be taken on the device; None is all of its memory.
+    stopwatch : Stopwatch, optional
+
+    Attributes
+    ----------
+    points, runs, count : int
+        Number of set voxels, of runs of core voxels along i, and of clusters.
+    numbers_d : buffer, (runs,) int32
+        Cluster of each run, numbered by their first core voxel in the order k, j, i.
+    device_bytes : int
+        Most bytes on the device at a time.
+
+    Raises
+    ------
+    UsageError
+        `min_samples` is out of range, or the stencil is so large that the work would take hours.
+    DeviceMemoryError
+        The device has no room.
+    DeviceError
+        The device fails or computes wrongly.
+    """
+
+    def __init__(
+        self,
+        device: Device,
+        mask: VoxelMask,
+        stencil: Stencil,
+        min_samples: int,
+        *,
+        memory: int | None = None,
+        stopwatch: Stopwatch | None = None,
+    ):
+        self._device, self._mask, self._stopwatch = device, mask, stopwatch
+        self._limits = memory_limits(device, memory)
+        self._samples = checked_min_samples(min_samples)
+        self._stencil = stencil
+        self._check_work(stencil)
+        self._needs = search_bytes(mask.needs(), stencil, mask.rows)
+        self.device_bytes = 0
+        self._check_budget({})
+        self._program = prepare_voxel_clusters(device)
+        self._full, self._forward = _Table.of(device, stencil), _Table.of(device, stencil.forward())
+        self._cores_d = mask.mask_d if self._samples == 1 else self._find_cores()
+        self._count()
+        self.count, self.numbers_d = self._join() if self.runs else (0, allocate(device, 4))
+
+    @property
+    def _is_cpu(self) -> bool:
+        """True where a work-item is to do as much as a core can, not as little as a lane."""
+        return self._device.kernel_variants["LANES"] != "1"
+
+    @property
+    def _rows(self) -> dict[str, int]:
+        return {"rows": self._mask.rows, "words": self._mask.words}
+
+    @property
+    def _run_rows(self) -> dict[str, int]:
+        return {**self._rows, "lone": int(not self._stencil.joins_columns)}
+
+    @property
+    def _slices(self) -> dict[str, int]:
+        return {"nj": self._mask.shape_ijk[1], "nk": self._mask.shape_ijk[2]}
+
+    def _check_work(self, stencil: Stencil) -> None:
+        nj = self._mask.shape_ijk[1]
+        work = float((stencil.tables[:, 1] - stencil.tables[:, 0]).sum(dtype=np.int64)) * nj
+        if work > LARGEST_WORK:
+            raise UsageError(
+                f"each voxel has up to {stencil.members[1]:,} voxels within eps, which makes {work:.1e} visits of rows"
+                f" of the volume, {LARGEST_WORK:.0e} are allowed: choose a smaller eps"
+            )
+
+    def _check_budget(self, more: dict[str, int]) -> None:
+        needs = {**self._needs, **more}
+        shortage = describe_shortage(self._limits, needs)
+        if shortage:
+            raise DeviceMemoryError(f"the clusters of the voxels cannot be found: {shortage}")
+        self.device_bytes = max(self.device_bytes, sum(needs.values()))
+
+    def _run(self, kernel: str, items: int, **arguments: Any) -> None:
+        launch(self._device, self._program[kernel], items, stopwatch=self._stopwatch, **arguments)
+
+    def _find_cores(self) -> Any:
+        mask = self._mask
+        item_words = mask.words if self._is_cpu else 1
+        planes = (self._samples - 1).bit_length()
+        cores_d = allocate(self._device, 4 * mask.words * mask.rows)
+        self._run(
+            "find_cores", mask.rows * -(-mask.words // item_words), mask=mask.mask_d, row_extents=mask.row_extents_d,
+            cores=cores_d, words=mask.words, item_words=item_words, planes=planes,
+            start=2**planes - self._samples, **self._full.arguments, **self._slices,
+        )  # fmt: skip
+        return cores_d
+
+    def _count(self) -> None:
+        """Count runs and points, row by row."""
+        rows = self._mask.rows
+        counts_d = self._row_counts_d = allocate(self._device, 8 * (rows + 1))
+        self._run(
+            "count_core_runs", rows + 1, mask=self._mask.mask_d, cores=self._cores_d,
+            row_extents=self._mask.row_extents_d, row_counts=counts_d, **self._run_rows,
+        )  # fmt: skip
+        # One scan of both: the second half begins with the number of all runs.
+        both = exclusive_scan(self._device, counts_d, 2 * (rows + 1), in_place=True, stopwatch=self._stopwatch).total
+        self.runs = int(download(self._device, np.empty(1, np.uint32), counts_d, 4 * rows)[0])
+        self.points = both - self.runs
+        if both >= 2**32:
+            raise DeviceMemoryError(f"{self.points:,} voxels are set: clusters are found among up to 2^31")
+        self._needs |= {"runs of core voxels": 16 * self.runs, "labels": 4 * self.points}
+        self._check_budget({})
+
+    def _join(self) -> tuple[int, Any]:
+        device, rows, runs = self._device, self._mask.rows, self.runs
+        self._runs_d = allocate(device, 4 * runs)
+        self._run(
+            "list_core_runs", rows, cores=self._cores_d, row_extents=self._mask.row_extents_d,
+            row_counts=self._row_counts_d, runs=self._runs_d, **self._run_rows,
+        )  # fmt: skip
+        # A CPU's cores take groups; a part is a group's work.  Elsewhere each item has a row of its own.
+        part_rows = -(-rows // (PARTS_PER_CORE * device.compute_units)) if self._is_cpu else 1
+        spread = device.group_size if self._is_cpu else 1
+        labels_d, roots_d = allocate(device, 4 * runs), allocate(device, 4 * runs)
+        given = {"runs": self._runs_d, "row_counts": self._row_counts_d, **self._forward.arguments, **self._slices}
+        self._run(
+            "join_runs", -(-rows // part_rows) * spread, labels=labels_d, roots=roots_d, part_rows=part_rows,
+            spread=spread, **given,
+        )  # fmt: skip
+        row_links_d = allocate(device, 4 * rows)
+        given |= {"labels": labels_d, "row_links": row_links_d, "part_rows": part_rows}
+        self._run("count_links", rows, **given)
+        links = exclusive_scan(device, row_links_d, rows, in_place=True, stopwatch=self._stopwatch).total
+        if links >= 2**32:
+            raise DeviceMemoryError(f"{links:,} pairs of runs are neighbours: choose a smaller eps")
+        self._check_budget({"pairs of runs": 12 * links, "roots": 5 * runs})
+        links_d = allocate(device, 12 * links)
+        if links:
+            self._run("list_links", rows, links=links_d, **given)
+        return join_parts(device, labels_d, roots_d, runs, links_d, links, stopwatch=self._stopwatch)
+
+    def label(self, numbers: NDArray[np.int32] | None = None) -> NDArray[np.int32]:
+        """Return the cluster of each point in the order k, j, i, -1 for noise.
+
+        Parameters
+        ----------
+        numbers : ndarray, shape (runs,), int32, optional
+            Other numbers of the runs' clusters; border points take the lowest of these.
+
+        Returns
+        -------
+        ndarray, shape (points,), int32
+        """
+        labels, labels_d = empty_output(self._device, (self.points,), np.int32)
+        if not self.runs:
+            labels.fill(-1)
+            return labels
+        numbers_d = self.numbers_d if numbers is None else upload(self._device, numbers)
+        self._run(
+            "label_points", self._mask.rows, mask=self._mask.mask_d, cores=self._cores_d,
+            row_extents=self._mask.row_extents_d, runs=self._runs_d, row_counts=self._row_counts_d,
+            numbers=numbers_d, labels=labels_d, words=self._mask.words,
+            **self._full.arguments, **self._slices,
+        )  # fmt: skip
+        return download(self._device, labels, labels_d)
+
+    def run_numbers(self) -> NDArray[np.int32]:
+        """Return the cluster of each run, shape (runs,), int32."""
+        return download(self._device, np.empty(self.runs, np.int32), self.numbers_d)
+
+    def flag_cores(self) -> NDArray[np.bool_]:
+        """Return whether each point is a core point, in the order k, j, i, shape (points,), bool."""
+        flags, flags_d = empty_output(self._device, (self.points,), np.uint8)
+        if self.points:
+            self._run(
+                "flag_cores", self._mask.rows, mask=self._mask.mask_d, cores=self._cores_d,
+                row_extents=self._mask.row_extents_d, row_counts=self._row_counts_d, flags=flags_d, **self._rows,
+            )  # fmt: skip
+            download(self._device, flags, flags_d)
+        return flags.view(np.bool_)

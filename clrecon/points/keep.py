@@ -1,0 +1,170 @@
+"""Which clusters of a cloud are kept."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from clrecon.errors import NoSurfaceError, UsageError
+from clrecon.points.cloud import PointCloud
+from clrecon.points.cluster_figures import SHEET_POINTS, SHEET_RATIO, ClusterFigures, measure_clusters
+from clrecon.points.step import PointStep
+
+__all__ = ["KEEP_FORMS", "KeepRule", "keep_clusters", "parse_keep_rules"]
+
+KEEP_FORMS = "largest, largest:N, min:POINTS, seed:X,Y,Z and no-sheets"
+"""The forms of a keep rule, for messages and help."""
+
+REPORTED = 20
+"""Clusters of a report, the largest ones."""
+
+REASONS = ("noise", "sheet", "small cluster", "other cluster")
+
+
+@dataclass(frozen=True)
+class KeepRule:
+    """One rule: `kind` is "largest", "min", "seed" or "no-sheets"; `numbers` are those behind the colon."""
+
+    kind: str
+    numbers: tuple[float, ...] = ()
+
+
+def parse_keep_rules(rules: str | Sequence[str]) -> tuple[KeepRule, ...]:
+    """Read keep rules: ``largest``, ``largest:N``, ``min:POINTS``, ``seed:X,Y,Z`` in LPS mm, ``no-sheets``.
+
+    Raises
+    ------
+    UsageError
+        A rule has another form.
+    """
+    return tuple(_parse(rule) for rule in ([rules] if isinstance(rules, str) else rules))
+
+
+def _parse(rule: str) -> KeepRule:
+    kind, _, rest = str(rule).strip().lower().partition(":")
+    try:
+        numbers = tuple(float(word) for word in rest.split(",")) if rest else ()
+    except ValueError:
+        numbers = (math.nan,)
+    whole = len(numbers) == 1 and numbers[0] >= 1 and numbers[0] == math.floor(numbers[0])
+    if kind == "largest" and ":" not in str(rule):
+        return KeepRule(kind, (1.0,))
+    if kind in ("largest", "min") and whole and math.isfinite(numbers[0]):
+        return KeepRule(kind, numbers)
+    if kind == "seed" and len(numbers) == 3 and all(map(math.isfinite, numbers)):
+        return KeepRule(kind, numbers)
+    if kind == "no-sheets" and ":" not in str(rule):
+        return KeepRule(kind)
+    raise UsageError(f"the keep rule {str(rule)!r} is not known: the rules are {KEEP_FORMS}, N and POINTS from 1 on")
+
+
+def keep_clusters(cloud: PointCloud, rules: str | Sequence[str] = (), *, cores: ArrayLike | None = None) -> PointStep:
+    """Keep some clusters of a cloud; noise goes, and without a rule nothing else does.
+
+    Sheets go first, then small clusters; the largest are counted among what is left.  A seed keeps its cluster alone,
+    several seeds theirs, and may not be used with `largest`.
+
+    Parameters
+    ----------
+    cloud : PointCloud
+        With labels, see `cluster_points`.
+    rules : str or sequence of str
+        ``largest``: the cluster of most points, ties by number; ``largest:N``: the N largest.  ``min:POINTS``: clusters
+        of at least so many points.  ``seed:X,Y,Z``: the cluster of the core point nearest to a place in LPS mm.
+        ``no-sheets``: no cluster of 500 points or more whose second principal standard deviation is over 15 times its
+        first: table tops, image planes.
+    cores : array_like, shape (n,), bool, optional
+        Core points, see `Clustering.cores`; without them a seed takes the nearest point of any cluster.
+
+    Returns
+    -------
+    PointStep
+        Reasons "noise", "sheet", "small cluster", "other cluster".  ``facts`` has the figures of the largest clusters,
+        those of all sheets, and how far the seeds are from their points.
+
+    Raises
+    ------
+    UsageError
+        The cloud has no labels, a rule has another form, or `cores` do not fit.
+    NoSurfaceError
+        No cluster is left.
+    """
+    wanted = parse_keep_rules(rules)
+    figures = measure_clusters(cloud)
+    labels = np.asarray(cloud.labels)
+    fate, facts = _judge(cloud, figures, wanted, cores)
+    removed = np.where(labels < 0, 1, fate[labels] if len(fate) else 1).astype(np.uint8)
+    kept = removed == 0
+    if not kept.any():
+        raise NoSurfaceError(_describe_nothing(labels, figures, fate))
+    facts = {
+        "keep": [_write(rule) for rule in wanted],
+        "clusters_before": len(figures.points),
+        "clusters_after": int((fate == 0).sum()),
+        "sheets": int(figures.sheets.sum()),
+        "clusters": figures.as_dicts(REPORTED),
+        **facts,
+    }
+    return PointStep(cloud.select(kept), removed, REASONS, facts)
+
+
+def _write(rule: KeepRule) -> str:
+    return rule.kind + (":" + ",".join(f"{number:g}" for number in rule.numbers) if rule.numbers else "")
+
+
+def _judge(
+    cloud: PointCloud, figures: ClusterFigures, rules: tuple[KeepRule, ...], cores: ArrayLike | None
+) -> tuple[NDArray[np.uint8], dict[str, object]]:
+    """Return for each cluster 0 or the number of the reason why it goes, and the facts about seeds."""
+    fate = np.zeros(len(figures.points), dtype=np.uint8)
+    kinds = [rule.kind for rule in rules]
+    if "seed" in kinds and "largest" in kinds:
+        raise UsageError("seeds say which clusters stay: the largest cannot be asked for too")
+    if "no-sheets" in kinds:
+        fate[figures.sheets] = 2
+    for rule in rules:
+        if rule.kind == "min":
+            fate[(fate == 0) & (figures.points < rule.numbers[0])] = 3
+    for rule in rules:
+        if rule.kind == "largest":
+            order = figures.order()
+            fate[order[fate[order] == 0][int(rule.numbers[0]) :]] = 4
+    seeds = [rule.numbers for rule in rules if rule.kind == "seed"]
+    if not seeds:
+        return fate, {}
+    found = [_find_cluster(cloud, seed, cores) for seed in seeds]
+    others = np.ones(len(fate), dtype=bool)
+    others[[cluster for cluster, _ in found]] = False
+    fate[others & (fate == 0)] = 4
+    return fate, {"seed_distances_mm": [round(distance, 3) for _, distance in found]}
+
+
+def _find_cluster(cloud: PointCloud, seed: tuple[float, ...], cores: ArrayLike | None) -> tuple[int, float]:
+    """Return the cluster of the point nearest to a seed, and their distance."""
+    labels = np.asarray(cloud.labels)
+    allowed = labels >= 0
+    if cores is not None:
+        given = np.asarray(cores)
+        if given.shape != labels.shape or given.dtype != bool:
+            raise UsageError(
+                f"cores are a truth value for each of {len(labels):,} points, not {given.shape} {given.dtype}"
+            )
+        allowed &= given
+    if not allowed.any():
+        raise NoSurfaceError("no point lies in a cluster: all are noise")
+    away = ((cloud.points - np.asarray(seed)) ** 2).sum(axis=1)
+    nearest = int(np.where(allowed, away, np.inf).argmin())
+    return int(labels[nearest]), float(np.sqrt(away[nearest]))
+
+
+def _describe_nothing(labels: NDArray[np.int32], figures: ClusterFigures, fate: NDArray[np.uint8]) -> str:
+    largest = int(figures.points.max(initial=0))
+    return (
+        f"no cluster is left of {len(figures.points):,}: {int((labels < 0).sum()):,} of {len(labels):,} points are"
+        f" noise, {int((fate == 2).sum()):,} clusters are sheets, {int((fate == 3).sum()):,} are too small, the largest"
+        f" has {largest:,} points; sheets have at least {SHEET_POINTS} points and a ratio over {SHEET_RATIO:g}"
+    )
