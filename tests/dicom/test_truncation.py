@@ -10,7 +10,8 @@ from clrecon.dicom import list_series, read_volume
 from clrecon.errors import ClreconError, RefusedInputError
 
 PIXEL_STRIDE = 7
-SERIES_STRIDE = 3
+SERIES_STRIDE = 11
+"""Odd, so that cuts meet every byte of the heads of elements; a listing of the one file is cut at every byte."""
 SEEDS = phantom_seeds()
 
 
@@ -23,7 +24,7 @@ def lengths(seed: Seed) -> list[int]:
 
 @pytest.mark.fuzz
 @pytest.mark.parametrize("name", SEEDS)
-def test_a_slice_cut_at_every_byte(tmp_path, name, capfd):
+def test_a_slice_cut_anywhere(tmp_path, name, capfd):
     seed = SEEDS[name]
     folder = tmp_path / "ct"
     folder.mkdir()

@@ -35,13 +35,13 @@ def scan(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def moments(work: Callable[[Progress], object]) -> Calls:
-    """The calls of progress of a whole run: of each stage the first, one in the middle, and the last."""
+    """The calls of progress of a whole run: of each stage the last, and of those with parts one in the middle."""
     calls: Calls = []
     work(lambda *call: calls.append(call))
-    chosen = []
+    chosen = [calls[0]]
     for stage in dict.fromkeys(call[0] for call in calls):
         own = [call for call in calls if call[0] == stage]
-        chosen += [own[0], own[len(own) // 2], own[-1]]
+        chosen += [own[len(own) // 2], own[-1]]
     return list(dict.fromkeys(chosen))
 
 
@@ -210,6 +210,8 @@ def test_a_turntable(name: str, scan: Path, device: Any, tmp_path: Path, monkeyp
 
     found = moments(work)
     assert {stage for stage, _, _ in found} == {"device", "scan", "read", "render", "frames"}
+    if name != "a.apng":  # before the frames, all kinds of movies are one job
+        found = [moment for moment in found if moment[0] in ("render", "frames")]
     for path in tmp_path.iterdir():  # the first run has shown that all of them are written
         if path.is_file():
             path.write_bytes(b"old")

@@ -51,7 +51,7 @@ def test_whatever_buffer_or_launch_fails_the_result_is_the_same(device, volume, 
         expected = WORK[work](resident, labels)
     count = counted.counts[kind]
     assert count > 0
-    for fails in range(1, count + 1, max(1, count // 12)):
+    for fails in range(1, count + 1, max(1, count // 6)):
         with monkeypatch.context() as patch, DeviceVolume(volume, device=device) as resident:
             failing = Failing(patch, kind, fails)
             found = WORK[work](resident, labels)

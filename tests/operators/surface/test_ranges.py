@@ -7,7 +7,6 @@ import pytest
 import tolerances
 from slab_surfaces import assert_same, extract_in_slabs
 from surface_volumes import MIRRORED, OBLIQUE, SHAPES, assert_sound, random_volume, smooth_volume
-from variants import VOXEL_TYPES
 
 from clrecon.errors import DeviceError, NoSurfaceError, UsageError
 from clrecon.geometry import Volume
@@ -40,9 +39,12 @@ def ball(radius: float, size: int = 33) -> Volume:
     return Volume((radius - np.sqrt(i * i + j * j + k * k)).astype(np.float32), affine)
 
 
-@pytest.mark.parametrize("dtype", VOXEL_TYPES)
-@pytest.mark.parametrize("affine", [OBLIQUE, MIRRORED], ids=["right-handed", "left-handed"])
-def test_device_equals_twin_for_every_voxel_type(device, dtype, affine):
+@pytest.mark.parametrize(
+    ("dtype", "affine"),
+    [("int16", OBLIQUE), ("int16", MIRRORED), ("float32", MIRRORED), ("uint8", OBLIQUE), ("int32", MIRRORED)],
+)
+def test_device_equals_twin_for_voxel_types(device, dtype, affine):
+    """Of whole numbers one of each kind: with a sign, without one, and beyond what float32 holds."""
     volume = random_volume((5, 6, 37), dtype, high=100, affine=affine)
     for level, options in CASES:
         assert_equals_twin(volume, level, device, **options)

@@ -110,10 +110,10 @@ def test_random_cells_have_the_topology_of_their_trilinear_field():
 
 
 @pytest.mark.slow
-def test_thousands_of_random_cells_have_the_topology_of_their_trilinear_field():
-    found = compare_cells(2, 2000)
+def test_a_thousand_random_cells_have_the_topology_of_their_trilinear_field():
+    found = compare_cells(2, 1000)
     assert found["wrong"] == 0
-    assert found["right"] >= 1950 and found["tunnels"] >= 600
+    assert found["right"] >= 975 and found["tunnels"] >= 300
 
 
 @pytest.mark.parametrize(("dtype", "low", "high"), [("int16", -32768, 32767), ("uint16", 0, 65535)])

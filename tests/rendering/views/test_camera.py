@@ -100,11 +100,11 @@ def in_picture(camera: Camera, volume: Volume, size) -> np.ndarray:
 def test_the_whole_volume_is_in_the_picture_of_any_view(make, perspective, size):
     volume = make()
     rng = np.random.default_rng(3)
-    for view in [*DIRECTIONS, *zip(rng.uniform(-180, 180, 20), rng.uniform(-90, 90, 20), strict=True)]:
+    for view in [*DIRECTIONS, *zip(rng.uniform(-180, 180, 5), rng.uniform(-90, 90, 5), strict=True)]:
         camera = Camera.fit(volume, view, view_angle=perspective, size=size)
         assert in_picture(camera, volume, size).all()
         turning = Camera.fit(volume, view, view_angle=perspective, size=size, turning=True)
-        for turn in (0.0, 47.0, 77.0, 133.0, 271.0):
+        for turn in (0.0, 47.0, 133.0, 271.0):
             assert in_picture(turning.orbit(turn), volume, size).all()
 
 
