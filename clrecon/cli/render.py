@@ -20,6 +20,7 @@ from clrecon.cli.render_options import (
     render_settings,
 )
 from clrecon.jobs.render.settings import describe_modes, describe_presets
+from clrecon.jobs.shared.clouds import CLOUD_INPUTS, is_cloud_file
 
 __all__ = ["add_arguments", "run"]
 
@@ -32,7 +33,8 @@ examples:
   clrecon render CT_FOLDER -o skull.png --iso 300 --light 1,-1,1 --shadows --background white
   clrecon render CT_FOLDER -o slice.png --mode slice --view axial,coronal,sagittal --window -450,1050
   clrecon render CT_FOLDER -o spine.png --curve auto
-  clrecon render CT_FOLDER --turntable bone.mp4"""
+  clrecon render CT_FOLDER --turntable bone.mp4
+  clrecon render cloud.ply -o cloud.png --color label --point-radius 0.5"""
 
 
 def _epilog() -> str:
@@ -59,7 +61,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "input",
         metavar="INPUT",
-        help="DICOM folder (subfolders and any file names are fine) or file; or a NIfTI, NRRD or MetaImage file",
+        help="DICOM folder (subfolders and any file names are fine) or file; a NIfTI, NRRD or MetaImage file; or a"
+        f" cloud of points ({', '.join(CLOUD_INPUTS)})",
     )
     parser.add_argument(
         "-o", "--output", metavar="OUT", help="picture: .png, .jpg or .tif; may be left out with --turntable"
@@ -86,6 +89,8 @@ def run(options: argparse.Namespace, console: Console) -> int:
     from clrecon.jobs.render.job import make_pictures
 
     files = PictureFiles(options.output, options.depth, options.values, options.turntable, options.report)
+    if options.mode is None and is_cloud_file(options.input):
+        options.mode = "points"
     report = make_pictures(
         options.input, files, render_settings(options), no_clobber=options.no_clobber, progress=console.progress
     )
@@ -102,12 +107,35 @@ def run(options: argparse.Namespace, console: Console) -> int:
 def describe_report(report: dict[str, Any]) -> list[str]:
     """Describe a report for people: the input, the pictures, the device, the time."""
     return [
-        f"input    {describe_volume(report['volume'])}",
+        f"input    {_describe_input(report)}",
         f"picture  {_describe_look(report)}",
         *(f"         {line}" for line in map(_describe_picture, report["pictures"])),
+        *(f"         {line}" for line in _describe_legend(report["pictures"])),
         f"device   {printable(report['device'])}",
         f"time     {_describe_times(report['seconds'])}",
     ]
+
+
+def _describe_input(report: dict[str, Any]) -> str:
+    cloud = report["cloud"]
+    if cloud is None:
+        return describe_volume(report["volume"])
+    known = [name for name in ("normals", "hu", "labels") if cloud[name]]
+    return f"{cloud['points']:,} points" + (f" with {', '.join(known)}" if known else "")
+
+
+def _describe_legend(pictures: list[dict[str, Any]]) -> list[str]:
+    """Name the colours of the points in a line each; those of the first picture are those of all."""
+    points = pictures[0]["points"] if pictures else None
+    if points is None or points["color_by"] not in ("label", "removed"):
+        return []
+    lines = []
+    for entry in points["legend"]:
+        name = printable(entry["name"]) if entry["name"] else f"{points['color_by']} {entry['label']}"
+        lines.append(f"{entry['color']} {name}: {entry['points']:,} points")
+    if points["legend_left_out"]:
+        lines.append(f"and {points['legend_left_out']:,} more")
+    return lines
 
 
 def _describe_look(report: dict[str, Any]) -> str:

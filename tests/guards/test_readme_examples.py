@@ -28,13 +28,14 @@ SMALLER = {
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory) -> Path:
-    """A series, and a label map with the name that the example asks for."""
+    """A series, and a label map and a cloud with the names that the example asks for."""
     folder = tmp_path_factory.mktemp("examples")
     make_phantom(folder / "ct", kind="spine", size=(64, 64), slices=48, spacing=(3.0, 3.0, 3.0))
     volume = clrecon.read_volume(folder / "ct")
     bone = (volume.voxels >= 226).astype(np.uint8)
     header = {"Segment0_LabelValue": "1", "Segment0_Layer": "0", "Segment0_Name": "T12", "Segment0_ID": "a"}
     write_nrrd(folder / "segmentation.seg.nrrd", bone, volume.affine, **header)
+    clrecon.PointCloud(np.random.default_rng(1).normal(size=(500, 3))).save(folder / "scan.ply", "ras")
     return folder
 
 

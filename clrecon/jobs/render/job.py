@@ -19,6 +19,7 @@ from clrecon.jobs.render.report import (
 )
 from clrecon.jobs.render.settings import RenderSettings
 from clrecon.jobs.render.studio import Studio, read_curve, read_function, read_look
+from clrecon.jobs.shared.clouds import is_cloud_file, refuse_scan_settings
 from clrecon.jobs.shared.labelled import read_with_labels
 from clrecon.jobs.shared.laps import Laps
 from clrecon.jobs.shared.masking import mask_volume
@@ -33,7 +34,9 @@ from clrecon.system.targets import keep_existing
 
 if TYPE_CHECKING:
     from clrecon.geometry import Volume
+    from clrecon.labels import LabelMap
     from clrecon.opencl import Device
+    from clrecon.points import PointCloud
     from clrecon.rendering import Rendering
     from clrecon.system.files import Staged
 
@@ -50,7 +53,7 @@ def make_pictures(
     no_clobber: bool = False,
     progress: Progress | None = None,
 ) -> PictureReport:
-    """Read a CT series and take the pictures that are asked for.
+    """Read a CT series or a cloud and take the pictures that are asked for.
 
     Checks come in this order: the outputs, the settings files (transfer function, centre line), the device, the input.
     Pictures and turntable are written under temporary names and renamed when all are done.  The report is renamed
@@ -59,7 +62,8 @@ def make_pictures(
     Parameters
     ----------
     source : path
-        DICOM folder or file, or a file of another format, see `clrecon.reading.read_volume`.
+        DICOM folder or file, or a file of another format, see `clrecon.reading.read_volume`; for mode points a file of
+        points, see `clrecon.read_points`.
     files : PictureFiles
     settings : RenderSettings, optional
     no_clobber : bool
@@ -88,44 +92,81 @@ def make_pictures(
     function = read_function(settings.transfer_function)
     curve = read_curve(settings.curve)
 
-    progress("device", 0, 0)
-    with DeviceOpening(settings.device, partial(_prepare, settings=settings)) as opening:
-        volume, labels = read_with_labels(
-            partial(read_selected, source, settings, progress=progress),
-            None if settings.labels is None else settings.labels.path,
-            partial(read_look, settings.labels),
-        )
-        watch.lap("read")
-        device = opening.wait()
-        watch.lap("device")
-    volume = mask_volume(volume, settings, progress)
-    watch.lap("mask")
-
-    studio = Studio(volume, device, settings, function=function, curve=curve, labels=labels, progress=progress)
+    subject, labels, device = _open(source, settings, progress, watch)
+    studio = Studio(subject, device, settings, function=function, curve=curve, labels=labels, progress=progress)
     with (
         keep_existing(no_clobber),
         studio,
         ExitStack() as staged,
     ):  # all files are on the disk before any of them replaces an older one
         pictures, written = _take_views(studio, settings, files, staged, watch, progress)
-        turntable, moving = _turn(studio, volume, settings, files, staged, watch, progress)
+        turntable, moving = _turn(studio, settings, files, staged, watch, progress)
         written += moving
         device = device.current
-        report = describe_pictures(volume, settings, studio, device, pictures, turntable, _seconds(watch))
+        report = describe_pictures(subject, settings, studio, device, pictures, turntable, _seconds(watch))
         if files.report is not None:
             written.append(staged.enter_context(stage_report(files.report, report)))
         commit_all(written)
-    log_warnings(log, report.warnings, volume.report.get("warnings", ()))
+    log_warnings(log, report.warnings, subject.report.get("warnings", ()))
     log.info("%d files of pictures made on %s in %.3f s", len(written), device.label, watch.total())
     return report
 
 
+def _open(
+    source: str | Path, settings: RenderSettings, progress: Progress, watch: Laps
+) -> tuple[Volume | PointCloud, LabelMap | None, Device]:
+    """Read the scan and its labels, or the cloud, while the device opens and builds its kernels.
+
+    Raises
+    ------
+    UsageError
+        The mode shows a cloud and the input is a scan, or the other way round.
+    """
+    is_cloud = is_cloud_file(source)
+    if is_cloud != (settings.mode == "points"):
+        raise UsageError(
+            f"the input is a cloud of points, which mode points shows, and not mode {settings.mode}"
+            if is_cloud
+            else "mode points shows a file of points, and the input is none: make a cloud of it first"
+        )
+    if is_cloud:
+        refuse_scan_settings(settings)
+    progress("device", 0, 0)
+    with DeviceOpening(settings.device, partial(_prepare, settings=settings)) as opening:
+        subject: Volume | PointCloud
+        labels = None
+        if is_cloud:
+            from clrecon.points.reader import read_points
+
+            progress("read", 0, 0)
+            subject = read_points(source)
+        else:
+            subject, labels = read_with_labels(
+                partial(read_selected, source, settings, progress=progress),
+                None if settings.labels is None else settings.labels.path,
+                partial(read_look, settings.labels),
+            )
+        watch.lap("read")
+        device = opening.wait()
+        watch.lap("device")
+    if not is_cloud:
+        subject = mask_volume(subject, settings, progress)  # type: ignore[arg-type]
+        watch.lap("mask")
+    return subject, labels, device
+
+
 def _prepare(device: Device, settings: RenderSettings) -> None:
-    """Build the kernels for int16 by taking a small picture of an empty volume."""
+    """Build the kernels for int16 by taking a small picture of an empty volume, or of one point."""
     import numpy as np
 
     from clrecon.geometry import Volume
+    from clrecon.points import PointCloud
 
+    if settings.mode == "points":
+        small = RenderSettings.of("points", size=(8, 8))
+        with Studio(PointCloud([(0.0, 0.0, 0.0)]), device, small, progress=ignore_progress) as studio:
+            studio.take_view("anterior")
+        return
     nothing = Volume(np.zeros((2, 2, 2), np.int16), np.eye(4))
     mode = "slice" if settings.mode == "cpr" else settings.mode  # the same kernel, and no curve is needed
     small = RenderSettings.of(mode, size=(8, 8), iso_value=0.0 if mode == "surface" else None)
@@ -163,7 +204,6 @@ def _take_views(
 
 def _turn(
     studio: Studio,
-    volume: Volume,
     settings: RenderSettings,
     files: PictureFiles,
     staged: ExitStack,
@@ -176,7 +216,7 @@ def _turn(
         return None, []
     from clrecon.rendering.movies.movie import animation_kind, stage_animation, turntable_cameras
 
-    first = settings.camera(volume, settings.views_used[0], turning=True)
+    first = settings.camera(studio.box, settings.views_used[0], turning=True)
     cameras = turntable_cameras(first, turn.frames, turn.degrees)
 
     empty: list[str] | None = []

@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING, Any
 from clrecon.anatomy.head import SKIN_SEEN_HU, warn_of_face
 from clrecon.geometry.certificate import without_ids
 from clrecon.jobs.render.settings import LabelLook, RenderSettings
+from clrecon.jobs.shared.clouds import describe_cloud
 from clrecon.jobs.shared.report import peak_memory_bytes, platform_name
 from clrecon.jobs.shared.run_report import RunReport
-from clrecon.rendering.pictures.styles import CurveCut, PlaneCut, Style, SurfaceLook, VolumeLook
+from clrecon.rendering.pictures.styles import CurveCut, PlaneCut, PointLook, Style, SurfaceLook, VolumeLook
 from clrecon.system.wording import name_parameter
 from clrecon.version import package_version
 
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
     from clrecon.jobs.render.studio import Studio
     from clrecon.labels import LabelMap
     from clrecon.opencl import Device
+    from clrecon.points import PointCloud
     from clrecon.rendering import Rendering, TransferFunction
     from clrecon.rendering.views.camera import Camera
 
@@ -70,9 +72,17 @@ def describe_picture(picture: Rendering, name: str, view: str) -> dict[str, Any]
         "slices": made.get("slices"),
         "plane": made.get("plane"),
         "curve": made.get("curve"),
+        "points": _describe_points(made),
         "slabs": made.get("slabs", 1),
         "seconds": made.get("seconds"),
     }
+
+
+def _describe_points(made: Mapping[str, Any]) -> dict[str, Any] | None:
+    """Return how the points of a cloud are shown; None in other modes."""
+    if made.get("mode") != "points":
+        return None
+    return {name: made[name] for name in ("points", "radius_mm", "color_by", "shading", "legend", "legend_left_out")}
 
 
 def find_emptiness(picture: Rendering) -> str | None:
@@ -84,7 +94,7 @@ def find_emptiness(picture: Rendering) -> str | None:
         if np.isfinite(picture.depth).any():
             return None
         return (
-            f"nothing of the volume shows in mode {picture.mode}:"
+            f"nothing of the {'cloud' if picture.mode == 'points' else 'volume'} shows in mode {picture.mode}:"
             " look at view and zoom, at what is clipped, and at the iso value or the transfer function"
         )
     is_water = picture.mode == "drr"
@@ -130,12 +140,14 @@ class PictureReport(RunReport):
         Settings of slices and reformations; None in other modes.
     labels : list of mapping or None
         The labels with a look of their own.
+    cloud : mapping or None
+        Of a cloud: ``points``, and whether it has ``normals``, ``hu``, ``labels``; ``file``: what its file says.
     pictures : list of mapping
         See `describe_picture`, with the files.
     turntable : mapping or None
     """
 
-    affine_ijk_to_lps_mm: list[list[float]]
+    affine_ijk_to_lps_mm: list[list[float]] | None  # type: ignore[assignment]
     mode: str
     preset: str | None
     transfer_function: Mapping[str, Any] | None
@@ -151,6 +163,7 @@ class PictureReport(RunReport):
     combine: str | None
     offset_mm: float | None
     labels: list[dict[str, Any]] | None
+    cloud: Mapping[str, Any] | None
     pictures: list[dict[str, Any]]
     turntable: Mapping[str, Any] | None
     device: str
@@ -165,7 +178,7 @@ class PictureReport(RunReport):
 
 
 def describe_pictures(
-    volume: Volume,
+    subject: Volume | PointCloud,
     settings: RenderSettings,
     studio: Studio,
     device: Device,
@@ -177,7 +190,7 @@ def describe_pictures(
 
     Parameters
     ----------
-    volume : Volume
+    subject : Volume or PointCloud
     settings : RenderSettings
     studio : Studio
         The studio of the pictures: it knows their transfer function, light and warnings.
@@ -187,19 +200,28 @@ def describe_pictures(
     turntable : dict, optional
     seconds : mapping
     """
-    certificate = dict(volume.report) if settings.keep_ids else without_ids(volume.report)
+    from clrecon.geometry import Volume
+
+    volume = subject if isinstance(subject, Volume) else None
+    certificate: dict[str, Any] = {}
+    if volume is not None:
+        certificate = dict(volume.report) if settings.keep_ids else without_ids(volume.report)
     warnings = [str(text) for text in certificate.pop("warnings", [])] + device.warnings + studio.warnings
-    warnings += warn_of_face(volume, _skin_shown(studio.style), "picture")
+    if volume is not None:
+        warnings += warn_of_face(volume, _skin_shown(studio.style), "picture")
+    cloud = describe_cloud(subject) if not isinstance(subject, Volume) else None
+    warnings = [*((cloud or {}).get("file") or {}).get("warnings", ()), *warnings]
     style, lighting = studio.style, studio.lighting
     clip = getattr(style, "clip", None)
     surface = style if isinstance(style, SurfaceLook) else None
+    colored = style if isinstance(style, SurfaceLook | PointLook) else None
     return PictureReport(
-        affine_ijk_to_lps_mm=volume.affine.tolist(),
+        affine_ijk_to_lps_mm=subject.report.get("affine_ijk_to_lps_mm") if volume is None else volume.affine.tolist(),
         mode=style.mode,
         preset=settings.preset_used,
         transfer_function=_describe_function(studio.function),
         iso_value_hu=None if surface is None else surface.iso_value,
-        color=None if surface is None else surface.color,
+        color=None if colored is None else colored.color,
         depth_cue=None if surface is None else surface.depth_cue,
         lighting=None if lighting is None else asdict(lighting),
         shadows=getattr(style, "shadows", False),
@@ -210,6 +232,7 @@ def describe_pictures(
         combine=style.combine if isinstance(style, PlaneCut | CurveCut) and style.thickness else None,
         offset_mm=style.offset_mm if isinstance(style, PlaneCut) else None,
         labels=_describe_labels(settings.labels, studio.labels),
+        cloud=cloud,
         pictures=list(pictures),
         turntable=turntable,
         device=device.label,

@@ -5,18 +5,29 @@ from __future__ import annotations
 from contextlib import ExitStack
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 from clrecon.jobs.render.settings import SPINES, LabelLook, RenderSettings
+from clrecon.rendering.looks.colors import is_transparent
 from clrecon.rendering.looks.presets import find_preset
-from clrecon.rendering.pictures.styles import SPINE, CurveCut, SlicesInSpace, Style, SurfaceLook, VolumeLook
+from clrecon.rendering.pictures.styles import (
+    SPINE,
+    CurveCut,
+    PointLook,
+    SlicesInSpace,
+    Style,
+    SurfaceLook,
+    VolumeLook,
+)
 from clrecon.system.progress import Progress
 
 if TYPE_CHECKING:
     from clrecon.geometry import Volume
     from clrecon.geometry.affine import Float64Array
+    from clrecon.geometry.grid import Grid
     from clrecon.labels import LabelMap
     from clrecon.opencl import Device
+    from clrecon.points import PointCloud
     from clrecon.rendering import Lighting, Rendering, TransferFunction
     from clrecon.rendering.views.camera import Camera
 
@@ -79,7 +90,7 @@ class Studio:
 
     Parameters
     ----------
-    volume : Volume
+    subject : Volume or PointCloud
     device : Device
     settings : RenderSettings
     function : TransferFunction, optional
@@ -92,7 +103,7 @@ class Studio:
 
     def __init__(
         self,
-        volume: Volume,
+        subject: Volume | PointCloud,
         device: Device,
         settings: RenderSettings,
         *,
@@ -101,13 +112,14 @@ class Studio:
         labels: LabelMap | None = None,
         progress: Progress,
     ):
-        self._volume, self.device, self._settings = volume, device, settings
+        self._subject, self.device, self._settings = subject, device, settings
         self.labels, self._progress = labels, progress
         self.style = settings.style_with(function, curve, labels)
         self.function = _shown_function(settings, self.style) if function is None else function
         self.warnings: list[str] = []
         self._stack = ExitStack()
         self._renderer: Any = None
+        self._box: Grid | None = None
 
     def __enter__(self) -> Studio:
         return self
@@ -118,15 +130,26 @@ class Studio:
         self._stack.close()
 
     @property
+    def box(self) -> Grid:
+        """The grid that cameras look at: the volume, or the box of the cloud."""
+        from clrecon.geometry.grid import Grid
+        from clrecon.operators.rays.point_pictures import cloud_box
+
+        if not isinstance(self._subject, Grid):
+            self._box = self._box or cloud_box(self._subject)
+            return self._box
+        return self._subject
+
+    @property
     def lighting(self) -> Lighting | None:
         """The light of shaded pictures, None in modes without shading."""
-        return self.style.light if isinstance(self.style, VolumeLook | SurfaceLook) else None
+        return self.style.light if isinstance(self.style, VolumeLook | SurfaceLook | PointLook) else None
 
     def take_view(self, view: str) -> Rendering:
         """Take the picture of one view, with its annotations."""
         settings = self._settings
         if not isinstance(self.style, CurveCut):
-            return self.take(settings.camera(self._volume, view))
+            return self.take(settings.camera(self.box, view))
         if self.style.curve == SPINE:
             self._progress("curve", 0, 0)
         return self._render(view=view, up=settings.up, size=settings.size)
@@ -136,15 +159,32 @@ class Studio:
         return self._render(camera=camera, size=self._settings.size_used)
 
     def _render(self, **place: Any) -> Rendering:
+        settings = self._settings
+        if isinstance(self.style, PointLook):
+            picture = self._take_points(self.style, place["camera"], place["size"])
+        else:
+            picture = self._open_volume().render(self.style, background=settings.background, **place)
+        return picture.annotated(letters=settings.letters, scale_bar=settings.scale_bar, caption=settings.caption)
+
+    def _open_volume(self) -> Any:
         from clrecon.operators.rays.render import VolumeRenderer
 
-        settings = self._settings
         if self._renderer is None:
-            self._renderer = self._stack.enter_context(
-                VolumeRenderer(self._volume, device=self.device, memory=settings.memory)
-            )
-        picture: Rendering = self._renderer.render(self.style, background=settings.background, **place)
-        return picture.annotated(letters=settings.letters, scale_bar=settings.scale_bar, caption=settings.caption)
+            opened = VolumeRenderer(cast("Volume", self._subject), device=self.device, memory=self._settings.memory)
+            self._renderer = self._stack.enter_context(opened)
+        return self._renderer
+
+    def _take_points(self, style: PointLook, camera: Camera, size: tuple[int, int]) -> Rendering:
+        from clrecon.operators.rays.point_pictures import PointPictures
+
+        if self._renderer is None:
+            opened = PointPictures(cast("PointCloud", self._subject), device=self.device, memory=self._settings.memory)
+            self._renderer = self._stack.enter_context(opened)
+        background = self._settings.background
+        picture: Rendering = self._renderer.take(
+            style, camera, size, None if is_transparent(background) else background
+        )
+        return picture
 
 
 def _shown_function(settings: RenderSettings, style: Style) -> TransferFunction | None:

@@ -1,0 +1,58 @@
+"""Inputs that are clouds of points, told by the extension of their files."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import fields
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from clrecon.errors import UsageError
+from clrecon.jobs.shared.settings import InputSettings
+from clrecon.system.wording import name_parameter
+
+if TYPE_CHECKING:
+    from clrecon.points import PointCloud
+
+__all__ = ["CLOUD_INPUTS", "describe_cloud", "is_cloud_file", "refuse_scan_settings"]
+
+CLOUD_INPUTS = (".ply", ".vtp", ".npz", ".xyz", ".las", ".laz")
+"""Extensions of files that are read as clouds, see `clrecon.read_points`."""
+
+_OF_BOTH = ("keep_ids", "device", "memory")
+"""Settings of the input that clouds have too."""
+
+
+def is_cloud_file(source: str | Path) -> bool:
+    """True for a file, or the name of one, whose extension is that of a cloud; folders are scans."""
+    return os.path.splitext(os.fspath(source))[1].lower() in CLOUD_INPUTS and not os.path.isdir(source)
+
+
+def refuse_scan_settings(settings: InputSettings, also: Sequence[str] = ()) -> None:
+    """Refuse settings that have no meaning where the input is a cloud.
+
+    Parameters
+    ----------
+    settings : InputSettings
+    also : sequence of str
+        Further settings that are about a scan.
+
+    Raises
+    ------
+    UsageError
+        One of them was given.
+    """
+    defaults = {own.name: own.default for own in fields(settings)}
+    of_scans = [own.name for own in fields(InputSettings) if own.name not in _OF_BOTH]
+    for name in (*of_scans, *also):
+        if getattr(settings, name) != defaults[name]:
+            raise UsageError(
+                f"the input is a cloud of points, and {name_parameter(name)} is about a scan: leave it out"
+            )
+
+
+def describe_cloud(cloud: PointCloud) -> dict[str, Any]:
+    """Return the report's entry of a cloud: its points, and what is known of them."""
+    known = {name: getattr(cloud, name) is not None for name in ("normals", "hu", "labels")}
+    return {"points": len(cloud), **known, "file": cloud.report.get("file")}
