@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 __all__ = ["CLOUD_INPUTS", "describe_cloud", "is_cloud_file", "refuse_scan_settings"]
 
-CLOUD_INPUTS = (".ply", ".vtp", ".npz", ".xyz", ".las", ".laz")
+CLOUD_INPUTS = (".ply", ".vtp", ".npz", ".xyz", ".las", ".csv", ".txt")
 """Extensions of files that are read as clouds, see `clrecon.read_points`."""
 
 _OF_BOTH = ("keep_ids", "device", "memory")

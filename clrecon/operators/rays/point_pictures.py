@@ -31,6 +31,9 @@ LONE_POINT_MM = 1.0
 
 NOISE_COLOR, KEPT_COLOR, PLAIN_COLOR = "#707070", "#a0a0a0", "bone"
 
+DARKEST_SHARE = 1 / 3
+"""Width that is added below the 1st percentile of the HU: that is a quarter of the way from black to white."""
+
 MOST_NAMED = 24
 """Most entries of a legend; those with the most points."""
 
@@ -226,12 +229,18 @@ def _color_points(cloud: PointCloud, style: PointLook) -> _Colors:
     if by == "hu":
         if cloud.hu is None:
             raise UsageError("the cloud has no HU to colour it by")
-        window = choose_window(cloud.hu) if style.window is None else (float(style.window[0]), float(style.window[1]))
+        window = _choose_window(cloud.hu) if style.window is None else (float(style.window[0]), float(style.window[1]))
         share = np.clip((cloud.hu - np.float32(window[0])) * np.float32(255.0 / (window[1] - window[0])), 0, 255)
         grey = np.rint(share).astype(np.uint8)
         return _Colors(_rows(grey, grey, grey), by, [], 0, window)
     color = np.rint(255.0 * find_color(PLAIN_COLOR if style.color is None else style.color)).astype(np.uint8)
     return _Colors(np.broadcast_to(np.append(color, np.uint8(255)), (len(cloud), 4)), "none", [], 0, None)
+
+
+def _choose_window(hu: NDArray[np.float32]) -> tuple[float, float]:
+    """Return a window in which the lowest HU are dark grey, so that they show before black."""
+    low, high = choose_window(hu)
+    return low - DARKEST_SHARE * (high - low), high
 
 
 def _rows(*channels: NDArray[np.uint8]) -> NDArray[np.uint8]:

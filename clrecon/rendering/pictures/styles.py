@@ -316,7 +316,7 @@ class PointLook(Style):
     color : str or (float, float, float), optional
         One colour for all, see `clrecon.rendering.looks.colors.find_color`; default: "bone".
     window : (float, float), optional
-        HU shown as black and white; default: the 1st and the 99th percentile of the points.
+        HU shown as black and white; default: the 99th percentile of the points is white, the 1st dark grey.
     lighting : Lighting, optional
         Default: ``Lighting()``.
     clip : Clip, optional
