@@ -14,7 +14,8 @@ __all__ = ["add_arguments", "run"]
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of the command."""
     parser.epilog = (
-        "The device marked * is the one that would be used. Simulators (Oclgrind) are used only when they are named."
+        "The device marked * is the one that would be used: one that failed the check at its first use only when it is"
+        " named, as simulators (Oclgrind)."
     )
     add_device(parser, computes=False)
 
@@ -46,6 +47,8 @@ def _describe_survey(survey: dict[str, Any]) -> list[str]:
         lines.append(f"{'':18}{printable(driver)}")
         if device["shortcoming"]:
             lines.append(f"{'':18}cannot be used: {printable(device['shortcoming'])}")
+        if device["fault"]:
+            lines.append(f"{'':18}failed the check at its first use: {printable(device['fault'])}")
     if survey["platforms"]:
         lines += ["", "platforms:"]
         rows = [(printable(p["name"]), printable(p["note"]), printable(p["version"])) for p in survey["platforms"]]

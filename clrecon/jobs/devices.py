@@ -25,8 +25,9 @@ def survey_devices(name: str | None = None) -> tuple[dict[str, Any], DeviceError
     -------
     survey : dict
         ``{"platforms": [{"name", "version", "note"}], "devices": [{"index", "name", "platform", "type", "version",
-        "driver", "memory_bytes", "max_allocation_bytes", "compute_units", "simulator", "chosen", ...}],
-        "chosen": index or None, "warnings": [text]}``.
+        "driver", "memory_bytes", "max_allocation_bytes", "compute_units", "simulator", "fault", "chosen", ...}],
+        "chosen": index or None, "warnings": [text]}``.  A fault is what is remembered of the check at the first use of
+        a device, empty where it passed or was not checked yet; nothing runs on any device.
     problem : DeviceError or None
         Why no device would be used.
 
@@ -35,20 +36,23 @@ def survey_devices(name: str | None = None) -> tuple[dict[str, Any], DeviceError
     DeviceError
         pyopencl itself cannot be imported.
     """
-    from clrecon.opencl import cache_warnings, choose_unchecked, list_devices, list_platforms
+    from clrecon.opencl import cache_warnings, choose_remembered, list_devices, list_platforms, remembered_fault
 
     devices = list_devices()
     problem: DeviceError | None = None
     chosen: int | None = None
     warnings: Sequence[str] = cache_warnings()
     try:
-        device = choose_unchecked(name)
+        device = choose_remembered(name)
         chosen, warnings = device.index, device.warnings
     except DeviceError as error:
         problem = error
     survey = {
         "platforms": list_platforms(),
-        "devices": [{**device.describe(), "chosen": device.index == chosen} for device in devices],
+        "devices": [
+            {**device.describe(), "fault": remembered_fault(device), "chosen": device.index == chosen}
+            for device in devices
+        ],
         "chosen": chosen,
         "warnings": list(warnings),
     }

@@ -7,11 +7,12 @@ from clrecon.opencl.arrays import allocate, copy_buffer, download, empty_output,
 from clrecon.opencl.cache_folders import cache_warnings
 from clrecon.opencl.commands import has_hung_commands, keep_for_hung_commands
 from clrecon.opencl.context import Device
+from clrecon.opencl.first_use import remembered_fault
 from clrecon.opencl.launching import Stopwatch, launch
 from clrecon.opencl.memory import MemoryLimits, check_budget, check_memory, describe_shortage, memory_limits
 from clrecon.opencl.pages import result_pages
 from clrecon.opencl.program import Kernel, Program, load_program
-from clrecon.opencl.select import choose_device, choose_unchecked, list_devices, list_platforms
+from clrecon.opencl.select import choose_device, choose_remembered, choose_unchecked, list_devices, list_platforms
 from clrecon.opencl.sources import kernel_constant, kernel_files, kernel_number, read_kernel_source
 from clrecon.opencl.stand_in import take_device, work_on
 from clrecon.opencl.waiting import settle, wait
@@ -27,6 +28,7 @@ __all__ = [
     "check_budget",
     "check_memory",
     "choose_device",
+    "choose_remembered",
     "choose_unchecked",
     "copy_buffer",
     "describe_shortage",
@@ -43,6 +45,7 @@ __all__ = [
     "load_program",
     "memory_limits",
     "read_kernel_source",
+    "remembered_fault",
     "result_pages",
     "settle",
     "take_device",

@@ -12,11 +12,19 @@ from clrecon.errors import DeviceError
 from clrecon.opencl import quirks
 from clrecon.opencl.cache_folders import cache_warnings
 from clrecon.opencl.context import Device, describe_error
-from clrecon.opencl.first_use import find_fault
+from clrecon.opencl.first_use import find_fault, remembered_fault
 from clrecon.system.log import get_logger
 from clrecon.system.wording import name_parameter
 
-__all__ = ["choose_device", "choose_unchecked", "driver_advice", "find_candidates", "list_devices", "list_platforms"]
+__all__ = [
+    "choose_device",
+    "choose_remembered",
+    "choose_unchecked",
+    "driver_advice",
+    "find_candidates",
+    "list_devices",
+    "list_platforms",
+]
 
 log = get_logger(__name__)
 
@@ -172,6 +180,13 @@ def choose_device(name: str | int | Device | None = None) -> Device:
         )
     log.debug("device %d chosen of %d: %s", chosen.index, len(list_devices()), chosen.label)
     return chosen
+
+
+def choose_remembered(name: str | int | None = None) -> Device:
+    """Choose as `choose_device` does, by what earlier processes found at the first use; nothing runs on the device."""
+    devices, is_automatic = find_candidates(name)
+    sound = (device for device in devices if not remembered_fault(device))
+    return next(sound, devices[0]) if is_automatic else devices[0]
 
 
 def choose_unchecked(name: str | int | None = None) -> Device:

@@ -14,4 +14,4 @@ def _check_device(device: Device) -> str:
     return check_ball(device)
 
 
-register(_check_device)
+register(_check_device, "-m", "clrecon.operators.first_use")

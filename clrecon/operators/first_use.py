@@ -6,13 +6,16 @@ checks every kernel.
 
 from __future__ import annotations
 
+import json
+import sys
+
 import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.errors import ClreconError, DeviceMemoryError, DeviceTimeoutError
 from clrecon.geometry import Volume
 from clrecon.mesh import Mesh
-from clrecon.opencl import Device
+from clrecon.opencl import Device, list_devices
 from clrecon.operators.surface.extract import extract_isosurface
 
 __all__ = ["check_ball"]
@@ -91,3 +94,14 @@ def _count_open_edges(triangles: NDArray[np.int64], vertices: int) -> int:
     begin, end = triangles.ravel(), np.roll(triangles, -1, axis=1).ravel()
     there, back = np.sort(begin * vertices + end), np.sort(end * vertices + begin)
     return int(np.count_nonzero(there != back)) + int(np.count_nonzero(np.diff(there) == 0))
+
+
+def main(index: str) -> None:
+    """Check a device in a process of its own; the last line that it prints is the answer as JSON."""
+    device = list_devices()[int(index)]
+    device.fault = ""  # what the check asks of the device is no first use
+    print(json.dumps(check_ball(device)), flush=True)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1])

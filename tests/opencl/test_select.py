@@ -112,6 +112,15 @@ def test_a_device_that_cannot_work_is_passed_over(machine):
         choose_device("h200")
 
 
+def test_row_57_what_is_remembered_chooses_the_device_that_is_shown(machine, monkeypatch):
+    found = {"H200": "wrong sums"}
+    monkeypatch.setattr(select, "remembered_fault", lambda device: found.get(device.name, ""))
+    assert select.choose_remembered().name == "Radeon"
+    assert select.choose_remembered("h200").name == select.choose_remembered("gpu").name == "H200"
+    found.update({device.name: "wrong sums" for device in machine})
+    assert select.choose_remembered().name == "H200"  # none is better
+
+
 def test_row_57_a_device_that_computes_wrongly_is_passed_over_or_refused(machine, monkeypatch):
     machine[3].fault = "7 of 9 vertices of a ball lie beside it"
     assert choose_device().name == "Radeon"

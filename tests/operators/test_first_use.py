@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import json
+import os
+import signal
+import subprocess
 import sys
 from pathlib import Path
 from types import SimpleNamespace
@@ -94,6 +98,96 @@ def test_row_57_what_fails_is_not_remembered_for_the_next_process(checked: list[
         wrong: Any = FakeDevice(name="wrong")
         assert first_use.find_fault(wrong) == first_use.find_fault(wrong) == "wrong sums"
         assert len(checked) == count
+
+
+@pytest.fixture
+def kept(checked: list[Any]) -> dict[str, bytes]:
+    """What the files say."""
+    return first_use.read_binary.__self__  # type: ignore[attr-defined, no-any-return]
+
+
+def test_row_57_what_was_found_is_told_without_a_check(checked: list[Any], monkeypatch: pytest.MonkeyPatch) -> None:
+    for name, words in (("wrong", "wrong sums"), ("right", "")):
+        device: Any = FakeDevice(name=name)
+        assert first_use.remembered_fault(device) == ""
+        first_use.find_fault(device)
+        assert first_use.remembered_fault(FakeDevice(name=name)) == words  # type: ignore[arg-type]
+    assert len(checked) == 2
+    assert first_use.remembered_fault(FakeDevice(name="wrong", is_simulator=True)) == ""  # type: ignore[arg-type]
+    monkeypatch.setenv(first_use.VARIABLE, "off")
+    assert first_use.remembered_fault(FakeDevice(name="wrong")) == ""  # type: ignore[arg-type]
+
+
+def test_row_57_an_interrupted_check_says_nothing(
+    checked: list[Any], kept: dict[str, bytes], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupt(device: Any) -> str:
+        assert list(kept.values()) == [first_use._BEGUN]
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(first_use, "_check", [interrupt])
+    with pytest.raises(KeyboardInterrupt):
+        first_use.find_fault(FakeDevice())  # type: ignore[arg-type]
+    assert list(kept.values()) == [b""] and first_use.remembered_fault(FakeDevice()) == ""  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("code", "fault", "remembered"),
+    [
+        ("import os; os.abort()", "its driver ends the process (SIGABRT)", first_use._CRASHED),
+        ("raise SystemExit(3)", "its driver ends the process (exit code 3)", first_use._CRASHED),
+        ("print('of a driver'); print('\"wrong sums\"')", "wrong sums", first_use._WRONG),
+        ("print('\"\"')", "", first_use._PASSED),
+    ],
+)
+def test_row_57_where_a_process_died_in_the_check_a_child_makes_it(
+    checked: list[Any],
+    kept: dict[str, bytes],
+    monkeypatch: pytest.MonkeyPatch,
+    code: str,
+    fault: str,
+    remembered: bytes,
+) -> None:
+    monkeypatch.setattr(first_use, "_command", ["-c", code])
+    key = first_use._key(FakeDevice())  # type: ignore[arg-type]
+    for before in (first_use._BEGUN, first_use._CRASHED + b"earlier"):
+        kept[key] = before
+        expected = {first_use._BEGUN: "a process ended while it checked this device"}.get(before, "earlier")
+        assert first_use.remembered_fault(FakeDevice()) == expected  # type: ignore[arg-type]
+        device: Any = FakeDevice(index=0)
+        assert first_use.find_fault(device) == fault
+        assert kept[key] == remembered + (fault.encode() if fault else b"")
+    assert checked == []
+    monkeypatch.setattr(sys, "executable", "")
+    kept[key] = first_use._BEGUN
+    assert first_use.find_fault(FakeDevice(index=0)) == "a process ended while it checked this device"  # type: ignore[arg-type]
+
+
+CRASH = """
+import os, sys
+import clrecon.operators, clrecon.operators.first_use
+from clrecon.opencl import choose_device
+clrecon.operators.first_use.check_ball = lambda device: os.abort()
+choose_device(int(sys.argv[1]))
+"""
+
+
+def test_row_57_a_crash_in_the_check_becomes_words_in_the_next_process(device: Device, tmp_path: Path) -> None:
+    environment = {**os.environ, "XDG_CACHE_HOME": str(tmp_path)}
+    environment.pop(first_use.VARIABLE, None)
+
+    def devices() -> dict[str, Any]:
+        line = [sys.executable, "-m", "clrecon.cli.main", "devices", "--json"]
+        done = subprocess.run(line, env=environment, capture_output=True, text=True, check=True)
+        return json.loads(done.stdout)["devices"][device.index]
+
+    assert devices()["fault"] == ""
+    done = subprocess.run([sys.executable, "-c", CRASH, str(device.index)], env=environment, check=False)
+    assert done.returncode == -signal.SIGABRT
+    assert devices()["fault"] == "a process ended while it checked this device"
+    take = "import sys; import clrecon; clrecon.device(int(sys.argv[1]))"
+    subprocess.run([sys.executable, "-c", take, str(device.index)], env=environment, check=True)
+    assert devices()["fault"] == ""  # the child has found nothing wrong
 
 
 def test_row_57_simulators_and_those_who_say_so_are_not_checked(
