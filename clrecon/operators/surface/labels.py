@@ -27,6 +27,8 @@ from clrecon.system.progress import Progress
 
 __all__ = ["extract_labels", "prepare_labels"]
 
+_FILLS = "the whole CT is inside of it, and a surface that ends open has nowhere to lie; close it"
+
 
 def _refuse_label(
     volume: Volume, taken: ResampledLabels, labels: LabelMap, rule: IsoRule, number: int
@@ -36,6 +38,8 @@ def _refuse_label(
     if not mask.any():
         return NoSurfaceError(f"label {label} has no voxel in the CT: it lies outside")
     hu = volume.voxels[mask]
+    if not rule.closed and hu.max() >= rule.lowest_inside:
+        return NoSurfaceError(f"no surface of label {label} at {rule.iso_value:g} HU: {_FILLS}")
     return NoSurfaceError(
         f"no surface of label {label} at {rule.iso_value:g} HU: its voxels run from {float(hu.min()):g} to"
         f" {float(hu.max()):g} HU"
@@ -119,8 +123,17 @@ def extract_labels(
 
         meshes = resident.attempt(make)
     if not meshes:
-        raise NoSurfaceError(f"no label has a voxel of {rule.iso_value:g} HU or more in the CT")
+        raise _refuse_all(resident.volume, taken, labels, rule)
     return meshes
+
+
+def _refuse_all(volume: Volume, taken: ResampledLabels, labels: LabelMap, rule: IsoRule) -> NoSurfaceError:
+    """The error where no label has a surface: none has a dense voxel, or one is all of an open volume."""
+    for values, numbers in zip(volume.voxels, taken.voxels, strict=True):
+        dense = numbers[(numbers > 0) & rule.mark_inside(values)]
+        if dense.size:
+            return _refuse_label(volume, taken, labels, rule, int(dense[0]))
+    return NoSurfaceError(f"no label has a voxel of {rule.iso_value:g} HU or more in the CT")
 
 
 def _make_meshes(

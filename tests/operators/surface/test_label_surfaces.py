@@ -228,6 +228,23 @@ def test_labels_without_a_surface_are_refused_or_left_out(device):
         extract_labels(volume, LabelMap(labels, far), 3, device=device)
 
 
+@pytest.mark.parametrize("numbers", [None, [1]])
+def test_a_label_that_is_the_whole_of_an_open_volume_has_no_surface(device, numbers):
+    hu = np.zeros((5, 7, 9), np.int16)
+    hu[2:4, 2:5, 2:6] = 300
+    volume, label_map = Volume(hu, OBLIQUE), LabelMap(np.ones((5, 7, 9), np.uint8), OBLIQUE, {1: "all"})
+    for closed, solid in ((True, False), (True, True), (False, False)):
+        assert 1 in extract_labels(volume, label_map, 30, device=device, numbers=numbers, closed=closed, solid=solid)
+    # Nothing leads to its dense voxels from outside: solid, all of it is inside.
+    with pytest.raises(NoSurfaceError, match="no surface of label 1 all at 30 HU: the whole CT is inside of it"):
+        extract_labels(volume, label_map, 30, device=device, numbers=numbers, closed=False, solid=True)
+    full = Volume(np.full((5, 7, 9), 50, np.int16), OBLIQUE)
+    with pytest.raises(NoSurfaceError, match="no surface of label 1 all at 30 HU: the whole CT is inside of it"):
+        extract_labels(full, label_map, 30, device=device, numbers=numbers, closed=False)
+    with pytest.raises(NoSurfaceError, match="no label has a voxel of 500|its voxels run from 0 to 300 HU"):
+        extract_labels(volume, label_map, 500, device=device, numbers=numbers, closed=False, solid=True)
+
+
 def test_a_label_outside_the_volume_is_refused_when_asked_for(device):
     volume, labels = random_volume((5, 7, 9)), np.zeros((10, 7, 9), np.uint8)
     labels[:5], labels[8:] = 2, 4
