@@ -133,7 +133,8 @@ def test_a_test_that_ends_its_process_ends_the_run(tmp_path: Path) -> None:
     script = shutil.copy(ROOT / "scripts" / "test.py", tmp_path / "scripts")
     code = f"import os, runpy, sys\nos.cpu_count = lambda: 2\nsys.path.insert(0, {str(tmp_path / 'scripts')!r})\n"
     code += f"sys.argv = ['test.py', '--fast']\nrunpy.run_path({str(script)!r}, run_name='__main__')"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
-    assert done.returncode == 1 and "INTERNALERROR" not in done.stdout
+    # The time tells a wait for ever from a busy machine, on which three starts of Python have taken a minute.
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=600)
+    assert done.returncode == 1 and "INTERNALERROR" not in done.stdout, done.stdout + done.stderr
     assert "crashed while running 'test_a.py::test_one'" in done.stdout
-    assert " failed, " in done.stdout.splitlines()[-1] and done.stderr.splitlines()[-1] == "pytest failed"
+    assert done.stdout.splitlines()[-1].startswith("1 failed") and done.stderr.splitlines()[-1] == "pytest failed"
