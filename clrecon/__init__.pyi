@@ -21,10 +21,13 @@ from clrecon.mesh.refine.decimation import decimate_mesh as decimate_mesh
 from clrecon.mesh.refine.smoothing import smooth_mesh as smooth_mesh
 from clrecon.opencl import list_devices
 from clrecon.operators import choose_device
+from clrecon.operators.points.bilateral import denoise_points as denoise_points
 from clrecon.operators.points.clusters import Clustering as Clustering
 from clrecon.operators.points.clusters import cluster_points as cluster_points
 from clrecon.operators.points.neighbours import Neighbours as Neighbours
 from clrecon.operators.points.neighbours import find_neighbours as find_neighbours
+from clrecon.operators.points.normals import estimate_normals as estimate_normals
+from clrecon.operators.points.outliers import remove_outliers as remove_outliers
 from clrecon.operators.rays.render import VolumeRenderer as VolumeRenderer
 from clrecon.operators.rays.render import render as render
 from clrecon.operators.reformat.cut import cut_slice as cut_slice

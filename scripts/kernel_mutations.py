@@ -204,6 +204,26 @@ INVERSIONS: dict[str, dict[str, tuple[tuple[str, str], ...]]] = {
     },
     "flag_cores": {"flags": (("(core & rest & -rest) != 0", "(core & rest & -rest) == 0"),)},
     "sum_volumes": {"sums": (("sums[item] = sum;", "sums[item] = -sum;"),)},
+    "fit_planes": {
+        "normals": tuple((f"store_rows(n{c} * size,", f"store_rows(n{c} * size + 0.1f,") for c in "xyz"),
+        "variations": (("choose(longest > NO_PLANE, l, (floats)(0.0f))", "choose(longest > NO_PLANE, 0.3f - l, l)"),),
+    },
+    "orient_normals": {
+        "oriented": (("vstore3(normal, number, oriented);", "vstore3(-normal, number, oriented);"),),
+        "states": (("states[number] = state;", "states[number] = 3 - state;"),),
+    },
+    "find_gradients": {"gradients": (("vstore3(known,", "vstore3(-known,"),)},
+    "filter_points": {
+        "moves": tuple((f"scatter_rows(move * n{c},", f"scatter_rows(-move * n{c},") for c in "xyz"),
+        "planes": (("scatter_rows(sigma_s, planes", "scatter_rows(-sigma_s, planes"),),
+    },
+    "filter_cells": {
+        "moves": (("(float3)(move * nx, move * ny, move * nz)", "-(float3)(move * nx, move * ny, move * nz)"),)
+    },
+    "measure_distances": {
+        "means": (("scatter_rows(sum / ", "scatter_rows(-sum / "),),
+        "nearest": (("scatter_rows(second,", "scatter_rows(-second,"),),
+    },
     "list_neighbours": {
         "neighbours": (
             ("own[t] = (int)c->sorted[t];", "own[t] = ~(int)c->sorted[t];"),

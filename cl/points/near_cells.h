@@ -47,12 +47,12 @@ static inline uint word_of_cell(const cloud_grid *g, const uint cell)
 }
 
 /* Occupied cell of a point: the last one that begins no later. */
-static inline uint cell_of_place(const cloud_grid *g, const uint place)
+static inline uint cell_of_place(__global const uint *starts, const uint cells, const uint place)
 {
-    uint low = 0, high = g->cells;
+    uint low = 0, high = cells;
     while (high - low > 1u) {
         const uint middle = low + (high - low) / 2u;
-        if (g->starts[middle] <= place)
+        if (starts[middle] <= place)
             low = middle;
         else
             high = middle;

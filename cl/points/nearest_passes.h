@@ -99,7 +99,7 @@ static inline void list_point(
     const int by_place, const uint first_place, __global int *restrict neighbours, __global float *restrict distances)
 {
     const float3 point = (float3)(g->x[place], g->y[place], g->z[place]);
-    const uint number = cell_of_place(g, place), word = word_of_cell(g, number);
+    const uint number = cell_of_place(g->starts, g->cells, place), word = word_of_cell(g, number);
     const int3 cell = place_of_bit(g, word, nth_bit(g->mask[word], number - g->ranks[word]));
     const size_t row = by_place ? place - first_place : g->order[place];
     if (list_equal(g, point, cell, row, k, by_place, neighbours, distances))

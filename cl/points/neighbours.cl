@@ -22,7 +22,6 @@
 #include "points/near_cells.h"
 
 #define BATCH_CELLS 16
-#define MOST_NEIGHBOURS 128
 
 #if LANES == 8
 #include "points/nearest_listed.h"

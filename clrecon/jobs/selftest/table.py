@@ -2,7 +2,18 @@
 
 from __future__ import annotations
 
-from clrecon.jobs.selftest import clusters, labels, pictures, points, primitives, rays, reformat, resident, surface
+from clrecon.jobs.selftest import (
+    clusters,
+    labels,
+    pictures,
+    point_filters,
+    points,
+    primitives,
+    rays,
+    reformat,
+    resident,
+    surface,
+)
 from clrecon.jobs.selftest.check import Check
 
 __all__ = ["CHECKS", "checks_of"]
@@ -17,6 +28,7 @@ CHECKS: tuple[Check, ...] = (
     *reformat.CHECKS,
     *points.CHECKS,
     *clusters.CHECKS,
+    *point_filters.CHECKS,
 )
 
 

@@ -44,7 +44,7 @@ __all__ = [
 BATCH_CELLS = kernel_constant("points/neighbours.cl", "BATCH_CELLS")
 """Cells a work-item on a CPU."""
 
-MOST_NEIGHBOURS = kernel_constant("points/neighbours.cl", "MOST_NEIGHBOURS")
+MOST_NEIGHBOURS = kernel_constant("points/near_rows.h", "MOST_NEIGHBOURS")
 """Most neighbours of a point: three times as many candidates have room in the kernel."""
 
 PART_POINTS = 1 << 16

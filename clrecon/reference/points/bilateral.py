@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["LEAST_RANGE_MM", "bilateral_factors", "denoise_points", "filter_scales"]
+__all__ = ["LEAST_RANGE_MM", "bilateral_factors", "cell_factors", "denoise_points", "filter_scales"]
 
 LEAST_RANGE_MM = 1e-6
 """Where sigma_s is smaller, the neighbours lie in the plane already, and the point stays."""
@@ -48,6 +48,27 @@ def bilateral_factors(
     squares = np.einsum("nki,nki->nk", away, away)
     weights = np.exp(-squares / (2.0 * sigma_c**2)[:, None] - heights**2 / (2.0 * sigma_s**2)[:, None])
     factors: NDArray[np.float64] = np.where(moves, (weights * heights).sum(axis=1) / weights.sum(axis=1), 0.0)
+    return factors
+
+
+def cell_factors(
+    points: NDArray[np.floating],
+    normals: NDArray[np.floating],
+    cells: NDArray[np.integer],
+    sigma_c: NDArray[np.floating],
+    sigma_s: NDArray[np.floating],
+) -> NDArray[np.float64]:
+    """Return beta with sums over all points of a point's cell in place of its neighbours."""
+    factors = np.zeros(len(points))
+    order = np.argsort(cells, kind="stable")
+    for own in np.split(order, np.flatnonzero(np.diff(cells[order])) + 1):
+        among = np.broadcast_to(own, (len(own), len(own)))
+        away = points[own][:, None].astype(np.float64) - points.astype(np.float64)[among]
+        heights = np.einsum("nki,ni->nk", away, normals[own])
+        moves = (sigma_s[own] >= LEAST_RANGE_MM) & (sigma_c[own] > 0.0)
+        far, high = np.where(moves, sigma_c[own], 1.0)[:, None], np.where(moves, sigma_s[own], 1.0)[:, None]
+        weights = np.exp(-np.einsum("nki,nki->nk", away, away) / (2.0 * far**2) - heights**2 / (2.0 * high**2))
+        factors[own] = np.where(moves, (weights * heights).sum(axis=1) / weights.sum(axis=1), 0.0)
     return factors
 
 

@@ -1,0 +1,240 @@
+"""Normals of points: the host's side of cl/points/normals.cl."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from clrecon.errors import UsageError
+from clrecon.geometry import Volume
+from clrecon.opencl import (
+    Device,
+    Program,
+    Stopwatch,
+    allocate,
+    check_memory,
+    download,
+    empty_output,
+    kernel_number,
+    launch,
+    load_program,
+    take_device,
+    upload,
+    work_on,
+)
+from clrecon.operators.points.gradients import find_gradients
+from clrecon.operators.points.neighbours import NeighbourSearch, Part, check_neighbours, take_points
+from clrecon.operators.resident.device_volume import DeviceVolume, open_volume
+from clrecon.points import PointCloud, PointStep
+from clrecon.system.progress import Progress
+
+__all__ = ["PlaneFits", "estimate_normals", "prepare_normals"]
+
+FEWEST_NEIGHBOURS = 3
+"""Three points lie in a plane."""
+
+_HOW = {how: int(kernel_number("points/normals.cl", f"ORIENT_{how}")) for how in ("NOT", "DOWN", "AWAY")}
+_STATES = {
+    state: int(kernel_number("points/normals.cl", f"STATE_{state}"))
+    for state in ("SURE", "DOUBTFUL", "UNORIENTED", "NO_PLANE")
+}
+
+
+def prepare_normals(device: Device) -> Program:
+    """Build the kernels of `estimate_normals`, but for those that search neighbours.
+
+    Raises
+    ------
+    DeviceError
+        The driver's compiler refuses.
+    """
+    return load_program(device, "points/normals.cl", {"LANES": device.kernel_variants["LANES"]})
+
+
+class PlaneFits:
+    """Planes through the neighbours of the points of one part after another.
+
+    Parameters
+    ----------
+    search : NeighbourSearch
+    stopwatch : Stopwatch
+
+    Attributes
+    ----------
+    neighbours_d : buffer, (most places of a part, k) int32
+    normals_d : buffer, (3, place_count) float32
+    variations_d : buffer, (place_count,) float32
+    """
+
+    def __init__(self, search: NeighbourSearch, stopwatch: Stopwatch):
+        self._search, self._stopwatch, device = search, stopwatch, search.device
+        with stopwatch.timed("build"):
+            self.program = prepare_normals(device)
+        most = search.most_places
+        self.neighbours_d = allocate(device, 4 * search.k * most)
+        self.normals_d, self.variations_d = allocate(device, 12 * most), allocate(device, 4 * most)
+
+    @staticmethod
+    def needs(points: int) -> dict[str, int]:
+        """Return the bytes beside those of the search, for a part of so many points."""
+        return {"planes of a part": 16 * points}
+
+    def fit(self, part: Part) -> None:
+        """List the neighbours of a part and fit their planes."""
+        search = self._search
+        search.list_places(part, self.neighbours_d)
+        lanes = int(search.device.kernel_variants["LANES"])
+        launch(
+            search.device, self.program["fit_planes"], -(-part.place_count // lanes), stopwatch=self._stopwatch,
+            **search.coordinates, neighbours=self.neighbours_d, normals=self.normals_d, variations=self.variations_d,
+            first_place=part.first_place, place_count=part.place_count, k=search.k,
+        )  # fmt: skip
+
+
+def estimate_normals(
+    cloud: PointCloud,
+    k: int = 16,
+    *,
+    volume: Volume | DeviceVolume | None = None,
+    viewpoint: ArrayLike | None = None,
+    device: Device | str | int | None = None,
+    memory: int | None = None,
+    progress: Progress | None = None,
+) -> PointStep:
+    """Estimate the normal of each point: the smallest principal axis of its nearest points.
+
+    With a volume normals point towards lower HU, out of bone: against the gradient of the trilinear field, as
+    differences over half a voxel to either side.  Where axis and gradient are nearly at a right angle (cosine below
+    0.2) the neighbours lie on both sides of something thin; there the gradient itself is taken, and these points are
+    counted as doubtful.  A cloud without a volume gets normals away from a viewpoint within, or else normals of either
+    direction, with a warning.
+
+    Parameters
+    ----------
+    cloud : PointCloud
+    k : int
+        Neighbours of each point, itself among them; 3 to 128.
+    volume : Volume or DeviceVolume, optional
+        The CT from which the cloud comes.  A `DeviceVolume` is used directly, with its own device and memory.
+    viewpoint : array_like, shape (3,), optional
+        A point inside of the object, LPS mm; without a volume alone.
+    device : Device, str or int, optional
+        See `clrecon.device`; None is the best of the machine.
+    memory : int, optional
+        Most bytes taken on the device; None is all that it has.
+    progress : callable, optional
+        Called as ``progress("gradients", slices done, all slices)`` and ``progress("normals", points done, all
+        points)``.
+
+    Returns
+    -------
+    PointStep
+        The cloud with `normals`.  Its facts: ``neighbours``, ``oriented_by`` ("gradient", "viewpoint" or None),
+        ``doubtful`` (normals that are the gradient's), ``unoriented`` (of either direction: the gradient is zero
+        there), ``without_plane`` (neighbours in a line or at one place; without a gradient these normals are zero),
+        ``seconds`` and ``device``.
+
+    Raises
+    ------
+    UsageError
+        The cloud is empty, `k` is out of range, or volume and viewpoint are given both.
+    DeviceMemoryError
+        The device has no room for the cloud.
+    DeviceError
+        The device fails.
+    """
+    check_memory(memory)
+    points = take_points(cloud)
+    k, warnings = check_neighbours(k, len(points), FEWEST_NEIGHBOURS)
+    if volume is not None and viewpoint is not None:
+        raise UsageError("normals are oriented by a volume or away from a viewpoint, not both: leave out one")
+    place = None if viewpoint is None else _check_viewpoint(viewpoint)
+    if volume is None:
+        taken = take_device(device)
+        return work_on(
+            taken, lambda device, told: _Run(cloud, k, device, memory, [*warnings, *told], progress).step(place)
+        )
+    with open_volume(volume, device, memory, "the orientation of normals") as resident:
+
+        def work(told: list[str]) -> PointStep:
+            run = _Run(cloud, k, resident.device, resident.memory, [*warnings, *told], progress)
+            gradients = find_gradients(
+                resident, points, stopwatch=run.stopwatch, progress=progress, warnings=run.warnings
+            )
+            return run.step(gradients=gradients)
+
+        return resident.attempt(work)
+
+
+def _check_viewpoint(viewpoint: ArrayLike) -> NDArray[np.float64]:
+    place = np.asarray(viewpoint, dtype=np.float64)
+    if place.shape != (3,) or not np.isfinite(place).all():
+        raise UsageError(f"a viewpoint is three numbers in LPS mm, not {viewpoint!r}")
+    return place
+
+
+@dataclass
+class _Run:
+    """One estimate on one device."""
+
+    cloud: PointCloud
+    k: int
+    device: Device
+    memory: int | None
+    warnings: list[str]
+    progress: Progress | None
+
+    def __post_init__(self) -> None:
+        self.stopwatch = Stopwatch()
+
+    def step(
+        self, viewpoint: NDArray[np.float64] | None = None, gradients: NDArray[np.float32] | None = None
+    ) -> PointStep:
+        """Estimate and orient all normals."""
+        device, stopwatch, points = self.device, self.stopwatch, self.cloud.points
+        n = len(points)
+        results = {"normals": 13 * n, "gradients": 0 if gradients is None else 12 * n}
+        search = NeighbourSearch(device, points, self.k, {**PlaneFits.needs(n), **results}, self.memory, stopwatch)
+        fits = PlaneFits(search, stopwatch)
+        normals, normals_d = empty_output(device, (n, 3), np.float32)
+        states, states_d = empty_output(device, (n,), np.uint8)
+        how, seen_from = ("AWAY", viewpoint - search.grid.base) if viewpoint is not None else ("NOT", np.zeros(3))
+        gradients_d = normals_d
+        if gradients is not None:
+            how, gradients_d = "DOWN", upload(device, gradients)
+        for part in search.each_part("normals", self.progress):
+            fits.fit(part)
+            launch(
+                device, fits.program["orient_normals"], part.place_count, stopwatch=stopwatch, **search.coordinates,
+                order=search.grid.order_d, normals=fits.normals_d, gradients=gradients_d, oriented=normals_d,
+                states=states_d, viewpoint=(*seen_from, 0.0), how=_HOW[how], first_place=part.first_place,
+                place_count=part.place_count,
+            )  # fmt: skip
+        with stopwatch.timed("download"):
+            normals, states = download(device, normals, normals_d), download(device, states, states_d)
+        return self._describe(normals, states, how)
+
+    def _describe(self, normals: NDArray[np.float32], states: NDArray[np.uint8], how: str) -> PointStep:
+        counts = np.bincount(states, minlength=len(_STATES))
+        doubtful, unoriented, flat = (int(counts[_STATES[state]]) for state in ("DOUBTFUL", "UNORIENTED", "NO_PLANE"))
+        warnings, n = list(self.warnings), len(states)
+        if flat:
+            warnings.append(
+                f"{flat:,} of {n:,} points have their neighbours in a line or at one place: normal (0, 0, 0)"
+            )
+        if how == "NOT":
+            warnings.append("normals have either direction: give a volume or a viewpoint to orient them")
+        elif unoriented:
+            warnings.append(f"{unoriented:,} of {n:,} normals have either direction: HU do not change there")
+        facts = {
+            "neighbours": self.k,
+            "oriented_by": {"DOWN": "gradient", "AWAY": "viewpoint", "NOT": None}[how],
+            "doubtful": doubtful,
+            "unoriented": unoriented,
+            "without_plane": flat,
+            "seconds": dict(self.stopwatch.seconds),
+            "device": self.device.label,
+        }
+        return PointStep(self.cloud.changed(normals=normals), np.zeros(n, np.uint8), (), facts, tuple(warnings))

@@ -1,0 +1,64 @@
+"""Statistical outliers equal their twin and those of a definition by hand."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from point_shapes import sphere
+from tolerances import MEAN_DISTANCE_SHARE
+
+from clrecon.errors import UsageError
+from clrecon.operators.points.outliers import remove_outliers
+from clrecon.points import PointCloud
+from clrecon.reference.points.neighbours import find_neighbours
+from clrecon.reference.points.outliers import find_outliers, mean_distances
+
+
+@pytest.mark.parametrize("deviations", [0.0, 1.0, 2.0, 3.5])
+@pytest.mark.parametrize("k", [2, 16])
+def test_outliers_equal_their_twin(device, deviations, k):
+    points = sphere(10.0).points
+    step = remove_outliers(PointCloud(points), k, deviations, device=device)
+    _, distances = find_neighbours(points, k)
+    assert np.array_equal(step.removed, find_outliers(distances, deviations))
+    assert step.facts["mean_distance_mm"] == pytest.approx(mean_distances(distances).mean(), rel=MEAN_DISTANCE_SHARE)
+    assert np.array_equal(step.cloud.points, points[step.removed == 0])
+    assert step.counts == {"outlier": int(step.removed.sum())}
+
+
+def test_far_points_go_and_the_shape_stays(device):
+    shape, rng = sphere(10.0).points, np.random.default_rng(5)
+    far = rng.uniform(-60, 60, (30, 3))
+    far = far[np.linalg.norm(far, axis=1) > 20]
+    cloud = PointCloud(np.r_[shape, far], hu=np.arange(len(shape) + len(far)))
+    step = remove_outliers(cloud, device=device)
+    assert step.removed[len(shape) :].all()
+    assert step.removed[: len(shape)].mean() < 0.01
+    assert np.array_equal(step.cloud.hu, np.flatnonzero(step.removed == 0))
+
+
+def test_a_ring_of_equal_distances_keeps_all(device):
+    angles = 2.0 * np.pi * np.arange(64) / 64
+    step = remove_outliers(PointCloud(np.c_[np.cos(angles), np.sin(angles), 0 * angles]), 3, 2.0, device=device)
+    assert not step.removed.any()
+    equal = remove_outliers(PointCloud(np.zeros((50, 3))), device=device)
+    assert not equal.removed.any()
+
+
+@pytest.mark.oclgrind
+def test_a_small_cloud(device):
+    points = np.r_[sphere(3.0).points, [[30.0, 0.0, 0.0]]]
+    step = remove_outliers(PointCloud(points), 6, device=device)
+    assert step.removed[-1] == 1
+
+
+@pytest.mark.parametrize("deviations", [-1.0, float("nan"), float("inf"), "2", True])
+def test_wrong_deviations_are_refused(device, deviations):
+    with pytest.raises(UsageError, match="a number from 0 on"):
+        remove_outliers(PointCloud(np.eye(3)), 2, deviations, device=device)
+
+
+def test_one_point_alone_is_refused_in_words(device):
+    step = remove_outliers(PointCloud(np.zeros((1, 3))), device=device)
+    assert len(step.cloud) == 1
+    assert "the cloud has 1 points" in step.warnings[0]
