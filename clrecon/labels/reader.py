@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from math import prod
 from pathlib import Path
 
@@ -13,7 +14,7 @@ from clrecon.geometry.grid import Grid
 from clrecon.labels.grids import read_grid_labels
 from clrecon.labels.label_map import LabelMap
 from clrecon.labels.overlap import check_wanted
-from clrecon.labels.segmentation import read_segmentation
+from clrecon.labels.segmentation import read_segmentation, tell_pixel_bytes
 from clrecon.system.progress import Progress, ignore_progress
 from clrecon.system.text import escape_text
 
@@ -77,12 +78,13 @@ def read_labels(
             raise RefusedInputError(
                 f"{name} is no label map that can be read: NIfTI, NRRD, MetaImage and DICOM SEG are"
             )
+        check = None if volume is None else partial(_check_proportion, name, volume)
         if kind == "DICOM":
-            labels = read_segmentation(path, wanted, progress or ignore_progress)
+            labels = read_segmentation(path, wanted, progress or ignore_progress, check)
         else:
             grid = open_grid(path, kind, LABEL_MAP)
-            if volume is not None:
-                _check_proportion(grid, volume)
+            if check is not None:
+                check(grid.shape_ijk, _stored_bytes(grid))
             labels = read_grid_labels(grid, wanted, progress or ignore_progress)
     except OSError as error:
         raise RefusedInputError(f"{escape_text(path.name)} cannot be read: {error.strerror or error}") from error
@@ -97,7 +99,9 @@ def is_large_map(path: str | Path) -> bool:
     """Tell from its header whether a label map takes long to unpack, and is better held against its scan first."""
     try:
         kind = tell_kind(Path(path))
-        return kind not in (None, "DICOM") and _stored_bytes(open_grid(Path(path), str(kind), LABEL_MAP)) > LARGE_BYTES
+        if kind == "DICOM":
+            return tell_pixel_bytes(Path(path)) > LARGE_BYTES
+        return kind is not None and _stored_bytes(open_grid(Path(path), kind, LABEL_MAP)) > LARGE_BYTES
     except (ClreconError, OSError):  # told by `read_labels`
         return False
 
@@ -106,13 +110,13 @@ def _stored_bytes(grid: GridFile) -> int:
     return prod(grid.shape_ijk) * grid.layers * grid.dtype.itemsize
 
 
-def _check_proportion(grid: GridFile, volume: Grid) -> None:
+def _check_proportion(name: str, volume: Grid, shape_ijk: tuple[int, int, int], stored_bytes: int) -> None:
     """Refuse a large map with many times the voxels of its scan, before it is unpacked."""
-    times = prod(grid.shape_ijk) / prod(volume.shape_ijk)
-    if _stored_bytes(grid) <= LARGE_BYTES or times <= MOST_TIMES:
+    times = prod(shape_ijk) / prod(volume.shape_ijk)
+    if stored_bytes <= LARGE_BYTES or times <= MOST_TIMES:
         return
-    shapes = [" x ".join(map(str, each.shape_ijk)) for each in (grid, volume)]
+    shapes = [" x ".join(map(str, each)) for each in (shape_ijk, volume.shape_ijk)]
     raise RefusedInputError(
-        f"{grid.name} has {shapes[0]} voxels, {times:,.0f} times as many as the scan ({shapes[1]}): it is not unpacked,"
+        f"{name} has {shapes[0]} voxels, {times:,.0f} times as many as the scan ({shapes[1]}): it is not unpacked,"
         f" up to {MOST_TIMES} times are; give labels on the grid of the scan"
     )

@@ -7,7 +7,7 @@ pixels are packed without a gap between frames, lowest bit first).
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -28,12 +28,15 @@ from clrecon.system.progress import Progress, ignore_progress
 from clrecon.system.regular_files import open_regular
 from clrecon.system.text import escape_text, hash_uid
 
-__all__ = ["read_segmentation"]
+__all__ = ["Check", "read_segmentation", "tell_pixel_bytes"]
 
 SEGMENTATION_CLASSES = ("1.2.840.10008.5.1.4.1.1.66.4", "1.2.840.10008.5.1.4.1.1.66.7")
 IMPLICIT_LITTLE, EXPLICIT_LITTLE = "1.2.840.10008.1.2", "1.2.840.10008.1.2.1"
 RLE_LOSSLESS = "1.2.840.10008.1.2.5"
 MOST_FRAMES = 1_000_000
+Check = Callable[[tuple[int, int, int], int], None]
+"""Called with the shape (i, j, k) of a map and its unpacked bytes, before anything is unpacked; may refuse it."""
+
 LARGEST_BYTES = 2**32
 _PLACE: Schema = {
     0x00209113: {0x00200032: None},  # PlanePositionSequence: ImagePositionPatient
@@ -60,9 +63,17 @@ class _Layout:
     frames: int
     bits: int
 
+    @property
+    def pixel_bytes(self) -> int:
+        """Bytes of all frames, unpacked to a byte or two a pixel."""
+        return self.rows * self.columns * self.frames * max(1, self.bits // 8)
+
 
 def read_segmentation(
-    path: Path, only: tuple[str | int, ...] | None = None, progress: Progress = ignore_progress
+    path: Path,
+    only: tuple[str | int, ...] | None = None,
+    progress: Progress = ignore_progress,
+    check: Check | None = None,
 ) -> LabelMap:
     """Read a DICOM SEG of binary segments or of a label map.
 
@@ -73,6 +84,8 @@ def read_segmentation(
         The segments that are wanted; only the other segments may overlap.
     progress : callable
         Called as ``progress("read", frames done, all frames)``.
+    check : callable, optional
+        See `Check`; its errors are those of this function.
 
     Raises
     ------
@@ -84,10 +97,30 @@ def read_segmentation(
     """
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # pydicom's messages quote the file unescaped
-        return _read(path, escape_text(path.name), only, progress)
+        return _read(path, escape_text(path.name), only, progress, check)
 
 
-def _read(path: Path, name: str, only: tuple[str | int, ...] | None, progress: Progress) -> LabelMap:
+def tell_pixel_bytes(path: Path) -> int:
+    """Tell from the header of a DICOM SEG how many bytes its pixels take unpacked; 0 where it does not say so."""
+    from pydicom import dcmread
+
+    try:
+        with warnings.catch_warnings(), open_regular(path) as file:
+            warnings.simplefilter("ignore")
+            dataset = dcmread(
+                file,
+                stop_before_pixels=True,
+                specific_tags=["Rows", "Columns", "NumberOfFrames", "BitsAllocated"],
+            )
+            layout = _layout_of(dataset, "")
+    except Exception:  # pydicom raises many error types; told by `read_segmentation`
+        return 0
+    return layout.pixel_bytes
+
+
+def _read(
+    path: Path, name: str, only: tuple[str | int, ...] | None, progress: Progress, check: Check | None
+) -> LabelMap:
     dataset = _parse(path, name)
     try:
         layout = _read_layout(dataset, name, path.stat().st_size)
@@ -97,6 +130,8 @@ def _read(path: Path, name: str, only: tuple[str | int, ...] | None, progress: P
             raise RefusedInputError(f"{name} is corrupt: {layout.frames} frames and {len(groups)} descriptions of them")
         shared = (list(dataset.get("SharedFunctionalGroupsSequence") or []) or [None])[0]
         stack = place_frames(shared, groups, name)
+        if check is not None:
+            check((layout.columns, layout.rows, stack.slices), layout.pixel_bytes)
         frame_of_reference = str(dataset.get("FrameOfReferenceUID", ""))
         numbers = None if layout.kind == "LABELMAP" else [_segment_of(group, shared) for group in groups]
         pixels = _FramePixels(dataset, layout, name)
@@ -170,9 +205,7 @@ def _read_layout(dataset: Any, name: str, file_bytes: int) -> _Layout:
             f"{name} holds segments of type {escape_text(kind) or 'unknown'}: binary ones and label maps are read,"
             " fractional ones do not say which voxels they mean"
         )
-    layout = _Layout(
-        kind, int(dataset.Rows), int(dataset.Columns), int(dataset.get("NumberOfFrames", 1)), int(dataset.BitsAllocated)
-    )
+    layout = _layout_of(dataset, kind)
     if layout.bits not in ((1, 8) if kind == "BINARY" else (8, 16)) or not 0 < layout.frames <= MOST_FRAMES:
         raise RefusedInputError(f"{name} is corrupt: {layout.frames} frames of {layout.bits} bits a pixel")
     compressed = dataset.file_meta.TransferSyntaxUID == RLE_LOSSLESS
@@ -182,6 +215,11 @@ def _read_layout(dataset: Any, name: str, file_bytes: int) -> _Layout:
     shape = (layout.columns, layout.rows, layout.frames)
     check_size(name, shape, max(1, layout.bits // 8), held, compressed=False)
     return layout
+
+
+def _layout_of(dataset: Any, kind: str) -> _Layout:
+    frames = int(dataset.get("NumberOfFrames", 1))
+    return _Layout(kind, int(dataset.Rows), int(dataset.Columns), frames, int(dataset.BitsAllocated))
 
 
 def _segment_of(group: Any, shared: Any) -> int:

@@ -11,8 +11,10 @@ from pydicom.uid import DeflatedExplicitVRLittleEndian, RLELossless
 
 from clrecon.dicom import read_volume
 from clrecon.errors import RefusedInputError, UsageError
+from clrecon.geometry import Volume
 from clrecon.geometry.certificate import amend
 from clrecon.labels import read_labels, resample_labels
+from clrecon.labels.reader import is_large_map
 
 pytest.importorskip("highdicom")
 
@@ -68,6 +70,27 @@ def test_progress_counts_frames_from_the_first_to_the_last(tmp_path, kind):
     read_labels(path, progress=lambda *step: told.append(step))
     frames = pydicom.dcmread(path).NumberOfFrames
     assert told == [("read", frame, frames) for frame in range(1, frames + 1)]
+
+
+@pytest.mark.parametrize(("kind", "syntax"), [("BINARY", None), ("LABELMAP", RLELossless)], ids=["bits", "rle"])
+def test_a_large_segmentation_is_held_against_its_scan_before_it_is_unpacked(tmp_path, monkeypatch, kind, syntax):
+    path = write_seg(tmp_path / "a.dcm", masks(), ct_slices(), kind=kind, syntax=syntax)  # 5 slices of 9 x 6
+    small, fits = (Volume(np.zeros(shape, np.int16), np.eye(4)) for shape in ((1, 5, 6), (1, 5, 7)))
+    assert not is_large_map(path) and read_labels(path, volume=small).numbers == (1, 2)
+    frames = pydicom.dcmread(path).NumberOfFrames
+    for most, large in ((frames * 54 - 1, True), (frames * 54, False)):
+        monkeypatch.setattr("clrecon.labels.reader.LARGE_BYTES", most)
+        assert is_large_map(path) == large
+    assert read_labels(path, volume=small).numbers == (1, 2)
+    monkeypatch.setattr("clrecon.labels.reader.LARGE_BYTES", frames * 54 - 1)
+    assert read_labels(path, volume=fits).numbers == (1, 2)  # 270 voxels for 35
+    monkeypatch.setattr("clrecon.labels.segmentation._FramePixels", None)
+    with pytest.raises(
+        RefusedInputError, match=r"a.dcm has 9 x 6 x 5 voxels, 9 times as many as the scan \(6 x 5 x 1\)"
+    ):
+        read_labels(path, volume=small)
+    (tmp_path / "b.dcm").write_bytes(path.read_bytes()[:400])
+    assert not is_large_map(tmp_path / "b.dcm")
 
 
 def test_holes_between_frames_are_slices_without_labels(tmp_path):
