@@ -33,11 +33,10 @@ from clrecon.rendering.pictures.styles import (
 )
 from clrecon.rendering.views.camera import Camera
 from clrecon.rendering.views.clip import Clip
-from clrecon.rendering.views.directions import DIRECTIONS, checked_size
+from clrecon.rendering.views.directions import DEFAULT_SIZE, DIRECTIONS, checked_size
 from clrecon.rendering.views.plane import find_plane
 
 __all__ = [
-    "DEFAULT_SIZE",
     "LabelLook",
     "POINT_COLORS",
     "RenderSettings",
@@ -47,7 +46,6 @@ __all__ = [
     "describe_presets",
 ]
 
-DEFAULT_SIZE = (1024, 1024)
 DEFAULT_VIEWS = {"slice": "axial", "cpr": "left"}
 """Default view of the modes whose default is not the view from the front."""
 SPINES = (SPINE, "auto")

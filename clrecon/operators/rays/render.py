@@ -34,12 +34,11 @@ from clrecon.rendering.pictures.styles import (
     VolumeLook,
 )
 from clrecon.rendering.views.camera import Camera, box_corners
-from clrecon.rendering.views.directions import checked_size
+from clrecon.rendering.views.directions import DEFAULT_SIZE, checked_size
 from clrecon.system.progress import Progress
 
 __all__ = ["VolumeRenderer", "render"]
 
-DEFAULT_SIZE = (1024, 1024)
 DEFAULT_VIEW = "anterior"
 
 SMALLEST_STEP = 0.01

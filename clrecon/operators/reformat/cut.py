@@ -22,13 +22,12 @@ from clrecon.rendering.pictures.styles import CurveCut, PlaneCut
 from clrecon.rendering.views.camera import Camera
 from clrecon.rendering.views.centre_line import Curve
 from clrecon.rendering.views.curved import CurvedSheet, straightened_sheet, stretched_length, stretched_sheet
-from clrecon.rendering.views.directions import checked_size, find_up, find_view
+from clrecon.rendering.views.directions import DEFAULT_SIZE, checked_size, find_up, find_view
 from clrecon.rendering.views.plane import Sheet, find_plane, finest_step, plane_sheet, slab_samples
 from clrecon.system.progress import Progress
 
 __all__ = ["cut_slice", "reformat_curve"]
 
-DEFAULT_SIZE = (1024, 1024)
 
 WHOLE_SHARE = 0.85
 """Share of the volume's height; if the spine was found over less, a warning says so."""

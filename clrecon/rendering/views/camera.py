@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from clrecon.errors import UsageError
 from clrecon.geometry.affine import Float64Array, checked_points
 from clrecon.geometry.grid import Grid
-from clrecon.rendering.views.directions import checked_size, checked_vector, find_up, find_view
+from clrecon.rendering.views.directions import DEFAULT_SIZE, checked_size, checked_vector, find_up, find_view
 
 __all__ = ["Camera", "CameraBasis", "box_corners"]
 
@@ -128,7 +128,7 @@ class Camera:
         *,
         up: str | ArrayLike | None = None,
         view_angle: float | None = None,
-        size: Sequence[int] = (1024, 1024),
+        size: Sequence[int] = DEFAULT_SIZE,
         turning: bool = False,
     ) -> Camera:
         """Return a camera that looks at the middle of a volume from a side of the patient, so that the volume just

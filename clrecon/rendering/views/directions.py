@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 from clrecon.errors import UsageError
 from clrecon.geometry.affine import Float64Array
 
-__all__ = ["DIRECTIONS", "LARGEST_SIDE", "checked_size", "checked_vector", "find_up", "find_view"]
+__all__ = ["DEFAULT_SIZE", "DIRECTIONS", "LARGEST_SIDE", "checked_size", "checked_vector", "find_up", "find_view"]
 
 DIRECTIONS: dict[str, tuple[float, float, float]] = {
     "anterior": (0.0, -1.0, 0.0),
@@ -21,6 +21,9 @@ DIRECTIONS: dict[str, tuple[float, float, float]] = {
     "inferior": (0.0, 0.0, -1.0),
 }
 """Unit vectors in LPS, from the middle of the patient to each side; the view of that name is taken from there."""
+
+DEFAULT_SIZE = (1024, 1024)
+"""Width and height of a picture for which none are given."""
 
 LARGEST_SIDE = 16384
 """Largest number of pixels along a side of a picture; more is a typing error."""
