@@ -1,4 +1,4 @@
-"""The virtual environment of this project, made once and then found again (shared by run.py and test.py).
+"""The virtual environment of this project, made once and then found again (shared by run.py, test.py and comparisons).
 
 A finished environment has a stamp: a file with the text of setup.cfg and pyproject.toml, the Python, the folder and
 the extras.  If the stamp is missing or differs (a changed file, another Python, an interrupted installation), the
@@ -13,7 +13,7 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-__all__ = ["ROOT", "SetupError", "ensure_environment", "program_path"]
+__all__ = ["ROOT", "SetupError", "ensure_environment", "find_python", "program_path"]
 
 ROOT = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))
 _STAMP = "clrecon-installed.txt"
@@ -29,6 +29,15 @@ def program_path(folder: str, name: str) -> str:
     if os.name == "nt":
         return os.path.join(folder, "Scripts", name + ".exe")
     return os.path.join(folder, "bin", name)
+
+
+def find_python(checkout: str | os.PathLike[str]) -> str | None:
+    """Return the Python of a checkout's environment, that of the tests before that of scripts/run.py; None without."""
+    for folder in (".venv-test", ".venv"):
+        python = program_path(os.path.join(os.path.abspath(checkout), folder), "python")
+        if os.path.exists(python):
+            return python
+    return None
 
 
 def _wanted_stamp(extras: str) -> str:

@@ -24,6 +24,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from _environment import find_python
+
 VOLATILE = frozenset({"seconds", "seconds_a_frame", "peak_memory_bytes", "version"})
 """Names in reports whose values differ between runs, or always differ between versions."""
 
@@ -101,11 +103,10 @@ def _parse() -> argparse.Namespace:
 
 def _program(checkout: Path) -> list[str]:
     """Return the command that calls clrecon of a checkout."""
-    for name in (".venv-test", ".venv"):
-        python = checkout / name / ("Scripts/python.exe" if sys.platform == "win32" else "bin/python")
-        if python.exists():
-            return [str(python.absolute()), "-m", "clrecon"]
-    return [sys.executable, str((checkout / "scripts" / "run.py").resolve())]
+    python = find_python(checkout)
+    if python is None:
+        return [sys.executable, str((checkout / "scripts" / "run.py").resolve())]
+    return [python, "-m", "clrecon"]
 
 
 def _compare_all(options: argparse.Namespace, scratch: Path) -> Iterator[str]:

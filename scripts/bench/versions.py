@@ -22,27 +22,22 @@ from typing import Any
 
 import numpy as np
 
-sys.path.insert(0, str(Path(__file__).resolve().parent))
+sys.path[:0] = [str(Path(__file__).resolve().parent), str(Path(__file__).resolve().parent.parent)]
 
+from _environment import find_python  # noqa: E402
 from measure import describe_machine, write_json  # noqa: E402
 from results import device_name  # noqa: E402
 
 SIDES = ("clrecon_s", "peer_s")
 
 
-def find_python(folder: Path) -> Path:
-    """Return the Python of a checkout's environment."""
-    for name in (".venv-test", ".venv"):
-        python = folder / name / "bin" / "python"
-        if python.exists():
-            return python
-    raise SystemExit(f"{folder} has no environment: run its scripts/test.py or scripts/run.py once")
-
-
 def run_bench(folder: Path, case: str, given: str, device: str, options: argparse.Namespace) -> dict[str, Any]:
     """Run one case in one checkout and return its result."""
+    python = find_python(folder)
+    if python is None:
+        raise SystemExit(f"{folder} has no environment: run its scripts/test.py or scripts/run.py once")
     with tempfile.TemporaryDirectory() as results:
-        command = [str(find_python(folder)), str(folder / "scripts" / "bench" / "bench.py"), "run", case]
+        command = [python, str(folder / "scripts" / "bench" / "bench.py"), "run", case]
         command += ["--input", given, "--device", device, "--pairs", str(options.pairs), "--limit", str(options.limit)]
         done = subprocess.run([*command, "--json", results], cwd=folder, capture_output=True, text=True)
         files = list(Path(results).glob("*.json"))
