@@ -28,6 +28,7 @@ from clrecon.operators.points.neighbours import Neighbours as Neighbours
 from clrecon.operators.points.neighbours import find_neighbours as find_neighbours
 from clrecon.operators.points.normals import estimate_normals as estimate_normals
 from clrecon.operators.points.outliers import remove_outliers as remove_outliers
+from clrecon.operators.points.slice_overlap import find_ghost_slices as find_ghost_slices
 from clrecon.operators.rays.render import VolumeRenderer as VolumeRenderer
 from clrecon.operators.rays.render import render as render
 from clrecon.operators.reformat.cut import cut_slice as cut_slice
@@ -40,6 +41,8 @@ from clrecon.operators.surface.label_masks import extract_label_masks as extract
 from clrecon.operators.surface.labels import extract_labels as extract_labels
 from clrecon.points import PointCloud as PointCloud
 from clrecon.points import PointStep as PointStep
+from clrecon.points import drop_ghost_slices as drop_ghost_slices
+from clrecon.points import fill_ghost_slices as fill_ghost_slices
 from clrecon.points import keep_clusters as keep_clusters
 from clrecon.points.reader import read_points as read_points
 from clrecon.reading import list_series as list_series

@@ -185,6 +185,7 @@ INVERSIONS: dict[str, dict[str, tuple[tuple[str, str], ...]]] = {
         "points": (("= point.x;", "= -point.x;"), ("= point.y;", "= -point.y;"), ("= point.z;", "= -point.z;")),
         "starts": (("starts[cell] = place;", "starts[cell] = ~place;"), ("= n;", "= ~n;")),
     },
+    "count_overlaps": {"counts": tuple((f"= {what};", f"= ~{what};") for what in ("own", "next", "second"))},
     "clear_words": {"mask": (("mask[word] = 0;", "mask[word] = ~0u;"),)},
     "set_bits": {"mask": (("1u << (voxel.x & 31)", "~(1u << (voxel.x & 31))"),)},
     "find_extents": {"extents": (("(ushort)end);", "(ushort)~end);"),)},

@@ -12,7 +12,7 @@ __all__ = ["add_arguments", "run"]
 
 _SETTINGS = (
     "kind", "size", "slices", "spacing", "tilt", "oblique", "noise", "point_spread_mm", "seed", "radius_mm",
-    "table", "table_gap_mm", "prone",
+    "table", "table_gap_mm", "prone", "ghosts",
 )  # fmt: skip
 
 
@@ -44,6 +44,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--table", metavar="T", help="what a body lies on: none, flat, curved or headrest")
     parser.add_argument("--table-gap", dest="table_gap_mm", type=float, metavar="MM", help="between body and table")
     parser.add_argument("--prone", action="store_true", default=None, help="the patient lies on the face")
+    parser.add_argument(
+        "--ghosts", action="store_true", default=None, help="of a spine: two foreign slices, and a localizer"
+    )
     parser.add_argument("--seed", type=int, metavar="N")
     add_no_clobber(parser)
 
@@ -78,5 +81,8 @@ def _summary(truth: dict[str, Any], output: str) -> list[str]:
     lines.append(f"surface  at {truth['iso_value_hu']:g} HU")
     if truth["surface"]:
         lines[-1] += f": {truth['surface']['area_mm2']:,.1f} mm2, {truth['surface']['volume_ml']:,.3f} ml"
+    if truth["ghosts"]:
+        said = [f"slice {one['slice']} shows {one['shows']}" for one in truth["ghosts"]["slices"]]
+        lines.append(f"ghosts   {', '.join(said)}; the last file is a localizer")
     beside = "truth.json and materials.nrrd" if truth["parts"] else "truth.json"
     return [*lines, f"wrote    {printable(output)}, with the truth in {beside}"]

@@ -17,6 +17,7 @@ from clrecon.errors import OutputError, UsageError
 from clrecon.geometry import column_spacing, tilt_degrees
 from clrecon.phantom.bodies import choose_body
 from clrecon.phantom.dicom_series import RESCALE_INTERCEPT, write_series
+from clrecon.phantom.ghosts import draw_ghosts
 from clrecon.phantom.label_map import write_label_map
 from clrecon.phantom.plan import Anatomy
 from clrecon.phantom.sampling import add_noise, apply_point_spread, sample_occupancy
@@ -96,6 +97,7 @@ def _make(
     floor, ceiling = (-32768, 32767 + RESCALE_INTERCEPT) if labels is None else (RESCALE_INTERCEPT, CEILING_HU)
     for k in range(len(field)):
         voxels[k] = np.rint(np.clip(field[k], floor, ceiling))
+    ghosts = draw_ghosts(voxels, settings.seed) if settings.ghosts else None
     truth = {
         "generator": _GENERATOR,
         "version": package_version(),
@@ -109,6 +111,7 @@ def _make(
         "half_maximum_hu": half_maximum,
         "surface": surface,
         "spine": spine,
+        "ghosts": ghosts,
         "parts": None if labels is None else describe_parts(voxels, labels, affine),
         "noise_hu": settings.noise,
         "point_spread_mm": settings.point_spread_mm,
@@ -144,7 +147,8 @@ def make_phantom(
     truth : dict
         Plain JSON types: ``kind, shape_ijk, affine_ijk_to_lps_mm, spacing_mm (di, dj, dk), tilt_deg,
         iso_value_hu``, ``half_maximum_hu`` and ``surface`` (analytic shapes, else null), ``spine`` (centres of the
-        vertebrae, the marker on the patient's left and what is absent, else null), ``parts`` (scenes: each material
+        vertebrae, the marker on the patient's left and what is absent, else null), ``ghosts`` (the foreign slices, else
+        null), ``parts`` (scenes: each material
         with its label in `label_materials`, voxels, volume and voxels above 300 HU, else null), ``noise_hu,
         point_spread_mm, seed, version, settings``.
 

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.errors import OutputError
+from clrecon.phantom.ghosts import make_localizer
 from clrecon.phantom.settings import PhantomSettings, Placement
 from clrecon.system.progress import Progress
 
@@ -127,10 +128,18 @@ def write_series(
         A file cannot be written.
     """
     for k, header in enumerate(_make_headers(settings, placement)):
-        stored = voxels[k] - np.int16(RESCALE_INTERCEPT)
-        header.PixelData = stored.astype("<i2").tobytes()
-        path = folder / slice_file_name(k)
-        header.save_as(path, enforce_file_format=True)
-        _check_written(path, header, stored)
+        _write_image(folder / slice_file_name(k), header, voxels[k])
         if progress is not None:
             progress("write", k + 1, len(voxels))
+    if settings.ghosts:
+        number, instance = len(voxels) + 1, _make_uid(settings, "instance", "localizer")
+        localizer, view = make_localizer(header, voxels, placement.affine, number, instance)
+        _write_image(folder / slice_file_name(len(voxels)), localizer, view)
+
+
+def _write_image(path: Path, header: FileDataset, values: NDArray[np.int16]) -> None:
+    """Write one image in HU and read it back."""
+    stored = values - np.int16(RESCALE_INTERCEPT)
+    header.PixelData = stored.astype("<i2").tobytes()
+    header.save_as(path, enforce_file_format=True)
+    _check_written(path, header, stored)

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from clrecon.errors import UsageError
 from clrecon.geometry import compose_affine
+from clrecon.phantom.ghosts import ghost_places
 
 __all__ = [
     "KINDS",
@@ -151,6 +152,9 @@ class PhantomSettings:
     prone : bool
         The patient lies on the face: the table is at the front, and the image's rows and columns are turned by half a
         turn about z, as a scanner does it (PatientPosition HFP).
+    ghosts : bool
+        Of a spine: two slices of the stack are foreign, a screen capture and a sagittal view, the folder has a
+        sagittal localizer, and the table is the curved one unless another is named.
     transfer_syntax : {"explicit", "implicit"}
         Value representations in the files, both little endian and uncompressed.
 
@@ -175,6 +179,7 @@ class PhantomSettings:
     table: str | None = None
     table_gap_mm: float = 0.0
     prone: bool = False
+    ghosts: bool = False
     transfer_syntax: str = "explicit"
 
     def __post_init__(self) -> None:
@@ -212,6 +217,10 @@ class PhantomSettings:
                 raise UsageError(f"a {self.kind} has no radius: it is for sphere, torus, cylinder and plane")
         _check_number("gap between body and table", self.table_gap_mm, -100.0, 500.0, "mm")
         self._check_lying()
+        if self.ghosts:
+            if self.kind != "spine":
+                raise UsageError(f"a {self.kind} has no ghosts: they are for the spine")
+            ghost_places(self.slices)
 
     def _check_lying(self) -> None:
         if self.table is not None and self.table not in TABLE_NAMES:
@@ -225,8 +234,10 @@ class PhantomSettings:
 
     @property
     def table_used(self) -> str:
-        """Name of the table: the given one, else that of the kind; ``own`` for the spine's own couch."""
-        return self.table or KINDS[self.kind].table or "none"
+        """Name of the table: the given one, else that of the kind; ``own`` for the spine's own couch, which is too thin
+        to be a ghost.
+        """
+        return self.table or ("curved" if self.ghosts else KINDS[self.kind].table) or "none"
 
     @property
     def shape_kji(self) -> tuple[int, int, int]:
@@ -234,14 +245,14 @@ class PhantomSettings:
         return self.slices, self.size[1], self.size[0]
 
     def as_dict(self) -> dict[str, Any]:
-        """All settings as plain JSON types; `table`, `table_gap_mm` and `prone` where they are not the default.
+        """All settings as plain JSON types; `table`, `table_gap_mm`, `prone`, `ghosts` where they are not the default.
 
         UIDs are derived from these texts, so the defaults are left out: phantoms of earlier versions keep their UIDs.
         """
         plain = {
             name: list(value) if isinstance(value, tuple) else value for name, value in dataclasses.asdict(self).items()
         }
-        for name, default in (("table", None), ("table_gap_mm", 0.0), ("prone", False)):
+        for name, default in (("table", None), ("table_gap_mm", 0.0), ("prone", False), ("ghosts", False)):
             if plain[name] == default:
                 del plain[name]
         return plain

@@ -20,9 +20,9 @@ KEYWORDS = ("device", "memory", "progress")
 TAKE_PROGRESS = {
     "SurfaceExtractor.extract", "VolumeRenderer.render", "choose_iso_value", "cluster_points", "compare_meshes",
     "cut_slice", "decimate_mesh", "denoise_points", "estimate_normals", "extract_isosurface", "extract_isosurfaces",
-    "extract_label_masks", "extract_labels", "find_neighbours", "find_spine_line", "list_series",
-    "mask_field_of_view", "read_labels", "read_volume", "reformat_curve", "remove_outliers", "remove_table",
-    "render", "smooth_mesh", "write_animation",
+    "extract_label_masks", "extract_labels", "find_ghost_slices", "find_neighbours", "find_spine_line",
+    "list_series", "mask_field_of_view", "read_labels", "read_volume", "reformat_curve", "remove_outliers",
+    "remove_table", "render", "smooth_mesh", "write_animation",
 }  # fmt: skip
 """What can take longer than a second."""
 

@@ -1,4 +1,4 @@
-"""Checks of clusters of voxels: masks of bands and of lists, and DBSCAN on even and uneven stacks."""
+"""Checks of voxels of a band: masks, clusters on even and uneven stacks, what neighbouring slices have in common."""
 
 from __future__ import annotations
 
@@ -10,10 +10,12 @@ from clrecon.jobs.selftest.check import Check, require_equal
 from clrecon.jobs.selftest.scenes import OBLIQUE, noise, stack
 from clrecon.opencl import Device, download
 from clrecon.operators.points.band_mask import VoxelMask, mark_band, mark_voxels
+from clrecon.operators.points.slice_overlap import count_overlaps
 from clrecon.operators.points.voxel_clusters import ClusterSearch, pad_for
 from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.points.stencil import Lattice, make_stencil
 from clrecon.reference.points import clusters as twin
+from clrecon.reference.points import slice_overlap as overlap_twin
 
 __all__ = ["CHECKS"]
 
@@ -70,6 +72,15 @@ def _check_clusters(device: Device) -> str:
     return f"{', '.join(map(str, said))} clusters equal"
 
 
+def _check_overlaps(device: Device) -> str:
+    volume = _volume(False)
+    with DeviceVolume(volume, device=device) as resident:
+        counts = count_overlaps(device, mark_band(resident, (75.0, 110.0)))
+    inside = (volume.voxels >= 75) & (volume.voxels <= 110)
+    require_equal(counts, overlap_twin.count_overlaps(inside), "voxels that neighbouring slices have in common")
+    return f"{len(inside)} slices equal"
+
+
 CHECKS = (
     Check("masks of voxels", ("clear_words", "set_bits", "find_extents"), _check_masks),
     Check(
@@ -81,4 +92,5 @@ CHECKS = (
         _check_clusters,
         {"surface/classify.cl": ("RANGE",)},
     ),
+    Check("overlap of slices", ("count_overlaps",), _check_overlaps),
 )  # fmt: skip

@@ -1,0 +1,171 @@
+"""Ghost slices: foreign slices of a stack, told by how little they have in common with both neighbours."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clrecon.errors import UsageError
+from clrecon.geometry import Volume
+from clrecon.points.cloud import PointCloud
+from clrecon.points.step import PointStep
+
+__all__ = ["GHOST_SHARE", "GhostSlices", "drop_ghost_slices", "fill_ghost_slices", "judge_slices"]
+
+GHOST_SHARE = 0.75
+"""A slice is a ghost where its likeness to both neighbours is below this share of their likeness to each other."""
+
+REASON = "ghost slice"
+
+
+@dataclass(frozen=True)
+class GhostSlices:
+    """The result of the slice test.
+
+    Attributes
+    ----------
+    slices : tuple of int
+        The ghosts, ascending.
+    points : ndarray, shape (nk,), int64
+        Voxels of the band in each slice.
+    nearest : ndarray, shape (nk,), float64
+        The higher one of Dice's coefficients with the slice before and the one behind.
+    around : ndarray, shape (nk,), float64
+        Dice's coefficient of these two slices with each other.
+    hu : (float, float)
+        The band.
+    warnings : tuple of str
+        A line each.
+
+    Notes
+    -----
+    `nearest` and `around` are NaN in the first and the last slice, which are not tested, and where neither slice has a
+    voxel in the band.
+    """
+
+    slices: tuple[int, ...]
+    points: NDArray[np.int64]
+    nearest: NDArray[np.float64]
+    around: NDArray[np.float64]
+    hu: tuple[float, float]
+    warnings: tuple[str, ...] = ()
+
+    @property
+    def tested(self) -> int:
+        """Number of slices that were tested: all with points but the first and the last."""
+        return int(((self.points > 0) & np.isfinite(self.around)).sum())
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the entries of a report: ghosts with their figures, and the least like of all others."""
+        others = np.where(np.isin(np.arange(len(self.points)), self.slices), np.nan, self._shares())
+        return {
+            "hu": list(self.hu),
+            "slices": len(self.points),
+            "slices_tested": self.tested,
+            "ghost_slices": [
+                {
+                    "slice": k,
+                    "points": int(self.points[k]),
+                    "dice_with_neighbour": round(float(self.nearest[k]), 4),
+                    "dice_of_neighbours": round(float(self.around[k]), 4),
+                }
+                for k in self.slices
+            ],
+            "ghost_share": GHOST_SHARE,
+            "least_share_of_others": None if np.isnan(others).all() else round(float(np.nanmin(others)), 4),
+        }
+
+    def _shares(self) -> NDArray[np.float64]:
+        with np.errstate(divide="ignore", invalid="ignore"):
+            shares: NDArray[np.float64] = np.where(self.points > 0, self.nearest / self.around, np.nan)
+        return np.where(np.isfinite(shares), shares, np.nan)
+
+
+def judge_slices(counts: NDArray[np.int64], hu: tuple[float, float], warnings: tuple[str, ...] = ()) -> GhostSlices:
+    """Tell the ghosts from the counts of voxels.
+
+    Parameters
+    ----------
+    counts : ndarray, shape (3, nk), int64
+        Voxels of each slice, and those that it has in common with the next slice and with the one after.
+    hu : (float, float)
+        Band of the voxels.
+    warnings : tuple of str
+        Given on.
+    """
+    points, nk = counts[0], counts.shape[1]
+    nearest, around = np.full(nk, np.nan), np.full(nk, np.nan)
+    if nk >= 3:
+        with np.errstate(divide="ignore", invalid="ignore"):
+            likeness = [2.0 * counts[n, : nk - n] / (points[: nk - n] + points[n:]) for n in (1, 2)]
+        nearest[1:-1] = np.fmax(likeness[0][:-1], likeness[0][1:])
+        around[1:-1] = likeness[1]
+    ghosts = (points > 0) & (nearest < GHOST_SHARE * around)  # NaN is no ghost
+    return GhostSlices(tuple(np.flatnonzero(ghosts).tolist()), points, nearest, around, hu, warnings)
+
+
+def drop_ghost_slices(cloud: PointCloud, found: GhostSlices, *, volume: Volume | None = None) -> PointStep:
+    """Remove the points of ghost slices.
+
+    Parameters
+    ----------
+    cloud : PointCloud
+        Voxel centres, or with `volume` points of a surface, of which those nearer than one slice to a ghost go.
+    found : GhostSlices
+        Of the volume that the cloud comes from, see `find_ghost_slices`.
+    volume : Volume, optional
+        That volume, for clouds without `ijk`.
+
+    Returns
+    -------
+    PointStep
+        Reason "ghost slice".
+
+    Raises
+    ------
+    UsageError
+        The cloud has no voxel indices and no volume is given, or its slices are not those that were tested.
+    """
+    nk = len(found.points)
+    if cloud.ijk is not None:
+        k, reach = cloud.ijk[:, 2].astype(np.float64), 0.5
+    elif volume is not None:
+        k, reach = volume.lps_to_ijk(cloud.points)[:, 2], 1.0
+    else:
+        raise UsageError("the points do not say in which slice they lie: give the volume that they come from")
+    if len(k) and not -1.0 <= k.min() <= k.max() <= nk:
+        raise UsageError(f"the points lie in slices {k.min():g} to {k.max():g}, {nk} were tested: another volume")
+    removed = np.zeros(len(cloud), np.uint8)
+    for ghost in found.slices:
+        removed[np.abs(k - ghost) < reach] = 1
+    return PointStep(cloud.select(removed == 0), removed, (REASON,), found.as_dict(), found.warnings)
+
+
+def fill_ghost_slices(volume: Volume, found: GhostSlices) -> Volume:
+    """Return a volume whose ghosts are copies of the slice before, or behind where that is a ghost too.
+
+    It is for what looks at whole bodies, such as `remove_table`: a screen capture would tie body and table into one.
+    No value of a filled slice was measured there: remove its points with `drop_ghost_slices` all the same.
+
+    Parameters
+    ----------
+    volume : Volume
+    found : GhostSlices
+        Of this volume.
+
+    Raises
+    ------
+    UsageError
+        The volume has another number of slices than were tested.
+    """
+    if volume.shape_ijk[2] != len(found.points):
+        raise UsageError(f"{len(found.points)} slices were tested, the volume has {volume.shape_ijk[2]}")
+    if not found.slices:
+        return volume
+    voxels = volume.voxels.copy()
+    for k in found.slices:
+        voxels[k] = volume.voxels[k - 1 if k - 1 not in found.slices else k + 1]
+    return volume.with_voxels(voxels)
