@@ -13,6 +13,7 @@ from clrecon.jobs.selftest import (
     reformat,
     resident,
     surface,
+    voxel_points,
 )
 from clrecon.jobs.selftest.check import Check
 
@@ -29,6 +30,7 @@ CHECKS: tuple[Check, ...] = (
     *points.CHECKS,
     *clusters.CHECKS,
     *point_filters.CHECKS,
+    *voxel_points.CHECKS,
 )
 
 
