@@ -23,10 +23,11 @@ from clrecon.opencl import (
     result_pages,
     upload,
 )
+from clrecon.operators.points.band_mask import prepare_band_mask
 from clrecon.operators.primitives.scan import exclusive_scan, prepare_scan
 from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.operators.resident.voxel_types import label_variants, voxel_variants
-from clrecon.operators.surface.marching_cubes import load_classify, pad4, split_steps
+from clrecon.operators.surface.marching_cubes import pad4, split_steps
 from clrecon.operators.surface.slabs import OUTPUT_SHARE
 from clrecon.points.cloud import MOST_POINTS
 from clrecon.system.progress import Progress
@@ -77,7 +78,7 @@ def prepare_voxels(device: Device, dtype: DTypeLike, labels: DTypeLike | None = 
         The driver's compiler refuses.
     """
     prepare_scan(device)
-    load_classify(device, dtype, "between")
+    prepare_band_mask(device, dtype)
     own = {} if labels is None else label_variants(labels)
     return load_program(device, "points/emit.cl", {**voxel_variants(dtype), **device.kernel_variants, **own})
 
@@ -242,7 +243,7 @@ class VoxelEmission:
         rows = (stop - begin) * nj
         mask_d, extents_d = allocate(device, 4 * rows * words), allocate(device, 4 * rows)
         launch(
-            device, load_classify(device, self.volume.voxels.dtype, "between")["classify_samples"], rows,
+            device, prepare_band_mask(device, self.volume.voxels.dtype)["classify_samples"], rows,
             stopwatch=stopwatch, voxels=voxels_d, mask=mask_d, row_extents=extents_d, level=chosen.low,
             highest=chosen.high, ni=ni, nj=nj, nk=nk, border=0, first_slice=begin, first_sample_slice=begin,
             gk=stop - begin, words=words,

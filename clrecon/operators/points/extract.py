@@ -7,14 +7,15 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import DTypeLike, NDArray
+from numpy.typing import NDArray
 
 from clrecon.anatomy.head import warn_of_face
 from clrecon.errors import NoSurfaceError, UsageError
 from clrecon.geometry import Volume
-from clrecon.geometry.iso_rule import checked_iso_value, data_range
+from clrecon.geometry.iso_rule import data_range
 from clrecon.geometry.precision import describe_far
 from clrecon.opencl import Device
+from clrecon.operators.points.band_mask import band_bounds, checked_band
 from clrecon.operators.points.emit import Selection, VoxelEmission
 from clrecon.operators.resident.device_volume import DeviceVolume, open_volume
 from clrecon.operators.surface.extract import SurfaceExtractor
@@ -63,8 +64,8 @@ def extract_points(
         `hu` is given.
     kind : {"surface", "shell", "voxels"}, optional
         None: "voxels" where `hu` is given, else "surface".
-    hu : (float, float or None), optional
-        Lowest and highest value of a band, both included; None: no upper end.  For "surface" both ends are levels.
+    hu : (float or None, float or None), optional
+        Lowest and highest value of a band, both included; None: no such end.  For "surface" both ends are levels.
     labels : LabelMap, optional
         Only points of a label, on any grid; see `clrecon.labels.resample_labels`.  For voxels the label is what the map
         says; for a surface what `clrecon.extract_labels` makes of it, which grows it by a voxel.
@@ -112,7 +113,7 @@ def extract_points(
             level = iso_value if hu is None else hu
             cloud = _surface(resident, level, labels, label, progress)
         else:
-            band = _checked_band((iso_value, None) if hu is None else hu)
+            band = _closed_band((iso_value, None) if hu is None else hu)
             cloud = _voxels(resident, band, kind == "shell", labels, label, paper, progress)
     cloud.report.update(kind=kind, voxels=resident.volume.voxels.size, points=len(cloud))
     return cloud
@@ -131,29 +132,18 @@ def _check(iso_value: object, kind: str | None, hu: object, labels: object, labe
     return kind
 
 
-def _checked_band(hu: Sequence[float | None]) -> Band:
-    if len(hu) != 2 or hu[0] is None:
-        raise UsageError(f"a band of HU is a lowest and a highest value, not {hu!r}")
-    low, high = checked_iso_value(hu[0]), math.inf if hu[1] is None else checked_iso_value(hu[1])
-    if low > high:
-        raise UsageError(f"the band {low:g} to {high:g} HU holds nothing: give its lower end first")
-    return low, high
-
-
-def _ends(dtype: DTypeLike, band: Band) -> tuple[Any, Any] | None:
-    """Return the ends of a band as values of the voxels' type; None where it holds none of them."""
-    dtype = np.dtype(dtype)
-    if dtype.kind == "f":
-        with np.errstate(over="ignore"):
-            return np.float32(band[0]), np.float32(band[1])
-    limits = np.iinfo(dtype)
-    low = max(math.ceil(band[0]), limits.min)
-    high = limits.max if math.isinf(band[1]) else min(math.floor(band[1]), limits.max)
-    return (dtype.type(low), dtype.type(high)) if low <= high else None
+def _closed_band(hu: Sequence[float | None]) -> Band:
+    """Return a band whose ends may be None for open ones; see `checked_band`."""
+    if len(hu) != 2:
+        return checked_band(np.array(hu, dtype=object))
+    return checked_band([-math.inf if hu[0] is None else hu[0], math.inf if hu[1] is None else hu[1]])
 
 
 def _describe(band: Band) -> str:
-    return f"{band[0]:g} HU or more" if math.isinf(band[1]) else f"{band[0]:g} to {band[1]:g} HU"
+    low, high = band
+    if math.isinf(high):
+        return f"{low:g} HU or more"
+    return f"{high:g} HU or less" if math.isinf(low) else f"{low:g} to {high:g} HU"
 
 
 def _refuse_band(volume: Volume, band: Band, where: str) -> NoSurfaceError:
@@ -166,9 +156,7 @@ def _voxels(
     progress: Progress | None,
 ) -> PointCloud:  # fmt: skip
     volume = resident.volume
-    ends = _ends(volume.voxels.dtype, band)
-    if ends is None:
-        raise _refuse_band(volume, band, "")
+    ends = band_bounds(volume, band)
     taken = None if labels is None else resident.bring(labels)
     number = 0 if labels is None or label is None else labels.find(label)
     chosen = Selection(*ends, shell, None if taken is None else taken.voxels, number, paper)
@@ -183,8 +171,8 @@ def _voxels(
         points = positions if run.origin is None else positions + run.origin
         of_label = None if chosen.labels is None else chosen.labels.reshape(-1)[numbers].astype(np.int32)
         report = {
-            "iso_value_hu": band[0] if math.isinf(band[1]) else None,
-            "band_hu": [band[0], None if math.isinf(band[1]) else band[1]],
+            "iso_value_hu": band[0] if math.isinf(band[1]) and not math.isinf(band[0]) else None,
+            "band_hu": [None if math.isinf(end) else end for end in band],
             "voxels_in_band": run.marked,
             "share": len(hu) / volume.voxels.size,
             **({"label": number or None} if labels is not None else {}),
@@ -195,7 +183,7 @@ def _voxels(
             "warnings": [
                 *resident.device.warnings,
                 *describe_far(volume),
-                *warn_of_face(volume, band[:1], "cloud"),
+                *warn_of_face(volume, band[:1] if math.isfinite(band[0]) else (), "cloud"),
                 *(() if taken is None else taken.warnings),
                 *run.warnings,
             ],

@@ -39,7 +39,6 @@ __all__ = [
     "classify",
     "count",
     "emit",
-    "load_classify",
     "pad4",
     "prepare_marching_cubes",
     "split_steps",
@@ -113,7 +112,7 @@ def prepare_marching_cubes(
     if inside == "between":
         variants["RANGE"] = "1"
     if labels is None:
-        load_classify(device, dtype, inside)
+        _load_classify(device, dtype, inside)
     else:
         variants.update({"MASKS" if masks else "LABELS": "1"}, **label_variants(labels))
     if uneven:
@@ -121,8 +120,7 @@ def prepare_marching_cubes(
     return load_program(device, "surface/marching_cubes.cl", variants)
 
 
-def load_classify(device: Device, dtype: DTypeLike, inside: str = "above") -> Program:
-    """Build the kernels that mark samples of volumes of `dtype`; `inside` as in `IsoRule.inside`."""
+def _load_classify(device: Device, dtype: DTypeLike, inside: str = "above") -> Program:
     own = {"above": {}, "below": {"BORDER_INSIDE": "1"}, "between": {"RANGE": "1"}}[inside]
     variants = {**voxel_variants(dtype), **device.kernel_variants, **own}
     return load_program(device, "surface/classify.cl", variants)
@@ -205,7 +203,7 @@ def classify(
     bricks : BrickStates, optional
         The comparison of the volume's bricks with the only level, if the slab is the whole volume.
     """
-    program = load_classify(device, slab.grid.volume.voxels.dtype, slab.grid.rule.inside)
+    program = _load_classify(device, slab.grid.volume.voxels.dtype, slab.grid.rule.inside)
     mask_d = allocate(device, 4 * slab.mask_rows * slab.grid.words)
     row_extents_d = allocate(device, 4 * slab.mask_rows)
     if bricks is not None:
