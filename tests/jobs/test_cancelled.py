@@ -111,6 +111,7 @@ def test_reading(scan: Path) -> None:
     assert clrecon.read_volume(scan).voxels.shape[0] == 31
 
 
+@pytest.mark.slow
 def test_a_mesh(scan: Path, device: Any, tmp_path: Path) -> None:
     settings = MeshSettings(
         iso_value=(100.0, 200.0), smooth=2, decimate=0.5, split=True, field_of_view=14.0, device=str(device.index)
@@ -198,6 +199,7 @@ def test_labels(own: bool, device: Any, monkeypatch: pytest.MonkeyPatch) -> None
     assert buffers.made > 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["a.apng", "a.gif", "a.mp4", "frames"])
 def test_a_turntable(name: str, scan: Path, device: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     settings = RenderSettings.of(

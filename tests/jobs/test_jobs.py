@@ -108,6 +108,7 @@ def test_survey_says_why_no_device_is_used(device: Any) -> None:
     assert "abacus" in str(problem)
 
 
+@pytest.mark.slow
 def test_demo_writes_and_replaces(device: Any, tmp_path: Path) -> None:
     folder = tmp_path / "demo"
     first = make_demo(folder, str(device.index))

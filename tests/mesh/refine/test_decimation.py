@@ -60,6 +60,7 @@ def test_a_sphere_loses_nine_of_ten_triangles_within_the_bound():
     assert (said["fraction"], said["triangles_before"], small.report["iso_value_hu"]) == (0.9, 32768, 300.0)
 
 
+@pytest.mark.slow
 def test_the_bound_stops_the_decimation():
     sphere = Mesh(*samples.sphere(FAR, 20.0, 6))
     reached = []
@@ -77,6 +78,7 @@ def test_a_torus_stays_a_torus():
     assert quality["triangles"] < 3000
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(10, 14))
 def test_no_triangle_of_either_surface_is_further_than_the_bound(seed):
     """Smoothing and decimation of noise, each from the surface that it was given."""
@@ -86,6 +88,7 @@ def test_no_triangle_of_either_surface_is_further_than_the_bound(seed):
     check_within(decimate_mesh(smooth, 0.9), smooth, 0.125)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(2))
 def test_what_is_not_looked_at_again_is_still_within_the_bound(seed):
     """After some rounds of mending, which look at what has changed, all of both surfaces is looked at."""

@@ -60,6 +60,7 @@ def test_the_scale_of_float_values_does_not_matter(device, scale):
     assert np.abs(mesh.vertices - expected.vertices).max() < tolerances.FRAME_MM
 
 
+@pytest.mark.slow
 def test_every_state_of_a_cell_equals_the_twin(device):
     """One cell a case and drawing, apart from each other: thousands of decisions, among them all tunnels."""
     rng = np.random.default_rng(6)
