@@ -15,6 +15,16 @@
 /* Factor for squares, so that points whose distance rounds to the same float32 are not lost. */
 #define SAME 1.000001f
 
+/* Vectors at any place: PoCL 3.0 calls a function for each vload8 and vstore8. */
+typedef float8 loose_float8 __attribute__((aligned(4)));
+typedef int8 loose_int8 __attribute__((aligned(4)));
+typedef long4 loose_long4 __attribute__((aligned(8)));
+#define FLOATS_AT(pointer) (*(loose_float8 *)(pointer))
+#define INTS_AT(pointer) (*(loose_int8 *)(pointer))
+#define LONGS_AT(pointer) (*(loose_long4 *)(pointer))
+#define GLOBAL_FLOATS_AT(pointer) (*(__global const loose_float8 *)(pointer))
+#define GLOBAL_INTS_AT(pointer) (*(__global const loose_int8 *)(pointer))
+
 /* Candidates around a point or a cell, and the nearest of them, sorted. */
 typedef struct {
     float x[ROOM + 8], y[ROOM + 8], z[ROOM + 8];
@@ -39,10 +49,10 @@ static inline int copy_points(candidates *c, const cloud_grid *g, const uint fro
         const uint at = from + (uint)t;
         const int to = c->count + t;
         if (at + 8u <= g->points) {
-            vstore8(vload8(0, g->x + at), 0, c->x + to);
-            vstore8(vload8(0, g->y + at), 0, c->y + to);
-            vstore8(vload8(0, g->z + at), 0, c->z + to);
-            vstore8(as_int8(vload8(0, g->order + at)), 0, c->number + to);
+            FLOATS_AT(c->x + to) = GLOBAL_FLOATS_AT(g->x + at);
+            FLOATS_AT(c->y + to) = GLOBAL_FLOATS_AT(g->y + at);
+            FLOATS_AT(c->z + to) = GLOBAL_FLOATS_AT(g->z + at);
+            INTS_AT(c->number + to) = GLOBAL_INTS_AT(g->order + at);
         } else
             for (int lane = 0; lane < (int)(g->points - at); ++lane) {
                 c->x[to + lane] = g->x[at + lane];
@@ -50,7 +60,7 @@ static inline int copy_points(candidates *c, const cloud_grid *g, const uint fro
                 c->z[to + lane] = g->z[at + lane];
                 c->number[to + lane] = (int)g->order[at + lane];
             }
-        vstore8((int8)((int)at) + (int8)(0, 1, 2, 3, 4, 5, 6, 7), 0, c->place + to);
+        INTS_AT(c->place + to) = (int8)((int)at) + (int8)(0, 1, 2, 3, 4, 5, 6, 7);
     }
     c->count += more;
     return 1;
@@ -74,9 +84,9 @@ static inline int copy_block(candidates *c, const cloud_grid *g, const int3 cell
 static inline void find_squares(candidates *c, const float3 point)
 {
     for (int t = 0; t < c->count; t += 8) {
-        const float8 dx = vload8(0, c->x + t) - point.x, dy = vload8(0, c->y + t) - point.y;
-        const float8 dz = vload8(0, c->z + t) - point.z;
-        vstore8(dx * dx + dy * dy + dz * dz, 0, c->square + t);
+        const float8 dx = FLOATS_AT(c->x + t) - point.x, dy = FLOATS_AT(c->y + t) - point.y;
+        const float8 dz = FLOATS_AT(c->z + t) - point.z;
+        FLOATS_AT(c->square + t) = dx * dx + dy * dy + dz * dz;
     }
 }
 
@@ -101,19 +111,19 @@ static inline void sort_kept(candidates *c, const int count)
         c->kept_number[t] = c->number[c->kept[t]];
     }
     for (int t = 0; t < count; t += 8) {
-        const int8 high = as_int8(sqrt(vload8(0, c->kept_square + t))), low = vload8(0, c->kept_number + t);
+        const int8 high = as_int8(sqrt(FLOATS_AT(c->kept_square + t))), low = INTS_AT(c->kept_number + t);
         const int8 first = (int8)(low.s0, high.s0, low.s1, high.s1, low.s2, high.s2, low.s3, high.s3);
         const int8 second = (int8)(low.s4, high.s4, low.s5, high.s5, low.s6, high.s6, low.s7, high.s7);
-        vstore4(as_long4(first), 0, c->keys + t);
-        vstore4(as_long4(second), 0, c->keys + t + 4);
+        LONGS_AT(c->keys + t) = as_long4(first);
+        LONGS_AT(c->keys + t + 4) = as_long4(second);
     }
     for (int t = count; t < count + 4; ++t)
         c->keys[t] = LONG_MAX;
     for (int t = 0; t < count; t += 4) {
-        const long4 own = vload4(0, c->keys + t);
+        const long4 own = LONGS_AT(c->keys + t);
         long4 a = 0, b = 0, d = 0, e = 0;
         for (int other = 0; other < count; other += 4) {
-            const long4 key = vload4(0, c->keys + other);
+            const long4 key = LONGS_AT(c->keys + other);
             a -= key < (long4)(own.x);
             b -= key < (long4)(own.y);
             d -= key < (long4)(own.z);
@@ -217,13 +227,13 @@ static inline int add_near(
 {
     uint at = from;
     for (; at < end && at + 8u <= g->points; at += 8u) {
-        const float8 dx = vload8(0, g->x + at) - point.x, dy = vload8(0, g->y + at) - point.y;
-        const float8 dz = vload8(0, g->z + at) - point.z;
+        const float8 dx = GLOBAL_FLOATS_AT(g->x + at) - point.x, dy = GLOBAL_FLOATS_AT(g->y + at) - point.y;
+        const float8 dz = GLOBAL_FLOATS_AT(g->z + at) - point.z;
         const float8 square = dx * dx + dy * dy + dz * dz;
         if (!ANY_LANE(square <= *bound))
             continue;
         float lane_of[8];
-        vstore8(square, 0, lane_of);
+        FLOATS_AT(lane_of) = square;
         for (uint lane = 0; lane < min(end - at, 8u); ++lane)
             if (lane_of[lane] <= *bound && add_point(c, g, at + lane, lane_of[lane], k, bound))
                 return 1;

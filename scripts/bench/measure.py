@@ -29,7 +29,17 @@ __all__ = [
 ]
 
 ROOT = Path(__file__).resolve().parents[2]
-_PACKAGES = ("numpy", "pyopencl", "vtk", "SimpleITK", "scipy", "connected-components-3d")
+_PACKAGES = (
+    "numpy",
+    "pyopencl",
+    "vtk",
+    "SimpleITK",
+    "scipy",
+    "connected-components-3d",
+    "napf",
+    "small_gicp",
+    "open3d",
+)
 
 
 def run_program(command: Sequence[str], timeout_s: float = 600.0) -> tuple[float, str]:

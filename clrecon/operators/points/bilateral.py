@@ -105,7 +105,8 @@ def denoise_points(
     PointStep
         The cloud with moved points, their HU and labels; normals and voxel indices no longer hold and are left out.
         Its facts: ``rms_move_mm`` and ``largest_move_mm`` over all iterations, ``neighbours``, ``range_factor``,
-        ``iterations``, ``features``, ``feature_points`` and ``cell_mm`` of the last iteration, ``seconds``, ``device``.
+        ``iterations``, ``features``, ``feature_points`` and ``cell_mm`` of the last iteration, ``seconds``,
+        ``kernel_seconds``, ``device``.
 
     Raises
     ------
@@ -247,6 +248,7 @@ class _Run:
             "feature_points": self.feature_points,
             "cell_mm": self.cell_mm,
             "seconds": dict(self.stopwatch.seconds),
+            "kernel_seconds": dict(self.stopwatch.by_kernel),
             "device": self.device.label,
         }
         changed = cloud.changed(points=moved, normals=None, ijk=None)
