@@ -1,8 +1,8 @@
 """Cases of clouds of points: nearest points, normals, the bilateral filter and outliers, beside CPU libraries.
 
 The clouds come from the input: voxel centres from 500, 200 and 60 HU up, and the vertices of the surface at the iso
-value.  Both sides begin with an array of points and end with arrays in memory of the computer; the search structure is built
-every time.  Each ratio is given for wall and for processor seconds (names that end in ``_cpu``).
+value.  Both sides begin with an array of points and end with arrays in memory of the computer; the search structure is
+built every time.  Each ratio is given for wall and for processor seconds (names that end in ``_cpu``).
 """
 
 from __future__ import annotations
@@ -146,7 +146,7 @@ def measure_filter(job: Job) -> dict[str, Any]:
         axes, _ = principal_axes(points, indices)
         own = [_kernel_seconds(points, job) for _ in range(job.pairs)]
         for kind in (np.float64, np.float32):
-            peer = [_run(lambda kind=kind: _filter_as(kind, points, axes, indices), []) for _ in range(3)]  # type: ignore[misc]
+            peer = [_filter_seconds(kind, points, axes, indices) for _ in range(3)]
             key = f"{name}_alone_numpy_{np.dtype(kind).name}"
             figures["sides"][key] = summarise(own[: len(peer)], peer)
             figures["ratios"][key] = figures["sides"][key]["ratio"]
@@ -160,6 +160,10 @@ def _kernel_seconds(points: Any, job: Job) -> float:
 
     seconds: float = denoise_points(PointCloud(points), K, device=job.device).facts["kernel_seconds"]["filter_points"]
     return seconds
+
+
+def _filter_seconds(kind: Any, points: Any, axes: Any, indices: Any) -> float:
+    return _run(lambda: _filter_as(kind, points, axes, indices), [])
 
 
 def _filter_as(kind: Any, points: Any, axes: Any, indices: Any) -> Any:
