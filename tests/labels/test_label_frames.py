@@ -50,6 +50,7 @@ def heights(stack):
         ((0.0, 5.0, 10.0), 2.4745, [0, 1, 2], 3, 5.0),
         ((0.0, 5.0, 10.0), 5000.0, [0, 1, 2], 3, 5.0),
         ((0.0, 5.0, 10.0), 0.0, [0, 1, 2], 3, 5.0),
+        ((0.0, 0.04), 2.5, [0, 1], 2, 0.04),
         ((10.0, 0.0, 7.5), None, [4, 0, 3], 5, 2.5),
     ],
 )
@@ -71,6 +72,9 @@ def test_a_frame_says_itself_what_all_say():
     own = frames(0.0, 2.0)
     own[0].PixelMeasuresSequence = holder("P", PixelSpacing=(0.75, 0.50005)).P
     assert place_frames(shared(), own, "a.dcm").affine[0, 0] == 0.50005
+    own = frames(0.0, 5.0)  # the step that counts is that of the first frame
+    own[1].PixelMeasuresSequence = holder("P", PixelSpacing=(0.75, 0.5), SpacingBetweenSlices=2.5).P
+    assert place_frames(shared(), own, "a.dcm").slices == 2
     with pytest.raises(ValueError, match="no PlaneOrientationSequence"):
         place_frames(None, own, "a.dcm")
 

@@ -37,6 +37,7 @@ def test_newton_and_then_between_two_levels():
 def test_the_secant_goes_through_the_two_best_trials():
     # From (1100, 180) and (1050, 190) it falls by 0.2 a level: 80 more are 400 levels on.
     assert next_level([(0, 300.0), (1050, 190.0), (1100, 180.0)], 100.0, -0.1) == 1500
+    assert next_level([(1000, 60.0), (1050, 50.0), (1200, 40.0)], 100.0, -0.1) == 800
     # Less than a tenth of the expected rise is not believed.
     assert next_level([(1050, 180.001), (1100, 180.0)], 100.0, -2.0) == 1100 + 400
 

@@ -24,6 +24,8 @@ def test_the_largest_number_is_painted_and_no_further_one():
     for number in (0, 65_536):
         with pytest.raises(RefusedInputError, match=f"a.dcm numbers a segment {number}: 1 to 65,535 are possible"):
             painter({number: "x"})
+    with pytest.raises(RefusedInputError, match="numbers a segment 70000"):  # the first of them
+        painter({1: "x", 70_000: "y", 0: "z"})
 
 
 def test_the_pair_with_most_voxels_is_told_and_the_others_are_counted():

@@ -116,6 +116,15 @@ def test_labels_of_another_place_are_refused_with_the_numbers():
         resample_labels(LabelMap(VOXELS, far), VOLUME)
 
 
+def test_labels_below_the_first_voxel_along_all_axes_are_refused_with_both_places():
+    far = np.eye(4)
+    far[:3, 3] = -20.0
+    volume = Volume(np.zeros((3, 4, 5), np.int16), np.eye(4))
+    words = r"\(0.1 ml\) lie inside the CT: they span x -20 to -16, y -20 to -16, z -20 to -17 mm, the CT x 0 to 4,"
+    with pytest.raises(RefusedInputError, match=words):
+        resample_labels(LabelMap(np.ones((4, 5, 5), np.uint8), far), volume)
+
+
 def test_an_empty_map_is_refused():
     with pytest.raises(RefusedInputError, match="the label map is empty"):
         resample_labels(LabelMap(np.zeros((2, 2, 2), np.uint8), OBLIQUE), VOLUME)

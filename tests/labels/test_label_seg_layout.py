@@ -10,6 +10,7 @@ from dicom_series import element_bytes
 from pydicom import Dataset
 from pydicom.datadict import tag_for_keyword
 from pydicom.dataset import FileMetaDataset
+from pydicom.encaps import encapsulate
 from pydicom.uid import ExplicitVRLittleEndian, RLELossless
 
 from clrecon.errors import RefusedInputError
@@ -71,6 +72,15 @@ def test_pixels_fill_their_bytes_to_the_last_bit():
     assert [pixels.read(frame).ravel().tolist() for frame in range(3)] == [[1] * 9, [1] + [0] * 8, [0] * 8 + [1]]
     with pytest.raises(RefusedInputError, match="is cut: 3 frames of 3 x 3 do not fit 3 bytes"):
         _FramePixels(header("BINARY", 1, PixelData=data[:3]), layout, "a.dcm")
+
+
+@pytest.mark.parametrize(("bits", "frames"), [(1, 2), (8, 1), (8, 3)])
+def test_compressed_frames_are_as_many_as_said_and_of_whole_bytes(bits, frames):
+    data = header("BINARY", bits, RLELossless, PixelData=encapsulate([bytes(66), bytes(66)]))
+    with pytest.raises(ValueError, match=f"compressed frames of {bits} bits|frame"):
+        _FramePixels(data, _Layout("BINARY", 3, 3, frames, bits), "a.dcm")
+    sound = header("BINARY", 8, RLELossless, PixelData=encapsulate([bytes(66), bytes(66)]))
+    assert len(_FramePixels(sound, _Layout("BINARY", 3, 3, 2, 8), "a.dcm")._fragments) == 2
 
 
 def test_pixels_of_two_bytes_come_lowest_byte_first():
