@@ -120,6 +120,8 @@ class ClusterSearch:
     min_samples : int
     memory : int, optional
         Bytes that may be taken on the device; None is all of its memory.
+    parts_per_core : int
+        Of CPU devices; the labels do not depend on it.
     stopwatch : Stopwatch, optional
 
     Attributes
@@ -149,10 +151,12 @@ class ClusterSearch:
         min_samples: int,
         *,
         memory: int | None = None,
+        parts_per_core: int = PARTS_PER_CORE,
         stopwatch: Stopwatch | None = None,
     ):
         self._device, self._mask, self._stopwatch = device, mask, stopwatch
         self._limits = memory_limits(device, memory)
+        self._parts = parts_per_core * device.compute_units
         self._samples = checked_min_samples(min_samples)
         self._stencil = stencil
         self._check_work(stencil)
@@ -238,7 +242,7 @@ class ClusterSearch:
             row_counts=self._row_counts_d, runs=self._runs_d, **self._run_rows,
         )  # fmt: skip
         # A CPU's cores take groups; a part is a group's work.  Elsewhere each item has a row of its own.
-        part_rows = -(-rows // (PARTS_PER_CORE * device.compute_units)) if self._is_cpu else 1
+        part_rows = -(-rows // self._parts) if self._is_cpu else 1
         spread = device.group_size if self._is_cpu else 1
         labels_d, roots_d = allocate(device, 4 * runs), allocate(device, 4 * runs)
         given = {"runs": self._runs_d, "row_counts": self._row_counts_d, **self._forward.arguments, **self._slices}

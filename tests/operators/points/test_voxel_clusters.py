@@ -31,11 +31,11 @@ def points_of(volume: Volume) -> np.ndarray:
     return volume.ijk_to_lps(np.argwhere(volume.voxels > 0)[:, ::-1])
 
 
-def search(device, volume: Volume, eps: float, samples: int) -> ClusterSearch:
+def search(device, volume: Volume, eps: float, samples: int, **parts: int) -> ClusterSearch:
     stencil = make_stencil(Lattice.of(volume), eps)
     with DeviceVolume(volume, device=device) as resident:
         mask = mark_band(resident, (1.0, 1.0), pad=pad_for(stencil))
-        return ClusterSearch(device, mask, stencil, samples)
+        return ClusterSearch(device, mask, stencil, samples, **parts)
 
 
 def check_equal(device, volume: Volume, eps: float, samples: int) -> int:
@@ -124,11 +124,10 @@ def test_devices_with_small_work_groups_get_the_same(device, group, monkeypatch)
     check_equal(device, Volume(noise((6, 9, 70), 0.3), FINE), 1.2, 5)
 
 
-def test_parts_of_any_size_give_the_same(device, monkeypatch):
+def test_parts_of_any_size_give_the_same(device):
     volume = Volume(noise((6, 9, 70), 0.3), FINE)
-    for parts in (1, 7, 1000):
-        monkeypatch.setattr(voxel_clusters, "PARTS_PER_CORE", parts)
-        check_equal(device, volume, 1.2, 5)
+    labels = [search(device, volume, 1.2, 5, parts_per_core=parts).label() for parts in (1, 7, 1000)]
+    np.testing.assert_array_equal(labels, [search(device, volume, 1.2, 5).label()] * 3)
 
 
 @pytest.mark.oclgrind
