@@ -1,4 +1,6 @@
-/* Runs of core voxels: which of them are neighbours, and the labels that they give to the voxels beside them. */
+/* Runs of core voxels: which of them are neighbours, and the labels that they give to the voxels beside them.
+ *
+ * Arguments are not `restrict`: inlined, it becomes an instruction that Oclgrind 21.10 does not know. */
 #ifndef CLRECON_CORE_RUNS_H
 #define CLRECON_CORE_RUNS_H
 
@@ -17,9 +19,9 @@ static inline uint find_root(__global uint *labels, uint run)
 
 /* Pairs of a part's runs with those of later parts; writes them if there is a place for them, and returns how many. */
 static inline uint find_links(
-    __global const ushort2 *restrict runs, __global const uint *restrict row_counts,
-    __global const int4 *restrict stencil, __global const int2 *restrict tables, __global const uint *restrict labels,
-    __global uint *restrict links, const int nj, const int nk, const uint row, const uint end_row)
+    __global const ushort2 *runs, __global const uint *row_counts,
+    __global const int4 *stencil, __global const int2 *tables, __global const uint *labels,
+    __global uint *links, const int nj, const int nk, const uint row, const uint end_row)
 {
     const uint own_begin = row_counts[row], own_end = row_counts[row + 1];
     if (own_begin == own_end)
@@ -54,7 +56,7 @@ static inline uint find_links(
 }
 
 /* Bits of one word, as load_shifted. */
-static inline uint shifted_word(__global const uint *restrict mask, const int at, const int shift, const int total)
+static inline uint shifted_word(__global const uint *mask, const int at, const int shift, const int total)
 {
     const int word = at + (shift >> 5);
     const uint bits = shift & 31;
@@ -73,8 +75,8 @@ static inline void fill_labels(__global int *to, int count, const int number)
 
 /* Give the set voxels of a row that are no core voxels the lowest number among core voxels of one row of the stencil. */
 static inline void label_borders(
-    __global const uint *restrict mask, __global const uint *restrict cores, __global const ushort2 *restrict runs,
-    __global const int *restrict numbers, __global int *restrict labels, const int4 near, const int own_at,
+    __global const uint *mask, __global const uint *cores, __global const ushort2 *runs,
+    __global const int *numbers, __global int *labels, const int4 near, const int own_at,
     const int other_at, uint run, const uint end_run, const ushort2 extent, const int total)
 {
     uint point = 0;

@@ -151,7 +151,7 @@ __kernel void list_core_runs(
             continue;
         }
         /* Bits that differ from the one before: runs begin and end there, in turn. */
-        uint changes = bits ^ (bits << 1 | (uint)(begin >= 0));
+        uint changes = bits ^ bits << 1 ^ (uint)(begin >= 0);
         while (changes != 0) {
             const int bit = popcount((changes & -changes) - 1);
             if (begin < 0)
