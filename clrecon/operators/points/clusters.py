@@ -13,6 +13,7 @@ from clrecon.geometry import Volume
 from clrecon.geometry.affine import checked_affine
 from clrecon.opencl import Device, Stopwatch, check_memory, take_device, work_on
 from clrecon.operators.points.band_mask import checked_band, mark_band, mark_voxels, mask_bytes
+from clrecon.operators.points.extract import extract_points
 from clrecon.operators.points.voxel_clusters import ClusterSearch, checked_min_samples, pad_for, search_bytes
 from clrecon.operators.resident.device_volume import DeviceVolume, open_volume
 from clrecon.points import PointCloud, PointStep
@@ -216,16 +217,8 @@ def _cluster_band(
         labels, cores = search.label(), search.flag_cores()
     if not len(labels):
         raise UsageError(f"no voxel lies from {band[0]:g} to {band[1]:g} HU: there is nothing to cluster")
-    return request.finish(_band_cloud(volume, band), labels, cores, search, stopwatch, device, told)
-
-
-def _band_cloud(volume: Volume, band: tuple[float, float]) -> PointCloud:
-    """Return the centres of the voxels in a band, in the order k, j, i."""
-    voxels = volume.voxels
-    kji = np.argwhere((voxels >= band[0]) & (voxels <= band[1]))
-    ijk = kji[:, ::-1]
-    report = {"affine_ijk_to_lps_mm": volume.affine.tolist(), "certificate": volume.report}
-    return PointCloud(volume.ijk_to_lps(ijk), hu=voxels[tuple(kji.T)], ijk=ijk, report=report)
+    cloud = extract_points(resident, kind="voxels", hu=band)
+    return request.finish(cloud, labels, cores, search, stopwatch, device, told)
 
 
 def _cluster_cloud(
