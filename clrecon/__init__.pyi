@@ -24,11 +24,11 @@ from clrecon.operators import choose_device
 from clrecon.operators.points.bilateral import denoise_points as denoise_points
 from clrecon.operators.points.clusters import Clustering as Clustering
 from clrecon.operators.points.clusters import cluster_points as cluster_points
-from clrecon.operators.points.extract import extract_points as extract_points
 from clrecon.operators.points.neighbours import Neighbours as Neighbours
 from clrecon.operators.points.neighbours import find_neighbours as find_neighbours
 from clrecon.operators.points.normals import estimate_normals as estimate_normals
 from clrecon.operators.points.outliers import remove_outliers as remove_outliers
+from clrecon.operators.points.reconstruct import reconstruct_surface as reconstruct_surface
 from clrecon.operators.points.slice_overlap import find_ghost_slices as find_ghost_slices
 from clrecon.operators.rays.render import VolumeRenderer as VolumeRenderer
 from clrecon.operators.rays.render import render as render

@@ -181,6 +181,35 @@ INVERSIONS: dict[str, dict[str, tuple[tuple[str, str], ...]]] = {
     "mark_cells": {"mask": (("1u << (cell.x & 31)", "~(1u << (cell.x & 31))"),)},
     "count_marked": {"counts": (("= popcount(mask[word]);", "= 32 - popcount(mask[word]);"),)},
     "number_points": {"keys": (("keys[point] = ", "keys[point] = ~"),)},
+    "merge_rows": {"cells": (("merged[item] = bits;", "merged[item] = ~bits;"),)},
+    "mark_reached": {"bricks": (("bricks[item] = marked;", "bricks[item] = ~marked;"),)},
+    "sort_normals": {"normals": tuple((f"= normal.{c};", f"= -normal.{c};") for c in "xyz")},
+    "measure_nodes": {
+        "values": (("vstore8(mean, value, values);", "vstore8(-mean, value, values);"),),
+        "near": (("near[byte] = row_bits(is_near)", "near[byte] = ~row_bits(is_near)"),),
+        "core": (("core[byte] = row_bits(", "core[byte] = ~row_bits("),),
+        "negative": (("(mean <= 0.0f)", "(mean > 0.0f)"),),
+    },
+    "fill_far": {
+        "volume": (("(float8)(far_value) : (float8)(-far_value)", "(float8)(-far_value) : (float8)(far_value)"),)
+    },
+    "place_bricks": {"volume": (("? either : -either", "? -either : either"),)},
+    "count_runs": {"counts": (("counts[row] = count;", "counts[row] = ~count;"),)},
+    "list_runs": {
+        "firsts": (("firsts[begun++] = 32 * word +", "firsts[begun++] = nx - 32 * word -"),),
+        "lasts": (("lasts[ended] = nx - 1;", "lasts[ended] = 1 - nx;"),),
+    },
+    "count_joins": {"counts": (("counts[row] = join_row(", "counts[row] = ~join_row("),)},
+    "list_joins": {"pairs": (("vstore3((uint3)(a, b, b)", "vstore3((uint3)(b, b, b)"),)},
+    "count_votes": {"votes": (("vstore2(sum, run, votes);", "vstore2(sum.yx, run, votes);"),)},
+    "paint_regions": {
+        "inside": (("inside[at] = negative[at];", "inside[at] = ~negative[at];"),),
+        "reached": (("reached[at] = far;\n", "reached[at] = ~far;\n"),),
+    },
+    "flood_signs": {
+        "inside": (("next_inside[at] = taken;", "next_inside[at] = ~taken;"),),
+        "reached": (("next_reached[at] = now;", "next_reached[at] = ~now;"),),
+    },
     "gather_points": {
         "points": (("= point.x;", "= -point.x;"), ("= point.y;", "= -point.y;"), ("= point.z;", "= -point.z;")),
         "starts": (("starts[cell] = place;", "starts[cell] = ~place;"), ("= n;", "= ~n;")),
@@ -204,14 +233,6 @@ INVERSIONS: dict[str, dict[str, tuple[tuple[str, str], ...]]] = {
         "labels": (("own + point + before, runs", "own + point, runs"), (", numbers[run]);", ", ~numbers[run]);"))
     },
     "flag_cores": {"flags": (("(core & rest & -rest) != 0", "(core & rest & -rest) == 0"),)},
-    "restrict_mask": {"mask": (("mask[at] = kept;", "mask[at] = ~kept;"),)},
-    "find_shell": {"shell": (("= bits & ~(before", "= ~bits | (before"),)},
-    "count_points": {"counts": (("counts[row] = count;", "counts[row] = 32u * words - count;"),)},
-    "emit_points": {
-        "positions": (("(place.sum + place.rest).xyz", "-(place.sum + place.rest).xyz"),),
-        "hu": (("= (float)row->voxels[i];", "= -(float)row->voxels[i];"),),
-        "numbers": (("= row->number + (uint)i;", "= ~(row->number + (uint)i);"),),
-    },
     "sum_volumes": {"sums": (("sums[item] = sum;", "sums[item] = -sum;"),)},
     "fit_planes": {
         "normals": tuple((f"store_rows(n{c} * size,", f"store_rows(n{c} * size + 0.1f,") for c in "xyz"),

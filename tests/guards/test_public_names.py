@@ -18,12 +18,11 @@ KEYWORDS = ("device", "memory", "progress")
 """What a call is computed with, not what it computes: never by position."""
 
 TAKE_PROGRESS = {
-    "SurfaceExtractor.extract_vertices", "extract_points",
     "SurfaceExtractor.extract", "VolumeRenderer.render", "choose_iso_value", "cluster_points", "compare_meshes",
     "cut_slice", "decimate_mesh", "denoise_points", "estimate_normals", "extract_isosurface", "extract_isosurfaces",
     "extract_label_masks", "extract_labels", "find_ghost_slices", "find_neighbours", "find_spine_line",
-    "list_series", "mask_field_of_view", "read_labels", "read_volume", "reformat_curve", "remove_outliers",
-    "remove_table", "render", "smooth_mesh", "write_animation",
+    "list_series", "mask_field_of_view", "read_labels", "read_volume", "reconstruct_surface", "reformat_curve",
+    "remove_outliers", "remove_table", "render", "smooth_mesh", "write_animation",
 }  # fmt: skip
 """What can take longer than a second."""
 

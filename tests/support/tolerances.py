@@ -18,12 +18,6 @@ FLOAT64_PLACE_MM = 1e-9  # coordinates of some 1000 mm there and back in float64
 SIX_DIGITS_MM = 5.1e-3  # Open3D writes six digits into text: half of 1e-2 mm from 1000 mm on
 LAS_POINT_MM = 8.2e-5  # half a step of 1e-4 mm, and half a step of float32 at some 1000 mm
 
-# --- operators: points of volumes ---
-HALF_STEP = 0.5001  # of float32: a place is rounded once
-CLOUD_PLACE_MM = 1.6e-5  # half a step of float32 below 512 mm
-CLOUD_BALL_MM = 0.02  # a ball of 20 mm in voxels of 0.64 to 0.8 mm and whole HU: measured 0.009
-BALL_OF_VOXELS = 2e-3  # relative volume of such a ball by counting voxels
-
 # --- geometry: images of pyvista ---
 IMAGE_POINT_MM = 1e-9  # VTK places points by direction and spacing in float64
 IMAGE_SURFACE_MM = 1e-4  # float32 vertices some 200 mm from the origin, placed by another program: measured 2e-5
@@ -204,3 +198,5 @@ TWIN_AXIS_NEAR_DOUBLE_DEGREES = 0.1  # where the two smaller eigenvalues differ 
 GRADIENT_SHARE = 1e-4  # of the steepest gradient: weights from float32 coordinates of 40 voxels; measured 2e-5
 TWIN_FILTER_MM = 1e-5  # the bar: exp and normals in float32 at coordinates up to 30 mm; measured 3e-6
 MEAN_DISTANCE_SHARE = 1e-5  # sums of 16 distances in float32
+TWIN_FIELD_MM = 2e-5  # float32 sums of some 30 heights of up to 2 mm, places up to 30 mm: measured 3e-6
+FAR_FIELD_MM = 1e-3  # a cloud that moved by steps of float32 at 1e5 mm has its nodes elsewhere in it: measured 2e-4

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from clrecon.jobs.selftest import (
     clusters,
+    fields,
     labels,
     pictures,
     point_filters,
@@ -13,7 +14,6 @@ from clrecon.jobs.selftest import (
     reformat,
     resident,
     surface,
-    voxel_points,
 )
 from clrecon.jobs.selftest.check import Check
 
@@ -29,8 +29,8 @@ CHECKS: tuple[Check, ...] = (
     *reformat.CHECKS,
     *points.CHECKS,
     *clusters.CHECKS,
+    *fields.CHECKS,
     *point_filters.CHECKS,
-    *voxel_points.CHECKS,
 )
 
 

@@ -1,0 +1,393 @@
+"""A signed distance around a cloud with normals, on nodes: the host's side of cl/points/field.cl."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clrecon.errors import DeviceMemoryError, UsageError
+from clrecon.opencl import (
+    Device,
+    Program,
+    Stopwatch,
+    allocate,
+    describe_shortage,
+    download,
+    empty_output,
+    kernel_constant,
+    launch,
+    load_program,
+    memory_limits,
+    result_pages,
+    upload,
+)
+from clrecon.operators.points.field_signs import Masks, Signs
+from clrecon.operators.points.grid import CELL_ROUNDING, GridPlan, fill_grid, plan_grid
+from clrecon.operators.primitives.compact import compact, prepare_compact
+
+__all__ = ["MOST_NODES", "FieldSettings", "Nodes", "NodeField", "plan_nodes", "prepare_field"]
+
+BRICK = tuple(kernel_constant("points/field.cl", name) for name in ("BRICK_LONG", "BRICK_WIDE", "BRICK_WIDE"))
+BRICK_ROWS = kernel_constant("points/field.cl", "BRICK_ROWS")
+BRICK_BYTES = 4 * kernel_constant("points/field.cl", "BRICK_NODES")
+
+MOST_NODES = 2**31
+"""Most nodes of a field."""
+
+LEAST_SHARE = 1e-6
+"""No node lies nearer to the surface than this share of the spacing, in the value of the field: 0 has no sign."""
+
+
+@dataclass(frozen=True)
+class FieldSettings:
+    """Lengths of a field in mm: spacing h of the nodes, reach R and smoothing s of the weights, bridge B."""
+
+    spacing: float
+    reach: float
+    smoothing: float
+    bridge: float
+
+    @property
+    def rounds(self) -> int:
+        """Nodes that signs flood from a far node on: 2 B, as the farthest far node is about B away."""
+        return 2 * math.ceil(self.bridge / self.spacing)
+
+    def squared(self) -> dict[str, float]:
+        """The squares as kernels take them: products of float32."""
+        values = {name: np.float32(getattr(self, name)) for name in ("reach", "smoothing", "bridge", "spacing")}
+        return {f"squared_{name}": float(value * value) for name, value in values.items()}
+
+
+@dataclass(frozen=True, eq=False)
+class Nodes:
+    """The nodes of a field: whole bricks, at least B and a spacing beyond the points on each side.
+
+    Attributes
+    ----------
+    corner : ndarray, shape (3,), float32
+        Node (0, 0, 0) in mm relative to `base`.
+    base : ndarray, shape (3,), float64
+        LPS mm, as of the grid.
+    spacing : numpy.float32
+    bricks : (x, y, z)
+    """
+
+    corner: NDArray[np.float32]
+    base: NDArray[np.float64]
+    spacing: np.float32
+    bricks: tuple[int, int, int]
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """Nodes (nx, ny, nz)."""
+        x, y, z = (count * size for count, size in zip(self.bricks, BRICK, strict=True))
+        return x, y, z
+
+    @property
+    def count(self) -> int:
+        """Number of nodes."""
+        return math.prod(self.shape)
+
+    @property
+    def words(self) -> int:
+        """Words of 32 nodes in a row of the masks."""
+        return -(-self.shape[0] // 32)
+
+    @property
+    def rows(self) -> int:
+        """Rows of nodes."""
+        return self.shape[1] * self.shape[2]
+
+    @property
+    def mask_bytes(self) -> int:
+        """Bytes of a mask of nodes."""
+        return 4 * self.words * self.rows
+
+    @property
+    def brick_words(self) -> int:
+        """Words of 32 bricks in a row of the mask of bricks."""
+        return -(-self.bricks[0] // 32)
+
+    @property
+    def layer_bytes(self) -> int:
+        """Bytes of the volume in a layer of bricks."""
+        return 4 * self.shape[0] * self.shape[1] * BRICK[2]
+
+    @property
+    def corner_and_spacing(self) -> tuple[float, float, float, float]:
+        """The float4 of kernels."""
+        x, y, z = map(float, self.corner)
+        return x, y, z, float(self.spacing)
+
+    @property
+    def affine(self) -> NDArray[np.float64]:
+        """4x4, node (i, j, k) to LPS mm."""
+        affine = np.diag([*[float(self.spacing)] * 3, 1.0])
+        affine[:3, 3] = self.base + self.corner
+        return affine
+
+
+def plan_nodes(points: GridPlan, settings: FieldSettings) -> Nodes:
+    """Lay nodes around the points of a grid.
+
+    Raises
+    ------
+    UsageError
+        There are more than `MOST_NODES`.
+    """
+    h = np.float32(settings.spacing)
+    margin = settings.bridge + float(h)
+    low, high = points.points.min(axis=0).astype(np.float64), points.points.max(axis=0).astype(np.float64)
+    corner = (low - margin).astype(np.float32)
+    counts = np.ceil((high + margin - corner) / float(h)) + 1.0
+    bricks = [math.ceil(min(count, 2.0**40) / size) for count, size in zip(counts, BRICK, strict=True)]
+    nodes = Nodes(corner, points.base, h, (bricks[0], bricks[1], bricks[2]))
+    if nodes.count > MOST_NODES:
+        size = " x ".join(f"{length:.6g}" for length in high - low)
+        least = settings.spacing * (nodes.count / MOST_NODES) ** (1.0 / 3.0)
+        raise UsageError(
+            f"nodes every {settings.spacing:.6g} mm: the box of the points, {size} mm, has"
+            f" {' x '.join(f'{count:,}' for count in nodes.shape)} = {nodes.count:,} of them, possible are"
+            f" {MOST_NODES:,}: take {1.05 * least:.3g} mm or more, or remove points that lie far from all others"
+        )
+    return nodes
+
+
+def prepare_field(device: Device) -> Program:
+    """Build the kernels of a field."""
+    prepare_compact(device)
+    return load_program(device, "points/field.cl", {"LANES": device.kernel_variants["LANES"]})
+
+
+@dataclass(frozen=True)
+class _Slab:
+    """Layers of bricks that go through the device together, and the listed bricks in them."""
+
+    first: int
+    end: int
+    first_brick: int
+    end_brick: int
+
+
+class NodeField:
+    """The field of a cloud on a device, for one set of lengths.
+
+    Parameters
+    ----------
+    device : Device
+    points : array_like, shape (n, 3)
+        LPS mm, or a `PointCloud`.
+    normals : ndarray, shape (n, 3), float32
+        Unit vectors that point outward.
+    settings : FieldSettings
+    memory : int, optional
+        Bytes that may be taken on the device; None is all of its memory.
+    stopwatch : Stopwatch, optional
+
+    Raises
+    ------
+    UsageError
+        The points or the spacing cannot be used.
+    DeviceMemoryError
+        The device has no room even for a slab of one layer of bricks.
+    """
+
+    def __init__(
+        self,
+        device: Device,
+        points: Any,
+        normals: NDArray[np.float32],
+        settings: FieldSettings,
+        *,
+        memory: int | None = None,
+        stopwatch: Stopwatch | None = None,
+    ):
+        self.device, self.settings, self.stopwatch = device, settings, stopwatch
+        self.limits = memory_limits(device, memory)
+        plan = plan_grid(points, 2.0 * settings.spacing)
+        self.nodes = plan_nodes(plan, settings)
+        # Cells are found by coordinates in float32.
+        extent = float(np.ptp(plan.points, axis=0).max()) + 2.0 * settings.bridge
+        self._within = settings.reach + 1e-3 * settings.spacing + 4.0 * CELL_ROUNDING * extent
+        self._check_first(device, plan)
+        self._program = prepare_field(device)
+        self.grid = fill_grid(device, plan, memory=memory, stopwatch=stopwatch)
+        self._normals_d = self._sort_normals(normals)
+        self._list_d, self._list = self._find_bricks()
+        self.slabs = self._plan_slabs()
+        self.masks = Masks(device, self.nodes.shape, stopwatch)
+        self._values = self._measure()
+
+    def _run(self, kernel: str, items: int, **arguments: Any) -> None:
+        launch(self.device, self._program[kernel], items, stopwatch=self.stopwatch, **arguments)
+
+    @property
+    def bricks(self) -> int:
+        """Number of bricks that points reach."""
+        return len(self._list)
+
+    def _kept(self, n: int) -> dict[str, int]:
+        """Return the bytes of what stays while slabs are worked on, beside the grid."""
+        return {"normals": 12 * n, "masks of nodes": Masks.COUNT * self.nodes.mask_bytes}
+
+    def _check_first(self, device: Device, plan: GridPlan) -> None:
+        n = len(plan.points)
+        needs = {**plan.needs(device), **self._kept(n), "normals as given": 12 * n, "nodes": self.nodes.layer_bytes}
+        shortage = describe_shortage(self.limits, needs)
+        if shortage:
+            raise DeviceMemoryError(f"no surface can be made of the cloud: {shortage}")
+
+    def _sort_normals(self, normals: NDArray[np.float32]) -> tuple[Any, Any, Any]:
+        n = self.grid.n
+        sorted_d = [allocate(self.device, 4 * n) for _ in range(3)]
+        self._run(
+            "sort_normals", n,
+            normals=upload(self.device, normals), order=self.grid.order_d, n=n,
+            nx=sorted_d[0], ny=sorted_d[1], nz=sorted_d[2],
+        )  # fmt: skip
+        return sorted_d[0], sorted_d[1], sorted_d[2]
+
+    @cached_property
+    def _where(self) -> dict[str, Any]:
+        """Arguments that kernels have in common."""
+        origin = self.grid.origin_and_scale
+        return {"nodes": self.nodes.corner_and_spacing, "origin": origin, "within": self._within}
+
+    def _find_bricks(self) -> tuple[Any, NDArray[np.uint32]]:
+        """List the bricks that points may reach; on the device and here."""
+        grid, nodes = self.grid, self.nodes
+        bricks_x, bricks_y, bricks_z = nodes.bricks
+        rows, words = bricks_y * bricks_z, nodes.brick_words
+        merged_d, bricks_d = allocate(self.device, 4 * rows * grid.words), allocate(self.device, 4 * rows * words)
+        self._run(
+            "merge_rows", rows * grid.words,
+            mask=grid.mask_d, merged=merged_d, ny=grid.shape[1], nz=grid.shape[2], words=grid.words,
+            bricks_y=bricks_y, bricks_z=bricks_z, **self._where,
+        )  # fmt: skip
+        self._run(
+            "mark_reached", rows * words,
+            merged=merged_d, bricks=bricks_d, nx=grid.shape[0], words=grid.words, bricks_x=bricks_x,
+            brick_words=words, rows=rows, **self._where,
+        )  # fmt: skip
+        found = compact(self.device, bricks_d, rows * words, stopwatch=self.stopwatch)
+        listed = download(self.device, np.empty(found.count, np.uint32), found.positions_d)
+        return found.positions_d, listed
+
+    def _plan_slabs(self) -> tuple[_Slab, ...]:
+        """Cut the layers of bricks into slabs that the device has room for."""
+        layers = self.nodes.bricks[2]
+        per_layer = 32 * self.nodes.brick_words * self.nodes.bricks[1]
+        before = np.searchsorted(self._list, per_layer * np.arange(layers + 1, dtype=np.int64))
+
+        def cut(thick: int) -> tuple[_Slab, ...]:
+            ends = [min(first + thick, layers) for first in range(0, layers, thick)]
+            return tuple(
+                _Slab(first, end, int(before[first]), int(before[end]))
+                for first, end in zip(range(0, layers, thick), ends, strict=True)
+            )
+
+        def shortage(thick: int) -> str:
+            most = max(slab.end_brick - slab.first_brick for slab in cut(thick))
+            own = {"nodes": thick * self.nodes.layer_bytes, "bricks": BRICK_BYTES * most}
+            kept = {"grid": self.grid.nbytes, "list of bricks": 4 * self.bricks, **self._kept(self.grid.n)}
+            return describe_shortage(self.limits, {**kept, **own})
+
+        thick = _largest(layers, lambda count: not shortage(count))
+        if thick == 0:
+            raise DeviceMemoryError(f"no surface can be made of the cloud: {shortage(1)}")
+        return cut(thick)
+
+    def _measure(self) -> list[Any]:
+        """Measure the field in all bricks; return the values of each slab, on the device where there is one slab."""
+        grid, nodes, device = self.grid, self.nodes, self.device
+        values = []
+        for slab in self.slabs:
+            count = slab.end_brick - slab.first_brick
+            values_d = allocate(device, BRICK_BYTES * count)
+            if count:
+                self._run(
+                    "measure_nodes", count if int(device.kernel_variants["LANES"]) > 1 else BRICK_ROWS * count,
+                    mask=grid.mask_d, ranks=grid.ranks_d, starts=grid.starts_d,
+                    px=grid.x_d, py=grid.y_d, pz=grid.z_d,
+                    nx=self._normals_d[0], ny=self._normals_d[1], nz=self._normals_d[2],
+                    list=self._listed(slab), values=values_d, count=count,
+                    near=self.masks.near_d, core=self.masks.core_d, negative=self.masks.negative_d,
+                    cells_x=grid.shape[0], cells_y=grid.shape[1], cells_z=grid.shape[2], words=grid.words,
+                    nodes_y=nodes.shape[1], node_words=nodes.words, bricks_y=nodes.bricks[1],
+                    brick_words=nodes.brick_words, **self._where, **self.settings.squared(),
+                )  # fmt: skip
+            if len(self.slabs) > 1:
+                values.append(download(device, np.empty((count, BRICK_BYTES // 4), np.float32), values_d))
+            else:
+                values.append(values_d)
+        return values
+
+    def _listed(self, slab: _Slab) -> Any:
+        """Return the list of the bricks of a slab, on the device."""
+        if len(self.slabs) == 1:
+            return self._list_d
+        return upload(self.device, self._list[slab.first_brick : slab.end_brick])
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes on the device without points and grid, with all masks."""
+        values = BRICK_BYTES * self.bricks if len(self.slabs) == 1 else 0
+        return values + 4 * self.bricks + Masks.COUNT * self.nodes.mask_bytes
+
+    def release_points(self) -> None:
+        """Free the points and their grid: the values stay."""
+        del self.grid, self._normals_d
+
+    def release(self) -> None:
+        """Free everything on the device."""
+        del self._values, self._list_d, self.masks
+
+    def fill(self, signs: Signs, progress: Callable[[int, int], None] | None = None) -> NDArray[np.float32]:
+        """Return the field as a volume, positive inside, with the decided signs; shape (nz, ny, nx), mm."""
+        nx, ny, nz = self.nodes.shape
+        device, whole = self.device, len(self.slabs) == 1
+        volume, volume_d = empty_output(device, (nz, ny, nx), np.float32) if whole else (
+            result_pages.empty((nz, ny, nx), np.float32), None,
+        )  # fmt: skip
+        for number, slab in enumerate(self.slabs):
+            first, end = BRICK[2] * slab.first, BRICK[2] * slab.end
+            slab_d = volume_d if whole else allocate(device, 4 * nx * ny * (end - first))
+            self._fill_slab(slab, signs, self._values[number], slab_d)
+            download(device, volume[first:end], slab_d)
+            if progress is not None:
+                progress(number + 1, len(self.slabs))
+        return volume
+
+    def _fill_slab(self, slab: _Slab, signs: Signs, values: Any, slab_d: Any) -> None:
+        nodes = self.nodes
+        bricks_x, bricks_y, _ = nodes.bricks
+        far = float(np.float32(self.settings.bridge))
+        offset, rows = BRICK[2] * slab.first * nodes.shape[1], BRICK[2] * (slab.end - slab.first) * nodes.shape[1]
+        sizes = {"bricks_x": bricks_x, "node_words": nodes.words, "row_offset": offset, "far_value": far}
+        self._run("fill_far", rows * bricks_x, inside=signs.inside_d, volume=slab_d, rows=rows, **sizes)
+        count = slab.end_brick - slab.first_brick
+        if count:
+            self._run(
+                "place_bricks", BRICK_ROWS * count,
+                list=self._listed(slab), values=values if len(self.slabs) == 1 else upload(self.device, values),
+                near=self.masks.near_d, inside=signs.inside_d, volume=slab_d,
+                nodes_y=nodes.shape[1], bricks_y=bricks_y, brick_words=nodes.brick_words,
+                least=LEAST_SHARE * float(nodes.spacing), count=count, **sizes,
+            )  # fmt: skip
+
+
+def _largest(most: int, fits: Callable[[int], bool]) -> int:
+    """Return the largest number up to `most` that fits; 0 where 1 does not."""
+    if fits(most):
+        return most
+    low, high = 0, most
+    while high - low > 1:
+        middle = (low + high) // 2
+        low, high = (middle, high) if fits(middle) else (low, middle)
+    return low

@@ -1,0 +1,158 @@
+"""Twin of `clrecon.operators.points.field`: a signed distance around a cloud with normals, on nodes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["FAR", "FieldTwin", "SignsTwin", "decide_signs", "fill_nodes", "measure_field"]
+
+FAR = np.float32(np.inf)
+"""Squared distance of nodes that no point reaches."""
+
+_SIDES = tuple((axis, way) for axis in range(3) for way in (1, -1))
+
+
+@dataclass(frozen=True, eq=False)
+class FieldTwin:
+    """The field on nodes, arrays of shape (nz, ny, nx).
+
+    Attributes
+    ----------
+    value : float64, mm
+        Mean of <x - p, n>; NaN where no point has weight.
+    squared : float32, mm^2
+        Squared distance to the nearest point, in the arithmetic of float32; `FAR` beyond the reach.
+    """
+
+    value: NDArray[np.float64]
+    squared: NDArray[np.float32]
+
+
+@dataclass(frozen=True, eq=False)
+class SignsTwin:
+    """Which nodes are inside, shape (nz, ny, nx), and the votes for far regions."""
+
+    inside: NDArray[np.bool_]
+    votes: int
+    against: int
+    regions: int
+
+
+def measure_field(
+    points: NDArray[np.float32],
+    normals: NDArray[np.float32],
+    corner: NDArray[np.float32],
+    spacing: float,
+    shape: tuple[int, int, int],
+    *,
+    reach: float,
+    smoothing: float,
+) -> FieldTwin:
+    """Average the distances from the planes of the points around each node.
+
+    Parameters
+    ----------
+    points, normals : ndarray, shape (n, 3), float32
+        mm, and unit vectors.
+    corner : ndarray, shape (3,), float32
+        Place of node (0, 0, 0) in mm.
+    spacing : float
+        mm between nodes.
+    shape : (nx, ny, nz)
+        Number of nodes.
+    reach, smoothing : float
+        R and s in mm: a point at distance d < R has the weight ``(1 - d^2 / R^2)^2 / (d^2 + s^2)``.
+
+    Returns
+    -------
+    FieldTwin
+    """
+    h, reach32 = np.float32(spacing), np.float32(reach)
+    nx, ny, nz = shape
+    summed, weights = np.zeros((2, nz, ny, nx))
+    squared = np.full((nz, ny, nx), FAR, dtype=np.float32)
+    most = int(reach / spacing + 0.501)  # from the nearest node on
+    nearest = np.rint((points - corner) / h).astype(np.int64)
+    steps = np.arange(-most, most + 1)
+    for dk in steps:
+        for dj in steps:
+            for di in steps:
+                node = nearest + (di, dj, dk)
+                on_grid = ((node >= 0) & (node < shape)).all(axis=1)
+                i, j, k = node[on_grid].T
+                place = corner + node[on_grid].astype(np.float32) * h
+                away = place - points[on_grid]
+                x, y, z = away.T
+                own = x * x + (y * y + z * z)
+                used = own < reach32 * reach32
+                at = k[used], j[used], i[used]
+                exact = own[used].astype(np.float64)
+                weight = (1.0 - exact / float(reach32) ** 2) ** 2 / (exact + float(np.float32(smoothing)) ** 2)
+                height = (away[used].astype(np.float64) * normals[on_grid][used]).sum(axis=1)
+                np.add.at(summed, at, weight * height)
+                np.add.at(weights, at, weight)
+                np.minimum.at(squared, at, own[used])
+    with np.errstate(invalid="ignore"):
+        return FieldTwin(summed / weights, squared)
+
+
+def _shifted(mask: NDArray[np.bool_], axis: int, way: int) -> NDArray[np.bool_]:
+    """Return for each node the bit of its neighbour; False beyond the nodes."""
+    result = np.zeros_like(mask)
+    to, source = [slice(None)] * 3, [slice(None)] * 3
+    to[axis], source[axis] = (slice(None, -1), slice(1, None)) if way > 0 else (slice(1, None), slice(None, -1))
+    result[tuple(to)] = mask[tuple(source)]
+    return result
+
+
+def decide_signs(
+    near: NDArray[np.bool_], core: NDArray[np.bool_], negative: NDArray[np.bool_], rounds: int
+) -> SignsTwin:
+    """Decide which nodes are inside.
+
+    Nodes of `core` keep the sign of the field.  Far nodes, those that are not near, form regions over their six
+    neighbours; each pair of a near and a far neighbour is a vote with the near node's sign, and a region takes the sign
+    of most of its votes, outside where they are even.  The signs of far nodes then flood the near nodes that are not of
+    `core`, one neighbour farther in each of `rounds` rounds.  Nodes that both signs reach in one round, or none ever,
+    keep their own.
+
+    Parameters
+    ----------
+    near, core, negative : ndarray, shape (nz, ny, nx), bool
+        Nodes within B of a point, those within one spacing, and those whose field is not positive.
+    """
+    from scipy import ndimage
+
+    regions, count = ndimage.label(~near)
+    votes = np.zeros((2, count + 1), dtype=np.int64)
+    for axis, way in _SIDES:
+        voter, sign = _shifted(near, axis, way), _shifted(negative, axis, way)
+        for which in (0, 1):
+            votes[which] += np.bincount(regions[voter & (sign == bool(which))], minlength=count + 1)
+    votes[:, 0] = 0
+    inside = np.where(near, negative, (votes[1] > votes[0])[regions])
+    reached = ~near
+    for _ in range(rounds):
+        signs = np.zeros((2, *near.shape), dtype=bool)
+        for axis, way in _SIDES:
+            there, sign = _shifted(reached, axis, way), _shifted(inside, axis, way)
+            signs[0] |= there & ~sign
+            signs[1] |= there & sign
+        new = (signs[0] | signs[1]) & ~reached & ~core
+        inside = np.where(new & (signs[0] != signs[1]), signs[1], inside)
+        reached |= new
+    return SignsTwin(inside, int(votes.sum()), int(votes.min(axis=0).sum()), count)
+
+
+def fill_nodes(
+    field: FieldTwin, near: NDArray[np.bool_], signs: SignsTwin, far_value: float, least: float
+) -> NDArray[np.float64]:
+    """Return the volume whose surface at 0 is the result, positive inside.
+
+    Near nodes have |f|, at least `least` and at most `far_value`; all others have `far_value`.
+    """
+    size = np.where(near, np.clip(np.abs(field.value), least, far_value), far_value)
+    return np.where(signs.inside, size, -size)

@@ -1,0 +1,149 @@
+"""The field around a cloud equals its twin, and so do the signs of all nodes."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from point_fields import cube_cloud, fetch_mask, fetch_masks, sphere_cloud, twin_field
+from tolerances import TWIN_FIELD_MM
+
+from clrecon.errors import DeviceMemoryError, UsageError
+from clrecon.opencl import memory_limits, upload
+from clrecon.operators.points.field import MOST_NODES, FieldSettings, NodeField, plan_nodes
+from clrecon.operators.points.field_signs import Masks, decide_signs
+from clrecon.operators.points.grid import plan_grid
+from clrecon.points import PointCloud
+from clrecon.reference.points import field as twin
+
+
+def scattered_cloud(n, size=(9.0, 7.0, 8.0), seed=3):
+    rng = np.random.default_rng(seed)
+    normals = rng.normal(size=(n, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    return PointCloud((rng.random((n, 3)) - 0.5) * size, normals)
+
+
+def check_equal(device, cloud, settings, **options):
+    """Compare every step with the twin; return the volume."""
+    field = NodeField(device, cloud, cloud.normals, settings, **options)
+    expected, near, core = twin_field(cloud, field.nodes, settings)
+    found_near, found_core, negative = fetch_masks(field.masks)
+    np.testing.assert_array_equal(found_near, near)
+    np.testing.assert_array_equal(found_core, core)
+    clear = near & (np.abs(np.where(near, expected.value, 0.0)) > TWIN_FIELD_MM)
+    np.testing.assert_array_equal(negative[clear], expected.value[clear] <= 0.0)
+    assert not negative[~near].any()
+    signs = decide_signs(field.masks, field.limits, settings.rounds)
+    decided = twin.decide_signs(near, core, negative, settings.rounds)
+    np.testing.assert_array_equal(fetch_mask(field.masks, signs.inside_d), decided.inside)
+    assert (signs.votes, signs.against, signs.regions) == (decided.votes, decided.against, decided.regions)
+    assert signs.outside_is_inside == decided.inside[0, 0, 0]
+    volume = field.fill(signs)
+    far = float(np.float32(settings.bridge))
+    filled = twin.fill_nodes(expected, near, decided, far, 1e-6 * settings.spacing)
+    np.testing.assert_allclose(volume, filled, atol=TWIN_FIELD_MM, rtol=0.0)
+    np.testing.assert_array_equal(volume > 0.0, decided.inside)
+    return volume
+
+
+def lengths(spacing, reach=2.0, smoothing=0.1, bridge=2.0):
+    return FieldSettings(spacing, reach * spacing, smoothing * spacing, bridge * spacing)
+
+
+@pytest.mark.parametrize("shares", [(2.0, 0.1, 2.0), (3.0, 1000.0, 1.5), (4.0, 1.0, 1.0), (2.6, 0.1, 2.5)])
+def test_a_small_sphere(device, shares):
+    check_equal(device, sphere_cloud(700, 4.0), lengths(0.6, *shares))
+
+
+@pytest.mark.parametrize("n", [1, 2, 3, 60, 255, 256, 257, 1000])
+def test_scattered_points_whose_normals_do_not_agree(device, n):
+    check_equal(device, scattered_cloud(n), lengths(0.8))
+
+
+@pytest.mark.oclgrind
+def test_a_field_of_every_kernel(device):
+    check_equal(device, sphere_cloud(150, 2.5), lengths(0.9))
+
+
+def test_points_in_one_place_are_gathered_in_turn(device):
+    points = np.concatenate([np.full((600, 3), (0.3, 0.1, -0.2)), sphere_cloud(300, 3.0).points])
+    normals = np.concatenate([np.tile((0.0, 0.6, 0.8), (600, 1)), sphere_cloud(300, 3.0).normals])
+    check_equal(device, PointCloud(points, normals), lengths(0.7))
+
+
+@pytest.mark.parametrize("length", [6.1, 6.2, 14.2, 25.0])
+def test_rows_around_whole_bricks_and_words(device, length):
+    cloud = cube_cloud(500, 2.0)
+    stretched = PointCloud(cloud.points * (length, 1.0, 1.0), cloud.normals)
+    check_equal(device, stretched, lengths(0.8, bridge=1.25))
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_signs_of_masks_at_random(device, seed):
+    rng = np.random.default_rng(seed)
+    shape = (8 * int(rng.integers(1, 9)), 4 * int(rng.integers(1, 4)), 4 * int(rng.integers(1, 4)))
+    near = rng.random(shape[::-1]) < (0.1, 0.5, 0.7, 0.9, 0.99, 0.6)[seed]
+    core, negative = near & (rng.random(near.shape) < 0.4), near & (rng.random(near.shape) < 0.5)
+    near[0, 0, 0] = core[0, 0, 0] = negative[0, 0, 0] = False
+    masks = put_masks(device, near, core, negative)
+    for rounds in (0, 1, 4):
+        signs = decide_signs(masks, memory_limits(device), rounds)
+        expected = twin.decide_signs(near, core, negative, rounds)
+        np.testing.assert_array_equal(fetch_mask(masks, signs.inside_d), expected.inside)
+        assert (signs.votes, signs.against, signs.regions) == (expected.votes, expected.against, expected.regions)
+        masks = put_masks(device, near, core, negative)
+
+
+def put_masks(device, *arrays):
+    masks = Masks(device, arrays[0].shape[::-1])
+    for name, array in zip(("near_d", "core_d", "negative_d"), arrays, strict=True):
+        padded = np.zeros((*array.shape[:2], 32 * masks.words), dtype=bool)
+        padded[:, :, : array.shape[2]] = array
+        packed = np.packbits(padded, axis=2, bitorder="little")
+        buffer = masks.make()
+        write(device, buffer, upload(device, packed), packed.nbytes)
+        setattr(masks, name, buffer)
+    return masks
+
+
+def write(device, to_d, from_d, size):
+    import pyopencl
+
+    pyopencl.enqueue_copy(device.queue, to_d, from_d, byte_count=size).wait()
+
+
+def test_slabs_give_the_same_field_bit_for_bit(device):
+    cloud, settings = sphere_cloud(3000, 12.0), lengths(0.5)
+    whole = NodeField(device, cloud, cloud.normals, settings)
+    assert len(whole.slabs) == 1
+    signs = decide_signs(whole.masks, whole.limits, settings.rounds)
+    expected = whole.fill(signs)
+    needs = whole.grid.nbytes + whole.nbytes + 12 * len(cloud)
+    parts = NodeField(device, cloud, cloud.normals, settings, memory=needs + expected.nbytes // 6)
+    assert len(parts.slabs) > 2
+    parts_signs = decide_signs(parts.masks, whole.limits, settings.rounds)
+    assert np.array_equal(parts.fill(parts_signs), expected)
+
+
+def test_without_room_for_a_layer_of_bricks_the_needs_are_said(device):
+    cloud = sphere_cloud(3000, 12.0)
+    with pytest.raises(DeviceMemoryError, match="no surface can be made of the cloud: this needs"):
+        NodeField(device, cloud, cloud.normals, lengths(0.5), memory=200_000)
+
+
+def test_nodes_reach_beyond_the_points():
+    cloud, settings = sphere_cloud(500, 5.0), lengths(0.7, bridge=2.3)
+    nodes = plan_nodes(plan_grid(cloud, 1.4), settings)
+    first, last = nodes.affine[:3, 3], nodes.affine[:3, 3] + 0.7 * (np.array(nodes.shape) - 1)
+    margin = settings.bridge + 0.69
+    assert (cloud.points.min(axis=0) - first > margin).all()
+    assert (last - cloud.points.max(axis=0) > margin).all()
+    assert nodes.shape[0] % 8 == nodes.shape[1] % 4 == nodes.shape[2] % 4 == 0
+
+
+def test_too_many_nodes_are_refused_with_their_number():
+    points = np.array([(0, 0, 0), (900, 900, 900)], np.float32)
+    with pytest.raises(UsageError, match=r"nodes every 0\.5 mm: .* of them, possible are 2,147,483,648: take 0\.7"):
+        plan_nodes(plan_grid(points, 1.0), lengths(0.5))
+    nodes = plan_nodes(plan_grid(points, 1.5), lengths(0.75))
+    assert nodes.count <= MOST_NODES
