@@ -10,7 +10,7 @@ from typing import Any
 from measure import alternate, spread, summarise
 from registry import Job, case
 
-__all__ = ["measure_voxel_clusters"]
+__all__ = ["BANDS", "compare_sides", "measure_voxel_clusters"]
 
 EPS_MM, MIN_SAMPLES = 1.2, 6
 BANDS = {"T15": 500.0, "T1": 200.0, "T4": 60.0}
@@ -47,7 +47,7 @@ def measure_voxel_clusters(job: Job) -> dict[str, Any]:
                 def ours(own: Any = own_stencil, samples: int = samples, mask: Any = mask) -> Any:
                     return ClusterSearch(job.device, mask, own, samples).label()
 
-                _compare(job, f"{name}-{peer}", ours, theirs, figures)
+                compare_sides(job, f"{name}-{peer}", ours, theirs, figures)
                 found[peer] = ours()
                 figures["equal"][f"{name}-{peer}"] = _is_equal(peer, found[peer], theirs(), inside)
             figures["points"][name] = len(points)
@@ -88,7 +88,10 @@ def _is_equal(peer: str, ours: Any, theirs: Any, inside: Any) -> bool:
     return bool(np.array_equal(ours, theirs))
 
 
-def _compare(job: Job, name: str, ours: Callable[[], Any], theirs: Callable[[], Any], figures: dict[str, Any]) -> None:
+def compare_sides(
+    job: Job, name: str, ours: Callable[[], Any], theirs: Callable[[], Any], figures: dict[str, Any]
+) -> None:
+    """Time both sides in turn, by the wall and by the processor, and enter them into `figures` under `name`."""
     spent: dict[str, list[float]] = {"ours": [], "theirs": []}
 
     def timed(which: str, run: Callable[[], Any]) -> float:
