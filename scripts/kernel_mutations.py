@@ -233,6 +233,30 @@ INVERSIONS: dict[str, dict[str, tuple[tuple[str, str], ...]]] = {
         "labels": (("own + point + before, runs", "own + point, runs"), (", numbers[run]);", ", ~numbers[run]);"))
     },
     "flag_cores": {"flags": (("(core & rest & -rest) != 0", "(core & rest & -rest) == 0"),)},
+    "find_core_points": {
+        "cores": (("? point.x : NAN;", "? NAN : point.x;"), ("core_x[at] = x[at];", "core_x[at] = NAN;")),
+        "labels": (("labels[cell] = label;", "labels[cell] = ~label;"),),
+    },
+    "join_chunks": {
+        "labels": (
+            (
+                "labels[max(root, other_root)] = min(root, other_root);",
+                "labels[min(root, other_root)] = max(root, other_root);",
+            ),
+        )
+    },
+    "note_words": {"roots": (("roots[word] = root;", "roots[word] = ~root;"),)},
+    "hook_cells": {
+        "labels": (("max(root, other_root), min(root, other_root)", "min(root, other_root), max(root, other_root)"),)
+    },
+    "find_firsts": {"places": (("least = min(least, order[at]);", "least = order[at] ^ 1u;"),)},
+    "mark_firsts": {"marks": (("1u << (firsts[cell] & 31)", "~(1u << (firsts[cell] & 31))"),)},
+    "number_cells": {"numbers": (("numbers[cell] = number;", "numbers[cell] = ~number;"),)},
+    "label_free_points": {
+        "clusters": (("= (int)least;", "= ~(int)least;"),),
+        "cores": (("= (uchar)is_core;", "= (uchar)!is_core;"),),
+    },
+    "count_pairs": {"pairs": (("pairs[cell] = (float)own", "pairs[cell] = -(float)own"),)},
     "sum_volumes": {"sums": (("sums[item] = sum;", "sums[item] = -sum;"),)},
     "fit_planes": {
         "normals": tuple((f"store_rows(n{c} * size,", f"store_rows(n{c} * size + 0.1f,") for c in "xyz"),

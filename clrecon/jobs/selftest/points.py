@@ -12,10 +12,10 @@ from clrecon.operators.points.neighbours import find_neighbours
 from clrecon.reference.points import grid as grid_twin
 from clrecon.reference.points import neighbours as neighbours_twin
 
-__all__ = ["CHECKS"]
+__all__ = ["CHECKS", "scattered_points"]
 
 
-def _scattered(n: int) -> NDArray[np.float32]:
+def scattered_points(n: int) -> NDArray[np.float32]:
     """Return points in a box of 60 x 40 x 30 mm, one in twenty of them twice."""
     points = np.random.default_rng(23).random((n, 3), np.float32) * np.array([60, 40, 30], np.float32)
     points[n // 2 : n // 2 + n // 20] = points[: n // 20]
@@ -23,7 +23,7 @@ def _scattered(n: int) -> NDArray[np.float32]:
 
 
 def _check_grid(device: Device) -> str:
-    points = _scattered(20_000)
+    points = scattered_points(20_000)
     for edge in (0.5, 2.3):
         made, twin = make_grid(device, points, edge), grid_twin.make_grid(points, edge)
         what = f"of a grid of {edge} mm"
@@ -42,12 +42,12 @@ def _check_grid(device: Device) -> str:
 
 def _check_neighbours(device: Device) -> str:
     """Compare neighbours of scattered points with far ones, a crowd and many at one place, and of a lattice."""
-    scattered = _scattered(12_000)
+    scattered = scattered_points(12_000)
     scattered[:500] *= 0.01
     scattered[500:540] = scattered[0]
     scattered[540:545] += np.float32(300.0)
     lattice = np.argwhere(np.ones((20, 20, 20))).astype(np.float32)
-    many = _scattered(30_000)  # in some 15,000 cells, of which a work-item takes 16
+    many = scattered_points(30_000)  # in some 15,000 cells, of which a work-item takes 16
     for points, k in ((scattered, 16), (scattered, 5), (lattice, 16), (many, 2)):
         found = find_neighbours(points, k, device=device)
         indices, distances = neighbours_twin.find_neighbours(points, k)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from clrecon.jobs.selftest import (
     clusters,
     fields,
+    free_clusters,
     labels,
     pictures,
     point_filters,
@@ -31,6 +32,7 @@ CHECKS: tuple[Check, ...] = (
     *clusters.CHECKS,
     *fields.CHECKS,
     *point_filters.CHECKS,
+    *free_clusters.CHECKS,
 )
 
 

@@ -32,6 +32,7 @@ __all__ = [
     "CELL_ROUNDING",
     "MOST_CELLS",
     "MOST_CELLS_ALONG",
+    "PADDING",
     "GridPlan",
     "PointGrid",
     "fill_grid",
@@ -52,6 +53,9 @@ MOST_CELLS_ALONG = 2**17
 
 CELL_ROUNDING = kernel_number("points/grid.h", "GRID_ROUNDING")
 """A point may lie outside of its cell by this share of its distance from the grid's origin: float32 chose the cell."""
+
+PADDING = 8
+"""Elements after the coordinates of a grid."""
 
 _CHUNK = 256
 """Points that numpy compares together: reductions of rows of three numbers are slow."""
@@ -94,7 +98,7 @@ class GridPlan:
         """Return the bytes that `fill_grid` takes at most, by description; the grid itself is what it keeps of them."""
         n = len(self.points)
         sorting = 4 * n + sort_bytes(device, n, _bits(n))
-        gathering = 8 * n + 12 * n + 4 * (n + 1)
+        gathering = 8 * n + 12 * (n + PADDING) + 4 * (n + 1)
         return {
             "points": self.points.nbytes,
             "sorted points": max(sorting, gathering),
@@ -131,8 +135,9 @@ class PointGrid:
         First sorted point of each cell with points, then `n`.
     order_d : buffer, (n,) uint32
         Number of the point at each place of the sorted order; points of a cell are in the order of the input.
-    x_d, y_d, z_d : buffer, (n,) float32
-        Sorted coordinates in mm relative to `base`.
+    x_d, y_d, z_d : buffer, (n + PADDING,) float32
+        Sorted coordinates in mm relative to `base`; the last ones are undefined, so that a vector can be read from any
+        point on.
     """
 
     device: Device
@@ -160,7 +165,7 @@ class PointGrid:
     @property
     def nbytes(self) -> int:
         """Bytes of the grid on the device."""
-        return 16 * self.n + 4 * (self.cells + 1) + 8 * self.words * self.shape[1] * self.shape[2]
+        return 16 * self.n + 12 * PADDING + 4 * (self.cells + 1) + 8 * self.words * self.shape[1] * self.shape[2]
 
 
 def _bits(numbers: int) -> int:
@@ -301,7 +306,7 @@ def fill_grid(
     by_cell = radix_sort(device, keys_d, n, bits=_bits(cells), stopwatch=stopwatch)
     wait(device)  # what the sort used is free then
     del keys_d
-    x_d, y_d, z_d = (allocate(device, 4 * n) for _ in range(3))
+    x_d, y_d, z_d = (allocate(device, 4 * (n + PADDING)) for _ in range(3))
     starts_d = allocate(device, 4 * (cells + 1))
     run(
         "gather_points", n,

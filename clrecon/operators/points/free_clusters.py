@@ -1,0 +1,459 @@
+"""DBSCAN of free points on the device: the host's side of cl/points/free_clusters.cl."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from clrecon.errors import DeviceError, DeviceMemoryError, UsageError
+from clrecon.opencl import (
+    Device,
+    Program,
+    Stopwatch,
+    allocate,
+    check_memory,
+    describe_shortage,
+    download,
+    empty_output,
+    kernel_constant,
+    launch,
+    load_program,
+    memory_limits,
+    take_device,
+    work_on,
+)
+from clrecon.operators.points.grid import PADDING, GridPlan, PointGrid, fill_grid, find_box, plan_grid, prepare_grid
+from clrecon.operators.primitives.scan import exclusive_scan
+from clrecon.operators.primitives.union_find import prepare_components
+from clrecon.system.progress import Progress, ignore_progress
+from clrecon.system.wording import name_parameter
+
+__all__ = ["FreeClusters", "cluster_free_points", "find_clusters", "plan_cells", "prepare_clusters"]
+
+EPS_TOLERANCE = 1e-6
+"""Distances up to eps times one more than this are within eps."""
+
+LEAST_EPS_MM = 1e-9
+"""Smallest eps: squares of smaller ones leave the range of float32."""
+
+DOUBTFUL = 1e-6
+"""Part of the limit's square within which sums of two floats decide, see cl/points/pair_distance.h."""
+
+CELL_SLACK = 1e-3
+"""Part by which cells are smaller than they could be, besides the rounding of the grid."""
+
+MOST_PAIRS = 1e12
+"""Most candidate pairs of points; more would take many minutes."""
+
+MOST_PASSES = 1000
+"""Limit of passes of hooking and of jumps, far above the need."""
+
+FORWARD_ROWS = kernel_constant("points/cell_links.h", "FORWARD_ROWS")
+NEAR_ROWS = kernel_constant("points/cell_links.h", "NEAR_ROWS")
+
+CHUNKS_A_CORE = 2
+"""Chunks for each core of a CPU: few, since links between chunks take more time than those within."""
+
+CELLS_A_CHUNK = 32
+"""Cells of a chunk on other devices, and fewest on a CPU."""
+
+CELLS_AN_ITEM = 32
+"""Neighbouring cells of a work-item of hook_cells and find_firsts on a CPU."""
+
+
+@dataclass(frozen=True, eq=False)
+class FreeClusters:
+    """The result of `cluster_free_points`.
+
+    Attributes
+    ----------
+    labels : ndarray, shape (n,), int32
+        Cluster of each point, numbered by the first core point; -1 is noise.
+    cores : ndarray, shape (n,), bool
+        The core points.
+    count : int
+        Number of clusters.
+    facts : dict
+        For a report: eps, min_samples, clusters, core and noise points, edge and number of the grid's cells, the device
+        and the seconds of its kernels.
+    warnings : tuple of str
+        A line each.
+    """
+
+    labels: NDArray[np.int32]
+    cores: NDArray[np.bool_]
+    count: int
+    facts: dict[str, Any]
+    warnings: tuple[str, ...] = ()
+
+
+def prepare_clusters(device: Device) -> Program:
+    """Build the kernels of `find_clusters`."""
+    prepare_grid(device)
+    prepare_components(device)
+    return load_program(device, "points/free_clusters.cl", {"LANES": device.kernel_variants["LANES"]})
+
+
+def _check(eps: float, min_samples: int) -> None:
+    if not (isinstance(eps, (int, float, np.floating, np.integer)) and math.isfinite(eps) and eps >= LEAST_EPS_MM):
+        raise UsageError(f"{name_parameter('eps', eps)}: a distance in mm is needed, at least {LEAST_EPS_MM:g}")
+    if isinstance(min_samples, bool) or not isinstance(min_samples, (int, np.integer)) or min_samples < 1:
+        raise UsageError(f"{name_parameter('min_samples', min_samples)}: a whole number from 1 on is needed")
+
+
+def plan_cells(points: ArrayLike, eps: float) -> GridPlan:
+    """Lay a grid over points whose cells are so small that all points of one are within eps of each other.
+
+    Raises
+    ------
+    UsageError
+        As `clrecon.operators.points.grid.plan_grid`.
+    """
+    places = np.asarray(points)
+    low, high = find_box(places).astype(np.float64)
+    extent = high - low
+    if not np.isfinite(extent).all():
+        return plan_grid(places, eps)  # refuses them
+    if float(np.sqrt((extent**2).sum())) <= eps:  # one cell, whatever the number of points
+        return plan_grid(places, 1.01 * float(extent.max()) if extent.any() else 1.0)
+    edge = eps / math.sqrt(3.0)
+    along = float(extent.max()) / edge
+    return plan_grid(places, edge * (1.0 - CELL_SLACK - min(4e-7 * along, 0.1)))
+
+
+def cluster_free_points(
+    points: ArrayLike,
+    eps: float,
+    min_samples: int = 6,
+    *,
+    device: Device | str | int | None = None,
+    memory: int | None = None,
+    progress: Progress | None = None,
+) -> FreeClusters:
+    """Cluster points anywhere in space by density (DBSCAN), equal to scikit-learn label for label.
+
+    Points are core points when at least `min_samples` points lie within `eps`, themselves included.  Core points within
+    `eps` of each other belong to one cluster.  Clusters are numbered by their first core point in the order of the
+    points; other points near core points take the lowest number among these; all others are noise, -1.
+
+    Parameters
+    ----------
+    points : array_like, shape (n, 3)
+        LPS mm, finite, or a `PointCloud`.  Distances are those of the points as float32, of far clouds relative to
+        whole millimetres near their centre, and are compared as in exact arithmetic.
+    eps : float
+        mm.  Distances up to ``eps * (1 + 1e-6)`` are within.
+    min_samples : int
+        From 1 on; 1 gives connected components.
+    device : Device, str or int, optional
+        See `clrecon.device`; None is the best of the machine.
+    memory : int, optional
+        Bytes that may be taken on the device; None is all that it has.
+    progress : callable, optional
+        Called as ``progress("clusters", done, 4)`` after the grid, the core points, the links and the labels.
+
+    Returns
+    -------
+    FreeClusters
+
+    Raises
+    ------
+    UsageError
+        `eps` or `min_samples` cannot be used, a point is not finite, the grid would have too many cells, or more than
+        1e12 pairs of points would have to be compared.
+    DeviceError
+        No device, no room for the points, or the device fails.
+
+    References
+    ----------
+    Ester, Kriegel, Sander and Xu 1996.
+    """
+    _check(eps, min_samples)
+    check_memory(memory)
+    places = np.asarray(points)
+    if places.ndim != 2 or places.shape[1] != 3:
+        raise UsageError(f"points have shape (n, 3), these have {places.shape}")
+    n = len(places)
+    facts: dict[str, Any] = {"eps_mm": float(eps), "min_samples": int(min_samples)}
+    if n < min_samples:
+        warning = f"{n:,} points are fewer than min_samples {min_samples}: all are noise"
+        facts |= {"clusters": 0, "core_points": 0, "noise_points": n}
+        return FreeClusters(np.full(n, -1, np.int32), np.zeros(n, bool), 0, facts, (warning,))
+    plan = plan_cells(places, eps)
+
+    def work(current: Device, told: list[str]) -> FreeClusters:
+        stopwatch = Stopwatch()
+        with stopwatch.running(current):
+            search = find_clusters(
+                current, plan, eps, min_samples, memory=memory, stopwatch=stopwatch, progress=progress
+            )
+        labels, cores, count, cells = search
+        found = {
+            "clusters": count,
+            "core_points": int(cores.sum()),
+            "noise_points": int((labels < 0).sum()),
+            "cell_edge_mm": float(plan.edge),
+            "cells": cells,
+            "device": current.label,
+            "kernel_seconds": dict(stopwatch.by_kernel),
+        }
+        return FreeClusters(labels, cores, count, facts | found, tuple(told))
+
+    return work_on(take_device(device), work)
+
+
+def find_clusters(
+    device: Device,
+    plan: GridPlan,
+    eps: float,
+    min_samples: int,
+    *,
+    per_chunk: int | None = None,
+    memory: int | None = None,
+    stopwatch: Stopwatch | None = None,
+    progress: Progress | None = None,
+) -> tuple[NDArray[np.int32], NDArray[np.bool_], int, int]:
+    """Cluster the points of a plan on one device; parameters are those of `cluster_free_points`.
+
+    Parameters
+    ----------
+    plan : GridPlan
+        As `plan_cells` makes it for `eps`.
+    per_chunk : int, optional
+        Cells of a chunk, a multiple of `CELLS_AN_ITEM`; the result does not depend on it.
+
+    Returns
+    -------
+    labels : ndarray, shape (n,), int32
+    cores : ndarray, shape (n,), bool
+    count : int
+        Number of clusters.
+    cells : int
+        Number of cells with points.
+    """
+    tell = ignore_progress if progress is None else progress
+    n = len(plan.points)
+    shortage = describe_shortage(memory_limits(device, memory), {**plan.needs(device), "clusters": 23 * n})
+    if shortage:
+        raise DeviceMemoryError(f"the clusters of the points cannot be found: {shortage}")
+    grid = fill_grid(device, plan, memory=memory, stopwatch=stopwatch)
+    tell("clusters", 1, 4)
+    search = ClusterSearch(device, grid, eps, min_samples, per_chunk, stopwatch)
+    search.check_pairs()
+    search.find_cores()
+    tell("clusters", 2, 4)
+    search.join()
+    tell("clusters", 3, 4)
+    labels, cores = search.label()
+    tell("clusters", 4, 4)
+    return labels, cores, search.count, grid.cells
+
+
+class ClusterSearch:
+    """The passes of cl/points/free_clusters.cl, in their order.
+
+    Attributes
+    ----------
+    core_x_d : buffer, (n + PADDING,) float32
+        x of core points, NaN for others.
+    labels_d : buffer, (cells,) uint32
+        After each step the cells' labels, all of them roots.
+    roots_d : buffer, (nz, ny, words) uint32
+        Roots of words, as the search noted them last.
+    count : int
+        Number of clusters, once `label` has run.
+    """
+
+    def __init__(
+        self,
+        device: Device,
+        grid: PointGrid,
+        eps: float,
+        min_samples: int,
+        per_chunk: int | None = None,
+        stopwatch: Stopwatch | None = None,
+    ):
+        self._device, self._grid, self._stopwatch = device, grid, stopwatch
+        self._program, self._of_grid = prepare_clusters(device), prepare_grid(device)
+        self._jumps = prepare_components(device)
+        self._is_cpu = int(device.kernel_variants["LANES"]) > 1
+        self._samples = min_samples
+        nx, ny, nz = grid.shape
+        self._total_words = grid.words * ny * nz
+        limit = min(eps, 2.0 * grid.edge * math.hypot(nx, ny, nz)) * (1.0 + EPS_TOLERANCE)
+        self._reach_squared = (limit / grid.edge * (1.0 + 1e-5) + 1e-5 + 4e-7 * max(grid.shape)) ** 2
+        self._where: dict[str, Any] = {
+            "x": grid.x_d, "y": grid.y_d, "z": grid.z_d, "starts": grid.starts_d, "mask": grid.mask_d,
+            "ranks": grid.ranks_d, "origin": grid.origin_and_scale, "bounds": _bounds(limit), "nx": nx, "ny": ny,
+            "nz": nz, "words": grid.words, "cells": grid.cells,
+        }  # fmt: skip
+        self._per_chunk = self._plan_chunk() if per_chunk is None else per_chunk
+        self._per_item = CELLS_AN_ITEM if self._is_cpu else 1
+        self.core_x_d = allocate(device, 4 * (grid.n + PADDING))
+        self.labels_d, self._other_d, self._firsts_d = (allocate(device, 4 * grid.cells) for _ in range(3))
+        self.roots_d, self._flags_d = allocate(device, 4 * self._total_words), allocate(device, 8)
+        self.count = 0
+
+    def _plan_chunk(self) -> int:
+        if not self._is_cpu:
+            return CELLS_A_CHUNK
+        share = -(-self._grid.cells // (CHUNKS_A_CORE * self._device.compute_units))
+        return max(-(-share // CELLS_A_CHUNK), 1) * CELLS_A_CHUNK
+
+    def _run(self, kernel: str, items: int, program: Program | None = None, **arguments: Any) -> None:
+        launch(self._device, (program or self._program)[kernel], items, stopwatch=self._stopwatch, **arguments)
+
+    def check_pairs(self) -> None:
+        """Refuse clouds that are so dense that comparing their points would take many minutes.
+
+        Raises
+        ------
+        UsageError
+            More than `MOST_PAIRS` pairs may have to be compared.
+        """
+        n, cells = self._grid.n, self._grid.cells
+        if float(n) * n <= MOST_PAIRS:
+            return
+        counts = np.diff(download(self._device, np.empty(cells + 1, np.uint32), self._grid.starts_d)).astype(np.float64)
+        if float(counts @ counts) * 187 <= MOST_PAIRS:  # 125 cells around, 62 after each
+            return
+        pairs = float(self.count_pairs().sum(dtype=np.float64))
+        if pairs > MOST_PAIRS:
+            raise UsageError(
+                f"up to {pairs:.2g} pairs of points would have to be compared, {MOST_PAIRS:.0g} at most are:"
+                f" {n:,} points lie in {cells:,} cells of {self._grid.edge:.4g} mm, up to {int(counts.max()):,} in one."
+                f"  Take a smaller {name_parameter('eps')}, or thin the cloud"
+            )
+
+    def count_pairs(self) -> NDArray[np.float32]:
+        """Return the most pairs that may have to be compared for each cell with points."""
+        cells = self._grid.cells
+        pairs, pairs_d = empty_output(self._device, (cells,), np.float32)
+        self._run("count_pairs", cells, pairs=pairs_d, min_samples=self._samples, **self._where)
+        return download(self._device, pairs, pairs_d)
+
+    def find_cores(self) -> None:
+        """Find the core points, and label each core cell with itself."""
+        self._run(
+            "find_core_points", self._grid.cells,
+            core_x=self.core_x_d, labels=self.labels_d, firsts=self._firsts_d, min_samples=self._samples,
+            reach_squared=self._reach_squared, **self._where,
+        )  # fmt: skip
+
+    def join(self) -> None:
+        """Give all cells of a cluster one label."""
+        self.join_within()
+        if self._per_chunk < self._grid.cells:
+            self.note_words()
+            self.hook_chunks()
+
+    def join_within(self) -> None:
+        """Join all cells within each chunk: the own rows first, then the nearest, then all others."""
+        self.join_chunks(0, 1)
+        self.join_chunks(1, NEAR_ROWS)
+        self.note_words()
+        self.join_chunks(NEAR_ROWS, FORWARD_ROWS)
+
+    def join_chunks(self, first_row: int, end_row: int) -> None:
+        """Join the cells within each chunk along some of the rows."""
+        chunks = -(-self._grid.cells // self._per_chunk)
+        items = chunks * self._device.group_size if self._is_cpu else chunks
+        self._run(
+            "join_chunks", items,
+            core_x=self.core_x_d, roots=self.roots_d, labels=self.labels_d, per_chunk=self._per_chunk,
+            first_row=first_row, end_row=end_row, **self._where,
+        )  # fmt: skip
+
+    def note_words(self) -> None:
+        """Note for each word of the mask whether its core cells have one root."""
+        grid = self._grid
+        self._run(
+            "note_words", self._total_words,
+            mask=grid.mask_d, ranks=grid.ranks_d, labels=self.labels_d, roots=self.roots_d, total=self._total_words,
+        )  # fmt: skip
+
+    def hook_chunks(self) -> None:
+        """Join the clusters of all chunks, in rounds."""
+        self._run("clear_cells", 2, self._of_grid, mask=self._flags_d, total=2)
+        self._jump(self.labels_d, self._other_d, 1)  # a copy: all labels are roots
+        passes = itertools.count(2)
+        while True:
+            number = self._next_pass(passes)
+            self._run(
+                "hook_cells", -(-self._grid.cells // self._per_item),
+                core_x=self.core_x_d, roots=self.roots_d, labels=self.labels_d, hooked=self._other_d,
+                flags=self._flags_d, per_chunk=self._per_chunk, per_item=self._per_item, pass_number=number,
+                **self._where,
+            )  # fmt: skip
+            if self._read_flags()[1] != number:
+                return
+            while True:
+                number = self._next_pass(passes)
+                self._jump(self._other_d, self.labels_d, number)
+                if self._read_flags()[0] != number:
+                    break
+                self.labels_d, self._other_d = self._other_d, self.labels_d
+
+    def _next_pass(self, passes: Iterator[int]) -> int:
+        number = next(passes)
+        if number > MOST_PASSES:
+            raise DeviceError(
+                f"{self._device.label} has not found the clusters after {MOST_PASSES} passes: it computes wrongly,"
+                " see `clrecon selftest` and try another device"
+            )
+        return number
+
+    def _jump(self, labels_d: Any, jumped_d: Any, number: int) -> None:
+        self._run(
+            "jump_labels", self._grid.cells, self._jumps,
+            labels=labels_d, jumped=jumped_d, flags=self._flags_d, n=self._grid.cells, pass_number=number,
+        )  # fmt: skip
+
+    def _read_flags(self) -> NDArray[np.uint32]:
+        return download(self._device, np.empty(2, dtype=np.uint32), self._flags_d)
+
+    def label(self) -> tuple[NDArray[np.int32], NDArray[np.bool_]]:
+        """Number the clusters, and return labels and core points in the order of the input."""
+        grid, words = self._grid, -(-self._grid.n // 32)
+        self._run(
+            "find_firsts", -(-grid.cells // self._per_item),
+            core_x=self.core_x_d, starts=grid.starts_d, order=grid.order_d, labels=self.labels_d,
+            firsts=self._firsts_d, cells=grid.cells, per_item=self._per_item,
+        )  # fmt: skip
+        marks_d, before_d = allocate(self._device, 4 * words), allocate(self._device, 4 * words)
+        self._run("clear_cells", words, self._of_grid, mask=marks_d, total=words)
+        self._run(
+            "mark_firsts", grid.cells, labels=self.labels_d, firsts=self._firsts_d, marks=marks_d, cells=grid.cells
+        )
+        self._run("count_marked", words, self._of_grid, mask=marks_d, counts=before_d, total=words)
+        self.count = exclusive_scan(self._device, before_d, words, in_place=True, stopwatch=self._stopwatch).total
+        numbers_d = self._other_d
+        self._run(
+            "number_cells", grid.cells,
+            labels=self.labels_d, firsts=self._firsts_d, marks=marks_d, before=before_d, numbers=numbers_d,
+            cells=grid.cells,
+        )  # fmt: skip
+        labels, labels_d = empty_output(self._device, (grid.n,), np.int32)
+        cores, cores_d = empty_output(self._device, (grid.n,), np.uint8)
+        self._run(
+            "label_free_points", grid.cells,
+            core_x=self.core_x_d, order=grid.order_d, numbers=numbers_d, clusters=labels_d, cores=cores_d,
+            reach_squared=self._reach_squared, **self._where,
+        )  # fmt: skip
+        download(self._device, labels, labels_d)
+        return labels, download(self._device, cores, cores_d).view(np.bool_)
+
+
+def _bounds(limit: float) -> tuple[float, float, float, float]:
+    """Return the float4 of cl/points/pair_distance.h for the largest distance of neighbours in mm."""
+    square = limit * limit
+    high = np.float32(square)
+    near = np.nextafter(np.float32(square * (1.0 - DOUBTFUL)), np.float32(0.0))
+    far = np.nextafter(np.float32(square * (1.0 + DOUBTFUL)), np.float32(np.inf))
+    return float(near), float(far), float(high), float(np.float32(square - float(high)))

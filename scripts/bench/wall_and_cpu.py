@@ -1,0 +1,37 @@
+"""Pairs of runs timed twice: in wall seconds, and in processor seconds of all threads of the process."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+from measure import alternate, summarise
+
+__all__ = ["alternate_twice"]
+
+
+def alternate_twice(
+    candidate: Callable[[], Any], peer: Callable[[], Any], pairs: int, limit_s: float | None = None
+) -> dict[str, dict[str, Any]]:
+    """Run two functions in turn, once untimed first.
+
+    Returns
+    -------
+    dict
+        ``wall`` and ``cpu``, each as `summarise` gives it.  Idle threads of OpenBLAS count as processor time, and slow
+        whatever comes next: set OPENBLAS_NUM_THREADS=1.
+    """
+    cpu: dict[str, list[float]] = {"ours": [], "theirs": []}
+
+    def timed(run: Callable[[], Any], side: str) -> Callable[[], float]:
+        def once() -> float:
+            wall, busy = time.perf_counter(), time.process_time()
+            run()
+            cpu[side].append(time.process_time() - busy)
+            return time.perf_counter() - wall
+
+        return once
+
+    ours, theirs = alternate(timed(candidate, "ours"), timed(peer, "theirs"), pairs, limit_s=limit_s)
+    return {"wall": summarise(ours, theirs), "cpu": summarise(cpu["ours"][1:], cpu["theirs"][1:])}

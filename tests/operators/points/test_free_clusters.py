@@ -1,0 +1,213 @@
+"""Clusters of free points equal those of scipy's tree and of exact arithmetic, whatever the cloud and the device."""
+
+from __future__ import annotations
+
+from fractions import Fraction
+
+import numpy as np
+import pytest
+from point_grids import scattered_points
+
+from clrecon.errors import DeviceMemoryError, UsageError
+from clrecon.operators.points import free_clusters as module
+from clrecon.operators.points.free_clusters import ClusterSearch, cluster_free_points, find_clusters, plan_cells
+from clrecon.operators.points.grid import fill_grid
+from clrecon.points import PointCloud
+from clrecon.reference.points import clusters as twin
+from clrecon.reference.points import free_clusters as passes_twin
+from clrecon.reference.points import grid as grid_twin
+
+
+@pytest.fixture(params=["own form", "other form"])
+def form(request, device, monkeypatch):
+    """Both forms of the kernels on every device."""
+    if request.param == "other form":
+        lanes = "1" if device.kernel_variants["LANES"] == "8" else "8"
+        monkeypatch.setattr(device, "kernel_variants", {**device.kernel_variants, "LANES": lanes})
+
+
+def check_equal(device, points, eps, min_samples):
+    before = points.copy()
+    found = cluster_free_points(points, eps, min_samples, device=device)
+    count, labels, cores = twin.cluster_points(points, eps, min_samples)
+    assert found.labels.dtype == np.int32
+    assert found.count == count
+    np.testing.assert_array_equal(found.cores, cores)
+    np.testing.assert_array_equal(found.labels, labels)
+    assert np.array_equal(points, before)
+    assert found.facts["clusters"] == count
+    assert found.facts["noise_points"] == (labels < 0).sum()
+    return found
+
+
+@pytest.mark.parametrize("n", [1, 2, 31, 32, 33, 1000, 9001])
+@pytest.mark.parametrize("min_samples", [1, 2, 5])
+@pytest.mark.parametrize("eps", [0.8, 2.0])
+def test_scattered_points(device, form, n, min_samples, eps):
+    check_equal(device, scattered_points(n, (30.0, 14.0, 11.0)), eps, min_samples)
+
+
+@pytest.mark.parametrize("per_chunk", [32, 64, 640])
+def test_chunks_of_any_size_give_the_same(device, form, per_chunk):
+    points = scattered_points(4000, (30.0, 14.0, 11.0), seed=2)
+    labels = find_clusters(device, plan_cells(points, 1.0), 1.0, 3, per_chunk=per_chunk)[0]
+    assert np.array_equal(labels, twin.cluster_points(points, 1.0, 3)[1])
+
+
+@pytest.mark.oclgrind
+def test_a_small_cloud_in_small_chunks(device):
+    points = scattered_points(400, (12.0, 8.0, 6.0))
+    labels, cores, count, _ = find_clusters(device, plan_cells(points, 1.1), 1.1, 4, per_chunk=32)
+    expected_count, expected, expected_cores = twin.cluster_points(points, 1.1, 4)
+    assert count == expected_count > 1
+    assert np.array_equal(labels, expected)
+    assert np.array_equal(cores, expected_cores)
+
+
+def test_the_passes_equal_their_twins(device, form):
+    points = scattered_points(5000, (30.0, 14.0, 11.0), seed=3)
+    plan = plan_cells(points, 0.9)
+    grid = grid_twin.make_grid(points, float(plan.edge))
+    search = ClusterSearch(device, fill_grid(device, plan), 0.9, 3, 64)
+    pairs = passes_twin.count_pairs(grid, float(plan.edge), 3)
+    assert np.array_equal(search.count_pairs(), pairs)
+    search.find_cores()
+    search.join_within()
+    search.note_words()
+    cores = twin.cluster_points(points, 0.9, 3)[2][grid.order]
+    labels = passes_twin.join_chunks(grid, cores, 0.9 * (1 + 1e-6), 64)
+    found = module.download(device, np.empty(len(labels), np.uint32), search.labels_d)
+    assert np.array_equal(found, labels)
+    roots = passes_twin.note_words(grid, labels)
+    assert np.array_equal(module.download(device, np.empty(len(roots), np.uint32), search.roots_d), roots)
+    assert (roots == passes_twin.SEVERAL_ROOTS).any()
+
+
+def test_a_lattice_at_its_own_spacing(device, form):
+    """Distances equal eps, times what the rounding of the coordinates makes of them."""
+    lattice = np.stack(np.meshgrid(*[np.arange(-7, 8)] * 3, indexing="ij"), -1).reshape(-1, 3).astype(np.float32)
+    assert check_equal(device, lattice, 1.0, 7).count == 1
+    assert check_equal(device, lattice, 0.999, 2).count == 0
+    for eps in (0.7, 0.7 * np.sqrt(2.0), 0.7 * np.sqrt(3.0), 1.4):
+        check_equal(device, lattice * np.float32(0.7), eps, 9)
+
+
+@pytest.mark.every_device
+def test_distances_at_the_limit_are_decided_as_in_exact_arithmetic(device, form):
+    """Pairs of points about eps apart: float32 alone would take some of them wrongly."""
+    rng, eps, n = np.random.default_rng(4), 1.25, 3000
+    limit = eps * (1.0 + 1e-6)
+    ways = rng.normal(size=(n, 3))
+    ways *= limit * (1.0 + rng.uniform(-1e-7, 1e-7, (n, 1))) / np.linalg.norm(ways, axis=1, keepdims=True)
+    places = 5.0 * np.stack(np.unravel_index(np.arange(n), (15, 15, 15)), axis=1) - 35.0 + rng.random((n, 3))
+    points = np.concatenate([places, places + ways]).astype(np.float32)
+    found = cluster_free_points(points, eps, 2, device=device)
+    a, b = points[:n], points[n:]
+
+    def is_near(first, second):
+        parts = [Fraction(float(x)) - Fraction(float(y)) for x, y in zip(first, second, strict=True)]
+        return sum(part * part for part in parts) <= Fraction(limit) ** 2
+
+    exact = np.array([is_near(first, second) for first, second in zip(a, b, strict=True)])
+    assert 0.2 < exact.mean() < 0.8
+    in_float32 = ((b - a) ** 2).sum(axis=1) <= np.float32(limit) ** 2
+    assert (in_float32 != exact).any()
+    assert np.array_equal(found.cores[:n], exact)
+    assert np.array_equal(found.cores[n:], exact)
+
+
+def test_equal_points_are_one_cluster_at_once(device):
+    found = cluster_free_points(np.full((200_000, 3), 7.25, np.float32), 0.5, 6, device=device)
+    assert (found.labels == 0).all()
+    assert found.cores.all()
+    assert found.facts["cells"] == 1
+
+
+@pytest.mark.parametrize(("gap", "clusters"), [(1.001, 2), (0.999, 1)])
+def test_two_dense_spots(device, gap, clusters):
+    """Their boxes are compared before their points."""
+    spot = np.random.default_rng(5).random((4000, 3)) * 0.02
+    spot[0], spot[1] = 0.0, 0.02
+    points = np.concatenate([spot, spot + (gap + 0.02, 0, 0)]).astype(np.float32)
+    points[4000, 1:] = points[1, 1:]
+    found = cluster_free_points(points, 1.0, 6, device=device)
+    assert found.count == clusters
+    assert found.cores.all()
+
+
+def test_permuted_points_have_the_same_clusters(device):
+    points = scattered_points(5000, (30.0, 14.0, 11.0), seed=6)
+    order = np.random.default_rng(7).permutation(len(points))
+    one, other = (cluster_free_points(cloud, 0.9, 4, device=device) for cloud in (points, points[order]))
+    assert np.array_equal(one.cores[order], other.cores)
+    pairs = np.unique(np.stack([one.labels[order], other.labels])[:, other.cores], axis=1)
+    assert pairs.shape[1] == one.count == other.count
+    firsts = [np.flatnonzero(other.cores & (other.labels == number))[0] for number in range(other.count)]
+    assert firsts == sorted(firsts)
+
+
+def test_far_clouds_have_the_clusters_of_near_ones(device):
+    """Coordinates are relative to whole millimetres, so these are the same numbers."""
+    points = np.rint(scattered_points(3000, (30.0, 14.0, 11.0), seed=8) * 256.0) / 256.0
+    near = cluster_free_points(points, 0.9, 3, device=device)
+    far = cluster_free_points(PointCloud(points + (1e5, -2e5, 3e5)), 0.9, 3, device=device)
+    assert near.count > 1
+    assert np.array_equal(near.labels, far.labels)
+
+
+@pytest.mark.parametrize("eps", [60.0, 1e6, 1e30])
+def test_eps_beyond_the_box_gives_one_cluster(device, eps):
+    found = cluster_free_points(scattered_points(500, (30.0, 14.0, 11.0)), eps, 500, device=device)
+    assert (found.labels == 0).all()
+    assert found.facts["cells"] == 1
+
+
+def test_fewer_points_than_samples_are_noise_with_a_warning(device):
+    points = scattered_points(5)
+    found = cluster_free_points(points, 1.0, 6, device=device)
+    assert found.labels.tolist() == [-1] * 5
+    assert found.warnings == ("5 points are fewer than min_samples 6: all are noise",)
+    assert cluster_free_points(points[:0], 1.0, 6, device=device).labels.shape == (0,)
+
+
+@pytest.mark.parametrize("eps", [0, -1.0, np.nan, np.inf, 1e-10, "1"])
+def test_eps_that_is_no_distance_is_refused(eps):
+    with pytest.raises(UsageError, match=r"eps=.*: a distance in mm is needed, at least 1e-09"):
+        cluster_free_points(scattered_points(10), eps)
+
+
+@pytest.mark.parametrize("min_samples", [0, -3, 2.5, True])
+def test_min_samples_that_are_no_count_are_refused(min_samples):
+    with pytest.raises(UsageError, match=r"min_samples=.*: a whole number from 1 on is needed"):
+        cluster_free_points(scattered_points(10), 1.0, min_samples)
+
+
+def test_points_that_cannot_be_clustered_are_refused(device):
+    points = scattered_points(100)
+    with pytest.raises(UsageError, match=r"points have shape \(n, 3\), these have \(100, 2\)"):
+        cluster_free_points(points[:, :2], 1.0)
+    points[7] = np.nan
+    with pytest.raises(UsageError, match="1 of 100 points are not finite"):
+        cluster_free_points(points, 1.0, device=device)
+    with pytest.raises(UsageError, match="has 5,[0-9,]+ x 3,[0-9,]+ x 3,[0-9,]+ of them"):
+        cluster_free_points(scattered_points(100), 0.0129, device=device)
+
+
+def test_too_many_pairs_are_refused_before_they_are_compared(device, monkeypatch):
+    monkeypatch.setattr(module, "MOST_PAIRS", 1e6)
+    points = scattered_points(3000, (3.0, 3.0, 3.0))
+    words = r"up to 3\.\de\+06 pairs of points .*, 1e\+06 at most are: 3,000 points lie in \d+ cells of 0\.8\d+ mm, up"
+    with pytest.raises(UsageError, match=words):
+        cluster_free_points(points, 1.5, 6, device=device)
+    assert cluster_free_points(points, 6.0, 6, device=device).count == 1  # one cell needs no pairs
+
+
+def test_the_forecast_of_memory_is_refused_first(device):
+    with pytest.raises(DeviceMemoryError, match="the clusters of the points cannot be found: this needs"):
+        cluster_free_points(scattered_points(50_000), 1.0, device=device, memory=2_000_000)
+
+
+def test_progress_is_told_in_four_steps(device):
+    told = []
+    cluster_free_points(scattered_points(100), 1.0, 2, device=device, progress=lambda *step: told.append(step))
+    assert told == [("clusters", done, 4) for done in range(1, 5)]
