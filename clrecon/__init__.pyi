@@ -30,6 +30,8 @@ from clrecon.operators.points.normals import estimate_normals as estimate_normal
 from clrecon.operators.points.outliers import remove_outliers as remove_outliers
 from clrecon.operators.points.reconstruct import reconstruct_surface as reconstruct_surface
 from clrecon.operators.points.slice_overlap import find_ghost_slices as find_ghost_slices
+from clrecon.operators.points.sparse_cells import remove_sparse_cells as remove_sparse_cells
+from clrecon.operators.points.thin import thin_points as thin_points
 from clrecon.operators.rays.render import VolumeRenderer as VolumeRenderer
 from clrecon.operators.rays.render import render as render
 from clrecon.operators.reformat.cut import cut_slice as cut_slice

@@ -233,6 +233,12 @@ INVERSIONS: dict[str, dict[str, tuple[tuple[str, str], ...]]] = {
         "labels": (("own + point + before, runs", "own + point, runs"), (", numbers[run]);", ", ~numbers[run]);"))
     },
     "flag_cores": {"flags": (("(core & rest & -rest) != 0", "(core & rest & -rest) == 0"),)},
+    "choose_points": {"points": (("chosen[cell] = order", "chosen[cell] = ~order"),)},
+    "label_crowded": {"labels": ((">= fewest ? cell : SPARSE", ">= fewest ? SPARSE : cell"),)},
+    "hook_touching": {
+        "labels": (("max(root, other_root), min(root, other_root)", "min(root, other_root), max(root, other_root)"),)
+    },
+    "mark_places": {"marks": (("= kinds[cell];", "= ~kinds[cell];"),)},
     "find_core_points": {
         "cores": (("? point.x : NAN;", "? NAN : point.x;"), ("core_x[at] = x[at];", "core_x[at] = NAN;")),
         "labels": (("labels[cell] = label;", "labels[cell] = ~label;"),),

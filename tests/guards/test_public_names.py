@@ -22,7 +22,8 @@ TAKE_PROGRESS = {
     "cut_slice", "decimate_mesh", "denoise_points", "estimate_normals", "extract_isosurface", "extract_isosurfaces",
     "extract_label_masks", "extract_labels", "find_ghost_slices", "find_neighbours", "find_spine_line",
     "list_series", "mask_field_of_view", "read_labels", "read_volume", "reconstruct_surface", "reformat_curve",
-    "remove_outliers", "remove_table", "render", "smooth_mesh", "write_animation",
+    "remove_outliers", "remove_sparse_cells", "remove_table", "render", "smooth_mesh", "thin_points",
+    "write_animation",
 }  # fmt: skip
 """What can take longer than a second."""
 

@@ -1,4 +1,4 @@
-"""Checks of clusters of free points: the whole, and its passes."""
+"""Checks of what is made of grids over free points: clusters and their passes, thinning, sparse cells."""
 
 from __future__ import annotations
 
@@ -8,10 +8,14 @@ from clrecon.jobs.selftest.check import Check, require_close, require_equal
 from clrecon.jobs.selftest.points import scattered_points
 from clrecon.opencl import Device, download
 from clrecon.operators.points.free_clusters import ClusterSearch, cluster_free_points, plan_cells
-from clrecon.operators.points.grid import fill_grid
+from clrecon.operators.points.grid import fill_grid, plan_grid
+from clrecon.operators.points.sparse_cells import grow_cells
+from clrecon.operators.points.thin import choose_points
 from clrecon.reference.points import clusters as clusters_twin
 from clrecon.reference.points import free_clusters as passes_twin
 from clrecon.reference.points import grid as grid_twin
+from clrecon.reference.points import sparse_cells as sparse_twin
+from clrecon.reference.points import thin as thin_twin
 
 __all__ = ["CHECKS"]
 
@@ -53,7 +57,25 @@ def _check_passes(device: Device) -> str:
     return f"links of {made.cells:,} cells equal"
 
 
+def _check_thin(device: Device) -> str:
+    points = scattered_points(20_000)
+    chosen = choose_points(device, plan_grid(points, 2.1))
+    require_equal(chosen, thin_twin.choose_points(points, 2.1), "points nearest to the means of cells")
+    return f"{len(chosen):,} points of 20,000 equal"
+
+
+def _check_sparse_cells(device: Device) -> str:
+    points = scattered_points(20_000)
+    for edge, fewest, threshold, largest in ((1.1, 2, 3, False), (1.6, 2, 4, True)):
+        found = grow_cells(device, plan_grid(points, edge), fewest, threshold, largest).removed
+        expected = sparse_twin.grow_cells(points, edge, fewest, threshold, largest)
+        require_equal(found, expected, f"what becomes of points in cells of {edge} mm")
+    return "growth over 2 grids equal"
+
+
 CHECKS = (
+    Check("thinned points", ("choose_points",), _check_thin),
+    Check("sparse cells of points", ("label_crowded", "hook_touching", "mark_places"), _check_sparse_cells),
     Check(
         "clusters of free points",
         (

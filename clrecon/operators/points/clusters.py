@@ -14,6 +14,7 @@ from clrecon.geometry.affine import checked_affine
 from clrecon.opencl import Device, Stopwatch, check_memory, take_device, work_on
 from clrecon.operators.points.band_mask import checked_band, mark_band, mark_voxels, mask_bytes
 from clrecon.operators.points.extract import extract_points
+from clrecon.operators.points.free_clusters import cluster_free_points
 from clrecon.operators.points.voxel_clusters import ClusterSearch, checked_min_samples, pad_for, search_bytes
 from clrecon.operators.resident.device_volume import DeviceVolume, open_volume
 from clrecon.points import PointCloud, PointStep
@@ -70,14 +71,14 @@ def cluster_points(
     Parameters
     ----------
     cloud : PointCloud, Volume or DeviceVolume
-        A cloud of voxel centres (with `ijk`), or a volume whose voxels in the band `hu` are clustered, in the order
-        k, j, i.
+        A cloud of voxel centres (with `ijk`), a cloud of free points (without), or a volume whose voxels in the band
+        `hu` are clustered, in the order k, j, i.
     eps : float, optional
         mm in the patient, a ball whatever the spacing.  Distances up to ``eps * (1 + 1e-6)`` are within.  By default
-        1.5 times the largest of the steps of the lattice: the pixels and the largest slice gap.
+        1.5 times the largest of the steps of the lattice: the pixels and the largest slice gap.  Free points need it.
     min_samples : int or "plane+1"
-        1 to 255; 1 gives connected components.  "plane+1" is one more than the members of the stencil in a slice: a
-        slice without bone above and below becomes noise.
+        1 to 255, of free points any number from 1; 1 gives connected components.  "plane+1" is one more than the
+        members of the stencil in a slice: a slice without bone above and below becomes noise.
     hu : (float, float), optional
         Band in HU, both ends included, for a volume.
     volume : Volume or DeviceVolume, optional
@@ -88,7 +89,8 @@ def cluster_points(
     memory : int, optional
         Bytes that may be taken on the device; None is all that it has.
     progress : callable, optional
-        Called as ``progress("mask", slices done, all slices)`` where the voxels go to the device slab by slab.
+        Called as ``progress("mask", slices done, all slices)`` where the voxels go to the device slab by slab, and as
+        ``progress("clusters", done, 4)`` for free points.
 
     Returns
     -------
@@ -114,7 +116,11 @@ def cluster_points(
     if isinstance(cloud, PointCloud):
         if hu is not None:
             raise UsageError(f"{name_parameter('hu')} says which voxels of a volume are points; a cloud has its points")
-        return _cluster_cloud(cloud, eps, min_samples, volume, device, memory)
+        if not len(cloud):
+            raise UsageError("the cloud is empty: there is nothing to cluster")
+        if cloud.ijk is None:
+            return _cluster_free(cloud, eps, min_samples, volume, device, memory, progress)
+        return _cluster_cloud(cloud, cloud.ijk, eps, min_samples, volume, device, memory)
     if hu is None or volume is not None:
         raise UsageError(f"clusters of a volume need {name_parameter('hu', 'LO,HI')} and no other volume")
     band = checked_band(hu)
@@ -221,19 +227,39 @@ def _cluster_band(
     return request.finish(cloud, labels, cores, search, stopwatch, device, told)
 
 
-def _cluster_cloud(
+def _cluster_free(
     cloud: PointCloud,
     eps: float | None,
     min_samples: int | str,
     volume: Volume | DeviceVolume | None,
     device: Device | str | int | None,
     memory: int | None,
+    progress: Progress | None,
 ) -> Clustering:
-    if not len(cloud):
-        raise UsageError("the cloud is empty: there is nothing to cluster")
-    if cloud.ijk is None:
-        raise UsageError("the points are no voxels (they have no ijk): clusters of free points are not supported yet")
-    order, ijk = _order_voxels(cloud.ijk)
+    if volume is not None:
+        raise UsageError("the points are no voxels (they have no ijk), so that a volume says nothing of them")
+    if eps is None or isinstance(min_samples, str):
+        raise UsageError(
+            "the points are no voxels (they have no ijk), so that no lattice gives a distance:"
+            f" {name_parameter('eps')} in mm and {name_parameter('min_samples')} as a whole number are needed"
+        )
+    found = cluster_free_points(cloud, eps, min_samples, device=device, memory=memory, progress=progress)
+    labelled = cloud.changed(labels=found.labels)
+    figures = measure_clusters(labelled)
+    facts = {**found.facts, "sheets": int(figures.sheets.sum()), "largest_clusters": figures.as_dicts(REPORTED)}
+    return Clustering(labelled, np.zeros(len(cloud), np.uint8), (), facts, found.warnings, found.cores)
+
+
+def _cluster_cloud(
+    cloud: PointCloud,
+    ijk_of_cloud: NDArray[np.int32],
+    eps: float | None,
+    min_samples: int | str,
+    volume: Volume | DeviceVolume | None,
+    device: Device | str | int | None,
+    memory: int | None,
+) -> Clustering:
+    order, ijk = _order_voxels(ijk_of_cloud)
     lattice, first = _find_lattice(cloud, volume)
     request = _Request.of(lattice, eps, min_samples)
     taken = take_device(device) if not isinstance(volume, DeviceVolume) else volume.device

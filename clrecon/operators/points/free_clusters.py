@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import itertools
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from clrecon.errors import DeviceError, DeviceMemoryError, UsageError
+from clrecon.errors import DeviceMemoryError, UsageError
 from clrecon.opencl import (
     Device,
     Program,
@@ -30,7 +28,7 @@ from clrecon.opencl import (
 )
 from clrecon.operators.points.grid import PADDING, GridPlan, PointGrid, fill_grid, find_box, plan_grid, prepare_grid
 from clrecon.operators.primitives.scan import exclusive_scan
-from clrecon.operators.primitives.union_find import prepare_components
+from clrecon.operators.primitives.union_find import hook_in_rounds, prepare_components
 from clrecon.system.progress import Progress, ignore_progress
 from clrecon.system.wording import name_parameter
 
@@ -50,9 +48,6 @@ CELL_SLACK = 1e-3
 
 MOST_PAIRS = 1e12
 """Most candidate pairs of points; more would take many minutes."""
-
-MOST_PASSES = 1000
-"""Limit of passes of hooking and of jumps, far above the need."""
 
 FORWARD_ROWS = kernel_constant("points/cell_links.h", "FORWARD_ROWS")
 NEAR_ROWS = kernel_constant("points/cell_links.h", "NEAR_ROWS")
@@ -281,7 +276,6 @@ class ClusterSearch:
     ):
         self._device, self._grid, self._stopwatch = device, grid, stopwatch
         self._program, self._of_grid = prepare_clusters(device), prepare_grid(device)
-        self._jumps = prepare_components(device)
         self._is_cpu = int(device.kernel_variants["LANES"]) > 1
         self._samples = min_samples
         nx, ny, nz = grid.shape
@@ -297,7 +291,7 @@ class ClusterSearch:
         self._per_item = CELLS_AN_ITEM if self._is_cpu else 1
         self.core_x_d = allocate(device, 4 * (grid.n + PADDING))
         self.labels_d, self._other_d, self._firsts_d = (allocate(device, 4 * grid.cells) for _ in range(3))
-        self.roots_d, self._flags_d = allocate(device, 4 * self._total_words), allocate(device, 8)
+        self.roots_d = allocate(device, 4 * self._total_words)
         self.count = 0
 
     def _plan_chunk(self) -> int:
@@ -380,43 +374,17 @@ class ClusterSearch:
 
     def hook_chunks(self) -> None:
         """Join the clusters of all chunks, in rounds."""
-        self._run("clear_cells", 2, self._of_grid, mask=self._flags_d, total=2)
-        self._jump(self.labels_d, self._other_d, 1)  # a copy: all labels are roots
-        passes = itertools.count(2)
-        while True:
-            number = self._next_pass(passes)
+
+        def hook(labels_d: Any, hooked_d: Any, flags_d: Any, number: int) -> None:
             self._run(
                 "hook_cells", -(-self._grid.cells // self._per_item),
-                core_x=self.core_x_d, roots=self.roots_d, labels=self.labels_d, hooked=self._other_d,
-                flags=self._flags_d, per_chunk=self._per_chunk, per_item=self._per_item, pass_number=number,
-                **self._where,
+                core_x=self.core_x_d, roots=self.roots_d, labels=labels_d, hooked=hooked_d, flags=flags_d,
+                per_chunk=self._per_chunk, per_item=self._per_item, pass_number=number, **self._where,
             )  # fmt: skip
-            if self._read_flags()[1] != number:
-                return
-            while True:
-                number = self._next_pass(passes)
-                self._jump(self._other_d, self.labels_d, number)
-                if self._read_flags()[0] != number:
-                    break
-                self.labels_d, self._other_d = self._other_d, self.labels_d
 
-    def _next_pass(self, passes: Iterator[int]) -> int:
-        number = next(passes)
-        if number > MOST_PASSES:
-            raise DeviceError(
-                f"{self._device.label} has not found the clusters after {MOST_PASSES} passes: it computes wrongly,"
-                " see `clrecon selftest` and try another device"
-            )
-        return number
-
-    def _jump(self, labels_d: Any, jumped_d: Any, number: int) -> None:
-        self._run(
-            "jump_labels", self._grid.cells, self._jumps,
-            labels=labels_d, jumped=jumped_d, flags=self._flags_d, n=self._grid.cells, pass_number=number,
-        )  # fmt: skip
-
-    def _read_flags(self) -> NDArray[np.uint32]:
-        return download(self._device, np.empty(2, dtype=np.uint32), self._flags_d)
+        self.labels_d, self._other_d = hook_in_rounds(
+            self._device, self.labels_d, self._other_d, self._grid.cells, hook, stopwatch=self._stopwatch
+        )
 
     def label(self) -> tuple[NDArray[np.int32], NDArray[np.bool_]]:
         """Number the clusters, and return labels and core points in the order of the input."""

@@ -27,6 +27,7 @@ from clrecon.opencl import (
 )
 from clrecon.operators.primitives.radix_sort import prepare_sort, radix_sort, sort_bytes
 from clrecon.operators.primitives.scan import exclusive_scan
+from clrecon.points.cells import MARGIN
 
 __all__ = [
     "CELL_ROUNDING",
@@ -213,7 +214,7 @@ def plan_grid(points: ArrayLike, edge: float) -> GridPlan:
     if places.dtype != np.float32 or base.any():
         places, box = (places - base).astype(np.float32), (box - base).astype(np.float32)
     cell = np.float32(edge)
-    corner = (box[0].astype(np.float64) - 1e-3 * float(cell)).astype(np.float32)
+    corner = (box[0].astype(np.float64) - MARGIN * float(cell)).astype(np.float32)
     shape = _count_cells(box, corner, cell)
     return GridPlan(places, base, corner, cell, shape)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -23,7 +24,7 @@ from clrecon.opencl import (
 from clrecon.operators.primitives.compact import Compacted, compact, prepare_compact
 from clrecon.operators.primitives.scan import LARGEST_SCAN, exclusive_scan
 
-__all__ = ["join_parts", "label_components", "prepare_components"]
+__all__ = ["hook_in_rounds", "join_parts", "label_components", "prepare_components"]
 
 LARGEST_MESH = 2**32 - 1
 """Most triangles, so that 32 bits can count them."""
@@ -139,6 +140,48 @@ def join_parts(
     return rounds.number(labels_d, spare_d, n)
 
 
+def hook_in_rounds(
+    device: Device,
+    labels_d: Any,
+    other_d: Any,
+    n: int,
+    hook: Callable[[Any, Any, Any, int], None],
+    *,
+    stopwatch: Stopwatch | None = None,
+) -> tuple[Any, Any]:
+    """Find components by a kernel that hooks roots to smaller ones, in rounds, until it hooks none.
+
+    Parameters
+    ----------
+    device : Device
+    labels_d : buffer, (n,) uint32
+        For each node a root, which is its own label, of its component and not above it; 2^32 - 1 for nodes that take
+        no part.
+    other_d : buffer, (n,) uint32
+        Overwritten.
+    n : int
+        Number of nodes, at least 1.
+    hook : callable
+        Called with the labels, all of them roots; with a copy, in which it lowers the label of a root by atomic_min()
+        to another root of the same component; with two flags, of which it sets the second to the number that it is
+        called with where it finds such a root; and with that number.
+    stopwatch : Stopwatch, optional
+
+    Returns
+    -------
+    labels_d, other_d : buffer, (n,) uint32
+        The same two: labels that are all roots, the least node of each component, and a free buffer.
+
+    Raises
+    ------
+    DeviceError
+        The device fails or computes wrongly.
+    """
+    rounds = _Rounds(device, stopwatch, labels_d, other_d, n)
+    rounds.start()
+    return rounds.hook_by(hook)
+
+
 def _check_mesh(triangles: NDArray[np.uint32], vertex_count: int) -> None:
     if not 0 <= vertex_count <= LARGEST_SCAN or len(triangles) > LARGEST_MESH:
         raise UsageError(
@@ -188,6 +231,20 @@ class _Rounds:
         # Roots are their own label in both buffers, and other labels lead to the same root, if not in one step.
         while self._hook(corners_d, count):
             self.jump("jump_roots", self._roots.count, roots=self._roots.positions_d, count=self._roots.count)
+
+    def hook_by(self, hook: Callable[[Any, Any, Any, int], None]) -> tuple[Any, Any]:
+        """Run the rounds of `hook_in_rounds`."""
+        self.run(
+            "jump_labels", self._nodes,
+            labels=self._labels_d, jumped=self._other_d, flags=self._flags_d, n=self._nodes,
+            pass_number=self._next_pass(),
+        )  # fmt: skip  # a copy, since all labels are roots
+        while True:
+            number = self._next_pass()
+            hook(self._labels_d, self._other_d, self._flags_d, number)
+            if self._read_flags()[1] != number:
+                return self._labels_d, self._other_d
+            self.jump("jump_labels", self._nodes, n=self._nodes)
 
     def unite(self, labels_d: Any) -> None:
         """Bring the labels of the roots to one buffer, in which the label of each label is then a root."""

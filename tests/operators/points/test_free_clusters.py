@@ -9,7 +9,9 @@ import pytest
 from point_grids import scattered_points
 
 from clrecon.errors import DeviceMemoryError, UsageError
+from clrecon.geometry import Volume
 from clrecon.operators.points import free_clusters as module
+from clrecon.operators.points.clusters import cluster_points
 from clrecon.operators.points.free_clusters import ClusterSearch, cluster_free_points, find_clusters, plan_cells
 from clrecon.operators.points.grid import fill_grid
 from clrecon.points import PointCloud
@@ -211,3 +213,26 @@ def test_progress_is_told_in_four_steps(device):
     told = []
     cluster_free_points(scattered_points(100), 1.0, 2, device=device, progress=lambda *step: told.append(step))
     assert told == [("clusters", done, 4) for done in range(1, 5)]
+
+
+def test_clouds_without_voxels_are_clustered_as_free_points(device):
+    points = scattered_points(2000, (30.0, 14.0, 11.0))
+    cloud = PointCloud(points, hu=np.arange(2000))
+    step = cluster_points(cloud, 1.1, 3, device=device)
+    count, labels, cores = twin.cluster_points(points, 1.1, 3)
+    assert np.array_equal(step.cloud.labels, labels)
+    assert np.array_equal(step.cloud.hu, cloud.hu)
+    assert np.array_equal(step.cores, cores)
+    assert not step.removed.any()
+    assert step.facts["clusters"] == count
+    assert step.facts["largest_clusters"][0]["points"] == np.bincount(labels[labels >= 0]).max()
+
+
+def test_free_points_need_a_distance_and_no_volume(device):
+    cloud = PointCloud(scattered_points(100))
+    with pytest.raises(UsageError, match="no lattice gives a distance: eps in mm and min_samples as a whole number"):
+        cluster_points(cloud, device=device)
+    with pytest.raises(UsageError, match="eps in mm and min_samples as a whole number"):
+        cluster_points(cloud, 1.0, "plane+1", device=device)
+    with pytest.raises(UsageError, match="a volume says nothing of them"):
+        cluster_points(cloud, 1.0, volume=Volume(np.zeros((2, 2, 2), np.int16), np.eye(4)), device=device)

@@ -1,0 +1,270 @@
+"""Paper B's removal of sparse cells, and growth over the others: the host's side of cl/points/sparse_cells.cl."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from clrecon.errors import DeviceMemoryError, UsageError
+from clrecon.opencl import (
+    Device,
+    Program,
+    Stopwatch,
+    allocate,
+    check_memory,
+    describe_shortage,
+    download,
+    empty_output,
+    launch,
+    load_program,
+    memory_limits,
+    take_device,
+    upload,
+    work_on,
+)
+from clrecon.operators.points.grid import GridPlan, PointGrid, fill_grid, plan_grid, prepare_grid
+from clrecon.operators.points.neighbours import find_neighbours
+from clrecon.operators.primitives.union_find import hook_in_rounds, prepare_components
+from clrecon.points import PointCloud, PointStep
+from clrecon.system.progress import Progress, ignore_progress
+from clrecon.system.wording import name_parameter
+
+__all__ = ["REASONS", "choose_edge", "grow_cells", "prepare_sparse_cells", "remove_sparse_cells"]
+
+REASONS = ("sparse cell", "not reached by growth", "smaller component")
+
+NEIGHBOURS = 16
+"""Neighbours of a point, itself among them, the farthest of which gives the default edge."""
+
+EDGE_FACTOR = 2.0
+"""Default edge of the cells in distances to the farthest of these neighbours: about 15 points a cell on bone."""
+
+SPARSE = 2**32 - 1
+"""The label of a sparse cell."""
+
+
+def prepare_sparse_cells(device: Device) -> Program:
+    """Build the kernels of `remove_sparse_cells`."""
+    prepare_grid(device)
+    prepare_components(device)
+    return load_program(device, "points/sparse_cells.cl")
+
+
+def choose_edge(cloud: PointCloud, *, device: Device | str | int | None = None, memory: int | None = None) -> float:
+    """Return twice the median distance from a point to the 16th of its nearest points, itself counted, in mm.
+
+    Raises
+    ------
+    UsageError
+        The cloud is empty, or that distance is 0.
+    DeviceError
+        As `find_neighbours`.
+    """
+    found = find_neighbours(cloud, NEIGHBOURS, device=device, memory=memory)
+    edge = EDGE_FACTOR * float(np.median(found.distances[:, -1]))
+    if edge == 0.0:
+        raise UsageError(
+            f"most of the {len(cloud):,} points are {found.distances.shape[1]} at one place, so that no edge of cells"
+            f" can be chosen: give {name_parameter('edge')} in mm"
+        )
+    return edge
+
+
+@dataclass(frozen=True, eq=False)
+class _Grown:
+    """What becomes of each point, and the figures of it."""
+
+    removed: NDArray[np.uint8]
+    facts: dict[str, Any]
+
+
+def grow_cells(
+    device: Device,
+    plan: GridPlan,
+    fewest: int,
+    threshold: int,
+    largest: bool,
+    *,
+    memory: int | None = None,
+    stopwatch: Stopwatch | None = None,
+) -> _Grown:
+    """Find the cells that stay; parameters are those of `remove_sparse_cells`.
+
+    Raises
+    ------
+    DeviceMemoryError
+        The device has no room for the grid.
+    DeviceError
+        The device fails.
+    """
+    needs = {**plan.needs(device), "labels of cells": 9 * len(plan.points), "marks of points": len(plan.points)}
+    shortage = describe_shortage(memory_limits(device, memory), needs)
+    if shortage:
+        raise DeviceMemoryError(f"sparse cells cannot be found: {shortage}")
+    program = prepare_sparse_cells(device)
+    grid = fill_grid(device, plan, memory=memory, stopwatch=stopwatch)
+    labels = _label_cells(device, program, grid, fewest, stopwatch)
+    starts = download(device, np.empty(grid.cells + 1, np.uint32), grid.starts_d).astype(np.int64)
+    counts = starts[1:] - starts[:-1]
+    kinds, facts = _judge_cells(labels, counts, threshold, largest)
+    removed, removed_d = empty_output(device, (grid.n,), np.uint8)
+    launch(
+        device, program["mark_places"], grid.cells, stopwatch=stopwatch,
+        starts=grid.starts_d, order=grid.order_d, kinds=upload(device, kinds), marks=removed_d, cells=grid.cells,
+    )  # fmt: skip
+    return _Grown(download(device, removed, removed_d), facts)
+
+
+def _label_cells(
+    device: Device, program: Program, grid: PointGrid, fewest: int, stopwatch: Stopwatch | None
+) -> NDArray[np.uint32]:
+    """Return the first cell of the component of each cell, `SPARSE` for sparse ones."""
+    cells, (nx, ny, nz) = grid.cells, grid.shape
+    labels_d, other_d = allocate(device, 4 * cells), allocate(device, 4 * cells)
+    launch(
+        device, program["label_crowded"], cells, stopwatch=stopwatch,
+        starts=grid.starts_d, labels=labels_d, cells=cells, fewest=fewest,
+    )  # fmt: skip
+
+    def hook(roots_d: Any, hooked_d: Any, flags_d: Any, number: int) -> None:
+        launch(
+            device, program["hook_touching"], cells, stopwatch=stopwatch,
+            x=grid.x_d, y=grid.y_d, z=grid.z_d, starts=grid.starts_d, mask=grid.mask_d, ranks=grid.ranks_d,
+            labels=roots_d, hooked=hooked_d, flags=flags_d, origin=grid.origin_and_scale, nx=nx, ny=ny, nz=nz,
+            words=grid.words, cells=cells, pass_number=number,
+        )  # fmt: skip
+
+    roots_d = hook_in_rounds(device, labels_d, other_d, cells, hook, stopwatch=stopwatch)[0]
+    return download(device, np.empty(cells, np.uint32), roots_d)
+
+
+def _judge_cells(
+    labels: NDArray[np.uint32], counts: NDArray[np.int64], threshold: int, largest: bool
+) -> tuple[NDArray[np.uint8], dict[str, Any]]:
+    """Return the number of the reason for which each cell goes, 0 for those that stay, and figures."""
+    crowded = labels != SPARSE
+    own = labels[crowded]
+    cells_of = np.bincount(own, minlength=len(labels))
+    points_of = np.bincount(own, weights=counts[crowded], minlength=len(labels))
+    reached = np.zeros(len(labels), bool)
+    reached[labels[crowded & (counts >= threshold)]] = True
+    roots = np.flatnonzero(reached)
+    facts: dict[str, Any] = {"cells": len(labels), "sparse_cells": int((~crowded).sum()), "components": len(roots)}
+    kinds = np.ones(len(labels), np.uint8)
+    kinds[crowded] = np.where(reached[own], 0, 2)
+    if len(roots):
+        best = roots[np.lexsort((roots, -points_of[roots], -cells_of[roots]))[0]]
+        facts["largest_component"] = {"cells": int(cells_of[best]), "points": int(points_of[best])}
+        if largest:
+            kinds[crowded] = np.where((own != best) & (kinds[crowded] == 0), 3, kinds[crowded])
+    return kinds, facts
+
+
+def remove_sparse_cells(
+    cloud: PointCloud | ArrayLike,
+    edge: float | None = None,
+    fewest: int = 2,
+    threshold: int = 2,
+    *,
+    keep_largest: bool = False,
+    device: Device | str | int | None = None,
+    memory: int | None = None,
+    progress: Progress | None = None,
+) -> PointStep:
+    """Remove points in grid cells with few points, and those that growth over the other cells does not reach.
+
+    Parameters
+    ----------
+    cloud : PointCloud, or array_like of shape (n, 3)
+        LPS mm; at least one point.
+    edge : float, optional
+        Edge of the cells in mm.  By default twice the median distance from a point to the 16th of its nearest points,
+        itself counted: about 15 points a cell.  The grid begins at the lowest coordinates less a thousandth of it.
+    fewest : int
+        Cells with fewer points lose them.
+    threshold : int
+        Growth begins in cells with at least so many points, and goes on over neighbours by faces, edges and corners.
+    keep_largest : bool
+        True: keep the component with the most cells alone; of several the one with the most points, then the first.
+        It takes real bone too, since ribs and vertebrae stand apart: `facts` and a warning say how much.
+    device : Device, str or int, optional
+        See `clrecon.device`; None is the best of the machine.
+    memory : int, optional
+        Bytes that may be taken on the device; None is all that it has.
+    progress : callable, optional
+        Called as ``progress("cells", done, 2)`` after the choice of the edge and at the end.
+
+    Returns
+    -------
+    PointStep
+        Reasons: "sparse cell", "not reached by growth", "smaller component".
+
+    Raises
+    ------
+    UsageError
+        The cloud is empty, a parameter cannot be used, the grid would have too many cells, or the cells are so small
+        that all points would go.
+    DeviceError
+        No device, no room for the points, or the device fails.
+
+    References
+    ----------
+    Liu et al. 2019, section 2.2.
+    """
+    check_memory(memory)
+    made = cloud if isinstance(cloud, PointCloud) else PointCloud(cloud)
+    _check(made, edge, fewest, threshold)
+    tell, taken = progress or ignore_progress, take_device(device)
+    length = choose_edge(made, device=taken, memory=memory) if edge is None else float(edge)
+    tell("cells", 1, 2)
+    plan = plan_grid(made.points, length)
+
+    def work(current: Device, told: list[str]) -> PointStep:
+        stopwatch = Stopwatch()
+        with stopwatch.running(current):
+            grown = grow_cells(
+                current, plan, int(fewest), int(threshold), keep_largest, memory=memory, stopwatch=stopwatch
+            )
+        asked = {"edge_is_default": edge is None, "fewest": int(fewest), "threshold": int(threshold)}
+        made_on = {"device": current.label, "kernel_seconds": dict(stopwatch.by_kernel)}
+        facts = {"edge_mm": float(plan.edge), **asked, **grown.facts, **made_on}
+        return _finish(made, grown, facts, keep_largest, told)
+
+    step = work_on(taken, work)
+    tell("cells", 2, 2)
+    return step
+
+
+def _check(cloud: PointCloud, edge: float | None, fewest: int, threshold: int) -> None:
+    if not len(cloud):
+        raise UsageError("the cloud is empty: it has no cells")
+    for name, value in (("fewest", fewest), ("threshold", threshold)):
+        if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 1:
+            raise UsageError(f"{name_parameter(name, value)}: a whole number of points from 1 on is needed")
+    if edge is not None and not (isinstance(edge, (int, float, np.number)) and math.isfinite(edge) and edge > 0.0):
+        raise UsageError(f"{name_parameter('edge', edge)}: a positive length in mm is needed")
+
+
+def _finish(cloud: PointCloud, grown: _Grown, facts: dict[str, Any], keep_largest: bool, told: list[str]) -> PointStep:
+    """Put the step together, and refuse one that leaves nothing."""
+    removed = grown.removed
+    if removed.all():
+        raise UsageError(
+            f"all {len(cloud):,} points would go: {grown.facts['sparse_cells']:,} of {grown.facts['cells']:,} cells of"
+            f" {facts['edge_mm']:.4g} mm have fewer than {facts['fewest']} points, and no other has"
+            f" {facts['threshold']}.  Take a larger {name_parameter('edge')}, or none for the default"
+        )
+    warnings = list(told)
+    smaller = int((removed == 3).sum())
+    if keep_largest and smaller:
+        components, points = grown.facts["components"], int((removed == 0).sum())
+        warnings.append(
+            f"the largest component keeps {points:,} points; {smaller:,} in {components - 1:,} other components went"
+            f" ({smaller / len(cloud):.1%} of the cloud), bone that stands apart among them"
+        )
+    facts["points_a_cell"] = len(cloud) / grown.facts["cells"]
+    return PointStep(cloud.select(removed == 0), removed, REASONS, facts, tuple(warnings))
