@@ -24,6 +24,7 @@ from clrecon.operators import choose_device
 from clrecon.operators.points.bilateral import denoise_points as denoise_points
 from clrecon.operators.points.clusters import Clustering as Clustering
 from clrecon.operators.points.clusters import cluster_points as cluster_points
+from clrecon.operators.points.extract import extract_points as extract_points
 from clrecon.operators.points.neighbours import Neighbours as Neighbours
 from clrecon.operators.points.neighbours import find_neighbours as find_neighbours
 from clrecon.operators.points.normals import estimate_normals as estimate_normals

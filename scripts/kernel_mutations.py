@@ -263,6 +263,14 @@ INVERSIONS: dict[str, dict[str, tuple[tuple[str, str], ...]]] = {
         "cores": (("= (uchar)is_core;", "= (uchar)!is_core;"),),
     },
     "count_pairs": {"pairs": (("pairs[cell] = (float)own", "pairs[cell] = -(float)own"),)},
+    "restrict_mask": {"mask": (("mask[at] = kept;", "mask[at] = ~kept;"),)},
+    "find_shell": {"shell": (("= bits & ~(before", "= ~bits | (before"),)},
+    "count_points": {"counts": (("counts[row] = count;", "counts[row] = 32u * words - count;"),)},
+    "emit_points": {
+        "positions": (("(place.sum + place.rest).xyz", "-(place.sum + place.rest).xyz"),),
+        "hu": (("= (float)row->voxels[i];", "= -(float)row->voxels[i];"),),
+        "numbers": (("= row->number + (uint)i;", "= ~(row->number + (uint)i);"),),
+    },
     "sum_volumes": {"sums": (("sums[item] = sum;", "sums[item] = -sum;"),)},
     "fit_planes": {
         "normals": tuple((f"store_rows(n{c} * size,", f"store_rows(n{c} * size + 0.1f,") for c in "xyz"),

@@ -13,6 +13,7 @@ from clrecon.exchange.clouds.formats import write_cloud
 from clrecon.exchange.content import PointContent, describe_facts
 from clrecon.exchange.coordinates import as_stored
 from clrecon.geometry import frame_from_lps
+from clrecon.points.voxel_numbers import VoxelNumbers
 from clrecon.system.messages import Message
 from clrecon.system.targets import keep_existing
 
@@ -87,8 +88,28 @@ class PointCloud(Message):
             _check_finite(self._normals, "normals")
         self._hu = self._values(hu, "hu", np.float32, "fiu")
         self._labels = self._values(labels, "labels", np.int32, "iu")
-        self._ijk = self._vectors(ijk, "ijk", np.int32)
+        self._ijk: NDArray[np.int32] | VoxelNumbers | None = self._vectors(ijk, "ijk", np.int32)
         self.report: dict[str, Any] = {} if report is None else report
+
+    @classmethod
+    def of_known(
+        cls,
+        points: NDArray[np.floating],
+        normals: NDArray[np.float32] | None = None,
+        hu: NDArray[np.float32] | None = None,
+        labels: NDArray[np.int32] | None = None,
+        ijk: NDArray[np.int32] | VoxelNumbers | None = None,
+        report: dict[str, Any] | None = None,
+    ) -> PointCloud:
+        """Make a cloud of arrays that an operator has made: they have the promised types and are finite.
+
+        Nothing is checked or copied, which would take longer than making them.  Of `VoxelNumbers` the indices are made
+        when they are first asked for.
+        """
+        made = cls.__new__(cls)
+        made._points, made._normals, made._hu, made._labels, made._ijk = points, normals, hu, labels, ijk
+        made.report = {} if report is None else report
+        return made
 
     def _vectors(self, values: ArrayLike | None, name: str, dtype: DTypeLike) -> NDArray[Any] | None:
         if values is None:
@@ -131,7 +152,14 @@ class PointCloud(Message):
     @property
     def ijk(self) -> NDArray[np.int32] | None:
         """Voxel indices, shape (n, 3), of points that are voxel centres; or None."""
+        if isinstance(self._ijk, VoxelNumbers):
+            self._ijk = self._ijk.indices()
         return self._ijk
+
+    @property
+    def has_ijk(self) -> bool:
+        """True where the points are voxel centres whose indices are known."""
+        return self._ijk is not None
 
     def __len__(self) -> int:
         return len(self._points)
@@ -204,7 +232,7 @@ class PointCloud(Message):
         """
         points, normals = self.in_space(space)
         facts = describe_facts(self.report, space, keep_ids=keep_ids)
-        return PointContent(vertices=points, normals=normals, hu=self._hu, labels=self._labels, ijk=self._ijk, **facts)
+        return PointContent(vertices=points, normals=normals, hu=self._hu, labels=self._labels, ijk=self.ijk, **facts)
 
     def save(
         self, path: str | os.PathLike[str], space: str = "lps", *, no_clobber: bool = False, keep_ids: bool = False

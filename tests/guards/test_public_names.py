@@ -18,6 +18,7 @@ KEYWORDS = ("device", "memory", "progress")
 """What a call is computed with, not what it computes: never by position."""
 
 TAKE_PROGRESS = {
+    "SurfaceExtractor.extract_vertices", "extract_points",
     "SurfaceExtractor.extract", "VolumeRenderer.render", "choose_iso_value", "cluster_points", "compare_meshes",
     "cut_slice", "decimate_mesh", "denoise_points", "estimate_normals", "extract_isosurface", "extract_isosurfaces",
     "extract_label_masks", "extract_labels", "find_ghost_slices", "find_neighbours", "find_spine_line",

@@ -18,6 +18,12 @@ FLOAT64_PLACE_MM = 1e-9  # coordinates of some 1000 mm there and back in float64
 SIX_DIGITS_MM = 5.1e-3  # Open3D writes six digits into text: half of 1e-2 mm from 1000 mm on
 LAS_POINT_MM = 8.2e-5  # half a step of 1e-4 mm, and half a step of float32 at some 1000 mm
 
+# --- operators: points of volumes ---
+HALF_STEP = 0.5001  # of float32: a place is rounded once
+CLOUD_PLACE_MM = 1.6e-5  # half a step of float32 below 512 mm
+CLOUD_BALL_MM = 0.02  # a ball of 20 mm in voxels of 0.64 to 0.8 mm and whole HU: measured 0.009
+BALL_OF_VOXELS = 2e-3  # relative volume of such a ball by counting voxels
+
 # --- geometry: images of pyvista ---
 IMAGE_POINT_MM = 1e-9  # VTK places points by direction and spacing in float64
 IMAGE_SURFACE_MM = 1e-4  # float32 vertices some 200 mm from the origin, placed by another program: measured 2e-5

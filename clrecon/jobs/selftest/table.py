@@ -15,6 +15,7 @@ from clrecon.jobs.selftest import (
     reformat,
     resident,
     surface,
+    voxel_points,
 )
 from clrecon.jobs.selftest.check import Check
 
@@ -33,6 +34,7 @@ CHECKS: tuple[Check, ...] = (
     *fields.CHECKS,
     *point_filters.CHECKS,
     *free_clusters.CHECKS,
+    *voxel_points.CHECKS,
 )
 
 

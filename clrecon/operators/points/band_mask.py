@@ -18,7 +18,16 @@ from clrecon.operators.resident.voxel_types import voxel_variants
 from clrecon.system.progress import Progress, ignore_progress
 from clrecon.system.wording import name_parameter
 
-__all__ = ["VoxelMask", "check_shape", "checked_band", "mark_band", "mark_voxels", "mask_bytes", "prepare_band_mask"]
+__all__ = [
+    "VoxelMask",
+    "band_bounds",
+    "check_shape",
+    "checked_band",
+    "mark_band",
+    "mark_voxels",
+    "mask_bytes",
+    "prepare_band_mask",
+]
 
 LONGEST_ROW = 65_535
 """Most voxels in a row: columns of runs have 16 bits."""
@@ -113,7 +122,7 @@ def prepare_band_mask(device: Device, dtype: DTypeLike = np.int16) -> Program:
     return load_program(device, "surface/classify.cl", variants)
 
 
-def _bounds(volume: Volume, hu: tuple[float, float]) -> tuple[Any, Any]:
+def band_bounds(volume: Volume, hu: tuple[float, float]) -> tuple[Any, Any]:
     """Return the band's ends as scalars of the voxels' type: for whole numbers the first and last within.
 
     Raises
@@ -169,7 +178,7 @@ def mark_band(
     """
     volume, stopwatch = resident.volume, stopwatch or Stopwatch()
     check_shape(volume.shape_ijk, pad)
-    bounds = _bounds(volume, hu)
+    bounds = band_bounds(volume, hu)
     ni, nj, nk = volume.shape_ijk
     words = -(-ni // 32) + pad
     masks = {**mask_bytes(volume.shape_ijk, pad), **(beside or {})}

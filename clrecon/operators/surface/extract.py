@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from types import TracebackType
 
+import numpy as np
+
 from clrecon.errors import NoSurfaceError, UsageError
 from clrecon.geometry import Volume
 from clrecon.geometry.iso_rule import IsoRule, Level, check_topology, choose_iso_rule
@@ -12,10 +14,11 @@ from clrecon.mesh import Mesh
 from clrecon.opencl import Device
 from clrecon.operators.resident.device_volume import DeviceVolume, take_volume
 from clrecon.operators.surface import marching_cubes
-from clrecon.operators.surface.extraction import Extraction, prepare_isosurface
+from clrecon.operators.surface.extraction import Extraction, Part, prepare_isosurface
 from clrecon.operators.surface.marching_cubes import Placement
 from clrecon.operators.surface.slabs import SampleGrid, Slab, plan_slabs
 from clrecon.operators.surface.trilinear import check_row
+from clrecon.points import PointCloud
 from clrecon.system.progress import Progress
 
 __all__ = ["SurfaceExtractor", "extract_isosurface", "extract_isosurfaces", "prepare_isosurface"]
@@ -107,18 +110,35 @@ class SurfaceExtractor:
         progress: Progress | None = None,
     ) -> Mesh:
         """Extract the surface at one iso value, or of one range, see `extract_isosurface`."""
-        resident, volume = self._resident, self.volume
-        rule = choose_iso_rule(volume, iso_value, closed, topology, below=below, values=resident.values)
+        grid = self._choose_grid(iso_value, closed, topology, below)
+        return self._resident.attempt(lambda told: self._extract(grid, told, progress))
+
+    def extract_vertices(
+        self, iso_value: Level, *, closed: bool = True, below: bool = False, progress: Progress | None = None
+    ) -> PointCloud:
+        """Extract the vertices and normals of the surface that `extract` makes, without its triangles.
+
+        Returns
+        -------
+        PointCloud
+            In the order of the mesh's vertices, the same bit for bit; the HU of each is the iso value, and those of a
+            range have none.
+        """
+        grid = self._choose_grid(iso_value, closed, "separated", below)
+        return self._resident.attempt(lambda told: self._extract_vertices(grid, told, progress))
+
+    def _choose_grid(self, iso_value: Level, closed: bool, topology: str, below: bool) -> SampleGrid:
+        volume = self.volume
+        rule = choose_iso_rule(volume, iso_value, closed, topology, below=below, values=self._resident.values)
         grid = SampleGrid(volume, rule)
         if topology == "trilinear":
             check_row(volume)
         if min(grid.shape) < 2:
             raise NoSurfaceError(f"an open volume of {grid.shape} voxels has no cells: leave it closed")
-        return resident.attempt(lambda told: self._extract(grid, told, progress))
+        return grid
 
-    def _extract(self, grid: SampleGrid, told: list[str], progress: Progress | None) -> Mesh:
-        resident, volume, rule = self._resident, self.volume, grid.rule
-        run = Extraction(resident, grid, self._placement(grid))
+    def _run(self, run: Extraction, told: list[str], progress: Progress | None) -> Part:
+        rule, volume = run.grid.rule, self.volume
         run.warnings += told
         if progress is not None:
             progress("build", 0, 1)
@@ -126,9 +146,21 @@ class SurfaceExtractor:
             prepare_isosurface(self.device, volume.voxels.dtype, rule.topology, volume.uneven, rule.inside)
         if progress is not None:
             progress("build", 1, 1)
-        positions, normals, triangles = run.run(plan_slabs(grid, resident), progress)
+        return run.run(plan_slabs(run.grid, self._resident), progress)
+
+    def _extract(self, grid: SampleGrid, told: list[str], progress: Progress | None) -> Mesh:
+        run = Extraction(self._resident, grid, self._placement(grid))
+        positions, normals, triangles = self._run(run, told, progress)
         report = run.describe(len(positions), len(triangles))
         return Mesh(run.placement.to_lps(positions), triangles, normals, report)
+
+    def _extract_vertices(self, grid: SampleGrid, told: list[str], progress: Progress | None) -> PointCloud:
+        run = Extraction(self._resident, grid, self._placement(grid), vertices_only=True)
+        positions, normals, _ = self._run(run, told, progress)
+        report = run.describe(len(positions), 0)
+        iso_value = report["iso_value_hu"]
+        hu = None if iso_value is None else np.full(len(positions), iso_value, np.float32)
+        return PointCloud.of_known(run.placement.to_lps(positions), normals, hu, report=report)
 
     def _placement(self, grid: SampleGrid) -> Placement:
         border = grid.rule.border

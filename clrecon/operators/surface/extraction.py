@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -90,13 +91,17 @@ def _join(parts: list[Part]) -> Part:
 
 
 class Extraction:
-    """One extraction, slab by slab, with fewer slices in a slab if the device has no room for more."""
+    """One extraction, slab by slab, with fewer slices in a slab if the device has no room for more.
 
-    def __init__(self, resident: DeviceVolume, grid: SampleGrid, placement: Placement):
+    With `vertices_only` it stops after the vertices: the part of a slab then has no triangles.
+    """
+
+    def __init__(self, resident: DeviceVolume, grid: SampleGrid, placement: Placement, *, vertices_only: bool = False):
         self.resident = resident
         self.device = resident.device
         self.grid = grid
         self.placement = placement
+        self._vertices_only = vertices_only
         self.was_held = resident.is_held
         self.levels = _voxel_levels(resident.device, resident.volume, grid.rule)
         self.stopwatch = Stopwatch()
@@ -110,7 +115,7 @@ class Extraction:
         self.resident.halve(
             self.grid.kind, slices, lambda slices: self._go_on(slices, progress), warnings=self.warnings
         )
-        if self.triangles == 0:
+        if self.vertices == 0:
             raise _refuse_level(self.device, self.grid.volume, self.grid.rule)
         try:
             return _join(self.parts)
@@ -141,6 +146,8 @@ class Extraction:
             bricks = self._compare_bricks(slab, voxels_d)
             classified = marching_cubes.classify(device, slab, voxels_d, self.levels, stopwatch, bricks)
             counted = marching_cubes.count(device, slab, program, classified, stopwatch, voxels_d)
+        if self._vertices_only:
+            counted = replace(counted, triangles=0)
         self._check_output(slab, counted)
         part = marching_cubes.emit(
             device, slab, program, voxels_d, classified, counted, self.placement, self.vertices, stopwatch

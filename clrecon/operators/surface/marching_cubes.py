@@ -39,7 +39,9 @@ __all__ = [
     "classify",
     "count",
     "emit",
+    "pad4",
     "prepare_marching_cubes",
+    "split_steps",
 ]
 
 LONGEST_ROW = 13_000
@@ -124,14 +126,14 @@ def _load_classify(device: Device, dtype: DTypeLike, inside: str = "above") -> P
     return load_program(device, "surface/classify.cl", variants)
 
 
-def _pad4(rows: NDArray[np.float64]) -> NDArray[np.float32]:
+def pad4(rows: NDArray[np.float64]) -> NDArray[np.float32]:
     """Return rows of three as rows of four float32, for float4."""
     padded = np.zeros((*rows.shape[:-1], 4), dtype=np.float32)
     padded[..., :3] = rows
     return padded
 
 
-def _split(values: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def split_steps(values: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Split numbers into 12 significant bits and the rest: 12-bit parts times whole numbers < 4096 are exact."""
     mantissa, exponent = np.frexp(values)
     head = np.ldexp(np.round(np.ldexp(mantissa, 12)), exponent - 12)
@@ -172,10 +174,10 @@ class Placement:
         head, rest = origins[:-1].astype(np.float32), origins[:-1] - origins[:-1].astype(np.float32)
         parts = [head.astype(np.float64)[:, None], rest[:, None], np.diff(origins, axis=0)[:, None]]
         normals = slice_normal_matrices(volume, border), layer_normal_matrices(volume, border)
-        frames = _pad4(np.concatenate([*parts, *normals], axis=1))
+        frames = pad4(np.concatenate([*parts, *normals], axis=1))
         frames[:, 2, 3] = layer_margins(volume, border)
-        steps = _pad4(np.stack([part for step in (0, 1) for part in _split(volume.affine[:3, step])]))
-        return cls(frames, steps, _pad4(vertex_margin(volume, border)), origin)
+        steps = pad4(np.stack([part for step in (0, 1) for part in split_steps(volume.affine[:3, step])]))
+        return cls(frames, steps, pad4(vertex_margin(volume, border)), origin)
 
     def to_lps(self, positions: NDArray[np.float32]) -> NDArray[np.floating]:
         """Convert positions of the device to LPS mm: unchanged, but float64 in a volume far from the origin."""

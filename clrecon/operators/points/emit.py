@@ -1,0 +1,320 @@
+"""Voxels of a band of HU as points, slab by slab: the host's side of cl/points/emit.cl."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import DTypeLike, NDArray
+
+from clrecon.errors import DeviceError, DeviceFailedError, DeviceMemoryError
+from clrecon.geometry import Volume
+from clrecon.geometry.precision import find_vertex_origin
+from clrecon.opencl import (
+    Device,
+    Program,
+    Stopwatch,
+    allocate,
+    download,
+    empty_output,
+    launch,
+    load_program,
+    result_pages,
+    upload,
+)
+from clrecon.operators.points.band_mask import prepare_band_mask
+from clrecon.operators.primitives.scan import exclusive_scan, prepare_scan
+from clrecon.operators.resident.device_volume import DeviceVolume
+from clrecon.operators.resident.voxel_types import label_variants, voxel_variants
+from clrecon.operators.surface.marching_cubes import pad4, split_steps
+from clrecon.operators.surface.slabs import OUTPUT_SHARE
+from clrecon.points.cloud import MOST_POINTS
+from clrecon.system.progress import Progress
+
+__all__ = ["Selection", "VoxelEmission", "prepare_voxels"]
+
+POINT_BYTES = 20
+"""Bytes of a point: place, HU, number of the voxel."""
+
+MOST_NUMBERS = 2**32
+"""Voxels of a slab have numbers of 32 bits."""
+
+Points = tuple[NDArray[np.float32], NDArray[np.float32], NDArray[Any]]
+"""Positions (n, 3), HU (n,) and voxel numbers (n,), uint32 or int64, of the points of some slices."""
+
+
+@dataclass(frozen=True, eq=False)
+class Selection:
+    """The voxels that become points.
+
+    Attributes
+    ----------
+    low, high : scalar of the voxels' type
+        Lowest and highest value, both included.
+    shell : bool
+        True: only those with one of six neighbours outside; beyond the volume all is outside.
+    labels : ndarray, shape (nk, nj, ni), uint8 or uint16, or None
+        On the volume's grid: only voxels with `label`, or with any number but 0 where it is 0.
+    label : int
+    paper : bool
+        True: every slice is put where the first one lies.
+    """
+
+    low: Any
+    high: Any
+    shell: bool = False
+    labels: NDArray[Any] | None = None
+    label: int = 0
+    paper: bool = False
+
+
+def prepare_voxels(device: Device, dtype: DTypeLike, labels: DTypeLike | None = None) -> Program:
+    """Build the kernels for volumes of `dtype` and label maps of type `labels`.
+
+    Raises
+    ------
+    DeviceError
+        The driver's compiler refuses.
+    """
+    prepare_scan(device)
+    prepare_band_mask(device, dtype)
+    own = {} if labels is None else label_variants(labels)
+    return load_program(device, "points/emit.cl", {**voxel_variants(dtype), **device.kernel_variants, **own})
+
+
+def _double_float(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return numbers as the nearest float32 and the rest, on a new axis before the last."""
+    nearest = values.astype(np.float32).astype(np.float64)
+    return np.stack([nearest, values - nearest], axis=-2)
+
+
+@dataclass
+class VoxelEmission:
+    """The points of one volume, slab by slab, with fewer slices in a slab if the device has no room for more.
+
+    Attributes
+    ----------
+    resident : DeviceVolume
+    selection : Selection
+    origin : ndarray, shape (3,), float64, or None
+        The point that positions are counted from, see `find_vertex_origin`.
+    marked : int
+        Voxels in the band, before labels and shells take some away.
+    slabs : int
+    largest : dict of str to int
+        Bytes on the device of the largest slab: "volume", "scratch", "output".
+    warnings : list of str
+    """
+
+    resident: DeviceVolume
+    selection: Selection
+    origin: NDArray[np.float64] | None = None
+    marked: int = 0
+    slabs: int = 0
+    stopwatch: Stopwatch = field(default_factory=Stopwatch)
+    largest: dict[str, int] = field(default_factory=lambda: {"volume": 0, "scratch": 0, "output": 0})
+    warnings: list[str] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        volume = self.volume
+        self.origin = find_vertex_origin(volume)
+        places = volume.slice_origins()
+        if self.selection.paper:
+            places = np.broadcast_to(places[0], places.shape)
+        self._origins = pad4(_double_float(places if self.origin is None else places - self.origin))
+        self._steps = pad4(np.stack([part for step in (0, 1) for part in split_steps(volume.affine[:3, step])]))
+        self._next = 0
+        self._parts: list[Points] = []
+
+    @property
+    def volume(self) -> Volume:
+        """The volume."""
+        return self.resident.volume
+
+    @property
+    def kind(self) -> str:
+        """Purpose of the slabs, see `DeviceVolume.plan`."""
+        return "shell of voxels" if self.selection.shell else "voxels"
+
+    def run(self, progress: Progress | None = None) -> Points:
+        """Make the points of the whole volume.
+
+        Raises
+        ------
+        DeviceError
+            Not even one slice fits, there are 2^31 points or more, or the device fails.
+        """
+        labels = self.selection.labels
+        with self.stopwatch.timed("build"):
+            prepare_voxels(self.resident.device, self.volume.voxels.dtype, None if labels is None else labels.dtype)
+        slices = self._plan()
+        self.resident.halve(self.kind, slices, lambda slices: self._go_on(slices, progress), warnings=self.warnings)
+        try:
+            return _join(self._parts)
+        except MemoryError as error:
+            raise DeviceError(f"the cloud does not fit the memory of this computer: {error}") from error
+
+    def _around(self, first: int, end: int) -> tuple[int, int]:
+        """Slices that a slab reads: those of a shell need their neighbours."""
+        border = int(self.selection.shell)
+        return max(first - border, 0), min(end + border, self.volume.shape_ijk[2])
+
+    def needs(self, slices: int, points: int = 0) -> dict[str, int]:
+        """Return the bytes of every buffer of a slab in the middle of the volume, by description."""
+        (ni, nj, nk), labels = self.volume.shape_ijk, self.selection.labels
+        read = min(slices + 2 * self.selection.shell, nk)
+        words = -(-ni // 32)
+        return {
+            "volume": read * self.resident.slice_bytes,
+            "masks": 4 * read * nj * words * (1 + self.selection.shell),
+            "rows": 4 * read * nj + 9 * slices * nj,
+            **({} if labels is None else {"labels": read * nj * ni * labels.dtype.itemsize}),
+            **({"points": POINT_BYTES * points} if points else {}),
+        }
+
+    def _plan(self) -> int:
+        nk, limits = self.volume.shape_ijk[2], self.resident.limits
+        room = min(limits.total_bytes // OUTPUT_SHARE, limits.buffer_bytes)
+
+        def needs(slices: int) -> dict[str, int]:
+            return {**self.needs(slices), **({} if slices == nk else {"points": room})}
+
+        ni, nj, _ = self.volume.shape_ijk
+        slices = self.resident.plan(self.kind, nk, needs, most=max(MOST_NUMBERS // (ni * nj), 1))
+        if slices == 0:
+            raise (DeviceFailedError if limits.asked_bytes is None else DeviceError)(
+                f"one slice needs {sum(self.needs(1).values()):,} bytes, and room for its points: {limits.describe()};"
+                f" {'use another device' if limits.asked_bytes is None else 'allow more'}"
+            )
+        return slices
+
+    def _go_on(self, slices: int, progress: Progress | None) -> None:
+        nk = self.volume.shape_ijk[2]
+        while self._next < nk:
+            end = min(self._next + slices, nk)
+            part, marked = self._one_slab(self._next, end)
+            self._parts.append(part)
+            self.marked += marked
+            self.slabs += 1
+            self._next = end
+            if sum(len(part[1]) for part in self._parts) > MOST_POINTS:
+                raise DeviceError(f"the cloud has more than {MOST_POINTS:,} points: choose a narrower band of HU")
+            if progress is not None and (end < nk or self.slabs > 1):
+                progress("slabs", end, nk)
+
+    def _one_slab(self, first: int, end: int) -> tuple[Points, int]:
+        device, stopwatch, (ni, nj, nk) = self.resident.device, self.stopwatch, self.volume.shape_ijk
+        begin, stop = self._around(first, end)
+        is_whole = (begin, stop) == (0, nk)
+        voxels_d = self.resident.whole(stopwatch) if is_whole else self.resident.part(begin, stop, stopwatch)
+        words, rows = -(-ni // 32), (end - first) * nj
+        with stopwatch.running(device):
+            where = {"words": words, "first_row": (first - begin) * nj, "rows": rows}
+            mask_d, extents_d, marked = self._mark(voxels_d, begin, stop, where)
+            counts_d, total = self._count(mask_d, extents_d, where)
+        self._check_output(end - first, total)
+        positions, positions_d = empty_output(device, (total, 3), np.float32)
+        hu, hu_d = empty_output(device, (total,), np.float32)
+        numbers, numbers_d = empty_output(device, (total,), np.uint32)
+        is_small = self.volume.voxels.size <= MOST_NUMBERS
+        if total:
+            program = prepare_voxels(device, self.volume.voxels.dtype)
+            words_per_item = words if device.kernel_variants["LANES"] == "8" else 1
+            with stopwatch.running(device):
+                launch(
+                    device, program["emit_points"], rows * -(-words // words_per_item), stopwatch=stopwatch,
+                    mask=mask_d, row_extents=extents_d, offsets=counts_d, voxels=voxels_d,
+                    origins=upload(device, self._origins[first:end]), steps=upload(device, self._steps),
+                    positions=positions_d, hu=hu_d, numbers=numbers_d,
+                    first_number=first * nj * ni if is_small else 0, ni=ni, nj=nj,
+                    words_per_item=words_per_item, **where,
+                )  # fmt: skip
+            with stopwatch.timed("download"):
+                for array, array_d in ((positions, positions_d), (hu, hu_d), (numbers, numbers_d)):
+                    download(device, array, array_d)
+        self.volume.release_slices(begin, stop)
+        return (positions, hu, numbers if is_small else numbers + np.int64(first * nj * ni)), marked or total
+
+    def _mark(self, voxels_d: Any, begin: int, stop: int, own: dict[str, int]) -> tuple[Any, Any, int | None]:
+        """Mark the voxels of the band, of the label; with a label or a shell also count those of the band."""
+        device, stopwatch, (ni, nj, nk) = self.resident.device, self.stopwatch, self.volume.shape_ijk
+        chosen, words = self.selection, own["words"]
+        rows = (stop - begin) * nj
+        mask_d, extents_d = allocate(device, 4 * rows * words), allocate(device, 4 * rows)
+        launch(
+            device, prepare_band_mask(device, self.volume.voxels.dtype)["classify_samples"], rows,
+            stopwatch=stopwatch, voxels=voxels_d, mask=mask_d, row_extents=extents_d, level=chosen.low,
+            highest=chosen.high, ni=ni, nj=nj, nk=nk, border=0, first_slice=begin, first_sample_slice=begin,
+            gk=stop - begin, words=words,
+        )  # fmt: skip
+        if chosen.labels is None and not chosen.shell:
+            return mask_d, extents_d, None
+        _, marked = self._count(mask_d, extents_d, own)
+        program = prepare_voxels(
+            device, self.volume.voxels.dtype, None if chosen.labels is None else chosen.labels.dtype
+        )
+        if chosen.labels is not None:
+            launch(
+                device, program["restrict_mask"], rows, stopwatch=stopwatch, mask=mask_d, row_extents=extents_d,
+                labels=upload(device, chosen.labels[begin:stop]), label=chosen.label, ni=ni, words=words, rows=rows,
+            )  # fmt: skip
+        if chosen.shell:
+            shell_d = allocate(device, 4 * rows * words)
+            launch(
+                device, program["find_shell"], rows, stopwatch=stopwatch,
+                mask=mask_d, row_extents=extents_d, shell=shell_d, nj=nj, words=words, slices=stop - begin,
+            )  # fmt: skip
+            mask_d = shell_d
+        return mask_d, extents_d, marked
+
+    def _count(self, mask_d: Any, extents_d: Any, own: dict[str, int]) -> tuple[Any, int]:
+        """Count the voxels of a mask in the slab's own rows; return the number before each row, and all."""
+        device, stopwatch = self.resident.device, self.stopwatch
+        program = prepare_voxels(device, self.volume.voxels.dtype)
+        counts_d = allocate(device, 4 * own["rows"])
+        launch(
+            device, program["count_points"], own["rows"], stopwatch=stopwatch,
+            mask=mask_d, row_extents=extents_d, counts=counts_d, **own,
+        )  # fmt: skip
+        scanned = exclusive_scan(device, counts_d, own["rows"], in_place=True, stopwatch=stopwatch)
+        if scanned.total > MOST_POINTS:
+            raise DeviceMemoryError(f"a slab has {scanned.total:,} points: more than {MOST_POINTS:,}")
+        return scanned.offsets_d, scanned.total
+
+    def _check_output(self, slices: int, points: int) -> None:
+        """Refuse a slab whose points do not fit beside the other buffers; record the memory of the slab."""
+        needs = self.needs(slices, points)
+        shortage = self.resident.shortage(needs)
+        if shortage:
+            raise DeviceMemoryError(shortage)
+        volume, output = needs["volume"], needs.get("points", 0)
+        for what, size in (("volume", volume), ("output", output), ("scratch", sum(needs.values()) - volume - output)):
+            self.largest[what] = max(self.largest[what], size)
+
+    def describe(self) -> dict[str, Any]:
+        """Return the entries of the report about the device and the work."""
+        device = self.resident.device
+        return {
+            "device": device.label,
+            "driver": device.driver,
+            "slabs": self.slabs,
+            "device_bytes": dict(self.largest),
+            "seconds": dict(self.stopwatch.seconds),
+            "kernel_seconds": dict(self.stopwatch.by_kernel),
+        }
+
+
+def _join(parts: list[Points]) -> Points:
+    """Join the points of all slabs; those of a slab are freed as soon as they are copied."""
+    if len(parts) == 1:
+        return parts[0]
+    rows = sum(len(part[1]) for part in parts)
+    joined = tuple(result_pages.empty((rows, *array.shape[1:]), array.dtype) for array in parts[0])
+    filled = 0
+    while parts:
+        part = parts.pop(0)
+        for whole, array in zip(joined, part, strict=True):
+            whole[filled : filled + len(array)] = array
+        filled += len(part[1])
+    return joined  # type: ignore[return-value]

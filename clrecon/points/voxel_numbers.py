@@ -1,0 +1,37 @@
+"""Voxels as numbers: a third of the memory of their indices, which are made of them when somebody asks."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["VoxelNumbers"]
+
+
+@dataclass(frozen=True, eq=False)
+class VoxelNumbers:
+    """Voxels of a volume by number.
+
+    Attributes
+    ----------
+    numbers : ndarray, shape (n,), uint32 or int64
+        ``i + ni * (j + nj * k)``.
+    shape_ijk : (ni, nj, nk)
+    """
+
+    numbers: NDArray[Any]
+    shape_ijk: tuple[int, int, int]
+
+    def indices(self) -> NDArray[np.int32]:
+        """Return the voxel indices (i, j, k), shape (n, 3)."""
+        ni, nj, _ = self.shape_ijk
+        found = np.empty((len(self.numbers), 3), np.int32)
+        rows = self.numbers // self.numbers.dtype.type(ni)
+        slices = rows // self.numbers.dtype.type(nj)
+        found[:, 0] = self.numbers - rows * self.numbers.dtype.type(ni)
+        found[:, 1] = rows - slices * self.numbers.dtype.type(nj)
+        found[:, 2] = slices
+        return found
