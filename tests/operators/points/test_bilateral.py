@@ -70,6 +70,7 @@ def test_paper_mode_is_factor_one_with_its_features(device):
     assert (paper.facts["range_factor"], paper.facts["features"]) == (1.0, "paper")
 
 
+@pytest.mark.every_device
 def test_the_device_reaches_the_truths(device):
     for shape, region, expected in ((plane, "inner", 0.076), (sphere, "everywhere", 0.080), (cube, "edges", 0.150)):
         truth = shape()

@@ -43,6 +43,7 @@ def test_scattered_points(device, n, k):
     check_equal(device, scattered_points(n), min(k, n))
 
 
+@pytest.mark.every_device
 @pytest.mark.parametrize("cloud", CLOUDS)
 @pytest.mark.parametrize("k", [1, 16])
 def test_awkward_clouds(device, cloud, k):

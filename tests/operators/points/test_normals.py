@@ -42,6 +42,7 @@ def test_axes_equal_their_twin(device, shape, noisy):
     assert "either direction" in step.warnings[0]
 
 
+@pytest.mark.every_device
 @pytest.mark.parametrize("n", [3, 7, 8, 9, 15, 16, 17])
 def test_every_size_of_the_last_vector(device, n):
     points = np.random.default_rng(n).normal(size=(n, 3)).astype(np.float32)
