@@ -79,9 +79,11 @@ def measure_clusters(cloud: PointCloud) -> ClusterFigures:
     """
     if cloud.labels is None:
         raise UsageError("the points have no labels: cluster them first")
-    labels, points = cloud.labels, cloud.points
+    labels, points = cloud.labels.astype(np.intp), cloud.points
+    kept: NDArray[np.intp] | None = None
     if labels.size and labels.min() < 0:
-        labels, points = labels[labels >= 0], points[labels >= 0]
+        kept = np.flatnonzero(labels >= 0)
+        labels = labels[kept]
     count = int(labels.max(initial=-1)) + 1
     sizes = np.bincount(labels, minlength=count)
     boxes = np.stack([np.full((count, 3), np.inf), np.full((count, 3), -np.inf)], axis=1)
@@ -89,11 +91,12 @@ def measure_clusters(cloud: PointCloud) -> ClusterFigures:
     shares = 1.0 / np.maximum(sizes, 1)
     around: list[NDArray[np.float64]] = []
     for axis in range(3):
-        values = np.ascontiguousarray(points[:, axis], dtype=np.float64)
-        low, high = np.full(count, np.inf), np.full(count, -np.inf)
-        np.minimum.at(low, labels, values)
-        np.maximum.at(high, labels, values)
+        own = np.ascontiguousarray(points[:, axis] if kept is None else points[:, axis][kept])
+        low, high = np.full(count, np.inf, own.dtype), np.full(count, -np.inf, own.dtype)
+        np.minimum.at(low, labels, own)
+        np.maximum.at(high, labels, own)
         boxes[:, 0, axis], boxes[:, 1, axis] = low, high
+        values = own.astype(np.float64)
         centres[:, axis] = np.bincount(labels, values, count) * shares
         around.append(values - centres[labels, axis])
         for other in range(axis + 1):

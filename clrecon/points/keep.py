@@ -62,7 +62,13 @@ def _parse(rule: str) -> KeepRule:
     raise UsageError(f"the keep rule {str(rule)!r} is not known: the rules are {KEEP_FORMS}, N and POINTS from 1 on")
 
 
-def keep_clusters(cloud: PointCloud, rules: str | Sequence[str] = (), *, cores: ArrayLike | None = None) -> PointStep:
+def keep_clusters(
+    cloud: PointCloud,
+    rules: str | Sequence[str] = (),
+    *,
+    cores: ArrayLike | None = None,
+    figures: ClusterFigures | None = None,
+) -> PointStep:
     """Keep some clusters of a cloud; noise goes, and without a rule nothing else does.
 
     Sheets go first, then small clusters; the largest are counted among what is left.  A seed keeps its cluster alone,
@@ -79,6 +85,8 @@ def keep_clusters(cloud: PointCloud, rules: str | Sequence[str] = (), *, cores: 
         first: table tops, image planes.
     cores : array_like, shape (n,), bool, optional
         Core points, see `Clustering.cores`; without them a seed takes the nearest point of any cluster.
+    figures : ClusterFigures, optional
+        The figures of the clusters of this cloud, see `Clustering.figures`; default: they are measured.
 
     Returns
     -------
@@ -94,8 +102,10 @@ def keep_clusters(cloud: PointCloud, rules: str | Sequence[str] = (), *, cores: 
         No cluster is left.
     """
     wanted = parse_keep_rules(rules)
-    figures = measure_clusters(cloud)
+    figures = measure_clusters(cloud) if figures is None or cloud.labels is None else figures
     labels = np.asarray(cloud.labels)
+    if labels.max(initial=-1) >= len(figures.points):
+        raise UsageError(f"the figures are of {len(figures.points):,} clusters, the cloud has others: leave them out")
     fate, facts = _judge(cloud, figures, wanted, cores)
     removed = np.where(labels < 0, 1, fate[labels] if len(fate) else 1).astype(np.uint8)
     kept = removed == 0

@@ -18,7 +18,7 @@ from clrecon.operators.points.free_clusters import cluster_free_points
 from clrecon.operators.points.voxel_clusters import ClusterSearch, checked_min_samples, pad_for, search_bytes
 from clrecon.operators.resident.device_volume import DeviceVolume, open_volume
 from clrecon.points import PointCloud, PointStep
-from clrecon.points.cluster_figures import measure_clusters
+from clrecon.points.cluster_figures import ClusterFigures, measure_clusters
 from clrecon.points.keep import REPORTED
 from clrecon.points.stencil import Lattice, Stencil, checked_eps, make_stencil
 from clrecon.system.progress import Progress
@@ -34,6 +34,10 @@ PLANE_PLUS_ONE = "plane+1"
 WIDE_GAP = 1.5
 """Slice gap in pixels above which ``plane+1`` takes much bone too."""
 
+PLACES_CHECKED = 1 << 14
+"""Points, evenly spread over the cloud, whose places are compared with their voxels: all would take as long as the
+search itself."""
+
 PLACE_TOLERANCE_MM = 0.01
 """Largest distance of a point from its voxel: float32 and files round by less."""
 
@@ -46,9 +50,12 @@ class Clustering(PointStep):
     ----------
     cores : ndarray, shape (n,), bool, or None
         The core points.
+    figures : ClusterFigures or None
+        The figures of all clusters, for `clrecon.keep_clusters`.
     """
 
     cores: NDArray[np.bool_] | None = None
+    figures: ClusterFigures | None = None
 
 
 def cluster_points(
@@ -198,7 +205,7 @@ class _Request:
             "kernel_seconds": dict(stopwatch.by_kernel),
         }
         removed = np.zeros(len(cloud), dtype=np.uint8)
-        return Clustering(labelled, removed, (), facts, tuple(warnings), cores)
+        return Clustering(labelled, removed, (), facts, tuple(warnings), cores, figures)
 
 
 def _cluster_band(
@@ -279,6 +286,11 @@ def _cluster_cloud(
     return work_on(taken, work)
 
 
+def _corners(ijk: NDArray[np.int32]) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+    """Return the lowest and the highest voxel, an axis at a time: ten times as fast as along axis 0."""
+    return np.array([column.min() for column in ijk.T]), np.array([column.max() for column in ijk.T])
+
+
 def _order_voxels(ijk: NDArray[np.int32]) -> tuple[NDArray[np.int64] | None, NDArray[np.int32]]:
     """Return the order k, j, i of voxels, None if they have it already, and the voxels in that order.
 
@@ -287,14 +299,16 @@ def _order_voxels(ijk: NDArray[np.int32]) -> tuple[NDArray[np.int64] | None, NDA
     UsageError
         A voxel is there twice.
     """
-    size = ijk.max(axis=0).astype(np.int64) - ijk.min(axis=0) + 1
-    own = (ijk - ijk.min(axis=0)).astype(np.int64)
-    places = (own[:, 2] * size[1] + own[:, 1]) * size[0] + own[:, 0]
-    order = None
-    if not (np.diff(places) > 0).all():
-        order = np.argsort(places, kind="stable")
-        ijk, places = ijk[order], places[order]
-    twice = int((np.diff(places) == 0).sum())
+    low, high = _corners(ijk)
+    ni, nj, nk = (high.astype(np.int64) - low + 1).tolist()
+    kind = np.int32 if ni * nj * nk < 1 << 31 else np.int64
+    i, j, k = (column.astype(kind, copy=False) - kind(first) for column, first in zip(ijk.T, low, strict=True))
+    places = (k * kind(nj) + j) * kind(ni) + i
+    if (places[1:] > places[:-1]).all():
+        return None, ijk
+    order = np.argsort(places, kind="stable")
+    ijk, places = ijk[order], places[order]
+    twice = int((places[1:] == places[:-1]).sum())
     if twice:
         raise UsageError(f"{twice:,} of {len(ijk):,} points have the voxel of another point: a voxel is one point")
     return order, ijk
@@ -324,7 +338,8 @@ def _find_lattice(cloud: PointCloud, volume: Volume | DeviceVolume | None) -> tu
         It is not known, or the points are not at their voxels.
     """
     assert cloud.ijk is not None
-    low, high = cloud.ijk.min(axis=0), cloud.ijk.max(axis=0)
+    low, high = _corners(cloud.ijk)
+    some = slice(None, None, max(1, len(cloud) // PLACES_CHECKED))
     if volume is not None:
         own = volume.volume if isinstance(volume, DeviceVolume) else volume
         if (low < 0).any() or (high >= own.shape_ijk).any():
@@ -332,17 +347,17 @@ def _find_lattice(cloud: PointCloud, volume: Volume | DeviceVolume | None) -> tu
                 f"the cloud's voxels run from {low.tolist()} to {high.tolist()}, the volume has {own.shape_ijk} voxels:"
                 " it is another volume"
             )
-        places = own.ijk_to_lps(cloud.ijk)
+        places = own.ijk_to_lps(cloud.ijk[some])
         lattice, first = Lattice.of(own), np.zeros(3, np.int32)
     else:
         affine = cloud.report.get("affine_ijk_to_lps_mm")
         if affine is None:
             raise UsageError("the cloud does not say where its voxels lie: give the volume that it comes from")
         matrix = checked_affine(affine)
-        places = cloud.ijk @ matrix[:3, :3].T + matrix[:3, 3]
+        places = cloud.ijk[some] @ matrix[:3, :3].T + matrix[:3, 3]
         ni, nj, nk = (high - low + 1).tolist()
         lattice, first = Lattice((ni, nj, nk), matrix), low
-    away = float(np.abs(places - cloud.points).max())
+    away = float(np.abs(places - cloud.points[some]).max())
     if away > PLACE_TOLERANCE_MM:
         raise UsageError(
             f"points lie up to {away:.3g} mm from their voxels"
