@@ -31,6 +31,7 @@ class _Command(NamedTuple):
 
 COMMANDS = {
     "mesh": _Command("clrecon.cli.mesh", "make a mesh from a CT series: the main job"),
+    "cloud": _Command("clrecon.cli.cloud", "make a cloud of points from a CT series, or clean one"),
     "render": _Command("clrecon.cli.render", "make pictures of a CT series, still or moving"),
     "info": _Command("clrecon.cli.info", "show which series a folder holds and whether they can be used"),
     "devices": _Command("clrecon.cli.devices", "show the OpenCL devices and which one would be used"),

@@ -14,6 +14,7 @@ import clrecon
 from clrecon.cli.common import Parser, add_common
 from clrecon.cli.main import COMMANDS
 from clrecon.cli.wording import _DESTINATIONS, speaker_of
+from clrecon.jobs.cloud.settings import CloudSettings
 from clrecon.jobs.mesh.label_choice import LabelChoice
 from clrecon.jobs.mesh.settings import MeshSettings
 from clrecon.jobs.render.files import PictureFiles
@@ -91,7 +92,15 @@ def test_every_parameter_that_the_library_names_is_one_of_its_own() -> None:
     public = [getattr(clrecon, name) for name in clrecon.__all__]
     is_error = [isinstance(each, type) and issubclass(each, Exception) for each in public]
     functions = [each for each, error in zip(public, is_error, strict=True) if callable(each) and not error]
-    settings = (InputSettings, MeshSettings, RenderSettings, RenderSettings.of, LabelChoice, PictureFiles)
+    settings = (
+        InputSettings,
+        CloudSettings,
+        MeshSettings,
+        RenderSettings,
+        RenderSettings.of,
+        LabelChoice,
+        PictureFiles,
+    )
     known = {name for own in (*functions, *settings) for name in inspect.signature(own).parameters}
     named = {name for path in PACKAGE.rglob("*.py") for name in named_parameters(path.read_text(encoding="utf-8"))}
     assert named - known == set()

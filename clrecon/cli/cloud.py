@@ -1,0 +1,258 @@
+"""``clrecon cloud``: from a CT series or a cloud to a clean cloud of points."""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import fields
+from typing import Any
+
+from clrecon.cli.cloud_values import parse_clusters, parse_denoisers, parse_level
+from clrecon.cli.common import add_device, add_keep_ids, add_memory, add_no_clobber, megabytes, pick
+from clrecon.cli.console import Console, printable
+from clrecon.cli.masking import add_masking
+from clrecon.cli.mesh import describe_volume
+from clrecon.cli.reading import add_reading
+from clrecon.jobs.cloud.settings import DENOISERS, KINDS, STEPS, CloudSettings
+from clrecon.jobs.shared.clouds import CLOUD_INPUTS
+
+__all__ = ["add_arguments", "describe_cloud_job", "run"]
+
+_PARTS = ("device", "read", "mask", "steps", "write", "other")
+_EXAMPLES = """\
+examples:
+  clrecon cloud CT_FOLDER -o bone.ply
+  clrecon cloud CT_FOLDER -o bone.npz --points shell --report bone.json
+  clrecon cloud CT_FOLDER -o bone.ply --hu 200,3000 --cluster eps=1.2,min=6 --keep largest:2
+  clrecon cloud CT_FOLDER -o bone.ply --hu 200,3000 --keep no-sheets --removed went.ply
+  clrecon cloud scan.ply -o clean.ply --outliers --denoise bilateral --normals
+  clrecon cloud CT_FOLDER -o t12.vtp --labels spine.nii.gz --label T12
+  clrecon render went.ply -o went.png --color removed"""
+
+
+def _epilog() -> str:
+    width = max(map(len, STEPS))
+    return "\n".join(
+        (
+            "The steps run in this order, whatever the order of the options:",
+            *(f"  {name:<{width}}  {text}" for name, text in STEPS.items()),
+            "",
+            "Points are in patient millimetres, by default in the DICOM frame (LPS: left, posterior, superior).",
+            "All files appear as a whole at the end or not at all, and older files of these names stay until then.",
+            "",
+            _EXAMPLES,
+        )
+    )
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of the command."""
+    parser.epilog = _epilog()
+    parser.add_argument(
+        "input",
+        metavar="INPUT",
+        help="DICOM folder (subfolders and any file names are fine) or file; a NIfTI, NRRD or MetaImage file; or a"
+        f" cloud of points ({', '.join(CLOUD_INPUTS)})",
+    )
+    parser.add_argument("-o", "--output", metavar="OUT", required=True, help="cloud file: .ply .vtp .npz .xyz or .las")
+    parser.add_argument(
+        "--space",
+        type=str.lower,
+        default="lps",
+        metavar="lps|ras",
+        help="patient frame of the written files and of seeds (default: lps)",
+    )
+    parser.add_argument(
+        "--input-space",
+        type=str.lower,
+        metavar="lps|ras",
+        help="patient frame of a cloud file that does not say its own (default: lps)",
+    )
+    add_reading(parser)
+    add_masking(parser)
+    _add_points(parser)
+    _add_steps(parser)
+    device = parser.add_argument_group("device")
+    add_device(device)
+    add_memory(device)
+    checks = parser.add_argument_group("files and checks")
+    checks.add_argument(
+        "--removed",
+        metavar="FILE",
+        help="write the points before any of them went, each with the number of the reason why it went as label (0:"
+        " kept)",
+    )
+    checks.add_argument(
+        "--allow-point-loss",
+        action="store_true",
+        help="go on where a step that should take noise alone takes more than half of the points, which else is"
+        " refused",
+    )
+    add_no_clobber(checks)
+    add_keep_ids(checks)
+    checks.add_argument("--report", metavar="FILE", help="write the figures of each step, device and times as JSON")
+
+
+def _add_points(parser: argparse.ArgumentParser) -> None:
+    group = parser.add_argument_group("points")
+    group.add_argument(
+        "--points",
+        type=str.lower,
+        metavar="|".join(KINDS),
+        help="surface: where the HU cross the iso value, between the voxels; voxels: the centres of those within;"
+        " shell: of these the outer ones (default: surface, with a band voxels)",
+    )
+    group.add_argument(
+        "--hu",
+        type=parse_level,
+        metavar="N|LO,HI",
+        help="iso value, inside is N and above; or a band, both ends included (default: that of bone)",
+    )
+    group.add_argument(
+        "--labels", metavar="FILE", help="label map: NIfTI, NRRD (.seg.nrrd too), MetaImage or DICOM SEG"
+    )
+    group.add_argument("--label", metavar="NAME|N", help="points of this label only (default: of all)")
+    group.add_argument(
+        "--paper",
+        action="store_true",
+        help="place and filter voxels as the papers print it, and say by how much that is wrong",
+    )
+
+
+def _add_steps(parser: argparse.ArgumentParser) -> None:
+    group = parser.add_argument_group("steps")
+    group.add_argument(
+        "--cluster",
+        dest="clusters",
+        type=parse_clusters,
+        nargs="?",
+        const={},
+        metavar="eps=MM,min=N",
+        help="density clusters (DBSCAN) without noise: neighbours are within eps, and a core point has min of them,"
+        " itself included; min=plane+1 makes noise of lone slices (default: 1.5 times the largest voxel step, 6)",
+    )
+    group.add_argument(
+        "--keep",
+        metavar="RULE",
+        action="append",
+        default=[],
+        help="clusters that stay: largest, largest:N, min:POINTS, seed:X,Y,Z (the nearest), no-sheets (tables and image"
+        " planes go); may be given again",
+    )
+    group.add_argument(
+        "--outliers",
+        type=float,
+        nargs="?",
+        const=2.0,
+        metavar="SD",
+        help="points go whose mean distance to 16 neighbours is SD standard deviations over the mean (without a number:"
+        " 2)",
+    )
+    group.add_argument(
+        "--denoise",
+        type=parse_denoisers,
+        default=(),
+        metavar=",".join(DENOISERS),
+        help="bilateral: points move along their normals to the weighted mean height of their neighbours, edges stay",
+    )
+    group.add_argument(
+        "--normals",
+        action="store_true",
+        help="unit normals that point out of bone; points of a surface have those of the scan until they are moved",
+    )
+
+
+def run(options: argparse.Namespace, console: Console) -> int:
+    """Run the command; returns the exit code."""
+    from clrecon.jobs.cloud.files import CloudFiles
+    from clrecon.jobs.cloud.job import make_cloud
+    from clrecon.jobs.cloud.settings import Clustering
+
+    given = pick(options, {own.name for own in fields(CloudSettings)})
+    clusters = None if options.clusters is None else Clustering(**options.clusters)
+    settings = CloudSettings(**{**given, "clusters": clusters, "keep": tuple(options.keep)})
+    files = CloudFiles(options.output, options.removed, options.report)
+    report = make_cloud(options.input, files, settings, no_clobber=options.no_clobber, progress=console.progress)
+    console.result(report)
+    for line in describe_cloud_job(report):
+        console.say(line)
+    paths = {"cloud": options.output, "removed": options.removed}
+    for entry in report["outputs"]:
+        console.say(
+            f"wrote    {printable(paths[entry['what']])}, {megabytes(entry['bytes'])}, {report['space'].upper()} mm"
+        )
+    if options.report:
+        console.say(f"report   {printable(options.report)}")
+    for warning in report["warnings"]:
+        console.warn(warning)
+    return 0
+
+
+def describe_cloud_job(report: dict[str, Any]) -> list[str]:
+    """Describe a report for people: the input, each step with what it took away, the cloud, the time."""
+    return [
+        f"input    {_describe_input(report)}",
+        *_describe_steps(report["steps"]),
+        *_describe_removed(report),
+        f"cloud    {report['points']:,} points{_describe_known(report)}",
+        f"device   {printable(report['device'])}",
+        f"time     {_describe_times(report['seconds'])}",
+    ]
+
+
+def _describe_input(report: dict[str, Any]) -> str:
+    if report["cloud_read"] is None:
+        return describe_volume(report["volume"])
+    file = report["cloud_read"]["file"] or {}
+    frame = (
+        f", {file['space']} as {'the file says' if file['space_from'] == 'file' else file['space_from']}"
+        if file
+        else ""
+    )
+    return f"{report['cloud_read']['points']:,} points{frame}"
+
+
+def _describe_steps(steps: list[dict[str, Any]]) -> list[str]:
+    lines: list[str] = []
+    for step in steps:
+        head = "steps    " if not lines else "         "
+        lines.append(f"{head}{step['step']}: {_describe_step(step)}, {step['seconds']:.2f} s")
+    return lines
+
+
+def _describe_step(step: dict[str, Any]) -> str:
+    after = step["points_after"]
+    if step["step"] == "points":
+        band = step.get("band_hu")
+        level = f" of {step['iso_value_hu']:g} HU" if step.get("iso_value_hu") is not None else ""
+        level = f" of {band[0]:g} to {band[1]:g} HU" if band and band[1] is not None else level
+        share = f", {100.0 * step['share']:.3g} % of {step['voxels']:,} voxels" if "share" in step else ""
+        return f"{after:,} points ({step['kind']}{level}){share}"
+    if "clusters" in step and "eps_mm" in step:
+        noise = f", {step['noise_points']:,} points are noise" if "noise_points" in step else ""
+        return f"{step['clusters']:,} clusters at eps {step['eps_mm']:.4g} mm, min {step['min_samples']}{noise}"
+    if "rms_move_mm" in step:
+        return f"{after:,} points moved by {step['rms_move_mm']:.3f} mm rms, at most {step['largest_move_mm']:.3f} mm"
+    if "doubtful" in step:
+        return f"{after:,} normals, {step['doubtful']:,} doubtful, oriented by {step['oriented_by'] or 'nothing'}"
+    removed = [f"{count:,} {reason}" for reason, count in step["removed"].items() if count]
+    if not removed:
+        return f"{after:,} points, none went"
+    return f"{after:,} of {step['points_before']:,} points stay, {', '.join(removed)} went"
+
+
+def _describe_removed(report: dict[str, Any]) -> list[str]:
+    """Name the labels of the file of removed points."""
+    if not report["removed_labels"]:
+        return []
+    names = ", ".join(f"{entry['label']} {entry['reason']}" for entry in report["removed_labels"])
+    return [f"removed  labels of that file: {names}"]
+
+
+def _describe_known(report: dict[str, Any]) -> str:
+    known = [word for word, name in (("normals", "normals"), ("HU", "has_hu"), ("labels", "labels")) if report[name]]
+    return f" with {', '.join(known)}" if known else ""
+
+
+def _describe_times(seconds: dict[str, float]) -> str:
+    parts = ", ".join(f"{part} {seconds[part]:.2f}" for part in _PARTS if seconds.get(part, 0.0) >= 0.005)
+    return f"{seconds['total']:.2f} s ({parts})"

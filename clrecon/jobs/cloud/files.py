@@ -1,0 +1,61 @@
+"""The files of a cloud job: their names and early checks."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from clrecon.jobs.shared.outputs import check_distinct
+
+__all__ = ["CloudFiles"]
+
+
+@dataclass(frozen=True)
+class CloudFiles:
+    """Files that a cloud job writes.
+
+    Attributes
+    ----------
+    output : path
+        The cloud: ``.ply``, ``.vtp``, ``.npz``, ``.xyz`` or ``.las``.
+    removed : path, optional
+        The points as they were extracted, each with the number of the reason why it went as its label; 0 is kept.
+    report : path, optional
+        The report as JSON.
+    """
+
+    output: str | Path
+    removed: str | Path | None = None
+    report: str | Path | None = None
+
+    def check(self) -> list[tuple[str, str | Path]]:
+        """Refuse outputs that cannot be written, before any work is done.
+
+        Returns
+        -------
+        list of (str, path)
+            Description and path of each output.
+
+        Raises
+        ------
+        UsageError
+            An extension is unknown, or two outputs are the same file.
+        OutputError
+            A folder is missing or cannot be written, or a target is no regular file.
+        """
+        from clrecon.exchange.clouds.formats import check_cloud_format
+        from clrecon.system.files import check_writable
+
+        named = [
+            ("the cloud", self.output),
+            ("the cloud of removed points", self.removed),
+            ("the report", self.report),
+        ]
+        outputs = [(what, path) for what, path in named if path is not None]
+        for path in (self.output, self.removed):
+            if path is not None:
+                check_cloud_format(path)
+        check_distinct(outputs)
+        for _, path in outputs:
+            check_writable(path)
+        return outputs

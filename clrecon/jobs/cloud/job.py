@@ -1,0 +1,175 @@
+"""The cloud job: a CT series or a cloud in, a clean cloud of points out, with its report."""
+
+from __future__ import annotations
+
+from contextlib import ExitStack
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from clrecon.jobs.cloud.files import CloudFiles
+from clrecon.jobs.cloud.points import prepare_chain, take_points
+from clrecon.jobs.cloud.report import CloudReport, describe_clouds, describe_file
+from clrecon.jobs.cloud.settings import OF_SCANS, CloudSettings
+from clrecon.jobs.cloud.trail import Trail
+from clrecon.jobs.shared.clouds import is_cloud_file, refuse_scan_settings
+from clrecon.jobs.shared.labelled import read_with_labels
+from clrecon.jobs.shared.laps import Laps
+from clrecon.jobs.shared.masking import mask_volume
+from clrecon.jobs.shared.opening import DeviceOpening
+from clrecon.jobs.shared.outputs import check_kept, commit_all
+from clrecon.jobs.shared.report import stage_report
+from clrecon.reading import read_selected
+from clrecon.system.files import allow_open_files
+from clrecon.system.log import get_logger, log_warnings
+from clrecon.system.progress import Progress, ignore_progress
+from clrecon.system.targets import keep_existing, refuse_existing, resolve_target
+
+if TYPE_CHECKING:
+    from clrecon.geometry import Volume
+    from clrecon.labels import LabelMap
+    from clrecon.opencl import Device
+    from clrecon.points import PointCloud
+    from clrecon.system.files import Staged
+
+__all__ = ["make_cloud"]
+
+log = get_logger(__name__)
+
+
+def make_cloud(
+    source: str | Path,
+    files: CloudFiles,
+    settings: CloudSettings | None = None,
+    *,
+    no_clobber: bool = False,
+    progress: Progress | None = None,
+) -> CloudReport:
+    """Read a CT series or a cloud, run the steps that are asked for, and write the cloud that is left.
+
+    The steps run in the order of `clrecon.jobs.cloud.settings.STEPS`.  Checks come first: the outputs, then the device,
+    then the input.  All files are written under temporary names and renamed when all are done; the report comes last,
+    as the commit mark.
+
+    Parameters
+    ----------
+    source : path
+        DICOM folder or file, a file of another format, or a file of points, see `clrecon.read_points`.
+    files : CloudFiles
+    settings : CloudSettings, optional
+    no_clobber : bool
+        True: files that exist stay and are an `OutputError`, before any work.
+    progress : callable, optional
+        ``progress(stage, done, total)``.
+
+    Returns
+    -------
+    CloudReport
+
+    Raises
+    ------
+    UsageError, OutputError, DeviceError, NoDicomError, RefusedInputError, NoSurfaceError
+        After an error nothing is written, and older files are intact.
+    """
+    settings = settings or CloudSettings()
+    progress = progress or ignore_progress
+    watch = Laps()
+    with keep_existing(no_clobber):
+        outputs = files.check()
+        for _, path in outputs:
+            refuse_existing(path, resolve_target(path))
+    check_kept(outputs, source, settings.labels)
+    is_cloud = is_cloud_file(source)
+    if is_cloud:
+        refuse_scan_settings(settings, OF_SCANS)
+
+    subject, labels, device = _open(source, is_cloud, settings, progress, watch)
+    trail = take_points(subject, labels, device, settings, progress)
+    watch.lap("steps")
+    trail.check(settings.allow_point_loss)
+    with keep_existing(no_clobber):
+        report = _write(subject, trail, files, settings, device.current, watch, progress)
+    log_warnings(log, report.warnings, subject.report.get("warnings", ()))
+    log.info("%d points of %d on %s in %.3f s", report.points, report.points_first, report.device, watch.total())
+    return report
+
+
+def _open(
+    source: str | Path, is_cloud: bool, settings: CloudSettings, progress: Progress, watch: Laps
+) -> tuple[Volume | PointCloud, LabelMap | None, Device]:
+    """Read the input while the device opens and builds its kernels."""
+    progress("device", 0, 0)
+    labels = None
+    subject: Volume | PointCloud
+    with DeviceOpening(settings.device, partial(prepare_chain, settings=settings, is_cloud=is_cloud)) as opening:
+        if is_cloud:
+            from clrecon.points.reader import read_points
+
+            progress("read", 0, 0)
+            subject = read_points(source, space=settings.input_space)
+        else:
+            subject, labels = read_with_labels(
+                partial(read_selected, source, settings, progress=progress),
+                settings.labels,
+                partial(_read_map, settings),
+            )
+        watch.lap("read")
+        device = opening.wait()
+        watch.lap("device")
+    if not is_cloud:
+        subject = mask_volume(subject, settings, progress)  # type: ignore[arg-type]
+        watch.lap("mask")
+    return subject, labels, device
+
+
+def _read_map(settings: CloudSettings, volume: Volume | None) -> LabelMap | None:
+    if settings.labels is None:
+        return None
+    from clrecon.labels import read_labels
+
+    return read_labels(settings.labels, None if settings.label is None else [settings.label], volume=volume)
+
+
+def _write(
+    subject: Volume | PointCloud,
+    trail: Trail,
+    files: CloudFiles,
+    settings: CloudSettings,
+    device: Device,
+    watch: Laps,
+    progress: Progress,
+) -> CloudReport:
+    """Write all files, the report as the last one, and return it."""
+    from clrecon.exchange.clouds.formats import describe_cloud_losses, stage_cloud
+
+    space, ids = settings.space, settings.keep_ids
+    progress("write", 0, 0)
+    allow_open_files(3)
+    written: list[Staged] = []
+    entries: list[dict[str, Any]] = []
+    with ExitStack() as staged:  # all files are on the disk before the first replaces an older one
+        wanted = [("cloud", files.output, trail.cloud), ("removed", files.removed, None)]
+        for what, path, cloud in wanted:
+            if path is not None:
+                chosen = trail.removed_cloud() if cloud is None else cloud
+                file = staged.enter_context(stage_cloud(chosen, path, space, keep_ids=ids))
+                written.append(file)
+                entries.append(describe_file(what, path, file.size))
+        losses = describe_cloud_losses(trail.cloud.describe(space), f".{entries[0]['format']}")
+        watch.lap("write")
+        report = describe_clouds(
+            subject, trail, settings, device, has_removed=files.removed is not None, outputs=entries,
+            warnings=[*trail.warnings, *losses], seconds=_seconds(watch),
+        )  # fmt: skip
+        if files.report is not None:
+            written.append(staged.enter_context(stage_report(files.report, report)))
+        commit_all(written)
+    return report
+
+
+def _seconds(watch: Laps) -> dict[str, float]:
+    parts = ("device", "read", "mask", "steps", "write")
+    seconds = {part: watch.seconds.get(part, 0.0) for part in parts}
+    seconds["other"] = max(0.0, watch.total() - sum(seconds.values()))
+    seconds["total"] = watch.total()
+    return {part: round(value, 4) for part, value in seconds.items()}

@@ -1,0 +1,172 @@
+"""The report of a cloud job."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from clrecon.geometry.certificate import without_ids
+from clrecon.jobs.cloud.settings import CloudSettings
+from clrecon.jobs.cloud.trail import Trail, name_reasons
+from clrecon.jobs.shared.clouds import describe_cloud
+from clrecon.jobs.shared.report import peak_memory_bytes, platform_name
+from clrecon.jobs.shared.run_report import RunReport
+from clrecon.version import package_version
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from clrecon.geometry import Volume
+    from clrecon.opencl import Device
+    from clrecon.points import PointCloud
+
+__all__ = ["CloudReport", "describe_clouds", "describe_file"]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class CloudReport(RunReport):
+    """The report of a cloud job: a `RunReport` with further entries, which docs/contract.md explains.
+
+    Attributes
+    ----------
+    kind : str or None
+        Kind of the points; None for a cloud that was read.
+    iso_value_hu : float or None
+    hu : [low, high] or None
+    label : mapping or None
+    cloud_read : mapping or None
+        The cloud that was read, see `clrecon.jobs.shared.clouds.describe_cloud`.
+    points, points_first : int
+        Points of the written cloud, and before any step.
+    removed : mapping of str to int
+        Points that went, by reason.
+    normals, has_hu, labels : bool
+        What the written cloud knows of its points.
+    bounds_mm : [[x, y, z], [x, y, z]]
+    space, unit : str
+    paper : bool
+    steps : list of mapping
+        In the order in which they ran: ``step``, ``points_before``, ``points_after``, ``removed``, ``seconds`` and
+        figures of their own.
+    gates : list of mapping
+    removed_labels : list of mapping or None
+        The labels of the file of removed points.
+    outputs : list of mapping
+        ``what``, ``format`` and ``bytes`` of each file but the report.
+    """
+
+    affine_ijk_to_lps_mm: list[list[float]] | None  # type: ignore[assignment]
+    kind: str | None
+    iso_value_hu: float | None
+    hu: list[float | None] | None
+    label: str | None
+    cloud_read: Mapping[str, Any] | None
+    points: int
+    points_first: int
+    removed: Mapping[str, int]
+    normals: bool
+    has_hu: bool
+    labels: bool
+    bounds_mm: list[list[float]]
+    space: str
+    unit: str = "mm"
+    paper: bool
+    steps: list[dict[str, Any]]
+    gates: list[dict[str, Any]]
+    removed_labels: list[dict[str, Any]] | None
+    outputs: list[dict[str, Any]]
+    device: str
+    driver: str
+    memory_allowed_bytes: int | None
+    version: str
+    platform: str
+    warnings: list[str]
+    volume: Mapping[str, Any]
+    seconds: Mapping[str, float]
+    peak_memory_bytes: int | None
+
+
+def describe_file(what: str, path: str | Path, size: int) -> dict[str, Any]:
+    """Return one entry of ``outputs``."""
+    return {"what": what, "format": os.path.splitext(os.fspath(path))[1].lower().lstrip("."), "bytes": size}
+
+
+def describe_clouds(
+    subject: Volume | PointCloud,
+    trail: Trail,
+    settings: CloudSettings,
+    device: Device,
+    *,
+    has_removed: bool,
+    outputs: list[dict[str, Any]],
+    warnings: Sequence[str],
+    seconds: Mapping[str, float],
+) -> CloudReport:
+    """Compose the report of a job.
+
+    Parameters
+    ----------
+    subject : Volume or PointCloud
+        What was read.
+    trail : Trail
+    settings : CloudSettings
+    device : Device
+    has_removed : bool
+        True: the points that went were written too.
+    outputs : list of dict
+        Results of `describe_file`.
+    warnings : sequence of str
+        Those of the job; those of the input come before them.
+    seconds : mapping
+    """
+    from clrecon.geometry import Volume
+
+    cloud, first = trail.cloud, trail.first.report
+    certificate: dict[str, Any] = {}
+    read = None
+    if isinstance(subject, Volume):
+        certificate = dict(subject.report) if settings.keep_ids else without_ids(subject.report)
+        affine = subject.affine.tolist()
+    else:
+        read, affine = describe_cloud(subject), subject.report.get("affine_ijk_to_lps_mm")
+    told = [*certificate.pop("warnings", []), *((read or {}).get("file") or {}).get("warnings", ())]
+    band = first.get("band_hu")
+    return CloudReport(
+        affine_ijk_to_lps_mm=affine,
+        kind=None if read is not None else settings.kind,
+        iso_value_hu=first.get("iso_value_hu"),
+        hu=band,
+        label=settings.label,
+        cloud_read=read,
+        points=len(cloud),
+        points_first=len(trail.first),
+        removed=trail.counts,
+        normals=cloud.normals is not None,
+        has_hu=cloud.hu is not None,
+        labels=cloud.labels is not None,
+        bounds_mm=_bounds(cloud, settings.space),
+        space=settings.space,
+        paper=settings.paper,
+        steps=trail.steps,
+        gates=[gate.as_dict() for gate in trail.gates],
+        removed_labels=name_reasons(trail.reasons) if has_removed else None,
+        outputs=outputs,
+        device=device.label,
+        driver=device.driver,
+        memory_allowed_bytes=settings.memory,
+        version=package_version(),
+        platform=platform_name(),
+        warnings=list(dict.fromkeys([*map(str, told), *device.warnings, *warnings])),
+        volume=certificate,
+        seconds=seconds,
+        peak_memory_bytes=peak_memory_bytes(),
+    )
+
+
+def _bounds(cloud: PointCloud, space: str) -> list[list[float]]:
+    import numpy as np
+
+    points, _ = cloud.in_space(space)
+    return np.stack([points.min(axis=0), points.max(axis=0)]).astype(float).tolist()

@@ -1,0 +1,187 @@
+"""Settings of the cloud job, validated on construction, and the order of its steps."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from clrecon.errors import UsageError
+from clrecon.jobs.shared.settings import InputSettings
+from clrecon.system.wording import name_parameter
+
+__all__ = ["DENOISERS", "KINDS", "STEPS", "CloudSettings", "Clustering", "OF_SCANS"]
+
+KINDS = ("surface", "shell", "voxels")
+"""Kinds of points, see `clrecon.extract_points`."""
+
+DENOISERS = ("bilateral",)
+
+
+STEPS = {
+    "read": "the scan, or a cloud from a file",
+    "masks": "the field of view and the body: what is outside becomes air",
+    "points": "the surface, the shell or the voxels of the HU band or the label",
+    "clusters": "density clusters (DBSCAN), each point with the number of its own",
+    "keep": "noise and the clusters that the rules do not keep go",
+    "outliers": "points whose neighbours are far go",
+    "bilateral": "points move along their normals to the weighted mean height of their neighbours, edges stay",
+    "normals": "unit vectors that point out of bone",
+}
+"""The steps in the order in which they run, whatever the order of the options."""
+
+OF_SCANS = ("points", "hu", "labels")
+"""Settings beside those of the input that have no meaning where the input is a cloud."""
+
+LARGEST_MM = 1e4
+
+
+@dataclass(frozen=True)
+class Clustering:
+    """Parameters of DBSCAN, see `clrecon.cluster_points`.
+
+    Parameters
+    ----------
+    eps : float, optional
+        Mm.
+    min_samples : int or "plane+1"
+    """
+
+    eps: float | None = None
+    min_samples: int | str = 6
+
+    def __post_init__(self) -> None:
+        if self.eps is not None:
+            _check_mm("eps of clusters", self.eps)
+        if isinstance(self.min_samples, str) and self.min_samples != "plane+1":
+            raise UsageError(f"the fewest points of a neighbourhood are a number or plane+1, not {self.min_samples!r}")
+        if not isinstance(self.min_samples, str) and not 1 <= self.min_samples <= 255:
+            raise UsageError(f"the fewest points of a neighbourhood lie between 1 and 255, not at {self.min_samples}")
+
+
+@dataclass(frozen=True)
+class CloudSettings(InputSettings):
+    """Settings of the cloud job.
+
+    Parameters
+    ----------
+    points : {"surface", "shell", "voxels"}, optional
+        Default: "voxels" where a band is given, else "surface".
+    hu : float or (low, high), optional
+        One number is an iso value, inside is that and above; two are a band, both ends included.  Default: the iso
+        value of the mesh job.
+    labels : path, optional
+        Label map; only points of one label are taken.
+    label : str, optional
+        Number or name of that label.
+    clusters : Clustering, optional
+    keep : sequence of str
+        Keep rules, see `clrecon.keep_clusters`; they need clusters, which then have the default parameters.
+    outliers : float, optional
+        Standard deviations of the mean distance to the neighbours beyond which a point goes.
+    denoise : sequence of {"bilateral"}
+    normals : bool
+        Points without normals get them, and points that were moved new ones.
+    paper : bool
+        The formulas as the papers print them, with what that does.
+    allow_point_loss : bool
+        Go on where a step that should take noise only takes more than half of its points.
+    space : {"lps", "ras"}
+        Patient frame of the written files, and of the seeds.
+    input_space : {"lps", "ras"}, optional
+        Patient frame of a cloud file that does not say its own.
+    **shared
+        See `clrecon.jobs.shared.settings.InputSettings`.
+
+    Raises
+    ------
+    UsageError
+        A value is impossible, or two exclude each other.
+    """
+
+    points: str | None = None
+    hu: float | Sequence[float] | None = None
+    labels: str | Path | None = None
+    label: str | None = None
+    clusters: Clustering | None = None
+    keep: Sequence[str] = ()
+    outliers: float | None = None
+    denoise: Sequence[str] = ()
+    normals: bool = False
+    paper: bool = False
+    allow_point_loss: bool = False
+    space: str = "lps"
+    input_space: str | None = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        from clrecon.geometry import frame_from_lps  # numpy: not loaded before a job starts
+
+        frame_from_lps(self.space)
+        _check_choice("points are", self.points, KINDS)
+        for name in self.denoise:
+            _check_choice("clouds are denoised by", name, DENOISERS)
+        if len(set(self.denoise)) < len(self.denoise):
+            raise UsageError(f"a way to denoise is named twice: {', '.join(self.denoise)}")
+        if self.outliers is not None and not (math.isfinite(self.outliers) and self.outliers > 0.0):
+            raise UsageError(f"outliers are told by standard deviations above 0, not {self.outliers:g}")
+        self._check_hu()
+        self._check_labels()
+        if self.keep:
+            from clrecon.points.keep import parse_keep_rules
+
+            parse_keep_rules(tuple(self.keep))
+        if self.paper and self.kind == "surface":
+            raise UsageError(
+                "the formulas of the papers are for voxel centres, not for points of a surface: give a band too"
+                f" ({name_parameter('hu')}), or {name_parameter('points', 'voxels')}"
+            )
+
+    def _check_hu(self) -> None:
+        ends = self.hu if isinstance(self.hu, Sequence) else () if self.hu is None else (self.hu,)
+        for value in ends:
+            if not math.isfinite(value):
+                raise UsageError(f"HU are finite numbers, not {value}")
+        if isinstance(self.hu, Sequence):
+            if len(self.hu) != 2:
+                raise UsageError(f"a band of HU has two ends, not {len(self.hu)}")
+            if self.hu[0] > self.hu[1]:
+                raise UsageError(f"the band {self.hu[0]:g},{self.hu[1]:g} HU holds nothing: give its lower end first")
+            if self.points == "surface":
+                raise UsageError("a surface has one iso value, not a band: give one number of HU, or other points")
+
+    def _check_labels(self) -> None:
+        if self.label is not None and self.labels is None:
+            raise UsageError("a label is one of a label map: give its file too")
+
+    @property
+    def kind(self) -> str:
+        """The kind of points that is taken from a scan."""
+        return self.points or ("voxels" if self.is_band else "surface")
+
+    @property
+    def is_band(self) -> bool:
+        """True where two ends of a band were given, and not one iso value."""
+        return isinstance(self.hu, Sequence)
+
+    def for_trial(self) -> CloudSettings:
+        """Return the settings for a cube of a few voxels: the same steps, none of them about this scan."""
+        hu = (0.0, 3000.0) if self.is_band else 0.0
+        rules = [rule for rule in self.keep if not rule.lower().startswith(("min", "seed"))]
+        return replace(self, hu=hu, labels=None, label=None, keep=tuple(rules), device=None)
+
+    @property
+    def clustering(self) -> Clustering | None:
+        """Parameters of the clusters; those by default where only rules are given."""
+        return self.clusters or (Clustering() if self.keep else None)
+
+
+def _check_choice(what: str, value: str | None, known: Sequence[str]) -> None:
+    if value is not None and value not in known:
+        raise UsageError(f"{what} one of {', '.join(known)}, not {value!r:.60}")
+
+
+def _check_mm(what: str, value: float) -> None:
+    if not 0.0 < value <= LARGEST_MM:
+        raise UsageError(f"{what} is a length in mm above 0 and up to {LARGEST_MM:g}, not {value:g}")

@@ -1,0 +1,312 @@
+"""`clrecon cloud`: every option end to end on a small volume, what is refused, and what is left when a step fails."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from contract_tables import names_in
+from label_files import write_nrrd
+
+import clrecon
+from clrecon.cli.main import main
+from clrecon.errors import RefusedInputError, UsageError
+from clrecon.jobs.cloud.files import CloudFiles
+from clrecon.jobs.cloud.job import make_cloud
+from clrecon.jobs.cloud.settings import STEPS, CloudSettings, Clustering
+from clrecon.jobs.mesh.presets import DEFAULT_PRESET, PRESETS
+
+pytestmark = pytest.mark.first_device
+
+AFFINE = np.array([[0.8, 0.1, 0.0, -20.0], [-0.1, 0.8, 0.0, 30.0], [0.0, 0.0, 1.0, 100.0], [0.0, 0.0, 0.0, 1.0]])
+BAND = "200,3000"
+
+
+def make_voxels() -> np.ndarray:
+    """Two balls of 9 and 5 voxels, a plate without thickness below them, and lone voxels around."""
+    k, j, i = np.indices((40, 44, 48))
+    balls = [9.3 - np.sqrt((k - 14) ** 2 + (j - 16) ** 2 + (i - 15) ** 2)]
+    balls.append(5.2 - np.sqrt((k - 26) ** 2 + (j - 16) ** 2 + (i - 34) ** 2))
+    voxels = np.clip(np.rint(100.0 * np.max(balls, axis=0) + 200.0), -1000, 900).astype(np.int16)
+    voxels[4:36, 38, 4:44] = 600
+    for place in ((36, 5, 5), (2, 30, 44), (37, 30, 40)):
+        voxels[place] = 700
+    return voxels
+
+
+@pytest.fixture(scope="module")
+def scan(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("cloud") / "scan.nrrd"
+    write_nrrd(path, make_voxels(), AFFINE)
+    return path
+
+
+@pytest.fixture
+def cloud_command(device: Any, tmp_path: Path) -> Any:
+    """Run the command in an empty folder; returns the exit code."""
+
+    def run(source: Path, *options: str, output: str = "out.ply") -> int:
+        return main(["cloud", str(source), "-o", str(tmp_path / output), "--device", str(device.index), *options])
+
+    return run
+
+
+def test_points_of_the_surface_are_those_of_the_function(
+    device: Any, scan: Path, tmp_path: Path, cloud_command: Any, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cloud_command(scan, "--report", str(tmp_path / "r.json"), "--json") == 0
+    report = json.loads((tmp_path / "r.json").read_text())
+    assert json.loads(capsys.readouterr().out) == report
+    assert set(report) == names_in("clrecon cloud INPUT")
+    level = PRESETS[DEFAULT_PRESET].iso_value
+    own = clrecon.extract_points(clrecon.read_volume(scan), level, kind="surface", device=device)
+    written = clrecon.read_points(tmp_path / "out.ply")
+    assert np.array_equal(written.points, own.points) and np.array_equal(written.normals, own.normals)
+    assert (written.hu == level).all() and report["iso_value_hu"] == level
+    assert report["points"] == report["points_first"] == len(own) and report["kind"] == "surface"
+    assert report["normals"] and report["has_hu"] and not report["labels"] and report["removed"] == {}
+    assert np.allclose(report["bounds_mm"], [own.points.min(axis=0), own.points.max(axis=0)])
+    assert [step["step"] for step in report["steps"]] == ["points"]
+    assert report["outputs"][0]["bytes"] == (tmp_path / "out.ply").stat().st_size
+    assert {path.name for path in tmp_path.iterdir()} == {"out.ply", "r.json"}
+
+
+def test_clusters_rules_and_what_went(
+    device: Any, scan: Path, tmp_path: Path, cloud_command: Any, capsys: pytest.CaptureFixture[str]
+) -> None:
+    options = ["--keep", "no-sheets", "--hu", BAND, "--cluster", "eps=1.2,min=4", "--keep", "largest:1"]
+    removed, told = tmp_path / "went.npz", tmp_path / "r.json"
+    assert cloud_command(scan, *options, "--removed", str(removed), "--report", str(told)) == 0
+    said = capsys.readouterr().out
+    assert "3 noise" in said and "labels of that file: 0 kept, 1 noise, 2 sheet, 3 other cluster" in said
+    volume = clrecon.read_volume(scan)
+    first = clrecon.extract_points(volume, hu=(200, 3000), device=device)
+    found = clrecon.cluster_points(first, 1.2, 4, volume=volume, device=device)
+    step = clrecon.keep_clusters(found.cloud, ["no-sheets", "largest:1"], cores=found.cores)
+    written, went = clrecon.read_points(tmp_path / "out.ply"), clrecon.read_points(removed)
+    assert np.array_equal(written.points, step.cloud.points) and np.array_equal(written.labels, step.cloud.labels)
+    assert np.array_equal(went.points, first.points) and np.array_equal(went.labels == 0, step.removed == 0)
+    report = json.loads(told.read_text())
+    balls = (written.points[:, 2] > 104) & (written.points[:, 2] < 124)
+    assert balls.all() and report["removed"]["noise"] == 3 and report["removed"]["sheet"] == 32 * 40
+    assert report["points_first"] == len(first) == sum(report["removed"].values()) + report["points"]
+    assert [step["step"] for step in report["steps"]] == ["points", "clusters", "keep"]
+    assert list(STEPS).index("clusters") < list(STEPS).index("keep")
+    assert report["gates"][0]["ok"] and report["removed_labels"][2] == {"label": 2, "reason": "sheet"}
+    assert [entry["what"] for entry in report["outputs"]] == ["cloud", "removed"]
+
+
+def test_seeds_and_files_in_the_frame_of_the_output(scan: Path, tmp_path: Path, cloud_command: Any) -> None:
+    centre = AFFINE[:3] @ (34, 16, 26, 1)
+    for space, sign in (("lps", 1.0), ("ras", -1.0)):
+        seed = ",".join(str(number) for number in centre * (sign, sign, 1.0))
+        given = ["--hu", BAND, "--keep", f"seed:{seed}", "--space", space]
+        assert cloud_command(scan, *given, output=f"{space}.ply") == 0
+    lps, ras = (clrecon.read_points(tmp_path / f"{space}.ply") for space in ("lps", "ras"))
+    assert np.allclose(lps.points, ras.points, atol=1e-4) and len(lps) < 1000
+    assert np.linalg.norm(lps.points - centre, axis=1).max() < 5.5
+    assert b"SPACE=RAS" in (tmp_path / "ras.ply").read_bytes()[:2000]
+
+
+@pytest.mark.parametrize("kind", ["surface", "shell", "voxels"])
+@pytest.mark.parametrize("extension", ["ply", "vtp", "npz", "xyz"])
+def test_kinds_and_formats(
+    kind: str, extension: str, scan: Path, tmp_path: Path, cloud_command: Any, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cloud_command(scan, "--points", kind, "--hu", "250", output=f"a.{extension}") == 0
+    said = capsys.readouterr()
+    cloud = clrecon.read_points(tmp_path / f"a.{extension}")
+    assert len(cloud) > 200 and f"{len(cloud):,} points ({kind} of 250 HU)" in said.out
+    assert (cloud.normals is not None) == (kind == "surface" and extension != "xyz")
+    assert ("XYZ has no place for normals" in said.err) == (kind == "surface" and extension == "xyz")
+
+
+def test_labels_choose_points(scan: Path, tmp_path: Path, cloud_command: Any) -> None:
+    labels = np.zeros(make_voxels().shape, np.uint8)
+    labels[4:34, :30, :26], labels[4:34, :30, 26:] = 1, 2
+    header = {f"Segment{n}_{what}": value for n, name in ((0, "left"), (1, "right")) for what, value in (
+        ("LabelValue", str(n + 1)), ("Layer", "0"), ("Name", name))}  # fmt: skip
+    write_nrrd(tmp_path / "labels.seg.nrrd", labels, AFFINE, **header)
+    given = ["--labels", str(tmp_path / "labels.seg.nrrd")]
+    assert cloud_command(scan, *given, "--label", "right", "--hu", BAND, output="r.ply") == 0
+    assert cloud_command(scan, *given, "--label", "1", output="l.ply") == 0
+    right, left = (clrecon.read_points(tmp_path / name) for name in ("r.ply", "l.ply"))
+    assert np.linalg.norm(right.points - AFFINE[:3] @ (34, 16, 26, 1), axis=1).max() < 6.0
+    assert np.linalg.norm(left.points - AFFINE[:3] @ (15, 16, 14, 1), axis=1).max() < 10.0
+
+
+def test_the_placing_of_the_paper_says_how_wrong_it_is(
+    scan: Path, tmp_path: Path, cloud_command: Any, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cloud_command(scan, "--hu", BAND, "--paper", "--json") == 0
+    report = json.loads(capsys.readouterr().out)
+    paper = report["steps"][0]["paper"]
+    assert report["paper"] and paper["error_max_mm"] > 30.0
+    assert np.ptp(clrecon.read_points(tmp_path / "out.ply").points[:, 2]) < 1e-3
+
+
+def test_a_step_that_takes_more_than_noise_is_refused(
+    device: Any, tmp_path: Path, cloud_command: Any, capsys: pytest.CaptureFixture[str]
+) -> None:
+    voxels = np.zeros((24, 24, 24), np.int16)
+    voxels[::3, ::3, ::3] = 500  # lone voxels
+    voxels[5:9, 5:9, 5:9] = 500
+    write_nrrd(tmp_path / "scan.nrrd", voxels, np.eye(4))
+    given = ["--hu", BAND, "--cluster", "eps=1.5,min=5"]
+    assert cloud_command(tmp_path / "scan.nrrd", *given) == 4
+    error = capsys.readouterr().err
+    assert "points gone (" in error and "more than half is no noise" in error and "--allow-point-loss" in error
+    assert {path.name for path in tmp_path.iterdir()} == {"scan.nrrd"}
+    assert cloud_command(tmp_path / "scan.nrrd", *given, "--allow-point-loss") == 0
+    assert "and was allowed" in capsys.readouterr().err
+    settings = CloudSettings(hu=(200, 3000), clusters=Clustering(1.5, 5), device=str(device.index))
+    with pytest.raises(RefusedInputError, match="allow_point_loss=True"):
+        make_cloud(tmp_path / "scan.nrrd", CloudFiles(tmp_path / "b.ply"), settings)
+
+
+def test_a_rule_may_take_what_it_likes(scan: Path, tmp_path: Path, cloud_command: Any) -> None:
+    """The smaller ball alone: most points go, because they were asked to."""
+    centre = ",".join(str(number) for number in AFFINE[:3] @ (34, 16, 26, 1))
+    assert cloud_command(scan, "--hu", BAND, "--keep", f"seed:{centre}", "--report", str(tmp_path / "r.json")) == 0
+    report = json.loads((tmp_path / "r.json").read_text())
+    assert report["removed"]["other cluster"] > 0.5 * report["points_first"]
+
+
+WRONG = (
+    (["--points", "vertices"], "points are one of surface, shell, voxels"),
+    (["--hu", "bone"], "no iso value N and no band LO,HI"),
+    (["--hu", "1,2,3"], "no iso value N and no band LO,HI"),
+    (["--hu", "300,200"], "holds nothing: give its lower end first"),
+    (["--hu", "nan"], "HU are finite numbers"),
+    (["--hu", BAND, "--points", "surface"], "a surface has one iso value, not a band"),
+    (["--label", "L1"], "give its file too"),
+    (["--cluster", "eps=0"], "eps of clusters is a length in mm"),
+    (["--cluster", "eps"], "is not eps=MM,min=N"),
+    (["--cluster", "min=x"], "min is no number: 'x'"),
+    (["--cluster", "min=0"], "between 1 and 255"),
+    (["--keep", "smallest"], "the rules are largest"),
+    (["--denoise", "median"], "denoised by one of bilateral, not 'median'"),
+    (["--outliers", "-1"], "standard deviations above 0"),
+    (["--paper"], "not for points of a surface"),
+    (["--space", "xyz"], "xyz"),
+    (["--memory", "0"], "memory"),
+    (["--removed", "out.stl"], "use one of .ply"),
+    (["--nonsense"], "unrecognized arguments"),
+)
+
+
+@pytest.mark.parametrize(("options", "says"), WRONG, ids=[" ".join(options) for options, _ in WRONG])
+def test_wrong_options_are_one_line(
+    options: list[str], says: str, scan: Path, tmp_path: Path, cloud_command: Any, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cloud_command(scan, *options) == 3
+    error = capsys.readouterr().err
+    assert says in error and error.count("\n") == 1
+    assert not list(tmp_path.iterdir())
+
+
+def test_files_that_cannot_be(
+    scan: Path, tmp_path: Path, cloud_command: Any, capsys: pytest.CaptureFixture[str], device: Any
+) -> None:
+    assert cloud_command(scan, output="out.stl") == 3
+    assert cloud_command(scan, "--report", str(tmp_path / "out.ply")) == 3
+    assert "cannot be the same file" in capsys.readouterr().err
+    assert cloud_command(scan, output="nowhere/out.ply") == 6
+    assert cloud_command(tmp_path / "missing") == 2
+    (tmp_path / "empty").mkdir()
+    assert cloud_command(tmp_path / "empty") == 2
+    (tmp_path / "empty").rmdir()
+    (tmp_path / "out.ply").write_text("mine")
+    assert cloud_command(scan, "--no-clobber") == 6
+    assert cloud_command(scan, "--hu", "5000") == 2
+    assert cloud_command(scan, "--hu", "5000,6000") == 2
+    assert main(["cloud", str(scan), "-o", str(tmp_path / "out.ply"), "--device", "99"]) == 5
+    assert (tmp_path / "out.ply").read_text() == "mine"
+    assert {path.name for path in tmp_path.iterdir()} == {"out.ply"}
+
+
+def test_a_cloud_is_read_and_cleaned(
+    device: Any, scan: Path, tmp_path: Path, cloud_command: Any, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cloud_command(scan, "--hu", BAND, output="first.npz") == 0
+    capsys.readouterr()
+    assert cloud_command(tmp_path / "first.npz", "--keep", "largest", "--json", output="second.ply") == 0
+    report = json.loads(capsys.readouterr().out)
+    assert report["cloud_read"]["points"] == report["points_first"] and report["volume"] == {}
+    assert report["kind"] is None and np.allclose(report["affine_ijk_to_lps_mm"], AFFINE)
+    before, after = (clrecon.read_points(tmp_path / name) for name in ("first.npz", "second.ply"))
+    assert 0 < len(after) < len(before)
+    for option in (["--remove-table"], ["--hu", "200"], ["--points", "shell"], ["--series", "1"]):
+        assert cloud_command(tmp_path / "first.npz", *option, output="third.ply") == 3
+        assert "is about a scan: leave it out" in capsys.readouterr().err
+    assert cloud_command(tmp_path / "first.npz", output="first.npz") == 3
+    bad = tmp_path / "bad.xyz"
+    bad.write_text("1 2 3\n4 nan 6\n")
+    assert cloud_command(bad, output="third.ply") == 4
+    assert "not finite" in capsys.readouterr().err
+
+
+def test_frames_of_clouds_that_do_not_say_theirs(tmp_path: Path, cloud_command: Any) -> None:
+    (tmp_path / "a.xyz").write_text("1 2 3\n4 5 6\n7 8 9\n")
+    assert cloud_command(tmp_path / "a.xyz", "--input-space", "ras") == 0
+    assert np.array_equal(clrecon.read_points(tmp_path / "out.ply").points[0], (-1.0, -2.0, 3.0))
+
+
+def test_outliers_filter_and_normals(
+    device: Any, scan: Path, tmp_path: Path, cloud_command: Any, capsys: pytest.CaptureFixture[str]
+) -> None:
+    options = ["--normals", "--denoise", "bilateral", "--outliers", "3", "--points", "shell", "--hu", "250"]
+    assert cloud_command(scan, *options, "--report", str(tmp_path / "r.json"), output="out.npz") == 0
+    said = capsys.readouterr().out
+    assert "mm rms, at most" in said and "oriented by gradient" in said
+    volume = clrecon.read_volume(scan)
+    cloud = clrecon.extract_points(volume, 250, kind="shell", device=device)
+    cloud = clrecon.remove_outliers(cloud, deviations=3.0, device=device).cloud
+    cloud = clrecon.denoise_points(cloud, device=device).cloud
+    cloud = clrecon.estimate_normals(cloud, volume=volume, device=device).cloud
+    written = clrecon.read_points(tmp_path / "out.npz")
+    assert np.array_equal(written.points, cloud.points) and np.array_equal(written.normals, cloud.normals)
+    report = json.loads((tmp_path / "r.json").read_text())
+    assert [step["step"] for step in report["steps"]] == ["points", "outliers", "bilateral", "normals"]
+    places = [list(STEPS).index(step["step"]) for step in report["steps"]]
+    assert places == sorted(places) and report["removed"].get("outlier", 0) > 0
+    assert [gate["name"] for gate in report["gates"]] == ["points_kept_outliers"]
+
+
+def test_points_of_a_surface_keep_the_normals_of_its_field(scan: Path, tmp_path: Path, cloud_command: Any) -> None:
+    assert cloud_command(scan, output="a.ply") == 0
+    assert cloud_command(scan, "--normals", output="b.ply") == 0
+    assert cloud_command(scan, "--denoise", "bilateral", output="c.ply") == 0
+    one, two, moved = (clrecon.read_points(tmp_path / f"{name}.ply") for name in "abc")
+    assert np.array_equal(one.normals, two.normals) and moved.normals is None
+
+
+def test_a_cancelled_job_leaves_nothing(device: Any, scan: Path, tmp_path: Path) -> None:
+    settings = CloudSettings(hu=(200, 3000), keep=("largest",), device=str(device.index))
+    files = CloudFiles(tmp_path / "a.ply", tmp_path / "b.ply", tmp_path / "r.json")
+    calls: list[tuple[str, int, int]] = []
+    make_cloud(scan, files, settings, progress=lambda *call: calls.append(call))
+    assert {"device", "write"} <= {stage for stage, _, _ in calls}
+    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    for moment in dict.fromkeys(calls):
+
+        def cancel(*call: Any, moment: Any = moment) -> None:
+            if call == moment:
+                raise clrecon.Cancelled
+
+        with pytest.raises(clrecon.Cancelled):
+            make_cloud(scan, files, settings, progress=cancel)
+        assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
+    with pytest.raises(clrecon.OutputError):
+        make_cloud(scan, files, settings, no_clobber=True)
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
+
+
+def test_what_the_settings_refuse() -> None:
+    with pytest.raises(UsageError, match="a band of HU has two ends"):
+        CloudSettings(hu=(1.0,))
+    with pytest.raises(UsageError, match="named twice"):
+        CloudSettings(denoise=("bilateral", "bilateral"))
