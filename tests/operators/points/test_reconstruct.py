@@ -76,6 +76,13 @@ def test_a_leak_is_refused_or_mended(device):
     assert rms(cube_distances(mesh.vertices)) < 0.1
 
 
+def test_doubtful_votes_are_warned_of(device, monkeypatch):
+    assert reconstruct_surface(sphere_cloud(2000, 8.0), 0.65, device=device).report["warnings"] == []
+    monkeypatch.setattr("clrecon.operators.points.reconstruct.DOUBTFUL_SHARE", -1.0)
+    mesh = reconstruct_surface(sphere_cloud(2000, 8.0), 0.65, device=device)
+    assert "votes are against the winner: parts of the cloud may be open" in mesh.report["warnings"][0]
+
+
 def test_a_large_hole_is_refused_after_all_widenings(device):
     cloud = sphere_cloud(3000, 10.0)
     cap = cloud.select(np.flatnonzero(cloud.points[:, 2] < 5.0))
