@@ -17,14 +17,14 @@ from clrecon.jobs.shared.clouds import CLOUD_INPUTS
 
 __all__ = ["add_arguments", "describe_cloud_job", "run"]
 
-_PARTS = ("device", "read", "mask", "steps", "write", "other")
+_PARTS = ("device", "read", "mask", "steps", "surface", "write", "other")
 _EXAMPLES = """\
 examples:
   clrecon cloud CT_FOLDER -o bone.ply
   clrecon cloud CT_FOLDER -o bone.npz --points shell --report bone.json
   clrecon cloud CT_FOLDER -o bone.ply --hu 200,3000 --cluster eps=1.2,min=6 --keep largest:2
   clrecon cloud CT_FOLDER -o bone.ply --hu 200,3000 --keep no-sheets --removed went.ply
-  clrecon cloud scan.ply -o clean.ply --outliers --denoise bilateral --normals
+  clrecon cloud scan.ply -o clean.ply --denoise grid,bilateral --normals --spacing 1 --surface clean.stl
   clrecon cloud CT_FOLDER -o t12.vtp --labels spine.nii.gz --label T12
   clrecon render went.ply -o went.png --color removed"""
 
@@ -152,12 +152,17 @@ def _add_steps(parser: argparse.ArgumentParser) -> None:
         type=parse_denoisers,
         default=(),
         metavar=",".join(DENOISERS),
-        help="bilateral: points move along their normals to the weighted mean height of their neighbours, edges stay",
+        help="grid: points alone in a cell of a grid go; bilateral: points move along their normals to the weighted"
+        " mean height of their neighbours, edges stay",
     )
     group.add_argument(
         "--normals",
         action="store_true",
         help="unit normals that point out of bone; points of a surface have those of the scan until they are moved",
+    )
+    group.add_argument("--spacing", type=float, metavar="MM", help="keep one point for each cell of that size")
+    group.add_argument(
+        "--surface", metavar="FILE", help="write a closed mesh around the points too, which need normals for it"
     )
 
 
@@ -170,12 +175,12 @@ def run(options: argparse.Namespace, console: Console) -> int:
     given = pick(options, {own.name for own in fields(CloudSettings)})
     clusters = None if options.clusters is None else Clustering(**options.clusters)
     settings = CloudSettings(**{**given, "clusters": clusters, "keep": tuple(options.keep)})
-    files = CloudFiles(options.output, options.removed, options.report)
+    files = CloudFiles(options.output, options.removed, options.surface, options.report)
     report = make_cloud(options.input, files, settings, no_clobber=options.no_clobber, progress=console.progress)
     console.result(report)
     for line in describe_cloud_job(report):
         console.say(line)
-    paths = {"cloud": options.output, "removed": options.removed}
+    paths = {"cloud": options.output, "removed": options.removed, "surface": options.surface}
     for entry in report["outputs"]:
         console.say(
             f"wrote    {printable(paths[entry['what']])}, {megabytes(entry['bytes'])}, {report['space'].upper()} mm"
@@ -194,6 +199,7 @@ def describe_cloud_job(report: dict[str, Any]) -> list[str]:
         *_describe_steps(report["steps"]),
         *_describe_removed(report),
         f"cloud    {report['points']:,} points{_describe_known(report)}",
+        *_describe_surface(report["surface"]),
         f"device   {printable(report['device'])}",
         f"time     {_describe_times(report['seconds'])}",
     ]
@@ -251,6 +257,13 @@ def _describe_removed(report: dict[str, Any]) -> list[str]:
 def _describe_known(report: dict[str, Any]) -> str:
     known = [word for word, name in (("normals", "normals"), ("HU", "has_hu"), ("labels", "labels")) if report[name]]
     return f" with {', '.join(known)}" if known else ""
+
+
+def _describe_surface(surface: dict[str, Any] | None) -> list[str]:
+    if surface is None:
+        return []
+    against = f", {100.0 * surface['votes_against_share']:.2g} % of the votes against it"
+    return [f"surface  {surface['vertices']:,} vertices, {surface['triangles']:,} triangles, closed{against}"]
 
 
 def _describe_times(seconds: dict[str, float]) -> str:

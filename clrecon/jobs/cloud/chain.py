@@ -18,7 +18,7 @@ __all__ = ["run_steps"]
 def run_steps(
     trail: Trail, settings: CloudSettings, device: Device, resident: DeviceVolume | None, progress: Progress
 ) -> None:
-    """Run the steps that are asked for, from the clusters to the normals.
+    """Run the steps that are asked for, from the clusters to the spacing.
 
     Parameters
     ----------
@@ -36,7 +36,7 @@ def run_steps(
         A step refuses its parameters, leaves nothing, or the device fails.
     """
     shared: dict[str, Any] = {"device": device.current, "memory": settings.memory, "progress": progress}
-    for run in (_cluster, _remove_outliers, _denoise, _find_normals):
+    for run in (_cluster, _remove_sparse, _remove_outliers, _denoise, _find_normals, _thin):
         trail.start()
         run(trail, settings, resident, shared)
 
@@ -49,7 +49,12 @@ def _cluster(trail: Trail, settings: CloudSettings, resident: DeviceVolume | Non
     from clrecon.operators.points.clusters import cluster_points
     from clrecon.points.keep import keep_clusters
 
-    found = cluster_points(trail.cloud, chosen.eps, chosen.min_samples, **_with_volume(resident, shared))
+    eps, volume = chosen.eps, resident
+    if resident is not None and trail.cloud.ijk is None:  # points of a surface: free, but of that scan
+        from clrecon.points.stencil import Lattice
+
+        eps, volume = Lattice.of(resident.volume).default_eps if eps is None else eps, None
+    found = cluster_points(trail.cloud, eps, chosen.min_samples, **_with_volume(volume, shared))
     trail.add("clusters", found)
     trail.start()
     rules = rules_in_lps(settings)
@@ -73,6 +78,17 @@ def rules_in_lps(settings: CloudSettings) -> list[str]:
             rule = f"seed:{-x!r},{-y!r},{z!r}"
         rules.append(rule)
     return rules
+
+
+def _remove_sparse(
+    trail: Trail, settings: CloudSettings, resident: DeviceVolume | None, shared: dict[str, Any]
+) -> None:
+    """Remove what paper B's grid takes for noise."""
+    if "grid" not in settings.denoise:
+        return
+    from clrecon.operators.points.sparse_cells import remove_sparse_cells
+
+    trail.add("sparse cells", remove_sparse_cells(trail.cloud, **shared), takes_noise=True)
 
 
 def _remove_outliers(
@@ -100,3 +116,11 @@ def _find_normals(trail: Trail, settings: CloudSettings, resident: DeviceVolume 
     from clrecon.operators.points.normals import estimate_normals
 
     trail.add("normals", estimate_normals(trail.cloud, **_with_volume(resident, shared)))
+
+
+def _thin(trail: Trail, settings: CloudSettings, resident: DeviceVolume | None, shared: dict[str, Any]) -> None:
+    if settings.spacing is None:
+        return
+    from clrecon.operators.points.thin import thin_points
+
+    trail.add("spacing", thin_points(trail.cloud, settings.spacing, **shared))

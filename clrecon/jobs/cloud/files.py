@@ -20,12 +20,15 @@ class CloudFiles:
         The cloud: ``.ply``, ``.vtp``, ``.npz``, ``.xyz`` or ``.las``.
     removed : path, optional
         The points as they were extracted, each with the number of the reason why it went as its label; 0 is kept.
+    surface : path, optional
+        A closed mesh around the cloud, in a format of meshes.
     report : path, optional
         The report as JSON.
     """
 
     output: str | Path
     removed: str | Path | None = None
+    surface: str | Path | None = None
     report: str | Path | None = None
 
     def check(self) -> list[tuple[str, str | Path]]:
@@ -44,17 +47,21 @@ class CloudFiles:
             A folder is missing or cannot be written, or a target is no regular file.
         """
         from clrecon.exchange.clouds.formats import check_cloud_format
+        from clrecon.exchange.formats import check_format
         from clrecon.system.files import check_writable
 
         named = [
             ("the cloud", self.output),
             ("the cloud of removed points", self.removed),
+            ("the surface", self.surface),
             ("the report", self.report),
         ]
         outputs = [(what, path) for what, path in named if path is not None]
         for path in (self.output, self.removed):
             if path is not None:
                 check_cloud_format(path)
+        if self.surface is not None:
+            check_format(self.surface)
         check_distinct(outputs)
         for _, path in outputs:
             check_writable(path)

@@ -7,6 +7,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from clrecon.errors import UsageError
 from clrecon.jobs.cloud.files import CloudFiles
 from clrecon.jobs.cloud.points import prepare_chain, take_points
 from clrecon.jobs.cloud.report import CloudReport, describe_clouds, describe_file
@@ -24,10 +25,12 @@ from clrecon.system.files import allow_open_files
 from clrecon.system.log import get_logger, log_warnings
 from clrecon.system.progress import Progress, ignore_progress
 from clrecon.system.targets import keep_existing, refuse_existing, resolve_target
+from clrecon.system.wording import name_parameter
 
 if TYPE_CHECKING:
     from clrecon.geometry import Volume
     from clrecon.labels import LabelMap
+    from clrecon.mesh import Mesh
     from clrecon.opencl import Device
     from clrecon.points import PointCloud
     from clrecon.system.files import Staged
@@ -87,8 +90,10 @@ def make_cloud(
     trail = take_points(subject, labels, device, settings, progress)
     watch.lap("steps")
     trail.check(settings.allow_point_loss)
+    surface = _reconstruct(trail, files, settings, device.current, progress)
+    watch.lap("surface")
     with keep_existing(no_clobber):
-        report = _write(subject, trail, files, settings, device.current, watch, progress)
+        report = _write(subject, trail, surface, files, settings, device.current, watch, progress)
     log_warnings(log, report.warnings, subject.report.get("warnings", ()))
     log.info("%d points of %d on %s in %.3f s", report.points, report.points_first, report.device, watch.total())
     return report
@@ -130,9 +135,32 @@ def _read_map(settings: CloudSettings, volume: Volume | None) -> LabelMap | None
     return read_labels(settings.labels, None if settings.label is None else [settings.label], volume=volume)
 
 
+def _reconstruct(
+    trail: Trail, files: CloudFiles, settings: CloudSettings, device: Device, progress: Progress
+) -> Mesh | None:
+    """Make the mesh around the points, if its file is named.
+
+    Raises
+    ------
+    UsageError
+        The points have no normals.
+    """
+    if files.surface is None:
+        return None
+    if trail.cloud.normals is None:
+        raise UsageError(
+            f"a surface needs points with normals out of bone: ask for them ({name_parameter('normals', True)})"
+        )
+    from clrecon.operators.points.reconstruct import reconstruct_surface
+
+    progress("surface", 0, 0)
+    return reconstruct_surface(trail.cloud, device=device, memory=settings.memory, progress=progress)
+
+
 def _write(
     subject: Volume | PointCloud,
     trail: Trail,
+    surface: Mesh | None,
     files: CloudFiles,
     settings: CloudSettings,
     device: Device,
@@ -141,10 +169,11 @@ def _write(
 ) -> CloudReport:
     """Write all files, the report as the last one, and return it."""
     from clrecon.exchange.clouds.formats import describe_cloud_losses, stage_cloud
+    from clrecon.exchange.formats import stage_mesh
 
     space, ids = settings.space, settings.keep_ids
     progress("write", 0, 0)
-    allow_open_files(3)
+    allow_open_files(4)
     written: list[Staged] = []
     entries: list[dict[str, Any]] = []
     with ExitStack() as staged:  # all files are on the disk before the first replaces an older one
@@ -155,10 +184,14 @@ def _write(
                 file = staged.enter_context(stage_cloud(chosen, path, space, keep_ids=ids))
                 written.append(file)
                 entries.append(describe_file(what, path, file.size))
+        if surface is not None and files.surface is not None:
+            mesh_file = staged.enter_context(stage_mesh(surface, files.surface, space, keep_ids=ids))
+            written.append(mesh_file)
+            entries.append(describe_file("surface", files.surface, mesh_file.size))
         losses = describe_cloud_losses(trail.cloud.describe(space), f".{entries[0]['format']}")
         watch.lap("write")
         report = describe_clouds(
-            subject, trail, settings, device, has_removed=files.removed is not None, outputs=entries,
+            subject, trail, settings, device, surface=surface, has_removed=files.removed is not None, outputs=entries,
             warnings=[*trail.warnings, *losses], seconds=_seconds(watch),
         )  # fmt: skip
         if files.report is not None:
@@ -168,7 +201,7 @@ def _write(
 
 
 def _seconds(watch: Laps) -> dict[str, float]:
-    parts = ("device", "read", "mask", "steps", "write")
+    parts = ("device", "read", "mask", "steps", "surface", "write")
     seconds = {part: watch.seconds.get(part, 0.0) for part in parts}
     seconds["other"] = max(0.0, watch.total() - sum(seconds.values()))
     seconds["total"] = watch.total()

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from clrecon.geometry import Volume
+    from clrecon.mesh import Mesh
     from clrecon.opencl import Device
     from clrecon.points import PointCloud
 
@@ -53,6 +54,9 @@ class CloudReport(RunReport):
     gates : list of mapping
     removed_labels : list of mapping or None
         The labels of the file of removed points.
+    surface : mapping or None
+        The mesh around the cloud: ``vertices``, ``triangles``, ``spacing_mm``, ``bridge_mm``, ``votes_against_share``,
+        ``warnings``.
     outputs : list of mapping
         ``what``, ``format`` and ``bytes`` of each file but the report.
     """
@@ -76,6 +80,7 @@ class CloudReport(RunReport):
     steps: list[dict[str, Any]]
     gates: list[dict[str, Any]]
     removed_labels: list[dict[str, Any]] | None
+    surface: Mapping[str, Any] | None
     outputs: list[dict[str, Any]]
     device: str
     driver: str
@@ -99,6 +104,7 @@ def describe_clouds(
     settings: CloudSettings,
     device: Device,
     *,
+    surface: Mesh | None,
     has_removed: bool,
     outputs: list[dict[str, Any]],
     warnings: Sequence[str],
@@ -113,6 +119,7 @@ def describe_clouds(
     trail : Trail
     settings : CloudSettings
     device : Device
+    surface : Mesh, optional
     has_removed : bool
         True: the points that went were written too.
     outputs : list of dict
@@ -152,6 +159,7 @@ def describe_clouds(
         steps=trail.steps,
         gates=[gate.as_dict() for gate in trail.gates],
         removed_labels=name_reasons(trail.reasons) if has_removed else None,
+        surface=None if surface is None else _describe_surface(surface),
         outputs=outputs,
         device=device.label,
         driver=device.driver,
@@ -163,6 +171,12 @@ def describe_clouds(
         seconds=seconds,
         peak_memory_bytes=peak_memory_bytes(),
     )
+
+
+def _describe_surface(mesh: Mesh) -> dict[str, Any]:
+    told = ("spacing_mm", "bridge_mm", "votes_against_share", "warnings")
+    facts = {name: mesh.report.get(name) for name in told}
+    return {"vertices": mesh.vertex_count, "triangles": mesh.triangle_count, **facts}
 
 
 def _bounds(cloud: PointCloud, space: str) -> list[list[float]]:

@@ -16,7 +16,7 @@ __all__ = ["DENOISERS", "KINDS", "STEPS", "CloudSettings", "Clustering", "OF_SCA
 KINDS = ("surface", "shell", "voxels")
 """Kinds of points, see `clrecon.extract_points`."""
 
-DENOISERS = ("bilateral",)
+DENOISERS = ("grid", "bilateral")
 
 
 STEPS = {
@@ -25,9 +25,12 @@ STEPS = {
     "points": "the surface, the shell or the voxels of the HU band or the label",
     "clusters": "density clusters (DBSCAN), each point with the number of its own",
     "keep": "noise and the clusters that the rules do not keep go",
+    "sparse cells": "points alone in a cell of a grid go, and what growth from denser cells does not reach",
     "outliers": "points whose neighbours are far go",
     "bilateral": "points move along their normals to the weighted mean height of their neighbours, edges stay",
     "normals": "unit vectors that point out of bone",
+    "spacing": "one point for each cell of that size stays",
+    "surface": "a closed mesh around the points, in a file of its own",
 }
 """The steps in the order in which they run, whatever the order of the options."""
 
@@ -80,9 +83,11 @@ class CloudSettings(InputSettings):
         Keep rules, see `clrecon.keep_clusters`; they need clusters, which then have the default parameters.
     outliers : float, optional
         Standard deviations of the mean distance to the neighbours beyond which a point goes.
-    denoise : sequence of {"bilateral"}
+    denoise : sequence of {"grid", "bilateral"}
     normals : bool
         Points without normals get them, and points that were moved new ones.
+    spacing : float, optional
+        Mm; one point for each cell of that size stays.
     paper : bool
         The formulas as the papers print them, with what that does.
     allow_point_loss : bool
@@ -109,6 +114,7 @@ class CloudSettings(InputSettings):
     outliers: float | None = None
     denoise: Sequence[str] = ()
     normals: bool = False
+    spacing: float | None = None
     paper: bool = False
     allow_point_loss: bool = False
     space: str = "lps"
@@ -126,6 +132,8 @@ class CloudSettings(InputSettings):
             raise UsageError(f"a way to denoise is named twice: {', '.join(self.denoise)}")
         if self.outliers is not None and not (math.isfinite(self.outliers) and self.outliers > 0.0):
             raise UsageError(f"outliers are told by standard deviations above 0, not {self.outliers:g}")
+        if self.spacing is not None:
+            _check_mm("the spacing of points", self.spacing)
         self._check_hu()
         self._check_labels()
         if self.keep:
@@ -137,6 +145,9 @@ class CloudSettings(InputSettings):
                 "the formulas of the papers are for voxel centres, not for points of a surface: give a band too"
                 f" ({name_parameter('hu')}), or {name_parameter('points', 'voxels')}"
             )
+
+        if self.paper and self.clustering is not None:
+            raise UsageError("as printed all slices fall into one plane, where clusters mean nothing: leave them out")
 
     def _check_hu(self) -> None:
         ends = self.hu if isinstance(self.hu, Sequence) else () if self.hu is None else (self.hu,)
@@ -169,7 +180,15 @@ class CloudSettings(InputSettings):
         """Return the settings for a cube of a few voxels: the same steps, none of them about this scan."""
         hu = (0.0, 3000.0) if self.is_band else 0.0
         rules = [rule for rule in self.keep if not rule.lower().startswith(("min", "seed"))]
-        return replace(self, hu=hu, labels=None, label=None, keep=tuple(rules), device=None)
+        return replace(
+            self,
+            hu=hu,
+            labels=None,
+            label=None,
+            keep=tuple(rules),
+            spacing=None if self.spacing is None else 2.0,
+            device=None,
+        )
 
     @property
     def clustering(self) -> Clustering | None:

@@ -188,7 +188,11 @@ WRONG = (
     (["--cluster", "min=x"], "min is no number: 'x'"),
     (["--cluster", "min=0"], "between 1 and 255"),
     (["--keep", "smallest"], "the rules are largest"),
-    (["--denoise", "median"], "denoised by one of bilateral, not 'median'"),
+    (["--hu", BAND, "--paper", "--cluster"], "where clusters mean nothing"),
+    (["--denoise", "median"], "denoised by one of grid, bilateral, not 'median'"),
+    (["--spacing", "0"], "the spacing of points is a length in mm"),
+    (["--hu", BAND, "--surface", "out.stl"], "ask for them (--normals)"),
+    (["--surface", "out.xyz"], ".stl"),
     (["--outliers", "-1"], "standard deviations above 0"),
     (["--paper"], "not for points of a surface"),
     (["--space", "xyz"], "xyz"),
@@ -284,9 +288,37 @@ def test_points_of_a_surface_keep_the_normals_of_its_field(scan: Path, tmp_path:
     assert np.array_equal(one.normals, two.normals) and moved.normals is None
 
 
+def test_grid_thinning_and_a_surface(
+    device: Any, scan: Path, tmp_path: Path, cloud_command: Any, capsys: pytest.CaptureFixture[str]
+) -> None:
+    mesh_file, told = tmp_path / "out.stl", tmp_path / "r.json"
+    options = ["--surface", str(mesh_file), "--spacing", "1.2", "--denoise", "grid", "--report", str(told)]
+    assert cloud_command(scan, *options, output="out.npz") == 0
+    said = capsys.readouterr().out
+    assert "closed, " in said and "sparse cells: " in said and "spacing: " in said
+    cloud = clrecon.extract_points(clrecon.read_volume(scan), PRESETS[DEFAULT_PRESET].iso_value, device=device)
+    cloud = clrecon.remove_sparse_cells(cloud, device=device).cloud
+    cloud = clrecon.thin_points(cloud, 1.2, device=device).cloud
+    assert np.array_equal(clrecon.read_points(tmp_path / "out.npz").points, cloud.points)
+    mesh = clrecon.reconstruct_surface(cloud, device=device)
+    report = json.loads(told.read_text())
+    assert set(report) == names_in("clrecon cloud INPUT")
+    assert report["surface"]["triangles"] == mesh.triangle_count == (mesh_file.stat().st_size - 84) // 50
+    assert [step["step"] for step in report["steps"]] == ["points", "sparse cells", "spacing"]
+    assert [entry["what"] for entry in report["outputs"]] == ["cloud", "surface"]
+
+
+def test_free_points_are_clustered(scan: Path, tmp_path: Path, cloud_command: Any) -> None:
+    centre = ",".join(str(number) for number in AFFINE[:3] @ (15, 16, 14, 1))
+    assert cloud_command(scan, "--cluster", "eps=1.5,min=5", "--keep", f"seed:{centre}", output="a.ply") == 0
+    ball = clrecon.read_points(tmp_path / "a.ply")
+    assert np.linalg.norm(ball.points - AFFINE[:3] @ (15, 16, 14, 1), axis=1).max() < 9.0
+    assert len(np.unique(ball.labels)) == 1
+
+
 def test_a_cancelled_job_leaves_nothing(device: Any, scan: Path, tmp_path: Path) -> None:
     settings = CloudSettings(hu=(200, 3000), keep=("largest",), device=str(device.index))
-    files = CloudFiles(tmp_path / "a.ply", tmp_path / "b.ply", tmp_path / "r.json")
+    files = CloudFiles(tmp_path / "a.ply", tmp_path / "b.ply", report=tmp_path / "r.json")
     calls: list[tuple[str, int, int]] = []
     make_cloud(scan, files, settings, progress=lambda *call: calls.append(call))
     assert {"device", "write"} <= {stage for stage, _, _ in calls}
