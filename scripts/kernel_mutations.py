@@ -185,7 +185,7 @@ INVERSIONS: dict[str, dict[str, tuple[tuple[str, str], ...]]] = {
     "mark_reached": {"bricks": (("bricks[item] = marked;", "bricks[item] = ~marked;"),)},
     "sort_normals": {"normals": tuple((f"= normal.{c};", f"= -normal.{c};") for c in "xyz")},
     "measure_nodes": {
-        "values": (("vstore8(mean, value, values);", "vstore8(-mean, value, values);"),),
+        "values": (("vstore8(mean, value, values);", "vstore8(1.0f - mean, value, values);"),),
         "near": (("near[byte] = row_bits(is_near)", "near[byte] = ~row_bits(is_near)"),),
         "core": (("core[byte] = row_bits(", "core[byte] = ~row_bits("),),
         "negative": (("(mean <= 0.0f)", "(mean > 0.0f)"),),
@@ -197,7 +197,7 @@ INVERSIONS: dict[str, dict[str, tuple[tuple[str, str], ...]]] = {
     "count_runs": {"counts": (("counts[row] = count;", "counts[row] = ~count;"),)},
     "list_runs": {
         "firsts": (("firsts[begun++] = 32 * word +", "firsts[begun++] = nx - 32 * word -"),),
-        "lasts": (("lasts[ended] = nx - 1;", "lasts[ended] = 1 - nx;"),),
+        "lasts": (("lasts[ended++] = 32 * word +", "lasts[ended++] = nx - 32 * word -"),),
     },
     "count_joins": {"counts": (("counts[row] = join_row(", "counts[row] = ~join_row("),)},
     "list_joins": {"pairs": (("vstore3((uint3)(a, b, b)", "vstore3((uint3)(b, b, b)"),)},
