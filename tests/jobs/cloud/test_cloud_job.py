@@ -312,7 +312,7 @@ def test_free_points_are_clustered(scan: Path, tmp_path: Path, cloud_command: An
     centre = ",".join(str(number) for number in AFFINE[:3] @ (15, 16, 14, 1))
     assert cloud_command(scan, "--cluster", "eps=1.5,min=5", "--keep", f"seed:{centre}", output="a.ply") == 0
     ball = clrecon.read_points(tmp_path / "a.ply")
-    assert np.linalg.norm(ball.points - AFFINE[:3] @ (15, 16, 14, 1), axis=1).max() < 9.0
+    assert np.linalg.norm(ball.points - AFFINE[:3] @ (15, 16, 14, 1), axis=1).max() < 10.0
     assert len(np.unique(ball.labels)) == 1
 
 
