@@ -114,7 +114,7 @@ def first_of(devices: list[Any]) -> list[Any]:
     return devices if is_set("CLRECON_TEST_EVERY_DEVICE") else devices[:1]
 
 
-def is_for_every_device(node: pytest.Item | pytest.FunctionDefinition) -> bool:
+def is_for_every_device(node: Any) -> bool:
     """True for tests of what a driver makes of kernels; what a simulator watches is as small."""
     return any(node.get_closest_marker(name) for name in ("every_device", "oclgrind"))
 

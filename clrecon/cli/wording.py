@@ -11,13 +11,18 @@ __all__ = ["speaker_of"]
 _DESTINATIONS = {
     "color_by": "color",
     "direction": "light",
+    "eps": "clusters",
     "grow_mm": "grow",
     "half_way": "hu",
     "iso_value": "hu",
+    "min_samples": "clusters",
     "only": "label",
     "picture": "output",
 }
 """Options of parameters by another name; used if the command has no option of the parameter's own name."""
+
+_PARTS = {"eps": "eps=", "min_samples": "min="}
+"""Parameters that are a part of an option's value."""
 
 
 def speaker_of(parser: argparse.ArgumentParser) -> Speaker:
@@ -28,6 +33,9 @@ def speaker_of(parser: argparse.ArgumentParser) -> Speaker:
         option = options.get(parameter) or options.get(_DESTINATIONS.get(parameter, ""))
         if option is None:
             return in_python(parameter, value)
+        part = _PARTS.get(parameter, "")
+        if part:
+            return f"{option} {part}{'MM' if value is None and parameter == 'eps' else 'N' if value is None else value}"
         if value is None or value is True or (parameter == "closed" and value is False):
             return option
         words = str(value).strip("()").replace(", ", ",")

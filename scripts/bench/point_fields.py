@@ -34,6 +34,7 @@ def measure_fields(job: Job) -> dict[str, Any]:
 
     mesh = extract_isosurface(job.input.volume(), job.hu, device=job.device)
     points, normals = mesh.vertices, mesh.normals
+    assert normals is not None
     vtkSMPTools.Initialize(job.peer_threads)
     low, high = points.min(axis=0).astype(float), points.max(axis=0).astype(float)
 

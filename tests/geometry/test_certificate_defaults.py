@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import MISSING, fields
+from typing import Any
 
 import pytest
 
@@ -33,7 +34,7 @@ def test_entries_of_other_files_stand_where_they_always_have(kind, moved):
 
 
 def test_files_get_no_hash_of_an_identifier():
-    report = {"series": {"number": 3, "uid_hash": "a"}, "frame_of_reference_hash": "b", "slices": 5}
+    report: dict[str, Any] = {"series": {"number": 3, "uid_hash": "a"}, "frame_of_reference_hash": "b", "slices": 5}
     found = without_ids(report)
     assert found == {"series": {"number": 3, "uid_hash": None}, "frame_of_reference_hash": None, "slices": 5}
     assert report["frame_of_reference_hash"] == "b" and report["series"]["uid_hash"] == "a"

@@ -75,6 +75,12 @@ def test_the_same_parameter_has_another_option_in_another_command() -> None:
     assert speaker_of(parser_of("mesh"))("iso_value", 300) == "--hu 300"
 
 
+def test_a_parameter_may_be_a_part_of_an_option() -> None:
+    speak = speaker_of(parser_of("cloud"))
+    assert [speak("eps", 0.5), speak("min_samples", 4)] == ["--cluster eps=0.5", "--cluster min=4"]
+    assert [speak("eps", None), speak("min_samples", None)] == ["--cluster eps=MM", "--cluster min=N"]
+
+
 def test_words_of_python_come_back_after_an_error() -> None:
     with pytest.raises(ValueError, match="in a block"), spoken_by(lambda parameter, value: "another"):
         raise ValueError("in a block")

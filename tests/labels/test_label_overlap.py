@@ -36,8 +36,8 @@ def test_the_pair_with_most_voxels_is_told_and_the_others_are_counted():
     with pytest.raises(RefusedInputError, match="overlap: 1 a and 2 b share 1 voxels, and 2 more pairs; choose"):
         one.finish(np.eye(4))
     two = painter({1: "a", 2: "b", 3: "c"})
-    for number, voxels in ((1, (0, 1, 2)), (2, (1,)), (3, (0, 2))):
-        two.paint(0, number, mask(*voxels))
+    for number, painted in ((1, (0, 1, 2)), (2, (1,)), (3, (0, 2))):
+        two.paint(0, number, mask(*painted))
     with pytest.raises(RefusedInputError, match="overlap: 1 a and 3 c share 2 voxels, and 1 more pairs; choose"):
         two.finish(np.eye(4))
 

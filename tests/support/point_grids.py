@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from clrecon.opencl import download
 
 
-def fetch_grid(grid) -> dict[str, np.ndarray]:
+def fetch_grid(grid: Any) -> dict[str, np.ndarray]:
     """All arrays of a `PointGrid`, by the names of the twin; `points` has shape (n, 3), in the sorted order."""
 
-    def fetch(buffer, n: int, dtype: type) -> np.ndarray:
+    def fetch(buffer: Any, n: int, dtype: type) -> np.ndarray:
         return download(grid.device, np.empty(n, dtype), buffer)
 
     nx, ny, nz = grid.shape

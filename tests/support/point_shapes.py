@@ -78,7 +78,7 @@ def cube(size: float = 30.0, seed: int = 3) -> Shape:
     normals = np.zeros((n, 3))
     normals[rows, face // 2] = sign
 
-    def distance(p):
+    def distance(p: np.ndarray) -> np.ndarray:
         beyond = np.abs(p) - half
         return np.linalg.norm(np.maximum(beyond, 0.0), axis=1) + np.minimum(beyond.max(axis=1), 0.0)
 

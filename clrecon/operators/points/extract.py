@@ -74,13 +74,8 @@ def extract_points(
     paper : bool
         True: voxels are placed with the position of the first image in all slices, as eq. 1 of Karakullukcu and others
         prints it.  All slices then fall into one plane; the report gives the error.
-    device : Device, str or int, optional
-        See `clrecon.device`; None is the best of the machine.
-    memory : int, optional
-        Bytes that may be taken on the device; None is all that it has.  With less a volume is processed slab by slab,
-        and the points are the same bit for bit.
-    progress : callable, optional
-        As in `extract_isosurface`.
+    device, memory, progress
+        As in `extract_isosurface`.  With less memory a volume is processed slab by slab, with the same points.
 
     Returns
     -------

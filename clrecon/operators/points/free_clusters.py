@@ -40,8 +40,8 @@ EPS_TOLERANCE = 1e-6
 LEAST_EPS_MM = 1e-9
 """Smallest eps: squares of smaller ones leave the range of float32."""
 
-DOUBTFUL = 1e-6
-"""Part of the limit's square within which sums of two floats decide, see cl/points/pair_distance.h."""
+UNSURE_SHARE = 1e-6
+"""Part of the limit's square within which kernels decide in sums of two floats; both ends are given to them."""
 
 CELL_SLACK = 1e-3
 """Part by which cells are smaller than they could be, besides the rounding of the grid."""
@@ -422,6 +422,6 @@ def _bounds(limit: float) -> tuple[float, float, float, float]:
     """Return the float4 of cl/points/pair_distance.h for the largest distance of neighbours in mm."""
     square = limit * limit
     high = np.float32(square)
-    near = np.nextafter(np.float32(square * (1.0 - DOUBTFUL)), np.float32(0.0))
-    far = np.nextafter(np.float32(square * (1.0 + DOUBTFUL)), np.float32(np.inf))
+    near = np.nextafter(np.float32(square * (1.0 - UNSURE_SHARE)), np.float32(0.0))
+    far = np.nextafter(np.float32(square * (1.0 + UNSURE_SHARE)), np.float32(np.inf))
     return float(near), float(far), float(high), float(np.float32(square - float(high)))

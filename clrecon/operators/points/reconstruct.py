@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -96,13 +97,8 @@ def reconstruct_surface(
         B, mm, at least h; None is 2 h.
     widenings : int
         0 to 3: how often `bridge` may be widened.
-    device : Device, str or int, optional
-        See `clrecon.device`; None is the best of the machine.
-    memory : int, optional
-        Bytes that may be taken on the device; None is all that it has.  Where the nodes do not fit, they are worked on
-        in slabs; the mesh is the same bit for bit.
-    progress : callable, optional
-        Called as ``progress("field", steps done, steps)``.
+    device, memory, progress
+        As in `extract_isosurface`.  Nodes that do not fit are worked on in slabs, with the same mesh bit for bit.
 
     Returns
     -------
@@ -114,14 +110,11 @@ def reconstruct_surface(
     Raises
     ------
     UsageError
-        The cloud has fewer than four points or no normals, a normal is 0, a length is not as above, or there would be
-        more than 2^31 nodes.
+        Fewer than four points, no normals, one that is 0, a length that is not as above, or more than 2^31 nodes.
     RefusedInputError
         Inside and outside are joined, or the normals point inward.
-    NoSurfaceError
-        The cloud encloses nothing at this spacing.
-    DeviceError
-        No device, no room on it, or the device fails.
+    NoSurfaceError, DeviceError
+        The cloud encloses nothing at this spacing; no device, no room on it, or it fails.
 
     References
     ----------
@@ -130,19 +123,8 @@ def reconstruct_surface(
     """
     check_memory(memory)
     normals = _check_cloud(cloud)
-    if isinstance(widenings, bool) or not isinstance(widenings, int) or not 0 <= widenings <= MOST_WIDENINGS:
-        raise UsageError(f"widenings are a whole number from 0 to {MOST_WIDENINGS}, not {widenings!r}")
-    lengths = {"spacing": spacing, "reach": reach, "smoothing": smoothing, "bridge": bridge}
-    for name, length in lengths.items():
-        if length is not None and not (np.isfinite(length) and length > 0.0):
-            raise UsageError(f"{name} is a positive number of mm, not {length!r}")
-
-    own = mean_spacing(cloud.points) if spacing is None else float(spacing)
-    if own == 0.0:
-        raise UsageError(
-            "the points coincide, so that their spacing is not known: name it in mm"
-            f" ({name_parameter('spacing', 1)}), or thin the cloud"
-        )
+    _check_numbers(widenings, {"spacing": spacing, "reach": reach, "smoothing": smoothing, "bridge": bridge})
+    own = _own_spacing(cloud) if spacing is None else float(spacing)
     settings = _choose_lengths(own, noisy, reach, smoothing, bridge)
 
     def work(current: Device, told: list[str]) -> Mesh:
@@ -153,6 +135,24 @@ def reconstruct_surface(
         return mesh
 
     return work_on(take_device(device), work)
+
+
+def _check_numbers(widenings: object, lengths: Mapping[str, float | None]) -> None:
+    if isinstance(widenings, bool) or not isinstance(widenings, int) or not 0 <= widenings <= MOST_WIDENINGS:
+        raise UsageError(f"widenings are a whole number from 0 to {MOST_WIDENINGS}, not {widenings!r}")
+    for name, length in lengths.items():
+        if length is not None and not (np.isfinite(length) and length > 0.0):
+            raise UsageError(f"{name} is a positive number of mm, not {length!r}")
+
+
+def _own_spacing(cloud: PointCloud) -> float:
+    own = mean_spacing(cloud.points)
+    if own == 0.0:
+        raise UsageError(
+            "the points coincide, so that their spacing is not known: name it in mm"
+            f" ({name_parameter('spacing', 1)}), or thin the cloud"
+        )
+    return own
 
 
 def _check_cloud(cloud: PointCloud) -> NDArray[np.float32]:
@@ -278,7 +278,7 @@ class _Reconstruction:
             f"inside and outside of the cloud are joined: {signs.share_against:.0%} of {signs.votes:,} votes are"
             f" against the winner, possible are {LEAK_SHARE:.0%} (bridge {b:.4g} mm, spacing {h:.4g} mm, tries"
             f" {tries}): the cloud has holes wider than twice the bridge, ends open, or its normals do not agree;"
-            f" take a larger {name_parameter('spacing')} or {name_parameter('bridge')}, or close it first"
+            f" take a larger {name_parameter('spacing')} or a wider bridge, or close it first"
         )
 
     def _describe(self, field: NodeField, signs: Signs, tries: int) -> dict[str, Any]:

@@ -69,7 +69,7 @@ def choose_edge(cloud: PointCloud, *, device: Device | str | int | None = None, 
     if edge == 0.0:
         raise UsageError(
             f"most of the {len(cloud):,} points are {found.distances.shape[1]} at one place, so that no edge of cells"
-            f" can be chosen: give {name_parameter('edge')} in mm"
+            f" can be chosen: thin the cloud first, or give an edge in mm"
         )
     return edge
 
@@ -246,7 +246,7 @@ def _check(cloud: PointCloud, edge: float | None, fewest: int, threshold: int) -
         if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 1:
             raise UsageError(f"{name_parameter(name, value)}: a whole number of points from 1 on is needed")
     if edge is not None and not (isinstance(edge, (int, float, np.number)) and math.isfinite(edge) and edge > 0.0):
-        raise UsageError(f"{name_parameter('edge', edge)}: a positive length in mm is needed")
+        raise UsageError(f"an edge of {edge!r}: a positive length in mm is needed")
 
 
 def _finish(cloud: PointCloud, grown: _Grown, facts: dict[str, Any], keep_largest: bool, told: list[str]) -> PointStep:
@@ -256,7 +256,7 @@ def _finish(cloud: PointCloud, grown: _Grown, facts: dict[str, Any], keep_larges
         raise UsageError(
             f"all {len(cloud):,} points would go: {grown.facts['sparse_cells']:,} of {grown.facts['cells']:,} cells of"
             f" {facts['edge_mm']:.4g} mm have fewer than {facts['fewest']} points, and no other has"
-            f" {facts['threshold']}.  Take a larger {name_parameter('edge')}, or none for the default"
+            f" {facts['threshold']}.  Take larger cells, or none for the default"
         )
     warnings = list(told)
     smaller = int((removed == 3).sum())

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from point_fields import cube_cloud, fetch_mask, fetch_masks, sphere_cloud, twin_field
+from cloud_shapes import cube_cloud, fetch_mask, fetch_masks, sphere_cloud, twin_field
 from tolerances import TWIN_FIELD_MM
 
 from clrecon.errors import DeviceMemoryError, UsageError

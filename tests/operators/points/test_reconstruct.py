@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from point_fields import cube_cloud, cube_distances, sphere_cloud
+from cloud_shapes import cube_cloud, cube_distances, sphere_cloud
 from tolerances import FAR_FIELD_MM, MEAN_SPACING
 
 from clrecon import PointCloud, Volume, extract_isosurface, reconstruct_surface
