@@ -12,7 +12,7 @@ from clrecon.cli.console import Console, printable
 from clrecon.cli.masking import add_masking
 from clrecon.cli.mesh import describe_volume
 from clrecon.cli.reading import add_reading
-from clrecon.jobs.cloud.settings import DENOISERS, KINDS, STEPS, CloudSettings
+from clrecon.jobs.cloud.settings import DENOISERS, GHOSTS, KINDS, STEPS, CloudSettings
 from clrecon.jobs.shared.clouds import CLOUD_INPUTS
 
 __all__ = ["add_arguments", "describe_cloud_job", "run"]
@@ -120,6 +120,14 @@ def _add_points(parser: argparse.ArgumentParser) -> None:
 
 def _add_steps(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group("steps")
+    group.add_argument(
+        "--ghost-slices",
+        type=str.lower,
+        default=GHOSTS[0],
+        metavar="|".join(GHOSTS),
+        help="slices inside the stack that are unlike both neighbours, as screen captures and localizers are: drop"
+        f" takes their points away, keep warns of them (default: {GHOSTS[0]})",
+    )
     group.add_argument(
         "--cluster",
         dest="clusters",

@@ -37,7 +37,7 @@ def measure_cloud_chain(job: Job) -> dict[str, Any]:
             "--hu",
             f"{BAND[0]:g},{BAND[1]:g}",
         ]
-        own += ["--cluster", f"eps={EPS_MM},min={FEWEST}", "-q", "--report", str(report)]
+        own += ["--ghost-slices", "drop", "--cluster", f"eps={EPS_MM},min={FEWEST}", "-q", "--report", str(report)]
         own += ["--device", str(job.device.index)]
         parts: list[dict[str, float]] = []
 
@@ -48,7 +48,7 @@ def measure_cloud_chain(job: Job) -> dict[str, Any]:
 
         for clusterer in CLUSTERERS:
             peer = [sys.executable, str(HERE / "peers" / "cloud_chain.py"), str(folder), str(other)]
-            peer += [*map(str, (*BAND, EPS_MM, FEWEST)), clusterer]
+            peer += [*map(str, (*BAND, EPS_MM, FEWEST)), clusterer, "drop"]
             printed: list[str] = []
 
             def run_peer(command: list[str] = peer, printed: list[str] = printed) -> float:

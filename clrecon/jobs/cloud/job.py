@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 from clrecon.errors import UsageError
 from clrecon.jobs.cloud.files import CloudFiles
-from clrecon.jobs.cloud.points import prepare_chain, take_points
+from clrecon.jobs.cloud.ghosts import find_ghosts
+from clrecon.jobs.cloud.points import iso_value_of, prepare_chain, take_points
 from clrecon.jobs.cloud.report import CloudReport, describe_clouds, describe_file
 from clrecon.jobs.cloud.settings import OF_SCANS, CloudSettings
 from clrecon.jobs.cloud.trail import Trail
@@ -33,6 +34,7 @@ if TYPE_CHECKING:
     from clrecon.mesh import Mesh
     from clrecon.opencl import Device
     from clrecon.points import PointCloud
+    from clrecon.points.ghost_slices import GhostSlices
     from clrecon.system.files import Staged
 
 __all__ = ["make_cloud"]
@@ -87,7 +89,11 @@ def make_cloud(
         refuse_scan_settings(settings, OF_SCANS)
 
     subject, labels, device = _open(source, is_cloud, settings, progress, watch)
-    trail = take_points(subject, labels, device, settings, progress)
+    ghosts = None
+    if not is_cloud and settings.masks:
+        subject, ghosts = _mask(subject, device, settings, progress)  # type: ignore[arg-type]
+        watch.lap("mask")
+    trail = take_points(subject, labels, device, settings, progress, ghosts)
     watch.lap("steps")
     trail.check(settings.allow_point_loss)
     surface = _reconstruct(trail, files, settings, device.current, progress)
@@ -121,10 +127,19 @@ def _open(
         watch.lap("read")
         device = opening.wait()
         watch.lap("device")
-    if not is_cloud:
-        subject = mask_volume(subject, settings, progress)  # type: ignore[arg-type]
-        watch.lap("mask")
     return subject, labels, device
+
+
+def _mask(volume: Volume, device: Device, settings: CloudSettings, progress: Progress) -> tuple[Volume, GhostSlices]:
+    """Turn what the settings name into air; ghost slices are found before, and do not tie the body to its table."""
+    from clrecon.operators.resident.device_volume import DeviceVolume
+    from clrecon.points.ghost_slices import fill_ghost_slices
+
+    with DeviceVolume(volume, device=device.current, memory=settings.memory) as resident:
+        ghosts = find_ghosts(resident, iso_value_of(settings), settings, progress)
+    if settings.ghost_slices == "drop":
+        volume = fill_ghost_slices(volume, ghosts)
+    return mask_volume(volume, settings, progress), ghosts
 
 
 def _read_map(settings: CloudSettings, volume: Volume | None) -> LabelMap | None:

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 from clrecon.errors import ClreconError, DeviceError
 from clrecon.jobs.cloud.chain import run_steps
+from clrecon.jobs.cloud.ghosts import drop_ghosts, find_ghosts, warn_of_ghosts
 from clrecon.jobs.cloud.settings import CloudSettings
 from clrecon.jobs.cloud.trail import Trail
 from clrecon.jobs.mesh.presets import DEFAULT_PRESET, find_preset
@@ -17,12 +18,18 @@ if TYPE_CHECKING:
     from clrecon.opencl import Device
     from clrecon.operators.resident.device_volume import DeviceVolume
     from clrecon.points import PointCloud
+    from clrecon.points.ghost_slices import GhostSlices
 
-__all__ = ["prepare_chain", "take_points"]
+__all__ = ["iso_value_of", "prepare_chain", "take_points"]
 
 
 def take_points(
-    subject: Volume | PointCloud, labels: LabelMap | None, device: Device, settings: CloudSettings, progress: Progress
+    subject: Volume | PointCloud,
+    labels: LabelMap | None,
+    device: Device,
+    settings: CloudSettings,
+    progress: Progress,
+    ghosts: GhostSlices | None = None,
 ) -> Trail:
     """Make the cloud of a volume, or take one that was read, and run the steps on it.
 
@@ -33,6 +40,8 @@ def take_points(
     device : Device
     settings : CloudSettings
     progress : callable
+    ghosts : GhostSlices, optional
+        Of the scan before it was masked; None: they are looked for in the volume.
 
     Raises
     ------
@@ -49,7 +58,13 @@ def take_points(
         run_steps(trail, settings, device, None, progress)
         return trail
     with DeviceVolume(subject, device=device, memory=settings.memory) as resident:
+        if ghosts is None:
+            ghosts = find_ghosts(resident, iso_value_of(settings), settings, progress)
         trail = _extract(resident, labels, settings, progress)
+        if settings.ghost_slices == "drop":
+            drop_ghosts(trail, ghosts, subject)
+        else:
+            warn_of_ghosts(trail, ghosts)
         run_steps(trail, settings, device, resident, progress)
     return trail
 
@@ -68,7 +83,7 @@ def _extract(resident: DeviceVolume, labels: LabelMap | None, settings: CloudSet
 
 def iso_value_of(settings: CloudSettings) -> float:
     """Return the iso value that was given, or that of the default preset of meshes."""
-    if settings.hu is None:
+    if settings.hu is None or settings.is_band:
         return find_preset(DEFAULT_PRESET).iso_value
     assert not isinstance(settings.hu, (tuple, list))
     return float(settings.hu)  # type: ignore[arg-type]

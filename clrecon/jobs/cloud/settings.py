@@ -11,16 +11,20 @@ from clrecon.errors import UsageError
 from clrecon.jobs.shared.settings import InputSettings
 from clrecon.system.wording import name_parameter
 
-__all__ = ["DENOISERS", "KINDS", "STEPS", "CloudSettings", "Clustering", "OF_SCANS"]
+__all__ = ["DENOISERS", "GHOSTS", "KINDS", "STEPS", "CloudSettings", "Clustering", "OF_SCANS"]
 
 KINDS = ("surface", "shell", "voxels")
 """Kinds of points, see `clrecon.extract_points`."""
 
 DENOISERS = ("grid", "bilateral")
 
+GHOSTS = ("keep", "drop")
+"""What becomes of the points of ghost slices."""
+
 
 STEPS = {
     "read": "the scan, or a cloud from a file",
+    "ghost slices": "foreign slices inside the stack are told by their neighbours; with drop the points in them go",
     "masks": "the field of view and the body: what is outside becomes air",
     "points": "the surface, the shell or the voxels of the HU band or the label",
     "clusters": "density clusters (DBSCAN), each point with the number of its own",
@@ -34,7 +38,7 @@ STEPS = {
 }
 """The steps in the order in which they run, whatever the order of the options."""
 
-OF_SCANS = ("points", "hu", "labels")
+OF_SCANS = ("points", "hu", "labels", "ghost_slices")
 """Settings beside those of the input that have no meaning where the input is a cloud."""
 
 LARGEST_MM = 1e4
@@ -78,6 +82,9 @@ class CloudSettings(InputSettings):
         Label map; only points of one label are taken.
     label : str, optional
         Number or name of that label.
+    ghost_slices : {"keep", "drop"}
+        What becomes of the points of slices that are unlike both neighbours, see `clrecon.find_ghost_slices`.  With
+        "keep" there is a warning that names them.
     clusters : Clustering, optional
     keep : sequence of str
         Keep rules, see `clrecon.keep_clusters`; they need clusters, which then have the default parameters.
@@ -109,6 +116,7 @@ class CloudSettings(InputSettings):
     hu: float | Sequence[float] | None = None
     labels: str | Path | None = None
     label: str | None = None
+    ghost_slices: str = "keep"
     clusters: Clustering | None = None
     keep: Sequence[str] = ()
     outliers: float | None = None
@@ -126,6 +134,7 @@ class CloudSettings(InputSettings):
 
         frame_from_lps(self.space)
         _check_choice("points are", self.points, KINDS)
+        _check_choice("points of ghost slices are kept or dropped:", self.ghost_slices, GHOSTS)
         for name in self.denoise:
             _check_choice("clouds are denoised by", name, DENOISERS)
         if len(set(self.denoise)) < len(self.denoise):
@@ -170,6 +179,11 @@ class CloudSettings(InputSettings):
     def kind(self) -> str:
         """The kind of points that is taken from a scan."""
         return self.points or ("voxels" if self.is_band else "surface")
+
+    @property
+    def masks(self) -> bool:
+        """True where something of the scan is turned into air."""
+        return self.remove_table or self.field_of_view is not None
 
     @property
     def is_band(self) -> bool:

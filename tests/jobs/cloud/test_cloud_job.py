@@ -99,6 +99,39 @@ def test_clusters_rules_and_what_went(
     assert [entry["what"] for entry in report["outputs"]] == ["cloud", "removed"]
 
 
+@pytest.mark.parametrize("options", [["--hu", BAND], ["--fov", "20"], ["--hu", BAND, "--points", "shell"]])
+def test_points_of_foreign_slices_are_warned_of_and_dropped(
+    options: list[str], tmp_path: Path, cloud_command: Any, capsys: pytest.CaptureFixture[str]
+) -> None:
+    voxels = make_voxels()
+    voxels[14, 4:40, :40] = np.where(np.indices((36, 40)).sum(axis=0) % 7 < 2, 900, -1000)
+    source = tmp_path / "foreign" / "scan.nrrd"
+    source.parent.mkdir()
+    write_nrrd(source, voxels, AFFINE)
+    assert cloud_command(source, *options, output="kept.npz") == 0
+    captured = capsys.readouterr()
+    assert "slice 14 of 40, counted from 0, is unlike both neighbours" in captured.err
+    assert "(--ghost-slices drop)" in captured.err
+    kept = clrecon.read_points(tmp_path / "kept.npz")
+    there = kept.points[:, 2] - 100.0
+    assert (np.abs(there - 14.0) < 0.5).sum() > 300
+    told = tmp_path / "r.json"
+    assert cloud_command(source, *options, "--ghost-slices", "drop", "--report", str(told), output="out.npz") == 0
+    left = clrecon.read_points(tmp_path / "out.npz")
+    assert not (np.abs(left.points[:, 2] - 114.0) < 0.5).any() and len(left) > 1000
+    report = json.loads(told.read_text())
+    assert report["removed"] == {"ghost slice": len(kept) - len(left)} or "--fov" in options
+    step = next(step for step in report["steps"] if step["step"] == "ghost slices")
+    assert [entry["slice"] for entry in step["ghost_slices"]] == [14] and step["slices"] == 40
+    assert capsys.readouterr().err.count("unlike both") == 0
+
+
+def test_a_scan_without_foreign_slices_loses_nothing(scan: Path, tmp_path: Path, cloud_command: Any) -> None:
+    assert cloud_command(scan, "--hu", BAND, output="a.npz") == 0
+    assert cloud_command(scan, "--hu", BAND, "--ghost-slices", "drop", output="b.npz") == 0
+    assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
+
+
 def test_seeds_and_files_in_the_frame_of_the_output(scan: Path, tmp_path: Path, cloud_command: Any) -> None:
     centre = AFFINE[:3] @ (34, 16, 26, 1)
     for space, sign in (("lps", 1.0), ("ras", -1.0)):
@@ -187,6 +220,7 @@ WRONG = (
     (["--cluster", "eps"], "is not eps=MM,min=N"),
     (["--cluster", "min=x"], "min is no number: 'x'"),
     (["--cluster", "min=0"], "between 1 and 255"),
+    (["--ghost-slices", "hide"], "ghost slices are kept or dropped: one of keep, drop, not 'hide'"),
     (["--keep", "smallest"], "the rules are largest"),
     (["--hu", BAND, "--paper", "--cluster"], "where clusters mean nothing"),
     (["--denoise", "median"], "denoised by one of grid, bilateral, not 'median'"),
