@@ -11,6 +11,7 @@ from clrecon.cli.common import add_device, add_keep_ids, add_memory, add_no_clob
 from clrecon.cli.console import Console, printable
 from clrecon.cli.masking import add_masking
 from clrecon.cli.mesh import describe_volume
+from clrecon.cli.points import parse_point
 from clrecon.cli.reading import add_reading
 from clrecon.jobs.cloud.settings import DENOISERS, GHOSTS, KINDS, STEPS, CloudSettings
 from clrecon.jobs.shared.clouds import CLOUD_INPUTS
@@ -167,6 +168,13 @@ def _add_steps(parser: argparse.ArgumentParser) -> None:
         "--normals",
         action="store_true",
         help="unit normals that point out of bone; points of a surface have those of the scan until they are moved",
+    )
+    group.add_argument(
+        "--viewpoint",
+        type=parse_point,
+        metavar="X,Y,Z",
+        help="a point inside of the object, mm in the frame of --space: normals of a cloud that was read point away"
+        " from it (a scan turns its own by HU)",
     )
     group.add_argument("--spacing", type=float, metavar="MM", help="keep one point for each cell of that size")
     group.add_argument(

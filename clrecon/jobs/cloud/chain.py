@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from clrecon.jobs.cloud.settings import CloudSettings
@@ -66,6 +67,12 @@ def _with_volume(resident: DeviceVolume | None, shared: dict[str, Any]) -> dict[
     return shared if resident is None else {"volume": resident, "progress": shared["progress"]}
 
 
+def in_lps(point: Sequence[float], space: str) -> tuple[float, ...]:
+    """Return a point of the frame of the output, mm, in LPS."""
+    x, y, z = point
+    return (x, y, z) if space == "lps" else (-x, -y, z)
+
+
 def rules_in_lps(settings: CloudSettings) -> list[str]:
     """Return the keep rules with seeds in LPS; they are given in the frame of the output."""
     if settings.space == "lps":
@@ -74,8 +81,8 @@ def rules_in_lps(settings: CloudSettings) -> list[str]:
     for rule in settings.keep:
         kind, _, rest = rule.partition(":")
         if kind.strip().lower() == "seed":
-            x, y, z = (float(word) for word in rest.split(","))
-            rule = f"seed:{-x!r},{-y!r},{z!r}"
+            point = in_lps([float(word) for word in rest.split(",")], settings.space)
+            rule = f"seed:{','.join(map(repr, point))}"
         rules.append(rule)
     return rules
 
@@ -115,7 +122,8 @@ def _find_normals(trail: Trail, settings: CloudSettings, resident: DeviceVolume 
         return
     from clrecon.operators.points.normals import estimate_normals
 
-    trail.add("normals", estimate_normals(trail.cloud, **_with_volume(resident, shared)))
+    inside = None if settings.viewpoint is None else in_lps(settings.viewpoint, settings.space)
+    trail.add("normals", estimate_normals(trail.cloud, viewpoint=inside, **_with_volume(resident, shared)))
 
 
 def _thin(trail: Trail, settings: CloudSettings, resident: DeviceVolume | None, shared: dict[str, Any]) -> None:

@@ -87,6 +87,11 @@ def make_cloud(
     is_cloud = is_cloud_file(source)
     if is_cloud:
         refuse_scan_settings(settings, OF_SCANS)
+    elif settings.viewpoint is not None:
+        raise UsageError(
+            f"the HU of a scan turn its normals out of bone: leave out {name_parameter('viewpoint')}, which is for"
+            " clouds of points"
+        )
 
     subject, labels, device = _open(source, is_cloud, settings, progress, watch)
     ghosts = None

@@ -91,6 +91,8 @@ class CloudSettings(InputSettings):
     outliers : float, optional
         Standard deviations of the mean distance to the neighbours beyond which a point goes.
     denoise : sequence of {"grid", "bilateral"}
+    viewpoint : (x, y, z), optional
+        A point inside of the object, mm in the frame of the output: normals of a cloud from a file point away from it.
     normals : bool
         Points without normals get them, and points that were moved new ones.
     spacing : float, optional
@@ -122,6 +124,7 @@ class CloudSettings(InputSettings):
     outliers: float | None = None
     denoise: Sequence[str] = ()
     normals: bool = False
+    viewpoint: Sequence[float] | None = None
     spacing: float | None = None
     paper: bool = False
     allow_point_loss: bool = False
@@ -145,6 +148,7 @@ class CloudSettings(InputSettings):
             _check_mm("the spacing of points", self.spacing)
         self._check_hu()
         self._check_labels()
+        self._check_viewpoint()
         if self.keep:
             from clrecon.points.keep import parse_keep_rules
 
@@ -174,6 +178,14 @@ class CloudSettings(InputSettings):
     def _check_labels(self) -> None:
         if self.label is not None and self.labels is None:
             raise UsageError("a label is one of a label map: give its file too")
+
+    def _check_viewpoint(self) -> None:
+        if self.viewpoint is None:
+            return
+        if len(self.viewpoint) != 3 or not all(map(math.isfinite, self.viewpoint)):
+            raise UsageError(f"a viewpoint is a point of three numbers in mm, not {tuple(self.viewpoint)}")
+        if not self.normals:
+            raise UsageError(f"a viewpoint turns normals: ask for them too ({name_parameter('normals', True)})")
 
     @property
     def kind(self) -> str:

@@ -221,6 +221,9 @@ WRONG = (
     (["--cluster", "min=x"], "min is no number: 'x'"),
     (["--cluster", "min=0"], "between 1 and 255"),
     (["--ghost-slices", "hide"], "ghost slices are kept or dropped: one of keep, drop, not 'hide'"),
+    (["--viewpoint", "1,2,3"], "a viewpoint turns normals: ask for them too (--normals)"),
+    (["--viewpoint", "1,2,3", "--normals"], "leave out --viewpoint, which is for clouds of points"),
+    (["--viewpoint", "1,2", "--normals"], "no point: three numbers in mm"),
     (["--keep", "smallest"], "the rules are largest"),
     (["--hu", BAND, "--paper", "--cluster"], "where clusters mean nothing"),
     (["--denoise", "median"], "denoised by one of grid, bilateral, not 'median'"),
@@ -340,6 +343,21 @@ def test_grid_thinning_and_a_surface(
     assert report["surface"]["triangles"] == mesh.triangle_count == (mesh_file.stat().st_size - 84) // 50
     assert [step["step"] for step in report["steps"]] == ["points", "sparse cells", "spacing"]
     assert [entry["what"] for entry in report["outputs"]] == ["cloud", "surface"]
+
+
+def test_a_free_cloud_gets_its_surface_from_a_viewpoint(tmp_path: Path, cloud_command: Any) -> None:
+    rng = np.random.default_rng(4)
+    directions = rng.normal(size=(6000, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    centre, source = np.array([30.0, -20.0, 5.0]), tmp_path / "free.xyz"
+    np.savetxt(source, 10.0 * directions + centre, "%.6f")
+    given = ["--normals", "--viewpoint=-30,20,5", "--space", "ras", "--surface", str(tmp_path / "out.stl")]
+    assert cloud_command(source, *given, "--report", str(tmp_path / "r.json")) == 0
+    cloud, report = clrecon.read_points(tmp_path / "out.ply"), json.loads((tmp_path / "r.json").read_text())
+    outward = (cloud.points - centre) / 10.0
+    assert np.einsum("ij,ij->i", cloud.normals, outward).min() > 0.9
+    assert report["steps"][0]["oriented_by"] == "viewpoint" and report["surface"]["triangles"] > 1000
+    assert (tmp_path / "out.stl").stat().st_size == 84 + 50 * report["surface"]["triangles"]
 
 
 def test_free_points_are_clustered(scan: Path, tmp_path: Path, cloud_command: Any) -> None:
