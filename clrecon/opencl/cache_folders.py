@@ -50,6 +50,9 @@ _MESA_OFF = {"MESA_SHADER_CACHE_DISABLE": "true", "MESA_GLSL_CACHE_DISABLE": "tr
 """Environment that switches Mesa's cache off (before 22.1 by the last name): a thread of its own writes to it, even
 into a folder that is being removed."""
 
+_RELATIVE = "is no absolute path"
+"""Libraries differ in what they make of such a folder: pytools looks for one elsewhere, others take it as it is."""
+
 _UNKNOWN_OWNER = 65534
 """Owner that a user namespace shows for everything of users outside of it, the system's own folders included."""
 
@@ -91,6 +94,8 @@ def find_fault(folder: Path) -> str:
 
     The folder is made where it is not there.
     """
+    if not folder.is_absolute():
+        return _RELATIVE
     try:
         make_private(folder)
         state = folder.lstat()
@@ -105,6 +110,8 @@ def find_fault(folder: Path) -> str:
 
 def _fault_of_room(folder: Path) -> str:
     """Return why nothing can be kept in a folder, which is made where it is not there."""
+    if not folder.is_absolute():
+        return _RELATIVE
     try:
         make_private(folder)
         with tempfile.TemporaryFile(dir=folder) as file:
@@ -139,6 +146,8 @@ def _cache_home() -> tuple[Path, str]:
     named = os.environ.get("XDG_CACHE_HOME")
     if named:
         return Path(named), "XDG_CACHE_HOME"
+    if os.environ.get("HOME") == "":  # the root folder for Python, the home of the user table for pytools
+        return Path(".cache"), "~/.cache"
     return Path(os.path.expanduser("~/.cache")), "~/.cache"
 
 

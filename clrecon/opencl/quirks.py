@@ -6,6 +6,7 @@ One has its own file: `clrecon.opencl.unknown_cpu`.
 from __future__ import annotations
 
 import os
+import re
 from functools import cache
 from typing import Any
 
@@ -28,6 +29,13 @@ SIMULATOR_PLATFORMS = ("oclgrind",)
 """Platforms of simulators, which claim to be fast devices (Oclgrind: CPU, GPU and accelerator at once) and are 1000
 times slower."""
 
+_THREAD_COUNTS = ("POCL_MAX_PTHREAD_COUNT", "POCL_CPU_MAX_CU_COUNT")
+"""Variables for the number of PoCL's threads, before version 4 and since."""
+
+_MOST_THREADS = 4096
+"""Threads that PoCL may be asked for: more than any processor has, and each takes a stack.  A device may get two for
+one that is asked for."""
+
 
 @cache
 def import_pyopencl() -> Any:
@@ -40,8 +48,9 @@ def import_pyopencl() -> Any:
     Raises
     ------
     DeviceError
-        PYOPENCL_NO_CACHE is no truth value.
+        PYOPENCL_NO_CACHE is no truth value, or the number of PoCL's threads none that it can have.
     """
+    _check_thread_counts()
     os.environ.setdefault("PYOPENCL_CACHE_FAILURE_FATAL", "")
     if not os.environ.get("PYOPENCL_NO_CACHE", "").strip():
         os.environ.pop("PYOPENCL_NO_CACHE", None)
@@ -52,6 +61,19 @@ def import_pyopencl() -> Any:
         told = os.environ.get("PYOPENCL_NO_CACHE", "")
         raise DeviceError(f"PYOPENCL_NO_CACHE is {told!r}: unset it, or write 1 or 0 ({error})") from error
     return pyopencl
+
+
+def _check_thread_counts() -> None:
+    """Refuse what PoCL makes nothing good of: -1 ends the process when the platform is loaded, words are one thread."""
+    for name in _THREAD_COUNTS:
+        told = os.environ.get(name, "").strip()
+        if not told:
+            os.environ.pop(name, None)
+        elif not re.fullmatch(r"\+?[0-9]{1,9}", told) or int(told) > _MOST_THREADS:
+            raise DeviceError(
+                f"{name} is {told!r:.60}, and PoCL needs a number of threads: unset it, or write a whole number, at"
+                f" most {_MOST_THREADS}"
+            )
 
 
 def is_simulator(platform_name: str) -> bool:

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from clrecon.errors import DeviceError
-from clrecon.opencl import cache_folders
+from clrecon.opencl import cache_folders, quirks
 from clrecon.opencl.cache_folders import cache_warnings, find_fault, make_private, prepare_caches, refuse_short_files
 
 VARIABLES = ("XDG_CACHE_HOME", "POCL_CACHE_DIR", "PYOPENCL_NO_CACHE", *cache_folders._MESA_OFF)
@@ -42,14 +42,16 @@ def environment_of(tmp_path, **variables):
     ("variables", "fault"),
     [
         ({"HOME": "/proc/nowhere"}, "~/.cache cannot be written"),
+        ({"HOME": "/dev/null", "XDG_CACHE_HOME": "relative"}, "XDG_CACHE_HOME is no absolute path"),
         ({"POCL_CACHE_DIR": "/proc/nowhere"}, "POCL_CACHE_DIR cannot be written"),
         ({"POCL_CACHE_DIR": ""}, "POCL_CACHE_DIR is set to nothing"),
     ],
 )
 def test_row_59_no_place_for_built_kernels(device, variables, fault, tmp_path):
     command = [sys.executable, "-c", CODE, str(device.index)]
-    done = subprocess.run(command, env=environment_of(tmp_path, **variables), capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
+    environment = environment_of(tmp_path, **variables)
+    done = subprocess.run(command, env=environment, cwd=tmp_path, capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (0, "")
     total, [warning] = json.loads(done.stdout)
     assert total == 10
     assert warning == f"caches of built kernels are not used, every process builds them anew: {fault}"
@@ -187,6 +189,27 @@ def test_row_59_a_folder_that_another_user_prepared_is_not_loaded(fresh, tmp_pat
     assert stat.S_IMODE(caches.pocl.parent.stat().st_mode) == stat.S_IMODE(caches.pocl.stat().st_mode) == 0o700
 
 
+@pytest.mark.parametrize(
+    ("variables", "name"),
+    [
+        ({"XDG_CACHE_HOME": "relative"}, "XDG_CACHE_HOME"),
+        ({"XDG_CACHE_HOME": " "}, "XDG_CACHE_HOME"),
+        ({"XDG_CACHE_HOME": "", "HOME": "relative"}, "~/.cache"),
+        ({"XDG_CACHE_HOME": "", "HOME": ""}, "~/.cache"),
+    ],
+)
+def test_row_59_a_folder_that_depends_on_the_current_one_is_not_used(fresh, tmp_path, monkeypatch, variables, name):
+    """Libraries look for their caches elsewhere then."""
+    monkeypatch.chdir(tmp_path)
+    for variable, value in variables.items():
+        monkeypatch.setenv(variable, value)
+    caches = fresh()
+    [warning] = caches.warnings
+    assert warning.endswith(f"anew: {name} is no absolute path") and not caches.refusal
+    assert not caches.is_lasting and caches.binaries is None and os.environ["PYOPENCL_NO_CACHE"] == "1"
+    assert not list(tmp_path.iterdir())
+
+
 def test_row_59_the_other_caches_are_switched_off_one_by_one(fresh, tmp_path):
     for place in ("pytools", "mesa_shader_cache", "clrecon/kernels"):
         spoil(tmp_path / "home" / place, "others")
@@ -256,3 +279,21 @@ def test_the_switch_of_pyopencl_for_its_cache(told, says, tmp_path):
     environment = environment_of(tmp_path, PYOPENCL_NO_CACHE=told)
     done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True)
     assert (says in done.stderr) if says else (done.returncode, done.stderr) == (0, "")
+
+
+@pytest.mark.parametrize("name", quirks._THREAD_COUNTS)
+@pytest.mark.parametrize("told", ["-1", "x", "2.5", "4097", "4294967297", "9" * 5000, "\udcff"])
+def test_a_number_of_threads_that_ends_the_process_is_refused(name, told, monkeypatch):
+    monkeypatch.setenv(name, told)
+    with pytest.raises(
+        DeviceError, match=f"^{name} is '.*: unset it, or write a whole number, at most 4096$"
+    ) as caught:
+        quirks.import_pyopencl.__wrapped__()
+    assert str(caught.value).isprintable() and len(str(caught.value)) < 250
+
+
+@pytest.mark.parametrize("told", ["", " ", "0", " 2 ", "+3", "4096"])
+def test_numbers_of_threads_that_work(told, monkeypatch):
+    monkeypatch.setenv("POCL_MAX_PTHREAD_COUNT", told)
+    assert quirks.import_pyopencl.__wrapped__() is quirks.import_pyopencl()
+    assert os.environ.get("POCL_MAX_PTHREAD_COUNT") == (told if told.strip() else None)
