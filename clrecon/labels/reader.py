@@ -66,9 +66,9 @@ def read_labels(
     """
     wanted = check_wanted(only)
     path = Path(path)
-    if path.is_dir():
-        raise UsageError(f"{escape_text(path.name)} is a folder: give the file with the labels")
     try:
+        if path.is_dir():
+            raise UsageError(f"{escape_text(path.name)} is a folder: give the file with the labels")
         if not path.exists():
             raise UsageError(f"there is no label map {escape_text(str(path), 200)}")
         if not path.is_file():

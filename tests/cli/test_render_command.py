@@ -385,6 +385,8 @@ WRONG = {
     "letters on a curve": (["--curve", "auto", "--letters"], 3, "--letters"),
     "small letters": (["--letters", "--size", "20"], 3, "at least 64"),
     "function file": (["--transfer-function", "nowhere.json"], 3, "nowhere.json"),
+    "long name of a function": (["--transfer-function", "a" * 300 + ":b"], 4, "File name too long"),
+    "long name of labels": (["--labels", "a" * 300], 4, "File name too long"),
     "two functions": (["--transfer-function", "a.json", "--preset", "bone"], 3, "not both"),
     "label option": (["--label-color", "1=red"], 3, "--labels FILE"),
     "label colour": (["--labels", "a.nii", "--label-color", "1"], 3, "LABEL=COLOUR"),

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import os
 from contextlib import ExitStack
-from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, cast
 
@@ -47,7 +47,7 @@ def read_function(named: str | None) -> TransferFunction | None:
     from clrecon.rendering.looks.transfer_files import load_transfer_function
 
     path, colon, name = named.rpartition(":")
-    if colon and not Path(named).exists() and Path(path).exists():
+    if colon and not os.path.exists(named) and os.path.exists(path):
         return load_transfer_function(path, name)
     return load_transfer_function(named)
 
