@@ -2,8 +2,9 @@
 
 SimpleITK, the reference reader of this format, interprets the header, but only after every important field was checked
 here; and it never reads the voxels.  The reasons were seen with SimpleITK 2.5.  A header with NDims = 100000 ends the
-process (a write beyond an array).  A header without a position is placed at the origin.  Damaged compressed voxels come
-back as numbers, with only a line on standard error.
+process (a write beyond an array).  A header without a position is placed at the origin.  A field with too few numbers
+swallows the next one: a spacing of 2 mm was then read as 1 mm.  Damaged compressed voxels come back as numbers, with
+only a line on standard error.
 
 Its frame is LPS mm.  AnatomicalOrientation only informs people; the affine comes from TransformMatrix, Offset and
 ElementSpacing.
@@ -52,6 +53,10 @@ PLAIN = {
     "ElementToIntensityFunctionOffset": 0.0,
 }
 """Fields that must have this value."""
+
+UNUSED_NUMBERS = {"CenterOfRotation": 0, "ElementSize": 0, "Color": 4, "CompressedDataSize": 1}
+"""Fields of numbers that are not used, and how many they have, 0 for one an axis.  MetaIO takes what is missing from
+the lines that follow: those are then not read, or complained of on standard error."""
 
 ELEMENT_TYPES = (
     *(f"MET_{sign}{size}" for sign in ("", "U") for size in ("CHAR", "SHORT", "INT", "LONG", "LONG_LONG")),
@@ -154,6 +159,9 @@ class _Header:
             raise self.wrong("ElementSpacing", "steps above 0 mm; directions belong into TransformMatrix")
         self.numbers("TransformMatrix", int(axes * axes))
         self.numbers("Offset", int(axes))
+        for key, count in UNUSED_NUMBERS.items():
+            if key in self.fields:
+                self.numbers(key, count or int(axes))
 
     def _check_kind(self) -> None:
         if self.text("ObjectType", "Image").lower() != "image":
@@ -240,9 +248,13 @@ def _ask_library(path: Path, header: _Header) -> tuple[tuple[int, int, int], np.
     kind = reader.GetPixelIDValue()
     dtype = next((np.dtype(code) for name, code in _PIXELS.items() if getattr(sitk, name) == kind), None)
     size, axes = tuple(int(n) for n in reader.GetSize()), reader.GetDimension()
-    if dtype is None or list(size) != header.numbers("DimSize", axes) or reader.GetNumberOfComponents() != 1:
-        raise RefusedInputError(f"{header.name} has a corrupt MetaImage header: it can be read in two ways")
     directions = np.array(reader.GetDirection()).reshape(axes, axes)
+    placed = (reader.GetSpacing(), reader.GetOrigin(), directions.T.ravel())
+    said = (header.numbers("ElementSpacing", axes), header.numbers("Offset", axes))
+    same = all(map(np.allclose, placed, (*said, header.numbers("TransformMatrix", axes * axes))))
+    same = same and list(size) == header.numbers("DimSize", axes)
+    if dtype is None or not same or reader.GetNumberOfComponents() != 1:
+        raise RefusedInputError(f"{header.name} has a corrupt MetaImage header: it can be read in two ways")
     affine = np.eye(4)
     affine[:3, :3] = directions[:3, :3] * np.array(reader.GetSpacing()[:3])
     affine[:3, 3] = reader.GetOrigin()[:3]

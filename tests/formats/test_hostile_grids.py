@@ -15,6 +15,7 @@ from volume_files import WRITERS, make_ct, write_metaimage
 
 import clrecon
 from clrecon.errors import ClreconError, RefusedInputError
+from clrecon.formats.metaimage import UNUSED_NUMBERS
 
 nibabel = pytest.importorskip("nibabel")
 pytest.importorskip("nrrd")
@@ -142,6 +143,10 @@ def test_a_damaged_metaimage_header_never_ends_the_process(tmp_path):
         ("CompressedData", "True", "cut or corrupt in slice 1 of 4"),
         ("DistanceUnits", "inch", "DistanceUnits is 'inch', expected mm, cm or um"),
         ("ElementToIntensityFunctionSlope", "2", "expected 1"),
+        ("CenterOfRotation", "1e9990 0", "CenterOfRotation is '1e9990 0', expected 3 finite numbers"),
+        ("ElementSize", "1 1", "expected 3 finite numbers"),
+        ("Color", "1 0 0", "Color is '1 0 0', expected 4 finite numbers"),
+        ("CompressedDataSize", "z", "CompressedDataSize is 'z', expected a finite number"),
         ("ObjectType", "Scene", "ObjectType is 'Scene', expected Image"),
         ("Comment", "x" * 5000, "does not end|no line 'ElementDataFile"),
         ("ElementDataFile", "../a.raw", "voxels are in '../a.raw': only files beside it are read"),
@@ -157,7 +162,7 @@ def test_a_damaged_metaimage_header_never_ends_the_process(tmp_path):
         ("ElementDataFile", "", "expected LOCAL or one file"),
     ],
 )  # fmt: skip
-def test_hostile_metaimages_are_refused(tmp_path, key, value, message):
+def test_hostile_metaimages_are_refused(tmp_path, capfd, key, value, message):
     folder = tmp_path / "here"
     folder.mkdir()
     (folder / "folder").mkdir()
@@ -175,6 +180,8 @@ def test_hostile_metaimages_are_refused(tmp_path, key, value, message):
         path.write_bytes(text.encode("latin-1") + data)
     with pytest.raises(RefusedInputError, match=message):
         clrecon.read_volume(path)
+    if key in UNUSED_NUMBERS:  # the library was not asked
+        assert capfd.readouterr().err == ""
 
 
 def test_units_of_length_become_mm(tmp_path):
@@ -203,13 +210,22 @@ def test_the_byte_order_of_a_metaimage_that_does_not_say_is_a_warning(tmp_path):
     assert "byte order is not said" in volume.report["warnings"][1]
 
 
+@pytest.mark.parametrize("field", ["ElementMin =", "ImagePosition = 1"])
+def test_a_field_that_swallows_the_spacing_is_refused(tmp_path, field):
+    """SimpleITK takes the name of the next field for a number, and 1 mm for the spacing that it then does not see."""
+    path = write_metaimage(tmp_path / "a.mha", make_ct())
+    edit(path, b"ElementSpacing", f"{field}\nElementSpacing".encode())
+    with pytest.raises(RefusedInputError, match="it can be read in two ways"):
+        clrecon.read_volume(path)
+
+
 @pytest.mark.parametrize("frames", [1, 5])
 def test_one_point_in_time_is_a_volume_and_several_are_refused(tmp_path, frames):
     voxels = np.stack([make_ct(seed=n) for n in range(frames)])
     steps = np.diag((1.0, 1.0, 1.0, 1.0))
     fields = {
         "NDims": "4", "DimSize": f"7 6 4 {frames}", "ElementSpacing": "1 1 1 1", "Offset": "0 0 0 0",
-        "TransformMatrix": "1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1",
+        "TransformMatrix": "1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1", "CenterOfRotation": "0 0 0 0",
     }  # fmt: skip
     directions = np.vstack([steps[:3, :3], np.full((1, 3), np.nan)])
     nrrd_header = {"space directions": directions, "kinds": ["domain"] * 3 + ["time"]}
