@@ -13,7 +13,7 @@ import tempfile
 from importlib import import_module
 from pathlib import Path
 
-from trials import Answer, Trial, WrongOutcome, digest
+from trials import MEMORY_LIMIT_BYTES, Answer, Trial, WrongOutcome, digest
 
 from clrecon.cli.common import Parser, add_common
 from clrecon.cli.main import COMMANDS, main
@@ -29,7 +29,15 @@ ODD = [
 UNTRIED = {"bench", "selftest", "demo"}
 """Commands that take seconds each; their options are tried by the tests of the command line."""
 NEVER = ("-h", "--help", "--debug")
-PROCESS_LIMIT_S = 60
+COMMAND_LIMIT_S = 20.0
+"""Processor time of a command: all kernels of a picture are built in 7 s, once."""
+LIBRARIES_BYTES = 256 * 1024 * 1024
+"""What the first command of a process takes for drivers and VTK, whatever its input: it took 132 MB with kernels that
+are kept, and 307 MB where PoCL's compiler was loaded to build them."""
+PROCESS_LIMIT_S = 60.0
+"""Processor time of a process that builds all its kernels."""
+PROCESS_WAIT_S = 240.0
+"""Time after which a process is ended, on a machine however busy."""
 
 
 @functools.cache
@@ -80,7 +88,9 @@ def options_trial(number: int, folder: Path, chance: random.Random) -> Trial:
         return call_main(given, folder)
 
     unharmed = Answer({"exit": "0"})
-    return Trial(" ".join(f"{text!r:.100}" for text in given), run, unharmed, lambda answer: False)
+    words = " ".join(f"{text!r:.100}" for text in given)
+    limit_bytes = MEMORY_LIMIT_BYTES + LIBRARIES_BYTES
+    return Trial(words, run, unharmed, lambda answer: False, COMMAND_LIMIT_S, limit_bytes)
 
 
 def call_main(given: list[str], folder: Path) -> Answer:
@@ -199,16 +209,19 @@ def call_process(changed: dict[str, str], mask: int | None, folder: Path) -> Ans
     """Make a mesh of the small series in a process of its own."""
     target = folder / "mesh.stl"
     given = ["mesh", str(small_ct()), "-o", str(target), "--hu", "300"]
-    done = subprocess.run(
-        [sys.executable, "-m", "clrecon", *given],
-        env={**os.environ, **changed},
-        umask=-1 if mask is None else mask,
-        capture_output=True,
-        text=True,
-        errors="replace",
-        timeout=PROCESS_LIMIT_S,
-        cwd=folder,
-    )
+    try:
+        done = subprocess.run(
+            [sys.executable, "-m", "clrecon", *given],
+            env={**os.environ, **changed},
+            umask=-1 if mask is None else mask,
+            capture_output=True,
+            encoding=changed.get("PYTHONIOENCODING", "utf-8"),
+            errors="replace",
+            timeout=PROCESS_WAIT_S,
+            cwd=folder,
+        )
+    except subprocess.TimeoutExpired:
+        raise WrongOutcome("hang", f"no end in {PROCESS_WAIT_S:.0f} s") from None
     check_call(given, done.returncode, done.stdout, done.stderr)
     check_files(done.returncode, list(folder.glob("mesh*")))
     if done.returncode:

@@ -36,7 +36,12 @@ SHARES = {"values": 30, "bytes": 25, "ends": 5, "volumes": 10, "labels": 5, "opt
 """Families, and their shares of the time in percent."""
 WORKER = Path(__file__).with_name("worker.py")
 WORKER_LIMIT_S = 6 * TIME_LIMIT_S
-START_LIMIT_S = 120
+START_LIMIT_S = 120.0
+"""Processor time after which a worker is ended."""
+STALL_LIMIT_S = 300.0
+"""Time after which a worker that does not answer is ended, whatever it does: it waits for something."""
+LONGEST_LOOK_S = 2.0
+"""What counts of the time between two looks at the workers: with the machine, the campaign itself may have stood."""
 
 
 @dataclass(frozen=True)
@@ -59,6 +64,8 @@ class Worker:
     case: Case
     started: float
     answered: int = 0
+    worked: float = 0.0
+    waited: float = 0.0
 
     @classmethod
     def start(cls, case: Case, seed: str) -> Worker:
@@ -79,6 +86,7 @@ class Worker:
     def give(self, case: Case, seed: str) -> None:
         """Give the next case."""
         self.case, self.started = case, time.monotonic()
+        self.worked, self.waited = processor_s(self.process.pid), 0.0
         assert self.process.stdin is not None
         self.process.stdin.write(f"{case.family} {case.number} {seed}\n".encode())
         self.process.stdin.flush()
@@ -93,13 +101,15 @@ class Worker:
 
     @property
     def limit_s(self) -> float:
-        """Seconds that a case may take: the first one imports, and environments build kernels."""
+        """Processor time that a case may take: the first one imports, and environments build kernels."""
         return WORKER_LIMIT_S if self.answered and self.case.family != "environment" else START_LIMIT_S
 
-    @property
-    def is_late(self) -> bool:
-        """True if the case takes longer than any may."""
-        return time.monotonic() - self.started > self.limit_s
+    def find_delay(self, look_s: float) -> str:
+        """Return in what the case goes beyond what any may take, `look_s` after the last look; empty if it does not."""
+        self.waited += min(look_s, LONGEST_LOOK_S)
+        if processor_s(self.process.pid) - self.worked > self.limit_s:
+            return f"over {self.limit_s:.0f} s of processor time"
+        return f"no answer in {STALL_LIMIT_S:.0f} s" if self.waited > STALL_LIMIT_S else ""
 
     @property
     def answers(self) -> IO[bytes]:
@@ -123,6 +133,15 @@ class Worker:
         self.answers.close()
         how = signal.Signals(-status).name if status < 0 else f"exit {status}"
         return f"{how}; {words}" if words else how
+
+
+def processor_s(process: int) -> float:
+    """Processor time of a process and of those that it has waited for; 0 where the system does not say."""
+    try:
+        fields = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()
+    except OSError:
+        return 0.0
+    return sum(map(int, fields[11:15])) / os.sysconf("SC_CLK_TCK")
 
 
 @dataclass
@@ -237,12 +256,14 @@ def run_campaign(schedule: Schedule | OneCase, *, seconds: float, seed: str = "1
                 workers.append(Worker.start(case, seed))
             if not workers:
                 break
+            looked = time.monotonic()
             ready, _, _ = select.select([worker.answers for worker in workers], [], [], 1.0)
+            look_s = time.monotonic() - looked
             for worker in list(workers):
                 if worker.answers in ready:
                     outcome = worker.take()
-                elif worker.is_late:
-                    outcome = Outcome("hang", "", f"over {worker.limit_s:.0f} s")
+                elif delay := worker.find_delay(look_s):
+                    outcome = Outcome("hang", "", delay)
                 else:
                     continue
                 schedule.spend(worker.case, time.monotonic() - worker.started)

@@ -128,11 +128,12 @@ def put(data: bytes, keyword: str, value: bytes | None) -> bytes:
         if data[place.start : place.start + 4] == key:
             return data[: place.start] + element + data[place.end :]
     order = (tag >> 16, tag & 0xFFFF)
-    behind = next(
+    greater = (
         place.start
         for place in found
         if struct.unpack("<HH", data[place.start : place.start + 4]) > order and place.start > 132 + 60
     )
+    behind = next(greater, len(data))
     return data[:behind] + element + data[behind:]
 
 

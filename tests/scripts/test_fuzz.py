@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import os
 import random
+import time
 from collections import Counter
 from pathlib import Path
 
@@ -80,7 +81,21 @@ def test_what_nothing_contradicts_is_no_fault() -> None:
 
 
 def test_a_case_over_its_time_hangs() -> None:
-    assert judge(lambda: UNHARMED, limit_s=-1.0) == "hang"
+    def work():
+        start = time.process_time()
+        while time.process_time() - start < 0.3:
+            pass
+        return UNHARMED
+
+    assert judge(work, limit_s=0.1) == "hang"
+
+
+def test_time_on_a_busy_machine_is_no_fault() -> None:
+    def wait():
+        time.sleep(0.3)
+        return UNHARMED
+
+    assert judge(wait, limit_s=0.1) == "same"
 
 
 @pytest.mark.parametrize(
@@ -88,13 +103,14 @@ def test_a_case_over_its_time_hangs() -> None:
     [
         ("import os; os.abort()", "crash", "SIGABRT"),
         ("raise SystemExit('no such thing')", "crash", "no such thing"),
-        ("import time; time.sleep(60)", "hang", "over 1 s"),
+        ("import time; time.sleep(60)", "hang", "no answer in 1 s"),
+        ("while True: pass", "hang", "over 1 s of processor time"),
     ],
 )
 def test_a_worker_that_dies_or_hangs_is_a_fault(tmp_path, monkeypatch, program, kind, words) -> None:
     (tmp_path / "worker.py").write_text(program)
     monkeypatch.setattr(fuzz, "WORKER", tmp_path / "worker.py")
-    monkeypatch.setattr(fuzz, "START_LIMIT_S", 1.0)
+    monkeypatch.setattr(fuzz, "STALL_LIMIT_S" if "sleep" in program else "START_LIMIT_S", 1.0)
     campaign = run_campaign(OneCase(Case("values", 7)), seconds=30)
     ((case, outcome),) = campaign.faults
     assert str(case) == "values:7" and outcome.kind == kind and words in outcome.text
@@ -140,6 +156,22 @@ def test_values_harm_one_element() -> None:
     assert slices.value_in(harmed, "RescaleIntercept").strip() == b"-24"
     assert slices.value_in(slices.put(data, "RescaleIntercept", None), "RescaleIntercept") == b""
     assert slices.value_in(slices.put(data, "GantryDetectorTilt", b"12"), "GantryDetectorTilt") == b"12"
+
+
+def test_an_element_behind_all_others_is_put_at_the_end() -> None:
+    data = slices.series()[0]
+    pixels = next(element for element in slices.find_elements(data) if data[element.start :].startswith(b"\xe0\x7f"))
+    cut = data[: pixels.start]
+    assert slices.put(cut, "PixelData", b"12") == cut + slices.element_bytes("PixelData", b"12")
+
+
+@pytest.mark.parametrize("keyword", [*slices.GEOMETRY, *slices.PIXELS])
+def test_a_harmed_value_leaves_the_other_elements_readable(keyword) -> None:
+    """A VR that depends on other elements is written as one of its two."""
+    data = slices.series()[0]
+    was_there = slices.value_in(data, keyword) != b""
+    harmed = slices.put(data, keyword, b"12")
+    assert len(slices.find_elements(harmed)) == len(slices.find_elements(data)) + (not was_there)
 
 
 @pytest.mark.parametrize(

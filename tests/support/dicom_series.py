@@ -166,7 +166,7 @@ def element_bytes(keyword: str, value: bytes, implicit: bool = False) -> bytes:
 
     tag = tag_for_keyword(keyword) or 0
     head = struct.pack("<HH", tag >> 16, tag & 0xFFFF)
-    vr = dictionary_VR(tag).encode()
+    vr = dictionary_VR(tag)[:2].encode()  # of "US or SS" the first
     return head + (struct.pack("<L", len(value)) if implicit else vr + struct.pack("<H", len(value))) + value
 
 
