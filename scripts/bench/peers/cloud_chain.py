@@ -11,6 +11,7 @@ from __future__ import annotations
 import json
 import sys
 import time
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -62,7 +63,7 @@ def label(points: Any, eps: float, fewest: int, clusterer: str) -> Any:
 
 def write(path: str, points: Any, hu: Any, labels: Any) -> None:
     """Write a PLY with Open3D, HU and labels as attributes."""
-    import open3d
+    open3d: Any = import_module("open3d")  # its stubs know no arrays
 
     cloud = open3d.t.geometry.PointCloud()
     cloud.point["positions"] = open3d.core.Tensor(np.ascontiguousarray(points, np.float32))
