@@ -45,6 +45,22 @@ def test_coding_of_its_own_makes_a_slice_doubtful(tmp_path, keyword, value, usua
     assert words in list_series(tmp_path).series[0].warnings
 
 
+@pytest.mark.parametrize("usual", [None, -2000])
+@pytest.mark.parametrize("value", [None, 24, -2000])
+def test_padding_of_its_own_makes_a_slice_doubtful(tmp_path, usual, value):
+    def change(ds, k):
+        own = value if k == 2 else usual
+        if own is not None:
+            ds.PixelPaddingValue = own
+
+    write_series(tmp_path, change=change)
+    words = (
+        "PixelPaddingValue is not as in the other slices: measured voxels may count as padding, or padding as HU"
+        " (1 of 7 slices, at -397.50 mm)"
+    )
+    assert read_volume(tmp_path).report["warnings"] == ([words] if value != usual else [])
+
+
 def test_slices_that_each_have_their_own_rescale_are_not_doubtful(tmp_path):
     write_series(tmp_path, change=lambda ds, k: set_values(RescaleIntercept=-1024 - k)(ds, k))
     assert read_volume(tmp_path).report["warnings"] == []

@@ -134,6 +134,10 @@ def describe_differences(headers: Sequence[SliceHeader]) -> Iterator[tuple[str, 
         if len(headers) / 2 < count < len(headers):
             text = f"{keyword} is not {usual:g} as in the other slices: the HU may be wrong"
             yield text, lambda h, number_of=number_of, usual=usual: number_of(h) != usual  # type: ignore[misc]
+    padding, count = Counter(header.padding for header in headers).most_common(1)[0]
+    if len(headers) / 2 < count < len(headers):
+        text = "PixelPaddingValue is not as in the other slices: measured voxels may count as padding, or padding as HU"
+        yield text, lambda h: h.padding != padding
 
 
 def _thickness(header: SliceHeader) -> float:
