@@ -111,9 +111,12 @@ class WarmTests:
 
     def _ask(self, question: Any) -> Any:
         assert self.process.stdin is not None and self.process.stdout is not None
-        self.process.stdin.write(json.dumps(question) + "\n")
-        self.process.stdin.flush()
-        answer = self.process.stdout.readline()
+        try:
+            self.process.stdin.write(json.dumps(question) + "\n")
+            self.process.stdin.flush()
+            answer = self.process.stdout.readline()
+        except BrokenPipeError:  # it ended before it was asked
+            answer = ""
         if not answer:
             raise ChildProcessError(f"the process that runs the tests has ended ({self.process.wait()})")
         return json.loads(answer)

@@ -94,6 +94,8 @@ class Device:
     memory_bytes, max_allocation_bytes : int
         All memory of the device, and the largest single buffer.
     compute_units : int
+    has_private_arrays : bool
+        Work-items may keep hundreds of values in arrays of their own, see `quirks.has_private_arrays`.
     is_simulator : bool
         A checking simulator such as Oclgrind: used only when it is named.
     shortcoming : str
@@ -143,6 +145,7 @@ class Device:
         self.is_simulator: bool = quirks.is_simulator(self.platform)
         self.shares_host_memory: bool = quirks.shares_host_memory(self.platform, self.type)
         self.has_event_times: bool = quirks.has_event_times(self.platform)
+        self.has_private_arrays: bool = quirks.has_private_arrays(self.platform)
         self.fault: str | None = None
         self.keeps_binaries: bool = not quirks.keeps_programs(self.platform)
         self.known_good: KnownGood | None = known_good() if quirks.is_pocl(self.platform) else None

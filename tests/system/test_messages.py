@@ -19,12 +19,16 @@ from clrecon.jobs.mesh.settings import MeshSettings
 from clrecon.jobs.render.settings import RenderSettings
 from clrecon.labels import LabelMap
 from clrecon.mesh import Mesh
+from clrecon.operators.points.clusters import Clustering
+from clrecon.operators.points.neighbours import Neighbours
 from clrecon.phantom import PhantomSettings
+from clrecon.points import PointCloud, PointStep
 from clrecon.rendering import Lighting, Rendering, TransferFunction
 from clrecon.rendering.looks.label_style import LabelStyle
 from clrecon.rendering.pictures.styles import (
     CurveCut,
     PlaneCut,
+    PointLook,
     Projection,
     SlicesInSpace,
     SurfaceLook,
@@ -45,6 +49,7 @@ CAMERA = Camera.fit(Volume(VOXELS, AFFINE))
 CURVE = Curve([[0, 0, 0], [1, 2, 3], [2, 2, 7.0]])
 ENTRY = SeriesEntry(1, "ab", "thin", "CT", 4, [6, 5, 4], [1.0] * 3, None, 0.0, 0.0, {"min": 1.0}, False, [], [])
 EMPTY = np.zeros((2, 3), np.float32)
+CLOUD = PointCloud([[0, 0, 0], [1, 2, 3]], hu=[200, 300], labels=[0, -1], report={"iso_value_hu": 250.0})
 
 MESSAGES = {
     "volume": Volume(VOXELS, AFFINE, {"warnings": ["doubtful"]}),
@@ -73,6 +78,11 @@ MESSAGES = {
     "iso choice": half_iso_value(1000.0, 40.0),
     "gate": at_most("gap", 1.0, 2.0, "mm", "a gap"),
     "quality": TRIANGLE.quality(),
+    "point cloud": CLOUD,
+    "point step": PointStep(CLOUD, np.array([0, 1, 0], np.uint8), ("noise",), {"eps_mm": 1.2}, ("doubtful",)),
+    "clusters": Clustering(CLOUD, np.zeros(2, np.uint8), cores=np.array([True, False])),
+    "nearest points": Neighbours(np.zeros((2, 1), np.int32), np.zeros((2, 1), np.float32)),
+    "point look": PointLook(radius_mm=0.5, color_by="label"),
     "listing": SeriesListing([ENTRY], 1, {}, [], {"slices": 4}, RefusedInputError("no")),
 }
 HELD_BY_A_DEVICE = {"DeviceVolume", "SurfaceExtractor", "VolumeRenderer"}

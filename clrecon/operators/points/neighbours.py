@@ -102,7 +102,12 @@ def prepare_neighbours(device: Device) -> Program:
         The driver's compiler refuses.
     """
     prepare_grid(device)
-    return load_program(device, "points/neighbours.cl", {"LANES": device.kernel_variants["LANES"]})
+    return load_program(device, "points/neighbours.cl", {"LANES": "1" if _has_one_lane(device) else "8"})
+
+
+def _has_one_lane(device: Device) -> bool:
+    """True where the form for GPUs is taken: there, and where long arrays of a work-item go wrong."""
+    return device.kernel_variants["LANES"] == "1" or not device.has_private_arrays
 
 
 def take_points(points: PointCloud | ArrayLike) -> NDArray[np.floating]:
@@ -207,7 +212,7 @@ class NeighbourSearch:
 
     @property
     def _part_points(self) -> int:
-        return PART_POINTS if int(self.device.kernel_variants["LANES"]) > 1 else PART_POINTS_OF_GPU
+        return PART_POINTS_OF_GPU if _has_one_lane(self.device) else PART_POINTS
 
     @property
     def most_places(self) -> int:
@@ -220,7 +225,7 @@ class NeighbourSearch:
         return {"x": self.grid.x_d, "y": self.grid.y_d, "z": self.grid.z_d}
 
     def _launch(self, part: Part, by_place: bool, neighbours_d: Any, distances_d: Any) -> None:
-        grid, one_lane = self.grid, int(self.device.kernel_variants["LANES"]) == 1
+        grid, one_lane = self.grid, _has_one_lane(self.device)
         (nx, ny, nz), (x, y, z) = grid.shape, (float(value) for value in grid.origin - grid.base)
         launch(
             self.device, self._program["list_neighbours"],

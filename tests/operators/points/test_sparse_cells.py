@@ -111,8 +111,8 @@ def test_cells_below_the_spacing_are_refused(device):
 @pytest.mark.parametrize(
     ("given", "words"),
     [
-        ({"edge": 0.0}, "edge=.*: a positive length in mm is needed"),
-        ({"edge": np.nan}, "edge=.*: a positive length in mm is needed"),
+        ({"edge": 0.0}, "an edge of .*: a positive length in mm is needed"),
+        ({"edge": np.nan}, "an edge of .*: a positive length in mm is needed"),
         ({"edge": 1.0, "fewest": 0}, "fewest=.*: a whole number of points from 1 on is needed"),
         ({"edge": 1.0, "threshold": 1.5}, "threshold=.*: a whole number of points from 1 on is needed"),
         ({"edge": 1e-5}, "take larger cells"),
