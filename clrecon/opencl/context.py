@@ -94,8 +94,8 @@ class Device:
     memory_bytes, max_allocation_bytes : int
         All memory of the device, and the largest single buffer.
     compute_units : int
-    has_private_arrays : bool
-        Work-items may keep hundreds of values in arrays of their own, see `quirks.has_private_arrays`.
+    most_steps : int or None
+        Steps after which the loops of a work-item end whatever they have done, see `quirks.most_steps`.
     is_simulator : bool
         A checking simulator such as Oclgrind: used only when it is named.
     shortcoming : str
@@ -145,7 +145,7 @@ class Device:
         self.is_simulator: bool = quirks.is_simulator(self.platform)
         self.shares_host_memory: bool = quirks.shares_host_memory(self.platform, self.type)
         self.has_event_times: bool = quirks.has_event_times(self.platform)
-        self.has_private_arrays: bool = quirks.has_private_arrays(self.platform)
+        self.most_steps: int | None = quirks.most_steps(self.name)
         self.fault: str | None = None
         self.keeps_binaries: bool = not quirks.keeps_programs(self.platform)
         self.known_good: KnownGood | None = known_good() if quirks.is_pocl(self.platform) else None
@@ -204,6 +204,11 @@ class Device:
     def group_size(self) -> int:
         """Work-group size of all launches: 64, or less where the device allows less (Apple's CPU: 1)."""
         return min(GROUP_SIZE, self.max_work_group_size)
+
+    @property
+    def has_long_items(self) -> bool:
+        """A work-item may do the share of a core: on CPUs, unless `most_steps` ends it."""
+        return int(self.kernel_variants["LANES"]) > 1 and self.most_steps is None
 
     @property
     def label(self) -> str:

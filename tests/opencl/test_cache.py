@@ -51,7 +51,8 @@ def test_row_59_no_place_for_built_kernels(device, variables, fault, tmp_path):
     command = [sys.executable, "-c", CODE, str(device.index)]
     environment = environment_of(tmp_path, **variables)
     done = subprocess.run(command, env=environment, cwd=tmp_path, capture_output=True, text=True)
-    assert (done.returncode, done.stderr) == (0, "")
+    own = [line for line in done.stderr.splitlines() if not line.startswith("MESA: ")]  # a driver's own words
+    assert (done.returncode, own) == (0, [])
     total, [warning] = json.loads(done.stdout)
     assert total == 10
     assert warning == f"caches of built kernels are not used, every process builds them anew: {fault}"

@@ -92,7 +92,8 @@ def prepare_clusters(device: Device) -> Program:
     """Build the kernels of `find_clusters`."""
     prepare_grid(device)
     prepare_components(device)
-    return load_program(device, "points/free_clusters.cl", {"LANES": device.kernel_variants["LANES"]})
+    lanes = device.kernel_variants["LANES"] if device.has_long_items else "1"
+    return load_program(device, "points/free_clusters.cl", {"LANES": lanes})
 
 
 def _check(eps: float, min_samples: int) -> None:
@@ -276,7 +277,7 @@ class ClusterSearch:
     ):
         self._device, self._grid, self._stopwatch = device, grid, stopwatch
         self._program, self._of_grid = prepare_clusters(device), prepare_grid(device)
-        self._is_cpu = int(device.kernel_variants["LANES"]) > 1
+        self._is_cpu = device.has_long_items
         self._samples = min_samples
         nx, ny, nz = grid.shape
         self._total_words = grid.words * ny * nz

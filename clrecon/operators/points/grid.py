@@ -43,6 +43,9 @@ __all__ = [
     "prepare_grid",
 ]
 
+STEPS_A_POINT = 16
+"""Steps with each point of a cloud that a work-item may make where all others are candidates: four passes at least."""
+
 MARKED_TOGETHER = kernel_constant("points/grid.cl", "MARKED_TOGETHER")
 """Points a work-item of mark_cells on a CPU."""
 
@@ -287,6 +290,11 @@ def fill_grid(
     if shortage:
         raise DeviceMemoryError(f"the points cannot be sorted by cells: {shortage}")
     program, n, total = prepare_grid(device), len(plan.points), plan.total_words
+    if device.most_steps is not None and n > device.most_steps // STEPS_A_POINT:
+        device.remark(
+            f"{device.label} ends the loops of a work-item after {device.most_steps:,} steps and tells nobody: what is"
+            " found around points far from all others, or among thousands within a cell, may be wrong; PoCL does not"
+        )
     (nx, ny, nz), words = plan.shape, plan.words
     scale = np.float32(1.0) / plan.edge
     where = {"origin": (*map(float, plan.corner), float(scale)), "n": n, "nx": nx, "ny": ny, "nz": nz, "words": words}

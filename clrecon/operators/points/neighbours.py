@@ -106,8 +106,8 @@ def prepare_neighbours(device: Device) -> Program:
 
 
 def _has_one_lane(device: Device) -> bool:
-    """True where the form for GPUs is taken: there, and where long arrays of a work-item go wrong."""
-    return device.kernel_variants["LANES"] == "1" or not device.has_private_arrays
+    """True where the form for GPUs is taken: there, and where the loops of a work-item must be short."""
+    return not device.has_long_items
 
 
 def take_points(points: PointCloud | ArrayLike) -> NDArray[np.floating]:

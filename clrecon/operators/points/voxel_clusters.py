@@ -172,7 +172,7 @@ class ClusterSearch:
     @property
     def _is_cpu(self) -> bool:
         """True where a work-item is to do as much as a core can, not as little as a lane."""
-        return self._device.kernel_variants["LANES"] != "1"
+        return self._device.has_long_items
 
     @property
     def _rows(self) -> dict[str, int]:

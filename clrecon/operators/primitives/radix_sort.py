@@ -50,7 +50,7 @@ def prepare_sort(device: Device) -> Program:
 def _plan_chunks(device: Device, n: int) -> tuple[int, int]:
     """Return the elements of a chunk and the number of chunks."""
     wanted = MOST_CHUNKS
-    if int(device.kernel_variants["LANES"]) > 1:  # a chunk is the work of a core: some for each, for equal shares
+    if device.has_long_items:  # a chunk is the work of a core: some for each, for equal shares
         wanted = min(max(16, 8 * device.compute_units), MOST_CHUNKS)
     per_chunk = max(FEWEST_PER_CHUNK, -(-n // wanted))
     return per_chunk, -(-n // per_chunk)

@@ -236,3 +236,12 @@ def test_free_points_need_a_distance_and_no_volume(device):
         cluster_points(cloud, 1.0, "plane+1", device=device)
     with pytest.raises(UsageError, match="a volume says nothing of them"):
         cluster_points(cloud, 1.0, volume=Volume(np.zeros((2, 2, 2), np.int16), np.eye(4)), device=device)
+
+
+@pytest.mark.every_device
+def test_a_large_cloud_where_work_items_end_early(device):
+    """Shares of a core would be longer than llvmpipe's loops: nearly all labels were wrong, without a word."""
+    if device.most_steps is None:
+        pytest.skip("work-items of this device do not end early")
+    check_equal(device, scattered_points(60_000, (60.0, 40.0, 30.0)), 1.2, 4)
+    assert any("ends the loops of a work-item" in text for text in device.warnings)

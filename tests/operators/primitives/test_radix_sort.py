@@ -88,3 +88,11 @@ def test_what_cannot_be_sorted_is_refused(device):
         radix_sort(device, None, 0)
     with pytest.raises(UsageError, match="33 bits: keys have 0 to 32"):
         radix_sort(device, None, 1, bits=33)
+
+
+@pytest.mark.every_device
+def test_many_keys_where_work_items_end_early(device):
+    """Shares of a core would be longer than llvmpipe's loops: they were sorted wrongly, without a word."""
+    if device.most_steps is None:
+        pytest.skip("work-items of this device do not end early")
+    check_sorted(device, np.random.default_rng(7).integers(0, 2**32, 70 * device.most_steps, dtype=np.uint32))
