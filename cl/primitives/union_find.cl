@@ -7,8 +7,8 @@
  * jumping.  A root that has a smaller neighbour hooks to the smallest; one that has none, and that nobody hooks to, has
  * a smaller neighbour in the next round.  So two rounds halve the roots at least: 2 log2(n) rounds at most.
  *
- * Words: the label of a vertex is another vertex of its component with a smaller number, or itself, and then the vertex
- * is a root.  A triangle is mixed when its corners have different roots.
+ * The label of a vertex is a vertex of the same component with a smaller number, or the vertex itself, which is then
+ * called a root.  A triangle is mixed when its corners have different roots.
  *
  * Passes
  *   1. clear_labels, hook_corners   the first round, where every vertex is a root: no label need be read
@@ -62,7 +62,7 @@ static inline uint follow_labels(
 }
 
 /* Parameters  labels  out  (n,) UNUSED
- *             flags   out  (2,) zeros; later the number of the last pass that had something to say
+ *             flags   out  (2,) zeros; later the number of the last pass that changed something
  *             n       vertices
  * Launch      global = n rounded up by the host, any local
  * Guarantees  every label is written */
@@ -95,11 +95,12 @@ __kernel void hook_corners(__global const uint *restrict triangles, __global uin
 
 /* Parameters  labels  in   (n,) each not above the number of its vertex, or UNUSED
  *             jumped  out  (n,) the label of the label ..., JUMPS times or until it is a root
- *             flags   out  [0]: the pass where a label is not yet a root, else as it was
+ *             flags   out  [0]: pass_number where a label is not yet a root, else unchanged
  *             n       vertices
  *             pass_number    counts from 1
  * Launch      as clear_labels
- * Guarantees  a chain of c links becomes one of at most ceil(c / (JUMPS + 1)); all who write the flag write the same */
+ * Guarantees  a chain of c links becomes one of at most ceil(c / (JUMPS + 1));
+ *             all items that write the flag write the same */
 __kernel void jump_labels(
     __global const uint *restrict labels, __global uint *restrict jumped, __global uint *flags, const uint n,
     const uint pass_number)
@@ -174,10 +175,10 @@ __kernel void gather_roots(
 /* Parameters  corners  in      (count, 3) roots of the first round, as gathered
  *             labels   in      (n,) of these all roots
  *             hooked   in/out  (n,) of these that are roots now as labels; then each the smallest in a triangle with it
- *             flags    out     [1]: pass_number where a root was hooked, else as it was
+ *             flags    out     [1]: pass_number where a root was hooked, else unchanged
  *             count    mixed triangles;  pass_number counts from 1
  * Launch      as gather_roots
- * Guarantees  all who write the flag write the same; without it every triangle lies in one component */
+ * Guarantees  all items that write the flag write the same; without it each triangle lies in one component */
 __kernel void hook_roots(
     __global const uint *restrict corners, __global const uint *restrict labels, __global uint *hooked,
     __global uint *flags, const uint count, const uint pass_number)

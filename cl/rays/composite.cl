@@ -34,7 +34,7 @@
 #define AT_ONCE 4 /* of them taken before any is blended */
 #define SAMPLES_AHEAD 6.0f /* that their voxels are asked for */
 
-/* What rays have seen so far: premultiplied colour, t of the first hit (negative before), sum of t, weighted. */
+/* State of the rays: premultiplied colour, t of the first hit (negative while there is none), weighted sum of t. */
 typedef struct {
     floats red, green, blue, opacity, first_hit, sum;
 } sights;
@@ -51,8 +51,8 @@ typedef struct {
 #define IS_WEIGHED 0
 #endif
 
-/* Opacity over `times` as many steps; libraries' logarithms are slow on CPUs, so only where it is needed.  What is
- * opaque stays so, however short the way. */
+/* Opacity over `times` as many steps.  Called only where it is needed: logarithms are slow on CPUs.  Opacity 1 stays 1,
+ * however short the way. */
 static inline floats stretch_opacity(const floats opacity, const floats times)
 {
     const floats stretched = 1.0f - exp2(log2(greater(1.0f - opacity, (floats)(1e-30f))) * times);
@@ -66,9 +66,9 @@ static inline floats weigh_opacity(const looks *look, const floats opacity, cons
     return stretch_opacity(factor * whole, (floats)(1.0f / look->steps_per_unit));
 }
 
-/* Opacity over one ray step of segment n of each ray, which is seen at `number`; 0 for segments that do not count.
- * With `inner` they all count, lie within the volume with all voxels that they need, and are not the last of their
- * rays. */
+/* Opacity over one ray step of segment n of each ray, whose light and colour are taken at `number`; 0 for lanes whose
+ * segment does not count.  With `inner` the segments of all lanes count, lie within the volume with all voxels that
+ * they need, and are not the last of their rays. */
 static inline floats find_opacity(const field *f, const slice_stack *stack, const looks *look, const ray_lanes *course,
     const packet *rays, const float n, const int inner, const ints counts, const segment_values *v, floats *number,
     floats *value)
@@ -106,7 +106,7 @@ static inline floats find_opacity(const field *f, const slice_stack *stack, cons
     return opacity;
 }
 
-/* Blend segment n of every ray that it shows of: seen at `number`, with this value and opacity there. */
+/* Blend segment n of each ray where it has opacity; `value` and `opacity` are those at `number`. */
 static inline void blend_samples(const field *f, const slice_stack *stack, const looks *look, const ray_lanes *course,
     const packet *rays, const float n, const int inner, const floats number, const floats value, floats opacity,
     sights *seen)
@@ -197,7 +197,7 @@ static inline void start_rays(const field *f, const looks *look, const int2 firs
     rays->inner_begin = max(rays->inner_begin, -LEAST_LANE(-choose(some, rays->begin, (floats)(0.0f))));
 }
 
-/* What earlier slabs left. */
+/* The state that earlier slabs left. */
 static inline void load_sights(__global const float4 *states, const int2 first_pixel, const int2 size, sights *seen)
 {
     float lane_of[6][LANES];
@@ -222,10 +222,10 @@ static inline void load_sights(__global const float4 *states, const int2 first_p
 }
 
 /* Parameters  voxels   in   (slices, nj, ni)
- *             ways     in   (bk, bj, bi) how far nothing shows, see rays/look_ahead.h
+ *             ways     in   (bk, bj, bi) distances to visible bricks, see rays/look_ahead.h
  *             colors opacities clears changes factors  in  (NODES) each, (GRADIENT_NODES), see looks
  *             highlights in (HIGHLIGHTS) see rays/shade.h
- *             entries  in   (tile rows, tile columns) t before which nothing shows, MAXFLOAT: nothing does
+ *             entries  in   (tile rows, tile columns) t before which nothing is visible, MAXFLOAT where nothing is
  *             view     in   see rays/view.h
  *             states   in/out  (height, width, 2) float4: premultiplied rgba; t of the first hit, sum of w t, -, -
  *             image    out  (height, width) rgba
@@ -236,7 +236,7 @@ static inline void load_sights(__global const float4 *states, const int2 first_p
  *                      slab_low <= k < slab_high are this slab's
  *             bi bj bk bricks, cells_k of each along k
  *             has_dense  whether a step has more opacity than DENSE anywhere
- *             one_sided  whether all nodes that show something are the first ones, or the last ones
+ *             one_sided  whether the visible nodes are the first ones, or the last ones
  *             low scale first_shown last_shown narrow factor_scale steps_per_unit  see looks
  *             main_axis ahead eye aside   see main_way
  *             jitter   samples at random places of their segments

@@ -62,7 +62,7 @@ typedef struct {
     floats share; /* of the slice above */
 } slopes;
 
-/* With `inner` places lie between the second voxel from each side, and need not be held within the volume. */
+/* With `inner` all places lie within the second voxels from each side, and need not be clamped. */
 static inline void find_cells(
     const field *f, const floats i, const floats j, const floats k, const int inner, cell_lanes *c)
 {
@@ -94,8 +94,8 @@ static inline short16 hold_pairs(const short16 pairs)
 }
 #endif
 
-/* True where all cells of `inner` places lie in one row, so near each other that a window shows them and the voxels
- * beside them; `row` and `at` are set then.  Rows have at least WINDOW voxels. */
+/* True where all cells of `inner` places lie in one row, and one window holds them and the voxels beside them; sets
+ * `row` and `at` then.  Rows have at least WINDOW voxels. */
 static inline int find_window(const field *f, cell_lanes *c)
 {
     const int j = c->j.s0, k = c->k.s0;
@@ -108,7 +108,7 @@ static inline int find_window(const field *f, cell_lanes *c)
     return 1;
 }
 
-/* Ask for the voxels of the cell that the first lane will come to: rows are too far apart for CPUs to foresee. */
+/* Prefetch the voxels of the next cell of the first lane: rows are too far apart for the prefetchers of CPUs. */
 static inline void fetch_cell_early(const field *f, const float i, const float j, const float k)
 {
     const size_t slice = (size_t)f->ni * f->nj;
@@ -251,7 +251,7 @@ static inline void find_slopes(
     s->share = c.part_k;
 }
 
-/* The same as differences at one place. */
+/* The differences that belong to these values, at one place. */
 static inline void mix_slopes(const slopes *s, floats *along_i, floats *along_j, floats *along_k)
 {
     *along_i = s->below_i + s->share * (s->above_i - s->below_i);

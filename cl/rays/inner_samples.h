@@ -5,7 +5,7 @@
 #include "rays/field.h"
 #include "rays/ray_packet.h"
 
-/* Whether it pays to know. */
+/* Whether the way is long enough that finding the inner samples saves time. */
 #if HAS_WINDOWS && !defined(UNEVEN)
 #define HAS_INNER 1
 #else

@@ -61,8 +61,8 @@ static inline floats count_to_face(
 #endif
 }
 
-/* Places of LANES rays, k from the first slice of the buffer, the bricks that they lie in, and how far off in bricks the
- * nearest one that shows is: 0 where they do themselves. */
+/* Places of LANES rays, k from the first slice of the buffer, the bricks that they lie in, and the distance in bricks
+ * to the nearest visible one: 0 in a visible brick. */
 typedef struct {
     floats i, j, k;
     ints brick_i, brick_j, brick_k, distance;
@@ -93,7 +93,7 @@ static inline floats count_to_box(const leap_map *map, const ray_lanes *rays, co
         count_to_face(b->k, rays->stride_k, rays->pace_k, b->brick_k, reach_k, map->cells_k));
 }
 
-/* Samples of each ray to the faces of the cube of empty bricks around it, a fraction; 0 where it is in none. */
+/* Samples of each ray to the faces of the cube of empty bricks around it, a fraction; 0 in a visible brick. */
 static inline floats count_to_faces(const leap_map *map, const ray_lanes *rays, const brick_lanes *b)
 {
     const floats steps = count_to_box(map, rays, b, b->distance, b->distance, b->distance);
@@ -101,8 +101,8 @@ static inline floats count_to_faces(const leap_map *map, const ray_lanes *rays, 
     return choose(b->distance > 0, steps, (floats)(0.0f));
 }
 
-/* Samples from number n of each ray on that lie in bricks with none that shows less than `margin` bricks further; 0
- * where that is not so from the beginning. */
+/* Number of samples of each ray, from number n on, in bricks that are more than `margin` bricks from a visible one; 0
+ * where sample n is nearer. */
 static inline floats count_free_steps(const leap_map *map, const slice_stack *stack, const ray_lanes *rays,
     const floats n, const int first_k, const int margin)
 {
@@ -113,7 +113,7 @@ static inline floats count_free_steps(const leap_map *map, const slice_stack *st
     return choose(b.distance > 0, greater(steps, (floats)(1.0f)), (floats)(0.0f));
 }
 
-/* True where the brick of a place shows something; k counts from the first slice of the buffer. */
+/* True where the brick of a place is visible; k counts from the first slice of the buffer. */
 static inline int is_shown(const leap_map *map, const float i, const float j, const float k)
 {
     const int brick_i = clamp((int)(i * BRICKS_PER_CELL), 0, map->bi - 1);

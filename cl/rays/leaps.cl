@@ -69,7 +69,7 @@ __kernel void measure_cells(
 }
 
 /* Parameters  ranges     in   (bricks, 2)
- *             shown      in   (bins + 1) how many bins before each show anything
+ *             shown      in   (bins + 1) number of visible bins before each
  *             distances  out  (bricks) 0 where a brick may show something, FARTHEST elsewhere
  *             bins_low bins_scale bins   node of a value v: (v - bins_low) * bins_scale + 0.5, clamped to 0..bins - 1
  * Launch      global = bricks rounded up by the host, any local

@@ -1,7 +1,7 @@
 /* Leaps along rows of empty bricks, in the direction of most of a picture's rays.
  *
- * Near visible bricks the cubes of rays/leap.h are small, but ahead the way is often free for long.  Rays drift to the
- * side on their way: not only a brick's row must be empty, but also the rows beside it, on the side of the drift.
+ * Near visible bricks the cubes of rays/leap.h are small, but many bricks ahead may be empty.  Rays drift to the side
+ * on their way, so the rows beside a brick's own must be empty too, on the side of the drift.
  *
  *      main axis -->                                  an entry of the map of ways, bit by bit
  *      beside     .  .  .  .  #   # shows something   7 ............. 4   3 ............. 0
@@ -54,8 +54,8 @@ static inline floats count_ahead(
 }
 
 /* The brick beside one that rays through it drift to, along one axis of `count` bricks; the same where they do not.
- * All bricks of a row along the main axis drift to the same side, so that what is free beside one of them goes on beside
- * the next. */
+ * All bricks of a row along the main axis drift to the same side, so that what is free beside one of them goes on
+ * beside the next. */
 static inline int find_beside(const main_way *way, const int brick, const float eye, const int count)
 {
     const float offset = way->eye.w > 0.0f ? (float)brick + 0.5f - eye : eye;

@@ -66,7 +66,7 @@ static inline void find_gradients(__global const float4 *view, const slice_stack
 }
 
 /* Light on LANES places with LPS gradients (x, y, z), seen along unit vectors: a place takes `share` of its own colour
- * and `highlight` of white.  The smaller the gradient the less counts its direction. */
+ * and `highlight` of white.  The direction of a smaller gradient counts less. */
 static inline void find_light(__global const float4 *view, __global const float *highlights,
     const floats x, const floats y, const floats z, const floats direction_x, const floats direction_y,
     const floats direction_z, floats *share, floats *highlight)

@@ -1,10 +1,10 @@
 /* Projections: the highest, the lowest or the mean value along each ray, or the water that attenuates as much as what
  * lies along it: a digitally reconstructed radiograph.
  *
- * Extremes are taken of samples on every slice plane of the axis that runs most along the ray, and evenly between
- * them: along an axis of the volume they are its own voxels.  Bricks that cannot hold a better value are passed over.
- * Means and radiographs are integrals: samples in the middle of segments, weighted with their lengths.  A work-item has a packet of
- * LANES neighbouring rays, as in composite.cl.
+ * Samples for extremes lie on the slice planes of the axis that is nearest to the ray, and evenly between them: along
+ * an axis of the volume they are its own voxels.  Bricks that cannot hold a better value are skipped.  Means and
+ * radiographs are integrals: samples in the middle of segments, weighted with their lengths.  A work-item has a packet
+ * of LANES neighbouring rays, as in composite.cl.
  *
  * -D UNEVEN        slices at places of their own
  * -D LEAST_VALUE   of radiographs: HU of air, which lower voxels count as */
@@ -45,9 +45,8 @@ static inline void plan_segments(const ray_packet *r, const float ray_step, ray_
     lay_course(r, s->first_t, s->step_t, (float4)(0.0f), course);
 }
 
-/* Samples of an extreme lie where the index along the axis that runs most along the ray is a whole number of parts.  A
- * way so short that none falls into it (a thin slab between clip planes, a corner of the volume) has one in its
- * middle. */
+/* Samples of an extreme lie where the index along the axis nearest to the ray is a whole number of parts.  A way that
+ * is too short for one (a thin slab between clip planes, a corner of the volume) has one sample in its middle. */
 static inline void plan_crossings(const ray_packet *r, const float ray_step, ray_lanes *course, row_of_samples *s)
 {
     const floats size_i = fabs(r->step_i), size_j = fabs(r->step_j), size_k = fabs(r->step_k);
@@ -81,7 +80,7 @@ static inline void plan_crossings(const ray_packet *r, const float ray_step, ray
     course->stride_k = choose(exact_k, stride, course->stride_k);
 }
 
-/* Rounded to parts of a voxel: places that lie on a voxel but for rounding do. */
+/* Rounded to parts of a voxel, so that places that miss a voxel by a rounding error lie on it. */
 static inline floats snap(const floats index)
 {
     const floats upward = choose(index < 0.0f, (floats)(-0.5f), (floats)(0.5f));

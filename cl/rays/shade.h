@@ -1,4 +1,4 @@
-/* Light at a single place, from nothing but numbers: Phong 1975, with Blinn's halfway vector.  Normals are turned towards
+/* Light at a single place (Phong 1975, with Blinn's halfway vector); reads no volume.  Normals are turned towards
  * the viewer, as in rays/phong.h. */
 #ifndef CLRECON_SHADE_H
 #define CLRECON_SHADE_H

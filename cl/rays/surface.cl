@@ -103,7 +103,7 @@ static inline void clip_to_slab(const line *along, const float slab_low, const f
     *end = min(*end, rate > 0.0f ? (int)ceil(at_high) : (int)floor(at_low) + 1);
 }
 
-/* Where a ray meets something. */
+/* A hit of a ray. */
 typedef struct {
     float4 place;
     float3 gradient; /* LPS, of any length */
@@ -112,14 +112,14 @@ typedef struct {
     int exists;
 } hit;
 
-/* What a ray has seen so far, kept in `states` between slabs. */
+/* The state of a ray, kept in `states` between slabs. */
 typedef struct {
     float4 color; /* premultiplied */
     float first_hit, sum; /* t of the first hit; sum of t, weighted */
     float label; /* that the ray passes through, or OUT */
 } sight;
 
-/* What light and colours come from. */
+/* Sources of light and colours. */
 typedef struct {
     __global const float4 *view, *normals;
     __global const float *highlights;
@@ -138,7 +138,7 @@ static inline void load_sight(__global const float4 *states, const size_t at_pix
     seen->label = state.z;
 }
 
-/* Keep what a ray has seen for the next slab, or after the last make its pixel of it. */
+/* Keep the state of a ray for the next slab; after the last slab, write its pixel. */
 static inline void store_sight(
     const sight *seen, const float offset, const int stage, const size_t at_pixel, __global float4 *states,
     __global uchar4 *image, __global float *depths, __global float *means,
@@ -155,7 +155,7 @@ static inline void store_sight(
     means[at_pixel] = seen->first_hit == NO_HIT ? NAN : seen->sum / color.w + offset;
 }
 
-/* Samples of a ray through the volume; returns the end of those that are to be looked at, from *n on. */
+/* Samples of a ray through the volume; *n is the first one to be looked at, the return value the end of them. */
 static inline int start_line(
     const ray *r, const float ray_step, const float slab_low, const float slab_high, line *along, int *n)
 {
@@ -174,7 +174,7 @@ static inline int start_line(
     return end;
 }
 
-/* Fill in where a ray meets the surface: between sample n, which is inside, and the one before. */
+/* Set the place where a ray meets the surface: between sample n, which is inside, and the one before. */
 static inline void find_hit(
     const scene *s, const looks *look, const ray *r, const line *along, const int n, hit *h)
 {
@@ -185,7 +185,7 @@ static inline void find_hit(
                         : find_cap(look->view, look->normals, look->planes, look->perspective, r);
 }
 
-/* See where the light of all hits is kept off: `to_light` stops there. */
+/* Find where the light of each hit is blocked: `to_light` stops there. */
 static inline void follow_light(const scene *s, const looks *look, const hit *hits, bundle *to_light)
 {
     to_light->last_counts = look->planes > 0;
@@ -218,8 +218,8 @@ static inline void add_hit(
 }
 
 #ifdef LABELS
-/* Let a ray go on through the label that it is in.  Where it comes into another one that is a hit; returns whether the
- * ray has more samples. */
+/* Continue a ray through the label that it is in.  Entering another label is a hit.  Returns whether the ray has more
+ * samples. */
 static inline int pass_label(
     const scene *s, __global const LABEL *labels, const looks *look, const line *along, float *number,
     const float end, sight *seen, hit *h)
@@ -244,10 +244,11 @@ static inline int pass_label(
 #endif
 
 /* Parameters  voxels   in   (slices, nj, ni)
- *             leaps    in   (bk, bj, bi) Chebyshev distance in bricks to what reaches the level, 0: does so itself
+ *             leaps    in   (bk, bj, bi) Chebyshev distance in bricks to the nearest one that reaches the
+ *                           level, 0 where this one does
  *             view     in   see rays/view.h; the box goes one index step beyond the outermost voxel centres
  *             normals  in   (planes) unit normals of the clip planes, LPS
- *             labels   in   (slices, nj, ni), label_colors (numbers) in: with LABELS alone, see rays/label_color.h
+ *             labels   in   (slices, nj, ni), label_colors (numbers) in: only with LABELS, see rays/label_color.h
  *             highlights in (HIGHLIGHTS) see rays/shade.h
  *             states   in/out  (height, width, 2) float4: premultiplied rgba; t of the first hit, sum of w t, label
  *                           that the ray passes through or OUT, -

@@ -7,7 +7,7 @@
 
 #define DARK 0.01f /* no light is left */
 
-/* Label of a place on the surface: of the nearest voxel of its cell that is inside and has one. */
+/* Label of a place on the surface: that of the nearest voxel of its cell that is inside and has a label. */
 static inline uint find_surface_label(
     const scene *s, __global const LABEL *labels, const float4 field_place)
 {
@@ -63,7 +63,7 @@ static inline float4 find_label_differences(
     return sum / 18.0f;
 }
 
-/* Share of the light that comes through what is inside from sample n of a line on, which is. */
+/* Share of the light that passes the part of a line that is inside, beginning at sample n, which is. */
 static inline float let_light_through(
     const scene *s, __global const LABEL *labels, __global const float4 *label_colors,
     const line *to_light, int n, const int end)

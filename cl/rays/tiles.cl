@@ -6,10 +6,10 @@
 #include "rays/stack.h"
 #include "rays/view.h"
 
-/* Parameters  leaps    in   (bk, bj, bi) Chebyshev distance in bricks to what shows, 0: shows
+/* Parameters  leaps    in   (bk, bj, bi) Chebyshev distance in bricks to the nearest visible one, 0 where this one is
  *             view     in   see rays/view.h; its box is as much larger as rays may be away from the middle one
- *             entries  out  (tile rows, tile columns) t in mm before which no ray of the tile meets anything,
- *                           MAXFLOAT: none does
+ *             entries  out  (tile rows, tile columns) t in mm before which nothing on the rays of the tile is visible,
+ *                           MAXFLOAT where nothing is
  *             bi bj bk bricks, cells_k of each along k;  first_k: slice that they begin with
  *             margin   bricks that rays of a tile may be away from the middle one
  *             width height     of the picture

@@ -30,7 +30,7 @@ static inline int hold_within(int at, int n)
     return at < 0 ? 0 : at >= n ? n - 1 : at;
 }
 
-/* By how much label `own`, that of sample (i, j, k), leads before `other` there, in units of the occupancy; 1 at least. */
+/* Lead of label `own`, that of sample (i, j, k), over `other` there, in units of the occupancy; 1 at least. */
 static inline int find_lead(const mask_part *masks, int i, int j, int k, uint own, uint other)
 {
     const int ni = masks->occupied.ni, nj = masks->occupied.nj, nk = masks->occupied.nk;
@@ -50,7 +50,8 @@ static inline int find_lead(const mask_part *masks, int i, int j, int k, uint ow
     return lead > 0 ? FINENESS * lead : 1;
 }
 
-/* Give lane n of a gathered group, which holds the label's occupancy, the values and gradients that place its vertex. */
+/* Set the values and gradients that place the vertex of lane n of a gathered group, which holds the occupancy of the
+ * label. */
 static inline void gather_mask_border(
     vertex_group *group, uint n, const mask_part *masks, int i, int j, int k, int axis, int inner)
 {

@@ -14,8 +14,8 @@
  * Beside the mask a row has its extent, the first word with a bit set and the one after the last; a flag word has bit
  * w % 32 of entry w / 32 set where word w has work; and the list of active words says row << row_shift | w.
  *
- * A window is a word with its successor above it, in 64 bits: what is asked about samples 0..32 of the word can
- * be answered from it without a special case at the word's end. */
+ * A window is a word with its successor above it, in 64 bits: tests of samples 0..32 of the word need no special case
+ * at the word's end. */
 #ifndef CLRECON_MASK_ROWS_H
 #define CLRECON_MASK_ROWS_H
 

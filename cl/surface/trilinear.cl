@@ -38,7 +38,7 @@ static inline uint find_choices(const cell_rows *rows, uint active)
     return active & (uint)(faces | ~opposite_differ);
 }
 
-/* Of a word's place among the vertices inside cells: the word has some of its own. */
+/* Flag in a word's place among the vertices inside cells: the word has such vertices. */
 #define HAS_CELL_VERTICES 0x8000
 
 /* Parameters  voxels              in      slices of the volume from first_slice on
@@ -59,7 +59,7 @@ static inline uint find_choices(const cell_rows *rows, uint active)
  *             rows_to_count       rows of the outputs
  * Launch      global = rows_to_count rounded up by the host, any local
  * Assumes     22 (gi + 1) < 65536, so that places in a row fit 16 bits, and 6 (gi + 1) < 32768
- * Guarantees  every output is written, but for the places of words without work, which nothing asks for */
+ * Guarantees  every output is written, except the places of words without work, which nothing reads */
 __kernel void count_cells(
     __global const VOXEL *restrict voxels, __global const uint *restrict mask,
     __global const uint *restrict words_with_work,

@@ -30,7 +30,7 @@
 #define FACE_BITS 30
 #define CELL_BITS 18
 
-/* Biased exponent of a float, 1 for 0 and what is too small for one of its own. */
+/* Biased exponent of a float; 1 for 0 and denormal numbers. */
 static inline uint find_exponent(float height)
 {
     return max(as_uint(height) >> 23 & 255, 1u);

@@ -80,8 +80,8 @@ static inline void place_waist(const long values[8], float3 margin, float3 *lowe
     *upper = (float3)(high[0], high[1], high[2]);
 }
 
-/* One coordinate in mm of a point of the cell at sample (i, j): an exact sum of the origin and the steps, and all that
- * is small, as place_vertices has it. */
+/* One coordinate in mm of a point of the cell at sample (i, j): an exact sum of the origin and the steps, plus the
+ * small terms, as in place_vertices. */
 static inline float place_cell_vertex(
     float i, float j, float3 point,
     float origin, float origin_rest, float i_step, float i_rest, float j_step, float j_rest, float k_step)

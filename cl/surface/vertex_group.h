@@ -1,7 +1,7 @@
 /* Vertices on crossed edges, gathered one by one and computed LANES at a time.
  *
- * Gathering is what differs from vertex to vertex: where the edge is and the values around it.  Computing is the same
- * arithmetic for all of them: where on the edge the surface lies, its place in mm, its normal. */
+ * Gathering differs from vertex to vertex: it finds the edge and the values around it.  Computing is the same
+ * arithmetic for all vertices: the place of the surface on the edge, its position in mm, its normal. */
 #ifndef CLRECON_VERTEX_GROUP_H
 #define CLRECON_VERTEX_GROUP_H
 
@@ -101,8 +101,8 @@ static inline void gather_vertex(
 #undef SAMPLE
 }
 
-/* Ask for the rows of the volume that the edges of 32 samples from (i, j, k) on touch and that their neighbours in the
- * rows before have not touched yet.  Does nothing where the driver knows no prefetch. */
+/* Prefetch the rows of the volume that the edges of 32 samples from (i, j, k) on touch, except those that the rows
+ * before have touched.  Does nothing where the driver knows no prefetch. */
 static inline void prefetch_around(const volume_part *volume, int i, int j, int k)
 {
 #ifdef HAS_BUILTIN_PREFETCH
@@ -132,7 +132,7 @@ static inline floats add_exactly(floats a, floats b, floats *error)
     return sum;
 }
 
-/* One coordinate of the positions: an exact sum of the origin and the steps, and all that is small. */
+/* One coordinate of the positions: an exact sum of the origin and the steps, plus the small terms. */
 static inline floats place_vertices(
     floats i, floats j, floats t, ints along_j, ints along_k,
     float origin, float origin_rest, float i_step, float i_rest, float j_step, float j_rest, float k_step)
