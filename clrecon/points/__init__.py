@@ -1,8 +1,31 @@
-"""Clouds of points: the class `PointCloud`, what a step made of one, and which clusters are kept."""
+"""Clouds of points: the class `PointCloud`, what a step made of one, and which clusters are kept.
 
-from clrecon.points.cloud import PointCloud
-from clrecon.points.ghost_slices import drop_ghost_slices, fill_ghost_slices
-from clrecon.points.keep import keep_clusters
-from clrecon.points.step import PointStep
+The names are loaded when first used, so that the command line learns the kinds of points without numpy.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from clrecon.points.cloud import PointCloud
+    from clrecon.points.ghost_slices import drop_ghost_slices, fill_ghost_slices
+    from clrecon.points.keep import keep_clusters
+    from clrecon.points.step import PointStep
 
 __all__ = ["PointCloud", "PointStep", "drop_ghost_slices", "fill_ghost_slices", "keep_clusters"]
+
+_MODULES = {
+    "cloud": ("PointCloud",),
+    "ghost_slices": ("drop_ghost_slices", "fill_ghost_slices"),
+    "keep": ("keep_clusters",),
+    "step": ("PointStep",),
+}
+
+
+def __getattr__(name: str) -> Any:
+    for module, names in _MODULES.items():
+        if name in names:
+            return getattr(importlib.import_module(f"clrecon.points.{module}"), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -46,6 +46,11 @@ def test_help_loads_nothing_heavy(tmp_path: Path) -> None:
     assert loaded_after(HELP, tmp_path) & HEAVY == set()
 
 
+def test_help_of_clouds_names_the_kinds_of_points_without_numpy(tmp_path: Path) -> None:
+    code = HELP.replace('"--help"', '"cloud", "--help"').replace('"mesh"', '"surface|shell|voxels"')
+    assert loaded_after(code, tmp_path) & HEAVY == set()
+
+
 def test_only_a_listing_that_is_shown_loads_rich(tmp_path: Path) -> None:
     listing: dict[str, object] = {"series": [], "chosen": None, "certificate": None}
     show = f"from clrecon.cli import info, mesh, series_table; series_table.render_listing({listing}, [])"

@@ -9,12 +9,10 @@ from pathlib import Path
 
 from clrecon.errors import UsageError
 from clrecon.jobs.shared.settings import InputSettings
+from clrecon.points.kinds import KINDS
 from clrecon.system.wording import name_parameter
 
 __all__ = ["DENOISERS", "GHOSTS", "KINDS", "STEPS", "CloudSettings", "Clustering", "OF_SCANS"]
-
-KINDS = ("surface", "shell", "voxels")
-"""Kinds of points, see `clrecon.extract_points`."""
 
 DENOISERS = ("grid", "bilateral")
 

@@ -20,6 +20,7 @@ from clrecon.operators.points.emit import Selection, VoxelEmission
 from clrecon.operators.resident.device_volume import DeviceVolume, open_volume
 from clrecon.operators.surface.extract import SurfaceExtractor
 from clrecon.points import PointCloud
+from clrecon.points.kinds import KINDS
 from clrecon.points.voxel_numbers import VoxelNumbers
 from clrecon.system.progress import Progress
 from clrecon.system.wording import name_parameter
@@ -27,9 +28,7 @@ from clrecon.system.wording import name_parameter
 if TYPE_CHECKING:  # label maps load pydicom, which other clouds need not wait for
     from clrecon.labels import LabelMap
 
-__all__ = ["KINDS", "extract_points"]
-
-KINDS = ("surface", "shell", "voxels")
+__all__ = ["extract_points"]
 
 Band = tuple[float, float]
 
