@@ -51,7 +51,7 @@ def find_devices() -> tuple[list[Any], str]:
     except DeviceError as error:
         return [], str(error)
     for device in found:
-        device.fault = ""  # passed: the check at its first use is tests/opencl/test_first_use.py's
+        device.fault = ""  # passed: the check at its first use is tests/operators/test_first_use.py's
         if device.known_good is not None:  # an earlier session may have been killed
             device.known_good.sweep()
             device.known_good.warnings.clear()

@@ -4,7 +4,7 @@ Only this package searches for drivers and knows where the kernel files are.
 """
 
 from clrecon.opencl.arrays import allocate, copy_buffer, download, empty_output, upload
-from clrecon.opencl.cache_folders import cache_warnings
+from clrecon.opencl.cache.folders import cache_warnings
 from clrecon.opencl.commands import has_hung_commands, keep_for_hung_commands
 from clrecon.opencl.context import Device
 from clrecon.opencl.first_use import remembered_fault

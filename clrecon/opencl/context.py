@@ -13,9 +13,9 @@ from typing import Any
 
 from clrecon.errors import DeviceError, DeviceFailedError, DeviceLostError, DeviceMemoryError
 from clrecon.opencl import quirks
-from clrecon.opencl.cache_folders import cache_warnings
+from clrecon.opencl.cache.folders import cache_warnings
+from clrecon.opencl.cache.known_good import KnownGood, known_good
 from clrecon.opencl.commands import Commands
-from clrecon.opencl.known_good import KnownGood, known_good
 from clrecon.opencl.unknown_cpu import NameOfCpu, has_unknown_cpu
 from clrecon.system.log import get_logger
 
@@ -103,7 +103,7 @@ class Device:
     fault : str or None
         What the check at first use found wrong, empty if nothing; None before the check.
     keeps_binaries : bool
-        Built programs are kept for the next process by `clrecon.opencl.binaries`: the driver keeps none.
+        Built programs are kept for the next process by `clrecon.opencl.cache.binaries`: the driver keeps none.
     known_good : KnownGood or None
         The check of the programs that PoCL keeps; None for other drivers, and where nothing is kept.
     kernel_variants : dict of str to str

@@ -17,7 +17,7 @@ import threading
 from collections.abc import Callable
 from typing import Any
 
-from clrecon.opencl.binaries import binary_key, read_binary, store_binary
+from clrecon.opencl.cache.binaries import binary_key, read_binary, store_binary
 from clrecon.opencl.context import Device
 from clrecon.system.log import get_logger
 from clrecon.system.time_limit import device_seconds

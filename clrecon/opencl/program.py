@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 
 from clrecon.errors import DeviceError
-from clrecon.opencl.binaries import binary_key, read_binary, store_binary
-from clrecon.opencl.cache_folders import refuse_short_files
+from clrecon.opencl.cache.binaries import binary_key, read_binary, store_binary
+from clrecon.opencl.cache.folders import refuse_short_files
 from clrecon.opencl.context import Device, describe_error
 from clrecon.opencl.quirks import import_pyopencl
 from clrecon.opencl.signatures import KernelArgument, definitions_of, find_signatures

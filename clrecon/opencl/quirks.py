@@ -11,7 +11,7 @@ from functools import cache
 from typing import Any
 
 from clrecon.errors import DeviceError
-from clrecon.opencl.cache_folders import prepare_caches
+from clrecon.opencl.cache.folders import prepare_caches
 
 __all__ = [
     "SIMULATOR_PLATFORMS",

@@ -10,7 +10,7 @@ from typing import Any
 
 from clrecon.errors import DeviceError
 from clrecon.opencl import quirks
-from clrecon.opencl.cache_folders import cache_warnings
+from clrecon.opencl.cache.folders import cache_warnings
 from clrecon.opencl.context import Device, describe_error
 from clrecon.opencl.first_use import find_fault, remembered_fault
 from clrecon.system.log import get_logger

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from clrecon.errors import DeviceError
-from clrecon.opencl import binaries, program, quirks
-from clrecon.opencl.binaries import binary_key, read_binary, store_binary
-from clrecon.opencl.cache_folders import make_private, prepare_caches
+from clrecon.opencl import program, quirks
+from clrecon.opencl.cache import binaries
+from clrecon.opencl.cache.binaries import binary_key, read_binary, store_binary
+from clrecon.opencl.cache.folders import make_private, prepare_caches
 from clrecon.opencl.program import load_program
 from clrecon.opencl.sources import read_kernel_source
 

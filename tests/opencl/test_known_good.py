@@ -11,8 +11,8 @@ import sys
 
 import pytest
 
-from clrecon.opencl import known_good
-from clrecon.opencl.known_good import DAMAGED, UNFINISHED, KnownGood
+from clrecon.opencl.cache import known_good
+from clrecon.opencl.cache.known_good import DAMAGED, UNFINISHED, KnownGood
 from clrecon.opencl.quirks import is_pocl
 
 CODE = """

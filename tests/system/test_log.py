@@ -15,8 +15,8 @@ from dicom_series import Plan, set_values, write_series
 import clrecon
 from clrecon.jobs.mesh.job import make_mesh
 from clrecon.jobs.mesh.settings import MeshSettings
-from clrecon.opencl import binaries
-from clrecon.opencl.cache_folders import prepare_caches
+from clrecon.opencl.cache import binaries
+from clrecon.opencl.cache.folders import prepare_caches
 
 NAME = "Mueller^Hans"
 

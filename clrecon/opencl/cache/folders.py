@@ -44,7 +44,7 @@ LONGEST_FILE_BYTES = 1 << 20
 
 _OWN = "clrecon"
 """Name of the folder within PoCL's that holds the kernels of clrecon alone, so that each file in it can be accounted
-for (`clrecon.opencl.known_good`).  A process that this one starts inherits POCL_CACHE_DIR with it."""
+for (`clrecon.opencl.cache.known_good`).  A process that this one starts inherits POCL_CACHE_DIR with it."""
 
 _MESA_OFF = {"MESA_SHADER_CACHE_DISABLE": "true", "MESA_GLSL_CACHE_DISABLE": "true"}
 """Environment that switches Mesa's cache off (before 22.1 by the last name): a thread of its own writes to it, even
@@ -67,7 +67,7 @@ class Caches(NamedTuple):
     is_lasting : bool
         `pocl` is there for the next process too.
     binaries : Path or None
-        Folder of `clrecon.opencl.binaries`; None where nothing can be kept.
+        Folder of `clrecon.opencl.cache.binaries`; None where nothing can be kept.
     warnings : tuple of str
         What the user should know, at most one text.
     refusal : str

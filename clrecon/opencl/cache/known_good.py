@@ -26,7 +26,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from clrecon.opencl.cache_folders import make_private, prepare_caches
+from clrecon.opencl.cache.folders import make_private, prepare_caches
 from clrecon.system.log import get_logger
 
 if sys.platform != "win32":

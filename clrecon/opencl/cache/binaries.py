@@ -2,7 +2,7 @@
 
 A file is named by a hash of everything that its binary depends on, and contains that name and a hash of name and
 binary together: a program is built again if its file was cut, changed, or takes the place of another.  The folder
-belongs to the user alone (`clrecon.opencl.cache_folders`), since its contents are executed.
+belongs to the user alone (`clrecon.opencl.cache.folders`), since its contents are executed.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 
-from clrecon.opencl.cache_folders import prepare_caches
+from clrecon.opencl.cache.folders import prepare_caches
 from clrecon.system.log import get_logger
 
 __all__ = ["binary_key", "read_binary", "store_binary"]
