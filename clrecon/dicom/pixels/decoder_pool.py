@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 
 from clrecon.dicom.pixels.decoder_process import DONE, FAILED, NO_DECODER, NO_MEMORY, READY, REPLY
 from clrecon.errors import RefusedInputError
+from clrecon.system.closing import Closing
 from clrecon.system.log import get_logger
 from clrecon.system.text import escape_text
 
@@ -64,7 +65,7 @@ class DecoderError(RefusedInputError):
     """A frame that cannot be decoded, or no process to decode it in.  The message names no file."""
 
 
-class DecoderPool:
+class DecoderPool(Closing):
     """Processes that decode frames of one size; a context manager, safe to use from several threads at once.
 
     Parameters
@@ -97,12 +98,6 @@ class DecoderPool:
         self._workers: list[_Worker] = []
         self._idle: list[_Worker] = []
         self._watchdog: threading.Thread | None = None
-
-    def __enter__(self) -> DecoderPool:
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self.close()
 
     def decode(self, data: bytes, decoder: str, out: NDArray[Any]) -> None:
         """Decode one frame into `out`.

@@ -24,6 +24,7 @@ from clrecon.dicom.parse.transfer_syntaxes import choose_decoder, is_encapsulate
 from clrecon.dicom.pixels.codestream import Codestream, read_codestream
 from clrecon.dicom.pixels.decoder_pool import DecoderError, DecoderPool
 from clrecon.errors import RefusedInputError
+from clrecon.system.closing import Closing
 from clrecon.system.regular_files import open_regular
 
 __all__ = ["StoredPixels"]
@@ -36,7 +37,7 @@ COMPRESSED_RATIO, COMPRESSED_EXTRA_BYTES = 4, 1 << 20
 Known = TypeVar("Known")
 
 
-class StoredPixels:
+class StoredPixels(Closing):
     """Reads stored pixel values of the slices of one stack; a context manager, to be used from several threads.
 
     Parameters
@@ -64,10 +65,8 @@ class StoredPixels:
         self._frames: dict[Path, list[Pieces]] = {}
         self._inflated: dict[Path, bytes] = {}
 
-    def __enter__(self) -> StoredPixels:
-        return self
-
-    def __exit__(self, *error: object) -> None:
+    def close(self) -> None:
+        """Close the processes that decode."""
         self._pool.close()
 
     def stop(self) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from contextlib import ExitStack
-from types import TracebackType
 from typing import TYPE_CHECKING, Any, cast
 
 from clrecon.jobs.render.settings import SPINES, LabelLook, RenderSettings
@@ -19,6 +18,7 @@ from clrecon.rendering.pictures.styles import (
     SurfaceLook,
     VolumeLook,
 )
+from clrecon.system.closing import Closing
 from clrecon.system.progress import Progress
 
 if TYPE_CHECKING:
@@ -85,7 +85,7 @@ def read_look(look: LabelLook | None, volume: Volume | None = None) -> LabelMap 
     return labels
 
 
-class Studio:
+class Studio(Closing):
     """Taker of the pictures that settings ask for; a context manager that frees the memory of the device.
 
     Parameters
@@ -121,12 +121,8 @@ class Studio:
         self._renderer: Any = None
         self._box: Grid | None = None
 
-    def __enter__(self) -> Studio:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    def close(self) -> None:
+        """Free the memory of the device."""
         self._stack.close()
 
     @property

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from types import TracebackType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -22,6 +21,7 @@ from clrecon.rendering.looks.label_style import distinct_colors
 from clrecon.rendering.looks.window import choose_window
 from clrecon.rendering.pictures.styles import PointLook
 from clrecon.rendering.views.camera import Camera
+from clrecon.system.closing import Closing
 from clrecon.system.progress import Progress
 
 __all__ = ["PointPictures", "cloud_box"]
@@ -70,7 +70,7 @@ class _Colors(NamedTuple):
     window: tuple[float, float] | None
 
 
-class PointPictures:
+class PointPictures(Closing):
     """A cloud of points of which pictures are made one after the other.
 
     Use it as a context manager, or `close` it.
@@ -105,14 +105,6 @@ class PointPictures:
             self._base = np.rint(self.box.affine[:3, 3])
             points = (points - self._base).astype(np.float32)
         self._points: NDArray[np.float32] = points
-
-    def __enter__(self) -> PointPictures:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
-        self.close()
 
     def close(self) -> None:
         """Free what was made for the pictures."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from types import TracebackType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -35,6 +34,7 @@ from clrecon.rendering.pictures.styles import (
 )
 from clrecon.rendering.views.camera import Camera, box_corners
 from clrecon.rendering.views.directions import DEFAULT_SIZE, checked_size
+from clrecon.system.closing import Closing
 from clrecon.system.progress import Progress
 
 __all__ = ["VolumeRenderer", "render"]
@@ -49,7 +49,7 @@ MOST_STEPS = 1 << 15
 turns."""
 
 
-class VolumeRenderer:
+class VolumeRenderer(Closing):
     """A volume on a device, of which pictures are made one after the other.
 
     The volume is uploaded once where it fits the device as a whole; a larger one goes through in slabs for each
@@ -86,14 +86,6 @@ class VolumeRenderer:
     def device(self) -> Device:
         """The device that works."""
         return self._resident.device
-
-    def __enter__(self) -> VolumeRenderer:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
-        self.close()
 
     def close(self) -> None:
         """Free the volume on the device; a `DeviceVolume` that was given stays as it is."""

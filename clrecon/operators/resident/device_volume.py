@@ -6,7 +6,6 @@ import threading
 from collections.abc import Callable, Hashable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
-from types import TracebackType
 from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 
 import numpy as np
@@ -32,6 +31,7 @@ from clrecon.opencl import (
 )
 from clrecon.operators.resident.stack_table import StackTable
 from clrecon.operators.resident.voxel_types import ray_variants
+from clrecon.system.closing import Closing
 from clrecon.system.log import get_logger
 
 if TYPE_CHECKING:  # label maps load pydicom, which surfaces need not wait for
@@ -51,7 +51,7 @@ class _Kept:
     nbytes: int
 
 
-class DeviceVolume:
+class DeviceVolume(Closing):
     """A volume on a device: uploaded once, and used by every operator that it is given to.
 
     The voxels are uploaded when they are first needed.  If they do not fit as a whole beside an operator's other
@@ -113,14 +113,6 @@ class DeviceVolume:
         self._taken: tuple[LabelMap, ResampledLabels] | None = None
         self._part_bytes = 0
         self.most_slices: dict[str, int] = {}
-
-    def __enter__(self) -> DeviceVolume:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
-        self.close()
 
     def close(self) -> None:
         """Free everything on the device.  Objects that are asked for later are uploaded again."""

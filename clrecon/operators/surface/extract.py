@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from types import TracebackType
 
 import numpy as np
 
@@ -19,12 +18,13 @@ from clrecon.operators.surface.marching_cubes import Placement
 from clrecon.operators.surface.slabs import SampleGrid, Slab, plan_slabs
 from clrecon.operators.surface.trilinear import check_row
 from clrecon.points import PointCloud
+from clrecon.system.closing import Closing
 from clrecon.system.progress import Progress
 
 __all__ = ["SurfaceExtractor", "extract_isosurface", "extract_isosurfaces", "prepare_isosurface"]
 
 
-class SurfaceExtractor:
+class SurfaceExtractor(Closing):
     """A volume on a device, from which surfaces are extracted at one iso value after the other.
 
     The volume is uploaded once if it fits the device as a whole.  A larger one is processed slab by slab each time,
@@ -60,14 +60,6 @@ class SurfaceExtractor:
     def device(self) -> Device:
         """The device that works."""
         return self._resident.device
-
-    def __enter__(self) -> SurfaceExtractor:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
-        self.close()
 
     def close(self) -> None:
         """Free the volume on the device; a `DeviceVolume` that was given stays as it is."""
