@@ -15,6 +15,7 @@ _DESTINATIONS = {
     "grow_mm": "grow",
     "half_way": "hu",
     "iso_value": "hu",
+    "kind": "points",
     "min_samples": "clusters",
     "only": "label",
     "picture": "output",

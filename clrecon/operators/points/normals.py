@@ -29,11 +29,16 @@ from clrecon.operators.points.neighbours import NeighbourSearch, Part, check_nei
 from clrecon.operators.resident.device_volume import DeviceVolume, open_volume
 from clrecon.points import PointCloud, PointStep
 from clrecon.system.progress import Progress
+from clrecon.system.wording import name_parameter
 
 __all__ = ["PlaneFits", "estimate_normals", "prepare_normals"]
 
 FEWEST_NEIGHBOURS = 3
 """Three points lie in a plane."""
+
+DOUBTFUL_SHARE = 0.1
+"""Share of doubtful normals above which there is a warning.  Shells of bone have 0.04 where voxels are nearly cubes,
+and 0.22 and 0.38 with gaps between slices of 4.25 and 7 mm."""
 
 _HOW = {how: int(kernel_number("points/normals.cl", f"ORIENT_{how}")) for how in ("NOT", "DOWN", "AWAY")}
 _STATES = {
@@ -108,8 +113,8 @@ def estimate_normals(
     With a volume normals point towards lower HU, out of bone: against the gradient of the trilinear field, as
     differences over half a voxel to either side.  Where axis and gradient are nearly at a right angle (cosine below
     0.2) the neighbours lie on both sides of something thin; there the gradient itself is taken, and these points are
-    counted as doubtful.  A cloud without a volume gets normals away from a viewpoint within, or else normals of either
-    direction, with a warning.
+    counted as doubtful; above a tenth of all there is a warning.  A cloud without a volume gets normals away from a
+    viewpoint within, or else normals of either direction, with a warning.
 
     Parameters
     ----------
@@ -226,7 +231,14 @@ class _Run:
             )
         if how == "NOT":
             warnings.append("normals have either direction: give a volume or a viewpoint to orient them")
-        elif unoriented:
+        if doubtful > DOUBTFUL_SHARE * n:
+            warnings.append(
+                f"{doubtful:,} of {n:,} normals ({doubtful / n:.0%}) are doubtful and follow the HU alone: the"
+                f" {self.k} nearest points of theirs lie in one slice, or on both sides of something thin; take the"
+                f" points of a surface ({name_parameter('kind', 'surface')}), which bring their normals, or thin the"
+                " cloud to the largest gap between slices before"
+            )
+        if how != "NOT" and unoriented:
             warnings.append(f"{unoriented:,} of {n:,} normals have either direction: HU do not change there")
         facts = {
             "neighbours": self.k,

@@ -317,6 +317,19 @@ def test_outliers_filter_and_normals(
     assert [gate["name"] for gate in report["gates"]] == ["points_kept_outliers"]
 
 
+def test_doubtful_normals_of_far_slices_are_warned_of(
+    tmp_path: Path, cloud_command: Any, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_nrrd(tmp_path / "far.nrrd", make_voxels()[::6], AFFINE @ np.diag([1.0, 1.0, 6.0, 1.0]))
+    options = ["--points", "shell", "--hu", "250", "--normals", "--report", str(tmp_path / "r.json")]
+    assert cloud_command(tmp_path / "far.nrrd", *options) == 0
+    report = json.loads((tmp_path / "r.json").read_text())
+    share = report["steps"][-1]["doubtful"] / report["points"]
+    said = f"normals ({share:.0%}) are doubtful and follow the HU alone"
+    assert share > 0.1 and said in capsys.readouterr().err
+    assert any(said in warning and "(--points surface)" in warning for warning in report["warnings"])
+
+
 def test_points_of_a_surface_keep_the_normals_of_its_field(scan: Path, tmp_path: Path, cloud_command: Any) -> None:
     assert cloud_command(scan, output="a.ply") == 0
     assert cloud_command(scan, "--normals", output="b.ply") == 0

@@ -150,6 +150,24 @@ def test_thin_sheets_take_the_gradient_and_are_counted(device):
     assert step.facts["doubtful"] == doubtful.sum() > 20
     assert np.all(np.sign(step.cloud.normals[doubtful, 0]) == np.sign(faces - 12.0)[doubtful])
     assert degrees_between(step.cloud.normals[doubtful], expected[doubtful]).max() < 0.01
+    assert step.warnings[0].startswith(f"{doubtful.sum()} of 30 normals (")
+    assert "are doubtful and follow the HU alone: the 16 nearest points" in step.warnings[0]
+    assert "(kind='surface')" in step.warnings[0]
+
+
+@pytest.mark.parametrize(("gap", "warned"), [(0.5, False), (5.0, True)])
+def test_many_doubtful_normals_of_a_shell_are_warned_of(device, gap, warned):
+    """A cylinder along the slices' axis: ten pixels apart, the neighbours of a point lie in its own slice."""
+    j, i = np.indices((60, 60))
+    slice_ = np.rint(100.0 * (12.0 - 0.5 * np.hypot(i - 30, j - 30))).astype(np.int16)
+    volume = Volume(np.stack([slice_] * int(30 / gap)), np.diag([0.5, 0.5, gap, 1.0]))
+    shell = clrecon.extract_points(volume, 0.5, kind="shell", device=device)
+    step = estimate_normals(shell, volume=volume, device=device)
+    share = step.facts["doubtful"] / len(shell)
+    assert (share > 0.1) == warned
+    assert [f"({share:.0%}) are doubtful" in warning for warning in step.warnings] == [True] * warned
+    thinned = clrecon.thin_points(shell, gap, device=device).cloud
+    assert estimate_normals(thinned, volume=volume, device=device).facts["doubtful"] < 0.1 * len(thinned)
 
 
 def test_points_beyond_the_volume_are_unoriented_and_said(device):
