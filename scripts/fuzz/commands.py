@@ -25,6 +25,8 @@ ODD = [
     "1,2", "1,2,3", "-1,2,3", "1:2", "2:1", ":", ",", "1,,2", "\u0661", "\u00bd", "a", "A=1", "=", "a=b,c=d",
     "\x1b[31m", "x\ny", "../../x", "/dev/null", "/dev/full", "/nonexistent/x", ".", "~", "%s", "{}", "x" * 5000, "all",
     "none", "auto", "300", "bone", "png", "500MB", "1GiB", "0B", "64x64", "0x0", "1x99999999", "0,0", "\udcff",
+    "eps=2,min=3", "eps=1e-9", "min=plane+1", "largest", "largest:2", "min:3", "seed:1,2,3", "no-sheets",
+    "grid,bilateral", "-500,900", "1e-7", "1e4", "0,0,0",
 ]  # fmt: skip
 UNTRIED = {"bench", "selftest", "demo"}
 """Commands that take seconds each; their options are tried by the tests of the command line."""
@@ -60,9 +62,9 @@ def small_ct() -> Path:
 
 def draw_arguments(chance: random.Random, folder: Path) -> list[str]:
     """A command with one to three odd options."""
-    command = chance.choice([name for name in COMMANDS if name not in UNTRIED] + ["mesh", "render"])
+    command = chance.choice([name for name in COMMANDS if name not in UNTRIED] + ["mesh", "render", "cloud"])
     given = [command]
-    if command in ("mesh", "render", "info") and chance.random() < 0.97:
+    if command in ("mesh", "render", "info", "cloud") and chance.random() < 0.97:
         given.append(str(small_ct()))
     if command == "phantom":
         given += [str(folder / "out"), "--size", "12", "--slices", "8"]
@@ -70,14 +72,28 @@ def draw_arguments(chance: random.Random, folder: Path) -> list[str]:
         given += ["-o", str(folder / ("out" + chance.choice([".stl", ".ply", ".vtp", ".glb", ".obj", ".3mf", ".xyz"])))]
     if command == "render":
         given += ["-o", str(folder / "out.png"), "--size", "32x24"]
-    for action in chance.sample(actions(command), chance.randrange(1, 4)):
+    if command == "cloud":
+        given += ["-o", str(folder / ("out" + chance.choice([".ply", ".vtp", ".npz", ".xyz", ".las", ".stl"])))]
+    return given + draw_options(command, chance, chance.randrange(1, 4))
+
+
+def draw_options(command: str, chance: random.Random, count: int) -> list[str]:
+    """Some options of a command, as its parser has them, with odd values."""
+    given: list[str] = []
+    for action in chance.sample(actions(command), count):
         name = chance.choice(action.option_strings)
         if action.nargs == 0:
             given.append(name)
             continue
-        pool = [str(choice) for choice in action.choices or ()] + ODD
+        pool = [str(choice) for choice in action.choices or _named(action)] + ODD
         given += [f"{name}={chance.choice(pool)}"] if chance.random() < 0.6 else [name, chance.choice(pool)]
     return given
+
+
+def _named(action: argparse.Action) -> list[str]:
+    """The values that the help of an option names, as often as odd ones are drawn otherwise."""
+    named = str(action.metavar or "").split("|")
+    return named * (len(ODD) // (2 * len(named))) if len(named) > 1 else []
 
 
 def options_trial(number: int, folder: Path, chance: random.Random) -> Trial:

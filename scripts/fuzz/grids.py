@@ -6,7 +6,7 @@ import functools
 import random
 import tempfile
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -67,10 +67,10 @@ def label_maps() -> dict[str, dict[str, bytes]]:
     return made
 
 
-def damage(data: bytes, chance: random.Random) -> tuple[bytes, str]:
+def damage(data: bytes, chance: random.Random, words: Sequence[bytes] = WORDS, header: int = 400) -> tuple[bytes, str]:
     """Change a few bytes, most of them in the header."""
     kind = chance.choice(["word", "word", "bytes", "bytes", "cut", "more", "far bytes"])
-    head = min(len(data), 400)
+    head = min(len(data), header)
     if kind == "cut":
         length = chance.randrange(len(data))
         return data[:length], f"ends after {length}"
@@ -78,7 +78,7 @@ def damage(data: bytes, chance: random.Random) -> tuple[bytes, str]:
         extra = chance.choice([b"\0", chance.randbytes(50), data[:300], b"\n"])
         return data + extra, f"goes on with {extra[:20]!r}"
     place = chance.randrange(len(data) if kind == "far bytes" else head)
-    new = chance.choice(WORDS) if kind == "word" else chance.randbytes(chance.randrange(1, 9))
+    new = chance.choice(words) if kind == "word" else chance.randbytes(chance.randrange(1, 9))
     over = chance.randrange(len(new) + 4) if kind == "word" else len(new)
     return data[:place] + new + data[place + over :], f"{new!r:.60} for {over} bytes at {place}"
 

@@ -14,6 +14,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[2]
 sys.path[:0] = [str(Path(__file__).parent), str(ROOT / "tests" / "support")]
 
+from clouds import clouds_trial  # noqa: E402
 from commands import environment_trial, options_trial  # noqa: E402
 from grids import labels_trial, volumes_trial  # noqa: E402
 from slices import bytes_trial, ends_trial, values_trial  # noqa: E402
@@ -25,6 +26,7 @@ FAMILIES: dict[str, Callable[[int, Path, random.Random], Trial]] = {
     "ends": ends_trial,
     "volumes": volumes_trial,
     "labels": labels_trial,
+    "clouds": clouds_trial,
     "options": options_trial,
     "environment": environment_trial,
 }

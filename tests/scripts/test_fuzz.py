@@ -8,10 +8,12 @@ from __future__ import annotations
 import json
 import os
 import random
+import tempfile
 import time
 from collections import Counter
 from pathlib import Path
 
+import clouds
 import commands
 import fuzz
 import numpy as np
@@ -144,9 +146,27 @@ def test_families_share_the_time() -> None:
 
 
 def test_a_case_is_made_again(tmp_path) -> None:
-    for trial in (slices.values_trial, slices.bytes_trial, slices.ends_trial):
+    for trial in (slices.values_trial, slices.bytes_trial, slices.ends_trial, clouds.clouds_trial):
         words = {trial(20_000, tmp_path, random.Random("1")).words for _ in range(2)}
         assert len(words) == 1
+
+
+def test_clouds_are_read_and_given_to_the_command(tmp_path) -> None:
+    said = []
+    for number in range(12):
+        trial = clouds.clouds_trial(number, tmp_path, random.Random(f"1 clouds {number}"))
+        assert (tmp_path / "ct" / trial.words.partition(":")[0]).is_file()
+        said.append(trial.words)
+    assert 2 < sum("'-" in words for words in said) < 11
+    assert {"same", "refused"} <= {Judge().judge(plain_cloud(name)).kind for name in ("full.ply", "none.ply")}
+
+
+def plain_cloud(name):
+    """A trial of a file as it was written, or of one that is not there."""
+    path = Path(tempfile.mkdtemp()) / name
+    if name in clouds.clouds():
+        path.write_bytes(clouds.clouds()[name])
+    return Trial(name, lambda: clouds.answer_of_cloud(path), clouds.unharmed_cloud("full.ply"), lambda answer: True)
 
 
 def test_values_harm_one_element() -> None:
