@@ -19,7 +19,7 @@ from clrecon.geometry.affine import column_spacing
 if TYPE_CHECKING:
     from clrecon.geometry import Volume
 
-__all__ = ["SKIN_HU", "SKIN_SEEN_HU", "find_head", "shows_face", "warn_of_face"]
+__all__ = ["SKIN_HU", "SKIN_SEEN_HU", "find_head", "measure_skin", "shows_face", "warn_of_face", "warn_of_skin"]
 
 SKIN_HU = (-950.0, 150.0)
 """Levels between air and bone: the outermost surface is the skin."""
@@ -49,6 +49,20 @@ TRUNK_CM2 = 330.0
 CUT_SHARE = 0.75
 """Share of the border of a slice that is body from which the body counts as cut all round."""
 
+SKIN_CM2 = 40.0
+"""Least area of a label's surface beside the air around a head that counts as skin; a face has over 200."""
+
+BESIDE_MM = 2.0
+"""Distance from a surface at which there must be air."""
+
+OPEN_MM = 16.0
+"""Passages narrower than this keep the air of nose, sinuses and ears apart from the air around a head."""
+
+MOST_SAMPLES = 20_000
+"""Triangles that stand for all of a mesh."""
+
+SAID = "a {} of the skin can show a face: treat the file as one that identifies the patient"
+
 _judged: WeakKeyDictionary[Any, bool | None] = WeakKeyDictionary()
 
 
@@ -65,7 +79,64 @@ def warn_of_face(volume: Volume, values: Iterable[float | None], what: str) -> l
     """
     if not any(value is not None and shows_face(volume, value) for value in values):
         return []
-    return [f"a {what} of the skin can show a face: treat the file as one that identifies the patient"]
+    return [SAID.format(what)]
+
+
+def warn_of_skin(volume: Volume, vertices: NDArray[Any], triangles: NDArray[Any]) -> list[str]:
+    """Return the warning about the surface of a label, if it shows the skin of a head, see `measure_skin`."""
+    if find_head(volume) is not True or volume.report.get("outside_air") is not None:
+        return []
+    return [SAID.format("surface")] if measure_skin(volume, vertices, triangles) >= SKIN_CM2 else []
+
+
+def measure_skin(volume: Volume, vertices: NDArray[Any], triangles: NDArray[Any]) -> float:
+    """Measure the area of a surface that lies beside the air around a patient, in cm2.
+
+    Parameters
+    ----------
+    volume : Volume
+    vertices : ndarray, shape (v, 3)
+        LPS mm, in the frame of the volume.
+    triangles : ndarray of int, shape (t, 3)
+        They face outwards.
+
+    Returns
+    -------
+    float
+        Right to some cm2: the air is told on a grid of about 2 mm, without passages narrower than `OPEN_MM`, and at
+        most `MOST_SAMPLES` triangles stand for all.
+    """
+    outer, steps = _outer_air(volume)
+    every = -(-len(triangles) // MOST_SAMPLES) or 1
+    corners = vertices[triangles[::every]].astype(np.float64)
+    crossed = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    lengths = np.linalg.norm(crossed, axis=1)
+    is_flat = lengths == 0.0
+    outwards = crossed / np.where(is_flat, 1.0, lengths)[:, None]
+    ijk = volume.lps_to_ijk(corners.mean(axis=1) + BESIDE_MM * outwards)
+    at = np.round(ijk[:, ::-1] / steps).astype(int)
+    inside = np.all((at >= 0) & (at < outer.shape), axis=1) & ~is_flat
+    beside = np.zeros(len(at), bool)
+    beside[inside] = outer[tuple(at[inside].T)]
+    return float(every * 0.5 * lengths[beside].sum() / 100.0)
+
+
+def _outer_air(volume: Volume) -> tuple[NDArray[np.bool_], NDArray[Any]]:
+    """The air around the patient on a coarse grid: every n-th voxel along k, j and i, and these numbers n."""
+    from scipy import ndimage
+
+    spacing = np.array(column_spacing(volume.affine))[::-1]
+    steps = np.maximum(1, np.round(PIXEL_MM / spacing).astype(int))
+    air = volume.voxels[tuple(slice(None, None, step) for step in steps)] < AIR_HU
+    reach = 2 * np.round(OPEN_MM / 2.0 / (spacing * steps)).astype(int) + 1
+    wide = ndimage.minimum_filter(air, size=tuple(reach), mode="nearest")
+    parts, count = ndimage.label(wide)
+    at_border = np.zeros(count + 1, bool)
+    for axis in range(3):
+        for end in (0, -1):
+            at_border[np.take(parts, end, axis=axis)] = True
+    at_border[0] = False
+    return ndimage.maximum_filter(at_border[parts], size=tuple(reach)) & air, steps
 
 
 def shows_face(volume: Volume, hu: float) -> bool:

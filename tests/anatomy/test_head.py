@@ -10,10 +10,11 @@ import numpy as np
 import pytest
 
 import clrecon
-from clrecon.anatomy.head import find_head, shows_face, warn_of_face
+from clrecon.anatomy.head import find_head, measure_skin, shows_face, warn_of_face
 from clrecon.cli.main import main
 from clrecon.geometry import Volume
-from clrecon.phantom import PhantomSettings, make_phantom, write_phantom
+from clrecon.labels import LabelMap
+from clrecon.phantom import MATERIALS, PhantomSettings, label_materials, make_phantom, write_phantom
 
 COARSE: dict[str, Any] = {"size": (96, 96), "slices": 48, "spacing": (2.4, 2.4, 3.5)}
 SAID = "a surface of the skin can show a face: treat the file as one that identifies the patient"
@@ -83,6 +84,43 @@ def test_row_70_commands_say_so_once(device: Any, tmp_path: Path, capsys: pytest
     render = ("render", str(tmp_path / "ct"), "-o", str(tmp_path / "a.png"), "--size", "64")
     looks = (["--iso", "0"], ["--preset", "muscle"], ["--preset", "bone"], ["--iso", "300"], ["--mode", "slice"])
     assert [said(*render, *look) for look in looks] == [1, 1, 0, 0, 0]
+
+
+def test_row_70_the_skin_that_a_surface_shows_is_measured() -> None:
+    """Of a plate amid air one half is skin; in a closed case of plates all its surface is apart from the air around."""
+    k, j, i = np.indices((40, 40, 40))
+    plate = np.where((k >= 20) & (k < 24), 40, -1000).astype(np.int16)
+    square = np.array([[10.0, 10.0, 23.5], [30.0, 10.0, 23.5], [30.0, 30.0, 23.5], [10.0, 30.0, 23.5]]) * 2.0
+    upwards = np.array([[0, 1, 2], [0, 2, 3]])
+    volume = Volume(plate, np.diag([2.0, 2.0, 2.0, 1.0]))
+    assert measure_skin(volume, square, upwards) == pytest.approx(16.0)  # 40 mm x 40 mm
+    assert measure_skin(volume, square, upwards[:, ::-1]) == 0.0
+    case = (abs(k - 20) < 18) & (abs(j - 20) < 18) & (abs(i - 20) < 18) & (plate < 0)
+    hollow = np.where(case & ~((abs(k - 20) < 15) & (abs(j - 20) < 15) & (abs(i - 20) < 15)), 40, plate)
+    assert measure_skin(Volume(hollow, volume.affine), square, upwards) == 0.0
+    for side, area in ((8.0, 0.0), (24.0, 16.0)):  # mm of a passage through the lid
+        drilled = np.where((k >= 34) & (abs(j - 20) < side / 4) & (abs(i - 20) < side / 4), -1000, hollow)
+        assert measure_skin(Volume(drilled, volume.affine), square, upwards) == pytest.approx(area, abs=1.0)
+
+
+def test_row_70_surfaces_of_labels_say_so(device: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    settings = PhantomSettings(kind="head", **COARSE)
+    head, map_ = phantom("head"), LabelMap(label_materials(settings), phantom("head").affine)
+    tissue, bone = MATERIALS.index("tissue"), MATERIALS.index("bone")
+
+    def told(iso_value: float) -> dict[int, int]:
+        meshes = clrecon.extract_labels(head, map_, iso_value, numbers=[tissue, bone], device=device)
+        return {number: mesh.report["warnings"].count(SAID) for number, mesh in meshes.items()}
+
+    assert told(-100.0) == {tissue: 1, bone: 0} and told(200.0)[bone] == 0
+    write_phantom(tmp_path / "ct", settings)
+    for number, count in ((tissue, 1), (bone, 0)):
+        given = ["--labels", str(tmp_path / "ct" / "materials.nrrd"), "--label", str(number), "--surface", "mask"]
+        assert (
+            main(["mesh", str(tmp_path / "ct"), "-o", str(tmp_path / "a.stl"), *given, "--device", str(device.index)])
+            == 0
+        )
+        assert capsys.readouterr().err.count("can show a face") == count
 
 
 @pytest.mark.parametrize(

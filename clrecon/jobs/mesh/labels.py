@@ -119,6 +119,7 @@ def _extract_masks(
     volume: Volume, labels: LabelMap, choice: LabelChoice, device: Device, settings: MeshSettings, progress: Progress
 ) -> dict[int, Mesh]:
     """Extract each label's own surface, on the map's own grid; the map must still lie on the scan."""
+    from clrecon.anatomy.head import warn_of_skin
     from clrecon.labels.resample import check_together
     from clrecon.operators.surface.label_masks import extract_label_masks
 
@@ -140,6 +141,7 @@ def _extract_masks(
             "grow_mm": None,
             "solid": False,
         }
+        mesh.report["warnings"] += warn_of_skin(volume, mesh.vertices, mesh.triangles)
         if shares[number] < 1.0:
             share = f"{100 * (1 - shares[number]):.3g} %"
             mesh.report["warnings"].append(f"{share} of label {number} lie outside the CT: its surface goes on there")

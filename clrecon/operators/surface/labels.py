@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from typing import Any
 
+from clrecon.anatomy.head import SKIN_HU, warn_of_skin
 from clrecon.errors import NoSurfaceError
 from clrecon.geometry import Volume
 from clrecon.geometry.iso_rule import IsoRule, choose_iso_rule
@@ -188,6 +189,8 @@ def _as_mesh(run: LabelExtraction, taken: ResampledLabels, report: dict[str, Any
     report["warnings"] += _warn(taken, report)
     positions, normals, triangles = part
     mesh = Mesh(run.placement.to_lps(positions), triangles, normals, report)
+    if SKIN_HU[0] <= run.rule.iso_value <= SKIN_HU[1]:
+        report["warnings"] += warn_of_skin(run.volume, mesh.vertices, mesh.triangles)
     run.stopwatch = Stopwatch()  # the time of common work counts for the first label
     return mesh
 
