@@ -7,7 +7,7 @@ import pytest
 import sample_meshes as samples
 
 from clrecon.mesh import Mesh
-from clrecon.mesh.intersections import count_self_intersections
+from clrecon.mesh.intersections import count_self_intersections, find_beside
 
 pytestmark = pytest.mark.unit
 
@@ -70,3 +70,39 @@ def test_random_triangles_of_all_sizes():
     vertices = corners.reshape(-1, 3).astype(np.float32).astype(float)
     triangles = np.arange(180).reshape(-1, 3)
     assert count((vertices, triangles)) == count_by_solving(vertices, triangles) > 20
+
+
+@pytest.mark.parametrize("scale", [2.0**-9, 2.0**9])
+def test_the_unit_of_length_changes_no_pair(scale):
+    """A power of two changes no digit: what small volumes would leave unseen is found as in mm."""
+    vertices, triangles = samples.join(samples.sphere(rounds=1), samples.sphere((11, 4, -3), 10.0, 1))
+    assert count((scale * vertices.astype(np.float32), triangles)) == count((vertices, triangles)) > 0
+    # An edge that ends just above the face, in a triangle that passes its plane elsewhere.
+    beside = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0.25, 0.25, 2], [0.25, 0.25, 0.5], [5, 5, -1]])
+    assert count((scale * beside, [[0, 1, 2], [3, 4, 5]])) == 0
+
+
+def test_triangles_that_share_a_vertex_are_not_examined():
+    """The edge from vertex 3 to 4 passes through the inside of the first triangle."""
+    vertices = np.array([[0, 0, 0], [4, 0, 0], [0, 4, 0], [1, 1, -1], [1, 1.5, 3], [0.5, 0.5, 3.0]])
+    assert count((vertices, [[0, 1, 2], [5, 3, 4]])) == 1
+    assert count((vertices, [[0, 1, 2], [0, 3, 4]])) == 0
+
+
+def test_triangles_that_are_points_cut_nothing():
+    assert count((np.zeros((3, 3)), [[0, 1, 2]])) == 0
+    assert count((np.ones((1, 3)), [[0, 0, 0]] * 3)) == 0
+
+
+def test_only_triangles_that_can_touch_a_changed_one_lie_beside_it():
+    """Equal triangles in a row: two can touch if their centres are no farther apart than twice the longest way from
+    a centre to a corner.
+    """
+    face = np.array([[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [0.0, 2.0, 0.0]])  # its corners lie within 2 of its centre
+    changed = np.arange(40) == 20
+    for step, beside in ((3.9, [19, 20, 21]), (4.1, [20])):
+        vertices = (face + step * np.arange(40)[:, None, None] * [1, 0, 0]).reshape(-1, 3)
+        triangles = np.arange(120, dtype=np.uint32).reshape(-1, 3)
+        assert np.flatnonzero(find_beside(vertices, triangles, changed)).tolist() == beside
+        assert not find_beside(vertices, triangles, np.zeros(40, bool)).any()
+        assert find_beside(vertices, triangles, np.arange(40) < 3).all()  # more than one of twenty: all are looked at

@@ -91,3 +91,9 @@ def test_pyvista_sees_the_same_mesh_without_a_copy():
 
 def test_what_a_mesh_says_of_itself():
     assert repr(Mesh(*samples.box())) == "Mesh(8 vertices, 12 triangles, LPS mm)"
+
+
+def test_what_is_empty_still_has_three_columns():
+    assert Mesh([], []).vertices.shape == Mesh(np.zeros((0, 3)), []).vertices.shape == (0, 3)
+    with pytest.raises(UsageError, match=r"shape \(n, 3\), these have \(0, 2\)"):
+        Mesh(np.zeros((0, 2)), [])

@@ -80,3 +80,11 @@ def test_of_equal_ones_the_first_wherever_they_lie():
         triangle, distance = nearest((boxes[0] + place, boxes[1]), place + (0, 0.5, 0.5))
         assert distance == pytest.approx(2.1, abs=1e-3)
         assert triangle < 12
+
+
+@pytest.mark.parametrize("scale", [0.125, 32.0])
+def test_short_and_long_edges_have_the_distance_of_their_scale(scale):
+    vertices, triangles = TRIANGLE
+    for point, distance in (((1, -3, 4), 5.0), ((7, 0, 4), 5.0), ((-2, 1.5, 0), 2.0), ((5, 5.5, 12), 13.0)):
+        found = nearest((scale * vertices, triangles), scale * np.array(point))
+        assert found == (0, pytest.approx(scale * distance, rel=1e-12))

@@ -10,6 +10,7 @@ import tolerances
 from clrecon.errors import UsageError
 from clrecon.mesh import Mesh, measure_quality
 from clrecon.mesh.connectivity import (
+    _index_type,
     count_duplicate_faces,
     find_edges,
     find_split_vertices,
@@ -264,3 +265,7 @@ def test_vertices_that_nothing_uses_do_not_count_by_place():
     vertices, triangles = samples.box()
     quality = Mesh(np.concatenate([vertices, vertices]), triangles).quality()
     assert (quality["coincident_vertices"], quality["open_edges_by_place"], quality["closed"]) == (0, 0, True)
+
+
+def test_numbers_of_half_edges_take_the_smallest_type_that_holds_them():
+    assert (_index_type(2**31 - 1), _index_type(2**31), _index_type(2**31 + 1)) == (np.int32, np.int64, np.int64)

@@ -9,7 +9,13 @@ import tolerances
 
 from clrecon.errors import NoSurfaceError, UsageError
 from clrecon.mesh import Mesh
-from clrecon.mesh.compare.distances import NearDistance, SurfaceDistance, compare_meshes, sample_surface
+from clrecon.mesh.compare.distances import (
+    NearDistance,
+    SurfaceDistance,
+    compare_meshes,
+    sample_surface,
+    sample_surface_points,
+)
 
 pytestmark = pytest.mark.unit
 
@@ -114,3 +120,13 @@ def test_the_triangles_around_each_of_several_vertices_count():
     assert found.tolist() == [2.0, 2.0, 2.0, np.inf, 2.0]
     assert (rows == -1).tolist() == [False, False, False, True, False]
     assert all(7 in triangles[row] for row in rows[found == 2.0])
+
+
+def test_each_sample_lies_in_the_triangle_that_its_share_of_the_area_names():
+    """Four triangles of one area after one without: a sample of each, from the second on."""
+    corners = np.array([[[3.0 * k, 0, 0], [3.0 * k + 2, 0, 0], [3.0 * k, 1, 0]] for k in range(4)]).reshape(-1, 3)
+    triangles = np.concatenate([[[0, 0, 1]], np.arange(12).reshape(-1, 3)]).astype(np.uint32)
+    points, rows = sample_surface_points(corners, triangles, 4)
+    assert rows.tolist() == [1, 2, 3, 4]
+    assert (points[:, 0] // 3.0).tolist() == [0.0, 1.0, 2.0, 3.0]
+    assert points[0].tolist() == [0.0, 0.0, 0.0]  # the sequence begins in the first corner

@@ -131,3 +131,11 @@ def test_points_that_reach_no_iso_surface_fail_their_gate():
         assert [gate["name"] for gate in gates] == ["iso_distance_found", "iso_distance_p95", "iso_distance_mean"]
         assert failed(gates) == ({"iso_distance_found"} if count else set())
         assert gates[1]["ok"] is (True if found else None)
+
+
+def test_what_was_not_measured_has_its_bound_and_no_gate_without_its_figure():
+    not_looked_for = next(gate for gate in of(samples.box()) if gate["name"] == "self_intersections")
+    assert (not_looked_for["bound"], not_looked_for["measured"], not_looked_for["unit"]) == (0, None, None)
+    assert judge_mesh(voxel_mm=1.0) == []
+    one = Mesh(*samples.box())
+    assert judge_mesh(deviation=compare_meshes(one, one, 10)) == []

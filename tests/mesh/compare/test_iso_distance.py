@@ -10,6 +10,7 @@ from scipy.ndimage import map_coordinates
 from clrecon.geometry import Volume, compose_affine
 from clrecon.geometry.iso_rule import choose_iso_rule
 from clrecon.mesh import Mesh
+from clrecon.mesh.compare import iso_distance
 from clrecon.mesh.compare.iso_distance import (
     distances_to_iso_surface,
     measure_iso_distance,
@@ -166,3 +167,58 @@ def test_where_the_gradient_leads_nowhere_rays_find_the_surface():
     assert 0.7 * across <= distances[0] <= 1.4 * 0.7 * across  # the rays follow the sheared grid
     assert distances[1] == pytest.approx(0.3 * across, abs=1e-3)
     assert np.isnan(distances[2])
+
+
+def layers(axis: int, first: int, low: float = 0.0, high: float = 900.0, count: int = 12) -> Volume:
+    """Voxels of 1 mm: `low` below a number along an axis, `high` from it on."""
+    shape = [4, 4, 4]
+    shape[axis] = count
+    along = np.indices(shape)[axis]
+    return Volume(np.where(along >= first, high, low).astype(np.float32).transpose(2, 1, 0), np.eye(4))
+
+
+@pytest.mark.parametrize("axis", range(3))
+@pytest.mark.parametrize(("at", "first", "distance"), [(1.5, 3, 1.0), (1.5, 4, None), (4.5, 4, 1.0), (4.5, 3, None)])
+def test_lines_reach_the_voxels_of_the_cell_and_of_its_neighbours(axis, at, first, distance):
+    """In a flat cell the gradient is zero; the level lies half way to the voxels that differ."""
+    volume = layers(axis, first)
+    point = np.full((1, 3), 2.0)
+    point[0, axis] = at
+    found = distances_to_iso_surface(volume, choose_iso_rule(volume, 450.0, closed=False), point)
+    np.testing.assert_allclose(found, [np.nan if distance is None else distance], atol=1e-9)
+
+
+def test_lines_find_a_level_between_values_less_than_1_apart():
+    volume = layers(0, 3, 0.0, 0.5)
+    rule = choose_iso_rule(volume, 0.25, closed=False)
+    assert distances_to_iso_surface(volume, rule, np.array([[1.5, 2.0, 2.0]])) == pytest.approx([1.0])
+
+
+def test_a_surface_is_looked_for_within_eleven_half_voxels_along_the_gradient():
+    """Of twelve steps of half a voxel at most, the last shows that the surface is reached."""
+    volume = Volume(np.tile(100.0 * np.arange(24.0), (4, 4, 1)).astype(np.float32), np.eye(4))
+    rule = choose_iso_rule(volume, 1000.0, closed=False)
+    found = distances_to_iso_surface(volume, rule, np.array([[4.55, 2, 2], [4.45, 2, 2], [15.45, 2, 2], [15.55, 2, 2]]))
+    np.testing.assert_allclose(found, [5.45, np.nan, 5.45, np.nan], atol=1e-4)
+
+
+def test_flat_fields_divide_by_no_zero():
+    volume = Volume(np.zeros((4, 4, 4), np.int16), np.eye(4))
+    with np.errstate(all="raise"):
+        assert np.isnan(distances_to_iso_surface(volume, choose_iso_rule(volume, 500, closed=False), np.ones((1, 3))))
+
+
+def test_of_more_points_than_100_000_every_second_is_measured(monkeypatch):
+    monkeypatch.setattr(iso_distance, "distances_to_iso_surface", lambda volume, rule, points: np.zeros(len(points)))
+    volume = Volume(np.zeros((4, 4, 4), np.int16), np.eye(4))
+    for count, measured in ((100_000, 100_000), (100_001, 50_001), (250_000, 83_334)):
+        mesh = Mesh(np.zeros((count, 3), np.float32), np.zeros((count, 3), np.uint32))
+        found = measure_iso_distance(mesh, volume, choose_iso_rule(volume, 500, closed=False))
+        assert found["samples"] == {"vertices": measured, "centres": measured}
+        assert found == found.as_dict()  # a record is equal to its entries
+
+
+def test_a_mesh_that_does_not_say_whether_it_is_closed_is_open():
+    rule = rule_of_report({"iso_level_hu": 225.5})
+    assert rule is not None
+    assert (rule.closed, rule.iso_level) == (False, 225.5)

@@ -85,3 +85,12 @@ def test_components_are_told_apart_and_only_the_chosen_are_looked_at():
     mesh = Mesh(np.concatenate(bars)[order].astype(np.float32), np.zeros((0, 3), np.uint32))
     chosen = np.array([True, True, True, False])
     assert find_rails(mesh, volume, labels[order], chosen).tolist() == [False, True, False, False]
+
+
+@pytest.mark.parametrize("k", [0.5, 1.0, LAST - 1.0, LAST - 0.5])
+def test_slices_count_from_the_second_to_the_last_but_one(k):
+    """The faces that close a surface at the border of the scan lie beyond them."""
+    volume = make_volume()
+    points = make_bar(volume)
+    points[np.abs(volume.lps_to_ijk(points)[:, 2] - k) < 1e-6, 0] += 5.0
+    assert is_straight(points, volume) == (k in (0.5, LAST - 0.5))

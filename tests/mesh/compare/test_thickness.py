@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import sample_meshes as samples
 
+from clrecon.mesh.compare import thickness
 from clrecon.mesh.compare.thickness import measure_walls, wall_thickness
 
 pytestmark = pytest.mark.unit
@@ -43,3 +44,13 @@ def test_an_open_sheet_has_no_wall():
     vertices = np.array([[0.0, 0, 0], [10, 0, 0], [0, 10, 0]])
     found = measure_walls(vertices, np.array([[0, 1, 2]], np.uint32), 1.0, 50)
     assert (found["min_mm"], found["thin_share"], found["not_measured"]) == (None, None, 50)
+
+
+def test_the_figures_of_known_thicknesses(monkeypatch):
+    """From 0 to 100 mm in steps of 1 mm: each percentile is its own number."""
+    lengths = np.append(np.arange(101.0), [np.nan, np.nan])
+    monkeypatch.setattr(thickness, "wall_thickness", lambda *_: lengths)
+    vertices, triangles = samples.box()
+    found = measure_walls(vertices, triangles.astype(np.uint32), 25.0, len(lengths))
+    assert (found["min_mm"], found["p5_mm"], found["median_mm"]) == (0.0, 5.0, 50.0)
+    assert (found["thin_share"], found["samples"], found["not_measured"]) == (25 / 101, 103, 2)

@@ -9,7 +9,16 @@ from clrecon.errors import UsageError
 from clrecon.geometry import Volume
 from clrecon.geometry.iso_rule import choose_iso_rule
 from clrecon.mesh import Mesh
-from clrecon.mesh.compare.walls import Walls, judge_components, judge_walls, looks_like_bone, normals_of, sample_walls
+from clrecon.mesh.compare.walls import (
+    Walls,
+    _is_near,
+    judge_components,
+    judge_walls,
+    lie_near_line,
+    looks_like_bone,
+    normals_of,
+    sample_walls,
+)
 from clrecon.mesh.connectivity import label_components
 from clrecon.phantom import KINDS, PhantomSettings, make_phantom
 from clrecon.reference.surface.extract import extract_isosurface
@@ -125,3 +134,45 @@ def test_depths_are_in_voxels_along_the_normal():
         walls = sample_walls(points, np.array([[0.0, 0.0, -1.0]]), volume, choose_iso_rule(volume, 100.0))
         assert walls.flat.tolist() == [is_flat]
         assert walls.near_mm == max(15.0, 5.0 * thick)
+
+
+@pytest.mark.parametrize(
+    ("wall_hu", "compact", "metal"), [(599.5, 0, 0), (600.0, 1, 0), (2000.0, 1, 0), (2000.5, 1, 1)]
+)
+def test_where_bone_is_compact_and_where_metal_begins(wall_hu, compact, metal):
+    found = judge_walls(Walls(np.zeros((3, 3)), np.full(3, wall_hu), np.zeros(3, bool)))
+    assert (found["compact_share"], found["metal_share"], found["contrast_share"]) == (compact, metal, 0.0)
+
+
+def test_figures_of_walls_have_one_digit_and_shares_four():
+    found = judge_walls(Walls(np.zeros((3, 3)), np.array([100.0, 200.06, 700.0]), np.array([True, False, False])))
+    assert found["wall_hu"] == {"median": 200.1, "p90": 600.0, "p99": 690.0}
+    assert (found["compact_share"], found["samples"]) == (0.3333, 3)
+
+
+@pytest.mark.parametrize(("per_mm", "is_flat"), [(47.8, True), (48.2, False)])
+def test_a_wall_is_flat_up_to_120_hu_from_its_highest_value_to_its_lowest(per_mm, is_flat):
+    """Values fall evenly over the 2.5 mm from the first depth to the last: by 119.5 and by 120.5 HU."""
+    hu = 500.0 - per_mm * np.arange(8.0)
+    volume = Volume(np.tile(hu[:, None, None], (1, 4, 4)).astype(np.float32), np.eye(4))
+    walls = sample_walls(
+        np.array([[1.5, 1.5, 0.0]]), np.array([[0.0, 0.0, -1.0]]), volume, choose_iso_rule(volume, 100)
+    )
+    assert walls.flat.tolist() == [is_flat]
+    assert walls.wall == pytest.approx([500.0])
+
+
+def test_a_cell_and_its_26_neighbours_are_near():
+    places = np.stack(np.meshgrid(*[np.arange(-2.0, 4.0)] * 3, indexing="ij"), axis=-1).reshape(-1, 3) * [7.0, 7.0, 7.0]
+    middle = (places == [7.0, 0.0, 14.0]).all(axis=1)
+    within = (np.abs(places - [7.0, 0.0, 14.0]) <= 7.0).all(axis=1)
+    np.testing.assert_array_equal(_is_near(places + 0.5, middle, 7.0), within)
+    far = places * [1.0, 2.0, 3.0]  # more cells along one axis than along another
+    within = (np.abs(far - [7.0, 0.0, 42.0]) <= 7.0).all(axis=1)
+    np.testing.assert_array_equal(_is_near(far + 0.5, middle, 7.0), within)
+
+
+def test_points_near_a_line_of_several_pieces():
+    line = np.array([[0.0, 0, 0], [10, 0, 0], [10, 10, 0]])
+    points = np.array([[5.0, 1, 0], [5, 3, 0], [11, 5, 0], [8.5, 5, 0], [-1.5, 0, 0], [-2.5, 0, 0], [10, 12, 1]])
+    assert lie_near_line(points, line, 2.0).tolist() == [True, False, True, True, True, False, False]

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+from typing import Any
+
 import numpy as np
 import pytest
 import sample_meshes as samples
@@ -13,7 +16,7 @@ from clrecon.mesh import Mesh, split_components
 from clrecon.mesh.compare.distances import SurfaceDistance
 from clrecon.mesh.intersections import count_self_intersections
 from clrecon.mesh.refine.clusters import Clusters
-from clrecon.mesh.refine.decimation import _collapse, _mend, decimate_mesh
+from clrecon.mesh.refine.decimation import _collapse, _mend, check_refinement, decimate_mesh
 from clrecon.mesh.refine.deviation import Deviation
 from clrecon.mesh.refine.smoothing import smooth_mesh
 from clrecon.reference.surface.extract import extract_isosurface
@@ -203,3 +206,64 @@ def test_the_public_names():
 
     assert clrecon.decimate_mesh is decimate_mesh
     assert {"smooth_mesh", "decimate_mesh", "compare_meshes"} <= set(clrecon.__all__)
+
+
+def test_rounds_end_where_one_takes_hardly_any_triangle():
+    sphere = Mesh(*samples.sphere(rounds=1))
+    said = decimate_mesh(sphere, 0.5, 1e-3).report["refinement"]["decimate"]
+    assert (said["rounds"], said["reached"], said["ended_by"], said["vertices_taken_back"]) == (1, 0.0, "bound", 0)
+
+
+def test_a_mesh_of_2_to_the_31_corners_is_too_large():
+    def of(vertices: int, triangles: int) -> Any:
+        return SimpleNamespace(vertex_count=vertices, triangle_count=triangles, check=lambda: None)
+
+    assert check_refinement(of(1, 715_827_882), 1.0) == check_refinement(of(2**31 - 1, 1), 1.0) == 1.0
+    for large in (of(1, 715_827_883), of(2**31, 1)):
+        with pytest.raises(UsageError, match="too large to be refined, at most 715,827,882"):
+            check_refinement(large, 1.0)
+
+
+@pytest.mark.parametrize("bound", [0.05, 0.4])
+def test_the_last_iteration_of_a_round_reaches_four_squares_of_the_bound(monkeypatch, bound):
+    """fast-simplification ends after iteration 99, with the error 1e-9 * (99 + 3)**agg in units of what it is given."""
+    seen = []
+
+    def look(points: np.ndarray, faces: np.ndarray, agg: float, **_: object) -> tuple[np.ndarray, ...]:
+        seen.append((points, agg))
+        return points, faces, np.zeros((0, 2), int)
+
+    monkeypatch.setattr("fast_simplification.simplify", look)
+    vertices, triangles = samples.sphere(rounds=1)
+    _collapse(Clusters(vertices, triangles.astype(np.uint32), np.zeros(3)), 0.5, bound)
+    ((points, agg),) = seen
+    scale = np.ptp(points, axis=0) / np.ptp(vertices, axis=0)
+    np.testing.assert_allclose(4.0 * (bound * scale) ** 2, 1e-9 * 102.0**agg, rtol=1e-6)
+
+
+def test_a_cluster_whose_place_alone_has_changed_is_undone():
+    """The vertex that stays is moved down along all axes, and goes back to its place."""
+    vertices, triangles = samples.sphere(rounds=1)
+    a, b = (int(corner) for corner in triangles[0, :2])
+    clusters = Clusters(vertices, triangles.astype(np.uint32), np.zeros(3))
+    names = np.arange(len(vertices))
+    names[b] = a
+    left = names[triangles]
+    left = left[(left != left[:, (1, 2, 0)]).all(axis=1)]
+    standing = np.unique(left)
+    points = vertices[standing]
+    points[standing == a] -= 0.25
+    before = clusters.places[a].copy()
+    clusters.collapse(np.array([[a, b]]), points, np.searchsorted(standing, left))
+    np.testing.assert_allclose(clusters.places[a], before - 0.25, atol=1e-6)
+    assert clusters.undo(np.array([a])) == 2  # the vertex that stays, and the one that had gone
+    np.testing.assert_array_equal(clusters.places[a], before)
+
+
+def test_the_corners_of_faces_without_area_are_faults():
+    """A corner on the edge between two others: the face between them is flat, and its neighbour is not."""
+    vertices, triangles = samples.box()
+    vertices = np.concatenate([vertices, [[0.5, 0.0, 0.0]]])
+    clusters = Clusters(vertices, np.concatenate([triangles, [[0, 8, 1]]]).astype(np.uint32), np.zeros(3))
+    found = np.concatenate(clusters._find_flat(clusters.faces()))
+    assert found.tolist() == [0, 8, 1]

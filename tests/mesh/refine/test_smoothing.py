@@ -198,3 +198,19 @@ def test_normals_do_not_depend_on_the_diagonals():
 def test_a_vertex_without_faces_has_a_unit_normal():
     normals = vertex_normals(np.zeros((4, 3), np.float32), np.array([[0, 1, 2]], np.uint32))
     np.testing.assert_array_equal(normals, [[0, 0, 1]] * 4)
+
+
+def test_vertices_that_stay_in_the_way_are_taken_back_wholly():
+    """A corner that would go into a larger box by a whole, a half and a quarter step stays where it was."""
+    vertices, triangles = samples.join(samples.box(), samples.box((1.25, -5, -5), (10, 10, 10)))
+    step = np.zeros((16, 3))
+    step[7] = (4.0, 0.0, 0.0)
+    moved, taken_back = move_vertices(vertices.astype(np.float32), triangles.astype(np.uint32), step)
+    np.testing.assert_array_equal(moved, vertices)
+    assert taken_back > 0
+
+
+def test_smoothing_tells_its_three_steps():
+    told = []
+    smooth_mesh(Mesh(*samples.sphere()), 5, 1.0, progress=lambda *said: told.append(said))
+    assert told == [("smooth", step, 3) for step in range(4)]
