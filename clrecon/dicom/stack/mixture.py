@@ -130,10 +130,10 @@ def describe_differences(headers: Sequence[SliceHeader]) -> Iterator[tuple[str, 
     if any(map(is_other, headers)):
         yield "SliceThickness differs along the stack", is_other
     for keyword, number_of in CODING.items():
-        usual, count = Counter(map(number_of, headers)).most_common(1)[0]
+        number, count = Counter(map(number_of, headers)).most_common(1)[0]
         if len(headers) / 2 < count < len(headers):
-            text = f"{keyword} is not {usual:g} as in the other slices: the HU may be wrong"
-            yield text, lambda h, number_of=number_of, usual=usual: number_of(h) != usual  # type: ignore[misc]
+            text = f"{keyword} is not {number:g} as in the other slices: the HU may be wrong"
+            yield text, lambda h, number_of=number_of, number=number: number_of(h) != number  # type: ignore[misc]
     padding, count = Counter(header.padding for header in headers).most_common(1)[0]
     if len(headers) / 2 < count < len(headers):
         text = "PixelPaddingValue is not as in the other slices: measured voxels may count as padding, or padding as HU"

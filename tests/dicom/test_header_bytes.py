@@ -1,0 +1,206 @@
+"""Bytes of headers at their limits: heads of elements, tails of files, items without end; without files."""
+
+from __future__ import annotations
+
+import io
+import struct
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from pydicom.datadict import keyword_for_tag
+
+from clrecon.dicom.headers import multiframe
+from clrecon.dicom.headers.header import _check_matrix, _check_single_frame
+from clrecon.dicom.headers.surplus import _check_tail, check_surplus
+from clrecon.dicom.parse import encapsulated, plain
+from clrecon.dicom.parse.careful import _looks_implicit
+from clrecon.dicom.parse.forced import restore_start
+from clrecon.dicom.parse.raw import CorruptFileError, read_pixel_head
+from clrecon.dicom.parse.sequences import _make_encoding, _Walk
+from clrecon.dicom.parse.transfer_syntaxes import RLE
+from clrecon.dicom.parse.values import ValueProblem, Values
+from clrecon.dicom.pixels.stray_bits import OVERLAY_BITS
+from clrecon.errors import RefusedInputError
+
+pytestmark = pytest.mark.unit
+
+EXPLICIT = _make_encoding(False, True)
+
+
+def element(tag: int, vr: bytes = b"LO", value: bytes = b"") -> bytes:
+    """An element in explicit VR little endian with a short length."""
+    return struct.pack("<HH2sH", tag >> 16, tag & 0xFFFF, vr, len(value)) + value
+
+
+def long_element(tag: int, vr: bytes = b"OB", value: bytes = b"") -> bytes:
+    return struct.pack("<HH2sHL", tag >> 16, tag & 0xFFFF, vr, 0, len(value)) + value
+
+
+def check_tail(tail: bytes) -> None:
+    _check_tail(io.BytesIO(bytes(20) + tail), 20, 20 + len(tail), implicit=False, little_endian=True)
+
+
+@pytest.mark.parametrize(
+    "tail",
+    [
+        element(0x7FE10010),  # eight bytes, the shortest element
+        element(0x7FE10010, value=b"AB") + element(0x7FE10011),
+        long_element(0xFFFCFFFC, value=bytes(6)),
+        element(0x7FE10010) + long_element(0xFFFCFFFC),
+        long_element(0xFFFCFFFB) + long_element(0xFFFCFFFD),
+    ],
+)
+def test_elements_behind_the_pixels(tail):
+    check_tail(tail)
+
+
+@pytest.mark.parametrize(
+    "tail",
+    [
+        element(0x7FE10010)[:-1],
+        element(0x7FE10010) + element(0x7FE10010),
+        element(0x7FE00010),
+        element(0x7FE10010, value=b"AB")[:-1],
+        long_element(0xFFFCFFFC) + element(0xFFFDFFFD),  # nothing follows the trailing padding
+        element(0x7FE10010, vr=b"Z["),
+        element(0x7FE10010, vr=b"@A"),
+        long_element(0x7FE10010)[:-1],
+    ],
+)
+def test_what_are_no_elements_behind_the_pixels(tail):
+    with pytest.raises(CorruptFileError, match=f"^{len(tail)} bytes behind the pixel data are no elements of DICOM$"):
+        check_tail(tail)
+
+
+@pytest.mark.parametrize("vr", [b"AA", b"DA", b"AZ", b"ZZ", b"LO"])
+def test_two_capital_letters_are_a_value_representation(vr):
+    assert _Walk(element(0x00100010, vr), 0).read_head(0, 8, EXPLICIT) == (0x00100010, vr, 0, 8)
+    assert _looks_implicit(io.BytesIO(element(0x00080005, vr)), 0) is False
+    assert restore_start(element(0x00080005, vr)) is not None
+
+
+@pytest.mark.parametrize("vr", [b"@A", b"A@", b"[A", b"A[", b"aa"])
+def test_other_bytes_are_no_value_representation(vr):
+    with pytest.raises(ValueProblem, match="has no VR within explicit VR"):
+        _Walk(element(0x00100010, vr), 0).read_head(0, 8, EXPLICIT)
+    assert _looks_implicit(io.BytesIO(element(0x00080005, vr)), 0) is True
+
+
+def test_the_head_of_pixel_data():
+    assert read_pixel_head(b"", 500, False, True) == (None, -1, 0, "")
+    assert read_pixel_head(element(0x7FE10010), 500, False, True) == (None, -1, 0, "")
+    assert read_pixel_head(long_element(0x7FE00010, b"OW", bytes(4))[:12], 500, False, True) == (
+        0x7FE00010,
+        512,
+        4,
+        "OW",
+    )
+    head = struct.pack("<HHL", 0x7FE0, 0x0010, 0xFFFFFFFF) + bytes(4)
+    assert read_pixel_head(head, 500, True, True) == (0x7FE00010, 508, -1, "")
+
+
+def fragments(count: int) -> io.BytesIO:
+    items = struct.pack("<HHL", 0xFFFE, 0xE000, 0) * count
+    return io.BytesIO(items + struct.pack("<HHL", 0xFFFE, 0xE0DD, 0))
+
+
+def test_a_thousand_fragments_a_frame_and_a_thousand_more():
+    """The first item is the table of offsets; a frame in RLE may have several fragments."""
+    file = fragments(2000)
+    assert [len(pieces) for pieces in encapsulated.find_frames(file, 0, len(file.getvalue()), 1, RLE)] == [1999]
+    file = fragments(2001)
+    with pytest.raises(RefusedInputError, match="in more than 2000 fragments"):
+        encapsulated.find_frames(file, 0, len(file.getvalue()), 1, RLE)
+
+
+def test_a_table_of_offsets_tells_the_first_fragment_of_each_frame():
+    table = struct.pack("<3L", 0, 20, 30)
+    pieces = [(100, 2), (110, 2), (120, 2), (130, 2)]
+    assert encapsulated._firsts_by_table(io.BytesIO(table), (0, 12), pieces, 3) == [0, 2, 3]
+    for offsets in ((10, 20, 30), (0, 20, 20), (0, 30, 20), (0, 5, 20)):
+        file = io.BytesIO(struct.pack("<3L", *offsets))
+        assert encapsulated._firsts_by_table(file, (0, 12), pieces, 3) == []
+    assert encapsulated._firsts_by_table(io.BytesIO(table), (0, 12), pieces, 2) == []
+
+
+@pytest.mark.parametrize(("more", "said"), [(0, False), (1, True), (2, True)])
+def test_an_even_number_of_bytes_has_no_byte_of_padding(tmp_path, more, said):
+    """32 bytes of pixels; a rest of zeros is told from its first byte on."""
+    (tmp_path / "a").write_bytes(b"\1" * 40 + bytes(32 + more))
+    header: Any = SimpleNamespace(
+        transfer_syntax="1.2.840.10008.1.2.1",
+        **{"frames": 1, "pixel_bytes": 32, "pixel_offset": 40, "pixel_length": 32 + more, "file_bytes": 72 + more},
+        **{"inflate_from": -1, "rows": 4, "columns": 4, "bits_allocated": 16, "signed": True, "float_pixels": False},
+        **{"little_endian": True, "file": tmp_path / "a"},
+    )
+    warnings = check_surplus(SimpleNamespace(), header)  # type: ignore[arg-type]
+    assert [f"Pixel Data has {32 + more} bytes" in text and "taken as padding" in text for text in warnings] == (
+        [True] * said
+    )
+
+
+@pytest.mark.parametrize(("rows", "columns"), [(0, 5), (5, 0), (0, 0)])
+def test_images_without_rows_or_columns(rows, columns):
+    _check_matrix(1, "MONOCHROME2", 1, 1)
+    with pytest.raises(ValueProblem, match=f"is {rows} x {columns}"):
+        _check_matrix(1, "MONOCHROME2", rows, columns)
+
+
+def values_of(**raw: tuple[int, bytes, str]) -> Values:
+    elements: Any = SimpleNamespace(
+        values={tag: value for tag, value, _ in raw.values()},
+        vrs={tag: vr for tag, _, vr in raw.values()},
+        little_endian=True,
+    )
+    return Values(elements)
+
+
+def test_a_single_slice_may_say_that_it_has_one_frame():
+    for text in (b"", b"0 ", b"1 "):
+        _check_single_frame(values_of(frames=(0x00280008, text, "IS")), "1.2")
+    with pytest.raises(ValueProblem, match="multi-frame image of 2 frames"):
+        _check_single_frame(values_of(frames=(0x00280008, b"2 ", "IS")), "1.2")
+
+
+def test_unsigned_numbers_have_two_bytes_or_four_as_ul():
+    assert values_of(rows=(0x00280010, b"\1\2", "US")).unsigned("Rows") == 513
+    assert values_of(rows=(0x00280010, b"\1\2\0\0", "UL")).unsigned("Rows") == 513
+    for raw, vr in ((b"\1\2\0\0", "US"), (b"\1\2", "UL"), (b"\1\2\0\0\0", "UL"), (b"\1", "US")):
+        with pytest.raises(ValueProblem, match="expected one unsigned number"):
+            values_of(rows=(0x00280010, raw, vr)).unsigned("Rows")
+
+
+def test_padding_values_are_binary_numbers():
+    for raw, vr in ((b"\x30\xf8", "SS"), (b"\x30\xf8", "US"), (b"\x30\xf8\xff\xff", "UL"), (b"\x30\xf8", "OW")):
+        assert values_of(padding=(0x00280120, raw, vr)).padding(16, 16, True) == (-2000, -2000)
+    for raw, vr in ((b"-2", "IS"), (b"-2000 ", "DS"), (b"\x30\xf8\xff\xff", "US"), (b"\x30", "US"), (b"\0\0\0", "OW")):
+        with pytest.raises(ValueProblem, match="expected one binary number"):
+            values_of(padding=(0x00280120, raw, vr)).padding(16, 16, True)
+
+
+def test_tags_of_overlays_and_of_what_converters_leave_over():
+    assert [f"{tag:08X}" for tag in OVERLAY_BITS] == [f"60{group:02X}0102" for group in range(0, 32, 2)]
+    assert {keyword_for_tag(tag) for tag in multiframe._UNASSIGNED} == {
+        *("AcquisitionDate", "ContentDate", "AcquisitionTime", "ContentTime", "KVP", "TriggerTime"),
+        *("ConvolutionKernel", "AcquisitionNumber", "TemporalPositionIdentifier", "PixelPaddingValue"),
+        *("PixelPaddingRangeLimit", "RescaleIntercept", "RescaleSlope", "RescaleType", "LossyImageCompression"),
+    }
+
+
+def test_a_header_of_more_than_256_mib_is_not_read():
+    with pytest.raises(ValueProblem, match="a header of 268435457 bytes, no more than 268435456 are read"):
+        multiframe._read_header_bytes(Path("none"), SimpleNamespace(pixel_offset=2**28 + 1))  # type: ignore[arg-type]
+    with pytest.raises(OSError):
+        multiframe._read_header_bytes(Path("none"), SimpleNamespace(pixel_offset=2**28))  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("tag", sorted(plain.SEQUENCE_TAGS)[::9])
+def test_known_sequences_of_undefined_length_are_sequences_in_implicit_vr(tag):
+    key = (tag & 0xFFFF) << 16 | tag >> 16
+    assert plain._is_sequence(b"", 0, key)
+    assert not plain._is_sequence(bytes(4), 0, key ^ 0x40000000)
+    private = struct.unpack("<L", struct.pack("<HH", 0x0009, 0x1001))[0]
+    assert plain._is_sequence(struct.pack("<HH", 0xFFFE, 0xE000), 0, private)
+    assert not plain._is_sequence(bytes(4), 0, private)
