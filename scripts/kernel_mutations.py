@@ -217,6 +217,7 @@ INVERSIONS: dict[str, dict[str, tuple[tuple[str, str], ...]]] = {
     "count_overlaps": {"counts": tuple((f"= {what};", f"= ~{what};") for what in ("own", "next", "second"))},
     "clear_words": {"mask": (("mask[word] = 0;", "mask[word] = ~0u;"),)},
     "set_bits": {"mask": (("1u << (voxel.x & 31)", "~(1u << (voxel.x & 31))"),)},
+    "set_numbered_bits": {"mask": (("1u << (i & 31)", "~(1u << (i & 31))"),)},
     "find_extents": {"extents": (("(ushort)end);", "(ushort)~end);"),)},
     "find_cores": {"mask": (("store_words(core,", "store_words(~core,"),)},
     "count_core_runs": {

@@ -5,7 +5,8 @@
  *
  * Passes
  *   1. clear_words
- *   2. set_bits       items may write the same word: atomic_or(), whose order does not matter
+ *   2. set_bits, or of voxels by number set_numbered_bits: items may write the same word: atomic_or(), whose order does
+ *      not matter
  *   3. find_extents   the part of each row that has bits */
 
 /* Parameters  mask   out  (n,) zeros
@@ -32,6 +33,21 @@ __kernel void set_bits(
         return;
     const int3 voxel = vload3(point, ijk);
     atomic_or(mask + (voxel.z * nj + voxel.y) * words + (voxel.x >> 5), 1u << (voxel.x & 31));
+}
+
+/* Parameters  numbers  in      (n,) voxels as i + ni (j + nj k)
+ *             mask     in/out  (nk nj words) the bits of these voxels are set
+ *             n        voxels;  ni  voxels a row;  words  words a row
+ * Launch      global = n rounded up by the host, any local
+ * Guarantees  the same mask in any order: bits are only set */
+__kernel void set_numbered_bits(
+    __global const uint *restrict numbers, __global uint *mask, const uint n, const uint ni, const int words)
+{
+    const uint point = get_global_id(0);
+    if (point >= n)
+        return;
+    const uint number = numbers[point], row = number / ni, i = number - row * ni;
+    atomic_or(mask + (size_t)row * words + (i >> 5), 1u << (i & 31));
 }
 
 /* Parameters  mask         in   (rows, words)

@@ -7,9 +7,9 @@ entries of the ZIP are dated 1980-01-01, the earliest date of the format, which 
 from __future__ import annotations
 
 import zipfile
+from html import escape  # that of xml.sax loads all of urllib
 from pathlib import Path
 from typing import BinaryIO
-from xml.sax.saxutils import escape
 
 from clrecon.errors import OutputError
 from clrecon.exchange.content import Content, refuse_file
@@ -89,7 +89,7 @@ def _description(content: Content) -> str:
     remarks = content.remarks
     known = len(remarks) - len(content.certificate)
     lines = [" ".join(remarks[:known]), *remarks[known:]]
-    return escape("\n".join(lines))
+    return escape("\n".join(lines), quote=False)
 
 
 def verify(path: Path, content: Content) -> None:

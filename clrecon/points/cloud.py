@@ -43,6 +43,11 @@ def _check_finite(points: NDArray[np.floating], name: str) -> None:
         )
 
 
+def _take(values: NDArray[Any] | VoxelNumbers, numbers: NDArray[np.intp]) -> Any:
+    """Return the values of some points."""
+    return values.take(numbers) if isinstance(values, VoxelNumbers) else values.take(numbers, axis=0)
+
+
 class PointCloud(Message):
     """Points in the patient frame LPS, millimetres, with normals, HU, labels and voxel indices where they are known.
 
@@ -83,12 +88,10 @@ class PointCloud(Message):
         if len(self._points) > MOST_POINTS:
             raise UsageError(f"a cloud has at most {MOST_POINTS:,} points, this one has {len(self._points):,}")
         _check_finite(self._points, "points")
-        self._normals = self._vectors(normals, "normals", np.float32)
-        if self._normals is not None:
-            _check_finite(self._normals, "normals")
-        self._hu = self._values(hu, "hu", np.float32, "fiu")
-        self._labels = self._values(labels, "labels", np.int32, "iu")
-        self._ijk: NDArray[np.int32] | VoxelNumbers | None = self._vectors(ijk, "ijk", np.int32)
+        self._normals = self._checked("normals", normals)
+        self._hu = self._checked("hu", hu)
+        self._labels = self._checked("labels", labels)
+        self._ijk: NDArray[np.int32] | VoxelNumbers | None = self._checked("ijk", ijk)
         self.report: dict[str, Any] = {} if report is None else report
 
     @classmethod
@@ -110,6 +113,17 @@ class PointCloud(Message):
         made._points, made._normals, made._hu, made._labels, made._ijk = points, normals, hu, labels, ijk
         made.report = {} if report is None else report
         return made
+
+    def _checked(self, name: str, values: ArrayLike | None) -> NDArray[Any] | None:
+        """Return what is known of the points as it is kept, for example their `labels`."""
+        if name == "hu":
+            return self._values(values, name, np.float32, "fiu")
+        if name == "labels":
+            return self._values(values, name, np.int32, "iu")
+        vectors = self._vectors(values, name, np.float32 if name == "normals" else np.int32)
+        if name == "normals" and vectors is not None:
+            _check_finite(vectors, name)
+        return vectors
 
     def _vectors(self, values: ArrayLike | None, name: str, dtype: DTypeLike) -> NDArray[Any] | None:
         if values is None:
@@ -157,6 +171,17 @@ class PointCloud(Message):
         return self._ijk
 
     @property
+    def voxel_numbers(self) -> VoxelNumbers | None:
+        """Voxels by number while nobody has asked for their indices, or None: for steps that need no indices."""
+        return self._ijk if isinstance(self._ijk, VoxelNumbers) else None
+
+    def voxel_slices(self) -> NDArray[Any] | None:
+        """Return the slice k of each point that is a voxel centre, shape (n,), whole numbers; None for other points."""
+        if isinstance(self._ijk, VoxelNumbers):
+            return self._ijk.slices()
+        return None if self._ijk is None else self._ijk[:, 2]
+
+    @property
     def has_ijk(self) -> bool:
         """True where the points are voxel centres whose indices are known."""
         return self._ijk is not None
@@ -171,11 +196,18 @@ class PointCloud(Message):
 
     def changed(self, **arrays: ArrayLike | None) -> PointCloud:
         """Return a cloud with other `points`, `normals`, `hu`, `labels`, `ijk` or `report`; all else stays."""
-        own = {name: getattr(self, name) for name in ("points", "normals", "hu", "labels", "ijk", "report")}
-        unknown = arrays.keys() - own.keys()
+        known = ("points", "normals", "hu", "labels", "ijk", "report")
+        unknown = arrays.keys() - set(known)
         if unknown:
-            raise UsageError(f"a cloud has no {sorted(unknown)[0]}: it has {', '.join(own)}")
-        return PointCloud(**{**own, "report": dict(self.report), **arrays})
+            raise UsageError(f"a cloud has no {sorted(unknown)[0]}: it has {', '.join(known)}")
+        if "points" in arrays or "report" in arrays:
+            own = {name: getattr(self, name) for name in known}
+            return PointCloud(**{**own, "report": dict(self.report), **arrays})
+        # What stays was checked before.
+        made = PointCloud.of_known(self._points, self._normals, self._hu, self._labels, self._ijk, dict(self.report))
+        for name, values in arrays.items():
+            setattr(made, f"_{name}", made._checked(name, values))
+        return made
 
     def select(self, mask: ArrayLike) -> PointCloud:
         """Return the cloud of some of the points.
@@ -202,8 +234,11 @@ class PointCloud(Message):
                 f"a selection of a cloud of {len(self):,} points is as many truth values or numbers of points below"
                 f" that, this is {chosen.dtype} of shape {chosen.shape}"
             )
-        arrays = {name: getattr(self, name) for name in ("points", "normals", "hu", "labels", "ijk")}
-        return self.changed(**{name: values[chosen] for name, values in arrays.items() if values is not None})
+        numbers = np.flatnonzero(chosen) if chosen.dtype == bool else chosen
+        points = as_stored(self._points.take(numbers, axis=0))  # those far from the origin may be gone
+        of_points = {"normals": self._normals, "hu": self._hu, "labels": self._labels, "ijk": self._ijk}
+        taken = {name: _take(values, numbers) for name, values in of_points.items() if values is not None}
+        return PointCloud.of_known(points, **taken, report=dict(self.report))
 
     def in_space(self, space: str) -> tuple[NDArray[np.floating], NDArray[np.float32] | None]:
         """Return points and normals in another patient frame; the cloud itself is always LPS.
@@ -225,14 +260,15 @@ class PointCloud(Message):
         points = self._points * signs + np.float32(0)
         return points, None if self._normals is None else self._normals * signs + np.float32(0)
 
-    def describe(self, space: str, *, keep_ids: bool = False) -> PointContent:
+    def describe(self, space: str, *, keep_ids: bool = False, with_ijk: bool = True) -> PointContent:
         """Return the contents of a file of the cloud in `space`; nothing else of `report` is ever written.
 
-        Only with `keep_ids` they have the hash of the frame of reference.
+        Only with `keep_ids` they have the hash of the frame of reference, and only with `with_ijk` voxel indices.
         """
         points, normals = self.in_space(space)
         facts = describe_facts(self.report, space, keep_ids=keep_ids)
-        return PointContent(vertices=points, normals=normals, hu=self._hu, labels=self._labels, ijk=self.ijk, **facts)
+        ijk = self.ijk if with_ijk else None
+        return PointContent(vertices=points, normals=normals, hu=self._hu, labels=self._labels, ijk=ijk, **facts)
 
     def save(
         self, path: str | os.PathLike[str], space: str = "lps", *, no_clobber: bool = False, keep_ids: bool = False

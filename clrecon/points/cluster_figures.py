@@ -21,6 +21,10 @@ SHEET_RATIO = 15.0
 five scans have 27 and more, clusters among bone up to 5."""
 
 
+LEAST_RUN = 4
+"""Points of one cluster in a row, on the average, from which they are summed run by run."""
+
+
 @dataclass(frozen=True)
 class ClusterFigures:
     """The clusters of a cloud, an entry of each array for each.
@@ -69,6 +73,44 @@ class ClusterFigures:
         ]
 
 
+class _Groups:
+    """The points by cluster.  Neighbours in the order of a cloud mostly are of one cluster: runs of them come first."""
+
+    def __init__(self, labels: NDArray[np.int32]):
+        begins = np.ones(len(labels), bool)
+        np.not_equal(labels[1:], labels[:-1], out=begins[1:])
+        self._starts: NDArray[np.intp] | None = np.flatnonzero(begins)
+        if LEAST_RUN * len(self._starts) > len(labels):
+            self._starts = None  # a run is a point
+            lengths = None
+        else:
+            self._lengths = np.diff(self._starts, append=len(labels))
+            lengths, labels = self._lengths, labels[self._starts]
+        self._labels = np.maximum(labels, -1).astype(np.intp)
+        self._labels += 1  # 0 is noise
+        self.count = int(self._labels.max(initial=0))
+        self.sizes: NDArray[np.int64] = np.bincount(self._labels, lengths, self.count + 1)[1:].astype(np.int64)
+
+    def sums(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the sum of the values of each cluster."""
+        runs = values if self._starts is None else np.add.reduceat(values, self._starts)
+        return np.bincount(self._labels, runs, self.count + 1)[1:].astype(np.float64, copy=False)
+
+    def ends(self, values: NDArray[np.floating]) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
+        """Return the lowest and the highest value of each cluster; infinite without points."""
+        ends = []
+        for extreme, none in ((np.minimum, np.inf), (np.maximum, -np.inf)):
+            found = np.full(self.count + 1, none, values.dtype)
+            extreme.at(found, self._labels, values if self._starts is None else extreme.reduceat(values, self._starts))
+            ends.append(found[1:])
+        return ends[0], ends[1]
+
+    def spread(self, figures: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the figure of its cluster for each point; 0 for noise."""
+        of_runs = np.append(0.0, figures).take(self._labels)
+        return of_runs if self._starts is None else np.repeat(of_runs, self._lengths)
+
+
 def measure_clusters(cloud: PointCloud) -> ClusterFigures:
     """Measure each cluster of a cloud with labels; noise is left out.
 
@@ -79,27 +121,18 @@ def measure_clusters(cloud: PointCloud) -> ClusterFigures:
     """
     if cloud.labels is None:
         raise UsageError("the points have no labels: cluster them first")
-    labels, points = cloud.labels.astype(np.intp), cloud.points
-    kept: NDArray[np.intp] | None = None
-    if labels.size and labels.min() < 0:
-        kept = np.flatnonzero(labels >= 0)
-        labels = labels[kept]
-    count = int(labels.max(initial=-1)) + 1
-    sizes = np.bincount(labels, minlength=count)
-    boxes = np.stack([np.full((count, 3), np.inf), np.full((count, 3), -np.inf)], axis=1)
-    centres, spread = np.zeros((count, 3)), np.zeros((count, 3, 3))
+    groups = _Groups(cloud.labels)
+    count, sizes = groups.count, groups.sizes
+    boxes, centres, spread = np.empty((count, 2, 3)), np.empty((count, 3)), np.zeros((count, 3, 3))
     shares = 1.0 / np.maximum(sizes, 1)
     around: list[NDArray[np.float64]] = []
     for axis in range(3):
-        own = np.ascontiguousarray(points[:, axis] if kept is None else points[:, axis][kept])
-        low, high = np.full(count, np.inf, own.dtype), np.full(count, -np.inf, own.dtype)
-        np.minimum.at(low, labels, own)
-        np.maximum.at(high, labels, own)
-        boxes[:, 0, axis], boxes[:, 1, axis] = low, high
+        own = np.ascontiguousarray(cloud.points[:, axis])
+        boxes[:, 0, axis], boxes[:, 1, axis] = groups.ends(own)
         values = own.astype(np.float64)
-        centres[:, axis] = np.bincount(labels, values, count) * shares
-        around.append(values - centres[labels, axis])
+        centres[:, axis] = groups.sums(values) * shares
+        around.append(values - groups.spread(centres[:, axis]))
         for other in range(axis + 1):
-            spread[:, axis, other] = np.bincount(labels, around[axis] * around[other], count) * shares
+            spread[:, axis, other] = groups.sums(around[axis] * around[other]) * shares
     lengths = np.linalg.eigvalsh(spread) if count else np.zeros((0, 3))  # reads the lower triangles
     return ClusterFigures(sizes, centres, boxes, np.sqrt(np.maximum(lengths, 0.0)))

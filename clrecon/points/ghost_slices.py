@@ -130,18 +130,19 @@ def drop_ghost_slices(cloud: PointCloud, found: GhostSlices, *, volume: Volume |
         The cloud has no voxel indices and no volume is given, or its slices are not those that were tested.
     """
     nk = len(found.points)
-    if cloud.ijk is not None:
-        k, reach = cloud.ijk[:, 2].astype(np.float64), 0.5
-    elif volume is not None:
-        k, reach = volume.lps_to_ijk(cloud.points)[:, 2], 1.0
-    else:
-        raise UsageError("the points do not say in which slice they lie: give the volume that they come from")
+    k = cloud.voxel_slices()
+    is_voxels = k is not None
+    if k is None:
+        if volume is None:
+            raise UsageError("the points do not say in which slice they lie: give the volume that they come from")
+        k = volume.lps_to_ijk(cloud.points)[:, 2]
     if len(k) and not -1.0 <= k.min() <= k.max() <= nk:
         raise UsageError(f"the points lie in slices {k.min():g} to {k.max():g}, {nk} were tested: another volume")
     removed = np.zeros(len(cloud), np.uint8)
     for ghost in found.slices:
-        removed[np.abs(k - ghost) < reach] = 1
-    return PointStep(cloud.select(removed == 0), removed, (REASON,), found.as_dict(), found.warnings)
+        removed[k == ghost if is_voxels else np.abs(k - ghost) < 1.0] = 1
+    left = cloud.select(removed == 0) if removed.any() else cloud
+    return PointStep(left, removed, (REASON,), found.as_dict(), found.warnings)
 
 
 def fill_ghost_slices(volume: Volume, found: GhostSlices) -> Volume:

@@ -107,7 +107,7 @@ def keep_clusters(
     if labels.max(initial=-1) >= len(figures.points):
         raise UsageError(f"the figures are of {len(figures.points):,} clusters, the cloud has others: leave them out")
     fate, facts = _judge(cloud, figures, wanted, cores)
-    removed = np.where(labels < 0, 1, fate[labels] if len(fate) else 1).astype(np.uint8)
+    removed = np.append(np.uint8(1), fate).take(np.maximum(labels, -1) + 1)  # the first one is that of noise
     kept = removed == 0
     if not kept.any():
         raise NoSurfaceError(_describe_nothing(labels, figures, fate))
@@ -119,7 +119,7 @@ def keep_clusters(
         "clusters": figures.as_dicts(REPORTED),
         **facts,
     }
-    return PointStep(cloud.select(kept), removed, REASONS, facts)
+    return PointStep(cloud if kept.all() else cloud.select(kept), removed, REASONS, facts)
 
 
 def _write(rule: KeepRule) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -11,7 +11,12 @@ from numpy.typing import NDArray
 
 from clrecon.points.cloud import PointCloud
 
-__all__ = ["PointStep"]
+__all__ = ["PointStep", "count_numbers"]
+
+
+def count_numbers(numbers: NDArray[np.uint8], reasons: Sequence[str]) -> dict[str, int]:
+    """Return how many points have the number of each reason, from 1: a pass for each is faster than one for all."""
+    return {reason: int(np.count_nonzero(numbers == number)) for number, reason in enumerate(reasons, 1)}
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,8 +46,7 @@ class PointStep:
     @property
     def counts(self) -> dict[str, int]:
         """Number of removed points for each reason."""
-        counts = np.bincount(self.removed, minlength=len(self.reasons) + 1)
-        return {reason: int(count) for reason, count in zip(self.reasons, counts[1:], strict=True)}
+        return count_numbers(self.removed, self.reasons)
 
     def as_dict(self) -> dict[str, Any]:
         """Return the entries of the step's report: points before and after, removed by reason, facts."""

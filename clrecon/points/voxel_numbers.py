@@ -25,6 +25,16 @@ class VoxelNumbers:
     numbers: NDArray[Any]
     shape_ijk: tuple[int, int, int]
 
+    def slices(self) -> NDArray[Any]:
+        """Return the slice k of each voxel, shape (n,)."""
+        ni, nj, _ = self.shape_ijk
+        kind = self.numbers.dtype.type
+        return self.numbers // kind(ni) // kind(nj)  # a slice may have 2^32 voxels, their product is no uint32 then
+
+    def take(self, chosen: NDArray[np.intp]) -> VoxelNumbers:
+        """Return some of the voxels, by their places in the list."""
+        return VoxelNumbers(self.numbers.take(chosen), self.shape_ijk)
+
     def indices(self) -> NDArray[np.int32]:
         """Return the voxel indices (i, j, k), shape (n, 3)."""
         ni, nj, _ = self.shape_ijk

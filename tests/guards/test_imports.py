@@ -7,6 +7,7 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -93,3 +94,18 @@ def test_surfaces_load_no_label_maps_and_no_dicom(tmp_path: Path) -> None:
     code = "import clrecon; clrecon.extract_isosurface, clrecon.SurfaceExtractor, clrecon.DeviceVolume"
     loaded = loaded_after(code, tmp_path)
     assert "numpy" in loaded and not loaded & {"pydicom", "scipy", "clrecon.labels", "clrecon.dicom"}
+
+
+@pytest.mark.first_device
+@pytest.mark.parametrize("hu", [(200.0, 3000.0), 226.0])
+def test_preparing_a_device_for_a_cloud_loads_no_scipy(device: Any, hu: object) -> None:
+    """It takes as long to load as the scan takes to read, beside which the device is prepared."""
+    code = f"""
+import sys, clrecon
+from clrecon.jobs.cloud.points import prepare_chain
+from clrecon.jobs.cloud.settings import CloudSettings, Clustering
+prepare_chain(clrecon.device({device.index}), CloudSettings(hu={hu}, clusters=Clustering()), is_cloud=False)
+"""
+    done = subprocess.run([sys.executable, "-c", f"{code}\n{LOADED}"], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert set(json.loads(done.stdout.splitlines()[-1])) & HEAVY == {"numpy", "pyopencl"}

@@ -10,6 +10,7 @@ import pytest
 
 from clrecon.errors import UsageError
 from clrecon.points import PointCloud, PointStep
+from clrecon.points.voxel_numbers import VoxelNumbers
 
 
 def a_cloud(n: int = 5) -> PointCloud:
@@ -41,6 +42,43 @@ def test_a_selection_takes_every_array_along() -> None:
         assert one.points[:, 0].tolist() == [3.0, 9.0, 12.0] and one.ijk[:, 2].tolist() == [5, 11, 14]
     assert cloud.select([4, 0]).hu.tolist() == [400.0, 0.0]
     assert kept.report == cloud.report and kept.report is not cloud.report
+
+
+def test_voxels_by_number_stay_numbers_until_their_indices_are_asked_for() -> None:
+    shape = (5, 4, 3)
+    numbers = VoxelNumbers(np.array([0, 19, 20, 41, 59], np.uint32), shape)
+    cloud = PointCloud.of_known(np.zeros((5, 3), np.float32), ijk=numbers).changed(labels=np.arange(5))
+    chosen = cloud.select([True, False, True, False, True])
+    assert chosen.voxel_numbers is not None and chosen.labels.tolist() == [0, 2, 4]
+    assert chosen.voxel_slices().tolist() == [0, 1, 2]
+    assert cloud.describe("lps", with_ijk=False).ijk is None and cloud.voxel_numbers is not None
+    expected = [[0, 0, 0], [4, 3, 0], [0, 0, 1], [1, 0, 2], [4, 3, 2]]
+    assert cloud.ijk.tolist() == expected and cloud.voxel_numbers is None
+    assert cloud.voxel_slices().tolist() == [0, 0, 1, 2, 2]
+    assert chosen.describe("lps").ijk.tolist() == expected[::2]
+    assert PointCloud(np.zeros((2, 3))).voxel_slices() is None
+
+
+def test_what_is_changed_is_checked() -> None:
+    cloud = PointCloud(np.zeros((3, 3)), hu=[1, 2, 3], report={"a": 1})
+    changed = cloud.changed(hu=None, normals=np.eye(3))
+    assert changed.hu is None and changed.normals.dtype == np.float32 and cloud.normals is None
+    changed.report["b"] = 2
+    assert cloud.report == {"a": 1} and cloud.changed(report={}).report == {}
+    with pytest.raises(UsageError, match="1 of 3 normals are not finite"):
+        cloud.changed(normals=np.where(np.eye(3) > 0, [1.0, 1.0, np.nan], 0.0))
+    with pytest.raises(UsageError, match="not finite"):
+        cloud.changed(points=np.full((3, 3), np.inf))
+    with pytest.raises(UsageError, match="labels have shape"):
+        cloud.changed(labels=[1, 2])
+    with pytest.raises(UsageError, match="a cloud has no colour"):
+        cloud.changed(colour=[1, 2, 3])
+
+
+def test_a_selection_of_far_points_is_stored_as_others_are() -> None:
+    cloud = PointCloud(np.array([[0.1, 0.2, 0.3], [1e5, 0.0, 0.1]]))
+    assert cloud.points.dtype == np.float64
+    assert cloud.select([1]).points.dtype == np.float64 and cloud.select([0]).points.dtype == np.float32
 
 
 def test_ras_negates_x_and_y() -> None:

@@ -93,6 +93,30 @@ def test_figures_of_a_turned_cluster() -> None:
     assert figures.points.tolist() == [5000, 5000]
 
 
+def test_figures_do_not_depend_on_the_order_of_the_points() -> None:
+    rng = np.random.default_rng(11)
+    labels = np.repeat([2, -1, 0, 4, 0, -3, 2], [400, 70, 300, 9, 250, 30, 800])  # 1 and 3 have no points
+    points = (rng.normal(size=(len(labels), 3)) * (1.0, 3.0, 9.0) + labels[:, None] * 20.0).astype(np.float32)
+    for order in (np.arange(len(labels)), rng.permutation(len(labels))):  # in runs, and hardly ever
+        figures = measure_clusters(PointCloud(points[order], labels=labels[order]))
+        assert figures.points.tolist() == [550, 0, 1200, 0, 9]
+        for cluster in (0, 2, 4):
+            own = points[labels == cluster].astype(np.float64)
+            np.testing.assert_array_equal(figures.boxes[cluster], [own.min(axis=0), own.max(axis=0)])
+            np.testing.assert_allclose(figures.centres[cluster], own.mean(axis=0), rtol=1e-12)
+            squares = np.linalg.eigvalsh(np.cov(own.T, bias=True))
+            np.testing.assert_allclose(figures.deviations[cluster], np.sqrt(squares), rtol=1e-9)
+        assert np.isinf(figures.boxes[[1, 3]]).all() and not figures.deviations[[1, 3]].any()
+
+
+def test_any_negative_label_is_noise() -> None:
+    cloud = PointCloud(np.arange(15.0).reshape(5, 3), labels=[0, -1, -7, 1, 0])
+    step = keep_clusters(cloud)
+    assert step.removed.tolist() == [0, 1, 1, 0, 0]
+    assert step.counts == {"noise": 2, "sheet": 0, "small cluster": 0, "other cluster": 0}
+    assert step.cloud.points[:, 0].tolist() == [0.0, 9.0, 12.0]
+
+
 @pytest.mark.parametrize(
     "rule",
     ["", "biggest", "largest:0", "largest:1.5", "largest:", "min", "min:-3", "seed:1,2", "seed:a,b,c", "no-sheets:3"],

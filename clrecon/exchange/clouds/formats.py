@@ -35,7 +35,7 @@ class WritableCloud(Protocol):
     """Protocol of an object that can be written: a `PointCloud`."""
 
     def __len__(self) -> int: ...
-    def describe(self, space: str, *, keep_ids: bool = False) -> PointContent: ...
+    def describe(self, space: str, *, keep_ids: bool = False, with_ijk: bool = True) -> PointContent: ...
 
 
 def check_cloud_format(path: str | os.PathLike[str]) -> str:
@@ -85,7 +85,8 @@ def stage_cloud(
 ) -> AbstractContextManager[StagedFile]:
     """Write a cloud under a temporary name, to be committed with other files; see `clrecon.system.files.stage_file`."""
     extension = check_cloud_format(path)
-    content = cloud.describe(space, keep_ids=keep_ids)
+    has_place = "ijk" in _KEPT.get(extension, _KEPT_BY_OTHERS)
+    content = cloud.describe(space, keep_ids=keep_ids, with_ijk=has_place)
     if len(cloud) == 0:
         raise NoSurfaceError(f"the cloud is empty: no {extension[1:].upper()} file is written")
     return stage_content(content, path, CLOUD_FORMATS[extension], f"{len(cloud):,} points", "PLY or VTP")

@@ -51,7 +51,7 @@ def _cluster(trail: Trail, settings: CloudSettings, resident: DeviceVolume | Non
     from clrecon.points.keep import keep_clusters
 
     eps, volume = chosen.eps, resident
-    if resident is not None and trail.cloud.ijk is None:  # points of a surface: free, but of that scan
+    if resident is not None and not trail.cloud.has_ijk:  # points of a surface: free, but of that scan
         from clrecon.points.stencil import Lattice
 
         eps, volume = Lattice.of(resident.volume).default_eps if eps is None else eps, None

@@ -47,7 +47,6 @@ class CloudFiles:
             A folder is missing or cannot be written, or a target is no regular file.
         """
         from clrecon.exchange.clouds.formats import check_cloud_format
-        from clrecon.exchange.formats import check_format
         from clrecon.system.files import check_writable
 
         named = [
@@ -61,6 +60,8 @@ class CloudFiles:
             if path is not None:
                 check_cloud_format(path)
         if self.surface is not None:
+            from clrecon.exchange.formats import check_format
+
             check_format(self.surface)
         check_distinct(outputs)
         for _, path in outputs:

@@ -189,7 +189,6 @@ def _write(
 ) -> CloudReport:
     """Write all files, the report as the last one, and return it."""
     from clrecon.exchange.clouds.formats import describe_cloud_losses, stage_cloud
-    from clrecon.exchange.formats import stage_mesh
 
     space, ids = settings.space, settings.keep_ids
     progress("write", 0, 0)
@@ -205,10 +204,12 @@ def _write(
                 written.append(file)
                 entries.append(describe_file(what, path, file.size))
         if surface is not None and files.surface is not None:
+            from clrecon.exchange.formats import stage_mesh  # with all its writers
+
             mesh_file = staged.enter_context(stage_mesh(surface, files.surface, space, keep_ids=ids))
             written.append(mesh_file)
             entries.append(describe_file("surface", files.surface, mesh_file.size))
-        losses = describe_cloud_losses(trail.cloud.describe(space), f".{entries[0]['format']}")
+        losses = describe_cloud_losses(trail.cloud.describe(space, with_ijk=False), f".{entries[0]['format']}")
         watch.lap("write")
         report = describe_clouds(
             subject, trail, settings, device, surface=surface, has_removed=files.removed is not None, outputs=entries,

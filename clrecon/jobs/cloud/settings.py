@@ -202,7 +202,7 @@ class CloudSettings(InputSettings):
 
     def for_trial(self) -> CloudSettings:
         """Return the settings for a cube of a few voxels: the same steps, none of them about this scan."""
-        hu = (0.0, 3000.0) if self.is_band else 0.0
+        hu = (300.0, 3000.0) if self.is_band else 300.0  # below, a cube of 12 mm is searched for a face
         rules = [rule for rule in self.keep if not rule.lower().startswith(("min", "seed"))]
         return replace(
             self,

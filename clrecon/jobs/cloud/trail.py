@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from clrecon.errors import RefusedInputError
+from clrecon.points.step import count_numbers
 from clrecon.system.gates import Gate
 from clrecon.system.wording import name_parameter
 
@@ -71,7 +72,7 @@ class Trail:
         self.fate: NDArray[np.uint8] = np.zeros(len(cloud), np.uint8)
         self.gates: list[Gate] = []
         self.warnings: list[str] = []
-        self._there: NDArray[np.intp] = np.arange(len(cloud))
+        self._there: NDArray[np.intp] | None = None
         self._lap = time.perf_counter() if began is None else began
         self.warnings += cloud.report.get("warnings", ())
         if began is not None:
@@ -106,9 +107,12 @@ class Trail:
             if count and reason not in self.reasons:
                 self.reasons.append(reason)
             numbers.append(self.reasons.index(reason) + 1 if count else 0)
-        gone = step.removed > 0
-        self.fate[self._there[gone]] = np.array(numbers, np.uint8)[step.removed[gone]]
-        self._there = self._there[~gone]
+        is_gone = step.removed > 0
+        if is_gone.any():
+            gone, left = np.flatnonzero(is_gone), np.flatnonzero(~is_gone)
+            there = self._there
+            self.fate[gone if there is None else there[gone]] = np.array(numbers, np.uint8)[step.removed[gone]]
+            self._there = left if there is None else there[left]
         self.cloud = step.cloud
         told = step.as_dict()
         self.steps.append({"step": name, **told, "seconds": self._seconds()})
@@ -146,8 +150,7 @@ class Trail:
     @property
     def counts(self) -> dict[str, int]:
         """Points that went, by reason, in the order of the steps."""
-        counts = np.bincount(self.fate, minlength=len(self.reasons) + 1)[1:]
-        return {reason: int(count) for reason, count in zip(self.reasons, counts, strict=True)}
+        return count_numbers(self.fate, self.reasons)
 
     def removed_cloud(self) -> PointCloud:
         """Return the first cloud with the fate of each point as its label: 0 kept, else the number of the reason."""

@@ -14,6 +14,7 @@ from clrecon.operators.points.slice_overlap import count_overlaps
 from clrecon.operators.points.voxel_clusters import ClusterSearch, pad_for
 from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.points.stencil import Lattice, make_stencil
+from clrecon.points.voxel_numbers import VoxelNumbers
 from clrecon.reference.points import clusters as twin
 from clrecon.reference.points import slice_overlap as overlap_twin
 
@@ -45,7 +46,11 @@ def _check_masks(device: Device) -> str:
     inside = (volume.voxels >= 75) & (volume.voxels <= 110)
     inside[:, 7] = False
     ijk = np.argwhere(inside)[:, ::-1].astype(np.int32)
-    listed = mark_voxels(device, np.random.default_rng(4).permutation(ijk), volume.shape_ijk, pad=1)
+    mixed = np.random.default_rng(4).permutation(len(ijk))
+    numbers = VoxelNumbers(np.flatnonzero(inside)[mixed].astype(np.uint32), volume.shape_ijk)
+    numbered = mark_voxels(device, numbers, volume.shape_ijk, pad=1)
+    require_equal(_bits(device, numbered), inside, "the mask of a list of voxels by number")
+    listed = mark_voxels(device, ijk[mixed], volume.shape_ijk, pad=1)
     require_equal(_bits(device, listed), inside, "the mask of a list of voxels")
     extents = download(device, np.empty((*SHAPE[:2], 2), np.uint16), listed.row_extents_d)
     columns = inside.reshape(*SHAPE[:2], -1)
@@ -85,7 +90,7 @@ def _check_overlaps(device: Device) -> str:
 
 
 CHECKS = (
-    Check("masks of voxels", ("clear_words", "set_bits", "find_extents"), _check_masks),
+    Check("masks of voxels", ("clear_words", "set_bits", "set_numbered_bits", "find_extents"), _check_masks),
     Check(
         "clusters of voxels",
         (

@@ -120,10 +120,12 @@ def check_kept(outputs: Sequence[tuple[str, str | Path | None]], *inputs: str | 
 
 def _find_voxels(path: str | Path) -> Path | None:
     """Return the file that a header names for its voxels; None if it is the same file, or there is no header."""
-    from clrecon.formats import VOLUME, open_grid, tell_kind
+    if not os.path.isfile(path):
+        return None
+    from clrecon.formats import VOLUME, open_grid, tell_kind  # which a folder of DICOM does not need
 
     try:
-        kind = tell_kind(Path(path)) if os.path.isfile(path) else None
+        kind = tell_kind(Path(path))
         return open_grid(Path(path), kind, VOLUME).voxel_bytes.path if kind and kind != "DICOM" else None
     except (ClreconError, OSError):
         return None  # reading reports the error

@@ -15,6 +15,7 @@ from clrecon.geometry import Volume
 from clrecon.opencl import Device, Program, Stopwatch, allocate, copy_buffer, launch, load_program, upload
 from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.operators.resident.voxel_types import voxel_variants
+from clrecon.points.voxel_numbers import VoxelNumbers
 from clrecon.system.progress import Progress, ignore_progress
 from clrecon.system.wording import name_parameter
 
@@ -250,7 +251,7 @@ class _Marking:
 
 def mark_voxels(
     device: Device,
-    ijk: NDArray[np.int32],
+    voxels: NDArray[np.int32] | VoxelNumbers,
     shape_ijk: tuple[int, int, int],
     *,
     pad: int = 0,
@@ -261,8 +262,8 @@ def mark_voxels(
     Parameters
     ----------
     device : Device
-    ijk : ndarray, shape (n, 3), int32
-        Voxels within the volume.
+    voxels : ndarray, shape (n, 3), int32, or VoxelNumbers of uint32
+        Voxels within the volume, by index or by number.
     shape_ijk : (ni, nj, nk)
     pad : int
         Words of zeros behind each row.
@@ -281,12 +282,16 @@ def mark_voxels(
     program = load_program(device, "points/band_mask.cl")
     mask_d, extents_d = allocate(device, 4 * words * rows), allocate(device, 4 * rows)
     launch(device, program["clear_words"], words * rows, stopwatch=stopwatch, mask=mask_d, n=words * rows)
-    if len(ijk):
-        ijk_d = upload(device, np.ascontiguousarray(ijk, np.int32))
-        launch(
-            device, program["set_bits"], len(ijk), stopwatch=stopwatch, ijk=ijk_d, mask=mask_d, n=len(ijk), nj=nj,
-            words=words,
-        )  # fmt: skip
+    if isinstance(voxels, VoxelNumbers):
+        n, kernel = len(voxels.numbers), "set_numbered_bits"
+        given = {"numbers": np.ascontiguousarray(voxels.numbers, np.uint32)}
+        sizes = {"ni": ni}
+    else:
+        n, kernel = len(voxels), "set_bits"
+        given, sizes = {"ijk": np.ascontiguousarray(voxels, np.int32)}, {"nj": nj}
+    if n:
+        given_d = {name: upload(device, values) for name, values in given.items()}
+        launch(device, program[kernel], n, stopwatch=stopwatch, mask=mask_d, n=n, words=words, **given_d, **sizes)
     launch(
         device, program["find_extents"], rows, stopwatch=stopwatch, mask=mask_d, row_extents=extents_d, rows=rows,
         words=words,

@@ -21,6 +21,7 @@ from clrecon.points import PointCloud, PointStep
 from clrecon.points.cluster_figures import ClusterFigures, measure_clusters
 from clrecon.points.keep import REPORTED
 from clrecon.points.stencil import Lattice, Stencil, checked_eps, make_stencil
+from clrecon.points.voxel_numbers import VoxelNumbers
 from clrecon.system.progress import Progress
 from clrecon.system.wording import name_parameter
 
@@ -125,9 +126,9 @@ def cluster_points(
             raise UsageError(f"{name_parameter('hu')} says which voxels of a volume are points; a cloud has its points")
         if not len(cloud):
             raise UsageError("the cloud is empty: there is nothing to cluster")
-        if cloud.ijk is None:
+        if not cloud.has_ijk:
             return _cluster_free(cloud, eps, min_samples, volume, device, memory, progress)
-        return _cluster_cloud(cloud, cloud.ijk, eps, min_samples, volume, device, memory)
+        return _cluster_cloud(cloud, eps, min_samples, volume, device, memory)
     if hu is None or volume is not None:
         raise UsageError(f"clusters of a volume need {name_parameter('hu', 'LO,HI')} and no other volume")
     band = checked_band(hu)
@@ -197,8 +198,8 @@ class _Request:
             warnings.append(f"{len(cloud):,} points are fewer than min_samples {self.samples}: all are noise")
         facts = {
             **self.describe(search),
-            "core_points": int(cores.sum()),
-            "noise_points": int((labels < 0).sum()),
+            "core_points": int(np.count_nonzero(cores)),
+            "noise_points": int(np.count_nonzero(labels < 0)),
             "sheets": int(figures.sheets.sum()),
             "largest_clusters": figures.as_dicts(REPORTED),
             "device": device.label,
@@ -254,29 +255,26 @@ def _cluster_free(
     labelled = cloud.changed(labels=found.labels)
     figures = measure_clusters(labelled)
     facts = {**found.facts, "sheets": int(figures.sheets.sum()), "largest_clusters": figures.as_dicts(REPORTED)}
-    return Clustering(labelled, np.zeros(len(cloud), np.uint8), (), facts, found.warnings, found.cores)
+    return Clustering(labelled, np.zeros(len(cloud), np.uint8), (), facts, found.warnings, found.cores, figures)
 
 
 def _cluster_cloud(
     cloud: PointCloud,
-    ijk_of_cloud: NDArray[np.int32],
     eps: float | None,
     min_samples: int | str,
     volume: Volume | DeviceVolume | None,
     device: Device | str | int | None,
     memory: int | None,
 ) -> Clustering:
-    order, ijk = _order_voxels(ijk_of_cloud)
-    lattice, first = _find_lattice(cloud, volume)
+    own = volume.volume if isinstance(volume, DeviceVolume) else volume
+    order, lattice, voxels = _find_numbered(cloud, own) or _find_listed(cloud, own)
     request = _Request.of(lattice, eps, min_samples)
     taken = take_device(device) if not isinstance(volume, DeviceVolume) else volume.device
 
     def work(current: Device, told: list[str]) -> Clustering:
         stopwatch = Stopwatch()
         with stopwatch.running(current):
-            mask = mark_voxels(
-                current, ijk - first, lattice.shape_ijk, pad=pad_for(request.stencil), stopwatch=stopwatch
-            )
+            mask = mark_voxels(current, voxels, lattice.shape_ijk, pad=pad_for(request.stencil), stopwatch=stopwatch)
             search = ClusterSearch(current, mask, request.stencil, request.samples, memory=memory, stopwatch=stopwatch)
             labels, cores = search.label(), search.flag_cores()
             if order is not None:
@@ -284,6 +282,30 @@ def _cluster_cloud(
         return request.finish(cloud, labels, cores, search, stopwatch, current, told)
 
     return work_on(taken, work)
+
+
+Order = NDArray[np.int64] | None
+
+
+def _find_numbered(cloud: PointCloud, volume: Volume | None) -> tuple[Order, Lattice, VoxelNumbers] | None:
+    """Return order, lattice and voxels of a cloud as it is extracted: numbers of that volume, ascending; else None."""
+    voxels = cloud.voxel_numbers
+    if volume is None or voxels is None or voxels.shape_ijk != volume.shape_ijk or voxels.numbers.dtype != np.uint32:
+        return None
+    within = not len(cloud) or int(voxels.numbers[-1]) < volume.voxels.size
+    if not (within and (voxels.numbers[1:] > voxels.numbers[:-1]).all()):
+        return None
+    some = np.arange(0, len(cloud), _stride(cloud))
+    _check_places(volume.ijk_to_lps(voxels.take(some).indices()), cloud, is_given=True)
+    return None, Lattice.of(volume), voxels
+
+
+def _find_listed(cloud: PointCloud, volume: Volume | None) -> tuple[Order, Lattice, NDArray[np.int32]]:
+    """Return order, lattice and voxels of any cloud of voxels."""
+    assert cloud.ijk is not None
+    order, ijk = _order_voxels(cloud.ijk)
+    lattice, first = _find_lattice(cloud, volume)
+    return order, lattice, ijk - first
 
 
 def _corners(ijk: NDArray[np.int32]) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
@@ -329,7 +351,7 @@ def _restore_order(
     return mine, mine_cores
 
 
-def _find_lattice(cloud: PointCloud, volume: Volume | DeviceVolume | None) -> tuple[Lattice, NDArray[np.int32]]:
+def _find_lattice(cloud: PointCloud, volume: Volume | None) -> tuple[Lattice, NDArray[np.int32]]:
     """Return the lattice of a cloud's voxels, and the voxel that it begins with.
 
     Raises
@@ -339,28 +361,34 @@ def _find_lattice(cloud: PointCloud, volume: Volume | DeviceVolume | None) -> tu
     """
     assert cloud.ijk is not None
     low, high = _corners(cloud.ijk)
-    some = slice(None, None, max(1, len(cloud) // PLACES_CHECKED))
+    some = cloud.ijk[:: _stride(cloud)]
     if volume is not None:
-        own = volume.volume if isinstance(volume, DeviceVolume) else volume
-        if (low < 0).any() or (high >= own.shape_ijk).any():
+        if (low < 0).any() or (high >= volume.shape_ijk).any():
             raise UsageError(
-                f"the cloud's voxels run from {low.tolist()} to {high.tolist()}, the volume has {own.shape_ijk} voxels:"
-                " it is another volume"
+                f"the cloud's voxels run from {low.tolist()} to {high.tolist()}, the volume has {volume.shape_ijk}"
+                " voxels: it is another volume"
             )
-        places = own.ijk_to_lps(cloud.ijk[some])
-        lattice, first = Lattice.of(own), np.zeros(3, np.int32)
-    else:
-        affine = cloud.report.get("affine_ijk_to_lps_mm")
-        if affine is None:
-            raise UsageError("the cloud does not say where its voxels lie: give the volume that it comes from")
-        matrix = checked_affine(affine)
-        places = cloud.ijk[some] @ matrix[:3, :3].T + matrix[:3, 3]
-        ni, nj, nk = (high - low + 1).tolist()
-        lattice, first = Lattice((ni, nj, nk), matrix), low
-    away = float(np.abs(places - cloud.points[some]).max())
+        _check_places(volume.ijk_to_lps(some), cloud, is_given=True)
+        return Lattice.of(volume), np.zeros(3, np.int32)
+    affine = cloud.report.get("affine_ijk_to_lps_mm")
+    if affine is None:
+        raise UsageError("the cloud does not say where its voxels lie: give the volume that it comes from")
+    matrix = checked_affine(affine)
+    _check_places(some @ matrix[:3, :3].T + matrix[:3, 3], cloud, is_given=False)
+    ni, nj, nk = (high - low + 1).tolist()
+    return Lattice((ni, nj, nk), matrix), low
+
+
+def _stride(cloud: PointCloud) -> int:
+    """Return the step from one point whose place is compared to the next."""
+    return max(1, len(cloud) // PLACES_CHECKED)
+
+
+def _check_places(places: NDArray[np.float64], cloud: PointCloud, *, is_given: bool) -> None:
+    """Refuse a cloud whose points do not lie at their voxels; `is_given`: the volume is."""
+    away = float(np.abs(places - cloud.points[:: _stride(cloud)]).max())
     if away > PLACE_TOLERANCE_MM:
         raise UsageError(
             f"points lie up to {away:.3g} mm from their voxels"
-            + (": it is another volume" if volume is not None else ", as in uneven stacks: give the volume")
+            + (": it is another volume" if is_given else ", as in uneven stacks: give the volume")
         )
-    return lattice, first

@@ -18,7 +18,6 @@ from clrecon.opencl import Device
 from clrecon.operators.points.band_mask import band_bounds, checked_band
 from clrecon.operators.points.emit import Selection, VoxelEmission
 from clrecon.operators.resident.device_volume import DeviceVolume, open_volume
-from clrecon.operators.surface.extract import SurfaceExtractor
 from clrecon.points import PointCloud
 from clrecon.points.kinds import KINDS
 from clrecon.points.voxel_numbers import VoxelNumbers
@@ -204,6 +203,8 @@ def _surface(
     resident: DeviceVolume, level: Any, labels: LabelMap | None, label: int | str | None, progress: Progress | None
 ) -> PointCloud:
     if labels is None:
+        from clrecon.operators.surface.extract import SurfaceExtractor  # which voxels need not wait for
+
         with SurfaceExtractor(resident) as extractor:
             return extractor.extract_vertices(level, progress=progress)
     from clrecon.operators.surface.labels import extract_labels

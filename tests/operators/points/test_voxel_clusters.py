@@ -200,6 +200,33 @@ def test_a_cloud_of_a_part_of_the_volume_needs_no_volume(device):
         np.testing.assert_array_equal(step.cloud.labels, expected.cloud.labels)
 
 
+@pytest.mark.parametrize("make", [lambda voxels: Volume(voxels, OBLIQUE), uneven], ids=["oblique", "uneven"])
+def test_voxels_by_number_are_clustered_as_those_by_index(device, make):
+    volume = make(noise((6, 19, 67), 0.3))
+    listed = voxel_cloud(volume)
+    for chosen in (slice(None), slice(40, None, 3), np.arange(900)[::-1]):
+        cloud = clrecon.extract_points(volume, hu=(1, 1), device=device).select(np.arange(len(listed))[chosen])
+        numbered = cluster_points(cloud, 1.1, 4, volume=volume, device=device)
+        assert cloud.voxel_numbers is not None or not isinstance(chosen, slice)  # indices are made for other orders
+        by_index = cluster_points(listed.select(np.arange(len(listed))[chosen]), 1.1, 4, volume=volume, device=device)
+        np.testing.assert_array_equal(numbered.cloud.labels, by_index.cloud.labels)
+        np.testing.assert_array_equal(numbered.cores, by_index.cores)
+        np.testing.assert_array_equal(numbered.cloud.ijk, by_index.cloud.ijk)
+
+
+def test_voxels_by_number_of_another_volume_are_refused(device):
+    volume = Volume(noise((6, 19, 67), 0.3), OBLIQUE)
+    cloud = clrecon.extract_points(volume, hu=(1, 1), device=device)
+    affine = OBLIQUE.copy()
+    affine[0, 3] += 0.02
+    moved = Volume(volume.voxels, affine)
+    with pytest.raises(UsageError, match="mm from their voxels: it is another volume"):
+        cluster_points(cloud, 1.1, 4, volume=moved, device=device)
+    smaller = Volume(volume.voxels[:3], OBLIQUE)
+    with pytest.raises(UsageError, match="it is another volume"):
+        cluster_points(cloud, 1.1, 4, volume=smaller, device=device)
+
+
 def test_an_uneven_cloud_needs_its_volume(device):
     volume = uneven(noise((6, 10, 20), 0.4))
     with pytest.raises(UsageError, match="mm from their voxels, as in uneven stacks: give the volume"):
