@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import pytest
 from house import find_circles, imported_files, package_modules
 
 
+@cache
 def package_imports() -> dict[str, set[str]]:
     modules = package_modules()
     return {name: imported_files(path.read_text(encoding="utf-8"), modules) for name, path in modules.items()}

@@ -37,7 +37,8 @@ def run_pytest(tmp_path: Path, test: str, *options: str, **variables: str) -> su
     (tmp_path / "conftest.py").write_text((ROOT / "tests" / "conftest.py").read_text())
     (tmp_path / "test_one.py").write_text(test)
     environment = {key: value for key, value in os.environ.items() if not key.startswith("CLRECON_")}
-    environment |= {"PYTHONPATH": str(ROOT), **variables}
+    # Plugins that happen to be installed take longer to import than these tests run.
+    environment |= {"PYTHONPATH": str(ROOT), "PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1", **variables}
     command = [
         sys.executable,
         "-m",
@@ -53,28 +54,68 @@ def run_pytest(tmp_path: Path, test: str, *options: str, **variables: str) -> su
     return subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)
 
 
+CHOOSE = """
+def choose(n):
+    if n == 1:
+        return 1
+    if n == 2:
+        return 2
+    return 3
+"""
+
+PROJECT = {
+    "tests/support/coverage_figure.py": (ROOT / "tests" / "support" / "coverage_figure.py").read_text("utf-8"),
+    "pyproject.toml": (ROOT / "pyproject.toml").read_text("utf-8"),
+    "pytest.ini": "[pytest]\nmarkers =\n    slow\n    untraced\n    every_device\n",
+    "clrecon/__init__.py": "",
+    "clrecon/seen.py": CHOOSE,
+    "clrecon/unseen.py": "a = 1\nb = 2\n",
+}
+"""A project of 8 lines and 4 branches."""
+
 COVERED = """
+import time
 import pytest
-from clrecon.system import wording
-def test_quick():
-    assert wording
-@pytest.mark.slow
-def test_slow():
-    from clrecon.jobs import demo
-    assert demo
+from clrecon.seen import choose
+@pytest.mark.parametrize("n", PARAMETERS)
+def test_quick(n):
+    until = time.process_time() + (n == "long")
+    while time.process_time() < until:
+        pass
+    assert choose(1 if n == "long" else n)
+@pytest.mark.MARK
+def test_marked():
+    assert choose(3) == 3
 """
 
 
-@pytest.mark.parametrize("options", [[], ["-n", "2"]])
-def test_the_coverage_is_said_before_the_last_line(tmp_path: Path, options: list[str]) -> None:
-    (tmp_path / "pytest.ini").write_text("[pytest]\nmarkers = slow\n")
-    search = os.pathsep.join([str(ROOT / "tests" / "support"), str(ROOT)])
-    done = run_pytest(tmp_path, COVERED, *options, CLRECON_COVERAGE="1", PYTHONPATH=search)
+WORKERS = ["-p", "xdist", "-n", "2", "--dist", "loadfile"]
+
+
+@pytest.mark.parametrize(
+    ("options", "parameters", "mark", "lines", "branches"),
+    [
+        (WORKERS, [1], "slow", "37.5", "25.0"),  # def, if, return
+        (WORKERS, [1], "every_device", "62.5", "75.0"),  # a mark of those that are traced
+        ([], [1, 1, 2], "slow", "62.5", "75.0"),
+        ([], [1, "long", 2], "untraced", "37.5", "25.0"),  # nothing new for a long time: the rest is not traced
+        ([], ["long", 2], "slow", "62.5", "75.0"),
+    ],
+)
+def test_the_coverage_is_said_before_the_last_line(
+    tmp_path: Path, options: list[str], parameters: list[object], mark: str, lines: str, branches: str
+) -> None:
+    for name, text in PROJECT.items():
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text(text)
+    test = COVERED.replace("PARAMETERS", repr(parameters)).replace("MARK", mark)
+    search = os.pathsep.join([str(tmp_path / "tests" / "support"), str(tmp_path)])
+    done = run_pytest(tmp_path, test, *options, CLRECON_COVERAGE="1", PYTHONPATH=search)
     assert done.returncode == 0, done.stdout + done.stderr
     *_, said, last = done.stdout.splitlines()
-    figure = re.match(r"coverage of clrecon: (\d+\.\d) % of (\d+) lines and (\d+\.\d) % of \d+ branches", said)
-    assert figure and "2 passed" in last, done.stdout
-    assert 0.0 < float(figure[1]) < 50.0 and int(figure[2]) > 5000
+    figure = re.match(r"coverage of clrecon: (\d+\.\d) % of 8 lines and (\d+\.\d) % of 4 branches", said)
+    assert figure and f"{len(parameters) + 1} passed" in last, done.stdout
+    assert figure.groups() == (lines, branches)
 
 
 NO_DRIVER = "import clrecon.opencl\nclrecon.opencl.list_devices = lambda: []\n"

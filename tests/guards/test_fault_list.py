@@ -4,21 +4,23 @@ from __future__ import annotations
 
 import ast
 import re
+from functools import cache
 from pathlib import Path
 
 import pytest
 from fault_rows import PENDING, ROWS
-from house import ROOT
+from house import ROOT, statements_of
 
 LAST_ROW = 72
 EXPECTED = [row for row in range(1, LAST_ROW + 1) if row not in PENDING]
 NAMED = re.compile(r"test_rows?_(\d+(?:_and_\d+)*)_")
 
 
+@cache
 def list_tests(folder: Path) -> dict[str, set[str]]:
     found = {}
     for path in sorted(folder.rglob("test_*.py")):
-        functions = (node for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.FunctionDef))
+        functions = (node for node in statements_of(path.read_text()) if isinstance(node, ast.FunctionDef))
         found[path.relative_to(folder).as_posix()] = {node.name for node in functions if node.name.startswith("test_")}
     return found
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import inspect
 import re
+from functools import cache
 from importlib import import_module
 
 import pytest
@@ -48,6 +49,12 @@ def named_parameters(source: str) -> set[str]:
     }
 
 
+@cache
+def named_in_package() -> frozenset[str]:
+    """The same of all of clrecon."""
+    return frozenset().union(*(named_parameters(path.read_text(encoding="utf-8")) for path in PACKAGE.rglob("*.py")))
+
+
 @pytest.mark.parametrize(
     ("parameter", "value", "python", "mesh"),
     [
@@ -89,7 +96,7 @@ def test_words_of_python_come_back_after_an_error() -> None:
 
 def test_every_parameter_that_the_library_names_has_an_option() -> None:
     speakers = [speaker_of(parser_of(command)) for command in COMMANDS]
-    named = {name for path in PACKAGE.rglob("*.py") for name in named_parameters(path.read_text(encoding="utf-8"))}
+    named = named_in_package()
     assert len(named) > 10
     assert {name for name in named if all(speak(name, None) == name for speak in speakers)} == set()
 
@@ -108,7 +115,7 @@ def test_every_parameter_that_the_library_names_is_one_of_its_own() -> None:
         PictureFiles,
     )
     known = {name for own in (*functions, *settings) for name in inspect.signature(own).parameters}
-    named = {name for path in PACKAGE.rglob("*.py") for name in named_parameters(path.read_text(encoding="utf-8"))}
+    named = named_in_package()
     assert named - known == set()
 
 
@@ -120,7 +127,7 @@ def test_the_command_line_says_all_that_pictures_may_be_told() -> None:
 
 
 def test_every_other_name_of_a_parameter_is_needed() -> None:
-    named = {name for path in PACKAGE.rglob("*.py") for name in named_parameters(path.read_text(encoding="utf-8"))}
+    named = named_in_package()
     assert set(_DESTINATIONS) - named == set()
 
 

@@ -1,16 +1,19 @@
 """The coverage of clrecon by a session of pytest, in one line before pytest's own last line.
 
-Tracing costs a Python program half of its time again, or far more where one function is called a million times.  Tests
-marked ``slow`` or ``fuzz`` repeat what others do once, or stand for long searches; tests on further devices repeat what
-those on the first one have run, and a test that has many parameters runs much the same lines with each.  They are not
-traced, and neither are the processes that tests start.  The true coverage is therefore a little higher than the figure.
+Tracing makes loops of plain Python take four to nine times as long.  Tests marked ``slow`` or ``fuzz`` repeat what
+others do once, or stand for long searches; those marked ``untraced`` are long loops over functions that other tests run
+too; tests on further devices repeat what those on the first one have run; guards and tests of scripts read the project
+or start programs.  They are not traced, and neither are the processes that tests start.  Many parameters of a test run
+much the same lines: once those that ran nothing new have taken `BARREN_SECONDS`, the others are not traced.  The true
+coverage is therefore a little higher than the figure.
 """
 
 from __future__ import annotations
 
 import json
 import tempfile
-from collections import Counter
+import time
+from collections import defaultdict
 from collections.abc import Generator
 from pathlib import Path
 
@@ -18,9 +21,10 @@ import coverage
 import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
-UNTRACED = ("slow", "fuzz", "further_device")
-MOST_TRACED = 4
-"""Parameters of one test that a process traces."""
+UNTRACED = ("slow", "fuzz", "untraced", "further_device")
+UNTRACED_ROOMS = (ROOT / "tests" / "guards", ROOT / "tests" / "scripts")
+BARREN_SECONDS = 0.25
+"""Processor time of traced parameters that ran nothing new, after which a process traces no more of their test."""
 
 
 def make_coverage(folder: Path, suffix: str | None = None) -> coverage.Coverage:
@@ -40,9 +44,14 @@ def read_figure(folder: Path) -> str:
     branches = 100 * totals["covered_branches"] / totals["num_branches"]
     return (
         f"coverage of clrecon: {lines:.1f} % of {totals['num_statements']} lines and {branches:.1f} % of"
-        f" {totals['num_branches']} branches (slow and fuzz tests, all but {MOST_TRACED} parameters of a test, further"
-        " devices and processes apart not counted)"
+        f" {totals['num_branches']} branches (slow and fuzz tests, parameters after others that ran nothing new,"
+        " further devices and processes apart not counted)"
     )
+
+
+def name_of(item: pytest.Item) -> str:
+    """A test without its parameters."""
+    return item.nodeid.partition("[")[0]
 
 
 class CoverageFigure:
@@ -52,24 +61,40 @@ class CoverageFigure:
         """`traces` is the name of this process among those that trace, None where it runs no test."""
         self.folder = folder
         self.combines = combines
-        self.traced: Counter[str] = Counter()
+        self.barren: defaultdict[str, float] = defaultdict(float)  # seconds by test
         self.coverage = make_coverage(folder, traces) if traces else None
         if self.coverage:
             self.coverage.start()
 
+    def count_steps(self) -> int:
+        """How many steps from line to line have been seen."""
+        collector = self.coverage._collector if self.coverage else None
+        assert collector is not None
+        return sum(map(len, collector.data.values()))
+
+    def is_traced(self, item: pytest.Item) -> bool:
+        """Whether a test is, see above."""
+        marked = any(item.get_closest_marker(name) for name in UNTRACED)
+        apart = any(item.path.is_relative_to(room) for room in UNTRACED_ROOMS)
+        return not (marked or apart or self.barren[name_of(item)] > BARREN_SECONDS)
+
     @pytest.hookimpl(wrapper=True)
     def pytest_runtest_protocol(self, item: pytest.Item) -> Generator[None, object, object]:
-        """Run a test, untraced where it is marked so or has been traced with other parameters."""
-        test = item.nodeid.partition("[")[0]
-        pauses = self.traced[test] >= MOST_TRACED or any(item.get_closest_marker(name) for name in UNTRACED)
-        self.traced[test] += 1
-        if self.coverage and pauses:
+        """Run a test, traced or not."""
+        if not self.coverage:
+            return (yield)
+        if not self.is_traced(item):
             self.coverage.stop()
+            try:
+                return (yield)
+            finally:
+                self.coverage.start()
+        seen, since = self.count_steps(), time.process_time()
         try:
             return (yield)
         finally:
-            if self.coverage and pauses:
-                self.coverage.start()
+            if self.count_steps() == seen:
+                self.barren[name_of(item)] += time.process_time() - since
 
     @pytest.hookimpl(wrapper=True, tryfirst=True)
     def pytest_sessionfinish(self) -> Generator[None, object, object]:

@@ -138,6 +138,18 @@ def project_files(*suffixes: str) -> list[Path]:
     return sorted(path for path in found if not suffixes or path.name.endswith(suffixes))
 
 
+def statements_of(source: str) -> Iterator[ast.stmt]:
+    """All statements of a source; walking through their expressions too would take five times as long."""
+    left: list[ast.AST] = [ast.parse(source)]
+    while left:
+        node = left.pop()
+        if isinstance(node, ast.stmt):
+            yield node
+        for block in ("body", "orelse", "finalbody", "handlers", "cases"):
+            inner = getattr(node, block, [])
+            left += inner if isinstance(inner, list) else []  # that of a lambda or a choice is an expression
+
+
 def layer_of(module: str) -> str:
     """``clrecon.mesh.refine.smoothing`` -> ``mesh``; ``clrecon`` -> ``__init__``."""
     parts = module.split(".")

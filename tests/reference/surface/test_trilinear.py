@@ -103,6 +103,7 @@ def compare_cells(seed: int, count: int) -> Counter:
     return found
 
 
+@pytest.mark.untraced
 def test_random_cells_have_the_topology_of_their_trilinear_field():
     found = compare_cells(1, 150)
     assert found["wrong"] == 0
@@ -240,6 +241,7 @@ def count_crossings(triangles, points) -> int:
     )
 
 
+@pytest.mark.untraced
 def test_the_triangles_of_a_cell_do_not_cross_each_other():
     for case, heights in draw_cells(8, 150):
         row = find_row(case, heights)
