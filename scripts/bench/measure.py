@@ -20,6 +20,7 @@ from clrecon.version import package_version
 __all__ = [
     "Costs",
     "alternate",
+    "busy_seconds",
     "describe_machine",
     "medians",
     "run_program",
@@ -45,12 +46,16 @@ _PACKAGES = (
 def run_program(command: Sequence[str], timeout_s: float = 600.0) -> tuple[float, str]:
     """Run a program to its end; returns the wall seconds of the whole process and its output.
 
+    Python keeps what it compiles, as pip does when it installs a program, whatever the environment says: else each
+    process compiles this folder anew.
+
     Raises
     ------
     RuntimeError
         The program fails or takes longer than `timeout_s`.
     """
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, (str(ROOT), os.environ.get("PYTHONPATH"))))}
+    environment.pop("PYTHONDONTWRITEBYTECODE", None)
     start = time.perf_counter()
     try:
         done = subprocess.run(command, capture_output=True, text=True, env=environment, timeout=timeout_s)
@@ -91,6 +96,17 @@ def _usage() -> tuple[int, float]:
         return 0, time.process_time()
     usage = resource.getrusage(resource.RUSAGE_SELF)
     return usage.ru_minflt + usage.ru_majflt, usage.ru_utime + usage.ru_stime
+
+
+def busy_seconds() -> float:
+    """Processor seconds so far of this process and of all its child processes that have ended."""
+    own = os.times()
+    try:
+        import resource
+    except ImportError:  # Windows, where children are not counted
+        return own.user + own.system
+    usages = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
+    return sum(usage.ru_utime + usage.ru_stime for usage in usages)
 
 
 def medians(runs: Sequence[dict[str, float]]) -> dict[str, float]:

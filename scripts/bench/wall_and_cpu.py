@@ -1,4 +1,4 @@
-"""Pairs of runs timed twice: in wall seconds, and in processor seconds of all threads of the process."""
+"""Pairs of runs timed twice: in wall seconds, and in processor seconds of all threads and of child processes."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-from measure import alternate, summarise
+from measure import alternate, busy_seconds, summarise
 
 __all__ = ["alternate_twice"]
 
@@ -26,9 +26,9 @@ def alternate_twice(
 
     def timed(run: Callable[[], Any], side: str) -> Callable[[], float]:
         def once() -> float:
-            wall, busy = time.perf_counter(), time.process_time()
+            wall, busy = time.perf_counter(), busy_seconds()
             run()
-            cpu[side].append(time.process_time() - busy)
+            cpu[side].append(busy_seconds() - busy)
             return time.perf_counter() - wall
 
         return once

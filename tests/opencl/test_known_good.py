@@ -186,6 +186,22 @@ def test_files_that_were_added_later_are_recorded_by_the_process_that_made_them(
     assert not build(store, tmp_path) and store.warnings == [UNFINISHED]
 
 
+def test_programs_built_beside_by_another_process_do_not_stay_in_a_record(records, tmp_path, monkeypatch):
+    store = records()
+    with store.building(KEY):
+        touch(tmp_path)
+        (tmp_path / "AB" / "OTHER").mkdir()
+        (tmp_path / "AB" / "OTHER" / "program.bc").write_bytes(b"of another process")
+    store.record()
+    assert json.loads((tmp_path / "records" / KEY).read_bytes()).keys() == {PROGRAM, "AB/OTHER"}
+    os.utime(tmp_path / "AB" / "OTHER" / "program.bc", (1, 1))
+    store = records()
+    monkeypatch.setattr(store, "_programs", lambda: pytest.fail("all programs of the folder are looked at"))
+    assert build(store, tmp_path)
+    store.record()
+    assert json.loads((tmp_path / "records" / KEY).read_bytes()).keys() == {PROGRAM}
+
+
 def test_what_turned_out_wrong_is_forgotten(records, tmp_path):
     store = records()
     build(store, tmp_path)

@@ -200,9 +200,14 @@ class KnownGood:
                     yield f"{group.name}/{program.name}"
 
     def _find_used(self, recorded: dict[str, _Files], start: int) -> list[str]:
-        """Return the programs that PoCL has built or found since `start`."""
-        if recorded and all(self._is_used(name, start) for name in recorded):
-            return list(recorded)
+        """Return the programs that PoCL has built or found since `start`.
+
+        Of those that are recorded the used ones: others that are recorded with them were built beside them by another
+        process.  Only if none was used, all programs are looked at.
+        """
+        used = [name for name in recorded if self._is_used(name, start)]
+        if used:
+            return used
         return [name for name in self._programs() if self._is_used(name, start)] or list(recorded)
 
     def _is_used(self, name: str, start: int) -> bool:
