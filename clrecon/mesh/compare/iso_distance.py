@@ -165,7 +165,9 @@ def _distances_to_level(volume: Volume, rule: IsoRule, level: float, points: Flo
         here = points[where].copy()
         going = np.arange(len(here))
         for _ in range(_STEPS):
-            ijk = volume.lps_to_ijk(here[going])
+            # Beyond the border the field does not change: a step from there would begin at the border all the same.
+            ijk = np.add(*_split_cells(volume, rule, volume.lps_to_ijk(here[going])))
+            here[going] = volume.ijk_to_lps(ijk)
             value, per_step = trilinear_field(volume, rule, ijk)
             slices = np.clip(np.floor(ijk[:, 2]).astype(np.int64) + rule.border, 0, len(matrices) - 1)
             gradient = np.einsum("nab,nb->na", matrices[slices], per_step)

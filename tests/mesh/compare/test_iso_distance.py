@@ -202,6 +202,15 @@ def test_a_surface_is_looked_for_within_eleven_half_voxels_along_the_gradient():
     np.testing.assert_allclose(found, [5.45, np.nan, 5.45, np.nan], atol=1e-4)
 
 
+def test_a_point_far_beyond_the_last_slice_of_a_closed_volume():
+    """The surface lies just before the border, where a step from the border is short."""
+    volume = Volume(np.full((4, 4, 4), 1000, np.int16), np.eye(4))
+    rule = choose_iso_rule(volume, 0, closed=True)
+    surface = 3.0 + (1000 + 0.5) / (1000 - rule.outside)
+    found = distances_to_iso_surface(volume, rule, np.array([[1.5, 1.5, 5.25], [1.5, 5.25, 1.5], [1.5, 1.5, -2.25]]))
+    np.testing.assert_allclose(found, 5.25 - surface, atol=1e-9)
+
+
 def test_flat_fields_divide_by_no_zero():
     volume = Volume(np.zeros((4, 4, 4), np.int16), np.eye(4))
     with np.errstate(all="raise"):
