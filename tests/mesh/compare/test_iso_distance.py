@@ -189,9 +189,11 @@ def test_lines_reach_the_voxels_of_the_cell_and_of_its_neighbours(axis, at, firs
 
 
 def test_lines_find_a_level_between_values_less_than_1_apart():
+    """Half way between two voxels, and just before the end of the lines."""
     volume = layers(0, 3, 0.0, 0.5)
-    rule = choose_iso_rule(volume, 0.25, closed=False)
-    assert distances_to_iso_surface(volume, rule, np.array([[1.5, 2.0, 2.0]])) == pytest.approx([1.0])
+    for level, distance in ((0.25, 1.0), (0.485, 1.47)):
+        rule = choose_iso_rule(volume, level, closed=False)
+        assert distances_to_iso_surface(volume, rule, np.array([[1.5, 2.0, 2.0]])) == pytest.approx([distance])
 
 
 def test_a_surface_is_looked_for_within_eleven_half_voxels_along_the_gradient():
