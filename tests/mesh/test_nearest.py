@@ -7,6 +7,7 @@ import pytest
 import sample_meshes as samples
 import tolerances
 
+from clrecon.mesh import nearest as searching
 from clrecon.mesh.nearest import find_nearest_triangle
 
 pytestmark = pytest.mark.unit
@@ -88,3 +89,17 @@ def test_short_and_long_edges_have_the_distance_of_their_scale(scale):
     for point, distance in (((1, -3, 4), 5.0), ((7, 0, 4), 5.0), ((-2, 1.5, 0), 2.0), ((5, 5.5, 12), 13.0)):
         found = nearest((scale * vertices, triangles), scale * np.array(point))
         assert found == (0, pytest.approx(scale * distance, rel=1e-12))
+
+
+def test_only_triangles_whose_box_is_near_are_measured_exactly(monkeypatch):
+    measured = []
+    exactly = searching._distances_from_origin
+
+    def watch(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
+        measured.append(len(a))
+        return exactly(a, b, c)
+
+    monkeypatch.setattr(searching, "_distances_from_origin", watch)
+    squares = samples.join(*(samples.box((3 * k, 0, 0)) for k in range(100)))
+    assert nearest(squares, (30.5, 0.5, 2.0))[1] == pytest.approx(1.0)
+    assert measured == [2 + 2 * 4]  # of one box: the two faces on top, and two on each side, whose boxes reach up to it

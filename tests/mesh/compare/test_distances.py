@@ -15,6 +15,7 @@ from clrecon.mesh.compare.distances import (
     compare_meshes,
     sample_surface,
     sample_surface_points,
+    triangle_distances,
 )
 
 pytestmark = pytest.mark.unit
@@ -76,6 +77,39 @@ def test_distance_to_one_triangle(point, distance):
     for vertex in range(3):
         near = NearDistance(vertices + FAR, triangles)(points, np.array([vertex]), 0.5)
         assert near == pytest.approx([distance], abs=1e-9)
+
+
+@pytest.mark.parametrize("scale", [0.125, 1.0, 32.0])
+def test_the_foot_of_a_perpendicular_on_a_face_on_each_edge_and_on_each_corner(scale):
+    """A triangle with legs of 3 and 4: on its edges the foot lies at a third, a quarter and half of the way."""
+    a, b, c = np.array([[0.0, 0, 0], [3, 0, 0], [0, 4, 0]])
+    cases = [
+        ((1.0, 1.0, 2.0), 2.0),  # over the face
+        ((1.0, -2.0, 0.0), 2.0),  # beside each edge
+        ((1.0, -3.0, 4.0), 5.0),
+        ((-2.0, 1.0, 0.0), 2.0),
+        ((1.5 + 4.0, 2.0 + 3.0, 12.0), 13.0),
+        ((-3.0, -4.0, 0.0), 5.0),  # beyond each corner
+        ((5.0, -2.0, 1.0), 3.0),
+        ((-3.0, 8.0, 0.0), 5.0),
+        ((1.5, 2.0, 0.0), 0.0),  # on an edge
+    ]
+    points = scale * np.array([point for point, _ in cases])
+    for turned in ((a, b, c), (b, c, a), (c, b, a)):
+        corners = [np.repeat(scale * corner[:, None], len(cases), axis=1) for corner in turned]
+        found = triangle_distances(points.T, *corners)
+        np.testing.assert_allclose(found, [scale * distance for _, distance in cases], rtol=1e-12, atol=1e-12)
+
+
+def test_each_triangle_around_each_vertex_is_found():
+    vertices, triangles = samples.box()
+    near = NearDistance(vertices, triangles.astype(np.uint32))
+    for vertex in range(8):
+        rows = np.flatnonzero((triangles == vertex).any(axis=1))
+        centres = vertices[triangles[rows]].mean(axis=1)
+        found, nearest = near.find_around(centres, np.full((len(rows), 1), vertex))
+        assert nearest.tolist() == rows.tolist()
+        np.testing.assert_allclose(found, 0.0, atol=1e-15)
 
 
 def test_distances_near_a_vertex_are_exact_or_within_the_limit():
