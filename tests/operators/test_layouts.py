@@ -1,0 +1,199 @@
+"""Words of rows, bits of numbers, shares of work and bytes of forecasts: closed cases without a device."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from clrecon.geometry import Volume
+from clrecon.geometry.iso_rule import choose_iso_rule
+from clrecon.operators.first_use import _count_open_edges
+from clrecon.operators.points.band_mask import mask_bytes
+from clrecon.operators.points.cell_edge import choose_cell_edge
+from clrecon.operators.points.emit import VoxelEmission
+from clrecon.operators.points.field import BRICK, Nodes
+from clrecon.operators.points.free_clusters import CELLS_A_CHUNK, CHUNKS_A_CORE, ClusterSearch
+from clrecon.operators.points.grid import GridPlan
+from clrecon.operators.points.voxel_clusters import pad_for, search_bytes
+from clrecon.operators.primitives.radix_sort import (
+    FEWEST_PER_CHUNK,
+    MOST_CHUNKS,
+    RADIX_BITS,
+    _plan_chunks,
+    _plan_digits,
+    sort_bytes,
+)
+from clrecon.operators.rays import composite
+from clrecon.operators.rays.buffers import TILE, PictureBuffers
+from clrecon.operators.rays.point_pictures import DARKEST_SHARE, _choose_window
+from clrecon.operators.surface.slabs import SampleGrid, Slab
+from clrecon.rendering.looks.transfer_function import TransferFunction
+
+pytestmark = pytest.mark.unit
+
+NOWHERE = np.zeros(3)
+
+
+@pytest.mark.parametrize(("bricks", "words"), [(1, 1), (3, 1), (4, 1), (5, 2), (8, 2), (9, 3), (132, 33), (133, 34)])
+def test_words_of_nodes_of_a_field(bricks, words):
+    nodes = Nodes(NOWHERE.astype(np.float32), NOWHERE, np.float32(1.0), (bricks, 2, 3))
+    assert BRICK == (8, 4, 4)
+    assert nodes.shape == (8 * bricks, 8, 12)
+    assert (nodes.words, nodes.rows, nodes.mask_bytes) == (words, 96, 384 * words)
+    assert nodes.brick_words == -(-bricks // 32)
+    assert nodes.layer_bytes == 4 * 8 * bricks * 8 * 4
+
+
+@pytest.mark.parametrize(("cells", "words"), [(1, 1), (32, 1), (33, 2), (64, 2), (1056, 33), (1057, 34)])
+def test_words_of_cells_of_a_grid(cells, words):
+    plan = GridPlan(np.zeros((1, 3), np.float32), NOWHERE, NOWHERE.astype(np.float32), np.float32(1.0), (cells, 3, 5))
+    assert (plan.words, plan.total_words) == (words, 15 * words)
+
+
+def sample_grid(ni: int, nj: int = 4, nk: int = 5) -> SampleGrid:
+    volume = Volume(np.zeros((nk, nj, ni), np.int16), np.eye(4))
+    return SampleGrid(volume, choose_iso_rule(volume, 100, closed=False))
+
+
+@pytest.mark.parametrize(
+    ("ni", "words", "shift"),
+    [(2, 1, 5), (32, 1, 5), (33, 2, 5), (1024, 32, 5), (1025, 33, 6), (2048, 64, 6), (2049, 65, 7)],
+)
+def test_words_of_samples(ni, words, shift):
+    grid = sample_grid(ni)
+    assert (grid.words, grid.row_shift, grid.flag_words) == (words, shift, 2 ** (shift - 5))
+
+
+def test_slices_and_rows_of_a_slab():
+    grid = sample_grid(40, 7, 12)
+    for first, end, classified, counted in ((0, 12, 12, 12), (3, 6, 5, 4), (3, 11, 9, 9), (9, 10, 3, 2)):
+        slab = Slab(grid, first, end)
+        assert (slab.slices, slab.rows, slab.is_whole) == (end - first, 7 * (end - first), end - first == 12)
+        assert (slab.mask_slices, slab.mask_rows, slab.counted_rows) == (classified, 7 * classified, 7 * counted)
+        assert slab.scratch() == {
+            "inside mask": 4 * 7 * classified * 2,
+            "word counts": 4 * 7 * counted * 2,
+            "row extents": 4 * 7 * classified,
+            "row counts": 12 * 7 * counted,
+            "word flags": 4 * 7 * counted,
+            "active words": 4 * 7 * (end - first) * 2,
+        }
+        assert all(type(size) is int for size in slab.scratch().values())
+
+
+def test_bytes_of_masks_and_of_a_search():
+    assert mask_bytes((64, 3, 5)) == {"mask of the voxels": 4 * 2 * 15, "row extents": 60}
+    assert mask_bytes((65, 3, 5), pad=2) == {"mask of the voxels": 4 * 5 * 15, "row extents": 60}
+    for reach, pad in ((0, 0), (1, 1), (32, 1), (33, 2)):
+        assert pad_for(SimpleNamespace(reach=reach)) == pad  # type: ignore[arg-type]
+    stencil: Any = SimpleNamespace(rows=np.zeros(7, np.int32), tables=np.zeros(11, np.int32))
+    assert search_bytes(mask_bytes((64, 3, 5)), stencil, 15) == {
+        **mask_bytes((64, 3, 5)),
+        "mask of core voxels": 120,
+        "counts of rows": 180,
+        "stencil": 56 + 88,
+    }
+
+
+def test_bytes_of_a_slab_of_voxels():
+    emission: Any = SimpleNamespace(
+        volume=SimpleNamespace(shape_ijk=(65, 7, 20)),
+        selection=SimpleNamespace(labels=None, shell=False),
+        resident=SimpleNamespace(slice_bytes=65 * 7 * 2),
+    )
+    inside = {"volume": 4 * 910, "masks": 4 * 4 * 7 * 3, "rows": 13 * 4 * 7}
+    assert VoxelEmission.needs(emission, 4) == inside
+    assert VoxelEmission.needs(emission, 4, 10) == {**inside, "points": 200}
+    emission.selection = SimpleNamespace(labels=np.zeros(0, np.uint16), shell=True)
+    assert VoxelEmission.needs(emission, 4) == {
+        "volume": 6 * 910,
+        "masks": 4 * 6 * 7 * 3 * 2,
+        "rows": 4 * 6 * 7 + 9 * 4 * 7,
+        "labels": 6 * 910,
+    }
+    assert VoxelEmission.needs(emission, 19)["volume"] == 20 * 910
+    assert all(type(size) is int for size in VoxelEmission.needs(emission, 4).values())
+
+
+def device(cores: int, has_long_items: bool = True) -> Any:
+    return SimpleNamespace(compute_units=cores, has_long_items=has_long_items)
+
+
+def test_chunks_and_bytes_of_a_sort():
+    assert _plan_chunks(device(1), 1) == (FEWEST_PER_CHUNK, 1)
+    n = 16 * FEWEST_PER_CHUNK + 1  # 16 chunks on one core: they get longer by one
+    assert _plan_chunks(device(1), n - 1) == (FEWEST_PER_CHUNK, 16)
+    assert _plan_chunks(device(1), n) == (FEWEST_PER_CHUNK + 1, 16)
+    assert _plan_chunks(device(3), 24 * 5000 + 1) == (5001, 24)
+    assert _plan_chunks(device(3, False), 24 * 5000 + 1) == (FEWEST_PER_CHUNK, 30)
+    assert _plan_chunks(device(10_000), MOST_CHUNKS * 5000) == (5000, MOST_CHUNKS)
+    assert _plan_digits(RADIX_BITS) == [(0, RADIX_BITS)]
+    assert _plan_digits(2 * RADIX_BITS - 1) == [(0, RADIX_BITS - 1), (RADIX_BITS - 1, RADIX_BITS)]
+    assert sort_bytes(device(1), 1000, RADIX_BITS) == 8 * 1000 + (4 << RADIX_BITS)
+    assert sort_bytes(device(1), 1000, RADIX_BITS + 1) == 16 * 1000 + (4 << RADIX_BITS)
+    assert sort_bytes(device(1), 1000, 3) == 8 * 1000 + 32
+    assert sort_bytes(device(1), n, 3) == 8 * n + 32 * 16
+
+
+def test_cells_of_a_chunk_of_clusters():
+    def chunk(cells: int, cores: int, is_cpu: bool = True) -> int:
+        search: Any = SimpleNamespace(_is_cpu=is_cpu, _grid=SimpleNamespace(cells=cells), _device=device(cores))
+        return ClusterSearch._plan_chunk(search)
+
+    a_core = CHUNKS_A_CORE * CELLS_A_CHUNK
+    assert chunk(10**6, 2, is_cpu=False) == CELLS_A_CHUNK
+    assert (chunk(1, 4), chunk(4 * a_core, 4), chunk(4 * a_core + 1, 4)) == (32, CELLS_A_CHUNK, 2 * CELLS_A_CHUNK)
+    assert chunk(12 * a_core, 4) == 3 * CELLS_A_CHUNK
+
+
+def test_items_of_a_picture():
+    for size, tiles in (((TILE, TILE), 1), ((TILE + 1, TILE), 2), ((3 * TILE, 2 * TILE + 1), 9)):
+        picture: Any = SimpleNamespace(size=size)
+        picture.tiles = PictureBuffers.tiles.fget(picture)  # type: ignore[attr-defined]
+        assert picture.tiles == tiles
+        for queues, lanes in ((1, 1), (2, 8), (4, 1)):
+            items = PictureBuffers.items(picture, queues, lanes)
+            assert items == -(-tiles // queues) * queues * TILE * TILE // lanes
+            assert type(items) is int
+    assert PictureBuffers.needs((30, 20)) == ({"picture": 7200}, {"states of the rays": 19200})
+
+
+def test_the_table_of_colours_has_ten_bits_a_channel(monkeypatch):
+    monkeypatch.setattr(composite, "upload", lambda device, table: table)
+    function = TransferFunction([(0, 1.0, 0.5, 0.0, 0.0), (100, 0.0, 0.5, 1.0, 1.0)])
+    tables = composite.TransferTables.of(device(1), function, 1.0)
+    assert (tables.low, len(tables.colors_d), tables.shown_ends) == (0.0, composite.NODES, (1, composite.NODES - 1))
+    for node, expected in ((0, (1023, 511.5, 0)), (-1, (0, 511.5, 1023))):
+        color = int(tables.colors_d[node])
+        assert [color >> 20, color >> 10 & 1023, color & 1023] == pytest.approx(expected, abs=1.0)
+
+
+def test_the_window_of_a_cloud_begins_below_its_lowest_values():
+    hu = np.linspace(100.0, 400.0, 30_001).astype(np.float32)
+    low, high = _choose_window(hu)
+    lowest = (low + DARKEST_SHARE * high) / (1.0 + DARKEST_SHARE)
+    assert 100.0 <= lowest < high <= 400.0
+    assert low == pytest.approx(lowest - DARKEST_SHARE * (high - lowest))
+    assert low < 100.0
+
+
+@pytest.mark.parametrize("k", [8, 16])
+def test_the_edge_of_cells_by_the_density_of_points(k):
+    """27 cells of even points hold 5.6 k of them, or 40."""
+    points = np.random.default_rng(7).random((20_000, 3)).astype(np.float32)
+    wanted = max(40.0, 5.6 * k)
+    expected = (wanted / len(points)) ** (1 / 3) / 3.0
+    assert choose_cell_edge(points, k) == pytest.approx(expected, rel=0.1)
+    assert choose_cell_edge(100.0 * points, k) == pytest.approx(100.0 * expected, rel=0.1)
+    assert choose_cell_edge(np.ones((5, 3), np.float32), k) == 1.0
+
+
+def test_edges_that_are_not_passed_once_each_way():
+    closed = np.array([[0, 1, 2], [0, 3, 1], [1, 3, 2], [0, 2, 3]])
+    assert _count_open_edges(closed, 4) == 0
+    assert _count_open_edges(closed[:3], 4) > 0
+    assert _count_open_edges(np.concatenate([closed[:3], closed[3:, ::-1]]), 4) > 0
+    assert _count_open_edges(np.concatenate([closed, closed]), 4) == 12  # each twice
