@@ -108,6 +108,8 @@ class Device:
         The check of the programs that PoCL keeps; None for other drivers, and where nothing is kept.
     kernel_variants : dict of str to str
         ``-D`` definitions for kernels that are written for vectors, see `quirks.kernel_variants`.
+    first_header : str
+        Header that stands before every kernel file, see `quirks.first_header`; empty for none.
     build_options : tuple of str
         Options for every program.  In caches that several computers share, they distinguish CPUs that the driver does
         not.
@@ -151,6 +153,7 @@ class Device:
         self.known_good: KnownGood | None = known_good() if quirks.is_pocl(self.platform) else None
         self._remarks: list[str] = []
         self.kernel_variants: dict[str, str] = quirks.kernel_variants(self.platform, self.type)
+        self.first_header: str = quirks.first_header(self.platform, _version_numbers(self.driver))
         self.shortcoming: str = _find_shortcoming(cl_device)
         self.build_options: tuple[str, ...] = ()
         self._cpu: NameOfCpu | None = None

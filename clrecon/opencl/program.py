@@ -186,7 +186,7 @@ def load_program(device: Device, name: str, variants: Mapping[str, str] | None =
 
 
 def _build(device: Device, name: str, options: tuple[str, ...]) -> Program:
-    source, start = read_kernel_source(name), time.perf_counter()
+    source, start = _complete(device, read_kernel_source(name)), time.perf_counter()
     if device.trace is not None:
         device.trace(f"the build of cl/{name}")
     if device.known_good is not None:
@@ -209,6 +209,11 @@ def _build(device: Device, name: str, options: tuple[str, ...]) -> Program:
 
 
 _STANDARD = ("-cl-std=CL1.2",)
+
+
+def _complete(device: Device, source: str) -> str:
+    """Return the text of a kernel file with the header that the device needs before it."""
+    return read_kernel_source(device.first_header) + source if device.first_header else source
 
 
 def _key(device: Device, source: str, options: tuple[str, ...]) -> str:

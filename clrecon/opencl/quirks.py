@@ -15,6 +15,7 @@ from clrecon.opencl.cache.folders import prepare_caches
 
 __all__ = [
     "SIMULATOR_PLATFORMS",
+    "first_header",
     "has_event_times",
     "import_pyopencl",
     "is_pocl",
@@ -85,6 +86,17 @@ def is_simulator(platform_name: str) -> bool:
 def is_pocl(platform_name: str) -> bool:
     """True for PoCL, which keeps what it builds, and ends the process when a file of it is damaged."""
     return "portable computing language" in platform_name.lower()
+
+
+def first_header(platform_name: str, driver: tuple[int, ...]) -> str:
+    """Return the header that stands before every kernel file: for PoCL 3.0 one with the simple functions of OpenCL.
+
+    PoCL 3.0 calls a function for each min() and vload8(): its functions are compiled for one processor of each
+    generation, such as "haswell", kernels for the very processor, and LLVM 14 does not inline between the two.
+    PoCL 3.1 compiles both for the same one.  DBSCAN of free points took 1.4 times as long as there, and takes as long
+    with the header.
+    """
+    return "include/inlined.h" if is_pocl(platform_name) and driver[:2] == (3, 0) else ""
 
 
 def keeps_programs(platform_name: str) -> bool:
