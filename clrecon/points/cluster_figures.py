@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from clrecon.errors import UsageError
 from clrecon.points.cloud import PointCloud
+from clrecon.system.pieces import chunks
 
 __all__ = ["SHEET_POINTS", "SHEET_RATIO", "ClusterFigures", "measure_clusters"]
 
@@ -20,6 +21,9 @@ SHEET_RATIO = 15.0
 """Ratio of the two smaller principal standard deviations above which a cluster is a sheet.  Table tops and headrests of
 five scans have 27 and more, clusters among bone up to 5."""
 
+
+PIECE = 1 << 16
+"""Points that are measured at a time: the caches of a core hold what is made of them."""
 
 LEAST_RUN = 4
 """Points of one cluster in a row, on the average, from which they are summed run by run."""
@@ -73,8 +77,8 @@ class ClusterFigures:
         ]
 
 
-class _Groups:
-    """The points by cluster.  Neighbours in the order of a cloud mostly are of one cluster: runs of them come first."""
+class _Runs:
+    """A piece of a cloud by runs of points of one cluster, which neighbours in the order of a cloud mostly are."""
 
     def __init__(self, labels: NDArray[np.int32]):
         begins = np.ones(len(labels), bool)
@@ -82,32 +86,29 @@ class _Groups:
         self._starts: NDArray[np.intp] | None = np.flatnonzero(begins)
         if LEAST_RUN * len(self._starts) > len(labels):
             self._starts = None  # a run is a point
-            lengths = None
         else:
             self._lengths = np.diff(self._starts, append=len(labels))
-            lengths, labels = self._lengths, labels[self._starts]
+            labels = labels[self._starts]
         self._labels = np.maximum(labels, -1).astype(np.intp)
         self._labels += 1  # 0 is noise
-        self.count = int(self._labels.max(initial=0))
-        self.sizes: NDArray[np.int64] = np.bincount(self._labels, lengths, self.count + 1)[1:].astype(np.int64)
+        self.clusters = int(self._labels.max(initial=0))
 
-    def sums(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the sum of the values of each cluster."""
-        runs = values if self._starts is None else np.add.reduceat(values, self._starts)
-        return np.bincount(self._labels, runs, self.count + 1)[1:].astype(np.float64, copy=False)
+    def count(self, sizes: NDArray[np.int64]) -> None:
+        """Add the number of points to that of their clusters; entry 0 of these and further figures is noise."""
+        np.add.at(sizes, self._labels, 1 if self._starts is None else self._lengths)
 
-    def ends(self, values: NDArray[np.floating]) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
-        """Return the lowest and the highest value of each cluster; infinite without points."""
-        ends = []
-        for extreme, none in ((np.minimum, np.inf), (np.maximum, -np.inf)):
-            found = np.full(self.count + 1, none, values.dtype)
-            extreme.at(found, self._labels, values if self._starts is None else extreme.reduceat(values, self._starts))
-            ends.append(found[1:])
-        return ends[0], ends[1]
+    def add(self, sums: NDArray[np.float64], values: NDArray[np.float64]) -> None:
+        """Add values of points to the sums of their clusters."""
+        np.add.at(sums, self._labels, values if self._starts is None else np.add.reduceat(values, self._starts))
+
+    def widen(self, low: NDArray[np.floating], high: NDArray[np.floating], values: NDArray[np.floating]) -> None:
+        """Take values of points into the range of their clusters."""
+        for extreme, ends in ((np.minimum, low), (np.maximum, high)):
+            extreme.at(ends, self._labels, values if self._starts is None else extreme.reduceat(values, self._starts))
 
     def spread(self, figures: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the figure of its cluster for each point; 0 for noise."""
-        of_runs = np.append(0.0, figures).take(self._labels)
+        """Return for each point the figure of its cluster."""
+        of_runs = figures.take(self._labels)
         return of_runs if self._starts is None else np.repeat(of_runs, self._lengths)
 
 
@@ -121,18 +122,25 @@ def measure_clusters(cloud: PointCloud) -> ClusterFigures:
     """
     if cloud.labels is None:
         raise UsageError("the points have no labels: cluster them first")
-    groups = _Groups(cloud.labels)
-    count, sizes = groups.count, groups.sizes
-    boxes, centres, spread = np.empty((count, 2, 3)), np.empty((count, 3)), np.zeros((count, 3, 3))
+    points = cloud.points
+    pieces = [(where, _Runs(cloud.labels[where])) for where in chunks(len(cloud), PIECE)]
+    entries = max((runs.clusters for _, runs in pieces), default=0) + 1
+    sizes, sums, squares = np.zeros(entries, np.int64), np.zeros((3, entries)), np.zeros((3, 3, entries))
+    low, high = np.full((3, entries), np.inf, points.dtype), np.full((3, entries), -np.inf, points.dtype)
+    for where, runs in pieces:
+        runs.count(sizes)
+        for axis in range(3):
+            own = np.ascontiguousarray(points[where, axis])
+            runs.widen(low[axis], high[axis], own)
+            runs.add(sums[axis], own.astype(np.float64))
     shares = 1.0 / np.maximum(sizes, 1)
-    around: list[NDArray[np.float64]] = []
-    for axis in range(3):
-        own = np.ascontiguousarray(cloud.points[:, axis])
-        boxes[:, 0, axis], boxes[:, 1, axis] = groups.ends(own)
-        values = own.astype(np.float64)
-        centres[:, axis] = groups.sums(values) * shares
-        around.append(values - groups.spread(centres[:, axis]))
-        for other in range(axis + 1):
-            spread[:, axis, other] = groups.sums(around[axis] * around[other]) * shares
-    lengths = np.linalg.eigvalsh(spread) if count else np.zeros((0, 3))  # reads the lower triangles
-    return ClusterFigures(sizes, centres, boxes, np.sqrt(np.maximum(lengths, 0.0)))
+    centres = sums * shares
+    for where, runs in pieces:
+        around = [points[where, axis] - runs.spread(centres[axis]) for axis in range(3)]
+        for axis in range(3):
+            for other in range(axis + 1):
+                runs.add(squares[axis, other], around[axis] * around[other])
+    spread = np.moveaxis(squares * shares, 2, 0)[1:]  # eigvalsh reads the lower triangles
+    lengths = np.linalg.eigvalsh(spread) if len(spread) else np.zeros((0, 3))
+    boxes = np.stack([low.T, high.T], axis=1)[1:].astype(np.float64)
+    return ClusterFigures(sizes[1:], centres.T[1:], boxes, np.sqrt(np.maximum(lengths, 0.0)))
