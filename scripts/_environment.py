@@ -61,7 +61,7 @@ def _is_finished(folder: str, stamp: str, program: str) -> bool:
         return False
 
 
-def ensure_environment(name: str, extras: str = "", program: str = "clrecon") -> str:
+def ensure_environment(name: str, extras: str = "", program: str = "clrecon", compiled: bool = True) -> str:
     """Return the folder of a finished environment; make it if it is missing.
 
     Parameters
@@ -72,6 +72,8 @@ def ensure_environment(name: str, extras: str = "", program: str = "clrecon") ->
         Extras of setup.cfg to install, such as ``test,dev``.
     program : str
         A program of the finished environment.
+    compiled : bool
+        Whether pip compiles all modules, half a minute for the tests' ten thousand; else each is at its first import.
 
     Raises
     ------
@@ -84,7 +86,7 @@ def ensure_environment(name: str, extras: str = "", program: str = "clrecon") ->
         return folder
     with _locked(folder + ".lock"):
         if not _is_finished(folder, stamp, program):  # another process may have made it while this one waited
-            _make(folder, stamp, extras)
+            _make(folder, stamp, extras, compiled)
     return folder
 
 
@@ -142,7 +144,7 @@ def _check_venv() -> None:
         ) from error
 
 
-def _make(folder: str, stamp: str, extras: str) -> None:
+def _make(folder: str, stamp: str, extras: str, compiled: bool) -> None:
     import subprocess
 
     _check_venv()
@@ -157,7 +159,7 @@ def _make(folder: str, stamp: str, extras: str) -> None:
         raise SetupError(f"python -m venv failed:\n{(made.stdout + made.stderr).strip()}")
     target = f"{ROOT}[{extras}]" if extras else ROOT
     command = [program_path(folder, "python"), "-m", "pip", "install", "--disable-pip-version-check", "--no-input"]
-    command += ["--progress-bar", "off", "--editable", target]
+    command += ["--progress-bar", "off", *([] if compiled else ["--no-compile"]), "--editable", target]
     log = os.path.join(folder, _LOG)
     code = _run_logged(command, log)
     if code:

@@ -13,6 +13,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from made_once import make_once
 
 from clrecon.errors import DeviceError
 from clrecon.opencl import quirks
@@ -98,10 +99,10 @@ def test_row_59_reports_of_other_commands_and_pictures_have_the_warnings(device,
 def phantom_folder(shared_folder):
     from clrecon.jobs.phantom import make_phantom
 
-    folder = shared_folder / "phantom-of-caches"
-    if not folder.exists():
+    def make(folder):
         make_phantom(folder, kind="sphere", size=(24, 24), slices=24)
-    return folder
+
+    return make_once(shared_folder, "phantom-of-caches", make)
 
 
 @pytest.mark.every_device

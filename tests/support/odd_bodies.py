@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import functools
-import os
-import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from made_once import make_once
 from numpy.typing import NDArray
 
 from clrecon.geometry import Volume
@@ -72,16 +71,7 @@ def settings_of(name: str) -> PhantomSettings:
 
 def write_odd(folder: Path, name: str) -> Path:
     """The series of a body of `BODIES` in `folder`, which processes share: who asks first makes it."""
-    series = folder / name
-    if not series.is_dir():
-        with tempfile.TemporaryDirectory(dir=folder) as own:
-            write_phantom(Path(own) / name, settings_of(name))
-            try:
-                os.rename(Path(own) / name, series)
-            except OSError:
-                if not series.is_dir():  # else another process was first
-                    raise
-    return series
+    return make_once(folder, name, lambda path: write_phantom(path, settings_of(name)))
 
 
 @functools.cache

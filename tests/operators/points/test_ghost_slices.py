@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from made_once import make_once
 from pydicom import dcmread
 
 import clrecon
@@ -142,13 +143,19 @@ SETTINGS = PhantomSettings(
 )
 
 
-@pytest.fixture(scope="module")
-def made(tmp_path_factory):
-    """The made case: its folder, its truth, and the bone of the same phantom without ghosts and table."""
-    folder = tmp_path_factory.mktemp("ghosts") / "series"
-    truth = write_phantom(folder, SETTINGS)
+def make_case(folder: Path) -> None:
+    folder.mkdir()
+    truth = write_phantom(folder / "series", SETTINGS)
     clean, _, _ = make_phantom(dataclasses.replace(SETTINGS, ghosts=False, table="none", table_gap_mm=0.0))
-    return folder, [one["slice"] for one in truth["ghosts"]["slices"]], clean >= BONE[0]
+    np.savez(folder / "truth.npz", slices=[one["slice"] for one in truth["ghosts"]["slices"]], bone=clean >= BONE[0])
+
+
+@pytest.fixture(scope="module")
+def made(shared_folder):
+    """The made case: its folder, its truth, and the bone of the same phantom without ghosts and table."""
+    folder = make_once(shared_folder, "ghosts", make_case)
+    with np.load(folder / "truth.npz") as truth:
+        return folder / "series", truth["slices"].tolist(), truth["bone"]
 
 
 def score(cloud: PointCloud, bone: np.ndarray) -> tuple[float, float]:
