@@ -15,7 +15,7 @@
 /* Factor for squares, so that points whose distance rounds to the same float32 are not lost. */
 #define SAME 1.000001f
 
-/* Vectors at any place: PoCL 3.0 calls a function for each vload8 and vstore8. */
+/* Vectors at any place: some drivers call a function for each vload8 and vstore8. */
 typedef float8 loose_float8 __attribute__((aligned(4)));
 typedef int8 loose_int8 __attribute__((aligned(4)));
 typedef long4 loose_long4 __attribute__((aligned(8)));

@@ -18,7 +18,7 @@ typedef VOXEL4 some_voxels __attribute__((aligned(sizeof(VOXEL))));
 typedef uchar16 some_bytes __attribute__((aligned(1)));
 #define BYTES(from) (*(__global const some_bytes *)(from))
 
-/* PoCL 3.0 calls a function for each min(), max(), any() and vload16(). */
+/* Some drivers call a function for each min(), max(), any() and vload16(). */
 #define LESSER(a, b) ((a) < (b) ? (a) : (b))
 #define GREATER(a, b) ((a) > (b) ? (a) : (b))
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import re
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,7 +18,7 @@ HEADER = "include/inlined.h"
 FLOATS = np.array(
     [0.0, -0.0, 1.0, -1.0, 0.5, -0.3, 1.7, -2.5, 3e9, -8388609.5, 1e-40, 3e38, np.inf, -np.inf, np.nan], np.float32
 )
-TYPES = {
+TYPES: dict[str, Any] = {
     "char": np.int8, "uchar": np.uint8, "short": np.int16, "ushort": np.uint16, "int": np.int32, "uint": np.uint32,
     "long": np.int64, "ulong": np.uint64,
 }  # fmt: skip
