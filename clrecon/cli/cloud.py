@@ -278,8 +278,11 @@ def _describe_known(report: dict[str, Any]) -> str:
 def _describe_surface(surface: dict[str, Any] | None) -> list[str]:
     if surface is None:
         return []
-    against = f", {100.0 * surface['votes_against_share']:.2g} % of the votes against it"
-    return [f"surface  {surface['vertices']:,} vertices, {surface['triangles']:,} triangles, closed{against}"]
+    against = f"{100.0 * surface['votes_against_share']:.2g} % of the votes against it"
+    walls = f"{100.0 * surface['wall_share']:.2g} % walls without points"
+    return [
+        f"surface  {surface['vertices']:,} vertices, {surface['triangles']:,} triangles, closed, {against}, {walls}"
+    ]
 
 
 def _describe_times(seconds: dict[str, float]) -> str:

@@ -19,6 +19,12 @@ __all__ = ["read_points"]
 
 log = get_logger(__name__)
 
+FEWEST_OF_A_BODY = 100
+"""Points from which on the size of a cloud is looked at."""
+
+SMALLEST_MM, LARGEST_MM = 3.0, 5000.0
+"""Sides of the box of what a CT shows; 2 m in metres, and 5 mm in micrometres, lie beyond."""
+
 
 def read_points(path: str | os.PathLike[str], *, space: str | None = None) -> PointCloud:
     """Read a cloud from a file.
@@ -64,6 +70,7 @@ def read_points(path: str | os.PathLike[str], *, space: str | None = None) -> Po
         signs = np.diag(frame_from_lps(used))
         points = points * signs.astype(points.dtype if points.dtype.kind == "f" else np.float64)
         normals = None if normals is None else normals * signs.astype(np.float32) + np.float32(0)
+    warnings += _doubt_unit(points)
     arrays = {"normals": normals, "hu": raw.hu(), "labels": raw.labels(), "ijk": raw.ijk()}
     warnings += raw.unused()
     facts: dict[str, Any] = {
@@ -94,3 +101,13 @@ def _check_points(points: np.ndarray, name: str) -> None:
             f"{int(wrong.sum()):,} of the {len(points):,} points of {name} are not finite, the first is number"
             f" {int(np.flatnonzero(wrong)[0]):,}: remove them first"
         )
+
+
+def _doubt_unit(points: np.ndarray) -> list[str]:
+    """Return a warning where a cloud is as small as a patient in metres, or larger than one in mm."""
+    size = points.max(axis=0).astype(np.float64) - points.min(axis=0)
+    if len(points) < FEWEST_OF_A_BODY or SMALLEST_MM <= size.max() <= LARGEST_MM or not size.max() > 0.0:
+        return []
+    box = " x ".join(f"{side:.3g}" for side in size)
+    unit = "metres: then multiply them by 1000" if size.max() < SMALLEST_MM else "micrometres: then divide them by 1000"
+    return [f"the points lie in a box of {box}, which is read as mm; perhaps they are in {unit}"]

@@ -87,6 +87,11 @@ def make_cloud(
     is_cloud = is_cloud_file(source)
     if is_cloud:
         refuse_scan_settings(settings, OF_SCANS)
+    elif settings.paper and settings.kind == "surface":
+        raise UsageError(
+            "the formulas of the papers are for voxel centres, not for points of a surface: give a band too"
+            f" ({name_parameter('hu')}), or {name_parameter('points', 'voxels')}"
+        )
     elif settings.viewpoint is not None:
         raise UsageError(
             f"the HU of a scan turn its normals out of bone: leave out {name_parameter('viewpoint')}, which is for"
@@ -163,13 +168,20 @@ def _reconstruct(
     Raises
     ------
     UsageError
-        The points have no normals.
+        The points have no normals, or those of a cloud that nothing has turned outward.
     """
     if files.surface is None:
         return None
+    of_scan = any(step["step"] == "points" for step in trail.steps)
     if trail.cloud.normals is None:
+        more = "" if of_scan else f", and name a point inside of the cloud ({name_parameter('viewpoint')})"
         raise UsageError(
-            f"a surface needs points with normals out of bone: ask for them ({name_parameter('normals', True)})"
+            f"a surface needs points with normals out of bone: ask for them ({name_parameter('normals', True)}){more}"
+        )
+    if any(step["step"] == "normals" and step["oriented_by"] is None for step in trail.steps):
+        raise UsageError(
+            "a surface needs normals that point outward, and those of this cloud have either direction: name a point"
+            f" inside of it ({name_parameter('viewpoint')})"
         )
     from clrecon.operators.points.reconstruct import reconstruct_surface
 
@@ -213,7 +225,8 @@ def _write(
         watch.lap("write")
         report = describe_clouds(
             subject, trail, settings, device, surface=surface, has_removed=files.removed is not None, outputs=entries,
-            warnings=[*trail.warnings, *losses], seconds=_seconds(watch),
+            warnings=[*trail.warnings, *(surface.report["warnings"] if surface is not None else ()), *losses],
+            seconds=_seconds(watch),
         )  # fmt: skip
         if files.report is not None:
             written.append(staged.enter_context(stage_report(files.report, report)))

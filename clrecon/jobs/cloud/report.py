@@ -56,7 +56,7 @@ class CloudReport(RunReport):
         The labels of the file of removed points.
     surface : mapping or None
         The mesh around the cloud: ``vertices``, ``triangles``, ``spacing_mm``, ``bridge_mm``, ``votes_against_share``,
-        ``warnings``.
+        ``wall_share``, ``lost_share``, ``open_cubes``, ``warnings``.
     outputs : list of mapping
         ``what``, ``format`` and ``bytes`` of each file but the report.
     """
@@ -174,7 +174,7 @@ def describe_clouds(
 
 
 def _describe_surface(mesh: Mesh) -> dict[str, Any]:
-    told = ("spacing_mm", "bridge_mm", "votes_against_share", "warnings")
+    told = ("spacing_mm", "bridge_mm", "votes_against_share", "wall_share", "lost_share", "open_cubes", "warnings")
     facts = {name: mesh.report.get(name) for name in told}
     return {"vertices": mesh.vertex_count, "triangles": mesh.triangle_count, **facts}
 

@@ -151,12 +151,6 @@ class CloudSettings(InputSettings):
             from clrecon.points.keep import parse_keep_rules
 
             parse_keep_rules(tuple(self.keep))
-        if self.paper and self.kind == "surface":
-            raise UsageError(
-                "the formulas of the papers are for voxel centres, not for points of a surface: give a band too"
-                f" ({name_parameter('hu')}), or {name_parameter('points', 'voxels')}"
-            )
-
         if self.paper and self.clustering is not None:
             raise UsageError("as printed all slices fall into one plane, where clusters mean nothing: leave them out")
 

@@ -246,10 +246,15 @@ def _cluster_free(
 ) -> Clustering:
     if volume is not None:
         raise UsageError("the points are no voxels (they have no ijk), so that a volume says nothing of them")
-    if eps is None or isinstance(min_samples, str):
+    if eps is None:
         raise UsageError(
-            "the points are no voxels (they have no ijk), so that no lattice gives a distance:"
-            f" {name_parameter('eps')} in mm and {name_parameter('min_samples')} as a whole number are needed"
+            "the points are no voxels (they have no ijk), so that no lattice gives a distance: name one in mm"
+            f" ({name_parameter('eps')}), about twice the spacing of the points"
+        )
+    if isinstance(min_samples, str):
+        raise UsageError(
+            f"the points are no voxels (they have no ijk) and lie in no planes: give a whole number in place of"
+            f" {min_samples!r} ({name_parameter('min_samples')})"
         )
     found = cluster_free_points(cloud, eps, min_samples, device=device, memory=memory, progress=progress)
     labelled = cloud.changed(labels=found.labels)

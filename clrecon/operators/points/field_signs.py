@@ -64,6 +64,10 @@ class Masks:
         """Return a buffer for another mask."""
         return allocate(self.device, 4 * self.total)
 
+    def fetch(self, mask_d: Any) -> NDArray[np.uint32]:
+        """Return a mask, shape (nz, ny, words)."""
+        return download(self.device, np.empty((self.shape[2], self.shape[1], self.words), np.uint32), mask_d)
+
 
 @dataclass(frozen=True)
 class Signs:

@@ -64,12 +64,15 @@ def choose_edge(cloud: PointCloud, *, device: Device | str | int | None = None, 
     DeviceError
         As `find_neighbours`.
     """
+    if len(cloud) == 1:
+        raise UsageError("the cloud has one point, so that no edge of cells can be chosen: leave it as it is")
     found = find_neighbours(cloud, NEIGHBOURS, device=device, memory=memory)
     edge = EDGE_FACTOR * float(np.median(found.distances[:, -1]))
     if edge == 0.0:
         raise UsageError(
-            f"most of the {len(cloud):,} points are {found.distances.shape[1]} at one place, so that no edge of cells"
-            f" can be chosen: thin the cloud first, or give an edge in mm"
+            f"over half of the {len(cloud):,} points have {found.distances.shape[1] - 1} others at the same place, so"
+            " that no edge of cells can be chosen: remove double points first (clrecon.thin_points with a small"
+            " spacing), or give an edge in mm"
         )
     return edge
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["FAR", "FieldTwin", "SignsTwin", "decide_signs", "fill_nodes", "measure_field"]
+__all__ = ["FAR", "FieldTwin", "SignsTwin", "decide_signs", "fill_nodes", "find_walls", "measure_field"]
 
 FAR = np.float32(np.inf)
 """Squared distance of nodes that no point reaches."""
@@ -156,3 +156,45 @@ def fill_nodes(
     """
     size = np.where(near, np.clip(np.abs(field.value), least, far_value), far_value)
     return np.where(signs.inside, size, -size)
+
+
+def find_walls(
+    near: NDArray[np.bool_], negative: NDArray[np.bool_], inside: NDArray[np.bool_], cube: int
+) -> dict[tuple[int, int, int], tuple[int, int, float]]:
+    """Count the faces between inner and outer nodes, and those that no points support.
+
+    A face is supported where both nodes are near and the field has two signs there.  Where it has one, the signs of far
+    nodes have come through a hole in the cloud and stopped at the points of the other side: a wall.
+
+    Parameters
+    ----------
+    near, negative, inside : ndarray, shape (nz, ny, nx), bool
+        As in `decide_signs`, and its result.
+    cube : int
+        Nodes along an edge of the cubes in which faces are counted, that of their lower node.
+
+    Returns
+    -------
+    dict
+        By cube (z, y, x): faces, walls, and the volume that these walls enclose in cubes of the spacing, by the
+        divergence of x - c, their mean place c.
+    """
+    faces: dict[tuple[int, int, int], int] = {}
+    walls: dict[tuple[int, int, int], list[tuple[NDArray[np.float64], NDArray[np.float64]]]] = {}
+    for axis in range(3):
+        step = np.eye(3, dtype=int)[axis]
+        for lower in np.argwhere(np.ones(near.shape, bool)):
+            upper = lower + step
+            if upper[axis] == near.shape[axis] or inside[tuple(lower)] == inside[tuple(upper)]:
+                continue
+            z, y, x = (int(place) // cube for place in lower)
+            faces[z, y, x] = faces.get((z, y, x), 0) + 1
+            if not (near[tuple(lower)] and near[tuple(upper)] and negative[tuple(lower)] != negative[tuple(upper)]):
+                towards = -step if inside[tuple(lower)] else step
+                walls.setdefault((z, y, x), []).append((lower + 0.5 * step, towards.astype(float)))
+    result = {}
+    for place, count in faces.items():
+        found = walls.get(place, [])
+        middle = np.mean([at for at, _ in found], axis=0) if found else np.zeros(3)
+        result[place] = (count, len(found), sum(float((at - middle) @ normal) for at, normal in found) / 3.0)
+    return result

@@ -230,9 +230,9 @@ def test_clouds_without_voxels_are_clustered_as_free_points(device):
 
 def test_free_points_need_a_distance_and_no_volume(device):
     cloud = PointCloud(scattered_points(100))
-    with pytest.raises(UsageError, match="no lattice gives a distance: eps in mm and min_samples as a whole number"):
+    with pytest.raises(UsageError, match=r"no lattice gives a distance: name one in mm \(eps\), about twice"):
         cluster_points(cloud, device=device)
-    with pytest.raises(UsageError, match="eps in mm and min_samples as a whole number"):
+    with pytest.raises(UsageError, match="lie in no planes: give a whole number in place of 'plane\\+1'"):
         cluster_points(cloud, 1.0, "plane+1", device=device)
     with pytest.raises(UsageError, match="a volume says nothing of them"):
         cluster_points(cloud, 1.0, volume=Volume(np.zeros((2, 2, 2), np.int16), np.eye(4)), device=device)
