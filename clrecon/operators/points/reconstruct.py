@@ -117,10 +117,8 @@ def reconstruct_surface(
     Mesh
         In LPS mm.  `Mesh.report` has ``surface`` ("cloud"), ``points``, ``spacing_mm`` and ``spacing_from``,
         ``reach_mm``, ``smoothing_mm``, ``bridge_mm``, ``tries``, ``votes``, ``votes_against_share``, ``regions``,
-        ``wall_share`` (of the surface: walls that no points support), ``lost_share`` (of the volume: what they enclose
-        where a third of the surface are walls), ``open_cubes`` (where that is, the worst first: ``centre_mm``,
-        ``edge_mm``, ``wall_share``), ``nodes``, ``bricks``, ``slabs``, the device, the seconds, and the certificate of
-        the cloud.
+        ``wall_share``, ``lost_share`` and ``open_cubes`` (see docs/clouds.md), ``nodes``, ``bricks``, ``slabs``, the
+        device, the seconds, and the certificate of the cloud.
 
     Raises
     ------
