@@ -199,9 +199,9 @@ class Copy:
         if self.warm is None:
             self.warm = WarmTests(self.root, self.environment(False), trace.modules)
         stages = [list(part) for part in (tests[:FIRST_TESTS], tests[FIRST_TESTS:]) if part]
-        limit_s = trace.limit_s(tests)
+        limits_s = [trace.limit_s(part) for part in stages]
         files = str(self.root.parent / "tests"), str(self._said)
-        return self.warm.run(Run(stages, limit_s, TIMES_WALL * limit_s + AND_WALL_SECONDS, *files)).status
+        return self.warm.run(Run(stages, limits_s, TIMES_WALL * sum(limits_s) + AND_WALL_SECONDS, *files)).status
 
     def close(self) -> None:
         """End the process that runs the tests."""

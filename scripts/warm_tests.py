@@ -8,12 +8,14 @@ from __future__ import annotations
 import contextlib
 import importlib
 import json
+import math
 import os
 import resource
 import select
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -36,8 +38,8 @@ class Run:
     ----------
     stages : list of list of str
         Names of tests, in order.  A stage begins when the one before has passed: only its files are collected.
-    cpu_s : float
-        Processor time that the run may take, in seconds.
+    cpu_s : list of float
+        Processor time that each stage may take, in seconds: a loop without end is seen in the first tests.
     wall_s : float
         Seconds after which the run is ended, however little the processor had to do.
     folder : str
@@ -47,7 +49,7 @@ class Run:
     """
 
     stages: list[list[str]]
-    cpu_s: float
+    cpu_s: list[float]
     wall_s: float
     folder: str
     said: str
@@ -155,14 +157,11 @@ def run_stages(run: Run) -> int:
     nothing = os.open(os.devnull, os.O_RDONLY)
     for number, target in ((nothing, 0), (said, 1), (said, 2)):
         os.dup2(number, target)
-    for limit, value in (
-        (resource.RLIMIT_AS, MEMORY_BYTES),
-        (resource.RLIMIT_CORE, 0),
-        (resource.RLIMIT_CPU, max(1, round(run.cpu_s))),
-    ):
-        resource.setrlimit(limit, (value, value + (5 if limit == resource.RLIMIT_CPU else 0)))
-    status = 0
-    for tests in run.stages:
+    for limit, value in ((resource.RLIMIT_AS, MEMORY_BYTES), (resource.RLIMIT_CORE, 0)):
+        resource.setrlimit(limit, (value, value))
+    status, most = 0, math.ceil(sum(run.cpu_s)) + 5
+    for tests, cpu_s in zip(run.stages, run.cpu_s, strict=True):
+        resource.setrlimit(resource.RLIMIT_CPU, (min(math.ceil(time.process_time() + cpu_s), most), most))
         files = dict.fromkeys(test.partition("::")[0] for test in tests)
         status = int(pytest.main([*PYTEST_OPTIONS, f"--basetemp={run.folder}", *files], plugins=[Chooser(tests)]))
         if status not in (0, 5):
@@ -191,7 +190,7 @@ def run_in_fork(run: Run) -> Outcome:
     took = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
     if late:
         code = -signal.SIGALRM
-    elif code == -signal.SIGKILL and took >= run.cpu_s:
+    elif code == -signal.SIGKILL and took >= sum(run.cpu_s):
         code = -signal.SIGXCPU
     return Outcome(code, took)
 

@@ -15,7 +15,7 @@ from clrecon.dicom.pixels.voxels import _describe_unfit, _fits_stored_bits
 from clrecon.dicom.series.disk import DiskReader
 from clrecon.dicom.series.gates import _judge_thickness
 from clrecon.dicom.series.missing_parts import describe_missing_parts
-from clrecon.dicom.series.phases import Phase
+from clrecon.dicom.series.phases import Phase, _are_passes
 from clrecon.dicom.series.remains import DAMAGED_START, _Slices, describe_start
 from clrecon.dicom.stack import attributes
 from clrecon.dicom.stack.attributes import Alternation, _is_compared, _shorten, find_alternation
@@ -237,3 +237,20 @@ def test_padding_takes_the_middle_value_of_the_air_beside_it():
     assert padding.count == 1
     assert padding.fill() == -990.0  # of -1000, -990, -980 and -960
     assert voxels[0, 1, 1] == -990
+
+
+@pytest.mark.parametrize(
+    ("seconds", "are"),
+    [
+        ([[1, 10, 20], [2, 11, 21]], True),
+        ([[1, 10, 20], [2, 11, 21], [3, 12, 22]], True),
+        ([[3, 12, 22], [1, 10, 20], [2, 11, 21]], True),
+        ([[1, 10, 20], [2, 11, 21], [3, 22, 23]], False),  # the second visit of the last after the third of the first
+        ([[1, 2, 3], [4, 5, 6], [7, 8, 9]], True),  # the table stopped at each place
+        ([[1, 11, 21], [2, 12, 22], [30, 41, 51], [31, 42, 52]], True),  # two stops of two places
+        ([[1, 11, 21], [2, 12, 22], [30, 41, 51], [42, 43, 52]], False),
+    ],
+)
+def test_visits_of_all_places_are_one_pass_after_the_other(seconds, are):
+    values = [[(f"1000{second:02d}",) for second in visits] for visits in seconds]
+    assert _are_passes(values, ("AcquisitionTime",)) == are
