@@ -112,6 +112,15 @@ def test_each_triangle_around_each_vertex_is_found():
         np.testing.assert_allclose(found, 0.0, atol=1e-15)
 
 
+def test_only_the_triangles_around_the_vertex_count_whether_the_foot_lies_within_or_not():
+    vertices, triangles = samples.box()
+    near = NearDistance(vertices, triangles.astype(np.uint32))
+    points = np.array([[1.0, 0.75, 0.75], [1.25, 0.75, 0.75], [3.0, 2.0, 1.0], [3.0, 2.0, 3.0]])
+    found, rows = near.find_within(points, np.full(4, 7), 0.5)
+    np.testing.assert_allclose(found, [0.0, 0.25, np.sqrt(5.0), 3.0], rtol=1e-15)
+    assert all(7 in triangles[row] for row in rows)
+
+
 def test_distances_near_a_vertex_are_exact_or_within_the_limit():
     vertices, triangles = samples.torus(40, 24)
     triangles = triangles.astype(np.uint32)
