@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import sample_meshes as samples
 
-from clrecon.mesh import Mesh
+from clrecon.mesh import Mesh, intersections
 from clrecon.mesh.intersections import count_self_intersections, find_beside
 
 pytestmark = pytest.mark.unit
@@ -106,3 +106,17 @@ def test_only_triangles_that_can_touch_a_changed_one_lie_beside_it():
         assert np.flatnonzero(find_beside(vertices, triangles, changed)).tolist() == beside
         assert not find_beside(vertices, triangles, np.zeros(40, bool)).any()
         assert find_beside(vertices, triangles, np.arange(40) < 3).all()  # more than one of twenty: all are looked at
+
+
+@pytest.mark.parametrize("axis", range(3))
+def test_pairs_whose_boxes_are_apart_are_left_out(axis, monkeypatch):
+    """Both triangles share a cell of the grid, which is 1.5 of their boxes long."""
+    seen = []
+    monkeypatch.setattr(
+        intersections, "_cut", lambda one, other: seen.append(one.shape[1]) or np.zeros(one.shape[1], bool)
+    )
+    face = np.array([[0.0, 0, 0], [1, 0.5, 0.25], [0.5, 1, 1]])
+    for shift, pairs in ((1.25, []), (0.75, [1])):
+        both = np.concatenate([face, face + shift * np.eye(3)[axis]])
+        assert count((both, [[0, 1, 2], [3, 4, 5]])) == 0
+        assert seen == pairs

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from inspect import Parameter, signature
 from types import SimpleNamespace
 from typing import Any
 
@@ -17,6 +18,7 @@ from clrecon.operators.points.emit import VoxelEmission
 from clrecon.operators.points.field import BRICK, Nodes
 from clrecon.operators.points.free_clusters import CELLS_A_CHUNK, CHUNKS_A_CORE, ClusterSearch
 from clrecon.operators.points.grid import GridPlan
+from clrecon.operators.points.slice_overlap import find_ghost_slices
 from clrecon.operators.points.voxel_clusters import pad_for, search_bytes
 from clrecon.operators.primitives.radix_sort import (
     FEWEST_PER_CHUNK,
@@ -197,3 +199,10 @@ def test_edges_that_are_not_passed_once_each_way():
     assert _count_open_edges(closed[:3], 4) > 0
     assert _count_open_edges(np.concatenate([closed[:3], closed[3:, ::-1]]), 4) > 0
     assert _count_open_edges(np.concatenate([closed, closed]), 4) == 12  # each twice
+
+
+def test_what_a_search_for_ghosts_takes_beside_its_band_is_named():
+    kinds = {name: parameter.kind for name, parameter in signature(find_ghost_slices).parameters.items()}
+    named = {"device", "memory", "progress"}
+    assert {name for name, kind in kinds.items() if kind == Parameter.KEYWORD_ONLY} == named
+    assert {name for name, kind in kinds.items() if kind == Parameter.POSITIONAL_OR_KEYWORD} == {"volume", "hu"}
