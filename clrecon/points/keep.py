@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,6 +13,7 @@ from clrecon.errors import NoSurfaceError, UsageError
 from clrecon.points.cloud import PointCloud
 from clrecon.points.cluster_figures import SHEET_POINTS, SHEET_RATIO, ClusterFigures, measure_clusters
 from clrecon.points.step import PointStep
+from clrecon.system.wording import name_parameter
 
 __all__ = ["KEEP_FORMS", "KeepRule", "keep_clusters", "parse_keep_rules"]
 
@@ -119,7 +120,21 @@ def keep_clusters(
         "clusters": figures.as_dicts(REPORTED),
         **facts,
     }
-    return PointStep(cloud if kept.all() else cloud.select(kept), removed, REASONS, facts)
+    warnings = _warn_of_seeds(cloud, wanted, facts)
+    return PointStep(cloud if kept.all() else cloud.select(kept), removed, REASONS, facts, warnings)
+
+
+def _warn_of_seeds(cloud: PointCloud, rules: tuple[KeepRule, ...], facts: Mapping[str, object]) -> tuple[str, ...]:
+    """Name seeds outside of the box of all points: of another frame or unit, most likely."""
+    low, high = cloud.points.min(axis=0), cloud.points.max(axis=0)
+    seeds = [rule for rule in rules if rule.kind == "seed"]
+    far = facts.get("seed_distances_mm")
+    return tuple(
+        f"{_write(seed)} (mm LPS) lies outside of the box of the points, {distance:,.1f} mm from the nearest one in a"
+        " cluster, which was kept"
+        for seed, distance in zip(seeds, far if isinstance(far, list) else [], strict=True)
+        if not (np.all(low <= seed.numbers) and np.all(seed.numbers <= high))
+    )
 
 
 def _write(rule: KeepRule) -> str:
@@ -172,6 +187,11 @@ def _find_cluster(cloud: PointCloud, seed: tuple[float, ...], cores: ArrayLike |
 
 
 def _describe_nothing(labels: NDArray[np.int32], figures: ClusterFigures, fate: NDArray[np.uint8]) -> str:
+    if not len(figures.points):
+        return (
+            f"no cluster is left: all of {len(labels):,} points are noise, as none has enough others near it; take a"
+            f" larger {name_parameter('eps')} or a smaller {name_parameter('min_samples')}"
+        )
     largest = int(figures.points.max(initial=0))
     return (
         f"no cluster is left of {len(figures.points):,}: {int((labels < 0).sum()):,} of {len(labels):,} points are"

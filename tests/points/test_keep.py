@@ -135,7 +135,10 @@ def test_what_cannot_be_kept_is_refused() -> None:
         keep_clusters(a_cloud(), "seed:0,0,0", cores=np.ones(3, bool))
     with pytest.raises(NoSurfaceError, match=r"no cluster is left of 4: 2 of 2,502 points are noise.*4 are too small"):
         keep_clusters(a_cloud(), "min:5000")
-    with pytest.raises(NoSurfaceError, match="no cluster is left of 0: 1 of 1 points are noise"):
+    with pytest.raises(
+        NoSurfaceError,
+        match="no cluster is left: all of 1 points are noise, as none has enough others near it; take a larger eps",
+    ):
         keep_clusters(PointCloud([[0.0, 0.0, 0.0]], labels=[-1]))
     with pytest.raises(NoSurfaceError, match="all are noise"):
         keep_clusters(PointCloud([[0.0, 0.0, 0.0]], labels=[-1]), "seed:0,0,0")
@@ -143,3 +146,14 @@ def test_what_cannot_be_kept_is_refused() -> None:
 
 def test_rules_are_read_with_spaces_and_capitals() -> None:
     assert [rule.kind for rule in parse_keep_rules([" Largest:2", "No-Sheets "])] == ["largest", "no-sheets"]
+
+
+def test_a_seed_outside_of_all_points_is_warned_of():
+    cloud = PointCloud(np.array([[0.0, 0, 0], [1, 1, 1], [9, 9, 9]]), labels=[0, 0, 1])
+    assert keep_clusters(cloud, "seed:1,1,0.5").warnings == ()
+    step = keep_clusters(cloud, ["seed:1,1,0.5", "seed:9,9,4000"])
+    assert len(step.cloud) == 3
+    assert step.warnings == (
+        "seed:9,9,4000 (mm LPS) lies outside of the box of the points, 3,991.0 mm from the nearest one in a cluster,"
+        " which was kept",
+    )

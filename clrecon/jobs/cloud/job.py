@@ -87,6 +87,10 @@ def make_cloud(
     is_cloud = is_cloud_file(source)
     if is_cloud:
         refuse_scan_settings(settings, OF_SCANS)
+    elif settings.input_space is not None:
+        raise UsageError(
+            f"a scan says its own frame: leave out {name_parameter('input_space')}, which is for clouds of points"
+        )
     elif settings.paper and settings.kind == "surface":
         raise UsageError(
             "the formulas of the papers are for voxel centres, not for points of a surface: give a band too"

@@ -232,6 +232,7 @@ WRONG = (
     (["--surface", "out.xyz"], ".stl"),
     (["--outliers", "-1"], "standard deviations above 0"),
     (["--paper"], "not for points of a surface"),
+    (["--input-space", "ras"], "a scan says its own frame: leave out --input-space"),
     (["--space", "xyz"], "xyz"),
     (["--memory", "0"], "memory"),
     (["--removed", "out.stl"], "use one of .ply"),
