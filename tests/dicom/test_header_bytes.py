@@ -21,7 +21,7 @@ from clrecon.dicom.parse.raw import CorruptFileError, read_pixel_head
 from clrecon.dicom.parse.sequences import _make_encoding, _Walk
 from clrecon.dicom.parse.transfer_syntaxes import RLE
 from clrecon.dicom.parse.values import ValueProblem, Values
-from clrecon.dicom.pixels.stray_bits import OVERLAY_BITS
+from clrecon.dicom.pixels.stray_bits import OVERLAY_BITS, describe_stray_bits
 from clrecon.errors import RefusedInputError
 
 pytestmark = pytest.mark.unit
@@ -180,13 +180,20 @@ def test_padding_values_are_binary_numbers():
             values_of(padding=(0x00280120, raw, vr)).padding(16, 16, True)
 
 
-def test_tags_of_overlays_and_of_what_converters_leave_over():
+def test_tags_of_overlays():
     assert [f"{tag:08X}" for tag in OVERLAY_BITS] == [f"60{group:02X}0102" for group in range(0, 32, 2)]
+    assert describe_stray_bits([None], [SimpleNamespace()]) == (0, "")  # type: ignore[list-item]
+
+
+def test_elements_that_converters_leave_over_and_where_a_data_set_begins():
     assert {keyword_for_tag(tag) for tag in multiframe._UNASSIGNED} == {
         *("AcquisitionDate", "ContentDate", "AcquisitionTime", "ContentTime", "KVP", "TriggerTime"),
         *("ConvolutionKernel", "AcquisitionNumber", "TemporalPositionIdentifier", "PixelPaddingValue"),
         *("PixelPaddingRangeLimit", "RescaleIntercept", "RescaleSlope", "RescaleType", "LossyImageCompression"),
     }
+    meta = element(0x00020010, b"UI", b"1.2.840.10008.1.2.1\0") + long_element(0x00020102, b"OB", b"abc\0")
+    assert multiframe.find_data_set(bytes(132) + meta + element(0x00080005, b"CS")) == 132 + len(meta)
+    assert multiframe.find_data_set(bytes(140)) == 132
 
 
 def test_a_header_of_more_than_256_mib_is_not_read():

@@ -17,7 +17,7 @@ from clrecon.operators.points.cell_edge import choose_cell_edge
 from clrecon.operators.points.emit import VoxelEmission
 from clrecon.operators.points.field import BRICK, Nodes
 from clrecon.operators.points.free_clusters import CELLS_A_CHUNK, CHUNKS_A_CORE, ClusterSearch
-from clrecon.operators.points.grid import GridPlan
+from clrecon.operators.points.grid import PADDING, GridPlan
 from clrecon.operators.points.slice_overlap import find_ghost_slices
 from clrecon.operators.points.voxel_clusters import pad_for, search_bytes
 from clrecon.operators.primitives.radix_sort import (
@@ -31,6 +31,8 @@ from clrecon.operators.primitives.radix_sort import (
 from clrecon.operators.rays import composite
 from clrecon.operators.rays.buffers import TILE, PictureBuffers
 from clrecon.operators.rays.point_pictures import DARKEST_SHARE, _choose_window
+from clrecon.operators.surface import mask_extraction
+from clrecon.operators.surface.mask_extraction import FACES_PER_AREA, FULL, STEEPNESS
 from clrecon.operators.surface.slabs import SampleGrid, Slab
 from clrecon.rendering.looks.transfer_function import TransferFunction
 
@@ -53,6 +55,21 @@ def test_words_of_nodes_of_a_field(bricks, words):
 def test_words_of_cells_of_a_grid(cells, words):
     plan = GridPlan(np.zeros((1, 3), np.float32), NOWHERE, NOWHERE.astype(np.float32), np.float32(1.0), (cells, 3, 5))
     assert (plan.words, plan.total_words) == (words, 15 * words)
+
+
+def test_bytes_of_a_grid_where_each_point_has_its_own_cell():
+    """The order of the points stays beside their sorted coordinates and the first point of each cell."""
+    for n in (1, 1000):
+        points = np.zeros((n, 3), np.float32)
+        plan = GridPlan(points, NOWHERE, NOWHERE.astype(np.float32), np.float32(1.0), (33, 3, 5))
+        gathering = 4 * n + 4 * n + 3 * 4 * (n + PADDING) + 4 * (n + 1)
+        sorting = 4 * n + sort_bytes(device(1), n, n.bit_length())
+        assert plan.needs(device(1)) == {
+            "points": 12 * n,
+            "sorted points": max(gathering, sorting),
+            "cells of the grid": 8 * 30,
+        }
+    assert gathering > sorting
 
 
 def sample_grid(ni: int, nj: int = 4, nk: int = 5) -> SampleGrid:
@@ -206,3 +223,18 @@ def test_what_a_search_for_ghosts_takes_beside_its_band_is_named():
     named = {"device", "memory", "progress"}
     assert {name for name, kind in kinds.items() if kind == Parameter.KEYWORD_ONLY} == named
     assert {name for name, kind in kinds.items() if kind == Parameter.POSITIONAL_OR_KEYWORD} == {"volume", "hu"}
+
+
+def test_the_first_step_to_the_volume_of_a_label(monkeypatch):
+    """The slope by which levels move the volume, of 300 vertices over voxels of 3 mm3."""
+    told = []
+    monkeypatch.setattr(mask_extraction, "next_level", lambda tried, wanted, slope: told.append((wanted, slope)) or 7)
+    mesh: Any = SimpleNamespace(
+        counted=SimpleNamespace(vertices=300),
+        run=SimpleNamespace(labels=SimpleNamespace(affine=np.diag([2.0, -3.0, 0.5, 1.0]))),
+        place=lambda level: None,
+        emission=SimpleNamespace(download=lambda: "mesh"),
+    )
+    assert mask_extraction.StartedMesh.keep_volume(mesh, 10.0, closed=False) == ("mesh", 7)
+    ((wanted, slope),) = told
+    assert (wanted, slope) == (10.0, pytest.approx(-(300 / FACES_PER_AREA) * 3.0 / (STEEPNESS * FULL)))

@@ -7,7 +7,16 @@ import pytest
 from point_grids import fetch_grid, scattered_points
 
 from clrecon.errors import DeviceMemoryError, UsageError
-from clrecon.operators.points.grid import CELL_ROUNDING, MOST_CELLS, MOST_CELLS_ALONG, fill_grid, make_grid, plan_grid
+from clrecon.operators.points.grid import (
+    CELL_ROUNDING,
+    MOST_CELLS,
+    MOST_CELLS_ALONG,
+    PADDING,
+    STEPS_A_POINT,
+    fill_grid,
+    make_grid,
+    plan_grid,
+)
 from clrecon.points import PointCloud
 from clrecon.reference.points import grid as twin
 
@@ -130,3 +139,23 @@ def test_the_forecast_is_refused_before_anything_is_taken(device):
         fill_grid(device, plan, memory=sum(needs.values()) - 1)
     grid = fill_grid(device, plan, memory=sum(needs.values()))
     assert grid.nbytes <= sum(needs.values())
+
+
+def test_buffers_are_as_long_as_what_the_kernels_write(device):
+    grid = make_grid(device, scattered_points(1000), 0.9)
+    words = grid.words * grid.shape[1] * grid.shape[2]
+    assert [grid.mask_d.size, grid.ranks_d.size] == [4 * words] * 2
+    assert [grid.x_d.size, grid.y_d.size, grid.z_d.size] == [4 * (1000 + PADDING)] * 3
+    assert grid.starts_d.size == 4 * (grid.cells + 1)
+
+
+def test_where_loops_end_early_only_clouds_beyond_that_are_warned_of(device, monkeypatch):
+    told = []
+    monkeypatch.setattr(device, "most_steps", 1000 * STEPS_A_POINT)
+    monkeypatch.setattr(device, "remark", told.append)
+    for n in (999, 1000):
+        make_grid(device, scattered_points(n), 0.9)
+    assert told == []
+    make_grid(device, scattered_points(1001), 0.9)
+    (text,) = told
+    assert f"after {1000 * STEPS_A_POINT:,} steps" in text

@@ -9,6 +9,7 @@ from clrecon.errors import UsageError
 from clrecon.opencl import download, upload
 from clrecon.operators.primitives import radix_sort as module
 from clrecon.operators.primitives.radix_sort import FEWEST_PER_CHUNK, RADIX_BITS, radix_sort, sort_bytes
+from clrecon.operators.primitives.scan import exclusive_scan
 from clrecon.reference.primitives import radix_sort as twin
 
 CHUNK = FEWEST_PER_CHUNK
@@ -96,3 +97,12 @@ def test_many_keys_where_work_items_end_early(device):
     if device.most_steps is None:
         pytest.skip("work-items of this device do not end early")
     check_sorted(device, np.random.default_rng(7).integers(0, 2**32, 70 * device.most_steps, dtype=np.uint32))
+
+
+@pytest.mark.parametrize("bits", [RADIX_BITS, RADIX_BITS + 1, 2 * RADIX_BITS + 1])
+def test_buffers_are_as_long_as_the_keys(device, bits):
+    """Of one, two and three passes, which take turns in two pairs of buffers."""
+    keys = np.random.default_rng(bits).integers(0, 2**bits, 1000, dtype=np.uint32)
+    made = radix_sort(device, upload(device, keys), 1000, bits=bits)
+    offsets_d = exclusive_scan(device, made.keys_d, 1000).offsets_d
+    assert [made.keys_d.size, made.values_d.size, offsets_d.size] == [4000] * 3
