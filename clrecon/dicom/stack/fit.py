@@ -103,7 +103,7 @@ class Stack:
     tilt_deg: float | None
     problems: tuple[str, ...]
     warnings: tuple[str, ...]
-    missing: int = 0
+    missing: int
 
     @property
     def slice_positions(self) -> Float64Array | None:

@@ -150,7 +150,7 @@ def test_buffers_are_as_long_as_what_the_kernels_write(device):
 
 
 def test_where_loops_end_early_only_clouds_beyond_that_are_warned_of(device, monkeypatch):
-    told = []
+    told: list[str] = []
     monkeypatch.setattr(device, "most_steps", 1000 * STEPS_A_POINT)
     monkeypatch.setattr(device, "remark", told.append)
     for n in (999, 1000):
