@@ -65,6 +65,17 @@ class Parser(argparse.ArgumentParser):
             return value
         return super()._get_values(action, arg_strings)
 
+    def _get_value(self, action: argparse.Action, arg_string: str) -> Any:  # type: ignore[override]
+        """Read a value; what is no number is said in words, with the unit that must not stand there."""
+        if action.type not in (int, float):
+            return super()._get_value(action, arg_string)
+        try:
+            return action.type(arg_string)  # type: ignore[operator]
+        except ValueError:
+            number = "whole number" if action.type is int else "number"
+            unit = ": write the length in mm, without a unit" if action.metavar == "MM" else ""
+            raise argparse.ArgumentError(action, f"{arg_string!r:.80} is no {number}{unit}") from None
+
     def error(self, message: str) -> NoReturn:
         raise UsageError(f"{message} (see: {self.prog} --help)")
 

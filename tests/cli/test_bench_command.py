@@ -80,7 +80,7 @@ def test_a_failed_device_is_partly_done(
     ("extra", "code", "words"),
     [
         (["--runs", "0"], 3, "1 to 1000"),
-        (["--runs", "many"], 3, "invalid int value"),
+        (["--runs", "many"], 3, "'many' is no whole number"),
         (["--hu", "nan"], 3, "finite"),
         (["--device", "abacus"], 5, "abacus"),
         (["--report", "no/such/folder/b.json"], 6, "does not exist"),

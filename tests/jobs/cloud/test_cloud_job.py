@@ -227,6 +227,8 @@ WRONG = (
     (["--keep", "smallest"], "the rules are largest"),
     (["--hu", BAND, "--paper", "--cluster"], "where clusters mean nothing"),
     (["--denoise", "median"], "denoised by one of grid, bilateral, not 'median'"),
+    (["--spacing", "1mm"], "'1mm' is no number: write the length in mm, without a unit"),
+    (["--outliers", "few"], "argument --outliers: 'few' is no number (see"),
     (["--spacing", "0"], "the spacing of points is a length in mm"),
     (["--hu", BAND, "--surface", "out.stl"], "ask for them (--normals)"),
     (["--surface", "out.xyz"], ".stl"),
