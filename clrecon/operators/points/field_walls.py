@@ -138,10 +138,10 @@ def _neighbours(mask: Words, axis: int, layers: int) -> tuple[Words, Words]:
 
 def _count(words: Words, cubes_y: int) -> NDArray[np.int64]:
     """Return the number of set bits by cube, shape (cubes_y, words)."""
-    bits = _BITS[np.ascontiguousarray(words).view(np.uint16)].reshape(*words.shape, 2).sum(axis=(0, 3), dtype=np.int64)
-    padded = np.zeros((cubes_y * CUBE, words.shape[2]), np.int64)
-    padded[: len(bits)] = bits
-    return padded.reshape(cubes_y, CUBE, -1).sum(axis=1)
+    k, j, word = np.nonzero(words)  # few of them
+    bits = _BITS[words[k, j, word].view(np.uint16)].reshape(-1, 2).sum(axis=1)
+    count = words.shape[2]
+    return np.bincount(j // CUBE * count + word, bits, cubes_y * count).astype(np.int64).reshape(cubes_y, count)
 
 
 def _list(wall: Words, inside: Words) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
