@@ -230,6 +230,7 @@ def test_patients_and_studies_stand_apart() -> None:
     assert rows == [["1", "1", "1"], ["3", "1", "3"], ["2", "28", "2"], ["5", "28", "2"], ["4", "-", "-"]]
 
 
+@pytest.mark.untraced
 def test_thousands_of_series_take_one_line_each() -> None:
     entries = [entry(number, modality="MR", problems=["modality MR is not CT"]) for number in range(1, 2001)]
     lines = render_listing(listing(*entries, chosen=None), [])

@@ -243,6 +243,7 @@ def test_every_cut_of_the_groups_is_refused(tmp_path):
         assert "mf: " in refusal(tmp_path) or "truncated" in refusal(tmp_path)
 
 
+@pytest.mark.untraced
 def test_wrong_bytes_in_the_groups_do_no_harm(tmp_path):
     """Each byte of the groups wrong in turn: the volume, or a refusal."""
     plan = write_enhanced(tmp_path / "mf", Plan(shape=(2, 2, 2)))
