@@ -77,6 +77,13 @@ COVERED = """
 import time
 import pytest
 from clrecon.seen import choose
+@pytest.fixture
+def inner():
+    return 0
+@pytest.fixture
+def three(request):
+    request.getfixturevalue("inner")
+    return choose(3)
 @pytest.mark.parametrize("n", PARAMETERS)
 def test_quick(n):
     until = time.process_time() + (n == "long")
@@ -84,8 +91,8 @@ def test_quick(n):
         pass
     assert choose(1 if n == "long" else n)
 @pytest.mark.MARK
-def test_marked():
-    assert choose(3) == 3
+def test_marked(three):
+    assert three == 3
 """
 
 

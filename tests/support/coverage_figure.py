@@ -4,8 +4,9 @@ Tracing makes loops of plain Python take four to nine times as long.  Tests mark
 others do once, or stand for long searches; those marked ``untraced`` are long loops over functions that other tests run
 too; tests on further devices repeat what those on the first one have run; guards and tests of scripts read the project
 or start programs.  They are not traced, and neither are the processes that tests start.  Many parameters of a test run
-much the same lines: once those that ran nothing new have taken `BARREN_SECONDS`, the others are not traced.  The true
-coverage is therefore a little higher than the figure.
+much the same lines: once those that ran nothing new have taken `BARREN_SECONDS`, the others are not traced.  Of a test
+its fixtures and its body are traced, not what pytest does around them.  The true coverage is therefore a little higher
+than the figure.
 """
 
 from __future__ import annotations
@@ -14,7 +15,8 @@ import json
 import tempfile
 import time
 from collections import defaultdict
-from collections.abc import Generator
+from collections.abc import Generator, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import coverage
@@ -61,6 +63,8 @@ class CoverageFigure:
         """`traces` is the name of this process among those that trace, None where it runs no test."""
         self.folder = folder
         self.combines = combines
+        self.traces_test = False
+        self.depth = 0  # fixtures ask for each other
         self.barren: defaultdict[str, float] = defaultdict(float)  # seconds by test
         self.coverage = make_coverage(folder, traces) if traces else None
         if self.coverage:
@@ -78,23 +82,53 @@ class CoverageFigure:
         apart = any(item.path.is_relative_to(room) for room in UNTRACED_ROOMS)
         return not (marked or apart or self.barren[name_of(item)] > BARREN_SECONDS)
 
+    @contextmanager
+    def tracing(self) -> Iterator[None]:
+        """A part of a test, traced if the test is."""
+        if not (self.coverage and self.traces_test):
+            yield
+            return
+        self.depth += 1
+        if self.depth == 1:
+            self.coverage.start()
+        try:
+            yield
+        finally:
+            self.depth -= 1
+            if self.depth == 0:
+                self.coverage.stop()
+
+    @pytest.hookimpl(wrapper=True)
+    def pytest_runtestloop(self) -> Generator[None, object, object]:
+        """All tests; what was imported for them has been traced until here."""
+        if self.coverage:
+            self.coverage.stop()
+        return (yield)
+
     @pytest.hookimpl(wrapper=True)
     def pytest_runtest_protocol(self, item: pytest.Item) -> Generator[None, object, object]:
         """Run a test, traced or not."""
-        if not self.coverage:
+        self.traces_test = self.coverage is not None and self.is_traced(item)
+        if not self.traces_test:
             return (yield)
-        if not self.is_traced(item):
-            self.coverage.stop()
-            try:
-                return (yield)
-            finally:
-                self.coverage.start()
         seen, since = self.count_steps(), time.process_time()
         try:
             return (yield)
         finally:
             if self.count_steps() == seen:
                 self.barren[name_of(item)] += time.process_time() - since
+
+    @pytest.hookimpl(wrapper=True)
+    def pytest_fixture_setup(self) -> Generator[None, object, object]:
+        """Make a fixture."""
+        with self.tracing():
+            return (yield)
+
+    @pytest.hookimpl(wrapper=True)
+    def pytest_pyfunc_call(self) -> Generator[None, object, object]:
+        """Run the body of a test."""
+        with self.tracing():
+            return (yield)
 
     @pytest.hookimpl(wrapper=True, tryfirst=True)
     def pytest_sessionfinish(self) -> Generator[None, object, object]:
