@@ -14,7 +14,7 @@ from clrecon.jobs.cloud.points import iso_value_of, prepare_chain, take_points
 from clrecon.jobs.cloud.report import CloudReport, describe_clouds, describe_file
 from clrecon.jobs.cloud.settings import OF_SCANS, CloudSettings
 from clrecon.jobs.cloud.trail import Trail
-from clrecon.jobs.shared.clouds import is_cloud_file, refuse_scan_settings
+from clrecon.jobs.shared.clouds import is_cloud_file, refuse_other_clouds, refuse_scan_settings
 from clrecon.jobs.shared.labelled import read_with_labels
 from clrecon.jobs.shared.laps import Laps
 from clrecon.jobs.shared.masking import mask_volume
@@ -84,6 +84,7 @@ def make_cloud(
         for _, path in outputs:
             refuse_existing(path, resolve_target(path))
     check_kept(outputs, source, settings.labels)
+    refuse_other_clouds(source)
     is_cloud = is_cloud_file(source)
     if is_cloud:
         refuse_scan_settings(settings, OF_SCANS)

@@ -15,10 +15,13 @@ from clrecon.system.wording import name_parameter
 if TYPE_CHECKING:
     from clrecon.points import PointCloud
 
-__all__ = ["CLOUD_INPUTS", "describe_cloud", "is_cloud_file", "refuse_scan_settings"]
+__all__ = ["CLOUD_INPUTS", "describe_cloud", "is_cloud_file", "refuse_other_clouds", "refuse_scan_settings"]
 
 CLOUD_INPUTS = (".ply", ".vtp", ".npz", ".xyz", ".las", ".csv", ".txt")
 """Extensions of files that are read as clouds, see `clrecon.read_points`."""
+
+OTHER_CLOUDS = (".pcd", ".e57", ".laz", ".pts", ".ptx")
+"""Extensions of clouds that are not read."""
 
 _OF_BOTH = ("keep_ids", "device", "memory")
 """Settings of the input that clouds have too."""
@@ -27,6 +30,21 @@ _OF_BOTH = ("keep_ids", "device", "memory")
 def is_cloud_file(source: str | Path) -> bool:
     """True for a file, or the name of one, whose extension is that of a cloud; folders are scans."""
     return os.path.splitext(os.fspath(source))[1].lower() in CLOUD_INPUTS and not os.path.isdir(source)
+
+
+def refuse_other_clouds(source: str | Path) -> None:
+    """Refuse a file whose extension is that of a cloud of another kind; it would be looked through for a scan.
+
+    Raises
+    ------
+    UsageError
+        With the kinds that are read.
+    """
+    extension = os.path.splitext(os.fspath(source))[1].lower()
+    if extension in OTHER_CLOUDS and os.path.isfile(source):
+        raise UsageError(
+            f"clouds in files {extension} are not read: convert it to one of {', '.join(CLOUD_INPUTS)} first"
+        )
 
 
 def refuse_scan_settings(settings: InputSettings, also: Sequence[str] = ()) -> None:

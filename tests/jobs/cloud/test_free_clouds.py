@@ -61,6 +61,15 @@ def test_the_filter_as_printed_on_a_cloud_that_was_read(tmp_path: Path, cloud_co
     assert not np.array_equal(one, two)
 
 
+@pytest.mark.parametrize("name", ["a.pcd", "a.E57", "a.laz"])
+def test_clouds_that_are_not_read_are_no_scans(
+    name: str, tmp_path: Path, cloud_command: Any, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / name).write_text("# .PCD")
+    assert cloud_command(tmp_path / name) == 3
+    assert f"clouds in files {name[1:].lower()} are not read: convert it to one of .ply," in capsys.readouterr().err
+
+
 def test_a_single_point_has_no_cells(tmp_path: Path, cloud_command: Any, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "one.xyz").write_text("1 2 3\n")
     assert cloud_command(tmp_path / "one.xyz", "--denoise", "grid") == 3
