@@ -8,12 +8,15 @@ from typing import Any
 
 import numpy as np
 import pytest
+from uneven_volume import HEIGHTS, uneven
 
+from clrecon.errors import UsageError
 from clrecon.geometry import Volume
 from clrecon.geometry.iso_rule import choose_iso_rule
 from clrecon.operators.first_use import _count_open_edges
 from clrecon.operators.points.band_mask import mask_bytes
 from clrecon.operators.points.cell_edge import choose_cell_edge
+from clrecon.operators.points.clusters import _order_voxels
 from clrecon.operators.points.emit import VoxelEmission
 from clrecon.operators.points.field import BRICK, Nodes
 from clrecon.operators.points.free_clusters import CELLS_A_CHUNK, CHUNKS_A_CORE, ClusterSearch
@@ -31,10 +34,13 @@ from clrecon.operators.primitives.radix_sort import (
 from clrecon.operators.rays import composite
 from clrecon.operators.rays.buffers import TILE, PictureBuffers
 from clrecon.operators.rays.point_pictures import DARKEST_SHARE, _choose_window
+from clrecon.operators.rays.splats import LARGEST_DISC, SMALLEST_DISC, _Splats
+from clrecon.operators.resident.frame import FieldFrame
 from clrecon.operators.surface import mask_extraction
 from clrecon.operators.surface.mask_extraction import FACES_PER_AREA, FULL, STEEPNESS
 from clrecon.operators.surface.slabs import SampleGrid, Slab
-from clrecon.rendering.looks.transfer_function import TransferFunction
+from clrecon.rendering import Lighting, TransferFunction
+from clrecon.rendering.views.camera import Camera
 
 pytestmark = pytest.mark.unit
 
@@ -238,3 +244,32 @@ def test_the_first_step_to_the_volume_of_a_label(monkeypatch):
     assert mask_extraction.StartedMesh.keep_volume(mesh, 10.0, closed=False) == ("mesh", 7)
     ((wanted, slope),) = told
     assert (wanted, slope) == (10.0, pytest.approx(-(300 / FACES_PER_AREA) * 3.0 / (STEEPNESS * FULL)))
+
+
+def test_heights_of_an_uneven_volume_count_from_its_first_slice():
+    for sign in (1.0, -1.0):
+        volume = uneven(sign=sign)
+        places = FieldFrame.of(volume).places(volume.slice_origins())
+        np.testing.assert_allclose(places[0], 0.0, atol=1e-9)
+        np.testing.assert_allclose(np.abs(places[:, 2]), HEIGHTS, atol=1e-9)
+        inner = FieldFrame.of(volume).places(volume.ijk_to_lps(np.array([[2.0, 1.0, 0.0]])))
+        np.testing.assert_allclose(inner, [[2.0, 1.0, 0.0]], atol=1e-9)
+
+
+def test_voxels_of_a_box_of_more_than_2_to_the_31_are_told_apart():
+    """The number of the last is 2^32: in 32 bits it is that of the first."""
+    ijk = np.array([[0, 0, 0], [2047, 2047, 0], [0, 0, 1024]], np.int32)
+    assert _order_voxels(ijk)[0] is None
+    order, ordered = _order_voxels(ijk[::-1])
+    assert order is not None
+    assert (order.tolist(), ordered.tolist()) == ([2, 1, 0], ijk.tolist())
+    with pytest.raises(UsageError, match="1 of 4 points have the voxel of another"):
+        _order_voxels(ijk[[0, 1, 2, 1]])
+
+
+@pytest.mark.parametrize(("radius", "pixels"), [(4.0, 8.0), (1.5, 3.0), (1e-9, SMALLEST_DISC), (1e9, LARGEST_DISC)])
+def test_discs_in_pixels(radius, pixels):
+    """Half a mm a pixel."""
+    camera = Camera((0.0, -50.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 1.0), parallel_scale=11.75)
+    splats = _Splats(device(1), camera, (61, 47), radius, None, Lighting(), None, True)
+    assert splats.disc_pixels == pytest.approx(pixels)

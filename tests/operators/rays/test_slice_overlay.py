@@ -180,3 +180,13 @@ def test_bad_input_is_refused(device, wrong, says):
     volume = make_volume(blobs, "even", 8.0, np.int16)
     with pytest.raises(UsageError, match=says):
         overlay_slices(DeviceVolume(volume, device=device), Camera.fit(volume), (8, 8), **wrong)
+
+
+def test_each_slice_is_told(device):
+    volume = make_volume(blobs, "uneven", dtype=np.int16)
+    told: list[tuple] = []
+    style = SlicesInSpace(slices=[1, 4, 7], opacity=0.4, lowest_hu=-300.0, window=WINDOW)
+    camera = look(volume, (0.4, 0.8, -0.7), 14.0, False)
+    resident = DeviceVolume(volume, device=device)
+    operator.overlay_slices(resident, style, camera, SIZE, None, progress=lambda *said: told.append(said))
+    assert told == [("slabs", 0, 3), ("slabs", 3, 3)]
