@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from queue import Empty
 from types import SimpleNamespace
 from typing import Any
@@ -10,6 +11,8 @@ import numpy as np
 import pytest
 
 from clrecon.dicom.headers.concatenation import Concatenation
+from clrecon.dicom.pixels import stray_bits
+from clrecon.dicom.pixels.decoder_pool import _find_modules
 from clrecon.dicom.pixels.padding import PaddingMasks, pack_mask
 from clrecon.dicom.pixels.voxels import _describe_unfit, _fits_stored_bits
 from clrecon.dicom.series.disk import DiskReader
@@ -254,3 +257,27 @@ def test_padding_takes_the_middle_value_of_the_air_beside_it():
 def test_visits_of_all_places_are_one_pass_after_the_other(seconds, are):
     values = [[(f"1000{second:02d}",) for second in visits] for visits in seconds]
     assert _are_passes(values, ("AcquisitionTime",)) == are
+
+
+def test_decoders_find_numpy_but_nothing_of_the_current_folder(tmp_path, monkeypatch):
+    ours, others = Path(np.__file__).parents[1], Path(np.__file__).parents[2]
+    for folder in (tmp_path, others, ours):
+        monkeypatch.syspath_prepend(str(folder))
+    monkeypatch.syspath_prepend("relative")
+    for folder in (tmp_path, others, ours):
+        monkeypatch.chdir(folder)
+        found = _find_modules()
+        assert "relative" not in found
+        assert [str(one) in found for one in (tmp_path, others)] == [one != folder for one in (tmp_path, others)]
+        assert str(ours) in found
+
+
+@pytest.mark.parametrize(
+    ("overlays", "expected"),
+    [([12], (0, 0, True, None)), ([12, 13, 14, 15], (0, 0, False, None)), ([], (1, 0, True, (4101, 5)))],
+)
+def test_bits_above_the_stored_ones_are_sign_or_overlay(overlays, expected, monkeypatch):
+    """Twelve stored bits of 16: -1 with its sign extended, and 5 with the lowest bit above set."""
+    monkeypatch.setattr(stray_bits, "_read_overlay_bits", lambda header: overlays)
+    header: Any = SimpleNamespace(bits_allocated=16, bits_stored=12, high_bit=11, signed=True, float_pixels=False)
+    assert stray_bits.find_stray_bits(header, np.array([[-1, 4101]], np.int16), None) == expected

@@ -123,6 +123,16 @@ def test_bytes_of_masks_and_of_a_search():
     }
 
 
+@pytest.mark.parametrize(("slices", "ends"), [(10, []), (5, [5, 10]), (4, [4, 8, 10])])
+def test_several_slabs_of_voxels_are_told(slices, ends):
+    emission: Any = SimpleNamespace(volume=SimpleNamespace(shape_ijk=(4, 4, 10)), _next=0, _parts=[], marked=0, slabs=0)
+    emission._one_slab = lambda first, end: ((None, []), 1)
+    told: list[tuple] = []
+    VoxelEmission._go_on(emission, slices, lambda *said: told.append(said))
+    assert told == [("slabs", end, 10) for end in ends]
+    assert emission.marked == emission.slabs == max(len(ends), 1)
+
+
 def test_bytes_of_a_slab_of_voxels():
     emission: Any = SimpleNamespace(
         volume=SimpleNamespace(shape_ijk=(65, 7, 20)),
