@@ -21,12 +21,16 @@ from clrecon.dicom.parse.raw import CorruptFileError, read_pixel_head
 from clrecon.dicom.parse.sequences import _make_encoding, _Walk
 from clrecon.dicom.parse.transfer_syntaxes import RLE
 from clrecon.dicom.parse.values import ValueProblem, Values
+from clrecon.dicom.pixels import codestream
+from clrecon.dicom.pixels.decoder_process import REPLY, send
 from clrecon.dicom.pixels.stray_bits import OVERLAY_BITS, describe_stray_bits
+from clrecon.dicom.series.series import PROBLEMS_SHOWN, Series
 from clrecon.errors import RefusedInputError
 
 pytestmark = pytest.mark.unit
 
 EXPLICIT = _make_encoding(False, True)
+SHOWN = [f"bad {number}" for number in range(PROBLEMS_SHOWN)]
 
 
 def element(tag: int, vr: bytes = b"LO", value: bytes = b"") -> bytes:
@@ -211,3 +215,60 @@ def test_known_sequences_of_undefined_length_are_sequences_in_implicit_vr(tag):
     private = struct.unpack("<L", struct.pack("<HH", 0x0009, 0x1001))[0]
     assert plain._is_sequence(struct.pack("<HH", 0xFFFE, 0xE000), 0, private)
     assert not plain._is_sequence(bytes(4), 0, private)
+
+
+def box(kind: bytes, value: bytes, form: str) -> bytes:
+    if form == "long":
+        return struct.pack(">L4sQ", 1, kind, 16 + len(value)) + value
+    return struct.pack(">L4s", 0 if form == "to the end" else 8 + len(value), kind) + value
+
+
+@pytest.mark.parametrize("form", ["short", "long", "to the end"])
+@pytest.mark.parametrize("before", ["short", "long"])
+def test_the_codestream_in_a_jp2_file(form, before):
+    start = codestream._JP2_START + box(b"ftyp", b"jp2 12", before)
+    after = b"" if form == "to the end" else box(b"uuid", b"more", "short")
+    assert codestream._unwrap_jp2(start + box(b"jp2c", b"\xff\x4f\xff\x51 codes", form) + after) == (
+        b"\xff\x4f\xff\x51 codes"
+    )
+    for data in (start, start + bytes(7), start + struct.pack(">L4s", 7, b"uuid") + bytes(20)):
+        with pytest.raises(RefusedInputError, match="a JP2 file without a codestream"):
+            codestream._unwrap_jp2(data)
+
+
+def test_replies_of_decoders_are_written_whole():
+    class Narrow(io.BytesIO):
+        """Takes three bytes at a time, as a pipe that is full may do."""
+
+        def write(self, part: Any) -> int:
+            return super().write(bytes(part[:3]))
+
+    sink = Narrow()
+    send(sink, 7, b"a text of some length")
+    assert sink.getvalue() == struct.pack(REPLY, 7, 21) + b"a text of some length"
+
+
+@pytest.mark.parametrize(
+    ("kind", "bad", "expected"),
+    [
+        ("stack", 0, ["lost", "hole"]),
+        ("stack", 1, ["bad 0"]),  # what it leaves would only hide the cause
+        ("localizer", 0, ["localizer images, not a stack", "lost"]),
+        ("localizer", 1, ["bad 0", "localizer images, not a stack"]),
+        ("stack", PROBLEMS_SHOWN, [f"bad {n}" for n in range(PROBLEMS_SHOWN)]),
+        (
+            "stack",
+            PROBLEMS_SHOWN + 2,
+            [f"bad {n}" for n in range(PROBLEMS_SHOWN)] + ["and 2 more files with a problem"],
+        ),
+    ],
+)
+def test_problems_of_a_series_and_which_of_them_hide_others(kind, bad, expected):
+    series = SimpleNamespace(
+        kind=kind,
+        others=[SimpleNamespace(problem=f"bad {number}") for number in range(bad)],
+        corrupt=[],
+        lost=["lost"],
+        _find_stack_problems=lambda: ["hole"],
+    )
+    assert Series.problems.func(series) == expected  # type: ignore[attr-defined]
