@@ -8,6 +8,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 from pydicom.datadict import keyword_for_tag
 
@@ -21,8 +22,8 @@ from clrecon.dicom.parse.raw import CorruptFileError, read_pixel_head
 from clrecon.dicom.parse.sequences import _make_encoding, _Walk
 from clrecon.dicom.parse.transfer_syntaxes import RLE
 from clrecon.dicom.parse.values import ValueProblem, Values
-from clrecon.dicom.pixels import codestream
-from clrecon.dicom.pixels.decoder_process import REPLY, send
+from clrecon.dicom.pixels import codestream, decoder_pool
+from clrecon.dicom.pixels.decoder_process import DONE, FAILED, NO_DECODER, NO_MEMORY, READY, REPLY, send
 from clrecon.dicom.pixels.stray_bits import OVERLAY_BITS, describe_stray_bits
 from clrecon.dicom.series.series import PROBLEMS_SHOWN, Series
 from clrecon.errors import RefusedInputError
@@ -272,3 +273,33 @@ def test_problems_of_a_series_and_which_of_them_hide_others(kind, bad, expected)
         _find_stack_problems=lambda: ["hole"],
     )
     assert Series.problems.func(series) == expected  # type: ignore[attr-defined]
+
+
+def worker(*replies: tuple[int, int]) -> Any:
+    """A process that answers with these statuses and counts."""
+    answers = iter(replies)
+    made = SimpleNamespace(ready=False, why=None, deadline=0.0, _settings={}, _write=lambda data: None)
+    made._read_reply = lambda: next(answers)
+    made._read_text = lambda count: f"{count} letters"
+    made._read_into = lambda target: target.__setitem__(slice(None), bytes(range(len(target))))
+    return made
+
+
+def test_a_decoder_answers_with_as_many_bytes_as_it_was_asked_for():
+    out = np.zeros(4, np.uint16)
+    ask = decoder_pool._Worker.ask
+    assert ask(worker((READY, 0), (DONE, 8)), {}, b"", out, 1.0) == (DONE, "")
+    assert out.view(np.uint8).tolist() == list(range(8))
+    for count in (7, 9):
+        with pytest.raises(decoder_pool._WorkerEndedError):
+            ask(worker((READY, 0), (DONE, count)), {}, b"", out, 1.0)
+    for status in (FAILED, NO_MEMORY):
+        assert ask(worker((READY, 0), (status, 5)), {}, b"", out, 1.0) == (status, "5 letters")
+
+
+def test_why_there_is_no_decoder():
+    for status, why in ((NO_DECODER, "5 letters"), (FAILED, ""), (NO_MEMORY, ""), (DONE, "")):
+        process = worker((status, 5))
+        with pytest.raises(decoder_pool._WorkerEndedError):
+            decoder_pool._Worker.ask(process, {}, b"", np.zeros(4, np.uint16), 1.0)
+        assert (process.why, process.ready) == (why, False)

@@ -22,6 +22,7 @@ def test_few_values_are_groups_and_many_are_heaps_at_the_widest_steps():
     assert ways(TAG, (1, 2, 4)) == three
     nine = (0, 1, 2, 100, 101, 1000, 1001, 5000, 5001)
     assert ways(TAG, nine) == [("000000011", True), ("000001122", True), ("000112233", True)]
+    assert ways(TAG, range(8))[0] == ("01234567", False)  # the most values that are groups
     assert ways(TAG, ("", "a", "", "b")) == [("0102", False), ("0101", False)]
     assert ways(TAG, ("a", "b", "c")) == [("012", False)]
     assert ways(TAG, ("1", "nan", "inf")) == [("210", False)]  # two of them are no numbers

@@ -8,17 +8,18 @@ from typing import Any
 
 import numpy as np
 import pytest
-from uneven_volume import HEIGHTS, uneven
+from uneven_volume import HEIGHTS, SIDEWAYS, uneven
 
-from clrecon.errors import UsageError
+from clrecon.errors import DeviceMemoryError, UsageError
 from clrecon.geometry import Volume
-from clrecon.geometry.iso_rule import choose_iso_rule
+from clrecon.geometry.iso_rule import choose_iso_rule, slice_normal_matrices
 from clrecon.operators.first_use import _count_open_edges
+from clrecon.operators.points import field
 from clrecon.operators.points.band_mask import mask_bytes
 from clrecon.operators.points.cell_edge import choose_cell_edge
 from clrecon.operators.points.clusters import _order_voxels
 from clrecon.operators.points.emit import VoxelEmission
-from clrecon.operators.points.field import BRICK, Nodes
+from clrecon.operators.points.field import BRICK, NodeField, Nodes
 from clrecon.operators.points.free_clusters import CELLS_A_CHUNK, CHUNKS_A_CORE, ClusterSearch
 from clrecon.operators.points.grid import PADDING, GridPlan
 from clrecon.operators.points.slice_overlap import find_ghost_slices
@@ -35,6 +36,7 @@ from clrecon.operators.rays import composite
 from clrecon.operators.rays.buffers import TILE, PictureBuffers
 from clrecon.operators.rays.point_pictures import DARKEST_SHARE, _choose_window
 from clrecon.operators.rays.splats import LARGEST_DISC, SMALLEST_DISC, _Splats
+from clrecon.operators.resident import stack_table
 from clrecon.operators.resident.frame import FieldFrame
 from clrecon.operators.surface import mask_extraction
 from clrecon.operators.surface.mask_extraction import FACES_PER_AREA, FULL, STEEPNESS
@@ -283,3 +285,42 @@ def test_discs_in_pixels(radius, pixels):
     camera = Camera((0.0, -50.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 1.0), parallel_scale=11.75)
     splats = _Splats(device(1), camera, (61, 47), radius, None, Lighting(), None, True)
     assert splats.disc_pixels == pytest.approx(pixels)
+
+
+def test_the_table_of_an_uneven_stack(monkeypatch):
+    """Heights, steps and shifts as the volume was made with; three rows of each slice are its normal matrix."""
+    monkeypatch.setattr(stack_table, "upload", lambda device, array: array)
+    volume = uneven()
+    made = stack_table.StackTable.of(volume, device(1))
+    table, gaps = made.arguments["stack_slices"], np.diff(HEIGHTS)
+    np.testing.assert_allclose(table[:, 0, 0], HEIGHTS, atol=1e-5)
+    np.testing.assert_allclose(table[:, 0, 1:3], np.column_stack([0.0 * SIDEWAYS, SIDEWAYS]), atol=1e-5)
+    np.testing.assert_allclose(table[:, 0, 3], [*(1.0 / gaps), 0.0], rtol=1e-5)
+    np.testing.assert_array_equal(table[:, 1:, :3], slice_normal_matrices(volume, border=0).astype(np.float32))
+    np.testing.assert_allclose(made.slope, [0.0, np.abs(np.diff(SIDEWAYS) / gaps).max(), 1 / 0.25, 0.0], atol=1e-5)
+    np.testing.assert_allclose(
+        made.index_steps(np.array([1.0, 2.0, 0.5])), [1.0, 2.0 + 0.5 * made.slope[1], 2.0], rtol=1e-6
+    )
+    assert (made.arguments["stack_nk"], len(made.arguments["stack_layers"])) == (6, made.arguments["layer_count"])
+
+
+@pytest.mark.parametrize(("room", "ends"), [(1, [1, 2, 3, 4, 5]), (2, [2, 4, 5]), (4, [4, 5]), (5, [5]), (9, [5])])
+def test_slabs_of_a_field_are_as_thick_as_there_is_room(room, ends, monkeypatch):
+    nodes = Nodes(NOWHERE.astype(np.float32), NOWHERE, np.float32(1.0), (3, 2, 5))
+    monkeypatch.setattr(
+        field, "describe_shortage", lambda limits, needs: "" if needs["nodes"] <= limits * nodes.layer_bytes else "much"
+    )
+    planned: Any = SimpleNamespace(
+        nodes=nodes,
+        _list=np.arange(0, 32 * 2 * 5, 4),  # eight of the 32 places of each row of bricks
+        grid=SimpleNamespace(nbytes=0, n=1),
+        limits=room,
+        bricks=80,
+        _kept=lambda n: {},
+    )
+    slabs = NodeField._plan_slabs(planned)
+    assert [(slab.first, slab.end) for slab in slabs] == list(zip([0, *ends[:-1]], ends, strict=True))
+    assert [(slab.first_brick, slab.end_brick) for slab in slabs] == [(16 * s.first, 16 * s.end) for s in slabs]
+    planned.limits = 0
+    with pytest.raises(DeviceMemoryError, match="no surface can be made of the cloud: much"):
+        NodeField._plan_slabs(planned)
