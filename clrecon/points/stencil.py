@@ -113,6 +113,15 @@ class Stencil:
         own = (self.rows[:, 0] == 0) & (self.rows[:, 1] == 0)
         return bool((self.rows[own, 3] > 0).any())
 
+    def holds(self, shape_ijk: tuple[int, int, int]) -> bool:
+        """Tell whether all voxels of a volume of this shape are within eps of each other."""
+        ni, nj, nk = shape_ijk
+        counts = {int(end - begin) for begin, end in self.tables.tolist()}
+        is_even = len({tuple(table) for table in self.tables.tolist()}) == 1
+        slices = 2 * nk - 1 if is_even else nk
+        whole = (self.rows[:, 2] == 1 - ni) & (self.rows[:, 3] == ni - 1)
+        return counts == {(2 * nj - 1) * slices} and bool(whole.all())
+
     def forward(self) -> Stencil:
         """Return the rows that lie after the voxel in the order k, j, i, those of its own row included."""
         rows: list[NDArray[np.int32]] = []

@@ -159,14 +159,19 @@ class ClusterSearch:
         self._parts = parts_per_core * device.compute_units
         self._samples = checked_min_samples(min_samples)
         self._stencil = stencil
-        self._check_work(stencil)
+        self._is_one = stencil.holds(mask.shape_ijk)
+        """True where all voxels are within eps of each other: one cluster, or noise where they are too few."""
+        if not self._is_one:
+            self._check_work(stencil)
         self._needs = search_bytes(mask.needs(), stencil, mask.rows)
         self.device_bytes = 0
         self._check_budget({})
         self._program = prepare_voxel_clusters(device)
         self._full, self._forward = _Table.of(device, stencil), _Table.of(device, stencil.forward())
-        self._cores_d = mask.mask_d if self._samples == 1 else self._find_cores()
+        self._cores_d = mask.mask_d if self._samples == 1 or self._is_one else self._find_cores()
         self._count()
+        if self._is_one and self.points < self._samples:
+            self._cores_d, self.runs = upload(device, np.zeros(mask.rows * mask.words, np.uint32)), 0
         self.count, self.numbers_d = self._join() if self.runs else (0, allocate(device, 4))
 
     @property
@@ -242,6 +247,8 @@ class ClusterSearch:
             row_counts=self._row_counts_d, runs=self._runs_d, **self._run_rows,
         )  # fmt: skip
         # A CPU's cores take groups; a part is a group's work.  Elsewhere each item has a row of its own.
+        if self._is_one:
+            return 1, upload(device, np.zeros(runs, np.int32))
         part_rows = -(-rows // self._parts) if self._is_cpu else 1
         spread = device.group_size if self._is_cpu else 1
         labels_d, roots_d = allocate(device, 4 * runs), allocate(device, 4 * runs)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 from surface_volumes import OBLIQUE
@@ -279,6 +281,28 @@ def test_an_eps_larger_than_the_volume_gives_one_cluster(device):
     few = Volume(np.pad(np.ones((1, 1, 3), np.int16), 2), FINE)
     step = cluster_points(few, 1e6, 6, hu=(1, 1), device=device)
     assert step.facts["noise_points"] == 3 and "3 points are fewer than min_samples 6: all are noise" in step.warnings
+
+
+def test_an_eps_larger_than_the_volume_needs_no_search(device, monkeypatch):
+    monkeypatch.setattr(voxel_clusters, "LARGEST_WORK", 1e4)
+    voxels = np.zeros((15, 30, 33), np.int16)
+    voxels[3::4, 5::9, ::16] = 1
+    volume = Volume(voxels, FINE)
+    for samples, labels in ((6, 0), (255, -1)):
+        step = cluster_points(volume, 1e6, samples, hu=(1, 1), device=device)
+        assert len(step.cloud) == 27 and (step.cloud.labels == labels).all()
+        assert (step.cores == (labels == 0)).all() and step.facts["clusters"] == labels + 1
+    with pytest.raises(UsageError, match="visits of rows of the volume"):
+        cluster_points(volume, 15.0, 6, hu=(1, 1), device=device)
+
+
+@pytest.mark.parametrize("origins", [None, [[0.0, 0, 0], [0, 0, 1], [0, 0, 2.5]]], ids=["even", "uneven"])
+def test_a_stencil_holds_a_volume_from_its_diagonal_on(origins):
+    shape, affine = (5, 4, 3), np.diag([1.0, 2.0, 1.25, 1.0])
+    lattice = Lattice(shape, affine, None if origins is None else np.array(origins))
+    diagonal = math.sqrt(4.0**2 + 6.0**2 + 2.5**2)
+    assert not make_stencil(lattice, diagonal - 1e-3).holds(shape)
+    assert make_stencil(lattice, diagonal).holds(shape) and make_stencil(lattice, 1e6).holds(shape)
 
 
 def test_volumes_over_the_memory_give_the_same_labels(device):
