@@ -11,14 +11,15 @@ import numpy as np
 import pytest
 
 from clrecon.dicom.headers.concatenation import Concatenation
-from clrecon.dicom.pixels import stray_bits
+from clrecon.dicom.pixels import stored, stray_bits
 from clrecon.dicom.pixels.decoder_pool import _find_modules
 from clrecon.dicom.pixels.padding import PaddingMasks, pack_mask
 from clrecon.dicom.pixels.voxels import _describe_unfit, _fits_stored_bits
+from clrecon.dicom.series import certificate
 from clrecon.dicom.series.disk import DiskReader
 from clrecon.dicom.series.gates import _judge_thickness
 from clrecon.dicom.series.missing_parts import describe_missing_parts
-from clrecon.dicom.series.phases import Phase, _are_passes
+from clrecon.dicom.series.phases import SAME_POSITION_MM, Phase, _are_passes, _sort_copies
 from clrecon.dicom.series.remains import DAMAGED_START, _Slices, describe_start
 from clrecon.dicom.stack import attributes
 from clrecon.dicom.stack.attributes import Alternation, _is_compared, _shorten, find_alternation
@@ -281,3 +282,54 @@ def test_bits_above_the_stored_ones_are_sign_or_overlay(overlays, expected, monk
     monkeypatch.setattr(stray_bits, "_read_overlay_bits", lambda header: overlays)
     header: Any = SimpleNamespace(bits_allocated=16, bits_stored=12, high_bit=11, signed=True, float_pixels=False)
     assert stray_bits.find_stray_bits(header, np.array([[-1, 4101]], np.int16), None) == expected
+
+
+def test_copies_lie_where_the_first_of_them_does():
+    """Each slice lies 0.6 of the tolerance beyond the one before: the third is no copy of the first."""
+    count = 3
+    copies = slices(
+        frame_of_reference=["1.2"] * count,
+        position_mm=[(0.0, 0.0, 0.6 * SAME_POSITION_MM * number) for number in range(count)],
+        di_mm=[1.0] * count,
+        dj_mm=[1.0] * count,
+        row_cosines=[(1.0, 0.0, 0.0)] * count,
+        column_cosines=[(0.0, 1.0, 0.0)] * count,
+    )
+    assert _sort_copies(copies, lambda one, other: True) == [copies[:2], copies[2:]]
+    assert _sort_copies(copies, lambda one, other: False) == [[one] for one in copies]
+
+
+def test_a_doubt_about_the_order_is_said_once(monkeypatch):
+    own = headers(1.0, 1.0)
+    for header in own:
+        header.has_slope = header.has_intercept = True
+        header.lossy, header.warnings = False, ()
+    monkeypatch.setattr(certificate, "_describe_what_was_left", lambda series: [])
+    for said, doubt, expected in (([], "A doubt", ["A doubt"]), (["A doubt."], "A doubt", ["A doubt."]), ([], "", [])):
+        stack = SimpleNamespace(slices=own, warnings=said)
+        series: Any = SimpleNamespace(kind="stack", stack=stack, find_doubt=lambda doubt=doubt: doubt)
+        assert certificate.collect_series_warnings(series) == expected
+
+
+@pytest.mark.parametrize(
+    ("declared", "coded", "doubtful"),
+    [
+        (False, None, ""),
+        (False, False, ""),
+        (True, True, ""),
+        (True, None, "no sign"),
+        (True, False, "no sign"),
+        (False, True, "a sign"),
+    ],
+)
+def test_the_sign_of_ten_decoded_bits_where_twelve_are_stored(declared, coded, doubtful):
+    header: Any = SimpleNamespace(bits_stored=12, signed=declared)
+    frame: Any = SimpleNamespace(bits=10, signed=coded)
+    stored._settle_sign(header, frame, np.array([[0, 511]], np.int16))  # without the tenth bit both readings agree
+    high = np.array([[0, 512]], np.int16)
+    stored._settle_sign(header, SimpleNamespace(bits=12, signed=coded), high)  # type: ignore[arg-type]
+    if not doubtful:
+        stored._settle_sign(header, frame, high)
+        return
+    with pytest.raises(RefusedInputError, match=f"has 10 bits and {doubtful}, the header says 12 bits with"):
+        stored._settle_sign(header, frame, high)
