@@ -148,7 +148,7 @@ def _make(folder: str, stamp: str, extras: str, compiled: bool) -> None:
     import subprocess
 
     _check_venv()
-    _say(f"making {os.path.basename(folder)} and installing clrecon (about a minute, once)")
+    _say(f"making {os.path.basename(folder)} and installing clrecon (a minute or two, once)")
     try:
         os.unlink(os.path.join(folder, _STAMP))
     except FileNotFoundError:
