@@ -14,7 +14,7 @@ from clrecon.dicom.headers.concatenation import Concatenation
 from clrecon.dicom.pixels import stored, stray_bits
 from clrecon.dicom.pixels.decoder_pool import _find_modules
 from clrecon.dicom.pixels.padding import PaddingMasks, pack_mask
-from clrecon.dicom.pixels.voxels import _describe_unfit, _fits_stored_bits
+from clrecon.dicom.pixels.voxels import _describe_unfit, _fill_slice, _fits_stored_bits
 from clrecon.dicom.series import certificate
 from clrecon.dicom.series.disk import DiskReader
 from clrecon.dicom.series.gates import _judge_thickness
@@ -226,6 +226,20 @@ def test_values_that_are_no_hu_are_counted():
     assert _describe_unfit(np.array([-3.0, 2e9])) == "values from -3 to 2e+09"
 
 
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_float_pixels_reach_up_to_a_thousand_million(sign):
+    header: Any = SimpleNamespace(name="IM1", padding=None, float_pixels=True, slope=1.0, intercept=0.0)
+    for value in (1e9, 1e9 + 0.5):
+        source: Any = SimpleNamespace(load=lambda header, out, value=value: np.array([[0.0, sign * value]]))
+        out = np.empty((1, 2))
+        if value == 1e9:
+            assert _fill_slice(source, header, out)[1:3] == (min(0.0, sign * value), max(0.0, sign * value))
+            assert out.tolist() == [[0.0, sign * value]]
+        else:
+            with pytest.raises(RefusedInputError, match="IM1: Float Pixel Data holds values from .* no HU"):
+                _fill_slice(source, header, out)
+
+
 def test_a_phase_counts_its_slices():
     shown = [str(Phase(2, "order", "1", tuple(thick(*[1.0] * count)))) for count in (1, 2)]
     assert shown == ["2: order 1, 1 slice", "2: order 1, 2 slices"]
@@ -333,3 +347,18 @@ def test_the_sign_of_ten_decoded_bits_where_twelve_are_stored(declared, coded, d
         return
     with pytest.raises(RefusedInputError, match=f"has 10 bits and {doubtful}, the header says 12 bits with"):
         stored._settle_sign(header, frame, high)
+
+
+def test_copies_and_kernels_that_are_mixed_are_told():
+    def told(copies: int, *kernels: str) -> list[str]:
+        own = slices(phase=[(("KVP", "120"), ("ConvolutionKernel", kernel)) for kernel in kernels])
+        places = SimpleNamespace(copies=copies, phases=(), interleaved=False)
+        series: Any = SimpleNamespace(places=places, phase=None, stack=SimpleNamespace(slices=own) if own else None)
+        return certificate._describe_what_was_left(series)
+
+    assert told(0, "B30", "B30") == told(0) == []
+    assert told(1, "B30") == ["1 duplicate slice dropped: same place, same pixels as another"]
+    assert told(2, "B30", "B70", "B30") == [
+        "2 duplicate slices dropped: same place, same pixels as another",
+        "ConvolutionKernel differs between slices (2 kernels): sharp and soft are mixed",
+    ]
