@@ -25,6 +25,7 @@ from clrecon.dicom.parse.values import ValueProblem, Values
 from clrecon.dicom.pixels import codestream, decoder_pool
 from clrecon.dicom.pixels.decoder_process import DONE, FAILED, NO_DECODER, NO_MEMORY, READY, REPLY, send
 from clrecon.dicom.pixels.stray_bits import OVERLAY_BITS, describe_stray_bits
+from clrecon.dicom.series import choice
 from clrecon.dicom.series.series import PROBLEMS_SHOWN, Series
 from clrecon.errors import RefusedInputError
 
@@ -303,3 +304,32 @@ def test_why_there_is_no_decoder():
         with pytest.raises(decoder_pool._WorkerEndedError):
             decoder_pool._Worker.ask(process, {}, b"", np.zeros(4, np.uint16), 1.0)
         assert (process.why, process.ready) == (why, False)
+
+
+def test_all_elements_are_kept_where_none_are_named():
+    meta = element(0x00020010, b"UI", b"1.2.840.10008.1.2.1\0")
+    own = element(0x00080060, b"CS", b"CT") + element(0x00090010, b"LO", b"us") + element(0x00180060, b"DS", b"120 ")
+    data = bytes(128) + b"DICM" + meta + own + long_element(0x7FE00010, b"OW", bytes(4))
+    found = plain.parse_plainly(data, len(data), None)
+    assert found is not None
+    assert found.values == {0x00080060: b"CT", 0x00090010: b"us", 0x00180060: b"120 "}
+    some = plain.parse_plainly(data, len(data), (0x00080005, 0x00180060))
+    assert some is not None
+    assert (some.values, some.vrs) == ({0x00180060: b"120 "}, {0x00180060: "DS"})
+
+
+@pytest.mark.parametrize(
+    ("kind", "count", "problems", "said"),
+    [
+        ("stack", 5, ["bad"], "[2: CT, cannot be used]"),
+        ("stack", 4, ["bad"], "[2: CT]"),  # smaller than the chosen one
+        ("stack", 9, [], "[2: CT]"),
+        ("localizer", 9, ["bad"], "[2: CT]"),
+    ],
+)
+def test_larger_stacks_that_cannot_be_used_are_told(kind, count, problems, said, monkeypatch):
+    monkeypatch.setattr(choice, "_describe_other_planes", lambda left, chosen: [])
+    other: Any = SimpleNamespace(kind=kind, count=count, problems=problems, describe=lambda: "2: CT")
+    chosen: Any = SimpleNamespace(count=5)
+    assert choice.describe_left([chosen, other], chosen) == [f"1 other series left: {said}"]
+    assert choice.describe_left([chosen], chosen) == []
