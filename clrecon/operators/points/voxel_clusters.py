@@ -170,8 +170,6 @@ class ClusterSearch:
         self._full, self._forward = _Table.of(device, stencil), _Table.of(device, stencil.forward())
         self._cores_d = mask.mask_d if self._samples == 1 or self._is_one else self._find_cores()
         self._count()
-        if self._is_one and self.points < self._samples:
-            self._cores_d, self.runs = upload(device, np.zeros(mask.rows * mask.words, np.uint32)), 0
         self.count, self.numbers_d = self._join() if self.runs else (0, allocate(device, 4))
 
     @property
@@ -234,6 +232,8 @@ class ClusterSearch:
         both = exclusive_scan(self._device, counts_d, 2 * (rows + 1), in_place=True, stopwatch=self._stopwatch).total
         self.runs = int(download(self._device, np.empty(1, np.uint32), counts_d, 4 * rows)[0])
         self.points = both - self.runs
+        if self._is_one and self.points < self._samples:
+            self._cores_d, self.runs = upload(self._device, np.zeros(rows * self._mask.words, np.uint32)), 0
         if both >= 2**32:
             raise DeviceMemoryError(f"{self.points:,} voxels are set: clusters are found among up to 2^31")
         self._needs |= {"runs of core voxels": 16 * self.runs, "labels": 4 * self.points}
