@@ -120,7 +120,7 @@ def test_vtp_as_vtk_writes_it(mode, packing, base64, tmp_path):
 
 def test_a_surface_of_vtp_gives_its_vertices(tmp_path):
     pyvista = pytest.importorskip("pyvista")
-    ball = pyvista.Sphere()
+    ball = pyvista.Sphere(radius=30.0)
     ball.save(tmp_path / "a.vtp")
     cloud = read_points(tmp_path / "a.vtp")
     assert len(cloud) == ball.n_points and cloud.normals is not None
