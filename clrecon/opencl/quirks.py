@@ -93,8 +93,7 @@ def first_header(platform_name: str, driver: tuple[int, ...]) -> str:
 
     PoCL 3.0 calls a function for each min() and vload8(): its functions are compiled for one processor of each
     generation, such as "haswell", kernels for the very processor, and LLVM 14 does not inline between the two.
-    PoCL 3.1 compiles both for the same one.  DBSCAN of free points took 1.4 times as long as there, and takes as long
-    with the header.
+    PoCL 3.1 compiles both for the same one.
     """
     return "include/inlined.h" if is_pocl(platform_name) and driver[:2] == (3, 0) else ""
 
