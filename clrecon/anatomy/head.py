@@ -64,6 +64,7 @@ MOST_SAMPLES = 20_000
 SAID = "a {} of the skin can show a face: treat the file as one that identifies the patient"
 
 _judged: WeakKeyDictionary[Any, bool | None] = WeakKeyDictionary()
+_airs: WeakKeyDictionary[Any, tuple[NDArray[np.bool_], NDArray[Any]]] = WeakKeyDictionary()
 
 
 def warn_of_face(volume: Volume, values: Iterable[float | None], what: str) -> list[str]:
@@ -103,10 +104,12 @@ def measure_skin(volume: Volume, vertices: NDArray[Any], triangles: NDArray[Any]
     Returns
     -------
     float
-        Right to some cm2: the air is told on a grid of about 2 mm, without passages narrower than `OPEN_MM`, and at
-        most `MOST_SAMPLES` triangles stand for all.
+        Right to some cm2: the air is told once for each volume, on a grid of about 2 mm and without passages narrower
+        than `OPEN_MM`, and at most `MOST_SAMPLES` triangles stand for all.
     """
-    outer, steps = _outer_air(volume)
+    if volume not in _airs:
+        _airs[volume] = _outer_air(volume)
+    outer, steps = _airs[volume]
     every = -(-len(triangles) // MOST_SAMPLES) or 1
     corners = vertices[triangles[::every]].astype(np.float64)
     crossed = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])

@@ -126,8 +126,10 @@ def keep_clusters(
 
 def _warn_of_seeds(cloud: PointCloud, rules: tuple[KeepRule, ...], facts: Mapping[str, object]) -> tuple[str, ...]:
     """Name seeds outside of the box of all points: of another frame or unit, most likely."""
-    low, high = cloud.points.min(axis=0), cloud.points.max(axis=0)
     seeds = [rule for rule in rules if rule.kind == "seed"]
+    if not seeds:
+        return ()
+    low, high = cloud.points.min(axis=0), cloud.points.max(axis=0)
     far = facts.get("seed_distances_mm")
     return tuple(
         f"{_write(seed)} (mm LPS) lies outside of the box of the points, {distance:,.1f} mm from the nearest one in a"

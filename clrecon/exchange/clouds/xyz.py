@@ -122,7 +122,7 @@ def _words(line: str) -> list[str]:
 
 
 def _numbers_in(line: str) -> int:
-    """Return how many numbers a line holds; 0 if it has a word that is none."""
+    """Return the count of numbers in a line; 0 if one of its words is not a number."""
     words = _words(line)
     try:
         for word in words:
