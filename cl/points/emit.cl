@@ -2,7 +2,7 @@
  *
  * Reference: the affine cloud of a CT series, one product a voxel, here of the voxels that are kept alone.
  *
- * Passes (the mask itself is that of cl/surface/classify.cl, without a border)
+ * Passes (the mask itself is that of cl/masks/classify.cl, without a border)
  *   1. restrict_mask   only voxels of a label, or of any, stay in the mask
  *   2. find_shell      for shells: only voxels with one of six neighbours outside stay, in a mask of its own
  *   3. count_points    bits of each row (then the exclusive scan of scan.cl: number of the row's first point)

@@ -8,7 +8,7 @@
  * lowest di, highest di), nearest first; `tables` says which part of the list is that of slice k.
  *
  * Passes
- *   1. the mask comes from cl/surface/classify.cl, that of a list of voxels from band_mask.cl
+ *   1. the mask comes from cl/masks/classify.cl, that of a list of voxels from band_mask.cl
  *   2. find_cores    each word and its neighbours in 8 planes of bits: 32 counters of 8 bits side by side
  *   3. count_core_runs   runs of core voxels along i, the nodes of the clusters, and points; then scan.cl
  *   4. list_core_runs

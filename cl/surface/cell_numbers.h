@@ -14,7 +14,7 @@
 #ifndef CLRECON_CELL_NUMBERS_H
 #define CLRECON_CELL_NUMBERS_H
 
-#include "surface/mask_rows.h"
+#include "include/mask_rows.h"
 
 /* The crossed edges owned by one row of samples, and their numbers. */
 typedef struct {

@@ -14,7 +14,7 @@
 #include "include/label_type.h"
 #include "include/volume.h"
 #include "surface/label_masks.h"
-#include "surface/mask_rows.h"
+#include "include/mask_rows.h"
 
 #if REACH != 2
 #error "the rows below have five samples"

@@ -6,7 +6,7 @@
  *   3. count_faces */
 #include "include/label_type.h"
 #include "include/volume.h"
-#include "surface/mask_rows.h"
+#include "include/mask_rows.h"
 
 /* 16 labels, and whether any bit of them is set: without conversions, which some drivers call as functions. */
 #define JOIN_NAMES(a, b) a##b

@@ -5,7 +5,7 @@
  * Passes
  *   1. own_samples      for each sample the label that it is inside of, or 0
  *      (for solid labels, the host fills their cavities before the next pass)
- *   2. classify_label   for each label one bit per sample, packed as in cl/surface/classify.cl */
+ *   2. classify_label   for each label one bit per sample, packed as in cl/masks/classify.cl */
 #include "include/label_type.h"
 #include "include/volume.h"
 

@@ -20,7 +20,7 @@
  * Sample (i, j, k) is corner 0 of cell (i, j, k), and owns edges 0, 4 and 8.
  *
  * Passes
- *      (one bit a sample, inside or not; per row the words that hold any: cl/surface/classify.cl)
+ *      (one bit a sample, inside or not; per row the words that hold any: cl/masks/classify.cl)
  *   1. count_rows         per row: vertices, triangles and words with work; per word its place in the row
  *      (exclusive scan of all row counts: cl/primitives/scan.cl)
  *   2. total_counts       vertices, triangles and words with work of the slab
@@ -37,7 +37,7 @@
  * and shared without a hash, an atomic or an index array, and the order never depends on the device. */
 #include "include/volume.h"
 #include "surface/cell_numbers.h"
-#include "surface/mask_rows.h"
+#include "include/mask_rows.h"
 #include "surface/mc_tables.h"
 #include "surface/vertex_group.h"
 #ifdef LABELS

@@ -12,7 +12,7 @@
  * Few cells are ambiguous, so each pass decides them again, from the voxels at their corners. */
 #include "include/volume.h"
 #include "surface/cell_numbers.h"
-#include "surface/mask_rows.h"
+#include "include/mask_rows.h"
 #include "surface/mc_tables.h"
 #include "surface/trilinear_place.h"
 #include "surface/vertex_group.h"

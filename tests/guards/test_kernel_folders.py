@@ -13,7 +13,7 @@ from clrecon.opencl.quirks import first_header
 KERNELS = ROOT / "cl"
 OPERATORS = PACKAGE / "operators"
 
-LAUNCHED_BY = {"surface/classify.cl": "surface/marching_cubes.py", "rays/tiles.cl": "rays/composite.py"}
+LAUNCHED_BY = {"rays/tiles.cl": "rays/composite.py"}
 """Kernel files without an operator of their own: they have other variants, or fewer, than the rest of the operator."""
 
 FIRST_HEADERS = {first_header("Portable Computing Language", (3, 0))}

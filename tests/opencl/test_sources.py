@@ -18,7 +18,15 @@ from clrecon.opencl import (
 
 def test_every_theme_is_found():
     names = kernel_files()
-    assert {name.split("/")[0] for name in names} == {"primitives", "resident", "surface", "points", "rays", "reformat"}
+    assert {name.split("/")[0] for name in names} == {
+        "primitives",
+        "resident",
+        "masks",
+        "surface",
+        "points",
+        "rays",
+        "reformat",
+    }
     assert all(name.endswith(".cl") for name in names)
 
 

@@ -14,8 +14,8 @@ from clrecon.errors import DeviceMemoryError, UsageError
 from clrecon.geometry import Volume
 from clrecon.geometry.iso_rule import choose_iso_rule, slice_normal_matrices
 from clrecon.operators.first_use import _count_open_edges
+from clrecon.operators.masks.band_mask import mask_bytes
 from clrecon.operators.points import field
-from clrecon.operators.points.band_mask import mask_bytes
 from clrecon.operators.points.cell_edge import choose_cell_edge
 from clrecon.operators.points.clusters import _order_voxels
 from clrecon.operators.points.emit import VoxelEmission

@@ -103,13 +103,13 @@ CHECKS = (
         "ranges",
         ("classify_samples", *MARCHING),
         partial(_check_variant, make=waves, shape=WIDE, level=(30.0, 60.0)),
-        {"surface/classify.cl": ("RANGE",), "surface/marching_cubes.cl": ("RANGE",)},
+        {"masks/classify.cl": ("RANGE",), "surface/marching_cubes.cl": ("RANGE",)},
     ),
     Check(
         "below a level",
         ("classify_samples", *MARCHING),
         partial(_check_variant, make=waves, shape=WIDE, level=30.0, below=True),
-        {"surface/classify.cl": ("BORDER_INSIDE",)},
+        {"masks/classify.cl": ("BORDER_INSIDE",)},
     ),
     Check(
         "trilinear topology",

@@ -52,6 +52,6 @@ CHECKS = (
         "points of voxels",
         ("classify_samples", "restrict_mask", "find_shell", "count_points", "emit_points"),
         _check_voxels,
-        {"surface/classify.cl": ("RANGE",)},
+        {"masks/classify.cl": ("RANGE",)},
     ),
 )

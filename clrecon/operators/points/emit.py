@@ -23,7 +23,7 @@ from clrecon.opencl import (
     result_pages,
     upload,
 )
-from clrecon.operators.points.band_mask import prepare_band_mask
+from clrecon.operators.masks.classify import prepare_classify
 from clrecon.operators.primitives.scan import exclusive_scan, prepare_scan
 from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.operators.resident.voxel_types import label_variants, voxel_variants
@@ -78,7 +78,7 @@ def prepare_voxels(device: Device, dtype: DTypeLike, labels: DTypeLike | None = 
         The driver's compiler refuses.
     """
     prepare_scan(device)
-    prepare_band_mask(device, dtype)
+    prepare_classify(device, dtype, "between")
     own = {} if labels is None else label_variants(labels)
     return load_program(device, "points/emit.cl", {**voxel_variants(dtype), **device.kernel_variants, **own})
 
@@ -243,7 +243,7 @@ class VoxelEmission:
         rows = (stop - begin) * nj
         mask_d, extents_d = allocate(device, 4 * rows * words), allocate(device, 4 * rows)
         launch(
-            device, prepare_band_mask(device, self.volume.voxels.dtype)["classify_samples"], rows,
+            device, prepare_classify(device, self.volume.voxels.dtype, "between")["classify_samples"], rows,
             stopwatch=stopwatch, voxels=voxels_d, mask=mask_d, row_extents=extents_d, level=chosen.low,
             highest=chosen.high, ni=ni, nj=nj, nk=nk, border=0, first_slice=begin, first_sample_slice=begin,
             gk=stop - begin, words=words,

@@ -15,7 +15,7 @@ from clrecon.geometry import Volume
 from clrecon.geometry.iso_rule import data_range
 from clrecon.geometry.precision import describe_far
 from clrecon.opencl import Device
-from clrecon.operators.points.band_mask import band_bounds, checked_band
+from clrecon.operators.masks.band_mask import band_bounds, checked_band
 from clrecon.operators.points.emit import Selection, VoxelEmission
 from clrecon.operators.resident.device_volume import DeviceVolume, open_volume
 from clrecon.points import PointCloud

@@ -22,7 +22,7 @@ from clrecon.opencl import (
     memory_limits,
     upload,
 )
-from clrecon.operators.points.band_mask import VoxelMask
+from clrecon.operators.masks.band_mask import VoxelMask
 from clrecon.operators.primitives.scan import exclusive_scan, prepare_scan
 from clrecon.operators.primitives.union_find import join_parts, prepare_components
 from clrecon.points.stencil import Stencil

@@ -24,6 +24,7 @@ from clrecon.opencl import (
     load_program,
     upload,
 )
+from clrecon.operators.masks.classify import prepare_classify
 from clrecon.operators.primitives.scan import exclusive_scan, prepare_scan
 from clrecon.operators.resident.bricks import BrickStates
 from clrecon.operators.resident.voxel_types import label_variants, voxel_variants
@@ -112,18 +113,12 @@ def prepare_marching_cubes(
     if inside == "between":
         variants["RANGE"] = "1"
     if labels is None:
-        _load_classify(device, dtype, inside)
+        prepare_classify(device, dtype, inside)
     else:
         variants.update({"MASKS" if masks else "LABELS": "1"}, **label_variants(labels))
     if uneven:
         variants["UNEVEN"] = "1"
     return load_program(device, "surface/marching_cubes.cl", variants)
-
-
-def _load_classify(device: Device, dtype: DTypeLike, inside: str = "above") -> Program:
-    own = {"above": {}, "below": {"BORDER_INSIDE": "1"}, "between": {"RANGE": "1"}}[inside]
-    variants = {**voxel_variants(dtype), **device.kernel_variants, **own}
-    return load_program(device, "surface/classify.cl", variants)
 
 
 def pad4(rows: NDArray[np.float64]) -> NDArray[np.float32]:
@@ -203,7 +198,7 @@ def classify(
     bricks : BrickStates, optional
         The comparison of the volume's bricks with the only level, if the slab is the whole volume.
     """
-    program = _load_classify(device, slab.grid.volume.voxels.dtype, slab.grid.rule.inside)
+    program = prepare_classify(device, slab.grid.volume.voxels.dtype, slab.grid.rule.inside)
     mask_d = allocate(device, 4 * slab.mask_rows * slab.grid.words)
     row_extents_d = allocate(device, 4 * slab.mask_rows)
     if bricks is not None:

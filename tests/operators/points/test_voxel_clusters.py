@@ -13,8 +13,8 @@ from variants import VOXEL_TYPES
 import clrecon
 from clrecon.errors import DeviceError, DeviceMemoryError, NoSurfaceError, UsageError
 from clrecon.geometry import Volume
+from clrecon.operators.masks.band_mask import checked_band, mark_band
 from clrecon.operators.points import voxel_clusters
-from clrecon.operators.points.band_mask import check_shape, checked_band, mark_band
 from clrecon.operators.points.clusters import cluster_points
 from clrecon.operators.points.voxel_clusters import ClusterSearch, pad_for
 from clrecon.operators.resident.device_volume import DeviceVolume
@@ -378,13 +378,6 @@ def test_bad_clouds_are_refused(device):
         cluster_points(cloud, volume=Volume(noise((3, 4, 40), 1.0), OBLIQUE), device=device)
     one = cluster_points(cloud.select([0]), min_samples=1, eps=0.6, device=device)
     assert one.cloud.labels.tolist() == [0]
-
-
-def test_masks_too_large_are_refused():
-    with pytest.raises(UsageError, match="masks hold rows of up to 65,535"):
-        check_shape((65_536, 2, 2))
-    with pytest.raises(UsageError, match="up to 2,147,483,647 words"):
-        check_shape((65_000, 65_000, 20))
 
 
 def test_work_of_hours_is_refused(device):

@@ -10,7 +10,7 @@
  * -D BORDER_INSIDE: the border counts as inside, so that inside samples enclose the others. */
 #include "include/bricks.h"
 #include "include/volume.h"
-#include "surface/mask_rows.h"
+#include "include/mask_rows.h"
 
 #ifdef HAS_BUILTIN_PREFETCH
 #define PREFETCH(place) __builtin_prefetch((const void *)(size_t)(place))

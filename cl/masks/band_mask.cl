@@ -1,4 +1,4 @@
-/* The bit mask of a list of voxels; that of a band of HU comes from cl/surface/classify.cl.
+/* The bit mask of a list of voxels; that of a band of HU comes from cl/masks/classify.cl.
  *
  * A row (j, k) is `words` words of 32 voxels, of which the last may be zeros alone: bit b of word w is voxel
  * i = 32 w + b.

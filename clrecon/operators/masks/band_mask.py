@@ -8,13 +8,13 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, DTypeLike, NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from clrecon.errors import DeviceError, DeviceFailedError, NoSurfaceError, UsageError
 from clrecon.geometry import Volume
-from clrecon.opencl import Device, Program, Stopwatch, allocate, copy_buffer, launch, load_program, upload
+from clrecon.opencl import Device, Stopwatch, allocate, copy_buffer, launch, load_program, upload
+from clrecon.operators.masks.classify import prepare_classify
 from clrecon.operators.resident.device_volume import DeviceVolume
-from clrecon.operators.resident.voxel_types import voxel_variants
 from clrecon.points.voxel_numbers import VoxelNumbers
 from clrecon.system.progress import Progress, ignore_progress
 from clrecon.system.wording import name_parameter
@@ -27,7 +27,6 @@ __all__ = [
     "mark_band",
     "mark_voxels",
     "mask_bytes",
-    "prepare_band_mask",
 ]
 
 LONGEST_ROW = 65_535
@@ -109,18 +108,6 @@ def check_shape(shape_ijk: tuple[int, int, int], pad: int = 0) -> None:
             f"the volume has {ni:,} x {nj:,} x {nk:,} voxels: masks hold rows of up to {LONGEST_ROW:,}, and up to"
             f" {MOST_WORDS:,} words of 32 voxels ({words * nj * nk:,} here)"
         )
-
-
-def prepare_band_mask(device: Device, dtype: DTypeLike = np.int16) -> Program:
-    """Build the kernel for volumes of `dtype`.
-
-    Raises
-    ------
-    DeviceError
-        The driver's compiler refuses.
-    """
-    variants = {**voxel_variants(dtype), **device.kernel_variants, "RANGE": "1"}
-    return load_program(device, "surface/classify.cl", variants)
 
 
 def band_bounds(volume: Volume, hu: tuple[float, float]) -> tuple[Any, Any]:
@@ -242,7 +229,8 @@ class _Marking:
         volume = self.resident.volume
         ni, nj, _ = volume.shape_ijk
         launch(
-            self.resident.device, prepare_band_mask(self.resident.device, volume.voxels.dtype)["classify_samples"],
+            self.resident.device,
+            prepare_classify(self.resident.device, volume.voxels.dtype, "between")["classify_samples"],
             nj * slices, stopwatch=self.stopwatch, voxels=voxels_d, mask=mask_d, row_extents=extents_d,
             level=self.bounds[0], highest=self.bounds[1], ni=ni, nj=nj, nk=slices, border=0, first_slice=0,
             first_sample_slice=0, gk=slices, words=self.words,
@@ -279,7 +267,7 @@ def mark_voxels(
     check_shape(shape_ijk, pad)
     ni, nj, nk = shape_ijk
     words, rows = -(-ni // 32) + pad, nj * nk
-    program = load_program(device, "points/band_mask.cl")
+    program = load_program(device, "masks/band_mask.cl")
     mask_d, extents_d = allocate(device, 4 * words * rows), allocate(device, 4 * rows)
     launch(device, program["clear_words"], words * rows, stopwatch=stopwatch, mask=mask_d, n=words * rows)
     if isinstance(voxels, VoxelNumbers):

@@ -1,0 +1,1 @@
+"""Masks of voxels on a device, one bit a voxel."""
