@@ -18,6 +18,7 @@ from clrecon.labels import read_labels as read_labels
 from clrecon.mesh import Mesh as Mesh
 from clrecon.mesh.compare.distances import compare_meshes as compare_meshes
 from clrecon.mesh.refine.decimation import decimate_mesh as decimate_mesh
+from clrecon.mesh.refine.quadric import collapse_quadric as collapse_quadric
 from clrecon.mesh.refine.smoothing import smooth_mesh as smooth_mesh
 from clrecon.opencl import list_devices
 from clrecon.operators import choose_device

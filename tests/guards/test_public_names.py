@@ -19,7 +19,8 @@ KEYWORDS = ("device", "memory", "progress")
 
 TAKE_PROGRESS = {
     "SurfaceExtractor.extract_vertices", "extract_points",
-    "SurfaceExtractor.extract", "VolumeRenderer.render", "choose_iso_value", "cluster_points", "compare_meshes",
+    "SurfaceExtractor.extract", "VolumeRenderer.render", "choose_iso_value", "cluster_points", "collapse_quadric",
+    "compare_meshes",
     "cut_slice", "decimate_mesh", "denoise_points", "estimate_normals", "extract_isosurface", "extract_isosurfaces",
     "extract_label_masks", "extract_labels", "find_ghost_slices", "find_neighbours", "find_spine_line",
     "list_series", "mask_field_of_view", "read_labels", "read_volume", "reconstruct_surface", "reformat_curve",

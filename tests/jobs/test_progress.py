@@ -35,6 +35,7 @@ def works(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[str, Work
         "remove_table": ("mask", lambda **own: clrecon.remove_table(volume, **own)),
         "smooth_mesh": ("smooth", lambda **own: clrecon.smooth_mesh(mesh, 5, **own)),
         "decimate_mesh": ("decimate", lambda **own: clrecon.decimate_mesh(mesh, 0.5, **own)),
+        "collapse_quadric": ("decimate", lambda **own: clrecon.collapse_quadric(mesh, 0.5, **own)),
         "compare_meshes": ("compare", lambda **own: clrecon.compare_meshes(mesh, other, 2000, **own)),
         "read_labels": ("read", lambda **own: clrecon.read_labels(labels, **own)),
     }
@@ -42,7 +43,7 @@ def works(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[str, Work
 
 NAMES = (
     "choose_iso_value", "find_spine_line", "mask_field_of_view", "remove_table", "smooth_mesh", "decimate_mesh",
-    "compare_meshes", "read_labels",
+    "collapse_quadric", "compare_meshes", "read_labels",
 )  # fmt: skip
 
 

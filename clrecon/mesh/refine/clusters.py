@@ -18,10 +18,33 @@ from clrecon.mesh.intersections import find_beside, find_self_intersections
 from clrecon.mesh.refine.deviation import WITNESSES, Deviation
 from clrecon.mesh.triangles import cross_products
 
-__all__ = ["Clusters"]
+__all__ = ["Clusters", "last_of_collapses"]
 
 Float64Array = NDArray[np.float64]
 IntArray = NDArray[np.integer]
+
+
+def last_of_collapses(collapses: NDArray[np.integer], count: int) -> NDArray[np.int64]:
+    """Return for each vertex the one that it was merged into in the end.
+
+    Parameters
+    ----------
+    collapses : ndarray, shape (c, 2), int
+        In each, the second vertex is merged into the first.
+    count : int
+        Number of vertices.
+
+    Returns
+    -------
+    ndarray, shape (count,), int64
+    """
+    into = np.arange(count)
+    into[collapses[:, 1]] = collapses[:, 0]
+    while True:
+        further = into[into]
+        if np.array_equal(further, into):
+            return into
+        into = further
 
 
 class Clusters:
@@ -70,13 +93,7 @@ class Clusters:
             The mesh afterwards does not match the collapses.
         """
         standing = self.standing()
-        into = np.arange(len(standing))
-        into[collapses[:, 1]] = collapses[:, 0]
-        while True:
-            further = into[into]
-            if np.array_equal(further, into):
-                break
-            into = further
+        into = last_of_collapses(collapses, len(standing))
         rename = np.arange(len(self._names))
         rename[standing] = standing[into]
         names, places = rename[self._names], self._places.copy()

@@ -23,7 +23,10 @@ from clrecon.mesh.refine.shifts import measure_volumes, move_vertices, restore_v
 from clrecon.system.pieces import local_origin
 from clrecon.system.progress import Progress
 
-__all__ = ["BOUND_VOXEL", "carry_on", "check_refinement", "decimate_mesh", "default_deviation"]
+__all__ = [
+    "BOUND_VOXEL", "carry_on", "check_refinement", "check_share", "check_triangles", "decimate_mesh",
+    "default_deviation",
+]  # fmt: skip
 
 BOUND_VOXEL = 0.25
 """Default bound in shortest voxel steps; a mean of 0.1 voxel is then kept too."""
@@ -79,12 +82,23 @@ def check_refinement(mesh: Mesh, max_deviation_mm: float | None) -> float:
     bound = default_deviation(mesh) if max_deviation_mm is None else float(max_deviation_mm)
     if not (math.isfinite(bound) and bound > 0.0):
         raise UsageError(f"the largest deviation is a length in mm above 0, not {bound:g}")
+    check_triangles(mesh)
+    return bound
+
+
+def check_share(fraction: float) -> None:
+    """Check a share of triangles to remove; raises UsageError."""
+    if not 0.0 < fraction < 1.0:
+        raise UsageError(f"the share of triangles to take away lies between 0 and 1, {fraction:g} does not")
+
+
+def check_triangles(mesh: Mesh) -> None:
+    """Check that a mesh can be refined; raises as `check_refinement` does."""
     mesh.check()
     if mesh.triangle_count == 0:
         raise NoSurfaceError("the surface is empty: there is nothing to refine")
     if max(mesh.vertex_count, 3 * mesh.triangle_count) >= 2**31:
         raise UsageError(f"a mesh of {mesh.triangle_count} triangles is too large to be refined, at most 715,827,882")
-    return bound
 
 
 def carry_on(mesh: Mesh, name: str, said: dict[str, Any]) -> dict[str, Any]:
@@ -127,8 +141,7 @@ def decimate_mesh(
     NoSurfaceError
         The mesh is empty.
     """
-    if not 0.0 < fraction < 1.0:
-        raise UsageError(f"the share of triangles to take away lies between 0 and 1, {fraction:g} does not")
+    check_share(fraction)
     bound = check_refinement(mesh, max_deviation_mm)
     origin = local_origin(mesh.vertices)
     clusters = Clusters(mesh.vertices - origin, mesh.triangles, origin)
