@@ -19,7 +19,7 @@
  *
  * Sample (i, j, k) is corner 0 of cell (i, j, k), and owns edges 0, 4 and 8.
  *
- * Passes
+ * Passes, of which all but the fourth know bits alone: those are in cl/surface/cells.cl, which is built once a device
  *      (one bit a sample, inside or not; per row the words that hold any: cl/masks/classify.cl)
  *   1. count_rows         per row: vertices, triangles and words with work; per word its place in the row
  *      (exclusive scan of all row counts: cl/primitives/scan.cl)
@@ -36,9 +36,7 @@
  * row, then by axis: the number of any edge's vertex follows from three popcounts, so vertices are computed once
  * and shared without a hash, an atomic or an index array, and the order never depends on the device. */
 #include "include/volume.h"
-#include "surface/cell_numbers.h"
 #include "include/mask_rows.h"
-#include "surface/mc_tables.h"
 #include "surface/vertex_group.h"
 #ifdef LABELS
 #include "surface/label_border.h"
@@ -50,126 +48,6 @@
 #ifndef WORDS_PER_ITEM
 #define WORDS_PER_ITEM 1
 #endif
-
-/* Parameters  mask             in   (gk, gj, words)
- *             row_extents      in   (gk, gj)
- *             row_counts       out  (3, rows_to_count) vertices owned by each row, triangles of its cells, words with
- *                                   work: words that own a vertex or have an active cell
- *             words_with_work  out  (rows_to_count, flag_words) bit w of a row: word w has work
- *             word_vertices    out  (rows_to_count, words) vertices of the row before each word
- *             word_triangles   out  (rows_to_count, words) triangles of the row before each word
- *             gi gj gk         samples; words a row; flag_words = ceil(words / 32), rounded up to a power of two
- *             rows_to_count    rows that are counted, the first ones of the mask
- * Launch      global = rows_to_count rounded up by the host, any local
- * Assumes     5 (gi + 1) < 65536, so that places in a row fit 16 bits
- * Guarantees  every output is written, but for the places of words beyond the extents, which nothing asks for */
-__kernel void count_rows(
-    __global const uint *restrict mask, __global const ushort2 *restrict row_extents,
-    __global uint *restrict row_counts, __global uint *restrict words_with_work,
-    __global ushort *restrict word_vertices, __global ushort *restrict word_triangles,
-    const uint gi, const uint gj, const uint gk, const uint words, const uint flag_words, const uint rows_to_count)
-{
-    const uint row = get_global_id(0);
-    if (row >= rows_to_count)
-        return;
-    const uint j = row % gj;
-    const uint k = row / gj;
-    const int has_y = j + 1 < gj, has_z = k + 1 < gk;
-    /* Rows (y, z) around the row of cells; where the grid ends, rows beyond are the last one: no edge is crossed. */
-    __global const uint *y0z0 = mask + (size_t)row * words;
-    __global const uint *y1z0 = has_y ? y0z0 + words : y0z0;
-    __global const uint *y0z1 = has_z ? y0z0 + (size_t)gj * words : y0z0;
-    __global const uint *y1z1 = has_y && has_z ? y0z1 + words : y0z0;
-    /* Beyond the extents of the four rows everything is outside; the sample before may own an edge into them. */
-    const ushort2 extents[4] = {row_extents[row], row_extents[has_y ? row + 1 : row],
-        row_extents[has_z ? row + gj : row], row_extents[has_y && has_z ? row + gj + 1 : row]};
-    uint begin = words, end = 0;
-    for (uint around = 0; around < 4; ++around) {
-        if (extents[around].x < extents[around].y) {
-            begin = min(begin, (uint)extents[around].x);
-            end = max(end, (uint)extents[around].y);
-        }
-    }
-    begin -= begin != 0;
-    for (uint f = 0; f < flag_words; ++f)
-        words_with_work[(size_t)row * flag_words + f] = 0;
-    if (end == 0) {
-        row_counts[row] = row_counts[rows_to_count + row] = row_counts[2 * (size_t)rows_to_count + row] = 0;
-        return;
-    }
-    cell_rows rows = {y0z0[begin], y1z0[begin], y0z1[begin], y1z1[begin]};
-    uint vertices = 0, triangles = 0, working = 0, flags = 0;
-    for (uint w = begin; w < end; ++w) {
-        word_vertices[(size_t)row * words + w] = (ushort)vertices;
-        word_triangles[(size_t)row * words + w] = (ushort)triangles;
-        const uint next = w + 1 < words ? w + 1 : w;
-        const cell_rows next_rows = {y0z0[next], y1z0[next], y0z1[next], y1z1[next]};
-        rows.y0z0 |= next_rows.y0z0 << 32;
-        rows.y1z0 |= next_rows.y1z0 << 32;
-        rows.y0z1 |= next_rows.y0z1 << 32;
-        rows.y1z1 |= next_rows.y1z1 << 32;
-        const uint active = find_active_cells(rows, w, gi);
-        const uint y = (uint)(rows.y0z0 ^ rows.y1z0), z = (uint)(rows.y0z0 ^ rows.y0z1);
-        if ((active | y | z) != 0) {
-            const uint x = (uint)((rows.y0z0 ^ rows.y0z0 >> 1) & samples_with_next(w, gi));
-            vertices += popcount(x) + popcount(y) + popcount(z);
-            if (has_y && has_z) {
-                for (uint rest = active; rest != 0; rest &= rest - 1)
-                    triangles += (uint)MC_TRIANGLES[cell_case(rows, lowest_bit(rest))] & 15;
-            }
-            flags |= 1u << (w & 31);
-            ++working;
-        }
-        if ((w & 31) == 31 || w + 1 == end) {
-            words_with_work[(size_t)row * flag_words + (w >> 5)] = flags;
-            flags = 0;
-        }
-        rows = next_rows;
-    }
-    row_counts[row] = vertices;
-    row_counts[rows_to_count + row] = triangles;
-    row_counts[2 * (size_t)rows_to_count + row] = working;
-}
-
-/* Parameters  row_offsets  in   (3, rows_to_count) sum of all row counts before each
- *             total        in   (1,) sum of all row counts
- *             totals       out  (3,) vertices, triangles and words with work of the first `rows` rows
- * Launch      one item
- * Assumes     the sum of all row counts fits 32 bits */
-__kernel void total_counts(
-    __global const uint *restrict row_offsets, __global const ulong *restrict total, __global uint *restrict totals,
-    const uint rows, const uint rows_to_count)
-{
-    if (get_global_id(0) != 0)
-        return;
-    for (uint which = 0; which < 3; ++which) {
-        const size_t begin = (size_t)which * rows_to_count, end = begin + rows;
-        totals[which] = (end == 3 * (size_t)rows_to_count ? (uint)total[0] : row_offsets[end]) - row_offsets[begin];
-    }
-}
-
-/* Parameters  words_with_work  in   (rows_to_count, flag_words)
- *             row_offsets      in   (3, rows_to_count)
- *             active_words     out  (active,) numbers of the words with work, ascending: row times 2^row_shift, plus
- *                                   the place in the row
- *             rows             rows whose words are listed
- * Launch      global = rows rounded up by the host, any local
- * Guarantees  every number is written once */
-__kernel void list_words(
-    __global const uint *restrict words_with_work, __global const uint *restrict row_offsets,
-    __global uint *restrict active_words,
-    const uint rows, const uint rows_to_count, const uint flag_words, const uint row_shift)
-{
-    const uint row = get_global_id(0);
-    if (row >= rows)
-        return;
-    __global const uint *word_offsets = row_offsets + 2 * (size_t)rows_to_count;
-    uint place = word_offsets[row] - word_offsets[0];
-    for (uint f = 0; f < flag_words; ++f) {
-        for (uint flags = words_with_work[(size_t)row * flag_words + f]; flags != 0; flags &= flags - 1)
-            active_words[place++] = (row << row_shift) + 32 * f + lowest_bit(flags);
-    }
-}
 
 /* Parameters  voxels          in   slices of the volume from first_slice on
  *             mask            in   (gk, gj, words)
@@ -192,7 +70,7 @@ __kernel void list_words(
  *             ni nj nk, border   of the whole volume
  *             first_slice     slice of the volume that `voxels` begins with
  *             first_sample_slice   slice of the sample grid that the mask begins with
- *             gk, words       as above
+ *             gk, words       slices of the mask, and 32-bit words of it in a row
  *             row_shift       a word's number is its row times 2^row_shift, plus its place in the row
  *             active          number of words with work
  *             inside, label   in   with -D LABELS: the label that each sample is inside of, slices as those of `voxels`,
@@ -324,107 +202,5 @@ void emit_vertices(
 #ifdef LABELS
     if (half_way != 0)
         atomic_add(half_way_count, half_way);
-#endif
-}
-
-#if LANES > 1
-#define TRIANGLES_WAITING 64
-
-/* Write triangles that wait in private memory. */
-static inline void flush_triangles(const uint *waiting, uint count, __global uint *out)
-{
-    uint n = 0;
-    for (; n + 8 <= 3 * count; n += 8)
-        vstore8(vload8(0, waiting + n), 0, out + n);
-    for (; n < 3 * count; ++n)
-        out[n] = waiting[n];
-}
-#endif
-
-/* Parameters  mask              in   (gk, gj, words)
- *             active_words      in   (active,)
- *             row_offsets       in   (3, rows_to_count)
- *             word_vertices     in   (gk, gj, words)
- *             word_triangles    in   (gk, gj, words)
- *             triangles         out  (triangles, 3) vertex numbers, counter-clockwise as seen from lower values
- *             first_vertex      number of the slab's first vertex
- *             rows_to_count     rows that were counted
- *             gi gj gk, words, row_shift, active   as above
- *             mirrored          1 when index space is left-handed in mm: the winding is turned round
- * Launch      global = ceil(active / WORDS_PER_ITEM) rounded up by the host, any local
- * Guarantees  every triangle is written once, cell by cell along the rows */
-__kernel void emit_triangles(
-    __global const uint *restrict mask, __global const uint *restrict active_words,
-    __global const uint *restrict row_offsets, __global const ushort *restrict word_vertices,
-    __global const ushort *restrict word_triangles,
-    __global uint *restrict triangles, const uint first_vertex, const uint rows_to_count,
-    const uint gi, const uint gj, const uint gk, const uint words, const uint row_shift, const uint active,
-    const int mirrored)
-{
-    const uint begin = get_global_id(0) * WORDS_PER_ITEM;
-    if (begin >= active)
-        return;
-    const uint end = min(begin + WORDS_PER_ITEM, active);
-    /* Where in a packed triangle its first and its last corner stand. */
-    const uint first_shift = mirrored ? 8 : 0, last_shift = mirrored ? 0 : 8;
-#if LANES > 1
-    uint waiting[3 * TRIANGLES_WAITING];
-    uint waits = 0;
-#endif
-    const uint first_row = active_words[begin] >> row_shift;
-    __global const uint *triangle_offsets = row_offsets + rows_to_count;
-    size_t triangle = (size_t)(triangle_offsets[first_row] - triangle_offsets[0])
-        + word_triangles[(size_t)first_row * words + (active_words[begin] & ((1u << row_shift) - 1))];
-    uint slice_begin = 0, slice_end = 0, k = 0;
-    for (uint n = begin; n < end; ++n) {
-        const uint row = active_words[n] >> row_shift, w = active_words[n] & ((1u << row_shift) - 1);
-        if (row >= slice_end) {
-            k = row / gj;
-            slice_begin = k * gj;
-            slice_end = slice_begin + gj;
-        }
-        const uint j = row - slice_begin;
-        if (j + 1 >= gj || k + 1 >= gk)
-            continue;
-        cell_rows rows;
-        load_cell_rows(&rows, mask, j, k, w, gj, words);
-        uint rest = find_active_cells(rows, w, gi);
-        numbered_rows edges;
-        number_rows(&edges, &rows, mask, row_offsets, word_vertices, first_vertex, j, k, w, gi, gj, gk, words);
-        for (; rest != 0; rest &= rest - 1) {
-            const uint b = lowest_bit(rest);
-            uint numbers[16];
-            number_cell(numbers, &edges, b);
-            const ulong packed = MC_TRIANGLES[cell_case(rows, b)];
-            const uint count = (uint)packed & 15;
-#if LANES > 1
-            /* Two triangles whether they count or not, the rest where there are more: wrong guesses cost more. */
-            __private uint *out = waiting + 3 * waits;
-#define PUT(n) \
-            out[3 * n] = numbers[packed >> (4 + 12 * n + first_shift) & 15]; \
-            out[3 * n + 1] = numbers[packed >> (8 + 12 * n) & 15]; \
-            out[3 * n + 2] = numbers[packed >> (4 + 12 * n + last_shift) & 15];
-            PUT(0) PUT(1)
-            if (count > 2) {
-                PUT(2) PUT(3) PUT(4)
-            }
-#undef PUT
-            waits += count;
-            if (waits > TRIANGLES_WAITING - 5) {
-                flush_triangles(waiting, waits, triangles + 3 * triangle);
-                triangle += waits;
-                waits = 0;
-            }
-#else
-            for (uint n = 0; n < count; ++n) {
-                const uint corners = (uint)(packed >> (4 + 12 * n));
-                vstore3((uint3)(numbers[corners >> first_shift & 15], numbers[corners >> 4 & 15],
-                    numbers[corners >> last_shift & 15]), triangle++, triangles);
-            }
-#endif
-        }
-    }
-#if LANES > 1
-    flush_triangles(waiting, waits, triangles + 3 * triangle);
 #endif
 }

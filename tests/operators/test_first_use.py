@@ -41,7 +41,8 @@ def test_row_57_a_device_that_computes_rightly_passes(device: Device) -> None:
 def test_row_57_a_device_that_computes_wrongly_does_not(
     device: Device, monkeypatch: pytest.MonkeyPatch, kernel: str, name: str, words: str
 ) -> None:
-    mutation, original = Mutation("surface/marching_cubes.cl", kernel, name), program.read_kernel_source
+    file = "surface/cells.cl" if kernel == "emit_triangles" else "surface/marching_cubes.cl"
+    mutation, original = Mutation(file, kernel, name), program.read_kernel_source
     source = mutation.source()
     monkeypatch.setattr(program, "read_kernel_source", lambda file: source if file == mutation.file else original(file))
     monkeypatch.setattr(device, "programs", {})

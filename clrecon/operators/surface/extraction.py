@@ -17,7 +17,8 @@ from clrecon.opencl import Device, Program, Stopwatch, result_pages
 from clrecon.operators.resident.bricks import BrickStates, brick_bytes, compare_bricks, measure_bricks
 from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.operators.surface import marching_cubes
-from clrecon.operators.surface.marching_cubes import Counted, Placement
+from clrecon.operators.surface.cells import Counted, count
+from clrecon.operators.surface.marching_cubes import Placement
 from clrecon.operators.surface.slabs import BRICKS, SampleGrid, Slab
 from clrecon.operators.surface.trilinear import prepare_trilinear
 from clrecon.system.progress import Progress
@@ -145,7 +146,7 @@ class Extraction:
         with stopwatch.running(device):
             bricks = self._compare_bricks(slab, voxels_d)
             classified = marching_cubes.classify(device, slab, voxels_d, self.levels, stopwatch, bricks)
-            counted = marching_cubes.count(device, slab, program, classified, stopwatch, voxels_d)
+            counted = count(device, slab, classified, stopwatch, voxels_d)
         if self._vertices_only:
             counted = replace(counted, triangles=0)
         self._check_output(slab, counted)

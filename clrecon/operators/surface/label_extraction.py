@@ -32,9 +32,10 @@ from clrecon.opencl import (
 from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.operators.resident.voxel_types import label_variants, voxel_variants
 from clrecon.operators.surface import marching_cubes
+from clrecon.operators.surface.cells import Classified, count
 from clrecon.operators.surface.extraction import Part, voxel_level
 from clrecon.operators.surface.label_groups import Window, group_boxes
-from clrecon.operators.surface.marching_cubes import Classified, Placement
+from clrecon.operators.surface.marching_cubes import Placement
 from clrecon.operators.surface.slabs import SampleGrid
 
 __all__ = ["HeldSlices", "LabelExtraction", "prepare_labels"]
@@ -172,7 +173,7 @@ class LabelExtraction:
                 inside=held.inside_d, mask=mask_d, row_extents=classified.row_extents_d, half_way_count=half_way_d,
                 label=number, **window.arguments,
             )  # fmt: skip
-            counted = marching_cubes.count(device, window, surface, classified, stopwatch)
+            counted = count(device, window, classified, stopwatch)
         if counted.triangles == 0:
             return None
         output = counted.output()

@@ -1,4 +1,4 @@
-"""Marching cubes: the passes of cl/surface/marching_cubes.cl on one slab of a volume."""
+"""Marching cubes: the passes of cl/surface/cells.cl and cl/surface/marching_cubes.cl on one slab of a volume."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from clrecon.errors import DeviceError, DeviceMemoryError, UsageError
+from clrecon.errors import DeviceError, UsageError
 from clrecon.geometry import Volume
 from clrecon.geometry.iso_rule import layer_margins, layer_normal_matrices, slice_normal_matrices, vertex_margin
 from clrecon.geometry.precision import find_vertex_origin
@@ -25,20 +25,18 @@ from clrecon.opencl import (
     upload,
 )
 from clrecon.operators.masks.classify import prepare_classify
-from clrecon.operators.primitives.scan import exclusive_scan, prepare_scan
+from clrecon.operators.primitives.scan import prepare_scan
 from clrecon.operators.resident.bricks import BrickStates
 from clrecon.operators.resident.voxel_types import label_variants, voxel_variants
+from clrecon.operators.surface.cells import Classified, Counted, load_cells
 from clrecon.operators.surface.slabs import Slab
-from clrecon.operators.surface.trilinear import CellVertices, count_cells, emit_cells
+from clrecon.operators.surface.trilinear import emit_cells
 
 __all__ = [
-    "Classified",
-    "Counted",
     "Emission",
     "Placement",
     "check_row",
     "classify",
-    "count",
     "emit",
     "pad4",
     "prepare_marching_cubes",
@@ -60,35 +58,6 @@ def check_row(ni: int) -> None:
         raise UsageError(f"the volume has {ni:,} columns, {LONGEST_ROW - 2:,} are supported")
 
 
-@dataclass(frozen=True)
-class Classified:
-    """The results of `classify` for one slab, on the device."""
-
-    mask_d: Any
-    row_extents_d: Any
-
-
-@dataclass(frozen=True)
-class Counted:
-    """The results of `count` for one slab, on the device, and the totals of the slab's own rows.
-
-    `cells` exists if the topology is that of the trilinear field.
-    """
-
-    row_offsets_d: Any
-    word_vertices_d: Any
-    word_triangles_d: Any
-    active_words_d: Any
-    vertices: int
-    triangles: int
-    active_words: int
-    cells: CellVertices | None = None
-
-    def output(self) -> dict[str, int]:
-        """Bytes of the slab's mesh."""
-        return {"vertices": 24 * self.vertices, "triangles": 12 * self.triangles}
-
-
 def prepare_marching_cubes(
     device: Device,
     dtype: DTypeLike,
@@ -98,7 +67,7 @@ def prepare_marching_cubes(
     *,
     masks: bool = False,
 ) -> Program:
-    """Build the kernels for volumes of `dtype`; with `labels` (their type), those whose emit_vertices takes labels.
+    """Build the kernels for volumes of `dtype`, and return emit_vertices; with `labels` (their type) it takes labels.
 
     With `uneven`, for volumes with uneven slices; `inside` as in `IsoRule.inside`; with `masks`, for surfaces of label
     masks, whose volumes are occupancies.
@@ -109,6 +78,7 @@ def prepare_marching_cubes(
         The driver's compiler refuses.
     """
     prepare_scan(device)
+    load_cells(device)
     variants = {**voxel_variants(dtype), **device.kernel_variants}
     if inside == "between":
         variants["RANGE"] = "1"
@@ -217,65 +187,6 @@ def classify(
     return Classified(mask_d, row_extents_d)
 
 
-def count(
-    device: Device,
-    slab: Slab,
-    program: Program,
-    classified: Classified,
-    stopwatch: Stopwatch,
-    voxels_d: Any = None,
-) -> Counted:
-    """Passes 2 to 4: count vertices and triangles, find where those of each word begin, and which words have any.
-
-    Parameters
-    ----------
-    voxels_d : buffer, optional
-        Slices ``slab.voxel_slices`` of the volume; needed for the topology of the trilinear field.
-
-    Raises
-    ------
-    DeviceMemoryError
-        The slab has more vertices or triangles than 32 bits can number.
-    DeviceError
-        The device fails.
-    """
-    grid, rows = slab.grid, slab.counted_rows
-    gi, gj, _ = grid.shape
-    row_counts_d = allocate(device, 12 * rows)
-    word_vertices_d, word_triangles_d = (allocate(device, 2 * rows * grid.words) for _ in range(2))
-    flags_d = allocate(device, 4 * rows * grid.flag_words)
-    launch(
-        device, program["count_rows"], rows, stopwatch=stopwatch,
-        mask=classified.mask_d, row_extents=classified.row_extents_d, row_counts=row_counts_d,
-        words_with_work=flags_d, word_vertices=word_vertices_d, word_triangles=word_triangles_d,
-        gi=gi, gj=gj, gk=slab.mask_slices, words=grid.words, flag_words=grid.flag_words, rows_to_count=rows,
-    )  # fmt: skip
-    cells = None
-    if grid.rule.topology == "trilinear":
-        cells = count_cells(
-            device, slab, voxels_d, classified.mask_d, flags_d, row_counts_d, word_triangles_d, stopwatch
-        )
-    scanned = exclusive_scan(device, row_counts_d, 3 * rows, in_place=True, stopwatch=stopwatch)
-    if scanned.total >= 2**32:
-        raise DeviceMemoryError(
-            f"a slab of {slab.slices} slices has {scanned.total:,} vertices and triangles: more than 32 bits can number"
-        )
-    totals_d = allocate(device, 12)
-    launch(
-        device, program["total_counts"], 1, stopwatch=stopwatch,
-        row_offsets=scanned.offsets_d, total=scanned.total_d, totals=totals_d, rows=slab.rows, rows_to_count=rows,
-    )  # fmt: skip
-    vertices, triangles, active = (int(n) for n in download(device, np.empty(3, np.uint32), totals_d))
-    active_words_d = allocate(device, 4 * active)
-    launch(
-        device, program["list_words"], slab.rows, stopwatch=stopwatch,
-        words_with_work=flags_d, row_offsets=scanned.offsets_d, active_words=active_words_d, rows=slab.rows,
-        rows_to_count=rows, flag_words=grid.flag_words, row_shift=grid.row_shift,
-    )  # fmt: skip
-    offsets_d = scanned.offsets_d
-    return Counted(offsets_d, word_vertices_d, word_triangles_d, active_words_d, vertices, triangles, active, cells)
-
-
 def too_many(vertices: int, triangles: int) -> DeviceError:
     """Return the error for a surface whose vertices or triangles 32 bits cannot number."""
     return DeviceError(
@@ -342,7 +253,7 @@ class Emission:
         slab, counted = self._slab, self._counted
         gi, gj, _ = slab.grid.shape
         launch(
-            self._device, self._program["emit_triangles"], self._items, stopwatch=self._stopwatch,
+            self._device, load_cells(self._device)["emit_triangles"], self._items, stopwatch=self._stopwatch,
             word_triangles=counted.word_triangles_d, triangles=self.triangles_d, first_vertex=first_vertex,
             rows_to_count=slab.counted_rows, gi=gi, gj=gj, gk=slab.mask_slices, words=slab.grid.words,
             mirrored=slab.grid.winds_backwards, **self._common,

@@ -37,9 +37,10 @@ from clrecon.opencl import (
 )
 from clrecon.operators.resident.voxel_types import label_variants
 from clrecon.operators.surface import marching_cubes
+from clrecon.operators.surface.cells import Classified, Counted, count
 from clrecon.operators.surface.extraction import Part
 from clrecon.operators.surface.label_groups import Window, group_boxes
-from clrecon.operators.surface.marching_cubes import Classified, Counted, Placement
+from clrecon.operators.surface.marching_cubes import Placement
 from clrecon.operators.surface.slabs import SampleGrid
 
 __all__ = ["HeldMap", "MaskExtraction", "prepare_label_masks"]
@@ -223,7 +224,7 @@ class MaskExtraction:
                 map=held.map_d, mask=mask_d, row_extents=classified.row_extents_d, label=number,
                 begin_j=box[1].start, end_j=box[1].stop, **window.arguments,
             )  # fmt: skip
-            counted = marching_cubes.count(device, window, surface, classified, stopwatch)
+            counted = count(device, window, classified, stopwatch)
         output = counted.output()
         check_budget(device, {**needs, **output}, self.memory, less_may_fit=True)
         scratch = window.scratch()

@@ -120,7 +120,7 @@ def emit_cells(
 
     Parameters
     ----------
-    counted : marching_cubes.Counted
+    counted : cells.Counted
         With `cells`.
     tables : dict
         ``slice_frames``, ``steps`` and ``margin``, as emit_vertices takes them.

@@ -15,8 +15,8 @@ from clrecon.geometry import Volume
 from clrecon.geometry.iso_rule import choose_iso_rule
 from clrecon.operators.resident import device_volume
 from clrecon.operators.resident.device_volume import DeviceVolume
+from clrecon.operators.surface import cells, marching_cubes
 from clrecon.operators.surface import extract as isosurface
-from clrecon.operators.surface import marching_cubes
 from clrecon.operators.surface.extract import SurfaceExtractor, extract_isosurface
 from clrecon.operators.surface.slabs import SampleGrid, Slab, plan_slabs
 
@@ -120,7 +120,7 @@ def test_memory_that_runs_out_late_halves_the_slab(device, monkeypatch, fails):
     """The driver says at the n-th allocation that there is no more: smaller slabs, a warning, the same mesh."""
     volume = smooth_volume((24, 30, 40))
     expected = extract_isosurface(volume, 100, device=device)
-    true_allocate, calls = marching_cubes.allocate, []
+    true_allocate, calls = cells.allocate, []
 
     def allocate(*arguments):
         calls.append(1)
@@ -129,6 +129,7 @@ def test_memory_that_runs_out_late_halves_the_slab(device, monkeypatch, fails):
         return true_allocate(*arguments)
 
     monkeypatch.setattr(marching_cubes, "allocate", allocate)
+    monkeypatch.setattr(cells, "allocate", allocate)
     mesh = extract_isosurface(volume, 100, device=device)
     assert mesh.report["slabs"] == 2
     assert mesh.report["warnings"][-1] == "no room for 1 byte: continued with slabs of 13 slices"
@@ -140,18 +141,19 @@ def test_memory_that_never_suffices_is_an_error_in_the_end(device, monkeypatch):
         raise DeviceMemoryError("no room for 1 byte")
 
     monkeypatch.setattr(marching_cubes, "allocate", allocate)
+    monkeypatch.setattr(cells, "allocate", allocate)
     with pytest.raises(DeviceError, match="no room for 1 byte"):
         extract_isosurface(smooth_volume((9, 10, 11)), 100, device=device)
 
 
 def test_counts_over_32_bits_are_refused(device, monkeypatch):
-    true_scan = marching_cubes.exclusive_scan
+    true_scan = cells.exclusive_scan
 
     def scan(*arguments, **options):
         scanned = true_scan(*arguments, **options)
         return dataclasses.replace(scanned, total=scanned.total + 2**32)
 
-    monkeypatch.setattr(marching_cubes, "exclusive_scan", scan)
+    monkeypatch.setattr(cells, "exclusive_scan", scan)
     with pytest.raises(DeviceError, match="more than 32 bits can number"):
         extract_isosurface(random_volume((5, 6, 7)), 3, device=device)
 
