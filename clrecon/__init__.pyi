@@ -22,6 +22,7 @@ from clrecon.mesh.refine.quadric import collapse_quadric as collapse_quadric
 from clrecon.mesh.refine.smoothing import smooth_mesh as smooth_mesh
 from clrecon.opencl import list_devices
 from clrecon.operators import choose_device
+from clrecon.operators.masks.mask import Mask as Mask
 from clrecon.operators.points.bilateral import denoise_points as denoise_points
 from clrecon.operators.points.clusters import Clustering as Clustering
 from clrecon.operators.points.clusters import cluster_points as cluster_points

@@ -219,12 +219,19 @@ INVERSIONS: dict[str, dict[str, tuple[tuple[str, str], ...]]] = {
     "set_bits": {"mask": (("1u << (voxel.x & 31)", "~(1u << (voxel.x & 31))"),)},
     "set_numbered_bits": {"mask": (("1u << (i & 31)", "~(1u << (i & 31))"),)},
     "find_extents": {"extents": (("(ushort)end);", "(ushort)~end);"),)},
+    "combine_masks": {"mask": (("combined[word] = bits;", "combined[word] = ~bits;"),)},
+    "invert_mask": {"mask": (("= ~mask[word] & within;", "= mask[word];"),)},
+    "count_row_bits": {"counts": (("counts[row] = count;", "counts[row] = ~count;"),)},
+    "replace_outside": {"voxels": (("& 1 ? own : outside;", "& 1 ? outside : own;"),)},
+    "write_runs": {
+        "mask": (("|= from_first & to_last;", "|= ~(from_first & to_last);"), ("|= to_last;", "|= ~to_last;"))
+    },
     "find_cores": {"mask": (("store_words(core,", "store_words(~core,"),)},
-    "count_core_runs": {
+    "count_row_runs": {
         "runs": (("row_counts[row] = runs;", "row_counts[row] = 64 * words - runs;"),),
         "points": (("= points;", "= 64 * words - points;"),),
     },
-    "list_core_runs": {
+    "list_row_runs": {
         "runs": (("(ushort2)((ushort)begin, (ushort)(column", "(ushort2)((ushort)~begin, (ushort)~(column"),)
     },
     "join_runs": {"labels": (("labels[run] = root;", "labels[run] = ~root;"),)},

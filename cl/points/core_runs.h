@@ -1,59 +1,8 @@
-/* Runs of core voxels: which of them are neighbours, and the labels that they give to the voxels beside them.
+/* Runs of core voxels: the labels that they give to the voxels beside them.
  *
  * Arguments are not `restrict`: inlined, it becomes an instruction that Oclgrind 21.10 does not know. */
 #ifndef CLRECON_CORE_RUNS_H
 #define CLRECON_CORE_RUNS_H
-
-/* The root of a run of this item's own part; halves the way to it. */
-static inline uint find_root(__global uint *labels, uint run)
-{
-    uint label = labels[run];
-    while (label != run) {
-        const uint next = labels[label];
-        labels[run] = next;
-        run = next;
-        label = labels[run];
-    }
-    return run;
-}
-
-/* Pairs of a part's runs with those of later parts; writes them if there is a place for them, and returns how many. */
-static inline uint find_links(
-    __global const ushort2 *runs, __global const uint *row_counts,
-    __global const int4 *stencil, __global const int2 *tables, __global const uint *labels,
-    __global uint *links, const int nj, const int nk, const uint row, const uint end_row)
-{
-    const uint own_begin = row_counts[row], own_end = row_counts[row + 1];
-    if (own_begin == own_end)
-        return 0;
-    const int j = row % nj, k = row / nj;
-    const int2 table = tables[k];
-    uint count = 0, last_a = 0, last_b = 0;
-    for (int which = table.x; which < table.y; ++which) {
-        const int4 near = stencil[which];
-        const uint other = row + near.y * nj + near.x;
-        if (j + near.x < 0 || j + near.x >= nj || k + near.y >= nk || other < end_row)
-            continue;
-        uint first = row_counts[other];
-        const uint end = row_counts[other + 1];
-        for (uint own = own_begin; own < own_end && first < end; ++own) {
-            const int begin = (int)runs[own].x + near.z, last = (int)runs[own].y + near.w;
-            while (first < end && (int)runs[first].y < begin)
-                ++first;
-            for (uint next = first; next < end && (int)runs[next].x <= last; ++next) {
-                const uint a = labels[own], b = labels[next];
-                if (a == last_a && b == last_b)
-                    continue;
-                last_a = a;
-                last_b = b;
-                if (links != 0)
-                    vstore3((uint3)(a, b, b), count, links);
-                ++count;
-            }
-        }
-    }
-    return count;
-}
 
 /* Bits of one word, as load_shifted. */
 static inline uint shifted_word(__global const uint *mask, const int at, const int shift, const int total)

@@ -10,11 +10,8 @@
  * Passes
  *   1. the mask comes from cl/masks/classify.cl, that of a list of voxels from band_mask.cl
  *   2. find_cores    each word and its neighbours in 8 planes of bits: 32 counters of 8 bits side by side
- *   3. count_core_runs   runs of core voxels along i, the nodes of the clusters, and points; then scan.cl
- *   4. list_core_runs
- *   5. join_runs     parts of the rows, each by one work-item: union-find without a second writer
- *   6. count_links, list_links   pairs of nodes in different parts, joined by union_find.cl
- *   7. label_points  core voxels by their run, other voxels by the runs near them
+ *   3. runs of core voxels along i, the nodes of the clusters, are listed and joined: cl/masks/runs.cl
+ *   4. label_points  core voxels by their run, other voxels by the runs near them
  *
  * Counters, for min_samples = 6, of a word of 4 voxels.  They begin at 8 - 6 = 2, and one that overflows is a core
  * voxel, whatever its bits are afterwards:
@@ -31,7 +28,7 @@
  *      widened      .#########.....    columns 1 to 5 and 5 to 8: both meet column 5
  *      other row    .....#.........    is a neighbour of both: a sweep must not drop it after the first
  *
- * Races.  Each item writes words of its own alone: a block, a row, a part, a place in a list. */
+ * Races.  Each item writes words of its own alone: a block, a row. */
 #include "points/bit_counters.h"
 #include "points/core_runs.h"
 
@@ -93,177 +90,6 @@ __kernel void find_cores(
         }
         store_words(core, own_cores + w, end - w);
     }
-}
-
-/* Parameters  mask, cores  in   (rows, words)
- *             row_extents  in   (rows) of the mask
- *             row_counts   out  (2, rows + 1) runs of core voxels along i, and set voxels; 0 behind the last row
- *             rows, words
- *             lone         1 where eps is below the step along i: each core voxel is a run of its own
- * Launch      global = rows + 1 rounded up by the host, any local
- * Guarantees  every count is written */
-__kernel void count_core_runs(
-    __global const uint *restrict mask, __global const uint *restrict cores,
-    __global const ushort2 *restrict row_extents, __global uint *restrict row_counts, const uint rows, const int words,
-    const int lone)
-{
-    const uint row = get_global_id(0);
-    if (row > rows)
-        return;
-    const ushort2 extent = row < rows ? row_extents[row] : (ushort2)(0, 0);
-    const size_t at = (size_t)row * words;
-    uint runs = 0, points = 0, before = 0;
-    for (int w = extent.x; w < extent.y; ++w) {
-        const uint core = cores[at + w];
-        runs += popcount(lone ? core : core & ~(core << 1 | before));
-        points += popcount(mask[at + w]);
-        before = core >> 31;
-    }
-    row_counts[row] = runs;
-    row_counts[rows + 1 + row] = points;
-}
-
-/* Parameters  cores        in   (rows, words)
- *             row_extents  in   (rows)
- *             row_counts   in   (rows + 1) number of runs in all rows before
- *             runs         out  (count) first and last column of each run, row by row
- *             rows, words, lone  as count_core_runs
- * Launch      global = rows rounded up by the host, any local
- * Guarantees  every run is written */
-__kernel void list_core_runs(
-    __global const uint *restrict cores, __global const ushort2 *restrict row_extents,
-    __global const uint *restrict row_counts, __global ushort2 *restrict runs, const uint rows, const int words,
-    const int lone)
-{
-    const uint row = get_global_id(0);
-    if (row >= rows)
-        return;
-    const ushort2 extent = row_extents[row];
-    const size_t at = (size_t)row * words;
-    uint place = row_counts[row];
-    int begin = -1;
-    for (int w = extent.x; w < extent.y; ++w) {
-        const uint bits = cores[at + w];
-        const int column = 32 * w;
-        if (lone) {
-            for (uint rest = bits; rest != 0; rest &= rest - 1)
-                runs[place++] = (ushort2)((ushort)(column + popcount((rest & -rest) - 1)));
-            continue;
-        }
-        /* Bits that differ from the one before: runs begin and end there, in turn. */
-        uint changes = bits ^ bits << 1 ^ (uint)(begin >= 0);
-        while (changes != 0) {
-            const int bit = popcount((changes & -changes) - 1);
-            if (begin < 0)
-                begin = column + bit;
-            else {
-                runs[place++] = (ushort2)((ushort)begin, (ushort)(column + bit - 1));
-                begin = -1;
-            }
-            changes &= changes - 1;
-        }
-    }
-    if (begin >= 0)
-        runs[place] = (ushort2)((ushort)begin, (ushort)(32 * extent.y - 1));
-}
-
-/* Parameters  runs        in       (count)
- *             row_counts  in       (rows + 1) first run of each row, and `count`
- *             stencil     in       (m) rows of the forward stencils
- *             tables      in       (nk)
- *             labels      out      (count) the smallest run of the part that a run is joined with
- *             roots       out      (count) of roots their own number
- *             nj, nk      rows a slice, and slices
- *             part_rows   rows a part
- *             spread      work-items for one part, of which the first does all
- * Launch      global = ceil(rows / part_rows) spread rounded up by the host, any local
- * Guarantees  every label is a root; runs of different parts have different labels */
-__kernel void join_runs(
-    __global const ushort2 *restrict runs, __global const uint *restrict row_counts,
-    __global const int4 *restrict stencil, __global const int2 *restrict tables, __global uint *labels,
-    __global uint *restrict roots, const int nj, const int nk, const uint part_rows, const uint spread)
-{
-    const uint item = get_global_id(0), rows = nj * nk;
-    const uint part = item / spread;
-    if (item % spread != 0 || part > (rows - 1) / part_rows)
-        return;
-    const uint first_row = part * part_rows, end_row = min(first_row + part_rows, rows);
-    const uint first_run = row_counts[first_row], end_run = row_counts[end_row];
-    for (uint run = first_run; run < end_run; ++run)
-        labels[run] = run;
-    for (uint row = first_row; row < end_row; ++row) {
-        const uint own_begin = row_counts[row], own_end = row_counts[row + 1];
-        if (own_begin == own_end)
-            continue;
-        const int j = row % nj, k = row / nj;
-        const int2 table = tables[k];
-        for (int which = table.x; which < table.y; ++which) {
-            const int4 near = stencil[which];
-            const uint other = row + near.y * nj + near.x;
-            if (j + near.x < 0 || j + near.x >= nj || k + near.y >= nk || other >= end_row)
-                continue;
-            uint first = row_counts[other];
-            const uint end = row_counts[other + 1];
-            for (uint own = own_begin; own < own_end && first < end; ++own) {
-                const int begin = (int)runs[own].x + near.z, last = (int)runs[own].y + near.w;
-                while (first < end && (int)runs[first].y < begin)
-                    ++first;
-                if (first == end || (int)runs[first].x > last)
-                    continue;
-                uint root = find_root(labels, own);
-                for (uint next = first; next < end && (int)runs[next].x <= last; ++next) {
-                    if (labels[next] == root)
-                        continue;
-                    const uint met = find_root(labels, next), least = min(root, met);
-                    labels[max(root, met)] = least;
-                    root = least;
-                }
-            }
-        }
-    }
-    for (uint run = first_run; run < end_run; ++run) {
-        const uint root = labels[labels[run]]; /* labels before this one are roots, and labels point there */
-        labels[run] = root;
-        if (root == run)
-            roots[run] = run;
-    }
-}
-
-/* Parameters  runs, row_counts, stencil, tables  in   as join_runs
- *             labels      in   (count) all of them roots
- *             row_links   out  (rows) pairs of runs of the row with runs of later parts, those of equal roots in
- *                              succession once
- *             nj, nk, part_rows  as join_runs
- * Launch      global = rows rounded up by the host, any local
- * Guarantees  every count is written */
-__kernel void count_links(
-    __global const ushort2 *restrict runs, __global const uint *restrict row_counts,
-    __global const int4 *restrict stencil, __global const int2 *restrict tables, __global const uint *restrict labels,
-    __global uint *restrict row_links, const int nj, const int nk, const uint part_rows)
-{
-    const uint row = get_global_id(0);
-    if (row >= nj * nk)
-        return;
-    const uint end_row = (row / part_rows + 1) * part_rows;
-    row_links[row] = find_links(runs, row_counts, stencil, tables, labels, 0, nj, nk, row, end_row);
-}
-
-/* Parameters  as count_links, but
- *             row_links   in   (rows) pairs of all rows before
- *             links       out  (m, 3) the pairs as triangles (a, b, b) of roots, for union_find.cl
- * Launch      as count_links
- * Guarantees  every pair is written */
-__kernel void list_links(
-    __global const ushort2 *restrict runs, __global const uint *restrict row_counts,
-    __global const int4 *restrict stencil, __global const int2 *restrict tables, __global const uint *restrict labels,
-    __global const uint *restrict row_links, __global uint *restrict links, const int nj, const int nk,
-    const uint part_rows)
-{
-    const uint row = get_global_id(0);
-    if (row >= nj * nk)
-        return;
-    const uint end_row = (row / part_rows + 1) * part_rows;
-    find_links(runs, row_counts, stencil, tables, labels, links + 3 * (size_t)row_links[row], nj, nk, row, end_row);
 }
 
 /* Parameters  mask, cores  in   (rows, words)

@@ -18,7 +18,7 @@ KEYWORDS = ("device", "memory", "progress")
 """What a call is computed with, not what it computes: never by position."""
 
 TAKE_PROGRESS = {
-    "SurfaceExtractor.extract_vertices", "extract_points",
+    "Mask.from_band", "SurfaceExtractor.extract_vertices", "extract_points",
     "SurfaceExtractor.extract", "VolumeRenderer.render", "choose_iso_value", "cluster_points", "collapse_quadric",
     "compare_meshes",
     "cut_slice", "decimate_mesh", "denoise_points", "estimate_normals", "extract_isosurface", "extract_isosurfaces",

@@ -94,7 +94,7 @@ CHECKS = (
     Check(
         "clusters of voxels",
         (
-            "classify_samples", "find_cores", "count_core_runs", "list_core_runs", "join_runs", "count_links",
+            "classify_samples", "find_cores", "count_row_runs", "list_row_runs", "join_runs", "count_links",
             "list_links", "label_points", "flag_cores",
         ),
         _check_clusters,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -23,8 +22,14 @@ from clrecon.opencl import (
     upload,
 )
 from clrecon.operators.masks.band_mask import VoxelMask
-from clrecon.operators.primitives.scan import exclusive_scan, prepare_scan
-from clrecon.operators.primitives.union_find import join_parts, prepare_components
+from clrecon.operators.masks.runs import (
+    PARTS_PER_CORE,
+    StencilTable,
+    count_runs,
+    join_runs,
+    list_runs,
+    prepare_runs,
+)
 from clrecon.points.stencil import Stencil
 
 __all__ = [
@@ -38,9 +43,6 @@ __all__ = [
 
 MOST_SAMPLES = 255
 """Largest min_samples: counters have 8 bits."""
-
-PARTS_PER_CORE = 4
-"""Parts of the rows for each core of a CPU device, so that all cores are busy to the end."""
 
 LARGEST_WORK = 1e11
 """Most visits of a row of the stencil at a row of the volume: some minutes."""
@@ -87,24 +89,8 @@ def prepare_voxel_clusters(device: Device) -> Program:
     DeviceError
         The driver's compiler refuses.
     """
-    prepare_scan(device)
-    prepare_components(device)
+    prepare_runs(device)
     return load_program(device, "points/voxel_clusters.cl", {"LANES": device.kernel_variants["LANES"]})
-
-
-@dataclass(frozen=True)
-class _Table:
-    rows_d: Any
-    tables_d: Any
-
-    @classmethod
-    def of(cls, device: Device, stencil: Stencil) -> _Table:
-        rows = stencil.rows if len(stencil.rows) else np.zeros((1, 4), np.int32)  # OpenCL has no empty buffers
-        return cls(upload(device, rows), upload(device, stencil.tables))
-
-    @property
-    def arguments(self) -> dict[str, Any]:
-        return {"stencil": self.rows_d, "tables": self.tables_d}
 
 
 class ClusterSearch:
@@ -156,7 +142,7 @@ class ClusterSearch:
     ):
         self._device, self._mask, self._stopwatch = device, mask, stopwatch
         self._limits = memory_limits(device, memory)
-        self._parts = parts_per_core * device.compute_units
+        self._parts = parts_per_core
         self._samples = checked_min_samples(min_samples)
         self._stencil = stencil
         self._is_one = stencil.holds(mask.shape_ijk)
@@ -167,7 +153,7 @@ class ClusterSearch:
         self.device_bytes = 0
         self._check_budget({})
         self._program = prepare_voxel_clusters(device)
-        self._full, self._forward = _Table.of(device, stencil), _Table.of(device, stencil.forward())
+        self._full, self._forward = StencilTable.of(device, stencil), StencilTable.of(device, stencil.forward())
         self._cores_d = mask.mask_d if self._samples == 1 or self._is_one else self._find_cores()
         self._count()
         self.count, self.numbers_d = self._join() if self.runs else (0, allocate(device, 4))
@@ -180,10 +166,6 @@ class ClusterSearch:
     @property
     def _rows(self) -> dict[str, int]:
         return {"rows": self._mask.rows, "words": self._mask.words}
-
-    @property
-    def _run_rows(self) -> dict[str, int]:
-        return {**self._rows, "lone": int(not self._stencil.joins_columns)}
 
     @property
     def _slices(self) -> dict[str, int]:
@@ -222,52 +204,28 @@ class ClusterSearch:
 
     def _count(self) -> None:
         """Count runs and points, row by row."""
-        rows = self._mask.rows
-        counts_d = self._row_counts_d = allocate(self._device, 8 * (rows + 1))
-        self._run(
-            "count_core_runs", rows + 1, mask=self._mask.mask_d, cores=self._cores_d,
-            row_extents=self._mask.row_extents_d, row_counts=counts_d, **self._run_rows,
-        )  # fmt: skip
-        # One scan of both: the second half begins with the number of all runs.
-        both = exclusive_scan(self._device, counts_d, 2 * (rows + 1), in_place=True, stopwatch=self._stopwatch).total
-        self.runs = int(download(self._device, np.empty(1, np.uint32), counts_d, 4 * rows)[0])
-        self.points = both - self.runs
+        counted = count_runs(
+            self._device, self._mask, self._cores_d, lone=not self._stencil.joins_columns, stopwatch=self._stopwatch
+        )
+        self._counted, self._row_counts_d = counted, counted.row_counts_d
+        self.runs, self.points = counted.count, counted.voxels
         if self._is_one and self.points < self._samples:
-            self._cores_d, self.runs = upload(self._device, np.zeros(rows * self._mask.words, np.uint32)), 0
-        if both >= 2**32:
-            raise DeviceMemoryError(f"{self.points:,} voxels are set: clusters are found among up to 2^31")
+            nothing = np.zeros(self._mask.rows * self._mask.words, np.uint32)
+            self._cores_d, self.runs = upload(self._device, nothing), 0
         self._needs |= {"runs of core voxels": 16 * self.runs, "labels": 4 * self.points}
         self._check_budget({})
 
     def _join(self) -> tuple[int, Any]:
-        device, rows, runs = self._device, self._mask.rows, self.runs
-        self._runs_d = allocate(device, 4 * runs)
-        self._run(
-            "list_core_runs", rows, cores=self._cores_d, row_extents=self._mask.row_extents_d,
-            row_counts=self._row_counts_d, runs=self._runs_d, **self._run_rows,
-        )  # fmt: skip
-        # A CPU's cores take groups; a part is a group's work.  Elsewhere each item has a row of its own.
+        device, runs = self._device, self.runs
+        listed = list_runs(device, self._mask, self._cores_d, self._counted, stopwatch=self._stopwatch)
+        self._runs_d = listed.runs_d
         if self._is_one:
             return 1, upload(device, np.zeros(runs, np.int32))
-        part_rows = -(-rows // self._parts) if self._is_cpu else 1
-        spread = device.group_size if self._is_cpu else 1
-        labels_d, roots_d = allocate(device, 4 * runs), allocate(device, 4 * runs)
-        given = {"runs": self._runs_d, "row_counts": self._row_counts_d, **self._forward.arguments, **self._slices}
-        self._run(
-            "join_runs", -(-rows // part_rows) * spread, labels=labels_d, roots=roots_d, part_rows=part_rows,
-            spread=spread, **given,
+        return join_runs(
+            device, listed, self._mask.shape_ijk, self._forward,
+            check=lambda links: self._check_budget({"pairs of runs": 12 * links, "roots": 5 * runs}),
+            parts_per_core=self._parts, stopwatch=self._stopwatch,
         )  # fmt: skip
-        row_links_d = allocate(device, 4 * rows)
-        given |= {"labels": labels_d, "row_links": row_links_d, "part_rows": part_rows}
-        self._run("count_links", rows, **given)
-        links = exclusive_scan(device, row_links_d, rows, in_place=True, stopwatch=self._stopwatch).total
-        if links >= 2**32:
-            raise DeviceMemoryError(f"{links:,} pairs of runs are neighbours: choose a smaller eps")
-        self._check_budget({"pairs of runs": 12 * links, "roots": 5 * runs})
-        links_d = allocate(device, 12 * links)
-        if links:
-            self._run("list_links", rows, links=links_d, **given)
-        return join_parts(device, labels_d, roots_d, runs, links_d, links, stopwatch=self._stopwatch)
 
     def label(self, numbers: NDArray[np.int32] | None = None) -> NDArray[np.int32]:
         """Return the cluster of each point in the order k, j, i, -1 for noise.

@@ -1,0 +1,357 @@
+"""`Mask`: voxels of a volume that are chosen, one bit each, on a device."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from clrecon.errors import UsageError
+from clrecon.geometry import AIR_HU, Volume
+from clrecon.opencl import Device, Stopwatch, allocate, check_budget, launch, load_program, upload
+from clrecon.operators.masks import logic
+from clrecon.operators.masks.band_mask import check_shape, checked_band, mark_band, mask_bytes
+from clrecon.operators.masks.mask_bits import MaskBits
+from clrecon.operators.masks.regions import RowSpans, box_spans, checked_box, tube_spans
+from clrecon.operators.masks.runs import write_runs
+from clrecon.operators.resident.device_volume import DeviceVolume, open_volume
+from clrecon.system.progress import Progress
+
+if TYPE_CHECKING:  # label maps load pydicom, which others need not wait for
+    from clrecon.labels import LabelMap
+
+__all__ = ["Mask"]
+
+
+class Mask(MaskBits):
+    """Voxels of a volume that are chosen: one bit each, on a device, in the frame of the volume.
+
+    Make one by `from_band`, `from_labels`, `from_box`, `from_tube` or `from_array`.  Masks of one volume are joined by
+    ``&``, ``|``, ``^`` and ``-`` (and not), and inverted by ``~``.  Every operation makes a new mask.
+
+    Attributes
+    ----------
+    volume : Volume
+        The volume whose voxels these are; its HU are not changed.
+    device : Device
+    memory : int or None
+        Most bytes that an operation takes on the device.
+    name : str
+        What was chosen, in words.
+    """
+
+    # Made of
+
+    @classmethod
+    def from_band(
+        cls,
+        volume: Volume | DeviceVolume,
+        hu: Sequence[float],
+        *,
+        device: Device | str | int | None = None,
+        memory: int | None = None,
+        progress: Progress | None = None,
+    ) -> Mask:
+        """Choose the voxels of a band of HU.
+
+        Parameters
+        ----------
+        volume : Volume or DeviceVolume
+        hu : (float, float)
+            Both ends included; infinity leaves one open.  NaN lies in no band.
+        device : Device, str or int, optional
+            See `clrecon.device`; a `DeviceVolume` has its own.
+        memory : int, optional
+            Most bytes on the device; volumes that do not fit beside their mask go there slab by slab.
+        progress : callable, optional
+            Called as ``progress("mask", slices done, all slices)`` where there are several slabs.
+
+        Raises
+        ------
+        UsageError
+            These are not two numbers, the lower one first, or the volume is too large for masks.
+        NoSurfaceError
+            The type of the voxels has no value in the band.
+        DeviceError
+            No device, not even the mask and one slice fit its memory, or it fails.
+        """
+        band = checked_band(hu)
+        name = f"{band[0]:g} to {band[1]:g} HU"
+        with open_volume(volume, device, memory, "a mask") as resident:
+
+            def make(told: list[str]) -> Mask:
+                marked = mark_band(resident, band, progress=progress)
+                made = cls(resident.volume, marked.mask_d, name, device=resident.device, memory=resident.memory)
+                made._extents = marked
+                return made
+
+            return resident.attempt(make)
+
+    @classmethod
+    def from_labels(
+        cls,
+        volume: Volume | DeviceVolume,
+        labels: LabelMap,
+        numbers: Sequence[int | str] | None = None,
+        *,
+        device: Device | str | int | None = None,
+        memory: int | None = None,
+    ) -> Mask:
+        """Choose the voxels of labels; each voxel has the label of the map's voxel that holds its centre.
+
+        Parameters
+        ----------
+        volume : Volume or DeviceVolume
+        labels : LabelMap
+            On any grid.
+        numbers : sequence of int or str, optional
+            Numbers or names of labels; all of the map by default.
+
+        Raises
+        ------
+        UsageError
+            `labels` is not a LabelMap, or it has no such label.
+        RefusedInputError
+            The map names another frame of reference, or lies outside of the volume.
+        DeviceError
+            As for `from_band`.
+        """
+        from clrecon.labels import LabelMap
+
+        if not isinstance(labels, LabelMap):
+            raise UsageError(f"labels are a LabelMap, see clrecon.read_labels, not {type(labels).__name__}")
+        chosen = None if numbers is None else [labels.find(number) for number in numbers]
+        with open_volume(volume, device, memory, "a mask") as resident:
+            voxels = resident.bring(labels).voxels
+            wanted = np.zeros(int(np.iinfo(voxels.dtype).max) + 1, np.bool_)
+            wanted[list(labels.numbers) if chosen is None else chosen] = True
+            names = [labels.name(number) for number in (labels.numbers if chosen is None else chosen)]
+            return cls._packed(resident, wanted[voxels], f"labels {', '.join(names)}" if names else "no label")
+
+    @classmethod
+    def from_array(
+        cls,
+        volume: Volume | DeviceVolume,
+        voxels: ArrayLike,
+        *,
+        device: Device | str | int | None = None,
+        memory: int | None = None,
+    ) -> Mask:
+        """Choose the voxels that are true in an array.
+
+        Parameters
+        ----------
+        volume : Volume or DeviceVolume
+        voxels : array_like, shape (nk, nj, ni), bool
+            Or whole numbers, of which all but 0 are true.
+
+        Raises
+        ------
+        UsageError
+            The shape is not that of the volume, or these are no whole numbers.
+        DeviceError
+            As for `from_band`.
+        """
+        array = np.asarray(voxels)
+        if array.dtype.kind not in "biu":
+            raise UsageError(f"a mask is made of true and false or of whole numbers, not of {array.dtype}")
+        with open_volume(volume, device, memory, "a mask") as resident:
+            shape = resident.volume.voxels.shape
+            if array.shape != shape:
+                raise UsageError(f"the array of the mask has shape {array.shape}, the volume {shape}")
+            return cls._packed(resident, array if array.dtype == np.bool_ else array != 0, "an array")
+
+    @classmethod
+    def from_box(
+        cls,
+        volume: Volume | DeviceVolume,
+        box: Sequence[float | None],
+        *,
+        device: Device | str | int | None = None,
+        memory: int | None = None,
+    ) -> Mask:
+        """Choose the voxels whose centres lie in a box in the patient, its sides included.
+
+        Parameters
+        ----------
+        volume : Volume or DeviceVolume
+            Oblique, tilted and uneven stacks too: the places of the voxels count.
+        box : (x0, x1, y0, y1, z0, z1)
+            LPS mm; None or NaN leaves a side open.
+
+        Raises
+        ------
+        UsageError
+            These are not six numbers, the lower one of each pair first, or no voxel lies in the box.
+        DeviceError
+            As for `from_band`.
+        """
+        sides = checked_box(box)
+        with open_volume(volume, device, memory, "a mask") as resident:
+            name = "box " + ", ".join(
+                f"{axis} {low:g} to {high:g} mm"
+                for axis, (low, high) in zip("xyz", sides, strict=True)
+                if np.isfinite((low, high)).any()
+            )
+            return cls._spanned(resident, box_spans(resident.volume, sides), name)
+
+    @classmethod
+    def from_tube(
+        cls,
+        volume: Volume | DeviceVolume,
+        points_mm: ArrayLike,
+        radius_mm: float,
+        *,
+        device: Device | str | int | None = None,
+        memory: int | None = None,
+    ) -> Mask:
+        """Choose the voxels whose centres lie within a distance of a line through points, such as that of the spine.
+
+        Parameters
+        ----------
+        volume : Volume or DeviceVolume
+        points_mm : array_like, shape (n, 3)
+            LPS mm, joined by straight pieces; of one point the tube is a ball.
+        radius_mm : float
+
+        Raises
+        ------
+        UsageError
+            The points are no points, the radius is not above 0, or no voxel lies in the tube.
+        DeviceError
+            As for `from_band`.
+        """
+        with open_volume(volume, device, memory, "a mask") as resident:
+            spans = tube_spans(resident.volume, points_mm, radius_mm)
+            return cls._spanned(resident, spans, f"tube of {float(radius_mm):g} mm round a line")
+
+    # What it holds
+
+    def to_label_map(self, name: str | None = None) -> LabelMap:
+        """Return a label map on the grid of the volume, with number 1 where voxels are chosen.
+
+        Parameters
+        ----------
+        name : str, optional
+            Of the label; by default that of the mask.
+
+        Raises
+        ------
+        UsageError
+            The slices of the volume are uneven: no label map has such a grid.
+        """
+        from clrecon.labels import LabelMap
+
+        if self.volume.uneven:
+            raise UsageError("the slices of the volume are uneven, and a label map has even ones: take to_numpy()")
+        return LabelMap(self.to_numpy().view(np.uint8), self.volume.affine, {1: name or self.name})
+
+    def apply(self, volume: Volume | DeviceVolume, outside: float = AIR_HU) -> Any:
+        """Return a volume with another value at the voxels that are not chosen.
+
+        Parameters
+        ----------
+        volume : Volume or DeviceVolume
+            In the same frame; not changed.
+        outside : float
+            HU.
+
+        Returns
+        -------
+        Volume or DeviceVolume
+            As `volume`; its report says what was chosen, under ``region``.
+
+        Raises
+        ------
+        UsageError
+            The volume has other voxels, or their type does not hold the value.
+        DeviceError
+            The device has no room, or it fails.
+        """
+        own = volume.volume if isinstance(volume, DeviceVolume) else volume
+        if not isinstance(own, Volume):
+            raise UsageError(f"a mask is applied to a Volume, not to {type(volume).__name__}")
+        self._check_frame(own)
+        value = _checked_value(outside, own.voxels.dtype)
+        if isinstance(volume, DeviceVolume) and volume.device is self.device:
+            made = own.with_voxels(self._replace(volume, value))
+        else:
+            made = own.with_voxels(np.where(self.to_numpy(), own.voxels, value))
+        chosen = {"chosen": self.name, "voxels": self.count, "all_voxels": own.voxels.size, "outside_hu": float(value)}
+        made.report["region"] = chosen
+        if isinstance(volume, DeviceVolume):
+            return DeviceVolume(made, device=volume.device, memory=volume.memory)
+        return made
+
+    def _replace(self, resident: DeviceVolume, value: Any) -> NDArray[Any]:
+        """Return the voxels with `value` where none is chosen, by the device if it has room."""
+        voxels = resident.volume.voxels
+        sizes = {"volume": voxels.nbytes, "volume of what is chosen": voxels.nbytes, **mask_bytes(self.shape_ijk)}
+        if resident.shortage(sizes):
+            return np.where(self.to_numpy(), voxels, value)
+        voxels_d = resident.whole(Stopwatch())
+        return logic.replace_outside(self.device, voxels_d, voxels.dtype, self._mask_d, self.shape_ijk, value)[0]
+
+    @classmethod
+    def _packed(cls, resident: DeviceVolume, chosen: NDArray[np.bool_], name: str) -> Mask:
+        volume = resident.volume
+        check_shape(volume.shape_ijk)
+        ni, nj, nk = volume.shape_ijk
+        packed = np.zeros((nk, nj, 4 * -(-ni // 32)), np.uint8)
+        packed[..., : -(-ni // 8)] = np.packbits(chosen, axis=2, bitorder="little")
+
+        def make(told: list[str]) -> Mask:
+            check_budget(resident.device, mask_bytes(volume.shape_ijk), resident.memory)
+            words_d = upload(resident.device, packed.view("<u4").astype(np.uint32, copy=False))
+            return cls(volume, words_d, name, device=resident.device, memory=resident.memory)
+
+        return resident.attempt(make)
+
+    @classmethod
+    def _spanned(cls, resident: DeviceVolume, spans: RowSpans, name: str) -> Mask:
+        volume, n = resident.volume, len(spans.columns)
+        check_shape(volume.shape_ijk)
+        if not n:
+            low, high = _bounds(volume)
+            raise UsageError(
+                f"no voxel lies in the {name}: the volume runs from ({', '.join(f'{x:.1f}' for x in low)}) to"
+                f" ({', '.join(f'{x:.1f}' for x in high)}) mm"
+            )
+
+        def make(told: list[str]) -> Mask:
+            device = resident.device
+            sizes = mask_bytes(volume.shape_ijk)
+            check_budget(device, {**sizes, "spans of rows": 8 * n}, resident.memory)
+            words = sizes["mask of the voxels"] // 4
+            mask_d = allocate(device, 4 * words)
+            launch(device, load_program(device, "masks/band_mask.cl")["clear_words"], words, mask=mask_d, n=words)
+            write_runs(
+                device, upload(device, spans.columns), upload(device, spans.row_counts),
+                upload(device, np.zeros(n, np.int32)), upload(device, np.ones(1, np.uint8)), mask_d, volume.shape_ijk,
+            )  # fmt: skip
+            return cls(volume, mask_d, name, device=device, memory=resident.memory)
+
+        return resident.attempt(make)
+
+
+def _checked_value(value: float, dtype: np.dtype[Any]) -> Any:
+    """Return a value of HU as one of the voxels' type."""
+    try:
+        number = float(value)
+        with np.errstate(invalid="ignore", over="ignore"):
+            made = dtype.type(number)
+    except (TypeError, ValueError, OverflowError):
+        number, made = np.nan, None
+    if made is None or not np.isfinite(number) or (dtype.kind != "f" and float(made) != number):
+        raise UsageError(f"the value outside is {value!r}: voxels of {dtype} hold no such HU")
+    return made
+
+
+def _bounds(volume: Volume) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the lowest and highest place of the voxels, mm."""
+    last = np.array(volume.shape_ijk) - 1
+    corners = np.array([[a, b, c] for a in (0, last[0]) for b in (0, last[1]) for c in range(last[2] + 1)])
+    places = volume.ijk_to_lps(corners)
+    return places.min(axis=0), places.max(axis=0)

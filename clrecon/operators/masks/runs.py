@@ -1,0 +1,215 @@
+"""Runs of set voxels along the rows of a mask, and their components: the host side of cl/masks/runs.cl."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from clrecon.errors import DeviceMemoryError
+from clrecon.opencl import Device, Program, Stopwatch, allocate, download, launch, load_program, upload
+from clrecon.operators.masks.band_mask import VoxelMask
+from clrecon.operators.primitives.scan import exclusive_scan, prepare_scan
+from clrecon.operators.primitives.union_find import join_parts, prepare_components
+from clrecon.points.stencil import Stencil
+
+__all__ = [
+    "PARTS_PER_CORE",
+    "RowRuns",
+    "StencilTable",
+    "count_runs",
+    "join_runs",
+    "list_runs",
+    "prepare_runs",
+    "write_runs",
+]
+
+PARTS_PER_CORE = 4
+"""Parts of the rows for each core of a CPU device, so that all cores are busy to the end."""
+
+
+def prepare_runs(device: Device) -> Program:
+    """Build the kernels.
+
+    Raises
+    ------
+    DeviceError
+        The driver's compiler refuses.
+    """
+    prepare_scan(device)
+    prepare_components(device)
+    return load_program(device, "masks/runs.cl")
+
+
+@dataclass(frozen=True)
+class StencilTable:
+    """A stencil on a device."""
+
+    rows_d: Any
+    tables_d: Any
+
+    @classmethod
+    def of(cls, device: Device, stencil: Stencil) -> StencilTable:
+        """Upload a stencil."""
+        rows = stencil.rows if len(stencil.rows) else np.zeros((1, 4), np.int32)  # OpenCL has no empty buffers
+        return cls(upload(device, rows), upload(device, stencil.tables))
+
+    @property
+    def arguments(self) -> dict[str, Any]:
+        """Arguments of kernels."""
+        return {"stencil": self.rows_d, "tables": self.tables_d}
+
+
+@dataclass(frozen=True)
+class RowRuns:
+    """Runs of set voxels along i, on a device.
+
+    Attributes
+    ----------
+    runs_d : buffer, (count, 2) uint16
+        First and last column, row by row; None before `list_runs`.
+    row_counts_d : buffer, (2, rows + 1) uint32
+        First run of each row, and `count`; `count` and the voxels of all rows before.
+    count : int
+    voxels : int
+        Set voxels of the mask.
+    lone : bool
+        Each voxel is a run of its own.
+    """
+
+    runs_d: Any
+    row_counts_d: Any
+    count: int
+    voxels: int
+    lone: bool
+
+
+def count_runs(
+    device: Device, mask: VoxelMask, bits_d: Any, *, lone: bool = False, stopwatch: Stopwatch | None = None
+) -> RowRuns:
+    """Count the runs of each row.
+
+    Parameters
+    ----------
+    mask : VoxelMask
+    bits_d : buffer, (nk, nj, words) uint32
+        Voxels of the mask whose runs are counted; may be the mask itself.
+    lone : bool
+        Each voxel is a run of its own.
+
+    Raises
+    ------
+    DeviceMemoryError
+        There are more voxels and runs than 32 bits can number.
+    """
+    rows = mask.rows
+    counts_d = allocate(device, 8 * (rows + 1))
+    launch(
+        device, prepare_runs(device)["count_row_runs"], rows + 1, stopwatch=stopwatch, mask=mask.mask_d, bits=bits_d,
+        row_extents=mask.row_extents_d, row_counts=counts_d, rows=rows, words=mask.words, lone=int(lone),
+    )  # fmt: skip
+    # One scan of both: the second half begins with the number of all runs.
+    both = exclusive_scan(device, counts_d, 2 * (rows + 1), in_place=True, stopwatch=stopwatch).total
+    count = int(download(device, np.empty(1, np.uint32), counts_d, 4 * rows)[0])
+    if both >= 2**32:
+        raise DeviceMemoryError(f"{both - count:,} voxels are set: components are found among up to 2^31")
+    return RowRuns(None, counts_d, count, both - count, lone)
+
+
+def list_runs(
+    device: Device, mask: VoxelMask, bits_d: Any, counted: RowRuns, *, stopwatch: Stopwatch | None = None
+) -> RowRuns:
+    """List the runs that were counted."""
+    runs_d = allocate(device, 4 * counted.count)
+    launch(
+        device, prepare_runs(device)["list_row_runs"], mask.rows, stopwatch=stopwatch, bits=bits_d,
+        row_extents=mask.row_extents_d, row_counts=counted.row_counts_d, runs=runs_d, rows=mask.rows,
+        words=mask.words, lone=int(counted.lone),
+    )  # fmt: skip
+    return RowRuns(runs_d, counted.row_counts_d, counted.count, counted.voxels, counted.lone)
+
+
+def join_runs(
+    device: Device,
+    listed: RowRuns,
+    shape_ijk: tuple[int, int, int],
+    forward: StencilTable,
+    *,
+    check: Callable[[int], None],
+    parts_per_core: int = PARTS_PER_CORE,
+    stopwatch: Stopwatch | None = None,
+) -> tuple[int, Any]:
+    """Number the components of runs that are neighbours by a stencil.
+
+    Parameters
+    ----------
+    listed : RowRuns
+        At least one run.
+    forward : StencilTable
+        Rows behind the voxel, see `Stencil.forward`.
+    check : callable
+        Called with the number of pairs of runs in different parts before memory is taken for them: 12 bytes a pair and
+        5 a run.
+    parts_per_core : int
+        Of CPU devices; the numbers do not depend on it.
+
+    Returns
+    -------
+    count : int
+    numbers_d : buffer, (runs,) int32
+        Component of each run, in the order of their first runs.
+
+    Raises
+    ------
+    DeviceMemoryError
+        There are more pairs than 32 bits can number.
+    DeviceError
+        The device fails or computes wrongly.
+    """
+    program = prepare_runs(device)
+    _, nj, nk = shape_ijk
+    rows, runs = nj * nk, listed.count
+    # A CPU's cores take groups; a part is a group's work.  Elsewhere each item has a row of its own.
+    is_cpu = device.has_long_items
+    part_rows = -(-rows // (parts_per_core * device.compute_units)) if is_cpu else 1
+    spread = device.group_size if is_cpu else 1
+    labels_d, roots_d, row_links_d = (allocate(device, 4 * n) for n in (runs, runs, rows))
+    given = {"runs": listed.runs_d, "row_counts": listed.row_counts_d, **forward.arguments, "nj": nj, "nk": nk}
+    given |= {"labels": labels_d, "part_rows": part_rows}
+    launch(
+        device, program["join_runs"], -(-rows // part_rows) * spread, stopwatch=stopwatch, roots=roots_d,
+        spread=spread, **given,
+    )  # fmt: skip
+    given |= {"row_links": row_links_d}
+    launch(device, program["count_links"], rows, stopwatch=stopwatch, **given)
+    links = exclusive_scan(device, row_links_d, rows, in_place=True, stopwatch=stopwatch).total
+    if links >= 2**32:
+        raise DeviceMemoryError(f"{links:,} pairs of runs are neighbours: fewer than 2^32 can be joined")
+    check(links)
+    links_d = allocate(device, 12 * links)
+    if links:
+        launch(device, program["list_links"], rows, stopwatch=stopwatch, links=links_d, **given)
+    return join_parts(device, labels_d, roots_d, runs, links_d, links, stopwatch=stopwatch)
+
+
+def write_runs(
+    device: Device,
+    runs_d: Any,
+    row_counts_d: Any,
+    numbers_d: Any,
+    marks_d: Any,
+    mask_d: Any,
+    shape_ijk: tuple[int, int, int],
+    *,
+    wanted: int = 1,
+    stopwatch: Stopwatch | None = None,
+) -> None:
+    """Set the bits of runs whose component has the mark `wanted`, 0 or 1; the other bits stay as they are."""
+    ni, nj, nk = shape_ijk
+    launch(
+        device, prepare_runs(device)["write_runs"], nj * nk, stopwatch=stopwatch, runs=runs_d,
+        row_counts=row_counts_d, numbers=numbers_d, marks=marks_d, mask=mask_d, wanted=wanted, rows=nj * nk,
+        words=-(-ni // 32),
+    )  # fmt: skip

@@ -1,0 +1,178 @@
+"""`clrecon.Mask`: made of bands, labels, boxes, tubes and arrays, joined, and given back."""
+
+from __future__ import annotations
+
+import copy
+import math
+import pickle
+
+import numpy as np
+import pytest
+from surface_volumes import MIRRORED, OBLIQUE, random_volume
+from uneven_volume import uneven
+
+import clrecon
+from clrecon.errors import DeviceError, NoSurfaceError, UsageError
+from clrecon.geometry import Volume
+from clrecon.reference.masks import regions as twin
+
+TILTED = np.array([[0.6, 0.0, 0.0, -20.0], [0.0, 0.6, 0.7, 5.0], [0.0, 0.0, 2.0, 100.0], [0, 0, 0, 1.0]])
+ROWS = [1, 31, 32, 33, 512, 513, 2049]
+
+
+def volumes() -> list[Volume]:
+    noise = np.random.default_rng(8).integers(0, 100, (6, 13, 40)).astype(np.int16)
+    frames = [Volume(noise, frame) for frame in (np.eye(4), OBLIQUE, MIRRORED, TILTED)]
+    return [*frames, uneven(noise), uneven(noise, -1.0), Volume(noise[:1], OBLIQUE)]
+
+
+@pytest.mark.parametrize("ni", ROWS)
+def test_arrays_come_back_from_rows_of_any_length(device, ni):
+    volume = random_volume((3, 4, ni), high=100)
+    chosen = volume.voxels > 60
+    made = clrecon.Mask.from_array(volume, chosen, device=device)
+    np.testing.assert_array_equal(made.to_numpy(), chosen)
+    np.testing.assert_array_equal((~made).to_numpy(), ~chosen)
+    assert (made.count, made.share) == (chosen.sum(), chosen.mean())
+    assert (~made).count == (~chosen).sum()  # bits beyond the row stay 0
+    np.testing.assert_array_equal(clrecon.Mask.from_band(volume, (61, math.inf), device=device).to_numpy(), chosen)
+
+
+def test_logic_equals_that_of_numpy(device):
+    volume = random_volume((5, 6, 70), high=100)
+    a, b = volume.voxels > 40, volume.voxels % 3 == 0
+    one, other = (clrecon.Mask.from_array(volume, chosen, device=device) for chosen in (a, b))
+    for made, expected in ((one & other, a & b), (one | other, a | b), (one ^ other, a ^ b), (one - other, a & ~b)):
+        np.testing.assert_array_equal(made.to_numpy(), expected)
+    assert (one - other).name == "(an array) and not (an array)"
+    np.testing.assert_array_equal(one.to_numpy(), a)  # nothing is changed
+    with pytest.raises(TypeError):
+        one & a  # type: ignore[operator]
+
+
+@pytest.mark.parametrize("which", range(7))
+def test_boxes_equal_the_twin(device, which):
+    volume = volumes()[which]
+    places = twin.find_places(volume).reshape(-1, 3)
+    low, high = places.min(axis=0), places.max(axis=0)
+    rng = np.random.default_rng(which)
+    for _ in range(6):
+        sides = np.sort(rng.uniform(low, high, (2, 3)), axis=0).T
+        sides[rng.random((3, 2)) < 0.4] = np.nan
+        expected = twin.find_in_box(volume, np.where(np.isnan(sides), [-np.inf, np.inf], sides))
+        if expected.any():
+            made = clrecon.Mask.from_box(volume, sides.ravel().tolist(), device=device)
+            np.testing.assert_array_equal(made.to_numpy(), expected)
+    whole = clrecon.Mask.from_box(volume, np.stack([low, high], axis=1).ravel().tolist(), device=device)
+    assert whole.share == 1.0  # a box that ends at voxels holds them
+
+
+@pytest.mark.parametrize("which", range(7))
+def test_tubes_equal_the_twin(device, which):
+    volume = volumes()[which]
+    places = twin.find_places(volume)
+    rng = np.random.default_rng(which)
+    for radius, count in ((0.4, 1), (1.7, 2), (3.1, 4), (2.0, 9)):
+        line = places.reshape(-1, 3)[rng.integers(0, volume.voxels.size, count)] + rng.normal(0.0, 0.2, (count, 3))
+        line = np.concatenate([line, line[-1:]])  # a piece without length
+        expected = twin.find_in_tube(volume, line, radius)
+        if expected.any():
+            made = clrecon.Mask.from_tube(volume, line, radius, device=device)
+            np.testing.assert_array_equal(made.to_numpy(), expected)
+    ball = clrecon.Mask.from_tube(volume, places[0, 3, 4][None], 1e4, device=device)
+    assert ball.share == 1.0
+
+
+def test_labels_are_chosen_by_number_and_name(device):
+    volume = random_volume((4, 5, 40))
+    numbers = volume.voxels.astype(np.uint8)
+    labels = clrecon.LabelMap(numbers, volume.affine, {2: "L1", 3: "L2"})
+    made = clrecon.Mask.from_labels(volume, labels, ["L1", 3], device=device)
+    np.testing.assert_array_equal(made.to_numpy(), (numbers == 2) | (numbers == 3))
+    assert made.name == "labels L1, L2"
+    assert clrecon.Mask.from_labels(volume, labels, device=device).count == np.count_nonzero(numbers)
+    again = clrecon.Mask.from_labels(volume, made.to_label_map("two"), ["two"], device=device)
+    assert again.count == made.count
+    with pytest.raises(UsageError, match="L9"):
+        clrecon.Mask.from_labels(volume, labels, ["L9"], device=device)
+    with pytest.raises(UsageError, match="labels are a LabelMap"):
+        clrecon.Mask.from_labels(volume, numbers, device=device)
+
+
+@pytest.mark.parametrize("dtype", ["int16", "uint8", "float32"])
+def test_volumes_keep_what_is_chosen(device, dtype):
+    volume = random_volume((4, 5, 40), dtype=dtype, high=100)
+    made = clrecon.Mask.from_band(volume, (30, 60), device=device)
+    outside = 0 if dtype == "uint8" else -1024
+    expected = np.where((volume.voxels >= 30) & (volume.voxels <= 60), volume.voxels, outside)
+    found = made.apply(volume, outside)
+    np.testing.assert_array_equal(found.voxels, expected)
+    assert found.voxels.dtype == dtype
+    assert found.report["region"]["voxels"] == made.count
+    with clrecon.DeviceVolume(volume, device=device) as resident, made.apply(resident, outside) as kept:
+        assert isinstance(kept, clrecon.DeviceVolume)
+        np.testing.assert_array_equal(kept.volume.voxels, expected)
+    with pytest.raises(UsageError, match="hold no such HU"):
+        made.apply(volume, math.nan)
+
+
+def test_a_surface_of_what_is_chosen_is_that_of_the_part(device):
+    volume = random_volume((8, 9, 40), high=100)
+    made = clrecon.Mask.from_box(volume, [volume.affine[0, 3] + 9.0, None, None, None, None, None], device=device)
+    part = volume.with_voxels(np.where(made.to_numpy(), volume.voxels, -1024))
+    one, other = (clrecon.extract_isosurface(each, 50, device=device) for each in (made.apply(volume), part))
+    np.testing.assert_array_equal(one.vertices, other.vertices)
+    assert 0 < one.triangles.shape[0] < clrecon.extract_isosurface(volume, 50, device=device).triangles.shape[0]
+
+
+def test_bad_input_is_refused(device):
+    volume = random_volume((3, 4, 40))
+    make = clrecon.Mask
+    with pytest.raises(UsageError, match="a band is two numbers"):
+        make.from_band(volume, (3, 1), device=device)
+    with pytest.raises(NoSurfaceError, match="no voxel can lie from"):
+        make.from_band(volume, (0.2, 0.8), device=device)
+    with pytest.raises(UsageError, match="has shape \\(3, 4, 39\\), the volume \\(3, 4, 40\\)"):
+        make.from_array(volume, np.zeros((3, 4, 39), bool), device=device)
+    with pytest.raises(UsageError, match="not of float64"):
+        make.from_array(volume, np.zeros((3, 4, 40)), device=device)
+    for box, words in (
+        ((1, 2, 3), "a box is six numbers of mm"),
+        (7, "a box is six numbers of mm"),
+        ((5, 1, None, None, None, None), "runs from 5 to 1 mm in x"),
+        ((900, 950, 0, 1, 0, 1), "no voxel lies in the box x 900 to 950 mm.*the volume runs from"),
+    ):
+        with pytest.raises(UsageError, match=words):
+            make.from_box(volume, box, device=device)
+    for points, radius, words in (
+        (np.zeros((0, 3)), 3.0, "needs points that are numbers"),
+        ([[0, 0, np.nan]], 3.0, "needs points that are numbers"),
+        ([[0, 0]], 3.0, "points have shape"),
+        ([[0, 0, 0]], 0.0, "the radius of the tube is 0.0"),
+        ([[0, 0, 0]], math.nan, "the radius of the tube is nan"),
+        ([[9e3, 0, 0]], 3.0, "no voxel lies in the tube of 3 mm"),
+    ):
+        with pytest.raises(UsageError, match=words):
+            make.from_tube(volume, points, radius, device=device)
+    one = make.from_band(volume, (1, 3), device=device)
+    with pytest.raises(UsageError, match="the mask has"):
+        one.apply(random_volume((3, 4, 41)))
+    with pytest.raises(UsageError, match="lie up to .* mm apart"):
+        one & make.from_band(Volume(volume.voxels, np.eye(4)), (1, 3), device=device)
+    with pytest.raises(UsageError, match="even ones"):
+        make.from_band(uneven(), (0, 3), device=device).to_label_map()
+    for refuse in (pickle.dumps, copy.copy):
+        with pytest.raises(TypeError, match="belongs to its process"):
+            refuse(one)
+
+
+def test_memory_is_summed_before_it_is_taken(device):
+    volume = random_volume((40, 50, 600))
+    few = clrecon.Mask.from_band(volume, (1, 3), device=device, memory=400_000)  # slab by slab
+    assert few.count == ((volume.voxels >= 1) & (volume.voxels <= 3)).sum()
+    with pytest.raises(DeviceError, match="masks of the voxels .* are allowed"):
+        few & few
+    with pytest.raises(DeviceError, match="are allowed"):
+        clrecon.Mask.from_band(volume, (1, 3), device=device, memory=100_000)
+    with pytest.raises(DeviceError, match="are allowed"):
+        clrecon.Mask.from_array(volume, volume.voxels > 1, device=device, memory=100_000)
