@@ -6,10 +6,11 @@
 
 It needs the extras `test` and `mutation`.  A room is a folder of clrecon/ with its tests in the folder of that name in
 tests/ and those of ROOM_TESTS.  The changes are made in a private copy of the project.  The tests of a room are traced
-once.  Each change is then tried with the tests that run the changed line, the shortest first, until one fails.  Tests
-marked slow or fuzz are left out, and so are the longest where all together would take more than a minute.  A change
-that no test notices survives, unless `equivalent_changes.json` says why it changes nothing.  A line that none of the
-tests runs is a survivor too.  Time is that of the processor: a busy machine makes no change look caught.
+once; with --json the trace is kept beside FILE.  Each change is then tried with the tests that run the changed line,
+those of the files that import the changed one first, and of each file the shortest, until one fails.  Tests marked slow
+or fuzz are left out, and so are the last where all together would take more than a minute.  A change that no test
+notices survives, unless `equivalent_changes.json` says why it changes nothing.  A line that none of the tests runs is a
+survivor too.  Time is that of the processor: a busy machine makes no change look caught.
 
 With --resume, changes that FILE calls caught stay caught while their file is the same; survivors are tried again.
 The exit status is 1 if more than 5 % of the changes of a room survive.
@@ -18,7 +19,6 @@ The exit status is 1 if more than 5 % of the changes of a room survive.
 from __future__ import annotations
 
 import argparse
-import hashlib
 import json
 import os
 import shutil
@@ -27,17 +27,16 @@ import subprocess
 import sys
 import tempfile
 import time
-from bisect import bisect_right
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, field
-from itertools import accumulate
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 sys.path.insert(0, str(Path(__file__).parent))
 
 from python_changes import Change, Equivalent, choose_changes, read_equivalents, statement_lines  # noqa: E402
+from room_traces import Digests, Imports, KeptTrace, Trace, digest  # noqa: E402
 from warm_tests import PYTEST_OPTIONS, Run, WarmTests  # noqa: E402
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -48,71 +47,16 @@ ROOM_TESTS = {
 }
 """Further tests of a room: those of the only code that uses a part of it."""
 MOST_SURVIVORS = 0.05
-TIMES_PLAIN, AND_SECONDS = 4.0, 10.0
-"""A change may make its tests this many times slower, and this much more; a change that takes longer is caught."""
 TIMES_WALL, AND_WALL_SECONDS = 20.0, 60.0
 """Seconds after which a change is given up: so many times what its tests may take of the processor, and this more."""
 FIRST_TESTS = 5
 """So many tests are tried before the files of the others are imported."""
-MOST_SECONDS = 60.0
-"""Traced seconds of the tests that a change is tried with."""
 CHECKED_SECONDS = 20.0
 UNNOTICED = ("survived", "not run", "late")
 
 
 class BrokenRoomError(Exception):
     """The tests of a room fail without a change, or there are none."""
-
-
-@dataclass(frozen=True)
-class Trace:
-    """What the tests of a room run without a change.
-
-    Attributes
-    ----------
-    lines : dict
-        File below the root -> line -> tests, by their names in pytest.
-    seconds : dict
-        Test -> processor time in seconds.
-    start : float
-        Processor time before the first test, in seconds.
-    modules : list of str
-        Modules from outside of the project that the tests import.
-    """
-
-    lines: dict[str, dict[int, list[str]]]
-    seconds: dict[str, float]
-    start: float
-    modules: list[str] = field(default_factory=list)
-
-    @classmethod
-    def read(cls, path: Path) -> Trace:
-        """Read what the plugin has written."""
-        data = json.loads(path.read_text(encoding="utf-8"))
-        lines = {file: {int(line): tests for line, tests in rows.items()} for file, rows in data["lines"].items()}
-        return cls(lines, data["seconds"], data["start"], data["modules"])
-
-    def tests_of(self, file: str, lines: Sequence[int]) -> list[str]:
-        """Tests that run one of the lines, the shortest first; as many as take MOST_SECONDS.
-
-        A line that is run when its module is imported (a constant, a default) belongs to no test: then all tests that
-        run anything of this file.
-        """
-        rows = self.lines.get(file, {})
-        if any(line in rows and not rows[line] for line in lines):
-            lines = list(rows)
-        tests = {test for line in lines for test in rows.get(line, ())}
-        return self.shortest(tests, MOST_SECONDS)
-
-    def shortest(self, tests: Iterable[str], seconds: float) -> list[str]:
-        """The shortest of these tests, one at least, as many as together take no longer than some seconds."""
-        found = sorted(tests, key=lambda test: (self.seconds[test], test))
-        ends = list(accumulate(self.seconds[test] for test in found))
-        return found[: max(1, bisect_right(ends, seconds))]
-
-    def limit_s(self, tests: Sequence[str]) -> float:
-        """Processor time that these tests may take with a change, in seconds."""
-        return TIMES_PLAIN * (self.start + sum(self.seconds[test] for test in tests)) + AND_SECONDS
 
 
 @dataclass
@@ -155,17 +99,36 @@ class Copy:
             environment.pop(name, None)
         return environment
 
-    def trace(self, room: str) -> Trace:
-        """Run the tests of a room without a change.
+    def trace(self, room: str, kept: Path | None = None) -> Trace:
+        """Run the tests of a room without a change, and see which lines they run.
+
+        Parameters
+        ----------
+        room : str
+        kept : Path, optional
+            File of an earlier trace: files of tests are traced again if they, or anything but tests, have changed.
 
         Raises
         ------
         BrokenRoomError
             There are none, one fails, or one fails in another order.
         """
+        tests = [f"tests/{room}", *ROOM_TESTS.get(room, ())]
+        now, earlier = Digests.of(self.root, self.package, tests), KeptTrace.read(kept)
+        trace, stale = earlier.still_good(now) if earlier else (None, tests)
+        if stale:
+            new = self._trace(room, stale if trace else tests)
+            trace = trace.joined(new) if trace else new
+        assert trace is not None
+        if kept is not None:
+            KeptTrace(now, trace).write(kept)
+        trace = replace(trace, imports=Imports.read(self.root, [self.package, "tests"]))
+        self._check_order(room, trace)
+        return trace
+
+    def _trace(self, room: str, tests: Sequence[str]) -> Trace:
         target = self.root.parent / f"trace-{room}.json"
         traced = {"CLRECON_TRACE_TO": str(target), "CLRECON_TRACED": str(self.root / self.package / room)}
-        tests = [f"tests/{room}", *ROOM_TESTS.get(room, ())]
         command = [sys.executable, "-m", "pytest", *PYTEST_OPTIONS, "-p", "traced_tests", *tests]
         ended = subprocess.run(
             [*command, f"--basetemp={self.root.parent / 'tests'}"],
@@ -179,9 +142,7 @@ class Copy:
         if ended.returncode:
             said = ended.stdout.decode(errors="replace")[-3000:]
             raise BrokenRoomError(f"the tests in {tests} fail without a change (status {ended.returncode}):\n{said}")
-        trace = Trace.read(target)
-        self._check_order(room, trace)
-        return trace
+        return Trace.from_json(json.loads(target.read_text(encoding="utf-8")))
 
     def _check_order(self, room: str, trace: Trace) -> None:
         """Run the shortest tests as for a change, but without one: neither order nor warm start must make one fail."""
@@ -245,8 +206,8 @@ class RoomResult:
     Attributes
     ----------
     rows : list of dict
-        A change as in `Change.as_dict`, with ``room``, ``outcome``, ``tests`` (that run the line), ``digest`` (of the
-        file without the change) and, for an equivalent change, ``why``.
+        A change as in `Change.as_dict`, with ``room``, ``outcome``, ``tests`` (it was tried with so many), ``digest``
+        (of the file without the change) and, for an equivalent change, ``why``.
     """
 
     room: str
@@ -284,11 +245,6 @@ def room_texts(root: Path, package: str, room: str) -> dict[str, str]:
     return {path.relative_to(root).as_posix(): path.read_text(encoding="utf-8") for path in files}
 
 
-def digest(text: str) -> str:
-    """A short name of a text."""
-    return hashlib.sha256(text.encode()).hexdigest()[:16]
-
-
 def try_room(
     copy: Copy,
     room: str,
@@ -297,6 +253,7 @@ def try_room(
     equivalents: Sequence[Equivalent] = (),
     known: Sequence[dict[str, Any]] = (),
     until: float = float("inf"),
+    kept: Path | None = None,
 ) -> Iterator[dict[str, Any]]:
     """Try changes of a room one after the other.
 
@@ -311,6 +268,8 @@ def try_room(
         Earlier rows; what was caught then is not tried again while its file is the same.
     until : float
         Time of `time.monotonic` after which no change is begun.
+    kept : Path, optional
+        File of the trace, see `Copy.trace`.
 
     Yields
     ------
@@ -333,7 +292,7 @@ def try_room(
         elif found is not None:
             yield {**row, "outcome": found["outcome"], "tests": found["tests"]}
         elif time.monotonic() < until:
-            trace = trace or copy.trace(room)
+            trace = trace or copy.trace(room, kept)
             outcome, tests = copy.try_change(change, trace)
             yield {**row, "outcome": outcome, "tests": tests}
 
@@ -372,8 +331,10 @@ def main(argv: Sequence[str] | None = None) -> int:
             result = RoomResult(room)
             results.append(result)
             changes = choose_changes(room_texts(copy.root, copy.package, room), options.changes, options.seed)
+            kept = options.json and options.json.with_name(f"{options.json.stem}-{room}-lines.json")
+            tried = try_room(copy, room, changes, equivalents=equivalents, known=known, until=until, kept=kept)
             try:
-                for row in try_room(copy, room, changes, equivalents=equivalents, known=known, until=until):
+                for row in tried:
                     result.rows.append(row)
                     if row["outcome"] in UNNOTICED:
                         print(f"{row['outcome']} ({row['tests']} tests): {row['file']}:{row['line']} {row['operator']}")

@@ -7,9 +7,10 @@ from __future__ import annotations
 
 import ast
 import difflib
+import hashlib
 import json
-import random
 import re
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from functools import cache
@@ -20,8 +21,10 @@ __all__ = [
     "Change",
     "Equivalent",
     "choose_changes",
+    "definition_names",
     "find_places",
     "make_change",
+    "name_places",
     "read_equivalents",
     "statement_lines",
 ]
@@ -171,6 +174,10 @@ def _spans_left_out(text: str) -> list[tuple[Position, Position]]:
     return [((node.lineno, node.col_offset), (node.end_lineno, node.end_col_offset)) for node in nodes]
 
 
+def _count_slashes(tree: ast.Module) -> int:
+    return sum(bool(node.posonlyargs) for node in ast.walk(tree) if isinstance(node, ast.arguments))
+
+
 def find_places(text: str) -> list[Place]:
     """Find everything that can be changed in a file with the given text, in the order of the file."""
     from cosmic_ray.ast import ast_nodes, get_ast
@@ -191,13 +198,17 @@ def find_places(text: str) -> list[Place]:
 def make_change(file: str, text: str, place: Place) -> Change | None:
     """Change a text in one place; None if it stays the same program or becomes none.
 
-    None too for ``frozen=True`` of a dataclass: nothing assigns to its fields in a right program.
+    None too for ``frozen=True`` of a dataclass, as nothing assigns to its fields in a right program, and for the star
+    of a signature, which is no product.
     """
     from cosmic_ray.mutating import mutate_code
 
     changed = mutate_code(text, _operators()[place.operator], place.occurrence)
     try:
-        if changed is None or ast.dump(ast.parse(changed)) == ast.dump(ast.parse(text)):
+        if changed is None:
+            return None
+        now, was = ast.parse(changed), ast.parse(text)
+        if ast.dump(now) == ast.dump(was) or _count_slashes(now) > _count_slashes(was):
             return None
         compile(changed, file, "exec")
     except SyntaxError:
@@ -214,8 +225,58 @@ def make_change(file: str, text: str, place: Place) -> Change | None:
     return Change(file, first[1] + 1, place.operator, place.occurrence, before, after, changed)
 
 
+def name_places(texts: dict[str, str]) -> dict[tuple[str, ...], list[Place]]:
+    """Name each position of files that can be changed.
+
+    A name is file, definition around the position, text of its line without the blanks at its ends, and the number of
+    the position among those of the same three.  An edit elsewhere leaves it alone.
+
+    Parameters
+    ----------
+    texts : dict
+        Path below the root -> text of the file.
+
+    Returns
+    -------
+    dict
+        Name -> what can be done there, in an order that another edit leaves alone too.
+    """
+    named: dict[tuple[str, ...], list[Place]] = {}
+    for file in sorted(texts):
+        lines = texts[file].split("\n")
+        at: dict[Position, list[Place]] = {}
+        for place in find_places(texts[file]):
+            at.setdefault(place.start, []).append(place)
+        names = definition_names(texts[file])
+        seen: Counter[tuple[str, ...]] = Counter()
+        for start in sorted(at):
+            place_of = (file, names.get(start[0], ""), lines[start[0] - 1].strip())
+            name = (*place_of, str(seen[place_of]))
+            named[name] = at[start]
+            seen[place_of] += 1
+    return named
+
+
+def definition_names(text: str) -> dict[int, str]:
+    """Line -> names of the classes and functions around it, from the outermost, with dots between; none outside."""
+    names: dict[int, str] = {}
+
+    def walk(node: ast.AST, outer: str) -> None:
+        for child in ast.iter_child_nodes(node):
+            name = outer
+            if isinstance(child, (ast.FunctionDef, ast.AsyncFunctionDef, ast.ClassDef)):
+                name = f"{outer}.{child.name}".lstrip(".")
+                names.update(dict.fromkeys(range(child.lineno, (child.end_lineno or child.lineno) + 1), name))
+            walk(child, name)
+
+    walk(ast.parse(text), "")
+    return names
+
+
 def choose_changes(texts: dict[str, str], count: int, seed: str) -> list[Change]:
     """Choose changes at random: each position of a file alike, and at each position one of its changes.
+
+    The order is that of a hash of the seed and the position's name: an edit draws no other changes elsewhere.
 
     Parameters
     ----------
@@ -225,18 +286,21 @@ def choose_changes(texts: dict[str, str], count: int, seed: str) -> list[Change]
         At most so many; fewer where there are fewer positions.
     seed : str
     """
-    draw = random.Random(seed)
-    at: dict[tuple[str, Position], list[Place]] = {}
-    for file in sorted(texts):
-        for place in find_places(texts[file]):
-            at.setdefault((file, place.start), []).append(place)
-    positions = sorted(at)
-    draw.shuffle(positions)
+
+    def draw(*words: str) -> str:
+        return hashlib.sha256("\0".join((seed, *words)).encode()).hexdigest()
+
+    named = name_places(texts)
     chosen: list[Change] = []
-    for file, start in positions:
+    for name in sorted(named, key=lambda name: draw(*name)):
         if len(chosen) >= count:
             break
-        change = make_change(file, texts[file], draw.choice(at[file, start]))
+        seen: Counter[str] = Counter()
+        draws = []
+        for place in named[name]:
+            draws.append((draw(*name, place.operator, str(seen[place.operator])), place))
+            seen[place.operator] += 1
+        change = make_change(name[0], texts[name[0]], min(draws, key=lambda entry: entry[0])[1])
         if change is not None:
             chosen.append(change)
     return chosen

@@ -5,23 +5,29 @@ The changes are written here: cosmic-ray, which finds them in clrecon, is not pa
 
 from __future__ import annotations
 
+import gc
 import json
 import signal
+import sys
 from collections.abc import Iterator
 from pathlib import Path
+from types import ModuleType
 
 import mutate_python
 import pytest
-from mutate_python import BrokenRoomError, Copy, RoomResult, Trace, room_texts, try_room
+from mutate_python import BrokenRoomError, Copy, RoomResult, room_texts, try_room
 from python_changes import (
     Change,
     Equivalent,
     choose_changes,
+    definition_names,
     find_places,
     make_change,
     read_equivalents,
     statement_lines,
 )
+from room_traces import FAR, Digests, Imports, KeptTrace, Trace
+from traced_tests import Caches
 from warm_tests import Run, WarmTests
 
 ROOM = """from functools import cache
@@ -130,9 +136,12 @@ def names(trace: Trace, changed: Change) -> set[str]:
 
 
 def test_the_tests_of_a_line_are_found_through_fixtures_and_caches(trace: Trace) -> None:
-    assert names(trace, TIMES) == {"area", "square_is_positive", "small"}
-    assert names(trace, change("[1, 2]", "[1, 3]")) == {"first", "second"}
-    assert names(trace, EQUAL) == {"count"}
+    runs = {line: {test.partition("::test_")[2] for test in tests} for line, tests in trace.lines[TIMES.file].items()}
+    assert runs[TIMES.line] == {"area", "square_is_positive", "small"}
+    assert runs[EQUAL.line] == {"count"}
+    # The second test finds what the first has left in the cache of the tests.
+    assert runs[change("[1, 2]", "[1, 3]").line] == {"first"}
+    assert names(trace, change("[1, 2]", "[1, 3]")) >= {"first", "second"}
     assert names(trace, MINUS) == set()
     # A constant of the module belongs to every test of the file.
     assert names(trace, change("SCALE = 2", "SCALE = 3")) == {
@@ -141,11 +150,86 @@ def test_the_tests_of_a_line_are_found_through_fixtures_and_caches(trace: Trace)
 
 
 def test_short_tests_come_first_and_time_is_limited() -> None:
-    trace = Trace({"a.py": {3: ["x", "y"], 4: ["z"]}}, {"x": 2.0, "y": 0.5, "z": 1.0}, 1.5)
-    assert trace.tests_of("a.py", [3, 4, 5]) == ["y", "z", "x"]
+    trace = Trace({"a.py": {3: ["x", "y"], 4: ["z"]}}, {"x": 2.0, "y[2]": 0.5, "y[1]": 0.7, "z": 1.0}, 1.5)
+    assert trace.tests_of("a.py", [3, 4, 5]) == ["y[2]", "y[1]", "z", "x"]
     assert trace.tests_of("b.py", [3]) == []
-    assert trace.limit_s(["x", "y"]) == 4 * (1.5 + 2.5) + 10
-    assert [trace.shortest("xyz", seconds) for seconds in (0.1, 1.4, 1.5, 3.5)] == [["y"], ["y"], ["y", "z"], [*"yzx"]]
+    assert trace.limit_s(["x", "y[2]"]) == 4 * (1.5 + 2.5) + 10
+    tests = ["x", "y[2]", "z"]
+    found = [trace.shortest(tests, seconds) for seconds in (0.1, 1.4, 1.5, 3.5)]
+    assert found == [["y[2]"], ["y[2]"], ["y[2]", "z"], ["y[2]", "z", "x"]]
+    long = Trace({"a.py": {3: ["x", "y"]}}, {"x": 59.0, "y": 1.5}, 1.5)
+    assert long.tests_of("a.py", [3]) == ["y"]
+
+
+def test_tests_that_import_the_changed_file_come_first(tmp_path: Path) -> None:
+    texts = {
+        "toy/deep.py": "",
+        "toy/middle.py": "def f():\n    from toy import deep\n",
+        "tests/support/helper.py": "import toy.middle\n",
+        "tests/test_near.py": "from toy.deep import x\n",
+        "tests/test_far.py": "import helper\n",
+        "tests/test_apart.py": "import os\n",
+    }
+    for name, text in texts.items():
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text(text)
+    imports = Imports.read(tmp_path, ["toy", "tests"])
+    steps = [imports.steps("toy/deep.py", f"tests/test_{name}.py") for name in ("near", "far", "apart")]
+    assert steps == [1, 3, FAR]
+    near, far, apart = (f"tests/test_{name}.py::test_it" for name in ("near", "far", "apart"))
+    seconds = {apart: 0.1, far: 0.2, near: 3.0, f"{near}_too": 0.1, f"{far}_too": 0.1}
+    trace = Trace({"toy/deep.py": {1: [near, far, apart]}}, seconds, 1.0, imports=imports)
+    # Those that do not run the line come last: they may use what the others have kept.
+    assert trace.tests_of("toy/deep.py", [1]) == [near, far, apart, f"{near}_too", f"{far}_too"]
+
+
+def test_a_trace_is_kept_while_nothing_but_tests_changes(
+    copy: Copy, trace: Trace, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    traced: list[list[str]] = []
+    plain = Copy._trace
+    monkeypatch.setattr(
+        Copy, "_trace", lambda self, room, tests: traced.append(list(tests)) or plain(self, room, tests)
+    )
+    kept, more = tmp_path / "kept.json", copy.root / "tests" / "flat" / "test_more.py"
+    first = copy.trace("flat", kept)
+    assert (first.lines, first.seconds.keys()) == (trace.lines, trace.seconds.keys())
+    again = copy.trace("flat", kept)
+    assert (again.lines, again.seconds, again.modules) == (first.lines, first.seconds, first.modules)
+    assert traced == [["tests/flat"]]
+    more.write_text("from toy.flat.shapes import untested\n\n\ndef test_more():\n    assert untested(1)\n")
+    both = copy.trace("flat", kept)
+    assert traced.pop() == ["tests/flat/test_more.py"]
+    assert both.lines[MINUS.file][MINUS.line] == ["tests/flat/test_more.py::test_more"]
+    assert both.lines[TIMES.file][TIMES.line] == first.lines[TIMES.file][TIMES.line]
+    assert both.seconds.keys() - first.seconds.keys() == {"tests/flat/test_more.py::test_more"}
+    more.unlink()
+    left = copy.trace("flat", kept)
+    assert left.seconds == first.seconds and left.tests_of(MINUS.file, [MINUS.line]) == []
+    assert traced == [["tests/flat"]]
+    found = KeptTrace.read(kept)
+    assert found is not None
+    assert found.still_good(Digests("of another package", found.digests.tests)) == (None, [*found.digests.tests])
+
+
+def test_caches_are_emptied_though_they_are_frozen(tmp_path: Path) -> None:
+    gc.freeze()
+    try:
+        module = ModuleType("cached_toy")
+        module.__file__ = str(tmp_path / "cached_toy.py")
+        exec("from functools import cache\n@cache\ndef f(): return []\n", vars(module))
+        gc.freeze()
+        caches = Caches()
+        sys.modules["cached_toy"] = module
+        first = module.f()
+        caches.empty({tmp_path / "elsewhere"})
+        assert module.f() is first
+        caches.empty({tmp_path})
+        assert module.f() is not first
+        assert gc.get_freeze_count() > 0
+    finally:
+        sys.modules.pop("cached_toy", None)
+        gc.unfreeze()
 
 
 @pytest.mark.parametrize(
@@ -165,23 +249,23 @@ def test_a_change_is_noticed_or_not(copy: Copy, trace: Trace, changed: Change, o
 
 def test_a_change_that_never_ends_is_caught(copy: Copy, trace: Trace, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Trace, "limit_s", lambda self, tests: 3.0)
-    assert copy.try_change(change("n -= 1", "n += 1"), trace) == ("time", 1)
+    assert copy.try_change(change("n -= 1", "n += 1"), trace) == ("time", 6)
 
 
 def test_a_change_that_waits_for_ever_is_not_known(copy: Copy, trace: Trace, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(mutate_python, "TIMES_WALL", 0.0)
     monkeypatch.setattr(mutate_python, "AND_WALL_SECONDS", 1.0)
-    assert copy.try_change(change("n -= 1", "__import__('time').sleep(60.0)"), trace) == ("late", 1)
+    assert copy.try_change(change("n -= 1", "__import__('time').sleep(60.0)"), trace) == ("late", 6)
 
 
 def test_a_change_that_ends_the_process_is_caught(copy: Copy, trace: Trace) -> None:
-    assert copy.try_change(change("n -= 1", "__import__('os').abort()"), trace) == ("crash", 1)
+    assert copy.try_change(change("n -= 1", "__import__('os').abort()"), trace) == ("crash", 6)
 
 
 def test_later_tests_are_tried_when_the_first_pass(copy: Copy, trace: Trace, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(mutate_python, "FIRST_TESTS", 1)
-    assert copy.try_change(change("width * height", "width + height"), trace) == ("caught", 3)
-    assert copy.try_change(TIMES, trace) == ("survived", 3)
+    assert copy.try_change(change("width * height", "width + height"), trace) == ("caught", 6)
+    assert copy.try_change(TIMES, trace) == ("survived", 6)
 
 
 def test_the_process_that_forks_has_imported_what_lies_outside(copy: Copy, trace: Trace, tmp_path: Path) -> None:
@@ -208,7 +292,7 @@ def test_rows_are_kept_and_equivalent_changes_are_named(
     copy: Copy, trace: Trace, project: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     tried: list[Change] = []
-    monkeypatch.setattr(Copy, "trace", lambda self, room: trace)
+    monkeypatch.setattr(Copy, "trace", lambda self, room, kept: trace)
     monkeypatch.setattr(Copy, "try_change", lambda self, one, trace: tried.append(one) or ("caught", 1))
     same = [Equivalent(EQUAL.file, EQUAL.before, EQUAL.after, "n never falls below 0")]
     first = list(try_room(copy, "flat", [TIMES, EQUAL, MINUS], equivalents=same))
@@ -271,6 +355,30 @@ def test_changes_are_chosen_by_the_seed() -> None:
     assert any(choose_changes({"a.py": text}, 3, str(seed)) != one for seed in range(5))
 
 
+def test_an_edit_draws_no_other_changes_elsewhere() -> None:
+    pytest.importorskip("cosmic_ray", reason="it is in the extra mutation")
+    text = "\n\n".join(f"def f{n}(x):\n    y = 2 * x + {n}\n    return y < 1 or y > 5" for n in range(8)) + "\n"
+    edited = "import math\n\n" + text.replace("2 * x + 3", "math.exp(x) - 3")
+
+    def chosen(texts: dict[str, str], count: int) -> list[tuple[str, str, str]]:
+        return [(one.file, one.before, one.after) for one in choose_changes(texts, count, "1")]
+
+    texts = {"a.py": text, "b.py": text}
+    before, after = chosen(texts, 999), chosen({**texts, "a.py": edited}, 999)
+    kept = [row for row in before if row[:2] != ("a.py", "y = 2 * x + 3")]
+    assert [row for row in after if row[:2] != ("a.py", "y = math.exp(x) - 3")] == kept
+    assert len(before) - len(kept) == 4
+    # Equal lines of two functions, and equal places of a line, are told apart.
+    assert before[:20] == chosen(texts, 20)
+    same = chosen({"a.py": "def f(x):\n    return x + x + x + x + x + x + x\n\n\ndef g(x):\n    return x + x + x\n"}, 9)
+    assert len(same) == 8 and len(set(same)) > 5
+
+
+def test_the_definition_around_a_line_is_named() -> None:
+    text = "a = 1\nclass A:\n    b = 2\n    def f(self):\n        def g():\n            return 3\n        return 4\n"
+    assert definition_names(text) == {2: "A", 3: "A", 4: "A.f", 5: "A.f.g", 6: "A.f.g", 7: "A.f"}
+
+
 def test_a_change_says_its_lines() -> None:
     pytest.importorskip("cosmic_ray", reason="it is in the extra mutation")
     text = "a = [\n    1,\n    x <= 2,\n]\n"
@@ -278,3 +386,4 @@ def test_a_change_says_its_lines() -> None:
     found = {(one.line, one.before, one.after) for one in changes if one}
     assert {(3, "x <= 2,", "x < 2,"), (2, "1,", "2,"), (2, "1,", "0,"), (3, "x <= 2,", "x <= 3,")} <= found
     assert choose_changes({"a.py": "@dataclass(frozen=True)\nclass A:\n    pass\n"}, 9, "1") == []
+    assert choose_changes({"a.py": "def f(\n    a,\n    *,\n    b,\n):\n    pass\n"}, 9, "1") == []
