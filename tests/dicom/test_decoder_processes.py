@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import io
+import json
 import os
+import signal
+import struct
 import subprocess
 import sys
 import threading
 import time
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from clrecon.dicom.pixels import decoder_pool
+from clrecon.dicom.pixels import decoder_pool, decoder_process
 from clrecon.dicom.pixels.decoder_pool import DecoderError, DecoderPool
 
 PIXELS = np.arange(12 * 9, dtype=np.int16).reshape(12, 9)
@@ -257,3 +262,60 @@ def test_processes_end_with_a_parent_that_is_killed(name):
 def test_the_process_imports_neither_clrecon_nor_pydicom():
     code = Path(decoder_pool.SCRIPT).read_text(encoding="utf-8")
     assert "import clrecon" not in code and "from clrecon" not in code and "pydicom import" not in code
+
+
+@LINUX
+def test_the_lifeline_tells_this_process_when_its_other_end_closes():
+    """The steps of the process, taken in this one, which is told by the same signal and does not end."""
+    import fcntl
+
+    told = []
+    before = signal.signal(signal.SIGIO, lambda number, frame: told.append(number))
+    ours, theirs = os.pipe()
+    try:
+        fcntl.fcntl(ours, fcntl.F_SETFL, fcntl.fcntl(ours, fcntl.F_GETFL) | os.O_NONBLOCK)
+        decoder_process.end_with(ours)
+        assert fcntl.fcntl(ours, fcntl.F_GETFL) & os.O_ASYNC and not os.get_blocking(ours)
+        assert fcntl.fcntl(ours, fcntl.F_GETOWN) == os.getpid() and not told
+        os.close(theirs)
+        assert told == [signal.SIGIO]
+        with monkeypatch_exit() as codes:
+            decoder_process.end_with(ours)
+        assert codes == [1]  # it had ended before we asked
+    finally:
+        os.close(ours)
+        signal.signal(signal.SIGIO, before)
+
+
+@contextmanager
+def monkeypatch_exit():
+    codes: list[int] = []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(os, "_exit", codes.append)
+        yield codes
+
+
+@pytest.mark.parametrize(("lifeline", "is_orphan"), [(-1, True), (0, False), (3, False)])
+def test_only_a_process_without_a_lifeline_needs_the_alarm(monkeypatch, lifeline, is_orphan):
+    """The main function in this process, with what changes the process itself put aside."""
+    settings = {"path": sys.path, "decoders": ["hostile_decoders:copy"], "memory_bytes": 1, "seconds": 4.0}
+    request = {"decoder": "hostile_decoders:copy", "dtype": "<i2", "rows": 12, "columns": 9, "length": PIXELS.nbytes}
+    lines = f"{json.dumps(settings)}\n{json.dumps(request)}\n".encode()
+    source, sink = io.BytesIO(lines + PIXELS.tobytes()), io.BytesIO()
+    limits: list[object] = []
+    alarms: list[int] = []
+    for name, aside in {
+        "end_with": lambda number: None,
+        "take_standard_output": lambda: sink,
+        "limit_memory": lambda count: limits.append(count),
+        "limit_time": lambda *arguments: limits.append(arguments),
+    }.items():
+        monkeypatch.setattr(decoder_process, name, aside)
+    monkeypatch.setattr(signal, "signal", lambda *_: None)
+    monkeypatch.setattr(signal, "alarm", alarms.append)
+    monkeypatch.setattr(sys, "argv", ["decoder_process.py", str(lifeline)])
+    monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(source))
+    decoder_process.main()
+    assert limits == [1, (4.0, is_orphan)] and alarms == [0]
+    head = struct.pack(decoder_process.REPLY, decoder_process.READY, 0)
+    assert sink.getvalue() == head + struct.pack(decoder_process.REPLY, decoder_process.DONE, 216) + PIXELS.tobytes()

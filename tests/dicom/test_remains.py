@@ -10,7 +10,8 @@ import pytest
 from dicom_series import Plan, make_dataset, save_dataset, set_values, write_series
 
 from clrecon.dicom import list_series, read_volume
-from clrecon.dicom.series.remains import describe_start
+from clrecon.dicom.series.remains import UNKNOWN, Stranger, describe_start, find_remains
+from clrecon.dicom.series.scan import scan_path
 from clrecon.errors import RefusedInputError
 
 COUNT = 12
@@ -196,3 +197,22 @@ def test_what_lies_apart_is_a_warning(tmp_path):
 )
 def test_starts(start, what):
     assert describe_start(start) == what
+
+
+@pytest.mark.parametrize("size", [0, 1, 255, 256, 257])
+def test_broken_files_lend_their_names_and_not_their_size(tmp_path, size):
+    """Beside files of which no size is known nothing is as large as the slices; a name that counts on is a remain."""
+    near, alike = (str(tmp_path / name) for name in ("notes", "IM2"))
+    strangers = [Stranger(near, size, UNKNOWN), Stranger(alike, size, UNKNOWN)]
+    known = [(str(tmp_path / "IM1"), None)]
+    assert find_remains(strangers, known) == [(tmp_path / "IM2", "named like slices, but no DICOM")]
+    sized = find_remains(strangers[:1], [*known, (str(tmp_path / "IM3"), 256)])
+    assert sized == [(tmp_path / "notes", "as large as the slices beside it, but no DICOM")]
+
+
+def test_a_small_file_beside_a_broken_one_is_no_remain(tmp_path):
+    write_series(tmp_path, plan_with("IM0001"), set_values(only=COUNT - 1, Modality="C_T"))
+    (tmp_path / "notes").write_bytes(b"a\0b")
+    found = scan_path(tmp_path)
+    assert [image.kind for image in found.others] == ["broken"] and len(found.strangers) == 1
+    assert found.suspects == []

@@ -105,14 +105,14 @@ def describe_start(start: bytes) -> str:
     return UNKNOWN if b"\0" in start else TEXT
 
 
-def find_remains(strangers: Sequence[Stranger], slices: Iterable[tuple[str, int]]) -> list[tuple[Path, str]]:
+def find_remains(strangers: Sequence[Stranger], slices: Iterable[tuple[str, int | None]]) -> list[tuple[Path, str]]:
     """Find the files that may be remains of a slice.
 
     Parameters
     ----------
     strangers : sequence of Stranger
-    slices : iterable of (str, int)
-        Path and bytes of the files that hold CT slices.
+    slices : iterable of (str, int or None)
+        Path and bytes of the files that hold CT slices; None where they are no measure for others.
 
     Returns
     -------
@@ -127,7 +127,8 @@ def find_remains(strangers: Sequence[Stranger], slices: Iterable[tuple[str, int]
         folder, _, name = file.rpartition(os.sep)
         known = folders[folder]
         known.names.add(name)
-        known.sizes.append(size)
+        if size is not None:
+            known.sizes.append(size)
     for folder, known in folders.items():
         known.finish()
         paths.update(f"{_pattern(os.path.basename(folder))}/{pattern}" for pattern in known.patterns)

@@ -111,9 +111,9 @@ def scan_path(path: Path, progress: Progress | None = None, force: bool = False)
 
 
 def _suspect_strangers(scan: Scan) -> None:
-    slices = {str(header.file): header.file_bytes for header in scan.slices}
-    broken = {str(image.file): 0 for image in scan.others if image.kind == "broken"}
-    for path, reason in find_remains(scan.strangers, (slices | broken).items()):
+    slices: dict[str, int | None] = {str(header.file): header.file_bytes for header in scan.slices}
+    slices |= {str(image.file): None for image in scan.others if image.kind == "broken"}
+    for path, reason in find_remains(scan.strangers, slices.items()):
         scan.suspects.append(CorruptFile(path, reason))
 
 
