@@ -187,7 +187,8 @@ def plan_slabs(grid: SampleGrid, resident: DeviceVolume) -> int:
     most = None if gk <= most_mask_slices else most_mask_slices - 2
     slices = resident.plan(grid.kind, gk, needs, own=(BRICKS,), most=most)
     if slices == 0:
-        shortest = Slab(grid, max(0, min(2, gk - 1)), max(0, min(2, gk - 1)) + 1).needs()
+        first = min(2, gk - 1)
+        shortest = Slab(grid, first, first + 1).needs()
         raise (DeviceFailedError if limits.asked_bytes is None else DeviceError)(
             f"one slice with its neighbours needs {sum(shortest.values()):,} bytes, and room for its mesh:"
             f" {limits.describe()}; {'use another device' if limits.asked_bytes is None else 'allow more'}"

@@ -65,6 +65,20 @@ def test_a_field_of_every_kernel(device):
     check_equal(device, sphere_cloud(150, 2.5), lengths(0.9))
 
 
+def test_a_point_at_the_end_of_its_cell_reaches_the_first_nodes_of_a_brick(device):
+    """Cells begin 0.002 mm below the lowest point and are 2 mm long: the second point is 0.0003 mm below the next one.
+
+    Nodes begin 4.5 mm below the lowest point; along z a brick has four, and the third brick begins at 3.5 mm.
+    """
+    cloud = PointCloud([[0.0, 0.0, 0.0], [0.5, 0.5, 1.9977]], np.array([[0.0, 0.0, -1.0], [0.0, 0.0, 1.0]]))
+    settings = FieldSettings(1.0, reach=1.5025, smoothing=0.1, bridge=3.5)
+    check_equal(device, cloud, settings)
+    field = NodeField(device, cloud, cloud.normals, settings)
+    assert field.nodes.bricks == (2, 3, 3) and field.nodes.corner.tolist() == [-4.5, -4.5, -4.5]
+    near = fetch_masks(field.masks)[0]
+    assert np.argwhere(near[8:]).tolist() == [[0, 5, 5]]  # k, j, i: 1.5023 mm above the second point
+
+
 def test_points_in_one_place_are_gathered_in_turn(device):
     points = np.concatenate([np.full((600, 3), (0.3, 0.1, -0.2)), sphere_cloud(300, 3.0).points])
     normals = np.concatenate([np.tile((0.0, 0.6, 0.8), (600, 1)), sphere_cloud(300, 3.0).normals])

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+from typing import Any
+
 import numpy as np
 import pytest
 import tolerances
@@ -15,6 +18,9 @@ from raycast_scenes import (
 )
 from soft_function import SOFT
 
+from clrecon.geometry import Volume
+from clrecon.operators.rays import slabs
+from clrecon.operators.rays.slabs import BRICK_CELLS, plan_ray_slabs
 from clrecon.reference.rays.render import MODES
 from clrecon.rendering import Lighting
 
@@ -33,3 +39,30 @@ def test_slabs_give_the_picture_of_the_whole(device, mode, towards, even):
     assert np.abs(premultiplied(whole.image) - premultiplied(parts.image)).max() <= tolerances.RAY_SAME_255
     for name in ("depth", "expected_depth", "values"):
         assert np.allclose(getattr(whole, name), getattr(parts, name), atol=1e-3, rtol=1e-5, equal_nan=True)
+
+
+@pytest.mark.parametrize("lanes", ["1", "8"])
+@pytest.mark.parametrize(("most_slices", "most"), [(19, 19 - 5), (20, 20), (21, 21)])
+def test_a_slab_needs_its_slices_with_two_before_and_three_behind(monkeypatch, lanes, most_slices, most):
+    """The forecast and the bound of kernels with several lanes, by hand: 9 x 7 x 20 voxels of two bytes."""
+    ni, nj, nk = 9, 7, 20
+    monkeypatch.setattr(slabs, "MOST_VOXELS", ni * nj * most_slices + 1)
+    asked: dict[str, Any] = {}
+    resident = SimpleNamespace(
+        volume=Volume(np.zeros((nk, nj, ni), np.int16), np.eye(4)),
+        dtype=np.dtype(np.int16),
+        device=SimpleNamespace(kernel_variants={"LANES": lanes}),
+        plan=lambda purpose, slices, needs, **more: asked.update(more, slices=slices, needs=needs) or 3,
+    )
+    labels = SimpleNamespace(voxels=np.zeros(1, np.uint16))
+    assert plan_ray_slabs(resident, {"picture": 11}, {"rays": 13}, labels) == 3
+    assert asked["slices"] == nk and asked["most"] == (None if lanes == "1" else most)
+    bricks = -(-ni // BRICK_CELLS) * -(-nj // BRICK_CELLS)
+    for slices, held, rest in ((3, 8, {"rays": 13}), (19, 24, {"rays": 13}), (20, 20, {})):
+        assert asked["needs"](slices) == {
+            "volume": 2 * ni * nj * held,
+            "labels": 2 * ni * nj * held,
+            "bricks": 8 * bricks * -(-held // BRICK_CELLS),
+            "picture": 11,
+            **rest,
+        }

@@ -98,6 +98,21 @@ def test_a_budget_for_less_than_a_slice_is_refused_before_anything_is_allocated(
         extract_isosurface(smooth_volume((40, 60, 70)), 100, device=device, memory=10_000)
 
 
+@pytest.mark.parametrize("slices", [2, 3, 5])
+def test_a_refusal_says_the_bytes_of_one_slice_with_its_neighbours(device, slices):
+    """Of an open surface of 33 x 6 samples in a slice: a slice in the middle, or the last of two."""
+    volume = smooth_volume((slices, 6, 33))
+    read = {2: 2, 3: 2, 5: 4}[slices]  # one before, two behind, where there are so many
+    classified, counted = {2: (1, 1), 3: (1, 1), 5: (3, 2)}[slices]
+    words = 2 * 6
+    scratch = 4 * words * classified + 4 * words * counted + 4 * 6 * classified + 12 * 6 * counted + 4 * 6 * counted
+    needed = volume.voxels.itemsize * 6 * 33 * read + scratch + 4 * words
+    with pytest.raises(
+        DeviceError, match=f"^one slice with its neighbours needs {needed:,} bytes, and room for its mesh"
+    ):
+        extract_isosurface(volume, 100, device=device, memory=100, closed=False)
+
+
 @pytest.mark.parametrize("memory", [0, -1, 1.5, "2", True])
 def test_a_budget_is_a_number_of_bytes(device, memory):
     with pytest.raises(UsageError, match="whole number of bytes"):
