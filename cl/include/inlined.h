@@ -62,6 +62,15 @@ INLINED_FOR_WIDTHS(INLINED_ORDER_OF_NUMBERS, float)
 #define INLINED_SQRT_OF_float8 sqrt
 #endif
 #define INLINED_SQRT_OF_float16 sqrt
+#define INLINED_FMA_OF_float2 fma
+#define INLINED_FMA_OF_float3 fma
+#define INLINED_FMA_OF_float4 fma
+#ifdef __FMA__
+#define INLINED_FMA_OF_float8 __builtin_ia32_vfmaddps256
+#else
+#define INLINED_FMA_OF_float8 fma
+#endif
+#define INLINED_FMA_OF_float16 fma
 #define INLINED_OF_VECTORS(type, whole) \
     INLINED whole inlined_popcount(const whole bits) { return popcount(bits); } \
     INLINED whole inlined_isnan(const type a) { return isnan(a); } \
@@ -69,7 +78,7 @@ INLINED_FOR_WIDTHS(INLINED_ORDER_OF_NUMBERS, float)
     INLINED type inlined_sqrt(const type a) { return INLINED_SQRT_OF_##type(a); } \
     INLINED type inlined_floor(const type a) { return floor(a); } \
     INLINED type inlined_ceil(const type a) { return ceil(a); } \
-    INLINED type inlined_fma(const type a, const type b, const type c) { return fma(a, b, c); }
+    INLINED type inlined_fma(const type a, const type b, const type c) { return INLINED_FMA_OF_##type(a, b, c); }
 INLINED_OF_VECTORS(float2, int2)
 INLINED_OF_VECTORS(float3, int3)
 INLINED_OF_VECTORS(float4, int4)

@@ -14,6 +14,8 @@ typedef float8 floats;
 typedef int8 ints;
 #define to_floats convert_float8
 #define to_ints convert_int8
+#define as_floats as_float8
+#define as_ints as_int8
 #define load_lanes(pointer) vload8(0, pointer)
 #define store_lanes(vector, pointer) vstore8(vector, 0, pointer)
 #define LANE_NUMBERS ((floats)(0.0f, 1.0f, 2.0f, 3.0f, 4.0f, 5.0f, 6.0f, 7.0f))
@@ -48,6 +50,8 @@ typedef float floats;
 typedef int ints;
 #define to_floats convert_float
 #define to_ints convert_int
+#define as_floats as_float
+#define as_ints as_int
 #define load_lanes(pointer) (*(pointer))
 #define store_lanes(vector, pointer) (*(pointer) = (vector))
 #define LANE_NUMBERS 0.0f

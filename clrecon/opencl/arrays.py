@@ -51,8 +51,10 @@ def upload(device: Device, array: NDArray[Any]) -> Any:
     return _make_buffer(device, flags | cl.mem_flags.COPY_HOST_PTR, array.nbytes, array)
 
 
-def copy_buffer(device: Device, source_d: Any, target_d: Any, size: int, offset: int = 0) -> None:
-    """Copy the first `size` bytes of a buffer to another one on the same device, from byte `offset` of it on.
+def copy_buffer(
+    device: Device, source_d: Any, target_d: Any, size: int, offset: int = 0, source_offset: int = 0
+) -> None:
+    """Copy `size` bytes of a buffer, from byte `source_offset` on, to byte `offset` of another one on the same device.
 
     Raises
     ------
@@ -63,7 +65,7 @@ def copy_buffer(device: Device, source_d: Any, target_d: Any, size: int, offset:
     try:
         with device.lock:
             queue = device.queue
-            event = cl.enqueue_copy(queue, target_d, source_d, byte_count=size, dst_offset=offset)
+            event = cl.enqueue_copy(queue, target_d, source_d, byte_count=size, src_offset=source_offset, dst_offset=offset)
             device.commands.add(f"the copy of {size:,} bytes", event, queue, source_d, target_d)
     except cl.Error as error:
         raise device.fail("copying failed", error) from error

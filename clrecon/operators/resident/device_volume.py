@@ -125,6 +125,23 @@ class DeviceVolume(Closing):
         """Refuse to be pickled or copied: buffers stay with their process."""
         raise TypeError("a DeviceVolume belongs to its process: send its volume, and make one there")
 
+    def follow(self, volume: Volume, voxels_d: Any = None) -> DeviceVolume:
+        """Return another volume on the same device, under the same limit of memory.
+
+        Parameters
+        ----------
+        volume : Volume
+            Made of this one, as by a filter.
+        voxels_d : buffer, optional
+            Its voxels on the device, (nk, nj, ni): the next operator finds them there.  None: they are uploaded when
+            they are first needed.
+        """
+        made = DeviceVolume(volume, device=self._taken_device, memory=self.memory)
+        made.device = self.device
+        if voxels_d is not None:
+            made._context, made._whole_d = self.device.context, voxels_d
+        return made
+
     @property
     def dtype(self) -> np.dtype[Any]:
         """Type of the voxels."""

@@ -1,0 +1,97 @@
+"""The noise of a scan, measured in soft tissue."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clrecon.errors import UsageError
+from clrecon.geometry import Volume
+
+__all__ = ["Noise", "measure_noise"]
+
+SOFT_TISSUE_HU = (-150.0, 250.0)
+"""All voxels of a block lie here: fat, muscle and organs with noise of up to some 60 HU, no air and no dense bone."""
+
+BLOCK = 6
+"""Voxels along each side of a block within a slice."""
+
+MOST_SLICES = 24
+"""Slices that are looked at, evenly over the volume."""
+
+FEWEST_BLOCKS = 50
+
+QUARTILE_OF_NOISE = 0.9149
+"""First quartile of the standard deviation of 36 normal numbers without their plane (33 degrees of freedom), over the
+standard deviation of the numbers: sqrt(27.62 / 33), with 27.62 the first quartile of chi squared."""
+
+
+@dataclass(frozen=True)
+class Noise:
+    """What `measure_noise` found.
+
+    Attributes
+    ----------
+    hu : float
+        Standard deviation.
+    blocks : int
+        Blocks of soft tissue that it was measured in.
+    slices : int
+        Slices that were looked at.
+    """
+
+    hu: float
+    blocks: int
+    slices: int
+
+
+def measure_noise(volume: Volume) -> Noise:
+    """Measure the noise of a scan: the standard deviation of HU within soft tissue.
+
+    Blocks of 6 x 6 voxels in a slice, all within -150 to 250 HU, lose their mean and their slopes; what is left has a
+    standard deviation each.  Edges and textures make it larger, so that the first quartile over all blocks stands for
+    those without, divided by what the first quartile is for noise alone.  It holds where a quarter of the blocks and
+    more are even, as in muscle and fat.
+
+    Parameters
+    ----------
+    volume : Volume
+
+    Returns
+    -------
+    Noise
+
+    Raises
+    ------
+    UsageError
+        There are fewer than 50 blocks of soft tissue.
+    """
+    nk = volume.shape_ijk[2]
+    ks = np.unique(np.linspace(0, nk - 1, min(nk, MOST_SLICES)).round().astype(int)).tolist()
+    found = [_block_deviations(volume.voxels[k]) for k in ks]
+    deviations = np.concatenate(found)
+    if len(deviations) < FEWEST_BLOCKS:
+        low, high = SOFT_TISSUE_HU
+        raise UsageError(
+            f"the noise cannot be measured: {len(deviations)} blocks of {BLOCK} x {BLOCK} voxels in {len(ks)} slices"
+            f" lie from {low:g} to {high:g} HU as soft tissue does, at least {FEWEST_BLOCKS} are needed"
+        )
+    return Noise(float(np.percentile(deviations, 25.0)) / QUARTILE_OF_NOISE, len(deviations), len(ks))
+
+
+def _block_deviations(layer: NDArray[Any]) -> NDArray[np.float64]:
+    """Return the standard deviations of the blocks of soft tissue of a slice, without their planes."""
+    nj, ni = (BLOCK * (n // BLOCK) for n in layer.shape)
+    blocks = layer[:nj, :ni].reshape(nj // BLOCK, BLOCK, ni // BLOCK, BLOCK).swapaxes(1, 2).reshape(-1, BLOCK, BLOCK)
+    low, high = SOFT_TISSUE_HU
+    soft = blocks[((blocks >= low) & (blocks <= high)).all(axis=(1, 2))].astype(np.float64)
+    soft -= soft.mean(axis=(1, 2), keepdims=True)
+    steps = np.arange(BLOCK) - (BLOCK - 1) / 2.0
+    square = BLOCK * float(steps @ steps)
+    along_i, along_j = np.einsum("nji,i->n", soft, steps) / square, np.einsum("nji,j->n", soft, steps) / square
+    left = np.einsum("nji,nji->n", soft, soft) - square * (along_i**2 + along_j**2)
+    deviations: NDArray[np.float64] = np.sqrt(np.maximum(left, 0.0) / (BLOCK * BLOCK - 3))
+    return deviations

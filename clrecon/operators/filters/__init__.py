@@ -1,0 +1,1 @@
+"""Filters of volumes: HU in, HU out, at the same places."""

@@ -1,0 +1,331 @@
+"""The bilateral filter of volumes: the host's side of cl/filters/bilateral.cl."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import DTypeLike, NDArray
+
+from clrecon.errors import DeviceError, DeviceFailedError
+from clrecon.geometry import Volume
+from clrecon.opencl import (
+    Device,
+    Program,
+    Stopwatch,
+    allocate,
+    copy_buffer,
+    download,
+    empty_output,
+    kernel_constant,
+    launch,
+    load_program,
+    upload,
+    wait,
+)
+from clrecon.operators.filters.near_level import (
+    SlicesThere,
+    list_mixed_groups,
+    mixed_group_bytes,
+    prepare_near_level,
+    row_words,
+)
+from clrecon.operators.filters.result import finish_result
+from clrecon.operators.filters.settings import BilateralSettings, inside_level
+from clrecon.operators.resident.device_volume import DeviceVolume, take_volume
+from clrecon.operators.resident.voxel_types import voxel_variants
+from clrecon.system.progress import Progress, ignore_progress
+
+__all__ = ["Filtered", "filter_bilateral", "prepare_bilateral", "run_bilateral"]
+
+VolumeKind = TypeVar("VolumeKind", Volume, DeviceVolume)
+
+GROUP = kernel_constant("filters/bilateral.cl", "GROUP")
+"""Voxels of a group."""
+
+BILATERAL = "bilateral filter"
+"""Purpose by which slabs are planned."""
+
+TAPS_A_LAUNCH = 1 << 32
+"""Taps of all voxels of a launch: about a second of work, after which progress is told."""
+
+
+def prepare_bilateral(device: Device, dtype: DTypeLike = np.int16) -> Program:
+    """Build the kernels for volumes of `dtype`.
+
+    Raises
+    ------
+    DeviceError
+        The driver's compiler refuses.
+    """
+    variants = {**voxel_variants(dtype), "LANES": device.kernel_variants["LANES"]}
+    return load_program(device, "filters/bilateral.cl", variants)
+
+
+def filter_bilateral(
+    volume: VolumeKind,
+    *,
+    sigma_mm: float | None = None,
+    sigma_hu: float | None = None,
+    dimensions: int = 3,
+    near: float | None = None,
+    normals: bool = False,
+    taps: int | None = None,
+    device: Device | str | int | None = None,
+    memory: int | None = None,
+    progress: Progress | None = None,
+) -> VolumeKind:
+    """Filter a volume by distance and difference: noise goes, edges of more than some `sigma_hu` stay (Tomasi and
+    Manduchi 1998).
+
+    Each voxel becomes the mean of its neighbours with the weights ``exp(-|t|^2 / (2 sigma_mm^2) - d^2 / (2
+    sigma_hu^2))``, |t| the distance in mm and d the difference in HU.  Distances are those of the voxels' places, in
+    anisotropic, sheared and uneven volumes too.  Beyond the border lies the value of the nearest voxel.  NaN and
+    infinite voxels of floats stay as they are, and count nowhere.
+
+    The window is the box around the ball of 2.5 sigma_mm.  Of one with more than `taps` voxels the nearest stay, in
+    whole rings of equal distance.
+
+    It removes specks and smooths plateaus.  It does not make the surface more accurate: see docs/filters.md.
+
+    Parameters
+    ----------
+    volume : Volume or DeviceVolume
+        A `DeviceVolume` is filtered on its device, and the result stays there.
+    sigma_mm : float, optional
+        Default: one voxel, the geometric mean of its sides.
+    sigma_hu : float, optional
+        Default: three times the noise, see `clrecon.measure_noise`.
+    dimensions : {3, 2}
+        2: slice by slice.
+    near : float, optional
+        An iso value: only voxels near its surface are filtered, in a fraction of the time.  Each voxel is on the same
+        side of it as after the whole filter, and the positions of the surface are the same bit for bit.  All else stays
+        as it was.
+    normals : bool
+        With `near`: the voxels that decide the normals at the vertices are filtered too.
+    taps : int, optional
+        Most voxels of a window, 2 to 4,096; default 125, in 2 dimensions 29.  In slices with square pixels 13 are
+        OpenCV's disc of diameter 5.
+    device : Device, str or int, optional
+        See `clrecon.device`; None is the best of the machine.  A `DeviceVolume` has its own.
+    memory : int, optional
+        Most bytes taken on the device; None is all that it has.
+    progress : callable, optional
+        Called as ``progress("filter", slices done, all slices)``.
+
+    Returns
+    -------
+    Volume or DeviceVolume
+        As it was given; in the type of the voxels, whole numbers rounded.  ``report["filtered"]["steps"]`` has an entry
+        for each filter: ``filter``, ``dimensions``, ``sigma_mm``, ``sigma_hu``, ``noise_hu`` where it was measured,
+        ``taps``, ``window`` (voxels along i, j, k), ``whole_window_taps`` and ``window_share`` (of the weight of the
+        whole window), ``near_hu``, ``rings``, ``filtered_share`` (of all voxels) and ``slabs``.  A certificate stays
+        one.
+
+    Raises
+    ------
+    UsageError
+        A sigma is not above 0 or not finite, or longer than the volume; `taps` leave no neighbour; there is no soft
+        tissue to measure the noise in; integers beyond 2^24.
+    NoSurfaceError
+        The type of the voxels has no value at `near`.
+    DeviceError
+        No device, no room for three slices, or the device fails.
+    """
+    resident, is_new = take_volume(volume, device, memory, "a filter")
+    try:
+        settings = BilateralSettings.checked(resident.volume, sigma_mm, sigma_hu, dimensions, near, normals, taps)
+
+        def work(told: list[str]) -> Any:
+            found = run_bilateral(resident, settings, progress=progress)
+            facts = {**settings.as_report(), "filtered_share": round(found.share, 6), "slabs": found.slabs}
+            warnings = [*told, *settings.warnings, *found.warnings]
+            return finish_result(resident, found.voxels, found.voxels_d, facts, warnings, keep=not is_new)
+
+        made: VolumeKind = resident.attempt(work)
+        return made
+    finally:
+        if is_new:
+            resident.close()
+
+
+@dataclass(frozen=True)
+class Filtered:
+    """What a run of the filter made.
+
+    Attributes
+    ----------
+    voxels : ndarray, shape (nk, nj, ni)
+    voxels_d : buffer or None
+        The same on the device, where they fit as a whole.
+    share : float
+        Share of the voxels that were filtered.
+    slabs : int
+    warnings : tuple of str
+    """
+
+    voxels: NDArray[Any]
+    voxels_d: Any
+    share: float
+    slabs: int
+    warnings: tuple[str, ...]
+
+
+def run_bilateral(
+    resident: DeviceVolume,
+    settings: BilateralSettings,
+    *,
+    stopwatch: Stopwatch | None = None,
+    progress: Progress | None = None,
+) -> Filtered:
+    """Filter the voxels of a volume, slab by slab where they do not fit the device as a whole.
+
+    Raises
+    ------
+    DeviceError
+        Not even a slab of one slice fits, or the device fails.
+    """
+    run = _Run(resident, settings, stopwatch or Stopwatch(), progress or ignore_progress)
+    nk = resident.volume.shape_ijk[2]
+    slices = resident.plan(BILATERAL, nk, run.needs)
+    if slices == 0:
+        limits = resident.limits
+        raise (DeviceFailedError if limits.asked_bytes is None else DeviceError)(
+            f"a slice with the {2 * run.halo} slices around it needs {sum(run.needs(1).values()):,} bytes:"
+            f" {limits.describe()}; {'use another device' if limits.asked_bytes is None else 'allow more'}"
+        )
+    return resident.halve(BILATERAL, slices, run.run, warnings=run.warnings)
+
+
+class _Run:
+    """One filtering, whatever the number of slices in a slab."""
+
+    def __init__(self, resident: DeviceVolume, settings: BilateralSettings, stopwatch: Stopwatch, progress: Progress):
+        self.resident, self.settings, self.stopwatch, self.progress = resident, settings, stopwatch, progress
+        self.warnings: list[str] = []
+        ni, self.nj, self.nk = resident.volume.shape_ijk
+        self.ni, self.dtype = ni, resident.dtype
+        reach = settings.window.reach
+        self.reach = reach[0]
+        rings = 0 if settings.near is None else settings.rings
+        # A window without neighbours along an axis says nothing of them: the box has them all the same.
+        self.box = tuple(min(max(n, 1) + rings, GROUP) for n in reach)
+        self.halo = reach[2] if settings.near is None else self.box[2]
+        self.row_groups = -(-ni // GROUP)
+        inner, inner_end = -(-self.reach // GROUP), (ni - self.reach) // GROUP
+        self.inner, self.inner_end = (inner, inner_end) if inner < inner_end else (0, 0)
+        self.strips = self.row_groups - (self.inner_end - self.inner)
+
+    def needs(self, slices: int) -> dict[str, int]:
+        """Return the bytes on the device for a slab of so many slices."""
+        there = self.nk if slices == self.nk else min(slices + 2 * self.halo, self.nk)
+        window = self.settings.window
+        strip = (GROUP + 2 * self.reach) * self.dtype.itemsize
+        needs = {
+            "volume": there * self.resident.slice_bytes,
+            "filtered voxels": slices * self.resident.slice_bytes,
+            "ends of the rows": there * self.nj * self.strips * strip,
+            "window": 4 * window.exponents.size + 16 * window.taps,
+        }
+        if self.settings.near is not None:
+            needs["groups near the level"] = mixed_group_bytes(self.ni, there * self.nj, slices * self.nj)
+        return needs
+
+    def run(self, slices: int) -> Filtered:
+        """Filter with so many slices in a slab."""
+        device, stopwatch = self.resident.device, self.stopwatch
+        with stopwatch.timed("build"):
+            self.program = prepare_bilateral(device, self.dtype)
+            if self.settings.near is not None:
+                prepare_near_level(device, self.dtype)
+        window = self.settings.window
+        self.tap_rows = window.rows()
+        self.tap_rows_d = upload(device, self.tap_rows)
+        self.spatial_d = upload(device, np.maximum(window.exponents, -1000.0).astype(np.float32))
+        self.progress("filter", 0, self.nk)
+        shape = (self.nk, self.nj, self.ni)
+        if slices == self.nk:
+            voxels_d = self.resident.whole(stopwatch)
+            filtered, filtered_d = empty_output(device, shape, self.dtype)
+            groups = self._filter(SlicesThere(voxels_d, self.ni, self.nj, 0, self.nk, 0, self.nk), filtered_d)
+            with stopwatch.timed("download"):
+                filtered = download(device, filtered, filtered_d)
+            return Filtered(filtered, filtered_d, self._share(groups), 1, tuple(self.warnings))
+        filtered, groups = np.empty(shape, self.dtype), 0
+        for first in range(0, self.nk, slices):
+            end = min(first + slices, self.nk)
+            there_first, there_end = max(0, first - self.halo), min(end + self.halo, self.nk)
+            voxels_d = self.resident.part(there_first, there_end, stopwatch)
+            part, part_d = empty_output(device, (end - first, self.nj, self.ni), self.dtype)
+            there = SlicesThere(
+                voxels_d, self.ni, self.nj, there_first, there_end - there_first, first, end - first
+            )  # fmt: skip
+            groups += self._filter(there, part_d)
+            with stopwatch.timed("download"):
+                filtered[first:end] = download(device, part, part_d)
+            self.resident.volume.release_slices(there_first, end)
+        return Filtered(filtered, None, self._share(groups), -(-self.nk // slices), tuple(self.warnings))
+
+    def _share(self, groups: int) -> float:
+        return groups / (self.row_groups * self.nj * self.nk)
+
+    def _filter(self, there: SlicesThere, filtered_d: Any) -> int:
+        """Filter the slices that are worked on; return the number of groups that were filtered."""
+        device, stopwatch = self.resident.device, self.stopwatch
+        width = GROUP + 2 * self.reach
+        ends_d = allocate(device, there.rows * self.strips * width * self.dtype.itemsize)
+        sides = {"strips": max(self.strips, 1), "inner": self.inner, "inner_end": self.inner_end, "reach": self.reach}
+        with stopwatch.running(device):
+            if self.strips:
+                launch(
+                    device, self.program["copy_row_ends"], there.rows * self.strips, stopwatch=stopwatch,
+                    voxels=there.voxels_d, ends=ends_d, ni=self.ni, rows=there.rows, **sides,
+                )  # fmt: skip
+            near = self.settings.near
+            if near is None:
+                groups, per_row, groups_d = self.row_groups * there.core_rows, self.row_groups, None
+            else:
+                size = there.core_count * self.resident.slice_bytes
+                offset = (there.core_first - there.first) * self.resident.slice_bytes
+                copy_buffer(device, there.voxels_d, filtered_d, size, source_offset=offset)
+                level = inside_level(self.dtype, near)
+                box = (self.box[0], self.box[1], self.box[2])
+                found = list_mixed_groups(device, there, self.dtype, level, box, stopwatch=stopwatch)
+                groups, per_row, groups_d = found.count, 32 * row_words(self.ni), found.positions_d
+            self._launch(there, filtered_d, ends_d, groups, per_row, groups_d, sides)
+        return groups
+
+    def _launch(
+        self,
+        there: SlicesThere,
+        filtered_d: Any,
+        ends_d: Any,
+        groups: int,
+        per_row: int,
+        groups_d: Any,
+        sides: dict[str, int],
+    ) -> None:
+        """Filter all groups, or those of a list, in launches of about a second."""
+        device, window = self.resident.device, self.settings.window
+        range_factor = -1.0 / (2.0 * math.log(2.0) * self.settings.sigma_hu**2)
+        items = 1 if device.kernel_variants["LANES"] == "8" else GROUP
+        slice_groups = self.row_groups * there.nj
+        most = max(TAPS_A_LAUNCH // (GROUP * window.taps * slice_groups), 1) * slice_groups
+        for first in range(0, groups, most):
+            count = min(most, groups - first)
+            launch(
+                device, self.program["filter_bilateral"], count * items, stopwatch=self.stopwatch,
+                voxels=there.voxels_d, ends=ends_d, tap_rows=self.tap_rows_d, spatial=self.spatial_d,
+                groups=self.tap_rows_d if groups_d is None else groups_d, filtered=filtered_d, range=range_factor,
+                is_listed=groups_d is not None, first_entry=first, group_count=first + count, row_groups=per_row,
+                ni=self.ni, nj=there.nj, nk=self.nk, first_k=there.first, core_k=there.core_first,
+                row_count=len(self.tap_rows), table_taps=window.taps if len(window.exponents) > 1 else 0, **sides,
+            )  # fmt: skip
+            if groups_d is None:
+                wait(device)
+                self.progress("filter", there.core_first + (first + count) // slice_groups, self.nk)
+        if groups_d is not None:
+            self.progress("filter", there.core_first + there.core_count, self.nk)

@@ -1,0 +1,1 @@
+"""Twins of `clrecon.operators.filters`."""
