@@ -3,6 +3,8 @@
 from clrecon.anatomy.body import mask_field_of_view as mask_field_of_view
 from clrecon.anatomy.body import remove_table as remove_table
 from clrecon.anatomy.iso_choice import choose_iso_value as choose_iso_value
+from clrecon.anatomy.noise import Noise as Noise
+from clrecon.anatomy.noise import measure_noise as measure_noise
 from clrecon.anatomy.spine_line import find_spine_line as find_spine_line
 from clrecon.errors import Cancelled as Cancelled
 from clrecon.errors import ClreconError as ClreconError
@@ -22,6 +24,8 @@ from clrecon.mesh.refine.quadric import collapse_quadric as collapse_quadric
 from clrecon.mesh.refine.smoothing import smooth_mesh as smooth_mesh
 from clrecon.opencl import list_devices
 from clrecon.operators import choose_device
+from clrecon.operators.filters.bilateral import filter_bilateral as filter_bilateral
+from clrecon.operators.filters.denoisers import filter_volume as filter_volume
 from clrecon.operators.masks.mask import Mask as Mask
 from clrecon.operators.points.bilateral import denoise_points as denoise_points
 from clrecon.operators.points.clusters import Clustering as Clustering

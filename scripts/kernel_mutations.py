@@ -70,6 +70,24 @@ INVERSIONS: dict[str, dict[str, tuple[tuple[str, str], ...]]] = {
     "number_components": {
         "numbers": (("numbers[vertex] = label == UNUSED ? -1 :", "numbers[vertex] = label == UNUSED ? 1 : -"),)
     },
+    "copy_row_ends": {"ends": (("to[i] = from[clamp(", "to[i] = (VOXEL)-from[clamp("),)},
+    "filter_bilateral": {
+        "filtered": (
+            (
+                "choose(change < 0.0f, (floats)(-0.5f), (floats)(0.5f))",
+                "choose(change < 0.0f, (floats)(0.5f), (floats)(-2.5f))",
+            ),
+        )
+    },
+    "classify_groups": {
+        "some": (("some_bits |= (uint)(is_in != 0)", "some_bits |= (uint)(is_in == 0)"),),
+        "all": (("all_bits |= (uint)(is_out == 0)", "all_bits |= (uint)(is_out != 0)"),),
+    },
+    "spread_groups": {
+        "some_near": (("some_near[word] = some_bits;", "some_near[word] = ~some_bits;"),),
+        "all_near": (("all_near[word] = all_bits;", "all_near[word] = ~all_bits;"),),
+    },
+    "mark_mixed_groups": {"mask": (("mask[word] = some_bits & ~all_bits;", "mask[word] = ~(some_bits & ~all_bits);"),)},
     "measure_bricks": {
         "ranges": (
             ("range[0] = min(", "range[0] = (VOXEL)-min("),

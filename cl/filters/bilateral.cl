@@ -30,7 +30,7 @@
 #define LEAST_EXPONENT -120.0f /* weights below are 0 but for rounding, and those of floats are 0 */
 #define TO_WHOLE 12582912.0f /* 1.5 * 2^23: what is added to a small number loses its fraction */
 
-#if LANES == 8 && !defined(__FMA__) && !defined(__ARM_FEATURE_FMA)
+#if LANES == 8 && defined(__SSE__) && !defined(__FMA__)
 #define fused(a, b, c) ((a) * (b) + (c)) /* there fma() is a long function */
 #else
 #define fused(a, b, c) fma(a, b, c)

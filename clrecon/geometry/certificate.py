@@ -72,8 +72,8 @@ class Certificate(Record):
     warnings, problems : list of str
         Doubts, and reasons to refuse.
     masked : mapping
-        Facts about parts that were turned into air after reading, by step (``remove_table``, ``field_of_view``,
-        ``outside_air``); each step is an entry of its own.
+        Facts about what was done after reading: parts that were turned into air (``remove_table``, ``field_of_view``,
+        ``outside_air``) and filters (``filtered``); each is an entry of its own.
     """
 
     format: str

@@ -65,7 +65,9 @@ def copy_buffer(
     try:
         with device.lock:
             queue = device.queue
-            event = cl.enqueue_copy(queue, target_d, source_d, byte_count=size, src_offset=source_offset, dst_offset=offset)
+            event = cl.enqueue_copy(
+                queue, target_d, source_d, byte_count=size, src_offset=source_offset, dst_offset=offset
+            )
             device.commands.add(f"the copy of {size:,} bytes", event, queue, source_d, target_d)
     except cl.Error as error:
         raise device.fail("copying failed", error) from error

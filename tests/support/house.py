@@ -108,7 +108,7 @@ INSIDE_FUNCTIONS: dict[str, frozenset[str]] = {
     "rendering": frozenset({"scipy", "PIL", "imageio_ffmpeg", "pyvista", "vtk", "vtkmodules"}),
     "phantom": frozenset({"scipy"}),
     "opencl": frozenset({"pyopencl"}),
-    "operators": frozenset({"pyopencl"}),
+    "operators": frozenset({"pyopencl", "SimpleITK", "skimage"}),
     "jobs": frozenset({"pyvista", "skimage", "vtkmodules"}),  # vtkmodules: flying edges, the peer of the bench
     "viewer": frozenset({"pyvista", "vtk", "vtkmodules"}),
     "cli": frozenset({"rich"}),

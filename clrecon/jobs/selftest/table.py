@@ -5,6 +5,7 @@ from __future__ import annotations
 from clrecon.jobs.selftest import (
     clusters,
     fields,
+    filters,
     free_clusters,
     labels,
     masks,
@@ -30,6 +31,7 @@ CHECKS: tuple[Check, ...] = (
     *rays.CHECKS,
     *pictures.CHECKS,
     *reformat.CHECKS,
+    *filters.CHECKS,
     *points.CHECKS,
     *clusters.CHECKS,
     *masks.CHECKS,

@@ -138,18 +138,20 @@ def filter_bilateral(
     resident, is_new = take_volume(volume, device, memory, "a filter")
     try:
         settings = BilateralSettings.checked(resident.volume, sigma_mm, sigma_hu, dimensions, near, normals, taps)
-
-        def work(told: list[str]) -> Any:
-            found = run_bilateral(resident, settings, progress=progress)
-            facts = {**settings.as_report(), "filtered_share": round(found.share, 6), "slabs": found.slabs}
-            warnings = [*told, *settings.warnings, *found.warnings]
-            return finish_result(resident, found.voxels, found.voxels_d, facts, warnings, keep=not is_new)
-
-        made: VolumeKind = resident.attempt(work)
-        return made
+        made: Any = resident.attempt(lambda told: _filter(resident, settings, told, progress, keep=not is_new))
+        return made  # type: ignore[no-any-return]
     finally:
         if is_new:
             resident.close()
+
+
+def _filter(
+    resident: DeviceVolume, settings: BilateralSettings, told: list[str], progress: Progress | None, *, keep: bool
+) -> Volume | DeviceVolume:
+    found = run_bilateral(resident, settings, progress=progress)
+    facts = {**settings.as_report(), "filtered_share": round(found.share, 6), "slabs": found.slabs}
+    warnings = [*told, *settings.warnings, *found.warnings]
+    return finish_result(resident, found.voxels, found.voxels_d, facts, warnings, keep=keep)
 
 
 @dataclass(frozen=True)

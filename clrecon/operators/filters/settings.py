@@ -7,14 +7,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import DTypeLike
 
 from clrecon.anatomy.noise import Noise, measure_noise
 from clrecon.errors import NoSurfaceError, UsageError
 from clrecon.geometry import Volume
 from clrecon.geometry.iso_rule import LARGEST_INTEGER, checked_iso_value
 from clrecon.operators.filters.window import Window, choose_window
-from clrecon.system.wording import name_parameter
 
 __all__ = ["BilateralSettings", "checked_length"]
 
@@ -91,8 +89,7 @@ class BilateralSettings:
         window = choose_window(volume, sigma_mm, dimensions, most_taps)
         if window.taps == 1:
             raise UsageError(
-                f"{name_parameter('taps', most_taps)} leaves no neighbour in the window, whose nearest ring has more:"
-                " allow more taps"
+                f"taps={most_taps} leaves no neighbour in the window, whose nearest ring has more: allow more taps"
             )
         return cls(sigma_mm, sigma_hu, dimensions, near, 2 if normals else 1, most_taps, window, noise)
 
@@ -104,7 +101,7 @@ class BilateralSettings:
             return []
         return [
             f"the window of {window.taps:,} taps holds {100.0 * window.share:.0f} % of the weight that"
-            f" {name_parameter('sigma_mm', round(self.sigma_mm, 3))} gives to {window.whole_taps:,}: the filter smooths"
+            f" sigma_mm={self.sigma_mm:.3g} gives to {window.whole_taps:,}: the filter smooths"
             " less far than asked for"
         ]
 
@@ -126,7 +123,7 @@ class BilateralSettings:
         }
 
 
-def inside_level(dtype: DTypeLike, near: float) -> Any:
+def inside_level(dtype: np.dtype[Any], near: float) -> Any:
     """Return the lowest value inside as a scalar of the voxels' type.
 
     Raises
@@ -134,9 +131,8 @@ def inside_level(dtype: DTypeLike, near: float) -> Any:
     NoSurfaceError
         No value of the type is.
     """
-    dtype = np.dtype(dtype)
     if dtype.kind == "f":
-        return dtype.type(near)
+        return np.float32(near)
     limits, level = np.iinfo(dtype), math.ceil(near)
     if level > limits.max:
         raise NoSurfaceError(f"no voxel can lie near {near:g} HU: voxels are {dtype}, at most {limits.max}")
@@ -165,7 +161,7 @@ def _check_whole_numbers(volume: Volume) -> None:
 def _positive(name: str, value: float, what: str) -> float:
     is_number = isinstance(value, (int, float, np.integer, np.floating)) and not isinstance(value, bool)
     if not is_number or not 0.0 < value < math.inf:
-        raise UsageError(f"{name_parameter(name)} is {what}, not {value!r}")
+        raise UsageError(f"{name} is {what}, not {value!r}")
     return float(value)
 
 
@@ -181,7 +177,7 @@ def checked_length(name: str, value: float, volume: Volume) -> float:
     sides = [n * step for n, step in zip(volume.shape_ijk, volume.spacing, strict=True)]
     if length > max(sides):
         told = " x ".join(f"{side:.4g}" for side in sides)
-        raise UsageError(f"{name_parameter(name)} is {length:g} mm, larger than the volume ({told} mm)")
+        raise UsageError(f"{name} is {length:g} mm, larger than the volume ({told} mm)")
     return length
 
 
@@ -189,7 +185,7 @@ def _measured_noise(volume: Volume) -> Noise:
     try:
         noise = measure_noise(volume)
     except UsageError as error:
-        raise UsageError(f"{error}: give {name_parameter('sigma_hu', 'HU')}") from error
+        raise UsageError(f"{error}: give sigma_hu=HU") from error
     if noise.hu == 0.0:
-        raise UsageError(f"the soft tissue of the volume has no noise: give {name_parameter('sigma_hu', 'HU')}")
+        raise UsageError("the soft tissue of the volume has no noise: give sigma_hu=HU")
     return noise

@@ -85,12 +85,17 @@ def choose_window(volume: Volume, sigma_mm: float, dimensions: int, most_taps: i
     box = _box(volume, RADIUS_OF_SIGMA * sigma_mm, dimensions)
     whole = _lattice(np.minimum(box, 3 * LARGEST_REACH))
     squares = _squares(whole, _nominal_steps(volume))
-    is_kept = (np.abs(whole) <= np.minimum(box, LARGEST_REACH)).all(axis=1)
+    is_kept = np.asarray((np.abs(whole) <= np.minimum(box, LARGEST_REACH)).all(axis=1))
     if np.count_nonzero(is_kept) > most_taps:
         is_kept = _nearest_rings(whole, squares, is_kept, most_taps)
     weights = np.exp(-squares / (2.0 * sigma_mm**2))
-    share = float(weights[is_kept].sum() / weights.sum())
-    return Window(whole[is_kept], _exponents(volume, whole[is_kept], sigma_mm), share, math.prod((2 * box + 1).tolist()))
+    total = float(weights.sum())
+    if (box > 3 * LARGEST_REACH).any():  # too many to add: the integral, for sigmas of many voxels
+        steps = _nominal_steps(volume)[:, :dimensions]
+        total = (math.tau * sigma_mm**2) ** (dimensions / 2) / math.sqrt(np.linalg.det(steps.T @ steps))
+    share = float(weights[is_kept].sum()) / total
+    kept = whole[is_kept]
+    return Window(kept, _exponents(volume, kept, sigma_mm), share, math.prod((2 * box + 1).tolist()))
 
 
 def _nominal_steps(volume: Volume) -> Float64Array:

@@ -39,5 +39,4 @@ def mark_mixed_groups(voxels: NDArray[Any], level: float, reach: tuple[int, int,
     ni = voxels.shape[2]
     padded = np.zeros((*voxels.shape[:2], -(-ni // GROUP) * GROUP), np.bool_)
     padded[:, :, :ni] = mixed
-    marked: NDArray[np.bool_] = padded.reshape(*voxels.shape[:2], -1, GROUP).any(axis=3)
-    return marked
+    return np.asarray(padded.reshape(*voxels.shape[:2], -1, GROUP).any(axis=3))

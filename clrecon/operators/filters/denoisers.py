@@ -1,0 +1,232 @@
+"""Filters of other packages under one name: SimpleITK and scikit-image, on the computer's processor."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib import import_module, metadata
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clrecon.anatomy.noise import measure_noise
+from clrecon.errors import UsageError
+from clrecon.geometry import Volume
+from clrecon.geometry.regular import shear_degrees
+from clrecon.operators.filters.result import report_filter
+from clrecon.operators.filters.settings import checked_length
+from clrecon.operators.resident.device_volume import DeviceVolume
+from clrecon.system.progress import Progress, ignore_progress
+
+__all__ = ["DENOISERS", "filter_volume"]
+
+VolumeKind = TypeVar("VolumeKind", Volume, DeviceVolume)
+
+SHEARED_DEGREES = 0.1
+"""Angle of shear below which distances along the axes are those in the patient, to a part in 500,000."""
+
+_DISTRIBUTIONS = {"skimage": "scikit-image"}
+"""Name of the distribution of a module, where it differs."""
+
+ITK_TIME_STEP = 0.0625
+"""Largest stable time step of curvature flow in three dimensions, for steps of 1 mm and more."""
+
+
+@dataclass(frozen=True)
+class _Denoiser:
+    """A filter of another package.
+
+    Attributes
+    ----------
+    package : str
+        Module that has it.
+    extra : str
+        What to install for it; empty where clrecon always brings it.
+    defaults : dict of str to number or None
+        Its parameters.
+    run : callable
+        Takes the package, the volume and all parameters; returns voxels as floats, and what it used.
+    needs_grid : bool
+        It takes the volume for a grid at right angles with even steps.
+    """
+
+    package: str
+    extra: str
+    defaults: dict[str, Any]
+    run: Callable[[Any, Volume, dict[str, Any], Progress], tuple[NDArray[Any], dict[str, Any]]]
+    needs_grid: bool = True
+
+
+def filter_volume(
+    volume: VolumeKind, name: str, *, progress: Progress | None = None, **parameters: float | None
+) -> VolumeKind:
+    """Filter a volume by a filter of SimpleITK or scikit-image, on the computer's processor.
+
+    For `clrecon.filter_bilateral`, which runs on the device, see there.
+
+    Parameters
+    ----------
+    volume : Volume or DeviceVolume
+        A `DeviceVolume` gets the result uploaded when it is first needed.
+    name : {"median", "gaussian", "curvature-flow", "non-local-means"}
+        median: SimpleITK, of a box of ``radius_mm`` (default one voxel along each axis) in whole voxels.
+        gaussian: scikit-image, with ``sigma_mm`` (default 0.7).
+        curvature-flow: SimpleITK, in mm, with ``iterations`` (default 5) of ``time_step`` (default 0.0625 for voxels of
+        1 mm and more, less for smaller ones).
+        non-local-means: scikit-image, slice by slice, with ``sigma_hu`` (default the noise that `clrecon.measure_noise`
+        finds), patches of ``patch`` (default 5) voxels and ``reach`` (default 6) voxels around.
+    progress : callable, optional
+        Called as ``progress("filter", slices done, all slices)``.
+    **parameters
+        Those of the filter.
+
+    Returns
+    -------
+    Volume or DeviceVolume
+        As it was given, in the type of the voxels, whole numbers rounded; ``report["filtered"]["steps"]`` says the
+        name, the parameters and the package.
+
+    Raises
+    ------
+    UsageError
+        The name or a parameter is unknown or out of range; the package is not installed; float voxels hold NaN; the
+        slices are unevenly spaced, or sheared by more than 0.1 degrees, which only non-local-means takes.
+    """
+    resident = volume if isinstance(volume, DeviceVolume) else None
+    source = resident.volume if resident is not None else volume
+    if not isinstance(source, Volume):
+        raise UsageError(f"a filter needs a Volume, not {type(volume).__name__}: clrecon.Volume(voxels, affine)")
+    denoiser = DENOISERS.get(name)
+    if denoiser is None:
+        raise UsageError(f"there is no filter {name!r}: it is one of {', '.join(DENOISERS)}, or filter_bilateral")
+    unknown = sorted(parameters.keys() - denoiser.defaults.keys())
+    if unknown:
+        raise UsageError(f"{name} has no parameter {unknown[0]}: it has {', '.join(denoiser.defaults)}")
+    _check_volume(source, name, denoiser)
+    package = _import_package(name, denoiser)
+    tell = progress or ignore_progress
+    nk = source.shape_ijk[2]
+    tell("filter", 0, nk)
+    found, used = denoiser.run(package, source, {**denoiser.defaults, **parameters}, tell)
+    tell("filter", nk, nk)
+    top = denoiser.package.split(".")[0]
+    facts = {"filter": name, **used, "package": f"{top} {metadata.version(_DISTRIBUTIONS.get(top, top))}"}
+    made = report_filter(source, _as_voxels(found, source), facts, [])
+    return made if resident is None else resident.follow(made)  # type: ignore[return-value]
+
+
+def _check_volume(volume: Volume, name: str, denoiser: _Denoiser) -> None:
+    if volume.voxels.dtype.kind == "f" and not np.isfinite(volume.voxels).all():
+        raise UsageError(
+            f"the voxels hold NaN or infinite values, which {name} spreads: filter_bilateral leaves them out"
+        )
+    if not denoiser.needs_grid:
+        return
+    why = ""
+    if volume.uneven:
+        why = "the slices are unevenly spaced"
+    elif (angle := shear_degrees(volume.affine)) > SHEARED_DEGREES:
+        why = f"the slices are sheared by {angle:.2g} degrees"
+    if why:
+        raise UsageError(
+            f"{why}, and {name} takes them for even steps at right angles: filter_bilateral and non-local-means do not"
+        )
+
+
+def _import_package(name: str, denoiser: _Denoiser) -> Any:
+    try:
+        return import_module(denoiser.package)
+    except ImportError as error:
+        install = f"clrecon[{denoiser.extra}]" if denoiser.extra else "scikit-image"
+        package = denoiser.package.split(".")[0]
+        raise UsageError(f"the filter {name} needs the package {package}: pip install '{install}'") from error
+
+
+def _as_voxels(found: NDArray[Any], volume: Volume) -> NDArray[Any]:
+    """Return values in the type of the voxels, whole numbers rounded."""
+    dtype = volume.voxels.dtype
+    if dtype.kind == "f" or found.dtype == dtype:
+        return np.ascontiguousarray(found, dtype)
+    limits = np.iinfo(dtype)
+    return np.clip(np.rint(found), limits.min, limits.max).astype(dtype)
+
+
+def _whole(name: str, value: Any, least: int, most: int) -> int:
+    if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or not least <= value <= most:
+        raise UsageError(f"{name} is a whole number from {least} to {most}, not {value!r}")
+    return int(value)
+
+
+def _number(name: str, value: Any, most: float) -> float:
+    is_number = isinstance(value, (int, float, np.integer, np.floating)) and not isinstance(value, bool)
+    if not is_number or not 0.0 < value <= most:
+        raise UsageError(f"{name} is a number above 0, at most {most:g}, not {value!r}")
+    return float(value)
+
+
+def _image(sitk: Any, volume: Volume) -> Any:
+    """Return the volume as an image with its steps in mm."""
+    image = sitk.GetImageFromArray(volume.voxels)
+    image.SetSpacing(volume.spacing)
+    return image
+
+
+def _run_median(
+    sitk: Any, volume: Volume, asked: dict[str, Any], tell: Progress
+) -> tuple[NDArray[Any], dict[str, Any]]:
+    if asked["radius_mm"] is None:
+        radius, used = [1, 1, 1], {}
+    else:
+        length = checked_length("radius_mm", asked["radius_mm"], volume)
+        radius, used = [math.floor(length / step + 0.5) for step in volume.spacing], {"radius_mm": length}
+        if not any(radius):
+            raise UsageError(f"radius_mm={length:g} is less than half a voxel along each axis: nothing would change")
+    found = sitk.GetArrayFromImage(sitk.Median(_image(sitk, volume), radius))
+    return found, {**used, "window": [2 * n + 1 for n in radius]}
+
+
+def _run_gaussian(
+    filters: Any, volume: Volume, asked: dict[str, Any], tell: Progress
+) -> tuple[NDArray[Any], dict[str, Any]]:
+    sigma = checked_length("sigma_mm", asked["sigma_mm"], volume)
+    steps = [sigma / step for step in reversed(volume.spacing)]
+    found = filters.gaussian(volume.voxels.astype(np.float32), steps, mode="nearest", preserve_range=True)
+    return found, {"sigma_mm": sigma}
+
+
+def _run_curvature_flow(
+    sitk: Any, volume: Volume, asked: dict[str, Any], tell: Progress
+) -> tuple[NDArray[Any], dict[str, Any]]:
+    iterations = _whole("iterations", asked["iterations"], 1, 1000)
+    stable = ITK_TIME_STEP * min(1.0, min(volume.spacing)) ** 2
+    step = stable if asked["time_step"] is None else _number("time_step", asked["time_step"], 1.0)
+    image = sitk.Cast(_image(sitk, volume), sitk.sitkFloat32)
+    found = sitk.GetArrayFromImage(sitk.CurvatureFlow(image, step, iterations))
+    return found, {"iterations": iterations, "time_step": step}
+
+
+def _run_non_local_means(
+    restoration: Any, volume: Volume, asked: dict[str, Any], tell: Progress
+) -> tuple[NDArray[Any], dict[str, Any]]:
+    patch, reach = _whole("patch", asked["patch"], 3, 31), _whole("reach", asked["reach"], 1, 31)
+    noise = measure_noise(volume).hu if asked["sigma_hu"] is None else _number("sigma_hu", asked["sigma_hu"], 1e6)
+    found = np.empty(volume.voxels.shape, np.float32)
+    for k, layer in enumerate(volume.voxels):
+        found[k] = restoration.denoise_nl_means(
+            layer.astype(np.float32), patch, reach, 0.8 * noise, fast_mode=True, sigma=noise, preserve_range=True
+        )
+        tell("filter", k + 1, len(found))
+    return found, {"sigma_hu": noise, "patch": patch, "reach": reach, "dimensions": 2}
+
+
+DENOISERS = {
+    "median": _Denoiser("SimpleITK", "volumes", {"radius_mm": None}, _run_median),
+    "gaussian": _Denoiser("skimage.filters", "", {"sigma_mm": 0.7}, _run_gaussian),
+    "curvature-flow": _Denoiser("SimpleITK", "volumes", {"iterations": 5, "time_step": None}, _run_curvature_flow),
+    "non-local-means": _Denoiser(
+        "skimage.restoration", "", {"sigma_hu": None, "patch": 5, "reach": 6}, _run_non_local_means, needs_grid=False
+    ),
+}
+"""The filters by name."""

@@ -1,0 +1,77 @@
+"""Windows of filters: taps counted by hand, distances in mm, and what a cap leaves."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from surface_volumes import OBLIQUE
+from uneven_volume import uneven
+
+from clrecon.geometry import Volume
+from clrecon.operators.filters.window import LARGEST_REACH, choose_window
+from clrecon.reference.filters.bilateral import spatial_weights
+
+pytestmark = pytest.mark.unit
+
+
+def cube(spacing: tuple[float, float, float] = (1.0, 1.0, 1.0)) -> Volume:
+    return Volume(np.zeros((8, 8, 8), np.int16), np.diag((*spacing, 1.0)))
+
+
+@pytest.mark.parametrize(("diameter", "taps"), [(3, 5), (5, 13), (7, 29), (9, 49)])
+def test_discs_of_opencv(diameter, taps):
+    """OpenCV's window of diameter d holds the pixels within d // 2 steps."""
+    window = choose_window(cube(), 5.0, 2, taps)
+    steps = np.arange(-(diameter // 2), diameter // 2 + 1)
+    disc = {(i, j, 0) for i in steps for j in steps if i * i + j * j <= (diameter // 2) ** 2}
+    assert {tuple(offset) for offset in window.offsets.tolist()} == disc
+    assert window.taps == taps and window.reach == (diameter // 2, diameter // 2, 0)
+
+
+@pytest.mark.parametrize(
+    ("spacing", "sigma", "reach"),
+    [((1, 1, 1), 0.8, (2, 2, 2)), ((0.7, 0.7, 1.4), 0.56, (2, 2, 1)), ((0.5, 1, 2), 0.4, (2, 1, 1))],
+)
+def test_boxes_of_itk(spacing, sigma, reach):
+    """ITK's radius is ceil(2.5 sigma / step) along each axis."""
+    window = choose_window(cube(spacing), sigma, 3, 4096)
+    assert window.reach == reach
+    assert window.taps == window.whole_taps == np.prod(2 * np.array(reach) + 1)
+    assert window.share == 1.0
+
+
+def test_a_cap_leaves_whole_rings():
+    window = choose_window(cube(), 1.0, 3, 125)
+    squares = (window.offsets**2).sum(axis=1)
+    assert window.taps == 123 and window.whole_taps == 343
+    assert squares.max() == 9 and 0.95 < window.share < 1.0
+    assert choose_window(cube(), 1.0, 3, 6).taps == 1
+    assert choose_window(cube(), 1.0, 3, 7).taps == 7
+
+
+def test_the_largest_reach():
+    window = choose_window(cube(), 100.0, 2, 4096)
+    assert max(window.reach) == LARGEST_REACH == 14
+    assert window.share == pytest.approx(29**2 / (2 * np.pi * 100.0**2), rel=0.01)
+
+
+@pytest.mark.parametrize("volume", [Volume(np.zeros((6, 5, 4)), OBLIQUE), uneven()], ids=["oblique", "uneven"])
+def test_weights_are_those_of_true_distances(volume):
+    window = choose_window(volume, 0.9, 3, 90)
+    expected = spatial_weights(volume, window.offsets, 0.9)
+    np.testing.assert_allclose(np.broadcast_to(np.exp2(window.exponents), expected.shape), expected, rtol=1e-9)
+    assert len(window.exponents) == (volume.shape_ijk[2] if volume.uneven else 1)
+
+
+def test_a_sheared_window_holds_the_ball():
+    """The nearest voxel of the next slice lies two columns away."""
+    affine = np.diag((1.0, 1.0, 1.0, 1.0))
+    affine[0, 2] = 2.0
+    window = choose_window(Volume(np.zeros((4, 4, 4)), affine), 1.0, 3, 7)
+    assert {tuple(offset) for offset in window.offsets.tolist()} >= {(0, 0, 0), (1, 0, 0), (-2, 0, 1), (2, 0, -1)}
+
+
+def test_rows_list_the_taps():
+    window = choose_window(cube((0.5, 1, 2)), 1.2, 3, 60)
+    listed = [(first + n, j, k) for j, k, first, count in window.rows().tolist() for n in range(count)]
+    assert listed == [tuple(offset) for offset in window.offsets.tolist()]
