@@ -108,6 +108,14 @@ def test_boxes_are_those_of_the_voxels(device):
         assert (boxes, faces.tolist()) == expected
 
 
+@pytest.mark.parametrize("memory", [None, 100])
+def test_of_a_single_label_no_faces_are_counted(device, memory):
+    """They say which labels touch: there is no other."""
+    labels = random_labels((5, 6, 40), numbers=(0, 0, 4))
+    boxes, faces = survey_labels(LabelMap(labels, np.eye(4)), device, memory, Stopwatch())
+    assert boxes == find_boxes(labels, (4,), (0, 0, 0)) and faces.tolist() == [[0, 0]] * 5
+
+
 def test_every_voxel_of_the_mask_is_inside_and_no_other(device):
     """Each edge between a voxel of the label and one without carries one vertex, within half a voxel of their face."""
     labels = random_labels((9, 8, 40))

@@ -12,6 +12,7 @@ from clrecon.geometry import Volume
 from clrecon.geometry.iso_rule import choose_iso_rule
 from clrecon.labels import LabelMap, resample_labels
 from clrecon.labels.growth import Growth
+from clrecon.opencl import Stopwatch
 from clrecon.operators.resident import device_volume
 from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.operators.surface import label_extraction as operator
@@ -290,3 +291,18 @@ def test_a_real_vertebra_is_sound(device, real_data):
     shared = {row.tobytes() for row in full[32].vertices} & {row.tobytes() for row in full[33].vertices}
     assert len(shared) > 100
     assert full[32].report["vertices_by_hu_share"] > 0.6
+
+
+@pytest.mark.parametrize(("missing", "slices"), [(0, (0, 40)), (1, (16, 26))])
+def test_a_volume_that_is_held_is_used_whole_where_a_mesh_of_half_the_bytes_fits(device, missing, slices):
+    """Voxels of two bytes, labels and the samples inside of one each, and half of that: six bytes a voxel."""
+    volume = random_volume((40, 5, 8), affine=np.eye(4))
+    labels = np.zeros(volume.voxels.shape, np.uint8)
+    labels[20:22, 1:4, 2:6] = 1
+    with DeviceVolume(volume, device=device, memory=6 * volume.voxels.size - missing) as resident:
+        resident.whole(Stopwatch())
+        rule, growth = choose_iso_rule(volume, 3), Growth.of(volume, 1.0)
+        taken = resample_labels(LabelMap(labels, np.eye(4)), volume)
+        run = operator.LabelExtraction(resident, taken, rule, growth, False)
+        assert run.slices_for({1: (slice(20, 22), slice(1, 4), slice(2, 6))}) == slices
+        assert sum(run.needs(0, 40).values()) == 4 * volume.voxels.size
