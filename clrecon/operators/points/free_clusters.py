@@ -26,7 +26,16 @@ from clrecon.opencl import (
     take_device,
     work_on,
 )
-from clrecon.operators.points.grid import PADDING, GridPlan, PointGrid, fill_grid, find_box, plan_grid, prepare_grid
+from clrecon.operators.points.grid import (
+    MOST_PAIRS,
+    PADDING,
+    GridPlan,
+    PointGrid,
+    fill_grid,
+    find_box,
+    plan_grid,
+    prepare_grid,
+)
 from clrecon.operators.primitives.scan import exclusive_scan
 from clrecon.operators.primitives.union_find import hook_in_rounds, prepare_components
 from clrecon.system.progress import Progress, ignore_progress
@@ -45,9 +54,6 @@ UNSURE_SHARE = 1e-6
 
 CELL_SLACK = 1e-3
 """Part by which cells are smaller than they could be, besides the rounding of the grid."""
-
-MOST_PAIRS = 1e12
-"""Most candidate pairs of points; more would take many minutes."""
 
 FORWARD_ROWS = kernel_constant("points/cell_links.h", "FORWARD_ROWS")
 NEAR_ROWS = kernel_constant("points/cell_links.h", "NEAR_ROWS")

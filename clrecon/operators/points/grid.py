@@ -33,6 +33,7 @@ __all__ = [
     "CELL_ROUNDING",
     "MOST_CELLS",
     "MOST_CELLS_ALONG",
+    "MOST_PAIRS",
     "PADDING",
     "GridPlan",
     "PointGrid",
@@ -54,6 +55,9 @@ MOST_CELLS = 2**31
 
 MOST_CELLS_ALONG = 2**17
 """Most cells along an axis: float32 then places a point to 0.03 of a cell."""
+
+MOST_PAIRS = 10**12
+"""Most pairs of points that may have to be compared because they lie in near cells: minutes to hours."""
 
 CELL_ROUNDING = kernel_number("points/grid.h", "GRID_ROUNDING")
 """A point may lie outside of its cell by this share of its distance from the grid's origin: float32 chose the cell."""

@@ -26,7 +26,7 @@ from clrecon.opencl import (
     work_on,
 )
 from clrecon.operators.points.cell_edge import choose_cell_edge
-from clrecon.operators.points.grid import GridPlan, PointGrid, fill_grid, plan_grid, prepare_grid
+from clrecon.operators.points.grid import MOST_PAIRS, GridPlan, PointGrid, fill_grid, plan_grid, prepare_grid
 from clrecon.points import PointCloud
 from clrecon.system.progress import Progress, ignore_progress
 
@@ -52,9 +52,6 @@ PART_POINTS = 1 << 16
 
 PART_POINTS_OF_GPU = 1 << 20
 """Points of a launch on a GPU, which needs many work-items and keeps each launch short."""
-
-MOST_PAIRS = 10**12
-"""Most pairs of points of one cell that may have to be compared: minutes to hours."""
 
 CROWDED = 4096
 """Points in a cell from which on pairs are counted before the search."""

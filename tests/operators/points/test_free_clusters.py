@@ -66,6 +66,14 @@ def test_a_small_cloud_in_small_chunks(device):
     assert np.array_equal(cores, expected_cores)
 
 
+def test_cells_of_far_points_are_smaller_by_a_tenth_at_most():
+    """They are 1 / sqrt(3) mm, less 0.001 and what coordinates in float32 need, or a tenth: then there are too many."""
+    with pytest.raises(UsageError, match=r"^cells of 0\.519038 mm: the box of the points, 1e\+07 x 0 x 0 mm, has "):
+        plan_cells([[0.0, 0.0, 0.0], [1e7, 0.0, 0.0]], 1.0)
+    near = plan_cells([[0.0, 0.0, 0.0], [1e4, 0.0, 0.0]], 1.0)
+    assert float(near.edge) == pytest.approx((0.999 - 4e-7 * 1e4 * 3**0.5) / 3**0.5, rel=1e-7)
+
+
 def test_the_passes_equal_their_twins(device, form):
     points = scattered_points(5000, (30.0, 14.0, 11.0), seed=3)
     plan = plan_cells(points, 0.9)

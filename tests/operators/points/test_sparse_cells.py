@@ -112,6 +112,8 @@ def test_cells_below_the_spacing_are_refused(device):
     ("given", "words"),
     [
         ({"edge": 0.0}, "an edge of .*: a positive length in mm is needed"),
+        ({"edge": -1.0}, "an edge of -1.0: a positive length in mm is needed"),
+        ({"edge": -1}, "an edge of -1: a positive length in mm is needed"),
         ({"edge": np.nan}, "an edge of .*: a positive length in mm is needed"),
         ({"edge": 1.0, "fewest": 0}, "fewest=.*: a whole number of points from 1 on is needed"),
         ({"edge": 1.0, "threshold": 1.5}, "threshold=.*: a whole number of points from 1 on is needed"),

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any
 
 import numpy as np
 import pytest
 
 from clrecon.operators.rays.point_pictures import PointPictures
+from clrecon.operators.rays.splats import LARGEST_DISC
 from clrecon.points import PointCloud
 from clrecon.points.spacing import mean_spacing
 from clrecon.rendering.pictures.styles import PointLook
@@ -28,3 +30,15 @@ def test_discs_are_as_large_as_points_lie_apart(
     with PointPictures(PointCloud(points), device=device) as pictures:
         found = [pictures.take(PointLook(radius_mm=given), ABOVE, (9, 9)).report["radius_mm"] for _ in range(2)]
     assert found == [radius, radius] and 0.2 < radius < 1.5
+
+
+@pytest.mark.parametrize(("pixels", "is_told"), [(0.5, False), (1.0, False), (1.25, True)])
+def test_discs_of_more_pixels_than_are_drawn_are_told(device: Any, pixels: float, is_told: bool) -> None:
+    """A picture of 8 x 8 pixels is 16 mm high: 2 mm a pixel."""
+    camera = dataclasses.replace(ABOVE, parallel_scale=8.0)
+    look = PointLook(radius_mm=2.0 * pixels * LARGEST_DISC)
+    with PointPictures(PointCloud(PLANE), device=device) as pictures:
+        warnings = pictures.take(look, camera, (8, 8)).report["warnings"]
+    words = f"discs of {2.5 * LARGEST_DISC:.3g} mm are {1.25 * LARGEST_DISC:.0f} pixels in radius: they are drawn with"
+    told = [f"{words} {LARGEST_DISC:g}, which is {2.0 * LARGEST_DISC:.3g} mm"]
+    assert [text for text in warnings if "discs" in text] == (told if is_told else [])
