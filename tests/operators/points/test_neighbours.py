@@ -8,8 +8,10 @@ from point_grids import scattered_points
 from tolerances import TREE_DISTANCE_STEPS
 
 from clrecon.errors import DeviceMemoryError, UsageError
+from clrecon.opencl import download
 from clrecon.operators.points import neighbours
 from clrecon.operators.points.cell_edge import choose_cell_edge
+from clrecon.operators.points.grid import fill_grid, plan_grid
 from clrecon.operators.points.neighbours import find_neighbours
 from clrecon.points import PointCloud
 from clrecon.reference.points import neighbours as twin
@@ -122,6 +124,21 @@ def test_a_million_equal_points_do_not_take_the_square(device):
     found = find_neighbours(np.zeros((100_000, 3), np.float32), 16, device=device)
     assert np.array_equal(found.indices, np.broadcast_to(np.arange(16), (100_000, 16)))
     assert not found.distances.any()
+
+
+def test_equal_points_in_a_crowded_cell_are_no_pairs(device, monkeypatch):
+    """Five points at one place, four others in one cell, three in a third, which is not crowded: 16 pairs."""
+    monkeypatch.setattr(neighbours, "CROWDED", 3)
+    apart = np.array([[0.1, 0.0, 0.0], [0.2, 0.0, 0.0], [0.0, 0.1, 0.0], [0.0, 0.0, 0.1]])
+    points = np.concatenate([np.zeros((5, 3)), apart + (10.0, 0.0, 0.0), apart[:3] + (20.0, 0.0, 0.0)])
+    grid = fill_grid(device, plan_grid(points, 1.0))
+    starts = download(device, np.empty(grid.cells + 1, np.uint32), grid.starts_d)
+    assert sorted(np.diff(starts).tolist()) == [3, 4, 5]
+    monkeypatch.setattr(neighbours, "MOST_PAIRS", 16)
+    neighbours._check_pairs(grid, starts)
+    monkeypatch.setattr(neighbours, "MOST_PAIRS", 15)
+    with pytest.raises(UsageError, match=r"^5 of 12 points lie in one cell of 1 mm: 1\.6e\+01 pairs would be compared"):
+        neighbours._check_pairs(grid, starts)
 
 
 @pytest.mark.parametrize("k", [0, -1, 129, 2.0, True, None])
