@@ -130,6 +130,9 @@ def test_every_voxel_of_the_mask_is_inside_and_no_other(device):
         assert len(mesh.vertices) == len(centres)
         away = np.abs(mesh.vertices - centres[nearest])
         assert distance.max() <= 0.5 - KEEP + 1e-4 and np.sort(away, axis=1)[:, 1].max() < 1e-4  # along the edge alone
+        # Voxels of 1 mm: of so rough a mask many vertices come as near to a sample as they may, a sixteenth of a mm.
+        to_sample = np.abs(mesh.vertices - np.rint(mesh.vertices)).max(axis=1)
+        assert to_sample.min() == pytest.approx(1 / 16, abs=1e-5)
 
 
 @pytest.mark.parametrize("radius", [3.2, 6.4, 12.1])
