@@ -237,6 +237,12 @@ INVERSIONS: dict[str, dict[str, tuple[tuple[str, str], ...]]] = {
     "set_bits": {"mask": (("1u << (voxel.x & 31)", "~(1u << (voxel.x & 31))"),)},
     "set_numbered_bits": {"mask": (("1u << (i & 31)", "~(1u << (i & 31))"),)},
     "find_extents": {"extents": (("(ushort)end);", "(ushort)~end);"),)},
+    "spread_ball": {"mask": (("met.a = (met.a ^ flip) & own.a;", "met.a = ~(met.a ^ flip) & own.a;"),)},
+    "mark_border_runs": {"marks": (("marks[numbers[run]] = 1;", "marks[numbers[run]] = 0;"),)},
+    "mark_voxel_runs": {
+        "marks": (("marks[component] = 1;", "marks[component] = 0;"),),
+        "components": (("found[which] = component;", "found[which] = ~component;"),),
+    },
     "combine_masks": {"mask": (("combined[word] = bits;", "combined[word] = ~bits;"),)},
     "invert_mask": {"mask": (("= ~mask[word] & within;", "= mask[word];"),)},
     "count_row_bits": {"counts": (("counts[row] = count;", "counts[row] = ~count;"),)},

@@ -10,6 +10,8 @@ from clrecon.jobs.selftest.scenes import OBLIQUE, noise, stack
 from clrecon.opencl import Device
 from clrecon.operators.masks.mask import Mask
 from clrecon.operators.resident.device_volume import DeviceVolume
+from clrecon.reference.masks import balls as balls_twin
+from clrecon.reference.masks import components as components_twin
 from clrecon.reference.masks import regions as twin
 
 __all__ = ["CHECKS"]
@@ -51,7 +53,43 @@ def _check_regions(device: Device) -> str:
     return f"{said:,} voxels equal"
 
 
+def _check_balls(device: Device) -> str:
+    said = 0
+    for uneven, columns in ((False, 70), (True, 70), (False, 530)):
+        shape = (*SHAPE[:2], columns) if columns == SHAPE[2] else (9, 60, columns)
+        affine = OBLIQUE if columns == SHAPE[2] else np.diag((0.6, 0.6, 1.5, 1.0))
+        volume = stack(noise(shape, "int16", 100), affine, uneven)
+        few, many = volume.voxels > 97, volume.voxels > 2
+        with DeviceVolume(volume, device=device) as resident:
+            one, other = Mask.from_array(resident, few), Mask.from_array(resident, many)
+            for made, expected, what in (
+                (one.dilate(1.3), balls_twin.dilate(volume, few, 1.3), "dilation"),
+                (other.erode(1.3), balls_twin.erode(volume, many, 1.3), "erosion"),
+                (one.close(1.3), balls_twin.close(volume, few, 1.3), "closing"),
+            ):
+                require_equal(made.to_numpy(), expected, f"{what} by a ball, rows of {columns} voxels")
+        said += 3 * few.size
+    return f"{said:,} voxels equal"
+
+
+def _check_components(device: Device) -> str:
+    volume = stack(noise(SHAPE, "int16", 100), OBLIQUE)
+    chosen = volume.voxels > 42
+    with DeviceVolume(volume, device=device) as resident:
+        mask = Mask.from_array(resident, chosen)
+        filled, flat = mask.fill_holes(), mask.fill_holes(by_slice=True)
+        lone = Mask.from_array(resident, volume.voxels > 70)
+        at = np.argwhere(volume.voxels > 70)[::9]
+        grown = lone.grow(volume.ijk_to_lps(at[:, ::-1]))
+    require_equal(filled.to_numpy(), components_twin.fill_holes(chosen), "filled holes")
+    require_equal(flat.to_numpy(), components_twin.fill_holes(chosen, by_slice=True), "filled holes of slices")
+    require_equal(grown.to_numpy(), components_twin.grow(volume.voxels > 70, at), "components grown from points")
+    return f"{len(at):,} points, {filled.count - mask.count:,} voxels of holes equal"
+
+
 CHECKS = (
+    Check("balls", ("spread_ball",), _check_balls),
+    Check("holes and growing", ("mark_border_runs", "mark_voxel_runs", "write_runs"), _check_components),
     Check(
         "logic of masks",
         ("combine_masks", "invert_mask", "count_row_bits", "replace_outside"),

@@ -13,7 +13,7 @@ from clrecon.geometry import AIR_HU, Volume
 from clrecon.opencl import Device, Stopwatch, allocate, check_budget, launch, load_program, upload
 from clrecon.operators.masks import logic
 from clrecon.operators.masks.band_mask import check_shape, checked_band, mark_band, mask_bytes
-from clrecon.operators.masks.mask_bits import MaskBits
+from clrecon.operators.masks.components import MaskComponents
 from clrecon.operators.masks.regions import RowSpans, box_spans, checked_box, tube_spans
 from clrecon.operators.masks.runs import write_runs
 from clrecon.operators.resident.device_volume import DeviceVolume, open_volume
@@ -25,7 +25,7 @@ if TYPE_CHECKING:  # label maps load pydicom, which others need not wait for
 __all__ = ["Mask"]
 
 
-class Mask(MaskBits):
+class Mask(MaskComponents):
     """Voxels of a volume that are chosen: one bit each, on a device, in the frame of the volume.
 
     Make one by `from_band`, `from_labels`, `from_box`, `from_tube` or `from_array`.  Masks of one volume are joined by
@@ -275,24 +275,24 @@ class Mask(MaskBits):
             raise UsageError(f"a mask is applied to a Volume, not to {type(volume).__name__}")
         self._check_frame(own)
         value = _checked_value(outside, own.voxels.dtype)
+        voxels_d = None
         if isinstance(volume, DeviceVolume) and volume.device is self.device:
-            made = own.with_voxels(self._replace(volume, value))
+            voxels, voxels_d = self._replace(volume, value)
         else:
-            made = own.with_voxels(np.where(self.to_numpy(), own.voxels, value))
+            voxels = np.where(self.to_numpy(), own.voxels, value)
+        made = own.with_voxels(voxels)
         chosen = {"chosen": self.name, "voxels": self.count, "all_voxels": own.voxels.size, "outside_hu": float(value)}
         made.report["region"] = chosen
-        if isinstance(volume, DeviceVolume):
-            return DeviceVolume(made, device=volume.device, memory=volume.memory)
-        return made
+        return volume.follow(made, voxels_d) if isinstance(volume, DeviceVolume) else made
 
-    def _replace(self, resident: DeviceVolume, value: Any) -> NDArray[Any]:
-        """Return the voxels with `value` where none is chosen, by the device if it has room."""
+    def _replace(self, resident: DeviceVolume, value: Any) -> tuple[NDArray[Any], Any]:
+        """Return the voxels with `value` where none is chosen, and those on the device if it has room, else None."""
         voxels = resident.volume.voxels
         sizes = {"volume": voxels.nbytes, "volume of what is chosen": voxels.nbytes, **mask_bytes(self.shape_ijk)}
         if resident.shortage(sizes):
-            return np.where(self.to_numpy(), voxels, value)
+            return np.where(self.to_numpy(), voxels, value), None
         voxels_d = resident.whole(Stopwatch())
-        return logic.replace_outside(self.device, voxels_d, voxels.dtype, self._mask_d, self.shape_ijk, value)[0]
+        return logic.replace_outside(self.device, voxels_d, voxels.dtype, self._mask_d, self.shape_ijk, value)
 
     @classmethod
     def _packed(cls, resident: DeviceVolume, chosen: NDArray[np.bool_], name: str) -> Mask:

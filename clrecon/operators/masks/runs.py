@@ -7,9 +7,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from clrecon.errors import DeviceMemoryError
-from clrecon.opencl import Device, Program, Stopwatch, allocate, download, launch, load_program, upload
+from clrecon.opencl import Device, Program, Stopwatch, allocate, check_budget, download, launch, load_program, upload
 from clrecon.operators.masks.band_mask import VoxelMask
 from clrecon.operators.primitives.scan import exclusive_scan, prepare_scan
 from clrecon.operators.primitives.union_find import join_parts, prepare_components
@@ -17,11 +18,15 @@ from clrecon.points.stencil import Stencil
 
 __all__ = [
     "PARTS_PER_CORE",
+    "Components",
     "RowRuns",
     "StencilTable",
     "count_runs",
+    "find_components",
     "join_runs",
     "list_runs",
+    "mark_at_border",
+    "mark_with_voxels",
     "prepare_runs",
     "write_runs",
 ]
@@ -213,3 +218,116 @@ def write_runs(
         row_counts=row_counts_d, numbers=numbers_d, marks=marks_d, mask=mask_d, wanted=wanted, rows=nj * nk,
         words=-(-ni // 32),
     )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Components:
+    """Components of the set voxels of a mask by the faces of voxels, run by run, on a device.
+
+    Attributes
+    ----------
+    runs : RowRuns
+    count : int
+        Number of components.
+    numbers_d : buffer, (runs.count,) int32
+        Component of each run, in the order of their first runs.
+    """
+
+    runs: RowRuns
+    count: int
+    numbers_d: Any
+
+
+def find_components(
+    device: Device,
+    mask: VoxelMask,
+    *,
+    by_slice: bool = False,
+    beside: int = 0,
+    memory: int | None = None,
+    stopwatch: Stopwatch | None = None,
+) -> Components:
+    """Find the components of set voxels that share a face, in the volume or within each slice.
+
+    Parameters
+    ----------
+    beside : int
+        Bytes that are taken on the device for other masks meanwhile.
+
+    Raises
+    ------
+    DeviceError
+        The device has no room for the runs, or it fails.
+    """
+    needs = {"masks of the voxels": sum(mask.needs().values()) + beside, "counts of rows": 12 * (mask.rows + 1)}
+    check_budget(device, needs, memory)
+    counted = count_runs(device, mask, mask.mask_d, stopwatch=stopwatch)
+    if not counted.count:
+        return Components(counted, 0, None)
+    needs |= {"runs of voxels": 16 * counted.count}
+    check_budget(device, needs, memory)
+    listed = list_runs(device, mask, mask.mask_d, counted, stopwatch=stopwatch)
+    faces = [(1, 0, 0, 0)] if by_slice else [(1, 0, 0, 0), (0, 1, 0, 0)]
+    nk = mask.shape_ijk[2]
+    table = StencilTable(
+        upload(device, np.array(faces, np.int32)),
+        upload(device, np.tile(np.array([[0, len(faces)]], np.int32), (nk, 1))),
+    )
+
+    def check(links: int) -> None:
+        check_budget(device, {**needs, "pairs of runs": 12 * links, "roots": 5 * counted.count}, memory)
+
+    count, numbers_d = join_runs(device, listed, mask.shape_ijk, table, check=check, stopwatch=stopwatch)
+    return Components(listed, count, numbers_d)
+
+
+def mark_at_border(
+    device: Device,
+    found: Components,
+    shape_ijk: tuple[int, int, int],
+    *,
+    by_slice: bool = False,
+    stopwatch: Stopwatch | None = None,
+) -> Any:
+    """Return a buffer with a mark, 0 or 1, for each component: 1 where it reaches the border of the volume or slice."""
+    ni, nj, nk = shape_ijk
+    marks_d = upload(device, np.zeros(found.count, np.uint8))
+    launch(
+        device, prepare_runs(device)["mark_border_runs"], nj * nk, stopwatch=stopwatch, runs=found.runs.runs_d,
+        row_counts=found.runs.row_counts_d, numbers=found.numbers_d, marks=marks_d, ni=ni, nj=nj, nk=nk,
+        by_slice=int(by_slice),
+    )  # fmt: skip
+    return marks_d
+
+
+def mark_with_voxels(
+    device: Device,
+    found: Components,
+    shape_ijk: tuple[int, int, int],
+    voxels: NDArray[np.int32],
+    *,
+    stopwatch: Stopwatch | None = None,
+) -> tuple[Any, NDArray[np.int32]]:
+    """Return a buffer with a mark for each component, 1 where it holds a voxel of a list, and each voxel's component.
+
+    Parameters
+    ----------
+    voxels : ndarray, shape (n, 3), int32
+        i, j, k within the volume.
+
+    Returns
+    -------
+    marks_d : buffer, (components,) uint8
+    components : ndarray, shape (n,), int32
+        -1 where the voxel is not set.
+    """
+    n = len(voxels)
+    marks_d = upload(device, np.zeros(found.count, np.uint8))
+    which, which_d = np.empty(n, np.int32), allocate(device, 4 * n)
+    launch(
+        device, prepare_runs(device)["mark_voxel_runs"], n, stopwatch=stopwatch,
+        voxels=upload(device, np.ascontiguousarray(voxels, np.int32)), runs=found.runs.runs_d,
+        row_counts=found.runs.row_counts_d, numbers=found.numbers_d, marks=marks_d, found=which_d, n=n,
+        nj=shape_ijk[1],
+    )  # fmt: skip
+    return marks_d, download(device, which, which_d)

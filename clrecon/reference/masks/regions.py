@@ -12,9 +12,9 @@ from clrecon.geometry import Volume
 __all__ = ["find_in_box", "find_in_tube", "find_places"]
 
 
-def find_places(volume: Volume, border: int = 0) -> NDArray[np.float64]:
-    """Return LPS mm of all voxels and of those in `border` layers beyond, shape (nk, nj, ni, 3) and 2 border more."""
-    shape = [n + 2 * border for n in volume.voxels.shape]
+def find_places(volume: Volume, border: tuple[int, int, int] = (0, 0, 0)) -> NDArray[np.float64]:
+    """Return LPS mm of all voxels, and of as many beyond them along i, j and k as `border` says, (nk, nj, ni, 3)."""
+    shape = [n + 2 * more for n, more in zip(volume.voxels.shape, border[::-1], strict=True)]
     ijk = np.indices(shape)[::-1].reshape(3, -1).T - border
     return volume.ijk_to_lps(ijk).reshape(*shape, 3)
 

@@ -112,6 +112,9 @@ def test_volumes_keep_what_is_chosen(device, dtype):
     with clrecon.DeviceVolume(volume, device=device) as resident, made.apply(resident, outside) as kept:
         assert isinstance(kept, clrecon.DeviceVolume)
         np.testing.assert_array_equal(kept.volume.voxels, expected)
+        assert kept.is_held
+        found, same = (clrecon.extract_isosurface(each, 45) for each in (kept, kept.volume))
+        np.testing.assert_array_equal(found.vertices, same.vertices)
     with pytest.raises(UsageError, match="hold no such HU"):
         made.apply(volume, math.nan)
 

@@ -1,0 +1,131 @@
+/* Dilation and erosion of a bit mask by a ball in mm, or by any other stencil, a piece of a row at a time.
+ *
+ * References: our own; that balls are rows of voxels, and wider rows hold the narrower ones, is old (van Herk 1992 and
+ * others decompose structuring elements so).
+ *
+ * A ball is a list of rows (dj, dk, centre, half), the widest first: the voxels from centre - half to centre + half of
+ * the row.  `tables` says which part of the list is that of slice k.  What is gathered from the widest rows is widened by
+ * a voxel on both sides whenever the next row is narrower by one, so that each row is read once and its bits go as far as
+ * its half:
+ *
+ *      rows of half 2   ....#.......      read
+ *      widened          ...###......
+ *      rows of half 1   ...###..#...      read and joined
+ *      widened          ..#####.###.      one by 2 voxels, the other by 1
+ *      rows of half 0   joined, and done
+ *
+ * Erosion is the same of the complement, and the complement of that (`flip`).  What lies beyond the volume is not set, or
+ * set, as `beyond` says of the bits that are spread. */
+#include "masks/row_pieces.h"
+
+/* Words of a row from `at` on, their bits `shift` voxels further along i, `beyond` beyond the row. */
+static inline words_of_piece load_row_shifted(
+    __global const uint *mask, const int at, const int first, const int shift, const int ni, const int total,
+    const uint flip, const uint beyond)
+{
+    const int word = shift >> 5, bits = shift & 31;
+    const words_of_piece own = bits_of_row(first + word, ni);
+    const words_of_piece low = ((load_vector(mask, at + word, total) ^ flip) & own) | (beyond & ~own);
+    if (bits == 0)
+        return low;
+    const words_of_piece next = bits_of_row(first + word + 1, ni);
+    const words_of_piece high = ((load_vector(mask, at + word + 1, total) ^ flip) & next) | (beyond & ~next);
+    return low >> (uint)bits | high << (uint)(32 - bits);
+}
+
+/* Parameters  mask     in   (nk, nj, words)
+ *             stencil  in   (m) rows of balls
+ *             tables   in   (nk) begin and end of the ball of each slice
+ *             spread   out  (nk, nj, words)
+ *             ni, nj, nk   voxels;  words a row
+ *             pieces   of a row, `step` words each, and `halo` words before and behind them
+ *             shifted  0: all centres are 0; else 1, and there is a halo: bits that are shifted out of the row count there
+ *             flip     ~0: the complement is spread, and the complement of that written; else 0
+ *             beyond   ~0: what is spread lies everywhere beyond the volume; else 0
+ * Launch      global = nk nj pieces rounded up by the host, any local
+ * Assumes     step + 2 halo <= PIECE_WORDS; without a halo step >= words, with one of a word halves <= 32;
+ *             nk nj words < 2^31
+ * Guarantees  every word is written; bits beyond the rows are 0 */
+__kernel void spread_ball(
+    __global const uint *restrict mask, __global const int4 *restrict stencil, __global const int2 *restrict tables,
+    __global uint *restrict spread, const int ni, const int nj, const int nk, const int words, const int pieces,
+    const int step, const int halo, const int shifted, const uint flip, const uint beyond)
+{
+    const uint item = get_global_id(0);
+    const int row = (int)(item / pieces), total = nj * nk * words;
+    if (row >= nj * nk)
+        return;
+    const int first = (int)(item % pieces) * step - halo;
+    const int j = row % nj, k = row / nj;
+    const int2 table = tables[k];
+    row_piece own, met;
+    own.a = bits_of_row(first, ni);
+    met.a = (words_of_piece)(0u);
+#if LANES == 8
+    own.b = bits_of_row(first + VECTOR_WORDS, ni);
+    met.b = (words_of_piece)(0u);
+#endif
+    int half_width = stencil[table.x].w;
+    for (int which = table.x; which < table.y; ++which) {
+        const int4 near = stencil[which];
+        for (; half_width > near.w; --half_width)
+            met = widen(shifted ? met : within_row(met, own, beyond), beyond);
+        if (j + near.x < 0 || j + near.x >= nj || k + near.y < 0 || k + near.y >= nk) {
+            met.a |= beyond;
+#if LANES == 8
+            met.b |= beyond;
+#endif
+            continue;
+        }
+        const int at = (row + near.y * nj + near.x) * words + first;
+        if (!shifted) {
+            met.a |= load_vector(mask, at, total) ^ flip;
+#if LANES == 8
+            met.b |= load_vector(mask, at + VECTOR_WORDS, total) ^ flip;
+#endif
+        } else {
+            met.a |= load_row_shifted(mask, at, first, near.z, ni, total, flip, beyond);
+#if LANES == 8
+            met.b |= load_row_shifted(
+                mask, at + VECTOR_WORDS, first + VECTOR_WORDS, near.z, ni, total, flip, beyond);
+#endif
+        }
+    }
+    for (; half_width > 0; --half_width)
+        met = widen(shifted ? met : within_row(met, own, beyond), beyond);
+    met.a = (met.a ^ flip) & own.a;
+    const int begin = first + halo, end = min(begin + step, words);
+    __global uint *to = spread + row * words;
+#define STORE(n, word) \
+    if (first + n >= begin && first + n < end) \
+        to[first + n] = word;
+#if LANES == 8
+    met.b = (met.b ^ flip) & own.b;
+    if (halo == 0 && end == PIECE_WORDS) {
+        vstore8(met.a, 0, to);
+        vstore8(met.b, 1, to);
+        return;
+    }
+    STORE(0, met.a.s0)
+    STORE(1, met.a.s1)
+    STORE(2, met.a.s2)
+    STORE(3, met.a.s3)
+    STORE(4, met.a.s4)
+    STORE(5, met.a.s5)
+    STORE(6, met.a.s6)
+    STORE(7, met.a.s7)
+    STORE(8, met.b.s0)
+    STORE(9, met.b.s1)
+    STORE(10, met.b.s2)
+    STORE(11, met.b.s3)
+    STORE(12, met.b.s4)
+    STORE(13, met.b.s5)
+    STORE(14, met.b.s6)
+    STORE(15, met.b.s7)
+#else
+    STORE(0, met.a.x)
+    STORE(1, met.a.y)
+    STORE(2, met.a.z)
+    STORE(3, met.a.w)
+#endif
+}
