@@ -49,6 +49,7 @@ from clrecon.operators.surface.extract import extract_isosurface as extract_isos
 from clrecon.operators.surface.extract import extract_isosurfaces as extract_isosurfaces
 from clrecon.operators.surface.label_masks import extract_label_masks as extract_label_masks
 from clrecon.operators.surface.labels import extract_labels as extract_labels
+from clrecon.operators.surface.methods import extract_by_method as extract_by_method
 from clrecon.points import PointCloud as PointCloud
 from clrecon.points import PointStep as PointStep
 from clrecon.points import drop_ghost_slices as drop_ghost_slices

@@ -168,6 +168,31 @@ INVERSIONS: dict[str, dict[str, tuple[tuple[str, str], ...]]] = {
             ("= mirrored ? 8 : 0, last_shift = mirrored ? 0 : 8", "= mirrored ? 0 : 8, last_shift = mirrored ? 8 : 0"),
         )
     },
+    "find_cell_runs": {"runs": (("= starts;", "= starts & starts >> 1;"),)},
+    "begin_cell_runs": {
+        "parents": (("parents[run] = run;", "parents[run] = 0u;"),),
+        "cells": (
+            ("run_cells[run - 1] = cells + popcount(", "run_cells[run - 1] = 32 * words - cells - popcount("),
+            ("run_cells[run - 1] = cells;", "run_cells[run - 1] = 32 * words - cells;"),
+        ),
+    },
+    "join_cell_runs": {
+        "joins": (
+            ("find_mixed_faces(rows.y1z0, rows.y1z1,", "~find_mixed_faces(rows.y1z0, rows.y1z1,"),
+            ("find_mixed_faces(rows.y0z1, rows.y1z1,", "~find_mixed_faces(rows.y0z1, rows.y1z1,"),
+        )
+    },
+    "find_run_roots": {"roots": (("roots[run] = find_root(", "roots[run] = run + 0 * find_root("),)},
+    "seed_cell_runs": {
+        "marks": (
+            ("= found | ((seeds_here & before) != 0);", "= !(found | ((seeds_here & before) != 0));"),
+            ("seeded[run - 1] = found;", "seeded[run - 1] = !found;"),
+        )
+    },
+    "mark_grown": {"grown": (("? ~0u : 0u;", "? 0u : ~0u;"),)},
+    "start_rows": {"starts": (("= set;\n    for", "= !set;\n    for"), ("+ j] = set;", "+ j] = !set;"))},
+    "keep_edges": {"kept": (("row_kept[w] = bits;", "row_kept[w] = ~bits;"),)},
+    "count_visited": {"counts": (("counts[row] = count;", "counts[row] = 32 * words - count;"),)},
     "count_cells": {
         "triangles": (("row_counts[rows_to_count + row] += more;", "row_counts[rows_to_count + row] -= more;"),),
         "vertices": (("row_cell_vertices[row] = vertices;", "row_cell_vertices[row] = 99 * words - vertices;"),),

@@ -25,6 +25,8 @@
  *             word_triangles   out  (rows_to_count, words) triangles of the row before each word
  *             gi gj gk         samples; words a row; flag_words = ceil(words / 32), rounded up to a power of two
  *             rows_to_count    rows that are counted, the first ones of the mask
+ *             inside           in   (gk, gj, words) with -D GROWN: the inside mask, where `mask` is the kept mask of
+ *                                   growing.cl, whose crossed edges are those of the grown cells
  * Launch      global = rows_to_count rounded up by the host, any local
  * Assumes     5 (gi + 1) < 65536, so that places in a row fit 16 bits
  * Guarantees  every output is written, but for the places of words beyond the extents, which nothing asks for */
@@ -32,7 +34,11 @@ __kernel void count_rows(
     __global const uint *restrict mask, __global const ushort2 *restrict row_extents,
     __global uint *restrict row_counts, __global uint *restrict words_with_work,
     __global ushort *restrict word_vertices, __global ushort *restrict word_triangles,
-    const uint gi, const uint gj, const uint gk, const uint words, const uint flag_words, const uint rows_to_count)
+    const uint gi, const uint gj, const uint gk, const uint words, const uint flag_words, const uint rows_to_count
+#ifdef GROWN
+    , __global const uint *restrict inside
+#endif
+    )
 {
     const uint row = get_global_id(0);
     if (row >= rows_to_count)
@@ -79,8 +85,14 @@ __kernel void count_rows(
             const uint x = (uint)((rows.y0z0 ^ rows.y0z0 >> 1) & samples_with_next(w, gi));
             vertices += popcount(x) + popcount(y) + popcount(z);
             if (has_y && has_z) {
+#ifdef GROWN
+                cell_rows cases;
+                load_cell_rows(&cases, inside, j, k, w, gj, words);
+#else
+                const cell_rows cases = rows;
+#endif
                 for (uint rest = active; rest != 0; rest &= rest - 1)
-                    triangles += (uint)MC_TRIANGLES[cell_case(rows, lowest_bit(rest))] & 15;
+                    triangles += (uint)MC_TRIANGLES[cell_case(cases, lowest_bit(rest))] & 15;
             }
             flags |= 1u << (w & 31);
             ++working;
@@ -160,6 +172,7 @@ static inline void flush_triangles(const uint *waiting, uint count, __global uin
  *             rows_to_count     rows that were counted
  *             gi gj gk, words   as above
  *             row_shift, active   as in cl/surface/marching_cubes.cl
+ *             inside            in   with -D GROWN: as for count_rows
  *             mirrored          1 when index space is left-handed in mm: the winding is turned round
  * Launch      global = ceil(active / WORDS_PER_ITEM) rounded up by the host, any local
  * Guarantees  every triangle is written once, cell by cell along the rows */
@@ -169,7 +182,11 @@ __kernel void emit_triangles(
     __global const ushort *restrict word_triangles,
     __global uint *restrict triangles, const uint first_vertex, const uint rows_to_count,
     const uint gi, const uint gj, const uint gk, const uint words, const uint row_shift, const uint active,
-    const int mirrored)
+    const int mirrored
+#ifdef GROWN
+    , __global const uint *restrict inside
+#endif
+    )
 {
     const uint begin = get_global_id(0) * WORDS_PER_ITEM;
     if (begin >= active)
@@ -199,13 +216,19 @@ __kernel void emit_triangles(
         cell_rows rows;
         load_cell_rows(&rows, mask, j, k, w, gj, words);
         uint rest = find_active_cells(rows, w, gi);
+#ifdef GROWN
+        cell_rows cases;
+        load_cell_rows(&cases, inside, j, k, w, gj, words);
+#else
+        const cell_rows cases = rows;
+#endif
         numbered_rows edges;
         number_rows(&edges, &rows, mask, row_offsets, word_vertices, first_vertex, j, k, w, gi, gj, gk, words);
         for (; rest != 0; rest &= rest - 1) {
             const uint b = lowest_bit(rest);
             uint numbers[16];
             number_cell(numbers, &edges, b);
-            const ulong packed = MC_TRIANGLES[cell_case(rows, b)];
+            const ulong packed = MC_TRIANGLES[cell_case(cases, b)];
             const uint count = (uint)packed & 15;
 #if LANES > 1
             /* Two triangles whether they count or not, the rest where there are more: wrong guesses cost more. */

@@ -169,6 +169,35 @@ static inline void store_triples(floats x, floats y, floats z, uint count, __glo
 #endif
 }
 
+#define GOLDEN_SECTION 0.6180340f
+#define SEARCH_STEPS 24 /* the last part of an edge is 0.618^24, 1e-5 of it */
+
+#ifdef GOLDEN_SEARCH
+/* Where the cubic of Catmull and Rom through the two values of each edge and those beside it crosses the level, by
+ * golden sections: of both parts that which has its ends on both sides of the level is cut again. */
+static inline floats search_crossing(
+    const vertex_group *group, ints axis, floats value, floats next_value, floats level)
+{
+#define ALONG(which) choose(axis == 2, to_floats(load_lanes(group->which##_k)), \
+        choose(axis == 1, to_floats(load_lanes(group->which##_j)), to_floats(load_lanes(group->which##_i))))
+    const floats rise = 0.5f * ALONG(gradient), next_rise = 0.5f * ALONG(next_gradient);
+#undef ALONG
+    const floats change = next_value - value;
+    const floats second = 3.0f * change - 2.0f * rise - next_rise, third = rise + next_rise - 2.0f * change;
+    const floats height = level - value; /* the cubic begins at 0 */
+    const ints rises = next_value > value;
+    floats low = (floats)(0.0f), high = (floats)(1.0f);
+    for (int step = 0; step < SEARCH_STEPS; ++step) {
+        const floats cut = low + GOLDEN_SECTION * (high - low);
+        const floats reached = cut * (rise + cut * (second + cut * third));
+        const ints beyond = choose(rises, reached, -reached) >= choose(rises, height, -height);
+        low = choose(beyond, low, cut);
+        high = choose(beyond, cut, high);
+    }
+    return 0.5f * (low + high);
+}
+#endif
+
 /* Compute the first `count` vertices of a group and write them from `positions` and `normals` on. */
 static inline void write_vertices(
     const vertex_group *group, const slice_frame *frame, uint count,
@@ -187,7 +216,13 @@ static inline void write_vertices(
 #else
     const float level = frame->iso_level;
 #endif
+#ifdef GOLDEN
+    floats t = (floats)(GOLDEN_SECTION);
+#elif defined(GOLDEN_SEARCH)
+    floats t = clamp(search_crossing(group, axis, value, next_value, level), keep, 1.0f - keep);
+#else
     floats t = clamp((level - value) / (next_value - value), keep, 1.0f - keep);
+#endif
     floats value_scale = (floats)(frame->value_scale);
 #ifdef LABELS
     const ints half_way = load_lanes(group->half_way) != 0;

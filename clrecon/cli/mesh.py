@@ -8,6 +8,7 @@ from typing import Any
 
 from clrecon.cli.common import add_device, add_keep_ids, add_memory, add_no_clobber, megabytes, pick
 from clrecon.cli.console import Console, printable
+from clrecon.cli.growing import add_methods, describe_cells
 from clrecon.cli.labels import add_label_arguments, describe_labels, label_choice
 from clrecon.cli.levels import LEVELS_HELP, parse_hu, parse_levels
 from clrecon.cli.masking import add_masking
@@ -54,6 +55,7 @@ def _epilog() -> str:
             "  clrecon mesh CT_FOLDER -o bone.stl --hu 200,350 --min-volume 1 --split",
             "  clrecon mesh CT_FOLDER -o fat.stl --hu -150:-30 --remove-table",
             "  clrecon mesh CT_FOLDER -o lung.stl --below -400 --keep-largest 2",
+            "  clrecon mesh CT_FOLDER -o spine.stl --hu 226 --method i-mc --grow-from 0,-150,-600",
             "  clrecon mesh CT_FOLDER -o bone.stl --labels spine.nii.gz --label T12 --label L1",
         )
     )
@@ -103,6 +105,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     surface.add_argument(
         "--open", dest="closed", action="store_false", help="leave the surface open at the border of the volume"
     )
+    add_methods(parser)
     components = parser.add_argument_group("components")
     components.add_argument(
         "--keep",
@@ -181,6 +184,7 @@ def describe_mesh(report: dict[str, Any]) -> list[str]:
         f"surface  {_describe_surfaces(report)}, {border} at the border of the volume",
         f"mesh     {report['vertices']:,} vertices, {report['triangles']:,} triangles",
         *_describe_quality(report),
+        *describe_cells(report),
         *describe_labels(report["meshes"]),
         *_describe_parts(report["meshes"]),
         *describe_refinement(report["meshes"]),

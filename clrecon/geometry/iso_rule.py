@@ -16,7 +16,8 @@ from numpy.typing import DTypeLike, NDArray
 
 from clrecon.errors import NoSurfaceError, UsageError
 from clrecon.geometry.affine import normal_matrix
-from clrecon.geometry.precision import find_vertex_origin, float32_step, largest_coordinate
+from clrecon.geometry.precision import find_vertex_origin, float32_step, largest_coordinate, power_of_two_over
+from clrecon.geometry.vertex_rules import check_vertex_rule
 from clrecon.geometry.volume import AIR_HU, Volume
 
 LARGEST_INTEGER = 2**23
@@ -35,20 +36,9 @@ Level = float | Sequence[float]
 """An iso value, or the two ends of a range, HU."""
 
 __all__ = [
-    "TOPOLOGIES",
-    "IsoRule",
-    "Level",
-    "ValueRange",
-    "check_topology",
-    "checked_iso_value",
-    "choose_iso_rule",
-    "data_range",
-    "layer_margins",
-    "layer_normal_matrices",
-    "slice_normal_matrices",
-    "takes_parts",
-    "vertex_margin",
-]
+    "TOPOLOGIES", "IsoRule", "Level", "ValueRange", "check_topology", "checked_iso_value", "choose_iso_rule",
+    "data_range", "layer_margins", "layer_normal_matrices", "slice_normal_matrices", "takes_parts", "vertex_margin",
+]  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -84,6 +74,7 @@ class IsoRule:
     upper_level : float or None
         For a range: where the surface lies between an inside sample and one above the range.  For integer voxels and an
         integer end k it is k + 0.5.
+    vertex_rule : {"linear", "golden", "golden-search"}
     """
 
     iso_value: float
@@ -97,6 +88,7 @@ class IsoRule:
     upper_value: float | None = None
     highest_inside: int | float | None = None
     upper_level: float | None = None
+    vertex_rule: str = "linear"
 
     @property
     def border(self) -> int:
@@ -142,6 +134,7 @@ class IsoRule:
             "iso_value_hu": None if ranged else value,
             "iso_level_hu": None if ranged else level,
             "inside": self.inside,
+            "vertex_rule": self.vertex_rule,
             "inside_hu": ends[self.inside][0],
             "inside_levels_hu": ends[self.inside][1],
         }
@@ -206,6 +199,7 @@ def choose_iso_rule(
     topology: str = "separated",
     *,
     below: bool = False,
+    vertex_rule: str = "linear",
     values: ValueRange | None = None,
 ) -> IsoRule:
     """Decide what is inside and where the surface lies.
@@ -220,6 +214,7 @@ def choose_iso_rule(
     topology : {"separated", "trilinear"}
     below : bool
         A sample is inside when its value is < `iso_value`: the same surface, turned round.
+    vertex_rule : {"linear", "golden", "golden-search"}
     values : ValueRange, optional
         Those of this volume; given where several rules for one volume are chosen.
 
@@ -233,6 +228,7 @@ def choose_iso_rule(
     """
     iso_value, upper_value = _checked_level(iso_value, below)
     check_topology(topology, ranged=upper_value is not None)
+    check_vertex_rule(vertex_rule, topology)
     dtype = volume.voxels.dtype
     value_scale = 1.0
     values = values or ValueRange(volume)
@@ -242,7 +238,7 @@ def choose_iso_rule(
             raise NoSurfaceError(f"the voxels run from {low} to {high}: infinite values have no iso surface")
         if max(-low, high) > LARGEST_FLOAT:
             raise UsageError(f"the voxels run from {low:g} to {high:g}: beyond {LARGEST_FLOAT:g} is not supported")
-        value_scale = _power_of_two_over(max(-low, high, abs(iso_value), abs(upper_value or 0.0)))
+        value_scale = power_of_two_over(max(-low, high, abs(iso_value), abs(upper_value or 0.0)))
         iso_level = float(np.float32(iso_value))
         lowest_inside: int | float = iso_level
     else:
@@ -257,7 +253,9 @@ def choose_iso_rule(
         lowest_inside = math.ceil(iso_value)
         iso_level = iso_value - 0.5 if lowest_inside == iso_value else iso_value
     inside = "below" if below else "above"
-    rule = IsoRule(iso_value, lowest_inside, iso_level, 0.0, closed, value_scale, topology, inside)
+    rule = IsoRule(
+        iso_value, lowest_inside, iso_level, 0.0, closed, value_scale, topology, inside, vertex_rule=vertex_rule
+    )
     if upper_value is not None:
         rule = _end_range(rule, upper_value, dtype)
     return replace(rule, outside=_choose_outside(rule, max(low, float(AIR_HU)), dtype))
@@ -310,12 +308,6 @@ def check_topology(topology: str, ranged: bool = False) -> None:
         raise UsageError(
             "the topology trilinear follows one level, a range has two: leave it out, or give one iso value"
         )
-
-
-def _power_of_two_over(largest: float) -> float:
-    """Return a power of two that scales `largest` to 1 or below, as far as float32 reaches."""
-    _, exponent = math.frexp(largest)
-    return 2.0 ** min(max(-exponent, -126), 126)
 
 
 def _checked_level(level: Level, below: bool) -> tuple[float, float | None]:

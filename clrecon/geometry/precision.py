@@ -7,6 +7,7 @@ volume's centre, and that point is added in float64.
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -17,7 +18,15 @@ from clrecon.geometry.affine import Float64Array
 if TYPE_CHECKING:
     from clrecon.geometry.volume import Volume
 
-__all__ = ["FAR_MM", "describe_far", "find_vertex_origin", "float32_step", "is_far", "largest_coordinate"]
+__all__ = [
+    "FAR_MM",
+    "describe_far",
+    "find_vertex_origin",
+    "float32_step",
+    "is_far",
+    "largest_coordinate",
+    "power_of_two_over",
+]
 
 FAR_MM = 4096.0
 """Coordinates from here on count as far.  Below, the step of float32 is at most 2.4e-4 mm; from here on it is 4.9e-4 mm
@@ -66,3 +75,9 @@ def find_vertex_origin(volume: Volume) -> Float64Array | None:
         return None
     centre = (np.array(volume.shape_ijk, dtype=np.float64) - 1.0) / 2.0
     return np.rint(volume.ijk_to_lps(centre[None])[0])
+
+
+def power_of_two_over(largest: float) -> float:
+    """Return a power of two that scales `largest` to 1 or below, as far as float32 reaches."""
+    _, exponent = math.frexp(largest)
+    return 2.0 ** min(max(-exponent, -126), 126)

@@ -26,7 +26,8 @@ ODD = [
     "\x1b[31m", "x\ny", "../../x", "/dev/null", "/dev/full", "/nonexistent/x", ".", "~", "%s", "{}", "x" * 5000, "all",
     "none", "auto", "300", "bone", "png", "500MB", "1GiB", "0B", "64x64", "0x0", "1x99999999", "0,0", "\udcff",
     "eps=2,min=3", "eps=1e-9", "min=plane+1", "largest", "largest:2", "min:3", "seed:1,2,3", "no-sheets",
-    "grid,bilateral", "-500,900", "1e-7", "1e4", "0,0,0",
+    "grid,bilateral", "-500,900", "1e-7", "1e4", "0,0,0", "label:1",
+    "label:", "i-mc", "g-mc", "skimage", "golden",
 ]  # fmt: skip
 UNTRIED = {"bench", "selftest", "demo"}
 """Commands that take seconds each; their options are tried by the tests of the command line."""

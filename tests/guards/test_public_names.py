@@ -20,7 +20,7 @@ KEYWORDS = ("device", "memory", "progress")
 TAKE_PROGRESS = {
     "Mask.from_band", "SurfaceExtractor.extract_vertices", "extract_points",
     "SurfaceExtractor.extract", "VolumeRenderer.render", "choose_iso_value", "cluster_points", "collapse_quadric",
-    "compare_meshes",
+    "compare_meshes", "extract_by_method",
     "cut_slice", "decimate_mesh", "denoise_points", "estimate_normals", "extract_isosurface", "extract_isosurfaces",
     "extract_label_masks", "extract_labels", "filter_bilateral", "filter_volume",
     "find_ghost_slices", "find_neighbours", "find_spine_line",

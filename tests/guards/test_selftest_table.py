@@ -25,6 +25,8 @@ OF_COMPILERS = re.compile(r"__\w+__|CLRECON_\w+_H")
 NEVER_BUILT = {
     ("rays/composite.cl", "LEAST_VALUE"): "of rays/field.h: operators give it to project.cl alone",
     ("rays/surface.cl", "LEAST_VALUE"): "of rays/field.h: operators give it to project.cl alone",
+    ("surface/trilinear.cl", "GOLDEN"): "of surface/vertex_group.h: operators build trilinear.cl by types alone",
+    ("surface/trilinear.cl", "GOLDEN_SEARCH"): "of surface/vertex_group.h: operators build trilinear.cl by types alone",
     ("surface/trilinear.cl", "LABELS"): "of surface/vertex_group.h: operators build trilinear.cl by types alone",
     ("surface/trilinear.cl", "RANGE"): "of surface/vertex_group.h: operators build trilinear.cl by types alone",
     ("surface/trilinear.cl", "UNEVEN"): "of surface/vertex_group.h: operators build trilinear.cl by types alone",
@@ -71,7 +73,8 @@ def test_row_57_every_kernel_and_every_variant_has_a_check() -> None:
     names = [check.name for check in CHECKS]
     assert len(set(names)) == len(names)
     assert {macro for macros in SWITCHES.values() for macro in macros} == {
-        "BORDER_INSIDE", "GRADIENT_OPACITY", "LABELS", "LEAST_VALUE", "MASKS", "RANGE", "TAKES_PARTS", "UNEVEN",
+        "BORDER_INSIDE", "GOLDEN", "GOLDEN_SEARCH", "GRADIENT_OPACITY", "GROWN", "LABELS",
+        "LEAST_VALUE", "MASKS", "RANGE", "TAKES_PARTS", "UNEVEN",
     }  # fmt: skip
 
 

@@ -190,11 +190,14 @@ def _open(
 
     def read_map(volume: Volume | None) -> LabelMap | None:
         labels = open_labels(settings.labels, volume)
-        if labels is not None and settings.labels is not None and no_clobber:
+        if labels is not None and settings.labels is not None and settings.labels_pick and no_clobber:
             refuse_files(name_outputs(output, name_label_files(labels, settings.labels, surfaces)))
         return labels
 
-    prepare = partial(prepare_surfaces, components=settings.selects, topology=settings.topology, inside=settings.inside)
+    prepare = partial(
+        prepare_surfaces, components=settings.selects, topology=settings.topology, inside=settings.inside,
+        vertex_rule=settings.vertex_rule, grows=settings.method_used == "i-mc",
+    )  # fmt: skip
     with DeviceOpening(settings.device, prepare) as opening:
         volume, labels = read_with_labels(
             partial(read_selected, source, settings, progress=progress),
@@ -230,9 +233,9 @@ def _extract(
     progress: Progress,
 ) -> tuple[list[Surface], list[Mesh]]:
     """Extract the surfaces, those of labels included, with one mesh each."""
-    if labels is not None and settings.labels is not None:
+    if labels is not None and settings.labels is not None and settings.labels_pick:
         return extract_label_surfaces(volume, surfaces, labels, settings.labels, device, settings, progress)
-    return surfaces, extract_surfaces(volume, surfaces, device, settings, progress)
+    return surfaces, extract_surfaces(volume, surfaces, device, settings, progress, labels)
 
 
 def _select(

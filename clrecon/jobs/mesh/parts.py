@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from clrecon.errors import DeviceFailedError, NoSurfaceError, UsageError
 from clrecon.jobs.mesh.bone import find_bone
+from clrecon.jobs.mesh.methods import extract_one
 from clrecon.jobs.mesh.settings import MeshSettings
 from clrecon.jobs.mesh.surfaces import Part, Surface
 from clrecon.jobs.shared.outputs import MOST_FILES
@@ -16,6 +17,7 @@ from clrecon.system.wording import name_parameter
 
 if TYPE_CHECKING:
     from clrecon.geometry import Volume
+    from clrecon.labels import LabelMap
     from clrecon.mesh import Mesh
     from clrecon.opencl import Device
 
@@ -51,9 +53,14 @@ def check_levels(volume: Volume, surfaces: Sequence[Surface]) -> None:
 
 
 def extract_surfaces(
-    volume: Volume, surfaces: Sequence[Surface], device: Device, settings: MeshSettings, progress: Progress
+    volume: Volume,
+    surfaces: Sequence[Surface],
+    device: Device,
+    settings: MeshSettings,
+    progress: Progress,
+    labels: LabelMap | None = None,
 ) -> list[Mesh]:
-    """Extract all surfaces with one mesh each.
+    """Extract all surfaces with one mesh each; `labels` are those that they may grow from.
 
     Raises
     ------
@@ -63,6 +70,8 @@ def extract_surfaces(
     from clrecon.operators.surface.extract import extract_isosurfaces
 
     levels = [surface.iso_value for surface in surfaces if surface.iso_value is not None]
+    if settings.method_used in ("i-mc", "t-mc-soup", "skimage") or settings.vertex_rule != "linear":
+        return [extract_one(volume, level, device, settings, labels, progress) for level in levels]
     return extract_isosurfaces(
         volume,
         levels,

@@ -15,12 +15,23 @@ if TYPE_CHECKING:
 __all__ = ["leave_outside", "prepare_surfaces"]
 
 
-def prepare_surfaces(device: Device, components: bool, topology: str, inside: str = "above") -> None:
-    """Build the kernels for surfaces of this topology and, if wanted, for components."""
+def prepare_surfaces(
+    device: Device,
+    components: bool,
+    topology: str,
+    inside: str = "above",
+    vertex_rule: str = "linear",
+    grows: bool = False,
+) -> None:
+    """Build the kernels for surfaces of this topology and, if wanted, for components and for growing."""
     from clrecon.operators.primitives.union_find import prepare_components
     from clrecon.operators.surface.extract import prepare_isosurface
 
-    prepare_isosurface(device, topology=topology, inside=inside)
+    prepare_isosurface(device, topology=topology, inside=inside, vertex_rule=vertex_rule)
+    if grows:
+        from clrecon.operators.surface.growing import prepare_growing
+
+        prepare_growing(device)
     if components:
         prepare_components(device)
 

@@ -29,13 +29,17 @@ def refine_surface(mesh: Mesh, settings: MeshSettings, progress: Progress = igno
         return mesh
     from clrecon.mesh.compare.distances import compare_meshes
     from clrecon.mesh.refine.decimation import BOUND_VOXEL, decimate_mesh, default_deviation
+    from clrecon.mesh.refine.quadric import collapse_quadric
     from clrecon.mesh.refine.smoothing import smooth_mesh
 
     raw = mesh
     if settings.smooth is not None:
         mesh = smooth_mesh(mesh, settings.smooth, settings.max_deviation_mm, progress=progress)
-    if settings.decimate is not None:
-        mesh = decimate_mesh(mesh, settings.decimate, settings.max_deviation_mm, progress=progress)
+    share = settings.decimate_used
+    if share is not None and settings.method == "g-mc":
+        mesh = collapse_quadric(mesh, share, progress=progress)
+    elif share is not None:
+        mesh = decimate_mesh(mesh, share, settings.max_deviation_mm, progress=progress)
     mesh.report["refinement"] |= {
         "deviation": compare_meshes(mesh, raw, progress=progress),
         "voxel_mm": default_deviation(raw) / BOUND_VOXEL,

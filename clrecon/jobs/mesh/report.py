@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 __all__ = ["MeshReport", "describe_job", "describe_part"]
 
-_OF_ONE = ("quality", "walls", "iso_distance", "refinement", "print")
+_OF_ONE = ("quality", "walls", "iso_distance", "refinement", "print", "cells", "growing")
 """Entries of a mesh that are also at the top of the report if there is only one mesh."""
 
 _SAID_ABOVE = ("vertices", "triangles", "closed", "manifold", "components", "area_mm2", "volume_ml", "bounds_mm")
@@ -62,6 +62,8 @@ def describe_part(part: Part, file: StagedFile, output: str | os.PathLike[str], 
         "bounds_mm": _bounds(part.mesh, space),
         "output": {"format": os.path.splitext(output)[1].lower().lstrip("."), "bytes": file.size},
         "quality": {name: value for name, value in quality.items() if name not in _SAID_ABOVE} or None,
+        "cells": origin.get("cells"),
+        "growing": origin.get("growing"),
         **describe_label(origin),
         **part.facts,
     }
@@ -88,13 +90,14 @@ class MeshReport(RunReport):
     closed, manifold : bool or None
     area_mm2, volume_ml : float or None
     bounds_mm : [[x, y, z], [x, y, z]] or None
-    closed_at_border, topology, keep, keep_largest, min_volume_ml, seeds_mm, split, purpose
+    closed_at_border, topology, method, grow_from, vertex_rule
+    keep, keep_largest, min_volume_ml, seeds_mm, split, purpose
         The settings.
     slabs : int
         Largest number for a surface.
     device_bytes : mapping of str to int
         Most bytes taken on the device, by purpose.
-    quality, walls, iso_distance, refinement, print : mapping or None
+    quality, walls, iso_distance, refinement, print, cells, growing : mapping or None
         Entries of the only mesh.
     meshes : list of mapping
         One for each file, see `describe_part`.
@@ -130,6 +133,9 @@ class MeshReport(RunReport):
     bounds_mm: list[list[float]] | None
     closed_at_border: bool
     topology: str
+    method: str
+    grow_from: list[str | list[float]]
+    vertex_rule: str
     keep: str | None
     keep_largest: int | None
     min_volume_ml: float | None
@@ -150,6 +156,8 @@ class MeshReport(RunReport):
     iso_distance: Mapping[str, Any] | None
     refinement: Mapping[str, Any] | None
     print: Mapping[str, Any] | None
+    cells: Mapping[str, int] | None
+    growing: Mapping[str, Any] | None
     meshes: list[dict[str, Any]]
     output: Mapping[str, Any]
     preset_reason: str | None
@@ -204,6 +212,9 @@ def describe_job(
         **_describe_all(parts, meshes),
         closed_at_border=settings.closed,
         topology=settings.topology,
+        method=settings.method_used,
+        grow_from=[seed if isinstance(seed, str) else [float(value) for value in seed] for seed in settings.grow_from],
+        vertex_rule=settings.vertex_rule,
         keep=settings.keep,
         keep_largest=settings.keep_largest,
         min_volume_ml=settings.min_volume_ml,

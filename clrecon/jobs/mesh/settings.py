@@ -7,10 +7,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from clrecon.errors import UsageError
+from clrecon.jobs.mesh.growing import LABEL_SEED, check_growing, is_label_seed
 from clrecon.jobs.mesh.label_choice import LabelChoice
 from clrecon.jobs.mesh.presets import DEFAULT_PRESET, find_preset
 from clrecon.jobs.mesh.purposes import find_purpose
 from clrecon.jobs.shared.settings import InputSettings
+from clrecon.system.wording import name_parameter
 
 __all__ = ["MeshSettings", "name_level"]
 
@@ -43,6 +45,13 @@ class MeshSettings(InputSettings):
         Close the surface where it meets the border of the volume (outside is air).
     topology : {"separated", "trilinear"}
         Rule where the voxels around a cell do not tell which of them are joined, see `extract_isosurface`.
+    method : str, optional
+        One of `clrecon.operators.surface.methods.METHODS`; None: "i-mc" with seeds in `grow_from`, else "t-mc".
+    grow_from : sequence of str or (x, y, z)
+        Seeds of the method "i-mc": "auto", points in mm of the frame `space`, and ``label:NAME`` of the label map
+        `labels`, which then makes no meshes of its own.
+    vertex_rule : {"linear", "golden", "golden-search"}
+        Where on an edge a vertex lies, see `extract_isosurface`.
     keep : "bone", optional
         Keep only components that look like bone, see `clrecon.mesh.compare.walls`.  With `keep_largest`: of these the
         largest.
@@ -84,6 +93,9 @@ class MeshSettings(InputSettings):
     space: str = "lps"
     closed: bool = True
     topology: str = "separated"
+    method: str | None = None
+    grow_from: Sequence[str | Sequence[float]] = ()
+    vertex_rule: str = "linear"
     keep: str | None = None
     keep_largest: int | None = None
     min_volume_ml: float | None = None
@@ -122,9 +134,13 @@ class MeshSettings(InputSettings):
 
         frame_from_lps(self.space)
         check_topology(self.topology)
-        if self.labels is not None and self.below is not None:
+        check_growing(
+            self.method, self.grow_from, self.vertex_rule, topology=self.topology, inside=self.inside,
+            labels=self.labels,
+        )  # fmt: skip
+        if self.labels_pick and self.below is not None:
             raise UsageError("labels take what lies from one iso value on, not below it")
-        if self.labels is not None and self.topology != "separated":
+        if self.labels_pick and self.topology != "separated":
             raise UsageError(f"the topology {self.topology} follows HU: leave it out with labels, which pick the cells")
 
     def _check_masks(self) -> None:
@@ -158,7 +174,7 @@ class MeshSettings(InputSettings):
             return
         if self.keep != "bone":
             raise UsageError(f"what is kept can be told for bone, not for {self.keep!r}: keep is bone or left out")
-        if self.labels is not None:
+        if self.labels_pick:
             raise UsageError("labels say what is kept: leave keep bone out")
         if self.inside != "above":
             raise UsageError("bone lies above an iso value: keep bone goes with neither below nor a range")
@@ -194,7 +210,7 @@ class MeshSettings(InputSettings):
             raise UsageError(f"the range {name} HU holds nothing: give its lower end first, then a higher one")
         if self.below is not None:
             raise UsageError(f"below takes iso values, not the range {name} HU")
-        if self.labels is not None:
+        if self.labels_pick:
             raise UsageError(f"labels take one iso value, not the range {name} HU")
         if self.topology == "trilinear":
             raise UsageError(f"the topology trilinear follows one level, the range {name} HU has two: leave it out")
@@ -206,6 +222,11 @@ class MeshSettings(InputSettings):
             raise UsageError(f"the share of triangles to take away lies between 0 and 1, {self.decimate:g} does not")
         if self.max_deviation_mm is None:
             return
+        if self.method == "g-mc":
+            raise UsageError(
+                f"{name_parameter('method', 'g-mc')} collapses without a bound: leave"
+                f" {name_parameter('max_deviation_mm')} out, or take {name_parameter('method', 's-mc')}"
+            )
         if not self.refines:
             raise UsageError("a largest deviation bounds smoothing and decimation: ask for one of them too")
         if not (math.isfinite(self.max_deviation_mm) and self.max_deviation_mm > 0.0):
@@ -236,6 +257,30 @@ class MeshSettings(InputSettings):
         return self.labels is None or self.labels.surface == "hu"
 
     @property
+    def labels_pick(self) -> bool:
+        """True where the label map makes the meshes; False without one, and where it only has seeds."""
+        return self.labels is not None and not self.seed_labels
+
+    @property
+    def seed_labels(self) -> tuple[str, ...]:
+        """Labels that surfaces grow from."""
+        return tuple(str(seed)[len(LABEL_SEED) :] for seed in self.grow_from if is_label_seed(seed))
+
+    @property
+    def method_used(self) -> str:
+        """The method of marching cubes."""
+        return self.method or ("i-mc" if self.grow_from else "t-mc")
+
+    @property
+    def decimate_used(self) -> float | None:
+        """Share of the triangles to take away, where the method says one if none is given."""
+        if self.decimate is not None or self.method not in ("g-mc", "s-mc"):
+            return self.decimate
+        from clrecon.operators.surface.methods import DECIMATED_SHARE
+
+        return DECIMATED_SHARE
+
+    @property
     def inside(self) -> str:
         """Values that the surfaces enclose, see `clrecon.geometry.iso_rule.IsoRule`; "between" if one is a range."""
         if self.below is not None:
@@ -245,7 +290,7 @@ class MeshSettings(InputSettings):
     @property
     def refines(self) -> bool:
         """True where the surface is smoothed or decimated."""
-        return self.smooth is not None or self.decimate is not None
+        return self.smooth is not None or self.decimate_used is not None
 
     @property
     def preset_used(self) -> str | None:

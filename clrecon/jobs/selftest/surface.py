@@ -6,15 +6,19 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
+import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.geometry import Volume
 from clrecon.geometry.iso_rule import Level
 from clrecon.jobs.selftest.check import Check, require_close, require_equal, require_whole
 from clrecon.jobs.selftest.scenes import MIRRORED, OBLIQUE, WIDE, noise, stack, waves
+from clrecon.labels import LabelMap
 from clrecon.mesh import Mesh
 from clrecon.opencl import Device
-from clrecon.operators.surface.extract import SurfaceExtractor
+from clrecon.operators.surface.extract import SurfaceExtractor, extract_isosurface
+from clrecon.operators.surface.seeds import AUTO, AUTO_SHARE
+from clrecon.reference.surface import growing as growing_twin
 from clrecon.reference.surface.extract import Surface
 from clrecon.reference.surface.extract import extract_isosurface as extract_twin
 
@@ -31,6 +35,9 @@ MARCHING = ("count_rows", "total_counts", "list_words", "emit_vertices", "emit_t
 
 LONG = (532, 2, 6)
 """Voxels (k, j, i) of more than 500 slices: one of the kernels works slice by slice."""
+
+LONG_THIN = (520, 7, 34)
+"""Voxels of an open volume, of whose rows one kernel finds the begins slice by slice."""
 
 
 def compare_mesh(volume: Volume, mesh: Mesh, expected: Surface, what: str) -> float:
@@ -84,6 +91,52 @@ def _check_variant(
     return f"{len(types)} surfaces: triangles equal, vertices within {worst:.1e} voxel"
 
 
+GROWING = (
+    "find_cell_runs",
+    "begin_cell_runs",
+    "join_cell_runs",
+    "find_run_roots",
+    "mark_grown",
+    "keep_edges",
+    "count_visited",
+)
+"""Kernels that every grown surface launches, beside those of components."""
+
+
+class _GrownTwin:
+    """Cells of components that the twin takes, and what it counts."""
+
+    def __init__(self, marked: NDArray[Any] | None):
+        self.marked = marked
+        self.counts: dict[str, int] = {}
+
+    def __call__(self, inside: NDArray[Any]) -> NDArray[Any]:
+        count, numbers = growing_twin.label_cells(inside)
+        if self.marked is None:
+            chosen = growing_twin.choose_largest(np.bincount(numbers[numbers >= 0], minlength=count), AUTO_SHARE)
+        else:
+            chosen = growing_twin.find_seeded(inside, self.marked, numbers, count)
+        cells = chosen[numbers] & (numbers >= 0)
+        active, visited = int((numbers >= 0).sum()), growing_twin.count_visited(cells)
+        self.counts = {"active": active, "all": cells.size, "grown": int(cells.sum()), "visited": visited}
+        return np.asarray(cells)
+
+
+def _check_growing(device: Device) -> str:
+    """Compare parts of surfaces that grow from the largest components, and from the voxels of a label."""
+    worst = 0.0
+    for dtype, shape, closed, by_label in (("int16", WIDE, True, False), ("float32", LONG_THIN, False, True)):
+        volume = stack(noise(shape, dtype, 8), OBLIQUE)
+        marked = noise(shape, "uint8", 40) == 38  # whose HU are 7
+        twin = _GrownTwin(marked if by_label else None)
+        expected = extract_twin(volume, 6.5, closed=closed, grown=twin)
+        seeds = (LabelMap(marked.astype(np.uint8), volume.affine), 1) if by_label else AUTO
+        mesh = extract_isosurface(volume, 6.5, device=device, closed=closed, grow_from=seeds)
+        worst = max(worst, compare_mesh(volume, mesh, expected, f"a part in {dtype} voxels"))
+        require_equal([mesh.report["cells"][name] for name in twin.counts], list(twin.counts.values()), "cells")
+    return f"2 parts of surfaces: triangles and counts of cells equal, vertices within {worst:.1e} voxel"
+
+
 TRILINEAR = ("count_cells", "make_room", "emit_cell_triangles", "emit_cell_vertices")
 
 CHECKS = (
@@ -110,6 +163,24 @@ CHECKS = (
         ("classify_samples", *MARCHING),
         partial(_check_variant, make=waves, shape=WIDE, level=30.0, below=True),
         {"masks/classify.cl": ("BORDER_INSIDE",)},
+    ),
+    Check(
+        "growing",
+        (*MARCHING, *GROWING, "start_rows", "seed_cell_runs", "flag_roots", "number_components"),
+        _check_growing,
+        {"surface/cells.cl": ("GROWN",)},
+    ),
+    Check(
+        "golden sections",
+        MARCHING,
+        partial(_check_variant, make=waves, shape=WIDE, level=30.0, types=("int16",), vertex_rule="golden"),
+        {"surface/marching_cubes.cl": ("GOLDEN",)},
+    ),
+    Check(
+        "search by golden sections",
+        MARCHING,
+        partial(_check_variant, make=waves, shape=WIDE, level=30.0, types=("int16",), vertex_rule="golden-search"),
+        {"surface/marching_cubes.cl": ("GOLDEN_SEARCH",)},
     ),
     Check(
         "trilinear topology",

@@ -16,23 +16,39 @@ from clrecon.operators.surface.trilinear import CellVertices, count_cells
 __all__ = ["Classified", "Counted", "count", "load_cells"]
 
 
-def load_cells(device: Device) -> Program:
-    """Build the kernels, which are the same for every type of voxels.
+def load_cells(device: Device, grown: bool = False) -> Program:
+    """Build the kernels, which are the same for every type of voxels; with `grown`, those for parts of a surface.
 
     Raises
     ------
     DeviceError
         The driver's compiler refuses.
     """
-    return load_program(device, "surface/cells.cl", device.kernel_variants)
+    variants = {**device.kernel_variants, "GROWN": "1"} if grown else device.kernel_variants
+    return load_program(device, "surface/cells.cl", variants)
 
 
 @dataclass(frozen=True)
 class Classified:
-    """The results of `marching_cubes.classify` for one slab, on the device."""
+    """The results of `marching_cubes.classify` for one slab, on the device.
+
+    Attributes
+    ----------
+    mask_d : buffer, (gk, gj, words) uint32
+        Its crossed edges have the vertices.
+    row_extents_d : buffer, (gk, gj) ushort2
+    inside_d : buffer, optional
+        For a part of a surface the inside mask, see cl/surface/growing.cl; None: `mask_d` is it.
+    """
 
     mask_d: Any
     row_extents_d: Any
+    inside_d: Any = None
+
+    @property
+    def own(self) -> dict[str, Any]:
+        """Arguments of kernels for parts of a surface."""
+        return {} if self.inside_d is None else {"inside": self.inside_d}
 
 
 @dataclass(frozen=True)
@@ -78,7 +94,7 @@ def count(
         The device fails.
     """
     grid, rows = slab.grid, slab.counted_rows
-    program = load_cells(device)
+    program = load_cells(device, classified.inside_d is not None)
     gi, gj, _ = grid.shape
     row_counts_d = allocate(device, 12 * rows)
     word_vertices_d, word_triangles_d = (allocate(device, 2 * rows * grid.words) for _ in range(2))
@@ -88,6 +104,7 @@ def count(
         mask=classified.mask_d, row_extents=classified.row_extents_d, row_counts=row_counts_d,
         words_with_work=flags_d, word_vertices=word_vertices_d, word_triangles=word_triangles_d,
         gi=gi, gj=gj, gk=slab.mask_slices, words=grid.words, flag_words=grid.flag_words, rows_to_count=rows,
+        **classified.own,
     )  # fmt: skip
     cells = None
     if grid.rule.topology == "trilinear":

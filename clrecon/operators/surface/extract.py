@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -14,12 +16,15 @@ from clrecon.opencl import Device
 from clrecon.operators.resident.device_volume import DeviceVolume, take_volume
 from clrecon.operators.surface import marching_cubes
 from clrecon.operators.surface.extraction import Extraction, Part, prepare_isosurface
+from clrecon.operators.surface.growing import prepare_growing
 from clrecon.operators.surface.marching_cubes import Placement
+from clrecon.operators.surface.seeds import Seeds
 from clrecon.operators.surface.slabs import SampleGrid, Slab, plan_slabs
 from clrecon.operators.surface.trilinear import check_row
 from clrecon.points import PointCloud
 from clrecon.system.closing import Closing
 from clrecon.system.progress import Progress
+from clrecon.system.wording import name_parameter
 
 __all__ = ["SurfaceExtractor", "extract_isosurface", "extract_isosurfaces", "prepare_isosurface"]
 
@@ -99,11 +104,21 @@ class SurfaceExtractor(Closing):
         closed: bool = True,
         topology: str = "separated",
         below: bool = False,
+        grow_from: Any = None,
+        vertex_rule: str = "linear",
         progress: Progress | None = None,
     ) -> Mesh:
         """Extract the surface at one iso value, or of one range, see `extract_isosurface`."""
-        grid = self._choose_grid(iso_value, closed, topology, below)
-        return self._resident.attempt(lambda told: self._extract(grid, told, progress))
+        grid = self._choose_grid(iso_value, closed, topology, below, vertex_rule)
+        seeds = None
+        if grow_from is not None:
+            if topology != "separated":
+                raise UsageError(
+                    f"a surface of {name_parameter('topology')} {topology} cannot be grown: leave"
+                    f" {name_parameter('grow_from')} out, or take the topology separated"
+                )
+            seeds, grid = Seeds.read(grow_from, self._resident), replace(grid, grows=True)
+        return self._resident.attempt(lambda told: self._extract(grid, told, progress, seeds))
 
     def extract_vertices(
         self, iso_value: Level, *, closed: bool = True, below: bool = False, progress: Progress | None = None
@@ -119,9 +134,13 @@ class SurfaceExtractor(Closing):
         grid = self._choose_grid(iso_value, closed, "separated", below)
         return self._resident.attempt(lambda told: self._extract_vertices(grid, told, progress))
 
-    def _choose_grid(self, iso_value: Level, closed: bool, topology: str, below: bool) -> SampleGrid:
+    def _choose_grid(
+        self, iso_value: Level, closed: bool, topology: str, below: bool, vertex_rule: str = "linear"
+    ) -> SampleGrid:
         volume = self.volume
-        rule = choose_iso_rule(volume, iso_value, closed, topology, below=below, values=self._resident.values)
+        rule = choose_iso_rule(
+            volume, iso_value, closed, topology, below=below, vertex_rule=vertex_rule, values=self._resident.values
+        )
         grid = SampleGrid(volume, rule)
         if topology == "trilinear":
             check_row(volume)
@@ -135,13 +154,17 @@ class SurfaceExtractor(Closing):
         if progress is not None:
             progress("build", 0, 1)
         with run.stopwatch.timed("build"):
-            prepare_isosurface(self.device, volume.voxels.dtype, rule.topology, volume.uneven, rule.inside)
+            prepare_isosurface(
+                self.device, volume.voxels.dtype, rule.topology, volume.uneven, rule.inside, rule.vertex_rule
+            )
+            if run.grid.grows:
+                prepare_growing(self.device)
         if progress is not None:
             progress("build", 1, 1)
         return run.run(plan_slabs(run.grid, self._resident), progress)
 
-    def _extract(self, grid: SampleGrid, told: list[str], progress: Progress | None) -> Mesh:
-        run = Extraction(self._resident, grid, self._placement(grid))
+    def _extract(self, grid: SampleGrid, told: list[str], progress: Progress | None, seeds: Seeds | None) -> Mesh:
+        run = Extraction(self._resident, grid, self._placement(grid), seeds=seeds)
         positions, normals, triangles = self._run(run, told, progress)
         report = run.describe(len(positions), len(triangles))
         return Mesh(run.placement.to_lps(positions), triangles, normals, report)
@@ -169,6 +192,8 @@ def extract_isosurface(
     closed: bool = True,
     topology: str = "separated",
     below: bool = False,
+    grow_from: Any = None,
+    vertex_rule: str = "linear",
     memory: int | None = None,
     progress: Progress | None = None,
 ) -> Mesh:
@@ -176,24 +201,18 @@ def extract_isosurface(
 
     Marching cubes with a derived, face-consistent case table and vertices shared between cells.  A voxel is inside when
     its value is >= `iso_value`. For integer voxels and an integer `iso_value` k the surface lies at k - 0.5, between
-    the integers, so no face is degenerate.  Vertices are mapped once through the volume's affine, shear included.  They
-    are exact to one unit in the last place of float32 at the volume's largest coordinate (6e-5 mm at 1 m), but stay
-    four of these units away from voxel centres.  From 4096 mm on they are computed relative to the volume's centre and
-    given as float64.
-
-    A volume may have any size: if it does not fit the device, it is processed slab by slab.  The mesh is the same bit
-    for bit.
+    the integers.  Vertices are mapped once through the volume's affine, shear included.  They are exact to one unit in
+    the last place of float32 at the volume's largest coordinate (6e-5 mm at 1 m), but stay four of these units away
+    from voxel centres.  From 4096 mm on they are given as float64.  A volume that does not fit the device is processed
+    slab by slab; the mesh is the same bit for bit.
 
     Parameters
     ----------
     volume : Volume or DeviceVolume
-        Its voxels may be a memory-mapped file larger than the memory of the computer.  A `DeviceVolume` is used
-        directly, with its own device and memory.
+        Its voxels may be a memory-mapped file.  A `DeviceVolume` is used directly, with its own device and memory.
     iso_value : float or (float, float)
-        HU; or the two ends of a range.  Inside of a range are the voxels from its lower to its upper end, both
-        included; the surface lies where the values cross the end that they cross: at 100 to 300 and integer voxels at
-        99.5 and at 300.5, as those at the iso values 100 and 301 do.  Between two neighbouring voxels, one below and
-        one above the range, there is no surface.
+        HU; or the two ends of a range, both included: at 100 to 300 the surface of integer voxels lies at 99.5 and at
+        300.5.  Between two neighbouring voxels, one below and one above the range, there is no surface.
     device : Device, str or int, optional
         See `clrecon.device`; None is the best of the machine.
     closed : bool
@@ -206,29 +225,31 @@ def extract_isosurface(
         cells, so that the surface has the components and tunnels of that field.  Few cells differ.  "trilinear" cannot
         be used with a range.
     below : bool
-        True: enclose the voxels below the iso value: the same vertices and triangles, turned round.  Beyond the border
-        the field then lies as far above the level as it would lie below it otherwise, so that the surface is closed.
+        True: enclose the voxels below the iso value: the same vertices and triangles, turned round, and closed too.
+    grow_from : "auto", (3,) float, LabelMap, (LabelMap, label), Mask, or a list of these, optional
+        Make only what hangs together with a seed, cell by cell: see `clrecon.operators.surface.seeds.Seeds.read`.
+    vertex_rule : {"linear", "golden", "golden-search"}
+        Where on an edge a vertex lies, see `docs/methods.md`.  "golden" misses the surface by up to 0.6 voxels.
     memory : int, optional
-        Bytes that may be taken on the device, see `SurfaceExtractor`; None is all that it has.
+        See `SurfaceExtractor`.
     progress : callable, optional
-        Called as ``progress("build", done, total)`` around the building of the kernels, and as
-        ``progress("slabs", slices done, all slices)`` where there are several.
+        Called as ``progress("build", done, total)`` and ``progress("slabs", slices done, all slices)``.
 
     Returns
     -------
     Mesh
         Triangles are counter-clockwise and normals point as seen from outside: from lower values, with `below` from
         higher ones; `Mesh.report` holds the iso value or the range, the affine, the certificate (``volume.report``),
-        the device, the number of slabs, ``device_bytes`` {volume, scratch, output} of the largest, and the seconds
-        {upload, build, kernels, download}.
+        the device, the number of slabs, ``device_bytes`` of the largest, the seconds, ``cells`` {visited, all}, of a
+        grown surface {grown, active} too, and ``growing``, what was left out of it.
 
     Raises
     ------
     NoSurfaceError
         The iso value crosses nothing; the message gives the range of the data.
     UsageError
-        `volume`, `iso_value` or `topology` is not what it should be, values or the volume are too large for
-        float32, or a row of the volume is too long.
+        An argument is not what it should be, values or the volume are too large for float32, a row of the volume is
+        too long, or a seed is outside of the volume or not near the surface.
     DeviceError
         No device, not even one slice fits its memory, 2^32 vertices or triangles or more, or the device fails or
         computes wrongly.
@@ -239,7 +260,10 @@ def extract_isosurface(
     1995 and Grosso 2016.
     """
     with SurfaceExtractor(volume, device=device, memory=memory) as extractor:
-        return extractor.extract(iso_value, closed=closed, topology=topology, below=below, progress=progress)
+        return extractor.extract(
+            iso_value, closed=closed, topology=topology, below=below, grow_from=grow_from, vertex_rule=vertex_rule,
+            progress=progress,
+        )  # fmt: skip
 
 
 def extract_isosurfaces(

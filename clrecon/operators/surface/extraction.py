@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import Any
 
@@ -17,8 +18,10 @@ from clrecon.opencl import Device, Program, Stopwatch, result_pages
 from clrecon.operators.resident.bricks import BrickStates, brick_bytes, compare_bricks, measure_bricks
 from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.operators.surface import marching_cubes
-from clrecon.operators.surface.cells import Counted, count
+from clrecon.operators.surface.cells import Classified, Counted, count
+from clrecon.operators.surface.growing import Grown, grow, growing_needs, join_slabs, keep_edges
 from clrecon.operators.surface.marching_cubes import Placement
+from clrecon.operators.surface.seeds import Seeds
 from clrecon.operators.surface.slabs import BRICKS, SampleGrid, Slab
 from clrecon.operators.surface.trilinear import prepare_trilinear
 from clrecon.system.progress import Progress
@@ -97,12 +100,22 @@ class Extraction:
     With `vertices_only` it stops after the vertices: the part of a slab then has no triangles.
     """
 
-    def __init__(self, resident: DeviceVolume, grid: SampleGrid, placement: Placement, *, vertices_only: bool = False):
+    def __init__(
+        self,
+        resident: DeviceVolume,
+        grid: SampleGrid,
+        placement: Placement,
+        *,
+        vertices_only: bool = False,
+        seeds: Seeds | None = None,
+    ):
         self.resident = resident
         self.device = resident.device
         self.grid = grid
         self.placement = placement
         self._vertices_only = vertices_only
+        self._seeds = seeds
+        self._grown: Grown | None = None
         self.was_held = resident.is_held
         self.levels = _voxel_levels(resident.device, resident.volume, grid.rule)
         self.stopwatch = Stopwatch()
@@ -113,6 +126,8 @@ class Extraction:
 
     def run(self, slices: int, progress: Progress | None) -> Part:
         """Process the grid, `slices` at a time or fewer."""
+        if self._seeds is not None:
+            self._grow(self._seeds, slices)
         self.resident.halve(
             self.grid.kind, slices, lambda slices: self._go_on(slices, progress), warnings=self.warnings
         )
@@ -138,14 +153,42 @@ class Extraction:
             if progress is not None and (slab.end < gk or self.slabs > 1):
                 progress("slabs", slab.end, gk)
 
+    def _grow(self, seeds: Seeds, slices: int) -> None:
+        """Find the cells of the part of the surface that is made, from the bits of the whole grid."""
+        gk = self.grid.shape[2]
+        whole = Slab(self.grid, 0, gk)
+        needs = growing_needs(self.grid)
+        if slices >= gk:
+            needs["volume"] = whole.volume_bytes()
+            with self.stopwatch.running(self.device):
+                classified = self._classify(whole, self.resident.whole(self.stopwatch))
+        else:
+            shortage = self.resident.shortage({**needs, "volume": Slab(self.grid, 0, slices).volume_bytes()})
+            if shortage:
+                raise DeviceMemoryError(f"a surface cannot be grown: {shortage}")
+            slabs = (Slab(self.grid, first, min(first + slices, gk)) for first in range(0, gk, slices))
+            classified = join_slabs(
+                self.resident, self.grid, ((slab, self._classify(slab, self._upload_part(slab))) for slab in slabs)
+            )
+        self._grown = grow(self.resident, self.grid, classified, seeds, self.stopwatch)
+
+    def _classify(self, slab: Slab, voxels_d: Any) -> Classified:
+        bricks = self._compare_bricks(slab, voxels_d)
+        return marching_cubes.classify(self.device, slab, voxels_d, self.levels, self.stopwatch, bricks)
+
     def _one_slab(self, slab: Slab) -> Part:
         device, stopwatch = self.device, self.stopwatch
         volume, inside = self.grid.volume, self.grid.rule.inside
-        program = prepare_isosurface(device, volume.voxels.dtype, uneven=volume.uneven, inside=inside)
+        program = prepare_isosurface(
+            device, volume.voxels.dtype, uneven=volume.uneven, inside=inside, vertex_rule=self.grid.rule.vertex_rule
+        )
         voxels_d = self.resident.whole(stopwatch) if slab.is_whole else self._upload_part(slab)
         with stopwatch.running(device):
-            bricks = self._compare_bricks(slab, voxels_d)
-            classified = marching_cubes.classify(device, slab, voxels_d, self.levels, stopwatch, bricks)
+            if self._grown is None:
+                classified = self._classify(slab, voxels_d)
+            else:
+                own = self._grown.classified if slab.is_whole else self._classify(slab, voxels_d)
+                classified = keep_edges(device, slab, self._grown, own, stopwatch)
             counted = count(device, slab, classified, stopwatch, voxels_d)
         if self._vertices_only:
             counted = replace(counted, triangles=0)
@@ -191,6 +234,13 @@ class Extraction:
         for what, size in (("volume", volume), ("output", output), ("scratch", sum(needs.values()) - volume - output)):
             self.largest[what] = max(self.largest[what], size)
 
+    def _count_cells(self) -> dict[str, int]:
+        """Cells that are visited, of all; of a surface that is grown also the active and the grown ones."""
+        if self._grown is not None:
+            return self._grown.cells
+        every = math.prod(n - 1 for n in self.grid.shape)
+        return {"visited": every, "all": every}
+
     def describe(self, vertices: int, triangles: int) -> dict[str, Any]:
         """Return the report of a mesh: how it was made, without patient data."""
         rule = self.grid.rule
@@ -201,6 +251,8 @@ class Extraction:
             "topology": rule.topology,
             "outside_hu": rule.outside if rule.closed else None,
             "affine_ijk_to_lps_mm": self.grid.volume.affine.tolist(),
+            "cells": self._count_cells(),
+            "growing": None if self._grown is None else self._grown.growing,
             "certificate": self.grid.volume.report,
             "device": self.device.label,
             "driver": self.device.driver,
@@ -223,10 +275,11 @@ def prepare_isosurface(
     topology: str = "separated",
     uneven: bool = False,
     inside: str = "above",
+    vertex_rule: str = "linear",
 ) -> Program:
     """Build the kernels for volumes of `dtype` now, so that a later `extract_isosurface` with `topology` does not wait.
 
-    With `uneven`, for volumes with uneven slices; `inside` as in `IsoRule.inside`.
+    With `uneven`, for volumes with uneven slices; `inside` and `vertex_rule` as in `IsoRule`.
 
     Raises
     ------
@@ -235,4 +288,4 @@ def prepare_isosurface(
     """
     if topology == "trilinear":
         prepare_trilinear(device, dtype)
-    return marching_cubes.prepare_marching_cubes(device, dtype, uneven=uneven, inside=inside)
+    return marching_cubes.prepare_marching_cubes(device, dtype, uneven=uneven, inside=inside, vertex_rule=vertex_rule)

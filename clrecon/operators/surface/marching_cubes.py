@@ -66,11 +66,12 @@ def prepare_marching_cubes(
     inside: str = "above",
     *,
     masks: bool = False,
+    vertex_rule: str = "linear",
 ) -> Program:
     """Build the kernels for volumes of `dtype`, and return emit_vertices; with `labels` (their type) it takes labels.
 
-    With `uneven`, for volumes with uneven slices; `inside` as in `IsoRule.inside`; with `masks`, for surfaces of label
-    masks, whose volumes are occupancies.
+    With `uneven`, for volumes with uneven slices; `inside` and `vertex_rule` as in `IsoRule`; with `masks`, for
+    surfaces of label masks, whose volumes are occupancies.
 
     Raises
     ------
@@ -88,6 +89,8 @@ def prepare_marching_cubes(
         variants.update({"MASKS" if masks else "LABELS": "1"}, **label_variants(labels))
     if uneven:
         variants["UNEVEN"] = "1"
+    if vertex_rule != "linear":
+        variants[vertex_rule.upper().replace("-", "_")] = "1"
     return load_program(device, "surface/marching_cubes.cl", variants)
 
 
@@ -252,11 +255,12 @@ class Emission:
             return
         slab, counted = self._slab, self._counted
         gi, gj, _ = slab.grid.shape
+        program = load_cells(self._device, self._classified.inside_d is not None)
         launch(
-            self._device, load_cells(self._device)["emit_triangles"], self._items, stopwatch=self._stopwatch,
+            self._device, program["emit_triangles"], self._items, stopwatch=self._stopwatch,
             word_triangles=counted.word_triangles_d, triangles=self.triangles_d, first_vertex=first_vertex,
             rows_to_count=slab.counted_rows, gi=gi, gj=gj, gk=slab.mask_slices, words=slab.grid.words,
-            mirrored=slab.grid.winds_backwards, **self._common,
+            mirrored=slab.grid.winds_backwards, **self._common, **self._classified.own,
         )  # fmt: skip
 
     @property

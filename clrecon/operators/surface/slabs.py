@@ -25,10 +25,13 @@ class SampleGrid:
     ----------
     volume : Volume
     rule : IsoRule
+    grows : bool
+        Only a part of the surface is made, for which bits of the whole grid stay on the device.
     """
 
     volume: Volume
     rule: IsoRule
+    grows: bool = False
 
     @cached_property
     def shape(self) -> tuple[int, int, int]:
@@ -39,7 +42,8 @@ class SampleGrid:
     @property
     def kind(self) -> str:
         """Key of the grid: grids with the same key need the same memory."""
-        return f"{self.rule.topology} surface with a border of {self.rule.border}"
+        grown = "grown " * self.grows
+        return f"{grown}{self.rule.topology} surface with a border of {self.rule.border}"
 
     @property
     def words(self) -> int:
@@ -131,7 +135,9 @@ class Slab:
         """Return the most bytes of every buffer between the volume and the mesh, by description."""
         counted_words = self.counted_rows * self.grid.words
         cell_vertices = 8 * self.counted_rows + 2 * self.rows * self.grid.words
+        grown = 4 * self.grid.shape[1] * self.grid.shape[2] * (self.grid.words + 1)
         return {
+            **({"grown cells": grown, "kept mask": 4 * self.mask_rows * self.grid.words} if self.grid.grows else {}),
             **({"cell vertices": cell_vertices} if self.grid.rule.topology == "trilinear" else {}),
             "inside mask": 4 * self.mask_rows * self.grid.words,
             "word counts": 4 * counted_words,

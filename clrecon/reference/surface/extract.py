@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,6 +18,7 @@ from clrecon.geometry.iso_rule import (
     slice_normal_matrices,
     vertex_margin,
 )
+from clrecon.geometry.vertex_rules import golden_fraction, search_fraction
 from clrecon.reference.surface.case_table import CORNERS, EDGES, case_table
 from clrecon.reference.surface.trilinear import find_row, place_cell_vertices
 from clrecon.reference.surface.trilinear_table import CELL_VERTEX
@@ -85,10 +87,12 @@ def _edge_vertex(numbers: NDArray[np.int64], cell: NDArray[np.int64], edge: int)
     return int(numbers[k, j, i, axis])
 
 
-def _find_triangles(inside: NDArray[np.bool_], numbers: NDArray[np.int64]) -> NDArray[np.uint32]:
-    """Return the triangles of all cells by the case table, in the order of the cells."""
+def _find_triangles(
+    inside: NDArray[np.bool_], numbers: NDArray[np.int64], wanted: NDArray[np.bool_] | None = None
+) -> NDArray[np.uint32]:
+    """Return the triangles of all cells by the case table, or those wanted, in the order of the cells."""
     cases = _find_cases(inside)
-    cells = np.argwhere((cases != 0) & (cases != 255))
+    cells = np.argwhere((cases != 0) & (cases != 255) & (True if wanted is None else wanted))
     case_of = cases[tuple(cells.T)]
     found, order = [np.empty((0, 3), np.int64)], [np.empty(0, np.int64)]
     for case in np.unique(case_of):
@@ -139,7 +143,14 @@ def _find_trilinear_triangles(
 
 
 def extract_isosurface(
-    volume: Volume, iso_value: Level, *, closed: bool = True, topology: str = "separated", below: bool = False
+    volume: Volume,
+    iso_value: Level,
+    *,
+    closed: bool = True,
+    topology: str = "separated",
+    below: bool = False,
+    vertex_rule: str = "linear",
+    grown: Callable[[NDArray[np.bool_]], NDArray[np.bool_]] | None = None,
 ) -> Surface:
     """Extract the iso surface of a small volume.
 
@@ -154,6 +165,9 @@ def extract_isosurface(
         Keep inside corners apart that only meet across a face or cell, or join them where the trilinear field does.
     below : bool
         True: inside is below the iso value.
+    vertex_rule : {"linear", "golden", "golden-search"}
+    grown : callable, optional
+        Function from the samples that are inside, (gk, gj, gi), to the cells whose triangles are wanted; None: all.
 
     Returns
     -------
@@ -161,19 +175,24 @@ def extract_isosurface(
     normals : ndarray, shape (n, 3), float64, unit, towards what is outside
     triangles : ndarray, shape (m, 3), uint32, counter-clockwise as seen from outside
     """
-    rule = choose_iso_rule(volume, iso_value, closed, topology, below=below)
+    rule = choose_iso_rule(volume, iso_value, closed, topology, below=below, vertex_rule=vertex_rule)
     inside = rule.mark_inside(sample_grid(volume, rule, rule.border))
     if rule.closed:
         inside[[0, -1]] = inside[:, [0, -1]] = inside[:, :, [0, -1]] = False
+    cells = None if grown is None else grown(inside)
     if not below:
-        return extract_inside(volume, rule, inside)
+        return extract_inside(volume, rule, inside, cells=cells)
     # The surface around the other samples, turned round: exactly that of the iso value, in ambiguous cells too.
-    positions, normals, triangles = extract_inside(volume, rule, ~inside)
+    positions, normals, triangles = extract_inside(volume, rule, ~inside, cells=cells)
     return positions, -normals, triangles[:, ::-1].copy()
 
 
 def extract_inside(
-    volume: Volume, rule: IsoRule, inside: NDArray[np.bool_], hu_places: NDArray[np.bool_] | None = None
+    volume: Volume,
+    rule: IsoRule,
+    inside: NDArray[np.bool_],
+    hu_places: NDArray[np.bool_] | None = None,
+    cells: NDArray[np.bool_] | None = None,
 ) -> Surface:
     """Extract the surface between the samples that are inside and the others.
 
@@ -186,6 +205,8 @@ def extract_inside(
     hu_places : ndarray, shape (gk, gj, gi), bool, optional
         Where both samples of an edge are marked, HU place the vertex at the iso level.  Elsewhere it lies half way, and
         its normal follows `inside`. None: HU place every vertex.
+    cells : ndarray, shape (gk - 1, gj - 1, gi - 1), bool, optional
+        Cells whose triangles are wanted.
 
     Returns
     -------
@@ -206,13 +227,19 @@ def extract_inside(
         above = np.maximum(value, next_value) > rule.highest_inside
     level = np.where(above, rule.upper_level or 0.0, rule.iso_level)
     t = np.where(half_way, 0.5, np.clip((level - value) / change, margin, 1.0 - margin))
+    if rule.vertex_rule == "golden":
+        t = golden_fraction(value)
+    elif rule.vertex_rule == "golden-search":
+        along = np.arange(len(edges.axis)), edges.axis
+        before, after = next_value - 2.0 * slopes[edges.near][along], value + 2.0 * slopes[edges.far][along]
+        t = np.clip(search_fraction(before, value, next_value, after, level), margin, 1.0 - margin)
     slope, next_slope = (1.0 - t[:, None]) * slopes[edges.near], t[:, None] * slopes[edges.far]
     if half_way.any():
         around = np.pad(inside.astype(np.float64), 1, mode="constant" if rule.closed else "edge")
         slopes = gradients(around, rule.closed)
         slope[half_way], next_slope[half_way] = slopes[edges.near][half_way], slopes[edges.far][half_way]
     slope[above], next_slope[above] = -slope[above], -next_slope[above]  # gradients point inwards from here on
-    return build_surface(volume, rule, inside, edges, t, slope, next_slope)
+    return build_surface(volume, rule, inside, edges, t, slope, next_slope, cells)
 
 
 @dataclass(frozen=True)
@@ -259,6 +286,7 @@ def build_surface(
     t: NDArray[np.float64],
     slope: NDArray[np.float64],
     next_slope: NDArray[np.float64],
+    cells_wanted: NDArray[np.bool_] | None = None,
 ) -> Surface:
     """Place the vertices at the parts `t` of their edges, and write the triangles.
 
@@ -269,6 +297,8 @@ def build_surface(
     slope, next_slope : ndarray, shape (n, 3)
         Parts of the two ends in the gradient at the vertex, per step along i, j, k; where their sum vanishes, the
         direction of the edge is used.
+    cells_wanted : ndarray, shape (gk - 1, gj - 1, gi - 1), bool, optional
+        Cells whose triangles are wanted, of the topology "separated"; vertices of no triangle are left out then.
     """
     (k, j, i), (k1, j1, i1), axis, numbers = edges.near, edges.far, edges.axis, edges.numbers
     slope, next_slope = slope.copy(), next_slope.copy()
@@ -285,7 +315,7 @@ def build_surface(
     at_samples = slice_normal_matrices(volume, rule.border)
     up = np.einsum("nij,nj->ni", at_samples[k], slope) + np.einsum("nij,nj->ni", at_samples[k1], next_slope)
     if rule.topology == "separated":
-        triangles = _find_triangles(inside, numbers)
+        triangles = _find_triangles(inside, numbers, cells_wanted)
     else:
         heights = field.astype(np.float32) - np.float32(rule.iso_level)
         in_cells = np.column_stack([np.broadcast_to(margins[:2], (len(layers), 2)), layers])
@@ -299,6 +329,9 @@ def build_surface(
         triangles = np.argsort(order).astype(np.uint32)[triangles]
         positions, up = (np.concatenate(pair)[order] for pair in ((positions, placed), (up, cell_up)))
     normals = -up / np.linalg.norm(up, axis=1, keepdims=True)
+    if cells_wanted is not None:
+        used, left = np.unique(triangles, return_inverse=True)
+        positions, normals, triangles = positions[used], normals[used], left.reshape(-1, 3).astype(np.uint32)
     if is_left_handed(volume.affine):
         triangles = triangles[:, ::-1].copy()
     return positions, normals, triangles

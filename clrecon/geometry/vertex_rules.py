@@ -1,0 +1,105 @@
+"""Rules for where on a crossed edge of the sample grid a vertex lies, as fractions of the edge.
+
+References
+----------
+Lorensen and Cline 1987 (linear); Liu et al. 2019, "Vertebrae CT Images 3D Reconstruction with Improve Marching Cubes
+Algorithm", J. Harbin Inst. Technol. (New Series) 26(6), eq. 6-11 (golden section); Catmull and Rom 1974; Kiefer 1953
+(golden-section search).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from clrecon.errors import UsageError
+from clrecon.system.wording import name_parameter
+
+__all__ = [
+    "GOLDEN", "SEARCH_STEPS", "VERTEX_RULES", "check_vertex_rule", "cubic_value", "golden_fraction", "linear_fraction",
+    "normal_on_edge", "point_on_edge", "search_fraction",
+]  # fmt: skip
+
+VERTEX_RULES = ("linear", "golden", "golden-search")
+
+GOLDEN = 0.6180340
+"""(sqrt(5) - 1) / 2 in the digits of the paper, which float32 holds to its last place."""
+
+SEARCH_STEPS = 24
+"""Cuts of an edge: the last part is 0.618^24, 1e-5 of it."""
+
+
+def check_vertex_rule(vertex_rule: str, topology: str = "separated") -> None:
+    """Refuse an unknown rule, and one that does not go with the topology.
+
+    Raises
+    ------
+    UsageError
+    """
+    if vertex_rule not in VERTEX_RULES:
+        raise UsageError(f"{name_parameter('vertex_rule')} is one of {', '.join(VERTEX_RULES)}, not {vertex_rule!r}")
+    if vertex_rule != "linear" and topology == "trilinear":
+        raise UsageError(
+            f"{name_parameter('vertex_rule', vertex_rule)} and {name_parameter('topology', 'trilinear')} exclude each"
+            " other: the trilinear field is linear along edges"
+        )
+
+
+def linear_fraction(value: ArrayLike, next_value: ArrayLike, level: ArrayLike) -> NDArray[np.float64]:
+    """Return where values that are linear along an edge cross the level: (level - f0) / (f1 - f0)."""
+    first, last = np.asarray(value, np.float64), np.asarray(next_value, np.float64)
+    return np.asarray((np.asarray(level) - first) / (last - first))
+
+
+def golden_fraction(value: ArrayLike) -> NDArray[np.float64]:
+    """Return the constant of eq. 6-8 for every edge, whatever its values."""
+    return np.full(np.shape(value), GOLDEN)
+
+
+def point_on_edge(corner: ArrayLike, axis: int, fraction: ArrayLike) -> NDArray[np.float64]:
+    """Return the point at a fraction of the edge from a corner (x, y, z) along an axis.
+
+    Eq. 6, 7 and 8 for the axes 0, 1 and 2, with the golden constant as the fraction: (x + g, y, z), (x, y + g, z),
+    (x, y, z + g).
+    """
+    placed = np.array(corner, np.float64)
+    placed[..., axis] += np.asarray(fraction, np.float64)
+    return placed
+
+
+def normal_on_edge(normal: ArrayLike, next_normal: ArrayLike, fraction: ArrayLike) -> NDArray[np.float64]:
+    """Return the normal at a fraction of an edge, between those at its corners: eq. 9-11, N0 + t (N1 - N0), not yet of
+    length 1.
+
+    The paper writes one equation for each axis of edges; they differ in the second corner alone.
+    """
+    first = np.asarray(normal, np.float64)
+    return np.asarray(first + np.asarray(fraction)[..., None] * (np.asarray(next_normal, np.float64) - first))
+
+
+def cubic_value(
+    before: ArrayLike, value: ArrayLike, next_value: ArrayLike, after: ArrayLike, fraction: ArrayLike
+) -> NDArray[np.float64]:
+    """Return the cubic of Catmull and Rom through four values one step apart, at a fraction between the middle two."""
+    f0, f1, t = np.asarray(value, np.float64), np.asarray(next_value, np.float64), np.asarray(fraction)
+    rise, next_rise = (f1 - np.asarray(before)) / 2.0, (np.asarray(after) - f0) / 2.0
+    second, third = 3.0 * (f1 - f0) - 2.0 * rise - next_rise, 2.0 * (f0 - f1) + rise + next_rise
+    return np.asarray(f0 + t * (rise + t * (second + t * third)))
+
+
+def search_fraction(
+    before: ArrayLike, value: ArrayLike, next_value: ArrayLike, after: ArrayLike, level: ArrayLike
+) -> NDArray[np.float64]:
+    """Return where the cubic through four values crosses the level between the middle two, by golden sections.
+
+    Each step cuts what is left of the edge by the golden section and keeps the part whose ends lie on both sides of the
+    level, so that a crossing is found even where the cubic has three.
+    """
+    levels, rises = np.asarray(level), np.asarray(next_value) > np.asarray(value)
+    low = np.zeros(np.broadcast(value, levels).shape)
+    high = np.ones_like(low)
+    for _ in range(SEARCH_STEPS):
+        cut = low + GOLDEN * (high - low)
+        beyond = (cubic_value(before, value, next_value, after, cut) >= levels) == rises
+        low, high = np.where(beyond, low, cut), np.where(beyond, cut, high)
+    return 0.5 * (low + high)

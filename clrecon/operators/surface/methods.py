@@ -1,0 +1,229 @@
+"""Methods of marching cubes by the names that papers give them: one table, and a mesh by any of them.
+
+Reference: Liu et al. 2019, "Vertebrae CT Images 3D Reconstruction with Improve Marching Cubes Algorithm", J. Harbin
+Inst. Technol. (New Series) 26(6): T-MC, G-MC, S-MC and I-MC.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from clrecon.errors import NoSurfaceError, UsageError
+from clrecon.geometry import Volume, is_left_handed
+from clrecon.geometry.iso_rule import IsoRule, Level, choose_iso_rule
+from clrecon.mesh import Mesh
+from clrecon.mesh.normals import vertex_normals
+from clrecon.opencl import Device
+from clrecon.operators.resident.device_volume import DeviceVolume
+from clrecon.operators.surface.extract import SurfaceExtractor
+from clrecon.operators.surface.seeds import AUTO
+from clrecon.operators.surface.soup import extract_soup, weld
+from clrecon.system.progress import Progress
+from clrecon.system.wording import name_parameter
+
+__all__ = ["DECIMATED_SHARE", "METHODS", "Method", "check_method", "extract_by_method"]
+
+DECIMATED_SHARE = 0.9
+"""Share of the triangles that G-MC and S-MC take away, if none is given."""
+
+
+@dataclass(frozen=True)
+class Method:
+    """A method of marching cubes.
+
+    Attributes
+    ----------
+    name : str
+    what : str
+        In words.
+    on_device : bool
+        Extracted by the kernels; else in numpy, as a row for comparisons.
+    grows : bool
+    decimates : {"", "quadric", "bounded"}
+    """
+
+    name: str
+    what: str
+    on_device: bool = True
+    grows: bool = False
+    decimates: str = ""
+
+
+METHODS = {
+    method.name: method
+    for method in (
+        Method("t-mc", "every cell, shared vertices"),
+        Method("i-mc", "only cells that hang together with seeds", grows=True),
+        Method("g-mc", "t-mc, then quadric collapse without a bound", decimates="quadric"),
+        Method("s-mc", "t-mc, then decimation within a bound, topology kept", decimates="bounded"),
+        Method("t-mc-soup", "every cell, triangles of their own, welded afterwards (numpy)", on_device=False),
+        Method("skimage", "scikit-image's marching cubes, placed by the scan's geometry", on_device=False),
+    )
+}
+
+
+def check_method(
+    method: str,
+    *,
+    grows: bool = False,
+    vertex_rule: str = "linear",
+    topology: str = "separated",
+    plain: bool = True,
+) -> Method:
+    """Return a method of the table.
+
+    Parameters
+    ----------
+    grows : bool
+        Seeds are given.
+    plain : bool
+        The surface is that of one iso value and what lies above it.
+
+    Raises
+    ------
+    UsageError
+        There is no such method, or it does not go with the other choices.
+    """
+    if method not in METHODS:
+        raise UsageError(f"there is no {name_parameter('method', method)}: it is one of {', '.join(METHODS)}")
+    chosen, said = METHODS[method], name_parameter("method", method)
+    if grows and not chosen.grows:
+        raise UsageError(
+            f"{said} makes the whole surface: leave {name_parameter('grow_from')} out, or take"
+            f" {name_parameter('method', 'i-mc')}"
+        )
+    if (grows or chosen.grows) and topology != "separated":
+        raise UsageError(
+            f"a surface of {name_parameter('topology', topology)} cannot be grown: it is grown cell by cell"
+        )
+    if chosen.on_device:
+        return chosen
+    for name, value, usual in (("vertex_rule", vertex_rule, "linear"), ("topology", topology, "separated")):
+        if value != usual:
+            raise UsageError(f"{said} has its own rules: leave {name_parameter(name, value)} out")
+    if not plain:
+        raise UsageError(
+            f"{said} takes one iso value, what lies above it is inside: neither ranges nor what lies below"
+        )
+    return chosen
+
+
+def extract_by_method(
+    volume: Volume | DeviceVolume,
+    iso_value: Level,
+    method: str,
+    *,
+    grow_from: Any = None,
+    vertex_rule: str = "linear",
+    decimate: float | None = None,
+    closed: bool = True,
+    device: Device | str | int | None = None,
+    memory: int | None = None,
+    progress: Progress | None = None,
+) -> Mesh:
+    """Extract an iso surface by one of the methods that papers compare.
+
+    Parameters
+    ----------
+    volume : Volume or DeviceVolume
+    iso_value : float or (float, float)
+        HU, see `extract_isosurface`.
+    method : {"t-mc", "i-mc", "g-mc", "s-mc", "t-mc-soup", "skimage"}
+        See `METHODS` and `docs/methods.md`.
+    grow_from : optional
+        Seeds of "i-mc", see `extract_isosurface`; None: "auto".
+    vertex_rule : {"linear", "golden", "golden-search"}
+    decimate : float, optional
+        Share of the triangles that "g-mc" and "s-mc" take away; 0.9 by default.
+    closed, device, memory, progress
+        As `extract_isosurface`.
+
+    Returns
+    -------
+    Mesh
+        In LPS mm; its report has ``method``, and of "t-mc-soup" and "skimage" ``seconds`` {extract, weld}.
+
+    Raises
+    ------
+    UsageError
+        The method is unknown, or an argument does not go with it.
+    NoSurfaceError, DeviceError
+        As `extract_isosurface`.
+    """
+    chosen = check_method(
+        method, grows=grow_from is not None, vertex_rule=vertex_rule, plain=not np.ndim(iso_value)
+    )  # fmt: skip
+    if decimate is not None and not chosen.decimates:
+        raise UsageError(f"{name_parameter('method', method)} takes no triangles away: leave the share out")
+    if not chosen.on_device:
+        mesh = _extract_on_host(volume, iso_value, method, closed)
+    else:
+        with SurfaceExtractor(volume, device=device, memory=memory) as extractor:
+            mesh = extractor.extract(
+                iso_value, closed=closed, vertex_rule=vertex_rule, progress=progress,
+                grow_from=(AUTO if grow_from is None else grow_from) if chosen.grows else None,
+            )  # fmt: skip
+    if chosen.decimates:
+        from clrecon.mesh.refine.decimation import decimate_mesh
+        from clrecon.mesh.refine.quadric import collapse_quadric
+
+        share = DECIMATED_SHARE if decimate is None else decimate
+        collapse = collapse_quadric if chosen.decimates == "quadric" else decimate_mesh
+        mesh = collapse(mesh, share, progress=progress)
+    mesh.report["method"] = method
+    return mesh
+
+
+def _extract_on_host(volume: Volume | DeviceVolume, iso_value: Level, method: str, closed: bool) -> Mesh:
+    """Extract without a device: the rows of comparisons."""
+    scan = volume.volume if isinstance(volume, DeviceVolume) else volume
+    rule = choose_iso_rule(scan, iso_value, closed)
+    started = time.perf_counter()
+    if method == "skimage":
+        vertices, triangles = _extract_by_skimage(scan, rule)
+        extracted = time.perf_counter()
+    else:
+        soup = extract_soup(scan, rule)
+        extracted = time.perf_counter()
+        vertices, triangles = weld(soup)
+    if not len(triangles):
+        raise NoSurfaceError(f"no surface {rule.describe_place()}")
+    welded = time.perf_counter()
+    every = int(np.prod([n + 2 * rule.border - 1 for n in scan.shape_ijk]))
+    report = {
+        **rule.as_report(),
+        "closed_at_border": rule.closed,
+        "topology": rule.topology,
+        "outside_hu": rule.outside if rule.closed else None,
+        "affine_ijk_to_lps_mm": scan.affine.tolist(),
+        "cells": {"visited": every, "all": every},
+        "growing": None,
+        "certificate": scan.report,
+        "seconds": {"extract": extracted - started, "weld": welded - extracted},
+        "warnings": [],
+    }
+    places = vertices.astype(np.float32)
+    return Mesh(places, triangles, vertex_normals(places, triangles), report)
+
+
+def _extract_by_skimage(volume: Volume, rule: IsoRule) -> tuple[np.ndarray[Any, Any], np.ndarray[Any, Any]]:
+    """Extract by scikit-image in voxels, and place the vertices by the geometry of the scan, uneven slices included."""
+    try:
+        from skimage.measure import marching_cubes
+    except ImportError as error:
+        raise UsageError(f"{name_parameter('method', 'skimage')} needs scikit-image, which is not installed") from error
+    values = volume.voxels.astype(np.float32)
+    if rule.closed:
+        values = np.pad(values, 1, constant_values=np.float32(rule.outside))
+    try:
+        found, faces, _, _ = marching_cubes(values, rule.iso_level, allow_degenerate=False)
+    except (ValueError, RuntimeError) as error:
+        raise NoSurfaceError(f"no surface {rule.describe_place()}: {error}") from error
+    vertices = volume.ijk_to_lps(found[:, ::-1].astype(np.float64) - rule.border)
+    # In (k, j, i) its triangles are counter-clockwise as seen from higher values; reversing the axes mirrors them.
+    triangles = faces[:, ::-1] if is_left_handed(volume.affine) else faces
+    return vertices, np.ascontiguousarray(triangles, np.uint32)
