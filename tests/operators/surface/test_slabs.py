@@ -52,6 +52,19 @@ def test_a_resident_volume_can_be_asked_for_a_surface_that_does_not_fit_as_a_who
     assert_same(again, extract_isosurface(volume, 100, device=device, closed=False))
 
 
+def test_building_and_slices_that_are_done_are_told(device, monkeypatch):
+    """Slices are those of the samples, one beyond the volume at each end."""
+    told: list[tuple[str, int, int]] = []
+    volume = smooth_volume((23, 9, 10))
+    extract_isosurface(volume, 100, device=device, progress=lambda *step: told.append(step))
+    building = [("build", 0, 1), ("build", 1, 1)]
+    assert told == building
+    told.clear()
+    monkeypatch.setattr(isosurface, "plan_slabs", lambda *_: 10)
+    extract_isosurface(volume, 100, device=device, progress=lambda *step: told.append(step))
+    assert told == [*building, ("slabs", 10, 25), ("slabs", 20, 25), ("slabs", 25, 25)]
+
+
 def test_empty_slabs_in_between_do_no_harm(device):
     voxels = np.zeros((30, 8, 40), np.int16)
     voxels[3:6, 2:5, 5:9] = voxels[20:24, 3:6, 20:36] = 100
