@@ -66,6 +66,15 @@ def test_a_small_cloud_in_small_chunks(device):
     assert np.array_equal(cores, expected_cores)
 
 
+@pytest.mark.parametrize("n", [0, 1, 4])
+def test_what_is_said_of_points_that_are_fewer_than_a_core_needs(n):
+    """No device is needed: nothing is compared."""
+    found = cluster_free_points(np.zeros((n, 3)), 2.0, 5)
+    assert found.facts == {"eps_mm": 2.0, "min_samples": 5, "clusters": 0, "core_points": 0, "noise_points": n}
+    assert found.warnings == (f"{n} points are fewer than min_samples 5: all are noise",)
+    assert (found.count, found.labels.tolist(), found.cores.tolist()) == (0, [-1] * n, [False] * n)
+
+
 def test_cells_of_far_points_are_smaller_by_a_tenth_at_most():
     """They are 1 / sqrt(3) mm, less 0.001 and what coordinates in float32 need, or a tenth: then there are too many."""
     with pytest.raises(UsageError, match=r"^cells of 0\.519038 mm: the box of the points, 1e\+07 x 0 x 0 mm, has "):
