@@ -181,14 +181,6 @@ def test_eps_beyond_the_box_gives_one_cluster(device, eps):
     assert found.facts["cells"] == 1
 
 
-def test_fewer_points_than_samples_are_noise_with_a_warning(device):
-    points = scattered_points(5)
-    found = cluster_free_points(points, 1.0, 6, device=device)
-    assert found.labels.tolist() == [-1] * 5
-    assert found.warnings == ("5 points are fewer than min_samples 6: all are noise",)
-    assert cluster_free_points(points[:0], 1.0, 6, device=device).labels.shape == (0,)
-
-
 @pytest.mark.parametrize("eps", [0, -1.0, np.nan, np.inf, 1e-10, "1"])
 def test_eps_that_is_no_distance_is_refused(eps):
     with pytest.raises(UsageError, match=r"eps=.*: a distance in mm is needed, at least 1e-09"):
