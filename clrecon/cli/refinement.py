@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Mapping
 from typing import Any
 
 from clrecon.cli.console import Console
@@ -96,10 +97,22 @@ def describe_refinement(meshes: list[dict[str, Any]]) -> list[str]:
 def _describe_decimation(found: dict[str, Any]) -> str:
     """Describe how many triangles were removed, how many were asked for, and why decimation ended."""
     asked, reached = 100 * found["fraction"], 100 * found["reached"]
+    topology = _describe_topology(found["topology"])
     if found["ended_by"] == "share":
-        return f"{reached:.1f} % of the triangles taken away, as asked"
+        return f"{reached:.1f} % of the triangles taken away, as asked, {topology}"
     bound = f"the bound of {found['max_deviation_mm']:.3g} mm"
-    return f"{reached:.1f} % of the triangles taken away of {asked:g} % asked for: {bound} ended it"
+    return f"{reached:.1f} % of the triangles taken away of {asked:g} % asked for: {bound} ended it, {topology}"
+
+
+def _describe_topology(found: Mapping[str, Any]) -> str:
+    """Describe the Euler number before and after, and in how many components it changed."""
+    before, after = found["euler_number_before"], found["euler_number_after"]
+    if not (found["components_changed"] or found["components_lost"]):
+        return f"Euler number {before} before and after"
+    parts = [f"changed in {found['components_changed']} of {found['components_before']} components"]
+    if found["components_lost"]:
+        parts.append(f"{found['components_lost']} lost")
+    return f"Euler number {before} before, {after} after ({', '.join(parts)})"
 
 
 def _describe_purpose(purpose: Purpose) -> str:

@@ -2,25 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from clrecon.system.pieces import chunks, local_origin
+from clrecon.system.pieces import in_threads, local_origin
 
 __all__ = ["count_self_intersections", "find_beside", "find_self_intersections"]
 
 _CELLS_A_TRIANGLE = 8
 """Largest mean number of cells for a triangle; cells are enlarged until it holds."""
 
-_PIECE = 1 << 14
+_PIECE = 1 << 16
+"""Pairs of triangles in one cell that are examined together."""
 
 _FEW = 0.05
 """Share of changed triangles up to which it is faster to search only around them."""
 
 Float64Array = NDArray[np.float64]
-Pairs = tuple[NDArray[np.int64], NDArray[np.int64]]
 
 
 def count_self_intersections(vertices: NDArray[np.floating], triangles: NDArray[np.uint32]) -> int:
@@ -48,29 +48,29 @@ def find_self_intersections(
     ndarray, shape (k, 2), int64
         Numbers of triangles.
     """
-    found = [np.zeros((0, 2), dtype=np.int64)]
-    if len(triangles):
-        points = (vertices - local_origin(vertices))[triangles.T]  # corner, triangle, axis
-        low, high = (np.ascontiguousarray(end.T) for end in (points.min(axis=0), points.max(axis=0)))
-        corners = np.ascontiguousarray(triangles.T)
-        for one, other in _neighbours(low, high):
-            if changed is not None:
-                looked_at = changed.take(one) | changed.take(other)
-                one, other = one[looked_at], other[looked_at]
-            for axis in range(3):
-                overlap = low[axis].take(one) <= high[axis].take(other)
-                overlap &= low[axis].take(other) <= high[axis].take(one)
-                one, other = one[overlap], other[overlap]
-            apart = np.ones(len(one), dtype=bool)
-            for corner in corners:
-                number = corner.take(one)
-                for second in corners:
-                    apart &= number != second.take(other)
-            one, other = one[apart], other[apart]
-            for where in chunks(len(one), _PIECE):
-                cut = _cut(points[:, one[where]], points[:, other[where]])
-                found.append(np.column_stack([one[where][cut], other[where][cut]]))
-    return np.concatenate(found)
+    if len(triangles) == 0:
+        return np.zeros((0, 2), dtype=np.int64)
+    points = (vertices - local_origin(vertices))[triangles.T]  # corner, triangle, axis
+    corners = np.ascontiguousarray(triangles.T)
+    entries = _enter(*(np.ascontiguousarray(end.T) for end in (points.min(axis=0), points.max(axis=0))))
+    pieces = entries.pieces()
+    found = [np.zeros((0, 2), dtype=np.int64)] * (len(pieces) - 1)
+
+    def work(where: slice) -> None:
+        one, other = entries.overlapping(slice(pieces[where.start], pieces[where.start + 1]), changed)
+        apart = np.ones(len(one), dtype=bool)
+        for corner in corners:
+            number = corner.take(one)
+            for second in corners:
+                apart &= number != second.take(other)
+        one, other = one[apart], other[apart]
+        if len(one) == 0:
+            return
+        cut = _cut(points[:, one], points[:, other])
+        found[where.start] = np.column_stack([one[cut], other[cut]])
+
+    in_threads(work, len(found), 1)
+    return np.concatenate(found) if found else np.zeros((0, 2), dtype=np.int64)
 
 
 def find_beside(
@@ -100,10 +100,61 @@ def find_beside(
     return np.isfinite(cKDTree(centres[changed]).query(centres, distance_upper_bound=reach, workers=-1)[0])
 
 
-def _neighbours(low: Float64Array, high: Float64Array) -> Iterator[Pairs]:
-    """Find pairs of triangles whose boxes, shape (3, m), share a cell of a grid, each pair once."""
+@dataclass(frozen=True)
+class _Entries:
+    """Triangles in the cells of a grid, those of a cell side by side: a triangle is in all cells that its box meets.
+
+    Attributes
+    ----------
+    triangle : ndarray, shape (e,), int64
+    cell : ndarray, shape (3, e), int32
+    later : ndarray, shape (e,), int64
+        Number of entries of the same cell that follow.
+    low, high : ndarray, shape (3, e), float32, mm
+        Box of the triangle, rounded outward.
+    first : ndarray, shape (3, m), int32
+        Lowest cell of each triangle.
+    """
+
+    triangle: NDArray[np.int64]
+    cell: NDArray[np.int32]
+    later: NDArray[np.int64]
+    low: NDArray[np.float32]
+    high: NDArray[np.float32]
+    first: NDArray[np.int32]
+
+    def pieces(self) -> NDArray[np.int64]:
+        """Return the entries at which pieces of about `_PIECE` pairs begin, and the number of entries."""
+        pairs = np.cumsum(self.later)
+        begin = np.searchsorted(pairs, np.arange(0, int(pairs[-1]), _PIECE), side="right")
+        return np.unique(np.append(begin, len(pairs)))
+
+    def overlapping(
+        self, where: slice, changed: NDArray[np.bool_] | None
+    ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Find the pairs of triangles whose boxes overlap and that begin at one of these entries, each once."""
+        count = self.later[where]
+        here = np.repeat(np.arange(where.start, where.stop), count)
+        there = np.arange(len(here)) - np.repeat(np.cumsum(count) - count, count) + here + 1
+        if changed is not None:
+            either = changed.take(self.triangle.take(here)) | changed.take(self.triangle.take(there))
+            here, there = here[either], there[either]
+        for low, high in zip(self.low, self.high, strict=True):
+            overlap = low.take(here) <= high.take(there)
+            overlap &= low.take(there) <= high.take(here)
+            here, there = here[overlap], there[overlap]
+        one, other = self.triangle.take(here), self.triangle.take(there)
+        # Of the cells that both share, exactly one holds the lowest corner of the intersection of their boxes.
+        once = np.ones(len(one), dtype=bool)
+        for first, cell in zip(self.first, self.cell, strict=True):
+            once &= np.maximum(first.take(one), first.take(other)) == cell.take(here)
+        return one[once], other[once]
+
+
+def _enter(low: Float64Array, high: Float64Array) -> _Entries:
+    """Enter triangles, by their boxes of shape (3, m), into the cells of a grid."""
     start = low.min(axis=1)[:, None]
-    size = 1.5 * float(np.median((high - low).max(axis=0))) or 1.0
+    size = float(np.median((high - low).max(axis=0))) or 1.0
     while True:
         first, last = ((corner - start) // size for corner in (low, high))
         cells = (last - first + 1).prod(axis=0)
@@ -116,21 +167,10 @@ def _neighbours(low: Float64Array, high: Float64Array) -> Iterator[Pairs]:
     key = (cell[2] * shape[1] + cell[1]) * shape[0] + cell[0]
     order = np.argsort(key, kind="stable")
     key, triangle, cell = key[order], triangle[order], cell[:, order]
-    places = np.arange(len(key))
-    step = 0
-    while len(places):
-        step += 1
-        places = places[: np.searchsorted(places, len(key) - step)]
-        places = places[key.take(places) == key.take(places + step)]
-        for where in chunks(len(places), 1 << 16):
-            here = places[where]
-            one, other = triangle.take(here), triangle.take(here + step)
-            # Of the cells that both share, exactly one holds the lowest corner of the intersection of their boxes.
-            for axis in range(3):
-                both = np.maximum(first[axis].take(one), first[axis].take(other))
-                once = both == cell[axis].take(here)
-                here, one, other = here[once], one[once], other[once]
-            yield one, other
+    ends = np.append(np.flatnonzero(key[1:] != key[:-1]) + 1, len(key))
+    later = np.repeat(ends, np.diff(ends, prepend=0)) - 1 - np.arange(len(key))
+    below, above = np.nextafter(low.astype(np.float32), -np.inf), np.nextafter(high.astype(np.float32), np.inf)
+    return _Entries(triangle, cell, later, below.take(triangle, axis=1), above.take(triangle, axis=1), first)
 
 
 def _enter_into_cells(first: NDArray[np.int32], last: NDArray[np.int32]) -> tuple[NDArray[np.int64], NDArray[np.int32]]:

@@ -6,16 +6,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clrecon.exchange.coordinates import as_stored, find_coincident
-from clrecon.mesh.connectivity import (
-    Edges,
-    find_edges,
-    find_faces_back_to_back,
-    find_split_vertices,
-    label_components,
-    opposite_half_edges,
-)
+from clrecon.mesh.connectivity import Edges, find_edges, label_components
 from clrecon.mesh.intersections import find_beside, find_self_intersections
 from clrecon.mesh.refine.deviation import WITNESSES, Deviation
+from clrecon.mesh.refine.faults import any_corner, find_faults_beside, find_sheets, find_torn
+from clrecon.mesh.refine.topology import TopologyChange, compare_topology, measure_topology
 from clrecon.mesh.triangles import cross_products
 
 __all__ = ["Clusters", "last_of_collapses"]
@@ -66,13 +61,21 @@ class Clusters:
         self._triangles, self._origin = triangles, origin
         self._names, self._places = np.arange(len(vertices)), self._rounded(vertices)
         self._before = self._names, self._places
-        self._components = label_components(triangles, len(vertices))
+        self._named, self._is_face = triangles.copy(), _are_faces(triangles)
+        self._faces: NDArray[np.uint32] | None = None
+        edges = find_edges(triangles, len(vertices))
+        self._components = label_components(triangles, len(vertices), edges)
+        self._topology = measure_topology(triangles, self._components[1], self._components[0], edges)
         # For each original triangle, faces that show that it lies within the bound (witnesses); -1 where none is known.
-        itself = np.where(self._is_face(triangles), np.arange(len(triangles), dtype=np.int32), np.int32(-1))
+        itself = np.where(self._is_face, np.arange(len(triangles), dtype=np.int32), np.int32(-1))
         self._witnesses = np.repeat(itself[None], WITNESSES, axis=0)
         self._witnesses_before = self._witnesses
         # Vertices whose name or place has changed since the surface was last examined for cuts and for distances.
-        self._new_to_cuts, self._new_to_distances = (np.zeros(len(vertices), dtype=bool) for _ in range(2))
+        self._new_to_cuts, self._new_to_distances, self._new_to_faults = (
+            np.zeros(len(vertices), dtype=bool) for _ in range(3)
+        )
+        # Whether all of the surface has been examined for faults since the last collapses, and whether none were there.
+        self._examined = self._sound = False
 
     def _rounded(self, places: Float64Array) -> Float64Array:
         return as_stored(places + self._origin).astype(np.float64) - self._origin
@@ -97,7 +100,9 @@ class Clusters:
         rename = np.arange(len(self._names))
         rename[standing] = standing[into]
         names, places = rename[self._names], self._places.copy()
-        left = self._faces_of(names)
+        named = names.astype(np.uint32)[self._triangles]
+        is_face = _are_faces(named)
+        left = named[is_face]
         going_on = np.unique(left)
         number = np.full(len(names), -1)
         number[going_on] = np.arange(len(going_on))
@@ -108,9 +113,11 @@ class Clusters:
         places[going_on[gained]] = self._rounded(points[gained])
         self._before, self._witnesses_before = (self._names, self._places), self._witnesses.copy()
         self._names, self._places = names, places
+        self._named, self._is_face, self._faces = named, is_face, left
         new = self._has_moved()
         for fresh in (self._new_to_cuts, self._new_to_distances):
             fresh[names[new]] = True
+        self._examined = self._sound = False
 
     @property
     def collapsed_count(self) -> int:
@@ -129,16 +136,9 @@ class Clusters:
 
     def faces(self) -> NDArray[np.uint32]:
         """Triangles with three different names, shape (k, 3)."""
-        return self._faces_of(self._names)
-
-    def _faces_of(self, names: IntArray) -> NDArray[np.uint32]:
-        named = names.astype(np.uint32)[self._triangles]
-        return named[self._is_face(named)]
-
-    @staticmethod
-    def _is_face(named: IntArray) -> NDArray[np.bool_]:
-        a, b, c = named.T
-        return (a != b) & (b != c) & (c != a)
+        if self._faces is None:
+            self._faces = self._named[self._is_face]
+        return self._faces
 
     def standing(self) -> IntArray:
         """The vertices that represent a cluster and have faces, in their order."""
@@ -155,6 +155,8 @@ class Clusters:
 
     def undo(self, names: IntArray) -> int:
         """Undo these clusters; return the number of vertices that moved or reappeared."""
+        if len(names) == 0:
+            return 0
         marked = np.zeros(len(self._names), dtype=bool)
         marked[names] = True
         moved = marked[self._names] & self._has_moved()
@@ -162,8 +164,13 @@ class Clusters:
         self._names[moved] = names_before[moved]
         back = self._names[moved]
         self._places[back] = places_before[back]
-        for fresh in (self._new_to_cuts, self._new_to_distances):
+        for fresh in (self._new_to_cuts, self._new_to_distances, self._new_to_faults):
             fresh[back] = True
+        rows = np.flatnonzero(any_corner(moved, self._triangles))
+        if len(rows):
+            self._named[rows] = self._names[self._triangles[rows]]
+            self._is_face[rows] = _are_faces(self._named[rows])
+            self._faces = None
         return int(np.count_nonzero(moved))
 
     def _has_moved(self) -> NDArray[np.bool_]:
@@ -172,29 +179,50 @@ class Clusters:
         x, y, z = (self._places != places_before).T
         return np.asarray((self._names != names_before) | (x | y | z)[self._names])
 
-    def find_faults(self) -> IntArray:
+    def find_faults(self, everywhere: bool = False) -> IntArray:
         """Find the names of clusters that have spoilt the surface.
 
         These are clusters at non-manifold edges and vertices, at faces without area or doubled, at places that two
-        vertices share, and of components that have vanished or come apart.
+        vertices share, of components that have vanished or come apart, and where tunnels were closed or opened.
+
+        Parameters
+        ----------
+        everywhere : bool
+            Examine all of the surface.  If not, only the surroundings of what was undone are examined once all of it
+            has been, until they are sound, and then all of it until it is so once in this round.
         """
+        found: IntArray = np.zeros(0, dtype=np.int64)
+        if self._examined and self._new_to_faults.any():
+            found = find_faults_beside(self.faces(), self._new_to_faults)
+        self._new_to_faults[:] = False
+        if len(found) or (self._sound and not everywhere):
+            return found
+        found = self._find_faults_everywhere()
+        self._examined, self._sound = True, len(found) == 0
+        return found
+
+    def _find_faults_everywhere(self) -> IntArray:
         faces = self.faces()
-        size = len(self._names)
-        edges = find_edges(faces, size)
-        faults = []
-        if not edges.oriented:  # as every mesh with three faces at an edge is
-            upward = (faces.reshape(-1) < faces[:, (1, 2, 0)].reshape(-1))[edges.half_edges]
-            ups = np.add.reduceat(upward, edges.first, dtype=np.int64)
-            faults += list(edges.ends[:, (ups > 1) | (edges.uses - ups > 1)])
-        opposite = opposite_half_edges(faces, edges)
-        if opposite is not None:
-            faults.append(faces[find_faces_back_to_back(opposite)].reshape(-1))
-        split = find_split_vertices(faces, size, edges, opposite)
-        # The waist can be a vertex without a cluster: the cluster beside it touches it twice.
-        faults += [split, faces[np.isin(faces, split).any(axis=1)].reshape(-1) if len(split) else split]
+        edges = find_edges(faces, len(self._names))
+        faults = find_sheets(faces, len(self._names), edges)
         if not any(map(len, faults)):  # the other faults can only be found, or cost less, after these are repaired
             faults += [self._find_lost(faces, edges), *self._find_flat(faces), self._find_coincident()]
+        if not any(map(len, faults)):
+            faults.append(self._find_torn(faces, edges))
         return np.unique(np.concatenate(faults).astype(np.int64))
+
+    def _find_torn(self, faces: NDArray[np.uint32], edges: Edges) -> IntArray:
+        """Find names where components have got another Euler number."""
+        count, labels = self._components
+        differ = measure_topology(faces, labels, count, edges).euler != self._topology.euler
+        if not differ.any():
+            return np.zeros(0, dtype=np.int64)
+        return find_torn(self._triangles[differ[labels[self._triangles[:, 0]]]], self._names)
+
+    def compare_topology(self) -> TopologyChange:
+        """Compare the topology of the present surface with that of the given one."""
+        count, labels = self._components
+        return compare_topology(self._topology, measure_topology(self.faces(), labels, count))
 
     def _find_lost(self, faces: NDArray[np.uint32], edges: Edges) -> IntArray:
         """Find names of components without a face, and of all but the largest part of those that came apart."""
@@ -231,10 +259,10 @@ class Clusters:
         Only faces that changed since the last call, and differ from those before the round, are examined with their
         surroundings.
         """
-        named = self._names.astype(np.uint32)[self._triangles]
-        is_face = self._is_face(named)
-        faces = named[is_face]
-        changed = _any_corner(self._new_to_cuts, faces) & _any_corner(self._has_moved(), self._triangles[is_face])
+        faces = self.faces()
+        changed = any_corner(self._new_to_cuts, faces)
+        if changed.any():
+            changed &= any_corner(self._has_moved(), self._triangles[self._is_face])
         self._new_to_cuts[:] = False
         stored = self._stored()
         near = find_beside(stored, faces, changed)
@@ -252,11 +280,12 @@ class Clusters:
         deviation : Deviation
             The original surface, with the same triangles, and the bound.
         """
-        named = self._names.astype(np.uint32)[self._triangles]
-        is_face = self._is_face(named)
-        new = _any_corner(self._new_to_distances, named)
+        if not self._new_to_distances.any():
+            return np.zeros(0, dtype=np.int64)
+        named, is_face = self._named, self._is_face
+        new = any_corner(self._new_to_distances, named)
         self._new_to_distances[:] = False
-        differs = _any_corner(self._has_moved(), self._triangles)
+        differs = any_corner(self._has_moved(), self._triangles)
 
         changed = _any_witness(new, self._witnesses)
         as_before = changed & ~_any_witness(differs, self._witnesses_before)
@@ -264,11 +293,12 @@ class Clusters:
         rows = np.flatnonzero(changed & ~as_before)
         self._witnesses[:, rows] = rows
         rows = rows[deviation.can_be_far(rows, self._names, self._places)]
-        is_left_behind, seen = deviation.is_far_from(rows, self._names, self._places, named[is_face])
+        is_left_behind, seen = deviation.is_far_from(rows, self._names, self._places, self.faces())
         self._witnesses[:, rows] = np.append(np.flatnonzero(is_face), -1)[seen]
 
-        now = named[is_face & new & differs]
-        away = now[deviation.are_far(self._places, now)]
+        from_rows = np.flatnonzero(is_face & new & differs)
+        now = named[from_rows]
+        away = now[deviation.are_far(self._places, now, from_rows)]
         # A triangle that is again as before the round is within the bound again when its former neighbours are back
         # too.
         left_behind = rows[is_left_behind]
@@ -277,10 +307,10 @@ class Clusters:
         return np.unique(np.concatenate([names.reshape(-1) for names in found]))
 
 
-def _any_corner(flags: NDArray[np.bool_], triangles: IntArray) -> NDArray[np.bool_]:
-    """Mark triangles, shape (m, 3), that have a corner whose flag is set."""
-    a, b, c = triangles.T
-    return np.asarray(flags[a] | flags[b] | flags[c])
+def _are_faces(named: IntArray) -> NDArray[np.bool_]:
+    """True for triangles, shape (m, 3), with three different corners."""
+    a, b, c = named.T
+    return np.asarray((a != b) & (b != c) & (c != a))
 
 
 def _any_witness(flags: NDArray[np.bool_], witnesses: IntArray) -> NDArray[np.bool_]:

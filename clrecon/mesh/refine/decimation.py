@@ -112,9 +112,10 @@ def decimate_mesh(
     """Remove triangles by collapsing edges in order of their quadric error (Garland and Heckbert 1997).
 
     fast-simplification chooses the collapses and stops where the error reaches the bound.  Collapses are then undone
-    where the result exceeds the bound, is not manifold, has faces without area, cuts itself or has lost a component.
-    So a closed and manifold surface stays closed and manifold, and keeps all its components.  Further rounds follow
-    until the share is reached or hardly any more triangles can be removed within the bound.
+    where the result exceeds the bound, is not manifold, has faces without area, cuts itself, or has lost a component or
+    a tunnel.  So a closed and manifold surface stays closed and manifold, keeps all its components and, as far as a
+    collapse of the last round is the cause, their Euler numbers.  Further rounds follow until the share is reached or
+    hardly any more triangles can be removed within the bound.
 
     Parameters
     ----------
@@ -132,7 +133,7 @@ def decimate_mesh(
     Mesh
         Normals from the faces; the report is taken over, with ``refinement["decimate"]``: ``fraction`` (asked for),
         ``reached``, ``ended_by`` (``"share"`` or ``"bound"``), ``rounds``, ``max_deviation_mm``, ``triangles_before``,
-        ``vertices_taken_back``.
+        ``vertices_taken_back``, ``topology`` (measured: `clrecon.mesh.refine.topology.TopologyChange`).
 
     Raises
     ------
@@ -177,6 +178,7 @@ def decimate_mesh(
         "max_deviation_mm": bound,
         "triangles_before": mesh.triangle_count,
         "vertices_taken_back": taken_back,
+        "topology": clusters.compare_topology(),
     }
     return Mesh(vertices, triangles, vertex_normals(vertices, triangles), carry_on(mesh, "decimate", said))
 
@@ -200,7 +202,9 @@ def _mend(clusters: Clusters, deviation: Deviation, tell: Callable[[], None] = l
             continue
         if clusters.undo(clusters.find_far(deviation)):
             continue
-        if not clusters.undo(clusters.find_crossing()):
+        if clusters.undo(clusters.find_crossing()):
+            continue
+        if not clusters.undo(clusters.find_faults(everywhere=True)):
             break
 
 

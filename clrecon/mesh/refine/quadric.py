@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 
 from clrecon.errors import NoSurfaceError
 from clrecon.exchange.coordinates import as_stored
-from clrecon.mesh.compare.distances import SAMPLES, NearDistance, SurfaceDistance, sample_surface
+from clrecon.mesh.compare.distances import SAMPLES, SurfaceDistance, sample_surface
+from clrecon.mesh.compare.near_distances import NearDistance
 from clrecon.mesh.connectivity import find_edges, label_components
 from clrecon.mesh.mesh import Mesh
 from clrecon.mesh.normals import vertex_normals

@@ -10,13 +10,12 @@ import tolerances
 from clrecon.errors import NoSurfaceError, UsageError
 from clrecon.mesh import Mesh
 from clrecon.mesh.compare.distances import (
-    NearDistance,
     SurfaceDistance,
     compare_meshes,
     sample_surface,
     sample_surface_points,
-    triangle_distances,
 )
+from clrecon.mesh.compare.near_distances import NearDistance, triangle_distances
 
 pytestmark = pytest.mark.unit
 

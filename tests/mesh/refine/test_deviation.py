@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 import sample_meshes as samples
 
-from clrecon.mesh.refine.clusters import _any_corner, _any_witness
+from clrecon.mesh.refine.clusters import _any_witness
 from clrecon.mesh.refine.deviation import Deviation, _inner_weights
+from clrecon.mesh.refine.faults import any_corner
 
 pytestmark = pytest.mark.unit
 
@@ -65,7 +66,11 @@ def test_points_between_the_middle_and_the_corners_are_tested():
         vertices = flat.copy()
         for at_x, at_y in dents:
             vertices[at_x + size * at_y, 2] = -3.0
-        return Deviation(vertices, triangles, BOUND).are_far(flat, faces).tolist()
+        deviation = Deviation(vertices, triangles, BOUND)
+        found = deviation.are_far(flat, faces, np.array([0, 1]))
+        # Where a face came from only says where to look first.
+        np.testing.assert_array_equal(found, deviation.are_far(flat, faces, np.array([287, 100])))
+        return found.tolist()
 
     assert far() == [False, False]
     # Parts are at most four mean edges of 1.14 to 1.3 long, their number is even: eight of the diagonal, six of a side.
@@ -75,14 +80,14 @@ def test_points_between_the_middle_and_the_corners_are_tested():
     assert far((0, 8)) == [False, True]
     assert far((6, 3)) == far((8, 4)) == [True, False]  # inside; the middle
     assert far((5, 0)) == far((7, 3)) == [False, False]  # between the points
-    assert Deviation(flat, triangles, BOUND).are_far(flat, np.zeros((0, 3), np.uint32)).tolist() == []
+    assert Deviation(flat, triangles, BOUND).are_far(flat, np.zeros((0, 3), np.uint32), np.zeros(0, int)).tolist() == []
 
 
 def test_one_flag_of_three_corners_is_enough():
     flags = np.array([False, True, False, False])
     triangles = np.array([[1, 0, 2], [0, 1, 2], [0, 2, 1], [0, 2, 3], [1, 1, 1]])
-    assert _any_corner(flags, triangles).tolist() == [True, True, True, False, True]
-    assert _any_corner(flags, triangles).dtype == np.bool_
+    assert any_corner(flags, triangles).tolist() == [True, True, True, False, True]
+    assert any_corner(flags, triangles).dtype == np.bool_
     witnesses = np.repeat([[0, 2, 1, -1]], 7, axis=0)
     witnesses[6, 0] = 1
     assert _any_witness(flags, witnesses).tolist() == [True, False, True, True]

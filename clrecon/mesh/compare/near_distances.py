@@ -1,0 +1,238 @@
+"""Distances from points to the triangles around a vertex near them, and to single triangles."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clrecon.mesh.compare.distances import SurfaceDistance
+from clrecon.mesh.compare.frames import FaceFrames
+from clrecon.mesh.connectivity import order_by_number
+from clrecon.mesh.triangles import cross_product
+from clrecon.system.pieces import in_threads
+
+__all__ = ["NearDistance", "triangle_distances"]
+
+_PIECE = 1 << 13
+"""Points in a piece: with six triangles each they take about 8 MB."""
+
+_PIECE_OF_BOUNDS = 1 << 11
+"""Points in a piece for upper bounds, which take 2 MB with six triangles each."""
+
+Points = NDArray[np.float64]
+IntArray = NDArray[np.integer]
+Columns = NDArray[np.float64]
+"""Shape (3, k): one row each for x, y, z."""
+
+
+class NearDistance:
+    """Distances from points to a surface, where a vertex of the surface near each point is known.
+
+    If a triangle around that vertex is near enough, its distance is returned; it is never less than the distance to the
+    surface.  For the other points all triangles are searched, and the result is exact.
+
+    Parameters
+    ----------
+    vertices : ndarray, shape (n, 3), mm
+    triangles : ndarray, shape (m, 3), uint32
+    """
+
+    def __init__(self, vertices: NDArray[np.floating], triangles: NDArray[np.uint32]):
+        self._vertices, self._triangles = vertices, triangles
+        corners = triangles.reshape(-1)
+        self._face_of = order_by_number(corners, len(vertices)) // 3
+        self._begin = np.concatenate([[0], np.cumsum(np.bincount(corners, minlength=len(vertices)))])
+        self._columns = np.ascontiguousarray(vertices.T, dtype=np.float64)
+        self._exact: SurfaceDistance | None = None
+        self._frames: FaceFrames | None = None
+
+    def __call__(self, points: Points, near: NDArray[np.integer], limit: float) -> NDArray[np.float64]:
+        """Return distances in mm, shape (k,); up to `limit` they may be too large, as only nearby triangles are
+        examined.
+
+        Parameters
+        ----------
+        points : ndarray, shape (k, 3), float64, mm
+        near : ndarray, shape (k,), int
+            A vertex near each point.
+        limit : float
+            mm.
+        """
+        found, _ = self.find_within(points, near, limit)
+        rest = np.flatnonzero(~(found <= limit))
+        if len(rest):
+            self._exact = self._exact or SurfaceDistance(self._vertices, self._triangles)
+            found[rest] = self._exact(points[rest])
+        return found
+
+    def find_within(
+        self, points: Points, near: NDArray[np.integer], limit: float
+    ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+        """Return distances to the triangles around one vertex only, and the rows of these; up to `limit` as for
+        `__call__`.
+
+        Parameters
+        ----------
+        points, near, limit
+            As in `__call__`.
+        """
+        found, rows = self._around(points, near, _perpendicular)
+        rest = np.flatnonzero(~(found <= limit))
+        if len(rest):
+            found[rest], rows[rest] = self._around(points[rest], near[rest], triangle_distances)
+        return found, rows
+
+    def find_surely_within(
+        self, points: Points, near: NDArray[np.integer], limit: float
+    ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+        """As `find_within`, but by upper bounds first: up to `limit` distances may be too large and rows others.
+
+        Parameters
+        ----------
+        points, near, limit
+            As in `__call__`.
+        """
+        found, rows = self.find_upper_bounds(points, near)
+        rest = np.flatnonzero(~(found <= limit))
+        if len(rest):
+            found[rest], rows[rest] = self._around(points[rest], near[rest], triangle_distances)
+        return found, rows
+
+    def find_upper_bounds(
+        self, points: Points, near: NDArray[np.integer]
+    ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+        """Return upper bounds of the distances to the triangles around one vertex, and the rows of these.
+
+        Parameters
+        ----------
+        points, near
+            As in `__call__`.
+        """
+        found, rows = np.full(len(points), np.inf), np.full(len(points), -1)
+        self.prepare()
+
+        def work(where: slice) -> None:
+            found[where], rows[where] = self.upper_bounds(points[where].T.astype(np.float32), near[where])
+
+        in_threads(work, len(points), _PIECE_OF_BOUNDS)
+        return found, rows
+
+    def upper_bounds(
+        self, columns: NDArray[np.float32], near: NDArray[np.integer]
+    ) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
+        """As `find_upper_bounds`, for one piece: points in columns, shape (3, k), float32."""
+        pair, row, start, some = self._pairs(near)
+        square = self.frames.squares(columns.take(pair, axis=1, mode="clip"), row)
+        least = np.full(len(some), np.inf, dtype=np.float32)
+        rows = np.full(len(some), -1)
+        if some.any():
+            least[some] = np.minimum.reduceat(square, start[some])
+        best = np.flatnonzero(square == least[pair])[::-1]  # backwards: the first of equals wins
+        rows[pair[best]] = row[best]
+        np.sqrt(least, out=least)
+        least += np.float32(self.frames.slack)
+        return least, rows
+
+    def prepare(self) -> None:
+        """Make what upper bounds need, before threads use it."""
+        assert self.frames is not None
+
+    @property
+    def frames(self) -> FaceFrames:
+        """Frames of the triangles, made when they are first asked for."""
+        if self._frames is None:
+            self._frames = FaceFrames(self._vertices, self._triangles)
+        return self._frames
+
+    def find_around(self, points: Points, near: NDArray[np.integer]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+        """Return distances to the triangles around some vertices only; infinity and row -1 where there are no
+        triangles.
+
+        Parameters
+        ----------
+        points : ndarray, shape (k, 3), float64, mm
+        near : ndarray, shape (k, v), int
+            Several vertices for each point.
+        """
+        found, rows = self._around(points, near[:, 0], triangle_distances)
+        for others in near.T[1:]:
+            length, row = self._around(points, others, triangle_distances)
+            rows = np.where(length < found, row, rows)
+            found = np.minimum(found, length)
+        return found, rows
+
+    def _corners(self, rows: NDArray[np.integer]) -> tuple[Columns, Columns, Columns]:
+        a, b, c = self._triangles[rows].T.astype(np.intp)
+        # "clip" avoids checking each index, which takes longer than the look-up; the triangles have been checked.
+        one, two, three = (self._columns.take(corner, axis=1, mode="clip") for corner in (a, b, c))
+        return one, two, three
+
+    def _around(
+        self, points: Points, near: NDArray[np.integer], measure: Callable[..., NDArray[np.float64]]
+    ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+        """Return the smallest value of a measure among the triangles around the vertices, and the rows of these."""
+        found, rows = np.full(len(points), np.inf), np.full(len(points), -1)
+
+        def work(where: slice) -> None:
+            pair, row, start, some = self._pairs(near[where])
+            columns = np.ascontiguousarray(points[where].T)
+            length = measure(columns.take(pair, axis=1, mode="clip"), *self._corners(row))
+            if some.any():
+                found[where][some] = np.minimum.reduceat(length, start[some])
+                shortest = np.flatnonzero(length == found[where][pair])[::-1]  # backwards: the first of equals wins
+                rows[where][pair[shortest]] = row[shortest]
+
+        in_threads(work, len(points), _PIECE)
+        return found, rows
+
+    def _pairs(self, near: NDArray[np.integer]) -> tuple[IntArray, IntArray, IntArray, NDArray[np.bool_]]:
+        """List the triangles around vertices: number of the vertex in `near`, and the triangle; for each vertex where
+        its pairs begin, and whether it has any.
+        """
+        first = self._begin[near]
+        count = self._begin[near + 1] - first
+        start = np.cumsum(count) - count
+        pair = np.repeat(np.arange(len(count)), count)
+        row = self._face_of[np.arange(len(pair)) + (first - start)[pair]]
+        return pair, row, start, count > 0
+
+
+def _perpendicular(points: Columns, a: Columns, b: Columns, c: Columns) -> NDArray[np.float64]:
+    """Return the length of the perpendicular from each point to its triangle, infinity where its foot lies outside."""
+    b, c, points = b - a, c - a, points - a
+    cross = cross_product(b, c)
+    square = np.einsum("ij,ij->j", cross, cross)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        # Barycentric coordinates by volumes relative to that of the face (Ericson 2005, section 3.4).
+        u = np.einsum("ij,ij->j", cross_product(points, c), cross) / square
+        v = np.einsum("ij,ij->j", cross_product(b, points), cross) / square
+        length = np.abs(np.einsum("ij,ij->j", points, cross)) / np.sqrt(square)
+    return np.where((u >= 0.0) & (v >= 0.0) & (u + v <= 1.0), length, np.inf)
+
+
+def triangle_distances(points: Columns, a: Columns, b: Columns, c: Columns) -> NDArray[np.float64]:
+    """Return the distance of each point from its triangle: to the face by the perpendicular, else to the nearest edge.
+
+    Parameters
+    ----------
+    points, a, b, c : ndarray, shape (3, k), float64, mm
+        Points and corners of the triangles, one row each for x, y, z.
+
+    Returns
+    -------
+    ndarray, shape (k,), float64, mm
+    """
+    shortest = _perpendicular(points, a, b, c)
+    beside = np.flatnonzero(np.isinf(shortest))
+    points, a, b, c = (columns.take(beside, axis=1) for columns in (points, a, b, c))
+    square = np.full(len(beside), np.inf)
+    for start, end in ((a, b), (b, c), (c, a)):
+        along, there = end - start, points - start
+        length = np.einsum("ij,ij->j", along, along)
+        share = np.clip(np.einsum("ij,ij->j", along, there) / np.where(length > 0.0, length, 1.0), 0.0, 1.0)
+        there -= share * along
+        np.minimum(square, np.einsum("ij,ij->j", there, there), out=square)
+    shortest[beside] = np.sqrt(square)
+    return shortest

@@ -1,0 +1,111 @@
+"""Faults of merged vertices: beside what is new, and where the Euler number changes."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import sample_meshes as samples
+
+from clrecon.mesh.connectivity import find_edges
+from clrecon.mesh.refine.clusters import Clusters
+from clrecon.mesh.refine.faults import find_faults_beside, find_sheets, find_torn
+
+pytestmark = pytest.mark.unit
+
+RINGS, SIDES = 9, 6
+
+
+def merged(triangles: np.ndarray, names: np.ndarray) -> np.ndarray:
+    named = names[triangles]
+    return named[(named != named[:, (1, 2, 0)]).all(axis=1)].astype(np.uint32)
+
+
+def euler(faces: np.ndarray) -> int:
+    return len(np.unique(faces)) - find_edges(faces, int(faces.max()) + 1).count + len(faces)
+
+
+def test_a_tunnel_that_is_pinched_shut_is_torn_where_it_was():
+    """One ring around the tube of a torus becomes a vertex: V - E + F of the ring is 0, not 1."""
+    _, triangles = samples.torus(RINGS, SIDES)
+    triangles = triangles.astype(np.uint32)
+    names = np.arange(RINGS * SIDES)
+    assert find_torn(triangles, names).tolist() == []
+    names[:SIDES] = 0
+    assert euler(merged(triangles, names)) == 1
+    assert find_torn(triangles, names).tolist() == [0]
+    names[1:SIDES] = np.arange(1, SIDES)
+    names[1 : SIDES - 1] = 0  # all but one: a disc, but two strips lead from it to the last one
+    assert euler(merged(triangles, names)) == 1
+    assert find_torn(triangles, names).tolist() == [0, SIDES - 1]
+
+
+def test_what_collapses_to_a_disc_tears_nothing():
+    vertices, triangles = samples.sphere(rounds=2)
+    triangles = triangles.astype(np.uint32)
+    names = np.arange(len(vertices))
+    names[np.linalg.norm(vertices - vertices[0], axis=1) < 8.0] = 0
+    faces = merged(triangles, names)
+    assert 0 < len(faces) < len(triangles) and euler(faces) == 2
+    assert find_torn(triangles, names).tolist() == []
+
+
+def test_an_open_border_is_no_tear():
+    """Vertices of the border merged along it: the strips between begin at the border."""
+    x, y = (axis.ravel() for axis in np.meshgrid(np.arange(6), np.arange(5)))
+    corner = (x + 6 * y)[(x < 5) & (y < 4)]
+    lower = np.column_stack([corner, corner + 1, corner + 7])
+    upper = np.column_stack([corner, corner + 7, corner + 6])
+    triangles = np.concatenate([lower, upper]).astype(np.uint32)
+    names = np.arange(30)
+    names[[1, 2]] = 1
+    names[[3, 4, 9]] = 3
+    assert euler(merged(triangles, names)) == 1
+    assert find_torn(triangles, names).tolist() == []
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_beside_what_is_new_the_same_faults_are_found(seed):
+    """Vertices of a torus are merged at random; all faults lie at vertices that are called new."""
+    _, triangles = samples.torus(24, 12)
+    rng = np.random.default_rng(seed)
+    names = np.arange(24 * 12)
+    gone = rng.choice(len(names), 40, replace=False)
+    names[gone] = rng.choice(np.setdiff1d(names, gone), 40)
+    faces = merged(triangles, names)
+    new = np.zeros(len(names), dtype=bool)
+    new[names[gone]] = True
+    # Neighbours count as new here: a fan can come apart at a vertex whose own faces stay.
+    found = find_faults_beside(faces, new)
+    expected = np.unique(np.concatenate(find_sheets(faces, len(names), find_edges(faces, len(names)))))
+    assert len(expected) > 0
+    np.testing.assert_array_equal(found, expected)
+    assert find_faults_beside(faces, np.zeros(len(names), dtype=bool)).tolist() == []
+
+
+def test_a_fault_far_from_what_is_new_is_not_looked_for():
+    one = samples.weld(samples.join(samples.box(), samples.box((1.0, 1.0, 1.0))))  # two boxes share a corner
+    vertices, triangles = samples.join(one, samples.sphere((9.0, 9.0, 9.0), 1.0, 1))
+    faces = triangles.astype(np.uint32)
+    (shared,) = np.flatnonzero((vertices == 1.0).all(axis=1))
+    new = np.zeros(len(vertices), dtype=bool)
+    new[-1] = True
+    assert find_faults_beside(faces, new).tolist() == []
+    new[shared] = True
+    assert shared in find_faults_beside(faces, new)
+
+
+def test_a_tunnel_is_opened_again():
+    """The ring of a torus that was merged into one vertex comes back, and the topology is what it was."""
+    vertices, triangles = samples.torus(RINGS, SIDES)
+    clusters = Clusters(vertices, triangles.astype(np.uint32), np.zeros(3))
+    names = np.arange(len(vertices))
+    names[: SIDES - 1] = 0
+    faces = merged(triangles, names)
+    standing = np.unique(faces)
+    collapses = np.column_stack([np.zeros(SIDES - 2, int), np.arange(1, SIDES - 1)])
+    clusters.collapse(collapses, vertices[standing], np.searchsorted(standing, faces))
+    found = clusters.compare_topology()
+    assert (found.euler_number_before, found.euler_number_after, found.components_changed) == (0, 1, 1)
+    while clusters.undo(clusters.find_faults()):
+        pass
+    assert clusters.compare_topology().changes == [] and clusters.collapsed_count == 0
