@@ -25,10 +25,13 @@ from clrecon.system.gates import Gate, none_of
 from clrecon.system.pieces import local_origin
 from clrecon.system.progress import Progress, ignore_progress
 
-__all__ = ["collapse_quadric"]
+__all__ = ["collapse_quadric", "measure_farthest"]
 
 _EXACT = 64
 """Points at a time that are measured exactly."""
+
+_NEAREST = 3
+"""Vertices near a point around which distances are measured first."""
 
 Points = NDArray[np.float64]
 
@@ -87,7 +90,7 @@ def collapse_quadric(mesh: Mesh, fraction: float, *, progress: Progress | None =
         "fraction": fraction,
         "reached": 1.0 - len(triangles) / mesh.triangle_count,
         "triangles_before": mesh.triangle_count,
-        "farthest_mm": _farthest(mesh, vertices, triangles, lost),
+        "farthest_mm": measure_farthest(mesh, vertices, triangles, lost),
         "samples": SAMPLES,
         "topology": topology,
         "gates": gates,
@@ -125,13 +128,25 @@ def _judge(found: TopologyChange) -> list[Gate]:
     ]
 
 
-def _farthest(
-    mesh: Mesh, vertices: NDArray[np.floating], triangles: NDArray[np.uint32], lost: NDArray[np.int64]
+def measure_farthest(
+    mesh: Mesh,
+    vertices: NDArray[np.floating],
+    triangles: NDArray[np.uint32],
+    also: NDArray[np.integer] | None = None,
 ) -> float:
-    """Return the largest distance found between the two surfaces, in mm."""
+    """Return the largest distance found between a mesh and another surface, in mm.
+
+    Parameters
+    ----------
+    mesh : Mesh
+    vertices, triangles : ndarray
+        The other surface.
+    also : ndarray, shape (k,), int, optional
+        Vertices of the mesh to measure from besides points that cover each surface evenly; default: all.
+    """
     origin = local_origin(mesh.vertices)
     before, after = mesh.vertices - origin, vertices - origin
-    seen = np.concatenate([sample_surface(before, mesh.triangles), before[lost]])
+    seen = np.concatenate([sample_surface(before, mesh.triangles), before if also is None else before[also]])
     there = _farthest_point(seen, after, triangles)
     return max(there, _farthest_point(sample_surface(after, triangles), before, mesh.triangles))
 
@@ -139,14 +154,14 @@ def _farthest(
 def _farthest_point(points: Points, vertices: Points, triangles: NDArray[np.uint32]) -> float:
     """Return the distance of the farthest of some points from a surface.
 
-    Distances to the triangles around the nearest vertex are never less than those to the surface: only points where
+    Distances to the triangles around the nearest vertices are never less than those to the surface: only points where
     they are large are measured exactly, the farthest first.
     """
     from scipy.spatial import cKDTree
 
     used = np.unique(triangles)
-    near = used[cKDTree(vertices[used]).query(points, workers=-1)[1]]
-    at_most = NearDistance(vertices, triangles).find_around(points, near[:, None])[0]
+    near = used[cKDTree(vertices[used]).query(points, k=min(_NEAREST, len(used)), workers=-1)[1]]
+    at_most = NearDistance(vertices, triangles).find_around(points, near.reshape(len(points), -1))[0]
     order = np.argsort(-at_most)
     exact, found = SurfaceDistance(vertices, triangles), 0.0
     for first in range(0, len(order), _EXACT):
