@@ -324,4 +324,4 @@ def test_what_cannot_be_filtered_is_refused(device):
     with pytest.raises(UsageError, match="has no noise: give sigma_hu=HU"):
         clrecon.filter_bilateral(Volume(np.zeros((9, 60, 60)), np.eye(4)), device=device)
     with pytest.raises(UsageError, match="a filter needs a Volume, not ndarray"):
-        clrecon.filter_bilateral(np.zeros((2, 2, 2)), device=device)
+        clrecon.filter_bilateral(np.zeros((2, 2, 2)), device=device)  # type: ignore[type-var]
