@@ -53,17 +53,21 @@ static inline floats power_of_two(const floats e)
     return as_floats(as_ints(power) + (as_ints(shifted) << 23));
 }
 
+/* Differences count in units of 1 / range HU: for voxels of up to 16 bits it is one operation, exact to a unit in the
+ * last place of the voxel's own value. */
 static inline void add_tap(
-    tap_sums *sums, const floats values, const floats centre, const float spatial, const float range)
+    tap_sums *sums, const floats values, const floats centre, const floats scaled, const float spatial,
+    const float range)
 {
-    floats away = values - centre;
+    floats away = sizeof(VOXEL) <= 2 ? fused(values, (floats)(range), -scaled) : (values - centre) * range;
     if (IS_FLOAT)
         away = choose(fabs(values) <= LARGEST_FLOAT, away, (floats)(0.0f));
-    const floats exponent = fused(away * range, away, (floats)(spatial));
+    const floats exponent = fused(-away, away, (floats)(spatial));
     floats weight = power_of_two(greater(exponent, (floats)(LEAST_EXPONENT)));
     if (IS_FLOAT) {
         const ints counts = (fabs(values) <= LARGEST_FLOAT) & (exponent >= LEAST_EXPONENT);
         weight = choose(counts, weight, (floats)(0.0f));
+        away = choose(counts, away, (floats)(0.0f)); /* it may be infinite */
         sums->low = choose(counts, lesser(sums->low, values), sums->low);
         sums->high = choose(counts, greater(sums->high, values), sums->high);
     }
@@ -73,9 +77,9 @@ static inline void add_tap(
 
 /* The new values; whole numbers are rounded, halves away from the old value.  Floats stay between the values that
  * counted, which the last rounding might leave: what was on one side of a level with its whole window stays there. */
-static inline floats finish_value(const tap_sums *sums, const floats centre)
+static inline floats finish_value(const tap_sums *sums, const floats centre, const float range)
 {
-    const floats change = sums->differences / sums->weights;
+    const floats change = sums->differences / (sums->weights * range);
     if (IS_FLOAT) {
         const floats value = lesser(greater(centre + change, sums->low), sums->high);
         return choose(fabs(centre) <= LARGEST_FLOAT, value, centre);
@@ -84,7 +88,7 @@ static inline floats finish_value(const tap_sums *sums, const floats centre)
 }
 
 /* Parameters  voxels    in   slices of the volume
- *             ends      out  (rows, strips, GROUP + 2 reach) strips for the groups 0 to inner - 1, and from inner_end on
+ *             ends      out  (rows, strips, GROUP + 2 reach) strips for the groups 0 to inner - 1 and from inner_end on
  *             ni        voxels a row;  rows  of the slices
  *             strips    a row
  *             inner, inner_end   groups that read the row itself
@@ -110,27 +114,32 @@ __kernel void copy_row_ends(
 /* Parameters  voxels     in   slices of the volume from first_k on
  *             ends       in   strips of all their rows, see copy_row_ends
  *             tap_rows   in   (row_count, 4) rows of taps: steps along j and k, first step along i, taps
+ *             tap_steps  in   (steps,) steps to the taps in `voxels`
  *             spatial    in   exponents of distances, tap by tap; a table for each slice where they are uneven
  *             groups     in   numbers (j, k - core_k) row * row_groups + g of the groups to filter, where is_listed
  *             filtered   out  slices of the volume from core_k on; of a list, its groups alone are written
- *             range      -c: exponent of a difference of 1 HU
+ *             range      sqrt(c): what a difference of 1 HU counts
  *             is_listed  0: every group is filtered
- *             first_entry, group_count  entries of the list, or groups of all core slices, from which on and up to which
- *                        this launch filters
+ *             first_entry, group_count  entries of the list, or groups of all core slices, from which on and up to
+ *                        which this launch filters
  *             row_groups   groups a row: ceil(ni / GROUP), or what the list counts by
  *             ni nj nk   voxels of the whole volume
  *             first_k    slice that `voxels` begins with;  core_k  slice that `filtered` begins with
  *             row_count  rows of taps
+ *             steps      taps;  inner_j, inner_k  rows and slices around a voxel that takes its taps by tap_steps
  *             table_taps   taps of a slice's table, 0 where all slices share one
  *             strips, inner, inner_end, reach   as copy_row_ends
- * Launch      LANES = 8: global = group_count - first_entry, LANES = 1: GROUP times as many; rounded up by the host, any local
+ * Launch      LANES = 8: global = group_count - first_entry, LANES = 1: GROUP times as many; rounded up by the host,
+ *             any local
  * Assumes     reach <= GROUP; all slices that windows reach are there; whole numbers lie within 2^24
  * Guarantees  the same bits for every list, every number of slices, and every driver that rounds fma() right */
 __kernel void filter_bilateral(
     __global const VOXEL *restrict voxels, __global const VOXEL *restrict ends, __global const int4 *restrict tap_rows,
+    __global const int *restrict tap_steps,
     __global const float *restrict spatial, __global const uint *restrict groups, __global VOXEL *restrict filtered,
     const float range, const int is_listed, const uint first_entry, const uint group_count, const uint row_groups, const int ni,
-    const int nj, const int nk, const int first_k, const int core_k, const int row_count, const int table_taps, const uint strips,
+    const int nj, const int nk, const int first_k, const int core_k, const int row_count, const int steps,
+    const int inner_j, const int inner_k, const int table_taps, const uint strips,
     const uint inner, const uint inner_end, const int reach)
 {
     const uint item = get_global_id(0);
@@ -159,27 +168,36 @@ __kernel void filter_bilateral(
     __global const float *taps = spatial + (size_t)table_taps * k;
 
     const floats centre = to_floats(load_lanes(own));
+    const floats scaled = centre * range;
     tap_sums sums = {0.0f, 0.0f, centre, centre};
 #if LANES == 8
     const floats next_centre = to_floats(load_lanes(own + LANES));
+    const floats next_scaled = next_centre * range;
     tap_sums next = {0.0f, 0.0f, next_centre, next_centre};
 #endif
-    for (int r = 0; r < row_count; ++r) {
+    const int tap_count = in_row && j >= inner_j && j + inner_j < nj && k >= inner_k && k + inner_k < nk ? steps : 0;
+    for (int t = 0; t < tap_count; ++t)
+        add_tap(&sums, to_floats(load_lanes(own + tap_steps[t])), centre, scaled, taps[t], range);
+#if LANES == 8
+    for (int t = 0; t < tap_count; ++t)
+        add_tap(&next, to_floats(load_lanes(own + LANES + tap_steps[t])), next_centre, next_scaled, taps[t], range);
+#endif
+    for (int r = tap_count ? row_count : 0; r < row_count; ++r) {
         const int4 tap_row = tap_rows[r];
         const int near_j = clamp(j + tap_row.x, 0, nj - 1), near_k = clamp(k + tap_row.y, 0, nk - 1) - first_k;
         __global const VOXEL *near = base + ((size_t)near_k * nj + near_j) * row_step + tap_row.z;
         for (int t = 0; t < tap_row.w; ++t)
-            add_tap(&sums, to_floats(load_lanes(near + t)), centre, taps[t], range);
+            add_tap(&sums, to_floats(load_lanes(near + t)), centre, scaled, taps[t], range);
 #if LANES == 8
         for (int t = 0; t < tap_row.w; ++t)
-            add_tap(&next, to_floats(load_lanes(near + t + LANES)), next_centre, taps[t], range);
+            add_tap(&next, to_floats(load_lanes(near + t + LANES)), next_centre, next_scaled, taps[t], range);
 #endif
         taps += tap_row.w;
     }
     __global VOXEL *to = filtered + voxel_index(i, j, core_slice, ni, nj);
 #if LANES == 8
-    const VOXEL8 values = CLRECON_VECTOR(convert_, VOXEL8)(finish_value(&sums, centre));
-    const VOXEL8 next_values = CLRECON_VECTOR(convert_, VOXEL8)(finish_value(&next, next_centre));
+    const VOXEL8 values = CLRECON_VECTOR(convert_, VOXEL8)(finish_value(&sums, centre, range));
+    const VOXEL8 next_values = CLRECON_VECTOR(convert_, VOXEL8)(finish_value(&next, next_centre, range));
     if (count == GROUP) {
         vstore8(values, 0, to);
         vstore8(next_values, 1, to);
@@ -191,6 +209,6 @@ __kernel void filter_bilateral(
             to[n] = lanes[n];
     }
 #else
-    *to = (VOXEL)finish_value(&sums, centre);
+    *to = (VOXEL)finish_value(&sums, centre, range);
 #endif
 }

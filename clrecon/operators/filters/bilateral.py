@@ -230,7 +230,7 @@ class _Run:
             "volume": there * self.resident.slice_bytes,
             "filtered voxels": slices * self.resident.slice_bytes,
             "ends of the rows": there * self.nj * self.strips * strip,
-            "window": 4 * window.exponents.size + 16 * window.taps,
+            "window": 4 * window.exponents.size + 20 * window.taps,
         }
         if self.settings.near is not None:
             needs["groups near the level"] = mixed_group_bytes(self.ni, there * self.nj, slices * self.nj)
@@ -246,6 +246,8 @@ class _Run:
         window = self.settings.window
         self.tap_rows = window.rows()
         self.tap_rows_d = upload(device, self.tap_rows)
+        steps, self.inner_jk = self._tap_steps()
+        self.tap_steps_d = upload(device, steps)
         self.spatial_d = upload(device, np.maximum(window.exponents, -1000.0).astype(np.float32))
         self.progress("filter", 0, self.nk)
         shape = (self.nk, self.nj, self.ni)
@@ -270,6 +272,14 @@ class _Run:
                 filtered[first:end] = download(device, part, part_d)
             self.resident.volume.release_slices(there_first, end)
         return Filtered(filtered, None, self._share(groups), -(-self.nk // slices), tuple(self.warnings))
+
+    def _tap_steps(self) -> tuple[NDArray[np.int32], tuple[int, int]]:
+        """Return the steps to the taps in memory, and how far from the borders along j and k they are used."""
+        steps = self.settings.window.offsets.astype(np.int64) @ np.array([1, self.ni, self.ni * self.nj])
+        reach = self.settings.window.reach
+        if steps.max() > np.iinfo(np.int32).max:  # of slices beyond 100 million voxels: nowhere
+            return np.zeros(1, np.int32), (self.nj, self.nk)
+        return steps.astype(np.int32), (reach[1], reach[2])
 
     def _share(self, groups: int) -> float:
         return groups / (self.row_groups * self.nj * self.nk)
@@ -312,7 +322,7 @@ class _Run:
     ) -> None:
         """Filter all groups, or those of a list, in launches of about a second."""
         device, window = self.resident.device, self.settings.window
-        range_factor = -1.0 / (2.0 * math.log(2.0) * self.settings.sigma_hu**2)
+        range_factor = math.sqrt(0.5 / math.log(2.0)) / self.settings.sigma_hu
         items = 1 if device.kernel_variants["LANES"] == "8" else GROUP
         slice_groups = self.row_groups * there.nj
         most = max(TAPS_A_LAUNCH // (GROUP * window.taps * slice_groups), 1) * slice_groups
@@ -324,7 +334,8 @@ class _Run:
                 groups=self.tap_rows_d if groups_d is None else groups_d, filtered=filtered_d, range=range_factor,
                 is_listed=groups_d is not None, first_entry=first, group_count=first + count, row_groups=per_row,
                 ni=self.ni, nj=there.nj, nk=self.nk, first_k=there.first, core_k=there.core_first,
-                row_count=len(self.tap_rows), table_taps=window.taps if len(window.exponents) > 1 else 0, **sides,
+                tap_steps=self.tap_steps_d, row_count=len(self.tap_rows), steps=window.taps, inner_j=self.inner_jk[0],
+                inner_k=self.inner_jk[1], table_taps=window.taps if len(window.exponents) > 1 else 0, **sides,
             )  # fmt: skip
             if groups_d is None:
                 wait(device)
