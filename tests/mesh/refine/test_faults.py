@@ -109,3 +109,13 @@ def test_a_tunnel_is_opened_again():
     while clusters.undo(clusters.find_faults()):
         pass
     assert clusters.compare_topology().changes == [] and clusters.collapsed_count == 0
+
+
+def test_two_faces_back_to_back_beside_what_is_new_are_found():
+    vertices, triangles = samples.sphere(rounds=1)
+    count = len(vertices)
+    both = [[count, count + 1, count + 2], [count, count + 2, count + 1]]
+    faces = np.concatenate([triangles, both]).astype(np.uint32)
+    new = np.zeros(count + 3, dtype=bool)
+    new[count + 1] = True
+    assert find_faults_beside(faces, new).tolist() == [count, count + 1, count + 2]

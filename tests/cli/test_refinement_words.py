@@ -1,0 +1,32 @@
+"""What the console says of a decimation."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from clrecon.cli.refinement import describe_refinement
+
+pytestmark = pytest.mark.unit
+
+
+def told(**topology: int) -> str:
+    numbers = {
+        "euler_number_before": 1454, "euler_number_after": 1454, "components_before": 932, "components_lost": 0,
+        "components_changed": 0,
+    } | topology  # fmt: skip
+    deviation: dict[str, Any] = {"hd95_mm": 0.1, "assd_mm": 0.05, "max_mm": 0.2, "volume_change_percent": None}
+    found = {"fraction": 0.9, "reached": 0.8359, "ended_by": "bound", "max_deviation_mm": 0.175, "topology": numbers}
+    return describe_refinement([{"refinement": {"decimate": found, "deviation": deviation, "voxel_mm": 0.7}}])[0]
+
+
+def test_the_euler_number_is_said_before_and_after() -> None:
+    start = "refined  83.6 % of the triangles taken away of 90 % asked for: the bound of 0.175 mm ended it, "
+    assert told() == start + "Euler number 1454 before and after"
+    assert told(euler_number_after=1456, components_changed=1) == (
+        start + "Euler number 1454 before, 1456 after (changed in 1 of 932 components)"
+    )
+    # Changes of two components can cancel out.
+    assert "changed in 2 of 932 components" in told(components_changed=2)
+    assert "changed in 0 of 932 components, 3 lost)" in told(components_lost=3, euler_number_after=1448)
