@@ -81,8 +81,11 @@ class Copy:
     def make(cls, project: Path, folder: Path, package: str = "clrecon") -> Copy:
         """Copy a project without what git, environments and builds keep in it."""
         ignored = shutil.ignore_patterns(".*", "__pycache__", "*.egg-info", "build", "dist", "clrecon-demo")
-        shutil.copytree(project, folder / "copy", ignore=ignored, symlinks=True)
-        return cls((folder / "copy").resolve(), package)
+        root = shutil.copytree(project, folder / "copy", ignore=ignored, symlinks=True).resolve()
+        if (root / "cl").is_dir():
+            # An editable installation would give `clrecon.cl` the kernels of its own folder.
+            (root / package / "cl").symlink_to(root / "cl")
+        return cls(root, package)
 
     def environment(self, writes_bytecode: bool, **more: str) -> dict[str, str]:
         """Variables of a run.  Bytecode is written by the traced run alone, in which nothing is changed."""

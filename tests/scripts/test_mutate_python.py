@@ -8,6 +8,7 @@ from __future__ import annotations
 import gc
 import json
 import signal
+import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -340,6 +341,20 @@ def test_wrong_options_are_refused(words: list[str], capsys: pytest.CaptureFixtu
     with pytest.raises(SystemExit, match="2"):
         mutate_python.main(words)
     assert words[0] in capsys.readouterr().err or "no room 'nowhere'" in capsys.readouterr().err
+
+
+def test_kernels_are_those_of_the_copy(tmp_path: Path) -> None:
+    """Not those of the folder that an editable installation points to."""
+    for name in ("clrecon", "cl", "tests"):
+        (tmp_path / "project" / name).mkdir(parents=True)
+    (tmp_path / "project" / "clrecon" / "__init__.py").write_text("")
+    (tmp_path / "project" / "cl" / "own.cl").write_text("own")
+    made = Copy.make(tmp_path / "project", tmp_path)
+    program = "from importlib import resources; print(resources.files('clrecon.cl').joinpath('own.cl').read_text())"
+    said = subprocess.run(
+        [sys.executable, "-c", program], cwd=made.root, env=made.environment(False), capture_output=True, text=True
+    )
+    assert said.stdout == "own\n", said.stderr
 
 
 def test_changes_are_chosen_by_the_seed() -> None:
