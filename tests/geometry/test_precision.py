@@ -7,7 +7,14 @@ import pytest
 
 from clrecon.errors import UsageError
 from clrecon.geometry import Volume, frame_from_lps
-from clrecon.geometry.precision import describe_far, find_vertex_origin, float32_step, is_far, largest_coordinate
+from clrecon.geometry.precision import (
+    describe_far,
+    find_vertex_origin,
+    float32_step,
+    is_far,
+    largest_coordinate,
+    power_of_two_over,
+)
 
 
 def volume_from(x: float) -> Volume:
@@ -44,3 +51,12 @@ def test_lps_is_the_frame_itself():
     for name in ("abc", "lpt", "xyz"):
         with pytest.raises(UsageError, match=f"unknown space '{name}': use one of lps, ras"):
             frame_from_lps(name)
+
+
+@pytest.mark.parametrize(
+    ("exponent", "scale"),
+    [(126, -126), (125, -126), (124, -125), (0, -1), (-1, 0), (-127, 126), (-128, 126), (-149, 126)],
+)
+def test_the_power_of_two_stays_within_the_normal_numbers_of_float32(exponent: int, scale: int) -> None:
+    assert power_of_two_over(2.0**exponent) == 2.0**scale
+    assert power_of_two_over(1.5 * 2.0**exponent) == 2.0**scale
