@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import argparse
 
+from clrecon.jobs.shared.preprocess_steps import PREPROCESS_FORMS
+from clrecon.jobs.shared.region_rules import REGION_FORMS
+
 __all__ = ["add_masking"]
 
 
 def add_masking(parser: argparse.ArgumentParser) -> None:
-    """Declare ``--remove-table``, ``--allow-bone-loss`` and ``--fov``."""
+    """Declare ``--remove-table``, ``--allow-bone-loss``, ``--fov``, ``--region`` and ``--preprocess``."""
     group = parser.add_argument_group("masking")
     group.add_argument(
         "--remove-table",
@@ -18,7 +21,8 @@ def add_masking(parser: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--allow-bone-loss",
         action="store_true",
-        help="go on where --remove-table takes more than 2 %% of the bone, which else is refused",
+        help="go on where --remove-table takes more than 2 %% of the bone, or a step of --preprocess more than half of"
+        " what is at the level and above, which else is refused",
     )
     group.add_argument(
         "--fov",
@@ -30,6 +34,20 @@ def add_masking(parser: argparse.ArgumentParser) -> None:
         metavar="RADIUS_MM",
         help="turn what lies further from the centre of the slices into air first (without a number: the largest circle"
         " that fits the slice)",
+    )
+    group.add_argument(
+        "--region",
+        action="append",
+        metavar="RULE",
+        help=f"turn what lies outside of the region of interest into air first: {REGION_FORMS}; several of one kind add"
+        " up, of different kinds cut each other; a seed grows within the others; a tube without a file goes along the"
+        " spinal canal",
+    )
+    group.add_argument(
+        "--preprocess",
+        metavar="STEP[,STEP...]",
+        help=f"steps before the surface, in this order: {PREPROCESS_FORMS}; morphology works on what is at the iso"
+        " value and above, or at level:HU; region is the place of --region, which else comes first",
     )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
@@ -20,6 +21,8 @@ from clrecon.jobs.shared.laps import Laps
 from clrecon.jobs.shared.masking import mask_volume
 from clrecon.jobs.shared.opening import DeviceOpening
 from clrecon.jobs.shared.outputs import check_kept, commit_all
+from clrecon.jobs.shared.preprocess import preprocess_volume
+from clrecon.jobs.shared.region import Band, restrict_volume
 from clrecon.jobs.shared.report import stage_report
 from clrecon.reading import read_selected
 from clrecon.system.files import allow_open_files
@@ -154,7 +157,11 @@ def _mask(volume: Volume, device: Device, settings: CloudSettings, progress: Pro
         ghosts = find_ghosts(resident, iso_value_of(settings), settings, progress)
     if settings.ghost_slices == "drop":
         volume = fill_ghost_slices(volume, ghosts)
-    return mask_volume(volume, settings, progress), ghosts
+    level = iso_value_of(settings)
+    band: Band = tuple(settings.hu) if settings.is_band else (level, math.inf)  # type: ignore[arg-type, assignment]
+    volume = mask_volume(volume, settings, progress)
+    volume = restrict_volume(volume, settings, device, [band], progress)
+    return preprocess_volume(volume, settings, device, [band], progress), ghosts
 
 
 def _read_map(settings: CloudSettings, volume: Volume | None) -> LabelMap | None:

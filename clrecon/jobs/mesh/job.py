@@ -12,7 +12,7 @@ from clrecon.jobs.mesh.bone import judge_surfaces, warn_of_walls
 from clrecon.jobs.mesh.labels import extract_label_surfaces, judge_label_volumes, name_label_files, open_labels
 from clrecon.jobs.mesh.levels import choose_level
 from clrecon.jobs.mesh.parts import check_levels, extract_surfaces, first_names, select_parts
-from clrecon.jobs.mesh.prepare import leave_outside, prepare_surfaces
+from clrecon.jobs.mesh.prepare import bands_of, narrow_volume, prepare_surfaces
 from clrecon.jobs.mesh.refinement import describe_purposes, judge_parts, refine_surface, warn_of_gates
 from clrecon.jobs.mesh.report import MeshReport, describe_job, describe_part
 from clrecon.jobs.mesh.settings import MeshSettings
@@ -31,6 +31,7 @@ from clrecon.jobs.shared.outputs import (
     refuse_numbered,
     stage_meshes,
 )
+from clrecon.jobs.shared.region import restrict_volume
 from clrecon.jobs.shared.report import stage_report
 from clrecon.reading import read_selected
 from clrecon.system.log import get_logger, log_warnings
@@ -105,8 +106,10 @@ def make_mesh(
 
     volume, labels, device = _open(source, output, surfaces, settings, no_clobber, progress, watch)
     volume = mask_volume(volume, settings, progress)
+    if settings.below is None:
+        volume = restrict_volume(volume, settings, device, bands_of(surfaces), progress)
     watch.lap("mask")
-    volume, surfaces, choice = _choose(volume, surfaces, settings, progress, watch)
+    volume, surfaces, choice = _choose(volume, surfaces, settings, device, progress, watch)
     surfaces, extracted = _extract(volume, surfaces, labels, device, settings, progress)
     origins = [mesh.report for mesh in extracted]
     watch.lap("surface")
@@ -211,7 +214,7 @@ def _open(
 
 
 def _choose(
-    volume: Volume, surfaces: list[Surface], settings: MeshSettings, progress: Progress, watch: Laps
+    volume: Volume, surfaces: list[Surface], settings: MeshSettings, device: Device, progress: Progress, watch: Laps
 ) -> tuple[Volume, list[Surface], IsoChoice | None]:
     """Return the volume for extraction, its surfaces, and the choice of the iso value if it was not given."""
     choice = choose_level(volume, settings, progress)
@@ -219,7 +222,7 @@ def _choose(
         surfaces = plan_surfaces([choice.iso_value])
     watch.lap("choose")
     check_levels(volume, surfaces)
-    volume = leave_outside(volume, settings, progress)
+    volume = narrow_volume(volume, surfaces, settings, device, progress)
     watch.lap("mask")
     return volume, surfaces, choice
 

@@ -1,10 +1,15 @@
-"""Preparation of a mesh job: its kernels, and a volume without the air around the patient."""
+"""Preparation of a mesh job: its kernels, and the parts of the volume that its surfaces are made of."""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from clrecon.jobs.mesh.settings import MeshSettings
+from clrecon.jobs.mesh.surfaces import Surface
+from clrecon.jobs.shared.preprocess import preprocess_volume
+from clrecon.jobs.shared.region import Band, restrict_volume
 from clrecon.system.progress import Progress
 from clrecon.system.wording import name_parameter
 
@@ -12,7 +17,7 @@ if TYPE_CHECKING:
     from clrecon.geometry import Volume
     from clrecon.opencl import Device
 
-__all__ = ["leave_outside", "prepare_surfaces"]
+__all__ = ["bands_of", "leave_outside", "narrow_volume", "prepare_surfaces"]
 
 
 def prepare_surfaces(
@@ -34,6 +39,36 @@ def prepare_surfaces(
         prepare_growing(device)
     if components:
         prepare_components(device)
+
+
+def bands_of(surfaces: Sequence[Surface]) -> list[Band]:
+    """Return the HU that each surface encloses; NaN for a level that is still to be measured."""
+    bands: list[Band] = []
+    for surface in surfaces:
+        level = surface.iso_value
+        if isinstance(level, tuple):
+            bands.append((level[0], level[1]))
+        elif level is not None:
+            bands.append((-math.inf, level) if surface.below else (level, math.inf))
+    return bands
+
+
+def narrow_volume(
+    volume: Volume, surfaces: Sequence[Surface], settings: MeshSettings, device: Device, progress: Progress
+) -> Volume:
+    """Return the volume without what the surfaces shall not hold: outside air, where they lie below a level, what is
+    outside of the region, and what preprocessing takes.
+
+    Raises
+    ------
+    ClreconError
+        As `leave_outside`, `restrict_volume` and `preprocess_volume`.
+    """
+    bands = bands_of(surfaces)
+    volume = leave_outside(volume, settings, progress)
+    if settings.below is not None:
+        volume = restrict_volume(volume, settings, device, bands, progress)
+    return preprocess_volume(volume, settings, device, bands, progress)
 
 
 def leave_outside(volume: Volume, settings: MeshSettings, progress: Progress) -> Volume:

@@ -148,7 +148,8 @@ class MeshSettings(InputSettings):
         if self.follows_hu:
             return
         levels = (self.iso_value, self.below, self.preset, self.half_way)
-        if any(given is not None for given in (*levels, self.field_of_view)) or self.remove_table:
+        turned = (self.field_of_view, self.region, self.preprocess)
+        if any(given is not None for given in (*levels, *turned)) or self.remove_table:
             raise UsageError(
                 "the surface of a mask does not depend on HU: leave out iso values, presets, and what turns voxels into"
                 " air"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from contextlib import ExitStack
 from functools import partial
@@ -25,8 +26,11 @@ from clrecon.jobs.shared.laps import Laps
 from clrecon.jobs.shared.masking import mask_volume
 from clrecon.jobs.shared.opening import DeviceOpening
 from clrecon.jobs.shared.outputs import check_kept, commit_all
+from clrecon.jobs.shared.preprocess import preprocess_volume
+from clrecon.jobs.shared.region import Band, restrict_volume
 from clrecon.jobs.shared.report import stage_report
 from clrecon.reading import read_selected
+from clrecon.rendering.pictures.styles import SurfaceLook
 from clrecon.system.files import allow_open_files
 from clrecon.system.log import get_logger, log_warnings
 from clrecon.system.progress import Progress, ignore_progress
@@ -150,9 +154,18 @@ def _open(
         device = opening.wait()
         watch.lap("device")
     if not is_cloud:
-        subject = mask_volume(subject, settings, progress)  # type: ignore[arg-type]
+        subject = _narrow(subject, settings, device, progress)  # type: ignore[arg-type]
         watch.lap("mask")
     return subject, labels, device
+
+
+def _narrow(volume: Volume, settings: RenderSettings, device: Device, progress: Progress) -> Volume:
+    """Turn what the settings name into air, and run the steps of preprocessing."""
+    style = settings.style
+    bands: list[Band] = [(style.iso_value, math.inf)] if isinstance(style, SurfaceLook) else []
+    volume = mask_volume(volume, settings, progress)
+    volume = restrict_volume(volume, settings, device, bands, progress)
+    return preprocess_volume(volume, settings, device, bands, progress)
 
 
 def _prepare(device: Device, settings: RenderSettings) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from clrecon.errors import UsageError
@@ -22,9 +23,15 @@ class InputSettings(Selection):
     remove_table : bool
         First turn everything except the patient's body into air, see `clrecon.anatomy.body.remove_table`.
     allow_bone_loss : bool
-        Continue even if this removes more than 2 % of the bone.
+        Continue even if this removes more than 2 % of the bone, or `preprocess` more than half of what is at the level
+        and above.
     field_of_view : float or "auto", optional
         First turn everything farther from the centre of the slices (mm) into air; "auto": the circle that fits them.
+    region : sequence of str, optional
+        Rules of the region of interest, outside of which everything becomes air, see
+        `clrecon.jobs.shared.region_rules.parse_region_rules`; mm of the frame `space` where the job has one, else LPS.
+    preprocess : str or sequence of str, optional
+        Steps before the surface, see `clrecon.jobs.shared.preprocess_steps.parse_preprocess`.
     keep_ids : bool
         Write the hashes of the UIDs of series and frame of reference into reports and mesh files.
     device : str, optional
@@ -42,6 +49,8 @@ class InputSettings(Selection):
     remove_table: bool = False
     allow_bone_loss: bool = False
     field_of_view: float | str | None = None
+    region: Sequence[str] | None = None
+    preprocess: str | Sequence[str] | None = None
     keep_ids: bool = False
     device: str | None = None
     memory: int | None = None
@@ -54,5 +63,29 @@ class InputSettings(Selection):
                 raise UsageError(f"the field of view is a radius in mm or auto, not {self.field_of_view!r}")
         elif self.field_of_view is not None and not (math.isfinite(self.field_of_view) and self.field_of_view > 0.0):
             raise UsageError(f"the radius of the field of view is a length in mm above 0, not {self.field_of_view:g}")
-        if self.allow_bone_loss and not self.remove_table:
-            raise UsageError("a loss of bone is allowed, but nothing takes any: ask for the removal of the table too")
+        if self.allow_bone_loss and not (self.remove_table or self.preprocess is not None):
+            raise UsageError(
+                "a loss of bone is allowed, but nothing takes any: ask for the removal of the table or for"
+                " preprocessing too"
+            )
+        self._check_region()
+
+    def _check_region(self) -> None:
+        from clrecon.jobs.shared.region_rules import parse_region_rules
+
+        if self.region:
+            parse_region_rules(self.region)
+        if self.region_later and not self.region:
+            raise UsageError("a step of preprocessing is the region of interest, and there is none: give its rules")
+
+    @property
+    def region_later(self) -> bool:
+        """True where the region of interest is a step of preprocessing, and does not come before."""
+        from clrecon.jobs.shared.preprocess_steps import parse_preprocess
+
+        return self.preprocess is not None and any(step.name == "region" for step in parse_preprocess(self.preprocess))
+
+    @property
+    def space_of_points(self) -> str:
+        """Patient frame of the region's numbers: that of what is written, LPS where a job has none."""
+        return str(getattr(self, "space", "lps"))
