@@ -124,7 +124,7 @@ class _Run:
 
     def _filter(self, resident: DeviceVolume, step: PreprocessStep) -> tuple[DeviceVolume, dict[str, Any]]:
         from clrecon.operators.filters.bilateral import filter_bilateral
-        from clrecon.operators.filters.others import filter_volume
+        from clrecon.operators.filters.denoisers import filter_volume
 
         given: dict[str, Any] = dict(zip(FILTERS[step.name], step.numbers, strict=False))
         if step.name.startswith("bilateral"):
@@ -140,7 +140,7 @@ class _Run:
             )  # fmt: skip
         else:
             done = filter_volume(resident, step.name, **given)
-        return done, dict(done.volume.report["filters"][-1])
+        return done, dict(done.volume.report["filtered"]["steps"][-1])
 
     def _change_shape(self, resident: DeviceVolume, step: PreprocessStep) -> tuple[DeviceVolume, dict[str, Any]]:
         from clrecon.operators.masks.mask import Mask
@@ -156,10 +156,11 @@ class _Run:
         self._check_loss(step, facts)
         inside, outside = _values(resident.volume, mask, band)
         facts |= {"inside_hu": inside, "outside_hu": outside}
-        if taken.count:
-            resident = (~taken).apply(resident, outside)
-        if added.count:
-            resident = (~added).apply(resident, inside)
+        report = resident.volume.report
+        for voxels, value in ((taken, outside), (added, inside)):
+            if voxels.count:
+                resident = (~voxels).apply(resident, value)
+        resident.volume.report = report
         self.warnings.append(
             f"{step} took {taken.count:,} of {before:,} voxels of {_describe(band)} and added {added.count:,}"
         )

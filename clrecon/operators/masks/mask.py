@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from clrecon.errors import UsageError
 from clrecon.geometry import AIR_HU, Volume
+from clrecon.geometry.certificate import amend
 from clrecon.opencl import Device, Stopwatch, allocate, check_budget, launch, load_program, upload
 from clrecon.operators.masks import logic
 from clrecon.operators.masks.band_mask import check_shape, checked_band, mark_band, mask_bytes
@@ -282,7 +283,7 @@ class Mask(MaskComponents):
             voxels = np.where(self.to_numpy(), own.voxels, value)
         made = own.with_voxels(voxels)
         chosen = {"chosen": self.name, "voxels": self.count, "all_voxels": own.voxels.size, "outside_hu": float(value)}
-        made.report["region"] = chosen
+        made.report = amend(made.report, region=chosen)
         return volume.follow(made, voxels_d) if isinstance(volume, DeviceVolume) else made
 
     def _replace(self, resident: DeviceVolume, value: Any) -> tuple[NDArray[Any], Any]:
