@@ -118,7 +118,8 @@ def _describe_topology(found: Mapping[str, Any]) -> str:
 def _describe_purpose(purpose: Purpose) -> str:
     """Describe a purpose by the options that it stands for; part of the help of ``--for``."""
     options = [
-        f"--{field.replace('_', '-')}" + ("" if value is True else f" {value}")
+        f"--{field.replace('_', '-')}"
+        + ("" if value is True else f" {' '.join(value)}" if isinstance(value, tuple) else f" {value}")
         for field, value in purpose.settings.items()
     ]
     return f"{purpose.name}: {' '.join(options)}: {purpose.description}".replace("%", "%%")

@@ -37,14 +37,18 @@ def settings_for(name: str | None, given: dict[str, Any]) -> dict[str, Any]:
     """
     if name is None:
         return dict(given)
-    fields = dict(find_purpose(name).settings)
-    if not given.get("closed", True):
-        raise UsageError(f"a surface for {name} is closed: leave {name_parameter('closed', False)} out")
-    if any(given.get(other) for other in ("seeds", "min_volume_ml", "split", "labels")):
-        del fields["keep_largest"]
-    chosen = any(given.get(other) for other in ("keep_largest", "seeds", "min_volume_ml"))
-    if chosen or not _at_levels_of_bone(given):
-        del fields["keep"]
+    purpose = find_purpose(name)
+    fields = dict(purpose.settings)
+    if purpose.is_for_print:
+        if not given.get("closed", True):
+            raise UsageError(f"a surface for {name} is closed: leave {name_parameter('closed', False)} out")
+        if any(given.get(other) for other in ("seeds", "min_volume_ml", "split", "labels")):
+            del fields["keep_largest"]
+        chosen = any(given.get(other) for other in ("keep_largest", "seeds", "min_volume_ml"))
+        if chosen or not _at_levels_of_bone(given):
+            del fields["keep"]
+    elif given.get("region"):
+        fields["preprocess"] += ",region"  # the paper's order
     taken = {field: value for field, value in fields.items() if not given.get(field)}
     return {**given, **taken, "purpose": name}
 

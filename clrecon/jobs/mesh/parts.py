@@ -92,7 +92,7 @@ def select_parts(surface: Surface, mesh: Mesh, settings: MeshSettings, device: D
     NoSurfaceError, UsageError
         As `_select_parts`.
     """
-    if settings.purpose is None:
+    if not settings.is_for_print:
         return _select_parts(surface, mesh, settings, device, volume)
     from clrecon.jobs.mesh.print_facts import measure_pieces
 
@@ -134,7 +134,7 @@ def _select_parts(surface: Surface, mesh: Mesh, settings: MeshSettings, device: 
         among = find_bone(
             mesh, volume, surface, labelled, without_table=settings.remove_table, advice=_advice(settings)
         )
-        if settings.purpose is not None:
+        if settings.is_for_print:
             from clrecon.jobs.mesh.print_facts import measure_pieces
 
             other = mesh.triangles[~among[labelled[1][mesh.triangles[:, 0]]]]
@@ -153,7 +153,7 @@ def _select_parts(surface: Surface, mesh: Mesh, settings: MeshSettings, device: 
 
 def _advice(settings: MeshSettings) -> str:
     """Return advice for a surface without bone."""
-    if settings.purpose is None:
+    if not settings.is_for_print:
         return f"{name_parameter('keep_largest', 'N')} keeps by size"
     purpose, largest = name_parameter("purpose", settings.purpose), name_parameter("keep_largest", 1)
     return f"{purpose} keeps bone: {largest} takes the largest component, whatever it is"

@@ -21,11 +21,14 @@ class Purpose:
         Fields of `MeshSettings` that it sets if they are not given.
     description : str
         One line.
+    is_for_print : bool
+        The surface has to be closed and of bone, and what a printer needs to know of it is measured.
     """
 
     name: str
     settings: dict[str, Any]
     description: str
+    is_for_print: bool = False
 
 
 PURPOSES: dict[str, Purpose] = {
@@ -35,6 +38,12 @@ PURPOSES: dict[str, Purpose] = {
             "print",
             {"keep": "bone", "keep_largest": 1, "smooth": 20, "decimate": 0.9, "strict": True},
             "one closed piece, of bone at iso values of bone; size and thickness of walls are said",
+            is_for_print=True,
+        ),
+        Purpose(
+            "paper-b",
+            {"preprocess": "bilateral-2d,open:1", "method": "i-mc", "grow_from": ("auto",), "vertex_rule": "golden"},
+            "improved marching cubes as Liu et al. 2019 print it (region by --region); --vertex-rule linear is more exact",
         ),
     )
 }

@@ -289,6 +289,11 @@ class MeshSettings(InputSettings):
         return "between" if any(isinstance(level, tuple) for level in self.levels) else "above"
 
     @property
+    def is_for_print(self) -> bool:
+        """True where what a printer needs to know is measured."""
+        return self.purpose is not None and find_purpose(self.purpose).is_for_print
+
+    @property
     def refines(self) -> bool:
         """True where the surface is smoothed or decimated."""
         return self.smooth is not None or self.decimate_used is not None
