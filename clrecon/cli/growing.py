@@ -34,7 +34,6 @@ def add_methods(parser: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--vertex-rule",
         type=str.lower,
-        default="linear",
         metavar="linear|golden|golden-search",
         help="where on an edge a vertex lies: linear (default); golden: at 0.618 whatever the HU, up to 0.6 voxels off;"
         " golden-search: where a cubic crosses the iso value, no better than linear",

@@ -157,6 +157,7 @@ def run(options: argparse.Namespace, console: Console) -> int:
 
     names = {own.name for own in fields(MeshSettings)} - {"purpose"}
     given = {**pick(options, names), **options.hu, "labels": label_choice(options)}
+    given = {name: value for name, value in given.items() if value is not None}
     settings = MeshSettings(**settings_for(options.purpose, given))
     report = make_mesh(
         options.input,

@@ -16,7 +16,7 @@ from clrecon.errors import UsageError
 from clrecon.system.wording import name_parameter
 
 __all__ = [
-    "GOLDEN", "SEARCH_STEPS", "VERTEX_RULES", "check_vertex_rule", "cubic_value", "golden_fraction", "linear_fraction",
+    "GOLDEN", "SEARCH_STEPS", "VERTEX_RULES", "check_vertex_rule", "cubic_value", "describe_rule", "golden_fraction", "linear_fraction",
     "normal_on_edge", "point_on_edge", "search_fraction",
 ]  # fmt: skip
 
@@ -43,6 +43,16 @@ def check_vertex_rule(vertex_rule: str, topology: str = "separated") -> None:
             f"{name_parameter('vertex_rule', vertex_rule)} and {name_parameter('topology', 'trilinear')} exclude each"
             " other: the trilinear field is linear along edges"
         )
+
+
+def describe_rule(vertex_rule: str) -> list[str]:
+    """Return the warning for a rule that does not follow the HU, none for the others."""
+    if vertex_rule != "golden":
+        return []
+    return [
+        "vertices lie at 0.618 of their edges whatever the HU, as the paper has it: 0.22 voxels from the surface in the"
+        f" root mean square, 0.6 at most; {name_parameter('vertex_rule', 'linear')} is within 0.02"
+    ]
 
 
 def linear_fraction(value: ArrayLike, next_value: ArrayLike, level: ArrayLike) -> NDArray[np.float64]:

@@ -42,8 +42,8 @@ PURPOSES: dict[str, Purpose] = {
         ),
         Purpose(
             "paper-b",
-            {"preprocess": "bilateral-2d,open:1", "method": "i-mc", "grow_from": ("auto",), "vertex_rule": "golden"},
-            "improved marching cubes as Liu et al. 2019 print it (region by --region); --vertex-rule linear is more exact",
+            {"preprocess": "bilateral-2d,open:1", "method": "i-mc", "vertex_rule": "golden"},
+            "improved marching cubes as Liu et al. 2019 have it; the vertex rule linear is more exact",
         ),
     )
 }

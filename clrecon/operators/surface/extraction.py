@@ -14,6 +14,7 @@ from clrecon.errors import ClreconError, DeviceError, DeviceMemoryError, NoSurfa
 from clrecon.geometry import Volume
 from clrecon.geometry.iso_rule import IsoRule, data_range
 from clrecon.geometry.precision import describe_far
+from clrecon.geometry.vertex_rules import describe_rule
 from clrecon.opencl import Device, Program, Stopwatch, result_pages
 from clrecon.operators.resident.bricks import BrickStates, brick_bytes, compare_bricks, measure_bricks
 from clrecon.operators.resident.device_volume import DeviceVolume
@@ -264,6 +265,7 @@ class Extraction:
                 *self.device.warnings,
                 *describe_far(self.grid.volume),
                 *warn_of_face(self.grid.volume, said["inside_hu"], "surface"),
+                *describe_rule(rule.vertex_rule),
                 *self.warnings,
             ],
         }

@@ -59,7 +59,7 @@ def test_bone_is_kept_where_the_level_is_that_of_bone_and_nothing_else_is_chosen
 
 
 def test_impossible_purposes() -> None:
-    with pytest.raises(UsageError, match="can be for print, not for 'fun'"):
+    with pytest.raises(UsageError, match="can be for print, paper-b, not for 'fun'"):
         settings_for("fun", {})
     with pytest.raises(UsageError, match="leave closed=False out"):
         settings_for("print", {"closed": False})
@@ -97,3 +97,30 @@ def test_a_print_of_a_phantom(device: Any, tmp_path: Path, capsys: pytest.Captur
     assert facts["pieces_ml"] == pytest.approx(report["volume_ml"], rel=0.01)
     assert 0.0 < facts["wall"]["p5_mm"] <= facts["wall"]["median_mm"] <= size.max()
     assert main([*arguments, "--open"]) == 3
+
+
+def test_paper_b_is_the_way_of_the_paper() -> None:
+    settings = MeshSettings(**settings_for("paper-b", {"region": ["hu:100,"], "closed": False}))
+    assert (settings.preprocess, settings.method_used, settings.vertex_rule) == (
+        "bilateral-2d,open:1,region", "i-mc", "golden",
+    )  # fmt: skip
+    assert not settings.is_for_print
+    own = MeshSettings(**settings_for("paper-b", {"vertex_rule": "linear", "preprocess": "fill"}))
+    assert (own.preprocess, own.vertex_rule) == ("fill", "linear")
+    assert MeshSettings(**settings_for("paper-b", {})).preprocess == "bilateral-2d,open:1"
+
+
+def test_paper_b_runs_as_a_whole(device: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_phantom(tmp_path / "ct", PhantomSettings(size=(96, 96), slices=40, spacing=(1.6, 1.6, 2.0), noise=12.0))
+    report_path, mesh_path = tmp_path / "r.json", tmp_path / "bone.stl"
+    options = ["--for", "paper-b", "--hu", "250", "--region", "tube:60", "--device", str(device.index)]
+    assert main(["mesh", str(tmp_path / "ct"), "-o", str(mesh_path), "--report", str(report_path), *options]) == 0
+    report = json.loads(report_path.read_text())
+    steps = [step["step"] for step in report["volume"]["preprocess"]]
+    assert steps == ["bilateral-2d", "open:1", "region"]
+    assert (report["method"], report["vertex_rule"]) == ("i-mc", "golden")
+    cells = report["meshes"][0]["cells"]
+    assert 0 < cells["active"] <= cells["all"]
+    said = capsys.readouterr()
+    assert "cells" in said.out
+    assert any("0.2 voxel" in warning or "golden" in warning for warning in report["warnings"])

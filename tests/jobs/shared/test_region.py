@@ -177,12 +177,12 @@ def test_a_cloud_and_a_picture_are_of_the_region(
     assert np.abs(points - to_lps(SMALL)).max() < 6.43 + 0.8
     picture = ["--mode", "surface", "--size", "64", "--depth", str(tmp_path / "d.npy")]
     shares = []
-    for more in ([], ["--region", box], ["--region", box, "--preprocess", "erode:2"]):
+    for more in ([], ["--region", box], ["--region", box, "--preprocess", "erode:1"]):
         arguments = ["render", str(scan), "-o", str(tmp_path / "p.png"), *given[:2], *more, "--json", *picture]
         assert main(arguments) == 0, capsys.readouterr()
         capsys.readouterr()
         shares.append(np.isfinite(np.load(tmp_path / "d.npy")).mean())
-    assert shares[0] > 2 * shares[1] > 2 * shares[2] > 0
+    assert shares[0] > 2 * shares[1] > 2.2 * shares[2] > 0
 
 
 def test_what_lies_below_a_level_is_cut_by_a_region_too(report_of: Any) -> None:
