@@ -16,7 +16,8 @@ from clrecon.errors import UsageError
 from clrecon.system.wording import name_parameter
 
 __all__ = [
-    "GOLDEN", "SEARCH_STEPS", "VERTEX_RULES", "check_vertex_rule", "cubic_value", "describe_rule", "golden_fraction", "linear_fraction",
+    "GOLDEN", "SEARCH_STEPS", "VERTEX_RULES", "check_vertex_rule", "cubic_value", "describe_rule", "golden_fraction",
+    "linear_fraction",
     "normal_on_edge", "point_on_edge", "search_fraction",
 ]  # fmt: skip
 

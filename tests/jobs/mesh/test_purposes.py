@@ -123,4 +123,4 @@ def test_paper_b_runs_as_a_whole(device: Any, tmp_path: Path, capsys: pytest.Cap
     assert 0 < cells["active"] <= cells["all"]
     said = capsys.readouterr()
     assert "cells" in said.out
-    assert any("0.2 voxel" in warning or "golden" in warning for warning in report["warnings"])
+    assert any("0.618 of their edges" in warning for warning in report["warnings"])
