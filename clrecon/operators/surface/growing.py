@@ -22,7 +22,7 @@ from clrecon.operators.surface.cells import Classified, load_cells
 from clrecon.operators.surface.seeds import AUTO_SHARE, SEED_REACH_MM, Seeds
 from clrecon.operators.surface.slabs import SampleGrid, Slab
 
-__all__ = ["Grown", "grow", "join_slabs", "keep_edges", "prepare_growing"]
+__all__ = ["Grown", "find_components", "grow", "growing_needs", "join_slabs", "keep_edges", "prepare_growing"]
 
 FARTHEST_TOLD_MM = 50.0
 """Of a seed in air the nearest cell is looked for up to here, for the message."""
@@ -307,3 +307,32 @@ def keep_edges(device: Device, slab: Slab, grown: Grown, classified: Classified,
         first=slab.first, whole_gk=gk,
     )  # fmt: skip
     return Classified(kept_d, extents_d, classified.mask_d)
+
+
+def find_components(
+    resident: DeviceVolume, grid: SampleGrid, classified: Classified, stopwatch: Stopwatch
+) -> tuple[int, int]:
+    """Find all components of active cells.
+
+    Parameters
+    ----------
+    classified : Classified
+        Inside mask of the whole grid.
+
+    Returns
+    -------
+    count, cells : int
+        Components, and active cells.
+
+    Raises
+    ------
+    DeviceError
+        The device fails.
+    """
+    search = _Search(resident, grid, classified, stopwatch)
+    with stopwatch.running(resident.device):
+        runs = search.find_runs()
+        if runs.total == 0:
+            return 0, 0
+        count, _, run_cells = search.join(runs)
+    return count, int(run_cells.sum(dtype=np.int64))

@@ -1,0 +1,118 @@
+"""Case of growing: parts of a surface that hang together with seeds, beside the ways to the same without it."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+from measure import alternate, summarise
+from registry import Job, case
+
+__all__ = ["measure_growing"]
+
+
+@case("growing", "surfaces grown from seeds (I-MC), against the whole (T-MC), T-MC with a choice after it, and cc3d")
+def measure_growing(job: Job) -> dict[str, Any]:
+    """Time meshes from the volume on the device to the mesh in memory, and components of cells from the inside mask.
+
+    Meshes: I-MC with the largest parts ("auto"); peers are T-MC, and T-MC whose components are then numbered on the
+    device and chosen, as many as I-MC takes.  Components: all components of active cells, from bits on the device;
+    peers are cc3d and scipy on the inside mask, and the flood of one seed on it by scikit-image and SimpleITK.  The
+    time to make the mask is not counted on either side.
+    """
+    import cc3d
+    import numpy as np
+    from scipy import ndimage
+
+    from clrecon.geometry.iso_rule import choose_iso_rule
+    from clrecon.mesh import select_components
+    from clrecon.opencl import Stopwatch
+    from clrecon.operators.primitives.union_find import label_components
+    from clrecon.operators.resident.device_volume import DeviceVolume
+    from clrecon.operators.surface.extract import SurfaceExtractor
+    from clrecon.operators.surface.growing import find_components
+    from clrecon.operators.surface.marching_cubes import classify
+    from clrecon.operators.surface.slabs import SampleGrid, Slab
+
+    volume = job.input.volume()
+    resident = DeviceVolume(volume, device=job.device)
+    figures: dict[str, Any] = {"ratios": {}, "sides": {}}
+
+    def compare(name: str, ours: Callable[[], Any], theirs: Callable[[], Any], rows: int) -> None:
+        taken = alternate(
+            lambda: _seconds(ours), lambda: _seconds(theirs), job.pairs, limit_s=job.limit_s / rows
+        )  # fmt: skip
+        figures["sides"][name] = summarise(*taken)
+        figures["ratios"][name] = figures["sides"][name]["ratio"]
+
+    with SurfaceExtractor(resident) as extractor:
+        grown = extractor.extract(job.hu, grow_from="auto")
+
+        def choose_after() -> Any:
+            mesh = extractor.extract(job.hu)
+            labelled = label_components(job.device, mesh.triangles, mesh.vertex_count)
+            return select_components(mesh, grown.report["growing"]["components_taken"], labelled=labelled)
+
+        compare("t_mc", lambda: extractor.extract(job.hu, grow_from="auto"), lambda: extractor.extract(job.hu), 6)
+        compare("t_mc_and_choice", lambda: extractor.extract(job.hu, grow_from="auto"), choose_after, 6)
+        compare(
+            "golden_search", lambda: extractor.extract(job.hu),
+            lambda: extractor.extract(job.hu, vertex_rule="golden-search"), 6,
+        )  # fmt: skip
+
+    rule = choose_iso_rule(volume, job.hu)
+    grid, watch = SampleGrid(volume, rule), Stopwatch()
+    level = volume.voxels.dtype.type(rule.lowest_inside)
+    slab = Slab(grid, 0, grid.shape[2])
+    with watch.running(job.device):
+        classified = classify(job.device, slab, resident.whole(watch), (level,), watch)
+    mask = volume.voxels >= job.hu
+    own = find_components(resident, grid, classified, watch)
+    peers: dict[str, Callable[[], Any]] = {
+        "cc3d_6": lambda: cc3d.connected_components(mask, connectivity=6, return_N=True)[1],
+        "ndimage_6": lambda: ndimage.label(mask)[1],
+        **_floods(mask),
+    }
+    for name, peer in peers.items():
+        compare(name, lambda: find_components(resident, grid, classified, Stopwatch()), peer, 6)
+    return {
+        **figures,
+        "cells": grown.report["cells"],
+        "growing": grown.report["growing"],
+        "components": {"cells": own[0], "voxels": int(peers["cc3d_6"]())},
+        "triangles": grown.triangle_count,
+        "kernel_seconds": dict(grown.report["kernel_seconds"]),
+        "equal": bool(np.array_equal(own[1], grown.report["cells"]["active"])),
+    }
+
+
+def _floods(mask: Any) -> dict[str, Callable[[], Any]]:
+    """Floods from one voxel of the largest solid, by those programs that are there."""
+    import cc3d
+    import numpy as np
+
+    numbers = cc3d.connected_components(mask, connectivity=6)
+    largest = int(np.bincount(numbers[mask]).argmax())
+    seed = tuple(int(n) for n in np.argwhere(numbers == largest)[0])
+    found: dict[str, Callable[[], Any]] = {}
+    try:
+        from skimage.segmentation import flood
+
+        found["skimage_flood"] = lambda: flood(mask, seed, connectivity=1)
+    except ImportError:
+        pass
+    try:
+        import SimpleITK as sitk
+
+        image = sitk.GetImageFromArray(mask.astype(np.uint8))
+        found["simpleitk_connected"] = lambda: sitk.ConnectedThreshold(image, [seed[::-1]], 1, 1)
+    except ImportError:
+        pass
+    return found
+
+
+def _seconds(run: Callable[[], Any]) -> float:
+    start = time.perf_counter()
+    run()
+    return time.perf_counter() - start
