@@ -190,8 +190,8 @@ INVERSIONS: dict[str, dict[str, tuple[tuple[str, str], ...]]] = {
         )
     },
     "mark_grown": {"grown": (("? ~0u : 0u;", "? 0u : ~0u;"),)},
-    "start_rows": {"starts": (("= set;\n    for", "= !set;\n    for"), ("+ j] = set;", "+ j] = !set;"))},
-    "keep_edges": {"kept": (("row_kept[w] = bits;", "row_kept[w] = ~bits;"),)},
+    "start_rows": {"starts": (("= set;\n    for", "= !set;\n    for"),)},  # all of them inverted: the same edges
+    "keep_edges": {"kept": (("bits ^= flips << 1;", "bits ^= ~flips << 1;"),)},
     "count_visited": {"counts": (("counts[row] = count;", "counts[row] = 32 * words - count;"),)},
     "count_cells": {
         "triangles": (("row_counts[rows_to_count + row] += more;", "row_counts[rows_to_count + row] -= more;"),),

@@ -33,17 +33,31 @@ static inline uint find_root(volatile __global const uint *parents, uint run)
     return run;
 }
 
+/* The same, and halves the way: every run passed gets its parent's parent, which never becomes larger by it. */
+static inline uint halve_way(volatile __global uint *parents, uint run)
+{
+    uint parent = parents[run];
+    while (parent != run) {
+        const uint next = parents[parent];
+        if (next != parent)
+            atomic_min(parents + run, next);
+        run = next;
+        parent = parents[run];
+    }
+    return run;
+}
+
 /* Join the components of two runs: the larger root gets the smaller one as its parent. */
 static inline void unite(volatile __global uint *parents, uint a, uint b)
 {
-    a = find_root(parents, a);
-    b = find_root(parents, b);
+    a = halve_way(parents, a);
+    b = halve_way(parents, b);
     while (a != b) {
         const uint large = max(a, b), small = min(a, b);
         const uint parent = atomic_cmpxchg(parents + large, large, small);
         if (parent == large)
             return;
-        a = find_root(parents, parent); /* it was no root any more */
+        a = halve_way(parents, parent); /* it was no root any more */
         b = small;
     }
 }

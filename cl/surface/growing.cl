@@ -29,8 +29,8 @@
  * mask in the kept mask, or the inverted one; the case is therefore read from the inside mask (cells.cl, -D GROWN).
  *
  * Races.  join_cell_runs is the only pass where items read what others write in the same launch.  A parent is never above
- * its run, it only ever falls, and it is changed by atomic_cmpxchg() alone and at roots alone, from the root itself to
- * a smaller run of the same component.  A parent that an item reads too early was a parent a moment ago, so following
+ * its run and only ever falls: at roots by atomic_cmpxchg(), from the root itself to a smaller run of the same
+ * component; at other runs by atomic_min(), to the parent's parent.  A parent that an item reads too early was a parent a moment ago, so following
  * it leads to the same component, and the swap of one that is no root any more fails and says the new one.  No item
  * waits for another.  A root is the smallest run of its component whatever the order: the outcome is the same on every
  * device. */
@@ -128,16 +128,22 @@ __kernel void begin_cell_runs(
         run_cells[run - 1] = cells;
 }
 
-/* Join the runs of a row of cells with those of the next one, row `other`, in word w.  `mixed_before` says whether the
- * last face of the word before is mixed, and is then told that of this word. */
+/* Join the runs of a row of cells with those of the next one, row `other`, in word w.  `mixed` are the
+ * faces, `joined` those whose cells others join; `mixed_before` says whether the last face of the word before is mixed,
+ * and is then told that of this word. */
 static inline void join_word(
     volatile __global uint *parents, __global const uint *run_starts, __global const ushort *word_runs,
-    __global const uint *row_offsets, uint row, uint other, uint w, uint words, uint mixed, uint *mixed_before)
+    __global const uint *row_offsets, uint row, uint other, uint w, uint words, uint mixed, uint joined,
+    uint *mixed_before)
 {
+    if (mixed == 0) {
+        *mixed_before = 0;
+        return;
+    }
     const size_t at = (size_t)row * words + w, other_at = (size_t)other * words + w;
     const uint starts = run_starts[at], other_starts = run_starts[other_at];
     /* Where both runs go on from a cell whose face is mixed too, they have been joined there. */
-    uint joins = mixed & ~((mixed << 1 | *mixed_before) & ~starts & ~other_starts);
+    uint joins = mixed & ~joined & ~((mixed << 1 | *mixed_before) & ~starts & ~other_starts);
     *mixed_before = mixed >> 31;
     for (; joins != 0; joins &= joins - 1) {
         const uint upto = (joins & -joins) | ((joins & -joins) - 1);
@@ -168,16 +174,37 @@ __kernel void join_cell_runs(
     const ushort2 none = (ushort2)(0, 0);
     const ushort2 next_y = j + 2 < gj ? run_extents[row + 1] : none;
     const ushort2 next_z = k + 2 < gk ? run_extents[row + gj] : none;
+    if (next_y.x >= next_y.y && next_z.x >= next_z.y)
+        return;
+    __global const uint *y1z0 = mask + (size_t)(row + 1) * words;
+    __global const uint *y0z1 = mask + (size_t)(row + gj) * words;
+    __global const uint *y1z1 = y0z1 + words;
     uint mixed_y_before = 0, mixed_z_before = 0;
+    cell_rows rows = {0, y1z0[extent.x], y0z1[extent.x], y1z1[extent.x]};
     for (uint w = extent.x; w < extent.y; ++w) {
-        cell_rows rows;
-        load_cell_rows(&rows, mask, j, k, w, gj, words);
+        const uint next = w + 1 < words ? w + 1 : w;
+        const cell_rows next_rows = {0, y1z0[next], y0z1[next], y1z1[next]};
+        rows.y1z0 |= next_rows.y1z0 << 32;
+        rows.y0z1 |= next_rows.y0z1 << 32;
+        rows.y1z1 |= next_rows.y1z1 << 32;
         if (w >= next_y.x && w < next_y.y)
             join_word(parents, run_starts, word_runs, row_offsets, row, row + 1, w, words,
-                find_mixed_faces(rows.y1z0, rows.y1z1, w, gi), &mixed_y_before);
-        if (w >= next_z.x && w < next_z.y)
-            join_word(parents, run_starts, word_runs, row_offsets, row, row + gj, w, words,
-                find_mixed_faces(rows.y0z1, rows.y1z1, w, gi), &mixed_z_before);
+                find_mixed_faces(rows.y1z0, rows.y1z1, w, gi), 0, &mixed_y_before);
+        if (w >= next_z.x && w < next_z.y) {
+            const uint mixed = find_mixed_faces(rows.y0z1, rows.y1z1, w, gi);
+            uint joined = 0;
+            if (j > 0 && mixed != 0) {
+                /* Round the edge that four cells share: by the row before, both cells are joined to its own already. */
+                const ulong own = load_window(mask, row, w, words);
+                const ulong before = load_window(mask, row + gj - 1, w, words);
+                const ulong beyond = load_window(mask, row + 2 * gj, w, words);
+                joined = find_mixed_faces(before, rows.y0z1, w, gi) & find_mixed_faces(own, rows.y0z1, w, gi)
+                    & find_mixed_faces(rows.y0z1, beyond, w, gi);
+            }
+            join_word(parents, run_starts, word_runs, row_offsets, row, row + gj, w, words, mixed, joined,
+                &mixed_z_before);
+        }
+        rows = next_rows;
     }
 }
 
@@ -249,6 +276,7 @@ __kernel void seed_cell_runs(
  *             numbers  in   (runs,) component of each run
  *             chosen   in   (components,) 1 for chosen ones, else 0
  *             grown    out  (gk, gj, words) bit b: cell b of the word belongs to a chosen component
+ *             grown_extents   out  (gk, gj) first word of the row with a grown cell, and the one after the last
  *             gi gj gk, words   as above
  * Launch      as find_cell_runs
  * Guarantees  every word is written */
@@ -256,6 +284,7 @@ __kernel void mark_grown(
     __global const uint *restrict mask, __global const uint *restrict run_starts,
     __global const ushort2 *restrict run_extents, __global const uint *restrict row_offsets,
     __global const int *restrict numbers, __global const uchar *restrict chosen, __global uint *restrict grown,
+    __global ushort2 *restrict grown_extents,
     const uint gi, const uint gj, const uint gk, const uint words)
 {
     const uint row = get_global_id(0);
@@ -269,6 +298,7 @@ __kernel void mark_grown(
     for (uint w = extent.y; w < words; ++w)
         row_grown[w] = 0;
     uint run = row_offsets[row], keeps = 0; /* all ones where the run that goes on is chosen */
+    uint begin = words, end = 0;
     for (uint w = extent.x; w < extent.y; ++w) {
         cell_rows rows;
         load_cell_rows(&rows, mask, j, k, w, gj, words);
@@ -279,8 +309,12 @@ __kernel void mark_grown(
             active &= ~before;
             keeps = chosen[numbers[run++]] ? ~0u : 0u;
         }
-        row_grown[w] = bits | (active & keeps);
+        bits |= active & keeps;
+        row_grown[w] = bits;
+        begin = min(begin, bits != 0 ? w : words);
+        end = bits != 0 ? w + 1 : end;
     }
+    grown_extents[row] = (ushort2)((ushort)min(begin, end), (ushort)end);
 }
 
 /* The row of cells that has a crossed edge along i from row (j, k) of samples, in the bits of the whole grid. */
@@ -316,8 +350,7 @@ __kernel void start_rows(
 }
 
 /* Parameters  mask          in   (gk, gj, words) inside mask of a slab
- *             row_extents   in   (gk, gj)
- *             grown         in   (whole_gk, gj, words)
+ *             grown, grown_extents   in   (whole_gk, gj, words) and (whole_gk, gj) of mark_grown
  *             starts        in   (whole_gk, gj) of start_rows; unused where rows_start is 0
  *             kept          out  (gk, gj, words) kept mask of the slab
  *             kept_extents  out  (gk, gj) its extents
@@ -326,8 +359,8 @@ __kernel void start_rows(
  * Launch      global = gj * gk rounded up by the host, any local
  * Guarantees  every word and extent is written; bits beyond the row are 0 */
 __kernel void keep_edges(
-    __global const uint *restrict mask, __global const ushort2 *restrict row_extents,
-    __global const uint *restrict grown, __global const uint *restrict starts,
+    __global const uint *restrict mask, __global const uint *restrict grown,
+    __global const ushort2 *restrict grown_extents, __global const uint *restrict starts,
     __global uint *restrict kept, __global ushort2 *restrict kept_extents, const int rows_start,
     const uint gi, const uint gj, const uint gk, const uint words, const uint first, const uint whole_gk)
 {
@@ -335,16 +368,15 @@ __kernel void keep_edges(
     if (row >= gj * gk)
         return;
     const uint j = row % gj, k = row / gj + first;
-    __global const uint *row_grown = grown + cell_row_of(j, k, gj, whole_gk) * words;
+    const size_t cell_row = cell_row_of(j, k, gj, whole_gk);
+    __global const uint *row_grown = grown + cell_row * words;
     __global uint *row_kept = kept + (size_t)row * words;
-    const ushort2 extent = row_extents[row];
-    const uint crossed_from = extent.x < extent.y ? extent.x - (extent.x != 0) : words;
-    const uint crossed_to = extent.x < extent.y ? extent.y : words;
+    const ushort2 extent = grown_extents[cell_row];
     uint set = rows_start ? 0u - starts[(size_t)k * gj + j] : 0u; /* all ones, or 0 */
     uint begin = words, end = 0;
     for (uint w = 0; w < words; ++w) {
         uint bits = set;
-        if (w >= crossed_from && w < crossed_to) {
+        if (w >= extent.x && w < extent.y) {
             const ulong own = load_window(mask, row, w, words);
             uint flips = (uint)((own ^ own >> 1) & samples_with_next(w, gi)) & row_grown[w];
             flips ^= flips << 1;
@@ -364,13 +396,13 @@ __kernel void keep_edges(
 }
 
 /* Parameters  grown        in   (gk, gj, words)
- *             run_extents  in   (gk, gj)
+ *             grown_extents  in   (gk, gj)
  *             counts       out  (gk, gj) cells of the row that are grown, or share a face with one that is
  *             gi gj gk, words   as above
  * Launch      as find_cell_runs
  * Guarantees  every count is written */
 __kernel void count_visited(
-    __global const uint *restrict grown, __global const ushort2 *restrict run_extents, __global uint *restrict counts,
+    __global const uint *restrict grown, __global const ushort2 *restrict grown_extents, __global uint *restrict counts,
     const uint gi, const uint gj, const uint gk, const uint words)
 {
     const uint row = get_global_id(0);
@@ -382,7 +414,7 @@ __kernel void count_visited(
         const uint around[5] = {row, j > 0 ? row - 1 : row, row + 1, k > 0 ? row - gj : row, row + gj};
         uint begin = words, end = 0;
         for (uint n = 0; n < 5; ++n) {
-            const ushort2 extent = run_extents[around[n]];
+            const ushort2 extent = grown_extents[around[n]];
             if (extent.x < extent.y) {
                 begin = min(begin, (uint)extent.x);
                 end = max(end, (uint)extent.y);

@@ -51,6 +51,8 @@ class Grown:
     Attributes
     ----------
     grown_d : buffer, (gk, gj, words) uint32
+    extents_d : buffer, (gk, gj) ushort2
+        First word of each row with a grown cell, and the one after the last.
     starts_d : buffer, (gk, gj) uint32, or None
         For open volumes: with what each row of the kept mask begins.
     classified : Classified
@@ -62,6 +64,7 @@ class Grown:
     """
 
     grown_d: Any
+    extents_d: Any
     starts_d: Any
     classified: Classified
     cells: dict[str, int]
@@ -194,20 +197,21 @@ class _Search:
             f" from the surface {self.grid.rule.describe_place()}: a seed lies within {SEED_REACH_MM:g} mm of it"
         )
 
-    def mark(self, runs: _Runs, numbers_d: Any, chosen: NDArray[np.bool_]) -> tuple[Any, int]:
-        """Return the bits of the cells of chosen components, and the number of cells that growing visits."""
+    def mark(self, runs: _Runs, numbers_d: Any, chosen: NDArray[np.bool_]) -> tuple[Any, Any, int]:
+        """Return the bits of the cells of chosen components, their extents, and how many cells growing visits."""
         device = self.device
-        grown_d, counts_d = allocate(device, 4 * self.rows * self.grid.words), allocate(device, 4 * self.rows)
+        grown_d = allocate(device, 4 * self.rows * self.grid.words)
+        extents_d, counts_d = allocate(device, 4 * self.rows), allocate(device, 4 * self.rows)
         self.run(
             "mark_grown", self.rows, mask=self.classified.mask_d, run_starts=runs.starts_d,
             run_extents=runs.extents_d, row_offsets=runs.offsets_d, numbers=numbers_d,
-            chosen=upload(device, chosen.astype(np.uint8)), grown=grown_d, **self.sizes,
+            chosen=upload(device, chosen.astype(np.uint8)), grown=grown_d, grown_extents=extents_d, **self.sizes,
         )  # fmt: skip
         self.run(
-            "count_visited", self.rows, grown=grown_d, run_extents=runs.extents_d, counts=counts_d, **self.sizes
+            "count_visited", self.rows, grown=grown_d, grown_extents=extents_d, counts=counts_d, **self.sizes
         )  # fmt: skip
         counts = download(device, np.empty(self.rows, np.uint32), counts_d)
-        return grown_d, int(counts.sum(dtype=np.int64))
+        return grown_d, extents_d, int(counts.sum(dtype=np.int64))
 
 
 def growing_needs(grid: SampleGrid) -> dict[str, int]:
@@ -256,7 +260,7 @@ def grow(resident: DeviceVolume, grid: SampleGrid, classified: Classified, seeds
         numbers = download(device, np.empty(runs.total, np.int32), numbers_d)
         sizes = np.bincount(numbers, weights=run_cells, minlength=count).astype(np.int64)
         chosen = _choose(search, runs, numbers, sizes, seeds)
-        grown_d, visited = search.mark(runs, numbers_d, chosen)
+        grown_d, extents_d, visited = search.mark(runs, numbers_d, chosen)
         starts_d = None
         if not grid.rule.closed:
             starts_d = allocate(device, 4 * search.rows)
@@ -273,7 +277,7 @@ def grow(resident: DeviceVolume, grid: SampleGrid, classified: Classified, seeds
         "cells_left_out_share": 1.0 - grown / active,
         "largest_left_out_cells": int(sizes[~chosen].max(initial=0)),
     }
-    return Grown(grown_d, starts_d, classified, cells, growing)
+    return Grown(grown_d, extents_d, starts_d, classified, cells, growing)
 
 
 def _choose(
@@ -301,7 +305,7 @@ def keep_edges(device: Device, slab: Slab, grown: Grown, classified: Classified,
     kept_d, extents_d = allocate(device, 4 * slab.mask_rows * slab.grid.words), allocate(device, 4 * slab.mask_rows)
     launch(
         device, prepare_growing(device)["keep_edges"], slab.mask_rows, stopwatch=stopwatch,
-        mask=classified.mask_d, row_extents=classified.row_extents_d, grown=grown.grown_d,
+        mask=classified.mask_d, grown=grown.grown_d, grown_extents=grown.extents_d,
         starts=grown.grown_d if grown.starts_d is None else grown.starts_d, kept=kept_d, kept_extents=extents_d,
         rows_start=grown.starts_d is not None, gi=gi, gj=gj, gk=slab.mask_slices, words=slab.grid.words,
         first=slab.first, whole_gk=gk,
