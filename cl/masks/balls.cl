@@ -15,7 +15,8 @@
  *      rows of half 0   joined, and done
  *
  * Erosion is the same of the complement, and the complement of that (`flip`).  What lies beyond the volume is not set, or
- * set, as `beyond` says of the bits that are spread. */
+ * set, as `beyond` says of the bits that are spread.  Most rows of a mask are empty: what an empty row erodes to, and what
+ * empty rows alone dilate to, is known from the extents of the rows. */
 #include "masks/row_pieces.h"
 
 /* Words of a row from `at` on, their bits `shift` voxels further along i, `beyond` beyond the row. */
@@ -33,10 +34,29 @@ static inline words_of_piece load_row_shifted(
     return low >> (uint)bits | high << (uint)(32 - bits);
 }
 
+/* True if no row that the ball of row (j, k) may look at has a bit set: extents of rows without any are 0. */
+static inline int is_empty_near(
+    __global const uint *row_extents, const int j, const int k, const int reach_j, const int reach_k, const int nj,
+    const int nk)
+{
+    const int first = max(j - reach_j, 0), end = min(j + reach_j, nj - 1) + 1, last_k = min(k + reach_k, nk - 1);
+    uint any_bits = 0;
+    for (int near_k = max(k - reach_k, 0); near_k <= last_k; ++near_k) {
+        __global const uint *extents = row_extents + (size_t)near_k * nj;
+        for (int near_j = first; near_j < end; ++near_j)
+            any_bits |= extents[near_j];
+        if (any_bits != 0)
+            return 0;
+    }
+    return 1;
+}
+
 /* Parameters  mask     in   (nk, nj, words)
+ *             row_extents  in   (nk, nj) of the mask: 0 for rows without a bit set
  *             stencil  in   (m) rows of balls
  *             tables   in   (nk) begin and end of the ball of each slice
  *             spread   out  (nk, nj, words)
+ *             reach_j, reach_k   largest |dj| and |dk| of the balls
  *             ni, nj, nk   voxels;  words a row
  *             pieces   of a row, `step` words each, and `halo` words before and behind them
  *             shifted  0: all centres are 0; else 1, and there is a halo: bits that are shifted out of the row count there
@@ -47,8 +67,9 @@ static inline words_of_piece load_row_shifted(
  *             nk nj words < 2^31
  * Guarantees  every word is written; bits beyond the rows are 0 */
 __kernel void spread_ball(
-    __global const uint *restrict mask, __global const int4 *restrict stencil, __global const int2 *restrict tables,
-    __global uint *restrict spread, const int ni, const int nj, const int nk, const int words, const int pieces,
+    __global const uint *restrict mask, __global const uint *restrict row_extents,
+    __global const int4 *restrict stencil, __global const int2 *restrict tables,
+    __global uint *restrict spread, const int reach_j, const int reach_k, const int ni, const int nj, const int nk, const int words, const int pieces,
     const int step, const int halo, const int shifted, const uint flip, const uint beyond)
 {
     const uint item = get_global_id(0);
@@ -57,6 +78,14 @@ __kernel void spread_ball(
         return;
     const int first = (int)(item % pieces) * step - halo;
     const int j = row % nj, k = row / nj;
+    __global uint *to = spread + row * words;
+    const int begin = first + halo, end = min(begin + step, words);
+    if (flip ? row_extents[row] == 0
+             : beyond == 0 && is_empty_near(row_extents, j, k, reach_j, reach_k, nj, nk)) {
+        for (int w = begin; w < end; ++w)
+            to[w] = 0;
+        return;
+    }
     const int2 table = tables[k];
     row_piece own, met;
     own.a = bits_of_row(first, ni);
@@ -94,8 +123,6 @@ __kernel void spread_ball(
     for (; half_width > 0; --half_width)
         met = widen(shifted ? met : within_row(met, own, beyond), beyond);
     met.a = (met.a ^ flip) & own.a;
-    const int begin = first + halo, end = min(begin + step, words);
-    __global uint *to = spread + row * words;
 #define STORE(n, word) \
     if (first + n >= begin && first + n < end) \
         to[first + n] = word;

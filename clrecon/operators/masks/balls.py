@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from clrecon.errors import UsageError
 from clrecon.geometry import Volume, slice_normal
 from clrecon.opencl import Device, Program, Stopwatch, allocate, kernel_constant, launch, load_program, upload
+from clrecon.operators.masks.band_mask import VoxelMask
 from clrecon.points.stencil import SLACK, Lattice, Stencil, make_stencil
 
 __all__ = ["ball_of", "prepare_balls", "reaches_beyond", "spread_bits", "table_bytes", "whole_ball_of"]
@@ -146,8 +147,7 @@ def table_bytes(ball: Stencil) -> int:
 
 def spread_bits(
     device: Device,
-    mask_d: Any,
-    shape_ijk: tuple[int, int, int],
+    mask: VoxelMask,
     ball: Stencil,
     *,
     erode: bool = False,
@@ -158,9 +158,10 @@ def spread_bits(
 
     Parameters
     ----------
-    mask_d : buffer, (nk, nj, words) uint32
+    mask : VoxelMask
+        Without zeros behind its rows.
     ball : Stencil
-        For each slice the rows that its voxels look at; not only balls.
+        For each slice the rows that its voxels look at; not only balls, but the voxel itself is among them.
     erode : bool
         Keep the voxels whose ball has no voxel that is not set; else set those whose ball has one that is set.
     beyond : bool
@@ -171,8 +172,8 @@ def spread_bits(
     -------
     buffer, (nk, nj, words) uint32
     """
-    ni, nj, nk = shape_ijk
-    words = -(-ni // 32)
+    ni, nj, nk = mask.shape_ijk
+    words = mask.words
     piece = PIECE_WORDS[device.kernel_variants["LANES"]]
     halo = 0 if words <= piece and (ball.rows[:, 2] == -ball.rows[:, 3]).all() else 1
     step = piece - 2 * halo
@@ -180,7 +181,8 @@ def spread_bits(
     rows, tables = _split_tables(ball, HALO_BITS if halo else None)
     spread_d = allocate(device, 4 * words * nj * nk)
     launch(
-        device, prepare_balls(device)["spread_ball"], nj * nk * pieces, stopwatch=stopwatch, mask=mask_d,
+        device, prepare_balls(device)["spread_ball"], nj * nk * pieces, stopwatch=stopwatch, mask=mask.mask_d,
+        row_extents=mask.row_extents_d, reach_j=int(np.abs(rows[:, 0]).max()), reach_k=int(np.abs(rows[:, 1]).max()),
         stencil=upload(device, rows), tables=upload(device, tables), spread=spread_d, ni=ni, nj=nj,
         nk=nk, words=words, pieces=pieces, step=step, halo=halo, shifted=int(rows[:, 2].any()),
         flip=0xFFFFFFFF if erode else 0, beyond=0xFFFFFFFF if erode != beyond else 0,

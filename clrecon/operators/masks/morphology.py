@@ -110,4 +110,4 @@ class MaskShapes(MaskBits):
         check_budget(
             self.device, {"2 masks of the voxels": 2 * size, "rows of the ball": table_bytes(ball)}, self.memory
         )
-        return spread_bits(self.device, self._mask_d, self.shape_ijk, ball, erode=erode, beyond=beyond)
+        return spread_bits(self.device, self.bits, ball, erode=erode, beyond=beyond)
