@@ -106,8 +106,7 @@ class MaskShapes(MaskBits):
     ) -> Any:
         radius = checked_mm(mm, "the radius of the ball")
         ball = (whole_ball_of if whole else ball_of)(self.volume, radius, by_slice=by_slice)
-        size = mask_bytes(self.shape_ijk)["mask of the voxels"]
-        check_budget(
-            self.device, {"2 masks of the voxels": 2 * size, "rows of the ball": table_bytes(ball)}, self.memory
-        )
+        size, extents = mask_bytes(self.shape_ijk).values()
+        needs = {"2 masks of the voxels": 2 * size, "row extents": extents, "rows of the ball": table_bytes(ball)}
+        check_budget(self.device, needs, self.memory)
         return spread_bits(self.device, self.bits, ball, erode=erode, beyond=beyond)
