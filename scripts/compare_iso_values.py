@@ -163,7 +163,8 @@ def _sphere_distance(kji: Array) -> Array:
 def make_spine(settings: dict[str, Any], hu: dict[str, float]) -> tuple[Volume, Array]:
     """Make a spine phantom and, in an array of its shape, the signed distance to the bone of its vertebrae in mm."""
     from clrecon.phantom import PhantomSettings, add_noise, apply_point_spread, tissue
-    from clrecon.phantom.settings import CENTRE_LPS_MM, place_slices
+    from clrecon.phantom.placement import place_slices
+    from clrecon.phantom.settings import CENTRE_LPS_MM
     from clrecon.phantom.spine import draw_spine
     from clrecon.phantom.vertebra import vertebra_distance
 

@@ -12,7 +12,8 @@ __all__ = ["add_arguments", "run"]
 
 _SETTINGS = (
     "kind", "size", "slices", "spacing", "tilt", "oblique", "noise", "point_spread_mm", "seed", "radius_mm",
-    "table", "table_gap_mm", "prone", "ghosts",
+    "table", "table_gap_mm", "prone", "ghosts", "levels", "facet_gap_mm", "kyphosis_deg", "scoliosis_deg", "uneven_mm",
+    "missing", "phases",
 )  # fmt: skip
 
 
@@ -20,15 +21,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of the command."""
     parser.epilog = (
         "Writes a real DICOM series and truth.json with the affine and the exact area and volume, or with the voxels\n"
-        "of each material and the label map materials.nrrd. Same settings and seed, same files.\n\n"
+        "of each material and the label map materials.nrrd; with chosen levels also the label map levels.nrrd. Same\n"
+        "settings and seed, same files.\n\n"
         f"kinds:\n{_list_kinds()}\n\n"
         "examples:\n  clrecon phantom phantom/ --kind torus --spacing 0.7 0.5 2.5 --tilt 12 --oblique 10 -5 30\n"
-        "  clrecon phantom phantom/ --kind skull --table headrest --table-gap 4"
+        "  clrecon phantom phantom/ --kind skull --table headrest --table-gap 4\n"
+        "  clrecon phantom phantom/ --levels C1-L5 --scoliosis 35 --facet-gap 0.3 --spacing 0.7 0.7 1"
     )
     parser.add_argument("output", metavar="OUT", help="folder for the series")
     parser.add_argument("--kind", metavar="K", help="what to make, see below (default: spine)")
     parser.add_argument("--size", metavar="N", help="columns and rows, like 256 or 256x192")
-    parser.add_argument("--slices", type=int, metavar="N")
+    parser.add_argument(
+        "--slices", type=int, metavar="N", help="default: as many as the levels need, 120 without levels"
+    )
     parser.add_argument(
         "--spacing", type=float, nargs=3, metavar=("DJ", "DI", "DK"), help="mm between rows, columns, slices"
     )
@@ -47,6 +52,23 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--ghosts", action="store_true", default=None, help="of a spine: two foreign slices, and a localizer"
     )
+    spine = parser.add_argument_group("of a spine")
+    spine.add_argument("--levels", metavar="C1-L5", help="vertebrae to show, like L4-L5 or C3-C7,T1-T5")
+    spine.add_argument(
+        "--facet-gap", dest="facet_gap_mm", type=float, metavar="MM", help="distance of neighbours in the facet joints"
+    )
+    for name, positive in (("kyphosis", "the back is round"), ("scoliosis", "the middle lies to the left")):
+        spine.add_argument(
+            f"--{name}", dest=f"{name}_deg", type=float, metavar="DEG",
+            help=f"angle between the first and the last level; positive: {positive}",
+        )  # fmt: skip
+    spine.add_argument(
+        "--uneven", dest="uneven_mm", type=float, metavar="MM", help="the gaps of the slices vary by up to this much"
+    )
+    spine.add_argument(
+        "--phases", type=int, metavar="N", help="series at the same places, with ever more contrast medium"
+    )
+    parser.add_argument("--missing", metavar="N,M-O", help="numbers of slices that are left out, like 20-22,40")
     parser.add_argument("--seed", type=int, metavar="N")
     add_no_clobber(parser)
 
@@ -81,8 +103,26 @@ def _summary(truth: dict[str, Any], output: str) -> list[str]:
     lines.append(f"surface  at {truth['iso_value_hu']:g} HU")
     if truth["surface"]:
         lines[-1] += f": {truth['surface']['area_mm2']:,.1f} mm2, {truth['surface']['volume_ml']:,.3f} ml"
+    levels = [level for level in (truth["spine"] or {}).get("vertebrae", []) if "label" in level]
+    if levels:
+        lines.append(f"levels   {', '.join(level['name'] for level in levels)}")
+        if cut := [level["name"] for level in levels if not level["whole"]]:
+            lines[-1] += f"; not whole in the volume: {', '.join(cut)}"
+    if series := truth.get("series"):
+        lines.append(f"series   {_series_words(series)}")
     if truth["ghosts"]:
         said = [f"slice {one['slice']} shows {one['shows']}" for one in truth["ghosts"]["slices"]]
         lines.append(f"ghosts   {', '.join(said)}; the last file is a localizer")
-    beside = "truth.json and materials.nrrd" if truth["parts"] else "truth.json"
-    return [*lines, f"wrote    {printable(output)}, with the truth in {beside}"]
+    maps = [name for name, made in (("materials.nrrd", truth["parts"]), ("levels.nrrd", levels)) if made]
+    return [*lines, f"wrote    {printable(output)}, with the truth in {' and '.join(['truth.json', *maps])}"]
+
+
+def _series_words(series: dict[str, Any]) -> str:
+    said = []
+    if series["uneven_mm"]:
+        said.append(f"gaps vary by up to {series['uneven_mm']:g} mm")
+    if series["missing"]:
+        said.append(f"missing are slices {', '.join(map(str, series['missing']))}")
+    if series["phases"] > 1:
+        said.append(f"{series['phases']} phases at the same places")
+    return "; ".join(said)

@@ -26,13 +26,14 @@ def make_phantom(
     Parameters
     ----------
     output : path
-        Folder for the DICOM files, ``truth.json`` and, of a scene, ``materials.nrrd``.
+        Folder for the DICOM files, ``truth.json`` and, of a scene, ``materials.nrrd``, or of chosen levels
+        ``levels.nrrd``.
     no_clobber : bool
         True: a folder that holds anything stays and is an `OutputError`.
     progress : callable, optional
     **settings
         Fields of `clrecon.phantom.PhantomSettings`; those that are None keep their default.  ``size`` may be a
-        text like ``"256x192"`` (columns x rows).
+        text like ``"256x192"`` (columns x rows), ``missing`` one like ``"20-22,40"``.
 
     Returns
     -------
@@ -44,10 +45,12 @@ def make_phantom(
     UsageError, OutputError
         Settings are impossible, or the folder cannot be written.
     """
-    from clrecon.phantom import PhantomSettings, parse_size, write_phantom
+    from clrecon.phantom import PhantomSettings, parse_missing, parse_size, write_phantom
 
     given = {name: value for name, value in settings.items() if value is not None}
     if isinstance(given.get("size"), str):
         given["size"] = parse_size(given["size"])
+    if isinstance(given.get("missing"), str):
+        given["missing"] = parse_missing(given["missing"])
     with keep_existing(no_clobber):
         return write_phantom(output, PhantomSettings(**given), progress=progress)

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from clrecon.phantom.build import label_materials, make_phantom, write_phantom
     from clrecon.phantom.sampling import add_noise, apply_point_spread, sample_distance, sample_occupancy
     from clrecon.phantom.scenes import MATERIALS
-    from clrecon.phantom.settings import KINDS, PhantomSettings, parse_size
+    from clrecon.phantom.settings import KINDS, PhantomSettings, parse_missing, parse_size
     from clrecon.phantom.shapes import Body, Box, Cylinder, HalfSpace, Sphere, Torus
 
 __all__ = [
@@ -30,6 +30,7 @@ __all__ = [
     "apply_point_spread",
     "label_materials",
     "make_phantom",
+    "parse_missing",
     "parse_size",
     "sample_distance",
     "sample_occupancy",
@@ -40,7 +41,7 @@ _MODULES = {
     "build": ("label_materials", "make_phantom", "write_phantom"),
     "sampling": ("add_noise", "apply_point_spread", "sample_distance", "sample_occupancy"),
     "scenes": ("MATERIALS",),
-    "settings": ("KINDS", "PhantomSettings", "parse_size"),
+    "settings": ("KINDS", "PhantomSettings", "parse_missing", "parse_size"),
     "shapes": ("Body", "Box", "Cylinder", "HalfSpace", "Sphere", "Torus"),
 }
 

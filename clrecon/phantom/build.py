@@ -1,6 +1,6 @@
 """Make a phantom: voxels, affine and truth, in memory or as a DICOM series beside its truth.json.
 
-A scene also gets a label map of its materials.
+A scene also gets a label map of its materials, a spine with chosen levels one of its levels.
 """
 
 from __future__ import annotations
@@ -16,15 +16,18 @@ from numpy.typing import NDArray
 from clrecon.errors import OutputError, UsageError
 from clrecon.geometry import column_spacing, tilt_degrees
 from clrecon.phantom.bodies import choose_body
+from clrecon.phantom.describe import describe_series, describe_spine
 from clrecon.phantom.dicom_series import RESCALE_INTERCEPT, write_series
 from clrecon.phantom.ghosts import draw_ghosts
 from clrecon.phantom.label_map import write_label_map
-from clrecon.phantom.plan import Anatomy
+from clrecon.phantom.levels import level_number
+from clrecon.phantom.placement import Placement, place_slices
 from clrecon.phantom.sampling import add_noise, apply_point_spread, sample_occupancy
 from clrecon.phantom.scene_plans import plan_scene
 from clrecon.phantom.scenes import CEILING_HU, DENSE_HU, LabelArray, describe_parts, draw_scene
-from clrecon.phantom.settings import CENTRE_LPS_MM, KINDS, PhantomSettings, Placement, place_slices
-from clrecon.phantom.spine import draw_spine
+from clrecon.phantom.settings import KINDS, PhantomSettings
+from clrecon.phantom.spine import draw_spine, label_levels
+from clrecon.phantom.tissue import BLOOD_HU
 from clrecon.system.files import temporary_folder
 from clrecon.system.progress import Progress
 from clrecon.system.regular_files import read_regular
@@ -37,44 +40,24 @@ TRUTH_NAME = "truth.json"
 LARGEST_TRUTH = 1 << 28
 """Largest truth.json that is read, in bytes; that of a series of thousands of slices has some MiB."""
 MATERIALS_NAME = "materials.nrrd"
+LEVELS_NAME = "levels.nrrd"
 
 SPINE_ISO_HU = 226.0
 """Suggested iso value for the spine: above discs, organs and noise, below the blurred thin cortex."""
 
 _GENERATOR = "clrecon phantom"
-_OURS = re.compile(r"IM\d{4}\.dcm|truth\.json|materials\.nrrd")
+_OURS = re.compile(r"IM\d{4}\.dcm|truth\.json|materials\.nrrd|levels\.nrrd")
 
-
-def _describe_spine(anatomy: Anatomy, affine: NDArray[np.float64], settings: PhantomSettings) -> dict[str, Any]:
-    """Describe where the parts are, LPS mm, and which of them lie in the volume."""
-    inverse = np.linalg.inv(affine)
-    extents = np.array(settings.shape_kji[::-1])
-
-    def inside(point: NDArray[np.float64]) -> bool:
-        ijk = inverse[:3, :3] @ point + inverse[:3, 3]
-        return bool(np.all((ijk > -0.5) & (ijk < extents - 0.5)))
-
-    centre = np.array(CENTRE_LPS_MM)
-    return {
-        "vertebrae": [
-            {
-                "name": vertebra.name,
-                "center_lps_mm": [float(value) for value in vertebra.center + centre],
-                "inside": inside(vertebra.center + centre),
-            }
-            for vertebra in anatomy.vertebrae
-        ],
-        "left_marker_lps_mm": [float(value) for value in anatomy.marker + centre],
-        "left_marker_radius_mm": anatomy.marker_radius,
-        "left_marker_inside": inside(anatomy.marker + centre),
-        "absent": anatomy.absent,
-    }
+_PHASE_HU = 90.0
+"""What the contrast medium adds to the vessels from phase to phase."""
 
 
 def _make(
-    settings: PhantomSettings, placement: Placement, progress: Progress | None
+    settings: PhantomSettings, placement: Placement, progress: Progress | None, phase: int = 0
 ) -> tuple[NDArray[np.int16], dict[str, Any], LabelArray | None]:
+    """Make voxels of all slices, truth and, of a scene, materials."""
     affine = placement.affine
+    places = placement.places if settings.uneven_mm else None
     surface: dict[str, Any] | None = None
     spine: dict[str, Any] | None = None
     half_maximum: float | None = None
@@ -82,8 +65,9 @@ def _make(
     if KINDS[settings.kind].is_scene:
         field, labels = draw_scene(plan_scene(settings), settings, affine, progress)
     elif settings.kind == "spine":
-        field, anatomy = draw_spine(settings, affine, progress)
-        spine = _describe_spine(anatomy, affine, settings)
+        blood = BLOOD_HU + _PHASE_HU * phase
+        field, anatomy = draw_spine(settings, affine, progress, places=places, blood_hu=blood)
+        spine = describe_spine(anatomy, affine, settings)
     else:
         body = choose_body(affine, settings)
         field = sample_occupancy(body, affine, settings.shape_kji)
@@ -91,8 +75,8 @@ def _make(
         field += np.float32(settings.outside_hu)
         surface = body.describe()
         half_maximum = (settings.inside_hu + settings.outside_hu) / 2.0
-    apply_point_spread(field, affine, settings.point_spread_mm, progress)
-    add_noise(field, settings.noise, settings.seed)
+    apply_point_spread(field, affine, settings.point_spread_mm, progress, places)
+    add_noise(field, settings.noise, settings.seed if phase == 0 else settings.seed + 1000003 * phase)
     voxels = np.empty(field.shape, dtype=np.int16)
     floor, ceiling = (-32768, 32767 + RESCALE_INTERCEPT) if labels is None else (RESCALE_INTERCEPT, CEILING_HU)
     for k in range(len(field)):
@@ -118,7 +102,15 @@ def _make(
         "seed": settings.seed,
         "settings": settings.as_dict(),
     }
+    if (series := describe_series(settings, placement)) is not None:
+        truth["series"] = series
+        truth["shape_ijk"][2] = len(series["slice_positions_lps_mm"])
     return voxels, truth, labels
+
+
+def _written(settings: PhantomSettings, voxels: NDArray[np.int16]) -> NDArray[np.int16]:
+    """Return the slices that are not missing."""
+    return voxels[[k for k in range(len(voxels)) if k + 1 not in settings.missing]] if settings.missing else voxels
 
 
 def _iso_value(settings: PhantomSettings, half_maximum: float | None) -> float:
@@ -141,16 +133,17 @@ def make_phantom(
     Returns
     -------
     voxels : ndarray, shape (nk, nj, ni), int16
-        HU.
+        HU; of several phases the first.
     affine : ndarray, shape (4, 4), float64
-        Index (i, j, k) to LPS mm, as the decimal strings of a written series give it.
+        Index (i, j, k) to LPS mm, as the decimal strings of a written series give it; of an uneven or gapped series
+        that of the even one, and the truth has the positions.
     truth : dict
         Plain JSON types: ``kind, shape_ijk, affine_ijk_to_lps_mm, spacing_mm (di, dj, dk), tilt_deg,
         iso_value_hu``, ``half_maximum_hu`` and ``surface`` (analytic shapes, else null), ``spine`` (centres of the
         vertebrae, the marker on the patient's left and what is absent, else null), ``ghosts`` (the foreign slices, else
         null), ``parts`` (scenes: each material
         with its label in `label_materials`, voxels, volume and voxels above 300 HU, else null), ``noise_hu,
-        point_spread_mm, seed, version, settings``.
+        point_spread_mm, seed, version, settings``; and ``series`` of one that is uneven, gapped or phased.
 
     Raises
     ------
@@ -159,7 +152,7 @@ def make_phantom(
     """
     placement = place_slices(settings)
     voxels, truth, _ = _make(settings, placement, progress)
-    return voxels, placement.affine, truth
+    return _written(settings, voxels), placement.affine, truth
 
 
 def label_materials(settings: PhantomSettings) -> LabelArray:
@@ -223,7 +216,8 @@ def _check_replaceable(folder: Path) -> None:
 def write_phantom(
     out_folder: str | Path, settings: PhantomSettings, progress: Progress | None = None
 ) -> dict[str, Any]:
-    """Write a phantom as a DICOM CT series with a truth.json; a scene also with the label map materials.nrrd.
+    """Write a phantom as a DICOM CT series with a truth.json; a scene also with the label map materials.nrrd, a spine
+    with chosen levels, bend or facets with the label map levels.nrrd.
 
     The series is written into a temporary folder beside `out_folder`, read back, and then renamed: `out_folder` is
     either complete or untouched.
@@ -258,10 +252,17 @@ def write_phantom(
             finished = temporary / "series"
             finished.mkdir()
             write_series(finished, voxels, settings, placement, progress)
+            for phase in range(1, settings.phases):
+                voxels, _, _ = _make(settings, placement, progress, phase)
+                write_series(finished, voxels, settings, placement, progress, phase)
             text = json.dumps(truth, indent=2) + "\n"
             (finished / TRUTH_NAME).write_text(text, encoding="utf-8")
             if labels is not None:
                 write_label_map(finished / MATERIALS_NAME, labels, placement.affine)
+            if settings.spine_choice is not None:
+                names = {level_number(name): name for name in settings.spine_choice.levels}
+                levels = label_levels(settings, placement.affine)
+                write_label_map(finished / LEVELS_NAME, levels, placement.affine, names)
             place_folder(finished, folder, folder.name, keep=existing_stay())
     except OSError as error:
         reason = error.strerror or type(error).__name__

@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 
 from clrecon.errors import OutputError
 from clrecon.phantom.ghosts import make_localizer
-from clrecon.phantom.settings import PhantomSettings, Placement
+from clrecon.phantom.placement import Placement
+from clrecon.phantom.settings import PhantomSettings
 from clrecon.system.progress import Progress
 
 if TYPE_CHECKING:
@@ -28,6 +29,7 @@ CT_IMAGE_STORAGE = "1.2.840.10008.5.1.4.1.1.2"
 _TRANSFER_SYNTAXES = {"explicit": "1.2.840.10008.1.2.1", "implicit": "1.2.840.10008.1.2"}
 # No clock: phantoms made twice must be equal byte for byte.
 _DATE, _TIME = "20200101", "120000"
+_PHASE_SECONDS = 3
 
 
 def slice_file_name(index: int) -> str:
@@ -42,21 +44,22 @@ def _make_uid(settings: PhantomSettings, *what: str) -> str:
     return str(generate_uid(entropy_srcs=["clrecon phantom", described, *what]))
 
 
-def _make_headers(settings: PhantomSettings, placement: Placement) -> Iterator[FileDataset]:
-    """Yield one dataset for each slice, complete except for the pixels."""
+def _make_headers(settings: PhantomSettings, placement: Placement, phase: int) -> Iterator[FileDataset]:
+    """Yield one dataset for each slice of a phase, complete except for the pixels."""
     from pydicom.dataset import FileDataset, FileMetaDataset
     from pydicom.uid import PYDICOM_IMPLEMENTATION_UID, UID
 
     study, series, frame = (_make_uid(settings, name) for name in ("study", "series", "frame of reference"))
     columns, rows = settings.size
     for k, position in enumerate(placement.positions):
-        instance = _make_uid(settings, "instance", str(k))
+        number = phase * settings.slices + k
+        instance = _make_uid(settings, "instance", str(number))
         meta = FileMetaDataset()
         meta.MediaStorageSOPClassUID = UID(CT_IMAGE_STORAGE)
         meta.MediaStorageSOPInstanceUID = UID(instance)
         meta.TransferSyntaxUID = UID(_TRANSFER_SYNTAXES[settings.transfer_syntax])
         meta.ImplementationClassUID = PYDICOM_IMPLEMENTATION_UID
-        header = FileDataset(slice_file_name(k), {}, file_meta=meta, preamble=b"\0" * 128)
+        header = FileDataset(slice_file_name(number), {}, file_meta=meta, preamble=b"\0" * 128)
         header.ImageType = ["ORIGINAL", "PRIMARY", "AXIAL"]
         header.SOPClassUID, header.SOPInstanceUID = UID(CT_IMAGE_STORAGE), UID(instance)
         header.StudyDate = header.SeriesDate = header.AcquisitionDate = header.ContentDate = _DATE
@@ -73,7 +76,11 @@ def _make_headers(settings: PhantomSettings, placement: Placement) -> Iterator[F
         header.StudyInstanceUID, header.SeriesInstanceUID = UID(study), UID(series)
         header.FrameOfReferenceUID, header.PositionReferenceIndicator = UID(frame), ""
         header.StudyID, header.SeriesNumber, header.AcquisitionNumber = "1", "1", "1"
-        header.InstanceNumber = str(k + 1)
+        header.InstanceNumber = str(number + 1)
+        if settings.phases > 1:
+            header.AcquisitionNumber = header.TemporalPositionIdentifier = str(phase + 1)
+            header.NumberOfTemporalPositions = str(settings.phases)
+            header.AcquisitionTime = header.ContentTime = f"1200{_PHASE_SECONDS * phase % 60:02d}"
         header.ImagePositionPatient, header.ImageOrientationPatient = position, placement.orientation
         header.SamplesPerPixel, header.PhotometricInterpretation = 1, "MONOCHROME2"
         header.Rows, header.Columns = rows, columns
@@ -107,8 +114,9 @@ def write_series(
     settings: PhantomSettings,
     placement: Placement,
     progress: Progress | None = None,
+    phase: int = 0,
 ) -> None:
-    """Write one file for each slice into an existing folder and read each back.
+    """Write one file for each slice that is not missing into an existing folder and read each back.
 
     Parameters
     ----------
@@ -119,6 +127,8 @@ def write_series(
     placement : Placement
     progress : callable, optional
         Called as ``progress("write", done, slices)``.
+    phase : int
+        Number of the phase, from 0; its files follow those of the phase before.
 
     Raises
     ------
@@ -127,8 +137,9 @@ def write_series(
     OSError
         A file cannot be written.
     """
-    for k, header in enumerate(_make_headers(settings, placement)):
-        _write_image(folder / slice_file_name(k), header, voxels[k])
+    for k, header in enumerate(_make_headers(settings, placement, phase)):
+        if k + 1 not in settings.missing:
+            _write_image(folder / slice_file_name(phase * settings.slices + k), header, voxels[k])
         if progress is not None:
             progress("write", k + 1, len(voxels))
     if settings.ghosts:

@@ -1,4 +1,5 @@
-"""Signed distances to simple shapes, for the spine phantom: float32 arrays in mm, positive inside.
+"""Signed distances to simple shapes, for the spine phantom: arrays of the type of the coordinates in mm, positive
+inside.
 
 Ellipses and stretched capsules give first-order distances (exact on the surface, approximate away from it), which
 is what a partial-volume ramp of about one voxel needs.  Smooth union after I. Quilez' polynomial smooth minimum.
@@ -42,7 +43,7 @@ def ellipse(x: Field, y: Field, half_x: float | Field, half_y: float | Field) ->
     radius = np.sqrt(u * u + v * v)
     slope = np.sqrt((u / half_x) ** 2 + (v / half_y) ** 2)
     # At the very centre radius / slope is 0 / 0; the distance there is about the smaller half axis.
-    return np.asarray((1.0 - radius) * (radius + 1e-3) / (slope + 1e-3 / np.minimum(half_x, half_y)), dtype=np.float32)
+    return np.asarray((1.0 - radius) * (radius + 1e-3) / (slope + 1e-3 / np.minimum(half_x, half_y)), dtype=x.dtype)
 
 
 def ellipsoid(x: Field, y: Field, z: Field, half: Point) -> Field:
@@ -50,7 +51,7 @@ def ellipsoid(x: Field, y: Field, z: Field, half: Point) -> Field:
     u, v, w = x / half[0], y / half[1], z / half[2]
     radius = np.sqrt(u * u + v * v + w * w)
     slope = np.sqrt((u / half[0]) ** 2 + (v / half[1]) ** 2 + (w / half[2]) ** 2)
-    return np.asarray((1.0 - radius) * (radius + 1e-3) / (slope + 1e-3 / min(half)), dtype=np.float32)
+    return np.asarray((1.0 - radius) * (radius + 1e-3) / (slope + 1e-3 / min(half)), dtype=x.dtype)
 
 
 def capsule(

@@ -6,6 +6,7 @@ Source: the NRRD format definition (teem.sourceforge.net/nrrd/format.html).
 from __future__ import annotations
 
 import gzip
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,9 @@ from numpy.typing import NDArray
 __all__ = ["write_label_map"]
 
 
-def write_label_map(path: Path, labels: NDArray[np.uint8], affine: NDArray[np.float64]) -> None:
+def write_label_map(
+    path: Path, labels: NDArray[np.uint8], affine: NDArray[np.float64], names: Mapping[int, str] | None = None
+) -> None:
     """Write labels that lie where `affine` says, oblique and sheared ones included.
 
     Parameters
@@ -23,6 +26,8 @@ def write_label_map(path: Path, labels: NDArray[np.uint8], affine: NDArray[np.fl
     labels : ndarray, shape (nk, nj, ni), uint8
     affine : ndarray, shape (4, 4)
         Index (i, j, k) to LPS mm.
+    names : mapping of int to str, optional
+        Names of labels, in ASCII; they are written as segments, as 3D Slicer does.
 
     Raises
     ------
@@ -37,7 +42,11 @@ def write_label_map(path: Path, labels: NDArray[np.uint8], affine: NDArray[np.fl
     header = (
         "NRRD0004\ntype: uint8\ndimension: 3\nspace: left-posterior-superior\n"
         f"sizes: {ni} {nj} {nk}\nspace directions: {' '.join(vector(affine[:3, axis]) for axis in range(3))}\n"
-        f"kinds: domain domain domain\nencoding: gzip\nspace origin: {vector(affine[:3, 3])}\n\n"
+        f"kinds: domain domain domain\nencoding: gzip\nspace origin: {vector(affine[:3, 3])}\n"
     )
+    for n, (number, name) in enumerate((names or {}).items()):
+        header += f"Segment{n}_ID:={name}\nSegment{n}_Name:={name}\nSegment{n}_LabelValue:={number}\n"
+        header += f"Segment{n}_Layer:=0\n"
+    header += "\n"
     # no clock: phantoms made twice are equal byte for byte
     path.write_bytes(header.encode("ascii") + gzip.compress(labels.tobytes(), compresslevel=6, mtime=0))

@@ -1,136 +1,28 @@
 """The plan of the spine phantom: levels, curve, ribs and body outline, in mm about the centre of the volume.
 
-Axes are the patient's: x to the left, y to the posterior, z to the superior.  Sizes are round figures of adult
-anatomy (vertebral bodies 28 to 50 mm wide, 16 to 28 mm high, discs 4 to 11 mm), interpolated between levels.
+Axes are the patient's: x to the left, y to the posterior, z to the superior.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import math
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Anatomy", "Disc", "Rib", "Vertebra", "plan_anatomy"]
+from clrecon.phantom.chain import Chain, SpineChoice, lay_chain, lean_and_roll
+from clrecon.phantom.extent import centring_shift
+from clrecon.phantom.facets import close_facets
+from clrecon.phantom.outline import plan_outline
+from clrecon.phantom.parts import Anatomy, Disc, Rib, Vertebra
+
+__all__ = ["plan_anatomy"]
 
 Float64Array = NDArray[np.float64]
 
-LEVELS = tuple([f"T{n}" for n in range(1, 13)] + [f"L{n}" for n in range(1, 6)])
-"""Vertebrae from top to bottom."""
-
-_CENTRE_LEVEL = LEVELS.index("T12")
-_KEYS = [LEVELS.index(name) for name in ("T1", "T6", "T12", "L1", "L3", "L5")]
-_SIZES = {
-    "width": (28.0, 29.0, 40.0, 42.0, 46.0, 50.0),
-    "depth": (18.0, 25.0, 31.0, 33.0, 35.0, 36.0),
-    "height": (16.5, 20.0, 25.0, 27.0, 28.5, 28.0),
-    "disc": (4.0, 4.5, 6.5, 8.0, 10.5, 10.0),
-    "canal_half_width": (9.0, 8.5, 11.0, 11.5, 12.0, 13.0),
-    "canal_half_depth": (7.5, 7.5, 8.0, 8.5, 8.5, 8.5),
-    # Lean of the upward axis towards the posterior: thoracic kyphosis, lumbar lordosis.
-    "lean_degrees": (-20.0, -4.0, 10.0, 9.0, 1.0, -17.0),
-}
-
-
-@dataclass(frozen=True)
-class Vertebra:
-    """One level: its frame and its sizes.
-
-    Attributes
-    ----------
-    name : str
-    center : ndarray, shape (3,)
-        Middle of the vertebral body, mm.
-    axes : ndarray, shape (3, 3)
-        Rows are the local left, posterior and superior directions.
-    width, depth, height, canal_half_width, canal_half_depth : float
-        mm.
-    lumbar : float
-        0 thoracic shape to 1 lumbar shape of the processes.
-    waves : ndarray, shape (n, 5)
-        Trabecular texture, see `clrecon.phantom.fields.waves_at`.
-    """
-
-    name: str
-    center: Float64Array
-    axes: Float64Array
-    width: float
-    depth: float
-    height: float
-    canal_half_width: float
-    canal_half_depth: float
-    lumbar: float
-    waves: Float64Array
-
-    def to_patient(self, local: tuple[float, float, float]) -> Float64Array:
-        """Map a local point to mm of the plan."""
-        return self.center + np.array(local) @ self.axes
-
-
-@dataclass(frozen=True)
-class Disc:
-    """Disc between two bodies: an elliptic cylinder from the centre of one to the centre of the other."""
-
-    center: Float64Array
-    axes: Float64Array
-    half_width: float
-    half_depth: float
-    half_length: float
-
-
-@dataclass(frozen=True)
-class Rib:
-    """A rib as a chain of points, shape (n, 3), from its head at the spine to its end."""
-
-    name: str
-    points: Float64Array
-
-
-@dataclass(frozen=True)
-class Anatomy:
-    """All parts of the spine phantom.
-
-    Attributes
-    ----------
-    vertebrae, discs, ribs : lists, top to bottom
-    half_width, half_depth : float
-        Half axes of the body outline about x = y = 0.
-    curve_x, curve_y : ndarray
-        Polynomials (highest power first) in z / 100 mm: centre line of the vertebral bodies.
-    curve_z : (low, high)
-        Range in which the polynomials hold.
-    marker : ndarray, shape (3,)
-        Centre of the small metal ball on the patient's left.
-    marker_radius : float
-    absent : list of str
-        Parts left out on purpose.
-    """
-
-    vertebrae: list[Vertebra]
-    discs: list[Disc]
-    ribs: list[Rib]
-    half_width: float
-    half_depth: float
-    curve_x: Float64Array
-    curve_y: Float64Array
-    curve_z: tuple[float, float]
-    marker: Float64Array
-    marker_radius: float
-    absent: list[str]
-
-    def level_z(self, name: str) -> float:
-        """Return z of the centre of a level's vertebral body."""
-        return float(next(v.center[2] for v in self.vertebrae if v.name == name))
-
-
-def _frame(lean: float, roll: float) -> Float64Array:
-    """Return the rows local left, posterior and superior after a lean about x and a small roll about y, in radians."""
-    superior = np.array((math.sin(roll), math.sin(lean), 0.0))
-    superior[2] = math.sqrt(1.0 - superior @ superior)
-    left = np.array((1.0, 0.0, 0.0)) - superior[0] * superior
-    left /= np.linalg.norm(left)
-    return np.array((left, np.cross(superior, left), superior))
+_ROOM_MM = {f"T{n}": 3.0 for n in range(1, 7)}
+"""Room between the articular processes of chosen levels, see `Vertebra.room`; 2 mm elsewhere."""
 
 
 def _trabecular_waves(generator: np.random.Generator, steps_mm: Float64Array) -> Float64Array:
@@ -170,7 +62,57 @@ def _plan_rib(vertebra: Vertebra, side: int, half_width: float, half_depth: floa
     return Rib(f"{side_name} rib {number}", chain[:: 3 if len(chain) > 60 else 2])
 
 
-def plan_anatomy(field_of_view_mm: tuple[float, float, float], steps_mm: Float64Array, seed: int) -> Anatomy:
+def _plan_vertebrae(chain: Chain, generator: np.random.Generator, seed: int, steps_mm: Float64Array) -> list[Vertebra]:
+    neck = np.random.default_rng((seed, 19))
+    return [
+        Vertebra(
+            name=name,
+            center=chain.centres[n],
+            axes=chain.frames[n],
+            width=float(chain.sizes["width"][n]),
+            depth=float(chain.sizes["depth"][n]),
+            height=float(chain.sizes["height"][n]),
+            canal_half_width=float(chain.sizes["canal_half_width"][n]),
+            canal_half_depth=float(chain.sizes["canal_half_depth"][n]),
+            lumbar=float(np.interp(n - (len(chain.names) - 17), (9, 12), (0.0, 1.0))),
+            waves=_trabecular_waves(neck if name[0] == "C" else generator, chain.frames[n] @ steps_mm),
+        )
+        for n, name in enumerate(chain.names)
+    ]
+
+
+def _plan_discs(vertebrae: list[Vertebra]) -> list[Disc]:
+    discs = []
+    for upper, lower in zip(vertebrae[:-1], vertebrae[1:], strict=True):
+        if upper.name == "C1":
+            continue  # a joint without a disc
+        gap = upper.center - lower.center
+        length = float(np.linalg.norm(gap))
+        axes = lean_and_roll(math.asin(gap[1] / length), math.asin(gap[0] / length))
+        half = 0.515 * (upper.width + lower.width) / 2.0, 0.515 * (upper.depth + lower.depth) / 2.0
+        discs.append(Disc((upper.center + lower.center) / 2.0, axes, half[0], half[1], length / 2.0))
+    return discs
+
+
+def _plan_ribs(vertebrae: list[Vertebra], moved: Float64Array, half_width: float, half_depth: float) -> list[Rib]:
+    """Plan the ribs of a straight trunk, and move each with its vertebra."""
+    ribs = []
+    for vertebra, away in zip(vertebrae, moved, strict=True):
+        for side in (1, -1):
+            # the twelfth rib of the left side is absent: an image mirrored by mistake shows it absent on the right
+            if vertebra.name[0] == "T" and (vertebra.name, side) != ("T12", 1):
+                home = dataclasses.replace(vertebra, center=vertebra.center - away) if away.any() else vertebra
+                rib = _plan_rib(home, side, half_width, half_depth)
+                ribs.append(Rib(rib.name, rib.points + away) if away.any() else rib)
+    return ribs
+
+
+def plan_anatomy(
+    field_of_view_mm: tuple[float, float, float],
+    steps_mm: Float64Array,
+    seed: int,
+    choice: SpineChoice | None = None,
+) -> Anatomy:
     """Lay out the phantom for a field of view.
 
     Parameters
@@ -182,6 +124,8 @@ def plan_anatomy(field_of_view_mm: tuple[float, float, float], steps_mm: Float64
         Columns are the voxel steps in LPS mm.
     seed : int
         Small changes of position and the phases of the texture.
+    choice : SpineChoice, optional
+        Levels, bend and facets; None: T1 to L5, straight, T12 in the middle.
 
     Returns
     -------
@@ -190,62 +134,55 @@ def plan_anatomy(field_of_view_mm: tuple[float, float, float], steps_mm: Float64
     generator = np.random.default_rng((seed, 11))
     half_width = float(np.clip(min(0.45 * field_of_view_mm[0], 0.60 * field_of_view_mm[1]), 118.0, 160.0))
     half_depth = float(0.73 * half_width)
-    sizes = {key: np.interp(np.arange(len(LEVELS)), _KEYS, values) for key, values in _SIZES.items()}
-    leans = np.radians(sizes["lean_degrees"] + generator.normal(0.0, 0.6, len(LEVELS)))
-    rolls = np.radians(generator.normal(0.0, 0.5, len(LEVELS)) + 1.5 * np.sin(np.arange(len(LEVELS)) * 0.7))
-
-    frames = [_frame(lean, roll) for lean, roll in zip(leans, rolls, strict=True)]
-    centres = np.zeros((len(LEVELS), 3))
-    for n in range(1, len(LEVELS)):
-        centres[n] = centres[n - 1] - frames[n - 1][2] * (sizes["height"][n - 1] / 2.0 + sizes["disc"][n - 1] / 2.0)
-        centres[n] -= frames[n][2] * (sizes["height"][n] / 2.0 + sizes["disc"][n - 1] / 2.0)
-    # tips of the spinous processes stay about 20 mm under the skin of the back
-    anchor = np.array((1.7, half_depth - 21.0 - 67.0, -4.0))
-    centres += anchor - centres[_CENTRE_LEVEL]
-
-    vertebrae = [
-        Vertebra(
-            name=name,
-            center=centres[n],
-            axes=frames[n],
-            width=float(sizes["width"][n]),
-            depth=float(sizes["depth"][n]),
-            height=float(sizes["height"][n]),
-            canal_half_width=float(sizes["canal_half_width"][n]),
-            canal_half_depth=float(sizes["canal_half_depth"][n]),
-            lumbar=float(np.interp(n, (9, 12), (0.0, 1.0))),
-            waves=_trabecular_waves(generator, frames[n] @ steps_mm),
-        )
-        for n, name in enumerate(LEVELS)
-    ]
-    discs = []
-    for upper, lower in zip(vertebrae[:-1], vertebrae[1:], strict=True):
-        gap = upper.center - lower.center
-        length = float(np.linalg.norm(gap))
-        axes = _frame(math.asin(gap[1] / length), math.asin(gap[0] / length))
-        half = 0.515 * (upper.width + lower.width) / 2.0, 0.515 * (upper.depth + lower.depth) / 2.0
-        discs.append(Disc((upper.center + lower.center) / 2.0, axes, half[0], half[1], length / 2.0))
-    # the twelfth rib of the left side is absent: an image mirrored by mistake shows it absent on the right
-    ribs = [
-        _plan_rib(vertebra, side, half_width, half_depth)
-        for vertebra in vertebrae
-        for side in (1, -1)
-        if vertebra.name[0] == "T" and (vertebra.name, side) != ("T12", 1)
-    ]
-    z = centres[:, 2] / 100.0
+    chain = lay_chain(generator, seed, half_depth, choice)
+    vertebrae = _plan_vertebrae(chain, generator, seed, steps_mm)
+    if choice is not None:
+        shown = [v for v in vertebrae if v.name in choice.levels]
+        shift = centring_shift(shown, choice) if choice.centred else np.zeros(3)
+        chain = dataclasses.replace(chain, centres=chain.centres + shift)
+        vertebrae = [dataclasses.replace(v, center=v.center + shift, room=_ROOM_MM.get(v.name, 2.0)) for v in vertebrae]
+    discs = _plan_discs(vertebrae)
+    ribs = _plan_ribs(vertebrae, chain.moved, half_width, half_depth)
+    z = chain.centres[:, 2] / 100.0
+    outline = plan_outline(chain, half_width, half_depth)
     # On the skin of the left flank, or as far left as a small field of view still shows.
     left = min(half_width + 1.0, 0.42 * field_of_view_mm[0])
     marker_y = 0.0 if left < half_width else half_depth * 0.1
-    return Anatomy(
+    marker = np.array((left, marker_y, 0.0))
+    if outline is not None:
+        middle_x, middle_y, wide, _, _ = outline.at(np.zeros(1))
+        marker = np.array((min(middle_x[0] + wide[0] + 1.0, 0.42 * field_of_view_mm[0]), middle_y[0], 0.0))
+    anatomy = Anatomy(
         vertebrae=vertebrae,
         discs=discs,
         ribs=ribs,
         half_width=half_width,
         half_depth=half_depth,
-        curve_x=np.polyfit(z, centres[:, 0], 6),
-        curve_y=np.polyfit(z, centres[:, 1], 6),
-        curve_z=(float(centres[-1, 2]), float(centres[0, 2])),
-        marker=np.array((left, marker_y, 0.0)),
+        curve_x=np.polyfit(z, chain.centres[:, 0], 6),
+        curve_y=np.polyfit(z, chain.centres[:, 1], 6),
+        curve_z=(float(chain.centres[-1, 2]), float(chain.centres[0, 2])),
+        marker=marker,
         marker_radius=float(max(3.0, 0.9 * np.linalg.norm(steps_mm, axis=0).max())),
         absent=["left rib 12"],
+        centres=dict(zip(chain.names, chain.centres, strict=True)),
+        outline=outline,
+    )
+    return anatomy if choice is None else _keep_chosen(anatomy, choice)
+
+
+def _keep_chosen(anatomy: Anatomy, choice: SpineChoice) -> Anatomy:
+    """Leave out what belongs to levels that are not chosen."""
+    names = [v.name for v in anatomy.vertebrae]
+    vertebrae = [v for v in anatomy.vertebrae if v.name in choice.levels]
+    if choice.facet_gap_mm is not None:
+        vertebrae = close_facets(vertebrae, choice.facet_gap_mm)
+    pairs = [pair for pair in zip(names[:-1], names[1:], strict=True) if pair[0] != "C1"]
+    both = [set(pair) <= set(choice.levels) for pair in pairs]
+    ribs = [rib for rib in anatomy.ribs if f"T{rib.name.split()[-1]}" in choice.levels]
+    return dataclasses.replace(
+        anatomy,
+        vertebrae=vertebrae,
+        discs=[disc for disc, kept in zip(anatomy.discs, both, strict=True) if kept],
+        ribs=ribs,
+        absent=anatomy.absent if "T12" in choice.levels else [],
     )

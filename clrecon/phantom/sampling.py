@@ -202,8 +202,19 @@ def _blur_axis(field: Float32Array, sigma: float, axis: int) -> Float32Array:
     return np.moveaxis(blurred, 0, axis)
 
 
+def _uneven_weights(at_mm: Float64Array, sigma_mm: float) -> Float32Array:
+    """Return the matrix (n, n) of Gaussian means over samples at uneven places."""
+    weights = np.exp(-0.5 * ((at_mm[:, None] - at_mm) / sigma_mm) ** 2)
+    weights *= np.gradient(at_mm)  # each sample stands for the space between its neighbours
+    return np.asarray(weights / weights.sum(axis=1, keepdims=True), dtype=np.float32)
+
+
 def apply_point_spread(
-    voxels: Float32Array, affine: ArrayLike, sigma_mm: float, progress: Progress | None = None
+    voxels: Float32Array,
+    affine: ArrayLike,
+    sigma_mm: float,
+    progress: Progress | None = None,
+    places: Float64Array | None = None,
 ) -> Float32Array:
     """Blur `voxels` in place by a Gaussian of `sigma_mm` along each of the affine's three steps.
 
@@ -217,6 +228,8 @@ def apply_point_spread(
     affine : array_like, shape (4, 4)
     sigma_mm : float
         Standard deviation; 0 does nothing.
+    places : ndarray, shape (nk,), optional
+        k of each slice in the affine; default: 0, 1, 2 and so on.
 
     Returns
     -------
@@ -232,8 +245,11 @@ def apply_point_spread(
     def blur_slice(k: int) -> None:
         voxels[k] = _blur_axis(_blur_axis(voxels[k], sigma_mm / di, 1), sigma_mm / dj, 0)
 
+    weights = None if places is None else _uneven_weights(places * dk, sigma_mm)
+
     def blur_row(j: int) -> None:
-        voxels[:, j] = _blur_axis(np.ascontiguousarray(voxels[:, j]), sigma_mm / dk, 0)
+        row = np.ascontiguousarray(voxels[:, j])
+        voxels[:, j] = _blur_axis(row, sigma_mm / dk, 0) if weights is None else weights @ row
 
     map_slices(blur_slice, voxels.shape[0], "blur", progress)
     map_slices(blur_row, voxels.shape[1])

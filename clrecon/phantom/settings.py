@@ -1,36 +1,29 @@
-"""`PhantomSettings`, its validation, and where the slices of a phantom lie in the patient.
-
-Positions are rounded to the decimal strings that a DICOM header can hold *before* the affine is taken from them,
-so that voxels, written files and truth all belong to exactly the same affine.
-"""
+"""`PhantomSettings` and its validation."""
 
 from __future__ import annotations
 
 import dataclasses
-import math
 import re
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from clrecon.errors import UsageError
-from clrecon.geometry import compose_affine
+from clrecon.phantom.chain import SpineChoice
+from clrecon.phantom.facets import LARGEST_GAP_MM
+from clrecon.phantom.fit import fit_slices, spine_choice
 from clrecon.phantom.ghosts import ghost_places
+from clrecon.phantom.levels import THORACOLUMBAR, format_levels, parse_levels
 
 __all__ = [
     "KINDS",
     "TABLE_NAMES",
     "Kind",
     "PhantomSettings",
-    "Placement",
-    "format_decimal",
+    "parse_missing",
     "parse_size",
-    "place_slices",
 ]
-
-Float64Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -74,6 +67,21 @@ TABLE_NAMES = ("none", "flat", "curved", "headrest")
 CENTRE_LPS_MM = (-3.5, -142.25, -418.75)
 """Centre of the volume, away from zero as on a real couch, so that an origin lost by a program shows."""
 
+MOST_BEND = 60.0
+"""Largest kyphosis and scoliosis that is added, degrees."""
+
+_CHOOSING = ("levels", "facet_gap_mm", "kyphosis_deg", "scoliosis_deg")
+_SPINE_ONLY: dict[str, Any] = {
+    "levels": None,
+    "facet_gap_mm": None,
+    "kyphosis_deg": 0.0,
+    "scoliosis_deg": 0.0,
+    "uneven_mm": 0.0,
+    "phases": 1,
+}
+"""Settings of a spine alone, with their defaults."""
+_SAID_PLURAL = {"levels": "they are", "phases": "they are", "ghosts": "they are"}
+
 
 def parse_size(text: str) -> tuple[int, int]:
     """Read ``"256"`` or ``"256x192"`` as (columns, rows).
@@ -89,25 +97,21 @@ def parse_size(text: str) -> tuple[int, int]:
     return int(parts[0]), int(parts[-1])
 
 
-def format_decimal(value: float) -> str:
-    """Write a number as a DICOM decimal string: at most 16 characters, as many digits as fit.
+def parse_missing(text: str) -> tuple[int, ...]:
+    """Read numbers of slices such as ``"20-22,40"``.
 
     Raises
     ------
     UsageError
-        The number is not finite.
+        `text` has another form.
     """
-    if not math.isfinite(value):
-        raise UsageError(f"{value} cannot be written as a decimal string")
-    value = float(value) + 0.0  # no minus zero
-    text = repr(value)
-    if text.endswith(".0"):
-        text = text[:-2]
-    digits = 16
-    while len(text) > 16:
-        digits -= 1
-        text = f"{value:.{digits}g}"
-    return "0" if float(text) == 0.0 else text
+    numbers: list[int] = []
+    for part in text.split(","):
+        found = re.fullmatch(r" *([0-9]{1,4})(?: *- *([0-9]{1,4}))? *", part, re.ASCII)
+        if found is None or int(found[2] or found[1]) < int(found[1]):
+            raise UsageError(f"missing slices {text[:40]!r} are not understood: use numbers from 1, like 20-22,40")
+        numbers += range(int(found[1]), int(found[2] or found[1]) + 1)
+    return tuple(numbers)
 
 
 @dataclass(frozen=True)
@@ -121,7 +125,7 @@ class PhantomSettings:
     size : (columns, rows)
         Extents of a slice in pixels.
     slices : int
-        Number of slices.
+        Number of slices; default: as many as whole vertebrae of `levels` need, 120 without levels.
     spacing : (dj, di, dk)
         mm, in DICOM's order: distance between rows, between columns, and between neighbouring slices **along the
         slice normal**.  With a tilted gantry the slice step itself is longer: ``dk / cos(tilt)``.  Default: that of
@@ -155,6 +159,21 @@ class PhantomSettings:
     ghosts : bool
         Of a spine: two slices of the stack are foreign, a screen capture and a sagittal view, the folder has a
         sagittal localizer, and the table is the curved one unless another is named.
+    levels : str, optional
+        Of a spine: the vertebrae that it shows, from C1 to L5, like ``"C1-L5"``, ``"L4-L5"`` or ``"C3-C7,T1-T5"``, in
+        the middle of the stack.  Their joints are 2 mm wide or more.  Default: T1 to L5 with T12 in the middle, as far
+        as the slices show them.
+    facet_gap_mm : float, optional
+        Of a spine: distance of neighbouring vertebrae in their facet joints, at most 1.5 mm.
+    kyphosis_deg, scoliosis_deg : float
+        Of a spine: angle between the first and the last of its levels that is added to the natural curve, from -60 to
+        60; vertebrae stay rigid.  Positive: the back is round, the middle lies to the left.
+    uneven_mm : float
+        Of a spine: the gaps of the slices differ by up to this much from their mean, at most 0.4 of it.
+    missing : tuple of int
+        Numbers of slices, from 1 as in file names, that are not written; not the first and not the last.
+    phases : int
+        Of a spine: this many series of slices at the same places, with ever more contrast medium in the vessels.
     transfer_syntax : {"explicit", "implicit"}
         Value representations in the files, both little endian and uncompressed.
 
@@ -166,7 +185,7 @@ class PhantomSettings:
 
     kind: str = "spine"
     size: tuple[int, int] = (256, 256)
-    slices: int = 120
+    slices: int = None  # type: ignore[assignment]  # a number once constructed
     spacing: tuple[float, float, float] = None  # type: ignore[assignment]  # three numbers once constructed
     tilt: float = 0.0
     oblique: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -180,6 +199,13 @@ class PhantomSettings:
     table_gap_mm: float = 0.0
     prone: bool = False
     ghosts: bool = False
+    levels: str | None = None
+    facet_gap_mm: float | None = None
+    kyphosis_deg: float = 0.0
+    scoliosis_deg: float = 0.0
+    uneven_mm: float = 0.0
+    missing: tuple[int, ...] = ()
+    phases: int = 1
     transfer_syntax: str = "explicit"
 
     def __post_init__(self) -> None:
@@ -198,7 +224,8 @@ class PhantomSettings:
             object.__setattr__(self, name, value)
         for name, extent in (("columns", self.size[0]), ("rows", self.size[1])):
             _check_integer(name, extent, 8, 4096)
-        _check_integer("slices", self.slices, 1, 9999)
+        if self.slices is not None:
+            _check_integer("slices", self.slices, 1, 9999)
         _check_integer("seed", self.seed, 0, 2**31 - 1)
         for name, step in zip(("row spacing dj", "column spacing di", "slice gap dk"), self.spacing, strict=True):
             _check_number(name, step, 0.05, 50.0, "mm")
@@ -217,10 +244,60 @@ class PhantomSettings:
                 raise UsageError(f"a {self.kind} has no radius: it is for sphere, torus, cylinder and plane")
         _check_number("gap between body and table", self.table_gap_mm, -100.0, 500.0, "mm")
         self._check_lying()
+        self._check_spine()
+        self._check_series()
+
+    def _check_spine(self) -> None:
+        _check_number("kyphosis", self.kyphosis_deg, -MOST_BEND, MOST_BEND, "degrees")
+        _check_number("scoliosis", self.scoliosis_deg, -MOST_BEND, MOST_BEND, "degrees")
+        if self.facet_gap_mm is not None:
+            _check_number("gap of the facet joints", self.facet_gap_mm, 0.0, LARGEST_GAP_MM, "mm")
+        _check_number("unevenness", self.uneven_mm, 0.0, 0.4 * self.spacing[2], "mm (0.4 of the mean gap)")
+        _check_integer("phases", self.phases, 1, 20)
+        if self.levels is not None:
+            object.__setattr__(self, "levels", format_levels(parse_levels(self.levels)))
+        if self.kind != "spine":
+            for name, default in (*_SPINE_ONLY.items(), ("ghosts", False)):
+                if getattr(self, name) != default:
+                    said = name.removesuffix("_deg").removesuffix("_mm").replace("_", " ")
+                    raise UsageError(f"a {self.kind} has no {said}: {_SAID_PLURAL.get(name, 'it is')} for the spine")
+        if self.slices is None or self.levels is not None:
+            choice, slices = self.spine_choice, self.slices
+            if choice is not None and self.levels is not None:
+                slices = fit_slices(choice, self.size, self.spacing, self.seed, self._directions, self.slices)
+            object.__setattr__(self, "slices", slices or 120)
+
+    def _check_series(self) -> None:
+        missing = tuple(self.missing)
+        object.__setattr__(self, "missing", tuple(sorted(missing, key=int)) if _are_integers(missing) else missing)
+        for number in missing:
+            _check_integer("the number of a missing slice", number, 2, self.slices - 1)
+        if len(set(missing)) < len(missing):
+            raise UsageError("a slice is named more than once among those that are missing")
+        if self.phases * self.slices > 9999:
+            raise UsageError(f"{self.phases} phases of {self.slices} slices are more than 9999 files")
         if self.ghosts:
-            if self.kind != "spine":
-                raise UsageError(f"a {self.kind} has no ghosts: they are for the spine")
+            if self.uneven_mm or self.missing or self.phases > 1:
+                raise UsageError("ghosts are for an even series of one phase without missing slices")
             ghost_places(self.slices)
+
+    @property
+    def _directions(self) -> tuple[float, tuple[float, float, float], bool]:
+        return self.tilt, self.oblique, self.prone
+
+    @property
+    def spine_choice(self) -> SpineChoice | None:
+        """What is chosen of a spine; None without levels, bend and facets."""
+        if self.kind != "spine" or all(getattr(self, name) == _SPINE_ONLY[name] for name in _CHOOSING):
+            return None
+        return spine_choice(
+            parse_levels(self.levels) if self.levels is not None else THORACOLUMBAR,
+            (self.kyphosis_deg, self.scoliosis_deg),
+            self.facet_gap_mm,
+            centred=self.levels is not None,
+            directions=self._directions,
+            length_mm=None if self.slices is None else self.slices * self.spacing[2],
+        )
 
     def _check_lying(self) -> None:
         if self.table is not None and self.table not in TABLE_NAMES:
@@ -245,17 +322,23 @@ class PhantomSettings:
         return self.slices, self.size[1], self.size[0]
 
     def as_dict(self) -> dict[str, Any]:
-        """All settings as plain JSON types; `table`, `table_gap_mm`, `prone`, `ghosts` where they are not the default.
+        """All settings as plain JSON types; those of table, spine and series where they are not the default.
 
         UIDs are derived from these texts, so the defaults are left out: phantoms of earlier versions keep their UIDs.
         """
         plain = {
             name: list(value) if isinstance(value, tuple) else value for name, value in dataclasses.asdict(self).items()
         }
-        for name, default in (("table", None), ("table_gap_mm", 0.0), ("prone", False), ("ghosts", False)):
+        plain["missing"] = list(self.missing)
+        lying = {"table": None, "table_gap_mm": 0.0, "prone": False, "ghosts": False}
+        for name, default in {**lying, **_SPINE_ONLY, "missing": []}.items():
             if plain[name] == default:
                 del plain[name]
         return plain
+
+
+def _are_integers(values: tuple[Any, ...]) -> bool:
+    return all(isinstance(value, (int, np.integer)) for value in values)
 
 
 def _check_integer(name: str, value: Any, low: int, high: int) -> None:
@@ -266,81 +349,3 @@ def _check_integer(name: str, value: Any, low: int, high: int) -> None:
 def _check_number(name: str, value: Any, low: float, high: float, unit: str) -> None:
     if isinstance(value, bool) or not isinstance(value, (int, float, np.number)) or not low <= value <= high:
         raise UsageError(f"{name} must be a number from {low:g} to {high:g} {unit}, got {value}")
-
-
-@dataclass(frozen=True)
-class Placement:
-    """Where the slices lie: the decimal strings of the files, and the affine that these strings give.
-
-    Attributes
-    ----------
-    orientation : list of 6 str
-        Row cosines, then column cosines.
-    pixel_spacing : list of 2 str
-        dj, di in mm.
-    positions : list of lists of 3 str
-        Centre of pixel (0, 0) of every slice, LPS mm.
-    slice_thickness, tilt : str
-        dk in mm and the gantry tilt in degrees.
-    affine : ndarray, shape (4, 4)
-        Index (i, j, k) to LPS mm.
-    """
-
-    orientation: list[str]
-    pixel_spacing: list[str]
-    positions: list[list[str]]
-    slice_thickness: str
-    tilt: str
-    affine: Float64Array
-
-
-def _rotation(oblique: tuple[float, float, float]) -> Float64Array:
-    """Return the rotation about x, then y, then z, degrees."""
-    matrix = np.eye(3)
-    for axis, angle in enumerate(oblique):
-        c, s = math.cos(math.radians(angle)), math.sin(math.radians(angle))
-        first, second = (axis + 1) % 3, (axis + 2) % 3
-        turn = np.eye(3)
-        turn[[first, second], [first, second]] = c
-        turn[first, second], turn[second, first] = -s, s
-        matrix = turn @ matrix
-    return matrix
-
-
-def place_slices(settings: PhantomSettings) -> Placement:
-    """Compute orientation and positions of all slices, centred on `CENTRE_LPS_MM`.
-
-    Parameters
-    ----------
-    settings : PhantomSettings
-
-    Returns
-    -------
-    Placement
-    """
-    dj, di, dk = settings.spacing
-    tilt = math.radians(settings.tilt)
-    rotation = _rotation(settings.oblique)
-    if settings.prone:
-        rotation = rotation @ np.diag((-1.0, -1.0, 1.0))
-    row = rotation @ (1.0, 0.0, 0.0)
-    column = rotation @ (0.0, math.cos(tilt), -math.sin(tilt))
-    step = rotation @ (0.0, 0.0, dk / math.cos(tilt))
-
-    orientation = [format_decimal(value) for value in (*row, *column)]
-    pixel_spacing = [format_decimal(dj), format_decimal(di)]
-    cosines = np.array([float(text) for text in orientation])
-    i_step, j_step = cosines[:3] * float(pixel_spacing[1]), cosines[3:] * float(pixel_spacing[0])
-    middle = np.array((*settings.size, settings.slices), dtype=np.float64) / 2.0 - 0.5
-    first = np.array(CENTRE_LPS_MM) - middle @ np.array((i_step, j_step, step))
-    positions = [[format_decimal(value) for value in first + k * step] for k in range(settings.slices)]
-    written = np.array(positions, dtype=np.float64)
-    k_step = (written[-1] - written[0]) / (settings.slices - 1) if settings.slices > 1 else step
-    return Placement(
-        orientation=orientation,
-        pixel_spacing=pixel_spacing,
-        positions=positions,
-        slice_thickness=format_decimal(dk),
-        tilt=format_decimal(settings.tilt),
-        affine=compose_affine(i_step, j_step, k_step, written[0]),
-    )

@@ -14,16 +14,18 @@ from numpy.typing import NDArray
 
 from clrecon.geometry import column_spacing
 from clrecon.phantom.fields import Field, capsule, coverage, ellipse, waves_at
+from clrecon.phantom.levels import level_number
+from clrecon.phantom.parts import Anatomy, Vertebra
 from clrecon.phantom.placing import Piece, PlacedPiece, Window, paint
-from clrecon.phantom.plan import Anatomy, Vertebra, plan_anatomy
+from clrecon.phantom.plan import plan_anatomy
 from clrecon.phantom.scenes import Plan
 from clrecon.phantom.settings import CENTRE_LPS_MM, PhantomSettings
 from clrecon.phantom.tables import lay_under
-from clrecon.phantom.tissue import draw_tissue
+from clrecon.phantom.tissue import BLOOD_HU, draw_tissue
 from clrecon.phantom.vertebra import local_bounds, vertebra_distance
 from clrecon.system.progress import Progress
 
-__all__ = ["draw_spine"]
+__all__ = ["draw_spine", "label_levels", "plan_spine"]
 
 Float64Array = NDArray[np.float64]
 Float32Array = NDArray[np.float32]
@@ -121,8 +123,63 @@ class _Scene:
         paint(canvas, at.region, coverage(bone - cortex, self.ramp), marrow)
 
 
+def plan_spine(settings: PhantomSettings, affine: Float64Array) -> tuple[Anatomy, Float64Array]:
+    """Plan the spine of a phantom.
+
+    Parameters
+    ----------
+    settings : PhantomSettings
+    affine : ndarray, shape (4, 4)
+        Index (i, j, k) to LPS mm.
+
+    Returns
+    -------
+    anatomy : Anatomy
+        In mm about `CENTRE_LPS_MM`.
+    grid : ndarray, shape (4, 4)
+        Index to mm of the plan.
+    """
+    # The plan's origin is the centre of the volume.
+    grid = affine.copy()
+    grid[:3, 3] -= CENTRE_LPS_MM
+    extents = np.array(settings.shape_kji[::-1]) * column_spacing(affine)
+    width, depth, length = (float(extent) for extent in extents)
+    return plan_anatomy((width, depth, length), grid[:3, :3], settings.seed, settings.spine_choice), grid
+
+
+def label_levels(settings: PhantomSettings, affine: Float64Array) -> NDArray[np.uint8]:
+    """Label each voxel of a spine phantom with the number of the vertebra that holds its centre.
+
+    Parameters
+    ----------
+    settings : PhantomSettings
+    affine : ndarray, shape (4, 4)
+        Index (i, j, k) to LPS mm.
+
+    Returns
+    -------
+    ndarray, shape (nk, nj, ni), uint8
+        0 where no vertebra is, else `clrecon.phantom.levels.level_number`.
+    """
+    anatomy, grid = plan_spine(settings, affine)
+    labels = np.zeros(settings.shape_kji, dtype=np.uint8)
+    for vertebra in anatomy.vertebrae:
+        low, high = (np.array(corner) for corner in local_bounds(vertebra))
+        placed = PlacedPiece(Piece(vertebra.center, vertebra.axes, low, high), grid, settings.shape_kji)
+        for k in range(settings.slices):
+            if placed.meets(k):
+                at = placed.window(float(k))
+                labels[k][at.region][vertebra_distance(vertebra, at.x, at.y, at.z) >= 0.0] = level_number(vertebra.name)
+    return labels
+
+
 def draw_spine(
-    settings: PhantomSettings, affine: Float64Array, progress: Progress | None = None
+    settings: PhantomSettings,
+    affine: Float64Array,
+    progress: Progress | None = None,
+    *,
+    places: Float64Array | None = None,
+    blood_hu: float = BLOOD_HU,
 ) -> tuple[Float32Array, Anatomy]:
     """Draw the spine phantom without point spread and noise.
 
@@ -133,6 +190,10 @@ def draw_spine(
         Index (i, j, k) to LPS mm.
     progress : callable, optional
         Called as ``progress("draw", done, slices)``.
+    places : ndarray, shape (nk,), optional
+        k of each slice in the affine; default: 0, 1, 2 and so on.
+    blood_hu : float
+        HU of heart and vessels.
 
     Returns
     -------
@@ -142,14 +203,10 @@ def draw_spine(
         The plan, in mm about `CENTRE_LPS_MM`.
     """
     shape = settings.shape_kji
-    # The plan's origin is the centre of the volume.
-    grid = affine.copy()
-    grid[:3, 3] -= CENTRE_LPS_MM
     di, dj, dk = column_spacing(affine)
     subslices = int(np.clip(round(dk / math.sqrt(di * dj)), 1, 4))
     ramp = (di * dj * dk / subslices) ** (1.0 / 3.0)
-    extent = (shape[2] * di, shape[1] * dj, shape[0] * dk)
-    anatomy = plan_anatomy(extent, grid[:3, :3], settings.seed)
+    anatomy, grid = plan_spine(settings, affine)
     scene = _Scene(anatomy, grid, shape, ramp)
     body = Plan([], front=-anatomy.half_depth, back=anatomy.half_depth)
     own = settings.table_used == "own"
@@ -157,21 +214,23 @@ def draw_spine(
     voxels = np.empty(shape, dtype=np.float32)
     offsets = (np.arange(subslices) + 0.5) / subslices - 0.5
 
-    def draw(k: int) -> None:
-        full = Window((slice(0, shape[1]), slice(0, shape[2])), grid, float(k))
-        tissue = draw_tissue(anatomy, full.x, full.y, full.z, ramp, settings.seed, table, settings.prone)
+    def draw(k: int, place: float) -> None:
+        full = Window((slice(0, shape[1]), slice(0, shape[2])), grid, place)
+        tissue = draw_tissue(
+            anatomy, full.x, full.y, full.z, ramp, settings.seed, table, settings.prone, blood_hu=blood_hu
+        )
         scratch = np.full(shape[1:], -1e3, dtype=np.float32)
         voxels[k] = 0.0
         for offset in offsets:
             canvas = tissue.copy() if subslices > 1 else tissue
-            scene.draw(canvas, scratch, k, k + offset)
+            scene.draw(canvas, scratch, k, place + offset)
             voxels[k] += canvas
         if subslices > 1:
             voxels[k] /= np.float32(subslices)
 
     # One thread: the pieces are small, and threads lose more time to the interpreter lock than they gain.
     for k in range(shape[0]):
-        draw(k)
+        draw(k, float(k if places is None else places[k]))
         if progress is not None:
             progress("draw", k + 1, shape[0])
     return voxels, anatomy

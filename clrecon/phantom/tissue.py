@@ -7,10 +7,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from clrecon.phantom.fields import Field, capsule, coverage, ellipse, ellipsoid
-from clrecon.phantom.plan import Anatomy
+from clrecon.phantom.parts import Anatomy
 from clrecon.phantom.scenes import Part
 
-__all__ = ["draw_tissue"]
+__all__ = ["BLOOD_HU", "draw_tissue"]
 
 AIR_HU = -1000.0
 SKIN_HU = 25.0
@@ -43,22 +43,35 @@ def _draw_couch(canvas: Field, anatomy: Anatomy, x: Field, y: Field, ramp: float
     _blend(canvas, coverage(shell - np.float32(1.6), ramp), TABLE_CORE_HU)
 
 
-def _draw_wall(canvas: Field, anatomy: Anatomy, x: Field, y: Field, ramp: float) -> Field:
+def _draw_wall(
+    canvas: Field, half_width: float | Field, half_depth: float | Field, x: Field, y: Field, ramp: float
+) -> Field:
     """Draw skin, fat and muscle; return the distance into the body cavity."""
-    skin = ellipse(x, y, anatomy.half_width, anatomy.half_depth)
+    skin = ellipse(x, y, half_width, half_depth)
     _blend(canvas, coverage(skin, ramp), SKIN_HU)
     _blend(canvas, coverage(skin - np.float32(1.8), ramp), FAT_HU)
     # The flanks and the belly have more fat than the ribs of the back.
-    fat = np.float32(11.0) - np.float32(3.0) * np.clip(y / np.float32(anatomy.half_depth), -1.0, 1.0)
+    fat = np.float32(11.0) - np.float32(3.0) * np.clip(y / np.asarray(half_depth, dtype=np.float32), -1.0, 1.0)
     muscle = skin - fat
     _blend(canvas, coverage(muscle, ramp), MUSCLE_HU)
     return muscle - np.float32(13.0)
 
 
 def _draw_organs(
-    canvas: Field, anatomy: Anatomy, cavity: Field, x: Field, y: Field, z: Field, ramp: float, seed: int
+    canvas: Field,
+    anatomy: Anatomy,
+    cavity: Field,
+    x: Field,
+    y: Field,
+    z: Field,
+    ramp: float,
+    seed: int,
+    blood_hu: float,
 ) -> Field:
-    """Draw abdominal organs in fat and, above the diaphragm, lungs; return the distance into the lungs."""
+    """Draw abdominal organs in fat and, above the diaphragm, lungs; return the distance into the lungs.
+
+    `x` and `y` count from the middle of the trunk.
+    """
     wide, deep = anatomy.half_width - 28.0, anatomy.half_depth - 28.0
     low = np.float32(anatomy.level_z("L1"))
     _blend(canvas, coverage(cavity, ramp), FAT_HU + 8.0)
@@ -89,14 +102,16 @@ def _draw_organs(
     organ((-0.48 * wide, -0.10 * deep, mid - 8.0), (0.62 * wide, 0.80 * deep, 74.0), LIVER_HU)
     organ((0.20 * wide, -0.45 * deep, mid), (0.34 * wide, 0.36 * deep, 34.0), BOWEL_HU + 8.0)
     organ((0.70 * wide, 0.22 * deep, mid - 4.0), (0.24 * wide, 0.42 * deep, 44.0), SPLEEN_HU)
-    spine_y = anatomy.vertebrae[13].center[1]
+    spine_y = anatomy.centres["L2"][1]
+    if anatomy.outline is not None:
+        spine_y = spine_y - float(anatomy.outline.at(np.array([kidney]))[1][0])
     for side in (1.0, -1.0):
         # The right kidney lies lower, under the liver.
         organ((side * 56.0, spine_y + 8.0, kidney + 8.0 * side), (23.0, 19.0, 50.0), KIDNEY_HU)
 
     mediastinum = ellipse(x - np.float32(6.0), y + np.float32(0.25 * deep), 0.34 * wide + 6.0, 0.85 * deep)
     # Heart and great vessels are one piece, in a rim of fat.
-    _blend(canvas, coverage(np.minimum(np.minimum(mediastinum - np.float32(4.0), above), cavity), ramp), BLOOD_HU)
+    _blend(canvas, coverage(np.minimum(np.minimum(mediastinum - np.float32(4.0), above), cavity), ramp), blood_hu)
     lung = np.minimum(np.minimum(cavity + np.float32(9.0), above), -mediastinum)
     return lung
 
@@ -106,7 +121,16 @@ _BAND = 24000
 
 
 def draw_tissue(
-    anatomy: Anatomy, x: Field, y: Field, z: Field, ramp: float, seed: int, table: Sequence[Part] | None, prone: bool
+    anatomy: Anatomy,
+    x: Field,
+    y: Field,
+    z: Field,
+    ramp: float,
+    seed: int,
+    table: Sequence[Part] | None,
+    prone: bool,
+    *,
+    blood_hu: float = BLOOD_HU,
 ) -> Field:
     """Draw one slice without bone, in bands of rows.
 
@@ -122,6 +146,8 @@ def draw_tissue(
         Table that the body lies on; None: a couch of its own.
     prone : bool
         True: that couch is under the front.
+    blood_hu : float
+        HU of heart and vessels.
 
     Returns
     -------
@@ -136,14 +162,24 @@ def draw_tissue(
             _draw_couch(canvas[band], anatomy, x[band], -y[band] if prone else y[band], ramp)
         for part in table or ():
             _blend(canvas[band], coverage(part.distance_at(x[band], y[band], z[band]), ramp), part.hu)
-        _draw_band(canvas[band], anatomy, x[band], y[band], z[band], ramp, seed)
+        _draw_band(canvas[band], anatomy, x[band], y[band], z[band], ramp, seed, blood_hu)
     return canvas
 
 
-def _draw_band(canvas: Field, anatomy: Anatomy, x: Field, y: Field, z: Field, ramp: float, seed: int) -> None:
+def _draw_band(
+    canvas: Field, anatomy: Anatomy, x: Field, y: Field, z: Field, ramp: float, seed: int, blood_hu: float
+) -> None:
     """Draw onto `canvas`, which already holds air and the couch."""
-    cavity = _draw_wall(canvas, anatomy, x, y, ramp)
-    lung = _draw_organs(canvas, anatomy, cavity, x, y, z, ramp, seed)
+    neck: float | Field = 0.0
+    if anatomy.outline is None:
+        cavity = _draw_wall(canvas, anatomy.half_width, anatomy.half_depth, x, y, ramp)
+        lung = _draw_organs(canvas, anatomy, cavity, x, y, z, ramp, seed, blood_hu)
+    else:
+        middle_x, middle_y, half_width, half_depth, neck = anatomy.outline.at(z)
+        body_x, body_y = x - middle_x, y - middle_y
+        cavity = _draw_wall(canvas, half_width, half_depth, body_x, body_y, ramp)
+        lung = _draw_organs(canvas, anatomy, cavity, body_x, body_y, z, ramp, seed, blood_hu)
+        lung = np.minimum(lung, np.float32(60.0) * (np.float32(0.2) - neck))  # no lungs in the neck
 
     height = np.clip(z, *anatomy.curve_z) * np.float32(0.01)
     spine_x, spine_y = (
@@ -170,6 +206,21 @@ def _draw_band(canvas: Field, anatomy: Anatomy, x: Field, y: Field, z: Field, ra
     _blend(canvas, coverage(psoas, ramp), MUSCLE_HU + 4.0)
     fat_round = ellipse(from_x - np.float32(2.0), from_y + np.float32(29.0), 34.0, 14.0)
     _blend(canvas, coverage(np.minimum(fat_round, -lung), ramp), FAT_HU + 20.0)
+    _draw_vessels(canvas, from_x, from_y, z, neck, ramp, seed, blood_hu)
+    # The canal lies nearer to the middle of the small bodies of the neck.
+    behind = np.float32(9.5) * neck
+    canal = ellipse(from_x, from_y - np.float32(24.3) + behind, 11.5, 8.3)
+    _blend(canvas, coverage(canal, ramp), FAT_HU + 40.0)
+    sac = ellipse(from_x, from_y - np.float32(24.0) + behind, 8.5, 6.6)
+    _blend(canvas, coverage(sac, ramp), FLUID_HU)
+    _blend(canvas, coverage(np.minimum(sac - np.float32(3.0), z - np.float32(anatomy.level_z("L1"))), ramp), CORD_HU)
+
+
+def _draw_vessels(
+    canvas: Field, from_x: Field, from_y: Field, z: Field, neck: float | Field, ramp: float, seed: int, blood_hu: float
+) -> None:
+    """Draw aorta and vena cava in front of the spine, and in the neck the windpipe."""
+    trunk = np.float32(1.0) - neck
     aorta = ellipse(from_x - np.float32(13.0), from_y + np.float32(29.0), 10.0, 10.0)
     # Plaques: spots of the left and rear wall, at intervals along the vessel.
     plaque = (
@@ -181,12 +232,10 @@ def _draw_band(canvas: Field, anatomy: Anatomy, x: Field, y: Field, z: Field, ra
             0.0,
         )
     )
-    _blend(canvas, coverage(aorta, ramp), BLOOD_HU)
-    _blend(canvas, coverage(np.minimum(plaque, from_x - np.float32(13.0)), ramp), CALCIUM_HU)
-    _blend(canvas, coverage(ellipse(from_x + np.float32(16.0), from_y + np.float32(27.0), 12.5, 8.5), ramp), BLOOD_HU)
-
-    canal = ellipse(from_x, from_y - np.float32(24.3), 11.5, 8.3)
-    _blend(canvas, coverage(canal, ramp), FAT_HU + 40.0)
-    sac = ellipse(from_x, from_y - np.float32(24.0), 8.5, 6.6)
-    _blend(canvas, coverage(sac, ramp), FLUID_HU)
-    _blend(canvas, coverage(np.minimum(sac - np.float32(3.0), z - np.float32(anatomy.level_z("L1"))), ramp), CORD_HU)
+    _blend(canvas, trunk * coverage(aorta, ramp), blood_hu)
+    _blend(canvas, trunk * coverage(np.minimum(plaque, from_x - np.float32(13.0)), ramp), CALCIUM_HU)
+    vein = ellipse(from_x + np.float32(16.0), from_y + np.float32(27.0), 12.5, 8.5)
+    _blend(canvas, trunk * coverage(vein, ramp), blood_hu)
+    if not isinstance(neck, float):
+        windpipe = ellipse(from_x, from_y + np.float32(27.0), 8.0, 8.0)
+        _blend(canvas, coverage(np.minimum(windpipe, np.float32(60.0) * (neck - np.float32(0.5))), ramp), AIR_HU)

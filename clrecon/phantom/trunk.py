@@ -8,7 +8,8 @@ import math
 import numpy as np
 
 from clrecon.phantom.fields import Field, coverage, ellipsoid
-from clrecon.phantom.plan import Vertebra, plan_anatomy
+from clrecon.phantom.parts import Vertebra
+from clrecon.phantom.plan import plan_anatomy
 from clrecon.phantom.scenes import AIR_HU, Part, Plan
 from clrecon.phantom.solids import ball, column, cut, rod
 from clrecon.phantom.vertebra import local_bounds, vertebra_distance

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import numpy as np
 
+from clrecon.phantom.cervical import cervical_bounds, cervical_shape, facet_seats
 from clrecon.phantom.fields import Field, capsule, ellipse, smooth_union
-from clrecon.phantom.plan import Vertebra
+from clrecon.phantom.parts import Vertebra
 
-__all__ = ["canal_distance", "local_bounds", "vertebra_distance"]
+__all__ = ["canal_distance", "local_bounds", "upper_facet_seats", "vertebra_distance", "vertebra_shape"]
 
 
 def local_bounds(vertebra: Vertebra) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
     """Return the lowest and highest corner, local mm, of a box that holds the whole vertebra."""
+    if vertebra.is_cervical:
+        return cervical_bounds(vertebra)
     side = max(vertebra.width / 2.0 + 24.0, vertebra.canal_half_width + 26.0)
     back = vertebra.depth / 2.0 + 2.0 * vertebra.canal_half_depth + 40.0
     below = -1.45 * vertebra.height - 4.0
@@ -51,6 +54,8 @@ def _arch_distance(vertebra: Vertebra, x: Field, y: Field, z: Field) -> Field:
     middle = vertebra.depth / 2.0 + deep
     rear = middle + deep
     lumbar = vertebra.lumbar
+    half_room = vertebra.room / 2.0
+    thin, short = 0.15 * vertebra.room, 0.03 * vertebra.room
 
     def rod(thoracic: tuple[float, ...], lumbar_rod: tuple[float, ...], across: Field = side) -> Field:
         ax, ay, az, bx, by, bz, radius_a, radius_b, flatten = _mix(thoracic, lumbar_rod, lumbar)
@@ -69,13 +74,13 @@ def _arch_distance(vertebra: Vertebra, x: Field, y: Field, z: Field) -> Field:
         ),
         # superior articular process: in front of and lateral to the inferior one of the level above
         rod(
-            (wide + 2.0, middle + 2.5, 0.15, wide + 1.8, middle + 4.0, 0.62, 2.8, 2.4, 1.0),
-            (wide + 4.8, middle + 3.0, 0.15, wide + 6.0, middle + 4.6, 0.60, 3.6, 3.2, 1.0),
+            (wide + 2.0, middle + 2.5, 0.15, wide + 1.8, middle + 4.0 - half_room, 0.62 - short, 2.8, 2.4 - thin, 1.0),
+            (wide + 4.8, middle + 3.0, 0.15, wide + 6.0, middle + 4.6 - half_room, 0.60 - short, 3.6, 3.2 - thin, 1.0),
         ),
         # inferior articular process
         rod(
-            (wide, middle + 6.5, -0.20, wide - 0.5, middle + 9.8, -0.68, 2.9, 2.3, 1.0),
-            (wide + 0.8, middle + 7.0, -0.20, wide - 0.8, middle + 9.8, -0.72, 3.6, 3.0, 1.0),
+            (wide, middle + 6.5, -0.20, wide - 0.5, middle + 9.8 + half_room, -0.68, 2.9, 2.3 - thin, 1.0),
+            (wide + 0.8, middle + 7.0, -0.20, wide - 0.8, middle + 9.8 + half_room, -0.72, 3.6, 3.0 - thin, 1.0),
         ),
         # lamina
         rod(
@@ -99,12 +104,48 @@ def _arch_distance(vertebra: Vertebra, x: Field, y: Field, z: Field) -> Field:
     return distance
 
 
+def upper_facet_seats(vertebra: Vertebra) -> list[tuple[float, float, float]]:
+    """Return points along the middle of the upper articular process, local mm, with x of the left side.
+
+    C1 has none: what lies above it is not part of the phantom.
+    """
+    if vertebra.is_cervical:
+        return facet_seats(vertebra)
+    wide, middle = vertebra.canal_half_width, vertebra.depth / 2.0 + vertebra.canal_half_depth
+    low = _mix((2.0, 2.5, 0.15), (4.8, 3.0, 0.15), vertebra.lumbar)
+    top = _mix((1.8, 4.0, 0.62), (6.0, 4.6, 0.60), vertebra.lumbar)
+    seats = []
+    for share in (0.5, 0.75, 1.0):
+        x, y, z = (a + share * (b - a) for a, b in zip(low, top, strict=True))
+        seats.append((wide + x, middle + y, z * vertebra.height))
+    return seats
+
+
+def vertebra_shape(vertebra: Vertebra, x: Field, y: Field, z: Field) -> tuple[Field, list[Field]]:
+    """Return the distance to the bone before cutting, and those to what is cut out of it, mm, positive inside; x, y, z
+    are local mm.
+    """
+    if vertebra.is_cervical:
+        bone, cuts = cervical_shape(vertebra, x, y, z)
+    else:
+        bone = smooth_union(_body_distance(vertebra, x, y, z), _arch_distance(vertebra, x, y, z), 2.0)
+        cuts = [canal_distance(vertebra, x, y)]
+    for cx, cy, cz, radius in vertebra.facets:
+        ball = np.sqrt((x - np.float32(cx)) ** 2 + (y - np.float32(cy)) ** 2 + (z - np.float32(cz)) ** 2)
+        np.maximum(bone, np.float32(radius) - ball, out=bone)
+    return bone, cuts
+
+
 def vertebra_distance(vertebra: Vertebra, x: Field, y: Field, z: Field) -> Field:
     """Return the distance to the outer surface of the bone, mm, positive inside; x, y, z are local mm.
 
+    It is exact on the surface and of first order near it; `clrecon.phantom.truth` has true distances.
+
     Returns
     -------
-    ndarray, float32, the broadcast shape of x, y and z
+    ndarray, of the type and the broadcast shape of x, y and z
     """
-    bone = smooth_union(_body_distance(vertebra, x, y, z), _arch_distance(vertebra, x, y, z), 2.0)
-    return np.minimum(bone, -canal_distance(vertebra, x, y))
+    bone, cuts = vertebra_shape(vertebra, x, y, z)
+    for cut in cuts:
+        bone = np.minimum(bone, -cut)
+    return bone

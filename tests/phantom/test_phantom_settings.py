@@ -8,7 +8,7 @@ import pytest
 
 from clrecon.errors import UsageError
 from clrecon.phantom import PhantomSettings, make_phantom, parse_size
-from clrecon.phantom.settings import format_decimal
+from clrecon.phantom.placement import format_decimal
 
 
 @pytest.mark.parametrize(

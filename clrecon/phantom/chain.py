@@ -1,0 +1,187 @@
+"""The chain of vertebrae: sizes, places and directions of all levels, straight or bent.
+
+Axes are the patient's: x to the left, y to the posterior, z to the superior.  Sizes are round figures of adult
+anatomy (bodies of the chest and loin 28 to 50 mm wide and 16 to 28 mm high, discs 4 to 11 mm, interpolated between
+levels; the neck is that of a small adult).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clrecon.phantom.levels import LEVELS, THORACOLUMBAR
+
+__all__ = ["Chain", "SpineChoice", "lean_and_roll", "lay_chain"]
+
+Float64Array = NDArray[np.float64]
+
+_KEYS = [THORACOLUMBAR.index(name) for name in ("T1", "T6", "T12", "L1", "L3", "L5")]
+_SIZES = {
+    "width": (28.0, 29.0, 40.0, 42.0, 46.0, 50.0),
+    "depth": (18.0, 25.0, 31.0, 33.0, 35.0, 36.0),
+    "height": (16.5, 20.0, 25.0, 27.0, 28.5, 28.0),
+    "disc": (4.0, 4.5, 6.5, 8.0, 10.5, 10.0),
+    "canal_half_width": (9.0, 8.5, 11.0, 11.5, 12.0, 13.0),
+    "canal_half_depth": (7.5, 7.5, 8.0, 8.5, 8.5, 8.5),
+    # Lean of the upward axis towards the posterior: thoracic kyphosis, lumbar lordosis.
+    "lean_degrees": (-20.0, -4.0, 10.0, 9.0, 1.0, -17.0),
+}
+_NECK = {
+    # C1 has no body: these are sizes of the space that its ring leaves to the dens and the cord
+    "width": (17.0, 17.0, 16.5, 17.0, 17.5, 19.0, 21.5),
+    "depth": (14.0, 14.5, 14.5, 14.5, 15.0, 15.5, 16.0),
+    "height": (10.0, 16.5, 10.2, 10.0, 10.0, 10.4, 11.8),
+    "disc": (4.0, 3.3, 3.3, 3.3, 3.3, 3.5, 3.8),
+    "canal_half_width": (14.0, 12.0, 11.5, 11.8, 12.0, 11.8, 11.0),
+    "canal_half_depth": (11.0, 8.6, 7.4, 7.2, 7.2, 7.2, 7.2),
+    "lean_degrees": (6.0, 5.0, 2.0, -3.0, -8.0, -13.0, -17.0),
+}
+"""Sizes of C1 to C7; `disc` is the height of the one below."""
+
+_ANCHOR_LEVEL = "T12"
+
+
+@dataclass(frozen=True)
+class SpineChoice:
+    """What is chosen of a spine: its levels, its bend and its facets.
+
+    Attributes
+    ----------
+    levels : tuple of str
+        Levels that are shown, from top to bottom.
+    kyphosis_deg, scoliosis_deg : float
+        Angle between the first and the last chosen level that is added to the natural one, in the sagittal plane
+        (positive: the back is round) and in the coronal plane (positive: the middle lies to the left).
+    facet_gap_mm : float, optional
+        Distance of neighbouring vertebrae in their facet joints; None: the shapes' own, 2 mm and more.
+    centred : bool
+        True: the levels are put into the middle of the volume; False: T12 is, as without a choice.
+    normal : (x, y, z)
+        Normal of the slices.
+    length_mm : float, optional
+        Length of the volume along `normal`; None: as long as the chosen levels need.
+    """
+
+    levels: tuple[str, ...]
+    kyphosis_deg: float = 0.0
+    scoliosis_deg: float = 0.0
+    facet_gap_mm: float | None = None
+    centred: bool = True
+    normal: tuple[float, float, float] = (0.0, 0.0, 1.0)
+    length_mm: float | None = None
+
+    @property
+    def is_bent(self) -> bool:
+        """True where the spine has another curve than the natural one."""
+        return self.kyphosis_deg != 0.0 or self.scoliosis_deg != 0.0
+
+
+@dataclass(frozen=True)
+class Chain:
+    """All planned levels.
+
+    Attributes
+    ----------
+    names : tuple of str
+    sizes : dict of str to ndarray
+        mm of each level.
+    frames : list of ndarray, shape (3, 3)
+        Rows are the local left, posterior and superior directions.
+    centres : ndarray, shape (n, 3)
+        Middle of each vertebral body, mm.
+    moved : ndarray, shape (n, 3)
+        How far the bend has moved each centre; 0 without one.
+    """
+
+    names: tuple[str, ...]
+    sizes: dict[str, Float64Array]
+    frames: list[Float64Array]
+    centres: Float64Array
+    moved: Float64Array
+
+
+def lean_and_roll(lean: float, roll: float) -> Float64Array:
+    """Return the rows local left, posterior and superior after a lean about x and a small roll about y, in radians."""
+    superior = np.array((math.sin(roll), math.sin(lean), 0.0))
+    superior[2] = math.sqrt(1.0 - superior @ superior)
+    left = np.array((1.0, 0.0, 0.0)) - superior[0] * superior
+    left /= np.linalg.norm(left)
+    return np.array((left, np.cross(superior, left), superior))
+
+
+def _stack(sizes: dict[str, Float64Array], frames: list[Float64Array], anchor: int, at: Float64Array) -> Float64Array:
+    """Return the centres of bodies with their discs between them, that of level `anchor` at `at`."""
+    centres = np.zeros((len(frames), 3))
+    for n in range(1, len(frames)):
+        centres[n] = centres[n - 1] - frames[n - 1][2] * (sizes["height"][n - 1] / 2.0 + sizes["disc"][n - 1] / 2.0)
+        centres[n] -= frames[n][2] * (sizes["height"][n] / 2.0 + sizes["disc"][n - 1] / 2.0)
+    centres += at - centres[anchor]
+    return centres
+
+
+def lay_chain(generator: np.random.Generator, seed: int, half_depth: float, choice: SpineChoice | None) -> Chain:
+    """Lay the levels out, the middle of T12 a little below the middle of the volume.
+
+    Parameters
+    ----------
+    generator : Generator
+        Small changes of the curve of chest and loin.
+    seed : int
+        Those of the neck, which is planned where a cervical level is chosen.
+    half_depth : float
+        Half the depth of the trunk, mm: the tips of the spinous processes stay about 20 mm under the skin.
+    choice : SpineChoice, optional
+        None: T1 to L5, straight.
+
+    Returns
+    -------
+    Chain
+    """
+    count = len(THORACOLUMBAR)
+    sizes = {key: np.interp(np.arange(count), _KEYS, values) for key, values in _SIZES.items()}
+    leans = np.radians(sizes["lean_degrees"] + generator.normal(0.0, 0.6, count))
+    rolls = np.radians(generator.normal(0.0, 0.5, count) + 1.5 * np.sin(np.arange(count) * 0.7))
+    names = THORACOLUMBAR
+    if choice is not None and choice.levels[0][0] == "C":
+        neck = np.random.default_rng((seed, 17))
+        names = LEVELS
+        more = len(LEVELS) - count
+        sizes = {key: np.concatenate((_NECK[key], values)) for key, values in sizes.items()}
+        leans = np.concatenate((np.radians(sizes["lean_degrees"][:more] + neck.normal(0.0, 0.6, more)), leans))
+        rolls = np.concatenate((np.radians(neck.normal(0.0, 0.5, more)), rolls))
+        leans[0], rolls[0] = leans[1], rolls[1]  # the ring lies square to the dens
+    anchor = names.index(_ANCHOR_LEVEL)
+    at = np.array((1.7, half_depth - 21.0 - 67.0, -4.0))
+    frames = [lean_and_roll(lean, roll) for lean, roll in zip(leans, rolls, strict=True)]
+    centres = _stack(sizes, frames, anchor, at)
+    chain = Chain(names, sizes, frames, centres, np.zeros_like(centres))
+    if choice is not None and choice.is_bent:
+        chain = _bend(chain, leans, rolls, anchor, choice)
+    return chain
+
+
+def _bend(chain: Chain, leans: Float64Array, rolls: Float64Array, anchor: int, choice: SpineChoice) -> Chain:
+    """Turn each level by its share of the angles; no level lies farther back than it did."""
+    first, last = (chain.names.index(choice.levels[end]) for end in (0, -1))
+    along = np.clip((np.arange(len(chain.names)) - first) / max(1, last - first), 0.0, 1.0) - 0.5
+    if first == last:
+        along[:] = 0.0
+    bent = zip(
+        leans + math.radians(choice.kyphosis_deg) * along,
+        rolls + math.radians(choice.scoliosis_deg) * along,
+        strict=True,
+    )
+    frames = [lean_and_roll(lean, roll) for lean, roll in bent]
+    centres = _stack(chain.sizes, frames, anchor, chain.centres[anchor])
+    shown = slice(first, last + 1)
+    away = (centres - chain.centres)[shown]
+    centres[:, 0] -= (away[:, 0].min() + away[:, 0].max()) / 2.0
+    centres[:, 1] -= away[:, 1].max()
+    moved = centres - chain.centres
+    moved[:, 2] = 0.0
+    return dataclasses.replace(chain, frames=frames, centres=centres, moved=moved)
