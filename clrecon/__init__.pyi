@@ -50,6 +50,8 @@ from clrecon.operators.surface.extract import extract_isosurfaces as extract_iso
 from clrecon.operators.surface.label_masks import extract_label_masks as extract_label_masks
 from clrecon.operators.surface.labels import extract_labels as extract_labels
 from clrecon.operators.surface.methods import extract_by_method as extract_by_method
+from clrecon.phantom.truth import PhantomTruth as PhantomTruth
+from clrecon.phantom.truth import phantom_truth as phantom_truth
 from clrecon.points import PointCloud as PointCloud
 from clrecon.points import PointStep as PointStep
 from clrecon.points import drop_ghost_slices as drop_ghost_slices

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from clrecon.phantom.scenes import MATERIALS
     from clrecon.phantom.settings import KINDS, PhantomSettings, parse_missing, parse_size
     from clrecon.phantom.shapes import Body, Box, Cylinder, HalfSpace, Sphere, Torus
+    from clrecon.phantom.truth import PhantomTruth, phantom_truth
 
 __all__ = [
     "KINDS",
@@ -24,6 +25,7 @@ __all__ = [
     "Cylinder",
     "HalfSpace",
     "PhantomSettings",
+    "PhantomTruth",
     "Sphere",
     "Torus",
     "add_noise",
@@ -32,6 +34,7 @@ __all__ = [
     "make_phantom",
     "parse_missing",
     "parse_size",
+    "phantom_truth",
     "sample_distance",
     "sample_occupancy",
     "write_phantom",
@@ -42,6 +45,7 @@ _MODULES = {
     "sampling": ("add_noise", "apply_point_spread", "sample_distance", "sample_occupancy"),
     "scenes": ("MATERIALS",),
     "settings": ("KINDS", "PhantomSettings", "parse_missing", "parse_size"),
+    "truth": ("PhantomTruth", "phantom_truth"),
     "shapes": ("Body", "Box", "Cylinder", "HalfSpace", "Sphere", "Torus"),
 }
 

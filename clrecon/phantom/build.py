@@ -34,7 +34,15 @@ from clrecon.system.regular_files import read_regular
 from clrecon.system.targets import existing_stay, place_folder, refuse_existing, resolve_target
 from clrecon.version import package_version
 
-__all__ = ["SPINE_ISO_HU", "TRUTH_NAME", "label_materials", "make_phantom", "write_phantom"]
+__all__ = [
+    "LARGEST_TRUTH",
+    "SPINE_ISO_HU",
+    "TRUTH_NAME",
+    "is_phantom_truth",
+    "label_materials",
+    "make_phantom",
+    "write_phantom",
+]
 
 TRUTH_NAME = "truth.json"
 LARGEST_TRUTH = 1 << 28
@@ -178,6 +186,11 @@ def label_materials(settings: PhantomSettings) -> LabelArray:
     return draw_scene(plan_scene(settings), settings, place_slices(settings).affine)[1]
 
 
+def is_phantom_truth(truth: Any) -> bool:
+    """True for what a truth.json of this package holds."""
+    return isinstance(truth, dict) and truth.get("generator") == _GENERATOR
+
+
 def _check_replaceable(folder: Path) -> None:
     """Accept a folder that is absent, empty, or holds an earlier phantom and nothing else.
 
@@ -206,10 +219,10 @@ def _check_replaceable(folder: Path) -> None:
             f"{folder.name} holds {len(names)} files that are not a phantom ({example}): give a new or empty folder"
         )
     try:
-        generator = json.loads(read_regular(folder / TRUTH_NAME, LARGEST_TRUTH))["generator"]
-    except (OSError, ValueError, KeyError, TypeError) as error:
+        known = json.loads(read_regular(folder / TRUTH_NAME, LARGEST_TRUTH))
+    except (OSError, ValueError) as error:
         raise UsageError(f"{folder.name}/{TRUTH_NAME} is not of a phantom: give a new or empty folder") from error
-    if generator != _GENERATOR:
+    if not is_phantom_truth(known):
         raise UsageError(f"{folder.name}/{TRUTH_NAME} is not of a phantom: give a new or empty folder")
 
 

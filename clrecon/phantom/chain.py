@@ -161,22 +161,23 @@ def lay_chain(generator: np.random.Generator, seed: int, half_depth: float, choi
     centres = _stack(sizes, frames, anchor, at)
     chain = Chain(names, sizes, frames, centres, np.zeros_like(centres))
     if choice is not None and choice.is_bent:
-        chain = _bend(chain, leans, rolls, anchor, choice)
+        chain = _bend(chain, anchor, choice)
     return chain
 
 
-def _bend(chain: Chain, leans: Float64Array, rolls: Float64Array, anchor: int, choice: SpineChoice) -> Chain:
+def _bend(chain: Chain, anchor: int, choice: SpineChoice) -> Chain:
     """Turn each level by its share of the angles; no level lies farther back than it did."""
     first, last = (chain.names.index(choice.levels[end]) for end in (0, -1))
     along = np.clip((np.arange(len(chain.names)) - first) / max(1, last - first), 0.0, 1.0) - 0.5
     if first == last:
         along[:] = 0.0
-    bent = zip(
-        leans + math.radians(choice.kyphosis_deg) * along,
-        rolls + math.radians(choice.scoliosis_deg) * along,
-        strict=True,
-    )
-    frames = [lean_and_roll(lean, roll) for lean, roll in bent]
+    up = np.array([frame[2] for frame in chain.frames])
+    # angles as they are seen on a lateral and an anterior picture, so that they add up
+    coronal = np.arctan2(up[:, 0], up[:, 2]) + math.radians(choice.scoliosis_deg) * along
+    sagittal = np.arctan2(up[:, 1], up[:, 2]) + math.radians(choice.kyphosis_deg) * along
+    up = np.stack((np.tan(coronal), np.tan(sagittal), np.ones_like(along)), axis=1)
+    up /= np.linalg.norm(up, axis=1)[:, None]
+    frames = [lean_and_roll(math.asin(y), math.asin(x)) for x, y, _ in up]
     centres = _stack(chain.sizes, frames, anchor, chain.centres[anchor])
     shown = slice(first, last + 1)
     away = (centres - chain.centres)[shown]

@@ -80,7 +80,8 @@ _SPINE_ONLY: dict[str, Any] = {
     "phases": 1,
 }
 """Settings of a spine alone, with their defaults."""
-_SAID_PLURAL = {"levels": "they are", "phases": "they are", "ghosts": "they are"}
+_SAID = {"uneven_mm": "uneven slices", "facet_gap_mm": "facet joints"}
+_SAID_PLURAL = dict.fromkeys(("levels", "phases", "ghosts", "uneven_mm", "facet_gap_mm"), "they are")
 
 
 def parse_size(text: str) -> tuple[int, int]:
@@ -259,7 +260,7 @@ class PhantomSettings:
         if self.kind != "spine":
             for name, default in (*_SPINE_ONLY.items(), ("ghosts", False)):
                 if getattr(self, name) != default:
-                    said = name.removesuffix("_deg").removesuffix("_mm").replace("_", " ")
+                    said = _SAID.get(name) or name.removesuffix("_deg").removesuffix("_mm").replace("_", " ")
                     raise UsageError(f"a {self.kind} has no {said}: {_SAID_PLURAL.get(name, 'it is')} for the spine")
         if self.slices is None or self.levels is not None:
             choice, slices = self.spine_choice, self.slices

@@ -28,6 +28,7 @@ ODD = [
     "eps=2,min=3", "eps=1e-9", "min=plane+1", "largest", "largest:2", "min:3", "seed:1,2,3", "no-sheets",
     "grid,bilateral", "-500,900", "1e-7", "1e4", "0,0,0", "label:1",
     "label:", "i-mc", "g-mc", "skimage", "golden",
+    "L4-L5", "L5-L1", "C1-L5", "T12,L1", "2-3", "60",
 ]  # fmt: skip
 UNTRIED = {"bench", "selftest", "demo"}
 """Commands that take seconds each; their options are tried by the tests of the command line."""

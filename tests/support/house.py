@@ -70,6 +70,7 @@ _layer(
     "reading",
     "labels",
     "mesh",
+    "phantom",
     "points",
     "rendering",
     "operators",

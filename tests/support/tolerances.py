@@ -96,6 +96,9 @@ PHANTOM_DISTANCE_MM = 0.02  # brute force over surface points 0.5 mm apart: sagg
 PHANTOM_MESH_AREA_RATIO = 0.01  # marching cubes on partial volume cuts convex surfaces: R = 9 voxels
 PHANTOM_MESH_VOLUME_RATIO = 0.012  # marching cubes on partial volume: -0.9 % at R = 10 voxels (TRUST 2.1)
 PHANTOM_POSITION_MM = 1e-9  # decimal strings of 16 characters near 1000 mm
+PHANTOM_FACET_MM = 0.1  # gap of facets measured from points of the cover 1 mm apart, not at its narrowest place
+PHANTOM_TRUTH_NEAR_MM = 0.02  # the largest of 99 %; measured 0.001 within 0.5 mm of bone, 0.012 elsewhere
+PHANTOM_TRUTH_MM = 0.2  # the largest: beside facets that nearly touch 0.19, else 0.11
 PHANTOM_BLUR_HU = 1e-3  # float32 sums of 1000 HU against scipy
 
 # --- pipeline ---
