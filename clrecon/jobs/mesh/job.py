@@ -12,14 +12,13 @@ from clrecon.jobs.mesh.bone import judge_surfaces, warn_of_walls
 from clrecon.jobs.mesh.labels import extract_label_surfaces, judge_label_volumes, name_label_files, open_labels
 from clrecon.jobs.mesh.levels import choose_level
 from clrecon.jobs.mesh.parts import check_levels, extract_surfaces, first_names, select_parts
-from clrecon.jobs.mesh.prepare import bands_of, narrow_volume, prepare_surfaces
+from clrecon.jobs.mesh.prepare import mask_parts, narrow_volume, prepare_surfaces
 from clrecon.jobs.mesh.refinement import describe_purposes, judge_parts, refine_surface, warn_of_gates
 from clrecon.jobs.mesh.report import MeshReport, describe_job, describe_part
 from clrecon.jobs.mesh.settings import MeshSettings
 from clrecon.jobs.mesh.surfaces import Part, Surface, plan_surfaces
 from clrecon.jobs.shared.labelled import read_with_labels
 from clrecon.jobs.shared.laps import Laps
-from clrecon.jobs.shared.masking import mask_volume
 from clrecon.jobs.shared.opening import DeviceOpening
 from clrecon.jobs.shared.outputs import (
     check_kept,
@@ -31,7 +30,6 @@ from clrecon.jobs.shared.outputs import (
     refuse_numbered,
     stage_meshes,
 )
-from clrecon.jobs.shared.region import restrict_volume
 from clrecon.jobs.shared.report import stage_report
 from clrecon.reading import read_selected
 from clrecon.system.log import get_logger, log_warnings
@@ -105,9 +103,7 @@ def make_mesh(
         _check_files(source, output, report_path, surfaces, settings)
 
     volume, labels, device = _open(source, output, surfaces, settings, no_clobber, progress, watch)
-    volume = mask_volume(volume, settings, progress)
-    if settings.below is None:
-        volume = restrict_volume(volume, settings, device, bands_of(surfaces), progress)
+    volume = mask_parts(volume, surfaces, settings, device, progress)
     watch.lap("mask")
     volume, surfaces, choice = _choose(volume, surfaces, settings, device, progress, watch)
     surfaces, extracted = _extract(volume, surfaces, labels, device, settings, progress)

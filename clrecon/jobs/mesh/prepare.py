@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from clrecon.jobs.mesh.settings import MeshSettings
 from clrecon.jobs.mesh.surfaces import Surface
+from clrecon.jobs.shared.masking import mask_volume
 from clrecon.jobs.shared.preprocess import preprocess_volume
 from clrecon.jobs.shared.region import Band, restrict_volume
 from clrecon.system.progress import Progress
@@ -17,7 +18,7 @@ if TYPE_CHECKING:
     from clrecon.geometry import Volume
     from clrecon.opencl import Device
 
-__all__ = ["bands_of", "leave_outside", "narrow_volume", "prepare_surfaces"]
+__all__ = ["leave_outside", "mask_parts", "narrow_volume", "prepare_surfaces"]
 
 
 def prepare_surfaces(
@@ -41,7 +42,7 @@ def prepare_surfaces(
         prepare_components(device)
 
 
-def bands_of(surfaces: Sequence[Surface]) -> list[Band]:
+def _bands_of(surfaces: Sequence[Surface]) -> list[Band]:
     """Return the HU that each surface encloses; NaN for a level that is still to be measured."""
     bands: list[Band] = []
     for surface in surfaces:
@@ -51,6 +52,24 @@ def bands_of(surfaces: Sequence[Surface]) -> list[Band]:
         elif level is not None:
             bands.append((-math.inf, level) if surface.below else (level, math.inf))
     return bands
+
+
+def mask_parts(
+    volume: Volume, surfaces: Sequence[Surface], settings: MeshSettings, device: Device, progress: Progress
+) -> Volume:
+    """Return the volume with air outside of the body, the field of view and the region, as the settings ask for it.
+
+    Where the surfaces lie below a level, the region comes later: the air around the patient has to go before.
+
+    Raises
+    ------
+    ClreconError
+        As `mask_volume` and `restrict_volume`.
+    """
+    volume = mask_volume(volume, settings, progress)
+    if settings.below is not None:
+        return volume
+    return restrict_volume(volume, settings, device, _bands_of(surfaces), progress)
 
 
 def narrow_volume(
@@ -64,7 +83,7 @@ def narrow_volume(
     ClreconError
         As `leave_outside`, `restrict_volume` and `preprocess_volume`.
     """
-    bands = bands_of(surfaces)
+    bands = _bands_of(surfaces)
     volume = leave_outside(volume, settings, progress)
     if settings.below is not None:
         volume = restrict_volume(volume, settings, device, bands, progress)

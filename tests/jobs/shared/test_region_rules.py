@@ -31,7 +31,7 @@ def test_a_rule_is_read(text: str, rule: RegionRule) -> None:
 
 
 def test_a_rule_describes_itself_without_folders() -> None:
-    rules = parse_region_rules(["label:/home/someone/spine.nii:T12", "box:,2,3,,5,", "tube:30:a\\b\\line.csv"])
+    rules = parse_region_rules(["label:maps/of/spine.nii:T12", "box:,2,3,,5,", "tube:30:a\\b\\line.csv"])
     assert [str(rule) for rule in rules] == ["label:spine.nii:T12", "box:,2,3,,5,", "tube:30:line.csv"]
 
 
