@@ -15,10 +15,12 @@ from clrecon.errors import DeviceError, NoSurfaceError, UsageError
 from clrecon.geometry import Volume
 from clrecon.geometry.iso_rule import choose_iso_rule
 from clrecon.labels import LabelMap
+from clrecon.operators.masks.mask import Mask
 from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.operators.surface.extract import SurfaceExtractor, extract_isosurface
 from clrecon.operators.surface.seeds import AUTO_SHARE
 from clrecon.operators.surface.slabs import SampleGrid
+from clrecon.phantom import PhantomSettings, make_phantom
 from clrecon.reference.surface.extract import extract_isosurface as extract_twin
 from clrecon.reference.surface.growing import choose_largest, count_visited, grow_cells, label_cells
 
@@ -86,6 +88,30 @@ def test_types_ranges_and_uneven_slices_equal_the_twin(dtype: str, device: Any) 
     assert_twin(volume, device, (2, 4))
     assert_twin(uneven(volume.voxels), device, 7)
     assert_twin(smooth_volume((9, 10, 40)), device, 100, vertex_rule="golden-search")
+
+
+def test_the_identity_holds_on_a_spine(device: Any) -> None:
+    """The cells are those that the paper's frontier enters, one by one: the twin asserts that beside the mesh."""
+    voxels, affine, _ = make_phantom(PhantomSettings(size=(64, 64), slices=24, spacing=(2.4, 2.4, 3.3), noise=40.0))
+    volume = Volume(voxels, affine)
+    assert_twin(volume, device, 226)
+    assert extract_isosurface(volume, 226, device=device, grow_from="auto").report["growing"]["components"] > 50
+
+
+def test_a_mask_grows_what_it_touches(device: Any) -> None:
+    volume = blocks()
+    chosen = np.zeros(volume.voxels.shape, bool)
+    chosen[5, 5, 50] = True
+    labels = LabelMap(chosen.astype(np.uint8), volume.affine)
+    mask = Mask.from_array(volume, chosen, device=device)
+    small = extract_isosurface(volume, 0, device=device, grow_from=mask)
+    assert_same(small, extract_isosurface(volume, 0, device=device, grow_from=(labels, 1)))
+    seeds = ["auto", mask, tuple(volume.ijk_to_lps([(69.0, 17.0, 8.0)])[0])]
+    both = extract_isosurface(volume, 0, device=device, grow_from=seeds)
+    assert_same(both, extract_isosurface(volume, 0, device=device))
+    other = Mask.from_array(Volume(volume.voxels[1:], volume.affine), chosen[1:], device=device)
+    with pytest.raises(UsageError, match=r"the mask has \(15, 18, 70\) voxels, the volume has \(16, 18, 70\)"):
+        extract_isosurface(volume, 0, device=device, grow_from=other)
 
 
 @pytest.mark.oclgrind
