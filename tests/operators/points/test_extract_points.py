@@ -10,6 +10,7 @@ import tolerances
 
 from clrecon import LabelMap, Volume, extract_isosurface, extract_labels
 from clrecon.errors import DeviceError, NoSurfaceError, UsageError
+from clrecon.operators.points.emit import Selection, VoxelEmission
 from clrecon.operators.points.extract import extract_points
 from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.reference.points.emit import extract_voxels, mark_shell
@@ -124,10 +125,20 @@ def test_the_whole_volume_and_its_report(device):
     assert (report["kind"], report["band_hu"], report["iso_value_hu"]) == ("voxels", [0.0, None], 0.0)
     assert report["voxels"] == report["points"] == report["voxels_in_band"] == 495
     assert report["affine_ijk_to_lps_mm"] == volume.affine.tolist() and report["device"] == device.label
+    assert extract_points(volume, hu=(0, 40), device=device).report["iso_value_hu"] is None
     low = extract_points(volume, hu=(None, 40), device=device)
     assert len(low) == np.count_nonzero(volume.voxels <= 40) and low.report["band_hu"] == [None, 40.0]
     shell = extract_points(volume, 0, kind="shell", device=device)
     assert len(shell) == 495 - 1 * 3 * 31 and shell.report["voxels_in_band"] == 495
+
+
+@pytest.mark.parametrize(("high", "points"), [(-1, 0), (99, 495)])
+def test_the_bytes_of_a_volume_with_and_without_points(device, high, points):
+    """3 x 5 x 33 voxels of two bytes; a mask of two words a row, its ends, and counts of each row; 20 bytes a point."""
+    volume = Volume(np.zeros((3, 5, 33), np.int16), np.eye(4))
+    emission = VoxelEmission(DeviceVolume(volume, device=device), Selection(np.int16(-5), np.int16(high)))
+    assert len(emission.run()[1]) == points
+    assert emission.largest == {"volume": 2 * 495, "output": 20 * points, "scratch": 15 * (4 * 2 + 4 + 9)}
 
 
 def test_surface_points_are_the_vertices_of_the_mesh(device):

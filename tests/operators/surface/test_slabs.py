@@ -52,6 +52,14 @@ def test_a_resident_volume_can_be_asked_for_a_surface_that_does_not_fit_as_a_who
     assert_same(again, extract_isosurface(volume, 100, device=device, closed=False))
 
 
+@pytest.mark.parametrize("more", [{}, {"closed": False}, {"below": True}, {"closed": False, "below": True}])
+def test_vertices_alone_are_those_of_the_mesh(device, more):
+    """At -400 HU much of the border is inside, where it is closed, and other vertices enclose what is below."""
+    with SurfaceExtractor(smooth_volume((9, 10, 11)), device=device) as extractor:
+        mesh, cloud = extractor.extract(-400, **more), extractor.extract_vertices(-400, **more)
+    assert np.array_equal(cloud.points, mesh.vertices) and np.array_equal(cloud.normals, mesh.normals)
+
+
 def test_building_and_slices_that_are_done_are_told(device, monkeypatch):
     """Slices are those of the samples, one beyond the volume at each end."""
     told: list[tuple[str, int, int]] = []
