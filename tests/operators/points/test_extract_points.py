@@ -47,6 +47,14 @@ def test_rows_of_every_length(device, columns, kind):
     check_voxels(extract_points(volume, hu=BAND, kind=kind, device=device), volume, shell=kind == "shell")
 
 
+def test_the_form_of_the_other_kind_of_device(device, monkeypatch):
+    """An item takes a word on GPUs, a row of words on CPUs."""
+    lanes = "1" if device.kernel_variants["LANES"] == "8" else "8"
+    monkeypatch.setattr(device, "kernel_variants", {**device.kernel_variants, "LANES": lanes})
+    volume = make_volume((5, 7, 130))
+    check_voxels(extract_points(volume, hu=BAND, device=device), volume)
+
+
 @pytest.mark.parametrize(
     "dtype",
     ["int16", *(pytest.param(name, marks=pytest.mark.first_device) for name in ("uint8", "int8", "uint16", "int32"))],
