@@ -10,7 +10,7 @@ import tolerances
 
 from clrecon import LabelMap, Volume, extract_isosurface, extract_labels
 from clrecon.errors import DeviceError, NoSurfaceError, UsageError
-from clrecon.operators.points.emit import Selection, VoxelEmission
+from clrecon.operators.points.emit import Selection, VoxelEmission, _join
 from clrecon.operators.points.extract import extract_points
 from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.reference.points.emit import extract_voxels, mark_shell
@@ -45,6 +45,17 @@ def check_voxels(cloud, volume, **choice: Any) -> None:
 def test_rows_of_every_length(device, columns, kind):
     volume = make_volume((5, 7, columns))
     check_voxels(extract_points(volume, hu=BAND, kind=kind, device=device), volume, shell=kind == "shell")
+
+
+@pytest.mark.parametrize("lengths", [(4,), (3, 2), (0, 5), (2, 0, 1)])
+def test_slabs_are_joined_in_their_order(lengths):
+    places, numbers = np.arange(3.0 * sum(lengths), dtype=np.float32).reshape(-1, 3), np.arange(sum(lengths))
+    ends = np.cumsum((0, *lengths))
+    parts = [(places[a:b], places[a:b, 0], numbers[a:b]) for a, b in zip(ends, ends[1:], strict=False)]
+    found = _join(parts)
+    for array, expected in zip(found, (places, places[:, 0], numbers), strict=True):
+        assert array.dtype == expected.dtype
+        np.testing.assert_array_equal(array, expected)
 
 
 def test_the_form_of_the_other_kind_of_device(device, monkeypatch):
