@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -50,6 +51,31 @@ def test_a_resident_volume_can_be_asked_for_a_surface_that_does_not_fit_as_a_who
     monkeypatch.undo()
     assert_same(mesh, extract_isosurface(volume, 100, device=device))
     assert_same(again, extract_isosurface(volume, 100, device=device, closed=False))
+
+
+@pytest.mark.parametrize(("slices", "read"), [(1, 4), (3, 6), (20, 20), (22, 20)])
+def test_slabs_are_planned_by_one_in_the_middle(slices, read):
+    """Of 20 slices with a border those with one voxel slice before and two behind, as far as there are."""
+    volume = smooth_volume((20, 6, 33))
+    asked: dict[str, Any] = {}
+    limits = SimpleNamespace(total_bytes=8000, buffer_bytes=900)
+    resident = SimpleNamespace(
+        limits=limits, plan=lambda kind, gk, needs, **more: asked.update(more, gk=gk, needs=needs) or 7
+    )
+    assert plan_slabs(SampleGrid(volume, choose_iso_rule(volume, 100)), resident) == 7
+    assert asked["gk"] == 22 and asked["most"] is None
+    needs = asked["needs"](slices)
+    assert needs["volume"] == read * 6 * 33 * 2 and needs.get("mesh") == (None if slices == 22 else 900)
+
+
+def test_the_bytes_of_a_surface_are_told(device):
+    volume = smooth_volume((9, 10, 33))
+    mesh = extract_isosurface(volume, 100, device=device)
+    taken = mesh.report["device_bytes"]
+    assert (taken["volume"], taken["output"]) == (5940, 24 * len(mesh.vertices) + 12 * len(mesh.triangles))
+    scratch = Slab(SampleGrid(volume, choose_iso_rule(volume, 100)), 0, 11).scratch()
+    active = scratch.pop("active words")  # as many as there may be: only those that are crossed are taken
+    assert 0 < taken["scratch"] - sum(scratch.values()) <= active
 
 
 @pytest.mark.parametrize("more", [{}, {"closed": False}, {"below": True}, {"closed": False, "below": True}])
