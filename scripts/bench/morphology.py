@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 from registry import Job, case
@@ -57,7 +58,7 @@ def measure_morphology(job: Job) -> dict[str, Any]:
         compare_sides(job, f"{step}-{peer}", on_device(step, of), theirs, figures)
         figures["equal"][f"{step}-{peer}"] = bool(np.array_equal(steps[step](of).to_numpy(), theirs()))
         if peer == "simpleitk":
-            compare_sides(job, f"{step}-{peer}-packed", lambda step=step: packed(step), theirs, figures)
+            compare_sides(job, f"{step}-{peer}-packed", partial(packed, step), theirs, figures)
     return figures
 
 
