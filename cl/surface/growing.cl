@@ -39,7 +39,8 @@
 
 /* Parameters  mask         in   (gk, gj, words) inside mask of the whole grid
  *             row_extents  in   (gk, gj) first word of the row with a bit set, and the one after the last
- *             run_starts   out  (gk, gj, words) bit b: a run begins at cell b of the word
+ *             active_cells out  (gk, gj, words) bit b: cell b of the word is active
+ *             run_starts   out  (gk, gj, words) bit b: a run begins there
  *             word_runs    out  (gk, gj, words) runs of the row that begin before each word
  *             row_runs     out  (gk, gj) runs of each row
  *             run_extents  out  (gk, gj) words of the row that may have active cells: first, and the one after the last
@@ -50,7 +51,7 @@
  *             row of cells have none */
 __kernel void find_cell_runs(
     __global const uint *restrict mask, __global const ushort2 *restrict row_extents,
-    __global uint *restrict run_starts, __global ushort *restrict word_runs,
+    __global uint *restrict active_cells, __global uint *restrict run_starts, __global ushort *restrict word_runs,
     __global uint *restrict row_runs, __global ushort2 *restrict run_extents,
     const uint gi, const uint gj, const uint gk, const uint words)
 {
@@ -71,47 +72,56 @@ __kernel void find_cell_runs(
         begin -= begin != 0;
     }
     begin = min(begin, end);
+    row_runs[row] = 0;
+    run_extents[row] = (ushort2)((ushort)begin, (ushort)end);
+    if (begin == end)
+        return;
+    __global const uint *y0z0 = mask + (size_t)row * words;
+    __global const uint *y1z0 = y0z0 + words;
+    __global const uint *y0z1 = y0z0 + (size_t)gj * words;
+    __global const uint *y1z1 = y0z1 + words;
+    cell_rows rows = {y0z0[begin], y1z0[begin], y0z1[begin], y1z1[begin]};
     for (uint w = begin; w < end; ++w) {
-        cell_rows rows;
-        load_cell_rows(&rows, mask, j, k, w, gj, words);
-        const uint active = find_active_cells(rows, w, gi);
-        uint starts = 0;
-        if (active != 0) {
-            const corner_columns columns = join_rows(rows);
-            starts = active & (~(uint)(columns.any ^ columns.all) | (w == 0));
-        }
+        const uint next = w + 1 < words ? w + 1 : w;
+        const cell_rows next_rows = {y0z0[next], y1z0[next], y0z1[next], y1z1[next]};
+        rows.y0z0 |= next_rows.y0z0 << 32;
+        rows.y1z0 |= next_rows.y1z0 << 32;
+        rows.y0z1 |= next_rows.y0z1 << 32;
+        rows.y1z1 |= next_rows.y1z1 << 32;
+        const corner_columns columns = join_rows(rows);
+        const uint active = (uint)((columns.any | columns.any >> 1) & ~(columns.all & columns.all >> 1)
+            & samples_with_next(w, gi));
+        const uint starts = active & (~(uint)(columns.any ^ columns.all) | (w == 0));
+        active_cells[(size_t)row * words + w] = active;
         run_starts[(size_t)row * words + w] = starts;
         word_runs[(size_t)row * words + w] = (ushort)runs;
         runs += popcount(starts);
+        rows = next_rows;
     }
     row_runs[row] = runs;
-    run_extents[row] = (ushort2)((ushort)begin, (ushort)end);
 }
 
-/* Parameters  mask, run_starts, run_extents   in   of find_cell_runs
+/* Parameters  active_cells, run_starts, run_extents   in   of find_cell_runs
  *             row_offsets  in   (gk, gj) runs of all rows before each
  *             parents      out  (runs,) each run's own number
  *             run_cells    out  (runs,) its number of cells
- *             gi gj gk, words   as above
+ *             gj gk, words   as above
  * Launch      as find_cell_runs
  * Guarantees  every run is written once */
 __kernel void begin_cell_runs(
-    __global const uint *restrict mask, __global const uint *restrict run_starts,
+    __global const uint *restrict active_cells, __global const uint *restrict run_starts,
     __global const ushort2 *restrict run_extents, __global const uint *restrict row_offsets,
     __global uint *restrict parents, __global uint *restrict run_cells,
-    const uint gi, const uint gj, const uint gk, const uint words)
+    const uint gj, const uint gk, const uint words)
 {
     const uint row = get_global_id(0);
     if (row >= gj * gk)
         return;
-    const uint j = row % gj, k = row / gj;
     const ushort2 extent = run_extents[row];
     uint run = row_offsets[row], cells = 0;
     int running = 0; /* a run has begun: it is `run` - 1 */
     for (uint w = extent.x; w < extent.y; ++w) {
-        cell_rows rows;
-        load_cell_rows(&rows, mask, j, k, w, gj, words);
-        uint active = find_active_cells(rows, w, gi);
+        uint active = active_cells[(size_t)row * words + w];
         for (uint starts = run_starts[(size_t)row * words + w]; starts != 0; starts &= starts - 1) {
             const uint before = (1u << lowest_bit(starts)) - 1;
             if (running)
@@ -272,25 +282,24 @@ __kernel void seed_cell_runs(
         seeded[run - 1] = found;
 }
 
-/* Parameters  mask, run_starts, run_extents, row_offsets   in   as above
+/* Parameters  active_cells, run_starts, run_extents, row_offsets   in   as above
  *             numbers  in   (runs,) component of each run
  *             chosen   in   (components,) 1 for chosen ones, else 0
  *             grown    out  (gk, gj, words) bit b: cell b of the word belongs to a chosen component
  *             grown_extents   out  (gk, gj) first word of the row with a grown cell, and the one after the last
- *             gi gj gk, words   as above
+ *             gj gk, words   as above
  * Launch      as find_cell_runs
  * Guarantees  every word is written */
 __kernel void mark_grown(
-    __global const uint *restrict mask, __global const uint *restrict run_starts,
+    __global const uint *restrict active_cells, __global const uint *restrict run_starts,
     __global const ushort2 *restrict run_extents, __global const uint *restrict row_offsets,
     __global const int *restrict numbers, __global const uchar *restrict chosen, __global uint *restrict grown,
     __global ushort2 *restrict grown_extents,
-    const uint gi, const uint gj, const uint gk, const uint words)
+    const uint gj, const uint gk, const uint words)
 {
     const uint row = get_global_id(0);
     if (row >= gj * gk)
         return;
-    const uint j = row % gj, k = row / gj;
     const ushort2 extent = run_extents[row];
     __global uint *row_grown = grown + (size_t)row * words;
     for (uint w = 0; w < extent.x; ++w)
@@ -300,9 +309,7 @@ __kernel void mark_grown(
     uint run = row_offsets[row], keeps = 0; /* all ones where the run that goes on is chosen */
     uint begin = words, end = 0;
     for (uint w = extent.x; w < extent.y; ++w) {
-        cell_rows rows;
-        load_cell_rows(&rows, mask, j, k, w, gj, words);
-        uint active = find_active_cells(rows, w, gi), bits = 0;
+        uint active = active_cells[(size_t)row * words + w], bits = 0;
         for (uint starts = run_starts[(size_t)row * words + w]; starts != 0; starts &= starts - 1) {
             const uint before = (1u << lowest_bit(starts)) - 1;
             bits |= active & before & keeps;
@@ -379,13 +386,15 @@ __kernel void keep_edges(
         if (w >= extent.x && w < extent.y) {
             const ulong own = load_window(mask, row, w, words);
             uint flips = (uint)((own ^ own >> 1) & samples_with_next(w, gi)) & row_grown[w];
-            flips ^= flips << 1;
-            flips ^= flips << 2;
-            flips ^= flips << 4;
-            flips ^= flips << 8;
-            flips ^= flips << 16; /* bit b: the number of flips up to b is odd */
-            bits ^= flips << 1;
-            set ^= 0u - (flips >> 31);
+            if (flips != 0) {
+                flips ^= flips << 1;
+                flips ^= flips << 2;
+                flips ^= flips << 4;
+                flips ^= flips << 8;
+                flips ^= flips << 16; /* bit b: the number of flips up to b is odd */
+                bits ^= flips << 1;
+                set ^= 0u - (flips >> 31);
+            }
         }
         bits &= (uint)low_bits(min(32u, gi - min(32 * w, gi)));
         row_kept[w] = bits;

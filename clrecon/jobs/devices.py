@@ -100,6 +100,8 @@ def run_device_selftest(
         if tell is not None:
             tell(device.describe(), result)
         progress("selftest", len(results), len(CHECKS))
+    place = {check.name: n for n, check in enumerate(CHECKS)}
+    results.sort(key=lambda result: place.get(result["operator"], len(place)))  # processes run side by side
     passed = bool(results) and all(result["passed"] for result in results)
     return {
         "device": device.describe(),

@@ -1,10 +1,11 @@
-"""The self-test as a whole: its checks run in a process of their own, so that a driver that crashes or hangs becomes
+"""The self-test as a whole: its checks run in processes of their own, so that a driver that crashes or hangs becomes
 words.
 """
 
 from __future__ import annotations
 
 import json
+import os
 import queue
 import signal
 import subprocess
@@ -22,19 +23,26 @@ __all__ = ["run_selftest"]
 
 COMMAND = ("-m", "clrecon.jobs.selftest.child")
 
+MOST_PROCESSES = 4
+"""Each of them takes a second to begin, and has the twins on a core of its own."""
 
-def run_selftest(device: Device, checks: Sequence[Check], *, silent_seconds: float) -> Iterator[dict[str, Any]]:
-    """Run checks on `device` in a process of their own and yield each result at once.
 
-    After a crash the checks that are left run in a new process.  After a hang they count as failed: each of them would
-    take as long.
+def run_selftest(
+    device: Device, checks: Sequence[Check], *, silent_seconds: float, processes: int | None = None
+) -> Iterator[dict[str, Any]]:
+    """Run checks on `device` in processes of their own, side by side, and yield each result at once.
+
+    After a crash the checks that are left to a process run in a new one.  After a hang they count as failed: each of
+    them would take as long.
 
     Parameters
     ----------
     device : Device
     checks : sequence of Check
     silent_seconds : float
-        Time without a line after which the process counts as hanging.
+        Time without a line after which a process counts as hanging.
+    processes : int, optional
+        Default: one for each core of this computer, up to four.
 
     Yields
     ------
@@ -46,13 +54,61 @@ def run_selftest(device: Device, checks: Sequence[Check], *, silent_seconds: flo
     DeviceError
         No process can be started.
     """
+    many = min(processes or _count_cores(), MOST_PROCESSES, len(checks))
+    if many <= 1:
+        yield from _run_part(device, checks, silent_seconds, [], threading.Event())
+        return
+    told: queue.Queue[dict[str, Any] | BaseException | None] = queue.Queue()
+    children: list[_Child] = []
+    is_over = threading.Event()
+
+    def run(part: Sequence[Check]) -> None:
+        try:
+            for result in _run_part(device, part, silent_seconds, children, is_over):
+                told.put(result)
+        except BaseException as error:  # raised again by the thread that waits
+            told.put(error)
+        told.put(None)
+
+    threads = [threading.Thread(target=run, args=(checks[n::many],), daemon=True) for n in range(many)]
+    try:
+        for thread in threads:
+            thread.start()
+        running = many
+        while running:
+            line = told.get()
+            if isinstance(line, BaseException):
+                raise line
+            if line is None:
+                running -= 1
+            else:
+                yield line
+    finally:
+        is_over.set()
+        for child in children:
+            child.end()
+        for thread in threads:
+            thread.join()
+
+
+def _count_cores() -> int:
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def _run_part(
+    device: Device, checks: Sequence[Check], silent_seconds: float, children: list[_Child], is_over: threading.Event
+) -> Iterator[dict[str, Any]]:
+    """Run checks one after the other; `children` gets each process that is started, until `is_over`."""
     left = list(checks)
-    while left:
+    while left and not is_over.is_set():
         with _Child(device, left) as child:
+            children.append(child)
+            if is_over.is_set():  # since it was started
+                return
             for result in child.results(silent_seconds):
                 left = left[1:]
                 yield result
-            if not left:
+            if not left or is_over.is_set():
                 return
             words = child.describe_end()
             yield _failed(left[0], words, child.seconds)
@@ -102,6 +158,10 @@ class _Child:
         return self
 
     def __exit__(self, *_: object) -> None:
+        self.end()
+
+    def end(self) -> None:
+        """End the process, whatever it does."""
         self._process.kill()
         self._process.wait()
 

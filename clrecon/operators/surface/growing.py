@@ -1,7 +1,7 @@
 """Growing of surfaces: the components of active cells that hold a seed, the host side of cl/surface/growing.cl.
 
 All of the volume's bits are on the device while components are found, 1 / 16 of the bytes of 16-bit voxels for each of
-five masks, also where the surface is then emitted slab by slab.
+six masks, also where the surface is then emitted slab by slab.
 """
 
 from __future__ import annotations
@@ -75,6 +75,7 @@ class Grown:
 class _Runs:
     """Runs of active cells on the device."""
 
+    active_d: Any
     starts_d: Any
     words_d: Any
     extents_d: Any
@@ -91,7 +92,8 @@ class _Search:
         self.program = prepare_growing(self.device)
         gi, gj, gk = grid.shape
         self.rows = gj * gk
-        self.sizes = {"gi": gi, "gj": gj, "gk": gk, "words": grid.words}
+        self.row_sizes = {"gj": gj, "gk": gk, "words": grid.words}
+        self.sizes = {"gi": gi, **self.row_sizes}
 
     def run(self, kernel: str, items: int, **arguments: Any) -> None:
         launch(self.device, self.program[kernel], items, stopwatch=self.stopwatch, **arguments)
@@ -99,16 +101,17 @@ class _Search:
     def find_runs(self) -> _Runs:
         """Find the runs of all rows."""
         bits = 4 * self.rows * self.grid.words
-        starts_d, words_d = allocate(self.device, bits), allocate(self.device, bits // 2)
+        active_d, starts_d, words_d = (allocate(self.device, size) for size in (bits, bits, bits // 2))
         counts_d, extents_d = allocate(self.device, 4 * self.rows), allocate(self.device, 4 * self.rows)
         self.run(
             "find_cell_runs", self.rows, mask=self.classified.mask_d, row_extents=self.classified.row_extents_d,
-            run_starts=starts_d, word_runs=words_d, row_runs=counts_d, run_extents=extents_d, **self.sizes,
+            active_cells=active_d, run_starts=starts_d, word_runs=words_d, row_runs=counts_d, run_extents=extents_d,
+            **self.sizes,
         )  # fmt: skip
         scanned = exclusive_scan(self.device, counts_d, self.rows, in_place=True, stopwatch=self.stopwatch)
         if scanned.total >= MOST_RUNS:
             raise DeviceMemoryError(f"the surface has {scanned.total:,} runs of cells: {MOST_RUNS:,} can be numbered")
-        return _Runs(starts_d, words_d, extents_d, scanned.offsets_d, scanned.total)
+        return _Runs(active_d, starts_d, words_d, extents_d, scanned.offsets_d, scanned.total)
 
     def join(self, runs: _Runs) -> tuple[int, Any, NDArray[np.uint32]]:
         """Join runs to components.
@@ -123,10 +126,15 @@ class _Search:
         """
         device, n = self.device, runs.total
         parents_d, cells_d, roots_d = (allocate(device, 4 * n) for _ in range(3))
-        common = {"mask": self.classified.mask_d, "run_starts": runs.starts_d, "run_extents": runs.extents_d,
-                  "row_offsets": runs.offsets_d, **self.sizes}  # fmt: skip
-        self.run("begin_cell_runs", self.rows, parents=parents_d, run_cells=cells_d, **common)
-        self.run("join_cell_runs", self.rows, word_runs=runs.words_d, parents=parents_d, **common)
+        common = {"run_starts": runs.starts_d, "run_extents": runs.extents_d, "row_offsets": runs.offsets_d}
+        self.run(
+            "begin_cell_runs", self.rows, active_cells=runs.active_d, parents=parents_d, run_cells=cells_d, **common,
+            **self.row_sizes,
+        )  # fmt: skip
+        self.run(
+            "join_cell_runs", self.rows, mask=self.classified.mask_d, word_runs=runs.words_d, parents=parents_d,
+            **common, **self.sizes,
+        )  # fmt: skip
         self.run("find_run_roots", n, parents=parents_d, roots=roots_d, runs=n)
         count, numbers_d = join_parts(device, roots_d, parents_d, n, None, 0, stopwatch=self.stopwatch)
         return count, numbers_d, download(device, np.empty(n, np.uint32), cells_d)
@@ -203,9 +211,9 @@ class _Search:
         grown_d = allocate(device, 4 * self.rows * self.grid.words)
         extents_d, counts_d = allocate(device, 4 * self.rows), allocate(device, 4 * self.rows)
         self.run(
-            "mark_grown", self.rows, mask=self.classified.mask_d, run_starts=runs.starts_d,
+            "mark_grown", self.rows, active_cells=runs.active_d, run_starts=runs.starts_d,
             run_extents=runs.extents_d, row_offsets=runs.offsets_d, numbers=numbers_d,
-            chosen=upload(device, chosen.astype(np.uint8)), grown=grown_d, grown_extents=extents_d, **self.sizes,
+            chosen=upload(device, chosen.astype(np.uint8)), grown=grown_d, grown_extents=extents_d, **self.row_sizes,
         )  # fmt: skip
         self.run(
             "count_visited", self.rows, grown=grown_d, grown_extents=extents_d, counts=counts_d, **self.sizes
@@ -218,7 +226,13 @@ def growing_needs(grid: SampleGrid) -> dict[str, int]:
     """Return the bytes of the masks of a whole grid while components are found; those of runs come on top."""
     rows = grid.shape[1] * grid.shape[2]
     bits = 4 * rows * grid.words
-    return {"inside mask": bits, "begins of runs": bits + bits // 2, "grown cells": bits, "rows of cells": 20 * rows}
+    return {
+        "inside mask": bits,
+        "active cells": bits,
+        "begins of runs": bits + bits // 2,
+        "grown cells": bits,
+        "rows of cells": 20 * rows,
+    }
 
 
 def join_slabs(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import pickle
 import re
+import time
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -130,7 +131,7 @@ def test_row_57_a_driver_that_crashes_or_hangs_becomes_words(
     monkeypatch.setattr(run, "COMMAND", (str(story),))
     monkeypatch.setattr(device, "_remarks", [])
     names = ["first", "crash", "second", "exit", "third", "hang", "last"]
-    outcomes = list(run_selftest(device, [check_named(name) for name in names], silent_seconds=1.5))
+    outcomes = list(run_selftest(device, [check_named(name) for name in names], silent_seconds=1.5, processes=1))
     assert [outcome["operator"] for outcome in outcomes] == names
     assert [outcome["passed"] for outcome in outcomes] == [True, False, True, False, True, False, False]
     words = {outcome["operator"]: outcome["detail"] for outcome in outcomes}
@@ -139,3 +140,37 @@ def test_row_57_a_driver_that_crashes_or_hangs_becomes_words(
     assert words["hang"] == "the driver hangs: nothing for 1.5 s in kernel of_hang (64 items)"
     assert device.warnings == ["a remark of the process"]
     assert words["last"] == "not run: the driver hangs"
+
+
+def test_processes_run_side_by_side_and_one_that_hangs_holds_no_other(
+    device: Device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    story = tmp_path / "story.py"
+    story.write_text(STORY)
+    monkeypatch.setattr(run, "COMMAND", (str(story),))
+    monkeypatch.setattr(device, "_remarks", [])
+    names = ["hang", "first", "left", "second", "last", "crash", "fourth", "third"]
+    outcomes = list(run_selftest(device, [check_named(name) for name in names], silent_seconds=1.5, processes=2))
+    assert {outcome["operator"]: outcome["passed"] for outcome in outcomes} == {
+        "hang": False, "left": False, "last": False, "fourth": False,
+        "first": True, "second": True, "crash": False, "third": True,
+    }  # fmt: skip
+    assert [outcome["operator"] for outcome in outcomes][0] == "first"  # it does not wait for the other process
+    assert sorted(outcome["detail"] for outcome in outcomes if "not run" in outcome["detail"]) == (
+        ["not run: the driver hangs"] * 3
+    )
+
+
+def test_a_caller_that_leaves_ends_all_processes(
+    device: Device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    story = tmp_path / "story.py"
+    story.write_text(STORY)
+    monkeypatch.setattr(run, "COMMAND", (str(story),))
+    monkeypatch.setattr(device, "_remarks", [])
+    names = ["hang", "first", "left", "second"]
+    outcomes = run_selftest(device, [check_named(name) for name in names], silent_seconds=600.0, processes=2)
+    assert next(outcomes)["operator"] == "first"
+    began = time.perf_counter()
+    outcomes.close()
+    assert time.perf_counter() - began < 20.0
