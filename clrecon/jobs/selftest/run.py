@@ -12,7 +12,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Iterator, Sequence
 from typing import IO, Any
 
 from clrecon.errors import DeviceError
@@ -29,7 +29,7 @@ MOST_PROCESSES = 4
 
 def run_selftest(
     device: Device, checks: Sequence[Check], *, silent_seconds: float, processes: int | None = None
-) -> Iterator[dict[str, Any]]:
+) -> Generator[dict[str, Any], None, None]:
     """Run checks on `device` in processes of their own, side by side, and yield each result at once.
 
     After a crash the checks that are left to a process run in a new one.  After a hang they count as failed: each of
