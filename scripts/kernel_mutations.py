@@ -83,7 +83,7 @@ INVERSIONS: dict[str, dict[str, tuple[tuple[str, str], ...]]] = {
     },
     "classify_groups": {
         "some": (("some_bits |= (uint)(is_in != 0)", "some_bits |= (uint)(is_in == 0)"),),
-        "all": (("all_bits |= (uint)(is_out == 0)", "all_bits |= (uint)(is_out != 0)"),),
+        "every": (("all_bits |= (uint)(is_out == 0)", "all_bits |= (uint)(is_out != 0)"),),
     },
     "spread_groups": {
         "some_near": (("some_near[word] = some_bits;", "some_near[word] = ~some_bits;"),),

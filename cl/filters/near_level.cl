@@ -2,13 +2,13 @@
  *
  * A weighted mean lies between its values: a voxel whose whole window is on one side of the level stays there.  So the
  * groups whose windows are mixed are all that a filter has to make.  A word holds one bit for each of 32 groups of a
- * row: "some" where a voxel of the box around the group is inside (value >= level), "all" where every one is.
+ * row: "some" where a voxel of the box around the group is inside (value >= level), "every" where every one is.
  *
  *     group           g - 1              g               g + 1
  *     voxels          ..............xx|xxxxxxxxxxxxxxxx|xx..............      reach = 2 along i
- *                                   `--- some, all of group g ---'
- *     rows            some |= those of rows j - reach_j .. j + reach_j, all &=, and then the same along k
- *     mixed           some & ~all
+ *                                   `--- some, every of group g ---'
+ *     rows            some |= those of rows j - reach_j .. j + reach_j, every &=, and then the same along k
+ *     mixed           some & ~every
  *
  * Boxes are not smaller than the window; they overlap from voxel to voxel, so one of them is mixed exactly if all of
  * them together are.
@@ -32,15 +32,15 @@ static inline uint inside_bits(__global const VOXEL *voxels, const int count, co
 
 /* Parameters  voxels  in   (rows, ni)
  *             some    out  (rows, words)
- *             all     out  (rows, words) bits beyond the row are 0 in both
+ *             every   out  (rows, words) bits beyond the row are 0 in both
  *             level   lowest value inside
  *             ni      voxels a row;  rows;  words a row, ceil(groups / 32)
  *             reach   voxels beyond a group that its box holds, at most GROUP
  * Launch      global = rows rounded up by the host, any local
  * Guarantees  every word is written; beyond the row nothing is mixed */
 __kernel void classify_groups(
-    __global const VOXEL *restrict voxels, __global uint *restrict some, __global uint *restrict all, const VOXEL level,
-    const int ni, const uint rows, const int words, const int reach)
+    __global const VOXEL *restrict voxels, __global uint *restrict some, __global uint *restrict every,
+    const VOXEL level, const int ni, const uint rows, const int words, const int reach)
 {
     const uint row = get_global_id(0);
     if (row >= rows)
@@ -61,7 +61,7 @@ __kernel void classify_groups(
         all_bits |= (uint)(is_out == 0) << (g % 32);
         if (g % 32 == 31 || g == groups - 1) {
             some[(size_t)row * words + g / 32] = some_bits;
-            all[(size_t)row * words + g / 32] = all_bits;
+            every[(size_t)row * words + g / 32] = all_bits;
             some_bits = all_bits = 0;
         }
         before_in = own & far;
@@ -70,14 +70,14 @@ __kernel void classify_groups(
     }
 }
 
-/* Parameters  some, all   in   (slices, nj, words)
+/* Parameters  some, every   in   (slices, nj, words)
  *             some_near, all_near   out  the same of the rows within reach
  *             count       words;  words a row;  nj rows a slice
  *             reach       rows
  * Launch      global = count rounded up by the host, any local
  * Guarantees  every word is written */
 __kernel void spread_groups(
-    __global const uint *restrict some, __global const uint *restrict all, __global uint *restrict some_near,
+    __global const uint *restrict some, __global const uint *restrict every, __global uint *restrict some_near,
     __global uint *restrict all_near, const uint count, const int words, const int nj, const int reach)
 {
     const uint word = get_global_id(0);
@@ -89,7 +89,7 @@ __kernel void spread_groups(
     uint some_bits = 0, all_bits = ~0u;
     for (int n = 0; n < near_rows; ++n) {
         some_bits |= some[first + (uint)(n * words)];
-        all_bits &= all[first + (uint)(n * words)];
+        all_bits &= every[first + (uint)(n * words)];
     }
     some_near[word] = some_bits;
     all_near[word] = all_bits;

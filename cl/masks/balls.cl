@@ -58,28 +58,29 @@ static inline int is_empty_near(
  *             spread   out  (nk, nj, words)
  *             reach_j, reach_k   largest |dj| and |dk| of the balls
  *             ni, nj, nk   voxels;  words a row
- *             pieces   of a row, `step` words each, and `halo` words before and behind them
+ *             pieces   of a row, `piece` words each, and `halo` words before and behind them
  *             shifted  0: all centres are 0; else 1, and there is a halo: bits that are shifted out of the row count there
  *             flip     ~0: the complement is spread, and the complement of that written; else 0
  *             beyond   ~0: what is spread lies everywhere beyond the volume; else 0
  * Launch      global = nk nj pieces rounded up by the host, any local
- * Assumes     step + 2 halo <= PIECE_WORDS; without a halo step >= words, with one of a word halves <= 32;
+ * Assumes     piece + 2 halo <= PIECE_WORDS; without a halo piece >= words, with one of a word halves <= 32;
  *             nk nj words < 2^31
  * Guarantees  every word is written; bits beyond the rows are 0 */
 __kernel void spread_ball(
     __global const uint *restrict mask, __global const uint *restrict row_extents,
     __global const int4 *restrict stencil, __global const int2 *restrict tables,
-    __global uint *restrict spread, const int reach_j, const int reach_k, const int ni, const int nj, const int nk, const int words, const int pieces,
-    const int step, const int halo, const int shifted, const uint flip, const uint beyond)
+    __global uint *restrict spread, const int reach_j, const int reach_k, const int ni, const int nj, const int nk,
+    const int words, const int pieces,
+    const int piece, const int halo, const int shifted, const uint flip, const uint beyond)
 {
     const uint item = get_global_id(0);
     const int row = (int)(item / pieces), total = nj * nk * words;
     if (row >= nj * nk)
         return;
-    const int first = (int)(item % pieces) * step - halo;
+    const int first = (int)(item % pieces) * piece - halo;
     const int j = row % nj, k = row / nj;
     __global uint *to = spread + row * words;
-    const int begin = first + halo, end = min(begin + step, words);
+    const int begin = first + halo, end = min(begin + piece, words);
     if (flip ? row_extents[row] == 0
              : beyond == 0 && is_empty_near(row_extents, j, k, reach_j, reach_k, nj, nk)) {
         for (int w = begin; w < end; ++w)

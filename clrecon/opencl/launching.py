@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
@@ -101,7 +101,8 @@ def launch(
     Raises
     ------
     TypeError
-        An argument is missing or unknown, or its value does not fit its type.
+        An argument is missing or unknown, or its value does not fit its type; where the device has a `trace`, also a
+        buffer for reading alone in the place of one that is written.
     DeviceError
         The driver refuses; the message names the kernel and the sizes.
     """
@@ -111,6 +112,7 @@ def launch(
     values = kernel.order(arguments)
     if device.trace is not None:
         device.trace(f"kernel {kernel.name} ({rounded:,} items)")
+        _check_written(kernel, values)
     try:
         with device.lock:
             queue = device.queue
@@ -123,3 +125,11 @@ def launch(
         wait(device)  # what crashes or hangs is then the kernel that was told last
     if stopwatch is not None:
         stopwatch.record(kernel.name, event)
+
+
+def _check_written(kernel: Kernel, values: Sequence[Any]) -> None:
+    """Refuse buffers for reading alone where the kernel writes: CPU drivers do not notice, others may."""
+    cl = import_pyopencl()
+    for argument, value in zip(kernel.arguments, values, strict=True):
+        if argument.is_written and value.get_info(cl.mem_info.FLAGS) & cl.mem_flags.READ_ONLY:
+            raise TypeError(f"kernel {kernel.name} writes {argument.name}, whose buffer is for reading alone")

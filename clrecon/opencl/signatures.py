@@ -37,11 +37,14 @@ class KernelArgument:
     type : str
         Type in OpenCL C, for example ``"int"`` or ``"float4"``; for a buffer the type of its elements.
     is_buffer : bool
+    is_written : bool
+        A buffer whose elements are not const.
     """
 
     name: str
     type: str
     is_buffer: bool
+    is_written: bool = False
 
 
 def definitions_of(options: tuple[str, ...]) -> dict[str, str]:
@@ -189,5 +192,6 @@ def _arguments(text: str) -> tuple[KernelArgument, ...]:
         words = [word for word in _WORD.findall(part) if word not in _QUALIFIERS]
         if len(words) != 2:
             raise ValueError(f"an argument of a kernel is a type and a name, not {part.strip()!r}")
-        arguments.append(KernelArgument(words[1], words[0], "*" in part))
+        is_buffer = "*" in part
+        arguments.append(KernelArgument(words[1], words[0], is_buffer, is_buffer and "const" not in part.split("*")[0]))
     return tuple(arguments)

@@ -66,6 +66,16 @@ def test_a_wrong_argument_is_an_error_before_the_launch(device, change, message,
         launch(device, kernel, device.group_size, **arguments)
 
 
+def test_a_trace_refuses_to_write_what_is_for_reading_alone(device, monkeypatch):
+    buffers = scan_buffers(device)
+    launch(device, scan_program(device)["sum_blocks"], device.group_size, **buffers)
+    monkeypatch.setattr(device, "trace", lambda doing: None)
+    launch(device, scan_program(device)["sum_blocks"], device.group_size, **buffers)
+    buffers["block_sums"] = upload(device, np.zeros(1, np.uint32))
+    with pytest.raises(TypeError, match="sum_blocks writes block_sums, whose buffer is for reading alone"):
+        launch(device, scan_program(device)["sum_blocks"], device.group_size, **buffers)
+
+
 @pytest.mark.every_device
 def test_numbers_become_what_the_kernel_takes(device):
     """The driver is given four bytes, whatever a number was."""
@@ -105,7 +115,7 @@ def test_every_argument_can_be_named_in_python(name):
 @pytest.mark.parametrize("options", VARIANTS, ids=lambda options: " ".join(options) or "plain")
 def test_names_and_types_are_those_that_the_compiler_knows(options, device):
     cl = import_pyopencl()
-    info, access = cl.kernel_arg_info, cl.kernel_arg_address_qualifier
+    info, access, qualifiers = cl.kernel_arg_info, cl.kernel_arg_address_qualifier, cl.kernel_arg_type_qualifier
     found, known = {}, {}
     for name in kernel_files():
         source = read_kernel_source(name)
@@ -124,7 +134,8 @@ def test_names_and_types_are_those_that_the_compiler_knows(options, device):
                     KernelArgument(
                         kernel.get_arg_info(n, info.NAME),
                         kernel.get_arg_info(n, info.TYPE_NAME).rstrip("*"),
-                        kernel.get_arg_info(n, info.ADDRESS_QUALIFIER) == access.GLOBAL,
+                        (is_buffer := kernel.get_arg_info(n, info.ADDRESS_QUALIFIER) == access.GLOBAL),
+                        is_buffer and not kernel.get_arg_info(n, info.TYPE_QUALIFIER) & qualifiers.CONST,
                     )
                     for n in range(kernel.num_args)
                 )

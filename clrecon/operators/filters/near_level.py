@@ -115,10 +115,10 @@ def list_mixed_groups(
     mask_d = allocate(device, 4 * core_count)
     launch(
         device, program["classify_groups"], there.rows, stopwatch=stopwatch, voxels=there.voxels_d, some=some_d,
-        all=all_d, level=level, ni=there.ni, rows=there.rows, words=words, reach=reach[0],
+        every=all_d, level=level, ni=there.ni, rows=there.rows, words=words, reach=reach[0],
     )  # fmt: skip
     launch(
-        device, program["spread_groups"], count, stopwatch=stopwatch, some=some_d, all=all_d, some_near=some_near_d,
+        device, program["spread_groups"], count, stopwatch=stopwatch, some=some_d, every=all_d, some_near=some_near_d,
         all_near=all_near_d, count=count, words=words, nj=there.nj, reach=reach[1],
     )  # fmt: skip
     launch(

@@ -184,7 +184,7 @@ def spread_bits(
         device, prepare_balls(device)["spread_ball"], nj * nk * pieces, stopwatch=stopwatch, mask=mask.mask_d,
         row_extents=mask.row_extents_d, reach_j=int(np.abs(rows[:, 0]).max()), reach_k=int(np.abs(rows[:, 1]).max()),
         stencil=upload(device, rows), tables=upload(device, tables), spread=spread_d, ni=ni, nj=nj,
-        nk=nk, words=words, pieces=pieces, step=step, halo=halo, shifted=int(rows[:, 2].any()),
+        nk=nk, words=words, pieces=pieces, piece=step, halo=halo, shifted=int(rows[:, 2].any()),
         flip=0xFFFFFFFF if erode else 0, beyond=0xFFFFFFFF if erode != beyond else 0,
     )  # fmt: skip
     return spread_d

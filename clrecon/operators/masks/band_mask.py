@@ -27,6 +27,7 @@ __all__ = [
     "mark_band",
     "mark_voxels",
     "mask_bytes",
+    "zero_words",
 ]
 
 LONGEST_ROW = 65_535
@@ -237,6 +238,14 @@ class _Marking:
         )  # fmt: skip
 
 
+def zero_words(device: Device, words: int, *, stopwatch: Stopwatch | None = None) -> Any:
+    """Return a buffer of words of 32 zero bits that kernels may write: uploaded buffers are for reading alone."""
+    words_d = allocate(device, 4 * words)
+    clear = load_program(device, "masks/band_mask.cl")["clear_words"]
+    launch(device, clear, words, stopwatch=stopwatch, mask=words_d, n=words)
+    return words_d
+
+
 def mark_voxels(
     device: Device,
     voxels: NDArray[np.int32] | VoxelNumbers,
@@ -268,8 +277,7 @@ def mark_voxels(
     ni, nj, nk = shape_ijk
     words, rows = -(-ni // 32) + pad, nj * nk
     program = load_program(device, "masks/band_mask.cl")
-    mask_d, extents_d = allocate(device, 4 * words * rows), allocate(device, 4 * rows)
-    launch(device, program["clear_words"], words * rows, stopwatch=stopwatch, mask=mask_d, n=words * rows)
+    mask_d, extents_d = zero_words(device, words * rows, stopwatch=stopwatch), allocate(device, 4 * rows)
     if isinstance(voxels, VoxelNumbers):
         n, kernel = len(voxels.numbers), "set_numbered_bits"
         given = {"numbers": np.ascontiguousarray(voxels.numbers, np.uint32)}

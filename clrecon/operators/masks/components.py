@@ -9,9 +9,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from clrecon.errors import UsageError
 from clrecon.geometry.affine import Float64Array, checked_points
-from clrecon.opencl import allocate, copy_buffer, upload
+from clrecon.opencl import allocate, copy_buffer
 from clrecon.operators.masks import logic
-from clrecon.operators.masks.band_mask import mask_bytes
+from clrecon.operators.masks.band_mask import mask_bytes, zero_words
 from clrecon.operators.masks.morphology import MaskShapes
 from clrecon.operators.masks.runs import Components, find_components, mark_at_border, mark_with_voxels, write_runs
 
@@ -76,7 +76,7 @@ class MaskComponents(MaskShapes):
         marks_d, components = mark_with_voxels(device, found, shape, voxels)
         if (components < 0).any():
             raise UsageError(self._describe_miss(points[components < 0][0], "lies in a voxel that is not chosen"))
-        grown_d = upload(device, np.zeros(size // 4, np.uint32))
+        grown_d = zero_words(device, size // 4)
         self._write(found, marks_d, grown_d, wanted=1)
         return self._made(grown_d, f"({self.name}) grown from {len(points)} point{'s' * (len(points) != 1)}")
 

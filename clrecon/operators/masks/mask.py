@@ -11,9 +11,9 @@ from numpy.typing import ArrayLike, NDArray
 from clrecon.errors import UsageError
 from clrecon.geometry import AIR_HU, Volume
 from clrecon.geometry.certificate import amend
-from clrecon.opencl import Device, Stopwatch, allocate, check_budget, launch, load_program, upload
+from clrecon.opencl import Device, Stopwatch, check_budget, upload
 from clrecon.operators.masks import logic
-from clrecon.operators.masks.band_mask import check_shape, checked_band, mark_band, mask_bytes
+from clrecon.operators.masks.band_mask import check_shape, checked_band, mark_band, mask_bytes, zero_words
 from clrecon.operators.masks.components import MaskComponents
 from clrecon.operators.masks.regions import RowSpans, box_spans, checked_box, tube_spans
 from clrecon.operators.masks.runs import write_runs
@@ -325,9 +325,7 @@ class Mask(MaskComponents):
             device = resident.device
             sizes = mask_bytes(volume.shape_ijk)
             check_budget(device, {**sizes, "spans of rows": 8 * n}, resident.memory)
-            words = sizes["mask of the voxels"] // 4
-            mask_d = allocate(device, 4 * words)
-            launch(device, load_program(device, "masks/band_mask.cl")["clear_words"], words, mask=mask_d, n=words)
+            mask_d = zero_words(device, sizes["mask of the voxels"] // 4)
             write_runs(
                 device, upload(device, spans.columns), upload(device, spans.row_counts),
                 upload(device, np.zeros(n, np.int32)), upload(device, np.ones(1, np.uint8)), mask_d, volume.shape_ijk,

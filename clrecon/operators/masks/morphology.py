@@ -4,11 +4,9 @@ from __future__ import annotations
 
 from typing import Any, TypeVar
 
-import numpy as np
-
-from clrecon.opencl import check_budget, upload
+from clrecon.opencl import check_budget
 from clrecon.operators.masks.balls import ball_of, reaches_beyond, spread_bits, table_bytes, whole_ball_of
-from clrecon.operators.masks.band_mask import mask_bytes
+from clrecon.operators.masks.band_mask import mask_bytes, zero_words
 from clrecon.operators.masks.mask_bits import MaskBits
 from clrecon.operators.masks.regions import checked_mm
 
@@ -98,8 +96,7 @@ class MaskShapes(MaskBits):
         if not reaches_beyond(self.volume, radius, by_slice=by_slice):
             return self._spread(mm, by_slice, erode=True, whole=True)
         self._check_budget(2)
-        words = mask_bytes(self.shape_ijk)["mask of the voxels"] // 4
-        return upload(self.device, np.zeros(words, np.uint32))
+        return zero_words(self.device, mask_bytes(self.shape_ijk)["mask of the voxels"] // 4)
 
     def _spread(
         self, mm: float, by_slice: bool, *, erode: bool = False, beyond: bool = False, whole: bool = False

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from clrecon.errors import DeviceMemoryError
 from clrecon.opencl import Device, Program, Stopwatch, allocate, check_budget, download, launch, load_program, upload
-from clrecon.operators.masks.band_mask import VoxelMask
+from clrecon.operators.masks.band_mask import VoxelMask, zero_words
 from clrecon.operators.primitives.scan import exclusive_scan, prepare_scan
 from clrecon.operators.primitives.union_find import join_parts, prepare_components
 from clrecon.points.stencil import Stencil
@@ -291,7 +291,7 @@ def mark_at_border(
 ) -> Any:
     """Return a buffer with a mark, 0 or 1, for each component: 1 where it reaches the border of the volume or slice."""
     ni, nj, nk = shape_ijk
-    marks_d = upload(device, np.zeros(found.count, np.uint8))
+    marks_d = zero_words(device, -(-found.count // 4), stopwatch=stopwatch)
     launch(
         device, prepare_runs(device)["mark_border_runs"], nj * nk, stopwatch=stopwatch, runs=found.runs.runs_d,
         row_counts=found.runs.row_counts_d, numbers=found.numbers_d, marks=marks_d, ni=ni, nj=nj, nk=nk,
@@ -322,7 +322,7 @@ def mark_with_voxels(
         -1 where the voxel is not set.
     """
     n = len(voxels)
-    marks_d = upload(device, np.zeros(found.count, np.uint8))
+    marks_d = zero_words(device, -(-found.count // 4), stopwatch=stopwatch)
     which, which_d = np.empty(n, np.int32), allocate(device, 4 * n)
     launch(
         device, prepare_runs(device)["mark_voxel_runs"], n, stopwatch=stopwatch,

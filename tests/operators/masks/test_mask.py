@@ -179,3 +179,15 @@ def test_memory_is_summed_before_it_is_taken(device):
         clrecon.Mask.from_band(volume, (1, 3), device=device, memory=100_000)
     with pytest.raises(DeviceError, match="are allowed"):
         clrecon.Mask.from_array(volume, volume.voxels > 1, device=device, memory=100_000)
+
+
+@pytest.mark.oclgrind
+def test_under_a_simulator(device):
+    volume = Volume(np.zeros((5, 6, 41), np.int16), OBLIQUE)
+    chosen = np.random.default_rng(3).random((5, 6, 41)) < 0.4
+    mask = clrecon.Mask.from_array(volume, chosen, device=device)
+    opened = mask.close(2.0).open(1.0).fill_holes() | mask.fill_holes(by_slice=True)
+    grown = opened.grow(volume.ijk_to_lps(np.argwhere(opened.to_numpy())[:1, ::-1]))
+    assert 0 < grown.count <= opened.count
+    assert mask.apply(volume, -5.0).voxels.min() == -5
+    assert not (clrecon.Mask.from_band(volume, (0, 1), device=device) & ~mask & mask).count
