@@ -22,7 +22,18 @@ static inline uint find_mixed_faces(ulong a, ulong b, uint w, uint gi)
     return (uint)((any | any >> 1) & ~(all & all >> 1) & samples_with_next(w, gi));
 }
 
-/* The run without a parent that run `run` leads to. */
+/* The parent of a run, while others may write it.  A load of an aligned word is whole on every device; a checker of races
+ * does not know that, and is given an atomic operation that changes nothing (-D ATOMIC_LOADS). */
+static inline uint load_parent(volatile __global uint *parents, uint run)
+{
+#ifdef ATOMIC_LOADS
+    return atomic_or(parents + run, 0u);
+#else
+    return parents[run];
+#endif
+}
+
+/* The run without a parent that run `run` leads to, when nothing is written any more. */
 static inline uint find_root(volatile __global const uint *parents, uint run)
 {
     uint parent = parents[run];
@@ -36,13 +47,13 @@ static inline uint find_root(volatile __global const uint *parents, uint run)
 /* The same, and halves the way: every run passed gets its parent's parent, which never becomes larger by it. */
 static inline uint halve_way(volatile __global uint *parents, uint run)
 {
-    uint parent = parents[run];
+    uint parent = load_parent(parents, run);
     while (parent != run) {
-        const uint next = parents[parent];
+        const uint next = load_parent(parents, parent);
         if (next != parent)
             atomic_min(parents + run, next);
         run = next;
-        parent = parents[run];
+        parent = load_parent(parents, run);
     }
     return run;
 }

@@ -168,9 +168,9 @@ def test_lone_voxels_do_not_move_it() -> None:
 
 
 def test_contrast_medium_does_not_move_it(spine_level) -> None:
-    from clrecon.phantom import tissue
+    from clrecon.phantom import build, tissue
 
-    with mock.patch.dict(vars(tissue), {"BLOOD_HU": 300.0, "KIDNEY_HU": 180.0}):
+    with mock.patch.object(build, "BLOOD_HU", 300.0), mock.patch.object(tissue, "KIDNEY_HU", 180.0):
         voxels = make_phantom(PhantomSettings(kind="spine", **SPINE))[0]
     chosen = choose_iso_value(as_volume(voxels))
     assert chosen.contrast_medium_share > 0.1

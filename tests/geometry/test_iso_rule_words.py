@@ -27,14 +27,14 @@ def test_a_rule_says_what_is_asked_for(level, below, words, place):
 @pytest.mark.parametrize(
     ("level", "below", "expected"),
     [
-        (200, False, (200, 199.5, "above", [200, None], [199.5, None])),
-        (200, True, (200, 199.5, "below", [None, 200], [None, 199.5])),
-        ((100, 300), False, (None, None, "between", [100, 300], [99.5, 300.5])),
+        (200, False, (200, 199.5, "above", "linear", [200, None], [199.5, None])),
+        (200, True, (200, 199.5, "below", "linear", [None, 200], [None, 199.5])),
+        ((100, 300), False, (None, None, "between", "linear", [100, 300], [99.5, 300.5])),
     ],
 )
 def test_a_report_names_both_ends_of_what_is_inside(level, below, expected):
     report = choose_iso_rule(VOLUME, level, below=below).as_report()
-    assert list(report) == ["iso_value_hu", "iso_level_hu", "inside", "inside_hu", "inside_levels_hu"]
+    assert list(report) == ["iso_value_hu", "iso_level_hu", "inside", "vertex_rule", "inside_hu", "inside_levels_hu"]
     assert tuple(report.values()) == expected
 
 

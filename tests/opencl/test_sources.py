@@ -23,6 +23,7 @@ def test_every_theme_is_found():
         "resident",
         "masks",
         "surface",
+        "filters",
         "points",
         "rays",
         "reformat",

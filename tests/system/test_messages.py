@@ -12,6 +12,7 @@ import pytest
 
 import clrecon
 from clrecon.anatomy.iso_choice import half_iso_value
+from clrecon.anatomy.noise import Noise
 from clrecon.errors import RefusedInputError
 from clrecon.geometry import Volume
 from clrecon.jobs.mesh.label_choice import LabelChoice
@@ -21,7 +22,7 @@ from clrecon.labels import LabelMap
 from clrecon.mesh import Mesh
 from clrecon.operators.points.clusters import Clustering
 from clrecon.operators.points.neighbours import Neighbours
-from clrecon.phantom import PhantomSettings
+from clrecon.phantom import PhantomSettings, phantom_truth
 from clrecon.points import PointCloud, PointStep
 from clrecon.rendering import Lighting, Rendering, TransferFunction
 from clrecon.rendering.looks.label_style import LabelStyle
@@ -82,10 +83,12 @@ MESSAGES = {
     "point step": PointStep(CLOUD, np.array([0, 1, 0], np.uint8), ("noise",), {"eps_mm": 1.2}, ("doubtful",)),
     "clusters": Clustering(CLOUD, np.zeros(2, np.uint8), cores=np.array([True, False])),
     "nearest points": Neighbours(np.zeros((2, 1), np.int32), np.zeros((2, 1), np.float32)),
+    "noise": Noise(12.5, 40, 9),
+    "truth of a phantom": phantom_truth(PhantomSettings(kind="sphere", size=(16, 16), slices=16)),
     "point look": PointLook(radius_mm=0.5, color_by="label"),
     "listing": SeriesListing([ENTRY], 1, {}, [], {"slices": 4}, RefusedInputError("no")),
 }
-HELD_BY_A_DEVICE = {"DeviceVolume", "SurfaceExtractor", "VolumeRenderer"}
+HELD_BY_A_DEVICE = {"DeviceVolume", "Mask", "SurfaceExtractor", "VolumeRenderer"}
 """Public classes that are no messages: they own memory of a device."""
 
 

@@ -41,7 +41,7 @@ def prepare_growing(device: Device) -> Program:
     prepare_scan(device)
     prepare_components(device)
     load_cells(device, grown=True)
-    return load_program(device, "surface/growing.cl")
+    return load_program(device, "surface/growing.cl", {"ATOMIC_LOADS": "1"} if device.is_simulator else {})
 
 
 @dataclass(frozen=True)

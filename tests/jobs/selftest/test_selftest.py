@@ -26,7 +26,7 @@ FEW = {"scan_block_sums": 64, "total_counts": 64}
 """Kernels that are launched over one work-group, whatever the data."""
 
 OF_TYPES = {"VOXEL", "VALUE", "LABEL", "VOXEL_IS_SHORT"}
-OF_DEVICES = {"LANES", "WORDS_PER_ITEM", "HAS_BUILTIN_PREFETCH", "SCAN_GROUP", "CPU_NAME"}
+OF_DEVICES = {"LANES", "WORDS_PER_ITEM", "HAS_BUILTIN_PREFETCH", "SCAN_GROUP", "CPU_NAME", "ATOMIC_LOADS"}
 
 
 def macros_of(device: Device) -> dict[str, set[str]]:
