@@ -18,7 +18,7 @@ sys.path.insert(0, str(ROOT / "scripts"))
 from kernel_mutations import EQUIVALENT, INVERSIONS, all_mutations, find_kernels  # noqa: E402
 
 OF_TYPES = {"VOXEL", "VALUE", "LABEL", "VOXEL_IS_SHORT"}
-OF_DEVICES = {"LANES", "WORDS_PER_ITEM", "HAS_BUILTIN_PREFETCH", "SCAN_GROUP", "NO_WINDOWS", "CPU_NAME"}
+OF_DEVICES = {"LANES", "WORDS_PER_ITEM", "HAS_BUILTIN_PREFETCH", "SCAN_GROUP", "NO_WINDOWS", "CPU_NAME", "ATOMIC_LOADS"}
 OF_COMPILERS = re.compile(r"__\w+__|CLRECON_\w+_H")
 """Macros that a check need not name: it runs with several types, and with what its device is given."""
 
