@@ -147,6 +147,8 @@ def test_buffers_are_as_long_as_what_the_kernels_write(device):
     assert [grid.mask_d.size, grid.ranks_d.size] == [4 * words] * 2
     assert [grid.x_d.size, grid.y_d.size, grid.z_d.size] == [4 * (1000 + PADDING)] * 3
     assert grid.starts_d.size == 4 * (grid.cells + 1)
+    buffers = (grid.mask_d, grid.ranks_d, grid.x_d, grid.y_d, grid.z_d, grid.order_d, grid.starts_d)
+    assert grid.nbytes == sum(buffer.size for buffer in buffers)
 
 
 def test_where_loops_end_early_only_clouds_beyond_that_are_warned_of(device, monkeypatch):

@@ -8,6 +8,7 @@ import tolerances
 from raycast_scenes import (
     PLACE,
     STEPS,
+    DeviceCaster,
     ball,
     ball_chords,
     casters,
@@ -105,6 +106,18 @@ def test_a_radiograph_tells_the_water_in_a_ball(cast, steps, perspective):
         assert well_inside.sum() > 50
         truth = 1.5 * ball_chords(radius, ramp, passing[well_inside])
         assert np.abs(water[well_inside] / truth - 1.0).max() <= tolerances.RAY_CHORD
+
+
+def test_a_radiograph_is_transparent_where_there_is_no_water_at_all(device):
+    """A hundredth of water over 20 mm is 0.2 mm of it: little, but not nothing."""
+    volume = even_volume(ball(8.0, 2.0, -990.0, -1000.0), "even", 20.0)
+    size = (24, 24)
+    camera = look(volume, (0.0, 1.0, 0.0), 14.0)
+    found = DeviceCaster(device)(volume, mode="drr", camera=camera, size=size)
+    passing, _ = distances_from(centre_of(volume), camera, size)
+    assert 0.0 < found.values[passing < 4.0].max() < 1.0
+    assert (found.image[passing < 4.0][:, 3] == 255).all()
+    assert (found.image[passing > 11.0][:, 3] == 0).all()
 
 
 @pytest.mark.parametrize("perspective", [False, True])

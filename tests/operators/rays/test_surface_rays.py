@@ -213,6 +213,27 @@ def test_what_is_nearer_is_brighter_with_a_depth_cue(device):
     assert np.ptp(share) > 0.1 and np.abs(cued.image[..., 0] - 255.0 * share).max() <= 1.0
 
 
+@pytest.mark.first_device
+def test_a_light_has_a_direction_and_no_length(device):
+    volume = make_volume(blobs, "even", 18.0, np.int16)
+    camera, towards = look(volume, (0.4, 1.0, -0.3), 12.0), np.array((0.5, -0.8, 0.6))
+    pictures = [
+        cast(
+            device,
+            volume,
+            100.0,
+            camera,
+            shadows=True,
+            lighting=Lighting(0.2, 0.7, 0.3, 20.0, direction=length * towards),
+        )
+        for length in (1.0, 0.25, 8.0)
+    ]
+    lit = cast(device, volume, 100.0, camera, lighting=FIXED).image
+    assert (pictures[0].image != lit).any()  # there are shadows
+    for other in pictures[1:]:
+        np.testing.assert_array_equal(other.image, pictures[0].image)
+
+
 @pytest.mark.oclgrind
 @pytest.mark.parametrize("grid", ["sheared", "uneven"])
 def test_a_small_picture_under_the_simulator(device, grid):
