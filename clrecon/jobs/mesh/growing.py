@@ -24,7 +24,7 @@ def is_label_seed(seed: object) -> bool:
 
 
 def check_growing(
-    method: str | None,
+    method: str,
     grow_from: Sequence[str | Sequence[float]],
     vertex_rule: str,
     *,
@@ -32,7 +32,7 @@ def check_growing(
     inside: str,
     labels: LabelChoice | None,
 ) -> None:
-    """Refuse seeds that are none, and methods and rules that do not go with the other settings of a mesh job.
+    """Check the seeds, the method and the vertex rule of a mesh job, each and with its other settings.
 
     Raises
     ------
@@ -40,15 +40,14 @@ def check_growing(
     """
     for seed in grow_from:
         _check_seed(seed)
-    if method is None and not grow_from and vertex_rule == "linear":
-        return
+    if method == "t-mc" and not grow_from and vertex_rule == "linear":
+        return  # what every device does: the operators need not be loaded
     from clrecon.geometry.vertex_rules import check_vertex_rule
     from clrecon.operators.surface.methods import check_method
 
     chosen = check_method(
-        method or ("i-mc" if grow_from else "t-mc"), grows=bool(grow_from), vertex_rule=vertex_rule,
-        topology=topology, plain=inside == "above",
-    )  # fmt: skip
+        method, grows=bool(grow_from), vertex_rule=vertex_rule, topology=topology, plain=inside == "above"
+    )
     check_vertex_rule(vertex_rule, topology)
     from_labels = any(map(is_label_seed, grow_from))
     if from_labels and labels is None:

@@ -135,7 +135,7 @@ class MeshSettings(InputSettings):
         frame_from_lps(self.space)
         check_topology(self.topology)
         check_growing(
-            self.method, self.grow_from, self.vertex_rule, topology=self.topology, inside=self.inside,
+            self.method_used, self.grow_from, self.vertex_rule, topology=self.topology, inside=self.inside,
             labels=self.labels,
         )  # fmt: skip
         if self.labels_pick and self.below is not None:

@@ -13,7 +13,7 @@ import numpy as np
 from clrecon.errors import NoSurfaceError, RefusedInputError, UsageError
 from clrecon.geometry.certificate import amend
 from clrecon.jobs.shared.preprocess_steps import FILTERS, MORPHOLOGY, PreprocessStep, parse_preprocess
-from clrecon.jobs.shared.region import Band, apply_region
+from clrecon.jobs.shared.region import Band, apply_region, carry_report
 from clrecon.jobs.shared.settings import InputSettings
 from clrecon.system.progress import Progress
 from clrecon.system.wording import name_parameter
@@ -139,7 +139,7 @@ class _Run:
                 progress=self._progress, **given,
             )  # fmt: skip
         else:
-            done = filter_volume(resident, step.name, **given)
+            done = filter_volume(resident, step.name, progress=self._progress, **given)
         return done, dict(done.volume.report["filtered"]["steps"][-1])
 
     def _change_shape(self, resident: DeviceVolume, step: PreprocessStep) -> tuple[DeviceVolume, dict[str, Any]]:
@@ -156,11 +156,11 @@ class _Run:
         self._check_loss(step, facts)
         inside, outside = _values(resident.volume, mask, band)
         facts |= {"inside_hu": inside, "outside_hu": outside}
-        report = resident.volume.report
+        volume = resident.volume
         for voxels, value in ((taken, outside), (added, inside)):
             if voxels.count:
                 resident = (~voxels).apply(resident, value)
-        resident.volume.report = report
+        resident.volume.report = carry_report(volume, resident.volume)
         self.warnings.append(
             f"{step} took {taken.count:,} of {before:,} voxels of {_describe(band)} and added {added.count:,}"
         )

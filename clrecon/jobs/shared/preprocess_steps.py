@@ -21,6 +21,9 @@ FILTERS = {
 }
 """Filters of HU, with the parameters that may follow them."""
 
+COUNTED = ("curvature-flow",)
+"""Filters whose parameter is a whole number."""
+
 MORPHOLOGY = ("erode", "dilate", "open", "close", "fill", "fill-slices")
 """Steps on the voxels at the level and above."""
 
@@ -83,4 +86,8 @@ def _parse(word: str) -> PreprocessStep:
         raise UsageError(f"the step {word!r:.80} of preprocessing is not known: the steps are {PREPROCESS_FORMS}")
     if name != "level" and any(number <= 0.0 for number in numbers):
         raise UsageError(f"the step {word!r:.80} of preprocessing needs numbers above 0")
+    if name in COUNTED:
+        if any(number != int(number) for number in numbers):
+            raise UsageError(f"the step {word!r:.80} of preprocessing needs a whole number")
+        numbers = tuple(int(number) for number in numbers)
     return PreprocessStep(name, numbers)

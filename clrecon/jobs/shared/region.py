@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from clrecon.operators.masks.mask import Mask
     from clrecon.operators.resident.device_volume import DeviceVolume
 
-__all__ = ["Band", "apply_region", "restrict_volume", "value_outside"]
+__all__ = ["Band", "apply_region", "carry_report", "restrict_volume", "value_outside"]
 
 Band = tuple[float, float]
 """Lowest and highest HU that are inside of what the job makes; infinite where it has no end."""
@@ -91,9 +91,16 @@ def apply_region(
         f"outside of the region {' and '.join(facts['rules'])} is air now:"
         f" {kept:,} of {every:,} voxels stay ({100.0 * kept / every:.3g} %), {cells:,} of {all_cells:,} cells"
     )
-    report = amend(volume.report, region=facts)
-    restricted.volume.report = amend(report, warnings=[*volume.report.get("warnings", ()), said])
+    report = carry_report(volume, restricted.volume)
+    restricted.volume.report = amend(report, region=facts, warnings=[*report.get("warnings", ()), said])
     return restricted
+
+
+def carry_report(before: Volume, after: Volume) -> dict[str, Any]:
+    """Return the report of a volume for another with some voxels changed: only the range of its HU is another."""
+    if before.report.get("hu_range") is None:
+        return before.report
+    return amend(before.report, hu_range=after.report["hu_range"])
 
 
 def value_outside(bands: Sequence[Band], dtype: np.dtype[Any]) -> float:
@@ -156,10 +163,8 @@ def _mask_of(resident: DeviceVolume, rule: RegionRule, space: str, facts: dict[s
     from clrecon.labels import read_labels
 
     assert rule.path is not None
-    if rule.name is None:
-        return Mask.from_labels(resident, read_labels(rule.path, volume=resident.volume))
-    labels = read_labels(rule.path, [rule.name], volume=resident.volume)
-    return Mask.from_labels(resident, labels, [labels.find(rule.name)])
+    names = None if rule.name is None else [rule.name]
+    return Mask.from_labels(resident, read_labels(rule.path, names, volume=resident.volume), names)
 
 
 def _line_of(volume: Volume, rule: RegionRule, facts: dict[str, Any]) -> Any:

@@ -123,34 +123,32 @@ for check in checks:
 """
 
 
-def test_row_57_a_driver_that_crashes_or_hangs_becomes_words(
-    device: Device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+@pytest.fixture
+def storied(device: Device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Device:
+    """The device, whose self-test runs `STORY` in the place of checks."""
     story = tmp_path / "story.py"
     story.write_text(STORY)
     monkeypatch.setattr(run, "COMMAND", (str(story),))
     monkeypatch.setattr(device, "_remarks", [])
+    return device
+
+
+def test_row_57_a_driver_that_crashes_or_hangs_becomes_words(storied: Device) -> None:
     names = ["first", "crash", "second", "exit", "third", "hang", "last"]
-    outcomes = list(run_selftest(device, [check_named(name) for name in names], silent_seconds=1.5, processes=1))
+    outcomes = list(run_selftest(storied, [check_named(name) for name in names], silent_seconds=1.5, processes=1))
     assert [outcome["operator"] for outcome in outcomes] == names
     assert [outcome["passed"] for outcome in outcomes] == [True, False, True, False, True, False, False]
     words = {outcome["operator"]: outcome["detail"] for outcome in outcomes}
     assert words["crash"] == "the driver crashed with SIGSEGV in kernel of_crash (64 items)"
     assert words["exit"] == "the process of the test ended with exit code 7 in kernel of_exit (64 items)"
     assert words["hang"] == "the driver hangs: nothing for 1.5 s in kernel of_hang (64 items)"
-    assert device.warnings == ["a remark of the process"]
+    assert storied.warnings == ["a remark of the process"]
     assert words["last"] == "not run: the driver hangs"
 
 
-def test_processes_run_side_by_side_and_one_that_hangs_holds_no_other(
-    device: Device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    story = tmp_path / "story.py"
-    story.write_text(STORY)
-    monkeypatch.setattr(run, "COMMAND", (str(story),))
-    monkeypatch.setattr(device, "_remarks", [])
+def test_processes_run_side_by_side_and_one_that_hangs_holds_no_other(storied: Device) -> None:
     names = ["hang", "first", "left", "second", "last", "crash", "fourth", "third"]
-    outcomes = list(run_selftest(device, [check_named(name) for name in names], silent_seconds=1.5, processes=2))
+    outcomes = list(run_selftest(storied, [check_named(name) for name in names], silent_seconds=1.5, processes=2))
     assert {outcome["operator"]: outcome["passed"] for outcome in outcomes} == {
         "hang": False, "left": False, "last": False, "fourth": False,
         "first": True, "second": True, "crash": False, "third": True,
@@ -161,15 +159,9 @@ def test_processes_run_side_by_side_and_one_that_hangs_holds_no_other(
     )
 
 
-def test_a_caller_that_leaves_ends_all_processes(
-    device: Device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    story = tmp_path / "story.py"
-    story.write_text(STORY)
-    monkeypatch.setattr(run, "COMMAND", (str(story),))
-    monkeypatch.setattr(device, "_remarks", [])
+def test_a_caller_that_leaves_ends_all_processes(storied: Device) -> None:
     names = ["hang", "first", "left", "second"]
-    outcomes = run_selftest(device, [check_named(name) for name in names], silent_seconds=600.0, processes=2)
+    outcomes = run_selftest(storied, [check_named(name) for name in names], silent_seconds=600.0, processes=2)
     assert next(outcomes)["operator"] == "first"
     began = time.perf_counter()
     outcomes.close()

@@ -88,6 +88,7 @@ def test_steps_are_read_in_their_order() -> None:
         ("bilateral:1:2:3", "is not known"),
         ("region,fill,region", "named twice"),
         ("sharpen", "is not known"),
+        ("curvature-flow:2.5", "needs a whole number"),
     ],
 )
 def test_a_step_of_another_form_is_refused(text: str, words: str) -> None:
