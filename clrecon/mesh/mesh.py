@@ -13,6 +13,7 @@ from clrecon.exchange.content import Content, describe_facts
 from clrecon.exchange.coordinates import as_stored
 from clrecon.exchange.formats import write_mesh
 from clrecon.geometry import frame_from_lps
+from clrecon.geometry.affine import apply_affine, checked_affine, normal_matrix
 from clrecon.mesh.quality import MeshQuality, measure_quality
 from clrecon.system.messages import Message
 from clrecon.system.targets import keep_existing
@@ -153,6 +154,41 @@ class Mesh(Message):
         # Adding 0 turns -0 into 0; text formats would show -0.
         vertices = self._vertices * signs + np.float32(0)
         return vertices, None if self._normals is None else self._normals * signs + np.float32(0)
+
+    def transformed(self, matrix: ArrayLike) -> Mesh:
+        """Return the mesh moved, turned or scaled by an affine; this one stays as it is.
+
+        Parameters
+        ----------
+        matrix : array_like, shape (4, 4)
+            LPS mm to LPS mm; the last row is (0, 0, 0, 1).  A mirror is allowed: triangles are turned round, so that
+            they stay counter-clockwise when seen from outside.
+
+        Returns
+        -------
+        Mesh
+            Normals go through the inverse transpose.  The report has ``moved_by``, the matrix from the place where the
+            scan put the mesh, and no longer the affine and the certificate of the scan: they say nothing of its new
+            place.
+
+        Raises
+        ------
+        UsageError
+            `matrix` is no affine, or singular.
+        """
+        checked = checked_affine(matrix)
+        normals = self._normals
+        if normals is not None and len(normals):
+            directions = normals @ normal_matrix(checked).T
+            lengths = np.linalg.norm(directions, axis=1, keepdims=True)
+            normals = np.divide(directions, lengths, out=directions, where=lengths > 0)
+        mirrored = np.linalg.det(checked[:3, :3]) < 0
+        scan = ("affine_ijk_to_lps_mm", "certificate", "certificate_lines")
+        report = {name: value for name, value in self.report.items() if name not in scan}
+        before = self.report.get("moved_by")
+        report["moved_by"] = (checked if before is None else checked @ np.array(before)).tolist()
+        triangles = self._triangles[:, ::-1] if mirrored else self._triangles
+        return Mesh(apply_affine(checked, self._vertices), triangles, normals, report)
 
     def describe(self, space: str, *, keep_ids: bool = False) -> Content:
         """Return the contents of a file of the mesh in `space`; nothing else of `report` is ever written.

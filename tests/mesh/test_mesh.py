@@ -97,3 +97,37 @@ def test_what_is_empty_still_has_three_columns():
     assert Mesh([], []).vertices.shape == Mesh(np.zeros((0, 3)), []).vertices.shape == (0, 3)
     with pytest.raises(UsageError, match=r"shape \(n, 3\), these have \(0, 2\)"):
         Mesh(np.zeros((0, 2)), [])
+
+
+def test_a_moved_turned_and_scaled_mesh_has_its_points_normals_and_volume():
+    vertices, triangles = samples.sphere((3, 0, -7))
+    mesh = Mesh(vertices, triangles, (vertices - (3, 0, -7)) / 10, {"iso_value_hu": 200.0, "certificate": {"a": 1}})
+    turn_and_stretch = np.array([[0, -2, 0, 5], [1, 0, 0, 6], [0, 0, 3, 7], [0, 0, 0, 1.0]])
+    moved = mesh.transformed(turn_and_stretch)
+    x, y, z = mesh.vertices.T
+    np.testing.assert_allclose(moved.vertices, np.stack([5 - 2 * y, 6 + x, 7 + 3 * z], axis=1), rtol=0, atol=1e-5)
+    assert moved.quality()["volume_ml"] == pytest.approx(6 * mesh.quality()["volume_ml"], rel=1e-5)
+    towards = np.stack([-mesh.normals[:, 1] / 2, mesh.normals[:, 0], mesh.normals[:, 2] / 3], axis=1)
+    towards /= np.linalg.norm(towards, axis=1, keepdims=True)
+    np.testing.assert_allclose(moved.normals, towards, rtol=0, atol=1e-6)
+    assert moved.report == {"iso_value_hu": 200.0, "moved_by": turn_and_stretch.tolist()}
+    np.testing.assert_array_equal(mesh.vertices, vertices.astype(np.float32))
+    back = moved.transformed(np.linalg.inv(turn_and_stretch))
+    np.testing.assert_allclose(back.vertices, mesh.vertices, rtol=0, atol=1e-5)
+    np.testing.assert_allclose(back.report["moved_by"], np.eye(4), rtol=0, atol=1e-12)
+
+
+def test_a_mirrored_mesh_still_looks_outward():
+    mesh = Mesh(*samples.torus())
+    mirrored = mesh.transformed(np.diag([-1.0, 1.0, 1.0, 1.0]))
+    assert mirrored.quality()["volume_ml"] == pytest.approx(mesh.quality()["volume_ml"], rel=1e-6)
+    assert mirrored.normals is None
+    np.testing.assert_array_equal(mirrored.triangles, mesh.triangles[:, ::-1])
+
+
+@pytest.mark.parametrize(
+    ("matrix", "words"), [(np.eye(3), "4x4"), (np.diag([1.0, 0, 1, 1]), "singular"), (np.ones((4, 4)), "last row")]
+)
+def test_what_moves_a_mesh_is_an_affine(matrix, words):
+    with pytest.raises(UsageError, match=words):
+        Mesh(*samples.sphere((0, 0, 0))).transformed(matrix)
