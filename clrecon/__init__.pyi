@@ -18,7 +18,13 @@ from clrecon.geometry import Volume as Volume
 from clrecon.labels import LabelMap as LabelMap
 from clrecon.labels import read_labels as read_labels
 from clrecon.mesh import Mesh as Mesh
+from clrecon.mesh.compare.cells import GridCells as GridCells
+from clrecon.mesh.compare.cells import find_mesh_cells as find_mesh_cells
+from clrecon.mesh.compare.cells import measure_cells as measure_cells
+from clrecon.mesh.compare.cut_cells import find_cut_cells as find_cut_cells
 from clrecon.mesh.compare.distances import compare_meshes as compare_meshes
+from clrecon.mesh.compare.slices import measure_slices as measure_slices
+from clrecon.mesh.compare.truth import measure_truth as measure_truth
 from clrecon.mesh.refine.decimation import decimate_mesh as decimate_mesh
 from clrecon.mesh.refine.quadric import collapse_quadric as collapse_quadric
 from clrecon.mesh.refine.smoothing import smooth_mesh as smooth_mesh
@@ -66,6 +72,8 @@ from clrecon.rendering import TransferFunction as TransferFunction
 from clrecon.rendering import load_transfer_function as load_transfer_function
 from clrecon.rendering.movies.movie import turntable_cameras as turntable_cameras
 from clrecon.rendering.movies.movie import write_animation as write_animation
+from clrecon.rendering.pictures.likeness import make_control_pictures as make_control_pictures
+from clrecon.rendering.pictures.likeness import measure_pictures as measure_pictures
 from clrecon.rendering.pictures.styles import CurveCut as CurveCut
 from clrecon.rendering.pictures.styles import PlaneCut as PlaneCut
 from clrecon.rendering.pictures.styles import PointLook as PointLook

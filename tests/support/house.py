@@ -106,7 +106,7 @@ INSIDE_FUNCTIONS: dict[str, frozenset[str]] = {
     "mesh": frozenset({"scipy", "pyvista", "vtk", "vtkmodules", "fast_simplification"}),
     "points": frozenset({"pyvista", "open3d"}),
     "reference": frozenset({"scipy"}),
-    "rendering": frozenset({"scipy", "PIL", "imageio_ffmpeg", "pyvista", "vtk", "vtkmodules"}),
+    "rendering": frozenset({"scipy", "PIL", "skimage", "imageio_ffmpeg", "pyvista", "vtk", "vtkmodules"}),
     "phantom": frozenset({"scipy"}),
     "opencl": frozenset({"pyopencl"}),
     "operators": frozenset({"pyopencl", "SimpleITK", "skimage"}),

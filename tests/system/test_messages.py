@@ -20,6 +20,7 @@ from clrecon.jobs.mesh.settings import MeshSettings
 from clrecon.jobs.render.settings import RenderSettings
 from clrecon.labels import LabelMap
 from clrecon.mesh import Mesh
+from clrecon.mesh.compare.cells import GridCells
 from clrecon.operators.points.clusters import Clustering
 from clrecon.operators.points.neighbours import Neighbours
 from clrecon.phantom import PhantomSettings, phantom_truth
@@ -77,6 +78,7 @@ MESSAGES = {
     "curve cut": CurveCut(CURVE, kind="stretched"),
     "phantom settings": PhantomSettings(),
     "iso choice": half_iso_value(1000.0, 40.0),
+    "grid cells": GridCells([[0, -1, 2], [3, 4, 5]], "t-mc"),
     "gate": at_most("gap", 1.0, 2.0, "mm", "a gap"),
     "quality": TRIANGLE.quality(),
     "point cloud": CLOUD,

@@ -1,0 +1,302 @@
+"""The grid cells that a surface passes through, and how far two sets of them agree."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clrecon.errors import NoSurfaceError, UsageError
+from clrecon.exchange.coordinates import rounding_step
+from clrecon.geometry.grid import Grid
+from clrecon.mesh.compare.boxes import meets_box
+from clrecon.mesh.mesh import Mesh
+from clrecon.system.messages import Message
+from clrecon.system.pieces import chunks
+from clrecon.system.progress import Progress, ignore_progress
+from clrecon.system.records import Record
+
+__all__ = ["CellOverlap", "GridCells", "find_mesh_cells", "measure_cells"]
+
+_ROUNDINGS = 2.0
+"""Steps of the coordinates by which a triangle may reach into a cell without passing through it: vertices are rounded,
+and those of marching cubes stay four steps away from the samples."""
+
+_BITS, _FARTHEST = 21, 1 << 20
+"""Bits of a number of a cell for each axis, and the farthest cell from the grid's first that they hold."""
+
+_MOST_CANDIDATES = 64
+"""Triangles whose box meets more cells are divided into four, until none does."""
+
+_PIECE = 1 << 17
+"""Pairs of a triangle and a cell that are tested at once: about 100 MB."""
+
+IntArray = NDArray[np.int64]
+Triangles = NDArray[np.float64]
+"""Corners, shape (n, 3, 3): triangle, corner, axis."""
+
+
+class GridCells(Message):
+    """A set of grid cells: cubes between eight neighbouring voxel centres, numbered by their lowest corner.
+
+    Parameters
+    ----------
+    ijk : array_like, shape (n, 3), int
+        Lowest corners; those beside the voxels, such as -1, belong to the border of a closed volume or lie outside.
+    name : str
+        What the set is, for reports: "t-mc", "truth".
+
+    Raises
+    ------
+    UsageError
+        The shape or type is wrong, or a cell is more than a million voxels away.
+    """
+
+    def __init__(self, ijk: Any, name: str = ""):
+        corners = np.asarray(ijk)
+        if corners.size == 0:
+            corners = np.zeros((0, 3), np.int64)
+        if corners.ndim != 2 or corners.shape[1] != 3 or corners.dtype.kind not in "iu":
+            raise UsageError(
+                f"cells are whole numbers of shape (n, 3), these are {corners.dtype} of shape {corners.shape}"
+            )
+        self._keys = np.unique(_pack(corners.astype(np.int64)))
+        self._keys.flags.writeable = False
+        self.name = name
+
+    @property
+    def ijk(self) -> IntArray:
+        """Lowest corners, shape (n, 3), int64, each once, ordered by k, j, i."""
+        return _unpack(self._keys)
+
+    @property
+    def keys(self) -> IntArray:
+        """One number a cell, ascending, shape (n,), int64: for operations on sets."""
+        return self._keys
+
+    def __len__(self) -> int:
+        return len(self._keys)
+
+    def __repr__(self) -> str:
+        return f"GridCells({len(self)} cells{f' of {self.name}' if self.name else ''})"
+
+
+def _pack(ijk: IntArray) -> IntArray:
+    if ijk.size and (ijk.min() < -_FARTHEST or ijk.max() >= _FARTHEST):
+        raise UsageError(
+            f"cells lie between {ijk.min(axis=0).tolist()} and {ijk.max(axis=0).tolist()}, more than {_FARTHEST} from"
+            " the first voxel: the surface does not belong to this grid"
+        )
+    i, j, k = (ijk + _FARTHEST).T
+    return np.asarray(k << 2 * _BITS | j << _BITS | i)
+
+
+def _unpack(keys: IntArray) -> IntArray:
+    mask = (1 << _BITS) - 1
+    return np.stack([(keys >> (axis * _BITS) & mask) - _FARTHEST for axis in range(3)], axis=1)
+
+
+@dataclass(frozen=True, eq=False)
+class CellOverlap(Record):
+    """How far the cells of a surface agree with those of a reference.
+
+    Attributes
+    ----------
+    reference : str
+        Name of the reference set.
+    cells, reference_cells, common_cells : int
+        Cells of the surface, of the reference, and of both.
+    cells_outside : int
+        Cells of the surface outside of the grid and its border of one voxel.
+    recall : float
+        Share of the reference's cells that the surface passes through: the repetition rate of characteristic voxels
+        of Liu et al. 2019.
+    precision : float
+        Share of the surface's cells that are the reference's too.
+    dice, jaccard : float
+        2 common / (cells + reference cells); common / all cells of either.
+    """
+
+    reference: str
+    cells: int
+    reference_cells: int
+    common_cells: int
+    cells_outside: int
+    recall: float
+    precision: float
+    dice: float
+    jaccard: float
+
+
+def find_mesh_cells(mesh: Mesh, grid: Grid, *, name: str = "", progress: Progress | None = None) -> GridCells:
+    """Find the grid cells that the triangles of a mesh pass through.
+
+    The test of triangle and cell is exact (separating axes), in index coordinates, so that sheared, tilted and uneven
+    grids are served too.  A triangle passes through a cell when it reaches farther into it than coordinates are
+    rounded.  One that lies in the plane between two cells belongs to the upper one.
+
+    Parameters
+    ----------
+    mesh : Mesh
+    grid : Volume or LabelMap
+        The voxels between whose centres the cells lie.
+    name : str
+        Of the set.
+    progress : callable, optional
+        Called as ``progress("cells", triangles done, all triangles)``.
+
+    Returns
+    -------
+    GridCells
+
+    Raises
+    ------
+    UsageError
+        An index of a triangle or a coordinate is wrong, or the mesh reaches farther beyond the grid than the grid is
+        large.
+
+    References
+    ----------
+    Akenine-Moller 2001, "Fast 3D triangle-box overlap testing", Journal of Graphics Tools 6(1).
+    """
+    mesh.check()
+    if mesh.triangle_count == 0:
+        return GridCells([], name)
+    margin = _ROUNDINGS * rounding_step(mesh.vertices) / min(grid.spacing)
+    ijk = grid.lps_to_ijk(mesh.vertices)
+    _check_place(ijk, grid)
+    told = progress or ignore_progress
+    found = []
+    for where in chunks(mesh.triangle_count, _PIECE):
+        told("cells", where.start, mesh.triangle_count)
+        found += [np.unique(_pack(cells)) for cells in _cells_of(ijk[mesh.triangles[where]], min(margin, 0.25))]
+    told("cells", mesh.triangle_count, mesh.triangle_count)
+    return GridCells(_unpack(np.unique(np.concatenate(found))), name)
+
+
+def _check_place(ijk: NDArray[np.float64], grid: Grid) -> None:
+    """Refuse a mesh that reaches farther beyond the grid than the grid is large: its cells could be any number."""
+    low, high, size = ijk.min(axis=0), ijk.max(axis=0), np.array(grid.shape_ijk) + 1
+    if (low < -size).any() or (high > 2 * size).any():
+        raise UsageError(
+            f"the mesh does not belong to this grid: it runs from {low.round(1).tolist()} to"
+            f" {high.round(1).tolist()} in voxels (i, j, k) of {list(grid.shape_ijk)}; see whether both are in the same"
+            " patient frame"
+        )
+
+
+def _cells_of(triangles: Triangles, margin: float) -> Iterator[IntArray]:
+    """Yield cells of triangles, shape (n, 3), some of them several times."""
+    corners = lifted = _lift_flat(triangles, margin)
+    owner = np.arange(len(corners))
+    reached = np.zeros(len(corners), dtype=bool)
+    while len(corners):
+        low = np.ceil(corners.min(axis=1) - 1.0 + margin).astype(np.int64)
+        size = np.maximum(np.floor(corners.max(axis=1) - margin).astype(np.int64) - low + 1, 0)
+        count = size.prod(axis=1)
+        one = count == 1
+        reached[owner[one]] = True
+        yield low[one]
+        several = np.flatnonzero((count > 1) & (count <= _MOST_CANDIDATES))
+        for cells, row in _tested(corners, low, size, several, margin):
+            reached[owner[row]] = True
+            yield cells
+        many = count > _MOST_CANDIDATES
+        corners, owner = _divide(corners[many]), np.repeat(owner[many], 4)
+    # Slivers along an edge between cells reach farther into none of them than coordinates are rounded.
+    yield np.floor(lifted[~reached].mean(axis=1)).astype(np.int64)
+
+
+def _lift_flat(corners: Triangles, margin: float) -> Triangles:
+    """Return triangles; those in a plane between cells are moved to the middle of the upper cells."""
+    plane = np.rint(corners[:, :1])
+    flat = (np.abs(corners - plane) <= margin).all(axis=1, keepdims=True)
+    return np.where(flat, plane + 0.5, corners)
+
+
+def _divide(corners: Triangles) -> Triangles:
+    """Return the four triangles between corners and middles of edges of each, shape (4 n, 3, 3)."""
+    a, b, c = (corners[:, corner] for corner in range(3))
+    ab, bc, ca = 0.5 * (a + b), 0.5 * (b + c), 0.5 * (c + a)
+    parts = [np.stack(part, axis=1) for part in ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))]
+    return np.stack(parts, axis=1).reshape(-1, 3, 3)
+
+
+def _tested(
+    corners: Triangles, low: IntArray, size: IntArray, rows: IntArray, margin: float
+) -> Iterator[tuple[IntArray, IntArray]]:
+    """Yield the cells of some rows that pass the test, and their rows."""
+    step = _PIECE // _MOST_CANDIDATES * 8
+    for start in range(0, len(rows), step):
+        part = rows[start : start + step]
+        extent = size[part]
+        count = extent.prod(axis=1)
+        pair = np.repeat(np.arange(len(part)), count)
+        place = np.arange(len(pair)) - np.repeat(np.cumsum(count) - count, count)
+        ni, nj = extent[pair, 0], extent[pair, 1]
+        offset = np.stack([place % ni, place // ni % nj, place // (ni * nj)], axis=1)
+        cells = low[part][pair] + offset
+        meets = meets_box(corners[part[pair]] - (cells + 0.5)[:, None], 0.5 - margin)
+        yield cells[meets], part[pair[meets]]
+
+
+def measure_cells(
+    mesh: Mesh | GridCells,
+    reference: Mesh | GridCells,
+    grid: Grid,
+    *,
+    reference_name: str | None = None,
+    progress: Progress | None = None,
+) -> CellOverlap:
+    """Measure how far the grid cells of a surface agree with those of a reference.
+
+    Parameters
+    ----------
+    mesh, reference : Mesh or GridCells
+        Surfaces, or their cells where these are known (`find_mesh_cells`, `find_cut_cells`).
+    grid : Volume or LabelMap
+        The voxels between whose centres the cells lie.
+    reference_name : str, optional
+        Name of the reference in the result; by default that of its cells, or "reference".
+    progress : callable, optional
+        As in `find_mesh_cells`.
+
+    Returns
+    -------
+    CellOverlap
+
+    Raises
+    ------
+    NoSurfaceError
+        A set is empty.
+    UsageError
+        As `find_mesh_cells`; or the mesh lies wholly outside of the grid.
+    """
+    own = mesh if isinstance(mesh, GridCells) else find_mesh_cells(mesh, grid, progress=progress)
+    wanted = reference if isinstance(reference, GridCells) else find_mesh_cells(reference, grid, progress=progress)
+    for what, cells in (("surface", own), ("reference", wanted)):
+        if len(cells) == 0:
+            raise NoSurfaceError(f"the {what} passes through no cell: there is nothing to compare")
+    corners = own.ijk
+    outside = int(((corners < -1) | (corners >= np.array(grid.shape_ijk))).any(axis=1).sum())
+    if outside == len(own):
+        raise UsageError(
+            f"the mesh lies wholly outside of the grid: its cells run from {corners.min(axis=0).tolist()} to"
+            f" {corners.max(axis=0).tolist()}, those of the grid from -1 to {[n - 1 for n in grid.shape_ijk]}; see"
+            " whether both are in the same patient frame"
+        )
+    common = len(np.intersect1d(own.keys, wanted.keys, assume_unique=True))
+    return CellOverlap(
+        reference=reference_name or wanted.name or "reference",
+        cells=len(own),
+        reference_cells=len(wanted),
+        common_cells=common,
+        cells_outside=outside,
+        recall=common / len(wanted),
+        precision=common / len(own),
+        dice=2.0 * common / (len(own) + len(wanted)),
+        jaccard=common / (len(own) + len(wanted) - common),
+    )

@@ -1,0 +1,197 @@
+"""A mesh cut into slices again, against the voxels that it was made from."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clrecon.errors import NoSurfaceError, UsageError
+from clrecon.geometry import Volume
+from clrecon.geometry.iso_rule import IsoRule, choose_iso_rule
+from clrecon.mesh.compare.parity import Lattice, find_piercings
+from clrecon.mesh.mesh import Mesh
+from clrecon.system.progress import Progress, ignore_progress
+from clrecon.system.records import Record
+
+__all__ = ["FINER", "OFFSETS", "SliceOverlap", "measure_slices"]
+
+FINER = 3
+"""Points of the lattice for each voxel, along each axis."""
+
+OFFSETS = (0.137, 0.271, 0.389)
+"""Where the lattice begins, in its own steps along i, j, k: off the planes of the voxels and of each other."""
+
+_MOST_ODD = 0.01
+"""Share of the rows with the mesh that it may pierce an odd number of times before it is refused as open."""
+
+
+@dataclass(frozen=True, eq=False)
+class SliceOverlap(Record):
+    """How far a mesh, filled in slices, agrees with the voxels' trilinear HU.
+
+    Attributes
+    ----------
+    dice : float
+        2 common / (points in the mesh + points in the HU) on the fine lattice.
+    voxel_dice : float
+        The same on the voxels' own lattice.  It cannot see where on its edge a vertex lies.
+    finer : int
+        Points of the fine lattice for each voxel and axis.
+    points_mesh, points_hu, points_common : int
+        Points of the fine lattice inside of the mesh, at the level or above, and both.
+    rows_odd : int
+        Rows of the fine lattice that the mesh pierces an odd number of times, where it is open; left out.
+    """
+
+    dice: float
+    voxel_dice: float
+    finer: int
+    points_mesh: int
+    points_hu: int
+    points_common: int
+    rows_odd: int
+
+
+def measure_slices(
+    mesh: Mesh,
+    volume: Volume,
+    iso_value: float,
+    *,
+    closed: bool = True,
+    finer: int = FINER,
+    offsets: Sequence[float] = OFFSETS,
+    progress: Progress | None = None,
+) -> SliceOverlap:
+    """Cut a mesh into slices again and compare them with the HU, on a lattice finer than the voxels and off their
+    planes.
+
+    A point of the lattice is in the mesh when a row of the lattice has pierced it an odd number of times before.  A
+    row that runs through an edge or a vertex pierces one of the triangles there, by half-open intervals.  A point is
+    in the bone when the trilinear HU reach the level.
+
+    Parameters
+    ----------
+    mesh : Mesh
+        Closed; the patient frame is that of the volume.
+    volume : Volume
+        The voxels, uneven ones too.
+    iso_value : float
+        HU, that of the mesh.
+    closed : bool
+        The mesh was closed where it leaves the volume: see `extract_isosurface`.
+    finer : int
+        Points of the lattice for each voxel and axis, 1 to 16.
+    offsets : three floats
+        Where the lattice begins, in its own steps along i, j, k, from 0 to below 1.
+    progress : callable, optional
+        Called as ``progress("slices", slices done, all slices)``.
+
+    Returns
+    -------
+    SliceOverlap
+
+    Raises
+    ------
+    UsageError
+        The mesh is open: more than one row in a hundred is pierced an odd number of times.  Or an argument is wrong,
+        or the mesh lies wholly outside of the volume.
+    NoSurfaceError
+        The mesh is empty.
+    """
+    mesh.check()
+    if mesh.triangle_count == 0:
+        raise NoSurfaceError("a mesh without triangles has no slices")
+    shifts = _check_lattice(finer, offsets)
+    if np.ndim(iso_value):
+        raise UsageError(f"slices are compared at one iso value, not at {iso_value!r}")
+    rule = choose_iso_rule(volume, iso_value, closed)
+    ijk = volume.lps_to_ijk(mesh.vertices)
+    _check_place(ijk, volume, rule)
+    told = progress or ignore_progress
+    fine = Lattice.over(volume, rule, int(finer), shifts)
+    own = Lattice.over(volume, rule, 1, (0.0, 0.0, 0.0))
+    planes = fine.shape_ijk[2] + own.shape_ijk[2]
+    counts = _count(ijk, mesh.triangles, volume, rule, fine, lambda done: told("slices", done, planes))
+    blind = _count(
+        ijk, mesh.triangles, volume, rule, own, lambda done: told("slices", fine.shape_ijk[2] + done, planes)
+    )
+    told("slices", planes, planes)
+    return SliceOverlap(
+        dice=counts.dice,
+        voxel_dice=blind.dice,
+        finer=int(finer),
+        points_mesh=counts.mesh,
+        points_hu=counts.hu,
+        points_common=counts.common,
+        rows_odd=counts.odd,
+    )
+
+
+def _check_lattice(finer: int, offsets: Sequence[float]) -> tuple[float, float, float]:
+    if isinstance(finer, bool) or not isinstance(finer, int | np.integer) or not 1 <= finer <= 16:
+        raise UsageError(f"the lattice is a whole number of times finer than the voxels, 1 to 16, not {finer!r}")
+    if len(offsets) != 3 or not all(0.0 <= offset < 1.0 for offset in offsets):
+        raise UsageError(f"the lattice has three offsets from 0 to below 1, not {tuple(offsets)}")
+    return float(offsets[0]), float(offsets[1]), float(offsets[2])
+
+
+def _check_place(ijk: NDArray[np.float64], volume: Volume, rule: IsoRule) -> None:
+    low, high = ijk.min(axis=0), ijk.max(axis=0)
+    if (high < -rule.border).any() or (low > np.array(volume.shape_ijk) - 1 + rule.border).any():
+        raise UsageError(
+            f"the mesh lies outside of the volume: it runs from {low.round(1).tolist()} to {high.round(1).tolist()} in"
+            f" voxels (i, j, k) of {list(volume.shape_ijk)}; see whether both are in the same patient frame"
+        )
+
+
+@dataclass
+class _Counts:
+    mesh: int = 0
+    hu: int = 0
+    common: int = 0
+    odd: int = 0
+    rows: int = 0
+
+    @property
+    def dice(self) -> float:
+        both = self.mesh + self.hu
+        return 2.0 * self.common / both if both else 0.0
+
+
+def _count(
+    ijk: NDArray[np.float64],
+    triangles: NDArray[np.uint32],
+    volume: Volume,
+    rule: IsoRule,
+    lattice: Lattice,
+    told: Callable[[int], None],
+) -> _Counts:
+    """Count the points of a lattice that are in the mesh, in the HU, and in both, plane by plane."""
+    counts = _Counts()
+    keys = find_piercings(ijk, triangles, lattice)
+    ni, nj, nk = lattice.shape_ijk
+    begin = np.searchsorted(keys, np.arange(nk + 1, dtype=np.int64) * nj * (ni + 1))
+    fields = lattice.planes(volume, rule)
+    for k, hu in enumerate(fields):
+        toggles = np.zeros((nj, ni + 1), dtype=np.uint8)
+        toggles.reshape(-1)[keys[begin[k] : begin[k + 1]] - k * nj * (ni + 1)] = 1
+        counts.rows += int(toggles.any(axis=1).sum())
+        filled = np.bitwise_xor.accumulate(toggles, axis=1).view(bool)
+        odd = filled[:, -1]
+        inside = filled[:, :-1]
+        if odd.any():
+            counts.odd += int(odd.sum())
+            inside, hu = inside[~odd], hu[~odd]
+        counts.mesh += int(np.count_nonzero(inside))
+        counts.hu += int(np.count_nonzero(hu))
+        counts.common += int(np.count_nonzero(inside & hu))
+        told(k)
+    if counts.odd > _MOST_ODD * counts.rows:
+        raise UsageError(
+            f"the mesh is open: {counts.odd} of {counts.rows} rows through it pierce it an odd number of times, and"
+            " what lies inside is not defined; close it first"
+        )
+    return counts

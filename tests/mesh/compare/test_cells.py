@@ -1,0 +1,143 @@
+"""Cells of shapes that are counted by hand."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+import sample_meshes as samples
+
+from clrecon.errors import NoSurfaceError, UsageError
+from clrecon.geometry import Volume
+from clrecon.mesh import Mesh
+from clrecon.mesh.compare.boxes import meets_box
+from clrecon.mesh.compare.cells import GridCells, find_mesh_cells, measure_cells
+
+pytestmark = pytest.mark.unit
+
+SHEARED = np.array([[0.7, 0.1, 0.2, -25.0], [-0.1, 0.9, 0.4, -30.0], [0.0, 0.05, 2.5, -84.0], [0, 0, 0, 1.0]])
+
+
+def grid(shape=(12, 12, 12), affine=None) -> Volume:
+    return Volume(np.zeros(shape, np.int16), np.eye(4) if affine is None else affine)
+
+
+def placed(mesh: samples.Arrays, on: Volume) -> Mesh:
+    return Mesh(on.ijk_to_lps(mesh[0]), mesh[1])
+
+
+def cells_of(mesh: samples.Arrays, on: Volume) -> set[tuple[int, ...]]:
+    return set(map(tuple, find_mesh_cells(placed(mesh, on), on).ijk.tolist()))
+
+
+def shell(low: int, high: int) -> set[tuple[int, ...]]:
+    """Cells of a cube's faces: from `low` to `high`, both included, along each axis."""
+    every = itertools.product(range(low, high + 1), repeat=3)
+    return {cell for cell in every if any(n in (low, high) for n in cell)}
+
+
+@pytest.mark.parametrize("affine", [np.eye(4), SHEARED], ids=["even", "sheared"])
+def test_a_box_passes_through_the_shell_of_its_cells(affine):
+    on = grid(affine=affine)
+    assert cells_of(samples.box((2.5,) * 3, (5.0,) * 3), on) == shell(2, 7)
+    assert cells_of(samples.box((2.25,) * 3, (0.5,) * 3), on) == {(2, 2, 2)}
+
+
+def test_faces_between_cells_belong_to_the_upper_ones():
+    low, high = 2, 7
+    wanted = set()
+    for axis, plane in itertools.product(range(3), (low, high)):
+        for u, v in itertools.product(range(low, high), repeat=2):
+            cell = [u, v]
+            cell.insert(axis, plane)
+            wanted.add(tuple(cell))
+    assert cells_of(samples.box((2.0,) * 3, (5.0,) * 3), grid()) == wanted
+
+
+def test_a_diagonal_plane_passes_beside_the_corners_it_touches():
+    # x + y + z = 4: the cells whose lowest corner has the sum 2 or 3, its highest then 5 or 6
+    corners = np.array([[4.0, 0, 0], [0, 4, 0], [0, 0, 4]])
+    cells = cells_of((corners, np.array([[0, 1, 2]])), grid())
+    assert cells == {cell for cell in itertools.product(range(4), repeat=3) if sum(cell) in (2, 3)}
+
+
+def test_large_triangles_are_divided_without_loss():
+    rng = np.random.default_rng(5)
+    on = grid((16, 16, 16), SHEARED)
+    for corners in rng.uniform(0.5, 14.5, (3, 3, 3)):
+        every = itertools.product(*(range(int(n.min()), int(n.max()) + 1) for n in corners.T))
+        met = {cell for cell in every if clip(corners - np.array(cell) - 0.5).size}
+        assert cells_of((corners, np.array([[0, 1, 2]])), on) == met
+        assert len(met) > 64
+
+
+def test_boxes_are_met_as_clipped_polygons_are():
+    rng = np.random.default_rng(1)
+    corners = rng.normal(0.0, 0.8, (2000, 3, 3))
+    assert np.array_equal(meets_box(corners, 0.5), [clip(triangle).size > 0 for triangle in corners])
+
+
+def clip(polygon: np.ndarray) -> np.ndarray:
+    """What is left of a polygon (n, 3) in the cube from -0.5 to 0.5 (Sutherland and Hodgman 1974)."""
+    for axis, sign in itertools.product(range(3), (1.0, -1.0)):
+        kept = []
+        for here, after in zip(polygon, np.roll(polygon, -1, axis=0), strict=True):
+            depth, later = 0.5 - sign * here[axis], 0.5 - sign * after[axis]
+            if depth >= 0.0:
+                kept.append(here)
+            if depth * later < 0.0:
+                kept.append(here + depth / (depth - later) * (after - here))
+        if not kept:
+            return np.zeros((0, 3))
+        polygon = np.array(kept)
+    return polygon
+
+
+def test_overlap_is_counted():
+    one = GridCells([[0, 0, 0], [1, 0, 0], [2, 0, 0], [2, 0, 0]])
+    other = GridCells([[1, 0, 0], [2, 0, 0], [3, 0, 0], [4, 0, 0], [-1, 0, 0]], "t-mc")
+    found = measure_cells(one, other, grid())
+    assert (found.cells, found.reference_cells, found.common_cells, found.reference) == (3, 5, 2, "t-mc")
+    assert (found.recall, found.precision, found.dice, found.jaccard) == pytest.approx((2 / 5, 2 / 3, 4 / 8, 2 / 6))
+    assert measure_cells(other, one, grid()).recall == pytest.approx(2 / 3)
+
+
+def test_cells_keep_their_corners():
+    corners = [[5, -1, 2], [0, 0, -70], [900_000, 3, 0]]
+    assert sorted(GridCells(corners).ijk.tolist()) == sorted(corners)
+    assert len(GridCells([])) == 0
+    assert repr(GridCells(corners, "truth")) == "GridCells(3 cells of truth)"
+
+
+def test_what_cannot_be_compared_is_refused():
+    on, empty = grid(), Mesh(np.zeros((0, 3)), np.zeros((0, 3), np.uint32))
+    box = placed(samples.box((2.5,) * 3, (5.0,) * 3), on)
+    far = placed(samples.box((14.5,) * 3, (5.0,) * 3), on)
+    with pytest.raises(NoSurfaceError, match="the surface passes through no cell"):
+        measure_cells(empty, box, on)
+    with pytest.raises(NoSurfaceError, match="the reference passes through no cell"):
+        measure_cells(box, empty, on)
+    with pytest.raises(UsageError, match=r"wholly outside .* from \[14, 14, 14\] to \[19, 19, 19\]"):
+        measure_cells(far, box, on)
+    with pytest.raises(UsageError, match="does not belong to this grid"):
+        find_mesh_cells(Mesh([[0, 0, 0], [3e6, 0, 0], [0, 1, 0]], [[0, 1, 2]]), on)
+    with pytest.raises(UsageError, match="more than 1048576 from the first voxel"):
+        GridCells([[0, 0, 1 << 20]])
+    with pytest.raises(UsageError, match="whole numbers of shape"):
+        GridCells([[0.5, 1, 2]])
+
+
+def test_cells_beyond_the_grid_are_counted():
+    on = grid((6, 6, 6))
+    found = measure_cells(placed(samples.box((2.5,) * 3, (5.0,) * 3), on), GridCells([[2, 2, 2]]), on)
+    inside = {cell for cell in shell(2, 7) if max(cell) < 6}
+    assert found.cells_outside == found.cells - len(inside)
+    assert found.common_cells == 1
+
+
+def test_progress_is_told():
+    told = []
+    on = grid()
+    find_mesh_cells(placed(samples.box(), on), on, progress=lambda *what: told.append(what))
+    assert told == [("cells", 0, 12), ("cells", 12, 12)]

@@ -1,0 +1,73 @@
+"""Meshes that are cut into slices again."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import sample_meshes as samples
+
+from clrecon.errors import NoSurfaceError, UsageError
+from clrecon.geometry import Volume
+from clrecon.mesh import Mesh
+from clrecon.mesh.compare.slices import measure_slices
+
+pytestmark = pytest.mark.unit
+
+SHEARED = np.array([[0.7, 0.1, 0.2, -25.0], [-0.1, 0.9, 0.4, -30.0], [0.0, 0.05, 2.5, -84.0], [0, 0, 0, 1.0]])
+
+
+def block(affine=None, low=3, high=8, size=12) -> Volume:
+    """Voxels of 100 HU from `low` to `high` along each axis, 0 HU around them."""
+    voxels = np.zeros((size,) * 3, np.float32)
+    voxels[low : high + 1, low : high + 1, low : high + 1] = 100.0
+    return Volume(voxels, np.eye(4) if affine is None else affine)
+
+
+def placed(mesh: samples.Arrays, on: Volume) -> Mesh:
+    return Mesh(on.ijk_to_lps(mesh[0]), mesh[1])
+
+
+@pytest.mark.parametrize("affine", [np.eye(4), SHEARED], ids=["even", "sheared"])
+@pytest.mark.parametrize("finer", [1, 2, 3, 5])
+def test_points_in_a_box_are_counted(affine, finer):
+    on = block(affine)
+    offsets = (0.137, 0.271, 0.389)
+    found = measure_slices(placed(samples.box((2.6,) * 3, (5.8,) * 3), on), on, 50.0, finer=finer, offsets=offsets)
+    places = [(np.arange(-99, 99) + offset) / finer for offset in offsets]
+    assert found.points_mesh == np.prod([((2.6 < place) & (place < 8.4)).sum() for place in places])
+    assert found.rows_odd == 0
+    assert found.voxel_dice == 1.0
+    assert found.dice == 2.0 * found.points_common / (found.points_mesh + found.points_hu)
+
+
+def test_rows_through_edges_and_vertices_pierce_once():
+    # corners, edges and the diagonals of faces lie on points of the lattice
+    on = block()
+    found = measure_slices(placed(samples.box((3.0,) * 3, (5.0,) * 3), on), on, 50.0, finer=1, offsets=(0, 0, 0))
+    assert found.points_mesh == 5**3  # half open: from 3 up to, but without, 8
+    assert found.rows_odd == 0
+    pyramid = samples.sphere((5.0, 5.0, 5.0), 3.0, 0)
+    assert measure_slices(placed(pyramid, on), on, 50.0, finer=2, offsets=(0, 0, 0)).rows_odd == 0
+
+
+def test_an_open_mesh_is_refused():
+    on = block()
+    vertices, triangles = samples.box((2.6,) * 3, (5.8,) * 3)
+    faced = np.flatnonzero(np.ptp(vertices[triangles][:, :, 0], axis=1) == 0.0)  # across the rows
+    with pytest.raises(UsageError, match=r"the mesh is open: \d+ of \d+ rows through it pierce"):
+        measure_slices(placed((vertices, np.delete(triangles, faced[0], axis=0)), on), on, 50.0)
+
+
+def test_what_cannot_be_sliced_is_refused():
+    on, empty = block(), Mesh(np.zeros((0, 3)), np.zeros((0, 3), np.uint32))
+    box = placed(samples.box((2.6,) * 3, (5.8,) * 3), on)
+    with pytest.raises(NoSurfaceError, match="without triangles"):
+        measure_slices(empty, on, 50.0)
+    with pytest.raises(UsageError, match="outside of the volume"):
+        measure_slices(placed(samples.box((2.6, 30.0, 2.6), (5.8,) * 3), on), on, 50.0)
+    with pytest.raises(UsageError, match="1 to 16, not 0"):
+        measure_slices(box, on, 50.0, finer=0)
+    with pytest.raises(UsageError, match="three offsets"):
+        measure_slices(box, on, 50.0, offsets=(0.1, 0.2, 1.0))
+    with pytest.raises(UsageError, match="at one iso value"):
+        measure_slices(box, on, (50.0, 70.0))
