@@ -147,6 +147,48 @@ INVERSIONS: dict[str, dict[str, tuple[tuple[str, str], ...]]] = {
         "image": (("= finish_color((float4)(color", "= (uchar4)(255) - finish_color((float4)(color"),),
         "depths": (("? depth * length_of_ray : depth;", "? -depth * length_of_ray : -depth;"),),
     },
+    "place_vertices": {"placed": (("placed[3 * vertex + axis] = (", "placed[3 * vertex + axis] = -("),)},
+    "count_pieces": {"pieces": (("? 0 : count_across(b.left", "? 0 : ~count_across(b.left"),)},
+    "draw_triangles": {
+        "keys": (("atomic_min(keys", "atomic_max(keys"),),
+        "numbers": (("atomic_min(numbers + at, number)", "atomic_min(numbers + at, ~number)"),),
+    },
+    "draw_pieces": {
+        "keys": (
+            ("draw_box(&c, &b, view[EYE_PIXEL], first + triangle", "draw_box(&c, &b, view[EYE_PIXEL], ~triangle"),
+        ),
+        "numbers": (("first + triangle, planes", "~(first + triangle), planes"),),
+    },
+    "shade_triangles": {
+        "keys": (("keys[at] = EMPTY;", "keys[at] = 0u;"),),
+        "layer": (("layer[at] = (float4)(rgb,", "layer[at] = (float4)(1.0f - rgb,"),),
+        "layer_depths": (("= m.depth * length_of_ray", "= -m.depth * length_of_ray"),),
+    },
+    "clear_rays": {
+        "states": (("states[2 * at] = (float4)(0.0f);", "states[2 * at] = (float4)(1.0f);"),),
+        "marks": (("marks[at] = (float4)(NO_HIT, 0", "marks[at] = (float4)(1.0f, 0"),),
+        "floor_keys": (("floor_keys[at] = 0;", "floor_keys[at] = EMPTY;"),),
+    },
+    "fill_depths": {"depths": (("= depth;", "= -depth;"),)},
+    "begin_layer": {
+        "keys": (("keys[at] = key;", "keys[at] = ~key;"),),
+        "numbers": (("numbers[at] = EMPTY;", "numbers[at] = 0u;"),),
+    },
+    "show_still": {
+        "keys": (("keys[at] = EMPTY;", "keys[at] = 0u;"),),
+        "layer": (("layer[at] = convert_float4(seen) / 255.0f", "layer[at] = 1.0f - convert_float4(seen) / 255.0f"),),
+        "layer_depths": (("= still_depths[at];", "= -still_depths[at];"),),
+    },
+    "blend_layer": {
+        "states": (("seen.xyz += weight", "seen.xyz -= weight"),),
+        "marks": (("mark.y += weight", "mark.y -= weight"),),
+    },
+    "count_open": {"open": (("atomic_add(open, found);", "atomic_add(open, found - found);"),)},
+    "finish_rays": {
+        "image": (IMAGE,),
+        "depths": (("depths[at] = first;", "depths[at] = -first;"),),
+        "means": (("? NAN : (mark.y", "? NAN : -(mark.y"),),
+    },
     "reformat_rows": {
         "values": (("values[pixel] = value;", "values[pixel] = -value;"),),
         "weights": (("weights[pixel] = weight;", "weights[pixel] = -weight;"),),

@@ -19,22 +19,14 @@
  *
  * A parallel camera sees a disc of radius r as a disc of that radius in mm.  A perspective one sees it at depth z across
  * the view: a pixel's ray passes there z * d mm beside the middle of the view, d being the pixel's tangent. */
+#include "rays/eye.h"
 #include "rays/shade.h"
 #include "rays/view.h"
 
 #pragma OPENCL FP_CONTRACT OFF
 
-#define EMPTY 0xffffffffu /* key and number of a pixel without a point */
 #define LEAST_PIXELS 0.7072f /* least radius of a disc: it reaches the centre of the pixel that its point falls in */
 #define MOST_PIXELS 128.0f /* and its largest */
-#define NEAREST_MM 1e-3f /* what is nearer to a perspective camera, or behind it, is not seen */
-
-#define SPLAT_RIGHT 0 /* xyz: unit vectors of the camera, LPS; w: what makes coordinates count from its position */
-#define SPLAT_UP 1
-#define SPLAT_FORWARD 2
-#define SPLAT_PIXEL 3 /* x: side of a pixel, mm or tangent; y, z: half the width and height in pixels; w: 1 in perspective */
-#define SPLAT_LIGHT 4 /* as VIEW_LIGHT */
-#define SPLAT_PHONG 5 /* as VIEW_PHONG */
 
 #define UNSHADED_POINTS 0 /* how points are shaded */
 #define SHADED_BY_NORMALS 1
@@ -53,8 +45,8 @@ typedef struct {
 static inline disc place_disc(__global const float *points, const size_t point, __global const float4 *view,
     const float radius, const int width, const int height)
 {
-    const float4 right = view[SPLAT_RIGHT], up = view[SPLAT_UP], forward = view[SPLAT_FORWARD];
-    const float4 pixel = view[SPLAT_PIXEL];
+    const float4 right = view[EYE_RIGHT], up = view[EYE_UP], forward = view[EYE_FORWARD];
+    const float4 pixel = view[EYE_PIXEL];
     const float x = points[3 * point], y = points[3 * point + 1], z = points[3 * point + 2];
     disc d;
     d.x = ((right.x * x + right.y * y) + right.z * z) + right.w;
@@ -85,15 +77,6 @@ static inline int covers(const disc *d, const float4 pixel, const int column, co
     return to_x * to_x + to_y * to_y <= d->reach * d->reach;
 }
 
-/* Bits that are ordered as the numbers are, those below 0 too. */
-static inline uint key_of(const float depth)
-{
-    const uint bits = as_uint(depth);
-    return bits & 0x80000000u ? ~bits : bits | 0x80000000u;
-}
-
-static inline float depth_of(const uint key) { return as_float(key & 0x80000000u ? key & 0x7fffffffu : ~key); }
-
 /* Parameters  keys, numbers  out  (pixels) EMPTY
  *             pixels
  * Launch      global = pixels rounded up by the host, any local
@@ -108,7 +91,7 @@ __kernel void clear_splats(__global uint *restrict keys, __global uint *restrict
 }
 
 /* Parameters  points  in      (count, 3) mm, LPS from the base of the view's table
- *             view    in      (6) float4, see SPLAT_RIGHT and what follows it
+ *             view    in      (6) float4, see rays/eye.h
  *             keys    in/out  (height, width) least key of a depth so far
  *             radius  of the discs, mm
  *             count   points
@@ -123,7 +106,7 @@ __kernel void splat_depths(
     if (point >= count)
         return;
     const disc d = place_disc(points, point, view, radius, width, height);
-    const float4 pixel = view[SPLAT_PIXEL];
+    const float4 pixel = view[EYE_PIXEL];
     const uint key = key_of(d.depth);
     for (int row = d.top; row < d.bottom; ++row)
         for (int column = d.left; column < d.right; ++column)
@@ -146,7 +129,7 @@ __kernel void splat_numbers(
     if (point >= count)
         return;
     const disc d = place_disc(points, point, view, radius, width, height);
-    const float4 pixel = view[SPLAT_PIXEL];
+    const float4 pixel = view[EYE_PIXEL];
     const uint key = key_of(d.depth);
     for (int row = d.top; row < d.bottom; ++row)
         for (int column = d.left; column < d.right; ++column) {
@@ -206,15 +189,13 @@ __kernel void shade_splats(
     }
     if (number < first || number - first >= count)
         return;
-    const float4 pixel = view[SPLAT_PIXEL];
+    const float4 pixel = view[EYE_PIXEL];
     const int column = (int)(at % (uint)width), row = (int)(at / (uint)width);
-    const float aside = (((float)column + 0.5f) - pixel.y) * pixel.x, upwards = (pixel.z - ((float)row + 0.5f)) * pixel.x;
-    const float3 ray = view[SPLAT_FORWARD].xyz
-        + (pixel.w > 0.0f ? aside * view[SPLAT_RIGHT].xyz + upwards * view[SPLAT_UP].xyz : (float3)(0.0f));
+    const float3 ray = find_ray(view, column, row);
     const float length_of_ray = sqrt(dot(ray, ray)), depth = depth_of(keys[at]);
     float3 color = convert_float3(colors[number - first].xyz) / 255.0f;
     if (shading == SHADED_BY_NORMALS)
-        color = shade_place(view[SPLAT_PHONG], view[SPLAT_LIGHT], highlights, color,
+        color = shade_place(view[EYE_PHONG], view[EYE_LIGHT], highlights, color,
             vload3(number - first, normals), ray / length_of_ray);
     else if (shading == SHADED_BY_DEPTHS)
         color *= find_eye_dome(keys, pixel, depth, column, row, apart, width, height);

@@ -32,6 +32,23 @@ def torus(rings: int = 15, sides: int = 8, major: float = 20.0, minor: float = 6
     return vertices, np.concatenate([np.column_stack([one, two, three]), np.column_stack([one, three, four])])
 
 
+def ball(radius: float, rings: int = 90) -> Arrays:
+    """Return a ball about the origin whose vertices lie on the sphere, `rings` bands from pole to pole."""
+    polar = np.linspace(0.0, np.pi, rings + 1)[1:-1, None]
+    around = np.linspace(0.0, 2.0 * np.pi, 2 * rings, endpoint=False)
+    bands = np.stack([np.sin(polar) * np.cos(around), np.sin(polar) * np.sin(around), np.cos(polar) + 0.0 * around], -1)
+    vertices = radius * np.concatenate([[(0.0, 0.0, 1.0)], bands.reshape(-1, 3), [(0.0, 0.0, -1.0)]])
+    width, last = 2 * rings, len(vertices) - 1
+    one = 1 + np.arange(width)
+    two = 1 + (np.arange(width) + 1) % width
+    caps = [np.stack([0 * one, one, two], axis=1)]
+    for band in range(rings - 2):
+        a, b = one + band * width, two + band * width
+        caps += [np.stack([a, a + width, b], axis=1), np.stack([b, a + width, b + width], axis=1)]
+    caps.append(np.stack([0 * one + last, two + (rings - 2) * width, one + (rings - 2) * width], axis=1))
+    return vertices, np.concatenate(caps)
+
+
 def torus_volume_ml(rings: int = 15, sides: int = 8, major: float = 20.0, minor: float = 6.0) -> float:
     """Volume within the triangles of `torus`, from its cross sections: independent of the divergence theorem.
 

@@ -27,6 +27,7 @@ from clrecon.phantom import PhantomSettings, phantom_truth
 from clrecon.points import PointCloud, PointStep
 from clrecon.rendering import Lighting, Rendering, TransferFunction
 from clrecon.rendering.looks.label_style import LabelStyle
+from clrecon.rendering.pictures.mesh_look import MeshLook
 from clrecon.rendering.pictures.styles import (
     CurveCut,
     PlaneCut,
@@ -87,6 +88,7 @@ MESSAGES = {
     "nearest points": Neighbours(np.zeros((2, 1), np.int32), np.zeros((2, 1), np.float32)),
     "noise": Noise(12.5, 40, 9),
     "truth of a phantom": phantom_truth(PhantomSettings(kind="sphere", size=(16, 16), slices=16)),
+    "mesh look": MeshLook(vertex_colors=np.zeros((2, 3), np.uint8), opacity=0.5),
     "point look": PointLook(radius_mm=0.5, color_by="label"),
     "listing": SeriesListing([ENTRY], 1, {}, [], {"slices": 4}, RefusedInputError("no")),
 }

@@ -11,9 +11,11 @@ import numpy as np
 from clrecon.errors import UsageError
 from clrecon.geometry import Volume
 from clrecon.geometry.grid import Grid
+from clrecon.mesh import Mesh
 from clrecon.opencl import Device
 from clrecon.operators.rays.point_pictures import PointPictures
 from clrecon.operators.rays.ray_pictures import take_picture
+from clrecon.operators.rays.scene import ScenePictures
 from clrecon.operators.rays.slices import overlay_slices
 from clrecon.operators.rays.surface import cast_surface
 from clrecon.operators.reformat.cut import cut_slice, reformat_curve
@@ -21,6 +23,7 @@ from clrecon.operators.resident.device_volume import DeviceVolume, take_volume
 from clrecon.points import PointCloud
 from clrecon.rendering import Rendering
 from clrecon.rendering.looks.colors import is_transparent
+from clrecon.rendering.pictures.mesh_look import MeshLook
 from clrecon.rendering.pictures.modes import check_known, find_style
 from clrecon.rendering.pictures.styles import (
     CurveCut,
@@ -110,6 +113,8 @@ class VolumeRenderer(Closing):
         style = find_style(style, look)
         if isinstance(style, PointLook):
             raise UsageError("mode points shows a point cloud, and this is a volume: make a cloud of it first")
+        if isinstance(style, MeshLook):
+            raise UsageError("mode mesh shows a mesh, and this is a volume: extract a surface first")
         place = _Place.checked(style, camera, view, up, zoom, view_angle)
         if isinstance(style, CurveCut):
             return self._reformat(style, place, size, background, progress)
@@ -241,8 +246,31 @@ def _render_cloud(
         return pictures.take(chosen, place.camera_for(pictures.box, size), size, ground, progress)
 
 
+def _render_mesh(
+    mesh: Mesh,
+    style: Style | str | None,
+    device: Device | str | int | None,
+    memory: int | None,
+    size: Sequence[int] | None,
+    background: str | Sequence[float],
+    progress: Progress | None,
+    look: dict[str, object],
+    **placing: Any,
+) -> Rendering:
+    """Make a picture of a mesh, whose mode is mesh."""
+    named = "mesh" if style is None and "mode" not in look else style
+    chosen = find_style(named, look)
+    if not isinstance(chosen, MeshLook):
+        raise UsageError(f"a mesh is shown in mode mesh, not in mode {chosen.mode}")
+    place = _Place.checked(chosen, **placing)
+    size = checked_size(DEFAULT_SIZE if size is None else size)
+    with ScenePictures([(mesh, chosen)], device=device, memory=memory) as pictures:
+        ground = None if is_transparent(background) else background
+        return pictures.take(place.camera_for(pictures.box, size), size, ground, progress)
+
+
 def render(
-    volume: Volume | DeviceVolume | PointCloud,
+    volume: Volume | DeviceVolume | PointCloud | Mesh,
     style: Style | str | None = None,
     *,
     camera: Camera | None = None,
@@ -257,20 +285,22 @@ def render(
     progress: Progress | None = None,
     **look: object,
 ) -> Rendering:
-    """Make a picture of a volume or of a point cloud.
+    """Make a picture of a volume, of a point cloud or of a mesh.
 
     >>> render(volume, SurfaceLook(300, color="orange"), view="left", size=(800, 600))
     >>> render(volume, preset="spine", view=(30, 15))
     >>> render(volume, "mip", window=(0, 1000))
     >>> render(cloud, color_by="label", view="left")
+    >>> render(mesh, MeshLook("orange", opacity=0.5), view="left")
 
     Parameters
     ----------
-    volume : Volume, DeviceVolume or PointCloud
+    volume : Volume, DeviceVolume, PointCloud or Mesh
     style : Style or str, optional
         What the picture shows: a `VolumeLook`, `Projection`, `SurfaceLook`, `SlicesInSpace`, `PlaneCut` or `CurveCut`,
-        of a point cloud a `PointLook`; or the name of a mode, see `clrecon.rendering.pictures.modes.MODES`.  Default:
-        volume rendering of bone, and of a cloud its points.
+        of a point cloud a `PointLook`, of a mesh a `MeshLook`; or the name of a mode, see
+        `clrecon.rendering.pictures.modes.MODES`.  Default: volume rendering of bone, of a cloud its points, and of a
+        mesh its triangles.
     camera : Camera, optional
         In place of `view`, `up`, `zoom` and `view_angle`, which are refused beside it.
     view : str or (azimuth, elevation), optional
@@ -303,13 +333,14 @@ def render(
     DeviceError
         No device, not enough memory, or the device fails.
     """
+    if not isinstance(volume, PointCloud | Mesh):
+        with VolumeRenderer(volume, device=device, memory=memory) as renderer:
+            return renderer.render(
+                style, camera=camera, view=view, up=up, zoom=zoom, view_angle=view_angle, size=size,
+                background=background, progress=progress, **look,
+            )  # fmt: skip
+    given = (style, device, memory, size, background, progress, look)
+    placing: dict[str, Any] = {"camera": camera, "view": view, "up": up, "zoom": zoom, "view_angle": view_angle}
     if isinstance(volume, PointCloud):
-        return _render_cloud(
-            volume, style, device, memory, size, background, progress, look,
-            camera=camera, view=view, up=up, zoom=zoom, view_angle=view_angle,
-        )  # fmt: skip
-    with VolumeRenderer(volume, device=device, memory=memory) as renderer:
-        return renderer.render(
-            style, camera=camera, view=view, up=up, zoom=zoom, view_angle=view_angle, size=size,
-            background=background, progress=progress, **look,
-        )  # fmt: skip
+        return _render_cloud(volume, *given, **placing)
+    return _render_mesh(volume, *given, **placing)

@@ -32,7 +32,7 @@ from clrecon.rendering.looks.colors import find_color
 from clrecon.rendering.views.camera import Camera
 from clrecon.system.progress import Progress
 
-__all__ = ["LARGEST_DISC", "SplatPicture", "draw_splats"]
+__all__ = ["LARGEST_DISC", "SplatPicture", "draw_splats", "eye_table"]
 
 LARGEST_DISC = kernel_number("rays/splats.cl", "MOST_PIXELS")
 """Largest radius of a disc in pixels."""
@@ -156,7 +156,7 @@ class _Splats:
     ):
         self.device, self.size, self.radius, self.lighting = device, size, np.float32(radius_mm), lighting
         self.shading = ("normals" if has_normals else "depths") if lighting.shades else "none"
-        self.table = _make_table(camera, size, lighting, np.zeros(3) if base is None else base)
+        self.table = eye_table(camera, size, lighting, np.zeros(3) if base is None else base)
         self.background = np.zeros(4, np.float32)
         if background is not None:
             self.background[:] = *find_color(background), 1.0
@@ -262,8 +262,8 @@ def _upload(device: Device, array: NDArray[Any], stopwatch: Stopwatch) -> Any:
         return upload(device, array if array.size else np.zeros(4, array.dtype))  # OpenCL has no empty buffers
 
 
-def _make_table(camera: Camera, size: tuple[int, int], lighting: Lighting, base: Float64Array) -> NDArray[np.float32]:
-    """Return the table (6, 4) of the view, see SPLAT_RIGHT in cl/rays/splats.cl."""
+def eye_table(camera: Camera, size: tuple[int, int], lighting: Lighting, base: Float64Array) -> NDArray[np.float32]:
+    """Return the table (6, 4) of the view, see cl/rays/eye.h."""
     width, height = size
     position = np.array(camera.position) - base
     rows = [(*axis, -(axis @ position)) for axis in camera.basis()]

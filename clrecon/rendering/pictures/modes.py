@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 from clrecon.errors import UsageError
 from clrecon.rendering.looks.presets import find_preset
+from clrecon.rendering.pictures.mesh_look import MeshLook
 from clrecon.rendering.pictures.styles import (
     CurveCut,
     PlaneCut,
@@ -41,19 +42,20 @@ MODES = {
     "slice": Mode(PlaneCut, "a plane through the volume in any direction, as thick as wanted"),
     "cpr": Mode(CurveCut, "curved planar reformation along a centre line"),
     "points": Mode(PointLook, "the points of a cloud, coloured by HU, label or what was removed"),
+    "mesh": Mode(MeshLook, "the triangles of a mesh, shaded"),
 }
 
 _RAYS = ("dvr", "mip", "minip", "mean", "drr", "surface", "slices")
-_CAMERAS = (*_RAYS, "points")
+_CAMERAS = (*_RAYS, "points", "mesh")
 
 _BESIDE = {
-    "preset": tuple(mode for mode in MODES if mode not in ("surface", "points")),
+    "preset": tuple(mode for mode in MODES if mode not in ("surface", "points", "mesh")),
     "transfer_function": ("mip", "minip", "mean", "drr"),
     "lighting": ("mip", "minip", "mean", "drr", "slices"),
     "zoom": (*_CAMERAS, "slice"),
     "view_angle": _CAMERAS,
     "letters": (*_CAMERAS, "slice"),
-    "depth": ("dvr", "mip", "minip", "surface", "slices", "slice", "points"),
+    "depth": ("dvr", "mip", "minip", "surface", "slices", "slice", "points", "mesh"),
     "values": ("mip", "minip", "mean", "drr", "slice", "cpr"),
     "turntable": _CAMERAS,
 }

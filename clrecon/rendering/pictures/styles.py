@@ -46,6 +46,7 @@ __all__ = [
     "Style",
     "SurfaceLook",
     "VolumeLook",
+    "style_field",
 ]
 
 _T = TypeVar("_T")
@@ -70,7 +71,7 @@ LOWEST_SHOWN_HU = -300.0
 """HU below this are transparent: air, lung and most things around a patient, so that slices behind are visible."""
 
 
-def _field(default: Any, check: Callable[[Any], Any], keyword: str | None = None) -> Any:
+def style_field(default: Any, check: Callable[[Any], Any], keyword: str | None = None) -> Any:
     """Declare a field with a check; `keyword` is its name in `render` if that differs."""
     return field(default=default, metadata={"check": check} | ({"keyword": keyword} if keyword else {}))
 
@@ -107,12 +108,12 @@ class Style:
 class _Labelled(Style):
     """Base of styles in which labels can look different."""
 
-    lighting: Lighting | None = _field(None, checks.instance_of("lighting", Lighting))
-    ray_step: float | None = _field(None, checks.ray_step)
-    clip: Clip | None = _field(None, checks.instance_of("clip", Clip))
-    labels: LabelMap | None = _field(None, checks.instance_of("labels", LabelMap))
-    label_colors: _ByLabel[_Color] | None = _field(None, checks.mapping("colours"))
-    label_opacity: _ByLabel[float] | None = _field(None, checks.mapping("opacities"))
+    lighting: Lighting | None = style_field(None, checks.instance_of("lighting", Lighting))
+    ray_step: float | None = style_field(None, checks.ray_step)
+    clip: Clip | None = style_field(None, checks.instance_of("clip", Clip))
+    labels: LabelMap | None = style_field(None, checks.instance_of("labels", LabelMap))
+    label_colors: _ByLabel[_Color] | None = style_field(None, checks.mapping("colours"))
+    label_opacity: _ByLabel[float] | None = style_field(None, checks.mapping("opacities"))
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -162,9 +163,9 @@ class VolumeLook(_Labelled):
 
     _mode: ClassVar[str] = "dvr"
 
-    transfer_function: TransferFunction | str = _field(DEFAULT_PRESET, checks.preset_or_function)
+    transfer_function: TransferFunction | str = style_field(DEFAULT_PRESET, checks.preset_or_function)
     _: KW_ONLY
-    jitter: bool = _field(False, partial(checks.flag, "jitter"))
+    jitter: bool = style_field(False, partial(checks.flag, "jitter"))
 
     @property
     def function(self) -> TransferFunction:
@@ -194,11 +195,13 @@ class Projection(Style):
         The part of space that is shown.
     """
 
-    kind: str = _field("mip", checks.one_of(PROJECTIONS, f"a projection is one of {', '.join(PROJECTIONS)}"), "mode")
+    kind: str = style_field(
+        "mip", checks.one_of(PROJECTIONS, f"a projection is one of {', '.join(PROJECTIONS)}"), "mode"
+    )
     _: KW_ONLY
-    window: Sequence[float] | None = _field(None, checked_window)
-    ray_step: float | None = _field(None, checks.ray_step)
-    clip: Clip | None = _field(None, checks.instance_of("clip", Clip))
+    window: Sequence[float] | None = style_field(None, checked_window)
+    ray_step: float | None = style_field(None, checks.ray_step)
+    clip: Clip | None = style_field(None, checks.instance_of("clip", Clip))
 
     @property
     def mode(self) -> str:
@@ -231,11 +234,11 @@ class SurfaceLook(_Labelled):
 
     _mode: ClassVar[str] = "surface"
 
-    iso_value: float = _field(DEFAULT_ISO_VALUE, checked_iso_value)
+    iso_value: float = style_field(DEFAULT_ISO_VALUE, checked_iso_value)
     _: KW_ONLY
-    color: _Color | None = _field(None, checks.color)
-    shadows: bool = _field(False, partial(checks.flag, "shadows"))
-    depth_cue: float | None = _field(
+    color: _Color | None = style_field(None, checks.color)
+    shadows: bool = style_field(False, partial(checks.flag, "shadows"))
+    depth_cue: float | None = style_field(
         None,
         checks.number("the depth cue is a share of the brightness from 0 to 1, not", lambda share: 0.0 <= share <= 1.0),
     )
@@ -277,19 +280,21 @@ class SlicesInSpace(Style):
 
     _mode: ClassVar[str] = "slices"
 
-    slices: int | Sequence[int] | None = _field(None, checks.slices)
+    slices: int | Sequence[int] | None = style_field(None, checks.slices)
     _: KW_ONLY
-    opacity: float = _field(
+    opacity: float = style_field(
         DEFAULT_OPACITY,
         checks.number("the opacity of a slice lies above 0 and up to 1, not at", lambda share: 0.0 < share <= 1.0),
         "slice_opacity",
     )
-    window: Sequence[float] | None = _field(None, checked_window)
-    transfer_function: TransferFunction | None = _field(None, checks.instance_of("transfer function", TransferFunction))
-    lowest_hu: float = _field(
+    window: Sequence[float] | None = style_field(None, checked_window)
+    transfer_function: TransferFunction | None = style_field(
+        None, checks.instance_of("transfer function", TransferFunction)
+    )
+    lowest_hu: float = style_field(
         LOWEST_SHOWN_HU, checks.number("the lowest HU that slices show is a number, not", lambda hu: True)
     )
-    clip: Clip | None = _field(None, checks.instance_of("clip", Clip))
+    clip: Clip | None = style_field(None, checks.instance_of("clip", Clip))
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -325,14 +330,14 @@ class PointLook(Style):
 
     _mode: ClassVar[str] = "points"
 
-    radius_mm: float | None = _field(None, partial(positive_mm, "the radius of points"))
-    color_by: str | None = _field(
+    radius_mm: float | None = style_field(None, partial(positive_mm, "the radius of points"))
+    color_by: str | None = style_field(
         None, checks.one_of(POINT_COLORS, f"points are coloured by one of {', '.join(POINT_COLORS)}")
     )
-    color: _Color | None = _field(None, checks.color)
-    window: Sequence[float] | None = _field(None, checked_window)
-    lighting: Lighting | None = _field(None, checks.instance_of("lighting", Lighting))
-    clip: Clip | None = _field(None, checks.instance_of("clip", Clip))
+    color: _Color | None = style_field(None, checks.color)
+    window: Sequence[float] | None = style_field(None, checked_window)
+    lighting: Lighting | None = style_field(None, checks.instance_of("lighting", Lighting))
+    clip: Clip | None = style_field(None, checks.instance_of("clip", Clip))
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -352,12 +357,12 @@ class PointLook(Style):
 class _Cut(Style):
     """Base of cuts through the volume; a thick one combines samples across it."""
 
-    thickness: float = _field(0.0, checked_thickness)
-    combine: str = _field(
+    thickness: float = style_field(0.0, checked_thickness)
+    combine: str = style_field(
         "mean", checks.one_of(COMBINATIONS, f"samples of a thick slice are combined by {', '.join(COMBINATIONS)}")
     )
-    window: Sequence[float] | None = _field(None, checked_window)
-    pixel_mm: float | None = _field(None, partial(positive_mm, "the size of a pixel"))
+    window: Sequence[float] | None = style_field(None, checked_window)
+    pixel_mm: float | None = style_field(None, partial(positive_mm, "the size of a pixel"))
 
 
 @dataclass(frozen=True)
@@ -381,7 +386,7 @@ class PlaneCut(_Cut):
     _mode: ClassVar[str] = "slice"
 
     _: KW_ONLY
-    offset_mm: float = _field(0.0, checked_offset)
+    offset_mm: float = style_field(0.0, checked_offset)
 
 
 @dataclass(frozen=True)
@@ -406,13 +411,15 @@ class CurveCut(_Cut):
 
     _mode: ClassVar[str] = "cpr"
 
-    curve: Curve | ArrayLike | str = _field(SPINE, checks.curve)
+    curve: Curve | ArrayLike | str = style_field(SPINE, checks.curve)
     _: KW_ONLY
-    kind: str = _field(
+    kind: str = style_field(
         "straightened", checks.one_of(CURVED_KINDS, f"a curved reformation is {' or '.join(CURVED_KINDS)}"), "cpr"
     )
-    angle: float = _field(0.0, checks.number("the angle of a straightened picture is in degrees, not", math.isfinite))
-    width_mm: float | None = _field(None, partial(positive_mm, "the width of the picture"))
+    angle: float = style_field(
+        0.0, checks.number("the angle of a straightened picture is in degrees, not", math.isfinite)
+    )
+    width_mm: float | None = style_field(None, partial(positive_mm, "the width of the picture"))
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -13,6 +13,7 @@ import pytest
 from clrecon.errors import UsageError
 from clrecon.labels import LabelMap
 from clrecon.rendering import Lighting, TransferFunction, find_preset
+from clrecon.rendering.pictures.mesh_look import MeshLook
 from clrecon.rendering.pictures.modes import MODES, check_known, find_style, keywords_of, make_style
 from clrecon.rendering.pictures.styles import (
     CurveCut,
@@ -87,6 +88,14 @@ WRONG: dict[type[Style], Wrong] = {
         "color_by": [("depth", "one of hu, label, removed, not 'depth'"), (TWO, "coloured by")],
         "color": [("octarine", "unknown colour 'octarine'"), (TWO, "colour")],
         "window": [((5, 5), "window")],
+        "lighting": LABELLED["lighting"],
+        "clip": RAYS["clip"],
+    },
+    MeshLook: {
+        "color": [("octarine", "unknown colour 'octarine'"), (TWO, "colour")],
+        "opacity": [(0.0, "opacity of a mesh"), (1.5, "not at 1.5"), (np.nan, "opacity"), ("all", "opacity")],
+        "flat": [("no", "flat is True or False, not 'no'"), (1, "flat")],
+        "vertex_colors": [(TWO, "colours of vertices"), ([[2.0, 0.0, 0.0]], "floats from 0 to 1"), ("red", "shape")],
         "lighting": LABELLED["lighting"],
         "clip": RAYS["clip"],
     },

@@ -1,0 +1,160 @@
+"""Checks of triangles and of the layers of a picture."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clrecon.geometry.affine import Float64Array
+from clrecon.jobs.selftest.check import Check, require_close, require_equal
+from clrecon.mesh import Mesh
+from clrecon.opencl import Device, download
+from clrecon.operators.rays.layers import Between, LayeredPicture, Still, draw_layers
+from clrecon.operators.rays.mesh_pictures import make_part
+from clrecon.reference.rays.triangles import Meetings, find_meetings, nth_layer, shade_layer
+from clrecon.rendering import Lighting
+from clrecon.rendering.pictures.mesh_look import MeshLook
+from clrecon.rendering.views.camera import Camera
+
+__all__ = ["CHECKS"]
+
+SIZE = (160, 104)
+"""Pixels, of which 32 are a work-item of the kernel that counts them."""
+
+TRIANGLES, SPLIT = 660, 90
+"""All triangles, every tenth of which fills a quarter of the picture; from `SPLIT` on they are opaque."""
+
+OPACITY = 0.35
+COLOR_255, DEPTH_MM = 2.0, 1e-3
+FIXED = Lighting(0.15, 0.7, 0.4, 20.0, direction=(0.4, -1.0, 0.8))
+
+
+def _soup() -> tuple[Mesh, NDArray[np.uint8]]:
+    """Return triangles anywhere within 7 mm, and a colour for each vertex."""
+    rng, count = np.random.default_rng(31), TRIANGLES
+    size = np.where(np.arange(count) % 10 < 9, 0.4, 3.0)[:, None, None]
+    corners = rng.uniform(-6.0, 6.0, (count, 1, 3)) + size * rng.normal(size=(count, 3, 3))
+    normals = rng.normal(size=(3 * count, 3))
+    normals /= np.linalg.norm(normals, axis=1)[:, None]
+    mesh = Mesh(corners.reshape(-1, 3), np.arange(3 * count).reshape(-1, 3), normals)
+    return mesh, rng.integers(0, 256, (3 * count, 3)).astype(np.uint8)
+
+
+def _still(camera: Camera) -> Still:
+    """Return a sheet in the middle of the triangles, opaque in a third of the picture, translucent in another."""
+    width, height = SIZE
+    along = camera.rays(SIZE)[1] @ camera.basis().forward
+    depth = (camera.distance / along).astype(np.float32)
+    image = np.full((height, width, 4), (40, 90, 200, 255), np.uint8)
+    image[:, : width // 3, 3] = 100
+    depth[:, 2 * width // 3 :] = np.nan
+    image[np.isnan(depth)] = 0
+    return Still(image, depth)
+
+
+def _blend(
+    mesh: Mesh, colors: NDArray[np.uint8], camera: Camera, still: Still
+) -> tuple[list[Float64Array], Float64Array, Float64Array, Float64Array]:
+    """Return the depths of all layers, premultiplied colours, first and expected depths; see `SPLIT`."""
+    count, (width, height) = mesh.triangle_count, SIZE
+    met = find_meetings(mesh.vertices, mesh.triangles, camera, SIZE)
+    along = np.ones((height, width)) if camera.is_parallel else camera.rays(SIZE)[1] @ camera.basis().forward
+    sheet = np.flatnonzero(~np.isnan(still.depth))
+    depths = np.concatenate([met.depths, (still.depth * along).ravel()[sheet].astype(np.float32)])
+    pixels = np.concatenate([met.pixels, sheet])
+    numbers = np.concatenate([met.triangles, np.full(len(sheet), count)])
+    shares = np.concatenate([met.shares, np.full((len(sheet), 3), 1 / 3)])
+    order = np.lexsort((numbers, depths, pixels))
+    every = Meetings(pixels[order], numbers[order], depths[order], shares[order])
+    triangles = np.concatenate([mesh.triangles, [[0, 1, 2]]])
+    color, opacity = np.zeros((height, width, 3)), np.zeros((height, width))
+    first, way, layers = np.full((height, width), np.nan), np.zeros((height, width)), []
+    for layer in range(int(np.bincount(pixels).max())):
+        places = np.where(opacity < 1.0, nth_layer(every, layer, SIZE), -1)
+        assert mesh.normals is not None
+        rgb, depth = shade_layer(
+            every, places, mesh.vertices, triangles, mesh.normals, colors / 255.0, camera, FIXED
+        )  # fmt: skip
+        own = np.where(places >= 0, every.triangles[places], 0)
+        is_sheet = own == count
+        rgb[is_sheet] = still.image[is_sheet][:, :3] / 255.0
+        share = np.where(is_sheet, still.image[..., 3] / 255.0, np.where(own >= SPLIT, 1.0, OPACITY))
+        weight = np.where(places >= 0, (1.0 - opacity) * share, 0.0)
+        color, opacity = color + weight[..., None] * rgb, opacity + weight
+        way += weight * np.nan_to_num(depth)
+        first = np.where(np.isnan(first), depth, first)
+        layers.append(np.where(np.isnan(depth), np.inf, depth))
+    with np.errstate(invalid="ignore"):
+        return layers, np.concatenate([color, opacity[..., None]], axis=-1), first, way / opacity
+
+
+def _check_layers(device: Device) -> str:
+    """Draw translucent and opaque triangles with a sheet between them, in parallel and in perspective."""
+    mesh, colors = _soup()
+    worst = 0.0
+    halves = [(slice(0, SPLIT), OPACITY), (slice(SPLIT, None), 1.0)]
+    parts = [
+        make_part(
+            Mesh(mesh.vertices, mesh.triangles[own], mesh.normals),
+            MeshLook(vertex_colors=colors, opacity=opacity, lighting=FIXED),
+        )
+        for own, opacity in halves
+    ]
+    for scale in ({"parallel_scale": 6.0}, {"view_angle": 14.0}):
+        camera = Camera((-20.0, -40.0, 15.0), (0.3, 0.2, 0.1), (0.1, 0.2, 1.0), **scale)
+        still = _still(camera)
+        ways: list[Any] = []
+
+        def note(between: Between, ways: list[Any] = ways) -> None:
+            held = (between.nearest_d, between.farthest_d)
+            ways.append([download(device, np.empty(SIZE[::-1], np.float32), each) for each in held])
+
+        found = draw_layers(device, parts, camera, SIZE, still=still, volume=note)
+        layers, rgba, first, mean = _blend(mesh, colors, camera, still)
+        _compare_ways(ways, layers, found)
+        require_close(found.depth, first, DEPTH_MM, "depths of triangles, in mm")
+        require_close(found.expected_depth, mean, DEPTH_MM, "expected depths of triangles, in mm")
+        opacity = found.image[..., 3:].astype(np.float64)
+        shown = np.concatenate([found.image[..., :3] * (opacity / 255.0), opacity], axis=-1)
+        away = np.abs(shown - 255.0 * rgba).max(axis=-1)
+        worst = max(worst, require_close(away, np.zeros_like(away), COLOR_255, "colours of triangles, of 255"))
+    return f"2 pictures of {SIZE[0]} x {SIZE[1]} pixels within {worst:.1f} of 255"
+
+
+def _compare_ways(ways: list[Any], layers: list[Float64Array], found: LayeredPicture) -> None:
+    """Compare where rays begin and end between layers; beyond the last one with something there may be an empty one."""
+    require_equal(found.open_pixels, 0, "pixels with further layers")
+    ends = [*layers, np.full(SIZE[::-1], np.inf), np.full(SIZE[::-1], np.inf)]
+    nearest = np.full(SIZE[::-1], -np.inf)
+    for number, ((begin, end), farthest) in enumerate(zip(ways, ends, strict=False)):
+        for what, own, expected in (("begin", begin, nearest), ("end", end, farthest)):
+            require_equal(
+                np.isinf(own), np.isinf(expected), f"pixels without a {what} of the way before layer {number}"
+            )
+            finite, wanted = (np.where(np.isinf(depths), 0.0, depths) for depths in (own, expected))
+            require_close(finite, wanted, DEPTH_MM, f"{what}s of the way before layer {number}, in mm")
+        nearest = farthest
+
+
+CHECKS = (
+    Check(
+        "triangles and layers",
+        (
+            "place_vertices",
+            "count_pieces",
+            "draw_triangles",
+            "draw_pieces",
+            "shade_triangles",
+            "clear_rays",
+            "fill_depths",
+            "begin_layer",
+            "show_still",
+            "blend_layer",
+            "count_open",
+            "finish_rays",
+        ),
+        _check_layers,
+    ),
+)

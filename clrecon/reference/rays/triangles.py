@@ -1,0 +1,180 @@
+"""Twin of the pictures of triangles: the layers of each pixel, from front to back."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clrecon.geometry.affine import Float64Array
+from clrecon.reference.rays.render import shade
+from clrecon.rendering import Lighting
+from clrecon.rendering.views.camera import Camera
+
+__all__ = ["Meetings", "find_meetings", "nth_layer", "shade_layer"]
+
+NOTHING_MM = np.float32(1e-12)
+NEAREST_MM = np.float32(1e-3)
+FAR_ENOUGH_MM = 0.1
+"""Depth of the corners from which on a triangle is looked for between them alone."""
+
+
+class Meetings(NamedTuple):
+    """Where rays meet triangles, sorted by pixel, and in a pixel by depth and then by the number of the triangle.
+
+    Attributes
+    ----------
+    pixels, triangles : ndarray, shape (n,), int64
+    depths : ndarray, shape (n,), float32
+        Mm across the view.
+    shares : ndarray, shape (n, 3), float64
+        Of the corners, in sum 1.
+    """
+
+    pixels: NDArray[np.int64]
+    triangles: NDArray[np.int64]
+    depths: NDArray[np.float32]
+    shares: Float64Array
+
+
+def find_meetings(
+    vertices: NDArray[np.floating], triangles: NDArray[np.integer], camera: Camera, size: Sequence[int]
+) -> Meetings:
+    """Find all triangles that the ray of each pixel meets; a ray on an edge counts as a little right and above of it.
+
+    All but the signs of areas is float32, product by product and sum by sum as the kernel does it; products of two
+    float32 are exact in float64.
+
+    Parameters
+    ----------
+    vertices : ndarray, shape (n, 3), floating
+        LPS mm.
+    triangles : ndarray, shape (m, 3), integer
+    camera : Camera
+    size : (width, height)
+    """
+    width, height = size
+    pixel, half_x, half_y = (np.float32(v) for v in (2.0 * camera.half_height() / height, 0.5 * width, 0.5 * height))
+    aside = ((np.arange(width, dtype=np.float32) + np.float32(0.5)) - half_x) * pixel
+    upwards = (half_y - (np.arange(height, dtype=np.float32) + np.float32(0.5))) * pixel
+    places = np.stack([_coordinate(vertices, axis, camera.position) for axis in camera.basis()], axis=1)
+    found: list[tuple[NDArray[np.int64], int, NDArray[np.float32], Float64Array]] = []
+    all_pixels = np.arange(width * height).reshape(height, width)
+    for number, corners in enumerate(places[triangles.astype(np.int64)]):
+        scale = [np.float32(1.0)] * 3 if camera.is_parallel else list(corners[:, 2])
+        across, down = _window(corners[:, 0] / scale, aside, pixel), _window(corners[:, 1] / scale, upwards, pixel)
+        if not camera.is_parallel and corners[:, 2].min() < FAR_ENOUGH_MM:
+            across, down = slice(None), slice(None)
+        x = [_drop_nothing(corners[n, 0] - scale[n] * aside[across])[None, :] for n in range(3)]
+        y = [_drop_nothing(corners[n, 1] - scale[n] * upwards[down])[:, None] for n in range(3)]
+        sides, areas = zip(*(_find_side(x[n], y[n], x[n - 2], y[n - 2]) for n in range(3)), strict=True)
+        met = (sides[0] != 0) & (sides[0] == sides[1]) & (sides[1] == sides[2])
+        if not np.any(met):
+            continue
+        u, v, w = (areas[n][met] for n in (1, 2, 0))
+        a, b, c = corners[:, 2]
+        total = (u + v) + w
+        depth = np.clip(((u * a + v * b) + w * c) / total, corners[:, 2].min(), corners[:, 2].max())
+        seen = np.full(len(depth), True) if camera.is_parallel else depth >= NEAREST_MM
+        shares = (np.stack([u, v, w], axis=1).astype(np.float64) / total[:, None])[seen]
+        found.append((all_pixels[down, across][met][seen], number, depth[seen], shares))
+    if not found:
+        return Meetings(np.zeros(0, int), np.zeros(0, int), np.zeros(0, np.float32), np.zeros((0, 3)))
+    pixels = np.concatenate([each[0] for each in found])
+    numbers = np.concatenate([np.full(len(each[0]), each[1]) for each in found])
+    depths, shares = np.concatenate([each[2] for each in found]), np.concatenate([each[3] for each in found])
+    order = np.lexsort((numbers, depths, pixels))
+    return Meetings(pixels[order], numbers[order], depths[order], shares[order])
+
+
+def nth_layer(meetings: Meetings, layer: int, size: Sequence[int]) -> NDArray[np.int64]:
+    """Return the place among the meetings of what each pixel shows in a layer, (h, w); -1 where it has none."""
+    width, height = size
+    first = np.searchsorted(meetings.pixels, np.arange(width * height))
+    counts = np.bincount(meetings.pixels, minlength=width * height)
+    return np.where(counts > layer, first + layer, -1).reshape(height, width)
+
+
+def shade_layer(
+    meetings: Meetings,
+    places: NDArray[np.int64],
+    vertices: NDArray[np.floating],
+    triangles: NDArray[np.integer],
+    normals: NDArray[np.floating] | None,
+    colors: Float64Array,
+    camera: Camera,
+    lighting: Lighting,
+) -> tuple[Float64Array, Float64Array]:
+    """Colour and light a layer.
+
+    Parameters
+    ----------
+    meetings, places
+        Results of `find_meetings` and `nth_layer`.
+    normals : ndarray, shape (n, 3), floating, optional
+        Of the vertices; default: those of the triangles.
+    colors : ndarray, shape (n, 3), float64
+        Of the vertices, 0 to 1.
+    camera : Camera
+    lighting : Lighting
+
+    Returns
+    -------
+    rgb : ndarray, shape (h, w, 3), float64
+    depth : ndarray, shape (h, w), float64
+        Mm along the ray; NaN where the layer has nothing.
+    """
+    height, width = places.shape
+    there = places >= 0
+    corners = triangles.astype(np.int64)[meetings.triangles[places[there]]]
+    shares = meetings.shares[places[there]]
+    directions = camera.rays((width, height))[1][there]
+    a, b, c = np.moveaxis(vertices.astype(np.float64)[corners], 1, 0)
+    face = np.cross(b - a, c - a)
+    length = np.linalg.norm(face, axis=1, keepdims=True)
+    face = np.where(length > 0.0, face / np.where(length > 0.0, length, 1.0), -directions)
+    normal = face
+    if normals is not None:
+        normal = np.einsum("nk,nkd->nd", shares, normals.astype(np.float64)[corners])
+        normal = np.where(np.einsum("nd,nd->n", normal, face)[:, None] < 0.0, -normal, normal)
+    away = np.einsum("nd,nd->n", normal, directions)
+    wrong = away * np.einsum("nd,nd->n", face, directions) < 0.0
+    normal = normal - np.where(wrong, 1.001 * away, 0.0)[:, None] * directions
+    rgb, depth = np.zeros((height, width, 3)), np.full((height, width), np.nan)
+    own = np.einsum("nk,nkd->nd", shares, colors[corners])
+    rgb[there] = shade(own, normal, directions, lighting) if lighting.shades else own
+    along = 1.0 if camera.is_parallel else directions @ camera.basis().forward
+    depth[there] = meetings.depths[places[there]] / along
+    return rgb, depth
+
+
+def _coordinate(
+    points: NDArray[np.floating], axis: Float64Array, position: tuple[float, float, float]
+) -> NDArray[np.float32]:
+    p, (a, b, c) = points.astype(np.float32), axis.astype(np.float32)
+    return ((a * p[:, 0] + b * p[:, 1]) + c * p[:, 2]) + np.float32(-(axis @ np.array(position)))
+
+
+def _window(at: NDArray[np.float32], centres: NDArray[np.float32], pixel: np.float32) -> slice:
+    """Return the pixels between corners along one axis, with two more on either side."""
+    near = np.flatnonzero((centres >= at.min() - 2.0 * pixel) & (centres <= at.max() + 2.0 * pixel))
+    return slice(near[0], near[-1] + 1) if len(near) else slice(0, 0)
+
+
+def _drop_nothing(lengths: NDArray[np.float32]) -> NDArray[np.float32]:
+    return np.where(np.abs(lengths) < NOTHING_MM, np.float32(0.0), lengths)
+
+
+def _find_side(
+    ax: NDArray[np.float32], ay: NDArray[np.float32], bx: NDArray[np.float32], by: NDArray[np.float32]
+) -> tuple[NDArray[np.int8], NDArray[np.float32]]:
+    """Return the sign of ax by - ay bx, or that a little beside it, and the difference."""
+    one, other = ax.astype(np.float64) * by, ay.astype(np.float64) * bx
+    exact = np.sign(one - other)
+    beside = np.where(ay != by, np.sign(ay - by), np.sign(bx - ax))
+    short_one, short_other = ax * by, ay * bx
+    rest = (one - short_one).astype(np.float32) - (other - short_other).astype(np.float32)
+    area = np.where(short_one != short_other, short_one - short_other, rest)
+    return np.where(exact != 0.0, exact, beside).astype(np.int8), area

@@ -1,0 +1,85 @@
+"""`MeshLook`: how a mesh is shown."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import KW_ONLY, dataclass, field
+from functools import partial
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from clrecon.errors import UsageError
+from clrecon.geometry.affine import Float64Array
+from clrecon.rendering.looks.colors import find_color
+from clrecon.rendering.looks.lighting import Lighting
+from clrecon.rendering.pictures import style_checks as checks
+from clrecon.rendering.pictures.styles import DEFAULT_COLOR, Style, style_field
+from clrecon.rendering.views.clip import Clip
+
+__all__ = ["MeshLook"]
+
+
+def _vertex_colors(value: Any) -> NDArray[np.uint8]:
+    """Return colours of vertices, (n, 3) uint8."""
+    given = np.asarray(value)
+    is_fine = given.ndim == 2 and given.shape[1] == 3 and given.dtype.kind in "fu"
+    if is_fine and given.dtype.kind == "f":
+        is_fine = bool(((given >= 0.0) & (given <= 1.0)).all())
+        given = np.rint(255.0 * given) if is_fine else given
+    if not is_fine or (given.dtype.kind == "u" and given.dtype != np.uint8):
+        raise UsageError(
+            "colours of vertices have shape (n, 3), as uint8 from 0 to 255 or as floats from 0 to 1, not shape"
+            f" {np.shape(value)} and type {np.asarray(value).dtype}"
+        )
+    return given.astype(np.uint8)
+
+
+@dataclass(frozen=True)
+class MeshLook(Style):
+    """The triangles of a mesh, shaded; both sides of a surface are lit.
+
+    Parameters
+    ----------
+    color : str or (float, float, float), optional
+        See `clrecon.rendering.looks.colors.find_color`; default: "bone".
+    opacity : float
+        Of each surface, above 0 and up to 1: a ray that enters and leaves a closed mesh meets two.
+    flat : bool
+        Every triangle is lit by its own normal.  Else the normals of the mesh are interpolated, or, where it has
+        none, those of its vertices' triangles.
+    vertex_colors : array_like, shape (n, 3), optional
+        A colour for each vertex, interpolated between them, in place of `color`: uint8, or floats from 0 to 1.
+    lighting : Lighting, optional
+        Default: ``Lighting()``.
+    clip : Clip, optional
+        The part of space that is shown; what is cut is open.
+    """
+
+    _mode: ClassVar[str] = "mesh"
+
+    color: str | Sequence[float] | None = style_field(None, checks.color)
+    _: KW_ONLY
+    opacity: float = style_field(
+        1.0, checks.number("the opacity of a mesh lies above 0 and up to 1, not at", lambda share: 0.0 < share <= 1.0)
+    )
+    flat: bool = style_field(False, partial(checks.flag, "flat"))
+    vertex_colors: ArrayLike | None = field(default=None, compare=False, metadata={"check": _vertex_colors})
+    lighting: Lighting | None = style_field(None, checks.instance_of("lighting", Lighting))
+    clip: Clip | None = style_field(None, checks.instance_of("clip", Clip))
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.color is not None and self.vertex_colors is not None:
+            raise UsageError("a mesh has one colour or a colour for each vertex, not both")
+
+    @property
+    def light(self) -> Lighting:
+        """The lighting that is used."""
+        return self.lighting or Lighting()
+
+    @property
+    def rgb(self) -> Float64Array:
+        """The colour: red, green and blue, each from 0 to 1."""
+        return find_color(DEFAULT_COLOR if self.color is None else self.color)
