@@ -137,13 +137,13 @@ def shade_layer(
     face = np.where(length > 0.0, face / np.where(length > 0.0, length, 1.0), -directions)
     normal = face
     if normals is not None:
-        normal = np.einsum("nk,nkd->nd", shares, normals.astype(np.float64)[corners])
-        normal = np.where(np.einsum("nd,nd->n", normal, face)[:, None] < 0.0, -normal, normal)
-    away = np.einsum("nd,nd->n", normal, directions)
-    wrong = away * np.einsum("nd,nd->n", face, directions) < 0.0
+        normal = np.einsum("nk,nki->ni", shares, normals.astype(np.float64)[corners])
+        normal = np.where(np.einsum("ni,ni->n", normal, face)[:, None] < 0.0, -normal, normal)
+    away = np.einsum("ni,ni->n", normal, directions)
+    wrong = away * np.einsum("ni,ni->n", face, directions) < 0.0
     normal = normal - np.where(wrong, 1.001 * away, 0.0)[:, None] * directions
     rgb, depth = np.zeros((height, width, 3)), np.full((height, width), np.nan)
-    own = np.einsum("nk,nkd->nd", shares, colors[corners])
+    own = np.einsum("nk,nki->ni", shares, colors[corners])
     rgb[there] = shade(own, normal, directions, lighting) if lighting.shades else own
     along = 1.0 if camera.is_parallel else directions @ camera.basis().forward
     depth[there] = meetings.depths[places[there]] / along
