@@ -1,94 +1,20 @@
-"""Where the rows of a lattice pierce a mesh, and the trilinear HU on its points."""
+"""Where the rows of a lattice pierce a mesh."""
 
 from __future__ import annotations
-
-import math
-from collections.abc import Iterator
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from clrecon.geometry import Volume
-from clrecon.geometry.iso_rule import IsoRule
+from clrecon.mesh.compare.lattice import Lattice
 from clrecon.system.pieces import chunks
 
-__all__ = ["Lattice", "find_piercings"]
+__all__ = ["find_piercings"]
 
-_PIECE = 1 << 18
+_PIECE = 1 << 16
 """Triangles at a time."""
 
 Float64Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
-
-
-@dataclass(frozen=True)
-class Lattice:
-    """Points at (first + n + offset) / finer along each axis of the voxels' index space.
-
-    Attributes
-    ----------
-    finer : int
-    offsets : (float, float, float)
-        In steps of the lattice.
-    first : (int, int, int)
-    shape_ijk : (int, int, int)
-        Number of points.
-    """
-
-    finer: int
-    offsets: tuple[float, float, float]
-    first: tuple[int, int, int]
-    shape_ijk: tuple[int, int, int]
-
-    @classmethod
-    def over(cls, volume: Volume, rule: IsoRule, finer: int, offsets: tuple[float, ...]) -> Lattice:
-        """Return the lattice over a volume and its border."""
-        first = [math.ceil(-rule.border * finer - shift) for shift in offsets]
-        last = [
-            math.floor((size - 1 + rule.border) * finer - shift)
-            for size, shift in zip(volume.shape_ijk, offsets, strict=True)
-        ]
-        shape = tuple(end - start + 1 for start, end in zip(first, last, strict=True))
-        return cls(finer, tuple(offsets), tuple(first), shape)  # type: ignore[arg-type]
-
-    def number(self, ijk: Float64Array) -> Float64Array:
-        """Return index coordinates of the voxels in numbers of the lattice's points, shape (n, 3)."""
-        return ijk * self.finer - np.array(self.offsets) - np.array(self.first)
-
-    def places(self, axis: int) -> Float64Array:
-        """Return the index coordinates of the points along an axis."""
-        return (np.arange(self.shape_ijk[axis]) + self.first[axis] + self.offsets[axis]) / self.finer
-
-    def planes(self, volume: Volume, rule: IsoRule) -> Iterator[NDArray[np.bool_]]:
-        """Yield for each plane of the lattice which of its points, shape (nj, ni), the trilinear HU put inside."""
-        level = np.float32(rule.iso_level)
-        ways = [_split(self.places(axis), volume.shape_ijk[axis], rule.border) for axis in range(3)]
-        (i, ti), (j, tj), (k, tk) = ways
-        kept: dict[int, NDArray[np.float32]] = {}
-        for lower, share in zip(k.tolist(), tk.tolist(), strict=True):
-            kept = {n: kept[n] if n in kept else _slice(volume, rule, n) for n in (lower, lower + 1)}
-            plane = kept[lower] + np.float32(share) * (kept[lower + 1] - kept[lower])
-            rows = plane[j] + tj[:, None] * (plane[j + 1] - plane[j])
-            steps = rows[:, 1:] - rows[:, :-1]
-            yield rows[:, i] + ti * steps[:, i] >= level
-
-
-def _split(places: Float64Array, size: int, border: int) -> tuple[IntArray, NDArray[np.float32]]:
-    """Return the lower sample of each place, counted in the volume with its border, and the way to the next."""
-    places = places + border
-    lower = np.clip(np.floor(places).astype(np.int64), 0, size + 2 * border - 2)
-    return lower, (places - lower).astype(np.float32)
-
-
-def _slice(volume: Volume, rule: IsoRule, number: int) -> NDArray[np.float32]:
-    """Return a slice of the volume with its border, shape (nj + 2 border, ni + 2 border), float32."""
-    ni, nj, nk = volume.shape_ijk
-    border = rule.border
-    values = np.full((nj + 2 * border, ni + 2 * border), rule.outside, dtype=np.float32)
-    if 0 <= number - border < nk:
-        values[border : border + nj, border : border + ni] = volume.voxels[number - border]
-    return values
 
 
 def find_piercings(ijk: Float64Array, triangles: NDArray[np.uint32], lattice: Lattice) -> IntArray:
@@ -109,8 +35,8 @@ def find_piercings(ijk: Float64Array, triangles: NDArray[np.uint32], lattice: La
     Returns
     -------
     ndarray, shape (p,), int64, ascending
-        Numbers (k * nj + j) * (ni + 1) + i; those that would be there an even number of times are not.  i = ni is
-        beyond the row.
+        Ends of runs of points inside, see `clrecon.mesh.compare.lattice`; those that would be there an even number of
+        times are not.
     """
     points = lattice.number(ijk)
     found = [np.zeros(0, dtype=np.int64)]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -11,7 +12,8 @@ from numpy.typing import NDArray
 from clrecon.errors import NoSurfaceError, UsageError
 from clrecon.geometry import Volume
 from clrecon.geometry.iso_rule import IsoRule, choose_iso_rule
-from clrecon.mesh.compare.parity import Lattice, find_piercings
+from clrecon.mesh.compare.lattice import Lattice, count_points, exclusive_or, find_level_runs
+from clrecon.mesh.compare.parity import find_piercings
 from clrecon.mesh.mesh import Mesh
 from clrecon.system.progress import Progress, ignore_progress
 from clrecon.system.records import Record
@@ -87,7 +89,7 @@ def measure_slices(
     offsets : three floats
         Where the lattice begins, in its own steps along i, j, k, from 0 to below 1.
     progress : callable, optional
-        Called as ``progress("slices", slices done, all slices)``.
+        Called as ``progress("slices", layers of cells done, all layers)``.
 
     Returns
     -------
@@ -111,23 +113,27 @@ def measure_slices(
     ijk = volume.lps_to_ijk(mesh.vertices)
     _check_place(ijk, volume, rule)
     told = progress or ignore_progress
-    fine = Lattice.over(volume, rule, int(finer), shifts)
-    own = Lattice.over(volume, rule, 1, (0.0, 0.0, 0.0))
-    planes = fine.shape_ijk[2] + own.shape_ijk[2]
-    counts = _count(ijk, mesh.triangles, volume, rule, fine, lambda done: told("slices", done, planes))
-    blind = _count(
-        ijk, mesh.triangles, volume, rule, own, lambda done: told("slices", fine.shape_ijk[2] + done, planes)
-    )
-    told("slices", planes, planes)
+    lattices = (Lattice.over(volume, rule, int(finer), shifts), Lattice.over(volume, rule, 1, (0.0, 0.0, 0.0)))
+    layers = lattices[0].cells_ijk[2]
+    found = []
+    for n, lattice in enumerate(lattices):
+        tell = functools.partial(_tell, told, n * layers, 2 * layers)
+        found.append(_count(ijk, mesh.triangles, volume, rule, lattice, tell))
+    fine, own = found
+    told("slices", 2 * layers, 2 * layers)
     return SliceOverlap(
-        dice=counts.dice,
-        voxel_dice=blind.dice,
+        dice=fine.dice,
+        voxel_dice=own.dice,
         finer=int(finer),
-        points_mesh=counts.mesh,
-        points_hu=counts.hu,
-        points_common=counts.common,
-        rows_odd=counts.odd,
+        points_mesh=fine.mesh,
+        points_hu=fine.hu,
+        points_common=fine.common,
+        rows_odd=fine.odd,
     )
+
+
+def _tell(told: Progress, before: int, total: int, done: int) -> None:
+    told("slices", before + done, total)
 
 
 def _check_lattice(finer: int, offsets: Sequence[float]) -> tuple[float, float, float]:
@@ -147,13 +153,12 @@ def _check_place(ijk: NDArray[np.float64], volume: Volume, rule: IsoRule) -> Non
         )
 
 
-@dataclass
+@dataclass(frozen=True)
 class _Counts:
-    mesh: int = 0
-    hu: int = 0
-    common: int = 0
-    odd: int = 0
-    rows: int = 0
+    mesh: int
+    hu: int
+    common: int
+    odd: int
 
     @property
     def dice(self) -> float:
@@ -169,29 +174,16 @@ def _count(
     lattice: Lattice,
     told: Callable[[int], None],
 ) -> _Counts:
-    """Count the points of a lattice that are in the mesh, in the HU, and in both, plane by plane."""
-    counts = _Counts()
-    keys = find_piercings(ijk, triangles, lattice)
-    ni, nj, nk = lattice.shape_ijk
-    begin = np.searchsorted(keys, np.arange(nk + 1, dtype=np.int64) * nj * (ni + 1))
-    fields = lattice.planes(volume, rule)
-    for k, hu in enumerate(fields):
-        toggles = np.zeros((nj, ni + 1), dtype=np.uint8)
-        toggles.reshape(-1)[keys[begin[k] : begin[k + 1]] - k * nj * (ni + 1)] = 1
-        counts.rows += int(toggles.any(axis=1).sum())
-        filled = np.bitwise_xor.accumulate(toggles, axis=1).view(bool)
-        odd = filled[:, -1]
-        inside = filled[:, :-1]
-        if odd.any():
-            counts.odd += int(odd.sum())
-            inside, hu = inside[~odd], hu[~odd]
-        counts.mesh += int(np.count_nonzero(inside))
-        counts.hu += int(np.count_nonzero(hu))
-        counts.common += int(np.count_nonzero(inside & hu))
-        told(k)
-    if counts.odd > _MOST_ODD * counts.rows:
+    """Count the points of a lattice that are in the mesh, in the HU, and in both."""
+    mesh, hu = find_piercings(ijk, triangles, lattice), find_level_runs(volume, rule, lattice, told)
+    rows, ends = np.unique(lattice.row_of(mesh), return_counts=True)
+    odd = rows[ends % 2 == 1]
+    if len(odd) > _MOST_ODD * len(rows):
         raise UsageError(
-            f"the mesh is open: {counts.odd} of {counts.rows} rows through it pierce it an odd number of times, and"
-            " what lies inside is not defined; close it first"
+            f"the mesh is open: {len(odd)} of {len(rows)} rows through it pierce it an odd number of times, and what"
+            " lies inside is not defined; close it first"
         )
-    return counts
+    if len(odd):
+        mesh, hu = (keys[~np.isin(lattice.row_of(keys), odd)] for keys in (mesh, hu))
+    own, wanted, apart = count_points(mesh), count_points(hu), count_points(exclusive_or(mesh, hu))
+    return _Counts(own, wanted, (own + wanted - apart) // 2, len(odd))
