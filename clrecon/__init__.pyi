@@ -56,6 +56,9 @@ from clrecon.operators.surface.extract import extract_isosurfaces as extract_iso
 from clrecon.operators.surface.label_masks import extract_label_masks as extract_label_masks
 from clrecon.operators.surface.labels import extract_labels as extract_labels
 from clrecon.operators.surface.methods import extract_by_method as extract_by_method
+from clrecon.operators.vertebrae.inside import VertebraInside as VertebraInside
+from clrecon.operators.vertebrae.inside import vertebra_inside as vertebra_inside
+from clrecon.operators.vertebrae.solid import vertebra_solid as vertebra_solid
 from clrecon.phantom.truth import PhantomTruth as PhantomTruth
 from clrecon.phantom.truth import phantom_truth as phantom_truth
 from clrecon.points import PointCloud as PointCloud

@@ -32,6 +32,7 @@ class _Command(NamedTuple):
 COMMANDS = {
     "mesh": _Command("clrecon.cli.mesh", "make a mesh from a CT series: the main job"),
     "cloud": _Command("clrecon.cli.cloud", "make a cloud of points from a CT series, or clean one"),
+    "inside": _Command("clrecon.cli.inside", "take vertebrae apart: dense and trabecular bone, canal, volumes"),
     "render": _Command("clrecon.cli.render", "make pictures of a CT series, still or moving"),
     "info": _Command("clrecon.cli.info", "show which series a folder holds and whether they can be used"),
     "devices": _Command("clrecon.cli.devices", "show the OpenCL devices and which one would be used"),

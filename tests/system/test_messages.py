@@ -92,7 +92,7 @@ MESSAGES = {
     "point look": PointLook(radius_mm=0.5, color_by="label"),
     "listing": SeriesListing([ENTRY], 1, {}, [], {"slices": 4}, RefusedInputError("no")),
 }
-HELD_BY_A_DEVICE = {"DeviceVolume", "Mask", "SurfaceExtractor", "VolumeRenderer"}
+HELD_BY_A_DEVICE = {"DeviceVolume", "Mask", "SurfaceExtractor", "VertebraInside", "VolumeRenderer"}
 """Public classes that are no messages: they own memory of a device."""
 
 

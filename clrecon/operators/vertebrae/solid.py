@@ -20,7 +20,7 @@ from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.operators.surface.label_extraction import LabelExtraction
 from clrecon.operators.vertebrae.crop import LabelCrop, check_types, crop_label
 
-__all__ = ["CLOSE_MM", "make_solid", "vertebra_solid"]
+__all__ = ["CLOSE_MM", "label_margin", "make_solid", "vertebra_solid"]
 
 CLOSE_MM = 1.5
 """Radius of the balls that close pores and vessels of the cortex."""
@@ -80,12 +80,12 @@ def vertebra_solid(
         The device has no room, or it fails.
     """
     check_types(volume, labels)
-    crop = crop_label(volume, labels, label, _margin(volume, close_mm, grow_mm))
+    crop = crop_label(volume, labels, label, label_margin(volume, close_mm, grow_mm))
     with DeviceVolume(crop.volume, device=device, memory=memory) as resident:
         return make_solid(resident, crop, iso_value, close_mm, grow_mm)[0]
 
 
-def _margin(volume: Volume, close_mm: float, grow_mm: float | None) -> float:
+def label_margin(volume: Volume, close_mm: float, grow_mm: float | None) -> float:
     """Return how far beyond the label voxels are looked at, mm."""
     close = checked_mm(close_mm, "the radius that closes a vertebra")
     growth = Growth.of(volume, grow_mm).grow_mm

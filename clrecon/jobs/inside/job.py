@@ -1,0 +1,185 @@
+"""The job that looks into vertebrae: a CT series and its labels in, meshes of the parts and their volumes out."""
+
+from __future__ import annotations
+
+from contextlib import ExitStack
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from clrecon.jobs.inside.report import InsideReport, describe_job, describe_mesh_file
+from clrecon.jobs.inside.settings import InsideSettings
+from clrecon.jobs.shared.labelled import read_with_labels
+from clrecon.jobs.shared.laps import Laps
+from clrecon.jobs.shared.opening import DeviceOpening
+from clrecon.jobs.shared.outputs import check_kept, check_outputs, commit_all, name_outputs, refuse_files, stage_meshes
+from clrecon.jobs.shared.report import stage_report
+from clrecon.reading import read_selected
+from clrecon.system.log import get_logger, log_warnings
+from clrecon.system.progress import Progress, ignore_progress
+from clrecon.system.targets import keep_existing
+
+if TYPE_CHECKING:
+    from clrecon.geometry import Volume
+    from clrecon.labels import LabelMap
+    from clrecon.mesh import Mesh
+    from clrecon.opencl import Device
+    from clrecon.operators.vertebrae.inside import VertebraInside
+
+__all__ = ["make_inside"]
+
+log = get_logger(__name__)
+
+
+def make_inside(
+    source: str | Path,
+    output: str | Path,
+    settings: InsideSettings,
+    *,
+    report_path: str | Path | None = None,
+    no_clobber: bool = False,
+    progress: Progress | None = None,
+) -> InsideReport:
+    """Read a CT series and its labels, look into vertebrae, and write the surfaces of their parts.
+
+    The files have the names of the parts: ``inside.stl`` becomes ``inside_solid.stl``, ``inside_dense.stl`` and so on,
+    with several vertebrae ``inside_L3_solid.stl``.  All are written under temporary names, then renamed; the report
+    comes last, as the commit mark.
+
+    Parameters
+    ----------
+    source : path
+        DICOM folder or file, or a file of another format, see `clrecon.read_volume`.
+    output : path
+        Mesh file; its extension gives the format.
+    settings : InsideSettings
+    report_path : path, optional
+        File for the report as JSON.
+    no_clobber : bool
+        True: files that exist stay and are an `OutputError`.
+    progress : callable, optional
+        ``progress(stage, done, total)``.
+
+    Returns
+    -------
+    InsideReport
+
+    Raises
+    ------
+    UsageError, OutputError, DeviceError, NoDicomError, RefusedInputError, NoSurfaceError
+        After an error nothing is written, and older files are intact.
+    """
+    from clrecon.operators.vertebrae.inside import PARTS
+
+    progress = progress or ignore_progress
+    watch = Laps()
+    with keep_existing(no_clobber):
+        # names of several vertebrae are those of the label map, which is not read yet: their number stands for them
+        first = [part if len(settings.only) == 1 else f"{len(settings.only)}_{part}" for part in PARTS]
+        outputs = check_outputs(output, report_path, first)
+        check_kept(outputs, source, settings.labels)
+    volume, labels, device = _open(source, settings, progress)
+    suffixes = _name_labels(labels, settings)
+    if no_clobber:
+        refuse_files(name_outputs(output, [_join(suffix, part, suffixes) for suffix in suffixes for part in PARTS]))
+    watch.lap("read")
+    found: list[tuple[str, VertebraInside, dict[str, Mesh]]] = []
+    for number, suffix in zip(_numbers(labels, settings), suffixes, strict=True):
+        progress("inside", len(found), len(suffixes) if len(suffixes) > 1 else 0)
+        inside = _look(volume, labels, number, settings, device)
+        found.append((suffix, inside, inside.extract_meshes(memory=settings.memory)))
+    watch.lap("inside")
+    with keep_existing(no_clobber):
+        report = _write(found, output, report_path, volume, settings, device, watch, progress)
+    log_warnings(log, report.warnings, volume.report.get("warnings", ()))
+    log.info("%d vertebrae looked into, on %s in %.3f s", len(found), report.device, report.seconds["total"])
+    return report
+
+
+def _open(source: str | Path, settings: InsideSettings, progress: Progress) -> tuple[Volume, LabelMap, Device]:
+    """Read the input while the device opens and builds its kernels."""
+    from clrecon.labels import read_labels
+
+    progress("device", 0, 0)
+    with DeviceOpening(settings.device, _prepare) as opening:
+        volume, labels = read_with_labels(
+            partial(read_selected, source, settings, progress=progress),
+            settings.labels,
+            lambda volume: read_labels(settings.labels, volume=volume),
+        )
+        device = opening.wait()
+    assert labels is not None
+    return volume, labels, device
+
+
+def _prepare(device: Device) -> None:
+    from clrecon.operators.surface.label_masks import prepare_label_masks
+
+    prepare_label_masks(device)
+
+
+def _numbers(labels: LabelMap, settings: InsideSettings) -> list[int]:
+    return list(dict.fromkeys(labels.find(label) for label in settings.only))
+
+
+def _name_labels(labels: LabelMap, settings: InsideSettings) -> list[str]:
+    """Return the names of the vertebrae in files and in the report."""
+    from clrecon.labels import file_suffixes
+
+    return list(file_suffixes({number: labels.name(number) for number in _numbers(labels, settings)}).values())
+
+
+def _join(suffix: str, part: str, suffixes: list[str]) -> str:
+    return f"{suffix}_{part}" if len(suffixes) > 1 else part
+
+
+def _look(volume: Volume, labels: LabelMap, number: int, settings: InsideSettings, device: Device) -> VertebraInside:
+    from clrecon.operators.vertebrae.inside import vertebra_inside
+
+    given = {name: getattr(settings, name) for name in ("dense", "close_mm") if getattr(settings, name) is not None}
+    return vertebra_inside(
+        volume, labels, number, settings.iso_value, grow_mm=settings.grow_mm, device=device, memory=settings.memory,
+        **given,
+    )  # fmt: skip
+
+
+def _write(
+    found: list[tuple[str, VertebraInside, dict[str, Mesh]]],
+    output: str | Path,
+    report_path: str | Path | None,
+    volume: Volume,
+    settings: InsideSettings,
+    device: Device,
+    watch: Laps,
+    progress: Progress,
+) -> InsideReport:
+    from clrecon.operators.vertebrae.solid import CLOSE_MM
+
+    suffixes = [suffix for suffix, _, _ in found]
+    named = [
+        (_join(suffix, part, suffixes), part, mesh) for suffix, _, meshes in found for part, mesh in meshes.items()
+    ]
+    paths = name_outputs(output, [name for name, _, _ in named], report_path)
+    with ExitStack() as staged:
+        files = stage_meshes(
+            staged, [mesh for _, _, mesh in named], paths, settings.space, progress, keep_ids=settings.keep_ids
+        )
+        watch.lap("write")
+        told = iter(
+            [
+                describe_mesh_file(part, mesh, path, file.size)
+                for (_, part, mesh), path, file in zip(named, paths, files, strict=True)
+            ]
+        )
+        vertebrae: list[dict[str, Any]] = [
+            {**inside.as_dict(), "name": suffix, "meshes": [next(told) for _ in meshes]}
+            for suffix, inside, meshes in found
+        ]
+        seconds = {part: round(value, 4) for part, value in {**watch.seconds, "total": watch.total()}.items()}
+        report = describe_job(
+            volume, vertebrae, settings, device.current, close_mm=settings.close_mm or CLOSE_MM, seconds=seconds
+        )
+        if report_path is not None:
+            files.append(staged.enter_context(stage_report(report_path, report)))
+        commit_all(files)
+    return report

@@ -1,0 +1,74 @@
+"""Settings of the job that looks into vertebrae, validated on construction."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from clrecon.errors import UsageError
+from clrecon.reading import Selection
+from clrecon.system.wording import name_parameter
+
+__all__ = ["InsideSettings"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class InsideSettings(Selection):
+    """Settings of the job.
+
+    Parameters
+    ----------
+    series, phase, allow_gaps, force
+        See `clrecon.reading.Selection`.
+    labels : path
+        Label map: NIfTI, NRRD, MetaImage or DICOM SEG.
+    only : sequence of str or int
+        The vertebrae, by numbers or names of their labels.
+    iso_value : float, optional
+        HU of the solid bone; None: the labels' own voxels.
+    dense : (low, high), optional
+        Band of dense bone, HU; None leaves an end open.  Default: `clrecon.operators.vertebrae.inside.DENSE_HU`.
+    close_mm : float, optional
+        Radius that closes the solid bone.  Default: `clrecon.operators.vertebrae.solid.CLOSE_MM`.
+    grow_mm : float, optional
+        Distance of growth with an iso value, see `clrecon.extract_labels`.
+    space : {"lps", "ras"}
+        Patient frame of the meshes.
+    keep_ids : bool
+        Write the hashes of the UIDs of series and frame of reference into the report and the mesh files.
+    device : str, optional
+        Name or index of an OpenCL device.
+    memory : int, optional
+        Most bytes on the device.
+
+    Raises
+    ------
+    UsageError
+        A value is impossible.
+    """
+
+    labels: str | Path
+    only: Sequence[str | int]
+    iso_value: float | None = None
+    dense: Sequence[float | None] | None = None
+    close_mm: float | None = None
+    grow_mm: float | None = None
+    space: str = "lps"
+    keep_ids: bool = False
+    device: str | None = None
+    memory: int | None = None
+
+    def __post_init__(self) -> None:
+        from clrecon.geometry import frame_from_lps
+
+        frame_from_lps(self.space)
+        if not self.only:
+            raise UsageError(f"choose the vertebrae by their labels: {name_parameter('only', 'L3')}")
+        if self.memory is not None and self.memory < 1:
+            raise UsageError(f"the memory that may be taken must be above 0 bytes, not {self.memory}")
+        if self.grow_mm is not None and self.iso_value is None:
+            raise UsageError(
+                f"the labels' own voxels do not grow: leave {name_parameter('grow_mm')} out, or give an iso value"
+                f" ({name_parameter('iso_value', 'N')})"
+            )

@@ -1,0 +1,229 @@
+"""The spinal canal of one vertebra: the hole of its arch slice by slice, joined, and cut at the pedicles' height."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clrecon.geometry import Volume, slice_normal
+from clrecon.geometry.affine import Float64Array
+
+__all__ = ["LEAST_HOLE_MM2", "Canal", "find_canal"]
+
+Bits = NDArray[np.bool_]
+
+LEAST_HOLE_MM2 = 60.0
+"""Smaller holes of an arch are no canal but gaps of a mask; canals of adults have 150 mm2 and more."""
+
+MOST_TOGETHER_MM = 12.0
+"""Slices that close the arch together lie within this height, that of a pedicle: the lamina is lower than the pedicles,
+and in tilted or coarse slices no single one shows a closed ring."""
+
+BEYOND_MM = 6.0
+"""What lies so far above and below a hole tells whether it goes on there."""
+
+MOST_BLOCKED = 0.5
+"""Share of a hole's outline that bone may cover there.  The wall of a canal that is tilted by 30 degrees covers a
+quarter, the bone below a hollow endplate nearly all."""
+
+STEEPEST = 1.0
+"""Largest shift of the canal from slice to slice, mm per mm: 45 degrees."""
+
+ROUNDS = 3
+"""Times that the direction of the canal is found with the wall that follows from the one before."""
+
+
+@dataclass(frozen=True)
+class Canal:
+    """The canal of one vertebra.
+
+    Attributes
+    ----------
+    voxels : ndarray, shape (nk, nj, ni), bool
+    closed_slices : int
+        Slices in which the arch is closed, alone or together with its neighbours.
+    together : int
+        Slices that close the arch together; 1 where single ones do.
+    height_mm : float
+        Height of the slices of the canal: that of the pedicles.
+    """
+
+    voxels: Bits
+    closed_slices: int
+    together: int
+    height_mm: float
+
+
+def find_canal(solid: Bits, volume: Volume) -> Canal | None:
+    """Find the canal beside the solid bone of a vertebra.
+
+    In each slice the largest hole of the arch is looked for that is open above and below; where no slice has one, in so
+    many neighbouring slices together as it takes.  In slices above and below it the pedicles still join the body with
+    the arch, but there is a gap behind: with a wall across the middle of the canal its front half is closed there too.
+    These slices are the pedicles' height.  In them the back half goes on from the nearest closed slice, in the
+    direction of the canal.
+
+    Parameters
+    ----------
+    solid : ndarray, shape (nk, nj, ni), bool
+        Solid bone of one vertebra, its holes filled.
+    volume : Volume
+        Where its voxels are; the slices are axial within 45 degrees.
+
+    Returns
+    -------
+    Canal or None
+        None where the arch is closed nowhere.
+    """
+    places = _Places(volume)
+    main, together = _join_holes(solid, places)
+    if main is None:
+        return None
+    closed = np.flatnonzero(main.any(axis=(1, 2)))
+    front, slope, wall = _find_front(solid, main, places)
+    canal = main | front
+    ends = places.ends
+    for k in np.flatnonzero(front.any(axis=(1, 2)) & ~main.any(axis=(1, 2))):
+        near = int(closed[np.argmin(np.abs(closed - k))])
+        canal[k] |= places.shift(main[near], near, int(k), slope) & wall[k] & ~solid[k]
+    slices = np.flatnonzero(canal.any(axis=(1, 2)))
+    return Canal(canal, len(closed), together, float((ends[1:] - ends[:-1])[slices].sum()))
+
+
+class _Places:
+    """Where the voxels of axial slices are: x and y in the patient, and heights along the normal, mm."""
+
+    def __init__(self, volume: Volume):
+        ni, nj, _ = volume.shape_ijk
+        normal = slice_normal(volume.affine)
+        self.origins = volume.slice_origins()
+        beyond = np.abs(volume.slice_origins(1) @ normal - self.origins[0] @ normal)
+        beyond[0] *= -1.0
+        self.heights: Float64Array = beyond[1:-1]
+        self.ends: Float64Array = (beyond[1:] + beyond[:-1]) / 2.0
+        self.plane = volume.affine[:2, :2]
+        self.area = float(np.linalg.norm(np.cross(volume.affine[:3, 0], volume.affine[:3, 1])))
+        i, j = np.arange(ni)[None, :], np.arange(nj)[:, None]
+        self._x, self._y = (row[0] * i + row[1] * j for row in self.plane)
+
+    def x(self, k: int) -> Float64Array:
+        return np.asarray(self._x + self.origins[k, 0])
+
+    def y(self, k: int) -> Float64Array:
+        return np.asarray(self._y + self.origins[k, 1])
+
+    def mean_y(self, voxels: Bits) -> float:
+        """Return the mean y of voxels."""
+        k, j, i = np.nonzero(voxels)
+        return float(np.mean(self._y[j, i] + self.origins[k, 1]))
+
+    def shift(self, section: Bits, source: int, target: int, slope: Float64Array) -> Bits:
+        """Return a section of slice `source` where the canal's direction leads in slice `target`."""
+        away = slope * (self.heights[target] - self.heights[source])
+        away -= (self.origins[target] - self.origins[source])[:2]
+        di, dj = np.rint(np.linalg.solve(self.plane, away)).astype(int)
+        j, i = np.nonzero(section)
+        nj, ni = section.shape
+        held = (j + dj >= 0) & (j + dj < nj) & (i + di >= 0) & (i + di < ni)
+        shifted = np.zeros_like(section)
+        shifted[j[held] + dj, i[held] + di] = True
+        return shifted
+
+
+def _fill_slices(solid: Bits) -> Bits:
+    from scipy.ndimage import binary_fill_holes
+
+    return np.stack([binary_fill_holes(section) for section in solid])
+
+
+def _join_holes(solid: Bits, places: _Places) -> tuple[Bits | None, int]:
+    """Return the largest hole, joined over the slices, and how many slices close it together; None without one."""
+    nk = len(solid)
+    for together in range(1, nk + 1):
+        if together > 1 and places.ends[together] - places.ends[0] > MOST_TOGETHER_MM:
+            break
+        joined = np.stack([solid[k : k + together].any(axis=0) for k in range(nk - together + 1)])
+        holes = _large_sections(_fill_slices(joined) & ~joined, LEAST_HOLE_MM2 / places.area)
+        if holes.any():
+            spread = np.zeros_like(solid)
+            for k, hole in enumerate(holes):
+                spread[k : k + together] |= hole
+            hole = _largest_open(spread, solid, places)
+            if hole is not None:
+                return hole, together
+    return None, 0
+
+
+def _large_sections(holes: Bits, least: float) -> Bits:
+    """Keep the parts of each slice that have at least so many voxels."""
+    from scipy.ndimage import label as find_components
+
+    kept = np.zeros_like(holes)
+    for k in np.flatnonzero(holes.any(axis=(1, 2))):
+        components, _ = find_components(holes[k])
+        sizes = np.bincount(components.ravel())
+        sizes[0] = 0
+        kept[k] = (sizes >= least)[components]
+    return kept
+
+
+def _largest_open(holes: Bits, solid: Bits, places: _Places) -> Bits | None:
+    """Return the largest hole, joined over the slices, that goes on above and below; None without one.
+
+    A hollow endplate is a ring in the slices through its rim, but bone lies on one side of its hole.  Gaps of a mask
+    in the body lie in front of the middle of all bone, the canal behind it.
+    """
+    from scipy.ndimage import find_objects
+    from scipy.ndimage import label as find_components
+
+    components, _ = find_components(holes)
+    sizes = np.bincount(components.ravel())
+    boxes = find_objects(components)
+    middle = places.mean_y(solid)
+    for number in np.argsort(-sizes[1:], kind="stable") + 1:
+        hole = components == number
+        if places.mean_y(hole) <= middle:
+            continue
+        section = hole.any(axis=0)
+        first, last = boxes[number - 1][0].start, boxes[number - 1][0].stop - 1
+        away = places.heights - places.heights[[first, last]][:, None]
+        above = (away[1] > 0.0) & (away[1] <= max(BEYOND_MM, away[1, min(last + 1, len(solid) - 1)]))
+        below = (away[0] < 0.0) & (away[0] >= min(-BEYOND_MM, away[0, max(first - 1, 0)]))
+        if all(solid[side].any(axis=0)[section].mean() < MOST_BLOCKED for side in (above, below)):
+            return np.asarray(hole)
+    return None
+
+
+def _find_front(solid: Bits, main: Bits, places: _Places) -> tuple[Bits, Float64Array, Bits]:
+    """Return the front half of the canal in the slices of the pedicles, the canal's shift in x and y per mm of height,
+    and the wall behind.
+    """
+    from scipy.ndimage import label as find_components
+
+    middle = float(np.mean(places.heights[np.nonzero(main)[0]]))
+    behind = places.mean_y(main)
+    slope = np.zeros(2)
+    front, wall = np.zeros_like(solid), np.zeros_like(solid)
+    for _ in range(ROUNDS):
+        limits = behind + slope[1] * (places.heights - middle)
+        wall = np.stack([places.y(n) >= limit for n, limit in enumerate(limits)])
+        blocked = solid | wall
+        components, _ = find_components(_fill_slices(blocked) & ~blocked)
+        sizes = np.bincount(components[main])
+        sizes[0] = 0
+        front = components == np.argmax(sizes) if sizes.any() else np.zeros_like(solid)
+        found = np.flatnonzero(front.any(axis=(1, 2)))
+        if len(found) < 3:
+            break
+        middles = np.array([_front_of(front[n], places.x(int(n)), places.y(int(n))) for n in found])
+        slope = np.clip(np.polyfit(places.heights[found], middles, 1)[0], -STEEPEST, STEEPEST)
+    return front, slope, wall
+
+
+def _front_of(section: Bits, x: Float64Array, y: Float64Array) -> tuple[float, float]:
+    """Return the middle of a section from side to side, and its front: the median over columns of their lowest y."""
+    columns = section.any(axis=0)
+    lowest = np.where(section, y, np.inf).min(axis=0)[columns]
+    return float(x[section].min() + x[section].max()) / 2.0, float(np.median(lowest))

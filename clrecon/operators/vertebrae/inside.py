@@ -1,0 +1,327 @@
+"""`VertebraInside`: solid bone, dense and trabecular bone and the canal of one vertebra."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, NoReturn
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clrecon.errors import NoSurfaceError, UsageError
+from clrecon.geometry import Volume
+from clrecon.labels import LabelMap
+from clrecon.labels.canal import Canal, find_canal
+from clrecon.labels.volumes import count_ml, slice_voxel_ml
+from clrecon.mesh import Mesh
+from clrecon.opencl import Device
+from clrecon.operators.masks.mask import Mask
+from clrecon.operators.resident.device_volume import DeviceVolume
+from clrecon.operators.surface.label_masks import extract_label_masks
+from clrecon.operators.vertebrae.crop import LabelCrop, check_types, crop_label
+from clrecon.operators.vertebrae.solid import CLOSE_MM, label_margin, make_solid
+from clrecon.operators.vertebrae.thickness import ShellThickness, measure_thickness
+
+__all__ = ["DENSE_HU", "PARTS", "VertebraInside", "name_band", "vertebra_inside"]
+
+DENSE_HU = (450.0, None)
+"""Band of dense bone: from half way between thin cortex (850 HU) and soft tissue on."""
+
+PARTS = ("dense", "trabecular", "canal", "solid")
+"""Parts by the order of their numbers, from 1, in `VertebraInside.to_label_map`; solid is dense and trabecular."""
+
+NEIGHBOUR_HU = 150.0
+"""Voxels of other labels are bone from here on, and no part of a canal; cord and sac lie below 100 HU."""
+
+MISSED_SHARE = 0.1
+"""Warn where this share of the band around a label lies in the next voxel outside of it."""
+
+LEAST_CANAL_MM = 6.0
+"""Warn of canals that are lower: pedicles of adults are 10 mm high and more."""
+
+
+@dataclass(frozen=True, eq=False)
+class VertebraInside:
+    """The parts of one vertebra as masks, made by `vertebra_inside`.
+
+    All masks are of `volume`, the part of the scan around the vertebra at its place in the patient.
+
+    Attributes
+    ----------
+    label : int
+    name : str
+    volume : Volume
+        Its axes are in the order that makes the slices as axial as they can be.
+    solid : Mask
+        All bone, without the canal.
+    dense : Mask
+        Voxels of the solid bone in the band `dense_hu`.
+    trabecular : Mask
+        The rest of the solid bone.
+    canal : Mask or None
+        Hole of the arch at the pedicles' height; None where the arch is closed nowhere.
+    dense_hu : (float, float)
+        Both ends included; infinity where an end is open.
+    iso_value : float or None
+        Level of the solid bone, HU; None: the label's own voxels.
+    inside_share : float
+        Share of the label's voxels that lie in the scan.
+    thickness : ShellThickness
+        Of the dense bone.
+    canal_found : Canal or None
+    warnings : list of str
+    """
+
+    label: int
+    name: str
+    volume: Volume
+    solid: Mask
+    dense: Mask
+    trabecular: Mask
+    canal: Mask | None
+    dense_hu: tuple[float, float]
+    iso_value: float | None
+    inside_share: float
+    thickness: ShellThickness
+    canal_found: Canal | None
+    warnings: list[str]
+
+    def __reduce__(self) -> NoReturn:
+        """Refuse to be pickled or copied: buffers stay with their process."""
+        raise TypeError("a VertebraInside belongs to its process: send to_label_map(), as_dict() and the meshes")
+
+    def __repr__(self) -> str:
+        parts = ", ".join(f"{name} {ml:.2f} ml" for name, ml in self.volumes_ml.items())
+        return f"VertebraInside({self.name}: {parts})"
+
+    @property
+    def masks(self) -> dict[str, Mask]:
+        """The masks by the names of `PARTS`, without those that are absent or empty."""
+        found = {name: getattr(self, name) for name in PARTS}
+        return {name: mask for name, mask in found.items() if mask is not None and mask.count}
+
+    @cached_property
+    def volumes_ml(self) -> dict[str, float]:
+        """Volume of each part, ml: the sum over its voxels."""
+        voxel_ml = slice_voxel_ml(self.volume)
+        everywhere = tuple(slice(0, size) for size in self.volume.voxels.shape)
+        return {
+            name: count_ml(mask.to_numpy(), 1, everywhere, voxel_ml)  # type: ignore[arg-type]
+            for name, mask in self.masks.items()
+        }
+
+    def to_label_map(self) -> LabelMap:
+        """Return the parts that do not overlap as a label map: dense 1, trabecular 2, canal 3, on the grid of `volume`.
+
+        Raises
+        ------
+        UsageError
+            The slices of the scan are uneven: no label map has such a grid.
+        """
+        return self._map({name: mask for name, mask in self.masks.items() if name != "solid"})
+
+    def extract_meshes(self, *, memory: int | None = None) -> dict[str, Mesh]:
+        """Return the surface of each part, as `extract_label_masks` makes it, by the names of `PARTS`.
+
+        Dense and trabecular bone share the vertices of their border; the outer surface is that of ``solid``.
+
+        Parameters
+        ----------
+        memory : int, optional
+            Most bytes on the device.
+
+        Raises
+        ------
+        UsageError
+            As `to_label_map`.
+        DeviceError
+            As `extract_label_masks`.
+        """
+        meshes: dict[str, Mesh] = {}
+        for names in (PARTS[:-1], PARTS[-1:]):
+            held = {name: mask for name, mask in self.masks.items() if name in names}
+            made = extract_label_masks(self._map(held), device=self.solid.device, memory=memory)
+            meshes |= {PARTS[number - 1]: mesh for number, mesh in made.items()}
+        for mesh in meshes.values():
+            mesh.report["certificate"] = self.volume.report
+        return {name: meshes[name] for name in PARTS if name in meshes}
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return what was found as plain JSON types."""
+        canal = self.canal_found
+        return {
+            "label": self.label,
+            "name": self.name,
+            "label_inside_share": self.inside_share,
+            "solid_of": "label" if self.iso_value is None else "iso value",
+            "iso_value_hu": self.iso_value,
+            "dense_hu": [None if math.isinf(end) else end for end in self.dense_hu],
+            "spacing_mm": list(self.volume.spacing),
+            "volumes_ml": {name: self.volumes_ml.get(name) for name in PARTS},
+            "dense_thickness": self.thickness.as_dict(),
+            "canal_height_mm": None if canal is None else canal.height_mm,
+            "canal_closed_slices": None if canal is None else canal.closed_slices,
+            "warnings": list(self.warnings),
+        }
+
+    def _map(self, masks: dict[str, Mask]) -> LabelMap:
+        if self.volume.uneven:
+            raise UsageError(
+                "the slices of the scan are uneven: parts have masks and volumes, but no label map or mesh"
+            )
+        voxels = np.zeros(self.volume.voxels.shape, np.uint8)
+        for name, mask in masks.items():
+            voxels[mask.to_numpy()] = PARTS.index(name) + 1
+        return LabelMap(voxels, self.volume.affine, {PARTS.index(name) + 1: name for name in masks})
+
+
+def vertebra_inside(
+    volume: Volume,
+    labels: LabelMap,
+    label: int | str,
+    iso_value: float | None = None,
+    *,
+    dense: Sequence[float | None] = DENSE_HU,
+    close_mm: float = CLOSE_MM,
+    grow_mm: float | None = None,
+    device: Device | str | int | None = None,
+    memory: int | None = None,
+) -> VertebraInside:
+    """Look into one vertebra: its solid bone, what of it is dense and what trabecular, and its canal.
+
+    The canal is the largest hole of the arch, slice by slice, joined, and cut at the pedicles' height.  Dense bone is a
+    band of HU and no cortex: thin cortex looks thicker and less dense than it is.
+
+    Parameters
+    ----------
+    volume : Volume
+    labels : LabelMap
+        On any grid, with filled labels.
+    label : int or str
+        Number or name, as `LabelMap.find` takes it.
+    iso_value : float, optional
+        HU; the solid bone is what is at this level and above within the label, closed and filled.  None: the label's
+        own voxels.
+    dense : (low, high)
+        Band of HU, both ends included; None leaves an end open.
+    close_mm : float
+        Radius of the balls that close the solid bone, mm.
+    grow_mm : float, optional
+        With an iso value: distance of growth, see `extract_labels`.
+    device : Device, str or int, optional
+        See `clrecon.device`.
+    memory : int, optional
+        Most bytes on the device.
+
+    Returns
+    -------
+    VertebraInside
+
+    Raises
+    ------
+    UsageError
+        These are not a Volume and a LabelMap, the map has no such label, the band or a length is no such thing, or a
+        growth is given without an iso value.
+    RefusedInputError
+        The map names another frame of reference, lies outside of the volume, or this label does.
+    NoSurfaceError
+        No voxel of the label has the iso value, or none of its solid bone lies in the band.
+    DeviceError
+        The device has no room, or it fails.
+    """
+    check_types(volume, labels)
+    band = _checked_dense(dense)
+    crop = crop_label(volume, labels, label, label_margin(volume, close_mm, grow_mm))
+    with DeviceVolume(crop.volume, device=device, memory=memory) as resident:
+        solid, others = make_solid(resident, crop, iso_value, close_mm, grow_mm)
+        in_band = _mark_band(resident, band, solid, crop)
+        dense_bone = in_band & solid
+        if not dense_bone.count:
+            raise _refuse_band(crop, solid, band)
+        bone = solid.to_numpy()
+        found = find_canal(bone, crop.volume) if crop.axial else None
+        canal = None
+        if found is not None:  # other labels that are bone are neighbours; the cord and the sac have labels too
+            canal = Mask.from_array(resident, found.voxels) - (others & _mark_bone(resident))
+    trabecular = solid - dense_bone
+    dense_bone.name, trabecular.name = name_band(band), f"solid bone without {name_band(band)}"
+    if canal is not None:
+        canal.name = f"canal of {crop.name}"
+    warnings = [*crop.warnings, *_warn_of_canal(crop, found)]
+    if iso_value is None:
+        warnings += _warn_of_missed(in_band, dense_bone, solid, others, band)
+    return VertebraInside(
+        crop.number, crop.name, crop.volume, solid, dense_bone, trabecular, canal, band, iso_value,
+        crop.inside_share, measure_thickness(dense_bone), found, warnings,
+    )  # fmt: skip
+
+
+def name_band(band: Sequence[float | None]) -> str:
+    """Write a band of HU as text: ``450 HU and above``, ``450 to 900 HU``."""
+    low, high = _checked_dense(band)
+    if math.isinf(high):
+        return f"{low:g} HU and above"
+    return f"{high:g} HU and below" if math.isinf(low) else f"{low:g} to {high:g} HU"
+
+
+def _checked_dense(dense: Sequence[float | None]) -> tuple[float, float]:
+    """Return the band of dense bone, infinite where it is open."""
+    try:
+        low, high = dense
+        ends = (-math.inf if low is None else float(low), math.inf if high is None else float(high))
+    except (TypeError, ValueError):
+        ends = (math.nan, math.nan)
+    if not ends[0] <= ends[1] or all(map(math.isinf, ends)):
+        raise UsageError(f"dense bone is a band of HU, (low, high) with None for an open end, not {dense!r}")
+    return ends
+
+
+def _mark_band(resident: DeviceVolume, band: tuple[float, float], solid: Mask, crop: LabelCrop) -> Mask:
+    try:
+        return Mask.from_band(resident, band)
+    except NoSurfaceError:  # the type of the voxels has no such value
+        raise _refuse_band(crop, solid, band) from None
+
+
+def _mark_bone(resident: DeviceVolume) -> Mask:
+    try:
+        return Mask.from_band(resident, (NEIGHBOUR_HU, math.inf))
+    except NoSurfaceError:  # the type of the voxels has no such value
+        return Mask.from_array(resident, np.zeros(resident.volume.voxels.shape, np.bool_))
+
+
+def _refuse_band(crop: LabelCrop, solid: Mask, band: tuple[float, float]) -> NoSurfaceError:
+    hu: NDArray[Any] = crop.volume.voxels[solid.to_numpy()]
+    return NoSurfaceError(
+        f"no voxel of label {crop.number} {crop.name} has {name_band(band)}: its bone runs from {float(hu.min()):g} to"
+        f" {float(hu.max()):g} HU"
+    )
+
+
+def _warn_of_canal(crop: LabelCrop, found: Canal | None) -> list[str]:
+    called = f"label {crop.number} {crop.name}"
+    if not crop.axial:
+        return [f"no canal of {called}: the slices are not axial, and uneven ones are not turned"]
+    if found is None:
+        return [f"no canal of {called}: its arch is closed in no slice, nor in some neighbouring slices together"]
+    if found.height_mm < LEAST_CANAL_MM:
+        return [
+            f"the canal of {called} is {found.height_mm:.3g} mm high: pedicles are higher, the label may have gaps or"
+            " be cut"
+        ]
+    return []
+
+
+def _warn_of_missed(in_band: Mask, dense: Mask, solid: Mask, others: Mask, band: tuple[float, float]) -> list[str]:
+    """Warn of a label that ends before the dense bone does."""
+    beside = in_band & (solid.dilate(min(max(solid.volume.spacing), 3.0)) - solid - others)
+    share = beside.count / (beside.count + dense.count)
+    if share < MISSED_SHARE:
+        return []
+    return [
+        f"{100 * share:.0f} % of the bone of {name_band(band)} lie in the next voxel outside of the label: masks end"
+        " before bone does; an iso value takes it in"
+    ]
