@@ -275,7 +275,9 @@ def _checked_dense(dense: Sequence[float | None]) -> tuple[float, float]:
     except (TypeError, ValueError):
         ends = (math.nan, math.nan)
     if not ends[0] <= ends[1] or all(map(math.isinf, ends)):
-        raise UsageError(f"dense bone is a band of HU, (low, high) with None for an open end, not {dense!r}")
+        raise UsageError(
+            f"dense bone is a band of HU, (low, high), the lower one first, None for an open end; not {dense!r}"
+        )
     return ends
 
 

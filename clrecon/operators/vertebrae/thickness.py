@@ -38,8 +38,9 @@ class ShellThickness(Record):
 def measure_thickness(mask: Mask) -> ShellThickness:
     """Measure the local thickness of a mask: at each voxel that of the largest ball within the mask that holds it.
 
-    A ball of radius r, counted from centre to centre, fits into what is thicker than 2 r.  The radii begin with the
-    largest step of the voxels, so that three voxels fit across in each direction, and grow by half the smallest step.
+    The radii begin with the largest step of the voxels, so that three voxels fit across in each direction, and grow by
+    half the smallest step.  A ball of lattice points fits into a plate of an odd number of voxels as long as its
+    diameter is not above the plate's thickness; of an even number it tells one voxel less.
 
     Parameters
     ----------
@@ -61,7 +62,6 @@ def measure_thickness(mask: Mask) -> ShellThickness:
     """
     spacing = mask.volume.spacing
     first, step = max(spacing), min(spacing) / 2.0
-    width = float(np.prod(spacing)) ** (1.0 / 3.0)  # a row of n voxels is (n - 1) steps from centre to centre
     radii = np.arange(first, max(MOST_RADIUS_MM, first) + step, step)
     counts = []
     for radius in radii:
@@ -73,7 +73,7 @@ def measure_thickness(mask: Mask) -> ShellThickness:
         return ShellThickness(limit, 0.0, None, None)
     left = np.maximum.accumulate(np.array([*counts, 0])[::-1])[::-1]  # openings by lattice balls may grow again
     own = -np.diff(left)  # voxels whose largest ball is that of each radius
-    thickness = 2.0 * radii[: len(own)] + width
+    thickness = 2.0 * radii[: len(own)]
     share = np.cumsum(own) / own.sum()
     median, p95 = (float(thickness[np.searchsorted(share, part)]) for part in (0.5, 0.95))
     return ShellThickness(limit, counts[0] / total, median, p95)
