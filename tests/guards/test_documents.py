@@ -73,7 +73,7 @@ def test_the_commands_of_documents_are_understood() -> None:
     assert {command[0] for command in commands} >= {"demo", "mesh", "render", "info", "devices", "phantom", "selftest"}
     more = find_commands((ROOT / "docs" / "certificate.md").read_text(encoding="utf-8"))
     assert [command[0] for command in more] == ["phantom", "info"]
-    for name in ("formats", "iso_value", "labels", "rendering"):
+    for name in ("formats", "inside", "iso_value", "labels", "rendering"):
         found = find_commands((ROOT / "docs" / f"{name}.md").read_text(encoding="utf-8"))
         assert found
         more += found
