@@ -116,6 +116,7 @@ GLB_METRES = 1e-7  # relative; float32 coordinates through a float64 matrix, rea
 
 # --- smoothing, decimation, distances ---
 SPHERE_SAGITTA_MM = 0.004  # triangles of 0.49 mm on a sphere of 10 mm sag 0.003 mm
+BALL_SAGITTA_MM = 0.011  # triangles of up to 0.8 mm on balls of 10 mm sag 0.0097 mm, tori of 0.4 mm less
 SMOOTHED_NOISE_SHARE = 0.5  # white noise through a filter that passes a tenth of the band; measured 0.33 to 0.42
 SMOOTHED_RADIUS_MM = 0.01  # noise of 0.1 mm on 20 mm; a Laplacian of as many steps loses 0.2 mm
 SMOOTHED_VOLUME = 2e-3  # the gate is 5e-3

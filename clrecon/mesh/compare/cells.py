@@ -11,7 +11,10 @@ from numpy.typing import NDArray
 
 from clrecon.errors import NoSurfaceError, UsageError
 from clrecon.exchange.coordinates import rounding_step
+from clrecon.geometry import Volume
+from clrecon.geometry.affine import normal_matrix
 from clrecon.geometry.grid import Grid
+from clrecon.geometry.iso_rule import layer_normal_matrices
 from clrecon.mesh.compare.boxes import meets_box
 from clrecon.mesh.mesh import Mesh
 from clrecon.system.messages import Message
@@ -165,7 +168,7 @@ def find_mesh_cells(mesh: Mesh, grid: Grid, *, name: str = "", progress: Progres
     mesh.check()
     if mesh.triangle_count == 0:
         return GridCells([], name)
-    margin = _ROUNDINGS * rounding_step(mesh.vertices) / min(grid.spacing)
+    margin = _ROUNDINGS * rounding_step(mesh.vertices) * _steps_per_mm(grid)
     ijk = grid.lps_to_ijk(mesh.vertices)
     _check_place(ijk, grid)
     told = progress or ignore_progress
@@ -175,6 +178,15 @@ def find_mesh_cells(mesh: Mesh, grid: Grid, *, name: str = "", progress: Progres
         found += [np.unique(_pack(cells)) for cells in _cells_of(ijk[mesh.triangles[where]], min(margin, 0.25))]
     told("cells", mesh.triangle_count, mesh.triangle_count)
     return GridCells(_unpack(np.unique(np.concatenate(found))), name)
+
+
+def _steps_per_mm(grid: Grid) -> float:
+    """Return the most index steps that a millimetre can be, in any direction and between any slices."""
+    if isinstance(grid, Volume):
+        matrices = layer_normal_matrices(grid, 1)
+    else:
+        matrices = normal_matrix(grid.affine)[None]
+    return float(np.linalg.norm(matrices, axis=1).max())
 
 
 def _check_place(ijk: NDArray[np.float64], grid: Grid) -> None:

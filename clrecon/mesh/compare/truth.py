@@ -20,8 +20,8 @@ __all__ = ["REACH_MM", "TRUTH_SAMPLES", "TruthDistance", "measure_truth"]
 TRUTH_SAMPLES = 20_000
 """Points on the mesh; each asks the true surface seven times."""
 
-REACH_MM = 3.0
-"""Points farther away are of another surface."""
+REACH_MM = 1.5
+"""Points farther away are of another surface: walls of inner cavities that face outwards, ribs, discs."""
 
 _STEP_MM = 0.2
 """Half the length over which the direction of the true surface is measured."""
@@ -43,6 +43,8 @@ class TruthDistance(Record):
         Angle between the triangles' normals and those of the true surface: median, 95th percentile.
     outer_share : float
         Share of the points that are of the outer side: within reach of the true surface, and facing as it does.
+    reach_mm : float
+        The reach.
     samples : int
         Points on the whole mesh.
     """
@@ -54,6 +56,7 @@ class TruthDistance(Record):
     normals_median_deg: float
     normals_p95_deg: float
     outer_share: float
+    reach_mm: float
     samples: int
 
 
@@ -62,7 +65,7 @@ def measure_truth(
     truth: SignedSurface,
     samples: int = TRUTH_SAMPLES,
     *,
-    reach_mm: float = REACH_MM,
+    reach_mm: float | None = None,
     grid: Grid | None = None,
     progress: Progress | None = None,
 ) -> TruthDistance:
@@ -78,8 +81,9 @@ def measure_truth(
         Such as `clrecon.phantom_truth` gives.
     samples : int
         Points on the mesh.
-    reach_mm : float
-        Points farther from the true surface are left out.
+    reach_mm : float, optional
+        Points farther from the true surface are left out.  Default: 1.5 mm, and with `grid` not less than the longest
+        step of its voxels.
     grid : Volume or LabelMap, optional
         The scan; points within a voxel of its border, where a mesh is closed by a cut, are then left out.
     progress : callable, optional
@@ -100,8 +104,10 @@ def measure_truth(
         raise UsageError(f"a {type(truth).__name__} has no signed distance: give the truth of a phantom")
     if samples < 1:
         raise UsageError(f"distances need at least 1 sample, not {samples}")
-    if not reach_mm > 0.0:
-        raise UsageError(f"the reach is above 0 mm, not {reach_mm}")
+    if reach_mm is None:
+        reach_mm = REACH_MM if grid is None else max(REACH_MM, *grid.spacing)
+    if not 0.0 < reach_mm < np.inf:
+        raise UsageError(f"the reach is a number of mm above 0, not {reach_mm}")
     mesh.check()
     told = progress or ignore_progress
     points, rows = sample_surface_points(mesh.vertices, mesh.triangles, samples)
@@ -118,7 +124,8 @@ def measure_truth(
     outer = cosine > 0.0
     if not outer.any():
         raise NoSurfaceError(
-            f"no point of the mesh lies within {reach_mm:g} mm of the true surface and faces as it does"
+            f"no point of the mesh lies within {reach_mm:g} mm of the true surface and faces as it does: see whether"
+            " both are in the same patient frame, and the triangles counter-clockwise from outside"
         )
     distance, angle = distance[outer], np.degrees(np.arccos(np.clip(cosine[outer], -1.0, 1.0)))
     away = np.abs(distance)
@@ -130,6 +137,7 @@ def measure_truth(
         normals_median_deg=float(np.median(angle)),
         normals_p95_deg=float(np.percentile(angle, 95)),
         outer_share=float(outer.sum() / samples),
+        reach_mm=float(reach_mm),
         samples=samples,
     )
 

@@ -1,0 +1,156 @@
+"""Meshes and cells against surfaces that are known as signed distances."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+import sample_meshes as samples
+import tolerances
+
+from clrecon.errors import NoSurfaceError, UsageError
+from clrecon.geometry import Volume
+from clrecon.mesh import Mesh
+from clrecon.mesh.compare.cells import find_mesh_cells, measure_cells
+from clrecon.mesh.compare.cut_cells import find_cut_cells
+from clrecon.mesh.compare.truth import measure_truth
+from clrecon.phantom import PhantomSettings, phantom_truth
+
+pytestmark = pytest.mark.unit
+
+SHEARED = np.array([[0.7, 0.1, 0.2, -25.0], [-0.1, 0.9, 0.4, -30.0], [0.0, 0.05, 2.5, -84.0], [0, 0, 0, 1.0]])
+CENTRE = np.array([-3.5, -142.25, -418.75])
+RADIUS = 10.0
+
+
+class Ball:
+    """A ball, and how many points were asked."""
+
+    def __init__(self, centre=CENTRE, radius=RADIUS):
+        self.centre, self.radius, self.asked = np.asarray(centre), radius, 0
+
+    def signed_distance(self, points_mm):
+        self.asked += len(points_mm)
+        return np.linalg.norm(points_mm - self.centre, axis=1) - self.radius
+
+
+class Ring:
+    """A torus about the z axis."""
+
+    def signed_distance(self, points_mm):
+        x, y, z = np.asarray(points_mm).T
+        return np.hypot(np.hypot(x, y) - 20.0, z) - 6.0
+
+
+def ball(radius=RADIUS, shift=(0.0, 0.0, 0.0), rounds=5) -> Mesh:
+    return Mesh(*samples.sphere(CENTRE + shift, radius, rounds))
+
+
+@pytest.mark.parametrize("more", [0.3, -0.4])
+def test_a_level_that_is_off_is_bias_alone(more):
+    found = measure_truth(ball(RADIUS + more), Ball())
+    assert found.bias_mm == pytest.approx(more, abs=tolerances.BALL_SAGITTA_MM)
+    assert found.scatter_mm < tolerances.BALL_SAGITTA_MM
+    assert found.p95_mm == pytest.approx(abs(more), abs=tolerances.BALL_SAGITTA_MM)
+    assert found.max_mm == pytest.approx(abs(more), abs=tolerances.BALL_SAGITTA_MM)
+    assert found.outer_share == 1.0
+    assert found.normals_p95_deg < 2.0  # facets of 0.6 mm on a ball of 10 mm turn by 1.1 degrees to their rim
+
+
+def test_a_shift_is_scatter_alone():
+    # s cos(theta) has the mean 0 and the standard deviation s / sqrt(3) on a ball
+    found = measure_truth(ball(shift=(0.3, 0.0, 0.0)), Ball())
+    assert found.bias_mm == pytest.approx(0.0, abs=tolerances.BALL_SAGITTA_MM)
+    assert found.scatter_mm == pytest.approx(0.3 / np.sqrt(3.0), abs=tolerances.BALL_SAGITTA_MM)
+    assert found.max_mm == pytest.approx(0.3, abs=tolerances.BALL_SAGITTA_MM)
+
+
+def test_a_torus():
+    found = measure_truth(Mesh(*samples.torus(300, 120, minor=6.25)), Ring())
+    assert found.bias_mm == pytest.approx(0.25, abs=tolerances.BALL_SAGITTA_MM)
+    assert found.scatter_mm < tolerances.BALL_SAGITTA_MM
+
+
+def test_the_wall_of_a_cavity_is_not_the_outer_side():
+    outer, inner = ball(RADIUS + 0.2), ball(RADIUS - 0.8)
+    vertices, triangles = samples.join((outer.vertices, outer.triangles), (inner.vertices, inner.triangles[:, ::-1]))
+    found = measure_truth(Mesh(vertices, triangles), Ball())
+    assert found.bias_mm == pytest.approx(0.2, abs=tolerances.BALL_SAGITTA_MM)
+    assert found.outer_share == pytest.approx(10.2**2 / (10.2**2 + 9.2**2), abs=1e-3)
+
+
+def test_what_lies_beyond_the_reach_is_left_out():
+    one, other = ball(), ball(radius=3.0, shift=(40.0, 0.0, 0.0), rounds=3)
+    both = Mesh(*samples.join((one.vertices, one.triangles), (other.vertices, other.triangles)))
+    found = measure_truth(both, Ball())
+    assert found.max_mm < tolerances.BALL_SAGITTA_MM
+    assert found.outer_share == pytest.approx(100 / 109, abs=2e-3)
+    assert found.reach_mm == 1.5
+    with pytest.raises(NoSurfaceError, match=r"within 1.5 mm of the true surface"):
+        measure_truth(other, Ball())
+    inside_out = Mesh(one.vertices, one.triangles[:, ::-1])
+    with pytest.raises(NoSurfaceError, match="counter-clockwise from outside"):
+        measure_truth(inside_out, Ball())
+
+
+def test_a_cut_at_the_border_of_the_scan_is_left_out():
+    grid = Volume(np.zeros((21, 41, 41), np.int16), np.diag([1.0, 1.0, 2.0, 1.0]))
+    truth = Ball((20.0, 20.0, 4.0))
+    vertices, triangles = samples.sphere((20.0, 20.0, 4.0), 10.2, 5)
+    cut = Mesh(np.maximum(vertices, [-99.0, -99.0, 0.0]), triangles)  # what lies below the grid is pressed flat
+    found = measure_truth(cut, truth, grid=grid)
+    assert found.bias_mm == pytest.approx(0.2, abs=tolerances.BALL_SAGITTA_MM)
+    assert found.scatter_mm < tolerances.BALL_SAGITTA_MM
+    assert found.reach_mm == 2.0  # of the longest step
+    assert measure_truth(cut, truth).scatter_mm > 10 * found.scatter_mm
+
+
+def test_bad_arguments_are_refused():
+    with pytest.raises(UsageError, match="a dict has no signed distance"):
+        measure_truth(ball(), {})
+    with pytest.raises(UsageError, match="a dict has no signed distance"):
+        find_cut_cells({}, Volume(np.zeros((3, 3, 3), np.int16), np.eye(4)))
+    with pytest.raises(UsageError, match="at least 1 sample"):
+        measure_truth(ball(), Ball(), 0)
+    for reach in (0.0, -1.0, np.nan, np.inf):
+        with pytest.raises(UsageError, match="the reach is a number of mm above 0"):
+            measure_truth(ball(), Ball(), reach_mm=reach)
+    with pytest.raises(NoSurfaceError):
+        measure_truth(Mesh(np.zeros((0, 3)), np.zeros((0, 3), np.uint32)), Ball())
+
+
+@pytest.mark.parametrize("affine", [np.eye(4), SHEARED], ids=["even", "sheared"])
+def test_cut_cells_are_those_of_all_points_asked(affine):
+    grid = Volume(np.zeros((19, 33, 40), np.int16), affine)
+    truth = Ball(grid.ijk_to_lps([[24.0, 18.0, 8.0]])[0], 7.5)
+    low = np.array(list(itertools.product(range(-1, 40), range(-1, 33), range(-1, 19))))
+    points = low[:, None] + 0.5 * np.array(list(itertools.product(range(3), repeat=3)))
+    within = truth.signed_distance(grid.ijk_to_lps(points.reshape(-1, 3))).reshape(len(low), 27) < 0.0
+    all_asked, truth.asked = truth.asked, 0
+    found = find_cut_cells(truth, grid)
+    assert set(map(tuple, found.ijk.tolist())) == set(
+        map(tuple, low[within.any(axis=1) & ~within.all(axis=1)].tolist())
+    )
+    assert truth.asked < all_asked / 10
+    assert found.name == "truth"
+
+
+@pytest.mark.parametrize("kind", ["sphere", "torus"])
+def test_cells_of_a_phantom_are_near_its_surface(kind):
+    truth = phantom_truth(PhantomSettings(kind=kind, size=(64, 64), slices=48, oblique=(20.0, 10.0, 5.0)))
+    grid = Volume(np.zeros((48, 64, 64), np.int16), truth.affine)
+    cut = find_cut_cells(truth, grid)
+    half = 0.5 * np.linalg.norm(grid.spacing)
+    assert len(cut) > 500
+    assert np.abs(truth.signed_distance(grid.ijk_to_lps(cut.ijk + 0.5))).max() <= half
+
+
+def test_cells_of_a_mesh_against_those_of_its_truth():
+    grid = Volume(np.zeros((33, 33, 33), np.int16), np.eye(4))
+    truth = Ball((16.2, 15.9, 16.4))
+    mesh = Mesh(*samples.sphere((16.2, 15.9, 16.4), RADIUS, 6))
+    found = measure_cells(mesh, find_cut_cells(truth, grid), grid)
+    assert found.reference == "truth"
+    assert found.recall > 0.99 and found.precision > 0.97  # corners between the 27 points of a cell
+    assert measure_cells(mesh, find_mesh_cells(mesh, grid, name="t-mc"), grid).dice == 1.0
