@@ -14,7 +14,9 @@
  * -D GRADIENT_OPACITY   opacity times a function of the gradient's magnitude
  * -D TAKES_PARTS=1      steep segments in parts; steps are so short that values are nearly linear between samples;
  *                       default 0, samples alone
- * -D LABELS             labels with colours and opacities */
+ * -D LABELS             labels with colours and opacities
+ * -D BETWEEN            only what lies between two depths of each pixel, see cl/rays/layers.cl */
+#include "rays/between.h"
 #include "rays/field.h"
 #include "rays/inner_samples.h"
 #include "rays/jitter.h"
@@ -159,12 +161,15 @@ static inline void blend_samples(const field *f, const slice_stack *stack, const
 /* Set up the rays of LANES pixels that are neighbours in a row; nothing shows before `entry`. */
 static inline void start_rays(const field *f, const looks *look, const int2 first_pixel, const int2 size,
     const uint planes, const int perspective, const int jitter, const float entry, const float4 slope,
-    ray_lanes *course, packet *rays)
+    ray_lanes *course, packet *rays BETWEEN_PARAMETERS)
 {
     const float ray_step = look->ray_step;
     const floats x = (float)first_pixel.x + LANE_NUMBERS, y = (float)first_pixel.y;
     ray_packet way;
     start_packet(look->view, x, y, planes, perspective, &way);
+#ifdef BETWEEN
+    shorten_ways(nearest, farthest, first_pixel, size, &way);
+#endif
     rays->phase = 0.5f;
     if (jitter) {
         float phase_of[LANES];
@@ -241,6 +246,7 @@ static inline void load_sights(__global const float4 *states, const int2 first_p
  *             main_axis ahead eye aside   see main_way
  *             jitter   samples at random places of their segments
  *             stage    FIRST_SLAB and LAST_SLAB, see rays/view.h
+ *             with BETWEEN nearest, farthest  in  (height, width) mm along the ray where the way begins and ends
  *             with LABELS those of the buffer's slices, and the table of rays/label_color.h
  *             with UNEVEN the table of slices, see rays/stack.h
  * Launch      global = tiles * 64 / LANES rounded up by the host, any local
@@ -260,7 +266,7 @@ __kernel void composite_rays(
     const float steps_per_unit, const uint width, const uint height, const uint planes, const int perspective,
     const int shaded, const int jitter, const int stage, const uint queues, const int main_axis, const int ahead,
     const float4 eye, const float aside
-    LABEL_PARAMETERS STACK_PARAMETERS)
+    BETWEEN_PARAMETERS LABEL_PARAMETERS STACK_PARAMETERS)
 {
     const uint first_pixel = (uint)get_global_id(0) * LANES;
     const field f = { voxels, ni, nj, first_k, end_k, last_place };
@@ -295,7 +301,8 @@ __kernel void composite_rays(
     const int2 pixel_of_first = find_pixel(first_pixel, width, height, queues), size = { (int)width, (int)height };
     ray_lanes course;
     packet rays;
-    start_rays(&f, &look, pixel_of_first, size, planes, perspective, jitter, entry, slope, &course, &rays);
+    start_rays(
+        &f, &look, pixel_of_first, size, planes, perspective, jitter, entry, slope, &course, &rays BETWEEN_ARGUMENTS);
     sights seen;
     seen.red = seen.green = seen.blue = seen.opacity = seen.sum = 0.0f;
     seen.first_hit = -1.0f;

@@ -2,7 +2,9 @@
  *
  * A ray crosses each slice plane once, so no marching is needed, and only the shown slices have to be on the device.
  * All rays cross the slices in the same order: by height for parallel rays, by distance from the camera's height for
- * rays from a camera. */
+ * rays from a camera.
+ *
+ * -D BETWEEN   only what lies between two depths of each pixel, see cl/rays/layers.cl */
 #include "include/volume.h"
 #include "rays/view.h"
 
@@ -24,12 +26,16 @@
  *             bins_low bins_scale  nearest node to a value v: (v - bins_low) * bins_scale + 0.5
  *             opacity  of a slice;  lowest: values below are transparent
  *             stage    FIRST_SLAB and LAST_SLAB, see rays/view.h
+ *             with BETWEEN nearest, farthest  in  (height, width) mm along the ray: a slice at the farther end is left out
  * Launch      global = tiles * 64 rounded up by the host, any local
  * Guarantees  every pixel of image and depths is written with the last slices */
 __kernel void overlay_slices(
     __global const VOXEL *restrict slices, __global const float4 *restrict places,
-    __global const float4 *restrict colors, __global const float4 *restrict view, __global float4 *restrict states,
-    __global uchar4 *restrict image, __global float *restrict depths, __global float *restrict means,
+    __global const float4 *restrict colors, __global const float4 *restrict view,
+#ifdef BETWEEN
+    __global const float *restrict nearest, __global const float *restrict farthest,
+#endif
+    __global float4 *restrict states, __global uchar4 *restrict image, __global float *restrict depths, __global float *restrict means,
     const float4 background, const int ni, const int nj, const int count,
     const float bins_low, const float bins_scale, const float opacity, const float lowest, const uint width,
     const uint height, const uint planes, const int perspective, const int stage, const uint queues)
@@ -40,6 +46,11 @@ __kernel void overlay_slices(
     const size_t at_pixel = (size_t)pixel.y * width + (size_t)pixel.x;
     ray r;
     start_ray(view, convert_float2(pixel), planes, perspective, &r);
+    float beyond = INFINITY;
+#ifdef BETWEEN
+    r.t_in = max(r.t_in, nearest[at_pixel] - r.offset);
+    beyond = farthest[at_pixel] - r.offset;
+#endif
 
     float4 seen = (float4)(0.0f);
     float first_hit = NO_HIT, sum = 0.0f;
@@ -55,7 +66,7 @@ __kernel void overlay_slices(
         const float t = (place.z - r.origin.z) / r.step.z;
         const float i = r.origin.x + t * r.step.x - place.x, j = r.origin.y + t * r.step.y - place.y;
         /* Half a voxel around the outermost centres belongs to them. */
-        if (t < r.t_in || t > r.t_out || i < -0.5f || j < -0.5f || i > (float)ni - 0.5f || j > (float)nj - 0.5f)
+        if (t < r.t_in || t > r.t_out || t >= beyond || i < -0.5f || j < -0.5f || i > (float)ni - 0.5f || j > (float)nj - 0.5f)
             continue;
         const float in_i = clamp(i, 0.0f, (float)(ni - 1)), in_j = clamp(j, 0.0f, (float)(nj - 1));
         const int low_i = (int)in_i, low_j = (int)in_j;

@@ -73,7 +73,7 @@ def test_row_57_every_kernel_and_every_variant_has_a_check() -> None:
     names = [check.name for check in CHECKS]
     assert len(set(names)) == len(names)
     assert {macro for macros in SWITCHES.values() for macro in macros} == {
-        "BORDER_INSIDE", "GOLDEN", "GOLDEN_SEARCH", "GRADIENT_OPACITY", "GROWN", "LABELS",
+        "BETWEEN", "BORDER_INSIDE", "GOLDEN", "GOLDEN_SEARCH", "GRADIENT_OPACITY", "GROWN", "LABELS",
         "LEAST_VALUE", "MASKS", "RANGE", "TAKES_PARTS", "UNEVEN",
     }  # fmt: skip
 
@@ -85,7 +85,7 @@ def test_row_57_a_gap_is_found(kernel: str) -> None:
     assert find_gaps(fewer, kernels, SWITCHES)
     without = {name: file for name, file in kernels.items() if name != "sum_blocks"}
     assert find_gaps(CHECKS, without, SWITCHES) == ["there is no kernel sum_blocks"]
-    more = {**SWITCHES, "rays/slices.cl": {"UPSIDE_DOWN"}}
+    more = {**SWITCHES, "rays/slices.cl": {"BETWEEN", "UPSIDE_DOWN"}}
     assert find_gaps(CHECKS, kernels, more) == ["cl/rays/slices.cl has no check with -D UPSIDE_DOWN"]
 
 

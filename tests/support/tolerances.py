@@ -206,6 +206,7 @@ WINDOW_SHARE = 0.51 / 16384  # weights of 14 bits, rounded
 SPLAT_DEPTH_MM = 1e-4  # float32 sums of 60 mm, and their products with a slanted ray: measured 8e-6
 SPLAT_COLOR_LEVELS = 1.01  # of 255: the table of highlights and the last rounding
 FAR_SPLAT_SHARE = 0.01  # pixels at rims of discs, whose points moved by a step of float32
+LAYER_LEVELS = 2.6  # of 255: rounding of colour and opacity, and the hundredth behind what is nearly opaque
 RAY_LENGTH_SHARE = 1e-6  # the length of a slanted ray in float32, and the product with it
 BALL_MESH_DEPTH_MM = 0.02  # a ball of 8 mm of 90 rings lies 0.005 mm below its sphere, and its depth at a slope of 4
 MEAN_SPACING = 0.15  # an estimate from cells of about four points: measured 0.08

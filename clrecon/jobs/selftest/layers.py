@@ -2,39 +2,54 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from clrecon.geometry import Volume
 from clrecon.geometry.affine import Float64Array
-from clrecon.jobs.selftest.check import Check, require_close, require_equal
+from clrecon.jobs.selftest.check import Check, require_close, require_equal, require_share, require_whole
+from clrecon.jobs.selftest.scenes import OBLIQUE, blobs, centre_of, look_at
 from clrecon.mesh import Mesh
 from clrecon.opencl import Device, download
-from clrecon.operators.rays.layers import Between, LayeredPicture, Still, draw_layers
+from clrecon.operators.rays.buffers import Between
+from clrecon.operators.rays.layers import LayeredPicture, Still, draw_layers
 from clrecon.operators.rays.mesh_pictures import make_part
+from clrecon.operators.rays.scene import ScenePictures
+from clrecon.reference.rays.render import cast_rays
+from clrecon.reference.rays.slices import overlay_slices as overlay_twin
 from clrecon.reference.rays.triangles import Meetings, find_meetings, nth_layer, shade_layer
-from clrecon.rendering import Lighting
+from clrecon.rendering import UNSHADED, Lighting, TransferFunction
 from clrecon.rendering.pictures.mesh_look import MeshLook
+from clrecon.rendering.pictures.styles import SlicesInSpace, VolumeLook
 from clrecon.rendering.views.camera import Camera
+from clrecon.rendering.views.clip import Clip
 
 __all__ = ["CHECKS"]
 
 SIZE = (160, 104)
 """Pixels, of which 32 are a work-item of the kernel that counts them."""
 
+WITH_VOLUME = (96, 60)
+"""Pixels: 720 work-items that take eight rays each."""
+
 TRIANGLES, SPLIT = 660, 90
-"""All triangles, every tenth of which fills a quarter of the picture; from `SPLIT` on they are opaque."""
+"""All triangles, every seventh of which fills a quarter of the picture; from `SPLIT` on they are opaque."""
 
 OPACITY = 0.35
-COLOR_255, DEPTH_MM = 2.0, 1e-3
+COLOR_255, DEPTH_MM, EDGE_SHARE = 2.0, 1e-3, 0.01
+BETWEEN_255 = 3.5
+"""As COLOR_255, and the hundredth behind what is nearly opaque, which rays leave out."""
+
 FIXED = Lighting(0.15, 0.7, 0.4, 20.0, direction=(0.4, -1.0, 0.8))
 
 
 def _soup() -> tuple[Mesh, NDArray[np.uint8]]:
     """Return triangles anywhere within 7 mm, and a colour for each vertex."""
     rng, count = np.random.default_rng(31), TRIANGLES
-    size = np.where(np.arange(count) % 10 < 9, 0.4, 3.0)[:, None, None]
+    size = np.where(np.arange(count) % 7 < 6, 0.4, 3.0)[:, None, None]
     corners = rng.uniform(-6.0, 6.0, (count, 1, 3)) + size * rng.normal(size=(count, 3, 3))
     normals = rng.normal(size=(3 * count, 3))
     normals /= np.linalg.norm(normals, axis=1)[:, None]
@@ -112,9 +127,12 @@ def _check_layers(device: Device) -> str:
             ways.append([download(device, np.empty(SIZE[::-1], np.float32), each) for each in held])
 
         found = draw_layers(device, parts, camera, SIZE, still=still, volume=note)
-        layers, rgba, first, mean = _blend(mesh, colors, camera, still)
+        layers, rgba, depth, mean = _blend(mesh, colors, camera, still)
         _compare_ways(ways, layers, found)
-        require_close(found.depth, first, DEPTH_MM, "depths of triangles, in mm")
+        first = draw_layers(device, parts, camera, SIZE, still=still, most=1)
+        more = np.isfinite(layers[0]) & (first.image[..., 3] < 255)
+        require_equal(first.open_pixels, np.count_nonzero(more), "pixels that may have a second layer")
+        require_close(found.depth, depth, DEPTH_MM, "depths of triangles, in mm")
         require_close(found.expected_depth, mean, DEPTH_MM, "expected depths of triangles, in mm")
         opacity = found.image[..., 3:].astype(np.float64)
         shown = np.concatenate([found.image[..., :3] * (opacity / 255.0), opacity], axis=-1)
@@ -138,7 +156,70 @@ def _compare_ways(ways: list[Any], layers: list[Float64Array], found: LayeredPic
         nearest = farthest
 
 
+def _screen(volume: Volume, camera: Camera) -> tuple[Mesh, Clip, Clip]:
+    """Return two triangles across a volume, aslant, and the half-spaces before and behind them."""
+    centre, toward = centre_of(volume), -camera.basis().forward + (0.2, 0.3, -0.25)
+    normal = toward / np.linalg.norm(toward)
+    one = np.cross(normal, (0.0, 0.0, 1.0))
+    one, other = 200.0 * one, 200.0 * np.cross(normal, one)
+    corners = [centre - one - other, centre + one - other, centre + one + other, centre - one + other]
+    return Mesh(corners, [(0, 1, 2), (0, 2, 3)]), Clip.plane(centre, normal), Clip.plane(centre, -normal)
+
+
+def _check_between(device: Device, slices: bool) -> str:
+    """Show a volume with a translucent screen across it: the twin's part before it, the screen, and the part behind."""
+    worst, opacity, color = 0.0, 0.4, np.array([0.2, 0.9, 0.4])
+    function = TransferFunction([(-300, 0.9, 0.2, 0.1, 0.0), (200, 1, 0.7, 0.4, 0.15), (900, 1, 1, 0.9, 0.6)])
+    screen = MeshLook(tuple(color.tolist()), opacity=opacity, lighting=UNSHADED)
+    window, chosen = (-500.0, 700.0), [1, 4, 7, 9, 12]
+
+    def grey(hu: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.clip((hu - window[0]) / (window[1] - window[0]), 0.0, 1.0)[:, None].repeat(3, axis=1)
+
+    for perspective in (False, True):
+        volume = blobs((16, 26, 22), OBLIQUE, "int16")
+        camera = look_at(volume, (0.4, 0.9, -0.5), 7.0, perspective)
+        step = 0.5 * min(volume.spacing)
+        mesh, before, behind = _screen(volume, camera)
+        look: VolumeLook | SlicesInSpace = VolumeLook(function, lighting=FIXED)
+        if slices:
+            look = SlicesInSpace(chosen, opacity=0.4, lowest_hu=-300.0, window=window)
+        with ScenePictures([(volume, look), (mesh, screen)], device=device) as pictures:
+            found = pictures.take(camera, WITH_VOLUME)
+        require_whole(found.report)
+        sides = []
+        for clip in (before, behind):
+            if slices:
+                rgba, _ = overlay_twin(volume, camera, WITH_VOLUME, chosen, 0.4, -300.0, grey, clip.planes)
+            else:
+                rgba = cast_rays(volume, function, camera, WITH_VOLUME, step, FIXED, clip).rgba
+            sides.append(np.clip(rgba, 0.0, 1.0))
+        rest = opacity * np.append(color, 1.0) + (1.0 - opacity) * sides[1]
+        expected = sides[0] + (1.0 - sides[0][..., 3:]) * rest
+        alpha = found.image[..., 3:].astype(np.float64)
+        shown = np.concatenate([found.image[..., :3] * (alpha / 255.0), alpha], axis=-1)
+        away = np.abs(shown - 255.0 * expected).max(axis=-1)
+        worst = max(
+            worst, require_share(away, np.zeros_like(away), BETWEEN_255, EDGE_SHARE, "colours about a screen, of 255")
+        )
+    return f"2 pictures of {WITH_VOLUME[0]} x {WITH_VOLUME[1]} pixels within {worst:.1f} of 255"
+
+
+RENDERED = ("measure_cells", "mark_bricks", "spread_in_rows", "spread_along", "enter_tiles", "look_ahead")
+
 CHECKS = (
+    Check(
+        "a volume before and behind triangles",
+        (*RENDERED, "composite_rays"),
+        partial(_check_between, slices=False),
+        {"rays/composite.cl": ("BETWEEN",)},
+    ),
+    Check(
+        "slices before and behind triangles",
+        ("overlay_slices",),
+        partial(_check_between, slices=True),
+        {"rays/slices.cl": ("BETWEEN",)},
+    ),
     Check(
         "triangles and layers",
         (

@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from clrecon.opencl import Device, allocate, download, empty_output, kernel_constant
+from clrecon.opencl import Device, Stopwatch, allocate, download, empty_output, kernel_constant
 from clrecon.operators.rays.ray_view import TILE
 from clrecon.rendering import Lighting
 from clrecon.rendering.looks.colors import find_color
 
-__all__ = ["HIGHLIGHTS", "PictureBuffers", "count_queues", "highlight_table"]
+__all__ = ["HIGHLIGHTS", "Between", "DrawnVolume", "PictureBuffers", "count_queues", "highlight_table"]
 
 HIGHLIGHTS = kernel_constant("rays/shade.h", "HIGHLIGHTS")
 """Entries of the table of highlights."""
@@ -29,6 +30,44 @@ def count_queues(device: Device) -> int:
     equal work.
     """
     return max(1, device.compute_units) if device.type == "cpu" else 1
+
+
+@dataclass
+class Between:
+    """The part of the rays between two layers, for a ray caster that adds a volume to their states.
+
+    Attributes
+    ----------
+    states_d : buffer, (h, w, 2) float4
+        See cl/rays/layers.cl.
+    nearest_d, farthest_d : buffer, (h, w) float32
+        Mm along the ray where it begins and ends.
+    """
+
+    states_d: Any
+    nearest_d: Any
+    farthest_d: Any
+
+
+class DrawnVolume(NamedTuple):
+    """A volume for a picture of layers.
+
+    Attributes
+    ----------
+    device : Device
+    sample : callable
+        Adds what the volume shows between two layers to the states of the rays, and waits.
+    near_mm : float
+        Where its rays begin, see `VIEW_NEAR` in cl/rays/view.h.
+    stopwatch : Stopwatch
+    warnings : list of str
+    """
+
+    device: Device
+    sample: Callable[[Between], None]
+    near_mm: float
+    stopwatch: Stopwatch
+    warnings: list[str]
 
 
 class PictureBuffers:
@@ -58,6 +97,13 @@ class PictureBuffers:
         self.background = np.zeros(4, np.float32)
         if background is not None:
             self.background[:] = *find_color(background), 1.0
+
+    @classmethod
+    def of_states(cls, device: Device, size: tuple[int, int], states_d: Any) -> PictureBuffers:
+        """Return the buffers of a picture that others finish: kernels write states alone."""
+        made = cls(device, (1, 1), None, False)
+        made.size, made.states_d = size, states_d
+        return made
 
     @property
     def arguments(self) -> dict[str, Any]:

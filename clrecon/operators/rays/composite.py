@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from clrecon.geometry.iso_rule import takes_parts
 from clrecon.labels.resample import ResampledLabels
 from clrecon.opencl import Device, Stopwatch, allocate, kernel_constant, launch, upload
-from clrecon.operators.rays.buffers import PictureBuffers, count_queues, highlight_table
+from clrecon.operators.rays.buffers import Between, PictureBuffers, count_queues, highlight_table
 from clrecon.operators.rays.ray_view import RayView
 from clrecon.operators.rays.slabs import FARTHEST, LeapMap, RaySlab, slab_labels
 from clrecon.operators.resident.device_volume import DeviceVolume
@@ -190,6 +190,7 @@ def composite_slab(
     style: LabelStyle | None,
     output: PictureBuffers,
     stopwatch: Stopwatch,
+    between: Between | None = None,
 ) -> None:
     """Blend one slab into a picture, and wait.
 
@@ -204,6 +205,8 @@ def composite_slab(
     style : LabelStyle, optional
     output : PictureBuffers
         Picture with the results of earlier slabs.
+    between : Between, optional
+        The part of the rays that counts; only the states of `output` are written.
     """
     device = resident.device
     variants = {"GRADIENT_OPACITY": "1"} if tables.weighed else {}
@@ -216,6 +219,10 @@ def composite_slab(
             "labels": slab_labels(resident, slab, labels, stopwatch),
             "label_colors": upload(device, style.table),
         }
+    shortened: dict[str, Any] = {}
+    if between is not None:
+        variants |= {"BETWEEN": "1"}
+        shortened = {"nearest": between.nearest_d, "farthest": between.farthest_d, "stage": 0}
     program = resident.program("rays/composite.cl", **variants)
     lanes = int(device.kernel_variants["LANES"])
     queues = count_queues(device)
@@ -228,8 +235,8 @@ def composite_slab(
             device, program["composite_rays"], output.items(queues, lanes), stopwatch=stopwatch,
             ways=ways_d, entries=entries_d, highlights=upload(device, highlight_table(lighting)),
             view=upload(device, view.table), last_place=last, slope=resident.stack.slope, shaded=lighting.shades,
-            jitter=jitter, queues=queues, **slab.arguments, **tables.arguments, **output.arguments, **view.arguments,
-            **way.arguments, **label_tables, **resident.stack.arguments,
+            jitter=jitter, queues=queues, **{**slab.arguments, **shortened}, **tables.arguments, **output.arguments,
+            **view.arguments, **way.arguments, **label_tables, **resident.stack.arguments,
         )  # fmt: skip
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -22,38 +21,22 @@ from clrecon.opencl import (
     upload,
 )
 from clrecon.operators.masks.band_mask import zero_words
+from clrecon.operators.rays.buffers import Between
 from clrecon.operators.rays.splats import eye_table
 from clrecon.operators.rays.triangles import LayerKeys, MeshPart, Triangles
 from clrecon.rendering import Lighting
 from clrecon.rendering.looks.colors import find_color
 from clrecon.rendering.views.camera import Camera
 
-__all__ = ["LAYERS", "Between", "LayeredPicture", "Still", "draw_layers"]
+__all__ = ["LAYERS", "PIXEL_BYTES", "LayeredPicture", "Still", "draw_layers"]
 
 LAYERS = 16
 """Most layers of a picture."""
 
 COUNTED = kernel_constant("rays/layers.cl", "COUNTED")
 
-_PIXEL_BYTES = 16 + 20 + 48 + 12 + 5 + 4
+PIXEL_BYTES = 16 + 20 + 48 + 12 + 5 + 4
 """Bytes a pixel: keys, a layer, states and marks, the picture, the still, the depth of the layer before."""
-
-
-@dataclass
-class Between:
-    """The part of the rays between two layers, for a ray caster that adds a volume to their states.
-
-    Attributes
-    ----------
-    states_d : buffer, (h, w, 2) float4
-        See cl/rays/layers.cl.
-    nearest_d, farthest_d : buffer, (h, w) float32
-        Mm along the ray where it begins and ends.
-    """
-
-    states_d: Any
-    nearest_d: Any
-    farthest_d: Any
 
 
 class Still(NamedTuple):
@@ -93,6 +76,7 @@ def draw_layers(
     still: Still | None = None,
     volume: Callable[[Between], None] | None = None,
     near_mm: float = 0.0,
+    most: int = LAYERS,
     background: str | Sequence[float] | None = None,
     memory: int | None = None,
     stopwatch: Stopwatch | None = None,
@@ -112,6 +96,8 @@ def draw_layers(
         Adds what a volume shows between two layers to the states of the rays, and waits; called from front to back.
     near_mm : float
         Where the volume's rays begin, see `VIEW_NEAR` in cl/rays/view.h.
+    most : int
+        Most layers.
     background : str or (float, float, float), optional
         None: transparent.
     memory : int, optional
@@ -129,10 +115,10 @@ def draw_layers(
     DeviceError
         The device has no room for picture and triangles, or it fails.
     """
-    needs = {"picture": _PIXEL_BYTES * size[0] * size[1], "triangles": sum(part.device_bytes for part in parts)}
+    needs = {"picture": PIXEL_BYTES * size[0] * size[1], "triangles": sum(part.device_bytes for part in parts)}
     check_budget(device, needs, memory)
     job = _Layers(device, parts, camera, size, still, near_mm, stopwatch or Stopwatch())
-    return job.run(volume, background)
+    return job.run(volume, most, background)
 
 
 class _Layers:
@@ -170,13 +156,15 @@ class _Layers:
         self.depths_d, self.nearest_d = allocate(device, 4 * self.pixels), allocate(device, 4 * self.pixels)
         self.states_d, self.marks_d = allocate(device, 32 * self.pixels), allocate(device, 16 * self.pixels)
 
-    def run(self, volume: Callable[[Between], None] | None, background: str | Sequence[float] | None) -> LayeredPicture:
+    def run(
+        self, volume: Callable[[Between], None] | None, most: int, background: str | Sequence[float] | None
+    ) -> LayeredPicture:
         device, (width, height) = self.device, self.size
         with self.stopwatch.running(device):
             self._launch("clear_rays", pixels=self.pixels, **self._rays, **self._floors)
         open_pixels, drawn = self.pixels if self.triangles or self.has_still else 0, 0
         is_first = True
-        while open_pixels and drawn < LAYERS:
+        while open_pixels and drawn < most:
             self._draw_layer()
             open_pixels = 0 if self.is_single else self._count_open()
             if volume is not None:
@@ -186,7 +174,7 @@ class _Layers:
             drawn, is_first = drawn + 1, False
             self.keys.go_behind()
             self.depths_d, self.nearest_d = self.nearest_d, self.depths_d
-        if volume is not None:
+        if volume is not None and (is_first or open_pixels):  # else all rays have gone to their ends already
             self._fill(self.depths_d, np.inf)
             self._sample(volume, is_first)
         image, image_d = empty_output(device, (height, width, 4), np.uint8)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -10,11 +11,11 @@ from numpy.typing import NDArray
 
 from clrecon.geometry.affine import Float64Array
 from clrecon.opencl import Stopwatch
-from clrecon.operators.rays.buffers import PictureBuffers
+from clrecon.operators.rays.buffers import Between, DrawnVolume, PictureBuffers
 from clrecon.operators.rays.composite import TransferTables, composite_slab
 from clrecon.operators.rays.leaps import find_leaps
 from clrecon.operators.rays.project import project_slab
-from clrecon.operators.rays.ray_view import RayView
+from clrecon.operators.rays.ray_view import NEAR_ROW, RayView
 from clrecon.operators.rays.slabs import RAYS, RaySlab, entry_slice, plan_ray_slabs, ray_slabs
 from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.operators.resident.frame import volume_box
@@ -24,7 +25,7 @@ from clrecon.rendering.pictures.styles import Projection, VolumeLook
 from clrecon.rendering.views.camera import Camera
 from clrecon.system.progress import Progress, ignore_progress
 
-__all__ = ["take_picture"]
+__all__ = ["take_picture", "take_with_layers"]
 
 
 def take_picture(
@@ -63,6 +64,45 @@ def take_picture(
         job = _Job(resident, style, camera, size, ray_step, background, progress or ignore_progress)
         job.warnings[:0] = told
         return job.run()
+
+    return resident.attempt(take)
+
+
+def take_with_layers(
+    resident: DeviceVolume,
+    style: VolumeLook,
+    camera: Camera,
+    size: tuple[int, int],
+    ray_step: float,
+    beside: Mapping[str, int],
+    draw: Callable[[DrawnVolume], Rendering],
+) -> Rendering:
+    """Take a picture of a volume with what lies in it.
+
+    Parameters
+    ----------
+    beside : mapping of str to int
+        Bytes of other buffers on the device.
+    draw : callable
+        Draws the picture; it is called again where the device has no room, or another one takes over.
+
+    Raises
+    ------
+    As `take_picture`.
+    """
+
+    def take(told: list[str]) -> Rendering:
+        job = _Job(resident, style, camera, size, ray_step, None, ignore_progress)
+        job.warnings[:0] = told
+        slices = plan_ray_slabs(resident, beside, {}, job.labels)
+
+        def attempt(slices: int) -> Rendering:
+            sampled = DrawnVolume(
+                resident.device, partial(job.sample_between, slices), job.near_mm, job.stopwatch, job.warnings
+            )
+            return draw(sampled)
+
+        return resident.halve(RAYS, slices, attempt, warnings=job.warnings)
 
     return resident.attempt(take)
 
@@ -126,7 +166,22 @@ class _Job:
         report["unit_distance_mm"] = style.function.unit_distance
         return Rendering(image, depths, means, self.camera, None, style.mode, report)
 
-    def _composite(self, slab: RaySlab, style: VolumeLook, output: PictureBuffers) -> None:
+    @property
+    def near_mm(self) -> float:
+        """Where the rays begin, see `VIEW_NEAR` in cl/rays/view.h."""
+        return float(self._view(self.box).table[NEAR_ROW, 0])
+
+    def sample_between(self, slices: int, between: Between) -> None:
+        """Add what the volume shows between two layers to the states of the rays."""
+        resident, style = self.resident, self.style
+        assert isinstance(style, VolumeLook)
+        output = PictureBuffers.of_states(resident.device, self.size, between.states_d)
+        for slab in ray_slabs(resident, slices, entry_slice(resident.volume, self.camera), self.stopwatch):
+            self._composite(slab, style, output, between)
+
+    def _composite(
+        self, slab: RaySlab, style: VolumeLook, output: PictureBuffers, between: Between | None = None
+    ) -> None:
         resident, stopwatch = self.resident, self.stopwatch
         key = (style.function, self.ray_step)
         tables = resident.keep("transfer function", key, 0, lambda: TransferTables.of(resident.device, *key))
@@ -136,7 +191,7 @@ class _Job:
         view = self._view(nothing if leaps.box is None else leaps.box)
         composite_slab(
             resident, slab, view, tables, leaps, self.lighting, style.jitter, self.labels, style.label_style,
-            output, stopwatch,
+            output, stopwatch, between,
         )  # fmt: skip
 
     def _finish_projection(

@@ -16,13 +16,16 @@ from clrecon.rendering import Lighting
 from clrecon.rendering.looks.lighting import LEAST_SOFT_GRADIENT
 from clrecon.rendering.views.camera import Camera, box_corners
 
-__all__ = ["TILE", "RayView"]
+__all__ = ["NEAR_ROW", "TILE", "RayView"]
 
 TILE = kernel_constant("rays/view.h", "TILE")
 """Pixels along each side of a tile."""
 
 BOX_ROW = kernel_constant("rays/view.h", "VIEW_BOX_LOW")
 """Row of the box in the table; its upper end and both of the focus follow."""
+
+NEAR_ROW = kernel_constant("rays/view.h", "VIEW_NEAR")
+"""Row of the table with the depth at which rays begin."""
 
 ENDLESS = 1e30
 """Offset of a clip plane that nothing reaches, in float32."""

@@ -1,276 +1,33 @@
-"""Rendering of a volume: one volume on a device, any number of pictures in any mode."""
+"""`render`: a picture of a volume, a cloud, a mesh, or of several of them."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
-from typing import Any, NamedTuple
-
-import numpy as np
+from typing import Any
 
 from clrecon.errors import UsageError
 from clrecon.geometry import Volume
-from clrecon.geometry.grid import Grid
 from clrecon.mesh import Mesh
 from clrecon.opencl import Device
 from clrecon.operators.rays.point_pictures import PointPictures
-from clrecon.operators.rays.ray_pictures import take_picture
-from clrecon.operators.rays.scene import ScenePictures
-from clrecon.operators.rays.slices import overlay_slices
-from clrecon.operators.rays.surface import cast_surface
-from clrecon.operators.reformat.cut import cut_slice, reformat_curve
-from clrecon.operators.resident.device_volume import DeviceVolume, take_volume
+from clrecon.operators.rays.scene import ScenePictures, Subject, check_objects
+from clrecon.operators.rays.volume_renderer import Place, VolumeRenderer
+from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.points import PointCloud
 from clrecon.rendering import Rendering
 from clrecon.rendering.looks.colors import is_transparent
 from clrecon.rendering.pictures.mesh_look import MeshLook
-from clrecon.rendering.pictures.modes import check_known, find_style
-from clrecon.rendering.pictures.styles import (
-    CurveCut,
-    PlaneCut,
-    PointLook,
-    Projection,
-    SlicesInSpace,
-    Style,
-    SurfaceLook,
-    VolumeLook,
-)
-from clrecon.rendering.views.camera import Camera, box_corners
+from clrecon.rendering.pictures.modes import find_style
+from clrecon.rendering.pictures.styles import PointLook, Style, VolumeLook
+from clrecon.rendering.views.camera import Camera
 from clrecon.rendering.views.directions import DEFAULT_SIZE, checked_size
-from clrecon.system.closing import Closing
 from clrecon.system.progress import Progress
 
 __all__ = ["VolumeRenderer", "render"]
 
-DEFAULT_VIEW = "anterior"
-
-SMALLEST_STEP = 0.01
-"""Smallest ray step as a share of the smallest spacing; shorter steps only add time."""
-
-MOST_STEPS = 1 << 15
-"""Most ray steps through the diagonal of a volume: float32 counts them, and Mesa's llvmpipe ends loops after 65535
-turns."""
-
-
-class VolumeRenderer(Closing):
-    """A volume on a device, of which pictures are made one after the other.
-
-    The volume is uploaded once where it fits the device as a whole; a larger one goes through in slabs for each
-    picture, and gives the same.  Use it as a context manager, or `close` it.
-
-    Parameters
-    ----------
-    volume : Volume or DeviceVolume
-        The voxels must not change as long as the renderer is open.  A `DeviceVolume` is used directly, with its own
-        device and memory.
-    device : Device, str or int, optional
-        See `clrecon.device`; None is the best of the machine.
-    memory : int, optional
-        Bytes that may be taken on the device; None is all that it has.
-
-    Raises
-    ------
-    UsageError
-        `volume` is not a Volume or holds NaN, or `memory` is not a number of bytes.
-    DeviceError
-        The device does not exist.
-    """
-
-    def __init__(
-        self, volume: Volume | DeviceVolume, *, device: Device | str | int | None = None, memory: int | None = None
-    ):
-        self._resident, self._is_own = take_volume(volume, device, memory, "a picture")
-        self.volume = self._resident.volume
-        voxels = self.volume.voxels
-        if voxels.dtype.kind == "f" and not np.isfinite(voxels).all():
-            raise UsageError("the voxels hold NaN or infinite values: fill them first, for CT with -1024")
-
-    @property
-    def device(self) -> Device:
-        """The device that works."""
-        return self._resident.device
-
-    def close(self) -> None:
-        """Free the volume on the device; a `DeviceVolume` that was given stays as it is."""
-        if self._is_own:
-            self._resident.close()
-
-    def render(
-        self,
-        style: Style | str | None = None,
-        *,
-        camera: Camera | None = None,
-        view: str | Sequence[float] | None = None,
-        up: str | Sequence[float] | None = None,
-        zoom: float | None = None,
-        view_angle: float | None = None,
-        size: Sequence[int] | None = None,
-        background: str | Sequence[float] = "black",
-        progress: Progress | None = None,
-        **look: object,
-    ) -> Rendering:
-        """Make one picture, see the function `render`."""
-        style = find_style(style, look)
-        if isinstance(style, PointLook):
-            raise UsageError("mode points shows a point cloud, and this is a volume: make a cloud of it first")
-        if isinstance(style, MeshLook):
-            raise UsageError("mode mesh shows a mesh, and this is a volume: extract a surface first")
-        place = _Place.checked(style, camera, view, up, zoom, view_angle)
-        if isinstance(style, CurveCut):
-            return self._reformat(style, place, size, background, progress)
-        size = checked_size(DEFAULT_SIZE if size is None else size)
-        if isinstance(style, PlaneCut):
-            return self._cut(style, place, size, background, progress)
-        camera = place.camera_for(self.volume, size)
-        ground = None if is_transparent(background) else background
-        if isinstance(style, SurfaceLook):
-            step = self._checked_step(style.ray_step)
-            return cast_surface(self._resident, style, camera, size, step, ground, progress)
-        if isinstance(style, SlicesInSpace):
-            return overlay_slices(self._resident, style, camera, size, ground, progress)
-        assert isinstance(style, VolumeLook | Projection)
-        step = self._checked_step(style.ray_step)
-        return take_picture(self._resident, style, camera, size, step, ground, progress)
-
-    def _cut(
-        self,
-        style: PlaneCut,
-        place: _Place,
-        size: tuple[int, int],
-        background: str | Sequence[float],
-        progress: Progress | None,
-    ) -> Rendering:
-        own: dict[str, Any] = {} if place.camera is not None else {"zoom": place.zoom, "up": place.up}
-        return cut_slice(
-            self._resident, place.camera or place.view, size,
-            background=background, progress=progress, **own, **style.parameters(),
-        )  # fmt: skip
-
-    def _reformat(
-        self,
-        style: CurveCut,
-        place: _Place,
-        size: Sequence[int] | None,
-        background: str | Sequence[float],
-        progress: Progress | None,
-    ) -> Rendering:
-        return reformat_curve(
-            self._resident, size=size, view=place.view, up=place.up, background=background, progress=progress,
-            **style.parameters(),
-        )  # fmt: skip
-
-    def _checked_step(self, ray_step: float | None) -> float:
-        smallest = min(self.volume.spacing)
-        diagonal = float(np.linalg.norm(np.ptp(box_corners(self.volume), axis=0)))
-        finest = max(SMALLEST_STEP * smallest, diagonal / MOST_STEPS)
-        if ray_step is None:
-            return max(0.5 * smallest, finest)
-        try:
-            step = float(ray_step)
-        except (TypeError, ValueError, OverflowError):
-            step = math.nan
-        if finest <= step < math.inf:
-            return min(step, 2.0 * diagonal)  # one sample, in the middle of the way through the volume
-        raise UsageError(
-            f"the ray step is a length in mm, at least {finest:.3g} in this volume (a hundredth of its smallest"
-            f" spacing, and {MOST_STEPS:,} through its diagonal), not {ray_step!r}"
-        )
-
-
-class _Place(NamedTuple):
-    """The view of a picture as the caller described it."""
-
-    camera: Camera | None
-    view: str | Sequence[float]
-    up: str | Sequence[float] | None
-    zoom: float
-    view_angle: float | None
-
-    @classmethod
-    def checked(
-        cls,
-        style: Style,
-        camera: Camera | None,
-        view: str | Sequence[float] | None,
-        up: str | Sequence[float] | None,
-        zoom: float | None,
-        view_angle: float | None,
-    ) -> _Place:
-        """Refuse what has no meaning in the style's mode or beside a camera."""
-        if not (camera is None or isinstance(camera, Camera)):
-            raise UsageError(f"the camera of a picture is a Camera or None, not {type(camera).__name__}")
-        for keyword, value in (("zoom", zoom), ("view_angle", view_angle)):
-            if value is not None:
-                check_known(style.mode, keyword)
-        if camera is not None:
-            if isinstance(style, CurveCut):
-                raise UsageError("a curved reformation has no camera: view and up say which way one looks at it")
-            _check_alone(view=view, up=up, zoom=zoom, view_angle=view_angle)
-        return cls(camera, DEFAULT_VIEW if view is None else view, up, 1.0 if zoom is None else zoom, view_angle)
-
-    def camera_for(self, volume: Grid, size: tuple[int, int]) -> Camera:
-        """Return the given camera, or one made from the other parameters."""
-        if self.camera is not None:
-            return self.camera
-        return Camera.fit(volume, self.view, self.zoom, up=self.up, view_angle=self.view_angle, size=size)
-
-
-def _check_alone(**placing: Any) -> None:
-    """Refuse parameters that place a camera if a camera is given."""
-    given = [name for name, value in placing.items() if value is not None]
-    if given:
-        them = " and ".join(filter(None, (", ".join(given[:-1]), given[-1])))
-        raise UsageError(f"a camera says by itself where a picture is taken from: leave out {them}, or the camera")
-
-
-def _render_cloud(
-    cloud: PointCloud,
-    style: Style | str | None,
-    device: Device | str | int | None,
-    memory: int | None,
-    size: Sequence[int] | None,
-    background: str | Sequence[float],
-    progress: Progress | None,
-    look: dict[str, object],
-    **placing: Any,
-) -> Rendering:
-    """Make a picture of a cloud, whose mode is points."""
-    named = "points" if style is None and "mode" not in look else style
-    chosen = find_style(named, look)
-    if not isinstance(chosen, PointLook):
-        raise UsageError(f"a point cloud is shown in mode points, not in mode {chosen.mode}")
-    place = _Place.checked(chosen, **placing)
-    size = checked_size(DEFAULT_SIZE if size is None else size)
-    with PointPictures(cloud, device=device, memory=memory) as pictures:
-        ground = None if is_transparent(background) else background
-        return pictures.take(chosen, place.camera_for(pictures.box, size), size, ground, progress)
-
-
-def _render_mesh(
-    mesh: Mesh,
-    style: Style | str | None,
-    device: Device | str | int | None,
-    memory: int | None,
-    size: Sequence[int] | None,
-    background: str | Sequence[float],
-    progress: Progress | None,
-    look: dict[str, object],
-    **placing: Any,
-) -> Rendering:
-    """Make a picture of a mesh, whose mode is mesh."""
-    named = "mesh" if style is None and "mode" not in look else style
-    chosen = find_style(named, look)
-    if not isinstance(chosen, MeshLook):
-        raise UsageError(f"a mesh is shown in mode mesh, not in mode {chosen.mode}")
-    place = _Place.checked(chosen, **placing)
-    size = checked_size(DEFAULT_SIZE if size is None else size)
-    with ScenePictures([(mesh, chosen)], device=device, memory=memory) as pictures:
-        ground = None if is_transparent(background) else background
-        return pictures.take(place.camera_for(pictures.box, size), size, ground, progress)
-
 
 def render(
-    volume: Volume | DeviceVolume | PointCloud | Mesh,
+    shown: Subject | Sequence[Subject | tuple[Subject, Style]],
     style: Style | str | None = None,
     *,
     camera: Camera | None = None,
@@ -285,17 +42,20 @@ def render(
     progress: Progress | None = None,
     **look: object,
 ) -> Rendering:
-    """Make a picture of a volume, of a point cloud or of a mesh.
+    """Make a picture of a volume, of a point cloud, of a mesh, or of several of them in one place.
 
     >>> render(volume, SurfaceLook(300, color="orange"), view="left", size=(800, 600))
     >>> render(volume, preset="spine", view=(30, 15))
     >>> render(volume, "mip", window=(0, 1000))
     >>> render(cloud, color_by="label", view="left")
     >>> render(mesh, MeshLook("orange", opacity=0.5), view="left")
+    >>> render([(scan, VolumeLook("muscle")), (vertebra, MeshLook("orange")), (implant, MeshLook(opacity=0.4))])
 
     Parameters
     ----------
-    volume : Volume, DeviceVolume, PointCloud or Mesh
+    shown : Volume, DeviceVolume, PointCloud or Mesh; or a sequence of them
+        Of several objects each may be a pair with its style, and `style` and `look` are refused.  All are in LPS mm.
+        One volume of them may be translucent (a `VolumeLook` or `SlicesInSpace`); see `docs/rendering.md`.
     style : Style or str, optional
         What the picture shows: a `VolumeLook`, `Projection`, `SurfaceLook`, `SlicesInSpace`, `PlaneCut` or `CurveCut`,
         of a point cloud a `PointLook`, of a mesh a `MeshLook`; or the name of a mode, see
@@ -333,14 +93,50 @@ def render(
     DeviceError
         No device, not enough memory, or the device fails.
     """
-    if not isinstance(volume, PointCloud | Mesh):
-        with VolumeRenderer(volume, device=device, memory=memory) as renderer:
-            return renderer.render(
-                style, camera=camera, view=view, up=up, zoom=zoom, view_angle=view_angle, size=size,
-                background=background, progress=progress, **look,
-            )  # fmt: skip
-    given = (style, device, memory, size, background, progress, look)
     placing: dict[str, Any] = {"camera": camera, "view": view, "up": up, "zoom": zoom, "view_angle": view_angle}
-    if isinstance(volume, PointCloud):
-        return _render_cloud(volume, *given, **placing)
-    return _render_mesh(volume, *given, **placing)
+    if isinstance(shown, Volume | DeviceVolume) or not isinstance(shown, PointCloud | Mesh | Sequence):
+        with VolumeRenderer(shown, device=device, memory=memory) as renderer:
+            return renderer.render(style, size=size, background=background, progress=progress, **{**placing, **look})
+    objects = _name_objects(shown, style, look)
+    place = Place.checked(objects[0][1], **placing)
+    size = checked_size(DEFAULT_SIZE if size is None else size)
+    ground = None if is_transparent(background) else background
+    if isinstance(shown, PointCloud) and isinstance(chosen := objects[0][1], PointLook):
+        with PointPictures(shown, device=device, memory=memory) as points:
+            return points.take(chosen, place.camera_for(points.box, size), size, ground, progress)
+    with ScenePictures(objects, device=device, memory=memory) as pictures:
+        return pictures.take(place.camera_for(pictures.box, size), size, ground, progress)
+
+
+def _name_objects(
+    shown: PointCloud | Mesh | Sequence[Any], style: Style | str | None, look: dict[str, object]
+) -> list[tuple[Any, Style]]:
+    """Return the objects of a picture, one at least, each with its style.
+
+    Raises
+    ------
+    UsageError
+        There is none, or a style is given where each object has its own, or has none of that mode.
+    """
+    if isinstance(shown, Sequence):
+        if style is not None or look:
+            raise UsageError("of several objects each has its own style: give pairs (object, style)")
+        objects = [_styled(each) for each in shown]
+        check_objects(objects)
+        return objects
+    mode = "points" if isinstance(shown, PointCloud) else "mesh"
+    chosen = find_style(mode if style is None and "mode" not in look else style, look)
+    if chosen.mode != mode:
+        named = "a point cloud" if isinstance(shown, PointCloud) else "a mesh"
+        raise UsageError(f"{named} is shown in mode {mode}, not in mode {chosen.mode}")
+    return [(shown, chosen)]
+
+
+def _styled(given: Any) -> tuple[Any, Style]:
+    """Return an object with its style, or with the default of its kind."""
+    if isinstance(given, tuple):
+        if len(given) != 2 or not isinstance(given[1], Style):
+            raise UsageError("an object of a picture stands alone, or in a pair (object, style)")
+        return given
+    own = MeshLook() if isinstance(given, Mesh) else PointLook() if isinstance(given, PointCloud) else VolumeLook()
+    return given, own

@@ -1,34 +1,88 @@
-"""Pictures of several objects in one place: meshes, and what is seen with them."""
+"""Pictures of several objects in one place: meshes, clouds, and volumes in or behind which they lie."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import ExitStack
+from functools import partial
 from typing import Any
 
+import numpy as np
+
 from clrecon.errors import UsageError
+from clrecon.geometry import Volume
+from clrecon.geometry.affine import Float64Array
+from clrecon.geometry.grid import Grid
 from clrecon.mesh import Mesh
 from clrecon.opencl import Device, Stopwatch, check_memory, take_device, work_on
-from clrecon.operators.rays.layers import draw_layers
+from clrecon.operators.rays.buffers import DrawnVolume
+from clrecon.operators.rays.layers import PIXEL_BYTES, Still, draw_layers
 from clrecon.operators.rays.mesh_pictures import box_around, make_part, mesh_corners
-from clrecon.operators.rays.triangles import MOST_TRIANGLES
+from clrecon.operators.rays.point_pictures import PointPictures, cloud_box
+from clrecon.operators.rays.triangles import MOST_TRIANGLES, MeshPart
+from clrecon.operators.rays.volume_renderer import VolumeRenderer
+from clrecon.operators.resident.device_volume import DeviceVolume
+from clrecon.points import PointCloud
 from clrecon.rendering import Rendering
 from clrecon.rendering.pictures.mesh_look import MeshLook
-from clrecon.rendering.views.camera import Camera
+from clrecon.rendering.pictures.styles import PointLook, SlicesInSpace, Style, SurfaceLook, VolumeLook
+from clrecon.rendering.views.camera import Camera, box_corners
 from clrecon.system.closing import Closing
-from clrecon.system.progress import Progress
+from clrecon.system.progress import Progress, ignore_progress
 
-__all__ = ["ScenePictures"]
+__all__ = ["ScenePictures", "Subject", "check_objects"]
+
+Subject = Volume | DeviceVolume | PointCloud | Mesh
+"""What a picture can show."""
+
+_LOOKS: dict[type, tuple[type[Style], ...]] = {Mesh: (MeshLook,), PointCloud: (PointLook,)}
+_VOLUME_LOOKS = (VolumeLook, SlicesInSpace, SurfaceLook)
+
+
+def check_objects(objects: Sequence[tuple[Any, Style]]) -> None:
+    """Refuse objects that one picture cannot show together.
+
+    Raises
+    ------
+    UsageError
+        There is none, one is of another kind, its style is not of its kind, or two volumes are translucent.
+    """
+    if not objects:
+        raise UsageError("a picture shows at least one object")
+    translucent = 0
+    for subject, style in objects:
+        if not isinstance(subject, Subject):
+            kinds = "Volume, DeviceVolume, PointCloud or Mesh"
+            raise UsageError(f"an object of a picture is a {kinds}, not {type(subject).__name__}")
+        allowed = _LOOKS.get(type(subject), _VOLUME_LOOKS)
+        if not isinstance(style, allowed):
+            names = " or ".join(each.__name__ for each in allowed)
+            raise UsageError(
+                f"a {type(subject).__name__} has the style {names} in a picture with other objects, not mode"
+                f" {style.mode}"
+            )
+        translucent += isinstance(style, VolumeLook | SlicesInSpace)
+    if translucent > 1:
+        raise UsageError(
+            f"{translucent} volumes are shown by volume rendering or as slices: one of them can be, others as surfaces"
+        )
 
 
 class ScenePictures(Closing):
-    """Meshes of which pictures are made one after the other.
+    """Objects of which pictures are made together, one after the other.
+
+    Every pixel has layers from front to back: triangles of meshes (`clrecon.operators.rays.layers`), and one for what
+    is opaque already when it is drawn, that is discs of points and surfaces of volumes.  Between them lies the volume
+    that is shown by volume rendering or as slices.
 
     Use it as a context manager, or `close` it.
 
     Parameters
     ----------
-    meshes : sequence of (Mesh, MeshLook)
-        Their arrays must not change as long as this object is open.  Of triangles at the same depth the first is seen.
+    objects : sequence of (object, style)
+        Mesh and MeshLook; PointCloud and PointLook; Volume or DeviceVolume and VolumeLook, SlicesInSpace or
+        SurfaceLook.  Their arrays must not change as long as this object is open.  Of triangles at the same depth the
+        first is seen.
     device : Device, str or int, optional
         See `clrecon.device`; None is the best of the machine.
     memory : int, optional
@@ -37,31 +91,38 @@ class ScenePictures(Closing):
     Raises
     ------
     UsageError
-        There is nothing to show, a mesh has a number that cannot be, or `memory` is not a number of bytes.
+        See `check_objects`; or an object is empty, has a number that cannot be, or `memory` is not a number of bytes.
     DeviceError
         The device does not exist.
     """
 
     def __init__(
         self,
-        meshes: Sequence[tuple[Mesh, MeshLook]],
+        objects: Sequence[tuple[Subject, Style]],
         *,
         device: Device | str | int | None = None,
         memory: int | None = None,
     ):
         check_memory(memory)
-        if not meshes:
-            raise UsageError("a picture shows at least one object")
-        self.box = box_around([mesh_corners(mesh) for mesh, _ in meshes])
-        self._parts = [make_part(mesh, look) for mesh, look in meshes]
+        check_objects(objects)
+        self.memory = memory
+        self.box = _box_of([subject for subject, _ in objects])
+        self._parts: list[MeshPart] = []
+        self._objects = list(objects)
+        for subject, style in objects:
+            if isinstance(subject, Mesh) and isinstance(style, MeshLook):
+                self._parts.append(make_part(subject, style))
         self._triangles = sum(len(part.triangles) for part in self._parts)
         if self._triangles > MOST_TRIANGLES:
             raise UsageError(f"a picture shows at most {MOST_TRIANGLES:,} triangles, these are {self._triangles:,}")
-        self.memory = memory
+        self._stack = ExitStack()
         self._device = take_device(device)
+        self._takers: dict[int, VolumeRenderer | PointPictures] = {}
 
     def close(self) -> None:
         """Free what was made for the pictures."""
+        self._stack.close()
+        self._takers.clear()
         self._parts = []
 
     @property
@@ -85,39 +146,137 @@ class ScenePictures(Closing):
         background : str or (float, float, float), optional
             None: transparent.
         progress : callable, optional
-            Called as ``progress("render", 0, 0)``.
+            Called as ``progress("render", objects drawn, all objects)``.
 
         Raises
         ------
         UsageError
-            Triangles cover too many pixels.
+            Triangles or discs cover too many pixels, or a style refuses its object.
         DeviceError
             Not enough memory, or the device fails.
         """
-        stopwatch = Stopwatch()
-        if progress is not None:
-            progress("render", 0, 0)
-
-        def draw(device: Device, told: list[str]) -> Rendering:
-            found = draw_layers(
-                device, self._parts, camera, size, background=background, memory=self.memory, stopwatch=stopwatch
-            )
-            warnings = [*device.warnings, *told]
-            if found.open_pixels:
-                warnings.append(
-                    f"{found.open_pixels:,} pixels have more than {found.layers} translucent surfaces behind each"
-                    " other: the rest is left out"
-                )
-            report: dict[str, Any] = {
-                "mode": "mesh",
-                "device": device.label,
-                "driver": device.driver,
-                "triangles": self._triangles,
-                "layers": found.layers,
-                "seconds": dict(stopwatch.seconds),
-                "kernel_seconds": dict(stopwatch.by_kernel),
-                "warnings": warnings,
+        tell = progress or ignore_progress
+        tell("render", 0, len(self._objects))
+        drawn: list[Rendering] = []
+        translucent: tuple[VolumeRenderer, VolumeLook | SlicesInSpace] | None = None
+        for place, (_, style) in enumerate(self._objects):
+            if isinstance(style, PointLook | SurfaceLook):
+                drawn.append(self._draw_alone(place, style, camera, size))
+                tell("render", len(drawn), len(self._objects))
+            elif isinstance(style, VolumeLook | SlicesInSpace):
+                renderer = self._taker(place)
+                assert isinstance(renderer, VolumeRenderer)
+                translucent = renderer, style
+        finish = partial(self._finish, drawn, camera, size, background)
+        if translucent is None:
+            made = work_on(self._device, lambda device, told: finish(device, Stopwatch(), told, None))
+        else:
+            renderer, look = translucent
+            beside = {
+                "picture": PIXEL_BYTES * size[0] * size[1],
+                "triangles": sum(part.device_bytes for part in self._parts),
             }
-            return Rendering(found.image, found.depth, found.expected_depth, camera, None, "mesh", report)
+            made = renderer.render_with_layers(
+                look,
+                camera,
+                size,
+                beside,
+                lambda volume: finish(volume.device, volume.stopwatch, volume.warnings, volume),
+            )
+        tell("render", len(self._objects), len(self._objects))
+        return made
 
-        return work_on(self._device, draw)
+    def _taker(self, place: int) -> VolumeRenderer | PointPictures:
+        """Return what takes pictures of an object alone; it stays open."""
+        if place not in self._takers:
+            subject = self._objects[place][0]
+            opened: VolumeRenderer | PointPictures
+            if isinstance(subject, PointCloud):
+                opened = PointPictures(subject, device=self._device.current, memory=self.memory)
+            else:
+                assert isinstance(subject, Volume | DeviceVolume)
+                own = None if isinstance(subject, DeviceVolume) else self._device.current
+                memory = None if isinstance(subject, DeviceVolume) else self.memory
+                opened = VolumeRenderer(subject, device=own, memory=memory)
+            self._stack.enter_context(opened)
+            self._takers[place] = opened
+        return self._takers[place]
+
+    def _draw_alone(
+        self, place: int, style: PointLook | SurfaceLook, camera: Camera, size: tuple[int, int]
+    ) -> Rendering:
+        taker = self._taker(place)
+        if isinstance(taker, PointPictures):
+            assert isinstance(style, PointLook)
+            return taker.take(style, camera, size, None)
+        return taker.render(style, camera=camera, size=size, background="transparent")
+
+    def _finish(
+        self,
+        drawn: list[Rendering],
+        camera: Camera,
+        size: tuple[int, int],
+        background: str | Sequence[float] | None,
+        device: Device,
+        stopwatch: Stopwatch,
+        told: list[str],
+        volume: DrawnVolume | None,
+    ) -> Rendering:
+        """Draw all layers on a device."""
+        found = draw_layers(
+            device, self._parts, camera, size, still=_join_stills(drawn),
+            volume=None if volume is None else volume.sample,
+            near_mm=0.0 if volume is None else volume.near_mm, background=background, memory=self.memory,
+            stopwatch=stopwatch,
+        )  # fmt: skip
+        warnings = [*device.warnings, *told]
+        for each in drawn:
+            warnings += [text for text in each.report["warnings"] if text not in warnings]
+        if found.open_pixels:
+            warnings.append(
+                f"{found.open_pixels:,} pixels have more than {found.layers} translucent surfaces behind each other:"
+                " the rest is left out"
+            )
+        modes = [style.mode for _, style in self._objects]
+        report: dict[str, Any] = {
+            "mode": modes[0],
+            "objects": modes,
+            "device": device.label,
+            "driver": device.driver,
+            "triangles": self._triangles,
+            "layers": found.layers,
+            "seconds": dict(stopwatch.seconds),
+            "kernel_seconds": dict(stopwatch.by_kernel),
+            "warnings": warnings,
+        }
+        return Rendering(found.image, found.depth, found.expected_depth, camera, None, modes[0], report)
+
+
+def _box_of(subjects: Sequence[Subject]) -> Grid:
+    """Return what cameras fit: a volume that all others lie in, else the box around all."""
+    corners: list[Float64Array] = []
+    for subject in subjects:
+        if isinstance(subject, Mesh):
+            corners.append(mesh_corners(subject))
+        else:
+            grid = cloud_box(subject) if isinstance(subject, PointCloud) else _grid_of(subject)
+            corners.append(box_corners(grid))
+    every = box_around(corners)
+    for subject, own in zip(subjects, corners, strict=True):
+        if isinstance(subject, Volume | DeviceVolume) and np.allclose(box_around([own]).affine, every.affine):
+            return _grid_of(subject)
+    return every
+
+
+def _grid_of(volume: Volume | DeviceVolume) -> Volume:
+    return volume.volume if isinstance(volume, DeviceVolume) else volume
+
+
+def _join_stills(drawn: Sequence[Rendering]) -> Still | None:
+    """Return the nearest of pictures that were made before, pixel by pixel; None of none."""
+    if not drawn:
+        return None
+    depths = np.stack([np.where(each.image[..., 3] > 0, each.depth, np.nan) for each in drawn])
+    nearest = np.argmin(np.where(np.isnan(depths), np.inf, depths), axis=0)
+    image = np.take_along_axis(np.stack([each.image for each in drawn]), nearest[None, ..., None], axis=0)[0]
+    return Still(image, np.take_along_axis(depths, nearest[None], axis=0)[0])

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -12,8 +13,8 @@ from clrecon.errors import UsageError
 from clrecon.geometry import Volume
 from clrecon.geometry.affine import Float64Array
 from clrecon.opencl import Stopwatch, check_budget, kernel_constant, launch, load_program, upload
-from clrecon.operators.rays.buffers import PictureBuffers, count_queues
-from clrecon.operators.rays.ray_view import RayView
+from clrecon.operators.rays.buffers import Between, DrawnVolume, PictureBuffers, count_queues
+from clrecon.operators.rays.ray_view import NEAR_ROW, RayView
 from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.operators.resident.frame import FieldFrame, volume_box
 from clrecon.operators.resident.voxel_types import voxel_variants
@@ -22,7 +23,7 @@ from clrecon.rendering.pictures.styles import SlicesInSpace
 from clrecon.rendering.views.camera import Camera
 from clrecon.system.progress import Progress, ignore_progress
 
-__all__ = ["choose_slices", "overlay_slices"]
+__all__ = ["choose_slices", "overlay_slices", "overlay_with_layers"]
 
 DEFAULT_COUNT = 12
 """Number of slices shown by default: enough to see the body, few enough to see each slice."""
@@ -112,6 +113,43 @@ def overlay_slices(
     return resident.attempt(take)
 
 
+def overlay_with_layers(
+    resident: DeviceVolume,
+    style: SlicesInSpace,
+    camera: Camera,
+    size: tuple[int, int],
+    beside: Mapping[str, int],
+    draw: Callable[[DrawnVolume], Rendering],
+) -> Rendering:
+    """Show slices of a volume in space with what lies between them.
+
+    Parameters
+    ----------
+    beside : mapping of str to int
+        Bytes of other buffers on the device.
+    draw : callable
+        Draws the picture; it is called again where the device has no room, or another one takes over.
+
+    Raises
+    ------
+    As `overlay_slices`.
+    """
+    chosen = choose_slices(resident.volume, style.slices)
+
+    def take(told: list[str]) -> Rendering:
+        overlay = _Overlay(resident, style, camera, size, chosen, ignore_progress)
+        overlay.warnings[:0] = told
+        near_mm = float(overlay.view.table[NEAR_ROW, 0])
+
+        def attempt(slices: int) -> Rendering:
+            sample = partial(overlay.sample_between, slices)
+            return draw(DrawnVolume(resident.device, sample, near_mm, overlay.stopwatch, overlay.warnings))
+
+        return overlay.plan(beside, {}, attempt)
+
+    return resident.attempt(take)
+
+
 class _Colors(NamedTuple):
     """Colours (NODES, 4) float32 by value; the nearest node to v is ``floor((v - low) * scale + 0.5)``."""
 
@@ -178,8 +216,13 @@ class _Overlay:
 
     def run(self, background: str | Sequence[float] | None) -> Rendering:
         """Take the picture, with fewer slices at a time if the device has no room for the planned number."""
+        return self.plan(*PictureBuffers.needs(self.view.size), lambda slices: self._take(slices, background))
+
+    def plan(
+        self, picture: Mapping[str, int], states: Mapping[str, int], attempt: Callable[[int], Rendering]
+    ) -> Rendering:
+        """Attempt a picture with all slices that fit beside it at once, then with fewer."""
         resident, count = self.resident, len(self.chosen)
-        picture, states = PictureBuffers.needs(self.view.size)
 
         def needs(slices: int) -> dict[str, int]:
             own = {"slices": slices * resident.slice_bytes, **picture}
@@ -192,9 +235,13 @@ class _Overlay:
             check_budget(resident.device, needs(1), resident.memory)
         if slices < count:
             resident.make_way()
-        return resident.halve(
-            SLICES, max(slices, 1), lambda slices: self._take(slices, background), warnings=self.warnings
-        )
+        return resident.halve(SLICES, max(slices, 1), attempt, warnings=self.warnings)
+
+    def sample_between(self, slices: int, between: Between) -> None:
+        """Add what slices show between two layers to the states of the rays."""
+        output = PictureBuffers.of_states(self.resident.device, self.view.size, between.states_d)
+        for first in range(0, len(self.order), slices):
+            self._draw(self.order[first : first + slices], 0, output, between)
 
     def _take(self, slices: int, background: str | Sequence[float] | None) -> Rendering:
         stopwatch, device = self.stopwatch, self.resident.device
@@ -219,7 +266,7 @@ class _Overlay:
         }
         return Rendering(image, depths, means, self.view.camera, None, "slices", report)
 
-    def _draw(self, part: Sequence[int], stage: int, output: PictureBuffers) -> None:
+    def _draw(self, part: Sequence[int], stage: int, output: PictureBuffers, between: Between | None = None) -> None:
         """Draw slices in the given order, and wait."""
         resident, style, colors, view, stopwatch = self.resident, self.style, self.colors, self.view, self.stopwatch
         device, volume = resident.device, resident.volume
@@ -231,12 +278,16 @@ class _Overlay:
             slices_d, places[:, 3] = resident.upload(volume.voxels[list(part)], stopwatch), range(len(part))
         ni, nj, _ = volume.shape_ijk
         queues = count_queues(device)
-        program = load_program(device, "rays/slices.cl", voxel_variants(volume.voxels.dtype))
+        variants, shortened = voxel_variants(volume.voxels.dtype), {}
+        if between is not None:
+            variants = {**variants, "BETWEEN": "1"}
+            shortened = {"nearest": between.nearest_d, "farthest": between.farthest_d}
+        program = load_program(device, "rays/slices.cl", variants)
         with stopwatch.running(device):  # wait: CPU devices read the host's array
             launch(
                 device, program["overlay_slices"], output.items(queues, 1), stopwatch=stopwatch,
                 slices=slices_d, places=upload(device, places), colors=upload(device, colors.table),
                 view=upload(device, view.table), ni=ni, nj=nj, count=len(part), bins_low=colors.low,
                 bins_scale=colors.scale, opacity=style.opacity, lowest=style.lowest_hu, stage=stage, queues=queues,
-                **output.arguments, **view.arguments,
+                **output.arguments, **view.arguments, **shortened,
             )  # fmt: skip

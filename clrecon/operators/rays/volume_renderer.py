@@ -1,0 +1,242 @@
+"""`VolumeRenderer`: one volume on a device, any number of pictures in any mode."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from clrecon.errors import UsageError
+from clrecon.geometry import Volume
+from clrecon.geometry.grid import Grid
+from clrecon.opencl import Device
+from clrecon.operators.rays.buffers import DrawnVolume
+from clrecon.operators.rays.ray_pictures import take_picture, take_with_layers
+from clrecon.operators.rays.slices import overlay_slices, overlay_with_layers
+from clrecon.operators.rays.surface import cast_surface
+from clrecon.operators.reformat.cut import cut_slice, reformat_curve
+from clrecon.operators.resident.device_volume import DeviceVolume, take_volume
+from clrecon.rendering import Rendering
+from clrecon.rendering.looks.colors import is_transparent
+from clrecon.rendering.pictures.mesh_look import MeshLook
+from clrecon.rendering.pictures.modes import check_known, find_style
+from clrecon.rendering.pictures.styles import (
+    CurveCut,
+    PlaneCut,
+    PointLook,
+    Projection,
+    SlicesInSpace,
+    Style,
+    SurfaceLook,
+    VolumeLook,
+)
+from clrecon.rendering.views.camera import Camera, box_corners
+from clrecon.rendering.views.directions import DEFAULT_SIZE, checked_size
+from clrecon.system.closing import Closing
+from clrecon.system.progress import Progress
+
+__all__ = ["DEFAULT_VIEW", "Place", "VolumeRenderer"]
+
+DEFAULT_VIEW = "anterior"
+
+SMALLEST_STEP = 0.01
+"""Smallest ray step as a share of the smallest spacing; shorter steps only add time."""
+
+MOST_STEPS = 1 << 15
+"""Most ray steps through the diagonal of a volume: float32 counts them, and Mesa's llvmpipe ends loops after 65535
+turns."""
+
+
+class VolumeRenderer(Closing):
+    """A volume on a device, of which pictures are made one after the other.
+
+    The volume is uploaded once where it fits the device as a whole; a larger one goes through in slabs for each
+    picture, and gives the same.  Use it as a context manager, or `close` it.
+
+    Parameters
+    ----------
+    volume : Volume or DeviceVolume
+        The voxels must not change as long as the renderer is open.  A `DeviceVolume` is used directly, with its own
+        device and memory.
+    device : Device, str or int, optional
+        See `clrecon.device`; None is the best of the machine.
+    memory : int, optional
+        Bytes that may be taken on the device; None is all that it has.
+
+    Raises
+    ------
+    UsageError
+        `volume` is not a Volume or holds NaN, or `memory` is not a number of bytes.
+    DeviceError
+        The device does not exist.
+    """
+
+    def __init__(
+        self, volume: Volume | DeviceVolume, *, device: Device | str | int | None = None, memory: int | None = None
+    ):
+        self._resident, self._is_own = take_volume(volume, device, memory, "a picture")
+        self.volume = self._resident.volume
+        voxels = self.volume.voxels
+        if voxels.dtype.kind == "f" and not np.isfinite(voxels).all():
+            raise UsageError("the voxels hold NaN or infinite values: fill them first, for CT with -1024")
+
+    @property
+    def device(self) -> Device:
+        """The device that works."""
+        return self._resident.device
+
+    def close(self) -> None:
+        """Free the volume on the device; a `DeviceVolume` that was given stays as it is."""
+        if self._is_own:
+            self._resident.close()
+
+    def render(
+        self,
+        style: Style | str | None = None,
+        *,
+        camera: Camera | None = None,
+        view: str | Sequence[float] | None = None,
+        up: str | Sequence[float] | None = None,
+        zoom: float | None = None,
+        view_angle: float | None = None,
+        size: Sequence[int] | None = None,
+        background: str | Sequence[float] = "black",
+        progress: Progress | None = None,
+        **look: object,
+    ) -> Rendering:
+        """Make one picture, see the function `render`."""
+        style = find_style(style, look)
+        if isinstance(style, PointLook):
+            raise UsageError("mode points shows a point cloud, and this is a volume: make a cloud of it first")
+        if isinstance(style, MeshLook):
+            raise UsageError("mode mesh shows a mesh, and this is a volume: extract a surface first")
+        place = Place.checked(style, camera, view, up, zoom, view_angle)
+        if isinstance(style, CurveCut):
+            return self._reformat(style, place, size, background, progress)
+        size = checked_size(DEFAULT_SIZE if size is None else size)
+        if isinstance(style, PlaneCut):
+            return self._cut(style, place, size, background, progress)
+        camera = place.camera_for(self.volume, size)
+        ground = None if is_transparent(background) else background
+        if isinstance(style, SurfaceLook):
+            step = self._checked_step(style.ray_step)
+            return cast_surface(self._resident, style, camera, size, step, ground, progress)
+        if isinstance(style, SlicesInSpace):
+            return overlay_slices(self._resident, style, camera, size, ground, progress)
+        assert isinstance(style, VolumeLook | Projection)
+        step = self._checked_step(style.ray_step)
+        return take_picture(self._resident, style, camera, size, step, ground, progress)
+
+    def render_with_layers(
+        self,
+        style: VolumeLook | SlicesInSpace,
+        camera: Camera,
+        size: tuple[int, int],
+        beside: Mapping[str, int],
+        draw: Callable[[DrawnVolume], Rendering],
+    ) -> Rendering:
+        """Make a picture of the volume with what lies in it.
+
+        Parameters
+        ----------
+        beside : mapping of str to int
+            Bytes of other buffers on the device.
+        draw : callable
+            Draws the picture; it is called again where the device has no room, or another one takes over.
+        """
+        if isinstance(style, SlicesInSpace):
+            return overlay_with_layers(self._resident, style, camera, size, beside, draw)
+        step = self._checked_step(style.ray_step)
+        return take_with_layers(self._resident, style, camera, size, step, beside, draw)
+
+    def _cut(
+        self,
+        style: PlaneCut,
+        place: Place,
+        size: tuple[int, int],
+        background: str | Sequence[float],
+        progress: Progress | None,
+    ) -> Rendering:
+        own: dict[str, Any] = {} if place.camera is not None else {"zoom": place.zoom, "up": place.up}
+        return cut_slice(
+            self._resident, place.camera or place.view, size,
+            background=background, progress=progress, **own, **style.parameters(),
+        )  # fmt: skip
+
+    def _reformat(
+        self,
+        style: CurveCut,
+        place: Place,
+        size: Sequence[int] | None,
+        background: str | Sequence[float],
+        progress: Progress | None,
+    ) -> Rendering:
+        return reformat_curve(
+            self._resident, size=size, view=place.view, up=place.up, background=background, progress=progress,
+            **style.parameters(),
+        )  # fmt: skip
+
+    def _checked_step(self, ray_step: float | None) -> float:
+        smallest = min(self.volume.spacing)
+        diagonal = float(np.linalg.norm(np.ptp(box_corners(self.volume), axis=0)))
+        finest = max(SMALLEST_STEP * smallest, diagonal / MOST_STEPS)
+        if ray_step is None:
+            return max(0.5 * smallest, finest)
+        try:
+            step = float(ray_step)
+        except (TypeError, ValueError, OverflowError):
+            step = math.nan
+        if finest <= step < math.inf:
+            return min(step, 2.0 * diagonal)  # one sample, in the middle of the way through the volume
+        raise UsageError(
+            f"the ray step is a length in mm, at least {finest:.3g} in this volume (a hundredth of its smallest"
+            f" spacing, and {MOST_STEPS:,} through its diagonal), not {ray_step!r}"
+        )
+
+
+class Place(NamedTuple):
+    """The view of a picture as the caller described it."""
+
+    camera: Camera | None
+    view: str | Sequence[float]
+    up: str | Sequence[float] | None
+    zoom: float
+    view_angle: float | None
+
+    @classmethod
+    def checked(
+        cls,
+        style: Style,
+        camera: Camera | None,
+        view: str | Sequence[float] | None,
+        up: str | Sequence[float] | None,
+        zoom: float | None,
+        view_angle: float | None,
+    ) -> Place:
+        """Refuse what has no meaning in the style's mode or beside a camera."""
+        if not (camera is None or isinstance(camera, Camera)):
+            raise UsageError(f"the camera of a picture is a Camera or None, not {type(camera).__name__}")
+        for keyword, value in (("zoom", zoom), ("view_angle", view_angle)):
+            if value is not None:
+                check_known(style.mode, keyword)
+        if camera is not None:
+            if isinstance(style, CurveCut):
+                raise UsageError("a curved reformation has no camera: view and up say which way one looks at it")
+            _check_alone(view=view, up=up, zoom=zoom, view_angle=view_angle)
+        return cls(camera, DEFAULT_VIEW if view is None else view, up, 1.0 if zoom is None else zoom, view_angle)
+
+    def camera_for(self, volume: Grid, size: tuple[int, int]) -> Camera:
+        """Return the given camera, or one made from the other parameters."""
+        if self.camera is not None:
+            return self.camera
+        return Camera.fit(volume, self.view, self.zoom, up=self.up, view_angle=self.view_angle, size=size)
+
+
+def _check_alone(**placing: Any) -> None:
+    """Refuse parameters that place a camera if a camera is given."""
+    given = [name for name, value in placing.items() if value is not None]
+    if given:
+        them = " and ".join(filter(None, (", ".join(given[:-1]), given[-1])))
+        raise UsageError(f"a camera says by itself where a picture is taken from: leave out {them}, or the camera")
