@@ -215,27 +215,31 @@ INVERSIONS: dict[str, dict[str, tuple[tuple[str, str], ...]]] = {
     "find_cell_runs": {"runs": (("= starts;", "= starts & starts >> 1;"),)},
     "begin_cell_runs": {
         "parents": (("parents[run] = run;", "parents[run] = 0u;"),),
-        "cells": (
-            ("run_cells[run - 1] = cells + popcount(", "run_cells[run - 1] = 32 * words - cells - popcount("),
-            ("run_cells[run - 1] = cells;", "run_cells[run - 1] = 32 * words - cells;"),
-        ),
+        "cells": (("run_cells[run] = 0;", "run_cells[run] = 1;"),),
+        "chosen": (("chosen[run] = 0;", "chosen[run] = 1;"),),
+        "sums": (("sums[n] = 0;", "sums[n] = 1;"),),
     },
     "join_cell_runs": {
         "joins": (
-            ("find_mixed_faces(rows.y1z0, rows.y1z1,", "~find_mixed_faces(rows.y1z0, rows.y1z1,"),
-            ("find_mixed_faces(rows.y0z1, rows.y1z1,", "~find_mixed_faces(rows.y0z1, rows.y1z1,"),
+            (
+                "find_mixed_faces(load_window(mask, row + 1, w, words), y1z1,",
+                "~find_mixed_faces(load_window(mask, row + 1, w, words), y1z1,",
+            ),
+            ("find_mixed_faces(y0z1, y1z1,", "~find_mixed_faces(y0z1, y1z1,"),
         )
     },
-    "find_run_roots": {"roots": (("roots[run] = find_root(", "roots[run] = run + 0 * find_root("),)},
-    "seed_cell_runs": {
-        "marks": (
-            ("= found | ((seeds_here & before) != 0);", "= !(found | ((seeds_here & before) != 0));"),
-            ("seeded[run - 1] = found;", "seeded[run - 1] = !found;"),
-        )
+    "find_run_roots": {
+        "roots": (("= find_root(parents, run);", "= run + 0 * find_root(parents, run);"),),
+        "cells": (("cells += popcount(active);\n    }", "cells += 32 - popcount(active);\n    }"),),
     },
-    "mark_grown": {"grown": (("? ~0u : 0u;", "? 0u : ~0u;"),)},
-    "start_rows": {"starts": (("= set;\n    for", "= !set;\n    for"),)},  # all of them inverted: the same edges
-    "keep_edges": {"kept": (("bits ^= flips << 1;", "bits ^= ~flips << 1;"),)},
+    "find_largest": {"largest": (("atomic_max(sums + LARGEST, run_cells[run])", "atomic_max(sums + LARGEST, 1u)"),)},
+    "choose_largest": {"chosen": (("* parts >= sums[LARGEST])", "* parts < sums[LARGEST])"),)},
+    "choose_seeded": {"marks": (("seeds_here = active & (uint)(corners", "seeds_here = active & ~(uint)(corners"),)},
+    "sum_components": {
+        "components": (("atomic_inc(sums + COMPONENTS);", "atomic_add(sums + COMPONENTS, 2u);"),),
+        "cells": (("atomic_add(sums + CHOSEN_CELLS, cells)", "atomic_add(sums + CHOSEN_CELLS, cells + 1)"),),
+    },
+    "mark_grown": {"grown": (("? ~0u : 0u;\n        }\n        bits", "? 0u : ~0u;\n        }\n        bits"),)},
     "count_visited": {"counts": (("counts[row] = count;", "counts[row] = 32 * words - count;"),)},
     "count_cells": {
         "triangles": (("row_counts[rows_to_count + row] += more;", "row_counts[rows_to_count + row] -= more;"),),

@@ -25,12 +25,12 @@ typedef struct {
 } numbered_edges;
 
 static inline void number_edges(
-    numbered_edges *edges, ulong own, ulong next_y, ulong next_z, ulong with_next, uint first)
+    numbered_edges *edges, ulong own, ulong next_y, ulong next_z, ulong with_next, ulong kept, uint first)
 {
-    edges->x_window = (own ^ own >> 1) & with_next;
-    edges->y_window = own ^ next_y;
+    edges->x_window = (own ^ own >> 1) & with_next & kept;
+    edges->y_window = (own ^ next_y) & kept;
     edges->xy = (edges->x_window & 0xffffffffUL) | edges->y_window << 32;
-    edges->z = (uint)(own ^ next_z);
+    edges->z = (uint)((own ^ next_z) & kept);
     edges->first = first;
 }
 
@@ -46,10 +46,15 @@ typedef struct {
     numbered_edges y0z0, y1z0, y0z1, y1z1;
 } numbered_rows;
 
-/* Number the edges of word w of the four rows around row (j, k) of cells.  `row_offsets` and `word_vertices` say how
+/* For number_rows: all crossed edges have a vertex. */
+#define EVERY_EDGE {~(ulong)0, ~(ulong)0, ~(ulong)0, ~(ulong)0}
+
+/* Number the edges of word w of the four rows around row (j, k) of cells.  `kept` are the samples of the four rows whose
+ * crossed edges have a vertex.  `row_offsets` and `word_vertices` say how
  * many vertices come before each row and, in it, before each word; `first_vertex` is the number of the very first. */
 static inline void number_rows(
-    numbered_rows *edges, const cell_rows *rows, __global const uint *mask, __global const uint *row_offsets,
+    numbered_rows *edges, const cell_rows *rows, const cell_rows *kept, __global const uint *mask,
+    __global const uint *row_offsets,
     __global const ushort *word_vertices, uint first_vertex, uint j, uint k, uint w,
     uint gi, uint gj, uint gk, uint words)
 {
@@ -61,10 +66,10 @@ static inline void number_rows(
     const ulong y1z2 = k + 2 < gk ? load_window(mask, row + 2 * gj + 1, w, words) : rows->y1z1;
     const ulong with_next = samples_with_next(w, gi);
 #define FIRST(r) (first_vertex + row_offsets[r] + word_vertices[(size_t)(r) * words + w])
-    number_edges(&edges->y0z0, rows->y0z0, rows->y1z0, rows->y0z1, with_next, FIRST(row));
-    number_edges(&edges->y1z0, rows->y1z0, y2z0, rows->y1z1, with_next, FIRST(row + 1));
-    number_edges(&edges->y0z1, rows->y0z1, rows->y1z1, y0z2, with_next, FIRST(row + gj));
-    number_edges(&edges->y1z1, rows->y1z1, y2z1, y1z2, with_next, FIRST(row + gj + 1));
+    number_edges(&edges->y0z0, rows->y0z0, rows->y1z0, rows->y0z1, with_next, kept->y0z0, FIRST(row));
+    number_edges(&edges->y1z0, rows->y1z0, y2z0, rows->y1z1, with_next, kept->y1z0, FIRST(row + 1));
+    number_edges(&edges->y0z1, rows->y0z1, rows->y1z1, y0z2, with_next, kept->y0z1, FIRST(row + gj));
+    number_edges(&edges->y1z1, rows->y1z1, y2z1, y1z2, with_next, kept->y1z1, FIRST(row + gj + 1));
 #undef FIRST
 }
 

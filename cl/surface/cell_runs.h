@@ -44,14 +44,25 @@ static inline uint find_root(volatile __global const uint *parents, uint run)
     return run;
 }
 
-/* The same, and halves the way: every run passed gets its parent's parent, which never becomes larger by it. */
+/* Give a run that is no root an ancestor as its parent.  Another item may do so at the same time, whichever is last: both
+ * are ancestors, and a run that is no root never becomes one again. */
+static inline void shorten_way(volatile __global uint *parents, uint run, uint ancestor)
+{
+#ifdef ATOMIC_LOADS
+    atomic_min(parents + run, ancestor);
+#else
+    parents[run] = ancestor;
+#endif
+}
+
+/* The same, and halves the way: every run passed gets its parent's parent. */
 static inline uint halve_way(volatile __global uint *parents, uint run)
 {
     uint parent = load_parent(parents, run);
     while (parent != run) {
         const uint next = load_parent(parents, parent);
         if (next != parent)
-            atomic_min(parents + run, next);
+            shorten_way(parents, run, next);
         run = next;
         parent = load_parent(parents, run);
     }
@@ -70,6 +81,30 @@ static inline void unite(volatile __global uint *parents, uint a, uint b)
             return;
         a = halve_way(parents, parent); /* it was no root any more */
         b = small;
+    }
+}
+
+/* Join the runs of a row of cells with those of the next one, row `other`, in word w.  `mixed` are the
+ * faces, `joined` those whose cells others join; `mixed_before` says whether the last face of the word before is mixed,
+ * and is then told that of this word. */
+static inline void join_word(
+    volatile __global uint *parents, __global const uint *run_starts, __global const ushort *word_runs,
+    __global const uint *row_offsets, uint row, uint other, uint w, uint words, uint mixed, uint joined,
+    uint *mixed_before)
+{
+    if (mixed == 0) {
+        *mixed_before = 0;
+        return;
+    }
+    const size_t at = (size_t)row * words + w, other_at = (size_t)other * words + w;
+    const uint starts = run_starts[at], other_starts = run_starts[other_at];
+    /* Where both runs go on from a cell whose face is mixed too, they have been joined there. */
+    uint joins = mixed & ~joined & ~((mixed << 1 | *mixed_before) & ~starts & ~other_starts);
+    *mixed_before = mixed >> 31;
+    for (; joins != 0; joins &= joins - 1) {
+        const uint upto = (joins & -joins) | ((joins & -joins) - 1);
+        unite(parents, row_offsets[row] + word_runs[at] + popcount(starts & upto) - 1,
+            row_offsets[other] + word_runs[other_at] + popcount(other_starts & upto) - 1);
     }
 }
 

@@ -25,8 +25,10 @@
  *             word_triangles   out  (rows_to_count, words) triangles of the row before each word
  *             gi gj gk         samples; words a row; flag_words = ceil(words / 32), rounded up to a power of two
  *             rows_to_count    rows that are counted, the first ones of the mask
- *             inside           in   (gk, gj, words) with -D GROWN: the inside mask, where `mask` is the kept mask of
- *                                   growing.cl, whose crossed edges are those of the grown cells
+ *             grown            in   (whole_gk, gj, words) with -D GROWN: the grown samples of growing.cl; other edges and
+ *                                   cells do not count
+ *             grown_extents    in   (whole_gk, gj) with -D GROWN: their extents, in the place of row_extents
+ *             first_grown      with -D GROWN: slice of them that the mask begins with
  * Launch      global = rows_to_count rounded up by the host, any local
  * Assumes     5 (gi + 1) < 65536, so that places in a row fit 16 bits
  * Guarantees  every output is written, but for the places of words beyond the extents, which nothing asks for */
@@ -36,7 +38,7 @@ __kernel void count_rows(
     __global ushort *restrict word_vertices, __global ushort *restrict word_triangles,
     const uint gi, const uint gj, const uint gk, const uint words, const uint flag_words, const uint rows_to_count
 #ifdef GROWN
-    , __global const uint *restrict inside
+    , __global const uint *restrict grown, __global const ushort2 *restrict grown_extents, const uint first_grown
 #endif
     )
 {
@@ -51,6 +53,11 @@ __kernel void count_rows(
     __global const uint *y1z0 = has_y ? y0z0 + words : y0z0;
     __global const uint *y0z1 = has_z ? y0z0 + (size_t)gj * words : y0z0;
     __global const uint *y1z1 = has_y && has_z ? y0z1 + words : y0z0;
+#ifdef GROWN
+    const size_t grown_row = (size_t)first_grown * gj + row;
+    __global const uint *row_grown = grown + grown_row * words;
+    uint begin = grown_extents[grown_row].x, end = grown_extents[grown_row].y;
+#else
     /* Beyond the extents of the four rows everything is outside; the sample before may own an edge into them. */
     const ushort2 extents[4] = {row_extents[row], row_extents[has_y ? row + 1 : row],
         row_extents[has_z ? row + gj : row], row_extents[has_y && has_z ? row + gj + 1 : row]};
@@ -61,6 +68,7 @@ __kernel void count_rows(
             end = max(end, (uint)extents[around].y);
         }
     }
+#endif
     begin -= begin != 0;
     for (uint f = 0; f < flag_words; ++f)
         words_with_work[(size_t)row * flag_words + f] = 0;
@@ -79,20 +87,19 @@ __kernel void count_rows(
         rows.y1z0 |= next_rows.y1z0 << 32;
         rows.y0z1 |= next_rows.y0z1 << 32;
         rows.y1z1 |= next_rows.y1z1 << 32;
-        const uint active = find_active_cells(rows, w, gi);
-        const uint y = (uint)(rows.y0z0 ^ rows.y1z0), z = (uint)(rows.y0z0 ^ rows.y0z1);
+#ifdef GROWN
+        const uint kept = row_grown[w];
+#else
+        const uint kept = ~0u;
+#endif
+        const uint active = find_active_cells(rows, w, gi) & kept;
+        const uint y = (uint)(rows.y0z0 ^ rows.y1z0) & kept, z = (uint)(rows.y0z0 ^ rows.y0z1) & kept;
         if ((active | y | z) != 0) {
-            const uint x = (uint)((rows.y0z0 ^ rows.y0z0 >> 1) & samples_with_next(w, gi));
+            const uint x = (uint)((rows.y0z0 ^ rows.y0z0 >> 1) & samples_with_next(w, gi)) & kept;
             vertices += popcount(x) + popcount(y) + popcount(z);
             if (has_y && has_z) {
-#ifdef GROWN
-                cell_rows cases;
-                load_cell_rows(&cases, inside, j, k, w, gj, words);
-#else
-                const cell_rows cases = rows;
-#endif
                 for (uint rest = active; rest != 0; rest &= rest - 1)
-                    triangles += (uint)MC_TRIANGLES[cell_case(cases, lowest_bit(rest))] & 15;
+                    triangles += (uint)MC_TRIANGLES[cell_case(rows, lowest_bit(rest))] & 15;
             }
             flags |= 1u << (w & 31);
             ++working;
@@ -172,7 +179,7 @@ static inline void flush_triangles(const uint *waiting, uint count, __global uin
  *             rows_to_count     rows that were counted
  *             gi gj gk, words   as above
  *             row_shift, active   as in cl/surface/marching_cubes.cl
- *             inside            in   with -D GROWN: as for count_rows
+ *             grown, first_grown   with -D GROWN: as for count_rows
  *             mirrored          1 when index space is left-handed in mm: the winding is turned round
  * Launch      global = ceil(active / WORDS_PER_ITEM) rounded up by the host, any local
  * Guarantees  every triangle is written once, cell by cell along the rows */
@@ -184,7 +191,7 @@ __kernel void emit_triangles(
     const uint gi, const uint gj, const uint gk, const uint words, const uint row_shift, const uint active,
     const int mirrored
 #ifdef GROWN
-    , __global const uint *restrict inside
+    , __global const uint *restrict grown, const uint first_grown
 #endif
     )
 {
@@ -215,20 +222,20 @@ __kernel void emit_triangles(
             continue;
         cell_rows rows;
         load_cell_rows(&rows, mask, j, k, w, gj, words);
-        uint rest = find_active_cells(rows, w, gi);
 #ifdef GROWN
-        cell_rows cases;
-        load_cell_rows(&cases, inside, j, k, w, gj, words);
+        cell_rows kept;
+        load_cell_rows(&kept, grown, j, k + first_grown, w, gj, words);
 #else
-        const cell_rows cases = rows;
+        const cell_rows kept = EVERY_EDGE;
 #endif
+        uint rest = find_active_cells(rows, w, gi) & (uint)kept.y0z0;
         numbered_rows edges;
-        number_rows(&edges, &rows, mask, row_offsets, word_vertices, first_vertex, j, k, w, gi, gj, gk, words);
+        number_rows(&edges, &rows, &kept, mask, row_offsets, word_vertices, first_vertex, j, k, w, gi, gj, gk, words);
         for (; rest != 0; rest &= rest - 1) {
             const uint b = lowest_bit(rest);
             uint numbers[16];
             number_cell(numbers, &edges, b);
-            const ulong packed = MC_TRIANGLES[cell_case(cases, b)];
+            const ulong packed = MC_TRIANGLES[cell_case(rows, b)];
             const uint count = (uint)packed & 15;
 #if LANES > 1
             /* Two triangles whether they count or not, the rest where there are more: wrong guesses cost more. */

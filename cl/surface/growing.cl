@@ -13,27 +13,27 @@
  * Passes
  *   1. find_cell_runs      runs of each row of cells; per word the runs of the row that begin before it
  *      (exclusive scan of the runs of all rows: cl/primitives/scan.cl)
- *   2. begin_cell_runs     each run by itself, and its number of cells
+ *   2. begin_cell_runs     each run by itself, without cells and not chosen
  *   3. join_cell_runs      runs of neighbouring rows with a mixed face between them
- *   4. find_run_roots     the smallest run of each component
- *      (numbering of the components: cl/primitives/union_find.cl; the host chooses some)
- *   5. seed_cell_runs      where seeds are a mask: the runs whose cells have a corner in it
- *   6. mark_grown     bits of the cells of chosen components
- *   7. start_rows     in open volumes: whether the kept mask is set at the begin of each row
- *   8. keep_edges     the kept mask: the inside mask that has the crossed edges of grown cells, and no others
- *   9. count_visited  grown cells and their neighbours
+ *   4. find_run_roots      the smallest run of each component, and there the component's cells
+ *   5. find_largest, choose_largest, choose_seeded   the components that are grown: the largest ones; those whose cells
+ *                          have a corner in a mask; the host chooses others by their roots
+ *   6. sum_components      how many there are, and their cells
+ *   7. mark_grown          bits of the samples whose edges belong to chosen components
+ *   8. count_visited       grown cells and their neighbours
  *
- * The kept mask.  All cells around a crossed edge are active and belong to one component, so an edge is grown or it is
- * not, and on the border of each face an even number of grown edges is crossed.  Hence a mask whose crossed edges are
- * the grown ones exists: along each row it changes where a grown edge is crossed.  A cell has the case of the inside
- * mask in the kept mask, or the inverted one; the case is therefore read from the inside mask (cells.cl, -D GROWN).
+ * The grown samples.  All cells around a crossed edge are active and belong to one component, so an edge is grown or it
+ * is not, and one of its cells says which: that of the sample that owns the edge, or at the far ends of the grid, where
+ * that cell does not exist, the last one before.  A bit a sample therefore tells the grown ones of the crossed edges, and
+ * of the active cells too; cl/surface/cells.cl and cl/surface/marching_cubes.cl take them with -D GROWN.
  *
  * Races.  join_cell_runs is the only pass where items read what others write in the same launch.  A parent is never above
- * its run and only ever falls: at roots by atomic_cmpxchg(), from the root itself to a smaller run of the same
- * component; at other runs by atomic_min(), to the parent's parent.  A parent that an item reads too early was a parent a moment ago, so following
+ * its run: at roots it is set by atomic_cmpxchg(), from the root itself to a smaller run of the same component; at other
+ * runs to the parent's parent.  A parent that an item reads too early was a parent a moment ago, so following
  * it leads to the same component, and the swap of one that is no root any more fails and says the new one.  No item
  * waits for another.  A root is the smallest run of its component whatever the order: the outcome is the same on every
- * device. */
+ * device.  Where other passes write one word from many items they do so by atomic operations whose order does not
+ * count. */
 #include "include/mask_rows.h"
 #include "surface/cell_runs.h"
 
@@ -101,75 +101,48 @@ __kernel void find_cell_runs(
     row_runs[row] = runs;
 }
 
-/* Parameters  active_cells, run_starts, run_extents   in   of find_cell_runs
- *             row_offsets  in   (gk, gj) runs of all rows before each
- *             parents      out  (runs,) each run's own number
- *             run_cells    out  (runs,) its number of cells
- *             gj gk, words   as above
- * Launch      as find_cell_runs
+/* What is summed up over all components: places in `sums`.  Of numbers of cells, which may be large, the lower 32 bits come
+ * first. */
+#define COMPONENTS 0
+#define CHOSEN 1
+#define ACTIVE_CELLS 2
+#define CHOSEN_CELLS 4
+#define LARGEST 6
+#define LARGEST_LEFT_OUT 7
+#define SUMS 8
+
+/* Parameters  parents    out  (runs,) each run's own number
+ *             run_cells  out  (runs,) 0
+ *             chosen     out  (runs,) 0
+ *             sums       out  (SUMS,) 0
+ *             runs
+ * Launch      global = runs rounded up by the host, any local
  * Guarantees  every run is written once */
 __kernel void begin_cell_runs(
-    __global const uint *restrict active_cells, __global const uint *restrict run_starts,
-    __global const ushort2 *restrict run_extents, __global const uint *restrict row_offsets,
-    __global uint *restrict parents, __global uint *restrict run_cells,
-    const uint gj, const uint gk, const uint words)
+    __global uint *restrict parents, __global uint *restrict run_cells, __global uint *restrict chosen,
+    __global uint *restrict sums, const uint runs)
 {
-    const uint row = get_global_id(0);
-    if (row >= gj * gk)
+    const uint run = get_global_id(0);
+    if (run >= runs)
         return;
-    const ushort2 extent = run_extents[row];
-    uint run = row_offsets[row], cells = 0;
-    int running = 0; /* a run has begun: it is `run` - 1 */
-    for (uint w = extent.x; w < extent.y; ++w) {
-        uint active = active_cells[(size_t)row * words + w];
-        for (uint starts = run_starts[(size_t)row * words + w]; starts != 0; starts &= starts - 1) {
-            const uint before = (1u << lowest_bit(starts)) - 1;
-            if (running)
-                run_cells[run - 1] = cells + popcount(active & before);
-            active &= ~before;
-            cells = 0;
-            running = 1;
-            parents[run] = run;
-            ++run;
-        }
-        cells += popcount(active);
-    }
-    if (running)
-        run_cells[run - 1] = cells;
-}
-
-/* Join the runs of a row of cells with those of the next one, row `other`, in word w.  `mixed` are the
- * faces, `joined` those whose cells others join; `mixed_before` says whether the last face of the word before is mixed,
- * and is then told that of this word. */
-static inline void join_word(
-    volatile __global uint *parents, __global const uint *run_starts, __global const ushort *word_runs,
-    __global const uint *row_offsets, uint row, uint other, uint w, uint words, uint mixed, uint joined,
-    uint *mixed_before)
-{
-    if (mixed == 0) {
-        *mixed_before = 0;
-        return;
-    }
-    const size_t at = (size_t)row * words + w, other_at = (size_t)other * words + w;
-    const uint starts = run_starts[at], other_starts = run_starts[other_at];
-    /* Where both runs go on from a cell whose face is mixed too, they have been joined there. */
-    uint joins = mixed & ~joined & ~((mixed << 1 | *mixed_before) & ~starts & ~other_starts);
-    *mixed_before = mixed >> 31;
-    for (; joins != 0; joins &= joins - 1) {
-        const uint upto = (joins & -joins) | ((joins & -joins) - 1);
-        unite(parents, row_offsets[row] + word_runs[at] + popcount(starts & upto) - 1,
-            row_offsets[other] + word_runs[other_at] + popcount(other_starts & upto) - 1);
+    parents[run] = run;
+    run_cells[run] = 0;
+    chosen[run] = 0;
+    if (run == 0) {
+        for (uint n = 0; n < SUMS; ++n)
+            sums[n] = 0;
     }
 }
 
-/* Parameters  mask, run_starts, word_runs, run_extents   in   of find_cell_runs
+/* Parameters  mask, active_cells, run_starts, word_runs, run_extents   in   of find_cell_runs
  *             row_offsets  in      (gk, gj)
  *             parents      in/out  (runs,) begun; then each run has a parent of its component that is not above it
  *             gi gj gk, words   as above
  * Launch      as find_cell_runs
  * Guarantees  two runs lead to one root where mixed faces join them; the root is the smallest run */
 __kernel void join_cell_runs(
-    __global const uint *restrict mask, __global const uint *restrict run_starts,
+    __global const uint *restrict mask, __global const uint *restrict active_cells,
+    __global const uint *restrict run_starts,
     __global const ushort *restrict word_runs, __global const ushort2 *restrict run_extents,
     __global const uint *restrict row_offsets, volatile __global uint *parents,
     const uint gi, const uint gj, const uint gk, const uint words)
@@ -186,63 +159,141 @@ __kernel void join_cell_runs(
     const ushort2 next_z = k + 2 < gk ? run_extents[row + gj] : none;
     if (next_y.x >= next_y.y && next_z.x >= next_z.y)
         return;
-    __global const uint *y1z0 = mask + (size_t)(row + 1) * words;
-    __global const uint *y0z1 = mask + (size_t)(row + gj) * words;
-    __global const uint *y1z1 = y0z1 + words;
     uint mixed_y_before = 0, mixed_z_before = 0;
-    cell_rows rows = {0, y1z0[extent.x], y0z1[extent.x], y1z1[extent.x]};
     for (uint w = extent.x; w < extent.y; ++w) {
-        const uint next = w + 1 < words ? w + 1 : w;
-        const cell_rows next_rows = {0, y1z0[next], y0z1[next], y1z1[next]};
-        rows.y1z0 |= next_rows.y1z0 << 32;
-        rows.y0z1 |= next_rows.y0z1 << 32;
-        rows.y1z1 |= next_rows.y1z1 << 32;
+        if (active_cells[(size_t)row * words + w] == 0) {
+            mixed_y_before = mixed_z_before = 0;
+            continue;
+        }
+        const ulong y0z1 = load_window(mask, row + gj, w, words), y1z1 = load_window(mask, row + gj + 1, w, words);
         if (w >= next_y.x && w < next_y.y)
             join_word(parents, run_starts, word_runs, row_offsets, row, row + 1, w, words,
-                find_mixed_faces(rows.y1z0, rows.y1z1, w, gi), 0, &mixed_y_before);
+                find_mixed_faces(load_window(mask, row + 1, w, words), y1z1, w, gi), 0, &mixed_y_before);
         if (w >= next_z.x && w < next_z.y) {
-            const uint mixed = find_mixed_faces(rows.y0z1, rows.y1z1, w, gi);
+            const uint mixed = find_mixed_faces(y0z1, y1z1, w, gi);
             uint joined = 0;
             if (j > 0 && mixed != 0) {
                 /* Round the edge that four cells share: by the row before, both cells are joined to its own already. */
                 const ulong own = load_window(mask, row, w, words);
                 const ulong before = load_window(mask, row + gj - 1, w, words);
                 const ulong beyond = load_window(mask, row + 2 * gj, w, words);
-                joined = find_mixed_faces(before, rows.y0z1, w, gi) & find_mixed_faces(own, rows.y0z1, w, gi)
-                    & find_mixed_faces(rows.y0z1, beyond, w, gi);
+                joined = find_mixed_faces(before, y0z1, w, gi) & find_mixed_faces(own, y0z1, w, gi)
+                    & find_mixed_faces(y0z1, beyond, w, gi);
             }
             join_word(parents, run_starts, word_runs, row_offsets, row, row + gj, w, words, mixed, joined,
                 &mixed_z_before);
         }
-        rows = next_rows;
     }
 }
 
-/* Parameters  parents  in   (runs,) joined
- *             roots    out  (runs,) the smallest run of each run's component
- *             runs
- * Launch      global = runs rounded up by the host, any local
- * Guarantees  every root is written */
-__kernel void find_run_roots(__global const uint *restrict parents, __global uint *restrict roots, const uint runs)
+/* Parameters  active_cells, run_starts, run_extents   in   of find_cell_runs
+ *             row_offsets  in      (gk, gj) runs of all rows before each
+ *             parents      in      (runs,) joined
+ *             roots        out     (runs,) the smallest run of each run's component
+ *             run_cells    in/out  (runs,) 0; then at each root the cells of its component, at other runs 0
+ *             gj gk, words   as above
+ * Launch      as find_cell_runs
+ * Assumes     a component has fewer than 2^32 cells
+ * Guarantees  every run is written */
+__kernel void find_run_roots(
+    __global const uint *restrict active_cells, __global const uint *restrict run_starts,
+    __global const ushort2 *restrict run_extents, __global const uint *restrict row_offsets,
+    __global const uint *restrict parents, __global uint *restrict roots, volatile __global uint *run_cells,
+    const uint gj, const uint gk, const uint words)
 {
-    const uint run = get_global_id(0);
-    if (run < runs)
-        roots[run] = find_root(parents, run);
+    const uint row = get_global_id(0);
+    if (row >= gj * gk)
+        return;
+    const ushort2 extent = run_extents[row];
+    /* Runs that follow each other are often of one component: their cells are added up before they are added to it. */
+    uint run = row_offsets[row], root = 0, cells = 0;
+    for (uint w = extent.x; w < extent.y; ++w) {
+        uint active = active_cells[(size_t)row * words + w];
+        for (uint starts = run_starts[(size_t)row * words + w]; starts != 0; starts &= starts - 1) {
+            const uint before = (1u << lowest_bit(starts)) - 1;
+            cells += popcount(active & before);
+            active &= ~before;
+            const uint next_root = find_root(parents, run);
+            if (next_root != root && cells != 0) {
+                atomic_add(run_cells + root, cells);
+                cells = 0;
+            }
+            root = next_root;
+            roots[run++] = root;
+        }
+        cells += popcount(active);
+    }
+    if (cells != 0)
+        atomic_add(run_cells + root, cells);
 }
 
-/* Parameters  mask, run_starts, word_runs, run_extents, row_offsets   in   as above
+/* Parameters  roots      in      (runs,)
+ *             run_cells  in      (runs,) at each root the cells of its component
+ *             sums       in/out  (SUMS,) LARGEST: 0; then the cells of the largest component
+ *             runs
+ * Launch      global = runs rounded up by the host, any local */
+__kernel void find_largest(
+    __global const uint *restrict roots, __global const uint *restrict run_cells, volatile __global uint *sums,
+    const uint runs)
+{
+    const uint run = get_global_id(0);
+    if (run < runs && roots[run] == run)
+        atomic_max(sums + LARGEST, run_cells[run]);
+}
+
+/* Parameters  roots, run_cells, runs   in   as above
+ *             sums       in      (SUMS,) of find_largest
+ *             parts      the components with at least one of so many parts of the largest are chosen
+ *             chosen     in/out  (runs,) 1 at the roots of chosen components
+ * Launch      as find_largest */
+__kernel void choose_largest(
+    __global const uint *restrict roots, __global const uint *restrict run_cells, __global const uint *restrict sums,
+    __global uint *restrict chosen, const uint parts, const uint runs)
+{
+    const uint run = get_global_id(0);
+    if (run < runs && roots[run] == run && (ulong)run_cells[run] * parts >= sums[LARGEST])
+        chosen[run] = 1;
+}
+
+/* Parameters  roots, run_cells, chosen, runs   in   as above
+ *             sums       in/out  (SUMS,) 0; then components, those chosen, their cells, and the most cells of one that is
+ *                        not chosen
+ * Launch      as find_largest */
+__kernel void sum_components(
+    __global const uint *restrict roots, __global const uint *restrict run_cells, __global const uint *restrict chosen,
+    volatile __global uint *sums, const uint runs)
+{
+    const uint run = get_global_id(0);
+    if (run >= runs || roots[run] != run)
+        return;
+    const uint cells = run_cells[run];
+    atomic_inc(sums + COMPONENTS);
+    if (atomic_add(sums + ACTIVE_CELLS, cells) > ~0u - cells)
+        atomic_inc(sums + ACTIVE_CELLS + 1);
+    if (chosen[run] == 0) {
+        atomic_max(sums + LARGEST_LEFT_OUT, cells);
+        return;
+    }
+    atomic_inc(sums + CHOSEN);
+    if (atomic_add(sums + CHOSEN_CELLS, cells) > ~0u - cells)
+        atomic_inc(sums + CHOSEN_CELLS + 1);
+}
+
+/* Parameters  mask, run_starts, word_runs, run_extents, row_offsets, roots   in   as above
  *             seeds        in   (nk, nj, voxel_words) voxels that are seeds, without a border
- *             seeded       out  (runs,) 1 where a cell of the run has an enclosed corner that is a seed, else 0
+ *             chosen       in/out  (runs,) 1 at the roots of components, a cell of which has an enclosed corner that is a
+ *                          seed
  *             enclosed_set   1 where set bits of the mask are enclosed by the surface, 0 where the others are
  *             border       layers of samples around the volume, 0 or 1
  *             voxel_words  words of a row of `seeds`
  *             gi gj gk, words   as above
  * Launch      as find_cell_runs
- * Guarantees  every run is written, by the item of its row */
-__kernel void seed_cell_runs(
+ * Guarantees  every component with a seed is chosen */
+__kernel void choose_seeded(
     __global const uint *restrict mask, __global const uint *restrict run_starts,
     __global const ushort *restrict word_runs, __global const ushort2 *restrict run_extents,
-    __global const uint *restrict row_offsets, __global const uint *restrict seeds, __global uint *restrict seeded,
+    __global const uint *restrict row_offsets, __global const uint *restrict seeds,
+    __global const uint *restrict roots, volatile __global uint *chosen,
     const int enclosed_set, const uint border, const uint voxel_words,
     const uint gi, const uint gj, const uint gk, const uint words)
 {
@@ -252,7 +303,6 @@ __kernel void seed_cell_runs(
     const uint j = row % gj, k = row / gj;
     const ushort2 extent = run_extents[row];
     uint run = row_offsets[row], found = 0;
-    int running = 0;
     for (uint w = extent.x; w < extent.y; ++w) {
         cell_rows rows;
         load_cell_rows(&rows, mask, j, k, w, gj, words);
@@ -269,139 +319,70 @@ __kernel void seed_cell_runs(
         uint seeds_here = active & (uint)(corners | corners >> 1);
         for (uint starts = run_starts[(size_t)row * words + w]; starts != 0; starts &= starts - 1) {
             const uint before = (1u << lowest_bit(starts)) - 1;
-            if (running)
-                seeded[run - 1] = found | ((seeds_here & before) != 0);
+            if (found | ((seeds_here & before) != 0))
+                atomic_or(chosen + roots[run - 1], 1u);
             seeds_here &= ~before;
             found = 0;
-            running = 1;
             ++run;
         }
         found |= seeds_here != 0;
     }
-    if (running)
-        seeded[run - 1] = found;
+    if (found)
+        atomic_or(chosen + roots[run - 1], 1u);
 }
 
-/* Parameters  active_cells, run_starts, run_extents, row_offsets   in   as above
- *             numbers  in   (runs,) component of each run
- *             chosen   in   (components,) 1 for chosen ones, else 0
- *             grown    out  (gk, gj, words) bit b: cell b of the word belongs to a chosen component
- *             grown_extents   out  (gk, gj) first word of the row with a grown cell, and the one after the last
- *             gj gk, words   as above
+/* Parameters  active_cells, run_starts, run_extents, row_offsets, roots   in   as above
+ *             chosen   in   (runs,) 1 at the roots of chosen components
+ *             grown    out  (gk, gj, words) grown samples: bit b is that of cell b, which is set where the cell belongs to
+ *                           a chosen component; at the ends of a row, of its slice and of the grid that of the last cell
+ *             grown_extents   out  (gk, gj) first word of the row with a bit set, and the one after the last
+ *             gi gj gk, words   as above
  * Launch      as find_cell_runs
- * Guarantees  every word is written */
+ * Guarantees  every extent is written, and every word of rows that have an active cell: in others no edge is crossed */
 __kernel void mark_grown(
     __global const uint *restrict active_cells, __global const uint *restrict run_starts,
     __global const ushort2 *restrict run_extents, __global const uint *restrict row_offsets,
-    __global const int *restrict numbers, __global const uchar *restrict chosen, __global uint *restrict grown,
-    __global ushort2 *restrict grown_extents,
-    const uint gj, const uint gk, const uint words)
+    __global const uint *restrict roots, __global const uint *restrict chosen,
+    __global uint *restrict grown, __global ushort2 *restrict grown_extents,
+    const uint gi, const uint gj, const uint gk, const uint words)
 {
     const uint row = get_global_id(0);
     if (row >= gj * gk)
         return;
-    const ushort2 extent = run_extents[row];
+    uint cell_row = row;
+    if (row >= (gk - 1) * gj)
+        cell_row -= gj;
+    if (cell_row % gj == gj - 1)
+        cell_row -= 1;
+    const ushort2 extent = run_extents[cell_row];
+    if (extent.x >= extent.y) {
+        grown_extents[row] = (ushort2)(0, 0);
+        return;
+    }
     __global uint *row_grown = grown + (size_t)row * words;
     for (uint w = 0; w < extent.x; ++w)
         row_grown[w] = 0;
     for (uint w = extent.y; w < words; ++w)
         row_grown[w] = 0;
-    uint run = row_offsets[row], keeps = 0; /* all ones where the run that goes on is chosen */
-    uint begin = words, end = 0;
+    uint run = row_offsets[cell_row], keeps = 0; /* all ones where the run that goes on is chosen */
+    uint begin = words, end = 0, last_cell = 0;
     for (uint w = extent.x; w < extent.y; ++w) {
-        uint active = active_cells[(size_t)row * words + w], bits = 0;
-        for (uint starts = run_starts[(size_t)row * words + w]; starts != 0; starts &= starts - 1) {
+        uint active = active_cells[(size_t)cell_row * words + w], bits = 0;
+        for (uint starts = run_starts[(size_t)cell_row * words + w]; starts != 0; starts &= starts - 1) {
             const uint before = (1u << lowest_bit(starts)) - 1;
             bits |= active & before & keeps;
             active &= ~before;
-            keeps = chosen[numbers[run++]] ? ~0u : 0u;
+            keeps = chosen[roots[run++]] ? ~0u : 0u;
         }
         bits |= active & keeps;
+        if (w == (gi - 1) >> 5) /* the sample behind the last cell */
+            bits |= (bits << 1 | last_cell) & 1u << (gi - 1 & 31);
+        last_cell = bits >> 31;
         row_grown[w] = bits;
         begin = min(begin, bits != 0 ? w : words);
         end = bits != 0 ? w + 1 : end;
     }
     grown_extents[row] = (ushort2)((ushort)min(begin, end), (ushort)end);
-}
-
-/* The row of cells that has a crossed edge along i from row (j, k) of samples, in the bits of the whole grid. */
-static inline size_t cell_row_of(uint j, uint k, uint gj, uint whole_gk)
-{
-    return (size_t)min(k, whole_gk - 2) * gj + min(j, gj - 2);
-}
-
-/* Parameters  mask    in   (gk, gj, words)
- *             grown   in   (gk, gj, words)
- *             starts  out  (gk, gj) 1 where the kept mask is set at the first sample of a row, else 0
- *             gj gk, words   as above
- * Launch      global = gk rounded up by the host, any local
- * Guarantees  every entry is written; that of row (0, 0) is 0 */
-__kernel void start_rows(
-    __global const uint *restrict mask, __global const uint *restrict grown, __global uint *restrict starts,
-    const uint gj, const uint gk, const uint words)
-{
-    const uint k = get_global_id(0);
-    if (k >= gk)
-        return;
-#define FIRST(bits, j, k) (bits[((size_t)(k) * gj + (j)) * words] & 1)
-    uint set = 0;
-    for (uint before = 0; before < k; ++before)
-        set ^= (FIRST(mask, 0, before) ^ FIRST(mask, 0, before + 1)) & FIRST(grown, 0, before);
-    const uint cells = min(k, gk - 2);
-    starts[(size_t)k * gj] = set;
-    for (uint j = 1; j < gj; ++j) {
-        set ^= (FIRST(mask, j - 1, k) ^ FIRST(mask, j, k)) & FIRST(grown, j - 1, cells);
-        starts[(size_t)k * gj + j] = set;
-    }
-#undef FIRST
-}
-
-/* Parameters  mask          in   (gk, gj, words) inside mask of a slab
- *             grown, grown_extents   in   (whole_gk, gj, words) and (whole_gk, gj) of mark_grown
- *             starts        in   (whole_gk, gj) of start_rows; unused where rows_start is 0
- *             kept          out  (gk, gj, words) kept mask of the slab
- *             kept_extents  out  (gk, gj) its extents
- *             rows_start    1 where `starts` says with what rows begin, 0 where they begin outside
- *             gi gj gk, words   of the slab;  first  slice of the grid that it begins with;  whole_gk  of the grid
- * Launch      global = gj * gk rounded up by the host, any local
- * Guarantees  every word and extent is written; bits beyond the row are 0 */
-__kernel void keep_edges(
-    __global const uint *restrict mask, __global const uint *restrict grown,
-    __global const ushort2 *restrict grown_extents, __global const uint *restrict starts,
-    __global uint *restrict kept, __global ushort2 *restrict kept_extents, const int rows_start,
-    const uint gi, const uint gj, const uint gk, const uint words, const uint first, const uint whole_gk)
-{
-    const uint row = get_global_id(0);
-    if (row >= gj * gk)
-        return;
-    const uint j = row % gj, k = row / gj + first;
-    const size_t cell_row = cell_row_of(j, k, gj, whole_gk);
-    __global const uint *row_grown = grown + cell_row * words;
-    __global uint *row_kept = kept + (size_t)row * words;
-    const ushort2 extent = grown_extents[cell_row];
-    uint set = rows_start ? 0u - starts[(size_t)k * gj + j] : 0u; /* all ones, or 0 */
-    uint begin = words, end = 0;
-    for (uint w = 0; w < words; ++w) {
-        uint bits = set;
-        if (w >= extent.x && w < extent.y) {
-            const ulong own = load_window(mask, row, w, words);
-            uint flips = (uint)((own ^ own >> 1) & samples_with_next(w, gi)) & row_grown[w];
-            if (flips != 0) {
-                flips ^= flips << 1;
-                flips ^= flips << 2;
-                flips ^= flips << 4;
-                flips ^= flips << 8;
-                flips ^= flips << 16; /* bit b: the number of flips up to b is odd */
-                bits ^= flips << 1;
-                set ^= 0u - (flips >> 31);
-            }
-        }
-        bits &= (uint)low_bits(min(32u, gi - min(32 * w, gi)));
-        row_kept[w] = bits;
-        begin = min(begin, bits != 0 ? w : words);
-        end = bits != 0 ? w + 1 : end;
-    }
-    kept_extents[row] = (ushort2)((ushort)min(begin, end), (ushort)end);
 }
 
 /* Parameters  grown        in   (gk, gj, words)
@@ -418,28 +399,39 @@ __kernel void count_visited(
     if (row >= gj * gk)
         return;
     const uint j = row % gj, k = row / gj;
-    uint count = 0;
-    if (j + 1 < gj && k + 1 < gk) {
-        const uint around[5] = {row, j > 0 ? row - 1 : row, row + 1, k > 0 ? row - gj : row, row + gj};
-        uint begin = words, end = 0;
-        for (uint n = 0; n < 5; ++n) {
-            const ushort2 extent = grown_extents[around[n]];
-            if (extent.x < extent.y) {
-                begin = min(begin, (uint)extent.x);
-                end = max(end, (uint)extent.y);
-            }
-        }
-        begin -= begin != 0;
-        end = min(end + 1, words);
-        for (uint w = begin; w < end; ++w) {
-            const uint own = grown[(size_t)row * words + w];
-            const uint before = w > 0 ? grown[(size_t)row * words + w - 1] >> 31 : 0;
-            const uint after = w + 1 < words ? grown[(size_t)row * words + w + 1] << 31 : 0;
-            uint visited = own | own << 1 | before | own >> 1 | after;
-            for (uint n = 1; n < 5; ++n)
-                visited |= grown[(size_t)around[n] * words + w];
+    counts[row] = 0;
+    if (j + 1 >= gj || k + 1 >= gk)
+        return;
+    const uint row_a = j > 0 ? row - 1 : row, row_b = row + 1, row_c = k > 0 ? row - gj : row, row_d = row + gj;
+    const ushort2 extent = grown_extents[row], extent_a = grown_extents[row_a], extent_b = grown_extents[row_b],
+        extent_c = grown_extents[row_c], extent_d = grown_extents[row_d];
+    /* Extents of rows without a bit are 0; such rows need not be written, so what lies there does not count. */
+#define END(extent) (uint)extent.y
+#define BEGIN(extent) (extent.y != 0 ? (uint)extent.x : words)
+#define COUNTS(extent) (extent.y != 0 ? ~0u : 0u)
+    const uint last = max(max(END(extent), max(END(extent_a), END(extent_b))), max(END(extent_c), END(extent_d)));
+    if (last == 0)
+        return;
+    const uint first = min(
+        min(BEGIN(extent), min(BEGIN(extent_a), BEGIN(extent_b))), min(BEGIN(extent_c), BEGIN(extent_d)));
+    const uint own_counts = COUNTS(extent), counts_a = COUNTS(extent_a), counts_b = COUNTS(extent_b),
+        counts_c = COUNTS(extent_c), counts_d = COUNTS(extent_d);
+    const uint begin = first - (first != 0), end = min(last + 1, words);
+    __global const uint *of_row = grown + (size_t)row * words;
+    __global const uint *a = grown + (size_t)row_a * words, *b = grown + (size_t)row_b * words;
+    __global const uint *c = grown + (size_t)row_c * words, *d = grown + (size_t)row_d * words;
+    uint count = 0, before = 0, own = of_row[begin] & own_counts;
+    for (uint w = begin; w < end; ++w) {
+        const uint after = w + 1 < words ? of_row[w + 1] & own_counts : 0;
+        const uint visited = own | own << 1 | before >> 31 | own >> 1 | after << 31 | (a[w] & counts_a)
+            | (b[w] & counts_b) | (c[w] & counts_c) | (d[w] & counts_d);
+        if (visited != 0)
             count += popcount(visited & (uint)samples_with_next(w, gi));
-        }
+        before = own;
+        own = after;
     }
     counts[row] = count;
+#undef END
+#undef BEGIN
+#undef COUNTS
 }

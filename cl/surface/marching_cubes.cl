@@ -81,6 +81,8 @@
  *             map, label, occupied  in   with -D MASKS: the label map, the label, and the occupancy of all labels, where
  *                             `voxels` is that of the label; slices as those of `voxels`; see mask_border.h
  *             biases          in   (highest label + 1,) with -D MASKS: see mask_border.h
+ *             grown           in   (whole_gk, gj, words) with -D GROWN: the samples whose edges have vertices, see growing.cl
+ *             first_grown     with -D GROWN: slice of them that the mask begins with
  * Launch      global = ceil(active / WORDS_PER_ITEM) rounded up by the host, any local
  * Guarantees  every position and normal is written once.  Positions are right to one unit in the last place of the
  *             volume's largest coordinate (half a unit up to 4096 samples an axis, where products of a sample number
@@ -104,6 +106,9 @@ void emit_vertices(
 #ifdef MASKS
     , __global const LABEL *restrict map, const uint label, __global const VOXEL *restrict occupied,
     __global const int *restrict biases
+#endif
+#ifdef GROWN
+    , __global const uint *restrict grown, const uint first_grown
 #endif
     )
 {
@@ -164,7 +169,12 @@ void emit_vertices(
         const uint j = row - slice_begin;
         crossed_edges edges;
         find_crossed_edges(&edges, mask, j, k, w, gi, gj, gk, words);
-        const uint x = (uint)edges.x, y = (uint)edges.y, z = (uint)edges.z;
+#ifdef GROWN
+        const uint kept = grown[((size_t)first_grown * gj + row) * words + w];
+#else
+        const uint kept = ~0u;
+#endif
+        const uint x = (uint)edges.x & kept, y = (uint)edges.y & kept, z = (uint)edges.z & kept;
         /* Without branches: whether an axis has its vertex is as good as random, and wrong guesses cost more. */
         ushort crossed[96]; /* 4 * sample + axis */
         uint count = 0;

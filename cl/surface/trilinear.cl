@@ -194,7 +194,8 @@ __kernel void emit_cell_triangles(
 
     const uint first_shift = mirrored ? 8 : 0, last_shift = mirrored ? 0 : 8;
     numbered_rows edges;
-    number_rows(&edges, &rows, mask, row_offsets, word_vertices, first_vertex, j, k, w, gi, gj, gk, words);
+    const cell_rows kept = EVERY_EDGE;
+    number_rows(&edges, &rows, &kept, mask, row_offsets, word_vertices, first_vertex, j, k, w, gi, gj, gk, words);
     uint cell_vertex = first_vertex + first_cell_vertex(row_offsets, cell_vertex_offsets, row, k, gj)
         + (word_cell_vertices[(size_t)row * words + w] & (HAS_CELL_VERTICES - 1));
     const uint row_triangle = row_offsets[rows_to_count + row] - row_offsets[rows_to_count];

@@ -57,6 +57,20 @@ class BenchInput:
         voxels, affine = self.arrays()
         return Volume(np.load(voxels), np.load(affine))
 
+    def vertebrae(self) -> Any:
+        """The centres of the vertebrae that lie in a phantom, shape (n, 3), LPS mm; None for other inputs."""
+        settings = _phantom_settings(self.name) if self.folder is None else None
+        if settings is None:
+            return None
+        kept = self.work / f"{self.name}-vertebrae.npy"
+        if not kept.is_file():
+            from clrecon.phantom import make_phantom
+
+            self.work.mkdir(mode=0o700, parents=True, exist_ok=True)
+            known = make_phantom(settings)[2]["spine"]["vertebrae"]
+            _save(kept, np.array([each["center_lps_mm"] for each in known if each["inside"]]).reshape(-1, 3))
+        return np.load(kept)
+
     def ct_folder(self) -> Path:
         """The input as a folder of CT slices.
 

@@ -33,7 +33,7 @@ def prepare_surfaces(
     from clrecon.operators.primitives.union_find import prepare_components
     from clrecon.operators.surface.extract import prepare_isosurface
 
-    prepare_isosurface(device, topology=topology, inside=inside, vertex_rule=vertex_rule)
+    prepare_isosurface(device, topology=topology, inside=inside, vertex_rule=vertex_rule, grown=grows)
     if grows:
         from clrecon.operators.surface.growing import prepare_growing
 

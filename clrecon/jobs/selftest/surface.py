@@ -37,7 +37,7 @@ LONG = (532, 2, 6)
 """Voxels (k, j, i) of more than 500 slices: one of the kernels works slice by slice."""
 
 LONG_THIN = (520, 7, 34)
-"""Voxels of an open volume, of whose rows one kernel finds the begins slice by slice."""
+"""Voxels (k, j, i) of an open volume of many thin slices, whose ends are a large part of it."""
 
 
 def compare_mesh(volume: Volume, mesh: Mesh, expected: Surface, what: str) -> float:
@@ -96,11 +96,11 @@ GROWING = (
     "begin_cell_runs",
     "join_cell_runs",
     "find_run_roots",
+    "sum_components",
     "mark_grown",
-    "keep_edges",
     "count_visited",
 )
-"""Kernels that every grown surface launches, beside those of components."""
+"""Kernels that every grown surface launches, beside those that choose components."""
 
 
 class _GrownTwin:
@@ -109,9 +109,11 @@ class _GrownTwin:
     def __init__(self, marked: NDArray[Any] | None):
         self.marked = marked
         self.counts: dict[str, int] = {}
+        self.components = 0
 
     def __call__(self, inside: NDArray[Any]) -> NDArray[Any]:
         count, numbers = growing_twin.label_cells(inside)
+        self.components = count
         if self.marked is None:
             chosen = growing_twin.choose_largest(np.bincount(numbers[numbers >= 0], minlength=count), AUTO_SHARE)
         else:
@@ -122,19 +124,40 @@ class _GrownTwin:
         return np.asarray(cells)
 
 
+def _grains() -> tuple[NDArray[Any], NDArray[Any]]:
+    """Return grains of one voxel, many before the only large one, and a mark in the one at an edge of the volume.
+
+    Each grain has four runs of cells, that at the edge one, in row 10: the large grain begins with run 521.
+    """
+    voxels, marked = np.zeros((24, 12, 40), np.int16), np.zeros((24, 12, 40), bool)
+    places = [(k, j, i) for k in (2, 5, 8, 11) for j in (2, 5, 8) for i in range(2, 38, 3)]
+    for place in places[:130]:
+        voxels[place] = 100
+    voxels[14:20, 3:9, 10:16] = 100
+    voxels[0, 11, 5] = 100
+    marked[0, 11, 5] = True
+    return voxels, marked
+
+
 def _check_growing(device: Device) -> str:
     """Compare parts of surfaces that grow from the largest components, and from the voxels of a label."""
     worst = 0.0
-    for dtype, shape, closed, by_label in (("int16", WIDE, True, False), ("float32", LONG_THIN, False, True)):
-        volume = stack(noise(shape, dtype, 8), OBLIQUE)
-        marked = noise(shape, "uint8", 40) == 38  # whose HU are 7
-        twin = _GrownTwin(marked if by_label else None)
+    grains, at_edge = _grains()
+    for voxels, closed, marked in (
+        (noise(WIDE, "int16", 8), True, None),
+        (noise(LONG_THIN, "float32", 8), False, noise(LONG_THIN, "uint8", 40) == 38),  # whose HU are 7
+        (grains, False, None),
+        (grains, False, at_edge),
+    ):
+        volume = stack(voxels, OBLIQUE)
+        twin = _GrownTwin(marked)
         expected = extract_twin(volume, 6.5, closed=closed, grown=twin)
-        seeds = (LabelMap(marked.astype(np.uint8), volume.affine), 1) if by_label else AUTO
+        seeds = AUTO if marked is None else (LabelMap(marked.astype(np.uint8), volume.affine), 1)
         mesh = extract_isosurface(volume, 6.5, device=device, closed=closed, grow_from=seeds)
-        worst = max(worst, compare_mesh(volume, mesh, expected, f"a part in {dtype} voxels"))
+        worst = max(worst, compare_mesh(volume, mesh, expected, f"a part in {voxels.dtype} voxels"))
         require_equal([mesh.report["cells"][name] for name in twin.counts], list(twin.counts.values()), "cells")
-    return f"2 parts of surfaces: triangles and counts of cells equal, vertices within {worst:.1e} voxel"
+        require_equal(mesh.report["growing"]["components"], twin.components, "components")
+    return f"4 parts of surfaces: triangles and counts of cells equal, vertices within {worst:.1e} voxel"
 
 
 TRILINEAR = ("count_cells", "make_room", "emit_cell_triangles", "emit_cell_vertices")
@@ -166,9 +189,9 @@ CHECKS = (
     ),
     Check(
         "growing",
-        (*MARCHING, *GROWING, "start_rows", "seed_cell_runs", "flag_roots", "number_components"),
+        (*MARCHING, *GROWING, "find_largest", "choose_largest", "choose_seeded"),
         _check_growing,
-        {"surface/cells.cl": ("GROWN",)},
+        {"surface/cells.cl": ("GROWN",), "surface/marching_cubes.cl": ("GROWN",)},
     ),
     Check(
         "golden sections",

@@ -10,7 +10,7 @@ import numpy as np
 from clrecon.errors import UsageError
 from clrecon.opencl import Device, Program, Stopwatch, allocate, download, kernel_constant, launch, load_program
 
-__all__ = ["LARGEST_SCAN", "Scanned", "exclusive_scan", "prepare_scan"]
+__all__ = ["LARGEST_SCAN", "Scanned", "enqueue_scan", "exclusive_scan", "prepare_scan"]
 
 SCAN_PER_ITEM = kernel_constant("primitives/scan.cl", "SCAN_PER_ITEM")
 """Elements a work-item."""
@@ -65,12 +65,30 @@ def exclusive_scan(
     DeviceError
         The device fails.
     """
+    _check_size(n)
+    offsets_d = counts_d if in_place else allocate(device, 4 * n)
+    total_d = enqueue_scan(device, counts_d, offsets_d, n, stopwatch=stopwatch)
+    total = download(device, np.empty(1, dtype=np.uint64), total_d)
+    return Scanned(offsets_d, total_d, int(total[0]))
+
+
+def _check_size(n: int) -> None:
     if not 1 <= n <= LARGEST_SCAN:
         raise UsageError(f"{n:,} elements: a scan takes 1 to {LARGEST_SCAN:,}")
+
+
+def enqueue_scan(device: Device, counts_d: Any, offsets_d: Any, n: int, *, stopwatch: Stopwatch | None = None) -> Any:
+    """Enqueue the same for offsets in a buffer that is there, which may be that of the counts.
+
+    Returns
+    -------
+    total_d : buffer, (1,) uint64
+        The exact total; nothing is waited for.
+    """
+    _check_size(n)
     scan = _load_scan(device)
     blocks = -(-n // (SCAN_PER_ITEM * device.group_size))
     sums_d, block_offsets_d, total_d = (allocate(device, 4 * blocks), allocate(device, 4 * blocks), allocate(device, 8))
-    offsets_d = counts_d if in_place else allocate(device, 4 * n)
     items = blocks * device.group_size
     launch(device, scan["sum_blocks"], items, stopwatch=stopwatch, counts=counts_d, block_sums=sums_d, n=n)
     launch(
@@ -81,5 +99,4 @@ def exclusive_scan(
         device, scan["scan_blocks"], items, stopwatch=stopwatch,
         counts=counts_d, block_offsets=block_offsets_d, offsets=offsets_d, n=n,
     )  # fmt: skip
-    total = download(device, np.empty(1, dtype=np.uint64), total_d)
-    return Scanned(offsets_d, total_d, int(total[0]))
+    return total_d

@@ -37,18 +37,28 @@ class Classified:
     mask_d : buffer, (gk, gj, words) uint32
         Its crossed edges have the vertices.
     row_extents_d : buffer, (gk, gj) ushort2
-    inside_d : buffer, optional
-        For a part of a surface the inside mask, see cl/surface/growing.cl; None: `mask_d` is it.
+    grown_d, grown_extents_d : buffer, optional
+        For a part of a surface: the samples of the whole grid whose edges have vertices, see cl/surface/growing.cl, and
+        their extents.
+    first_grown : int
+        Slice of them that the slab begins with.
     """
 
     mask_d: Any
     row_extents_d: Any
-    inside_d: Any = None
+    grown_d: Any = None
+    grown_extents_d: Any = None
+    first_grown: int = 0
+
+    @property
+    def is_part(self) -> bool:
+        """True where only grown samples have vertices."""
+        return self.grown_d is not None
 
     @property
     def own(self) -> dict[str, Any]:
         """Arguments of kernels for parts of a surface."""
-        return {} if self.inside_d is None else {"inside": self.inside_d}
+        return {"grown": self.grown_d, "first_grown": self.first_grown} if self.is_part else {}
 
 
 @dataclass(frozen=True)
@@ -94,7 +104,7 @@ def count(
         The device fails.
     """
     grid, rows = slab.grid, slab.counted_rows
-    program = load_cells(device, classified.inside_d is not None)
+    program = load_cells(device, classified.is_part)
     gi, gj, _ = grid.shape
     row_counts_d = allocate(device, 12 * rows)
     word_vertices_d, word_triangles_d = (allocate(device, 2 * rows * grid.words) for _ in range(2))
@@ -104,7 +114,7 @@ def count(
         mask=classified.mask_d, row_extents=classified.row_extents_d, row_counts=row_counts_d,
         words_with_work=flags_d, word_vertices=word_vertices_d, word_triangles=word_triangles_d,
         gi=gi, gj=gj, gk=slab.mask_slices, words=grid.words, flag_words=grid.flag_words, rows_to_count=rows,
-        **classified.own,
+        **({"grown_extents": classified.grown_extents_d} if classified.is_part else {}), **classified.own,
     )  # fmt: skip
     cells = None
     if grid.rule.topology == "trilinear":

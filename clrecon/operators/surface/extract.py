@@ -155,8 +155,9 @@ class SurfaceExtractor(Closing):
             progress("build", 0, 1)
         with run.stopwatch.timed("build"):
             prepare_isosurface(
-                self.device, volume.voxels.dtype, rule.topology, volume.uneven, rule.inside, rule.vertex_rule
-            )
+                self.device, volume.voxels.dtype, rule.topology, volume.uneven, rule.inside, rule.vertex_rule,
+                run.grid.grows,
+            )  # fmt: skip
             if run.grid.grows:
                 prepare_growing(self.device)
         if progress is not None:

@@ -20,7 +20,7 @@ from clrecon.operators.resident.bricks import BrickStates, brick_bytes, compare_
 from clrecon.operators.resident.device_volume import DeviceVolume
 from clrecon.operators.surface import marching_cubes
 from clrecon.operators.surface.cells import Classified, Counted, count
-from clrecon.operators.surface.growing import Grown, grow, growing_needs, join_slabs, keep_edges
+from clrecon.operators.surface.growing import Grown, grow, growing_needs, join_slabs
 from clrecon.operators.surface.marching_cubes import Placement
 from clrecon.operators.surface.seeds import Seeds
 from clrecon.operators.surface.slabs import BRICKS, SampleGrid, Slab
@@ -127,8 +127,6 @@ class Extraction:
 
     def run(self, slices: int, progress: Progress | None) -> Part:
         """Process the grid, `slices` at a time or fewer."""
-        if self._seeds is not None:
-            self._grow(self._seeds, slices)
         self.resident.halve(
             self.grid.kind, slices, lambda slices: self._go_on(slices, progress), warnings=self.warnings
         )
@@ -142,6 +140,8 @@ class Extraction:
     def _go_on(self, slices: int, progress: Progress | None) -> None:
         """Process the slices that are not yet done."""
         gk = self.grid.shape[2]
+        if self._seeds is not None and self._grown is None and slices < gk:
+            self._grow(self._seeds, slices)
         while self.first < gk:
             slab = Slab(self.grid, self.first, min(self.first + slices, gk))
             part = self._one_slab(slab)
@@ -155,23 +155,18 @@ class Extraction:
                 progress("slabs", slab.end, gk)
 
     def _grow(self, seeds: Seeds, slices: int) -> None:
-        """Find the cells of the part of the surface that is made, from the bits of the whole grid."""
+        """Find the cells of the part of the surface that is made, from the bits of the whole grid, slab by slab."""
         gk = self.grid.shape[2]
-        whole = Slab(self.grid, 0, gk)
-        needs = growing_needs(self.grid)
-        if slices >= gk:
-            needs["volume"] = whole.volume_bytes()
-            with self.stopwatch.running(self.device):
-                classified = self._classify(whole, self.resident.whole(self.stopwatch))
-        else:
-            shortage = self.resident.shortage({**needs, "volume": Slab(self.grid, 0, slices).volume_bytes()})
-            if shortage:
-                raise DeviceMemoryError(f"a surface cannot be grown: {shortage}")
-            slabs = (Slab(self.grid, first, min(first + slices, gk)) for first in range(0, gk, slices))
+        needs = {**growing_needs(self.grid), "volume": Slab(self.grid, 0, slices).volume_bytes()}
+        shortage = self.resident.shortage(needs)
+        if shortage:
+            raise DeviceMemoryError(f"a surface cannot be grown: {shortage}")
+        slabs = (Slab(self.grid, first, min(first + slices, gk)) for first in range(0, gk, slices))
+        with self.stopwatch.running(self.device):
             classified = join_slabs(
                 self.resident, self.grid, ((slab, self._classify(slab, self._upload_part(slab))) for slab in slabs)
             )
-        self._grown = grow(self.resident, self.grid, classified, seeds, self.stopwatch)
+            self._grown = grow(self.resident, self.grid, classified, seeds, self.stopwatch)
 
     def _classify(self, slab: Slab, voxels_d: Any) -> Classified:
         bricks = self._compare_bricks(slab, voxels_d)
@@ -181,15 +176,19 @@ class Extraction:
         device, stopwatch = self.device, self.stopwatch
         volume, inside = self.grid.volume, self.grid.rule.inside
         program = prepare_isosurface(
-            device, volume.voxels.dtype, uneven=volume.uneven, inside=inside, vertex_rule=self.grid.rule.vertex_rule
-        )
+            device, volume.voxels.dtype, uneven=volume.uneven, inside=inside, vertex_rule=self.grid.rule.vertex_rule,
+            grown=self._seeds is not None,
+        )  # fmt: skip
         voxels_d = self.resident.whole(stopwatch) if slab.is_whole else self._upload_part(slab)
         with stopwatch.running(device):
-            if self._grown is None:
-                classified = self._classify(slab, voxels_d)
+            if self._grown is not None and slab.is_whole:
+                classified = self._grown.classified
             else:
-                own = self._grown.classified if slab.is_whole else self._classify(slab, voxels_d)
-                classified = keep_edges(device, slab, self._grown, own, stopwatch)
+                classified = self._classify(slab, voxels_d)
+            if self._seeds is not None:
+                if self._grown is None:
+                    self._grown = grow(self.resident, self.grid, classified, self._seeds, stopwatch)
+                classified = self._grown.part(classified, slab.first)
             counted = count(device, slab, classified, stopwatch, voxels_d)
         if self._vertices_only:
             counted = replace(counted, triangles=0)
@@ -235,25 +234,28 @@ class Extraction:
         for what, size in (("volume", volume), ("output", output), ("scratch", sum(needs.values()) - volume - output)):
             self.largest[what] = max(self.largest[what], size)
 
-    def _count_cells(self) -> dict[str, int]:
-        """Cells that are visited, of all; of a surface that is grown also the active and the grown ones."""
+    def _describe_cells(self) -> tuple[dict[str, int], dict[str, Any] | None]:
+        """Cells that are visited, of all; of a surface that is grown also the active and the grown ones, and what was
+        grown.
+        """
         if self._grown is not None:
-            return self._grown.cells
+            return self._grown.report(self.device, self.grid)
         every = math.prod(n - 1 for n in self.grid.shape)
-        return {"visited": every, "all": every}
+        return {"visited": every, "all": every}, None
 
     def describe(self, vertices: int, triangles: int) -> dict[str, Any]:
         """Return the report of a mesh: how it was made, without patient data."""
         rule = self.grid.rule
         said = rule.as_report()
+        cells, growing = self._describe_cells()
         return {
             **said,
             "closed_at_border": rule.closed,
             "topology": rule.topology,
             "outside_hu": rule.outside if rule.closed else None,
             "affine_ijk_to_lps_mm": self.grid.volume.affine.tolist(),
-            "cells": self._count_cells(),
-            "growing": None if self._grown is None else self._grown.growing,
+            "cells": cells,
+            "growing": growing,
             "certificate": self.grid.volume.report,
             "device": self.device.label,
             "driver": self.device.driver,
@@ -278,10 +280,12 @@ def prepare_isosurface(
     uneven: bool = False,
     inside: str = "above",
     vertex_rule: str = "linear",
+    grown: bool = False,
 ) -> Program:
     """Build the kernels for volumes of `dtype` now, so that a later `extract_isosurface` with `topology` does not wait.
 
-    With `uneven`, for volumes with uneven slices; `inside` and `vertex_rule` as in `IsoRule`.
+    With `uneven`, for volumes with uneven slices; `inside` and `vertex_rule` as in `IsoRule`; with `grown`, for parts
+    of a surface.
 
     Raises
     ------
@@ -290,4 +294,6 @@ def prepare_isosurface(
     """
     if topology == "trilinear":
         prepare_trilinear(device, dtype)
-    return marching_cubes.prepare_marching_cubes(device, dtype, uneven=uneven, inside=inside, vertex_rule=vertex_rule)
+    return marching_cubes.prepare_marching_cubes(
+        device, dtype, uneven=uneven, inside=inside, vertex_rule=vertex_rule, grown=grown
+    )

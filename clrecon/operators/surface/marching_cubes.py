@@ -67,11 +67,12 @@ def prepare_marching_cubes(
     *,
     masks: bool = False,
     vertex_rule: str = "linear",
+    grown: bool = False,
 ) -> Program:
     """Build the kernels for volumes of `dtype`, and return emit_vertices; with `labels` (their type) it takes labels.
 
     With `uneven`, for volumes with uneven slices; `inside` and `vertex_rule` as in `IsoRule`; with `masks`, for
-    surfaces of label masks, whose volumes are occupancies.
+    surfaces of label masks, whose volumes are occupancies; with `grown`, for parts of a surface.
 
     Raises
     ------
@@ -79,7 +80,7 @@ def prepare_marching_cubes(
         The driver's compiler refuses.
     """
     prepare_scan(device)
-    load_cells(device)
+    load_cells(device, grown)
     variants = {**voxel_variants(dtype), **device.kernel_variants}
     if inside == "between":
         variants["RANGE"] = "1"
@@ -87,6 +88,8 @@ def prepare_marching_cubes(
         prepare_classify(device, dtype, inside)
     else:
         variants.update({"MASKS" if masks else "LABELS": "1"}, **label_variants(labels))
+    if grown:
+        variants["GROWN"] = "1"
     if uneven:
         variants["UNEVEN"] = "1"
     if vertex_rule != "linear":
@@ -241,7 +244,7 @@ class Emission:
             self._device, self._program["emit_vertices"], self._items, stopwatch=self._stopwatch,
             voxels=self._voxels_d, **self.tables, positions=self.positions_d, normals=self.normals_d,
             iso_level=iso_level, outside=rule.outside, value_scale=rule.value_scale,
-            **self._slab.arguments, **self._common, **label_arguments, **upper,
+            **self._slab.arguments, **self._common, **self._classified.own, **label_arguments, **upper,
         )  # fmt: skip
 
     @property
@@ -255,7 +258,7 @@ class Emission:
             return
         slab, counted = self._slab, self._counted
         gi, gj, _ = slab.grid.shape
-        program = load_cells(self._device, self._classified.inside_d is not None)
+        program = load_cells(self._device, self._classified.is_part)
         launch(
             self._device, program["emit_triangles"], self._items, stopwatch=self._stopwatch,
             word_triangles=counted.word_triangles_d, triangles=self.triangles_d, first_vertex=first_vertex,

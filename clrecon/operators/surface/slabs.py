@@ -135,9 +135,9 @@ class Slab:
         """Return the most bytes of every buffer between the volume and the mesh, by description."""
         counted_words = self.counted_rows * self.grid.words
         cell_vertices = 8 * self.counted_rows + 2 * self.rows * self.grid.words
-        grown = 4 * self.grid.shape[1] * self.grid.shape[2] * (self.grid.words + 2)
+        grown = 4 * self.grid.shape[1] * self.grid.shape[2] * (self.grid.words + 1)
         return {
-            **({"grown cells": grown, "kept mask": 4 * self.mask_rows * self.grid.words} if self.grid.grows else {}),
+            **({"grown samples": grown} if self.grid.grows else {}),
             **({"cell vertices": cell_vertices} if self.grid.rule.topology == "trilinear" else {}),
             "inside mask": 4 * self.mask_rows * self.grid.words,
             "word counts": 4 * counted_words,
