@@ -10,6 +10,7 @@ from clrecon.cli.common import add_device, add_keep_ids, add_memory, add_no_clob
 from clrecon.cli.console import Console, printable
 from clrecon.cli.mesh import describe_volume
 from clrecon.cli.reading import add_reading
+from clrecon.jobs.inside.pictures import DEFAULT_VIEW
 
 __all__ = ["add_arguments", "run"]
 
@@ -23,7 +24,7 @@ parts, each a mesh of its own:
 The files are named by their parts: inside_solid.stl, inside_dense.stl; of several vertebrae inside_L3_solid.stl.
 
 examples:
-  clrecon inside CT_FOLDER --labels spine.nii.gz --label L3 -o inside.stl
+  clrecon inside CT_FOLDER --labels spine.nii.gz --label L3 -o inside.stl --picture inside.png
   clrecon inside CT_FOLDER --labels spine.nii.gz --label L3 --label L4 --hu 300 -o spine.ply --report inside.json
   clrecon inside CT_FOLDER --labels spine.nii.gz --label T12 --dense 350:900 -o t12.glb"""
 
@@ -45,6 +46,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action="append",
         required=True,
         help="label of a vertebra; may be given again",
+    )
+    pictures = parser.add_argument_group("pictures")
+    pictures.add_argument(
+        "--picture",
+        metavar="FILE",
+        help="a picture of each part, opaque, with others faded: .png, .jpg or .tif; inside.png becomes"
+        " inside_canal.png and so on",
+    )
+    pictures.add_argument(
+        "--view",
+        default=DEFAULT_VIEW,
+        metavar="V",
+        help=f"anterior, posterior, left, right, superior, inferior, or AZ,EL in degrees (default: {DEFAULT_VIEW})",
     )
     parts = parser.add_argument_group("parts")
     parts.add_argument(
@@ -112,6 +126,7 @@ def run(options: argparse.Namespace, console: Console) -> int:
         options.input,
         options.output,
         settings,
+        picture=options.picture,
         report_path=options.report,
         no_clobber=options.no_clobber,
         progress=console.progress,
@@ -124,6 +139,9 @@ def run(options: argparse.Namespace, console: Console) -> int:
     console.say(
         f"wrote    {len(files)} meshes beside {printable(options.output)}, {size}, {report['space'].upper()} mm"
     )
+    if options.picture:
+        count = sum(len(vertebra["pictures"]) for vertebra in report["vertebrae"])
+        console.say(f"picture  {count} pictures beside {printable(options.picture)}")
     if options.report:
         console.say(f"report   {printable(options.report)}")
     for warning in report["warnings"]:
@@ -137,7 +155,9 @@ def describe_inside(report: dict[str, Any]) -> list[str]:
     for vertebra in report["vertebrae"]:
         lines += _describe_vertebra(vertebra)
     seconds = report["seconds"]
-    times = ", ".join(f"{part} {seconds[part]:.2f}" for part in ("read", "inside", "write"))
+    times = ", ".join(
+        f"{part} {seconds[part]:.2f}" for part in ("read", "inside", "render", "write") if part in seconds
+    )
     return [*lines, f"device   {printable(report['device'])}", f"time     {seconds['total']:.2f} s ({times})"]
 
 

@@ -3,16 +3,26 @@
 from __future__ import annotations
 
 from contextlib import ExitStack
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from clrecon.jobs.inside.pictures import check_pictures, describe_picture, draw_parts, stage_picture
 from clrecon.jobs.inside.report import InsideReport, describe_job, describe_mesh_file
 from clrecon.jobs.inside.settings import InsideSettings
 from clrecon.jobs.shared.labelled import read_with_labels
 from clrecon.jobs.shared.laps import Laps
 from clrecon.jobs.shared.opening import DeviceOpening
-from clrecon.jobs.shared.outputs import check_kept, check_outputs, commit_all, name_outputs, refuse_files, stage_meshes
+from clrecon.jobs.shared.outputs import (
+    check_distinct,
+    check_kept,
+    check_outputs,
+    commit_all,
+    name_outputs,
+    refuse_files,
+    stage_meshes,
+)
 from clrecon.jobs.shared.report import stage_report
 from clrecon.reading import read_selected
 from clrecon.system.log import get_logger, log_warnings
@@ -25,6 +35,8 @@ if TYPE_CHECKING:
     from clrecon.mesh import Mesh
     from clrecon.opencl import Device
     from clrecon.operators.vertebrae.inside import VertebraInside
+    from clrecon.rendering import Rendering
+    from clrecon.system.files import StagedFile
 
 __all__ = ["make_inside"]
 
@@ -36,6 +48,7 @@ def make_inside(
     output: str | Path,
     settings: InsideSettings,
     *,
+    picture: str | Path | None = None,
     report_path: str | Path | None = None,
     no_clobber: bool = False,
     progress: Progress | None = None,
@@ -53,6 +66,8 @@ def make_inside(
     output : path
         Mesh file; its extension gives the format.
     settings : InsideSettings
+    picture : path, optional
+        Picture, .png, .jpg or .tif: one of each part, with names like those of the meshes.
     report_path : path, optional
         File for the report as JSON.
     no_clobber : bool
@@ -74,26 +89,63 @@ def make_inside(
     progress = progress or ignore_progress
     watch = Laps()
     with keep_existing(no_clobber):
-        # names of several vertebrae are those of the label map, which is not read yet: their number stands for them
-        first = [part if len(settings.only) == 1 else f"{len(settings.only)}_{part}" for part in PARTS]
-        outputs = check_outputs(output, report_path, first)
-        check_kept(outputs, source, settings.labels)
+        _check_files(source, output, picture, report_path, settings)
     volume, labels, device = _open(source, settings, progress)
     suffixes = _name_labels(labels, settings)
     if no_clobber:
-        refuse_files(name_outputs(output, [_join(suffix, part, suffixes) for suffix in suffixes for part in PARTS]))
+        names = [_join(suffix, part, suffixes) for suffix in suffixes for part in PARTS]
+        refuse_files(name_outputs(output, names) + ([] if picture is None else name_outputs(picture, names)))
     watch.lap("read")
-    found: list[tuple[str, VertebraInside, dict[str, Mesh]]] = []
+    found: list[_Found] = []
     for number, suffix in zip(_numbers(labels, settings), suffixes, strict=True):
         progress("inside", len(found), len(suffixes) if len(suffixes) > 1 else 0)
         inside = _look(volume, labels, number, settings, device)
-        found.append((suffix, inside, inside.extract_meshes(memory=settings.memory)))
+        found.append(_Found(suffix, inside, inside.extract_meshes(memory=settings.memory)))
     watch.lap("inside")
+    if picture is not None:
+        for place, one in enumerate(found):
+            progress("render", place, len(found) if len(found) > 1 else 0)
+            one.pictures = draw_parts(one.meshes, settings.view, device, settings.memory)
+        watch.lap("render")
     with keep_existing(no_clobber):
-        report = _write(found, output, report_path, volume, settings, device, watch, progress)
+        report = _write(found, (output, picture, report_path), volume, settings, device, watch, progress)
     log_warnings(log, report.warnings, volume.report.get("warnings", ()))
     log.info("%d vertebrae looked into, on %s in %.3f s", len(found), report.device, report.seconds["total"])
     return report
+
+
+@dataclass
+class _Found:
+    """One vertebra: its name in files, its parts, their surfaces and their pictures."""
+
+    suffix: str
+    inside: VertebraInside
+    meshes: dict[str, Mesh]
+    pictures: dict[str, Rendering] = field(default_factory=dict)
+
+
+def _check_files(
+    source: str | Path,
+    output: str | Path,
+    picture: str | Path | None,
+    report_path: str | Path | None,
+    settings: InsideSettings,
+) -> None:
+    """Refuse outputs that cannot be written or would replace an input."""
+    from clrecon.operators.vertebrae.inside import PARTS
+    from clrecon.system.files import check_writable
+
+    # names of several vertebrae are those of the label map, which is not read yet: their number stands for them
+    first = [part if len(settings.only) == 1 else f"{len(settings.only)}_{part}" for part in PARTS]
+    outputs = check_outputs(output, report_path, first)
+    if picture is not None:
+        check_pictures(picture, settings.view)
+        drawn = [("the picture", path) for path in name_outputs(picture, first)]
+        check_distinct(outputs, drawn)
+        for _, path in drawn:
+            check_writable(path)
+        outputs += drawn
+    check_kept(outputs, source, settings.labels)
 
 
 def _open(source: str | Path, settings: InsideSettings, progress: Progress) -> tuple[Volume, LabelMap, Device]:
@@ -144,37 +196,40 @@ def _look(volume: Volume, labels: LabelMap, number: int, settings: InsideSetting
 
 
 def _write(
-    found: list[tuple[str, VertebraInside, dict[str, Mesh]]],
-    output: str | Path,
-    report_path: str | Path | None,
+    found: list[_Found],
+    outputs: tuple[str | Path, str | Path | None, str | Path | None],
     volume: Volume,
     settings: InsideSettings,
     device: Device,
     watch: Laps,
     progress: Progress,
 ) -> InsideReport:
+    """Write all files, with the report of all vertebrae as the last one, and return the report."""
     from clrecon.operators.vertebrae.solid import CLOSE_MM
 
-    suffixes = [suffix for suffix, _, _ in found]
-    named = [
-        (_join(suffix, part, suffixes), part, mesh) for suffix, _, meshes in found for part, mesh in meshes.items()
-    ]
-    paths = name_outputs(output, [name for name, _, _ in named], report_path)
+    output, picture, report_path = outputs
+    suffixes = [one.suffix for one in found]
     with ExitStack() as staged:
-        files = stage_meshes(
-            staged, [mesh for _, _, mesh in named], paths, settings.space, progress, keep_ids=settings.keep_ids
-        )
+        files: list[StagedFile] = []
+        vertebrae: list[dict[str, Any]] = []
+        for one in found:
+            names = [_join(one.suffix, part, suffixes) for part in one.meshes]
+            paths = name_outputs(output, names, report_path)
+            written = stage_meshes(
+                staged, list(one.meshes.values()), paths, settings.space, progress, keep_ids=settings.keep_ids
+            )
+            told: dict[str, Any] = {**one.inside.as_dict(), "name": one.suffix, "pictures": []}
+            parts = zip(one.meshes, one.meshes.values(), paths, written, strict=True)
+            told["meshes"] = [describe_mesh_file(part, mesh, path, file.size) for part, mesh, path, file in parts]
+            files += written
+            for part, drawn in one.pictures.items():
+                assert picture is not None
+                (path,) = name_outputs(picture, [_join(one.suffix, part, suffixes)])
+                files.append(stage_picture(staged, drawn, path))
+                told["pictures"].append(describe_picture(part, drawn, path, files[-1].size))
+                told["warnings"] += drawn.report["warnings"]
+            vertebrae.append(told)
         watch.lap("write")
-        told = iter(
-            [
-                describe_mesh_file(part, mesh, path, file.size)
-                for (_, part, mesh), path, file in zip(named, paths, files, strict=True)
-            ]
-        )
-        vertebrae: list[dict[str, Any]] = [
-            {**inside.as_dict(), "name": suffix, "meshes": [next(told) for _ in meshes]}
-            for suffix, inside, meshes in found
-        ]
         seconds = {part: round(value, 4) for part, value in {**watch.seconds, "total": watch.total()}.items()}
         report = describe_job(
             volume, vertebrae, settings, device.current, close_mm=settings.close_mm or CLOSE_MM, seconds=seconds

@@ -30,7 +30,7 @@ class InsideReport(RunReport):
     ----------
     vertebrae : list of mapping
         One for each label, see `clrecon.VertebraInside.as_dict`, with ``meshes`` beside: ``part``, ``vertices``,
-        ``triangles``, ``format`` and ``bytes`` of each file.
+        ``triangles``, ``format`` and ``bytes`` of each file, and ``pictures``.
     close_mm : float
     space, unit : str
     """

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from clrecon.errors import UsageError
+from clrecon.jobs.inside.pictures import DEFAULT_VIEW
 from clrecon.reading import Selection
 from clrecon.system.wording import name_parameter
 
@@ -35,6 +36,8 @@ class InsideSettings(Selection):
         Distance of growth with an iso value, see `clrecon.extract_labels`.
     space : {"lps", "ras"}
         Patient frame of the meshes.
+    view : str
+        View of the pictures, see `clrecon.Camera.fit`.
     keep_ids : bool
         Write the hashes of the UIDs of series and frame of reference into the report and the mesh files.
     device : str, optional
@@ -55,6 +58,7 @@ class InsideSettings(Selection):
     close_mm: float | None = None
     grow_mm: float | None = None
     space: str = "lps"
+    view: str = DEFAULT_VIEW
     keep_ids: bool = False
     device: str | None = None
     memory: int | None = None

@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from contract_tables import names_in
 
@@ -115,6 +116,35 @@ def test_wrong_files_are_one_line_and_leave_nothing(
         InsideSettings(labels="x.nrrd", only=())
     with pytest.raises(UsageError, match="must be above 0 bytes"):
         InsideSettings(labels="x.nrrd", only=["L1"], memory=0)
+
+
+def test_pictures_show_each_part(inside: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    image = pytest.importorskip("PIL.Image")
+    assert inside("--label", "L1", "--picture", str(tmp_path / "p.png"), "--view", "left", "--json") == 0
+    (vertebra,) = json.loads(capsys.readouterr().out)["vertebrae"]
+    assert [picture["part"] for picture in vertebra["pictures"]] == list(PARTS)
+    assert {path.name for path in tmp_path.glob("*.png")} == {f"p_{part}.png" for part in PARTS}
+    shown = {}
+    for part in PARTS:
+        pixels = np.asarray(image.open(tmp_path / f"p_{part}.png").convert("RGB")).astype(int)
+        assert pixels.shape == (1024, 1024, 3)
+        assert (pixels[0] == 255).all()
+        blue, red = pixels[..., 2] - pixels[..., 0], pixels[..., 0] - pixels[..., 2]
+        shown[part] = (blue > 60).mean(), (red > 60).mean()
+    assert shown["canal"][0] > 0.01  # blue is opaque here alone
+    assert max(shown[part][0] for part in ("solid", "dense", "trabecular")) < 0.1 * shown["canal"][0]
+    assert shown["trabecular"][1] > 0.05
+    assert shown["canal"][1] < 0.01
+
+
+def test_wrong_pictures_are_refused_first(inside: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert inside("--label", "L1", "--picture", str(tmp_path / "p.svg")) == 3
+    assert inside("--label", "L1", "--picture", str(tmp_path / "p.png"), "--view", "above") == 3
+    assert inside("--label", "L1", "--picture", str(tmp_path / "none" / "p.png")) == 6
+    assert capsys.readouterr().err.count("\n") == 3
+    (tmp_path / "p_canal.png").write_text("kept")
+    assert inside("--label", "L1", "--picture", str(tmp_path / "p.png"), "--no-clobber") == 6
+    assert [path.read_text() for path in tmp_path.iterdir()] == ["kept"]
 
 
 def test_the_meshes_lie_in_the_patient(inside: Any, spine: Path, tmp_path: Path) -> None:
