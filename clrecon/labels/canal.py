@@ -31,6 +31,10 @@ quarter, the bone below a hollow endplate nearly all."""
 STEEPEST = 1.0
 """Largest shift of the canal from slice to slice, mm per mm: 45 degrees."""
 
+SPREAD_MM = 4.0
+"""The canal is at most so much wider than in the nearest slice in which the arch is closed; what lies farther out are
+gaps of a mask beside it."""
+
 ROUNDS = 3
 """Times that the direction of the canal is found with the wall that follows from the one before."""
 
@@ -83,11 +87,12 @@ def find_canal(solid: Bits, volume: Volume) -> Canal | None:
         return None
     closed = np.flatnonzero(main.any(axis=(1, 2)))
     front, slope, wall = _find_front(solid, main, places)
-    canal = main | front
-    ends = places.ends
-    for k in np.flatnonzero(front.any(axis=(1, 2)) & ~main.any(axis=(1, 2))):
+    canal, ends = main.copy(), places.ends
+    for k in np.flatnonzero(front.any(axis=(1, 2))):
         near = int(closed[np.argmin(np.abs(closed - k))])
-        canal[k] |= places.shift(main[near], near, int(k), slope) & wall[k] & ~solid[k]
+        section = places.shift(main[near], near, int(k), slope)
+        canal[k] |= front[k] & places.spread(section, SPREAD_MM)
+        canal[k] |= section & wall[k] & ~solid[k]
     slices = np.flatnonzero(canal.any(axis=(1, 2)))
     return Canal(canal, len(closed), together, float((ends[1:] - ends[:-1])[slices].sum()))
 
@@ -118,6 +123,15 @@ class _Places:
         """Return the mean y of voxels."""
         k, j, i = np.nonzero(voxels)
         return float(np.mean(self._y[j, i] + self.origins[k, 1]))
+
+    def spread(self, section: Bits, mm: float) -> Bits:
+        """Return a section and what lies within a distance of it."""
+        from scipy.ndimage import distance_transform_edt
+
+        if not section.any():
+            return section
+        steps = np.linalg.norm(self.plane, axis=0)
+        return np.asarray(distance_transform_edt(~section, sampling=(steps[1], steps[0])) <= mm)
 
     def shift(self, section: Bits, source: int, target: int, slope: Float64Array) -> Bits:
         """Return a section of slice `source` where the canal's direction leads in slice `target`."""
@@ -218,8 +232,14 @@ def _find_front(solid: Bits, main: Bits, places: _Places) -> tuple[Bits, Float64
         if len(found) < 3:
             break
         middles = np.array([_front_of(front[n], places.x(int(n)), places.y(int(n))) for n in found])
-        slope = np.clip(np.polyfit(places.heights[found], middles, 1)[0], -STEEPEST, STEEPEST)
+        slope = np.clip(_slopes(places.heights[found], middles), -STEEPEST, STEEPEST)
     return front, slope, wall
+
+
+def _slopes(heights: Float64Array, middles: Float64Array) -> Float64Array:
+    """Return the median of the slopes between all pairs (Theil and Sen): slices with gaps beside the canal are few."""
+    one, other = np.triu_indices(len(heights), 1)
+    return np.asarray(np.median((middles[other] - middles[one]) / (heights[other] - heights[one])[:, None], axis=0))
 
 
 def _front_of(section: Bits, x: Float64Array, y: Float64Array) -> tuple[float, float]:

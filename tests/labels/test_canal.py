@@ -93,6 +93,16 @@ def test_small_gaps_of_an_arch_are_no_canal():
     assert find_canal(solid, volume) is None
 
 
+def test_gaps_of_a_pedicle_beside_the_canal_are_left_out():
+    solid, volume, expected = block()
+    solid[27:31, 40:44, 45:52] = False  # 7 mm into a pedicle, where the arch is open behind
+    canal = find_canal(solid, volume)
+    beside = canal.voxels & ~expected
+    assert (expected & ~canal.voxels).sum() == 0
+    assert beside.sum() == 4 * 4 * 4  # 4 mm of it
+    assert beside[27:31, 40:44, 45:49].all()
+
+
 def test_uneven_and_turned_slices_keep_their_places():
     solid, volume, expected = block()
     turned = np.diag([-1.0, -1.0, 1.0, 1.0])  # rows and columns the other way round, as of a prone patient
