@@ -198,6 +198,31 @@ def test_real_vertebrae(real_data, device):
     assert cut.canal is None
 
 
+def test_a_real_label_with_gaps_is_warned_of(real_data, device):
+    folder = real_data / "thoracolumbar_labels"
+    volume, labels = (
+        clrecon.read_volume(folder / "ct_2mm_jpeg2000"),
+        clrecon.read_labels(folder / "ct_2mm_labels.nii.gz"),
+    )
+    inside = clrecon.vertebra_inside(volume, labels, "T12", device=device)  # the map has the spinal cord too
+    assert inside.volumes_ml["canal"] == pytest.approx(1.5, abs=0.2)
+    told = " ".join(inside.warnings)
+    assert "the canal of label 32 vertebrae_T12 is 4 mm high: pedicles are higher" in told
+    assert "in the next voxel outside of the label" in told
+
+
+@pytest.mark.parametrize("turned", [{"tilt": 15.0}, {"oblique": (10.0, -5.0, 30.0)}], ids=str)
+def test_tilted_and_oblique_scans_have_the_same_parts(turned, device):
+    settings = PhantomSettings(levels="L1", size=(130, 130), spacing=(1.0, 1.0, 1.2), **turned)
+    voxels, affine, _ = make_phantom(settings)
+    truth = clrecon.phantom_truth(settings)
+    labels = LabelMap(truth.label_map(), affine, truth.names)
+    inside = clrecon.vertebra_inside(Volume(voxels, affine), labels, "L1", device=device)
+    assert inside.volumes_ml["solid"] == pytest.approx(35.76, rel=0.01)
+    assert inside.volumes_ml["canal"] == pytest.approx(5.5, rel=0.1)
+    assert 12.0 <= inside.canal_found.height_mm <= 15.6
+
+
 def test_the_canal_of_real_masks(real_data, device):
     labels = clrecon.read_labels(real_data / "vertebra_masks" / "sub-verse004_seg-vert_msk.nii.gz")  # sagittal slices
     volume = Volume(np.where(labels.voxels > 0, 500, 0).astype(np.int16), labels.affine)
